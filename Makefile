@@ -1,0 +1,44 @@
+# Two commands for users (`make run`, `make test`), three for developers (`make check`, `make model`, `make clean`).
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: run test check format model clean
+
+run: $(VENV)/.demo
+	$(BIN)/python tools/demo.py
+
+test: check
+	$(BIN)/python -m pytest -q
+
+check: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# the shipped model: a bench sweep recorded from the simulated device (sample 1), then training
+model: $(VENV)/.dev
+	$(BIN)/python tools/bench_sweep.py --plant sample_1 --out build/bench_sweep.csv
+	$(BIN)/python tools/train_model.py build/bench_sweep.csv --element torque --insert MRE-50-40 \
+	    --out tormagd/learning/models/torque_mre_50_40.safetensors --plot build/training.png
+
+clean:
+	rm -rf $(VENV) build run .mypy_cache .ruff_cache .pytest_cache .hypothesis
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.demo: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable '.[demo]'
+	touch $@
+
+$(VENV)/.dev: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	touch $@ $(VENV)/.demo

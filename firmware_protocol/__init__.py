@@ -1,0 +1,1 @@
+"""The wire between tormagd and the brake's firmware: messages, codec and serial framing, all following tormag.dbc."""

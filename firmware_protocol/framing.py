@@ -1,0 +1,133 @@
+"""Serial frames: which bytes of a stream belong together, and whether they arrived whole.
+
+    COBS( function u8 | sequence u8 | payload 0..8 | CRC-16/CCITT-FALSE u16, big-endian ) 0x00
+
+COBS takes the zeros out of the frame, so that a zero on the line is always the end of one: after any disturbance the
+receiver is back at the next zero. The sequence counts the frames of one direction modulo 256.
+"""
+
+from binascii import crc_hqx
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from firmware_protocol.codec import EncodeError
+
+DELIMITER: Final = b"\x00"
+CRC_INITIAL: Final = 0xFFFF
+CRC_LENGTH: Final = 2
+HEADER_LENGTH: Final = 2
+MAX_PAYLOAD: Final = 8
+MAX_ENCODED: Final = 1 + HEADER_LENGTH + MAX_PAYLOAD + CRC_LENGTH
+"""Longest frame before its delimiter; under 254 bytes, COBS adds exactly one."""
+
+
+class Frame(NamedTuple):
+    """One frame that arrived whole. Whether its payload is a message is for `codec.decode` to say."""
+
+    function: int
+    sequence: int
+    payload: bytes
+
+
+@dataclass(slots=True)
+class FramingStatistics:
+    """What a FrameDecoder has seen since it was made."""
+
+    bytes: int = 0
+    frames: int = 0
+    """Frames returned by `feed`."""
+    corrupt: int = 0
+    """Stretches between two delimiters that were not a frame."""
+    lost: int = 0
+    """Frames missing from the sequence, those among them that arrived corrupt included."""
+    repeated: int = 0
+    """Frames with the sequence number of the frame before."""
+    resynchronisations: int = 0
+    """Times a frame was found again after something corrupt."""
+
+
+def cobs_encode(data: bytes) -> bytes:
+    """`data` (under 254 bytes) without zeros: each zero, and one before the start, becomes the distance to the next."""
+    return b"".join(bytes((len(run) + 1,)) + run for run in data.split(DELIMITER))
+
+
+def cobs_decode(data: bytes) -> bytes | None:
+    """Inverse of `cobs_encode` for `data` without zeros; None if the distances do not end where the data does."""
+    runs = []
+    position = 0
+    while position < len(data):
+        end = position + data[position]
+        runs.append(data[position + 1 : end])
+        position = end
+    return DELIMITER.join(runs) if position == len(data) else None
+
+
+def encode_frame(function: int, sequence: int, payload: bytes) -> bytes:
+    """One frame with its delimiter. Raises EncodeError over 8 bytes of payload or for a number outside 0..255."""
+    if not (0 <= function <= 0xFF and 0 <= sequence <= 0xFF and len(payload) <= MAX_PAYLOAD):
+        raise EncodeError(
+            f"frame of function {function}, sequence {sequence}, {len(payload)} bytes: "
+            f"allowed are 0 to 255, 0 to 255, 0 to {MAX_PAYLOAD}"
+        )
+    body = bytes((function, sequence)) + payload
+    return cobs_encode(body + crc_hqx(body, CRC_INITIAL).to_bytes(CRC_LENGTH, "big")) + DELIMITER
+
+
+class FrameDecoder:
+    """Takes a byte stream in pieces of any size and gives the frames in it.
+
+    Between calls it holds at most one frame's worth of bytes. A frame that repeats the one before it byte for byte is
+    counted and not returned; one that repeats only the sequence number comes from a sender that started anew, and is.
+    """
+
+    def __init__(self) -> None:
+        self.statistics = FramingStatistics()
+        self._pending = b""
+        self._last: Frame | None = None
+        self._synchronised = True
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames that `data` completes, in order. Never raises on content."""
+        self.statistics.bytes += len(data)
+        *ended, rest = data.split(DELIMITER)
+        frames = []
+        for stretch in ended:
+            encoded = self._pending + stretch
+            self._pending = b""
+            if encoded and (frame := self._accept(encoded)) is not None:
+                frames.append(frame)
+        # One byte over the longest frame is kept, enough to know it for too long when its end comes.
+        self._pending = (self._pending + rest[: MAX_ENCODED + 1])[: MAX_ENCODED + 1]
+        return frames
+
+    def _accept(self, encoded: bytes) -> Frame | None:
+        statistics = self.statistics
+        frame = _parse(encoded)
+        if frame is None:
+            statistics.corrupt += 1
+            self._synchronised = False
+            return None
+        if not self._synchronised:
+            statistics.resynchronisations += 1
+            self._synchronised = True
+        last, self._last = self._last, frame
+        if last is not None:
+            advance = (frame.sequence - last.sequence) % 256
+            if advance == 0:
+                statistics.repeated += 1
+                if frame == last:
+                    return None
+            else:
+                statistics.lost += advance - 1
+        statistics.frames += 1
+        return frame
+
+
+def _parse(encoded: bytes) -> Frame | None:
+    if len(encoded) > MAX_ENCODED:
+        return None
+    body = cobs_decode(encoded)
+    # The CRC of data followed by its own CRC is zero.
+    if body is None or len(body) < HEADER_LENGTH + CRC_LENGTH or crc_hqx(body, CRC_INITIAL) != 0:
+        return None
+    return Frame(body[0], body[1], body[HEADER_LENGTH:-CRC_LENGTH])

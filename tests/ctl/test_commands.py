@@ -1,0 +1,242 @@
+import json
+import subprocess
+import sys
+from itertools import chain, repeat
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tormagd.ctl.main import main
+from tormagd.ctl.outcome import Colour
+from tormagd.ctl.status import status_text
+
+
+def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
+    code = main([*arguments, "--json"])
+    printed = json.loads(capsys.readouterr().out)
+    assert list(printed) == ["command", "ok", "result", "error"]
+    assert printed["ok"] == (code == 0)
+    return code, printed
+
+
+def test_status_gives_the_daemons_own_keys(fake_daemon, capsys):
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "status")
+    assert code == 0
+    assert printed["result"]["operating_state"] == "ENABLED"
+    assert printed["result"]["measured_jp"] == [35.0, 35.0]
+    assert printed["result"]["link"] == {"state": "UP", "frames": 7}
+
+
+def test_status_in_fault_exits_4_and_names_cause_and_remedy(fake_daemon, capsys):
+    details = [{"code": "SKEW", "cause": "carriages apart", "remedy": "clean the screw"}]
+    result = {"operating_state": "FAULT", "faults": ["SKEW"], "fault_details": details}
+    fake_daemon.answers["status"] = lambda: {"ok": True, "result": result}
+    assert main(["--endpoint", fake_daemon.control, "status"]) == 4
+    text = capsys.readouterr().out
+    assert "SKEW" in text
+    assert "carriages apart" in text
+    assert "next: clean the screw" in text
+
+
+@pytest.mark.parametrize("command", ["enable", "disable", "pause", "resume", "stop", "clear-fault"])
+def test_a_command_reaches_the_daemon_under_its_name(fake_daemon, capsys, command):
+    fake_daemon.answers[command] = lambda: {"ok": True, "result": {"operating_state": "PAUSED"}}
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, command)
+    assert (code, printed["command"], printed["result"]) == (0, command, {"operating_state": "PAUSED"})
+    assert fake_daemon.commands == [command]
+
+
+@pytest.mark.parametrize(("code", "expected"), [("not_homed", 1), ("fault", 4), ("device_latched", 4)])
+def test_a_refusal_tells_code_message_and_hint(fake_daemon, capsys, code, expected):
+    fake_daemon.refuse("enable", code)
+    exit_code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "enable")
+    assert exit_code == expected
+    assert printed["error"] == {"code": code, "message": "cannot enable", "hint": "do this first"}
+
+
+def test_diagnostics_go_to_stderr_with_the_next_step(fake_daemon, capsys):
+    fake_daemon.refuse("enable", "not_homed")
+    assert main(["--endpoint", fake_daemon.control, "enable"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "cannot enable" in captured.err
+    assert captured.err.splitlines()[-1].strip() == "next: do this first"
+
+
+@pytest.mark.parametrize("arguments", [["status"], ["home"], ["send", "step"], ["record", "out.mcap"]])
+def test_without_a_daemon_every_command_ends_with_3(run_dir, capsys, arguments, monkeypatch):
+    monkeypatch.chdir(run_dir)
+    code, printed = run_json(capsys, "--endpoint", f"ipc://{run_dir}/control", "--wait", "0.05", *arguments)
+    assert code == 3
+    assert printed["error"]["code"] == "unreachable"
+    assert "start the daemon" in printed["error"]["hint"]
+    assert list(run_dir.iterdir()) == []
+
+
+def test_an_answer_that_is_no_reply_is_not_believed(fake_daemon, capsys):
+    fake_daemon.answers["pause"] = lambda: {"ok": "perhaps"}
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "pause")
+    assert (code, printed["error"]["code"]) == (3, "unintelligible")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["fly"],
+        ["send"],
+        ["send", "step", "--rate", "nan"],
+        ["send", "step", "--rate", "0"],
+        ["send", "step", "--valid-for-ms", "-1"],
+        ["send", "step", "--source", ""],
+        ["home", "--timeout", "0"],
+        ["plot", "a.mcap"],
+        ["scene", "burn"],
+    ],
+)
+def test_usage_errors_exit_2(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert "usage:" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--endpoint", "tcp://192.0.2.1:5555", "status"], "CURVE"),
+        (["--endpoint", "carrier-pigeon", "status"], "carrier-pigeon"),
+        (["--endpoint", "ipc://" + "x" * 200, "status"], "107"),
+        (["--config", "/nowhere/tormagd.toml", "status"], "/nowhere/tormagd.toml"),
+        (["send", "sawtooth"], "step, sine, ramp, pulse"),
+        (["send", "step", "--to-N", "-1"], "--to-N = -1"),
+        (["send", "step", "--rate", "5"], "at least one period, 200 ms"),
+        (["scene", "show", "unheard-of"], "coronary"),
+        (["plot", "/nowhere/a.mcap", "-o", "a.png"], "/nowhere/a.mcap"),
+    ],
+)
+def test_what_cannot_be_used_is_named_and_exits_2(arguments, named, capsys):
+    code, printed = run_json(capsys, *arguments)
+    assert code == 2
+    assert named in printed["error"]["message"] + printed["error"]["hint"]
+
+
+def test_a_configuration_names_the_endpoints(fake_daemon, tmp_path, capsys):
+    config = tmp_path / "tormagd.toml"
+    config.write_text(f'[endpoints]\ncontrol = "{fake_daemon.control}"\n')
+    assert run_json(capsys, "--config", str(config), "status")[0] == 0
+
+
+def test_scenes_are_listed_and_shown(capsys):
+    names = [scene["name"] for scene in run_json(capsys, "scene", "list")[1]["result"]["scenes"]]
+    assert names == ["coronary", "pulse"]
+    shown = run_json(capsys, "scene", "show", "pulse")[1]["result"]
+    assert shown["name"] == "pulse"
+    assert shown["insert"]["gap_open_mm"] == 95.0
+    # without a name: the configuration's
+    assert run_json(capsys, "scene", "show")[1]["result"]["name"] == "coronary"
+
+
+def test_scene_text_is_toml_that_loads_again(tmp_path, capsys):
+    assert main(["scene", "show", "pulse"]) == 0
+    copy = tmp_path / "copy.toml"
+    copy.write_text(capsys.readouterr().out)
+    assert run_json(capsys, "scene", "show", str(copy)) == run_json(capsys, "scene", "show", "pulse")
+
+
+def states(*pairs: tuple[bool, bool], **changes: Any) -> Any:
+    """Answers to `status`, one (is_homed, is_busy) after the other, the last one for ever."""
+    sequence = chain(pairs, repeat(pairs[-1]))
+    return lambda: {
+        "ok": True,
+        "result": dict(zip(("is_homed", "is_busy"), next(sequence), strict=True))
+        | {"operating_state": "DISABLED"}
+        | changes,
+    }
+
+
+@pytest.mark.parametrize(
+    "sequence",
+    [
+        [(False, False), (False, False), (False, True), (False, True), (True, False)],
+        [(True, False), (True, False), (False, True), (True, False)],  # homed before: the old state is not the answer
+        [(False, False), (True, False)],  # over between two looks
+    ],
+)
+def test_home_waits_until_the_device_is_homed(fake_daemon, capsys, sequence):
+    fake_daemon.answers["status"] = states(*sequence)
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "home")
+    assert code == 0
+    assert printed["result"]["seconds"] >= 0.0
+    assert fake_daemon.commands == ["status", "home", *["status"] * (len(sequence) - 1)]
+
+
+@pytest.mark.parametrize(
+    ("sequence", "timeout", "expected"),
+    [
+        ([(False, False), (False, True), (False, False)], "5", "not_homed"),
+        ([(False, False), (False, True)], "0.15", "timeout"),
+        ([(True, False)], "5", "not_begun"),
+    ],
+)
+def test_home_that_does_not_succeed_says_how(fake_daemon, capsys, monkeypatch, sequence, timeout, expected):
+    monkeypatch.setattr("tormagd.ctl.operate.BEGIN_S", 0.2)
+    fake_daemon.answers["status"] = states(*sequence)
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "home", "--timeout", timeout)
+    assert (code, printed["error"]["code"]) == (1, expected)
+
+
+def test_a_fault_while_homing_exits_4_with_its_remedy(fake_daemon, capsys):
+    details = [{"code": "SUPPLY", "cause": "supply voltage low", "remedy": "check the power supply"}]
+    fake_daemon.answers["status"] = states(
+        (False, True), operating_state="FAULT", faults=["SUPPLY"], fault_details=details
+    )
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "home")
+    assert code == 4
+    assert printed["error"]["hint"] == "check the power supply"
+
+
+def test_home_no_wait_returns_at_once(fake_daemon, capsys):
+    fake_daemon.answers["status"] = states((False, False), (False, True))
+    assert run_json(capsys, "--endpoint", fake_daemon.control, "home", "--no-wait")[0] == 0
+    assert fake_daemon.commands == ["status", "home"]
+
+
+class Terminal:
+    def isatty(self) -> bool:
+        return True
+
+
+def test_colours_only_on_a_terminal_and_not_with_no_color(monkeypatch):
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    assert Colour(Terminal()).red("x") == "\x1b[31mx\x1b[0m"  # type: ignore[arg-type]
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert Colour(Terminal()).red("x") == "x"  # type: ignore[arg-type]
+    monkeypatch.delenv("NO_COLOR")
+    monkeypatch.setenv("TERM", "dumb")
+    assert Colour(Terminal()).red("x") == "x"  # type: ignore[arg-type]
+
+
+def test_status_text_of_a_daemon_that_says_little_or_nonsense():
+    plain = Colour(sys.stderr)
+    assert "state     -" in status_text({}, plain)
+    assert "measured -" in status_text({"link": 3, "rates": None, "measured_cf": "many", "limits": None}, plain)
+
+
+@pytest.mark.parametrize("command", [["status"], ["send", "step"], ["scene", "list"]])
+def test_a_command_loads_only_what_it_needs(command, run_dir):
+    script = (
+        "import sys; from tormagd.ctl.main import main; main(sys.argv[1:]);"
+        "print([m for m in ('torch', 'matplotlib', 'can', 'mcap', 'numpy', 'scipy', 'tormagd.daemon', 'serial')"
+        " if m in sys.modules], file=sys.stderr)"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", script, "--endpoint", f"ipc://{run_dir}/control", "--wait", "0.01", *command],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(__file__).parent,
+    )
+    assert ran.stderr.splitlines()[-1] == "[]"

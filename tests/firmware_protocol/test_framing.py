@@ -1,0 +1,208 @@
+"""Frames over streams that are whole, cut, noisy, repeated and endless."""
+
+import pickle
+import random
+from binascii import crc_hqx
+from dataclasses import asdict
+from itertools import pairwise
+
+import pytest
+from cobs import cobs  # type: ignore[import-untyped]
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from firmware_protocol.codec import EncodeError
+from firmware_protocol.framing import MAX_ENCODED, Frame, FrameDecoder, cobs_decode, cobs_encode, encode_frame
+
+byte = st.integers(0, 255)
+frames = st.builds(Frame, byte, byte, st.binary(max_size=8))
+
+
+def wire(frame: Frame) -> bytes:
+    return encode_frame(*frame)
+
+
+def numbered(count: int, start: int = 0) -> list[Frame]:
+    return [Frame(3, (start + index) % 256, bytes((index % 256, 0, 255))) for index in range(count)]
+
+
+@given(st.binary(max_size=253))
+def test_cobs_is_the_cobs_of_the_reference(data: bytes) -> None:
+    encoded = cobs_encode(data)
+    assert encoded == cobs.encode(data)
+    assert cobs_decode(encoded) == data
+
+
+@given(st.binary(min_size=1, max_size=20).map(lambda data: data.replace(b"\0", b"\1")))
+def test_cobs_refuses_what_the_reference_refuses(data: bytes) -> None:
+    try:
+        expected = cobs.decode(data)
+    except cobs.DecodeError:
+        expected = None
+    assert cobs_decode(data) == expected
+
+
+def test_crc_is_ccitt_false_in_big_endian() -> None:
+    assert crc_hqx(b"123456789", 0xFFFF) == 0x29B1
+    assert cobs.decode(encode_frame(0x31, 0x32, b"3456789")[:-1]) == b"123456789\x29\xb1"
+
+
+@given(frames)
+def test_a_frame_comes_back(frame: Frame) -> None:
+    encoded = wire(frame)
+    assert encoded.count(0) == 1
+    assert encoded.endswith(b"\0")
+    assert len(encoded) == len(frame.payload) + 6 <= MAX_ENCODED + 1
+    assert FrameDecoder().feed(encoded) == [frame]
+
+
+@pytest.mark.parametrize(
+    ("function", "sequence", "length"), [(256, 0, 0), (-1, 0, 0), (1, 256, 0), (1, -1, 0), (1, 0, 9)]
+)
+def test_what_does_not_fit_a_frame_is_refused(function: int, sequence: int, length: int) -> None:
+    with pytest.raises(EncodeError, match=f"function {function}, sequence {sequence}, {length} bytes"):
+        encode_frame(function, sequence, bytes(length))
+
+
+def test_one_byte_at_a_time() -> None:
+    decoder = FrameDecoder()
+    sent = numbered(300)
+    received = [frame for frame_sent in sent for b in wire(frame_sent) for frame in decoder.feed(bytes((b,)))]
+    assert received == sent
+    statistics = decoder.statistics
+    assert (statistics.frames, statistics.corrupt, statistics.lost, statistics.repeated) == (300, 0, 0, 0)
+    assert statistics.bytes == sum(len(wire(frame)) for frame in sent)
+
+
+@given(st.lists(frames.map(wire) | st.binary(max_size=40), max_size=12), st.data())
+def test_how_a_stream_is_cut_makes_no_difference(pieces: list[bytes], data: st.DataObject) -> None:
+    stream = b"".join(pieces)
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=20)))
+    whole, cut = FrameDecoder(), FrameDecoder()
+    expected = whole.feed(stream)
+    bounds = [0, *cuts, len(stream)]
+    received = [frame for a, b in pairwise(bounds) for frame in cut.feed(stream[a:b])]
+    assert received == expected
+    assert asdict(cut.statistics) == asdict(whole.statistics)
+
+
+@given(st.binary(max_size=400))
+def test_after_any_garbage_at_most_one_frame_is_lost(garbage: bytes) -> None:
+    first, second, third = numbered(3)
+    received = FrameDecoder().feed(garbage + wire(first) + wire(second) + wire(third))
+    assert received[-2:] == [second, third]
+
+
+@given(st.binary(max_size=400))
+def test_after_garbage_with_a_delimiter_no_frame_is_lost(garbage: bytes) -> None:
+    sent = numbered(2)
+    assert FrameDecoder().feed(garbage + b"\0" + wire(sent[0]) + wire(sent[1]))[-2:] == sent
+
+
+@given(frames, st.data())
+def test_a_cut_frame_is_not_a_frame(frame: Frame, data: st.DataObject) -> None:
+    encoded = wire(frame)
+    cut = encoded[: data.draw(st.integers(1, len(encoded) - 2))]
+    decoder = FrameDecoder()
+    following = Frame(frame.function, (frame.sequence + 1) % 256, b"after")
+    assert decoder.feed(cut + b"\0" + wire(following)) == [following]
+    assert decoder.statistics.corrupt == 1
+    assert decoder.statistics.resynchronisations == 1
+
+
+@given(frames, st.data())
+def test_a_flipped_bit_in_a_frame_is_found(frame: Frame, data: st.DataObject) -> None:
+    """CRC-16 finds every flip inside; flips of COBS distances move bytes about and are found by place or CRC."""
+    encoded = bytearray(wire(frame))
+    position = data.draw(st.integers(0, len(encoded) - 2))
+    encoded[position] ^= 1 << data.draw(st.integers(0, 7))
+    assume(encoded[position] != 0)  # that cuts the frame in two, which is another test
+    decoder = FrameDecoder()
+    assert decoder.feed(bytes(encoded)) == []
+    assert decoder.statistics.corrupt == 1
+
+
+def test_a_repeated_frame_is_counted_and_given_once() -> None:
+    decoder = FrameDecoder()
+    first, second = numbered(2)
+    assert decoder.feed(wire(first) * 3 + wire(second) * 2) == [first, second]
+    assert (decoder.statistics.frames, decoder.statistics.repeated, decoder.statistics.lost) == (2, 3, 0)
+
+
+def test_a_sender_that_starts_anew_is_heard() -> None:
+    decoder = FrameDecoder()
+    old, new = Frame(2, 0, b"old"), Frame(8, 0, b"new")
+    assert decoder.feed(wire(old) + wire(new)) == [old, new]
+    assert decoder.statistics.repeated == 1
+
+
+@pytest.mark.parametrize("start", [0, 100, 250])
+@pytest.mark.parametrize("missing", [1, 7, 254])
+def test_gaps_in_the_sequence_are_counted_through_zero(start: int, missing: int) -> None:
+    sent = numbered(missing + 2, start)
+    decoder = FrameDecoder()
+    decoder.feed(wire(sent[0]) + wire(sent[-1]))
+    assert decoder.statistics.lost == missing
+
+
+def test_a_lossy_line_loses_only_what_it_lost() -> None:
+    generator = random.Random(5)
+    decoder = FrameDecoder()
+    sent = numbered(2000)
+    kept = [sent[0], *(frame for frame in sent[1:-1] if generator.random() > 0.2), sent[-1]]
+    received = [frame for kept_frame in kept for frame in decoder.feed(wire(kept_frame))]
+    assert received == kept
+    assert decoder.statistics.lost == len(sent) - len(kept)
+    assert decoder.statistics.corrupt == 0
+
+
+def test_a_noisy_line_never_gives_a_wrong_frame() -> None:
+    """One bit in 200 flipped: CRC-16 lets through one in 65536 of what is damaged beyond its guarantee, none here."""
+    generator = random.Random(6)
+    decoder = FrameDecoder()
+    sent = numbered(3000)
+    stream = bytearray(b"".join(map(wire, sent)))
+    for position in range(len(stream)):
+        if generator.random() < 8 / 200:
+            stream[position] ^= 1 << generator.randrange(8)
+    received = decoder.feed(bytes(stream))
+    assert 0.4 * len(sent) < len(received) < len(sent)
+    assert set(received) <= set(sent)
+    assert decoder.statistics.resynchronisations <= decoder.statistics.corrupt
+
+
+@pytest.mark.parametrize("piece", [b"\xff" * 65536, b"\x01" * 65536, bytes(65536), bytes(range(256)) * 256])
+def test_memory_is_bounded_whatever_arrives(piece: bytes) -> None:
+    decoder = FrameDecoder()
+    for _ in range(20):
+        assert decoder.feed(piece) == []
+        assert len(pickle.dumps(decoder)) < 1000
+    assert decoder.feed(b"\0" + wire(Frame(1, 2, b"x"))) == [Frame(1, 2, b"x")]
+
+
+@pytest.mark.parametrize("body", [b"", b"\x03", b"\x03\x07"])
+def test_a_right_crc_does_not_make_a_frame_of_less_than_its_header(body: bytes) -> None:
+    encoded = cobs.encode(body + crc_hqx(body, 0xFFFF).to_bytes(2, "big")) + b"\0"
+    assert FrameDecoder().feed(encoded) == ([Frame(3, 7, b"")] if len(body) == 2 else [])
+
+
+def test_a_whole_frame_with_a_byte_more_before_the_delimiter_is_not_a_frame() -> None:
+    """Also when the byte comes alone: what is kept of a stretch must not look like a whole one."""
+    encoded = wire(Frame(1, 2, bytes(8)))
+    stretched = encoded[:-1] + b"\x01\0"
+    for size in (1, len(encoded) - 1, len(stretched)):
+        decoder = FrameDecoder()
+        assert [f for i in range(0, len(stretched), size) for f in decoder.feed(stretched[i : i + size])] == []
+        assert decoder.statistics.corrupt == 1
+
+
+@pytest.mark.parametrize("excess", [0, 1, 2, 100])
+def test_the_longest_frame_passes_and_a_longer_stretch_does_not(excess: int) -> None:
+    """However it is cut: the byte that makes it too long must count also when it was not kept."""
+    body = bytes((1, 2)) + bytes(8 + excess)
+    encoded = cobs.encode(body + crc_hqx(body, 0xFFFF).to_bytes(2, "big")) + b"\0"
+    for size in (1, 5, 200):
+        decoder = FrameDecoder()
+        received = [f for i in range(0, len(encoded), size) for f in decoder.feed(encoded[i : i + size])]
+        assert received == ([Frame(1, 2, bytes(8))] if excess == 0 else [])
+        assert decoder.statistics.corrupt == (excess > 0)

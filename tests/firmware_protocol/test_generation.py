@@ -1,0 +1,135 @@
+"""What is generated is what is committed, and the DBC cannot say what the codec cannot do."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+import firmware_protocol
+from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH
+from firmware_protocol.dbc import SchemaError, read_schema
+from firmware_protocol.generate import main, python_source
+
+ROOM = Path(firmware_protocol.__file__).parent
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    """A copy of the room's sources and generated files, to be damaged."""
+    for name in ("tormag.dbc", "README.md", "layouts.py"):
+        shutil.copy(ROOM / name, tmp_path)
+    shutil.copytree(ROOM / "vectors", tmp_path / "vectors")
+    return tmp_path
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def test_the_committed_files_are_what_the_dbc_gives(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--check"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_a_stale_file_is_shown_with_the_remedy_and_not_touched(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit(room / "layouts.py", "0.0001", "0.0002")
+    before = (room / "layouts.py").read_bytes()
+    assert main(["--check"], room) == 1
+    output = capsys.readouterr().out
+    assert '-            Signal("left_duty", float, 0.0002, -1, 1),' in output
+    assert "out of date: layouts.py; remedy: python -m firmware_protocol.generate" in output
+    assert (room / "layouts.py").read_bytes() == before
+
+
+def test_generating_repairs_every_file_and_then_has_nothing_to_do(room: Path) -> None:
+    names = ("layouts.py", "README.md", "vectors/messages.json", "vectors/frames.json")
+    committed = {name: (room / name).read_bytes() for name in names}
+    (room / "layouts.py").unlink()
+    edit(room / "README.md", "`left_duty` | i16", "`left_duty` | i32")
+    edit(room / "vectors" / "messages.json", '"Drive"', '"Dive"')
+    (room / "vectors" / "frames.json").write_text("{}", encoding="utf-8")
+    assert main(["--check"], room) == 1
+    assert main([], room) == 0
+    assert {name: (room / name).read_bytes() for name in names} == committed
+    assert main(["--check"], room) == 0
+
+
+def test_the_schema_hash_is_the_committed_one() -> None:
+    schema = read_schema()
+    assert schema.schema_hash() == SCHEMA_HASH
+    assert schema.version == PROTOCOL_VERSION
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("(0.0001,0)", "(0.0002,0)"),
+        ("[-1|1]", "[-0.5|0.5]"),
+        ("SG_ right_duty : 16|16@1-", "SG_ right_force : 16|16@1-"),
+        ('1 "COMMAND_TIMEOUT" ;', '1 "TIMEOUT" ;'),
+        ("BO_ 33 Drive", "BO_ 33 Motors"),
+        ('BA_ "ProtocolVersion" 1;', 'BA_ "ProtocolVersion" 2;'),
+        ('BA_ "Kind" SG_ 65 handle_position_mm 1;', ""),
+        ('"mm" Host', '"cm" Host'),
+    ],
+)
+def test_a_change_of_layout_changes_the_hash(room: Path, old: str, new: str) -> None:
+    edit(room / "tormag.dbc", old, new)
+    assert read_schema(room / "tormag.dbc").schema_hash() != SCHEMA_HASH
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("Motor duties. Every 1 ms", "Duties of the motors, every 1 ms"),
+        ('BA_ "GenMsgCycleTime" BO_ 33 1;', 'BA_ "GenMsgCycleTime" BO_ 33 2;'),
+    ],
+)
+def test_a_change_of_comment_or_cycle_time_does_not(room: Path, old: str, new: str) -> None:
+    edit(room / "tormag.dbc", old, new)
+    assert read_schema(room / "tormag.dbc").schema_hash() == SCHEMA_HASH
+
+
+def test_the_generated_module_follows_the_dbc(room: Path) -> None:
+    edit(room / "tormag.dbc", '1 "RUN" 0 "OFF" ;', '1 "GO" 0 "OFF" ;')
+    source = python_source(read_schema(room / "tormag.dbc"))
+    assert "    GO = 1\n" in source
+    assert f"0x{SCHEMA_HASH:08X}" not in source
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("right_duty : 16|16@1-", "right_duty : 17|15@1-", "Drive.right_duty: only little-endian integers"),
+        ("left_duty : 0|16@1- (0.0001,0)", "left_duty : 7|16@0- (0.0001,0)", "Drive.left_duty: only little-endian"),
+        ("(0.0001,0) [-1|1]", "(0.0001,1) [-1|1]", "Drive.left_duty: an offset of 0"),
+        ("BO_ 33 Drive: 7", "BO_ 33 Drive: 8", "Drive: 56 bits of signals in 8 bytes"),
+        ("48|16@1+ (1,0) [0|65535]", "56|8@1+ (1,0) [0|255]", "Identity.serial_number: starts at bit 56, expected 48"),
+        ("SG_ nonce : 40|8@1+ (1,0) [0|255]", "SG_ nonce : 40|8@1+ (1,0) [0|256]", r"Hello.nonce: steps \(0, 256\)"),
+        ("(1,0) [0|4]", "(1,0) [0|5]", "Status.mode: an enumeration counts"),
+        ('2 "HOMING" 1', '5 "HOMING" 1', "Status.mode: an enumeration counts"),
+        ('256 "SKEW"', '257 "SKEW"', "Status.faults: flags are the bits"),
+        ('BA_ "TypeName" SG_ 33 mode "DriveMode";', "", "Drive.mode: a value table, its kind and its TypeName"),
+        ("[0|0.65535]", "[0|0.5]", r"State.device_time_s: steps \(0, 50000\)"),
+        ('BA_ "Kind" SG_ 33 counter 4;', 'BA_ "Kind" SG_ 33 counter 5;', "Drive.counter: a checksum must be the last"),
+    ],
+)
+def test_a_dbc_that_the_codec_cannot_follow_is_refused(room: Path, old: str, new: str, text: str) -> None:
+    edit(room / "tormag.dbc", old, new)
+    with pytest.raises(SchemaError, match=text):
+        read_schema(room / "tormag.dbc")
+
+
+def test_an_identifier_of_another_node_is_refused(room: Path) -> None:
+    text = (room / "tormag.dbc").read_text(encoding="utf-8")
+    (room / "tormag.dbc").write_text(text.replace(" 33 ", " 34 "), encoding="utf-8")
+    with pytest.raises(SchemaError, match="Drive: 0x22 is not"):
+        read_schema(room / "tormag.dbc")
+
+
+def test_a_readme_without_markers_is_refused(room: Path) -> None:
+    edit(room / "README.md", "<!-- generated from tormag.dbc: end -->", "")
+    with pytest.raises(SchemaError, match=r"README\.md: the markers"):
+        main([], room)

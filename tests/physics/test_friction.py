@@ -1,0 +1,127 @@
+"""Pre-sliding friction: exactness, levels, passivity, refusals."""
+
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tormagd.physics.errors import DomainError
+from tormagd.physics.friction import Friction
+
+FRICTION = Friction(presliding_stiffness_N_mm=8.0, viscous_N_s_mm=0.0005, static_ratio=1.15, stribeck_speed_mm_s=5.0)
+frictions = st.builds(
+    Friction,
+    presliding_stiffness_N_mm=st.floats(0.1, 100.0),
+    viscous_N_s_mm=st.floats(0.0, 0.1),
+    static_ratio=st.floats(1.0, 2.0),
+    stribeck_speed_mm_s=st.floats(0.1, 50.0),
+)
+speeds = st.floats(-200.0, 200.0)
+levels = st.floats(0.0, 10.0)
+
+
+def slide(friction: Friction, speed_mm_s: float, kinetic_N: float) -> float:
+    return friction.advance(0.0, speed_mm_s, kinetic_N, 1e3)[0]
+
+
+def test_steady_sliding_gives_kinetic_plus_viscous_force() -> None:
+    assert slide(FRICTION, 42.0, 2.0) == pytest.approx(2.0 + 0.0005 * 42.0)
+    assert slide(FRICTION, -42.0, 2.0) == pytest.approx(-2.0 - 0.0005 * 42.0)
+
+
+def test_break_away_is_the_static_level() -> None:
+    assert slide(FRICTION, 1e-2, 2.0) == pytest.approx(2.0 * 1.15, rel=1e-4)
+    assert slide(FRICTION, 5.0, 2.0) == pytest.approx(2.0 * (1.0 + 0.15 / math.e) + 0.0025)
+
+
+def test_the_first_micrometres_are_a_spring() -> None:
+    force, deflection = FRICTION.advance(0.0, 0.1, 2.0, 1e-2)
+    assert deflection == pytest.approx(1e-3, rel=3e-3)
+    assert force == pytest.approx(8.0 * deflection + 0.0005 * 0.1, rel=1e-12)
+
+
+def test_the_exact_solution_between_reversals() -> None:
+    """From -z_ss, dz/dt = v - sigma0 |v| z / g has z = z_ss (1 - 2 exp(-x / z_ss)) after a travel x."""
+    level = FRICTION.level_N(30.0, 2.0)
+    reach = level / 8.0
+    _, deflection = FRICTION.advance(-reach, 30.0, 2.0, 0.01)
+    assert deflection == pytest.approx(reach * (1.0 - 2.0 * math.exp(-0.3 / reach)), rel=1e-12)
+
+
+def test_at_rest_the_force_is_held() -> None:
+    assert FRICTION.advance(0.1, 0.0, 2.0, 1e3) == pytest.approx((0.8, 0.1), rel=1e-15)
+
+
+def test_a_falling_level_lets_the_bristle_slip() -> None:
+    _, deflection = FRICTION.advance(0.25, 0.0, 0.5, 0.0)
+    assert 8.0 * deflection == pytest.approx(0.5 * 1.15)
+    assert FRICTION.advance(0.25, 42.0, 0.0, 1e-3) == pytest.approx((0.021, 0.0))
+
+
+@given(frictions, st.floats(-1.0, 1.0), speeds, st.floats(0.01, 10.0), st.floats(1e-6, 0.1), st.floats(0.0, 1.0))
+def test_splitting_a_step_changes_nothing(
+    friction: Friction, start_mm: float, speed_mm_s: float, kinetic_N: float, dt_s: float, share: float
+) -> None:
+    _, whole = friction.advance(start_mm, speed_mm_s, kinetic_N, dt_s)
+    _, part = friction.advance(start_mm, speed_mm_s, kinetic_N, share * dt_s)
+    _, rest = friction.advance(part, speed_mm_s, kinetic_N, (1.0 - share) * dt_s)
+    assert rest == pytest.approx(whole, abs=1e-12)
+
+
+@given(frictions, st.floats(-10.0, 10.0), st.floats(-1e6, 1e6), st.floats(0.0, 1e6), st.floats(0.0, 1e6))
+def test_the_dry_force_never_exceeds_the_level(
+    friction: Friction, start_mm: float, speed_mm_s: float, kinetic_N: float, dt_s: float
+) -> None:
+    force, deflection = friction.advance(start_mm, speed_mm_s, kinetic_N, dt_s)
+    assert math.isfinite(force)
+    assert abs(friction.presliding_stiffness_N_mm * deflection) <= friction.level_N(speed_mm_s, kinetic_N) * (1 + 1e-12)
+
+
+@given(frictions, st.lists(st.tuples(speeds, levels, st.floats(1e-4, 0.5)), min_size=1, max_size=40))
+def test_passive_under_any_motion_and_any_field(friction: Friction, steps: list[tuple[float, float, float]]) -> None:
+    """The hand never gets back more than it put in: work done stays above the energy stored in the bristles."""
+    deflection_mm, work_mJ = 0.0, 0.0
+    for speed_mm_s, kinetic_N, dt_s in steps:
+        force_N, deflection_mm = friction.advance(deflection_mm, speed_mm_s, kinetic_N, dt_s)
+        work_mJ += force_N * speed_mm_s * dt_s
+        stored_mJ = 0.5 * friction.presliding_stiffness_N_mm * deflection_mm**2
+        assert work_mJ >= stored_mJ - 1e-9 * (1.0 + work_mJ)
+
+
+@given(frictions, st.floats(0.1, 10.0), st.floats(0.01, 20.0), st.floats(0.1, 5.0), st.integers(8, 100))
+def test_a_closed_cycle_costs_the_hand_work(
+    friction: Friction, kinetic_N: float, amplitude_mm: float, frequency_Hz: float, steps: int
+) -> None:
+    dt_s = 1.0 / (frequency_Hz * steps)
+    positions = [amplitude_mm * math.sin(2.0 * math.pi * index / steps) for index in range(2 * steps + 1)]
+    deflection_mm, works_mJ = 0.0, []
+    for before, after in pairwise(positions):
+        force_N, deflection_mm = friction.advance(deflection_mm, (after - before) / dt_s, kinetic_N, dt_s)
+        works_mJ.append(force_N * (after - before))
+    assert sum(works_mJ[steps:]) > 0.0
+
+
+@pytest.mark.parametrize("index", range(4))
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_what_is_not_finite_is_refused(index: int, bad: float) -> None:
+    values = [0.0, 42.0, 2.0, 1e-3]
+    values[index] = bad
+    with pytest.raises(DomainError, match=("deflection_mm", "speed_mm_s", "kinetic_N", "dt_s")[index]):
+        FRICTION.advance(*values)
+
+
+def test_negative_level_and_step_are_refused() -> None:
+    with pytest.raises(DomainError, match="kinetic_N"):
+        FRICTION.advance(0.0, 42.0, -1e-9, 1e-3)
+    with pytest.raises(DomainError, match="dt_s"):
+        FRICTION.advance(0.0, 42.0, 2.0, -1e-9)
+
+
+@pytest.mark.parametrize(
+    "values", [(0.0, 0.0, 1.1, 5.0), (8.0, -1.0, 1.1, 5.0), (8.0, 0.0, 0.9, 5.0), (8.0, 0.0, 1.1, 0.0)]
+)
+def test_parameters_are_checked(values: tuple[float, float, float, float]) -> None:
+    with pytest.raises(DomainError):
+        Friction(*values)

@@ -1,0 +1,207 @@
+"""Motor, gearbox, screw and carriage: against the data sheet, against closed forms, and for passivity."""
+
+import itertools
+import math
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tormagd.simulation.axis import Axis
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import PlantError, PlantParameters, load_plant, plant_names
+from tormagd.simulation.plant import SUBSTEP_S, Plant, holding_over_stroke
+
+SAMPLE_1 = load_plant("sample_1")
+LEAD_M_RAD = 8e-3 / math.tau
+BACKLASH_M = 40e-6
+STIFFNESS_N_M = 5e6
+
+
+def an_axis(plant: PlantParameters = SAMPLE_1, drag_N: float = 0.0, start_mm: float = 40.0) -> Axis:
+    return Axis(plant, drag_N, start_mm, 0.0, SUBSTEP_S)
+
+
+def at_gap(plant: PlantParameters, gap_mm: float) -> PlantParameters:
+    assumed = msgspec.structs.replace(plant.assumed, start_left_mm=gap_mm / 2.0, start_right_mm=gap_mm / 2.0)
+    return msgspec.structs.replace(plant, assumed=assumed)
+
+
+def test_no_load_speed_and_current_are_those_of_the_data_sheet() -> None:
+    axis = an_axis()
+    for _ in range(2000):
+        axis.step(12.0, 0.0)
+    assert axis.speed_rad_s * 60.0 / math.tau == pytest.approx(150.0, rel=0.05)
+    assert axis.current_A == pytest.approx(0.2, abs=0.03)
+
+
+def test_stall_torque_and_current_are_those_of_the_data_sheet() -> None:
+    electronics = msgspec.structs.replace(SAMPLE_1.electronics, current_limit_A=20.0)
+    axis = an_axis(msgspec.structs.replace(SAMPLE_1, electronics=electronics))
+    # up to full voltage so slowly that nothing but the torque pushes into the stop
+    for step in range(60_000):
+        axis.step(min(12.0, step * 3e-4), 0.0)
+    assert axis.speed_rad_s == 0.0
+    assert axis.current_A == pytest.approx(5.5, rel=0.05)
+    torque_Nm = axis.contact_N * (LEAD_M_RAD + axis.screw_friction_m)
+    assert torque_Nm == pytest.approx(2.65, rel=0.10)
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "value"),
+    [("motor", "inertia_kg_m2", 1e-10), ("screw", "stiffness_N_um", 1e9), ("motor", "back_emf_V_s_rad", 10.0)],
+)
+def test_a_plant_too_quick_for_the_substep_is_refused(table: str, key: str, value: float) -> None:
+    changed = msgspec.structs.replace(getattr(SAMPLE_1, table), **{key: value})
+    with pytest.raises(PlantError, match=key):
+        an_axis(msgspec.structs.replace(SAMPLE_1, **{table: changed}))
+
+
+def test_current_is_limited() -> None:
+    axis = an_axis()
+    currents = []
+    for step in range(2000):
+        axis.step(12.0 if step < 1000 else -12.0, 0.0)
+        currents.append(axis.current_A)
+    assert min(currents) == -5.0
+    assert max(currents) <= 5.0
+
+
+def test_under_break_away_voltage_the_screw_truly_stands() -> None:
+    axis = an_axis()
+    break_away_V = SAMPLE_1.gear.output_friction_Nm / (70.0 * 0.011) * 2.2
+    for _ in range(5000):
+        axis.step(0.98 * break_away_V, 0.0)
+    assert axis.speed_rad_s == 0.0
+    assert axis.angle_rad == 0.0
+    for _ in range(5000):
+        axis.step(1.05 * break_away_V, 0.0)
+    assert axis.angle_rad > 0.0
+
+
+def test_lost_motion_on_reversal_is_backlash_and_twice_the_drag() -> None:
+    drag_N = 6.0
+    axis = an_axis(drag_N=drag_N)
+    for _ in range(1000):
+        axis.step(3.0, 0.0)
+    for _ in range(1000):
+        axis.step(None, 0.0)
+    turned_at, stood_at = axis.angle_rad, axis.position_m
+    lost_m = 0.0
+    while axis.position_m == stood_at:
+        axis.step(-1.0, 0.0)
+        lost_m = (turned_at - axis.angle_rad) * LEAD_M_RAD
+    assert lost_m == pytest.approx(BACKLASH_M + 2.0 * drag_N / STIFFNESS_N_M, abs=1e-6)
+
+
+def test_magnets_stronger_than_drag_keep_the_nut_on_one_flank() -> None:
+    axis = an_axis(drag_N=6.0)
+    for volts in (3.0, -3.0, 3.0):
+        for step in range(500):
+            axis.step(volts, 20.0)
+            # the first movement takes up the backlash from the unloaded start
+            if volts < 0.0 or step > 250:
+                assert 14.0 - 1e-6 <= axis.contact_N <= 26.0 + 1e-6
+
+
+def test_the_stops_hold_against_full_drive() -> None:
+    for volts, stop_mm in ((12.0, 48.0), (-12.0, 22.0)):
+        axis = an_axis(start_mm=35.0)
+        for _ in range(20_000):
+            axis.step(volts, 30.0)
+        assert axis.position_m * 1e3 == pytest.approx(stop_mm, abs=1e-9)
+        assert axis.speed_rad_s == pytest.approx(0.0, abs=0.05)
+        assert abs(axis.contact_N) < 2500.0
+
+
+@pytest.mark.parametrize("name", plant_names())
+def test_attraction_and_holding_margin_over_the_stroke(name: str) -> None:
+    plant = load_plant(name)
+    rows = holding_over_stroke(plant)
+    assert rows[0].gap_mm == 44.5
+    assert rows[-1].gap_mm == 95.0
+    assert 50.0 < rows[0].attraction_N < 80.0
+    assert all(before.attraction_N > after.attraction_N for before, after in itertools.pairwise(rows))
+    assert all(row.margin_Nm > 0.05 for row in rows)
+    worn = holding_over_stroke(plant, wear=4.0)
+    assert worn[0].margin_Nm < 0.0 < worn[-1].margin_Nm
+
+
+@pytest.mark.parametrize("name", plant_names())
+@pytest.mark.parametrize("gap_mm", [45.5, 60.0, 75.0, 94.0])
+def test_the_carriages_hold_with_the_power_off(name: str, gap_mm: float) -> None:
+    plant = Plant(at_gap(load_plant(name), gap_mm), SteadyHand())
+    plant.advance(1.0, 0.0, 0.0, left_on=False, right_on=False)
+    # nothing but the contact's springs: the screws do not turn at all
+    assert plant.gap_mm == pytest.approx(gap_mm, abs=1e-6)
+    assert plant.left.angle_rad == plant.right.angle_rad == 0.0
+
+
+@pytest.mark.parametrize("name", plant_names())
+def test_a_worn_gearbox_lets_the_magnets_close_the_gap_where_the_margin_is_negative(name: str) -> None:
+    parameters = load_plant(name)
+    for gap_mm in (46.0, 90.0):
+        plant = Plant(at_gap(parameters, gap_mm), SteadyHand())
+        plant.wear(4.0)
+        plant.advance(3.0, 0.0, 0.0, left_on=False, right_on=False)
+        closes = min(holding_over_stroke(parameters, wear=4.0), key=lambda row: abs(row.gap_mm - gap_mm)).margin_Nm < 0
+        assert (plant.gap_mm < gap_mm - 1.0) is closes, plant.truth
+    assert plant.gap_mm == pytest.approx(90.0, abs=1e-6)
+
+
+def test_halving_the_substep_changes_little() -> None:
+    def travel(substep_s: float) -> list[float]:
+        plant = Plant(SAMPLE_1, SteadyHand(), substep_s=substep_s)
+        gaps = []
+        for left_V, right_V in ((-12.0, -12.0), (6.0, -3.0), (0.0, 0.0), (12.0, 12.0), (-4.0, 1.0), (0.2, 0.2)):
+            for _ in range(10):
+                plant.advance(0.01, left_V, right_V, left_on=True, right_on=True)
+                gaps.append(plant.gap_mm)
+        return gaps
+
+    whole, half = travel(SUBSTEP_S), travel(SUBSTEP_S / 2.0)
+    assert max(whole) - min(whole) > 3.0
+    assert max(abs(a - b) for a, b in zip(whole, half, strict=True)) < 0.01
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    volts=st.lists(st.one_of(st.none(), st.floats(-12.0, 12.0)), min_size=1, max_size=12),
+    wear=st.sampled_from([1.0, 4.0]),
+)
+def test_no_energy_comes_from_nowhere(volts: list[float | None], wear: float) -> None:
+    """What the supply and the magnets put in is never less than what is stored and lost in the winding."""
+    axis = an_axis(drag_N=6.0)
+    axis.gear_friction_Nm /= wear
+    axis.screw_friction_m /= wear
+    inertia = SAMPLE_1.motor.inertia_kg_m2 * 70.0**2
+    attraction_N = 40.0
+    put_in_J = throughput_J = 0.0
+    for volt in volts:
+        for _ in range(300):
+            before_m, angle_rad = axis.position_m, axis.angle_rad
+            axis.step(volt, attraction_N)
+            # work on the rotor by the current of the step, and by the magnets on the carriage
+            electric_J = 0.77 * axis.current_A * (axis.angle_rad - angle_rad)
+            magnetic_J = -attraction_N * (axis.position_m - before_m)
+            put_in_J += electric_J + magnetic_J
+            throughput_J += abs(electric_J) + abs(magnetic_J)
+            stored_J = 0.5 * inertia * axis.speed_rad_s**2 + 0.5 * axis.contact_N**2 / STIFFNESS_N_M
+            assert put_in_J + 0.01 * throughput_J + 1e-6 >= stored_J
+
+
+def test_friction_takes_a_turning_screw_to_rest_and_never_back() -> None:
+    axis = an_axis()
+    for _ in range(500):
+        axis.step(12.0, 0.0)
+    speeds = []
+    while axis.speed_rad_s != 0.0:
+        axis.step(None, 0.0)
+        speeds.append(axis.speed_rad_s)
+    assert all(after < before for before, after in itertools.pairwise(speeds))
+    assert min(speeds) == 0.0
+    resting_at = axis.angle_rad
+    for _ in range(1000):
+        axis.step(None, 0.0)
+    assert axis.angle_rad == resting_at

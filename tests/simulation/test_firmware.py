@@ -1,0 +1,374 @@
+"""The virtual firmware's rules, seen through the wire in virtual time."""
+
+import itertools
+
+import pytest
+
+from firmware_protocol.codec import (
+    PROTOCOL_VERSION,
+    SCHEMA_HASH,
+    Clear,
+    DeviceFault,
+    DeviceMode,
+    Drive,
+    DriveMode,
+    Hello,
+    Home,
+    Identity,
+    Retract,
+    Sense,
+    State,
+    Status,
+    Switches,
+)
+from tormagd.simulation.parameters import load_plant, plant_names
+
+COMMAND_TIMEOUT_S = 0.05
+STATUS_PERIOD_S = 0.02
+
+
+def count(host, kind) -> int:
+    return sum(isinstance(message, kind) for _, message in host.received)
+
+
+# -- handshake, heartbeat, status ----------------------------------------------------------------------------------
+
+
+def test_hello_is_answered_by_identity_each_time(make_host) -> None:
+    host = make_host()
+    assert host.hello() == Identity(SCHEMA_HASH, 1, 0, 1)
+    host.hello()
+    assert count(host, Identity) == 2
+
+
+def test_status_comes_fifty_times_a_second_unasked_and_nothing_else_does(make_host) -> None:
+    host = make_host()
+    host.wait(2.0)
+    assert 99 <= count(host, Status) <= 101
+    assert len(host.received) == count(host, Status)
+
+
+def test_each_accepted_drive_is_answered_once_by_state_and_sense(make_host) -> None:
+    host = make_host()
+    host.heartbeat(0.5)
+    host.wait(0.005)
+    states = [message for _, message in host.received if isinstance(message, State)]
+    assert len(states) == count(host, Sense) == 500
+    assert all((after.counter - before.counter) % 256 == 1 for before, after in itertools.pairwise(states))
+    host.wait(STATUS_PERIOD_S)
+    assert host.status.drive_counter == 500 % 256
+
+
+def test_a_drive_whose_counter_did_not_change_is_not_accepted(running) -> None:
+    host = running()
+    states = count(host, State)
+    for _ in range(60):
+        host.send(Drive(0.0, 0.0, DriveMode.RUN, 7))
+        host.wait(1e-3)
+    assert count(host, State) - states <= 2
+    assert host.wait_for(DeviceMode.LATCHED) > 0.0
+    assert host.status.faults == DeviceFault.COMMAND_TIMEOUT
+
+
+# -- what must come before a run -----------------------------------------------------------------------------------
+
+
+def test_drive_run_moves_nothing_before_homing(make_host) -> None:
+    host = make_host()
+    host.hello()
+    before_mm = host.device.truth.gap_mm
+    for _ in range(200):
+        host.drive(-1.0, -1.0)
+    assert host.status.mode is DeviceMode.IDLE
+    assert host.device.truth.gap_mm == before_mm
+
+
+def test_drive_run_is_refused_without_a_hello(make_host) -> None:
+    host = make_host()
+    host.command(Home)
+    host.heartbeat(3.0)
+    assert Switches.HOMED in host.status.switches
+    for _ in range(100):
+        host.drive(-1.0, -1.0)
+    assert host.status.mode is DeviceMode.IDLE
+    host.hello()
+    for _ in range(100):
+        host.drive(-0.5, -0.5)
+    assert host.status.mode is DeviceMode.RUN
+
+
+@pytest.mark.parametrize(("schema", "version"), [(SCHEMA_HASH ^ 1, PROTOCOL_VERSION), (SCHEMA_HASH, 99)])
+def test_a_foreign_schema_latches_names_itself_and_clears_only_after_a_right_hello(make_host, schema, version) -> None:
+    host = make_host()
+    host.send(Hello(schema, version, 1))
+    host.wait(0.05)
+    assert host.last(Identity).schema_hash == SCHEMA_HASH
+    assert host.status.faults == DeviceFault.SCHEMA_MISMATCH
+    assert host.status.mode is DeviceMode.LATCHED
+    host.command(Clear)
+    assert not host.acknowledged()
+    host.hello()
+    host.command(Clear)
+    assert host.acknowledged()
+    assert host.status.mode is DeviceMode.IDLE
+
+
+# -- homing --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", plant_names())
+def test_homing_zeroes_the_encoders_at_the_open_switches_repeatably(make_host, name: str) -> None:
+    host = make_host(plant=load_plant(name))
+    zeros = []
+    for _ in range(2):
+        host.home()
+        truth, state = host.device.truth, host.last(State)
+        zeros.append((truth.left_mm - state.left_position_mm, truth.right_mm - state.right_position_mm))
+        assert truth.left_mm == pytest.approx(47.5, abs=0.05)
+        assert truth.right_mm == pytest.approx(47.5, abs=0.05)
+        assert host.status.switches == Switches.LEFT_OPEN | Switches.RIGHT_OPEN | Switches.HOMED
+        host.go_to(80.0, 1.0)
+        host.heartbeat(2.0)
+    assert [zero for pair in zeros for zero in pair] == pytest.approx([47.5] * 4, abs=0.02)
+    assert zeros[0] == pytest.approx(zeros[1], abs=0.01)
+
+
+def test_homing_without_an_encoder_fails_and_opens(make_host) -> None:
+    host = make_host(["encoder_stuck_left"])
+    host.command(Home)
+    smallest_mm = host.device.truth.gap_mm
+    while host.status.mode is not DeviceMode.LATCHED:
+        host.heartbeat(0.01)
+        assert host.time_s < 20.0
+        smallest_mm = min(smallest_mm, host.device.truth.gap_mm)
+    assert host.status.faults == DeviceFault.HOMING_FAILED
+    assert Switches.HOMED not in host.status.switches
+    assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
+    assert smallest_mm > 78.0
+
+
+def test_home_is_refused_while_running_and_repeating_it_does_not_restart_it(running, make_host) -> None:
+    host = running()
+    host.send(Home(77))
+    for _ in range(30):
+        host.drive(0.0, 0.0)
+    assert host.status.mode is DeviceMode.RUN
+    assert host.status.command_nonce != 77
+
+    host = make_host()
+    for _ in range(100):
+        host.send(Home(5))
+        host.heartbeat(0.03)
+    assert host.status.mode is DeviceMode.IDLE
+    assert Switches.HOMED in host.status.switches
+
+
+def test_duties_are_applied_in_steps_of_ten_bits(running) -> None:
+    def travel(duty: float) -> float:
+        host = running()
+        for _ in range(300):
+            host.drive(duty, duty)
+        return host.device.truth.gap_mm
+
+    step = 1.0 / 1023.0
+    assert travel(512.3 * step) == travel(511.7 * step) == travel(512 * step)
+    assert travel(513 * step) > travel(512 * step) > 60.0
+
+
+# -- ways out of a run ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", plant_names())
+def test_silence_opens_the_gap_and_latches(running, name: str) -> None:
+    host = running(plant=name)
+    for _ in range(200):  # stand still first
+        host.drive(0.0, 0.0)
+    stood_mm, silent_s = host.device.truth.gap_mm, host.time_s
+    moved_s = safe_s = None
+    fastest_mm_s = 0.0
+    while host.status.mode is not DeviceMode.LATCHED:
+        before_mm = host.device.truth.gap_mm
+        host.wait(1e-3)
+        truth = host.device.truth
+        fastest_mm_s = max(fastest_mm_s, (truth.gap_mm - before_mm) / 1e-3)
+        if moved_s is None and truth.gap_mm > stood_mm + 0.05:
+            moved_s = host.time_s - silent_s
+        if safe_s is None and truth.force_N < 1.0:
+            safe_s = host.time_s - silent_s
+    assert moved_s is not None
+    assert COMMAND_TIMEOUT_S - 1e-3 <= moved_s < COMMAND_TIMEOUT_S + 0.03
+    # from 60 mm, with what the sensorless watch waits and the bounded travel
+    assert safe_s is not None
+    assert 0.3 < safe_s < 0.8
+    assert fastest_mm_s < 2 * 20.0
+    assert host.status.faults == DeviceFault.COMMAND_TIMEOUT
+    assert Switches.HOMED not in host.status.switches
+    assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
+    assert host.device.truth.left_A == 0.0
+
+
+@pytest.mark.parametrize("way", ["off", "retract"])
+def test_a_host_that_lets_go_finds_the_device_open_homed_and_idle(running, way: str) -> None:
+    host = running()
+    if way == "retract":
+        host.command(Retract)
+        assert host.acknowledged()
+    host.heartbeat(2.0)
+    assert host.status.mode is DeviceMode.IDLE
+    assert host.status.faults == DeviceFault(0)
+    assert Switches.HOMED in host.status.switches
+    assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
+    host.go_to(80.0)
+    assert host.device.truth.gap_mm == pytest.approx(80.0, abs=0.3)
+
+
+def test_after_retract_a_host_that_keeps_running_is_not_obeyed_before_it_lets_go(running) -> None:
+    host = running()
+    host.send(Retract(99))
+    for _ in range(4000):
+        host.drive(-0.5, -0.5)
+    assert host.status.mode is DeviceMode.IDLE
+    assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
+    host.heartbeat(0.01)
+    for _ in range(100):
+        host.drive(-0.5, -0.5)
+    assert host.status.mode is DeviceMode.RUN
+
+
+def test_clear_ends_a_latch_and_a_new_run_needs_homing(running) -> None:
+    host = running()
+    host.wait_for(DeviceMode.LATCHED)
+    host.command(Home)
+    assert not host.acknowledged()
+    host.command(Clear)
+    assert host.acknowledged()
+    assert host.status.mode is DeviceMode.IDLE
+    assert host.status.faults == DeviceFault(0)
+    host.heartbeat(0.1)
+    for _ in range(100):
+        host.drive(-1.0, -1.0)
+    assert host.status.mode is DeviceMode.IDLE
+    host.home()
+    host.go_to(80.0)
+    assert host.status.mode is DeviceMode.RUN
+
+
+def test_a_closed_switch_ends_the_run(running) -> None:
+    host = running(gap_mm=50.0)
+    while host.status.mode is DeviceMode.RUN:
+        host.drive(-0.3, -0.3)
+        assert host.time_s < 20.0
+    assert host.status.faults == DeviceFault.END_STOP
+    assert host.device.truth.gap_mm > 44.0 - 1e-6
+    host.wait_for(DeviceMode.LATCHED)
+    assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
+
+
+def test_the_open_switch_is_not_driven_through(running) -> None:
+    host = running(gap_mm=90.0)
+    for _ in range(1000):
+        host.drive(1.0, 1.0)
+    assert host.status.mode is DeviceMode.RUN
+    assert host.device.truth.left_mm < 47.95
+
+
+def test_skew_ends_the_run(running) -> None:
+    host = running()
+    while host.status.mode is DeviceMode.RUN:
+        host.drive(0.4, -0.4)
+        assert host.time_s < 20.0
+    assert host.status.faults == DeviceFault.SKEW
+    assert abs(host.device.truth.left_mm - host.device.truth.right_mm) < 4.0
+
+
+def test_a_blocked_carriage_is_an_overcurrent_and_a_failed_retract(running) -> None:
+    host = running(["drag_left=+10000%@3.5", "drag_left=+1000%@3.5"], gap_mm=60.0)
+    while host.time_s < 3.6:
+        host.drive(0.0, 0.0)
+    while host.status.mode is DeviceMode.RUN:
+        host.drive(1.0, 0.0)
+        assert host.time_s < 20.0
+    assert host.status.faults == DeviceFault.OVERCURRENT
+    host.wait_for(DeviceMode.LATCHED)
+    assert host.status.faults == DeviceFault.OVERCURRENT | DeviceFault.RETRACT_FAILED
+    # the other carriage is opened all the same
+    assert host.device.truth.right_mm == pytest.approx(47.5, abs=0.3)
+    assert host.device.truth.left_A == 0.0
+
+
+# -- injected faults -----------------------------------------------------------------------------------------------
+
+
+def test_commands_that_vanish_are_silence(running) -> None:
+    host = running(["commands_vanish@3.5"])
+    while host.status.mode is not DeviceMode.LATCHED:
+        host.drive(0.0, 0.0)
+        assert host.time_s < 20.0
+    assert host.status.faults == DeviceFault.COMMAND_TIMEOUT
+
+
+def test_reset_forgets_zero_handshake_and_mode_but_holds_the_gap(running) -> None:
+    host = running(["reset@3.5"], gap_mm=60.0)
+    while host.time_s < 3.6:
+        host.drive(-0.2, -0.2)
+    assert host.status.mode is DeviceMode.IDLE
+    assert Switches.HOMED not in host.status.switches
+    stood_mm = host.device.truth.gap_mm
+    host.heartbeat(0.5)
+    assert host.device.truth.gap_mm == pytest.approx(stood_mm, abs=1e-6)
+    assert host.last(State).left_position_mm == pytest.approx(0.0, abs=0.3)
+    host.home()
+    host.go_to(60.0)
+
+
+def test_supply_loss_holds_and_says_so_until_it_is_gone(running) -> None:
+    host = running(["supply_loss@3.5"])
+    while host.time_s < 3.5:
+        host.drive(0.0, 0.0)
+    stood_mm = host.device.truth.gap_mm
+    host.wait_for(DeviceMode.LATCHED)
+    assert host.status.faults == DeviceFault.SUPPLY | DeviceFault.RETRACT_FAILED
+    assert host.status.supply_V == 0.0
+    assert host.device.truth.gap_mm == pytest.approx(stood_mm, abs=0.02)
+    host.command(Clear)
+    assert not host.acknowledged()
+
+
+def test_a_worn_gearbox_without_supply_closes_and_is_noticed(running) -> None:
+    host = running(["worn_gearbox@3.5", "supply_loss@3.5"], gap_mm=48.0)
+    while host.time_s < 3.5:
+        host.drive(0.0, 0.0)
+    # noticed while it is still trying to open, not only when it has given up
+    host.wait(0.29)
+    assert host.status.mode is DeviceMode.RETRACTING
+    assert host.status.faults == DeviceFault.SUPPLY | DeviceFault.UNCOMMANDED_MOTION
+    host.wait(0.7)
+    assert host.device.truth.gap_mm < 46.0
+    assert DeviceFault.RETRACT_FAILED in host.status.faults
+
+
+def test_a_worn_gearbox_with_supply_is_noticed_after_a_reset_and_opened(running) -> None:
+    host = running(["worn_gearbox@3.6", "reset@3.5"], gap_mm=48.0)
+    while host.time_s < 3.5:
+        host.drive(0.0, 0.0)
+    host.wait_for(DeviceMode.LATCHED)
+    assert host.status.faults == DeviceFault.UNCOMMANDED_MOTION
+    assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
+
+
+def test_a_stuck_encoder_is_found_by_the_skew_and_the_carriage_opened_blind(running) -> None:
+    host = running(["encoder_stuck_left@3.5"])
+    while host.status.mode is DeviceMode.RUN:
+        host.drive(-0.3, -0.3) if host.time_s > 3.5 else host.drive(0.0, 0.0)
+        assert host.time_s < 20.0
+    assert host.status.faults == DeviceFault.SKEW
+    host.wait_for(DeviceMode.LATCHED)
+    assert host.device.truth.left_mm == pytest.approx(47.5, abs=0.51)
+    assert host.device.truth.right_mm == pytest.approx(47.5, abs=0.3)
+
+
+def test_a_stiff_guide_still_opens(running) -> None:
+    host = running(["drag_left=+1000%@3.5"])
+    host.wait_for(DeviceMode.LATCHED)
+    assert host.status.faults == DeviceFault.COMMAND_TIMEOUT
+    assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)

@@ -1,0 +1,182 @@
+"""Element, sensors and the plant as a whole."""
+
+import itertools
+import statistics
+
+import msgspec
+import numpy as np
+import pytest
+
+from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.simulation.element import Element, radial_moment_Tm
+from tormagd.simulation.hand import ReversingHand, SteadyHand
+from tormagd.simulation.parameters import PlantParameters, load_plant, plant_names
+from tormagd.simulation.plant import Plant
+
+SAMPLE_1 = load_plant("sample_1")
+STEP_S = 1e-3
+SPEED_MM_S = 41.9
+
+
+def without_memory(plant: PlantParameters) -> PlantParameters:
+    """The plant with its constitutive law alone: no hysteresis, relaxation, drift, Stribeck or viscous part."""
+    replace = msgspec.structs.replace
+    return replace(
+        plant,
+        field=replace(plant.field, hysteresis_percent=0.0),
+        relaxation=replace(plant.relaxation, fractions=(0.0, 0.0, 0.0)),
+        thermal=replace(plant.thermal, drift_K_h=0.0),
+        friction=replace(plant.friction, static_to_kinetic=1.0, viscous_N_s_mm=0.0),
+    )
+
+
+@pytest.mark.parametrize("name", plant_names())
+@pytest.mark.parametrize("gap_mm", [45.0, 60.0, 94.9])
+def test_without_memory_the_force_is_the_constitutive_law_at_the_true_gap(name: str, gap_mm: float) -> None:
+    plant = without_memory(load_plant(name))
+    element = Element(plant, gap_mm, STEP_S)
+    for step in range(400):
+        element.advance(step * STEP_S, gap_mm, SPEED_MM_S)
+    insert = Elastomer(
+        plant.elastomer.shear_modulus_kPa * 1e3,
+        plant.elastomer.relative_permeability,
+        plant.elastomer.kinetic_friction,
+    )
+    law_N = brake_force_N(float(radial_moment_Tm(np.array([gap_mm]), plant)[0]), insert, TORMAG)
+    assert element.force_N == pytest.approx(law_N, rel=1e-5)
+
+
+def test_the_joined_field_law_is_smooth_and_falls() -> None:
+    plant = load_plant("sample_2")
+    gap_mm = np.linspace(44.0, 110.0, 66_001)
+    slope = np.gradient(radial_moment_Tm(gap_mm, plant), gap_mm)
+    assert np.all(slope < 1e-12)
+    # largest curvature of Eq. 7 is 1.206e-6 * 1.867 * 0.867 * x**-0.133: no kink where the laws meet
+    assert np.max(np.abs(np.diff(slope)[45_000:])) < 5e-8
+
+
+@pytest.mark.parametrize("steps", [10, 1000])
+def test_hysteresis_lags_and_does_not_depend_on_the_rate(steps: int) -> None:
+    quiet = without_memory(SAMPLE_1)
+    field = msgspec.structs.replace(quiet.field, hysteresis_percent=1.0)
+    element = Element(msgspec.structs.replace(quiet, field=field), 60.0, STEP_S)
+
+    def sweep(start_mm: float, end_mm: float) -> float:
+        for step in range(1, steps + 1):
+            element.advance(0.0, start_mm + (end_mm - start_mm) * step / steps, SPEED_MM_S)
+        return element.kinetic_N
+
+    sweep(60.0, 90.0)
+    closing_N = sweep(90.0, 60.0)
+    sweep(60.0, 46.0)
+    opening_N = sweep(46.0, 60.0)
+    assert opening_N > closing_N
+    # 1% of the largest moment to either side, with F about proportional to the square of the moment
+    assert opening_N / closing_N - 1.0 == pytest.approx(4 * 0.01 * (60.0 / 45.0) ** 1.3, rel=0.1)
+    assert (opening_N + closing_N) / 2.0 == pytest.approx(Element(quiet, 60.0, STEP_S).kinetic_N, rel=0.01)
+
+
+def test_force_relaxes_after_a_field_step_by_the_stated_share() -> None:
+    thermal = msgspec.structs.replace(SAMPLE_1.thermal, drift_K_h=0.0)
+    element = Element(msgspec.structs.replace(SAMPLE_1, thermal=thermal), 94.0, 0.1)
+    before_N = element.kinetic_N
+    element.advance(0.0, 50.0, SPEED_MM_S)
+    step_N = element.kinetic_N - before_N
+    for _ in range(300):
+        element.advance(0.0, 50.0, SPEED_MM_S)
+    lost = (before_N + step_N - element.kinetic_N) / step_N
+    expected = 0.05 * (1 - np.exp(-30 / 8)) + 0.04 * (1 - np.exp(-30 / 90)) + 0.04 * (1 - np.exp(-30 / 900))
+    # the equilibrium level before the step carries its own lost share
+    assert lost == pytest.approx(expected, rel=0.05)
+
+
+def test_warming_weakens_the_force_and_levels_off() -> None:
+    element = Element(without_memory(SAMPLE_1), 50.0, STEP_S)
+    warm = Element(msgspec.structs.replace(without_memory(SAMPLE_1), thermal=SAMPLE_1.thermal), 50.0, STEP_S)
+    for one in (element, warm):
+        one.advance(3600.0, 50.0, SPEED_MM_S)
+    assert warm.temperature_C == pytest.approx(25.97, abs=0.01)
+    assert warm.kinetic_N / element.kinetic_N == pytest.approx(1.0 - 0.004 * (warm.temperature_C - 25.0), rel=1e-9)
+    warm.advance(1e7, 50.0, SPEED_MM_S)
+    assert warm.temperature_C == pytest.approx(40.0)
+
+
+def test_the_brake_gives_the_hand_no_energy_over_its_reversals() -> None:
+    plant = Plant(SAMPLE_1, ReversingHand(4.0))
+    work_J = stored_J = 0.0
+    directions = set()
+    for _ in range(8000):
+        before_mm = plant.handle_mm
+        plant.advance(STEP_S, 0.0, 0.0, left_on=False, right_on=False)
+        work_J += plant.truth.force_N * (plant.handle_mm - before_mm) * 1e-3
+        stored_J = 0.5 * plant.truth.force_N**2 / 8.0 * 1e-3
+        assert work_J >= stored_J - 1e-6
+        if abs(plant.handle_mm_s) > 35.0:
+            assert plant.truth.force_N * plant.handle_mm_s > 0.0
+            directions.add(plant.handle_mm_s > 0.0)
+    assert work_J > 0.1
+    assert directions == {True, False}
+
+
+def readings(plant: Plant, milliseconds: int) -> list[float]:
+    values = []
+    for _ in range(milliseconds):
+        plant.advance(STEP_S, 0.0, 0.0, left_on=False, right_on=False)
+        values.append(plant.sensed_force_N)
+    return values
+
+
+@pytest.mark.parametrize("name", plant_names())
+def test_force_sensor_noise_has_the_stated_spread_around_the_truth(name: str) -> None:
+    parameters = load_plant(name)
+    plant = Plant(parameters, SteadyHand(), seed=3)
+    values = readings(plant, 4000)[200:]
+    fresh = [after for before, after in itertools.pairwise(values) if after != before]
+    assert len(fresh) == pytest.approx(3.8 * parameters.force_sensor.rate_Hz, abs=3)
+    assert statistics.stdev(fresh) == pytest.approx(parameters.force_sensor.noise_mN * 1e-3, rel=0.08)
+    assert statistics.fmean(fresh) == pytest.approx(plant.truth.force_N, abs=3e-3)
+
+
+@pytest.mark.parametrize(("delay_ms", "rate_Hz"), [(0.0, 1000.0), (1.0, 1000.0), (7.0, 1000.0), (4.0, 250.0)])
+def test_force_sensor_shows_the_force_of_its_delay_ago(delay_ms: float, rate_Hz: float) -> None:
+    sensor = msgspec.structs.replace(
+        SAMPLE_1.force_sensor, noise_mN=0.0, drift_mN_min=0.0, delay_ms=delay_ms, rate_Hz=rate_Hz
+    )
+    plant = Plant(msgspec.structs.replace(SAMPLE_1, force_sensor=sensor), ReversingHand(2.0))
+    forces = []
+    period_ms = round(1000.0 / rate_Hz)
+    for millisecond in range(1, 600):
+        plant.advance(STEP_S, 0.0, 0.0, left_on=False, right_on=False)
+        forces.append(plant.truth.force_N)
+        sampled_ms = (millisecond - round(delay_ms)) // period_ms * period_ms
+        if sampled_ms >= period_ms:
+            assert plant.sensed_force_N == forces[sampled_ms - 1]
+
+
+def test_force_sensor_offset_drifts_at_the_stated_rate() -> None:
+    sensor = msgspec.structs.replace(SAMPLE_1.force_sensor, noise_mN=0.0, drift_mN_min=600.0, delay_ms=0.0)
+    signs = set()
+    for seed in range(6):
+        plant = Plant(msgspec.structs.replace(SAMPLE_1, force_sensor=sensor), SteadyHand(), seed)
+        plant.advance(2.0, 0.0, 0.0, left_on=False, right_on=False)
+        offset_N = plant.sensed_force_N - plant.truth.force_N
+        assert abs(offset_N) == pytest.approx(0.02, rel=0.01)
+        signs.add(offset_N > 0.0)
+    assert signs == {True, False}
+
+
+def test_time_may_be_cut_in_any_way() -> None:
+    whole = Plant(SAMPLE_1, SteadyHand(), seed=1)
+    whole.advance(0.3, -6.0, -5.0, left_on=True, right_on=True)
+    pieces = Plant(SAMPLE_1, SteadyHand(), seed=1)
+    for _ in range(3000):
+        pieces.advance(0.3 / 3000 / 3, -6.0, -5.0, left_on=True, right_on=True)
+        pieces.advance(0.3 / 3000 * 2 / 3, -6.0, -5.0, left_on=True, right_on=True)
+    assert pieces.truth == whole.truth
+    assert pieces.sensed_force_N == whole.sensed_force_N
+
+
+@pytest.mark.parametrize("arguments", [(-1e-3, 0.0, 0.0), (float("nan"), 0.0, 0.0), (1e-3, float("inf"), 0.0)])
+def test_impossible_steps_are_refused(arguments: tuple[float, float, float]) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        Plant(SAMPLE_1, SteadyHand()).advance(*arguments, left_on=True, right_on=True)

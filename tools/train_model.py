@@ -1,0 +1,132 @@
+"""Train a force model from recorded data and write it as a model file.
+
+python tools/train_model.py DATA.csv --element torque --insert MRE-50-40 --out FILE.safetensors
+"""
+
+import argparse
+import datetime
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+from tqdm import tqdm
+
+from tormagd.learning.dataset import Dataset, DatasetError, read_csv
+from tormagd.learning.features import Element, Scaling
+from tormagd.learning.levenberg_marquardt import Epoch, Training, train
+from tormagd.learning.metrics import fit_metrics, not_rising_share
+from tormagd.learning.mlp import ForceNetwork, to_model
+from tormagd.learning.model_file import ForceModel, ModelMetadata, save_model
+from tormagd.physics.errors import DomainError
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument(
+        "data", type=Path, metavar="DATA.csv", help="training CSV; a `cycle` column keeps cycles together"
+    )
+    parser.add_argument("--element", type=Element, choices=list(Element), required=True, help="what was measured")
+    parser.add_argument("--insert", required=True, help="the insert it was measured on, such as MRE-50-40")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.safetensors")
+    parser.add_argument("--hidden", type=int, default=50, help="hidden units (default: 50)")
+    parser.add_argument("--epochs", type=int, default=200, help="most epochs (default: 200)")
+    parser.add_argument("--seed", type=int, default=0, help="decides the split and the initial weights (default: 0)")
+    parser.add_argument("--validation-share", type=float, default=0.3, help="rows or cycles held out (default: 0.3)")
+    parser.add_argument("--created", type=datetime.date.fromisoformat, help="date in the file (default: today)")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the convergence")
+    parser.add_argument("--json", action="store_true", help="print the metrics as JSON")
+    return parser.parse_args(arguments)
+
+
+def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Training]:
+    """Train on `data` and return the model with its metrics, and how it went."""
+    training_data, validation_data = data.split(options.validation_share, options.seed)
+    scaling = Scaling.fit(training_data.features, training_data.force_N)
+    network = ForceNetwork(scaling, options.hidden, seed=options.seed)
+    metadata = ModelMetadata(  # before the training, which a wrong name should not have to wait for
+        element=options.element,
+        insert=options.insert,
+        hidden=options.hidden,
+        ranges=training_data.ranges(),
+        scaling=scaling,
+        training_data_sha256=data.sha256(),
+        metrics={},
+        created=options.created or datetime.date.today(),
+    )
+    with tqdm(total=options.epochs, unit="epoch", disable=None, leave=False) as bar:
+
+        def show(epoch: Epoch) -> None:
+            bar.set_postfix_str(f"train {epoch.train_rmse_N:.4f} N, validation {epoch.validation_rmse_N:.4f} N rms")
+            bar.update()
+
+        result = train(network, training_data, validation_data, epochs=options.epochs, progress=show)
+
+    model = to_model(network, metadata)
+    metrics = {
+        **{f"train_{name}": value for name, value in fit_metrics(model, training_data).items()},
+        **{f"validation_{name}": value for name, value in fit_metrics(model, validation_data).items()},
+        "not_rising_share": not_rising_share(model),
+        "train_rows": float(len(training_data)),
+        "validation_rows": float(len(validation_data)),
+        "epochs": float(len(result.history)),
+        "best_epoch": float(result.best.epoch),
+    }
+    return to_model(network, msgspec.structs.replace(metadata, metrics=metrics)), result
+
+
+def plot_convergence(path: Path, result: Training) -> None:
+    """Draw the errors over the epochs."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    epochs = [step.epoch for step in result.history]
+    axes.semilogy(epochs, [step.train_rmse_N for step in result.history], label="training")
+    axes.semilogy(epochs, [step.validation_rmse_N for step in result.history], label="validation")
+    axes.axvline(result.best.epoch, color="grey", linestyle=":", label=f"kept: epoch {result.best.epoch}")
+    axes.set(xlabel="epoch", ylabel="force error, N rms", title=f"Levenberg-Marquardt, stopped by {result.stopped_by}")
+    axes.legend()
+    figure.savefig(path, dpi=150)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    options = parse(arguments)
+    for path in (options.out, options.plot):
+        if path is not None and not path.parent.is_dir():
+            print(f"train_model: cannot write {path}: {path.parent} is not a directory", file=sys.stderr)
+            return 2
+    try:
+        model, result = fit(options, read_csv(options.data))
+        save_model(options.out, model)
+        if options.plot is not None:
+            plot_convergence(options.plot, result)
+    except (DatasetError, DomainError) as error:
+        print(f"train_model: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"train_model: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
+        return 2
+    metrics = model.metadata.metrics
+    if options.json:
+        report = {"out": str(options.out), "data_sha256": model.metadata.training_data_sha256, **metrics}
+        print(json.dumps({**report, "stopped_by": result.stopped_by}))
+        return 0
+    print(f"{'':12}{'R2':>9}{'MAE N':>9}{'MAE %':>8}{'RMSE N':>9}{'max N':>8}{'rows':>8}")
+    for part in ("train", "validation"):
+        values = {
+            name.removeprefix(f"{part}_"): value for name, value in metrics.items() if name.startswith(f"{part}_")
+        }
+        print(
+            f"{part:12}{values.get('r2', float('nan')):9.5f}{values['mae_N']:9.4f}{values['mae_percent']:8.2f}"
+            f"{values['rmse_N']:9.4f}{values['max_N']:8.3f}{values['rows']:8.0f}"
+        )
+    print(f"kept epoch {result.best.epoch} of {len(result.history)}, stopped by {result.stopped_by}")
+    print(f"dF/dB <= 0 on {100 * metrics['not_rising_share']:.2f}% of the training box")
+    print(options.out)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

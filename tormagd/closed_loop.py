@@ -1,0 +1,150 @@
+"""The closed loop in virtual time: the daemon's core against the simulated device, as fast as the processor goes.
+
+The same `plan` and `step`, the same link, the same protocol bytes as in the daemon; only time, sockets and the port
+are replaced. It stands beside the rooms because it joins control with simulation, which no room may.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from tormagd.config import Config
+from tormagd.control.governor import TimedSetpoint
+from tormagd.control.plan import Plan, Planner, PlanState
+from tormagd.control.step import StepOutput, Stepper, StepState
+from tormagd.hardware.frame_stream import FrameStream
+from tormagd.hardware.link import DeviceLink, LinkState
+from tormagd.hardware.measurement import Measurement
+from tormagd.safety.operating_state import Conditions, OperatingState
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.plant import Truth
+
+Array = npt.NDArray[np.float64]
+HOMING_S = 10.0
+"Longer than the slowest homing from a closed gap."
+
+
+class Sample(NamedTuple):
+    """One control tick: what was asked, what the controller knew, and what really was."""
+
+    time_s: float
+    state: StepState
+    output: StepOutput
+    plan: Plan
+    trim: float
+    truth: Truth
+
+
+class ClosedLoop:
+    """A daemon and its device in one process and one virtual time, which starts at 0."""
+
+    def __init__(self, config: Config, stepper: Stepper, planner: Planner | None, device: VirtualDevice) -> None:
+        """`planner` may be missing where every tick is given its plan."""
+        self._config, self._stepper, self._planner, self.device = config, stepper, planner, device
+        self._period_s = 1.0 / config.rates.control_hz
+        self._inference_s = 1.0 / config.rates.inference_hz
+        self._stream = FrameStream()
+        self._requested = 0
+        self._ticks = 0
+        self.link = DeviceLink(0.0)
+        self.step_state = stepper.start(0.0)
+        self.plan_state: PlanState | None = None if planner is None else planner.start(0.0)
+
+    @property
+    def now_s(self) -> float:
+        """Virtual time."""
+        return self._ticks * self._period_s
+
+    @property
+    def measurement(self) -> Measurement | None:
+        """The newest measurement while the link runs."""
+        return self.link.measurement if self.link.state is LinkState.RUNNING else None
+
+    def tick(self, setpoint: TimedSetpoint | None = None, plan: Plan | None = None) -> Sample:
+        """One control period. A given `plan` is used instead of planning: a bench sweep asks for gaps, not forces."""
+        self._ticks += 1
+        now_s = self.now_s
+        for message in self._stream.unpack(self.device.transmit(now_s)):
+            self.link.receive(now_s, message)
+        used = self._newest_plan() if plan is None else plan
+        self.step_state, output = self._stepper.step(self.step_state, now_s, self.measurement, used)
+        self._send(now_s, output)
+        if plan is None:
+            self._infer(now_s, setpoint)
+        trim = 1.0 if self.plan_state is None else self.plan_state.trim
+        return Sample(now_s, self.step_state, output, used, trim, self.device.truth)
+
+    def command(self, name: str) -> None:
+        """An operator's command. Raises RefusedError."""
+        self.step_state = self._stepper.command(self.step_state, name, self.now_s, self.conditions())
+
+    def conditions(self) -> Conditions:
+        """What commands are decided on."""
+        measurement = self.measurement
+        return Conditions(
+            connected=measurement is not None,
+            fresh=measurement is not None,
+            homed=measurement is not None and measurement.is_homed,
+            busy=measurement is not None and measurement.is_busy,
+            device_latched=measurement is not None and measurement.is_latched,
+            requested_N=None,  # an operator here arms before the publisher starts
+            neutral_N=0.0,
+        )
+
+    def run(
+        self, duration_s: float, setpoint: Callable[[float], TimedSetpoint | None] = lambda now_s: None
+    ) -> Iterable[Sample]:
+        """The ticks of the next `duration_s`; `setpoint` gives the newest setpoint at a time."""
+        for _ in range(round(duration_s / self._period_s)):
+            yield self.tick(setpoint(self.now_s))
+
+    def arm(self, plan: Plan | None = None) -> None:
+        """Connects, homes and enables, as an operator does. Raises RuntimeError if the device does not get there."""
+        self._until(lambda m: True, "answer", plan)
+        self.command("home")
+        self._until(lambda m: m.is_busy, "start homing", plan)
+        self._until(lambda m: not m.is_busy and m.is_homed, "home", plan)
+        self.command("enable")
+        if self.step_state.safety.operating_state is not OperatingState.ENABLED:
+            raise RuntimeError(f"not enabled: {self.step_state.safety}")
+
+    def _newest_plan(self) -> Plan:
+        if self.plan_state is None:
+            raise ValueError("plan = None: allowed is a plan for every tick of a loop without a planner")
+        return self.plan_state.plan
+
+    def _infer(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
+        if self._planner is None or self.plan_state is None:
+            return
+        is_new = setpoint is not None and setpoint.stamp_s > self.plan_state.governor.stamp_s
+        if is_new or now_s - self.plan_state.plan.time_s >= self._inference_s - 1e-9:
+            self.plan_state = self._planner.plan(self.plan_state, now_s, setpoint, self.step_state.estimate)
+
+    def _until(self, reached: Callable[[Measurement], bool], what: str, plan: Plan | None) -> None:
+        for _ in range(round(HOMING_S / self._period_s)):
+            self.tick(plan=plan)
+            if self.measurement is not None and reached(self.measurement):
+                return
+        raise RuntimeError(f"the device did not {what} within {HOMING_S:g} s: {self.link.state} {self.link.cause}")
+
+    def _send(self, now_s: float, output: StepOutput) -> None:
+        if output.request_number != self._requested:
+            self._requested = output.request_number
+            self.link.request(now_s, output.request)
+        if self.link.state is LinkState.RUNNING:
+            drive = self.link.drive(output.left_duty, output.right_duty, output.mode)
+            self.device.receive(now_s, self._stream.pack(drive))
+        for message in self.link.due(now_s):
+            self.device.receive(now_s, self._stream.pack(message))
+
+
+def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:
+    """A publisher in virtual time: each force is sent at its time, and nothing before the first."""
+
+    def newest(now_s: float) -> TimedSetpoint | None:
+        index = int(np.searchsorted(times_s, now_s, side="right")) - 1
+        return None if index < 0 else TimedSetpoint(float(forces_N[index]), float(times_s[index]), valid_for_s)
+
+    return newest

@@ -1,0 +1,224 @@
+"""One typed, validated configuration.
+
+A TOML file, or the defaults. Unknown keys, wrong types, NaN and infinities, values out of range and impossible
+orderings are refused with the key's path, the value and what is allowed.
+"""
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+LEAST_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
+DEFAULT_RUN_DIR = "/run/tormag"
+
+Positive = Annotated[float, Meta(gt=0.0)]
+
+
+class ConfigError(ValueError):
+    """A configuration that was refused: the text names the key, the value and what is allowed."""
+
+
+class Strict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A table of the configuration."""
+
+
+class Device(Strict, frozen=True):
+    """Where the firmware is. `backend` names an entry point of the group `tormagd.backends`."""
+
+    backend: str = "serial"
+    port: str = "/dev/tormag"
+    baud: Annotated[int, Meta(ge=115_200, le=12_000_000)] = 1_000_000
+    command_timeout_ms: Annotated[float, Meta(ge=5.0, le=1_000.0)] = 50.0
+    "What the firmware does without us: its own timeout, stated here so that it can be checked against ours."
+    measurement_timeout_ms: Annotated[float, Meta(ge=2.0, le=1_000.0)] = 20.0
+    "Oldest device state the controller accepts while it drives."
+
+
+class Endpoints(Strict, frozen=True):
+    """ZeroMQ addresses. Only `ipc://` and loopback are open; any other address is refused without CURVE keys."""
+
+    setpoint: str = f"ipc://{DEFAULT_RUN_DIR}/setpoint"
+    telemetry: str = f"ipc://{DEFAULT_RUN_DIR}/telemetry"
+    control: str = f"ipc://{DEFAULT_RUN_DIR}/control"
+    recording: str = f"ipc://{DEFAULT_RUN_DIR}/recording"
+
+
+class Rates(Strict, frozen=True):
+    """How often each rate group runs, Hz."""
+
+    control_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 1_000
+    inference_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 250
+    telemetry_hz: Annotated[int, Meta(ge=1, le=200)] = 50
+
+
+class RealTime(Strict, frozen=True):
+    """Each of these is optional; one that is refused by the kernel is a plain warning and a line of `doctor`."""
+
+    fifo_priority: Annotated[int, Meta(ge=0, le=90)] = 0
+    lock_memory: bool = False
+    cpus: tuple[Annotated[int, Meta(ge=0, le=4095)], ...] = ()
+    watchdog_ms: Annotated[float, Meta(ge=100.0, le=60_000.0)] = 500.0
+
+
+class Motor(Strict, frozen=True):
+    """The DC motor and lead screw the controller believes in (37D class, 70:1); see `control/motor.py`."""
+
+    supply_V: Annotated[float, Meta(ge=3.0, le=60.0)] = 12.0
+    resistance_ohm: Annotated[float, Meta(ge=0.05, le=100.0)] = 2.2
+    inductance_mH: Annotated[float, Meta(ge=0.01, le=100.0)] = 1.5
+    back_emf_V_s: Annotated[float, Meta(ge=1e-4, le=1.0)] = 0.011
+    inertia_kg_m2: Annotated[float, Meta(ge=1e-9, le=1e-2)] = 8e-7
+    gear_ratio: Annotated[float, Meta(ge=1.0, le=1_000.0)] = 70.0
+    screw_lead_mm: Annotated[float, Meta(ge=0.2, le=50.0)] = 8.0
+    gear_efficiency: Annotated[float, Meta(gt=0.1, le=1.0)] = 0.7
+    coulomb_V: Annotated[float, Meta(ge=0.0, le=12.0)] = 0.5
+    "Voltage that just overcomes the dry friction of gearbox and screw."
+
+
+class Position(Strict, frozen=True):
+    """The carriage position loop: PID with filtered derivative, back-calculation and feed-forward."""
+
+    proportional_per_mm: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 6.0
+    integral_time_s: Annotated[float, Meta(ge=0.005, le=100.0)] = 0.08
+    derivative_time_s: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0145
+    derivative_filter_s: Annotated[float, Meta(ge=1e-4, le=0.1)] = 0.003
+    back_calculation_s: Annotated[float, Meta(ge=0.001, le=10.0)] = 0.1
+    synchronisation: Annotated[float, Meta(ge=0.0, le=10.0)] = 1.0
+    "Extra proportional action on the skew between the carriages, as a multiple of the carriage's own."
+    gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] = 38.0
+    gap_acceleration_mm_s2: Annotated[float, Meta(gt=0.0, le=100_000.0)] = 1_300.0
+    "From rest; with speed it falls along the motors' torque-speed line."
+    duty_limit: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0
+    lead_ms: Annotated[float, Meta(ge=0.0, le=50.0)] = 0.0
+    "How far ahead the gap is asked for, along the setpoint's own slope, to make up for known lags."
+
+
+class Trim(Strict, frozen=True):
+    """The slow correction of the force model by the force sensor."""
+
+    time_s: Annotated[float, Meta(ge=0.05, le=1_000.0)] = 0.7
+    least: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.6
+    most: Annotated[float, Meta(ge=1.0, le=5.0)] = 1.6
+
+
+class Limits(Strict, frozen=True):
+    """What counts as a fault, and what only as a warning."""
+
+    skew_warning_mm: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.2
+    skew_fault_mm: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
+    following_error_mm: Annotated[float, Meta(gt=0.0, le=50.0)] = 3.0
+    following_time_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.25
+    low_confidence: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.5
+    stale_ramp_N_s: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 2.0
+    neutral_margin_N: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.1
+
+
+class Config(Strict, frozen=True):
+    """Everything `tormagd` can be told."""
+
+    scene: str = "coronary"
+    "A scene file, or the name of a shipped one."
+    device: Device = msgspec.field(default_factory=Device)
+    endpoints: Endpoints = msgspec.field(default_factory=Endpoints)
+    rates: Rates = msgspec.field(default_factory=Rates)
+    realtime: RealTime = msgspec.field(default_factory=RealTime)
+    motor: Motor = msgspec.field(default_factory=Motor)
+    position: Position = msgspec.field(default_factory=Position)
+    trim: Trim = msgspec.field(default_factory=Trim)
+    limits: Limits = msgspec.field(default_factory=Limits)
+
+    def __post_init__(self) -> None:
+        rates, device, limits = self.rates, self.device, self.limits
+        _order(
+            rates.inference_hz <= rates.control_hz,
+            "rates.inference_hz",
+            rates.inference_hz,
+            f"at most rates.control_hz = {rates.control_hz}",
+        )
+        _order(
+            rates.control_hz % rates.telemetry_hz == 0,
+            "rates.telemetry_hz",
+            rates.telemetry_hz,
+            f"a divisor of rates.control_hz = {rates.control_hz}",
+        )
+        _order(
+            device.command_timeout_ms < self.realtime.watchdog_ms,
+            "device.command_timeout_ms",
+            device.command_timeout_ms,
+            f"under realtime.watchdog_ms = {self.realtime.watchdog_ms:g}: the device must act before systemd does",
+        )
+        _order(
+            device.measurement_timeout_ms <= device.command_timeout_ms,
+            "device.measurement_timeout_ms",
+            device.measurement_timeout_ms,
+            f"at most device.command_timeout_ms = {device.command_timeout_ms:g}",
+        )
+        _order(
+            limits.skew_warning_mm <= limits.skew_fault_mm,
+            "limits.skew_warning_mm",
+            limits.skew_warning_mm,
+            f"at most limits.skew_fault_mm = {limits.skew_fault_mm:g}",
+        )
+        for name in ("setpoint", "telemetry", "control", "recording"):
+            address = getattr(self.endpoints, name)
+            _order(
+                address.startswith(("ipc://", "inproc://", "tcp://127.", "tcp://localhost:", "tcp://[::1]:")),
+                f"endpoints.{name}",
+                address,
+                "ipc:// or a loopback tcp:// address; others need CURVE keys",
+            )
+
+
+def _order(condition: bool, key: str, value: object, allowed: str) -> None:
+    if not condition:
+        raise ValueError(f"{key} = {value!r}: allowed is {allowed}")
+
+
+def load_toml(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file. Raises ConfigError: not readable, not TOML (with its line), a number not finite."""
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: {error}") from error
+    _refuse_nonfinite(tables, str(path))
+    return tables
+
+
+def _refuse_nonfinite(value: Any, where: str) -> None:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{where} = {value}: allowed is a finite number")
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _refuse_nonfinite(inner, f"{where}: {key}" if ":" not in where else f"{where}.{key}")
+    if isinstance(value, list):
+        for inner in value:
+            _refuse_nonfinite(inner, where)
+
+
+def load_config(path: Path | None) -> Config:
+    """The configuration in `path`, or the defaults. Raises ConfigError."""
+    if path is None:
+        return Config()
+    tables = load_toml(path)
+    try:
+        return msgspec.convert(tables, Config)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path}: {error}{_value_at(tables, str(error))}") from error
+
+
+def _value_at(tables: dict[str, Any], message: str) -> str:
+    """` (it is VALUE)` for the `$.a.b` path msgspec puts at the end of its message; msgspec leaves the value out."""
+    if "`$." not in message:
+        return ""
+    value: Any = tables
+    for key in message.rsplit("`$.", 1)[1].rstrip("`").split("."):
+        if not isinstance(value, dict) or key not in value:
+            return ""
+        value = value[key]
+    return "" if isinstance(value, dict) else f" (it is {value!r})"

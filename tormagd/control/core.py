@@ -1,0 +1,67 @@
+"""The functional core put together for one scene: `plan` and `step` with their constants.
+
+The daemon, the virtual-time simulation and the tests build it here, so that all of them run the same one.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from tormagd.config import Config, ConfigError
+from tormagd.control.motor import Margins, margins
+from tormagd.control.plan import Planner
+from tormagd.control.portrait import FieldOfGap
+from tormagd.control.step import Stepper
+from tormagd.inverse.nearest import NearestFieldSearch
+from tormagd.learning.model_file import ModelFileError, load_model
+from tormagd.learning.shipped import model_path
+from tormagd.physics.errors import DomainError
+from tormagd.physics.field import PowerFieldLaw
+from tormagd.physics.inserts import insert
+from tormagd.scenes.scene import Scene, load_scene, scene_path
+
+ELEMENT = "torque"
+LEAST_PHASE_MARGIN_DEG = 30.0
+LEAST_GAIN_MARGIN_DB = 4.0
+
+
+class Core(NamedTuple):
+    """What one scene's control needs; nothing in it changes."""
+
+    scene: Scene
+    planner: Planner
+    stepper: Stepper
+    margins: Margins
+
+
+def build_core(config: Config) -> Core:
+    """The core for `config.scene`. Raises ConfigError where scene, model and configuration do not fit each other."""
+    scene = load_scene(config.scene)
+    for name in ("control_hz", "inference_hz"):
+        offered, needed = getattr(config.rates, name), getattr(scene.bandwidth, name)
+        if offered < needed:
+            raise ConfigError(f"rates.{name} = {offered}: allowed is at least {needed}, which scene {scene.name} needs")
+    stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
+    if stability.phase_margin_deg < LEAST_PHASE_MARGIN_DEG or stability.gain_margin_dB < LEAST_GAIN_MARGIN_DB:
+        raise ConfigError(
+            f"position: these gains leave a phase margin of {stability.phase_margin_deg:.0f} degrees and a gain margin "
+            f"of {stability.gain_margin_dB:.1f} dB: allowed is at least {LEAST_PHASE_MARGIN_DEG:g} and "
+            f"{LEAST_GAIN_MARGIN_DB:g}"
+        )
+    try:
+        fitted = insert(scene.insert.name)
+        model = load_model(
+            model_path(scene.insert.model, beside=Path(scene_path(config.scene)).parent),
+            element=ELEMENT,
+            insert=scene.insert.name,
+        )
+    except (DomainError, ModelFileError) as error:
+        raise ConfigError(f"scene {scene.name}: {error}") from error
+    field = FieldOfGap(PowerFieldLaw(), fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm * 1e-3)
+    solver = NearestFieldSearch(
+        model,
+        field_range_mT=(field.field_mT(scene.insert.gap_open_mm), field.field_mT(scene.insert.gap_closed_mm)),
+        step_mT=scene.solver.step_mT,
+        neighbours=scene.solver.neighbours,
+    )
+    planner = Planner(config, scene, model, solver, field, 100.0 * fitted.cip_fraction)
+    return Core(scene, planner, Stepper(config, scene), stability)

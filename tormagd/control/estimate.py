@@ -1,0 +1,110 @@
+"""From a measurement to what the controller needs: gap, carriage speeds, and the handle's motion since it turned."""
+
+from typing import NamedTuple
+
+from tormagd.hardware.measurement import Measurement
+
+TURN_MM = 0.05
+"A handle motion against the last direction counts as a reversal from here on: 6 counts of its encoder."
+MOBILISED_MM = 2.0
+"Displacement saturates here: friction is fully mobilised, whatever the insert."
+RATE_FILTER_S = 0.05
+
+
+class Handle(NamedTuple):
+    """The handle's motion. `displacement_mm` counts from the last reversal and saturates at MOBILISED_MM."""
+
+    displacement_mm: float
+    rate_mm_s: float
+    direction: float
+    turned_mm: float
+    furthest_mm: float
+
+
+class Estimate(NamedTuple):
+    """Carriages in mm from the centre plane, speeds in mm/s (opening is positive), force in N against the motion.
+
+    Before homing the positions count from wherever the carriages were, and mean nothing.
+    """
+
+    number: int
+    is_homed: bool
+    device_time_s: float
+    left_mm: float
+    right_mm: float
+    left_mm_s: float
+    right_mm_s: float
+    force_N: float
+    handle: Handle
+    handle_mm: float
+
+    @property
+    def gap_mm(self) -> float:
+        """Distance between the magnets, mm."""
+        return self.left_mm + self.right_mm
+
+    @property
+    def skew_mm(self) -> float:
+        """Left carriage minus right carriage, mm."""
+        return self.left_mm - self.right_mm
+
+
+def first_estimate(measurement: Measurement, home_mm: float) -> Estimate:
+    """The estimate from one measurement: everything at rest. `home_mm` is a carriage's distance from the centre
+    plane when it is on its home switch.
+    """
+    handle = Handle(0.0, 0.0, 1.0, measurement.handle_mm, measurement.handle_mm)
+    return Estimate(
+        number=measurement.number,
+        is_homed=measurement.is_homed,
+        device_time_s=measurement.device_time_s,
+        left_mm=home_mm + measurement.left_mm,
+        right_mm=home_mm + measurement.right_mm,
+        left_mm_s=0.0,
+        right_mm_s=0.0,
+        force_N=measurement.force_N,
+        handle=handle,
+        handle_mm=measurement.handle_mm,
+    )
+
+
+def update(last: Estimate | None, measurement: Measurement, home_mm: float, derivative_filter_s: float) -> Estimate:
+    """The estimate after one more measurement; the same one again where the device has said nothing new.
+
+    Speeds are filtered derivatives over the *device's* clock, so that late delivery is not mistaken for slow motion.
+    """
+    if last is None:
+        return first_estimate(measurement, home_mm)
+    dt_s = measurement.device_time_s - last.device_time_s
+    if measurement.number == last.number or dt_s <= 0.0:
+        return last
+    left, right = home_mm + measurement.left_mm, home_mm + measurement.right_mm
+    share = dt_s / (derivative_filter_s + dt_s)
+    handle = _handle(last, measurement.handle_mm, dt_s)
+    return Estimate(
+        number=measurement.number,
+        is_homed=measurement.is_homed,
+        device_time_s=measurement.device_time_s,
+        left_mm=left,
+        right_mm=right,
+        left_mm_s=last.left_mm_s + share * ((left - last.left_mm) / dt_s - last.left_mm_s),
+        right_mm_s=last.right_mm_s + share * ((right - last.right_mm) / dt_s - last.right_mm_s),
+        force_N=measurement.force_N * handle.direction,
+        handle=handle,
+        handle_mm=measurement.handle_mm,
+    )
+
+
+def _handle(last: Estimate, position_mm: float, dt_s: float) -> Handle:
+    before = last.handle
+    share = dt_s / (RATE_FILTER_S + dt_s)
+    speed = before.direction * before.rate_mm_s
+    speed += share * ((position_mm - last.handle_mm) / dt_s - speed)
+    direction, turned, furthest = before.direction, before.turned_mm, before.furthest_mm
+    if (position_mm - furthest) * direction >= 0.0:
+        furthest = position_mm
+    elif abs(position_mm - furthest) > TURN_MM:
+        # it turned where it was furthest, not where we became sure of it
+        direction, turned, furthest = -direction, furthest, position_mm
+    displacement = min(abs(position_mm - turned), MOBILISED_MM)
+    return Handle(displacement, direction * speed, direction, turned, furthest)

@@ -1,0 +1,104 @@
+"""DC motor, gearbox and lead screw of one carriage: continuous model, H(z) by zero-order hold, stability margins.
+
+Continuous model, from duty u to carriage position x (mm), friction and load left out because they are disturbances:
+    L di/dt = V u - R i - Ke w,    J dw/dt = Ke i,    dx/dt = w lead / (2 pi N)
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from tormagd.config import Motor, Position
+
+Array = npt.NDArray[np.float64]
+
+
+class TransferFunction(NamedTuple):
+    """H(z) = numerator(z) / denominator(z), highest power first, sampled every `period_s`."""
+
+    numerator: Array
+    denominator: Array
+    period_s: float
+
+
+class Margins(NamedTuple):
+    """Open-loop stability margins: gain margin dB, phase margin degrees, crossover Hz."""
+
+    gain_margin_dB: float
+    phase_margin_deg: float
+    crossover_Hz: float
+
+
+def full_speed_mm_s(motor: Motor) -> float:
+    """Speed of one carriage at full duty without load, mm/s."""
+    return motor.supply_V / motor.back_emf_V_s / motor.gear_ratio * motor.screw_lead_mm / (2.0 * math.pi)
+
+
+def mechanical_time_s(motor: Motor) -> float:
+    """Time constant of the speed after a voltage step, s: J R / Ke^2."""
+    return motor.inertia_kg_m2 * motor.resistance_ohm / motor.back_emf_V_s**2
+
+
+def zero_order_hold(motor: Motor, period_s: float) -> TransferFunction:
+    """H(z) from duty to carriage position, mm, exact for a duty held over each period."""
+    inductance_H = motor.inductance_mH * 1e-3
+    advance_mm = motor.screw_lead_mm / (2.0 * math.pi * motor.gear_ratio)
+    # states: current A, motor speed rad/s, carriage position mm; last row and column carry the held input
+    continuous = np.zeros((4, 4))
+    continuous[0] = [
+        -motor.resistance_ohm / inductance_H,
+        -motor.back_emf_V_s / inductance_H,
+        0.0,
+        motor.supply_V / inductance_H,
+    ]
+    continuous[1, 0] = motor.back_emf_V_s / motor.inertia_kg_m2
+    continuous[2, 1] = advance_mm
+    discrete = _exponential(continuous * period_s)
+    transition, drive = discrete[:3, :3], discrete[:3, 3]
+    denominator = np.poly(transition)
+    # the Markov parameters c A^k b are the impulse response; times the denominator they give the numerator
+    impulse = [0.0]
+    state = drive
+    for _ in range(3):
+        impulse.append(float(state[2]))
+        state = transition @ state
+    numerator = np.array([sum(denominator[j] * impulse[k - j] for j in range(k + 1)) for k in range(4)])
+    return TransferFunction(numerator, np.asarray(denominator, dtype=np.float64), period_s)
+
+
+def _exponential(matrix: Array) -> Array:
+    """Matrix exponential by scaling and squaring a Taylor series; exact to rounding for these small matrices."""
+    squarings = max(0, math.ceil(math.log2(max(float(np.abs(matrix).sum(axis=1).max()), 1e-300))) + 4)
+    scaled = matrix / 2.0**squarings
+    total = term = np.eye(len(matrix))
+    for k in range(1, 16):
+        term = term @ scaled / k
+        total = total + term
+    for _ in range(squarings):
+        total = total @ total
+    return total
+
+
+def margins(motor: Motor, position: Position, period_s: float, *, delay_periods: float = 1.0) -> Margins:
+    """Margins of the position loop as it is computed: PID and its filter in z, H(z), and the delay of one exchange."""
+    frequency = np.geomspace(0.05, 0.4999 / period_s, 4_000)
+    z = np.exp(2j * np.pi * frequency * period_s)
+    plant = zero_order_hold(motor, period_s)
+    open_loop = np.polyval(plant.numerator, z) / np.polyval(plant.denominator, z) * z**-delay_periods
+    integral = period_s / position.integral_time_s / (1.0 - 1.0 / z)
+    smoothing = period_s / (position.derivative_filter_s + period_s)
+    derivative = position.derivative_time_s * smoothing * (1.0 - 1.0 / z) / period_s / (1.0 - (1.0 - smoothing) / z)
+    open_loop = open_loop * position.proportional_per_mm * (1.0 + integral + derivative)
+    magnitude = np.abs(open_loop)
+    phase_deg = np.degrees(np.unwrap(np.angle(open_loop)))
+    phase_deg += 360.0 * np.round((-180.0 - phase_deg[0]) / 360.0)
+    below = np.flatnonzero((magnitude[:-1] >= 1.0) & (magnitude[1:] < 1.0))
+    crossing = int(below[-1]) if below.size else 0
+    turning = np.flatnonzero((phase_deg[:-1] >= -180.0) & (phase_deg[1:] < -180.0))
+    turning = turning[turning > crossing] if below.size else turning
+    gain_margin = -20.0 * math.log10(float(magnitude[turning[0]])) if turning.size else math.inf
+    if phase_deg[crossing] < -180.0:
+        gain_margin = -abs(gain_margin)
+    return Margins(gain_margin, 180.0 + float(phase_deg[crossing]), float(frequency[crossing]))

@@ -1,0 +1,43 @@
+"""PID on position with two degrees of freedom: filtered derivative of the measurement, feed-forward of the reference,
+back-calculation against wind-up. Pure functions; gains are those of `config.Position`.
+"""
+
+from typing import NamedTuple
+
+from tormagd.config import Position
+
+
+class PidState(NamedTuple):
+    """The integral action, duty. Starting it at 0 is bumpless: holding takes no duty, because friction holds."""
+
+    integral: float = 0.0
+
+
+class PidOutput(NamedTuple):
+    """Duty in -limit..limit, and whether the limit held it back."""
+
+    duty: float
+    is_saturated: bool
+
+
+def pid(
+    gains: Position,
+    state: PidState,
+    *,
+    error_mm: float,
+    speed_error_mm_s: float,
+    feed_forward: float,
+    dt_s: float,
+) -> tuple[PidState, PidOutput]:
+    """One update, `dt_s` > 0 after the last. The speed error carries the derivative action: its measured half is the
+    filtered derivative of the position, its other half the reference's exact speed, so that a moving reference gives
+    no derivative kick and no lag.
+    """
+    proportional = gains.proportional_per_mm * error_mm
+    derivative = gains.proportional_per_mm * gains.derivative_time_s * speed_error_mm_s
+    asked = proportional + state.integral + derivative + feed_forward
+    duty = min(max(asked, -gains.duty_limit), gains.duty_limit)
+    growth = proportional / gains.integral_time_s + (duty - asked) / gains.back_calculation_s
+    # the integral never needs more than the whole duty, whatever a long saturation makes of back-calculation
+    integral = min(max(state.integral + growth * dt_s, -gains.duty_limit), gains.duty_limit)
+    return PidState(integral), PidOutput(duty, duty != asked)

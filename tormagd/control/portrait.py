@@ -1,0 +1,68 @@
+"""The device's phase portrait: which forces a gap gives, and how fast a gap speed changes them."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from tormagd.control.estimate import MOBILISED_MM
+from tormagd.learning.model_file import ForceModel
+from tormagd.physics.field import FieldLaw, flux_density_T, radial_moment_from_flux_density_Tm
+
+Array = npt.NDArray[np.float64]
+ROLLER_RATE_MM_S = 42.0
+"Surface speed of the roller at the thesis's 20 rpm: the portrait is drawn for a handle in motion."
+GRID = 201
+
+
+class FieldOfGap(NamedTuple):
+    """The flux density at the shaft's surface, mT, over the gap, mm, in one insert."""
+
+    law: FieldLaw
+    relative_permeability: float
+    inner_radius_m: float
+
+    def field_mT(self, gap_mm: float) -> float:
+        """Flux density |b| at R_i (Eq. 6 with a of the field law)."""
+        moment = self.law.radial_moment_Tm(gap_mm)
+        return 1e3 * float(flux_density_T(moment, self.relative_permeability, self.inner_radius_m))
+
+    def gap_mm(self, field_mT: float) -> float:
+        """The gap that gives `field_mT`."""
+        moment = radial_moment_from_flux_density_Tm(1e-3 * field_mT, self.relative_permeability, self.inner_radius_m)
+        return float(self.law.gap_mm(moment))
+
+
+class Portrait(NamedTuple):
+    """Force over gap with friction fully mobilised, and its slope; forces rise along the arrays."""
+
+    force_N: Array
+    slope_N_mm: Array
+    """|dF/dgap|, N per mm."""
+
+    @property
+    def least_N(self) -> float:
+        """F_min: what the open gap gives. A passive brake gives no less."""
+        return float(self.force_N[0])
+
+    @property
+    def most_N(self) -> float:
+        """F_max: what the closed gap gives."""
+        return float(self.force_N[-1])
+
+    def slope_at_N_mm(self, force_N: float) -> float:
+        """|dF/dgap| where the gap gives this force."""
+        return float(np.interp(force_N, self.force_N, self.slope_N_mm))
+
+    def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
+        """The fastest change of force that a gap speed renders at this force."""
+        return gap_speed_mm_s * self.slope_at_N_mm(force_N)
+
+
+def portrait(model: ForceModel, field: FieldOfGap, cip_percent: float, gap_range_mm: tuple[float, float]) -> Portrait:
+    """The portrait that the learned model predicts over a gap range."""
+    gaps = np.linspace(gap_range_mm[1], gap_range_mm[0], GRID)
+    features = np.array([[MOBILISED_MM, ROLLER_RATE_MM_S, field.field_mT(float(gap)), cip_percent] for gap in gaps])
+    # a learned curve may dip by a hair where it is flat; the portrait is the rising envelope
+    force = np.maximum.accumulate(model.predict(features))
+    return Portrait(force, np.abs(np.gradient(force, gaps)))

@@ -1,0 +1,216 @@
+"""`step`: safety, reference, two PIDs, duty. Pure: no clock, no I/O, explicit state, the same result every time."""
+
+import math
+from typing import NamedTuple
+
+from firmware_protocol.codec import DeviceMode, DriveMode
+from tormagd.config import Config
+from tormagd.control.estimate import Estimate, first_estimate, update
+from tormagd.control.motor import full_speed_mm_s, mechanical_time_s
+from tormagd.control.pid import PidOutput, PidState, pid
+from tormagd.control.plan import Plan
+from tormagd.control.trajectory import Reference, follow
+from tormagd.hardware.measurement import Measurement
+from tormagd.safety.codes import Fault, Limit, device_faults
+from tormagd.safety.operating_state import (
+    Conditions,
+    DeviceRequest,
+    OperatingState,
+    RefusedError,
+    SafetyState,
+    command,
+    latch,
+)
+from tormagd.scenes.scene import Scene
+
+CARRY_S = 0.012
+"A plan's gap is carried forward along its speed by no more than three inference periods."
+STARTING_S = 0.15
+"After enabling, the device may take this long to report that it runs."
+COULOMB_SPEED_MM_S = 0.5
+"Below this reference speed the friction feed-forward fades, so that a resting carriage is not pushed to and fro."
+LAGGING_MM = 0.1
+"The speed limit is reported as RATE only where it leaves the reference this far behind its target."
+
+
+class StepState(NamedTuple):
+    """What a step remembers."""
+
+    time_s: float
+    safety: SafetyState = SafetyState()
+    estimate: Estimate | None = None
+    reference: Reference | None = None
+    left: PidState = PidState()
+    right: PidState = PidState()
+    enabled_s: float = math.inf
+    following_s: float = math.inf
+
+
+class StepOutput(NamedTuple):
+    """What goes to the device, and what holds it back."""
+
+    mode: DriveMode
+    left_duty: float
+    right_duty: float
+    request: DeviceRequest
+    request_number: int
+    limits: tuple[Limit, ...]
+
+
+class Stepper:
+    """The constants of a step. Its methods change nothing."""
+
+    def __init__(self, config: Config, scene: Scene) -> None:
+        self._position, self._limits, self._device = config.position, config.limits, config.device
+        self._nominal_dt_s = 1.0 / config.rates.control_hz
+        self._gaps_mm = (scene.insert.gap_closed_mm, scene.insert.gap_open_mm)
+        self._home_mm = scene.insert.gap_open_mm / 2.0
+        self._supply_V = config.motor.supply_V
+        self._full_speed_mm_s = full_speed_mm_s(config.motor)
+        self._mechanical_time_s = mechanical_time_s(config.motor)
+        self._gear_loss = 1.0 - config.motor.gear_efficiency
+        self._coulomb = config.motor.coulomb_V / config.motor.supply_V
+
+    def start(self, now_s: float) -> StepState:
+        """The state before the first step: disabled."""
+        return StepState(now_s)
+
+    def command(self, state: StepState, name: str, now_s: float, conditions: Conditions) -> StepState:
+        """The state after an operator's command. Raises RefusedError."""
+        safety = command(state.safety, name, now_s, conditions)
+        if safety.operating_state is OperatingState.ENABLED and state.safety.operating_state is OperatingState.DISABLED:
+            # bumpless: from where the gap is, at rest, with empty integrators
+            if state.estimate is None:
+                raise RefusedError("not_fresh", "no measurement from the device yet", "look at the link in tormagctl status")
+            reference = Reference(state.estimate.gap_mm)
+            return state._replace(
+                safety=safety,
+                reference=reference,
+                left=PidState(),
+                right=PidState(),
+                enabled_s=now_s,
+                following_s=math.inf,
+            )
+        return state._replace(safety=safety)
+
+    def lose_link(self, state: StepState) -> StepState:
+        """The state after the link broke: a fault where the device was driven, otherwise only a forgotten estimate."""
+        safety = state.safety
+        if safety.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED):
+            safety = latch(safety, (Fault.LINK_LOST,))
+        return state._replace(safety=safety, estimate=None)
+
+    def step(
+        self, state: StepState, now_s: float, measurement: Measurement | None, plan: Plan
+    ) -> tuple[StepState, StepOutput]:
+        """One control period. With no measurement (no link) the device is told nothing but OFF."""
+        if measurement is None:
+            state = state._replace(time_s=now_s, estimate=None)
+            return state, self._off(state.safety, ())
+        estimate = update(state.estimate, measurement, self._home_mm, self._position.derivative_filter_s)
+        state = state._replace(estimate=estimate)
+        safety = latch(state.safety, self._watch(state, estimate, now_s, measurement))
+        if safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
+            if measurement.is_busy:  # homing moves the origin: what was learned about motion before it is void
+                estimate = first_estimate(measurement, self._home_mm)
+            state = state._replace(time_s=now_s, safety=safety, estimate=estimate, reference=None)
+            return state, self._off(safety, ())
+        return self._drive(state._replace(safety=safety), now_s, measurement, estimate, plan)
+
+    def _drive(
+        self, state: StepState, now_s: float, measurement: Measurement, estimate: Estimate, plan: Plan
+    ) -> tuple[StepState, StepOutput]:
+        dt_s = now_s - state.time_s
+        if not 0.0 < dt_s < 10.0 * self._nominal_dt_s:
+            dt_s = self._nominal_dt_s  # a clock that stood still or a process that was stopped is not a long period
+        reference = state.reference or Reference(estimate.gap_mm)
+        limits: list[Limit] = []
+        if state.safety.operating_state is OperatingState.PAUSED:
+            reference, _ = follow(self._position, reference, reference.gap_mm, 0.0, dt_s, 2.0 * self._full_speed_mm_s)
+        else:
+            carried = plan.gap_speed_mm_s * min(max(now_s - plan.time_s, 0.0), CARRY_S)
+            target = min(max(plan.gap_mm + carried, self._gaps_mm[0]), self._gaps_mm[1])
+            reference, is_limited = follow(
+                self._position, reference, target, plan.gap_speed_mm_s, dt_s, 2.0 * self._full_speed_mm_s
+            )
+            if is_limited and abs(target - reference.gap_mm) > LAGGING_MM:
+                limits.append(Limit.RATE)
+        left_state, left = self._carriage(state.left, reference, estimate.left_mm, estimate.left_mm_s, estimate, dt_s)
+        right_state, right = self._carriage(
+            state.right, reference, estimate.right_mm, estimate.right_mm_s, estimate, dt_s, is_right=True
+        )
+        if not (math.isfinite(left.duty) and math.isfinite(right.duty)):
+            safety = latch(state.safety, (Fault.NOT_FINITE,))
+            return self.start(now_s)._replace(safety=safety), self._off(safety, ())
+        if left.is_saturated or right.is_saturated:
+            limits.append(Limit.SATURATED)
+        if abs(estimate.skew_mm) > self._limits.skew_warning_mm:
+            limits.append(Limit.SKEW)
+        following_s = self._following(state, reference, estimate, now_s)
+        state = state._replace(
+            time_s=now_s, reference=reference, left=left_state, right=right_state, following_s=following_s
+        )
+        # the bridges switch the device's real supply: the same volts take less duty of a higher one
+        scale = self._supply_V / max(measurement.supply_V, 0.5 * self._supply_V)
+        most = self._position.duty_limit
+        output = StepOutput(
+            DriveMode.RUN,
+            min(max(left.duty * scale, -most), most),
+            min(max(right.duty * scale, -most), most),
+            state.safety.request,
+            state.safety.request_number,
+            tuple(limits),
+        )
+        return state, output
+
+    def _carriage(
+        self,
+        state: PidState,
+        reference: Reference,
+        position_mm: float,
+        speed_mm_s: float,
+        estimate: Estimate,
+        dt_s: float,
+        *,
+        is_right: bool = False,
+    ) -> tuple[PidState, PidOutput]:
+        speed = reference.speed_mm_s / 2.0
+        coulomb = self._coulomb * min(max(speed / COULOMB_SPEED_MM_S, -1.0), 1.0)
+        acceleration = reference.acceleration_mm_s2 / 2.0
+        # what the gears lose has to be added to speed up, and helps to brake
+        loss = math.copysign(self._gear_loss, acceleration * speed)
+        inertia = acceleration * self._mechanical_time_s / (1.0 - loss)
+        skew = estimate.skew_mm if is_right else -estimate.skew_mm
+        return pid(
+            self._position,
+            state,
+            error_mm=reference.gap_mm / 2.0 - position_mm + self._position.synchronisation * skew / 2.0,
+            speed_error_mm_s=speed - speed_mm_s,
+            feed_forward=(speed + inertia) / self._full_speed_mm_s + coulomb,
+            dt_s=dt_s,
+        )
+
+    def _watch(self, state: StepState, estimate: Estimate, now_s: float, measurement: Measurement) -> tuple[Fault, ...]:
+        faults: list[Fault] = []
+        if now_s >= state.safety.clearing_until_s:
+            faults.extend(device_faults(measurement.faults))
+        if state.safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
+            return tuple(faults)
+        if now_s - measurement.received_s > self._device.measurement_timeout_ms * 1e-3:
+            faults.append(Fault.MEASUREMENT_STALE)
+        if abs(estimate.skew_mm) > self._limits.skew_fault_mm:
+            faults.append(Fault.SKEW)
+        if now_s - state.following_s > self._limits.following_time_s:
+            faults.append(Fault.FOLLOWING_ERROR)
+        if measurement.mode is not DeviceMode.RUN and not faults and now_s - state.enabled_s > STARTING_S:
+            faults.append(Fault.DEVICE_NOT_RUNNING)
+        return tuple(faults)
+
+    def _following(self, state: StepState, reference: Reference, estimate: Estimate, now_s: float) -> float:
+        if abs(reference.gap_mm - estimate.gap_mm) <= self._limits.following_error_mm:
+            return math.inf
+        return min(state.following_s, now_s)
+
+    @staticmethod
+    def _off(safety: SafetyState, limits: tuple[Limit, ...]) -> StepOutput:
+        return StepOutput(DriveMode.OFF, 0.0, 0.0, safety.request, safety.request_number, limits)

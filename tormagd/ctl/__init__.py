@@ -1,0 +1,1 @@
+"""tormagctl: the operator's command line. Talks to the daemon over ZeroMQ only."""

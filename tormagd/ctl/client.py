@@ -1,0 +1,103 @@
+"""One request to the daemon's control endpoint, and its answer, within a bounded time."""
+
+import itertools
+import os
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import zmq
+
+from tormagd.ctl.outcome import CommandError, Exit, usage_error
+from tormagd.messages import VERSION, MessageError, Reply, Request, decode, encode
+
+FAULT_CODES = ("fault", "device_latched")
+"Refusals that mean: the device is in FAULT."
+
+
+class Client:
+    """A connection to the control endpoint; a context manager."""
+
+    def __init__(self, address: str, wait_s: float) -> None:
+        self._address, self._wait_s = address, wait_s
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.DEALER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._ids = itertools.count(1)
+        connect(self._socket, address)
+
+    def request(self, command: str, **args: Any) -> dict[str, Any]:
+        """The result of `command`. Raises CommandError: UNREACHABLE without an answer in time, REFUSED or FAULT."""
+        request_id = next(self._ids)
+        self._socket.send(encode(Request(v=VERSION, id=request_id, command=command, args=args)))
+        deadline_s = time.monotonic() + self._wait_s
+        while (left_s := deadline_s - time.monotonic()) > 0.0:
+            if not self._socket.poll(max(1, round(left_s * 1e3))):
+                break
+            reply = _reply(self._socket.recv_multipart()[-1])
+            if reply.id not in (request_id, None):
+                continue  # the late answer to a request that was given up
+            if reply.error is not None:
+                code = Exit.FAULT if reply.error.code in FAULT_CODES else Exit.REFUSED
+                raise CommandError(code, reply.error.code, reply.error.message, reply.error.hint)
+            return reply.result or {}
+        raise unreachable(self._address, f"no answer within {self._wait_s:g} s")
+
+    def close(self) -> None:
+        """Close the connection without waiting for anything."""
+        self._context.destroy(linger=0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def connect(socket: "zmq.Socket[bytes]", address: str) -> None:
+    """Connect `socket`. Raises CommandError (USAGE) for an address that ZeroMQ cannot use."""
+    try:
+        socket.connect(address)
+    except zmq.ZMQError as error:
+        raise usage_error(
+            f"endpoint {address!r}: {error}",
+            f"give an address such as ipc:///run/tormag/control (a path of at most {zmq.IPC_PATH_MAX_LEN} characters)",
+        ) from error
+
+
+def unreachable(address: str, what: str) -> CommandError:
+    """Nobody answers at `address`: says why where that can be seen, and what to do."""
+    message, hint = f"daemon not reachable at {address}: {what}", "is it running? systemctl status tormagd"
+    if address.startswith("ipc:///"):
+        path = Path(address.removeprefix("ipc://"))
+        try:
+            path.stat()
+        except PermissionError:
+            hint = (
+                f"you may not enter {path.parent}: join the group tormag (sudo usermod -aG tormag $USER), log in again"
+            )
+        except OSError:
+            hint = (
+                f"there is no socket {path}: start the daemon (systemctl start tormagd), or give --config or --endpoint"
+            )
+        else:
+            if not os.access(path, os.W_OK):
+                hint = (
+                    f"you may not write to {path}: join the group tormag (sudo usermod -aG tormag $USER), log in again"
+                )
+    return CommandError(Exit.UNREACHABLE, "unreachable", message, hint)
+
+
+def _reply(data: bytes) -> Reply:
+    try:
+        return decode(data, Reply)
+    except MessageError as error:
+        raise CommandError(
+            Exit.UNREACHABLE,
+            "unintelligible",
+            f"the answer is not one of tormagd's: {error}",
+            "check the endpoint, and that tormagd and tormagctl are of the same version",
+        ) from error

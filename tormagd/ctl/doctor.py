@@ -1,0 +1,281 @@
+"""`tormagctl doctor`: what on this machine would hurt real time or access, each with its remedy.
+
+Each check is a small function of the machine (and the configuration) that returns one finding. None of them changes
+anything. A *fail* keeps tormagd from doing what it is configured to do; a *warn* costs timing.
+"""
+
+import os
+import re
+import sys
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+
+import msgspec
+
+from tormagd.config import Config
+from tormagd.ctl.machine import Machine
+from tormagd.ctl.outcome import Colour, Exit, Outcome
+
+CAP_IPC_LOCK, CAP_SYS_NICE = 14, 23
+DEFAULT_SLACK_NS = 50_000
+MEMORY_TO_LOCK_BYTES = 1_000_000_000
+"What the daemon occupies with its models loaded and locked, rounded up."
+GOOD_CLOCKS = ("tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page", "riscv_clocksource", "timebase")
+FAST_LATENCY_MS = 1
+
+
+class Verdict(StrEnum):
+    """How much a finding matters."""
+
+    OK = "ok"
+    WARN = "warn"
+    FAIL = "fail"
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One line of the report: what was found, and where that is not good, what to do in plain words."""
+
+    name: str
+    verdict: Verdict
+    found: str
+    remedy: str = ""
+
+
+def doctor(config: Config, root: Path = Path("/")) -> Outcome:
+    """Run every check. The exit code is REFUSED where one failed."""
+    findings = examine(config, Machine(root))
+    count = {verdict: sum(finding.verdict is verdict for finding in findings) for verdict in Verdict}
+    result = {
+        "checks": [msgspec.to_builtins(finding) for finding in findings],
+        **{str(verdict): number for verdict, number in count.items()},
+    }
+    return Outcome(result, _text(findings), Exit.REFUSED if count[Verdict.FAIL] else Exit.DONE)
+
+
+def examine(config: Config, machine: Machine) -> tuple[Finding, ...]:
+    """Every check's finding, in the order of the report."""
+    return tuple(check(config, machine) for check in CHECKS)
+
+
+def preemption(config: Config, machine: Machine) -> Finding:
+    """How soon the kernel lets go of a processor."""
+    remedy = "install a PREEMPT_RT kernel (Debian: linux-image-rt-amd64), or boot with preempt=full"
+    version = machine.text("/proc/version") or ""
+    if machine.text("/sys/kernel/realtime") == "1" or re.search(r"\bPREEMPT_RT\b", version):
+        return Finding("preemption", Verdict.OK, "PREEMPT_RT")
+    # the model in force stands in brackets or parentheses; reading it takes root
+    active = re.search(r"[\[(](\w+)[\])]", machine.text("/sys/kernel/debug/sched/preempt") or "")
+    if active:
+        return Finding("preemption", Verdict.WARN, f"dynamic, {active[1]} in force", remedy)
+    asked = re.search(r"\bpreempt=(\w+)", machine.text("/proc/cmdline") or "")
+    if "PREEMPT_DYNAMIC" in version:
+        return Finding("preemption", Verdict.WARN, f"dynamic, {asked[1] if asked else 'default'} model", remedy)
+    found = "full, but not PREEMPT_RT" if re.search(r"\bPREEMPT\b", version) else "none or voluntary"
+    return Finding("preemption", Verdict.WARN, found, remedy)
+
+
+def governor(config: Config, machine: Machine) -> Finding:
+    """Whether processors slow down between ticks."""
+    files = machine.path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
+    governors = sorted({text for file in files if (text := machine.text(f"/{file.relative_to(machine.root)}"))})
+    if not governors:
+        return Finding("cpu governor", Verdict.OK, "the kernel does not scale frequencies here")
+    if governors == ["performance"]:
+        return Finding("cpu governor", Verdict.OK, "performance")
+    return Finding(
+        "cpu governor", Verdict.WARN, ", ".join(governors), "sudo cpupower frequency-set --governor performance"
+    )
+
+
+def scheduling(config: Config, machine: Machine) -> Finding:
+    """Whether this user's processes may use SCHED_FIFO, at the priority the configuration asks for."""
+    wanted = config.realtime.fifo_priority
+    allowed = 99 if machine.has_capability(CAP_SYS_NICE) else int(machine.limit("Max realtime priority"))
+    found = f"allowed up to priority {allowed}, configured {wanted}"
+    remedy = "run tormagd by its systemd unit, or add '@tormag - rtprio 90' to /etc/security/limits.d/tormag.conf"
+    if allowed < wanted:
+        return Finding("sched_fifo", Verdict.FAIL, found, remedy)
+    if allowed == 0:
+        return Finding("sched_fifo", Verdict.WARN, found, remedy)
+    if wanted == 0:
+        return Finding("sched_fifo", Verdict.WARN, found, "set realtime.fifo_priority = 50 in the configuration")
+    return Finding("sched_fifo", Verdict.OK, found)
+
+
+def memory_lock(config: Config, machine: Machine) -> Finding:
+    """Whether the daemon may keep its memory from being paged out."""
+    limit = machine.limit("Max locked memory")
+    unlimited = machine.has_capability(CAP_IPC_LOCK) or limit == float("inf")
+    found = "unlimited" if unlimited else f"{limit / 1e6:.0f} MB"
+    if unlimited or limit >= MEMORY_TO_LOCK_BYTES:
+        return Finding("memlock", Verdict.OK, found)
+    remedy = (
+        "run tormagd by its systemd unit, or add '@tormag - memlock unlimited' to /etc/security/limits.d/tormag.conf"
+    )
+    return Finding("memlock", Verdict.FAIL if config.realtime.lock_memory else Verdict.WARN, found, remedy)
+
+
+def cores(config: Config, machine: Machine) -> Finding:
+    """Whether control can have a processor to itself."""
+    count = machine.cores()
+    impossible = [number for number in config.realtime.cpus if number >= count]
+    if impossible:
+        return Finding(
+            "cores", Verdict.FAIL, f"{count} online, realtime.cpus asks for {impossible}", f"name cores 0..{count - 1}"
+        )
+    if count < 2:
+        return Finding("cores", Verdict.WARN, f"{count} online", "use a machine with at least 2 cores")
+    return Finding("cores", Verdict.OK, f"{count} online")
+
+
+def load(config: Config, machine: Machine) -> Finding:
+    """Whether others want the processors as well."""
+    fields = (machine.text("/proc/loadavg") or "").split()
+    if not fields:
+        return Finding("load", Verdict.WARN, "not known", "mount /proc")
+    average, count = float(fields[0]), machine.cores()
+    found = f"{average:.2f} over one minute on {count} cores"
+    if average > 0.8 * count:
+        return Finding("load", Verdict.WARN, found, "stop what else runs here; top shows it")
+    return Finding("load", Verdict.OK, found)
+
+
+def timer_slack(config: Config, machine: Machine) -> Finding:
+    """By how much the kernel may delay this user's timers to bundle them; SCHED_FIFO threads have none."""
+    slack_ns = machine.number("/proc/self/timerslack_ns")
+    if slack_ns is None:
+        return Finding("timer slack", Verdict.OK, "the kernel does not say")
+    found = f"{slack_ns / 1e3:g} us"
+    if slack_ns > DEFAULT_SLACK_NS:
+        return Finding("timer slack", Verdict.WARN, found, "remove TimerSlackNSec= from what starts this session")
+    return Finding("timer slack", Verdict.OK, found)
+
+
+def clock_source(config: Config, machine: Machine) -> Finding:
+    """Whether reading the time is fast and even."""
+    name = machine.text("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+    if name is None:
+        return Finding("clock source", Verdict.OK, "the kernel does not say")
+    if name in GOOD_CLOCKS:
+        return Finding("clock source", Verdict.OK, name)
+    return Finding(
+        "clock source",
+        Verdict.WARN,
+        name,
+        "dmesg | grep -i clocksource tells why tsc was given up; update the firmware",
+    )
+
+
+def swap(config: Config, machine: Machine) -> Finding:
+    """Whether memory can be paged out to a disk."""
+    lines = (machine.text("/proc/swaps") or "").splitlines()[1:]
+    if not lines:
+        return Finding("swap", Verdict.OK, "off")
+    if config.realtime.lock_memory:
+        return Finding("swap", Verdict.OK, f"on ({lines[0].split()[0]}), but realtime.lock_memory keeps the daemon in")
+    return Finding(
+        "swap", Verdict.WARN, f"on ({lines[0].split()[0]})", "set realtime.lock_memory = true, or sudo swapoff -a"
+    )
+
+
+def huge_pages(config: Config, machine: Machine) -> Finding:
+    """Whether the kernel stops processes to make huge pages of their memory."""
+    active = re.search(r"\[(\w+)\]", machine.text("/sys/kernel/mm/transparent_hugepage/enabled") or "")
+    if active is None or active[1] != "always":
+        return Finding("huge pages", Verdict.OK, active[1] if active else "not in this kernel")
+    remedy = "echo madvise | sudo tee /sys/kernel/mm/transparent_hugepage/enabled"
+    return Finding("huge pages", Verdict.WARN, "always", remedy)
+
+
+def run_directory(config: Config, machine: Machine) -> Finding:
+    """Whether sockets can be made where the configuration wants them."""
+    address = config.endpoints.control
+    if not address.startswith("ipc:///"):
+        return Finding("run directory", Verdict.OK, f"none needed for {address}")
+    directory = os.path.dirname(address.removeprefix("ipc://"))  # noqa: PTH120
+    path = machine.path(directory)
+    remedy = "start tormagd by its systemd unit, which makes it; or name ipc sockets in a directory of your own"
+    if not path.is_dir():
+        return Finding("run directory", Verdict.FAIL, f"{directory} does not exist", remedy)
+    if not os.access(path, os.W_OK | os.X_OK):
+        remedy = "join the group tormag (sudo usermod -aG tormag $USER), log in again"
+        return Finding("run directory", Verdict.FAIL, f"{directory} is not writable for you", remedy)
+    return Finding("run directory", Verdict.OK, f"{directory} is writable")
+
+
+def port(config: Config, machine: Machine) -> Finding:
+    """Whether the device's port is there and open to this user. A port that is no path is a CAN channel."""
+    name = config.device.port
+    if not name.startswith("/"):
+        if machine.path(f"/sys/class/net/{name}").exists():
+            return Finding("device port", Verdict.OK, f"network interface {name}")
+        return Finding(
+            "device port",
+            Verdict.WARN,
+            f"no network interface {name}",
+            f"sudo ip link set {name} up type can, if it is one",
+        )
+    target = machine.resolved(name)
+    shown = name if target == name else f"{name} ({target})"
+    path = machine.path(target)
+    if not path.exists():
+        remedy = "plug the device in and switch it on; install systemd/udev/60-tormag.rules for the name /dev/tormag"
+        return Finding("device port", Verdict.FAIL, f"{shown} does not exist", remedy)
+    if not os.access(path, os.R_OK | os.W_OK):
+        remedy = "join the group that owns it (ls -l shows it; dialout or tormag), log in again"
+        return Finding("device port", Verdict.FAIL, f"{shown} is not readable and writable for you", remedy)
+    return Finding("device port", Verdict.OK, shown)
+
+
+def port_holder(config: Config, machine: Machine) -> Finding:
+    """Whether another process has the port. tormagd itself is meant to."""
+    name = config.device.port
+    others = machine.holders(machine.resolved(name)) if name.startswith("/") else []
+    strangers = [f"{comm} (process {pid})" for pid, comm in others if not comm.startswith("tormagd")]
+    if strangers:
+        return Finding("port holder", Verdict.FAIL, ", ".join(strangers), "end it, or give tormagd another port")
+    found = f"tormagd (process {others[0][0]})" if others else "nobody that this user may see"
+    return Finding("port holder", Verdict.OK, found)
+
+
+def usb_latency(config: Config, machine: Machine) -> Finding:
+    """How long a USB serial chip keeps received bytes back."""
+    adapter = os.path.basename(machine.resolved(config.device.port))  # noqa: PTH119
+    file = f"/sys/bus/usb-serial/devices/{adapter}/latency_timer"
+    latency_ms = machine.number(file) if adapter else None
+    if latency_ms is None:
+        return Finding("usb latency", Verdict.OK, "this port has no latency timer")
+    if latency_ms <= FAST_LATENCY_MS:
+        return Finding("usb latency", Verdict.OK, f"{latency_ms} ms")
+    remedy = f"echo {FAST_LATENCY_MS} | sudo tee {file}; systemd/udev/60-tormag.rules does it at every plug"
+    return Finding("usb latency", Verdict.WARN, f"{latency_ms} ms", remedy)
+
+
+CHECKS: tuple[Callable[[Config, Machine], Finding], ...] = (
+    preemption,
+    governor,
+    scheduling,
+    memory_lock,
+    cores,
+    load,
+    timer_slack,
+    clock_source,
+    swap,
+    huge_pages,
+    run_directory,
+    port,
+    port_holder,
+    usb_latency,
+)
+
+
+def _text(findings: tuple[Finding, ...]) -> str:
+    colour = Colour(sys.stdout)
+    paint = {Verdict.OK: colour.green, Verdict.WARN: colour.yellow, Verdict.FAIL: colour.red}
+    lines = []
+    for finding in findings:
+        lines.append(f"{paint[finding.verdict](f'{finding.verdict:<4}')}  {finding.name:<13}  {finding.found}")
+        if finding.remedy:
+            lines.append(f"{'':19}  next: {finding.remedy}")
+    return "\n".join(lines)

@@ -1,0 +1,81 @@
+"""What `/proc` and `/sys` say about this machine, read under a root that tests can replace."""
+
+import os
+import re
+from pathlib import Path
+
+
+class Machine:
+    """A file system root; every path below is absolute on the machine it describes."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def path(self, absolute: str) -> Path:
+        """Where `absolute` is under the root."""
+        return self.root / absolute.lstrip("/")
+
+    def text(self, absolute: str) -> str | None:
+        """The content of a file, stripped; None where it is not there or not ours to read."""
+        try:
+            return self.path(absolute).read_text(encoding="utf-8", errors="replace").strip()
+        except OSError:
+            return None
+
+    def number(self, absolute: str) -> int | None:
+        """The whole number in a file; None where there is none."""
+        text = self.text(absolute)
+        return int(text) if text is not None and re.fullmatch(r"\d+", text) else None
+
+    def limit(self, name: str) -> float:
+        """The soft limit `name` of this process, infinity for unlimited; 0 where it is not listed."""
+        for line in (self.text("/proc/self/limits") or "").splitlines():
+            if line.startswith(name):
+                value = line[len(name) :].split()[0]
+                return float("inf") if value == "unlimited" else float(value)
+        return 0.0
+
+    def has_capability(self, bit: int) -> bool:
+        """Whether this process holds an effective capability, by its number in capabilities(7)."""
+        found = re.search(r"^CapEff:\s*([0-9a-f]+)$", self.text("/proc/self/status") or "", re.MULTILINE)
+        return found is not None and bool(int(found[1], 16) >> bit & 1)
+
+    def cores(self) -> int:
+        """The number of processors online; 1 where the kernel does not say."""
+        ranges = (self.text("/sys/devices/system/cpu/online") or "0").split(",")
+        bounds = [re.findall(r"\d+", part) for part in ranges]
+        return sum(int(b[-1]) - int(b[0]) + 1 for b in bounds if b) or 1
+
+    def resolved(self, absolute: str) -> str:
+        """The path that `absolute` leads to, following symbolic links inside the root."""
+        current = absolute
+        for _ in range(8):
+            try:
+                target = self.path(current).readlink()
+            except OSError:
+                return current
+            current = os.path.normpath(os.path.join(os.path.dirname(current), target))  # noqa: PTH118, PTH120
+        return current
+
+    def holders(self, absolute: str) -> list[tuple[int, str]]:
+        """Process id and name of everybody who has `absolute` open, as far as we may see; not this process."""
+        found = []
+        for process in sorted(self.path("/proc").glob("[0-9]*")):
+            if process.name != str(os.getpid()) and self._holds(process, absolute):
+                name = self.text(f"/proc/{process.name}/comm") or "?"
+                found.append((int(process.name), name))
+        return found
+
+    def _holds(self, process: Path, absolute: str) -> bool:
+        # a process may end, or its files be another user's, while we look
+        try:
+            return any(_target(link) == absolute for link in (process / "fd").iterdir())
+        except OSError:
+            return False
+
+
+def _target(link: Path) -> str | None:
+    try:
+        return str(link.readlink())
+    except OSError:
+        return None

@@ -1,0 +1,234 @@
+"""The command line of `tormagctl`: arguments in, one outcome and an exit code out.
+
+Every command imports what it needs when it runs: `tormagctl status` answers without loading plots or solvers.
+"""
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from tormagd import __version__
+from tormagd.config import Config, ConfigError, Endpoints, load_config
+from tormagd.ctl.outcome import CommandError, Outcome, print_error, print_outcome, usage_error
+
+STATE_COMMANDS = {
+    "enable": "start rendering force (homed, fresh measurements and a neutral setpoint needed)",
+    "disable": "open the gap, then drives off",
+    "pause": "hold the gap where it is",
+    "resume": "go on after pause",
+    "stop": "open the gap and latch; needs clear-fault",
+    "clear-fault": "forget latched faults; stays disabled",
+}
+EXTRAS = {"mcap": "record", "zstandard": "record", "matplotlib": "plot"}
+EXIT_TEXT = """exit codes: 0 done, 1 refused by the daemon (or doctor found a failure), 2 usage, 3 daemon not reachable,
+4 device in FAULT. With --json stdout carries one object: {command, ok, result, error}."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        outcome = _run(options)
+    except CommandError as error:
+        print_error(options.command, error, options.json)
+        return error.exit_code
+    except ModuleNotFoundError as error:
+        extra = EXTRAS.get(error.name or "")
+        if extra is None:
+            raise
+        missing = usage_error(f"{error.name} is not installed", f"pip install 'tormagd[{extra}]'")
+        print_error(options.command, missing, options.json)
+        return missing.exit_code
+    except KeyboardInterrupt:
+        print(f"tormagctl {options.command}: interrupted; the daemon goes on", file=sys.stderr)
+        return 130
+    print_outcome(options.command, outcome, options.json)
+    return outcome.exit_code
+
+
+def _run(options: argparse.Namespace) -> Outcome:
+    config = _configuration(options.config)
+    endpoints = _endpoints(config.endpoints, options.endpoint)
+    match options.command:
+        case "send":
+            return _send(options, endpoints)
+        case "record":
+            from tormagd.ctl.record import record
+
+            return record(endpoints, options.file, options.duration, options.wait)
+        case "plot":
+            from tormagd.ctl.plot import plot
+
+            return plot(options.file, options.output)
+        case "scene":
+            from tormagd.ctl.scene import list_scenes, show_scene
+
+            return list_scenes() if options.action == "list" else show_scene(options.name or config.scene)
+        case "doctor":
+            from tormagd.ctl.doctor import doctor
+
+            return doctor(config)
+        case _:
+            return _ask(options, endpoints)
+
+
+def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
+    from tormagd.ctl.client import Client
+    from tormagd.ctl.operate import home, operate
+    from tormagd.ctl.status import status
+
+    with Client(endpoints.control, options.wait) as client:
+        match options.command:
+            case "status":
+                return status(client)
+            case "home":
+                return home(client, options.timeout, not options.no_wait)
+            case _:
+                return operate(client, options.command)
+
+
+def _send(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
+    from tormagd.ctl.send import send
+    from tormagd.ctl.waveform import WaveformError, read_csv, shape
+
+    # a CSV file lasts as long as it is unless it is to be cut; a computed shape lasts ten seconds
+    try:
+        if options.what.lower().endswith(".csv"):
+            waveform = read_csv(Path(options.what))
+            duration_s = min(waveform.duration_s, options.duration or math.inf)
+        else:
+            duration_s = options.duration or 10.0
+            waveform = shape(options.what, options.from_N, options.to_N, options.frequency, duration_s)
+    except WaveformError as error:
+        raise usage_error(str(error), "correct it and send again; tormagctl send --help shows the choices") from error
+    if options.valid_for_ms < 1e3 / options.rate:
+        raise usage_error(
+            f"--valid-for-ms = {options.valid_for_ms:g}: allowed is at least one period, {1e3 / options.rate:g} ms",
+            "raise --valid-for-ms or --rate, or every setpoint is stale before the next comes",
+        )
+    return send(
+        endpoints.setpoint, waveform, duration_s, options.rate, options.source, options.valid_for_ms, options.wait
+    )
+
+
+def _configuration(path: Path | None) -> Config:
+    try:
+        return load_config(path)
+    except ConfigError as error:
+        raise usage_error(
+            str(error), "correct the file; tormagd --check --config FILE shows what is in force"
+        ) from error
+
+
+def _endpoints(configured: Endpoints, address: str | None) -> Endpoints:
+    """`address` in place of the configured control endpoint. An ipc address's neighbours go with it: they are in one
+    directory wherever the daemon uses its own names."""
+    if address is None:
+        return configured
+    changed = {"control": address}
+    if address.startswith("ipc://") and address.endswith("/control"):
+        directory = address.removesuffix("control")
+        changed = {name: directory + name for name in Endpoints.__struct_fields__}
+    try:
+        return Config(endpoints=msgspec.structs.replace(configured, **changed)).endpoints
+    except ValueError as error:
+        raise usage_error(f"--endpoint: {error}", "give an address such as ipc:///run/tormag/control") from error
+
+
+def _parser() -> argparse.ArgumentParser:
+    # the common options may stand before or after the command; SUPPRESS keeps the second parser from undoing the first
+    shared = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
+    _add_common(shared)
+    parser = argparse.ArgumentParser(
+        prog="tormagctl", description="Operate the tormagd haptic controller.", epilog=EXIT_TEXT
+    )
+    _add_common(parser)
+    parser.set_defaults(config=None, endpoint=None, json=False, wait=1.0)
+    parser.add_argument("--version", action="version", version=f"tormagctl {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, help_text: str) -> argparse.ArgumentParser:
+        return commands.add_parser(name, help=help_text, description=help_text, parents=[shared], epilog=EXIT_TEXT)
+
+    command("status", "what the daemon is doing")
+    for name, help_text in STATE_COMMANDS.items():
+        command(name, help_text)
+    home = command("home", "find the home switches of both carriages")
+    home.add_argument("--timeout", type=_above_zero, default=30.0, metavar="S", help="wait this long (30)")
+    home.add_argument("--no-wait", action="store_true", help="do not wait until it is done")
+
+    send = command("send", "publish setpoints: a synthetic shape or a CSV file t_s,force_N")
+    send.add_argument("what", metavar="{step|sine|ramp|pulse|FILE.csv}")
+    send.add_argument("--rate", type=_rate, default=500.0, metavar="HZ", help="setpoints per second (500)")
+    send.add_argument("--duration", type=_above_zero, metavar="S", help="seconds (10, or the file's length)")
+    send.add_argument("--from-N", dest="from_N", type=_number, default=1.4, metavar="N", help="lower force (1.4)")
+    send.add_argument("--to-N", dest="to_N", type=_number, default=1.7, metavar="N", help="upper force (1.7)")
+    send.add_argument("--frequency", type=_above_zero, default=1.2, metavar="HZ", help="of sine and pulse (1.2)")
+    send.add_argument("--source", type=_source, default="tormagctl", help="the publisher's name (tormagctl)")
+    send.add_argument("--valid-for-ms", type=_validity, default=100.0, metavar="MS", help="of each setpoint (100)")
+
+    record = command("record", "write telemetry and control ticks to an MCAP file until Ctrl-C")
+    record.add_argument("file", type=Path, metavar="FILE.mcap")
+    record.add_argument("--duration", type=_above_zero, default=math.inf, metavar="S", help="end after this time")
+
+    plot = command("plot", "draw a recording: forces, gap, duty, limits and faults")
+    plot.add_argument("file", type=Path, metavar="FILE.mcap")
+    plot.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.png")
+
+    scene = command("scene", "list the scenes, or show one (default: the configuration's)")
+    scene.add_argument("action", choices=("list", "show"))
+    scene.add_argument("name", nargs="?", metavar="NAME")
+    command("doctor", "what on this machine would hurt real time or access, each with its remedy")
+    return parser
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--config", type=Path, metavar="FILE", help="the daemon's configuration")
+    parser.add_argument(
+        "--endpoint", metavar="URL", help="the control endpoint; ipc://DIR/control stands for all in DIR"
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    parser.add_argument("--wait", type=_above_zero, metavar="S", help="longest wait for the daemon (1)")
+
+
+def _number(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text!r}: allowed is a finite number")
+    return value
+
+
+def _within(text: str, least: float, most: float, unit: str) -> float:
+    value = _number(text)
+    if not least <= value <= most:
+        raise argparse.ArgumentTypeError(f"{text}: allowed is {least:g}..{most:g}{unit}")
+    return value
+
+
+def _above_zero(text: str) -> float:
+    return _within(text, 1e-3, 1e6, "")
+
+
+def _rate(text: str) -> float:
+    return _within(text, 1.0, 4_000.0, " Hz")
+
+
+def _validity(text: str) -> float:
+    return _within(text, 0.25, 60_000.0, " ms")
+
+
+def _source(text: str) -> str:
+    if not 0 < len(text) <= 64 or not text.isprintable():
+        raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 1..64 printable characters")
+    return text
+
+
+if __name__ == "__main__":
+    sys.exit(int(main()))

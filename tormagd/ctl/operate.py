@@ -1,0 +1,91 @@
+"""The commands that change what the device does: enable, disable, pause, resume, stop, clear-fault, home."""
+
+import sys
+import time
+from typing import Any
+
+from tormagd.ctl.client import Client
+from tormagd.ctl.outcome import CommandError, Exit, Outcome
+
+POLL_S = 0.05
+BEGIN_S = 2.0
+"By then a device that took the command has said that it is busy, over the slowest link."
+
+DONE_TEXT = {
+    "enable": "enabled",
+    "disable": "disabled; the gap opens",
+    "pause": "paused; the gap is held",
+    "resume": "resumed",
+    "stop": "stopped and latched; the gap opens. tormagctl clear-fault when it is safe to go on",
+    "clear-fault": "fault cleared. tormagctl home, then enable",
+}
+
+
+def operate(client: Client, command: str) -> Outcome:
+    """Give one command that the daemon carries out or refuses at once."""
+    return Outcome(client.request(command), DONE_TEXT[command])
+
+
+def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
+    """Home both carriages and wait until it is done.
+
+    Raises CommandError: REFUSED (by the daemon, did not begin, ended without being homed, not within `timeout_s`),
+    FAULT (the device latched a fault on the way).
+    """
+    was_homed = bool(client.request("status").get("is_homed"))
+    result = client.request("home")
+    if not is_waiting:
+        return Outcome(result, "homing; tormagctl status shows when it is done")
+    started_s = time.monotonic()
+    has_begun = False
+    shows_progress = sys.stderr.isatty()
+    try:
+        while (elapsed_s := time.monotonic() - started_s) < timeout_s:
+            state = client.request("status")
+            _raise_fault(state)
+            is_homed, is_busy = bool(state.get("is_homed")), bool(state.get("is_busy"))
+            # a homing that was over between two looks still shows, as a device that is homed and was not
+            has_begun = has_begun or is_busy or (is_homed and not was_homed)
+            if has_begun and not is_busy:
+                if is_homed:
+                    return Outcome({**result, "seconds": round(elapsed_s, 2)}, f"homed in {elapsed_s:.1f} s")
+                raise CommandError(
+                    Exit.REFUSED, "not_homed", "homing ended, but the device is not homed", "tormagctl status"
+                )
+            if not has_begun and elapsed_s > BEGIN_S:
+                raise CommandError(
+                    Exit.REFUSED,
+                    "not_begun",
+                    "the device did not begin to home",
+                    "look at the link in tormagctl status",
+                )
+            if shows_progress:
+                print(f"\rhoming {elapsed_s:5.1f} s, gap {_gap(state)}   ", end="", file=sys.stderr, flush=True)
+            time.sleep(POLL_S)
+    finally:
+        if shows_progress:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+    raise CommandError(
+        Exit.REFUSED,
+        "timeout",
+        f"still homing after {timeout_s:g} s",
+        "it goes on by itself; tormagctl status shows how far, tormagctl stop ends it",
+    )
+
+
+def _raise_fault(state: dict[str, Any]) -> None:
+    if state.get("operating_state") != "FAULT":
+        return
+    details = state.get("fault_details") or [{}]
+    faults = ", ".join(state.get("faults") or ["FAULT"])
+    raise CommandError(
+        Exit.FAULT,
+        "fault",
+        f"fault while homing: {faults}: {details[0].get('cause', 'see tormagctl status')}",
+        details[0].get("remedy", "tormagctl clear-fault, then home"),
+    )
+
+
+def _gap(state: dict[str, Any]) -> str:
+    gap_mm = state.get("gap_mm")
+    return "not known" if gap_mm is None else f"{gap_mm:.1f} mm"

@@ -1,0 +1,82 @@
+"""How a command ends: exit codes, the errors that stand for them, and what is printed."""
+
+import os
+import sys
+from enum import IntEnum
+from typing import Any, TextIO
+
+import msgspec
+
+
+class Exit(IntEnum):
+    """The exit codes of `tormagctl`."""
+
+    DONE = 0
+    REFUSED = 1
+    USAGE = 2
+    UNREACHABLE = 3
+    FAULT = 4
+
+
+class CommandError(Exception):
+    """A command that did not do what was asked: exit code, a stable code, what happened, and what to do next."""
+
+    def __init__(self, exit_code: Exit, code: str, message: str, hint: str) -> None:
+        super().__init__(message)
+        self.exit_code, self.code, self.message, self.hint = exit_code, code, message, hint
+
+
+def usage_error(message: str, hint: str) -> CommandError:
+    """Something in the arguments, or in a file they name, cannot be used."""
+    return CommandError(Exit.USAGE, "usage", message, hint)
+
+
+class Outcome(msgspec.Struct, frozen=True):
+    """A command that was carried out: its result (the stable keys of `--json`), and the same as text for a person."""
+
+    result: dict[str, Any]
+    text: str
+    exit_code: Exit = Exit.DONE
+
+
+def print_outcome(command: str, outcome: Outcome, as_json: bool) -> None:
+    """On stdout: one JSON object `{command, ok, result, error}`, or the text."""
+    if as_json:
+        _print_json(command, outcome.exit_code is Exit.DONE, outcome.result, None)
+    else:
+        print(outcome.text)
+
+
+def print_error(command: str, error: CommandError, as_json: bool) -> None:
+    """The error and its remedy on stderr, and with `--json` the object on stdout as well."""
+    colour = Colour(sys.stderr)
+    print(f"tormagctl {command}: {colour.red(error.message)}", file=sys.stderr)
+    print(f"  next: {error.hint}", file=sys.stderr)
+    if as_json:
+        _print_json(command, False, None, {"code": error.code, "message": error.message, "hint": error.hint})
+
+
+def _print_json(command: str, ok: bool, result: dict[str, Any] | None, error: dict[str, str] | None) -> None:
+    print(msgspec.json.encode({"command": command, "ok": ok, "result": result, "error": error}).decode())
+
+
+class Colour:
+    """ANSI colours for one stream; plain text where it is no terminal, or where NO_COLOR is set and not empty."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._is_on = stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+
+    def red(self, text: str) -> str:
+        return self._paint("31", text)
+
+    def green(self, text: str) -> str:
+        return self._paint("32", text)
+
+    def yellow(self, text: str) -> str:
+        return self._paint("33", text)
+
+    def bold(self, text: str) -> str:
+        return self._paint("1", text)
+
+    def _paint(self, code: str, text: str) -> str:
+        return f"\x1b[{code}m{text}\x1b[0m" if self._is_on else text

@@ -1,0 +1,33 @@
+"""`tormagctl plot`: a picture of a recording."""
+
+from pathlib import Path
+
+from tormagd.ctl.outcome import Outcome, usage_error
+from tormagd.recording.plot import bands, save_plot, tracking_rms_N
+from tormagd.recording.reader import RecordingError, read_recording
+
+
+def plot(source: Path, target: Path) -> Outcome:
+    """Draw `source` into `target`. Raises CommandError (USAGE) where one cannot be read or the other not written."""
+    try:
+        recording = read_recording(source)
+    except RecordingError as error:
+        raise usage_error(str(error), "give a file that tormagctl record has made") from error
+    try:
+        save_plot(recording, target, source.stem)
+    except ValueError as error:
+        raise usage_error(
+            str(error), "give -o a picture's name, such as pulse.png, and a recording with data"
+        ) from error
+    except OSError as error:
+        raise usage_error(f"{target}: {error.strerror}", "give a file in a directory you may write to") from error
+    result = {
+        "file": str(target),
+        "ticks": int(recording.ticks.t_ns.size),
+        "telemetry": int(recording.telemetry.t_ns.size),
+        "is_complete": recording.is_complete,
+        "tracking_rms_N": tracking_rms_N(recording),
+        "limits": [band.name for band in bands(recording, "limits")],
+        "faults": [band.name for band in bands(recording, "faults")],
+    }
+    return Outcome(result, str(target))

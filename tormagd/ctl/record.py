@@ -1,0 +1,104 @@
+"""`tormagctl record`: write what the daemon publishes to an MCAP file, in a process of its own."""
+
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import zmq
+
+from tormagd.config import Endpoints
+from tormagd.ctl.client import connect, unreachable
+from tormagd.ctl.interrupt import interrupted_by
+from tormagd.ctl.outcome import Outcome, usage_error
+from tormagd.messages import MessageError, Telemetry, decode
+from tormagd.recording.ticks import MAX_BATCH_BYTES, decode_ticks
+from tormagd.recording.writer import RecordingWriter
+
+POLL_MS = 100
+QUEUE = 10_000
+"Batches that may wait while the disk is slow: over three minutes."
+
+
+def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
+    """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM.
+
+    Raises CommandError: USAGE where the file exists or cannot be made, UNREACHABLE where nothing is published within
+    `wait_s`; then there is no file. A message that cannot be read is counted, and the first one's reason told.
+    """
+    context = zmq.Context()
+    try:
+        telemetry = _subscribe(context, endpoints.telemetry)
+        ticks = _subscribe(context, endpoints.recording)
+        with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
+            if not _any_ready((telemetry, ticks), wait_s, is_interrupted):
+                raise unreachable(endpoints.telemetry, f"nothing is published there within {wait_s:g} s")
+            try:
+                writer = RecordingWriter(path)
+            except FileExistsError as error:
+                raise usage_error(f"{path} exists", "give another name; recordings are never overwritten") from error
+            except OSError as error:
+                raise usage_error(f"{path}: {error.strerror}", "give a file in a directory you may write to") from error
+            with writer:
+                return _record(writer, path, telemetry, ticks, duration_s, is_interrupted)
+    finally:
+        context.destroy(linger=0)
+
+
+def _subscribe(context: "zmq.Context[zmq.Socket[bytes]]", address: str) -> "zmq.Socket[bytes]":
+    socket = context.socket(zmq.SUB)
+    socket.setsockopt(zmq.RCVHWM, QUEUE)
+    socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
+    socket.subscribe(b"")
+    connect(socket, address)
+    return socket
+
+
+def _any_ready(sockets: tuple["zmq.Socket[bytes]", ...], wait_s: float, is_interrupted: Callable[[], bool]) -> bool:
+    poller = zmq.Poller()
+    for socket in sockets:
+        poller.register(socket, zmq.POLLIN)
+    end_s = time.monotonic() + wait_s
+    while not (ready := poller.poll(POLL_MS)) and time.monotonic() < end_s and not is_interrupted():
+        pass
+    return bool(ready)
+
+
+def _record(
+    writer: RecordingWriter,
+    path: Path,
+    telemetry: "zmq.Socket[bytes]",
+    ticks: "zmq.Socket[bytes]",
+    duration_s: float,
+    is_interrupted: Callable[[], bool],
+) -> Outcome:
+    unreadable = 0
+    start_s = time.monotonic()
+    while not is_interrupted() and (left_s := start_s + duration_s - time.monotonic()) > 0.0:
+        _any_ready((telemetry, ticks), min(left_s, POLL_MS / 1e3), is_interrupted)
+        for socket in (telemetry, ticks):
+            while socket.poll(0) and not is_interrupted():
+                data = socket.recv_multipart()[-1]
+                try:
+                    if socket is telemetry:
+                        writer.telemetry(decode(data, Telemetry))
+                    else:
+                        writer.ticks(decode_ticks(data))
+                except MessageError as error:
+                    unreadable += 1
+                    if unreadable == 1:
+                        print(f"tormagctl record: left out a message: {error}", file=sys.stderr)
+    result = {
+        "file": str(path),
+        "seconds": round(time.monotonic() - start_s, 3),
+        "telemetry": writer.telemetry_count,
+        "telemetry_lost": writer.telemetry_lost,
+        "ticks": writer.tick_count,
+        "gaps": writer.gaps,
+        "longest_gap_ms": round(writer.longest_gap_ms, 3),
+        "unreadable": unreadable,
+    }
+    losses = f"{writer.gaps} gaps (longest {writer.longest_gap_ms:.0f} ms), {writer.telemetry_lost} snapshots lost"
+    text = f"{path}: {writer.tick_count} ticks, {writer.telemetry_count} snapshots; {losses}"
+    return Outcome(result, text)

@@ -1,0 +1,95 @@
+"""`tormagctl send`: publish setpoints at a steady rate."""
+
+import signal
+import time
+from collections.abc import Callable
+
+import zmq
+
+from tormagd.ctl.client import connect, unreachable
+from tormagd.ctl.interrupt import interrupted_by
+from tormagd.ctl.outcome import CommandError, Exit, Outcome
+from tormagd.ctl.waveform import Waveform
+from tormagd.messages import VERSION, Setpoint, encode
+
+
+def send(
+    address: str, waveform: Waveform, duration_s: float, rate_hz: float, source: str, valid_for_ms: float, wait_s: float
+) -> Outcome:
+    """Publish `waveform` for `duration_s` or until interrupted.
+
+    Each setpoint has its own deadline, counted from the start, so that lateness does not add up. A setpoint whose
+    successor is due already is left out: the newest one wins anyway. Raises CommandError (UNREACHABLE) where no daemon
+    subscribes within `wait_s`, or where it leaves on the way.
+    """
+    context = zmq.Context()
+    # XPUB speaks to SUB as PUB does, and it is told of the subscription: without that the first setpoints would be lost
+    socket = context.socket(zmq.XPUB)
+    socket.setsockopt(zmq.LINGER, 200)
+    try:
+        connect(socket, address)
+        if not socket.poll(round(wait_s * 1e3)):
+            raise unreachable(address, f"nobody takes setpoints there within {wait_s:g} s")
+        socket.recv()
+        with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
+            return _publish(socket, address, waveform, duration_s, rate_hz, source, valid_for_ms, is_interrupted)
+    finally:
+        context.destroy()
+
+
+def _publish(
+    socket: "zmq.Socket[bytes]",
+    address: str,
+    waveform: Waveform,
+    duration_s: float,
+    rate_hz: float,
+    source: str,
+    valid_for_ms: float,
+    is_interrupted: Callable[[], bool],
+) -> Outcome:
+    sent = skipped = index = 0
+    worst_late_s = 0.0
+    first_seq = time.time_ns()  # above every earlier run's, so that none of ours looks repeated
+    start_s, start_ns = time.monotonic(), time.time_ns()
+    while (t_s := index / rate_hz) <= duration_s and not is_interrupted():
+        wait_s = start_s + t_s - time.monotonic()
+        if wait_s > 0.0:
+            time.sleep(wait_s)
+        late_s = time.monotonic() - start_s - t_s
+        worst_late_s = max(worst_late_s, late_s)
+        overdue = min(int(late_s * rate_hz), int(duration_s * rate_hz) - index)
+        skipped += overdue
+        index += overdue
+        if socket.poll(0) and socket.recv()[:1] == b"\x00":
+            raise CommandError(
+                Exit.UNREACHABLE,
+                "gone",
+                f"the daemon at {address} went away after {sent} setpoints",
+                unreachable(address, "").hint,
+            )
+        sample = waveform.at(index / rate_hz)
+        setpoint = Setpoint(
+            v=VERSION,
+            source=source,
+            seq=first_seq + index,
+            stamp_ns=start_ns + round(index / rate_hz * 1e9),  # when the force is meant, whenever it gets sent
+            servo_cf=sample.force_N,
+            valid_for_ms=valid_for_ms,
+            displacement_mm=sample.displacement_mm,
+            rate_mm_s=sample.rate_mm_s,
+        )
+        socket.send(encode(setpoint))
+        sent += 1
+        index += 1
+    seconds = time.monotonic() - start_s
+    result = {
+        "source": source,
+        "sent": sent,
+        "skipped": skipped,
+        "start_ns": start_ns,
+        "seconds": round(seconds, 3),
+        "worst_late_ms": round(worst_late_s * 1e3, 3),
+        "interrupted": bool(is_interrupted()),
+    }
+    left_out = f", {skipped} left out because this machine was late" if skipped else ""
+    return Outcome(result, f"sent {sent} setpoints as {source!r} in {seconds:.1f} s{left_out}")

@@ -1,0 +1,156 @@
+"""What `tormagctl send` sends: a force over time, computed or from a CSV file. All computed shapes are synthetic."""
+
+import csv
+import math
+from bisect import bisect_right
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from tormagd.messages import MAX_FORCE_N
+
+REQUIRED_COLUMNS = ("t_s", "force_N")
+OPTIONAL_COLUMNS = ("displacement_mm", "rate_mm_s")
+MAX_FILE_BYTES = 64_000_000
+
+
+class WaveformError(ValueError):
+    """A shape or a file that cannot be sent: names the file, row, column, value and what is allowed."""
+
+
+class Sample(NamedTuple):
+    """What is asked at one moment."""
+
+    force_N: float
+    displacement_mm: float | None = None
+    rate_mm_s: float | None = None
+
+
+class Waveform(NamedTuple):
+    """`at(t_s)` for t_s in 0..duration_s. A shape that can go on for ever has duration_s = inf."""
+
+    duration_s: float
+    at: Callable[[float], Sample]
+
+
+SHAPES = ("step", "sine", "ramp", "pulse")
+
+
+def shape(name: str, from_N: float, to_N: float, frequency_hz: float, duration_s: float) -> Waveform:
+    """One of SHAPES between two forces. Raises WaveformError.
+
+    step: to_N from half of the time on. ramp: a straight line. sine: begins at from_N, swings to to_N and back.
+    pulse: a synthetic arterial pulse, one beat per 1/frequency_hz.
+    """
+    for label, value in (("from-N", from_N), ("to-N", to_N)):
+        if not 0.0 <= value <= MAX_FORCE_N:
+            raise WaveformError(f"--{label} = {value:g}: allowed is 0..{MAX_FORCE_N:g} N")
+    if name not in SHAPES:
+        raise WaveformError(f"{name!r}: allowed are {', '.join(SHAPES)} or a file ending in .csv")
+    if name in ("step", "ramp") and not math.isfinite(duration_s):
+        raise WaveformError(f"--duration = {duration_s:g}: allowed for a {name} is a finite time")
+
+    def at(t_s: float) -> Sample:
+        match name:
+            case "step":
+                share = float(t_s >= duration_s / 2)
+            case "ramp":
+                share = min(1.0, t_s / duration_s)
+            case "sine":
+                share = 0.5 - 0.5 * math.cos(math.tau * frequency_hz * t_s)
+            case _:
+                share = beat(t_s * frequency_hz % 1.0)
+        return Sample(from_N + (to_N - from_N) * share)
+
+    return Waveform(duration_s, at)
+
+
+def beat(phase: float) -> float:
+    """One synthetic heart beat, 0..1, over `phase` 0..1: a systolic bell, and a lower one for the reflected wave."""
+    bells = math.exp(-(((phase - 0.25) / 0.09) ** 2)) + 0.35 * math.exp(-(((phase - 0.55) / 0.12) ** 2))
+    # the second bell adds 0.06 % to the first one's top
+    return min(1.0, bells)
+
+
+def read_csv(path: Path) -> Waveform:
+    """The waveform of a setpoint CSV: `t_s,force_N` and optional columns, any spacing, straight lines between the rows.
+
+    Time is counted from the first row. Raises WaveformError.
+    """
+    columns, rows = _read_rows(path)
+    start_s = rows[0][columns.index("t_s")]
+    times_s = [row[columns.index("t_s")] - start_s for row in rows]
+    # in the order of Sample's fields; None for a column that the file does not have
+    places = [columns.index(name) if name in columns else None for name in ("force_N", *OPTIONAL_COLUMNS)]
+
+    def at(t_s: float) -> Sample:
+        right = min(max(bisect_right(times_s, t_s), 1), len(rows) - 1)
+        share = (t_s - times_s[right - 1]) / (times_s[right] - times_s[right - 1])
+        share = min(1.0, max(0.0, share))
+        before, after = rows[right - 1], rows[right]
+        values = [None if c is None else before[c] + (after[c] - before[c]) * share for c in places]
+        assert values[0] is not None  # force_N is a required column
+        return Sample(values[0], values[1], values[2])
+
+    return Waveform(times_s[-1], at)
+
+
+def _read_rows(path: Path) -> tuple[list[str], list[list[float]]]:
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise WaveformError(f"{path}: {path.stat().st_size} bytes: allowed is {MAX_FILE_BYTES}")
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file, strict=True)
+            columns = _check_header(path, [name.strip() for name in next(reader, [])])
+            rows: list[list[float]] = []
+            for cells in reader:
+                if cells:
+                    rows.append(_check_row(path, reader.line_num, columns, cells, rows[-1] if rows else None))
+    except OSError as error:
+        raise WaveformError(f"{path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise WaveformError(f"{path}: not UTF-8 text (byte {error.start})") from error
+    except csv.Error as error:
+        raise WaveformError(f"{path}: not CSV: {error}") from error
+    if len(rows) < 2:
+        raise WaveformError(f"{path}: {len(rows)} rows: allowed is at least 2")
+    return columns, rows
+
+
+def _check_header(path: Path, columns: list[str]) -> list[str]:
+    allowed = f"allowed is {','.join(REQUIRED_COLUMNS)} and optionally {','.join(OPTIONAL_COLUMNS)}"
+    missing = [name for name in REQUIRED_COLUMNS if name not in columns]
+    if missing:
+        raise WaveformError(f"{path}: row 1 has no column {missing[0]} (it is {','.join(columns)[:80]!r}): {allowed}")
+    for index, name in enumerate(columns):
+        if name not in REQUIRED_COLUMNS + OPTIONAL_COLUMNS:
+            raise WaveformError(f"{path}: row 1: column {name[:40]!r} is not known: {allowed}")
+        if name in columns[:index]:
+            raise WaveformError(f"{path}: row 1: column {name} is there twice")
+    return columns
+
+
+def _check_row(
+    path: Path, line: int, columns: list[str], cells: list[str], previous: list[float] | None
+) -> list[float]:
+    if len(cells) != len(columns):
+        raise WaveformError(f"{path}: row {line} has {len(cells)} values: allowed is {len(columns)}")
+    row = [_number(path, line, name, text) for name, text in zip(columns, cells, strict=True)]
+    time, force = columns.index("t_s"), columns.index("force_N")
+    if not 0.0 <= row[force] <= MAX_FORCE_N:
+        raise WaveformError(f"{path}: row {line}, force_N = {cells[force]}: allowed is 0..{MAX_FORCE_N:g} N")
+    if previous is not None and not row[time] > previous[time]:
+        raise WaveformError(
+            f"{path}: row {line}, t_s = {cells[time]}: allowed is above the row before, {previous[time]:g}"
+        )
+    return row
+
+
+def _number(path: Path, line: int, name: str, text: str) -> float:
+    try:
+        value = float(text) if "_" not in text else math.nan  # Python reads 1_5 as 15; a table means something else
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise WaveformError(f"{path}: row {line}, {name} = {text[:40]!r}: allowed is a finite number")
+    return value

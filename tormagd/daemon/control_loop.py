@@ -1,0 +1,48 @@
+"""The control loop: on every beat of the heartbeat measure, step, drive."""
+
+import logging
+import time
+
+from tormagd.control.plan import Plan
+from tormagd.control.step import StepOutput, Stepper, StepState
+from tormagd.daemon.rate_group import RateGroup
+from tormagd.hardware.connection import Connection
+from tormagd.safety.operating_state import Conditions
+
+log = logging.getLogger(__name__)
+
+
+class ControlLoop:
+    """Carries the newest measurement through `step` to the device, once a period."""
+
+    def __init__(self, stepper: Stepper, connection: Connection, period_ns: int) -> None:
+        self._stepper, self._connection = stepper, connection
+        self.state: StepState = stepper.start(time.monotonic())
+        self.output: StepOutput | None = None
+        self.timing = RateGroup("control", period_ns)
+        self.next_tick_ns = 0
+
+    def tick(self, due_ns: int, merged: int, plan: Plan) -> None:
+        """The control period that was due at `due_ns` and stands for `merged` missed ones too."""
+        self.next_tick_ns = due_ns + self.timing.period_ns
+        start_ns = time.monotonic_ns()
+        now_s = start_ns * 1e-9
+        before = self.state.safety
+        self.state, output = self._stepper.step(self.state, now_s, self._connection.measurement, plan)
+        self._connection.exchange(
+            now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
+        )
+        self.output = output
+        end_ns = time.monotonic_ns()
+        self.timing.record(due_ns, start_ns, end_ns, merged)
+        if self.state.safety.faults != before.faults:
+            log.error("fault: %s", ", ".join(self.state.safety.faults) or "none left")
+
+    def command(self, name: str, conditions: Conditions) -> None:
+        """An operator's command. Raises RefusedError."""
+        self.state = self._stepper.command(self.state, name, time.monotonic(), conditions)
+        log.info("%s: %s", name, self.state.safety.operating_state)
+
+    def lose_link(self) -> None:
+        """Tells the core that the device is gone."""
+        self.state = self._stepper.lose_link(self.state)

@@ -1,0 +1,203 @@
+"""The daemon put together: one thread, one event loop, three loops in it."""
+
+import asyncio
+import logging
+import signal
+import time
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from tormagd import __version__
+from tormagd.config import Config
+from tormagd.control.core import Core
+from tormagd.daemon import notify
+from tormagd.daemon.control_loop import ControlLoop
+from tormagd.daemon.endpoint import Endpoint
+from tormagd.daemon.heartbeat import Heartbeat
+from tormagd.daemon.inference_loop import InferenceLoop
+from tormagd.daemon.rate_group import RateGroup
+from tormagd.daemon.realtime import freeze_garbage
+from tormagd.daemon.telemetry import TickRow, explanations, snapshot, tick_row
+from tormagd.hardware.backend import Backend
+from tormagd.hardware.connection import Connection
+from tormagd.hardware.link import LinkState
+from tormagd.messages import Request, Telemetry
+from tormagd.safety.codes import FAULTS, LIMITS
+from tormagd.safety.operating_state import Conditions, OperatingState
+
+NS = 1_000_000_000
+RETRACT_ACKNOWLEDGED_S = 0.1
+LONGEST_RETRACT_S = 10.0
+"A full stroke takes the firmware 3 s at its own retract speed; longer means that it cannot, and it says so itself."
+ROWS = 100
+"Ticks in one recording message at most."
+OVERRUN_NEWS_S = 10.0
+"At most one log line about overruns in this time."
+
+log = logging.getLogger(__name__)
+
+
+class Daemon:
+    """Runs one scene on one device until it is told to end."""
+
+    def __init__(self, config: Config, core: Core, open_backend: Callable[[Any], Backend], refused: list[str]) -> None:
+        self._config, self._core, self._refused = config, core, refused
+        self._started_s = time.monotonic()
+        self._connection = Connection(config.device, open_backend, self._lose_link)
+        self._endpoint = Endpoint(config.endpoints)
+        rates = config.rates
+        self._control = ControlLoop(core.stepper, self._connection, NS // rates.control_hz)
+        self._inference = InferenceLoop(core.planner, self._endpoint, NS // rates.inference_hz, self._started_s)
+        self._telemetry = RateGroup("telemetry", NS // rates.telemetry_hz)
+        self._ticks_per_snapshot = rates.control_hz // rates.telemetry_hz
+        self._rows: list[TickRow] = []
+        self._snapshot: Telemetry | None = None
+        self._ended = asyncio.Event()
+        self._reported_overruns = 0
+        self._report_overruns_s = self._started_s
+
+    async def run(self) -> None:
+        """Runs until SIGTERM or SIGINT; opens the gap before it returns."""
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self._ended.set)
+        self._connection.open()
+        freeze_garbage()
+        loop.add_reader(self._endpoint.fileno(), self._receive_setpoints)
+        heartbeat = Heartbeat(NS // self._config.rates.control_hz)
+        loop.add_reader(heartbeat.fileno(), self._beat, heartbeat)
+        notify.notify("READY=1")
+        log.info("running scene %s", self._core.scene.name)
+        await self._ended.wait()
+        notify.notify("STOPPING=1")
+        await self._open_gap()
+        loop.remove_reader(heartbeat.fileno())
+        loop.remove_reader(self._endpoint.fileno())
+        self._connection.close()
+        heartbeat.close()
+        self._endpoint.close()
+        log.info("ended")
+
+    def _beat(self, heartbeat: Heartbeat) -> None:
+        beats = heartbeat.beats()
+        if not beats:
+            return  # a spurious wake-up
+        self._control.tick(heartbeat.due_ns, beats - 1, self._inference.state.plan)
+        self._record()
+        self._inference.after_tick(self._control.state.estimate)
+        if self._control.timing.runs % self._ticks_per_snapshot == 0:
+            self._publish()
+
+    def _receive_setpoints(self) -> None:
+        self._inference.receive(self._control.state.estimate, self._control.next_tick_ns)
+
+    def _record(self) -> None:
+        control, state = self._control, self._inference.state
+        if control.output is None:
+            return
+        timing = control.timing
+        self._rows.append(
+            tick_row(
+                control.state.time_s,
+                control.state,
+                control.output,
+                state.plan,
+                state.trim,
+                self._connection.measurement,
+                timing.lateness_us,
+                timing.exec_us,
+            )
+        )
+
+    def _publish(self) -> None:
+        start_ns = time.monotonic_ns()
+        row = self._rows[-1]
+        plan = self._inference.state.plan
+        stamp = self._endpoint.inbox.newest
+        age = None if stamp is None else start_ns * 1e-9 - stamp.stamp_s
+        self._snapshot = snapshot(row, self._telemetry.runs, self._connection.measurement, age)
+        self._endpoint.publish(self._snapshot)
+        self._endpoint.publish_ticks(TickRow._fields, self._rows[-ROWS:])
+        self._rows.clear()
+        self._endpoint.serve(start_ns * 1e-9, self._answer)
+        if plan.number and self._frames_are_fresh(start_ns * 1e-9):
+            notify.notify("WATCHDOG=1")
+        self._report_overruns(start_ns * 1e-9)
+        self._telemetry.record(start_ns, start_ns, time.monotonic_ns())
+
+    def _frames_are_fresh(self, now_s: float) -> bool:
+        # without a port there are no frames to be fresh, and starting the daemon again would not bring one
+        measurement = self._connection.measurement
+        return self._connection.state is not LinkState.RUNNING or (
+            measurement is not None and now_s - measurement.received_s < self._config.realtime.watchdog_ms * 1e-3
+        )
+
+    def _report_overruns(self, now_s: float) -> None:
+        overruns = self._control.timing.overruns
+        if overruns > self._reported_overruns and now_s > self._report_overruns_s:
+            log.warning("%d control ticks overran their period", overruns - self._reported_overruns)
+            self._reported_overruns = overruns
+            self._report_overruns_s = now_s + OVERRUN_NEWS_S
+
+    def _answer(self, request: Request) -> dict[str, Any]:
+        if request.command == "status":
+            return self._status()
+        self._control.command(request.command, self._conditions())
+        return {"operating_state": str(self._control.state.safety.operating_state)}
+
+    def _conditions(self) -> Conditions:
+        measurement = self._connection.measurement
+        setpoint = self._endpoint.inbox.newest
+        now_s = time.monotonic()
+        is_current = setpoint is not None and now_s - setpoint.stamp_s <= setpoint.valid_for_s
+        least_N = self._core.planner.portrait.least_N
+        timeout_s = self._config.device.measurement_timeout_ms * 1e-3
+        return Conditions(
+            connected=measurement is not None,
+            fresh=measurement is not None and now_s - measurement.received_s < timeout_s,
+            homed=measurement is not None and measurement.is_homed,
+            busy=measurement is not None and measurement.is_busy,
+            device_latched=measurement is not None and measurement.is_latched,
+            requested_N=setpoint.force_N if setpoint is not None and is_current else None,
+            neutral_N=least_N + self._config.limits.neutral_margin_N,
+        )
+
+    def _status(self) -> dict[str, Any]:
+        snapshot_ = self._snapshot
+        if snapshot_ is None:
+            return {}
+        known: dict[str, Any] = msgspec.to_builtins(snapshot_)
+        return known | {
+            "version": __version__,
+            "scene": self._core.scene.name,
+            "uptime_s": round(time.monotonic() - self._started_s, 1),
+            "least_N": round(self._core.planner.portrait.least_N, 3),
+            "most_N": round(self._core.planner.portrait.most_N, 3),
+            "trim": round(self._inference.state.trim, 4),
+            "link": self._connection.report(),
+            "setpoints": self._endpoint.inbox.report(),
+            "rates": {
+                group.name: group.report() for group in (self._control.timing, self._inference.timing, self._telemetry)
+            },
+            "fault_details": explanations(snapshot_.faults, FAULTS),
+            "limit_details": explanations(snapshot_.limits, LIMITS),
+            "not_granted": self._refused,
+        }
+
+    def _lose_link(self) -> None:
+        self._control.lose_link()
+
+    async def _open_gap(self) -> None:
+        """Asks the device to open and waits until it has; what it cannot do in time it goes on doing without us."""
+        if self._control.state.safety.operating_state is not OperatingState.FAULT and self._connection.measurement:
+            self._control.command("disable", self._conditions())
+        until_s = time.monotonic() + LONGEST_RETRACT_S
+        await asyncio.sleep(RETRACT_ACKNOWLEDGED_S)
+        while time.monotonic() < until_s:
+            measurement = self._connection.measurement
+            if measurement is None or not measurement.is_busy:
+                return
+            await asyncio.sleep(0.02)
+

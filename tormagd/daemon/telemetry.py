@@ -1,0 +1,132 @@
+"""Snapshots of the running daemon, built once per telemetry period; status answers and watchers all read the same."""
+
+import time
+from typing import Any, NamedTuple
+
+from tormagd.control.plan import Plan
+from tormagd.control.step import StepOutput, StepState
+from tormagd.hardware.measurement import Measurement
+from tormagd.messages import VERSION, Telemetry, Tick
+from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.operating_state import OperatingState
+
+
+class TickRow(NamedTuple):
+    """One control tick as it is recorded: enough to replay it, in the units of `Telemetry`. Times are in ns and s."""
+
+    t_ns: int
+    monotonic_s: float
+    plan: int
+    setpoint_cf: float | None
+    governed_cf: float
+    predicted_cf: float | None
+    field_mT: float
+    plan_gap_mm: float
+    plan_gap_speed_mm_s: float
+    plan_time_s: float
+    confidence: float
+    trim: float
+    reference_gap_mm: float | None
+    measured_cf: float | None
+    left_mm: float | None
+    right_mm: float | None
+    handle_mm: float | None
+    handle_rate_mm_s: float | None
+    left_duty: float
+    right_duty: float
+    left_current_A: float | None
+    right_current_A: float | None
+    supply_V: float | None
+    device_time_s: float | None
+    operating_state: str
+    limits: tuple[str, ...]
+    faults: tuple[str, ...]
+    lateness_us: float
+    exec_us: float
+
+
+def tick_row(
+    now_s: float,
+    state: StepState,
+    output: StepOutput,
+    plan: Plan,
+    trim: float,
+    measurement: Measurement | None,
+    lateness_us: float,
+    exec_us: float,
+) -> TickRow:
+    """The row of one tick."""
+    estimate = state.estimate
+    return TickRow(
+        t_ns=time.time_ns(),
+        monotonic_s=now_s,
+        plan=plan.number,
+        setpoint_cf=plan.setpoint_N,
+        governed_cf=plan.governed_N,
+        predicted_cf=plan.predicted_N,
+        field_mT=plan.field_mT,
+        plan_gap_mm=plan.gap_mm,
+        plan_gap_speed_mm_s=plan.gap_speed_mm_s,
+        plan_time_s=plan.time_s,
+        confidence=plan.confidence,
+        trim=trim,
+        reference_gap_mm=None if state.reference is None else state.reference.gap_mm,
+        measured_cf=None if estimate is None else estimate.force_N,
+        left_mm=None if estimate is None or not estimate.is_homed else estimate.left_mm,
+        right_mm=None if estimate is None or not estimate.is_homed else estimate.right_mm,
+        handle_mm=None if estimate is None else estimate.handle_mm,
+        handle_rate_mm_s=None if estimate is None else estimate.handle.rate_mm_s,
+        left_duty=output.left_duty,
+        right_duty=output.right_duty,
+        left_current_A=None if measurement is None else measurement.left_current_A,
+        right_current_A=None if measurement is None else measurement.right_current_A,
+        supply_V=None if measurement is None else measurement.supply_V,
+        device_time_s=None if measurement is None else measurement.device_time_s,
+        operating_state=state.safety.operating_state,
+        limits=limits_held(state, output, plan),
+        faults=tuple(state.safety.faults),
+        lateness_us=lateness_us,
+        exec_us=exec_us,
+    )
+
+
+def limits_held(state: StepState, output: StepOutput, plan: Plan) -> tuple[str, ...]:
+    """What holds the force back now; nothing does while the device is not driven."""
+    if state.safety.operating_state in (OperatingState.DISABLED, OperatingState.FAULT):
+        return ()
+    return tuple(dict.fromkeys((*plan.limits, *output.limits)))
+
+
+def snapshot(row: TickRow, sequence: int, measurement: Measurement | None, age_s: float | None) -> Telemetry:
+    """The telemetry of the newest tick."""
+    known = row.left_mm is not None and row.right_mm is not None
+    left, right = row.left_mm or 0.0, row.right_mm or 0.0
+    return Telemetry(
+        v=VERSION,
+        t_ns=row.t_ns,
+        seq=sequence,
+        operating_state=row.operating_state,
+        is_homed=measurement is not None and measurement.is_homed,
+        is_busy=measurement is not None and measurement.is_busy,
+        setpoint_cf=row.setpoint_cf,
+        governed_cf=row.governed_cf,
+        measured_cf=row.measured_cf,
+        predicted_cf=row.predicted_cf,
+        field_mT=row.field_mT,
+        gap_mm=left + right if known else None,
+        gap_setpoint_mm=row.reference_gap_mm,
+        measured_jp=(left, right) if known else None,
+        skew_mm=left - right if known else None,
+        duty=(row.left_duty, row.right_duty),
+        limits=row.limits,
+        faults=row.faults,
+        setpoint_age_ms=None if age_s is None else age_s * 1e3,
+        confidence=row.confidence,
+        tick=Tick(lateness_us=row.lateness_us, exec_us=row.exec_us),
+    )
+
+
+def explanations(codes: tuple[str, ...], table: dict[Any, Any]) -> list[dict[str, str]]:
+    """Each code with its cause and remedy."""
+    kind = Fault if Fault.STOPPED in table else Limit
+    return [{"code": code, **table[kind(code)]._asdict()} for code in codes]

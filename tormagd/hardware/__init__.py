@@ -1,0 +1,1 @@
+"""Hardware: what carries messages to the firmware, and what the firmware last said."""

@@ -1,0 +1,29 @@
+"""Messages to serial bytes and back: the part of the serial backend that needs no port."""
+
+from firmware_protocol.codec import FUNCTION, DecodeError, Message, decode, encode
+from firmware_protocol.framing import FrameDecoder, encode_frame
+
+
+class FrameStream:
+    """Both directions of one serial conversation. A frame that does not decode is counted, never raised."""
+
+    def __init__(self) -> None:
+        self._decoder = FrameDecoder()
+        self._sequence = 0
+        self.statistics = self._decoder.statistics
+
+    def pack(self, message: Message) -> bytes:
+        """The bytes of the next outgoing frame. Raises EncodeError for a value that does not fit the wire."""
+        frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
+        self._sequence = (self._sequence + 1) % 256
+        return frame
+
+    def unpack(self, data: bytes) -> list[Message]:
+        """The valid messages completed by `data`."""
+        messages = []
+        for frame in self._decoder.feed(data):
+            try:
+                messages.append(decode(frame.function, frame.payload))
+            except DecodeError:
+                self.statistics.corrupt += 1
+        return messages

@@ -1,0 +1,198 @@
+"""The conversation with one firmware: handshake, commands that are repeated until acknowledged, measurements.
+
+No I/O and no clock: the daemon and the virtual-time simulation carry the same messages to and from it.
+"""
+
+import math
+from enum import StrEnum
+
+from firmware_protocol.codec import (
+    PROTOCOL_VERSION,
+    SCHEMA_HASH,
+    Clear,
+    Drive,
+    DriveMode,
+    Hello,
+    Home,
+    Identity,
+    Message,
+    Retract,
+    Sense,
+    State,
+    Status,
+    period,
+)
+from tormagd.hardware.measurement import Measurement
+from tormagd.safety.operating_state import DeviceRequest
+
+REPEAT_S = 0.05
+"A Hello or a command without its acknowledgement is sent again after this time."
+HELLO_S = 1.0
+"A device that was reset takes no Drive before a Hello; it hears one this often."
+SILENT_S = 0.1
+"Without any message for this long the link is lost; the firmware has opened the gap by then."
+
+POSITION_SPAN_MM = period(State, "left_position_mm")
+DEVICE_TIME_SPAN_S = period(State, "device_time_s")
+HANDLE_SPAN_MM = period(Sense, "handle_position_mm")
+
+_COMMANDS: dict[DeviceRequest, type[Home] | type[Retract] | type[Clear]] = {
+    DeviceRequest.HOME: Home,
+    DeviceRequest.RETRACT: Retract,
+    DeviceRequest.CLEAR: Clear,
+}
+
+
+class LinkState(StrEnum):
+    """Where the conversation stands."""
+
+    CLOSED = "CLOSED"
+    IDENTIFYING = "IDENTIFYING"
+    RUNNING = "RUNNING"
+    REFUSED = "REFUSED"
+    LOST = "LOST"
+
+
+class DeviceLink:
+    """One conversation, from the opening of the port to its loss. A new connection takes a new link."""
+
+    def __init__(self, now_s: float) -> None:
+        self.state = LinkState.IDENTIFYING
+        self.cause = "waiting for the device to say who it is"
+        self.identity: Identity | None = None
+        self.measurement: Measurement | None = None
+        self._heard_s = now_s
+        self._hello_due_s = now_s
+        self._counter = 0
+        self._nonce = 0
+        # a Hello sets what the device calls the last accepted nonce, so it repeats that one and acknowledges nothing
+        self._acknowledged = 0
+        self._request = DeviceRequest.NONE
+        self._request_due_s = now_s
+        self._state: State | None = None
+        self._sense: Sense | None = None
+        self._status: Status | None = None
+
+    def receive(self, now_s: float, message: Message) -> None:
+        """Takes one message from the device."""
+        self._heard_s = now_s
+        if isinstance(message, State):
+            self._take_state(now_s, message)
+        elif isinstance(message, Sense):
+            self._take_sense(message)
+        elif isinstance(message, Status):
+            self._take_status(message)
+        elif isinstance(message, Identity):
+            self._take_identity(message)
+
+    def due(self, now_s: float) -> list[Message]:
+        """Handshake and command messages to send now; also notices silence."""
+        if now_s - self._heard_s > SILENT_S and self.state is LinkState.RUNNING:
+            self.state = LinkState.LOST
+            self.cause = f"no message for {SILENT_S * 1e3:.0f} ms"
+        messages: list[Message] = []
+        is_waiting = self._request is not DeviceRequest.NONE and self.state is LinkState.RUNNING
+        if now_s >= self._hello_due_s and not is_waiting:
+            self._hello_due_s = now_s + (REPEAT_S if self.identity is None else HELLO_S)
+            messages.append(Hello(schema_hash=SCHEMA_HASH, protocol_version=PROTOCOL_VERSION, nonce=self._acknowledged))
+        if is_waiting and now_s >= self._request_due_s:
+            self._request_due_s = now_s + REPEAT_S
+            messages.append(_COMMANDS[self._request](nonce=self._nonce))
+        return messages
+
+    def drive(self, left_duty: float, right_duty: float, mode: DriveMode) -> Drive:
+        """The next Drive message; duties in -1..1."""
+        self._counter = (self._counter + 1) % 256
+        return Drive(left_duty=left_duty, right_duty=right_duty, mode=mode, counter=self._counter)
+
+    def request(self, now_s: float, request: DeviceRequest) -> None:
+        """Asks the device for a routine; repeated until its Status acknowledges it. Replaces an unfinished one."""
+        # 0 is what a freshly started device reports, so it never stands for a request
+        self._nonce = self._nonce % 255 + 1
+        self._request = request
+        self._request_due_s = now_s
+
+    def age_s(self, now_s: float) -> float:
+        """Time since the newest measurement, s; infinite without one."""
+        return math.inf if self.measurement is None else now_s - self.measurement.received_s
+
+    def _take_identity(self, identity: Identity) -> None:
+        self.identity = identity
+        if identity.schema_hash == SCHEMA_HASH:
+            self.state = LinkState.RUNNING
+            self.cause = ""
+        else:
+            self.state = LinkState.REFUSED
+            self.cause = (
+                f"the firmware's protocol schema is {identity.schema_hash:08x} (firmware {identity.firmware_major}."
+                f"{identity.firmware_minor}), this daemon's is {SCHEMA_HASH:08x}: install the one that fits the other"
+            )
+
+    def _take_status(self, status: Status) -> None:
+        self._status = status
+        if self._request is not DeviceRequest.NONE and status.command_nonce == self._nonce:
+            self._request = DeviceRequest.NONE
+            self._acknowledged = self._nonce
+        if self.measurement is not None:
+            self.measurement = self.measurement._replace(
+                mode=status.mode,
+                switches=status.switches,
+                faults=status.faults,
+                temperature_C=status.temperature_C,
+                supply_V=status.supply_V,
+            )
+
+    def _take_sense(self, sense: Sense) -> None:
+        # Sense follows the State of the same instant; the measurement takes the newest of both
+        if self.measurement is not None and self._sense is not None:
+            travel = _unwrapped(self._sense.handle_position_mm, sense.handle_position_mm, HANDLE_SPAN_MM)
+            self.measurement = self.measurement._replace(
+                left_current_A=sense.left_current_A,
+                right_current_A=sense.right_current_A,
+                force_N=sense.force_N,
+                handle_mm=self.measurement.handle_mm + travel,
+            )
+        self._sense = sense
+
+    def _take_state(self, now_s: float, state: State) -> None:
+        previous, self._state = self._state, state
+        if previous is None or self.measurement is None:
+            self._first_measurement(now_s, state)
+            return
+        last = self.measurement
+        # before homing the position's origin is arbitrary; homing sets it to 0, so a wrap and a re-zero look alike:
+        # taking the shortest way each time is right for the first and harmless for the second
+        self.measurement = last._replace(
+            number=last.number + 1,
+            received_s=now_s,
+            device_time_s=last.device_time_s + (state.device_time_s - previous.device_time_s) % DEVICE_TIME_SPAN_S,
+            left_mm=last.left_mm + _unwrapped(previous.left_position_mm, state.left_position_mm, POSITION_SPAN_MM),
+            right_mm=last.right_mm + _unwrapped(previous.right_position_mm, state.right_position_mm, POSITION_SPAN_MM),
+        )
+
+    def _first_measurement(self, now_s: float, state: State) -> None:
+        if self._status is None or self._sense is None:
+            self._state = None
+            return
+        status, sense = self._status, self._sense
+        self.measurement = Measurement(
+            number=0,
+            received_s=now_s,
+            device_time_s=state.device_time_s,
+            left_mm=state.left_position_mm,
+            right_mm=state.right_position_mm,
+            left_current_A=sense.left_current_A,
+            right_current_A=sense.right_current_A,
+            force_N=sense.force_N,
+            handle_mm=0.0,
+            mode=status.mode,
+            switches=status.switches,
+            faults=status.faults,
+            temperature_C=status.temperature_C,
+            supply_V=status.supply_V,
+        )
+
+
+def _unwrapped(previous: float, value: float, span: float) -> float:
+    """The shortest way from `previous` to `value` on a circle of `span`."""
+    return (value - previous + span / 2.0) % span - span / 2.0

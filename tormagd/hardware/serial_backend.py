@@ -1,0 +1,76 @@
+"""The serial backend: pyserial opens and configures the port, the event loop watches its descriptor."""
+
+import os
+
+import serial
+
+from firmware_protocol.codec import Message
+from tormagd.config import Device
+from tormagd.hardware.backend import BackendError, LinkStatistics
+from tormagd.hardware.frame_stream import FrameStream
+
+READ_BYTES = 4_096
+UNSENT_BYTES = 512  # half a frame may wait for the driver; more means that nobody reads at the other end
+
+
+class SerialBackend:
+    """An open, exclusively held serial port."""
+
+    def __init__(self, port: serial.Serial) -> None:
+        self._port = port
+        self._fd: int = port.fileno()
+        self._stream = FrameStream()
+        self._unsent = b""
+
+    @property
+    def statistics(self) -> LinkStatistics:
+        """Counters since the port was opened."""
+        return self._stream.statistics
+
+    def fileno(self) -> int:
+        """The port's descriptor."""
+        return self._fd
+
+    def receive(self) -> list[Message]:
+        """All valid messages that have arrived. Raises BackendError at end-of-file or a read error."""
+        try:
+            data = os.read(self._fd, READ_BYTES)
+        except BlockingIOError:
+            return []
+        except OSError as error:
+            raise BackendError(f"{self._port.port}: reading failed: {error.strerror}") from error
+        if not data:
+            raise BackendError(f"{self._port.port}: the device was unplugged")
+        return self._stream.unpack(data)
+
+    def send(self, message: Message) -> None:
+        """Writes one frame. Raises BackendError when the port is gone or its far end has stopped reading."""
+        data = self._unsent + self._stream.pack(message)
+        try:
+            written = os.write(self._fd, data)
+        except BlockingIOError:
+            written = 0
+        except OSError as error:
+            raise BackendError(f"{self._port.port}: writing failed: {error.strerror}") from error
+        self._unsent = data[written:]
+        if len(self._unsent) > UNSENT_BYTES:
+            raise BackendError(f"{self._port.port}: nobody reads at the other end")
+
+    def close(self) -> None:
+        """Closes the port and drops its lock."""
+        try:
+            self._port.close()
+        except OSError:  # a port whose device is gone cannot be flushed, and need not be
+            return
+
+
+def open_serial(device: Device) -> SerialBackend:
+    """Opens `device.port` exclusively. Raises BackendError saying why not."""
+    try:
+        port = serial.Serial(device.port, device.baud, timeout=0, write_timeout=0, exclusive=True)
+        port.reset_input_buffer()
+    except serial.SerialException as error:
+        raise BackendError(f"{device.port}: cannot be opened: {error}") from error
+    except OSError as error:
+        raise BackendError(f"{device.port}: cannot be opened: {error.strerror}") from error
+    return SerialBackend(port)

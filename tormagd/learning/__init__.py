@@ -1,0 +1,1 @@
+"""What was learned: data sets, the network, its training, model files."""

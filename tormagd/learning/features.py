@@ -1,0 +1,87 @@
+"""What the network is fed: the four features of Eq. 43, their units, their scaling, and the check at the border."""
+
+from enum import StrEnum
+from typing import Self
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tormagd.physics.errors import DomainError
+
+FEATURES = ("displacement_mm", "rate_mm_s", "field_mT", "cip_percent")
+UNITS = {"displacement_mm": "mm", "rate_mm_s": "mm/s", "field_mT": "mT", "cip_percent": "%", "force_N": "N"}
+FIELD = FEATURES.index("field_mT")
+
+LARGEST = 1e9
+"""Bound on every input and weight: no device comes near it, and the product of two does not overflow float32."""
+
+
+class Element(StrEnum):
+    """What the features were measured on: they mean different things on the two, so a model serves one only."""
+
+    TORQUE = "torque"
+    TACTILE = "tactile"
+
+
+class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Affine map between physical values and the network's -1..1: scaled = (value - offset) * gain.
+
+    A feature that never varied in training has gain 0: the network knows nothing about it and does not depend on it.
+    """
+
+    input_offset: tuple[float, float, float, float]
+    input_gain: tuple[float, float, float, float]
+    output_offset: float
+    output_gain: float
+
+    @classmethod
+    def fit(cls, features: NDArray[np.float64], force_N: NDArray[np.float64]) -> Self:
+        """Map the range of each column of `features` (n x 4), and of `force_N` (n), onto -1..1."""
+        low, high = features.min(axis=0), features.max(axis=0)
+        span = high - low
+        gain = np.divide(2.0, span, out=np.zeros_like(span), where=span > 0)
+        force_low, force_high = float(force_N.min()), float(force_N.max())
+        if not force_high > force_low:
+            raise DomainError(
+                "force_N", force_low, "at least two different values, otherwise there is nothing to learn"
+            )
+        return cls(
+            input_offset=tuple(((low + high) / 2).tolist()),
+            input_gain=tuple(gain.tolist()),
+            output_offset=(force_low + force_high) / 2,
+            output_gain=2 / (force_high - force_low),
+        )
+
+
+def require_inputs(displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> None:
+    """Raise `DomainError` naming the first feature that is NaN, infinite or beyond `LARGEST`."""
+    # written out because it stands before every prediction of the control loop
+    if (
+        -LARGEST <= displacement_mm <= LARGEST
+        and -LARGEST <= rate_mm_s <= LARGEST
+        and -LARGEST <= field_mT <= LARGEST
+        and -LARGEST <= cip_percent <= LARGEST
+    ):
+        return
+    for name, value in zip(FEATURES, (displacement_mm, rate_mm_s, field_mT, cip_percent), strict=True):
+        require_number(name, value)
+
+
+def require_number(name: str, value: float) -> None:
+    """Raise `DomainError` when `value` is NaN, infinite or beyond `LARGEST`."""
+    if not -LARGEST <= value <= LARGEST:
+        raise DomainError(name, value, f"a finite number within +-{LARGEST:g}")
+
+
+def require_features(features: NDArray[np.float64]) -> None:
+    """Raise `DomainError` unless `features` is n x 4, finite and within +-`LARGEST`."""
+    if features.ndim != 2 or features.shape[1] != len(FEATURES):
+        raise DomainError(
+            "features", f"an array of shape {features.shape}", f"n x 4 in the order {', '.join(FEATURES)}"
+        )
+    refused = ~(np.abs(features) <= LARGEST)
+    if refused.any():
+        row, column = np.argwhere(refused)[0]
+        where = f"features[{row}], {FEATURES[column]}"
+        raise DomainError(where, features[row, column], f"a finite number within +-{LARGEST:g}")

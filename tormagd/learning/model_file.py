@@ -1,0 +1,307 @@
+"""The force model as data: a frozen network with its provenance, and the file that carries it.
+
+A model file is safetensors, which holds numbers and text and cannot carry code. Its header says what the numbers mean,
+and a SHA-256 over header and tensors makes every changed bit a refusal instead of a different force.
+"""
+
+import datetime
+import hashlib
+import json
+import math
+import re
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import msgspec
+import numpy as np
+import safetensors
+import safetensors.numpy
+from numpy.typing import ArrayLike, NDArray
+
+from tormagd.learning.features import (
+    FEATURES,
+    FIELD,
+    LARGEST,
+    UNITS,
+    Element,
+    Scaling,
+    require_features,
+    require_inputs,
+    require_number,
+)
+from tormagd.physics.errors import DomainError
+
+Array: TypeAlias = NDArray[np.float64]
+
+FORMAT = "tormagd-force-model-1"
+MAX_HIDDEN = 4096
+MAX_FILE_BYTES = 1 << 20
+"""Room for the largest admissible network, and little enough that a wrong file is refused before it costs memory."""
+
+TEXT_FIELDS = frozenset({"element", "insert", "training_data_sha256", "created"})
+"""Header fields written as they are; the others are JSON."""
+
+
+class ModelFileError(ValueError):
+    """A model file that is missing, damaged, or meant for something else; the text says which and what to do."""
+
+
+class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a force model is and where it came from.
+
+    `insert` names the insert the data were measured on; `ranges` holds the least and the greatest value seen in
+    training for each feature and for `force_N`; `metrics` whatever the trainer measured; `created` is given, never
+    read from a clock. Raises `DomainError` on anything that could not be saved and loaded again.
+    """
+
+    element: Element
+    insert: str
+    hidden: int
+    ranges: dict[str, tuple[float, float]]
+    scaling: Scaling
+    training_data_sha256: str
+    metrics: dict[str, float]
+    created: datetime.date
+    features: tuple[str, ...] = FEATURES
+    units: dict[str, str] = msgspec.field(default_factory=lambda: dict(UNITS))
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[\x21-\x7e]{1,64}", self.insert):
+            raise DomainError("insert", repr(self.insert[:80]), "1 to 64 printable characters without blanks")
+        if not re.fullmatch(r"[0-9a-f]{64}", self.training_data_sha256):
+            raise DomainError("training_data_sha256", repr(self.training_data_sha256[:80]), "64 hexadecimal digits")
+        if not 1 <= self.hidden <= MAX_HIDDEN:
+            raise DomainError("hidden", self.hidden, f"1 to {MAX_HIDDEN}")
+        if self.features != FEATURES:
+            raise DomainError("features", self.features, f"{FEATURES}, in this order")
+        if self.units != UNITS:
+            raise DomainError("units", self.units, str(UNITS))
+        if set(self.ranges) != set(UNITS):
+            raise DomainError("ranges", sorted(self.ranges), f"one range for each of {', '.join(UNITS)}")
+        for name, (low, high) in self.ranges.items():
+            if not -LARGEST <= low <= high <= LARGEST:
+                raise DomainError(f"ranges.{name}", (low, high), f"[least, greatest], finite, within +-{LARGEST:g}")
+        low, high = self.ranges["force_N"]
+        if not low < high:
+            raise DomainError("ranges.force_N", (low, high), "a greatest force above the least")
+        scaling = self.scaling
+        numbers = (*scaling.input_offset, *scaling.input_gain, scaling.output_offset, scaling.output_gain)
+        if not all(abs(number) <= LARGEST for number in numbers):
+            raise DomainError("scaling", scaling, f"finite numbers within +-{LARGEST:g}")
+        if not scaling.output_gain > 0:
+            raise DomainError("scaling.output_gain", scaling.output_gain, "above 0")
+        for name, value in self.metrics.items():
+            if not math.isfinite(value):
+                raise DomainError(f"metrics.{name}", value, "a finite number")
+
+
+class PhysicalLayers(NamedTuple):
+    """The network in physical units: F = output_bias + output_weight . sigmoid(hidden_weight x + hidden_bias)."""
+
+    hidden_weight: Array
+    hidden_bias: Array
+    output_weight: Array
+    output_bias: float
+
+
+@dataclass(frozen=True, eq=False)
+class ForceModel:
+    """Force of one insert from (displacement_mm, rate_mm_s, field_mT, cip_percent), by a 4-h-1 sigmoid network.
+
+    The weights act on scaled values (`metadata.scaling`): hidden_weight (h x 4), hidden_bias (h), output_weight (h).
+    `physical` is the same network with the scaling folded in.
+    Raises `DomainError` when metadata and weights do not fit together, or a number is not finite.
+    """
+
+    metadata: ModelMetadata
+    hidden_weight: Array
+    hidden_bias: Array
+    output_weight: Array
+    output_bias: float
+    physical: PhysicalLayers = field(init=False, repr=False)
+    _tanh: PhysicalLayers = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        hidden = self.metadata.hidden
+        for name, shape in (("hidden_weight", (hidden, 4)), ("hidden_bias", (hidden,)), ("output_weight", (hidden,))):
+            object.__setattr__(self, name, _weights(name, getattr(self, name), shape))
+        require_number("output_bias", self.output_bias)
+        object.__setattr__(self, "physical", self._fold())
+        # sigmoid(z) = (1 + tanh(z/2)) / 2: one operation fewer than exp, and it cannot overflow
+        weight, bias, output, constant = self.physical
+        halved = PhysicalLayers(weight / 2, bias / 2, output / 2, constant + float(output.sum()) / 2)
+        object.__setattr__(self, "_tanh", halved)
+
+    def _fold(self) -> PhysicalLayers:
+        scaling = self.metadata.scaling
+        gain, offset = np.array(scaling.input_gain), np.array(scaling.input_offset)
+        weight = self.hidden_weight * gain
+        constant = self.output_bias / scaling.output_gain + scaling.output_offset
+        require_number("output_bias / output_gain + output_offset", constant)
+        return PhysicalLayers(
+            _weights("hidden_weight * input_gain", weight, weight.shape),
+            _weights("hidden_bias, unscaled", self.hidden_bias - weight @ offset, self.hidden_bias.shape),
+            _weights("output_weight / output_gain", self.output_weight / scaling.output_gain, self.output_weight.shape),
+            constant,
+        )
+
+    @property
+    def feature_ranges(self) -> tuple[tuple[float, float], ...]:
+        """Least and greatest value of each feature seen in training, in the order of `FEATURES`."""
+        return tuple(self.metadata.ranges[name] for name in FEATURES)
+
+    @property
+    def field_range_mT(self) -> tuple[float, float]:
+        """Least and greatest field seen in training."""
+        return self.metadata.ranges["field_mT"]
+
+    @property
+    def force_span_N(self) -> float:
+        """Greatest less least force seen in training."""
+        low, high = self.metadata.ranges["force_N"]
+        return high - low
+
+    def predict(self, features: ArrayLike) -> Array:
+        """Force in N (n) for `features` (n x 4, order of `FEATURES`). Raises `DomainError` on a wrong shape or NaN."""
+        rows = np.asarray(features, dtype=np.float64)
+        require_features(rows)
+        weight, bias, output, constant = self._tanh
+        return np.asarray(np.tanh(rows @ weight.T + bias) @ output + constant, dtype=np.float64)
+
+    def predict_one(self, displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
+        """Force in N at one point: `predict` without its overhead. Raises `DomainError` on a non-finite input."""
+        require_inputs(displacement_mm, rate_mm_s, field_mT, cip_percent)
+        weight, bias, output, constant = self._tanh
+        hidden = weight.dot((displacement_mm, rate_mm_s, field_mT, cip_percent))
+        hidden += bias
+        return float(output.dot(np.tanh(hidden, hidden))) + constant
+
+    def field_slope_N_per_mT(self, features: ArrayLike) -> Array:
+        """dF/dB (n) at `features` (n x 4). Raises `DomainError` like `predict`."""
+        rows = np.asarray(features, dtype=np.float64)
+        require_features(rows)
+        weight, bias, output, _ = self._tanh
+        return np.asarray((1 - np.tanh(rows @ weight.T + bias) ** 2) @ (output * weight[:, FIELD]), dtype=np.float64)
+
+
+def save_model(path: Path | str, model: ForceModel) -> None:
+    """Write `model` to `path`; the same model gives the same bytes. Readers see the old file or the whole new one."""
+    target = Path(path)
+    tensors = _tensors(model)
+    header = _header(model.metadata)
+    header["checksum"] = _checksum(header, tensors)
+    temporary = target.with_name(target.name + ".part")
+    temporary.write_bytes(_canonical(safetensors.numpy.save(tensors, header)))
+    temporary.replace(target)
+
+
+def load_model(path: Path | str, *, element: Element | str, insert: str | None = None) -> ForceModel:
+    """Read a model meant for `element` and, when given, trained on `insert`.
+
+    Raises `ModelFileError` when the file cannot be read, is truncated or altered, holds anything but a finite 4-h-1
+    network in the features and units of this program, or belongs to another element or insert.
+    """
+    source = Path(path)
+    try:
+        with source.open("rb") as file:
+            model = _decode(file.read(MAX_FILE_BYTES + 1))
+    except OSError as error:
+        raise ModelFileError(f"{source}: cannot be read: {error.strerror}") from error
+    except safetensors.SafetensorError as error:
+        raise ModelFileError(f"{source}: damaged or not a model file ({error}); train or copy it again") from error
+    except RecursionError as error:
+        raise ModelFileError(f"{source}: the header is nested without end, which no model file is") from error
+    except (DomainError, msgspec.DecodeError, ModelFileError) as error:
+        raise ModelFileError(f"{source}: {error}") from error
+    found = model.metadata
+    if found.element != element:
+        raise ModelFileError(f"{source}: trained on the {found.element} element, but the {element} element is in use")
+    if insert is not None and found.insert != insert:
+        raise ModelFileError(f"{source}: trained on insert {found.insert}, but {insert} is in use")
+    return model
+
+
+def _decode(data: bytes) -> ForceModel:
+    if len(data) > MAX_FILE_BYTES:
+        raise ModelFileError(f"more than {MAX_FILE_BYTES} bytes, which no force model has")
+    # the library proves that the header is whole and that the tensors lie inside the file
+    tensors = {name: _tensor(name, content) for name, content in safetensors.deserialize(data)}  # type: ignore[no-untyped-call]
+    header = _json_header(data).get("__metadata__", {})
+    if header.get("format") != FORMAT:
+        raise ModelFileError(f"format is {header.get('format')!r}, not {FORMAT!r}")
+    checksum = header.pop("checksum", None)
+    if checksum != _checksum(header, tensors):
+        raise ModelFileError("altered since it was written (the checksum does not match); train or copy it again")
+    names = {"hidden_weight", "hidden_bias", "output_weight", "output_bias"}
+    if set(tensors) != names:
+        raise ModelFileError(f"tensors are {sorted(tensors)}; needed are {sorted(names)}")
+    del header["format"]
+    fields = {name: text if name in TEXT_FIELDS else msgspec.json.decode(text) for name, text in header.items()}
+    return ForceModel(
+        metadata=msgspec.convert(fields, ModelMetadata),
+        hidden_weight=tensors["hidden_weight"],
+        hidden_bias=tensors["hidden_bias"],
+        output_weight=tensors["output_weight"],
+        output_bias=float(_weights("output_bias", tensors["output_bias"], (1,))[0]),
+    )
+
+
+def _tensor(name: str, content: dict[str, Any]) -> Array:
+    if content["dtype"] not in ("F64", "float64"):
+        raise ModelFileError(f"tensor {name} is {content['dtype']}; needed is F64")
+    return np.frombuffer(content["data"], dtype="<f8").reshape(content["shape"])
+
+
+def _weights(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Return `value` as an unwritable float64 copy; raise `DomainError` on another shape or a number not finite."""
+    source = np.asarray(value)
+    if source.dtype.kind != "f":
+        raise DomainError(name, source.dtype, "floating-point numbers")
+    array = source.astype(np.float64)
+    if array.shape != shape:
+        raise DomainError(name, f"shape {array.shape}", f"shape {shape}")
+    refused = array[~(np.abs(array) <= LARGEST)]
+    if refused.size:
+        raise DomainError(name, refused.flat[0], f"finite numbers within +-{LARGEST:g}")
+    array.setflags(write=False)
+    return array
+
+
+def _tensors(model: ForceModel) -> dict[str, Array]:
+    return {
+        "hidden_weight": model.hidden_weight,
+        "hidden_bias": model.hidden_bias,
+        "output_weight": model.output_weight,
+        "output_bias": np.array([model.output_bias]),
+    }
+
+
+def _header(metadata: ModelMetadata) -> dict[str, str]:
+    fields = msgspec.to_builtins(metadata)
+    texts = {name: value if name in TEXT_FIELDS else json.dumps(value) for name, value in fields.items()}
+    return {"format": FORMAT, **texts}
+
+
+def _checksum(header: dict[str, str], tensors: dict[str, Array]) -> str:
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"{name} {tensor.dtype} {tensor.shape}".encode())
+        digest.update(tensor.tobytes())
+    return digest.hexdigest()
+
+
+def _json_header(data: bytes) -> dict[str, dict[str, str]]:
+    (length,) = struct.unpack_from("<Q", data)
+    decoded: dict[str, dict[str, str]] = msgspec.json.decode(data[8 : 8 + length])
+    return decoded
+
+
+def _canonical(data: bytes) -> bytes:
+    """Return safetensors bytes with the header's keys sorted: the library writes its metadata in random order."""
+    (length,) = struct.unpack_from("<Q", data)
+    header = json.dumps(_json_header(data), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)
+    return struct.pack("<Q", len(header)) + header + data[8 + length :]

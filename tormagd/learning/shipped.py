@@ -1,0 +1,20 @@
+"""The models that come with the package."""
+
+from importlib import resources
+from pathlib import Path
+
+from tormagd.learning.model_file import ModelFileError
+
+_MODELS = resources.files(__package__) / "models"
+_ENDING = ".safetensors"
+
+
+def model_path(name_or_path: str, beside: Path) -> Path:
+    """The file of a shipped model's name, or a path, relative to `beside`. Raises ModelFileError naming the shipped."""
+    shipped = sorted(entry.name.removesuffix(_ENDING) for entry in _MODELS.iterdir() if entry.name.endswith(_ENDING))
+    if name_or_path in shipped:
+        return Path(str(_MODELS / f"{name_or_path}{_ENDING}"))
+    path = beside / name_or_path
+    if not path.is_file():
+        raise ModelFileError(f"model {name_or_path!r}: allowed is a model file or one of {', '.join(shipped)}")
+    return path

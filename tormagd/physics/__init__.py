@@ -1,0 +1,1 @@
+"""What the device is: field, magnetoelastic brake force, friction, relaxation, inserts, magnets."""

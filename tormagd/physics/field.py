@@ -1,0 +1,145 @@
+"""Field laws: the radial moment of the magnets' field as a function of their gap.
+
+The field in the elastomer is taken as radial, b = (mu_r / 4) a / R (thesis Eq. 6 and 8). The *radial moment* a, in
+T m, carries the whole dependence on the gap; the factor mu_r / 4 is left out of it, so that one law serves every
+insert. Reading b as independent of mu_r, as Eq. 6 literally says, would make the weakly filled inserts the strongest,
+which is the opposite of what table 2.4 measured.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from tormagd.physics.errors import Real, require
+
+REFERENCE_PERMEABILITY = 4.0
+"""Relative permeability at which both field laws were fitted: b = (mu_r / 4) a / R."""
+
+_TM_PER_MT_MM = 1e-6
+_EQ7_C1, _EQ7_C2, _EQ7_P = 1.206, 1256.0, 1.867
+_EQ7_MIN_MM, _EQ7_MAX_MM = 45.0, 95.0
+_EQ7_CURVED_MAX_MM = _EQ7_MAX_MM - 1e-9
+
+
+class FieldLaw(Protocol):
+    """A strictly falling map from gap (mm) to radial moment (T m), with its inverse and derivatives.
+
+    Every method takes a float or an array, returns the same kind and shape, and raises `DomainError` for a gap outside
+    `gap_range_mm`, or a radial moment that no gap in that range gives.
+    """
+
+    @property
+    def gap_range_mm(self) -> tuple[float, float]:
+        """Smallest and largest gap for which the law holds, mm."""
+
+    def radial_moment_Tm(self, gap_mm: Real) -> Real:
+        """Radial moment a, T m."""
+
+    def gap_mm(self, radial_moment_Tm: Real) -> Real:
+        """Gap with that radial moment, mm."""
+
+    def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
+        """First derivative of the radial moment, T m per mm; never positive."""
+
+    def d2_radial_moment_d_gap2(self, gap_mm: Real) -> Real:
+        """Second derivative of the radial moment, T m per mm^2."""
+
+
+@dataclass(frozen=True, slots=True)
+class ThesisFieldLaw:
+    """Thesis Eq. 7: a = c1 (95 - gap)^p + c2, in mT mm, on 45..95 mm.
+
+    The printed equation carries no unit; mT mm is the one that gives the measured field ("up to 800 mT"). It must not
+    be stretched beyond 95 mm: a larger s_max in Eq. 7 raises the field at *every* gap.
+
+    At 95 mm the slope is zero, so the inverse loses half of its digits there, and the second derivative has no bound:
+    asking for it at 95 mm raises `DomainError`.
+    """
+
+    @property
+    def gap_range_mm(self) -> tuple[float, float]:
+        return _EQ7_MIN_MM, _EQ7_MAX_MM
+
+    def radial_moment_Tm(self, gap_mm: Real) -> Real:
+        require("gap_mm", gap_mm, *self.gap_range_mm)
+        return _TM_PER_MT_MM * (_EQ7_C1 * _power(_EQ7_MAX_MM - gap_mm, _EQ7_P) + _EQ7_C2)
+
+    def gap_mm(self, radial_moment_Tm: Real) -> Real:
+        _require_moment(radial_moment_Tm, self)
+        # abs(): the weakest moment itself, times 1e6, may round to just under c2
+        excess = abs(radial_moment_Tm / _TM_PER_MT_MM - _EQ7_C2)
+        return _EQ7_MAX_MM - _power(excess / _EQ7_C1, 1.0 / _EQ7_P)
+
+    def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
+        require("gap_mm", gap_mm, *self.gap_range_mm)
+        return -_TM_PER_MT_MM * _EQ7_C1 * _EQ7_P * _power(_EQ7_MAX_MM - gap_mm, _EQ7_P - 1.0)
+
+    def d2_radial_moment_d_gap2(self, gap_mm: Real) -> Real:
+        require("gap_mm", gap_mm, _EQ7_MIN_MM, _EQ7_CURVED_MAX_MM)
+        return _TM_PER_MT_MM * _EQ7_C1 * _EQ7_P * (_EQ7_P - 1.0) * _power(_EQ7_MAX_MM - gap_mm, _EQ7_P - 2.0)
+
+
+@dataclass(frozen=True, slots=True)
+class PowerFieldLaw:
+    """Power law of the thesis's appendix: a = coefficient * gap^exponent, T m with the gap in mm.
+
+    It agrees with Eq. 7 within about 10% on 45..95 mm, and is the one to use beyond. It is accepted from 1 mm, under
+    which its pole at zero takes over, to 10 m.
+    Raises `DomainError` unless 1e-6 <= coefficient <= 1e3 and -6 <= exponent <= -0.1.
+    """
+
+    coefficient: float = 0.44
+    exponent: float = -1.3
+
+    def __post_init__(self) -> None:
+        require("coefficient", self.coefficient, 1e-6, 1e3)
+        require("exponent", self.exponent, -6.0, -0.1)
+
+    @property
+    def gap_range_mm(self) -> tuple[float, float]:
+        return 1.0, 1e4
+
+    def radial_moment_Tm(self, gap_mm: Real) -> Real:
+        require("gap_mm", gap_mm, *self.gap_range_mm)
+        return self.coefficient * _power(gap_mm, self.exponent)
+
+    def gap_mm(self, radial_moment_Tm: Real) -> Real:
+        _require_moment(radial_moment_Tm, self)
+        return _power(radial_moment_Tm / self.coefficient, 1.0 / self.exponent)
+
+    def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
+        require("gap_mm", gap_mm, *self.gap_range_mm)
+        return self.coefficient * self.exponent * _power(gap_mm, self.exponent - 1.0)
+
+    def d2_radial_moment_d_gap2(self, gap_mm: Real) -> Real:
+        require("gap_mm", gap_mm, *self.gap_range_mm)
+        return self.coefficient * self.exponent * (self.exponent - 1.0) * _power(gap_mm, self.exponent - 2.0)
+
+
+def flux_density_T(radial_moment_Tm: Real, relative_permeability: float, radius_m: float) -> Real:
+    """Radial flux density b = (mu_r / 4) a / R in the elastomer, T (Eq. 6 with the permeability of Eq. 8)."""
+    require("radial_moment_Tm", radial_moment_Tm, 0.0, 1e6)
+    return radial_moment_Tm * _flux_per_moment(relative_permeability, radius_m)
+
+
+def radial_moment_from_flux_density_Tm(flux_density_T: Real, relative_permeability: float, radius_m: float) -> Real:
+    """Radial moment a, T m, that gives the flux density b at radius R: inverse of `flux_density_T`."""
+    require("flux_density_T", flux_density_T, 0.0, 1e6)
+    return flux_density_T / _flux_per_moment(relative_permeability, radius_m)
+
+
+def _flux_per_moment(relative_permeability: float, radius_m: float) -> float:
+    require("relative_permeability", relative_permeability, 1.0, 1e3)
+    require("radius_m", radius_m, 1e-5, 1.0)
+    return relative_permeability / (REFERENCE_PERMEABILITY * radius_m)
+
+
+def _require_moment(radial_moment_Tm: Real, law: FieldLaw) -> None:
+    nearest_mm, farthest_mm = law.gap_range_mm
+    weakest_Tm, strongest_Tm = law.radial_moment_Tm(farthest_mm), law.radial_moment_Tm(nearest_mm)
+    require("radial_moment_Tm", radial_moment_Tm, weakest_Tm, strongest_Tm)
+
+
+def _power(base: Real, exponent: float) -> Real:
+    # a float power is typed Any, because a negative base would give a complex number; here none is negative
+    power: Real = base**exponent
+    return power

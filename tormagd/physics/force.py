@@ -1,0 +1,173 @@
+"""The magnetoelastic brake force: from the radial moment of the field to the friction force at the roller, and back.
+
+This is the thesis's chain (Eq. 29..34, with Gamma_1 and Gamma_2 as its appendix has them) with units; the dimensionless
+curve it reduces to, and why it is written so, is in `tormagd.physics.brake_curve`:
+
+    y = (mu_r a / 4)^2 / (4 mu0 mu_r G0 R_o R_i)                   magnetic over elastic stress
+    F = 2 pi t R_i^2 mu_d G0 / R_w * curve(y)                      Eq. 33 and 34
+
+The radial moment a (`radial_moment_Tm`) is that of `tormagd.physics.field`, without mu_r / 4. F rises strictly with it,
+so the inverse is unique. The model is used for a radial stretch lambda1 >= 0.05 only.
+
+Every function takes a float (and returns one; about ten times faster), or an array of float32 or float64 whose shape
+and type the result keeps. All raise `DomainError` for NaN and for values outside the stated domain.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tormagd.physics.brake_curve import MAX_COMPRESSION, BrakeCurve
+from tormagd.physics.errors import DomainError, FloatArray, Real, require
+from tormagd.physics.field import REFERENCE_PERMEABILITY, FieldLaw
+
+MU0_H_M = 4e-7 * math.pi
+
+
+@dataclass(frozen=True, slots=True)
+class Geometry:
+    """Elastomer cylinder around its shaft, and the roller, all in m.
+
+    Raises `DomainError` unless every length is 10 um .. 1 m and inner_radius_m < outer_radius_m.
+    """
+
+    inner_radius_m: float
+    outer_radius_m: float
+    thickness_m: float
+    roller_radius_m: float
+
+    def __post_init__(self) -> None:
+        for name in ("inner_radius_m", "outer_radius_m", "thickness_m", "roller_radius_m"):
+            require(name, getattr(self, name), 1e-5, 1.0)
+        if not self.inner_radius_m < self.outer_radius_m:
+            raise DomainError("outer_radius_m", self.outer_radius_m, f"above inner_radius_m, {self.inner_radius_m}")
+
+
+TORMAG = Geometry(inner_radius_m=0.004, outer_radius_m=0.011, thickness_m=0.020, roller_radius_m=0.020)
+"""The thesis's device (table 2.2)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Elastomer:
+    """Shear modulus G0 (Pa), relative permeability mu_r and kinetic friction coefficient mu_d of one insert.
+
+    Raises `DomainError` unless 1 Pa <= G0 <= 1 GPa, 1 <= mu_r <= 1000 and 0.001 <= mu_d <= 10.
+    """
+
+    shear_modulus_Pa: float
+    relative_permeability: float
+    friction_coefficient: float
+
+    def __post_init__(self) -> None:
+        require("shear_modulus_Pa", self.shear_modulus_Pa, 1.0, 1e9)
+        require("relative_permeability", self.relative_permeability, 1.0, 1e3)
+        require("friction_coefficient", self.friction_coefficient, 1e-3, 10.0)
+
+
+def max_radial_moment_Tm(elastomer: Elastomer, geometry: Geometry) -> float:
+    """Largest admissible radial moment, T m: the one that compresses the elastomer to lambda1 = 0.05."""
+    return _reduce(elastomer, geometry).max_moment_Tm
+
+
+def stretch_minus_one(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
+    """Radial stretch at the shaft less one, lambda1 - 1, from -0.95 to 0 (Eq. 29)."""
+    law = _reduce(elastomer, geometry)
+    require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
+    return -law.curve.compression(law.load(radial_moment_Tm))
+
+
+def brake_force_N(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
+    """Kinetic friction force at the roller, N, >= 0 (Eq. 33 and 34)."""
+    law = _reduce(elastomer, geometry)
+    require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
+    return law.force(radial_moment_Tm)
+
+
+def brake_force_masked_N(
+    radial_moment_Tm: FloatArray, elastomer: Elastomer, geometry: Geometry
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """`brake_force_N` of an array that may leave the domain: (force, admissible).
+
+    Where `admissible` is False (lambda1 would be below 0.05) the force is that of the domain's edge, a lower bound.
+    Raises `DomainError` for NaN and for elements outside 0..1e30.
+    """
+    law = _reduce(elastomer, geometry)
+    require("radial_moment_Tm", radial_moment_Tm, 0.0, 1e30)
+    return law.force(np.minimum(radial_moment_Tm, law.max_moment_Tm)), radial_moment_Tm <= law.max_moment_Tm
+
+
+def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
+    """Slope of the force over the radial moment, N / (T m), >= 0."""
+    law = _reduce(elastomer, geometry)
+    require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
+    load = law.load(radial_moment_Tm)
+    slope = law.curve.force_slope(law.curve.compression(load), load)
+    return 2.0 * law.force_scale_N * law.load_root_per_Tm**2 * radial_moment_Tm * slope
+
+
+def d_force_d_gap(gap_mm: Real, field: FieldLaw, elastomer: Elastomer, geometry: Geometry) -> Real:
+    """Slope of the force over the gap, N/mm, <= 0 (the bracket of Eq. 36)."""
+    return d_force_d_moment(field.radial_moment_Tm(gap_mm), elastomer, geometry) * field.d_radial_moment_d_gap(gap_mm)
+
+
+def d2_force_d_gap2(gap_mm: Real, field: FieldLaw, elastomer: Elastomer, geometry: Geometry) -> Real:
+    """Curvature of the force over the gap, N/mm^2."""
+    law = _reduce(elastomer, geometry)
+    moment_Tm = field.radial_moment_Tm(gap_mm)
+    require("radial_moment_Tm", moment_Tm, 0.0, law.max_moment_Tm)
+    load = law.load(moment_Tm)
+    compression = law.curve.compression(load)
+    slope, curvature = law.curve.force_slope(compression, load), law.curve.force_curvature(compression, load)
+    # chain rule twice: over y = (root a)^2, then over a(gap)
+    scale = 2.0 * law.force_scale_N * law.load_root_per_Tm**2
+    moment_slope = field.d_radial_moment_d_gap(gap_mm)
+    moment_curvature = field.d2_radial_moment_d_gap2(gap_mm)
+    return scale * ((slope + 2.0 * load * curvature) * moment_slope**2 + moment_Tm * slope * moment_curvature)
+
+
+def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
+    """Radial moment that gives the force, T m: inverse of `brake_force_N`.
+
+    Raises `DomainError` unless 0 <= force_N <= the force at `max_radial_moment_Tm`.
+    """
+    law = _reduce(elastomer, geometry)
+    require("force_N", force_N, 0.0, law.max_force_N)
+    load = law.curve.load(law.curve.compression_for_force(force_N / law.force_scale_N))
+    root: Real = load**0.5
+    return root / law.load_root_per_Tm
+
+
+class _Reduced(NamedTuple):
+    """One elastomer in one geometry: the dimensionless curve and the two scales that give it units."""
+
+    curve: BrakeCurve
+    load_root_per_Tm: float
+    force_scale_N: float
+    max_moment_Tm: float
+    max_force_N: float
+
+    def load(self, moment_Tm: Real) -> Real:
+        root = self.load_root_per_Tm * moment_Tm
+        return root * root
+
+    def force(self, moment_Tm: Real) -> Real:
+        load = self.load(moment_Tm)
+        return self.force_scale_N * self.curve.force(self.curve.compression(load), load)
+
+
+@lru_cache(maxsize=64)
+def _reduce(elastomer: Elastomer, geometry: Geometry) -> _Reduced:
+    g0, mu_r = elastomer.shear_modulus_Pa, elastomer.relative_permeability
+    inner, outer, thickness = geometry.inner_radius_m, geometry.outer_radius_m, geometry.thickness_m
+    curve = BrakeCurve.of(wall=(outer - inner) / inner, body_force=thickness * (mu_r - 1.0))
+    # b R = (mu_r / 4) a, and y = (b R)^2 / (4 mu0 mu_r G0 R_o R_i)
+    root = math.sqrt(mu_r / (4.0 * MU0_H_M * g0 * outer * inner)) / REFERENCE_PERMEABILITY
+    scale_N = 2.0 * math.pi * thickness * inner * inner * elastomer.friction_coefficient * g0 / geometry.roller_radius_m
+    max_moment_Tm = math.sqrt(curve.load(MAX_COMPRESSION)) / root
+    edge = _Reduced(curve, root, scale_N, max_moment_Tm, max_force_N=math.inf)
+    # evaluated as any other force, so that the force of the largest moment is admitted to the last digit
+    return edge._replace(max_force_N=edge.force(max_moment_Tm))

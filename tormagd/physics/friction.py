@@ -1,0 +1,80 @@
+"""Friction between elastomer and shaft: pre-sliding stiffness, Stribeck level, viscous part.
+
+A LuGre model without micro-damping. Its state is the bristle deflection z, in mm at the roller surface, positive when
+the handle last moved in the positive direction:
+
+    dz/dt = v - sigma0 |v| z / g(v)              g(v) = F_kinetic (1 + (ratio - 1) exp(-(v / v_s)^2))
+    F     = sigma0 z + sigma2 v
+
+The force is that which resists positive motion of the handle; the hand does the work F v.
+"""
+
+import math
+from dataclasses import dataclass
+
+from tormagd.physics.errors import DomainError, require
+
+MAX_SPEED_MM_S = 1e6
+MAX_LEVEL_N = 1e6
+MAX_STEP_S = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Friction:
+    """Friction at the roller, apart from its kinetic level, which the field sets.
+
+    presliding_stiffness_N_mm  sigma0: stiffness before break-away, > 0
+    viscous_N_s_mm             sigma2: viscous coefficient, >= 0
+    static_ratio               break-away over kinetic level, >= 1
+    stribeck_speed_mm_s        v_s: speed at which the level has fallen most of the way to kinetic, > 0
+    """
+
+    presliding_stiffness_N_mm: float
+    viscous_N_s_mm: float
+    static_ratio: float
+    stribeck_speed_mm_s: float
+
+    def __post_init__(self) -> None:
+        require("presliding_stiffness_N_mm", self.presliding_stiffness_N_mm, 1e-6, 1e6)
+        require("viscous_N_s_mm", self.viscous_N_s_mm, 0.0, 1e3)
+        require("static_ratio", self.static_ratio, 1.0, 10.0)
+        require("stribeck_speed_mm_s", self.stribeck_speed_mm_s, 1e-6, 1e6)
+
+    def level_N(self, speed_mm_s: float, kinetic_N: float) -> float:
+        """Steady level g(v) of the dry part at that speed, N."""
+        ratio = speed_mm_s / self.stribeck_speed_mm_s
+        return kinetic_N * (1.0 + (self.static_ratio - 1.0) * math.exp(-ratio * ratio))
+
+    def advance(self, deflection_mm: float, speed_mm_s: float, kinetic_N: float, dt_s: float) -> tuple[float, float]:
+        """One step at constant speed and level: (force_N, deflection_mm) at its end.
+
+        Exact in z for any dt. A deflection above what the level now carries (the field fell) slips back to that
+        level first, so the dry force never exceeds g(v). Passive: z moves with v, so the returned force times the
+        step's displacement is at least the exact work, and sigma0 z^2 / 2 is all that the hand can get back.
+        Raises `DomainError` for a value that is not finite, a negative level or a negative step.
+        """
+        if not (
+            -MAX_SPEED_MM_S <= speed_mm_s <= MAX_SPEED_MM_S
+            and 0.0 <= kinetic_N <= MAX_LEVEL_N
+            and 0.0 <= dt_s <= MAX_STEP_S
+            and abs(deflection_mm) < math.inf
+        ):
+            _refuse(deflection_mm, speed_mm_s, kinetic_N, dt_s)
+        viscous_N = self.viscous_N_s_mm * speed_mm_s
+        reach_mm = self.level_N(speed_mm_s, kinetic_N) / self.presliding_stiffness_N_mm
+        if reach_mm == 0.0:
+            return viscous_N, 0.0
+        if deflection_mm > reach_mm:
+            deflection_mm = reach_mm
+        elif deflection_mm < -reach_mm:
+            deflection_mm = -reach_mm
+        steady_mm = reach_mm if speed_mm_s >= 0.0 else -reach_mm
+        deflection_mm -= (steady_mm - deflection_mm) * math.expm1(-abs(speed_mm_s) * dt_s / reach_mm)
+        return self.presliding_stiffness_N_mm * deflection_mm + viscous_N, deflection_mm
+
+
+def _refuse(deflection_mm: float, speed_mm_s: float, kinetic_N: float, dt_s: float) -> None:
+    require("speed_mm_s", speed_mm_s, -MAX_SPEED_MM_S, MAX_SPEED_MM_S)
+    require("kinetic_N", kinetic_N, 0.0, MAX_LEVEL_N)
+    require("dt_s", dt_s, 0.0, MAX_STEP_S)
+    raise DomainError("deflection_mm", deflection_mm, "a finite number")

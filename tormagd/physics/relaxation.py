@@ -1,0 +1,83 @@
+"""Viscoelastic memory: a generalised Maxwell element (Prony series) driven by a force.
+
+    F = (1 - sum g_i) F0 + sum g_i h_i           dh_i/dt = dF0/dt - h_i / tau_i
+
+F0 is the force the elastomer would give without memory. After a step F0 the force starts at F0 and relaxes to
+(1 - sum g_i) F0. After a long rest at a high F0, a fall to a low one undershoots and can leave F below zero: contact is
+then lost, and it is the caller who says that a brake's level is not negative.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from tormagd.physics.errors import DomainError, require
+
+PronyState: TypeAlias = tuple[float, ...]
+"""The last driving force, N, then one branch force h_i, N, for each time constant."""
+
+MAX_FORCE_N = 1e9
+MAX_STEP_S = 1e9
+
+
+@dataclass(frozen=True, slots=True)
+class PronyStep:
+    """The exact update of a `PronySeries` over one step length, for a driving force linear over the step."""
+
+    equilibrium_fraction: float
+    fractions: tuple[float, ...]
+    decays: tuple[float, ...]
+    gains: tuple[float, ...]
+
+    def advance(self, state: PronyState, driving_N: float) -> tuple[float, PronyState]:
+        """(force_N, next state) at the end of the step, at which the driving force is `driving_N`.
+
+        Raises `DomainError` if `driving_N` is not finite or the state does not fit the series.
+        """
+        if not -MAX_FORCE_N <= driving_N <= MAX_FORCE_N:
+            require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
+        if len(state) != len(self.fractions) + 1:
+            raise DomainError("state", state, f"1 + {len(self.fractions)} forces")
+        change_N = driving_N - state[0]
+        force_N = self.equilibrium_fraction * driving_N
+        following = [driving_N]
+        for index, fraction in enumerate(self.fractions):
+            branch_N = state[index + 1] * self.decays[index] + change_N * self.gains[index]
+            force_N += fraction * branch_N
+            following.append(branch_N)
+        return force_N, tuple(following)
+
+
+@dataclass(frozen=True, slots=True)
+class PronySeries:
+    """Relaxing fractions g_i (each >= 0, sum < 1) and their time constants tau_i, s; raises `DomainError` otherwise."""
+
+    fractions: tuple[float, ...]
+    times_s: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.fractions) != len(self.times_s):
+            raise DomainError("times_s", self.times_s, f"one time for each of the {len(self.fractions)} fractions")
+        for fraction in self.fractions:
+            require("fractions", fraction, 0.0, 1.0)
+        for time_s in self.times_s:
+            require("times_s", time_s, 1e-6, 1e9)
+        if not sum(self.fractions) < 1.0:
+            raise DomainError("fractions", self.fractions, "a sum below 1")
+
+    def relaxed(self, driving_N: float) -> PronyState:
+        """State after an endless rest at that driving force; at 0 N, the state of an element never loaded."""
+        require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
+        return (driving_N, *(0.0 for _ in self.fractions))
+
+    def discretise(self, dt_s: float) -> PronyStep:
+        """The update for steps of `dt_s` (0 is a jump of the driving force); keep it where the step is constant."""
+        require("dt_s", dt_s, 0.0, MAX_STEP_S)
+        ratios = [dt_s / time_s for time_s in self.times_s]
+        return PronyStep(
+            equilibrium_fraction=1.0 - sum(self.fractions),
+            fractions=self.fractions,
+            decays=tuple(math.exp(-ratio) for ratio in ratios),
+            # mean of the decay over the step: what is left of a ramp that rose by one over it
+            gains=tuple(-math.expm1(-ratio) / ratio if ratio > 0.0 else 1.0 for ratio in ratios),
+        )

@@ -1,0 +1,241 @@
+"""One picture of a recording: what was asked, what was rendered, and what held it back.
+
+Quantities are taken from the control ticks where they are recorded there, else from telemetry. Their names are those of
+`Telemetry`; where a tick spells them otherwise, `SPELLINGS` says how.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from tormagd.recording.reader import Recording
+
+Floats = NDArray[np.float64]
+
+FORMATS = (".png", ".svg", ".pdf")
+BREAK_S = 0.1
+"Rows further apart than this are not joined by a line: nothing is known between them."
+
+# Okabe and Ito's palette, which stays apart for colour-blind eyes; red is kept for faults
+BLACK, BLUE, ORANGE, SKY, GREEN, PINK = "#222222", "#0072b2", "#e69f00", "#56b4e9", "#009e73", "#cc79a7"
+RED, GREY = "#d32f2f", "#9e9e9e"
+STATE_COLOURS = {"DISABLED": "#d0d0d0", "ENABLED": GREEN, "PAUSED": SKY, "FAULT": RED}
+LIMIT_COLOURS = (ORANGE, PINK, BLUE, "#8d6e63", "#7e57c2", "#f0c419")
+SPELLINGS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "gap_mm": (("gap_mm",), ("left_mm", "right_mm")),
+    "gap_setpoint_mm": (("gap_setpoint_mm",), ("reference_gap_mm",)),
+    "left_duty": (("left_duty",), ("duty.0",)),
+    "right_duty": (("right_duty",), ("duty.1",)),
+}
+"The columns whose sum is the quantity, in the order they are looked for."
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One quantity over time since the recording's start; shapes (n,) both."""
+
+    t_s: Floats
+    values: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """A code (a limit, a fault, an operating state) and the stretches of time it was there, seconds from the start."""
+
+    name: str
+    spans_s: tuple[tuple[float, float], ...]
+
+
+def start_ns(recording: Recording) -> int:
+    """The first message's time. Raises ValueError for a recording without messages."""
+    times = [int(columns.t_ns.min()) for columns in (recording.ticks, recording.telemetry) if columns.t_ns.size]
+    if not times:
+        raise ValueError("the recording has no messages: was the daemon running?")
+    return min(times)
+
+
+def series(recording: Recording, name: str) -> Series | None:
+    """The quantity `name`, from the ticks or else from telemetry; None where neither has a known value of it."""
+    begin = start_ns(recording)
+    for columns in (recording.ticks, recording.telemetry):
+        for spelling in SPELLINGS.get(name, ((name,),)):
+            if not all(part in columns.numbers for part in spelling):
+                continue
+            values = np.sum([columns.numbers[part] for part in spelling], axis=0)
+            if np.isfinite(values).any():
+                return Series((columns.t_ns - begin) / 1e9, values)
+    return None
+
+
+def bands(recording: Recording, name: str) -> tuple[Band, ...]:
+    """The codes in the words `name`, in the order of their first appearance, each with its stretches of time."""
+    begin = start_ns(recording)
+    for columns in (recording.ticks, recording.telemetry):
+        words = columns.words.get(name)
+        if words is not None and any(words):
+            return _bands((columns.t_ns - begin) / 1e9, words)
+    return ()
+
+
+def _bands(t_s: Floats, words: list[tuple[str, ...]]) -> tuple[Band, ...]:
+    period = float(np.median(np.diff(t_s))) if t_s.size > 1 else 0.0
+    ends = np.minimum(np.append(t_s[1:], t_s[-1] + period), t_s + max(BREAK_S, period))
+    spans: dict[str, list[tuple[float, float]]] = {}
+    for start, end, codes in zip(t_s.tolist(), ends.tolist(), words, strict=True):
+        for code in codes:
+            known = spans.setdefault(code, [])
+            if known and start <= known[-1][1]:
+                known[-1] = (known[-1][0], end)
+            else:
+                known.append((start, end))
+    return tuple(Band(code, tuple(known)) for code, known in spans.items())
+
+
+def tracking_rms_N(recording: Recording) -> float | None:
+    """RMS of measured minus asked force while ENABLED (all of it where no state is recorded); None without both."""
+    asked, measured = series(recording, "setpoint_cf"), series(recording, "measured_cf")
+    if asked is None or measured is None:
+        return None
+    wanted = np.interp(measured.t_s, asked.t_s, asked.values)
+    states = {band.name: band.spans_s for band in bands(recording, "operating_state")}
+    used = np.isfinite(wanted) & np.isfinite(measured.values)
+    if states:
+        enabled = np.zeros(used.shape, dtype=bool)
+        for start, end in states.get("ENABLED", ()):
+            enabled |= (measured.t_s >= start) & (measured.t_s < end)
+        used &= enabled
+    if not used.any():
+        return None
+    return float(np.sqrt(np.mean(np.square(measured.values[used] - wanted[used]))))
+
+
+def figure(recording: Recording, title: str) -> Figure:
+    """Four panels over one time axis: force, gap, duty, and lanes naming the state, limits and faults at each moment.
+
+    Raises ValueError for a recording without messages.
+    """
+    begin = start_ns(recording)
+    faults, limits = bands(recording, "faults"), bands(recording, "limits")
+    states = bands(recording, "operating_state")
+    lanes = bool(states) + len(limits) + max(1, len(faults))
+    fig = Figure(figsize=(12.0, 7.6 + 0.25 * lanes), layout="constrained")
+    heights = (4.2, 2.2, 1.6, 0.3 + 0.3 * lanes)
+    force, gap, duty, lane = fig.subplots(4, 1, sharex=True, height_ratios=heights)
+
+    _force_panel(force, recording)
+    for axes, quantity, label, parts in (
+        (gap, "gap", "gap (mm)", (("gap_setpoint_mm", "wanted", BLACK, "--"), ("gap_mm", "measured", BLUE, "-"))),
+        (duty, "duty", "drive duty", (("left_duty", "left", BLUE, "-"), ("right_duty", "right", ORANGE, "-"))),
+    ):
+        for name, text, colour, style in parts:
+            _line(axes, series(recording, name), text, colour, style)
+        _dress(axes, label, quantity)
+    duty.axhline(0.0, color=GREY, linewidth=0.6, zorder=0)
+    duty.set_ylim(-1.08, 1.08)
+    _lanes(lane, states, limits, faults)
+    for axes in (force, gap, duty):
+        for band in faults:
+            _shade(axes, band.spans_s, RED)
+
+    when = datetime.fromtimestamp(begin / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    lane.set_xlabel(f"seconds since {when}")
+    fig.suptitle(_headline(recording, title, faults), x=0.01, ha="left", fontsize=13, fontweight="bold")
+    last = max(int(c.t_ns.max()) for c in (recording.ticks, recording.telemetry) if c.t_ns.size)
+    lane.set_xlim(0.0, max((last - begin) / 1e9, 1e-3))
+    return fig
+
+
+def save_plot(recording: Recording, path: Path, title: str) -> None:
+    """Draw `figure` into `path`. Raises ValueError for a suffix other than FORMATS, or without messages; OSError."""
+    if path.suffix.lower() not in FORMATS:
+        raise ValueError(f"{path.name}: allowed are names ending in {', '.join(FORMATS)}")
+    figure(recording, title).savefig(path, dpi=110)
+
+
+def _headline(recording: Recording, title: str, faults: Iterable[Band]) -> str:
+    parts = [title]
+    error_N = tracking_rms_N(recording)
+    if error_N is not None:
+        parts.append(f"tracking error {error_N * 1e3:.0f} mN rms")
+    names = ", ".join(band.name for band in faults)
+    parts.append(f"faults: {names}" if names else "no fault")
+    if not recording.is_complete:
+        parts.append("recording cut short")
+    return "  ·  ".join(parts)
+
+
+def _force_panel(axes: Axes, recording: Recording) -> None:
+    # measured lies under what was wanted: it is the noisy one, and the eye compares the two edges
+    _line(axes, series(recording, "measured_cf"), "measured", ORANGE, "-", 1.3)
+    _line(axes, series(recording, "governed_cf"), "governed (what the device can do)", BLUE, "-", 1.5)
+    _line(axes, series(recording, "setpoint_cf"), "asked", BLACK, "--", 1.3)
+    _dress(axes, "force (N)", "force")
+
+
+def _line(axes: Axes, data: Series | None, label: str, colour: str, style: str, width: float = 1.2) -> None:
+    if data is None:
+        return
+    cuts = np.flatnonzero(np.diff(data.t_s) > BREAK_S) + 1
+    t_s, values = np.insert(data.t_s, cuts, data.t_s[cuts]), np.insert(data.values, cuts, np.nan)
+    axes.plot(t_s, values, style, label=label, color=colour, linewidth=width)
+
+
+def _dress(axes: Axes, label: str, quantity: str) -> None:
+    axes.set_ylabel(label)
+    axes.grid(axis="both", color="#e6e6e6", linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    if axes.lines:
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, borderaxespad=0.1, fontsize=9)
+    else:
+        axes.text(0.5, 0.5, f"no {quantity} recorded", transform=axes.transAxes, ha="center", va="center", color=GREY)
+
+
+def _shade(axes: Axes, spans_s: Iterable[tuple[float, float]], colour: str) -> None:
+    for start, end in spans_s:
+        axes.axvspan(start, end, color=colour, alpha=0.12, linewidth=0, zorder=0)
+
+
+def _lanes(axes: Axes, states: tuple[Band, ...], limits: tuple[Band, ...], faults: tuple[Band, ...]) -> None:
+    """One lane for the operating state, one for every limit and fault that occurred, each with its name and share."""
+    rows: list[tuple[str, list[tuple[Band, str]]]] = []
+    if states:
+        rows.append(("state", [(band, STATE_COLOURS.get(band.name, GREY)) for band in states]))
+    rows += [
+        (f"limit {band.name}", [(band, LIMIT_COLOURS[index % len(LIMIT_COLOURS)])]) for index, band in enumerate(limits)
+    ]
+    rows += [(f"FAULT {band.name}", [(band, RED)]) for band in faults] or [("no faults", [])]
+    for row, (_, parts) in enumerate(rows):
+        for band, colour in parts:
+            axes.broken_barh([(a, b - a) for a, b in band.spans_s], (row - 0.38, 0.76), facecolors=colour, linewidth=0)
+            if row == 0 and states:
+                _name_spans(axes, band, row)
+    axes.set_yticks(range(len(rows)), [name for name, _ in rows], fontsize=9)
+    for label, (name, _) in zip(axes.get_yticklabels(), rows, strict=True):
+        label.set_color(RED if name.startswith("FAULT") else BLACK)
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.grid(axis="x", color="#e6e6e6", linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(axis="y", length=0)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+
+
+def _name_spans(axes: Axes, band: Band, row: int) -> None:
+    """The state's name inside its longest stretch; the clip keeps it from running over its neighbours' ends."""
+    start, end = max(band.spans_s, key=lambda span: span[1] - span[0])
+    dark = band.name in ("ENABLED", "FAULT")
+    axes.annotate(
+        band.name,
+        ((start + end) / 2, row),
+        ha="center",
+        va="center",
+        fontsize=8,
+        color="white" if dark else BLACK,
+        clip_on=True,
+    )

@@ -1,0 +1,135 @@
+"""Reading a recording back into columns."""
+
+import math
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from mcap.exceptions import EndOfFile, McapError
+from mcap.records import Channel, Message, Metadata
+from mcap.stream_reader import StreamReader
+from numpy.typing import NDArray
+from zstandard import ZstdError
+
+from tormagd.recording.writer import TELEMETRY_TOPIC, TICKS_TOPIC
+
+MAX_RECORD_BYTES = 64_000_000
+MAX_NESTING = 2
+
+
+class RecordingError(ValueError):
+    """A file that is not a readable recording: the text names the file and what is wrong with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """The messages of one topic, one row each, in the order they were written.
+
+    `numbers[name]` is float64 of shape (rows,), with NaN where a value was null or the row had no such column; true and
+    false are 1 and 0. `words[name]` holds a tuple of strings for each row. An object's or a list's members get names of
+    their own: `tick.exec_us`, `duty.0`.
+    """
+
+    t_ns: NDArray[np.int64]
+    numbers: dict[str, NDArray[np.float64]]
+    words: dict[str, list[tuple[str, ...]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One file. `is_complete` is false where the recorder was killed: what was written before that is there."""
+
+    telemetry: Columns
+    ticks: Columns
+    metadata: dict[str, str] = field(default_factory=dict)
+    is_complete: bool = True
+
+
+def read_recording(path: Path) -> Recording:
+    """The recording in `path`. Raises RecordingError: not readable, not MCAP, damaged, or not written by tormagd."""
+    builders = {TELEMETRY_TOPIC: _Builder(), TICKS_TOPIC: _Builder()}
+    metadata: dict[str, str] = {}
+    topics: dict[int, str] = {}
+    is_complete = True
+    try:
+        with path.open("rb") as file:
+            try:
+                for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:
+                    if isinstance(record, Channel):
+                        topics[record.id] = record.topic
+                    elif isinstance(record, Metadata) and record.name == "tormagd":
+                        metadata.update(record.metadata)
+                    elif isinstance(record, Message) and topics.get(record.channel_id) in builders:
+                        builders[topics[record.channel_id]].add(record.log_time, msgspec.json.decode(record.data))
+            except EndOfFile:
+                is_complete = False
+        telemetry, ticks = builders[TELEMETRY_TOPIC].columns(), builders[TICKS_TOPIC].columns()
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from error
+    except (McapError, ZstdError, ValueError, OverflowError, struct.error, msgspec.MsgspecError) as error:
+        raise RecordingError(f"{path}: not an intact MCAP recording ({error})") from error
+    if not set(topics.values()) & set(builders):
+        raise RecordingError(
+            f"{path}: no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
+        )
+    return Recording(telemetry, ticks, metadata, is_complete)
+
+
+class _Builder:
+    """Rows of one topic on their way to columns; a column that first shows in a later row is filled up before it."""
+
+    def __init__(self) -> None:
+        self._t_ns: list[int] = []
+        self._numbers: dict[str, list[float]] = {}
+        self._words: dict[str, list[tuple[str, ...]]] = {}
+
+    def add(self, t_ns: int, message: object) -> None:
+        if not isinstance(message, dict):
+            raise ValueError(f"message of {t_ns} ns is {type(message).__name__}: allowed is an object")
+        row = len(self._t_ns)
+        self._t_ns.append(t_ns)
+        for name, value in _flat("", message, MAX_NESTING):
+            if isinstance(value, tuple):
+                words = self._words.setdefault(name, [])
+                words.extend([()] * (row - len(words)))
+                words.append(value)
+            else:
+                numbers = self._numbers.setdefault(name, [])
+                numbers.extend([math.nan] * (row - len(numbers)))
+                numbers.append(value)
+
+    def columns(self) -> Columns:
+        rows = len(self._t_ns)
+        for numbers in self._numbers.values():
+            numbers.extend([math.nan] * (rows - len(numbers)))
+        for words in self._words.values():
+            words.extend([()] * (rows - len(words)))
+        return Columns(
+            np.array(self._t_ns, dtype=np.int64),
+            # a column that was null until its first word (a text not known yet) is a column of words
+            {n: np.array(v, dtype=np.float64) for n, v in self._numbers.items() if n not in self._words},
+            self._words,
+        )
+
+
+def _flat(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, float | tuple[str, ...]]]:
+    """The numbers and words in `value`, each with its dotted name. A list without numbers is a row's words."""
+    match value:
+        case str():
+            yield prefix, (value,)
+        case None:
+            yield prefix, math.nan
+        case bool() | int() | float():
+            yield prefix, float(value)
+        case list() if all(isinstance(item, str) for item in value):
+            yield prefix, tuple(value)
+        case dict() | list() if depth > 0:
+            members = value.items() if isinstance(value, dict) else enumerate(value)
+            for name, inner in members:
+                yield from _flat(f"{prefix}.{name}" if prefix else str(name), inner, depth - 1)
+        case _:
+            raise ValueError(f"{prefix} = {str(value)[:80]}: allowed are numbers, strings and short lists of them")

@@ -1,0 +1,51 @@
+"""The recording endpoint's message: the control ticks of the last 20 ms, one row each."""
+
+from typing import TypeAlias
+
+import msgspec
+
+from tormagd.messages import VERSION, MessageError
+
+TIME_COLUMN = "t_ns"
+MAX_BATCH_BYTES = 4_000_000  # 20 ms at 4 kHz with 100 columns is under 1 MB
+MAX_COLUMNS = 256
+MAX_TIME_NS = 2**63
+
+Value: TypeAlias = int | float | bool | str | tuple[str, ...] | None
+
+
+class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
+    """Rows of one value per column; the first column is `t_ns`, CLOCK_REALTIME. A value that is not known is null."""
+
+    v: int
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Value, ...], ...]
+
+    def __post_init__(self) -> None:
+        if self.v != VERSION:
+            raise ValueError(f"v = {self.v!r}: allowed is {VERSION}")
+        if not 0 < len(self.columns) <= MAX_COLUMNS or self.columns[0] != TIME_COLUMN:
+            raise ValueError(
+                f"columns = {list(self.columns)[:4]!r}...: allowed are 1..{MAX_COLUMNS} names, {TIME_COLUMN} first"
+            )
+        if len(set(self.columns)) != len(self.columns):
+            raise ValueError(f"columns = {list(self.columns)!r}: allowed is each name once")
+        for number, row in enumerate(self.rows):
+            if len(row) != len(self.columns):
+                raise ValueError(f"rows[{number}] has {len(row)} values: allowed is {len(self.columns)}")
+            time_ns = row[0]
+            if isinstance(time_ns, bool) or not isinstance(time_ns, int) or not 0 <= time_ns < MAX_TIME_NS:
+                raise ValueError(f"rows[{number}].{TIME_COLUMN} = {time_ns!r}: allowed is 0..2^63-1 ns since 1970")
+
+
+_DECODER = msgspec.msgpack.Decoder(TickBatch)
+
+
+def decode_ticks(data: bytes) -> TickBatch:
+    """The batch in `data`. Raises MessageError for anything but a valid map of columns and rows."""
+    if len(data) > MAX_BATCH_BYTES:
+        raise MessageError(f"tick batch of {len(data)} bytes: allowed is {MAX_BATCH_BYTES}")
+    try:
+        return _DECODER.decode(data)
+    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
+        raise MessageError(f"tick batch: {error}") from error

@@ -1,0 +1,122 @@
+"""Two kinds of codes. A *fault* is latched and needs an explicit clear. A *limit* says: running, but held back by."""
+
+from enum import StrEnum
+from typing import NamedTuple
+
+from firmware_protocol.codec import DeviceFault
+
+
+class Explanation(NamedTuple):
+    """What a person needs to know about a code."""
+
+    cause: str
+    remedy: str
+
+
+class Fault(StrEnum):
+    """Why the device was opened. Latched until `clear-fault`."""
+
+    LINK_LOST = "LINK_LOST"
+    MEASUREMENT_STALE = "MEASUREMENT_STALE"
+    SKEW = "SKEW"
+    FOLLOWING_ERROR = "FOLLOWING_ERROR"
+    NOT_FINITE = "NOT_FINITE"
+    STOPPED = "STOPPED"
+    DEVICE_NOT_RUNNING = "DEVICE_NOT_RUNNING"
+    DEVICE_COMMAND_TIMEOUT = "DEVICE_COMMAND_TIMEOUT"
+    DEVICE_UNCOMMANDED_MOTION = "DEVICE_UNCOMMANDED_MOTION"
+    DEVICE_OVERCURRENT = "DEVICE_OVERCURRENT"
+    DEVICE_END_STOP = "DEVICE_END_STOP"
+    DEVICE_HOMING_FAILED = "DEVICE_HOMING_FAILED"
+    DEVICE_SUPPLY = "DEVICE_SUPPLY"
+    DEVICE_TEMPERATURE = "DEVICE_TEMPERATURE"
+    DEVICE_SCHEMA_MISMATCH = "DEVICE_SCHEMA_MISMATCH"
+    DEVICE_SKEW = "DEVICE_SKEW"
+    DEVICE_RETRACT_FAILED = "DEVICE_RETRACT_FAILED"
+
+
+class Limit(StrEnum):
+    """What holds the rendered force away from the one asked for. Comes and goes by itself."""
+
+    NO_SETPOINT = "NO_SETPOINT"
+    STALE = "STALE"
+    RANGE = "RANGE"
+    F_MIN = "F_MIN"
+    F_MAX = "F_MAX"
+    RATE = "RATE"
+    LOW_CONFIDENCE = "LOW_CONFIDENCE"
+    TRIM = "TRIM"
+    SATURATED = "SATURATED"
+    SKEW = "SKEW"
+
+
+FAULTS: dict[Fault, Explanation] = {
+    Fault.LINK_LOST: Explanation(
+        "the device stopped answering or its port disappeared",
+        "check cable and supply; the device opens by itself; then clear-fault and home",
+    ),
+    Fault.MEASUREMENT_STALE: Explanation(
+        "device states came too late to close the loop", "run `tormagctl doctor`; look for load on this machine"
+    ),
+    Fault.SKEW: Explanation(
+        "the two carriages moved apart from each other", "look for dirt or wear on the slower screw, then home"
+    ),
+    Fault.FOLLOWING_ERROR: Explanation(
+        "the gap did not follow its reference", "look for something that blocks a carriage, then home"
+    ),
+    Fault.NOT_FINITE: Explanation(
+        "a number in the loop was not finite", "keep the recording and report it; clear-fault starts afresh"
+    ),
+    Fault.STOPPED: Explanation("somebody gave the stop command", "clear-fault when it is safe to go on"),
+    Fault.DEVICE_NOT_RUNNING: Explanation(
+        "the device stopped taking drive commands by itself, as after a reset", "check its supply; clear-fault, home"
+    ),
+    Fault.DEVICE_COMMAND_TIMEOUT: Explanation(
+        "the device heard no valid drive command in time and opened the gap", "clear-fault, then home"
+    ),
+    Fault.DEVICE_UNCOMMANDED_MOTION: Explanation(
+        "a carriage moved with its drive off", "the gearbox may be worn and let the magnets pull shut; do not use it"
+    ),
+    Fault.DEVICE_OVERCURRENT: Explanation(
+        "a motor drew more current than allowed", "look for a blocked carriage, then clear-fault and home"
+    ),
+    Fault.DEVICE_END_STOP: Explanation("a carriage reached its closed end stop", "clear-fault, then home"),
+    Fault.DEVICE_HOMING_FAILED: Explanation(
+        "a home switch was not found in time", "check the switches and the screws, then clear-fault and home"
+    ),
+    Fault.DEVICE_SUPPLY: Explanation("the supply voltage is out of range", "check the power supply"),
+    Fault.DEVICE_TEMPERATURE: Explanation("the device is too hot", "let it cool down, then clear-fault"),
+    Fault.DEVICE_SCHEMA_MISMATCH: Explanation(
+        "daemon and firmware speak different versions of the protocol", "install the firmware that fits this daemon"
+    ),
+    Fault.DEVICE_SKEW: Explanation("the device saw its carriages apart", "look for a blocked carriage, then home"),
+    Fault.DEVICE_RETRACT_FAILED: Explanation(
+        "the device could not open the gap", "remove the insert by hand; check motors and supply"
+    ),
+}
+
+LIMITS: dict[Limit, Explanation] = {
+    Limit.NO_SETPOINT: Explanation("no publisher has sent a setpoint", "start the patient-side robot's publisher"),
+    Limit.STALE: Explanation(
+        "the newest setpoint is older than its valid_for_ms; the force decays to F_min", "check the publisher"
+    ),
+    Limit.RANGE: Explanation("the setpoint is outside the scene's range", "ask within the range, or change the scene"),
+    Limit.F_MIN: Explanation("less force was asked for than the open gap gives", "an insert with less iron goes lower"),
+    Limit.F_MAX: Explanation("more force was asked for than the closed gap gives", "an insert with more iron goes on"),
+    Limit.RATE: Explanation("the force was asked to change faster than the carriages travel", "ask for slower changes"),
+    Limit.LOW_CONFIDENCE: Explanation(
+        "the model was asked outside what it was trained on", "calibrate with this insert and these motions"
+    ),
+    Limit.TRIM: Explanation(
+        "the measured force is further from the model than the trim may correct", "calibrate this insert"
+    ),
+    Limit.SATURATED: Explanation("a motor has no more voltage to give", "expect lag while it lasts"),
+    Limit.SKEW: Explanation("the carriages are further apart than usual", "look at the slower screw"),
+}
+
+_BY_DEVICE_FAULT: dict[DeviceFault, Fault] = {bit: Fault(f"DEVICE_{bit.name}") for bit in DeviceFault}
+
+
+def device_faults(bits: DeviceFault) -> tuple[Fault, ...]:
+    """The faults that the firmware's bits stand for."""
+    return tuple(fault for bit, fault in _BY_DEVICE_FAULT.items() if bit in bits)

@@ -1,0 +1,168 @@
+"""The operating state: armed on purpose, opened on every fault, never re-armed by itself.
+
+Pure functions of explicit state. The safe state is *gap open*: friction holds the force when power goes, and the
+magnets pull shut. Opening is the device's own routine, because it must also work when this process is gone.
+"""
+
+from enum import StrEnum
+from typing import NamedTuple
+
+from tormagd.safety.codes import Fault
+
+CLEARING_S = 0.5
+"How long the device may take to report that a cleared fault is gone."
+
+
+class OperatingState(StrEnum):
+    """CRTK operating states."""
+
+    DISABLED = "DISABLED"
+    ENABLED = "ENABLED"
+    PAUSED = "PAUSED"
+    FAULT = "FAULT"
+
+
+class DeviceRequest(StrEnum):
+    """What the daemon asks of the firmware, once per request number."""
+
+    NONE = "none"
+    HOME = "home"
+    RETRACT = "retract"
+    CLEAR = "clear"
+
+
+class RefusedError(Exception):
+    """A command that the present state does not allow."""
+
+    def __init__(self, code: str, message: str, hint: str) -> None:
+        super().__init__(message)
+        self.code, self.message, self.hint = code, message, hint
+
+
+class Conditions(NamedTuple):
+    """What the decisions depend on."""
+
+    connected: bool
+    fresh: bool
+    homed: bool
+    busy: bool
+    device_latched: bool
+    requested_N: float | None
+    neutral_N: float
+
+
+class SafetyState(NamedTuple):
+    """Operating state, latched faults, and the newest request to the device."""
+
+    operating_state: OperatingState = OperatingState.DISABLED
+    faults: tuple[Fault, ...] = ()
+    request: DeviceRequest = DeviceRequest.NONE
+    request_number: int = 0
+    clearing_until_s: float = float("-inf")
+
+    def ask(self, request: DeviceRequest) -> "SafetyState":
+        """The same state with a new request to the device."""
+        return self._replace(request=request, request_number=self.request_number + 1)
+
+
+def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
+    """`state` with `faults` latched and the device asked to open; unchanged where there is nothing new."""
+    new = tuple(fault for fault in faults if fault not in state.faults)
+    if not new:
+        return state
+    latched = state._replace(operating_state=OperatingState.FAULT, faults=state.faults + new)
+    return latched.ask(DeviceRequest.RETRACT)
+
+
+def command(state: SafetyState, name: str, now_s: float, conditions: Conditions) -> SafetyState:
+    """The state after an operator's command. Raises RefusedError with code, message and what to do."""
+    transition = _TRANSITIONS.get(name)
+    if transition is None:
+        raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(_TRANSITIONS)}")
+    if name != "stop" and not conditions.connected:
+        raise RefusedError("not_connected", "the device is not connected", "check port, cable and supply")
+    return transition(state, now_s, conditions)
+
+
+def _enable(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
+    _refuse_in(state, OperatingState.FAULT, "enable")
+    if state.operating_state is not OperatingState.DISABLED:
+        raise RefusedError("already_enabled", f"already {state.operating_state}", "nothing to do")
+    if conditions.device_latched:
+        raise RefusedError("device_latched", "the device has latched a fault", "tormagctl clear-fault, then home")
+    _refuse_busy(conditions)
+    if not conditions.homed:
+        raise RefusedError("not_homed", "the carriages are not homed", "tormagctl home")
+    if not conditions.fresh:
+        raise RefusedError("not_fresh", "no fresh measurement from the device", "look at the link in tormagctl status")
+    if conditions.requested_N is not None and conditions.requested_N > conditions.neutral_N:
+        raise RefusedError(
+            "not_neutral",
+            f"the setpoint is {conditions.requested_N:.2f} N: allowed is at most {conditions.neutral_N:.2f} N",
+            "lower the setpoint, enable, then raise it",
+        )
+    return state._replace(operating_state=OperatingState.ENABLED)
+
+
+def _disable(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
+    _refuse_in(state, OperatingState.FAULT, "disable")
+    return state._replace(operating_state=OperatingState.DISABLED).ask(DeviceRequest.RETRACT)
+
+
+def _pause(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
+    if state.operating_state is not OperatingState.ENABLED:
+        raise RefusedError("not_enabled", f"cannot pause while {state.operating_state}", "tormagctl enable")
+    return state._replace(operating_state=OperatingState.PAUSED)
+
+
+def _resume(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
+    if state.operating_state is not OperatingState.PAUSED:
+        raise RefusedError("not_paused", f"cannot resume while {state.operating_state}", "tormagctl status")
+    return state._replace(operating_state=OperatingState.ENABLED)
+
+
+def _home(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
+    _refuse_in(state, OperatingState.FAULT, "home")
+    if state.operating_state is not OperatingState.DISABLED:
+        raise RefusedError("not_disabled", f"cannot home while {state.operating_state}", "tormagctl disable")
+    if conditions.device_latched:
+        raise RefusedError("device_latched", "the device has latched a fault", "tormagctl clear-fault")
+    _refuse_busy(conditions)
+    return state.ask(DeviceRequest.HOME)
+
+
+def _stop(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
+    return latch(state, (Fault.STOPPED,))
+
+
+def _clear_fault(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
+    _refuse_busy(conditions)
+    cleared = state._replace(
+        operating_state=OperatingState.DISABLED
+        if state.operating_state is OperatingState.FAULT
+        else state.operating_state,
+        faults=(),
+        clearing_until_s=now_s + CLEARING_S,
+    )
+    return cleared.ask(DeviceRequest.CLEAR) if conditions.device_latched else cleared
+
+
+def _refuse_in(state: SafetyState, forbidden: OperatingState, name: str) -> None:
+    if state.operating_state is forbidden:
+        raise RefusedError("fault", f"cannot {name} in {forbidden}: {', '.join(state.faults)}", "tormagctl clear-fault")
+
+
+def _refuse_busy(conditions: Conditions) -> None:
+    if conditions.busy:
+        raise RefusedError("busy", "the device is homing or opening", "wait until is_busy is false")
+
+
+_TRANSITIONS = {
+    "enable": _enable,
+    "disable": _disable,
+    "pause": _pause,
+    "resume": _resume,
+    "home": _home,
+    "stop": _stop,
+    "clear-fault": _clear_fault,
+}

@@ -1,0 +1,1 @@
+"""Scenes: what a task asks of the device, and what it tolerates."""

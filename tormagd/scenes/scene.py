@@ -1,0 +1,106 @@
+"""A scene states what one task requires: force range, tolerance, insert, geometry, rates.
+
+The daemon runs one scene. Nothing that a scene does not ask for is modelled or computed.
+"""
+
+from importlib import resources
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from tormagd.config import LEAST_INFERENCE_HZ, ConfigError, Strict, load_toml
+
+_SHIPPED = resources.files(__package__)
+
+
+class Force(Strict, frozen=True):
+    """The forces the task asks for, N, and how closely they must be rendered."""
+
+    least_N: Annotated[float, Meta(ge=0.0, le=1_000.0)]
+    "What the task would like as its lowest force; below the device's F_min it gets F_min, and the limit F_MIN shows."
+    most_N: Annotated[float, Meta(gt=0.0, le=1_000.0)]
+    resolution_N: Annotated[float, Meta(gt=0.0, le=100.0)]
+    tolerance_rms_N: Annotated[float, Meta(gt=0.0, le=100.0)]
+    least_variance_accounted_for: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+
+
+class Bandwidth(Strict, frozen=True):
+    """The rates below which the task is not served, Hz."""
+
+    control_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 1_000
+    inference_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = LEAST_INFERENCE_HZ
+    setpoint_hz: Annotated[int, Meta(ge=1, le=4_000)] = 500
+
+
+class Insert(Strict, frozen=True):
+    """Which elastomer is fitted, which device it is in, and the model learned from the two."""
+
+    name: str
+    model: str
+    "A safetensors file (relative to the scene file), or the name of a shipped model."
+    gap_closed_mm: Annotated[float, Meta(ge=20.0, le=300.0)] = 45.0
+    gap_open_mm: Annotated[float, Meta(ge=20.0, le=300.0)] = 95.0
+    inner_radius_mm: Annotated[float, Meta(gt=0.0, le=100.0)] = 4.0
+    outer_radius_mm: Annotated[float, Meta(gt=0.0, le=100.0)] = 11.0
+    thickness_mm: Annotated[float, Meta(gt=0.0, le=200.0)] = 20.0
+    roller_radius_mm: Annotated[float, Meta(gt=0.0, le=200.0)] = 20.0
+
+
+class Solver(Strict, frozen=True):
+    """The field search: a grid over the field, and how many neighbours compete for the answer."""
+
+    step_mT: Annotated[float, Meta(gt=0.0, le=50.0)] = 2.0
+    neighbours: Annotated[int, Meta(ge=1, le=64)] = 4
+
+
+class Scene(Strict, frozen=True):
+    """One task. Raises ConfigError, through `load_scene`, where its statements contradict each other."""
+
+    name: str
+    description: str
+    force: Force
+    insert: Insert
+    bandwidth: Bandwidth = msgspec.field(default_factory=Bandwidth)
+    solver: Solver = msgspec.field(default_factory=Solver)
+
+    def __post_init__(self) -> None:
+        pairs = (
+            ("force.least_N", self.force.least_N, "force.most_N", self.force.most_N),
+            ("insert.gap_closed_mm", self.insert.gap_closed_mm, "insert.gap_open_mm", self.insert.gap_open_mm),
+            (
+                "insert.inner_radius_mm",
+                self.insert.inner_radius_mm,
+                "insert.outer_radius_mm",
+                self.insert.outer_radius_mm,
+            ),
+        )
+        for low_name, low, high_name, high in pairs:
+            if not low < high:
+                raise ValueError(f"{low_name} = {low:g}: allowed is under {high_name} = {high:g}")
+
+
+def shipped_scenes() -> tuple[str, ...]:
+    """The names of the scenes that come with the package."""
+    return tuple(
+        sorted(entry.name.removesuffix(".toml") for entry in _SHIPPED.iterdir() if entry.name.endswith(".toml"))
+    )
+
+
+def scene_path(name_or_path: str) -> Path:
+    """The file of a shipped scene's name, or the path itself. Raises ConfigError naming the shipped scenes."""
+    if name_or_path in shipped_scenes():
+        return Path(str(_SHIPPED / f"{name_or_path}.toml"))
+    if not Path(name_or_path).is_file():
+        raise ConfigError(f"scene = {name_or_path!r}: allowed is a scene file or one of {', '.join(shipped_scenes())}")
+    return Path(name_or_path)
+
+
+def load_scene(name_or_path: str) -> Scene:
+    """The scene in a file or of a shipped name. Raises ConfigError naming file, key, value and what is allowed."""
+    path = scene_path(name_or_path)
+    try:
+        return msgspec.convert(load_toml(path), Scene)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path}: {error}") from error

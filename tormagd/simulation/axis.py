@@ -1,0 +1,147 @@
+"""One carriage of the device: motor, gearbox, lead screw, nut with backlash, guide with drag.
+
+Everything is referred to the gearbox output, the screw, in SI. Positive is opening: away from the centre plane.
+
+Friction is Coulomb friction proper, by time stepping (J. J. Moreau): in each step it takes as much of the momentum as
+its impulse can, and the screw truly stands when it can take all. A regularised sign function would creep under the
+magnets' pull and hide the question whether the device holds its gap with the power off.
+
+The carriage is taken as massless: its 0.3 kg at 1 m/s2 are 0.3 N beside some 60 N of attraction.
+"""
+
+import math
+
+from tormagd.simulation.parameters import PlantError, PlantParameters
+
+MAX_STEP_SHARE = 0.25
+"""Largest share of a substep in the time constants it has to resolve; the samples stay under 0.02."""
+
+
+class Axis:
+    """State and laws of one carriage.
+
+    `position_m` is the carriage's distance from the centre plane, `angle_rad` the screw's angle from power-on,
+    `contact_N` the force with which the nut pushes the carriage outward.
+    Raises PlantError for a plant that is too stiff or too light for the substep.
+    """
+
+    __slots__ = (
+        "_backlash_m",
+        "_closed_stop_m",
+        "_coupling_Nm_A",
+        "_current_limit_A",
+        "_decay",
+        "_dt_s",
+        "_impulse_rad_s_Nm",
+        "_lead_m_rad",
+        "_mesh_loss",
+        "_nut_zero_m",
+        "_open_stop_m",
+        "_resistance_Ohm",
+        "_stiffness_N_m",
+        "angle_rad",
+        "contact_N",
+        "current_A",
+        "drag_N",
+        "gear_friction_Nm",
+        "position_m",
+        "screw_friction_m",
+        "speed_rad_s",
+    )
+
+    def __init__(
+        self, plant: PlantParameters, drag_N: float, start_mm: float, attraction_N: float, dt_s: float
+    ) -> None:
+        motor, gear, screw = plant.motor, plant.gear, plant.screw
+        self._dt_s = dt_s
+        self._resistance_Ohm = motor.resistance_Ohm
+        self._coupling_Nm_A = gear.ratio * motor.back_emf_V_s_rad
+        # the current is exact for the speed of the step: L/R is under a millisecond
+        self._decay = math.exp(-dt_s * motor.resistance_Ohm / (motor.inductance_mH * 1e-3))
+        self._current_limit_A = plant.electronics.current_limit_A
+        self._impulse_rad_s_Nm = dt_s / (motor.inertia_kg_m2 * gear.ratio**2)
+        self._mesh_loss = 1.0 - gear.efficiency
+        self._lead_m_rad = screw.lead_mm * 1e-3 / math.tau
+        self._backlash_m = 0.5e-6 * screw.backlash_um
+        self._stiffness_N_m = screw.stiffness_N_um * 1e6
+        self._closed_stop_m = plant.closed_stop_mm * 1e-3
+        self._open_stop_m = plant.open_stop_mm * 1e-3
+        spring = self._stiffness_N_m * self._lead_m_rad**2 * self._impulse_rad_s_Nm * dt_s
+        braking = self._coupling_Nm_A**2 / motor.resistance_Ohm * self._impulse_rad_s_Nm
+        if max(math.sqrt(spring), braking) > MAX_STEP_SHARE:
+            raise PlantError(
+                f"motor.inertia_kg_m2 = {motor.inertia_kg_m2}: allowed is more, for this screw.stiffness_N_um = "
+                f"{screw.stiffness_N_um} and motor.back_emf_V_s_rad = {motor.back_emf_V_s_rad}; a substep of {dt_s} s "
+                "would not follow the motion"
+            )
+        self.gear_friction_Nm = gear.output_friction_Nm
+        self.screw_friction_m = screw.friction_coefficient * 0.5e-3 * plant.assumed.screw_mean_diameter_mm
+        self.drag_N = drag_N
+        self.angle_rad = 0.0
+        self.speed_rad_s = 0.0
+        self.current_A = 0.0
+        self.position_m = start_mm * 1e-3
+        # at power-on the nut carries the whole attraction and the guide nothing
+        self.contact_N = attraction_N
+        self._nut_zero_m = self.position_m + self._lead_of(attraction_N)
+
+    def step(self, voltage_V: float | None, attraction_N: float) -> None:
+        """One time step with that voltage at the motor, or None for an open bridge, and that pull of the magnets."""
+        if voltage_V is None:
+            self.current_A = current_A = 0.0
+        else:
+            settled_A = (voltage_V - self._coupling_Nm_A * self.speed_rad_s) / self._resistance_Ohm
+            current_A = settled_A + (self.current_A - settled_A) * self._decay
+            limit_A = self._current_limit_A
+            if current_A > limit_A:
+                current_A = limit_A
+            elif current_A < -limit_A:
+                current_A = -limit_A
+            self.current_A = current_A
+
+        drive_Nm = self._coupling_Nm_A * current_A
+        contact_N = self.contact_N
+        friction_Nm = self.gear_friction_Nm + self.screw_friction_m * abs(contact_N)
+        transmitted_Nm = abs(drive_Nm) - self.gear_friction_Nm
+        if transmitted_Nm > 0.0:
+            friction_Nm += self._mesh_loss * transmitted_Nm
+        speed_rad_s = self.speed_rad_s + (drive_Nm - self._lead_m_rad * contact_N) * self._impulse_rad_s_Nm
+        grip_rad_s = friction_Nm * self._impulse_rad_s_Nm
+        if speed_rad_s > grip_rad_s:
+            speed_rad_s -= grip_rad_s
+        elif speed_rad_s < -grip_rad_s:
+            speed_rad_s += grip_rad_s
+        else:
+            speed_rad_s = 0.0
+        self.speed_rad_s = speed_rad_s
+        self.angle_rad += self._dt_s * speed_rad_s
+        self._carry(attraction_N)
+
+    def _carry(self, attraction_N: float) -> None:
+        """Let the carriage follow the nut: it stands while the guide's drag holds it, else slides to the limit."""
+        nut_m = self._nut_zero_m + self.angle_rad * self._lead_m_rad
+        position_m = self.position_m
+        innermost_m = nut_m - self._lead_of(attraction_N + self.drag_N)
+        if position_m < innermost_m:
+            position_m = innermost_m
+        else:
+            outermost_m = nut_m - self._lead_of(attraction_N - self.drag_N)
+            if position_m > outermost_m:
+                position_m = outermost_m
+        if position_m > self._open_stop_m:
+            position_m = self._open_stop_m
+        elif position_m < self._closed_stop_m:
+            position_m = self._closed_stop_m
+        self.position_m = position_m
+        lead_m = nut_m - position_m
+        if lead_m > self._backlash_m:
+            self.contact_N = self._stiffness_N_m * (lead_m - self._backlash_m)
+        elif lead_m < -self._backlash_m:
+            self.contact_N = self._stiffness_N_m * (lead_m + self._backlash_m)
+        else:
+            self.contact_N = 0.0
+
+    def _lead_of(self, contact_N: float) -> float:
+        """How far the nut is outward of the carriage, m, when it pushes with that force."""
+        flank_m = self._backlash_m if contact_N > 0.0 else -self._backlash_m
+        return flank_m + contact_N / self._stiffness_N_m

@@ -1,0 +1,45 @@
+"""Faults that can be put into the simulated device, at once or at a time."""
+
+import math
+import re
+from typing import NamedTuple
+
+KNOWN = {
+    "worn_gearbox": "a quarter of the friction in gearboxes and screws: the carriages no longer hold by themselves",
+    "drag_left": "the left guide's drag changes by VALUE percent, as in drag_left=+50%",
+    "encoder_stuck_left": "the left encoder stays at its last count",
+    "reset": "the firmware restarts: mode, zero, handshake and clock are lost",
+    "commands_vanish": "nothing that the host sends arrives",
+    "supply_loss": "the motors' supply fails; the logic goes on",
+}
+FORMS = "NAME[=PERCENT%][@SECONDS] with NAME one of: " + "; ".join(f"{name}: {what}" for name, what in KNOWN.items())
+_FORM = re.compile(r"(?P<name>\w+)(?:=(?P<percent>[+-]?[\d.]+)%)?(?:@(?P<at_s>[\d.]+))?")
+
+
+class FaultError(ValueError):
+    """A fault specification that names no known fault, or not in a known form."""
+
+
+class Fault(NamedTuple):
+    """One fault, when it begins (device power-on is 0) and, for those that have a size, its change in percent."""
+
+    name: str
+    at_s: float = 0.0
+    percent: float = 0.0
+
+
+def parse_fault(spec: str) -> Fault:
+    """Read `NAME[=PERCENT%][@SECONDS]`. Raises FaultError that lists what is known."""
+    match = _FORM.fullmatch(spec)
+    name = match["name"] if match else spec
+    if match is None or name not in KNOWN:
+        raise FaultError(f"fault {spec!r}: allowed is {FORMS}")
+    if (match["percent"] is not None) != (name == "drag_left"):
+        raise FaultError(f"fault {spec!r}: drag_left takes a size, as in drag_left=+50%, and no other fault does")
+    try:
+        at_s, percent = float(match["at_s"] or 0.0), float(match["percent"] or 0.0)
+    except ValueError as error:
+        raise FaultError(f"fault {spec!r}: {error}") from error
+    if not (at_s < math.inf and -100.0 <= percent <= 10_000.0):
+        raise FaultError(f"fault {spec!r}: allowed are finite times and -100% to +10000%")
+    return Fault(name, at_s, percent)

@@ -1,0 +1,117 @@
+"""The hand that turns the handle: where the roller's surface is at a time."""
+
+import bisect
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+ROLLER_RADIUS_MM = 20.0
+DEFAULT_RPM = 20.0
+DEFAULT_PERIOD_S = 4.0
+REVERSING_TRAVEL_MM = 30.0
+KNOWN = "steady[=RPM], reversing[=PERIOD_S], or a FILE.csv with the columns t_s,position_mm"
+
+
+class HandError(ValueError):
+    """A hand specification or recording that cannot be used."""
+
+
+class Hand(Protocol):
+    """A motion of the roller's surface."""
+
+    def position_mm(self, time_s: float) -> float:
+        """Travel of the roller surface since time 0, mm."""
+
+
+@dataclass(frozen=True, slots=True)
+class SteadyHand:
+    """Turns at a constant speed, 42 mm/s at the 20 rpm of the thesis's measurements."""
+
+    rpm: float = DEFAULT_RPM
+
+    def position_mm(self, time_s: float) -> float:
+        return time_s * self.rpm / 60.0 * math.tau * ROLLER_RADIUS_MM
+
+
+@dataclass(frozen=True, slots=True)
+class ReversingHand:
+    """Forth, rest, back, rest: smooth strokes of 30 mm (0.35 of the period each) with full stops (0.15 each)."""
+
+    period_s: float = DEFAULT_PERIOD_S
+
+    def position_mm(self, time_s: float) -> float:
+        phase = math.fmod(time_s, self.period_s) / self.period_s
+        half, back = (phase, False) if phase < 0.5 else (phase - 0.5, True)
+        share = min(half / 0.35, 1.0)
+        stroke = REVERSING_TRAVEL_MM * share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+        return REVERSING_TRAVEL_MM - stroke if back else stroke
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedHand:
+    """A recording, linear between its points and standing before the first and after the last."""
+
+    times_s: tuple[float, ...]
+    positions_mm: tuple[float, ...]
+
+    def position_mm(self, time_s: float) -> float:
+        after = bisect.bisect_right(self.times_s, time_s)
+        if after == 0:
+            return self.positions_mm[0]
+        if after == len(self.times_s):
+            return self.positions_mm[-1]
+        start_s, end_s = self.times_s[after - 1], self.times_s[after]
+        start_mm, end_mm = self.positions_mm[after - 1], self.positions_mm[after]
+        return start_mm + (end_mm - start_mm) * (time_s - start_s) / (end_s - start_s)
+
+
+def parse_hand(spec: str) -> Hand:
+    """The hand that a command-line word stands for. Raises HandError naming what is allowed."""
+    name, _, value = spec.partition("=")
+    if name == "steady":
+        return SteadyHand(_number(spec, value, -300.0, 300.0) if value else DEFAULT_RPM)
+    if name == "reversing":
+        return ReversingHand(_number(spec, value, 0.1, 1000.0) if value else DEFAULT_PERIOD_S)
+    if spec.endswith(".csv"):
+        return read_recording(Path(spec))
+    raise HandError(f"hand {spec!r}: allowed are {KNOWN}")
+
+
+def _number(spec: str, text: str, low: float, high: float) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not low <= number <= high:
+        raise HandError(f"hand {spec!r}: allowed are numbers from {low:g} to {high:g}")
+    return number
+
+
+def read_recording(path: Path) -> RecordedHand:
+    """Read a CSV with the columns t_s and position_mm. Raises HandError naming file and line."""
+    times_s: list[float] = []
+    positions_mm: list[float] = []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = csv.DictReader(file)
+            if not {"t_s", "position_mm"} <= set(rows.fieldnames or ()):
+                raise HandError(f"{path}: columns {rows.fieldnames}: needed are t_s and position_mm")
+            for row in rows:
+                where = f"{path}, line {rows.line_num}"
+                try:
+                    time_s, position_mm = float(row["t_s"]), float(row["position_mm"])
+                except (TypeError, ValueError) as error:
+                    raise HandError(f"{where}: {error}") from error
+                if not (math.isfinite(time_s) and abs(position_mm) <= 1e6):
+                    raise HandError(f"{where}: {time_s}, {position_mm}: allowed are finite times, positions to 1e6 mm")
+                if times_s and time_s <= times_s[-1]:
+                    raise HandError(f"{where}: t_s = {time_s}: allowed is more than {times_s[-1]} of the line before")
+                times_s.append(time_s)
+                positions_mm.append(position_mm)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise HandError(f"{path}: {error}") from error
+    if not times_s:
+        raise HandError(f"{path}: no rows")
+    return RecordedHand(tuple(times_s), tuple(positions_mm))

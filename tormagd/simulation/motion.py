@@ -1,0 +1,214 @@
+"""The firmware's own motions: opening at a bounded speed, and homing. Positive is opening.
+
+Both move each carriage along a position ramp and let the drive duty follow it: the ramp's speed as feed-forward, the
+distance to the ramp as the integral part. The duty is bounded too, and with it, through the motor's back-EMF, the speed
+of a carriage whose encoder is dead.
+"""
+
+from enum import Enum, auto
+from typing import NamedTuple
+
+RAMP_GAIN_PER_MM = 1.0  # the motor follows a duty with 15 ms: crossover at 20 rad/s leaves 70 degrees
+RAMP_LEAD_MM = 1.0  # the ramp waits for a carriage that cannot follow
+DUTY_LIMIT = 0.85
+NO_LOAD_REV_S = 2.5  # 150 rpm at full duty, for the feed-forward
+TAPER_PER_S = 8.0  # speed over distance to the open end
+CREEP_MM_S = 1.0  # final approach to the switches
+BACK_OFF_MM = 1.0
+BACK_OFF_LIMIT_S = 0.4  # three times what it takes; without an encoder it must not go on towards closed
+SETTLE_S = 0.05  # braked at the switch before the drives go off: three motor time constants
+PROGRESS_MM = 0.05
+PATIENCE_S = 0.3
+DEAD_CURRENT_A = 0.02  # a connected motor draws ten times this at the duty that stands for no progress
+TIME_LIMIT_S = 8.0  # the whole stroke at homing speed takes under 4 s
+
+
+class Carriage(NamedTuple):
+    """What the firmware knows of one carriage: encoder position, its open switch, its motor's current."""
+
+    position_mm: float
+    at_open_end: bool
+    current_A: float
+
+
+class Outcome(Enum):
+    """Where a motion stands."""
+
+    MOVING = auto()
+    DONE = auto()
+    FAILED = auto()
+
+
+class Ramp:
+    """Moves one carriage at a bounded speed, by way of a position that runs ahead of it."""
+
+    def __init__(self, position_mm: float, lead_mm_rev: float) -> None:
+        self._reference_mm = position_mm
+        self._full_speed_mm_s = NO_LOAD_REV_S * lead_mm_rev
+
+    def duty(self, position_mm: float, speed_mm_s: float, dt_s: float) -> float:
+        """Duty for the next `dt_s` at that signed speed."""
+        reference_mm = self._reference_mm + speed_mm_s * dt_s
+        self._reference_mm = min(max(reference_mm, position_mm - RAMP_LEAD_MM), position_mm + RAMP_LEAD_MM)
+        duty = speed_mm_s / self._full_speed_mm_s + RAMP_GAIN_PER_MM * (self._reference_mm - position_mm)
+        return min(max(duty, -DUTY_LIMIT), DUTY_LIMIT)
+
+
+class Opening:
+    """Brings one carriage to its open switch and brakes it there.
+
+    A carriage that comes no further has failed when its current says why: a stall, or no current at all. Standing still
+    at a travelling current is a dead encoder, and the motion goes on.
+    """
+
+    def __init__(self, time_s: float, carriage: Carriage, lead_mm_rev: float, stall_A: float) -> None:
+        self._ramp = Ramp(carriage.position_mm, lead_mm_rev)
+        self._stall_A = stall_A
+        self._progress_mm = carriage.position_mm
+        self._progress_s = time_s
+        self._arrived_s: float | None = None
+        self.duty = 0.0
+        self.outcome = Outcome.MOVING
+
+    def step(self, time_s: float, dt_s: float, carriage: Carriage, speed_mm_s: float) -> None:
+        """One tick towards the open end, at that speed at most."""
+        if self.outcome is Outcome.FAILED:
+            return
+        if carriage.at_open_end:
+            self.duty = 0.0
+            if self._arrived_s is None:
+                self._arrived_s = time_s
+            self.outcome = Outcome.DONE if time_s - self._arrived_s >= SETTLE_S else Outcome.MOVING
+            return
+        self._arrived_s = None
+        self.outcome = Outcome.MOVING
+        self.duty = self._ramp.duty(carriage.position_mm, speed_mm_s, dt_s)
+        if carriage.position_mm > self._progress_mm + PROGRESS_MM:
+            self._progress_mm, self._progress_s = carriage.position_mm, time_s
+        elif time_s - self._progress_s > PATIENCE_S and not DEAD_CURRENT_A < abs(carriage.current_A) < self._stall_A:
+            self.duty = 0.0
+            self.outcome = Outcome.FAILED
+
+
+class Retraction:
+    """Opens the gap: both carriages to their switches, each as far as it comes.
+
+    With a valid zero the speed tapers towards the open end; without one the search for the switch is slow throughout.
+    """
+
+    def __init__(
+        self,
+        time_s: float,
+        carriages: tuple[Carriage, Carriage],
+        *,
+        lead_mm_rev: float,
+        stall_A: float,
+        speed_mm_s: float,
+        tapered: bool,
+    ) -> None:
+        self._deadline_s = time_s + TIME_LIMIT_S
+        self._speed_mm_s = speed_mm_s
+        self._tapered = tapered
+        self._openings = tuple(Opening(time_s, carriage, lead_mm_rev, stall_A) for carriage in carriages)
+
+    @property
+    def duties(self) -> tuple[float, float]:
+        """Left and right duty."""
+        left, right = self._openings
+        return left.duty, right.duty
+
+    @property
+    def blocked(self) -> bool:
+        """Whether a carriage has been given up; its screw springs back from the stall."""
+        return any(opening.outcome is Outcome.FAILED for opening in self._openings)
+
+    def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
+        """One tick; FAILED when a carriage could not be brought to its switch and neither moves any more."""
+        for opening, carriage in zip(self._openings, carriages, strict=True):
+            speed_mm_s = self._speed_mm_s
+            if self._tapered:
+                speed_mm_s = min(speed_mm_s, CREEP_MM_S + TAPER_PER_S * max(-carriage.position_mm, 0.0))
+            opening.step(time_s, dt_s, carriage, speed_mm_s)
+        outcomes = {opening.outcome for opening in self._openings}
+        if time_s >= self._deadline_s:
+            return Outcome.FAILED if outcomes != {Outcome.DONE} else Outcome.DONE
+        if Outcome.MOVING in outcomes:
+            return Outcome.MOVING
+        return Outcome.FAILED if Outcome.FAILED in outcomes else Outcome.DONE
+
+
+class Homing:
+    """Finds the open switches twice: at speed, then, after backing off, creeping, so that the zero repeats.
+
+    `zeros_mm` holds the encoder positions of the two switches once the outcome is DONE.
+    """
+
+    def __init__(
+        self,
+        time_s: float,
+        carriages: tuple[Carriage, Carriage],
+        *,
+        lead_mm_rev: float,
+        stall_A: float,
+        speed_mm_s: float,
+    ) -> None:
+        self._deadline_s = time_s + TIME_LIMIT_S
+        self._lead_mm_rev = lead_mm_rev
+        self._stall_A = stall_A
+        self._speed_mm_s = speed_mm_s
+        self._search: Retraction | None = self._outward(time_s, carriages, speed_mm_s)
+        self._ramps: tuple[Ramp, ...] = ()
+        self._starts_mm: tuple[float, ...] = ()
+        self._back_off_since_s = time_s
+        self._backed_off = False
+        self._edges_mm: list[float | None] = [None, None]
+        self.duties = (0.0, 0.0)
+
+    @property
+    def zeros_mm(self) -> tuple[float, float]:
+        """Encoder positions at which the open switches closed; 0 for one that was not found."""
+        left, right = self._edges_mm
+        return left or 0.0, right or 0.0
+
+    def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
+        """One tick: outward, back off, creep outward."""
+        if time_s >= self._deadline_s:
+            return Outcome.FAILED
+        if self._search is None:
+            return self._back_off(time_s, dt_s, carriages)
+        if self._backed_off:
+            for side, carriage in enumerate(carriages):
+                if carriage.at_open_end and self._edges_mm[side] is None:
+                    self._edges_mm[side] = carriage.position_mm
+        outcome = self._search.step(time_s, dt_s, carriages)
+        self.duties = self._search.duties
+        if outcome is not Outcome.DONE or self._backed_off:
+            return outcome
+        self._search = None
+        self._back_off_since_s = time_s
+        self._starts_mm = tuple(carriage.position_mm for carriage in carriages)
+        self._ramps = tuple(Ramp(carriage.position_mm, self._lead_mm_rev) for carriage in carriages)
+        return Outcome.MOVING
+
+    def _back_off(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
+        if time_s - self._back_off_since_s > BACK_OFF_LIMIT_S:
+            return Outcome.FAILED
+        duties = []
+        for ramp, start_mm, carriage in zip(self._ramps, self._starts_mm, carriages, strict=True):
+            clear = carriage.position_mm <= start_mm - BACK_OFF_MM and not carriage.at_open_end
+            duties.append(0.0 if clear else ramp.duty(carriage.position_mm, -self._speed_mm_s, dt_s))
+        self.duties = duties[0], duties[1]
+        if not any(duties):
+            self._backed_off = True
+            self._search = self._outward(time_s, carriages, CREEP_MM_S)
+        return Outcome.MOVING
+
+    def _outward(self, time_s: float, carriages: tuple[Carriage, Carriage], speed_mm_s: float) -> Retraction:
+        return Retraction(
+            time_s,
+            carriages,
+            lead_mm_rev=self._lead_mm_rev,
+            stall_A=self._stall_A,
+            speed_mm_s=speed_mm_s,
+            tapered=False,
+        )

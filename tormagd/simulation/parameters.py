@@ -1,0 +1,264 @@
+"""What a simulated device is made of: the plant file, typed, bounded and refused when it makes no sense."""
+
+import math
+import re
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+
+
+class PlantError(ValueError):
+    """A plant file that cannot be used: the message names the file, the key path, the value and what is allowed."""
+
+
+Positive = Annotated[float, Meta(gt=0.0)]
+NotNegative = Annotated[float, Meta(ge=0.0)]
+Share = Annotated[float, Meta(ge=0.0, lt=1.0)]
+
+
+class Elastomer(Struct, frozen=True, forbid_unknown_fields=True):
+    """The MRE insert, as in tables 2.3 and 2.4 of the thesis."""
+
+    shear_modulus_kPa: Annotated[float, Meta(ge=1.0, le=10_000.0)]
+    relative_permeability: Annotated[float, Meta(ge=1.0, le=10.0)]
+    kinetic_friction: Annotated[float, Meta(gt=0.0, le=2.0)]
+
+
+class Friction(Struct, frozen=True, forbid_unknown_fields=True):
+    """Where the contact between insert and shaft departs from a constant kinetic level."""
+
+    static_to_kinetic: Annotated[float, Meta(ge=1.0, le=3.0)]
+    stribeck_speed_mm_s: Positive
+    presliding_stiffness_N_mm: Positive
+    viscous_N_s_mm: NotNegative
+
+
+class Field(Struct, frozen=True, forbid_unknown_fields=True):
+    """Radial moment over gap, and its memory.
+
+    `power` is coefficient * gap_mm**exponent; `thesis` is Eq. 7 up to 95 mm, going over smoothly into that power law.
+    """
+
+    law: Literal["power", "thesis"]
+    coefficient: Annotated[float, Meta(gt=0.0, le=10.0)]
+    exponent: Annotated[float, Meta(ge=-3.0, lt=0.0)]
+    hysteresis_percent: Annotated[float, Meta(ge=0.0, le=10.0)]
+
+
+class Relaxation(Struct, frozen=True, forbid_unknown_fields=True):
+    """Prony terms of the insert: what share of a force step dies away with which time constant."""
+
+    fractions: Annotated[tuple[Share, ...], Meta(min_length=1, max_length=8)]
+    times_s: Annotated[tuple[Positive, ...], Meta(min_length=1, max_length=8)]
+
+
+class Thermal(Struct, frozen=True, forbid_unknown_fields=True):
+    """Temperature of the insert: its effect on the force, and how fast it starts to warm."""
+
+    force_percent_K: Annotated[float, Meta(ge=-5.0, le=5.0)]
+    drift_K_h: Annotated[float, Meta(ge=0.0, le=20.0)]
+
+
+class Magnets(Struct, frozen=True, forbid_unknown_fields=True):
+    """Two equal blocks; the last size is along the magnetisation."""
+
+    size_mm: tuple[Positive, Positive, Positive]
+    remanence_T: Annotated[float, Meta(gt=0.0, le=1.6)]
+
+
+class Motor(Struct, frozen=True, forbid_unknown_fields=True):
+    """One brushed motor, as seen on the motor's own shaft."""
+
+    resistance_Ohm: Positive
+    back_emf_V_s_rad: Positive
+    inductance_mH: Positive
+    inertia_kg_m2: Positive
+
+
+class Gear(Struct, frozen=True, forbid_unknown_fields=True):
+    """`output_friction_Nm` is what the no-load current shows; the mesh loses a share of the torque beyond it."""
+
+    ratio: Annotated[float, Meta(ge=1.0)]
+    efficiency: Annotated[float, Meta(gt=0.0, le=1.0)]
+    output_friction_Nm: NotNegative
+
+
+class Screw(Struct, frozen=True, forbid_unknown_fields=True):
+    """Lead screw, nut and guide of each carriage."""
+
+    lead_mm: Annotated[float, Meta(gt=0.0, le=50.0)]
+    friction_coefficient: Annotated[float, Meta(ge=0.0, le=1.0)]
+    drag_left_N: NotNegative
+    drag_right_N: NotNegative
+    backlash_um: Annotated[float, Meta(ge=0.0, le=1000.0)]
+    stiffness_N_um: Positive
+
+
+class Electronics(Struct, frozen=True, forbid_unknown_fields=True):
+    """Drive stage and encoders; the counts are per turn of the gearbox output."""
+
+    encoder_counts_per_rev: Annotated[int, Meta(ge=16, le=1_000_000)]
+    supply_V: Annotated[float, Meta(gt=0.0, le=25.0)]
+    current_limit_A: Annotated[float, Meta(gt=0.0, le=30.0)]
+    pwm_bits: Annotated[int, Meta(ge=4, le=16)]
+
+
+class ForceSensor(Struct, frozen=True, forbid_unknown_fields=True):
+    """Noise is the standard deviation of one sample; the offset drifts steadily, its sign falls with the seed."""
+
+    noise_mN: Annotated[float, Meta(ge=0.0, le=1000.0)]
+    drift_mN_min: Annotated[float, Meta(ge=0.0, le=1000.0)]
+    delay_ms: Annotated[float, Meta(ge=0.0, le=1000.0)]
+    rate_Hz: Annotated[float, Meta(gt=0.0, le=1000.0)]
+
+
+class FirmwareTiming(Struct, frozen=True, forbid_unknown_fields=True):
+    """How far the device's clock is off the host's, and the width of the uniform delay before a reply."""
+
+    clock_ppm: Annotated[float, Meta(ge=-1000.0, le=1000.0)]
+    reply_jitter_us: Annotated[float, Meta(ge=0.0, le=5000.0)]
+
+
+class Assumed(Struct, frozen=True, forbid_unknown_fields=True):
+    """What the plant card leaves open. Every default is an assumption, with its reason beside it."""
+
+    screw_mean_diameter_mm: Positive = 7.0  # an 8 mm trapezoidal screw, thread depth 1 mm
+    ambient_C: Annotated[float, Meta(ge=-20.0, le=60.0)] = 25.0  # where the thesis's temperature range begins
+    warm_C: Annotated[float, Meta(ge=-20.0, le=100.0)] = 40.0  # where it ends: warming levels off there
+    handle_counts_per_rev: Annotated[int, Meta(ge=16, le=65536)] = 16384  # 14-bit magnetic shaft encoder
+    home_mm: Positive = 47.5  # open switch: half of the largest gap, 95 mm
+    closed_mm: Positive = 22.25  # closed switch: a quarter millimetre inside half of the smallest gap, 45 mm
+    stop_beyond_mm: Positive = 0.25  # hard stop behind the closed switch; twice that behind the open one
+    start_left_mm: Positive = 40.0  # where the carriages stand at power-on: somewhere, and not equal
+    start_right_mm: Positive = 39.0
+    attraction_factor: Annotated[float, Meta(ge=0.5, le=5.0)] = 2.0  # iron shaft: 30 N at 45 mm in air, card 50..80 N
+    hysteresis_scale: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1  # field change, of the largest, that turns a branch
+    retract_mm_s: Annotated[float, Meta(gt=0.0, le=100.0)] = 15.0  # a carriage's; 80% of what 12 V reach under load
+    homing_mm_s: Annotated[float, Meta(gt=0.0, le=100.0)] = 8.0  # stops by braking within 0.15 mm of the switch
+    overcurrent_A: Positive = 3.0  # well over the 1 A of the worst travel, under the 3.7 A of the weakest stall
+    force_range_N: Annotated[float, Meta(gt=0.0, le=32.0)] = 20.0  # where the force sensor saturates
+
+
+class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
+    """One simulated device, in the units of the plant card."""
+
+    elastomer: Elastomer
+    friction: Friction
+    field: Field
+    relaxation: Relaxation
+    thermal: Thermal
+    magnets: Magnets
+    motor: Motor
+    gear: Gear
+    screw: Screw
+    electronics: Electronics
+    force_sensor: ForceSensor
+    firmware: FirmwareTiming
+    assumed: Assumed = Assumed()
+
+    @property
+    def closed_stop_mm(self) -> float:
+        """Face-to-centre distance at which a carriage meets its inner stop."""
+        return self.assumed.closed_mm - self.assumed.stop_beyond_mm
+
+    @property
+    def open_stop_mm(self) -> float:
+        """Face-to-centre distance at which a carriage meets its outer stop."""
+        return self.assumed.home_mm + 2.0 * self.assumed.stop_beyond_mm
+
+
+def plant_names() -> list[str]:
+    """Names of the plants that come with the package."""
+    folder = resources.files(__package__).joinpath("plants")
+    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def load_plant(path_or_name: str | Path) -> PlantParameters:
+    """Read a plant by the name of a packaged one (`sample_1`) or from a TOML file.
+
+    Raises PlantError for a missing or unreadable file, bad TOML, unknown or missing keys, values that are not
+    finite or out of range, and values that contradict each other.
+    """
+    name = str(path_or_name)
+    if name in plant_names():
+        text = resources.files(__package__).joinpath("plants", f"{name}.toml").read_text(encoding="utf-8")
+    else:
+        try:
+            text = Path(path_or_name).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            known = ", ".join(plant_names())
+            raise PlantError(f"plant {name!r}: neither a readable file ({error}) nor one of {known}") from error
+    return parse_plant(text, name)
+
+
+def parse_plant(text: str, name: str = "plant") -> PlantParameters:
+    """Turn the TOML text of a plant into parameters; `name` is what errors call it. Raises PlantError."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise PlantError(f"{name}: not TOML: {error}") from error
+    _require_finite(raw, "", name)
+    try:
+        parameters = msgspec.convert(raw, PlantParameters)
+    except msgspec.ValidationError as error:
+        reason, _, path = str(error).partition(" - at `$")
+        path = path.rstrip("`").lstrip(".")
+        raise PlantError(f"{name}: {path or 'top level'}{_value_at(raw, path)}: {reason}") from error
+    _require_consistent(parameters, name)
+    return parameters
+
+
+def _require_finite(value: Any, path: str, name: str) -> None:
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            _require_finite(inner, f"{path}.{key}" if path else key, name)
+    elif isinstance(value, list):
+        for index, inner in enumerate(value):
+            _require_finite(inner, f"{path}[{index}]", name)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise PlantError(f"{name}: {path} = {value}: allowed are finite numbers")
+
+
+def _value_at(raw: Any, path: str) -> str:
+    for key, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
+        raw = raw[int(index)] if index else raw.get(key)
+    return "" if isinstance(raw, dict) else f" = {raw!r}"
+
+
+def _require_consistent(plant: PlantParameters, name: str) -> None:
+    def require(holds: bool, message: str) -> None:
+        if not holds:
+            raise PlantError(f"{name}: {message}")
+
+    fractions, times = plant.relaxation.fractions, plant.relaxation.times_s
+    require(
+        len(fractions) == len(times),
+        f"relaxation.fractions has {len(fractions)} values, relaxation.times_s {len(times)}: allowed are equal counts",
+    )
+    require(sum(fractions) < 1.0, f"relaxation.fractions = {list(fractions)}: allowed is a sum under 1")
+    assumed = plant.assumed
+    require(
+        plant.closed_stop_mm > 0.0 and assumed.closed_mm < assumed.home_mm,
+        f"assumed.closed_mm = {assumed.closed_mm}: allowed is over stop_beyond_mm = {assumed.stop_beyond_mm} "
+        f"and under home_mm = {assumed.home_mm}",
+    )
+    for side in ("left", "right"):
+        start = getattr(assumed, f"start_{side}_mm")
+        require(
+            assumed.closed_mm < start < assumed.home_mm,
+            f"assumed.start_{side}_mm = {start}: allowed is between the switches, "
+            f"{assumed.closed_mm} .. {assumed.home_mm}",
+        )
+    require(
+        assumed.warm_C >= assumed.ambient_C,
+        f"assumed.warm_C = {assumed.warm_C}: allowed is at least ambient_C = {assumed.ambient_C}",
+    )
+    require(
+        assumed.overcurrent_A < plant.electronics.current_limit_A,
+        f"assumed.overcurrent_A = {assumed.overcurrent_A}: allowed is under electronics.current_limit_A = "
+        f"{plant.electronics.current_limit_A}",
+    )

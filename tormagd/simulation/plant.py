@@ -1,0 +1,196 @@
+"""The plant: two carriages, the magnets between them, the torque element, the hand and the force sensor."""
+
+import math
+import random
+from collections import deque
+from typing import NamedTuple
+
+from tormagd.physics.errors import Real
+from tormagd.physics.magnets import CuboidMagnet, attraction_N
+from tormagd.simulation.axis import Axis
+from tormagd.simulation.element import Curve, Element
+from tormagd.simulation.hand import Hand
+from tormagd.simulation.parameters import PlantParameters
+
+SUBSTEP_S = 1e-4
+"""Step of motors and screws: a seventh of the motors' electrical time constant, 1/150 of the mechanical one."""
+
+ELEMENT_STEP_S = 1e-3
+"""Step of the element and the hand; the element's updates are exact over it."""
+
+_ROUNDING = 1e-6
+"""Share of a substep by which sums of time steps may be off before a step is held back."""
+
+
+class Truth(NamedTuple):
+    """What really is, as no sensor sees it; `force_N` has the sign of the motion it resists."""
+
+    time_s: float
+    force_N: float
+    gap_mm: float
+    left_mm: float
+    right_mm: float
+    left_A: float
+    right_A: float
+    temperature_C: float
+    handle_mm: float
+    handle_mm_s: float
+    kinetic_N: float
+
+
+class Holding(NamedTuple):
+    """Whether a carriage stays where it is with the power off; torques at the screw, the guide's drag not counted."""
+
+    gap_mm: float
+    attraction_N: float
+    back_driving_Nm: float
+    friction_Nm: float
+
+    @property
+    def margin_Nm(self) -> float:
+        """Friction left over, N m; below 0 the magnets close the gap."""
+        return self.friction_Nm - self.back_driving_Nm
+
+
+class Plant:
+    """The device without its electronics, in fixed substeps of its own time; see `Axis` and `Element` for the laws.
+
+    `advance` may be called with any time step; the remainder of a substep is kept for the next call.
+    """
+
+    def __init__(self, parameters: PlantParameters, hand: Hand, seed: int = 0, *, substep_s: float = SUBSTEP_S) -> None:
+        assumed = parameters.assumed
+        self.parameters = parameters
+        self._hand = hand
+        self._substep_s = substep_s
+        self._substeps_per_element = round(ELEMENT_STEP_S / substep_s)
+        self._attraction = Curve.over_gap(lambda gap: pull_of_magnets_N(gap, parameters), parameters)
+        gap_mm = assumed.start_left_mm + assumed.start_right_mm
+        pull_N = self._attraction.at(gap_mm)
+        screw = parameters.screw
+        self.left = Axis(parameters, screw.drag_left_N, assumed.start_left_mm, pull_N, substep_s)
+        self.right = Axis(parameters, screw.drag_right_N, assumed.start_right_mm, pull_N, substep_s)
+        self.element = Element(parameters, gap_mm, ELEMENT_STEP_S)
+        self.handle_mm = hand.position_mm(0.0)
+        self.handle_mm_s = 0.0
+        self._force_sensor = ForceSensor(parameters, random.Random(seed))
+        self._target_s = 0.0
+        self._substeps = 0
+
+    @property
+    def time_s(self) -> float:
+        """Time since power-on, at the last whole substep."""
+        return self._substeps * self._substep_s
+
+    @property
+    def gap_mm(self) -> float:
+        """Distance between the magnets' faces."""
+        return (self.left.position_m + self.right.position_m) * 1e3
+
+    @property
+    def sensed_force_N(self) -> float:
+        """What the force sensor shows now."""
+        return self._force_sensor.reading_N
+
+    @property
+    def truth(self) -> Truth:
+        """The state at `time_s`; force and handle are at the last whole millisecond."""
+        left, right, element = self.left, self.right, self.element
+        return Truth(
+            time_s=self.time_s,
+            force_N=element.force_N,
+            gap_mm=self.gap_mm,
+            left_mm=left.position_m * 1e3,
+            right_mm=right.position_m * 1e3,
+            left_A=left.current_A,
+            right_A=right.current_A,
+            temperature_C=element.temperature_C,
+            handle_mm=self.handle_mm,
+            handle_mm_s=self.handle_mm_s,
+            kinetic_N=element.kinetic_N,
+        )
+
+    def advance(self, dt_s: float, left_V: float, right_V: float, left_on: bool, right_on: bool) -> None:
+        """Let time pass with these voltages at the motors; a bridge that is not on is open.
+
+        Raises ValueError for a time step that is negative or anything that is not finite.
+        """
+        if not (0.0 <= dt_s < math.inf and math.isfinite(left_V) and math.isfinite(right_V)):
+            raise ValueError(f"dt_s = {dt_s}, left_V = {left_V}, right_V = {right_V}: allowed are finite, dt_s >= 0")
+        self._target_s += dt_s
+        due = int(self._target_s / self._substep_s + _ROUNDING)
+        left_drive = left_V if left_on else None
+        right_drive = right_V if right_on else None
+        left, right, attraction = self.left, self.right, self._attraction
+        while self._substeps < due:
+            pull_N = attraction.at((left.position_m + right.position_m) * 1e3)
+            left.step(left_drive, pull_N)
+            right.step(right_drive, pull_N)
+            self._substeps += 1
+            if self._substeps % self._substeps_per_element == 0:
+                self._advance_element()
+
+    def _advance_element(self) -> None:
+        time_s = self.time_s
+        handle_mm = self._hand.position_mm(time_s)
+        self.handle_mm_s = (handle_mm - self.handle_mm) / ELEMENT_STEP_S
+        self.handle_mm = handle_mm
+        self.element.advance(time_s, self.gap_mm, self.handle_mm_s)
+        self._force_sensor.advance(time_s, self.element.force_N)
+
+    def wear(self, divisor: float) -> None:
+        """Divide what holds the carriages, gearbox and screw friction, by that number."""
+        for axis in (self.left, self.right):
+            axis.gear_friction_Nm /= divisor
+            axis.screw_friction_m /= divisor
+
+
+class ForceSensor:
+    """Samples at its own rate, adds noise and a drifting offset, saturates, and shows each sample after a delay."""
+
+    def __init__(self, plant: PlantParameters, noise: random.Random) -> None:
+        sensor = plant.force_sensor
+        self._noise = noise
+        self._period_s = 1.0 / sensor.rate_Hz
+        self._delay_s = sensor.delay_ms * 1e-3
+        self._spread_N = sensor.noise_mN * 1e-3
+        self._drift_N_s = noise.choice((-1.0, 1.0)) * sensor.drift_mN_min * 1e-3 / 60.0
+        self._range_N = plant.assumed.force_range_N
+        self._samples = 0
+        self._in_flight: deque[tuple[float, float]] = deque()
+        self.reading_N = 0.0
+
+    def advance(self, time_s: float, force_N: float) -> None:
+        """Bring the sensor to that time, at which the rendered force is `force_N`."""
+        # half an element step of tolerance: a sample falls on the nearest step
+        if time_s + 0.5 * ELEMENT_STEP_S >= self._samples * self._period_s:
+            self._samples += 1
+            sample_N = force_N + self._drift_N_s * time_s + self._noise.gauss(0.0, self._spread_N)
+            sample_N = min(max(sample_N, -self._range_N), self._range_N)
+            self._in_flight.append((time_s + self._delay_s, sample_N))
+        while self._in_flight and self._in_flight[0][0] <= time_s + 0.5 * ELEMENT_STEP_S:
+            self.reading_N = self._in_flight.popleft()[1]
+
+
+def pull_of_magnets_N(gap_mm: Real, plant: PlantParameters) -> Real:
+    """Attraction between the magnets over the gap, N: the closed form in air times the factor for the iron shaft."""
+    width_mm, depth_mm, thickness_mm = plant.magnets.size_mm
+    magnet = CuboidMagnet(width_mm * 1e-3, depth_mm * 1e-3, thickness_mm * 1e-3, plant.magnets.remanence_T)
+    return plant.assumed.attraction_factor * attraction_N(gap_mm, magnet)
+
+
+def holding_over_stroke(plant: PlantParameters, points: int = 51, wear: float = 1.0) -> list[Holding]:
+    """Attraction, back-driving torque and holding friction from the smallest to the largest gap of the stroke.
+
+    `wear` divides the friction of gearbox and screw, as the fault `worn_gearbox` does with 4.
+    """
+    start_mm, end_mm = 2.0 * plant.assumed.closed_mm, 2.0 * plant.assumed.home_mm
+    lead_m_rad = plant.screw.lead_mm * 1e-3 / math.tau
+    friction_m = plant.screw.friction_coefficient * 0.5e-3 * plant.assumed.screw_mean_diameter_mm
+    rows = []
+    for index in range(points):
+        gap_mm = start_mm + (end_mm - start_mm) * index / (points - 1)
+        pull_N = pull_of_magnets_N(gap_mm, plant)
+        friction_Nm = (plant.gear.output_friction_Nm + friction_m * pull_N) / wear
+        rows.append(Holding(gap_mm, pull_N, pull_N * lead_m_rad, friction_Nm))
+    return rows
