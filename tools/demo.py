@@ -22,14 +22,14 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 import zmq
-
 from demo_figure import draw
 from human_pulse import Array, pulse_profile, with_approach
 from rehearsal import Case, Rehearsal, rehearse
+from tracking import Tracking, tracking
+
 from tormagd.config import Config, load_config
 from tormagd.messages import MessageError, Telemetry, decode
 from tormagd.scenes.scene import Scene, load_scene
-from tracking import Tracking, tracking
 
 RUN_DIR = Path("run/demo")
 LEAST_N, MOST_N = 1.4, 1.7
@@ -99,8 +99,19 @@ def show(times_s: Array, forces_N: Array) -> Shown:
     codes: dict[str, int] = {}
     with contextlib.ExitStack() as stack:
         simulator = stack.enter_context(
-            process("simulator", "-m", "tormagd.simulation", "--pty", "--plant", "sample_1", "--seed", "1",
-                    "--truth", str(truth_path), stdout=subprocess.PIPE)
+            process(
+                "simulator",
+                "-m",
+                "tormagd.simulation",
+                "--pty",
+                "--plant",
+                "sample_1",
+                "--seed",
+                "1",
+                "--truth",
+                str(truth_path),
+                stdout=subprocess.PIPE,
+            )
         )
         assert simulator.stdout is not None
         port = simulator.stdout.readline().strip()
@@ -114,8 +125,16 @@ def show(times_s: Array, forces_N: Array) -> Shown:
         ctl("enable")
         recorder = stack.enter_context(process("recorder", *CTL, "record", str(RUN_DIR / "pulse.mcap")))
         publisher = stack.enter_context(
-            process("publisher", *CTL, "--json", "send", str(RUN_DIR / "pulse.csv"), "--rate", str(RATE_HZ),
-                    stdout=subprocess.PIPE)
+            process(
+                "publisher",
+                *CTL,
+                "--json",
+                "send",
+                str(RUN_DIR / "pulse.csv"),
+                "--rate",
+                str(RATE_HZ),
+                stdout=subprocess.PIPE,
+            )
         )
         limits = watch(publisher, PULSE_S + RAMP_S + HOLD_S)
         sent = json.loads(publisher.communicate(timeout=30)[0])["result"]
@@ -302,8 +321,10 @@ def print_summary(result: Tracking, shown: Shown, rehearsals: list[Rehearsal], l
             line = "a passive brake: see the picture for what the hand feels"
         print(f"  {'virtual time, ' + rehearsal.case.label:38s} {line}")
     late, spent = control["lateness_us"], control["exec_us"]
-    print(f"control    {control['hz']:7.1f} Hz  late p50 {late['p50']:.0f} p99 {late['p99']:.0f} us, "
-          f"step p50 {spent['p50']:.0f} p99 {spent['p99']:.0f} us, {control['merged']} ticks merged of {control['runs']}")
+    print(
+        f"control    {control['hz']:7.1f} Hz  late p50 {late['p50']:.0f} p99 {late['p99']:.0f} us, "
+        f"step p50 {spent['p50']:.0f} p99 {spent['p99']:.0f} us, {control['merged']} ticks merged of {control['runs']}"
+    )
     spent = inference["exec_us"]
     print(f"inference  {inference['hz']:7.1f} Hz  plan p50 {spent['p50']:.0f} p99 {spent['p99']:.0f} us")
     print(f"link       {shown.status['link']['frames']} frames, {lost} lost, repeated or corrupt")

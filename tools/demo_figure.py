@@ -7,12 +7,12 @@ import matplotlib
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
-from matplotlib.axes import Axes
-
 from human_pulse import Array
+from matplotlib.axes import Axes
 from rehearsal import Rehearsal
-from tormagd.scenes.scene import Scene
 from tracking import tracking
+
+from tormagd.scenes.scene import Scene
 
 ASKED, RENDERED, QUIET = "#222222", "#d1495b", "#8d99ae"
 CLOSE_UP_S = 4.0

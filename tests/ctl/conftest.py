@@ -48,7 +48,9 @@ def telemetry(seq: int, t_ns: int, **changes: Any) -> Telemetry:
 def status(**changes: Any) -> dict[str, Any]:
     """What the daemon answers to `status`."""
     snapshot = {name: getattr(telemetry(1, 1), name) for name in Telemetry.__struct_fields__ if name != "tick"}
-    return snapshot | {"version": "0", "scene": "pulse", "uptime_s": 5.0, "link": {"state": "UP", "frames": 7}} | changes
+    return (
+        snapshot | {"version": "0", "scene": "pulse", "uptime_s": 5.0, "link": {"state": "UP", "frames": 7}} | changes
+    )
 
 
 class FakeDaemon(threading.Thread):

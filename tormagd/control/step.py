@@ -81,7 +81,9 @@ class Stepper:
         if safety.operating_state is OperatingState.ENABLED and state.safety.operating_state is OperatingState.DISABLED:
             # bumpless: from where the gap is, at rest, with empty integrators
             if state.estimate is None:
-                raise RefusedError("not_fresh", "no measurement from the device yet", "look at the link in tormagctl status")
+                raise RefusedError(
+                    "not_fresh", "no measurement from the device yet", "look at the link in tormagctl status"
+                )
             reference = Reference(state.estimate.gap_mm)
             return state._replace(
                 safety=safety,

@@ -51,13 +51,16 @@ def _publish(
     worst_late_s = 0.0
     first_seq = time.time_ns()  # above every earlier run's, so that none of ours looks repeated
     start_s, start_ns = time.monotonic(), time.time_ns()
-    while (t_s := index / rate_hz) <= duration_s and not is_interrupted():
+    # the margin keeps the last one where the times of a file are off by a rounding error
+    last = int(duration_s * rate_hz + 1e-6)
+    while index <= last and not is_interrupted():
+        t_s = index / rate_hz
         wait_s = start_s + t_s - time.monotonic()
         if wait_s > 0.0:
             time.sleep(wait_s)
         late_s = time.monotonic() - start_s - t_s
         worst_late_s = max(worst_late_s, late_s)
-        overdue = min(int(late_s * rate_hz), int(duration_s * rate_hz) - index)
+        overdue = min(int(late_s * rate_hz), last - index)
         skipped += overdue
         index += overdue
         if socket.poll(0) and socket.recv()[:1] == b"\x00":

@@ -200,4 +200,3 @@ class Daemon:
             if measurement is None or not measurement.is_busy:
                 return
             await asyncio.sleep(0.02)
-
