@@ -1,7 +1,7 @@
 """A measured human pulse as a force profile.
 
 The pulse is a photoplethysmogram (blood volume under the skin seen by light, not a pressure or a force) that the PyPI
-package heartpy ships as `data.csv`: 100 Hz, 25 s, one person. Its shape and rhythm are measured; the newtons are chosen.
+package heartpy ships as `data.csv`: 100 Hz, 25 s, one person. Shape and rhythm are measured; the newtons are chosen.
 """
 
 import importlib.util

@@ -55,3 +55,11 @@ def plateau() -> ForceModel:
     weight = np.zeros((1, 4))
     weight[:, 2] = 500.0
     return make_model(weight, np.zeros(1), np.array([1.0]), 0.0)
+
+
+@pytest.fixture(scope="session")
+def creeping() -> ForceModel:
+    """The plateau, with a rise of 8 units of rounding across it."""
+    weight = np.zeros((2, 4))
+    weight[:, 2] = 500.0, 1.0
+    return make_model(weight, np.zeros(2), np.array([1.0, 1e-14]), -0.9)

@@ -110,6 +110,15 @@ def test_on_a_plateau_the_field_moves_as_little_as_possible(plateau: ForceModel,
     assert above.field_mT == pytest.approx(600, abs=0.5)
 
 
+def test_a_slope_below_rounding_does_not_move_the_field(creeping: ForceModel) -> None:
+    """The greatest force of all is at 800 mT, by a few units of rounding: no reason to travel there."""
+    grid = [creeping.predict_one(0.5, 10, field, CIP) for field in (500.0, 650.0, 800.0)]
+    assert 0 < grid[2] - grid[0] < 1e-14
+    solution = nearest(creeping, neighbours=701).solve(0.5, 10, grid[2] + 1, CIP, 600.0)
+    assert solution.reach is Reach.ABOVE
+    assert solution.field_mT == pytest.approx(600, abs=0.5)
+
+
 @pytest.mark.parametrize("make", SOLVERS)
 def test_out_of_reach_is_the_nearest_end_and_says_so(rising: ForceModel, make: Callable[..., FieldSolver]) -> None:
     solver = make(rising)

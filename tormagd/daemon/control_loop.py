@@ -7,6 +7,7 @@ from tormagd.control.plan import Plan
 from tormagd.control.step import StepOutput, Stepper, StepState
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.hardware.connection import Connection
+from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions
 
 log = logging.getLogger(__name__)
@@ -21,13 +22,13 @@ class ControlLoop:
         self.output: StepOutput | None = None
         self.timing = RateGroup("control", period_ns)
         self.next_tick_ns = 0
+        self._reported_faults: tuple[Fault, ...] = ()
 
     def tick(self, due_ns: int, merged: int, plan: Plan) -> None:
         """The control period that was due at `due_ns` and stands for `merged` missed ones too."""
         self.next_tick_ns = due_ns + self.timing.period_ns
         start_ns = time.monotonic_ns()
         now_s = start_ns * 1e-9
-        before = self.state.safety
         self.state, output = self._stepper.step(self.state, now_s, self._connection.measurement, plan)
         self._connection.exchange(
             now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
@@ -35,8 +36,7 @@ class ControlLoop:
         self.output = output
         end_ns = time.monotonic_ns()
         self.timing.record(due_ns, start_ns, end_ns, merged)
-        if self.state.safety.faults != before.faults:
-            log.error("fault: %s", ", ".join(self.state.safety.faults) or "none left")
+        self._report_faults()
 
     def command(self, name: str, conditions: Conditions) -> None:
         """An operator's command. Raises RefusedError."""
@@ -46,3 +46,11 @@ class ControlLoop:
     def lose_link(self) -> None:
         """Tells the core that the device is gone."""
         self.state = self._stepper.lose_link(self.state)
+        self._report_faults()
+
+    def _report_faults(self) -> None:
+        faults = self.state.safety.faults
+        if faults != self._reported_faults:
+            self._reported_faults = faults
+            if faults:
+                log.error("fault: %s", ", ".join(faults))

@@ -69,8 +69,7 @@ def open_serial(device: Device) -> SerialBackend:
     try:
         port = serial.Serial(device.port, device.baud, timeout=0, write_timeout=0, exclusive=True)
         port.reset_input_buffer()
-    except serial.SerialException as error:
-        raise BackendError(f"{device.port}: cannot be opened: {error}") from error
-    except OSError as error:
-        raise BackendError(f"{device.port}: cannot be opened: {error.strerror}") from error
+    except OSError as error:  # SerialException is one too; its text repeats path and number
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        raise BackendError(f"{device.port}: cannot be opened: {reason}") from error
     return SerialBackend(port)

@@ -45,7 +45,7 @@ class NearestFieldSearch:
     The candidate nearest the last field wins; without a last field the lowest, which is the opener gap. Where nothing
     crosses, the force is out of reach, and the nearest end is the answer.
 
-    Parameters: `field_range_mT` and `step_mT` make the grid; `dtype` is torch.float32 or torch.float64. By default it is
+    Parameters: `field_range_mT` and `step_mT` make the grid; `dtype` is torch.float32 or torch.float64. The default is
     float64 every 2 mT, which takes the time of float32 every 1 mT and is ten times nearer the network's own root.
     Raises `DomainError` on parameters it cannot use. Sets torch to one thread for the whole process: a second thread
     costs more than it saves at this size, and disturbs the loop. An instance is not reentrant: it owns its work space.

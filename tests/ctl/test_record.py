@@ -1,0 +1,76 @@
+import json
+import signal
+import subprocess
+import sys
+
+import msgpack
+import pytest
+
+from tormagd.ctl.main import main
+from tormagd.recording.reader import read_recording
+
+
+def test_record_then_plot(fake_daemon, tmp_path, capsys):
+    file, picture = tmp_path / "a.mcap", tmp_path / "a.png"
+    assert main(["--endpoint", fake_daemon.control, "--json", "record", str(file), "--duration", "0.3"]) == 0
+    result = json.loads(capsys.readouterr().out)["result"]
+    recording = read_recording(file)
+    assert recording.is_complete
+    assert recording.ticks.t_ns.size == result["ticks"] > 0
+    assert recording.telemetry.t_ns.size == result["telemetry"] > 0
+    assert (result["gaps"], result["telemetry_lost"], result["unreadable"]) == (0, 0, 0)
+
+    assert main(["--json", "plot", str(file), "-o", str(picture)]) == 0
+    drawn = json.loads(capsys.readouterr().out)["result"]
+    assert drawn["ticks"] == result["ticks"]
+    assert drawn["tracking_rms_N"] == pytest.approx(0.1 / 2**0.5, rel=0.1)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_recording_is_never_overwritten(fake_daemon, tmp_path, capsys):
+    file = tmp_path / "a.mcap"
+    file.write_text("precious")
+    assert main(["--endpoint", fake_daemon.control, "--json", "record", str(file)]) == 2
+    assert "exists" in json.loads(capsys.readouterr().out)["error"]["message"]
+    assert file.read_text() == "precious"
+
+
+def test_a_file_that_cannot_be_made_is_a_usage_error(fake_daemon, tmp_path, capsys):
+    assert main(["--endpoint", fake_daemon.control, "record", str(tmp_path / "none" / "a.mcap")]) == 2
+    assert "No such file" in capsys.readouterr().err
+
+
+def test_rubbish_is_counted_and_left_out(fake_daemon, tmp_path, capsys):
+    good = {"v": 1, "columns": ["t_ns", "x"], "rows": [[2**60, 1.0]]}
+    fake_daemon.rubbish += [
+        b"\xc1",
+        msgpack.packb(good | {"v": 2}),
+        msgpack.packb(good | {"columns": ["x", "t_ns"]}),
+        msgpack.packb(good | {"columns": ["t_ns", "t_ns"]}),
+        msgpack.packb(good | {"rows": [[2**60]]}),
+        msgpack.packb(good | {"rows": [[-1, 1.0]]}),
+        msgpack.packb(good | {"rows": [[1.5, 1.0]]}),
+    ] * 30  # published while the recorder is connecting, too
+    file = tmp_path / "a.mcap"
+    assert main(["--endpoint", fake_daemon.control, "--json", "record", str(file), "--duration", "0.6"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["result"]["unreadable"] > 7
+    assert captured.err.count("left out a message") == 1
+    assert read_recording(file).is_complete
+
+
+def test_an_interrupt_ends_a_recording_cleanly(fake_daemon, tmp_path):
+    file = tmp_path / "a.mcap"
+    command = [sys.executable, "-m", "tormagd.ctl.main", "--endpoint", fake_daemon.control, "--wait", "20", "--json"]
+    recorder = subprocess.Popen([*command, "record", str(file)], stdout=subprocess.PIPE, text=True)
+    try:
+        while recorder.poll() is None and not file.exists():
+            main(["--endpoint", fake_daemon.control, "--json", "status"])
+        recorder.send_signal(signal.SIGINT)
+        printed, _ = recorder.communicate(timeout=20)
+    finally:
+        recorder.kill()
+    assert recorder.returncode == 0
+    recording = read_recording(file)
+    assert recording.is_complete
+    assert json.loads(printed)["result"]["telemetry"] == recording.telemetry.t_ns.size

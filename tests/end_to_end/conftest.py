@@ -1,0 +1,161 @@
+"""A daemon and a simulated device as real processes, joined by a pty, spoken to over real sockets."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+
+from tormagd.messages import VERSION, Reply, Request, Setpoint, Telemetry, decode, encode
+
+PATIENCE_S = 30.0
+"Longer than anything takes on a busy machine; only a failure waits for it."
+
+
+class Rig:
+    """The processes of one test, and a client to each of the daemon's sockets."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.port = folder / "tty"
+        self.truth_path = folder / "truth.csv"
+        self.config = folder / "tormagd.toml"
+        self.config.write_text(
+            f'scene = "coronary"\n[device]\nport = "{self.port}"\n[endpoints]\n'
+            + "".join(f'{n} = "ipc://{folder}/{n}"\n' for n in ("setpoint", "telemetry", "control", "recording"))
+        )
+        self.simulator: subprocess.Popen[str] | None = None
+        self.daemon: subprocess.Popen[str] | None = None
+        self._context = zmq.Context()
+        self._seq = 0
+        self._setpoints = self._socket(zmq.XPUB, "setpoint")
+        self._control = self._socket(zmq.DEALER, "control")
+        self._telemetry = self._socket(zmq.SUB, "telemetry")
+        self._telemetry.subscribe(b"")
+
+    def start_simulator(self, *arguments: str) -> None:
+        """A device behind the port; a symbolic link stands for the stable name that udev gives a real one."""
+        command = [sys.executable, "-m", "tormagd.simulation", "--pty", "--seed", "1"]
+        command += ["--truth", str(self.truth_path), *arguments]
+        self.simulator = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert self.simulator.stdout is not None
+        path = self.simulator.stdout.readline().strip()
+        assert path.startswith("/dev/")
+        self.port.unlink(missing_ok=True)
+        self.port.symlink_to(path)
+
+    def start_daemon(self) -> None:
+        """A daemon that has found its device."""
+        environment = os.environ | {"OMP_NUM_THREADS": "1"}
+        self.daemon = subprocess.Popen(
+            [sys.executable, "-m", "tormagd.daemon.main", "--config", str(self.config)], env=environment, text=True
+        )
+        self.until(lambda: self.status()["link"]["state"] == "RUNNING", "the link runs")
+
+    def command(self, name: str) -> Reply:
+        """The daemon's answer."""
+        self._seq += 1
+        self._control.send(encode(Request(v=VERSION, id=self._seq, command=name)))
+        until_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until_s:
+            if self._control.poll(1_000):
+                reply = decode(self._control.recv(), Reply)
+                if reply.id == self._seq:
+                    return reply
+        pytest.fail(f"no answer to {name}")
+
+    def done(self, name: str) -> None:
+        """A command that must be carried out."""
+        reply = self.command(name)
+        assert reply.ok, reply.error
+
+    def status(self) -> dict[str, Any]:
+        """The daemon's status."""
+        reply = self.command("status")
+        assert reply.ok
+        assert reply.result is not None
+        return reply.result
+
+    def telemetry(self) -> Telemetry:
+        """The next telemetry message."""
+        assert self._telemetry.poll(round(PATIENCE_S * 1e3)), "no telemetry"
+        return decode(self._telemetry.recv(), Telemetry)
+
+    def until(self, reached: Callable[[], bool], what: str) -> None:
+        """Waits for a condition that each new look may find; fails saying what was waited for."""
+        until_s = time.monotonic() + PATIENCE_S
+        while not reached():
+            assert time.monotonic() < until_s, f"not within {PATIENCE_S:g} s: {what}"
+            self._telemetry.poll(50)
+
+    def arm(self) -> None:
+        """Homes and enables."""
+        self.done("home")
+        self.until(lambda: self.status()["is_homed"] and not self.status()["is_busy"], "homed")
+        self.done("enable")
+
+    def ask(self, force_N: float, valid_for_ms: float = 30_000.0, **fields: Any) -> None:
+        """Publishes one setpoint."""
+        self._seq += 1
+        setpoint = Setpoint(
+            v=VERSION,
+            source="test",
+            seq=self._seq,
+            stamp_ns=time.time_ns(),
+            servo_cf=force_N,
+            valid_for_ms=valid_for_ms,
+            **fields,
+        )
+        self.publish(encode(setpoint))
+
+    def publish(self, data: bytes) -> None:
+        """Sends any bytes to the setpoint socket."""
+        self._setpoints.send(data)
+
+    def wait_for_subscription(self) -> None:
+        """Until the daemon listens; what is published earlier is lost, as everywhere in ZeroMQ."""
+        assert self._setpoints.poll(round(PATIENCE_S * 1e3))
+        self._setpoints.recv()
+
+    def end(self, child: "subprocess.Popen[str]", number: signal.Signals) -> int:
+        """Sends a signal; the exit code."""
+        child.send_signal(number)
+        return child.wait(timeout=PATIENCE_S)
+
+    def truth(self) -> "np.ndarray[Any, Any]":
+        """What the simulator wrote; ends it."""
+        assert self.simulator is not None
+        self.end(self.simulator, signal.SIGTERM)
+        return np.genfromtxt(self.truth_path, delimiter=",", names=True)
+
+    def close(self) -> None:
+        """Ends what still runs."""
+        for child in (self.daemon, self.simulator):
+            if child is not None and child.poll() is None:
+                child.kill()
+                child.wait()
+        self._context.destroy(linger=0)
+
+    def _socket(self, kind: int, name: str) -> "zmq.Socket[bytes]":
+        socket = self._context.socket(kind)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.connect(f"ipc://{self.folder}/{name}")
+        return socket
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    """A device and a daemon that has found it."""
+    with contextlib.closing(Rig(tmp_path)) as made:
+        made.start_simulator()
+        made.start_daemon()
+        made.wait_for_subscription()
+        yield made

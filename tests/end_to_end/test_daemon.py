@@ -1,0 +1,147 @@
+"""The daemon as its users meet it: real processes, a real pty, real sockets. Nothing here asserts a duration."""
+
+import math
+import random
+import signal
+
+import msgpack
+import pytest
+
+HOSTILE_VALUES = [math.nan, math.inf, -math.inf, -0.1, 1e9, "1.5", None, [1.0], {"N": 1.0}, True]
+
+
+def raw_setpoint(**changes):
+    """A valid setpoint as a plain map, with some of it changed; a value of `...` leaves the key out."""
+    fields = {"v": 1, "source": "hostile", "seq": 1, "stamp_ns": 0, "servo_cf": 1.0, "valid_for_ms": 100.0} | changes
+    return msgpack.packb({name: value for name, value in fields.items() if value is not ...})
+
+
+def test_force_follows_the_setpoint(rig):
+    rig.arm()
+    for force_N in (1.0, 1.6):
+        rig.ask(force_N)
+        rig.until(lambda asked=force_N: abs((rig.telemetry().measured_cf or 0.0) - asked) < 0.06, f"{force_N} N")
+    newest = rig.telemetry()
+    assert newest.operating_state == "ENABLED"
+    assert newest.setpoint_cf == 1.6
+    assert abs(newest.skew_mm) < 0.05
+
+
+def test_below_the_least_force_says_so(rig):
+    rig.arm()
+    rig.ask(0.1)
+    rig.until(lambda: "F_MIN" in rig.telemetry().limits, "F_MIN shown")
+    newest = rig.telemetry()
+    assert newest.governed_cf == pytest.approx(rig.status()["least_N"], abs=1e-3)
+    assert [detail["code"] for detail in rig.status()["limit_details"]] == ["F_MIN"]
+
+
+def test_stale_setpoint_decays_to_the_least_force(rig):
+    rig.arm()
+    rig.ask(1.5)
+    rig.until(lambda: (rig.telemetry().governed_cf or 0.0) == 1.5, "governed")
+    rig.ask(1.5, valid_for_ms=50.0)
+    rig.until(lambda: "STALE" in rig.telemetry().limits, "STALE shown")
+    least_N = rig.status()["least_N"]
+    rig.until(lambda: rig.telemetry().governed_cf < least_N + 0.01, "decayed")
+    assert rig.telemetry().operating_state == "ENABLED"
+
+
+def test_enable_is_refused_until_everything_is_right(rig):
+    reply = rig.command("enable")
+    assert not reply.ok
+    assert reply.error.code == "not_homed"
+    rig.done("home")
+    rig.until(lambda: rig.status()["is_homed"] and not rig.status()["is_busy"], "homed")
+    rig.ask(1.5)
+    rig.until(lambda: rig.telemetry().setpoint_cf == 1.5, "setpoint seen")
+    reply = rig.command("enable")
+    assert not reply.ok
+    assert reply.error.code == "not_neutral"
+    rig.ask(0.5)
+    rig.until(lambda: rig.telemetry().setpoint_cf == 0.5, "setpoint seen")
+    rig.done("enable")
+
+
+def test_killed_daemon_leaves_an_open_gap_and_a_latched_reason(rig):
+    rig.arm()
+    rig.ask(1.6)
+    rig.until(lambda: abs((rig.telemetry().measured_cf or 0.0) - 1.6) < 0.1, "1.6 N")
+    assert rig.end(rig.daemon, signal.SIGKILL) == -signal.SIGKILL
+    rig.start_daemon()
+    rig.until(lambda: rig.status()["faults"] == ["DEVICE_COMMAND_TIMEOUT"], "the reason is reported")
+    assert rig.command("enable").error.code == "fault"
+    rig.until(lambda: not rig.status()["is_busy"], "the gap is open")
+    rig.done("clear-fault")
+    rig.until(lambda: rig.status()["faults"] == [], "cleared")
+    assert rig.command("enable").error.code == "not_homed"
+    rig.arm()
+    rig.end(rig.daemon, signal.SIGTERM)
+    truth = rig.truth()
+    closed = truth["gap_mm"].min()
+    assert closed < 70.0
+    assert truth["gap_mm"][-1] > 94.0
+
+
+def test_sigterm_opens_the_gap_and_exits_in_order(rig):
+    rig.arm()
+    rig.ask(1.6)
+    rig.until(lambda: abs((rig.telemetry().measured_cf or 0.0) - 1.6) < 0.1, "1.6 N")
+    assert rig.end(rig.daemon, signal.SIGTERM) == 0
+    assert rig.truth()["gap_mm"][-1] > 94.0
+    assert not (rig.folder / "setpoint").exists()
+
+
+def test_stop_opens_and_latches(rig):
+    rig.arm()
+    rig.ask(1.5)
+    rig.until(lambda: (rig.telemetry().gap_mm or 95.0) < 72.0, "closing")
+    rig.done("stop")
+    rig.until(lambda: rig.telemetry().operating_state == "FAULT" and (rig.telemetry().gap_mm or 0.0) > 94.0, "open")
+    assert rig.status()["fault_details"][0]["code"] == "STOPPED"
+    rig.until(lambda: not rig.status()["is_busy"], "at rest")
+    rig.done("clear-fault")
+    assert rig.status()["operating_state"] == "DISABLED"
+
+
+def test_hostile_setpoints_are_refused_counted_and_do_not_disturb(rig):
+    rig.arm()
+    rig.ask(1.5)
+    rig.until(lambda: abs((rig.telemetry().measured_cf or 0.0) - 1.5) < 0.1, "1.5 N")
+    before = rig.status()["setpoints"]
+    noise = random.Random(7)
+    messages = [raw_setpoint(servo_cf=value) for value in HOSTILE_VALUES]
+    messages += [raw_setpoint(valid_for_ms=value) for value in (0.0, -1.0, math.nan, "1")]
+    messages += [raw_setpoint(**{name: ...}) for name in ("v", "source", "seq", "stamp_ns", "servo_cf")]
+    messages += [raw_setpoint(v=2), raw_setpoint(source="x" * 65), raw_setpoint(stamp_ns=2**62)]
+    messages += [noise.randbytes(noise.randrange(200)) for _ in range(200)]
+    for data in messages:
+        rig.publish(data)
+    rig.until(lambda: rig.status()["setpoints"]["refused"] >= before["refused"] + len(messages), "all refused")
+    after = rig.status()
+    assert after["setpoints"]["refused"] == before["refused"] + len(messages)
+    assert after["setpoints"]["accepted"] == before["accepted"]
+    assert after["setpoints"]["last_refusal"]
+    rig.publish(bytes(10_000_000))
+    rig.until(lambda: rig.status()["setpoints"]["oversize"] == 1, "oversize counted")
+    newest = rig.telemetry()
+    assert newest.operating_state == "ENABLED"
+    assert newest.setpoint_cf == 1.5
+    assert abs(newest.measured_cf - 1.5) < 0.1
+
+
+def test_unplugged_device_is_a_named_fault_and_comes_back_without_re_arming(rig):
+    rig.arm()
+    rig.ask(1.5)
+    rig.until(lambda: (rig.telemetry().gap_mm or 95.0) < 72.0, "closing")
+    rig.end(rig.simulator, signal.SIGKILL)
+    rig.until(lambda: "LINK_LOST" in rig.status()["faults"], "the loss is named")
+    assert rig.status()["link"]["cause"]
+    rig.start_simulator()
+    rig.until(lambda: rig.status()["link"]["state"] == "RUNNING", "the link runs again")
+    assert rig.status()["operating_state"] == "FAULT"
+    rig.until(lambda: not rig.status()["is_busy"], "the returned device has opened")
+    rig.done("clear-fault")
+    rig.ask(0.5)
+    rig.until(lambda: rig.telemetry().setpoint_cf == 0.5, "neutral again")
+    rig.arm()

@@ -1,0 +1,248 @@
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from tormagd.messages import MessageError, Telemetry, Tick, encode
+from tormagd.recording.plot import bands, figure, save_plot, series, tracking_rms_N
+from tormagd.recording.reader import Recording, RecordingError, read_recording
+from tormagd.recording.ticks import TickBatch, decode_ticks
+from tormagd.recording.writer import RecordingWriter, telemetry_schema
+
+START_NS = 1_790_000_000_000_000_000
+COLUMNS = ("t_ns", "setpoint_cf", "measured_cf", "left_mm", "right_mm", "left_duty")
+
+
+def batch(*rows: tuple[Any, ...], columns: tuple[str, ...] = COLUMNS) -> TickBatch:
+    return TickBatch(v=1, columns=columns, rows=tuple((START_NS + int(ms * 1e6), *rest) for ms, *rest in rows))
+
+
+def telemetry(ms: float, seq: int, **changes: Any) -> Telemetry:
+    known: dict[str, Any] = dict.fromkeys(Telemetry.__struct_fields__)
+    known |= {"v": 1, "t_ns": START_NS + int(ms * 1e6), "seq": seq, "operating_state": "ENABLED", "is_homed": True}
+    known |= {"is_busy": False, "duty": (0.5, -0.5), "limits": (), "faults": (), "tick": Tick(20.0, 100.0)}
+    return Telemetry(**(known | changes))
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Path:
+    """100 ms: asked 1.5 N, measured 1.6; RATE for the middle 40 ms, then a fault for the last 20."""
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, {"scene": "pulse"}) as writer:
+        for k in range(5):
+            writer.ticks(batch(*((20 * k + i, 1.5, 1.6, 35.0, 36.0, 0.25) for i in range(20))))
+            writer.telemetry(
+                telemetry(
+                    20 * k,
+                    k,
+                    operating_state="FAULT" if k == 4 else "ENABLED",
+                    limits=("RATE",) if k in (1, 2) else (),
+                    faults=("SKEW",) if k == 4 else (),
+                    gap_setpoint_mm=70.0,
+                    measured_cf=9.0,
+                )
+            )
+    return path
+
+
+def test_a_recording_comes_back_as_it_was_written(written):
+    recording = read_recording(written)
+    assert recording.is_complete
+    assert recording.metadata["scene"] == "pulse"
+    assert np.array_equal(np.diff(recording.ticks.t_ns), np.full(99, 1_000_000))
+    assert recording.ticks.t_ns[0] == START_NS
+    assert recording.ticks.numbers["measured_cf"].tolist() == [1.6] * 100
+    assert recording.telemetry.numbers["duty.1"].tolist() == [-0.5] * 5
+    assert recording.telemetry.numbers["tick.exec_us"].tolist() == [100.0] * 5
+    assert recording.telemetry.words["limits"] == [(), ("RATE",), ("RATE",), (), ()]
+    assert recording.telemetry.words["operating_state"][4] == ("FAULT",)
+    assert np.isnan(recording.telemetry.numbers["setpoint_cf"]).all()
+
+
+def test_other_tools_find_json_messages_with_schemas(written):
+    with written.open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert summary is not None
+        topics = {channel.topic: channel for channel in summary.channels.values()}
+        assert set(topics) == {"/telemetry", "/ticks"}
+        assert {channel.message_encoding for channel in topics.values()} == {"json"}
+        schemas = {topic: summary.schemas[channel.schema_id] for topic, channel in topics.items()}
+        assert {schema.encoding for schema in schemas.values()} == {"jsonschema"}
+        assert set(json.loads(schemas["/ticks"].data)["properties"]) == set(COLUMNS)
+        assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
+        _, _, message = next(iter(reader.iter_messages(topics="/ticks")))
+        assert message.log_time == START_NS
+        assert json.loads(message.data)["left_mm"] == 35.0
+
+
+def test_the_telemetry_schema_has_every_field_in_plain_form():
+    schema = telemetry_schema()
+    assert set(schema["properties"]) == set(Telemetry.__struct_fields__)
+    assert schema["properties"]["setpoint_cf"] == {"type": "number"}
+    assert schema["properties"]["duty"] == {"type": "array", "items": {"type": "number"}}
+    assert schema["properties"]["tick"]["properties"] == {
+        "lateness_us": {"type": "number"},
+        "exec_us": {"type": "number"},
+    }
+    assert not {"$ref", "anyOf", "prefixItems"} & set(json.dumps(schema).replace('"', " ").split())
+
+
+def test_not_a_number_is_written_as_null(tmp_path):
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        writer.ticks(batch((0, math.nan, math.inf, None, 1.0, 0.0)))
+        writer.telemetry(telemetry(0, 0, measured_cf=math.nan))
+    with path.open("rb") as file:
+        texts = [message.data for _, _, message in make_reader(file).iter_messages()]
+    assert all(b"NaN" not in text and b"Infinity" not in text for text in texts)
+    assert math.isnan(read_recording(path).ticks.numbers["measured_cf"][0])
+
+
+def test_gaps_and_losses_are_counted(tmp_path):
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        columns = ("t_ns", "x")
+        for ms in (0, 1, 2, 11.9, 40, 41, 30, 31):  # one merged wait (not a gap), one of 28.1 ms, one back in time
+            writer.ticks(batch((ms, 0.0), columns=columns))
+        for seq in (3, 4, 7, 8, 0, 1):  # 5 and 6 are lost; then the daemon restarts
+            writer.telemetry(telemetry(seq, seq))
+    assert (writer.tick_count, writer.gaps, writer.telemetry_lost) == (8, 2, 2)
+    assert writer.longest_gap_ms == pytest.approx(28.1)
+
+
+def test_columns_may_change_while_recording(tmp_path):
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        writer.ticks(batch((0, 1.0), columns=("t_ns", "old")))
+        writer.ticks(batch((1, 2.0, "ENABLED"), columns=("t_ns", "new", "operating_state")))
+    ticks = read_recording(path).ticks
+    assert ticks.numbers["old"][0] == 1.0
+    assert np.isnan(ticks.numbers["old"][1])
+    assert np.isnan(ticks.numbers["new"][0])
+    assert ticks.words["operating_state"] == [(), ("ENABLED",)]
+
+
+def test_a_recording_is_not_overwritten(written):
+    before = written.read_bytes()
+    with pytest.raises(FileExistsError):
+        RecordingWriter(written)
+    assert written.read_bytes() == before
+
+
+def test_a_recording_cut_short_gives_what_is_whole(tmp_path, written):
+    data = written.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: len(data) - 40])
+    recording = read_recording(cut)
+    assert not recording.is_complete
+    assert recording.ticks.t_ns.size == 100
+    assert "cut short" in figure(recording, "x").get_suptitle()
+
+
+@given(place=st.floats(0.0, 1.0), value=st.integers(1, 255), keep=st.floats(0.0, 1.0))
+def test_a_damaged_file_gives_a_recording_or_a_recording_error(tmp_path_factory, place, value, keep):
+    path = Path(tmp_path_factory.getbasetemp()) / "small.mcap"
+    if not path.exists():
+        with RecordingWriter(path) as writer:
+            writer.ticks(batch((0, 1.0, 1.0, 35.0, 35.0, 0.0)))
+            writer.telemetry(telemetry(0, 0))
+    data = bytearray(path.read_bytes())
+    data[int(place * (len(data) - 1))] ^= value
+    damaged = path.with_name("damaged.mcap")
+    damaged.write_bytes(data[: int(keep * len(data))])
+    try:
+        recording = read_recording(damaged)
+    except RecordingError as error:
+        assert "damaged.mcap" in str(error)  # noqa: PT017
+    else:
+        assert isinstance(recording, Recording)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a recording at all", b"\x89MCAP0\r\n"])
+def test_another_file_is_refused_by_name(tmp_path, content):
+    path = tmp_path / "other.mcap"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match=r"other\.mcap"):
+        read_recording(path)
+
+
+def test_quantities_come_from_the_ticks_and_else_from_telemetry(written):
+    recording = read_recording(written)
+    measured, gap = series(recording, "measured_cf"), series(recording, "gap_mm")
+    wanted, right = series(recording, "gap_setpoint_mm"), series(recording, "right_duty")
+    assert measured is not None
+    assert measured.values.tolist() == [1.6] * 100
+    assert gap is not None
+    assert gap.values.tolist() == [71.0] * 100
+    assert wanted is not None
+    assert wanted.t_s.tolist() == pytest.approx([0.0, 0.02, 0.04, 0.06, 0.08])
+    assert right is not None
+    assert right.values.tolist() == [-0.5] * 5
+    assert series(recording, "field_mT") is None
+
+
+def test_bands_are_the_stretches_of_time_of_a_code(written):
+    recording = read_recording(written)
+    (limit,) = bands(recording, "limits")
+    assert limit.name == "RATE"
+    assert limit.spans_s == (pytest.approx((0.02, 0.06)),)
+    assert [(band.name, len(band.spans_s)) for band in bands(recording, "operating_state")] == [
+        ("ENABLED", 1),
+        ("FAULT", 1),
+    ]
+
+
+def test_tracking_error_counts_only_while_enabled(tmp_path, written):
+    assert tracking_rms_N(read_recording(written)) == pytest.approx(0.1)
+    path = tmp_path / "b.mcap"
+    with RecordingWriter(path) as writer:
+        columns = ("t_ns", "setpoint_cf", "measured_cf", "operating_state")
+        writer.ticks(batch(*((i, 1.0, 5.0, "DISABLED") for i in range(10)), columns=columns))
+        writer.ticks(batch(*((10 + i, 1.0, 1.2, "ENABLED") for i in range(10)), columns=columns))
+    assert tracking_rms_N(read_recording(path)) == pytest.approx(0.2)
+
+
+def test_the_picture_names_what_happened(written):
+    drawn = figure(read_recording(written), "a title")
+    heading = drawn.get_suptitle()
+    assert "a title" in heading
+    assert "100 mN" in heading
+    assert "SKEW" in heading
+    lanes = [label.get_text() for label in drawn.axes[-1].get_yticklabels()]
+    assert lanes == ["state", "limit RATE", "FAULT SKEW"]
+    assert [line.get_label() for line in drawn.axes[0].lines] == ["measured", "asked"]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
+def test_pictures_in_each_format(written, tmp_path, suffix):
+    target = tmp_path / f"a{suffix}"
+    save_plot(read_recording(written), target, "x")
+    assert target.stat().st_size > 5_000
+
+
+def test_other_formats_and_empty_recordings_are_refused(written, tmp_path):
+    with pytest.raises(ValueError, match=r"\.png"):
+        save_plot(read_recording(written), tmp_path / "a.docx", "x")
+    with RecordingWriter(tmp_path / "empty.mcap"):
+        pass
+    with pytest.raises(ValueError, match="no messages"):
+        save_plot(read_recording(tmp_path / "empty.mcap"), tmp_path / "a.png", "x")
+
+
+def test_a_telemetry_message_is_no_tick_batch():
+    with pytest.raises(MessageError, match="columns"):
+        decode_ticks(encode(telemetry(0, 0)))
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_batch_or_a_message_error(data):
+    try:
+        assert decode_ticks(data).columns[0] == "t_ns"
+    except MessageError:
+        pass
