@@ -56,6 +56,9 @@ setpoint = "ipc://run/demo/setpoint"
 telemetry = "ipc://run/demo/telemetry"
 control = "ipc://run/demo/control"
 recording = "ipc://run/demo/recording"
+
+[realtime]
+fifo_priority = 50  # refused where it is not allowed; then the log says so
 """
 
 

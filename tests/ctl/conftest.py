@@ -98,8 +98,8 @@ class FakeDaemon(threading.Thread):
             telemetry_out.send(encode(telemetry(seq, t_ns)))
             rows = [(t_ns + k * 1_000_000, 1.5, 1.5, 1.5 + 0.1 * math.sin(k), 35.0, 36.0, 0.1, -0.1) for k in range(20)]
             recording.send(msgpack.packb({"v": VERSION, "columns": COLUMNS, "rows": rows}))
-            while self.rubbish:
-                recording.send(self.rubbish.pop())
+            for data in self.rubbish:
+                recording.send(data)
             seq += 1
         context.destroy(linger=0)
 

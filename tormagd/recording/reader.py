@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from mcap.exceptions import EndOfFile, McapError
+from mcap.exceptions import McapError
 from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from tormagd.recording.writer import TELEMETRY_TOPIC, TICKS_TOPIC
 
 MAX_RECORD_BYTES = 64_000_000
 MAX_NESTING = 2
+UNREADABLE = (McapError, ZstdError, ValueError, OverflowError, struct.error, msgspec.MsgspecError)
 
 
 class RecordingError(ValueError):
@@ -65,12 +66,15 @@ def read_recording(path: Path) -> Recording:
                         metadata.update(record.metadata)
                     elif isinstance(record, Message) and topics.get(record.channel_id) in builders:
                         builders[topics[record.channel_id]].add(record.log_time, msgspec.json.decode(record.data))
-            except EndOfFile:
+            except UNREADABLE:
+                # a record that runs into the end of the file was being written when the recorder died
+                if file.read(1):
+                    raise
                 is_complete = False
         telemetry, ticks = builders[TELEMETRY_TOPIC].columns(), builders[TICKS_TOPIC].columns()
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
-    except (McapError, ZstdError, ValueError, OverflowError, struct.error, msgspec.MsgspecError) as error:
+    except UNREADABLE as error:
         raise RecordingError(f"{path}: not an intact MCAP recording ({error})") from error
     if not set(topics.values()) & set(builders):
         raise RecordingError(

@@ -1,0 +1,65 @@
+"""Imports go one way: each room may import only what stands here (and itself)."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+LOWEST = {"firmware_protocol", "config", "messages"}
+MAY_IMPORT = {
+    "firmware_protocol": set(),
+    "config": set(),
+    "messages": set(),
+    "physics": set(),
+    "design": {"physics"},
+    "learning": {"physics"},
+    "inverse": {"physics", "learning"},
+    "scenes": {"config"},
+    "safety": {"firmware_protocol"},
+    "hardware": {"firmware_protocol", "config", "safety"},
+    "control": LOWEST | {"physics", "learning", "inverse", "scenes", "safety", "hardware"},
+    "daemon": LOWEST | {"scenes", "safety", "hardware", "control"},
+    "recording": {"messages"},
+    "ctl": {"config", "messages", "scenes", "recording"},
+    "simulation": {"physics", "firmware_protocol"},
+    "closed_loop": LOWEST | {"control", "hardware", "safety", "simulation"},
+}
+
+
+def sources() -> Iterator[Path]:
+    """Every module of the two packages."""
+    for package in ("tormagd", "firmware_protocol"):
+        yield from sorted((ROOT / package).rglob("*.py"))
+
+
+def room(parts: tuple[str, ...]) -> str | None:
+    """The room a module or an import stands in; None for what is not ours."""
+    if parts[0] == "firmware_protocol":
+        return "firmware_protocol"
+    if parts[0] == "tormagd" and len(parts) > 1 and parts[1] in MAY_IMPORT:
+        return parts[1]
+    return None
+
+
+def imported_rooms(path: Path) -> set[str]:
+    """The rooms that a module imports, also inside functions."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        found |= {room(tuple(name.split("."))) for name in names}
+    return found - {None}
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_room_imports_only_what_stands_left_of_it(path):
+    here = room(path.relative_to(ROOT).with_suffix("").parts)
+    if here is None:
+        assert path.name == "__init__.py", f"{path} stands in no room"
+        return
+    assert imported_rooms(path) <= MAY_IMPORT[here] | {here}
