@@ -56,7 +56,7 @@ def imported_rooms(path: Path) -> set[str]:
     return found - {None}
 
 
-@pytest.mark.parametrize("path", sources(), ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("path", list(sources()), ids=lambda path: str(path.relative_to(ROOT)))
 def test_a_room_imports_only_what_stands_left_of_it(path):
     here = room(path.relative_to(ROOT).with_suffix("").parts)
     if here is None:

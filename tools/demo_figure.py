@@ -31,7 +31,7 @@ def draw(
     """Writes a PNG: the whole run, a close-up, the error, the samples side by side, the hand that stops."""
     figure, axes = plt.subplots(3, 2, figsize=(13, 10.5), constrained_layout=True)
     figure.suptitle("A measured human pulse, rendered as friction force by the simulated device", fontsize=14)
-    _forces(axes[0, 0], time_s, asked_N, rendered_N, "Real time, plant sample 1: the whole run")
+    _forces(axes[0, 0], time_s, asked_N, rendered_N, "Real time, plant sample 1")
     axes[0, 0].axvspan(0.0, pulse_start_s, color="#eef0f4", zorder=0)
     axes[0, 0].text(pulse_start_s / 2, axes[0, 0].get_ylim()[0] + 0.03, "approach", ha="center", color=QUIET)
     middle = pulse_start_s + 6.0
@@ -49,7 +49,7 @@ def draw(
 def _forces(axes: Axes, time_s: Array, asked_N: Array, rendered_N: Array, title: str) -> None:
     axes.plot(time_s, asked_N, color=ASKED, linewidth=1.4, label="asked")
     axes.plot(time_s, rendered_N, color=RENDERED, linewidth=1.2, label="rendered (the plant's)")
-    axes.legend(loc="lower right", frameon=False)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False, borderaxespad=0.0)
     _dress(axes, title, "force at the roller, N")
 
 
@@ -59,8 +59,9 @@ def _error(axes: Axes, scene: Scene, time_s: Array, asked_N: Array, rendered_N: 
     tolerance_mN = scene.force.tolerance_rms_N * 1e3
     axes.axhspan(-tolerance_mN, tolerance_mN, color="#e9f5ec", zorder=0)
     axes.plot(time_s[pulse], (rendered_N - asked_N)[pulse] * 1e3, color=RENDERED, linewidth=0.9)
+    axes.text(time_s[-1], tolerance_mN, "the scene's RMS tolerance", ha="right", va="top", color="#5a9367", fontsize=9)
     title = f"Error: RMS {result.rms_N * 1e3:.1f} mN, variance accounted for {result.variance_accounted_for:.3f}"
-    _dress(axes, f"{title} (green: the scene's RMS tolerance)", "rendered - asked, mN")
+    _dress(axes, title, "rendered - asked, mN")
 
 
 def _samples(axes: Axes, rehearsals: list[Rehearsal], start_s: float) -> None:
@@ -83,7 +84,7 @@ def _reversals(axes: Axes, rehearsals: list[Rehearsal], start_s: float) -> None:
     time_s = moving.time_s[part]
     axes.plot(time_s, moving.asked_N[part], color=ASKED, linewidth=1.4, label="asked")
     axes.plot(time_s, moving.rendered_N[part], color=RENDERED, linewidth=1.2, label="felt (signed)")
-    axes.legend(loc="lower right", frameon=False)
+    axes.legend(loc="center", bbox_to_anchor=(0.68, 0.5), frameon=False)
     second = axes.twinx()
     second.fill_between(time_s, moving.handle_mm_s[part], color=QUIET, alpha=0.25, linewidth=0)
     second.set_ylabel("handle speed, mm/s (grey)", color=QUIET)

@@ -76,6 +76,11 @@ class ClosedLoop:
         trim = 1.0 if self.plan_state is None else self.plan_state.trim
         return Sample(now_s, self.step_state, output, used, trim, self.device.truth)
 
+    def skip(self) -> None:
+        """One control period in which the daemon does nothing: it was killed, or its cable was cut."""
+        self._ticks += 1
+        self.device.transmit(self.now_s)
+
     def command(self, name: str) -> None:
         """An operator's command. Raises RefusedError."""
         self.step_state = self._stepper.command(self.step_state, name, self.now_s, self.conditions())

@@ -111,6 +111,9 @@ class Limits(Strict, frozen=True):
     skew_warning_mm: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.2
     skew_fault_mm: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
     following_error_mm: Annotated[float, Meta(gt=0.0, le=50.0)] = 3.0
+    no_motion_duty: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.35
+    "A carriage driven harder than this must move: it is well above what friction and the magnets hold."
+    no_motion_time_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.06
     following_time_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.25
     low_confidence: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.5
     stale_ramp_N_s: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 2.0

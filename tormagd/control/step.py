@@ -29,6 +29,8 @@ STARTING_S = 0.15
 "After enabling, the device may take this long to report that it runs."
 COULOMB_SPEED_MM_S = 0.5
 "Below this reference speed the friction feed-forward fades, so that a resting carriage is not pushed to and fro."
+STILL_MM_S = 0.5
+"Slower than this a carriage does not move: half an encoder count a millisecond and filtered."
 LAGGING_MM = 0.1
 "The speed limit is reported as RATE only where it leaves the reference this far behind its target."
 
@@ -44,6 +46,9 @@ class StepState(NamedTuple):
     right: PidState = PidState()
     enabled_s: float = math.inf
     following_s: float = math.inf
+    "Since when the gap has been too far from its reference; infinite while it follows."
+    still_s: float = math.inf
+    "Since when a carriage has been driven without moving; infinite while both obey."
 
 
 class StepOutput(NamedTuple):
@@ -92,6 +97,7 @@ class Stepper:
                 right=PidState(),
                 enabled_s=now_s,
                 following_s=math.inf,
+                still_s=math.inf,
             )
         return state._replace(safety=safety)
 
@@ -148,9 +154,13 @@ class Stepper:
             limits.append(Limit.SATURATED)
         if abs(estimate.skew_mm) > self._limits.skew_warning_mm:
             limits.append(Limit.SKEW)
-        following_s = self._following(state, reference, estimate, now_s)
         state = state._replace(
-            time_s=now_s, reference=reference, left=left_state, right=right_state, following_s=following_s
+            time_s=now_s,
+            reference=reference,
+            left=left_state,
+            right=right_state,
+            following_s=self._following(state, reference, estimate, now_s),
+            still_s=self._still(state, estimate, left.duty, right.duty, now_s),
         )
         # the bridges switch the device's real supply: the same volts take less duty of a higher one
         scale = self._supply_V / max(measurement.supply_V, 0.5 * self._supply_V)
@@ -204,6 +214,8 @@ class Stepper:
             faults.append(Fault.SKEW)
         if now_s - state.following_s > self._limits.following_time_s:
             faults.append(Fault.FOLLOWING_ERROR)
+        if now_s - state.still_s > self._limits.no_motion_time_s:
+            faults.append(Fault.NO_MOTION)
         if measurement.mode is not DeviceMode.RUN and not faults and now_s - state.enabled_s > STARTING_S:
             faults.append(Fault.DEVICE_NOT_RUNNING)
         return tuple(faults)
@@ -212,6 +224,12 @@ class Stepper:
         if abs(reference.gap_mm - estimate.gap_mm) <= self._limits.following_error_mm:
             return math.inf
         return min(state.following_s, now_s)
+
+    def _still(self, state: StepState, estimate: Estimate, left_duty: float, right_duty: float, now_s: float) -> float:
+        least = self._limits.no_motion_duty
+        is_left_still = abs(left_duty) > least and abs(estimate.left_mm_s) < STILL_MM_S
+        is_right_still = abs(right_duty) > least and abs(estimate.right_mm_s) < STILL_MM_S
+        return min(state.still_s, now_s) if is_left_still or is_right_still else math.inf
 
     @staticmethod
     def _off(safety: SafetyState, limits: tuple[Limit, ...]) -> StepOutput:

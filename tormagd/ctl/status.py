@@ -8,6 +8,8 @@ from tormagd.ctl.client import Client
 from tormagd.ctl.outcome import Colour, Exit, Outcome
 
 UNKNOWN = "-"
+SETPOINT_COUNTS = ("accepted", "refused", "dropped", "oversize")
+LINK_COUNTS = ("losses", "frames", "corrupt", "lost", "repeated", "resynchronisations")
 
 
 def status(client: Client) -> Outcome:
@@ -35,8 +37,9 @@ def status_text(result: Mapping[str, Any], colour: Colour) -> str:
         f"measured {_number(result, 'measured_cf', 'N')}",
         f"gap       {_number(result, 'gap_mm', 'mm', 2)}, wanted {_number(result, 'gap_setpoint_mm', 'mm', 2)}, "
         f"skew {_number(result, 'skew_mm', 'mm', 3)}",
-        f"setpoint  {_number(result, 'setpoint_age_ms', 'ms', 0)} old, {_counts(_table(result, 'setpoints'))}",
-        f"link      {link_state}, {_counts(link)}",
+        f"setpoint  {_number(result, 'setpoint_age_ms', 'ms', 0)} old, "
+        f"{_counts(_table(result, 'setpoints'), SETPOINT_COUNTS)}",
+        f"link      {link_state}, {_counts(link, LINK_COUNTS)}",
         *_explained(link.get("cause"), link.get("remedy"), colour.yellow),
         *_rates(_table(result, "rates")),
         f"daemon    {result.get('version', UNKNOWN)}, scene {result.get('scene', UNKNOWN)}, "
@@ -58,9 +61,8 @@ def _number(result: Mapping[str, Any], name: str, unit: str, digits: int = 3) ->
     return f"{value:.{digits}f} {unit}" if isinstance(value, int | float) else UNKNOWN
 
 
-def _counts(table: Mapping[str, Any]) -> str:
-    """The whole numbers of a table, by name."""
-    numbers = [f"{n} {name}" for name, n in table.items() if isinstance(n, int) and not isinstance(n, bool)]
+def _counts(table: Mapping[str, Any], names: tuple[str, ...]) -> str:
+    numbers = [f"{table[name]} {name}" for name in names if isinstance(table.get(name), int)]
     return ", ".join(numbers) or UNKNOWN
 
 

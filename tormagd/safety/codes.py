@@ -20,6 +20,7 @@ class Fault(StrEnum):
     MEASUREMENT_STALE = "MEASUREMENT_STALE"
     SKEW = "SKEW"
     FOLLOWING_ERROR = "FOLLOWING_ERROR"
+    NO_MOTION = "NO_MOTION"
     NOT_FINITE = "NOT_FINITE"
     STOPPED = "STOPPED"
     DEVICE_NOT_RUNNING = "DEVICE_NOT_RUNNING"
@@ -63,6 +64,9 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.FOLLOWING_ERROR: Explanation(
         "the gap did not follow its reference", "look for something that blocks a carriage, then home"
+    ),
+    Fault.NO_MOTION: Explanation(
+        "a carriage was driven and its encoder did not move", "look for a block or a loose encoder, then home"
     ),
     Fault.NOT_FINITE: Explanation(
         "a number in the loop was not finite", "keep the recording and report it; clear-fault starts afresh"
