@@ -82,9 +82,9 @@ class Motor(Strict, frozen=True):
 class Position(Strict, frozen=True):
     """The carriage position loop: PID with filtered derivative, back-calculation and feed-forward."""
 
-    proportional_per_mm: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 6.0
-    integral_time_s: Annotated[float, Meta(ge=0.005, le=100.0)] = 0.08
-    derivative_time_s: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0145
+    proportional_per_mm: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 3.6
+    integral_time_s: Annotated[float, Meta(ge=0.005, le=100.0)] = 0.1
+    derivative_time_s: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.02
     derivative_filter_s: Annotated[float, Meta(ge=1e-4, le=0.1)] = 0.003
     back_calculation_s: Annotated[float, Meta(ge=0.001, le=10.0)] = 0.1
     synchronisation: Annotated[float, Meta(ge=0.0, le=10.0)] = 1.0

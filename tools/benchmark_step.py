@@ -1,0 +1,191 @@
+"""`benchmark step`: how fast and how exactly the gap follows, on the plant in virtual time.
+
+The device's physical limit comes from the plant itself: full voltage one way, then full voltage the other way, with the
+switch timed so that it comes to rest at the target.
+"""
+
+import itertools
+import time
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.config import Config, Motor
+from tormagd.control.motor import margins
+from tormagd.control.plan import Plan
+from tormagd.control.step import Stepper
+from tormagd.scenes.scene import load_scene
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.plant import Plant
+
+Array = npt.NDArray[np.float64]
+
+START_MM, STEP_MM = 60.0, 1.0
+STROKE_MM = (46.0, 94.0)
+"The stroke within both ends' braking distance; the figure is scaled to the full 50 mm."
+WATCHED_S = 0.6
+SETTLING_BAND = 0.05
+CORNER = 0.3
+CORNER_PARAMETERS = ("resistance_ohm", "back_emf_V_s", "inertia_kg_m2", "inductance_mH")
+PERIOD_CORNERS = (0.8, 1.0, 1.2)
+TICK_S = 1e-3
+
+
+class Step(NamedTuple):
+    """One step of the gap, seen by the encoders; the plant's true error beside it."""
+
+    rise_s: float
+    overshoot: float
+    settling_5pct_s: float
+    steady_error_um: float
+    true_error_um: float
+    skew_um: float
+    time_s: Array
+    gap_mm: Array
+
+
+def run(plant_name: str = "sample_1", config: Config | None = None) -> dict[str, Any]:
+    """The contract's keys, for steps that open and that close; `worst` of both is what counts."""
+    config = config or Config()
+    parameters = load_plant(plant_name)
+    started_s = time.monotonic()
+    loop = settled_loop(config, parameters)
+    opening = step(loop, START_MM + STEP_MM)
+    closing = step(loop, START_MM)
+    stroke_s = stroke(loop)
+    factor = loop.now_s / (time.monotonic() - started_s)
+    limits = {+1: time_optimal(parameters, START_MM, STEP_MM), -1: time_optimal(parameters, START_MM, -STEP_MM)}
+    span = STROKE_MM[1] - STROKE_MM[0]
+    physical_s = time_optimal(parameters, STROKE_MM[0], span).total_s
+    nominal = margins(config.motor, config.position, TICK_S)
+    corners = corner_margins(config)
+    return {
+        "plant": plant_name,
+        "rise_s": max(opening.rise_s, closing.rise_s),
+        "overshoot": max(opening.overshoot, closing.overshoot),
+        "settling_5pct_s": max(opening.settling_5pct_s, closing.settling_5pct_s),
+        "steady_error_um": max(opening.steady_error_um, closing.steady_error_um),
+        "true_error_um": max(opening.true_error_um, closing.true_error_um),
+        "skew_um": max(opening.skew_um, closing.skew_um),
+        "rise_over_time_optimal": max(opening.rise_s / limits[1].rise_s, closing.rise_s / limits[-1].rise_s),
+        "stroke_ratio": stroke_s / physical_s,
+        "gain_margin_dB": nominal.gain_margin_dB,
+        "phase_margin_deg": nominal.phase_margin_deg,
+        "corners": corners,
+        "virtual_time_factor": factor,
+    }
+
+
+def settled_loop(config: Config, parameters: PlantParameters) -> ClosedLoop:
+    """A loop that is homed, enabled, and at rest at START_MM."""
+    device = VirtualDevice(parameters, SteadyHand(), seed=1)
+    loop = ClosedLoop(config, Stepper(config, load_scene("coronary")), None, device)
+    loop.arm(hold(95.0, 0.0))
+    drive(loop, START_MM, 3.0)
+    return loop
+
+
+def step(loop: ClosedLoop, target_mm: float) -> Step:
+    """One step to a gap, from rest."""
+    before = loop.step_state.estimate
+    if before is None:
+        raise RuntimeError("the loop has no measurement")
+    start_mm, start_s = before.gap_mm, loop.now_s
+    samples = drive(loop, target_mm, WATCHED_S)
+    time_s = np.array([sample.time_s - start_s for sample in samples])
+    estimates = [sample.state.estimate for sample in samples if sample.state.estimate is not None]
+    gap = np.array([estimate.gap_mm for estimate in estimates])
+    share = (gap - start_mm) / (target_mm - start_mm)
+    outside = np.flatnonzero(np.abs(share - 1.0) > SETTLING_BAND)
+    return Step(
+        rise_s=_rise(time_s, share),
+        overshoot=max(0.0, float(share.max()) - 1.0),
+        settling_5pct_s=float(time_s[outside[-1]]) if outside.size else 0.0,
+        steady_error_um=abs(float(gap[-1]) - target_mm) * 1e3,
+        true_error_um=abs(samples[-1].truth.gap_mm - target_mm) * 1e3,
+        skew_um=max(abs(estimate.skew_mm) for estimate in estimates) * 1e3,
+        time_s=time_s,
+        gap_mm=gap,
+    )
+
+
+def stroke(loop: ClosedLoop) -> float:
+    """Time from the first to the last millimetre of the stroke, opening, s."""
+    drive(loop, STROKE_MM[0], 3.0)
+    samples = drive(loop, STROKE_MM[1], 3.0)
+    gap = np.array([sample.truth.gap_mm for sample in samples])
+    return float(np.argmax(gap > STROKE_MM[1] - 0.05) + 1) * TICK_S
+
+
+class Optimum(NamedTuple):
+    """The fastest the plant can do: rise from 10 to 90 %, and from rest to rest."""
+
+    rise_s: float
+    total_s: float
+
+
+def time_optimal(parameters: PlantParameters, start_mm: float, distance_mm: float) -> Optimum:
+    """Bang-bang on the plant: the latest switch that still comes to rest at the target, by bisection."""
+    low, high = 0.0, 4.0
+    for _ in range(30):
+        middle = (low + high) / 2.0
+        gap, _ = bang_bang(parameters, start_mm, distance_mm, middle)
+        if abs(gap[-1] - start_mm) < abs(distance_mm):
+            low = middle
+        else:
+            high = middle
+    gap, total_s = bang_bang(parameters, start_mm, distance_mm, low)
+    time_s = np.arange(1, len(gap) + 1) * TICK_S / 10.0
+    return Optimum(_rise(time_s, (gap - start_mm) / distance_mm), total_s)
+
+
+def bang_bang(parameters: PlantParameters, start_mm: float, distance_mm: float, switch_s: float) -> tuple[Array, float]:
+    """True gap every 0.1 ms until rest, and the time of that, for full voltage that turns round at `switch_s`."""
+    at_rest = msgspec.structs.replace(parameters.assumed, start_left_mm=start_mm / 2, start_right_mm=start_mm / 2)
+    plant = Plant(msgspec.structs.replace(parameters, assumed=at_rest), SteadyHand())
+    volts = np.sign(distance_mm) * parameters.electronics.supply_V
+    gaps, time_s, tick = [], 0.0, TICK_S / 10.0
+    for count in itertools.count(1):
+        time_s = count * tick
+        applied = volts if time_s <= switch_s else -volts
+        before = plant.gap_mm
+        plant.advance(tick, applied, applied, left_on=True, right_on=True)
+        gaps.append(plant.gap_mm)
+        is_turning = time_s > switch_s and (plant.gap_mm - before) * distance_mm <= 0.0
+        if is_turning or time_s > 6.0:
+            return np.array(gaps), time_s
+    raise AssertionError("count ends never")
+
+
+def corner_margins(config: Config) -> dict[str, float]:
+    """The smallest margins over every corner of +-30% in the named motor parameters and +-20% in the period."""
+    gain, phase = [], []
+    for signs in itertools.product((1.0 - CORNER, 1.0 + CORNER), repeat=len(CORNER_PARAMETERS)):
+        changed = {
+            name: getattr(config.motor, name) * factor for name, factor in zip(CORNER_PARAMETERS, signs, strict=True)
+        }
+        motor: Motor = msgspec.structs.replace(config.motor, **changed)
+        for period in PERIOD_CORNERS:
+            found = margins(motor, config.position, TICK_S * period)
+            gain.append(found.gain_margin_dB)
+            phase.append(found.phase_margin_deg)
+    return {"gain_margin_dB": min(gain), "phase_margin_deg": min(phase), "corners": float(len(gain))}
+
+
+def hold(gap_mm: float, now_s: float) -> Plan:
+    """A plan that asks for a gap and nothing else."""
+    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
+
+
+def drive(loop: ClosedLoop, gap_mm: float, duration_s: float) -> list[Sample]:
+    """Asks for one gap for a while."""
+    return [loop.tick(plan=hold(gap_mm, loop.now_s)) for _ in range(round(duration_s / TICK_S))]
+
+
+def _rise(time_s: Array, share: Array) -> float:
+    return float(time_s[np.argmax(share >= 0.9)] - time_s[np.argmax(share >= 0.1)])

@@ -1,0 +1,66 @@
+"""One brake as a designer sees it: force over gap between two end positions, its slope and its inverse."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tormagd.physics.errors import DomainError, Real, require
+from tormagd.physics.field import FieldLaw
+from tormagd.physics.force import (
+    Elastomer,
+    Geometry,
+    brake_force_N,
+    d_force_d_gap,
+    max_radial_moment_Tm,
+    radial_moment_for_force_Tm,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Brake:
+    """An elastomer in a geometry between magnets whose gap goes from `closed_mm` to `open_mm`.
+
+    Raises `DomainError` unless both gaps lie in the field law's range, closed below open, and the elastomer bears the
+    field of the closed gap (lambda1 >= 0.05).
+    """
+
+    field: FieldLaw
+    elastomer: Elastomer
+    geometry: Geometry
+    closed_mm: float
+    open_mm: float
+
+    def __post_init__(self) -> None:
+        for name in ("closed_mm", "open_mm"):
+            require(name, getattr(self, name), *self.field.gap_range_mm)
+        if not self.closed_mm < self.open_mm:
+            raise DomainError("open_mm", self.open_mm, f"above closed_mm, {self.closed_mm:g}")
+        strongest_Tm = max_radial_moment_Tm(self.elastomer, self.geometry)
+        require("radial_moment_Tm", self.field.radial_moment_Tm(self.closed_mm), 0.0, strongest_Tm)
+
+    @property
+    def least_N(self) -> float:
+        """Force of the open gap: a passive brake gives no less while the handle moves."""
+        return self.force_N(self.open_mm)
+
+    @property
+    def most_N(self) -> float:
+        """Force of the closed gap."""
+        return self.force_N(self.closed_mm)
+
+    def force_N(self, gap_mm: Real) -> Real:
+        """Brake force at a gap; falls with it."""
+        return brake_force_N(self.field.radial_moment_Tm(gap_mm), self.elastomer, self.geometry)
+
+    def slope_N_mm(self, gap_mm: Real) -> Real:
+        """|dF/dgap|, N per mm of gap (the bracket of Eq. 36)."""
+        return abs(d_force_d_gap(gap_mm, self.field, self.elastomer, self.geometry))
+
+    def gap_mm(self, force_N: Real) -> Real:
+        """The gap, within the end positions, that gives the force; `DomainError` for a force no gap gives."""
+        require("force_N", force_N, self.least_N, self.most_N)
+        gap_mm = self.field.gap_mm(radial_moment_for_force_Tm(force_N, self.elastomer, self.geometry))
+        # the forces of the end positions come back as the end positions, not as a rounding beyond them
+        if isinstance(gap_mm, float):
+            return min(max(gap_mm, self.closed_mm), self.open_mm)
+        return np.clip(gap_mm, self.closed_mm, self.open_mm)

@@ -1,0 +1,104 @@
+"""Table 2.4: friction fitted to the measured force ranges of the inserts, and how far the force law then errs.
+
+Compared are *ranges*, F(45 mm) - F(95 mm): the table gives no single forces. The law's range is proportional to the
+friction coefficient, so the coefficient of a matrix that gives the least mean relative error over its inserts is a
+weighted median, found exactly; a least-squares fit answers another question.
+
+The one further parameter is the exponent n of the field's growth with permeability, b ~ (mu_r / 4)^n, 1 in the thesis.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from tormagd.physics.errors import DomainError, require
+from tormagd.physics.field import REFERENCE_PERMEABILITY, FieldLaw
+from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.physics.inserts import Insert, relative_permeability
+
+CLOSED_MM, OPEN_MM = 45.0, 95.0
+MIN_EXPONENT, MAX_EXPONENT = 0.0, 3.0
+_GRID = 61
+
+
+class RangeFit(NamedTuple):
+    """Friction coefficient by the matrix's Shore 00 hardness, and the permeability exponent it goes with."""
+
+    field: FieldLaw
+    friction: Mapping[int, float]
+    exponent: float
+
+    def range_N(self, insert: Insert) -> float:
+        """The force range this fit gives an insert, N. `DomainError` for a matrix that was not fitted."""
+        if insert.shore_hardness not in self.friction:
+            raise DomainError("shore_hardness", insert.shore_hardness, f"one of {sorted(self.friction)}")
+        return self.friction[insert.shore_hardness] * frictionless_range_N(insert, self.field, self.exponent)
+
+    def relative_error(self, insert: Insert) -> float:
+        """|range / measured range - 1|."""
+        return abs(self.range_N(insert) / insert.force_range.measured_N - 1.0)
+
+
+def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0) -> float:
+    """F(45 mm) - F(95 mm) of an insert in the thesis's device for a friction coefficient of one, N."""
+    require("exponent", exponent, MIN_EXPONENT, MAX_EXPONENT)
+    mu_r = relative_permeability(insert.cip_fraction)
+    elastomer = Elastomer(insert.shear_modulus_Pa, mu_r, friction_coefficient=1.0)
+    # the force law takes b ~ (mu_r / 4) a: another exponent is another moment
+    scale = (mu_r / REFERENCE_PERMEABILITY) ** (exponent - 1.0)
+    most_N = brake_force_N(scale * field.radial_moment_Tm(CLOSED_MM), elastomer, TORMAG)
+    return most_N - brake_force_N(scale * field.radial_moment_Tm(OPEN_MM), elastomer, TORMAG)
+
+
+def fit_friction(inserts: Iterable[Insert], field: FieldLaw, exponent: float = 1.0) -> RangeFit:
+    """The friction per matrix with the least mean relative error; `DomainError` for no inserts."""
+    ratios: dict[int, list[float]] = {}
+    for item in inserts:
+        ratio = frictionless_range_N(item, field, exponent) / item.force_range.measured_N
+        ratios.setdefault(item.shore_hardness, []).append(ratio)
+    if not ratios:
+        raise DomainError("inserts", "none", "one or more")
+    return RangeFit(field, {shore: _friction(values) for shore, values in ratios.items()}, exponent)
+
+
+def fit_exponent(inserts: Iterable[Insert], field: FieldLaw) -> RangeFit:
+    """As `fit_friction`, with the exponent free, to 1e-4 in the exponent.
+
+    The mean error is piecewise smooth with many kinks: a grid, then finer grids about its best point.
+    """
+    known = tuple(inserts)
+    low, high = MIN_EXPONENT, MAX_EXPONENT
+    while True:
+        exponents = np.linspace(low, high, _GRID)
+        fits = [fit_friction(known, field, float(exponent)) for exponent in exponents]
+        best = min(fits, key=lambda fit: mean_relative_error(fit, known))
+        step = float(exponents[1] - exponents[0])
+        if step < 1e-4:
+            return best
+        low, high = max(MIN_EXPONENT, best.exponent - step), min(MAX_EXPONENT, best.exponent + step)
+
+
+def mean_relative_error(fit: RangeFit, inserts: Iterable[Insert]) -> float:
+    """Mean over the inserts of `RangeFit.relative_error`."""
+    return float(np.mean([fit.relative_error(item) for item in inserts]))
+
+
+def leave_one_out(inserts: Iterable[Insert], field: FieldLaw, *, free_exponent: bool) -> dict[str, float]:
+    """Relative error of each insert under the fit to all the others, by name.
+
+    Raises `DomainError` where an insert is the only one of its matrix: the others then say nothing about it.
+    """
+    known = tuple(inserts)
+    fit = fit_exponent if free_exponent else fit_friction
+    return {
+        left_out.name: fit([item for item in known if item is not left_out], field).relative_error(left_out)
+        for left_out in known
+    }
+
+
+def _friction(ratios: list[float]) -> float:
+    # the minimum of sum |mu r - 1| = sum r |mu - 1/r| is the median of 1/r, weighted by r
+    ordered = sorted(ratios, reverse=True)
+    reached = np.cumsum(ordered)
+    return 1.0 / ordered[int(np.searchsorted(reached, 0.5 * reached[-1]))]
