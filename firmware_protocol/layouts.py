@@ -101,7 +101,7 @@ class Sense(NamedTuple):
     left_current_A: float
     # Right motor current; positive drives towards open.
     right_current_A: float
-    # Force at the roller, resisting the hand; noise and offset make it negative near zero.
+    # Friction force at the roller, positive against a positive motion of the handle.
     force_N: float
     # Roller surface position: 16384 counts a turn at 20 mm radius, counts modulo 2^16 (four turns); the host
     # unwraps.

@@ -34,7 +34,7 @@ class Device(Strict, frozen=True):
     baud: Annotated[int, Meta(ge=115_200, le=12_000_000)] = 1_000_000
     command_timeout_ms: Annotated[float, Meta(ge=5.0, le=1_000.0)] = 50.0
     "What the firmware does without us: its own timeout, stated here so that it can be checked against ours."
-    measurement_timeout_ms: Annotated[float, Meta(ge=2.0, le=1_000.0)] = 20.0
+    measurement_timeout_ms: Annotated[float, Meta(ge=2.0, le=1_000.0)] = 40.0
     "Oldest device state the controller accepts while it drives."
 
 
@@ -80,7 +80,10 @@ class Motor(Strict, frozen=True):
 
 
 class Position(Strict, frozen=True):
-    """The carriage position loop: PID with filtered derivative, back-calculation and feed-forward."""
+    """The carriage position loop: PID with filtered derivative, back-calculation and feed-forward.
+
+    The gains come from `tools/tune_position.py`.
+    """
 
     proportional_per_mm: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 3.6
     integral_time_s: Annotated[float, Meta(ge=0.005, le=100.0)] = 0.1

@@ -1,0 +1,94 @@
+"""From H(z) to the gains of the position loop: the stiffest that stay robust.
+
+Searches derivative time, filter and integral time on a grid; for each the largest proportional gain whose margins hold
+at every corner of +-30% in the motor's parameters and +-20% in the loop period. Stiffest means the largest integral
+gain: how fast a disturbance of the carriage (drag, the magnets' pull) is taken away.
+"""
+
+import argparse
+import itertools
+import json
+import math
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+from benchmark_step import corner_margins
+from tqdm import tqdm
+
+from tormagd.config import Config, load_config
+
+LEAST_GAIN_MARGIN_DB = 6.0
+LEAST_PHASE_MARGIN_DEG = 45.0
+DERIVATIVE_TIMES_S = (0.01, 0.015, 0.02, 0.025, 0.03, 0.04)
+FILTER_TIMES_S = (0.002, 0.003, 0.004)
+INTEGRAL_TIMES_S = (0.1, 0.15, 0.2, 0.4)
+"A shorter integral time than 0.1 s fights stiction: the carriages begin to hunt by a count."
+LARGEST_GAIN_PER_MM = 20.0
+DIGITS = 2
+
+
+class Tuning(NamedTuple):
+    """One robust set of gains, and its smallest margins over the corners."""
+
+    proportional_per_mm: float
+    integral_time_s: float
+    derivative_time_s: float
+    derivative_filter_s: float
+    gain_margin_dB: float
+    phase_margin_deg: float
+
+
+def main() -> int:
+    """Prints the gains as a table for the configuration file; 1 where no gain is robust."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--config", type=Path, help="whose [motor] is tuned for; the defaults otherwise")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    tunings = list(search(load_config(options.config)))
+    if not tunings:
+        print("no gain keeps the margins at every corner of these motor parameters", file=sys.stderr)
+        return 1
+    best = max(tunings, key=lambda tuning: tuning.proportional_per_mm / tuning.integral_time_s)
+    if options.json:
+        print(json.dumps(best._asdict()))
+        return 0
+    print(f"# smallest margins at the corners: {best.gain_margin_dB:.1f} dB, {best.phase_margin_deg:.0f} degrees")
+    print("[position]")
+    for name in best._fields[:4]:
+        print(f"{name} = {getattr(best, name):g}")
+    return 0
+
+
+def search(config: Config) -> list[Tuning]:
+    """The largest robust proportional gain for every point of the grid that has one."""
+    grid = list(itertools.product(DERIVATIVE_TIMES_S, FILTER_TIMES_S, INTEGRAL_TIMES_S))
+    found = []
+    for derivative_s, filter_s, integral_s in tqdm(grid, desc="gains", disable=not sys.stderr.isatty()):
+        position = msgspec.structs.replace(
+            config.position,
+            derivative_time_s=derivative_s,
+            derivative_filter_s=filter_s,
+            integral_time_s=integral_s,
+        )
+        low, high = 0.0, LARGEST_GAIN_PER_MM
+        while high - low > 0.02:
+            middle = (low + high) / 2.0
+            low, high = (middle, high) if robust(config, position, middle) else (low, middle)
+        gain = math.floor(low * 10 ** (DIGITS - 1)) / 10 ** (DIGITS - 1)
+        if gain > 0.0 and (margins := robust(config, position, gain)):
+            found.append(Tuning(gain, integral_s, derivative_s, filter_s, *margins))
+    return found
+
+
+def robust(config: Config, position: msgspec.Struct, gain: float) -> tuple[float, float] | None:
+    """The smallest margins over the corners; None where they are too small."""
+    tried = msgspec.structs.replace(config, position=msgspec.structs.replace(position, proportional_per_mm=gain))
+    found = corner_margins(tried)
+    margins = (found["gain_margin_dB"], found["phase_margin_deg"])
+    return margins if margins[0] >= LEAST_GAIN_MARGIN_DB and margins[1] >= LEAST_PHASE_MARGIN_DEG else None
+
+
+if __name__ == "__main__":
+    sys.exit(main())
