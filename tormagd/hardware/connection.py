@@ -16,6 +16,13 @@ from tormagd.safety.operating_state import DeviceRequest
 FIRST_BACK_OFF_S = 0.05
 LONGEST_BACK_OFF_S = 1.0
 
+_REMEDIES = {
+    LinkState.CLOSED: "check cable, supply, device.port and who holds it (tormagctl doctor); it is tried again by itself",
+    LinkState.IDENTIFYING: "is this the device, and is device.baud its rate?",
+    LinkState.REFUSED: "install firmware and daemon of the same protocol schema",
+    LinkState.LOST: "check cable and supply; it is tried again by itself",
+}
+
 log = logging.getLogger(__name__)
 
 
@@ -92,6 +99,7 @@ class Connection:
         report: dict[str, Any] = {
             "state": str(self.state),
             "cause": self._cause if self._link is None else self._link.cause,
+            "remedy": _REMEDIES.get(self.state, ""),
             "port": self._device.port,
             "losses": self.losses,
         }
