@@ -250,11 +250,12 @@ def live_line(telemetry: Telemetry, elapsed_s: float, duration_s: float) -> str:
     """One line: a bar of the measured force with a mark where it was asked, gap, limits."""
     width, most = 32, 2.0
     measured, asked = telemetry.measured_cf or 0.0, telemetry.setpoint_cf or 0.0
+    shown = "nothing" if telemetry.setpoint_cf is None else f"{asked:5.2f} N"
     filled = round(min(max(measured / most, 0.0), 1.0) * width)
     bar = list("#" * filled + "-" * (width - filled))
     bar[min(round(asked / most * width), width - 1)] = "|"
     return (
-        f"{min(elapsed_s, duration_s):5.1f}/{duration_s:.0f} s [{''.join(bar)}] asked {asked:5.2f} N "
+        f"{min(elapsed_s, duration_s):5.1f}/{duration_s:.0f} s [{''.join(bar)}] asked {shown} "
         f"measured {measured:5.2f} N gap {telemetry.gap_mm or 0.0:5.1f} mm "
         f"{telemetry.operating_state} {','.join(telemetry.limits)}"
     )

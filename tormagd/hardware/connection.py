@@ -17,10 +17,10 @@ FIRST_BACK_OFF_S = 0.05
 LONGEST_BACK_OFF_S = 1.0
 
 _REMEDIES = {
-    LinkState.CLOSED: "check cable, supply, device.port and who holds it (tormagctl doctor); it is tried again by itself",
+    LinkState.CLOSED: "check cable, supply, device.port and its holder (tormagctl doctor); it is tried again",
     LinkState.IDENTIFYING: "is this the device, and is device.baud its rate?",
     LinkState.REFUSED: "install firmware and daemon of the same protocol schema",
-    LinkState.LOST: "check cable and supply; it is tried again by itself",
+    LinkState.LOST: "check cable and supply; it is tried again",
 }
 
 log = logging.getLogger(__name__)

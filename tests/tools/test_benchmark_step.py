@@ -1,0 +1,32 @@
+"""The step benchmark on the plant: figures of the position loop that are promised to users."""
+
+import benchmark_step
+import pytest
+from tune_position import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG
+
+from tormagd.config import Config
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """One run on the sample the loop was tuned on."""
+    return benchmark_step.run("sample_1")
+
+
+def test_a_millimetre_is_nearly_time_optimal(measured):
+    assert measured["rise_s"] <= 0.06
+    assert 1.0 <= measured["rise_over_time_optimal"] <= 1.5
+    assert measured["overshoot"] <= 0.02
+    assert measured["settling_5pct_s"] <= 0.12
+    assert measured["steady_error_um"] <= 5.0
+    assert measured["skew_um"] <= 30.0
+
+
+def test_the_stroke_is_limited_by_the_motors(measured):
+    assert 1.0 <= measured["stroke_ratio"] <= 1.15
+
+
+def test_the_shipped_gains_are_robust():
+    corners = benchmark_step.corner_margins(Config())
+    assert corners["gain_margin_dB"] >= LEAST_GAIN_MARGIN_DB
+    assert corners["phase_margin_deg"] >= LEAST_PHASE_MARGIN_DEG
