@@ -1,16 +1,67 @@
-"""How well one rate group keeps its time: period, lateness, execution, overruns, merged ticks."""
+"""How well one rate group keeps its time: rate, lateness, execution, overruns, merged ticks."""
 
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
+HORIZON_NS = 5_000_000_000
+"Percentiles cover the time since one to two of these ago."
+SHARES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
+_EXACT = 64  # bins of one microsecond each; beyond, 32 bins for each doubling: 3% resolution
+_DOUBLINGS = 20
+_BINS = _EXACT + 32 * _DOUBLINGS
 
-WINDOW = 4_096
-"Statistics cover this many of the newest runs: four seconds at 1 kHz."
+
+class Histogram:
+    """Durations in microseconds, counted in bins. Adding costs a fraction of a microsecond, whatever has been added."""
+
+    def __init__(self) -> None:
+        self._now = [0] * _BINS
+        self._before = [0] * _BINS
+        self._most_now = self._most_before = 0.0
+
+    def add(self, value_us: float) -> None:
+        """Counts one duration; a negative one (a clock's grain) counts as 0."""
+        self._now[_bin(value_us)] += 1
+        if value_us > self._most_now:
+            self._most_now = value_us
+
+    def turn(self) -> None:
+        """Begins a new horizon and forgets the one before the last."""
+        self._before, self._now = self._now, [0] * _BINS
+        self._most_before, self._most_now = self._most_now, 0.0
+
+    def summary(self) -> dict[str, float]:
+        """p50, p99, p99.9 (upper edges of their bins) and the largest, us; all 0 while nothing was added."""
+        most = max(self._most_now, self._most_before)
+        used = _bin(most) + 1
+        counts = [now + before for now, before in zip(self._now[:used], self._before[:used], strict=True)]
+        total = sum(counts)
+        found = dict.fromkeys(SHARES, 0.0)
+        waiting = list(SHARES.items()) if total else []
+        seen = 0
+        for index, count in enumerate(counts):
+            seen += count
+            while waiting and seen >= waiting[0][1] * total:
+                found[waiting.pop(0)[0]] = min(float(_upper_edge(index)), round(most, 1))
+        return found | {"max": round(most, 1)}
+
+
+def _bin(value_us: float) -> int:
+    whole = int(value_us) if value_us > 0.0 else 0
+    if whole < _EXACT:
+        return whole
+    shift = whole.bit_length() - 6
+    return min(_EXACT + (shift - 1) * 32 + (whole >> shift) - 32, _BINS - 1)
+
+
+def _upper_edge(index: int) -> int:
+    if index < _EXACT:
+        return index + 1
+    shift, part = divmod(index - _EXACT, 32)
+    return (part + 33) << (shift + 1)
 
 
 class RateGroup:
-    """Timing of one periodic activity. Recording is cheap; percentiles are made only when somebody asks."""
+    """Timing of one periodic activity. Recording is cheap; a report is built by `refresh`, and only read by others."""
 
     def __init__(self, name: str, period_ns: int) -> None:
         self.name = name
@@ -18,52 +69,50 @@ class RateGroup:
         self.runs = 0
         self.merged = 0
         self.overruns = 0
-        self.late_worst_us = 0.0
         self.lateness_us = 0.0
         self.exec_us = 0.0
-        self._lateness = np.zeros(WINDOW)
-        self._exec = np.zeros(WINDOW)
-        self._started_ns = 0
-        self._window_ns = np.zeros(WINDOW, dtype=np.int64)
+        self._lateness = Histogram()
+        self._exec = Histogram()
+        self._worst_us = 0.0
+        # runs and start times at the last two turns of the horizon: the rate covers what the percentiles cover
+        self._marks: tuple[tuple[int, int], tuple[int, int]] | None = None
+        self._newest_ns = 0
+        self.report: dict[str, Any] = {}
+        self.refresh()
 
     def record(self, due_ns: int, start_ns: int, end_ns: int, merged: int = 0) -> None:
         """One run that was due, began and ended at these times, and stands for `merged` missed ones too."""
-        slot = self.runs % WINDOW
+        if self._marks is None:
+            self._marks = ((self.runs, start_ns), (self.runs, start_ns))
+        elif start_ns - self._marks[1][1] > HORIZON_NS:
+            self._marks = (self._marks[1], (self.runs, start_ns))
+            self._lateness.turn()
+            self._exec.turn()
         self.lateness_us = (start_ns - due_ns) * 1e-3
         self.exec_us = (end_ns - start_ns) * 1e-3
-        self._lateness[slot] = self.lateness_us
-        self._exec[slot] = self.exec_us
-        self._window_ns[slot] = start_ns
-        self.late_worst_us = max(self.late_worst_us, self.lateness_us)
+        self._lateness.add(self.lateness_us)
+        self._exec.add(self.exec_us)
+        self._worst_us = max(self._worst_us, self.lateness_us)
+        self._newest_ns = start_ns
         self.runs += 1
         self.merged += merged
         if end_ns - due_ns > self.period_ns:
             self.overruns += 1
 
     def rate_hz(self) -> float:
-        """Mean rate over the window, Hz."""
-        count = min(self.runs, WINDOW)
-        if count < 2:
+        """Mean rate over the horizon, Hz."""
+        if self._marks is None or self._newest_ns <= self._marks[0][1]:
             return 0.0
-        newest = int(self._window_ns[(self.runs - 1) % WINDOW])
-        oldest = int(self._window_ns[self.runs % WINDOW] if self.runs > WINDOW else self._window_ns[0])
-        return (count - 1) / max((newest - oldest) * 1e-9, 1e-9)
+        runs, start_ns = self._marks[0]
+        return (self.runs - 1 - runs) / ((self._newest_ns - start_ns) * 1e-9)
 
-    def report(self) -> dict[str, Any]:
-        """Counts since the start, percentiles over the window."""
-        count = min(self.runs, WINDOW)
-        return {
+    def refresh(self) -> None:
+        """Builds `report`: counts since the start, percentiles over the horizon."""
+        self.report = {
             "hz": round(self.rate_hz(), 2),
             "runs": self.runs,
             "merged": self.merged,
             "overruns": self.overruns,
-            "lateness_us": _percentiles(self._lateness[:count]) | {"worst": round(self.late_worst_us, 1)},
-            "exec_us": _percentiles(self._exec[:count]),
+            "lateness_us": self._lateness.summary() | {"worst": round(self._worst_us, 1)},
+            "exec_us": self._exec.summary(),
         }
-
-
-def _percentiles(values: npt.NDArray[np.float64]) -> dict[str, float]:
-    if values.size == 0:
-        return {"p50": 0.0, "p99": 0.0, "max": 0.0}
-    p50, p99, most = np.percentile(values, (50, 99, 100))
-    return {"p50": round(float(p50), 1), "p99": round(float(p99), 1), "max": round(float(most), 1)}

@@ -1,0 +1,274 @@
+"""`benchmark loop`: how late the control loop is, beside a bare timer that carries the same clients.
+
+Daemon and stub run in alternating blocks, because a shared machine drifts: what counts is the ratio of a block to its
+neighbour. Both have the same heartbeat, event loop and scheduling, publish a row for each tick, and answer the same
+eight clients that ask for status as fast as they are answered; the stub has no controller and no device.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import multiprocessing
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import uvloop
+import zmq
+
+from tormagd.config import Config, load_config
+from tormagd.ctl.client import Client
+from tormagd.ctl.outcome import CommandError
+from tormagd.daemon.endpoint import Endpoint
+from tormagd.daemon.heartbeat import Heartbeat
+from tormagd.daemon.realtime import freeze_garbage, prepare
+from tormagd.messages import Request
+from tormagd.recording.ticks import decode_ticks
+
+Array = npt.NDArray[np.float64]
+
+CLIENTS = 8
+SETPOINT_HZ = 500
+WARM_UP_S = 1.0
+TELEMETRY_EVERY = 20
+QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
+
+
+class Block(NamedTuple):
+    """The ticks of one block."""
+
+    lateness_us: Array
+    exec_us: Array
+    ticks: int
+    merged: int
+    seconds: float
+
+
+def run(seconds: float, pairs: int, fifo_priority: int) -> dict[str, Any]:
+    """The contract's object: `pairs` blocks of each kind, `seconds` long."""
+    daemon_blocks, bare_blocks = [], []
+    for _ in range(pairs):
+        daemon_blocks.append(measure(daemon_process, seconds, fifo_priority))
+        bare_blocks.append(measure(stub_process, seconds, fifo_priority))
+    daemon, bare = merge(daemon_blocks), merge(bare_blocks)
+    return {
+        "rate_hz": daemon.ticks / daemon.seconds,
+        "ticks": daemon.ticks,
+        "merged_ticks": daemon.merged,
+        "lateness_us": quantiles(daemon.lateness_us),
+        "control_exec_us": {"mean": float(daemon.exec_us.mean())} | quantiles(daemon.exec_us),
+        "bare": {
+            "method": f"uvloop + timerfd, fifo {fifo_priority}, {CLIENTS} clients",
+            "lateness_us": quantiles(bare.lateness_us),
+            "merged_share": bare.merged / max(bare.ticks, 1),
+        },
+        "ratio": {
+            name: statistics.median(
+                quantiles(one.lateness_us)[name] / quantiles(other.lateness_us)[name]
+                for one, other in zip(daemon_blocks, bare_blocks, strict=True)
+            )
+            for name in ("p50", "p99", "p999")
+        },
+        "merged_share": daemon.merged / max(daemon.ticks, 1),
+        "pairs": pairs,
+        "block_s": seconds,
+        "fifo_priority": fifo_priority,
+    }
+
+
+def measure(start: Any, seconds: float, fifo_priority: int) -> Block:
+    """One block of one kind, under the load of the clients."""
+    with tempfile.TemporaryDirectory(prefix="tormag-") as folder, contextlib.ExitStack() as stack:
+        config = stack.enter_context(start(Path(folder), fifo_priority))
+        stop = multiprocessing.Event()
+        load = multiprocessing.Process(target=hammer, args=(config.endpoints.control, stop), daemon=True)
+        load.start()
+        try:
+            return collect(config.endpoints.recording, seconds)
+        finally:
+            stop.set()
+            load.join(5.0)
+
+
+def collect(address: str, seconds: float) -> Block:
+    """Reads tick rows for a while, after a warm-up."""
+    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.subscribe(b"")
+        socket.connect(address)
+        started_s = time.monotonic()
+        lateness: list[float] = []
+        execution: list[float] = []
+        stamps: list[int] = []
+        while time.monotonic() < started_s + WARM_UP_S + seconds:
+            if not socket.poll(500):
+                continue
+            batch = decode_ticks(socket.recv())
+            if time.monotonic() < started_s + WARM_UP_S:
+                continue
+            columns = {name: index for index, name in enumerate(batch.columns)}
+            for row in batch.rows:
+                stamps.append(int(row[columns["t_ns"]]))  # type: ignore[arg-type]
+                lateness.append(float(row[columns["lateness_us"]]))  # type: ignore[arg-type]
+                execution.append(float(row[columns["exec_us"]]))  # type: ignore[arg-type]
+    if len(stamps) < 2:
+        raise RuntimeError(f"no ticks at {address} within {seconds:g} s")
+    spanned_s = (stamps[-1] - stamps[0]) * 1e-9
+    return Block(
+        np.array(lateness),
+        np.array(execution),
+        len(stamps),
+        max(0, round(spanned_s * 1e3) + 1 - len(stamps)),
+        spanned_s,
+    )
+
+
+def merge(blocks: list[Block]) -> Block:
+    """All blocks as one."""
+    return Block(
+        np.concatenate([block.lateness_us for block in blocks]),
+        np.concatenate([block.exec_us for block in blocks]),
+        sum(block.ticks for block in blocks),
+        sum(block.merged for block in blocks),
+        sum(block.seconds for block in blocks),
+    )
+
+
+def quantiles(values: Array) -> dict[str, float]:
+    """p50, p99, p99.9 and the largest."""
+    return {name: round(float(np.percentile(values, share)), 1) for name, share in QUANTILES.items()}
+
+
+def hammer(address: str, stop: Event) -> None:
+    """Eight clients that ask for status as fast as they are answered."""
+    clients = [Client(address, 2.0) for _ in range(CLIENTS)]
+    while not stop.is_set():
+        for client in clients:
+            with contextlib.suppress(CommandError):
+                client.request("status")
+
+
+def write_config(folder: Path, port: str, fifo_priority: int) -> Path:
+    """A configuration with its sockets in `folder`."""
+    path = folder / "tormagd.toml"
+    sockets = "".join(
+        f'{name} = "ipc://{folder}/{name}"\n' for name in ("setpoint", "telemetry", "control", "recording")
+    )
+    path.write_text(
+        f'scene = "coronary"\n[device]\nport = "{port}"\n[endpoints]\n{sockets}'
+        f"[realtime]\nfifo_priority = {fifo_priority}\n"
+    )
+    return path
+
+
+@contextlib.contextmanager
+def daemon_process(folder: Path, fifo_priority: int) -> Iterator[Config]:
+    """The daemon on a simulated device, enabled, with setpoints arriving."""
+    simulator = subprocess.Popen(
+        [sys.executable, "-m", "tormagd.simulation", "--pty"], stdout=subprocess.PIPE, text=True
+    )
+    assert simulator.stdout is not None
+    path = write_config(folder, simulator.stdout.readline().strip(), fifo_priority)
+    config = load_config(path)
+    daemon = subprocess.Popen(
+        [sys.executable, "-m", "tormagd.daemon.main", "--config", str(path)], stderr=subprocess.DEVNULL
+    )
+    publisher = None
+    try:
+        ctl = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(path), "--wait", "20"]
+        wait_for(config.endpoints.control)
+        for command in ("home", "enable"):
+            subprocess.run([*ctl, command], check=True, capture_output=True)
+        publisher = subprocess.Popen(
+            [*ctl, "send", "pulse", "--rate", str(SETPOINT_HZ), "--duration", "3600"], stdout=subprocess.DEVNULL
+        )
+        yield config
+    finally:
+        for child in filter(None, (publisher, daemon, simulator)):
+            child.terminate()
+            child.wait(20)
+
+
+@contextlib.contextmanager
+def stub_process(folder: Path, fifo_priority: int) -> Iterator[Config]:
+    """The bare timer."""
+    config = load_config(write_config(folder, "/dev/null", fifo_priority))
+    stub = multiprocessing.Process(target=bare_loop, args=(config,), daemon=True)
+    stub.start()
+    try:
+        yield config
+    finally:
+        stub.terminate()
+        stub.join(5.0)
+
+
+def bare_loop(config: Config) -> None:
+    """A heartbeat that publishes its own lateness, and answers."""
+    uvloop.run(_bare(config))
+
+
+async def _bare(config: Config) -> None:
+    prepare(config.realtime)
+    endpoint = Endpoint(config.endpoints)
+    heartbeat = Heartbeat(1_000_000_000 // config.rates.control_hz)
+    rows: list[tuple[int, float, float]] = []
+    answer = {"state": "bare"} | {f"key_{index}": float(index) for index in range(60)}
+
+    def reply(_request: Request) -> dict[str, Any]:
+        return answer
+
+    def beat() -> None:
+        if not heartbeat.beats():
+            return
+        now_ns = time.monotonic_ns()
+        rows.append((time.time_ns(), (now_ns - heartbeat.due_ns) * 1e-3, 0.0))
+        if len(rows) >= TELEMETRY_EVERY:
+            endpoint.publish_ticks(("t_ns", "lateness_us", "exec_us"), rows)
+            rows.clear()
+            endpoint.serve(now_ns * 1e-9, reply)
+
+    freeze_garbage()
+    asyncio.get_running_loop().add_reader(heartbeat.fileno(), beat)
+    await asyncio.Event().wait()
+
+
+def wait_for(address: str) -> None:
+    """Until the daemon answers and its device does."""
+    until_s = time.monotonic() + 60.0
+    client = Client(address, 1.0)
+    while time.monotonic() < until_s:
+        with contextlib.suppress(CommandError):
+            if client.request("status").get("link", {}).get("state") == "RUNNING":
+                client.close()
+                return
+    raise RuntimeError("the daemon did not reach its device")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `benchmark loop`."""
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of a block")
+    parser.add_argument("--pairs", type=int, default=3, help="blocks of each kind")
+    parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of both; 0 for none")
+
+
+def print_table(result: dict[str, Any]) -> None:
+    """The object for a person."""
+    bare = result["bare"]
+    print(f"{'':8s}{'p50':>9s}{'p99':>9s}{'p99.9':>9s}{'max':>9s}   lateness, us (fifo {result['fifo_priority']})")
+    for name, found in (("daemon", result["lateness_us"]), ("bare", bare["lateness_us"])):
+        print(f"{name:8s}" + "".join(f"{found[key]:9.1f}" for key in QUANTILES))
+    print(f"{'ratio':8s}" + "".join(f"{result['ratio'][key]:9.2f}" for key in ("p50", "p99", "p999")))
+    spent = result["control_exec_us"]
+    print(
+        f"{result['rate_hz']:.1f} Hz, merged {result['merged_share']:.3%} (bare {bare['merged_share']:.3%}), "
+        f"control {spent['mean']:.0f} us mean, {spent['p99']:.0f} us p99, on {os.cpu_count()} processors"
+    )
