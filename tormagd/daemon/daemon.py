@@ -151,6 +151,7 @@ class Daemon:
             self._status = self._status or self._build_status()
             return self._status
         self._control.command(request.command, self._conditions())
+        self._status = {}
         return {"operating_state": str(self._control.state.safety.operating_state)}
 
     def _conditions(self) -> Conditions:
@@ -175,7 +176,11 @@ class Daemon:
         if snapshot_ is None:
             return {}
         known: dict[str, Any] = msgspec.to_builtins(snapshot_)
+        safety = self._control.state.safety
         return known | {
+            # a command of this very period has changed the state since the snapshot, and whoever gave it asks now
+            "operating_state": str(safety.operating_state),
+            "faults": [str(fault) for fault in safety.faults],
             "version": __version__,
             "scene": self._core.scene.name,
             "uptime_s": round(time.monotonic() - self._started_s, 1),
@@ -185,7 +190,7 @@ class Daemon:
             "link": self._connection.report(),
             "setpoints": self._endpoint.inbox.report(),
             "rates": {group.name: group.report for group in self._groups},
-            "fault_details": explanations(snapshot_.faults, FAULTS),
+            "fault_details": explanations(tuple(safety.faults), FAULTS),
             "limit_details": explanations(snapshot_.limits, LIMITS),
             "not_granted": self._refused,
         }
