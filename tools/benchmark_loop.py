@@ -171,8 +171,8 @@ def write_config(folder: Path, port: str, fifo_priority: int) -> Path:
 
 
 @contextlib.contextmanager
-def daemon_process(folder: Path, fifo_priority: int) -> Iterator[Config]:
-    """The daemon on a simulated device, enabled, with setpoints arriving."""
+def daemon_process(folder: Path, fifo_priority: int, setpoint_hz: int = SETPOINT_HZ) -> Iterator[Config]:
+    """The daemon on a simulated device, enabled, with setpoints arriving (none where `setpoint_hz` is 0)."""
     simulator = subprocess.Popen(
         [sys.executable, "-m", "tormagd.simulation", "--pty"], stdout=subprocess.PIPE, text=True
     )
@@ -188,9 +188,10 @@ def daemon_process(folder: Path, fifo_priority: int) -> Iterator[Config]:
         wait_for(config.endpoints.control)
         for command in ("home", "enable"):
             subprocess.run([*ctl, command], check=True, capture_output=True)
-        publisher = subprocess.Popen(
-            [*ctl, "send", "pulse", "--rate", str(SETPOINT_HZ), "--duration", "3600"], stdout=subprocess.DEVNULL
-        )
+        if setpoint_hz:
+            publisher = subprocess.Popen(
+                [*ctl, "send", "pulse", "--rate", str(setpoint_hz), "--duration", "3600"], stdout=subprocess.DEVNULL
+            )
         yield config
     finally:
         for child in filter(None, (publisher, daemon, simulator)):
