@@ -236,9 +236,7 @@ def print_table(result: dict[str, Any]) -> None:
             f"{name:16s}"
             + ("not shown by this log" if found is None else f"{found['value']:12.5g} +- {found['ci95']:.2g}")
         )
-    print(
-        f"residual {result['relative_residual']:.1%} ; held out {result['holdout_voltage_nrmse']:.1%}"
-    )
+    print(f"residual {result['relative_residual']:.1%} of the voltage; held out {result['holdout_voltage_nrmse']:.1%}")
 
 
 def draw(path: Path, log: Log, result: dict[str, Any]) -> None:
