@@ -13,6 +13,7 @@ MAY_IMPORT = {
     "config": set(),
     "messages": set(),
     "physics": set(),
+    "characterisation": {"physics"},
     "design": {"physics"},
     "learning": {"physics"},
     "inverse": {"physics", "learning"},

@@ -19,6 +19,10 @@ class DomainError(ValueError):
         self.value = value
         self.allowed = allowed
 
+    def __reduce__(self) -> tuple[type["DomainError"], tuple[str, object, str]]:
+        # exceptions are rebuilt from their text by default: one raised in a process pool's worker would break the pool
+        return type(self), (self.variable, self.value, self.allowed)
+
 
 def require(variable: str, value: float | FloatArray, low: float, high: float) -> None:
     """Raise `DomainError` unless every element of `value` is a number in [low, high]; NaN never is."""

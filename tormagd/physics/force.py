@@ -27,6 +27,9 @@ from tormagd.physics.field import REFERENCE_PERMEABILITY, FieldLaw
 
 MU0_H_M = 4e-7 * math.pi
 
+_BLOCK = 4096
+"""Elements evaluated at a time: 32 kB in float64, so that a handful of temporaries fits into the second-level cache."""
+
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
@@ -155,8 +158,19 @@ class _Reduced(NamedTuple):
         return root * root
 
     def force(self, moment_Tm: Real) -> Real:
+        if isinstance(moment_Tm, np.ndarray) and moment_Tm.size > _BLOCK:
+            return self._blocked_force(moment_Tm)
         load = self.load(moment_Tm)
         return self.force_scale_N * self.curve.force(self.curve.compression(load), load)
+
+    def _blocked_force(self, moment_Tm: FloatArray) -> FloatArray:
+        # twenty passes over one array: in blocks its temporaries stay in the cache, where a pass is twice as fast
+        force = np.empty(moment_Tm.shape, moment_Tm.dtype)
+        # reshape copies where the moments are not contiguous; the result is, so its flat view is itself
+        flat, result = moment_Tm.reshape(-1), force.reshape(-1)
+        for start in range(0, flat.size, _BLOCK):
+            result[start : start + _BLOCK] = self.force(flat[start : start + _BLOCK])
+        return force
 
 
 @lru_cache(maxsize=64)

@@ -1,0 +1,140 @@
+"""The tool itself, on a sample; that it can fail; and the same promises under hypothesis, which shrinks what breaks."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tormagd.physics.brake_curve import BrakeCurve
+from tormagd.physics.errors import DomainError
+from tormagd.physics.field import PowerFieldLaw, ThesisFieldLaw
+from tormagd.physics.force import (
+    Elastomer,
+    Geometry,
+    brake_force_N,
+    d2_force_d_gap2,
+    d_force_d_gap,
+    max_radial_moment_Tm,
+    radial_moment_for_force_Tm,
+    stretch_minus_one,
+)
+
+TOOLS = Path(__file__).parents[2] / "tools"
+
+
+@pytest.fixture
+def tool(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(TOOLS))
+    import numerics
+
+    return numerics
+
+
+def test_a_sampled_run_passes_and_has_the_agreed_keys() -> None:
+    command = [sys.executable, str(TOOLS / "numerics.py"), "--json", "--cases", "20000", "--reference", "400"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads(done.stdout)
+    assert found["cases"] >= 20_000
+    assert found["reference_cases"] >= 400
+    assert found["nonfinite"] == found["untyped_refusals"] == found["misjudged_domain"] == 0
+    assert found["refused"] > 0
+    assert 0.0 < found["worst_rel_error"]["float64"] <= 1e-12
+    assert 0.0 < found["worst_rel_error"]["float32"] <= 1e-5
+    assert 0.0 < found["worst_rel_error"]["float32_soft"] <= 3e-4
+    assert all(share <= 1.0 for share in found["worst_error_over_allowed"].values())
+    assert all(share <= 1.0 for share in found["time_steps"].values())
+    assert found["force_evaluations_per_s"] > 0
+
+
+def test_an_error_in_the_physics_is_seen(tool: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One part in 1e11 on the force, far below what any plot would show."""
+    original = BrakeCurve.force
+    monkeypatch.setattr(BrakeCurve, "force", lambda self, eps, load: original(self, eps, load) * (1.0 + 1e-11))
+    tally = tool.check_chunk(seed=3, devices=8, references=20)
+    assert tally.of("float64", "force").over_allowed > 5.0
+    assert tally.of("float64", "stretch").over_allowed < 1.0
+
+
+def test_a_naive_formula_is_seen(tool: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """lambda1 from the printed difference, as Eq. 29 has it, cancels while the field is weak."""
+    monkeypatch.setattr(
+        BrakeCurve,
+        "compression",
+        lambda self, y: ((1 - self.a * y) ** 2 + 2 * self.b * y) ** 0.5 - (1 - self.a * y),
+    )
+    tally = tool.check_chunk(seed=3, devices=8, references=20)
+    assert tally.of("float64", "stretch").over_allowed > 10.0
+
+
+def test_wrong_time_steps_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(TOOLS))
+    import numerics_steps
+
+    assert max(numerics_steps.worst_step_errors(1, 20).over_allowed.values()) <= 1.0
+    # a decay by a difference of nearly equal numbers loses its digits at 1 us
+    monkeypatch.setattr("tormagd.physics.relaxation.math.expm1", lambda x: math.exp(x) - 1.0)
+    assert numerics_steps.worst_step_errors(1, 20).over_allowed["relaxation"] > 1.0
+
+
+devices = st.tuples(
+    st.floats(1e3, 1e7),
+    st.floats(1.0, 10.0),
+    st.floats(1e-3, 20e-3),
+    st.floats(1e-4, 0.05),
+    st.floats(0.5e-3, 0.05),
+)
+
+
+def built(device: tuple[float, float, float, float, float]) -> tuple[Elastomer, Geometry]:
+    modulus, mu_r, inner, wall, thickness = device
+    return Elastomer(modulus, mu_r, 0.2), Geometry(inner, inner + wall, thickness, 0.02)
+
+
+@given(devices, st.floats(5.0, 1000.0))
+def test_any_gap_is_answered_or_refused(device: tuple[float, float, float, float, float], gap_mm: float) -> None:
+    elastomer, geometry = built(device)
+    law = PowerFieldLaw()
+    moment = law.radial_moment_Tm(gap_mm)
+    if moment > max_radial_moment_Tm(elastomer, geometry):
+        with pytest.raises(DomainError, match="radial_moment_Tm"):
+            d2_force_d_gap2(gap_mm, law, elastomer, geometry)
+        return
+    force = brake_force_N(moment, elastomer, geometry)
+    assert 0.0 < force < math.inf
+    assert -0.95 <= stretch_minus_one(moment, elastomer, geometry) <= 0.0
+    slope = d_force_d_gap(gap_mm, law, elastomer, geometry)
+    assert -math.inf < slope < 0.0
+    assert math.isfinite(d2_force_d_gap2(gap_mm, law, elastomer, geometry))
+    back_mm = law.gap_mm(radial_moment_for_force_Tm(force, elastomer, geometry))
+    condition = max(abs(force / (gap_mm * slope)), 1.0 / 1.3)
+    assert abs(back_mm / gap_mm - 1.0) <= max(1e-12, 8.0 * sys.float_info.epsilon * condition)
+
+
+@given(devices, st.floats(1e-30, 1.0), st.sampled_from([np.float32, np.float64]))
+def test_no_load_in_the_domain_gives_anything_but_a_number(
+    device: tuple[float, float, float, float, float], share: float, dtype: type
+) -> None:
+    elastomer, geometry = built(device)
+    most = max_radial_moment_Tm(elastomer, geometry)
+    moment = np.array([min(share, 0.999) * most], dtype=dtype)
+    force = brake_force_N(moment, elastomer, geometry)
+    assert force.dtype == dtype
+    assert np.isfinite(force).all()
+    assert (force >= 0.0).all()
+    assert np.isfinite(radial_moment_for_force_Tm(force, elastomer, geometry)).all()
+
+
+@pytest.mark.parametrize("gap_mm", [95.0, math.nextafter(95.0, math.inf), 44.9, -1.0, 0.0, math.nan, math.inf])
+def test_the_second_derivative_at_the_end_of_eq_7_is_refused(gap_mm: float) -> None:
+    with pytest.raises(DomainError, match="gap_mm"):
+        ThesisFieldLaw().d2_radial_moment_d_gap2(gap_mm)
+    with pytest.raises(DomainError, match="gap_mm"):
+        d2_force_d_gap2(gap_mm, ThesisFieldLaw(), Elastomer(277.3e3, 4.0, 0.2), Geometry(0.004, 0.011, 0.02, 0.02))
