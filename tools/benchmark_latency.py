@@ -153,6 +153,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of the daemon; 0 for none")
 
 
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """The object for these options."""
+    return run(options.count, options.fifo)
+
+
 def print_table(result: dict[str, Any]) -> None:
     """The object for a person."""
     print(f"{'':22s}{'p50':>9s}{'p99':>9s}{'p99.9':>9s}   us (fifo {result['fifo_priority']})")

@@ -57,8 +57,8 @@ def run(seconds: float, pairs: int, fifo_priority: int) -> dict[str, Any]:
     """The contract's object: `pairs` blocks of each kind, `seconds` long."""
     daemon_blocks, bare_blocks = [], []
     for _ in range(pairs):
-        daemon_blocks.append(measure(daemon_process, seconds, fifo_priority))
-        bare_blocks.append(measure(stub_process, seconds, fifo_priority))
+        daemon_blocks.append(block(daemon_process, seconds, fifo_priority))
+        bare_blocks.append(block(stub_process, seconds, fifo_priority))
     daemon, bare = merge(daemon_blocks), merge(bare_blocks)
     return {
         "rate_hz": daemon.ticks / daemon.seconds,
@@ -85,7 +85,7 @@ def run(seconds: float, pairs: int, fifo_priority: int) -> dict[str, Any]:
     }
 
 
-def measure(start: Any, seconds: float, fifo_priority: int) -> Block:
+def block(start: Any, seconds: float, fifo_priority: int) -> Block:
     """One block of one kind, under the load of the clients."""
     with tempfile.TemporaryDirectory(prefix="tormag-") as folder, contextlib.ExitStack() as stack:
         config = stack.enter_context(start(Path(folder), fifo_priority))
@@ -259,6 +259,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="length of a block")
     parser.add_argument("--pairs", type=int, default=3, help="blocks of each kind")
     parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of both; 0 for none")
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """The object for these options."""
+    return run(options.seconds, options.pairs, options.fifo)
 
 
 def print_table(result: dict[str, Any]) -> None:

@@ -4,6 +4,7 @@ The device's physical limit comes from the plant itself: full voltage one way, t
 switch timed so that it comes to rest at the target.
 """
 
+import argparse
 import itertools
 import time
 from typing import Any, NamedTuple
@@ -175,6 +176,28 @@ def corner_margins(config: Config) -> dict[str, float]:
             gain.append(found.gain_margin_dB)
             phase.append(found.phase_margin_deg)
     return {"gain_margin_dB": min(gain), "phase_margin_deg": min(phase), "corners": float(len(gain))}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `benchmark step`."""
+    parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """The object for these options."""
+    return run(options.plant)
+
+
+def print_table(result: dict[str, Any]) -> None:
+    """The object for a person."""
+    for name, value in result.items():
+        if name == "corners":
+            print(
+                f"{'smallest margins':24s}{value['gain_margin_dB']:.1f} dB, {value['phase_margin_deg']:.0f} degrees "
+                f"over {value['corners']:.0f} corners"
+            )
+        else:
+            print(f"{name:24s}{value if isinstance(value, str) else f'{value:.4g}'}")
 
 
 def hold(gap_mm: float, now_s: float) -> Plan:

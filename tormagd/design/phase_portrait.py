@@ -16,9 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tormagd.design.brake import Brake
-from tormagd.physics.errors import DomainError, require
+from tormagd.physics.errors import DomainError, FloatArray, require
 
-Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 MAX_FORCE_N = 1e6
@@ -54,7 +53,7 @@ class Region(msgspec.Struct, frozen=True):
         """Area of the half with rising force, N^2/s; the other half is its mirror image."""
         return 0.5 * (self.least_rate_N_s + self.most_rate_N_s) * (self.most_N - self.least_N)
 
-    def rate_N_s(self, force_N: Array) -> Array:
+    def rate_N_s(self, force_N: FloatArray) -> FloatArray:
         """The rate required at a force inside the region."""
         share = (force_N - self.least_N) / (self.most_N - self.least_N)
         return self.least_rate_N_s + share * (self.most_rate_N_s - self.least_rate_N_s)
@@ -85,7 +84,7 @@ class PhasePortrait:
     def __post_init__(self) -> None:
         require("gap_speed_mm_s", self.gap_speed_mm_s, 1e-6, MAX_GAP_SPEED_MM_S)
 
-    def outline(self, points: int = 201) -> tuple[Array, Array]:
+    def outline(self, points: int = 201) -> tuple[FloatArray, FloatArray]:
         """The true boundary's upper half: (force_N, rate_N_s), both of `points` elements, force falling."""
         gap_mm = np.geomspace(self.brake.closed_mm, self.brake.open_mm, points)
         # a geometric series may end a rounding beyond its ends
@@ -105,10 +104,12 @@ class PhasePortrait:
     def true_coverage(self, region: Region) -> float:
         """Share of the region's area inside the true boundary, 0..1."""
         brake = self.brake
-        low, high = max(region.least_N, brake.least_N), min(region.most_N, brake.most_N)
+        least, most = brake.least_N, brake.most_N
+        low, high = max(region.least_N, least), min(region.most_N, most)
         if low >= high:
             return 0.0
-        nearest_mm, farthest_mm = brake.gap_mm(high), brake.gap_mm(low)
+        nearest_mm = brake.closed_mm if high == most else brake.gap_mm(high)
+        farthest_mm = brake.open_mm if low == least else brake.gap_mm(low)
         # over ln(gap) the curves are nearly straight, and dF = |dF/dgap| gap d(ln gap)
         log_gap = np.linspace(np.log(nearest_mm), np.log(farthest_mm), _PANELS + 1)
         gap_mm = np.clip(np.exp(log_gap), brake.closed_mm, brake.open_mm)
@@ -135,19 +136,19 @@ class PhasePortrait:
         smaller = np.minimum(region.rate_N_s(forces), offered.rate_N_s(forces))
         return min(float(np.trapezoid(smaller, forces)) / region.half_area, 1.0)
 
-    def true_cloud(self, force_N: Array, rate_N_s: Array) -> CloudCoverage:
+    def true_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
         """The points of a task against the true boundary. Raises `DomainError` for points that are not finite."""
         inside = self._within_forces(force_N, rate_N_s)
         limit = np.zeros_like(force_N)
         limit[inside] = self.gap_speed_mm_s * self.brake.slope_N_mm(self.brake.gap_mm(force_N[inside]))
         return self._judge(force_N, rate_N_s, limit)
 
-    def trapezoid_cloud(self, force_N: Array, rate_N_s: Array) -> CloudCoverage:
+    def trapezoid_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
         """The points of a task against the thesis's trapezoid. Raises `DomainError` for points that are not finite."""
         self._within_forces(force_N, rate_N_s)
         return self._judge(force_N, rate_N_s, self.trapezoid().rate_N_s(force_N))
 
-    def _within_forces(self, force_N: Array, rate_N_s: Array) -> Mask:
+    def _within_forces(self, force_N: FloatArray, rate_N_s: FloatArray) -> Mask:
         if force_N.ndim != 1 or force_N.shape != rate_N_s.shape or not force_N.size:
             raise DomainError("rate_N_s", rate_N_s.shape, f"one rate for each of one or more forces, {force_N.shape}")
         require("force_N", force_N, -MAX_FORCE_N, MAX_FORCE_N)
@@ -155,7 +156,7 @@ class PhasePortrait:
         inside: Mask = (force_N >= self.brake.least_N) & (force_N <= self.brake.most_N)
         return inside
 
-    def _judge(self, force_N: Array, rate_N_s: Array, limit_N_s: Array) -> CloudCoverage:
+    def _judge(self, force_N: FloatArray, rate_N_s: FloatArray, limit_N_s: FloatArray) -> CloudCoverage:
         below, above = force_N < self.brake.least_N, force_N > self.brake.most_N
         fast = ~below & ~above & (np.abs(rate_N_s) > limit_N_s)
         return CloudCoverage(~(below | above | fast), below, above, fast)

@@ -46,7 +46,7 @@ def frictionless_range_N(insert: Insert, field: FieldLaw, exponent: float = 1.0)
     mu_r = relative_permeability(insert.cip_fraction)
     elastomer = Elastomer(insert.shear_modulus_Pa, mu_r, friction_coefficient=1.0)
     # the force law takes b ~ (mu_r / 4) a: another exponent is another moment
-    scale = (mu_r / REFERENCE_PERMEABILITY) ** (exponent - 1.0)
+    scale: float = (mu_r / REFERENCE_PERMEABILITY) ** (exponent - 1.0)
     most_N = brake_force_N(scale * field.radial_moment_Tm(CLOSED_MM), elastomer, TORMAG)
     return most_N - brake_force_N(scale * field.radial_moment_Tm(OPEN_MM), elastomer, TORMAG)
 

@@ -1,5 +1,6 @@
 """Table 2.5 as a method: which inserts serve a task's force range and resolution, and why the others do not."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from tormagd.design.brake import Brake
 from tormagd.physics.errors import DomainError, require
+from tormagd.physics.force import radial_moment_for_force_Tm
 
 _POINTS = 201
 
@@ -39,6 +41,8 @@ class Verdict:
     """Largest force change that one gap step makes within the part of the task's range that the insert reaches."""
     served_share: float
     """Share of the task's force range between the insert's least and most force."""
+    sufficient_gap_mm: float
+    """Gap at which the least force is low enough; NaN where the field law says nothing of such a gap."""
     reasons: tuple[str, ...]
 
     @property
@@ -58,7 +62,7 @@ def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) 
     low, high = max(least, task.least_N), min(most, task.most_N)
     reasons = []
     if least > task.least_N + task.resolution_N:
-        reasons.append(f"least force {least:.2f} N is above {task.least_N:g} N by more than the resolution")
+        reasons.append(f"least force {least:.2f} N is above {task.least_N:g} N by more than {task.resolution_N:g} N")
     if most < task.most_N:
         reasons.append(f"most force {most:.2f} N is below {task.most_N:g} N")
     if low >= high:
@@ -71,10 +75,21 @@ def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) 
         share = (high - low) / (task.most_N - task.least_N)
     if resolution > task.resolution_N:
         reasons.append(f"one gap step changes {1e3 * resolution:.1f} mN, more than {1e3 * task.resolution_N:g} mN")
-    return Verdict(insert, least, most, resolution, share, tuple(reasons))
+    return Verdict(insert, least, most, resolution, share, _sufficient_gap_mm(brake, task), tuple(reasons))
 
 
 def rank(inserts: Mapping[str, Brake], task: ForceTask, gap_resolution_mm: float) -> list[Verdict]:
     """All inserts, best first: those that serve by the finest resolution, then the others by the share they serve."""
     verdicts = [judge(name, brake, task, gap_resolution_mm) for name, brake in inserts.items()]
     return sorted(verdicts, key=lambda v: (not v.serves, -v.served_share if v.reasons else 0.0, v.resolution_N))
+
+
+def _sufficient_gap_mm(brake: Brake, task: ForceTask) -> float:
+    tolerated_N = task.least_N + task.resolution_N
+    if tolerated_N >= brake.least_N:
+        return brake.open_mm
+    moment_Tm = radial_moment_for_force_Tm(tolerated_N, brake.elastomer, brake.geometry)
+    farthest_mm = brake.field.gap_range_mm[1]
+    if moment_Tm < brake.field.radial_moment_Tm(farthest_mm):
+        return math.nan
+    return brake.field.gap_mm(moment_Tm)

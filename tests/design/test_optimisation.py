@@ -1,0 +1,113 @@
+import itertools
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from tormagd.design.optimisation import SLACK, Design, Problem, Run, corner_cost, coverage, solve
+from tormagd.design.phase_portrait import Region
+from tormagd.physics.errors import DomainError
+
+THESIS_SPEED_MM_S = 25.0 / 3.0
+
+
+def grid(problem: Problem, side: int) -> list[Design]:
+    low, high = (msgspec.structs.astuple(bound) for bound in (problem.lower, problem.upper))
+    axes = [np.linspace(a, b, side) for a, b in zip(low, high, strict=True)]
+    return [Design(*(float(value) for value in point)) for point in itertools.product(*axes)]
+
+
+@pytest.mark.parametrize(
+    ("use_case", "measure", "speed", "bar"),
+    [
+        (1, "trapezoid", THESIS_SPEED_MM_S, 0.995),
+        (1, "true", 40.0, 0.99),
+        (1, "true", THESIS_SPEED_MM_S, 0.97),
+        (2, "trapezoid", THESIS_SPEED_MM_S, 0.999),
+        (2, "true", 40.0, 0.995),
+        (2, "true", THESIS_SPEED_MM_S, 0.974),
+    ],
+)
+def test_two_starts_end_together_and_above_the_bar(
+    use_case_1: Region, use_case_2: Region, use_case: int, measure: str, speed: float, bar: float
+) -> None:
+    problem = Problem((use_case_1, use_case_2)[use_case - 1], measure, speed)
+    first, second = (solve(Run(problem, start, "global")) for start in (problem.lower, Design(40.0, 50.0, 170.0)))
+    assert min(first.coverage, second.coverage) >= bar
+    assert first.coverage == pytest.approx(second.coverage, rel=0.01)
+    assert first.volume_mm3 == pytest.approx(second.volume_mm3, rel=0.05)
+
+
+def test_no_design_on_a_grid_is_better_or_as_good_and_smaller(problem: Problem) -> None:
+    found = solve(Run(problem, Design(11.0, 20.0, 95.0), "global"))
+    for design in grid(problem, 11):
+        reached = coverage(problem, design)
+        assert reached <= found.coverage + 2 * SLACK
+        if reached >= found.coverage:
+            assert problem.volume_mm3(design) >= 0.999 * found.volume_mm3
+
+
+def test_the_same_run_gives_the_same_design(problem: Problem, as_built: Design) -> None:
+    run = Run(problem, as_built, "global", seed=7)
+    assert solve(run).design == solve(run).design
+
+
+@pytest.mark.parametrize("solver", ["local", "global"])
+def test_no_solver_returns_less_than_its_start(use_case_1: Region, as_built: Design, solver: str) -> None:
+    covering = Problem(use_case_1, "true", THESIS_SPEED_MM_S)
+    assert solve(Run(covering, as_built, solver)).coverage >= coverage(covering, as_built) - SLACK
+    corners = Problem(use_case_1, "corners", THESIS_SPEED_MM_S)
+    assert solve(Run(corners, as_built, solver)).corner_cost <= corner_cost(corners, as_built)
+
+
+def test_the_thesis_cost_ends_below_the_grid_and_covers_less(use_case_2: Region, as_built: Design) -> None:
+    problem = Problem(use_case_2, "corners", THESIS_SPEED_MM_S)
+    found = solve(Run(problem, as_built, "global"))
+    assert found.corner_cost <= min(corner_cost(problem, design) for design in grid(problem, 10))
+    assert found.coverage < coverage(problem, as_built)
+
+
+def test_a_soft_elastomer_keeps_clear_of_collapse(use_case_2: Region) -> None:
+    soft = Problem(use_case_2, "true", 40.0, shear_modulus_Pa=20e3)
+    margins = [soft.load_margin(design) for design in grid(soft, 5)]
+    assert min(margins) < 0.0 < max(margins)
+    outcome = solve(Run(soft, Design(45.0, 50.0, 200.0), "global"))
+    assert soft.load_margin(outcome.design) >= 0.0
+    assert outcome.coverage > 0.9
+
+
+def test_an_elastomer_too_soft_for_any_design_is_refused(use_case_2: Region, as_built: Design) -> None:
+    jelly = Problem(use_case_2, "true", 40.0, shear_modulus_Pa=2e3, relative_permeability=6.0)
+    assert max(jelly.load_margin(design) for design in grid(jelly, 5)) < 0.0
+    for solver in ("local", "global"):
+        with pytest.raises(DomainError, match="shear_modulus_Pa"):
+            solve(Run(jelly, as_built, solver))
+
+
+def test_corner_cost_of_a_perfect_match_is_nothing(problem: Problem, as_built: Design) -> None:
+    own = msgspec.structs.replace(problem, region=problem.portrait(as_built).trapezoid(), measure="corners")
+    assert corner_cost(own, as_built) == 0.0
+    assert coverage(own, as_built) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "variable"),
+    [
+        ({"lower": Design(4.2, 0.5, 46.0)}, "lower.outer_radius_mm"),
+        ({"lower": Design(6.5, 0.5, 45.0)}, "lower.open_mm"),
+        ({"lower": Design(6.5, 60.0, 46.0)}, "upper.thickness_mm"),
+        ({"upper": Design(math.inf, 50.0, 200.0)}, "upper.outer_radius_mm"),
+    ],
+)
+def test_impossible_problems_are_refused(use_case_2: Region, changes: dict[str, Design], variable: str) -> None:
+    with pytest.raises(DomainError) as refused:
+        Problem(use_case_2, "true", 40.0, **changes)
+    assert refused.value.variable == variable
+
+
+def test_starts_outside_the_bounds_are_refused(problem: Problem) -> None:
+    with pytest.raises(DomainError, match=r"start\.outer_radius_mm"):
+        Run(problem, Design(5.0, 20.0, 95.0), "global")
+    with pytest.raises(DomainError, match=r"start\.open_mm"):
+        Run(problem, Design(11.0, 20.0, math.nan), "local")

@@ -1,0 +1,42 @@
+"""Measurements of tormagd, one a subcommand. Each prints one JSON object with --json, a table otherwise.
+
+A measurement is a module beside this one with `add_arguments(parser)`, `measure(options)` that returns the object, and
+`print_table(object)`.
+"""
+
+import argparse
+import importlib
+import json
+import sys
+from collections.abc import Sequence
+
+MEASUREMENTS = {
+    "inverse": "speed against accuracy of the searches for the field",
+    "loop": "lateness of the control loop beside a bare timer",
+    "latency": "from a setpoint to the first drive frame that reflects it",
+    "step": "how fast and how exactly the gap follows, in virtual time",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one measurement; returns 0, or 2 on a wrong command line."""
+    parser = argparse.ArgumentParser(prog="benchmark.py", description=(__doc__ or "").splitlines()[0])
+    measurements = parser.add_subparsers(dest="measurement", required=True)
+    modules = {}
+    for name, says in MEASUREMENTS.items():
+        modules[name] = importlib.import_module(f"benchmark_{name}")
+        subparser = measurements.add_parser(name, help=says, description=modules[name].__doc__)
+        subparser.add_argument("--json", action="store_true", help="print JSON")
+        modules[name].add_arguments(subparser)
+    options = parser.parse_args(arguments)
+    module = modules[options.measurement]
+    result = module.measure(options)
+    if options.json:
+        print(json.dumps(result))
+    else:
+        module.print_table(result)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

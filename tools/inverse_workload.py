@@ -1,0 +1,153 @@
+"""The workload of `benchmark inverse`: a plant, networks trained on it, a course of forces, the networks' own roots.
+
+Synthetic. The plant is the simulator's torque element at rest in memory: its force law, field law, pre-sliding and
+Stribeck friction, without hysteresis and relaxation, which no search could undo and which would hide the searches.
+"""
+
+import datetime
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from tormagd.control.portrait import FieldOfGap
+from tormagd.learning.dataset import Dataset
+from tormagd.learning.features import Element, Scaling
+from tormagd.learning.levenberg_marquardt import train
+from tormagd.learning.metrics import fit_metrics
+from tormagd.learning.mlp import ForceNetwork, to_model
+from tormagd.learning.model_file import ForceModel, ModelMetadata
+from tormagd.physics.field import PowerFieldLaw
+from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.physics.friction import Friction
+from tormagd.physics.inserts import insert
+from tormagd.simulation.element import radial_moment_Tm
+from tormagd.simulation.parameters import PlantParameters
+
+Array = npt.NDArray[np.float64]
+
+INSERT = insert("MRE-50-40")
+CIP_PERCENT = 100.0 * INSERT.cip_fraction
+GAPS_MM = (45.0, 95.0)
+NOMINAL = FieldOfGap(PowerFieldLaw(), INSERT.elastomer.relative_permeability, TORMAG.inner_radius_m)
+FIELDS_MT = (NOMINAL.field_mT(GAPS_MM[1]), NOMINAL.field_mT(GAPS_MM[0]))
+"What the controller calls field: the nominal law's, over the device's stroke."
+
+DISPLACEMENTS_MM = (1.4, 2.1)
+RATES_MM_S = (2.0, 55.0)
+"Near full mobilisation and in motion: before break-away the force is the hand's choice, and the inverse is ill-posed."
+
+SOLVES = 2000
+COVERED = (0.04, 0.96)
+ROOT_STEP_MT = 0.5
+SLOPE_STEP_MT = 0.5
+
+
+class Course(NamedTuple):
+    """Features and forces along the course, in the order they are solved; the true field is the plant's."""
+
+    displacement_mm: Array
+    rate_mm_s: Array
+    field_mT: Array
+    force_N: Array
+
+    def rows(self) -> list[tuple[float, float, float]]:
+        """(displacement_mm, rate_mm_s, force_N), as Python floats: what a solver is given."""
+        return list(zip(self.displacement_mm.tolist(), self.rate_mm_s.tolist(), self.force_N.tolist(), strict=True))
+
+
+def plant_force_N(plant: PlantParameters, displacement_mm: Array, rate_mm_s: Array, field_mT: Array) -> Array:
+    """The plant's force that long after a reversal at a steady rate, at the gap whose nominal field is `field_mT`."""
+    gaps = np.array([min(max(NOMINAL.gap_mm(field), GAPS_MM[0]), GAPS_MM[1]) for field in field_mT.tolist()])
+    elastomer = Elastomer(
+        shear_modulus_Pa=plant.elastomer.shear_modulus_kPa * 1e3,
+        relative_permeability=plant.elastomer.relative_permeability,
+        friction_coefficient=plant.elastomer.kinetic_friction,
+    )
+    kinetic_N = brake_force_N(radial_moment_Tm(gaps, plant), elastomer, TORMAG)
+    friction = Friction(
+        presliding_stiffness_N_mm=plant.friction.presliding_stiffness_N_mm,
+        viscous_N_s_mm=plant.friction.viscous_N_s_mm,
+        static_ratio=plant.friction.static_to_kinetic,
+        stribeck_speed_mm_s=plant.friction.stribeck_speed_mm_s,
+    )
+    # a reversal leaves the bristles bent the other way, which is the largest deflection there is
+    columns = zip(displacement_mm.tolist(), rate_mm_s.tolist(), kinetic_N.tolist(), strict=True)
+    return np.array([friction.advance(-1e3, rate, level, travel / rate)[0] for travel, rate, level in columns])
+
+
+def course(plant: PlantParameters, solves: int) -> Course:
+    """A smooth course through the plant's range: slow and fast swings of the field, the handle's speed and travel."""
+    phase = 2 * np.pi * np.arange(solves) / solves
+    middle, swing = sum(COVERED) / 2, (COVERED[1] - COVERED[0]) / 2
+    share = middle + swing * (0.8 * np.sin(3 * phase) + 0.2 * np.sin(17 * phase))
+    field = FIELDS_MT[0] + share * (FIELDS_MT[1] - FIELDS_MT[0])
+    rate = 25.0 + 20.0 * np.sin(5 * phase)
+    displacement = 1.75 + 0.25 * np.sin(7 * phase)
+    return Course(displacement, rate, field, plant_force_N(plant, displacement, rate, field))
+
+
+def plant_slope_N_per_mT(plant: PlantParameters, along: Course) -> Array:
+    """dF/dB of the plant along the course, by central differences."""
+    either = [
+        plant_force_N(plant, along.displacement_mm, along.rate_mm_s, along.field_mT + side * SLOPE_STEP_MT)
+        for side in (1, -1)
+    ]
+    slope: Array = (either[0] - either[1]) / (2 * SLOPE_STEP_MT)
+    return slope
+
+
+def training_data(plant: PlantParameters, rows: int, seed: int) -> Dataset:
+    """Rows at random over the box, with the plant's sensor noise."""
+    draw = np.random.default_rng(seed)
+    displacement, rate = draw.uniform(*DISPLACEMENTS_MM, rows), draw.uniform(*RATES_MM_S, rows)
+    field = draw.uniform(*FIELDS_MT, rows)
+    force = plant_force_N(plant, displacement, rate, field)
+    force = force + draw.normal(0.0, 1e-3 * plant.force_sensor.noise_mN, rows)
+    return Dataset(np.column_stack((displacement, rate, field, np.full(rows, CIP_PERCENT))), force)
+
+
+def trained(data: Dataset, hidden: int, epochs: int, seed: int = 0) -> ForceModel:
+    """A network with that many units, trained by Levenberg-Marquardt; its metrics hold `mae_N` of the held-out rows."""
+    training, validation = data.split(0.3, seed)
+    scaling = Scaling.fit(training.features, training.force_N)
+    network = ForceNetwork(scaling, hidden, seed=seed)
+    train(network, training, validation, epochs=epochs)
+    metadata = ModelMetadata(
+        element=Element.TORQUE,
+        insert=INSERT.name,
+        hidden=hidden,
+        ranges=training.ranges(),
+        scaling=scaling,
+        training_data_sha256=data.sha256(),
+        metrics={},
+        created=datetime.date(2024, 1, 1),
+    )
+    metadata.metrics.update(fit_metrics(to_model(network, metadata), validation))
+    return to_model(network, metadata)
+
+
+def network_roots_mT(model: ForceModel, along: Course) -> list[Array]:
+    """For each solve every field in range at which the network gives the force: a fine grid, then bisection.
+
+    Shares no code with the searches. Where the network does not reach the force, the array is empty.
+    """
+    grid = np.linspace(*FIELDS_MT, int((FIELDS_MT[1] - FIELDS_MT[0]) / ROOT_STEP_MT) + 2)
+    found: list[Array] = []
+    for displacement, rate, force in along.rows():
+        excess = _network(model, displacement, rate, grid) - force
+        left = np.flatnonzero((excess[1:] < 0) != (excess[:-1] < 0))
+        low, high, rises = grid[left], grid[left + 1], excess[left] < 0
+        for _ in range(40 if left.size else 0):
+            middle = (low + high) / 2
+            under = (_network(model, displacement, rate, middle) < force) == rises
+            low, high = np.where(under, middle, low), np.where(under, high, middle)
+        found.append((low + high) / 2)
+    return found
+
+
+def _network(model: ForceModel, displacement_mm: float, rate_mm_s: float, fields_mT: Array) -> Array:
+    rows = np.full((len(fields_mT), 4), CIP_PERCENT)
+    rows[:, 0], rows[:, 1], rows[:, 2] = displacement_mm, rate_mm_s, fields_mT
+    forces: Array = model.predict(rows)
+    return forces
