@@ -5,9 +5,10 @@ orderings are refused with the key's path, the value and what is allowed.
 """
 
 import math
+import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -15,7 +16,8 @@ from msgspec import Meta
 LEAST_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
 DEFAULT_RUN_DIR = "/run/tormag"
 
-Positive = Annotated[float, Meta(gt=0.0)]
+T = TypeVar("T")
+_LOCAL = re.compile(r"(ipc|inproc)://.+|tcp://(127(\.\d{1,3}){3}|localhost|\[::1\]):\d{1,5}")
 
 
 class ConfigError(ValueError):
@@ -169,14 +171,23 @@ class Config(Strict, frozen=True):
             limits.skew_warning_mm,
             f"at most limits.skew_fault_mm = {limits.skew_fault_mm:g}",
         )
+        taken: dict[str, str] = {}
         for name in ("setpoint", "telemetry", "control", "recording"):
             address = getattr(self.endpoints, name)
             _order(
-                address.startswith(("ipc://", "inproc://", "tcp://127.", "tcp://localhost:", "tcp://[::1]:")),
+                _LOCAL.fullmatch(address) is not None,
                 f"endpoints.{name}",
                 address,
                 "ipc:// or a loopback tcp:// address; others need CURVE keys",
             )
+            # libzmq takes an ipc address away from whoever bound it first, without a word
+            _order(
+                address not in taken,
+                f"endpoints.{name}",
+                address,
+                f"an address other than that of endpoints.{taken.get(address)}",
+            )
+            taken[address] = name
 
 
 def _order(condition: bool, key: str, value: object, allowed: str) -> None:
@@ -211,19 +222,27 @@ def load_config(path: Path | None) -> Config:
     """The configuration in `path`, or the defaults. Raises ConfigError."""
     if path is None:
         return Config()
+    return convert(path, Config)
+
+
+def convert(path: Path, kind: type[T]) -> T:
+    """The file's tables as a `kind`. Raises ConfigError naming file, key, value and what is allowed."""
     tables = load_toml(path)
     try:
-        return msgspec.convert(tables, Config)
+        return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{path}: {error}{_value_at(tables, str(error))}") from error
 
 
 def _value_at(tables: dict[str, Any], message: str) -> str:
-    """` (it is VALUE)` for the `$.a.b` path msgspec puts at the end of its message; msgspec leaves the value out."""
+    """` (it is VALUE)` for the `$.a.b` path msgspec puts at the end of its message; msgspec leaves the value out.
+
+    An element of an array, `$.a[...]`, is not told from its neighbours, so the value is the array.
+    """
     if "`$." not in message:
         return ""
     value: Any = tables
-    for key in message.rsplit("`$.", 1)[1].rstrip("`").split("."):
+    for key in message.rsplit("`$.", 1)[1].rstrip("`").split("[")[0].split("."):
         if not isinstance(value, dict) or key not in value:
             return ""
         value = value[key]

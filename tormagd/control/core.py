@@ -11,13 +11,13 @@ from tormagd.control.motor import Margins, margins
 from tormagd.control.plan import Planner
 from tormagd.control.portrait import FieldOfGap
 from tormagd.control.step import Stepper
-from tormagd.inverse.nearest import NearestFieldSearch
+from tormagd.inverse.choice import Choice, build, choose, named, solver_table
 from tormagd.learning.model_file import ModelFileError, load_model
 from tormagd.learning.shipped import model_path
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.inserts import insert
-from tormagd.scenes.scene import Scene, load_scene, scene_path
+from tormagd.scenes.scene import AUTO, Scene, load_scene, scene_path
 
 ELEMENT = "torque"
 LEAST_PHASE_MARGIN_DEG = 30.0
@@ -31,6 +31,7 @@ class Core(NamedTuple):
     planner: Planner
     stepper: Stepper
     margins: Margins
+    solver: Choice
 
 
 def build_core(config: Config) -> Core:
@@ -57,11 +58,19 @@ def build_core(config: Config) -> Core:
     except (DomainError, ModelFileError) as error:
         raise ConfigError(f"scene {scene.name}: {error}") from error
     field = FieldOfGap(PowerFieldLaw(), fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm * 1e-3)
-    solver = NearestFieldSearch(
-        model,
-        field_range_mT=(field.field_mT(scene.insert.gap_open_mm), field.field_mT(scene.insert.gap_closed_mm)),
-        step_mT=scene.solver.step_mT,
-        neighbours=scene.solver.neighbours,
-    )
+    fields_mT = (field.field_mT(scene.insert.gap_open_mm), field.field_mT(scene.insert.gap_closed_mm))
+    try:
+        choice = choose_solver(scene, model.metadata.hidden)
+        solver = build(choice, model, fields_mT)
+    except DomainError as error:
+        raise ConfigError(f"scene {scene.name}: {error}") from error
     planner = Planner(config, scene, model, solver, field, 100.0 * fitted.cip_fraction)
-    return Core(scene, planner, Stepper(config, scene), stability)
+    return Core(scene, planner, Stepper(config, scene), stability, choice)
+
+
+def choose_solver(scene: Scene, hidden: int) -> Choice:
+    """The search that `scene` names, or that its tolerance picks from the measured table. Raises DomainError."""
+    wanted = scene.solver
+    if wanted.name == AUTO:
+        return choose(solver_table(), scene.force.tolerance_rms_N, hidden)
+    return named(wanted.name, wanted.step_mT or None, wanted.neighbours or None)

@@ -14,7 +14,7 @@ from tormagd.scenes.scene import Scene
 LEAST_SLOPE_N_MM = 1e-3
 "Where the gap hardly changes the force, no gap speed helps."
 MOVING_MM_S = 5.0
-"Slower handles do not teach the trim: their friction may be static."
+"Slower handles do not teach the trim, and no force is planned for them: their friction may be static."
 TAUGHT_N = 0.2
 "Smaller forces do not teach it either: the sensor's offset would."
 
@@ -112,14 +112,14 @@ class Planner:
         return PlanState(governor, plan, trim)
 
     def _motion(self, setpoint: TimedSetpoint | None, estimate: Estimate | None) -> tuple[float, float]:
-        # the field sets how much friction there can be, so it is asked for at full mobilisation: before break-away the
-        # force is the hand's choice, not the field's, and the inverse there is ill-posed
+        # the field sets how much friction there can be, so it is asked for at full mobilisation and in motion: before
+        # break-away the force is the hand's choice, not the field's, and the inverse there is ill-posed
         displacement = MOBILISED_MM
         rate = 0.0 if estimate is None else abs(estimate.handle.rate_mm_s)
         if setpoint is not None:
             displacement = displacement if setpoint.displacement_mm is None else setpoint.displacement_mm
             rate = rate if setpoint.rate_mm_s is None else abs(setpoint.rate_mm_s)
-        return displacement, rate
+        return displacement, max(rate, MOVING_MM_S)
 
     def _predict(self, estimate: Estimate) -> float:
         gap = min(max(estimate.gap_mm, self._gaps_mm[0] - 5.0), self._gaps_mm[1] + 5.0)

@@ -111,9 +111,9 @@ class Stepper:
     def step(
         self, state: StepState, now_s: float, measurement: Measurement | None, plan: Plan
     ) -> tuple[StepState, StepOutput]:
-        """One control period. With no measurement (no link) the device is told nothing but OFF."""
+        """One control period. With no measurement the link is lost, and the device is told nothing but OFF."""
         if measurement is None:
-            state = state._replace(time_s=now_s, estimate=None)
+            state = self.lose_link(state)._replace(time_s=now_s)
             return state, self._off(state.safety, ())
         estimate = update(state.estimate, measurement, self._home_mm, self._position.derivative_filter_s)
         state = state._replace(estimate=estimate)
@@ -147,7 +147,7 @@ class Stepper:
         right_state, right = self._carriage(
             state.right, reference, estimate.right_mm, estimate.right_mm_s, estimate, dt_s, is_right=True
         )
-        if not (math.isfinite(left.duty) and math.isfinite(right.duty)):
+        if not all(math.isfinite(value) for value in (left.duty, right.duty, measurement.supply_V)):
             safety = latch(state.safety, (Fault.NOT_FINITE,))
             return self.start(now_s)._replace(safety=safety), self._off(safety, ())
         if left.is_saturated or right.is_saturated:

@@ -71,7 +71,15 @@ class Daemon:
         heartbeat = Heartbeat(NS // self._config.rates.control_hz)
         loop.add_reader(heartbeat.fileno(), self._beat, heartbeat)
         notify.notify("READY=1")
-        log.info("running scene %s", self._core.scene.name)
+        solver = self._core.solver
+        log.info(
+            "running scene %s with the %s solver at %g mT, %s (%s)",
+            self._core.scene.name,
+            solver.solver,
+            solver.step_mT,
+            solver.dtype,
+            solver.reason,
+        )
         await self._ended.wait()
         notify.notify("STOPPING=1")
         await self._open_gap()

@@ -60,6 +60,7 @@ def _print_resolved(config: Config, core: Core) -> None:
             "most_N": core.planner.portrait.most_N,
             "phase_margin_deg": core.margins.phase_margin_deg,
             "gain_margin_dB": core.margins.gain_margin_dB,
+            "solver": core.solver._asdict(),
         },
     }
     print(msgspec.json.format(msgspec.json.encode(resolved), indent=2).decode())

@@ -91,7 +91,9 @@ class DeviceLink:
             self.state = LinkState.LOST
             self.cause = f"no message for {SILENT_S * 1e3:.0f} ms"
         messages: list[Message] = []
-        is_waiting = self._request is not DeviceRequest.NONE and self.state is LinkState.RUNNING
+        is_waiting = (
+            self._request is not DeviceRequest.NONE and self.state is LinkState.RUNNING and self._status is not None
+        )
         if now_s >= self._hello_due_s and not is_waiting:
             self._hello_due_s = now_s + (REPEAT_S if self.identity is None else HELLO_S)
             messages.append(Hello(schema_hash=SCHEMA_HASH, protocol_version=PROTOCOL_VERSION, nonce=self._acknowledged))
@@ -129,6 +131,9 @@ class DeviceLink:
             )
 
     def _take_status(self, status: Status) -> None:
+        if self._status is None:
+            # an earlier host has counted as far; its last number again would be taken for a repetition
+            self._nonce = status.command_nonce % 255 + 1
         self._status = status
         if self._request is not DeviceRequest.NONE and status.command_nonce == self._nonce:
             self._request = DeviceRequest.NONE

@@ -1,6 +1,7 @@
 """The serial backend: pyserial opens and configures the port, the event loop watches its descriptor."""
 
 import os
+import termios
 
 import serial
 
@@ -69,7 +70,17 @@ def open_serial(device: Device) -> SerialBackend:
     try:
         port = serial.Serial(device.port, device.baud, timeout=0, write_timeout=0, exclusive=True)
         port.reset_input_buffer()
+        _tell_nothing_from_gone(port.fileno())
     except OSError as error:  # SerialException is one too; its text repeats path and number
         reason = os.strerror(error.errno) if error.errno else str(error)
         raise BackendError(f"{device.port}: cannot be opened: {reason}") from error
+    except termios.error as error:  # no OSError; unplugged while it was set up
+        raise BackendError(f"{device.port}: cannot be opened: {error.args[-1]}") from error
     return SerialBackend(port)
+
+
+def _tell_nothing_from_gone(fd: int) -> None:
+    # with pyserial's VMIN = 0 a read returns no bytes both when none have come and when the device is unplugged
+    attributes = termios.tcgetattr(fd)
+    attributes[6][termios.VMIN] = 1
+    termios.tcsetattr(fd, termios.TCSANOW, attributes)

@@ -1,20 +1,29 @@
-"""The thesis's search (Eq. 44), row by row: the baseline against which the others are measured."""
+"""The thesis's search (Eq. 44), row by row and as one array: the baselines against which the others are measured."""
+
+from collections.abc import Callable
+
+import torch
 
 from tormagd.inverse.nearest import field_grid
 from tormagd.inverse.solution import FieldSolution, Reach, confidence
-from tormagd.learning.features import require_inputs, require_number
+from tormagd.learning.features import FEATURES, FIELD, require_inputs, require_number
+from tormagd.learning.mlp import to_network
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 
 THESIS_EPSILON_N = 1.26
 """Radius of the neighbourhood in the thesis: the mean error of its network."""
 
+TIE = 64
+"""Units of rounding within which the force of the nearest row counts as the force asked."""
+
 
 class LinearFieldSearch:
     """Try the fields of a grid from the least upwards and stop at |F - NN| <= epsilon.
 
     With `epsilon_N` = 0 it sees every row and answers with the nearest. It knows no continuity: the last field is
-    checked and not used. Raises `DomainError` on parameters it cannot use.
+    checked and not used. `predict_one` is how one row is evaluated: the model's own by default, `torch_row(model)` as
+    the thesis did it. Raises `DomainError` on parameters it cannot use.
     """
 
     def __init__(
@@ -24,6 +33,7 @@ class LinearFieldSearch:
         field_range_mT: tuple[float, float],
         step_mT: float = 1.0,
         epsilon_N: float = THESIS_EPSILON_N,
+        predict_one: Callable[[float, float, float, float], float] | None = None,
     ) -> None:
         require_number("epsilon_N", epsilon_N)
         if epsilon_N < 0:
@@ -31,6 +41,7 @@ class LinearFieldSearch:
         self._model = model
         self._fields_mT: list[float] = field_grid(field_range_mT, step_mT).tolist()
         self._epsilon_N = epsilon_N
+        self._predict_one = predict_one or model.predict_one
 
     def solve(
         self,
@@ -48,7 +59,7 @@ class LinearFieldSearch:
         best_mT, best_N, above, below, rows = self._fields_mT[0], 0.0, False, False, 0
         best_error_N = float("inf")
         for field_mT in self._fields_mT:
-            predicted_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
+            predicted_N = self._predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
             rows += 1
             error_N = abs(force_N - predicted_N)
             if error_N < best_error_N:
@@ -64,3 +75,65 @@ class LinearFieldSearch:
             reach = Reach.BELOW if above else Reach.ABOVE
         trust = confidence(self._model, (displacement_mm, rate_mm_s, best_mT, cip_percent), force_N, best_N)
         return FieldSolution(best_mT, best_N, trust, rows, reach)
+
+
+def torch_row(model: ForceModel, dtype: torch.dtype = torch.float64) -> Callable[[float, float, float, float], float]:
+    """Return the forward pass of `model` in torch, one row at a time: what the thesis's loop calls."""
+    network = to_network(model).to(dtype)
+
+    def predict_one(displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
+        with torch.inference_mode():
+            row = torch.tensor(((displacement_mm, rate_mm_s, field_mT, cip_percent),), dtype=dtype)
+            return float(network(row))
+
+    return predict_one
+
+
+class GridArgmin:
+    """The same search as one array: the whole network on every field of the grid, then the row nearest in force.
+
+    It knows no continuity and does not interpolate: the last field is checked and not used, the answer is a grid point.
+    Raises `DomainError` on parameters it cannot use.
+    """
+
+    def __init__(
+        self,
+        model: ForceModel,
+        *,
+        field_range_mT: tuple[float, float],
+        step_mT: float = 1.0,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        fields_mT = field_grid(field_range_mT, step_mT)
+        self._model = model
+        self._network = to_network(model).to(dtype)
+        self._rows = torch.zeros((len(fields_mT), len(FEATURES)), dtype=dtype)
+        self._rows[:, FIELD] = torch.from_numpy(fields_mT)
+        self._others = torch.tensor([column for column in range(len(FEATURES)) if column != FIELD])
+        self._fields_mT: list[float] = fields_mT.tolist()
+
+    def solve(
+        self,
+        displacement_mm: float,
+        rate_mm_s: float,
+        force_N: float,
+        cip_percent: float,
+        last_field_mT: float | None,
+    ) -> FieldSolution:
+        """See `FieldSolver.solve`."""
+        near = self._fields_mT[0] if last_field_mT is None else last_field_mT
+        require_inputs(displacement_mm, rate_mm_s, near, cip_percent)
+        require_number("force_N", force_N)
+
+        with torch.inference_mode():
+            given = torch.tensor((displacement_mm, rate_mm_s, cip_percent), dtype=self._rows.dtype)
+            self._rows[:, self._others] = given
+            excess = self._network(self._rows) - force_N
+            best = int(excess.abs().argmin())
+            least_N, most_N = (float(end) for end in torch.aminmax(excess))
+        field_mT = self._fields_mT[best]
+        predicted_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
+        tie_N = TIE * torch.finfo(self._rows.dtype).eps * (abs(force_N) + abs(predicted_N))
+        reach = Reach.ABOVE if most_N < -tie_N else Reach.BELOW if least_N > tie_N else Reach.INSIDE
+        trust = confidence(self._model, (displacement_mm, rate_mm_s, field_mT, cip_percent), force_N, predicted_N)
+        return FieldSolution(field_mT, predicted_N, trust, 1, reach)

@@ -39,8 +39,8 @@ class NearestFieldSearch:
 
     - the root in every grid interval where predicted and asked force cross, by linear interpolation, so that the answer
       is not bound to the grid;
-    - of the `neighbours` grid points nearest in force, those as near as the best answer within the rounding of
-      `dtype`: the plateaus and touching points that no crossing marks.
+    - of the `neighbours` grid points nearest in force and the one nearest the last field, those as near as the best
+      answer within the rounding of `dtype`: the plateaus and touching points that no crossing marks.
 
     The candidate nearest the last field wins; without a last field the lowest, which is the opener gap. Where nothing
     crosses, the force is out of reach, and the nearest end is the answer.
@@ -69,6 +69,7 @@ class NearestFieldSearch:
         torch.set_num_threads(1)
         self._model = model
         self._neighbours = neighbours
+        self._per_mT = 1 / float(self._fields_mT[1] - self._fields_mT[0])
         weight, bias, output, constant = model.physical
         others = [column for column in range(len(FEATURES)) if column != FIELD]
         self._other_weight = np.ascontiguousarray(weight[:, others])
@@ -105,13 +106,13 @@ class NearestFieldSearch:
             torch.mv(self._hidden, self._output, out=self._force)
         excess_N = self._force_view - self._force_view.dtype.type(force_N - self._constant_N)
 
-        candidates, reach = self._candidates(excess_N)
+        candidates, reach = self._candidates(excess_N, near)
         field_mT = float(candidates[np.abs(candidates - near).argmin()])
         predicted_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
         trust = confidence(self._model, (displacement_mm, rate_mm_s, field_mT, cip_percent), force_N, predicted_N)
         return FieldSolution(field_mT, predicted_N, trust, 2, reach)
 
-    def _candidates(self, excess_N: Floats) -> tuple[NDArray[np.float64], Reach]:
+    def _candidates(self, excess_N: Floats, near_mT: float) -> tuple[NDArray[np.float64], Reach]:
         """Fields in mT that fit equally well, and whether they fit, from the force above the one asked on the grid."""
         fields = self._fields_mT
         below = excess_N < 0
@@ -120,6 +121,10 @@ class NearestFieldSearch:
         nearest = np.argpartition(error_N, self._neighbours - 1)[: self._neighbours]
         best_N = 0.0 if left.size else float(error_N[nearest].min())
         candidates = fields[nearest[error_N[nearest] <= best_N + self._tie_N]]
+        # on a plateau of more points than `neighbours` it is chance which of them were taken
+        here = min(max(round((near_mT - fields[0]) * self._per_mT), 0), len(fields) - 1)
+        if error_N[here] <= best_N + self._tie_N:
+            candidates = np.append(candidates, fields[here])
         if left.size:
             at, to = excess_N[left], excess_N[left + 1]
             roots = fields[left] + (fields[left + 1] - fields[left]) * (at / (at - to))

@@ -95,7 +95,7 @@ def _enable(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyS
         raise RefusedError("not_homed", "the carriages are not homed", "tormagctl home")
     if not conditions.fresh:
         raise RefusedError("not_fresh", "no fresh measurement from the device", "look at the link in tormagctl status")
-    if conditions.requested_N is not None and conditions.requested_N > conditions.neutral_N:
+    if conditions.requested_N is not None and not conditions.requested_N <= conditions.neutral_N:  # NaN is not neutral
         raise RefusedError(
             "not_neutral",
             f"the setpoint is {conditions.requested_N:.2f} N: allowed is at most {conditions.neutral_N:.2f} N",

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Annotated
 
 import msgspec
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
-from tormagd.config import LEAST_INFERENCE_HZ, ConfigError, Strict, load_toml
+from tormagd.config import LEAST_INFERENCE_HZ, ConfigError, Strict, convert
 
+AUTO = "auto"
 _SHIPPED = resources.files(__package__)
 
 
@@ -49,10 +50,19 @@ class Insert(Strict, frozen=True):
 
 
 class Solver(Strict, frozen=True):
-    """The field search: a grid over the field, and how many neighbours compete for the answer."""
+    """The field search. "auto": the cheapest that the scene's force tolerance allows, by the measured table."""
 
-    step_mT: Annotated[float, Meta(gt=0.0, le=50.0)] = 2.0
-    neighbours: Annotated[int, Meta(ge=1, le=64)] = 4
+    name: str = AUTO
+    step_mT: Annotated[float, Meta(gt=0.0, le=50.0)] | UnsetType = UNSET
+    "Of the grid over the field. Only beside a named search."
+    neighbours: Annotated[int, Meta(ge=1, le=64)] | UnsetType = UNSET
+    'Points of the grid that compete for the answer of the search "nearest". Only beside a named search.'
+
+    def __post_init__(self) -> None:
+        for key in ("step_mT", "neighbours"):
+            value = getattr(self, key)
+            if self.name == AUTO and value is not UNSET:
+                raise ValueError(f"solver.{key} = {value}: allowed only beside a solver.name other than {AUTO}")
 
 
 class Scene(Strict, frozen=True):
@@ -99,8 +109,4 @@ def scene_path(name_or_path: str) -> Path:
 
 def load_scene(name_or_path: str) -> Scene:
     """The scene in a file or of a shipped name. Raises ConfigError naming file, key, value and what is allowed."""
-    path = scene_path(name_or_path)
-    try:
-        return msgspec.convert(load_toml(path), Scene)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: {error}") from error
+    return convert(scene_path(name_or_path), Scene)

@@ -1,0 +1,394 @@
+"""The daemon's core against the simulated device, in virtual time and through protocol bytes.
+
+All data here are synthetic: the device is the simulator's, the pulse is a formula.
+"""
+
+import copy
+import math
+from collections.abc import Callable, Iterable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from firmware_protocol.codec import DeviceMode, DriveMode
+from tormagd.closed_loop import ClosedLoop, Sample, stream
+from tormagd.config import Config
+from tormagd.control.core import Core, build_core
+from tormagd.control.plan import Plan
+from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.operating_state import OperatingState, RefusedError
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.faults import parse_fault
+from tormagd.simulation.hand import parse_hand
+from tormagd.simulation.parameters import load_plant
+
+CONFIG = Config()
+OPEN_MM = 95.0
+LEAD_IN_S = 0.7
+"A ramp to the first force of the pulse, and a hold there."
+STRIKE_S = 3.4
+"When an injected fault begins: armed, and in the middle of a pulse."
+Maker = Callable[..., ClosedLoop]
+
+
+@pytest.fixture(scope="module")
+def core() -> Core:
+    return build_core(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def make(core: Core) -> Maker:
+    """A loop on a simulated device that has just been switched on."""
+
+    def build(
+        plant: str = "sample_1",
+        faults: Iterable[str] = (),
+        hand: str = "steady",
+        seed: int = 1,
+        *,
+        planned: bool = True,
+    ) -> ClosedLoop:
+        device = VirtualDevice(load_plant(plant), parse_hand(hand), [parse_fault(fault) for fault in faults], seed)
+        return ClosedLoop(CONFIG, core.stepper, core.planner if planned else None, device)
+
+    return build
+
+
+@pytest.fixture(scope="module")
+def armed_once(make: Maker) -> ClosedLoop:
+    loop = make()
+    loop.arm()
+    return loop
+
+
+@pytest.fixture
+def armed(armed_once: ClosedLoop) -> ClosedLoop:
+    """A copy of one loop that is armed: homing is the same every time."""
+    return copy.deepcopy(armed_once)
+
+
+def gap_plan(gap_mm: float) -> Plan:
+    """A plan for a gap instead of a force."""
+    return Plan(1, 0.0, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
+
+
+def pulse_N(time_s: float) -> float:
+    """A synthetic pulse of 1.2 Hz between 1.4 and 1.7 N, steep to rise and slow to fall, behind a ramp and a hold."""
+    if time_s < LEAD_IN_S:
+        return min(0.6 + 2.0 * time_s, 1.4)
+    phase = 2.0 * math.pi * 1.2 * (time_s - LEAD_IN_S)
+    return 1.4 + 0.15 * (1.0 - math.cos(phase + 0.4 * math.sin(phase)))
+
+
+def render(loop: ClosedLoop, force_N: Callable[[float], float], duration_s: float, rate_hz: int = 250) -> list[Sample]:
+    """The ticks while a publisher sends this force."""
+    times = np.arange(round(duration_s * rate_hz)) / rate_hz
+    forces = np.array([force_N(time) for time in times])
+    return list(loop.run(duration_s, stream(times + loop.now_s, forces)))
+
+
+def rms_N(samples: list[Sample], force_N: Callable[[float], float], from_s: float) -> float:
+    """Error of the true force against the force asked, from `from_s` after the first tick; nothing is removed."""
+    start_s = samples[0].time_s
+    errors = [
+        sample.truth.force_N - force_N(sample.time_s - start_s)
+        for sample in samples
+        if sample.time_s - start_s >= from_s
+    ]
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def hold_gap(loop: ClosedLoop, gap_mm: float, duration_s: float) -> list[Sample]:
+    """The ticks while a gap is asked for."""
+    return [loop.tick(plan=gap_plan(gap_mm)) for _ in range(round(duration_s * 1e3))]
+
+
+def faults_of(samples: list[Sample]) -> tuple[Fault, ...]:
+    return samples[-1].state.safety.faults
+
+
+# -- rendering -----------------------------------------------------------------------------------------------------
+
+
+def test_a_pulse_is_rendered(armed: ClosedLoop) -> None:
+    samples = render(armed, pulse_N, LEAD_IN_S + 2.5)
+    assert faults_of(samples) == ()
+    assert rms_N(samples, pulse_N, LEAD_IN_S) <= 0.03
+    assert samples[-1].trim == pytest.approx(1.0, abs=0.15)
+    # what is said of it: once it has arrived, nothing holds it back
+    assert not any(sample.plan.limits for sample in samples[-1_000:])
+
+
+@pytest.mark.parametrize("plant", ["sample_2", "sample_3"])
+def test_other_devices_of_the_kind_render_it_too(make: Maker, plant: str) -> None:
+    """The model was learned on sample 1; the trim makes up for what differs, given a second or two."""
+    loop = make(plant)
+    loop.arm()
+    samples = render(loop, pulse_N, LEAD_IN_S + 2.5)
+    assert faults_of(samples) == ()
+    assert rms_N(samples, pulse_N, LEAD_IN_S + 1.5) <= 0.05
+
+
+def test_a_staircase_rises_at_every_step(armed: ClosedLoop, core: Core) -> None:
+    """The coronary scene: from the least force to 2 N, a tenth of a newton apart."""
+    least = core.planner.portrait.least_N
+    steps = [least, *np.arange(math.ceil(10.0 * least) / 10.0, 2.05, 0.1)]
+    rendered, gaps = [], []
+    for force in steps:
+        samples = render(armed, lambda time_s, force=force: float(force), 0.4, rate_hz=100)  # type: ignore[misc]
+        assert faults_of(samples) == ()
+        rendered.append(float(np.mean([sample.truth.force_N for sample in samples[-100:]])))
+        gaps.append(samples[-1].truth.gap_mm)
+    assert all(before < after for before, after in pairwise(rendered))
+    assert all(before > after for before, after in pairwise(gaps))
+    assert rendered == pytest.approx(steps, abs=0.06)
+
+
+def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(make: Maker) -> None:
+    """A constant force: the friction level that waits for the hand stays what was asked while the hand rests."""
+    loop = make(hand="reversing")
+    loop.arm()
+    samples = render(loop, lambda time_s: 1.0, 4.0, rate_hz=100)[1_500:]
+    assert min(abs(sample.truth.handle_mm_s) for sample in samples) < 0.1
+    assert all(sample.truth.kinetic_N == pytest.approx(1.0, abs=0.08) for sample in samples)
+
+
+def test_without_a_publisher_the_gap_stays_open(armed: ClosedLoop) -> None:
+    samples = list(armed.run(0.5))
+    assert all(sample.plan.limits[0] is Limit.NO_SETPOINT for sample in samples)
+    assert min(sample.truth.gap_mm for sample in samples) > OPEN_MM - 1.0
+
+
+def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Core) -> None:
+    render(armed, lambda time_s: 1.4, 1.0)
+    at_s = armed.now_s
+    silent = stream(np.array([at_s]), np.array([1.4]))
+    samples = list(armed.run(1.2, silent))
+    stale = [sample for sample in samples if Limit.STALE in sample.plan.limits]
+    assert stale[0].time_s - at_s == pytest.approx(0.1, abs=0.01)
+    # 2 N/s down to the least force, and no faster
+    governed = [sample.plan.governed_N for sample in stale]
+    assert max(before - after for before, after in pairwise(governed)) <= 2.0 * 0.0061
+    assert governed[-1] == core.planner.portrait.least_N
+    assert samples[-1].truth.gap_mm > OPEN_MM - 3.0
+    assert samples[-1].truth.force_N == pytest.approx(core.planner.portrait.least_N, abs=0.05)
+
+
+# -- position ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("direction", [-1.0, 1.0], ids=["closing", "opening"])
+@pytest.mark.parametrize("start_mm", [85.0, 60.0])
+def test_a_millimetre_of_gap(make: Maker, direction: float, start_mm: float) -> None:
+    loop = make(planned=False)
+    loop.arm(gap_plan(OPEN_MM))
+    hold_gap(loop, start_mm, 1.8)
+    from_mm = loop.device.truth.gap_mm
+    assert from_mm == pytest.approx(start_mm, abs=0.02)
+    samples = hold_gap(loop, start_mm + direction, 0.5)
+    travelled = np.array([direction * (sample.truth.gap_mm - from_mm) for sample in samples])
+    reference = [direction * (sample.state.reference.gap_mm - start_mm) for sample in samples if sample.state.reference]
+    rise_s = (int(np.argmax(travelled >= 0.9)) - int(np.argmax(travelled >= 0.1))) * 1e-3
+    assert 0.0 < rise_s <= 0.06
+    assert travelled.max() <= 1.05
+    assert len(reference) == len(samples)
+    assert max(reference) <= 1.001
+    assert travelled[-1] == pytest.approx(1.0, abs=0.02)
+    assert max(abs(sample.truth.left_mm - sample.truth.right_mm) for sample in samples) < 0.2
+    assert faults_of(samples) == ()
+
+
+# -- commands ------------------------------------------------------------------------------------------------------
+
+
+def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None:
+    render(armed, lambda time_s: 1.2, 1.2)
+    armed.command("pause")
+    held_mm = armed.device.truth.gap_mm
+    paused = render(armed, lambda time_s: 1.8, 0.4)
+    assert all(sample.truth.gap_mm == pytest.approx(held_mm, abs=0.3) for sample in paused)
+    armed.command("resume")
+    resumed = render(armed, lambda time_s: 1.8, 0.8)
+    assert resumed[-1].truth.force_N == pytest.approx(1.8, abs=0.06)
+    armed.command("disable")
+    opened = list(armed.run(2.2))
+    assert opened[-1].truth.gap_mm == pytest.approx(OPEN_MM, abs=0.3)
+    assert faults_of(opened) == ()
+    assert all(sample.output.mode is DriveMode.OFF for sample in opened)
+    # disabled is not a fault: it can be armed again without homing
+    armed.command("enable")
+    again = render(armed, lambda time_s: 1.2, 1.2)
+    assert again[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
+
+
+def test_stop_opens_and_has_to_be_cleared(armed: ClosedLoop) -> None:
+    render(armed, lambda time_s: 1.2, 0.8)
+    armed.command("stop")
+    samples = list(armed.run(2.2))
+    assert faults_of(samples) == (Fault.STOPPED,)
+    assert samples[-1].truth.gap_mm == pytest.approx(OPEN_MM, abs=0.3)
+    with pytest.raises(RefusedError):
+        armed.command("enable")
+    armed.command("clear-fault")
+    armed.command("enable")
+    assert render(armed, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
+
+
+def test_enabling_before_homing_is_refused(make: Maker) -> None:
+    loop = make()
+    for _ in range(200):
+        loop.tick()
+    with pytest.raises(RefusedError) as caught:
+        loop.command("enable")
+    assert caught.value.code == "not_homed"
+
+
+# -- faults --------------------------------------------------------------------------------------------------------
+
+
+def struck(make: Maker, spec: str, seconds: float = 2.6) -> tuple[ClosedLoop, list[Sample]]:
+    """The ticks from a fault on that is injected into a running pulse, and the loop after them."""
+    loop = make(faults=[f"{spec}@{STRIKE_S:g}"])
+    loop.arm()
+    before = render(loop, pulse_N, STRIKE_S - loop.now_s, rate_hz=100)
+    assert faults_of(before) == ()
+    assert before[-1].truth.force_N == pytest.approx(pulse_N(before[-1].time_s - before[0].time_s), abs=0.1)
+    phase_s = before[-1].time_s - before[0].time_s
+    samples = render(loop, lambda time_s: pulse_N(phase_s + time_s), seconds, rate_hz=100)
+    assert (OperatingState.FAULT is samples[-1].state.safety.operating_state) == bool(faults_of(samples))
+    return loop, samples
+
+
+def first_fault(samples: list[Sample]) -> tuple[Fault, float]:
+    """The first fault and how long after the strike it was latched."""
+    for sample in samples:
+        if sample.state.safety.faults:
+            return sample.state.safety.faults[0], sample.time_s - STRIKE_S
+    pytest.fail("no fault")
+
+
+def opened_after_s(samples: list[Sample]) -> float:
+    """When the gap had come within 2 mm of its open end for good, after the strike."""
+    closed = [sample.time_s for sample in samples if sample.truth.gap_mm < OPEN_MM - 2.0]
+    assert samples[-1].truth.gap_mm > OPEN_MM - 2.0, f"gap of {samples[-1].truth.gap_mm} mm"
+    return max(closed) - STRIKE_S
+
+
+@pytest.mark.parametrize(
+    ("spec", "fault", "within_s"),
+    [
+        ("encoder_stuck_left", Fault.NO_MOTION, 0.3),
+        ("reset", Fault.DEVICE_NOT_RUNNING, 0.05),
+    ],
+)
+def test_a_fault_is_named_and_the_gap_opens(make: Maker, spec: str, fault: Fault, within_s: float) -> None:
+    _, samples = struck(make, spec)
+    found, after_s = first_fault(samples)
+    assert found is fault
+    assert after_s <= within_s
+    assert opened_after_s(samples) < 2.5
+    # what was said once is never taken back
+    assert samples[-1].output.mode is DriveMode.OFF
+    assert not any(sample.output.mode is DriveMode.RUN for sample in samples if sample.state.safety.faults)
+
+
+def test_a_device_that_hears_nothing_opens_by_itself(make: Maker) -> None:
+    """Nothing that the host sends arrives: the opening is the device's own, 50 ms after the last Drive."""
+    _, samples = struck(make, "commands_vanish")
+    found, after_s = first_fault(samples)
+    assert found is Fault.MEASUREMENT_STALE
+    assert after_s <= 0.06
+    assert set(faults_of(samples)) == {Fault.MEASUREMENT_STALE, Fault.DEVICE_COMMAND_TIMEOUT}
+    still_mm = samples[0].truth.gap_mm
+    moving_s = next(sample.time_s for sample in samples if sample.truth.gap_mm > still_mm + 1.0)
+    assert moving_s - STRIKE_S < 0.05 + 0.15
+    assert opened_after_s(samples) < 0.05 + 0.15 + (OPEN_MM - still_mm) / 15.0
+
+
+def test_without_supply_the_gap_is_held_by_friction_and_both_facts_are_named(make: Maker) -> None:
+    loop, samples = struck(make, "supply_loss", seconds=6.5)
+    found, after_s = first_fault(samples)
+    assert found is Fault.DEVICE_SUPPLY
+    assert after_s < 0.05
+    # where the pulse was closing the gap, the carriages coast on: the device notices that too
+    assert set(faults_of(samples)) - {Fault.DEVICE_UNCOMMANDED_MOTION} == {
+        Fault.DEVICE_SUPPLY,
+        Fault.DEVICE_RETRACT_FAILED,
+    }
+    held_mm = samples[1_000].truth.gap_mm
+    assert held_mm > samples[0].truth.gap_mm - 3.0
+    assert all(sample.truth.gap_mm == pytest.approx(held_mm, abs=0.02) for sample in samples[1_000:])
+    assert loop.measurement is not None
+    assert loop.measurement.mode is DeviceMode.LATCHED
+
+
+@pytest.mark.parametrize("spec", ["drag_left=+50%", "worn_gearbox"])
+def test_wear_is_made_up_for(make: Maker, spec: str) -> None:
+    """Half as much drag again on one side, or a quarter of the friction: synchronised, and still on the pulse."""
+    loop = make(faults=[f"{spec}@2.5"])
+    loop.arm()
+    samples = render(loop, pulse_N, LEAD_IN_S + 1.7)
+    assert faults_of(samples) == ()
+    assert rms_N(samples, pulse_N, LEAD_IN_S) <= 0.03
+    assert max(abs(sample.truth.left_mm - sample.truth.right_mm) for sample in samples) < CONFIG.limits.skew_fault_mm
+
+
+def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(make: Maker) -> None:
+    """Killed with the gap closed: the device opens by itself, and nothing shuts on the way."""
+    loop = make(faults=["worn_gearbox@2.5"])
+    loop.arm()
+    render(loop, lambda time_s: 1.6, 1.5)
+    closed_mm = loop.device.truth.gap_mm
+    for _ in range(2_500):
+        loop.skip()
+        assert loop.device.truth.gap_mm > closed_mm - 1.0
+    assert loop.device.truth.gap_mm > OPEN_MM - 2.0
+
+
+def test_a_daemon_that_pauses_for_longer_than_the_timeout_is_not_still_armed(armed: ClosedLoop) -> None:
+    render(armed, lambda time_s: 1.4, 1.0)
+    for _ in range(120):
+        armed.skip()
+    samples = render(armed, lambda time_s: 1.4, 2.6)
+    assert Fault.DEVICE_COMMAND_TIMEOUT in faults_of(samples) or Fault.LINK_LOST in faults_of(samples)
+    assert samples[-1].truth.gap_mm > OPEN_MM - 2.0
+
+
+def test_a_lost_link_is_a_fault_that_does_not_go_by_itself(armed: ClosedLoop) -> None:
+    """The device falls silent for the host: its bytes are lost for a quarter of a second."""
+    render(armed, lambda time_s: 1.4, 0.8)
+    transmit = armed.device.transmit
+    armed.device.transmit = lambda now_s: transmit(now_s)[:0]  # type: ignore[method-assign]
+    silent = render(armed, lambda time_s: 1.4, 0.25)
+    armed.device.transmit = transmit  # type: ignore[method-assign]
+    back = render(armed, lambda time_s: 1.4, 2.6)
+    assert faults_of(silent)[0] is Fault.MEASUREMENT_STALE
+    assert Fault.LINK_LOST in faults_of(silent) or silent[-1].state.safety.operating_state is OperatingState.FAULT
+    assert back[-1].state.safety.operating_state is OperatingState.FAULT
+    assert back[-1].truth.gap_mm > OPEN_MM - 2.0
+
+
+# -- repetition ----------------------------------------------------------------------------------------------------
+
+
+def trace(loop: ClosedLoop, seconds: float) -> list[tuple[object, ...]]:
+    return [
+        (sample.state, sample.output, sample.plan, sample.truth)
+        for sample in render(loop, pulse_N, seconds, rate_hz=100)
+    ]
+
+
+def test_a_run_repeats_itself_and_another_seed_does_not(make: Maker) -> None:
+    runs = []
+    for seed in (1, 1, 2):
+        loop = make(seed=seed)
+        loop.arm()
+        runs.append(trace(loop, 0.8))
+    assert runs[0] == runs[1]
+    assert runs[0] != runs[2]
+
+
+def test_a_loop_without_a_planner_wants_plans(make: Maker) -> None:
+    with pytest.raises(ValueError, match="allowed is a plan"):
+        make(planned=False).tick()

@@ -1,0 +1,252 @@
+"""The configuration: defaults that hold together, and refusals that say which key, which value, and what is allowed."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tormagd.config import LEAST_INFERENCE_HZ, Config, ConfigError, load_config
+from tormagd.daemon.main import main
+
+Write = Callable[[str], Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    """Writes a configuration file."""
+
+    def write_toml(text: str) -> Path:
+        path = tmp_path / "tormagd.toml"
+        path.write_text(text)
+        return path
+
+    return write_toml
+
+
+def refusal(path: Path) -> str:
+    """What the refused file is told."""
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    text = str(caught.value)
+    assert text.startswith(str(path))
+    return text
+
+
+def test_no_file_and_an_empty_file_are_the_defaults(write) -> None:
+    assert load_config(None) == load_config(write("")) == Config()
+
+
+def test_what_a_file_says_is_taken_and_the_rest_stays(write) -> None:
+    config = load_config(write('scene = "pulse"\n[device]\nport = "/dev/ttyACM3"\n[realtime]\ncpus = [1, 3]\n'))
+    assert (config.scene, config.device.port, config.realtime.cpus) == ("pulse", "/dev/ttyACM3", (1, 3))
+    assert config.rates == Config().rates
+    assert config.device.baud == Config().device.baud
+
+
+def test_a_resolved_configuration_is_a_configuration(write) -> None:
+    tables = msgspec.to_builtins(load_config(write("[motor]\nsupply_V = 24.0\n")))
+    assert msgspec.convert(tables, Config).motor.supply_V == 24.0
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "value", "allowed"),
+    [
+        ("sene = 'pulse'", "$", "sene", "unknown field"),
+        ("[device]\nprot = '/dev/null'", "$.device", "prot", "unknown field"),
+        ("[rates]\ncontrol_Hz = 1000", "$.rates", "control_Hz", "unknown field"),
+        ("scene = 3", "$.scene", "3", "`str`"),
+        ("[device]\nbaud = '1000000'", "$.device.baud", "'1000000'", "`int`"),
+        ("[device]\nbaud = 9600", "$.device.baud", "9600", ">= 115200"),
+        ("[rates]\ncontrol_hz = 1000.5", "$.rates.control_hz", "1000.5", "`int`"),
+        ("[rates]\ninference_hz = 82", "$.rates.inference_hz", "82", ">= 83"),
+        ("[rates]\ncontrol_hz = 50", "$.rates.control_hz", "50", ">= 83"),
+        ("[motor]\nsupply_V = true", "$.motor.supply_V", "True", "`float`"),
+        ("[motor]\ninductance_mH = 0.0", "$.motor.inductance_mH", "0.0", ">= 0.01"),
+        ("[realtime]\nlock_memory = 1", "$.realtime.lock_memory", "1", "`bool`"),
+        ("[realtime]\ncpus = [0, -1]", "$.realtime.cpus", "[0, -1]", ">= 0"),
+        ("[position]\nduty_limit = 1.01", "$.position.duty_limit", "1.01", "<= 1.0"),
+        ("[position]\nproportional_per_mm = -6.0", "$.position.proportional_per_mm", "-6.0", "> 0.0"),
+        ("rates = 1000", "$.rates", "1000", "`object`"),
+        ("[trim]\nmost = 0.9", "$.trim.most", "0.9", ">= 1.0"),
+    ],
+)
+def test_a_refusal_names_key_value_and_what_is_allowed(write, text: str, key: str, value: str, allowed: str) -> None:
+    refused = refusal(write(text))
+    assert key in refused or key == "$"
+    assert value in refused
+    assert allowed in refused
+
+
+@pytest.mark.parametrize("number", ["nan", "-nan", "inf", "-inf", "+inf"])
+@pytest.mark.parametrize("table", ["motor", "position"])
+def test_numbers_that_are_not_finite_are_refused(write, number: str, table: str) -> None:
+    key = {"motor": "supply_V", "position": "lead_ms"}[table]
+    refused = refusal(write(f"[{table}]\n{key} = {number}"))
+    assert f"{table}.{key}" in refused
+    assert number.strip("+-") in refused
+    assert "finite" in refused
+
+
+def test_a_nan_hides_in_no_list_and_no_unknown_table(write) -> None:
+    assert "finite" in refusal(write("[realtime]\ncpus = [0, nan]"))
+    assert "finite" in refusal(write("[a.b.c]\nd = [[{e = inf}]]"))
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "value", "other"),
+    [
+        ("[rates]\ncontrol_hz = 200\ninference_hz = 250", "rates.inference_hz", "250", "rates.control_hz = 200"),
+        ("[rates]\ntelemetry_hz = 60", "rates.telemetry_hz", "60", "rates.control_hz = 1000"),
+        (
+            "[device]\ncommand_timeout_ms = 500.0",
+            "device.command_timeout_ms",
+            "500.0",
+            "realtime.watchdog_ms = 500",
+        ),
+        (
+            "[realtime]\nwatchdog_ms = 100.0\n[device]\ncommand_timeout_ms = 200.0",
+            "device.command_timeout_ms",
+            "200.0",
+            "realtime.watchdog_ms = 100",
+        ),
+        (
+            "[device]\nmeasurement_timeout_ms = 50.1",
+            "device.measurement_timeout_ms",
+            "50.1",
+            "device.command_timeout_ms = 50",
+        ),
+        ("[limits]\nskew_warning_mm = 1.5", "limits.skew_warning_mm", "1.5", "limits.skew_fault_mm = 1"),
+    ],
+)
+def test_orders_that_cannot_be_are_refused(write, text: str, key: str, value: str, other: str) -> None:
+    refused = refusal(write(text))
+    assert f"{key} = {value}" in refused
+    assert other in refused
+
+
+@pytest.mark.parametrize("name", ["setpoint", "telemetry", "control", "recording"])
+@pytest.mark.parametrize(
+    "address",
+    [
+        "tcp://*:5555",
+        "tcp://0.0.0.0:5555",
+        "tcp://192.168.1.4:5555",
+        "tcp://eth0:5555",
+        "tcp://localhost.example.org:1",
+        "tcp://[::]:5555",
+        "udp://127.0.0.1:5555",
+        "pgm://127.0.0.1;239.0.0.1:5555",
+        "127.0.0.1:5555",
+        "",
+        "tcp://127.example.org:5555",
+        "tcp://127.0.0.1.example.org:5555",
+    ],
+)
+def test_only_this_machine_is_open(write, name: str, address: str) -> None:
+    refused = refusal(write(f'[endpoints]\n{name} = "{address}"'))
+    assert f"endpoints.{name} = {address!r}" in refused
+    assert "CURVE" in refused
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "ipc:///tmp/a",
+        "ipc://@name",
+        "tcp://127.0.0.1:5555",
+        "tcp://127.8.0.1:1",
+        "tcp://localhost:5555",
+        "tcp://[::1]:5555",
+    ],
+)
+def test_loopback_is_open(write, address: str) -> None:
+    assert load_config(write(f'[endpoints]\nsetpoint = "{address}"')).endpoints.setpoint == address
+
+
+def test_two_endpoints_cannot_share_an_address(write) -> None:
+    refused = refusal(write('[endpoints]\nsetpoint = "ipc:///tmp/a"\ncontrol = "ipc:///tmp/a"'))
+    assert "endpoints.control = 'ipc:///tmp/a'" in refused
+    assert "endpoints.setpoint" in refused
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, write) -> None:
+    assert "No such file" in refusal(tmp_path / "absent.toml")
+    assert "directory" in refusal(tmp_path)
+    assert "line 2" in refusal(write("scene = 'pulse'\nscene == 3"))
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"scene = '\xff'")
+    assert "utf-8" in refusal(binary)
+
+
+SCALARS = st.one_of(st.integers(), st.floats(), st.booleans(), st.text(max_size=5))
+KEYS = st.sampled_from([*msgspec.to_builtins(Config()), "unknown"])
+INNER = st.sampled_from(
+    sorted({key for table in msgspec.to_builtins(Config()).values() if isinstance(table, dict) for key in table})
+)
+
+
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(tables=st.dictionaries(KEYS, st.one_of(SCALARS, st.dictionaries(INNER, SCALARS, max_size=3)), max_size=3))
+def test_whatever_stands_in_the_file_is_taken_or_refused_as_a_configuration(write, tables: dict[str, object]) -> None:
+    lines = [f"{key} = {_toml(value)}" for key, value in tables.items()]
+    try:
+        config = load_config(write("\n".join(lines)))
+    except ConfigError as error:
+        refused = str(error)
+    else:
+        assert config.rates.control_hz >= config.rates.inference_hz >= LEAST_INFERENCE_HZ
+        return
+    assert "tormagd.toml" in refused
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_toml(inner)}" for key, inner in value.items()) + "}"
+    return (
+        {True: "true", False: "false"}[value]
+        if isinstance(value, bool)
+        else json.dumps(value).replace("NaN", "nan").replace("Infinity", "inf")
+    )
+
+
+def test_check_prints_the_resolved_configuration(write, capsys) -> None:
+    assert main(["--config", str(write('scene = "pulse"\n')), "--check"]) == 0
+    captured = capsys.readouterr()
+    resolved = json.loads(captured.out)
+    assert msgspec.convert(resolved["config"], Config).scene == "pulse"
+    assert resolved["scene"]["name"] == "pulse"
+    assert 0.0 < resolved["derived"]["least_N"] < resolved["derived"]["most_N"]
+    assert resolved["derived"]["phase_margin_deg"] >= 30.0
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("[rates]\ninference_hz = 10", "rates.inference_hz"),
+        ('scene = "no such scene"', "no such scene"),
+        ('[device]\nbackend = "telepathy"', "telepathy"),
+        ("[position]\nproportional_per_mm = 500.0", "margin"),
+        ("[rates]\ncontrol_hz = 500", "rates.control_hz"),
+        ("not toml", "line 1"),
+    ],
+)
+def test_a_bad_configuration_ends_with_two_and_says_why_on_stderr(write, capsys, text: str, word: str) -> None:
+    assert main(["--config", str(write(text)), "--check"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("tormagd: ")
+    assert word in captured.err
+
+
+def test_version_and_usage(capsys) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.startswith("tormagd ")
+    with pytest.raises(SystemExit) as ended:
+        main(["--chekc"])
+    assert ended.value.code == 2

@@ -1,0 +1,186 @@
+"""The governor: every difference between force asked and force rendered has a reason, and none of them jumps."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tormagd.config import Limits
+from tormagd.control.governor import AHEAD_S, Governed, GovernorState, TimedSetpoint, govern
+from tormagd.control.portrait import Portrait
+from tormagd.safety.codes import Limit
+from tormagd.scenes.scene import Force
+
+PORTRAIT = Portrait(np.linspace(0.4, 2.2, 19), np.linspace(0.01, 0.1, 19))
+SCENE = Force(least_N=0.0, most_N=2.0, resolution_N=0.1, tolerance_rms_N=0.05)
+LIMITS = Limits()
+GAP_SPEED_MM_S = 38.0
+VALID_S = 0.1
+
+
+def decide(
+    state: GovernorState,
+    now_s: float,
+    setpoint: TimedSetpoint | None,
+    *,
+    scene: Force = SCENE,
+    lead_s: float = 0.0,
+    portrait: Portrait = PORTRAIT,
+) -> tuple[GovernorState, Governed]:
+    """One decision on the device of these tests."""
+    return govern(
+        state,
+        now_s,
+        setpoint,
+        portrait=portrait,
+        scene=scene,
+        limits=LIMITS,
+        gap_speed_mm_s=GAP_SPEED_MM_S,
+        lead_s=lead_s,
+    )
+
+
+def stream_of(forces: list[float], period_s: float = 0.01, **keywords: Any) -> tuple[GovernorState, Governed]:
+    """The last decision on setpoints that came one per period."""
+    state = GovernorState(0.0, 0.4)
+    for number, force in enumerate(forces, 1):
+        now_s = number * period_s
+        state, governed = decide(state, now_s, TimedSetpoint(force, now_s, VALID_S), **keywords)
+    return state, governed
+
+
+@pytest.mark.parametrize(
+    ("asked", "scene_range", "rendered", "limits"),
+    [
+        (1.0, (0.0, 2.0), 1.0, ()),
+        (0.4, (0.0, 2.0), 0.4, ()),
+        (2.0, (0.0, 2.0), 2.0, ()),
+        (0.1, (0.0, 2.0), 0.4, (Limit.F_MIN,)),
+        (0.1, (0.5, 2.0), 0.5, (Limit.RANGE,)),
+        (2.5, (0.0, 2.0), 2.0, (Limit.RANGE,)),
+        (2.5, (0.0, 3.0), 2.2, (Limit.F_MAX,)),
+        (3.5, (0.0, 3.0), 2.2, (Limit.RANGE, Limit.F_MAX)),
+        (0.1, (0.2, 3.0), 0.4, (Limit.RANGE, Limit.F_MIN)),
+    ],
+)
+def test_range_and_reach(
+    asked: float, scene_range: tuple[float, float], rendered: float, limits: tuple[Limit, ...]
+) -> None:
+    scene = Force(least_N=scene_range[0], most_N=scene_range[1], resolution_N=0.1, tolerance_rms_N=0.05)
+    _, governed = decide(GovernorState(0.0, 0.4), 1.0, TimedSetpoint(asked, 1.0, VALID_S), scene=scene)
+    assert governed.force_N == pytest.approx(rendered)
+    assert governed.limits == limits
+
+
+def test_without_a_setpoint_the_least_force_is_rendered() -> None:
+    _, governed = decide(GovernorState(0.0, 0.4), 1.0, None)
+    assert governed == Governed(0.4, 0.0, 0.4, None, (Limit.NO_SETPOINT,))
+
+
+def test_a_stale_setpoint_decays_along_the_ramp_and_not_below_the_least() -> None:
+    setpoint = TimedSetpoint(1.6, 1.0, VALID_S)
+    state, _ = decide(GovernorState(0.99, 1.6), 1.0, setpoint)
+    state, valid = decide(state, 1.1 - 1e-9, setpoint)
+    assert valid.limits == ()
+    last_N = 1.6
+    for tick in range(1, 1_000):
+        now_s = 1.1 + tick * 1e-3
+        state, governed = decide(state, now_s, setpoint)
+        assert governed.limits == (Limit.STALE,)
+        assert governed.age_s == pytest.approx(now_s - 1.0)
+        assert governed.slope_N_s == 0.0
+        assert governed.ahead_N == governed.force_N
+        assert last_N - governed.force_N <= LIMITS.stale_ramp_N_s * 1e-3 + 1e-8
+        assert governed.force_N == pytest.approx(max(0.4, 1.6 - LIMITS.stale_ramp_N_s * tick * 1e-3))
+        last_N = governed.force_N
+    assert last_N == 0.4
+
+
+def test_a_publisher_that_comes_back_is_followed_again_without_a_slope_from_before() -> None:
+    state, _ = stream_of([1.0, 1.1, 1.2])
+    state, _ = decide(state, 0.5, TimedSetpoint(1.2, 0.03, VALID_S))
+    _, governed = decide(state, 0.6, TimedSetpoint(1.5, 0.6, VALID_S))
+    assert governed.limits == ()
+    assert (governed.force_N, governed.slope_N_s) == (1.5, 0.0)
+
+
+def test_a_slope_is_learned_and_carried_ahead() -> None:
+    state, governed = stream_of([1.0 + 0.01 * k for k in range(40)], period_s=0.01)
+    assert governed.slope_N_s == pytest.approx(1.0, rel=1e-3)
+    last = TimedSetpoint(1.39, 0.4, VALID_S)
+    for waited_s, ahead_N in ((0.0, 1.39), (0.01, 1.40), (AHEAD_S, 1.44), (0.09, 1.44)):
+        _, later = decide(state, 0.4 + waited_s, last)
+        assert later.ahead_N == pytest.approx(ahead_N, abs=1e-3)
+        assert later.force_N == pytest.approx(1.39)
+    _, led = decide(state, 0.4, last, lead_s=0.02)
+    assert led.ahead_N == pytest.approx(1.41, abs=1e-3)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    forces=st.lists(st.floats(0.0, 3.0), min_size=1, max_size=40),
+    period_s=st.floats(1e-6, 0.2),
+    lead_s=st.floats(0.0, 0.05),
+)
+def test_the_slope_is_one_that_the_gap_speed_can_render(forces: list[float], period_s: float, lead_s: float) -> None:
+    _, governed = stream_of(forces, period_s, lead_s=lead_s)
+    steepest = GAP_SPEED_MM_S * float(PORTRAIT.slope_N_mm.max())
+    assert abs(governed.slope_N_s) <= steepest + 1e-9
+    assert PORTRAIT.least_N <= governed.ahead_N <= PORTRAIT.most_N
+    assert PORTRAIT.least_N <= governed.force_N <= SCENE.most_N
+
+
+def test_a_jump_at_a_flat_force_gives_the_slope_renderable_there() -> None:
+    flat = Portrait(np.array([0.4, 1.0, 2.2]), np.array([0.001, 0.001, 0.1]))
+    _, governed = stream_of([1.0, 0.4, 1.0, 0.4, 0.5], period_s=0.01, portrait=flat)
+    assert abs(governed.slope_N_s) <= GAP_SPEED_MM_S * 0.001 + 1e-12
+
+
+def test_setpoints_with_equal_stamps_have_no_slope_between_them() -> None:
+    state, before = stream_of([1.0, 1.02, 1.04])
+    state, governed = decide(state, 0.031, TimedSetpoint(1.5, 0.03, VALID_S))
+    assert governed.force_N == 1.5
+    assert governed.slope_N_s == before.slope_N_s
+
+
+def test_a_stamp_ahead_of_the_clock_is_of_no_age() -> None:
+    state, _ = stream_of([1.0 + 0.01 * k for k in range(40)])
+    _, governed = decide(state, 0.41, TimedSetpoint(1.4, 0.45, VALID_S))
+    assert governed.age_s == pytest.approx(-0.04)
+    assert governed.ahead_N == pytest.approx(1.4)
+    assert governed.limits == ()
+
+
+def test_a_clock_that_stands_still_or_goes_back_lets_nothing_jump() -> None:
+    for now_s in (1.0, 0.5, -10.0):
+        _, governed = decide(GovernorState(1.0, 1.5), now_s, None)
+        assert governed.force_N == 1.5
+
+
+events = st.tuples(
+    st.none() | st.floats(0.0, 1_000.0),
+    st.floats(-2.0, 2.0) | st.just(0.0) | st.just(1e6),
+    st.floats(1e-3, 60.0),
+    st.floats(0.0, 0.5) | st.just(0.0) | st.just(1e-9) | st.just(1e5),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(history=st.lists(events, min_size=1, max_size=30))
+def test_nan_never_travels(history: list[tuple[float | None, float, float, float]]) -> None:
+    """First setpoints, equal stamps, huge gaps, stamps ahead and behind, in any order."""
+    state, now_s = GovernorState(0.0, PORTRAIT.least_N), 0.0
+    for force_N, age_s, valid_s, elapsed_s in history:
+        now_s += elapsed_s
+        setpoint = None if force_N is None else TimedSetpoint(force_N, now_s - age_s, valid_s)
+        state, governed = decide(state, now_s, setpoint)
+        assert all(math.isfinite(value) for value in (governed.force_N, governed.slope_N_s, governed.ahead_N))
+        assert PORTRAIT.least_N <= governed.force_N <= PORTRAIT.most_N
+        assert PORTRAIT.least_N <= governed.ahead_N <= PORTRAIT.most_N
+        assert math.isfinite(state.governed_N)
+        is_stale = setpoint is not None and now_s - setpoint.stamp_s > valid_s
+        assert (Limit.STALE in governed.limits) == is_stale
+        assert (Limit.NO_SETPOINT in governed.limits) == (setpoint is None)

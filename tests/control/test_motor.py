@@ -1,0 +1,182 @@
+"""H(z) of motor and screw, and the stability margins, against scipy and against a bisection of their own."""
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+from scipy.signal import StateSpace, cont2discrete, dlsim, lfilter
+
+from tormagd.config import Config, ConfigError, Motor, Position
+from tormagd.control.core import build_core
+from tormagd.control.motor import full_speed_mm_s, margins, mechanical_time_s, zero_order_hold
+
+PERIOD_S = 1e-3
+motors = st.builds(
+    Motor,
+    supply_V=st.floats(6.0, 24.0),
+    resistance_ohm=st.floats(0.5, 20.0),
+    inductance_mH=st.floats(0.1, 10.0),
+    back_emf_V_s=st.floats(0.003, 0.05),
+    inertia_kg_m2=st.floats(1e-7, 1e-5),
+    gear_ratio=st.floats(10.0, 200.0),
+    screw_lead_mm=st.floats(1.0, 10.0),
+)
+periods = st.floats(2.5e-4, 0.012)
+gains = st.builds(
+    Position,
+    proportional_per_mm=st.floats(0.5, 8.0),
+    integral_time_s=st.floats(0.05, 1.0),
+    derivative_time_s=st.floats(0.0, 0.03),
+    derivative_filter_s=st.floats(1e-3, 1e-2),
+)
+
+
+def continuous(motor: Motor) -> StateSpace:
+    """The motor's differential equations, written down a second time: current A, speed rad/s, position mm."""
+    inductance_H = motor.inductance_mH * 1e-3
+    a = [
+        [-motor.resistance_ohm / inductance_H, -motor.back_emf_V_s / inductance_H, 0.0],
+        [motor.back_emf_V_s / motor.inertia_kg_m2, 0.0, 0.0],
+        [0.0, motor.screw_lead_mm / (motor.gear_ratio * math.tau), 0.0],
+    ]
+    return StateSpace(a, [[motor.supply_V / inductance_H], [0.0], [0.0]], [[0.0, 0.0, 1.0]], [[0.0]])
+
+
+@settings(max_examples=60, deadline=None)
+@given(motor=motors, period_s=periods)
+def test_the_step_response_is_that_of_the_held_continuous_motor(motor: Motor, period_s: float) -> None:
+    ours = zero_order_hold(motor, period_s)
+    system = continuous(motor)
+    exact = cont2discrete((system.A, system.B, system.C, system.D), period_s, method="zoh")
+    duty = np.r_[np.ones(20), -0.5 * np.ones(20)]
+    _, expected, _ = dlsim(exact, duty)
+    response = lfilter(ours.numerator, ours.denominator, duty)
+    assert ours.period_s == period_s
+    np.testing.assert_allclose(response, expected.ravel(), rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+
+
+@settings(max_examples=60, deadline=None)
+@given(motor=motors, period_s=periods)
+def test_the_poles_are_the_exponentials_of_the_motors_own(motor: Motor, period_s: float) -> None:
+    ours = np.sort_complex(np.roots(zero_order_hold(motor, period_s).denominator))
+    poles = np.sort_complex(np.exp(np.linalg.eigvals(continuous(motor).A) * period_s))
+    np.testing.assert_allclose(ours, poles, atol=1e-5)
+    assert np.min(np.abs(ours - 1.0)) < 1e-9  # position integrates speed
+    assert np.sort(np.abs(ours))[1] < 1.0
+
+
+@settings(max_examples=40, deadline=None)
+@given(motor=motors)
+def test_full_speed_is_what_full_duty_comes_to(motor: Motor) -> None:
+    slowest_s = max(mechanical_time_s(motor), 2e-3 * motor.inductance_mH / motor.resistance_ohm)
+    plant = zero_order_hold(motor, 0.05 * slowest_s)
+    position = lfilter(plant.numerator, plant.denominator, np.ones(600))
+    assert (position[-1] - position[-2]) / plant.period_s == pytest.approx(full_speed_mm_s(motor), rel=1e-4)
+
+
+@pytest.mark.parametrize("resistance_ohm", [1.0, 2.2, 8.0])
+def test_the_mechanical_time_constant_is_where_the_speed_has_come_to_63_percent(resistance_ohm: float) -> None:
+    motor = Motor(resistance_ohm=resistance_ohm, inductance_mH=0.01)
+    plant = zero_order_hold(motor, mechanical_time_s(motor) / 50.0)
+    position = lfilter(plant.numerator, plant.denominator, np.ones(60))
+    speed = (position[51] - position[49]) / (2.0 * plant.period_s)
+    assert speed / full_speed_mm_s(motor) == pytest.approx(1.0 - math.exp(-1.0), abs=0.002)
+
+
+def open_loop(motor: Motor, position: Position, frequency_Hz: float) -> complex:
+    """The loop's response at one frequency: scipy's plant in state space, the controller's difference equations."""
+    system = continuous(motor)
+    a, b, c, _, _ = cont2discrete((system.A, system.B, system.C, system.D), PERIOD_S, method="zoh")
+    z = np.exp(2j * np.pi * frequency_Hz * PERIOD_S)
+    plant = (c @ np.linalg.solve(z * np.eye(3) - a, b))[0, 0]
+    # integral += e dt / Ti, used from the same update; speed += share ((x - x_last) / dt - speed)
+    integral = PERIOD_S / position.integral_time_s * z / (z - 1.0)
+    share = PERIOD_S / (position.derivative_filter_s + PERIOD_S)
+    speed = share * ((z - 1.0) / (z * PERIOD_S)) / (1.0 - (1.0 - share) / z)
+    controller = position.proportional_per_mm * (1.0 + integral + position.derivative_time_s * speed)
+    return complex(plant * controller / z)
+
+
+def test_margins_agree_with_an_independent_computation() -> None:
+    config = Config()
+    ours = margins(config.motor, config.position, PERIOD_S)
+
+    def gain(frequency_Hz: float) -> float:
+        return math.log(abs(open_loop(config.motor, config.position, frequency_Hz)))
+
+    def phase_past_turning(frequency_Hz: float) -> float:
+        # the imaginary part of -L changes sign where the phase passes -180 degrees
+        return (-open_loop(config.motor, config.position, frequency_Hz)).imag
+
+    crossover_Hz = brentq(gain, 3.0, 100.0)
+    phase_deg = math.degrees(np.angle(-open_loop(config.motor, config.position, crossover_Hz)))
+    turning_Hz = brentq(phase_past_turning, 20.0, 150.0)
+    assert ours.crossover_Hz == pytest.approx(crossover_Hz, rel=0.01)
+    assert ours.phase_margin_deg == pytest.approx(phase_deg, abs=0.5)
+    assert ours.gain_margin_dB == pytest.approx(-20.0 * gain(turning_Hz) / math.log(10.0), abs=0.1)
+
+
+@settings(max_examples=15, deadline=None)
+@given(motor=st.builds(Motor, resistance_ohm=st.floats(1.0, 5.0), back_emf_V_s=st.floats(0.008, 0.02)), position=gains)
+def test_gain_margin_falls_with_gain_decibel_for_decibel(motor: Motor, position: Position) -> None:
+    least = margins(motor, position, PERIOD_S)
+    doubled = msgspec.structs.replace(position, proportional_per_mm=2.0 * position.proportional_per_mm)
+    if least.gain_margin_dB > 8.0:
+        assert margins(motor, doubled, PERIOD_S).gain_margin_dB == pytest.approx(
+            least.gain_margin_dB - 20.0 * math.log10(2.0), abs=0.05
+        )
+    assert margins(motor, doubled, PERIOD_S).crossover_Hz > least.crossover_Hz
+
+
+def closed_loop_radius(motor: Motor, position: Position) -> float:
+    """Spectral radius of the closed loop, from its characteristic polynomial: above 1 it diverges."""
+    plant = zero_order_hold(motor, PERIOD_S)
+    share = PERIOD_S / (position.derivative_filter_s + PERIOD_S)
+    # controller over a common denominator z (z - 1) (z - (1 - share)), and a delay of one period
+    integral = np.poly1d([PERIOD_S / position.integral_time_s, 0.0])
+    filtered = np.poly1d([1.0, share - 1.0])
+    origin, unity = np.poly1d([1.0, 0.0]), np.poly1d([1.0, -1.0])
+    speed = share / PERIOD_S * position.derivative_time_s * unity * unity
+    numerator = position.proportional_per_mm * (unity * filtered + integral * filtered + speed)
+    denominator = unity * filtered * origin
+    characteristic = np.poly1d(plant.denominator) * denominator + np.poly1d(plant.numerator) * numerator
+    return float(np.abs(characteristic.roots).max())
+
+
+@pytest.mark.parametrize("factor", [0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 4.5, 5.0, 6.0, 10.0, 30.0])
+def test_positive_margins_are_what_makes_the_closed_loop_stable(factor: float) -> None:
+    config = Config()
+    position = msgspec.structs.replace(
+        config.position, proportional_per_mm=factor * config.position.proportional_per_mm
+    )
+    found = margins(config.motor, position, PERIOD_S)
+    is_stable = closed_loop_radius(config.motor, position) < 1.0
+    assert (found.gain_margin_dB > 0.0 and found.phase_margin_deg > 0.0) == is_stable
+
+
+def test_a_slower_loop_has_less_phase_left() -> None:
+    config = Config()
+    phases = [
+        margins(config.motor, config.position, period_s).phase_margin_deg for period_s in (5e-4, 1e-3, 2e-3, 4e-3)
+    ]
+    assert phases == sorted(phases, reverse=True)
+    assert phases[0] > phases[-1] + 5.0
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"proportional_per_mm": 60.0},
+        {"proportional_per_mm": 1_000.0},
+        {"derivative_time_s": 0.5},
+        {"derivative_time_s": 0.0, "integral_time_s": 0.005},
+    ],
+)
+def test_gains_that_would_oscillate_give_no_core(changes: dict[str, float]) -> None:
+    position = msgspec.structs.replace(Config().position, **changes)
+    with pytest.raises(ConfigError, match=r"phase margin of .* gain margin of .* allowed is at least"):
+        build_core(Config(position=position))

@@ -1,0 +1,252 @@
+"""`plan`: from setpoint to gap with the shipped model, and a trim that learns the model's error only where it can."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tormagd.config import Config
+from tormagd.control.core import Core
+from tormagd.control.estimate import MOBILISED_MM, Estimate, Handle
+from tormagd.control.governor import TimedSetpoint
+from tormagd.control.plan import MOVING_MM_S, PlanState
+from tormagd.safety.codes import Limit
+
+PERIOD_S = 0.004
+CONFIG = Config()
+
+
+def moving(gap_mm: float = 60.0, force_N: float = 1.0, **changes: object) -> Estimate:
+    """A homed device whose handle has long been moving."""
+    handle = Handle(MOBILISED_MM, 42.0, 1.0, 0.0, 100.0)
+    estimate = Estimate(1, True, 0.0, gap_mm / 2.0, gap_mm / 2.0, 0.0, 0.0, force_N, handle, 100.0)
+    return estimate._replace(**changes)  # type: ignore[arg-type]
+
+
+def planned(core: Core, force_N: float, estimate: Estimate | None = None, state: PlanState | None = None) -> PlanState:
+    """The state after a fresh setpoint."""
+    state = state or core.planner.start(0.0)
+    now_s = state.plan.time_s + PERIOD_S
+    return core.planner.plan(state, now_s, TimedSetpoint(force_N, now_s, 0.1), estimate)
+
+
+def test_starts_with_the_gap_open(core) -> None:
+    plan = core.planner.start(3.0).plan
+    assert (plan.gap_mm, plan.gap_speed_mm_s, plan.time_s) == (95.0, 0.0, 3.0)
+    assert plan.governed_N == core.planner.portrait.least_N
+    assert plan.limits == (Limit.NO_SETPOINT,)
+
+
+RESTING = moving(handle=Handle(MOBILISED_MM, 0.0, 1.0, 0.0, 100.0))
+
+
+@pytest.mark.parametrize("estimate", [None, RESTING], ids=["no device", "at rest"])
+def test_without_a_setpoint_the_gap_stays_open(core, estimate: Estimate | None) -> None:
+    state = core.planner.start(0.0)
+    for tick in range(1, 20):
+        state = core.planner.plan(state, tick * PERIOD_S, None, estimate)
+    assert state.plan.gap_mm == pytest.approx(95.0, abs=1.0)
+    assert state.plan.setpoint_N is None
+    assert state.plan.number == 19
+
+
+@pytest.mark.parametrize("rate_mm_s", [0.0, 1.0, 4.9])
+@pytest.mark.parametrize("force_N", [0.6, 1.0, 1.8])
+def test_a_handle_that_rests_does_not_close_the_gap(core, rate_mm_s: float, force_N: float) -> None:
+    """At rest the force is the hand's choice: the gap waits where it is right once the handle moves on."""
+    resting = moving(handle=Handle(MOBILISED_MM, rate_mm_s, 1.0, 0.0, 100.0))
+    gap = planned(core, force_N, moving()).plan.gap_mm
+    assert planned(core, force_N, resting).plan.gap_mm == pytest.approx(gap, abs=0.5)
+    assert planned(core, force_N, None).plan.gap_mm == pytest.approx(gap, abs=0.5)
+
+
+def test_the_portrait_rises_and_agrees_with_its_slope(core) -> None:
+    portrait = core.planner.portrait
+    assert np.all(np.diff(portrait.force_N) >= 0.0)
+    assert 0.0 < portrait.least_N < 0.6
+    assert portrait.most_N > 2.0
+    assert np.all(portrait.slope_N_mm >= 0.0)
+    # the slope is dF/dgap: integrated over the range it gives the force range back
+    step_mm = 50.0 / (len(portrait.force_N) - 1)
+    swept_N = float(np.trapezoid(portrait.slope_N_mm, dx=step_mm))
+    assert swept_N == pytest.approx(portrait.most_N - portrait.least_N, rel=0.01)
+    assert portrait.force_rate_N_s(1.5, 38.0) == pytest.approx(38.0 * portrait.slope_at_N_mm(1.5))
+
+
+def test_more_force_takes_a_smaller_gap(core) -> None:
+    gaps = [planned(core, force).plan.gap_mm for force in np.arange(0.5, 2.01, 0.1)]
+    assert all(closer < further for further, closer in pairwise(gaps))
+    assert 45.0 <= gaps[-1] < gaps[0] <= 95.0
+
+
+@pytest.mark.parametrize("force_N", [0.6, 1.0, 1.5, 1.9])
+def test_the_planned_gap_gives_the_force_by_the_portrait(core, force_N: float) -> None:
+    plan = planned(core, force_N, moving()).plan
+    gaps = np.linspace(95.0, 45.0, len(core.planner.portrait.force_N))
+    assert np.interp(plan.gap_mm, gaps[::-1], core.planner.portrait.force_N[::-1]) == pytest.approx(force_N, abs=0.03)
+    assert plan.governed_N == pytest.approx(force_N)
+    assert plan.confidence > 0.5
+
+
+@pytest.mark.parametrize(("force_N", "limit"), [(0.05, Limit.F_MIN), (2.5, Limit.RANGE)])
+def test_what_cannot_be_given_is_said_once(core, force_N: float, limit: Limit) -> None:
+    limits = planned(core, force_N, moving()).plan.limits
+    assert limits.count(limit) == 1
+    assert len(set(limits)) == len(limits)
+
+
+def test_a_trim_that_takes_the_force_out_of_reach_is_said(core) -> None:
+    """Where the element gives 1.6 times the model's force, 0.6 N are less than the open gap gives."""
+    state = core.planner.start(0.0)._replace(trim=1.6)
+    plan = planned(core, 0.6, None, state).plan
+    assert Limit.F_MIN in plan.limits
+    assert plan.gap_mm == pytest.approx(95.0, abs=0.1)
+    assert Limit.F_MIN not in planned(core, 0.6).plan.limits
+
+
+def test_the_gap_moves_ahead_along_the_setpoints_slope(core) -> None:
+    state = core.planner.start(0.0)
+    for _ in range(40):
+        state = planned(core, 1.0 + 0.5 * state.plan.time_s, moving(), state)
+    slope = core.planner.portrait.slope_at_N_mm(state.plan.governed_N)
+    assert state.plan.gap_speed_mm_s == pytest.approx(-0.5 / slope, rel=0.1)
+
+
+@settings(max_examples=30, deadline=None)
+@given(forces=st.lists(st.floats(0.0, 3.0), min_size=1, max_size=10))
+def test_the_gap_speed_is_one_the_carriages_have(core, forces: list[float]) -> None:
+    state = core.planner.start(0.0)
+    for force in forces:
+        state = planned(core, force, moving(), state)
+        assert abs(state.plan.gap_speed_mm_s) <= CONFIG.position.gap_speed_mm_s
+        assert 45.0 <= state.plan.gap_mm <= 95.0
+
+
+def learned(core: Core, seconds: float, estimate: Estimate) -> PlanState:
+    """The state after the same estimate for a while."""
+    state = core.planner.start(0.0)
+    for _ in range(round(seconds / PERIOD_S)):
+        state = planned(core, 1.0, estimate, state)
+    return state
+
+
+def test_the_trim_learns_the_ratio_of_measured_to_predicted_force(core) -> None:
+    unit = planned(core, 1.0, moving()).plan.predicted_N
+    predicted = planned(core, 1.0, moving(force_N=0.0, is_homed=True)).plan.predicted_N
+    assert unit is not None
+    assert predicted is not None
+    model_N = predicted / planned(core, 1.0, moving(force_N=0.0)).trim
+    state = learned(core, 8.0, moving(force_N=1.2 * model_N))
+    assert state.trim == pytest.approx(1.2, rel=1e-3)
+    assert state.plan.predicted_N == pytest.approx(1.2 * model_N, rel=1e-3)
+    assert Limit.TRIM not in state.plan.limits
+    # a model that is too low in force is corrected by a wider gap
+    assert state.plan.gap_mm > learned(core, 8.0, moving(force_N=model_N)).plan.gap_mm
+
+
+def test_it_learns_with_its_time_constant(core) -> None:
+    model_N = learned(core, PERIOD_S, moving()).plan.predicted_N
+    assert model_N is not None
+    model_N /= learned(core, PERIOD_S, moving()).trim
+    state = learned(core, CONFIG.trim.time_s, moving(force_N=1.2 * model_N))
+    assert (state.trim - 1.0) / 0.2 == pytest.approx(1.0 - math.exp(-1.0), abs=0.02)
+
+
+@pytest.mark.parametrize(("force_N", "trim"), [(50.0, CONFIG.trim.most), (-50.0, CONFIG.trim.least)])
+def test_the_trim_is_bounded_and_says_so(core, force_N: float, trim: float) -> None:
+    state = learned(core, 3.0, moving(force_N=force_N))
+    assert state.trim == trim
+    assert Limit.TRIM in state.plan.limits
+
+
+@pytest.mark.parametrize(
+    "estimate",
+    [
+        None,
+        moving(force_N=3.0, is_homed=False),
+        moving(force_N=3.0, handle=Handle(MOBILISED_MM - 0.01, 42.0, 1.0, 0.0, 100.0)),
+        moving(force_N=3.0, handle=Handle(MOBILISED_MM, MOVING_MM_S - 0.01, 1.0, 0.0, 100.0)),
+        moving(force_N=3.0, handle=Handle(MOBILISED_MM, 0.0, 1.0, 0.0, 100.0)),
+    ],
+    ids=["no measurement", "not homed", "not mobilised", "too slow", "at rest"],
+)
+def test_what_teaches_nothing_leaves_the_trim(core, estimate: Estimate | None) -> None:
+    state = core.planner.start(0.0)._replace(trim=1.1)
+    for _ in range(20):
+        state = planned(core, 1.0, estimate, state)
+    assert state.trim == 1.1
+
+
+def test_positions_before_homing_predict_nothing(core) -> None:
+    assert planned(core, 1.0, moving(is_homed=False)).plan.predicted_N is None
+    assert planned(core, 1.0, moving()).plan.predicted_N is not None
+
+
+def test_a_publishers_own_motion_is_used_instead_of_the_measured(core) -> None:
+    state = core.planner.start(0.0)
+
+    def gap(estimate: Estimate | None, rate_mm_s: float | None) -> float:
+        return core.planner.plan(
+            state, PERIOD_S, TimedSetpoint(1.0, PERIOD_S, 0.1, rate_mm_s=rate_mm_s), estimate
+        ).plan.gap_mm
+
+    slow = moving(force_N=0.0, is_homed=False, handle=Handle(MOBILISED_MM, 8.0, 1.0, 0.0, 100.0))
+    assert gap(None, 8.0) == gap(slow, None) == gap(moving(is_homed=False), -8.0)
+    assert gap(moving(is_homed=False), None) != gap(slow, None)
+
+
+def test_a_motion_nobody_has_measured_is_of_low_confidence(core) -> None:
+    state = core.planner.plan(
+        core.planner.start(0.0), PERIOD_S, TimedSetpoint(1.0, PERIOD_S, 0.1, rate_mm_s=5_000.0), None
+    )
+    assert Limit.LOW_CONFIDENCE in state.plan.limits
+    assert state.plan.confidence < CONFIG.limits.low_confidence
+    assert Limit.LOW_CONFIDENCE not in planned(core, 1.0, moving()).plan.limits
+
+
+estimates = st.none() | st.builds(
+    moving,
+    gap_mm=st.floats(-200.0, 400.0),
+    force_N=st.floats(-33.0, 33.0),
+    is_homed=st.booleans(),
+    handle=st.builds(
+        Handle,
+        displacement_mm=st.floats(0.0, MOBILISED_MM),
+        rate_mm_s=st.floats(-2_000.0, 2_000.0),
+        direction=st.sampled_from([-1.0, 1.0]),
+        turned_mm=st.just(0.0),
+        furthest_mm=st.just(0.0),
+    ),
+)
+setpoints = st.none() | st.builds(
+    TimedSetpoint,
+    force_N=st.floats(0.0, 1_000.0),
+    stamp_s=st.floats(-10.0, 100.0),
+    valid_for_s=st.floats(1e-6, 60.0),
+    displacement_mm=st.none() | st.floats(-1e9, 1e9),
+    rate_mm_s=st.none() | st.floats(-1e9, 1e9),
+)
+
+
+@settings(max_examples=80, deadline=None)
+@given(history=st.lists(st.tuples(st.floats(0.0, 20.0), setpoints, estimates), min_size=1, max_size=8))
+def test_nan_never_travels(core, history: list[tuple[float, TimedSetpoint | None, Estimate | None]]) -> None:
+    state, now_s = core.planner.start(0.0), 0.0
+    for elapsed_s, setpoint, estimate in history:
+        now_s += elapsed_s
+        last, state = state, core.planner.plan(state, now_s, setpoint, estimate)
+        plan = state.plan
+        numbers = (plan.governed_N, plan.field_mT, plan.gap_mm, plan.gap_speed_mm_s, plan.confidence, state.trim)
+        assert all(math.isfinite(value) for value in numbers)
+        assert plan.predicted_N is None or math.isfinite(plan.predicted_N)
+        assert 45.0 <= plan.gap_mm <= 95.0
+        assert CONFIG.trim.least <= state.trim <= CONFIG.trim.most
+        assert plan.number == last.plan.number + 1
+
+
+def test_the_same_inputs_give_the_same_plan(core) -> None:
+    state = learned(core, 0.1, moving())
+    assert planned(core, 1.3, moving(), state) == planned(core, 1.3, moving(), state)

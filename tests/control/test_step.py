@@ -1,0 +1,475 @@
+"""`step`: deterministic, every way a run can fail ends it, and no input whatever asks for more than the whole duty."""
+
+import math
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
+from tormagd.config import Config
+from tormagd.control.core import Core
+from tormagd.control.plan import Plan
+from tormagd.control.step import CARRY_S, STARTING_S, StepOutput, Stepper, StepState
+from tormagd.hardware.measurement import Measurement
+from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.operating_state import CLEARING_S, Conditions, DeviceRequest, OperatingState, RefusedError
+
+PERIOD_S = 1e-3
+CONFIG = Config()
+READY = Conditions(
+    connected=True, fresh=True, homed=True, busy=False, device_latched=False, requested_N=None, neutral_N=0.5
+)
+OFF = (DriveMode.OFF, 0.0, 0.0)
+
+
+def gap_plan(gap_mm: float, time_s: float = 0.0, gap_speed_mm_s: float = 0.0) -> Plan:
+    """A plan for a gap."""
+    return Plan(1, time_s, None, None, 0.0, None, 0.0, gap_mm, gap_speed_mm_s, 1.0, ())
+
+
+class Bench:
+    """A stepper fed with described measurements, a millisecond apart."""
+
+    def __init__(self, stepper: Stepper, measure) -> None:
+        self._stepper, self._measure = stepper, measure
+        self.state = stepper.start(0.0)
+        self.ticks = 0
+        self.output: StepOutput | None = None
+
+    @property
+    def now_s(self) -> float:
+        return self.ticks * PERIOD_S
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        return self.state.safety.faults
+
+    def step(self, plan: Plan | None = None, count: int = 1, **changes: object) -> StepOutput:
+        """Some control periods with the same kind of measurement."""
+        for _ in range(count):
+            self.ticks += 1
+            measurement = self._measure(self.ticks, **changes)
+            self.state, self.output = self._stepper.step(
+                self.state, self.now_s, measurement, plan or gap_plan(80.0, self.now_s)
+            )
+        assert self.output is not None
+        return self.output
+
+    def silent(self, measurement: Measurement | None, count: int = 1) -> StepOutput:
+        """Some control periods in which this same measurement is the newest."""
+        for _ in range(count):
+            self.ticks += 1
+            self.state, self.output = self._stepper.step(
+                self.state, self.now_s, measurement, gap_plan(80.0, self.now_s)
+            )
+        assert self.output is not None
+        return self.output
+
+    def command(self, name: str, conditions: Conditions = READY) -> None:
+        self.state = self._stepper.command(self.state, name, self.now_s, conditions)
+
+    def run_into(self, fault: Fault, **changes: object) -> int:
+        """Periods until exactly this fault is latched."""
+        start = self.ticks
+        while not self.faults:
+            self.step(**changes)
+            assert self.ticks - start < 1_000, f"no {fault}"
+        assert self.faults == (fault,)
+        return self.ticks - start
+
+
+@pytest.fixture
+def bench(core: Core, measure) -> Bench:
+    return Bench(core.stepper, measure)
+
+
+@pytest.fixture
+def running(bench: Bench) -> Bench:
+    """Enabled at a gap of 80 mm, and at rest there."""
+    bench.step(count=3)
+    bench.command("enable")
+    bench.step(count=3)
+    assert bench.state.safety.operating_state is OperatingState.ENABLED
+    return bench
+
+
+def is_opened(bench: Bench) -> bool:
+    """Whether the drives are off and the device has been asked to open."""
+    output = bench.output
+    assert output is not None
+    return (output[:3], output.request) == (OFF, DeviceRequest.RETRACT) and (
+        bench.state.safety.operating_state is OperatingState.FAULT
+    )
+
+
+def test_disabled_means_off(bench: Bench) -> None:
+    output = bench.step(gap_plan(45.0), count=10)
+    assert output[:3] == OFF
+    assert (output.request, output.request_number, output.limits) == (DeviceRequest.NONE, 0, ())
+
+
+def test_enabling_is_bumpless(running: Bench) -> None:
+    """At the planned gap, at rest: the first duties are none, whatever was learned in an earlier run."""
+    running.step(gap_plan(60.0), count=50)
+    running.command("disable")
+    running.step(count=3)
+    running.command("enable")
+    for _ in range(20):
+        assert running.step().left_duty == pytest.approx(0.0, abs=1e-9)
+    assert running.state.left.integral == pytest.approx(0.0, abs=1e-12)
+
+
+def test_enabling_wants_an_estimate(bench: Bench) -> None:
+    with pytest.raises(RefusedError) as caught:
+        bench.command("enable")
+    assert caught.value.code == "not_fresh"
+    assert bench.state.safety.operating_state is OperatingState.DISABLED
+
+
+def test_the_duty_pushes_towards_the_planned_gap(running: Bench) -> None:
+    closing = running.step(gap_plan(79.0), count=20)
+    assert closing.mode is DriveMode.RUN
+    assert closing.left_duty < 0.0
+    assert closing.right_duty == pytest.approx(closing.left_duty)
+    opening = running.step(gap_plan(81.0), count=60)
+    assert opening.left_duty > 0.0
+
+
+def test_the_carriage_that_is_behind_is_pushed_harder(running: Bench) -> None:
+    ahead = running.step(left_mm=-7.45, right_mm=-7.55)
+    assert ahead.left_duty < 0.0 < ahead.right_duty
+
+
+def test_a_plans_gap_is_carried_forward_along_its_speed_but_not_for_long(running: Bench) -> None:
+    plan = gap_plan(80.0, running.now_s, gap_speed_mm_s=-10.0)
+    running.step(plan, count=60)
+    # the reference has come to where the plan leads in CARRY_S, although the plan is much older
+    assert running.state.reference is not None
+    assert running.state.reference.gap_mm == pytest.approx(80.0 - 10.0 * CARRY_S, abs=0.12)
+
+
+@pytest.mark.parametrize("gap_mm", [-1e9, 0.0, 300.0, 1e9])
+def test_the_reference_stays_in_the_gap_range(core: Core, measure, gap_mm: float) -> None:
+    """Carriages that follow exactly; the plan asks for a gap that does not exist."""
+    state = core.stepper.start(0.0)
+    state, _ = core.stepper.step(state, 0.001, measure(1), gap_plan(80.0))
+    state = core.stepper.command(state, "enable", 0.001, READY)
+    for tick in range(2, 3_000):
+        side_mm = -7.5 if state.reference is None else state.reference.gap_mm / 2.0 - 47.5
+        exact = measure(tick, left_mm=side_mm, right_mm=side_mm)
+        state, _ = core.stepper.step(state, tick * PERIOD_S, exact, gap_plan(gap_mm, tick * PERIOD_S))
+        assert state.reference is not None
+        assert 45.0 - 1e-3 <= state.reference.gap_mm <= 95.0 + 1e-3
+    assert state.reference.gap_mm == pytest.approx(min(max(gap_mm, 45.0), 95.0), abs=0.01)
+
+
+def test_less_supply_takes_more_duty(core: Core, measure) -> None:
+    duties = {}
+    for supply_V in (9.0, 12.0, 14.5, 3.0, 0.0):
+        bench = Bench(core.stepper, measure)
+        bench.step(count=3)
+        bench.command("enable")
+        bench.step(count=3, supply_V=supply_V)
+        duties[supply_V] = bench.step(left_mm=-7.49, right_mm=-7.49, supply_V=supply_V).left_duty
+    assert -0.5 < duties[12.0] < 0.0
+    assert duties[9.0] == pytest.approx(duties[12.0] * 12.0 / 9.0)
+    assert duties[14.5] == pytest.approx(duties[12.0] * 12.0 / 14.5)
+    # a supply that is not there does not make the duty boundless
+    assert duties[0.0] == duties[3.0] == pytest.approx(duties[12.0] * 2.0)
+
+
+def test_limits_name_what_holds_back(running: Bench) -> None:
+    assert running.step().limits == ()
+    assert Limit.SKEW in running.step(left_mm=-7.35, right_mm=-7.65).limits
+    far = [running.step(gap_plan(50.0)).limits for _ in range(40)]
+    assert Limit.RATE in far[20]
+    assert Limit.SATURATED in far[-1]
+    assert Limit.SKEW not in far[-1]
+    assert not running.faults
+
+
+# -- every way a run can fail --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bit", DeviceFault)
+def test_a_fault_of_the_device_is_ours(running: Bench, bit: DeviceFault) -> None:
+    assert running.run_into(Fault(f"DEVICE_{bit.name}"), faults=bit, mode=DeviceMode.RETRACTING) == 1
+    assert is_opened(running)
+
+
+@pytest.mark.parametrize("bit", DeviceFault)
+def test_a_fault_of_the_device_is_ours_while_disabled_too(bench: Bench, bit: DeviceFault) -> None:
+    bench.step(faults=bit)
+    assert bench.faults == (Fault(f"DEVICE_{bit.name}"),)
+
+
+def test_a_stale_measurement(running: Bench) -> None:
+    newest = running._measure(running.ticks)
+    timeout = round(CONFIG.device.measurement_timeout_ms)
+    running.silent(newest, count=timeout - 1)
+    assert not running.faults
+    running.silent(newest, count=2)
+    assert running.faults == (Fault.MEASUREMENT_STALE,)
+    assert is_opened(running)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_skew(running: Bench, side: float) -> None:
+    allowed = CONFIG.limits.skew_fault_mm
+    running.step(left_mm=-7.5 + side * 0.49 * allowed, right_mm=-7.5 - side * 0.49 * allowed, count=2)
+    assert not running.faults
+    assert (
+        running.run_into(Fault.SKEW, left_mm=-7.5 + side * 0.51 * allowed, right_mm=-7.5 - side * 0.51 * allowed) == 1
+    )
+    assert is_opened(running)
+
+
+def test_a_gap_that_does_not_follow(core: Core, measure) -> None:
+    """The carriages creep, so that they do move, but by far too little."""
+    config = msgspec.structs.replace(CONFIG, limits=msgspec.structs.replace(CONFIG.limits, no_motion_time_s=10.0))
+    bench = Bench(Stepper(config, core.scene), measure)
+    bench.step(count=3)
+    bench.command("enable")
+    while bench.state.following_s == math.inf:
+        bench.step(gap_plan(50.0))
+        assert bench.ticks < 1_000
+    since = bench.ticks
+    while not bench.faults:
+        bench.step(gap_plan(50.0))
+    assert bench.faults == (Fault.FOLLOWING_ERROR,)
+    assert (bench.ticks - since) * PERIOD_S == pytest.approx(CONFIG.limits.following_time_s, abs=2.5e-3)
+    assert is_opened(bench)
+
+
+def test_following_again_in_time_is_no_fault(running: Bench) -> None:
+    for _ in range(3):
+        # the gap is 3.5 mm away from where the reference rests, for less than the time allowed
+        running.step(left_mm=-9.25, right_mm=-9.25, count=round(CONFIG.limits.no_motion_time_s / PERIOD_S) - 20)
+        running.step(count=20)
+    assert not running.faults
+
+
+def test_a_carriage_that_is_driven_and_does_not_move(running: Bench) -> None:
+    ticks = 0
+    while not running.faults:
+        running.step(gap_plan(60.0))
+        ticks += 1
+        assert ticks < 500
+    assert running.faults == (Fault.NO_MOTION,)
+    assert ticks * PERIOD_S < 0.25
+    assert is_opened(running)
+
+
+@pytest.mark.parametrize("mode", [DeviceMode.IDLE, DeviceMode.LATCHED, DeviceMode.HOMING, DeviceMode.RETRACTING])
+def test_a_device_that_stopped_running(running: Bench, mode: DeviceMode) -> None:
+    running.step(count=round(STARTING_S / PERIOD_S))
+    assert not running.faults
+    assert running.run_into(Fault.DEVICE_NOT_RUNNING, mode=mode) == 1
+    assert is_opened(running)
+
+
+def test_a_device_may_take_a_moment_to_start(bench: Bench) -> None:
+    bench.step(count=3, mode=DeviceMode.IDLE)
+    bench.command("enable")
+    bench.step(count=round(STARTING_S / PERIOD_S) - 1, mode=DeviceMode.IDLE)
+    assert not bench.faults
+    assert bench.run_into(Fault.DEVICE_NOT_RUNNING, mode=DeviceMode.IDLE) <= 3
+
+
+@pytest.mark.parametrize("name", ["pause", None])
+def test_a_lost_link_is_a_fault_while_driven(running: Bench, core: Core, name: str | None) -> None:
+    if name:
+        running.command(name)
+    state = core.stepper.lose_link(running.state)
+    assert state.safety.faults == (Fault.LINK_LOST,)
+    assert state.safety.request is DeviceRequest.RETRACT
+    assert state.estimate is None
+    assert core.stepper.lose_link(state).safety == state.safety
+
+
+@pytest.mark.parametrize("name", ["pause", None])
+def test_a_link_without_measurements_is_a_lost_one(running: Bench, name: str | None) -> None:
+    """However the link went: nothing that was armed is still armed when measurements come back."""
+    if name:
+        running.command(name)
+    assert running.silent(None)[:3] == OFF
+    assert running.faults == (Fault.LINK_LOST,)
+    running.step(count=5)
+    assert running.output is not None
+    assert running.output[:3] == OFF
+
+
+def test_a_lost_link_is_no_fault_while_disabled(bench: Bench, core: Core) -> None:
+    bench.step()
+    assert bench.silent(None, count=5) == StepOutput(DriveMode.OFF, 0.0, 0.0, DeviceRequest.NONE, 0, ())
+    assert bench.faults == ()
+    assert core.stepper.lose_link(bench.state).safety.faults == ()
+    assert bench.state.estimate is None
+
+
+def test_a_number_that_is_not_finite(running: Bench) -> None:
+    running.step(gap_plan(math.nan))
+    assert running.faults == (Fault.NOT_FINITE,)
+    assert is_opened(running)
+    running.command("clear-fault")
+    running.step(count=3)
+    running.command("enable")
+    assert all(math.isfinite(duty) for duty in running.step(gap_plan(79.0), count=10)[1:3])
+
+
+@pytest.mark.parametrize("name", ["left_mm", "right_mm", "supply_V", "device_time_s"])
+def test_a_measurement_that_is_not_finite_reaches_no_duty(running: Bench, name: str) -> None:
+    for value in (math.nan, math.inf, -math.inf):
+        output = running.step(gap_plan(79.0), **{name: value})
+        assert all(abs(duty) <= 1.0 for duty in output[1:3])
+
+
+# -- commands ------------------------------------------------------------------------------------------------------
+
+
+def test_pause_holds_the_gap_and_resume_goes_on(running: Bench) -> None:
+    running.step(gap_plan(79.0), count=8)
+    running.command("pause")
+    running.step(gap_plan(50.0), count=100)
+    held = running.state.reference
+    assert held is not None
+    assert held.speed_mm_s == pytest.approx(0.0, abs=1e-6)
+    running.step(gap_plan(50.0), count=50)
+    assert running.state.reference.gap_mm == pytest.approx(held.gap_mm, abs=1e-6)  # type: ignore[union-attr]
+    assert running.output is not None
+    assert running.output.mode is DriveMode.RUN
+    assert not running.faults
+    running.command("resume")
+    running.step(gap_plan(78.0), count=30)
+    assert running.state.reference.gap_mm < held.gap_mm - 0.2  # type: ignore[union-attr]
+
+
+def test_disable_and_stop_open(running: Bench) -> None:
+    running.command("disable")
+    output = running.step()
+    assert (output[:3], output.request) == (OFF, DeviceRequest.RETRACT)
+    assert not running.faults
+    running.command("stop")
+    running.step()
+    assert running.faults == (Fault.STOPPED,)
+    assert is_opened(running)
+
+
+def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench: Bench) -> None:
+    bench.step(faults=DeviceFault.OVERCURRENT, mode=DeviceMode.LATCHED)
+    bench.command("clear-fault", READY._replace(device_latched=True))
+    output = bench.step(faults=DeviceFault.OVERCURRENT, mode=DeviceMode.LATCHED)
+    assert output.request is DeviceRequest.CLEAR
+    assert bench.faults == ()
+    cleared = bench.ticks
+    assert bench.run_into(Fault.DEVICE_OVERCURRENT, faults=DeviceFault.OVERCURRENT, mode=DeviceMode.LATCHED)
+    assert (bench.ticks - cleared) * PERIOD_S == pytest.approx(CLEARING_S, abs=2e-3)
+
+
+def test_a_latched_fault_asks_once_and_stays(running: Bench) -> None:
+    running.run_into(Fault.DEVICE_SKEW, faults=DeviceFault.SKEW, mode=DeviceMode.RETRACTING)
+    number = running.output.request_number  # type: ignore[union-attr]
+    output = running.step(faults=DeviceFault.SKEW, mode=DeviceMode.LATCHED, count=100)
+    assert output.request_number == number
+    running.step(count=100)
+    assert running.faults == (Fault.DEVICE_SKEW,)
+    assert is_opened(running)
+
+
+def test_homing_forgets_the_motion_before_it(bench: Bench) -> None:
+    bench.step(count=5)
+    for tick in range(5):
+        bench.step(mode=DeviceMode.HOMING, left_mm=float(tick), right_mm=float(tick), switches=Switches(0))
+    bench.step(left_mm=0.0, right_mm=0.0)
+    assert bench.state.estimate is not None
+    # the origin jumped by 4 mm with the last homing state: one period's filtered jump is not carried further
+    bench.step(left_mm=0.0, right_mm=0.0, mode=DeviceMode.RETRACTING)
+    assert bench.state.estimate.left_mm_s == 0.0
+
+
+# -- any input -----------------------------------------------------------------------------------------------------
+
+measurements = st.none() | st.builds(
+    Measurement,
+    number=st.integers(0, 5),
+    received_s=st.floats(-1.0, 1.0),
+    device_time_s=st.floats(0.0, 1.0),
+    left_mm=st.floats(-60.0, 10.0),
+    right_mm=st.floats(-60.0, 10.0),
+    left_current_A=st.floats(-32.0, 32.0),
+    right_current_A=st.floats(-32.0, 32.0),
+    force_N=st.floats(-32.0, 32.0),
+    handle_mm=st.floats(-1e4, 1e4),
+    mode=st.sampled_from(DeviceMode),
+    switches=st.sampled_from([Switches.HOMED, Switches(0), Switches.HOMED | Switches.LEFT_OPEN]),
+    faults=st.sampled_from([DeviceFault(0), DeviceFault(0), DeviceFault(0), *DeviceFault]),
+    temperature_C=st.floats(-40.0, 125.0),
+    supply_V=st.floats(0.0, 25.5),
+)
+plans = st.builds(
+    gap_plan, gap_mm=st.floats(45.0, 95.0), time_s=st.floats(-1.0, 1.0), gap_speed_mm_s=st.floats(-38.0, 38.0)
+)
+elapsed = st.sampled_from([0.0, 1e-3, 1e-3, 1e-5, 0.1, 5.0, 3_600.0, -1e-3, -10.0])
+commands = st.none() | st.sampled_from(["enable", "disable", "pause", "resume", "home", "stop", "clear-fault"])
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    history=st.lists(st.tuples(elapsed, measurements, plans, commands), min_size=1, max_size=25),
+    limit=st.floats(0.1, 1.0),
+)
+def test_any_history_keeps_duties_in_bounds_and_repeats_itself(core: Core, history, limit: float) -> None:
+    config = msgspec.structs.replace(CONFIG, position=msgspec.structs.replace(CONFIG.position, duty_limit=limit))
+    runs = []
+    for stepper in (Stepper(config, core.scene), Stepper(config, core.scene)):
+        state, now_s, trace = stepper.start(0.0), 0.0, []
+        number = 0
+        for elapsed_s, measurement, plan, name in history:
+            now_s += elapsed_s
+            if name is not None:
+                state = _commanded(stepper, state, name, now_s)
+            state, output = stepper.step(state, now_s, measurement, plan)
+            assert all(abs(duty) <= limit for duty in output[1:3])
+            is_driven = state.safety.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED)
+            assert (output.mode is DriveMode.RUN) == is_driven
+            assert is_driven or output[:3] == OFF
+            assert output.request_number >= number
+            number = output.request_number
+            trace.append((state, output))
+        runs.append(trace)
+    assert runs[0] == runs[1]
+
+
+def _commanded(stepper: Stepper, state: StepState, name: str, now_s: float) -> StepState:
+    try:
+        return stepper.command(state, name, now_s, READY)
+    except RefusedError:
+        return state
+
+
+@pytest.mark.parametrize("elapsed_s", [0.0, -1e-3, -1e6, 0.011, 1.0, 1e9])
+def test_a_clock_that_jumps_is_one_ordinary_period(core: Core, measure, elapsed_s: float) -> None:
+    """A process that was stopped, or a clock that stood still, moves the reference no further than a period does."""
+
+    def following(state: StepState, number: int, now_s: float) -> Measurement:
+        assert state.reference is not None
+        side_mm = state.reference.gap_mm / 2.0 - 47.5
+        return measure(number, received_s=now_s, left_mm=side_mm, right_mm=side_mm)
+
+    state = core.stepper.start(0.0)
+    state, _ = core.stepper.step(state, 1.0, measure(1, received_s=1.0), gap_plan(80.0, 1.0))
+    state = core.stepper.command(state, "enable", 1.0, READY)
+    for tick in range(2, 12):
+        now_s = 1.0 + tick * PERIOD_S
+        state, _ = core.stepper.step(state, now_s, following(state, tick, now_s), gap_plan(60.0, now_s))
+    assert state.reference is not None
+    at_mm = state.reference.gap_mm
+    moved_mm = []
+    for later_s in (now_s + PERIOD_S, now_s + elapsed_s):
+        later, _ = core.stepper.step(state, later_s, following(state, 12, later_s), gap_plan(60.0, later_s))
+        assert later.reference is not None
+        moved_mm.append(later.reference.gap_mm - at_mm)
+    assert moved_mm[0] < -0.01
+    assert moved_mm[1] == pytest.approx(moved_mm[0])

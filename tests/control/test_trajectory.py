@@ -1,0 +1,121 @@
+"""The gap reference: within its limits whatever the target does, on a step without overshoot, on a ramp without lag."""
+
+import math
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from tormagd.config import Config, Position
+from tormagd.control.trajectory import Reference, follow
+
+DT_S = 1e-3
+LIMITS = Config().position
+NO_LOAD_MM_S = 79.0
+"Speed of the gap at full duty, of the shipped motor."
+HALF_COUNT_MM = 0.5 * 8.0 / 4480.0
+"Less than this no encoder sees."
+
+gaps = st.floats(45.0, 95.0)
+limits = st.builds(Position, gap_speed_mm_s=st.floats(5.0, 60.0), gap_acceleration_mm_s2=st.floats(100.0, 5_000.0))
+periods = st.floats(1e-5, 0.1)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    position=limits,
+    start=gaps,
+    targets=st.lists(st.tuples(gaps, st.floats(-200.0, 200.0), periods), min_size=1, max_size=60),
+)
+def test_speed_and_acceleration_limits_hold_for_any_target(
+    position: Position, start: float, targets: list[tuple[float, float, float]]
+) -> None:
+    reference = Reference(start)
+    for target, speed, dt_s in targets:
+        last = reference
+        reference, _ = follow(position, last, target, speed, dt_s, NO_LOAD_MM_S)
+        assert all(math.isfinite(value) for value in reference)
+        assert abs(reference.speed_mm_s) <= position.gap_speed_mm_s * (1.0 + 1e-12)
+        change = reference.speed_mm_s - last.speed_mm_s
+        most = position.gap_acceleration_mm_s2 * dt_s
+        assert abs(change) <= most * (1.0 + 1e-9) + 1e-12
+        is_speeding_up = abs(reference.speed_mm_s) > abs(last.speed_mm_s) and reference.speed_mm_s * last.speed_mm_s > 0
+        if is_speeding_up:
+            torque = 1.0 - abs(last.speed_mm_s) / NO_LOAD_MM_S
+            assert abs(change) <= most * torque * (1.0 + 1e-9) + 1e-12
+        assert reference.gap_mm == pytest.approx(last.gap_mm + reference.speed_mm_s * dt_s)
+        # the smoothed acceleration is an average of what was applied
+        assert abs(reference.acceleration_mm_s2) <= position.gap_acceleration_mm_s2 * (1.0 + 1e-9)
+
+
+@settings(max_examples=150, deadline=None)
+@given(position=limits, start=gaps, target=gaps)
+@example(position=LIMITS, start=70.0, target=69.0)
+@example(position=LIMITS, start=95.0, target=45.0)
+def test_a_step_is_reached_without_overshoot(position: Position, start: float, target: float) -> None:
+    reference = Reference(start)
+    distance = abs(target - start)
+    for _ in range(round(1_000 * (distance / position.gap_speed_mm_s + 1.0))):
+        reference, _ = follow(position, reference, target, 0.0, DT_S, NO_LOAD_MM_S)
+        assert (reference.gap_mm - target) * math.copysign(1.0, target - start) <= HALF_COUNT_MM
+    assert reference.gap_mm == pytest.approx(target, abs=1e-3)
+    assert abs(reference.speed_mm_s) < 0.1
+
+
+def test_a_step_takes_hardly_longer_than_its_limits_ask() -> None:
+    """1 mm of gap: time-optimal with this acceleration is 2 sqrt(d / a); the last stretch is a little slower."""
+    reference, ticks = Reference(70.0), 0
+    while abs(reference.gap_mm - 69.0) > 0.1:
+        reference, _ = follow(LIMITS, reference, 69.0, 0.0, DT_S, NO_LOAD_MM_S)
+        ticks += 1
+    assert ticks * DT_S < 1.3 * 2.0 * math.sqrt(1.0 / LIMITS.gap_acceleration_mm_s2)
+
+
+@settings(max_examples=60, deadline=None)
+@given(start=st.floats(60.0, 80.0), speed=st.floats(-0.8, 0.8).map(lambda share: share * LIMITS.gap_speed_mm_s))
+def test_a_ramp_slower_than_the_limit_is_followed_without_lag(start: float, speed: float) -> None:
+    reference, target, is_limited = Reference(start), start, True
+    for _ in range(800):
+        target += speed * DT_S
+        reference, is_limited = follow(LIMITS, reference, target, speed, DT_S, NO_LOAD_MM_S)
+    # its sampling is one period late at most
+    assert abs(reference.gap_mm - target) <= abs(speed) * DT_S + 1e-6
+    assert reference.speed_mm_s == pytest.approx(speed, abs=1e-3)
+    assert not is_limited
+
+
+def test_being_held_back_is_said() -> None:
+    reference, is_limited = follow(LIMITS, Reference(95.0), 45.0, 0.0, DT_S, NO_LOAD_MM_S)
+    assert is_limited
+    _, is_limited = follow(LIMITS, reference, reference.gap_mm, 0.0, DT_S, NO_LOAD_MM_S)
+    assert not is_limited
+    _, is_limited = follow(LIMITS, reference, reference.gap_mm, 2.0 * LIMITS.gap_speed_mm_s, DT_S, NO_LOAD_MM_S)
+    assert is_limited
+
+
+@settings(max_examples=60, deadline=None)
+@given(start=gaps, target=gaps, dt_s=periods)
+@example(start=95.0, target=45.0, dt_s=1e-5)
+@example(start=95.0, target=45.0, dt_s=0.1)
+def test_any_period_stays_finite_and_arrives(start: float, target: float, dt_s: float) -> None:
+    reference = Reference(start)
+    # one period of full braking covers a dt^2 / 2: a slow loop cannot stop more exactly than a part of that
+    grain = HALF_COUNT_MM + 0.2 * LIMITS.gap_acceleration_mm_s2 * dt_s**2
+    for _ in range(400):
+        reference, _ = follow(LIMITS, reference, target, 0.0, dt_s, NO_LOAD_MM_S)
+        assert all(math.isfinite(value) for value in reference)
+        assert min(start, target) - grain <= reference.gap_mm <= max(start, target) + grain
+    if dt_s * 400 > 4.0:
+        assert reference.gap_mm == pytest.approx(target, abs=0.01)
+
+
+@given(start=gaps, target=gaps, speed=st.floats(-100.0, 100.0), dt_s=periods)
+def test_opening_and_closing_are_alike(start: float, target: float, speed: float, dt_s: float) -> None:
+    forth, _ = follow(LIMITS, Reference(start, 10.0), target, speed, dt_s, NO_LOAD_MM_S)
+    back, _ = follow(LIMITS, Reference(-start, -10.0), -target, -speed, dt_s, NO_LOAD_MM_S)
+    assert back == pytest.approx(tuple(-value for value in forth))
+
+
+def test_a_target_at_rest_is_kept() -> None:
+    reference, is_limited = follow(LIMITS, Reference(70.0), 70.0, 0.0, DT_S, NO_LOAD_MM_S)
+    assert (reference, is_limited) == (Reference(70.0), False)

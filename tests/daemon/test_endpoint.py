@@ -1,0 +1,324 @@
+"""The daemon's sockets, real ones: setpoints in, telemetry out, commands answered, and hostile peers survived."""
+
+import itertools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+import zmq
+
+from tormagd.config import Endpoints
+from tormagd.daemon.endpoint import DRAIN, REQUESTS, Endpoint
+from tormagd.messages import VERSION, Reply, Request, Telemetry, Tick, decode, encode
+from tormagd.safety.operating_state import RefusedError
+
+PATIENCE_MS = 10_000
+TELEMETRY = Telemetry(
+    v=1,
+    t_ns=1,
+    seq=2,
+    operating_state="DISABLED",
+    is_homed=False,
+    is_busy=False,
+    setpoint_cf=None,
+    governed_cf=None,
+    measured_cf=None,
+    predicted_cf=None,
+    field_mT=None,
+    gap_mm=None,
+    gap_setpoint_mm=None,
+    measured_jp=None,
+    skew_mm=None,
+    duty=(0.0, 0.0),
+    limits=(),
+    faults=(),
+    setpoint_age_ms=None,
+    confidence=None,
+    tick=Tick(0.0, 0.0),
+)
+
+
+class Rig:
+    """An endpoint and its peers."""
+
+    def __init__(self, folder: Path) -> None:
+        names = ("setpoint", "telemetry", "control", "recording")
+        self.addresses = {name: f"ipc://{folder}/{name}" for name in names}
+        self.endpoint = Endpoint(Endpoints(**self.addresses))
+        self.context = zmq.Context()
+        self.now_s = 0.0
+        "The control clock."
+
+    def connect(self, kind: int, name: str) -> "zmq.Socket[bytes]":
+        socket = self.context.socket(kind)
+        socket.connect(self.addresses[name])
+        return socket
+
+    def publisher(self) -> "zmq.Socket[bytes]":
+        """A publisher that the endpoint has subscribed to."""
+        socket = self.connect(zmq.XPUB, "setpoint")
+        self.subscribed(socket)
+        return socket
+
+    def subscribed(self, socket: "zmq.Socket[bytes]") -> None:
+        """Waits for the endpoint's subscription; what is published earlier is lost, as everywhere in ZeroMQ."""
+        self.until(lambda: socket.poll(0) > 0)
+        assert socket.recv() == b"\x01"
+
+    def until(self, reached: Callable[[], bool]) -> None:
+        """Drains setpoints until it is so; what is waited for is a descriptor."""
+        waiting = zmq.Poller()
+        waiting.register(self.endpoint.fileno(), zmq.POLLIN)
+        for _ in range(PATIENCE_MS // 5):
+            self.endpoint.drain_setpoints(self.now_s)
+            if reached():
+                return
+            waiting.poll(5)
+        pytest.fail("not reached")
+
+    def serve(self, socket: "zmq.Socket[bytes]", answer: Callable[[Request], dict[str, Any]]) -> Reply:
+        """Serves until this client has its reply."""
+        for _ in range(PATIENCE_MS // 5):
+            self.endpoint.serve(self.now_s, answer)
+            if socket.poll(5):
+                return decode(socket.recv_multipart()[-1], Reply)
+        pytest.fail("no reply")
+
+    def close(self) -> None:
+        self.endpoint.close()
+        self.context.destroy(linger=0)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path)
+    yield made
+    made.close()
+
+
+def setpoint(seq: int, force_N: float = 1.0) -> bytes:
+    fields = {"v": 1, "source": "a", "seq": seq, "stamp_ns": 1, "servo_cf": force_N, "valid_for_ms": 50.0}
+    packed: bytes = msgpack.packb(fields)
+    return packed
+
+
+def never(request: Request) -> dict[str, Any]:
+    pytest.fail(f"{request} was answered")
+
+
+# -- setpoints -----------------------------------------------------------------------------------------------------
+
+
+def test_setpoints_arrive(rig: Rig) -> None:
+    rig.publisher().send(setpoint(1, 1.25))
+    rig.until(lambda: rig.endpoint.inbox.accepted == 1)
+    assert rig.endpoint.inbox.newest is not None
+    assert rig.endpoint.inbox.newest.force_N == 1.25
+
+
+def test_garbage_between_setpoints_is_counted_and_does_not_hide_them(rig: Rig) -> None:
+    publisher = rig.publisher()
+    for seq in range(5):
+        publisher.send(b"garbage")
+        publisher.send(setpoint(seq, 1.0 + seq / 10.0))
+        publisher.send(b"")
+    rig.until(lambda: rig.endpoint.inbox.refused == 10)
+    assert rig.endpoint.inbox.accepted == 5
+    assert rig.endpoint.inbox.newest is not None
+    assert rig.endpoint.inbox.newest.force_N == 1.4
+
+
+def test_a_message_in_parts_is_refused_whole(rig: Rig) -> None:
+    publisher = rig.publisher()
+    publisher.send_multipart([setpoint(1), setpoint(2)])
+    publisher.send(setpoint(3, 1.5))
+    rig.until(lambda: rig.endpoint.inbox.accepted == 1)
+    assert rig.endpoint.inbox.refused == 1
+    assert rig.endpoint.inbox.newest is not None
+    assert rig.endpoint.inbox.newest.force_N == 1.5
+
+
+def test_a_flood_is_drained_in_bounded_portions(rig: Rig) -> None:
+    publisher = rig.publisher()
+    for seq in range(3 * DRAIN):
+        publisher.send(setpoint(seq))
+    most = 0
+
+    def everything() -> bool:
+        nonlocal most
+        before = rig.endpoint.inbox.accepted
+        rig.endpoint.drain_setpoints(0.0)
+        most = max(most, rig.endpoint.inbox.accepted - before)
+        return rig.endpoint.inbox.accepted == 3 * DRAIN
+
+    rig.until(everything)
+    assert most <= DRAIN
+
+
+def test_an_oversize_message_is_counted_when_its_peer_comes_back(rig: Rig) -> None:
+    """libzmq cuts the peer off; the peer connects again by itself, and goes on being heard."""
+    publisher = rig.publisher()
+    publisher.send(b"\x00" * 10_000_000)
+    for _ in range(PATIENCE_MS // 5):
+        rig.endpoint.serve(rig.now_s, never)
+        if rig.endpoint.inbox.oversize:
+            break
+        publisher.poll(5)
+    assert rig.endpoint.inbox.oversize == 1
+    assert rig.endpoint.inbox.accepted == 0
+    numbers = itertools.count(1)
+
+    def is_heard_again() -> bool:
+        publisher.send(setpoint(next(numbers)))
+        return rig.endpoint.inbox.accepted > 0
+
+    rig.until(is_heard_again)
+    rig.endpoint.serve(rig.now_s, never)
+    assert (rig.endpoint.inbox.oversize, rig.endpoint.inbox.refused) == (1, 0)
+
+
+def test_a_publisher_that_leaves_is_not_one_that_was_cut_off(rig: Rig) -> None:
+    first = rig.publisher()
+    first.send(setpoint(1))
+    rig.until(lambda: rig.endpoint.inbox.accepted == 1)
+    first.close(linger=0)
+    for _ in range(20):
+        rig.endpoint.serve(rig.now_s, never)
+        rig.endpoint.drain_setpoints(rig.now_s)
+        rig.context.socket(zmq.PULL).poll(5)
+    rig.now_s = 2.0
+    rig.publisher().send(setpoint(2))
+    rig.until(lambda: rig.endpoint.inbox.accepted == 2)
+    rig.endpoint.serve(rig.now_s, never)
+    assert rig.endpoint.inbox.oversize == 0
+
+
+# -- telemetry and recording ---------------------------------------------------------------------------------------
+
+
+def test_telemetry_reaches_a_subscriber_and_is_sent_without_one(rig: Rig) -> None:
+    for _ in range(3_000):
+        rig.endpoint.publish(TELEMETRY)
+    subscriber = rig.connect(zmq.SUB, "telemetry")
+    subscriber.subscribe(b"")
+    for _ in range(PATIENCE_MS // 5):
+        rig.endpoint.publish(TELEMETRY)
+        if subscriber.poll(5):
+            break
+    assert decode(subscriber.recv(), Telemetry) == TELEMETRY
+
+
+def test_a_subscriber_that_does_not_read_blocks_nobody(rig: Rig) -> None:
+    subscriber = rig.connect(zmq.SUB, "recording")
+    subscriber.setsockopt(zmq.RCVHWM, 1)
+    subscriber.subscribe(b"")
+    rows = [tuple(range(30))] * 100
+    for _ in range(PATIENCE_MS // 5):
+        rig.endpoint.publish_ticks(("a",), rows)
+        if subscriber.poll(5):
+            break
+    for _ in range(5_000):
+        rig.endpoint.publish_ticks(("a", "b"), rows)
+    assert msgpack.unpackb(subscriber.recv()) == {"v": VERSION, "columns": ["a"], "rows": [list(range(30))] * 100}
+
+
+# -- commands ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [zmq.REQ, zmq.DEALER])
+def test_a_command_is_answered(rig: Rig, kind: int) -> None:
+    client = rig.connect(kind, "control")
+    client.send(encode(Request(v=VERSION, id="x7", command="status")))
+    reply = rig.serve(client, lambda request: {"command": request.command})
+    assert (reply.id, reply.ok, reply.result, reply.error) == ("x7", True, {"command": "status"}, None)
+
+
+def test_a_refusal_says_code_message_and_hint(rig: Rig) -> None:
+    def refuse(request: Request) -> dict[str, Any]:
+        raise RefusedError("busy", "homing", "wait")
+
+    client = rig.connect(zmq.DEALER, "control")
+    client.send(encode(Request(v=VERSION, id=3, command="enable")))
+    reply = rig.serve(client, refuse)
+    assert (reply.id, reply.ok, reply.result) == (3, False, None)
+    assert reply.error is not None
+    assert (reply.error.code, reply.error.message, reply.error.hint) == ("busy", "homing", "wait")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"garbage",
+        b"\xff" * 1_000,
+        msgpack.packb([1, 2]),
+        msgpack.packb({"v": 1, "id": 1}),
+        msgpack.packb({"v": 9, "id": 1, "command": "stop"}),
+        msgpack.packb({"v": 1, "id": 1, "command": 7}),
+        msgpack.packb({"v": 1, "id": [], "command": "stop"}),
+    ],
+    ids=range(8),
+)
+def test_garbage_is_answered_with_bad_request(rig: Rig, data: bytes) -> None:
+    client = rig.connect(zmq.DEALER, "control")
+    client.send(data)
+    reply = rig.serve(client, never)
+    assert (reply.id, reply.ok) == (None, False)
+    assert reply.error is not None
+    assert reply.error.code == "bad_request"
+    client.send(encode(Request(v=VERSION, id=1, command="status")))
+    assert rig.serve(client, lambda request: {}).ok
+
+
+def test_a_client_that_has_gone_is_no_trouble(rig: Rig) -> None:
+    gone = rig.connect(zmq.DEALER, "control")
+    for number in range(10):
+        gone.send(encode(Request(v=VERSION, id=number, command="status")))
+    client = rig.connect(zmq.DEALER, "control")
+    gone.close(linger=200)
+    client.send(encode(Request(v=VERSION, id=1, command="status")))
+    assert rig.serve(client, lambda request: {}).ok
+
+
+def test_a_flood_of_commands_is_answered_in_bounded_portions(rig: Rig) -> None:
+    client = rig.connect(zmq.DEALER, "control")
+    for number in range(4 * REQUESTS):
+        client.send(encode(Request(v=VERSION, id=number, command="status")))
+    answered: list[list[int]] = [[]]
+
+    def answer(request: Request) -> dict[str, Any]:
+        assert isinstance(request.id, int)
+        answered[-1].append(request.id)
+        return {}
+
+    for _ in range(PATIENCE_MS // 5):
+        rig.endpoint.serve(0.0, answer)
+        if sum(map(len, answered)) == 4 * REQUESTS:
+            break
+        answered.append([])
+        client.poll(5)
+    assert max(map(len, answered)) <= REQUESTS
+    assert list(itertools.chain(*answered)) == list(range(4 * REQUESTS))
+
+
+# -- opening and closing -------------------------------------------------------------------------------------------
+
+
+def test_closing_takes_the_socket_files_away_and_the_next_can_open(tmp_path: Path) -> None:
+    for _ in range(2):
+        made = Rig(tmp_path / "deep" / "folder")
+        assert (tmp_path / "deep" / "folder" / "control").exists()
+        made.close()
+        assert list((tmp_path / "deep" / "folder").iterdir()) == []
+
+
+def test_an_address_that_cannot_be_bound_is_named(tmp_path: Path) -> None:
+    taken = zmq.Context()
+    holder = taken.socket(zmq.PUB)
+    port = holder.bind_to_random_port("tcp://127.0.0.1")
+    address = f"tcp://127.0.0.1:{port}"
+    with pytest.raises(OSError, match=f"{address}: cannot be bound"):
+        Endpoint(Endpoints(setpoint=address))
+    taken.destroy(linger=0)

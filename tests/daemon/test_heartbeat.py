@@ -1,0 +1,73 @@
+"""The heartbeat: a kernel timer. What is waited for is its descriptor, never a time."""
+
+import os
+import select
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from tormagd.daemon.heartbeat import Heartbeat
+
+PERIOD_NS = 20_000_000
+PATIENCE_S = 10.0
+
+
+@pytest.fixture
+def heartbeat() -> Iterator[Heartbeat]:
+    made = Heartbeat(PERIOD_NS)
+    yield made
+    made.close()
+
+
+def wait(heartbeat: Heartbeat) -> None:
+    assert select.select([heartbeat.fileno()], [], [], PATIENCE_S)[0]
+
+
+def test_nothing_is_due_before_the_first_period() -> None:
+    slow = Heartbeat(3_600_000_000_000)
+    assert slow.beats() == 0
+    assert not select.select([slow.fileno()], [], [], 0.0)[0]
+    slow.close()
+
+
+def test_every_beat_is_due_one_period_after_the_last(heartbeat: Heartbeat) -> None:
+    before_ns = heartbeat.due_ns
+    total = 0
+    for _ in range(3):
+        wait(heartbeat)
+        beats = heartbeat.beats()
+        assert beats >= 1
+        total += beats
+        assert heartbeat.due_ns == before_ns + total * PERIOD_NS
+        # a beat is never early
+        assert heartbeat.due_ns <= time.monotonic_ns()
+
+
+def test_missed_beats_are_merged_and_counted(heartbeat: Heartbeat) -> None:
+    """Nobody reads the timer until a second one, set to five periods later, has rung."""
+    before_ns = heartbeat.due_ns
+    other = Heartbeat(5 * PERIOD_NS)
+    wait(other)
+    other.close()
+    wait(heartbeat)
+    beats = heartbeat.beats()
+    assert beats >= 5
+    assert heartbeat.due_ns == before_ns + beats * PERIOD_NS
+
+
+def test_reading_again_at_once_finds_nothing(heartbeat: Heartbeat) -> None:
+    wait(heartbeat)
+    heartbeat.beats()
+    due_ns = heartbeat.due_ns
+    if time.monotonic_ns() < due_ns + PERIOD_NS // 2:
+        assert heartbeat.beats() == 0
+        assert heartbeat.due_ns == due_ns
+
+
+def test_closing_gives_the_descriptor_back() -> None:
+    made = Heartbeat(PERIOD_NS)
+    descriptor = made.fileno()
+    made.close()
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(descriptor)

@@ -1,0 +1,86 @@
+"""Snapshots: what is not known is null, and nothing holds back a device that is not driven."""
+
+import pytest
+
+from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
+from tormagd.control.estimate import first_estimate
+from tormagd.control.plan import Plan
+from tormagd.control.step import StepOutput, StepState
+from tormagd.control.trajectory import Reference
+from tormagd.daemon.telemetry import explanations, limits_held, snapshot, tick_row
+from tormagd.hardware.measurement import Measurement
+from tormagd.messages import Telemetry, decode, encode
+from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
+from tormagd.safety.operating_state import DeviceRequest, OperatingState, SafetyState
+
+PLAN = Plan(7, 1.0, 1.5, 0.01, 1.4, 1.38, 500.0, 64.0, -1.0, 0.9, (Limit.RANGE, Limit.SKEW))
+OUTPUT = StepOutput(DriveMode.RUN, 0.1, -0.2, DeviceRequest.NONE, 0, (Limit.SKEW, Limit.RATE))
+MEASUREMENT = Measurement(
+    number=1,
+    received_s=1.0,
+    device_time_s=0.5,
+    left_mm=-15.0,
+    right_mm=-15.5,
+    left_current_A=0.3,
+    right_current_A=0.4,
+    force_N=1.39,
+    handle_mm=3.0,
+    mode=DeviceMode.RUN,
+    switches=Switches.HOMED,
+    faults=DeviceFault(0),
+    temperature_C=25.0,
+    supply_V=12.1,
+)
+
+
+def telemetry(measurement: Measurement | None, state: StepState) -> Telemetry:
+    """What is published, as a client decodes it."""
+    row = tick_row(1.0, state, OUTPUT, PLAN, 1.1, measurement, 20.0, 150.0)
+    return decode(encode(snapshot(row, 3, measurement, 0.012)), Telemetry)
+
+
+def test_a_driven_device() -> None:
+    state = StepState(1.0, SafetyState(OperatingState.ENABLED), first_estimate(MEASUREMENT, 47.5), Reference(64.2))
+    published = telemetry(MEASUREMENT, state)
+    assert published.measured_jp == (32.5, 32.0)
+    assert (published.gap_mm, published.skew_mm, published.gap_setpoint_mm) == (64.5, 0.5, 64.2)
+    assert (published.setpoint_cf, published.governed_cf, published.predicted_cf, published.measured_cf) == (
+        1.5,
+        1.4,
+        1.38,
+        1.39,
+    )
+    assert published.duty == (0.1, -0.2)
+    assert published.setpoint_age_ms == pytest.approx(12.0)
+    assert (published.is_homed, published.is_busy, published.operating_state) == (True, False, "ENABLED")
+    assert (published.tick.lateness_us, published.tick.exec_us) == (20.0, 150.0)
+    # each limit once, those of the plan first
+    assert published.limits == ("RANGE", "SKEW", "RATE")
+
+
+def test_positions_before_homing_are_not_known() -> None:
+    lost = MEASUREMENT._replace(switches=Switches(0), mode=DeviceMode.HOMING)
+    published = telemetry(lost, StepState(1.0, SafetyState(), first_estimate(lost, 47.5)))
+    assert (published.gap_mm, published.measured_jp, published.skew_mm, published.gap_setpoint_mm) == (None,) * 4
+    assert (published.is_homed, published.is_busy) == (False, True)
+    assert published.measured_cf == 1.39
+
+
+def test_without_a_device_nothing_measured_is_known() -> None:
+    published = telemetry(None, StepState(1.0))
+    assert (published.gap_mm, published.measured_cf, published.measured_jp) == (None, None, None)
+    assert (published.is_homed, published.is_busy) == (False, False)
+
+
+@pytest.mark.parametrize("present", OperatingState)
+def test_nothing_holds_back_a_device_that_is_not_driven(present: OperatingState) -> None:
+    held = limits_held(StepState(1.0, SafetyState(present)), OUTPUT, PLAN)
+    assert bool(held) == (present in (OperatingState.ENABLED, OperatingState.PAUSED))
+
+
+def test_codes_are_explained_by_their_table() -> None:
+    (fault,) = explanations(("SKEW",), FAULTS)
+    (limit,) = explanations(("SKEW",), LIMITS)
+    assert fault == {"code": "SKEW", **FAULTS[Fault.SKEW]._asdict()}
+    assert limit == {"code": "SKEW", **LIMITS[Limit.SKEW]._asdict()}
+    assert explanations((), FAULTS) == []

@@ -1,0 +1,314 @@
+"""The conversation with the firmware: who it is, what it was asked, and positions without wrap-around."""
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_protocol.codec import (
+    PROTOCOL_VERSION,
+    SCHEMA_HASH,
+    Clear,
+    DeviceFault,
+    DeviceMode,
+    DriveMode,
+    Hello,
+    Home,
+    Identity,
+    Message,
+    Retract,
+    Sense,
+    State,
+    Status,
+    Switches,
+    decode,
+    encode,
+    period,
+)
+from tormagd.hardware.frame_stream import FrameStream
+from tormagd.hardware.link import HELLO_S, REPEAT_S, SILENT_S, DeviceLink, LinkState
+from tormagd.safety.operating_state import DeviceRequest
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import load_plant
+
+US = Identity(SCHEMA_HASH, 1, 2, 77)
+POSITION_SPAN_MM = period(State, "left_position_mm")
+TIME_SPAN_S = period(State, "device_time_s")
+HANDLE_SPAN_MM = period(Sense, "handle_position_mm")
+
+
+def status(nonce: int = 0, **changes: object) -> Status:
+    healthy = Status(DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 12.0, 0, nonce)
+    return healthy._replace(**changes)  # type: ignore[arg-type]
+
+
+def running(nonce: int = 0) -> DeviceLink:
+    """A link that knows its device, at time 0."""
+    link = DeviceLink(0.0)
+    for message in (*link.due(0.0), US, status(nonce), Sense(0.0, 0.0, 0.0, 0.0), State(0.0, 0.0, 0.0, 0)):
+        if not isinstance(message, Hello):
+            link.receive(0.0, message)
+    assert link.state is LinkState.RUNNING
+    return link
+
+
+def due(link: DeviceLink, from_s: float, until_s: float, heard: bool = True) -> list[tuple[float, Message]]:
+    """What the link sends, asked every millisecond while the device says something that means nothing."""
+    sent = []
+    for tick in range(round(from_s * 1e3), round(until_s * 1e3)):
+        now_s = tick * 1e-3
+        if heard:
+            link.receive(now_s, Sense(0.0, 0.0, 0.0, 0.0))
+        sent += [(now_s, message) for message in link.due(now_s)]
+    return sent
+
+
+# -- who it is -----------------------------------------------------------------------------------------------------
+
+
+def test_hello_is_said_until_somebody_answers_and_then_now_and_again() -> None:
+    link = DeviceLink(0.0)
+    hello = Hello(SCHEMA_HASH, PROTOCOL_VERSION, 0)
+    asking = due(link, 0.0, 0.32)
+    assert [message for _, message in asking] == [hello] * len(asking)
+    assert [at_s for at_s, _ in asking] == pytest.approx([k * REPEAT_S for k in range(7)], abs=8e-3)
+    assert link.state is LinkState.IDENTIFYING
+    link.receive(0.32, US)
+    assert link.state is LinkState.RUNNING
+    later = due(link, 0.32, 0.45 + 3.0 * HELLO_S)
+    assert [message for _, message in later] == [hello] * 4
+    assert later[2][0] - later[1][0] == pytest.approx(HELLO_S, abs=2e-3)
+
+
+def test_another_schema_is_refused_with_both_hashes_and_the_firmwares_version() -> None:
+    link = DeviceLink(0.0)
+    link.receive(0.0, Identity(0x1F00C0DE, 3, 9, 1))
+    assert link.state is LinkState.REFUSED
+    assert all(word in link.cause for word in ("1f00c0de", f"{SCHEMA_HASH:08x}", "3.9"))
+    link.request(0.0, DeviceRequest.HOME)
+    assert all(isinstance(message, Hello) for _, message in due(link, 0.0, 2.0))
+
+
+def test_a_device_that_is_replaced_while_running_is_refused() -> None:
+    link = running()
+    link.receive(1.0, US._replace(schema_hash=SCHEMA_HASH ^ 1))
+    assert link.state is LinkState.REFUSED
+
+
+def test_silence_loses_a_running_link() -> None:
+    link = running()
+    link.receive(0.5, Sense(0.0, 0.0, 0.0, 0.0))
+    link.due(0.5 + SILENT_S)
+    assert link.state is LinkState.RUNNING
+    link.due(0.5 + SILENT_S + 1e-3)
+    assert link.state is LinkState.LOST
+    assert "100 ms" in link.cause
+
+
+def test_waiting_for_the_first_answer_is_no_loss() -> None:
+    link = DeviceLink(0.0)
+    due(link, 0.0, 10.0, heard=False)
+    assert link.state is LinkState.IDENTIFYING
+
+
+def test_drive_counters_go_round() -> None:
+    link = running()
+    counters = [link.drive(0.1, -0.2, DriveMode.RUN).counter for _ in range(600)]
+    assert all((after - before) % 256 == 1 for before, after in pairwise(counters))
+    assert link.drive(0.1, -0.2, DriveMode.RUN)[:3] == (0.1, -0.2, DriveMode.RUN)
+
+
+# -- what it was asked ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("request_", "kind"),
+    [(DeviceRequest.HOME, Home), (DeviceRequest.RETRACT, Retract), (DeviceRequest.CLEAR, Clear)],
+)
+def test_a_command_is_repeated_until_its_own_number_comes_back(request_: DeviceRequest, kind: type[Message]) -> None:
+    link = running()
+    link.request(1.0, request_)
+    sent = due(link, 1.0, 1.23)
+    assert {type(message) for _, message in sent} == {kind}
+    assert len({message.nonce for _, message in sent}) == 1  # type: ignore[union-attr]
+    assert [at_s for at_s, _ in sent] == pytest.approx([1.0 + k * REPEAT_S for k in range(5)], abs=5e-3)
+    nonce = sent[0][1].nonce  # type: ignore[union-attr]
+    link.receive(1.23, status((nonce + 1) % 256))
+    assert kind in {type(message) for _, message in due(link, 1.23, 1.3)}
+    link.receive(1.3, status(nonce))
+    assert kind not in {type(message) for _, message in due(link, 1.3, 2.5)}
+
+
+def test_no_hello_comes_between_a_command_and_its_acknowledgement() -> None:
+    """The device takes a Hello's number for the last accepted one: that must not look like an acknowledgement."""
+    link = running()
+    link.request(0.5, DeviceRequest.HOME)
+    waiting = due(link, 0.5, 3.0)
+    assert all(isinstance(message, Home) for _, message in waiting)
+    nonce = waiting[0][1].nonce  # type: ignore[union-attr]
+    link.receive(3.0, status(nonce))
+    hellos = [message for _, message in due(link, 3.0, 5.0)]
+    assert hellos
+    assert all(message == Hello(SCHEMA_HASH, PROTOCOL_VERSION, nonce) for message in hellos)
+    link.request(5.0, DeviceRequest.RETRACT)
+    link.receive(5.0, status(hellos[-1].nonce))  # type: ignore[union-attr]
+    assert any(isinstance(message, Retract) for _, message in due(link, 5.0, 5.1))
+
+
+def test_every_request_has_a_new_number_and_none_is_zero() -> None:
+    link = running()
+    last = 0
+    for turn in range(600):
+        link.request(turn * 0.1, DeviceRequest.HOME)
+        link.receive(turn * 0.1, status(last))
+        (nonce,) = [message.nonce for message in link.due(turn * 0.1) if isinstance(message, Home)]
+        assert nonce != last
+        assert 1 <= nonce <= 255
+        last = nonce
+        link.receive(turn * 0.1, status(nonce))
+
+
+def test_a_newer_request_replaces_an_unfinished_one() -> None:
+    link = running()
+    link.request(0.01, DeviceRequest.HOME)
+    (home,) = link.due(0.01)
+    link.request(0.02, DeviceRequest.RETRACT)
+    (retract,) = link.due(0.02)
+    assert isinstance(home, Home)
+    assert isinstance(retract, Retract)
+    assert home.nonce != retract.nonce
+    link.receive(0.03, status(home.nonce))
+    assert any(isinstance(message, Retract) for _, message in due(link, 0.03, 0.1))
+
+
+@pytest.mark.parametrize("left_by_another_host", [0, 1, 2, 254, 255])
+@pytest.mark.parametrize("is_early", [False, True], ids=["after the first Status", "before it"])
+def test_a_number_that_another_host_used_last_is_no_acknowledgement(left_by_another_host: int, is_early: bool) -> None:
+    link = DeviceLink(0.0)
+    if is_early:
+        link.request(0.0, DeviceRequest.RETRACT)
+        assert not any(isinstance(message, Retract) for message in link.due(0.0))
+    link.receive(0.0, US)
+    link.receive(0.0, status(left_by_another_host))
+    if not is_early:
+        link.request(0.0, DeviceRequest.RETRACT)
+    link.receive(0.01, status(left_by_another_host))
+    (retract,) = [message for _, message in due(link, 0.01, 0.05) if isinstance(message, Retract)]
+    assert retract.nonce not in (0, left_by_another_host)
+
+
+def test_a_second_host_homes_a_device_that_the_first_one_homed() -> None:
+    """A daemon that was started again talks to a device that has stayed on, and counts from the start."""
+    device = VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1)
+    ticks = 0
+    for _ in range(2):
+        link, stream = DeviceLink(ticks * 1e-3), FrameStream()
+        was_homing = False
+        for tick in range(200):
+            ticks += 1
+            now_s = ticks * 1e-3
+            for message in stream.unpack(device.transmit(now_s)):
+                link.receive(now_s, message)
+            if tick == 100:
+                link.request(now_s, DeviceRequest.HOME)
+            for message in (*link.due(now_s), link.drive(0.0, 0.0, DriveMode.OFF)):
+                device.receive(now_s, stream.pack(message))
+            was_homing |= link.measurement is not None and link.measurement.mode is DeviceMode.HOMING
+        assert was_homing
+        for _ in range(8_000):  # the rest of the homing, unattended
+            ticks += 1
+            device.transmit(ticks * 1e-3)
+
+
+# -- what it measured ----------------------------------------------------------------------------------------------
+
+
+def test_a_measurement_takes_a_status_a_sense_and_a_state() -> None:
+    link = DeviceLink(0.0)
+    link.receive(0.0, US)
+    for message in (State(0.0, 0.0, 0.0, 0), Sense(0.1, 0.2, 0.3, 0.0), State(0.0, 0.0, 0.0, 1)):
+        link.receive(0.0, message)
+        assert link.measurement is None
+    link.receive(0.0, status(supply_V=11.5))
+    link.receive(0.7, State(-3.0, -4.0, 0.25, 2))
+    measurement = link.measurement
+    assert measurement is not None
+    assert measurement[:9] == (0, 0.7, 0.25, -3.0, -4.0, 0.1, 0.2, 0.3, 0.0)
+    assert (measurement.supply_V, measurement.mode) == (11.5, DeviceMode.IDLE)
+    assert link.age_s(0.8) == pytest.approx(0.1)
+
+
+def test_a_status_updates_what_it_knows_and_leaves_the_number() -> None:
+    link = running()
+    before = link.measurement
+    assert before is not None
+    link.receive(
+        1.0, status(mode=DeviceMode.LATCHED, switches=Switches(0), faults=DeviceFault.SKEW, temperature_C=41.0)
+    )
+    after = link.measurement
+    assert after is not None
+    assert (after.mode, after.faults, after.temperature_C) == (DeviceMode.LATCHED, DeviceFault.SKEW, 41.0)
+    assert (after.is_homed, after.is_latched, after.is_busy) == (False, True, False)
+    assert (after.number, after.received_s) == (before.number, before.received_s)
+
+
+@pytest.mark.parametrize(
+    ("mode", "faults", "busy", "latched"),
+    [
+        (DeviceMode.IDLE, DeviceFault(0), False, False),
+        (DeviceMode.RUN, DeviceFault(0), False, False),
+        (DeviceMode.HOMING, DeviceFault(0), True, False),
+        (DeviceMode.RETRACTING, DeviceFault.SUPPLY, True, True),
+        (DeviceMode.LATCHED, DeviceFault(0), False, True),
+    ],
+)
+def test_busy_and_latched(mode: DeviceMode, faults: DeviceFault, busy: bool, latched: bool) -> None:
+    link = running()
+    link.receive(0.1, status(mode=mode, faults=faults))
+    assert link.measurement is not None
+    assert (link.measurement.is_busy, link.measurement.is_latched) == (busy, latched)
+
+
+def through_the_wire(message: Message) -> Message:
+    """What arrives of a message: quantised and wrapped."""
+    function = {State: 3, Sense: 4}[type(message)]
+    return decode(function, encode(message))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    start=st.tuples(st.floats(-55.0, 55.0), st.floats(-55.0, 55.0), st.floats(0.0, 0.6), st.floats(0.0, 120.0)),
+    moves=st.lists(
+        st.tuples(
+            st.floats(-0.45 * POSITION_SPAN_MM, 0.45 * POSITION_SPAN_MM),
+            st.floats(-0.45 * POSITION_SPAN_MM, 0.45 * POSITION_SPAN_MM),
+            st.floats(1e-4, 0.95 * TIME_SPAN_S),
+            st.floats(-0.45 * HANDLE_SPAN_MM, 0.45 * HANDLE_SPAN_MM),
+        ),
+        max_size=30,
+    ),
+)
+def test_wraps_are_taken_out(
+    start: tuple[float, float, float, float], moves: list[tuple[float, float, float, float]]
+) -> None:
+    """Any motion of less than half a wrap per message comes out as it was, but for the wire's steps."""
+    left, right, time_s, handle = start
+    link = DeviceLink(0.0)
+    link.receive(0.0, status())
+    link.receive(0.0, through_the_wire(Sense(0.0, 0.0, 0.0, handle)))
+    link.receive(0.0, through_the_wire(State(left, right, time_s, 0)))
+    first = link.measurement
+    assert first is not None
+    for number, (left_mm, right_mm, elapsed_s, handle_mm) in enumerate(moves, 1):
+        left, right, time_s, handle = left + left_mm, right + right_mm, time_s + elapsed_s, handle + handle_mm
+        link.receive(number * 1e-3, through_the_wire(State(left, right, time_s, number % 256)))
+        link.receive(number * 1e-3, through_the_wire(Sense(0.0, 0.0, 0.0, handle)))
+    last = link.measurement
+    assert last is not None
+    assert last.number == len(moves)
+    assert last.left_mm - first.left_mm == pytest.approx(left - start[0], abs=2e-3)
+    assert last.right_mm - first.right_mm == pytest.approx(right - start[1], abs=2e-3)
+    assert last.device_time_s - first.device_time_s == pytest.approx(time_s - start[2], abs=2e-5)
+    assert last.handle_mm == pytest.approx(handle - start[3], abs=8e-3)

@@ -1,0 +1,210 @@
+"""The serial backend over a real pseudo-terminal, and how a backend is found."""
+
+import contextlib
+import errno
+import os
+import select
+import termios
+import tty
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from firmware_protocol.codec import DeviceFault, DeviceMode, Drive, DriveMode, Home, Status, Switches
+from tormagd.config import ConfigError, Device
+from tormagd.hardware import backend as backends
+from tormagd.hardware.backend import BackendError, opener
+from tormagd.hardware.frame_stream import FrameStream
+from tormagd.hardware.serial_backend import SerialBackend, open_serial
+
+STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
+
+
+class Line(NamedTuple):
+    """A pseudo-terminal whose far end the test holds."""
+
+    far: int
+    near: int
+    device: Device
+
+    def read(self) -> bytes:
+        """What has arrived at the far end."""
+        data = b""
+        while select.select([self.far], [], [], 0.2 if not data else 0.0)[0]:
+            data += os.read(self.far, 65_536)
+        return data
+
+
+@pytest.fixture
+def line() -> Iterator[Line]:
+    far, near = os.openpty()
+    tty.setraw(near)
+    os.set_blocking(far, False)
+    yield Line(far, near, Device(port=os.ttyname(near)))
+    for descriptor in (far, near):
+        with contextlib.suppress(OSError):  # a test that unplugs has closed it already
+            os.close(descriptor)
+
+
+@pytest.fixture
+def port(line: Line) -> Iterator[SerialBackend]:
+    opened = open_serial(line.device)
+    yield opened
+    opened.close()
+
+
+def wait_readable(port: SerialBackend) -> None:
+    assert select.select([port.fileno()], [], [], 5.0)[0]
+
+
+def test_messages_pass_both_ways(line: Line, port: SerialBackend) -> None:
+    far = FrameStream()
+    assert port.receive() == []
+    os.write(line.far, far.pack(STATUS) + far.pack(STATUS._replace(drive_counter=9)))
+    wait_readable(port)
+    assert [message.drive_counter for message in port.receive()] == [0, 9]  # type: ignore[union-attr]
+    port.send(Home(7))
+    port.send(Drive(0.5, -0.5, DriveMode.RUN, 1))
+    assert far.unpack(line.read()) == [Home(7), Drive(0.5, -0.5, DriveMode.RUN, 1)]
+    assert (port.statistics.frames, port.statistics.corrupt) == (2, 0)
+
+
+def test_a_frame_may_arrive_in_pieces(line: Line, port: SerialBackend) -> None:
+    frame = FrameStream().pack(STATUS)
+    for piece in (frame[:5], frame[5:]):
+        os.write(line.far, piece)
+        wait_readable(port)
+        received = port.receive()
+    assert received == [STATUS]
+
+
+def test_bytes_from_before_the_opening_are_not_read(line: Line) -> None:
+    os.write(line.far, b"half a frame of an earlier life")
+    port = open_serial(line.device)
+    os.write(line.far, FrameStream().pack(STATUS))
+    wait_readable(port)
+    assert port.receive() == [STATUS]
+    assert port.statistics.corrupt == 0
+    port.close()
+
+
+def test_a_second_opening_is_refused_until_the_first_has_closed(line: Line) -> None:
+    first = open_serial(line.device)
+    with pytest.raises(BackendError, match=r"cannot be opened") as caught:
+        open_serial(line.device)
+    assert line.device.port in str(caught.value)
+    first.close()
+    open_serial(line.device).close()
+
+
+def test_a_device_that_goes_away_is_said_by_reading_and_writing(line: Line, port: SerialBackend) -> None:
+    os.close(line.far)
+    with pytest.raises(BackendError, match=line.device.port):
+        port.receive()
+    with pytest.raises(BackendError, match=line.device.port):
+        port.send(Home(1))
+
+
+def test_end_of_file_is_a_device_that_was_unplugged(port: SerialBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A real USB port reads nothing, for ever, once its device is gone."""
+    monkeypatch.setattr(os, "read", lambda descriptor, count: b"")
+    with pytest.raises(BackendError, match="unplugged"):
+        port.receive()
+
+
+def test_a_far_end_that_does_not_read_is_noticed(port: SerialBackend) -> None:
+    def send_for_long() -> None:
+        for counter in range(20_000):
+            port.send(Drive(0.0, 0.0, DriveMode.OFF, counter % 256))
+
+    with pytest.raises(BackendError, match="nobody reads"):
+        send_for_long()
+
+
+def test_what_the_driver_did_not_take_is_sent_before_the_next_frame(
+    line: Line, port: SerialBackend, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken = b""
+    room = iter([3, 0, 7, 0, 0, 100, 100])
+
+    def write(descriptor: int, data: bytes) -> int:
+        nonlocal taken
+        assert descriptor == port.fileno()
+        count = next(room)
+        if not count:
+            raise BlockingIOError
+        taken += data[:count]
+        return len(data[:count])
+
+    monkeypatch.setattr(os, "write", write)
+    for nonce in range(1, 8):
+        port.send(Home(nonce))
+    far = FrameStream()
+    assert far.unpack(taken) == [Home(nonce) for nonce in range(1, 8)]
+    assert far.statistics.lost == 0
+
+
+def test_closing_twice_or_after_the_device_has_gone_is_silent(line: Line) -> None:
+    port = open_serial(line.device)
+    os.close(line.far)
+    port.close()
+    port.close()
+
+
+def test_a_port_that_goes_while_it_is_set_up_is_not_opened(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(descriptor: int) -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(termios, "tcgetattr", gone)
+    with pytest.raises(BackendError, match="Input/output error"):
+        open_serial(line.device)
+
+
+@pytest.mark.parametrize("kind", ["absent", "a directory", "a file"])
+def test_what_is_no_serial_port_is_not_opened(tmp_path: Path, kind: str) -> None:
+    path = {"absent": tmp_path / "absent", "a directory": tmp_path, "a file": tmp_path / "file"}[kind]
+    if kind == "a file":
+        path.write_text("")
+    with pytest.raises(BackendError, match="cannot be opened") as caught:
+        open_serial(Device(port=str(path)))
+    assert str(caught.value).count(str(path)) == 1
+
+
+# -- finding one ---------------------------------------------------------------------------------------------------
+
+
+def installed(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
+    """Pretends that these plugins are installed."""
+    points = [metadata.EntryPoint(name, value, backends.ENTRY_POINTS) for name, value in entries.items()]
+    monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == backends.ENTRY_POINTS else [])
+
+
+def test_the_serial_backend_is_installed() -> None:
+    assert opener(Device()) is open_serial
+
+
+def test_a_plugin_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    installed(monkeypatch, other="os:getpid", serial="tormagd.hardware.serial_backend:open_serial")
+    assert opener(Device(backend="other")) is os.getpid
+
+
+def test_an_unknown_backend_names_the_installed_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    installed(monkeypatch, zeta="os:getpid", alpha="os:getpid")
+    with pytest.raises(ConfigError, match=r"device\.backend = 'telepathy': installed are alpha, zeta"):
+        opener(Device(backend="telepathy"))
+    installed(monkeypatch)
+    with pytest.raises(ConfigError, match="installed are none"):
+        opener(Device(backend="telepathy"))
+
+
+@pytest.mark.parametrize("value", ["no_such_module_anywhere:open", "os:no_such_attribute"])
+def test_a_plugin_that_does_not_load_is_refused_and_stops_nobody_else(
+    monkeypatch: pytest.MonkeyPatch, value: str
+) -> None:
+    installed(monkeypatch, broken=value, fine="os:getpid")
+    with pytest.raises(ConfigError, match=r"device\.backend = 'broken': the plugin does not load"):
+        opener(Device(backend="broken"))
+    assert opener(Device(backend="fine")) is os.getpid

@@ -1,0 +1,289 @@
+"""The ZeroMQ messages: whatever arrives becomes a valid message or a MessageError, and nothing else."""
+
+import math
+from typing import Any
+
+import msgpack
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tormagd.messages import (
+    MAX_MESSAGE_BYTES,
+    MAX_PREVIEW_SAMPLES,
+    ErrorReply,
+    MessageError,
+    Reply,
+    Request,
+    Setpoint,
+    Telemetry,
+    Tick,
+    decode,
+    encode,
+)
+
+SETPOINT: dict[str, Any] = {"v": 1, "source": "a", "seq": 7, "stamp_ns": 10**18, "servo_cf": 1.5, "valid_for_ms": 50.0}
+REQUEST: dict[str, Any] = {"v": 1, "id": 3, "command": "status"}
+TYPES = (Setpoint, Telemetry, Request, Reply)
+
+forces = st.floats(0.0, 1_000.0)
+motions = st.none() | st.floats(allow_nan=False, allow_infinity=False)
+setpoints = st.builds(
+    Setpoint,
+    v=st.just(1),
+    source=st.text(min_size=1, max_size=64).filter(lambda text: text.isprintable()),
+    seq=st.integers(0, 2**63 - 1),
+    stamp_ns=st.integers(0, 2**63 - 1),
+    servo_cf=forces,
+    valid_for_ms=st.floats(0.0, 60_000.0, exclude_min=True),
+    displacement_mm=motions,
+    rate_mm_s=motions,
+    preview_N=st.lists(forces, max_size=256).map(tuple),
+    preview_dt_ms=st.floats(0.0, 1_000.0, exclude_min=True),
+)
+values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.text(max_size=8)
+    | st.binary(max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=8,
+)
+
+
+def changed(base: dict[str, Any], **fields: Any) -> bytes:
+    """The packed map with some fields replaced."""
+    packed: bytes = msgpack.packb(base | fields)
+    return packed
+
+
+def refusal(data: bytes, kind: type[Any] = Setpoint) -> str:
+    """Why the message is refused."""
+    with pytest.raises(MessageError) as caught:
+        decode(data, kind)
+    return str(caught.value)
+
+
+@given(setpoints)
+def test_setpoints_come_back_as_they_went(setpoint: Setpoint) -> None:
+    assert decode(encode(setpoint), Setpoint) == setpoint
+
+
+@given(
+    st.builds(
+        Request,
+        v=st.just(1),
+        id=st.integers(-(2**63), 2**63 - 1) | st.text(max_size=20),
+        command=st.text(min_size=1, max_size=64),
+        args=st.dictionaries(st.text(max_size=8), st.none() | st.booleans() | st.text(max_size=8), max_size=4),
+    )
+)
+def test_requests_come_back_as_they_went(request_: Request) -> None:
+    assert decode(encode(request_), Request) == request_
+
+
+def test_replies_and_telemetry_come_back_as_they_went() -> None:
+    refused = Reply(v=1, id=None, ok=False, error=ErrorReply("busy", "homing", "wait"))
+    done = Reply(v=1, id="x", ok=True, result={"operating_state": "ENABLED", "faults": []})
+    assert decode(encode(refused), Reply) == refused
+    assert decode(encode(done), Reply) == done
+    telemetry = Telemetry(
+        v=1,
+        t_ns=1,
+        seq=2,
+        operating_state="DISABLED",
+        is_homed=False,
+        is_busy=False,
+        setpoint_cf=None,
+        governed_cf=0.4,
+        measured_cf=None,
+        predicted_cf=None,
+        field_mT=51.0,
+        gap_mm=None,
+        gap_setpoint_mm=None,
+        measured_jp=(47.5, 47.4),
+        skew_mm=None,
+        duty=(0.0, -1.0),
+        limits=("STALE",),
+        faults=(),
+        setpoint_age_ms=None,
+        confidence=1.0,
+        tick=Tick(12.0, 100.0),
+    )
+    assert decode(encode(telemetry), Telemetry) == telemetry
+
+
+def test_a_message_is_a_plain_msgpack_map() -> None:
+    """What a publisher in any language writes is what we write."""
+    assert msgpack.unpackb(encode(decode(changed(SETPOINT), Setpoint))) == SETPOINT
+
+
+def test_the_longest_preview_fits_the_size_limit() -> None:
+    preview = tuple(1.0 + 1.0 / (k + 3.0) for k in range(MAX_PREVIEW_SAMPLES))
+    full = msgspec.structs.replace(decode(changed(SETPOINT), Setpoint), preview_N=preview, preview_dt_ms=2.0)
+    assert len(encode(full)) < MAX_MESSAGE_BYTES / 4
+    assert decode(encode(full), Setpoint) == full
+
+
+@pytest.mark.parametrize("kind", [Setpoint, Request])
+def test_unknown_fields_are_ignored(kind: type[Any]) -> None:
+    base = {Setpoint: SETPOINT, Request: REQUEST}[kind]
+    newer = changed(base, colour="blue", nested={"v": 2, "list": [1, None]})
+    assert decode(newer, kind) == decode(changed(base), kind)
+
+
+@pytest.mark.parametrize("name", SETPOINT)
+def test_a_missing_field_is_named(name: str) -> None:
+    assert name in refusal(msgpack.packb({key: value for key, value in SETPOINT.items() if key != name}))
+
+
+@pytest.mark.parametrize("name", ["v", "seq", "stamp_ns", "servo_cf", "valid_for_ms", "displacement_mm", "rate_mm_s"])
+@pytest.mark.parametrize("value", ["1.5", True, [1.5], {"N": 1.5}, b"1.5", "nan"])
+def test_a_number_is_a_number(name: str, value: object) -> None:
+    text = refusal(changed(SETPOINT, **{name: value}))
+    assert name in text or isinstance(value, bytes)  # msgpack refuses binary before names are known
+
+
+@pytest.mark.parametrize("name", ["servo_cf", "valid_for_ms", "displacement_mm", "rate_mm_s"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_numbers_that_are_not_finite_are_refused(name: str, value: float) -> None:
+    text = refusal(changed(SETPOINT, **{name: value}))
+    assert f"{name} = {value}" in text
+    assert "allowed is" in text
+
+
+@pytest.mark.parametrize(
+    ("fields", "name"),
+    [
+        ({"v": 2}, "v = 2"),
+        ({"v": 0}, "v = 0"),
+        ({"source": ""}, "source = ''"),
+        ({"source": "x" * 65}, "source"),
+        ({"seq": -1}, "seq = -1"),
+        ({"seq": 2**63}, "seq"),
+        ({"seq": 1.5}, "seq"),
+        ({"stamp_ns": -1}, "stamp_ns = -1"),
+        ({"stamp_ns": 2**64 - 1}, "stamp_ns"),
+        ({"servo_cf": -1e-9}, "servo_cf = -1e-09"),
+        ({"servo_cf": 1_000.1}, "servo_cf = 1000.1"),
+        ({"valid_for_ms": 0.0}, "valid_for_ms = 0.0"),
+        ({"valid_for_ms": 60_001.0}, "valid_for_ms = 60001.0"),
+        ({"preview_N": [1.0] * 257, "preview_dt_ms": 2.0}, "preview_N = '257 values'"),
+        ({"preview_N": [1.0, math.nan], "preview_dt_ms": 2.0}, "preview_N"),
+        ({"preview_N": [1.0, -1.0], "preview_dt_ms": 2.0}, "preview_N"),
+        ({"preview_N": [1.0, "2"], "preview_dt_ms": 2.0}, "preview_N"),
+        ({"preview_N": [1.0]}, "preview_dt_ms = None"),
+        ({"preview_N": [1.0], "preview_dt_ms": 0.0}, "preview_dt_ms = 0.0"),
+        ({"preview_N": [1.0], "preview_dt_ms": math.inf}, "preview_dt_ms = inf"),
+    ],
+)
+def test_values_out_of_range_are_named(fields: dict[str, Any], name: str) -> None:
+    assert name in refusal(changed(SETPOINT, **fields))
+
+
+def test_integers_are_forces_too() -> None:
+    assert decode(changed(SETPOINT, servo_cf=2), Setpoint).servo_cf == 2.0
+
+
+@pytest.mark.parametrize(
+    ("fields", "name"),
+    [
+        ({"v": 3}, "v = 3"),
+        ({"command": ""}, "command"),
+        ({"command": "c" * 65}, "command"),
+        ({"id": None}, "id"),
+        ({"id": 1.0}, "id"),
+        ({"args": []}, "args"),
+    ],
+)
+def test_requests_out_of_range_are_named(fields: dict[str, Any], name: str) -> None:
+    assert name in refusal(changed(REQUEST, **fields), Request)
+
+
+@pytest.mark.parametrize("size", [MAX_MESSAGE_BYTES + 1, 10_000_000])
+def test_oversize_is_refused_before_it_is_read(size: int) -> None:
+    assert f"{size} bytes" in refusal(b"\xc1" * size)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\x80",
+        b"\xc1",
+        b"\xdf\xff\xff\xff\xff",  # a map that claims 2^32 - 1 entries
+        b"\xdd\xff\xff\xff\xff",
+        b"\xc6\xff\xff\xff\xff",
+        b"\x91" * MAX_MESSAGE_BYTES,  # arrays in arrays in arrays
+        b"\x81\xa1a" * (MAX_MESSAGE_BYTES // 3),
+        b"\x81\x01\x01",  # a key that is no text
+        b"\x81\x90\x01",  # a key that cannot be hashed
+        b"\xd6\xff\x00\x00\x00\x00",  # a timestamp
+        b"\xc7\x00\x05",
+        b"\x81\xa2\xff\xfe\x01",  # a key that is not UTF-8
+        msgpack.packb([1, 2, 3]),
+        msgpack.packb(SETPOINT) + b"\x00",
+        msgpack.packb(SETPOINT)[:-1],
+    ],
+    ids=range(16),
+)
+@pytest.mark.parametrize("kind", TYPES)
+def test_broken_msgpack_is_a_message_error(data: bytes, kind: type[Any]) -> None:
+    refusal(data, kind)
+
+
+@pytest.mark.parametrize("depth", [100, 300, 400, 511, 600, 900, 1000, 1023, 1100])
+@pytest.mark.parametrize("one", [b"\x91", b"\x81\xa1a"])
+def test_deep_nesting_is_decoded_or_refused(depth: int, one: bytes) -> None:
+    """Where free values are allowed, their depth is not the recursion limit's business."""
+    nested = b"\x84\xa1v\x01\xa2id\x01\xa7command\xa1x\xa4args\x81\xa1k" + one * depth + b"\xc0"
+    try:
+        request = decode(nested, Request)
+    except MessageError:
+        return
+    assert request.command == "x"
+
+
+@settings(max_examples=300)
+@given(data=st.binary(max_size=200), kind=st.sampled_from(TYPES))
+def test_random_bytes_are_a_message_error(data: bytes, kind: type[Any]) -> None:
+    refusal(data, kind)
+
+
+@settings(max_examples=300)
+@given(
+    base=st.sampled_from([SETPOINT, REQUEST]),
+    changes=st.dictionaries(
+        st.sampled_from([*SETPOINT, *REQUEST, "args", "preview_N", "preview_dt_ms", "rate_mm_s"]), values
+    ),
+    dropped=st.sets(st.sampled_from([*SETPOINT, *REQUEST])),
+    kind=st.sampled_from(TYPES),
+)
+def test_any_map_is_a_valid_message_or_a_message_error(
+    base: dict[str, Any], changes: dict[str, Any], dropped: set[str], kind: type[Any]
+) -> None:
+    fields = {key: value for key, value in (base | changes).items() if key not in dropped}
+    try:
+        message = decode(msgpack.packb(fields), kind)
+    except MessageError:
+        return
+    if isinstance(message, Setpoint):
+        assert 0.0 <= message.servo_cf <= 1_000.0
+        assert 0.0 < message.valid_for_ms <= 60_000.0
+        assert all(value is None or math.isfinite(value) for value in (message.displacement_mm, message.rate_mm_s))
+
+
+@given(cut=st.integers(0, 200), flipped=st.integers(0, 200), bit=st.integers(0, 7))
+def test_damaged_setpoints_never_break_the_decoder(cut: int, flipped: int, bit: int) -> None:
+    data = bytearray(changed(SETPOINT, rate_mm_s=3.0, preview_N=[1.0, 2.0], preview_dt_ms=2.0))
+    data[flipped % len(data)] ^= 1 << bit
+    try:
+        decode(bytes(data[: cut or None]), Setpoint)
+    except MessageError as error:
+        refused = str(error)
+    else:
+        return
+    assert refused

@@ -1,0 +1,232 @@
+"""The operating state: armed on purpose, opened on every fault, never re-armed by itself."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from tormagd.safety.codes import Fault
+from tormagd.safety.operating_state import (
+    CLEARING_S,
+    Conditions,
+    DeviceRequest,
+    OperatingState,
+    RefusedError,
+    SafetyState,
+    command,
+    latch,
+)
+
+COMMANDS = ("enable", "disable", "pause", "resume", "home", "stop", "clear-fault")
+READY = Conditions(
+    connected=True, fresh=True, homed=True, busy=False, device_latched=False, requested_N=None, neutral_N=0.5
+)
+DISABLED, ENABLED, PAUSED, FAULT = OperatingState
+FAULTED = latch(SafetyState(), (Fault.SKEW,))
+
+conditions = st.builds(
+    Conditions,
+    connected=st.sampled_from([True, True, True, False]),
+    fresh=st.sampled_from([True, True, True, False]),
+    homed=st.sampled_from([True, True, True, False]),
+    busy=st.sampled_from([False, False, False, True]),
+    device_latched=st.sampled_from([False, False, False, True]),
+    requested_N=st.none() | st.floats(0.0, 2.0),
+    neutral_N=st.floats(0.1, 1.0),
+)
+faults = st.lists(st.sampled_from(Fault), max_size=3, unique=True).map(tuple)
+
+
+def refusal(state: SafetyState, name: str, present: Conditions = READY) -> RefusedError:
+    """Why a command is refused."""
+    with pytest.raises(RefusedError) as caught:
+        command(state, name, 0.0, present)
+    assert caught.value.message
+    assert caught.value.hint
+    return caught.value
+
+
+def test_starts_disabled_and_asks_nothing() -> None:
+    assert SafetyState() == SafetyState(DISABLED, (), DeviceRequest.NONE, 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({"connected": False}, "not_connected"),
+        ({"device_latched": True}, "device_latched"),
+        ({"busy": True}, "busy"),
+        ({"homed": False}, "not_homed"),
+        ({"fresh": False}, "not_fresh"),
+        ({"requested_N": 0.501}, "not_neutral"),
+        ({"requested_N": float("nan")}, "not_neutral"),
+    ],
+)
+def test_enable_wants_every_condition(changes: dict[str, bool | float], code: str) -> None:
+    assert command(SafetyState(), "enable", 0.0, READY).operating_state is ENABLED
+    assert refusal(SafetyState(), "enable", READY._replace(**changes)).code == code
+
+
+def test_a_neutral_setpoint_may_be_enabled_on() -> None:
+    assert command(SafetyState(), "enable", 0.0, READY._replace(requested_N=0.5)).operating_state is ENABLED
+
+
+@pytest.mark.parametrize(
+    ("name", "allowed"),
+    [
+        ("enable", {DISABLED}),
+        ("disable", {DISABLED, ENABLED, PAUSED}),
+        ("pause", {ENABLED}),
+        ("resume", {PAUSED}),
+        ("home", {DISABLED}),
+        ("stop", set(OperatingState)),
+        ("clear-fault", set(OperatingState)),
+    ],
+)
+@pytest.mark.parametrize("present", OperatingState)
+def test_each_command_in_each_state(name: str, allowed: set[OperatingState], present: OperatingState) -> None:
+    state = FAULTED if present is FAULT else SafetyState(present)
+    if present in allowed:
+        command(state, name, 0.0, READY)
+    else:
+        refusal(state, name)
+
+
+@pytest.mark.parametrize(
+    ("present", "name", "after", "request_"),
+    [
+        (ENABLED, "pause", PAUSED, None),
+        (PAUSED, "resume", ENABLED, None),
+        (ENABLED, "disable", DISABLED, DeviceRequest.RETRACT),
+        (PAUSED, "disable", DISABLED, DeviceRequest.RETRACT),
+        (DISABLED, "disable", DISABLED, DeviceRequest.RETRACT),
+        (DISABLED, "home", DISABLED, DeviceRequest.HOME),
+        (ENABLED, "stop", FAULT, DeviceRequest.RETRACT),
+    ],
+)
+def test_what_a_command_does(
+    present: OperatingState, name: str, after: OperatingState, request_: DeviceRequest | None
+) -> None:
+    state = command(SafetyState(present), name, 0.0, READY)
+    assert state.operating_state is after
+    assert (state.request, state.request_number) == ((request_, 1) if request_ else (DeviceRequest.NONE, 0))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_without_a_device_only_stop_is_taken(name: str) -> None:
+    gone = READY._replace(connected=False, fresh=False)
+    if name == "stop":
+        assert command(SafetyState(), name, 0.0, gone).faults == (Fault.STOPPED,)
+    else:
+        assert refusal(SafetyState(), name, gone).code == "not_connected"
+
+
+@pytest.mark.parametrize("name", ["enable", "home", "clear-fault"])
+def test_a_busy_device_is_left_to_finish(name: str) -> None:
+    assert refusal(SafetyState(), name, READY._replace(busy=True)).code == "busy"
+
+
+def test_an_unknown_command_lists_the_known_ones() -> None:
+    refused = refusal(SafetyState(), "detonate")
+    assert refused.code == "unknown_command"
+    assert "detonate" in refused.message
+    assert all(name in refused.hint for name in COMMANDS)
+
+
+def test_a_command_refused_in_fault_names_the_faults() -> None:
+    refused = refusal(FAULTED, "enable")
+    assert refused.code == "fault"
+    assert Fault.SKEW in refused.message
+    assert "clear-fault" in refused.hint
+
+
+def test_clearing_asks_the_device_only_where_it_has_latched_too() -> None:
+    ours = command(FAULTED, "clear-fault", 2.0, READY)
+    assert (ours.operating_state, ours.faults, ours.request_number) == (DISABLED, (), FAULTED.request_number)
+    assert ours.clearing_until_s == 2.0 + CLEARING_S
+    both = command(FAULTED, "clear-fault", 2.0, READY._replace(device_latched=True))
+    assert (both.request, both.request_number) == (DeviceRequest.CLEAR, FAULTED.request_number + 1)
+
+
+def test_faults_are_kept_in_the_order_they_came() -> None:
+    state = latch(latch(SafetyState(), (Fault.SKEW,)), (Fault.STOPPED, Fault.SKEW, Fault.LINK_LOST))
+    assert state.faults == (Fault.SKEW, Fault.STOPPED, Fault.LINK_LOST)
+
+
+@given(present=faults, again=faults)
+def test_latching_twice_is_latching_once(present: tuple[Fault, ...], again: tuple[Fault, ...]) -> None:
+    once = latch(latch(SafetyState(), present), again)
+    assert latch(once, again) is once
+    assert set(once.faults) == {*present, *again}
+
+
+class Operating(RuleBasedStateMachine):
+    """Operators, faults and a device in any condition, against the rules of arming."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.state = SafetyState()
+        self.now_s = 0.0
+
+    @rule(name=st.sampled_from(COMMANDS), present=conditions, elapsed_s=st.floats(0.0, 1.0))
+    def operate(self, name: str, present: Conditions, elapsed_s: float) -> None:
+        self.now_s += elapsed_s
+        before = self.state
+        after = self._commanded(name, present)
+        if after is None:
+            assert name != "stop"
+            return
+        self.state = after
+        self._check_request(before)
+        if name == "enable":
+            assert before.operating_state is DISABLED
+            assert present.homed
+            assert present.fresh
+            assert present.connected
+            assert not present.busy
+            assert not present.device_latched
+            assert present.requested_N is None or present.requested_N <= present.neutral_N
+        elif self.state.operating_state is ENABLED:
+            assert (name, before.operating_state) == ("resume", PAUSED) or before.operating_state is ENABLED
+        if before.operating_state is FAULT:
+            assert (self.state.operating_state is FAULT) == (name == "stop")
+            assert name in ("stop", "clear-fault")
+        if before.operating_state is ENABLED and self.state.operating_state in (DISABLED, FAULT):
+            assert self.state.request is DeviceRequest.RETRACT
+            assert self.state.request_number == before.request_number + 1
+
+    @rule(found=faults)
+    def fail(self, found: tuple[Fault, ...]) -> None:
+        before = self.state
+        self.state = latch(before, found)
+        self._check_request(before)
+        if set(found) - set(before.faults):
+            assert self.state.operating_state is FAULT
+            assert self.state.request is DeviceRequest.RETRACT
+            assert self.state.request_number == before.request_number + 1
+        else:
+            assert self.state is before
+        assert set(self.state.faults) == {*before.faults, *found}
+
+    def _commanded(self, name: str, present: Conditions) -> SafetyState | None:
+        try:
+            return command(self.state, name, self.now_s, present)
+        except RefusedError:
+            return None
+
+    def _check_request(self, before: SafetyState) -> None:
+        """A request number stands for one request, and only ever goes up, by one."""
+        assert 0 <= self.state.request_number - before.request_number <= 1
+        if self.state.request_number == before.request_number:
+            assert self.state.request is before.request
+        if set(self.state.faults) - set(before.faults):
+            assert self.state.request is DeviceRequest.RETRACT
+            assert self.state.request_number == before.request_number + 1
+
+    @invariant()
+    def fault_state_and_latched_faults_go_together(self) -> None:
+        assert bool(self.state.faults) == (self.state.operating_state is FAULT)
+
+
+TestOperating = Operating.TestCase
+TestOperating.settings = settings(max_examples=150, stateful_step_count=30, deadline=None)
