@@ -1,4 +1,4 @@
-# Two commands for users (`make run`, `make test`), three for developers (`make check`, `make model`, `make clean`).
+# Two commands for users, `make run` and `make test`; the others are for developers.
 
 PYTHON ?= python3
 VENV := .venv
@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run test check format model clean
+.PHONY: run test check format model reproduction clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -28,6 +28,10 @@ model: $(VENV)/.dev
 	$(BIN)/python tools/bench_sweep.py --plant sample_1 --out build/bench_sweep.csv
 	$(BIN)/python tools/train_model.py build/bench_sweep.csv --element torque --insert MRE-50-40 \
 	    --out tormagd/learning/models/torque_mre_50_40.safetensors --plot build/training.png
+
+# docs/reproduction.md and its plots: the thesis's tables and figures beside ours
+reproduction: $(VENV)/.dev
+	$(BIN)/python tools/reproduce_thesis.py
 
 clean:
 	rm -rf $(VENV) build run .mypy_cache .ruff_cache .pytest_cache .hypothesis

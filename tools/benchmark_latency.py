@@ -28,6 +28,7 @@ Array = npt.NDArray[np.float64]
 LEAST_N, GRAIN_N = 1.0, 1e-4
 SPACING_S = (0.004, 0.009)
 "Random, so that setpoints meet every phase of the control period."
+PERIOD_S = 1e-3
 SETTLE_S = 0.5
 
 
@@ -76,6 +77,8 @@ def exchange(config: Config, count: int) -> tuple[dict[float, int], list[dict[st
             publisher.send(encode(setpoint))
             sent[force] = stamp
             read_rows(recording, rows, spacing.uniform(*SPACING_S))
+            # reading waits in whole milliseconds from a message that the daemon sends right after a tick
+            time.sleep(spacing.uniform(0.0, PERIOD_S))
         read_rows(recording, rows, SETTLE_S)
     return sent, rows
 

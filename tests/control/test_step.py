@@ -137,9 +137,21 @@ def test_the_duty_pushes_towards_the_planned_gap(running: Bench) -> None:
     assert opening.left_duty > 0.0
 
 
-def test_the_carriage_that_is_behind_is_pushed_harder(running: Bench) -> None:
-    ahead = running.step(left_mm=-7.45, right_mm=-7.55)
-    assert ahead.left_duty < 0.0 < ahead.right_duty
+def test_skew_pulls_the_carriages_together(core: Core, measure) -> None:
+    """Synchronisation adds its share of the skew to either carriage's own error, towards each other."""
+    duties = []
+    for synchronisation in (0.0, 1.0):
+        position = msgspec.structs.replace(CONFIG.position, synchronisation=synchronisation)
+        bench = Bench(Stepper(msgspec.structs.replace(CONFIG, position=position), core.scene), measure)
+        bench.step(count=3)
+        bench.command("enable")
+        bench.step()
+        duties.append(bench.step(left_mm=-7.49, right_mm=-7.51))
+    own, both = duties
+    assert own.left_duty < 0.0 < own.right_duty
+    pull = CONFIG.position.proportional_per_mm * 0.02 / 2.0
+    assert both.left_duty == pytest.approx(own.left_duty - pull, rel=1e-6)
+    assert both.right_duty == pytest.approx(own.right_duty + pull, rel=1e-6)
 
 
 def test_a_plans_gap_is_carried_forward_along_its_speed_but_not_for_long(running: Bench) -> None:

@@ -100,7 +100,8 @@ class Rig:
         """Homes and enables."""
         self.done("home")
         self.until(lambda: self.status()["is_homed"] and not self.status()["is_busy"], "homed")
-        self.done("enable")
+        # a busy machine may find the newest measurement a little old once
+        self.until(lambda: self.command("enable").ok, "enabled")
 
     def ask(self, force_N: float, valid_for_ms: float = 30_000.0, **fields: Any) -> None:
         """Publishes one setpoint."""

@@ -60,7 +60,7 @@ def test_enable_is_refused_until_everything_is_right(rig):
     assert reply.error.code == "not_neutral"
     rig.ask(0.5)
     rig.until(lambda: rig.telemetry().setpoint_cf == 0.5, "setpoint seen")
-    rig.done("enable")
+    rig.until(lambda: rig.command("enable").ok, "enabled")
 
 
 def test_killed_daemon_leaves_an_open_gap_and_a_latched_reason(rig):
