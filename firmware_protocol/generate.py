@@ -1,4 +1,4 @@
-"""Generate `layouts.py`, the message tables of `README.md` and the golden vectors from `tormag.dbc`.
+"""Generate `layouts.py`, the message tables of `README.md`, the C codec and the golden vectors from `tormag.dbc`.
 
 `python -m firmware_protocol.generate` writes them; with `--check` nothing is written, and the exit code is 1, with the
 difference on stdout, if what is committed is not what the DBC gives.
@@ -11,6 +11,7 @@ import textwrap
 from pathlib import Path
 from typing import Final
 
+from firmware_protocol.c.source import c_files
 from firmware_protocol.dbc import DBC, MessageSource, Schema, SchemaError, SignalSource, read_schema
 from firmware_protocol.golden import vector_files
 
@@ -114,6 +115,7 @@ def generated_files(room: Path) -> dict[Path, str]:
     if not (begin and end):
         raise SchemaError(f"README.md: the markers {TABLE_BEGIN!r} and {TABLE_END!r} are missing")
     files = {room / "layouts.py": python_source(schema), room / "README.md": before + markdown_tables(schema) + after}
+    files |= {room / "c" / name: text for name, text in c_files(schema, room / DBC.name).items()}
     return files | {room / "vectors" / name: text for name, text in vector_files(schema, room / DBC.name).items()}
 
 

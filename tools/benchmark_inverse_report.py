@@ -128,8 +128,9 @@ relaxation: those are errors of the model whatever the search, and are measured 
 - `k-d tree`: the mean of the k nearest of precomputed samples (scipy). `direct`: a second network that learned the
   inverse. `closed form`: the magnetoelastic law inverted, without the network.
 
-Times of the rows are from several rounds over all variants, so that a disturbance of the machine meets all alike; the
-choice is measured at length under the daemon's scheduling where the kernel grants it.
+Times of the rows are from several rounds over all variants, so that a disturbance of the machine meets all alike; their
+p99 and p99.9 still hold whatever else ran (the load average counts this program as 1). The choice is
+measured at length under the daemon's scheduling where the kernel grants it.
 
 Pareto marks the one-thread variants that no faster one equals in plant error; differences under one encoder count of
 the gap (about 0.02 mT) do not count. A scene gets the cheapest of `nearest`, `coarse-to-fine` and `newton` whose
@@ -207,7 +208,8 @@ def _choices(result: dict[str, Any]) -> list[str]:
         )
         said.append(
             f"scene {scene} (tolerance {1e3 * row['tolerance_rms_N']:g} mN rms): {row['name']}, {row['dtype']}, "
-            f"{row['reason']}. Over {row['solves']} solves ({'FIFO' if row['fifo'] else 'no FIFO'}) "
+            f"{row['reason']} (by tolerance: {row['by_tolerance']}). "
+            f"Over {row['solves']} solves ({'FIFO' if row['fifo'] else 'no FIFO'}) "
             f"p50 {row['p50_us']:.1f} us, p99 {row['p99_us']:.1f} us, "
             f"p99.9 {row['p999_us']:.1f} us; plant error {row['plant_mae_mT']:.2f} mT mean, "
             f"{row['plant_max_mT']:.2f} mT max, {1e3 * row['force_mae_N']:.1f} mN. "

@@ -18,7 +18,8 @@ def room(tmp_path: Path) -> Path:
     """A copy of the room's sources and generated files, to be damaged."""
     for name in ("tormag.dbc", "README.md", "layouts.py"):
         shutil.copy(ROOM / name, tmp_path)
-    shutil.copytree(ROOM / "vectors", tmp_path / "vectors")
+    for folder in ("vectors", "c"):
+        shutil.copytree(ROOM / folder, tmp_path / folder)
     return tmp_path
 
 

@@ -92,9 +92,12 @@ def test_the_committed_table_serves_every_size() -> None:
 
 @pytest.mark.parametrize("name", shipped_scenes())
 def test_a_shipped_scene_gets_a_search_within_its_tolerance(name: str) -> None:
-    core = build_core(Config(scene=name))
-    assert core.solver.solver in RUNTIME_SOLVERS
-    assert core.solver.reason.startswith("the cheapest within")
+    """By the table; one that names its search gets that."""
+    scene = load_scene(name)
+    choice = choose(solver_table(), scene.force.tolerance_rms_N, hidden=50)
+    assert choice.reason.startswith("the cheapest within")
+    built = build_core(Config(scene=name)).solver
+    assert built == choice if scene.solver.name == "auto" else built.solver == scene.solver.name
 
 
 def test_a_scene_may_name_its_search() -> None:

@@ -100,7 +100,7 @@ def test_drive_run_is_refused_without_a_hello(make_host) -> None:
 @pytest.mark.parametrize(("schema", "version"), [(SCHEMA_HASH ^ 1, PROTOCOL_VERSION), (SCHEMA_HASH, 99)])
 def test_a_foreign_schema_latches_names_itself_and_clears_only_after_a_right_hello(make_host, schema, version) -> None:
     host = make_host()
-    host.send(Hello(schema, version, 1))
+    host.send(Hello(schema, version, 200))
     host.wait(0.05)
     assert host.last(Identity).schema_hash == SCHEMA_HASH
     assert host.status.faults == DeviceFault.SCHEMA_MISMATCH

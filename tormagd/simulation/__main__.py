@@ -8,14 +8,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from firmware_protocol.c.build import BuildError
 from tormagd.physics.errors import DomainError
-from tormagd.simulation.device import DEFAULT_BAUD, VirtualDevice
+from tormagd.simulation.compiled_firmware import CompiledFirmware
+from tormagd.simulation.device import DEFAULT_BAUD, FirmwareKind, VirtualDevice
 from tormagd.simulation.faults import FORMS as KNOWN_FAULTS
 from tormagd.simulation.faults import FaultError, parse_fault
+from tormagd.simulation.firmware import Firmware
 from tormagd.simulation.hand import KNOWN as KNOWN_HANDS
 from tormagd.simulation.hand import HandError, parse_hand
 from tormagd.simulation.parameters import PlantError, load_plant, plant_names
 from tormagd.simulation.pty_door import PtyDoor
+
+# The C sources are what a microcontroller would run; the Python twin, held equal to them by tests, needs no compiler.
+FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,8 +41,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             [parse_fault(spec) for spec in options.fault],
             options.seed,
             options.baud,
+            FIRMWARES[options.firmware],
         )
-    except (PlantError, HandError, FaultError, DomainError) as error:
+    except (PlantError, HandError, FaultError, DomainError, BuildError) as error:
         return _refuse(parser, error)
     with contextlib.ExitStack() as resources:
         try:
@@ -72,6 +79,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of noise and jitter")
     parser.add_argument("--baud", type=_baud, default=DEFAULT_BAUD, metavar="N", help=f"default {DEFAULT_BAUD}")
+    parser.add_argument(
+        "--firmware",
+        choices=FIRMWARES,
+        default="python",
+        help="c compiles and runs the firmware's own C sources; default python, which needs no compiler",
+    )
     parser.add_argument("--truth", type=Path, metavar="FILE.csv", help="record what no sensor sees, 1000 rows a second")
     return parser
 

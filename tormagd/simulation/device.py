@@ -7,11 +7,12 @@ falls. So the same object runs in virtual time, as fast as it computes, and in r
 import math
 import random
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from firmware_protocol.codec import FUNCTION, DecodeError, Message, Switches, decode, encode
 from firmware_protocol.framing import DELIMITER, FrameDecoder, FramingStatistics, encode_frame
+from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.faults import Fault
 from tormagd.simulation.firmware import TICK_S, Answer, Firmware, Sensors
 from tormagd.simulation.hand import ROLLER_RADIUS_MM, Hand
@@ -20,6 +21,8 @@ from tormagd.simulation.plant import Plant, Truth
 
 BITS_PER_BYTE = 10  # start, eight data bits, stop
 DEFAULT_BAUD = 1_000_000
+FirmwareKind = Callable[[PlantParameters], Firmware | CompiledFirmware]
+"""What boots: `Firmware`, or the C sources of the same rules as `CompiledFirmware`."""
 WEAR = 4.0
 MAX_BACKLOG_BYTES = 65_536
 """What the serial buffers of both ends and the adapter between them hold; more is lost, as on a real port."""
@@ -39,10 +42,18 @@ class MessageDevice:
     `receive` queues a payload for its time of arrival; `advance` lets time pass and fills `outbox`.
     """
 
-    def __init__(self, parameters: PlantParameters, hand: Hand, faults: Iterable[Fault] = (), seed: int = 0) -> None:
+    def __init__(
+        self,
+        parameters: PlantParameters,
+        hand: Hand,
+        faults: Iterable[Fault] = (),
+        seed: int = 0,
+        boot: FirmwareKind = Firmware,
+    ) -> None:
         self.parameters = parameters
         self.plant = Plant(parameters, hand, seed)
-        self.firmware = Firmware(parameters)
+        self._boot = boot
+        self.firmware = boot(parameters)
         self.outbox: deque[Packet] = deque()
         self.undecodable = 0
         """Payloads that arrived and were no message."""
@@ -186,7 +197,7 @@ class MessageDevice:
             case "encoder_stuck_left":
                 self._stuck_left = self._encoders()[0]
             case "reset":
-                self.firmware = Firmware(self.parameters)
+                self.firmware = self._boot(self.parameters)
                 self._answers.clear()
                 self._counts_at_boot = self._encoders()
                 self._boot_s = time_s
@@ -216,10 +227,11 @@ class VirtualDevice:
         faults: Iterable[Fault] = (),
         seed: int = 0,
         baud: int = DEFAULT_BAUD,
+        boot: FirmwareKind = Firmware,
     ) -> None:
         if baud <= 0:
             raise ValueError(f"baud = {baud}: allowed are numbers over 0")
-        self.messages = MessageDevice(parameters, hand, faults, seed)
+        self.messages = MessageDevice(parameters, hand, faults, seed, boot)
         self._byte_s = BITS_PER_BYTE / baud
         self._decoder = FrameDecoder()
         self._receiver_free_s = 0.0

@@ -118,6 +118,8 @@ class Firmware:
             case Drive():
                 return self._drive(time_s, message, sensors)
             case Hello():
+                # accepted whatever it was before, so that a new host starts from a known nonce
+                self._nonce = message.nonce
                 self._compatible = message.schema_hash == SCHEMA_HASH and message.protocol_version == PROTOCOL_VERSION
                 if not self._compatible:
                     self._fail(time_s, DeviceFault.SCHEMA_MISMATCH, sensors)

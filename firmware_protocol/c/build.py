@@ -1,0 +1,115 @@
+"""Build the C sources on this machine, for the simulated device and for tests.
+
+`python -m firmware_protocol.c.build` builds the shared library, if that has not been done yet, and prints where it is.
+It goes to the user's cache, under a name that follows from the sources, the compiler and its flags.
+"""
+
+import ctypes
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from enum import Enum
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+ROOM: Final = Path(__file__).parent
+FIRMWARE: Final = ("codec", "crc", "device", "framing", "messages", "motion", "reports", "tormag")
+STRICT: Final = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+# A fused multiplication rounds once where Python rounds twice; without it the doubles are the same to the last bit.
+SAME_DOUBLES: Final = ("-ffp-contract=off",)
+TIME_LIMIT_S: Final = 120
+
+
+class BuildError(RuntimeError):
+    """The C sources could not be built here. The text says why and what helps."""
+
+
+class Target(Enum):
+    """What can be built: its host sources and its compiler flags."""
+
+    LIBRARY = ("bridge",), ("-O2", "-fPIC", "-shared")
+    SANITIZED_EXCHANGE = (
+        ("bridge", "exchange"),
+        ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer"),
+    )
+
+    def __init__(self, host_sources: tuple[str, ...], flags: tuple[str, ...]) -> None:
+        self.sources = tuple(ROOM / f"{name}.c" for name in FIRMWARE) + tuple(
+            ROOM / "host" / f"{name}.c" for name in host_sources
+        )
+        self.flags = flags
+
+
+def compiler() -> str:
+    """Path of the C compiler: `CC` from the environment, else `cc`. Raises BuildError without one."""
+    wanted = os.environ.get("CC", "cc")
+    found = shutil.which(wanted)
+    if found is None:
+        raise BuildError(f"no C compiler: {wanted!r} is not on the path; install gcc or clang, or name one in CC")
+    return found
+
+
+def build(target: Target) -> Path:
+    """The file built for a target, from the cache where it is up to date. Raises BuildError."""
+    command = [compiler(), *STRICT, *SAME_DOUBLES, *target.flags]
+    path = _cache_folder() / f"{target.name.lower()}-{_fingerprint(command)}"
+    if path.exists():
+        return path
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        # Built beside its place and moved there whole, because another process may be building it too.
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            built = Path(folder) / path.name
+            _compile([*command, *map(str, target.sources), "-lm", "-o", str(built)])
+            built.replace(path)
+    except OSError as error:
+        raise BuildError(f"cannot write {path}: {error}; XDG_CACHE_HOME names another cache") from error
+    return path
+
+
+@cache
+def load_library() -> ctypes.CDLL:
+    """The shared library, built if need be. Raises BuildError."""
+    path = build(Target.LIBRARY)
+    try:
+        return ctypes.CDLL(str(path))
+    except OSError as error:
+        raise BuildError(f"cannot load {path}: {error}; delete it to have it built again") from error
+
+
+def _cache_folder() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tormagd"
+
+
+def _fingerprint(command: list[str]) -> str:
+    digest = hashlib.sha256("\0".join(command).encode())
+    for path in sorted([*ROOM.glob("*.[ch]"), *ROOM.glob("host/*.[ch]")]):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def _compile(command: list[str]) -> None:
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=TIME_LIMIT_S, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise BuildError(f"{command[0]} did not finish in {TIME_LIMIT_S} s") from error
+    if result.returncode != 0:
+        raise BuildError(f"{' '.join(command)} failed:\n{result.stderr.strip()}")
+
+
+def main() -> int:
+    """Build the library and print its path; the exit code is 1 where that is not possible."""
+    try:
+        print(build(Target.LIBRARY))
+    except BuildError as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,203 @@
+"""The firmware's C sources, compiled for this machine, behind the interface of the Python firmware.
+
+What a microcontroller would run is what runs here: every message goes in and comes out as payload bytes through the C
+codec, and the state is the C struct. The Python firmware is its twin; tests hold the two equal step by step.
+"""
+
+import ctypes
+import math
+from functools import cache
+from typing import TypeVar
+
+from firmware_protocol.c.build import BuildError, load_library
+from firmware_protocol.codec import (
+    FUNCTION,
+    DecodeError,
+    DeviceFault,
+    DeviceMode,
+    EncodeError,
+    Identity,
+    Message,
+    Sense,
+    State,
+    Status,
+    decode,
+    encode,
+)
+from tormagd.simulation.firmware import SERIAL_NUMBER, Answer, Output, Sensors
+from tormagd.simulation.hand import ROLLER_RADIUS_MM
+from tormagd.simulation.parameters import PlantParameters
+
+MAX_PAYLOAD = 8
+M = TypeVar("M", State, Sense, Status, Identity)
+ANSWERS = (Answer.NONE, Answer.IDENTITY, Answer.MEASUREMENT)
+
+
+class _Parameters(ctypes.Structure):
+    """struct tormag_device_parameters."""
+
+    _fields_ = [
+        ("lead_mm", ctypes.c_double),
+        ("stall_A", ctypes.c_double),
+        ("mm_per_count", ctypes.c_double),
+        ("handle_mm_per_count", ctypes.c_double),
+        ("retract_mm_s", ctypes.c_double),
+        ("homing_mm_s", ctypes.c_double),
+        ("serial_number", ctypes.c_uint16),
+    ]
+
+
+class _Sensors(ctypes.Structure):
+    """struct tormag_sensors, in the order of `Sensors`; like the firmware's, the counters run over at 32 bits."""
+
+    _fields_ = [
+        ("left_counts", ctypes.c_int32),
+        ("right_counts", ctypes.c_int32),
+        ("left_current_A", ctypes.c_double),
+        ("right_current_A", ctypes.c_double),
+        ("force_N", ctypes.c_double),
+        ("handle_counts", ctypes.c_int32),
+        ("switches", ctypes.c_uint8),
+        ("supply_V", ctypes.c_double),
+        ("temperature_C", ctypes.c_double),
+    ]
+
+
+class _View(ctypes.Structure):
+    """struct tormag_bridge_view."""
+
+    _fields_ = [
+        ("mode", ctypes.c_uint8),
+        ("faults", ctypes.c_uint16),
+        ("homed", ctypes.c_bool),
+        ("left_duty", ctypes.c_double),
+        ("right_duty", ctypes.c_double),
+        ("enabled", ctypes.c_bool),
+    ]
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    """The library with its functions' types declared. Raises BuildError."""
+    library = load_library()
+    pointer, time_s, payload = ctypes.c_void_p, ctypes.c_double, ctypes.c_char_p
+    library.tormag_device_init.argtypes = [pointer, pointer]
+    for name, arguments in {
+        "sizes": [pointer],
+        "receive": [pointer, time_s, ctypes.c_uint8, payload, ctypes.c_size_t, pointer],
+        "tick": [pointer, time_s, pointer, payload],
+        "measurement": [pointer, time_s, pointer, payload],
+        "status": [pointer, pointer, payload],
+        "identity": [pointer, payload],
+        "view": [pointer, pointer],
+    }.items():
+        getattr(library, f"tormag_bridge_{name}").argtypes = arguments
+    _, *structures = _sizes(library)
+    if structures != [ctypes.sizeof(structure) for structure in (_Parameters, _Sensors, _View)]:
+        raise BuildError("the C structures are not laid out as ctypes does it; use the Python firmware on this machine")
+    return library
+
+
+def _sizes(library: ctypes.CDLL) -> list[int]:
+    """Bytes of the device, and of the three structures above."""
+    sizes = (ctypes.c_size_t * 4)()
+    library.tormag_bridge_sizes(sizes)
+    return list(sizes)
+
+
+class CompiledFirmware:
+    """One device's firmware from its boot on, as `Firmware`. Raises BuildError where the C sources cannot be built."""
+
+    def __init__(self, plant: PlantParameters) -> None:
+        parameters = _Parameters(
+            lead_mm=plant.screw.lead_mm,
+            stall_A=plant.assumed.overcurrent_A,
+            mm_per_count=plant.screw.lead_mm / plant.electronics.encoder_counts_per_rev,
+            handle_mm_per_count=math.tau * ROLLER_RADIUS_MM / plant.assumed.handle_counts_per_rev,
+            retract_mm_s=plant.assumed.retract_mm_s,
+            homing_mm_s=plant.assumed.homing_mm_s,
+            serial_number=SERIAL_NUMBER,
+        )
+        library = _library()
+        # The C struct lives in an array of doubles, for their alignment. It points nowhere, so that it may be copied.
+        self._device = (ctypes.c_double * math.ceil(_sizes(library)[0] / ctypes.sizeof(ctypes.c_double)))()
+        library.tormag_device_init(self._device, ctypes.byref(parameters))
+
+    def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
+        """Act on one message of the host; those of a device are ignored."""
+        payload = encode(message)
+        answer: int = _library().tormag_bridge_receive(
+            self._device, time_s, FUNCTION[type(message)], payload, len(payload), ctypes.byref(_Sensors(*sensors))
+        )
+        if answer < 0:
+            raise DecodeError(f"{message}: the C codec refuses {payload.hex()} with result {-answer}")
+        return ANSWERS[answer]
+
+    def tick(self, time_s: float, sensors: Sensors) -> Status | None:
+        """The 1 kHz tick: motions and watches; every twentieth gives a Status. Raises EncodeError as `status` does."""
+        payload = ctypes.create_string_buffer(MAX_PAYLOAD)
+        length: int = _library().tormag_bridge_tick(self._device, time_s, ctypes.byref(_Sensors(*sensors)), payload)
+        _require_sent(length, sensors)
+        return _decoded(Status, payload.raw) if length else None
+
+    def status(self, sensors: Sensors) -> Status:
+        """Mode, switches, faults, and what was last accepted (0 before anything was).
+
+        Raises EncodeError for a supply or temperature that has no step on the wire.
+        """
+        payload = ctypes.create_string_buffer(MAX_PAYLOAD)
+        _require_sent(_library().tormag_bridge_status(self._device, ctypes.byref(_Sensors(*sensors)), payload), sensors)
+        return _decoded(Status, payload.raw)
+
+    def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
+        """State and Sense of that moment. Raises EncodeError for a current or force that has no step on the wire."""
+        payloads = ctypes.create_string_buffer(2 * MAX_PAYLOAD)
+        result: int = _library().tormag_bridge_measurement(
+            self._device, time_s, ctypes.byref(_Sensors(*sensors)), payloads
+        )
+        _require_sent(result, sensors)
+        return _decoded(State, payloads.raw[:MAX_PAYLOAD]), _decoded(Sense, payloads.raw[MAX_PAYLOAD:])
+
+    def identity(self) -> Identity:
+        """Who this device is."""
+        payload = ctypes.create_string_buffer(MAX_PAYLOAD)
+        _library().tormag_bridge_identity(self._device, payload)
+        return _decoded(Identity, payload.raw)
+
+    @property
+    def mode(self) -> DeviceMode:
+        """Operating mode."""
+        return DeviceMode(self._view().mode)
+
+    @property
+    def faults(self) -> DeviceFault:
+        """Latched faults."""
+        return DeviceFault(self._view().faults)
+
+    @property
+    def homed(self) -> bool:
+        """Whether the zero of the encoders is valid."""
+        return bool(self._view().homed)
+
+    @property
+    def output(self) -> Output:
+        """What the bridges do."""
+        view = self._view()
+        return Output(view.left_duty, view.right_duty, view.enabled)
+
+    def _view(self) -> _View:
+        view = _View()
+        _library().tormag_bridge_view(self._device, ctypes.byref(view))
+        return view
+
+
+def _require_sent(result: int, sensors: Sensors) -> None:
+    if result < 0:
+        raise EncodeError(f"{sensors}: a value has no step on the wire")
+
+
+def _decoded(kind: type[M], payload: bytes) -> M:
+    """The message in a payload of the C codec; those of a device all have 8 bytes."""
+    message = decode(FUNCTION[kind], payload)
+    assert isinstance(message, kind), f"function {FUNCTION[kind]} decodes to {kind}"
+    return message
