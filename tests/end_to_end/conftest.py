@@ -29,7 +29,8 @@ class Rig:
         self.truth_path = folder / "truth.csv"
         self.config = folder / "tormagd.toml"
         self.config.write_text(
-            f'scene = "coronary"\n[device]\nport = "{self.port}"\n[endpoints]\n'
+            'scene = "coronary"\n[realtime]\nfifo_priority = 50\n'  # only a warning where it is refused
+            f'[device]\nport = "{self.port}"\nmeasurement_timeout_ms = 50.0\n[endpoints]\n'
             + "".join(f'{n} = "ipc://{folder}/{n}"\n' for n in ("setpoint", "telemetry", "control", "recording"))
         )
         self.simulator: subprocess.Popen[str] | None = None
