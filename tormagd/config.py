@@ -4,7 +4,9 @@ A TOML file, or the defaults. Unknown keys, wrong types, NaN and infinities, val
 orderings are refused with the key's path, the value and what is allowed.
 """
 
+import ipaddress
 import math
+import os
 import re
 import tomllib
 from pathlib import Path
@@ -13,11 +15,14 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 from msgspec import Meta
 
+CAN_EXCHANGE_BITS = 395  # Drive, State and Sense with the most stuffing: firmware_protocol/README.md
+CAN_MOST_LOAD = 0.7  # what is left is for Status, commands and the bus's other nodes
 LEAST_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
 DEFAULT_RUN_DIR = "/run/tormag"
+LONGEST_IPC_PATH = 107  # bytes that the kernel takes of a socket's path
 
 T = TypeVar("T")
-_LOCAL = re.compile(r"(ipc|inproc)://.+|tcp://(127(\.\d{1,3}){3}|localhost|\[::1\]):\d{1,5}")
+_TCP = re.compile(r"tcp://(localhost|[0-9.]+):([0-9]{1,5})")
 
 
 class ConfigError(ValueError):
@@ -33,11 +38,26 @@ class Device(Strict, frozen=True):
 
     backend: str = "serial"
     port: str = "/dev/tormag"
+    "Path of the serial port; with the backend `can`, the channel: `can0`, or an adapter's path."
     baud: Annotated[int, Meta(ge=115_200, le=12_000_000)] = 1_000_000
+    "Of a serial port, also of one with a CAN adapter behind it."
+    interface: str = ""
+    "The python-can interface, for the backend `can`."
+    bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 1_000_000
+    "Of the CAN bus. socketcan takes it from the kernel (`ip link`)."
+    node: Annotated[int, Meta(ge=0, le=15)] = 1
+    "The device's node number on the CAN bus."
     command_timeout_ms: Annotated[float, Meta(ge=5.0, le=1_000.0)] = 50.0
     "What the firmware does without us: its own timeout, stated here so that it can be checked against ours."
     measurement_timeout_ms: Annotated[float, Meta(ge=2.0, le=1_000.0)] = 40.0
     "Oldest device state the controller accepts while it drives."
+
+    def __post_init__(self) -> None:
+        _order(self.port.isprintable(), "device.port", self.port, "printable characters")
+        if self.backend == "can":
+            _order(self.interface != "", "device.interface", "", "a python-can interface, as in 'socketcan'")
+        if self.backend == "serial":
+            _order(self.interface == "", "device.interface", self.interface, "'' unless device.backend = 'can'")
 
 
 class Endpoints(Strict, frozen=True):
@@ -64,6 +84,7 @@ class RealTime(Strict, frozen=True):
     lock_memory: bool = False
     cpus: tuple[Annotated[int, Meta(ge=0, le=4095)], ...] = ()
     watchdog_ms: Annotated[float, Meta(ge=100.0, le=60_000.0)] = 500.0
+    "Without a plan or, while the link runs, a device state for this long, systemd's watchdog is no longer fed."
 
 
 class Motor(Strict, frozen=True):
@@ -95,7 +116,7 @@ class Position(Strict, frozen=True):
     synchronisation: Annotated[float, Meta(ge=0.0, le=10.0)] = 1.0
     "Extra proportional action on the skew between the carriages, as a multiple of the carriage's own."
     gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] = 38.0
-    gap_acceleration_mm_s2: Annotated[float, Meta(gt=0.0, le=100_000.0)] = 1_300.0
+    gap_acceleration_mm_s2: Annotated[float, Meta(gt=0.0, le=100_000.0)] = 1_600.0
     "From rest; with speed it falls along the motors' torque-speed line."
     duty_limit: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0
     lead_ms: Annotated[float, Meta(ge=0.0, le=50.0)] = 0.0
@@ -154,6 +175,13 @@ class Config(Strict, frozen=True):
             f"a divisor of rates.control_hz = {rates.control_hz}",
         )
         _order(
+            device.backend != "can" or rates.control_hz * CAN_EXCHANGE_BITS <= CAN_MOST_LOAD * device.bitrate,
+            "device.bitrate",
+            device.bitrate,
+            f"from {math.ceil(rates.control_hz * CAN_EXCHANGE_BITS / CAN_MOST_LOAD)} on at rates.control_hz = "
+            f"{rates.control_hz}",
+        )
+        _order(
             device.command_timeout_ms < self.realtime.watchdog_ms,
             "device.command_timeout_ms",
             device.command_timeout_ms,
@@ -174,20 +202,51 @@ class Config(Strict, frozen=True):
         taken: dict[str, str] = {}
         for name in ("setpoint", "telemetry", "control", "recording"):
             address = getattr(self.endpoints, name)
+            place = _ipc_place(name, address) if address.startswith("ipc://") else _tcp_place(name, address)
             _order(
-                _LOCAL.fullmatch(address) is not None,
+                place not in taken,
                 f"endpoints.{name}",
                 address,
-                "ipc:// or a loopback tcp:// address; others need CURVE keys",
+                f"an address other than that of endpoints.{taken.get(place)}",
             )
-            # libzmq takes an ipc address away from whoever bound it first, without a word
-            _order(
-                address not in taken,
-                f"endpoints.{name}",
-                address,
-                f"an address other than that of endpoints.{taken.get(address)}",
-            )
-            taken[address] = name
+            taken[place] = name
+
+
+def _ipc_place(name: str, address: str) -> str:
+    """What an `ipc://` address comes to, however it is spelt."""
+    path = address.removeprefix("ipc://")
+    _order(
+        path not in ("", "@", "*")
+        and path.isprintable()
+        and not path.endswith("/")
+        and len(path.encode()) <= LONGEST_IPC_PATH,
+        f"endpoints.{name}",
+        address,
+        f"after ipc:// the path of a socket, or @ and a name, of at most {LONGEST_IPC_PATH} bytes",
+    )
+    return path if path.startswith("@") else os.path.realpath(path)
+
+
+def _tcp_place(name: str, address: str) -> str:
+    """The same of a `tcp://` address. IPv4 only: a ZeroMQ socket speaks no IPv6 unless it is told to, at both ends."""
+    matched = _TCP.fullmatch(address)
+    host, port = matched.groups() if matched else ("", "0")
+    _order(
+        _is_loopback(host) and 0 < int(port) < 65_536,
+        f"endpoints.{name}",
+        address,
+        "ipc:// or a loopback tcp:// address with a port of 1..65535; others need CURVE keys",
+    )
+    return f"{'127.0.0.1' if host == 'localhost' else host}:{int(port)}"
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.IPv4Address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _order(condition: bool, key: str, value: object, allowed: str) -> None:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 
 import msgspec
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from tormagd.config import LEAST_INFERENCE_HZ, Config, ConfigError, load_config
 from tormagd.daemon.main import main
+from tormagd.hardware.backend import ENTRY_POINTS
 
 Write = Callable[[str], Path]
 
@@ -61,6 +63,10 @@ def test_a_resolved_configuration_is_a_configuration(write) -> None:
         ("scene = 3", "$.scene", "3", "`str`"),
         ("[device]\nbaud = '1000000'", "$.device.baud", "'1000000'", "`int`"),
         ("[device]\nbaud = 9600", "$.device.baud", "9600", ">= 115200"),
+        ("[device]\nbackend = 'can'", "device.interface", "''", "python-can interface"),
+        ("[device]\ninterface = 'slcan'", "device.interface", "'slcan'", "device.backend = 'can'"),
+        ("[device]\nnode = 16", "$.device.node", "16", "<= 15"),
+        ("[device]\nbitrate = 2_000_000", "$.device.bitrate", "2000000", "<= 1000000"),
         ("[rates]\ncontrol_hz = 1000.5", "$.rates.control_hz", "1000.5", "`int`"),
         ("[rates]\ninference_hz = 82", "$.rates.inference_hz", "82", ">= 83"),
         ("[rates]\ncontrol_hz = 50", "$.rates.control_hz", "50", ">= 83"),
@@ -100,6 +106,12 @@ def test_a_nan_hides_in_no_list_and_no_unknown_table(write) -> None:
     ("text", "key", "value", "other"),
     [
         ("[rates]\ncontrol_hz = 200\ninference_hz = 250", "rates.inference_hz", "250", "rates.control_hz = 200"),
+        (
+            "[device]\nbackend = 'can'\ninterface = 'socketcan'\nbitrate = 500_000",
+            "device.bitrate",
+            "500000",
+            "from 564286 on at rates.control_hz = 1000",
+        ),
         ("[rates]\ntelemetry_hz = 60", "rates.telemetry_hz", "60", "rates.control_hz = 1000"),
         (
             "[device]\ncommand_timeout_ms = 500.0",
@@ -144,6 +156,14 @@ def test_orders_that_cannot_be_are_refused(write, text: str, key: str, value: st
         "",
         "tcp://127.example.org:5555",
         "tcp://127.0.0.1.example.org:5555",
+        "tcp://127.0.0.1:99999",
+        "tcp://127.0.0.1:65536",
+        "tcp://127.0.0.1:0",
+        "tcp://127.0.0.1:",
+        "tcp://127.300.0.1:5555",
+        "tcp://localhost:５５５５",
+        "tcp://[::1]:5555",
+        "inproc://setpoint",
     ],
 )
 def test_only_this_machine_is_open(write, name: str, address: str) -> None:
@@ -160,16 +180,34 @@ def test_only_this_machine_is_open(write, name: str, address: str) -> None:
         "tcp://127.0.0.1:5555",
         "tcp://127.8.0.1:1",
         "tcp://localhost:5555",
-        "tcp://[::1]:5555",
+        "tcp://127.0.0.1:65535",
     ],
 )
 def test_loopback_is_open(write, address: str) -> None:
     assert load_config(write(f'[endpoints]\nsetpoint = "{address}"')).endpoints.setpoint == address
 
 
-def test_two_endpoints_cannot_share_an_address(write) -> None:
-    refused = refusal(write('[endpoints]\nsetpoint = "ipc:///tmp/a"\ncontrol = "ipc:///tmp/a"'))
-    assert "endpoints.control = 'ipc:///tmp/a'" in refused
+@pytest.mark.parametrize("path", ["", "@", "*", "/tmp/run/", "/", "/tmp/\\u0000", "/tmp/" + 103 * "x"])
+def test_an_address_that_nobody_can_connect_to_is_refused(write, path: str) -> None:
+    refused = refusal(write(f'[endpoints]\ncontrol = "ipc://{path}"'))
+    assert "endpoints.control = 'ipc://" in refused
+    assert "allowed is after ipc:// the path of a socket" in refused
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("ipc:///tmp/a", "ipc:///tmp/a"),
+        ("ipc:///tmp/a", "ipc:///tmp//a"),
+        ("ipc:///tmp/a", "ipc:///tmp/b/../a"),
+        ("ipc:///proc/self/cwd/a", "ipc://a"),
+        ("ipc://@a", "ipc://@a"),
+        ("tcp://127.0.0.1:5555", "tcp://localhost:05555"),
+    ],
+)
+def test_two_endpoints_cannot_share_an_address(write, first: str, second: str) -> None:
+    refused = refusal(write(f'[endpoints]\nsetpoint = "{first}"\ncontrol = "{second}"'))
+    assert f"endpoints.control = {second!r}" in refused
     assert "endpoints.setpoint" in refused
 
 
@@ -242,6 +280,30 @@ def test_a_bad_configuration_ends_with_two_and_says_why_on_stderr(write, capsys,
     assert word in captured.err
 
 
+@pytest.mark.parametrize(
+    ("force", "is_served"),
+    [
+        ("least_N = 900.0\nmost_N = 1000.0", False),
+        ("least_N = 0.5\nmost_N = 5.0", False),
+        ("least_N = 0.0\nmost_N = 0.5", False),
+        ("least_N = 0.0\nmost_N = 4.8", True),
+    ],
+)
+def test_a_scene_beyond_what_the_device_reaches_is_refused(
+    tmp_path: Path, write, capsys, force: str, is_served: bool
+) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        f'name = "x"\ndescription = ""\n[force]\n{force}\nresolution_N = 0.1\ntolerance_rms_N = 0.05\n'
+        '[insert]\nname = "MRE-50-40"\nmodel = "torque_mre_50_40"\n'
+    )
+    assert main(["--config", str(write(f'scene = "{scene}"')), "--check"]) == (0 if is_served else 2)
+    if not is_served:
+        refused = capsys.readouterr().err
+        assert f"scene x: {force.splitlines()[1].removesuffix('.0').replace('most', 'force.most')}" in refused
+        assert "allowed is 0.54..4.87" in refused
+
+
 def test_version_and_usage(capsys) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["--version"])
@@ -250,3 +312,30 @@ def test_version_and_usage(capsys) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["--chekc"])
     assert ended.value.code == 2
+
+
+@pytest.mark.parametrize(
+    "example", sorted((Path(__file__).parents[2] / "examples").glob("*.toml")), ids=lambda path: path.name
+)
+def test_the_sample_files_are_accepted(example: Path) -> None:
+    assert load_config(example).scene == "coronary"
+
+
+def test_a_slower_bus_carries_a_slower_loop(write) -> None:
+    slow = "[device]\nbackend = 'can'\ninterface = 'socketcan'\nbitrate = 500_000\n[rates]\n"
+    config = load_config(write(slow + "control_hz = 850\ntelemetry_hz = 50\n"))
+    assert (config.device.bitrate, config.rates.control_hz) == (500_000, 850)
+
+
+def test_a_check_names_a_broken_plugin_and_goes_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = [
+        metadata.EntryPoint("serial", "tormagd.hardware.serial_backend:open_serial", ENTRY_POINTS),
+        metadata.EntryPoint("broken", "no_such_module_anywhere:open", ENTRY_POINTS),
+    ]
+    monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == ENTRY_POINTS else [])
+    assert main(["--check"]) == 0
+    backends = json.loads(capsys.readouterr().out)["backends"]
+    assert backends["serial"] == "loads"
+    assert "no_such_module_anywhere" in backends["broken"]

@@ -23,14 +23,15 @@ PATIENCE_S = 30.0
 class Rig:
     """The processes of one test, and a client to each of the daemon's sockets."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, door: str = "--pty", device: str = "") -> None:
         self.folder = folder
+        self.door = door
         self.port = folder / "tty"
         self.truth_path = folder / "truth.csv"
         self.config = folder / "tormagd.toml"
         self.config.write_text(
             'scene = "coronary"\n[realtime]\nfifo_priority = 50\n'  # only a warning where it is refused
-            f'[device]\nport = "{self.port}"\nmeasurement_timeout_ms = 50.0\n[endpoints]\n'
+            f'[device]\nport = "{self.port}"\n{device}measurement_timeout_ms = 50.0\n[endpoints]\n'
             + "".join(f'{n} = "ipc://{folder}/{n}"\n' for n in ("setpoint", "telemetry", "control", "recording"))
         )
         self.simulator: subprocess.Popen[str] | None = None
@@ -44,12 +45,12 @@ class Rig:
 
     def start_simulator(self, *arguments: str) -> None:
         """A device behind the port; a symbolic link stands for the stable name that udev gives a real one."""
-        command = [sys.executable, "-m", "tormagd.simulation", "--pty", "--seed", "1"]
+        command = [sys.executable, "-m", "tormagd.simulation", self.door, "--seed", "1"]
         command += ["--truth", str(self.truth_path), *arguments]
         self.simulator = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert self.simulator.stdout is not None
         path = self.simulator.stdout.readline().strip()
-        assert path.startswith("/dev/")
+        assert path.startswith("/")
         self.port.unlink(missing_ok=True)
         self.port.symlink_to(path)
 
@@ -72,6 +73,19 @@ class Rig:
                 if reply.id == self._seq:
                     return reply
         pytest.fail(f"no answer to {name}")
+
+    def burst(self, *names: str) -> list[Reply]:
+        """The answers to commands that are given all at once."""
+        first = self._seq + 1
+        for name in names:
+            self._seq += 1
+            self._control.send(encode(Request(v=VERSION, id=self._seq, command=name)))
+        replies: list[Reply] = []
+        while len(replies) < len(names):
+            assert self._control.poll(round(PATIENCE_S * 1e3)), f"no answer to {names[len(replies)]}"
+            replies.append(decode(self._control.recv(), Reply))
+        assert [reply.id for reply in replies] == list(range(first, self._seq + 1))
+        return replies
 
     def done(self, name: str) -> None:
         """A command that must be carried out."""
@@ -157,6 +171,17 @@ class Rig:
 def rig(tmp_path: Path) -> Iterator[Rig]:
     """A device and a daemon that has found it."""
     with contextlib.closing(Rig(tmp_path)) as made:
+        made.start_simulator()
+        made.start_daemon()
+        made.wait_for_subscription()
+        yield made
+
+
+@pytest.fixture
+def can_rig(tmp_path: Path) -> Iterator[Rig]:
+    """The same on a CAN bus."""
+    device = 'backend = "can"\ninterface = "tormagsim"\n'
+    with contextlib.closing(Rig(tmp_path, "--can", device)) as made:
         made.start_simulator()
         made.start_daemon()
         made.wait_for_subscription()

@@ -12,12 +12,24 @@ from firmware_protocol.codec import Message
 from tormagd.config import ConfigError, Device
 
 ENTRY_POINTS = "tormagd.backends"
+"""Functions that open: `Device` to `Backend`, raising BackendError."""
+CHECKS = "tormagd.backend_checks"
+"""Of the same names, where a backend has settings of its own: `Device` to None, raising ConfigError, no hardware."""
+
+PLUGIN_ERRORS = (
+    ImportError, AttributeError, NameError, TypeError, ValueError, LookupError, OSError, RuntimeError, SyntaxError,
+)  # fmt: skip
+"""What a stranger's module may raise while it is imported."""
 
 log = logging.getLogger(__name__)
 
 
 class BackendError(OSError):
-    """The device is gone, or cannot be opened: the text says what happened and what to do."""
+    """The device is gone, or cannot be opened. The text says what happened, `remedy` what to do if that is special."""
+
+    def __init__(self, cause: str, remedy: str = "") -> None:
+        super().__init__(cause)
+        self.remedy = remedy
 
 
 class LinkStatistics(Protocol):
@@ -51,16 +63,37 @@ class Backend(Protocol):
         """Gives the device back. Never raises."""
 
 
-def opener(device: Device) -> Callable[[Device], Backend]:
-    """The `open` function of the backend that `device.backend` names. Raises ConfigError naming the installed ones.
+def installed() -> dict[str, str]:
+    """Every backend plugin by name, with the reason why it does not load, or "".
 
-    A plugin that cannot be imported is reported and skipped, so that a broken third-party package stops nobody else.
+    A broken one is reported and skipped, so that a third party's package stops nobody else.
+    """
+    found = {}
+    for entry in sorted(metadata.entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
+        try:
+            entry.load()
+        except PLUGIN_ERRORS as error:
+            log.warning("backend %s is skipped, it does not load: %s: %s", entry.name, type(error).__name__, error)
+            found[entry.name] = f"{type(error).__name__}: {error}"
+        else:
+            found[entry.name] = ""
+    return found
+
+
+def opener(device: Device) -> Callable[[Device], Backend]:
+    """The `open` function of the backend that `device.backend` names; only that plugin is imported.
+
+    Raises ConfigError: unknown (naming the installed ones), broken, or not what `device` asks for.
     """
     found = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINTS)}
     if device.backend not in found:
         raise ConfigError(f"device.backend = {device.backend!r}: installed are {', '.join(sorted(found)) or 'none'}")
+    checks = [entry for entry in metadata.entry_points(group=CHECKS) if entry.name == device.backend]
     try:
         loaded: Callable[[Device], Backend] = found[device.backend].load()
-    except (ImportError, AttributeError) as error:
+        loaded_checks: list[Callable[[Device], None]] = [entry.load() for entry in checks]
+    except PLUGIN_ERRORS as error:
         raise ConfigError(f"device.backend = {device.backend!r}: the plugin does not load: {error}") from error
+    for check in loaded_checks:
+        check(device)
     return loaded

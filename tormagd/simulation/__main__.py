@@ -4,14 +4,17 @@ import argparse
 import contextlib
 import signal
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from firmware_protocol.c.build import BuildError
+from tormagd.output import write_line
 from tormagd.physics.errors import DomainError
+from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevice
+from tormagd.simulation.can_door import CanDoor
 from tormagd.simulation.compiled_firmware import CompiledFirmware
-from tormagd.simulation.device import DEFAULT_BAUD, FirmwareKind, VirtualDevice
+from tormagd.simulation.device import DEFAULT_BAUD, FirmwareKind, MessageDevice, VirtualDevice
 from tormagd.simulation.faults import FORMS as KNOWN_FAULTS
 from tormagd.simulation.faults import FaultError, parse_fault
 from tormagd.simulation.firmware import Firmware
@@ -19,6 +22,8 @@ from tormagd.simulation.hand import KNOWN as KNOWN_HANDS
 from tormagd.simulation.hand import HandError, parse_hand
 from tormagd.simulation.parameters import PlantError, load_plant, plant_names
 from tormagd.simulation.pty_door import PtyDoor
+from tormagd.simulation.real_time import Door, PacedDevice, serve
+from tormagd.simulation.slcan_door import SlcanDoor
 
 # The C sources are what a microcontroller would run; the Python twin, held equal to them by tests, needs no compiler.
 FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware}
@@ -34,27 +39,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nonlocal stopping
         stopping = True
 
-    try:
-        device = VirtualDevice(
-            load_plant(options.plant),
-            parse_hand(options.hand),
-            [parse_fault(spec) for spec in options.fault],
-            options.seed,
-            options.baud,
-            FIRMWARES[options.firmware],
-        )
-    except (PlantError, HandError, FaultError, DomainError, BuildError) as error:
-        return _refuse(parser, error)
     with contextlib.ExitStack() as resources:
         try:
+            device, door = _opened(options, resources)
             truth = options.truth and resources.enter_context(options.truth.open("w", encoding="utf-8"))
-        except OSError as error:
-            return _refuse(parser, error)
-        door = resources.enter_context(contextlib.closing(PtyDoor(device)))
+        except (PlantError, HandError, FaultError, DomainError, BuildError, OSError) as error:
+            parser.error(str(error))
         signal.signal(signal.SIGTERM, stop)
         signal.signal(signal.SIGINT, stop)
-        print(door.path, flush=True)
-        punctuality = door.serve(lambda: stopping, truth)
+        if write_line(door.address, sys.stdout) is not None:
+            print(f"{parser.prog}: {door.address} could not be written to stdout; it ends", file=sys.stderr)
+            return 1
+        punctuality = serve(device, door, lambda: stopping, truth)
     if punctuality.late:
         print(
             f"fell behind real time {punctuality.late} times, by {punctuality.worst_s * 1e3:.1f} ms at worst; "
@@ -64,10 +60,45 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tuple[PacedDevice, Door]:
+    """The device and the door asked for. Raises what the parts of the device raise, and OSError."""
+    boot = FIRMWARES[options.firmware]
+    plant, hand = load_plant(options.plant), parse_hand(options.hand)
+    faults = [parse_fault(spec) for spec in options.fault]
+    door: Door
+    if options.pty:
+        line = VirtualDevice(plant, hand, faults, options.seed, options.baud, boot)
+        door = resources.enter_context(contextlib.closing(PtyDoor(line)))
+        return line, door
+    device = CanDevice(MessageDevice(plant, hand, faults, options.seed, boot), options.bitrate, options.node)
+    if options.slcan:
+        door = SlcanDoor(device)
+    elif options.bus is not None:
+        from tormagd.simulation.bus_door import BusDoor  # python-can takes 0.15 s to import, and no other door needs it
+
+        door = BusDoor(device, options.bus)
+    else:
+        folder = resources.enter_context(tempfile.TemporaryDirectory(prefix="tormagsim-"))
+        door = CanDoor(device, Path(options.can or f"{folder}/can"))
+    resources.callback(door.close)
+    return device, door
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m tormagd.simulation", description="A simulated TorMag device.")
     doors = parser.add_mutually_exclusive_group(required=True)
     doors.add_argument("--pty", action="store_true", help="serial line on a pseudo-terminal, its path printed first")
+    doors.add_argument("--slcan", action="store_true", help="CAN adapter on a pseudo-terminal, its path printed first")
+    doors.add_argument(
+        "--can",
+        nargs="?",
+        const="",
+        metavar="PATH",
+        help="CAN bus for python-can's interface tormagsim, its channel printed first",
+    )
+    doors.add_argument(
+        "--bus", metavar="INTERFACE:CHANNEL", help="node of an existing bus, as in socketcan:vcan0, printed first"
+    )
     parser.add_argument("--plant", default="sample_1", metavar="FILE", help=f"TOML file, or {', '.join(plant_names())}")
     parser.add_argument("--hand", default="steady", metavar="SPEC", help=KNOWN_HANDS)
     parser.add_argument(
@@ -79,6 +110,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of noise and jitter")
     parser.add_argument("--baud", type=_baud, default=DEFAULT_BAUD, metavar="N", help=f"default {DEFAULT_BAUD}")
+    parser.add_argument("--bitrate", type=_bitrate, default=DEFAULT_BITRATE, metavar="N", help="of the CAN bus")
+    parser.add_argument("--node", type=int, choices=range(16), default=DEFAULT_NODE, metavar="N", help="on the CAN bus")
     parser.add_argument(
         "--firmware",
         choices=FIRMWARES,
@@ -96,8 +129,11 @@ def _baud(text: str) -> int:
     return baud
 
 
-def _refuse(parser: argparse.ArgumentParser, error: Exception) -> NoReturn:
-    parser.error(str(error))
+def _bitrate(text: str) -> int:
+    bitrate = int(text)
+    if not 10_000 <= bitrate <= 1_000_000:
+        raise argparse.ArgumentTypeError(f"{bitrate}: allowed are 10000 to 1000000")
+    return bitrate
 
 
 if __name__ == "__main__":

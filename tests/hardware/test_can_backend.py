@@ -1,0 +1,350 @@
+"""The CAN backend: over the simulator's own bus, a slcan adapter on a pseudo-terminal, and a bus that fails as told."""
+
+import contextlib
+import errno
+import os
+import select
+import socket
+import tty
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from pathlib import Path
+
+import can
+import pytest
+
+from firmware_protocol.codec import DeviceFault, DeviceMode, Drive, DriveMode, Home, Message, Status, Switches
+from tormagd.config import ConfigError, Device
+from tormagd.hardware import backend as backends
+from tormagd.hardware.backend import BackendError, installed, opener
+from tormagd.hardware.can_backend import FRAMES_AT_ONCE, UNSENT_FRAMES, CanBackend, open_can
+from tormagd.hardware.can_stream import CanStream
+from tormagd.simulation.can_frame import ERROR_FLAG, CanFrame, from_socket, to_socket
+
+STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
+BUS_OFF = CanFrame(ERROR_FLAG | 0x40, bytes(8))
+PASSIVE = CanFrame(ERROR_FLAG | 0x04, bytes((0, 0x30, 0, 0, 0, 0, 0, 0)))
+
+
+def frame_of(message: Message) -> CanFrame:
+    return CanFrame(*CanStream(1).pack(message))
+
+
+def descriptors() -> int:
+    """How many this process has open."""
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def wait_readable(backend: CanBackend) -> None:
+    assert select.select([backend.fileno()], [], [], 5.0)[0]
+
+
+# -- on the simulator's bus ----------------------------------------------------------------------------------------
+
+
+class Bus:
+    """A served bus whose far end the test holds."""
+
+    def __init__(self, folder: Path) -> None:
+        self.device = Device(backend="can", interface="tormagsim", port=str(folder / "can"))
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._listener.bind(self.device.port)
+        self._listener.listen()
+        self.backend = open_can(self.device)
+        self.far, _ = self._listener.accept()
+
+    def put(self, *frames: CanFrame) -> None:
+        """Frames that the backend finds on the bus."""
+        for frame in frames:
+            self.far.send(to_socket(frame))
+
+    def close(self) -> None:
+        """Takes everything away."""
+        self.backend.close()
+        self.far.close()
+        self._listener.close()
+
+
+@pytest.fixture
+def bus(tmp_path: Path) -> Iterator[Bus]:
+    with contextlib.closing(Bus(tmp_path)) as made:
+        yield made
+
+
+def test_messages_pass_both_ways(bus: Bus) -> None:
+    assert bus.backend.receive() == []
+    bus.put(frame_of(STATUS), frame_of(STATUS._replace(drive_counter=9)))
+    assert [message.drive_counter for message in bus.backend.receive()] == [0, 9]  # type: ignore[union-attr]
+    bus.backend.send(Home(7))
+    assert from_socket(bus.far.recv(64)) == frame_of(Home(7))
+    assert (bus.backend.statistics.frames, bus.backend.statistics.corrupt) == (2, 0)
+
+
+def test_bus_off_is_said_by_its_name(bus: Bus) -> None:
+    bus.put(frame_of(STATUS), BUS_OFF)
+    with pytest.raises(BackendError, match="bus-off") as caught:
+        bus.backend.receive()
+    assert bus.device.port in str(caught.value)
+    assert "termination" in caught.value.remedy
+
+
+def test_an_error_frame_that_is_not_bus_off_is_counted(bus: Bus) -> None:
+    bus.put(PASSIVE, frame_of(STATUS))
+    assert bus.backend.receive() == [STATUS]
+    assert (bus.backend.statistics.corrupt, bus.backend.statistics.resynchronisations) == (1, 1)
+
+
+def test_another_host_on_the_same_node_ends_the_connection(bus: Bus) -> None:
+    bus.put(frame_of(Drive(0.1, 0.1, DriveMode.RUN, 1)))
+    with pytest.raises(BackendError, match="another host drives node 1") as caught:
+        bus.backend.receive()
+    assert "device.node" in caught.value.remedy
+
+
+def test_a_simulator_that_goes_away_is_said_by_reading_and_writing(bus: Bus) -> None:
+    bus.far.close()
+    with pytest.raises(BackendError, match=bus.device.port):
+        bus.backend.receive()
+    with pytest.raises(BackendError, match=bus.device.port):
+        bus.backend.send(Home(1))
+
+
+def test_a_bus_that_takes_no_frames_is_noticed(bus: Bus) -> None:
+    def send_for_long() -> None:
+        for counter in range(10_000):
+            bus.backend.send(Drive(0.0, 0.0, DriveMode.OFF, counter % 256))
+
+    with pytest.raises(BackendError, match="nobody acknowledges") as caught:
+        send_for_long()
+    assert "bit rate" in caught.value.remedy
+
+
+def test_no_more_frames_are_taken_at_once_than_the_loop_can_bear(bus: Bus) -> None:
+    bus.far.setblocking(False)
+    queued = 0
+    with contextlib.suppress(BlockingIOError):
+        for queued in range(2 * FRAMES_AT_ONCE):  # noqa: B007 - counts what the kernel takes
+            bus.put(frame_of(STATUS))
+    assert len(bus.backend.receive()) == min(queued, FRAMES_AT_ONCE)
+
+
+def test_nobody_at_the_channel_and_no_channel_are_said(tmp_path: Path) -> None:
+    for path in (tmp_path / "absent", tmp_path):
+        with pytest.raises(BackendError, match="cannot be opened") as caught:
+            open_can(Device(backend="can", interface="tormagsim", port=str(path)))
+        assert str(path) in str(caught.value)
+
+
+# -- behind an adapter on a serial line ----------------------------------------------------------------------------
+
+
+class Adapter:
+    """A pseudo-terminal where a slcan adapter would be."""
+
+    def __init__(self) -> None:
+        self.far, self.near = os.openpty()
+        tty.setraw(self.near)
+        self.device = Device(backend="can", interface="slcan", port=os.ttyname(self.near))
+
+    def unplug(self) -> None:
+        """Both ends: the test holds the host's too, so that lines written before it opened stay."""
+        for descriptor in (self.far, self.near):
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+
+
+@pytest.fixture
+def adapter() -> Iterator[Adapter]:
+    made = Adapter()
+    yield made
+    made.unplug()
+
+
+def test_lines_of_an_adapter_pass_both_ways(adapter: Adapter) -> None:
+    backend = open_can(adapter.device)
+    backend.send(Home(7))
+    said = b""
+    while not said.endswith(b"t061107\r"):
+        said += os.read(adapter.far, 100)
+    assert said.startswith(b"C\rS8\r")
+    status = frame_of(STATUS)
+    os.write(adapter.far, b"\rz\r\at%03X8%s\r" % (status.identifier, status.data.hex().encode()))
+    received: list[Message] = []
+    while not received:
+        wait_readable(backend)
+        received += backend.receive()
+    assert received == [STATUS]
+    backend.close()
+
+
+@pytest.mark.parametrize("damaged", [b"t07x8\r", b"t0718zz\r", b"t071\r", b"\xff\xfe071\r", b"t0719\r", b"tttt\r"])
+def test_a_damaged_line_is_counted_and_the_next_is_read(adapter: Adapter, damaged: bytes) -> None:
+    backend = open_can(adapter.device)
+    os.write(adapter.far, damaged)
+    while not backend.statistics.corrupt:
+        wait_readable(backend)
+        assert backend.receive() == []
+    os.write(adapter.far, b"t0718%s\r" % frame_of(STATUS).data.hex().encode())
+    received: list[Message] = []
+    while not received:
+        wait_readable(backend)
+        received += backend.receive()
+    assert received == [STATUS]
+    assert backend.statistics.resynchronisations == 1
+    backend.close()
+
+
+@pytest.mark.parametrize("other", ["slcan", "serial"])
+def test_an_adapter_belongs_to_one(adapter: Adapter, other: str) -> None:
+    first = open_can(adapter.device)
+    second = adapter.device if other == "slcan" else Device(port=adapter.device.port)
+    with pytest.raises(BackendError):
+        opener(second)(second)
+    first.close()
+    opener(second)(second).close()
+
+
+def test_an_adapter_that_was_unplugged_leaves_no_descriptor_behind() -> None:
+    before = descriptors()
+    for _ in range(3):
+        adapter = Adapter()
+        backend = open_can(adapter.device)
+        adapter.unplug()
+        with pytest.raises(BackendError, match="slcan"):
+            backend.receive()
+        with pytest.raises(BackendError, match="slcan"):
+            backend.send(Home(1))
+        backend.close()
+        backend.close()
+    assert descriptors() == before
+
+
+# -- a bus that fails as told --------------------------------------------------------------------------------------
+
+
+class FailingBus(can.BusABC):
+    """Hands out what it is given, and raises what it is given."""
+
+    def __init__(self, *events: can.Message | Exception) -> None:
+        self.events = list(events)
+        self._fd, self._other = os.pipe()
+        if events:
+            os.write(self._other, b"x")
+        super().__init__(channel="none")
+
+    def fileno(self) -> int:
+        return self._other  # always writable, never readable
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        event = self.events.pop(0) if self.events else None
+        if isinstance(event, Exception):
+            raise event
+        return event, False
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        event = self.events.pop(0) if len(self.events) > 1 else self.events[0]
+        assert isinstance(event, Exception)
+        raise event
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        os.close(self._fd)
+        os.close(self._other)
+
+
+@pytest.fixture
+def failing() -> Iterator[Callable[..., CanBackend]]:
+    with contextlib.ExitStack() as opened:
+
+        def make(*events: can.Message | Exception) -> CanBackend:
+            backend = CanBackend(Device(backend="can", interface="socketcan", port="can0"), FailingBus(*events))
+            opened.callback(backend.close)
+            return backend
+
+        yield make
+
+
+def test_an_interface_that_is_down_says_how_to_bring_it_up(failing: Callable[..., CanBackend]) -> None:
+    backend = failing(can.CanOperationError("Failed to transmit", errno.ENETDOWN))
+    with pytest.raises(BackendError, match="is down") as caught:
+        backend.send(Home(1))
+    assert "ip link set can0 up" in caught.value.remedy
+
+
+def test_a_full_queue_is_borne_for_as_long_as_the_device_would(failing: Callable[..., CanBackend]) -> None:
+    backend = failing(can.CanOperationError("Failed to transmit", errno.ENOBUFS))
+    for _ in range(UNSENT_FRAMES):
+        backend.send(Home(1))
+    with pytest.raises(BackendError, match="takes no frames"):
+        backend.send(Home(1))
+
+
+def test_the_systems_reason_is_found_behind_python_cans(failing: Callable[..., CanBackend]) -> None:
+    wrapped = can.CanOperationError("Could not read from serial device")
+    wrapped.__cause__ = OSError(errno.EIO, "Input/output error")
+    with pytest.raises(BackendError, match=os.strerror(errno.EIO)):
+        failing(wrapped).receive()
+    with pytest.raises(BackendError, match="fell off the table"):
+        failing(can.CanOperationError("fell off the table")).receive()
+
+
+@pytest.mark.parametrize("flag", ["is_extended_id", "is_remote_frame", "is_fd"])
+def test_other_kinds_of_frames_are_other_peoples(failing: Callable[..., CanBackend], flag: str) -> None:
+    status = frame_of(STATUS)
+    flags = {"is_extended_id": False} | {flag: True}
+    data = b"" if flag == "is_remote_frame" else status.data
+    other = can.Message(arbitration_id=status.identifier, data=data, **flags)
+    plain = can.Message(arbitration_id=status.identifier, data=status.data, is_extended_id=False)
+    backend = failing(other, plain)
+    assert backend.receive() + backend.receive() == [STATUS]
+    assert backend.statistics.corrupt == 0
+
+
+# -- finding one ---------------------------------------------------------------------------------------------------
+
+
+def can_device(interface: str) -> Device:
+    return Device(backend="can", interface=interface, port="can0")
+
+
+def test_the_can_backend_is_installed_and_so_is_the_simulators_bus() -> None:
+    assert opener(can_device("tormagsim")) is open_can
+    assert installed()["can"] == ""
+
+
+@pytest.mark.parametrize(
+    ("interface", "said"),
+    [
+        ("telepathy", "installed are .*socketcan"),
+        ("virtual", "no descriptor to wait for"),
+        ("nican", "no descriptor to wait for"),
+    ],
+)
+def test_an_interface_that_cannot_work_is_refused_before_anything_is_opened(interface: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=f"device.interface = '{interface}': .*{said}"):
+        opener(can_device(interface))
+
+
+def test_a_driver_that_does_not_load_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(can.interfaces.BACKENDS, "broken", ("no_such_module_anywhere", "Bus"))
+    with pytest.raises(ConfigError, match=r"device\.interface = 'broken': its driver does not load"):
+        opener(can_device("broken"))
+
+
+def test_a_broken_plugin_is_named_and_skipped(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    (tmp_path / "half_a_plugin.py").write_text("def open(device:\n")
+    (tmp_path / "angry_plugin.py").write_text("raise RuntimeError('not on a Friday')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    entries = {"fine": "os:getpid", "absent": "no_such_module_anywhere:open"}
+    entries |= {"half": "half_a_plugin:open", "angry": "angry_plugin:open"}
+    points = [metadata.EntryPoint(name, value, backends.ENTRY_POINTS) for name, value in entries.items()]
+    monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == backends.ENTRY_POINTS else [])
+    found = installed()
+    assert list(found) == ["absent", "angry", "fine", "half"]
+    assert found["fine"] == ""
+    assert "not on a Friday" in found["angry"]
+    assert "SyntaxError" in found["half"]
+    assert [record.levelname for record in caplog.records] == ["WARNING"] * 3
+    assert opener(Device(backend="fine")) is os.getpid

@@ -1,0 +1,484 @@
+"""The connection as a state machine, on a clock and a device that the test moves by hand."""
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import msgspec
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from firmware_protocol.codec import (
+    SCHEMA_HASH,
+    Clear,
+    DeviceFault,
+    DeviceMode,
+    Drive,
+    DriveMode,
+    Hello,
+    Home,
+    Identity,
+    Message,
+    Retract,
+    Sense,
+    State,
+    Status,
+    Switches,
+    period,
+)
+from tormagd.config import Device
+from tormagd.hardware.backend import BackendError
+from tormagd.hardware.connection import FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S, Connection
+from tormagd.hardware.link import SILENT_S, LinkState
+from tormagd.safety.operating_state import DeviceRequest
+
+TICK_S = 1e-3
+COMMANDS = {Home: DeviceRequest.HOME, Retract: DeviceRequest.RETRACT, Clear: DeviceRequest.CLEAR}
+
+
+class Firmware:
+    """As much of a device as a connection can see: it answers, counts nonces and forgets them when it is reset."""
+
+    def __init__(self) -> None:
+        self.identity = Identity(SCHEMA_HASH, 1, 0, 7)
+        self.accepted: list[type[Message]] = []
+        self.reset()
+
+    def reset(self) -> None:
+        self.nonce, self.counter, self.boot_ms = 0, 0, 0
+
+    def answers(self, message: Message) -> list[Message]:
+        if isinstance(message, Hello):
+            self.nonce = message.nonce
+            return [self.identity]
+        if isinstance(message, Drive):
+            self.counter = (self.counter + 1) % 256
+            time_s = self.boot_ms * 1e-3 % period(State, "device_time_s")
+            return [State(-1.0, -1.0, time_s, self.counter), Sense(0.1, 0.1, 1.0, 0.0)]
+        if isinstance(message, Home | Retract | Clear) and message.nonce != self.nonce:
+            self.nonce = message.nonce
+            self.accepted.append(type(message))
+        return []
+
+    def status(self) -> Status:
+        return Status(DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 12.0, 0, self.nonce)
+
+
+class Port:
+    """A backend over nothing: what the device says waits in a queue."""
+
+    def __init__(self, bench: "Bench", fd: int) -> None:
+        self.bench, self.fd = bench, fd
+        self.waiting: deque[Message] = deque()
+        self.statistics = SimpleNamespace(frames=0, bytes=0, corrupt=0, lost=0, repeated=0, resynchronisations=0)
+        self.is_dead = self.is_closed = False
+
+    def fileno(self) -> int:
+        return self.fd
+
+    def receive(self) -> list[Message]:
+        assert not self.is_closed
+        if self.is_dead:
+            raise BackendError("/dev/tormag: the device was unplugged")
+        messages, self.waiting = list(self.waiting), deque()
+        self.statistics.frames += len(messages)
+        return messages
+
+    def send(self, message: Message) -> None:
+        assert not self.is_closed
+        bench = self.bench
+        if isinstance(message, Drive):
+            assert bench.connection.state is LinkState.RUNNING, "only a device that is known is driven"
+        if isinstance(message, Home | Clear):
+            assert COMMANDS[type(message)] is bench.request
+            assert bench.asked_of == bench.losses, "a command that the last device was given moves no other"
+        if self.is_dead:
+            raise BackendError("/dev/tormag: writing failed")
+        if self.bench.is_bus_off:
+            raise BackendError("can0: bus-off", "look at the termination")
+        self.bench.sent.append((self.bench.now_s, message))
+        if not self.bench.is_mute:
+            self.waiting.extend(self.bench.firmware.answers(message))
+
+    def close(self) -> None:
+        assert not self.is_closed
+        self.is_closed = True
+
+
+class Bench:
+    """A connection with everything around it: clock, event loop, port, device and the core that is told of losses."""
+
+    def __init__(self) -> None:
+        self.ms = 0
+        self.firmware = Firmware()
+        self.ports: list[Port] = []
+        self.sent: list[tuple[float, Message]] = []
+        self.attempts_s: list[float] = []
+        self.readers: dict[int, Callable[[], None]] = {}
+        self.losses = 0
+        self.is_there = self.has_status = True
+        self.is_held = self.is_mute = self.is_bus_off = self.is_babbling = False
+        self.request, self.number = DeviceRequest.NONE, 0
+        self.asked_of: int | None = None
+        "The device that was asked, by the losses before it; None if there was none to ask."
+        self.accepted_before = 0
+        self.is_armed = True
+        self.seen = [LinkState.CLOSED]
+        self._fds = itertools.count(10)
+        self.connection = Connection(Device(port="/dev/tormag"), self._open, self._lose, lambda: self.now_s)
+
+    @property
+    def now_s(self) -> float:
+        return 1_000.0 + self.ms * TICK_S
+
+    @property
+    def port(self) -> Port | None:
+        return self.ports[-1] if self.ports and not self.ports[-1].is_closed else None
+
+    # what the connection is given
+    def _open(self, device: Device) -> Port:
+        self.attempts_s.append(self.now_s)
+        if not self.is_there:
+            raise BackendError("/dev/tormag: there is no such port", "plug the device in")
+        if self.is_held:
+            raise BackendError("/dev/tormag: another process holds it", "tormagctl ports says who")
+        self.ports.append(Port(self, next(self._fds)))
+        return self.ports[-1]
+
+    def _lose(self) -> None:
+        self.losses += 1
+        if self.is_armed:
+            self.ask(DeviceRequest.RETRACT)  # the core latches, and wants the gap open
+
+    def add_reader(self, fd: int, callback: Callable[[], None]) -> None:
+        assert fd not in self.readers
+        self.readers[fd] = callback
+
+    def remove_reader(self, fd: int) -> None:
+        del self.readers[fd]
+
+    # what happens
+    def ask(self, request: DeviceRequest) -> None:
+        self.request, self.number = request, self.number + 1
+        self.asked_of = self.losses if self.connection.state is LinkState.RUNNING else None
+        self.accepted_before = len(self.firmware.accepted)
+
+    def pass_ms(self, ms: int, is_stalled: bool = False) -> None:
+        """Lets time pass; a stalled host does not notice it."""
+        for _ in range(ms):
+            self.ms += 1
+            self.firmware.boot_ms += 1
+            if (port := self.port) is not None and self.is_there:
+                if self.is_babbling:
+                    port.statistics.corrupt += 1
+                elif self.ms % 20 == 0 and self.has_status and not self.is_mute:
+                    port.waiting.append(self.firmware.status())
+            if not is_stalled:
+                self.wake()
+                self.connection.exchange(0.0, 0.0, DriveMode.OFF, self.request, self.number)
+                self.look()
+
+    def wake(self) -> None:
+        """The event loop's turn."""
+        if (port := self.port) is not None and (port.waiting or port.is_dead):
+            self.readers[port.fd]()
+            self.look()
+
+    def look(self) -> None:
+        if (state := self.connection.state) is not self.seen[-1]:
+            self.seen.append(state)
+
+    def unplug(self) -> None:
+        self.is_there = False
+        if self.port is not None:
+            self.port.is_dead = True
+
+    def running(self) -> "Bench":
+        self.connection.open(self)
+        self.pass_ms(100)
+        assert self.connection.state is LinkState.RUNNING
+        assert self.connection.measurement is not None
+        return self
+
+    def of(self, kind: type[Message], since_s: float = -math.inf) -> list[float]:
+        return [at_s for at_s, message in self.sent if isinstance(message, kind) and at_s >= since_s]
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def unanswered(bench: Bench) -> None:
+    bench.is_mute = True
+    bench.connection.open(bench)
+
+
+def babbling(bench: Bench) -> None:
+    bench.is_mute = bench.is_babbling = True
+    bench.connection.open(bench)
+
+
+def absent(bench: Bench) -> None:
+    bench.is_there = False
+    bench.connection.open(bench)
+
+
+def held(bench: Bench) -> None:
+    bench.is_held = True
+    bench.connection.open(bench)
+
+
+def wrong(bench: Bench) -> None:
+    bench.firmware.identity = Identity(0xBAD, 3, 1, 7)
+    bench.connection.open(bench)
+
+
+def silent(bench: Bench) -> None:
+    bench.running().is_mute = True
+
+
+def bus_off(bench: Bench) -> None:
+    bench.running().is_bus_off = True
+
+
+def unplugged(bench: Bench) -> None:
+    bench.running().unplug()
+
+
+@pytest.mark.parametrize(
+    ("trouble", "after_ms", "state", "cause", "remedy"),
+    [
+        (absent, 1, LinkState.BACK_OFF, "no such port", "plug"),
+        (held, 1, LinkState.BACK_OFF, "another process", "tormagctl ports"),
+        (wrong, 60, LinkState.REFUSED, "00000bad", "same protocol schema"),
+        (unanswered, 1_010, LinkState.UNANSWERED, "it is silent", "rate"),
+        (babbling, 1_010, LinkState.UNANSWERED, "not this protocol", "rate"),
+        (unplugged, 1, LinkState.LOST, "unplugged", "cable"),
+        (silent, 82, LinkState.LOST, "no message for 80 ms", "cable"),
+        (bus_off, 1, LinkState.LOST, "bus-off", "termination"),
+    ],
+)
+def test_each_trouble_has_its_state_cause_and_remedy_and_goes_when_it_is_mended(
+    bench: Bench, trouble: Callable[[Bench], None], after_ms: int, state: LinkState, cause: str, remedy: str
+) -> None:
+    trouble(bench)
+    bench.pass_ms(after_ms)
+    assert bench.connection.state is state
+    report = bench.connection.report()
+    assert (report["state"], bench.connection.measurement) == (str(state), None)
+    assert cause in report["cause"]
+    assert remedy in report["remedy"]
+    bench.pass_ms(3_000)  # it has given up asking often by now
+    heal(bench)
+    bench.pass_ms(1_200)
+    assert bench.connection.state is LinkState.RUNNING
+    assert (bench.connection.cause, bench.connection.remedy) == ("", "")
+    assert bench.connection.measurement is not None
+
+
+def heal(bench: Bench) -> None:
+    bench.is_there = True
+    bench.is_held = bench.is_mute = bench.is_bus_off = bench.is_babbling = False
+    bench.firmware.identity = Identity(SCHEMA_HASH, 1, 0, 7)
+
+
+def test_a_device_that_was_reset_is_a_loss_without_closing_the_port(bench: Bench) -> None:
+    bench.running()
+    bench.firmware.reset()
+    bench.pass_ms(60)
+    assert bench.seen[-2:] == [LinkState.IDENTIFYING, LinkState.RUNNING]
+    assert (bench.losses, bench.connection.losses, len(bench.ports)) == (1, 1, 1)
+    assert "reset" in bench.connection.report()["last_loss"]
+
+
+def test_the_core_is_told_of_a_loss_once_and_within_a_tenth_of_a_second(bench: Bench) -> None:
+    bench.running().is_mute = True
+    bench.pass_ms(round(SILENT_S * 1e3) - 20)
+    assert bench.losses == 0, "the last Status came up to 20 ms before"
+    bench.pass_ms(100 - round(SILENT_S * 1e3) + 20)
+    assert bench.losses == 1
+    bench.pass_ms(5_000)
+    assert bench.losses == bench.connection.losses == 1
+
+
+def test_a_host_that_was_not_run_does_not_take_its_own_sleep_for_the_devices(bench: Bench) -> None:
+    """Whichever the event loop wakes first after a stall, the timer or the port."""
+    bench.running().pass_ms(500, is_stalled=True)
+    bench.ms += 1
+    bench.connection.exchange(0.0, 0.0, DriveMode.OFF, bench.request, bench.number)
+    assert bench.connection.state is LinkState.RUNNING
+    assert bench.losses == 0
+
+
+def test_a_device_whose_first_word_is_who_it_is_runs_at_once(bench: Bench) -> None:
+    unanswered(bench)
+    bench.pass_ms(1_100)
+    bench.is_mute = False
+    bench.has_status = False
+    bench.pass_ms(1_000)
+    assert bench.seen == [LinkState.CLOSED, LinkState.IDENTIFYING, LinkState.UNANSWERED, LinkState.RUNNING]
+
+
+def test_waiting_grows_to_a_second_and_starts_anew_with_the_next_device(bench: Bench) -> None:
+    bench.running().unplug()
+    first = len(bench.attempts_s)
+    bench.pass_ms(6_000)
+    waits_s = [after - before for before, after in itertools.pairwise(bench.attempts_s[first:])]
+    assert waits_s[:4] == pytest.approx([0.1, 0.2, 0.4, 0.8], abs=2e-3)
+    assert waits_s[4:] == pytest.approx([LONGEST_BACK_OFF_S] * len(waits_s[4:]), abs=2e-3)
+    heal(bench)
+    bench.pass_ms(1_100)
+    lost_s = bench.now_s
+    bench.unplug()
+    bench.pass_ms(60)
+    assert bench.attempts_s[-1] - lost_s == pytest.approx(FIRST_BACK_OFF_S, abs=2e-3)
+
+
+@pytest.mark.parametrize("request_", [DeviceRequest.HOME, DeviceRequest.CLEAR])
+def test_what_was_asked_of_a_device_that_then_went_is_not_done_by_the_one_that_comes(
+    bench: Bench, request_: DeviceRequest
+) -> None:
+    bench.running().unplug()
+    bench.is_armed = False
+    bench.ask(request_)
+    bench.pass_ms(200)
+    heal(bench)
+    bench.pass_ms(1_500)
+    assert bench.connection.state is LinkState.RUNNING
+    assert bench.firmware.accepted == []
+
+
+def test_opening_the_gap_waits_for_a_device_that_went_before_it_had_heard(bench: Bench) -> None:
+    bench.running()
+    bench.is_armed = False
+    bench.is_mute = True
+    bench.ask(DeviceRequest.RETRACT)
+    bench.pass_ms(20)
+    assert bench.of(Retract)
+    bench.pass_ms(3_000)
+    heal(bench)
+    bench.pass_ms(1_200)
+    assert bench.firmware.accepted == [Retract]
+
+
+def test_a_closed_connection_stays_closed(bench: Bench) -> None:
+    bench.running().connection.close()
+    assert bench.readers == {}
+    bench.pass_ms(3_000)
+    assert bench.connection.state is LinkState.CLOSED
+    assert len(bench.ports) == 1
+    bench.connection.close()
+
+
+def test_what_is_not_known_is_reported_as_such(bench: Bench) -> None:
+    before = bench.connection.report()
+    assert (before["state"], before["frames"], before["round_trip_us"], before["clock"]) == ("CLOSED", None, None, None)
+    bench.running().pass_ms(4_000)
+    after = bench.connection.report()
+    assert before.keys() == after.keys()
+    assert msgspec.msgpack.decode(msgspec.msgpack.encode(after)) == after, "it travels"
+    assert (after["firmware"], after["serial_number"], after["daemon_schema"]) == ("1.0", 7, f"{SCHEMA_HASH:08x}")
+    assert after["round_trip_us"]["p50"] == pytest.approx(1_000.0)
+    assert abs(after["clock"]["drift_ppm"]) < 1.0
+
+
+class Cables(RuleBasedStateMachine):
+    """Anything that can happen to a connection, in any order. It asserts its own transitions, `Port` what is sent."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bench = Bench()
+        self.bench.connection.open(self.bench)
+        self.bench.look()
+
+    @rule(ms=st.integers(1, 150))
+    def time_passes(self, ms: int) -> None:
+        self.bench.pass_ms(ms)
+
+    @rule(ms=st.integers(1, 400))
+    def the_host_is_not_run(self, ms: int) -> None:
+        self.bench.pass_ms(ms, is_stalled=True)
+
+    @rule()
+    def somebody_pulls_the_plug(self) -> None:
+        self.bench.unplug()
+
+    @rule()
+    def somebody_puts_it_in(self) -> None:
+        self.bench.is_there = True
+
+    @rule(is_held=st.booleans())
+    def another_process_opens_or_closes_the_port(self, is_held: bool) -> None:
+        self.bench.is_held = is_held
+
+    @rule(is_mute=st.booleans(), is_babbling=st.booleans())
+    def the_device_falls_silent_or_speaks(self, is_mute: bool, is_babbling: bool) -> None:
+        self.bench.is_mute, self.bench.is_babbling = is_mute, is_babbling
+
+    @rule(is_bus_off=st.booleans())
+    def the_bus_goes_off_or_on(self, is_bus_off: bool) -> None:
+        self.bench.is_bus_off = is_bus_off
+
+    @rule(schema=st.sampled_from([SCHEMA_HASH, SCHEMA_HASH, 0xBAD]), serial_number=st.integers(7, 8))
+    def another_device_takes_its_place(self, schema: int, serial_number: int) -> None:
+        self.bench.firmware.identity = Identity(schema, 1, 0, serial_number)
+
+    @rule()
+    def the_device_is_reset(self) -> None:
+        self.bench.firmware.reset()
+
+    @rule(request=st.sampled_from([DeviceRequest.HOME, DeviceRequest.RETRACT, DeviceRequest.CLEAR]))
+    def the_core_asks(self, request: DeviceRequest) -> None:
+        if request is DeviceRequest.RETRACT or self.bench.connection.state is LinkState.RUNNING:
+            self.bench.ask(request)
+
+    @rule(is_armed=st.booleans())
+    def the_core_is_armed_or_not(self, is_armed: bool) -> None:
+        self.bench.is_armed = is_armed
+
+    @invariant()
+    def a_state_says_why_and_what_to_do(self) -> None:
+        connection = self.bench.connection
+        is_running = connection.state is LinkState.RUNNING
+        assert bool(connection.cause) != is_running
+        assert bool(connection.remedy) == (connection.state not in (LinkState.RUNNING, LinkState.IDENTIFYING))
+        assert is_running or connection.measurement is None
+
+    @invariant()
+    def one_port_is_open_at_most_and_watched(self) -> None:
+        still_open = [port.fd for port in self.bench.ports if not port.is_closed]
+        assert len(still_open) <= 1
+        assert list(self.bench.readers) == still_open
+        waits = self.bench.connection.state in (LinkState.BACK_OFF, LinkState.LOST)
+        assert waits == (not still_open)
+
+    @invariant()
+    def ports_are_not_opened_in_a_hurry(self) -> None:
+        attempts_s = self.bench.attempts_s
+        assert all(after - before >= FIRST_BACK_OFF_S - 1e-9 for before, after in itertools.pairwise(attempts_s))
+
+    @invariant()
+    def each_loss_is_told_once(self) -> None:
+        assert self.bench.losses == self.bench.connection.losses
+        assert self.bench.losses >= self.bench.seen[1:].count(LinkState.RUNNING) - 1
+
+    def teardown(self) -> None:
+        """Mended, it runs, and the gap is opened if that was the last wish."""
+        heal(self.bench)
+        self.bench.pass_ms(2_300)
+        assert self.bench.connection.state is LinkState.RUNNING
+        if self.bench.request is DeviceRequest.RETRACT:
+            assert Retract in self.bench.firmware.accepted[self.bench.accepted_before :]
+        self.bench.connection.close()
+        assert self.bench.readers == {}
+
+
+Cables.TestCase.settings = settings(
+    max_examples=40, stateful_step_count=30, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+TestCables = Cables.TestCase

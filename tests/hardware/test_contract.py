@@ -1,0 +1,575 @@
+"""One suite for every transport: the daemon's core, link and backend against a device at the end of a bad line.
+
+Everything is real but the time: the control core, the link, the backend with its driver, the kernel's pty or socket,
+the device with its wire. Time is virtual, so that every case is the same every time: the far end hands what the device
+has sent to the kernel when the virtual clock says so, spoiled by a seeded channel, and waits until it is readable.
+"""
+
+import contextlib
+import copy
+import fcntl
+import math
+import os
+import random
+import select
+import socket
+import struct
+import termios
+import tty
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import can
+import numpy as np
+import pytest
+
+from firmware_protocol.codec import DriveMode, Message
+from tormagd.closed_loop import ClosedLoop, Sample, stream
+from tormagd.config import Config, Device
+from tormagd.control.core import Core, build_core
+from tormagd.hardware.backend import Backend, opener
+from tormagd.hardware.frame_stream import FrameStream
+from tormagd.hardware.link import DeviceLink, LinkState
+from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.operating_state import OperatingState
+from tormagd.simulation.can_device import DEVICE, CanDevice
+from tormagd.simulation.can_frame import MAX_IDENTIFIER, CanFrame, from_socket, to_socket
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import parse_hand
+from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.plant import Truth
+from tormagd.simulation.slcan_door import SlcanAdapter
+
+CONFIG = Config()
+PATIENCE_S = 10.0
+"Longer than a kernel takes to hand anything over; only a failure waits for it."
+PERIOD_S = 1e-3
+MOVING_S = 0.3
+"Into the closing of the gap: where the line goes bad."
+OPENING_S = 2.4
+"What the slower of two openings takes, with the device's own timeout before it."
+FORCE_N = 1.4
+CLOSED_MM, OPEN_MM = 46.9, 95.1
+"The stops of the gap, and a little."
+SETTLED_TICKS = 200
+"At the end of a case; on a good line the gap has long arrived by then, and nothing is saturated."
+COASTING_MM = 8.0
+"How far the carriages may still close after a fault on a late line: what was on its way, and their own speed."
+
+
+# -- channels ------------------------------------------------------------------------------------------------------
+
+
+class Channel:
+    """One direction of a line. A unit is what a transport carries at once: a frame, or a line of text."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = random.Random(seed)
+
+    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
+        """What comes out now, of these and earlier units."""
+        return units
+
+
+class Loss(Channel):
+    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
+        return [unit for unit in units if self._random.random() >= 0.2]
+
+
+class Corruption(Channel):
+    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
+        return [self._flipped(unit) if self._random.random() < 0.05 else unit for unit in units]
+
+    def _flipped(self, unit: bytes) -> bytes:
+        bit = self._random.randrange(8 * len(unit))
+        return bytes(byte ^ (1 << bit % 8 if at == bit // 8 else 0) for at, byte in enumerate(unit))
+
+
+class Duplicates(Channel):
+    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
+        return [unit for unit in units for _ in range(2 if self._random.random() < 0.3 else 1)]
+
+
+class Reordering(Channel):
+    """One unit in five waits until another has passed it."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self._waiting: list[bytes] = []
+
+    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
+        out = []
+        for unit in units:
+            if not self._waiting and self._random.random() < 0.2:
+                self._waiting.append(unit)
+            else:
+                out += [unit, *self._waiting]
+                self._waiting.clear()
+        return out
+
+
+class Delay(Channel):
+    delay_s = 0.03
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self._waiting: list[tuple[float, bytes]] = []
+
+    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
+        self._waiting += [(self._due_s(now_s), unit) for unit in units]
+        out = [unit for due_s, unit in self._waiting if due_s <= now_s]
+        self._waiting = [(due_s, unit) for due_s, unit in self._waiting if due_s > now_s]
+        return out
+
+    def _due_s(self, now_s: float) -> float:
+        return now_s + self.delay_s
+
+
+class Burst(Delay):
+    """Nothing for 60 ms, then all of it at once."""
+
+    delay_s = 0.06
+
+    def _due_s(self, now_s: float) -> float:
+        return math.ceil(now_s / self.delay_s) * self.delay_s
+
+
+class Cut(Channel):
+    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
+        return []
+
+
+class Case(NamedTuple):
+    """A kind of line and what has to come of it."""
+
+    channel: type[Channel]
+    tolerance_N: float = math.inf
+    "The force is rendered so well, in the end, where no fault appears."
+    faults: frozenset[Fault] = frozenset()
+    "A fault, if there is one, is one of these."
+    named: frozenset[Fault | Limit] = frozenset()
+    "One of these holds at the end."
+    link: LinkState = LinkState.RUNNING
+    "Where the link ends."
+    bad_s: float = 0.5
+    "How long the line is like that."
+    is_bytewise: bool = False
+    counted: tuple[str, ...] = ()
+    "Which of the link's counters show it."
+
+
+TOO_LATE = frozenset({Fault.MEASUREMENT_STALE, Fault.DEVICE_COMMAND_TIMEOUT, Fault.LINK_LOST})
+TOO_SLOW = frozenset({Fault.SKEW, Fault.DEVICE_SKEW, Fault.FOLLOWING_ERROR})
+CASES = {
+    "clean": Case(Channel, 0.05),
+    "one byte at a time": Case(Channel, 0.05, is_bytewise=True),
+    "20% loss": Case(Loss, 0.05, counted=("lost",)),
+    # State carries a CRC everywhere, Sense and Status only on serial: there a force or a fault bit may be a wrong one
+    "5% corruption": Case(Corruption, 0.5, faults=frozenset(Fault), counted=("corrupt", "resynchronisations")),
+    "duplicates": Case(Duplicates, 0.05, counted=("repeated",)),
+    "reordering": Case(Reordering, 0.05, counted=("lost",)),
+    # the carriages swing about their place, with all the voltage there is
+    "30 ms delay": Case(
+        Delay, faults=TOO_SLOW | TOO_LATE, named=TOO_SLOW | TOO_LATE | {Limit.SATURATED, Limit.SKEW}, bad_s=1.0
+    ),
+    "burst": Case(Burst, faults=TOO_LATE, named=TOO_LATE),
+    "cut": Case(Cut, faults=TOO_LATE, named=TOO_LATE, link=LinkState.LOST),
+}
+
+
+# -- transports ----------------------------------------------------------------------------------------------------
+
+
+class FarEnd(ABC):
+    """The device with its end of one transport, and what the daemon opens to come to it."""
+
+    device: VirtualDevice | CanDevice
+    configured: Device
+
+    @abstractmethod
+    def units(self, now_s: float) -> list[bytes]:
+        """What the device has sent by now."""
+
+    @abstractmethod
+    def take(self, now_s: float, unit: bytes) -> None:
+        """What has come from the host goes to the device."""
+
+    @abstractmethod
+    def read(self) -> bytes:
+        """The unit that the backend has just sent."""
+
+    @abstractmethod
+    def write(self, unit: bytes, backend: Backend) -> None:
+        """Hands a unit to the kernel, and waits until the backend can read it."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Gives the kernel's things back."""
+
+
+class PtyEnd(FarEnd):
+    """A far end at a pseudo-terminal."""
+
+    end: bytes
+    "The last byte of a unit."
+
+    def __init__(self) -> None:
+        self._far, self._near = os.openpty()
+        tty.setraw(self._near)
+        self._port = os.ttyname(self._near)
+        self._pending = b""
+
+    def read(self) -> bytes:
+        while self.end not in self._pending:
+            assert select.select([self._far], [], [], PATIENCE_S)[0], "the backend sent nothing"
+            self._pending += os.read(self._far, 4_096)
+        unit, _, self._pending = self._pending.partition(self.end)
+        return unit + self.end
+
+    def write(self, unit: bytes, backend: Backend) -> None:
+        expected = _waiting(backend.fileno()) + len(unit)
+        os.write(self._far, unit)
+        while _waiting(backend.fileno()) < expected:
+            assert select.select([backend.fileno()], [], [], PATIENCE_S)[0], "the backend gets nothing"
+
+    def close(self) -> None:
+        os.close(self._far)
+        os.close(self._near)
+
+
+class SerialEnd(PtyEnd):
+    end = b"\x00"
+
+    def __init__(self, device: VirtualDevice, folder: Path) -> None:
+        super().__init__()
+        self.device = device
+        self.configured = Device(port=self._port)
+        self._sending = b""
+
+    def units(self, now_s: float) -> list[bytes]:
+        *units, self._sending = (self._sending + self.device.transmit(now_s)).split(self.end)
+        return [unit + self.end for unit in units]
+
+    def take(self, now_s: float, unit: bytes) -> None:
+        self.device.receive(now_s, unit)
+
+
+class SlcanEnd(PtyEnd):
+    end = b"\r"
+
+    def __init__(self, device: VirtualDevice, folder: Path) -> None:
+        super().__init__()
+        self.device = CanDevice(device.messages)
+        self.configured = Device(backend="can", interface="slcan", port=self._port)
+        self._adapter = SlcanAdapter()
+        self._answers = b""
+
+    def units(self, now_s: float) -> list[bytes]:
+        self._greet()
+        answers, self._answers = self._answers, b""
+        sent = [self._adapter.line(frame) for sender, frame in self.device.transmit(now_s) if sender == DEVICE]
+        return ([answers] if answers else []) + (sent if self._adapter.is_open else [])
+
+    def take(self, now_s: float, unit: bytes) -> None:
+        answers, frames = self._adapter.feed(unit)
+        self._answers += answers
+        for frame in frames:
+            self.device.receive(now_s, frame)
+
+    def _greet(self) -> None:
+        while not self._adapter.is_open:  # python-can opens the channel when it opens the port
+            self._answers += self._adapter.feed(self.read())[0]
+
+
+class PacketEnd(FarEnd):
+    """A far end where a frame is a packet."""
+
+    def __init__(self, device: VirtualDevice) -> None:
+        self.device = CanDevice(device.messages)
+
+    def units(self, now_s: float) -> list[bytes]:
+        return [_unit(frame) for sender, frame in self.device.transmit(now_s) if sender == DEVICE]
+
+    def take(self, now_s: float, unit: bytes) -> None:
+        self.device.receive(now_s, _frame(unit))
+
+
+class TormagsimEnd(PacketEnd):
+    def __init__(self, device: VirtualDevice, folder: Path) -> None:
+        super().__init__(device)
+        path = str(folder / "can")
+        self.configured = Device(backend="can", interface="tormagsim", port=path)
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._listener.bind(path)
+        self._listener.listen()
+        self._listener.settimeout(PATIENCE_S)
+        self._host: socket.socket | None = None
+
+    def read(self) -> bytes:
+        frame = from_socket(self._connected().recv(64))
+        assert frame is not None
+        return _unit(frame)
+
+    def write(self, unit: bytes, backend: Backend) -> None:
+        self._connected().send(to_socket(_frame(unit)))
+
+    def close(self) -> None:
+        self._listener.close()
+        if self._host is not None:
+            self._host.close()
+
+    def _connected(self) -> socket.socket:
+        if self._host is None:
+            self._host, _ = self._listener.accept()
+        return self._host
+
+
+class BusEnd(PacketEnd):
+    """A far end at any bus of python-can's; the bus may echo what one sends."""
+
+    def __init__(self, device: VirtualDevice, interface: str, channel: str, bus: can.BusABC) -> None:
+        super().__init__(device)
+        self.configured = Device(backend="can", interface=interface, port=channel)
+        self._bus = bus
+        self._echoes: list[bytes] = []
+
+    def read(self) -> bytes:
+        while (message := self._bus.recv(PATIENCE_S)) is not None:
+            unit = _unit(CanFrame(message.arbitration_id, bytes(message.data)))
+            if unit not in self._echoes:
+                return unit
+            self._echoes.remove(unit)
+        raise AssertionError("the backend sent nothing")
+
+    def write(self, unit: bytes, backend: Backend) -> None:
+        frame = _frame(unit)
+        self._echoes = [*self._echoes[-64:], unit]
+        self._bus.send(can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=False), timeout=0)
+        assert select.select([backend.fileno()], [], [], PATIENCE_S)[0], "the backend gets nothing"
+
+    def close(self) -> None:
+        self._bus.shutdown()
+
+
+def udp_end(device: VirtualDevice, folder: Path) -> FarEnd:
+    group = "239.74.163.77"
+    try:
+        bus = can.Bus(interface="udp_multicast", channel=group, hop_limit=0, fd=False, ignore_config=True)
+        bus.send(can.Message(arbitration_id=0x7FF, is_extended_id=False), timeout=0)
+    except (can.CanError, OSError) as error:
+        pytest.skip(f"no UDP multicast: {error}")
+    if bus.recv(1.0) is None:
+        bus.shutdown()
+        pytest.skip("UDP multicast does not come back on this machine")
+    return BusEnd(device, "udp_multicast", group, bus)
+
+
+def socketcan_end(device: VirtualDevice, folder: Path) -> FarEnd:
+    try:
+        bus = can.Bus(interface="socketcan", channel="vcan0", ignore_config=True)
+    except OSError as error:
+        pytest.skip(f"no vcan0 (sudo ip link add vcan0 type vcan; sudo ip link set vcan0 up): {error}")
+    return BusEnd(device, "socketcan", "vcan0", bus)
+
+
+TRANSPORTS: dict[str, Callable[[VirtualDevice, Path], FarEnd]] = {
+    "serial": SerialEnd,
+    "slcan": SlcanEnd,
+    "tormagsim": TormagsimEnd,
+    "udp_multicast": udp_end,
+    "socketcan": socketcan_end,
+}
+
+
+def _waiting(fd: int) -> int:
+    """Bytes that can be read from a terminal: a kernel thread brings them across, and takes its time."""
+    return int(struct.unpack("i", fcntl.ioctl(fd, termios.FIONREAD, bytes(4)))[0])
+
+
+def _unit(frame: CanFrame) -> bytes:
+    return struct.pack(">H", frame.identifier) + frame.data
+
+
+def _frame(unit: bytes) -> CanFrame:
+    """Whatever was flipped, a controller hands out 11 bits of identifier and up to 8 bytes."""
+    return CanFrame(struct.unpack(">H", unit[:2])[0] & MAX_IDENTIFIER, unit[2:])
+
+
+# -- the line ------------------------------------------------------------------------------------------------------
+
+
+class Line:
+    """What the closed loop takes for its device: the real backend, a bad line, and the device behind it."""
+
+    def __init__(self, far: FarEnd, case: Case, seed: int) -> None:
+        self.far = far
+        self.backend = opener(far.configured)(far.configured)
+        self._bytewise = case.is_bytewise
+        self._up, self._down = case.channel(seed), case.channel(seed + 1)
+        self._to_host, self._from_host = FrameStream(), FrameStream()
+
+    @property
+    def truth(self) -> Truth:
+        """What really is."""
+        return self.far.device.truth
+
+    def exchange(self, now_s: float) -> list[Message]:
+        """What the backend has for the link now."""
+        units = self._up.carry(now_s, self.far.units(now_s))
+        for unit in self._down.carry(now_s, []):
+            self.far.take(now_s, unit)
+        messages: list[Message] = []
+        for unit in units:
+            for piece in self._pieces(unit):
+                self.far.write(piece, self.backend)
+                if self._bytewise or isinstance(self.far, BusEnd):
+                    messages += self.backend.receive()
+        return [*messages, *self.backend.receive()]
+
+    def send(self, now_s: float, message: Message) -> None:
+        """The link's message goes through the backend."""
+        self.backend.send(message)
+        for unit in self._down.carry(now_s, [self.far.read()]):
+            for piece in self._pieces(unit):
+                self.far.take(now_s, piece)
+
+    def transmit(self, now_s: float) -> bytes:
+        """As the virtual device's: what came, framed again."""
+        return b"".join(self._to_host.pack(message) for message in self.exchange(now_s))
+
+    def receive(self, now_s: float, data: bytes) -> None:
+        """As the virtual device's."""
+        for message in self._from_host.unpack(data):
+            self.send(now_s, message)
+
+    def close(self) -> None:
+        """Gives both ends back."""
+        self.backend.close()
+        self.far.close()
+
+    def _pieces(self, unit: bytes) -> list[bytes]:
+        if self._bytewise and isinstance(self.far, PtyEnd):
+            return [bytes((byte,)) for byte in unit]
+        return [unit]
+
+
+@pytest.fixture(scope="module")
+def core() -> Core:
+    return build_core(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def moving(core: Core) -> ClosedLoop:
+    """A loop that is armed and closing its gap, on a perfect line."""
+    device = VirtualDevice(load_plant("sample_1"), parse_hand("steady"), (), 1)
+    loop = ClosedLoop(CONFIG, core.stepper, core.planner, device)
+    loop.arm()
+    asked = publisher(loop.now_s)
+    for _ in loop.run(MOVING_S, asked):
+        pass
+    return loop
+
+
+def publisher(from_s: float) -> Callable[[float], object]:
+    """Somebody who wants FORCE_N every 10 ms."""
+    times = from_s + np.arange(1_000) * 0.01
+    return stream(times, np.full(1_000, FORCE_N))
+
+
+@pytest.fixture
+def lines(tmp_path: Path) -> Iterator[Callable[..., Line]]:
+    with contextlib.ExitStack() as opened:
+
+        def make(transport: str, device: VirtualDevice, case: Case, seed: int = 3) -> Line:
+            line = Line(TRANSPORTS[transport](device, tmp_path), case, seed)
+            opened.callback(line.close)
+            return line
+
+        yield make
+
+
+def numbers(value: object) -> Iterator[float]:
+    """Every float in nested named tuples."""
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, tuple):
+        for inner in value:
+            yield from numbers(inner)
+
+
+def check_limits(samples: list[Sample]) -> None:
+    """No duty over its limit, nothing that is not a number, and no carriage where it cannot be."""
+    for sample in samples:
+        output, truth = sample.output, sample.truth
+        assert max(abs(output.left_duty), abs(output.right_duty)) <= CONFIG.position.duty_limit
+        assert CLOSED_MM < truth.gap_mm < OPEN_MM
+    for sample in samples[::20]:
+        assert not any(math.isnan(number) for number in numbers(tuple(sample)))
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
+    transport: str, case: Case, moving: ClosedLoop, lines: Callable[..., Line]
+) -> None:
+    loop = copy.deepcopy(moving)
+    line = lines(transport, loop.device, case)
+    loop.device = line  # type: ignore[assignment]
+    samples = []
+    for sample in loop.run(case.bad_s, publisher(loop.now_s)):
+        samples.append(sample)
+        if sample.state.safety.faults:
+            break
+    check_limits(samples)
+    last = samples[-1]
+    if last.state.safety.faults:
+        assert last.state.safety.faults[0] in case.faults
+        check_safe(loop, last)
+    else:
+        assert last.truth.force_N == pytest.approx(FORCE_N, abs=case.tolerance_N)
+        assert case.tolerance_N > 0.05 or Limit.SATURATED not in last.output.limits
+    assert loop.link.state is case.link
+    if case.named:
+        settled = samples[-SETTLED_TICKS:]
+        assert case.named & {
+            name for sample in settled for name in (*sample.state.safety.faults, *sample.output.limits)
+        }
+    for name in case.counted:
+        assert getattr(line.backend.statistics, name) > 0, name
+
+
+def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
+    """From the fault on nothing is driven, and the gap opens, whatever the line does."""
+    samples = []
+    for sample in loop.run(OPENING_S, publisher(loop.now_s)):
+        samples.append(sample)
+        if sample.truth.gap_mm > OPEN_MM - 2.0:
+            break
+    check_limits(samples)
+    assert all(sample.output.mode is DriveMode.OFF for sample in (faulted, *samples))
+    assert all(sample.state.safety.operating_state is OperatingState.FAULT for sample in samples)
+    assert samples[-1].truth.gap_mm > OPEN_MM - 2.0
+    assert min(sample.truth.gap_mm for sample in samples) > faulted.truth.gap_mm - COASTING_MM
+
+
+@pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES.items() if name != "cut"])
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_host_and_device_meet_on_any_line_that_is_not_cut(
+    transport: str, case: Case, lines: Callable[..., Line]
+) -> None:
+    device = VirtualDevice(load_plant("sample_1"), parse_hand("steady"), (), 1)
+    line = lines(transport, device, case)
+    link = DeviceLink(0.0)
+    assert link.state is LinkState.IDENTIFYING
+    for tick in range(1, 1_000):
+        now_s = tick * PERIOD_S
+        for message in line.exchange(now_s):
+            link.receive(now_s, message)
+        for message in link.due(now_s):
+            line.send(now_s, message)
+        if link.state is LinkState.RUNNING:
+            break
+    assert link.state is LinkState.RUNNING
+    assert link.identity is not None

@@ -1,0 +1,298 @@
+"""The simulator's CAN doors: a process of its own, and hosts with python-can's own interfaces."""
+
+import contextlib
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import can
+import pytest
+
+from firmware_protocol.codec import (
+    FUNCTION,
+    PROTOCOL_VERSION,
+    SCHEMA_HASH,
+    Hello,
+    Home,
+    Identity,
+    Message,
+    Status,
+    can_identifier,
+    encode,
+)
+from tormagd.simulation.can_device import CanDevice
+from tormagd.simulation.can_door import MAX_HOSTS, CanDoor
+from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, CanFrame, from_socket, to_socket
+from tormagd.simulation.device import MessageDevice
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import PlantParameters
+from tormagd.simulation.slcan_door import LONGEST_COMMAND, SlcanAdapter
+
+LIMIT_S = 20.0
+HELLO = Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1)
+IDENTITY = can_identifier(FUNCTION[Identity])
+STATUS = can_identifier(FUNCTION[Status])
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    processes = []
+
+    def begin(*arguments: str) -> "subprocess.Popen[str]":
+        command = [sys.executable, "-m", "tormagd.simulation", *arguments]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        processes.append(process)
+        return process
+
+    yield begin
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def channel(process: "subprocess.Popen[str]") -> str:
+    assert process.stdout is not None
+    return process.stdout.readline().strip()
+
+
+def message_of(message: Message) -> can.Message:
+    identifier = can_identifier(FUNCTION[type(message)])
+    return can.Message(arbitration_id=identifier, data=encode(message), is_extended_id=False)
+
+
+def meet(bus: can.BusABC) -> None:
+    """Says Hello until both Identity and Status have come."""
+    seen: set[int] = set()
+    deadline_s = time.monotonic() + LIMIT_S
+    while not {IDENTITY, STATUS} <= seen:
+        assert time.monotonic() < deadline_s, f"only {seen} in {LIMIT_S} s"
+        bus.send(message_of(HELLO), timeout=1.0)
+        for _ in range(20):  # one Hello and many frames: who sends for each frame it reads never gets to the end
+            if (message := bus.recv(0.1)) is not None:
+                seen.add(message.arbitration_id)
+
+
+def test_hosts_come_and_go_on_the_simulators_bus_and_hear_each_other(start: Start, tmp_path: Path) -> None:
+    process = start("--can")
+    path = channel(process)
+    assert Path(path).is_socket()
+    for _ in range(2):
+        with can.Bus(interface="tormagsim", channel=path, ignore_config=True) as bus:
+            meet(bus)
+    with (
+        can.Bus(interface="tormagsim", channel=path, ignore_config=True) as one,
+        can.Bus(interface="tormagsim", channel=path, ignore_config=True) as other,
+    ):
+        meet(one)
+        meet(other)
+        one.send(message_of(Home(9)), timeout=1.0)
+        heard = can_identifier(FUNCTION[Home])
+        deadline_s = time.monotonic() + LIMIT_S
+        while (message := other.recv(LIMIT_S)) is not None and message.arbitration_id != heard:
+            assert time.monotonic() < deadline_s
+        assert message is not None
+        while (own := one.recv(0)) is not None:
+            assert own.arbitration_id != heard, "a sender does not hear itself"
+        with pytest.raises(can.CanOperationError, match="11-bit"):
+            one.send(can.Message(arbitration_id=1, is_extended_id=True))
+    process.send_signal(signal.SIGTERM)
+    output, errors = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 0, errors
+    assert output == ""
+    assert not Path(path).exists()
+
+
+def test_what_a_killed_simulator_left_is_replaced_and_what_somebody_serves_is_not(start: Start, tmp_path: Path) -> None:
+    path = str(tmp_path / "can")
+    killed = start("--can", path)
+    assert channel(killed) == path
+    second = start("--can", path)
+    output, errors = second.communicate(timeout=LIMIT_S)
+    assert (second.returncode, output) == (2, "")
+    assert path in errors
+    killed.kill()
+    killed.wait()
+    assert Path(path).is_socket()
+    third = start("--can", path)
+    assert channel(third) == path
+    with can.Bus(interface="tormagsim", channel=path, ignore_config=True) as bus:
+        meet(bus)
+
+
+def test_pythons_own_slcan_finds_an_adapter(start: Start) -> None:
+    process = start("--slcan")
+    path = channel(process)
+    assert Path(path).is_char_device()
+    with can.Bus(interface="slcan", channel=path, bitrate=1_000_000, sleep_after_open=0.0, ignore_config=True) as bus:
+        assert bus.get_version(LIMIT_S) == (10, 13)
+        assert bus.get_serial_number(LIMIT_S) == "SIM1"
+        meet(bus)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--can", "--bitrate", "7"), "10000"),
+        (("--can", "--node", "16"), "16"),
+        (("--can", "/nonexistent/can"), "/nonexistent"),
+        (("--bus", "telepathy:0"), "telepathy"),
+        (("--can", "--pty"), "not allowed"),
+    ],
+)
+def test_a_wrong_call_says_what_is_right_and_exits_with_2(start: Start, arguments: tuple[str, ...], said: str) -> None:
+    process = start(*arguments)
+    output, errors = process.communicate(timeout=LIMIT_S)
+    assert (process.returncode, output) == (2, "")
+    assert said in errors
+
+
+@pytest.mark.parametrize("address", ["udp_multicast:239.74.163.88", "socketcan:vcan0"])
+def test_the_device_is_a_node_of_a_bus_that_is_there(start: Start, address: str) -> None:
+    interface, _, name = address.partition(":")
+    options = {"hop_limit": 0, "fd": False} if interface == "udp_multicast" else {}
+    try:
+        bus = can.Bus(interface=interface, channel=name, ignore_config=True, **options)
+    except (can.CanError, OSError) as error:
+        pytest.skip(f"no {address} on this machine: {error}")
+    with bus:
+        assert channel(start("--bus", address)) == name
+        meet(bus)
+
+
+# -- the bus's door ------------------------------------------------------------------------------------------------
+
+
+class Served:
+    """A door in this process, and the clock it lives by."""
+
+    def __init__(self, plant: PlantParameters, path: Path) -> None:
+        self.device = CanDevice(MessageDevice(plant, SteadyHand(), seed=1))
+        self.door = CanDoor(self.device, path)
+        self.now_s = 0.0
+
+    def host(self) -> socket.socket:
+        """A host that has just come."""
+        host = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        host.settimeout(LIMIT_S)
+        host.connect(self.door.address)
+        self.exchange(0.0)
+        return host
+
+    def exchange(self, duration_s: float) -> None:
+        """Lets the door work for that long."""
+        until_s = self.now_s + duration_s
+        while True:
+            readable, _, _ = select.select(self.door.descriptors(), [], [], 0.0)
+            self.door.exchange(self.now_s, readable)
+            if self.now_s >= until_s:
+                return
+            self.now_s += 1e-3
+
+
+@pytest.fixture
+def served(sample_1: PlantParameters, tmp_path: Path) -> Iterator[Served]:
+    made = Served(sample_1, tmp_path / "can")
+    with contextlib.closing(made.door):
+        yield made
+
+
+def test_what_is_no_frame_ends_that_host_and_no_other(served: Served) -> None:
+    good = served.host()
+    for packet in (b"x", bytes(17), SOCKET_FRAME.pack(0x21, 9, bytes(8)), SOCKET_FRAME.pack(ERROR_FLAG, 0, b"")):
+        bad = served.host()
+        bad.send(packet)
+        served.exchange(0.002)
+        while bad.recv(64):  # a Status may have come before the end
+            pass
+        bad.close()
+    good.send(to_socket(CanFrame(0x081, encode(HELLO))))
+    served.exchange(0.005)
+    while (frame := from_socket(good.recv(64))) is not None and frame.identifier != IDENTITY:
+        assert frame.identifier == STATUS
+    assert frame is not None
+    good.close()
+
+
+def test_no_more_hosts_than_a_bus_has_places(served: Served) -> None:
+    hosts = [served.host() for _ in range(MAX_HOSTS)]
+    late = served.host()
+    assert late.recv(64) == b""
+    hosts[0].close()
+    served.exchange(0.001)
+    again = served.host()
+    served.exchange(0.03)
+    assert from_socket(again.recv(64)) is not None
+    for host in (*hosts, late, again):
+        host.close()
+
+
+def test_a_host_that_does_not_read_holds_nobody_up(served: Served) -> None:
+    lazy, busy = served.host(), served.host()
+    busy.setblocking(False)
+    heard = 0
+    for tick in range(3_000):
+        busy.send(to_socket(CanFrame(0x7F2, bytes((tick % 256,)))))
+        served.exchange(0.001)
+        with contextlib.suppress(BlockingIOError):
+            while busy.recv(64):
+                heard += 1
+    assert heard > 100, "a Status every 20 ms"
+    lazy.close()
+    busy.close()
+
+
+# -- the adapter ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("said", "answer"),
+    [
+        (b"O\r", b"\r"),
+        (b"O\rO\r", b"\r\a"),
+        (b"S8\r", b"\r"),
+        (b"S9\r", b"\a"),
+        (b"O\rS8\r", b"\r\a"),
+        (b"C\rC\r", b"\r\r"),
+        (b"V\rN\rF\r", b"V1013\rNSIM1\rF00\r"),
+        (b"\r\r", b"\r\r"),
+        (b"t0210\r", b"\a"),
+        (b"L\r", b"\a"),
+        (b"T000000210\r", b"\a"),
+        (b"x" * 10_000 + b"\r", b"\a"),
+    ],
+)
+def test_the_adapter_answers_as_the_manual_says(said: bytes, answer: bytes) -> None:
+    assert SlcanAdapter().feed(said) == (answer, [])
+
+
+@pytest.mark.parametrize("cut", [1, 3, 100])
+def test_frames_come_out_however_they_are_cut(cut: int) -> None:
+    adapter = SlcanAdapter()
+    said = b"O\rt0217E204D20401C865\rt7FF0\r"
+    frames = []
+    for start_at in range(0, len(said), cut):
+        frames += adapter.feed(said[start_at : start_at + cut])[1]
+    assert frames == [CanFrame(0x021, bytes.fromhex("e204d20401c865")), CanFrame(0x7FF, b"")]
+    assert adapter.line(frames[0]) == b"t0217E204D20401C865\r"
+
+
+@pytest.mark.parametrize(
+    "damaged", [b"t", b"t80", b"t8000", b"t0219", b"t02170", b"t021700\xff", b"t 2100", b"t0_100", b"t02120102030"]
+)
+def test_a_damaged_frame_is_refused(damaged: bytes) -> None:
+    adapter = SlcanAdapter()
+    adapter.feed(b"O\r")
+    assert adapter.feed(damaged + b"\r") == (b"\a", [])
+
+
+def test_a_command_without_an_end_takes_no_memory() -> None:
+    adapter = SlcanAdapter()
+    for _ in range(100):
+        adapter.feed(b"t" * 1_000)
+    assert len(adapter._pending) <= LONGEST_COMMAND + 1

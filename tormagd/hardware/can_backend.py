@@ -1,0 +1,219 @@
+"""The CAN backend: python-can opens the bus, the event loop watches its descriptor.
+
+Any python-can interface whose bus has a descriptor will do: `socketcan` in the field, `slcan` and `udp_multicast` on
+the bench, `tormagsim` for the simulated device.
+"""
+
+import contextlib
+import errno
+import fcntl
+import importlib
+import os
+import select
+from typing import Any
+
+import can
+from can.interfaces import BACKENDS
+from can.interfaces.slcan import slcanBus
+
+from firmware_protocol.codec import Message
+from tormagd.config import ConfigError, Device
+from tormagd.hardware.backend import PLUGIN_ERRORS, BackendError, LinkStatistics
+from tormagd.hardware.can_stream import CanStream, SecondHostError
+
+FRAMES_AT_ONCE = 256
+"""Most frames taken in one `receive`: a bus that never falls silent must not keep the loop."""
+UNSENT_FRAMES = 50
+"""Frames in a row that the bus did not take; at 1 kHz, the device's own command timeout."""
+BUS_OFF = 0x40
+"""Error class in the identifier of an error frame: linux/can/error.h, CAN_ERR_BUSOFF."""
+
+
+class CanBackend:
+    """An open bus and the conversation with one node on it."""
+
+    def __init__(self, device: Device, bus: can.BusABC, held: int | None = None) -> None:
+        """`held` is a descriptor that keeps others from opening the adapter; it is closed with the bus."""
+        self._device, self._bus, self._held = device, bus, held
+        self._fd: int = bus.fileno()
+        self._stream = CanStream(device.node)
+        self._readable, self._writable = select.poll(), select.poll()
+        self._readable.register(self._fd, select.POLLIN)
+        self._writable.register(self._fd, select.POLLOUT)
+        self._unsent = 0
+
+    @property
+    def statistics(self) -> LinkStatistics:
+        """Counters since the bus was opened."""
+        return self._stream.statistics
+
+    def fileno(self) -> int:
+        """The bus's descriptor."""
+        return self._fd
+
+    def receive(self) -> list[Message]:
+        """All messages of the node that have arrived.
+
+        Raises BackendError when the bus is off or gone, or when another host drives the node.
+        """
+        messages: list[Message] = []
+        for _ in range(FRAMES_AT_ONCE):
+            try:
+                frame = self._bus.recv(0)
+            except (can.CanError, OSError) as error:
+                if not (isinstance(self._bus, slcanBus) and isinstance(error.__cause__, UnicodeDecodeError)):
+                    raise self._gone("receiving failed", error) from error
+                self._bus.flush()  # it would keep a line that is no text for ever
+                self._stream.count_corrupt()
+                continue
+            except (ValueError, IndexError):  # how slcan says that a line of the adapter's is damaged
+                self._stream.count_corrupt()
+                continue
+            if frame is None:
+                # an adapter's own chatter is no frame, and more may stand behind it
+                if not self._readable.poll(0):
+                    break
+            elif (message := self._unpack(frame)) is not None:
+                messages.append(message)
+        return messages
+
+    def send(self, message: Message) -> None:
+        """Hands one frame to the bus. One that it does not take at once is dropped: the next tick has a newer one.
+
+        Raises BackendError when the bus is off or gone, or has not taken any for UNSENT_FRAMES.
+        """
+        identifier, data = self._stream.pack(message)
+        frame = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
+        if self._writable.poll(0):
+            try:
+                self._bus.send(frame, timeout=0)
+            except (can.CanError, OSError) as error:
+                if _errno(error) not in (errno.ENOBUFS, errno.EAGAIN):
+                    raise self._gone("sending failed", error) from error
+            else:
+                self._unsent = 0
+                return
+        self._unsent += 1
+        if self._unsent > UNSENT_FRAMES:
+            raise BackendError(
+                f"{self._name}: the bus takes no frames: nobody acknowledges them", remedy=self._look_at_the_bus
+            )
+
+    def close(self) -> None:
+        """Gives the bus back."""
+        with contextlib.suppress(can.CanError, OSError):
+            self._bus.shutdown()
+        if isinstance(self._bus, slcanBus):  # it says goodbye to the adapter first, and keeps the port if that is gone
+            self._bus.serialPortOrig.close()
+        if self._held is not None:
+            os.close(self._held)
+            self._held = None
+
+    @property
+    def _name(self) -> str:
+        return f"{self._device.interface} {self._device.port}"
+
+    @property
+    def _look_at_the_bus(self) -> str:
+        return f"check the device's supply, wiring, termination and bit rate ({self._device.bitrate})"
+
+    def _unpack(self, frame: can.Message) -> Message | None:
+        if frame.is_error_frame:
+            if frame.arbitration_id & BUS_OFF or self._bus.state is can.BusState.ERROR:
+                raise BackendError(
+                    f"{self._name}: bus-off: the controller met too many errors and left the bus",
+                    remedy=f"{self._look_at_the_bus}; restart-ms 100 (ip link) brings a socketcan interface back",
+                )
+            self._stream.count_corrupt()
+            return None
+        if frame.is_extended_id or frame.is_remote_frame or frame.is_fd:
+            return None  # somebody else's conversation on the same bus
+        try:
+            return self._stream.unpack(frame.arbitration_id, bytes(frame.data))
+        except SecondHostError as error:
+            raise BackendError(
+                f"{self._name}: another host drives node {self._device.node}",
+                remedy="end the other one, or give this device another node number (device.node)",
+            ) from error
+
+    def _gone(self, what: str, error: can.CanError | OSError) -> BackendError:
+        number = _errno(error)
+        if number == errno.ENETDOWN:
+            up = f"sudo ip link set {self._device.port} up type can bitrate {self._device.bitrate} restart-ms 100"
+            return BackendError(f"{self._name}: the interface is down", remedy=up)
+        return BackendError(f"{self._name}: {what}: {os.strerror(number) if number else error}")
+
+
+def check_can(device: Device) -> None:
+    """Raises ConfigError for an interface that is not installed, or cannot be waited for."""
+    interface = device.interface
+    if interface not in BACKENDS:
+        raise ConfigError(f"device.interface = {interface!r}: installed are {', '.join(sorted(BACKENDS))}")
+    module, name = BACKENDS[interface]
+    try:
+        bus = getattr(importlib.import_module(module), name)
+    except PLUGIN_ERRORS as error:
+        raise ConfigError(f"device.interface = {interface!r}: its driver does not load: {error}") from error
+    if bus.fileno is can.BusABC.fileno:
+        raise ConfigError(
+            f"device.interface = {interface!r}: this driver has no descriptor to wait for; allowed is the kernel's "
+            "driver of the same adapter, 'socketcan'"
+        )
+
+
+def open_can(device: Device) -> CanBackend:
+    """Opens `device.port` through `device.interface`. Raises BackendError saying why not."""
+    name = f"{device.interface} {device.port}"
+    held = None
+    try:
+        if device.interface == "slcan":
+            held = _hold(device.port)
+        bus = can.Bus(
+            interface=device.interface,
+            channel=device.port,
+            bitrate=device.bitrate,
+            ignore_config=True,  # what applies stands in our configuration, not in a file of python-can's
+            **_options(device),
+        )
+    except BlockingIOError as error:
+        raise BackendError(f"{name}: another program holds it", remedy="tormagctl ports says which") from error
+    except (can.CanError, OSError, ValueError) as error:
+        if held is not None:
+            os.close(held)
+        number = _errno(error)
+        reason = os.strerror(number) if number else str(error)
+        raise BackendError(f"{name}: cannot be opened: {reason}") from error
+    return CanBackend(device, bus, held)
+
+
+def _options(device: Device) -> dict[str, Any]:
+    """What makes an interface fit the loop. Interfaces not named here must not block in `recv(0)`."""
+    match device.interface:
+        case "socketcan":  # other nodes' frames need not wake us
+            return {"can_filters": [{"can_id": device.node, "can_mask": 0xF, "extended": False}]}
+        case "slcan":  # by default it sleeps for 2 s when it opens, and for 1 ms whenever it finds nothing to read
+            return {"tty_baudrate": device.baud, "sleep_after_open": 0.0, "timeout": 0.0}
+        case "udp_multicast":  # stays on this machine
+            return {"hop_limit": 0, "fd": False}
+    return {}
+
+
+def _hold(path: str) -> int:
+    """A descriptor with the lock that pyserial's exclusive ports take; python-can opens its own without one."""
+    descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _errno(error: BaseException | None) -> int | None:
+    """The number of the system's error behind one of python-can's, which wraps it in one way or another."""
+    while error is not None:
+        number = error.errno if isinstance(error, OSError) else getattr(error, "error_code", None)
+        if number is not None and number > 0:  # a resolver's errors have numbers of their own, under 0
+            return number
+        error = error.__cause__
+    return None

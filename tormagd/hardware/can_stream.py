@@ -1,0 +1,106 @@
+"""Messages to CAN frames and back: the part of the CAN backend that needs no bus."""
+
+from collections import deque
+from dataclasses import dataclass
+
+from firmware_protocol.codec import (
+    FUNCTION,
+    DecodeError,
+    Drive,
+    Identity,
+    Message,
+    Sense,
+    State,
+    Status,
+    can_identifier,
+    decode,
+    encode,
+)
+from tormagd.hardware.link import OVERTAKEN
+
+FROM_DEVICE = (State, Sense, Status, Identity)
+
+
+ECHOES = 32
+"""Drives that may be on the way while their own echo is not back, on a bus that has one (UDP multicast)."""
+
+
+class SecondHostError(Exception):
+    """Somebody else drives our node."""
+
+
+@dataclass(slots=True)
+class CanStatistics:
+    """What a CanStream has seen since it was made."""
+
+    bytes: int = 0
+    """Payload bytes of the frames of our node."""
+    frames: int = 0
+    """Frames that were returned as messages."""
+    corrupt: int = 0
+    """Frames of our node that are no message, and error frames; what the bus itself discards is not seen."""
+    lost: int = 0
+    """State messages missing from their counter, those among them that arrived corrupt included."""
+    repeated: int = 0
+    """State messages that came twice or were overtaken; the link takes no measurement from them."""
+    resynchronisations: int = 0
+    """Times a message was found again after something corrupt."""
+
+
+class CanStream:
+    """Both directions of one conversation with one node. What does not decode is counted, never raised."""
+
+    def __init__(self, node: int) -> None:
+        """Raises EncodeError for a node outside 0..15."""
+        self.node = node
+        self.statistics = CanStatistics()
+        self._identifiers = {message: can_identifier(function, node) for message, function in FUNCTION.items()}
+        self._counter: int | None = None
+        self._drives: deque[bytes] = deque(maxlen=ECHOES)
+        self._synchronised = True
+
+    def pack(self, message: Message) -> tuple[int, bytes]:
+        """Identifier and data of the frame. Raises EncodeError for a value that does not fit the wire."""
+        data = encode(message)
+        if isinstance(message, Drive):
+            self._drives.append(data)
+        return self._identifiers[type(message)], data
+
+    def unpack(self, identifier: int, data: bytes | bytearray) -> Message | None:
+        """The message in a frame; None for another node's, a host's and an unusable one.
+
+        Raises SecondHostError for a Drive to our node that is not the echo of one of ours.
+        """
+        if identifier & 0xF != self.node:
+            return None
+        self.statistics.bytes += len(data)
+        try:
+            message = decode(identifier >> 4, data)
+        except DecodeError:
+            self.count_corrupt()
+            return None
+        if isinstance(message, Drive) and data not in self._drives:
+            raise SecondHostError
+        if not isinstance(message, FROM_DEVICE):
+            return None
+        if not self._synchronised:
+            self.statistics.resynchronisations += 1
+            self._synchronised = True
+        if isinstance(message, State):
+            self._count(message.counter)
+        self.statistics.frames += 1
+        return message
+
+    def count_corrupt(self) -> None:
+        """Counts a frame that could not even be taken apart."""
+        self.statistics.corrupt += 1
+        self._synchronised = False
+
+    def _count(self, counter: int) -> None:
+        last = self._counter
+        if last is not None and (last - counter) % 256 < OVERTAKEN:
+            self.statistics.repeated += 1
+            return
+        self._counter = counter
+        if last is not None:
+            self.statistics.lost += (counter - last) % 256 - 1

@@ -1,0 +1,89 @@
+"""The python-can interface `tormagsim`: how a host comes to the simulated device's CAN bus.
+
+`can.Bus(interface="tormagsim", channel=PATH)` with the path that `python -m tormagd.simulation --can` prints. Several
+hosts may be on the bus; each hears the others and the device, and not itself.
+"""
+
+import errno
+import os
+import select
+import socket
+from typing import Any
+
+import can
+
+from tormagd.simulation.can_frame import (
+    ERROR_FLAG,
+    MAX_DATA,
+    MAX_IDENTIFIER,
+    SOCKET_FRAME,
+    CanFrame,
+    from_socket,
+    to_socket,
+)
+
+SEND_BUFFER_BYTES = 4_608
+"""The kernel's least, a handful of frames: a host has to notice soon that nobody takes them."""
+
+
+class SimulatorBus(can.BusABC):
+    """A host's controller on the simulated bus. Classical frames with 11-bit identifiers only."""
+
+    def __init__(self, channel: str, can_filters: Any = None, **settings: object) -> None:
+        """Raises can.CanInitializationError if no simulator serves `channel`. The bit rate is the simulator's."""
+        self.channel_info = f"tormagsim {channel}"
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+            self._socket.setblocking(False)
+            self._socket.connect(channel)
+        except OSError as error:
+            self._socket.close()
+            raise can.CanInitializationError(os.strerror(error.errno or 0), error.errno) from error
+        super().__init__(channel=channel, can_filters=can_filters, **settings)
+
+    def fileno(self) -> int:
+        """The socket's descriptor, -1 once it is shut down."""
+        return self._socket.fileno()
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Raises can.CanOperationError: not a classical data frame of 11 bits, no room, or the simulator has gone."""
+        if msg.is_extended_id or msg.is_remote_frame or msg.is_error_frame or msg.is_fd or len(msg.data) > MAX_DATA:
+            raise can.CanOperationError(f"{msg}: allowed are classical data frames of 11-bit identifiers")
+        packet = to_socket(CanFrame(msg.arbitration_id & MAX_IDENTIFIER, bytes(msg.data)))
+        try:
+            if timeout != 0:
+                select.select([], [self._socket], [], timeout)
+            self._socket.send(packet)
+        except BlockingIOError as error:
+            raise can.CanOperationError("the transmit queue is full", errno.ENOBUFS) from error
+        except OSError as error:
+            raise can.CanOperationError("the simulator has gone", error.errno) from error
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        try:
+            if timeout != 0:
+                select.select([self._socket], [], [], timeout)
+            packet = self._socket.recv(SOCKET_FRAME.size)
+        except BlockingIOError:
+            return None, False
+        except OSError as error:
+            raise can.CanOperationError("the simulator has gone", error.errno) from error
+        if not packet:
+            raise can.CanOperationError("the simulator has gone", errno.ENODEV)
+        frame = from_socket(packet)
+        if frame is None:
+            raise can.CanOperationError(f"the simulator sent {packet.hex()}, which is no frame", errno.EBADMSG)
+        message = can.Message(
+            arbitration_id=frame.identifier & MAX_IDENTIFIER,
+            is_extended_id=False,
+            is_error_frame=bool(frame.identifier & ERROR_FLAG),
+            data=frame.data,
+            channel=self.channel_info,
+        )
+        return message, False
+
+    def shutdown(self) -> None:
+        """Leaves the bus."""
+        super().shutdown()
+        self._socket.close()

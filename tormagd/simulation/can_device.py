@@ -1,0 +1,125 @@
+"""The simulated device on a CAN bus: frames in, frames out, each for as long as its bits take.
+
+One bus: whoever has something to send waits until it is free, then the lowest identifier goes first.
+"""
+
+from collections import deque
+from heapq import heappop, heappush
+from typing import NamedTuple
+
+from tormagd.simulation.can_frame import MAX_IDENTIFIER, CanFrame, frame_bits
+from tormagd.simulation.device import MessageDevice
+from tormagd.simulation.plant import Truth
+
+DEFAULT_BITRATE = 1_000_000
+DEFAULT_NODE = 1
+MAX_WAITING = 32
+"""Frames that the controllers on the bus hold together; what comes on top is lost, as in a full transmit queue."""
+DEVICE = 0
+"""The device as a sender; hosts count from 1."""
+
+
+class Delivery(NamedTuple):
+    """A frame that all but its sender have just received."""
+
+    sender: int
+    frame: CanFrame
+
+
+class _Flight(NamedTuple):
+    end_s: float
+    delivery: Delivery
+
+
+class CanDevice:
+    """One device and the bus it is on.
+
+    receive(now_s, frame, host)   a host hands a frame to its controller; it goes on the bus when its turn comes
+    transmit(now_s)               lets time pass until then, and gives the frames whose last bit has gone by
+    advance(now_s)                only lets time pass
+
+    Times are seconds from power-on and must not fall over all three (ValueError).
+    """
+
+    def __init__(self, messages: MessageDevice, bitrate: int = DEFAULT_BITRATE, node: int = DEFAULT_NODE) -> None:
+        if bitrate <= 0:
+            raise ValueError(f"bitrate = {bitrate}: allowed are numbers over 0")
+        if not 0 <= node <= 15:
+            raise ValueError(f"node = {node}: allowed are 0 to 15")
+        self.messages = messages
+        self.lost = 0
+        """Frames that found the queue full."""
+        self.busy_s = 0.0
+        """How long the bus has carried frames."""
+        self._bit_s = 1.0 / bitrate
+        self._node = node
+        self._order = 0
+        self._waiting: list[tuple[int, int, Delivery]] = []
+        self._flight: _Flight | None = None
+        self._free_s = 0.0
+        self._now_s = 0.0
+        self._delivered: deque[Delivery] = deque()
+
+    @property
+    def truth(self) -> Truth:
+        """What really is, at the time of the last call."""
+        return self.messages.truth
+
+    @property
+    def next_event_s(self) -> float:
+        """When there is next something to do: a frame that ends or may start, or an event inside the device."""
+        event_s = self.messages.next_event_s
+        if self._flight is not None:
+            return min(event_s, self._flight.end_s)
+        return min(event_s, max(self._free_s, self._now_s)) if self._waiting else event_s
+
+    def receive(self, now_s: float, frame: CanFrame, host: int = 1) -> None:
+        """A host sends `frame` now."""
+        self.advance(now_s)
+        self._queue(Delivery(host, frame))
+
+    def transmit(self, now_s: float) -> list[Delivery]:
+        """The frames that have gone by since the last call, the hosts' own among them."""
+        self.advance(now_s)
+        delivered = list(self._delivered)
+        self._delivered.clear()
+        return delivered
+
+    def advance(self, now_s: float) -> None:
+        """Let time pass until `now_s`."""
+        while (event_s := self.next_event_s) <= now_s:
+            self._pass_time(event_s)
+            if self._flight is not None and self._flight.end_s <= event_s:
+                self._land(self._flight)
+            if self._flight is None and self._waiting and self._free_s <= event_s:
+                self._take_off(event_s)
+        self._pass_time(now_s)
+
+    def _pass_time(self, time_s: float) -> None:
+        self.messages.advance(time_s)
+        self._now_s = time_s
+        outbox = self.messages.outbox
+        while outbox:
+            packet = outbox.popleft()
+            self._queue(Delivery(DEVICE, CanFrame(packet.function << 4 | self._node, packet.payload)))
+
+    def _queue(self, delivery: Delivery) -> None:
+        if len(self._waiting) >= MAX_WAITING:
+            self.lost += 1
+            return
+        self._order += 1
+        heappush(self._waiting, (delivery.frame.identifier, self._order, delivery))
+
+    def _take_off(self, time_s: float) -> None:
+        _, _, delivery = heappop(self._waiting)
+        duration_s = frame_bits(delivery.frame) * self._bit_s
+        self.busy_s += duration_s
+        self._flight = _Flight(time_s + duration_s, delivery)
+
+    def _land(self, flight: _Flight) -> None:
+        self._flight = None
+        self._free_s = flight.end_s
+        sender, frame = flight.delivery
+        self._delivered.append(flight.delivery)
+        if sender != DEVICE and frame.identifier <= MAX_IDENTIFIER and frame.identifier & 0xF == self._node:
+            self.messages.receive(flight.end_s, frame.identifier >> 4, frame.data)

@@ -1,0 +1,100 @@
+"""The CAN door: the device's bus as a Unix socket, one frame a packet. Hosts come through `can_bus.SimulatorBus`."""
+
+import contextlib
+import socket
+from collections.abc import Sequence
+from pathlib import Path
+
+from tormagd.simulation.can_device import CanDevice
+from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, from_socket, to_socket
+
+MAX_HOSTS = 8
+FRAMES_AT_ONCE = 16
+
+
+class CanDoor:
+    """One bus with a device and up to MAX_HOSTS hosts, that come and go as they like."""
+
+    def __init__(self, device: CanDevice, path: Path) -> None:
+        """Serves at `path`; what a killed simulator left there is replaced. Raises OSError."""
+        self._device = device
+        self._path = path
+        self._hosts: dict[int, socket.socket] = {}
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            _remove_abandoned(path)
+            self._listener.bind(str(path))
+            self._listener.listen(MAX_HOSTS)
+        except OSError as error:
+            self._listener.close()
+            raise OSError(f"{path}: cannot be served: {error.strerror or error}") from error
+        self._listener.setblocking(False)
+        self.address = str(path)
+
+    def descriptors(self) -> Sequence[int]:
+        """The listening socket and every host's."""
+        return (self._listener.fileno(), *self._hosts)
+
+    def exchange(self, now_s: float, readable: Sequence[int]) -> None:
+        """Frames in, frames out to all but their sender."""
+        for descriptor in readable:
+            if descriptor in self._hosts:
+                self._take(now_s, descriptor)
+            else:
+                self._welcome()
+        for sender, frame in self._device.transmit(now_s):
+            packet = to_socket(frame)
+            for descriptor in [descriptor for descriptor in self._hosts if descriptor != sender]:
+                self._hand(descriptor, packet)
+
+    def close(self) -> None:
+        """Takes the bus away."""
+        for descriptor in list(self._hosts):
+            self._dismiss(descriptor)
+        self._listener.close()
+        self._path.unlink(missing_ok=True)
+
+    def _welcome(self) -> None:
+        with contextlib.suppress(BlockingIOError):  # a host that came has gone again
+            host, _ = self._listener.accept()
+            if len(self._hosts) >= MAX_HOSTS:
+                host.close()
+                return
+            host.setblocking(False)
+            self._hosts[host.fileno()] = host
+
+    def _dismiss(self, descriptor: int) -> None:
+        self._hosts.pop(descriptor).close()
+
+    def _take(self, now_s: float, descriptor: int) -> None:
+        for _ in range(FRAMES_AT_ONCE):
+            try:
+                packet = self._hosts[descriptor].recv(SOCKET_FRAME.size + 1)
+            except BlockingIOError:
+                return
+            except OSError:
+                packet = b""
+            frame = from_socket(packet)
+            if frame is None or frame.identifier & ERROR_FLAG:  # end of file, or no host of ours
+                self._dismiss(descriptor)
+                return
+            self._device.receive(now_s, frame, descriptor)
+
+    def _hand(self, descriptor: int, packet: bytes) -> None:
+        try:
+            self._hosts[descriptor].send(packet)
+        except BlockingIOError:
+            return  # it does not read: its controller overruns
+        except OSError:
+            self._dismiss(descriptor)
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Removes a socket that nobody listens at."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            path.unlink()
+        except FileNotFoundError:
+            return

@@ -1,0 +1,101 @@
+"""Runs a simulated device in real time, in one thread, behind whatever door the host comes through.
+
+Between events the process sleeps, until the next word from a host or the next thing the device has to do, so a reply
+leaves when its last bit would have.
+"""
+
+import gc
+import select
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol, TextIO
+
+from tormagd.simulation.plant import Truth
+
+LATE_S = 2e-3
+"""From this lateness on, a wake-up counts as falling behind: two firmware ticks."""
+SLIP_S = 20e-3
+"""From this lateness on, the device's time stands still instead: the process did not run, and the device must not take
+its own sleep for the host's silence."""
+TRUTH_PERIOD_S = 1e-3
+TRUTH_HEADER = "t_ns,force_N,gap_mm,left_mm,right_mm,handle_mm,handle_mm_s,temperature_C\n"
+
+
+class PacedDevice(Protocol):
+    """A device and the wire in front of it; times are seconds from power-on and never fall."""
+
+    @property
+    def truth(self) -> Truth:
+        """What really is, at the time of the last call."""
+
+    @property
+    def next_event_s(self) -> float:
+        """When there is next something to do."""
+
+    def advance(self, now_s: float) -> None:
+        """Lets time pass."""
+
+
+class Door(Protocol):
+    """Where hosts come to a device."""
+
+    @property
+    def address(self) -> str:
+        """What a host opens."""
+
+    def descriptors(self) -> Sequence[int]:
+        """What to wait for: something came from a host."""
+
+    def exchange(self, now_s: float, readable: Sequence[int]) -> None:
+        """Takes in what has come on `readable` and hands out what is due."""
+
+    def close(self) -> None:
+        """Takes the door away."""
+
+
+class Punctuality(NamedTuple):
+    """How well real time was kept."""
+
+    late: int
+    worst_s: float
+    slipped_s: float
+
+
+def serve(device: PacedDevice, door: Door, stopped: Callable[[], bool], truth: TextIO | None = None) -> Punctuality:
+    """Run until `stopped()`, asked about once a millisecond; `truth` gets a CSV row a millisecond."""
+    # nothing made so far will die: keep the collector from walking it while the device runs
+    gc.freeze()
+    power_on_s = time.monotonic()
+    realtime_ns = time.time_ns()
+    late, worst_s, slipped_s = 0, 0.0, 0.0
+    row_s = 0.0
+    if truth is not None:
+        truth.write(TRUTH_HEADER)
+    while not stopped():
+        due_s = device.next_event_s
+        wait_s = due_s - (time.monotonic() - power_on_s)
+        readable, _, _ = select.select(door.descriptors(), [], [], max(wait_s, 0.0))
+        now_s = time.monotonic() - power_on_s
+        lateness_s = now_s - due_s
+        if lateness_s > LATE_S:
+            late += 1
+            worst_s = max(worst_s, lateness_s)
+            if lateness_s > SLIP_S:
+                power_on_s += lateness_s
+                realtime_ns += round(lateness_s * 1e9)
+                slipped_s += lateness_s
+                now_s = due_s
+        if truth is not None:
+            while row_s <= now_s:
+                device.advance(row_s)
+                truth.write(_truth_row(device.truth, realtime_ns + round(row_s * 1e9)))
+                row_s += TRUTH_PERIOD_S
+        door.exchange(now_s, readable)
+    return Punctuality(late, worst_s, slipped_s)
+
+
+def _truth_row(truth: Truth, t_ns: int) -> str:
+    return (
+        f"{t_ns},{truth.force_N:.5f},{truth.gap_mm:.5f},{truth.left_mm:.5f},{truth.right_mm:.5f},"
+        f"{truth.handle_mm:.4f},{truth.handle_mm_s:.3f},{truth.temperature_C:.3f}\n"
+    )

@@ -1,0 +1,114 @@
+"""The door of a CAN adapter on a serial line: the Lawicel ASCII protocol ("slcan") on a pseudo-terminal.
+
+What a CANable or a Lawicel CAN232 does between a host's serial port and the bus; commands end with CR and are answered
+with CR, or BEL when they are refused (Lawicel CAN232 manual, version 3).
+"""
+
+import re
+from collections.abc import Sequence
+
+from tormagd.simulation.can_device import DEVICE, CanDevice
+from tormagd.simulation.can_frame import CanFrame
+from tormagd.simulation.pty_door import Pty
+
+END = b"\r"
+OK = b"\r"
+REFUSED = b"\a"
+SENT = b"z\r"
+LONGEST_COMMAND = 32
+"""The longest there is, a 29-bit frame of 8 bytes, has 26 characters."""
+VERSION = b"V1013\r"
+SERIAL_NUMBER = b"NSIM1\r"
+STATUS_FLAGS = b"F00\r"
+_FRAME = re.compile(rb"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
+
+
+class SlcanAdapter:
+    """The adapter between the serial characters and the frames; no I/O and no clock."""
+
+    def __init__(self) -> None:
+        self.is_open = False
+        """Whether the channel is on the bus; a host opens it with `O`."""
+        self._pending = b""
+
+    def feed(self, data: bytes) -> tuple[bytes, list[CanFrame]]:
+        """What to answer to the host's characters, and the frames it sends."""
+        *commands, rest = (self._pending + data).split(END)
+        # a command that does not end is refused when its end comes; no more than that of it is kept
+        self._pending = rest[: LONGEST_COMMAND + 1]
+        answers, frames = b"", []
+        for command in commands:
+            if command[:1] == b"t" and self.is_open:
+                frame = _frame(command)
+                answers += SENT if frame else REFUSED
+                if frame:
+                    frames.append(frame)
+            else:
+                answers += self._answer(command)
+        return answers, frames
+
+    def line(self, frame: CanFrame) -> bytes:
+        """A received frame as characters for the host."""
+        return b"t%03X%d%s\r" % (frame.identifier, len(frame.data), frame.data.hex().upper().encode())
+
+    def _answer(self, command: bytes) -> bytes:
+        match command[:1]:
+            case b"":  # hosts send empty lines to end whatever was there before
+                return OK
+            case b"O" if not self.is_open:
+                self.is_open = True
+                return OK
+            case b"C":
+                self.is_open = False
+                return OK
+            case b"S" if not self.is_open and command[1:] in {b"%d" % number for number in range(9)}:
+                return OK  # accepted and without effect: the simulated bus has its own bit rate
+            case b"V":
+                return VERSION
+            case b"N":
+                return SERIAL_NUMBER
+            case b"F":
+                return STATUS_FLAGS
+        return REFUSED
+
+
+class SlcanDoor:
+    """One device behind such an adapter."""
+
+    def __init__(self, device: CanDevice) -> None:
+        self._device = device
+        self._adapter = SlcanAdapter()
+        self._pty = Pty()
+        self.address = self._pty.path
+
+    def descriptors(self) -> Sequence[int]:
+        """The line's device end."""
+        return (self._pty.fileno(),)
+
+    def exchange(self, now_s: float, readable: Sequence[int]) -> None:
+        """Characters in, characters out."""
+        out = b""
+        if readable:
+            out, frames = self._adapter.feed(self._pty.read())
+            for frame in frames:
+                self._device.receive(now_s, frame)
+        for sender, frame in self._device.transmit(now_s):
+            if sender == DEVICE and self._adapter.is_open:
+                out += self._adapter.line(frame)
+        if out:
+            self._pty.write(out)
+
+    def close(self) -> None:
+        """Take the line away."""
+        self._pty.close()
+
+
+def _frame(command: bytes) -> CanFrame | None:
+    """The frame in `tiiildd..`: identifier, length and data in hexadecimal."""
+    match = _FRAME.fullmatch(command)
+    if match is None:
+        return None
+    identifier, length, data = (text.decode() for text in match.groups())
+    if len(data) != 2 * int(length):
+        return None
+    return CanFrame(int(identifier, 16), bytes.fromhex(data))
