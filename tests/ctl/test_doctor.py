@@ -1,4 +1,5 @@
 import json
+import os
 import resource
 from pathlib import Path
 
@@ -131,6 +132,19 @@ def test_port_missing_taken_or_not_ours(good):
     assert finding.found == "minicom (process 4242)"
     write(good, "proc/4242/comm", "tormagd\n")
     assert checks.port_holder(Config(), Machine(good)).verdict is Verdict.OK
+
+
+def test_who_made_a_pseudo_terminal_is_not_its_holder(good):
+    config = Config(device=Device(port="/dev/pts/3"))
+    write(good, "dev/pts/3", "")
+    (good / "proc/4242/fd").mkdir(parents=True)
+    (good / "proc/4242/fd/3").symlink_to("/dev/pts/3")
+    write(good, "proc/4242/comm", "python\n")
+    assert checks.port_holder(config, Machine(good)).verdict is Verdict.OK
+    status = (good / "dev/pts/3").stat()
+    inode = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
+    write(good, "proc/locks", f"1: FLOCK  ADVISORY  WRITE 4242 {inode} 0 EOF\n")
+    assert checks.port_holder(config, Machine(good)).found == "python (process 4242)"
 
 
 def test_a_can_channel_is_a_network_interface(good):

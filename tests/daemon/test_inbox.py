@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tormagd.daemon.endpoint import AHEAD_S, SILENT_S, SOURCES, SetpointInbox
+from tormagd.messages import VERSION, Reply, decode, encode
 
 START_NS = 1_800_000_000_000_000_000
 "Some day on CLOCK_REALTIME that is second 0 of the control clock here."
@@ -19,10 +20,12 @@ class Publishing:
     def __init__(self) -> None:
         self.inbox = SetpointInbox()
         self.now_s = 0.0
+        self.step_s = 0.0
+        "By how much somebody has set the time of day forward."
 
     @property
     def realtime_ns(self) -> int:
-        return START_NS + round(self.now_s * 1e9)
+        return START_NS + round((self.now_s + self.step_s) * 1e9)
 
     def take(self, data: bytes) -> bool:
         return self.inbox.take(data, self.now_s, self.realtime_ns)
@@ -102,6 +105,32 @@ def test_of_several_publishers_the_newest_stamp_wins(publishing: Publishing) -> 
     assert publishing.counters() == (4, 0, 0)
 
 
+@pytest.mark.parametrize("step_s", [-3_600.0, -0.5, 0.5, 3_600.0])
+def test_setting_the_time_of_this_machine_keeps_no_setpoint_out(publishing: Publishing, step_s: float) -> None:
+    """Publisher and daemon read the same clock: the ages stay what they are, also between sources."""
+    publishing.send(1, 1.0, "a", 0.01)
+    publishing.send(1, 1.5, "b", 0.005)
+    publishing.step_s = step_s
+    for tick in range(2, 5):
+        publishing.now_s += 0.002
+        assert publishing.send(tick, float(tick), "a", 0.001)
+        assert publishing.force_N == tick
+        assert publishing.inbox.newest is not None
+        assert publishing.now_s - publishing.inbox.newest.stamp_s == pytest.approx(0.001, abs=1e-6)
+    assert not publishing.send(2, 9.0, "b", 0.3)
+    assert publishing.force_N == 4.0
+
+
+def test_a_publisher_whose_clock_is_set_back_is_heard_on_with_older_setpoints(publishing: Publishing) -> None:
+    """Its seq goes on, so it is newer; by the stamp it is half a second old, and the governor lets that decay."""
+    publishing.send(1, 1.0, "a", 0.0)
+    publishing.now_s = 0.002
+    assert publishing.send(2, 1.2, "a", 0.5)
+    assert publishing.force_N == 1.2
+    assert publishing.inbox.newest is not None
+    assert publishing.inbox.newest.stamp_s == pytest.approx(-0.498)
+
+
 def test_a_stamp_ahead_of_the_clock_is_refused(publishing: Publishing) -> None:
     assert publishing.send(1, 1.0, "a", -AHEAD_S)
     assert not publishing.send(2, 2.0, "a", -AHEAD_S - 0.001)
@@ -157,6 +186,8 @@ def test_a_flood_of_names_takes_no_memory(publishing: Publishing) -> None:
         {"seq": None},
         {"stamp_ns": 1.5},
         {"rate_mm_s": float("nan")},
+        {"displacement_mm": 1e10},
+        {"rate_mm_s": -1e308},
         {"preview_N": [float("nan")], "preview_dt_ms": 1.0},
     ],
 )
@@ -168,6 +199,13 @@ def test_a_refused_setpoint_changes_nothing_but_the_counter(publishing: Publishi
     assert publishing.counters() == (1, 1, 0)
     assert str(next(iter(fields))) in str(publishing.inbox.last_refusal)
     assert publishing.send(2, 1.1)
+
+
+def test_the_last_refusal_fits_into_an_answer(publishing: Publishing) -> None:
+    hostile = {"preview_N": [-1.2345678901234567e-100] * 256, "preview_dt_ms": 1.0}
+    assert not publishing.send(1, **hostile)
+    answer = Reply(v=VERSION, id=1, ok=True, result=publishing.inbox.report())
+    assert decode(encode(answer), Reply).result == publishing.inbox.report()
 
 
 @pytest.mark.parametrize("data", [b"", b"\xc1", b"\x00" * 20_000, msgpack.packb("setpoint")])
@@ -186,16 +224,16 @@ def test_garbage_is_counted(publishing: Publishing, data: bytes) -> None:
         max_size=60,
     )
 )
-def test_every_message_is_counted_once_and_the_newest_never_gets_older(
+def test_every_message_is_counted_once_and_no_source_supersedes_a_newer_one(
     events: list[tuple[str, int, float, float, float]],
 ) -> None:
     publishing = Publishing()
-    last_stamp_ns = 0
+    last_source, last_stamp_ns = "", 0
     for source, seq, age_s, force_N, elapsed_s in events:
         publishing.now_s += elapsed_s
         stamp_ns = publishing.realtime_ns - round(age_s * 1e9)
         if publishing.send(seq, force_N, source, stamp_ns=stamp_ns):
-            assert stamp_ns >= last_stamp_ns
-            last_stamp_ns = stamp_ns
+            assert stamp_ns >= last_stamp_ns or source == last_source
+            last_source, last_stamp_ns = source, stamp_ns
             assert publishing.force_N == force_N
     assert sum(publishing.counters()) == len(events)

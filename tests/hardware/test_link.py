@@ -27,7 +27,17 @@ from firmware_protocol.codec import (
     period,
 )
 from tormagd.hardware.frame_stream import FrameStream
-from tormagd.hardware.link import HELLO_S, REPEAT_S, SILENT_S, DeviceLink, LinkState
+from tormagd.hardware.link import (
+    FIRST_NONCE,
+    GIVE_UP_S,
+    HELLO_S,
+    OVERTAKEN,
+    REPEAT_S,
+    SILENT_S,
+    UNANSWERED_S,
+    DeviceLink,
+    LinkState,
+)
 from tormagd.safety.operating_state import DeviceRequest
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
@@ -70,7 +80,7 @@ def due(link: DeviceLink, from_s: float, until_s: float, heard: bool = True) -> 
 
 def test_hello_is_said_until_somebody_answers_and_then_now_and_again() -> None:
     link = DeviceLink(0.0)
-    hello = Hello(SCHEMA_HASH, PROTOCOL_VERSION, 0)
+    hello = Hello(SCHEMA_HASH, PROTOCOL_VERSION, FIRST_NONCE)
     asking = due(link, 0.0, 0.32)
     assert [message for _, message in asking] == [hello] * len(asking)
     assert [at_s for at_s, _ in asking] == pytest.approx([k * REPEAT_S for k in range(7)], abs=8e-3)
@@ -104,13 +114,82 @@ def test_silence_loses_a_running_link() -> None:
     assert link.state is LinkState.RUNNING
     link.due(0.5 + SILENT_S + 1e-3)
     assert link.state is LinkState.LOST
-    assert "100 ms" in link.cause
+    assert "80 ms" in link.cause
 
 
 def test_waiting_for_the_first_answer_is_no_loss() -> None:
     link = DeviceLink(0.0)
-    due(link, 0.0, 10.0, heard=False)
+    due(link, 0.0, UNANSWERED_S, heard=False)
     assert link.state is LinkState.IDENTIFYING
+    late = due(link, UNANSWERED_S, 10.0, heard=False)
+    assert link.state is LinkState.UNANSWERED
+    assert len(late) == pytest.approx(9.0 / HELLO_S, abs=1)
+
+
+def test_a_device_that_turns_up_late_is_asked_at_its_first_word() -> None:
+    link = DeviceLink(0.0)
+    due(link, 0.0, 3.3, heard=False)
+    link.receive(3.3, status())
+    assert link.state is LinkState.IDENTIFYING
+    assert [type(message) for message in link.due(3.3)] == [Hello]
+    link.receive(3.31, US)
+    assert link.state is LinkState.RUNNING
+
+
+def test_a_device_that_was_reset_has_to_say_again_who_it_is() -> None:
+    """Its Status shows the nonce 0, which no host ever sends."""
+    link = running(nonce=FIRST_NONCE)
+    before = link.measurement
+    link.receive(0.02, status(0, switches=Switches(0)))
+    assert link.state is LinkState.RUNNING, "the core sees first what the reset did"
+    assert link.measurement is not None
+    assert not link.measurement.is_homed
+    link.request(0.021, DeviceRequest.RETRACT)
+    assert [type(message) for message in link.due(0.021)] == [Hello]
+    assert link.state is LinkState.IDENTIFYING
+    assert "reset" in link.cause
+    assert link.measurement is None
+    for message in (US, status(FIRST_NONCE), Sense(0.0, 0.0, 0.0, 0.0), State(5.0, 5.0, 0.0, 1)):
+        link.receive(0.022, message)
+    assert link.state is LinkState.RUNNING
+    assert link.measurement is not None
+    assert before is not None
+    assert link.measurement.left_mm == 5.0
+    assert [type(message) for message in link.due(0.022)] == [Retract], "opening is still wanted"
+
+
+@pytest.mark.parametrize("request_", [DeviceRequest.HOME, DeviceRequest.CLEAR])
+def test_a_reset_device_does_nothing_that_was_asked_of_it_before(request_: DeviceRequest) -> None:
+    link = running(nonce=FIRST_NONCE)
+    link.request(0.01, request_)
+    link.receive(0.02, status(0))
+    link.due(0.02)
+    for message in (US, status(FIRST_NONCE)):
+        link.receive(0.03, message)
+    assert link.pending is DeviceRequest.NONE
+    assert {type(message) for _, message in due(link, 0.03, 2.0)} == {Hello}
+
+
+def test_another_device_at_the_same_line_is_not_taken_for_the_first() -> None:
+    link = running(nonce=FIRST_NONCE)
+    link.receive(1.0, US._replace(serial_number=78))
+    link.due(1.001)
+    assert link.state is LinkState.IDENTIFYING
+    assert "77 was replaced by device 78" in link.cause
+    assert link.measurement is None
+
+
+@pytest.mark.parametrize("behind", [0, 1, OVERTAKEN - 1])
+def test_a_state_that_is_no_news_measures_nothing(behind: int) -> None:
+    link = running()
+    link.receive(0.1, State(-1.0, -1.0, 0.1, 40))
+    before = link.measurement
+    link.receive(0.2, State(-9.0, -9.0, 0.05, 40 - behind))
+    assert link.measurement is before
+    assert link.repeated == 1
+    link.receive(0.3, State(-1.5, -1.5, 0.3, 40 + 3))
+    assert link.measurement is not None
+    assert link.measurement.left_mm == pytest.approx(-1.5)
 
 
 def test_drive_counters_go_round() -> None:
@@ -145,16 +224,37 @@ def test_no_hello_comes_between_a_command_and_its_acknowledgement() -> None:
     """The device takes a Hello's number for the last accepted one: that must not look like an acknowledgement."""
     link = running()
     link.request(0.5, DeviceRequest.HOME)
-    waiting = due(link, 0.5, 3.0)
+    waiting = due(link, 0.5, 0.5 + GIVE_UP_S)
     assert all(isinstance(message, Home) for _, message in waiting)
     nonce = waiting[0][1].nonce  # type: ignore[union-attr]
-    link.receive(3.0, status(nonce))
+    link.receive(0.5 + GIVE_UP_S, status(nonce))
     hellos = [message for _, message in due(link, 3.0, 5.0)]
     assert hellos
     assert all(message == Hello(SCHEMA_HASH, PROTOCOL_VERSION, nonce) for message in hellos)
     link.request(5.0, DeviceRequest.RETRACT)
     link.receive(5.0, status(hellos[-1].nonce))  # type: ignore[union-attr]
     assert any(isinstance(message, Retract) for _, message in due(link, 5.0, 5.1))
+
+
+@pytest.mark.parametrize("request_", [DeviceRequest.HOME, DeviceRequest.CLEAR])
+def test_a_command_that_the_device_does_not_take_is_given_up(request_: DeviceRequest) -> None:
+    link = running()
+    link.request(0.0, request_)
+    assert len(due(link, 0.0, GIVE_UP_S)) == pytest.approx(GIVE_UP_S / REPEAT_S, abs=1)
+    assert {type(message) for _, message in due(link, GIVE_UP_S + 2e-3, 4.0)} == {Hello}
+    assert link.pending is DeviceRequest.NONE
+
+
+def test_opening_is_asked_for_until_the_device_opens_or_has_latched() -> None:
+    """A latched device has its drives off and refuses: it has opened before, or cannot."""
+    link = running()
+    link.request(0.0, DeviceRequest.RETRACT)
+    assert {type(message) for _, message in due(link, 0.0, 5.0)} == {Retract}
+    link.receive(5.0, status(mode=DeviceMode.RETRACTING))
+    assert link.pending is DeviceRequest.RETRACT
+    link.receive(5.02, status(mode=DeviceMode.LATCHED))
+    assert link.pending is DeviceRequest.NONE
+    assert {type(message) for _, message in due(link, 5.02, 7.0)} == {Hello}
 
 
 def test_every_request_has_a_new_number_and_none_is_zero() -> None:

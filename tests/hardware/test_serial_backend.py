@@ -93,9 +93,10 @@ def test_bytes_from_before_the_opening_are_not_read(line: Line) -> None:
 
 def test_a_second_opening_is_refused_until_the_first_has_closed(line: Line) -> None:
     first = open_serial(line.device)
-    with pytest.raises(BackendError, match=r"cannot be opened") as caught:
+    with pytest.raises(BackendError, match=r"cannot be opened: another process holds it") as caught:
         open_serial(line.device)
     assert line.device.port in str(caught.value)
+    assert "tormagctl ports" in caught.value.remedy
     first.close()
     open_serial(line.device).close()
 

@@ -231,7 +231,11 @@ def port(config: Config, machine: Machine) -> Finding:
 def port_holder(config: Config, machine: Machine) -> Finding:
     """Whether another process has the port. tormagd itself is meant to."""
     name = config.device.port
-    others = machine.holders(machine.resolved(name)) if name.startswith("/") else []
+    target = machine.resolved(name)
+    others = machine.holders(target) if name.startswith("/") else []
+    if target.startswith("/dev/pts/"):  # whoever made a pseudo-terminal has it open as well
+        locking = machine.lock_owners(target)
+        others = [(pid, comm) for pid, comm in others if pid in locking]
     strangers = [f"{comm} (process {pid})" for pid, comm in others if not comm.startswith("tormagd")]
     if strangers:
         return Finding("port holder", Verdict.FAIL, ", ".join(strangers), "end it, or give tormagd another port")
@@ -248,7 +252,10 @@ def usb_latency(config: Config, machine: Machine) -> Finding:
         return Finding("usb latency", Verdict.OK, "this port has no latency timer")
     if latency_ms <= FAST_LATENCY_MS:
         return Finding("usb latency", Verdict.OK, f"{latency_ms} ms")
-    remedy = f"echo {FAST_LATENCY_MS} | sudo tee {file}; systemd/udev/60-tormag.rules does it at every plug"
+    remedy = (
+        f"tormagd asks the driver for {FAST_LATENCY_MS} ms when it opens the port; where that is refused: "
+        f"echo {FAST_LATENCY_MS} | sudo tee {file}; systemd/udev/60-tormag.rules does it at every plug"
+    )
     return Finding("usb latency", Verdict.WARN, f"{latency_ms} ms", remedy)
 
 

@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 
@@ -59,19 +60,41 @@ class Machine:
 
     def holders(self, absolute: str) -> list[tuple[int, str]]:
         """Process id and name of everybody who has `absolute` open, as far as we may see; not this process."""
-        found = []
-        for process in sorted(self.path("/proc").glob("[0-9]*")):
-            if process.name != str(os.getpid()) and self._holds(process, absolute):
-                name = self.text(f"/proc/{process.name}/comm") or "?"
-                found.append((int(process.name), name))
-        return found
+        holding, _ = self.all_holders([absolute])
+        return holding[absolute]
 
-    def _holds(self, process: Path, absolute: str) -> bool:
-        # a process may end, or its files be another user's, while we look
+    def all_holders(self, paths: Sequence[str]) -> tuple[dict[str, list[tuple[int, str]]], int]:
+        """`holders` of each path in one look, and the number of processes whose open files we may not see."""
+        holding: dict[str, list[tuple[int, str]]] = {path: [] for path in paths}
+        hidden = 0
+        for process in sorted(self.path("/proc").glob("[0-9]*")):
+            if process.name == str(os.getpid()):
+                continue
+            # a process may end, or its files be another user's, while we look
+            try:
+                targets = {target for link in (process / "fd").iterdir() if (target := _target(link))}
+            except PermissionError:
+                hidden += 1
+                continue
+            except OSError:
+                continue
+            for path in targets & holding.keys():
+                holding[path].append((int(process.name), self.process_name(int(process.name))))
+        return holding, hidden
+
+    def process_name(self, process_id: int) -> str:
+        """What a process calls itself; `?` where there is none."""
+        return self.text(f"/proc/{process_id}/comm") or "?"
+
+    def lock_owners(self, absolute: str) -> list[int]:
+        """The processes that hold a lock on a file, other users' too: the kernel lists locks for everybody."""
         try:
-            return any(_target(link) == absolute for link in (process / "fd").iterdir())
+            status = self.path(absolute).stat()
         except OSError:
-            return False
+            return []
+        inode = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
+        rows = [line.split() for line in (self.text("/proc/locks") or "").splitlines()]
+        return sorted({int(row[4]) for row in rows if len(row) > 5 and row[1] == "FLOCK" and row[5] == inode})
 
 
 def _target(link: Path) -> str | None:

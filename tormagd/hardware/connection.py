@@ -1,12 +1,18 @@
-"""Keeps a device connected: opens the port, watches it, and opens it again after a loss. Never re-arms anything."""
+"""Keeps a device connected: opens the port, watches it, and opens it again after a loss. Never re-arms anything.
 
-import asyncio
+CLOSED --> IDENTIFYING <--> UNANSWERED             the port is opened: --> IDENTIFYING
+             |     ^                               the port fails, or a running device falls silent: --> LOST
+             v     | reset, replaced               the port is opened again, in vain: --> BACK_OFF
+          RUNNING, REFUSED
+"""
+
 import logging
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, Final, Protocol
 
-from firmware_protocol.codec import DriveMode
+from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, DriveMode
 from tormagd.config import Device
 from tormagd.hardware.backend import Backend, BackendError
 from tormagd.hardware.link import DeviceLink, LinkState
@@ -15,10 +21,28 @@ from tormagd.safety.operating_state import DeviceRequest
 
 FIRST_BACK_OFF_S = 0.05
 LONGEST_BACK_OFF_S = 1.0
+COUNTERS = ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronisations")
+
+TRANSITIONS: Final[Mapping[LinkState, frozenset[LinkState]]] = MappingProxyType(
+    {
+        LinkState.CLOSED: frozenset({LinkState.IDENTIFYING, LinkState.BACK_OFF}),
+        LinkState.BACK_OFF: frozenset({LinkState.IDENTIFYING, LinkState.CLOSED}),
+        LinkState.IDENTIFYING: frozenset(
+            {LinkState.RUNNING, LinkState.REFUSED, LinkState.UNANSWERED, LinkState.LOST, LinkState.CLOSED}
+        ),
+        LinkState.UNANSWERED: frozenset(
+            {LinkState.IDENTIFYING, LinkState.RUNNING, LinkState.REFUSED, LinkState.LOST, LinkState.CLOSED}
+        ),
+        LinkState.REFUSED: frozenset({LinkState.RUNNING, LinkState.IDENTIFYING, LinkState.LOST, LinkState.CLOSED}),
+        LinkState.RUNNING: frozenset({LinkState.IDENTIFYING, LinkState.REFUSED, LinkState.LOST, LinkState.CLOSED}),
+        LinkState.LOST: frozenset({LinkState.IDENTIFYING, LinkState.BACK_OFF, LinkState.CLOSED}),
+    }
+)
+"""Where each state can lead. RUNNING is left only with a loss, and entered only by an Identity that fits."""
 
 _REMEDIES = {
-    LinkState.CLOSED: "check cable, supply, device.port and its holder (tormagctl doctor); it is tried again",
-    LinkState.IDENTIFYING: "is this the device, and is device.baud its rate?",
+    LinkState.BACK_OFF: "check cable, supply, device.port and who holds it (tormagctl ports); it is tried again",
+    LinkState.UNANSWERED: "is this the device, is it on, and is its rate the configured one? It is asked on",
     LinkState.REFUSED: "install firmware and daemon of the same protocol schema",
     LinkState.LOST: "check cable and supply; it is tried again",
 }
@@ -26,92 +50,177 @@ _REMEDIES = {
 log = logging.getLogger(__name__)
 
 
-class Connection:
-    """One device, however often its cable is pulled. States are those of the link, CLOSED while no port is open."""
+class Watcher(Protocol):
+    """The part of an event loop that a connection needs."""
 
-    def __init__(self, device: Device, open_backend: Callable[[Device], Backend], on_loss: Callable[[], None]) -> None:
-        self._device, self._open_backend, self._on_loss = device, open_backend, on_loss
+    def add_reader(self, fd: int, callback: Callable[[], None]) -> object:
+        """Calls back whenever the descriptor is readable."""
+
+    def remove_reader(self, fd: int) -> object:
+        """Stops that."""
+
+
+class Connection:
+    """One device, however often its cable is pulled.
+
+    It moves when `exchange` is called, once a control period, and when its descriptor is readable; it has no timers
+    of its own. `clock` gives seconds of a monotonic clock.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        open_backend: Callable[[Device], Backend],
+        on_loss: Callable[[], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._device, self._open_backend, self._on_loss, self._clock = device, open_backend, on_loss, clock
+        self._watcher: Watcher | None = None
         self._backend: Backend | None = None
         self._link: DeviceLink | None = None
+        self._waiting = LinkState.CLOSED
+        self._cause, self._remedy = "not opened yet", ""
         self._back_off_s = FIRST_BACK_OFF_S
-        self._cause = "not opened yet"
-        self._is_closing = False
+        self._reopen_s = 0.0
         self._requested = 0
-        self._reopening: asyncio.TimerHandle | None = None
+        self._unfinished = DeviceRequest.NONE
+        self._seen = LinkState.CLOSED
         self.losses = 0
+        self._last_loss = ""
 
     @property
     def state(self) -> LinkState:
-        """Where the conversation with the device stands."""
-        return LinkState.CLOSED if self._link is None else self._link.state
+        """Where the connection stands."""
+        return self._waiting if self._link is None else self._link.state
+
+    @property
+    def cause(self) -> str:
+        """Why it does not run; empty while it does."""
+        link, backend = self._link, self._backend
+        if link is None or backend is None:
+            return self._cause
+        if link.state is not LinkState.UNANSWERED:
+            return link.cause
+        heard = backend.statistics
+        if heard.frames:
+            return f"{link.cause}, though it sends messages"
+        return f"{link.cause}; " + ("what it sends is not this protocol" if heard.corrupt else "it is silent")
+
+    @property
+    def remedy(self) -> str:
+        """What to do about the cause."""
+        return self._remedy or _REMEDIES.get(self.state, "")
 
     @property
     def measurement(self) -> Measurement | None:
         """The newest measurement while the link runs."""
         return self._link.measurement if self._link is not None and self._link.state is LinkState.RUNNING else None
 
-    def open(self) -> None:
+    @property
+    def pending(self) -> DeviceRequest:
+        """The request that the device has not acknowledged; what waits for a device to come back counts too."""
+        return self._unfinished if self._link is None else self._link.pending
+
+    def open(self, watcher: Watcher) -> None:
         """Opens the port, now or as soon as it can be."""
-        self._reopening = None
-        try:
-            self._backend = self._open_backend(self._device)
-        except BackendError as error:
-            # the first failure is news, the same one again is not
-            log.log(logging.WARNING if str(error) != self._cause else logging.DEBUG, "%s", error)
-            self._cause = str(error)
-            self._open_later()
-            return
-        self._link = DeviceLink(time.monotonic())
-        asyncio.get_running_loop().add_reader(self._backend.fileno(), self._receive)
-        log.info("%s is open", self._device.port)
+        self._watcher = watcher
+        self._open(self._clock())
 
     def exchange(
-        self, now_s: float, left_duty: float, right_duty: float, mode: DriveMode, request: DeviceRequest, number: int
+        self, left_duty: float, right_duty: float, mode: DriveMode, request: DeviceRequest, number: int
     ) -> None:
-        """Sends one drive message, and whatever handshake or request is due."""
+        """Sends one drive message, and whatever handshake or request is due; opens the port when it is time to."""
+        now_s = self._clock()
+        if self._link is None and self._watcher is not None and now_s >= self._reopen_s:
+            self._open(now_s)
         link, backend = self._link, self._backend
         if link is None or backend is None:
             return
         if number != self._requested:
             self._requested = number
-            link.request(now_s, request)
-        due = link.due(now_s)
-        if link.state is LinkState.LOST:
-            self._lose(link.cause)
+            # opening the gap waits for a device; nothing else may move one that has come since it was asked for
+            if request is DeviceRequest.RETRACT or link.state is LinkState.RUNNING:
+                link.request(now_s, request)
+        if link.is_silent(now_s):
+            self._receive()  # a process that was not run itself finds here what it took for silence
+        if self._link is not link:
             return
         try:
             if link.state is LinkState.RUNNING:
                 backend.send(link.drive(left_duty, right_duty, mode))
-            for message in due:
+            for message in link.due(now_s):
                 backend.send(message)
         except BackendError as error:
-            self._lose(str(error))
+            self._lose(error)
+            return
+        self._notice()
+        if link.state is LinkState.LOST:
+            self._give_back(link.cause, "")
 
     def close(self) -> None:
         """Closes the port for good."""
-        self._is_closing = True
-        if self._reopening is not None:
-            self._reopening.cancel()
-        self._give_back()
+        self._watcher, watcher = None, self._watcher
+        if watcher is not None:
+            self._release(watcher)
+        self._waiting, self._cause, self._remedy = LinkState.CLOSED, "closed", ""
+        self._seen = LinkState.CLOSED
 
     def report(self) -> dict[str, Any]:
-        """State, cause and remedy, identity and counters."""
-        report: dict[str, Any] = {
+        """State, cause and remedy, identity, counters of this opening of the port, round trip and clock.
+
+        What is not known is None. The keys are those of `tormagctl firmware --json`.
+        """
+        link, backend = self._link, self._backend
+        identity = None if link is None else link.identity
+        fit = None if link is None else link.clock.fit()
+        counted = {name: None if backend is None else getattr(backend.statistics, name) for name in COUNTERS}
+        if link is not None and counted["repeated"] is not None:
+            counted["repeated"] += link.repeated
+        return {
             "state": str(self.state),
-            "cause": self._cause if self._link is None else self._link.cause,
-            "remedy": _REMEDIES.get(self.state, ""),
+            "cause": self.cause,
+            "remedy": self.remedy,
+            "backend": self._device.backend,
             "port": self._device.port,
             "losses": self.losses,
+            "last_loss": self._last_loss,
+            "firmware": identity and f"{identity.firmware_major}.{identity.firmware_minor}",
+            "serial_number": identity and identity.serial_number,
+            "firmware_schema": identity and f"{identity.schema_hash:08x}",
+            "daemon_schema": f"{SCHEMA_HASH:08x}",
+            "protocol_version": PROTOCOL_VERSION,
+            **counted,
+            "round_trip_us": None if link is None else link.round_trip.report(),
+            "clock": None
+            if link is None or fit is None
+            else {
+                # a State has been on its way for about half of the shortest round trip
+                "offset_s": round(fit.offset_s - link.round_trip.least_s / 2.0, 6),
+                "drift_ppm": round(fit.drift_ppm, 2),
+                "residual_us": round(fit.residual_us, 1),
+                "windows": fit.windows,
+                "outliers": fit.outliers,
+            },
         }
-        if self._link is not None and self._link.identity is not None:
-            identity = self._link.identity
-            report["firmware"] = f"{identity.firmware_major}.{identity.firmware_minor}"
-            report["serial_number"] = identity.serial_number
-        if self._backend is not None:
-            counted = self._backend.statistics
-            for name in ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronisations"):
-                report[name] = getattr(counted, name)
-        return report
+
+    def _open(self, now_s: float) -> None:
+        assert self._watcher is not None, "only an opened connection is opened again"
+        try:
+            self._backend = self._open_backend(self._device)
+        except BackendError as error:
+            # the first failure is news, the same one again is not
+            log.log(logging.WARNING if str(error) != self._cause else logging.DEBUG, "%s", error)
+            self._wait(LinkState.BACK_OFF, str(error), error.remedy)
+            self._notice()
+            return
+        self._remedy = ""
+        self._link = DeviceLink(now_s)
+        if self._unfinished is DeviceRequest.RETRACT:
+            self._link.request(now_s, self._unfinished)
+        self._unfinished = DeviceRequest.NONE
+        self._watcher.add_reader(self._backend.fileno(), self._receive)
+        log.info("%s is open", self._device.port)
+        self._notice()
 
     def _receive(self) -> None:
         backend, link = self._backend, self._link
@@ -120,30 +229,54 @@ class Connection:
         try:
             messages = backend.receive()
         except BackendError as error:
-            self._lose(str(error))
+            self._lose(error)
             return
-        now_s = time.monotonic()
+        now_s = self._clock()
         for message in messages:
             link.receive(now_s, message)
-        if link.state is LinkState.RUNNING:
-            self._back_off_s = FIRST_BACK_OFF_S
+            if link.state is not self._seen:
+                self._notice()
 
-    def _lose(self, cause: str) -> None:
-        log.warning("link lost: %s", cause)
-        self._cause = cause
-        self.losses += 1
-        self._give_back()
-        self._on_loss()
-        self._open_later()
+    def _lose(self, error: BackendError) -> None:
+        """The port failed."""
+        assert self._link is not None, "only an open port can fail"
+        self._link.lose(str(error))
+        self._notice()
+        self._give_back(str(error), error.remedy)
 
-    def _give_back(self) -> None:
+    def _give_back(self, cause: str, remedy: str) -> None:
+        """Closes the port, to open it again later."""
+        assert self._link is not None, "only what is open is given back"
+        assert self._watcher is not None, "only an opened connection has a port"
+        self._unfinished = self._link.pending
+        self._release(self._watcher)
+        self._wait(LinkState.LOST, cause, remedy)
+
+    def _release(self, watcher: Watcher) -> None:
         if self._backend is not None:
-            asyncio.get_running_loop().remove_reader(self._backend.fileno())
+            watcher.remove_reader(self._backend.fileno())
             self._backend.close()
         self._backend = self._link = None
 
-    def _open_later(self) -> None:
-        if self._is_closing:
-            return
-        self._reopening = asyncio.get_running_loop().call_later(self._back_off_s, self.open)
+    def _wait(self, state: LinkState, cause: str, remedy: str) -> None:
+        self._waiting, self._cause, self._remedy = state, cause, remedy
+        self._reopen_s = self._clock() + self._back_off_s
         self._back_off_s = min(2.0 * self._back_off_s, LONGEST_BACK_OFF_S)
+
+    def _notice(self) -> None:
+        """Acts on a change of state: says it, and tells the core when the device is gone."""
+        before, state = self._seen, self.state
+        if state is before:
+            return
+        assert state in TRANSITIONS[before], f"{before} does not lead to {state}"
+        self._seen = state
+        if state is LinkState.RUNNING:
+            self._back_off_s = FIRST_BACK_OFF_S
+            log.info("the device on %s runs", self._device.port)
+        elif before is LinkState.RUNNING:
+            self.losses += 1
+            self._last_loss = self.cause
+            log.warning("link lost: %s", self.cause)
+            self._on_loss()
+        elif state in (LinkState.REFUSED, LinkState.UNANSWERED):
+            log.warning("%s: %s; %s", self._device.port, self.cause, self.remedy)

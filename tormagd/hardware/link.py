@@ -10,6 +10,7 @@ from firmware_protocol.codec import (
     PROTOCOL_VERSION,
     SCHEMA_HASH,
     Clear,
+    DeviceMode,
     Drive,
     DriveMode,
     Hello,
@@ -22,15 +23,25 @@ from firmware_protocol.codec import (
     Status,
     period,
 )
+from tormagd.hardware.link_statistics import DeviceClock, RoundTrip
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import DeviceRequest
 
 REPEAT_S = 0.05
 "A Hello or a command without its acknowledgement is sent again after this time."
+GIVE_UP_S = 1.0
+"A Home or Clear that the device has not taken by then, it would take as a surprise."
 HELLO_S = 1.0
 "A device that was reset takes no Drive before a Hello; it hears one this often."
-SILENT_S = 0.1
-"Without any message for this long the link is lost; the firmware has opened the gap by then."
+SILENT_S = 0.08
+"Without any message for this long the link is lost; by then the firmware's own 50 ms have passed."
+UNANSWERED_S = 1.0
+"A device that has not said who it is for this long is asked only every HELLO_S: it may be another make's."
+FIRST_NONCE = 255
+"""A Hello's until a command has been acknowledged. Commands count from 1 to 254, so that theirs is always another, and
+0 is what a device shows after a reset."""
+OVERTAKEN = 16
+"A State whose counter is behind by less than this repeats an earlier one, or was overtaken; it is no measurement."
 
 POSITION_SPAN_MM = period(State, "left_position_mm")
 DEVICE_TIME_SPAN_S = period(State, "device_time_s")
@@ -44,12 +55,14 @@ _COMMANDS: dict[DeviceRequest, type[Home] | type[Retract] | type[Clear]] = {
 
 
 class LinkState(StrEnum):
-    """Where the conversation stands."""
+    """Where the connection stands. A conversation is in one of the last five."""
 
     CLOSED = "CLOSED"
+    BACK_OFF = "BACK_OFF"
     IDENTIFYING = "IDENTIFYING"
-    RUNNING = "RUNNING"
+    UNANSWERED = "UNANSWERED"
     REFUSED = "REFUSED"
+    RUNNING = "RUNNING"
     LOST = "LOST"
 
 
@@ -57,25 +70,47 @@ class DeviceLink:
     """One conversation, from the opening of the port to its loss. A new connection takes a new link."""
 
     def __init__(self, now_s: float) -> None:
+        self.repeated = 0
+        """States that were no news: from a sender that is stuck, or overtaken on their way."""
+        self._counter = 0
+        self._request = DeviceRequest.NONE
+        self._request_due_s = self._requested_s = now_s
+        self._begin(now_s, "waiting for the device to say who it is")
+
+    def _begin(self, now_s: float, cause: str) -> None:
+        """Knows nothing of the device; also when it turns out to have been reset, or to be another one."""
         self.state = LinkState.IDENTIFYING
-        self.cause = "waiting for the device to say who it is"
+        self.cause = cause
         self.identity: Identity | None = None
         self.measurement: Measurement | None = None
-        self._heard_s = now_s
-        self._hello_due_s = now_s
-        self._counter = 0
+        self.round_trip = RoundTrip()
+        self.clock = DeviceClock()
+        self._heard_s = self._hello_due_s = self._asked_s = now_s
+        self._broken = ""
         self._nonce = 0
         # a Hello sets what the device calls the last accepted nonce, so it repeats that one and acknowledges nothing
-        self._acknowledged = 0
-        self._request = DeviceRequest.NONE
-        self._request_due_s = now_s
+        self._acknowledged = FIRST_NONCE
         self._state: State | None = None
         self._sense: Sense | None = None
         self._status: Status | None = None
+        if self._request is not DeviceRequest.RETRACT:  # opening is always wanted still; nothing else moves unasked
+            self._request = DeviceRequest.NONE
+
+    @property
+    def pending(self) -> DeviceRequest:
+        """The request that the device has not acknowledged."""
+        return self._request
+
+    def is_silent(self, now_s: float) -> bool:
+        """Whether a running device has not been heard for too long."""
+        return self.state is LinkState.RUNNING and now_s - self._heard_s > SILENT_S
 
     def receive(self, now_s: float, message: Message) -> None:
         """Takes one message from the device."""
         self._heard_s = now_s
+        if self.state is LinkState.UNANSWERED:
+            self.state = LinkState.IDENTIFYING
+            self._asked_s = self._hello_due_s = now_s
         if isinstance(message, State):
             self._take_state(now_s, message)
         elif isinstance(message, Sense):
@@ -86,16 +121,18 @@ class DeviceLink:
             self._take_identity(message)
 
     def due(self, now_s: float) -> list[Message]:
-        """Handshake and command messages to send now; also notices silence."""
-        if now_s - self._heard_s > SILENT_S and self.state is LinkState.RUNNING:
-            self.state = LinkState.LOST
-            self.cause = f"no message for {SILENT_S * 1e3:.0f} ms"
+        """Handshake and command messages to send now, behind the period's Drive; also notices silence and a reset."""
+        self.round_trip.drive(self._counter, now_s)
+        self._watch(now_s)
+        if self._request is not DeviceRequest.RETRACT and now_s - self._requested_s > GIVE_UP_S:
+            self._request = DeviceRequest.NONE
         messages: list[Message] = []
         is_waiting = (
             self._request is not DeviceRequest.NONE and self.state is LinkState.RUNNING and self._status is not None
         )
         if now_s >= self._hello_due_s and not is_waiting:
-            self._hello_due_s = now_s + (REPEAT_S if self.identity is None else HELLO_S)
+            self._hello_due_s = now_s + (REPEAT_S if self.state is LinkState.IDENTIFYING else HELLO_S)
+            self.round_trip.hello()
             messages.append(Hello(schema_hash=SCHEMA_HASH, protocol_version=PROTOCOL_VERSION, nonce=self._acknowledged))
         if is_waiting and now_s >= self._request_due_s:
             self._request_due_s = now_s + REPEAT_S
@@ -103,23 +140,44 @@ class DeviceLink:
         return messages
 
     def drive(self, left_duty: float, right_duty: float, mode: DriveMode) -> Drive:
-        """The next Drive message; duties in -1..1."""
+        """The Drive message of this period; duties in -1..1."""
         self._counter = (self._counter + 1) % 256
         return Drive(left_duty=left_duty, right_duty=right_duty, mode=mode, counter=self._counter)
 
     def request(self, now_s: float, request: DeviceRequest) -> None:
-        """Asks the device for a routine; repeated until its Status acknowledges it. Replaces an unfinished one."""
-        # 0 is what a freshly started device reports, so it never stands for a request
-        self._nonce = self._nonce % 255 + 1
+        """Asks the device for a routine; repeated until its Status acknowledges it. Replaces an unfinished one.
+
+        A device may refuse: HOME and CLEAR are given up after GIVE_UP_S, RETRACT when the device has latched.
+        """
+        self._nonce = _next_nonce(self._nonce)
         self._request = request
-        self._request_due_s = now_s
+        self._request_due_s = self._requested_s = now_s
+
+    def lose(self, cause: str) -> None:
+        """The port failed: the conversation is over."""
+        self.state = LinkState.LOST
+        self.cause = cause
 
     def age_s(self, now_s: float) -> float:
         """Time since the newest measurement, s; infinite without one."""
         return math.inf if self.measurement is None else now_s - self.measurement.received_s
 
+    def _watch(self, now_s: float) -> None:
+        # what broke was heard a tick ago: so the core has seen the measurement that shows it, and names it better
+        if self._broken:
+            self._begin(now_s, self._broken)
+        elif self.is_silent(now_s):
+            self.state = LinkState.LOST
+            self.cause = f"no message for {SILENT_S * 1e3:.0f} ms"
+        elif self.state is LinkState.IDENTIFYING and now_s - self._asked_s > UNANSWERED_S:
+            self.state = LinkState.UNANSWERED
+            self.cause = f"the device has not said who it is for {UNANSWERED_S:g} s"
+
     def _take_identity(self, identity: Identity) -> None:
-        self.identity = identity
+        self.round_trip.identity()
+        known, self.identity = self.identity, identity
+        if known is not None and known.serial_number != identity.serial_number:
+            self._broken = f"device {known.serial_number} was replaced by device {identity.serial_number}"
         if identity.schema_hash == SCHEMA_HASH:
             self.state = LinkState.RUNNING
             self.cause = ""
@@ -133,11 +191,17 @@ class DeviceLink:
     def _take_status(self, status: Status) -> None:
         if self._status is None:
             # an earlier host has counted as far; its last number again would be taken for a repetition
-            self._nonce = status.command_nonce % 255 + 1
+            self._nonce = _next_nonce(status.command_nonce)
+        elif self._status.command_nonce != 0 and status.command_nonce == 0:
+            self._broken = "the device was reset"
         self._status = status
-        if self._request is not DeviceRequest.NONE and status.command_nonce == self._nonce:
+        if status.command_nonce == self._nonce:
             self._request = DeviceRequest.NONE
             self._acknowledged = self._nonce
+        elif self._request is DeviceRequest.RETRACT and status.mode is DeviceMode.LATCHED:
+            self._request = (
+                DeviceRequest.NONE
+            )  # it has opened already, or cannot, and will not try again before a Clear
         if self.measurement is not None:
             self.measurement = self.measurement._replace(
                 mode=status.mode,
@@ -160,7 +224,12 @@ class DeviceLink:
         self._sense = sense
 
     def _take_state(self, now_s: float, state: State) -> None:
-        previous, self._state = self._state, state
+        previous = self._state
+        if previous is not None and (previous.counter - state.counter) % 256 < OVERTAKEN:
+            self.repeated += 1
+            return
+        self._state = state
+        self.round_trip.state(state.counter, now_s)
         if previous is None or self.measurement is None:
             self._first_measurement(now_s, state)
             return
@@ -174,6 +243,7 @@ class DeviceLink:
             left_mm=last.left_mm + _unwrapped(previous.left_position_mm, state.left_position_mm, POSITION_SPAN_MM),
             right_mm=last.right_mm + _unwrapped(previous.right_position_mm, state.right_position_mm, POSITION_SPAN_MM),
         )
+        self.clock.add(now_s, self.measurement.device_time_s)
 
     def _first_measurement(self, now_s: float, state: State) -> None:
         if self._status is None or self._sense is None:
@@ -196,6 +266,10 @@ class DeviceLink:
             temperature_C=status.temperature_C,
             supply_V=status.supply_V,
         )
+
+
+def _next_nonce(nonce: int) -> int:
+    return nonce % (FIRST_NONCE - 1) + 1
 
 
 def _unwrapped(previous: float, value: float, span: float) -> float:

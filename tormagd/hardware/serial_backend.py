@@ -1,5 +1,7 @@
 """The serial backend: pyserial opens and configures the port, the event loop watches its descriptor."""
 
+import contextlib
+import errno
 import os
 import termios
 
@@ -9,9 +11,19 @@ from firmware_protocol.codec import Message
 from tormagd.config import Device
 from tormagd.hardware.backend import BackendError, LinkStatistics
 from tormagd.hardware.frame_stream import FrameStream
+from tormagd.hardware.usb_latency import make_prompt
 
 READ_BYTES = 4_096
 UNSENT_BYTES = 512  # half a frame may wait for the driver; more means that nobody reads at the other end
+
+# why a port does not open, where the kernel's own words leave open what to do
+_HELD = ("another process holds it", "tormagctl ports says who; end it, and it is tried again")
+_REFUSALS = {
+    errno.EAGAIN: _HELD,  # from flock
+    errno.EBUSY: _HELD,
+    errno.ENOENT: ("there is no such port", "plug the device in and switch it on; it is tried again"),
+    errno.EACCES: ("no permission", "join the group that owns it (dialout or tormag; ls -l shows it), log in again"),
+}
 
 
 class SerialBackend:
@@ -59,10 +71,11 @@ class SerialBackend:
 
     def close(self) -> None:
         """Closes the port and drops its lock."""
-        try:
+        # what was not sent is void, and closing would wait for it, up to half a minute; a device that is gone refuses
+        with contextlib.suppress(OSError, termios.error):
+            self._port.reset_output_buffer()
+        with contextlib.suppress(OSError):
             self._port.close()
-        except OSError:  # a port whose device is gone cannot be flushed, and need not be
-            return
 
 
 def open_serial(device: Device) -> SerialBackend:
@@ -71,9 +84,11 @@ def open_serial(device: Device) -> SerialBackend:
         port = serial.Serial(device.port, device.baud, timeout=0, write_timeout=0, exclusive=True)
         port.reset_input_buffer()
         _tell_nothing_from_gone(port.fileno())
+        make_prompt(port)
     except OSError as error:  # SerialException is one too; its text repeats path and number
         reason = os.strerror(error.errno) if error.errno else str(error)
-        raise BackendError(f"{device.port}: cannot be opened: {reason}") from error
+        reason, remedy = _REFUSALS.get(error.errno or 0, (reason, ""))
+        raise BackendError(f"{device.port}: cannot be opened: {reason}", remedy) from error
     except termios.error as error:  # no OSError; unplugged while it was set up
         raise BackendError(f"{device.port}: cannot be opened: {error.args[-1]}") from error
     return SerialBackend(port)

@@ -1,0 +1,155 @@
+"""What `tormagctl ports` finds, on a directory that stands for the machine, and on this machine's own pty."""
+
+import fcntl
+import json
+import os
+import subprocess
+import sys
+import tty
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from tormagd.config import Config, Device
+from tormagd.ctl import ports as module
+from tormagd.ctl.machine import Machine
+from tormagd.ctl.main import main
+from tormagd.ctl.ports import Holder, ports, survey
+
+FTDI = SimpleNamespace(
+    device="/dev/ttyUSB0", description="FT232R USB UART", vid=0x0403, pid=0x6001, serial_number="A50285BI"
+)
+ON_BOARD = SimpleNamespace(device="/dev/ttyS0", description="n/a", vid=None, pid=None, serial_number=None)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Two ports, /dev/tormag leading to the one with a chip of its own."""
+    (tmp_path / "dev").mkdir()
+    (tmp_path / "dev/ttyUSB0").write_text("")
+    (tmp_path / "dev/ttyS0").write_text("")
+    (tmp_path / "dev/tormag").symlink_to("ttyUSB0")
+    (tmp_path / "proc").mkdir()
+    timer = tmp_path / "sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
+    timer.parent.mkdir(parents=True)
+    timer.write_text("16\n")
+    return tmp_path
+
+
+def process(root: Path, number: int, name: str, *opened: str) -> None:
+    folder = root / "proc" / str(number)
+    (folder / "fd").mkdir(parents=True)
+    (folder / "comm").write_text(name + "\n")
+    for descriptor, path in enumerate(opened):
+        (folder / "fd" / str(descriptor)).symlink_to(path)
+
+
+def test_the_configured_port_is_known_by_where_its_name_leads(root: Path) -> None:
+    found = survey(Config(), Machine(root), [FTDI, ON_BOARD], [])
+    board, chip = found.serial
+    assert (chip.port, chip.usb_id, chip.serial_number) == ("/dev/ttyUSB0", "0403:6001", "A50285BI")
+    assert (chip.is_configured, chip.is_accessible, chip.latency_ms, chip.holders) == (True, True, 16, ())
+    assert (board.is_configured, board.usb_id, board.latency_ms) == (False, None, None)
+
+
+def test_open_files_and_locks_name_the_holders(root: Path) -> None:
+    process(root, 4242, "minicom", "/dev/null", "/dev/ttyUSB0")
+    process(root, 77, "tormagd")  # of another user: its lock is seen, its files are not
+    status = (root / "dev/ttyUSB0").stat()
+    inode = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
+    (root / "proc/locks").write_text(
+        f"1: FLOCK  ADVISORY  WRITE 77 {inode} 0 EOF\n2: POSIX  ADVISORY  WRITE 4242 {inode} 0 EOF\n3: strange\n"
+    )
+    _, chip = survey(Config(), Machine(root), [FTDI, ON_BOARD], []).serial
+    assert chip.holders == (Holder(77, "tormagd", True), Holder(4242, "minicom", False))
+
+
+def test_a_configured_port_that_no_driver_lists_is_shown_where_it_is_there(root: Path) -> None:
+    (root / "dev/pts").mkdir()
+    (root / "dev/pts/3").write_text("")
+    (root / "dev/tormag").unlink()
+    (root / "dev/tormag").symlink_to("pts/3")
+    (entry,) = survey(Config(), Machine(root), [], []).serial
+    assert (entry.port, entry.is_configured) == ("/dev/pts/3", True)
+    (root / "dev/pts/3").unlink()
+    assert survey(Config(), Machine(root), [], []).serial == ()
+
+
+def test_can_channels_say_whether_they_are_up(root: Path) -> None:
+    for name, state in (("can0", "up"), ("can1", "down")):
+        (root / f"sys/class/net/{name}").mkdir(parents=True)
+        (root / f"sys/class/net/{name}/operstate").write_text(state)
+    detected = [{"interface": "socketcan", "channel": name} for name in ("can0", "can1")]
+    detected.append({"interface": "udp_multicast", "channel": "239.74.163.2"})
+    found = survey(Config(device=Device(port="can0")), Machine(root), [], detected)
+    assert [(entry.channel, entry.is_up) for entry in found.can] == [
+        ("can0", True),
+        ("can1", False),
+        ("239.74.163.2", None),
+    ]
+
+
+def test_the_text_says_what_it_cannot_see(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    process(root, 4242, "minicom", "/dev/ttyUSB0")
+    process(root, 5, "secret")
+    (root / "proc/5/fd").rmdir()
+    listing = Path.iterdir
+
+    def guarded(path: Path) -> object:
+        if path == root / "proc/5/fd":
+            raise PermissionError
+        return listing(path)
+
+    monkeypatch.setattr(Path, "iterdir", guarded)
+    monkeypatch.setattr(module, "_listed_serial_ports", lambda: [FTDI])
+    monkeypatch.setattr(module, "_detected_channels", lambda: [{"interface": "socketcan", "channel": "can0"}])
+    outcome = ports(Config(), root)
+    assert outcome.result["hidden_processes"] == 1
+    for words in ("/dev/ttyUSB0", "configured", "held by minicom (process 4242)", "can0", "1 processes of other users"):
+        assert words in outcome.text
+
+
+def test_a_configured_port_that_is_not_there_is_said(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_listed_serial_ports", lambda: [])
+    monkeypatch.setattr(module, "_detected_channels", lambda: [])
+    (root / "dev/ttyUSB0").unlink()
+    assert "/dev/tormag, configured, but not there" in ports(Config(), root).text
+    assert "no serial port" in ports(Config(device=Device(port="can0")), root).text
+
+
+def test_a_real_lock_of_a_real_process_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another process holds a pty as the daemon holds its port."""
+    far, near = os.openpty()
+    tty.setraw(near)
+    path = os.ttyname(near)
+    code = (
+        f"import serial, sys; p = serial.Serial({path!r}, exclusive=True); print('held', flush=True); sys.stdin.read()"
+    )
+    config = tmp_path / "tormagd.toml"
+    config.write_text(f'[device]\nport = "{path}"\n')
+    monkeypatch.setattr(module, "_detected_channels", lambda: [])
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"held\n"
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(near, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        assert main(["--config", str(config), "--json", "ports"]) == 0
+        (entry,) = [e for e in json.loads(capsys.readouterr().out)["result"]["serial"] if e["is_configured"]]
+        assert {"process_id": holder.pid, "name": Machine(Path("/")).process_name(holder.pid), "is_locking": True} in (
+            entry["holders"]
+        )
+        holder.communicate()
+    os.close(far)
+    os.close(near)
+
+
+def test_the_ports_of_this_machine_are_listed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(module, "_detected_channels", lambda: [])
+    assert main(["--json", "ports"]) == 0
+    result = json.loads(capsys.readouterr().out)["result"]
+    assert set(result) == {"serial", "can", "hidden_processes"}

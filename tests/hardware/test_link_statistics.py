@@ -1,0 +1,181 @@
+"""Round trip and device clock, against ways and clocks that are known."""
+
+import random
+from collections.abc import Iterable
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_protocol.codec import Drive, DriveMode, Message
+from tormagd.hardware.frame_stream import FrameStream
+from tormagd.hardware.link import DeviceLink, LinkState
+from tormagd.hardware.link_statistics import LEAST_WINDOWS, ROUND_TRIPS, WINDOW_S, WINDOWS, DeviceClock, RoundTrip
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import load_plant
+
+PERIOD_S = 1e-3
+
+
+# -- round trip ----------------------------------------------------------------------------------------------------
+
+
+def exchange(trip: RoundTrip, ticks: Iterable[int], way_ticks: int, lost: frozenset[int] = frozenset()) -> None:
+    """Drives every millisecond; each that is not lost is answered `way_ticks` later. A Hello goes every second."""
+    states = 0
+    answers: dict[int, list[str]] = {}
+    for tick in ticks:
+        now_s = tick * PERIOD_S
+        for answer in answers.pop(tick, ()):
+            if answer == "identity":
+                trip.identity()
+            else:
+                states += 1
+                trip.state(states % 256, now_s)
+        trip.drive(tick % 256, now_s)
+        if tick not in lost:
+            answers.setdefault(tick + way_ticks, []).append("state")
+        if tick % 1_000 == 0:
+            trip.hello()
+            answers.setdefault(tick + way_ticks, []).append("identity")
+
+
+@pytest.mark.parametrize("way_ticks", [1, 2, 16, 120])
+def test_a_round_trip_of_any_length_is_known_after_one_hello(way_ticks: int) -> None:
+    """A USB adapter that keeps bytes back for 16 ms has 16 Drives under way at a time."""
+    trip = RoundTrip()
+    assert trip.report() is None
+    exchange(trip, range(1, 1_400), way_ticks)
+    report = trip.report()
+    assert report is not None
+    assert set(report.values()) == {way_ticks * 1e3}
+    assert trip.least_s == pytest.approx(way_ticks * PERIOD_S)
+
+
+def test_a_lost_drive_is_made_good_by_the_next_hello() -> None:
+    trip = RoundTrip()
+    exchange(trip, range(1, 2_400), 3, lost=frozenset({1_500, 1_501}))
+    assert trip.least_s == pytest.approx(3 * PERIOD_S)
+
+
+def test_an_answer_to_what_has_not_been_sent_ends_the_count() -> None:
+    trip = RoundTrip()
+    exchange(trip, range(1, 1_400), 1)
+    trip.drive(10, 5.0)
+    trip.state(200, 5.0)
+    known = trip.report()
+    trip.state(201, 5.001)
+    assert trip.report() == known
+
+
+# -- clock ---------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    drift_ppm=st.floats(-300.0, 300.0),
+    offset_s=st.floats(-1e5, 1e5),
+    seed=st.integers(0, 1_000),
+    outlier_share=st.floats(0.0, 0.1),
+)
+def test_offset_and_drift_are_found_behind_jitter_and_outliers(
+    drift_ppm: float, offset_s: float, seed: int, outlier_share: float
+) -> None:
+    """0.2 to 0.4 ms of way; a share of the windows is late by tens of milliseconds altogether."""
+    noise = random.Random(seed)
+    clock = DeviceClock()
+    late_until_s = late_s = 0.0
+    for tick in range(0, 20_000, 5):
+        now_s = tick * PERIOD_S
+        if now_s >= late_until_s:
+            late_until_s = now_s + WINDOW_S
+            late_s = noise.uniform(0.005, 0.05) if noise.random() < outlier_share else 0.0
+        latched_s = now_s - noise.uniform(0.0002, 0.0004) - late_s
+        clock.add(now_s, round((latched_s - offset_s) * (1.0 + drift_ppm * 1e-6), 5))
+    fit = clock.fit()
+    assert fit is not None
+    assert fit.drift_ppm == pytest.approx(drift_ppm, abs=2.0)
+    assert fit.residual_us < 20.0
+    newest_s = 20_000 * PERIOD_S
+    device_s = (newest_s - offset_s) * (1.0 + drift_ppm * 1e-6)
+    assert fit.offset_s == pytest.approx(newest_s - device_s, abs=2.5e-4 + abs(drift_ppm) * 1e-6)
+
+
+def test_memory_is_bounded_and_the_fit_follows_the_last_half_minute() -> None:
+    clock, trip = DeviceClock(), RoundTrip()
+    exchange(trip, range(1, 2_000), 1)
+    device_s = 0.0
+    for tick in range(600 * 20):
+        device_s += 0.05 * (1.0 + (100e-6 if tick < 300 * 20 else -50e-6))
+        clock.add(tick * 0.05, device_s)
+    fit = clock.fit()
+    assert fit is not None
+    assert fit.windows == WINDOWS
+    assert fit.drift_ppm == pytest.approx(-50.0, abs=0.1)
+    assert len(clock._windows) == WINDOWS
+    assert len(trip._recent) == ROUND_TRIPS
+
+
+def test_nothing_is_claimed_before_there_is_enough() -> None:
+    clock = DeviceClock()
+    for tick in range(round((LEAST_WINDOWS - 1) * WINDOW_S / PERIOD_S)):
+        clock.add(tick * PERIOD_S, tick * PERIOD_S)
+    assert clock.fit() is None
+
+
+@pytest.mark.parametrize("step_s", [-5.0, -0.1, 0.1])
+@pytest.mark.parametrize("after_s", [5.0, 8.0, 15.0, 25.0])
+def test_a_clock_that_is_set_begins_a_new_line(step_s: float, after_s: float) -> None:
+    clock = DeviceClock()
+    for tick in range(30_000):
+        now_s = tick * PERIOD_S
+        clock.add(now_s, now_s * (1.0 + 30e-6) + (step_s if now_s > 30.0 - after_s else 0.0))
+    fit = clock.fit()
+    assert fit is not None
+    assert fit.drift_ppm == pytest.approx(30.0, abs=1.0)
+    assert fit.offset_s == pytest.approx(-30.0 * 30e-6 - step_s, abs=1e-4)
+
+
+def test_a_clock_that_stands_still_is_a_drift_like_any_other() -> None:
+    clock = DeviceClock()
+    for tick in range(10_000):
+        clock.add(tick * PERIOD_S, 1.0)
+    fit = clock.fit()
+    assert fit is not None
+    assert fit.drift_ppm == pytest.approx(-1e6, rel=1e-3)
+
+
+# -- both, in a conversation with the simulated device ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("clock_ppm", [-120.0, 40.0])
+def test_the_simulated_devices_line_and_clock(clock_ppm: float) -> None:
+    """Frames take their time on a line of 1 Mbaud, replies their jitter; the host looks every 50 us."""
+    plant = load_plant("sample_1")
+    firmware = msgspec.structs.replace(plant.firmware, clock_ppm=clock_ppm)
+    device = VirtualDevice(msgspec.structs.replace(plant, firmware=firmware), SteadyHand(), seed=1)
+    link, stream = DeviceLink(0.0), FrameStream()
+    wire_s = sum(len(stream.pack(message)) for message in probe()) * 10e-6
+    for step in range(20 * 4_000):
+        now_s = step * 5e-5
+        for message in stream.unpack(device.transmit(now_s)):
+            link.receive(now_s, message)
+        if step % 20 == 0:
+            sent: list[Message] = []
+            if link.state is LinkState.RUNNING:
+                sent.append(link.drive(0.0, 0.0, DriveMode.OFF))
+            for message in (*sent, *link.due(now_s)):
+                device.receive(now_s, stream.pack(message))
+    report, fit = link.round_trip.report(), link.clock.fit()
+    assert report is not None
+    assert fit is not None
+    assert report["least"] >= wire_s * 1e6
+    assert report["p99"] <= wire_s * 1e6 + firmware.reply_jitter_us + 100.0
+    assert fit.drift_ppm == pytest.approx(clock_ppm, abs=4.0)
+
+
+def probe() -> tuple[Message, Message]:
+    """A Drive, and a State, which is as long."""
+    return Drive(0.0, 0.0, DriveMode.OFF, 0), Drive(0.0, 0.0, DriveMode.OFF, 1)

@@ -1,0 +1,147 @@
+"""`tormagctl ports`: where a device could be connected, and who holds what is there.
+
+Serial ports are those of the kernel's drivers, and the configured one. A process that has a port open is found by its
+open files, which only root sees of everybody; a lock on a port shows in the kernel's list of locks to anybody.
+"""
+
+import logging
+import os
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from tormagd.config import Config
+from tormagd.ctl.machine import Machine
+from tormagd.ctl.outcome import Colour, Outcome
+
+DETECTION_S = 2.0
+"python-can asks every interface at once; what has not answered by then is left out."
+NOT_ASKED = ("serial", "socketcand", "virtual")
+"Serial ports once more; a listening of several seconds for beacons on the network; what reaches no other process."
+
+
+class Holder(msgspec.Struct, frozen=True):
+    """A process that has a port open, or has locked it."""
+
+    process_id: int
+    name: str
+    is_locking: bool
+
+
+class SerialPort(msgspec.Struct, frozen=True):
+    """A serial port. `latency_ms` is that of a USB chip's driver, None where there is no such timer."""
+
+    port: str
+    description: str
+    usb_id: str | None
+    serial_number: str | None
+    is_configured: bool
+    is_accessible: bool
+    latency_ms: int | None
+    holders: tuple[Holder, ...]
+
+
+class CanChannel(msgspec.Struct, frozen=True):
+    """A CAN channel that python-can could connect with now. Several processes may use one at the same time."""
+
+    interface: str
+    channel: str
+    is_up: bool | None
+
+
+class Ports(msgspec.Struct, frozen=True):
+    """The keys of `--json`."""
+
+    serial: tuple[SerialPort, ...]
+    can: tuple[CanChannel, ...]
+    hidden_processes: int
+
+
+def ports(config: Config, root: Path = Path("/")) -> Outcome:
+    """What is there now."""
+    machine = Machine(root)
+    found = survey(config, machine, _listed_serial_ports(), _detected_channels())
+    return Outcome(msgspec.to_builtins(found), _text(found, config, Colour(sys.stdout)))
+
+
+def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: Iterable[Mapping[str, Any]]) -> Ports:
+    """The ports among `listed` (pyserial's ListPortInfo) and the configured one; the channels python-can `detected`."""
+    known = {machine.resolved(info.device): info for info in listed}
+    configured = machine.resolved(config.device.port) if config.device.port.startswith("/") else ""
+    if configured and machine.path(configured).exists():
+        known.setdefault(configured, None)
+    holding, hidden = machine.all_holders(list(known))
+    return Ports(
+        tuple(_serial_port(machine, path, known[path], path == configured, holding[path]) for path in sorted(known)),
+        tuple(
+            CanChannel(str(entry["interface"]), str(entry["channel"]), _is_up(machine, str(entry["channel"])))
+            for entry in detected
+        ),
+        hidden,
+    )
+
+
+def _serial_port(
+    machine: Machine, path: str, info: Any, is_configured: bool, opened: Sequence[tuple[int, str]]
+) -> SerialPort:
+    locking = machine.lock_owners(path)
+    names = dict(opened) | {owner: machine.process_name(owner) for owner in locking}
+    has_usb_id = info is not None and info.vid is not None
+    return SerialPort(
+        port=path,
+        description="pseudo-terminal" if info is None else str(info.description),
+        usb_id=f"{info.vid:04x}:{info.pid:04x}" if has_usb_id else None,
+        serial_number=None if info is None else info.serial_number,
+        is_configured=is_configured,
+        is_accessible=os.access(machine.path(path), os.R_OK | os.W_OK),
+        latency_ms=machine.number(f"/sys/bus/usb-serial/devices/{Path(path).name}/latency_timer"),
+        holders=tuple(Holder(owner, name, owner in locking) for owner, name in sorted(names.items())),
+    )
+
+
+def _is_up(machine: Machine, channel: str) -> bool | None:
+    state = machine.text(f"/sys/class/net/{channel}/operstate") if "/" not in channel else None
+    return None if state is None else state in ("up", "unknown")
+
+
+def _listed_serial_ports() -> list[Any]:
+    from serial.tools.list_ports import comports
+
+    return list(comports())
+
+
+def _detected_channels() -> Sequence[Mapping[str, Any]]:
+    # it says at every start which makers' libraries are not installed
+    logging.getLogger("can").setLevel(logging.CRITICAL)
+    import can
+
+    return can.detect_available_configs(sorted(set(can.VALID_INTERFACES) - set(NOT_ASKED)), timeout=DETECTION_S)
+
+
+def _text(found: Ports, config: Config, colour: Colour) -> str:
+    lines = []
+    for entry in found.serial:
+        marks = [
+            *([colour.bold("configured")] if entry.is_configured else []),
+            *([] if entry.is_accessible else [colour.red("not readable and writable for you")]),
+            *([f"USB {entry.usb_id}"] if entry.usb_id else []),
+            *([f"serial number {entry.serial_number}"] if entry.serial_number else []),
+            *([f"latency {entry.latency_ms} ms"] if entry.latency_ms is not None else []),
+        ]
+        lines.append(f"serial  {', '.join((entry.port, entry.description, *marks))}")
+        for holder in entry.holders:
+            how = ", exclusively" if holder.is_locking else ""
+            lines.append(f"          held by {holder.name} (process {holder.process_id}{how})")
+    if not any(entry.is_configured for entry in found.serial) and config.device.port.startswith("/"):
+        lines.append(f"serial  {config.device.port}, {colour.yellow('configured, but not there')}")
+    for channel in found.can:
+        state = {None: "", True: ", up", False: f", {colour.yellow('down')}"}[channel.is_up]
+        lines.append(f"can     {channel.interface} {channel.channel}{state}")
+    if found.hidden_processes:
+        lines.append(
+            f"{found.hidden_processes} processes of other users may hold a port too without locking it: sudo shows them"
+        )
+    return "\n".join(lines) or "no serial port and no CAN channel"

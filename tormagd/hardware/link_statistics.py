@@ -1,0 +1,178 @@
+"""How long the wire takes, and how the device's clock runs against ours.
+
+Both are fed by the conversation for every Drive and State, and both remember a bounded number of figures. What costs
+more than a comparison is computed where it is asked for, not where it is fed.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from itertools import compress
+from typing import NamedTuple, TypeAlias
+
+ROUND_TRIPS = 256
+"The round trips that percentiles are taken of: a quarter of a second of control."
+WINDOW_S = 0.5
+"The least delayed State of this time stands for all of it: queues on the way only ever add."
+WINDOWS = 60
+LEAST_WINDOWS = 6
+OUTLIER = 4.0
+"Standard deviations, by the median of the absolute deviations, beyond which a window does not count."
+MOST_RESIDUAL_US = 2_000.0
+"More than this around the line, and it is no line."
+NEWEST_WINDOWS = 3
+"Where none of the newest lies on the line, the clock has left it."
+CLOCK_STEP_S = 1e-5
+"The resolution of State.device_time_s; less than this is never an outlier."
+
+
+Windows: TypeAlias = Sequence[tuple[float, float]]
+"Offset and host's time of each window, s."
+
+
+class RoundTrip:
+    """Time from a Drive that is handed to the wire until its State has been read, s.
+
+    A State does not name the Drive it answers. The device answers in order, so when an Identity comes, the State before
+    it belongs to the last Drive before the Hello: that fixes how far the two counters are apart. A Drive that is lost
+    later moves them further apart, and makes round trips one period too long until the next Identity.
+    """
+
+    def __init__(self) -> None:
+        self._sent_s = [0.0] * 256
+        self._newest = 0
+        self._before_hello: int | None = None
+        self._state: int | None = None
+        self._lead: int | None = None
+        self._recent: deque[float] = deque(maxlen=ROUND_TRIPS)
+
+    def drive(self, counter: int, now_s: float) -> None:
+        """The Drive with this counter goes out now."""
+        self._newest = counter
+        self._sent_s[counter] = now_s
+
+    def hello(self) -> None:
+        """A Hello goes out after the newest Drive."""
+        self._before_hello = self._newest
+
+    def identity(self) -> None:
+        """The answer to the newest Hello came in."""
+        if self._before_hello is not None and self._state is not None:
+            self._lead = self._before_hello - self._state
+        self._before_hello = None
+
+    def state(self, counter: int, now_s: float) -> None:
+        """The State with this counter came in now."""
+        self._state = counter
+        if self._lead is None:
+            return
+        answered = (counter + self._lead) % 256
+        if (self._newest - answered) % 256 < 128:
+            self._recent.append(now_s - self._sent_s[answered])
+        else:  # it would be the answer to a Drive that has not been sent
+            self._lead = None
+
+    @property
+    def least_s(self) -> float:
+        """The shortest of the newest round trips; 0 while none is known."""
+        return min(self._recent, default=0.0)
+
+    def report(self) -> dict[str, float] | None:
+        """Percentiles of the newest round trips, us; None while none is known."""
+        ordered_s = sorted(self._recent)
+        if not ordered_s:
+            return None
+        shares = {"least": 0.0, "p50": 0.5, "p99": 0.99}
+        return {name: round(ordered_s[int(share * len(ordered_s))] * 1e6, 1) for name, share in shares.items()}
+
+
+class ClockFit(NamedTuple):
+    """A straight line through the device's clock.
+
+    `offset_s` is the host's time minus the device's at the newest State, the way from the device included; `drift_ppm`
+    is positive where the device's clock runs fast. `residual_us` is the standard deviation around the line.
+    """
+
+    offset_s: float
+    drift_ppm: float
+    residual_us: float
+    windows: int
+    outliers: int
+
+
+class DeviceClock:
+    """The device's clock against the host's, by regression over the least delayed State of each half second.
+
+    The line starts from a median of slopes (Theil 1950, of halves), so that a quarter of the windows may be wrong by
+    any amount; those far from it are left out of the least squares that follow.
+    """
+
+    def __init__(self) -> None:
+        self._windows: deque[tuple[float, float]] = deque(maxlen=WINDOWS)
+        self._least: tuple[float, float] = (math.inf, 0.0)
+        self._ends_s = -math.inf
+        self._fit: ClockFit | None = None
+        self._is_fitted = True
+
+    def add(self, host_s: float, device_s: float) -> None:
+        """A State that was latched at `device_s` on the device's clock, unwrapped, was read at `host_s`."""
+        offset_s = host_s - device_s
+        if host_s >= self._ends_s:
+            self._turn(host_s)
+        if offset_s < self._least[0]:
+            self._least = (offset_s, host_s)
+
+    def fit(self) -> ClockFit | None:
+        """The line through the last half minute, or since the clock was set; None before some seconds of it."""
+        if not self._is_fitted:
+            self._fit = _newest_line(list(self._windows))
+            self._is_fitted = True
+        return self._fit
+
+    def _turn(self, host_s: float) -> None:
+        if self._least[0] < math.inf:
+            self._windows.append(self._least)
+            self._is_fitted = False
+        self._least = (math.inf, 0.0)
+        self._ends_s = host_s + WINDOW_S
+
+
+def _newest_line(windows: Windows) -> ClockFit | None:
+    # no line fits across a clock that was set, or stood still for a while: the older half is forgotten until one does
+    while len(windows) >= LEAST_WINDOWS:
+        fit, is_left = _robust_line(windows)
+        if fit.residual_us < MOST_RESIDUAL_US and not is_left:
+            return fit
+        windows = windows[len(windows) // 2 :]
+    return None
+
+
+def _robust_line(windows: Windows) -> tuple[ClockFit, bool]:
+    """The line, and whether the clock has left it."""
+    newest_s = windows[-1][1]
+    half = len(windows) // 2
+    slope = _median([(b[0] - a[0]) / (b[1] - a[1]) for a, b in zip(windows, windows[-half:], strict=False)])
+    levels_s = [offset_s - slope * (time_s - newest_s) for offset_s, time_s in windows]
+    level_s = _median(levels_s)
+    most_s = max(OUTLIER * 1.4826 * _median([abs(each_s - level_s) for each_s in levels_s]), CLOCK_STEP_S)
+    on_line = [abs(each_s - level_s) <= most_s for each_s in levels_s]
+    kept = list(compress(windows, on_line))
+    centre_s = sum(time_s for _, time_s in kept) / len(kept)
+    level_s = sum(offset_s for offset_s, _ in kept) / len(kept)
+    slope = sum((offset_s - level_s) * (time_s - centre_s) for offset_s, time_s in kept) / sum(
+        (time_s - centre_s) ** 2 for _, time_s in kept
+    )
+    squares = [(offset_s - level_s - slope * (time_s - centre_s)) ** 2 for offset_s, time_s in kept]
+    fit = ClockFit(
+        offset_s=level_s + slope * (newest_s - centre_s),
+        # host - device falls by the drift with every second of the host
+        drift_ppm=-slope * 1e6,
+        residual_us=math.sqrt(sum(squares) / len(kept)) * 1e6,
+        windows=len(windows),
+        outliers=len(windows) - len(kept),
+    )
+    return fit, not any(on_line[-NEWEST_WINDOWS:])
+
+
+def _median(values: list[float]) -> float:
+    return sorted(values)[len(values) // 2]

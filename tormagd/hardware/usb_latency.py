@@ -1,0 +1,45 @@
+"""USB serial chips keep received bytes back, for 16 ms as a rule, unless they are told otherwise.
+
+The driver of such a chip has a latency timer in sysfs. A port without one (a device's own USB, a pty) keeps nothing.
+"""
+
+import logging
+from pathlib import Path
+
+import serial
+
+SYSFS = Path("/sys/bus/usb-serial/devices")
+PROMPT_MS = 1
+
+log = logging.getLogger(__name__)
+
+
+def latency_ms(port: str, sysfs: Path = SYSFS) -> int | None:
+    """How long the driver of this port (or of the port a link leads to) keeps bytes back; None for no such timer."""
+    try:
+        return int((sysfs / Path(port).resolve().name / "latency_timer").read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None
+
+
+def make_prompt(port: serial.Serial, sysfs: Path = SYSFS) -> None:
+    """Has the driver of an open port hand bytes on within a millisecond, where it has a timer. A refusal is a warning.
+
+    ASYNC_LOW_LATENCY needs no rights beyond the open port; the file itself is root's.
+    """
+    found_ms = latency_ms(port.port, sysfs)
+    if found_ms is None or found_ms <= PROMPT_MS:
+        return
+    refusal = ""
+    try:
+        port.set_low_latency_mode(True)
+    except (OSError, ValueError) as error:  # pyserial makes a ValueError of the driver's answer
+        refusal = f" ({error})"
+    left_ms = latency_ms(port.port, sysfs)
+    if left_ms is not None and left_ms > PROMPT_MS:
+        log.warning(
+            "%s keeps received bytes back for %d ms and cannot be told otherwise%s: tormagctl doctor says how to",
+            port.port,
+            left_ms,
+            refusal,
+        )
