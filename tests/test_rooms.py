@@ -12,6 +12,7 @@ MAY_IMPORT = {
     "firmware_protocol": set(),
     "config": set(),
     "messages": set(),
+    "output": set(),
     "physics": set(),
     "characterisation": {"physics"},
     "design": {"physics"},
@@ -21,10 +22,10 @@ MAY_IMPORT = {
     "safety": {"firmware_protocol"},
     "hardware": {"firmware_protocol", "config", "safety"},
     "control": LOWEST | {"physics", "learning", "inverse", "scenes", "safety", "hardware"},
-    "daemon": LOWEST | {"scenes", "safety", "hardware", "control"},
+    "daemon": LOWEST | {"output", "scenes", "safety", "hardware", "control"},
     "recording": {"messages"},
-    "ctl": {"config", "messages", "scenes", "recording"},
-    "simulation": {"physics", "firmware_protocol"},
+    "ctl": {"config", "messages", "output", "scenes", "recording"},
+    "simulation": {"physics", "firmware_protocol", "output"},
     "closed_loop": LOWEST | {"control", "hardware", "safety", "simulation"},
 }
 

@@ -1,7 +1,7 @@
 """Measurements of tormagd, one a subcommand. Each prints one JSON object with --json, a table otherwise.
 
-A measurement is a module beside this one with `add_arguments(parser)`, `measure(options)` that returns the object, and
-`print_table(object)`.
+A measurement is a module beside this one (`_` for `-`) with `add_arguments(parser)`, `measure(options)` that returns
+the object, and `print_table(object)`.
 """
 
 import argparse
@@ -15,6 +15,8 @@ MEASUREMENTS = {
     "loop": "lateness of the control loop beside a bare timer",
     "latency": "from a setpoint to the first drive frame that reflects it",
     "step": "how fast and how exactly the gap follows, in virtual time",
+    "virtual-time": "how much faster than real time that is, and what limits it",
+    "bus": "load of the bus at 1 kHz control, and what the codec costs",
 }
 
 
@@ -24,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     measurements = parser.add_subparsers(dest="measurement", required=True)
     modules = {}
     for name, says in MEASUREMENTS.items():
-        modules[name] = importlib.import_module(f"benchmark_{name}")
+        modules[name] = importlib.import_module(f"benchmark_{name.replace('-', '_')}")
         subparser = measurements.add_parser(name, help=says, description=modules[name].__doc__)
         subparser.add_argument("--json", action="store_true", help="print JSON")
         modules[name].add_arguments(subparser)

@@ -2,7 +2,7 @@
 
 Daemon and stub run in alternating blocks, because a shared machine drifts: what counts is the ratio of a block to its
 neighbour. Both have the same heartbeat, event loop and scheduling, publish a row for each tick, and answer the same
-eight clients that ask for status as fast as they are answered; the stub has no controller and no device.
+eight clients, each of which asks for status again as soon as it is answered; the stub has no controller and no device.
 """
 
 import argparse
@@ -14,8 +14,9 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,13 +25,15 @@ import numpy as np
 import numpy.typing as npt
 import uvloop
 import zmq
+from benchmark_plot import plot_histograms
 
 from tormagd.config import Config, load_config
 from tormagd.ctl.client import Client
 from tormagd.ctl.outcome import CommandError
+from tormagd.daemon.daemon import SERVED_BEFORE_NS
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
-from tormagd.daemon.realtime import freeze_garbage, prepare
+from tormagd.daemon.realtime import freeze_garbage, prepare, priority_of_threads
 from tormagd.messages import Request
 from tormagd.recording.ticks import decode_ticks
 
@@ -53,13 +56,24 @@ class Block(NamedTuple):
     seconds: float
 
 
-def run(seconds: float, pairs: int, fifo_priority: int) -> dict[str, Any]:
-    """The contract's object: `pairs` blocks of each kind, `seconds` long."""
-    daemon_blocks, bare_blocks = [], []
-    for _ in range(pairs):
-        daemon_blocks.append(block(daemon_process, seconds, fifo_priority))
-        bare_blocks.append(block(stub_process, seconds, fifo_priority))
-    daemon, bare = merge(daemon_blocks), merge(bare_blocks)
+class Pair(NamedTuple):
+    """A block of the daemon and one of the stub, one right after the other."""
+
+    daemon: Block
+    bare: Block
+
+
+def run(seconds: float, pairs: int, fifo_priority: int) -> list[Pair]:
+    """`pairs` blocks of each kind, `seconds` long."""
+    return [
+        Pair(block(daemon_process, seconds, fifo_priority), block(stub_process, seconds, fifo_priority))
+        for _ in range(pairs)
+    ]
+
+
+def summary(pairs: list[Pair], fifo_priority: int) -> dict[str, Any]:
+    """The contract's object."""
+    daemon, bare = merge([pair.daemon for pair in pairs]), merge([pair.bare for pair in pairs])
     return {
         "rate_hz": daemon.ticks / daemon.seconds,
         "ticks": daemon.ticks,
@@ -73,19 +87,21 @@ def run(seconds: float, pairs: int, fifo_priority: int) -> dict[str, Any]:
         },
         "ratio": {
             name: statistics.median(
-                quantiles(one.lateness_us)[name] / quantiles(other.lateness_us)[name]
-                for one, other in zip(daemon_blocks, bare_blocks, strict=True)
+                quantiles(pair.daemon.lateness_us)[name] / quantiles(pair.bare.lateness_us)[name] for pair in pairs
             )
             for name in ("p50", "p99", "p999")
         },
         "merged_share": daemon.merged / max(daemon.ticks, 1),
-        "pairs": pairs,
-        "block_s": seconds,
+        "pairs": len(pairs),
+        "block_s": round(daemon.seconds / len(pairs), 1),
         "fifo_priority": fifo_priority,
     }
 
 
-def block(start: Any, seconds: float, fifo_priority: int) -> Block:
+Started = Callable[[Path, int], contextlib.AbstractContextManager[Config]]
+
+
+def block(start: Started, seconds: float, fifo_priority: int) -> Block:
     """One block of one kind, under the load of the clients."""
     with tempfile.TemporaryDirectory(prefix="tormag-") as folder, contextlib.ExitStack() as stack:
         config = stack.enter_context(start(Path(folder), fifo_priority))
@@ -149,12 +165,20 @@ def quantiles(values: Array) -> dict[str, float]:
 
 
 def hammer(address: str, stop: Event) -> None:
-    """Eight clients that ask for status as fast as they are answered."""
-    clients = [Client(address, 2.0) for _ in range(CLIENTS)]
-    while not stop.is_set():
-        for client in clients:
+    """Eight clients that each ask for status as fast as they are answered."""
+
+    def ask() -> None:
+        client = Client(address, 2.0)
+        while not stop.is_set():
             with contextlib.suppress(CommandError):
                 client.request("status")
+        client.close()
+
+    clients = [threading.Thread(target=ask) for _ in range(CLIENTS)]
+    for client in clients:
+        client.start()
+    for client in clients:
+        client.join()
 
 
 def write_config(folder: Path, port: str, fifo_priority: int) -> Path:
@@ -194,9 +218,10 @@ def daemon_process(folder: Path, fifo_priority: int, setpoint_hz: int = SETPOINT
             )
         yield config
     finally:
-        for child in filter(None, (publisher, daemon, simulator)):
-            child.terminate()
-            child.wait(20)
+        for child in (publisher, daemon, simulator):
+            if child is not None:
+                child.terminate()
+                child.wait(20)
 
 
 @contextlib.contextmanager
@@ -219,7 +244,7 @@ def bare_loop(config: Config) -> None:
 
 async def _bare(config: Config) -> None:
     prepare(config.realtime)
-    endpoint = Endpoint(config.endpoints)
+    endpoint = Endpoint(config.endpoints, priority_of_threads())
     heartbeat = Heartbeat(1_000_000_000 // config.rates.control_hz)
     rows: list[tuple[int, float, float]] = []
     answer = {"state": "bare"} | {f"key_{index}": float(index) for index in range(60)}
@@ -235,7 +260,7 @@ async def _bare(config: Config) -> None:
         if len(rows) >= TELEMETRY_EVERY:
             endpoint.publish_ticks(("t_ns", "lateness_us", "exec_us"), rows)
             rows.clear()
-            endpoint.serve(now_ns * 1e-9, reply)
+            endpoint.serve(now_ns * 1e-9, reply, heartbeat.due_ns + heartbeat.period_ns - SERVED_BEFORE_NS)
 
     freeze_garbage()
     asyncio.get_running_loop().add_reader(heartbeat.fileno(), beat)
@@ -259,15 +284,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="length of a block")
     parser.add_argument("--pairs", type=int, default=3, help="blocks of each kind")
     parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of both; 0 for none")
+    parser.add_argument("--without-fifo", action="store_true", help="as many pairs without FIFO after those with it")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="histograms of the lateness")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """The object for these options."""
-    return run(options.seconds, options.pairs, options.fifo)
+    """The object for these options; what was measured without FIFO under `without_fifo`."""
+    pairs = run(options.seconds, options.pairs, options.fifo)
+    result = summary(pairs, options.fifo)
+    shown = {
+        "daemon": merge([pair.daemon for pair in pairs]).lateness_us,
+        "bare stub": merge([pair.bare for pair in pairs]).lateness_us,
+    }
+    if options.without_fifo:
+        ordinary = run(options.seconds, options.pairs, 0)
+        result["without_fifo"] = summary(ordinary, 0)
+        shown["daemon without FIFO"] = merge([pair.daemon for pair in ordinary]).lateness_us
+        shown["bare stub without FIFO"] = merge([pair.bare for pair in ordinary]).lateness_us
+    if options.plot:
+        plot_histograms(options.plot, f"Lateness of {result['ticks']} control ticks, {CLIENTS} clients", shown)
+    return result
 
 
 def print_table(result: dict[str, Any]) -> None:
     """The object for a person."""
+    _print_pairs(result)
+    if "without_fifo" in result:
+        print()
+        _print_pairs(result["without_fifo"])
+
+
+def _print_pairs(result: dict[str, Any]) -> None:
     bare = result["bare"]
     print(f"{'':8s}{'p50':>9s}{'p99':>9s}{'p99.9':>9s}{'max':>9s}   lateness, us (fifo {result['fifo_priority']})")
     for name, found in (("daemon", result["lateness_us"]), ("bare", bare["lateness_us"])):

@@ -4,7 +4,6 @@
 values. Unknown fields are ignored, so that a newer client can talk to an older daemon.
 """
 
-import math
 from typing import Any, TypeVar
 
 import msgpack
@@ -16,6 +15,9 @@ MAX_SOURCE_CHARACTERS = 64
 MAX_PREVIEW_SAMPLES = 256
 MAX_FORCE_N = 1_000.0  # a value no brake of this size can mean; the scene's own range is enforced by the governor
 MAX_VALIDITY_MS = 60_000.0
+MAX_DISPLACEMENT_MM = 1_000.0  # no handle travels this far, nor this fast
+MAX_RATE_MM_S = 10_000.0
+LONGEST_SHOWN = 80  # characters of a refused value: an answer with the refusal in it has to stay readable itself
 
 
 class MessageError(ValueError):
@@ -24,7 +26,10 @@ class MessageError(ValueError):
 
 def _require(condition: bool, name: str, value: object, allowed: str) -> None:
     if not condition:
-        raise ValueError(f"{name} = {value!r}: allowed is {allowed}")
+        shown = repr(value)
+        if len(shown) > LONGEST_SHOWN:
+            shown = f"{shown[: LONGEST_SHOWN - 3]}..."
+        raise ValueError(f"{name} = {shown}: allowed is {allowed}")
 
 
 class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -47,18 +52,20 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     def __post_init__(self) -> None:
         _require(self.v == VERSION, "v", self.v, f"{VERSION}")
-        _require(0 < len(self.source) <= MAX_SOURCE_CHARACTERS, "source", self.source[:80], "1..64 characters")
+        _require(0 < len(self.source) <= MAX_SOURCE_CHARACTERS, "source", self.source, "1..64 characters")
         _require(0 <= self.seq < 2**63, "seq", self.seq, "0..2^63-1")
         _require(0 <= self.stamp_ns < 2**63, "stamp_ns", self.stamp_ns, "0..2^63-1 ns since 1970")
         _require(0.0 <= self.servo_cf <= MAX_FORCE_N, "servo_cf", self.servo_cf, f"0..{MAX_FORCE_N:g} N")
         _require(0.0 < self.valid_for_ms <= MAX_VALIDITY_MS, "valid_for_ms", self.valid_for_ms, "above 0, to 60000 ms")
-        for name in ("displacement_mm", "rate_mm_s"):
+        for name, most in (("displacement_mm", MAX_DISPLACEMENT_MM), ("rate_mm_s", MAX_RATE_MM_S)):
             value = getattr(self, name)
-            _require(value is None or math.isfinite(value), name, value, "a finite number")
+            _require(value is None or -most <= value <= most, name, value, f"-{most:g}..{most:g}")
         if self.preview_N is not None:
             allowed = f"at most {MAX_PREVIEW_SAMPLES} forces of 0..{MAX_FORCE_N:g} N"
             _require(len(self.preview_N) <= MAX_PREVIEW_SAMPLES, "preview_N", f"{len(self.preview_N)} values", allowed)
-            _require(all(0.0 <= f <= MAX_FORCE_N for f in self.preview_N), "preview_N", self.preview_N, allowed)
+            for index, force_N in enumerate(self.preview_N):
+                if not 0.0 <= force_N <= MAX_FORCE_N:
+                    raise ValueError(f"preview_N[{index}] = {force_N!r}: allowed is 0..{MAX_FORCE_N:g} N")
             spacing = self.preview_dt_ms
             _require(spacing is not None and 0.0 < spacing <= 1_000.0, "preview_dt_ms", spacing, "above 0, to 1000 ms")
 
@@ -110,7 +117,7 @@ class Request(msgspec.Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         _require(self.v == VERSION, "v", self.v, f"{VERSION}")
-        _require(0 < len(self.command) <= 64, "command", self.command[:80], "1..64 characters")
+        _require(0 < len(self.command) <= 64, "command", self.command, "1..64 characters")
 
 
 class ErrorReply(msgspec.Struct, frozen=True):

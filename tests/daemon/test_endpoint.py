@@ -1,6 +1,11 @@
 """The daemon's sockets, real ones: setpoints in, telemetry out, commands answered, and hostile peers survived."""
 
 import itertools
+import os
+import shutil
+import socket
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +20,9 @@ from tormagd.messages import VERSION, Reply, Request, Telemetry, Tick, decode, e
 from tormagd.safety.operating_state import RefusedError
 
 PATIENCE_MS = 10_000
+NAMES = ("setpoint", "telemetry", "control", "recording")
+NEVER = 2**63
+"No time at which commands have to wait."
 TELEMETRY = Telemetry(
     v=1,
     t_ns=1,
@@ -44,17 +52,16 @@ class Rig:
     """An endpoint and its peers."""
 
     def __init__(self, folder: Path) -> None:
-        names = ("setpoint", "telemetry", "control", "recording")
-        self.addresses = {name: f"ipc://{folder}/{name}" for name in names}
+        self.addresses = {name: f"ipc://{folder}/{name}" for name in NAMES}
         self.endpoint = Endpoint(Endpoints(**self.addresses))
         self.context = zmq.Context()
         self.now_s = 0.0
         "The control clock."
 
     def connect(self, kind: int, name: str) -> "zmq.Socket[bytes]":
-        socket = self.context.socket(kind)
-        socket.connect(self.addresses[name])
-        return socket
+        made = self.context.socket(kind)
+        made.connect(self.addresses[name])
+        return made
 
     def publisher(self) -> "zmq.Socket[bytes]":
         """A publisher that the endpoint has subscribed to."""
@@ -81,7 +88,7 @@ class Rig:
     def serve(self, socket: "zmq.Socket[bytes]", answer: Callable[[Request], dict[str, Any]]) -> Reply:
         """Serves until this client has its reply."""
         for _ in range(PATIENCE_MS // 5):
-            self.endpoint.serve(self.now_s, answer)
+            self.endpoint.serve(self.now_s, answer, NEVER)
             if socket.poll(5):
                 return decode(socket.recv_multipart()[-1], Reply)
         pytest.fail("no reply")
@@ -160,9 +167,10 @@ def test_a_flood_is_drained_in_bounded_portions(rig: Rig) -> None:
 def test_an_oversize_message_is_counted_when_its_peer_comes_back(rig: Rig) -> None:
     """libzmq cuts the peer off; the peer connects again by itself, and goes on being heard."""
     publisher = rig.publisher()
+    rig.endpoint.serve(rig.now_s, never, NEVER)
     publisher.send(b"\x00" * 10_000_000)
     for _ in range(PATIENCE_MS // 5):
-        rig.endpoint.serve(rig.now_s, never)
+        rig.endpoint.serve(rig.now_s, never, NEVER)
         if rig.endpoint.inbox.oversize:
             break
         publisher.poll(5)
@@ -175,7 +183,7 @@ def test_an_oversize_message_is_counted_when_its_peer_comes_back(rig: Rig) -> No
         return rig.endpoint.inbox.accepted > 0
 
     rig.until(is_heard_again)
-    rig.endpoint.serve(rig.now_s, never)
+    rig.endpoint.serve(rig.now_s, never, NEVER)
     assert (rig.endpoint.inbox.oversize, rig.endpoint.inbox.refused) == (1, 0)
 
 
@@ -185,13 +193,39 @@ def test_a_publisher_that_leaves_is_not_one_that_was_cut_off(rig: Rig) -> None:
     rig.until(lambda: rig.endpoint.inbox.accepted == 1)
     first.close(linger=0)
     for _ in range(20):
-        rig.endpoint.serve(rig.now_s, never)
+        rig.endpoint.serve(rig.now_s, never, NEVER)
         rig.endpoint.drain_setpoints(rig.now_s)
         rig.context.socket(zmq.PULL).poll(5)
     rig.now_s = 2.0
     rig.publisher().send(setpoint(2))
     rig.until(lambda: rig.endpoint.inbox.accepted == 2)
-    rig.endpoint.serve(rig.now_s, never)
+    rig.endpoint.serve(rig.now_s, never, NEVER)
+    assert rig.endpoint.inbox.oversize == 0
+
+
+SHORT_SEND = """
+import sys, zmq
+publisher = zmq.Context().socket(zmq.XPUB)
+publisher.connect(sys.argv[1])
+publisher.recv()
+publisher.send(b"garbage")
+sys.stdin.read()
+"""
+
+
+def test_publishers_that_come_and_go_quickly_were_not_cut_off(rig: Rig) -> None:
+    """Of a process that ends the address is taken up by the next, on this clock at the same moment."""
+    for number in range(1, 3):
+        process = subprocess.Popen(
+            [sys.executable, "-c", SHORT_SEND, rig.addresses["setpoint"]], stdin=subprocess.PIPE, text=True
+        )
+
+        def is_heard(number: int = number) -> bool:
+            rig.endpoint.serve(rig.now_s, never, NEVER)
+            return rig.endpoint.inbox.refused == number
+
+        rig.until(is_heard)
+        process.communicate()
     assert rig.endpoint.inbox.oversize == 0
 
 
@@ -294,13 +328,34 @@ def test_a_flood_of_commands_is_answered_in_bounded_portions(rig: Rig) -> None:
         return {}
 
     for _ in range(PATIENCE_MS // 5):
-        rig.endpoint.serve(0.0, answer)
+        rig.endpoint.serve(0.0, answer, NEVER)
         if sum(map(len, answered)) == 4 * REQUESTS:
             break
         answered.append([])
         client.poll(5)
     assert max(map(len, answered)) <= REQUESTS
     assert list(itertools.chain(*answered)) == list(range(4 * REQUESTS))
+
+
+def test_when_the_slack_is_over_one_command_is_still_answered_and_the_others_wait(rig: Rig) -> None:
+    client = rig.connect(zmq.DEALER, "control")
+    for number in range(5):
+        client.send(encode(Request(v=VERSION, id=number, command="status")))
+    answered: list[int] = []
+
+    def answer(request: Request) -> dict[str, Any]:
+        assert isinstance(request.id, int)
+        answered.append(request.id)
+        return {}
+
+    for _ in range(PATIENCE_MS // 5):
+        before = len(answered)
+        rig.endpoint.serve(0.0, answer, 0)
+        assert len(answered) - before <= 1
+        if len(answered) == 5:
+            break
+        client.poll(5)
+    assert answered == list(range(5))
 
 
 # -- opening and closing -------------------------------------------------------------------------------------------
@@ -319,6 +374,72 @@ def test_an_address_that_cannot_be_bound_is_named(tmp_path: Path) -> None:
     holder = taken.socket(zmq.PUB)
     port = holder.bind_to_random_port("tcp://127.0.0.1")
     address = f"tcp://127.0.0.1:{port}"
-    with pytest.raises(OSError, match=f"{address}: cannot be bound"):
-        Endpoint(Endpoints(setpoint=address))
-    taken.destroy(linger=0)
+    try:
+        with pytest.raises(
+            OSError, match=f"^endpoints.setpoint = '{address}': cannot be bound: Address already in use"
+        ):
+            Endpoint(Endpoints(setpoint=address))
+    finally:
+        taken.destroy(linger=0)
+
+
+def test_a_second_daemon_takes_nothing_from_the_first_and_names_it(rig: Rig, tmp_path: Path) -> None:
+    for _ in range(2):
+        with pytest.raises(OSError, match=f"^endpoints.setpoint = .*: already running, pid {os.getpid()}$"):
+            Endpoint(Endpoints(**rig.addresses))
+    client = rig.connect(zmq.DEALER, "control")
+    client.send(encode(Request(v=VERSION, id=1, command="status")))
+    assert rig.serve(client, lambda request: {"pid": 1}).result == {"pid": 1}
+    assert sorted(path.name for path in tmp_path.iterdir() if path.is_socket()) == sorted(rig.addresses)
+
+
+def test_one_that_shares_a_single_address_is_refused_and_leaves_none_of_its_own(rig: Rig, tmp_path: Path) -> None:
+    others = {name: f"ipc://{tmp_path}/other/{name}" for name in rig.addresses}
+    with pytest.raises(OSError, match=r"^endpoints.control = .*already running"):
+        Endpoint(Endpoints(**others | {"control": rig.addresses["control"]}))
+    assert list((tmp_path / "other").iterdir()) == []
+    assert (tmp_path / "control").is_socket()
+
+
+def test_what_a_killed_daemon_left_behind_is_replaced(tmp_path: Path) -> None:
+    left = socket.socket(socket.AF_UNIX)
+    left.bind(str(tmp_path / "control"))
+    left.close()
+    (tmp_path / "control.lock").write_text("4194304999\n")
+    made = Rig(tmp_path)
+    client = made.connect(zmq.DEALER, "control")
+    client.send(encode(Request(v=VERSION, id=1, command="status")))
+    assert made.serve(client, lambda request: {}).ok
+    made.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sockets_that_somebody_has_put_in_their_place_are_left_to_him(tmp_path: Path) -> None:
+    """The directory was taken away while a daemon ran, and another began in a new one."""
+    folder = tmp_path / "run"
+    first = Rig(folder)
+    shutil.rmtree(folder)
+    second = Rig(folder)
+    first.close()
+    client = second.connect(zmq.DEALER, "control")
+    client.send(encode(Request(v=VERSION, id=1, command="status")))
+    assert second.serve(client, lambda request: {}).ok
+    assert {path.name for path in folder.iterdir() if path.is_socket()} == set(second.addresses)
+    second.close()
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["precious.txt", "precious.txt.lock"])
+def test_a_file_that_is_not_ours_is_left_alone(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("precious")
+    with pytest.raises(OSError, match=f"^endpoints.control = .*/{name} is .*left alone"):
+        Endpoint(
+            Endpoints(**{n: f"ipc://{tmp_path}/{n}" for n in NAMES} | {"control": f"ipc://{tmp_path}/precious.txt"})
+        )
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: "precious"}
+
+
+def test_a_directory_that_cannot_be_made_is_named_with_its_endpoint(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=f"^endpoints.setpoint = .* {tmp_path}/file cannot be made: .*File exists"):
+        Endpoint(Endpoints(setpoint=f"ipc://{tmp_path}/file/setpoint"))

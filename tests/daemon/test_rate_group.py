@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tormagd.daemon.rate_group import HORIZON_NS, SHARES, Histogram, RateGroup
+from tormagd.daemon.rate_group import ERROR_PERIODS, HORIZON_NS, SHARES, Grade, Histogram, RateGroup
 
 PERIOD_NS = 1_000_000
 
@@ -94,4 +94,35 @@ def test_merged_runs_and_overruns_are_counted() -> None:
     # late is as bad as slow: what counts is that the next one is due
     group.record(2 * PERIOD_NS, 3 * PERIOD_NS, 3 * PERIOD_NS + 1, merged=3)
     group.record(6 * PERIOD_NS, 6 * PERIOD_NS, 6 * PERIOD_NS + 1)
-    assert (group.runs, group.merged, group.overruns) == (4, 3, 2)
+    assert (group.runs, group.merged, group.overruns, group.stalls) == (4, 3, 2, 0)
+
+
+def test_the_delay_counts_from_the_first_run_that_was_missed() -> None:
+    group = RateGroup("test", PERIOD_NS)
+    group.record(5 * PERIOD_NS, 5 * PERIOD_NS + 10, 5 * PERIOD_NS + 20, merged=2)
+    assert group.delay_ns == 2 * PERIOD_NS + 20
+    assert group.lateness_us == pytest.approx(0.01)
+    assert group.overruns == 1
+
+
+def test_a_stall_is_an_error_and_an_overrun_a_warning_for_as_long_as_the_horizon() -> None:
+    group = RateGroup("test", PERIOD_NS)
+    stall_ns = round(ERROR_PERIODS * PERIOD_NS) + 1
+    assert group.grade() is Grade.GOOD
+
+    def run(due_ns: int, took_ns: int) -> Grade:
+        group.record(due_ns, due_ns, due_ns + took_ns)
+        return group.grade()
+
+    assert run(0, PERIOD_NS) is Grade.GOOD
+    assert run(PERIOD_NS, PERIOD_NS + 1) is Grade.WARNING
+    assert run(2 * PERIOD_NS, stall_ns - 1) is Grade.WARNING
+    assert run(3 * PERIOD_NS, stall_ns) is Grade.ERROR
+    assert run(4 * PERIOD_NS, 0) is Grade.ERROR
+    # forgotten one to two horizons later, while the counters stay
+    assert run(HORIZON_NS + PERIOD_NS, 0) is Grade.ERROR
+    assert run(2 * HORIZON_NS + 2 * PERIOD_NS, 0) is Grade.GOOD
+    assert (group.overruns, group.stalls) == (3, 1)
+    group.refresh()
+    assert group.report["grade"] == "good"
+    assert group.report["stalls"] == 1

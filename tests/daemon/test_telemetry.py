@@ -33,10 +33,10 @@ MEASUREMENT = Measurement(
 )
 
 
-def telemetry(measurement: Measurement | None, state: StepState) -> Telemetry:
+def telemetry(measurement: Measurement | None, state: StepState, is_busy: bool = False) -> Telemetry:
     """What is published, as a client decodes it."""
     row = tick_row(1.0, state, OUTPUT, PLAN, 1.1, measurement, 20.0, 150.0)
-    return decode(encode(snapshot(row, 3, measurement, 0.012)), Telemetry)
+    return decode(encode(snapshot(row, 3, measurement, is_busy, 0.012)), Telemetry)
 
 
 def test_a_driven_device() -> None:
@@ -60,7 +60,7 @@ def test_a_driven_device() -> None:
 
 def test_positions_before_homing_are_not_known() -> None:
     lost = MEASUREMENT._replace(switches=Switches(0), mode=DeviceMode.HOMING)
-    published = telemetry(lost, StepState(1.0, SafetyState(), first_estimate(lost, 47.5)))
+    published = telemetry(lost, StepState(1.0, SafetyState(), first_estimate(lost, 47.5)), is_busy=True)
     assert (published.gap_mm, published.measured_jp, published.skew_mm, published.gap_setpoint_mm) == (None,) * 4
     assert (published.is_homed, published.is_busy) == (False, True)
     assert published.measured_cf == 1.39
@@ -76,6 +76,13 @@ def test_without_a_device_nothing_measured_is_known() -> None:
 def test_nothing_holds_back_a_device_that_is_not_driven(present: OperatingState) -> None:
     held = limits_held(StepState(1.0, SafetyState(present)), OUTPUT, PLAN)
     assert bool(held) == (present in (OperatingState.ENABLED, OperatingState.PAUSED))
+
+
+@pytest.mark.parametrize("present", OperatingState)
+def test_no_force_is_governed_while_the_device_is_not_driven(present: OperatingState) -> None:
+    published = telemetry(MEASUREMENT, StepState(1.0, SafetyState(present), first_estimate(MEASUREMENT, 47.5)))
+    assert published.governed_cf == (1.4 if present in (OperatingState.ENABLED, OperatingState.PAUSED) else None)
+    assert published.setpoint_cf == 1.5
 
 
 def test_codes_are_explained_by_their_table() -> None:

@@ -3,6 +3,8 @@
 import math
 import random
 import signal
+import subprocess
+import sys
 
 import msgpack
 import pytest
@@ -62,6 +64,34 @@ def test_enable_is_refused_until_everything_is_right(rig):
     rig.ask(0.5)
     rig.until(lambda: rig.telemetry().setpoint_cf == 0.5, "setpoint seen")
     rig.until(lambda: rig.command("enable").ok, "enabled")
+
+
+def test_home_is_seen_as_busy_at_once_and_nothing_is_enabled_on_top_of_it(rig):
+    rig.arm()
+    rig.done("disable")
+    rig.until(lambda: not rig.status()["is_busy"], "open")
+    home, enable, status = rig.burst("home", "enable", "status")
+    assert home.ok
+    assert enable.error.code == "busy"
+    assert status.result["is_busy"]
+    rig.until(lambda: rig.status()["is_homed"] and not rig.status()["is_busy"], "homed")
+    assert rig.status()["faults"] == []
+
+
+def test_a_second_daemon_is_refused_and_the_first_goes_on(rig):
+    ended = subprocess.run(
+        [sys.executable, "-m", "tormagd.daemon.main", "--config", str(rig.config)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60.0,
+    )
+    assert ended.returncode == 1
+    assert ended.stderr.splitlines()[-1].startswith("tormagd: endpoints.setpoint = 'ipc://")
+    assert ended.stderr.endswith(f": already running, pid {rig.daemon.pid}\n")
+    rig.arm()
+    rig.ask(0.7)
+    rig.until(lambda: rig.telemetry().setpoint_cf == 0.7, "setpoints are heard")
 
 
 def test_killed_daemon_leaves_an_open_gap_and_a_latched_reason(rig):

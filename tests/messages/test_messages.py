@@ -10,8 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tormagd.messages import (
+    LONGEST_SHOWN,
+    MAX_DISPLACEMENT_MM,
     MAX_MESSAGE_BYTES,
     MAX_PREVIEW_SAMPLES,
+    MAX_RATE_MM_S,
     ErrorReply,
     MessageError,
     Reply,
@@ -28,7 +31,8 @@ REQUEST: dict[str, Any] = {"v": 1, "id": 3, "command": "status"}
 TYPES = (Setpoint, Telemetry, Request, Reply)
 
 forces = st.floats(0.0, 1_000.0)
-motions = st.none() | st.floats(allow_nan=False, allow_infinity=False)
+displacements = st.none() | st.floats(-MAX_DISPLACEMENT_MM, MAX_DISPLACEMENT_MM)
+rates = st.none() | st.floats(-MAX_RATE_MM_S, MAX_RATE_MM_S)
 setpoints = st.builds(
     Setpoint,
     v=st.just(1),
@@ -37,8 +41,8 @@ setpoints = st.builds(
     stamp_ns=st.integers(0, 2**63 - 1),
     servo_cf=forces,
     valid_for_ms=st.floats(0.0, 60_000.0, exclude_min=True),
-    displacement_mm=motions,
-    rate_mm_s=motions,
+    displacement_mm=displacements,
+    rate_mm_s=rates,
     preview_N=st.lists(forces, max_size=256).map(tuple),
     preview_dt_ms=st.floats(0.0, 1_000.0, exclude_min=True),
 )
@@ -171,8 +175,12 @@ def test_numbers_that_are_not_finite_are_refused(name: str, value: float) -> Non
         ({"servo_cf": 1_000.1}, "servo_cf = 1000.1"),
         ({"valid_for_ms": 0.0}, "valid_for_ms = 0.0"),
         ({"valid_for_ms": 60_001.0}, "valid_for_ms = 60001.0"),
+        ({"displacement_mm": 1e10}, "displacement_mm = 10000000000.0"),
+        ({"displacement_mm": -1_000.1}, "displacement_mm = -1000.1: allowed is -1000..1000"),
+        ({"rate_mm_s": -1e308}, "rate_mm_s = -1e+308"),
+        ({"rate_mm_s": 10_001}, "rate_mm_s = 10001.0: allowed is -10000..10000"),
         ({"preview_N": [1.0] * 257, "preview_dt_ms": 2.0}, "preview_N = '257 values'"),
-        ({"preview_N": [1.0, math.nan], "preview_dt_ms": 2.0}, "preview_N"),
+        ({"preview_N": [1.0, math.nan], "preview_dt_ms": 2.0}, "preview_N[1] = nan"),
         ({"preview_N": [1.0, -1.0], "preview_dt_ms": 2.0}, "preview_N"),
         ({"preview_N": [1.0, "2"], "preview_dt_ms": 2.0}, "preview_N"),
         ({"preview_N": [1.0]}, "preview_dt_ms = None"),
@@ -182,6 +190,19 @@ def test_numbers_that_are_not_finite_are_refused(name: str, value: float) -> Non
 )
 def test_values_out_of_range_are_named(fields: dict[str, Any], name: str) -> None:
     assert name in refusal(changed(SETPOINT, **fields))
+
+
+@pytest.mark.parametrize(
+    ("fields", "kind"),
+    [
+        ({"preview_N": [-1.2345678901234567e-100] * MAX_PREVIEW_SAMPLES, "preview_dt_ms": 1.0}, Setpoint),
+        ({"source": "\x1b" * 4_000}, Setpoint),
+        ({"command": "\x1b" * 4_000}, Request),
+    ],
+)
+def test_a_refusal_is_short_whatever_was_sent(fields: dict[str, Any], kind: type[Any]) -> None:
+    base = {Setpoint: SETPOINT, Request: REQUEST}[kind]
+    assert len(refusal(changed(base, **fields), kind)) < LONGEST_SHOWN + 60
 
 
 def test_integers_are_forces_too() -> None:

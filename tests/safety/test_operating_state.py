@@ -140,12 +140,46 @@ def test_a_command_refused_in_fault_names_the_faults() -> None:
     assert "clear-fault" in refused.hint
 
 
+@pytest.mark.parametrize("name", ["enable", "disable", "pause", "resume", "home"])
+def test_in_fault_every_refusal_says_how_to_leave_it(name: str) -> None:
+    refused = refusal(FAULTED, name)
+    assert (refused.code, refused.hint) == ("fault", "tormagctl clear-fault")
+
+
+@pytest.mark.parametrize(
+    ("present", "name", "hint"),
+    [
+        (PAUSED, "enable", "tormagctl resume"),
+        (ENABLED, "enable", "nothing to do"),
+        (DISABLED, "pause", "tormagctl enable"),
+        (PAUSED, "pause", "nothing to do"),
+        (DISABLED, "resume", "tormagctl enable"),
+        (ENABLED, "resume", "nothing to do"),
+    ],
+)
+def test_a_refusal_hints_at_what_is_wanted_instead(present: OperatingState, name: str, hint: str) -> None:
+    assert refusal(SafetyState(present), name).hint == hint
+
+
 def test_clearing_asks_the_device_only_where_it_has_latched_too() -> None:
     ours = command(FAULTED, "clear-fault", 2.0, READY)
     assert (ours.operating_state, ours.faults, ours.request_number) == (DISABLED, (), FAULTED.request_number)
-    assert ours.clearing_until_s == 2.0 + CLEARING_S
+    assert ours.clearing_until_s < 0.0, "there is nothing to wait for"
     both = command(FAULTED, "clear-fault", 2.0, READY._replace(device_latched=True))
     assert (both.request, both.request_number) == (DeviceRequest.CLEAR, FAULTED.request_number + 1)
+    assert both.clearing_until_s == 2.0 + CLEARING_S
+
+
+@pytest.mark.parametrize("present", [ENABLED, PAUSED])
+@pytest.mark.parametrize("device_latched", [False, True])
+def test_clearing_while_driven_hides_no_fault_of_the_device(present: OperatingState, device_latched: bool) -> None:
+    state = SafetyState(present)
+    assert command(state, "clear-fault", 2.0, READY._replace(device_latched=device_latched)) == state
+
+
+def test_enabling_ends_the_wait_for_a_cleared_fault_to_go() -> None:
+    cleared = command(FAULTED, "clear-fault", 2.0, READY._replace(device_latched=True))
+    assert command(cleared, "enable", 2.1, READY).clearing_until_s < 0.0
 
 
 def test_faults_are_kept_in_the_order_they_came() -> None:

@@ -8,7 +8,7 @@ from tormagd.control.step import StepOutput, Stepper, StepState
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.hardware.connection import Connection
 from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import Conditions
+from tormagd.safety.operating_state import Conditions, latch
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ class ControlLoop:
         now_s = start_ns * 1e-9
         self.state, output = self._stepper.step(self.state, now_s, self._connection.measurement, plan)
         self._connection.exchange(
-            now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
+            output.left_duty, output.right_duty, output.mode, output.request, output.request_number
         )
         self.output = output
         end_ns = time.monotonic_ns()
@@ -42,6 +42,11 @@ class ControlLoop:
         """An operator's command. Raises RefusedError."""
         self.state = self._stepper.command(self.state, name, time.monotonic(), conditions)
         log.info("%s: %s", name, self.state.safety.operating_state)
+
+    def latch(self, fault: Fault) -> None:
+        """Latches a fault that was found outside the step."""
+        self.state = self.state._replace(safety=latch(self.state.safety, (fault,)))
+        self._report_faults()
 
     def lose_link(self) -> None:
         """Tells the core that the device is gone."""

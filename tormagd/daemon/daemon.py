@@ -5,6 +5,7 @@ import logging
 import signal
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -13,19 +14,20 @@ from tormagd import __version__
 from tormagd.config import Config
 from tormagd.control.core import Core
 from tormagd.daemon import notify
+from tormagd.daemon.callbacks import Callbacks
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.inference_loop import InferenceLoop
-from tormagd.daemon.rate_group import RateGroup
-from tormagd.daemon.realtime import freeze_garbage
+from tormagd.daemon.rate_group import ERROR_PERIODS, RateGroup
+from tormagd.daemon.realtime import freeze_garbage, priority_of_threads
 from tormagd.daemon.telemetry import TickRow, explanations, snapshot, tick_row
 from tormagd.hardware.backend import Backend
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.link import LinkState
 from tormagd.messages import Request, Telemetry
-from tormagd.safety.codes import FAULTS, LIMITS
-from tormagd.safety.operating_state import Conditions, OperatingState
+from tormagd.safety.codes import FAULTS, LIMITS, Fault
+from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState
 
 NS = 1_000_000_000
 RETRACT_ACKNOWLEDGED_S = 0.1
@@ -33,8 +35,8 @@ LONGEST_RETRACT_S = 10.0
 "A full stroke takes the firmware 3 s at its own retract speed; longer means that it cannot, and it says so itself."
 ROWS = 100
 "Ticks in one recording message at most."
-OVERRUN_NEWS_S = 10.0
-"At most one log line about overruns in this time."
+SERVED_BEFORE_NS = 200_000
+"No command is taken up later than this before the next control tick: an answer takes a quarter of it."
 
 log = logging.getLogger(__name__)
 
@@ -45,11 +47,19 @@ class Daemon:
     def __init__(self, config: Config, core: Core, open_backend: Callable[[Any], Backend], refused: list[str]) -> None:
         self._config, self._core, self._refused = config, core, refused
         self._started_s = time.monotonic()
+        self._loop = asyncio.get_running_loop()
+        self._callbacks = Callbacks(self._loop)
         self._connection = Connection(config.device, open_backend, self._lose_link)
-        self._endpoint = Endpoint(config.endpoints)
+        self._endpoint = Endpoint(config.endpoints, priority_of_threads())
         rates = config.rates
         self._control = ControlLoop(core.stepper, self._connection, NS // rates.control_hz)
-        self._inference = InferenceLoop(core.planner, self._endpoint, NS // rates.inference_hz, self._started_s)
+        self._inference = InferenceLoop(
+            core.planner,
+            self._endpoint,
+            NS // rates.inference_hz,
+            self._started_s,
+            on_failure=partial(self._control.latch, Fault.PLAN_FAILED),
+        )
         self._telemetry = RateGroup("telemetry", NS // rates.telemetry_hz)
         self._groups = (self._control.timing, self._inference.timing, self._telemetry)
         self._status: dict[str, Any] = {}
@@ -57,19 +67,17 @@ class Daemon:
         self._rows: list[TickRow] = []
         self._snapshot: Telemetry | None = None
         self._ended = asyncio.Event()
-        self._reported_overruns = 0
-        self._report_overruns_s = self._started_s
 
     async def run(self) -> None:
         """Runs until SIGTERM or SIGINT; opens the gap before it returns."""
-        loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, self._ended.set)
-        self._connection.open()
+            self._loop.add_signal_handler(number, self._ended.set)
+        self._connection.open(self._callbacks)
         freeze_garbage()
-        loop.add_reader(self._endpoint.fileno(), self._receive_setpoints)
+        self._callbacks.add_reader(self._endpoint.fileno(), self._receive_setpoints)
         heartbeat = Heartbeat(NS // self._config.rates.control_hz)
-        loop.add_reader(heartbeat.fileno(), self._beat, heartbeat)
+        # not on one account: its parts have their own
+        self._loop.add_reader(heartbeat.fileno(), self._beat, heartbeat)
         notify.notify("READY=1")
         solver = self._core.solver
         log.info(
@@ -83,8 +91,8 @@ class Daemon:
         await self._ended.wait()
         notify.notify("STOPPING=1")
         await self._open_gap()
-        loop.remove_reader(heartbeat.fileno())
-        loop.remove_reader(self._endpoint.fileno())
+        self._loop.remove_reader(heartbeat.fileno())
+        self._callbacks.remove_reader(self._endpoint.fileno())
         self._connection.close()
         heartbeat.close()
         self._endpoint.close()
@@ -94,11 +102,24 @@ class Daemon:
         beats = heartbeat.beats()
         if not beats:
             return  # a spurious wake-up
+        callbacks, timing = self._callbacks, self._control.timing
+        start_ns = time.monotonic_ns()
         self._control.tick(heartbeat.due_ns, beats - 1, self._inference.state.plan)
+        driven_ns = time.monotonic_ns()
+        callbacks.ran(ControlLoop.tick.__qualname__, start_ns, driven_ns)
+        if timing.delay_ns > timing.period_ns:
+            callbacks.blame(driven_ns - timing.delay_ns, driven_ns)
+        else:
+            callbacks.forget()
         self._record()
-        self._inference.after_tick(self._control.state.estimate)
-        if self._control.timing.runs % self._ticks_per_snapshot == 0:
-            self._publish()
+        try:
+            self._inference.after_tick(self._control.state.estimate)
+        finally:  # whatever becomes of planning, the daemon can be seen and stopped
+            planned_ns = time.monotonic_ns()
+            callbacks.ran(InferenceLoop.after_tick.__qualname__, driven_ns, planned_ns)
+            if timing.runs % self._ticks_per_snapshot == 0:
+                self._publish(heartbeat.due_ns)
+                callbacks.ran(self._publish.__qualname__, planned_ns, time.monotonic_ns())
 
     def _receive_setpoints(self) -> None:
         self._inference.receive(self._control.state.estimate, self._control.next_tick_ns)
@@ -121,37 +142,47 @@ class Daemon:
             )
         )
 
-    def _publish(self) -> None:
+    def _publish(self, due_ns: int) -> None:
         start_ns = time.monotonic_ns()
         row = self._rows[-1]
-        plan = self._inference.state.plan
         stamp = self._endpoint.inbox.newest
         age = None if stamp is None else start_ns * 1e-9 - stamp.stamp_s
-        self._snapshot = snapshot(row, self._telemetry.runs, self._connection.measurement, age)
+        self._snapshot = snapshot(row, self._telemetry.runs, self._connection.measurement, self._is_busy(), age)
         self._endpoint.publish(self._snapshot)
         self._endpoint.publish_ticks(TickRow._fields, self._rows[-ROWS:])
         self._rows.clear()
         self._groups[self._telemetry.runs % len(self._groups)].refresh()  # one a period: none costs the loop much
         self._status = {}
-        self._endpoint.serve(start_ns * 1e-9, self._answer)
-        if plan.number and self._frames_are_fresh(start_ns * 1e-9):
+        self._endpoint.serve(start_ns * 1e-9, self._answer, self._control.next_tick_ns - SERVED_BEFORE_NS)
+        if self._is_alive(start_ns * 1e-9):
             notify.notify("WATCHDOG=1")
-        self._report_overruns(start_ns * 1e-9)
-        self._telemetry.record(start_ns, start_ns, time.monotonic_ns())
+        self._report_late_ticks()
+        self._telemetry.record(due_ns, start_ns, time.monotonic_ns())
 
-    def _frames_are_fresh(self, now_s: float) -> bool:
-        # without a port there are no frames to be fresh, and starting the daemon again would not bring one
-        measurement = self._connection.measurement
+    def _is_alive(self, now_s: float) -> bool:
+        """Whether plans and device states are as fresh as systemd's watchdog wants them; ticks are, or nobody asks."""
+        timeout_s = self._config.realtime.watchdog_ms * 1e-3
+        plan, measurement = self._inference.state.plan, self._connection.measurement
+        if plan.number == 0 or now_s - plan.time_s > timeout_s:
+            return False
+        # without a port there are no states to be fresh, and starting the daemon again would not bring one
         return self._connection.state is not LinkState.RUNNING or (
-            measurement is not None and now_s - measurement.received_s < self._config.realtime.watchdog_ms * 1e-3
+            measurement is not None and now_s - measurement.received_s < timeout_s
         )
 
-    def _report_overruns(self, now_s: float) -> None:
-        overruns = self._control.timing.overruns
-        if overruns > self._reported_overruns and now_s > self._report_overruns_s:
-            log.warning("%d control ticks overran their period", overruns - self._reported_overruns)
-            self._reported_overruns = overruns
-            self._report_overruns_s = now_s + OVERRUN_NEWS_S
+    def _is_busy(self) -> bool:
+        """Whether the device homes or opens, or was asked to and has not said yet that it does."""
+        measurement, output = self._connection.measurement, self._control.output
+        if measurement is None:
+            return False
+        is_asked = output is not None and output.request_number != self._control.state.safety.request_number
+        return is_asked or self._connection.pending is not DeviceRequest.NONE or measurement.is_busy
+
+    def _report_late_ticks(self) -> None:
+        news = self._callbacks.news()
+        if news is not None:
+            is_stall = news.worst.took_ns > ERROR_PERIODS * self._control.timing.period_ns
+            log.log(logging.ERROR if is_stall else logging.WARNING, "%s", news)
 
     def _answer(self, request: Request) -> dict[str, Any]:
         if request.command == "status":
@@ -160,7 +191,11 @@ class Daemon:
             return self._status
         self._control.command(request.command, self._conditions())
         self._status = {}
-        return {"operating_state": str(self._control.state.safety.operating_state)}
+        return {
+            "operating_state": str(self._control.state.safety.operating_state),
+            # without a device nothing moves yet: a request to open is kept for it, and no other is taken
+            "is_connected": self._connection.measurement is not None,
+        }
 
     def _conditions(self) -> Conditions:
         measurement = self._connection.measurement
@@ -173,7 +208,7 @@ class Daemon:
             connected=measurement is not None,
             fresh=measurement is not None and now_s - measurement.received_s < timeout_s,
             homed=measurement is not None and measurement.is_homed,
-            busy=measurement is not None and measurement.is_busy,
+            busy=self._is_busy(),
             device_latched=measurement is not None and measurement.is_latched,
             requested_N=setpoint.force_N if setpoint is not None and is_current else None,
             neutral_N=least_N + self._config.limits.neutral_margin_N,
@@ -188,6 +223,7 @@ class Daemon:
         return known | {
             # a command of this very period has changed the state since the snapshot, and whoever gave it asks now
             "operating_state": str(safety.operating_state),
+            "is_busy": self._is_busy(),
             "faults": [str(fault) for fault in safety.faults],
             "version": __version__,
             "scene": self._core.scene.name,
@@ -198,6 +234,7 @@ class Daemon:
             "link": self._connection.report(),
             "setpoints": self._endpoint.inbox.report(),
             "rates": {group.name: group.report for group in self._groups},
+            "late_ticks_by": dict(self._callbacks.blamed),
             "fault_details": explanations(tuple(safety.faults), FAULTS),
             "limit_details": explanations(snapshot_.limits, LIMITS),
             "not_granted": self._refused,

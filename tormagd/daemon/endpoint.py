@@ -6,10 +6,12 @@ and control goes on.
 
 import contextlib
 import logging
+import os
+import socket
+import struct
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -18,6 +20,7 @@ import zmq.utils.monitor
 
 from tormagd.config import Endpoints
 from tormagd.control.governor import TimedSetpoint
+from tormagd.daemon.socket_file import SocketFile, ipc_path
 from tormagd.messages import (
     MAX_MESSAGE_BYTES,
     VERSION,
@@ -44,6 +47,11 @@ RECONNECT_S = 0.5
 "A peer that was cut off comes back within this time (libzmq's default is 0.1 s)."
 AHEAD_S = 0.05
 "A stamp may be this far ahead of our clock."
+LONGEST_REFUSAL = 200
+"Characters kept of the last refusal."
+
+_CREDENTIALS = struct.Struct("3i")
+_Peer = tuple[int, ...] | str
 
 log = logging.getLogger(__name__)
 
@@ -65,7 +73,6 @@ class SetpointInbox:
         self.oversize = 0
         self.last_refusal: str | None = None
         self.newest: TimedSetpoint | None = None
-        self._newest_stamp_ns = 0
         self._newest_source = ""
         self._sources: dict[str, _Source] = {}
 
@@ -76,7 +83,7 @@ class SetpointInbox:
             self._admit(setpoint, now_s, realtime_ns)
         except MessageError as error:
             self.refused += 1
-            self.last_refusal = str(error)
+            self.last_refusal = str(error)[:LONGEST_REFUSAL]
             return False
         known = self._sources.get(setpoint.source)
         if known is not None and setpoint.seq <= known.seq and now_s - known.heard_s < SILENT_S:
@@ -84,18 +91,29 @@ class SetpointInbox:
             return False
         self._sources[setpoint.source] = _Source(setpoint, now_s)
         self.accepted += 1
-        if setpoint.stamp_ns < self._newest_stamp_ns and self.newest is not None:
+        # Both on the control clock, which no setting of the time moves. Of one publisher `seq` alone says what is
+        # newer: when its own clock was set back, its setpoints are older than they were, not out of order.
+        stamp_s = now_s - (realtime_ns - setpoint.stamp_ns) * 1e-9
+        if self.newest is not None and setpoint.source != self._newest_source and stamp_s < self.newest.stamp_s:
             return False
-        self._newest_stamp_ns = setpoint.stamp_ns
         self._newest_source = setpoint.source
         self.newest = TimedSetpoint(
             force_N=setpoint.servo_cf,
-            stamp_s=now_s - (realtime_ns - setpoint.stamp_ns) * 1e-9,
+            stamp_s=stamp_s,
             valid_for_s=setpoint.valid_for_ms * 1e-3,
             displacement_mm=setpoint.displacement_mm,
             rate_mm_s=setpoint.rate_mm_s,
+            preview_N=setpoint.preview_N or (),
+            preview_dt_s=(setpoint.preview_dt_ms or 0.0) * 1e-3,
         )
         return True
+
+    def withdraw(self, reason: str) -> None:
+        """Forgets the newest setpoint: nothing can be planned for it. It counts as refused, too."""
+        if self.newest is not None:
+            self.newest = None
+            self.refused += 1
+            self.last_refusal = reason[:LONGEST_REFUSAL]
 
     def report(self) -> dict[str, Any]:
         """Counters, the last refusal, and each source with its newest sequence number."""
@@ -123,23 +141,27 @@ class SetpointInbox:
 
 
 class Endpoint:
-    """The daemon's sockets."""
+    """The daemon's sockets. With an `io_priority` above 0, ZeroMQ's own threads run at this priority of SCHED_FIFO.
 
-    def __init__(self, endpoints: Endpoints) -> None:
-        self._context = zmq.Context()
+    Raises OSError naming the endpoint that cannot be bound, and why: another daemon has it, say.
+    """
+
+    def __init__(self, endpoints: Endpoints, io_priority: int = 0) -> None:
+        self._context = context(io_priority)
+        self._files: list[SocketFile] = []
         self.inbox = SetpointInbox()
-        self._setpoints = self._bind(zmq.SUB, endpoints.setpoint)
+        try:
+            self._setpoints = self._bind(zmq.SUB, "setpoint", endpoints.setpoint)
+            self._telemetry = self._bind(zmq.PUB, "telemetry", endpoints.telemetry)
+            self._recording = self._bind(zmq.PUB, "recording", endpoints.recording)
+            self._control = self._bind(zmq.ROUTER, "control", endpoints.control)
+        except OSError:
+            self._release()
+            raise
         self._setpoints.subscribe(b"")
         self._monitor = self._setpoints.get_monitor_socket(zmq.EVENT_DISCONNECTED | zmq.EVENT_ACCEPTED)
-        self._cut_off_s: deque[float] = deque(maxlen=SOURCES)
-        self._telemetry = self._bind(zmq.PUB, endpoints.telemetry)
-        self._recording = self._bind(zmq.PUB, endpoints.recording)
-        self._control = self._bind(zmq.ROUTER, endpoints.control)
-        self._paths = [
-            Path(address.removeprefix("ipc://"))
-            for address in (endpoints.setpoint, endpoints.telemetry, endpoints.recording, endpoints.control)
-            if _is_file(address)
-        ]
+        self._peers: dict[int, _Peer] = {}
+        self._cut_off: deque[tuple[_Peer, float]] = deque(maxlen=SOURCES)
 
     def fileno(self) -> int:
         """The descriptor that becomes readable when setpoints may have arrived (edge-triggered: drain them)."""
@@ -165,10 +187,15 @@ class Endpoint:
         """Sends the control ticks since the last time, a row each."""
         self._send(self._recording, msgpack.packb({"v": VERSION, "columns": columns, "rows": rows}))
 
-    def serve(self, now_s: float, answer: Callable[[Request], dict[str, Any]]) -> None:
-        """Answers waiting commands, at most REQUESTS. `answer` returns the result or raises RefusedError."""
+    def serve(self, now_s: float, answer: Callable[[Request], dict[str, Any]], until_ns: int) -> None:
+        """Answers waiting commands, at most REQUESTS, and none but the first from `until_ns` (monotonic) on.
+
+        `answer` returns the result or raises RefusedError.
+        """
         self._count_oversize(now_s)
-        for _ in range(REQUESTS):
+        for number in range(REQUESTS):
+            if number and time.monotonic_ns() >= until_ns:
+                return
             try:
                 envelope = self._control.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
@@ -181,43 +208,87 @@ class Endpoint:
     def close(self) -> None:
         """Closes the sockets without waiting for anybody."""
         self._setpoints.disable_monitor()
+        self._release()
+
+    def _release(self) -> None:
+        for file in self._files:
+            file.close()
         self._context.destroy(linger=0)
-        for path in self._paths:
-            path.unlink(missing_ok=True)
 
-    def _bind(self, kind: int, address: str) -> "zmq.Socket[bytes]":
-        if _is_file(address):
-            Path(address.removeprefix("ipc://")).parent.mkdir(parents=True, exist_ok=True)
-        socket = self._context.socket(kind)
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        socket.setsockopt(zmq.RCVHWM, 1_000)
-        socket.setsockopt(zmq.SNDHWM, 1_000)
+    def _bind(self, kind: int, name: str, address: str) -> "zmq.Socket[bytes]":
+        made = self._context.socket(kind)
+        made.setsockopt(zmq.LINGER, 0)
+        made.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+        made.setsockopt(zmq.RCVHWM, 1_000)
+        made.setsockopt(zmq.SNDHWM, 1_000)
+        path = ipc_path(address)
         try:
-            socket.bind(address)
+            if path is not None:
+                file = SocketFile(path)
+                self._files.append(file)
+                made.setsockopt(zmq.USE_FD, file.detach())
+            made.bind(address)
         except zmq.ZMQError as error:
-            raise OSError(f"{address}: cannot be bound: {error}") from error
-        return socket
+            raise OSError(f"endpoints.{name} = {address!r}: cannot be bound: {error.strerror}") from error
+        except OSError as error:
+            raise OSError(f"endpoints.{name} = {address!r}: {error}") from error
+        return made
 
-    def _send(self, socket: "zmq.Socket[bytes]", data: bytes) -> None:
+    def _send(self, to: "zmq.Socket[bytes]", data: bytes) -> None:
         # PUB drops for a subscriber that does not keep up; it never blocks
         with contextlib.suppress(zmq.Again):
-            socket.send(data, zmq.NOBLOCK)
+            to.send(data, zmq.NOBLOCK)
 
     def _count_oversize(self, now_s: float) -> None:
         # libzmq cuts off a peer that sends more than MAXMSGSIZE and delivers nothing. The only trace is a peer that is
-        # disconnected and, unlike one that leaves, connects again at once by itself
+        # disconnected and, unlike one that leaves, connects again at once by itself. A process that closes its socket
+        # and opens another that soon looks the same; over TCP, where only the machine is known, so do two processes
         while self._monitor.poll(0):
-            event = zmq.utils.monitor.recv_monitor_message(self._monitor)["event"]
-            if event == zmq.EVENT_DISCONNECTED:
-                self._cut_off_s.append(now_s)
-            elif self._cut_off_s and now_s - self._cut_off_s.pop() < RECONNECT_S:
-                self.inbox.oversize += 1
+            event = zmq.utils.monitor.recv_monitor_message(self._monitor)
+            descriptor = event["value"]
+            if event["event"] == zmq.EVENT_DISCONNECTED:
+                gone = self._peers.pop(descriptor, None)
+                if gone is not None:
+                    self._cut_off.append((gone, now_s))
+                continue
+            peer = _peer(descriptor)
+            if peer is None:
+                continue
+            self._peers[descriptor] = peer
+            for cut_off in self._cut_off:
+                if cut_off[0] == peer and now_s - cut_off[1] < RECONNECT_S:
+                    self._cut_off.remove(cut_off)
+                    self.inbox.oversize += 1
+                    break
 
 
-def _is_file(address: str) -> bool:
-    # "ipc://@name" is a name without a file
-    return address.startswith("ipc://") and not address.startswith("ipc://@")
+def context(io_priority: int) -> "zmq.Context[zmq.Socket[bytes]]":
+    """A ZeroMQ context whose threads run at this priority of SCHED_FIFO; 0 for an ordinary one.
+
+    A priority that is refused ends the process: see `realtime.priority_of_threads`.
+    """
+    made = zmq.Context()
+    if io_priority:
+        made.set(zmq.THREAD_SCHED_POLICY, os.SCHED_FIFO)
+        made.set(zmq.THREAD_PRIORITY, io_priority)
+    return made
+
+
+def _peer(descriptor: int) -> _Peer | None:
+    """The process at the other end of an accepted connection, over TCP its host; None where it has gone already."""
+    try:
+        connection = socket.socket(fileno=os.dup(descriptor))
+    except OSError:
+        return None
+    with connection:
+        try:
+            if connection.family == socket.AF_UNIX:
+                return _CREDENTIALS.unpack(
+                    connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+                )
+            return str(connection.getpeername()[0])
+        except OSError:
+            return None
 
 
 def _reply(data: bytes, answer: Callable[[Request], dict[str, Any]]) -> Reply:

@@ -1,38 +1,54 @@
 """The inference loop: plans at once when a setpoint arrived, and at least `inference_hz` times a second otherwise."""
 
+import logging
 import time
+from collections.abc import Callable
 
 from tormagd.control.estimate import Estimate
 from tormagd.control.plan import Planner, PlanState
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.rate_group import RateGroup
 
-MARGIN = 1.5
-"A plan is begun only where the slack before the next control tick is this many times the usual plan."
+INTO_THE_TICK = 0.05
+"Share of the plans that may take longer than the slack that is asked for before the next control tick."
+LEARNT_SHARE = 0.1
+"By how much of itself one plan moves that slack at most, however long it was interrupted."
+
+log = logging.getLogger(__name__)
 
 
 class InferenceLoop:
-    """Plans in the slack of the control loop, which always goes first."""
+    """Plans in the slack of the control loop, which always goes first. `on_failure` hears of a plan that failed."""
 
-    def __init__(self, planner: Planner, endpoint: Endpoint, period_ns: int, now_s: float) -> None:
-        self._planner, self._endpoint = planner, endpoint
+    def __init__(
+        self,
+        planner: Planner,
+        endpoint: Endpoint,
+        period_ns: int,
+        now_s: float,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        *,
+        on_failure: Callable[[], None],
+    ) -> None:
+        self._planner, self._endpoint, self._clock_ns = planner, endpoint, clock_ns
+        self._on_failure, self._failure = on_failure, ""
         self.state: PlanState = planner.start(now_s)
         self.timing = RateGroup("inference", period_ns)
-        self._due_ns = time.monotonic_ns() + period_ns
+        self._due_ns = clock_ns() + period_ns
         self._setpoint_ns = 0
-        self._usual_ns = 200_000.0
+        self._slack_ns = 200_000.0
 
     def receive(self, estimate: Estimate | None, next_tick_ns: int) -> None:
         """Reads setpoints; plans on a new one if the next control tick leaves the time."""
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock_ns()
         if self._endpoint.drain_setpoints(now_ns * 1e-9) and not self._setpoint_ns:
             self._setpoint_ns = now_ns
-        if self._setpoint_ns and time.monotonic_ns() + MARGIN * self._usual_ns < next_tick_ns:
+        if self._setpoint_ns and self._clock_ns() + self._slack_ns < next_tick_ns:
             self._plan(estimate, self._setpoint_ns)
 
     def after_tick(self, estimate: Estimate | None) -> None:
         """Plans if a setpoint is waiting or a plan is due; called in the slack after a control tick."""
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock_ns()
         # reading here too makes the edge-triggered descriptor harmless: nothing waits longer than a tick
         if self._endpoint.drain_setpoints(now_ns * 1e-9) and not self._setpoint_ns:
             self._setpoint_ns = now_ns
@@ -42,11 +58,28 @@ class InferenceLoop:
             self._plan(estimate, self._due_ns)
 
     def _plan(self, estimate: Estimate | None, due_ns: int) -> None:
-        start_ns = time.monotonic_ns()
-        self.state = self._planner.plan(self.state, start_ns * 1e-9, self._endpoint.inbox.newest, estimate)
-        end_ns = time.monotonic_ns()
+        start_ns = self._clock_ns()
+        self.state = self._planned(start_ns * 1e-9, estimate)
+        end_ns = self._clock_ns()
         self.timing.record(due_ns, start_ns, end_ns)
-        self._usual_ns += 0.1 * (end_ns - start_ns - self._usual_ns)
+        # it comes to rest where as many plans are longer as may be
+        is_longer = end_ns - start_ns > self._slack_ns
+        self._slack_ns *= 1.0 + LEARNT_SHARE * (is_longer - INTO_THE_TICK)
         self._setpoint_ns = 0
-        # due again one period after this plan; never an instant in the past, so that a late plan is not chased
-        self._due_ns = start_ns + self.timing.period_ns
+        # a period after this one was due, or the rate would fall by what each waits for its tick; but what was missed
+        # is not made up for
+        period_ns = self.timing.period_ns
+        self._due_ns = period_ns + (due_ns if start_ns - due_ns < period_ns else start_ns)
+
+    def _planned(self, now_s: float, estimate: Estimate | None) -> PlanState:
+        inbox = self._endpoint.inbox
+        try:
+            return self._planner.plan(self.state, now_s, inbox.newest, estimate)
+        except (ValueError, ArithmeticError, RuntimeError) as error:  # a DomainError; what numpy and torch raise
+            if str(error) != self._failure:  # the first failure is news, the same one again is not
+                self._failure = str(error)
+                log.exception("no gap could be planned for %s", inbox.newest)
+            inbox.withdraw(f"no gap could be planned: {error}")
+            self._on_failure()
+            afresh = self._planner.start(now_s)
+            return afresh._replace(plan=afresh.plan._replace(number=self.state.plan.number + 1))

@@ -2,19 +2,19 @@
 
 import argparse
 import logging
+import signal
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
-import torch
-import uvloop
 
 from tormagd import __version__
 from tormagd.config import Config, ConfigError, load_config
-from tormagd.control.core import Core, build_core
-from tormagd.daemon.daemon import Daemon
-from tormagd.daemon.realtime import prepare
-from tormagd.hardware.backend import opener
+from tormagd.output import write_line
+
+if TYPE_CHECKING:
+    from tormagd.control.core import Core
 
 REFUSED = 2
 
@@ -27,6 +27,22 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--version", action="version", version=f"tormagd {__version__}")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    # nothing moves until the daemon runs and takes the signal over: before that, Ctrl-C may simply end the process
+    interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        return _start(options)
+    finally:
+        signal.signal(signal.SIGINT, interrupt)
+
+
+def _start(options: argparse.Namespace) -> int:
+    # here, not above: these take a second to load, and the signal has to be seen to first
+    import torch
+    import uvloop
+
+    from tormagd.control.core import build_core
+    from tormagd.hardware.backend import opener
+
     torch.set_num_threads(1)  # the loop has one core; a second thread would only wait for it
     try:
         config = load_config(options.config)
@@ -46,12 +62,17 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-async def _run(config: Config, core: Core, open_backend: object) -> None:
+async def _run(config: Config, core: "Core", open_backend: object) -> None:
+    from tormagd.daemon.daemon import Daemon
+    from tormagd.daemon.realtime import prepare
+
     refused = prepare(config.realtime)
     await Daemon(config, core, open_backend, refused).run()  # type: ignore[arg-type]
 
 
-def _print_resolved(config: Config, core: Core) -> None:
+def _print_resolved(config: Config, core: "Core") -> None:
+    from tormagd.hardware.backend import installed
+
     resolved = {
         "config": msgspec.to_builtins(config),
         "scene": msgspec.to_builtins(core.scene),
@@ -62,8 +83,9 @@ def _print_resolved(config: Config, core: Core) -> None:
             "gain_margin_dB": core.margins.gain_margin_dB,
             "solver": core.solver._asdict(),
         },
+        "backends": {name: reason or "loads" for name, reason in installed().items()},
     }
-    print(msgspec.json.format(msgspec.json.encode(resolved), indent=2).decode())
+    write_line(msgspec.json.format(msgspec.json.encode(resolved), indent=2).decode(), sys.stdout)
 
 
 if __name__ == "__main__":

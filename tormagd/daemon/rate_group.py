@@ -1,7 +1,12 @@
 """How well one rate group keeps its time: rate, lateness, execution, overruns, merged ticks."""
 
-from typing import Any
+from enum import StrEnum
+from typing import Any, NamedTuple
 
+WARNING_PERIODS = 1.0
+"A run that is done later than this after it was due has overrun: the next one was due already."
+ERROR_PERIODS = 10.0
+"This late it is a stall; at 1 kHz a fifth of the time after which the firmware opens the gap."
 HORIZON_NS = 5_000_000_000
 "Percentiles cover the time since one to two of these ago."
 SHARES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
@@ -60,6 +65,23 @@ def _upper_edge(index: int) -> int:
     return (part + 33) << (shift + 1)
 
 
+class Grade(StrEnum):
+    """How well time was kept over the horizon."""
+
+    GOOD = "good"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+class _Mark(NamedTuple):
+    """The counters at a turn of the horizon."""
+
+    time_ns: int
+    runs: int
+    overruns: int
+    stalls: int
+
+
 class RateGroup:
     """Timing of one periodic activity. Recording is cheap; a report is built by `refresh`, and only read by others."""
 
@@ -69,13 +91,16 @@ class RateGroup:
         self.runs = 0
         self.merged = 0
         self.overruns = 0
+        self.stalls = 0
+        self.delay_ns = 0
+        "From when the newest run, or the first one it stands for, was due until it was done."
         self.lateness_us = 0.0
         self.exec_us = 0.0
         self._lateness = Histogram()
         self._exec = Histogram()
         self._worst_us = 0.0
-        # runs and start times at the last two turns of the horizon: the rate covers what the percentiles cover
-        self._marks: tuple[tuple[int, int], tuple[int, int]] | None = None
+        # the last two turns of the horizon: rate and grade cover what the percentiles cover
+        self._marks: tuple[_Mark, _Mark] | None = None
         self._newest_ns = 0
         self.report: dict[str, Any] = {}
         self.refresh()
@@ -83,9 +108,9 @@ class RateGroup:
     def record(self, due_ns: int, start_ns: int, end_ns: int, merged: int = 0) -> None:
         """One run that was due, began and ended at these times, and stands for `merged` missed ones too."""
         if self._marks is None:
-            self._marks = ((self.runs, start_ns), (self.runs, start_ns))
-        elif start_ns - self._marks[1][1] > HORIZON_NS:
-            self._marks = (self._marks[1], (self.runs, start_ns))
+            self._marks = (_Mark(start_ns, 0, 0, 0),) * 2
+        elif start_ns - self._marks[1].time_ns > HORIZON_NS:
+            self._marks = (self._marks[1], _Mark(start_ns, self.runs, self.overruns, self.stalls))
             self._lateness.turn()
             self._exec.turn()
         self.lateness_us = (start_ns - due_ns) * 1e-3
@@ -96,23 +121,37 @@ class RateGroup:
         self._newest_ns = start_ns
         self.runs += 1
         self.merged += merged
-        if end_ns - due_ns > self.period_ns:
+        self.delay_ns = end_ns - due_ns + merged * self.period_ns
+        if self.delay_ns > WARNING_PERIODS * self.period_ns:
             self.overruns += 1
+            if self.delay_ns > ERROR_PERIODS * self.period_ns:
+                self.stalls += 1
 
     def rate_hz(self) -> float:
         """Mean rate over the horizon, Hz."""
-        if self._marks is None or self._newest_ns <= self._marks[0][1]:
+        if self._marks is None or self._newest_ns <= self._marks[0].time_ns:
             return 0.0
-        runs, start_ns = self._marks[0]
-        return (self.runs - 1 - runs) / ((self._newest_ns - start_ns) * 1e-9)
+        since = self._marks[0]
+        return (self.runs - 1 - since.runs) / ((self._newest_ns - since.time_ns) * 1e-9)
+
+    def grade(self) -> Grade:
+        """ERROR with a stall within the horizon, WARNING with an overrun."""
+        if self._marks is None:
+            return Grade.GOOD
+        since = self._marks[0]
+        if self.stalls > since.stalls:
+            return Grade.ERROR
+        return Grade.WARNING if self.overruns > since.overruns else Grade.GOOD
 
     def refresh(self) -> None:
         """Builds `report`: counts since the start, percentiles over the horizon."""
         self.report = {
+            "grade": str(self.grade()),
             "hz": round(self.rate_hz(), 2),
             "runs": self.runs,
             "merged": self.merged,
             "overruns": self.overruns,
+            "stalls": self.stalls,
             "lateness_us": self._lateness.summary() | {"worst": round(self._worst_us, 1)},
             "exec_us": self._exec.summary(),
         }

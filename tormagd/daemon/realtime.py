@@ -4,6 +4,7 @@ import ctypes
 import gc
 import logging
 import os
+from concurrent.futures import ThreadPoolExecutor
 
 from tormagd.config import RealTime
 
@@ -15,7 +16,7 @@ log = logging.getLogger(__name__)
 def prepare(settings: RealTime) -> list[str]:
     """Applies the settings to this thread and process; returns what was refused, in plain words.
 
-    FIFO is set on this thread only and reset on fork, so that ZeroMQ's I/O thread and child processes stay ordinary.
+    FIFO is set on this thread only and reset on fork, so that child processes and threads stay ordinary.
     """
     refused = []
     if settings.cpus:
@@ -34,6 +35,24 @@ def prepare(settings: RealTime) -> list[str]:
     for line in refused:
         log.warning("not granted: %s", line)
     return refused
+
+
+def priority_of_threads() -> int:
+    """The FIFO priority that threads begun by this one may take: one below its own; 0 where it or they may have none.
+
+    ZeroMQ's threads ask for it: a setpoint passes through one, and would wait there for whatever else the machine runs.
+    """
+    if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
+        return 0
+    priority = max(os.sched_getparam(0).sched_priority - 1, os.sched_get_priority_min(os.SCHED_FIFO))
+    # tried, because libzmq ends the process where it is refused
+    with ThreadPoolExecutor(1) as pool:
+        try:
+            pool.submit(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(priority)).result()
+        except OSError as error:
+            log.warning("not granted: FIFO priority %d for ZeroMQ's threads: %s", priority, error.strerror)
+            return 0
+    return priority
 
 
 def freeze_garbage() -> None:

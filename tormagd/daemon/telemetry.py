@@ -18,11 +18,12 @@ class TickRow(NamedTuple):
     monotonic_s: float
     plan: int
     setpoint_cf: float | None
-    governed_cf: float
+    governed_cf: float | None
     predicted_cf: float | None
     field_mT: float
     plan_gap_mm: float
     plan_gap_speed_mm_s: float
+    plan_gap_acceleration_mm_s2: float
     plan_time_s: float
     confidence: float
     trim: float
@@ -62,11 +63,12 @@ def tick_row(
         monotonic_s=now_s,
         plan=plan.number,
         setpoint_cf=plan.setpoint_N,
-        governed_cf=plan.governed_N,
+        governed_cf=plan.governed_N if is_driven(state) else None,
         predicted_cf=plan.predicted_N,
         field_mT=plan.field_mT,
         plan_gap_mm=plan.gap_mm,
         plan_gap_speed_mm_s=plan.gap_speed_mm_s,
+        plan_gap_acceleration_mm_s2=plan.gap_acceleration_mm_s2,
         plan_time_s=plan.time_s,
         confidence=plan.confidence,
         trim=trim,
@@ -90,14 +92,21 @@ def tick_row(
     )
 
 
+def is_driven(state: StepState) -> bool:
+    """Whether the device follows the plan, or holds what it followed last."""
+    return state.safety.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED)
+
+
 def limits_held(state: StepState, output: StepOutput, plan: Plan) -> tuple[str, ...]:
     """What holds the force back now; nothing does while the device is not driven."""
-    if state.safety.operating_state in (OperatingState.DISABLED, OperatingState.FAULT):
+    if not is_driven(state):
         return ()
     return tuple(dict.fromkeys((*plan.limits, *output.limits)))
 
 
-def snapshot(row: TickRow, sequence: int, measurement: Measurement | None, age_s: float | None) -> Telemetry:
+def snapshot(
+    row: TickRow, sequence: int, measurement: Measurement | None, is_busy: bool, age_s: float | None
+) -> Telemetry:
     """The telemetry of the newest tick."""
     known = row.left_mm is not None and row.right_mm is not None
     left, right = row.left_mm or 0.0, row.right_mm or 0.0
@@ -107,7 +116,7 @@ def snapshot(row: TickRow, sequence: int, measurement: Measurement | None, age_s
         seq=sequence,
         operating_state=row.operating_state,
         is_homed=measurement is not None and measurement.is_homed,
-        is_busy=measurement is not None and measurement.is_busy,
+        is_busy=is_busy,
         setpoint_cf=row.setpoint_cf,
         governed_cf=row.governed_cf,
         measured_cf=row.measured_cf,

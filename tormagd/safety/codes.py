@@ -22,6 +22,7 @@ class Fault(StrEnum):
     FOLLOWING_ERROR = "FOLLOWING_ERROR"
     NO_MOTION = "NO_MOTION"
     NOT_FINITE = "NOT_FINITE"
+    PLAN_FAILED = "PLAN_FAILED"
     STOPPED = "STOPPED"
     DEVICE_NOT_RUNNING = "DEVICE_NOT_RUNNING"
     DEVICE_COMMAND_TIMEOUT = "DEVICE_COMMAND_TIMEOUT"
@@ -70,6 +71,9 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.NOT_FINITE: Explanation(
         "a number in the loop was not finite", "keep the recording and report it; clear-fault starts afresh"
+    ),
+    Fault.PLAN_FAILED: Explanation(
+        "no gap could be planned: model or search refused a number", "report it with the daemon's log; clear-fault"
     ),
     Fault.STOPPED: Explanation("somebody gave the stop command", "clear-fault when it is safe to go on"),
     Fault.DEVICE_NOT_RUNNING: Explanation(

@@ -87,7 +87,8 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
 def _enable(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
     _refuse_in(state, OperatingState.FAULT, "enable")
     if state.operating_state is not OperatingState.DISABLED:
-        raise RefusedError("already_enabled", f"already {state.operating_state}", "nothing to do")
+        remedy = "tormagctl resume" if state.operating_state is OperatingState.PAUSED else "nothing to do"
+        raise RefusedError("already_enabled", f"already {state.operating_state}", remedy)
     if conditions.device_latched:
         raise RefusedError("device_latched", "the device has latched a fault", "tormagctl clear-fault, then home")
     _refuse_busy(conditions)
@@ -101,7 +102,7 @@ def _enable(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyS
             f"the setpoint is {conditions.requested_N:.2f} N: allowed is at most {conditions.neutral_N:.2f} N",
             "lower the setpoint, enable, then raise it",
         )
-    return state._replace(operating_state=OperatingState.ENABLED)
+    return state._replace(operating_state=OperatingState.ENABLED, clearing_until_s=float("-inf"))
 
 
 def _disable(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
@@ -110,14 +111,18 @@ def _disable(state: SafetyState, now_s: float, conditions: Conditions) -> Safety
 
 
 def _pause(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
+    _refuse_in(state, OperatingState.FAULT, "pause")
     if state.operating_state is not OperatingState.ENABLED:
-        raise RefusedError("not_enabled", f"cannot pause while {state.operating_state}", "tormagctl enable")
+        remedy = "nothing to do" if state.operating_state is OperatingState.PAUSED else "tormagctl enable"
+        raise RefusedError("not_enabled", f"cannot pause while {state.operating_state}", remedy)
     return state._replace(operating_state=OperatingState.PAUSED)
 
 
 def _resume(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
+    _refuse_in(state, OperatingState.FAULT, "resume")
     if state.operating_state is not OperatingState.PAUSED:
-        raise RefusedError("not_paused", f"cannot resume while {state.operating_state}", "tormagctl status")
+        remedy = "nothing to do" if state.operating_state is OperatingState.ENABLED else "tormagctl enable"
+        raise RefusedError("not_paused", f"cannot resume while {state.operating_state}", remedy)
     return state._replace(operating_state=OperatingState.ENABLED)
 
 
@@ -137,14 +142,12 @@ def _stop(state: SafetyState, now_s: float, conditions: Conditions) -> SafetySta
 
 def _clear_fault(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
     _refuse_busy(conditions)
-    cleared = state._replace(
-        operating_state=OperatingState.DISABLED
-        if state.operating_state is OperatingState.FAULT
-        else state.operating_state,
-        faults=(),
-        clearing_until_s=now_s + CLEARING_S,
-    )
-    return cleared.ask(DeviceRequest.CLEAR) if conditions.device_latched else cleared
+    if state.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED):
+        return state  # nothing is latched; what the device latches meanwhile is news, and must not be passed over
+    cleared = state._replace(operating_state=OperatingState.DISABLED, faults=())
+    if not conditions.device_latched:
+        return cleared
+    return cleared._replace(clearing_until_s=now_s + CLEARING_S).ask(DeviceRequest.CLEAR)
 
 
 def _refuse_in(state: SafetyState, forbidden: OperatingState, name: str) -> None:

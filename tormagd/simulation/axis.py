@@ -87,10 +87,13 @@ class Axis:
 
     def step(self, voltage_V: float | None, attraction_N: float) -> None:
         """One time step with that voltage at the motor, or None for an open bridge, and that pull of the magnets."""
+        # twenty times a simulated millisecond: hence local names, and `_lead_of` written out in the second half
+        coupling_Nm_A, impulse_rad_s_Nm = self._coupling_Nm_A, self._impulse_rad_s_Nm
+        speed_rad_s, contact_N = self.speed_rad_s, self.contact_N
         if voltage_V is None:
             self.current_A = current_A = 0.0
         else:
-            settled_A = (voltage_V - self._coupling_Nm_A * self.speed_rad_s) / self._resistance_Ohm
+            settled_A = (voltage_V - coupling_Nm_A * speed_rad_s) / self._resistance_Ohm
             current_A = settled_A + (self.current_A - settled_A) * self._decay
             limit_A = self._current_limit_A
             if current_A > limit_A:
@@ -99,14 +102,14 @@ class Axis:
                 current_A = -limit_A
             self.current_A = current_A
 
-        drive_Nm = self._coupling_Nm_A * current_A
-        contact_N = self.contact_N
-        friction_Nm = self.gear_friction_Nm + self.screw_friction_m * abs(contact_N)
-        transmitted_Nm = abs(drive_Nm) - self.gear_friction_Nm
+        drive_Nm = coupling_Nm_A * current_A
+        gear_friction_Nm, lead_m_rad = self.gear_friction_Nm, self._lead_m_rad
+        friction_Nm = gear_friction_Nm + self.screw_friction_m * abs(contact_N)
+        transmitted_Nm = abs(drive_Nm) - gear_friction_Nm
         if transmitted_Nm > 0.0:
             friction_Nm += self._mesh_loss * transmitted_Nm
-        speed_rad_s = self.speed_rad_s + (drive_Nm - self._lead_m_rad * contact_N) * self._impulse_rad_s_Nm
-        grip_rad_s = friction_Nm * self._impulse_rad_s_Nm
+        speed_rad_s += (drive_Nm - lead_m_rad * contact_N) * impulse_rad_s_Nm
+        grip_rad_s = friction_Nm * impulse_rad_s_Nm
         if speed_rad_s > grip_rad_s:
             speed_rad_s -= grip_rad_s
         elif speed_rad_s < -grip_rad_s:
@@ -114,18 +117,19 @@ class Axis:
         else:
             speed_rad_s = 0.0
         self.speed_rad_s = speed_rad_s
-        self.angle_rad += self._dt_s * speed_rad_s
-        self._carry(attraction_N)
+        self.angle_rad = angle_rad = self.angle_rad + self._dt_s * speed_rad_s
 
-    def _carry(self, attraction_N: float) -> None:
-        """Let the carriage follow the nut: it stands while the guide's drag holds it, else slides to the limit."""
-        nut_m = self._nut_zero_m + self.angle_rad * self._lead_m_rad
-        position_m = self.position_m
-        innermost_m = nut_m - self._lead_of(attraction_N + self.drag_N)
+        # the carriage follows the nut: it stands while the guide's drag holds it, else slides to the limit
+        nut_m = self._nut_zero_m + angle_rad * lead_m_rad
+        position_m, drag_N = self.position_m, self.drag_N
+        backlash_m, stiffness_N_m = self._backlash_m, self._stiffness_N_m
+        inward_N = attraction_N + drag_N
+        innermost_m = nut_m - ((backlash_m if inward_N > 0.0 else -backlash_m) + inward_N / stiffness_N_m)
         if position_m < innermost_m:
             position_m = innermost_m
         else:
-            outermost_m = nut_m - self._lead_of(attraction_N - self.drag_N)
+            outward_N = attraction_N - drag_N
+            outermost_m = nut_m - ((backlash_m if outward_N > 0.0 else -backlash_m) + outward_N / stiffness_N_m)
             if position_m > outermost_m:
                 position_m = outermost_m
         if position_m > self._open_stop_m:
@@ -134,10 +138,10 @@ class Axis:
             position_m = self._closed_stop_m
         self.position_m = position_m
         lead_m = nut_m - position_m
-        if lead_m > self._backlash_m:
-            self.contact_N = self._stiffness_N_m * (lead_m - self._backlash_m)
-        elif lead_m < -self._backlash_m:
-            self.contact_N = self._stiffness_N_m * (lead_m + self._backlash_m)
+        if lead_m > backlash_m:
+            self.contact_N = stiffness_N_m * (lead_m - backlash_m)
+        elif lead_m < -backlash_m:
+            self.contact_N = stiffness_N_m * (lead_m + backlash_m)
         else:
             self.contact_N = 0.0
 

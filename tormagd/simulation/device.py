@@ -14,7 +14,7 @@ from firmware_protocol.codec import FUNCTION, DecodeError, Message, Switches, de
 from firmware_protocol.framing import DELIMITER, FrameDecoder, FramingStatistics, encode_frame
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.faults import Fault
-from tormagd.simulation.firmware import TICK_S, Answer, Firmware, Sensors
+from tormagd.simulation.firmware import NO_SWITCH, OFF, TICK_S, Answer, Firmware, Output, Sensors
 from tormagd.simulation.hand import ROLLER_RADIUS_MM, Hand
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.plant import Plant, Truth
@@ -70,10 +70,14 @@ class MessageDevice:
         self._inbox: deque[Packet] = deque()
         self._answers: deque[tuple[float, Answer]] = deque()
         self._deaf = False
+        self._output: Output = OFF
+        self._voltages_V = (0.0, 0.0)
+        """What the bridges make of `_output` from the supply."""
         self._stuck_left: int | None = None
         self._counts_at_boot = (0, 0)
         self._boot_s = 0.0
         self._ticks = 0
+        self._tick_due_s = TICK_S / self._rate
         self._time_s = 0.0
 
     @property
@@ -92,12 +96,13 @@ class MessageDevice:
         """Let time pass until `now_s`. Raises ValueError for a time before the last one."""
         if not self._time_s <= now_s < math.inf:
             raise ValueError(f"now_s = {now_s}: allowed is from {self._time_s} on")
+        inbox, answers = self._inbox, self._answers
         while (event_s := self.next_event_s) <= now_s:
             self._pass_time(event_s)
-            if self._inbox and self._inbox[0].time_s <= event_s:
-                self._deliver(event_s, self._inbox.popleft())
-            elif self._answers and self._answers[0][0] <= event_s:
-                self._send_answer(event_s, self._answers.popleft()[1])
+            if inbox and inbox[0].time_s <= event_s:
+                self._deliver(event_s, inbox.popleft())
+            elif answers and answers[0][0] <= event_s:
+                self._send_answer(event_s, answers.popleft()[1])
             else:
                 self._tick(event_s)
         self._pass_time(now_s)
@@ -105,19 +110,23 @@ class MessageDevice:
     @property
     def next_event_s(self) -> float:
         """When something will happen next, at the latest the next tick of the firmware."""
-        event_s = self._boot_s + (self._ticks + 1) * TICK_S / self._rate
-        if self._inbox:
-            event_s = min(event_s, self._inbox[0].time_s)
-        if self._answers:
-            event_s = min(event_s, self._answers[0][0])
-        return max(event_s, self._time_s)
+        event_s = self._tick_due_s
+        if self._inbox and (arrival_s := self._inbox[0].time_s) < event_s:
+            event_s = arrival_s
+        if self._answers and (answer_s := self._answers[0][0]) < event_s:
+            event_s = answer_s
+        return event_s if event_s > self._time_s else self._time_s
 
     def _pass_time(self, time_s: float) -> None:
-        left_duty, right_duty, enabled = self.firmware.output
-        powered = enabled and self._supply_V > 0.0
-        self.plant.advance(
-            time_s - self._time_s, self._volts(left_duty), self._volts(right_duty), left_on=powered, right_on=powered
-        )
+        if time_s == self._time_s:
+            return
+        output = self.firmware.output
+        if output is not self._output:
+            self._output = output
+            self._voltages_V = self._volts(output.left_duty), self._volts(output.right_duty)
+        left_V, right_V = self._voltages_V
+        powered = output.enabled and self._supply_V > 0.0
+        self.plant.advance(time_s - self._time_s, left_V, right_V, left_on=powered, right_on=powered)
         self._time_s = time_s
 
     def _volts(self, duty: float) -> float:
@@ -130,6 +139,7 @@ class MessageDevice:
         self._ticks += 1
         while self._faults and self._faults[0].at_s <= time_s:
             self._strike(time_s, self._faults.popleft())
+        self._tick_due_s = self._boot_s + (self._ticks + 1) * TICK_S / self._rate
         status = self.firmware.tick(self._device_time_s(time_s), self._sensors())
         if status is not None:
             self._send(time_s, status)
@@ -160,7 +170,7 @@ class MessageDevice:
     def _sensors(self) -> Sensors:
         plant = self.plant
         left, right = plant.left, plant.right
-        switches = Switches(0)
+        switches = NO_SWITCH
         if left.position_m >= self._home_m:
             switches |= Switches.LEFT_OPEN
         elif left.position_m <= self._closed_m:
@@ -170,16 +180,17 @@ class MessageDevice:
         elif right.position_m <= self._closed_m:
             switches |= Switches.RIGHT_CLOSED
         left_counts, right_counts = self._encoders()
+        left_start, right_start = self._counts_at_boot
         return Sensors(
-            left_counts=left_counts - self._counts_at_boot[0],
-            right_counts=right_counts - self._counts_at_boot[1],
-            left_current_A=left.current_A,
-            right_current_A=right.current_A,
-            force_N=plant.sensed_force_N,
-            handle_counts=math.floor(plant.handle_mm * self._handle_counts_per_mm),
-            switches=switches,
-            supply_V=self._supply_V,
-            temperature_C=plant.element.temperature_C,
+            left_counts - left_start,
+            right_counts - right_start,
+            left.current_A,
+            right.current_A,
+            plant.sensed_force_N,
+            math.floor(plant.handle_mm * self._handle_counts_per_mm),
+            switches,
+            self._supply_V,
+            plant.element.temperature_C,
         )
 
     def _encoders(self) -> tuple[int, int]:

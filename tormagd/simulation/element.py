@@ -43,9 +43,14 @@ class Curve:
     def at(self, x: float) -> float:
         """Value at x; the outermost pieces continue beyond the ends."""
         place = (x - self._start) * self._per_unit
-        index = min(max(int(place), 0), self._last)
-        low = self._values[index]
-        return low + (self._values[index + 1] - low) * (place - index)
+        index = int(place)
+        if index < 0:
+            index = 0
+        elif index > self._last:
+            index = self._last
+        values = self._values
+        low = values[index]
+        return low + (values[index + 1] - low) * (place - index)
 
     @classmethod
     def over_gap(cls, function: Callable[[FloatArray], FloatArray], plant: PlantParameters) -> "Curve":

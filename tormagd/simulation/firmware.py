@@ -45,6 +45,11 @@ MAX_TEMPERATURE_C = 60.0
 VERSION = (1, 0)
 SERIAL_NUMBER = 1
 
+# Operations on flags make new ones, at a microsecond each: what is needed in every tick is made here
+NO_SWITCH = Switches(0)
+CLOSED_SWITCHES = Switches.LEFT_CLOSED | Switches.RIGHT_CLOSED
+NO_FAULT = DeviceFault(0)
+
 MOTORS_OFF_MODES = (DeviceMode.IDLE, DeviceMode.LATCHED)
 LASTING_CAUSES = DeviceFault.SUPPLY | DeviceFault.TEMPERATURE
 
@@ -197,13 +202,13 @@ class Firmware:
         return None if self._ticks % STATUS_TICKS else self.status(sensors)
 
     def _tick_run(self, time_s: float, sensors: Sensors) -> None:
-        left, right = self._carriages(sensors)
-        fault = self._lasting_causes(sensors) | self._overcurrent(time_s, sensors)
+        left_mm, right_mm = self._positions_mm(sensors)
+        fault = self._causes(time_s, sensors)
         if time_s - self._drive_s > COMMAND_TIMEOUT_S:
             fault |= DeviceFault.COMMAND_TIMEOUT
-        if sensors.switches & (Switches.LEFT_CLOSED | Switches.RIGHT_CLOSED):
+        if sensors.switches and sensors.switches & CLOSED_SWITCHES:
             fault |= DeviceFault.END_STOP
-        if abs(left.position_mm - right.position_mm) > MAX_SKEW_MM:
+        if abs(left_mm - right_mm) > MAX_SKEW_MM:
             fault |= DeviceFault.SKEW
         if fault:
             self._fail(time_s, fault, sensors)
@@ -214,7 +219,7 @@ class Firmware:
         motion = self._motion
         assert motion is not None, "HOMING and RETRACTING always have their motion"
         homing = isinstance(motion, Homing)
-        if homing and (causes := self._lasting_causes(sensors) | self._overcurrent(time_s, sensors)):
+        if homing and (causes := self._causes(time_s, sensors)):
             self._fail(time_s, causes, sensors)
             return
         if isinstance(motion, Retraction) and not motion.blocked and self._slip_mm(time_s, sensors) > MAX_SLIP_MM:
@@ -239,12 +244,15 @@ class Firmware:
         if self._slip_mm(time_s, sensors) > MAX_SLIP_MM:
             self._fail(time_s, DeviceFault.UNCOMMANDED_MOTION, sensors)
             return
-        if new := self._lasting_causes(sensors) & ~self.faults:
+        causes = self._lasting_causes(sensors)
+        if causes and (new := causes & ~self.faults):
             self._fail(time_s, new, sensors)
 
     @staticmethod
     def _bounded(output: Output, sensors: Sensors) -> Output:
         """A carriage at its open switch is not driven on into the stop."""
+        if not sensors.switches:
+            return output
         return Output(
             min(output.left_duty, 0.0) if Switches.LEFT_OPEN in sensors.switches else output.left_duty,
             min(output.right_duty, 0.0) if Switches.RIGHT_OPEN in sensors.switches else output.right_duty,
@@ -290,19 +298,22 @@ class Firmware:
 
     def _lasting_causes(self, sensors: Sensors) -> DeviceFault:
         """Faults whose cause is there now, whatever the device does."""
-        causes = DeviceFault(0)
+        causes = NO_FAULT
         if not SUPPLY_RANGE_V[0] <= sensors.supply_V <= SUPPLY_RANGE_V[1]:
             causes |= DeviceFault.SUPPLY
         if sensors.temperature_C > MAX_TEMPERATURE_C:
             causes |= DeviceFault.TEMPERATURE
         return causes
 
-    def _overcurrent(self, time_s: float, sensors: Sensors) -> DeviceFault:
-        """OVERCURRENT once a motor's current has been over the level without a break for too long."""
-        for side, current_A in enumerate((sensors.left_current_A, sensors.right_current_A)):
-            if abs(current_A) < self._overcurrent_A:
-                self._calm_s[side] = time_s
-        return DeviceFault.OVERCURRENT if time_s - min(self._calm_s) > OVERCURRENT_S else DeviceFault(0)
+    def _causes(self, time_s: float, sensors: Sensors) -> DeviceFault:
+        """The lasting ones, and OVERCURRENT once a motor has drawn more than the level for too long without a break."""
+        calm_s = self._calm_s
+        if abs(sensors.left_current_A) < self._overcurrent_A:
+            calm_s[0] = time_s
+        if abs(sensors.right_current_A) < self._overcurrent_A:
+            calm_s[1] = time_s
+        causes = self._lasting_causes(sensors)
+        return causes | DeviceFault.OVERCURRENT if time_s - min(calm_s) > OVERCURRENT_S else causes
 
     def _slip_mm(self, time_s: float, sensors: Sensors) -> float:
         """How far a carriage has moved from where it rested; while opening, inward from where it had come to."""
@@ -315,19 +326,16 @@ class Firmware:
             self._watch_counts = max(counts[0], self._watch_counts[0]), max(counts[1], self._watch_counts[1])
         return max(abs(now - then) for now, then in zip(counts, self._watch_counts, strict=True)) * self._mm_per_count
 
-    def _carriages(self, sensors: Sensors) -> tuple[Carriage, Carriage]:
+    def _positions_mm(self, sensors: Sensors) -> tuple[float, float]:
         left_mm, right_mm = self._zeros_mm
+        mm_per_count = self._mm_per_count
+        return sensors.left_counts * mm_per_count - left_mm, sensors.right_counts * mm_per_count - right_mm
+
+    def _carriages(self, sensors: Sensors) -> tuple[Carriage, Carriage]:
+        left_mm, right_mm = self._positions_mm(sensors)
         return (
-            Carriage(
-                sensors.left_counts * self._mm_per_count - left_mm,
-                Switches.LEFT_OPEN in sensors.switches,
-                sensors.left_current_A,
-            ),
-            Carriage(
-                sensors.right_counts * self._mm_per_count - right_mm,
-                Switches.RIGHT_OPEN in sensors.switches,
-                sensors.right_current_A,
-            ),
+            Carriage(left_mm, Switches.LEFT_OPEN in sensors.switches, sensors.left_current_A),
+            Carriage(right_mm, Switches.RIGHT_OPEN in sensors.switches, sensors.right_current_A),
         )
 
     # -- reports -------------------------------------------------------------------------------------------------
@@ -340,7 +348,7 @@ class Firmware:
         """Mode, switches, faults, and what was last accepted (0 before anything was)."""
         return Status(
             mode=self.mode,
-            switches=sensors.switches | (Switches.HOMED if self.homed else Switches(0)),
+            switches=sensors.switches | Switches.HOMED if self.homed else sensors.switches,
             faults=self.faults,
             temperature_C=sensors.temperature_C,
             supply_V=sensors.supply_V,
@@ -350,10 +358,10 @@ class Firmware:
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
         """State and Sense of that moment."""
-        left, right = self._carriages(sensors)
+        left_mm, right_mm = self._positions_mm(sensors)
         self._state_counter = (self._state_counter + 1) % 256
         return (
-            State(left.position_mm, right.position_mm, time_s, self._state_counter),
+            State(left_mm, right_mm, time_s, self._state_counter),
             Sense(
                 sensors.left_current_A,
                 sensors.right_current_A,

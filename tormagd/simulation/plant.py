@@ -115,23 +115,22 @@ class Plant:
 
         Raises ValueError for a time step that is negative or anything that is not finite.
         """
-        if not (0.0 <= dt_s < math.inf and math.isfinite(left_V) and math.isfinite(right_V)):
+        if not (0.0 <= dt_s < math.inf and abs(left_V) < math.inf and abs(right_V) < math.inf):
             raise ValueError(f"dt_s = {dt_s}, left_V = {left_V}, right_V = {right_V}: allowed are finite, dt_s >= 0")
         self._target_s += dt_s
         due = int(self._target_s / self._substep_s + _ROUNDING)
         left_drive = left_V if left_on else None
         right_drive = right_V if right_on else None
-        left, right, attraction = self.left, self.right, self._attraction
-        while self._substeps < due:
-            pull_N = attraction.at((left.position_m + right.position_m) * 1e3)
+        left, right, pull_at, per_element = self.left, self.right, self._attraction.at, self._substeps_per_element
+        for substep in range(self._substeps + 1, due + 1):
+            pull_N = pull_at((left.position_m + right.position_m) * 1e3)
             left.step(left_drive, pull_N)
             right.step(right_drive, pull_N)
-            self._substeps += 1
-            if self._substeps % self._substeps_per_element == 0:
-                self._advance_element()
+            if substep % per_element == 0:
+                self._advance_element(substep * self._substep_s)
+        self._substeps = due
 
-    def _advance_element(self) -> None:
-        time_s = self.time_s
+    def _advance_element(self, time_s: float) -> None:
         handle_mm = self._hand.position_mm(time_s)
         self.handle_mm_s = (handle_mm - self.handle_mm) / ELEMENT_STEP_S
         self.handle_mm = handle_mm

@@ -1,0 +1,120 @@
+"""Who is to blame for a late tick, on a clock that the test moves."""
+
+from collections.abc import Callable
+
+from tormagd.daemon.callbacks import KERNEL, NEWS_NS, Callbacks, Delay
+
+MS = 1_000_000
+
+
+class Loop:
+    """An event loop whose descriptors are readable when the test says so; each callback takes its time."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+        self.readers: dict[int, Callable[[], None]] = {}
+
+    def clock_ns(self) -> int:
+        return self.now_ns
+
+    def add_reader(self, fd: int, callback: Callable[[], None]) -> None:
+        self.readers[fd] = callback
+
+    def remove_reader(self, fd: int) -> None:
+        del self.readers[fd]
+
+    def run_for(self, duration_ns: int) -> None:
+        self.now_ns += duration_ns
+
+
+class Slow:
+    """Something with a callback."""
+
+    def __init__(self, loop: Loop, takes_ns: int) -> None:
+        self._loop, self._takes_ns = loop, takes_ns
+
+    def receive(self) -> None:
+        self._loop.run_for(self._takes_ns)
+
+
+def test_the_callback_that_ran_into_the_tick_is_named() -> None:
+    loop = Loop()
+    callbacks = Callbacks(loop, loop.clock_ns)
+    callbacks.add_reader(1, Slow(loop, 3 * MS).receive)
+    loop.run_for(9 * MS)
+    loop.readers[1]()
+    # due at 10 ms, begun when the callback ended at 12 ms
+    callbacks.ran("tick", 12 * MS, 12 * MS + 1)
+    assert callbacks.blame(10 * MS, 12 * MS + 1) == Delay(2 * MS + 1, "Slow.receive", 2 * MS)
+    assert callbacks.blamed == {"Slow.receive": 1}
+
+
+def test_what_a_callback_took_before_the_tick_was_due_does_not_count() -> None:
+    loop = Loop()
+    callbacks = Callbacks(loop, loop.clock_ns)
+    callbacks.ran("long, but before", 0, 9 * MS)
+    callbacks.ran("short", 10 * MS, 11 * MS)
+    callbacks.ran("tick", 11 * MS, 13 * MS)
+    assert callbacks.blame(10 * MS, 13 * MS) == Delay(3 * MS, "tick", 2 * MS)
+
+
+def test_many_short_runs_of_one_callback_add_up() -> None:
+    loop = Loop()
+    callbacks = Callbacks(loop, loop.clock_ns)
+    for start in range(10, 18, 2):
+        callbacks.ran("often", start * MS, (start + 1) * MS)
+    callbacks.ran("once", 18 * MS, 21 * MS)
+    assert callbacks.blame(10 * MS, 21 * MS) == Delay(11 * MS, "often", 4 * MS)
+
+
+def test_where_nothing_of_ours_ran_it_was_the_kernel() -> None:
+    loop = Loop()
+    callbacks = Callbacks(loop, loop.clock_ns)
+    callbacks.ran("tick", 14 * MS, 15 * MS)
+    assert callbacks.blame(10 * MS, 15 * MS) == Delay(5 * MS, KERNEL, 4 * MS)
+
+
+def test_a_tick_in_time_leaves_nothing_to_the_next_and_no_news() -> None:
+    loop = Loop()
+    callbacks = Callbacks(loop, loop.clock_ns)
+    callbacks.ran("earlier", 0, 20 * MS)
+    callbacks.forget()
+    assert callbacks.news() is None
+    callbacks.ran("tick", 19 * MS, 20 * MS)
+    assert callbacks.blame(10 * MS, 20 * MS).culprit == KERNEL
+    # and a late one leaves nothing to the one after it
+    assert callbacks.blame(10 * MS, 20 * MS) == Delay(10 * MS, KERNEL, 10 * MS)
+
+
+def test_one_log_line_in_a_while_with_the_worst_of_all() -> None:
+    loop = Loop()
+    callbacks = Callbacks(loop, loop.clock_ns)
+    callbacks.ran("tick", 0, 2 * MS)
+    callbacks.blame(0, 2 * MS)
+    first = callbacks.news()
+    assert first is not None
+    assert str(first) == (
+        "control ticks that were late: 1, the worst done 2.0 ms after it was due; 2.0 ms of that went to tick"
+    )
+    assert callbacks.news() is None
+    for took in (3, 7, 5):
+        callbacks.ran(f"reader {took}", 0, took * MS)
+        callbacks.blame(0, took * MS)
+    loop.run_for(NEWS_NS - 1)
+    assert callbacks.news() is None
+    loop.run_for(1)
+    second = callbacks.news()
+    assert second is not None
+    assert second.ticks == 3
+    assert second.worst == Delay(7 * MS, "reader 7", 7 * MS)
+    loop.run_for(NEWS_NS)
+    assert callbacks.news() is None
+    assert callbacks.blamed.total() == 4
+
+
+def test_a_descriptor_that_is_no_longer_watched_is_taken_from_the_loop() -> None:
+    loop = Loop()
+    callbacks = Callbacks(loop, loop.clock_ns)
+    callbacks.add_reader(5, Slow(loop, 1).receive)
+    callbacks.remove_reader(5)
+    assert loop.readers == {}

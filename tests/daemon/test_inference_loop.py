@@ -1,0 +1,155 @@
+"""When plans are made: at once where the slack allows, right after the tick where not, and at the latest when due."""
+
+import random
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tormagd.control.governor import GovernorState, TimedSetpoint
+from tormagd.control.plan import Plan, PlanState
+from tormagd.daemon.endpoint import SetpointInbox
+from tormagd.daemon.inference_loop import InferenceLoop
+from tormagd.physics.errors import DomainError
+
+US = 1_000
+TICK_NS = 1_000 * US
+DUE_NS = 4 * TICK_NS
+
+
+class Rig:
+    """An inference loop whose plans take as long as the test says, on a clock that moves with them."""
+
+    def __init__(self) -> None:
+        self.now_ns = 1_000 * TICK_NS
+        self.plan_ns = 60 * US
+        self.has_arrived = False
+        self.planned_ns: list[int] = []
+        planner: Any = SimpleNamespace(start=lambda now_s: None, plan=self.plan)
+        endpoint: Any = SimpleNamespace(drain_setpoints=self.drain, inbox=SimpleNamespace(newest=None))
+        self.loop = InferenceLoop(planner, endpoint, DUE_NS, 0.0, lambda: self.now_ns, on_failure=pytest.fail)
+
+    def plan(self, *_arguments: Any) -> None:
+        self.planned_ns.append(self.now_ns)
+        self.now_ns += self.plan_ns
+
+    def drain(self, _now_s: float) -> bool:
+        arrived, self.has_arrived = self.has_arrived, False
+        return arrived
+
+    def setpoint(self, at_ns: int, next_tick_ns: int) -> None:
+        """One arrives, and the event loop says so."""
+        self.now_ns, self.has_arrived = at_ns, True
+        self.loop.receive(None, next_tick_ns)
+
+    def learn(self, times: int) -> None:
+        """So many plans with slack for each."""
+        for _ in range(times):
+            self.setpoint(self.now_ns, self.now_ns + TICK_NS)
+        self.planned_ns.clear()
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+def test_a_setpoint_is_planned_at_once_where_the_slack_allows(rig: Rig) -> None:
+    start_ns = rig.now_ns
+    rig.setpoint(start_ns + 100 * US, start_ns + TICK_NS)
+    assert rig.planned_ns == [start_ns + 100 * US]
+
+
+def test_one_that_comes_too_late_is_planned_right_after_the_tick_and_once(rig: Rig) -> None:
+    rig.learn(400)
+    start_ns = rig.now_ns
+    rig.setpoint(start_ns, start_ns + 50 * US)
+    assert rig.planned_ns == []
+    rig.now_ns = start_ns + 150 * US
+    rig.loop.after_tick(None)
+    assert rig.planned_ns == [start_ns + 150 * US]
+    rig.loop.after_tick(None)
+    assert len(rig.planned_ns) == 1
+    assert rig.loop.timing.lateness_us == pytest.approx(150.0)
+
+
+def test_one_that_no_descriptor_told_of_is_found_after_the_tick(rig: Rig) -> None:
+    rig.has_arrived = True
+    start_ns = rig.now_ns
+    rig.loop.after_tick(None)
+    assert rig.planned_ns == [start_ns]
+
+
+def test_without_setpoints_it_plans_when_due_and_never_chases_what_it_missed(rig: Rig) -> None:
+    start_ns = rig.now_ns
+    # the ticks end at varying times
+    after_ns = [tick * TICK_NS + (150 + 7 * tick % 80) * US for tick in range(402)]
+    for time_ns in after_ns:
+        rig.now_ns = start_ns + time_ns
+        rig.loop.after_tick(None)
+    assert len(rig.planned_ns) == 100
+    rig.planned_ns.clear()
+    rig.now_ns += 60 * TICK_NS
+    for _ in range(3):
+        rig.loop.after_tick(None)
+    assert len(rig.planned_ns) == 1
+
+
+@pytest.mark.parametrize("plan_us", [60, 300])
+def test_the_slack_that_is_asked_for_follows_what_plans_take(rig: Rig, plan_us: int) -> None:
+    rig.plan_ns = plan_us * US
+    rig.learn(400)
+    rig.setpoint(rig.now_ns, rig.now_ns + round(0.98 * plan_us * US))
+    assert rig.planned_ns == []
+    rig.setpoint(rig.now_ns, rig.now_ns + round(1.12 * plan_us * US))
+    assert len(rig.planned_ns) == 1
+
+
+def test_of_plans_that_vary_few_run_into_the_tick(rig: Rig) -> None:
+    varied = random.Random(1)
+    into = planned = 0
+    for _ in range(4_000):
+        rig.planned_ns.clear()
+        rig.plan_ns = round(varied.gauss(100.0, 20.0)) * US
+        tick_ns = rig.now_ns + round(varied.uniform(60.0, 250.0)) * US
+        rig.setpoint(rig.now_ns, tick_ns)
+        planned += len(rig.planned_ns)
+        into += rig.now_ns > tick_ns
+        rig.loop.after_tick(None)
+    assert planned > 2_000
+    assert into / planned < 0.04
+
+
+def test_one_interrupted_plan_does_not_keep_the_slack_from_the_next(rig: Rig) -> None:
+    rig.learn(400)
+    rig.plan_ns = 20_000 * US
+    rig.setpoint(rig.now_ns, rig.now_ns + TICK_NS)
+    rig.plan_ns = 60 * US
+    rig.planned_ns.clear()
+    rig.setpoint(rig.now_ns, rig.now_ns + 75 * US)
+    assert len(rig.planned_ns) == 1
+
+
+@pytest.mark.parametrize("error", [DomainError("displacement_mm", 1e10, "less"), ZeroDivisionError(), RuntimeError()])
+def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on(rig: Rig, error: Exception) -> None:
+    """The one that makes planning fail would make it fail again and again."""
+    inbox = SetpointInbox()
+    failures: list[None] = []
+
+    def plan(state: PlanState, now_s: float, setpoint: TimedSetpoint | None, _estimate: object) -> PlanState:
+        if setpoint is not None:
+            raise error
+        return state._replace(plan=state.plan._replace(number=state.plan.number + 1))
+
+    resting = Plan(0, 0.0, None, None, 0.5, None, 50.0, 95.0, 0.0, 1.0, ())
+    planner: Any = SimpleNamespace(start=lambda now_s: PlanState(GovernorState(now_s, 0.5), resting), plan=plan)
+    endpoint: Any = SimpleNamespace(drain_setpoints=rig.drain, inbox=inbox)
+    loop = InferenceLoop(planner, endpoint, DUE_NS, 0.0, lambda: rig.now_ns, on_failure=lambda: failures.append(None))
+    inbox.newest = TimedSetpoint(1.0, 0.0, 0.1)
+    rig.has_arrived = True
+    loop.after_tick(None)
+    assert (len(failures), inbox.newest, inbox.refused, loop.state.plan.number) == (1, None, 1, 1)
+    assert "no gap could be planned" in str(inbox.last_refusal)
+    rig.has_arrived = True
+    loop.after_tick(None)
+    assert (len(failures), inbox.refused, loop.state.plan.number) == (1, 1, 2)

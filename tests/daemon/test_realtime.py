@@ -1,0 +1,56 @@
+"""What the kernel is asked for: granted or a plain warning, never a failure."""
+
+import ctypes
+import os
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tormagd.config import RealTime
+from tormagd.daemon import realtime
+
+
+def refuse(*_arguments: Any) -> None:
+    raise PermissionError(1, "Operation not permitted")
+
+
+def test_nothing_asked_for_is_nothing_refused() -> None:
+    assert realtime.prepare(RealTime()) == []
+
+
+def test_each_refusal_names_its_setting_and_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(os, "sched_setaffinity", refuse)
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(mlockall=lambda flags: -1))
+    refused = realtime.prepare(RealTime(fifo_priority=40, cpus=(0,), lock_memory=True))
+    assert [line.split(":")[0] for line in refused] == [
+        "realtime.cpus = [0]",
+        "realtime.fifo_priority = 40",
+        "realtime.lock_memory",
+    ]
+    assert all("Operation not permitted" in line for line in refused[:2])
+
+
+def test_an_ordinary_thread_gives_its_threads_no_priority() -> None:
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+    assert realtime.priority_of_threads() == 0
+
+
+@pytest.mark.parametrize(("own", "theirs"), [(50, 49), (2, 1), (1, 1)])
+def test_threads_come_right_below_their_beginner(monkeypatch: pytest.MonkeyPatch, own: int, theirs: int) -> None:
+    asked: list[tuple[int, int]] = []
+    monkeypatch.setattr(os, "sched_getscheduler", lambda pid: os.SCHED_FIFO | os.SCHED_RESET_ON_FORK)
+    monkeypatch.setattr(os, "sched_getparam", lambda pid: os.sched_param(own))
+    monkeypatch.setattr(
+        os, "sched_setscheduler", lambda pid, policy, param: asked.append((policy, param.sched_priority))
+    )
+    assert realtime.priority_of_threads() == theirs
+    assert asked == [(os.SCHED_FIFO, theirs)]
+
+
+def test_threads_that_may_not_have_it_stay_ordinary(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getscheduler", lambda pid: os.SCHED_FIFO)
+    monkeypatch.setattr(os, "sched_getparam", lambda pid: os.sched_param(50))
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    assert realtime.priority_of_threads() == 0

@@ -1,0 +1,126 @@
+"""The daemon's own event loop without a device: whatever becomes of planning, it can be seen and stopped."""
+
+import asyncio
+import gc
+import signal
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+import zmq.asyncio
+
+from tormagd.config import Config, Endpoints, RealTime
+from tormagd.control.core import Core, build_core
+from tormagd.control.plan import PlanState
+from tormagd.daemon import notify
+from tormagd.daemon.daemon import Daemon
+from tormagd.hardware.backend import Backend, BackendError
+from tormagd.messages import VERSION, Reply, Request, decode, encode
+from tormagd.physics.errors import DomainError
+
+PATIENCE_S = 20.0
+WATCHDOG_MS = 100.0
+Command = Callable[[str], Awaitable[dict[str, Any]]]
+
+
+@pytest.fixture(scope="module")
+def core() -> Core:
+    return build_core(Config())
+
+
+@pytest.fixture(autouse=True)
+def thawed() -> Iterator[None]:
+    """The daemon takes what lives out of the collector's reach, for good."""
+    yield
+    gc.unfreeze()
+
+
+class FailingPlanner:
+    """Plans as the core's does, until its error is set."""
+
+    def __init__(self, core: Core) -> None:
+        self._planner = core.planner
+        self.portrait, self.start = core.planner.portrait, core.planner.start
+        self.error: Exception | None = None
+
+    def plan(self, *arguments: Any) -> PlanState:
+        if self.error is not None:
+            raise self.error
+        return self._planner.plan(*arguments)
+
+
+def no_device(_device: Any) -> Backend:
+    raise BackendError("no such port", "plug it in")
+
+
+def run(core: Core, folder: Path, operate: Callable[[Command, FailingPlanner], Awaitable[None]]) -> None:
+    """A daemon that has no device, for as long as `operate` takes."""
+    planner = FailingPlanner(core)
+    addresses = {name: f"ipc://{folder}/{name}" for name in ("setpoint", "telemetry", "control", "recording")}
+    config = Config(endpoints=Endpoints(**addresses), realtime=RealTime(watchdog_ms=WATCHDOG_MS))
+
+    async def both() -> None:
+        made: Any = core._replace(planner=planner)  # type: ignore[arg-type]
+        running = asyncio.create_task(Daemon(config, made, no_device, []).run())
+        with zmq.asyncio.Context() as context, context.socket(zmq.DEALER) as client:
+            client.linger = 0
+            client.connect(addresses["control"])
+
+            async def command(name: str) -> dict[str, Any]:
+                await client.send(encode(Request(v=VERSION, id=1, command=name)))
+                reply = decode(await asyncio.wait_for(client.recv(), PATIENCE_S), Reply)
+                assert reply.ok, reply.error
+                return reply.result or {}
+
+            try:
+                await operate(command, planner)
+            finally:
+                signal.raise_signal(signal.SIGTERM)
+                await running
+
+    asyncio.run(both())
+
+
+def test_stop_without_a_device_says_that_there_is_none(core: Core, tmp_path: Path) -> None:
+    async def operate(command: Command, _planner: FailingPlanner) -> None:
+        assert await command("stop") == {"operating_state": "FAULT", "is_connected": False}
+        status = await command("status")
+        assert (status["faults"], status["governed_cf"], status["is_busy"]) == (["STOPPED"], None, False)
+
+    run(core, tmp_path, operate)
+
+
+@pytest.mark.parametrize("error", [DomainError("displacement_mm", 1e10, "less"), TypeError("nobody expects this")])
+def test_a_daemon_that_cannot_plan_can_be_seen_and_stopped(core: Core, tmp_path: Path, error: Exception) -> None:
+    async def operate(command: Command, planner: FailingPlanner) -> None:
+        planner.error = error
+        first = await command("status")
+        while (status := await command("status"))["seq"] < first["seq"] + 3:
+            assert ("PLAN_FAILED" in status["faults"]) >= ("PLAN_FAILED" in first["faults"])
+        assert ("PLAN_FAILED" in status["faults"]) == isinstance(error, DomainError)
+        await command("stop")
+        assert "STOPPED" in (await command("status"))["faults"]
+
+    run(core, tmp_path, operate)
+
+
+def test_the_watchdog_is_fed_while_plans_are_fresh(core: Core, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    notified: list[str] = []
+    monkeypatch.setattr(notify, "notify", notified.append)
+
+    async def operate(command: Command, planner: FailingPlanner) -> None:
+        while "WATCHDOG=1" not in notified:
+            await command("status")
+        planner.error = TypeError("nobody expects this")
+        broken_ns = (await command("status"))["t_ns"]
+        while (await command("status"))["t_ns"] < broken_ns + 2e6 * WATCHDOG_MS:
+            pass
+        notified.clear()
+        newest = (await command("status"))["seq"]
+        while (await command("status"))["seq"] < newest + 5:
+            pass
+        assert notified == []
+
+    run(core, tmp_path, operate)

@@ -1,0 +1,52 @@
+"""`tormagctl calibrate` over real processes: a model of the (simulated) insert, and an interrupted run."""
+
+import json
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from tormagd.learning.dataset import read_csv
+from tormagd.learning.model_file import load_model
+
+
+def command(rig, *arguments):
+    """tormagctl on this rig's daemon, patient because the machine may be busy."""
+    program = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(rig.config), "--wait", "20", "--json"]
+    return [*program, "calibrate", "--yes", *arguments]
+
+
+def test_a_sweep_becomes_a_model_that_says_what_it_is(rig, tmp_path):
+    out, data = tmp_path / "model.safetensors", tmp_path / "training.csv"
+    arguments = ("--insert", "MRE-50-40", "--out", str(out), "--csv", str(data), "--rates", "1.0,1.4,1.0")
+    done = subprocess.run(command(rig, *arguments), capture_output=True, text=True, timeout=110, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    metrics = json.loads(done.stdout)["result"]["metrics"]
+    assert done.stderr.count("turn the handle") == 3
+    assert metrics["judged_r2"] > 0.97
+    assert metrics["noise_mae_N"] == pytest.approx(0.008, rel=0.25)  # sample 1: sd 10 mN
+    model = load_model(out, element="torque", insert="MRE-50-40")
+    assert model.metadata.metrics == metrics
+    assert model.metadata.training_data_sha256 == read_csv(data).sha256()
+    low, high = model.field_range_mT
+    assert low < 320.0
+    assert high > 480.0
+    rig.until(lambda: (rig.status()["gap_mm"] or 0.0) > 94.0, "the gap is open")
+    assert rig.status()["operating_state"] == "DISABLED"
+
+
+def test_an_interrupt_opens_the_gap_and_leaves_no_file(rig, tmp_path):
+    out = tmp_path / "log.csv"
+    running = subprocess.Popen(command(rig, "--motors", "--out", str(out)), stdout=subprocess.PIPE, text=True)
+    try:
+        rig.until(lambda: (rig.telemetry().gap_mm or 95.0) < 90.0, "the carriages move")
+        running.send_signal(signal.SIGINT)
+        printed, _ = running.communicate(timeout=30)
+    finally:
+        running.kill()
+    assert running.returncode == 1
+    assert json.loads(printed)["error"]["code"] == "interrupted"
+    assert not out.exists()
+    assert rig.status()["operating_state"] == "DISABLED"
+    rig.until(lambda: (rig.status()["gap_mm"] or 0.0) > 94.0, "the gap is open")

@@ -1,0 +1,114 @@
+"""The file of an `ipc://` socket: one process at a time has it, and nothing but a socket is ever taken away for it."""
+
+import contextlib
+import fcntl
+import os
+import socket
+import stat
+from pathlib import Path
+
+BACKLOG = 100
+_LOCK_FLAGS = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+
+
+class SocketFile:
+    """A listening socket with its path. Raises OSError saying what is in the way.
+
+    libzmq itself takes a path away from whoever listens there, or whatever lies there, without a word; so the socket is
+    made here and handed over (ZMQ_USE_FD). A lock on `PATH.lock` keeps others out until the process ends, however it
+    ends; what a killed one leaves behind is replaced.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._lock_path = path, path.with_name(f"{path.name}.lock")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OSError(f"the directory {path.parent} cannot be made: {error.filename}: {error.strerror}") from error
+        self._lock = _locked(self._lock_path)
+        try:
+            self._listener = _listening(path)
+        except OSError:
+            self._unlock()
+            raise
+        self._identity = _identity(path)
+
+    def detach(self) -> int:
+        """The listening descriptor, which is the caller's from now on."""
+        return self._listener.detach()
+
+    def close(self) -> None:
+        """Takes path and lock away, unless somebody has put others in their place."""
+        self._listener.close()
+        if self._identity is not None and _identity(self._path) == self._identity:
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+        self._unlock()
+
+    def _unlock(self) -> None:
+        held = os.fstat(self._lock)
+        # while it is held: whoever opened it before finds that its name has gone, and tries again
+        if _identity(self._lock_path) == (held.st_dev, held.st_ino):
+            with contextlib.suppress(OSError):
+                self._lock_path.unlink()
+        os.close(self._lock)
+
+
+def ipc_path(address: str) -> Path | None:
+    """The path in an address; None where it has none: `ipc://@name` is a name without a file."""
+    if not address.startswith("ipc://") or address.startswith("ipc://@"):
+        return None
+    return Path(address.removeprefix("ipc://"))
+
+
+def _locked(path: Path) -> int:
+    """A descriptor that holds the lock, with our process number in the file."""
+    while True:
+        try:
+            descriptor = os.open(path, _LOCK_FLAGS, 0o660)
+        except OSError as error:
+            raise OSError(f"{path} cannot be opened: {error.strerror}") from error
+        try:
+            _lock(path, descriptor)
+        except OSError:
+            os.close(descriptor)
+            raise
+        held = os.fstat(descriptor)
+        if _identity(path) == (held.st_dev, held.st_ino):
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+            return descriptor
+        os.close(descriptor)  # its owner ended, and took it away, between our opening and our locking it
+
+
+def _lock(path: Path, descriptor: int) -> None:
+    content = os.pread(descriptor, 32, 0).decode(errors="replace").strip()
+    if content and not content.isdecimal():
+        raise OSError(f"{path} is not a lock of this program; it is left alone: name another path")
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise OSError(f"already running, pid {content or 'not known'}") from error
+
+
+def _listening(path: Path) -> socket.socket:
+    if _identity(path) is not None and not stat.S_ISSOCK(path.lstat().st_mode):
+        raise OSError(f"{path} is there and not a socket; it is left alone: name another path")
+    made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+    try:
+        path.unlink(missing_ok=True)  # nobody has the lock: it is what a killed process left behind
+        made.bind(str(path))
+        made.listen(BACKLOG)
+    except OSError as error:
+        made.close()
+        raise OSError(f"{path} cannot be bound: {error.strerror or error}") from error
+    return made
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Which file is there; None where none is."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
