@@ -317,13 +317,16 @@ def print_summary(result: Tracking, shown: Shown, rehearsals: list[Rehearsal], l
     """The figures, as a table."""
     control, inference = shown.status["rates"]["control"], shown.status["rates"]["inference"]
     print(f"\nforce asked {LEAST_N}..{MOST_N} N (sd {result.reference_sd_N * 1e3:.0f} mN), rendered by the plant:")
-    print(f"  {'':46s} {'RMS':>8s} {'worst':>8s}  variance accounted for")
-    print(f"  {'real time, plant sample 1':46s} {numbers(result)}")
+    rows = {"real time, plant sample 1": numbers(result)}
     for rehearsal in rehearsals:
         line = numbers(scored(rehearsal.time_s, rehearsal.asked_N, rehearsal.rendered_N))
         if rehearsal.case.hand != "steady":
-            line = "a passive brake: see the picture for what the hand feels"
-        print(f"  {'virtual time, ' + rehearsal.case.label:46s} {line}")
+            line = "  (a brake: see the picture)"
+        rows[f"virtual time, {rehearsal.case.label}"] = line
+    width = max(map(len, rows))
+    print(f"  {'':{width}s} {'RMS':>8s} {'worst':>8s}  variance accounted for")
+    for label, line in rows.items():
+        print(f"  {label:{width}s} {line}")
     late, spent = control["lateness_us"], control["exec_us"]
     print(
         f"control    {control['hz']:7.1f} Hz  late p50 {late['p50']:.0f} p99 {late['p99']:.0f} us, "

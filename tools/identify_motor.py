@@ -1,75 +1,58 @@
 """Identifies a motor and its screw from a log: mass, friction, offset, delay, with 95% confidence.
 
-The model is inverse dynamics, linear in what is sought (Gautier and Khalil):
+Reads the motor log CSV (`t_s,input_V,position_mm`, optionally `current_A`) that `tormagctl calibrate --motors` writes,
+or the EMPS benchmark's .mat file, which states its own gain. `motor_fit` says with which models, and what the intervals
+cover. Volts and position alone fix only ratios to the gain: without `--gain-N-V` or a current the physical values are
+null. Everything is referred to the carriage; `viscous_N_s_m` is the slope of gain times voltage over speed, the
+back-EMF's part included.
 
-    gain V(t - delay) = mass a + viscous v + coulomb sign(v) + offset
-
-Position is low-passed without lag and differentiated centrally; both sides are filtered alike and thinned, so that the
-residuals left are nearly independent and the confidence intervals honest. The first half of the log is fitted, the
-second half judged. Volts and position alone fix only ratios to the gain: without `--gain-N-V` the physical values are
-null.
-
-Reads the motor log CSV (`t_s,input_V,position_mm`) or the EMPS benchmark's .mat file, which states its own gain.
+The first half of the log is fitted and the second half judged; the parameters come from all of it. `--samples` makes
+such logs of the simulated device in virtual time and prints what was identified beside what is true.
 """
 
 import argparse
-import csv
 import json
 import math
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import msgspec
 import numpy as np
-import numpy.typing as npt
-from scipy.io import loadmat
-from scipy.io.matlab import MatReadError
-from scipy.optimize import minimize_scalar
-from scipy.signal import butter, decimate, sosfiltfilt
+from motor_fit import THINNED_HZ, Estimate, Gearbox, Volts, Windings, fit_gearbox, fit_volts, fit_windings
+from motor_log import Log, LogError, read_log
 
-Array = npt.NDArray[np.float64]
+from tormagd.config import Config, ConfigError, Motor, load_config
 
-CUTOFF_HZ = 100.0
-THINNED_HZ = 40.0
-SLOW_M_S = 1e-3
-"Slower than this the sign of the speed is noise, and friction may be static."
-LONGEST_DELAY_S = 0.02
-LEAST_ROWS = 100
-
-
-class LogError(ValueError):
-    """A log that cannot be used: file, line, what is wrong and what is allowed."""
-
-
-class Log(NamedTuple):
-    """A motor log: evenly spaced times, s; voltage, V; position, m; and the gain where the file states one, N/V."""
-
-    t_s: Array
-    input_V: Array
-    position_m: Array
-    gain_N_V: float | None
-
-
-class Fit(NamedTuple):
-    """Least squares in volts: coefficients of a, v, sign(v), 1, their 95% half widths, the residual's share."""
-
-    coefficients: Array
-    ci95: Array
-    relative_residual: float
+PARAMETERS = ("mass_kg", "viscous_N_s_m", "coulomb_N", "offset_N")
+RATIOS = ("mass_V_s2_m", "viscous_V_s_m", "coulomb_V", "offset_V")
+VAGUE_SHARE = 0.5
+BACKLASH = "backlash: an encoder on the motor's side of the play cannot show it"
 
 
 def main() -> int:
-    """Prints the parameters; 2 where the log cannot be used."""
+    """Prints the parameters; 2 where the log or the configuration cannot be used."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("log", type=Path, help="motor log CSV, or DATA_EMPS.mat")
-    parser.add_argument("--gain-N-V", type=float, dest="gain", help="force for each volt, N/V")
+    parser.add_argument("log", type=Path, nargs="?", help="motor log CSV, or DATA_EMPS.mat")
+    parser.add_argument("--gain-N-V", type=float, dest="gain", help="force per volt, N/V; replaces a current")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="measured against simulated voltage")
+    parser.add_argument("--config", type=Path, help="whose gear ratio and screw lead hold; the defaults otherwise")
+    parser.add_argument("--write-config", type=Path, metavar="FILE.toml", help="new file with the identified [motor]")
+    parser.add_argument("--samples", action="store_true", help="identify the simulated samples, beside the truth")
     options = parser.parse_args()
+    if options.samples == (options.log is not None):
+        parser.error("give either a log or --samples")
+    if options.samples:
+        import motor_samples
+
+        return motor_samples.main(options.json)
     try:
         log = read_log(options.log)
         result = identify(log, options.gain if options.gain is not None else log.gain_N_V)
-    except LogError as error:
+        if options.write_config:
+            write_config(options.write_config, result, load_config(options.config))
+    except (LogError, ConfigError) as error:
         print(f"identify_motor: {error}", file=sys.stderr)
         return 2
     if options.plot:
@@ -81,162 +64,131 @@ def main() -> int:
     return 0
 
 
-def read_log(path: Path) -> Log:
-    """The log in a CSV or EMPS .mat file. Raises LogError."""
-    log = _read_mat(path) if path.suffix == ".mat" else _read_csv(path)
-    if len(log.t_s) < LEAST_ROWS:
-        raise LogError(f"{path}: {len(log.t_s)} rows: allowed are at least {LEAST_ROWS}")
-    for name, values in zip(("t_s", "input_V", "position"), log[:3], strict=True):
-        if not np.isfinite(values).all():
-            row = int(np.flatnonzero(~np.isfinite(values))[0])
-            raise LogError(f"{path}, row {row}: {name} = {values[row]}: allowed is a finite number")
-    steps = np.diff(log.t_s)
-    period = float(np.median(steps))
-    if period <= 0.0 or np.abs(steps - period).max() > 0.5 * period:
-        row = int(np.argmax(np.abs(steps - period)))
-        raise LogError(
-            f"{path}, row {row + 1}: t_s steps by {steps[row]:g} s: allowed is about {period:g} s throughout"
-        )
-    if 1.0 / period < 4.0 * CUTOFF_HZ:
-        raise LogError(f"{path}: sampled at {1.0 / period:.0f} Hz: allowed is at least {4.0 * CUTOFF_HZ:.0f} Hz")
-    return log
-
-
-def _read_mat(path: Path) -> Log:
-    try:
-        data = loadmat(path)
-        columns = [np.asarray(data[name], dtype=np.float64).ravel() for name in ("t", "vir", "qm")]
-        gain = float(np.asarray(data["gtau"]).item())
-    except OSError as error:
-        raise LogError(f"{path}: {error.strerror or error}") from error
-    except (MatReadError, KeyError, ValueError, TypeError) as error:
-        raise LogError(f"{path}: not an EMPS file with t, vir, qm and gtau: {error}") from error
-    if len({len(column) for column in columns}) != 1:
-        raise LogError(f"{path}: t, vir and qm have {[len(column) for column in columns]} rows: allowed is one length")
-    return Log(*columns, gain)
-
-
-def _read_csv(path: Path) -> Log:
-    names = ("t_s", "input_V", "position_mm")
-    rows: list[tuple[float, ...]] = []
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            missing = set(names) - set(reader.fieldnames or ())
-            if missing:
-                raise LogError(f"{path}: no column {', '.join(sorted(missing))}: needed are {', '.join(names)}")
-            for row in reader:
-                try:
-                    rows.append(tuple(float(row[name]) for name in names))
-                except (TypeError, ValueError) as error:
-                    raise LogError(f"{path}, line {reader.line_num}: {error}") from error
-    except OSError as error:
-        raise LogError(f"{path}: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise LogError(f"{path}: {error}") from error
-    table = np.array(rows).reshape(-1, 3)
-    return Log(table[:, 0], table[:, 1], table[:, 2] * 1e-3, None)
-
-
 def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
     """The contract's object. Raises LogError where the log does not move enough to show anything."""
     if gain_N_V is not None and not (math.isfinite(gain_N_V) and gain_N_V > 0.0):
         raise LogError(f"gain_N_V = {gain_N_V}: allowed is a finite number above 0")
     half = len(log.t_s) // 2
-    delay, delay_ci = _delay(_part(log, slice(None, half)))
-    fitted = fit(_part(log, slice(None, half)), delay)
-    whole = fit(log, delay)
-    judged = _part(log, slice(half, None))
-    measured, predicted = voltages(judged, fitted, delay)
-    scale = gain_N_V if gain_N_V is not None else math.nan
-    names = ("mass_kg", "viscous_N_s_m", "coulomb_N", "offset_N")
-    parameters: dict[str, Any] = {
-        name: {"value": float(scale * value), "ci95": float(scale * width)} if gain_N_V is not None else None
-        for name, value, width in zip(names, whole.coefficients, whole.ci95, strict=True)
-    }
-    parameters["delay_s"] = {"value": delay, "ci95": delay_ci}
-    parameters["backlash_um"] = None
-    ratios = ("mass_V_s2_m", "viscous_V_s_m", "coulomb_V", "offset_V")
+    measured, predicted = fit_volts(log.part(slice(None, half))).voltage(log.part(slice(half, None)))
+    volts = fit_volts(log)
+    ratios = (volts.mass, volts.viscous, volts.coulomb, volts.offset)
+    has_current = log.current_A is not None and gain_N_V is None
+    notes = [BACKLASH]
+    delay, motor = volts.delay, None
+    found: tuple[Estimate | None, ...]
+    if has_current:
+        windings = fit_windings(log)
+        gearbox = fit_gearbox(log, windings.back_emf.value)
+        found, delay = physical(windings, gearbox), windings.delay
+        motor = motor_parameters(windings, gearbox)
+        gain_N_V = motor["gain_N_V"].value
+    elif gain_N_V is not None:
+        found = tuple(ratio.scaled(gain_N_V) for ratio in ratios)
+        notes.append("gain: taken as given, without an interval of its own")
+    else:
+        found = (None,) * len(PARAMETERS)
+        notes.append("no gain and no current: only ratios to the gain show")
     return {
-        "parameters": parameters,
-        "ratios_to_gain": {
-            name: {"value": float(value), "ci95": float(width)}
-            for name, value, width in zip(ratios, whole.coefficients, whole.ci95, strict=True)
+        "parameters": {
+            **{name: _plain(estimate) for name, estimate in zip(PARAMETERS, found, strict=True)},
+            "delay_s": _plain(delay),
+            "backlash_um": None,
         },
+        "ratios_to_gain": {name: _plain(ratio) for name, ratio in zip(RATIOS, ratios, strict=True)},
+        "motor": None if motor is None else {name: _plain(estimate) for name, estimate in motor.items()},
+        "time_constant_s": _plain(_time_constant(volts, motor)),
         "gain_N_V": gain_N_V,
-        "relative_residual": whole.relative_residual,
+        "relative_residual": volts.relative_residual,
         "holdout_voltage_nrmse": float(np.linalg.norm(measured - predicted) / np.linalg.norm(measured)),
-        "notes": ["backlash: an encoder on the motor's side of the play cannot show it"],
+        "notes": notes,
     }
 
 
-def _part(log: Log, rows: slice) -> Log:
-    return Log(log.t_s[rows], log.input_V[rows], log.position_m[rows], log.gain_N_V)
+def physical(windings: Windings, gearbox: Gearbox) -> tuple[Estimate, ...]:
+    """The contract's four parameters: the back-EMF brakes the carriage as drag of K^2 / R does."""
+    k, resistance = windings.back_emf, windings.resistance
+    braking = k.value**2 / resistance.value
+    width = braking * math.hypot(2.0 * k.ci95 / k.value, resistance.ci95 / resistance.value)
+    viscous = Estimate(braking + gearbox.viscous.value, width + gearbox.viscous.ci95)
+    return gearbox.mass, viscous, gearbox.coulomb, gearbox.offset
 
 
-def regressors(log: Log, delay_s: float) -> tuple[Array, Array]:
-    """Rows of (a, v, sign(v), 1) and the delayed voltage, filtered alike and thinned."""
-    period = float(np.median(np.diff(log.t_s)))
-    sections = butter(4, CUTOFF_HZ, fs=1.0 / period, output="sos")
-    position = sosfiltfilt(sections, log.position_m)
-    speed = np.gradient(position, period)
-    acceleration = np.gradient(speed, period)
-    volts = np.interp(log.t_s - delay_s, log.t_s, log.input_V)
-    columns = (acceleration, speed, np.sign(speed) * (np.abs(speed) > SLOW_M_S), np.ones_like(speed), volts)
-    factor = max(1, round(1.0 / period / THINNED_HZ))
-    # the ends carry the filters' guesses
-    edge = 4
-    thinned = [_thin(column, factor)[edge:-edge] for column in columns]
-    rows = np.column_stack(thinned[:4])
-    if len(rows) < LEAST_ROWS // 2 or np.linalg.matrix_rank(rows) < 4:
-        raise LogError("the log moves too little: mass, friction and offset cannot be told apart")
-    return rows, thinned[4]
+def motor_parameters(windings: Windings, gearbox: Gearbox) -> dict[str, Estimate]:
+    """What a current shows besides: the motor as the carriage feels it, gain in N/V."""
+    k, resistance = windings.back_emf, windings.resistance
+    gain = k.value / resistance.value
+    width = gain * math.hypot(k.ci95 / k.value, resistance.ci95 / resistance.value)
+    return {
+        "gain_N_V": Estimate(gain, width),
+        "resistance_ohm": resistance,
+        "inductance_mH": windings.inductance.scaled(1e3),
+        "back_emf_V_s_m": k,
+        "friction_viscous_N_s_m": gearbox.viscous,
+        "gear_efficiency": gearbox.efficiency,
+        "mass_kg": gearbox.mass,
+        "coulomb_N": gearbox.coulomb,
+    }
 
 
-def _thin(column: Array, factor: int) -> Array:
-    return np.asarray(decimate(column, factor, ftype="fir", zero_phase=True)) if factor > 1 else column
+def _time_constant(volts: Volts, motor: dict[str, Estimate] | None) -> Estimate:
+    """Of the speed after a voltage step: mass R / K^2, or mass over drag where only ratios are known."""
+    if motor is None:
+        factors = [(volts.mass, 1.0), (volts.viscous, -1.0)]
+    else:
+        factors = [(motor["mass_kg"], 1.0), (motor["resistance_ohm"], 1.0), (motor["back_emf_V_s_m"], -2.0)]
+    value = math.prod(estimate.value**power for estimate, power in factors)
+    width = math.hypot(*(power * estimate.ci95 / estimate.value for estimate, power in factors))
+    return Estimate(value, abs(value) * width)
 
 
-def fit(log: Log, delay_s: float) -> Fit:
-    """Least squares over a log at a known delay."""
-    rows, volts = regressors(log, delay_s)
-    coefficients, *_ = np.linalg.lstsq(rows, volts, rcond=None)
-    residual = volts - rows @ coefficients
-    variance = float(residual @ residual) / (len(volts) - 4)
-    deviation = np.sqrt(variance * np.diag(np.linalg.inv(rows.T @ rows)))
-    return Fit(coefficients, 1.96 * deviation, float(np.linalg.norm(residual) / np.linalg.norm(volts)))
+def _plain(estimate: Estimate | None) -> dict[str, float] | None:
+    return None if estimate is None else estimate._asdict()
 
 
-def voltages(log: Log, fitted: Fit, delay_s: float) -> tuple[Array, Array]:
-    """The voltage that was applied and the one that the fit says the motion took."""
-    rows, volts = regressors(log, delay_s)
-    return volts, rows @ fitted.coefficients
+def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
+    """A configuration file with the identified motor, for the gear ratio and lead of `config`.
 
-
-def _delay(log: Log) -> tuple[float, float]:
-    """The delay that leaves the least residual, and its half width from the curvature of the sum of squares."""
-
-    def squares(delay_s: float) -> float:
-        rows, volts = regressors(log, delay_s)
-        coefficients, *_ = np.linalg.lstsq(rows, volts, rcond=None)
-        return float(np.sum((volts - rows @ coefficients) ** 2))
-
-    best = minimize_scalar(squares, bounds=(0.0, LONGEST_DELAY_S), method="bounded", options={"xatol": 1e-5})
-    count = len(regressors(log, float(best.x))[1])
-    step = 5e-4
-    curvature = (squares(best.x + step) - 2.0 * best.fun + squares(max(best.x - step, 0.0))) / step**2
-    width = 1.96 * math.sqrt(2.0 * best.fun / (count - 5) / curvature) if curvature > 0.0 else LONGEST_DELAY_S
-    return float(best.x), min(width, LONGEST_DELAY_S)
+    Raises LogError where the log cannot fill it, the file exists, or a value is one that `tormagd` would refuse.
+    """
+    found = result["motor"]
+    if found is None:
+        raise LogError("--write-config: needs a log with current_A, and no --gain-N-V")
+    advance_m_rad = config.motor.screw_lead_mm * 1e-3 / (math.tau * config.motor.gear_ratio)
+    identified = {
+        "resistance_ohm": found["resistance_ohm"]["value"],
+        "back_emf_V_s": found["back_emf_V_s_m"]["value"] * advance_m_rad,
+        "inertia_kg_m2": found["mass_kg"]["value"] * advance_m_rad**2,
+        "gear_efficiency": found["gear_efficiency"]["value"],
+        "coulomb_V": found["coulomb_N"]["value"] / found["gain_N_V"]["value"],
+    }
+    inductance = found["inductance_mH"]
+    if inductance["ci95"] < VAGUE_SHARE * inductance["value"]:  # a log at 1 kHz hardly shows it
+        identified["inductance_mH"] = inductance["value"]
+    kept = msgspec.to_builtins(config.motor)
+    table = kept | {name: float(f"{value:.4g}") for name, value in identified.items()}
+    try:
+        msgspec.convert(table, Motor)
+        with path.open("x", encoding="utf-8") as file:
+            file.write(f"# identified by tools/identify_motor.py: {', '.join(identified)}; the rest as configured\n")
+            file.write("[motor]\n")
+            file.writelines(f"{name} = {value!r}\n" for name, value in table.items())
+    except msgspec.ValidationError as error:
+        raise LogError(f"--write-config: {table}: {error}") from error
+    except OSError as error:
+        raise LogError(f"{path}: {error.strerror}") from error
 
 
 def print_table(result: dict[str, Any]) -> None:
     """The parameters for a person."""
-    for name, found in (result["parameters"] | result["ratios_to_gain"]).items():
+    tables = (result["parameters"], result["ratios_to_gain"], result["motor"] or {})
+    for name, found in (tables[2] | tables[1] | tables[0] | {"time_constant_s": result["time_constant_s"]}).items():
         print(
-            f"{name:16s}"
+            f"{name:24s}"
             + ("not shown by this log" if found is None else f"{found['value']:12.5g} +- {found['ci95']:.2g}")
         )
     print(f"residual {result['relative_residual']:.1%} of the voltage; held out {result['holdout_voltage_nrmse']:.1%}")
+    for note in result["notes"]:
+        print(note)
 
 
 def draw(path: Path, log: Log, result: dict[str, Any]) -> None:
@@ -247,16 +199,15 @@ def draw(path: Path, log: Log, result: dict[str, Any]) -> None:
     import matplotlib.pyplot as plt
 
     half = len(log.t_s) // 2
-    delay = result["parameters"]["delay_s"]["value"]
-    fitted = fit(_part(log, slice(None, half)), delay)
-    measured, predicted = voltages(_part(log, slice(half, None)), fitted, delay)
-    time_s = log.t_s[half] + np.arange(len(measured)) / THINNED_HZ
+    fitted = fit_volts(log.part(slice(None, half)))
+    time_s, measured, predicted = fitted.over_time(log.part(slice(half, None)))
     figure, (above, below) = plt.subplots(2, 1, figsize=(11, 6), sharex=True, constrained_layout=True)
     above.plot(time_s, measured, color="#222222", label="measured")
     above.plot(time_s, predicted, color="#d1495b", linewidth=1.0, label="from the fit of the other half")
     above.legend(frameon=False, ncols=2)
     above.set_ylabel("input, V")
-    above.set_title(f"Held-out half: relative error {result['holdout_voltage_nrmse']:.1%}", loc="left")
+    error = result["holdout_voltage_nrmse"]
+    above.set_title(f"Held-out half, {THINNED_HZ:.0f} Hz: relative error {error:.1%}; gaps where it stands", loc="left")
     below.plot(time_s, measured - predicted, color="#2a6f97", linewidth=0.8)
     below.set_ylabel("difference, V")
     below.set_xlabel("time, s")

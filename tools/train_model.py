@@ -10,15 +10,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import msgspec
 from tqdm import tqdm
 
 from tormagd.learning.dataset import Dataset, DatasetError, read_csv
-from tormagd.learning.features import Element, Scaling
-from tormagd.learning.levenberg_marquardt import Epoch, Training, train
-from tormagd.learning.metrics import fit_metrics, not_rising_share
-from tormagd.learning.mlp import ForceNetwork, to_model
-from tormagd.learning.model_file import ForceModel, ModelMetadata, save_model
+from tormagd.learning.features import Element
+from tormagd.learning.fitting import fit_model
+from tormagd.learning.levenberg_marquardt import Epoch, Training
+from tormagd.learning.model_file import ForceModel, save_model
 from tormagd.physics.errors import DomainError
 
 
@@ -43,37 +41,24 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Training]:
     """Train on `data` and return the model with its metrics, and how it went."""
     training_data, validation_data = data.split(options.validation_share, options.seed)
-    scaling = Scaling.fit(training_data.features, training_data.force_N)
-    network = ForceNetwork(scaling, options.hidden, seed=options.seed)
-    metadata = ModelMetadata(  # before the training, which a wrong name should not have to wait for
-        element=options.element,
-        insert=options.insert,
-        hidden=options.hidden,
-        ranges=training_data.ranges(),
-        scaling=scaling,
-        training_data_sha256=data.sha256(),
-        metrics={},
-        created=options.created or datetime.date.today(),
-    )
     with tqdm(total=options.epochs, unit="epoch", disable=None, leave=False) as bar:
 
         def show(epoch: Epoch) -> None:
             bar.set_postfix_str(f"train {epoch.train_rmse_N:.4f} N, validation {epoch.validation_rmse_N:.4f} N rms")
             bar.update()
 
-        result = train(network, training_data, validation_data, epochs=options.epochs, progress=show)
-
-    model = to_model(network, metadata)
-    metrics = {
-        **{f"train_{name}": value for name, value in fit_metrics(model, training_data).items()},
-        **{f"validation_{name}": value for name, value in fit_metrics(model, validation_data).items()},
-        "not_rising_share": not_rising_share(model),
-        "train_rows": float(len(training_data)),
-        "validation_rows": float(len(validation_data)),
-        "epochs": float(len(result.history)),
-        "best_epoch": float(result.best.epoch),
-    }
-    return to_model(network, msgspec.structs.replace(metadata, metrics=metrics)), result
+        return fit_model(
+            training_data,
+            validation_data,
+            element=options.element,
+            insert=options.insert,
+            data_sha256=data.sha256(),
+            created=options.created or datetime.date.today(),
+            hidden=options.hidden,
+            epochs=options.epochs,
+            seed=options.seed,
+            progress=show,
+        )
 
 
 def plot_convergence(path: Path, result: Training) -> None:

@@ -47,6 +47,14 @@ def test_a_command_reaches_the_daemon_under_its_name(fake_daemon, capsys, comman
     assert fake_daemon.commands == [command]
 
 
+@pytest.mark.parametrize(("is_connected", "said"), [(True, "the gap opens"), (False, "nothing could be sent")])
+def test_stop_says_whether_a_device_was_there_to_be_told(fake_daemon, capsys, is_connected, said):
+    answer = {"ok": True, "result": {"operating_state": "FAULT", "is_connected": is_connected}}
+    fake_daemon.answers["stop"] = lambda: answer
+    assert main(["--endpoint", fake_daemon.control, "stop"]) == 0
+    assert said in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("code", "expected"), [("not_homed", 1), ("fault", 4), ("device_latched", 4)])
 def test_a_refusal_tells_code_message_and_hint(fake_daemon, capsys, code, expected):
     fake_daemon.refuse("enable", code)
@@ -113,6 +121,7 @@ def test_usage_errors_exit_2(arguments, capsys):
         (["send", "step", "--to-N", "-1"], "--to-N = -1"),
         (["send", "step", "--rate", "5"], "at least one period, 200 ms"),
         (["scene", "show", "unheard-of"], "coronary"),
+        (["scene", "show", "x" * 300], "File name too long"),
         (["plot", "/nowhere/a.mcap", "-o", "a.png"], "/nowhere/a.mcap"),
     ],
 )
@@ -126,6 +135,14 @@ def test_a_configuration_names_the_endpoints(fake_daemon, tmp_path, capsys):
     config = tmp_path / "tormagd.toml"
     config.write_text(f'[endpoints]\ncontrol = "{fake_daemon.control}"\n')
     assert run_json(capsys, "--config", str(config), "status")[0] == 0
+
+
+def test_a_port_that_no_file_can_have_is_refused_before_it_is_opened(tmp_path, capsys):
+    config = tmp_path / "tormagd.toml"
+    config.write_text('[device]\nport = "\\u0000"\n')
+    code, printed = run_json(capsys, "--config", str(config), "status")
+    assert code == 2
+    assert "device.port = '\\x00': allowed is printable characters" in printed["error"]["message"]
 
 
 def test_scenes_are_listed_and_shown(capsys):

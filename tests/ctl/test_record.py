@@ -1,4 +1,6 @@
 import json
+import re
+import resource
 import signal
 import subprocess
 import sys
@@ -57,6 +59,28 @@ def test_rubbish_is_counted_and_left_out(fake_daemon, tmp_path, capsys):
     assert json.loads(captured.out)["result"]["unreadable"] >= 7
     assert captured.err.count("left out a message") == 1
     assert read_recording(file).is_complete
+
+
+def test_a_full_disk_ends_a_recording_that_can_still_be_read(fake_daemon, tmp_path):
+    file = tmp_path / "a.mcap"
+    command = [sys.executable, "-m", "tormagd.ctl.main", "--endpoint", fake_daemon.control, "--wait", "20", "--json"]
+    ended = subprocess.run(
+        [*command, "record", str(file), "--duration", "60"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        # the same as a full disk to a program, with another errno
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000)),
+    )
+    assert ended.returncode == 1
+    assert "Traceback" not in ended.stderr
+    error = json.loads(ended.stdout)["error"]
+    assert error["code"] == "not_written"
+    received = int(re.findall(r"File too large, after (\d+) ticks", error["message"])[0])
+    recording = read_recording(file)
+    assert not recording.is_complete
+    assert 0 < recording.ticks.t_ns.size <= received
 
 
 def test_an_interrupt_ends_a_recording_cleanly(fake_daemon, tmp_path):

@@ -1,5 +1,6 @@
 import json
 import math
+import os
 from itertools import pairwise
 from pathlib import Path
 
@@ -79,6 +80,9 @@ def test_duration_cuts_a_file_short(fake_daemon, capsys, tmp_path):
         ("t_s,force_N\n0,1\ninf,1\n", "row 3, t_s = 'inf'"),
         ("t_s,force_N\n0,1\n1,-0.5\n", "row 3, force_N = -0.5: allowed is 0..1000 N"),
         ("t_s,force_N\n0,1\n1,1e9\n", "row 3, force_N = 1e9"),
+        ("t_s,force_N\n-1e308,1\n1e308,1\n", "row 2, t_s = -1e308: allowed is -1e+10..1e+10 s"),
+        ("t_s,force_N,displacement_mm\n0,1,0\n1,1,1e10\n", "row 3, displacement_mm = 1e10: allowed is -1000..1000 mm"),
+        ("t_s,force_N,rate_mm_s\n0,1,0\n1,1,-1e5\n", "row 3, rate_mm_s = -1e5: allowed is -10000..10000 mm/s"),
         ("t_s,force_N\n0,1\n0,2\n", "row 3, t_s = 0: allowed is above"),
         ("t_s,force_N\n1,1\n0,2\n", "row 3, t_s = 0: allowed is above"),
         ("t_s,force_N\n0,1\n1\n", "row 3 has 1 values: allowed is 2"),
@@ -97,6 +101,14 @@ def test_a_faulty_file_is_refused_by_row_column_and_value(tmp_path, capsys, cont
     file.write_bytes(content if isinstance(content, bytes) else content.encode())
     assert main(["--json", "send", str(file)]) == 2
     assert named in json.loads(capsys.readouterr().out)["error"]["message"]
+
+
+def test_what_is_no_regular_file_is_refused_rather_than_waited_for(tmp_path, capsys):
+    os.mkfifo(tmp_path / "pipe.csv")
+    (tmp_path / "folder.csv").mkdir()
+    for name in ("pipe.csv", "folder.csv"):
+        assert main(["--json", "send", str(tmp_path / name)]) == 2
+        assert f"{name}: allowed is a regular file" in json.loads(capsys.readouterr().out)["error"]["message"]
 
 
 def test_a_missing_file_is_refused(tmp_path):

@@ -1,4 +1,5 @@
 import contextlib
+import errno
 import json
 import math
 from pathlib import Path
@@ -231,11 +232,35 @@ def test_the_picture_names_what_happened(written):
     drawn = figure(read_recording(written), "a title")
     heading = drawn.get_suptitle()
     assert "a title" in heading
-    assert "100 mN" in heading
+    # the sensor's noise and the approach are in the figure, and whoever reads it has to know
+    assert "100 mN rms (sensor noise and approach included)" in heading
     assert "SKEW" in heading
     lanes = [label.get_text() for label in drawn.axes[-1].get_yticklabels()]
     assert lanes == ["state", "limit RATE", "FAULT SKEW"]
     assert [line.get_label() for line in drawn.axes[0].lines] == ["measured", "asked"]
+
+
+def test_a_line_that_lies_on_another_leaves_it_visible(written):
+    for axes in figure(read_recording(written), "x").axes[1:3]:
+        lower, upper = axes.lines[:2]
+        assert lower.get_linewidth() > 2.0 * upper.get_linewidth()
+
+
+def test_a_disk_that_is_full_keeps_the_picture_that_was_there(written, tmp_path, monkeypatch):
+    target = tmp_path / "a.png"
+    target.write_bytes(b"precious")
+
+    def half(path: Path, data: bytes) -> int:
+        with path.open("wb") as file:
+            file.write(data[: len(data) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", half)
+    for name in ("a.png", "new.png"):
+        with pytest.raises(OSError, match="No space"):
+            save_plot(read_recording(written), tmp_path / name, "x")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "a.png"]
+    assert target.read_bytes() == b"precious"
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])

@@ -79,6 +79,12 @@ def test_an_unknown_name_lists_the_shipped_ones() -> None:
     assert all(name in refused for name in shipped_scenes())
 
 
+def test_a_name_that_no_file_can_have_is_refused(write) -> None:
+    assert "File name too long" in refusal("x" * 300)
+    with pytest.raises(ConfigError, match="File name too long"):
+        build_core(Config(scene=write(insert__model=f'"{"x" * 300}"')))
+
+
 @pytest.mark.parametrize(
     ("low", "low_value", "high", "high_value"),
     [

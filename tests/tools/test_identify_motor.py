@@ -3,8 +3,14 @@
 import json
 
 import identify_motor
+import motor_fit
+import motor_samples
 import numpy as np
 import pytest
+
+from tormagd.config import Config, load_config
+from tormagd.ctl.calibrate_motors import motor_log
+from tormagd.simulation.parameters import load_plant
 
 MASS, VISCOUS, COULOMB, OFFSET, GAIN, DELAY_S = 80.0, 150.0, 12.0, -2.0, 30.0, 0.003
 
@@ -51,6 +57,56 @@ def test_emps_is_within_the_published_values(recordings, capsys):
     assert values["coulomb_N"] == pytest.approx(20.3935, rel=0.03)
     assert values["offset_N"] == pytest.approx(-3.1648, abs=0.3)
     assert found["holdout_voltage_nrmse"] <= 0.06
+
+
+@pytest.fixture(scope="module")
+def sample_log():
+    """Half of what `tormagctl calibrate --motors` records, on simulated sample 3, in virtual time."""
+    return motor_samples.to_log(motor_log(motor_samples.record("sample_3", rounds=1), "left"))
+
+
+def test_true_values_of_a_simulated_sample_are_inside_their_intervals(sample_log):
+    """The plant is richer than the models: backlash, a springy screw, losses in the gears, friction under load."""
+    plant = load_plant("sample_3")
+    found = motor_samples.compare(sample_log, plant, "left")
+    assert {name for name, row in found.items() if not row["inside"]} == set()
+    # intervals that say something
+    assert found["back_emf_V_s_m"]["ci95"] < 0.01 * found["back_emf_V_s_m"]["true"]
+    for name, share in (("mass_kg", 0.15), ("gear_efficiency", 0.15), ("coulomb_N", 0.3), ("gain_N_V", 0.15)):
+        assert found[name]["ci95"] < share * found[name]["true"]
+    without_current = motor_samples.compare(sample_log._replace(current_A=None), plant, "left")
+    assert {name for name, row in without_current.items() if not row["inside"]} == set()
+    assert set(without_current) == {*identify_motor.PARAMETERS, "delay_s", "time_constant_s"}
+
+
+def test_the_identified_motor_is_a_configuration(sample_log, tmp_path):
+    result = identify_motor.identify(sample_log, None)
+    assert result["parameters"]["backlash_um"] is None
+    path = tmp_path / "motor.toml"
+    identify_motor.write_config(path, result, Config())
+    written, true = load_config(path).motor, load_plant("sample_3")
+    assert written.resistance_ohm == pytest.approx(true.motor.resistance_Ohm, rel=0.03)
+    assert written.back_emf_V_s == pytest.approx(true.motor.back_emf_V_s_rad, rel=0.01)
+    assert written.inertia_kg_m2 == pytest.approx(true.motor.inertia_kg_m2, rel=0.05)
+    assert written.gear_efficiency == pytest.approx(true.gear.efficiency, abs=0.05)
+    assert written.supply_V == Config().motor.supply_V
+    with pytest.raises(identify_motor.LogError, match="exists"):
+        identify_motor.write_config(path, result, Config())
+    with pytest.raises(identify_motor.LogError, match="current_A"):
+        identify_motor.write_config(tmp_path / "b.toml", result | {"motor": None}, Config())
+
+
+def test_intervals_cover_what_hangs_together():
+    """Residuals that stay for half a second: the naive interval of a mean is far too short, the block one is not."""
+    rng = np.random.default_rng(0)
+    blocks = np.repeat(np.arange(100), 40)
+    inside = 0
+    for _ in range(200):
+        noise = np.repeat(rng.normal(size=200), 20) + 0.1 * rng.normal(size=4000)
+        fitted = motor_fit.linear(np.ones((4000, 1)), 1.0 + noise, blocks)
+        inside += abs(fitted.values[0] - 1.0) <= fitted.half_widths[0]
+    assert 180 <= inside <= 199
+    assert 0.3 * fitted.half_widths[0] > 1.96 / 4000**0.5
 
 
 @pytest.mark.parametrize(

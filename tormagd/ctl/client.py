@@ -81,7 +81,8 @@ def unreachable(address: str, what: str) -> CommandError:
             )
         except OSError:
             hint = (
-                f"there is no socket {path}: start the daemon (systemctl start tormagd), or give --config or --endpoint"
+                f"there is no socket {path}: start the daemon (systemctl start tormagd), or give --config or "
+                "--endpoint; one that runs although its directory was removed cannot be reached: restart it"
             )
         else:
             if not os.access(path, os.W_OK):

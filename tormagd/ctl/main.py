@@ -14,6 +14,7 @@ import msgspec
 from tormagd import __version__
 from tormagd.config import Config, ConfigError, Endpoints, load_config
 from tormagd.ctl.outcome import CommandError, Outcome, print_error, print_outcome, usage_error
+from tormagd.output import write_line
 
 STATE_COMMANDS = {
     "enable": "start rendering force (homed, fresh measurements and a neutral setpoint needed)",
@@ -23,8 +24,8 @@ STATE_COMMANDS = {
     "stop": "open the gap and latch; needs clear-fault",
     "clear-fault": "forget latched faults; stays disabled",
 }
-EXTRAS = {"mcap": "record", "zstandard": "record", "matplotlib": "plot"}
-EXIT_TEXT = """exit codes: 0 done, 1 refused by the daemon (or doctor found a failure), 2 usage, 3 daemon not reachable,
+EXTRAS = {"mcap": "record", "zstandard": "record", "matplotlib": "plot", "tqdm": "lab"}
+EXIT_TEXT = """exit codes: 0 done, 1 refused or not done (doctor: a failure was found), 2 usage, 3 daemon not reachable,
 4 device in FAULT. With --json stdout carries one object: {command, ok, result, error}."""
 
 
@@ -44,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print_error(options.command, missing, options.json)
         return missing.exit_code
     except KeyboardInterrupt:
-        print(f"tormagctl {options.command}: interrupted; the daemon goes on", file=sys.stderr)
+        write_line(f"tormagctl {options.command}: interrupted; the daemon goes on", sys.stderr)
         return 130
     print_outcome(options.command, outcome, options.json)
     return outcome.exit_code
@@ -68,16 +69,23 @@ def _run(options: argparse.Namespace) -> Outcome:
             from tormagd.ctl.scene import list_scenes, show_scene
 
             return list_scenes() if options.action == "list" else show_scene(options.name or config.scene)
+        case "calibrate":
+            return _calibrate(options, config, endpoints)
         case "doctor":
             from tormagd.ctl.doctor import doctor
 
             return doctor(config)
+        case "ports":
+            from tormagd.ctl.ports import ports
+
+            return ports(config)
         case _:
             return _ask(options, endpoints)
 
 
 def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
     from tormagd.ctl.client import Client
+    from tormagd.ctl.firmware import firmware
     from tormagd.ctl.operate import home, operate
     from tormagd.ctl.status import status
 
@@ -85,6 +93,8 @@ def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
         match options.command:
             case "status":
                 return status(client)
+            case "firmware":
+                return firmware(client)
             case "home":
                 return home(client, options.timeout, not options.no_wait)
             case _:
@@ -113,6 +123,37 @@ def _send(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
     return send(
         endpoints.setpoint, waveform, duration_s, options.rate, options.source, options.valid_for_ms, options.wait
     )
+
+
+def _calibrate(options: argparse.Namespace, config: Config, endpoints: Endpoints) -> Outcome:
+    from tormagd.ctl.calibrate import calibrate, require_new
+    from tormagd.ctl.calibrate_motors import calibrate_motors
+    from tormagd.scenes.scene import load_scene
+
+    if options.motors == (options.insert is not None):
+        raise usage_error("give either --insert NAME or --motors", "tormagctl calibrate --help shows both")
+    if options.motors and options.csv is not None:
+        raise usage_error("--csv is the training data of an insert", "with --motors, --out is the log")
+    require_new(options.out, "--out")
+    if options.csv is not None:
+        require_new(options.csv, "--csv")
+    try:
+        scene = load_scene(config.scene)
+    except ConfigError as error:
+        raise usage_error(str(error), "correct the scene, or give the daemon's own --config") from error
+    if not options.yes:
+        _agree()
+    if options.motors:
+        return calibrate_motors(endpoints, scene.force.most_N, options.out, options.side, options.wait)
+    return calibrate(endpoints, scene, options.insert, options.out, options.csv, options.rates, options.wait)
+
+
+def _agree() -> None:
+    """Armed on purpose: a person agrees, or a script says --yes."""
+    if not sys.stdin.isatty():
+        raise usage_error("nobody can agree to the carriages moving", "a script says --yes")
+    print("The device homes where needed, enables, and moves its carriages. Press Enter, or Ctrl-C.", file=sys.stderr)
+    sys.stdin.readline()
 
 
 def _configuration(path: Path | None) -> Config:
@@ -155,6 +196,8 @@ def _parser() -> argparse.ArgumentParser:
         return commands.add_parser(name, help=help_text, description=help_text, parents=[shared], epilog=EXIT_TEXT)
 
     command("status", "what the daemon is doing")
+    command("firmware", "who is at the other end of the wire, and how well the wire carries")
+    command("ports", "where a device could be connected, and who holds what is there")
     for name, help_text in STATE_COMMANDS.items():
         command(name, help_text)
     home = command("home", "find the home switches of both carriages")
@@ -174,6 +217,21 @@ def _parser() -> argparse.ArgumentParser:
     record = command("record", "write telemetry and control ticks to an MCAP file until Ctrl-C")
     record.add_argument("file", type=Path, metavar="FILE.mcap")
     record.add_argument("--duration", type=_above_zero, default=math.inf, metavar="S", help="end after this time")
+
+    calibrate = command("calibrate", "guided sweep of an insert into a model file, or of the motors into a log")
+    calibrate.add_argument("--insert", metavar="NAME", help="the insert that is fitted, such as MRE-50-40")
+    calibrate.add_argument("--motors", action="store_true", help="record a motor log instead")
+    calibrate.add_argument("--out", type=Path, required=True, metavar="FILE", help="MODEL.safetensors, or LOG.csv")
+    calibrate.add_argument("--csv", type=Path, metavar="FILE", help="write the training data too")
+    calibrate.add_argument(
+        "--rates",
+        type=_rates,
+        default=(0.1, 0.2, 0.4, 0.2, 0.1, 0.4),
+        metavar="N/s,...",
+        help="of the sweeps, at least three (0.1,0.2,0.4,0.2,0.1,0.4)",
+    )
+    calibrate.add_argument("--side", choices=("left", "right"), default="left", help="whose log to write (left)")
+    calibrate.add_argument("--yes", action="store_true", help="arm and move without asking")
 
     plot = command("plot", "draw a recording: forces, gap, duty, limits and faults")
     plot.add_argument("file", type=Path, metavar="FILE.mcap")
@@ -222,6 +280,13 @@ def _rate(text: str) -> float:
 
 def _validity(text: str) -> float:
     return _within(text, 0.25, 60_000.0, " ms")
+
+
+def _rates(text: str) -> tuple[float, ...]:
+    rates = tuple(_within(part, 0.02, 10.0, " N/s") for part in text.split(","))
+    if not 3 <= len(rates) <= 60:
+        raise argparse.ArgumentTypeError(f"{text[:80]!r}: allowed are 3..60 rates")
+    return rates
 
 
 def _source(text: str) -> str:

@@ -5,7 +5,7 @@ import time
 from typing import Any
 
 from tormagd.ctl.client import Client
-from tormagd.ctl.outcome import CommandError, Exit, Outcome
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal
 
 POLL_S = 0.05
 BEGIN_S = 2.0
@@ -19,11 +19,17 @@ DONE_TEXT = {
     "stop": "stopped and latched; the gap opens. tormagctl clear-fault when it is safe to go on",
     "clear-fault": "fault cleared. tormagctl home, then enable",
 }
+STOPPED_WITHOUT_DEVICE = (
+    "stopped and latched, but no device is connected: nothing could be sent. It is told to open the gap when it is "
+    "back; tormagctl status shows the link"
+)
 
 
 def operate(client: Client, command: str) -> Outcome:
-    """Give one command that the daemon carries out or refuses at once."""
-    return Outcome(client.request(command), DONE_TEXT[command])
+    """Give one command that the daemon carries out or refuses at once. Without a device it takes `stop` only."""
+    result = client.request(command)
+    is_without_device = command == "stop" and result.get("is_connected") is False
+    return Outcome(result, STOPPED_WITHOUT_DEVICE if is_without_device else DONE_TEXT[command])
 
 
 def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
@@ -38,7 +44,7 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
         return Outcome(result, "homing; tormagctl status shows when it is done")
     started_s = time.monotonic()
     has_begun = False
-    shows_progress = sys.stderr.isatty()
+    shows_progress = is_terminal(sys.stderr)
     try:
         while (elapsed_s := time.monotonic() - started_s) < timeout_s:
             state = client.request("status")

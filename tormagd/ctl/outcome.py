@@ -7,6 +7,8 @@ from typing import Any, TextIO
 
 import msgspec
 
+from tormagd.output import write_line
+
 
 class Exit(IntEnum):
     """The exit codes of `tormagctl`."""
@@ -44,27 +46,39 @@ def print_outcome(command: str, outcome: Outcome, as_json: bool) -> None:
     if as_json:
         _print_json(command, outcome.exit_code is Exit.DONE, outcome.result, None)
     else:
-        print(outcome.text)
+        _print(command, outcome.text)
 
 
 def print_error(command: str, error: CommandError, as_json: bool) -> None:
     """The error and its remedy on stderr, and with `--json` the object on stdout as well."""
     colour = Colour(sys.stderr)
-    print(f"tormagctl {command}: {colour.red(error.message)}", file=sys.stderr)
-    print(f"  next: {error.hint}", file=sys.stderr)
+    write_line(f"tormagctl {command}: {colour.red(error.message)}\n  next: {error.hint}", sys.stderr)
     if as_json:
         _print_json(command, False, None, {"code": error.code, "message": error.message, "hint": error.hint})
 
 
 def _print_json(command: str, ok: bool, result: dict[str, Any] | None, error: dict[str, str] | None) -> None:
-    print(msgspec.json.encode({"command": command, "ok": ok, "result": result, "error": error}).decode())
+    answer = {"command": command, "ok": ok, "result": result, "error": error}
+    _print(command, msgspec.json.encode(answer).decode())
+
+
+def _print(command: str, text: str) -> None:
+    lost = write_line(text, sys.stdout)
+    # a reader that stopped reading meant to; a disk that is full did not
+    if lost is not None and not isinstance(lost, BrokenPipeError):
+        write_line(f"tormagctl {command}: the answer could not be written: {lost.strerror}", sys.stderr)
+
+
+def is_terminal(stream: TextIO | None) -> bool:
+    """Whether a person watches `stream`; nobody does where it is closed."""
+    return stream is not None and stream.isatty()
 
 
 class Colour:
     """ANSI colours for one stream; plain text where it is no terminal, or where NO_COLOR is set and not empty."""
 
-    def __init__(self, stream: TextIO) -> None:
-        self._is_on = stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+    def __init__(self, stream: TextIO | None) -> None:
+        self._is_on = is_terminal(stream) and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
     def red(self, text: str) -> str:
         return self._paint("31", text)

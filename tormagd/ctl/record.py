@@ -11,8 +11,9 @@ import zmq
 from tormagd.config import Endpoints
 from tormagd.ctl.client import connect, unreachable
 from tormagd.ctl.interrupt import interrupted_by
-from tormagd.ctl.outcome import Outcome, usage_error
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.messages import MessageError, Telemetry, decode
+from tormagd.output import write_line
 from tormagd.recording.ticks import MAX_BATCH_BYTES, decode_ticks
 from tormagd.recording.writer import RecordingWriter
 
@@ -25,7 +26,8 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
     """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM.
 
     Raises CommandError: USAGE where the file exists or cannot be made, UNREACHABLE where nothing is published within
-    `wait_s`; then there is no file. A message that cannot be read is counted, and the first one's reason told.
+    `wait_s`; then there is no file. REFUSED where the disk takes no more; what it took stays. A message that cannot be
+    read is counted, and the first one's reason told.
     """
     context = zmq.Context()
     try:
@@ -40,8 +42,16 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
                 raise usage_error(f"{path} exists", "give another name; recordings are never overwritten") from error
             except OSError as error:
                 raise usage_error(f"{path}: {error.strerror}", "give a file in a directory you may write to") from error
-            with writer:
-                return _record(writer, path, telemetry, ticks, duration_s, is_interrupted)
+            try:
+                with writer:
+                    return _record(writer, path, telemetry, ticks, duration_s, is_interrupted)
+            except OSError as error:
+                raise CommandError(
+                    Exit.REFUSED,
+                    "not_written",
+                    f"{path}: {error.strerror}, after {writer.tick_count} ticks and {writer.telemetry_count} snapshots",
+                    "make room; what is in the file, all but about the last second, can be plotted",
+                ) from error
     finally:
         context.destroy(linger=0)
 
@@ -88,7 +98,7 @@ def _record(
                 except MessageError as error:
                     unreadable += 1
                     if unreadable == 1:
-                        print(f"tormagctl record: left out a message: {error}", file=sys.stderr)
+                        write_line(f"tormagctl record: left out a message: {error}", sys.stderr)
     result = {
         "file": str(path),
         "seconds": round(time.monotonic() - start_s, 3),

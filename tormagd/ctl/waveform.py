@@ -2,15 +2,23 @@
 
 import csv
 import math
+import stat
 from bisect import bisect_right
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from tormagd.messages import MAX_FORCE_N
+from tormagd.messages import MAX_DISPLACEMENT_MM, MAX_FORCE_N, MAX_RATE_MM_S
 
 REQUIRED_COLUMNS = ("t_s", "force_N")
 OPTIONAL_COLUMNS = ("displacement_mm", "rate_mm_s")
+ALLOWED = {
+    "t_s": (-1e10, 1e10, "s"),  # seconds since 1970 are fine
+    "force_N": (0.0, MAX_FORCE_N, "N"),
+    "displacement_mm": (-MAX_DISPLACEMENT_MM, MAX_DISPLACEMENT_MM, "mm"),
+    "rate_mm_s": (-MAX_RATE_MM_S, MAX_RATE_MM_S, "mm/s"),
+}
+"Least, most and unit of each column; of what a setpoint carries, as in the messages."
 MAX_FILE_BYTES = 64_000_000
 
 
@@ -97,8 +105,11 @@ def read_csv(path: Path) -> Waveform:
 
 def _read_rows(path: Path) -> tuple[list[str], list[list[float]]]:
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise WaveformError(f"{path}: {path.stat().st_size} bytes: allowed is {MAX_FILE_BYTES}")
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):  # opening a named pipe would wait for a writer
+            raise WaveformError(f"{path}: allowed is a regular file")
+        if status.st_size > MAX_FILE_BYTES:
+            raise WaveformError(f"{path}: {status.st_size} bytes: allowed is {MAX_FILE_BYTES}")
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True)
             columns = _check_header(path, [name.strip() for name in next(reader, [])])
@@ -136,9 +147,7 @@ def _check_row(
     if len(cells) != len(columns):
         raise WaveformError(f"{path}: row {line} has {len(cells)} values: allowed is {len(columns)}")
     row = [_number(path, line, name, text) for name, text in zip(columns, cells, strict=True)]
-    time, force = columns.index("t_s"), columns.index("force_N")
-    if not 0.0 <= row[force] <= MAX_FORCE_N:
-        raise WaveformError(f"{path}: row {line}, force_N = {cells[force]}: allowed is 0..{MAX_FORCE_N:g} N")
+    time = columns.index("t_s")
     if previous is not None and not row[time] > previous[time]:
         raise WaveformError(
             f"{path}: row {line}, t_s = {cells[time]}: allowed is above the row before, {previous[time]:g}"
@@ -153,4 +162,7 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
         value = math.nan
     if not math.isfinite(value):
         raise WaveformError(f"{path}: row {line}, {name} = {text[:40]!r}: allowed is a finite number")
+    least, most, unit = ALLOWED[name]
+    if not least <= value <= most:
+        raise WaveformError(f"{path}: row {line}, {name} = {text[:40]}: allowed is {least:g}..{most:g} {unit}")
     return value

@@ -7,6 +7,7 @@ from tormagd.learning.model_file import ModelFileError
 
 _MODELS = resources.files(__package__) / "models"
 _ENDING = ".safetensors"
+LONGEST_SHOWN = 200  # characters of a refused name
 
 
 def model_path(name_or_path: str, beside: Path) -> Path:
@@ -14,7 +15,10 @@ def model_path(name_or_path: str, beside: Path) -> Path:
     shipped = sorted(entry.name.removesuffix(_ENDING) for entry in _MODELS.iterdir() if entry.name.endswith(_ENDING))
     if name_or_path in shipped:
         return Path(str(_MODELS / f"{name_or_path}{_ENDING}"))
-    path = beside / name_or_path
-    if not path.is_file():
-        raise ModelFileError(f"model {name_or_path!r}: allowed is a model file or one of {', '.join(shipped)}")
-    return path
+    path, allowed = beside / name_or_path, f"allowed is a model file or one of {', '.join(shipped)}"
+    try:
+        if path.is_file():
+            return path
+    except OSError as error:  # a name that no file can have, or a directory that may not be entered
+        raise ModelFileError(f"model {name_or_path[:LONGEST_SHOWN]!r}: {error.strerror}; {allowed}") from error
+    raise ModelFileError(f"model {name_or_path[:LONGEST_SHOWN]!r}: {allowed}")

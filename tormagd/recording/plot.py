@@ -4,6 +4,8 @@ Quantities are taken from the control ticks where they are recorded there, else 
 `Telemetry`; where a tick spells them otherwise, `SPELLINGS` says how.
 """
 
+import contextlib
+import io
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -129,12 +131,13 @@ def figure(recording: Recording, title: str) -> Figure:
     force, gap, duty, lane = fig.subplots(4, 1, sharex=True, height_ratios=heights)
 
     _force_panel(force, recording)
-    for axes, quantity, label, parts in (
-        (gap, "gap", "gap (mm)", (("gap_setpoint_mm", "wanted", BLACK, "--"), ("gap_mm", "measured", BLUE, "-"))),
-        (duty, "duty", "drive duty", (("left_duty", "left", BLUE, "-"), ("right_duty", "right", ORANGE, "-"))),
+    # both carriages do nearly the same, as do wish and measurement: the upper line is thin, so that the lower one shows
+    for axes, quantity, label, lower, upper in (
+        (gap, "gap", "gap (mm)", ("gap_mm", "measured", SKY), ("gap_setpoint_mm", "wanted", BLACK)),
+        (duty, "duty", "drive duty", ("left_duty", "left", SKY), ("right_duty", "right", BLACK)),
     ):
-        for name, text, colour, style in parts:
-            _line(axes, series(recording, name), text, colour, style)
+        for (name, text, colour), width in ((lower, 2.6), (upper, 0.7)):
+            _line(axes, series(recording, name), text, colour, "-", width)
         _dress(axes, label, quantity)
     duty.axhline(0.0, color=GREY, linewidth=0.6, zorder=0)
     duty.set_ylim(-1.08, 1.08)
@@ -155,14 +158,24 @@ def save_plot(recording: Recording, path: Path, title: str) -> None:
     """Draw `figure` into `path`. Raises ValueError for a suffix other than FORMATS, or without messages; OSError."""
     if path.suffix.lower() not in FORMATS:
         raise ValueError(f"{path.name}: allowed are names ending in {', '.join(FORMATS)}")
-    figure(recording, title).savefig(path, dpi=110)
+    picture = io.BytesIO()
+    figure(recording, title).savefig(picture, format=path.suffix[1:].lower(), dpi=110)
+    # beside it first: a full disk leaves neither half a picture nor takes the one that was there
+    unfinished = path.with_name(f"{path.name}.part")
+    try:
+        unfinished.write_bytes(picture.getvalue())
+        unfinished.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            unfinished.unlink()
+        raise
 
 
 def _headline(recording: Recording, title: str, faults: Iterable[Band]) -> str:
     parts = [title]
     error_N = tracking_rms_N(recording)
     if error_N is not None:
-        parts.append(f"tracking error {error_N * 1e3:.0f} mN rms")
+        parts.append(f"measured minus asked {error_N * 1e3:.0f} mN rms (sensor noise and approach included)")
     names = ", ".join(band.name for band in faults)
     parts.append(f"faults: {names}" if names else "no fault")
     if not recording.is_complete:

@@ -4,6 +4,7 @@ Two channels: `/telemetry`, the daemon's snapshots as published, and `/ticks`, o
 files open in Foxglove and PlotJuggler as they are.
 """
 
+import contextlib
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -27,7 +28,7 @@ class RecordingWriter:
 
     `telemetry_count`, `tick_count`, `telemetry_lost` (missing `seq`), `gaps` (steps between ticks above GAP_NS, or back
     in time) and `longest_gap_ms` count what was written. Raises FileExistsError rather than overwrite a recording, and
-    OSError where the file cannot be made.
+    OSError where the file cannot be made or, from `telemetry`, `ticks` and `close`, written.
     """
 
     def __init__(self, path: Path, metadata: dict[str, str] | None = None) -> None:
@@ -74,10 +75,15 @@ class RecordingWriter:
             self.tick_count += 1
 
     def close(self) -> None:
-        """Write the index and close the file. Without it the file still reads, up to its last whole chunk."""
+        """Write the index and close the file. Without it the file still reads, up to its last whole chunk.
+
+        Raises OSError where the index or the last chunk could not be written; the file is closed then too.
+        """
         if not self._file.closed:
-            self._mcap.finish()  # type: ignore[no-untyped-call]
-            self._file.close()
+            try:
+                self._mcap.finish()  # type: ignore[no-untyped-call]
+            finally:
+                self._file.close()
 
     def __enter__(self) -> Self:
         return self
@@ -85,7 +91,12 @@ class RecordingWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self.close()
+        if isinstance(error, OSError):
+            # behind a chunk that was cut, an index would make the whole file unreadable
+            with contextlib.suppress(OSError):
+                self._file.close()
+        else:
+            self.close()
 
     def _channel(self, topic: str, name: str, schema: dict[str, Any]) -> int:
         schema_id = self._mcap.register_schema(name=name, encoding="jsonschema", data=msgspec.json.encode(schema))

@@ -13,6 +13,7 @@ from msgspec import UNSET, Meta, UnsetType
 from tormagd.config import LEAST_INFERENCE_HZ, ConfigError, Strict, convert
 
 AUTO = "auto"
+LONGEST_SHOWN = 200  # characters of a refused name
 _SHIPPED = resources.files(__package__)
 
 
@@ -102,9 +103,13 @@ def scene_path(name_or_path: str) -> Path:
     """The file of a shipped scene's name, or the path itself. Raises ConfigError naming the shipped scenes."""
     if name_or_path in shipped_scenes():
         return Path(str(_SHIPPED / f"{name_or_path}.toml"))
-    if not Path(name_or_path).is_file():
-        raise ConfigError(f"scene = {name_or_path!r}: allowed is a scene file or one of {', '.join(shipped_scenes())}")
-    return Path(name_or_path)
+    path, allowed = Path(name_or_path), f"allowed is a scene file or one of {', '.join(shipped_scenes())}"
+    try:
+        if path.is_file():
+            return path
+    except OSError as error:  # a name that no file can have, or a directory that may not be entered
+        raise ConfigError(f"scene = {name_or_path[:LONGEST_SHOWN]!r}: {error.strerror}; {allowed}") from error
+    raise ConfigError(f"scene = {name_or_path[:LONGEST_SHOWN]!r}: {allowed}")
 
 
 def load_scene(name_or_path: str) -> Scene:

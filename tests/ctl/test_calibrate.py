@@ -1,0 +1,342 @@
+"""Calibrating: sweeps recorded in virtual time from the simulated device, good ones and bad ones (all synthetic)."""
+
+import contextlib
+import csv
+import datetime
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tormagd.closed_loop import ClosedLoop
+from tormagd.config import Config
+from tormagd.control import estimate
+from tormagd.control.core import build_core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.ctl import calibrate as ctl_calibrate
+from tormagd.ctl import calibrate_motors as ctl_calibrate_motors
+from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, up_and_down, write_sweeps
+from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS
+from tormagd.ctl.calibrate_motors import excitation, motor_log
+from tormagd.ctl.calibrate_run import Range
+from tormagd.ctl.main import main
+from tormagd.ctl.outcome import CommandError
+from tormagd.learning import calibration
+from tormagd.learning.calibration import CalibrationError, displacement, fit, require_usable, training_rows
+from tormagd.learning.model_file import load_model
+from tormagd.learning.shipped import model_path
+from tormagd.physics.inserts import insert
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import ReversingHand
+from tormagd.simulation.parameters import load_plant
+
+INSERT = "MRE-50-40"
+CREATED = datetime.date(2024, 2, 29)
+
+
+def record(plant="sample_1", hand=None, rates_N_s=(0.8, 1.0, 0.8), most_N=2.0):
+    """The ticks of each sweep, as the daemon would publish them."""
+    config = Config()
+    core = build_core(config)
+    device = VirtualDevice(load_plant(plant), hand or ReversingHand(2.0), seed=3)
+    loop = ClosedLoop(config, core.stepper, core.planner, device)
+    loop.arm()
+    sweeps = []
+    for rate in rates_N_s:
+        waveform = up_and_down(Range(core.planner.portrait.least_N, most_N), rate)
+        start_s = loop.now_s
+        rows = []
+        for sample in loop.run(
+            waveform.duration_s,
+            lambda now_s, w=waveform, s=start_s: TimedSetpoint(w.at(now_s - s).force_N, now_s, 0.25),
+        ):
+            seen = sample.state.estimate
+            assert seen is not None
+            rows.append(
+                (sample.time_s, seen.left_mm, seen.right_mm, seen.handle_mm, seen.handle.rate_mm_s, seen.force_N)
+            )
+        sweeps.append(dict(zip(COLUMNS, np.array(rows).T, strict=True)))
+    return sweeps
+
+
+@pytest.fixture(scope="module")
+def sweeps():
+    return record()
+
+
+@pytest.fixture
+def table(sweeps, tmp_path):
+    """The sweep file of a good run, as an array; tests spoil it."""
+    write_sweeps(tmp_path / "sweep.csv", sweeps)
+    return calibration.read_sweep(tmp_path / "sweep.csv")
+
+
+def rows(table):
+    return training_rows(table, insert(INSERT), 4.0)
+
+
+def column(name):
+    return calibration.COLUMNS.index(name)
+
+
+def refusal(table, epochs=20):
+    """The code and the text with which a sweep is refused."""
+    try:
+        data = rows(table)
+        require_usable(data)
+        fit(data, INSERT, CREATED, hidden=12, epochs=epochs)
+    except CalibrationError as refused:
+        return refused.code, str(refused)
+    pytest.fail("not refused")
+
+
+def test_a_good_sweep_gives_a_model_that_knows_what_it_was_judged_on(table):
+    data = rows(table)
+    require_usable(data)
+    model = fit(data, INSERT, CREATED, hidden=12, epochs=60)
+    metrics = model.metadata.metrics
+    assert metrics["judged_r2"] > 0.98
+    assert metrics["judged_mae_N"] <= metrics["most_mae_N"]
+    assert metrics["noise_mae_N"] == pytest.approx(0.01 * math.sqrt(2 / math.pi), rel=0.2)  # sample 1: sd 10 mN
+    assert metrics["judged_rows"] == (data.cycle == 1).sum()
+    assert metrics["judged_rows"] + metrics["train_rows"] + metrics["validation_rows"] == len(data)
+    assert (model.metadata.insert, model.metadata.created) == (INSERT, CREATED)
+    # what the shipped model, made from a bench sweep of the same plant, says of a turning handle
+    shipped = load_model(model_path("torque_mre_50_40", Path()), element="torque", insert=INSERT)
+    asked = [[2.0, 30.0, field, 40.0] for field in np.linspace(*model.field_range_mT, 9)]
+    assert model.predict(asked) == pytest.approx(shipped.predict(asked), rel=0.08)
+
+
+def test_the_whole_process_writes_model_and_training_data(sweeps, tmp_path, capsys):
+    write_sweeps(tmp_path / "sweep.csv", sweeps)
+    out, data = tmp_path / "m.safetensors", tmp_path / "t.csv"
+    arguments = [str(tmp_path / "sweep.csv"), "--insert", INSERT, "--out", str(out), "--csv", str(data)]
+    assert calibration.main(arguments) == 0
+    result = json.loads(capsys.readouterr().out)["result"]
+    model = load_model(out, element="torque", insert=INSERT)
+    assert result["metrics"] == model.metadata.metrics
+    header = data.read_text().splitlines()[0]
+    assert header == "displacement_mm,rate_mm_s,field_mT,cip_percent,force_N,cycle,time_s"
+    assert calibration.main([*arguments[:2], "MRE-99-99", *arguments[3:]]) == 1
+    assert "MRE-99-99" in json.loads(capsys.readouterr().out)["error"]["message"]
+
+
+def test_a_handle_that_stands_still_is_refused(table):
+    still = table.copy()
+    still[still[:, column("sweep")] == 2.0, column("rate_mm_s")] = 0.3
+    code, text = refusal(still)
+    assert code == "handle_still"
+    assert "0% of sweep 3" in text
+    assert "30%" in text
+
+
+@pytest.mark.parametrize("dead", [0.0, 1.3, "noise"])
+def test_a_dead_force_sensor_is_refused(table, dead):
+    spoilt = table.copy()
+    noise = np.random.default_rng(0).normal(0.0, 0.01, len(table))
+    spoilt[:, column("force_N")] = noise if dead == "noise" else dead
+    assert refusal(spoilt)[0] == "force_dead"
+
+
+def test_too_small_a_field_range_is_refused(table):
+    narrow = table.copy()
+    narrow[:, column("gap_mm")] = 80.0 + 0.05 * (narrow[:, column("gap_mm")] - 80.0)
+    code, text = refusal(narrow)
+    assert code == "field_range"
+    assert "20%" in text
+
+
+def test_a_force_that_has_little_to_do_with_the_field_is_refused_with_figures(table):
+    loose = table.copy()
+    slow = np.sin(table[:, column("time_s")] * 1.7) * 0.4
+    loose[:, column("force_N")] += slow
+    code, text = refusal(loose)
+    assert code == "poor_fit"
+    r2, mae_mN, allowed_mN = (
+        float(re.search(pattern, text)[1])
+        for pattern in (r"R2 is (-?[\d.]+)", r"mean error ([\d.]+) mN", r"allowed: ([\d.]+) mN")
+    )
+    assert r2 < 0.97
+    assert mae_mN > allowed_mN
+
+
+def test_a_force_that_falls_with_the_field_somewhere_is_refused(table):
+    folded = table.copy()
+    closed = (95.0 - table[:, column("gap_mm")]) / 35.0
+    noise = np.random.default_rng(0).normal(0.0, 0.01, len(table))
+    folded[:, column("force_N")] = 1.0 + 2.0 * (closed - 0.4) ** 2 + noise
+    code, text = refusal(folded, epochs=60)
+    assert code == "not_rising"
+    assert "falls by" in text
+
+
+def test_two_sweeps_are_too_few(table):
+    assert refusal(table[table[:, column("sweep")] < 2.0])[0] == "few_sweeps"
+
+
+def test_a_steady_handle_teaches_nothing_about_rate_and_displacement(table):
+    steady = table.copy()
+    steady[:, column("handle_mm")] = 42.0 * steady[:, column("time_s")]
+    steady[:, column("rate_mm_s")] = 42.0 + np.random.default_rng(0).normal(0.0, 0.2, len(table))
+    ranges = rows(steady).ranges()
+    assert ranges["displacement_mm"] == (2.0, 2.0)
+    assert ranges["rate_mm_s"][0] == ranges["rate_mm_s"][1] == pytest.approx(42.0, abs=0.1)
+
+
+def test_displacement_is_what_the_daemon_calls_it():
+    """One law, stated twice because the fitting process may not import control."""
+    rng = np.random.default_rng(1)
+    path = np.cumsum(rng.normal(0.0, 0.06, 4000)) + 3.0 * np.sin(np.arange(4000) / 90.0)
+    handle = estimate.Handle(0.0, 0.0, 1.0, path[0], path[0])
+    expected = []
+    for position in path:
+        fake = estimate.Estimate(0, True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, handle, 0.0)
+        handle = estimate._handle(fake, float(position), 1e-3)
+        expected.append(handle.displacement_mm)
+    found = displacement(path)
+    known = np.isfinite(found)
+    assert known[500:].all()
+    assert found[known] == pytest.approx(np.array(expected)[known])
+    assert (calibration.TURN_MM, calibration.MOBILISED_MM) == (estimate.TURN_MM, estimate.MOBILISED_MM)
+    assert calibration.COLUMNS == FILE_COLUMNS
+
+
+def test_a_sweep_file_that_is_none_says_why(tmp_path):
+    for text, told in (
+        ("a,b\n1,2\n", "header"),
+        (",".join(FILE_COLUMNS) + "\n1,2,3,4,5,x\n", "x"),
+        (",".join(FILE_COLUMNS) + "\n1,2,3,4,5,nan\n1,2,3,4,5,6\n", "finite"),
+    ):
+        path = tmp_path / "sweep.csv"
+        path.write_text(text)
+        with pytest.raises(ValueError, match=told):
+            calibration.read_sweep(path)
+
+
+def test_up_and_down_starts_ends_and_turns_where_it_should():
+    waveform = up_and_down(Range(0.6, 2.0), 0.5)
+    forces = [waveform.at(share * waveform.duration_s).force_N for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    assert forces == pytest.approx([0.6, 1.3, 2.0, 1.3, 0.6])
+    assert waveform.duration_s == pytest.approx(5.6)
+
+
+def test_the_motors_excitation_stays_within_the_range_and_uses_it():
+    forces = Range(0.6, 2.0)
+    waveform = excitation(forces)
+    asked = np.array([waveform.at(t).force_N for t in np.arange(0.0, waveform.duration_s, 0.005)])
+    assert asked.min() >= forces.least_N
+    assert asked.max() == pytest.approx(forces.most_N)
+    assert np.abs(np.diff(asked)).max() > 0.5  # jumps for the inertia
+    assert (np.abs(np.diff(asked)) > 0.0).mean() > 0.5  # ramps for the friction
+
+
+def ticks(count=200):
+    """Control ticks of a carriage that opens evenly; the device answers every millisecond."""
+    known = dict.fromkeys(MOTOR_COLUMNS, np.zeros(count))
+    time_s = 5.0 + 1e-3 * np.arange(count)
+    return known | {
+        "device_time_s": time_s,
+        "left_duty": np.arange(count) / 1e3,
+        "supply_V": np.full(count, 12.0),
+        "left_mm": 40.0 + np.arange(count) / 1e2,
+        "right_mm": np.full(count, 30.0),
+        "reference_gap_mm": np.full(count, 80.0),
+    }
+
+
+def test_a_motor_log_has_volts_and_even_times_whatever_the_ticks_missed():
+    given = ticks()
+    plain = motor_log(given, "left")
+    assert plain["t_s"][:3] == pytest.approx([0.0, 1e-3, 2e-3])
+    assert plain["input_V"][:3] == pytest.approx([0.0, 0.012, 0.024])
+    assert plain["reference_mm"][0] == 40.0
+    # a tick without news from the device, one that never came, one before the device was known
+    order = np.array([0, 1, 2, *range(3, 50), *range(51, 200)])
+    spoilt = {name: values[order].copy() for name, values in given.items()}
+    spoilt["device_time_s"][2] = spoilt["device_time_s"][1]
+    spoilt["left_mm"][2] = spoilt["left_mm"][1]
+    spoilt["supply_V"][0] = np.nan
+    log = motor_log(spoilt, "left")
+    assert np.diff(log["t_s"]) == pytest.approx(1e-3)
+    assert all(np.isfinite(values).all() for values in log.values())
+    assert log["position_mm"] == pytest.approx(plain["position_mm"][1 : len(log["t_s"]) + 1], abs=1e-9)
+    assert log["input_V"][0] == pytest.approx(0.024)  # the duty that the device went on with
+    assert log["input_V"][48] == log["input_V"][49]  # held where a tick is missing
+
+
+def test_a_motor_log_with_a_hole_is_refused():
+    given = ticks()
+    given["device_time_s"] = given["device_time_s"] + 0.03 * (np.arange(200) > 100)
+    with pytest.raises(CommandError, match="silence of 31 ms"):
+        motor_log(given, "left")
+
+
+def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, tmp_path, monkeypatch, capsys):
+    class Played:
+        def play(self, waveform, bar):
+            assert waveform.at(0.0).force_N > 0.6
+            return ticks(300)
+
+    monkeypatch.setattr(ctl_calibrate_motors, "armed", lambda *_: contextlib.nullcontext(Played()))
+    found = {"setpoint_age_ms": None, "least_N": 0.6, "most_N": 4.0}
+    fake_daemon.answers["status"] = lambda: {"ok": True, "result": found}
+    out = tmp_path / "right.csv"
+    arguments = ["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--motors", "--side", "right"]
+    assert main([*arguments, "--out", str(out)]) == 0
+    assert json.loads(capsys.readouterr().out)["result"]["rows"] == 299
+    with out.open(newline="") as file:
+        written = list(csv.DictReader(file))
+    assert list(written[0]) == ["t_s", "input_V", "position_mm", "current_A", "force_N", "reference_mm"]
+    assert (float(written[1]["t_s"]), float(written[1]["position_mm"])) == (0.001, 30.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("--out", "m"), "--motors"),
+        (("--insert", "A", "--motors", "--out", "m"), "--motors"),
+        (("--motors", "--csv", "t", "--out", "m"), "--csv"),
+        (("--insert", "A", "--out", "there"), "exists"),
+        (("--insert", "A", "--out", "none/m"), "not a directory"),
+        (("--insert", "A", "--out", "m"), "--yes"),
+    ],
+)
+def test_what_cannot_be_meant_is_a_usage_error(tmp_path, monkeypatch, capsys, arguments, told):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.stdin", open("/dev/null"))  # noqa: SIM115, PTH123
+    Path("there").write_text("precious")
+    assert main(["calibrate", *arguments]) == 2
+    assert told in capsys.readouterr().err
+    assert Path("there").read_text() == "precious"
+
+
+def test_a_second_publisher_is_refused_before_anything_moves(fake_daemon, tmp_path, capsys):
+    found = {"setpoint_age_ms": 12.0, "least_N": 0.6, "most_N": 4.0}
+    fake_daemon.answers["status"] = lambda: {"ok": True, "result": found}
+    out = tmp_path / "m.safetensors"
+    arguments = ["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--insert", INSERT]
+    assert main([*arguments, "--out", str(out)]) == 1
+    assert json.loads(capsys.readouterr().out)["error"]["code"] == "other_publisher"
+    assert fake_daemon.commands == ["status"]
+
+
+def test_an_unknown_insert_is_refused_before_anything_moves(fake_daemon, tmp_path, capsys):
+    out = tmp_path / "m.safetensors"
+    arguments = ["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--insert", "MRE-99-99"]
+    assert main([*arguments, "--out", str(out)]) == 1
+    assert "MRE-99-99" in json.loads(capsys.readouterr().out)["error"]["message"]
+    assert fake_daemon.commands == []
+
+
+def test_a_refused_fit_is_the_commands_refusal(tmp_path):
+    path = tmp_path / "sweep.csv"
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerow(FILE_COLUMNS)
+        csv.writer(file).writerows([(k * 1e-3, 0, 80.0, k * 1e-3, 0.0, 1.0) for k in range(100)])
+    with pytest.raises(CommandError, match="handle moved for 0%") as refused:
+        ctl_calibrate._ask_fitter(str(path), "--insert", INSERT, "--out", str(tmp_path / "m.safetensors"))
+    assert refused.value.code == "handle_still"
+    assert not (tmp_path / "m.safetensors").exists()

@@ -1,0 +1,100 @@
+"""Reading a motor log: the CSV of the contract, or the EMPS benchmark's .mat file."""
+
+import csv
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
+
+Array = npt.NDArray[np.float64]
+
+COLUMNS = ("t_s", "input_V", "position_mm")
+CURRENT_COLUMN = "current_A"
+LEAST_ROWS = 100
+LEAST_RATE_HZ = 400.0
+
+
+class LogError(ValueError):
+    """A log that cannot be used: file, line, what is wrong and what is allowed."""
+
+
+class Log(NamedTuple):
+    """A motor log: evenly spaced times, s; voltage, V; position, m; the gain where the file states one, N/V; and the
+    motor's current, A, where it was logged."""
+
+    t_s: Array
+    input_V: Array
+    position_m: Array
+    gain_N_V: float | None = None
+    current_A: Array | None = None
+
+    @property
+    def period_s(self) -> float:
+        """Time from row to row."""
+        return float(np.median(np.diff(self.t_s)))
+
+    def part(self, rows: slice) -> "Log":
+        """Some of the rows."""
+        current = None if self.current_A is None else self.current_A[rows]
+        return Log(self.t_s[rows], self.input_V[rows], self.position_m[rows], self.gain_N_V, current)
+
+
+def read_log(path: Path) -> Log:
+    """The log in a CSV or EMPS .mat file. Raises LogError."""
+    log = _read_mat(path) if path.suffix == ".mat" else _read_csv(path)
+    if len(log.t_s) < LEAST_ROWS:
+        raise LogError(f"{path}: {len(log.t_s)} rows: allowed are at least {LEAST_ROWS}")
+    for name, values in zip((*COLUMNS, "gain", CURRENT_COLUMN), log, strict=True):
+        if isinstance(values, np.ndarray) and not np.isfinite(values).all():
+            row = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise LogError(f"{path}, row {row}: {name} = {values[row]}: allowed is a finite number")
+    steps, period = np.diff(log.t_s), log.period_s
+    if period <= 0.0 or np.abs(steps - period).max() > 0.5 * period:
+        row = int(np.argmax(np.abs(steps - period)))
+        raise LogError(
+            f"{path}, row {row + 1}: t_s steps by {steps[row]:g} s: allowed is about {period:g} s throughout"
+        )
+    if 1.0 / period < LEAST_RATE_HZ:
+        raise LogError(f"{path}: sampled at {1.0 / period:.0f} Hz: allowed is at least {LEAST_RATE_HZ:.0f} Hz")
+    return log
+
+
+def _read_mat(path: Path) -> Log:
+    try:
+        data = loadmat(path)
+        columns = [np.asarray(data[name], dtype=np.float64).ravel() for name in ("t", "vir", "qm")]
+        gain = float(np.asarray(data["gtau"]).item())
+    except OSError as error:
+        raise LogError(f"{path}: {error.strerror or error}") from error
+    except (MatReadError, KeyError, ValueError, TypeError) as error:
+        raise LogError(f"{path}: not an EMPS file with t, vir, qm and gtau: {error}") from error
+    if len({len(column) for column in columns}) != 1:
+        raise LogError(f"{path}: t, vir and qm have {[len(column) for column in columns]} rows: allowed is one length")
+    return Log(*columns, gain)
+
+
+def _read_csv(path: Path) -> Log:
+    rows: list[tuple[float, ...]] = []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            header = reader.fieldnames or ()
+            missing = set(COLUMNS) - set(header)
+            if missing:
+                raise LogError(f"{path}: no column {', '.join(sorted(missing))}: needed are {', '.join(COLUMNS)}")
+            names = (*COLUMNS, CURRENT_COLUMN) if CURRENT_COLUMN in header else COLUMNS
+            for row in reader:
+                try:
+                    rows.append(tuple(float(row[name]) for name in names))
+                except (TypeError, ValueError) as error:
+                    raise LogError(f"{path}, line {reader.line_num}: {error}") from error
+    except OSError as error:
+        raise LogError(f"{path}: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise LogError(f"{path}: {error}") from error
+    table = np.array(rows).reshape(-1, len(names))
+    current = table[:, 3] if len(names) > len(COLUMNS) else None
+    return Log(table[:, 0], table[:, 1], table[:, 2] * 1e-3, None, current)

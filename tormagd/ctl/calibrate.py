@@ -1,0 +1,176 @@
+"""`tormagctl calibrate`: a guided sweep through the running daemon, and a model of the insert from it.
+
+The sweep asks for forces, so every limit of the daemon stays in force. A process of its own (`learning.calibration`)
+turns it into training data, fits, judges and saves: neither the daemon nor this program carries a training.
+"""
+
+import csv
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from tormagd.config import Endpoints
+from tormagd.ctl.calibrate_run import Columns, InterruptedRunError, Range, Run, armed, reach, seconds_bar
+from tormagd.ctl.client import Client
+from tormagd.ctl.interrupt import interrupted_by
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+from tormagd.ctl.waveform import Sample, Waveform
+from tormagd.scenes.scene import Scene
+
+COLUMNS = ("monotonic_s", "left_mm", "right_mm", "handle_mm", "handle_rate_mm_s", "measured_cf")
+"Of the control ticks, what a sweep is made of."
+FILE_COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
+EVERY = 4
+"Every fourth tick is kept: neighbours say nearly the same."
+
+PACES = ("steadily, about 20 turns a minute", "slowly, about 10 turns a minute", "quickly, about 25 turns a minute")
+MOVING_MM_S = 5.0
+HANDLE_PATIENCE_S = 30.0
+FITTING = "tormagd.learning.calibration"
+POLL_S = 0.2
+
+
+def calibrate(
+    endpoints: Endpoints,
+    scene: Scene,
+    insert: str,
+    out: Path,
+    training_csv: Path | None,
+    rates_N_s: Sequence[float],
+    wait_s: float,
+) -> Outcome:
+    """Sweep the force up and down once for each of `rates_N_s`, fit, judge, save. The gap opens after the sweeps.
+
+    Raises CommandError: USAGE, REFUSED (by the daemon; the handle stands still; a sweep or a fit that is not good
+    enough, and then there is no model file), FAULT, UNREACHABLE, `InterruptedRunError`.
+    """
+    _ask_fitter("--insert", insert)  # an unknown insert is told now, not after the sweeps
+    with Client(endpoints.control, wait_s) as client:
+        forces = reach(client, scene.force.most_N)
+        if not forces.most_N > forces.least_N:
+            raise CommandError(
+                Exit.REFUSED,
+                "no_range",
+                f"the daemon's scene ends at {forces.most_N:g} N, under the least force of {forces.least_N:g} N",
+                "run the daemon with a scene that asks for more force",
+            )
+        with armed(endpoints, client, COLUMNS, wait_s) as run:
+            sweeps = [_sweep(run, forces, number, rates_N_s) for number in range(len(rates_N_s))]
+    with tempfile.TemporaryDirectory(prefix="tormag") as folder:
+        table = Path(folder) / "sweep.csv"
+        write_sweeps(table, sweeps)
+        arguments = [str(table), "--insert", insert, "--out", str(out)]
+        arguments += ["--inner-radius-mm", str(scene.insert.inner_radius_mm)]
+        arguments += [] if training_csv is None else ["--csv", str(training_csv)]
+        result = _ask_fitter(*arguments)
+    return Outcome(result, _text(result))
+
+
+def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> Columns:
+    waveform = up_and_down(forces, rates_N_s[number])
+    label = f"sweep {number + 1} of {len(rates_N_s)}"
+    print(f"{label}: turn the handle to and fro {PACES[number % len(PACES)]}", file=sys.stderr)
+    _wait_for_handle(run, forces.least_N)
+    with seconds_bar(waveform.duration_s, label) as bar:
+        return run.play(waveform, bar)
+
+
+def _wait_for_handle(run: Run, force_N: float) -> None:
+    rate = COLUMNS.index("handle_rate_mm_s")
+    until_s = time.monotonic() + HANDLE_PATIENCE_S
+    while not any(abs(row[rate]) >= MOVING_MM_S for row in run.exchange(force_N)):
+        if time.monotonic() > until_s:
+            raise CommandError(
+                Exit.REFUSED,
+                "handle_still",
+                f"the handle stood still for {HANDLE_PATIENCE_S:g} s",
+                "turn it to and fro, at 5 mm/s or more at the roller, while the sweep runs",
+            )
+
+
+def up_and_down(forces: Range, rate_N_s: float) -> Waveform:
+    """From the least force to the most and back at a steady rate."""
+    span_N = forces.most_N - forces.least_N
+    half_s = span_N / rate_N_s
+
+    def at(t_s: float) -> Sample:
+        return Sample(forces.least_N + span_N * (1.0 - min(1.0, abs(t_s / half_s - 1.0))))
+
+    return Waveform(2.0 * half_s, at)
+
+
+def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:
+    """The file that `learning.calibration` reads: every fourth tick of each sweep that says everything."""
+    start_s = min((float(sweep["monotonic_s"][0]) for sweep in sweeps if sweep["monotonic_s"].size), default=0.0)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(FILE_COLUMNS)
+        for number, sweep in enumerate(sweeps):
+            known = np.isfinite(np.column_stack([sweep[name] for name in COLUMNS])).all(axis=1)
+            kept = {name: sweep[name][known][::EVERY] for name in COLUMNS}
+            rows = (
+                kept["monotonic_s"] - start_s,
+                np.full(len(kept["monotonic_s"]), number),
+                kept["left_mm"] + kept["right_mm"],
+                kept["handle_mm"],
+                kept["handle_rate_mm_s"],
+                kept["measured_cf"],
+            )
+            writer.writerows(zip(*(column.tolist() for column in rows), strict=True))
+
+
+def _ask_fitter(*arguments: str) -> dict[str, Any]:
+    command = [sys.executable, "-m", FITTING, *arguments]
+    with (
+        interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted,
+        subprocess.Popen(command, stdout=subprocess.PIPE) as fitter,
+    ):
+        said = None
+        while said is None:
+            try:
+                said, _ = fitter.communicate(timeout=POLL_S)
+            except subprocess.TimeoutExpired:
+                if is_interrupted():
+                    fitter.terminate()
+    try:
+        answer: dict[str, Any] = msgspec.json.decode(said)
+    except msgspec.DecodeError as error:
+        if is_interrupted():
+            raise InterruptedRunError from error
+        raise CommandError(
+            Exit.REFUSED,
+            "fit_failed",
+            f"the fitting process ended with {fitter.returncode} and said nothing",
+            "its last words are above; calibrate again",
+        ) from error
+    if "error" in answer:
+        told = answer["error"]
+        raise CommandError(Exit.REFUSED, told["code"], told["message"], told["hint"])
+    result: dict[str, Any] = answer["result"]
+    return result
+
+
+def _text(result: dict[str, Any]) -> str:
+    metrics = result["metrics"]
+    return (
+        f"{result['model']}: {result['insert']}, {result['created']}, {result['rows']} rows. On sweeps kept from the "
+        f"fit R2 {metrics['judged_r2']:.4f}, mean error {metrics['judged_mae_N'] * 1e3:.1f} mN (allowed "
+        f"{metrics['most_mae_N'] * 1e3:.1f}; the sensor's noise alone {metrics['noise_mae_N'] * 1e3:.1f})\n"
+        f"next: name the file as insert.model in a scene file of your own"
+    )
+
+
+def require_new(path: Path, option: str) -> None:
+    """Raise CommandError (USAGE) where `path` exists or cannot be made: before anything moves."""
+    if path.exists():
+        raise usage_error(f"{option} {path} exists", "give another name; nothing is overwritten")
+    if not path.parent.is_dir():
+        raise usage_error(f"{option} {path}: {path.parent} is not a directory", "give a file in one you may write to")

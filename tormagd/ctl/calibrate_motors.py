@@ -1,0 +1,138 @@
+"""`tormagctl calibrate --motors`: a log of one motor's voltage, current and motion, for `tools/identify_motor.py`.
+
+Only forces are asked for, so every limit of the daemon stays in force. They are chosen for what they make the carriages
+do: slow ramps show friction, fast ones the speed term, jumps the inertia.
+"""
+
+import bisect
+import csv
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from tormagd.config import Endpoints
+from tormagd.ctl.calibrate_run import Columns, Range, armed, reach, seconds_bar
+from tormagd.ctl.client import Client
+from tormagd.ctl.outcome import CommandError, Exit, Outcome
+from tormagd.ctl.waveform import Sample, Waveform
+
+Side: TypeAlias = Literal["left", "right"]
+
+COLUMNS = (
+    "device_time_s",
+    "left_duty",
+    "right_duty",
+    "supply_V",
+    "left_mm",
+    "right_mm",
+    "left_current_A",
+    "right_current_A",
+    "measured_cf",
+    "reference_gap_mm",
+)
+"Of the control ticks, what a motor log is made of."
+LOG_COLUMNS = ("t_s", "input_V", "position_mm", "current_A", "force_N", "reference_mm")
+
+CLEAR_N = 0.1
+"Kept from F_min: at the open end the firmware holds back a duty that would push on."
+RAMPS_S = (12.0, 6.0, 3.0)
+"Time from the least to the most force; then the same time back."
+JUMP_SHARES = (0.0, 0.5, 0.2, 0.8, 0.35, 1.0, 0.6, 0.9, 0.1, 0.7, 0.3, 0.55, 0.0)
+"Levels of the jumps, as shares of the range: small and large ones, up and down, over the whole stroke."
+JUMP_S = 0.6
+ROUNDS = 2
+"The whole is done twice: one half is fitted, the other judges."
+LONGEST_HOLE_S = 0.02
+"A longer silence of the device is not bridged."
+
+
+def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
+    """The forces to ask for: ramps, then jumps, `rounds` times."""
+    low, high = forces.least_N + CLEAR_N, forces.most_N
+    points = [(0.0, low)]
+
+    def go(force_N: float, duration_s: float) -> None:
+        points.append((points[-1][0] + duration_s, force_N))
+
+    for _ in range(rounds):
+        for ramp_s in RAMPS_S:
+            go(high, ramp_s)
+            go(low, ramp_s)
+        for share in JUMP_SHARES:
+            go(low + share * (high - low), 1e-3)
+            go(points[-1][1], JUMP_S)
+    times = [time_s for time_s, _ in points]
+
+    def at(t_s: float) -> Sample:
+        right = min(max(bisect.bisect_right(times, t_s), 1), len(points) - 1)
+        (before_s, before_N), (after_s, after_N) = points[right - 1], points[right]
+        share = min(max((t_s - before_s) / (after_s - before_s), 0.0), 1.0)
+        return Sample(before_N + share * (after_N - before_N))
+
+    return Waveform(times[-1], at)
+
+
+def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side: Side, wait_s: float) -> Outcome:
+    """Drive both carriages through `excitation` and write the log of one. The gap opens in the end.
+
+    Raises CommandError: USAGE where the file exists or cannot be made, REFUSED, FAULT, UNREACHABLE.
+    """
+    with Client(endpoints.control, wait_s) as client:
+        waveform = excitation(reach(client, scene_most_N))
+        with (
+            armed(endpoints, client, COLUMNS, wait_s) as run,
+            seconds_bar(waveform.duration_s, "motors") as bar,
+        ):
+            columns = run.play(waveform, bar)
+    log = motor_log(columns, side)
+    rows = len(log["t_s"])
+    with path.open("x", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(LOG_COLUMNS)
+        writer.writerows(
+            [f"{value:.6f}" for value in row] for row in zip(*(log[name] for name in LOG_COLUMNS), strict=True)
+        )
+    result = {"file": str(path), "side": side, "rows": rows, "seconds": round(float(log["t_s"][-1]), 3)}
+    text = f"{path}: {rows} rows of the {side} carriage. next: python tools/identify_motor.py {path}"
+    return Outcome(result, text)
+
+
+def motor_log(ticks: Columns, side: Side) -> Columns:
+    """The motor log CSV's columns from control ticks, evenly spaced on the device's clock, time from 0.
+
+    A row's voltage is the one sent in answer to the row's position: duty times supply. Positions are from the home
+    switch, opening positive; `force_N` is the force at the roller, which says nothing about the motor. A tick without
+    news from the device is left out; what is missing is filled in: voltages held, the rest along straight lines.
+    Raises CommandError (REFUSED) where the device was silent for more than 20 ms.
+    """
+    known = np.isfinite(np.column_stack([ticks[name] for name in COLUMNS])).all(axis=1)
+    time_s = ticks["device_time_s"][known]
+    # of ticks with the same measurement the last one's duty is what the device goes on with
+    fresh = np.append(np.diff(time_s) > 0.0, True)[: len(time_s)]
+    time_s = time_s[fresh]
+    holes = np.diff(time_s)
+    if len(time_s) < 2 or holes.max() > LONGEST_HOLE_S:
+        longest = "no measurements" if len(time_s) < 2 else f"a silence of {holes.max() * 1e3:.0f} ms"
+        raise CommandError(
+            Exit.REFUSED,
+            "holes",
+            f"{longest} in the ticks: allowed are {LONGEST_HOLE_S * 1e3:.0f} ms",
+            "run it again on a machine with less load; tormagctl doctor",
+        )
+    column = {name: ticks[name][known][fresh] for name in COLUMNS}
+    period_s = float(np.median(holes))
+    even_s = np.arange(time_s[0], time_s[-1], period_s)
+    held = np.searchsorted(time_s, even_s + period_s / 2.0, side="right") - 1
+    volts = column[f"{side}_duty"] * column["supply_V"]
+    straight = {
+        "position_mm": column[f"{side}_mm"],
+        "current_A": column[f"{side}_current_A"],
+        "force_N": column["measured_cf"],
+        "reference_mm": column["reference_gap_mm"] / 2.0,
+    }
+    return {
+        "t_s": even_s - even_s[0],
+        "input_V": volts[held],
+        **{name: np.interp(even_s, time_s, values) for name, values in straight.items()},
+    }

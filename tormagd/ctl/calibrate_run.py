@@ -1,0 +1,237 @@
+"""A calibration run through the daemon: arm, publish forces, collect control ticks, open the gap whatever happens."""
+
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import zmq
+from tqdm import tqdm
+
+from tormagd.config import Endpoints
+from tormagd.ctl.client import Client, connect, unreachable
+from tormagd.ctl.interrupt import interrupted_by
+from tormagd.ctl.operate import home
+from tormagd.ctl.outcome import CommandError, Exit, is_terminal
+from tormagd.ctl.waveform import Waveform
+from tormagd.messages import VERSION, MessageError, Setpoint, encode
+from tormagd.recording.ticks import MAX_BATCH_BYTES, TickBatch, Value, decode_ticks
+
+Columns = dict[str, npt.NDArray[np.float64]]
+
+SOURCE = "calibrate"
+RATE_HZ = 200.0
+VALID_FOR_MS = 250.0
+"If this process dies, the force decays to the least one this much later."
+SILENT_S = 1.0
+"Ticks come every 20 ms; without any for this long the daemon has gone."
+RECENT_SETPOINT_MS = 1_000.0
+QUEUE = 10_000
+HOMING_S = 30.0
+
+
+class InterruptedRunError(CommandError):
+    """The person ended the run; nothing is kept of it."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            Exit.REFUSED,
+            "interrupted",
+            "interrupted: a device that was armed is disabled and opens its gap; there is no model and no log",
+            "run it again when you are ready",
+        )
+
+
+class Range(msgspec.Struct, frozen=True):
+    """The forces that the daemon can give with the model it has now, N."""
+
+    least_N: float
+    most_N: float
+
+
+def seconds_bar(duration_s: float, label: str) -> "tqdm[Any]":
+    """A progress bar over time, on a terminal only."""
+    return tqdm(
+        total=duration_s,
+        desc=label,
+        bar_format="{desc}: {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} s",
+        disable=not is_terminal(sys.stderr),
+    )
+
+
+class Run:
+    """An armed device: forces go out, control ticks come in. Made by `armed`."""
+
+    def __init__(
+        self,
+        endpoints: Endpoints,
+        client: Client,
+        sockets: tuple["zmq.Socket[bytes]", "zmq.Socket[bytes]"],
+        columns: Sequence[str],
+        is_interrupted: Callable[[], bool],
+    ) -> None:
+        self._endpoints, self._client, self._columns = endpoints, client, tuple(columns)
+        self._setpoints, self._ticks = sockets
+        self._is_interrupted = is_interrupted
+        self._seq = time.time_ns()  # above every earlier run's, so that none of ours looks repeated
+        self._heard_s = time.monotonic()
+
+    def play(self, waveform: Waveform, bar: "tqdm[Any] | None" = None) -> Columns:
+        """Publish `waveform` and return what the ticks of that time said: one array for each column asked for.
+
+        A value that was null is NaN. Raises CommandError: FAULT or REFUSED where the device stops rendering on the way,
+        UNREACHABLE where the daemon goes, `InterruptedRunError`.
+        """
+        rows: list[list[float]] = []
+        start_s = time.monotonic()
+        while (t_s := time.monotonic() - start_s) < waveform.duration_s:
+            rows += self.exchange(waveform.at(t_s).force_N)
+            if bar is not None:
+                bar.update(time.monotonic() - start_s - t_s)
+        table = np.array(rows, dtype=np.float64).reshape(-1, len(self._columns))
+        return dict(zip(self._columns, table.T, strict=True))
+
+    def exchange(self, force_N: float) -> list[list[float]]:
+        """Publish one force and return the rows that came until the next one is due. Raises as `play`."""
+        if self._is_interrupted():
+            raise InterruptedRunError
+        due_s = time.monotonic() + 1.0 / RATE_HZ
+        self._seq += 1
+        setpoint = Setpoint(
+            v=VERSION,
+            source=SOURCE,
+            seq=self._seq,
+            stamp_ns=time.time_ns(),
+            servo_cf=force_N,
+            valid_for_ms=VALID_FOR_MS,
+        )
+        self._setpoints.send(encode(setpoint))
+        rows: list[list[float]] = []
+        while (left_s := due_s - time.monotonic()) > 0.0:
+            if self._ticks.poll(max(1, round(left_s * 1e3))):
+                rows += self._rows(self._ticks.recv_multipart()[-1])
+        if time.monotonic() - self._heard_s > SILENT_S:
+            raise unreachable(self._endpoints.recording, f"no control ticks for {SILENT_S:g} s")
+        return rows
+
+    def _rows(self, data: bytes) -> list[list[float]]:
+        try:
+            batch = decode_ticks(data)
+            places = [batch.columns.index(name) for name in ("operating_state", *self._columns)]
+        except (MessageError, ValueError) as error:
+            raise CommandError(
+                Exit.UNREACHABLE,
+                "unintelligible",
+                f"the ticks at {self._endpoints.recording} are not this version's: {error}",
+                "check the endpoint, and that tormagd and tormagctl are of the same version",
+            ) from error
+        self._heard_s = time.monotonic()
+        for row in batch.rows:
+            self._require_enabled(row[places[0]])
+        return [self._values(batch, index, places[1:]) for index in range(len(batch.rows))]
+
+    def _require_enabled(self, state: Value) -> None:
+        if state == "ENABLED":
+            return
+        status = self._client.request("status")
+        details = (status.get("fault_details") or [{}])[0]
+        raise CommandError(
+            Exit.FAULT if state == "FAULT" else Exit.REFUSED,
+            "not_enabled",
+            f"the device went {state} during the run: {details.get('code', 'somebody gave a command')}",
+            details.get("remedy", "run it again when you are ready"),
+        )
+
+    def _values(self, batch: TickBatch, index: int, places: Sequence[int]) -> list[float]:
+        row = batch.rows[index]
+        return [float(value) if isinstance((value := row[place]), int | float) else float("nan") for place in places]
+
+
+def reach(client: Client, scene_most_N: float) -> Range:
+    """What can be asked for. Raises CommandError where the daemon cannot tell, or somebody else publishes."""
+    status = client.request("status")
+    age_ms = status.get("setpoint_age_ms")
+    if isinstance(age_ms, int | float) and age_ms < RECENT_SETPOINT_MS:
+        raise CommandError(
+            Exit.REFUSED,
+            "other_publisher",
+            f"somebody published a setpoint {age_ms:.0f} ms ago",
+            "stop the publisher: a calibration must be the only one",
+        )
+    try:
+        found = msgspec.convert(status, Range)
+    except msgspec.ValidationError as error:
+        raise CommandError(
+            Exit.REFUSED, "no_range", f"the daemon does not say its range: {error}", "tormagctl status"
+        ) from error
+    return Range(found.least_N, min(found.most_N, scene_most_N))
+
+
+@contextmanager
+def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: float) -> Iterator[Run]:
+    """Home where needed, enable, and give a `Run`; in the end, however it comes, disable: the gap opens, drives off.
+
+    Raises CommandError as `home` and `enable` do, and UNREACHABLE where no ticks are published.
+    """
+    context = zmq.Context()
+    try:
+        # XPUB speaks to SUB as PUB does, and it is told of the subscription: without that the first would be lost
+        setpoints, ticks = context.socket(zmq.XPUB), context.socket(zmq.SUB)
+        for option, value in ((zmq.RCVHWM, QUEUE), (zmq.MAXMSGSIZE, MAX_BATCH_BYTES)):
+            ticks.setsockopt(option, value)
+        ticks.subscribe(b"")
+        connect(setpoints, endpoints.setpoint)
+        connect(ticks, endpoints.recording)
+        if not setpoints.poll(round(wait_s * 1e3)):
+            raise unreachable(endpoints.setpoint, f"nobody takes setpoints there within {wait_s:g} s")
+        with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
+            status = client.request("status")
+            if not status.get("is_homed"):
+                home(client, HOMING_S, is_waiting=True)
+            if is_interrupted():
+                raise InterruptedRunError
+            if status.get("operating_state") != "ENABLED":
+                _enable(client)
+            try:
+                _drop_old(ticks, wait_s, endpoints.recording)
+                yield Run(endpoints, client, (setpoints, ticks), columns, is_interrupted)
+            except BaseException:
+                # in FAULT the gap opens already, and a daemon that has gone has opened it: the first error counts
+                with suppress(CommandError):
+                    client.request("disable")
+                raise
+            client.request("disable")
+    finally:
+        context.destroy(linger=0)
+
+
+def _drop_old(ticks: "zmq.Socket[bytes]", wait_s: float, address: str) -> None:
+    # the newest tick from before `enable` took effect must not be read as a fall out of ENABLED
+    until_s = time.monotonic() + wait_s
+    while time.monotonic() < until_s:
+        if not ticks.poll(round(wait_s * 1e3)):
+            break
+        batch = decode_ticks(ticks.recv_multipart()[-1])
+        if "operating_state" in batch.columns:
+            place = batch.columns.index("operating_state")
+            if batch.rows and all(row[place] == "ENABLED" for row in batch.rows):
+                return
+    raise unreachable(address, f"no control ticks of an enabled device within {wait_s:g} s")
+
+
+def _enable(client: Client) -> None:
+    # on a busy machine the newest measurement may be a little old once
+    until_s = time.monotonic() + SILENT_S
+    while True:
+        try:
+            client.request("enable")
+        except CommandError as error:
+            if error.code != "not_fresh" or time.monotonic() > until_s:
+                raise
+        else:
+            return
