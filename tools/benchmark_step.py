@@ -6,16 +6,19 @@ switch timed so that it comes to rest at the target.
 
 import argparse
 import itertools
+import math
 import time
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import lfilter
 
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config, Motor
-from tormagd.control.motor import margins
+from tormagd.control.motor import margins, zero_order_hold
 from tormagd.control.plan import Plan
 from tormagd.control.step import Stepper
 from tormagd.scenes.scene import load_scene
@@ -29,12 +32,30 @@ Array = npt.NDArray[np.float64]
 START_MM, STEP_MM = 60.0, 1.0
 STROKE_MM = (46.0, 94.0)
 "The stroke within both ends' braking distance; the figure is scaled to the full 50 mm."
+STROKE_GAPS_MM = (47.0, 51.0, 57.0, 64.0, 71.0, 78.0, 85.0, 93.0)
+"Where the overshoot is measured too, opening and closing by STEP_MM."
+MODEL_GAP_MM, MODEL_DUTY, MODEL_S = 70.0, 0.5, 0.15
+"A duty step from rest in the middle of the stroke, with which H(z) is compared."
 WATCHED_S = 0.6
 SETTLING_BAND = 0.05
 CORNER = 0.3
 CORNER_PARAMETERS = ("resistance_ohm", "back_emf_V_s", "inertia_kg_m2", "inductance_mH")
 PERIOD_CORNERS = (0.8, 1.0, 1.2)
 TICK_S = 1e-3
+
+
+class Modelled(NamedTuple):
+    """Both carriages' mean position from the start of a duty step, mm, as the encoders count it and by H(z)."""
+
+    time_s: Array
+    measured_mm: Array
+    modelled_mm: Array
+
+    @property
+    def nrmse(self) -> float:
+        """|measured - modelled| / |measured - mean(measured)|, norms."""
+        deviation = self.measured_mm - self.measured_mm.mean()
+        return float(np.linalg.norm(self.measured_mm - self.modelled_mm) / np.linalg.norm(deviation))
 
 
 class Step(NamedTuple):
@@ -59,6 +80,7 @@ def run(plant_name: str = "sample_1", config: Config | None = None) -> dict[str,
     opening = step(loop, START_MM + STEP_MM)
     closing = step(loop, START_MM)
     stroke_s = stroke(loop)
+    over_stroke = overshoot_over_stroke(loop)
     factor = loop.now_s / (time.monotonic() - started_s)
     limits = {+1: time_optimal(parameters, START_MM, STEP_MM), -1: time_optimal(parameters, START_MM, -STEP_MM)}
     span = STROKE_MM[1] - STROKE_MM[0]
@@ -72,12 +94,14 @@ def run(plant_name: str = "sample_1", config: Config | None = None) -> dict[str,
         "settling_5pct_s": max(opening.settling_5pct_s, closing.settling_5pct_s),
         "steady_error_um": max(opening.steady_error_um, closing.steady_error_um),
         "true_error_um": max(opening.true_error_um, closing.true_error_um),
+        "overshoot_over_stroke": over_stroke,
         "skew_um": max(opening.skew_um, closing.skew_um),
         "rise_over_time_optimal": max(opening.rise_s / limits[1].rise_s, closing.rise_s / limits[-1].rise_s),
         "stroke_ratio": stroke_s / physical_s,
         "gain_margin_dB": nominal.gain_margin_dB,
         "phase_margin_deg": nominal.phase_margin_deg,
         "corners": corners,
+        "model_nrmse": max(model_step(config.motor, parameters, sign * MODEL_DUTY).nrmse for sign in (1.0, -1.0)),
         "virtual_time_factor": factor,
     }
 
@@ -121,6 +145,75 @@ def stroke(loop: ClosedLoop) -> float:
     samples = drive(loop, STROKE_MM[1], 3.0)
     gap = np.array([sample.truth.gap_mm for sample in samples])
     return float(np.argmax(gap > STROKE_MM[1] - 0.05) + 1) * TICK_S
+
+
+def overshoot_over_stroke(loop: ClosedLoop) -> float:
+    """The largest overshoot of steps from STROKE_GAPS_MM, both ways, share of the step."""
+    worst = 0.0
+    for gap_mm in STROKE_GAPS_MM:
+        for direction in (1.0, -1.0):
+            if gap_mm + direction * STEP_MM < STROKE_GAPS_MM[0]:
+                continue  # past the end of the stroke
+            drive(loop, gap_mm, 0.8)
+            worst = max(worst, step(loop, gap_mm + direction * STEP_MM).overshoot)
+    return worst
+
+
+def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> Modelled:
+    """The plant's answer to a duty step beside that of H(z): the step less the Coulomb duty, and the motor's inertia
+    over the gears' efficiency, because they take their share of the torque that speeds it up.
+    """
+    side_mm = MODEL_GAP_MM / 2.0
+    at_rest = msgspec.structs.replace(parameters.assumed, start_left_mm=side_mm, start_right_mm=side_mm)
+    plant = Plant(msgspec.structs.replace(parameters, assumed=at_rest), SteadyHand())
+    volts = duty * parameters.electronics.supply_V
+    counts_per_rad = parameters.electronics.encoder_counts_per_rev / math.tau
+    count = round(MODEL_S / TICK_S)
+    measured = np.zeros(count + 1)
+    for tick in range(1, count + 1):
+        plant.advance(TICK_S, volts, volts, left_on=True, right_on=True)
+        turned = [round(axis.angle_rad * counts_per_rad) for axis in (plant.left, plant.right)]
+        measured[tick] = sum(turned) / 2.0 / counts_per_rad * motor.screw_lead_mm / math.tau
+    geared = msgspec.structs.replace(motor, inertia_kg_m2=motor.inertia_kg_m2 / motor.gear_efficiency)
+    transfer = zero_order_hold(geared, TICK_S)
+    driving = np.full(count + 1, duty - math.copysign(motor.coulomb_V / motor.supply_V, duty))
+    modelled: Array = lfilter(transfer.numerator, transfer.denominator, driving)
+    return Modelled(TICK_S * np.arange(count + 1), measured, modelled)
+
+
+def draw(path: Path, plant_name: str, config: Config) -> None:
+    """Writes a PNG: H(z) beside the plant's duty steps, and the gap's 1 mm steps."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    parameters = load_plant(plant_name)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), constrained_layout=True)
+    for duty, colour in ((MODEL_DUTY, "#2a6f97"), (-MODEL_DUTY, "#d1495b")):
+        found = model_step(config.motor, parameters, duty)
+        left.plot(
+            found.time_s, found.measured_mm, color=colour, linewidth=2.5, alpha=0.4, label=f"plant, duty {duty:+g}"
+        )
+        left.plot(
+            found.time_s, found.modelled_mm, color="#222222", linewidth=1.0, label=f"H(z), NRMSE {found.nrmse:.1%}"
+        )
+    left.set_title(f"Duty step from rest at a gap of {MODEL_GAP_MM:g} mm", loc="left")
+    left.set_ylabel("carriage, mm")
+    loop = settled_loop(config, parameters)
+    for target_mm, colour in ((START_MM + STEP_MM, "#2a6f97"), (START_MM, "#d1495b")):
+        found_step = step(loop, target_mm)
+        right.plot(found_step.time_s, found_step.gap_mm, color=colour, label=f"to {target_mm:g} mm")
+        right.axhline(target_mm, color="#8d99ae", linewidth=0.8, linestyle=":")
+    right.set_xlim(0.0, 0.15)
+    right.set_title(f"Gap step, {plant_name} (synthetic)", loc="left")
+    right.set_ylabel("gap by the encoders, mm")
+    for axes in (left, right):
+        axes.set_xlabel("time, s")
+        axes.legend(frameon=False)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
 
 
 class Optimum(NamedTuple):
@@ -181,10 +274,13 @@ def corner_margins(config: Config) -> dict[str, float]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `benchmark step`."""
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
+    parser.add_argument("--plot", type=Path, help="PNG of H(z) beside the plant, and of the steps")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The object for these options."""
+    if options.plot is not None:
+        draw(options.plot, options.plant, Config())
     return run(options.plant)
 
 

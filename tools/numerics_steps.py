@@ -185,7 +185,7 @@ def _reference(errors: StepErrors, rng: np.random.Generator, steps_s: list[float
     for dt_s in steps_s:
         target_mm = float(rng.uniform(0.0, 1.0)) * EXTREME * 95.0
         target_speed = float(rng.uniform(-1.0, 1.0)) * EXTREME * limits.gap_speed_mm_s
-        reference, _ = follow(limits, reference, target_mm, target_speed, dt_s, 1.05 * limits.gap_speed_mm_s)
+        reference, _ = follow(limits, reference, Reference(target_mm, target_speed), dt_s, 1.05 * limits.gap_speed_mm_s)
         if not all(map(math.isfinite, reference)):
             errors.nonfinite += 1
         excess = max(abs(reference.speed_mm_s) - limits.gap_speed_mm_s, 0.0)

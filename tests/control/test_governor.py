@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tormagd.config import Limits
-from tormagd.control.governor import AHEAD_S, Governed, GovernorState, TimedSetpoint, govern
+from tormagd.control.governor import AHEAD_S, PATH_S, Governed, GovernorState, TimedSetpoint, govern
 from tormagd.control.portrait import Portrait
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Force
 
-PORTRAIT = Portrait(np.linspace(0.4, 2.2, 19), np.linspace(0.01, 0.1, 19))
+PORTRAIT = Portrait(np.linspace(95.0, 45.0, 19), np.linspace(0.4, 2.2, 19), np.linspace(0.01, 0.1, 19))
 SCENE = Force(least_N=0.0, most_N=2.0, resolution_N=0.1, tolerance_rms_N=0.05)
 LIMITS = Limits()
 GAP_SPEED_MM_S = 38.0
@@ -77,7 +77,8 @@ def test_range_and_reach(
 
 def test_without_a_setpoint_the_least_force_is_rendered() -> None:
     _, governed = decide(GovernorState(0.0, 0.4), 1.0, None)
-    assert governed == Governed(0.4, 0.0, 0.4, None, (Limit.NO_SETPOINT,))
+    assert (governed.force_N, governed.age_s, governed.limits) == (0.4, None, (Limit.NO_SETPOINT,))
+    assert np.all(governed.path_N == 0.4)
 
 
 def test_a_stale_setpoint_decays_along_the_ramp_and_not_below_the_least() -> None:
@@ -91,8 +92,7 @@ def test_a_stale_setpoint_decays_along_the_ramp_and_not_below_the_least() -> Non
         state, governed = decide(state, now_s, setpoint)
         assert governed.limits == (Limit.STALE,)
         assert governed.age_s == pytest.approx(now_s - 1.0)
-        assert governed.slope_N_s == 0.0
-        assert governed.ahead_N == governed.force_N
+        assert np.all(governed.path_N == governed.force_N)
         assert last_N - governed.force_N <= LIMITS.stale_ramp_N_s * 1e-3 + 1e-8
         assert governed.force_N == pytest.approx(max(0.4, 1.6 - LIMITS.stale_ramp_N_s * tick * 1e-3))
         last_N = governed.force_N
@@ -104,19 +104,21 @@ def test_a_publisher_that_comes_back_is_followed_again_without_a_slope_from_befo
     state, _ = decide(state, 0.5, TimedSetpoint(1.2, 0.03, VALID_S))
     _, governed = decide(state, 0.6, TimedSetpoint(1.5, 0.6, VALID_S))
     assert governed.limits == ()
-    assert (governed.force_N, governed.slope_N_s) == (1.5, 0.0)
+    assert governed.force_N == 1.5
+    assert np.all(governed.path_N == 1.5)
 
 
 def test_a_slope_is_learned_and_carried_ahead() -> None:
     state, governed = stream_of([1.0 + 0.01 * k for k in range(40)], period_s=0.01)
-    assert governed.slope_N_s == pytest.approx(1.0, rel=1e-3)
+    assert state.slope_N_s == pytest.approx(1.0, rel=1e-3)
+    assert governed.path_N == pytest.approx(1.39 + PATH_S, abs=1e-3)
     last = TimedSetpoint(1.39, 0.4, VALID_S)
     for waited_s, ahead_N in ((0.0, 1.39), (0.01, 1.40), (AHEAD_S, 1.44), (0.09, 1.44)):
         _, later = decide(state, 0.4 + waited_s, last)
-        assert later.ahead_N == pytest.approx(ahead_N, abs=1e-3)
+        assert later.path_N[0] == pytest.approx(ahead_N, abs=1e-3)
         assert later.force_N == pytest.approx(1.39)
     _, led = decide(state, 0.4, last, lead_s=0.02)
-    assert led.ahead_N == pytest.approx(1.41, abs=1e-3)
+    assert led.path_N[0] == pytest.approx(1.41, abs=1e-3)
 
 
 @settings(max_examples=100, deadline=None)
@@ -126,31 +128,31 @@ def test_a_slope_is_learned_and_carried_ahead() -> None:
     lead_s=st.floats(0.0, 0.05),
 )
 def test_the_slope_is_one_that_the_gap_speed_can_render(forces: list[float], period_s: float, lead_s: float) -> None:
-    _, governed = stream_of(forces, period_s, lead_s=lead_s)
+    state, governed = stream_of(forces, period_s, lead_s=lead_s)
     steepest = GAP_SPEED_MM_S * float(PORTRAIT.slope_N_mm.max())
-    assert abs(governed.slope_N_s) <= steepest + 1e-9
-    assert PORTRAIT.least_N <= governed.ahead_N <= PORTRAIT.most_N
+    assert abs(state.slope_N_s) <= steepest + 1e-9
+    assert np.all((governed.path_N >= PORTRAIT.least_N) & (governed.path_N <= SCENE.most_N))
     assert PORTRAIT.least_N <= governed.force_N <= SCENE.most_N
 
 
 def test_a_jump_at_a_flat_force_gives_the_slope_renderable_there() -> None:
-    flat = Portrait(np.array([0.4, 1.0, 2.2]), np.array([0.001, 0.001, 0.1]))
-    _, governed = stream_of([1.0, 0.4, 1.0, 0.4, 0.5], period_s=0.01, portrait=flat)
-    assert abs(governed.slope_N_s) <= GAP_SPEED_MM_S * 0.001 + 1e-12
+    flat = Portrait(np.array([95.0, 70.0, 45.0]), np.array([0.4, 1.0, 2.2]), np.array([0.001, 0.001, 0.1]))
+    state, _ = stream_of([1.0, 0.4, 1.0, 0.4, 0.5], period_s=0.01, portrait=flat)
+    assert abs(state.slope_N_s) <= GAP_SPEED_MM_S * 0.001 + 1e-12
 
 
 def test_setpoints_with_equal_stamps_have_no_slope_between_them() -> None:
-    state, before = stream_of([1.0, 1.02, 1.04])
-    state, governed = decide(state, 0.031, TimedSetpoint(1.5, 0.03, VALID_S))
+    before, _ = stream_of([1.0, 1.02, 1.04])
+    state, governed = decide(before, 0.031, TimedSetpoint(1.5, 0.03, VALID_S))
     assert governed.force_N == 1.5
-    assert governed.slope_N_s == before.slope_N_s
+    assert state.slope_N_s == before.slope_N_s
 
 
 def test_a_stamp_ahead_of_the_clock_is_of_no_age() -> None:
     state, _ = stream_of([1.0 + 0.01 * k for k in range(40)])
     _, governed = decide(state, 0.41, TimedSetpoint(1.4, 0.45, VALID_S))
     assert governed.age_s == pytest.approx(-0.04)
-    assert governed.ahead_N == pytest.approx(1.4)
+    assert governed.path_N[0] == pytest.approx(1.4)
     assert governed.limits == ()
 
 
@@ -160,8 +162,46 @@ def test_a_clock_that_stands_still_or_goes_back_lets_nothing_jump() -> None:
         assert governed.force_N == 1.5
 
 
+@pytest.mark.parametrize("waited_s", [0.0, 0.003, 0.02])
+def test_a_preview_is_what_comes(waited_s: float) -> None:
+    """A swing that no slope foresees; the path goes along it, from the age of the setpoint on."""
+    times = 2e-3 * np.arange(60)
+    forces = 1.0 + 0.3 * np.sin(2.0 * math.pi * 5.0 * times)
+    setpoint = TimedSetpoint(forces[0], 0.5, VALID_S, preview_N=tuple(forces[1:].tolist()), preview_dt_s=2e-3)
+    _, governed = decide(GovernorState(0.0, 0.4), 0.5 + waited_s, setpoint, lead_s=0.01)
+    expected = 1.0 + 0.3 * np.sin(2.0 * math.pi * 5.0 * (waited_s + 0.01 + PATH_S))
+    assert governed.path_N == pytest.approx(expected, abs=1e-3)
+    assert governed.force_N == pytest.approx(1.0)
+    assert governed.limits == ()
+
+
+def test_a_preview_beyond_the_range_is_held_at_its_ends() -> None:
+    setpoint = TimedSetpoint(1.0, 0.5, VALID_S, preview_N=(3.0,) * 8 + (0.0,) * 8, preview_dt_s=2e-3)
+    _, governed = decide(GovernorState(0.0, 0.4), 0.5, setpoint)
+    assert governed.path_N.max() == SCENE.most_N
+    assert governed.path_N.min() == PORTRAIT.least_N
+
+
+def test_a_short_preview_goes_on_as_it_ran_and_not_for_long() -> None:
+    rising = TimedSetpoint(1.0, 0.5, 10.0, preview_N=(1.01, 1.02), preview_dt_s=5e-3)
+    _, soon = decide(GovernorState(0.0, 0.4), 0.5, rising)
+    assert soon.path_N[:5] == pytest.approx(1.0 + 2.0 * PATH_S[:5])
+    # no further than it was known
+    assert soon.path_N[-1] == pytest.approx(1.04)
+    _, late = decide(GovernorState(0.0, 0.4), 5.0, rising)
+    assert late.path_N == pytest.approx(np.full(len(PATH_S), 1.04))
+
+
+def test_a_preview_does_not_outlive_its_validity() -> None:
+    setpoint = TimedSetpoint(1.5, 0.5, VALID_S, preview_N=(1.5,) * 200, preview_dt_s=2e-3)
+    _, governed = decide(GovernorState(0.699, 1.5), 0.7, setpoint)
+    assert governed.limits == (Limit.STALE,)
+    assert np.all(governed.path_N < 1.5)
+
+
 events = st.tuples(
     st.none() | st.floats(0.0, 1_000.0),
+    st.lists(st.floats(0.0, 1_000.0), max_size=20),
     st.floats(-2.0, 2.0) | st.just(0.0) | st.just(1e6),
     st.floats(1e-3, 60.0),
     st.floats(0.0, 0.5) | st.just(0.0) | st.just(1e-9) | st.just(1e5),
@@ -170,16 +210,20 @@ events = st.tuples(
 
 @settings(max_examples=150, deadline=None)
 @given(history=st.lists(events, min_size=1, max_size=30))
-def test_nan_never_travels(history: list[tuple[float | None, float, float, float]]) -> None:
+def test_nan_never_travels(history: list[tuple[float | None, list[float], float, float, float]]) -> None:
     """First setpoints, equal stamps, huge gaps, stamps ahead and behind, in any order."""
     state, now_s = GovernorState(0.0, PORTRAIT.least_N), 0.0
-    for force_N, age_s, valid_s, elapsed_s in history:
+    for force_N, preview, age_s, valid_s, elapsed_s in history:
         now_s += elapsed_s
-        setpoint = None if force_N is None else TimedSetpoint(force_N, now_s - age_s, valid_s)
+        setpoint = None
+        if force_N is not None:
+            setpoint = TimedSetpoint(
+                force_N, now_s - age_s, valid_s, preview_N=tuple(preview), preview_dt_s=max(valid_s / 20.0, 1e-6)
+            )
         state, governed = decide(state, now_s, setpoint)
-        assert all(math.isfinite(value) for value in (governed.force_N, governed.slope_N_s, governed.ahead_N))
+        assert math.isfinite(state.slope_N_s)
         assert PORTRAIT.least_N <= governed.force_N <= PORTRAIT.most_N
-        assert PORTRAIT.least_N <= governed.ahead_N <= PORTRAIT.most_N
+        assert np.all((governed.path_N >= PORTRAIT.least_N) & (governed.path_N <= PORTRAIT.most_N))
         assert math.isfinite(state.governed_N)
         is_stale = setpoint is not None and now_s - setpoint.stamp_s > valid_s
         assert (Limit.STALE in governed.limits) == is_stale

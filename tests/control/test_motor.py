@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from scipy.signal import StateSpace, cont2discrete, dlsim, lfilter
 
 from tormagd.config import Config, ConfigError, Motor, Position
-from tormagd.control.core import build_core
+from tormagd.control.core import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG, build_core
 from tormagd.control.motor import full_speed_mm_s, margins, mechanical_time_s, zero_order_hold
 
 PERIOD_S = 1e-3
@@ -156,6 +156,24 @@ def test_positive_margins_are_what_makes_the_closed_loop_stable(factor: float) -
     found = margins(config.motor, position, PERIOD_S)
     is_stable = closed_loop_radius(config.motor, position) < 1.0
     assert (found.gain_margin_dB > 0.0 and found.phase_margin_deg > 0.0) == is_stable
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    position=st.builds(
+        Position,
+        proportional_per_mm=st.floats(1e-3, 1_000.0),
+        integral_time_s=st.floats(0.005, 100.0),
+        derivative_time_s=st.floats(0.0, 1.0),
+        derivative_filter_s=st.floats(1e-4, 0.1),
+    )
+)
+def test_gains_at_their_bounds_are_unstable_only_where_the_margins_say_so(position: Position) -> None:
+    """What build_core accepts is stable, from end to end of what the configuration allows."""
+    motor = Config().motor
+    found = margins(motor, position, PERIOD_S)
+    if found.phase_margin_deg >= LEAST_PHASE_MARGIN_DEG and found.gain_margin_dB >= LEAST_GAIN_MARGIN_DB:
+        assert closed_loop_radius(motor, position) < 1.0
 
 
 def test_a_slower_loop_has_less_phase_left() -> None:

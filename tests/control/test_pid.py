@@ -134,3 +134,16 @@ def test_both_directions_are_alike(error: float, speed: float, integral: float) 
     mirrored_state, mirrored = update(GAINS, PidState(-integral), -error, -speed)
     assert mirrored.duty == -output.duty
     assert mirrored_state.integral == -state.integral
+
+
+@settings(max_examples=5, deadline=None)
+@given(position=gains, error=st.floats(0.5, 50.0), dt_s=st.sampled_from([0.01, 0.05, 0.1]))
+def test_an_hour_of_saturation_is_left_at_once(position: Position, error: float, dt_s: float) -> None:
+    """The integral stays within the whole duty, and an error of the other sign turns the duty round in one update."""
+    state = PidState()
+    for _ in range(round(3_600.0 / dt_s)):
+        state, _ = pid(position, state, error_mm=error, speed_error_mm_s=0.0, feed_forward=0.0, dt_s=dt_s)
+        assert abs(state.integral) <= position.duty_limit
+    most = 2.0 * position.duty_limit / position.proportional_per_mm
+    _, output = update(position, state, -most)
+    assert output.duty <= -position.duty_limit * (1.0 - 1e-9)

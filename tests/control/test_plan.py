@@ -12,7 +12,7 @@ from tormagd.config import Config
 from tormagd.control.core import Core
 from tormagd.control.estimate import MOBILISED_MM, Estimate, Handle
 from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import MOVING_MM_S, PlanState
+from tormagd.control.plan import MOST_LAG_S, MOVING_MM_S, PlanState
 from tormagd.safety.codes import Limit
 
 PERIOD_S = 0.004
@@ -85,8 +85,8 @@ def test_more_force_takes_a_smaller_gap(core) -> None:
 @pytest.mark.parametrize("force_N", [0.6, 1.0, 1.5, 1.9])
 def test_the_planned_gap_gives_the_force_by_the_portrait(core, force_N: float) -> None:
     plan = planned(core, force_N, moving()).plan
-    gaps = np.linspace(95.0, 45.0, len(core.planner.portrait.force_N))
-    assert np.interp(plan.gap_mm, gaps[::-1], core.planner.portrait.force_N[::-1]) == pytest.approx(force_N, abs=0.03)
+    portrait = core.planner.portrait
+    assert np.interp(plan.gap_mm, portrait.gap_mm[::-1], portrait.force_N[::-1]) == pytest.approx(force_N, abs=0.03)
     assert plan.governed_N == pytest.approx(force_N)
     assert plan.confidence > 0.5
 
@@ -123,6 +123,60 @@ def test_the_gap_speed_is_one_the_carriages_have(core, forces: list[float]) -> N
         state = planned(core, force, moving(), state)
         assert abs(state.plan.gap_speed_mm_s) <= CONFIG.position.gap_speed_mm_s
         assert 45.0 <= state.plan.gap_mm <= 95.0
+
+
+def test_a_preview_gives_the_gaps_speed_and_acceleration(core) -> None:
+    """Where the force turns round, the speed is none and only the acceleration tells what comes."""
+    times = 2e-3 * np.arange(40)
+    forces = 1.5 + 0.1 * np.cos(2.0 * math.pi * 3.0 * times)
+    setpoint = TimedSetpoint(forces[0], PERIOD_S, 0.1, preview_N=tuple(forces[1:].tolist()), preview_dt_s=2e-3)
+    plan = core.planner.plan(core.planner.start(0.0), PERIOD_S, setpoint, moving()).plan
+    curve_N_s2 = -0.1 * (2.0 * math.pi * 3.0) ** 2
+    assert plan.gap_speed_mm_s == pytest.approx(0.0, abs=1.0)
+    assert plan.gap_acceleration_mm_s2 == pytest.approx(-curve_N_s2 / core.planner.portrait.slope_at_N_mm(1.6), rel=0.2)
+    assert planned(core, 1.6, moving()).plan.gap_acceleration_mm_s2 == pytest.approx(0.0, abs=1e-6)
+
+
+def swung(core: Core, late_s: float, *, is_known: bool) -> PlanState:
+    """The state after 10 s of a swing of 2 Hz that the gap follows that much too late."""
+    portrait = core.planner.portrait
+
+    def force_N(time_s: float) -> float:
+        return 1.5 + 0.1 * math.sin(2.0 * math.pi * 2.0 * time_s)
+
+    def gap_mm(time_s: float) -> float:
+        return float(portrait.gaps_mm(np.array([force_N(time_s)]))[0])
+
+    state = core.planner.start(0.0)
+    for tick in range(1, round(10.0 / PERIOD_S)):
+        now_s = tick * PERIOD_S
+        come_s = now_s - late_s + state.lag_s  # it starts as much sooner as has been learned
+        side_mm_s = (gap_mm(come_s) - gap_mm(come_s - 1e-3)) / 2e-3
+        # the handle rests: the trim learns nothing
+        estimate = moving(gap_mm(come_s), left_mm_s=side_mm_s, right_mm_s=side_mm_s, handle=RESTING.handle)
+        ahead = tuple(force_N(now_s + 2e-3 * k) for k in range(1, 40)) if is_known else ()
+        setpoint = TimedSetpoint(force_N(now_s), now_s, 0.1, preview_N=ahead, preview_dt_s=2e-3)
+        state = core.planner.plan(state, now_s, setpoint, estimate)
+    return state
+
+
+@pytest.mark.parametrize(("late_s", "learned_s"), [(0.015, 0.015), (0.0, 0.0), (-0.01, 0.0), (0.04, MOST_LAG_S)])
+def test_a_lag_is_learned_where_what_comes_is_known(core, late_s: float, learned_s: float) -> None:
+    assert swung(core, late_s, is_known=True).lag_s == pytest.approx(learned_s, abs=2e-3)
+
+
+def test_a_gap_on_its_way_after_a_jump_is_not_late(core) -> None:
+    state = core.planner.start(0.0)
+    for tick in range(1, 500):
+        now_s = tick * PERIOD_S
+        setpoint = TimedSetpoint(1.5, now_s, 0.1, preview_N=(1.5,) * 40, preview_dt_s=2e-3)
+        travelling = moving(85.0, left_mm_s=-15.0, right_mm_s=-15.0, handle=RESTING.handle)
+        state = core.planner.plan(state, now_s, setpoint, travelling)
+    assert state.lag_s == 0.0
+
+
+def test_without_a_preview_no_lag_is_learned(core) -> None:
+    assert swung(core, 0.015, is_known=False).lag_s == 0.0
 
 
 def learned(core: Core, seconds: float, estimate: Estimate) -> PlanState:
@@ -228,6 +282,8 @@ setpoints = st.none() | st.builds(
     valid_for_s=st.floats(1e-6, 60.0),
     displacement_mm=st.none() | st.floats(-1e9, 1e9),
     rate_mm_s=st.none() | st.floats(-1e9, 1e9),
+    preview_N=st.lists(st.floats(0.0, 1_000.0), max_size=10).map(tuple),
+    preview_dt_s=st.floats(1e-9, 1.0),
 )
 
 
@@ -240,10 +296,11 @@ def test_nan_never_travels(core, history: list[tuple[float, TimedSetpoint | None
         last, state = state, core.planner.plan(state, now_s, setpoint, estimate)
         plan = state.plan
         numbers = (plan.governed_N, plan.field_mT, plan.gap_mm, plan.gap_speed_mm_s, plan.confidence, state.trim)
-        assert all(math.isfinite(value) for value in numbers)
+        assert all(math.isfinite(value) for value in (*numbers, plan.gap_acceleration_mm_s2, state.lag_s))
         assert plan.predicted_N is None or math.isfinite(plan.predicted_N)
         assert 45.0 <= plan.gap_mm <= 95.0
         assert CONFIG.trim.least <= state.trim <= CONFIG.trim.most
+        assert 0.0 <= state.lag_s <= MOST_LAG_S
         assert plan.number == last.plan.number + 1
 
 

@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.config import Config
 from tormagd.control.core import Core
+from tormagd.control.motor import electrical_time_s
 from tormagd.control.plan import Plan
-from tormagd.control.step import CARRY_S, STARTING_S, StepOutput, Stepper, StepState
+from tormagd.control.step import CARRY_S, EXCHANGE_S, STARTING_S, StepOutput, Stepper, StepState
+from tormagd.control.trajectory import APPROACH_S
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import CLEARING_S, Conditions, DeviceRequest, OperatingState, RefusedError
@@ -157,24 +159,47 @@ def test_skew_pulls_the_carriages_together(core: Core, measure) -> None:
 def test_a_plans_gap_is_carried_forward_along_its_speed_but_not_for_long(running: Bench) -> None:
     plan = gap_plan(80.0, running.now_s, gap_speed_mm_s=-10.0)
     running.step(plan, count=60)
-    # the reference has come to where the plan leads in CARRY_S, although the plan is much older
+    # the reference has come to where the plan leads in CARRY_S, although the plan is much older, and closes in on it
+    # with the plan's own speed, which the closing speed makes up for APPROACH_S away
     assert running.state.reference is not None
-    assert running.state.reference.gap_mm == pytest.approx(80.0 - 10.0 * CARRY_S, abs=0.12)
+    lag_s = EXCHANGE_S + electrical_time_s(CONFIG.motor)
+    led_mm = 80.0 - 10.0 * (CARRY_S + lag_s)
+    assert running.state.reference.gap_mm == pytest.approx(led_mm - 10.0 * APPROACH_S, abs=0.02)
 
 
 @pytest.mark.parametrize("gap_mm", [-1e9, 0.0, 300.0, 1e9])
 def test_the_reference_stays_in_the_gap_range(core: Core, measure, gap_mm: float) -> None:
-    """Carriages that follow exactly; the plan asks for a gap that does not exist."""
-    state = core.stepper.start(0.0)
-    state, _ = core.stepper.step(state, 0.001, measure(1), gap_plan(80.0))
-    state = core.stepper.command(state, "enable", 0.001, READY)
+    """Carriages that follow exactly, sooner than any do; the plan asks for a gap that does not exist."""
+    limits = msgspec.structs.replace(CONFIG.limits, no_motion_time_s=10.0)
+    stepper = Stepper(msgspec.structs.replace(CONFIG, limits=limits), core.scene)
+    state = stepper.start(0.0)
+    state, _ = stepper.step(state, 0.001, measure(1), gap_plan(80.0))
+    state = stepper.command(state, "enable", 0.001, READY)
     for tick in range(2, 3_000):
         side_mm = -7.5 if state.reference is None else state.reference.gap_mm / 2.0 - 47.5
         exact = measure(tick, left_mm=side_mm, right_mm=side_mm)
-        state, _ = core.stepper.step(state, tick * PERIOD_S, exact, gap_plan(gap_mm, tick * PERIOD_S))
+        state, _ = stepper.step(state, tick * PERIOD_S, exact, gap_plan(gap_mm, tick * PERIOD_S))
         assert state.reference is not None
         assert 45.0 - 1e-3 <= state.reference.gap_mm <= 95.0 + 1e-3
     assert state.reference.gap_mm == pytest.approx(min(max(gap_mm, 45.0), 95.0), abs=0.01)
+
+
+@pytest.mark.parametrize("jump_mm", [0.0018, 0.05, 0.4, -0.4])
+def test_counts_that_jump_and_come_back_do_no_harm(running: Bench, jump_mm: float) -> None:
+    """A burst on an encoder line, shorter than any motion: a push, no fault, and nothing left of it soon."""
+    pushed = running.step(left_mm=-7.5 + jump_mm)
+    assert -1.0 <= pushed.left_duty * math.copysign(1.0, jump_mm) < 0.0
+    settled = running.step(count=400)
+    assert not running.faults
+    assert abs(settled.left_duty) < 0.05
+    assert abs(running.state.left.integral) < 0.05
+
+
+@pytest.mark.parametrize("jump_mm", [-120.0, -37.4, 1.5, 8.0])
+def test_counts_that_jump_away_are_a_fault(running: Bench, jump_mm: float) -> None:
+    """A lost or wrapped counter is not followed: the carriages seem apart, which is tripped in one period."""
+    assert running.run_into(Fault.SKEW, left_mm=-7.5 + jump_mm) == 1
+    assert is_opened(running)
 
 
 def test_less_supply_takes_more_duty(core: Core, measure) -> None:

@@ -1,10 +1,12 @@
 """The step benchmark on the plant: figures of the position loop that are promised to users."""
 
 import benchmark_step
+import msgspec
 import pytest
 from tune_position import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG
 
 from tormagd.config import Config
+from tormagd.simulation.parameters import load_plant
 
 
 @pytest.fixture(scope="module")
@@ -18,12 +20,23 @@ def test_a_millimetre_is_nearly_time_optimal(measured):
     assert 1.0 <= measured["rise_over_time_optimal"] <= 1.5
     assert measured["overshoot"] <= 0.02
     assert measured["settling_5pct_s"] <= 0.12
+    assert measured["overshoot_over_stroke"] <= 0.02
     assert measured["steady_error_um"] <= 5.0
     assert measured["skew_um"] <= 30.0
 
 
 def test_the_stroke_is_limited_by_the_motors(measured):
     assert 1.0 <= measured["stroke_ratio"] <= 1.15
+
+
+def test_the_transfer_function_is_the_plants(measured):
+    assert measured["model_nrmse"] <= 0.05
+
+
+def test_a_wrong_motor_is_noticed_in_the_comparison():
+    """With twice the inertia the same comparison fails: it can."""
+    heavy = msgspec.structs.replace(Config().motor, inertia_kg_m2=1.6e-6)
+    assert benchmark_step.model_step(heavy, load_plant("sample_1"), benchmark_step.MODEL_DUTY).nrmse > 0.1
 
 
 def test_the_shipped_gains_are_robust():

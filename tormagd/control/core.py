@@ -9,7 +9,7 @@ from typing import NamedTuple
 from tormagd.config import Config, ConfigError
 from tormagd.control.motor import Margins, margins
 from tormagd.control.plan import Planner
-from tormagd.control.portrait import FieldOfGap
+from tormagd.control.portrait import FieldOfGap, Portrait
 from tormagd.control.step import Stepper
 from tormagd.inverse.choice import Choice, build, choose, named, solver_table
 from tormagd.learning.model_file import ModelFileError, load_model
@@ -65,7 +65,15 @@ def build_core(config: Config) -> Core:
     except DomainError as error:
         raise ConfigError(f"scene {scene.name}: {error}") from error
     planner = Planner(config, scene, model, solver, field, 100.0 * fitted.cip_fraction)
+    _refuse_out_of_reach(scene, planner.portrait)
     return Core(scene, planner, Stepper(config, scene), stability, choice)
+
+
+def _refuse_out_of_reach(scene: Scene, reach: Portrait) -> None:
+    # a lowest force below what the open gap gives is no error: no passive brake gives 0, and the limit F_MIN says so
+    between = f"allowed is {reach.least_N:.2f}..{reach.most_N:.2f}, what model {scene.insert.model} gives in these gaps"
+    if not reach.least_N < scene.force.most_N <= reach.most_N:
+        raise ConfigError(f"scene {scene.name}: force.most_N = {scene.force.most_N:g}: {between}")
 
 
 def choose_solver(scene: Scene, hidden: int) -> Choice:

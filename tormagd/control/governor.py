@@ -2,26 +2,38 @@
 
 from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+
 from tormagd.config import Limits
 from tormagd.control.portrait import Portrait
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Force
 
+Array = npt.NDArray[np.float64]
+
 SLOPE_FILTER_S = 0.003
 AHEAD_S = 0.05
-"Setpoints are carried forward along their slope by no more than this."
+"Setpoints are carried forward along their slope, or past the end of their preview, by no more than this."
+PATH_S = np.linspace(0.0, 0.03, 7)
+"The times, from the moment that is planned for, at which a plan looks at the force to come."
+PATH_S.flags.writeable = False
 LONGEST_STEP_S = 0.1
 "Setpoints further apart than this have no slope between them."
 
 
 class TimedSetpoint(NamedTuple):
-    """The newest valid setpoint. `stamp_s` is when the publisher meant it, on the clock of `now_s`."""
+    """The newest valid setpoint. `stamp_s` is when the publisher meant it, on the clock of `now_s`; `preview_N` are the
+    forces that follow it, `preview_dt_s` apart.
+    """
 
     force_N: float
     stamp_s: float
     valid_for_s: float
     displacement_mm: float | None = None
     rate_mm_s: float | None = None
+    preview_N: tuple[float, ...] = ()
+    preview_dt_s: float = 0.0
 
 
 class GovernorState(NamedTuple):
@@ -35,11 +47,10 @@ class GovernorState(NamedTuple):
 
 
 class Governed(NamedTuple):
-    """The force to render now, how it changes, where it will be `lead_s` from now, and what holds it back."""
+    """The force to render now, what it will be at `lead_s` + PATH_S from now, and what holds it back."""
 
     force_N: float
-    slope_N_s: float
-    ahead_N: float
+    path_N: Array
     age_s: float | None
     limits: tuple[Limit, ...]
 
@@ -64,7 +75,7 @@ def govern(
         reason = Limit.NO_SETPOINT if setpoint is None else Limit.STALE
         force = max(portrait.least_N, state.governed_N - limits.stale_ramp_N_s * elapsed)
         rested = GovernorState(now_s, force)
-        return rested, Governed(force, 0.0, force, age, (reason,))
+        return rested, Governed(force, np.full(len(PATH_S), force), age, (reason,))
     force, reasons = _within_range(setpoint.force_N, portrait, scene)
     slope = state.slope_N_s
     spacing = setpoint.stamp_s - state.stamp_s
@@ -74,9 +85,23 @@ def govern(
         renderable = portrait.force_rate_N_s(force, gap_speed_mm_s)
         between = min(max((force - state.last_N) / spacing, -renderable), renderable)
         slope += spacing / (SLOPE_FILTER_S + spacing) * (between - slope)
-    ahead = force + slope * min(max(age, 0.0) + lead_s, AHEAD_S)
-    ahead = min(max(ahead, portrait.least_N), portrait.most_N)
-    return GovernorState(now_s, force, setpoint.stamp_s, slope, force), Governed(force, slope, ahead, age, reasons)
+    ahead_s = max(age, 0.0) + lead_s + PATH_S
+    wanted = np.clip(_to_come(setpoint, force, slope, ahead_s), scene.least_N, scene.most_N)
+    path = np.clip(wanted, portrait.least_N, portrait.most_N)
+    return GovernorState(now_s, force, setpoint.stamp_s, slope, force), Governed(force, path, age, reasons)
+
+
+def _to_come(setpoint: TimedSetpoint, force_N: float, slope_N_s: float, ahead_s: Array) -> Array:
+    """The forces at these times after the setpoint's stamp."""
+    if not setpoint.preview_N:
+        return force_N + slope_N_s * np.minimum(ahead_s, AHEAD_S)
+    known_N = np.array([setpoint.force_N, *setpoint.preview_N])
+    known_s = setpoint.preview_dt_s * np.arange(len(known_N))
+    mean_N_s = (known_N[-1] - known_N[0]) / known_s[-1]
+    beyond_s = np.clip(ahead_s - known_s[-1], 0.0, AHEAD_S)
+    # past its end a short preview goes on as it has run so far; a long one has no end in sight
+    to_come: Array = np.interp(ahead_s, known_s, known_N) + mean_N_s * np.minimum(beyond_s, known_s[-1])
+    return to_come
 
 
 def _within_range(asked_N: float, portrait: Portrait, scene: Force) -> tuple[float, tuple[Limit, ...]]:

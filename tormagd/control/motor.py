@@ -41,6 +41,11 @@ def mechanical_time_s(motor: Motor) -> float:
     return motor.inertia_kg_m2 * motor.resistance_ohm / motor.back_emf_V_s**2
 
 
+def electrical_time_s(motor: Motor) -> float:
+    """Time constant of the current after a voltage step, s: L / R."""
+    return motor.inductance_mH * 1e-3 / motor.resistance_ohm
+
+
 def zero_order_hold(motor: Motor, period_s: float) -> TransferFunction:
     """H(z) from duty to carriage position, mm, exact for a duty held over each period."""
     inductance_H = motor.inductance_mH * 1e-3

@@ -2,23 +2,28 @@
 
 from typing import NamedTuple
 
+import numpy as np
+
 from tormagd.config import Config
 from tormagd.control.estimate import MOBILISED_MM, Estimate
-from tormagd.control.governor import Governed, GovernorState, TimedSetpoint, govern
+from tormagd.control.governor import PATH_S, Governed, GovernorState, TimedSetpoint, govern
 from tormagd.control.portrait import FieldOfGap, portrait
 from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
 from tormagd.learning.model_file import ForceModel
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Scene
 
-LEAST_SLOPE_N_MM = 1e-3
-"Where the gap hardly changes the force, no gap speed helps."
 MOVING_MM_S = 5.0
 "Slower handles do not teach the trim, and no force is planned for them: their friction may be static."
 TAUGHT_N = 0.2
 "Smaller forces do not teach it either: the sensor's offset would."
+LAG_TIME_S = 1.0
+MOST_LAG_S = 0.03
+LEAST_TRAVEL_MM_S = 10.0
+"Slower carriages teach the lag less."
 
-
+_FIT = np.linalg.pinv(np.stack([PATH_S, PATH_S**2 / 2.0], axis=1))
+"From the path's distances from its beginning to the speed and acceleration there of the nearest parabola."
 _LIMIT_OF_REACH = {Reach.BELOW: Limit.F_MIN, Reach.ABOVE: Limit.F_MAX}
 
 
@@ -36,14 +41,18 @@ class Plan(NamedTuple):
     gap_speed_mm_s: float
     confidence: float
     limits: tuple[Limit, ...]
+    gap_acceleration_mm_s2: float = 0.0
 
 
 class PlanState(NamedTuple):
-    """What planning remembers. `trim` is measured over predicted force, slowly learned."""
+    """What planning remembers. `trim` is measured over predicted force, `lag_s` how late the carriages are: both slowly
+    learned.
+    """
 
     governor: GovernorState
     plan: Plan
     trim: float = 1.0
+    lag_s: float = 0.0
 
 
 class Planner:
@@ -76,6 +85,8 @@ class Planner:
     ) -> PlanState:
         """The next plan. `estimate` is None while the device has said nothing: the trim then stays as it is."""
         position = self._config.position
+        # only what is known to come can make up for a lag: an extrapolation that far is a guess
+        is_known = setpoint is not None and len(setpoint.preview_N) > 0
         governor, governed = govern(
             state.governor,
             now_s,
@@ -84,18 +95,20 @@ class Planner:
             scene=self._scene.force,
             limits=self._config.limits,
             gap_speed_mm_s=position.gap_speed_mm_s,
-            lead_s=position.lead_ms * 1e-3,
+            lead_s=position.lead_ms * 1e-3 + (state.lag_s if is_known else 0.0),
         )
         predicted = self._predict(estimate) if estimate is not None and estimate.is_homed else None
         trim, trim_limits = self._learn(state, now_s, estimate, predicted)
+        lag_s = self._learn_lag(state, now_s, estimate, governed.force_N / trim) if is_known else state.lag_s
         displacement, rate = self._motion(setpoint, estimate)
         solution = self._solver.solve(
-            displacement, rate, governed.ahead_N / trim, self._cip_percent, state.plan.field_mT
+            displacement, rate, float(governed.path_N[0]) / trim, self._cip_percent, state.plan.field_mT
         )
         gap, gap_limits = self._gap(solution, governed)
         limits = (*governed.limits, *trim_limits, *gap_limits)
         if solution.confidence < self._config.limits.low_confidence:
             limits = (*limits, Limit.LOW_CONFIDENCE)
+        speed, acceleration = self._motion_ahead(governed, trim)
         plan = Plan(
             number=state.plan.number + 1,
             time_s=now_s,
@@ -105,11 +118,12 @@ class Planner:
             predicted_N=None if predicted is None else predicted * trim,
             field_mT=solution.field_mT,
             gap_mm=gap,
-            gap_speed_mm_s=self._gap_speed(governed, trim),
+            gap_speed_mm_s=speed,
             confidence=solution.confidence,
             limits=limits,
+            gap_acceleration_mm_s2=acceleration,
         )
-        return PlanState(governor, plan, trim)
+        return PlanState(governor, plan, trim, lag_s)
 
     def _motion(self, setpoint: TimedSetpoint | None, estimate: Estimate | None) -> tuple[float, float]:
         # the field sets how much friction there can be, so it is asked for at full mobilisation and in motion: before
@@ -145,14 +159,28 @@ class Planner:
         trim = min(max(wanted, settings.least), settings.most)
         return trim, () if trim == wanted else (Limit.TRIM,)
 
+    def _learn_lag(self, state: PlanState, now_s: float, estimate: Estimate | None, force_N: float) -> float:
+        """How far the gap is behind over how fast it moves: a motor weaker than it is believed to be comes late."""
+        if estimate is None or not estimate.is_homed:
+            return state.lag_s
+        behind_mm = float(self.portrait.gaps_mm(np.array([force_N]))[0]) - estimate.gap_mm
+        if abs(behind_mm) > MOST_LAG_S * self._config.position.gap_speed_mm_s:
+            return state.lag_s  # on its way after a jump
+        travel_mm_s = estimate.left_mm_s + estimate.right_mm_s
+        late_s = behind_mm * travel_mm_s / (travel_mm_s**2 + LEAST_TRAVEL_MM_S**2)
+        elapsed = max(0.0, now_s - state.plan.time_s)
+        return min(max(state.lag_s + elapsed / (LAG_TIME_S + elapsed) * late_s, 0.0), MOST_LAG_S)
+
     def _gap(self, solution: FieldSolution, governed: Governed) -> tuple[float, tuple[Limit, ...]]:
         # the field grid ends where the gap range ends, up to rounding
         gap = min(max(self._field.gap_mm(solution.field_mT), self._gaps_mm[0]), self._gaps_mm[1])
         reached = _LIMIT_OF_REACH.get(solution.reach)
         return gap, () if reached is None or reached in governed.limits else (reached,)
 
-    def _gap_speed(self, governed: Governed, trim: float) -> float:
+    def _motion_ahead(self, governed: Governed, trim: float) -> tuple[float, float]:
         # along the portrait, not from one solution to the next: a difference would amplify the solver's grain
-        most = self._config.position.gap_speed_mm_s
-        steepness = trim * self.portrait.slope_at_N_mm(governed.ahead_N / trim)
-        return min(max(-governed.slope_N_s / max(steepness, LEAST_SLOPE_N_MM), -most), most)
+        gaps = self.portrait.gaps_mm(governed.path_N / trim)
+        speed, acceleration = _FIT @ (gaps - gaps[0])
+        position = self._config.position
+        fastest, hardest = position.gap_speed_mm_s, position.gap_acceleration_mm_s2
+        return min(max(float(speed), -fastest), fastest), min(max(float(acceleration), -hardest), hardest)

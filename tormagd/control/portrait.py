@@ -34,8 +34,9 @@ class FieldOfGap(NamedTuple):
 
 
 class Portrait(NamedTuple):
-    """Force over gap with friction fully mobilised, and its slope; forces rise along the arrays."""
+    """Force over gap with friction fully mobilised, and its slope; forces rise and gaps fall along the arrays."""
 
+    gap_mm: Array
     force_N: Array
     slope_N_mm: Array
     """|dF/dgap|, N per mm."""
@@ -54,6 +55,11 @@ class Portrait(NamedTuple):
         """|dF/dgap| where the gap gives this force."""
         return float(np.interp(force_N, self.force_N, self.slope_N_mm))
 
+    def gaps_mm(self, forces_N: Array) -> Array:
+        """The gaps that give these forces; the nearest end of the range where none does."""
+        gaps: Array = np.interp(forces_N, self.force_N, self.gap_mm)
+        return gaps
+
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
         """The fastest change of force that a gap speed renders at this force."""
         return gap_speed_mm_s * self.slope_at_N_mm(force_N)
@@ -65,4 +71,4 @@ def portrait(model: ForceModel, field: FieldOfGap, cip_percent: float, gap_range
     features = np.array([[MOBILISED_MM, ROLLER_RATE_MM_S, field.field_mT(float(gap)), cip_percent] for gap in gaps])
     # a learned curve may dip by a hair where it is flat; the portrait is the rising envelope
     force = np.maximum.accumulate(model.predict(features))
-    return Portrait(force, np.abs(np.gradient(force, gaps)))
+    return Portrait(gaps, force, np.abs(np.gradient(force, gaps)))

@@ -6,10 +6,10 @@ from typing import NamedTuple
 from firmware_protocol.codec import DeviceMode, DriveMode
 from tormagd.config import Config
 from tormagd.control.estimate import Estimate, first_estimate, update
-from tormagd.control.motor import full_speed_mm_s, mechanical_time_s
+from tormagd.control.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s
 from tormagd.control.pid import PidOutput, PidState, pid
 from tormagd.control.plan import Plan
-from tormagd.control.trajectory import Reference, follow
+from tormagd.control.trajectory import Expected, Reference, expect, follow
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault, Limit, device_faults
 from tormagd.safety.operating_state import (
@@ -25,14 +25,25 @@ from tormagd.scenes.scene import Scene
 
 CARRY_S = 0.012
 "A plan's gap is carried forward along its speed by no more than three inference periods."
+WEAK_MM = 1.0
+"Carriages further behind than this have reached the top speed of motors that are weaker than they are believed to be."
 STARTING_S = 0.15
 "After enabling, the device may take this long to report that it runs."
+EXCHANGE_S = 0.0015
+"From a duty to its effect as the encoders report it: a period in the exchange, half a period that it is held."
 COULOMB_SPEED_MM_S = 0.5
 "Below this reference speed the friction feed-forward fades, so that a resting carriage is not pushed to and fro."
 STILL_MM_S = 0.5
 "Slower than this a carriage does not move: half an encoder count a millisecond and filtered."
 LAGGING_MM = 0.1
 "The speed limit is reported as RATE only where it leaves the reference this far behind its target."
+
+
+class Error(NamedTuple):
+    """How far a carriage is from where it is expected, mm and mm/s."""
+
+    position_mm: float
+    speed_mm_s: float
 
 
 class StepState(NamedTuple):
@@ -42,8 +53,11 @@ class StepState(NamedTuple):
     safety: SafetyState = SafetyState()
     estimate: Estimate | None = None
     reference: Reference | None = None
+    expected: Expected | None = None
     left: PidState = PidState()
     right: PidState = PidState()
+    duties: tuple[float, float] = (0.0, 0.0)
+    "Of the step before, left and right."
     enabled_s: float = math.inf
     following_s: float = math.inf
     "Since when the gap has been too far from its reference; infinite while it follows."
@@ -72,7 +86,9 @@ class Stepper:
         self._home_mm = scene.insert.gap_open_mm / 2.0
         self._supply_V = config.motor.supply_V
         self._full_speed_mm_s = full_speed_mm_s(config.motor)
+        self._no_load_mm_s = 2.0 * self._full_speed_mm_s
         self._mechanical_time_s = mechanical_time_s(config.motor)
+        self._lag_s = electrical_time_s(config.motor) + EXCHANGE_S
         self._gear_loss = 1.0 - config.motor.gear_efficiency
         self._coulomb = config.motor.coulomb_V / config.motor.supply_V
 
@@ -89,10 +105,10 @@ class Stepper:
                 raise RefusedError(
                     "not_fresh", "no measurement from the device yet", "look at the link in tormagctl status"
                 )
-            reference = Reference(state.estimate.gap_mm)
             return state._replace(
                 safety=safety,
-                reference=reference,
+                reference=Reference(state.estimate.gap_mm),
+                expected=Expected(state.estimate.gap_mm),
                 left=PidState(),
                 right=PidState(),
                 enabled_s=now_s,
@@ -121,7 +137,7 @@ class Stepper:
         if safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             if measurement.is_busy:  # homing moves the origin: what was learned about motion before it is void
                 estimate = first_estimate(measurement, self._home_mm)
-            state = state._replace(time_s=now_s, safety=safety, estimate=estimate, reference=None)
+            state = state._replace(time_s=now_s, safety=safety, estimate=estimate, reference=None, expected=None)
             return state, self._off(safety, ())
         return self._drive(state._replace(safety=safety), now_s, measurement, estimate, plan)
 
@@ -132,21 +148,21 @@ class Stepper:
         if not 0.0 < dt_s < 10.0 * self._nominal_dt_s:
             dt_s = self._nominal_dt_s  # a clock that stood still or a process that was stopped is not a long period
         reference = state.reference or Reference(estimate.gap_mm)
+        expected = state.expected or Expected(estimate.gap_mm)
+        expected = expect(expected, reference, dt_s, self._lag_s, self._position.derivative_filter_s)
+        top_mm_s = self._top_speed(expected, estimate)
         limits: list[Limit] = []
         if state.safety.operating_state is OperatingState.PAUSED:
-            reference, _ = follow(self._position, reference, reference.gap_mm, 0.0, dt_s, 2.0 * self._full_speed_mm_s)
+            reference, _ = follow(self._position, reference, Reference(reference.gap_mm), dt_s, top_mm_s)
         else:
-            carried = plan.gap_speed_mm_s * min(max(now_s - plan.time_s, 0.0), CARRY_S)
-            target = min(max(plan.gap_mm + carried, self._gaps_mm[0]), self._gaps_mm[1])
-            reference, is_limited = follow(
-                self._position, reference, target, plan.gap_speed_mm_s, dt_s, 2.0 * self._full_speed_mm_s
-            )
-            if is_limited and abs(target - reference.gap_mm) > LAGGING_MM:
+            target = self._target(plan, now_s)
+            reference, is_limited = follow(self._position, reference, target, dt_s, top_mm_s)
+            if is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
                 limits.append(Limit.RATE)
-        left_state, left = self._carriage(state.left, reference, estimate.left_mm, estimate.left_mm_s, estimate, dt_s)
-        right_state, right = self._carriage(
-            state.right, reference, estimate.right_mm, estimate.right_mm_s, estimate, dt_s, is_right=True
-        )
+        left_error, right_error = self._errors(expected, estimate)
+        ahead = self._feed_forward(reference)
+        left_state, left = self._carriage(state.left, left_error, ahead, dt_s)
+        right_state, right = self._carriage(state.right, right_error, ahead, dt_s)
         if not all(math.isfinite(value) for value in (left.duty, right.duty, measurement.supply_V)):
             safety = latch(state.safety, (Fault.NOT_FINITE,))
             return self.start(now_s)._replace(safety=safety), self._off(safety, ())
@@ -157,8 +173,10 @@ class Stepper:
         state = state._replace(
             time_s=now_s,
             reference=reference,
+            expected=expected,
             left=left_state,
             right=right_state,
+            duties=(left.duty, right.duty),
             following_s=self._following(state, reference, estimate, now_s),
             still_s=self._still(state, estimate, left.duty, right.duty, now_s),
         )
@@ -175,30 +193,46 @@ class Stepper:
         )
         return state, output
 
-    def _carriage(
-        self,
-        state: PidState,
-        reference: Reference,
-        position_mm: float,
-        speed_mm_s: float,
-        estimate: Estimate,
-        dt_s: float,
-        *,
-        is_right: bool = False,
-    ) -> tuple[PidState, PidOutput]:
-        speed = reference.speed_mm_s / 2.0
-        coulomb = self._coulomb * min(max(speed / COULOMB_SPEED_MM_S, -1.0), 1.0)
-        acceleration = reference.acceleration_mm_s2 / 2.0
+    def _target(self, plan: Plan, now_s: float) -> Reference:
+        """Where the plan leads by when a duty of now shows."""
+        age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + self._lag_s
+        gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
+        speed_mm_s = plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2
+        within_mm = min(max(gap_mm, self._gaps_mm[0]), self._gaps_mm[1])
+        return Reference(within_mm, speed_mm_s, plan.gap_acceleration_mm_s2)
+
+    def _top_speed(self, expected: Expected, estimate: Estimate) -> float:
+        """Of the gap: the motor's without load, or what the carriages show where they fall behind; not below half,
+        so that carriages that are held still are found out by their following error.
+        """
+        if abs(expected.gap_mm - estimate.gap_mm) <= WEAK_MM:
+            return self._no_load_mm_s
+        return min(max(abs(estimate.left_mm_s + estimate.right_mm_s), self._no_load_mm_s / 2.0), self._no_load_mm_s)
+
+    def _errors(self, expected: Expected, estimate: Estimate) -> tuple[Error, Error]:
+        """Both carriages' errors; either also takes half of the skew, so that the faster waits for the slower."""
+        half_mm, half_mm_s = expected.gap_mm / 2.0, expected.filtered_mm_s / 2.0
+        skew = self._position.synchronisation * estimate.skew_mm / 2.0
+        return (
+            Error(half_mm - estimate.left_mm - skew, half_mm_s - estimate.left_mm_s),
+            Error(half_mm - estimate.right_mm + skew, half_mm_s - estimate.right_mm_s),
+        )
+
+    def _feed_forward(self, reference: Reference) -> float:
+        speed, acceleration = reference.speed_mm_s / 2.0, reference.acceleration_mm_s2 / 2.0
         # what the gears lose has to be added to speed up, and helps to brake
         loss = math.copysign(self._gear_loss, acceleration * speed)
         inertia = acceleration * self._mechanical_time_s / (1.0 - loss)
-        skew = estimate.skew_mm if is_right else -estimate.skew_mm
+        coulomb = self._coulomb * min(max(speed / COULOMB_SPEED_MM_S, -1.0), 1.0)
+        return (speed + inertia) / self._full_speed_mm_s + coulomb
+
+    def _carriage(self, state: PidState, error: Error, ahead: float, dt_s: float) -> tuple[PidState, PidOutput]:
         return pid(
             self._position,
             state,
-            error_mm=reference.gap_mm / 2.0 - position_mm + self._position.synchronisation * skew / 2.0,
-            speed_error_mm_s=speed - speed_mm_s,
-            feed_forward=(speed + inertia) / self._full_speed_mm_s + coulomb,
+            error_mm=error.position_mm,
+            speed_error_mm_s=error.speed_mm_s,
+            feed_forward=ahead,
             dt_s=dt_s,
         )
 
@@ -227,8 +261,11 @@ class Stepper:
 
     def _still(self, state: StepState, estimate: Estimate, left_duty: float, right_duty: float, now_s: float) -> float:
         least = self._limits.no_motion_duty
-        is_left_still = abs(left_duty) > least and abs(estimate.left_mm_s) < STILL_MM_S
-        is_right_still = abs(right_duty) > least and abs(estimate.right_mm_s) < STILL_MM_S
+        # a duty that turns round before the carriage could move drives it nowhere
+        is_left_driven = left_duty * math.copysign(1.0, state.duties[0]) > least
+        is_right_driven = right_duty * math.copysign(1.0, state.duties[1]) > least
+        is_left_still = is_left_driven and abs(estimate.left_mm_s) < STILL_MM_S
+        is_right_still = is_right_driven and abs(estimate.right_mm_s) < STILL_MM_S
         return min(state.still_s, now_s) if is_left_still or is_right_still else math.inf
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""The gap reference: follows a moving target as fast as the carriages can, and no faster."""
+"""The gap reference: follows a moving target as fast as the motors can, and no faster."""
 
 import math
 from typing import NamedTuple
@@ -7,44 +7,65 @@ from tormagd.config import Position
 
 APPROACH_S = 0.01
 "Time constant of the last stretch: below it the reference would chase every quantum of its target."
-
-SMOOTHING_S = 0.002
-"The acceleration is for feed-forward: smoothed, because the motor's current follows it."
+LEAST_BRAKING = 0.2
+"Share of the acceleration that is left to brake with, however hard the target itself turns."
 
 
 class Reference(NamedTuple):
-    """Where the gap should be, mm, and how fast it moves there, mm/s and (smoothed) mm/s^2."""
+    """Where the gap is driven, mm, and how fast it is driven there, mm/s and mm/s^2."""
 
     gap_mm: float
     speed_mm_s: float = 0.0
     acceleration_mm_s2: float = 0.0
 
 
-def follow(
-    limits: Position,
-    reference: Reference,
-    target_mm: float,
-    target_speed_mm_s: float,
-    dt_s: float,
-    no_load_speed_mm_s: float,
-) -> tuple[Reference, bool]:
-    """The reference `dt_s` later, and whether the speed limit holds it back from the target.
+class Expected(NamedTuple):
+    """Where the gap must be by now if it follows its reference: mm, mm/s, and the speed as the estimate filters it.
 
-    The closing speed is the largest from which the distance left still suffices to brake, so that a step is
-    time-optimal under the limits and does not overshoot; the target's own speed is added, so that a moving target is
-    followed without lag. Speeding up, the acceleration falls with speed to nothing at `no_load_speed_mm_s`.
+    The windings take the acceleration with a lag and the exchange brings it in and back a little later, so this is the
+    reference with its jerk limited to what the drive can do. A lag has a positive kernel: it adds no overshoot.
     """
-    distance = target_mm - reference.gap_mm
-    change = limits.gap_acceleration_mm_s2 * dt_s
-    braking = (math.sqrt(change * change + 8.0 * limits.gap_acceleration_mm_s2 * abs(distance)) - change) / 2.0
+
+    gap_mm: float
+    speed_mm_s: float = 0.0
+    filtered_mm_s: float = 0.0
+
+
+def follow(
+    limits: Position, reference: Reference, target: Reference, dt_s: float, top_speed_mm_s: float
+) -> tuple[Reference, bool]:
+    """The reference `dt_s` later, and whether the speed limit holds it back from the target, which moves.
+
+    The closing speed is the largest from which the distance left still suffices to brake with
+    `gap_acceleration_mm_s2`, so that a step is time-optimal under the limits and does not overshoot. The target's own
+    speed is added, so that a moving target is followed without lag, and a target that itself turns round leaves less
+    to brake with. Speeding up, the acceleration falls with speed to nothing at `top_speed_mm_s`, > 0, where
+    the motors have no torque left.
+    """
+    acceleration = limits.gap_acceleration_mm_s2
+    distance = target.gap_mm - reference.gap_mm
+    relative = acceleration + math.copysign(1.0, distance) * target.acceleration_mm_s2
+    relative = max(relative, LEAST_BRAKING * acceleration)
+    change = relative * dt_s
+    braking = (math.sqrt(change * change + 8.0 * relative * abs(distance)) - change) / 2.0
     closing = math.copysign(min(braking, abs(distance) / max(APPROACH_S, dt_s)), distance)
-    wanted = target_speed_mm_s + closing
-    bounded = min(max(wanted, -limits.gap_speed_mm_s), limits.gap_speed_mm_s)
-    torque = max(0.0, 1.0 - abs(reference.speed_mm_s) / no_load_speed_mm_s)
+    wanted = target.speed_mm_s + closing
+    fastest = min(limits.gap_speed_mm_s, top_speed_mm_s)
+    bounded = min(max(wanted, -fastest), fastest)
+    torque = max(0.0, 1.0 - abs(reference.speed_mm_s) / top_speed_mm_s)
     is_opening = reference.speed_mm_s > 0.0
-    up, down = (change * torque, change) if is_opening else (change, change * torque)
-    step = min(max(bounded - reference.speed_mm_s, -down), up)
-    speed = reference.speed_mm_s + step
-    acceleration = reference.acceleration_mm_s2
-    acceleration += dt_s / (SMOOTHING_S + dt_s) * (step / dt_s - acceleration)
-    return Reference(reference.gap_mm + speed * dt_s, speed, acceleration), bounded != wanted
+    up, down = (acceleration * torque, acceleration) if is_opening else (acceleration, acceleration * torque)
+    chosen = min(max((bounded - reference.speed_mm_s) / dt_s, -down), up)
+    speed = reference.speed_mm_s + chosen * dt_s
+    return Reference(reference.gap_mm + speed * dt_s, speed, chosen), bounded != wanted
+
+
+def expect(expected: Expected, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> Expected:
+    """What is expected `dt_s` later, `lag_s` behind the reference; `filter_s` is that of the estimated speeds."""
+    share = dt_s / (lag_s + dt_s)
+    speed = expected.speed_mm_s + share * (reference.speed_mm_s - expected.speed_mm_s)
+    return Expected(
+        expected.gap_mm + share * (reference.gap_mm - expected.gap_mm),
+        speed,
+        expected.filtered_mm_s + dt_s / (filter_s + dt_s) * (speed - expected.filtered_mm_s),
+    )

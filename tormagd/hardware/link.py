@@ -87,6 +87,7 @@ class DeviceLink:
         self.clock = DeviceClock()
         self._heard_s = self._hello_due_s = self._asked_s = now_s
         self._broken = ""
+        self._delay_s = 0.0
         self._nonce = 0
         # a Hello sets what the device calls the last accepted nonce, so it repeats that one and acknowledges nothing
         self._acknowledged = FIRST_NONCE
@@ -116,7 +117,7 @@ class DeviceLink:
         elif isinstance(message, Sense):
             self._take_sense(message)
         elif isinstance(message, Status):
-            self._take_status(message)
+            self._take_status(now_s, message)
         elif isinstance(message, Identity):
             self._take_identity(message)
 
@@ -188,7 +189,7 @@ class DeviceLink:
                 f"{identity.firmware_minor}), this daemon's is {SCHEMA_HASH:08x}: install the one that fits the other"
             )
 
-    def _take_status(self, status: Status) -> None:
+    def _take_status(self, now_s: float, status: Status) -> None:
         if self._status is None:
             # an earlier host has counted as far; its last number again would be taken for a repetition
             self._nonce = _next_nonce(status.command_nonce)
@@ -199,9 +200,12 @@ class DeviceLink:
             self._request = DeviceRequest.NONE
             self._acknowledged = self._nonce
         elif self._request is DeviceRequest.RETRACT and status.mode is DeviceMode.LATCHED:
-            self._request = (
-                DeviceRequest.NONE
-            )  # it has opened already, or cannot, and will not try again before a Clear
+            # it has opened already, or cannot, and will not try again before a Clear
+            self._request = DeviceRequest.NONE
+        # only a running device says which Drive it obeys; one late Status alone is the host's own stall, not the wire's
+        last_s, self._delay_s = self._delay_s, 0.0
+        if status.mode is DeviceMode.RUN:
+            self._delay_s = self.round_trip.since_drive_s(status.drive_counter, now_s)
         if self.measurement is not None:
             self.measurement = self.measurement._replace(
                 mode=status.mode,
@@ -209,6 +213,7 @@ class DeviceLink:
                 faults=status.faults,
                 temperature_C=status.temperature_C,
                 supply_V=status.supply_V,
+                delay_s=min(last_s, self._delay_s),
             )
 
     def _take_sense(self, sense: Sense) -> None:

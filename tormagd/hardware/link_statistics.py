@@ -51,6 +51,10 @@ class RoundTrip:
         self._newest = counter
         self._sent_s[counter] = now_s
 
+    def since_drive_s(self, counter: int, now_s: float) -> float:
+        """Time since the newest Drive with this counter went out, s."""
+        return now_s - self._sent_s[counter]
+
     def hello(self) -> None:
         """A Hello goes out after the newest Drive."""
         self._before_hello = self._newest

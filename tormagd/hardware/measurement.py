@@ -9,7 +9,8 @@ class Measurement(NamedTuple):
     """One device state. Carriage positions are mm from the home switches (closing is negative); times are in s.
 
     `received_s` is the host's clock, `device_time_s` the device's own, unwrapped from an arbitrary start. `handle_mm`
-    is the travel of the roller's surface, unwrapped. `number` counts the states of this connection.
+    is the travel of the roller's surface, unwrapped. `number` counts the states of this connection. `delay_s` is how
+    long ago the Drive was sent that the device last said it obeys: the way there and back, and up to a control period.
     """
 
     number: int
@@ -26,6 +27,7 @@ class Measurement(NamedTuple):
     faults: DeviceFault
     temperature_C: float
     supply_V: float
+    delay_s: float = 0.0
 
     @property
     def is_homed(self) -> bool:

@@ -1,0 +1,156 @@
+"""Extremes of the loop on the simulated device: uneven screws, an uneven clock, targets that flip.
+
+All data here are synthetic: the device is the simulator's.
+"""
+
+import math
+from itertools import accumulate
+
+import msgspec
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.config import Config
+from tormagd.control.plan import Plan
+from tormagd.control.step import Stepper
+from tormagd.safety.operating_state import OperatingState
+from tormagd.scenes.scene import load_scene
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.faults import parse_fault
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import PlantParameters, load_plant
+
+CONFIG = Config()
+SCENE = load_scene("coronary")
+OPEN_MM = 95.0
+
+
+def gap_plan(gap_mm: float, now_s: float = 0.0) -> Plan:
+    """A plan for a gap instead of a force."""
+    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
+
+
+def on_the_way(loop: ClosedLoop, gap_mm: float, ticks: int) -> list[Sample]:
+    return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(ticks)]
+
+
+def assert_sane(samples: list[Sample], config: Config = CONFIG) -> None:
+    """Finite everywhere, nothing wound up beyond the duty limit."""
+    limit = config.position.duty_limit
+    for sample in samples:
+        state = sample.state
+        assert abs(sample.output.left_duty) <= limit
+        assert abs(sample.output.right_duty) <= limit
+        assert max(abs(state.left.integral), abs(state.right.integral)) <= limit
+        assert state.reference is None or all(map(math.isfinite, state.reference))
+        assert state.expected is None or all(map(math.isfinite, state.expected))
+        assert math.isfinite(sample.truth.gap_mm)
+
+
+# -- synchronisation -----------------------------------------------------------------------------------------------
+
+
+def uneven() -> PlantParameters:
+    """Sample 1 with three times the drag on the left."""
+    plant = load_plant("sample_1")
+    return msgspec.structs.replace(
+        plant, screw=msgspec.structs.replace(plant.screw, drag_left_N=12.0, drag_right_N=4.0)
+    )
+
+
+def worst_skew_um(synchronisation: float) -> float:
+    """Greatest skew by the encoders on the way to and fro at 15 mm/s, with half of the drag again on the left soon."""
+    position = msgspec.structs.replace(CONFIG.position, synchronisation=synchronisation)
+    config = msgspec.structs.replace(CONFIG, position=position)
+    device = VirtualDevice(uneven(), SteadyHand(), [parse_fault("drag_left=+50%@2.7")], 1)
+    loop = ClosedLoop(config, Stepper(config, SCENE), None, device)
+    loop.arm(gap_plan(OPEN_MM))
+    assert loop.now_s < 2.6
+    samples = []
+    for tick in range(1_600):
+        gap_mm, speed_mm_s = (94.0 - 15e-3 * tick, -15.0) if tick < 800 else (82.0 + 15e-3 * (tick - 800), 15.0)
+        samples.append(loop.tick(plan=gap_plan(gap_mm, loop.now_s)._replace(gap_speed_mm_s=speed_mm_s)))
+    assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
+    assert_sane(samples, config)
+    assert samples[-1].truth.gap_mm == pytest.approx(94.0, abs=0.1)
+    return max(abs(sample.state.estimate.skew_mm) for sample in samples if sample.state.estimate is not None) * 1e3
+
+
+def test_uneven_screws_stay_together_and_cross_coupling_is_why() -> None:
+    coupled, apart = worst_skew_um(CONFIG.position.synchronisation), worst_skew_um(0.0)
+    assert coupled <= 30.0
+    assert coupled < 0.8 * apart
+
+
+def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
+    """Sample 2 reaches less than the speed limit: over the stroke it falls behind, but never so far as a fault."""
+    loop = ClosedLoop(CONFIG, Stepper(CONFIG, SCENE), None, VirtualDevice(load_plant("sample_2"), SteadyHand(), seed=1))
+    loop.arm(gap_plan(OPEN_MM))
+    samples = on_the_way(loop, 47.0, 2_000) + on_the_way(loop, 93.0, 2_000)
+    assert_sane(samples)
+    assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
+    assert samples[-1].truth.gap_mm == pytest.approx(93.0, abs=0.1)
+
+
+# -- the clock -----------------------------------------------------------------------------------------------------
+
+
+class UnevenLoop(ClosedLoop):
+    """A loop whose ticks come after these times, and a period apart after the last."""
+
+    def __init__(self, periods_s: list[float]) -> None:
+        device = VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1)
+        self._at_s: list[float] = []
+        super().__init__(CONFIG, Stepper(CONFIG, SCENE), None, device)
+        self._periods_s = periods_s
+
+    @property
+    def now_s(self) -> float:
+        return self._at_s[self._ticks] if self._ticks < len(self._at_s) else super().now_s
+
+    def play(self, gap_mm: float) -> list[Sample]:
+        """The uneven periods, from now on."""
+        even = [tick * self._period_s for tick in range(self._ticks + 1)]
+        self._at_s = even + list(accumulate(self._periods_s, initial=even[-1]))[1:]
+        return on_the_way(self, gap_mm, len(self._periods_s))
+
+
+@settings(max_examples=4, deadline=None, suppress_health_check=list(HealthCheck))
+@given(periods_s=st.lists(st.floats(1e-5, 4e-3), min_size=300, max_size=300))
+def test_jitter_of_a_few_periods_is_ridden_out(periods_s: list[float]) -> None:
+    loop = UnevenLoop(periods_s)
+    loop.arm(gap_plan(OPEN_MM))
+    samples = loop.play(92.0)
+    assert_sane(samples)
+    assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
+    assert min(sample.truth.gap_mm for sample in samples) > 92.0 - 0.2
+
+
+@settings(max_examples=4, deadline=None, suppress_health_check=list(HealthCheck))
+@given(periods_s=st.lists(st.sampled_from([1e-5, 1e-3, 0.03, 0.1]), min_size=60, max_size=60))
+def test_jitter_beyond_the_timeout_ends_in_a_fault_and_not_in_motion(periods_s: list[float]) -> None:
+    loop = UnevenLoop(periods_s)
+    loop.arm(gap_plan(OPEN_MM))
+    samples = loop.play(90.0)
+    assert_sane(samples)
+    if max(periods_s) > 0.05:
+        assert samples[-1].state.safety.operating_state is OperatingState.FAULT
+    assert min(sample.truth.gap_mm for sample in samples) > 90.0 - 2.0
+
+
+# -- the target ----------------------------------------------------------------------------------------------------
+
+
+def test_a_target_that_flips_every_tick_is_averaged_and_left_behind_cleanly() -> None:
+    loop = ClosedLoop(CONFIG, Stepper(CONFIG, SCENE), None, VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1))
+    loop.arm(gap_plan(OPEN_MM))
+    on_the_way(loop, 85.0, 500)
+    flipping = [loop.tick(plan=gap_plan(80.0 + 10.0 * (tick % 2), loop.now_s)) for tick in range(600)]
+    assert_sane(flipping)
+    assert all(79.9 < sample.truth.gap_mm < 90.1 for sample in flipping)
+    after = on_the_way(loop, 85.0, 600)
+    assert_sane(after)
+    assert after[-1].state.safety.operating_state is OperatingState.ENABLED
+    assert after[-1].truth.gap_mm == pytest.approx(85.0, abs=0.03)

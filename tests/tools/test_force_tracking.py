@@ -1,0 +1,88 @@
+"""The force-tracking tool: its signals, its draws, and its figures on one short run. All devices are synthetic."""
+
+import force_tracking
+import numpy as np
+import pytest
+from force_signals import Signal, recorded_signals
+from force_tracking import DRAWN, SPREAD, STAIR_S, TRIM_S, Track, draw_plants, publisher, stair_levels, track
+
+from tormagd.simulation.parameters import load_plant
+
+
+def swing(seconds: float) -> Signal:
+    times = np.arange(round(seconds * 500)) / 500
+    return Signal("swing", "a formula", times, 1.5 + 0.1 * np.sin(2.0 * np.pi * 1.5 * times))
+
+
+@pytest.fixture(scope="module")
+def swung() -> Track:
+    return track(load_plant("sample_1"), swing(1.6), "pulse", 0.07)
+
+
+def test_a_swing_is_rendered_and_nothing_holds_it_back(swung: Track) -> None:
+    found = swung.since(0.8)
+    assert found.rms_N <= 0.015
+    assert found.variance_accounted_for >= 0.95
+    assert swung.time_s[0] >= 0.0
+    assert swung.time_s[-1] == pytest.approx(1.6, abs=0.01)
+    assert "STALE" not in swung.limits
+    assert all(0.0 <= share <= 1.0 for share in swung.limits.values())
+
+
+def test_the_error_is_measured_where_it_is(swung: Track) -> None:
+    """A millinewton more everywhere is a millinewton more of mean error: nothing is removed."""
+    shifted = swung._replace(rendered_N=swung.rendered_N + 0.001)
+    assert shifted.since(0.8).mean_N - swung.since(0.8).mean_N == pytest.approx(0.001)
+
+
+def test_a_publisher_sends_what_follows() -> None:
+    times, forces = np.arange(100) / 500, np.linspace(1.0, 2.0, 100)
+    publish = publisher(times + 3.0, forces, 0.02, 0.1)
+    assert publish(2.999) is None
+    setpoint = publish(3.0101)
+    assert setpoint is not None
+    assert setpoint.force_N == pytest.approx(forces[5])
+    assert setpoint.preview_N == pytest.approx(forces[6:16])
+    assert setpoint.preview_dt_s == 0.002
+    silent = publisher(times, forces, 0.0, 0.1)(0.1)
+    assert silent is not None
+    assert silent.preview_N == ()
+
+
+def test_draws_repeat_themselves_within_their_spread() -> None:
+    first, again = list(draw_plants(4)), list(draw_plants(4))
+    assert first == again
+    assert len({plant.motor.resistance_Ohm for plant, _ in first}) == 4
+    nominal = load_plant("sample_1")
+    for plant, factors in first:
+        assert len(factors) == len(DRAWN)
+        assert all(1.0 - SPREAD <= factor <= 1.0 + SPREAD for factor in factors.values())
+        assert plant.gear.output_friction_Nm == pytest.approx(
+            nominal.gear.output_friction_Nm * factors["gear.output_friction_Nm"]
+        )
+        assert plant.electronics == nominal.electronics
+
+
+def test_levels_are_those_of_the_steps() -> None:
+    """A record made by hand: each level half a step off only in its first moments."""
+    signal = force_tracking.staircase_signal(0.47)
+    assert signal.force_N[0] == 1.0
+    assert signal.force_N[signal.time_s > TRIM_S][0] == 0.47
+    assert signal.force_N[-1] == pytest.approx(2.0)
+    late = np.interp(signal.time_s - 0.1, signal.time_s, signal.force_N)
+    asked, levels = stair_levels(Track(signal.time_s, signal.force_N, late, {}, 1.0, 0.0))
+    assert asked == pytest.approx([0.47, *np.arange(0.5, 2.01, 0.1)])
+    assert levels == pytest.approx(asked)
+    assert STAIR_S > 1.0
+
+
+def test_recorded_signals_are_in_the_devices_range(recordings) -> None:
+    found = recorded_signals(recordings)
+    assert {signal.name.split()[0] for signal in found} == {"finger", "arterial", "tool", "haptic"}
+    for signal in found:
+        assert np.all(np.diff(signal.time_s) > 0.0)
+        assert 0.55 <= signal.force_N.min() <= signal.force_N.max() <= 1.75
+
+
+def test_a_folder_without_data_gives_no_signals(tmp_path) -> None:
+    assert recorded_signals(tmp_path) == []

@@ -1,0 +1,89 @@
+"""Recorded signals as force profiles within the device's range, from the folder that TORMAG_DATA names.
+
+Shape and rhythm are measured; where a signal is not a force, the newtons are chosen, as `scaled` says.
+"""
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import butter, sosfiltfilt
+
+Array = npt.NDArray[np.float64]
+
+PULSE_N = (1.4, 1.7)
+"The range of the demonstration's pulse."
+RATE_HZ = 500
+PULSE_S = 16.0
+"A recorded pulse is repeated up to this; the loops of `aac_nibp_pulse` end where they begin."
+LOW_PASS_HZ = 20.0
+ROLLER_M = 0.020
+TOOL_NM_PER_COUNT = 0.000039811
+HAPTIC_S = 40.0
+"Of the 98 s recorded."
+SHIFT_N = 0.6
+"Above the device's least force."
+
+
+class Signal(NamedTuple):
+    """A force profile. `is_known_ahead`: it comes from a file, so that a publisher can send a preview."""
+
+    name: str
+    scaled: str
+    time_s: Array
+    force_N: Array
+    is_known_ahead: bool = True
+    valid_for_s: float = 0.1
+
+
+def recorded_signals(folder: Path) -> list[Signal]:
+    """Every signal found under a data folder; those that are not there are left out."""
+    return [
+        *(_pulse(path, "finger pressure") for path in sorted((folder / "aac_nibp_pulse").glob("*.csv"))),
+        *(_pulse(path, "arterial pressure") for path in sorted((folder / "wfdb_mimicdb").glob("*_ABP.csv"))),
+        *(_tool(path) for path in sorted((folder / "umn_mis_tool").glob("*.TXT"))),
+        *(_haptic(path) for path in sorted((folder / "kit_cataract_haptic").glob("*.csv"))),
+    ]
+
+
+def data_folder() -> Path | None:
+    """The folder that TORMAG_DATA names, if it is there."""
+    name = os.environ.get("TORMAG_DATA")
+    return Path(name) if name and Path(name).is_dir() else None
+
+
+def _pulse(path: Path, what: str) -> Signal:
+    raw = np.loadtxt(path, delimiter=",", skiprows=1)
+    period_s = float(np.median(np.diff(raw[:, 0])))
+    # there and back where the ends do not meet: a jump is none of the pulse's own
+    values = raw[:, 1]
+    if abs(values[-1] - values[0]) > 0.02 * np.ptp(values):
+        values = np.concatenate([values, values[-2:0:-1]])
+    values = np.tile(values, int(np.ceil(PULSE_S / period_s / len(values))) + 1)
+    smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=1.0 / period_s, output="sos"), values)
+    time_s = np.arange(round(PULSE_S * RATE_HZ)) / RATE_HZ
+    part = np.interp(time_s, np.arange(len(smooth)) * period_s, smooth)
+    low, high = PULSE_N
+    force = low + (part - part.min()) / np.ptp(part) * (high - low)
+    return Signal(f"{what} {path.stem}", f"least..most to {low}..{high} N, {LOW_PASS_HZ:g} Hz", time_s, force)
+
+
+def _tool(path: Path) -> Signal:
+    raw = np.loadtxt(path, delimiter=",", comments="%", usecols=(0, 5))
+    count = len(raw)
+    force = np.abs(raw[:, 1]) * TOOL_NM_PER_COUNT / ROLLER_M
+    smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=1_000.0, output="sos"), force)
+    time_s = np.arange(0.0, count / 1_000.0 - 0.5, 1.0 / RATE_HZ)
+    forces = np.interp(time_s, np.arange(count) / 1_000.0, smooth)
+    return Signal(f"tool torque {path.stem}", f"over 20 mm, not scaled, {LOW_PASS_HZ:g} Hz", time_s, forces)
+
+
+def _haptic(path: Path) -> Signal:
+    raw = np.loadtxt(path, delimiter=",", skiprows=1)
+    time_s, first = np.unique(raw[:, 0], return_index=True)
+    forces = SHIFT_N + np.linalg.norm(raw[first, 1:4], axis=1)
+    time_s, forces = time_s[time_s <= HAPTIC_S], forces[time_s <= HAPTIC_S]
+    # live: sent when it came, nothing of it known before; over the recording's pauses the last one goes stale
+    return Signal(f"haptic commands {path.stem}", f"|F| + {SHIFT_N:g} N, at its own times", time_s, forces, False, 0.25)
