@@ -252,6 +252,19 @@ def test_a_publishers_own_motion_is_used_instead_of_the_measured(core) -> None:
     assert gap(moving(is_homed=False), None) != gap(slow, None)
 
 
+def test_a_stale_setpoints_motion_is_not_used_any_more(core) -> None:
+    state = core.planner.start(0.0)
+    measured = moving(is_homed=False)
+
+    def gap(now_s: float, rate_mm_s: float | None) -> float:
+        return core.planner.plan(
+            state, now_s, TimedSetpoint(1.0, PERIOD_S, 0.1, rate_mm_s=rate_mm_s), measured
+        ).plan.gap_mm
+
+    assert gap(0.09, 8.0) != gap(0.09, None)
+    assert gap(0.2, 8.0) == gap(0.2, None)
+
+
 def test_a_motion_nobody_has_measured_is_of_low_confidence(core) -> None:
     state = core.planner.plan(
         core.planner.start(0.0), PERIOD_S, TimedSetpoint(1.0, PERIOD_S, 0.1, rate_mm_s=5_000.0), None

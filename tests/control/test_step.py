@@ -252,6 +252,15 @@ def test_a_stale_measurement(running: Bench) -> None:
     assert is_opened(running)
 
 
+def test_a_measurement_over_a_slow_line(running: Bench) -> None:
+    """Each state comes at once after the last, but answers a drive of long ago: a loop around that would swing."""
+    timeout_s = CONFIG.device.measurement_timeout_ms * 1e-3
+    running.step(count=5, delay_s=timeout_s - 1e-3)
+    assert not running.faults
+    assert running.run_into(Fault.MEASUREMENT_STALE, delay_s=timeout_s + 1e-3) == 1
+    assert is_opened(running)
+
+
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_skew(running: Bench, side: float) -> None:
     allowed = CONFIG.limits.skew_fault_mm
@@ -269,7 +278,7 @@ def test_a_gap_that_does_not_follow(core: Core, measure) -> None:
     bench = Bench(Stepper(config, core.scene), measure)
     bench.step(count=3)
     bench.command("enable")
-    while bench.state.following_s == math.inf:
+    while bench.state.straying_s == 0.0:
         bench.step(gap_plan(50.0))
         assert bench.ticks < 1_000
     since = bench.ticks
@@ -297,6 +306,15 @@ def test_a_carriage_that_is_driven_and_does_not_move(running: Bench) -> None:
     assert running.faults == (Fault.NO_MOTION,)
     assert ticks * PERIOD_S < 0.25
     assert is_opened(running)
+
+
+def test_a_process_that_stood_still_saw_no_carriage_stand_still(running: Bench) -> None:
+    """One look before the pause and one after it say nothing of what the carriages did between."""
+    running.step(gap_plan(60.0), count=30)
+    assert running.state.still_s > 0.0
+    running.ticks += round(CONFIG.limits.no_motion_time_s / PERIOD_S)
+    running.step(gap_plan(60.0), count=2)
+    assert not running.faults
 
 
 @pytest.mark.parametrize("mode", [DeviceMode.IDLE, DeviceMode.LATCHED, DeviceMode.HOMING, DeviceMode.RETRACTING])

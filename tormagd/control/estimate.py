@@ -9,6 +9,8 @@ TURN_MM = 0.05
 MOBILISED_MM = 2.0
 "Displacement saturates here: friction is fully mobilised, whatever the insert."
 RATE_FILTER_S = 0.05
+LEAST_DT_S = 5e-6
+"Half a step of the device's clock; positions over less time than that would give speeds without bound."
 
 
 class Handle(NamedTuple):
@@ -76,7 +78,7 @@ def update(last: Estimate | None, measurement: Measurement, home_mm: float, deri
     if last is None:
         return first_estimate(measurement, home_mm)
     dt_s = measurement.device_time_s - last.device_time_s
-    if measurement.number == last.number or dt_s <= 0.0:
+    if measurement.number == last.number or dt_s < LEAST_DT_S:
         return last
     left, right = home_mm + measurement.left_mm, home_mm + measurement.right_mm
     share = dt_s / (derivative_filter_s + dt_s)

@@ -100,7 +100,7 @@ class Planner:
         predicted = self._predict(estimate) if estimate is not None and estimate.is_homed else None
         trim, trim_limits = self._learn(state, now_s, estimate, predicted)
         lag_s = self._learn_lag(state, now_s, estimate, governed.force_N / trim) if is_known else state.lag_s
-        displacement, rate = self._motion(setpoint, estimate)
+        displacement, rate = self._motion(None if Limit.STALE in governed.limits else setpoint, estimate)
         solution = self._solver.solve(
             displacement, rate, float(governed.path_N[0]) / trim, self._cip_percent, state.plan.field_mT
         )

@@ -59,10 +59,10 @@ class StepState(NamedTuple):
     duties: tuple[float, float] = (0.0, 0.0)
     "Of the step before, left and right."
     enabled_s: float = math.inf
-    following_s: float = math.inf
-    "Since when the gap has been too far from its reference; infinite while it follows."
-    still_s: float = math.inf
-    "Since when a carriage has been driven without moving; infinite while both obey."
+    straying_s: float = 0.0
+    "For how long the gap has been too far from its reference, counted in periods: a process that stood still saw nothing."
+    still_s: float = 0.0
+    "For how long a carriage has been driven without moving, counted alike."
 
 
 class StepOutput(NamedTuple):
@@ -112,8 +112,8 @@ class Stepper:
                 left=PidState(),
                 right=PidState(),
                 enabled_s=now_s,
-                following_s=math.inf,
-                still_s=math.inf,
+                straying_s=0.0,
+                still_s=0.0,
             )
         return state._replace(safety=safety)
 
@@ -132,17 +132,22 @@ class Stepper:
             state = self.lose_link(state)._replace(time_s=now_s)
             return state, self._off(state.safety, ())
         estimate = update(state.estimate, measurement, self._home_mm, self._position.derivative_filter_s)
-        state = state._replace(estimate=estimate)
         safety = latch(state.safety, self._watch(state, estimate, now_s, measurement))
         if safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             if measurement.is_busy:  # homing moves the origin: what was learned about motion before it is void
                 estimate = first_estimate(measurement, self._home_mm)
             state = state._replace(time_s=now_s, safety=safety, estimate=estimate, reference=None, expected=None)
             return state, self._off(safety, ())
-        return self._drive(state._replace(safety=safety), now_s, measurement, estimate, plan)
+        return self._drive(state, safety, now_s, measurement, estimate, plan)
 
     def _drive(
-        self, state: StepState, now_s: float, measurement: Measurement, estimate: Estimate, plan: Plan
+        self,
+        state: StepState,
+        safety: SafetyState,
+        now_s: float,
+        measurement: Measurement,
+        estimate: Estimate,
+        plan: Plan,
     ) -> tuple[StepState, StepOutput]:
         dt_s = now_s - state.time_s
         if not 0.0 < dt_s < 10.0 * self._nominal_dt_s:
@@ -152,7 +157,7 @@ class Stepper:
         expected = expect(expected, reference, dt_s, self._lag_s, self._position.derivative_filter_s)
         top_mm_s = self._top_speed(expected, estimate)
         limits: list[Limit] = []
-        if state.safety.operating_state is OperatingState.PAUSED:
+        if safety.operating_state is OperatingState.PAUSED:
             reference, _ = follow(self._position, reference, Reference(reference.gap_mm), dt_s, top_mm_s)
         else:
             target = self._target(plan, now_s)
@@ -163,8 +168,8 @@ class Stepper:
         ahead = self._feed_forward(reference)
         left_state, left = self._carriage(state.left, left_error, ahead, dt_s)
         right_state, right = self._carriage(state.right, right_error, ahead, dt_s)
-        if not all(math.isfinite(value) for value in (left.duty, right.duty, measurement.supply_V)):
-            safety = latch(state.safety, (Fault.NOT_FINITE,))
+        if not math.isfinite(left.duty + right.duty + measurement.supply_V):  # a sum is finite only if all of it is
+            safety = latch(safety, (Fault.NOT_FINITE,))
             return self.start(now_s)._replace(safety=safety), self._off(safety, ())
         if left.is_saturated or right.is_saturated:
             limits.append(Limit.SATURATED)
@@ -172,13 +177,15 @@ class Stepper:
             limits.append(Limit.SKEW)
         state = state._replace(
             time_s=now_s,
+            safety=safety,
+            estimate=estimate,
             reference=reference,
             expected=expected,
             left=left_state,
             right=right_state,
             duties=(left.duty, right.duty),
-            following_s=self._following(state, reference, estimate, now_s),
-            still_s=self._still(state, estimate, left.duty, right.duty, now_s),
+            straying_s=state.straying_s + dt_s if self._is_astray(reference, estimate) else 0.0,
+            still_s=state.still_s + dt_s if self._is_still(state, estimate, left.duty, right.duty) else 0.0,
         )
         # the bridges switch the device's real supply: the same volts take less duty of a higher one
         scale = self._supply_V / max(measurement.supply_V, 0.5 * self._supply_V)
@@ -187,8 +194,8 @@ class Stepper:
             DriveMode.RUN,
             min(max(left.duty * scale, -most), most),
             min(max(right.duty * scale, -most), most),
-            state.safety.request,
-            state.safety.request_number,
+            safety.request,
+            safety.request_number,
             tuple(limits),
         )
         return state, output
@@ -242,31 +249,30 @@ class Stepper:
             faults.extend(device_faults(measurement.faults))
         if state.safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             return tuple(faults)
-        if now_s - measurement.received_s > self._device.measurement_timeout_ms * 1e-3:
+        # what has just come over a slow line is old too, and a loop around it would swing
+        if now_s - measurement.received_s + measurement.delay_s > self._device.measurement_timeout_ms * 1e-3:
             faults.append(Fault.MEASUREMENT_STALE)
         if abs(estimate.skew_mm) > self._limits.skew_fault_mm:
             faults.append(Fault.SKEW)
-        if now_s - state.following_s > self._limits.following_time_s:
+        if state.straying_s > self._limits.following_time_s:
             faults.append(Fault.FOLLOWING_ERROR)
-        if now_s - state.still_s > self._limits.no_motion_time_s:
+        if state.still_s > self._limits.no_motion_time_s:
             faults.append(Fault.NO_MOTION)
         if measurement.mode is not DeviceMode.RUN and not faults and now_s - state.enabled_s > STARTING_S:
             faults.append(Fault.DEVICE_NOT_RUNNING)
         return tuple(faults)
 
-    def _following(self, state: StepState, reference: Reference, estimate: Estimate, now_s: float) -> float:
-        if abs(reference.gap_mm - estimate.gap_mm) <= self._limits.following_error_mm:
-            return math.inf
-        return min(state.following_s, now_s)
+    def _is_astray(self, reference: Reference, estimate: Estimate) -> bool:
+        return abs(reference.gap_mm - estimate.gap_mm) > self._limits.following_error_mm
 
-    def _still(self, state: StepState, estimate: Estimate, left_duty: float, right_duty: float, now_s: float) -> float:
+    def _is_still(self, state: StepState, estimate: Estimate, left_duty: float, right_duty: float) -> bool:
         least = self._limits.no_motion_duty
         # a duty that turns round before the carriage could move drives it nowhere
         is_left_driven = left_duty * math.copysign(1.0, state.duties[0]) > least
         is_right_driven = right_duty * math.copysign(1.0, state.duties[1]) > least
         is_left_still = is_left_driven and abs(estimate.left_mm_s) < STILL_MM_S
         is_right_still = is_right_driven and abs(estimate.right_mm_s) < STILL_MM_S
-        return min(state.still_s, now_s) if is_left_still or is_right_still else math.inf
+        return is_left_still or is_right_still
 
     @staticmethod
     def _off(safety: SafetyState, limits: tuple[Limit, ...]) -> StepOutput:

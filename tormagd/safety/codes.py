@@ -58,7 +58,8 @@ FAULTS: dict[Fault, Explanation] = {
         "check cable and supply; the device opens by itself; then clear-fault and home",
     ),
     Fault.MEASUREMENT_STALE: Explanation(
-        "device states came too late to close the loop", "run `tormagctl doctor`; look for load on this machine"
+        "device states came too late to close the loop",
+        "run `tormagctl doctor`; look for load on this machine, and at the round trip in `tormagctl firmware`",
     ),
     Fault.SKEW: Explanation(
         "the two carriages moved apart from each other", "look for dirt or wear on the slower screw, then home"
@@ -127,4 +128,6 @@ _BY_DEVICE_FAULT: dict[DeviceFault, Fault] = {bit: Fault(f"DEVICE_{bit.name}") f
 
 def device_faults(bits: DeviceFault) -> tuple[Fault, ...]:
     """The faults that the firmware's bits stand for."""
+    if not bits:  # as nearly always, a thousand times a second
+        return ()
     return tuple(fault for bit, fault in _BY_DEVICE_FAULT.items() if bit in bits)
