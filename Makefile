@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run test check format model reproduction clean
+.PHONY: run test check format model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -29,9 +29,14 @@ model: $(VENV)/.dev
 	$(BIN)/python tools/train_model.py build/bench_sweep.csv --element torque --insert MRE-50-40 \
 	    --out tormagd/learning/models/torque_mre_50_40.safetensors --plot build/training.png
 
-# docs/reproduction.md and its plots: the thesis's tables and figures beside ours
+# docs/reproduction.md and docs/learned_inverse.md with their plots: the thesis's tables and figures beside ours
 reproduction: $(VENV)/.dev
 	$(BIN)/python tools/reproduce_thesis.py
+	$(BIN)/python tools/tactile_experiment.py --out docs
+
+# docs/evidence: fuzz, fault matrix, numerics, replug and soak in full (about half an hour); `make test` samples them
+evidence: $(VENV)/.dev
+	$(BIN)/python tools/evidence.py
 
 clean:
 	rm -rf $(VENV) build run .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,167 @@
+"""The long suites in full, their figures written under docs/evidence: what `make test` only samples.
+
+Each part is a command that prints one JSON object and says by its exit status whether everything held. A part that
+fails stops no other. Exit status 0 if all held.
+"""
+
+import argparse
+import json
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tqdm import tqdm
+
+from tormagd import __version__
+
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "docs" / "evidence"
+README = "README.md"
+HEADER = """# Evidence
+
+Written by `make evidence`: the long suites in full, on simulated devices. Each file holds the command, the version and
+the figures of its last run. *Measured* stands where a part judges nothing. `python tools/evidence.py NAME` repeats one.
+
+| part | command | held | figures |
+| --- | --- | --- | --- |
+"""
+
+Figures = dict[str, Any]
+
+
+class Part(NamedTuple):
+    """One long suite: its command behind `python`, its figures in a line, and whether its exit status judges them."""
+
+    command: str
+    says: Callable[[Figures], str]
+    judges: bool = True
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the named parts, or all; returns 0 if all held, 1 if not, 2 on a wrong command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("part", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; default all")
+    options = parser.parse_args(arguments)
+    unknown = [name for name in options.part if name not in PARTS]
+    if unknown:
+        parser.error(f"{', '.join(unknown)}: allowed are {', '.join(PARTS)}")
+    return collect({name: PARTS[name] for name in options.part or PARTS}, FOLDER)
+
+
+def collect(parts: Mapping[str, Part], folder: Path) -> int:
+    """Runs the parts one after the other and writes their files and the table of all files there are."""
+    folder.mkdir(parents=True, exist_ok=True)
+    failed = []
+    for name, part in (progress := tqdm(parts.items(), desc="evidence", unit="part")):
+        progress.set_description(name)
+        record = run(part.command)
+        text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
+        (folder / f"{name}.json").write_text(text, encoding="utf-8")
+        held = "held" if record["held"] else f"FAILED, {record['error'] or 'see its figures'}"
+        tqdm.write(f"{name}: {held}", file=sys.stderr)
+        if not record["held"]:
+            failed.append(name)
+    (folder / README).write_text(table(PARTS | dict(parts), folder), encoding="utf-8")
+    if failed:
+        print(f"did not hold: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def run(command: str) -> Figures:
+    """What one part came to. Its progress goes to our stderr."""
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, *shlex.split(command)], cwd=ROOT, stdout=subprocess.PIPE, env=environment, check=False
+    )
+    figures, error = None, ""
+    try:
+        figures = json.loads(done.stdout)
+    except ValueError:
+        error = f"no figures, exit status {done.returncode}"
+    return {
+        "command": f"python {command}",
+        "version": __version__,
+        "held": done.returncode == 0 and figures is not None and bool(figures.get("passed", True)),
+        "error": error,
+        "figures": figures,
+    }
+
+
+def table(parts: Mapping[str, Part], folder: Path) -> str:
+    """The page that lists the parts whose files are there."""
+    rows = []
+    for name, part in parts.items():
+        path = folder / f"{name}.json"
+        if path.exists():
+            record = json.loads(path.read_text(encoding="utf-8"))
+            says = record["error"] if record["figures"] is None else part.says(record["figures"])
+            held = ("yes" if part.judges else "measured") if record["held"] else "**no**"
+            rows.append(f"| [{name}]({path.name}) | `{record['command']}` | {held} | {says} |\n")
+    return HEADER + "".join(rows)
+
+
+def _says_fuzz(figures: Figures) -> str:
+    clean, rise_N = figures["clean"], figures["harm"]["one_false_accept"]["greatest_rise_N"]
+    chance = sum(kind["judged"] * kind["odds"] for kind in figures["kinds"].values())
+    return (
+        f"{figures['frames']:,} damaged serial and {figures['can_frames']:,} CAN frames: {figures['false_accepts']} "
+        f"false accepts where the CRCs' odds give up to {chance:.0f}; one lifts the force by {rise_N} N at most; "
+        f"{clean['second_lost']} of {clean['runs_of_damage']:,} runs of damage not over after two frames; "
+        f"C and Python differ {figures['languages_differ']} times"
+    )
+
+
+def _says_bus(figures: Figures) -> str:
+    loads = ", ".join(f"{name} {way['headroom']:.0%}" for name, way in figures["ways"].items())
+    return f"headroom at 1 kHz and 1 Mbit/s: {loads}; codec {figures['codec_us']['payloads_best']:.1f} us a cycle"
+
+
+def _says_faults(figures: Figures) -> str:
+    cells = figures["cells"]
+    below = [cell["below_1N_ms"] for cell in cells if cell["below_1N_ms"] is not None]
+    opened = sum(cell["open_ms"] is not None for cell in cells)
+    return (
+        f"of {len(cells)} faults at 1.8 N {len(below)} end below 1 N, after at most {max(below)} ms; {opened} end open"
+    )
+
+
+def _says_numerics(figures: Figures) -> str:
+    worst = ", ".join(f"{name} {error:.1e}" for name, error in figures["worst_rel_error"].items())
+    return f"{figures['cases']:,} cases, {figures['reference_cases']:,} references; worst relative error {worst}"
+
+
+def _says_soak(figures: Figures) -> str:
+    virtual, daemon = figures["virtual"], figures["daemon"]
+    return (
+        f"{virtual['minutes']:g} min virtual, {virtual['growth_kB']:+} kB; {daemon['minutes']:g} min daemon, "
+        f"{daemon['growth_kB']:+} kB, {daemon['descriptor_growth']:+} descriptors, {daemon['clients']} clients"
+    )
+
+
+def _says_replug(figures: Figures) -> str:
+    lost_ms = max(spread["max"] for spread in figures["lost_after_ms"].values())
+    running_ms, descriptors = figures["running_after_ms"], figures["descriptors"]
+    return (
+        f"{figures['cycles']} cycles, {figures['losses']} losses; host knows after {lost_ms} ms at most; running again "
+        f"{running_ms['p50']} ms after the device's return (median), {running_ms['max']} ms at most; armed by itself "
+        f"{figures['rearmed']} times; descriptors {descriptors['first']}, at the end {descriptors['last']}"
+    )
+
+
+PARTS = {
+    "fuzz": Part("tools/fuzz_protocol.py --json", _says_fuzz),
+    "bus": Part("tools/benchmark.py bus --json", _says_bus),
+    "faults": Part("tools/faults.py --json", _says_faults, judges=False),
+    "numerics": Part("tools/numerics.py --json", _says_numerics),
+    "replug_serial": Part("tools/replug.py --cycles 200 --transport serial --json", _says_replug),
+    "replug_can": Part("tools/replug.py --cycles 200 --transport can --json", _says_replug),
+    "soak": Part("tools/soak.py --json", _says_soak),
+}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,228 @@
+"""What was said on the wire, as a log that CAN tools read: candump (.log), Vector (.asc, .blf) and more.
+
+On CAN, `python -m can.logger` records the bus and nothing of ours is needed. A serial line has one owner, so `tap` goes
+between: it holds the device's port, offers the daemon a pseudo-terminal instead, passes every byte on and logs the
+frames. `virtual` logs a session in virtual time, synthetic from end to end. `viewer` prints what python-can's viewer
+needs to know of the messages.
+"""
+
+import argparse
+import contextlib
+import math
+import os
+import select
+import signal
+import sys
+import time
+import tty
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import can
+import serial
+from tqdm import tqdm
+
+from firmware_protocol.codec import FUNCTION, can_identifier
+from firmware_protocol.framing import Frame, FrameDecoder
+from firmware_protocol.layouts import LAYOUTS
+from tormagd.closed_loop import ClosedLoop
+from tormagd.config import load_config
+from tormagd.control.core import build_core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.simulation.device import DEFAULT_BAUD, VirtualDevice
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import load_plant
+
+NODE = 1
+READ_BYTES = 4096
+POLL_MS = 100
+MEAN_N, SWING_N, SWING_HZ = 1.5, 0.3, 1.2
+"""The virtual session's force."""
+
+
+class WireLog:
+    """A log of both directions of one serial line; also a context manager.
+
+    A frame is stamped with the time its last byte passed. What is no frame, or names a function that CAN has no
+    identifier for, is counted in `damaged` and not in the log. Raises ValueError for a file type that python-can does
+    not know, and OSError where the file cannot be made.
+    """
+
+    def __init__(self, path: Path, node: int = NODE) -> None:
+        self._node = node
+        self._log = can.Logger(path)
+        self._decoders = {is_rx: FrameDecoder() for is_rx in (False, True)}
+        self._nameless = 0
+        self.frames = 0
+
+    @property
+    def damaged(self) -> int:
+        """Stretches of bytes that could not be logged."""
+        return self._nameless + sum(decoder.statistics.corrupt for decoder in self._decoders.values())
+
+    def to_device(self, time_s: float, data: bytes) -> None:
+        """Bytes from the host."""
+        self._add(time_s, data, is_rx=False)
+
+    def to_host(self, time_s: float, data: bytes) -> None:
+        """Bytes from the device."""
+        self._add(time_s, data, is_rx=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._log.stop()
+
+    def _add(self, time_s: float, data: bytes, *, is_rx: bool) -> None:
+        for frame in self._decoders[is_rx].feed(data):
+            if not 1 <= frame.function <= 0x7F:
+                self._nameless += 1
+                continue
+            self._log.on_message_received(self._message(time_s, frame, is_rx))
+            self.frames += 1
+
+    def _message(self, time_s: float, frame: Frame, is_rx: bool) -> can.Message:
+        return can.Message(
+            timestamp=time_s,
+            arbitration_id=can_identifier(frame.function, self._node),
+            is_extended_id=False,
+            data=frame.payload,
+            is_rx=is_rx,
+            channel="can0",
+        )
+
+
+Listener = Callable[[float, bytes], None]
+
+
+class TappedDevice(VirtualDevice):
+    """A simulated device whose line is listened to."""
+
+    to_device: Listener
+    to_host: Listener
+
+    def receive(self, now_s: float, data: bytes) -> None:
+        """As the device's own."""
+        self.to_device(now_s, data)
+        super().receive(now_s, data)
+
+    def transmit(self, now_s: float) -> bytes:
+        """As the device's own."""
+        data = super().transmit(now_s)
+        self.to_host(now_s, data)
+        return data
+
+
+def virtual_session(seconds: float, to_device: Listener, to_host: Listener, baud: int = DEFAULT_BAUD) -> ClosedLoop:
+    """Connects, homes, enables and follows a swinging force for that long, in virtual time; the loop at its end."""
+    config = load_config(None)
+    core = build_core(config)
+    device = TappedDevice(load_plant("sample_1"), SteadyHand(), seed=1, baud=baud)
+    device.to_device, device.to_host = to_device, to_host
+    loop = ClosedLoop(config, core.stepper, core.planner, device)
+    loop.arm()
+    ticks = round(seconds * config.rates.control_hz)
+    for _ in tqdm(range(ticks), desc="virtual session", unit="tick", disable=None):
+        force_N = MEAN_N + SWING_N * math.sin(math.tau * SWING_HZ * loop.now_s)
+        loop.tick(TimedSetpoint(force_N, loop.now_s, 0.1))
+    return loop
+
+
+def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stopped: Callable[[], bool]) -> None:
+    """Passes bytes between `port` and a pseudo-terminal, whose path is announced, until `stopped()`.
+
+    Raises OSError when the port goes away.
+    """
+    with contextlib.ExitStack() as resources:
+        ours, theirs = os.openpty()
+        resources.callback(os.close, ours)
+        resources.callback(os.close, theirs)  # held open, so that there is no end of file between hosts
+        tty.setraw(theirs)
+        os.set_blocking(ours, False)
+        announce(os.ttyname(theirs))
+        poll = select.poll()
+        poll.register(ours, select.POLLIN)
+        poll.register(port.fileno(), select.POLLIN)
+        while not stopped():
+            for descriptor, _ in poll.poll(POLL_MS):
+                data = os.read(descriptor, READ_BYTES)
+                if not data:
+                    raise OSError(f"{port.port}: the device was unplugged")
+                if descriptor == ours:
+                    _pass_on(port.fileno(), data)
+                    log.to_device(time.time(), data)
+                else:
+                    _pass_on(ours, data)
+                    log.to_host(time.time(), data)
+
+
+def _pass_on(descriptor: int, data: bytes) -> None:
+    """What nobody fetches is lost, as on a port; descriptors do not block."""
+    with contextlib.suppress(BlockingIOError):
+        os.write(descriptor, data)
+
+
+def viewer_formats(node: int = NODE) -> list[str]:
+    """`ID:FORMAT:DIVISOR...` of each message, as `python -m can.viewer -d FILE` reads them."""
+    lines = []
+    for layout in LAYOUTS:
+        divisors = [repr(1.0 / signal.scale) if signal.type is float else "1" for signal in layout.signals]
+        divisors += ["1"] * layout.protected
+        lines.append(":".join([f"{can_identifier(FUNCTION[layout.message], node):X}", layout.format, *divisors]))
+    return lines
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Returns 0; 1 where a file or port cannot be used."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    ways = parser.add_subparsers(dest="way", required=True)
+    virtual = ways.add_parser("virtual", help="log a session in virtual time")
+    tapped = ways.add_parser("tap", help="log what passes between the daemon and a serial device")
+    ways.add_parser("viewer", help="print the messages' formats for python-can's viewer")
+    for way in (virtual, tapped):
+        way.add_argument("file", type=Path, help="its ending says which format: .log, .asc, .blf, ...")
+    virtual.add_argument("--seconds", type=float, default=5.0, help="after homing and enabling")
+    tapped.add_argument("--port", default="/dev/tormag", help="the device's port")
+    tapped.add_argument("--baud", type=int, default=DEFAULT_BAUD)
+    options = parser.parse_args(arguments)
+    if options.way == "viewer":
+        print("\n".join(viewer_formats()))
+        return 0
+    try:
+        with WireLog(options.file) as log:
+            if options.way == "virtual":
+                virtual_session(options.seconds, log.to_device, log.to_host)
+            else:
+                _tap_until_stopped(options.port, options.baud, log)
+    except (OSError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    print(f"{options.file}: {log.frames} frames, {log.damaged} damaged stretches", file=sys.stderr)
+    return 0
+
+
+def _tap_until_stopped(path: str, baud: int, log: WireLog) -> None:
+    stopping = False
+
+    def stop(_signal: int, _frame: object) -> None:
+        nonlocal stopping
+        stopping = True
+
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
+    with serial.Serial(path, baud, timeout=0, exclusive=True) as port:
+        tap(
+            port,
+            log,
+            lambda pty: print(f"{pty}  # give this to the daemon as device.port", flush=True),
+            lambda: stopping,
+        )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
