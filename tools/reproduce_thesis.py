@@ -1,7 +1,7 @@
 """Recomputes the thesis's tables and figures: thesis value, ours, error, note; writes docs/reproduction.md.
 
 Runs without the laboratory: where the thesis measured, its printed measurements are the reference; the step test runs
-on the simulated device (synthetic).
+on the simulated device, and table 4.1 and the pulse on a simulated pad (synthetic).
 """
 
 import argparse
@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 from human_pulse import pulse_profile
-from reproduction_page import write_page
+from reproduction_page import print_summary, write_page
 from step_test import StepTest, step_test
+from tactile_experiment import reproduced
+from tactile_models import FULL, QUICK
 from thesis_errata import errata, table_2_4_errors
 from thesis_values import (
     AS_BUILT,
@@ -64,13 +66,16 @@ def main() -> int:
     parser.add_argument("--gap-speed", type=float, default=CONTROLLER_SPEED_MM_S, help="the controller's, mm/s")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--quick", action="store_true", help="one start, few rows and epochs: shows only that it runs")
     options = parser.parse_args()
     with ProcessPoolExecutor(options.workers) as pool:
+        learned = pool.submit(reproduced, QUICK if options.quick else FULL)
         steps = [pool.submit(step_test, insert(name), options.seed) for name in STEP_INSERTS]
-        runs = table_3_2_runs(options.gap_speed, options.seed)
+        runs = table_3_2_runs(options.gap_speed, options.seed, starts=1 if options.quick else None)
         with tqdm(total=len(runs), desc="optimisation", unit="run", disable=not sys.stderr.isatty()) as bar:
             outcomes = sweep(runs.values(), pool, options.state, lambda done, total: bar.update(done - bar.n))
         tests = [step.result() for step in steps]
+        chapter_4 = learned.result()
     result = {
         "table_2_3": table_2_3(),
         "table_2_4": table_2_4(),
@@ -79,9 +84,8 @@ def main() -> int:
         "figure_2_7": figure_2_7(tests),
         "phase_portrait": phase_portrait(options.gap_speed),
         "table_3_2": table_3_2(runs, outcomes, options.gap_speed),
-        "table_4_1": None,
-        "pulse": None,
-        "not_here": "table_4_1 and pulse belong to the learned inverse and are not recomputed by this tool",
+        "table_4_1": chapter_4["table_4_1"],
+        "pulse": chapter_4["pulse"],
         "errata": errata(),
     }
     write_page(options.page, result, tests)
@@ -331,12 +335,12 @@ RunKey = tuple[int, int, str, str]
 """Use case, start, objective, solver."""
 
 
-def table_3_2_runs(gap_speed_mm_s: float, seed: int) -> dict[RunKey, Run]:
-    """Every start of both use cases, by every measure and solver."""
+def table_3_2_runs(gap_speed_mm_s: float, seed: int, *, starts: int | None = None) -> dict[RunKey, Run]:
+    """Every start of both use cases (or the first `starts`), by every measure and solver."""
     runs = {}
     for number, case in USE_CASES.items():
         for objective, problem in _problems(number, gap_speed_mm_s).items():
-            for index, line in enumerate(case.starts, start=1):
+            for index, line in enumerate(case.starts[:starts], start=1):
                 runs[(number, index, objective, "global")] = Run(problem, line.start, "global", seed)
                 runs[(number, index, objective, "local")] = Run(problem, line.start, "local", seed)
     return runs
@@ -409,32 +413,6 @@ def _outcome(outcome: Outcome) -> Json:
 
 def _design(design: Design) -> Json:
     return {"R_o_mm": design.outer_radius_mm, "t_mm": design.thickness_mm, "s_max_mm": design.open_mm}
-
-
-def print_summary(result: Json) -> None:
-    """The figures that answer "does it reproduce?", one a line."""
-    ranges, optima = result["table_2_4"], result["table_3_2"]
-    print(f"table 2.3   largest mass difference {result['table_2_3']['max_error_g']:.3f} g")
-    print(
-        f"table 2.4   mean error {ranges['mean_rel_error']:.1%} (thesis {ranges['thesis']['mean_rel_error']:.1%}), "
-        f"free exponent {ranges['mean_rel_error_free_exponent']:.1%}; leave one out "
-        f"{ranges['leave_one_out_mean_rel_error']:.1%}, {ranges['leave_one_out_mean_rel_error_free_exponent']:.1%}"
-    )
-    for task in result["table_2_5"]["tasks"]:
-        serving = [verdict["insert"] for verdict in task["ranked"] if verdict["serves"]]
-        print(
-            f"table 2.5   {task['task']}: {', '.join(serving) or 'no insert'} (thesis {', '.join(task['thesis_mN'])})"
-        )
-    print(f"figure 2.5  {result['figure_2_5']['eq_7']['working_point_N']} N (thesis {list(FIGURE_2_5_N)})")
-    for row in result["figure_2_7"]["rows"]:
-        print(f"figure 2.7  {row['insert']}: {', '.join(f'{force:.2f}' for force in row['simulated_N'])} N")
-    for row in optima["best"]:
-        print(
-            f"table 3.2   use case {row['use_case']}, {row['objective']}: {row['coverage']:.2%}, "
-            f"starts within {row['spread']:.3%}"
-        )
-    print(f"            slowest start {optima['max_seconds']:.2f} s of one core")
-    print(f"errata      {len(result['errata'])}; table 4.1 and pulse: {result['not_here']}")
 
 
 if __name__ == "__main__":

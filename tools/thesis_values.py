@@ -102,3 +102,29 @@ USE_CASES = {
 AS_BUILT = Design(11.0, 20.0, 95.0)
 "Table 3.1."
 APPENDIX_B_BOUNDS = (Design(8.0, 10.0, 50.0), Design(15.0, 50.0, 200.0))
+
+
+class FitScore(NamedTuple):
+    """A half row of table 4.1: mean absolute error with its deviation, N; the same in percent; R2."""
+
+    mae_N: float
+    sd_N: float
+    percent: float
+    r2: float
+
+
+class FitScores(NamedTuple):
+    """A row of table 4.1."""
+
+    train: FitScore
+    test: FitScore
+
+
+TABLE_4_1 = {
+    "MRE-A": FitScores(FitScore(0.50, 0.41, 0.99, 0.99), FitScore(0.62, 0.54, 0.95, 0.99)),
+    "MRE-B": FitScores(FitScore(1.03, 0.91, 0.99, 0.99), FitScore(1.44, 1.02, 1.02, 0.98)),
+    "MRE-C": FitScores(FitScore(1.85, 1.33, 1.21, 0.96), FitScore(2.70, 2.21, 1.45, 0.94)),
+    "All": FitScores(FitScore(1.15, 0.98, 1.04, 0.97), FitScore(1.26, 1.05, 0.95, 0.97)),
+}
+PULSE_MAE_MT, PULSE_SD_MT, PULSE_MAX_MT = 1.14, 1.48, 3.64
+"Field error of section 4.3."

@@ -53,6 +53,11 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             output_gain=2 / (force_high - force_low),
         )
 
+    def scaled(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Map `features` (n x 4) to -1..1."""
+        scaled: NDArray[np.float64] = (features - np.array(self.input_offset)) * np.array(self.input_gain)
+        return scaled
+
 
 def require_inputs(displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> None:
     """Raise `DomainError` naming the first feature that is NaN, infinite or beyond `LARGEST`."""

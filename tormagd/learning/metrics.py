@@ -2,20 +2,25 @@
 
 import numpy as np
 
-from tormagd.learning.dataset import Dataset
+from tormagd.learning.dataset import Array, Dataset
 from tormagd.learning.features import FEATURES
 from tormagd.learning.model_file import ForceModel
 
 
 def fit_metrics(model: ForceModel, dataset: Dataset) -> dict[str, float]:
     """Return r2, mae_N, rmse_N, max_N, and mae_percent: the mean error in percent of the training force span."""
-    error_N = model.predict(dataset.features) - dataset.force_N
-    variance = float(np.var(dataset.force_N))
+    return force_metrics(model.predict(dataset.features), dataset.force_N, model.force_span_N)
+
+
+def force_metrics(predicted_N: Array, force_N: Array, span_N: float) -> dict[str, float]:
+    """Return r2, mae_N, rmse_N, max_N and mae_percent (of `span_N`) of forces (n) predicted by any model."""
+    error_N = predicted_N - force_N
+    variance = float(np.var(force_N))
     mae_N = float(np.abs(error_N).mean())
     mean_square = float(np.square(error_N).mean())
     metrics = {
         "mae_N": mae_N,
-        "mae_percent": 100 * mae_N / model.force_span_N,
+        "mae_percent": 100 * mae_N / span_N,
         "rmse_N": float(np.sqrt(mean_square)),
         "max_N": float(np.abs(error_N).max()),
     }
