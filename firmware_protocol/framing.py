@@ -1,6 +1,6 @@
 """Serial frames: which bytes of a stream belong together, and whether they arrived whole.
 
-    COBS( function u8 | sequence u8 | payload 0..8 | CRC-16/CCITT-FALSE u16, big-endian ) 0x00
+    COBS( function u8 | sequence u8 | payload 0..8 | CRC-16/GENIBUS u16, big-endian ) 0x00
 
 COBS takes the zeros out of the frame, so that a zero on the line is always the end of one: after any disturbance the
 receiver is back at the next zero. The sequence counts the frames of one direction modulo 256.
@@ -14,6 +14,9 @@ from firmware_protocol.codec import EncodeError
 
 DELIMITER: Final = b"\x00"
 CRC_INITIAL: Final = 0xFFFF
+CRC_FINAL_XOR: Final = 0xFFFF
+CRC_RESIDUE: Final = 0x1D0F
+"""Register after data and their own CRC. Not 0, where a zero more or less at the end would not show."""
 CRC_LENGTH: Final = 2
 HEADER_LENGTH: Final = 2
 MAX_PAYLOAD: Final = 8
@@ -70,7 +73,8 @@ def encode_frame(function: int, sequence: int, payload: bytes) -> bytes:
             f"allowed are 0 to 255, 0 to 255, 0 to {MAX_PAYLOAD}"
         )
     body = bytes((function, sequence)) + payload
-    return cobs_encode(body + crc_hqx(body, CRC_INITIAL).to_bytes(CRC_LENGTH, "big")) + DELIMITER
+    crc = crc_hqx(body, CRC_INITIAL) ^ CRC_FINAL_XOR
+    return cobs_encode(body + crc.to_bytes(CRC_LENGTH, "big")) + DELIMITER
 
 
 class FrameDecoder:
@@ -127,7 +131,6 @@ def _parse(encoded: bytes) -> Frame | None:
     if len(encoded) > MAX_ENCODED:
         return None
     body = cobs_decode(encoded)
-    # The CRC of data followed by its own CRC is zero.
-    if body is None or len(body) < HEADER_LENGTH + CRC_LENGTH or crc_hqx(body, CRC_INITIAL) != 0:
+    if body is None or len(body) < HEADER_LENGTH + CRC_LENGTH or crc_hqx(body, CRC_INITIAL) != CRC_RESIDUE:
         return None
     return Frame(body[0], body[1], body[HEADER_LENGTH:-CRC_LENGTH])

@@ -1,12 +1,12 @@
 """Golden vectors: bytes that every implementation of the wire must produce, read and refuse.
 
-Nothing here comes from this room's codec or framing: payloads are packed by cantools, the CRC-8 is computed bit by bit,
-frames are stuffed by the `cobs` package, and what a receiver must make of a damaged stream is written down by hand.
+Nothing here comes from this room's codec or framing: payloads are packed by cantools, the CRCs are computed bit by
+bit, frames are stuffed by the `cobs` package, and what a receiver must make of a damaged stream is written down by
+hand.
 """
 
 import json
 import random
-from binascii import crc_hqx
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -30,6 +30,16 @@ def bitwise_crc8(data: bytes) -> int:
         for _ in range(8):
             register = (register << 1) ^ (0x11D if register & 0x80 else 0)
     return register ^ 0xFF
+
+
+def bitwise_crc16(data: bytes) -> int:
+    """CRC-16/GENIBUS straight from its definition."""
+    register = 0xFFFF
+    for byte in data:
+        register ^= byte << 8
+        for _ in range(8):
+            register = (register << 1) ^ (0x11021 if register & 0x8000 else 0)
+    return register ^ 0xFFFF
 
 
 def vector_files(schema: Schema, dbc: Path) -> dict[str, str]:
@@ -119,9 +129,17 @@ def _invalid_payloads(schema: Schema, valid: list[Json]) -> Iterator[Json]:
                 )
 
 
-def _stuffed(function: int, sequence: int, payload: bytes) -> bytes:
+def _checked(function: int, sequence: int, payload: bytes) -> bytes:
     body = bytes((function, sequence)) + payload
-    return bytes(cobs.encode(body + crc_hqx(body, 0xFFFF).to_bytes(2, "big"))) + b"\x00"
+    return body + bitwise_crc16(body).to_bytes(2, "big")
+
+
+def _ended(checked: bytes) -> bytes:
+    return bytes(cobs.encode(checked)) + b"\x00"
+
+
+def _stuffed(function: int, sequence: int, payload: bytes) -> bytes:
+    return _ended(_checked(function, sequence, payload))
 
 
 def _valid_frames(messages: list[Json]) -> list[Json]:
@@ -141,9 +159,12 @@ def _streams() -> Iterator[Json]:
     payload = bytes.fromhex("0011002233440055")
     a, b, c, d = (_stuffed(3, sequence, payload) for sequence in (254, 255, 0, 1))
     flipped = b[:4] + bytes((b[4] ^ 0x10,)) + b[5:]
-    short = bytes(cobs.encode(bytes((3, 255, 0)))) + b"\x00"
-    bare = bytes(cobs.encode(b"\xff\xff")) + b"\x00"  # the CRC of nothing, and nothing
+    short = _ended(bytes((3, 255, 0)))
+    bare = _ended(b"\x00\x00")  # the CRC of nothing, and nothing
     another = _stuffed(8, 254, b"\x01")
+    # not with the longest payload, which a zero more makes too long, whatever the CRC says
+    longer = _ended(_checked(3, 255, payload[:-1]) + b"\x00")
+    shorter = _ended(next(body for n in range(256) if (body := _checked(3, 255, bytes((n,))))[-1] == 0)[:-1])
 
     def stream(name: str, data: bytes, frames: list[bytes], **counts: int) -> Json:
         expected = [cobs.decode(frame[:-1])[:-2] for frame in frames]
@@ -169,6 +190,8 @@ def _streams() -> Iterator[Json]:
     yield stream("too short", a + short + c, [a, c], **damaged)
     yield stream("a CRC without a header", a + bare + c, [a, c], **damaged)
     yield stream("a byte more than a whole frame", a + b[:-1] + b"\x01\x00" + c, [a, c], **damaged)
+    yield stream("a zero more than a whole frame", a + longer + c, [a, c], **damaged)
+    yield stream("a zero less than a whole frame", a + shorter + c, [a, c], **damaged)
     yield stream("COBS distance past the end", a + b"\x09\x01\x02\x00" + c, [a, c], **damaged)
     yield stream("one missing", a + c + d, [a, c, d], lost=1)
     yield stream("the same frame twice", a + b + b + c, [a, b, c], repeated=1)

@@ -7,8 +7,8 @@ is allowed as often as chance gives it at the odds of the CRC, one judgement in 
 are 0: `allowed` is a count that chance exceeds once in a million runs. Each false accept, up to --lives and some
 barrages, then goes into a running closed loop.
 
-`wrong_frames` had a right CRC-16 and were not sent. They are more than chance alone gives: a CRC without a final XOR
-does not show a zero more or less at its end. The lengths do, and so nearly none of them is a message.
+`wrong_frames` had a right CRC-16 and were not sent. They too are allowed as often as chance gives them, and never where
+the frames were whole. Few of them are messages, because the length has to be that of the function.
 
 Both languages hear all of it, the C99 under sanitizers, and must agree in every frame, count and verdict. Exit status 0
 if all that held. An exception that escapes a decoder ends the run and names the seed.
@@ -77,17 +77,25 @@ Generator = np.random.Generator
 
 @dataclass
 class Tally:
-    """What came of one kind of damage. `judged` is how often chance had its turn."""
+    """What came of one kind of damage. `judged` is how often chance had its turn, at `odds` for a message and at
+    `frame_odds` for a frame."""
 
     odds: float
+    frame_odds: float
     frames: int = 0
     judged: int = 0
     false_accepts: int = 0
+    wrong_frames: int = 0
 
     @property
     def allowed(self) -> int:
         """False accepts that chance exceeds once in a million runs."""
-        return int(stats.binom.isf(CHANCE, self.judged, self.odds)) if self.odds else 0
+        return _by_chance(self.judged, self.odds)
+
+    @property
+    def wrong_frames_allowed(self) -> int:
+        """Frames that were not sent, likewise."""
+        return _by_chance(self.judged, self.frame_odds)
 
     @property
     def rate_upper_95(self) -> float:
@@ -103,7 +111,6 @@ class Fuzz:
     tallies: dict[str, Tally] = field(default_factory=dict)
     false_messages: list[Message] = field(default_factory=list)
     clean_frames: int = 0
-    wrong_frames: int = 0
     runs: int = 0
     found_first: int = 0
     lost_second: int = 0
@@ -115,16 +122,17 @@ class Fuzz:
         body = bodies(draw(rng, direction.messages, rows), _sequence(rng, rows))
         corrupt, surplus, _ = self._through(direction, rng, body, WIRE_DAMAGE[kind](rng, seal(body)))
         messages = [message for message in accepted([(frame[0], frame[2:]) for frame in surplus]) if message]
-        self.wrong_frames += len(surplus)
-        self._count(f"serial: {kind}", CRC16_ODDS, rows, corrupt + len(surplus), len(messages), messages)
+        judged = corrupt + len(surplus)
+        tally = self._count(f"serial: {kind}", CRC16_ODDS, rows, judged, len(messages), messages, CRC16_ODDS)
+        tally.wrong_frames += len(surplus)
 
     def payload(self, kind: str, direction: Direction, rng: Generator, rows: int) -> None:
         """Bad payloads in good frames: the frames must arrive, and the codec must refuse them."""
         damage, odds = PAYLOAD_DAMAGE[kind]
         body = bodies(damage(rng, direction, rows, MAX_PAYLOAD), _sequence(rng, rows))
         _, surplus, messages = self._through(direction, rng, body, seal(body))
-        self.wrong_frames += len(surplus)
-        self._count(f"serial: {kind}", odds, rows, rows, len(messages), messages)
+        tally = self._count(f"serial: {kind}", odds, rows, rows, len(messages), messages)
+        tally.wrong_frames += len(surplus)
 
     def can(self, kind: str, direction: Direction, rng: Generator, rows: int) -> None:
         """Bad payloads in good CAN frames, up to CAN FD's lengths."""
@@ -199,13 +207,26 @@ class Fuzz:
         return statistics.corrupt, surplus, [message for message in verdicts if message is not None]
 
     def _count(
-        self, kind: str, odds: float, frames: int, judged: int, false_accepts: int, messages: list[Message]
-    ) -> None:
-        tally = self.tallies.setdefault(kind, Tally(odds))
+        self,
+        kind: str,
+        odds: float,
+        frames: int,
+        judged: int,
+        false_accepts: int,
+        messages: list[Message],
+        frame_odds: float = 0.0,
+    ) -> Tally:
+        tally = self.tallies.setdefault(kind, Tally(odds, frame_odds))
         tally.frames += frames
         tally.judged += judged
         tally.false_accepts += false_accepts
         self.false_messages += messages
+        return tally
+
+
+def _by_chance(judged: int, odds: float) -> int:
+    """A count that chance exceeds once in a million runs."""
+    return int(stats.binom.isf(CHANCE, judged, odds)) if odds else 0
 
 
 def _sequence(rng: Generator, rows: int) -> npt.NDArray[np.uint8]:
@@ -275,7 +296,7 @@ def run(frames: int, can_frames: int, seed: int, lives: int) -> dict[str, Any]:
         "seed": seed,
         "device_decoder": reason or "C99 under the address and undefined-behaviour sanitizers",
         "false_accepts": len(fuzz.false_messages),
-        "wrong_frames": fuzz.wrong_frames,
+        "wrong_frames": sum(tally.wrong_frames for tally in fuzz.tallies.values()),
         "kinds": {kind: _report(tally) for kind, tally in fuzz.tallies.items()},
         "clean": {
             "runs_of_damage": fuzz.runs,
@@ -302,6 +323,11 @@ def failures(result: dict[str, Any]) -> list[str]:
         f"{kind}: {tally['false_accepts']} false accepts, allowed {tally['allowed']}"
         for kind, tally in result["kinds"].items()
         if tally["false_accepts"] > tally["allowed"]
+    ]
+    found += [
+        f"{kind}: {tally['wrong_frames']} wrong frames, allowed {tally['wrong_frames_allowed']}"
+        for kind, tally in result["kinds"].items()
+        if tally["wrong_frames"] > tally["wrong_frames_allowed"]
     ]
     if result["clean"]["second_lost"]:
         found.append(f"not resynchronised within two frames: {result['clean']['second_lost']} times")
@@ -345,6 +371,8 @@ def _report(tally: Tally) -> dict[str, Any]:
         "false_accepts": tally.false_accepts,
         "odds": tally.odds,
         "allowed": tally.allowed,
+        "wrong_frames": tally.wrong_frames,
+        "wrong_frames_allowed": tally.wrong_frames_allowed,
         "rate_upper_95": float(f"{tally.rate_upper_95:.2e}"),
     }
 
@@ -363,11 +391,15 @@ def _harm(harm: Harm) -> dict[str, Any]:
 
 def print_table(result: dict[str, Any]) -> None:
     """The result for people."""
-    print(f"{'damage':38}{'frames':>10}{'judged':>10}{'odds':>10}{'false':>7}{'allowed':>9}{'rate <':>10}")
+    print(
+        f"{'damage':38}{'frames':>10}{'judged':>10}{'odds':>10}{'false':>7}{'allowed':>9}{'rate <':>10}"
+        f"{'wrong':>7}{'allowed':>9}"
+    )
     for kind, tally in result["kinds"].items():
         print(
             f"{kind:38}{tally['frames']:10}{tally['judged']:10}{tally['odds']:10.1e}{tally['false_accepts']:7}"
             f"{tally['allowed']:9}{tally['rate_upper_95']:10.1e}"
+            f"{tally['wrong_frames']:7}{tally['wrong_frames_allowed']:9}"
         )
     clean = result["clean"]
     print(f"{result['wrong_frames']} frames with a right CRC-16 were not sent")

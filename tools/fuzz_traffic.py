@@ -26,7 +26,7 @@ from firmware_protocol.codec import (
     Status,
     crc8,
 )
-from firmware_protocol.framing import CRC_INITIAL
+from firmware_protocol.framing import CRC_FINAL_XOR, CRC_INITIAL
 from firmware_protocol.layouts import LAYOUTS
 from firmware_protocol.schema import Layout, Signal
 
@@ -151,9 +151,10 @@ def seal(body: Rows) -> Rows:
     for column in range(int(body.length.max(initial=0))):
         updated = (register << 8) ^ _CRC16_STEP[(register >> 8) ^ body.data[:, column]]
         register = np.where(column < body.length, updated, register)
+    crc = register ^ CRC_FINAL_XOR
     # a zero in front stands for COBS's first byte, and one behind for the delimiter
     data = np.roll(body.data, 1, axis=1)
-    data[rows, body.length + 1], data[rows, body.length + 2] = register >> 8, register & 0xFF
+    data[rows, body.length + 1], data[rows, body.length + 2] = crc >> 8, crc & 0xFF
     end = body.length + 3
     columns = np.arange(WIDTH)
     zeros = np.where((data == 0) & (columns <= end[:, None]), columns, WIDTH)
@@ -241,6 +242,17 @@ def _inserted(rng: np.random.Generator, rows: Rows) -> Rows:
     return edit(rows, at, np.zeros_like(at), noise(rng, rng.integers(1, 5, len(at))))
 
 
+def _zero_more_or_less(rng: np.random.Generator, rows: Rows) -> Rows:
+    """Before the delimiter, COBS's 1 taken away where it stands, and put where it does not: the CRC has to find both.
+
+    It does not have to for most frames to the host: they are as long as a frame may be.
+    """
+    at = rows.length - 2
+    present = rows.data[np.arange(len(at)), at] == 1
+    one = Rows(np.ones_like(rows.data), np.where(present, 0, 1))
+    return edit(rows, np.where(present, at, at + 1), np.where(present, 1, 0), one)
+
+
 def _delimiters_inserted(rng: np.random.Generator, rows: Rows) -> Rows:
     at = rng.integers(0, rows.length, endpoint=True)
     length = rng.integers(1, 4, len(at))
@@ -279,6 +291,7 @@ WIRE_DAMAGE: dict[str, WireDamage] = {
     "bytes overwritten": _overwritten,
     "bytes cut out": _cut,
     "bytes inserted": _inserted,
+    "a zero more or less at the end": _zero_more_or_less,
     "delimiters inserted": _delimiters_inserted,
     "delimiter lost": _delimiter_lost,
     "two frames spliced": _spliced,

@@ -4,6 +4,8 @@
 #define CRC8_INITIAL 0xFFu
 #define CRC8_FINAL_XOR 0xFFu
 #define CRC16_POLYNOMIAL 0x1021u
+#define CRC16_INITIAL 0xFFFFu
+#define CRC16_FINAL_XOR 0xFFFFu
 
 static uint8_t crc8_of_byte(uint8_t crc, uint8_t byte)
 {
@@ -23,9 +25,9 @@ uint8_t tormag_crc8(uint8_t function, const uint8_t *payload, size_t length)
     return (uint8_t)(crc ^ CRC8_FINAL_XOR);
 }
 
-uint16_t tormag_crc16(uint16_t crc, const uint8_t *data, size_t length)
+uint16_t tormag_crc16(const uint8_t *data, size_t length)
 {
-    unsigned int bits = crc;
+    unsigned int bits = CRC16_INITIAL;
     for (size_t i = 0; i < length; i++) {
         bits ^= (unsigned int)data[i] << 8;
         for (int bit = 0; bit < 8; bit++) {
@@ -33,5 +35,5 @@ uint16_t tormag_crc16(uint16_t crc, const uint8_t *data, size_t length)
         }
         bits &= 0xFFFFu;
     }
-    return (uint16_t)bits;
+    return (uint16_t)(bits ^ CRC16_FINAL_XOR);
 }

@@ -5,12 +5,10 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#define TORMAG_CRC16_INITIAL 0xFFFFu
-
 /* CRC-8/SAE-J1850 over a message's function byte and `length` bytes of its payload. */
 uint8_t tormag_crc8(uint8_t function, const uint8_t *payload, size_t length);
 
-/* CRC-16/CCITT-FALSE, carried on from `crc` over `length` bytes; start with TORMAG_CRC16_INITIAL. */
-uint16_t tormag_crc16(uint16_t crc, const uint8_t *data, size_t length);
+/* CRC-16/GENIBUS over `length` bytes. */
+uint16_t tormag_crc16(const uint8_t *data, size_t length);
 
 #endif

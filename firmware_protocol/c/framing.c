@@ -53,7 +53,7 @@ size_t tormag_frame_encode(uint8_t *bytes, uint8_t function, uint8_t sequence, c
     if (length > 0u) { /* memcpy from a null pointer is undefined even for no bytes */
         memcpy(&body[HEADER_LENGTH], payload, length);
     }
-    const uint16_t crc = tormag_crc16(TORMAG_CRC16_INITIAL, body, HEADER_LENGTH + length);
+    const uint16_t crc = tormag_crc16(body, HEADER_LENGTH + length);
     body[HEADER_LENGTH + length] = (uint8_t)(crc >> 8);
     body[HEADER_LENGTH + length + 1u] = (uint8_t)(crc & 0xFFu);
     const size_t encoded_length = cobs_encode(bytes, body, TORMAG_FRAME_OVERHEAD + length);
@@ -73,16 +73,18 @@ static bool parse(struct tormag_frame *frame, const uint8_t *encoded, size_t len
     if (length > TORMAG_MAX_ENCODED || length < 1u + TORMAG_FRAME_OVERHEAD) {
         return false;
     }
-    const size_t body_length = length - 1u;
-    /* The CRC of data followed by its own CRC is zero. */
-    if (!cobs_decode(body, encoded, length) || tormag_crc16(TORMAG_CRC16_INITIAL, body, body_length) != 0u) {
+    if (!cobs_decode(body, encoded, length)) {
+        return false;
+    }
+    const size_t covered = length - 1u - CRC_LENGTH;
+    if (tormag_crc16(body, covered) != (((unsigned int)body[covered] << 8) | body[covered + 1u])) {
         return false;
     }
     /* Bytes behind the payload stay zero, so that frames compare as a whole. */
     memset(frame, 0, sizeof *frame);
     frame->function = body[0];
     frame->sequence = body[1];
-    frame->length = (uint8_t)(body_length - TORMAG_FRAME_OVERHEAD);
+    frame->length = (uint8_t)(covered - HEADER_LENGTH);
     memcpy(frame->payload, &body[HEADER_LENGTH], frame->length);
     return true;
 }

@@ -1,7 +1,7 @@
 /*
  * Payloads on a serial line:
  *
- *     COBS( function | sequence | payload | CRC-16/CCITT-FALSE, big-endian ) 00
+ *     COBS( function | sequence | payload | CRC-16/GENIBUS, big-endian ) 00
  *
  * No heap and no recursion; every loop is bounded by TORMAG_MAX_FRAME.
  */

@@ -180,6 +180,11 @@ def test_under_sanitizers_every_payload_is_accepted_or_refused_as_by_python(exch
 # -- frames --------------------------------------------------------------------------------------------------------
 
 
+def test_the_crc_is_genibus(library: ctypes.CDLL) -> None:
+    library.tormag_crc16.restype = ctypes.c_uint16
+    assert library.tormag_crc16(b"123456789", ctypes.c_size_t(9)) == 0xD64E
+
+
 def test_under_sanitizers_valid_frames_are_written_as_the_vectors_say(exchange: Exchange) -> None:
     requests = [f"frame {v['function']} {v['sequence']} {v['payload']}" for v in FRAMES["valid"]]
     assert exchange(requests) == [vector["frame"] for vector in FRAMES["valid"]]

@@ -12,7 +12,17 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from firmware_protocol.codec import EncodeError
-from firmware_protocol.framing import MAX_ENCODED, Frame, FrameDecoder, cobs_decode, cobs_encode, encode_frame
+from firmware_protocol.framing import (
+    CRC_INITIAL,
+    CRC_RESIDUE,
+    MAX_ENCODED,
+    Frame,
+    FrameDecoder,
+    cobs_decode,
+    cobs_encode,
+    encode_frame,
+)
+from firmware_protocol.golden import bitwise_crc16
 
 byte = st.integers(0, 255)
 frames = st.builds(Frame, byte, byte, st.binary(max_size=8))
@@ -42,9 +52,14 @@ def test_cobs_refuses_what_the_reference_refuses(data: bytes) -> None:
     assert cobs_decode(data) == expected
 
 
-def test_crc_is_ccitt_false_in_big_endian() -> None:
-    assert crc_hqx(b"123456789", 0xFFFF) == 0x29B1
-    assert cobs.decode(encode_frame(0x31, 0x32, b"3456789")[:-1]) == b"123456789\x29\xb1"
+def test_crc_is_genibus_in_big_endian() -> None:
+    assert bitwise_crc16(b"123456789") == 0xD64E
+    assert cobs.decode(encode_frame(0x31, 0x32, b"3456789")[:-1]) == b"123456789\xd6\x4e"
+
+
+@given(st.binary(max_size=20))
+def test_a_crc_carried_on_over_itself_leaves_the_residue(data: bytes) -> None:
+    assert crc_hqx(data + bitwise_crc16(data).to_bytes(2, "big"), CRC_INITIAL) == CRC_RESIDUE
 
 
 @given(frames)
@@ -182,8 +197,31 @@ def test_memory_is_bounded_whatever_arrives(piece: bytes) -> None:
 
 @pytest.mark.parametrize("body", [b"", b"\x03", b"\x03\x07"])
 def test_a_right_crc_does_not_make_a_frame_of_less_than_its_header(body: bytes) -> None:
-    encoded = cobs.encode(body + crc_hqx(body, 0xFFFF).to_bytes(2, "big")) + b"\0"
+    encoded = cobs.encode(body + bitwise_crc16(body).to_bytes(2, "big")) + b"\0"
     assert FrameDecoder().feed(encoded) == ([Frame(3, 7, b"")] if len(body) == 2 else [])
+
+
+@given(frames, byte)
+def test_a_byte_more_or_less_at_the_end_is_found(frame: Frame, more: int) -> None:
+    """Zeros above all, which a CRC without a final XOR does not see."""
+    checked = cobs.decode(wire(frame)[:-1])
+    decoder = FrameDecoder()
+    for damaged in (checked + bytes((more,)), checked + b"\0", checked + bytes(3), checked[:-1]):
+        assert decoder.feed(cobs.encode(damaged) + b"\0") == []
+    assert decoder.statistics.corrupt == 4
+
+
+def test_a_zero_less_at_the_end_is_found() -> None:
+    """In those frames whose CRC ends in one; about one in 256."""
+    decoder = FrameDecoder()
+    generator = random.Random(7)
+    found = 0
+    while found < 20:
+        encoded = encode_frame(3, 7, generator.randbytes(generator.randrange(9)))
+        if cobs.decode(encoded[:-1])[-1] == 0:
+            found += 1
+            assert decoder.feed(encoded[:-2] + b"\0") == []
+    assert decoder.statistics.corrupt == found
 
 
 def test_a_whole_frame_with_a_byte_more_before_the_delimiter_is_not_a_frame() -> None:
@@ -200,7 +238,7 @@ def test_a_whole_frame_with_a_byte_more_before_the_delimiter_is_not_a_frame() ->
 def test_the_longest_frame_passes_and_a_longer_stretch_does_not(excess: int) -> None:
     """However it is cut: the byte that makes it too long must count also when it was not kept."""
     body = bytes((1, 2)) + bytes(8 + excess)
-    encoded = cobs.encode(body + crc_hqx(body, 0xFFFF).to_bytes(2, "big")) + b"\0"
+    encoded = cobs.encode(body + bitwise_crc16(body).to_bytes(2, "big")) + b"\0"
     for size in (1, 5, 200):
         decoder = FrameDecoder()
         received = [f for i in range(0, len(encoded), size) for f in decoder.feed(encoded[i : i + size])]

@@ -23,14 +23,16 @@ def test_a_sample_holds() -> None:
     assert result["false_accepts"] >= result["harm"]["one_false_accept"]["lives"] == 6
 
 
-def fuzzed(kind: str, rows: int = 2_000) -> fuzz_protocol.Fuzz:
-    """One kind of damage against the host's decoder alone."""
+def fuzzed(
+    kind: str, rows: int = 2_000, direction: fuzz_traffic.Direction = fuzz_traffic.TO_HOST
+) -> fuzz_protocol.Fuzz:
+    """One kind of damage against Python's decoder alone."""
     fuzz = fuzz_protocol.Fuzz(None)
     rng = np.random.default_rng(7)
     if kind in fuzz_traffic.WIRE_DAMAGE:
-        fuzz.wire(kind, fuzz_traffic.TO_HOST, rng, rows)
+        fuzz.wire(kind, direction, rng, rows)
     else:
-        fuzz.payload(kind, fuzz_traffic.TO_HOST, rng, rows)
+        fuzz.payload(kind, direction, rng, rows)
     return fuzz
 
 
@@ -64,9 +66,24 @@ def test_a_codec_that_checks_nothing_is_found_out(kind: str, monkeypatch: pytest
 
 
 def test_a_decoder_without_its_crc_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(framing, "crc_hqx", lambda data, initial: 0)
+    monkeypatch.setattr(framing, "crc_hqx", lambda data, initial: framing.CRC_RESIDUE)
     (tally,) = fuzzed("bytes overwritten").tallies.values()
     assert tally.false_accepts > tally.allowed
+    assert tally.wrong_frames > tally.wrong_frames_allowed
+
+
+@pytest.mark.parametrize("direction", [fuzz_traffic.TO_HOST, fuzz_traffic.TO_DEVICE], ids=lambda d: d.receiver)
+def test_a_crc_without_a_final_xor_is_found_out(
+    direction: fuzz_traffic.Direction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind = "a zero more or less at the end"
+    (tally,) = fuzzed(kind, direction=direction).tallies.values()
+    assert (tally.judged, tally.wrong_frames, tally.false_accepts) == (2_000, 0, 0)
+    monkeypatch.setattr(fuzz_traffic, "CRC_FINAL_XOR", 0)
+    monkeypatch.setattr(framing, "CRC_FINAL_XOR", 0)
+    monkeypatch.setattr(framing, "CRC_RESIDUE", 0)
+    (tally,) = fuzzed(kind, direction=direction).tallies.values()
+    assert tally.wrong_frames > tally.wrong_frames_allowed
 
 
 def test_a_decoder_that_gives_repetitions_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
