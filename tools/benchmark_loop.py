@@ -182,14 +182,15 @@ def hammer(address: str, stop: Event) -> None:
 
 
 def write_config(folder: Path, port: str, fifo_priority: int) -> Path:
-    """A configuration with its sockets in `folder`."""
+    """A configuration with its sockets in `folder`, and the rates of examples/service.toml."""
     path = folder / "tormagd.toml"
     sockets = "".join(
         f'{name} = "ipc://{folder}/{name}"\n' for name in ("setpoint", "telemetry", "control", "recording")
     )
     path.write_text(
         f'scene = "coronary"\n[device]\nport = "{port}"\n[endpoints]\n{sockets}'
-        f"[realtime]\nfifo_priority = {fifo_priority}\n"
+        f"[rates]\ninference_hz = 1000\n"
+        f"[realtime]\nfifo_priority = {fifo_priority}\nkeep_awake = {str(fifo_priority > 0).lower()}\n"
     )
     return path
 

@@ -83,6 +83,8 @@ class RealTime(Strict, frozen=True):
     fifo_priority: Annotated[int, Meta(ge=0, le=90)] = 0
     lock_memory: bool = False
     cpus: tuple[Annotated[int, Meta(ge=0, le=4095)], ...] = ()
+    keep_awake: bool = False
+    "Idle processors do not sleep while the daemon runs: they wake up at once, and take the power for it."
     watchdog_ms: Annotated[float, Meta(ge=100.0, le=60_000.0)] = 500.0
     "Without a plan or, while the link runs, a device state for this long, systemd's watchdog is no longer fed."
 

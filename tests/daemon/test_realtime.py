@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,13 +24,28 @@ def test_each_refusal_names_its_setting_and_reason(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(os, "sched_setaffinity", refuse)
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(mlockall=lambda flags: -1))
-    refused = realtime.prepare(RealTime(fifo_priority=40, cpus=(0,), lock_memory=True))
+    monkeypatch.setattr(realtime, "_LATENCY", Path("/proc/version/none"))
+    refused = realtime.prepare(RealTime(fifo_priority=40, cpus=(0,), lock_memory=True, keep_awake=True))
     assert [line.split(":")[0] for line in refused] == [
         "realtime.cpus = [0]",
         "realtime.fifo_priority = 40",
         "realtime.lock_memory",
+        "realtime.keep_awake",
     ]
     assert all("Operation not permitted" in line for line in refused[:2])
+
+
+def test_processors_are_kept_awake_for_as_long_as_the_file_is_open(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    latency = tmp_path / "cpu_dma_latency"
+    latency.touch()
+    monkeypatch.setattr(realtime, "_LATENCY", latency)
+    assert realtime.prepare(RealTime(keep_awake=True)) == []
+    assert latency.read_bytes() == bytes(4)
+    opened = [link for link in Path("/proc/self/fd").iterdir() if os.path.realpath(link) == str(latency)]
+    assert len(opened) == 1
+    os.close(int(opened[0].name))
 
 
 def test_an_ordinary_thread_gives_its_threads_no_priority() -> None:

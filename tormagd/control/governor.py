@@ -86,8 +86,8 @@ def govern(
         between = min(max((force - state.last_N) / spacing, -renderable), renderable)
         slope += spacing / (SLOPE_FILTER_S + spacing) * (between - slope)
     ahead_s = max(age, 0.0) + lead_s + PATH_S
-    wanted = np.clip(_to_come(setpoint, force, slope, ahead_s), scene.least_N, scene.most_N)
-    path = np.clip(wanted, portrait.least_N, portrait.most_N)
+    least, most = (min(max(end, portrait.least_N), portrait.most_N) for end in (scene.least_N, scene.most_N))
+    path = _to_come(setpoint, force, slope, ahead_s).clip(least, most)
     return GovernorState(now_s, force, setpoint.stamp_s, slope, force), Governed(force, path, age, reasons)
 
 

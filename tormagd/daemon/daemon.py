@@ -13,6 +13,7 @@ import msgspec
 from tormagd import __version__
 from tormagd.config import Config
 from tormagd.control.core import Core
+from tormagd.control.plan import PlanState
 from tormagd.daemon import notify
 from tormagd.daemon.callbacks import Callbacks
 from tormagd.daemon.control_loop import ControlLoop
@@ -104,19 +105,20 @@ class Daemon:
             return  # a spurious wake-up
         callbacks, timing = self._callbacks, self._control.timing
         start_ns = time.monotonic_ns()
-        self._control.tick(heartbeat.due_ns, beats - 1, self._inference.state.plan)
+        used = self._inference.state
+        self._control.tick(heartbeat.due_ns, beats - 1, used.plan)
         driven_ns = time.monotonic_ns()
         callbacks.ran(ControlLoop.tick.__qualname__, start_ns, driven_ns)
         if timing.delay_ns > timing.period_ns:
             callbacks.blame(driven_ns - timing.delay_ns, driven_ns)
         else:
             callbacks.forget()
-        self._record()
         try:
             self._inference.after_tick(self._control.state.estimate)
         finally:  # whatever becomes of planning, the daemon can be seen and stopped
             planned_ns = time.monotonic_ns()
             callbacks.ran(InferenceLoop.after_tick.__qualname__, driven_ns, planned_ns)
+            self._record(used)
             if timing.runs % self._ticks_per_snapshot == 0:
                 self._publish(heartbeat.due_ns)
                 callbacks.ran(self._publish.__qualname__, planned_ns, time.monotonic_ns())
@@ -124,8 +126,8 @@ class Daemon:
     def _receive_setpoints(self) -> None:
         self._inference.receive(self._control.state.estimate, self._control.next_tick_ns)
 
-    def _record(self) -> None:
-        control, state = self._control, self._inference.state
+    def _record(self, used: PlanState) -> None:
+        control = self._control
         if control.output is None:
             return
         timing = control.timing
@@ -134,8 +136,8 @@ class Daemon:
                 control.state.time_s,
                 control.state,
                 control.output,
-                state.plan,
-                state.trim,
+                used.plan,
+                used.trim,
                 self._connection.measurement,
                 timing.lateness_us,
                 timing.exec_us,

@@ -9,7 +9,7 @@ from tormagd.control.plan import Planner, PlanState
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.rate_group import RateGroup
 
-INTO_THE_TICK = 0.05
+INTO_THE_TICK = 0.1
 "Share of the plans that may take longer than the slack that is asked for before the next control tick."
 LEARNT_SHARE = 0.1
 "By how much of itself one plan moves that slack at most, however long it was interrupted."

@@ -1,14 +1,20 @@
-"""What the kernel can be asked for: a real-time policy, locked memory, processors. A refusal is a warning."""
+"""What the kernel can be asked for: a real-time policy, locked memory, processors, and no sleep. A refusal is a warning."""
 
 import ctypes
 import gc
 import logging
 import os
+import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 from tormagd.config import RealTime
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
+_LATENCY = Path("/dev/cpu_dma_latency")
+"""The kernel keeps every processor out of sleeps that take longer to wake from than what was written here, us, for as long
+as the file stays open (Documentation/power/pm_qos_interface)."""
+_NO_LATENCY = (0).to_bytes(4, sys.byteorder)
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +38,12 @@ def prepare(settings: RealTime) -> list[str]:
             refused.append(f"realtime.fifo_priority = {settings.fifo_priority}: {error.strerror}; see LimitRTPRIO")
     if settings.lock_memory and ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
         refused.append(f"realtime.lock_memory: {os.strerror(ctypes.get_errno())}; see LimitMEMLOCK")
+    if settings.keep_awake:
+        try:
+            # never closed: it holds until the process ends
+            os.write(os.open(_LATENCY, os.O_WRONLY | os.O_CLOEXEC), _NO_LATENCY)
+        except OSError as error:
+            refused.append(f"realtime.keep_awake: {_LATENCY}: {error.strerror}; see systemd/udev")
     for line in refused:
         log.warning("not granted: %s", line)
     return refused
