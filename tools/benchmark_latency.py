@@ -56,10 +56,10 @@ class Course(NamedTuple):
         return self.sent_to_plan_us + self.plan_to_tick_us + self.tick_to_wire_us
 
 
-def run(count: int, fifo_priority: int) -> Course:
+def run(count: int, realtime: RealTime) -> Course:
     """`count` setpoints through the daemon, then as many through the bare hop."""
-    with tempfile.TemporaryDirectory(prefix="tormag-") as name, daemon_process(Path(name), fifo_priority, 0) as config:
-        prepare(RealTime(fifo_priority=max(fifo_priority - BELOW, 0)))
+    with tempfile.TemporaryDirectory(prefix="tormag-") as name, daemon_process(Path(name), realtime, 0) as config:
+        prepare(RealTime(fifo_priority=max(realtime.fifo_priority - BELOW, 0), keep_awake=realtime.keep_awake))
         sent, rows = exchange(config, count)
     first = first_ticks(sent, rows)
     ticks = [tick for _, tick in first]
@@ -71,7 +71,7 @@ def run(count: int, fifo_priority: int) -> Course:
     return Course((written_ns - stamp_ns) * 1e-3 - tick_us - plan_us, plan_us, tick_us, bare_hop(count))
 
 
-def summary(course: Course, count: int, fifo_priority: int) -> dict[str, Any]:
+def summary(course: Course, count: int, realtime: RealTime) -> dict[str, Any]:
     """The contract's object."""
     return {
         "setpoint_to_wire_us": quantiles(course.whole_us),
@@ -84,7 +84,8 @@ def summary(course: Course, count: int, fifo_priority: int) -> dict[str, Any]:
         },
         "setpoints": count,
         "seen": course.whole_us.size,
-        "fifo_priority": fifo_priority,
+        "fifo_priority": realtime.fifo_priority,
+        "keep_awake": realtime.keep_awake,
     }
 
 
@@ -189,12 +190,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `benchmark latency`."""
     parser.add_argument("--count", type=int, default=1_000, help="setpoints")
     parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of the daemon; 0 for none")
+    parser.add_argument(
+        "--keep-awake", action="store_true", help="idle processors do not sleep, here and in the daemon"
+    )
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="histograms of the whole, its stages and the hop")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The object for these options."""
-    course = run(options.count, options.fifo)
+    realtime = RealTime(fifo_priority=options.fifo, keep_awake=options.keep_awake)
+    course = run(options.count, realtime)
     if options.plot:
         shown = {
             "setpoint to wire": course.whole_us,
@@ -203,7 +208,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
             "tick, until written": course.tick_to_wire_us,
         }
         plot_histograms(options.plot, f"From {course.whole_us.size} setpoints to their first drive frames", shown)
-    return summary(course, options.count, options.fifo)
+    return summary(course, options.count, realtime)
 
 
 def print_table(result: dict[str, Any]) -> None:

@@ -27,7 +27,7 @@ import uvloop
 import zmq
 from benchmark_plot import plot_histograms
 
-from tormagd.config import Config, load_config
+from tormagd.config import Config, RealTime, load_config
 from tormagd.ctl.client import Client
 from tormagd.ctl.outcome import CommandError
 from tormagd.daemon.daemon import SERVED_BEFORE_NS
@@ -63,15 +63,14 @@ class Pair(NamedTuple):
     bare: Block
 
 
-def run(seconds: float, pairs: int, fifo_priority: int) -> list[Pair]:
+def run(seconds: float, pairs: int, realtime: RealTime) -> list[Pair]:
     """`pairs` blocks of each kind, `seconds` long."""
     return [
-        Pair(block(daemon_process, seconds, fifo_priority), block(stub_process, seconds, fifo_priority))
-        for _ in range(pairs)
+        Pair(block(daemon_process, seconds, realtime), block(stub_process, seconds, realtime)) for _ in range(pairs)
     ]
 
 
-def summary(pairs: list[Pair], fifo_priority: int) -> dict[str, Any]:
+def summary(pairs: list[Pair], realtime: RealTime) -> dict[str, Any]:
     """The contract's object."""
     daemon, bare = merge([pair.daemon for pair in pairs]), merge([pair.bare for pair in pairs])
     return {
@@ -81,7 +80,7 @@ def summary(pairs: list[Pair], fifo_priority: int) -> dict[str, Any]:
         "lateness_us": quantiles(daemon.lateness_us),
         "control_exec_us": {"mean": float(daemon.exec_us.mean())} | quantiles(daemon.exec_us),
         "bare": {
-            "method": f"uvloop + timerfd, fifo {fifo_priority}, {CLIENTS} clients",
+            "method": f"uvloop + timerfd, fifo {realtime.fifo_priority}, {CLIENTS} clients",
             "lateness_us": quantiles(bare.lateness_us),
             "merged_share": bare.merged / max(bare.ticks, 1),
         },
@@ -94,17 +93,18 @@ def summary(pairs: list[Pair], fifo_priority: int) -> dict[str, Any]:
         "merged_share": daemon.merged / max(daemon.ticks, 1),
         "pairs": len(pairs),
         "block_s": round(daemon.seconds / len(pairs), 1),
-        "fifo_priority": fifo_priority,
+        "fifo_priority": realtime.fifo_priority,
+        "keep_awake": realtime.keep_awake,
     }
 
 
-Started = Callable[[Path, int], contextlib.AbstractContextManager[Config]]
+Started = Callable[[Path, RealTime], contextlib.AbstractContextManager[Config]]
 
 
-def block(start: Started, seconds: float, fifo_priority: int) -> Block:
+def block(start: Started, seconds: float, realtime: RealTime) -> Block:
     """One block of one kind, under the load of the clients."""
     with tempfile.TemporaryDirectory(prefix="tormag-") as folder, contextlib.ExitStack() as stack:
-        config = stack.enter_context(start(Path(folder), fifo_priority))
+        config = stack.enter_context(start(Path(folder), realtime))
         stop = multiprocessing.Event()
         load = multiprocessing.Process(target=hammer, args=(config.endpoints.control, stop), daemon=True)
         load.start()
@@ -181,8 +181,8 @@ def hammer(address: str, stop: Event) -> None:
         client.join()
 
 
-def write_config(folder: Path, port: str, fifo_priority: int) -> Path:
-    """A configuration with its sockets in `folder`, and the rates of examples/service.toml."""
+def write_config(folder: Path, port: str, realtime: RealTime) -> Path:
+    """A configuration with its sockets in `folder`; planning in every period, as in examples/service.toml."""
     path = folder / "tormagd.toml"
     sockets = "".join(
         f'{name} = "ipc://{folder}/{name}"\n' for name in ("setpoint", "telemetry", "control", "recording")
@@ -190,19 +190,19 @@ def write_config(folder: Path, port: str, fifo_priority: int) -> Path:
     path.write_text(
         f'scene = "coronary"\n[device]\nport = "{port}"\n[endpoints]\n{sockets}'
         f"[rates]\ninference_hz = 1000\n"
-        f"[realtime]\nfifo_priority = {fifo_priority}\nkeep_awake = {str(fifo_priority > 0).lower()}\n"
+        f"[realtime]\nfifo_priority = {realtime.fifo_priority}\nkeep_awake = {str(realtime.keep_awake).lower()}\n"
     )
     return path
 
 
 @contextlib.contextmanager
-def daemon_process(folder: Path, fifo_priority: int, setpoint_hz: int = SETPOINT_HZ) -> Iterator[Config]:
+def daemon_process(folder: Path, realtime: RealTime, setpoint_hz: int = SETPOINT_HZ) -> Iterator[Config]:
     """The daemon on a simulated device, enabled, with setpoints arriving (none where `setpoint_hz` is 0)."""
     simulator = subprocess.Popen(
         [sys.executable, "-m", "tormagd.simulation", "--pty"], stdout=subprocess.PIPE, text=True
     )
     assert simulator.stdout is not None
-    path = write_config(folder, simulator.stdout.readline().strip(), fifo_priority)
+    path = write_config(folder, simulator.stdout.readline().strip(), realtime)
     config = load_config(path)
     daemon = subprocess.Popen(
         [sys.executable, "-m", "tormagd.daemon.main", "--config", str(path)], stderr=subprocess.DEVNULL
@@ -226,9 +226,9 @@ def daemon_process(folder: Path, fifo_priority: int, setpoint_hz: int = SETPOINT
 
 
 @contextlib.contextmanager
-def stub_process(folder: Path, fifo_priority: int) -> Iterator[Config]:
+def stub_process(folder: Path, realtime: RealTime) -> Iterator[Config]:
     """The bare timer."""
-    config = load_config(write_config(folder, "/dev/null", fifo_priority))
+    config = load_config(write_config(folder, "/dev/null", realtime))
     stub = multiprocessing.Process(target=bare_loop, args=(config,), daemon=True)
     stub.start()
     try:
@@ -285,21 +285,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="length of a block")
     parser.add_argument("--pairs", type=int, default=3, help="blocks of each kind")
     parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of both; 0 for none")
+    parser.add_argument("--keep-awake", action="store_true", help="both keep idle processors from sleeping")
     parser.add_argument("--without-fifo", action="store_true", help="as many pairs without FIFO after those with it")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="histograms of the lateness")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The object for these options; what was measured without FIFO under `without_fifo`."""
-    pairs = run(options.seconds, options.pairs, options.fifo)
-    result = summary(pairs, options.fifo)
+    realtime = RealTime(fifo_priority=options.fifo, keep_awake=options.keep_awake)
+    pairs = run(options.seconds, options.pairs, realtime)
+    result = summary(pairs, realtime)
     shown = {
         "daemon": merge([pair.daemon for pair in pairs]).lateness_us,
         "bare stub": merge([pair.bare for pair in pairs]).lateness_us,
     }
     if options.without_fifo:
-        ordinary = run(options.seconds, options.pairs, 0)
-        result["without_fifo"] = summary(ordinary, 0)
+        ordinary = run(options.seconds, options.pairs, RealTime())
+        result["without_fifo"] = summary(ordinary, RealTime())
         shown["daemon without FIFO"] = merge([pair.daemon for pair in ordinary]).lateness_us
         shown["bare stub without FIFO"] = merge([pair.bare for pair in ordinary]).lateness_us
     if options.plot:

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from benchmark_plot import plot_histograms
 
+from tormagd.config import RealTime
+
 PNG = b"\x89PNG"
 
 
@@ -23,7 +25,7 @@ def block(lateness_us: float, merged: int) -> benchmark_loop.Block:
 def test_ratios_are_medians_over_the_pairs_and_not_of_the_sums() -> None:
     lateness = [(30.0, 20.0), (900.0, 300.0), (44.0, 40.0)]
     pairs = [benchmark_loop.Pair(block(daemon, 10), block(bare, 0)) for daemon, bare in lateness]
-    result = benchmark_loop.summary(pairs, 50)
+    result = benchmark_loop.summary(pairs, RealTime(fifo_priority=50))
     assert result["ratio"] == {"p50": 1.5, "p99": 1.5, "p999": 1.5}
     assert result["rate_hz"] == pytest.approx(999.0)
     assert (result["ticks"], result["merged_ticks"]) == (29_970, 30)
@@ -46,7 +48,7 @@ def test_stages_add_up_to_the_whole() -> None:
         tick_to_wire_us=np.array([60.0, 70.0]),
         hop_us=np.array([100.0, 120.0]),
     )
-    result = benchmark_latency.summary(course, 3, 0)
+    result = benchmark_latency.summary(course, 3, RealTime())
     assert result["setpoint_to_wire_us"]["p50"] == pytest.approx(765.0)
     assert result["setpoint_to_wire_us"]["max"] == pytest.approx(960.0)
     assert result["ratio"] == pytest.approx(765.0 / 110.0, abs=0.01)
