@@ -60,7 +60,7 @@ class StepState(NamedTuple):
     "Of the step before, left and right."
     enabled_s: float = math.inf
     straying_s: float = 0.0
-    "For how long the gap has been too far from its reference, counted in periods: a process that stood still saw nothing."
+    "For how long the gap has been too far from its reference, in periods: a process that stood still saw nothing."
     still_s: float = 0.0
     "For how long a carriage has been driven without moving, counted alike."
 

@@ -1,4 +1,4 @@
-"""What the kernel can be asked for: a real-time policy, locked memory, processors, and no sleep. A refusal is a warning."""
+"""What the kernel can be asked for: real-time policy, locked memory, processors, no sleep. A refusal is a warning."""
 
 import ctypes
 import gc
@@ -12,8 +12,8 @@ from tormagd.config import RealTime
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _LATENCY = Path("/dev/cpu_dma_latency")
-"""The kernel keeps every processor out of sleeps that take longer to wake from than what was written here, us, for as long
-as the file stays open (Documentation/power/pm_qos_interface)."""
+"""While it is open, no processor sleeps so deep that waking takes longer than what was written, us (the kernel's
+Documentation/power/pm_qos_interface)."""
 _NO_LATENCY = (0).to_bytes(4, sys.byteorder)
 
 log = logging.getLogger(__name__)
