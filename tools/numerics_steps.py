@@ -15,7 +15,7 @@ import numpy as np
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.config import Position
-from tormagd.control.estimate import first_estimate, update
+from tormagd.control.estimate import LEAST_DT_S, first_estimate, update
 from tormagd.control.pid import PidState, pid
 from tormagd.control.trajectory import Reference, follow
 from tormagd.hardware.measurement import Measurement
@@ -174,6 +174,8 @@ def _speed_filter(errors: StepErrors, rng: np.random.Generator, steps_s: list[fl
         truth = last.left_mm_s + share * (quotient - last.left_mm_s)
         # positions to a rounding each, over the step; the step's own rounding is exact in the device's clock
         terms = abs(last.left_mm_s) + share * (home_mm + abs(left_mm) + abs(last.left_mm)) / exact_dt
+        if exact_dt < LEAST_DT_S:  # no news: the device's clock does not count so finely
+            truth, terms = last.left_mm_s, abs(last.left_mm_s)
         last = update(last, _measurement(number, time_s, left_mm), home_mm, filter_s)
         errors.take("speed filter", last.left_mm_s, truth, terms)
 
