@@ -77,7 +77,7 @@ def run(plant_name: str = "sample_1", config: Config | None = None) -> dict[str,
     config = config or Config()
     parameters = load_plant(plant_name)
     gc.collect()
-    gc.freeze()  # what was imported is no garbage, and need not be looked through again and again
+    gc.disable()  # what is kept here is no garbage, and need not be looked through again and again
     started_s = time.thread_time()
     loop = settled_loop(config, parameters)
     opening = step(loop, START_MM + STEP_MM)
@@ -85,6 +85,7 @@ def run(plant_name: str = "sample_1", config: Config | None = None) -> dict[str,
     stroke_s = stroke(loop)
     over_stroke = overshoot_over_stroke(loop)
     factor = loop.now_s / (time.thread_time() - started_s)
+    gc.enable()
     limits = {+1: time_optimal(parameters, START_MM, STEP_MM), -1: time_optimal(parameters, START_MM, -STEP_MM)}
     span = STROKE_MM[1] - STROKE_MM[0]
     physical_s = time_optimal(parameters, STROKE_MM[0], span).total_s
