@@ -50,6 +50,21 @@ def test_a_second_run_of_the_same_source_is_newer(fake_daemon, capsys):
     assert {(s.source, s.valid_for_ms) for s in fake_daemon.setpoints} == {("me", 70.0)}
 
 
+def test_a_preview_is_what_will_be_sent(fake_daemon, capsys):
+    result = send(fake_daemon, capsys, "sine", "--duration", "0.2", "--rate", "100", "--preview-ms", "50")
+    wait_for(fake_daemon, result["sent"])
+    arrived = fake_daemon.setpoints
+    forces = {setpoint.seq - arrived[0].seq: setpoint.servo_cf for setpoint in arrived}
+    for setpoint in arrived:
+        assert len(setpoint.preview_N) == 5
+        assert setpoint.preview_dt_ms == 10.0
+        for after, force in enumerate(setpoint.preview_N, start=1):
+            later = min(setpoint.seq - arrived[0].seq + after, 20)
+            assert force == pytest.approx(forces.get(later, force), abs=1e-9)
+    assert main(["--endpoint", fake_daemon.control, "send", "sine", "--rate", "1000", "--preview-ms", "300"]) == 2
+    assert "--preview-ms = 300" in capsys.readouterr().err
+
+
 def test_a_file_is_sent_with_its_handle_motion(fake_daemon, capsys, tmp_path):
     file = tmp_path / "task.csv"
     file.write_text("t_s,force_N,displacement_mm,rate_mm_s\n10,1,0,5\n10.1,2,10,5\n")

@@ -102,8 +102,9 @@ def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
 
 
 def _send(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
-    from tormagd.ctl.send import send
+    from tormagd.ctl.send import Stream, send
     from tormagd.ctl.waveform import WaveformError, read_csv, shape
+    from tormagd.messages import MAX_PREVIEW_SAMPLES
 
     # a CSV file lasts as long as it is unless it is to be cut; a computed shape lasts ten seconds
     try:
@@ -120,9 +121,15 @@ def _send(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
             f"--valid-for-ms = {options.valid_for_ms:g}: allowed is at least one period, {1e3 / options.rate:g} ms",
             "raise --valid-for-ms or --rate, or every setpoint is stale before the next comes",
         )
-    return send(
-        endpoints.setpoint, waveform, duration_s, options.rate, options.source, options.valid_for_ms, options.wait
-    )
+    preview = round(options.preview_ms * options.rate * 1e-3)
+    if preview > MAX_PREVIEW_SAMPLES:
+        raise usage_error(
+            f"--preview-ms = {options.preview_ms:g}: {preview} setpoints at {options.rate:g} Hz; allowed are "
+            f"{MAX_PREVIEW_SAMPLES}",
+            "look less far ahead",
+        )
+    stream = Stream(options.rate, options.source, options.valid_for_ms, preview)
+    return send(endpoints.setpoint, waveform, duration_s, stream, options.wait)
 
 
 def _calibrate(options: argparse.Namespace, config: Config, endpoints: Endpoints) -> Outcome:
@@ -213,6 +220,13 @@ def _parser() -> argparse.ArgumentParser:
     send.add_argument("--frequency", type=_above_zero, default=1.2, metavar="HZ", help="of sine and pulse (1.2)")
     send.add_argument("--source", type=_source, default="tormagctl", help="the publisher's name (tormagctl)")
     send.add_argument("--valid-for-ms", type=_validity, default=100.0, metavar="MS", help="of each setpoint (100)")
+    send.add_argument(
+        "--preview-ms",
+        type=_preview,
+        default=0.0,
+        metavar="MS",
+        help="each setpoint carries what follows it so long (0)",
+    )
 
     record = command("record", "write telemetry and control ticks to an MCAP file until Ctrl-C")
     record.add_argument("file", type=Path, metavar="FILE.mcap")
@@ -280,6 +294,10 @@ def _rate(text: str) -> float:
 
 def _validity(text: str) -> float:
     return _within(text, 0.25, 60_000.0, " ms")
+
+
+def _preview(text: str) -> float:
+    return _within(text, 0.0, 1_000.0, " ms")
 
 
 def _rates(text: str) -> tuple[float, ...]:

@@ -3,6 +3,7 @@
 import signal
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import zmq
 
@@ -13,9 +14,16 @@ from tormagd.ctl.waveform import Waveform
 from tormagd.messages import VERSION, Setpoint, encode
 
 
-def send(
-    address: str, waveform: Waveform, duration_s: float, rate_hz: float, source: str, valid_for_ms: float, wait_s: float
-) -> Outcome:
+class Stream(NamedTuple):
+    """How setpoints are published. Each carries the `preview` that follow it, in number."""
+
+    rate_hz: float
+    source: str
+    valid_for_ms: float
+    preview: int = 0
+
+
+def send(address: str, waveform: Waveform, duration_s: float, stream: Stream, wait_s: float) -> Outcome:
     """Publish `waveform` for `duration_s` or until interrupted.
 
     Each setpoint has its own deadline, counted from the start, so that lateness does not add up. A setpoint whose
@@ -32,7 +40,7 @@ def send(
             raise unreachable(address, f"nobody takes setpoints there within {wait_s:g} s")
         socket.recv()
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
-            return _publish(socket, address, waveform, duration_s, rate_hz, source, valid_for_ms, is_interrupted)
+            return _publish(socket, address, waveform, duration_s, stream, is_interrupted)
     finally:
         context.destroy()
 
@@ -42,11 +50,10 @@ def _publish(
     address: str,
     waveform: Waveform,
     duration_s: float,
-    rate_hz: float,
-    source: str,
-    valid_for_ms: float,
+    stream: Stream,
     is_interrupted: Callable[[], bool],
 ) -> Outcome:
+    rate_hz = stream.rate_hz
     sent = skipped = index = 0
     worst_late_s = 0.0
     first_seq = time.time_ns()  # above every earlier run's, so that none of ours looks repeated
@@ -71,22 +78,25 @@ def _publish(
                 unreachable(address, "").hint,
             )
         sample = waveform.at(index / rate_hz)
+        ahead = range(index + 1, index + 1 + stream.preview)
         setpoint = Setpoint(
             v=VERSION,
-            source=source,
+            source=stream.source,
             seq=first_seq + index,
             stamp_ns=start_ns + round(index / rate_hz * 1e9),  # when the force is meant, whenever it gets sent
             servo_cf=sample.force_N,
-            valid_for_ms=valid_for_ms,
+            valid_for_ms=stream.valid_for_ms,
             displacement_mm=sample.displacement_mm,
             rate_mm_s=sample.rate_mm_s,
+            preview_N=tuple(waveform.at(min(later / rate_hz, duration_s)).force_N for later in ahead) or None,
+            preview_dt_ms=1e3 / rate_hz if ahead else None,
         )
         socket.send(encode(setpoint))
         sent += 1
         index += 1
     seconds = time.monotonic() - start_s
     result = {
-        "source": source,
+        "source": stream.source,
         "sent": sent,
         "skipped": skipped,
         "start_ns": start_ns,
@@ -95,4 +105,4 @@ def _publish(
         "interrupted": bool(is_interrupted()),
     }
     left_out = f", {skipped} left out because this machine was late" if skipped else ""
-    return Outcome(result, f"sent {sent} setpoints as {source!r} in {seconds:.1f} s{left_out}")
+    return Outcome(result, f"sent {sent} setpoints as {stream.source!r} in {seconds:.1f} s{left_out}")
