@@ -6,8 +6,8 @@ import sys
 from typing import Any
 
 import numpy as np
-from identify_motor import identify
 from motor_fit import motion
+from motor_identification import identify
 from motor_log import Array, Log
 from tqdm import tqdm
 

@@ -4,6 +4,7 @@ import json
 
 import identify_motor
 import motor_fit
+import motor_identification
 import motor_samples
 import numpy as np
 import pytest
@@ -76,7 +77,7 @@ def test_true_values_of_a_simulated_sample_are_inside_their_intervals(sample_log
         assert found[name]["ci95"] < share * found[name]["true"]
     without_current = motor_samples.compare(sample_log._replace(current_A=None), plant, "left")
     assert {name for name, row in without_current.items() if not row["inside"]} == set()
-    assert set(without_current) == {*identify_motor.PARAMETERS, "delay_s", "time_constant_s"}
+    assert set(without_current) == {*motor_identification.PARAMETERS, "delay_s", "time_constant_s"}
 
 
 def test_the_identified_motor_is_a_configuration(sample_log, tmp_path):
