@@ -19,7 +19,7 @@ from benchmark_loop import daemon_process
 from tqdm import tqdm
 
 from tormagd.closed_loop import ClosedLoop
-from tormagd.config import load_config
+from tormagd.config import RealTime, load_config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
 from tormagd.ctl.client import Client
@@ -74,7 +74,8 @@ def daemon(minutes: float) -> dict[str, Any]:
     """A daemon in real time: memory, descriptors, faults, and what its link counted."""
     memory_kB, descriptors = [], []
     faults: set[str] = set()
-    with tempfile.TemporaryDirectory(prefix="tormag-") as folder, daemon_process(Path(folder), FIFO_PRIORITY) as config:
+    realtime = RealTime(fifo_priority=FIFO_PRIORITY)
+    with tempfile.TemporaryDirectory(prefix="tormag-") as folder, daemon_process(Path(folder), realtime) as config:
         process = child("tormagd.daemon.main")
         for _ in tqdm(range(round(60.0 * minutes / SAMPLE_S)), desc="real time", unit="sample", disable=None):
             time.sleep(SAMPLE_S)
