@@ -22,7 +22,7 @@ import msgpack
 import numpy as np
 import numpy.typing as npt
 import zmq
-from benchmark_loop import daemon_process, quantiles
+from benchmark_loop import add_realtime_arguments, asked_for, daemon_process, quantiles, realtime_settings
 from benchmark_plot import plot_histograms
 
 from tormagd.config import Config, RealTime
@@ -84,9 +84,7 @@ def summary(course: Course, count: int, realtime: RealTime) -> dict[str, Any]:
         },
         "setpoints": count,
         "seen": course.whole_us.size,
-        "fifo_priority": realtime.fifo_priority,
-        "keep_awake": realtime.keep_awake,
-    }
+    } | asked_for(realtime)
 
 
 def exchange(config: Config, count: int) -> tuple[dict[float, int], list[dict[str, Any]]]:
@@ -188,17 +186,14 @@ def _stamp(data: bytes) -> int:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `benchmark latency`."""
+    add_realtime_arguments(parser)
     parser.add_argument("--count", type=int, default=1_000, help="setpoints")
-    parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of the daemon; 0 for none")
-    parser.add_argument(
-        "--keep-awake", action="store_true", help="idle processors do not sleep, here and in the daemon"
-    )
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="histograms of the whole, its stages and the hop")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The object for these options."""
-    realtime = RealTime(fifo_priority=options.fifo, keep_awake=options.keep_awake)
+    realtime = realtime_settings(options)
     course = run(options.count, realtime)
     if options.plot:
         shown = {

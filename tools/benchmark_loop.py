@@ -21,6 +21,7 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import uvloop
@@ -93,9 +94,7 @@ def summary(pairs: list[Pair], realtime: RealTime) -> dict[str, Any]:
         "merged_share": daemon.merged / max(daemon.ticks, 1),
         "pairs": len(pairs),
         "block_s": round(daemon.seconds / len(pairs), 1),
-        "fifo_priority": realtime.fifo_priority,
-        "keep_awake": realtime.keep_awake,
-    }
+    } | asked_for(realtime)
 
 
 Started = Callable[[Path, RealTime], contextlib.AbstractContextManager[Config]]
@@ -191,6 +190,7 @@ def write_config(folder: Path, port: str, realtime: RealTime) -> Path:
         f'scene = "coronary"\n[device]\nport = "{port}"\n[endpoints]\n{sockets}'
         f"[rates]\ninference_hz = 1000\n"
         f"[realtime]\nfifo_priority = {realtime.fifo_priority}\nkeep_awake = {str(realtime.keep_awake).lower()}\n"
+        f"cpus = {list(realtime.cpus)}\n"
     )
     return path
 
@@ -280,19 +280,43 @@ def wait_for(address: str) -> None:
     raise RuntimeError("the daemon did not reach its device")
 
 
+def add_realtime_arguments(parser: argparse.ArgumentParser) -> None:
+    """What the kernel is asked for."""
+    parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of what is measured; 0 for none")
+    parser.add_argument("--keep-awake", action="store_true", help="idle processors do not sleep")
+    parser.add_argument(
+        "--cpus", type=int, nargs="+", default=[], metavar="N", help="processors that what is measured has to itself"
+    )
+
+
+def realtime_settings(options: argparse.Namespace) -> RealTime:
+    """The settings for these options. What measures and makes the load leaves the named processors from now on."""
+    if options.cpus:
+        os.sched_setaffinity(0, os.sched_getaffinity(0) - set(options.cpus))
+    return RealTime(fifo_priority=options.fifo, keep_awake=options.keep_awake, cpus=tuple(options.cpus))
+
+
+def asked_for(realtime: RealTime) -> dict[str, Any]:
+    """The settings as they stand in a result."""
+    return {
+        "fifo_priority": realtime.fifo_priority,
+        "keep_awake": realtime.keep_awake,
+        "cpus": list(realtime.cpus),
+    }
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `benchmark loop`."""
+    add_realtime_arguments(parser)
     parser.add_argument("--seconds", type=float, default=10.0, help="length of a block")
     parser.add_argument("--pairs", type=int, default=3, help="blocks of each kind")
-    parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of both; 0 for none")
-    parser.add_argument("--keep-awake", action="store_true", help="both keep idle processors from sleeping")
     parser.add_argument("--without-fifo", action="store_true", help="as many pairs without FIFO after those with it")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="histograms of the lateness")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The object for these options; what was measured without FIFO under `without_fifo`."""
-    realtime = RealTime(fifo_priority=options.fifo, keep_awake=options.keep_awake)
+    realtime = realtime_settings(options)
     pairs = run(options.seconds, options.pairs, realtime)
     result = summary(pairs, realtime)
     shown = {
@@ -300,8 +324,9 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         "bare stub": merge([pair.bare for pair in pairs]).lateness_us,
     }
     if options.without_fifo:
-        ordinary = run(options.seconds, options.pairs, RealTime())
-        result["without_fifo"] = summary(ordinary, RealTime())
+        without = msgspec.structs.replace(realtime, fifo_priority=0)
+        ordinary = run(options.seconds, options.pairs, without)
+        result["without_fifo"] = summary(ordinary, without)
         shown["daemon without FIFO"] = merge([pair.daemon for pair in ordinary]).lateness_us
         shown["bare stub without FIFO"] = merge([pair.bare for pair in ordinary]).lateness_us
     if options.plot:

@@ -9,10 +9,8 @@ from tormagd.control.plan import Planner, PlanState
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.rate_group import RateGroup
 
-INTO_THE_TICK = 0.1
-"Share of the plans that may take longer than the slack that is asked for before the next control tick."
-LEARNT_SHARE = 0.1
-"By how much of itself one plan moves that slack at most, however long it was interrupted."
+LEARNT_SHARE = 0.02
+"By how much of itself one plan moves the slack, however long it was interrupted."
 
 log = logging.getLogger(__name__)
 
@@ -35,41 +33,45 @@ class InferenceLoop:
         self.state: PlanState = planner.start(now_s)
         self.timing = RateGroup("inference", period_ns)
         self._due_ns = clock_ns() + period_ns
-        self._setpoint_ns = 0
+        self._waiting_ns = 0
         self._slack_ns = 200_000.0
 
     def receive(self, estimate: Estimate | None, next_tick_ns: int) -> None:
-        """Reads setpoints; plans on a new one if the next control tick leaves the time."""
-        now_ns = self._clock_ns()
-        if self._endpoint.drain_setpoints(now_ns * 1e-9) and not self._setpoint_ns:
-            self._setpoint_ns = now_ns
-        if self._setpoint_ns and self._clock_ns() + self._slack_ns < next_tick_ns:
-            self._plan(estimate, self._setpoint_ns)
+        """Something has arrived: reads it, and plans on a new setpoint, if the next control tick leaves the time."""
+        start_ns = self._clock_ns()
+        if start_ns + self._slack_ns >= next_tick_ns:
+            # not even reading, which takes half as long as planning: the tick would wait, and the plan come no sooner
+            self._waiting_ns = self._waiting_ns or start_ns
+        elif self._endpoint.drain_setpoints(start_ns * 1e-9):
+            self._plan(estimate, start_ns)
+            self._learn_slack(start_ns)
 
     def after_tick(self, estimate: Estimate | None) -> None:
         """Plans if a setpoint is waiting or a plan is due; called in the slack after a control tick."""
         now_ns = self._clock_ns()
         # reading here too makes the edge-triggered descriptor harmless: nothing waits longer than a tick
-        if self._endpoint.drain_setpoints(now_ns * 1e-9) and not self._setpoint_ns:
-            self._setpoint_ns = now_ns
-        if self._setpoint_ns:
-            self._plan(estimate, self._setpoint_ns)
+        if self._endpoint.drain_setpoints(now_ns * 1e-9):
+            self._plan(estimate, self._waiting_ns or now_ns)
+            self._learn_slack(now_ns)
         elif now_ns >= self._due_ns:
             self._plan(estimate, self._due_ns)
+        self._waiting_ns = 0
 
     def _plan(self, estimate: Estimate | None, due_ns: int) -> None:
         start_ns = self._clock_ns()
         self.state = self._planned(start_ns * 1e-9, estimate)
-        end_ns = self._clock_ns()
-        self.timing.record(due_ns, start_ns, end_ns)
-        # it comes to rest where as many plans are longer as may be
-        is_longer = end_ns - start_ns > self._slack_ns
-        self._slack_ns *= 1.0 + LEARNT_SHARE * (is_longer - INTO_THE_TICK)
-        self._setpoint_ns = 0
+        self.timing.record(due_ns, start_ns, self._clock_ns())
         # a period after this one was due, or the rate would fall by what each waits for its tick; but what was missed
         # is not made up for
         period_ns = self.timing.period_ns
         self._due_ns = period_ns + (due_ns if start_ns - due_ns < period_ns else start_ns)
+
+    def _learn_slack(self, start_ns: int) -> None:
+        """From reading, which began then, to the plan, which is done."""
+        took_ns = self._clock_ns() - start_ns
+        # to the median: of the setpoints that just have the time, half make the tick wait, by some microseconds;
+        # a longer slack would make more of them wait, and for a whole period
+        self._slack_ns *= 1.0 + LEARNT_SHARE * (0.5 if took_ns > self._slack_ns else -0.5)
 
     def _planned(self, now_s: float, estimate: Estimate | None) -> PlanState:
         inbox = self._endpoint.inbox
