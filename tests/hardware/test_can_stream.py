@@ -79,22 +79,22 @@ def test_what_is_damaged_is_counted_and_the_next_good_one_found_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("counters", "lost", "repeated"),
+    ("counters", "lost"),
     [
-        ([254, 255, 0, 1], 0, 0),
-        ([3, 4, 7], 2, 0),
-        ([250, 3], 8, 0),
-        ([5, 5, 5, 6], 0, 2),
-        ([5, 7, 6, 8], 1, 1),
-        ([200, 0, 1], 55, 0),
+        ([254, 255, 0, 1], 0),
+        ([3, 4, 7], 2),
+        ([250, 3], 8),
+        ([5, 5, 5, 6], 0),
+        ([5, 7, 6, 8], 1),
+        ([200, 0, 1], 55),
     ],
     ids=["over the end", "a gap", "a gap over the end", "a stuck sender", "overtaken", "a device that began anew"],
 )
-def test_the_states_own_counter_shows_what_is_missing(counters: list[int], lost: int, repeated: int) -> None:
+def test_the_states_own_counter_shows_what_is_missing(counters: list[int], lost: int) -> None:
     stream = CanStream(1)
     for counter in counters:
         assert stream.unpack(*frame_of(state(counter))) is not None
-    assert (stream.statistics.lost, stream.statistics.repeated) == (lost, repeated)
+    assert (stream.statistics.lost, stream.statistics.repeated) == (lost, 0), "no news is for the link to count"
 
 
 @given(frames=st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=50))

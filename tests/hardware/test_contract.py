@@ -25,15 +25,16 @@ import can
 import numpy as np
 import pytest
 
-from firmware_protocol.codec import DriveMode, Message
+from firmware_protocol.codec import DriveMode, Message, State
 from tormagd.closed_loop import ClosedLoop, Sample, stream
 from tormagd.config import Config, Device
 from tormagd.control.core import Core, build_core
 from tormagd.hardware.backend import Backend, opener
+from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import DeviceLink, LinkState
 from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import OperatingState
+from tormagd.safety.operating_state import DeviceRequest, OperatingState
 from tormagd.simulation.can_device import DEVICE, CanDevice
 from tormagd.simulation.can_frame import MAX_IDENTIFIER, CanFrame, from_socket, to_socket
 from tormagd.simulation.device import VirtualDevice
@@ -90,6 +91,11 @@ class Corruption(Channel):
 class Duplicates(Channel):
     def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
         return [unit for unit in units for _ in range(2 if self._random.random() < 0.3 else 1)]
+
+
+class Twice(Channel):
+    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
+        return [unit for unit in units for _ in range(2)]
 
 
 class Reordering(Channel):
@@ -167,7 +173,7 @@ CASES = {
     "20% loss": Case(Loss, 0.05, counted=("lost",)),
     # State carries a CRC everywhere, Sense and Status only on serial: there a force or a fault bit may be a wrong one
     "5% corruption": Case(Corruption, 0.5, faults=frozenset(Fault), counted=("corrupt", "resynchronisations")),
-    "duplicates": Case(Duplicates, 0.05, counted=("repeated",)),
+    "duplicates": Case(Duplicates, 0.05),
     "reordering": Case(Reordering, 0.05, counted=("lost",)),
     # what the device says answers a drive of 60 ms ago: a loop around that would swing
     "30 ms delay": Case(Delay, faults=TOO_LATE, named=TOO_LATE),
@@ -452,6 +458,36 @@ class Line:
         return [unit]
 
 
+class Tap:
+    """A line as a connection's backend, and everything it has heard."""
+
+    def __init__(self, line: Line) -> None:
+        self._line = line
+        self.statistics = line.backend.statistics
+        self.now_s = 0.0
+        self.heard: list[Message] = []
+
+    def fileno(self) -> int:
+        return self._line.backend.fileno()
+
+    def receive(self) -> list[Message]:
+        messages = self._line.exchange(self.now_s)
+        self.heard += messages
+        return messages
+
+    def send(self, message: Message) -> None:
+        self._line.send(self.now_s, message)
+
+    def close(self) -> None:
+        """The line is closed by whoever made it."""
+
+    def add_reader(self, fd: int, callback: Callable[[], None]) -> None:
+        self.wake = callback
+
+    def remove_reader(self, fd: int) -> None:
+        del self.wake
+
+
 @pytest.fixture(scope="module")
 def core() -> Core:
     return build_core(CONFIG)
@@ -549,6 +585,24 @@ def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
     assert all(sample.state.safety.operating_state is OperatingState.FAULT for sample in samples)
     assert samples[-1].truth.gap_mm > OPEN_MM - 2.0
     assert min(sample.truth.gap_mm for sample in samples) > faulted.truth.gap_mm - COASTING_MM
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Callable[..., Line]) -> None:
+    device = VirtualDevice(load_plant("sample_1"), parse_hand("steady"), (), 1)
+    tap = Tap(lines(transport, device, Case(Twice)))
+    connection = Connection(CONFIG.device, lambda _: tap, lambda: None, lambda: tap.now_s)
+    connection.open(tap)
+    for tick in range(1, 300):
+        tap.now_s = tick * PERIOD_S
+        connection.exchange(0.0, 0.0, DriveMode.OFF, DeviceRequest.NONE, 0)
+        tap.wake()
+    assert connection.state is LinkState.RUNNING
+    states = sum(isinstance(message, State) for message in tap.heard)
+    assert states > 100
+    # on serial every frame has a number, and the second is not given out; on CAN only State has, and the link knows
+    expected = len(tap.heard) if transport == "serial" else states // 2
+    assert connection.report()["repeated"] == expected
 
 
 @pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES.items() if name != "cut"])

@@ -192,6 +192,15 @@ def test_a_state_that_is_no_news_measures_nothing(behind: int) -> None:
     assert link.measurement.left_mm == pytest.approx(-1.5)
 
 
+def test_a_repetition_is_none_the_less_one_before_the_device_is_known() -> None:
+    link = DeviceLink(0.0)
+    for message in (US, State(0.0, 0.0, 0.0, 5), Sense(0.0, 0.0, 0.0, 0.0), status(), State(0.0, 0.0, 0.0, 5)):
+        link.receive(0.0, message)
+    assert (link.measurement, link.repeated) == (None, 1)
+    link.receive(0.001, State(0.0, 0.0, 0.0, 6))
+    assert link.measurement is not None
+
+
 def test_drive_counters_go_round() -> None:
     link = running()
     counters = [link.drive(0.1, -0.2, DriveMode.RUN).counter for _ in range(600)]

@@ -40,6 +40,7 @@ class LinkStatistics(Protocol):
     corrupt: int
     lost: int
     repeated: int
+    """What the backend knew for a repetition; not the States it gives out that are no news, which the link counts."""
     resynchronisations: int
 
 

@@ -42,7 +42,7 @@ class CanStatistics:
     lost: int = 0
     """State messages missing from their counter, those among them that arrived corrupt included."""
     repeated: int = 0
-    """State messages that came twice or were overtaken; the link takes no measurement from them."""
+    """Always 0: only State has a counter on CAN, and one that is no news is given out for the link to count."""
     resynchronisations: int = 0
     """Times a message was found again after something corrupt."""
 
@@ -87,7 +87,7 @@ class CanStream:
             self.statistics.resynchronisations += 1
             self._synchronised = True
         if isinstance(message, State):
-            self._count(message.counter)
+            self._count_lost(message.counter)
         self.statistics.frames += 1
         return message
 
@@ -96,10 +96,9 @@ class CanStream:
         self.statistics.corrupt += 1
         self._synchronised = False
 
-    def _count(self, counter: int) -> None:
+    def _count_lost(self, counter: int) -> None:
         last = self._counter
         if last is not None and (last - counter) % 256 < OVERTAKEN:
-            self.statistics.repeated += 1
             return
         self._counter = counter
         if last is not None:

@@ -175,7 +175,7 @@ class Connection:
         fit = None if link is None else link.clock.fit()
         counted = {name: None if backend is None else getattr(backend.statistics, name) for name in COUNTERS}
         if link is not None and counted["repeated"] is not None:
-            counted["repeated"] += link.repeated
+            counted["repeated"] += link.repeated  # each repetition is counted by whoever drops it
         return {
             "state": str(self.state),
             "cause": self.cause,

@@ -252,7 +252,6 @@ class DeviceLink:
 
     def _first_measurement(self, now_s: float, state: State) -> None:
         if self._status is None or self._sense is None:
-            self._state = None
             return
         status, sense = self._status, self._sense
         self.measurement = Measurement(
