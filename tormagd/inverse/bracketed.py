@@ -6,7 +6,7 @@ from typing import TypeAlias
 import numpy as np
 
 from tormagd.inverse.scan import FINEST_MT, Bracket, Curve, FieldScan
-from tormagd.inverse.solution import FieldSolution, confidence
+from tormagd.inverse.solution import FieldSolution, answer
 from tormagd.learning.model_file import ForceModel
 
 ACCURACY_MT = 1e-3
@@ -113,6 +113,5 @@ class BracketedSearch:
             if field_mT is None or abs(root_mT - look.near_mT) < abs(field_mT - look.near_mT):
                 field_mT = root_mT
         assert field_mT is not None, "a look shows a bracket or a candidate"
-        predicted_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
-        trust = confidence(self._model, (displacement_mm, rate_mm_s, field_mT, cip_percent), force_N, predicted_N)
-        return FieldSolution(field_mT, predicted_N, trust, iterations + 1, look.reach)
+        features = displacement_mm, rate_mm_s, field_mT, cip_percent
+        return answer(self._model, features, force_N, self._model.predict_one(*features), iterations + 1, look.reach)

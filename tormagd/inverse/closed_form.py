@@ -2,8 +2,8 @@
 
 import math
 
-from tormagd.inverse.solution import FieldSolution, Reach, confidence
-from tormagd.learning.features import Element, require_inputs, require_number
+from tormagd.inverse.solution import FieldSolution, Reach, answer, checked_near_mT
+from tormagd.learning.features import Element
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import flux_density_T, radial_moment_from_flux_density_Tm
@@ -41,17 +41,15 @@ class ClosedForm:
     ) -> FieldSolution:
         """See `FieldSolver.solve`; `reach` is that of the closed form."""
         low_mT, high_mT = self._range_mT
-        require_inputs(displacement_mm, rate_mm_s, low_mT if last_field_mT is None else last_field_mT, cip_percent)
-        require_number("force_N", force_N)
+        checked_near_mT(displacement_mm, rate_mm_s, force_N, cip_percent, last_field_mT, low_mT)
         if force_N < self._least_N:
             field_mT, reach = low_mT, Reach.BELOW
         elif force_N > self._most_N:
             field_mT, reach = high_mT, Reach.ABOVE
         else:
             field_mT, reach = min(max(self._field_mT(force_N), low_mT), high_mT), Reach.INSIDE
-        predicted_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
-        trust = confidence(self._model, (displacement_mm, rate_mm_s, field_mT, cip_percent), force_N, predicted_N)
-        return FieldSolution(field_mT, predicted_N, trust, 0, reach)
+        features = displacement_mm, rate_mm_s, field_mT, cip_percent
+        return answer(self._model, features, force_N, self._model.predict_one(*features), 0, reach)
 
     def _force_N(self, field_mT: float) -> float:
         """Kinetic force at a field; `DomainError` outside the law's domain."""

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from tormagd.inverse.scan import FieldScan
-from tormagd.inverse.solution import FieldSolution, confidence
+from tormagd.inverse.solution import FieldSolution, answer
 from tormagd.learning.features import FIELD
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
@@ -82,9 +82,9 @@ class DirectInverse:
             hidden = self._weight.dot((displacement_mm, rate_mm_s, cip_percent, share)) + self._bias
             found = float(self._output.dot(np.tanh(hidden, hidden))) + self._constant
             field_mT = self._low_mT + self._span_mT * min(max(found, 0.0), 1.0)
-        predicted_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
-        trust = confidence(self._model, (displacement_mm, rate_mm_s, field_mT, cip_percent), force_N, predicted_N)
-        return FieldSolution(field_mT, predicted_N, trust, look.iterations + 2, look.reach)
+        features = displacement_mm, rate_mm_s, field_mT, cip_percent
+        predicted_N = self._model.predict_one(*features)
+        return answer(self._model, features, force_N, predicted_N, look.iterations + 2, look.reach)
 
 
 def _fit(

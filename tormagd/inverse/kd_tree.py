@@ -5,7 +5,7 @@ from scipy.spatial import cKDTree
 
 from tormagd.inverse.nearest import field_grid
 from tormagd.inverse.scan import FieldScan
-from tormagd.inverse.solution import EXTRAPOLATION_RATE, FieldSolution, confidence
+from tormagd.inverse.solution import EXTRAPOLATION_RATE, FieldSolution, answer
 from tormagd.learning.features import FIELD
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
@@ -78,7 +78,7 @@ class KdTreeSearch:
             weights = 1 / np.maximum(distances[branch], 1e-9)
             field_mT = float(weights.dot(fields[branch]) / weights.sum())
             far = max(float(distances[0]) - self._cell, 0.0)
-        predicted_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
-        trust = confidence(self._model, (displacement_mm, rate_mm_s, field_mT, cip_percent), force_N, predicted_N)
-        trust *= float(np.exp(-EXTRAPOLATION_RATE * far))
-        return FieldSolution(field_mT, predicted_N, trust, iterations + 1, look.reach)
+        features = displacement_mm, rate_mm_s, field_mT, cip_percent
+        predicted_N = self._model.predict_one(*features)
+        solution = answer(self._model, features, force_N, predicted_N, iterations + 1, look.reach)
+        return solution._replace(confidence=solution.confidence * float(np.exp(-EXTRAPOLATION_RATE * far)))

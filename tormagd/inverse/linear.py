@@ -5,8 +5,8 @@ from collections.abc import Callable
 import torch
 
 from tormagd.inverse.nearest import field_grid
-from tormagd.inverse.solution import FieldSolution, Reach, confidence
-from tormagd.learning.features import FEATURES, FIELD, require_inputs, require_number
+from tormagd.inverse.solution import FieldSolution, Reach, answer, checked_near_mT
+from tormagd.learning.features import FEATURES, FIELD, require_number
 from tormagd.learning.mlp import to_network
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
@@ -52,9 +52,7 @@ class LinearFieldSearch:
         last_field_mT: float | None,
     ) -> FieldSolution:
         """See `FieldSolver.solve`; a force within epsilon of what some field gives counts as inside."""
-        near = self._fields_mT[0] if last_field_mT is None else last_field_mT
-        require_inputs(displacement_mm, rate_mm_s, near, cip_percent)
-        require_number("force_N", force_N)
+        checked_near_mT(displacement_mm, rate_mm_s, force_N, cip_percent, last_field_mT, self._fields_mT[0])
 
         best_mT, best_N, above, below, rows = self._fields_mT[0], 0.0, False, False, 0
         best_error_N = float("inf")
@@ -73,8 +71,8 @@ class LinearFieldSearch:
             reach = Reach.INSIDE
         else:
             reach = Reach.BELOW if above else Reach.ABOVE
-        trust = confidence(self._model, (displacement_mm, rate_mm_s, best_mT, cip_percent), force_N, best_N)
-        return FieldSolution(best_mT, best_N, trust, rows, reach)
+        features = displacement_mm, rate_mm_s, best_mT, cip_percent
+        return answer(self._model, features, force_N, best_N, rows, reach)
 
 
 def torch_row(model: ForceModel, dtype: torch.dtype = torch.float64) -> Callable[[float, float, float, float], float]:
@@ -121,9 +119,7 @@ class GridArgmin:
         last_field_mT: float | None,
     ) -> FieldSolution:
         """See `FieldSolver.solve`."""
-        near = self._fields_mT[0] if last_field_mT is None else last_field_mT
-        require_inputs(displacement_mm, rate_mm_s, near, cip_percent)
-        require_number("force_N", force_N)
+        checked_near_mT(displacement_mm, rate_mm_s, force_N, cip_percent, last_field_mT, self._fields_mT[0])
 
         with torch.inference_mode():
             given = torch.tensor((displacement_mm, rate_mm_s, cip_percent), dtype=self._rows.dtype)
@@ -131,9 +127,8 @@ class GridArgmin:
             excess = self._network(self._rows) - force_N
             best = int(excess.abs().argmin())
             least_N, most_N = (float(end) for end in torch.aminmax(excess))
-        field_mT = self._fields_mT[best]
-        predicted_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
+        features = displacement_mm, rate_mm_s, self._fields_mT[best], cip_percent
+        predicted_N = self._model.predict_one(*features)
         tie_N = TIE * torch.finfo(self._rows.dtype).eps * (abs(force_N) + abs(predicted_N))
         reach = Reach.ABOVE if most_N < -tie_N else Reach.BELOW if least_N > tie_N else Reach.INSIDE
-        trust = confidence(self._model, (displacement_mm, rate_mm_s, field_mT, cip_percent), force_N, predicted_N)
-        return FieldSolution(field_mT, predicted_N, trust, 1, reach)
+        return answer(self._model, features, force_N, predicted_N, 1, reach)

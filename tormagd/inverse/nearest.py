@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tormagd.inverse.solution import FieldSolution, Reach, confidence
-from tormagd.learning.features import FEATURES, FIELD, require_inputs, require_number
+from tormagd.inverse.solution import FieldSolution, Reach, answer, checked_near_mT
+from tormagd.learning.features import FEATURES, FIELD, require_number
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 
@@ -95,9 +95,8 @@ class NearestFieldSearch:
         last_field_mT: float | None,
     ) -> FieldSolution:
         """See `FieldSolver.solve`."""
-        near = self._fields_mT[0] if last_field_mT is None else last_field_mT
-        require_inputs(displacement_mm, rate_mm_s, near, cip_percent)
-        require_number("force_N", force_N)
+        least_mT = float(self._fields_mT[0])
+        near = checked_near_mT(displacement_mm, rate_mm_s, force_N, cip_percent, last_field_mT, least_mT)
 
         self._other_half_view[:] = self._other_weight.dot((displacement_mm, rate_mm_s, cip_percent)) + self._bias
         with torch.inference_mode():
@@ -108,9 +107,8 @@ class NearestFieldSearch:
 
         candidates, reach = self._candidates(excess_N, near)
         field_mT = float(candidates[np.abs(candidates - near).argmin()])
-        predicted_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
-        trust = confidence(self._model, (displacement_mm, rate_mm_s, field_mT, cip_percent), force_N, predicted_N)
-        return FieldSolution(field_mT, predicted_N, trust, 2, reach)
+        features = displacement_mm, rate_mm_s, field_mT, cip_percent
+        return answer(self._model, features, force_N, self._model.predict_one(*features), 2, reach)
 
     def _candidates(self, excess_N: Floats, near_mT: float) -> tuple[NDArray[np.float64], Reach]:
         """Fields in mT that fit equally well, and whether they fit, from the force above the one asked on the grid."""

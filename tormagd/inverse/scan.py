@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tormagd.inverse.nearest import field_grid
-from tormagd.inverse.solution import Reach
-from tormagd.learning.features import FEATURES, FIELD, require_inputs, require_number
+from tormagd.inverse.solution import Reach, checked_near_mT
+from tormagd.learning.features import FEATURES, FIELD
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 
@@ -123,10 +123,9 @@ class FieldScan:
         self, displacement_mm: float, rate_mm_s: float, force_N: float, cip_percent: float, last_field_mT: float | None
     ) -> Look:
         """Where the force is met, seen from the last field, or else from the least. `DomainError` on NaN."""
-        near = self._list_mT[0] if last_field_mT is None else last_field_mT
-        require_inputs(displacement_mm, rate_mm_s, near, cip_percent)
-        require_number("force_N", force_N)
-        near = min(max(near, self._list_mT[0]), self._list_mT[-1])
+        least_mT = self._list_mT[0]
+        near = checked_near_mT(displacement_mm, rate_mm_s, force_N, cip_percent, last_field_mT, least_mT)
+        near = min(max(near, least_mT), self._list_mT[-1])
         other = self._other_weight.dot((displacement_mm, rate_mm_s, cip_percent)) + self._bias
         curve = Curve(self._slope, other.astype(self._slope.dtype, copy=False), self._output, self._constant_N)
         np.add(self._field_half, curve.other, out=self._hidden)

@@ -4,6 +4,7 @@ import math
 from enum import StrEnum
 from typing import NamedTuple, Protocol
 
+from tormagd.learning.features import FIELD, require_inputs, require_number
 from tormagd.learning.model_file import ForceModel
 
 
@@ -46,6 +47,37 @@ class FieldSolver(Protocol):
         Raises `DomainError` on a non-finite input.
         """
         ...
+
+
+def checked_near_mT(
+    displacement_mm: float,
+    rate_mm_s: float,
+    force_N: float,
+    cip_percent: float,
+    last_field_mT: float | None,
+    least_mT: float,
+) -> float:
+    """The field from which distance counts: the last one, or `least_mT`, the opener gap, without one.
+
+    Raises `DomainError` naming the first argument of a solve that is not finite, or too large.
+    """
+    near_mT = least_mT if last_field_mT is None else last_field_mT
+    require_inputs(displacement_mm, rate_mm_s, near_mT, cip_percent)
+    require_number("force_N", force_N)
+    return near_mT
+
+
+def answer(
+    model: ForceModel,
+    features: tuple[float, float, float, float],
+    force_N: float,
+    predicted_force_N: float,
+    iterations: int,
+    reach: Reach,
+) -> FieldSolution:
+    """The field among `features` (order of `FEATURES`) as the solution for `force_N`, with its confidence."""
+    trust = confidence(model, features, force_N, predicted_force_N)
+    return FieldSolution(features[FIELD], predicted_force_N, trust, iterations, reach)
 
 
 EXTRAPOLATION_RATE = 4.0
