@@ -1,13 +1,18 @@
 """Load of the bus: computed from the DBC, measured on the simulated device, and 30 % left free."""
 
 import random
+import struct
 
 import benchmark_bus
 import pytest
 from benchmark_bus import Meter, can_bits, computed, most_can_bits, schedule, serial_bits
 
-from firmware_protocol.codec import FUNCTION, Drive, DriveMode, encode
+from firmware_protocol.codec import FUNCTION, DecodeError, Drive, DriveMode, can_identifier, crc8, decode, encode
 from firmware_protocol.framing import encode_frame
+from firmware_protocol.layouts import LAYOUTS
+from firmware_protocol.schema import Layout
+from tormagd.config import CAN_EXCHANGE_BITS
+from tormagd.simulation.can_frame import CanFrame, frame_bits
 
 
 def test_stuff_bits_of_a_frame_that_can_be_counted_by_hand() -> None:
@@ -36,6 +41,37 @@ def test_the_schedule_is_that_of_the_dbc() -> None:
     assert set(rates) == {kind.__name__ for kind in FUNCTION}
     assert 0.0 < rates["Hello"] <= rates["Home"] == rates["Retract"] == rates["Clear"]
     assert {message.sender for message in schedule() if message.name in ("State", "Sense", "Status")} == {"Device"}
+
+
+def fullest_bits(layout: Layout, node: int) -> int:
+    """Bits of the longest frame with a payload of this layout that ascent, byte by byte, comes to."""
+    length = struct.calcsize(layout.format) - layout.protected
+
+    def bits(body: bytes) -> int:
+        data = body + bytes([crc8(bytes([layout.function]) + body)]) if layout.protected else body
+        try:
+            decode(layout.function, data)
+        except DecodeError:
+            return 0
+        return frame_bits(CanFrame(can_identifier(layout.function, node), data))
+
+    ends = []
+    for phase in range(8):
+        body = bytes([0x0F0F >> phase & 0xFF] * length)  # behind a stuff bit, four equal bits need the next
+        for at in (*range(length), *range(length)):
+            body = max((body[:at] + bytes([byte]) + body[at + 1 :] for byte in range(256)), key=bits)
+        ends.append(bits(body))
+    return max(ends)
+
+
+def test_the_configuration_knows_what_an_exchange_takes_of_a_bus() -> None:
+    """The constant is the bound over every payload of these lengths, and real frames come near it."""
+    each_tick = {message.name for message in schedule(1_234.0) if message.rate_hz == 1_234.0}
+    layouts = [layout for layout in LAYOUTS if layout.message.__name__ in each_tick]
+    assert len(layouts) == len(each_tick) == 3
+    assert sum(most_can_bits(struct.calcsize(layout.format)) for layout in layouts) == CAN_EXCHANGE_BITS
+    fullest = sum(fullest_bits(layout, node=0) for layout in layouts)
+    assert 0.95 * CAN_EXCHANGE_BITS < fullest <= CAN_EXCHANGE_BITS
 
 
 def test_serial_bits_are_those_of_the_framing() -> None:
