@@ -54,7 +54,7 @@ OWN, MISMATCHED = "sample_1", ("sample_2", "sample_3")
 USUAL_HIDDEN = 50
 QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9}
 BASELINES = ("thesis-linear", "linear-argmin", "vectorised-argmin")
-NUMPY_DTYPE = {"float32": np.float32, "float64": np.float64}
+NUMPY_DTYPE: dict[str, type[np.floating]] = {"float32": np.float32, "float64": np.float64}
 TORCH_DTYPE = {"float32": torch.float32, "float64": torch.float64}
 ENCODER_FIELD_MT = 0.02
 "About what one encoder count changes (1/560 mm, 5 to 22 mT/mm): smaller differences of error decide nothing."

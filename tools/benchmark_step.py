@@ -182,7 +182,7 @@ def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> Modell
     transfer = zero_order_hold(geared, TICK_S)
     driving = np.full(count + 1, duty - math.copysign(motor.coulomb_V / motor.supply_V, duty))
     modelled: Array = lfilter(transfer.numerator, transfer.denominator, driving)
-    return Modelled(TICK_S * np.arange(count + 1), measured, modelled)
+    return Modelled(TICK_S * np.arange(count + 1, dtype=np.float64), measured, modelled)
 
 
 def draw(path: Path, plant_name: str, config: Config) -> None:
@@ -238,7 +238,7 @@ def time_optimal(parameters: PlantParameters, start_mm: float, distance_mm: floa
         else:
             high = middle
     gap, total_s = bang_bang(parameters, start_mm, distance_mm, low)
-    time_s = np.arange(1, len(gap) + 1) * TICK_S / 10.0
+    time_s = np.arange(1, len(gap) + 1, dtype=np.float64) * TICK_S / 10.0
     return Optimum(_rise(time_s, (gap - start_mm) / distance_mm), total_s)
 
 

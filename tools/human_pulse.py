@@ -54,4 +54,4 @@ def with_approach(times_s: Array, forces_N: Array, start_N: float, ramp_s: float
     ramp = np.linspace(start_N, forces_N[0], round(ramp_s / period_s), endpoint=False)
     hold = np.full(round(hold_s / period_s), forces_N[0])
     forces = np.concatenate([ramp, hold, forces_N])
-    return np.arange(len(forces)) * period_s, forces
+    return np.arange(len(forces), dtype=np.float64) * period_s, forces

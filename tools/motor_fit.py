@@ -212,12 +212,12 @@ def fit_volts(log: Log) -> Volts:
     varied = [size * abs(float(value)) for size, value in zip(largest, full.values[4:7], strict=True)]
     spreads = (varied[0], 0.0, varied[1], varied[2])
     widths = plain.half_widths
-    estimates = [
+    mass, viscous, coulomb, offset = (
         Estimate(float(value), float(width + abs(value - other) + spread))
         for value, width, other, spread in zip(plain.values, widths, full.values, spreads, strict=False)
-    ]
+    )
     delay = Estimate(delay_s, float(widths[4]) + abs(full_delay_s - delay_s))
-    return Volts(*estimates, delay, plain.relative_residual)
+    return Volts(mass, viscous, coulomb, offset, delay, plain.relative_residual)
 
 
 def _with_delay(log: Log, seen: Motion, rows: Array, kept: Array, blocks: Array) -> tuple[Fit, float]:
@@ -326,8 +326,9 @@ def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
             return np.array([(opening - closing).mean() / 2.0, (opening + closing).mean() / 2.0])
 
         values = np.array([fitted.values[0], fitted.values[1], 1.0 - fitted.values[2], *means(fitted.values)])
-        of_means = [fitted.half_width_of(lambda v, which=which: float(means(v)[which])) for which in (0, 1)]
-        return values, np.array([*fitted.half_widths[:3], *of_means])
+        coulomb = fitted.half_width_of(lambda values: float(means(values)[0]))
+        offset = fitted.half_width_of(lambda values: float(means(values)[1]))
+        return values, np.array([*fitted.half_widths[:3], coulomb, offset])
 
     return Gearbox(*_estimates(fit_in))
 
@@ -343,7 +344,7 @@ def _slow(values: Array, x: Array, direction: float, idle_N: float) -> Array:
     """The motor's force that moves the carriage slowly in `direction` at positions `x`."""
     lost = float(values[2])
     idling = float(values[8]) if len(values) > 8 else 0.0
-    load = values[3] + values[4] * x + values[5] * x**2 + direction * (values[6] + values[7] * x)
+    load: Array = values[3] + values[4] * x + values[5] * x**2 + direction * (values[6] + values[7] * x)
     force = load
     # the loss depends on the force itself; each turn leaves less than the lost share of the error
     for _ in range(SETTLING_TURNS):

@@ -65,15 +65,16 @@ def read_log(path: Path) -> Log:
 def _read_mat(path: Path) -> Log:
     try:
         data = loadmat(path)
-        columns = [np.asarray(data[name], dtype=np.float64).ravel() for name in ("t", "vir", "qm")]
+        t_s, input_V, position_m = (np.asarray(data[name], dtype=np.float64).ravel() for name in ("t", "vir", "qm"))
         gain = float(np.asarray(data["gtau"]).item())
     except OSError as error:
         raise LogError(f"{path}: {error.strerror or error}") from error
     except (MatReadError, KeyError, ValueError, TypeError) as error:
         raise LogError(f"{path}: not an EMPS file with t, vir, qm and gtau: {error}") from error
-    if len({len(column) for column in columns}) != 1:
-        raise LogError(f"{path}: t, vir and qm have {[len(column) for column in columns]} rows: allowed is one length")
-    return Log(*columns, gain)
+    rows = [len(t_s), len(input_V), len(position_m)]
+    if len(set(rows)) != 1:
+        raise LogError(f"{path}: t, vir and qm have {rows} rows: allowed is one length")
+    return Log(t_s, input_V, position_m, gain)
 
 
 def _read_csv(path: Path) -> Log:

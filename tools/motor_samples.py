@@ -125,7 +125,8 @@ def truth(plant: PlantParameters, side: Side, gap_mm: Array) -> dict[str, float]
         load_N = direction * contact_N + rub * np.abs(contact_N)
         driving = idle_N + load_N / gear.efficiency
         braking = np.maximum(idle_N + load_N, (load_N + gear.efficiency * idle_N) / (2.0 - gear.efficiency))
-        return np.where(load_N > 0.0, driving, braking) * direction
+        force_N: Array = np.where(load_N > 0.0, driving, braking) * direction
+        return force_N
 
     opening, closing = slow(1.0), slow(-1.0)
     return {

@@ -97,7 +97,8 @@ def _executor(options: argparse.Namespace, stack: ExitStack) -> Executor:
     # only a cluster needs it installed
     from distributed import Client
 
-    return stack.enter_context(stack.enter_context(Client(options.dask)).get_executor())
+    executor: Executor = stack.enter_context(stack.enter_context(Client(options.dask)).get_executor())
+    return executor
 
 
 def _merit(measure: str, outcome: Outcome) -> tuple[float, float]:

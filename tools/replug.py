@@ -158,25 +158,27 @@ class Stand:
 
         Begins again where a machine that is too busy has made a fault of it. Raises RuntimeError.
         """
-        for _ in range(ATTEMPTS):
-            self.until(lambda: self.status().get("link", {}).get("state") == "RUNNING", "the link runs")
-            self.until(lambda: self.status().get("is_busy") is False, "the device is at rest")
-            self.until(lambda: self.command("clear-fault"), "cleared")
-            losses = self.status()["link"]["losses"]
+        if not any(self._try_to_arm(force_N) for _ in range(ATTEMPTS)):
+            raise RuntimeError(f"a fault in each of {ATTEMPTS} attempts to arm; {self.status()}")
 
-            def is_upset(losses: int = losses) -> bool:
-                status = self.status()
-                return bool(status) and (status["operating_state"] == "FAULT" or status["link"]["losses"] != losses)
+    def _try_to_arm(self, force_N: float) -> bool:
+        """One attempt; whether it came to its end without a fault or a loss."""
+        self.until(lambda: self.status().get("link", {}).get("state") == "RUNNING", "the link runs")
+        self.until(lambda: self.status().get("is_busy") is False, "the device is at rest")
+        self.until(lambda: self.command("clear-fault"), "cleared")
+        losses = self.status()["link"]["losses"]
 
-            self.ask(NEUTRAL_N)
-            self.until(lambda upset=is_upset: self.command("home") or upset(), "home is taken")
-            self.until(lambda upset=is_upset: self._is_homed() or upset(), "homed")
-            self.until(lambda upset=is_upset: self.command("enable") or upset(), "enabled")
-            self.ask(force_N)
-            self.until(lambda upset=is_upset: self._is_moving() or upset(), "the gap moves")
-            if not is_upset():
-                return
-        raise RuntimeError(f"a fault in each of {ATTEMPTS} attempts to arm; {self.status()}")
+        def is_upset() -> bool:
+            status = self.status()
+            return bool(status) and (status["operating_state"] == "FAULT" or status["link"]["losses"] != losses)
+
+        self.ask(NEUTRAL_N)
+        self.until(lambda: self.command("home") or is_upset(), "home is taken")
+        self.until(lambda: self._is_homed() or is_upset(), "homed")
+        self.until(lambda: self.command("enable") or is_upset(), "enabled")
+        self.ask(force_N)
+        self.until(lambda: self._is_moving() or is_upset(), "the gap moves")
+        return not is_upset()
 
     def until(self, reached: Callable[[], bool], what: str) -> None:
         """Waits for a condition. Raises RuntimeError saying what was waited for, and the daemon's last words."""

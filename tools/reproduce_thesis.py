@@ -99,7 +99,7 @@ def main() -> int:
 
 def table_2_3() -> Json:
     """Masses from volume fractions and densities."""
-    rows = []
+    rows: list[Json] = []
     for item in INSERTS.values():
         printed = TABLE_2_3_MASSES_G[round(100 * item.cip_fraction)]
         rows.append(
@@ -358,7 +358,9 @@ def _problems(use_case: int, gap_speed_mm_s: float) -> dict[str, Problem]:
 
 def table_3_2(runs: dict[RunKey, Run], outcomes: dict[Run, Outcome], gap_speed_mm_s: float) -> Json:
     """Optima by the global solver, by the local one, by the thesis's cost; the thesis's designs beside them."""
-    starts, local, corners = [], [], []
+    starts: list[Json] = []
+    local: list[Json] = []
+    corners: list[Json] = []
     for key, run in runs.items():
         use_case, start, objective, solver = key
         row = {"use_case": use_case, "start": start, "objective": objective, **_outcome(outcomes[run])}

@@ -37,13 +37,16 @@ def _table_2_4(table: Json) -> Figure:
     figure, axes = plt.subplots(figsize=(9.5, 4.2), constrained_layout=True)
     rows = table["rows"]
     place = np.arange(len(rows))
-    bars = (("thesis estimate", THESIS, "thesis_N"), ("ours, friction fitted", OURS, "ours_N"))
-    bars += (("ours, exponent free too", FREE, "ours_free_exponent_N"),)
+    bars = (
+        ("thesis estimate", THESIS, "thesis_N"),
+        ("ours, friction fitted", OURS, "ours_N"),
+        ("ours, exponent free too", FREE, "ours_free_exponent_N"),
+    )
     for offset, (label, colour, key) in zip((-0.26, 0.0, 0.26), bars, strict=True):
         axes.bar(place + offset, [row[key] for row in rows], 0.24, color=colour, label=label)
     for row, x in zip(rows, place, strict=True):
-        label = "measured, with deviation" if x == 0 else None
-        axes.errorbar([x - 0.26, x, x + 0.26], [row["measured_N"]] * 3, row["deviation_N"], color=MEASURED, label=label)
+        named = "measured, with deviation" if x == 0 else None
+        axes.errorbar([x - 0.26, x, x + 0.26], [row["measured_N"]] * 3, row["deviation_N"], color=MEASURED, label=named)
     axes.set_xticks(place, [row["insert"].removeprefix("MRE-") for row in rows])
     axes.set(xlabel="insert (matrix-iron %)", ylabel="F(45 mm) - F(95 mm), N")
     axes.legend(frameon=False)

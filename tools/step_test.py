@@ -65,7 +65,8 @@ def step_test(fitted: Insert, seed: int) -> StepTest:
             rows.append((sample.time_s - began_s, estimate.gap_mm, estimate.force_N))
     record = np.array(rows)
     settled = record.reshape(len(GAPS_MM), -1, 3)[:, -round(SETTLED_S / 1e-3) :].mean(axis=1)
-    return StepTest(fitted.name, *record[::EVERY].T, settled[:, 1], settled[:, 2])
+    time_s, gap_mm, force_N = record[::EVERY].T
+    return StepTest(fitted.name, time_s, gap_mm, force_N, settled[:, 1], settled[:, 2])
 
 
 def _plan(gap_mm: float, now_s: float) -> Plan:

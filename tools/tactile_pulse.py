@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from human_pulse import pulse_profile
+from numpy.typing import NDArray
 from tactile_models import PAD_IN_USE, SCORED_SLOPE_N_MT, Effort, Trained, plant_force_N, slope_N_per_mT
 
 from tormagd.inverse.linear import LinearFieldSearch
@@ -113,7 +114,7 @@ class Course(NamedTuple):
     dt_s: float
 
     @property
-    def scored(self) -> Array:
+    def scored(self) -> NDArray[np.bool_]:
         """Rows (n, bool) where the force says something about the field."""
         return self.slope_N_mT >= SCORED_SLOPE_N_MT
 
@@ -205,7 +206,8 @@ def hold(trained: Trained, duration_s: float) -> tuple[dict[str, Any], dict[str,
     # there and back again, so that the repetition has no jump
     asked_N = np.resize(np.concatenate((beats_N, beats_N[::-1])), count - rising)
     pad = PADS[PAD_IN_USE]
-    traces, scores = {"time_s": np.arange(1, count - rising + 1) * dt_s, "asked": asked_N}, {}
+    traces = {"time_s": np.arange(1, count - rising + 1, dtype=np.float64) * dt_s, "asked": asked_N}
+    scores = {}
     for name, model, memory in (
         ("without", trained.model, None),
         ("with", trained.grey.model, GreyBoxMemory(trained.grey, dt_s)),

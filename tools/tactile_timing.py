@@ -58,8 +58,13 @@ def solve_times(trained: Trained, along: Course, solves: int) -> dict[str, Any]:
         for name, (solver, slow) in tqdm(searches.items(), desc="solve times", disable=None, leave=False):
             count = max(solves // SLOW_SHARE, 10) if slow else solves
             every = max(len(elastic_N) // count, 1) if slow else 1
-            times_us, fields = _timed(_search(solver), along.features[::every], elastic_N[::every], count)
-            kept = Course(*(part[::every] if isinstance(part, np.ndarray) else part for part in along))
+            kept = along._replace(
+                time_s=along.time_s[::every],
+                features=along.features[::every],
+                force_N=along.force_N[::every],
+                slope_N_mT=along.slope_N_mT[::every],
+            )
+            times_us, fields = _timed(_search(solver), kept.features, elastic_N[::every], count)
             looked = np.flatnonzero(kept.scored)[:: max(int(kept.scored.sum()) // ROOTS, 1)]
             errors = _solver_error_mT(model, kept.features[looked], elastic_N[::every][looked], fields[looked])
             rows.append(
