@@ -13,6 +13,7 @@ MAY_IMPORT = {
     "config": set(),
     "messages": set(),
     "output": set(),
+    "entry": set(),  # it loads the daemon or tormagctl by name, never both
     "physics": set(),
     "characterisation": {"physics"},
     "design": {"physics"},

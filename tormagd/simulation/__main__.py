@@ -1,8 +1,13 @@
 """`python -m tormagd.simulation`: the simulated device as a process of its own."""
 
+import signal
+
+if __name__ == "__main__":
+    # what follows takes half a second to load: until `main` sees to it, Ctrl-C may simply end the process
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 import argparse
 import contextlib
-import signal
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -40,13 +45,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         stopping = True
 
     with contextlib.ExitStack() as resources:
+        for number in (signal.SIGTERM, signal.SIGINT):  # before anything is opened: all of it is closed again
+            resources.callback(signal.signal, number, signal.signal(number, stop))
         try:
             device, door = _opened(options, resources)
             truth = options.truth and resources.enter_context(options.truth.open("w", encoding="utf-8"))
         except (PlantError, HandError, FaultError, DomainError, BuildError, OSError) as error:
             parser.error(str(error))
-        signal.signal(signal.SIGTERM, stop)
-        signal.signal(signal.SIGINT, stop)
         if write_line(door.address, sys.stdout) is not None:
             print(f"{parser.prog}: {door.address} could not be written to stdout; it ends", file=sys.stderr)
             return 1

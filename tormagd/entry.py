@@ -1,0 +1,29 @@
+"""Where the installed commands begin: while one is loading, Ctrl-C ends the process, without a traceback."""
+
+import signal
+from collections.abc import Callable
+from importlib import import_module
+
+INTERRUPTED = 130
+"""What a shell makes of a process that SIGINT has ended."""
+
+
+def daemon() -> int:
+    """`tormagd`."""
+    return _run("tormagd.daemon.main")
+
+
+def ctl() -> int:
+    """`tormagctl`."""
+    return _run("tormagd.ctl.main")
+
+
+def _run(module: str) -> int:
+    """The exit code of the module's `main`, which sees to SIGINT itself as soon as it runs."""
+    interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    main: Callable[[], int] = import_module(module).main
+    try:
+        signal.signal(signal.SIGINT, interrupt)
+        return main()
+    except KeyboardInterrupt:
+        return INTERRUPTED
