@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from tormagd.config import Config
 from tormagd.control.core import Core
-from tormagd.control.estimate import MOBILISED_MM, Estimate, Handle
+from tormagd.control.estimate import Estimate, Handle
 from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import MOST_LAG_S, MOVING_MM_S, PlanState
+from tormagd.control.plan import MOST_LAG_S, PlanState
+from tormagd.learning.displacement import MOBILISED_MM, MOVING_MM_S
 from tormagd.safety.codes import Limit
 
 PERIOD_S = 0.004

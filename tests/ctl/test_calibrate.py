@@ -25,7 +25,8 @@ from tormagd.ctl.calibrate_run import Range
 from tormagd.ctl.main import main
 from tormagd.ctl.outcome import CommandError
 from tormagd.learning import calibration
-from tormagd.learning.calibration import CalibrationError, displacement, fit, require_usable, training_rows
+from tormagd.learning.calibration import CalibrationError, fit, require_usable, training_rows
+from tormagd.learning.displacement import MOVING_MM_S, displacement
 from tormagd.learning.model_file import load_model
 from tormagd.learning.shipped import model_path
 from tormagd.physics.inserts import insert
@@ -187,7 +188,7 @@ def test_a_steady_handle_teaches_nothing_about_rate_and_displacement(table):
 
 
 def test_displacement_is_what_the_daemon_calls_it():
-    """One law, stated twice because the fitting process may not import control."""
+    """Of a whole sweep or position by position: one law."""
     rng = np.random.default_rng(1)
     path = np.cumsum(rng.normal(0.0, 0.06, 4000)) + 3.0 * np.sin(np.arange(4000) / 90.0)
     handle = estimate.Handle(0.0, 0.0, 1.0, path[0], path[0])
@@ -200,8 +201,11 @@ def test_displacement_is_what_the_daemon_calls_it():
     known = np.isfinite(found)
     assert known[500:].all()
     assert found[known] == pytest.approx(np.array(expected)[known])
-    assert (calibration.TURN_MM, calibration.MOBILISED_MM) == (estimate.TURN_MM, estimate.MOBILISED_MM)
+
+
+def test_what_ctl_may_not_import_is_equal():
     assert calibration.COLUMNS == FILE_COLUMNS
+    assert ctl_calibrate.MOVING_MM_S == MOVING_MM_S
 
 
 def test_a_sweep_file_that_is_none_says_why(tmp_path):

@@ -3,18 +3,15 @@
 from typing import NamedTuple
 
 from tormagd.hardware.measurement import Measurement
+from tormagd.learning.displacement import Turn
 
-TURN_MM = 0.05
-"A handle motion against the last direction counts as a reversal from here on: 6 counts of its encoder."
-MOBILISED_MM = 2.0
-"Displacement saturates here: friction is fully mobilised, whatever the insert."
 RATE_FILTER_S = 0.05
 LEAST_DT_S = 5e-6
 "Half a step of the device's clock; positions over less time than that would give speeds without bound."
 
 
 class Handle(NamedTuple):
-    """The handle's motion. `displacement_mm` counts from the last reversal and saturates at MOBILISED_MM."""
+    """The handle's motion; `displacement_mm` and the turn it counts from are those of `learning.displacement`."""
 
     displacement_mm: float
     rate_mm_s: float
@@ -102,11 +99,5 @@ def _handle(last: Estimate, position_mm: float, dt_s: float) -> Handle:
     share = dt_s / (RATE_FILTER_S + dt_s)
     speed = before.direction * before.rate_mm_s
     speed += share * ((position_mm - last.handle_mm) / dt_s - speed)
-    direction, turned, furthest = before.direction, before.turned_mm, before.furthest_mm
-    if (position_mm - furthest) * direction >= 0.0:
-        furthest = position_mm
-    elif abs(position_mm - furthest) > TURN_MM:
-        # it turned where it was furthest, not where we became sure of it
-        direction, turned, furthest = -direction, furthest, position_mm
-    displacement = min(abs(position_mm - turned), MOBILISED_MM)
-    return Handle(displacement, direction * speed, direction, turned, furthest)
+    turn = Turn(before.direction, before.turned_mm, before.furthest_mm).moved_to(position_mm)
+    return Handle(turn.displacement_mm(position_mm), turn.direction * speed, *turn)

@@ -5,16 +5,15 @@ from typing import NamedTuple
 import numpy as np
 
 from tormagd.config import Config
-from tormagd.control.estimate import MOBILISED_MM, Estimate
+from tormagd.control.estimate import Estimate
 from tormagd.control.governor import PATH_S, Governed, GovernorState, TimedSetpoint, govern
 from tormagd.control.portrait import FieldOfGap, portrait
 from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
+from tormagd.learning.displacement import MOBILISED_MM, MOVING_MM_S
 from tormagd.learning.model_file import ForceModel
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Scene
 
-MOVING_MM_S = 5.0
-"Slower handles do not teach the trim, and no force is planned for them: their friction may be static."
 TAUGHT_N = 0.2
 "Smaller forces do not teach it either: the sensor's offset would."
 LAG_TIME_S = 1.0

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from tormagd.control.estimate import MOBILISED_MM
+from tormagd.learning.displacement import MOBILISED_MM
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.field import FieldLaw, flux_density_T, radial_moment_from_flux_density_Tm
 

@@ -22,6 +22,7 @@ import numpy as np
 from tqdm import tqdm
 
 from tormagd.learning.dataset import Array, Dataset, DatasetError, write_csv
+from tormagd.learning.displacement import MOBILISED_MM, MOVING_MM_S, displacement
 from tormagd.learning.features import FEATURES, FIELD, Element
 from tormagd.learning.fitting import fit_model
 from tormagd.learning.levenberg_marquardt import Epoch
@@ -35,10 +36,6 @@ COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 """Of a sweep file: times of one device, the number of the sweep, the measured gap, the handle's travel at the roller,
 its rate and the measured force, both positive in the direction of motion."""
 
-TURN_MM, MOBILISED_MM = 0.05, 2.0
-"What the daemon takes for a turn of the handle, and where displacement saturates; a test holds the two equal."
-MOVING_MM_S = 5.0
-"Slower rows are left out: their friction may be static, and the hand's choice."
 LEAST_MOVING_SHARE = 0.3
 "Of every sweep. Turning to and fro with rests keeps over half of it."
 LEAST_FIELD_SPAN = 0.2
@@ -109,25 +106,6 @@ def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Datas
     cip_percent = np.full_like(rate_mm_s, 100.0 * fitted.cip_fraction)
     features = np.column_stack((displacement_mm, rate_mm_s, field_mT, cip_percent))
     return Dataset(features, force_N, sweep.astype(np.int64), time_s)
-
-
-def displacement(handle_mm: Array) -> Array:
-    """Travel since the handle's last turn (n), saturating at MOBILISED_MM: what the daemon's estimate calls it. NaN
-    until a turn, or so much travel that the last turn no longer matters."""
-    found = np.full_like(handle_mm, np.nan)
-    start = float(handle_mm[0])
-    direction, turned, furthest, is_known = 1.0, start, start, False
-    for index, position in enumerate(handle_mm.tolist()):
-        if (position - furthest) * direction >= 0.0:
-            furthest = position
-        elif abs(position - furthest) > TURN_MM:
-            # the first one may be no turn, but a handle that came this way all the time
-            is_known = is_known or turned != furthest
-            direction, turned, furthest = -direction, furthest, position
-        is_known = is_known or abs(position - start) >= MOBILISED_MM
-        if is_known:
-            found[index] = min(abs(position - turned), MOBILISED_MM)
-    return found
 
 
 def require_usable(data: Dataset) -> None:

@@ -1,0 +1,51 @@
+"""What a force model calls displacement: the handle's travel at the roller since it last turned."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+TURN_MM = 0.05
+"A handle motion against the last direction counts as a reversal from here on: 6 counts of its encoder."
+MOBILISED_MM = 2.0
+"Displacement saturates here: friction is fully mobilised, whatever the insert."
+MOVING_MM_S = 5.0
+"Slower handles teach no model and no trim, and no force is planned for them: their friction may be static."
+
+
+class Turn(NamedTuple):
+    """The way the handle goes, 1 or -1, where it last turned, mm, and the furthest it has been since, mm."""
+
+    direction: float
+    turned_mm: float
+    furthest_mm: float
+
+    def moved_to(self, position_mm: float) -> "Turn":
+        """The same after the handle moved there. It turned where it was furthest, not where we became sure of it."""
+        direction, turned_mm, furthest_mm = self
+        if (position_mm - furthest_mm) * direction >= 0.0:
+            return Turn(direction, turned_mm, position_mm)
+        if abs(position_mm - furthest_mm) > TURN_MM:
+            return Turn(-direction, furthest_mm, position_mm)
+        return self
+
+    def displacement_mm(self, position_mm: float) -> float:
+        """Travel from the turn to there, saturating at MOBILISED_MM."""
+        return min(abs(position_mm - self.turned_mm), MOBILISED_MM)
+
+
+def displacement(handle_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """The displacement at each of these positions (n, mm, in the order of time). NaN until a turn, or so much travel
+    that the last turn no longer matters.
+    """
+    found = np.full_like(handle_mm, np.nan)
+    start_mm = float(handle_mm[0])
+    turn, is_known = Turn(1.0, start_mm, start_mm), False
+    for index, position_mm in enumerate(handle_mm.tolist()):
+        last, turn = turn, turn.moved_to(position_mm)
+        # the first reversal may be no turn, but a handle that came this way all the time
+        has_turned = turn.direction != last.direction and last.turned_mm != last.furthest_mm
+        is_known = is_known or has_turned or abs(position_mm - start_mm) >= MOBILISED_MM
+        if is_known:
+            found[index] = turn.displacement_mm(position_mm)
+    return found
