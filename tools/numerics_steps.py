@@ -16,7 +16,7 @@ import numpy as np
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.config import Position
 from tormagd.control.estimate import LEAST_DT_S, first_estimate, update
-from tormagd.control.pid import PidState, pid
+from tormagd.control.pid import Error, PidState, pid
 from tormagd.control.trajectory import Reference, follow
 from tormagd.hardware.measurement import Measurement
 from tormagd.physics.element import RateStrengthening, TorqueElement
@@ -147,14 +147,7 @@ def _pid(errors: StepErrors, rng: np.random.Generator, steps_s: list[float]) -> 
         growth = [proportional / gains.integral_time_s, duty / gains.back_calculation_s]
         growth += [-term / gains.back_calculation_s for term in terms]
         following = min(max(integral + sum(growth) * dt_s, -limit), limit)
-        state, output = pid(
-            gains,
-            PidState(integral),
-            error_mm=error_mm,
-            speed_error_mm_s=speed_error,
-            feed_forward=feed_forward,
-            dt_s=dt_s,
-        )
+        state, output = pid(gains, PidState(integral), Error(error_mm, speed_error), feed_forward, dt_s)
         errors.take("PID duty", output.duty, duty, sum(map(abs, terms)))
         errors.take("PID integral", state.integral, following, sum(map(abs, growth)) * dt_s + abs(integral))
         integral = state.integral

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from simple_pid import PID
 
 from tormagd.config import Config, Position
-from tormagd.control.pid import PidOutput, PidState, pid
+from tormagd.control.pid import Error, PidOutput, PidState, pid
 
 DT_S = 1e-3
 GAINS = Config().position
@@ -26,9 +26,7 @@ def update(
     position: Position, state: PidState, error_mm: float, speed_error_mm_s: float = 0.0, feed_forward: float = 0.0
 ) -> tuple[PidState, PidOutput]:
     """One update, a millisecond after the last."""
-    return pid(
-        position, state, error_mm=error_mm, speed_error_mm_s=speed_error_mm_s, feed_forward=feed_forward, dt_s=DT_S
-    )
+    return pid(position, state, Error(error_mm, speed_error_mm_s), feed_forward, DT_S)
 
 
 @settings(max_examples=100, deadline=None)
@@ -142,7 +140,7 @@ def test_an_hour_of_saturation_is_left_at_once(position: Position, error: float,
     """The integral stays within the whole duty, and an error of the other sign turns the duty round in one update."""
     state = PidState()
     for _ in range(round(3_600.0 / dt_s)):
-        state, _ = pid(position, state, error_mm=error, speed_error_mm_s=0.0, feed_forward=0.0, dt_s=dt_s)
+        state, _ = pid(position, state, Error(error, 0.0), 0.0, dt_s)
         assert abs(state.integral) <= position.duty_limit
     most = 2.0 * position.duty_limit / position.proportional_per_mm
     _, output = update(position, state, -most)

@@ -7,6 +7,13 @@ from typing import NamedTuple
 from tormagd.config import Position
 
 
+class Error(NamedTuple):
+    """How far a carriage is from where it is expected, mm and mm/s."""
+
+    position_mm: float
+    speed_mm_s: float
+
+
 class PidState(NamedTuple):
     """The integral action, duty. Starting it at 0 is bumpless: holding takes no duty, because friction holds."""
 
@@ -20,21 +27,13 @@ class PidOutput(NamedTuple):
     is_saturated: bool
 
 
-def pid(
-    gains: Position,
-    state: PidState,
-    *,
-    error_mm: float,
-    speed_error_mm_s: float,
-    feed_forward: float,
-    dt_s: float,
-) -> tuple[PidState, PidOutput]:
-    """One update, `dt_s` > 0 after the last. The speed error carries the derivative action: its measured half is the
-    filtered derivative of the position, its other half the reference's exact speed, so that a moving reference gives
-    no derivative kick and no lag.
+def pid(gains: Position, state: PidState, error: Error, feed_forward: float, dt_s: float) -> tuple[PidState, PidOutput]:
+    """One update, `dt_s` > 0 after the last; the feed-forward is a duty. The speed error carries the derivative action:
+    its measured half is the filtered derivative of the position, its other half the speed that is expected, so that a
+    moving reference gives no derivative kick and no lag.
     """
-    proportional = gains.proportional_per_mm * error_mm
-    derivative = gains.proportional_per_mm * gains.derivative_time_s * speed_error_mm_s
+    proportional = gains.proportional_per_mm * error.position_mm
+    derivative = gains.proportional_per_mm * gains.derivative_time_s * error.speed_mm_s
     asked = proportional + state.integral + derivative + feed_forward
     duty = min(max(asked, -gains.duty_limit), gains.duty_limit)
     growth = proportional / gains.integral_time_s + (duty - asked) / gains.back_calculation_s

@@ -7,7 +7,7 @@ from firmware_protocol.codec import DeviceMode, DriveMode
 from tormagd.config import Config
 from tormagd.control.estimate import Estimate, first_estimate, update
 from tormagd.control.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s
-from tormagd.control.pid import PidOutput, PidState, pid
+from tormagd.control.pid import Error, PidState, pid
 from tormagd.control.plan import Plan
 from tormagd.control.trajectory import Expected, Reference, expect, follow
 from tormagd.hardware.measurement import Measurement
@@ -37,13 +37,6 @@ STILL_MM_S = 0.5
 "Slower than this a carriage does not move: half an encoder count a millisecond and filtered."
 LAGGING_MM = 0.1
 "The speed limit is reported as RATE only where it leaves the reference this far behind its target."
-
-
-class Error(NamedTuple):
-    """How far a carriage is from where it is expected, mm and mm/s."""
-
-    position_mm: float
-    speed_mm_s: float
 
 
 class StepState(NamedTuple):
@@ -166,8 +159,8 @@ class Stepper:
                 limits.append(Limit.RATE)
         left_error, right_error = self._errors(expected, estimate)
         ahead = self._feed_forward(reference)
-        left_state, left = self._carriage(state.left, left_error, ahead, dt_s)
-        right_state, right = self._carriage(state.right, right_error, ahead, dt_s)
+        left_state, left = pid(self._position, state.left, left_error, ahead, dt_s)
+        right_state, right = pid(self._position, state.right, right_error, ahead, dt_s)
         if not math.isfinite(left.duty + right.duty + measurement.supply_V):  # a sum is finite only if all of it is
             safety = latch(safety, (Fault.NOT_FINITE,))
             return self.start(now_s)._replace(safety=safety), self._off(safety, ())
@@ -232,16 +225,6 @@ class Stepper:
         inertia = acceleration * self._mechanical_time_s / (1.0 - loss)
         coulomb = self._coulomb * min(max(speed / COULOMB_SPEED_MM_S, -1.0), 1.0)
         return (speed + inertia) / self._full_speed_mm_s + coulomb
-
-    def _carriage(self, state: PidState, error: Error, ahead: float, dt_s: float) -> tuple[PidState, PidOutput]:
-        return pid(
-            self._position,
-            state,
-            error_mm=error.position_mm,
-            speed_error_mm_s=error.speed_mm_s,
-            feed_forward=ahead,
-            dt_s=dt_s,
-        )
 
     def _watch(self, state: StepState, estimate: Estimate, now_s: float, measurement: Measurement) -> tuple[Fault, ...]:
         faults: list[Fault] = []
