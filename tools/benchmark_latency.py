@@ -34,9 +34,8 @@ from tormagd.recording.ticks import decode_ticks
 Array = npt.NDArray[np.float64]
 
 LEAST_N, GRAIN_N = 1.0, 1e-4
-SPACING_S = (0.004, 0.009)
-"Random, so that setpoints meet every phase of the control period."
-PERIOD_S = 1e-3
+SPACING_S = (0.0015, 0.0025)
+"500 a second, as in `make run`; random, so that they meet every phase of the control period."
 SETTLE_S = 0.5
 BELOW = 10
 "The measurement's own processes are this far below the daemon's real-time priority."
@@ -92,6 +91,7 @@ def exchange(config: Config, count: int) -> tuple[dict[float, int], list[dict[st
     with context(priority_of_threads()) as ours, ours.socket(zmq.XPUB) as publisher, ours.socket(zmq.SUB) as recording:
         for socket in (publisher, recording):
             socket.setsockopt(zmq.LINGER, 0)
+        recording.setsockopt(zmq.RCVHWM, 0)  # read when the last one has been sent: reading would set the pace
         recording.subscribe(b"")
         recording.connect(config.endpoints.recording)
         publisher.connect(config.endpoints.setpoint)
@@ -109,9 +109,7 @@ def exchange(config: Config, count: int) -> tuple[dict[float, int], list[dict[st
             )
             publisher.send(encode(setpoint))
             sent[force] = stamp
-            read_rows(recording, rows, spacing.uniform(*SPACING_S))
-            # reading waits in whole milliseconds from a message that the daemon sends right after a tick
-            time.sleep(spacing.uniform(0.0, PERIOD_S))
+            time.sleep(spacing.uniform(*SPACING_S))
         read_rows(recording, rows, SETTLE_S)
     return sent, rows
 
