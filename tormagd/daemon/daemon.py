@@ -31,7 +31,8 @@ from tormagd.safety.codes import FAULTS, LIMITS, Fault
 from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState
 
 NS = 1_000_000_000
-RETRACT_ACKNOWLEDGED_S = 0.1
+OPENING_LOOK_S = 0.02
+"How often the end of the opening is looked for: Status comes as often."
 LONGEST_RETRACT_S = 10.0
 "A full stroke takes the firmware 3 s at its own retract speed; longer means that it cannot, and it says so itself."
 ROWS = 100
@@ -250,9 +251,5 @@ class Daemon:
         if self._control.state.safety.operating_state is not OperatingState.FAULT and self._connection.measurement:
             self._control.command("disable", self._conditions())
         until_s = time.monotonic() + LONGEST_RETRACT_S
-        await asyncio.sleep(RETRACT_ACKNOWLEDGED_S)
-        while time.monotonic() < until_s:
-            measurement = self._connection.measurement
-            if measurement is None or not measurement.is_busy:
-                return
-            await asyncio.sleep(0.02)
+        while self._is_busy() and time.monotonic() < until_s:
+            await asyncio.sleep(OPENING_LOOK_S)
