@@ -41,7 +41,8 @@ def status_text(result: Mapping[str, Any], colour: Colour) -> str:
         f"{_counts(_table(result, 'setpoints'), SETPOINT_COUNTS)}",
         f"link      {link_state}, {_counts(link, LINK_COUNTS)}",
         *_explained(link.get("cause"), link.get("remedy"), colour.yellow),
-        *_rates(_table(result, "rates")),
+        *_rates(_table(result, "rates"), colour),
+        *_late_ticks(_table(result, "late_ticks_by")),
         f"daemon    {result.get('version', UNKNOWN)}, scene {result.get('scene', UNKNOWN)}, "
         f"up {_number(result, 'uptime_s', 's', 0)}",
     ]
@@ -81,14 +82,24 @@ def _explained(cause: object, remedy: object, paint: Any) -> list[str]:
     return [*lines, f"          next: {remedy}"] if remedy else lines
 
 
-def _rates(rates: Mapping[str, Any]) -> list[str]:
+def _rates(rates: Mapping[str, Any], colour: Colour) -> list[str]:
     lines = []
     for name in rates:
         group = _table(rates, name)
         lateness = _table(group, "lateness_us")
+        grade = str(group.get("grade") or UNKNOWN)
+        paint = {"warning": colour.yellow, "error": colour.red}.get(grade, str)
         lines.append(
-            f"{name:<9} {_number(group, 'hz', 'Hz', 0)}, late {_number(lateness, 'p50', 'us', 0)} (p50) "
-            f"{_number(lateness, 'p99', 'us', 0)} (p99), overruns {group.get('overruns', UNKNOWN)}, "
+            f"{name:<9} {paint(grade)}, {_number(group, 'hz', 'Hz', 0)}, "
+            f"late {_number(lateness, 'p50', 'us', 0)} (p50) {_number(lateness, 'p99', 'us', 0)} (p99), "
+            f"overruns {group.get('overruns', UNKNOWN)}, stalls {group.get('stalls', UNKNOWN)}, "
             f"merged {group.get('merged', UNKNOWN)}"
         )
     return lines
+
+
+def _late_ticks(blamed: Mapping[str, Any]) -> list[str]:
+    """Who made control ticks late, the one who made most of them first; nothing while none was late."""
+    counted = {name: count for name, count in blamed.items() if isinstance(count, int)}
+    worst_first = sorted(counted, key=lambda name: (-counted[name], name))
+    return [f"late by   {', '.join(f'{counted[name]} {name}' for name in worst_first)}"] if counted else []
