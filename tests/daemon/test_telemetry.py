@@ -1,5 +1,9 @@
 """Snapshots: what is not known is null, and nothing holds back a device that is not driven."""
 
+from pathlib import Path
+
+import msgspec
+import numpy as np
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
@@ -7,9 +11,13 @@ from tormagd.control.estimate import first_estimate
 from tormagd.control.plan import Plan
 from tormagd.control.step import StepOutput, StepState
 from tormagd.control.trajectory import Reference
-from tormagd.daemon.telemetry import explanations, limits_held, snapshot, tick_row
+from tormagd.daemon.telemetry import TickRow, explanations, limits_held, snapshot, tick_row
 from tormagd.hardware.measurement import Measurement
-from tormagd.messages import Telemetry, decode, encode
+from tormagd.messages import VERSION, Telemetry, decode, encode
+from tormagd.recording.plot import save_plot
+from tormagd.recording.reader import read_recording
+from tormagd.recording.ticks import decode_ticks
+from tormagd.recording.writer import RecordingWriter
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.safety.operating_state import DeviceRequest, OperatingState, SafetyState
 
@@ -31,6 +39,7 @@ MEASUREMENT = Measurement(
     temperature_C=25.0,
     supply_V=12.1,
 )
+LATE = MEASUREMENT._replace(delay_s=0.031)
 
 
 def telemetry(measurement: Measurement | None, state: StepState, is_busy: bool = False) -> Telemetry:
@@ -70,6 +79,23 @@ def test_without_a_device_nothing_measured_is_known() -> None:
     published = telemetry(None, StepState(1.0))
     assert (published.gap_mm, published.measured_cf, published.measured_jp) == (None, None, None)
     assert (published.is_homed, published.is_busy) == (False, False)
+
+
+def test_a_recording_says_how_old_the_measurement_of_a_tick_was(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    old = [name for name in TickRow._fields if name not in ("received_s", "delay_s")]
+    with RecordingWriter(path) as writer:
+        for columns, measurement in ((old, MEASUREMENT), (TickRow._fields, LATE), (TickRow._fields, None)):
+            row = tick_row(1.012, StepState(1.012), OUTPUT, PLAN, 1.1, measurement, 20.0, 150.0)._asdict()
+            batch = {"v": VERSION, "columns": columns, "rows": [[row[name] for name in columns]]}
+            writer.ticks(decode_ticks(msgspec.msgpack.encode(batch)))
+    recording = read_recording(path)
+    ages_s = [recording.ticks.numbers[name] for name in ("monotonic_s", "received_s", "delay_s")]
+    assert np.array_equal(ages_s[0], [1.012] * 3)
+    # an older daemon's rows have neither, and without a device nothing is known of one
+    assert np.array_equal(ages_s[1], [np.nan, 1.0, np.nan], equal_nan=True)
+    assert np.array_equal(ages_s[2], [np.nan, 0.031, np.nan], equal_nan=True)
+    save_plot(recording, tmp_path / "a.png", "older and newer rows")
 
 
 @pytest.mark.parametrize("present", OperatingState)

@@ -12,7 +12,11 @@ from tormagd.safety.operating_state import OperatingState
 
 
 class TickRow(NamedTuple):
-    """One control tick as it is recorded: enough to replay it, in the units of `Telemetry`. Times are in ns and s."""
+    """One control tick as it is recorded, in the units of `Telemetry`. Times are in ns and s.
+
+    `received_s` (of the clock of `monotonic_s`) and `delay_s` are the measurement's: from them a step decides how old
+    it is.
+    """
 
     t_ns: int
     monotonic_s: float
@@ -39,6 +43,8 @@ class TickRow(NamedTuple):
     right_current_A: float | None
     supply_V: float | None
     device_time_s: float | None
+    received_s: float | None
+    delay_s: float | None
     operating_state: str
     limits: tuple[str, ...]
     faults: tuple[str, ...]
@@ -84,6 +90,8 @@ def tick_row(
         right_current_A=None if measurement is None else measurement.right_current_A,
         supply_V=None if measurement is None else measurement.supply_V,
         device_time_s=None if measurement is None else measurement.device_time_s,
+        received_s=None if measurement is None else measurement.received_s,
+        delay_s=None if measurement is None else measurement.delay_s,
         operating_state=state.safety.operating_state,
         limits=limits_held(state, output, plan),
         faults=tuple(state.safety.faults),
