@@ -7,6 +7,7 @@ from tormagd.control.plan import Plan
 from tormagd.control.step import StepOutput, Stepper, StepState
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.hardware.connection import Connection
+from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions, latch
 
@@ -20,6 +21,8 @@ class ControlLoop:
         self._stepper, self._connection = stepper, connection
         self.state: StepState = stepper.start(time.monotonic())
         self.output: StepOutput | None = None
+        self.measurement: Measurement | None = None
+        "What the last step was given; the connection may have a newer one by now."
         self.timing = RateGroup("control", period_ns)
         self.next_tick_ns = 0
         self._reported_faults: tuple[Fault, ...] = ()
@@ -29,7 +32,8 @@ class ControlLoop:
         self.next_tick_ns = due_ns + self.timing.period_ns
         start_ns = time.monotonic_ns()
         now_s = start_ns * 1e-9
-        self.state, output = self._stepper.step(self.state, now_s, self._connection.measurement, plan)
+        self.measurement = self._connection.measurement
+        self.state, output = self._stepper.step(self.state, now_s, self.measurement, plan)
         self._connection.exchange(
             output.left_duty, output.right_duty, output.mode, output.request, output.request_number
         )

@@ -139,7 +139,7 @@ class Daemon:
                 control.output,
                 used.plan,
                 used.trim,
-                self._connection.measurement,
+                control.measurement,
                 timing.lateness_us,
                 timing.exec_us,
             )
