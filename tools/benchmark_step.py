@@ -245,9 +245,9 @@ def time_optimal(parameters: PlantParameters, start_mm: float, distance_mm: floa
 def bang_bang(parameters: PlantParameters, start_mm: float, distance_mm: float, switch_s: float) -> tuple[Array, float]:
     """True gap every 0.1 ms until rest, and the time of that, for full voltage that turns round at `switch_s`."""
     at_rest = msgspec.structs.replace(parameters.assumed, start_left_mm=start_mm / 2, start_right_mm=start_mm / 2)
-    plant = Plant(msgspec.structs.replace(parameters, assumed=at_rest), SteadyHand())
-    volts = np.sign(distance_mm) * parameters.electronics.supply_V
     gaps, time_s, tick = [], 0.0, TICK_S / 10.0
+    plant = Plant(msgspec.structs.replace(parameters, assumed=at_rest), SteadyHand(), substep_s=tick)
+    volts = np.sign(distance_mm) * parameters.electronics.supply_V
     for count in itertools.count(1):
         time_s = count * tick
         applied = volts if time_s <= switch_s else -volts

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Callable
 
 import msgspec
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tormagd.simulation.axis import Axis
-from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.hand import ReversingHand, SteadyHand
 from tormagd.simulation.parameters import PlantError, PlantParameters, load_plant, plant_names
 from tormagd.simulation.plant import SUBSTEP_S, Plant, holding_over_stroke
 
@@ -23,6 +24,10 @@ def an_axis(plant: PlantParameters = SAMPLE_1, drag_N: float = 0.0, start_mm: fl
     return Axis(plant, drag_N, start_mm, 0.0, SUBSTEP_S)
 
 
+def steps(duration_s: float) -> int:
+    return round(duration_s / SUBSTEP_S)
+
+
 def at_gap(plant: PlantParameters, gap_mm: float) -> PlantParameters:
     assumed = msgspec.structs.replace(plant.assumed, start_left_mm=gap_mm / 2.0, start_right_mm=gap_mm / 2.0)
     return msgspec.structs.replace(plant, assumed=assumed)
@@ -30,7 +35,7 @@ def at_gap(plant: PlantParameters, gap_mm: float) -> PlantParameters:
 
 def test_no_load_speed_and_current_are_those_of_the_data_sheet() -> None:
     axis = an_axis()
-    for _ in range(2000):
+    for _ in range(steps(0.2)):
         axis.step(12.0, 0.0)
     assert axis.speed_rad_s * 60.0 / math.tau == pytest.approx(150.0, rel=0.05)
     assert axis.current_A == pytest.approx(0.2, abs=0.03)
@@ -40,8 +45,8 @@ def test_stall_torque_and_current_are_those_of_the_data_sheet() -> None:
     electronics = msgspec.structs.replace(SAMPLE_1.electronics, current_limit_A=20.0)
     axis = an_axis(msgspec.structs.replace(SAMPLE_1, electronics=electronics))
     # up to full voltage so slowly that nothing but the torque pushes into the stop
-    for step in range(60_000):
-        axis.step(min(12.0, step * 3e-4), 0.0)
+    for step in range(steps(6.0)):
+        axis.step(min(12.0, step * SUBSTEP_S * 3.0), 0.0)
     assert axis.speed_rad_s == 0.0
     assert axis.current_A == pytest.approx(5.5, rel=0.05)
     torque_Nm = axis.contact_N * (LEAD_M_RAD + axis.screw_friction_m)
@@ -61,8 +66,8 @@ def test_a_plant_too_quick_for_the_substep_is_refused(table: str, key: str, valu
 def test_current_is_limited() -> None:
     axis = an_axis()
     currents = []
-    for step in range(2000):
-        axis.step(12.0 if step < 1000 else -12.0, 0.0)
+    for step in range(steps(0.2)):
+        axis.step(12.0 if step < steps(0.1) else -12.0, 0.0)
         currents.append(axis.current_A)
     assert min(currents) == -5.0
     assert max(currents) <= 5.0
@@ -71,11 +76,11 @@ def test_current_is_limited() -> None:
 def test_under_break_away_voltage_the_screw_truly_stands() -> None:
     axis = an_axis()
     break_away_V = SAMPLE_1.gear.output_friction_Nm / (70.0 * 0.011) * 2.2
-    for _ in range(5000):
+    for _ in range(steps(0.5)):
         axis.step(0.98 * break_away_V, 0.0)
     assert axis.speed_rad_s == 0.0
     assert axis.angle_rad == 0.0
-    for _ in range(5000):
+    for _ in range(steps(0.5)):
         axis.step(1.05 * break_away_V, 0.0)
     assert axis.angle_rad > 0.0
 
@@ -83,9 +88,9 @@ def test_under_break_away_voltage_the_screw_truly_stands() -> None:
 def test_lost_motion_on_reversal_is_backlash_and_twice_the_drag() -> None:
     drag_N = 6.0
     axis = an_axis(drag_N=drag_N)
-    for _ in range(1000):
+    for _ in range(steps(0.1)):
         axis.step(3.0, 0.0)
-    for _ in range(1000):
+    for _ in range(steps(0.1)):
         axis.step(None, 0.0)
     turned_at, stood_at = axis.angle_rad, axis.position_m
     lost_m = 0.0
@@ -98,17 +103,17 @@ def test_lost_motion_on_reversal_is_backlash_and_twice_the_drag() -> None:
 def test_magnets_stronger_than_drag_keep_the_nut_on_one_flank() -> None:
     axis = an_axis(drag_N=6.0)
     for volts in (3.0, -3.0, 3.0):
-        for step in range(500):
+        for step in range(steps(0.05)):
             axis.step(volts, 20.0)
             # the first movement takes up the backlash from the unloaded start
-            if volts < 0.0 or step > 250:
+            if volts < 0.0 or step > steps(0.025):
                 assert 14.0 - 1e-6 <= axis.contact_N <= 26.0 + 1e-6
 
 
 def test_the_stops_hold_against_full_drive() -> None:
     for volts, stop_mm in ((12.0, 48.0), (-12.0, 22.0)):
         axis = an_axis(start_mm=35.0)
-        for _ in range(20_000):
+        for _ in range(steps(2.0)):
             axis.step(volts, 30.0)
         assert axis.position_m * 1e3 == pytest.approx(stop_mm, abs=1e-9)
         assert axis.speed_rad_s == pytest.approx(0.0, abs=0.05)
@@ -150,19 +155,48 @@ def test_a_worn_gearbox_lets_the_magnets_close_the_gap_where_the_margin_is_negat
     assert plant.gap_mm == pytest.approx(90.0, abs=1e-6)
 
 
-def test_halving_the_substep_changes_little() -> None:
-    def travel(substep_s: float) -> list[float]:
-        plant = Plant(SAMPLE_1, SteadyHand(), substep_s=substep_s)
-        gaps = []
-        for left_V, right_V in ((-12.0, -12.0), (6.0, -3.0), (0.0, 0.0), (12.0, 12.0), (-4.0, 1.0), (0.2, 0.2)):
-            for _ in range(10):
-                plant.advance(0.01, left_V, right_V, left_on=True, right_on=True)
-                gaps.append(plant.gap_mm)
-        return gaps
+HARD_MOTIONS: dict[str, Callable[[float], tuple[float, float]]] = {
+    "full voltage that turns round": lambda time_s: (12.0, 12.0) if time_s % 0.2 < 0.1 else (-12.0, -12.0),
+    "slow reversals": lambda time_s: (2.0 * math.sin(7.5 * time_s),) * 2,
+    "sticking": lambda time_s: (1.2 * math.sin(31.0 * time_s), -1.2 * math.sin(31.0 * time_s)),
+    "both for themselves": lambda time_s: ((-12.0, 6.0), (6.0, -3.0), (0.0, 0.0), (12.0, -12.0))[int(time_s * 20) % 4],
+}
 
-    whole, half = travel(SUBSTEP_S), travel(SUBSTEP_S / 2.0)
-    assert max(whole) - min(whole) > 3.0
-    assert max(abs(a - b) for a, b in zip(whole, half, strict=True)) < 0.01
+
+@pytest.mark.parametrize("drag_left_N", [6.0, 50.0], ids=["one flank", "through the backlash"])
+@pytest.mark.parametrize("motion", HARD_MOTIONS)
+def test_the_substep_is_fine_enough_for_hard_motion(motion: str, drag_left_N: float) -> None:
+    """Against substeps of 0.01 ms; voltages change between substeps, and screws are read there too."""
+    screw = msgspec.structs.replace(SAMPLE_1.screw, drag_left_N=drag_left_N)
+    parameters = at_gap(msgspec.structs.replace(SAMPLE_1, screw=screw), 60.0)
+
+    def path(substep_s: float) -> tuple[list[float], ...]:
+        plant = Plant(parameters, ReversingHand(0.5), substep_s=substep_s)
+        gaps_um, forces_mN, screws_um, currents_mA = [], [], [], []
+        left_V = right_V = 0.0
+        for tick in range(400):
+            plant.advance(0.13e-3, left_V, right_V, left_on=True, right_on=True)
+            left_V, right_V = HARD_MOTIONS[motion](tick * 1e-3)
+            plant.advance(0.27e-3, left_V, right_V, left_on=True, right_on=True)
+            screws_um.append(plant.screws_rad[0] * LEAD_M_RAD * 1e6)
+            currents_mA.append(plant.currents_A[0] * 1e3)
+            plant.advance(0.60e-3, left_V, right_V, left_on=True, right_on=True)
+            gaps_um.append(plant.gap_mm * 1e3)
+            forces_mN.append(plant.truth.force_N * 1e3)
+        return gaps_um, forces_mN, screws_um, currents_mA
+
+    def most(coarse: list[float], fine: list[float]) -> float:
+        return max(abs(a - b) for a, b in zip(coarse, fine, strict=True))
+
+    coarse, fine = path(SUBSTEP_S), path(1e-5)
+    assert max(fine[0]) - min(fine[0]) > 50.0
+    gap_um, force_mN, screw_um, current_mA = (most(a, b) for a, b in zip(coarse, fine, strict=True))
+    assert gap_um < 4.0
+    assert force_mN < 0.4
+    # one count of the encoders
+    assert screw_um < 1.8
+    # 24 V more, 0.27 ms ago
+    assert current_mA < 400.0
 
 
 @settings(max_examples=25, deadline=None)
@@ -179,7 +213,7 @@ def test_no_energy_comes_from_nowhere(volts: list[float | None], wear: float) ->
     attraction_N = 40.0
     put_in_J = throughput_J = 0.0
     for volt in volts:
-        for _ in range(300):
+        for _ in range(steps(0.03)):
             before_m, angle_rad = axis.position_m, axis.angle_rad
             axis.step(volt, attraction_N)
             # work on the rotor by the current of the step, and by the magnets on the carriage
@@ -193,7 +227,7 @@ def test_no_energy_comes_from_nowhere(volts: list[float | None], wear: float) ->
 
 def test_friction_takes_a_turning_screw_to_rest_and_never_back() -> None:
     axis = an_axis()
-    for _ in range(500):
+    for _ in range(steps(0.05)):
         axis.step(12.0, 0.0)
     speeds = []
     while axis.speed_rad_s != 0.0:
@@ -202,6 +236,6 @@ def test_friction_takes_a_turning_screw_to_rest_and_never_back() -> None:
     assert all(after < before for before, after in itertools.pairwise(speeds))
     assert min(speeds) == 0.0
     resting_at = axis.angle_rad
-    for _ in range(1000):
+    for _ in range(steps(0.1)):
         axis.step(None, 0.0)
     assert axis.angle_rad == resting_at

@@ -181,11 +181,12 @@ class MessageDevice:
             switches |= Switches.RIGHT_CLOSED
         left_counts, right_counts = self._encoders()
         left_start, right_start = self._counts_at_boot
+        left_A, right_A = plant.currents_A
         return Sensors(
             left_counts - left_start,
             right_counts - right_start,
-            left.current_A,
-            right.current_A,
+            left_A,
+            right_A,
             plant.sensed_force_N,
             math.floor(plant.handle_mm * self._handle_counts_per_mm),
             switches,
@@ -194,10 +195,11 @@ class MessageDevice:
         )
 
     def _encoders(self) -> tuple[int, int]:
-        left_counts = math.floor(self.plant.left.angle_rad * self._counts_per_rad)
-        if self._stuck_left is not None:
-            left_counts = self._stuck_left
-        return left_counts, math.floor(self.plant.right.angle_rad * self._counts_per_rad)
+        left_rad, right_rad = self.plant.screws_rad
+        left_counts = self._stuck_left
+        if left_counts is None:
+            left_counts = math.floor(left_rad * self._counts_per_rad)
+        return left_counts, math.floor(right_rad * self._counts_per_rad)
 
     def _strike(self, time_s: float, fault: Fault) -> None:
         match fault.name:

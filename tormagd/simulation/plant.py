@@ -12,8 +12,8 @@ from tormagd.simulation.element import Curve, Element
 from tormagd.simulation.hand import Hand
 from tormagd.simulation.parameters import PlantParameters
 
-SUBSTEP_S = 1e-4
-"""Step of motors and screws: a seventh of the motors' electrical time constant, 1/150 of the mechanical one."""
+SUBSTEP_S = 5e-4
+"""Step of motors and screws, under the motors' electrical time constant; see `Axis` for what it leaves out."""
 
 ELEMENT_STEP_S = 1e-3
 """Step of the element and the hand; the element's updates are exact over it."""
@@ -55,7 +55,9 @@ class Holding(NamedTuple):
 class Plant:
     """The device without its electronics, in fixed substeps of its own time; see `Axis` and `Element` for the laws.
 
-    `advance` may be called with any time step; the remainder of a substep is kept for the next call.
+    `advance` may be called with any time step; the remainder of a substep is kept for the next call. A voltage that
+    changes within a substep acts in it with its mean. Screws and currents can be read within a substep; the rest of the
+    state is that at its beginning.
     """
 
     def __init__(self, parameters: PlantParameters, hand: Hand, seed: int = 0, *, substep_s: float = SUBSTEP_S) -> None:
@@ -75,6 +77,10 @@ class Plant:
         self.handle_mm_s = 0.0
         self._force_sensor = ForceSensor(parameters, random.Random(seed))
         self._target_s = 0.0
+        self._left_V = self._right_V = 0.0
+        self._left_on = self._right_on = False
+        self._left_early_V = self._right_early_V = 0.0
+        """What the voltages before the present ones add to the mean over the substep that has begun."""
         self._substeps = 0
 
     @property
@@ -93,21 +99,39 @@ class Plant:
         return self._force_sensor.reading_N
 
     @property
+    def screws_rad(self) -> tuple[float, float]:
+        """Angles of the screws, left and right, now, which may be within a substep."""
+        age_s = self._target_s - self._substeps * self._substep_s
+        return self.left.angle_after_rad(age_s), self.right.angle_after_rad(age_s)
+
+    @property
+    def currents_A(self) -> tuple[float, float]:
+        """Currents of the motors, left and right, now."""
+        age_s = self._target_s - self._substeps * self._substep_s
+        if age_s < self._substep_s * _ROUNDING:
+            return self.left.current_A, self.right.current_A
+        early = self._substep_s / age_s
+        return (
+            self.left.current_after_A(age_s, self._left_V + early * self._left_early_V if self._left_on else None),
+            self.right.current_after_A(age_s, self._right_V + early * self._right_early_V if self._right_on else None),
+        )
+
+    @property
     def truth(self) -> Truth:
         """The state at `time_s`; force and handle are at the last whole millisecond."""
         left, right, element = self.left, self.right, self.element
         return Truth(
-            time_s=self.time_s,
-            force_N=element.force_N,
-            gap_mm=self.gap_mm,
-            left_mm=left.position_m * 1e3,
-            right_mm=right.position_m * 1e3,
-            left_A=left.current_A,
-            right_A=right.current_A,
-            temperature_C=element.temperature_C,
-            handle_mm=self.handle_mm,
-            handle_mm_s=self.handle_mm_s,
-            kinetic_N=element.kinetic_N,
+            self._substeps * self._substep_s,
+            element.force_N,
+            (left.position_m + right.position_m) * 1e3,
+            left.position_m * 1e3,
+            right.position_m * 1e3,
+            left.current_A,
+            right.current_A,
+            element.temperature_C,
+            self.handle_mm,
+            self.handle_mm_s,
+            element.kinetic_N,
         )
 
     def advance(self, dt_s: float, left_V: float, right_V: float, left_on: bool, right_on: bool) -> None:
@@ -117,15 +141,24 @@ class Plant:
         """
         if not (0.0 <= dt_s < math.inf and abs(left_V) < math.inf and abs(right_V) < math.inf):
             raise ValueError(f"dt_s = {dt_s}, left_V = {left_V}, right_V = {right_V}: allowed are finite, dt_s >= 0")
+        if left_V != self._left_V or right_V != self._right_V:
+            share = self._target_s / self._substep_s - self._substeps
+            self._left_early_V += share * (self._left_V - left_V)
+            self._right_early_V += share * (self._right_V - right_V)
+            self._left_V, self._right_V = left_V, right_V
+        self._left_on, self._right_on = left_on, right_on
         self._target_s += dt_s
         due = int(self._target_s / self._substep_s + _ROUNDING)
-        left_drive = left_V if left_on else None
-        right_drive = right_V if right_on else None
+        if due == self._substeps:
+            return
         left, right, pull_at, per_element = self.left, self.right, self._attraction.at, self._substeps_per_element
+        left_mean_V, right_mean_V = left_V + self._left_early_V, right_V + self._right_early_V
+        self._left_early_V = self._right_early_V = 0.0
         for substep in range(self._substeps + 1, due + 1):
             pull_N = pull_at((left.position_m + right.position_m) * 1e3)
-            left.step(left_drive, pull_N)
-            right.step(right_drive, pull_N)
+            left.step(left_mean_V if left_on else None, pull_N)
+            right.step(right_mean_V if right_on else None, pull_N)
+            left_mean_V, right_mean_V = left_V, right_V
             if substep % per_element == 0:
                 self._advance_element(substep * self._substep_s)
         self._substeps = due
