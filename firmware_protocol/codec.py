@@ -5,12 +5,12 @@ rounding to the nearest step, range checks and the CRC-8 of the protected messag
 carries the payloads over a serial line, and on CAN they are the data bytes.
 """
 
-import operator
 import struct
 from collections.abc import Callable, Iterable
 from enum import Enum
 from functools import cache
-from typing import Any, Final, NamedTuple
+from operator import index
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from firmware_protocol.layouts import (
     LAYOUTS,
@@ -95,17 +95,10 @@ def crc8(data: bytes) -> int:
     return register ^ CRC8_FINAL_XOR
 
 
-class _Field(NamedTuple):
-    """A signal with everything computed that one pass over a message needs.
-
-    `scale` is None for whole numbers; `member` gives the enumeration's member of a step, and is None elsewhere.
-    """
-
-    scale: float | None
-    lowest: int
-    highest: int
-    wraps: bool
-    member: Callable[[int], Any] | None
+_Field: TypeAlias = tuple[float | None, int, int, bool, Callable[[int], Any] | None]
+"""A signal with everything computed that one pass over a message needs: scale (None for whole numbers), lowest and
+highest step, whether it wraps, and, for an enumeration, what gives the member of a step.
+"""
 
 
 class _Codec(NamedTuple):
@@ -123,7 +116,7 @@ def _field(signal: Signal) -> _Field:
     scale = float(signal.scale) if signal.type is float else None
     # An enumeration's own look-up takes five times as long. The cache is bounded: steps are range-checked before.
     member = cache(signal.type) if issubclass(signal.type, Enum) else None
-    return _Field(scale, signal.lowest, signal.highest, signal.wraps, member)
+    return scale, signal.lowest, signal.highest, signal.wraps, member
 
 
 def _codec(layout: Layout) -> _Codec:
@@ -168,11 +161,12 @@ def encode(message: Message) -> bytes:
     codec = _BY_TYPE.get(type(message))
     if codec is None:
         raise EncodeError(f"{message!r} is not a message of this protocol")
+    _, function_byte, pack, _, _, protected, fields, _ = codec
     values: tuple[Any, ...] = message
     steps: list[int] = []
     try:
-        for value, (scale, lowest, highest, wraps, _) in zip(values, codec.fields, strict=True):
-            step = operator.index(value) if scale is None else round(value / scale)
+        for place, (scale, lowest, highest, wraps, _) in enumerate(fields):
+            step = index(values[place]) if scale is None else round(values[place] / scale)
             if not lowest <= step <= highest:
                 if not wraps:
                     raise _refusal(message, codec, len(steps))
@@ -182,8 +176,8 @@ def encode(message: Message) -> bytes:
         raise
     except (TypeError, ValueError, OverflowError) as error:  # not a number, NaN, infinite
         raise _refusal(message, codec, len(steps)) from error
-    body = codec.pack(*steps)
-    return body + bytes((crc8(codec.function_byte + body),)) if codec.protected else body
+    body = pack(*steps)
+    return body + bytes((crc8(function_byte + body),)) if protected else body
 
 
 def _refusal(message: Message, codec: _Codec, index: int) -> EncodeError:
@@ -202,25 +196,27 @@ def decode(function: int, payload: bytes | bytearray) -> Message:
     codec = _BY_FUNCTION.get(function)
     if codec is None:
         raise DecodeError(f"function {function}: known are {', '.join(map(str, _BY_FUNCTION))}")
-    if len(payload) != codec.length:
-        raise DecodeError(f"{_name(codec)}: {codec.length} bytes expected, {len(payload)} received")
-    steps = codec.unpack(payload)
-    if codec.protected:
-        expected = crc8(codec.function_byte + payload[:-1])
+    _, function_byte, _, unpack, length, protected, fields, make = codec
+    if len(payload) != length:
+        raise DecodeError(f"{_name(codec)}: {length} bytes expected, {len(payload)} received")
+    steps = unpack(payload)
+    if protected:
+        expected = crc8(function_byte + payload[:-1])
         if steps[-1] != expected:
             raise DecodeError(
                 f"{_name(codec)}: CRC {expected:#04x} expected, {steps[-1]:#04x} received ({payload.hex()})"
             )
     values: list[float] = []
-    for step, (scale, lowest, highest, _, member) in zip(steps, codec.fields, strict=False):  # the CRC stays over
+    for place, (scale, lowest, highest, _, member) in enumerate(fields):
+        step = steps[place]
         if not lowest <= step <= highest:
-            signal = codec.layout.signals[len(values)]
+            signal = codec.layout.signals[place]
             raise DecodeError(
                 f"{_name(codec)}.{signal.name}: {signal.minimum:.10g} to {signal.maximum:.10g} expected, "
                 f"{step * signal.scale:.10g} received"
             )
         values.append(step * scale if scale is not None else step if member is None else member(step))
-    return codec.make(values)
+    return make(values)
 
 
 def _name(codec: _Codec) -> str:

@@ -22,6 +22,8 @@ HEADER_LENGTH: Final = 2
 MAX_PAYLOAD: Final = 8
 MAX_ENCODED: Final = 1 + HEADER_LENGTH + MAX_PAYLOAD + CRC_LENGTH
 """Longest frame before its delimiter; under 254 bytes, COBS adds exactly one."""
+_DISTANCES: Final = [bytes((length + 1,)) for length in range(254)]
+"""What stands before a run of so many bytes."""
 
 
 class Frame(NamedTuple):
@@ -51,7 +53,7 @@ class FramingStatistics:
 
 def cobs_encode(data: bytes) -> bytes:
     """`data` (under 254 bytes) without zeros: each zero, and one before the start, becomes the distance to the next."""
-    return b"".join(bytes((len(run) + 1,)) + run for run in data.split(DELIMITER))
+    return b"".join([_DISTANCES[len(run)] + run for run in data.split(DELIMITER)])
 
 
 def cobs_decode(data: bytes) -> bytes | None:

@@ -174,8 +174,9 @@ def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> Modell
     counts_per_rad = parameters.electronics.encoder_counts_per_rev / math.tau
     count = round(MODEL_S / TICK_S)
     measured = np.zeros(count + 1)
+    plant.drive(volts, volts)
     for tick in range(1, count + 1):
-        plant.advance(TICK_S, volts, volts, left_on=True, right_on=True)
+        plant.advance(TICK_S)
         turned = [round(axis.angle_rad * counts_per_rad) for axis in (plant.left, plant.right)]
         measured[tick] = sum(turned) / 2.0 / counts_per_rad * motor.screw_lead_mm / math.tau
     geared = msgspec.structs.replace(motor, inertia_kg_m2=motor.inertia_kg_m2 / motor.gear_efficiency)
@@ -252,7 +253,8 @@ def bang_bang(parameters: PlantParameters, start_mm: float, distance_mm: float, 
         time_s = count * tick
         applied = volts if time_s <= switch_s else -volts
         before = plant.gap_mm
-        plant.advance(tick, applied, applied, left_on=True, right_on=True)
+        plant.drive(applied, applied)
+        plant.advance(tick)
         gaps.append(plant.gap_mm)
         is_turning = time_s > switch_s and (plant.gap_mm - before) * distance_mm <= 0.0
         if is_turning or time_s > 6.0:

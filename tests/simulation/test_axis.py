@@ -137,7 +137,7 @@ def test_attraction_and_holding_margin_over_the_stroke(name: str) -> None:
 @pytest.mark.parametrize("gap_mm", [45.5, 60.0, 75.0, 94.0])
 def test_the_carriages_hold_with_the_power_off(name: str, gap_mm: float) -> None:
     plant = Plant(at_gap(load_plant(name), gap_mm), SteadyHand())
-    plant.advance(1.0, 0.0, 0.0, left_on=False, right_on=False)
+    plant.advance(1.0)
     # nothing but the contact's springs: the screws do not turn at all
     assert plant.gap_mm == pytest.approx(gap_mm, abs=1e-6)
     assert plant.left.angle_rad == plant.right.angle_rad == 0.0
@@ -149,7 +149,7 @@ def test_a_worn_gearbox_lets_the_magnets_close_the_gap_where_the_margin_is_negat
     for gap_mm in (46.0, 90.0):
         plant = Plant(at_gap(parameters, gap_mm), SteadyHand())
         plant.wear(4.0)
-        plant.advance(3.0, 0.0, 0.0, left_on=False, right_on=False)
+        plant.advance(3.0)
         closes = min(holding_over_stroke(parameters, wear=4.0), key=lambda row: abs(row.gap_mm - gap_mm)).margin_Nm < 0
         assert (plant.gap_mm < gap_mm - 1.0) is closes, plant.truth
     assert plant.gap_mm == pytest.approx(90.0, abs=1e-6)
@@ -173,14 +173,14 @@ def test_the_substep_is_fine_enough_for_hard_motion(motion: str, drag_left_N: fl
     def path(substep_s: float) -> tuple[list[float], ...]:
         plant = Plant(parameters, ReversingHand(0.5), substep_s=substep_s)
         gaps_um, forces_mN, screws_um, currents_mA = [], [], [], []
-        left_V = right_V = 0.0
         for tick in range(400):
-            plant.advance(0.13e-3, left_V, right_V, left_on=True, right_on=True)
-            left_V, right_V = HARD_MOTIONS[motion](tick * 1e-3)
-            plant.advance(0.27e-3, left_V, right_V, left_on=True, right_on=True)
-            screws_um.append(plant.screws_rad[0] * LEAD_M_RAD * 1e6)
-            currents_mA.append(plant.currents_A[0] * 1e3)
-            plant.advance(0.60e-3, left_V, right_V, left_on=True, right_on=True)
+            plant.advance(0.13e-3)
+            plant.drive(*HARD_MOTIONS[motion](tick * 1e-3))
+            plant.advance(0.27e-3)
+            (angle_rad, current_A), _ = plant.shafts
+            screws_um.append(angle_rad * LEAD_M_RAD * 1e6)
+            currents_mA.append(current_A * 1e3)
+            plant.advance(0.60e-3)
             gaps_um.append(plant.gap_mm * 1e3)
             forces_mN.append(plant.truth.force_N * 1e3)
         return gaps_um, forces_mN, screws_um, currents_mA

@@ -107,7 +107,7 @@ def test_the_brake_gives_the_hand_no_energy_over_its_reversals() -> None:
     directions = set()
     for _ in range(8000):
         before_mm = plant.handle_mm
-        plant.advance(STEP_S, 0.0, 0.0, left_on=False, right_on=False)
+        plant.advance(STEP_S)
         work_J += plant.truth.force_N * (plant.handle_mm - before_mm) * 1e-3
         stored_J = 0.5 * plant.truth.force_N**2 / 8.0 * 1e-3
         assert work_J >= stored_J - 1e-6
@@ -121,7 +121,7 @@ def test_the_brake_gives_the_hand_no_energy_over_its_reversals() -> None:
 def readings(plant: Plant, milliseconds: int) -> list[float]:
     values = []
     for _ in range(milliseconds):
-        plant.advance(STEP_S, 0.0, 0.0, left_on=False, right_on=False)
+        plant.advance(STEP_S)
         values.append(plant.sensed_force_N)
     return values
 
@@ -146,7 +146,7 @@ def test_force_sensor_shows_the_force_of_its_delay_ago(delay_ms: float, rate_Hz:
     forces = []
     period_ms = round(1000.0 / rate_Hz)
     for millisecond in range(1, 600):
-        plant.advance(STEP_S, 0.0, 0.0, left_on=False, right_on=False)
+        plant.advance(STEP_S)
         forces.append(plant.truth.force_N)
         sampled_ms = (millisecond - round(delay_ms)) // period_ms * period_ms
         if sampled_ms >= period_ms:
@@ -158,7 +158,7 @@ def test_force_sensor_offset_drifts_at_the_stated_rate() -> None:
     signs = set()
     for seed in range(6):
         plant = Plant(msgspec.structs.replace(SAMPLE_1, force_sensor=sensor), SteadyHand(), seed)
-        plant.advance(2.0, 0.0, 0.0, left_on=False, right_on=False)
+        plant.advance(2.0)
         offset_N = plant.sensed_force_N - plant.truth.force_N
         assert abs(offset_N) == pytest.approx(0.02, rel=0.01)
         signs.add(offset_N > 0.0)
@@ -167,16 +167,24 @@ def test_force_sensor_offset_drifts_at_the_stated_rate() -> None:
 
 def test_time_may_be_cut_in_any_way() -> None:
     whole = Plant(SAMPLE_1, SteadyHand(), seed=1)
-    whole.advance(0.3, -6.0, -5.0, left_on=True, right_on=True)
+    whole.drive(-6.0, -5.0)
+    whole.advance(0.3)
     pieces = Plant(SAMPLE_1, SteadyHand(), seed=1)
+    pieces.drive(-6.0, -5.0)
     for _ in range(3000):
-        pieces.advance(0.3 / 3000 / 3, -6.0, -5.0, left_on=True, right_on=True)
-        pieces.advance(0.3 / 3000 * 2 / 3, -6.0, -5.0, left_on=True, right_on=True)
+        pieces.advance(0.3 / 3000 / 3)
+        pieces.advance(0.3 / 3000 * 2 / 3)
     assert pieces.truth == whole.truth
     assert pieces.sensed_force_N == whole.sensed_force_N
 
 
-@pytest.mark.parametrize("arguments", [(-1e-3, 0.0, 0.0), (float("nan"), 0.0, 0.0), (1e-3, float("inf"), 0.0)])
-def test_impossible_steps_are_refused(arguments: tuple[float, float, float]) -> None:
-    with pytest.raises(ValueError, match="finite"):
-        Plant(SAMPLE_1, SteadyHand()).advance(*arguments, left_on=True, right_on=True)
+@pytest.mark.parametrize("dt_s", [-1e-3, float("nan"), float("inf")])
+def test_impossible_steps_are_refused(dt_s: float) -> None:
+    with pytest.raises(ValueError, match="dt_s .* finite"):
+        Plant(SAMPLE_1, SteadyHand()).advance(dt_s)
+
+
+@pytest.mark.parametrize("voltages", [(float("inf"), 0.0), (None, float("nan"))])
+def test_impossible_voltages_are_refused(voltages: tuple[float | None, float | None]) -> None:
+    with pytest.raises(ValueError, match="_V .* finite"):
+        Plant(SAMPLE_1, SteadyHand()).drive(*voltages)

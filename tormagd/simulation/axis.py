@@ -177,18 +177,16 @@ class Axis:
         else:
             self.contact_N = 0.0
 
-    def angle_after_rad(self, age_s: float) -> float:
-        """The screw's angle that long after the last step, within the next."""
-        return self.angle_rad + age_s * self.speed_rad_s
-
-    def current_after_A(self, age_s: float, voltage_V: float | None) -> float:
-        """The current that long after the last step, within the next, with that mean voltage since."""
+    def shaft_after(self, age_s: float, voltage_V: float | None) -> tuple[float, float]:
+        """(angle_rad, current_A) that long after the last step and within the next, with that mean voltage since."""
+        speed_rad_s = self.speed_rad_s
+        angle_rad = self.angle_rad + age_s * speed_rad_s
         if voltage_V is None:
-            return 0.0
-        settled_A = (voltage_V - self._coupling_Nm_A * self.speed_rad_s) / self._resistance_Ohm
+            return angle_rad, 0.0
+        settled_A = (voltage_V - self._coupling_Nm_A * speed_rad_s) / self._resistance_Ohm
         current_A = settled_A + (self.current_A - settled_A) * math.exp(-age_s / self._electrical_time_s)
         limit_A = self._current_limit_A
-        return -limit_A if current_A < -limit_A else limit_A if current_A > limit_A else current_A
+        return angle_rad, -limit_A if current_A < -limit_A else limit_A if current_A > limit_A else current_A
 
     def _lead_of(self, contact_N: float) -> float:
         """How far the nut is outward of the carriage, m, when it pushes with that force."""

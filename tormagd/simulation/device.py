@@ -71,8 +71,6 @@ class MessageDevice:
         self._answers: deque[tuple[float, Answer]] = deque()
         self._deaf = False
         self._output: Output = OFF
-        self._voltages_V = (0.0, 0.0)
-        """What the bridges make of `_output` from the supply."""
         self._stuck_left: int | None = None
         self._counts_at_boot = (0, 0)
         self._boot_s = 0.0
@@ -105,6 +103,8 @@ class MessageDevice:
                 self._send_answer(event_s, answers.popleft()[1])
             else:
                 self._tick(event_s)
+            if self.firmware.output is not self._output:
+                self._switch()
         self._pass_time(now_s)
 
     @property
@@ -118,16 +118,17 @@ class MessageDevice:
         return event_s if event_s > self._time_s else self._time_s
 
     def _pass_time(self, time_s: float) -> None:
-        if time_s == self._time_s:
-            return
-        output = self.firmware.output
-        if output is not self._output:
-            self._output = output
-            self._voltages_V = self._volts(output.left_duty), self._volts(output.right_duty)
-        left_V, right_V = self._voltages_V
-        powered = output.enabled and self._supply_V > 0.0
-        self.plant.advance(time_s - self._time_s, left_V, right_V, left_on=powered, right_on=powered)
-        self._time_s = time_s
+        if time_s > self._time_s:
+            self.plant.advance(time_s - self._time_s)
+            self._time_s = time_s
+
+    def _switch(self) -> None:
+        """Let the bridges do what the firmware wants of them now."""
+        self._output = output = self.firmware.output
+        if output.enabled and self._supply_V > 0.0:
+            self.plant.drive(self._volts(output.left_duty), self._volts(output.right_duty))
+        else:
+            self.plant.drive(None, None)
 
     def _volts(self, duty: float) -> float:
         return round(duty * self._pwm_steps) / self._pwm_steps * self._supply_V
@@ -169,22 +170,24 @@ class MessageDevice:
 
     def _sensors(self) -> Sensors:
         plant = self.plant
-        left, right = plant.left, plant.right
+        left_m, right_m = plant.left.position_m, plant.right.position_m
         switches = NO_SWITCH
-        if left.position_m >= self._home_m:
+        if left_m >= self._home_m:
             switches |= Switches.LEFT_OPEN
-        elif left.position_m <= self._closed_m:
+        elif left_m <= self._closed_m:
             switches |= Switches.LEFT_CLOSED
-        if right.position_m >= self._home_m:
+        if right_m >= self._home_m:
             switches |= Switches.RIGHT_OPEN
-        elif right.position_m <= self._closed_m:
+        elif right_m <= self._closed_m:
             switches |= Switches.RIGHT_CLOSED
-        left_counts, right_counts = self._encoders()
+        (left_rad, left_A), (right_rad, right_A) = plant.shafts
+        left_counts = self._stuck_left
+        if left_counts is None:
+            left_counts = math.floor(left_rad * self._counts_per_rad)
         left_start, right_start = self._counts_at_boot
-        left_A, right_A = plant.currents_A
         return Sensors(
             left_counts - left_start,
-            right_counts - right_start,
+            math.floor(right_rad * self._counts_per_rad) - right_start,
             left_A,
             right_A,
             plant.sensed_force_N,
@@ -194,13 +197,6 @@ class MessageDevice:
             plant.element.temperature_C,
         )
 
-    def _encoders(self) -> tuple[int, int]:
-        left_rad, right_rad = self.plant.screws_rad
-        left_counts = self._stuck_left
-        if left_counts is None:
-            left_counts = math.floor(left_rad * self._counts_per_rad)
-        return left_counts, math.floor(right_rad * self._counts_per_rad)
-
     def _strike(self, time_s: float, fault: Fault) -> None:
         match fault.name:
             case "worn_gearbox":
@@ -208,17 +204,19 @@ class MessageDevice:
             case "drag_left":
                 self.plant.left.drag_N *= 1.0 + fault.percent / 100.0
             case "encoder_stuck_left":
-                self._stuck_left = self._encoders()[0]
+                self._stuck_left = self._sensors().left_counts + self._counts_at_boot[0]
             case "reset":
                 self.firmware = self._boot(self.parameters)
                 self._answers.clear()
-                self._counts_at_boot = self._encoders()
+                sensors, (left_start, right_start) = self._sensors(), self._counts_at_boot
+                self._counts_at_boot = sensors.left_counts + left_start, sensors.right_counts + right_start
                 self._boot_s = time_s
                 self._ticks = 0
             case "commands_vanish":
                 self._deaf = True
             case "supply_loss":
                 self._supply_V = 0.0
+                self._switch()
             case _:
                 raise ValueError(f"fault {fault.name!r} has no effect defined")
 
@@ -316,5 +314,7 @@ class VirtualDevice:
 
 def _stretches(data: bytes) -> list[bytes]:
     """`data` cut behind each delimiter, because a frame has arrived when its delimiter has."""
+    if data.find(DELIMITER) == len(data) - 1:  # one frame, as nearly always
+        return [data]
     *ended, rest = data.split(DELIMITER)
     return [*(stretch + DELIMITER for stretch in ended), rest]

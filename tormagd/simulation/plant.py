@@ -57,7 +57,7 @@ class Plant:
 
     `advance` may be called with any time step; the remainder of a substep is kept for the next call. A voltage that
     changes within a substep acts in it with its mean. Screws and currents can be read within a substep; the rest of the
-    state is that at its beginning.
+    state is that at its beginning. At power-on both bridges are open.
     """
 
     def __init__(self, parameters: PlantParameters, hand: Hand, seed: int = 0, *, substep_s: float = SUBSTEP_S) -> None:
@@ -77,8 +77,8 @@ class Plant:
         self.handle_mm_s = 0.0
         self._force_sensor = ForceSensor(parameters, random.Random(seed))
         self._target_s = 0.0
-        self._left_V = self._right_V = 0.0
-        self._left_on = self._right_on = False
+        self._left_V: float | None = None
+        self._right_V: float | None = None
         self._left_early_V = self._right_early_V = 0.0
         """What the voltages before the present ones add to the mean over the substep that has begun."""
         self._substeps = 0
@@ -99,21 +99,16 @@ class Plant:
         return self._force_sensor.reading_N
 
     @property
-    def screws_rad(self) -> tuple[float, float]:
-        """Angles of the screws, left and right, now, which may be within a substep."""
+    def shafts(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """(angle_rad, current_A) of the left and the right motor's screw now, which may be within a substep."""
+        left, right, left_V, right_V = self.left, self.right, self._left_V, self._right_V
         age_s = self._target_s - self._substeps * self._substep_s
-        return self.left.angle_after_rad(age_s), self.right.angle_after_rad(age_s)
-
-    @property
-    def currents_A(self) -> tuple[float, float]:
-        """Currents of the motors, left and right, now."""
-        age_s = self._target_s - self._substeps * self._substep_s
-        if age_s < self._substep_s * _ROUNDING:
-            return self.left.current_A, self.right.current_A
+        if age_s < _ROUNDING * self._substep_s:
+            return (left.angle_rad, left.current_A), (right.angle_rad, right.current_A)
         early = self._substep_s / age_s
         return (
-            self.left.current_after_A(age_s, self._left_V + early * self._left_early_V if self._left_on else None),
-            self.right.current_after_A(age_s, self._right_V + early * self._right_early_V if self._right_on else None),
+            left.shaft_after(age_s, None if left_V is None else left_V + early * self._left_early_V),
+            right.shaft_after(age_s, None if right_V is None else right_V + early * self._right_early_V),
         )
 
     @property
@@ -134,30 +129,32 @@ class Plant:
             element.kinetic_N,
         )
 
-    def advance(self, dt_s: float, left_V: float, right_V: float, left_on: bool, right_on: bool) -> None:
-        """Let time pass with these voltages at the motors; a bridge that is not on is open.
+    def drive(self, left_V: float | None, right_V: float | None) -> None:
+        """Put these voltages at the motors from now on; None opens a bridge. Raises ValueError if not finite."""
+        if not (abs(left_V or 0.0) < math.inf and abs(right_V or 0.0) < math.inf):
+            raise ValueError(f"left_V = {left_V}, right_V = {right_V}: allowed are finite voltages and None")
+        share = self._target_s / self._substep_s - self._substeps
+        self._left_early_V += share * ((self._left_V or 0.0) - (left_V or 0.0))
+        self._right_early_V += share * ((self._right_V or 0.0) - (right_V or 0.0))
+        self._left_V, self._right_V = left_V, right_V
 
-        Raises ValueError for a time step that is negative or anything that is not finite.
-        """
-        if not (0.0 <= dt_s < math.inf and abs(left_V) < math.inf and abs(right_V) < math.inf):
-            raise ValueError(f"dt_s = {dt_s}, left_V = {left_V}, right_V = {right_V}: allowed are finite, dt_s >= 0")
-        if left_V != self._left_V or right_V != self._right_V:
-            share = self._target_s / self._substep_s - self._substeps
-            self._left_early_V += share * (self._left_V - left_V)
-            self._right_early_V += share * (self._right_V - right_V)
-            self._left_V, self._right_V = left_V, right_V
-        self._left_on, self._right_on = left_on, right_on
-        self._target_s += dt_s
-        due = int(self._target_s / self._substep_s + _ROUNDING)
+    def advance(self, dt_s: float) -> None:
+        """Let time pass. Raises ValueError for a time step that is negative or not finite."""
+        if not 0.0 <= dt_s < math.inf:
+            raise ValueError(f"dt_s = {dt_s}: allowed are finite times from 0 on")
+        self._target_s = target_s = self._target_s + dt_s
+        due = int(target_s / self._substep_s + _ROUNDING)
         if due == self._substeps:
             return
         left, right, pull_at, per_element = self.left, self.right, self._attraction.at, self._substeps_per_element
-        left_mean_V, right_mean_V = left_V + self._left_early_V, right_V + self._right_early_V
+        left_V, right_V = self._left_V, self._right_V
+        left_mean_V = None if left_V is None else left_V + self._left_early_V
+        right_mean_V = None if right_V is None else right_V + self._right_early_V
         self._left_early_V = self._right_early_V = 0.0
         for substep in range(self._substeps + 1, due + 1):
             pull_N = pull_at((left.position_m + right.position_m) * 1e3)
-            left.step(left_mean_V if left_on else None, pull_N)
-            right.step(right_mean_V if right_on else None, pull_N)
+            left.step(left_mean_V, pull_N)
+            right.step(right_mean_V, pull_N)
             left_mean_V, right_mean_V = left_V, right_V
             if substep % per_element == 0:
                 self._advance_element(substep * self._substep_s)
