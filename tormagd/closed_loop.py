@@ -4,6 +4,7 @@ The same `plan` and `step`, the same link, the same protocol bytes as in the dae
 are replaced. It stands beside the rooms because it joins control with simulation, which no room may.
 """
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
@@ -148,8 +149,10 @@ class ClosedLoop:
 def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:
     """A publisher in virtual time: each force is sent at its time, and nothing before the first."""
 
+    sent_s, sent_N = times_s.tolist(), forces_N.tolist()
+
     def newest(now_s: float) -> TimedSetpoint | None:
-        index = int(np.searchsorted(times_s, now_s, side="right")) - 1
-        return None if index < 0 else TimedSetpoint(float(forces_N[index]), float(times_s[index]), valid_for_s)
+        index = bisect_right(sent_s, now_s) - 1
+        return None if index < 0 else TimedSetpoint(sent_N[index], sent_s[index], valid_for_s)
 
     return newest

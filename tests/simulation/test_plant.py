@@ -180,11 +180,11 @@ def test_time_may_be_cut_in_any_way() -> None:
 
 @pytest.mark.parametrize("dt_s", [-1e-3, float("nan"), float("inf")])
 def test_impossible_steps_are_refused(dt_s: float) -> None:
-    with pytest.raises(ValueError, match="dt_s .* finite"):
+    with pytest.raises(ValueError, match=r"dt_s .* finite"):
         Plant(SAMPLE_1, SteadyHand()).advance(dt_s)
 
 
 @pytest.mark.parametrize("voltages", [(float("inf"), 0.0), (None, float("nan"))])
 def test_impossible_voltages_are_refused(voltages: tuple[float | None, float | None]) -> None:
-    with pytest.raises(ValueError, match="_V .* finite"):
+    with pytest.raises(ValueError, match=r"_V .* finite"):
         Plant(SAMPLE_1, SteadyHand()).drive(*voltages)
