@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from tormagd.config import Limits
 from tormagd.control.governor import AHEAD_S, PATH_S, Governed, GovernorState, TimedSetpoint, govern
+from tormagd.control.periodicity import NOTHING_LEARNED
 from tormagd.control.portrait import Portrait
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Force
@@ -28,6 +29,7 @@ def decide(
     *,
     scene: Force = SCENE,
     lead_s: float = 0.0,
+    lag_s: float = 0.0,
     portrait: Portrait = PORTRAIT,
 ) -> tuple[GovernorState, Governed]:
     """One decision on the device of these tests."""
@@ -40,6 +42,7 @@ def decide(
         limits=LIMITS,
         gap_speed_mm_s=GAP_SPEED_MM_S,
         lead_s=lead_s,
+        lag_s=lag_s,
     )
 
 
@@ -197,6 +200,86 @@ def test_a_preview_does_not_outlive_its_validity() -> None:
     _, governed = decide(GovernorState(0.699, 1.5), 0.7, setpoint)
     assert governed.limits == (Limit.STALE,)
     assert np.all(governed.path_N < 1.5)
+
+
+def beats_N(time_s: float) -> float:
+    """A pulse of 1.1 Hz with a notch."""
+    phase = 2.0 * math.pi * 1.1 * time_s
+    return 1.4 + 0.15 * math.sin(phase) + 0.08 * math.sin(2.0 * phase + 1.0) + 0.04 * math.sin(3.0 * phase)
+
+
+def beaten(seconds: float) -> GovernorState:
+    """The state after so much of the pulse, 500 times a second, without a preview."""
+    state = GovernorState(0.0, 0.4)
+    for tick in range(1, round(500 * seconds) + 1):
+        state, _ = decide(state, tick / 500, TimedSetpoint(beats_N(tick / 500), tick / 500, VALID_S))
+    return state
+
+
+@pytest.fixture(scope="module")
+def learned() -> GovernorState:
+    return beaten(10.0)
+
+
+def test_a_force_that_repeats_itself_is_foreseen(learned: GovernorState) -> None:
+    worst_N = extrapolated_N = 0.0
+    state = learned
+    for tick in range(5_001, 5_501):
+        now_s = tick / 500
+        setpoint = TimedSetpoint(beats_N(now_s), now_s, VALID_S)
+        state, governed = decide(state, now_s, setpoint, lag_s=0.01)
+        _, blind = decide(state._replace(periodicity=NOTHING_LEARNED), now_s, setpoint)
+        assert governed.foresight > 0.9
+        assert governed.limits == ()
+        expected = [beats_N(now_s + 0.01 * governed.foresight + ahead_s) for ahead_s in PATH_S]
+        worst_N = max(worst_N, float(np.abs(governed.path_N - expected).max()))
+        extrapolated_N = max(
+            extrapolated_N, float(np.abs(blind.path_N - [beats_N(now_s + ahead_s) for ahead_s in PATH_S]).max())
+        )
+    assert worst_N < 0.3 * extrapolated_N
+
+
+def test_a_lag_is_made_up_for_as_far_as_it_is_known_what_comes() -> None:
+    state, _ = stream_of([1.0 + 0.01 * k for k in range(40)])
+    live = TimedSetpoint(1.39, 0.4, VALID_S)
+    _, extrapolated = decide(state, 0.4, live, lag_s=0.02)
+    assert extrapolated.foresight == 0.0
+    assert extrapolated.path_N[0] == pytest.approx(1.39)
+    preview = tuple(1.39 + 0.01 * k for k in range(1, 9))
+    _, known = decide(state, 0.4, live._replace(preview_N=preview, preview_dt_s=0.01), lag_s=0.02)
+    assert known.foresight == 1.0
+    assert known.path_N[0] == pytest.approx(1.41)
+
+
+def test_no_forecast_holds_a_force_of_a_stale_setpoint(learned: GovernorState) -> None:
+    last = TimedSetpoint(beats_N(10.0), 10.0, VALID_S)
+    state = learned
+    for tick in range(1, 1_000):
+        now_s = 10.0 + tick * 1e-3
+        state, governed = decide(state, now_s, last)
+        if now_s - 10.0 <= VALID_S:
+            continue
+        assert governed.limits == (Limit.STALE,)
+        assert governed.foresight == 0.0
+        assert np.all(governed.path_N == governed.force_N)
+        assert state.periodicity == NOTHING_LEARNED
+    assert state.governed_N == PORTRAIT.least_N
+
+
+def test_a_silent_stream_is_not_believed_to_go_on(learned: GovernorState) -> None:
+    """However long its last setpoint is valid."""
+    last = TimedSetpoint(beats_N(10.0), 10.0, 60.0)
+    _, soon = decide(learned, 10.05, last)
+    assert soon.foresight > 0.9
+    _, late = decide(learned, 10.2, last)
+    assert late.foresight == 0.0
+    _, blind = decide(learned._replace(periodicity=NOTHING_LEARNED), 10.2, last)
+    assert np.all(late.path_N == blind.path_N)
+
+
+def test_what_comes_with_a_preview_is_not_learned(learned: GovernorState) -> None:
+    state, _ = decide(learned, 10.002, TimedSetpoint(1.4, 10.002, VALID_S, preview_N=(1.4, 1.4), preview_dt_s=2e-3))
+    assert state.periodicity == NOTHING_LEARNED
 
 
 events = st.tuples(

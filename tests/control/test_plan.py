@@ -138,8 +138,8 @@ def test_a_preview_gives_the_gaps_speed_and_acceleration(core) -> None:
     assert planned(core, 1.6, moving()).plan.gap_acceleration_mm_s2 == pytest.approx(0.0, abs=1e-6)
 
 
-def swung(core: Core, late_s: float, *, is_known: bool) -> PlanState:
-    """The state after 10 s of a swing of 2 Hz that the gap follows that much too late."""
+def swung(core: Core, late_s: float, *, is_known: bool, seconds: float = 10.0) -> PlanState:
+    """The state after a swing of 2 Hz that the gap follows that much too late."""
     portrait = core.planner.portrait
 
     def force_N(time_s: float) -> float:
@@ -149,7 +149,7 @@ def swung(core: Core, late_s: float, *, is_known: bool) -> PlanState:
         return float(portrait.gaps_mm(np.array([force_N(time_s)]))[0])
 
     state = core.planner.start(0.0)
-    for tick in range(1, round(10.0 / PERIOD_S)):
+    for tick in range(1, round(seconds / PERIOD_S)):
         now_s = tick * PERIOD_S
         come_s = now_s - late_s + state.lag_s  # it starts as much sooner as has been learned
         side_mm_s = (gap_mm(come_s) - gap_mm(come_s - 1e-3)) / 2e-3
@@ -176,8 +176,12 @@ def test_a_gap_on_its_way_after_a_jump_is_not_late(core) -> None:
     assert state.lag_s == 0.0
 
 
-def test_without_a_preview_no_lag_is_learned(core) -> None:
-    assert swung(core, 0.015, is_known=False).lag_s == 0.0
+def test_without_a_preview_a_lag_is_learned_once_the_swing_is_foreseen(core) -> None:
+    early = swung(core, 0.015, is_known=False, seconds=1.0)
+    assert (early.plan.foresight, early.lag_s) == (0.0, 0.0)
+    late = swung(core, 0.015, is_known=False, seconds=20.0)
+    assert late.plan.foresight > 0.9
+    assert late.lag_s == pytest.approx(0.015, abs=2e-3)
 
 
 def learned(core: Core, seconds: float, estimate: Estimate) -> PlanState:
@@ -316,6 +320,12 @@ def test_nan_never_travels(core, history: list[tuple[float, TimedSetpoint | None
         assert CONFIG.trim.least <= state.trim <= CONFIG.trim.most
         assert 0.0 <= state.lag_s <= MOST_LAG_S
         assert plan.number == last.plan.number + 1
+
+
+def test_a_replay_gives_the_same_state(core) -> None:
+    first, again = (swung(core, 0.015, is_known=False, seconds=3.0) for _ in range(2))
+    assert first.plan.foresight > 0.0
+    assert first == again
 
 
 def test_the_same_inputs_give_the_same_plan(core) -> None:

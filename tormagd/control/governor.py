@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tormagd.config import Limits
+from tormagd.control.periodicity import LONGEST_STEP_S, NOTHING_LEARNED, Periodicity, forecast_N, observe
 from tormagd.control.portrait import Portrait
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Force
@@ -18,8 +19,6 @@ AHEAD_S = 0.05
 PATH_S = np.linspace(0.0, 0.03, 7)
 "The times, from the moment that is planned for, at which a plan looks at the force to come."
 PATH_S.flags.writeable = False
-LONGEST_STEP_S = 0.1
-"Setpoints further apart than this have no slope between them."
 
 
 class TimedSetpoint(NamedTuple):
@@ -44,15 +43,21 @@ class GovernorState(NamedTuple):
     stamp_s: float = float("-inf")
     slope_N_s: float = 0.0
     last_N: float = 0.0
+    periodicity: Periodicity = NOTHING_LEARNED
 
 
 class Governed(NamedTuple):
-    """The force to render now, what it will be at `lead_s` + PATH_S from now, and what holds it back."""
+    """The force to render now, what it will be PATH_S after the moment that is planned for, and what holds it back.
+
+    `foresight`, 0..1, is how well what comes is known: 1 from a preview, less where the force repeats itself, 0 where
+    it is extrapolated.
+    """
 
     force_N: float
     path_N: Array
     age_s: float | None
     limits: tuple[Limit, ...]
+    foresight: float = 0.0
 
 
 def govern(
@@ -65,8 +70,10 @@ def govern(
     limits: Limits,
     gap_speed_mm_s: float,
     lead_s: float,
+    lag_s: float,
 ) -> tuple[GovernorState, Governed]:
-    """One decision. A missing or stale setpoint decays to F_min along `limits.stale_ramp_N_s`: never a jump, never a
+    """One decision, for `lead_s` from now and, where what comes is known, up to `lag_s` later: an extrapolation that
+    far is a guess. A missing or stale setpoint decays to F_min along `limits.stale_ramp_N_s`: never a jump, never a
     force held for ever.
     """
     elapsed = max(0.0, now_s - state.time_s)
@@ -85,16 +92,25 @@ def govern(
         renderable = portrait.force_rate_N_s(force, gap_speed_mm_s)
         between = min(max((force - state.last_N) / spacing, -renderable), renderable)
         slope += spacing / (SLOPE_FILTER_S + spacing) * (between - slope)
-    ahead_s = max(age, 0.0) + lead_s + PATH_S
     least, most = (min(max(end, portrait.least_N), portrait.most_N) for end in (scene.least_N, scene.most_N))
-    path = _to_come(setpoint, force, slope, ahead_s).clip(least, most)
-    return GovernorState(now_s, force, setpoint.stamp_s, slope, force), Governed(force, path, age, reasons)
+    soon_s = max(age, 0.0) + lead_s
+    if setpoint.preview_N:
+        periodicity, foresight = NOTHING_LEARNED, 1.0
+        path = _previewed(setpoint, soon_s + lag_s + PATH_S)
+    else:
+        periodicity = observe(state.periodicity, setpoint.stamp_s, force, slope)
+        # one that has fallen silent for longer than a stream may is not believed to go on as it did
+        foresight = periodicity.trust if age <= LONGEST_STEP_S else 0.0
+        ahead_s = soon_s + foresight * lag_s + PATH_S
+        path = force + slope * np.minimum(ahead_s, AHEAD_S)
+        if foresight > 0.0:
+            path += foresight * (forecast_N(periodicity, ahead_s) - path)
+    rendered = GovernorState(now_s, force, setpoint.stamp_s, slope, force, periodicity)
+    return rendered, Governed(force, path.clip(least, most), age, reasons, foresight)
 
 
-def _to_come(setpoint: TimedSetpoint, force_N: float, slope_N_s: float, ahead_s: Array) -> Array:
+def _previewed(setpoint: TimedSetpoint, ahead_s: Array) -> Array:
     """The forces at these times after the setpoint's stamp."""
-    if not setpoint.preview_N:
-        return force_N + slope_N_s * np.minimum(ahead_s, AHEAD_S)
     known_N = np.array([setpoint.force_N, *setpoint.preview_N])
     known_s = setpoint.preview_dt_s * np.arange(len(known_N))
     mean_N_s = (known_N[-1] - known_N[0]) / known_s[-1]

@@ -18,6 +18,8 @@ TAUGHT_N = 0.2
 "Smaller forces do not teach it either: the sensor's offset would."
 LAG_TIME_S = 1.0
 MOST_LAG_S = 0.03
+LEAST_FORESIGHT = 0.5
+"With less the lag is hardly made up for, and teaching it would have no end."
 LEAST_TRAVEL_MM_S = 10.0
 "Slower carriages teach the lag less."
 
@@ -27,7 +29,8 @@ _LIMIT_OF_REACH = {Reach.BELOW: Limit.F_MIN, Reach.ABOVE: Limit.F_MAX}
 
 
 class Plan(NamedTuple):
-    """Where the gap should go, and why. `number` lets a recording say which plan a tick used."""
+    """Where the gap should go, and why. `number` lets a recording say which plan a tick used; `foresight` is the
+    governor's."""
 
     number: int
     time_s: float
@@ -41,6 +44,7 @@ class Plan(NamedTuple):
     confidence: float
     limits: tuple[Limit, ...]
     gap_acceleration_mm_s2: float = 0.0
+    foresight: float = 0.0
 
 
 class PlanState(NamedTuple):
@@ -84,8 +88,6 @@ class Planner:
     ) -> PlanState:
         """The next plan. `estimate` is None while the device has said nothing: the trim then stays as it is."""
         position = self._config.position
-        # only what is known to come can make up for a lag: an extrapolation that far is a guess
-        is_known = setpoint is not None and len(setpoint.preview_N) > 0
         governor, governed = govern(
             state.governor,
             now_s,
@@ -94,11 +96,12 @@ class Planner:
             scene=self._scene.force,
             limits=self._config.limits,
             gap_speed_mm_s=position.gap_speed_mm_s,
-            lead_s=position.lead_ms * 1e-3 + (state.lag_s if is_known else 0.0),
+            lead_s=position.lead_ms * 1e-3,
+            lag_s=state.lag_s,
         )
         predicted = self._predict(estimate) if estimate is not None and estimate.is_homed else None
         trim, trim_limits = self._learn(state, now_s, estimate, predicted)
-        lag_s = self._learn_lag(state, now_s, estimate, governed.force_N / trim) if is_known else state.lag_s
+        lag_s = self._learn_lag(state, now_s, estimate, governed, trim)
         displacement, rate = self._motion(None if Limit.STALE in governed.limits else setpoint, estimate)
         solution = self._solver.solve(
             displacement, rate, float(governed.path_N[0]) / trim, self._cip_percent, state.plan.field_mT
@@ -121,6 +124,7 @@ class Planner:
             confidence=solution.confidence,
             limits=limits,
             gap_acceleration_mm_s2=acceleration,
+            foresight=governed.foresight,
         )
         return PlanState(governor, plan, trim, lag_s)
 
@@ -158,11 +162,13 @@ class Planner:
         trim = min(max(wanted, settings.least), settings.most)
         return trim, () if trim == wanted else (Limit.TRIM,)
 
-    def _learn_lag(self, state: PlanState, now_s: float, estimate: Estimate | None, force_N: float) -> float:
+    def _learn_lag(
+        self, state: PlanState, now_s: float, estimate: Estimate | None, governed: Governed, trim: float
+    ) -> float:
         """How far the gap is behind over how fast it moves: a motor weaker than it is believed to be comes late."""
-        if estimate is None or not estimate.is_homed:
+        if estimate is None or not estimate.is_homed or governed.foresight < LEAST_FORESIGHT:
             return state.lag_s
-        behind_mm = float(self.portrait.gaps_mm(np.array([force_N]))[0]) - estimate.gap_mm
+        behind_mm = float(self.portrait.gaps_mm(np.array([governed.force_N / trim]))[0]) - estimate.gap_mm
         if abs(behind_mm) > MOST_LAG_S * self._config.position.gap_speed_mm_s:
             return state.lag_s  # on its way after a jump
         travel_mm_s = estimate.left_mm_s + estimate.right_mm_s

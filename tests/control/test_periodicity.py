@@ -1,0 +1,244 @@
+"""What comes next: foreseen where a force repeats itself, and believed only where that was earned. All synthetic."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tormagd.control.periodicity import (
+    GRID_S,
+    HISTORY,
+    LEAST_HISTORY,
+    LONGEST_STEP_S,
+    NOTHING_LEARNED,
+    Periodicity,
+    Score,
+    forecast_N,
+    observe,
+)
+
+Array = npt.NDArray[np.float64]
+
+AHEAD_S = np.array([0.02, 0.04, 0.06])
+STEEPEST_N_S = 3.0
+"What the governor lets a slope be, about."
+
+
+def pulse_N(times_s: Array, seed: int = 1, rate_hz: float = 1.1) -> Array:
+    """Beats of two humps, each a few percent longer or shorter and higher or lower than the one before."""
+    random = np.random.default_rng(seed)
+    forces = np.full(len(times_s), 1.4)
+    starts_s = times_s[0] - 2.0 + np.cumsum(random.normal(1.0, 0.04, 4_000)[: len(times_s)]) / rate_hz
+    for start_s in starts_s[starts_s < times_s[-1] + 1.0]:
+        height_N = random.normal(0.25, 0.015)
+        for after_s, width_s, share in ((0.2, 0.06, 1.0), (0.5, 0.09, 0.35)):
+            deviation = (times_s - start_s - after_s / rate_hz) / (width_s / rate_hz)
+            forces += height_N * share * np.exp(-0.5 * deviation**2)
+    return forces
+
+
+class Followed(NamedTuple):
+    """One row per setpoint: its time, the trust, and the errors of slope and mixture at AHEAD_S."""
+
+    time_s: Array
+    trust: Array
+    slope_N: Array
+    mixture_N: Array
+
+    def rms_N(self, start_s: float, end_s: float) -> tuple[float, float]:
+        """Of the slope and of the mixture, in a part of the time."""
+        inside = (self.time_s >= start_s) & (self.time_s < end_s)
+        return tuple(float(np.sqrt(np.mean(error[inside] ** 2))) for error in (self.slope_N, self.mixture_N))
+
+
+def follow(times_s: Array, forces_N: Array) -> Followed:
+    """Each setpoint observed, and what would have been planned for beside what came."""
+    state, rows = NOTHING_LEARNED, []
+    slope_N_s = 0.0
+    for before, (time_s, force_N) in enumerate(zip(times_s[1:].tolist(), forces_N[1:].tolist(), strict=True)):
+        steepness = (force_N - forces_N[before]) / (time_s - times_s[before])
+        slope_N_s += 0.5 * (float(np.clip(steepness, -STEEPEST_N_S, STEEPEST_N_S)) - slope_N_s)
+        state = observe(state, time_s, force_N, slope_N_s)
+        slope_N = force_N + slope_N_s * np.minimum(AHEAD_S, 0.05)
+        trust = state.trust
+        mixture_N = slope_N if trust == 0.0 else slope_N + trust * (forecast_N(state, AHEAD_S) - slope_N)
+        came_N = np.interp(time_s + AHEAD_S, times_s, forces_N)
+        rows.append((time_s, trust, slope_N - came_N, mixture_N - came_N))
+    return Followed(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def learned(seconds: float = 4.0, rate_hz: int = 200) -> Periodicity:
+    """The state after a pulse."""
+    times_s = np.arange(round(seconds * rate_hz)) / rate_hz
+    forces_N = pulse_N(times_s)
+    state = NOTHING_LEARNED
+    for time_s, force_N, slope_N_s in zip(times_s, forces_N, np.gradient(forces_N, times_s), strict=True):
+        state = observe(state, float(time_s), float(force_N), float(slope_N_s))
+    return state
+
+
+def times_at(kind: str, seconds: float) -> Array:
+    """When setpoints come."""
+    if kind == "irregular":
+        return np.cumsum(np.random.default_rng(7).uniform(0.001, 0.012, round(seconds / 0.0065)))
+    rate_hz = int(kind.split()[0])
+    return np.arange(round(seconds * rate_hz)) / rate_hz
+
+
+@pytest.mark.parametrize("kind", ["100 Hz", "500 Hz", "irregular"])
+def test_a_pulse_is_foreseen_after_a_few_beats(kind: str) -> None:
+    times_s = times_at(kind, 11.0)
+    followed = follow(times_s, pulse_N(times_s))
+    slope_N, mixture_N = followed.rms_N(5.0, 10.9)
+    assert mixture_N < 0.4 * slope_N
+    assert followed.trust[(followed.time_s > 5.0)].mean() > 0.8
+    assert np.all(followed.trust[followed.time_s < times_s[0] + LEAST_HISTORY * GRID_S - 0.02] == 0.0)
+
+
+def steps_N(times_s: Array) -> Array:
+    levels = np.random.default_rng(3).uniform(1.0, 1.8, 100)
+    return levels[(times_s / 0.4).astype(int)]
+
+
+def ramps_N(times_s: Array) -> Array:
+    return np.interp(times_s, 0.3 * np.arange(100), np.random.default_rng(4).uniform(1.0, 1.8, 100))
+
+
+def wander_N(times_s: Array) -> Array:
+    white = np.random.default_rng(5).normal(size=(40, 2))
+    frequencies = np.random.default_rng(6).uniform(0.2, 4.0, 40)
+    phases = 2.0 * math.pi * np.outer(times_s, frequencies)
+    return 1.4 + 0.03 * (np.cos(phases) @ white[:, 0] + np.sin(phases) @ white[:, 1])
+
+
+@pytest.mark.parametrize("kind", [steps_N, ramps_N, wander_N])
+def test_what_does_not_repeat_itself_is_not_planned_worse(kind) -> None:
+    times_s = times_at("250 Hz", 12.0)
+    followed = follow(times_s, kind(times_s))
+    for start_s in np.arange(0.0, 11.0, 1.0):
+        slope_N, mixture_N = followed.rms_N(start_s, start_s + 1.0)
+        assert mixture_N < 1.05 * slope_N + 0.003
+
+
+def test_steps_are_never_trusted() -> None:
+    times_s = times_at("250 Hz", 12.0)
+    assert follow(times_s, steps_N(times_s)).trust.mean() < 0.1
+
+
+def test_a_pulse_that_stops_is_held() -> None:
+    times_s = times_at("250 Hz", 9.0)
+    forces_N = pulse_N(times_s)
+    stopped = int(np.argmax(np.where((times_s > 7.0) & (times_s < 8.0), forces_N, 0.0))) - 12  # on the steepest flank
+    forces_N[stopped:] = forces_N[stopped]
+    followed = follow(times_s, forces_N)
+    errors_N = np.abs(followed.mixture_N).max(axis=1)
+    stop_s = times_s[stopped]
+    assert errors_N[(followed.time_s > stop_s) & (followed.time_s < stop_s + 0.15)].max() < 0.12
+    assert errors_N[(followed.time_s > stop_s + 0.15) & (followed.time_s < 8.9)].max() < 0.01
+
+
+def test_a_pulse_that_suddenly_beats_faster_is_followed() -> None:
+    times_s = times_at("250 Hz", 14.0)
+    later_s = np.where(times_s < 8.0, times_s, 8.0 + 1.6 * (times_s - 8.0))
+    forces_N = np.interp(later_s, np.arange(10_000) / 500.0, pulse_N(np.arange(10_000) / 500.0))
+    followed = follow(times_s, forces_N)
+    for start_s, share in ((8.0, 1.0), (9.0, 0.8), (11.0, 0.6)):
+        slope_N, mixture_N = followed.rms_N(start_s, start_s + 1.0)
+        assert mixture_N < share * slope_N
+
+
+def test_another_source_is_not_foreseen_from_the_first() -> None:
+    """It takes over within the stream: what was learned loses its trust within a tenth of a second."""
+    times_s = times_at("250 Hz", 9.0)
+    forces_N = np.where(times_s < 7.0, pulse_N(times_s), 0.9 + 0.2 * np.sin(2.0 * math.pi * 2.3 * times_s))
+    followed = follow(times_s, forces_N)
+    assert followed.trust[np.searchsorted(followed.time_s, 6.99)] > 0.8
+    slope_N, mixture_N = followed.rms_N(7.0, 7.5)
+    assert mixture_N < 2.0 * slope_N
+    assert followed.trust[(followed.time_s > 7.1) & (followed.time_s < 7.4)].max() < 0.3
+
+
+def test_after_a_jump_nothing_is_forecast() -> None:
+    """No remembered stretch is like one with a jump in it, and a regression would carry it on."""
+    state = learned()
+    assert state.trust > 0.0
+    while (state := observe(state, state.stamp_s + 0.005, 0.8, 0.0)).stamp_s < 4.03:
+        assert state.time_s < 4.0 or (state.changes_N, state.trust) == ((), 0.0)
+
+
+def test_a_gap_or_a_stamp_from_before_begins_anew() -> None:
+    state = learned()
+    for stamp_s in (state.stamp_s + LONGEST_STEP_S + 1e-6, state.stamp_s - 1e-6, -5.0):
+        fresh = observe(state, stamp_s, 1.5, 0.0)
+        assert fresh.trust == 0.0
+        assert (fresh.stamp_s, fresh.time_s, np.frombuffer(fresh.history).tolist()) == (stamp_s, stamp_s, [1.5])
+    kept = observe(state, state.stamp_s + LONGEST_STEP_S - 1e-6, 1.5, 0.0)
+    assert len(kept.history) > len(state.history)
+
+
+def test_a_stamp_again_counts_once_with_its_newest_force() -> None:
+    state = learned()
+    assert observe(state, state.stamp_s, state.force_N, 0.0) is state
+    other = observe(state, state.stamp_s, 1.7, 0.0)
+    assert (other.history, other.force_N) == (state.history, 1.7)
+    assert forecast_N(other, np.zeros(1)) == pytest.approx([1.7])
+
+
+def test_the_forecast_starts_at_the_newest_setpoint_between_two_points_of_the_grid() -> None:
+    state = learned()
+    state = observe(state, state.stamp_s + 0.004, 1.5, 0.0)
+    assert state.stamp_s - state.time_s > 0.003
+    assert forecast_N(state, np.zeros(1)) == pytest.approx([1.5])
+
+
+def test_memory_is_bounded() -> None:
+    assert len(learned(15.0, 100).history) == 8 * HISTORY
+
+
+def test_a_constant_force_for_ever_is_no_division_by_zero() -> None:
+    state = NOTHING_LEARNED
+    for tick in range(300):
+        state = observe(state, tick * GRID_S, 1.5, 0.0)
+    state = state._replace(long=Score(0.0, 0.0))
+    assert state.trust == 0.0
+    assert forecast_N(state, AHEAD_S) == pytest.approx(np.full(3, 1.5))
+
+
+LEARNED = learned()
+hostile = st.lists(
+    st.tuples(
+        st.sampled_from([0.0, 1e-12, 1e-3, 0.0049, GRID_S, 0.033, LONGEST_STEP_S, 0.2, -1e-9, -1.0, 1e6])
+        | st.floats(-0.01, LONGEST_STEP_S),
+        st.floats(0.0, 1_000.0) | st.sampled_from([0.0, 1.4, 2.0]),
+        st.floats(-100.0, 100.0),
+    ),
+    max_size=40,
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(setpoints=hostile)
+def test_nan_never_travels_and_a_replay_is_exact(setpoints: list[tuple[float, float, float]]) -> None:
+    """Stamps in any order, any distance apart, on top of what was learned; the state before stays as it was."""
+
+    def replay() -> list[Periodicity]:
+        states = [LEARNED]
+        for step_s, force_N, slope_N_s in setpoints:
+            states.append(observe(states[-1], states[-1].stamp_s + step_s, force_N, slope_N_s))
+        return states
+
+    before = LEARNED.history
+    states = replay()
+    for state in states:
+        assert 0.0 <= state.trust <= 1.0
+        assert len(state.history) <= 8 * HISTORY
+        assert -1e-9 <= state.stamp_s - state.time_s < GRID_S + 1e-9
+        assert all(math.isfinite(value) for score in (state.long, state.short) for value in score)
+        if state.changes_N:
+            assert np.all(np.isfinite(forecast_N(state, AHEAD_S)))
+    assert states == replay()
+    assert LEARNED.history == before
