@@ -28,6 +28,7 @@ class TickRow(NamedTuple):
     plan_gap_mm: float
     plan_gap_speed_mm_s: float
     plan_gap_acceleration_mm_s2: float
+    foresight: float
     plan_time_s: float
     confidence: float
     trim: float
@@ -75,6 +76,7 @@ def tick_row(
         plan_gap_mm=plan.gap_mm,
         plan_gap_speed_mm_s=plan.gap_speed_mm_s,
         plan_gap_acceleration_mm_s2=plan.gap_acceleration_mm_s2,
+        foresight=plan.foresight,
         plan_time_s=plan.time_s,
         confidence=plan.confidence,
         trim=trim,
