@@ -3,7 +3,7 @@
     force_tracking.py [samples|draws|staircase|signals|portrait|all] [--json] [--picture FILE.png]
 
 Nothing is removed from an error: no mean, no delay. The pulse is the one of `make run`, 500 setpoints a second; "with
-preview" each carries the next 70 ms, as a publisher can that plays a file. All devices are synthetic.
+preview" each carries the next 70 ms, as a publisher can that plays a file; live ones do not. All devices are synthetic.
 """
 
 import argparse
@@ -95,7 +95,7 @@ def track(plant: PlantParameters, signal: Signal, scene: str, preview_s: float) 
     times = np.concatenate([approach_s[:-1], lead_s + signal.time_s])
     forces = np.concatenate([approach_N[:-1], signal.force_N])
     start_s = loop.now_s
-    publish = publisher(times + start_s, forces, preview_s if signal.is_known_ahead else 0.0, signal.valid_for_s)
+    publish = publisher(times + start_s, forces, preview_s, signal.valid_for_s)
     rows, held = [], dict[str, int]()
     sample = None
     for sample in loop.run(float(times[-1]), publish):
@@ -190,16 +190,21 @@ def draw_plants(count: int) -> Iterator[tuple[PlantParameters, dict[str, float]]
         yield msgspec.structs.replace(nominal, **tables), named
 
 
-def draws(pool: concurrent.futures.Executor, count: int = DRAWS) -> Json:
-    """The pulse with preview on random devices, after TRIM_S."""
+def draws(pool: concurrent.futures.Executor, count: int = DRAWS) -> list[Json]:
+    """The pulse on random devices, after TRIM_S: with preview, then live."""
+    return [_drawn(pool, count, preview_s) for preview_s in (PREVIEW_S, 0.0)]
+
+
+def _drawn(pool: concurrent.futures.Executor, count: int, preview_s: float) -> Json:
     drawn = list(draw_plants(count))
     plants = [plant for plant, _ in drawn]
-    tracks = pool.map(track, plants, [pulse(DRAWN_PULSE_S)] * count, ["pulse"] * count, [PREVIEW_S] * count)
+    tracks = pool.map(track, plants, [pulse(DRAWN_PULSE_S)] * count, ["pulse"] * count, [preview_s] * count)
     rows = []
     for (_, factors), found in zip(drawn, tracks, strict=True):
         rows.append(figures(found.since(TRIM_S)) | {"trim": found.trim, "limits": found.limits, "factors": factors})
     rms = np.array([row["rms_N"] for row in rows])
     return {
+        "preview": preview_s > 0.0,
         "count": count,
         "worst_rms_N": float(rms.max()),
         "median_rms_N": float(np.median(rms)),
@@ -252,19 +257,21 @@ def stair_levels(found: Track) -> tuple[Array, Array]:
 
 
 def signals(pool: concurrent.futures.Executor) -> Json:
-    """The recorded signals on sample 1."""
+    """The recorded signals on sample 1: those known ahead with preview, and all of them live."""
     folder = data_folder()
     if folder is None:
         return {"rows": [], "note": "no recorded signals: TORMAG_DATA names no folder"}
-    played = recorded_signals(folder)
-    count = len(played)
-    tracks = pool.map(track, [load_plant("sample_1")] * count, played, ["coronary"] * count, [PREVIEW_S] * count)
+    found = recorded_signals(folder)
+    cases = [(signal, PREVIEW_S) for signal in found if signal.is_known_ahead] + [(signal, 0.0) for signal in found]
+    count = len(cases)
+    played, previews = [signal for signal, _ in cases], [preview_s for _, preview_s in cases]
+    tracks = pool.map(track, [load_plant("sample_1")] * count, played, ["coronary"] * count, previews)
     rows = []
-    for signal, found in zip(played, tracks, strict=True):
+    for (signal, preview_s), rendered in zip(cases, tracks, strict=True):
         rows.append(
-            {"signal": signal.name, "scaled": signal.scaled, "preview": signal.is_known_ahead}
-            | figures(found.since(0.0))
-            | {"limits": found.limits}
+            {"signal": signal.name, "scaled": signal.scaled, "preview": preview_s > 0.0}
+            | figures(rendered.since(0.0))
+            | {"limits": rendered.limits}
         )
     return {"rows": rows}
 
@@ -313,11 +320,11 @@ def print_tables(result: Json) -> None:
                 f"{label:22s}{_short(row['whole'])}  {_short(row['after_trim'])}  {row['trim']:5.3f} "
                 f"{row['lag_ms']:4.1f} ms  {_limits(row)}"
             )
-    if "draws" in result:
-        found = result["draws"]
+    for found in result.get("draws", []):
         print(
-            f"{found['count']} draws of +-20%, after 10 s: median {found['median_rms_N'] * 1e3:.1f} mN, worst "
-            f"{found['worst_rms_N'] * 1e3:.1f} mN, {found['within_18_mN']} within 18 mN"
+            f"{found['count']} draws of +-20%{', preview' if found['preview'] else ''}, after 10 s: median "
+            f"{found['median_rms_N'] * 1e3:.1f} mN, worst {found['worst_rms_N'] * 1e3:.1f} mN, "
+            f"{found['within_18_mN']} within 18 mN"
         )
         for number, row in enumerate(found["rows"]):
             if row["rms_N"] > 0.018:
@@ -329,7 +336,8 @@ def print_tables(result: Json) -> None:
             f"level {row['worst_N'] * 1e3:.0f} mN off, smallest step {row['smallest_step_N'] * 1e3:.0f} mN"
         )
     for row in result.get("signals", {"rows": []})["rows"]:
-        print(f"{row['signal']:34s}{_short(row)}  sd {row['sd_N'] * 1e3:4.0f} mN  {_limits(row)}  ({row['scaled']})")
+        label = f"{row['signal']}{', preview' if row['preview'] else ''}"
+        print(f"{label:44s}{_short(row)}  sd {row['sd_N'] * 1e3:4.0f} mN  {_limits(row)}  ({row['scaled']})")
     if "note" in result.get("signals", {}):
         print(result["signals"]["note"])
     for row in result.get("portrait", {"rows": []})["rows"]:
@@ -375,7 +383,7 @@ def main() -> int:
     if options.picture is not None:
         from force_tracking_figure import picture
 
-        picture(options.picture, pulses, stairs, result.get("draws"))
+        picture(options.picture, pulses, stairs, result.get("draws", []))
     return 0
 
 

@@ -17,7 +17,7 @@ CLOSE_UP_S = (12.0, 16.0)
 BAR_MN = 18.0
 
 
-def picture(path: Path, pulses: dict[str, Any], stairs: dict[str, Any], draws: dict[str, Any] | None) -> None:
+def picture(path: Path, pulses: dict[str, Any], stairs: dict[str, Any], draws: list[dict[str, Any]]) -> None:
     """Writes a PNG of what was measured; a part that was not is left empty."""
     figure, axes = plt.subplots(2, 2, figsize=(12, 7.5), constrained_layout=True)
     figure.suptitle("Forces asked and truly rendered by simulated devices (synthetic)", fontsize=13)
@@ -35,11 +35,15 @@ def picture(path: Path, pulses: dict[str, Any], stairs: dict[str, Any], draws: d
             axes[1, 0].plot(found.time_s, found.asked_N, color=ASKED, linewidth=2.0, label="asked")
         axes[1, 0].plot(found.time_s, found.rendered_N, color=COLOURS[name], linewidth=0.9, label=name)
     _dress(axes[1, 0], "Staircase of 0.1 N, coronary scene", "force at the roller, N", "time, s")
-    if draws is not None:
-        rms_mN = np.sort([1e3 * row["rms_N"] for row in draws["rows"]])
-        axes[1, 1].bar(np.arange(1, len(rms_mN) + 1), rms_mN, color=COLOURS["sample_2"])
+    for found in draws:
+        rms_mN = np.sort([1e3 * row["rms_N"] for row in found["rows"]])
+        label, colour = ("with preview", COLOURS["sample_2"]) if found["preview"] else ("live", COLOURS["sample_3"])
+        axes[1, 1].plot(np.arange(1, len(rms_mN) + 1), rms_mN, "o", markersize=4, color=colour, label=label)
+    if draws:
         axes[1, 1].axhline(BAR_MN, color=QUIET, linestyle=":", label=f"{BAR_MN:g} mN")
-        _dress(axes[1, 1], f"{len(rms_mN)} random devices, after 10 s of trim", "RMS error, mN", "sorted draws")
+        axes[1, 1].set_ylim(bottom=0.0)
+        title = f"{draws[0]['count']} random devices, after 10 s of trim"
+        _dress(axes[1, 1], title, "RMS error, mN", "draws, each row sorted")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)
