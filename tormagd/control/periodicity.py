@@ -45,6 +45,7 @@ FORGIVEN_N = 0.003
 "Differences as small as this neither earn trust nor lose it."
 
 TAPS = len(LAGS)
+_LEAST_BYTES = LEAST_HISTORY * array("d").itemsize
 _SHORTEST = LAGS[-1] + 1 + AHEAD
 _ROWS = np.array([0, *(-lag for lag in LAGS), *range(1, AHEAD + 1)])[:, None]
 _ENDS = np.arange(-1 - AHEAD, _SHORTEST - AHEAD - HISTORY - 2, -STRIDE)
@@ -80,8 +81,10 @@ class Periodicity(NamedTuple):
     "Of the newest point of the grid, not after the newest setpoint."
     history: bytes = b""
     "The forces on the grid, float64: bytes are immutable, and numpy reads them where they are."
+    from_s: float = -math.inf
+    "The point of the grid that `changes_N` are from."
     changes_N: tuple[float, ...] = ()
-    "From the newest point of the grid to itself and those ahead; empty while nothing is forecast."
+    "From there to itself and the points ahead; empty while nothing is forecast."
     awaited_N: tuple[tuple[float, float] | None, ...] = (None,) * JUDGED
     "What forecast and slope said that the next points of the grid would be."
     long: Score = Score(0.0, DOUBT_N**2)
@@ -110,6 +113,9 @@ def observe(state: Periodicity, stamp_s: float, force_N: float, slope_N_s: float
     Another force with the same stamp takes the place of the first; a stamp from before, or after LONGEST_STEP_S,
     begins anew.
     """
+    if state.from_s < state.time_s and len(state.history) >= _LEAST_BYTES:
+        # a plan later than the point of the grid came: the plan that a setpoint waits for has enough to do
+        state = _searched(state, slope_N_s)
     spacing_s = stamp_s - state.stamp_s
     if not 0.0 <= spacing_s <= LONGEST_STEP_S:
         return Periodicity(stamp_s, force_N, stamp_s, array("d", [force_N]).tobytes())
@@ -126,25 +132,34 @@ def observe(state: Periodicity, stamp_s: float, force_N: float, slope_N_s: float
         if guesses is not None:
             errors = guesses[0] - force, guesses[1] - force
             long, short = long.after(*errors, LONG_S), short.after(*errors, SHORT_S)
-    past = np.frombuffer(history)
-    changes = _search(past) if len(past) >= LEAST_HISTORY else ()
-    since_s = stamp_s - times_s[-1]
+    awaited = (*state.awaited_N, *[None] * count)[-JUDGED:]
+    # until the next forecast the last one serves, as far as it has been judged
+    changes = state.changes_N if stamp_s - state.from_s <= JUDGED * GRID_S else ()
+    return Periodicity(stamp_s, force_N, times_s[-1], history, state.from_s, changes, awaited, long, short)
+
+
+def _searched(state: Periodicity, slope_N_s: float) -> Periodicity:
+    """The state with a forecast from its newest point of the grid, and what it says to be judged by."""
+    changes = _search(np.frombuffer(state.history))
     said = None
     if changes:
-        forecast = force_N + changes[JUDGED] - changes[1] * since_s / GRID_S
-        said = forecast, force_N + slope_N_s * (JUDGED * GRID_S - since_s)
-    # to the points that no search was made at nothing was said about theirs
-    awaited = (*state.awaited_N, *[None] * (count - 1), said)[-JUDGED:]
-    return Periodicity(stamp_s, force_N, times_s[-1], history, changes, awaited, long, short)
+        since_s = state.stamp_s - state.time_s
+        forecast = state.force_N + changes[JUDGED] - changes[1] * since_s / GRID_S
+        said = forecast, state.force_N + slope_N_s * (JUDGED * GRID_S - since_s)
+    return state._replace(from_s=state.time_s, changes_N=changes, awaited_N=(*state.awaited_N[:-1], said))
 
 
 def forecast_N(state: Periodicity, ahead_s: Array) -> Array:
     """The forces at these times, 0 or more, after the newest setpoint; they stay where the forecast ends. Only where
     `trust` is above 0."""
-    since_s = state.stamp_s - state.time_s
-    # the forecast starts at the newest setpoint, which may be a part of a step after the newest point of the grid
-    forces: Array = np.interp(ahead_s + since_s, _AHEAD_S, state.changes_N)
-    forces += state.force_N - state.changes_N[1] * since_s / GRID_S
+    changes = state.changes_N
+    since_s = state.stamp_s - state.from_s
+    points, part = divmod(since_s / GRID_S, 1.0)
+    start = int(points)
+    # the forecast starts at the newest setpoint, which may have come some steps after the point it is from
+    base_N = state.force_N - changes[start] - part * (changes[start + 1] - changes[start])
+    forces: Array = np.interp(ahead_s + since_s, _AHEAD_S, changes)
+    forces += base_N
     return forces
 
 
