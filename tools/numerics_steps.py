@@ -17,7 +17,7 @@ from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.config import Position
 from tormagd.control.estimate import LEAST_DT_S, first_estimate, update
 from tormagd.control.pid import Error, PidState, pid
-from tormagd.control.trajectory import Reference, follow
+from tormagd.control.trajectory import Reference, Speeds, follow
 from tormagd.hardware.measurement import Measurement
 from tormagd.physics.element import RateStrengthening, TorqueElement
 from tormagd.physics.field import PowerFieldLaw
@@ -176,11 +176,12 @@ def _speed_filter(errors: StepErrors, rng: np.random.Generator, steps_s: list[fl
 def _reference(errors: StepErrors, rng: np.random.Generator, steps_s: list[float]) -> None:
     """Finite, and never faster than the limit."""
     limits = Position()
+    speeds = Speeds(1.05 * limits.gap_speed_mm_s, limits.gap_speed_mm_s, limits.gap_speed_mm_s)
     reference = Reference(float(rng.uniform(45.0, 95.0)))
     for dt_s in steps_s:
         target_mm = float(rng.uniform(0.0, 1.0)) * EXTREME * 95.0
         target_speed = float(rng.uniform(-1.0, 1.0)) * EXTREME * limits.gap_speed_mm_s
-        reference, _ = follow(limits, reference, Reference(target_mm, target_speed), dt_s, 1.05 * limits.gap_speed_mm_s)
+        reference, _ = follow(limits, reference, Reference(target_mm, target_speed), dt_s, speeds)
         if not all(map(math.isfinite, reference)):
             errors.nonfinite += 1
         excess = max(abs(reference.speed_mm_s) - limits.gap_speed_mm_s, 0.0)

@@ -14,6 +14,11 @@ from tormagd.config import Motor, Position
 
 Array = npt.NDArray[np.float64]
 
+PULL_STATED_MM = 45.0
+"The gap for which `motor.pull_V` is stated."
+PULL_DEPTH_MM = 32.0
+"Two blocks of 40 x 40 x 20 mm attract each other like dipoles this much further apart than their faces."
+
 
 class TransferFunction(NamedTuple):
     """H(z) = numerator(z) / denominator(z), highest power first, sampled every `period_s`."""
@@ -34,6 +39,25 @@ class Margins(NamedTuple):
 def full_speed_mm_s(motor: Motor) -> float:
     """Speed of one carriage at full duty without load, mm/s."""
     return motor.supply_V / motor.back_emf_V_s / motor.gear_ratio * motor.screw_lead_mm / (2.0 * math.pi)
+
+
+class TopSpeed(NamedTuple):
+    """Speed of the gap at full duty, mm/s: with friction alone, and how much less it opens at PULL_STATED_MM."""
+
+    unpulled_mm_s: float
+    pull_mm_s: float
+
+    def opening_mm_s(self, gap_mm: float) -> float:
+        """The speed at which the gap opens against the magnets' pull."""
+        nearness = (PULL_STATED_MM + PULL_DEPTH_MM) / (gap_mm + PULL_DEPTH_MM)
+        nearness *= nearness
+        return self.unpulled_mm_s - self.pull_mm_s * nearness * nearness
+
+
+def top_speed(motor: Motor) -> TopSpeed:
+    """Of both carriages together: what friction and pull leave of the supply against the back-EMF."""
+    gap_mm_s_V = 2.0 * full_speed_mm_s(motor) / motor.supply_V
+    return TopSpeed(gap_mm_s_V * (motor.supply_V - motor.coulomb_V), gap_mm_s_V * motor.pull_V)
 
 
 def mechanical_time_s(motor: Motor) -> float:

@@ -6,10 +6,10 @@ from typing import NamedTuple
 from firmware_protocol.codec import DeviceMode, DriveMode
 from tormagd.config import Config
 from tormagd.control.estimate import Estimate, first_estimate, update
-from tormagd.control.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s
+from tormagd.control.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s, top_speed
 from tormagd.control.pid import Error, PidState, pid
 from tormagd.control.plan import Plan
-from tormagd.control.trajectory import Expected, Reference, expect, follow
+from tormagd.control.trajectory import Expected, Reference, Speeds, expect, follow
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault, Limit, device_faults
 from tormagd.safety.operating_state import (
@@ -80,6 +80,7 @@ class Stepper:
         self._supply_V = config.motor.supply_V
         self._full_speed_mm_s = full_speed_mm_s(config.motor)
         self._no_load_mm_s = 2.0 * self._full_speed_mm_s
+        self._top_speed = top_speed(config.motor)
         self._mechanical_time_s = mechanical_time_s(config.motor)
         self._lag_s = electrical_time_s(config.motor) + EXCHANGE_S
         self._gear_loss = 1.0 - config.motor.gear_efficiency
@@ -148,13 +149,13 @@ class Stepper:
         reference = state.reference or Reference(estimate.gap_mm)
         expected = state.expected or Expected(estimate.gap_mm)
         expected = expect(expected, reference, dt_s, self._lag_s, self._position.derivative_filter_s)
-        top_mm_s = self._top_speed(expected, estimate)
+        speeds = self._speeds(reference, expected, estimate)
         limits: list[Limit] = []
         if safety.operating_state is OperatingState.PAUSED:
-            reference, _ = follow(self._position, reference, Reference(reference.gap_mm), dt_s, top_mm_s)
+            reference, _ = follow(self._position, reference, Reference(reference.gap_mm), dt_s, speeds)
         else:
             target = self._target(plan, now_s)
-            reference, is_limited = follow(self._position, reference, target, dt_s, top_mm_s)
+            reference, is_limited = follow(self._position, reference, target, dt_s, speeds)
             if is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
                 limits.append(Limit.RATE)
         left_error, right_error = self._errors(expected, estimate)
@@ -201,13 +202,17 @@ class Stepper:
         within_mm = min(max(gap_mm, self._gaps_mm[0]), self._gaps_mm[1])
         return Reference(within_mm, speed_mm_s, plan.gap_acceleration_mm_s2)
 
-    def _top_speed(self, expected: Expected, estimate: Estimate) -> float:
-        """Of the gap: the motor's without load, or what the carriages show where they fall behind; not below half,
-        so that carriages that are held still are found out by their following error.
+    def _speeds(self, reference: Reference, expected: Expected, estimate: Estimate) -> Speeds:
+        """The motors' and the configured one, or what the carriages show where they fall behind; not below half, so
+        that carriages that are held still are found out by their following error.
         """
-        if abs(expected.gap_mm - estimate.gap_mm) <= WEAK_MM:
-            return self._no_load_mm_s
-        return min(max(abs(estimate.left_mm_s + estimate.right_mm_s), self._no_load_mm_s / 2.0), self._no_load_mm_s)
+        motors_mm_s = self._no_load_mm_s
+        if abs(expected.gap_mm - estimate.gap_mm) > WEAK_MM:
+            shown_mm_s = abs(estimate.left_mm_s + estimate.right_mm_s)
+            motors_mm_s = min(max(shown_mm_s, motors_mm_s / 2.0), motors_mm_s)
+        closing_mm_s = min(motors_mm_s, self._position.gap_speed_mm_s)
+        # the magnets' pull helps to close, but a reserve is worth more there than a little speed
+        return Speeds(motors_mm_s, min(closing_mm_s, self._top_speed.opening_mm_s(reference.gap_mm)), closing_mm_s)
 
     def _errors(self, expected: Expected, estimate: Estimate) -> tuple[Error, Error]:
         """Both carriages' errors; either also takes half of the skew, so that the faster waits for the slower."""

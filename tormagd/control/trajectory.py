@@ -19,6 +19,14 @@ class Reference(NamedTuple):
     acceleration_mm_s2: float = 0.0
 
 
+class Speeds(NamedTuple):
+    """Of the gap, mm/s, > 0: where the motors have no torque left, and the fastest that the reference may be."""
+
+    no_load_mm_s: float
+    opening_mm_s: float
+    closing_mm_s: float
+
+
 class Expected(NamedTuple):
     """Where the gap must be by now if it follows its reference: mm, mm/s, and the speed as the estimate filters it.
 
@@ -32,15 +40,15 @@ class Expected(NamedTuple):
 
 
 def follow(
-    limits: Position, reference: Reference, target: Reference, dt_s: float, top_speed_mm_s: float
+    limits: Position, reference: Reference, target: Reference, dt_s: float, speeds: Speeds
 ) -> tuple[Reference, bool]:
     """The reference `dt_s` later, and whether the speed limit holds it back from the target, which moves.
 
     The closing speed is the largest from which the distance left still suffices to brake with
     `gap_acceleration_mm_s2`, so that a step is time-optimal under the limits and does not overshoot. The target's own
     speed is added, so that a moving target is followed without lag, and a target that itself turns round leaves less
-    to brake with. Speeding up, the acceleration falls with speed to nothing at `top_speed_mm_s`, > 0, where
-    the motors have no torque left.
+    to brake with. Speeding up, the acceleration falls with speed to nothing at `speeds.no_load_mm_s`, where the motors
+    have no torque left.
     """
     acceleration = limits.gap_acceleration_mm_s2
     distance = target.gap_mm - reference.gap_mm
@@ -50,9 +58,8 @@ def follow(
     braking = (math.sqrt(change * change + 8.0 * relative * abs(distance)) - change) / 2.0
     closing = math.copysign(min(braking, abs(distance) / max(APPROACH_S, dt_s)), distance)
     wanted = target.speed_mm_s + closing
-    fastest = min(limits.gap_speed_mm_s, top_speed_mm_s)
-    bounded = min(max(wanted, -fastest), fastest)
-    torque = max(0.0, 1.0 - abs(reference.speed_mm_s) / top_speed_mm_s)
+    bounded = min(max(wanted, -speeds.closing_mm_s), speeds.opening_mm_s)
+    torque = max(0.0, 1.0 - abs(reference.speed_mm_s) / speeds.no_load_mm_s)
     is_opening = reference.speed_mm_s > 0.0
     up, down = (acceleration * torque, acceleration) if is_opening else (acceleration, acceleration * torque)
     chosen = min(max((bounded - reference.speed_mm_s) / dt_s, -down), up)

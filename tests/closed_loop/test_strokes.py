@@ -1,0 +1,51 @@
+"""Strokes of the gap on the simulated device (synthetic): what magnets that pull and screws that stick do to them."""
+
+import msgspec
+
+from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.config import Config
+from tormagd.control.plan import Plan
+from tormagd.control.step import Stepper
+from tormagd.scenes.scene import load_scene
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import load_plant
+
+CONFIG = Config()
+
+
+def armed(config: Config = CONFIG) -> ClosedLoop:
+    """Sample 1 with the gap open."""
+    device = VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1)
+    loop = ClosedLoop(config, Stepper(config, load_scene("coronary")), None, device)
+    loop.arm(gap_plan(95.0, 0.0))
+    return loop
+
+
+def gap_plan(gap_mm: float, now_s: float) -> Plan:
+    """A plan for a gap instead of a force."""
+    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
+
+
+def go(loop: ClosedLoop, gap_mm: float, duration_s: float) -> list[Sample]:
+    return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(round(1_000 * duration_s))]
+
+
+def worst_lag_mm(samples: list[Sample]) -> float:
+    """How far the encoders were ever off what was expected of them."""
+    states = [sample.state for sample in samples]
+    return max(abs(s.expected.gap_mm - s.estimate.gap_mm) for s in states if s.expected and s.estimate)
+
+
+def test_the_gap_opens_no_faster_than_the_magnets_let_it() -> None:
+    """Without the pull in it the reference runs ahead of carriages that have no more voltage."""
+    lags_mm, overshoots_mm = [], []
+    for pull_V in (CONFIG.motor.pull_V, 0.0):
+        loop = armed(msgspec.structs.replace(CONFIG, motor=msgspec.structs.replace(CONFIG.motor, pull_V=pull_V)))
+        go(loop, 47.0, 2.5)
+        samples = go(loop, 70.0, 1.2)
+        lags_mm.append(worst_lag_mm(samples))
+        overshoots_mm.append(max(sample.truth.gap_mm for sample in samples) - 70.0)
+    assert lags_mm[0] < 0.1
+    assert lags_mm[0] < 0.3 * lags_mm[1]
+    assert overshoots_mm[0] < 0.01 < overshoots_mm[1]
