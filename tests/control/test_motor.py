@@ -5,7 +5,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.signal import StateSpace, cont2discrete, dlsim, lfilter
@@ -159,7 +159,14 @@ def test_positive_margins_are_what_makes_the_closed_loop_stable(factor: float) -
     assert (found.gain_margin_dB > 0.0 and found.phase_margin_deg > 0.0) == is_stable
 
 
+SHORT_INTEGRAL = Position(
+    proportional_per_mm=0.09375, integral_time_s=0.005859375, derivative_time_s=0.75, derivative_filter_s=0.0001
+)
+"Just unstable at 1.8 Hz, where the gain is 1 for the first time, and robust at its crossover of 10 Hz."
+
+
 @settings(max_examples=150, deadline=None)
+@example(position=SHORT_INTEGRAL)
 @given(
     position=st.builds(
         Position,

@@ -29,7 +29,7 @@ class TransferFunction(NamedTuple):
 
 
 class Margins(NamedTuple):
-    """Open-loop stability margins: gain margin dB, phase margin degrees, crossover Hz."""
+    """Open-loop stability margins: gain margin dB, upwards or downwards, phase margin degrees, crossover Hz."""
 
     gain_margin_dB: float
     phase_margin_deg: float
@@ -128,6 +128,11 @@ def margins(motor: Motor, position: Position, period_s: float, *, delay_periods:
     turning = np.flatnonzero((phase_deg[:-1] >= -180.0) & (phase_deg[1:] < -180.0))
     turning = turning[turning > crossing] if below.size else turning
     gain_margin = -20.0 * math.log10(float(magnitude[turning[0]])) if turning.size else math.inf
+    # with a short integral time the phase comes from below -180 degrees: there less gain loses the loop
+    rising = np.flatnonzero((phase_deg[:-1] < -180.0) & (phase_deg[1:] >= -180.0))
+    rising = rising[rising < crossing]
+    if rising.size:
+        gain_margin = min(gain_margin, 20.0 * math.log10(float(magnitude[rising].min())))
     if phase_deg[crossing] < -180.0:
         gain_margin = -abs(gain_margin)
     return Margins(gain_margin, 180.0 + float(phase_deg[crossing]), float(frequency[crossing]))
