@@ -49,3 +49,14 @@ def test_the_gap_opens_no_faster_than_the_magnets_let_it() -> None:
     assert lags_mm[0] < 0.1
     assert lags_mm[0] < 0.3 * lags_mm[1]
     assert overshoots_mm[0] < 0.01 < overshoots_mm[1]
+
+
+def test_a_step_knows_nothing_of_the_stroke_before_it() -> None:
+    """What the integral learned while closing is wrong for opening, and on target no error takes it away."""
+    loop = armed()
+    go(loop, 57.0, 1.5)
+    samples = go(loop, 57.0, 0.5)
+    assert max(abs(samples[-1].state.left.integral), abs(samples[-1].state.right.integral)) < 0.002
+    gaps_mm = [s.state.estimate.gap_mm for s in go(loop, 58.0, 0.4) + go(loop, 57.8, 0.4) if s.state.estimate]
+    assert max(gaps_mm) < 58.0 + 1e-3
+    assert min(gaps_mm[400:]) > 57.8 - 0.005

@@ -1,5 +1,7 @@
 """The PID against simple-pid where their structures coincide, and where ours is meant to be better."""
 
+import math
+
 import msgspec
 import pytest
 from hypothesis import given, settings
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 from simple_pid import PID
 
 from tormagd.config import Config, Position
-from tormagd.control.pid import Error, PidOutput, PidState, pid
+from tormagd.control.pid import ON_TARGET_MM, Error, PidOutput, PidState, pid, rested
 
 DT_S = 1e-3
 GAINS = Config().position
@@ -145,3 +147,19 @@ def test_an_hour_of_saturation_is_left_at_once(position: Position, error: float,
     most = 2.0 * position.duty_limit / position.proportional_per_mm
     _, output = update(position, state, -most)
     assert output.duty <= -position.duty_limit * (1.0 - 1e-9)
+
+
+@given(integral=st.floats(-1.0, 1.0), error_mm=st.floats(-0.01, 0.01))
+def test_a_carriage_at_rest_on_target_forgets_within_its_integral_time(integral: float, error_mm: float) -> None:
+    state = PidState(integral)
+    for _ in range(round(GAINS.integral_time_s / DT_S)):
+        state = rested(GAINS, state, Error(error_mm, 0.0), DT_S)
+    if abs(error_mm) > ON_TARGET_MM:
+        assert state.integral == integral  # it is still on its way, and the integral is what gets it there
+    else:
+        assert state.integral == pytest.approx(integral / math.e, rel=0.01)
+
+
+def test_no_carriage_is_nearer_than_on_target() -> None:
+    """Half a count of the device's encoders, 4480 on a lead of 8 mm, is within it, and a whole one is not."""
+    assert 0.5 * 8.0 / 4480.0 < ON_TARGET_MM < 8.0 / 4480.0

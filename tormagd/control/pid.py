@@ -6,6 +6,9 @@ from typing import NamedTuple
 
 from tormagd.config import Position
 
+ON_TARGET_MM = 0.001
+"Just over half an encoder count: no carriage stands nearer."
+
 
 class Error(NamedTuple):
     """How far a carriage is from where it is expected, mm and mm/s."""
@@ -25,6 +28,15 @@ class PidOutput(NamedTuple):
 
     duty: float
     is_saturated: bool
+
+
+def rested(gains: Position, state: PidState, error: Error, dt_s: float) -> PidState:
+    """The state before an update at a reference that rests. On target friction holds the carriage, and no error would
+    ever take back what the integral learned on the way, which is wrong on the way back: it forgets in its own time.
+    """
+    if abs(error.position_mm) > ON_TARGET_MM:
+        return state
+    return PidState(state.integral * gains.integral_time_s / (gains.integral_time_s + dt_s))
 
 
 def pid(gains: Position, state: PidState, error: Error, feed_forward: float, dt_s: float) -> tuple[PidState, PidOutput]:

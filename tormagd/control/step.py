@@ -7,7 +7,7 @@ from firmware_protocol.codec import DeviceMode, DriveMode
 from tormagd.config import Config
 from tormagd.control.estimate import Estimate, first_estimate, update
 from tormagd.control.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s, top_speed
-from tormagd.control.pid import Error, PidState, pid
+from tormagd.control.pid import Error, PidState, pid, rested
 from tormagd.control.plan import Plan
 from tormagd.control.trajectory import Expected, Reference, Speeds, expect, follow
 from tormagd.hardware.measurement import Measurement
@@ -33,6 +33,8 @@ EXCHANGE_S = 0.0015
 "From a duty to its effect as the encoders report it: a period in the exchange, half a period that it is held."
 COULOMB_SPEED_MM_S = 0.5
 "Below this reference speed the friction feed-forward fades, so that a resting carriage is not pushed to and fro."
+RESTING_MM_S = 0.02
+"A slower reference has arrived: it comes in exponentially, and what a second of it moves is a few encoder counts."
 STILL_MM_S = 0.5
 "Slower than this a carriage does not move: half an encoder count a millisecond and filtered."
 LAGGING_MM = 0.1
@@ -160,8 +162,12 @@ class Stepper:
                 limits.append(Limit.RATE)
         left_error, right_error = self._errors(expected, estimate)
         ahead = self._feed_forward(reference)
-        left_state, left = pid(self._position, state.left, left_error, ahead, dt_s)
-        right_state, right = pid(self._position, state.right, right_error, ahead, dt_s)
+        left_state, right_state = state.left, state.right
+        if abs(reference.speed_mm_s) < RESTING_MM_S:
+            left_state = rested(self._position, left_state, left_error, dt_s)
+            right_state = rested(self._position, right_state, right_error, dt_s)
+        left_state, left = pid(self._position, left_state, left_error, ahead, dt_s)
+        right_state, right = pid(self._position, right_state, right_error, ahead, dt_s)
         if not math.isfinite(left.duty + right.duty + measurement.supply_V):  # a sum is finite only if all of it is
             safety = latch(safety, (Fault.NOT_FINITE,))
             return self.start(now_s)._replace(safety=safety), self._off(safety, ())
