@@ -12,7 +12,7 @@ from scipy.signal import StateSpace, cont2discrete, dlsim, lfilter
 
 from tormagd.config import Config, ConfigError, Motor, Position
 from tormagd.control.core import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG, build_core
-from tormagd.control.motor import full_speed_mm_s, margins, mechanical_time_s, top_speed, zero_order_hold
+from tormagd.control.motor import Pull, full_speed_mm_s, margins, mechanical_time_s, zero_order_hold
 from tormagd.physics.magnets import CuboidMagnet, attraction_N
 
 PERIOD_S = 1e-3
@@ -210,18 +210,11 @@ def test_gains_that_would_oscillate_give_no_core(changes: dict[str, float]) -> N
 
 @pytest.mark.parametrize("gap_mm", np.linspace(45.0, 95.0, 11))
 def test_the_pull_falls_with_the_gap_as_that_of_two_blocks(gap_mm: float) -> None:
-    """What opening loses of its speed, beside the closed form of Akoun and Yonnet, both over their value at 45 mm."""
-    found = top_speed(Config().motor)
+    """Beside the closed form of Akoun and Yonnet, both over their value at 45 mm."""
     block = CuboidMagnet(0.04, 0.04, 0.02, 1.45)
-    lost = (found.unpulled_mm_s - found.opening_mm_s(gap_mm)) / found.pull_mm_s
-    assert lost == pytest.approx(attraction_N(float(gap_mm), block) / attraction_N(45.0, block), rel=0.03)
-
-
-def test_friction_and_pull_take_their_voltage_from_the_top_speed() -> None:
-    motor = Motor(supply_V=10.0, coulomb_V=1.0, pull_V=0.5)
-    no_load_mm_s = 2.0 * full_speed_mm_s(motor)
-    assert top_speed(motor).opening_mm_s(45.0) == pytest.approx(0.85 * no_load_mm_s)
-    assert top_speed(motor).opening_mm_s(1e4) == pytest.approx(0.9 * no_load_mm_s)
+    assert Pull(1.0).duty(gap_mm) == pytest.approx(
+        attraction_N(float(gap_mm), block) / attraction_N(45.0, block), rel=0.03
+    )
 
 
 def test_the_shipped_pull_is_what_the_devices_data_say() -> None:

@@ -41,23 +41,16 @@ def full_speed_mm_s(motor: Motor) -> float:
     return motor.supply_V / motor.back_emf_V_s / motor.gear_ratio * motor.screw_lead_mm / (2.0 * math.pi)
 
 
-class TopSpeed(NamedTuple):
-    """Speed of the gap at full duty, mm/s: with friction alone, and how much less it opens at PULL_STATED_MM."""
+class Pull(NamedTuple):
+    """What the magnets' pull takes of either motor while the gap opens, as a duty: `stated` at PULL_STATED_MM."""
 
-    unpulled_mm_s: float
-    pull_mm_s: float
+    stated: float
 
-    def opening_mm_s(self, gap_mm: float) -> float:
-        """The speed at which the gap opens against the magnets' pull."""
+    def duty(self, gap_mm: float) -> float:
+        """The duty at a gap: dipoles attract with the fourth power of their distance."""
         nearness = (PULL_STATED_MM + PULL_DEPTH_MM) / (gap_mm + PULL_DEPTH_MM)
         nearness *= nearness
-        return self.unpulled_mm_s - self.pull_mm_s * nearness * nearness
-
-
-def top_speed(motor: Motor) -> TopSpeed:
-    """Of both carriages together: what friction and pull leave of the supply against the back-EMF."""
-    gap_mm_s_V = 2.0 * full_speed_mm_s(motor) / motor.supply_V
-    return TopSpeed(gap_mm_s_V * (motor.supply_V - motor.coulomb_V), gap_mm_s_V * motor.pull_V)
+        return self.stated * nearness * nearness
 
 
 def mechanical_time_s(motor: Motor) -> float:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from firmware_protocol.codec import DeviceMode, DriveMode
 from tormagd.config import Config
 from tormagd.control.estimate import Estimate, first_estimate, update
-from tormagd.control.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s, top_speed
+from tormagd.control.motor import Pull, electrical_time_s, full_speed_mm_s, mechanical_time_s
 from tormagd.control.pid import Error, PidState, pid, rested
 from tormagd.control.plan import Plan
 from tormagd.control.trajectory import Expected, Reference, Speeds, expect, follow
@@ -82,7 +82,7 @@ class Stepper:
         self._supply_V = config.motor.supply_V
         self._full_speed_mm_s = full_speed_mm_s(config.motor)
         self._no_load_mm_s = 2.0 * self._full_speed_mm_s
-        self._top_speed = top_speed(config.motor)
+        self._pull = Pull(config.motor.pull_V / config.motor.supply_V)
         self._mechanical_time_s = mechanical_time_s(config.motor)
         self._lag_s = electrical_time_s(config.motor) + EXCHANGE_S
         self._gear_loss = 1.0 - config.motor.gear_efficiency
@@ -151,7 +151,8 @@ class Stepper:
         reference = state.reference or Reference(estimate.gap_mm)
         expected = state.expected or Expected(estimate.gap_mm)
         expected = expect(expected, reference, dt_s, self._lag_s, self._position.derivative_filter_s)
-        speeds = self._speeds(reference, expected, estimate)
+        pull = self._pull.duty(reference.gap_mm)
+        speeds = self._speeds(pull, expected, estimate)
         limits: list[Limit] = []
         if safety.operating_state is OperatingState.PAUSED:
             reference, _ = follow(self._position, reference, Reference(reference.gap_mm), dt_s, speeds)
@@ -161,7 +162,7 @@ class Stepper:
             if is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
                 limits.append(Limit.RATE)
         left_error, right_error = self._errors(expected, estimate)
-        ahead = self._feed_forward(reference)
+        ahead = self._feed_forward(reference, pull)
         left_state, right_state = state.left, state.right
         if abs(reference.speed_mm_s) < RESTING_MM_S:
             left_state = rested(self._position, left_state, left_error, dt_s)
@@ -208,7 +209,7 @@ class Stepper:
         within_mm = min(max(gap_mm, self._gaps_mm[0]), self._gaps_mm[1])
         return Reference(within_mm, speed_mm_s, plan.gap_acceleration_mm_s2)
 
-    def _speeds(self, reference: Reference, expected: Expected, estimate: Estimate) -> Speeds:
+    def _speeds(self, pull: float, expected: Expected, estimate: Estimate) -> Speeds:
         """The motors' and the configured one, or what the carriages show where they fall behind; not below half, so
         that carriages that are held still are found out by their following error.
         """
@@ -218,7 +219,8 @@ class Stepper:
             motors_mm_s = min(max(shown_mm_s, motors_mm_s / 2.0), motors_mm_s)
         closing_mm_s = min(motors_mm_s, self._position.gap_speed_mm_s)
         # the magnets' pull helps to close, but a reserve is worth more there than a little speed
-        return Speeds(motors_mm_s, min(closing_mm_s, self._top_speed.opening_mm_s(reference.gap_mm)), closing_mm_s)
+        opening_mm_s = self._no_load_mm_s * (1.0 - self._coulomb - pull)
+        return Speeds(motors_mm_s, min(closing_mm_s, opening_mm_s), closing_mm_s)
 
     def _errors(self, expected: Expected, estimate: Estimate) -> tuple[Error, Error]:
         """Both carriages' errors; either also takes half of the skew, so that the faster waits for the slower."""
@@ -229,13 +231,15 @@ class Stepper:
             Error(half_mm - estimate.right_mm + skew, half_mm_s - estimate.right_mm_s),
         )
 
-    def _feed_forward(self, reference: Reference) -> float:
+    def _feed_forward(self, reference: Reference, pull: float) -> float:
         speed, acceleration = reference.speed_mm_s / 2.0, reference.acceleration_mm_s2 / 2.0
         # what the gears lose has to be added to speed up, and helps to brake
         loss = math.copysign(self._gear_loss, acceleration * speed)
         inertia = acceleration * self._mechanical_time_s / (1.0 - loss)
-        coulomb = self._coulomb * min(max(speed / COULOMB_SPEED_MM_S, -1.0), 1.0)
-        return (speed + inertia) / self._full_speed_mm_s + coulomb
+        moving = min(max(speed / COULOMB_SPEED_MM_S, -1.0), 1.0)
+        # to close, the pull helps a fifth as much: the screw's friction eats the rest
+        friction = self._coulomb + (pull if moving > 0.0 else 0.0)
+        return (speed + inertia) / self._full_speed_mm_s + friction * moving
 
     def _watch(self, state: StepState, estimate: Estimate, now_s: float, measurement: Measurement) -> tuple[Fault, ...]:
         faults: list[Fault] = []
