@@ -92,7 +92,8 @@ def govern(
         renderable = portrait.force_rate_N_s(force, gap_speed_mm_s)
         between = min(max((force - state.last_N) / spacing, -renderable), renderable)
         slope += spacing / (SLOPE_FILTER_S + spacing) * (between - slope)
-    least, most = (min(max(end, portrait.least_N), portrait.most_N) for end in (scene.least_N, scene.most_N))
+    lowest, highest = portrait.least_N, portrait.most_N
+    least, most = min(max(scene.least_N, lowest), highest), min(max(scene.most_N, lowest), highest)
     soon_s = max(age, 0.0) + lead_s
     if setpoint.preview_N:
         periodicity, foresight = NOTHING_LEARNED, 1.0
@@ -105,8 +106,9 @@ def govern(
         path = force + slope * np.minimum(ahead_s, AHEAD_S)
         if foresight > 0.0:
             path += foresight * (forecast_N(periodicity, ahead_s) - path)
+    within = np.minimum(np.maximum(path, least), most)
     rendered = GovernorState(now_s, force, setpoint.stamp_s, slope, force, periodicity)
-    return rendered, Governed(force, path.clip(least, most), age, reasons, foresight)
+    return rendered, Governed(force, within, age, reasons, foresight)
 
 
 def _previewed(setpoint: TimedSetpoint, ahead_s: Array) -> Array:

@@ -185,7 +185,7 @@ class Planner:
     def _motion_ahead(self, governed: Governed, trim: float) -> tuple[float, float]:
         # along the portrait, not from one solution to the next: a difference would amplify the solver's grain
         gaps = self.portrait.gaps_mm(governed.path_N / trim)
-        speed, acceleration = _FIT @ (gaps - gaps[0])
+        speed, acceleration = _FIT.dot(gaps - gaps[0]).tolist()
         position = self._config.position
         fastest, hardest = position.gap_speed_mm_s, position.gap_acceleration_mm_s2
-        return min(max(float(speed), -fastest), fastest), min(max(float(acceleration), -hardest), hardest)
+        return min(max(speed, -fastest), fastest), min(max(acceleration, -hardest), hardest)

@@ -176,7 +176,7 @@ class Stepper:
             limits.append(Limit.SATURATED)
         if abs(estimate.skew_mm) > self._limits.skew_warning_mm:
             limits.append(Limit.SKEW)
-        state = state._replace(
+        state = StepState(
             time_s=now_s,
             safety=safety,
             estimate=estimate,
@@ -185,6 +185,7 @@ class Stepper:
             left=left_state,
             right=right_state,
             duties=(left.duty, right.duty),
+            enabled_s=state.enabled_s,
             straying_s=state.straying_s + dt_s if self._is_astray(reference, estimate) else 0.0,
             still_s=state.still_s + dt_s if self._is_still(state, estimate, left.duty, right.duty) else 0.0,
         )

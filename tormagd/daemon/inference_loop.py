@@ -40,7 +40,8 @@ class InferenceLoop:
         """Something has arrived: reads it, and plans on a new setpoint, if the next control tick leaves the time."""
         start_ns = self._clock_ns()
         if start_ns + self._slack_ns >= next_tick_ns:
-            # not even reading, which takes half as long as planning: the tick would wait, and the plan come no sooner
+            # not even reading: the tick would wait for that, and the plan come no sooner. The descriptor stays
+            # readable, so this is asked again and again, for the slack at most
             self._waiting_ns = self._waiting_ns or start_ns
         elif self._endpoint.drain_setpoints(start_ns * 1e-9):
             self._plan(estimate, start_ns)
