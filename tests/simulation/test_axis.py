@@ -155,20 +155,25 @@ def test_a_worn_gearbox_lets_the_magnets_close_the_gap_where_the_margin_is_negat
     assert plant.gap_mm == pytest.approx(90.0, abs=1e-6)
 
 
-HARD_MOTIONS: dict[str, Callable[[float], tuple[float, float]]] = {
+Volts = tuple[float | None, float | None]
+OPENING = "bridges that open"
+HARD_MOTIONS: dict[str, Callable[[float], Volts]] = {
     "full voltage that turns round": lambda time_s: (12.0, 12.0) if time_s % 0.2 < 0.1 else (-12.0, -12.0),
     "slow reversals": lambda time_s: (2.0 * math.sin(7.5 * time_s),) * 2,
     "sticking": lambda time_s: (1.2 * math.sin(31.0 * time_s), -1.2 * math.sin(31.0 * time_s)),
     "both for themselves": lambda time_s: ((-12.0, 6.0), (6.0, -3.0), (0.0, 0.0), (12.0, -12.0))[int(time_s * 20) % 4],
+    OPENING: lambda time_s: ((12.0, 12.0), (None, None), (-12.0, None), (None, -12.0))[int(time_s * 40) % 4],
 }
 
 
 @pytest.mark.parametrize("drag_left_N", [6.0, 50.0], ids=["one flank", "through the backlash"])
 @pytest.mark.parametrize("motion", HARD_MOTIONS)
-def test_the_substep_is_fine_enough_for_hard_motion(motion: str, drag_left_N: float) -> None:
+@pytest.mark.parametrize("name", plant_names())
+def test_the_substep_is_fine_enough_for_hard_motion(name: str, motion: str, drag_left_N: float) -> None:
     """Against substeps of 0.01 ms; voltages change between substeps, and screws are read there too."""
-    screw = msgspec.structs.replace(SAMPLE_1.screw, drag_left_N=drag_left_N)
-    parameters = at_gap(msgspec.structs.replace(SAMPLE_1, screw=screw), 60.0)
+    sample = load_plant(name)
+    screw = msgspec.structs.replace(sample.screw, drag_left_N=drag_left_N)
+    parameters = at_gap(msgspec.structs.replace(sample, screw=screw), 60.0)
 
     def path(substep_s: float) -> tuple[list[float], ...]:
         plant = Plant(parameters, ReversingHand(0.5), substep_s=substep_s)
@@ -189,14 +194,14 @@ def test_the_substep_is_fine_enough_for_hard_motion(motion: str, drag_left_N: fl
         return max(abs(a - b) for a, b in zip(coarse, fine, strict=True))
 
     coarse, fine = path(SUBSTEP_S), path(1e-5)
-    assert max(fine[0]) - min(fine[0]) > 50.0
+    assert max(fine[0]) - min(fine[0]) > 30.0
     gap_um, force_mN, screw_um, current_mA = (most(a, b) for a, b in zip(coarse, fine, strict=True))
-    assert gap_um < 4.0
-    assert force_mN < 0.4
-    # one count of the encoders
-    assert screw_um < 1.8
+    # a bridge that opens at full speed opens up to half a substep late or early; otherwise an encoder's count is 1.8 um
+    assert gap_um < (30.0 if motion == OPENING else 4.0)
+    assert force_mN < (2.5 if motion == OPENING else 0.4)
+    assert screw_um < (5.0 if motion == OPENING else 1.8)
     # 24 V more, 0.27 ms ago
-    assert current_mA < 400.0
+    assert current_mA < 600.0
 
 
 @settings(max_examples=25, deadline=None)

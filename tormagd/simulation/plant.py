@@ -13,7 +13,7 @@ from tormagd.simulation.hand import Hand
 from tormagd.simulation.parameters import PlantParameters
 
 SUBSTEP_S = 5e-4
-"""Step of motors and screws, under the motors' electrical time constant; see `Axis` for what it leaves out."""
+"""Step of motors and screws, at most the motors' electrical time constant; see `Axis` for what it leaves out."""
 
 ELEMENT_STEP_S = 1e-3
 """Step of the element and the hand; the element's updates are exact over it."""
@@ -56,7 +56,8 @@ class Plant:
     """The device without its electronics, in fixed substeps of its own time; see `Axis` and `Element` for the laws.
 
     `advance` may be called with any time step; the remainder of a substep is kept for the next call. A voltage that
-    changes within a substep acts in it with its mean. Screws and currents can be read within a substep; the rest of the
+    changes within a substep acts in it with its mean; a bridge opens at the nearer end of one, which moves a carriage
+    that is cut off at full speed by up to 25 um. Screws and currents can be read within a substep; the rest of the
     state is that at its beginning. At power-on both bridges are open.
     """
 
@@ -134,8 +135,8 @@ class Plant:
         if not (abs(left_V or 0.0) < math.inf and abs(right_V or 0.0) < math.inf):
             raise ValueError(f"left_V = {left_V}, right_V = {right_V}: allowed are finite voltages and None")
         share = self._target_s / self._substep_s - self._substeps
-        self._left_early_V += share * ((self._left_V or 0.0) - (left_V or 0.0))
-        self._right_early_V += share * ((self._right_V or 0.0) - (right_V or 0.0))
+        self._left_early_V += _early_V(self.left, share, self._left_V, left_V)
+        self._right_early_V += _early_V(self.right, share, self._right_V, right_V)
         self._left_V, self._right_V = left_V, right_V
 
     def advance(self, dt_s: float) -> None:
@@ -148,8 +149,8 @@ class Plant:
             return
         left, right, pull_at, per_element = self.left, self.right, self._attraction.at, self._substeps_per_element
         left_V, right_V = self._left_V, self._right_V
-        left_mean_V = None if left_V is None else left_V + self._left_early_V
-        right_mean_V = None if right_V is None else right_V + self._right_early_V
+        left_mean_V = _mean_V(left, left_V, self._left_early_V)
+        right_mean_V = _mean_V(right, right_V, self._right_early_V)
         self._left_early_V = self._right_early_V = 0.0
         for substep in range(self._substeps + 1, due + 1):
             pull_N = pull_at((left.position_m + right.position_m) * 1e3)
@@ -172,6 +173,23 @@ class Plant:
         for axis in (self.left, self.right):
             axis.gear_friction_Nm /= divisor
             axis.screw_friction_m /= divisor
+
+
+def _applied_V(axis: Axis, voltage_V: float | None) -> float:
+    """An open bridge drives no current, as the back-EMF itself would not."""
+    return axis.back_emf_V if voltage_V is None else voltage_V
+
+
+def _early_V(axis: Axis, share: float, before_V: float | None, voltage_V: float | None) -> float:
+    """What the voltage before, for that share of a substep, adds to its mean. A bridge opens at the nearer end of the
+    substep: it takes the current away at once, which no mean voltage does."""
+    share = float(round(share)) if voltage_V is None else share
+    return share * (_applied_V(axis, before_V) - _applied_V(axis, voltage_V))
+
+
+def _mean_V(axis: Axis, voltage_V: float | None, early_V: float) -> float | None:
+    """Over the substep that has begun; None only where the bridge was open all the time."""
+    return None if voltage_V is None and not early_V else _applied_V(axis, voltage_V) + early_V
 
 
 class ForceSensor:
