@@ -9,8 +9,10 @@ from tormagd.control.plan import Planner, PlanState
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.rate_group import RateGroup
 
-LEARNT_SHARE = 0.02
+LEARNT_SHARE = 0.01
 "By how much of itself one plan moves the slack, however long it was interrupted."
+MOST_SLACK_NS = 400_000.0
+"Plans that take longer run into the tick, rather than let setpoints wait for one tick after another."
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +43,7 @@ class InferenceLoop:
         start_ns = self._clock_ns()
         if start_ns + self._slack_ns >= next_tick_ns:
             # not even reading: the tick would wait for that, and the plan come no sooner. The descriptor stays
-            # readable, so this is asked again and again, for the slack at most
+            # readable, so this is asked again and again until the tick: at 500 setpoints a second 1 % of the time
             self._waiting_ns = self._waiting_ns or start_ns
         elif self._endpoint.drain_setpoints(start_ns * 1e-9):
             self._plan(estimate, start_ns)
@@ -70,9 +72,10 @@ class InferenceLoop:
     def _learn_slack(self, start_ns: int) -> None:
         """From reading, which began then, to the plan, which is done."""
         took_ns = self._clock_ns() - start_ns
-        # to the median: of the setpoints that just have the time, half make the tick wait, by some microseconds;
-        # a longer slack would make more of them wait, and for a whole period
-        self._slack_ns *= 1.0 + LEARNT_SHARE * (0.5 if took_ns > self._slack_ns else -0.5)
+        # to the median: half of the setpoints that just have the time make the tick wait, by what plans vary; with a
+        # longer slack more of them would wait, and for a whole period
+        moved_ns = self._slack_ns * (1.0 + (LEARNT_SHARE if took_ns > self._slack_ns else -LEARNT_SHARE))
+        self._slack_ns = min(moved_ns, MOST_SLACK_NS)
 
     def _planned(self, now_s: float, estimate: Estimate | None) -> PlanState:
         inbox = self._endpoint.inbox

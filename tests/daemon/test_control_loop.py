@@ -1,0 +1,29 @@
+"""One period: what the step is given, and what is kept of it."""
+
+from types import SimpleNamespace
+from typing import Any
+
+from firmware_protocol.codec import DriveMode
+from tormagd.control.step import StepOutput, StepState
+from tormagd.daemon.control_loop import ControlLoop
+from tormagd.safety.operating_state import DeviceRequest
+
+
+def test_the_measurement_that_a_step_was_given_is_kept_though_the_exchange_brings_a_newer_one() -> None:
+    given = []
+    connection: Any = SimpleNamespace(measurement="old")
+
+    def exchange(*_arguments: Any) -> None:
+        connection.measurement = "new"
+
+    def step(state: StepState, now_s: float, measurement: Any, _plan: Any) -> tuple[StepState, StepOutput]:
+        given.append(measurement)
+        return state._replace(time_s=now_s), StepOutput(DriveMode.OFF, 0.0, 0.0, DeviceRequest.NONE, 0, ())
+
+    connection.exchange = exchange
+    stepper: Any = SimpleNamespace(start=StepState, step=step)
+    loop = ControlLoop(stepper, connection, 1_000_000)
+    plan: Any = None
+    for seen in ("old", "new"):
+        loop.tick(0, 0, plan)
+        assert (given[-1], loop.measurement) == (seen, seen)
