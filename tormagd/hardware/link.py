@@ -219,21 +219,12 @@ class DeviceLink:
     def _take_sense(self, sense: Sense) -> None:
         # Sense follows the State of the same instant; the measurement takes the newest of both
         if self.measurement is not None and self._sense is not None:
-            last = self.measurement
             travel = _unwrapped(self._sense.handle_position_mm, sense.handle_position_mm, HANDLE_SPAN_MM)
-            # by position, here and below: twice a period, and `_replace` takes three times as long
-            self.measurement = Measurement(
-                *last[:5],
-                sense.left_current_A,
-                sense.right_current_A,
-                sense.force_N,
-                last.handle_mm + travel,
-                last.mode,
-                last.switches,
-                last.faults,
-                last.temperature_C,
-                last.supply_V,
-                last.delay_s,
+            self.measurement = self.measurement._replace(
+                left_current_A=sense.left_current_A,
+                right_current_A=sense.right_current_A,
+                force_N=sense.force_N,
+                handle_mm=self.measurement.handle_mm + travel,
             )
         self._sense = sense
 
@@ -250,13 +241,12 @@ class DeviceLink:
         last = self.measurement
         # before homing the position's origin is arbitrary; homing sets it to 0, so a wrap and a re-zero look alike:
         # taking the shortest way each time is right for the first and harmless for the second
-        self.measurement = Measurement(
-            last.number + 1,
-            now_s,
-            last.device_time_s + (state.device_time_s - previous.device_time_s) % DEVICE_TIME_SPAN_S,
-            last.left_mm + _unwrapped(previous.left_position_mm, state.left_position_mm, POSITION_SPAN_MM),
-            last.right_mm + _unwrapped(previous.right_position_mm, state.right_position_mm, POSITION_SPAN_MM),
-            *last[5:],
+        self.measurement = last._replace(
+            number=last.number + 1,
+            received_s=now_s,
+            device_time_s=last.device_time_s + (state.device_time_s - previous.device_time_s) % DEVICE_TIME_SPAN_S,
+            left_mm=last.left_mm + _unwrapped(previous.left_position_mm, state.left_position_mm, POSITION_SPAN_MM),
+            right_mm=last.right_mm + _unwrapped(previous.right_position_mm, state.right_position_mm, POSITION_SPAN_MM),
         )
         self.clock.add(now_s, self.measurement.device_time_s)
 
