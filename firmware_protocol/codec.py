@@ -180,11 +180,11 @@ def encode(message: Message) -> bytes:
     return body + bytes((crc8(function_byte + body),)) if protected else body
 
 
-def _refusal(message: Message, codec: _Codec, index: int) -> EncodeError:
-    signal = codec.layout.signals[index]
+def _refusal(message: Message, codec: _Codec, place: int) -> EncodeError:
+    signal = codec.layout.signals[place]
     kind = "finite values" if signal.wraps else "values" if signal.type is float else "whole numbers"
     span = "" if signal.wraps else f" from {signal.minimum:.10g} to {signal.maximum:.10g}"
-    return EncodeError(f"{type(message).__name__}.{signal.name} = {message[index]!r}: allowed are {kind}{span}")
+    return EncodeError(f"{type(message).__name__}.{signal.name} = {message[place]!r}: allowed are {kind}{span}")
 
 
 def decode(function: int, payload: bytes | bytearray) -> Message:

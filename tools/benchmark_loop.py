@@ -285,14 +285,26 @@ def add_realtime_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of what is measured; 0 for none")
     parser.add_argument("--keep-awake", action="store_true", help="idle processors do not sleep")
     parser.add_argument(
-        "--cpus", type=int, nargs="+", default=[], metavar="N", help="processors that what is measured has to itself"
+        "--cpus",
+        type=int,
+        nargs="+",
+        default=[],
+        metavar="N",
+        help="processors for what is measured; what measures it keeps to the others",
     )
 
 
 def realtime_settings(options: argparse.Namespace) -> RealTime:
-    """The settings for these options. What measures and makes the load leaves the named processors from now on."""
+    """The settings for these options. What measures and makes the load leaves the named processors from now on.
+
+    Raises SystemExit where that leaves it none.
+    """
     if options.cpus:
-        os.sched_setaffinity(0, os.sched_getaffinity(0) - set(options.cpus))
+        usable = os.sched_getaffinity(0)
+        others = usable - set(options.cpus)
+        if not set(options.cpus) <= usable or not others:
+            raise SystemExit(f"--cpus {options.cpus}: allowed are some, not all, of {sorted(usable)}")
+        os.sched_setaffinity(0, others)
     return RealTime(fifo_priority=options.fifo, keep_awake=options.keep_awake, cpus=tuple(options.cpus))
 
 

@@ -148,7 +148,6 @@ class ClosedLoop:
 
 def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:
     """A publisher in virtual time: each force is sent at its time, and nothing before the first."""
-
     sent_s, sent_N = times_s.tolist(), forces_N.tolist()
 
     def newest(now_s: float) -> TimedSetpoint | None:

@@ -20,7 +20,9 @@ def ctl() -> int:
 
 def _run(module: str) -> int:
     """The exit code of the module's `main`, which sees to SIGINT itself as soon as it runs."""
-    interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    interrupt = signal.getsignal(signal.SIGINT)
+    if interrupt is signal.default_int_handler:  # a shell's background job ignores it, and goes on doing so
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     main: Callable[[], int] = import_module(module).main
     try:
         signal.signal(signal.SIGINT, interrupt)

@@ -2,7 +2,7 @@
 
 import signal
 
-if __name__ == "__main__":
+if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     # what follows takes half a second to load: until `main` sees to it, Ctrl-C may simply end the process
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
