@@ -113,7 +113,6 @@ def test_a_nan_hides_in_no_list_and_no_unknown_table(write) -> None:
             "from 564286 on at rates.control_hz = 1000",
         ),
         ("[rates]\ntelemetry_hz = 60", "rates.telemetry_hz", "60", "rates.control_hz = 1000"),
-        ("[motor]\nsupply_V = 6.0\ncoulomb_V = 3.0", "motor.coulomb_V + motor.pull_V", "3.5", "motor.supply_V = 6"),
         (
             "[device]\ncommand_timeout_ms = 500.0",
             "device.command_timeout_ms",

@@ -12,7 +12,7 @@ from scipy.signal import StateSpace, cont2discrete, dlsim, lfilter
 
 from tormagd.config import Config, ConfigError, Motor, Position
 from tormagd.control.core import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG, build_core
-from tormagd.control.motor import Pull, full_speed_mm_s, margins, mechanical_time_s, zero_order_hold
+from tormagd.control.motor import full_speed_mm_s, margins, mechanical_time_s, pull_V, zero_order_hold
 from tormagd.physics.magnets import CuboidMagnet, attraction_N
 
 PERIOD_S = 1e-3
@@ -208,13 +208,20 @@ def test_gains_that_would_oscillate_give_no_core(changes: dict[str, float]) -> N
         build_core(Config(position=position))
 
 
+@pytest.mark.parametrize("changes", [{"pull_V": 6.0}, {"coulomb_V": 5.8}, {"supply_V": 3.0, "coulomb_V": 1.4}])
+def test_motors_too_weak_for_the_pull_give_no_core(changes: dict[str, float]) -> None:
+    motor = msgspec.structs.replace(Config().motor, **changes)
+    with pytest.raises(ConfigError, match=r"coulomb_V = .* pull_V = .* to open the gap from .* allowed is"):
+        build_core(Config(motor=motor))
+
+
 @pytest.mark.parametrize("gap_mm", np.linspace(45.0, 95.0, 11))
 def test_the_pull_falls_with_the_gap_as_that_of_two_blocks(gap_mm: float) -> None:
     """Beside the closed form of Akoun and Yonnet, both over their value at 45 mm."""
     block = CuboidMagnet(0.04, 0.04, 0.02, 1.45)
-    assert Pull(1.0).duty(gap_mm) == pytest.approx(
-        attraction_N(float(gap_mm), block) / attraction_N(45.0, block), rel=0.03
-    )
+    motor = Config().motor
+    expected = attraction_N(float(gap_mm), block) / attraction_N(45.0, block)
+    assert pull_V(motor, gap_mm) / motor.pull_V == pytest.approx(expected, rel=0.03)
 
 
 def test_the_shipped_pull_is_what_the_devices_data_say() -> None:

@@ -172,7 +172,7 @@ def test_after_a_jump_nothing_is_forecast() -> None:
 
 def test_a_gap_or_a_stamp_from_before_begins_anew() -> None:
     state = learned()
-    for stamp_s in (state.stamp_s + LONGEST_STEP_S + 1e-6, state.stamp_s - 1e-6, -5.0):
+    for stamp_s in (state.stamp_s + LONGEST_STEP_S + 1e-6, state.stamp_s - 1.1 * GRID_S, -5.0):
         fresh = observe(state, stamp_s, 1.5, 0.0)
         assert fresh.trust == 0.0
         assert (fresh.stamp_s, fresh.time_s, np.frombuffer(fresh.history).tolist()) == (stamp_s, stamp_s, [1.5])
@@ -183,9 +183,10 @@ def test_a_gap_or_a_stamp_from_before_begins_anew() -> None:
 def test_a_stamp_again_counts_once_with_its_newest_force() -> None:
     state = learned()
     assert observe(state, state.stamp_s, state.force_N, 0.0) is state
-    other = observe(state, state.stamp_s, 1.7, 0.0)
-    assert (other.history, other.force_N) == (state.history, 1.7)
-    assert forecast_N(other, np.zeros(1)) == pytest.approx([1.7])
+    for back_s in (0.0, 0.003):
+        other = observe(state, state.stamp_s - back_s, 1.7, 0.0)
+        assert (other.history, other.stamp_s, other.force_N) == (state.history, state.stamp_s, 1.7)
+        assert forecast_N(other, np.zeros(1)) == pytest.approx([1.7])
 
 
 def test_the_forecast_starts_at_the_newest_setpoint_between_two_points_of_the_grid() -> None:

@@ -528,3 +528,17 @@ def test_a_clock_that_jumps_is_one_ordinary_period(core: Core, measure, elapsed_
         moved_mm.append(later.reference.gap_mm - at_mm)
     assert moved_mm[0] < -0.01
     assert moved_mm[1] == pytest.approx(moved_mm[0])
+
+
+@pytest.mark.parametrize("gap_mm", [-64.0, -40.0, -5.0, 0.0, 30.0])
+def test_carriages_beyond_the_closed_end_are_driven_back(bench: Bench, gap_mm: float) -> None:
+    """The law of the magnets' pull has no meaning there, and below -32 mm another sign."""
+    there = {"left_mm": gap_mm / 2.0 - 47.5, "right_mm": gap_mm / 2.0 - 47.5}
+    bench.step(count=3, **there)
+    bench.command("enable")
+    for _ in range(30):
+        output = bench.step(gap_plan(70.0, bench.now_s), **there)
+        reference = bench.state.reference
+        assert reference is not None
+        assert reference.speed_mm_s >= 0.0
+    assert min(output.left_duty, output.right_duty) > 0.5

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tormagd.config import Config, ConfigError
-from tormagd.control.motor import Margins, margins
+from tormagd.control.motor import Margins, margins, pull_V
 from tormagd.control.plan import Planner
 from tormagd.control.portrait import FieldOfGap, Portrait
 from tormagd.control.step import Stepper
@@ -48,6 +48,7 @@ def build_core(config: Config) -> Core:
             f"of {stability.gain_margin_dB:.1f} dB: allowed is at least {LEAST_PHASE_MARGIN_DEG:g} and "
             f"{LEAST_GAIN_MARGIN_DB:g}"
         )
+    _refuse_too_weak(config, scene)
     try:
         fitted = insert(scene.insert.name)
         model = load_model(
@@ -67,6 +68,16 @@ def build_core(config: Config) -> Core:
     planner = Planner(config, scene, model, solver, field, 100.0 * fitted.cip_fraction)
     _refuse_out_of_reach(scene, planner.portrait)
     return Core(scene, planner, Stepper(config, scene), stability, choice)
+
+
+def _refuse_too_weak(config: Config, scene: Scene) -> None:
+    motor, closed_mm = config.motor, scene.insert.gap_closed_mm
+    needed_V, most_V = motor.coulomb_V + pull_V(motor, closed_mm), config.position.duty_limit * motor.supply_V / 2.0
+    if needed_V > most_V:
+        raise ConfigError(
+            f"motor: coulomb_V = {motor.coulomb_V:g} and pull_V = {motor.pull_V:g} take {needed_V:.2f} V to open the "
+            f"gap from {closed_mm:g} mm: allowed is {most_V:g} V, half of position.duty_limit times motor.supply_V"
+        )
 
 
 def _refuse_out_of_reach(scene: Scene, reach: Portrait) -> None:

@@ -41,16 +41,13 @@ def full_speed_mm_s(motor: Motor) -> float:
     return motor.supply_V / motor.back_emf_V_s / motor.gear_ratio * motor.screw_lead_mm / (2.0 * math.pi)
 
 
-class Pull(NamedTuple):
-    """What the magnets' pull takes of either motor while the gap opens, as a duty: `stated` at PULL_STATED_MM."""
-
-    stated: float
-
-    def duty(self, gap_mm: float) -> float:
-        """The duty at a gap: dipoles attract with the fourth power of their distance."""
-        nearness = (PULL_STATED_MM + PULL_DEPTH_MM) / (gap_mm + PULL_DEPTH_MM)
-        nearness *= nearness
-        return self.stated * nearness * nearness
+def pull_V(motor: Motor, gap_mm: float) -> float:
+    """Voltage that the magnets' pull takes of either motor to open a gap of 0 or more: dipoles attract with the fourth
+    power of their distance.
+    """
+    nearness = (PULL_STATED_MM + PULL_DEPTH_MM) / (gap_mm + PULL_DEPTH_MM)
+    nearness *= nearness
+    return motor.pull_V * nearness * nearness
 
 
 def mechanical_time_s(motor: Motor) -> float:

@@ -25,7 +25,7 @@ LAGS = (1, 2, 4, 7, 11)
 STRIDE = 3
 "Every third stretch is looked at: the regression makes up for most of what lies between them."
 AHEAD = 8
-"Points that are forecast: as far as a plan looks, late by the longest lag."
+"Points that are forecast; a plan looks 30 ms ahead, from as far ahead as the carriages are late."
 JUDGED = 4
 "The point ahead that forecasts are judged at."
 LONGEST_STEP_S = 0.1
@@ -110,12 +110,14 @@ NOTHING_LEARNED = Periodicity()
 def observe(state: Periodicity, stamp_s: float, force_N: float, slope_N_s: float) -> Periodicity:
     """The state with one setpoint more, in bounded time; `slope_N_s` is what is extrapolated otherwise.
 
-    Another force with the same stamp takes the place of the first; a stamp from before, or after LONGEST_STEP_S,
-    begins anew.
+    Another force with the same stamp, or one from up to GRID_S before, takes the place of the first; a stamp from
+    longer before, or after LONGEST_STEP_S, begins anew.
     """
     if state.from_s < state.time_s and len(state.history) >= _LEAST_BYTES:
         # a plan later than the point of the grid came: the plan that a setpoint waits for has enough to do
         state = _searched(state, slope_N_s)
+    if -GRID_S < stamp_s - state.stamp_s < 0.0:
+        stamp_s = state.stamp_s  # the clocks of publisher and daemon are read at slightly different times
     spacing_s = stamp_s - state.stamp_s
     if not 0.0 <= spacing_s <= LONGEST_STEP_S:
         return Periodicity(stamp_s, force_N, stamp_s, array("d", [force_N]).tobytes())
@@ -133,13 +135,15 @@ def observe(state: Periodicity, stamp_s: float, force_N: float, slope_N_s: float
             errors = guesses[0] - force, guesses[1] - force
             long, short = long.after(*errors, LONG_S), short.after(*errors, SHORT_S)
     awaited = (*state.awaited_N, *[None] * count)[-JUDGED:]
-    # until the next forecast the last one serves, as far as it has been judged
-    changes = state.changes_N if stamp_s - state.from_s <= JUDGED * GRID_S else ()
+    # until the next forecast the last one serves, as far as it reaches
+    changes = state.changes_N if stamp_s - state.from_s < (AHEAD - 1) * GRID_S else ()
     return Periodicity(stamp_s, force_N, times_s[-1], history, state.from_s, changes, awaited, long, short)
 
 
 def _searched(state: Periodicity, slope_N_s: float) -> Periodicity:
-    """The state with a forecast from its newest point of the grid, and what it says to be judged by."""
+    """The state with a forecast from its newest point of the grid, and what it and the slope say, to be judged by. The
+    slope may know of one setpoint more, which is on the safe side.
+    """
     changes = _search(np.frombuffer(state.history))
     said = None
     if changes:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from tormagd.config import Position
 
 ON_TARGET_MM = 0.001
-"Just over half an encoder count: no carriage stands nearer."
+"Just over half a count of 4,480 on 8 mm: a carriage cannot be told to stand nearer."
 
 
 class Error(NamedTuple):

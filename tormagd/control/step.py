@@ -6,7 +6,7 @@ from typing import NamedTuple
 from firmware_protocol.codec import DeviceMode, DriveMode
 from tormagd.config import Config
 from tormagd.control.estimate import Estimate, first_estimate, update
-from tormagd.control.motor import Pull, electrical_time_s, full_speed_mm_s, mechanical_time_s
+from tormagd.control.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s, pull_V
 from tormagd.control.pid import Error, PidState, pid, rested
 from tormagd.control.plan import Plan
 from tormagd.control.trajectory import Expected, Reference, Speeds, expect, follow
@@ -79,10 +79,9 @@ class Stepper:
         self._nominal_dt_s = 1.0 / config.rates.control_hz
         self._gaps_mm = (scene.insert.gap_closed_mm, scene.insert.gap_open_mm)
         self._home_mm = scene.insert.gap_open_mm / 2.0
-        self._supply_V = config.motor.supply_V
+        self._motor, self._supply_V = config.motor, config.motor.supply_V
         self._full_speed_mm_s = full_speed_mm_s(config.motor)
         self._no_load_mm_s = 2.0 * self._full_speed_mm_s
-        self._pull = Pull(config.motor.pull_V / config.motor.supply_V)
         self._mechanical_time_s = mechanical_time_s(config.motor)
         self._lag_s = electrical_time_s(config.motor) + EXCHANGE_S
         self._gear_loss = 1.0 - config.motor.gear_efficiency
@@ -151,7 +150,8 @@ class Stepper:
         reference = state.reference or Reference(estimate.gap_mm)
         expected = state.expected or Expected(estimate.gap_mm)
         expected = expect(expected, reference, dt_s, self._lag_s, self._position.derivative_filter_s)
-        pull = self._pull.duty(reference.gap_mm)
+        # a homed carriage that is found beyond the closed end has to come back from there
+        pull = pull_V(self._motor, max(reference.gap_mm, self._gaps_mm[0])) / self._supply_V
         speeds = self._speeds(pull, expected, estimate)
         limits: list[Limit] = []
         if safety.operating_state is OperatingState.PAUSED:
@@ -220,7 +220,7 @@ class Stepper:
             motors_mm_s = min(max(shown_mm_s, motors_mm_s / 2.0), motors_mm_s)
         closing_mm_s = min(motors_mm_s, self._position.gap_speed_mm_s)
         # the magnets' pull helps to close, but a reserve is worth more there than a little speed
-        opening_mm_s = self._no_load_mm_s * (1.0 - self._coulomb - pull)
+        opening_mm_s = self._no_load_mm_s * (self._position.duty_limit - self._coulomb - pull)
         return Speeds(motors_mm_s, min(closing_mm_s, opening_mm_s), closing_mm_s)
 
     def _errors(self, expected: Expected, estimate: Estimate) -> tuple[Error, Error]:
@@ -239,8 +239,8 @@ class Stepper:
         inertia = acceleration * self._mechanical_time_s / (1.0 - loss)
         moving = min(max(speed / COULOMB_SPEED_MM_S, -1.0), 1.0)
         # to close, the pull helps a fifth as much: the screw's friction eats the rest
-        friction = self._coulomb + (pull if moving > 0.0 else 0.0)
-        return (speed + inertia) / self._full_speed_mm_s + friction * moving
+        resisting = self._coulomb + (pull if moving > 0.0 else 0.0)
+        return (speed + inertia) / self._full_speed_mm_s + resisting * moving
 
     def _watch(self, state: StepState, estimate: Estimate, now_s: float, measurement: Measurement) -> tuple[Fault, ...]:
         faults: list[Fault] = []
