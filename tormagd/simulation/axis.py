@@ -126,19 +126,14 @@ class Axis:
             friction_Nm += self._mesh_loss * transmitted_Nm
         push_rad_s = (drive_Nm - lead_m_rad * contact_N) * impulse_rad_s_Nm
         grip_rad_s = friction_Nm * impulse_rad_s_Nm
-        if before_rad_s > 0.0:
-            speed_rad_s = before_rad_s + push_rad_s - grip_rad_s
-            if speed_rad_s < 0.0:
+        if before_rad_s:
+            against_rad_s = -grip_rad_s if before_rad_s > 0.0 else grip_rad_s
+            speed_rad_s = before_rad_s + push_rad_s + against_rad_s
+            if (speed_rad_s > 0.0) != (before_rad_s > 0.0):
                 # it stops within the step, and only what pushes harder than friction holds turns it back from there
-                back_rad_s = push_rad_s + grip_rad_s
+                back_rad_s = push_rad_s - against_rad_s
                 rest = speed_rad_s / (speed_rad_s - before_rad_s)
-                speed_rad_s = back_rad_s * rest if back_rad_s < 0.0 else 0.0
-        elif before_rad_s < 0.0:
-            speed_rad_s = before_rad_s + push_rad_s + grip_rad_s
-            if speed_rad_s > 0.0:
-                back_rad_s = push_rad_s - grip_rad_s
-                rest = speed_rad_s / (speed_rad_s - before_rad_s)
-                speed_rad_s = back_rad_s * rest if back_rad_s > 0.0 else 0.0
+                speed_rad_s = back_rad_s * rest if (back_rad_s > 0.0) != (before_rad_s > 0.0) else 0.0
         elif push_rad_s > grip_rad_s:
             speed_rad_s = push_rad_s - grip_rad_s
         elif push_rad_s < -grip_rad_s:

@@ -181,13 +181,11 @@ class MessageDevice:
         elif right_m <= self._closed_m:
             switches |= Switches.RIGHT_CLOSED
         (left_rad, left_A), (right_rad, right_A) = plant.shafts
-        left_counts = self._stuck_left
-        if left_counts is None:
-            left_counts = math.floor(left_rad * self._counts_per_rad)
+        left_counts, right_counts = self._encoders(left_rad, right_rad)
         left_start, right_start = self._counts_at_boot
         return Sensors(
             left_counts - left_start,
-            math.floor(right_rad * self._counts_per_rad) - right_start,
+            right_counts - right_start,
             left_A,
             right_A,
             plant.sensed_force_N,
@@ -197,6 +195,11 @@ class MessageDevice:
             plant.element.temperature_C,
         )
 
+    def _encoders(self, left_rad: float, right_rad: float) -> tuple[int, int]:
+        stuck = self._stuck_left
+        left_counts = math.floor(left_rad * self._counts_per_rad) if stuck is None else stuck
+        return left_counts, math.floor(right_rad * self._counts_per_rad)
+
     def _strike(self, time_s: float, fault: Fault) -> None:
         match fault.name:
             case "worn_gearbox":
@@ -204,12 +207,13 @@ class MessageDevice:
             case "drag_left":
                 self.plant.left.drag_N *= 1.0 + fault.percent / 100.0
             case "encoder_stuck_left":
-                self._stuck_left = self._sensors().left_counts + self._counts_at_boot[0]
+                (left_rad, _), (right_rad, _) = self.plant.shafts
+                self._stuck_left, _ = self._encoders(left_rad, right_rad)
             case "reset":
                 self.firmware = self._boot(self.parameters)
                 self._answers.clear()
-                sensors, (left_start, right_start) = self._sensors(), self._counts_at_boot
-                self._counts_at_boot = sensors.left_counts + left_start, sensors.right_counts + right_start
+                (left_rad, _), (right_rad, _) = self.plant.shafts
+                self._counts_at_boot = self._encoders(left_rad, right_rad)
                 self._boot_s = time_s
                 self._ticks = 0
             case "commands_vanish":
