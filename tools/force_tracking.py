@@ -25,7 +25,7 @@ from human_pulse import pulse_profile, with_approach
 from thesis_values import USE_CASES
 from tracking import Tracking, tracking
 
-from tormagd.closed_loop import ClosedLoop
+from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
@@ -121,18 +121,18 @@ def publisher(
     times_s: Array, forces_N: Array, preview_s: float, valid_for_s: float
 ) -> Callable[[float], TimedSetpoint | None]:
     """Each force at its time; with a preview, what follows it up to `preview_s` in even steps."""
+    live = stream(times_s, forces_N, valid_for_s)
     period_s = 1.0 / RATE_HZ
     ahead_s = period_s * np.arange(1, round(preview_s / period_s) + 1)
+    if not ahead_s.size:
+        return live
 
     def newest(now_s: float) -> TimedSetpoint | None:
-        index = int(np.searchsorted(times_s, now_s, side="right")) - 1
-        if index < 0:
+        setpoint = live(now_s)
+        if setpoint is None:
             return None
-        stamp_s = float(times_s[index])
-        preview = tuple(np.interp(stamp_s + ahead_s, times_s, forces_N).tolist())
-        return TimedSetpoint(
-            float(forces_N[index]), stamp_s, valid_for_s, preview_N=preview, preview_dt_s=period_s if preview else 0.0
-        )
+        preview = np.interp(setpoint.stamp_s + ahead_s, times_s, forces_N)
+        return setpoint._replace(preview_N=tuple(preview.tolist()), preview_dt_s=period_s)
 
     return newest
 
