@@ -36,7 +36,7 @@ Array = npt.NDArray[np.float64]
 LEAST_N, GRAIN_N = 1.0, 1e-4
 SPACING_S = (0.0015, 0.0025)
 "500 a second, as in `make run`; random, so that they meet every phase of the control period."
-SETTLE_S = 0.5
+SETTLE_NS = 500_000_000
 BELOW = 10
 "The measurement's own processes are this far below the daemon's real-time priority."
 
@@ -99,7 +99,6 @@ def exchange(config: Config, count: int) -> tuple[dict[float, int], list[dict[st
             raise RuntimeError("the daemon does not take setpoints")
         publisher.recv()
         sent: dict[float, int] = {}
-        rows: list[dict[str, Any]] = []
         spacing = random.Random(1)
         for number in range(count):
             force = round(LEAST_N + GRAIN_N * (number % 5_000), 6)
@@ -110,17 +109,18 @@ def exchange(config: Config, count: int) -> tuple[dict[float, int], list[dict[st
             publisher.send(encode(setpoint))
             sent[force] = stamp
             time.sleep(spacing.uniform(*SPACING_S))
-        read_rows(recording, rows, SETTLE_S)
-    return sent, rows
+        return sent, rows_until(recording, time.time_ns() + SETTLE_NS)
 
 
-def read_rows(recording: "zmq.Socket[bytes]", rows: list[dict[str, Any]], for_s: float) -> None:
-    """Takes what the daemon records for a while."""
-    until_s = time.monotonic() + for_s
-    while (left_s := until_s - time.monotonic()) > 0.0:
-        if recording.poll(max(1, round(left_s * 1e3))):
-            batch = decode_ticks(recording.recv())
-            rows.extend(dict(zip(batch.columns, row, strict=True)) for row in batch.rows)
+def rows_until(recording: "zmq.Socket[bytes]", until_ns: int) -> list[dict[str, Any]]:
+    """What the daemon has recorded, up to that time. Raises RuntimeError where it records no more."""
+    rows: list[dict[str, Any]] = []
+    while not rows or rows[-1]["t_ns"] < until_ns:
+        if not recording.poll(5_000):
+            raise RuntimeError("the daemon records nothing")
+        batch = decode_ticks(recording.recv())
+        rows.extend(dict(zip(batch.columns, row, strict=True)) for row in batch.rows)
+    return rows
 
 
 def first_ticks(sent: dict[float, int], rows: list[dict[str, Any]]) -> list[tuple[int, dict[str, Any]]]:
