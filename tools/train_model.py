@@ -17,6 +17,7 @@ from tormagd.learning.features import Element
 from tormagd.learning.fitting import fit_model
 from tormagd.learning.levenberg_marquardt import Epoch, Training
 from tormagd.learning.model_file import ForceModel, save_model
+from tormagd.learning.unremembered import Memory, identify
 from tormagd.physics.errors import DomainError
 
 
@@ -32,6 +33,12 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--epochs", type=int, default=200, help="most epochs (default: 200)")
     parser.add_argument("--seed", type=int, default=0, help="decides the split and the initial weights (default: 0)")
     parser.add_argument("--validation-share", type=float, default=0.3, help="rows or cycles held out (default: 0.3)")
+    parser.add_argument(
+        "--without-memory", action="store_true", help="take out what relaxation and hysteresis did; needs time_s"
+    )
+    parser.add_argument(
+        "--rising", action="store_true", help="refuse a model whose force does not rise with the field everywhere"
+    )
     parser.add_argument("--created", type=datetime.date.fromisoformat, help="date in the file (default: today)")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the convergence")
     parser.add_argument("--json", action="store_true", help="print the metrics as JSON")
@@ -39,7 +46,11 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Training]:
-    """Train on `data` and return the model with its metrics, and how it went."""
+    """Train on `data` and return the model with its metrics, and how it went. Raises DomainError."""
+    data_sha256 = data.sha256()
+    if options.without_memory:
+        memory, data = identify(data)
+        print(memory_line(memory), file=sys.stderr)
     training_data, validation_data = data.split(options.validation_share, options.seed)
     with tqdm(total=options.epochs, unit="epoch", disable=None, leave=False) as bar:
 
@@ -47,18 +58,29 @@ def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Trainin
             bar.set_postfix_str(f"train {epoch.train_rmse_N:.4f} N, validation {epoch.validation_rmse_N:.4f} N rms")
             bar.update()
 
-        return fit_model(
+        model, result = fit_model(
             training_data,
             validation_data,
             element=options.element,
             insert=options.insert,
-            data_sha256=data.sha256(),
+            data_sha256=data_sha256,
             created=options.created or datetime.date.today(),
             hidden=options.hidden,
             epochs=options.epochs,
             seed=options.seed,
             progress=show,
         )
+    share = model.metadata.metrics["not_rising_share"]
+    if options.rising and share > 0.0:
+        raise DomainError("not_rising_share", share, "0: train with other hidden units, another seed or more data")
+    return model, result
+
+
+def memory_line(memory: Memory) -> str:
+    """What was identified, for a person."""
+    terms = zip(memory.series.fractions, memory.series.times_s, strict=True)
+    relaxing = ", ".join(f"{fraction:.1%} in {time_s:.0f} s" for fraction, time_s in terms)
+    return f"taken out: relaxation of {relaxing}; a field {memory.lag_mT:.1f} mT behind"
 
 
 def plot_convergence(path: Path, result: Training) -> None:

@@ -19,7 +19,7 @@ from tormagd.safety.operating_state import OperatingState
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
-from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.hand import RecordedHand, SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
 CONFIG = Config()
@@ -86,7 +86,8 @@ def test_uneven_screws_stay_together_and_cross_coupling_is_why() -> None:
 
 def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
     """Sample 2 reaches less than the speed limit: over the stroke it falls behind, but never so far as a fault."""
-    loop = ClosedLoop(CONFIG, Stepper(CONFIG, SCENE), None, VirtualDevice(load_plant("sample_2"), SteadyHand(), seed=1))
+    at_rest = RecordedHand((0.0,), (0.0,))  # in motion, the force over the scene's would be a fault
+    loop = ClosedLoop(CONFIG, Stepper(CONFIG, SCENE), None, VirtualDevice(load_plant("sample_2"), at_rest, seed=1))
     loop.arm(gap_plan(OPEN_MM))
     samples = on_the_way(loop, 47.0, 2_000) + on_the_way(loop, 93.0, 2_000)
     assert_sane(samples)

@@ -6,6 +6,7 @@ import pytest
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config, Trim
 from tormagd.control.core import build_core
+from tormagd.control.plan import Plan
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
@@ -56,4 +57,15 @@ def test_the_trim_takes_up_what_the_elastomer_relaxes(plant: str, allowed_N: flo
 
 
 def test_without_a_trim_the_relaxation_is_seen(allowed_N: float) -> None:
-    assert drift_N("sample_1", 1e3) > 2.0 * allowed_N
+    """At a gap that is held, the force falls by more than the trim leaves of it."""
+    config = Config(scene="coronary")
+    core = build_core(config)
+    loop = ClosedLoop(config, core.stepper, None, VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1))
+    loop.arm(held(95.0, 0.0))
+    forces_N = [loop.tick(plan=held(65.0, loop.now_s)).truth.force_N for _ in range(round(HOLD_S * 1e3))]
+    assert forces_N[round(TRIMMED_S * 1e3)] - forces_N[-1] > 2.0 * allowed_N
+
+
+def held(gap_mm: float, now_s: float) -> Plan:
+    """A plan of nothing but a gap."""
+    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())

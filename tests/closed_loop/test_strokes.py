@@ -8,15 +8,15 @@ from tormagd.control.plan import Plan
 from tormagd.control.step import Stepper
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.hand import RecordedHand
 from tormagd.simulation.parameters import load_plant
 
 CONFIG = Config()
 
 
 def armed(config: Config = CONFIG) -> ClosedLoop:
-    """Sample 1 with the gap open."""
-    device = VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1)
+    """Sample 1 with the gap open and the handle at rest: a force over the scene's would be a fault."""
+    device = VirtualDevice(load_plant("sample_1"), RecordedHand((0.0,), (0.0,)), seed=1)
     loop = ClosedLoop(config, Stepper(config, load_scene("coronary")), None, device)
     loop.arm(gap_plan(95.0, 0.0))
     return loop

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tormagd.config import Limits
+from tormagd.control.device_fit import DeviceFit
 from tormagd.control.governor import AHEAD_S, PATH_S, Governed, GovernorState, TimedSetpoint, govern
 from tormagd.control.periodicity import NOTHING_LEARNED
 from tormagd.control.portrait import Portrait
@@ -38,6 +39,7 @@ def decide(
         now_s,
         setpoint,
         portrait=portrait,
+        device=DeviceFit(),
         scene=scene,
         limits=LIMITS,
         gap_speed_mm_s=GAP_SPEED_MM_S,

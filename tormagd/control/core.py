@@ -12,7 +12,8 @@ from tormagd.control.plan import Planner
 from tormagd.control.portrait import FieldOfGap, Portrait
 from tormagd.control.step import Stepper
 from tormagd.inverse.choice import Choice, build, choose, named, solver_table
-from tormagd.learning.model_file import ModelFileError, load_model
+from tormagd.learning.metrics import falling_at
+from tormagd.learning.model_file import ForceModel, ModelFileError, load_model
 from tormagd.learning.shipped import model_path
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw
@@ -59,15 +60,32 @@ def build_core(config: Config) -> Core:
     except (DomainError, ModelFileError) as error:
         raise ConfigError(f"scene {scene.name}: {error}") from error
     field = FieldOfGap(PowerFieldLaw(), fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm * 1e-3)
-    fields_mT = (field.field_mT(scene.insert.gap_open_mm), field.field_mT(scene.insert.gap_closed_mm))
     try:
+        fields_mT = _known_fields_mT(scene, model, field)
         choice = choose_solver(scene, model.metadata.hidden)
         solver = build(choice, model, fields_mT)
     except DomainError as error:
         raise ConfigError(f"scene {scene.name}: {error}") from error
-    planner = Planner(config, scene, model, solver, field, 100.0 * fitted.cip_fraction)
+    planner = Planner(config, scene, model, solver, field, fields_mT, fitted.elastomer, 100.0 * fitted.cip_fraction)
     _refuse_out_of_reach(scene, planner.portrait)
     return Core(scene, planner, Stepper(config, scene), stability, choice)
+
+
+def _known_fields_mT(scene: Scene, model: ForceModel, field: FieldOfGap) -> tuple[float, float]:
+    """The fields of the scene's gaps, as far as the model knows them and knows that they give more force."""
+    low_mT, high_mT = model.field_range_mT
+    low_mT = max(low_mT, field.field_mT(scene.insert.gap_open_mm))
+    high_mT = min(high_mT, field.field_mT(scene.insert.gap_closed_mm))
+    if not low_mT < high_mT:
+        raise DomainError("insert.model", f"trained on {model.field_range_mT} mT", "fields that the scene's gaps give")
+    falling_mm_s = falling_at(model, (low_mT, high_mT))
+    if falling_mm_s is not None:
+        raise DomainError(
+            "insert.model",
+            f"force that falls with the field at {falling_mm_s:.3g} mm/s",
+            "a force that rises with the field: train it on more data, as tools/train_model.py --rising checks",
+        )
+    return low_mT, high_mT
 
 
 def _refuse_too_weak(config: Config, scene: Scene) -> None:

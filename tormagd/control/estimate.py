@@ -3,21 +3,28 @@
 from typing import NamedTuple
 
 from tormagd.hardware.measurement import Measurement
-from tormagd.learning.displacement import Turn
+from tormagd.learning.displacement import MOVING_MM_S, Turn
 
 RATE_FILTER_S = 0.05
+SLIDING_MM = 0.3
+"Friction takes on the level of another rate over some such travel; without travel it does not change."
 LEAST_DT_S = 5e-6
 "Half a step of the device's clock; positions over less time than that would give speeds without bound."
 
 
 class Handle(NamedTuple):
-    """The handle's motion; `displacement_mm` and the turn it counts from are those of `learning.displacement`."""
+    """The handle's motion; `displacement_mm` and the turn it counts from are those of `learning.displacement`.
+
+    `sliding_mm_s` is the rate at which friction slides, of either sign of the motion: the rate over the last travel, so
+    that a handle that stops keeps it.
+    """
 
     displacement_mm: float
     rate_mm_s: float
     direction: float
     turned_mm: float
     furthest_mm: float
+    sliding_mm_s: float = MOVING_MM_S
 
 
 class Estimate(NamedTuple):
@@ -98,6 +105,9 @@ def _handle(last: Estimate, position_mm: float, dt_s: float) -> Handle:
     before = last.handle
     share = dt_s / (RATE_FILTER_S + dt_s)
     speed = before.direction * before.rate_mm_s
-    speed += share * ((position_mm - last.handle_mm) / dt_s - speed)
+    travel_mm = position_mm - last.handle_mm
+    speed += share * (travel_mm / dt_s - speed)
+    slid = abs(travel_mm) / (SLIDING_MM + abs(travel_mm))
+    sliding = before.sliding_mm_s + slid * (abs(speed) - before.sliding_mm_s)
     turn = Turn(before.direction, before.turned_mm, before.furthest_mm).moved_to(position_mm)
-    return Handle(turn.displacement_mm(position_mm), turn.direction * speed, *turn)
+    return Handle(turn.displacement_mm(position_mm), turn.direction * speed, *turn, sliding)

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tormagd.config import Limits
+from tormagd.control.device_fit import DeviceFit
 from tormagd.control.periodicity import LONGEST_STEP_S, NOTHING_LEARNED, Periodicity, forecast_N, observe
 from tormagd.control.portrait import Portrait
 from tormagd.safety.codes import Limit
@@ -66,6 +67,7 @@ def govern(
     setpoint: TimedSetpoint | None,
     *,
     portrait: Portrait,
+    device: DeviceFit,
     scene: Force,
     limits: Limits,
     gap_speed_mm_s: float,
@@ -73,26 +75,26 @@ def govern(
     lag_s: float,
 ) -> tuple[GovernorState, Governed]:
     """One decision, for `lead_s` from now and, where what comes is known, up to `lag_s` later: an extrapolation that
-    far is a guess. A missing or stale setpoint decays to F_min along `limits.stale_ramp_N_s`: never a jump, never a
-    force held for ever.
+    far is a guess. The force is within what the scene allows and `device`, as far as it has shown itself, gives. A
+    missing or stale setpoint decays to F_min along `limits.stale_ramp_N_s`: never a jump, never a force held for ever.
     """
     elapsed = max(0.0, now_s - state.time_s)
+    lowest, highest = max(device.force_N(portrait.least_N), 0.0), max(device.force_N(portrait.most_N), 0.0)
     age = None if setpoint is None else now_s - setpoint.stamp_s
     if setpoint is None or age is None or age > setpoint.valid_for_s:
         reason = Limit.NO_SETPOINT if setpoint is None else Limit.STALE
-        force = max(portrait.least_N, state.governed_N - limits.stale_ramp_N_s * elapsed)
+        force = max(lowest, state.governed_N - limits.stale_ramp_N_s * elapsed)
         rested = GovernorState(now_s, force)
         return rested, Governed(force, np.full(len(PATH_S), force), age, (reason,))
-    force, reasons = _within_range(setpoint.force_N, portrait, scene)
+    force, reasons = _within_range(setpoint.force_N, lowest, highest, scene)
     slope = state.slope_N_s
     spacing = setpoint.stamp_s - state.stamp_s
     if spacing > LONGEST_STEP_S:
         slope = 0.0
     elif spacing > 0.0:
-        renderable = portrait.force_rate_N_s(force, gap_speed_mm_s)
+        renderable = device.scale * portrait.force_rate_N_s(device.model_N(force), gap_speed_mm_s)
         between = min(max((force - state.last_N) / spacing, -renderable), renderable)
         slope += spacing / (SLOPE_FILTER_S + spacing) * (between - slope)
-    lowest, highest = portrait.least_N, portrait.most_N
     least, most = min(max(scene.least_N, lowest), highest), min(max(scene.most_N, lowest), highest)
     soon_s = max(age, 0.0) + lead_s
     if setpoint.preview_N:
@@ -122,15 +124,17 @@ def _previewed(setpoint: TimedSetpoint, ahead_s: Array) -> Array:
     return to_come
 
 
-def _within_range(asked_N: float, portrait: Portrait, scene: Force) -> tuple[float, tuple[Limit, ...]]:
+def _within_range(asked_N: float, lowest_N: float, highest_N: float, scene: Force) -> tuple[float, tuple[Limit, ...]]:
+    """The force nearest the one asked that the scene allows and the device gives: never over `scene.most_N`, unless the
+    open gap itself makes more."""
     reasons: list[Limit] = []
     force = min(max(asked_N, scene.least_N), scene.most_N)
     if force != asked_N:
         reasons.append(Limit.RANGE)
-    if force < portrait.least_N:
-        force = portrait.least_N
+    if force < lowest_N:
+        force = lowest_N
         reasons.append(Limit.F_MIN)
-    elif force > portrait.most_N:
-        force = portrait.most_N
+    elif force > highest_N:
+        force = highest_N
         reasons.append(Limit.F_MAX)
     return force, tuple(reasons)

@@ -8,6 +8,7 @@ import numpy.typing as npt
 from tormagd.learning.displacement import MOBILISED_MM
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.field import FieldLaw, flux_density_T, radial_moment_from_flux_density_Tm
+from tormagd.physics.force import Elastomer, Geometry, brake_force_N
 
 Array = npt.NDArray[np.float64]
 ROLLER_RATE_MM_S = 42.0
@@ -60,15 +61,42 @@ class Portrait(NamedTuple):
         gaps: Array = np.interp(forces_N, self.force_N, self.gap_mm)
         return gaps
 
+    def gap_mm_at(self, force_N: float) -> float:
+        """`gaps_mm` of one force."""
+        return float(np.interp(force_N, self.force_N, self.gap_mm))
+
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
         """The fastest change of force that a gap speed renders at this force."""
         return gap_speed_mm_s * self.slope_at_N_mm(force_N)
 
 
+class LawOfField(NamedTuple):
+    """The magnetoelastic law of the insert (Eq. 29 to 34) over the gaps of a portrait, scaled to its force: what the
+    learned model is held against. Force and field rise along the arrays."""
+
+    force_N: Array
+    fields_mT: Array
+
+    @classmethod
+    def beside(cls, shown: Portrait, field: FieldOfGap, elastomer: Elastomer, geometry: Geometry) -> "LawOfField":
+        """The law beside a portrait. Raises `DomainError` where the gaps leave the law's domain."""
+        moments_Tm: Array = np.asarray(field.law.radial_moment_Tm(shown.gap_mm), dtype=np.float64)
+        forces_N: Array = np.asarray(brake_force_N(moments_Tm, elastomer, geometry), dtype=np.float64)
+        scale = float(np.median(shown.force_N / forces_N))
+        return cls(scale * forces_N, np.array([field.field_mT(gap_mm) for gap_mm in shown.gap_mm.tolist()]))
+
+    def field_mT(self, force_N: float) -> float:
+        """The field for a force; that of the nearer end where none gives it."""
+        return float(np.interp(force_N, self.force_N, self.fields_mT))
+
+
 def portrait(model: ForceModel, field: FieldOfGap, cip_percent: float, gap_range_mm: tuple[float, float]) -> Portrait:
-    """The portrait that the learned model predicts over a gap range."""
+    """The portrait that the learned model predicts over a gap range, for a handle that turns at ROLLER_RATE_MM_S, or
+    the nearest rate that the model knows."""
     gaps = np.linspace(gap_range_mm[1], gap_range_mm[0], GRID)
-    features = np.array([[MOBILISED_MM, ROLLER_RATE_MM_S, field.field_mT(float(gap)), cip_percent] for gap in gaps])
-    # a learned curve may dip by a hair where it is flat; the portrait is the rising envelope
-    force = np.maximum.accumulate(model.predict(features))
+    (_, mobilised_mm), rates_mm_s, _, _ = model.feature_ranges
+    rate_mm_s = min(max(ROLLER_RATE_MM_S, rates_mm_s[0]), rates_mm_s[1])
+    displacement_mm = min(MOBILISED_MM, mobilised_mm)
+    features = np.array([[displacement_mm, rate_mm_s, field.field_mT(float(gap)), cip_percent] for gap in gaps])
+    force = model.predict(features)
     return Portrait(gaps, force, np.abs(np.gradient(force, gaps)))

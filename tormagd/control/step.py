@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from firmware_protocol.codec import DeviceMode, DriveMode
 from tormagd.config import Config
+from tormagd.control.device_fit import SCALE_SD
 from tormagd.control.estimate import Estimate, first_estimate, update
 from tormagd.control.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s, pull_V
 from tormagd.control.pid import Error, PidState, pid, rested
@@ -37,6 +38,14 @@ RESTING_MM_S = 0.02
 "A slower reference has arrived: it comes in exponentially, and what a second of it moves is a few encoder counts."
 STILL_MM_S = 0.5
 "Slower than this a carriage does not move: half an encoder count a millisecond and filtered."
+STARTS_OVER = 1.25
+"Static over kinetic friction at most: a start from rest may take so many times the greatest force."
+OVER_N = 0.1
+"What the sensor may be off besides."
+OVER_HELD_S, OVER_FAULT_S = 0.01, 0.04
+"A force over the ceiling opens the gap after the first, and is a fault after the second."
+SENSOR_FAULT_S = 2.0
+"A sensor that has not been believed for so long of sliding is a fault: forces are then only as good as the model."
 LAGGING_MM = 0.1
 "The speed limit is reported as RATE only where it leaves the reference this far behind its target."
 
@@ -58,6 +67,8 @@ class StepState(NamedTuple):
     "For how long the gap has been too far from its reference, in periods: a process that stood still saw nothing."
     still_s: float = 0.0
     "For how long a carriage has been driven without moving, counted alike."
+    over_s: float = 0.0
+    "For how long the measured force has been over the ceiling while the handle moved, counted alike."
 
 
 class StepOutput(NamedTuple):
@@ -79,6 +90,9 @@ class Stepper:
         self._nominal_dt_s = 1.0 / config.rates.control_hz
         self._gaps_mm = (scene.insert.gap_closed_mm, scene.insert.gap_open_mm)
         self._home_mm = scene.insert.gap_open_mm / 2.0
+        # devices not yet seen differ by SCALE_SD: a scene that tolerates that does without the sensor
+        self._needs_sensor = scene.force.tolerance_rms_N < SCALE_SD * scene.force.most_N
+        self._ceiling_N = STARTS_OVER * scene.force.most_N + OVER_N
         self._motor, self._supply_V = config.motor, config.motor.supply_V
         self._full_speed_mm_s = full_speed_mm_s(config.motor)
         self._no_load_mm_s = 2.0 * self._full_speed_mm_s
@@ -109,6 +123,7 @@ class Stepper:
                 enabled_s=now_s,
                 straying_s=0.0,
                 still_s=0.0,
+                over_s=0.0,
             )
         return state._replace(safety=safety)
 
@@ -127,7 +142,7 @@ class Stepper:
             state = self.lose_link(state)._replace(time_s=now_s)
             return state, self._off(state.safety, ())
         estimate = update(state.estimate, measurement, self._home_mm, self._position.derivative_filter_s)
-        safety = latch(state.safety, self._watch(state, estimate, now_s, measurement))
+        safety = latch(state.safety, self._watch(state, estimate, now_s, measurement, plan))
         if safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             if measurement.is_busy:  # homing moves the origin: what was learned about motion before it is void
                 estimate = first_estimate(measurement, self._home_mm)
@@ -158,6 +173,9 @@ class Stepper:
             reference, _ = follow(self._position, reference, Reference(reference.gap_mm), dt_s, speeds)
         else:
             target = self._target(plan, now_s)
+            if state.over_s > OVER_HELD_S:
+                target = Reference(self._gaps_mm[1])
+                limits.append(Limit.OVER_FORCE)
             reference, is_limited = follow(self._position, reference, target, dt_s, speeds)
             if is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
                 limits.append(Limit.RATE)
@@ -187,6 +205,7 @@ class Stepper:
             duties=(left.duty, right.duty),
             enabled_s=state.enabled_s,
             straying_s=state.straying_s + dt_s if self._is_astray(reference, estimate) else 0.0,
+            over_s=state.over_s + dt_s if self._is_over(estimate) else 0.0,
             still_s=state.still_s + dt_s if self._is_still(state, estimate, left.duty, right.duty) else 0.0,
         )
         # the bridges switch the device's real supply: the same volts take less duty of a higher one
@@ -207,7 +226,7 @@ class Stepper:
         age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + self._lag_s
         gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
         speed_mm_s = plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2
-        within_mm = min(max(gap_mm, self._gaps_mm[0]), self._gaps_mm[1])
+        within_mm = min(max(gap_mm, self._gaps_mm[0], plan.least_gap_mm), self._gaps_mm[1])
         return Reference(within_mm, speed_mm_s, plan.gap_acceleration_mm_s2)
 
     def _speeds(self, pull: float, expected: Expected, estimate: Estimate) -> Speeds:
@@ -242,7 +261,9 @@ class Stepper:
         resisting = self._coulomb + (pull if moving > 0.0 else 0.0)
         return (speed + inertia) / self._full_speed_mm_s + resisting * moving
 
-    def _watch(self, state: StepState, estimate: Estimate, now_s: float, measurement: Measurement) -> tuple[Fault, ...]:
+    def _watch(
+        self, state: StepState, estimate: Estimate, now_s: float, measurement: Measurement, plan: Plan
+    ) -> tuple[Fault, ...]:
         faults: list[Fault] = []
         if now_s >= state.safety.clearing_until_s:
             faults.extend(device_faults(measurement.faults))
@@ -255,11 +276,18 @@ class Stepper:
             faults.append(Fault.SKEW)
         if state.straying_s > self._limits.following_time_s:
             faults.append(Fault.FOLLOWING_ERROR)
+        if state.over_s > OVER_FAULT_S:
+            faults.append(Fault.OVER_FORCE)
+        if self._needs_sensor and plan.sensor_doubted_s > SENSOR_FAULT_S:
+            faults.append(Fault.SENSOR)
         if state.still_s > self._limits.no_motion_time_s:
             faults.append(Fault.NO_MOTION)
         if measurement.mode is not DeviceMode.RUN and not faults and now_s - state.enabled_s > STARTING_S:
             faults.append(Fault.DEVICE_NOT_RUNNING)
         return tuple(faults)
+
+    def _is_over(self, estimate: Estimate) -> bool:
+        return estimate.force_N > self._ceiling_N and abs(estimate.handle.rate_mm_s) > STILL_MM_S
 
     def _is_astray(self, reference: Reference, estimate: Estimate) -> bool:
         return abs(reference.gap_mm - estimate.gap_mm) > self._limits.following_error_mm

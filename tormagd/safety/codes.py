@@ -21,6 +21,8 @@ class Fault(StrEnum):
     SKEW = "SKEW"
     FOLLOWING_ERROR = "FOLLOWING_ERROR"
     NO_MOTION = "NO_MOTION"
+    OVER_FORCE = "OVER_FORCE"
+    SENSOR = "SENSOR"
     NOT_FINITE = "NOT_FINITE"
     PLAN_FAILED = "PLAN_FAILED"
     STOPPED = "STOPPED"
@@ -48,6 +50,10 @@ class Limit(StrEnum):
     RATE = "RATE"
     LOW_CONFIDENCE = "LOW_CONFIDENCE"
     TRIM = "TRIM"
+    MODEL_RANGE = "MODEL_RANGE"
+    CEILING = "CEILING"
+    OVER_FORCE = "OVER_FORCE"
+    SENSOR = "SENSOR"
     SATURATED = "SATURATED"
     SKEW = "SKEW"
 
@@ -69,6 +75,14 @@ FAULTS: dict[Fault, Explanation] = {
     ),
     Fault.NO_MOTION: Explanation(
         "a carriage was driven and its encoder did not move", "look for a block or a loose encoder, then home"
+    ),
+    Fault.OVER_FORCE: Explanation(
+        "the measured force stayed over what the scene allows; the gap opens at the device's own bounded speed",
+        "compare force sensor and gap: is it the insert and the model that the scene names? Then clear-fault, home",
+    ),
+    Fault.SENSOR: Explanation(
+        "the force sensor reads what no believable device gives at this gap, and the scene needs it",
+        "check sensor, cable and zero, and that the insert is the scene's; then clear-fault",
     ),
     Fault.NOT_FINITE: Explanation(
         "a number in the loop was not finite", "keep the recording and report it; clear-fault starts afresh"
@@ -118,6 +132,21 @@ LIMITS: dict[Limit, Explanation] = {
     ),
     Limit.TRIM: Explanation(
         "the measured force is further from the model than the trim may correct", "calibrate this insert"
+    ),
+    Limit.MODEL_RANGE: Explanation(
+        "the model was about to be asked what it was not shown; it was asked the nearest that it knows",
+        "move or ask within its range, or calibrate with these motions",
+    ),
+    Limit.CEILING: Explanation(
+        "the gap is held where this device, as far as it has shown itself, surely keeps to the scene's greatest force",
+        "turn the handle, so that the device shows its force; ask for less",
+    ),
+    Limit.OVER_FORCE: Explanation(
+        "the measured force is over what the scene allows; the gap opens", "look at the force sensor and the insert"
+    ),
+    Limit.SENSOR: Explanation(
+        "the force sensor reads what no believable device gives at this gap; nothing is learned from it",
+        "check sensor, cable and zero, and that the insert is the scene's",
     ),
     Limit.SATURATED: Explanation("a motor has no more voltage to give", "expect lag while it lasts"),
     Limit.SKEW: Explanation("the carriages are further apart than usual", "look at the slower screw"),

@@ -1,0 +1,93 @@
+"""What this device has shown of itself: the force it makes, over the model's, as a scale and an offset with variances.
+
+    F = scale F_model + offset
+
+Friction, field and elastomer differ from device to device by a factor; what the elastomer has relaxed, and what the
+field's hysteresis holds back, shift the force. A Kalman filter tells the two apart as far as the forces rendered so far
+allow, and no further: what a low force does not show of a high one is left to the device's spread, and known as such.
+"""
+
+import math
+from typing import NamedTuple
+
+SCALE_SD = 0.17
+"Spread of the scale of devices not yet seen: friction, shear modulus and field each differ evenly within 12%."
+LEAST_SCALE, MOST_SCALE = 0.64, 1.53
+"All three at their ends, and the field's exponent at its own, -1.34 and -1.26: no believable device is beyond."
+RELAXES = 0.21
+"The greatest share of its force that an elastomer loses in the course of hours."
+OFFSET_SD_N = 0.1
+"Of the offset: what relaxation and hysteresis do around 0.5 N."
+ERROR_N2_S = 0.002
+"Density of what the model does not follow, N^2 s: with these spreads a new device is learned in a tenth of a second."
+SCALE_DRIFT_1_S = 1e-4
+"Growth of the scale's variance: it warms by some kelvin an hour."
+SURE = 2.0
+"Standard deviations within which a force is taken to lie."
+
+
+class DeviceFit(NamedTuple):
+    """Scale and offset of one device, their variances and covariance."""
+
+    scale: float = 1.0
+    offset_N: float = 0.0
+    scale_variance: float = SCALE_SD**2
+    covariance_N: float = 0.0
+    offset_variance_N2: float = OFFSET_SD_N**2
+
+    def force_N(self, model_N: float) -> float:
+        """What the device gives where the model says `model_N`."""
+        return self.scale * model_N + self.offset_N
+
+    def model_N(self, force_N: float) -> float:
+        """What to ask of the model for the device to give `force_N`."""
+        return (force_N - self.offset_N) / self.scale
+
+    def deviation_N(self, model_N: float) -> float:
+        """Standard deviation of `force_N` there."""
+        variance = model_N * (model_N * self.scale_variance + 2.0 * self.covariance_N) + self.offset_variance_N2
+        return math.sqrt(max(variance, 0.0))
+
+    def surely_within_N(self, most_N: float) -> float:
+        """The most to ask of the model for the device to give no more than `most_N`: as far as it has shown itself,
+        but no believable device is weaker than LEAST_SCALE or stronger than MOST_SCALE."""
+        low_N, high_N = most_N / MOST_SCALE, most_N / LEAST_SCALE
+        for _ in range(10):  # bisection to a thousandth
+            middle_N = (low_N + high_N) / 2.0
+            upper_N = self.force_N(middle_N) + SURE * self.deviation_N(middle_N)
+            low_N, high_N = (middle_N, high_N) if upper_N <= most_N else (low_N, middle_N)
+        return low_N
+
+
+def observe(
+    fit: DeviceFit,
+    model_N: float,
+    measured_N: float,
+    elapsed_s: float,
+    *,
+    adapts_in_s: float,
+    bounds: tuple[float, float],
+) -> tuple[DeviceFit, bool]:
+    """The fit after `measured_N` where the model says `model_N`, `elapsed_s` after the last, and whether the scale is
+    held at one of its `bounds`. In the long run the offset is learned in `adapts_in_s`. All are finite."""
+    if elapsed_s <= 0.0:
+        return fit, False
+    offset_drift = ERROR_N2_S / adapts_in_s**2
+    scale_variance = min(fit.scale_variance + SCALE_DRIFT_1_S * elapsed_s, SCALE_SD**2)
+    offset_variance = min(fit.offset_variance_N2 + offset_drift * elapsed_s, OFFSET_SD_N**2)
+    covariance = fit.covariance_N
+    by_scale = model_N * scale_variance + covariance
+    by_offset = model_N * covariance + offset_variance
+    innovation_variance = model_N * by_scale + by_offset + ERROR_N2_S / elapsed_s
+    gain_scale, gain_offset = by_scale / innovation_variance, by_offset / innovation_variance
+    error_N = measured_N - fit.force_N(model_N)
+    wanted = fit.scale + gain_scale * error_N
+    scale = min(max(wanted, bounds[0]), bounds[1])
+    learned = DeviceFit(
+        scale,
+        fit.offset_N + gain_offset * error_N,
+        scale_variance - gain_scale * by_scale,
+        covariance - gain_scale * by_offset,
+        offset_variance - gain_offset * by_offset,
+    )
+    return learned, scale != wanted
