@@ -308,6 +308,70 @@ def test_a_carriage_that_is_driven_and_does_not_move(running: Bench) -> None:
     assert is_opened(running)
 
 
+def test_a_carriage_that_the_firmware_holds_at_its_open_switch_is_not_driven(bench: Bench) -> None:
+    """The switch lies 0.2 mm before the end asked for: nothing is learned there, and closing takes no longer."""
+    at_end = {"left_mm": -0.2, "right_mm": -0.2}
+    switches = Switches.HOMED | Switches.LEFT_OPEN | Switches.RIGHT_OPEN
+    bench.step(count=3, **at_end)
+    bench.command("enable")
+    for _ in range(2_000):
+        output = bench.step(gap_plan(95.0, bench.now_s), **at_end, switches=switches)
+        assert (output.left_duty, output.right_duty) == (0.0, 0.0)
+        assert Limit.SATURATED not in output.limits
+    assert not bench.faults
+    assert bench.state.left.integral <= 0.0
+    pushed = [bench.step(gap_plan(90.0, bench.now_s), **at_end, switches=switches).left_duty for _ in range(30)]
+    assert max(pushed[5:]) < 0.0
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_one_carriage_at_its_switch_excuses_no_other(bench: Bench, side: str) -> None:
+    switches = Switches.HOMED | (Switches.RIGHT_OPEN if side == "left" else Switches.LEFT_OPEN)
+    at_end = {"left_mm": -0.3, "right_mm": -0.3}
+    bench.step(count=3, **at_end)
+    bench.command("enable")
+    ticks = 0
+    while not bench.faults:
+        bench.step(gap_plan(95.0, bench.now_s), **at_end, switches=switches)
+        ticks += 1
+        assert ticks < 1_000
+    assert bench.faults == (Fault.NO_MOTION,)
+
+
+def test_after_an_encoder_fault_positions_are_unknown_until_the_device_has_homed(running: Bench) -> None:
+    running.run_into(Fault.SKEW, left_mm=-5.0)
+    assert running.state.estimate is not None
+    assert not running.state.estimate.is_homed
+    running.command("clear-fault")
+    for name in ("enable", "home", "enable"):
+        running.step(count=5)
+        assert not running.state.estimate.is_homed
+        if name == "home":
+            running.command(name)
+            continue
+        with pytest.raises(RefusedError) as caught:
+            running.command(name)
+        assert caught.value.code == "not_homed"
+    running.step(count=30, mode=DeviceMode.HOMING, switches=Switches(0))
+    assert not running.state.estimate.is_homed
+    running.step(count=2)
+    assert running.state.estimate.is_homed
+    running.command("enable")
+    assert running.step().mode is DriveMode.RUN
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_carriages_that_are_too_far_apart_are_not_enabled(bench: Bench, side: float) -> None:
+    half_mm = side * CONFIG.limits.skew_fault_mm / 2.0
+    bench.step(left_mm=-7.5 + 1.01 * half_mm, right_mm=-7.5 - 1.01 * half_mm)
+    with pytest.raises(RefusedError, match=r"1.01 mm apart: allowed is at most 1 mm") as caught:
+        bench.command("enable")
+    assert (caught.value.code, caught.value.hint) == ("skewed", "tormagctl home")
+    bench.step(left_mm=-7.5 + 0.99 * half_mm, right_mm=-7.5 - 0.99 * half_mm)
+    bench.command("enable")
+    assert not bench.faults
+
+
 def test_a_process_that_stood_still_saw_no_carriage_stand_still(running: Bench) -> None:
     """One look before the pause and one after it say nothing of what the carriages did between."""
     running.step(gap_plan(60.0), count=30)

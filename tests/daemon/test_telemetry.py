@@ -45,7 +45,8 @@ LATE = MEASUREMENT._replace(delay_s=0.031)
 def telemetry(measurement: Measurement | None, state: StepState, is_busy: bool = False) -> Telemetry:
     """What is published, as a client decodes it."""
     row = tick_row(1.0, state, OUTPUT, PLAN, 1.1, measurement, 20.0, 150.0)
-    return decode(encode(snapshot(row, 3, measurement, is_busy, 0.012)), Telemetry)
+    is_homed = state.estimate is not None and state.estimate.is_homed
+    return decode(encode(snapshot(row, 3, is_homed, is_busy, 0.012)), Telemetry)
 
 
 def test_a_driven_device() -> None:

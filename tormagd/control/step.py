@@ -19,6 +19,7 @@ from tormagd.safety.operating_state import (
     RefusedError,
     SafetyState,
     command,
+    homed_again,
     latch,
 )
 from tormagd.scenes.scene import Scene
@@ -100,6 +101,13 @@ class Stepper:
                 raise RefusedError(
                     "not_fresh", "no measurement from the device yet", "look at the link in tormagctl status"
                 )
+            apart_mm, most_mm = abs(state.estimate.skew_mm), self._limits.skew_fault_mm
+            if not apart_mm <= most_mm:
+                raise RefusedError(
+                    "skewed",
+                    f"the carriages are {apart_mm:.2f} mm apart: allowed is at most {most_mm:g} mm",
+                    "tormagctl home",
+                )
             return state._replace(
                 safety=safety,
                 reference=Reference(state.estimate.gap_mm),
@@ -128,6 +136,8 @@ class Stepper:
             return state, self._off(state.safety, ())
         estimate = update(state.estimate, measurement, self._home_mm, self._position.derivative_filter_s)
         safety = latch(state.safety, self._watch(state, estimate, now_s, measurement))
+        if safety.needs_homing:
+            safety, estimate = homed_again(safety, measurement.is_homed), estimate._replace(is_homed=False)
         if safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             if measurement.is_busy:  # homing moves the origin: what was learned about motion before it is void
                 estimate = first_estimate(measurement, self._home_mm)
@@ -167,8 +177,10 @@ class Stepper:
         if abs(reference.speed_mm_s) < RESTING_MM_S:
             left_state = rested(self._position, left_state, left_error, dt_s)
             right_state = rested(self._position, right_state, right_error, dt_s)
-        left_state, left = pid(self._position, left_state, left_error, ahead, dt_s)
-        right_state, right = pid(self._position, right_state, right_error, ahead, dt_s)
+        # the firmware gives a carriage at its open switch no opening duty: nothing may be learned or concluded there
+        is_left_blocked, is_right_blocked = measurement.is_left_open, measurement.is_right_open
+        left_state, left = pid(self._position, left_state, left_error, ahead, dt_s, is_blocked=is_left_blocked)
+        right_state, right = pid(self._position, right_state, right_error, ahead, dt_s, is_blocked=is_right_blocked)
         if not math.isfinite(left.duty + right.duty + measurement.supply_V):  # a sum is finite only if all of it is
             safety = latch(safety, (Fault.NOT_FINITE,))
             return self.start(now_s)._replace(safety=safety), self._off(safety, ())

@@ -150,7 +150,7 @@ class Daemon:
         row = self._rows[-1]
         stamp = self._endpoint.inbox.newest
         age = None if stamp is None else start_ns * 1e-9 - stamp.stamp_s
-        self._snapshot = snapshot(row, self._telemetry.runs, self._connection.measurement, self._is_busy(), age)
+        self._snapshot = snapshot(row, self._telemetry.runs, self._is_homed(), self._is_busy(), age)
         self._endpoint.publish(self._snapshot)
         self._endpoint.publish_ticks(TickRow._fields, self._rows[-ROWS:])
         self._rows.clear()
@@ -172,6 +172,11 @@ class Daemon:
         return self._connection.state is not LinkState.RUNNING or (
             measurement is not None and now_s - measurement.received_s < timeout_s
         )
+
+    def _is_homed(self) -> bool:
+        """Whether the carriages' positions are known; the device's word alone is not enough."""
+        estimate = self._control.state.estimate
+        return self._connection.measurement is not None and estimate is not None and estimate.is_homed
 
     def _is_busy(self) -> bool:
         """Whether the device homes or opens, or was asked to and has not said yet that it does."""
@@ -210,7 +215,7 @@ class Daemon:
         return Conditions(
             connected=measurement is not None,
             fresh=measurement is not None and now_s - measurement.received_s < timeout_s,
-            homed=measurement is not None and measurement.is_homed,
+            homed=self._is_homed(),
             busy=self._is_busy(),
             device_latched=measurement is not None and measurement.is_latched,
             requested_N=setpoint.force_N if setpoint is not None and is_current else None,

@@ -114,9 +114,7 @@ def limits_held(state: StepState, output: StepOutput, plan: Plan) -> tuple[str, 
     return tuple(dict.fromkeys((*plan.limits, *output.limits)))
 
 
-def snapshot(
-    row: TickRow, sequence: int, measurement: Measurement | None, is_busy: bool, age_s: float | None
-) -> Telemetry:
+def snapshot(row: TickRow, sequence: int, is_homed: bool, is_busy: bool, age_s: float | None) -> Telemetry:
     """The telemetry of the newest tick."""
     known = row.left_mm is not None and row.right_mm is not None
     left, right = row.left_mm or 0.0, row.right_mm or 0.0
@@ -125,7 +123,7 @@ def snapshot(
         t_ns=row.t_ns,
         seq=sequence,
         operating_state=row.operating_state,
-        is_homed=measurement is not None and measurement.is_homed,
+        is_homed=is_homed,
         is_busy=is_busy,
         setpoint_cf=row.setpoint_cf,
         governed_cf=row.governed_cf,

@@ -35,6 +35,16 @@ class Measurement(NamedTuple):
         return Switches.HOMED in self.switches
 
     @property
+    def is_left_open(self) -> bool:
+        """The left carriage is at its open switch."""
+        return Switches.LEFT_OPEN in self.switches
+
+    @property
+    def is_right_open(self) -> bool:
+        """The right carriage is at its open switch."""
+        return Switches.RIGHT_OPEN in self.switches
+
+    @property
     def is_busy(self) -> bool:
         """The device moves by its own routine and takes no drive commands."""
         return self.mode in (DeviceMode.HOMING, DeviceMode.RETRACTING)

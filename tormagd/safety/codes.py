@@ -62,13 +62,16 @@ FAULTS: dict[Fault, Explanation] = {
         "run `tormagctl doctor`; look for load on this machine, and at the round trip in `tormagctl firmware`",
     ),
     Fault.SKEW: Explanation(
-        "the two carriages moved apart from each other", "look for dirt or wear on the slower screw, then home"
+        "the two carriages moved apart from each other",
+        "look for dirt or wear on the slower screw, then clear-fault and home",
     ),
     Fault.FOLLOWING_ERROR: Explanation(
-        "the gap did not follow its reference", "look for something that blocks a carriage, then home"
+        "the gap did not follow its reference",
+        "look for something that blocks a carriage, then clear-fault and home",
     ),
     Fault.NO_MOTION: Explanation(
-        "a carriage was driven and its encoder did not move", "look for a block or a loose encoder, then home"
+        "a carriage away from its open end was driven and its encoder did not move",
+        "look for a block or a loose encoder, then clear-fault and home",
     ),
     Fault.NOT_FINITE: Explanation(
         "a number in the loop was not finite", "keep the recording and report it; clear-fault starts afresh"
