@@ -9,6 +9,7 @@ from tormagd.control.estimate import Estimate, first_estimate, update
 from tormagd.control.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s, pull_V
 from tormagd.control.pid import Error, PidState, pid, rested
 from tormagd.control.plan import Plan
+from tormagd.control.sight import Sight, look
 from tormagd.control.trajectory import Expected, Reference, Speeds, expect, follow
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault, Limit, device_faults
@@ -59,6 +60,7 @@ class StepState(NamedTuple):
     "For how long the gap has been too far from its reference, in periods: a process that stood still saw nothing."
     still_s: float = 0.0
     "For how long a carriage has been driven without moving, counted alike."
+    sight: Sight = Sight()
 
 
 class StepOutput(NamedTuple):
@@ -134,16 +136,38 @@ class Stepper:
         if measurement is None:
             state = self.lose_link(state)._replace(time_s=now_s)
             return state, self._off(state.safety, ())
+        is_new = state.estimate is None or measurement.number != state.estimate.number
+        was_blind, sight = state.sight.is_blind, look(state.sight, state.time_s, now_s, is_new)
         estimate = update(state.estimate, measurement, self._home_mm, self._position.derivative_filter_s)
-        safety = latch(state.safety, self._watch(state, estimate, now_s, measurement))
+        safety = latch(state.safety, self._watch(state, estimate, now_s, measurement, sight))
         if safety.needs_homing:
             safety, estimate = homed_again(safety, measurement.is_homed), estimate._replace(is_homed=False)
         if safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             if measurement.is_busy:  # homing moves the origin: what was learned about motion before it is void
                 estimate = first_estimate(measurement, self._home_mm)
-            state = state._replace(time_s=now_s, safety=safety, estimate=estimate, reference=None, expected=None)
+            state = state._replace(
+                time_s=now_s, safety=safety, estimate=estimate, reference=None, expected=None, sight=sight
+            )
             return state, self._off(safety, ())
-        return self._drive(state, safety, now_s, measurement, estimate, plan)
+        if sight.is_blind:
+            return self._hold(state._replace(time_s=now_s, safety=safety, estimate=estimate, sight=sight))
+        if was_blind:
+            state = self._from_where_it_is(state, estimate)
+        return self._drive(state._replace(sight=sight), safety, now_s, measurement, estimate, plan)
+
+    def _hold(self, state: StepState) -> tuple[StepState, StepOutput]:
+        """Asks the device for an answer without moving anything: friction holds the gap. Nothing is learned from it."""
+        limit = Limit.HOST_STALL if state.sight.has_stalled(state.time_s) else Limit.DEVICE_SILENT
+        safety = state.safety
+        output = StepOutput(DriveMode.RUN, 0.0, 0.0, safety.request, safety.request_number, (limit,))
+        return state._replace(duties=(0.0, 0.0)), output
+
+    def _from_where_it_is(self, state: StepState, estimate: Estimate) -> StepState:
+        """The device went on with its last duty, unseen: the reference goes on from what came of it, without a leap."""
+        most_mm_s = self._no_load_mm_s
+        speed_mm_s = min(max(estimate.left_mm_s + estimate.right_mm_s, -most_mm_s), most_mm_s)
+        reference = Reference(estimate.gap_mm, speed_mm_s)
+        return state._replace(reference=reference, expected=Expected(estimate.gap_mm, speed_mm_s, speed_mm_s))
 
     def _drive(
         self,
@@ -156,7 +180,7 @@ class Stepper:
     ) -> tuple[StepState, StepOutput]:
         dt_s = now_s - state.time_s
         if not 0.0 < dt_s < 10.0 * self._nominal_dt_s:
-            dt_s = self._nominal_dt_s  # a clock that stood still or a process that was stopped is not a long period
+            dt_s = self._nominal_dt_s  # a clock that stood still gives no period
         reference = state.reference or Reference(estimate.gap_mm)
         expected = state.expected or Expected(estimate.gap_mm)
         expected = expect(expected, reference, dt_s, self._lag_s, self._position.derivative_filter_s)
@@ -188,6 +212,8 @@ class Stepper:
             limits.append(Limit.SATURATED)
         if abs(estimate.skew_mm) > self._limits.skew_warning_mm:
             limits.append(Limit.SKEW)
+        if state.sight.has_stalled(now_s):
+            limits.append(Limit.HOST_STALL)
         state = StepState(
             time_s=now_s,
             safety=safety,
@@ -200,6 +226,7 @@ class Stepper:
             enabled_s=state.enabled_s,
             straying_s=state.straying_s + dt_s if self._is_astray(reference, estimate) else 0.0,
             still_s=state.still_s + dt_s if self._is_still(state, estimate, left.duty, right.duty) else 0.0,
+            sight=state.sight,
         )
         # the bridges switch the device's real supply: the same volts take less duty of a higher one
         scale = self._supply_V / max(measurement.supply_V, 0.5 * self._supply_V)
@@ -254,14 +281,20 @@ class Stepper:
         resisting = self._coulomb + (pull if moving > 0.0 else 0.0)
         return (speed + inertia) / self._full_speed_mm_s + resisting * moving
 
-    def _watch(self, state: StepState, estimate: Estimate, now_s: float, measurement: Measurement) -> tuple[Fault, ...]:
+    def _watch(
+        self, state: StepState, estimate: Estimate, now_s: float, measurement: Measurement, sight: Sight
+    ) -> tuple[Fault, ...]:
         faults: list[Fault] = []
         if now_s >= state.safety.clearing_until_s:
-            faults.extend(device_faults(measurement.faults))
+            is_ours = Fault.HOST_STALL in state.safety.faults or (
+                sight.has_stalled(now_s) and sight.stall_s > 0.5e-3 * self._device.command_timeout_ms
+            )
+            faults.extend(device_faults(measurement.faults, is_host_stall=is_ours))
         if state.safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             return tuple(faults)
         # what has just come over a slow line is old too, and a loop around it would swing
-        if now_s - measurement.received_s + measurement.delay_s > self._device.measurement_timeout_ms * 1e-3:
+        is_old = now_s - measurement.received_s + measurement.delay_s > self._device.measurement_timeout_ms * 1e-3
+        if is_old and not sight.is_waiting(now_s):
             faults.append(Fault.MEASUREMENT_STALE)
         if abs(estimate.skew_mm) > self._limits.skew_fault_mm:
             faults.append(Fault.SKEW)

@@ -15,14 +15,14 @@ from tormagd.config import Config
 from tormagd.control.core import Core
 from tormagd.control.plan import PlanState
 from tormagd.daemon import notify
-from tormagd.daemon.callbacks import Callbacks
+from tormagd.daemon.callbacks import Callbacks, Delay
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.rate_group import ERROR_PERIODS, RateGroup
 from tormagd.daemon.realtime import freeze_garbage, priority_of_threads
-from tormagd.daemon.telemetry import TickRow, explanations, snapshot, tick_row
+from tormagd.daemon.telemetry import Stall, TickRow, explanations, snapshot, tick_row
 from tormagd.hardware.backend import Backend
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.link import LinkState
@@ -68,6 +68,7 @@ class Daemon:
         self._ticks_per_snapshot = rates.control_hz // rates.telemetry_hz
         self._rows: list[TickRow] = []
         self._snapshot: Telemetry | None = None
+        self._stall: Stall | None = None
         self._ended = asyncio.Event()
 
     async def run(self) -> None:
@@ -111,9 +112,12 @@ class Daemon:
         driven_ns = time.monotonic_ns()
         callbacks.ran(ControlLoop.tick.__qualname__, start_ns, driven_ns)
         if timing.delay_ns > timing.period_ns:
-            callbacks.blame(driven_ns - timing.delay_ns, driven_ns)
+            self._note_stall(callbacks.blame(driven_ns - timing.delay_ns, driven_ns))
         else:
             callbacks.forget()
+        if faults := self._control.new_faults():
+            for explained in self._fault_details(faults):
+                log.error("fault: %(code)s: %(cause)s", explained)
         try:
             self._inference.after_tick(self._control.state.estimate)
         finally:  # whatever becomes of planning, the daemon can be seen and stopped
@@ -123,6 +127,20 @@ class Daemon:
             if timing.runs % self._ticks_per_snapshot == 0:
                 self._publish(heartbeat.due_ns)
                 callbacks.ran(self._publish.__qualname__, planned_ns, time.monotonic_ns())
+
+    def _note_stall(self, delay: Delay) -> None:
+        state = self._control.state
+        if state.sight.stalled_s == state.time_s:  # the step has taken this very lateness for a stall
+            self._stall = Stall(state.sight.stall_s, delay.culprit)
+
+    def _fault_details(self, faults: tuple[Fault, ...]) -> list[dict[str, str]]:
+        timeout_ms = self._config.device.command_timeout_ms
+        stall = f"{self._stall}; the device opened the gap by itself after {timeout_ms:g} ms" if self._stall else ""
+        return explanations(faults, FAULTS, stall)
+
+    def _limit_details(self, limits: tuple[str, ...]) -> list[dict[str, str]]:
+        stall = f"{self._stall}; then the gap was held until the device had answered" if self._stall else ""
+        return explanations(limits, LIMITS, stall)
 
     def _receive_setpoints(self) -> None:
         self._inference.receive(self._control.state.estimate, self._control.next_tick_ns)
@@ -243,8 +261,9 @@ class Daemon:
             "setpoints": self._endpoint.inbox.report(),
             "rates": {group.name: group.report for group in self._groups},
             "late_ticks_by": dict(self._callbacks.blamed),
-            "fault_details": explanations(tuple(safety.faults), FAULTS),
-            "limit_details": explanations(snapshot_.limits, LIMITS),
+            "fault_details": self._fault_details(safety.faults),
+            "limit_details": self._limit_details(snapshot_.limits),
+            "newest_stall": self._stall and {"ms": round(self._stall.took_s * 1e3, 1), "culprit": self._stall.culprit},
             "not_granted": self._refused,
         }
 

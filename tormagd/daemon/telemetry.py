@@ -1,13 +1,14 @@
 """Snapshots of the running daemon, built once per telemetry period; status answers and watchers all read the same."""
 
 import time
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from tormagd.control.plan import Plan
 from tormagd.control.step import StepOutput, StepState
 from tormagd.hardware.measurement import Measurement
 from tormagd.messages import VERSION, Telemetry, Tick
-from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.codes import Explanation, Fault, Limit
 from tormagd.safety.operating_state import OperatingState
 
 
@@ -143,7 +144,18 @@ def snapshot(row: TickRow, sequence: int, is_homed: bool, is_busy: bool, age_s: 
     )
 
 
-def explanations(codes: tuple[str, ...], table: dict[Any, Any]) -> list[dict[str, str]]:
-    """Each code with its cause and remedy."""
+class Stall(NamedTuple):
+    """The newest stall of the control loop: how long it stood still, and who is to blame for most of that."""
+
+    took_s: float
+    culprit: str
+
+    def __str__(self) -> str:
+        return f"the control loop stood still for {self.took_s * 1e3:.0f} ms ({self.culprit})"
+
+
+def explanations(codes: Iterable[str], table: Mapping[Any, Explanation], stall: str = "") -> list[dict[str, str]]:
+    """Each code with its cause and remedy; HOST_STALL with `stall`, the sentence about the newest one."""
     kind = Fault if Fault.STOPPED in table else Limit
-    return [{"code": code, **table[kind(code)]._asdict()} for code in codes]
+    known = [{"code": str(code), **table[kind(code)]._asdict()} for code in codes]
+    return [entry | {"cause": stall} if stall and entry["code"] == Limit.HOST_STALL else entry for entry in known]
