@@ -27,7 +27,7 @@ from tormagd.hardware.backend import Backend
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.link import LinkState
 from tormagd.messages import Request, Telemetry
-from tormagd.safety.codes import FAULTS, LIMITS, Fault
+from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState
 
 NS = 1_000_000_000
@@ -69,6 +69,7 @@ class Daemon:
         self._rows: list[TickRow] = []
         self._snapshot: Telemetry | None = None
         self._stall: Stall | None = None
+        self._told: dict[str, str] = {}
         self._ended = asyncio.Event()
 
     async def run(self) -> None:
@@ -116,8 +117,7 @@ class Daemon:
         else:
             callbacks.forget()
         if faults := self._control.new_faults():
-            for explained in self._fault_details(faults):
-                log.error("fault: %(code)s: %(cause)s", explained)
+            self._tell(faults)
         try:
             self._inference.after_tick(self._control.state.estimate)
         finally:  # whatever becomes of planning, the daemon can be seen and stopped
@@ -129,18 +129,28 @@ class Daemon:
                 callbacks.ran(self._publish.__qualname__, planned_ns, time.monotonic_ns())
 
     def _note_stall(self, delay: Delay) -> None:
-        state = self._control.state
-        if state.sight.stalled_s == state.time_s:  # the step has taken this very lateness for a stall
-            self._stall = Stall(state.sight.stall_s, delay.culprit)
+        sight, known = self._control.state.sight, self._stall
+        # only what the step took for a stall, too; of two that come close together it keeps the longer
+        if sight.stalled_s == self._control.state.time_s and (known is None or known.took_s != sight.stall_s):
+            self._stall = Stall(sight.stall_s, delay.culprit)
 
-    def _fault_details(self, faults: tuple[Fault, ...]) -> list[dict[str, str]]:
-        timeout_ms = self._config.device.command_timeout_ms
-        stall = f"{self._stall}; the device opened the gap by itself after {timeout_ms:g} ms" if self._stall else ""
-        return explanations(faults, FAULTS, stall)
-
-    def _limit_details(self, limits: tuple[str, ...]) -> list[dict[str, str]]:
-        stall = f"{self._stall}; then the gap was held until the device had answered" if self._stall else ""
-        return explanations(limits, LIMITS, stall)
+    def _tell(self, faults: tuple[Fault, ...]) -> None:
+        """Says which faults are new, and remembers what is known of their causes now."""
+        device, measurement = self._config.device, self._control.measurement
+        for fault in faults:
+            self._told.pop(fault, None)
+        if Fault.HOST_STALL in faults:
+            opened = f"the device opened the gap by itself after {device.command_timeout_ms:g} ms"
+            self._told[Fault.HOST_STALL] = f"{self._stall}; {opened}"
+        if Fault.MEASUREMENT_STALE in faults and measurement is not None:
+            silent_ms = (self._control.state.time_s - measurement.received_s) * 1e3
+            self._told[Fault.MEASUREMENT_STALE] = (
+                f"the device had sent no new state for {silent_ms:.0f} ms"
+                if silent_ms > device.measurement_timeout_ms
+                else f"the device was {measurement.delay_s * 1e3:.0f} ms behind with the commands that it obeyed"
+            )
+        for explained in explanations(faults, FAULTS, self._told):
+            log.error("fault: %(code)s: %(cause)s", explained)
 
     def _receive_setpoints(self) -> None:
         self._inference.receive(self._control.state.estimate, self._control.next_tick_ns)
@@ -261,8 +271,12 @@ class Daemon:
             "setpoints": self._endpoint.inbox.report(),
             "rates": {group.name: group.report for group in self._groups},
             "late_ticks_by": dict(self._callbacks.blamed),
-            "fault_details": self._fault_details(safety.faults),
-            "limit_details": self._limit_details(snapshot_.limits),
+            "fault_details": explanations(safety.faults, FAULTS, self._told),
+            "limit_details": explanations(
+                snapshot_.limits,
+                LIMITS,
+                {Limit.HOST_STALL: f"{self._stall}; the gap was held until the device answered"},
+            ),
             "newest_stall": self._stall and {"ms": round(self._stall.took_s * 1e3, 1), "culprit": self._stall.culprit},
             "not_granted": self._refused,
         }

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from tormagd.control.plan import Plan
@@ -154,8 +155,10 @@ class Stall(NamedTuple):
         return f"the control loop stood still for {self.took_s * 1e3:.0f} ms ({self.culprit})"
 
 
-def explanations(codes: Iterable[str], table: Mapping[Any, Explanation], stall: str = "") -> list[dict[str, str]]:
-    """Each code with its cause and remedy; HOST_STALL with `stall`, the sentence about the newest one."""
+def explanations(
+    codes: Iterable[str], table: Mapping[Any, Explanation], told: Mapping[str, str] = MappingProxyType({})
+) -> list[dict[str, str]]:
+    """Each code with its cause and remedy; `told` has causes with the figures of this very time."""
     kind = Fault if Fault.STOPPED in table else Limit
     known = [{"code": str(code), **table[kind(code)]._asdict()} for code in codes]
-    return [entry | {"cause": stall} if stall and entry["code"] == Limit.HOST_STALL else entry for entry in known]
+    return [entry | {"cause": told.get(entry["code"], entry["cause"])} for entry in known]
