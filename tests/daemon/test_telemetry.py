@@ -118,3 +118,5 @@ def test_codes_are_explained_by_their_table() -> None:
     assert fault == {"code": "SKEW", **FAULTS[Fault.SKEW]._asdict()}
     assert limit == {"code": "SKEW", **LIMITS[Limit.SKEW]._asdict()}
     assert explanations((), FAULTS) == []
+    (told,) = explanations(("HOST_STALL",), LIMITS, {"HOST_STALL": "it stood still for 9 ms", "SKEW": "no"})
+    assert told == {"code": "HOST_STALL", "cause": "it stood still for 9 ms", "remedy": LIMITS[Limit.HOST_STALL].remedy}
