@@ -304,7 +304,10 @@ def test_after_a_lost_encoder_enabling_wants_homing_though_the_device_calls_itse
     with pytest.raises(RefusedError) as caught:
         loop.command("enable")
     assert caught.value.code == "not_homed"
-    loop.device.messages._stuck_left = None  # the connector is pushed in again
+    loop.device.messages._stuck_left = None  # the connector is pushed in again: a leap that the device takes for motion
+    list(loop.run(0.3))
+    loop.command("clear-fault")
+    list(loop.run(0.1))
     loop.arm()
     assert render(loop, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
 

@@ -675,7 +675,7 @@ def test_a_silent_device_is_held_where_it_is_and_named(running: Bench) -> None:
     assert not running.faults
 
 
-@pytest.mark.parametrize(("stall_ms", "fault"), [(83, Fault.HOST_STALL), (15, Fault.DEVICE_COMMAND_TIMEOUT)])
+@pytest.mark.parametrize(("stall_ms", "fault"), [(83, Fault.HOST_STALL), (36, Fault.DEVICE_COMMAND_TIMEOUT)])
 def test_a_device_that_opened_because_of_a_stall_is_told_as_that(running: Bench, stall_ms: int, fault: Fault) -> None:
     """One fault, though the device goes on saying that it heard nothing; a shorter stall cannot have done it."""
     running.ticks += stall_ms

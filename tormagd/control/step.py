@@ -39,6 +39,8 @@ RESTING_MM_S = 0.02
 "A slower reference has arrived: it comes in exponentially, and what a second of it moves is a few encoder counts."
 STILL_MM_S = 0.5
 "Slower than this a carriage does not move: half an encoder count a millisecond and filtered."
+STALL_SHARE = 0.8
+"Of the device's timeout: a shorter stall of ours did not make it run out."
 LAGGING_MM = 0.1
 "The speed limit is reported as RATE only where it leaves the reference this far behind its target."
 
@@ -287,7 +289,7 @@ class Stepper:
         faults: list[Fault] = []
         if now_s >= state.safety.clearing_until_s:
             is_ours = Fault.HOST_STALL in state.safety.faults or (
-                sight.has_stalled(now_s) and sight.stall_s > 0.5e-3 * self._device.command_timeout_ms
+                sight.has_stalled(now_s) and sight.stall_s > STALL_SHARE * self._device.command_timeout_ms * 1e-3
             )
             faults.extend(device_faults(measurement.faults, is_host_stall=is_ours))
         if state.safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
