@@ -12,7 +12,7 @@ from tormagd.config import Config
 from tormagd.control.core import Core
 from tormagd.control.motor import electrical_time_s
 from tormagd.control.plan import Plan
-from tormagd.control.sight import ANSWER_S, BLIND_S
+from tormagd.control.sight import BLIND_S
 from tormagd.control.step import CARRY_S, EXCHANGE_S, STARTING_S, StepOutput, Stepper, StepState
 from tormagd.control.trajectory import APPROACH_S
 from tormagd.hardware.measurement import Measurement
@@ -653,8 +653,22 @@ def test_without_an_answer_in_time_the_measurement_is_stale(running: Bench) -> N
         ticks += 1
         assert ticks < 100
     assert running.faults == (Fault.MEASUREMENT_STALE,)
-    assert ticks == pytest.approx(ANSWER_S / PERIOD_S, abs=2)
+    assert ticks == pytest.approx(2.0 * BLIND_S / PERIOD_S, abs=2)
     assert is_opened(running)
+
+
+def test_a_slow_loop_takes_no_period_of_its_own_for_a_stall(core: Core, measure) -> None:
+    rates = msgspec.structs.replace(CONFIG.rates, control_hz=100, telemetry_hz=50, inference_hz=100)
+    stepper = Stepper(msgspec.structs.replace(CONFIG, rates=rates), core.scene)
+    state = stepper.start(0.0)
+    for tick in range(1, 8):
+        state, output = stepper.step(state, 0.01 * tick, measure(tick, received_s=0.01 * tick), gap_plan(79.0))
+        if tick == 3:
+            state = stepper.command(state, "enable", 0.01 * tick, READY)
+    assert output.left_duty < 0.0
+    assert Limit.HOST_STALL not in output.limits
+    state, output = stepper.step(state, 0.01 * tick + 0.06, measure(tick), gap_plan(79.0))
+    assert output.limits == (Limit.HOST_STALL,)
 
 
 def test_a_silent_device_is_held_where_it_is_and_named(running: Bench) -> None:

@@ -7,10 +7,9 @@ device does now is not known before it has answered the next Drive. Pure functio
 import math
 from typing import NamedTuple
 
-BLIND_S = 0.005
-"Without a new state for longer than this, where the carriages are is not known well enough to drive them."
-ANSWER_S = 0.01
-"How long the answer to the first Drive after a stall may take; a wire that needs more is slow for a loop."
+BLIND_S, BLIND_PERIODS = 0.005, 5.0
+"""Without a new state for longer than both, where the carriages are is not known well enough to drive them. The answer
+to the first Drive after a stall may take twice as long: a wire that needs more is slow for a loop."""
 SHOWN_S = 0.1
 "A stall is shown for this long after it, or nobody would see it: telemetry comes every 20 ms."
 
@@ -28,17 +27,21 @@ class Sight(NamedTuple):
         """Whether a stall ended not long ago."""
         return now_s - self.stalled_s < SHOWN_S
 
-    def is_waiting(self, now_s: float) -> bool:
+    def is_waiting(self, now_s: float, period_s: float) -> bool:
         """Whether the answer to the first Drive after a stall may still be on its way."""
-        return self.is_blind and now_s - self.stalled_s < ANSWER_S
+        return self.is_blind and now_s - self.stalled_s < 2.0 * _blind_s(period_s)
 
 
-def look(sight: Sight, last_s: float, now_s: float, is_new: bool) -> Sight:
+def look(sight: Sight, last_s: float, now_s: float, period_s: float, is_new: bool) -> Sight:
     """The sight of a step at `now_s` after one at `last_s`; `is_new`: it was given a state that the other was not."""
-    stall_s = now_s - last_s
-    if stall_s > BLIND_S:
+    stall_s, blind_s = now_s - last_s, _blind_s(period_s)
+    if stall_s > blind_s:
         before_s = sight.stall_s if sight.has_stalled(now_s) else 0.0
         return Sight(now_s, now_s, max(stall_s, before_s), is_blind=True)
     if is_new:
         return sight._replace(seen_s=now_s, is_blind=False)
-    return sight._replace(is_blind=sight.is_blind or now_s - sight.seen_s > BLIND_S)
+    return sight._replace(is_blind=sight.is_blind or now_s - sight.seen_s > blind_s)
+
+
+def _blind_s(period_s: float) -> float:
+    return max(BLIND_S, BLIND_PERIODS * period_s)

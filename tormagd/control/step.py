@@ -139,7 +139,7 @@ class Stepper:
             state = self.lose_link(state)._replace(time_s=now_s)
             return state, self._off(state.safety, ())
         is_new = state.estimate is None or measurement.number != state.estimate.number
-        was_blind, sight = state.sight.is_blind, look(state.sight, state.time_s, now_s, is_new)
+        was_blind, sight = state.sight.is_blind, look(state.sight, state.time_s, now_s, self._nominal_dt_s, is_new)
         estimate = update(state.estimate, measurement, self._home_mm, self._position.derivative_filter_s)
         safety = latch(state.safety, self._watch(state, estimate, now_s, measurement, sight))
         if safety.needs_homing:
@@ -296,7 +296,7 @@ class Stepper:
             return tuple(faults)
         # what has just come over a slow line is old too, and a loop around it would swing
         is_old = now_s - measurement.received_s + measurement.delay_s > self._device.measurement_timeout_ms * 1e-3
-        if is_old and not sight.is_waiting(now_s):
+        if is_old and not sight.is_waiting(now_s, self._nominal_dt_s):
             faults.append(Fault.MEASUREMENT_STALE)
         if abs(estimate.skew_mm) > self._limits.skew_fault_mm:
             faults.append(Fault.SKEW)
