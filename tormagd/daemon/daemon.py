@@ -146,7 +146,7 @@ class Daemon:
             silent_ms = (self._control.state.time_s - measurement.received_s) * 1e3
             self._told[Fault.MEASUREMENT_STALE] = (
                 f"the device had sent no new state for {silent_ms:.0f} ms"
-                if silent_ms > device.measurement_timeout_ms
+                if silent_ms > measurement.delay_s * 1e3
                 else f"the device was {measurement.delay_s * 1e3:.0f} ms behind with the commands that it obeyed"
             )
         for explained in explanations(faults, FAULTS, self._told):
