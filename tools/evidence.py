@@ -152,6 +152,15 @@ def _says_replug(figures: Figures) -> str:
     )
 
 
+def _says_stalls(figures: Figures) -> str:
+    short = [row for row in figures["rows"] if row["asked_ms"] < 50.0]
+    stops, faulted = (sum(row[name] for row in short) for name in ("stops", "faulted"))
+    return (
+        f"{figures['stops']} stops of daemon and device; {faulted} of {stops} for 5 to 45 ms latched, force off by "
+        f"{max(row['worst_N'] for row in short)} N at most; {len(figures['failures'])} did not hold"
+    )
+
+
 PARTS = {
     "fuzz": Part("tools/fuzz_protocol.py --json", _says_fuzz),
     "bus": Part("tools/benchmark.py bus --json", _says_bus),
@@ -160,6 +169,7 @@ PARTS = {
     "replug_serial": Part("tools/replug.py --cycles 200 --transport serial --json", _says_replug),
     "replug_can": Part("tools/replug.py --cycles 200 --transport can --json", _says_replug),
     "soak": Part("tools/soak.py --json", _says_soak),
+    "stalls": Part("tools/stalls.py --json", _says_stalls),
 }
 
 

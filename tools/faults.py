@@ -38,10 +38,13 @@ class Injection(NamedTuple):
     name: str
     device: str | None = None
     host: str | None = None
+    stall_ms: int = 0
 
 
 MATRIX = (
     Injection("daemon killed or cable cut", host="silent"),
+    Injection("daemon stalls for 45 ms", stall_ms=45),
+    Injection("daemon stalls for 83 ms", stall_ms=83),
     Injection("device hears nothing", device="commands_vanish"),
     Injection("device resets", device="reset"),
     Injection("motor supply fails", device="supply_loss"),
@@ -100,8 +103,8 @@ def inject(injection: Injection, plant: str) -> Cell:
         loop.command(injection.host)
     setpoint.is_silent = injection.host == "stale"
     watch = Watch(usual)
-    for _ in range(round(WATCHED_S * config.rates.control_hz)):
-        if injection.host == "silent":
+    for tick in range(round(WATCHED_S * config.rates.control_hz)):
+        if injection.host == "silent" or tick < injection.stall_ms:
             loop.skip()
             watch.see(loop, None)
         else:

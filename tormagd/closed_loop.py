@@ -25,6 +25,8 @@ from tormagd.simulation.plant import Truth
 Array = npt.NDArray[np.float64]
 HOMING_S = 10.0
 "Longer than the slowest homing from a closed gap."
+MAX_UNREAD_BYTES = 4096
+"What a serial port keeps for a program that does not read."
 
 
 class Sample(NamedTuple):
@@ -47,6 +49,7 @@ class ClosedLoop:
         self._period_s = 1.0 / config.rates.control_hz
         self._inference_s = 1.0 / config.rates.inference_hz
         self._stream = FrameStream()
+        self._unread = b""
         self._requested = 0
         self._ticks = 0
         self.link = DeviceLink(0.0)
@@ -67,7 +70,8 @@ class ClosedLoop:
         """One control period. A given `plan` is used instead of planning: a bench sweep asks for gaps, not forces."""
         self._ticks += 1
         now_s = self.now_s
-        for message in self._stream.unpack(self.device.transmit(now_s)):
+        arrived, self._unread = self._unread + self.device.transmit(now_s), b""
+        for message in self._stream.unpack(arrived):
             self.link.receive(now_s, message)
         used = self._newest_plan() if plan is None else plan
         self.step_state, output = self._stepper.step(self.step_state, now_s, self.measurement, used)
@@ -78,9 +82,9 @@ class ClosedLoop:
         return Sample(now_s, self.step_state, output, used, trim, self.device.truth)
 
     def skip(self) -> None:
-        """One control period in which the daemon does nothing: it was killed, or its cable was cut."""
+        """One control period in which the daemon does nothing: it was stopped, or killed. What comes waits for it."""
         self._ticks += 1
-        self.device.transmit(self.now_s)
+        self._unread = (self._unread + self.device.transmit(self.now_s))[-MAX_UNREAD_BYTES:]
 
     def command(self, name: str) -> None:
         """An operator's command. Raises RefusedError."""

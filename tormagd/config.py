@@ -49,8 +49,8 @@ class Device(Strict, frozen=True):
     "The device's node number on the CAN bus."
     command_timeout_ms: Annotated[float, Meta(ge=5.0, le=1_000.0)] = 50.0
     "What the firmware does without us: its own timeout, stated here so that it can be checked against ours."
-    measurement_timeout_ms: Annotated[float, Meta(ge=2.0, le=1_000.0)] = 40.0
-    "Oldest device state the controller accepts while it drives."
+    measurement_timeout_ms: Annotated[float, Meta(ge=2.0, le=1_000.0)] = 50.0
+    "Oldest device state the controller accepts while it drives; from some milliseconds on it only holds the gap."
 
     def __post_init__(self) -> None:
         _order(self.port.isprintable(), "device.port", self.port, "printable characters")

@@ -7,11 +7,12 @@ import math
 from itertools import accumulate
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.closed_loop import Array, ClosedLoop, Sample
 from tormagd.config import Config
 from tormagd.control.plan import Plan
 from tormagd.control.step import Stepper
@@ -60,8 +61,8 @@ def uneven() -> PlantParameters:
     )
 
 
-def worst_skew_um(synchronisation: float) -> float:
-    """Greatest skew by the encoders on the way to and fro at 15 mm/s, with half of the drag again on the left soon."""
+def skews_um(synchronisation: float) -> Array:
+    """Skew by the encoders on the way to and fro at 15 mm/s, with half of the drag again on the left soon."""
     position = msgspec.structs.replace(CONFIG.position, synchronisation=synchronisation)
     config = msgspec.structs.replace(CONFIG, position=position)
     device = VirtualDevice(uneven(), SteadyHand(), [parse_fault("drag_left=+50%@2.7")], 1)
@@ -75,13 +76,14 @@ def worst_skew_um(synchronisation: float) -> float:
     assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
     assert_sane(samples, config)
     assert samples[-1].truth.gap_mm == pytest.approx(94.0, abs=0.1)
-    return max(abs(sample.state.estimate.skew_mm) for sample in samples if sample.state.estimate is not None) * 1e3
+    return np.array([sample.state.estimate.skew_mm for sample in samples if sample.state.estimate is not None]) * 1e3
 
 
 def test_uneven_screws_stay_together_and_cross_coupling_is_why() -> None:
-    coupled, apart = worst_skew_um(CONFIG.position.synchronisation), worst_skew_um(0.0)
-    assert coupled <= 30.0
-    assert coupled < 0.8 * apart
+    coupled, apart = skews_um(CONFIG.position.synchronisation), skews_um(0.0)
+    assert np.abs(coupled).max() <= 30.0
+    # in the mean: the worst of either is one or two encoder counts
+    assert np.sqrt(np.mean(coupled**2)) < 0.8 * np.sqrt(np.mean(apart**2))
 
 
 def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:

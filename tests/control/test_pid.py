@@ -70,6 +70,29 @@ def test_the_duty_never_leaves_its_limit(
     assert output.is_saturated == (abs(asked) > position.duty_limit) or abs(abs(asked) - position.duty_limit) < 1e-9
 
 
+@settings(max_examples=50, deadline=None)
+@given(
+    position=gains,
+    integral=st.floats(-0.1, 0.1),
+    history=st.lists(st.tuples(st.floats(0.0, 5.0), st.floats(0.0, 30.0), st.floats(0.0, 1.0)), min_size=1),
+)
+def test_nothing_winds_up_against_a_switch(
+    position: Position, integral: float, history: list[tuple[float, float, float]]
+) -> None:
+    """However it is pushed there, for however long: no duty, no saturation, and closing finds no more to unlearn."""
+    state = PidState(integral)
+    for error, speed, ahead in history * 20:
+        state, output = pid(position, state, Error(error, speed), ahead, DT_S, is_blocked=True)
+        assert output.duty <= 0.0
+        assert not output.is_saturated
+        assert -position.duty_limit <= state.integral <= max(integral, 0.0)
+
+
+def test_a_carriage_at_its_switch_closes_as_any_other() -> None:
+    error = Error(-0.1, -5.0)
+    assert pid(GAINS, PidState(), error, -0.2, DT_S, is_blocked=True) == pid(GAINS, PidState(), error, -0.2, DT_S)
+
+
 @settings(max_examples=30, deadline=None)
 @given(position=gains, error=st.floats(1.0, 50.0), sign=st.sampled_from([-1.0, 1.0]))
 def test_a_long_saturation_winds_nothing_up(position: Position, error: float, sign: float) -> None:

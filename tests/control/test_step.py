@@ -12,6 +12,7 @@ from tormagd.config import Config
 from tormagd.control.core import Core
 from tormagd.control.motor import electrical_time_s
 from tormagd.control.plan import Plan
+from tormagd.control.sight import BLIND_S
 from tormagd.control.step import CARRY_S, EXCHANGE_S, STARTING_S, StepOutput, Stepper, StepState
 from tormagd.control.trajectory import APPROACH_S
 from tormagd.hardware.measurement import Measurement
@@ -308,6 +309,70 @@ def test_a_carriage_that_is_driven_and_does_not_move(running: Bench) -> None:
     assert is_opened(running)
 
 
+def test_a_carriage_that_the_firmware_holds_at_its_open_switch_is_not_driven(bench: Bench) -> None:
+    """The switch lies 0.2 mm before the end asked for: nothing is learned there, and closing takes no longer."""
+    at_end = {"left_mm": -0.2, "right_mm": -0.2}
+    switches = Switches.HOMED | Switches.LEFT_OPEN | Switches.RIGHT_OPEN
+    bench.step(count=3, **at_end)
+    bench.command("enable")
+    for _ in range(2_000):
+        output = bench.step(gap_plan(95.0, bench.now_s), **at_end, switches=switches)
+        assert (output.left_duty, output.right_duty) == (0.0, 0.0)
+        assert Limit.SATURATED not in output.limits
+    assert not bench.faults
+    assert bench.state.left.integral <= 0.0
+    pushed = [bench.step(gap_plan(90.0, bench.now_s), **at_end, switches=switches).left_duty for _ in range(30)]
+    assert max(pushed[5:]) < 0.0
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_one_carriage_at_its_switch_excuses_no_other(bench: Bench, side: str) -> None:
+    switches = Switches.HOMED | (Switches.RIGHT_OPEN if side == "left" else Switches.LEFT_OPEN)
+    at_end = {"left_mm": -0.3, "right_mm": -0.3}
+    bench.step(count=3, **at_end)
+    bench.command("enable")
+    ticks = 0
+    while not bench.faults:
+        bench.step(gap_plan(95.0, bench.now_s), **at_end, switches=switches)
+        ticks += 1
+        assert ticks < 1_000
+    assert bench.faults == (Fault.NO_MOTION,)
+
+
+def test_after_an_encoder_fault_positions_are_unknown_until_the_device_has_homed(running: Bench) -> None:
+    running.run_into(Fault.SKEW, left_mm=-5.0)
+    assert running.state.estimate is not None
+    assert not running.state.estimate.is_homed
+    running.command("clear-fault")
+    for name in ("enable", "home", "enable"):
+        running.step(count=5)
+        assert not running.state.estimate.is_homed
+        if name == "home":
+            running.command(name)
+            continue
+        with pytest.raises(RefusedError) as caught:
+            running.command(name)
+        assert caught.value.code == "not_homed"
+    running.step(count=30, mode=DeviceMode.HOMING, switches=Switches(0))
+    assert not running.state.estimate.is_homed
+    running.step(count=2)
+    assert running.state.estimate.is_homed
+    running.command("enable")
+    assert running.step().mode is DriveMode.RUN
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_carriages_that_are_too_far_apart_are_not_enabled(bench: Bench, side: float) -> None:
+    half_mm = side * CONFIG.limits.skew_fault_mm / 2.0
+    bench.step(left_mm=-7.5 + 1.01 * half_mm, right_mm=-7.5 - 1.01 * half_mm)
+    with pytest.raises(RefusedError, match=r"1.01 mm apart: allowed is at most 1 mm") as caught:
+        bench.command("enable")
+    assert (caught.value.code, caught.value.hint) == ("skewed", "tormagctl home")
+    bench.step(left_mm=-7.5 + 0.99 * half_mm, right_mm=-7.5 - 0.99 * half_mm)
+    bench.command("enable")
+    assert not bench.faults
+
+
 def test_a_process_that_stood_still_saw_no_carriage_stand_still(running: Bench) -> None:
     """One look before the pause and one after it say nothing of what the carriages did between."""
     running.step(gap_plan(60.0), count=30)
@@ -504,30 +569,155 @@ def _commanded(stepper: Stepper, state: StepState, name: str, now_s: float) -> S
         return state
 
 
-@pytest.mark.parametrize("elapsed_s", [0.0, -1e-3, -1e6, 0.011, 1.0, 1e9])
-def test_a_clock_that_jumps_is_one_ordinary_period(core: Core, measure, elapsed_s: float) -> None:
-    """A process that was stopped, or a clock that stood still, moves the reference no further than a period does."""
+def following(measure, state: StepState, number: int, now_s: float) -> Measurement:
+    """Carriages that are where they are wanted."""
+    assert state.reference is not None
+    side_mm = state.reference.gap_mm / 2.0 - 47.5
+    return measure(number, received_s=now_s, left_mm=side_mm, right_mm=side_mm)
 
-    def following(state: StepState, number: int, now_s: float) -> Measurement:
-        assert state.reference is not None
-        side_mm = state.reference.gap_mm / 2.0 - 47.5
-        return measure(number, received_s=now_s, left_mm=side_mm, right_mm=side_mm)
 
-    state = core.stepper.start(0.0)
+@pytest.fixture
+def moving(core: Core, measure) -> tuple[StepState, float]:
+    """On the way from 80 to 60 mm, and when that is."""
+    state = core.stepper.start(1.0 - PERIOD_S)
     state, _ = core.stepper.step(state, 1.0, measure(1, received_s=1.0), gap_plan(80.0, 1.0))
     state = core.stepper.command(state, "enable", 1.0, READY)
     for tick in range(2, 12):
         now_s = 1.0 + tick * PERIOD_S
-        state, _ = core.stepper.step(state, now_s, following(state, tick, now_s), gap_plan(60.0, now_s))
+        state, _ = core.stepper.step(state, now_s, following(measure, state, tick, now_s), gap_plan(60.0, now_s))
+    return state, now_s
+
+
+@pytest.mark.parametrize("elapsed_s", [0.0, -1e-3, -1e6])
+def test_a_clock_that_stands_still_is_one_ordinary_period(core: Core, measure, moving, elapsed_s: float) -> None:
+    state, now_s = moving
     assert state.reference is not None
-    at_mm = state.reference.gap_mm
     moved_mm = []
     for later_s in (now_s + PERIOD_S, now_s + elapsed_s):
-        later, _ = core.stepper.step(state, later_s, following(state, 12, later_s), gap_plan(60.0, later_s))
+        later, _ = core.stepper.step(state, later_s, following(measure, state, 12, later_s), gap_plan(60.0, later_s))
         assert later.reference is not None
-        moved_mm.append(later.reference.gap_mm - at_mm)
+        moved_mm.append(later.reference.gap_mm - state.reference.gap_mm)
     assert moved_mm[0] < -0.01
     assert moved_mm[1] == pytest.approx(moved_mm[0])
+
+
+# -- stalls --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("elapsed_s", [BLIND_S + 1e-4, 0.011, 0.048, 1.0, 1e9])
+@pytest.mark.parametrize(
+    "has_more", [False, True], ids=["nothing came", "what came before the stall was read after it"]
+)
+def test_after_a_stall_one_drive_asks_and_moves_nothing(
+    core: Core, measure, moving, elapsed_s: float, has_more: bool
+) -> None:
+    """Whatever is found then is older than the stall. The reference waits, and nothing is learned or concluded."""
+    state, now_s = moving
+    old = following(measure, state, 11 + has_more, now_s + (elapsed_s if has_more else 0.0))
+    after, output = core.stepper.step(state, now_s + elapsed_s, old, gap_plan(60.0, now_s))
+    assert output[:3] == (DriveMode.RUN, 0.0, 0.0)
+    assert output.limits == (Limit.HOST_STALL,)
+    assert not after.safety.faults
+    assert (after.reference, after.left, after.right) == (state.reference, state.left, state.right)
+    assert (after.still_s, after.straying_s) == (state.still_s, state.straying_s)
+    assert after.sight.stall_s == pytest.approx(elapsed_s)
+
+
+@pytest.mark.parametrize("came_mm", [0.0, -1.7, 1.0])
+def test_the_answer_to_it_is_gone_on_from_without_a_kick(core: Core, measure, moving, came_mm: float) -> None:
+    """The device went on with its last duty meanwhile, and is not where it was wanted before."""
+    state, now_s = moving
+    assert state.reference is not None
+    came = state.reference._replace(gap_mm=state.reference.gap_mm + came_mm)
+    integral = state.left.integral
+    for later in (0.045, 0.046):
+        at_s = now_s + later
+        answer = following(measure, state._replace(reference=came), 11 + (later > 0.045), at_s)
+        answer = answer._replace(device_time_s=at_s)
+        state, output = core.stepper.step(state, at_s, answer, gap_plan(came.gap_mm, at_s))
+    assert not state.safety.faults
+    assert state.reference is not None
+    assert state.reference.gap_mm == pytest.approx(came.gap_mm, abs=0.1)
+    assert abs(output.left_duty) < 0.6
+    assert state.left.integral == pytest.approx(integral, abs=0.02)
+    assert Limit.HOST_STALL in output.limits
+
+
+def test_without_an_answer_in_time_the_measurement_is_stale(running: Bench) -> None:
+    """The device is given some milliseconds, whatever the stall has left of the timeout, and no more."""
+    newest = running._measure(running.ticks)
+    running.ticks += round(CONFIG.device.measurement_timeout_ms) - 2
+    ticks = 0
+    while not running.faults:
+        assert running.silent(newest)[1:3] == (0.0, 0.0)
+        ticks += 1
+        assert ticks < 100
+    assert running.faults == (Fault.MEASUREMENT_STALE,)
+    assert ticks == pytest.approx(2.0 * BLIND_S / PERIOD_S, abs=2)
+    assert is_opened(running)
+
+
+def test_a_slow_loop_takes_no_period_of_its_own_for_a_stall(core: Core, measure) -> None:
+    rates = msgspec.structs.replace(CONFIG.rates, control_hz=100, telemetry_hz=50, inference_hz=100)
+    stepper = Stepper(msgspec.structs.replace(CONFIG, rates=rates), core.scene)
+    state = stepper.start(0.0)
+    for tick in range(1, 8):
+        state, output = stepper.step(state, 0.01 * tick, measure(tick, received_s=0.01 * tick), gap_plan(79.0))
+        if tick == 3:
+            state = stepper.command(state, "enable", 0.01 * tick, READY)
+    assert output.left_duty < 0.0
+    assert Limit.HOST_STALL not in output.limits
+    state, output = stepper.step(state, 0.01 * tick + 0.06, measure(tick), gap_plan(79.0))
+    assert output.limits == (Limit.HOST_STALL,)
+
+
+def test_a_silent_device_is_held_where_it_is_and_named(running: Bench) -> None:
+    running.step(gap_plan(79.0), count=10)
+    newest, before = running._measure(running.ticks), running.state
+    for _ in range(round(BLIND_S / PERIOD_S) + 1):
+        running.silent(newest)
+    held = running.state
+    for _ in range(30):
+        output = running.silent(newest)
+        assert output[:3] == (DriveMode.RUN, 0.0, 0.0)
+        assert output.limits == (Limit.DEVICE_SILENT,)
+    assert (running.state.reference, running.state.left) == (held.reference, held.left)
+    assert abs(held.left.integral - before.left.integral) < 0.05
+    back = running.step(gap_plan(80.0, running.now_s))
+    assert Limit.DEVICE_SILENT not in back.limits
+    assert abs(back.left_duty) < 0.2
+    assert not running.faults
+
+
+@pytest.mark.parametrize(("stall_ms", "fault"), [(83, Fault.HOST_STALL), (36, Fault.DEVICE_COMMAND_TIMEOUT)])
+def test_a_device_that_opened_because_of_a_stall_is_told_as_that(running: Bench, stall_ms: int, fault: Fault) -> None:
+    """One fault, though the device goes on saying that it heard nothing; a shorter stall cannot have done it."""
+    running.ticks += stall_ms
+    running.step()
+    running.step(count=15)
+    assert not running.faults
+    opened = {"faults": DeviceFault.COMMAND_TIMEOUT, "mode": DeviceMode.RETRACTING}
+    assert running.run_into(fault, **opened) == 1
+    running.step(count=500, **opened | {"mode": DeviceMode.LATCHED})
+    assert running.faults == (fault,)
+    assert is_opened(running)
+
+
+@settings(max_examples=60, deadline=None)
+@given(stalls_ms=st.lists(st.tuples(st.integers(6, 49), st.integers(3, 40)), min_size=1, max_size=8))
+def test_stalls_that_the_device_survives_are_never_a_fault(
+    core: Core, measure, stalls_ms: list[tuple[int, int]]
+) -> None:
+    """However they follow each other, held or moving; the duty right after each is none."""
+    bench = Bench(core.stepper, measure)
+    bench.step(count=3)
+    bench.command("enable")
+    for stall_ms, ran_ms in stalls_ms:
+        bench.ticks += stall_ms
+        assert bench.step(gap_plan(79.9, bench.now_s))[:3] == (DriveMode.RUN, 0.0, 0.0)
+        bench.step(gap_plan(79.9, bench.now_s), count=ran_ms)
+        assert not bench.faults
+        assert abs(bench.state.left.integral) < 0.3
 
 
 @pytest.mark.parametrize("gap_mm", [-64.0, -40.0, -5.0, 0.0, 30.0])

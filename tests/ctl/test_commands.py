@@ -248,10 +248,10 @@ def test_status_text_of_a_daemon_that_says_little_or_nonsense():
 def test_status_text_says_how_each_rate_is_kept_and_who_made_ticks_late():
     lateness_us = {"p50": 12.0, "p99": 80.0}
     group = {"grade": "error", "hz": 999.6, "lateness_us": lateness_us, "overruns": 9, "stalls": 2, "merged": 4}
-    blamed = {"Daemon._publish": 1, "kernel": 7, "Connection._receive": 1}
+    blamed = {"Daemon._publish": 1, "kernel": 7, "Connection.receive": 1}
     lines = status_text({"rates": {"control": group}, "late_ticks_by": blamed}, Colour(sys.stderr)).splitlines()
     assert "control   error, 1000 Hz, late 12 us (p50) 80 us (p99), overruns 9, stalls 2, merged 4" in lines
-    assert "late by   7 kernel, 1 Connection._receive, 1 Daemon._publish" in lines
+    assert "late by   7 kernel, 1 Connection.receive, 1 Daemon._publish" in lines
 
 
 @pytest.mark.parametrize("command", [["status"], ["send", "step"], ["scene", "list"]])

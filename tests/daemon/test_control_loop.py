@@ -21,9 +21,13 @@ def test_the_measurement_that_a_step_was_given_is_kept_though_the_exchange_bring
         return state._replace(time_s=now_s), StepOutput(DriveMode.OFF, 0.0, 0.0, DeviceRequest.NONE, 0, ())
 
     connection.exchange = exchange
+    connection.receive = lambda: given.append("received")
     stepper: Any = SimpleNamespace(start=StepState, step=step)
     loop = ControlLoop(stepper, connection, 1_000_000)
     plan: Any = None
     for seen in ("old", "new"):
         loop.tick(0, 0, plan)
         assert (given[-1], loop.measurement) == (seen, seen)
+    # after missed periods what has come is read first
+    loop.tick(0, 3, plan)
+    assert given[-2:] == ["received", "new"]

@@ -14,11 +14,14 @@ import zmq.asyncio
 from tormagd.config import Config, Endpoints, RealTime
 from tormagd.control.core import Core, build_core
 from tormagd.control.plan import PlanState
+from tormagd.control.sight import Sight
 from tormagd.daemon import notify
+from tormagd.daemon.callbacks import KERNEL, Delay
 from tormagd.daemon.daemon import Daemon
 from tormagd.hardware.backend import Backend, BackendError
 from tormagd.messages import VERSION, Reply, Request, decode, encode
 from tormagd.physics.errors import DomainError
+from tormagd.safety.codes import FAULTS, Fault
 
 PATIENCE_S = 20.0
 WATCHDOG_MS = 100.0
@@ -124,3 +127,37 @@ def test_the_watchdog_is_fed_while_plans_are_fresh(core: Core, tmp_path: Path, m
         assert notified == []
 
     run(core, tmp_path, operate)
+
+
+def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
+    core: Core, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Length and culprit are those of the stall that did it, whatever stalls come after."""
+    addresses = {name: f"ipc://{tmp_path}/{name}" for name in ("setpoint", "telemetry", "control", "recording")}
+
+    async def tell() -> None:
+        daemon = Daemon(Config(endpoints=Endpoints(**addresses)), core, no_device, [])
+        control = daemon._control
+
+        def stall(now_s: float, took_s: float, culprit: str) -> None:
+            control.state = control.state._replace(time_s=now_s, sight=Sight(now_s, now_s, took_s, is_blind=True))
+            daemon._note_stall(Delay(round(took_s * 1e9), culprit, 1))
+
+        stall(10.0, 0.083, KERNEL)
+        # a late tick that is no stall is not taken for one
+        control.state = control.state._replace(time_s=10.1)
+        daemon._note_stall(Delay(2_000_000, "Daemon._publish", 1_500_000))
+        control.latch(Fault.HOST_STALL)
+        daemon._tell(control.new_faults())
+        stall(11.0, 0.006, "somebody else")
+        control.latch(Fault.PLAN_FAILED)
+        daemon._tell(control.new_faults())
+        assert control.new_faults() == ()
+        daemon._endpoint.close()
+
+    asyncio.run(tell())
+    assert [record.getMessage() for record in caplog.records if record.getMessage().startswith("fault")] == [
+        "fault: HOST_STALL: the control loop stood still for 83 ms (kernel); "
+        "the device opened the gap by itself after 50 ms",
+        f"fault: PLAN_FAILED: {FAULTS[Fault.PLAN_FAILED].cause}",
+    ]

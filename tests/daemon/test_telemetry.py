@@ -45,7 +45,8 @@ LATE = MEASUREMENT._replace(delay_s=0.031)
 def telemetry(measurement: Measurement | None, state: StepState, is_busy: bool = False) -> Telemetry:
     """What is published, as a client decodes it."""
     row = tick_row(1.0, state, OUTPUT, PLAN, 1.1, measurement, 20.0, 150.0)
-    return decode(encode(snapshot(row, 3, measurement, is_busy, 0.012)), Telemetry)
+    is_homed = state.estimate is not None and state.estimate.is_homed
+    return decode(encode(snapshot(row, 3, is_homed, is_busy, 0.012)), Telemetry)
 
 
 def test_a_driven_device() -> None:
@@ -117,3 +118,5 @@ def test_codes_are_explained_by_their_table() -> None:
     assert fault == {"code": "SKEW", **FAULTS[Fault.SKEW]._asdict()}
     assert limit == {"code": "SKEW", **LIMITS[Limit.SKEW]._asdict()}
     assert explanations((), FAULTS) == []
+    (told,) = explanations(("HOST_STALL",), LIMITS, {"HOST_STALL": "it stood still for 9 ms", "SKEW": "no"})
+    assert told == {"code": "HOST_STALL", "cause": "it stood still for 9 ms", "remedy": LIMITS[Limit.HOST_STALL].remedy}

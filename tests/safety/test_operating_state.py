@@ -8,12 +8,14 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import (
     CLEARING_S,
+    LOST_POSITION,
     Conditions,
     DeviceRequest,
     OperatingState,
     RefusedError,
     SafetyState,
     command,
+    homed_again,
     latch,
 )
 
@@ -22,7 +24,7 @@ READY = Conditions(
     connected=True, fresh=True, homed=True, busy=False, device_latched=False, requested_N=None, neutral_N=0.5
 )
 DISABLED, ENABLED, PAUSED, FAULT = OperatingState
-FAULTED = latch(SafetyState(), (Fault.SKEW,))
+FAULTED = latch(SafetyState(), (Fault.DEVICE_OVERCURRENT,))
 
 conditions = st.builds(
     Conditions,
@@ -136,7 +138,7 @@ def test_an_unknown_command_lists_the_known_ones() -> None:
 def test_a_command_refused_in_fault_names_the_faults() -> None:
     refused = refusal(FAULTED, "enable")
     assert refused.code == "fault"
-    assert Fault.SKEW in refused.message
+    assert Fault.DEVICE_OVERCURRENT in refused.message
     assert "clear-fault" in refused.hint
 
 
@@ -182,6 +184,24 @@ def test_enabling_ends_the_wait_for_a_cleared_fault_to_go() -> None:
     assert command(cleared, "enable", 2.1, READY).clearing_until_s < 0.0
 
 
+@pytest.mark.parametrize("fault", [Fault.NO_MOTION, Fault.FOLLOWING_ERROR, Fault.SKEW])
+def test_an_encoder_fault_takes_homing_away_until_the_device_has_homed_again(fault: Fault) -> None:
+    """The device knows nothing of it, and calls itself homed all the time."""
+    cleared = command(latch(SafetyState(), (Fault.STOPPED, fault)), "clear-fault", 2.0, READY)
+    refused = refusal(homed_again(cleared, is_homed=True), "enable")
+    assert (refused.code, refused.hint) == ("not_homed", "tormagctl home")
+    asked = command(cleared, "home", 2.0, READY)
+    assert refusal(asked, "enable").code == "not_homed"
+    homing = homed_again(asked, is_homed=False)
+    assert command(homed_again(homing, is_homed=True), "enable", 2.0, READY).operating_state is ENABLED
+
+
+def test_other_faults_leave_homing_to_the_device() -> None:
+    others = tuple(fault for fault in Fault if fault not in LOST_POSITION)
+    cleared = command(latch(SafetyState(), others), "clear-fault", 2.0, READY)
+    assert command(cleared, "enable", 2.0, READY).operating_state is ENABLED
+
+
 def test_faults_are_kept_in_the_order_they_came() -> None:
     state = latch(latch(SafetyState(), (Fault.SKEW,)), (Fault.STOPPED, Fault.SKEW, Fault.LINK_LOST))
     assert state.faults == (Fault.SKEW, Fault.STOPPED, Fault.LINK_LOST)
@@ -201,6 +221,12 @@ class Operating(RuleBasedStateMachine):
         super().__init__()
         self.state = SafetyState()
         self.now_s = 0.0
+        self.is_position_lost = False
+
+    @rule(is_homed=st.sampled_from([True, True, True, False]))
+    def report(self, is_homed: bool) -> None:
+        self.state = homed_again(self.state, is_homed)
+        self.is_position_lost &= is_homed
 
     @rule(name=st.sampled_from(COMMANDS), present=conditions, elapsed_s=st.floats(0.0, 1.0))
     def operate(self, name: str, present: Conditions, elapsed_s: float) -> None:
@@ -215,6 +241,7 @@ class Operating(RuleBasedStateMachine):
         if name == "enable":
             assert before.operating_state is DISABLED
             assert present.homed
+            assert not self.is_position_lost
             assert present.fresh
             assert present.connected
             assert not present.busy
@@ -240,6 +267,7 @@ class Operating(RuleBasedStateMachine):
             assert self.state.request_number == before.request_number + 1
         else:
             assert self.state is before
+        self.is_position_lost |= not LOST_POSITION.isdisjoint(self.state.faults)
         assert set(self.state.faults) == {*before.faults, *found}
 
     def _commanded(self, name: str, present: Conditions) -> SafetyState | None:

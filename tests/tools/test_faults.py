@@ -4,13 +4,23 @@ import faults
 import pytest
 
 
-@pytest.mark.parametrize("name", ["daemon killed or cable cut", "device hears nothing", "left encoder stuck"])
+@pytest.mark.parametrize(
+    "name", ["daemon killed or cable cut", "daemon stalls for 83 ms", "device hears nothing", "left encoder stuck"]
+)
 def test_faults_end_open_and_named(name):
     (injection,) = (item for item in faults.MATRIX if item.name == name)
     cell = faults.inject(injection, "sample_1")
     assert cell.host_faults or cell.device_faults
     assert cell.open_ms is not None
     assert cell.below_1N_ms < 1_000.0
+
+
+def test_a_short_stall_of_the_daemon_is_no_fault():
+    (injection,) = (item for item in faults.MATRIX if item.stall_ms == 45)
+    cell = faults.inject(injection, "sample_1")
+    assert cell.host_faults == cell.device_faults == ()
+    assert "HOST_STALL" in cell.limits
+    assert cell.reaction == "daemon ENABLED, device RUN"
 
 
 def test_a_silent_publisher_is_no_fault():

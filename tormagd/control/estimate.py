@@ -30,7 +30,7 @@ class Handle(NamedTuple):
 class Estimate(NamedTuple):
     """Carriages in mm from the centre plane, speeds in mm/s (opening is positive), force in N against the motion.
 
-    Before homing the positions count from wherever the carriages were, and mean nothing.
+    Where they are not homed, positions mean nothing: they count from wherever the carriages were, or counts were lost.
     """
 
     number: int

@@ -39,16 +39,22 @@ def rested(gains: Position, state: PidState, error: Error, dt_s: float) -> PidSt
     return PidState(state.integral * gains.integral_time_s / (gains.integral_time_s + dt_s))
 
 
-def pid(gains: Position, state: PidState, error: Error, feed_forward: float, dt_s: float) -> tuple[PidState, PidOutput]:
+def pid(
+    gains: Position, state: PidState, error: Error, feed_forward: float, dt_s: float, *, is_blocked: bool = False
+) -> tuple[PidState, PidOutput]:
     """One update, `dt_s` > 0 after the last; the feed-forward is a duty. The speed error carries the derivative action:
     its measured half is the filtered derivative of the position, its other half the speed that is expected, so that a
-    moving reference gives no derivative kick and no lag.
+    moving reference gives no derivative kick and no lag. Where `is_blocked`, opening moves nothing: no duty above 0 is
+    given, the integral does not rise against that, and it is no saturation.
     """
     proportional = gains.proportional_per_mm * error.position_mm
     derivative = gains.proportional_per_mm * gains.derivative_time_s * error.speed_mm_s
     asked = proportional + state.integral + derivative + feed_forward
-    duty = min(max(asked, -gains.duty_limit), gains.duty_limit)
+    within = min(max(asked, -gains.duty_limit), gains.duty_limit)
+    duty = min(within, 0.0) if is_blocked else within
     growth = proportional / gains.integral_time_s + (duty - asked) / gains.back_calculation_s
+    if is_blocked:
+        growth = min(growth, 0.0)
     # the integral never needs more than the whole duty, whatever a long saturation makes of back-calculation
     integral = min(max(state.integral + growth * dt_s, -gains.duty_limit), gains.duty_limit)
-    return PidState(integral), PidOutput(duty, duty != asked)
+    return PidState(integral), PidOutput(duty, within != asked and duty == within)

@@ -10,6 +10,7 @@ from tormagd.control.estimate import Estimate, first_estimate, update
 from tormagd.control.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s, pull_V
 from tormagd.control.pid import Error, PidState, pid, rested
 from tormagd.control.plan import Plan
+from tormagd.control.sight import Sight, look
 from tormagd.control.trajectory import Expected, Reference, Speeds, expect, follow
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault, Limit, device_faults
@@ -20,6 +21,7 @@ from tormagd.safety.operating_state import (
     RefusedError,
     SafetyState,
     command,
+    homed_again,
     latch,
 )
 from tormagd.scenes.scene import Scene
@@ -46,6 +48,8 @@ OVER_HELD_S, OVER_FAULT_S = 0.01, 0.04
 "A force over the ceiling opens the gap after the first, and is a fault after the second."
 SENSOR_FAULT_S = 2.0
 "A sensor that has not been believed for so long of sliding is a fault: forces are then only as good as the model."
+STALL_SHARE = 0.8
+"Of the device's timeout: a shorter stall of ours did not make it run out."
 LAGGING_MM = 0.1
 "The speed limit is reported as RATE only where it leaves the reference this far behind its target."
 
@@ -69,6 +73,7 @@ class StepState(NamedTuple):
     "For how long a carriage has been driven without moving, counted alike."
     over_s: float = 0.0
     "For how long the measured force has been over the ceiling while the handle moved, counted alike."
+    sight: Sight = Sight()
 
 
 class StepOutput(NamedTuple):
@@ -114,6 +119,13 @@ class Stepper:
                 raise RefusedError(
                     "not_fresh", "no measurement from the device yet", "look at the link in tormagctl status"
                 )
+            apart_mm, most_mm = abs(state.estimate.skew_mm), self._limits.skew_fault_mm
+            if not apart_mm <= most_mm:
+                raise RefusedError(
+                    "skewed",
+                    f"the carriages are {apart_mm:.2f} mm apart: allowed is at most {most_mm:g} mm",
+                    "tormagctl home",
+                )
             return state._replace(
                 safety=safety,
                 reference=Reference(state.estimate.gap_mm),
@@ -141,14 +153,38 @@ class Stepper:
         if measurement is None:
             state = self.lose_link(state)._replace(time_s=now_s)
             return state, self._off(state.safety, ())
+        is_new = state.estimate is None or measurement.number != state.estimate.number
+        was_blind, sight = state.sight.is_blind, look(state.sight, state.time_s, now_s, self._nominal_dt_s, is_new)
         estimate = update(state.estimate, measurement, self._home_mm, self._position.derivative_filter_s)
-        safety = latch(state.safety, self._watch(state, estimate, now_s, measurement, plan))
+        safety = latch(state.safety, self._watch(state, estimate, now_s, measurement, plan, sight))
+        if safety.needs_homing:
+            safety, estimate = homed_again(safety, measurement.is_homed), estimate._replace(is_homed=False)
         if safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             if measurement.is_busy:  # homing moves the origin: what was learned about motion before it is void
                 estimate = first_estimate(measurement, self._home_mm)
-            state = state._replace(time_s=now_s, safety=safety, estimate=estimate, reference=None, expected=None)
+            state = state._replace(
+                time_s=now_s, safety=safety, estimate=estimate, reference=None, expected=None, sight=sight
+            )
             return state, self._off(safety, ())
-        return self._drive(state, safety, now_s, measurement, estimate, plan)
+        if sight.is_blind:
+            return self._hold(state._replace(time_s=now_s, safety=safety, estimate=estimate, sight=sight))
+        if was_blind:
+            state = self._from_where_it_is(state, estimate)
+        return self._drive(state._replace(sight=sight), safety, now_s, measurement, estimate, plan)
+
+    def _hold(self, state: StepState) -> tuple[StepState, StepOutput]:
+        """Asks the device for an answer without moving anything: friction holds the gap. Nothing is learned from it."""
+        limit = Limit.HOST_STALL if state.sight.has_stalled(state.time_s) else Limit.DEVICE_SILENT
+        safety = state.safety
+        output = StepOutput(DriveMode.RUN, 0.0, 0.0, safety.request, safety.request_number, (limit,))
+        return state._replace(duties=(0.0, 0.0)), output
+
+    def _from_where_it_is(self, state: StepState, estimate: Estimate) -> StepState:
+        """The device went on with its last duty, unseen: the reference goes on from what came of it, without a leap."""
+        most_mm_s = self._no_load_mm_s
+        speed_mm_s = min(max(estimate.left_mm_s + estimate.right_mm_s, -most_mm_s), most_mm_s)
+        reference = Reference(estimate.gap_mm, speed_mm_s)
+        return state._replace(reference=reference, expected=Expected(estimate.gap_mm, speed_mm_s, speed_mm_s))
 
     def _drive(
         self,
@@ -161,7 +197,7 @@ class Stepper:
     ) -> tuple[StepState, StepOutput]:
         dt_s = now_s - state.time_s
         if not 0.0 < dt_s < 10.0 * self._nominal_dt_s:
-            dt_s = self._nominal_dt_s  # a clock that stood still or a process that was stopped is not a long period
+            dt_s = self._nominal_dt_s  # a clock that stood still gives no period
         reference = state.reference or Reference(estimate.gap_mm)
         expected = state.expected or Expected(estimate.gap_mm)
         expected = expect(expected, reference, dt_s, self._lag_s, self._position.derivative_filter_s)
@@ -185,8 +221,10 @@ class Stepper:
         if abs(reference.speed_mm_s) < RESTING_MM_S:
             left_state = rested(self._position, left_state, left_error, dt_s)
             right_state = rested(self._position, right_state, right_error, dt_s)
-        left_state, left = pid(self._position, left_state, left_error, ahead, dt_s)
-        right_state, right = pid(self._position, right_state, right_error, ahead, dt_s)
+        # the firmware gives a carriage at its open switch no opening duty: nothing may be learned or concluded there
+        is_left_blocked, is_right_blocked = measurement.is_left_open, measurement.is_right_open
+        left_state, left = pid(self._position, left_state, left_error, ahead, dt_s, is_blocked=is_left_blocked)
+        right_state, right = pid(self._position, right_state, right_error, ahead, dt_s, is_blocked=is_right_blocked)
         if not math.isfinite(left.duty + right.duty + measurement.supply_V):  # a sum is finite only if all of it is
             safety = latch(safety, (Fault.NOT_FINITE,))
             return self.start(now_s)._replace(safety=safety), self._off(safety, ())
@@ -194,6 +232,8 @@ class Stepper:
             limits.append(Limit.SATURATED)
         if abs(estimate.skew_mm) > self._limits.skew_warning_mm:
             limits.append(Limit.SKEW)
+        if state.sight.has_stalled(now_s):
+            limits.append(Limit.HOST_STALL)
         state = StepState(
             time_s=now_s,
             safety=safety,
@@ -207,6 +247,7 @@ class Stepper:
             straying_s=state.straying_s + dt_s if self._is_astray(reference, estimate) else 0.0,
             over_s=state.over_s + dt_s if self._is_over(estimate) else 0.0,
             still_s=state.still_s + dt_s if self._is_still(state, estimate, left.duty, right.duty) else 0.0,
+            sight=state.sight,
         )
         # the bridges switch the device's real supply: the same volts take less duty of a higher one
         scale = self._supply_V / max(measurement.supply_V, 0.5 * self._supply_V)
@@ -262,15 +303,25 @@ class Stepper:
         return (speed + inertia) / self._full_speed_mm_s + resisting * moving
 
     def _watch(
-        self, state: StepState, estimate: Estimate, now_s: float, measurement: Measurement, plan: Plan
+        self,
+        state: StepState,
+        estimate: Estimate,
+        now_s: float,
+        measurement: Measurement,
+        plan: Plan,
+        sight: Sight,
     ) -> tuple[Fault, ...]:
         faults: list[Fault] = []
         if now_s >= state.safety.clearing_until_s:
-            faults.extend(device_faults(measurement.faults))
+            is_ours = Fault.HOST_STALL in state.safety.faults or (
+                sight.has_stalled(now_s) and sight.stall_s > STALL_SHARE * self._device.command_timeout_ms * 1e-3
+            )
+            faults.extend(device_faults(measurement.faults, is_host_stall=is_ours))
         if state.safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             return tuple(faults)
         # what has just come over a slow line is old too, and a loop around it would swing
-        if now_s - measurement.received_s + measurement.delay_s > self._device.measurement_timeout_ms * 1e-3:
+        is_old = now_s - measurement.received_s + measurement.delay_s > self._device.measurement_timeout_ms * 1e-3
+        if is_old and not sight.is_waiting(now_s, self._nominal_dt_s):
             faults.append(Fault.MEASUREMENT_STALE)
         if abs(estimate.skew_mm) > self._limits.skew_fault_mm:
             faults.append(Fault.SKEW)

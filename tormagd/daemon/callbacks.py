@@ -2,13 +2,13 @@
 
 from collections import Counter
 from collections.abc import Callable
-from time import monotonic_ns
+from time import monotonic_ns, thread_time_ns
 from typing import NamedTuple
 
 from tormagd.hardware.connection import Watcher
 
 KERNEL = "kernel"
-"To blame where nothing of ours ran: the thread was not given the processor."
+"To blame where nothing of ours ran: the thread was not given the processor, or was stopped."
 NEWS_NS = 10_000_000_000
 "At most one log line in this time."
 
@@ -38,11 +38,18 @@ class News(NamedTuple):
 class Callbacks:
     """Watches descriptors as the event loop does, and keeps account of the callbacks, each by its qualified name.
 
-    A callback in whose midst the kernel gave the processor to somebody else is charged with that too.
+    A callback in whose midst the kernel gave the processor to somebody else is charged with that too, unless that was
+    most of the delay: `cpu_ns` counts what the thread really ran.
     """
 
-    def __init__(self, loop: Watcher, clock_ns: Callable[[], int] = monotonic_ns) -> None:
-        self._loop, self._clock_ns = loop, clock_ns
+    def __init__(
+        self,
+        loop: Watcher,
+        clock_ns: Callable[[], int] = monotonic_ns,
+        cpu_ns: Callable[[], int] = thread_time_ns,
+    ) -> None:
+        self._loop, self._clock_ns, self._cpu_ns = loop, clock_ns, cpu_ns
+        self._cpu_before_ns = cpu_ns()
         self._ran: list[tuple[str, int, int]] = []
         self.blamed: Counter[str] = Counter()
         "How many late ticks each is to blame for."
@@ -71,6 +78,7 @@ class Callbacks:
     def forget(self) -> None:
         """A tick was on time: what ran before it does not matter any more."""
         self._ran.clear()
+        self._cpu_before_ns = self._cpu_ns()
 
     def blame(self, due_ns: int, done_ns: int) -> Delay:
         """A tick that was due and done at these times was late: whatever filled most of the time between."""
@@ -79,8 +87,11 @@ class Callbacks:
             shares[name] += max(0, min(end_ns, done_ns) - max(start_ns, due_ns))
         shares[KERNEL] = done_ns - due_ns - shares.total()
         culprit, share_ns = shares.most_common(1)[0]
+        waited_ns = done_ns - due_ns - (self._cpu_ns() - self._cpu_before_ns)
+        if waited_ns > (done_ns - due_ns) / 2:
+            culprit, share_ns = KERNEL, waited_ns
         delay = Delay(done_ns - due_ns, culprit, share_ns)
-        self._ran.clear()
+        self.forget()
         self.blamed[culprit] += 1
         self._news = News(self._news.ticks + 1, max(self._news.worst, delay))
         return delay

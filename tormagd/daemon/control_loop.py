@@ -25,13 +25,15 @@ class ControlLoop:
         "What the last step was given; the connection may have a newer one by now."
         self.timing = RateGroup("control", period_ns)
         self.next_tick_ns = 0
-        self._reported_faults: tuple[Fault, ...] = ()
+        self._known_faults: tuple[Fault, ...] = ()
 
     def tick(self, due_ns: int, merged: int, plan: Plan) -> None:
         """The control period that was due at `due_ns` and stands for `merged` missed ones too."""
         self.next_tick_ns = due_ns + self.timing.period_ns
         start_ns = time.monotonic_ns()
         now_s = start_ns * 1e-9
+        if merged:
+            self._connection.receive()  # what came before or during the pause is not to be taken for an answer after it
         self.measurement = self._connection.measurement
         self.state, output = self._stepper.step(self.state, now_s, self.measurement, plan)
         self._connection.exchange(
@@ -40,7 +42,6 @@ class ControlLoop:
         self.output = output
         end_ns = time.monotonic_ns()
         self.timing.record(due_ns, start_ns, end_ns, merged)
-        self._report_faults()
 
     def command(self, name: str, conditions: Conditions) -> None:
         """An operator's command. Raises RefusedError."""
@@ -50,16 +51,15 @@ class ControlLoop:
     def latch(self, fault: Fault) -> None:
         """Latches a fault that was found outside the step."""
         self.state = self.state._replace(safety=latch(self.state.safety, (fault,)))
-        self._report_faults()
 
     def lose_link(self) -> None:
         """Tells the core that the device is gone."""
         self.state = self._stepper.lose_link(self.state)
-        self._report_faults()
 
-    def _report_faults(self) -> None:
-        faults = self.state.safety.faults
-        if faults != self._reported_faults:
-            self._reported_faults = faults
-            if faults:
-                log.error("fault: %s", ", ".join(faults))
+    def new_faults(self) -> tuple[Fault, ...]:
+        """The faults that were latched since this was last asked."""
+        faults, known = self.state.safety.faults, self._known_faults
+        if faults == known:
+            return ()
+        self._known_faults = faults
+        return tuple(fault for fault in faults if fault not in known)

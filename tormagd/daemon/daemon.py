@@ -15,19 +15,19 @@ from tormagd.config import Config
 from tormagd.control.core import Core
 from tormagd.control.plan import PlanState
 from tormagd.daemon import notify
-from tormagd.daemon.callbacks import Callbacks
+from tormagd.daemon.callbacks import Callbacks, Delay
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.rate_group import ERROR_PERIODS, RateGroup
 from tormagd.daemon.realtime import freeze_garbage, priority_of_threads
-from tormagd.daemon.telemetry import TickRow, explanations, snapshot, tick_row
+from tormagd.daemon.telemetry import Stall, TickRow, explanations, snapshot, tick_row
 from tormagd.hardware.backend import Backend
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.link import LinkState
 from tormagd.messages import Request, Telemetry
-from tormagd.safety.codes import FAULTS, LIMITS, Fault
+from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState
 
 NS = 1_000_000_000
@@ -68,6 +68,8 @@ class Daemon:
         self._ticks_per_snapshot = rates.control_hz // rates.telemetry_hz
         self._rows: list[TickRow] = []
         self._snapshot: Telemetry | None = None
+        self._stall: Stall | None = None
+        self._told: dict[str, str] = {}
         self._ended = asyncio.Event()
 
     async def run(self) -> None:
@@ -111,9 +113,11 @@ class Daemon:
         driven_ns = time.monotonic_ns()
         callbacks.ran(ControlLoop.tick.__qualname__, start_ns, driven_ns)
         if timing.delay_ns > timing.period_ns:
-            callbacks.blame(driven_ns - timing.delay_ns, driven_ns)
+            self._note_stall(callbacks.blame(driven_ns - timing.delay_ns, driven_ns))
         else:
             callbacks.forget()
+        if faults := self._control.new_faults():
+            self._tell(faults)
         try:
             self._inference.after_tick(self._control.state.estimate)
         finally:  # whatever becomes of planning, the daemon can be seen and stopped
@@ -123,6 +127,30 @@ class Daemon:
             if timing.runs % self._ticks_per_snapshot == 0:
                 self._publish(heartbeat.due_ns)
                 callbacks.ran(self._publish.__qualname__, planned_ns, time.monotonic_ns())
+
+    def _note_stall(self, delay: Delay) -> None:
+        sight, known = self._control.state.sight, self._stall
+        # only what the step took for a stall, too; of two that come close together it keeps the longer
+        if sight.stalled_s == self._control.state.time_s and (known is None or known.took_s != sight.stall_s):
+            self._stall = Stall(sight.stall_s, delay.culprit)
+
+    def _tell(self, faults: tuple[Fault, ...]) -> None:
+        """Says which faults are new, and remembers what is known of their causes now."""
+        device, measurement = self._config.device, self._control.measurement
+        for fault in faults:
+            self._told.pop(fault, None)
+        if Fault.HOST_STALL in faults:
+            opened = f"the device opened the gap by itself after {device.command_timeout_ms:g} ms"
+            self._told[Fault.HOST_STALL] = f"{self._stall}; {opened}"
+        if Fault.MEASUREMENT_STALE in faults and measurement is not None:
+            silent_ms = (self._control.state.time_s - measurement.received_s) * 1e3
+            self._told[Fault.MEASUREMENT_STALE] = (
+                f"the device had sent no new state for {silent_ms:.0f} ms"
+                if silent_ms > measurement.delay_s * 1e3
+                else f"the device was {measurement.delay_s * 1e3:.0f} ms behind with the commands that it obeyed"
+            )
+        for explained in explanations(faults, FAULTS, self._told):
+            log.error("fault: %(code)s: %(cause)s", explained)
 
     def _receive_setpoints(self) -> None:
         self._inference.receive(self._control.state.estimate, self._control.next_tick_ns)
@@ -150,7 +178,7 @@ class Daemon:
         row = self._rows[-1]
         stamp = self._endpoint.inbox.newest
         age = None if stamp is None else start_ns * 1e-9 - stamp.stamp_s
-        self._snapshot = snapshot(row, self._telemetry.runs, self._connection.measurement, self._is_busy(), age)
+        self._snapshot = snapshot(row, self._telemetry.runs, self._is_homed(), self._is_busy(), age)
         self._endpoint.publish(self._snapshot)
         self._endpoint.publish_ticks(TickRow._fields, self._rows[-ROWS:])
         self._rows.clear()
@@ -172,6 +200,11 @@ class Daemon:
         return self._connection.state is not LinkState.RUNNING or (
             measurement is not None and now_s - measurement.received_s < timeout_s
         )
+
+    def _is_homed(self) -> bool:
+        """Whether the carriages' positions are known; the device's word alone is not enough."""
+        estimate = self._control.state.estimate
+        return self._connection.measurement is not None and estimate is not None and estimate.is_homed
 
     def _is_busy(self) -> bool:
         """Whether the device homes or opens, or was asked to and has not said yet that it does."""
@@ -210,7 +243,7 @@ class Daemon:
         return Conditions(
             connected=measurement is not None,
             fresh=measurement is not None and now_s - measurement.received_s < timeout_s,
-            homed=measurement is not None and measurement.is_homed,
+            homed=self._is_homed(),
             busy=self._is_busy(),
             device_latched=measurement is not None and measurement.is_latched,
             requested_N=setpoint.force_N if setpoint is not None and is_current else None,
@@ -238,8 +271,13 @@ class Daemon:
             "setpoints": self._endpoint.inbox.report(),
             "rates": {group.name: group.report for group in self._groups},
             "late_ticks_by": dict(self._callbacks.blamed),
-            "fault_details": explanations(tuple(safety.faults), FAULTS),
-            "limit_details": explanations(snapshot_.limits, LIMITS),
+            "fault_details": explanations(safety.faults, FAULTS, self._told),
+            "limit_details": explanations(
+                snapshot_.limits,
+                LIMITS,
+                {Limit.HOST_STALL: f"{self._stall}; the gap was held until the device answered"},
+            ),
+            "newest_stall": self._stall and {"ms": round(self._stall.took_s * 1e3, 1), "culprit": self._stall.culprit},
             "not_granted": self._refused,
         }
 

@@ -1,13 +1,15 @@
 """Snapshots of the running daemon, built once per telemetry period; status answers and watchers all read the same."""
 
 import time
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from tormagd.control.plan import Plan
 from tormagd.control.step import StepOutput, StepState
 from tormagd.hardware.measurement import Measurement
 from tormagd.messages import VERSION, Telemetry, Tick
-from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.codes import Explanation, Fault, Limit
 from tormagd.safety.operating_state import OperatingState
 
 
@@ -114,9 +116,7 @@ def limits_held(state: StepState, output: StepOutput, plan: Plan) -> tuple[str, 
     return tuple(dict.fromkeys((*plan.limits, *output.limits)))
 
 
-def snapshot(
-    row: TickRow, sequence: int, measurement: Measurement | None, is_busy: bool, age_s: float | None
-) -> Telemetry:
+def snapshot(row: TickRow, sequence: int, is_homed: bool, is_busy: bool, age_s: float | None) -> Telemetry:
     """The telemetry of the newest tick."""
     known = row.left_mm is not None and row.right_mm is not None
     left, right = row.left_mm or 0.0, row.right_mm or 0.0
@@ -125,7 +125,7 @@ def snapshot(
         t_ns=row.t_ns,
         seq=sequence,
         operating_state=row.operating_state,
-        is_homed=measurement is not None and measurement.is_homed,
+        is_homed=is_homed,
         is_busy=is_busy,
         setpoint_cf=row.setpoint_cf,
         governed_cf=row.governed_cf,
@@ -145,7 +145,20 @@ def snapshot(
     )
 
 
-def explanations(codes: tuple[str, ...], table: dict[Any, Any]) -> list[dict[str, str]]:
-    """Each code with its cause and remedy."""
+class Stall(NamedTuple):
+    """The newest stall of the control loop: how long it stood still, and who is to blame for most of that."""
+
+    took_s: float
+    culprit: str
+
+    def __str__(self) -> str:
+        return f"the control loop stood still for {self.took_s * 1e3:.0f} ms ({self.culprit})"
+
+
+def explanations(
+    codes: Iterable[str], table: Mapping[Any, Explanation], told: Mapping[str, str] = MappingProxyType({})
+) -> list[dict[str, str]]:
+    """Each code with its cause and remedy; `told` has causes with the figures of this very time."""
     kind = Fault if Fault.STOPPED in table else Limit
-    return [{"code": code, **table[kind(code)]._asdict()} for code in codes]
+    known = [{"code": str(code), **table[kind(code)]._asdict()} for code in codes]
+    return [entry | {"cause": told.get(entry["code"], entry["cause"])} for entry in known]

@@ -142,7 +142,7 @@ class Connection:
             if request is DeviceRequest.RETRACT or link.state is LinkState.RUNNING:
                 link.request(now_s, request)
         if link.is_silent(now_s):
-            self._receive()  # a process that was not run itself finds here what it took for silence
+            self.receive()  # a process that was not run itself finds here what it took for silence
         if self._link is not link:
             return
         try:
@@ -218,11 +218,12 @@ class Connection:
         if self._unfinished is DeviceRequest.RETRACT:
             self._link.request(now_s, self._unfinished)
         self._unfinished = DeviceRequest.NONE
-        self._watcher.add_reader(self._backend.fileno(), self._receive)
+        self._watcher.add_reader(self._backend.fileno(), self.receive)
         log.info("%s is open", self._device.port)
         self._notice()
 
-    def _receive(self) -> None:
+    def receive(self) -> None:
+        """Takes in what has come. The watcher calls it; so does whoever was not run for a while, before it judges."""
         backend, link = self._backend, self._link
         if backend is None or link is None:
             return

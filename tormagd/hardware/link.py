@@ -202,10 +202,10 @@ class DeviceLink:
         elif self._request is DeviceRequest.RETRACT and status.mode is DeviceMode.LATCHED:
             # it has opened already, or cannot, and will not try again before a Clear
             self._request = DeviceRequest.NONE
-        # only a running device says which Drive it obeys; one late Status alone is the host's own stall, not the wire's
+        # only a running device says which Drive it obeys; one late Status alone is a stall, not the wire's doing
         last_s, self._delay_s = self._delay_s, 0.0
         if status.mode is DeviceMode.RUN:
-            self._delay_s = self.round_trip.since_drive_s(status.drive_counter, now_s)
+            self._delay_s = self.round_trip.since_next_s(status.drive_counter, now_s)
         if self.measurement is not None:
             self.measurement = self.measurement._replace(
                 mode=status.mode,

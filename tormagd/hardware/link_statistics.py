@@ -51,9 +51,9 @@ class RoundTrip:
         self._newest = counter
         self._sent_s[counter] = now_s
 
-    def since_drive_s(self, counter: int, now_s: float) -> float:
-        """Time since the newest Drive with this counter went out, s."""
-        return now_s - self._sent_s[counter]
+    def since_next_s(self, counter: int, now_s: float) -> float:
+        """Time since the Drive after the newest one with this counter went out, s; 0 where that was the last."""
+        return 0.0 if counter == self._newest else now_s - self._sent_s[(counter + 1) % 256]
 
     def hello(self) -> None:
         """A Hello goes out after the newest Drive."""

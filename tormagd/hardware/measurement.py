@@ -10,7 +10,8 @@ class Measurement(NamedTuple):
 
     `received_s` is the host's clock, `device_time_s` the device's own, unwrapped from an arbitrary start. `handle_mm`
     is the travel of the roller's surface, unwrapped. `number` counts the states of this connection. `delay_s` is how
-    long ago the Drive was sent that the device last said it obeys: the way there and back, and up to a control period.
+    long ago the first Drive was sent that the device had not obeyed when it last said which it does: at most the way
+    there and back.
     """
 
     number: int
@@ -33,6 +34,16 @@ class Measurement(NamedTuple):
     def is_homed(self) -> bool:
         """The device knows where its carriages are."""
         return Switches.HOMED in self.switches
+
+    @property
+    def is_left_open(self) -> bool:
+        """The left carriage is at its open switch."""
+        return Switches.LEFT_OPEN in self.switches
+
+    @property
+    def is_right_open(self) -> bool:
+        """The right carriage is at its open switch."""
+        return Switches.RIGHT_OPEN in self.switches
 
     @property
     def is_busy(self) -> bool:

@@ -17,6 +17,7 @@ class Fault(StrEnum):
     """Why the device was opened. Latched until `clear-fault`."""
 
     LINK_LOST = "LINK_LOST"
+    HOST_STALL = "HOST_STALL"
     MEASUREMENT_STALE = "MEASUREMENT_STALE"
     SKEW = "SKEW"
     FOLLOWING_ERROR = "FOLLOWING_ERROR"
@@ -56,6 +57,8 @@ class Limit(StrEnum):
     SENSOR = "SENSOR"
     SATURATED = "SATURATED"
     SKEW = "SKEW"
+    HOST_STALL = "HOST_STALL"
+    DEVICE_SILENT = "DEVICE_SILENT"
 
 
 FAULTS: dict[Fault, Explanation] = {
@@ -63,18 +66,25 @@ FAULTS: dict[Fault, Explanation] = {
         "the device stopped answering or its port disappeared",
         "check cable and supply; the device opens by itself; then clear-fault and home",
     ),
+    Fault.HOST_STALL: Explanation(
+        "the control loop stood still for longer than the device waits, and the device opened the gap by itself",
+        "run `tormagctl doctor`; look for load on this machine; then clear-fault and home",
+    ),
     Fault.MEASUREMENT_STALE: Explanation(
-        "device states came too late to close the loop",
-        "run `tormagctl doctor`; look for load on this machine, and at the round trip in `tormagctl firmware`",
+        "the device fell silent, or its states came too late to close the loop",
+        "check cable and supply, and the round trip in `tormagctl firmware`; then clear-fault",
     ),
     Fault.SKEW: Explanation(
-        "the two carriages moved apart from each other", "look for dirt or wear on the slower screw, then home"
+        "the two carriages moved apart from each other",
+        "look for dirt or wear on the slower screw, then clear-fault and home",
     ),
     Fault.FOLLOWING_ERROR: Explanation(
-        "the gap did not follow its reference", "look for something that blocks a carriage, then home"
+        "the gap did not follow its reference",
+        "look for something that blocks a carriage, then clear-fault and home",
     ),
     Fault.NO_MOTION: Explanation(
-        "a carriage was driven and its encoder did not move", "look for a block or a loose encoder, then home"
+        "a carriage away from its open end was driven and its encoder did not move",
+        "look for a block or a loose encoder, then clear-fault and home",
     ),
     Fault.OVER_FORCE: Explanation(
         "the measured force stayed over what the scene allows; the gap opens at the device's own bounded speed",
@@ -150,13 +160,24 @@ LIMITS: dict[Limit, Explanation] = {
     ),
     Limit.SATURATED: Explanation("a motor has no more voltage to give", "expect lag while it lasts"),
     Limit.SKEW: Explanation("the carriages are further apart than usual", "look at the slower screw"),
+    Limit.HOST_STALL: Explanation(
+        "the control loop stood still for some milliseconds; then the gap was held until the device had answered",
+        "run `tormagctl doctor`; look for load on this machine",
+    ),
+    Limit.DEVICE_SILENT: Explanation(
+        "the device has sent no new state for some milliseconds; the gap is held until it does",
+        "look at the round trip in `tormagctl firmware`",
+    ),
 }
 
 _BY_DEVICE_FAULT: dict[DeviceFault, Fault] = {bit: Fault(f"DEVICE_{bit.name}") for bit in DeviceFault}
 
 
-def device_faults(bits: DeviceFault) -> tuple[Fault, ...]:
-    """The faults that the firmware's bits stand for."""
+def device_faults(bits: DeviceFault, *, is_host_stall: bool = False) -> tuple[Fault, ...]:
+    """The faults that the firmware's bits stand for. With `is_host_stall` it was this process that gave no command."""
     if not bits:  # as nearly always, a thousand times a second
         return ()
-    return tuple(fault for bit, fault in _BY_DEVICE_FAULT.items() if bit in bits)
+    found = tuple(fault for bit, fault in _BY_DEVICE_FAULT.items() if bit in bits)
+    if not is_host_stall:
+        return found
+    return tuple(Fault.HOST_STALL if fault is Fault.DEVICE_COMMAND_TIMEOUT else fault for fault in found)

@@ -11,6 +11,9 @@ from tormagd.safety.codes import Fault
 
 CLEARING_S = 0.5
 "How long the device may take to report that a cleared fault is gone."
+LOST_POSITION = frozenset({Fault.SKEW, Fault.FOLLOWING_ERROR, Fault.NO_MOTION})
+"""After these faults the counts of an encoder are not believed any more. The device does not know, and goes on calling
+itself homed; where it has latched a fault of its own it does not."""
 
 
 class OperatingState(StrEnum):
@@ -52,13 +55,17 @@ class Conditions(NamedTuple):
 
 
 class SafetyState(NamedTuple):
-    """Operating state, latched faults, and the newest request to the device."""
+    """Operating state, latched faults, and the newest request to the device.
+
+    `needs_homing`: the device's word that it is homed does not count, until it has begun homing and so taken it back.
+    """
 
     operating_state: OperatingState = OperatingState.DISABLED
     faults: tuple[Fault, ...] = ()
     request: DeviceRequest = DeviceRequest.NONE
     request_number: int = 0
     clearing_until_s: float = float("-inf")
+    needs_homing: bool = False
 
     def ask(self, request: DeviceRequest) -> "SafetyState":
         """The same state with a new request to the device."""
@@ -70,8 +77,17 @@ def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
     new = tuple(fault for fault in faults if fault not in state.faults)
     if not new:
         return state
-    latched = state._replace(operating_state=OperatingState.FAULT, faults=state.faults + new)
+    latched = state._replace(
+        operating_state=OperatingState.FAULT,
+        faults=state.faults + new,
+        needs_homing=state.needs_homing or not LOST_POSITION.isdisjoint(new),
+    )
     return latched.ask(DeviceRequest.RETRACT)
+
+
+def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
+    """`state` after the device has said whether it is homed; one that says no has begun anew and is believed again."""
+    return state if is_homed else state._replace(needs_homing=False)
 
 
 def command(state: SafetyState, name: str, now_s: float, conditions: Conditions) -> SafetyState:
@@ -92,6 +108,8 @@ def _enable(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyS
     if conditions.device_latched:
         raise RefusedError("device_latched", "the device has latched a fault", "tormagctl clear-fault, then home")
     _refuse_busy(conditions)
+    if state.needs_homing:
+        raise RefusedError("not_homed", "a fault took the carriages' positions away", "tormagctl home")
     if not conditions.homed:
         raise RefusedError("not_homed", "the carriages are not homed", "tormagctl home")
     if not conditions.fresh:

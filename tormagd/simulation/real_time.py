@@ -14,9 +14,10 @@ from tormagd.simulation.plant import Truth
 
 LATE_S = 2e-3
 """From this lateness on, a wake-up counts as falling behind: two firmware ticks."""
-SLIP_S = 20e-3
-"""From this lateness on, the device's time stands still instead: the process did not run, and the device must not take
-its own sleep for the host's silence."""
+SLIP_S = 5e-3
+"""From this lateness on, the device's time stands still instead: the process did not run, which no microcontroller
+knows, and the device must not take its own sleep for the host's silence: that would come on top of a stall of the host,
+which it survives for no longer than 50 ms."""
 TRUTH_PERIOD_S = 1e-3
 TRUTH_HEADER = "t_ns,force_N,gap_mm,left_mm,right_mm,handle_mm,handle_mm_s,temperature_C\n"
 

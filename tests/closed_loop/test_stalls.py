@@ -1,0 +1,190 @@
+"""Stalls of daemon and device against the simulated device, and a force below the least one, in virtual time."""
+
+import copy
+
+import pytest
+
+from firmware_protocol.codec import DeviceMode
+from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.config import Config
+from tormagd.control.core import Core, build_core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.operating_state import OperatingState
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import load_plant
+
+FORCE_N = 1.4
+ALLOWED_N = 0.1
+OPEN_MM = 95.0
+SHORT_MS = [5, 8, 15, 25, 35, 45, 47]
+LONG_MS = [60, 83, 150, 400]
+
+
+@pytest.fixture(scope="module")
+def core() -> Core:
+    return build_core(Config())
+
+
+def armed(core: Core, plant: str = "sample_1") -> ClosedLoop:
+    device = VirtualDevice(load_plant(plant), SteadyHand(), seed=1)
+    loop = ClosedLoop(Config(), core.stepper, core.planner, device)
+    loop.arm()
+    return loop
+
+
+@pytest.fixture(scope="module")
+def holding_once(core: Core) -> ClosedLoop:
+    loop = armed(core)
+    samples = run(loop, FORCE_N, 1.6)
+    assert samples[-1].truth.force_N == pytest.approx(FORCE_N, abs=0.05)
+    return loop
+
+
+@pytest.fixture
+def holding(holding_once: ClosedLoop) -> ClosedLoop:
+    """A copy of one loop that has settled on the force."""
+    return copy.deepcopy(holding_once)
+
+
+def run(loop: ClosedLoop, force_N: float, duration_s: float) -> list[Sample]:
+    """The ticks while a publisher sends this force, a new setpoint every period."""
+    return [loop.tick(TimedSetpoint(force_N, loop.now_s, 0.2)) for _ in range(round(duration_s * 1e3))]
+
+
+def stall(loop: ClosedLoop, stall_ms: int) -> list[float]:
+    """The daemon stands still; the plant's force meanwhile."""
+    forces_N = []
+    for _ in range(stall_ms):
+        loop.skip()
+        forces_N.append(loop.device.truth.force_N)
+    return forces_N
+
+
+class Stopped:
+    """A device whose process can be stopped: what comes waits for it, and its own time stands still."""
+
+    def __init__(self, device: VirtualDevice) -> None:
+        self._device = device
+        self._behind_s = 0.0
+        self._waiting: list[bytes] = []
+        self.until_s = 0.0
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._device, name)
+
+    def stop(self, now_s: float, stop_ms: int) -> None:
+        self.until_s = now_s + stop_ms * 1e-3
+        self._behind_s += stop_ms * 1e-3
+
+    def transmit(self, now_s: float) -> bytes:
+        if now_s < self.until_s:
+            return b""
+        for data in self._waiting:
+            self._device.receive(now_s - self._behind_s, data)
+        self._waiting.clear()
+        return self._device.transmit(now_s - self._behind_s)
+
+    def receive(self, now_s: float, data: bytes) -> None:
+        if now_s < self.until_s:
+            self._waiting.append(data)
+        else:
+            self._device.receive(now_s - self._behind_s, data)
+
+
+def limits_of(samples: list[Sample]) -> set[Limit]:
+    return {limit for sample in samples for limit in sample.output.limits}
+
+
+@pytest.mark.parametrize("stall_ms", SHORT_MS)
+def test_a_daemon_that_stalls_for_less_than_the_timeout_goes_on(holding: ClosedLoop, stall_ms: int) -> None:
+    before = holding.step_state
+    forces_N = stall(holding, stall_ms)
+    samples = run(holding, FORCE_N, 0.6)
+    assert samples[-1].state.safety.faults == ()
+    assert Limit.HOST_STALL in limits_of(samples)
+    assert not samples[-1].output.limits
+    forces_N += [sample.truth.force_N for sample in samples]
+    assert max(abs(force_N - FORCE_N) for force_N in forces_N) < ALLOWED_N
+    # judged within two periods, and the integral has not moved by more than holding moves it
+    assert sum(sample.state.sight.is_blind for sample in samples) <= 2
+    assert samples[2].state.left.integral == pytest.approx(before.left.integral, abs=0.02)
+
+
+@pytest.mark.parametrize("stall_ms", SHORT_MS)
+def test_a_stall_on_the_way_leaves_no_kick(holding: ClosedLoop, stall_ms: int) -> None:
+    """Half way up a step the device goes on with the duty it has. No more than that comes of it."""
+    run(holding, 1.7, 0.08)
+    stall(holding, stall_ms)
+    samples = run(holding, 1.7, 1.2)
+    assert samples[-1].state.safety.faults == ()
+    assert max(sample.truth.force_N for sample in samples) < 1.7 + ALLOWED_N
+    assert all(sample.truth.force_N == pytest.approx(1.7, abs=ALLOWED_N) for sample in samples[400:])
+
+
+def test_stalls_one_after_the_other(holding: ClosedLoop) -> None:
+    for stall_ms in (45, 6, 30, 47, 10, 20):
+        stall(holding, stall_ms)
+        samples = run(holding, FORCE_N, 0.05)
+        assert samples[-1].state.safety.faults == ()
+        assert samples[-1].truth.force_N == pytest.approx(FORCE_N, abs=ALLOWED_N)
+
+
+@pytest.mark.parametrize("stall_ms", LONG_MS)
+def test_a_daemon_that_stalls_for_longer_finds_the_device_opening_and_says_why(
+    holding: ClosedLoop, stall_ms: int
+) -> None:
+    stall(holding, stall_ms)
+    samples = run(holding, FORCE_N, 3.0)
+    assert samples[25].state.safety.operating_state is OperatingState.FAULT
+    assert samples[-1].state.safety.faults == (Fault.HOST_STALL,)
+    assert samples[-1].truth.gap_mm > OPEN_MM - 1.0
+    assert holding.measurement is not None
+    assert holding.measurement.mode is DeviceMode.LATCHED
+    assert samples[-1].state.sight.stall_s == pytest.approx(stall_ms * 1e-3 + 1e-3)
+
+
+@pytest.mark.parametrize("stop_ms", SHORT_MS)
+def test_a_device_that_stands_still_for_less_than_the_timeout_is_waited_for(holding: ClosedLoop, stop_ms: int) -> None:
+    device = Stopped(holding.device)
+    holding.device = device  # type: ignore[assignment]
+    device.stop(holding.now_s, stop_ms)
+    samples = run(holding, FORCE_N, 0.6)
+    assert samples[-1].state.safety.faults == ()
+    assert (Limit.DEVICE_SILENT in limits_of(samples)) == (stop_ms > 5)
+    assert Limit.HOST_STALL not in limits_of(samples)
+    assert max(abs(sample.truth.force_N - FORCE_N) for sample in samples) < ALLOWED_N
+
+
+@pytest.mark.parametrize("stop_ms", LONG_MS)
+def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLoop, stop_ms: int) -> None:
+    device = Stopped(holding.device)
+    holding.device = device  # type: ignore[assignment]
+    device.stop(holding.now_s, stop_ms)
+    samples = run(holding, FORCE_N, 3.0)
+    assert samples[-1].state.safety.faults[0] is Fault.MEASUREMENT_STALE
+    assert Fault.HOST_STALL not in samples[-1].state.safety.faults
+    assert not any(sample.output.mode.name == "RUN" for sample in samples if sample.state.safety.faults)
+
+
+# -- the open end --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("force_N", [0.2, 0.5])
+def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(core: Core, force_N: float) -> None:
+    """The switches close 0.2 mm before where they did at homing: the carriages coast on, but not all the way."""
+    loop = armed(core)
+    run(loop, 1.2, 0.8)
+    loop.device.messages._home_m -= 2e-4
+    samples = run(loop, force_N, 3.0)
+    assert samples[-1].state.safety.faults == ()
+    assert Limit.F_MIN in samples[-1].plan.limits
+    assert OPEN_MM - 0.5 < samples[-1].truth.gap_mm < OPEN_MM - 0.02
+    held = samples[1_500:]
+    assert Limit.SATURATED not in limits_of(held)
+    assert max(max(sample.state.left.integral, sample.state.right.integral) for sample in held) < 0.1
+    # and it comes off again as ever
+    forces_N = [sample.truth.force_N for sample in run(loop, 1.2, 1.5)]
+    assert max(forces_N) < 1.2 + ALLOWED_N
+    assert forces_N[-1] == pytest.approx(1.2, abs=0.06)
