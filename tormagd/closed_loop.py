@@ -101,6 +101,7 @@ class ClosedLoop:
             device_latched=measurement is not None and measurement.is_latched,
             requested_N=None,  # an operator here arms before the publisher starts
             neutral_N=0.0,
+            sensor_doubted=self.plan_state is not None and self.plan_state.sensor.is_doubted,
         )
 
     def run(

@@ -15,8 +15,8 @@ MAX_SOURCE_CHARACTERS = 64
 MAX_PREVIEW_SAMPLES = 256
 MAX_FORCE_N = 1_000.0  # a value no brake of this size can mean; the scene's own range is enforced by the governor
 MAX_VALIDITY_MS = 60_000.0
-MAX_DISPLACEMENT_MM = 1_000.0  # no handle travels this far, nor this fast
-MAX_RATE_MM_S = 10_000.0
+MAX_DISPLACEMENT_MM = 2.0  # since the handle last turned: friction is mobilised there, and more means nothing
+MAX_RATE_MM_S = 300.0  # no hand moves a handle faster
 LONGEST_SHOWN = 80  # characters of a refused value: an answer with the refusal in it has to stay readable itself
 
 
@@ -35,8 +35,9 @@ def _require(condition: bool, name: str, value: object, allowed: str) -> None:
 class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A force to render, from one publisher. `stamp_ns` is CLOCK_REALTIME at the publisher.
 
-    `displacement_mm` and `rate_mm_s` say at which handle motion the force is meant; without them the daemon uses the
-    motion it measures. `preview_N` holds the forces that follow this one, `preview_dt_ms` apart.
+    `displacement_mm` (since the handle turned) and `rate_mm_s` say at which handle motion the force is meant; without
+    them the daemon uses the motion it measures. `preview_N` holds the forces that follow this one, `preview_dt_ms`
+    apart.
     """
 
     v: int
@@ -57,9 +58,12 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         _require(0 <= self.stamp_ns < 2**63, "stamp_ns", self.stamp_ns, "0..2^63-1 ns since 1970")
         _require(0.0 <= self.servo_cf <= MAX_FORCE_N, "servo_cf", self.servo_cf, f"0..{MAX_FORCE_N:g} N")
         _require(0.0 < self.valid_for_ms <= MAX_VALIDITY_MS, "valid_for_ms", self.valid_for_ms, "above 0, to 60000 ms")
-        for name, most in (("displacement_mm", MAX_DISPLACEMENT_MM), ("rate_mm_s", MAX_RATE_MM_S)):
+        for name, least, most in (
+            ("displacement_mm", 0.0, MAX_DISPLACEMENT_MM),
+            ("rate_mm_s", -MAX_RATE_MM_S, MAX_RATE_MM_S),
+        ):
             value = getattr(self, name)
-            _require(value is None or -most <= value <= most, name, value, f"-{most:g}..{most:g}")
+            _require(value is None or least <= value <= most, name, value, f"{least:g}..{most:g}")
         if self.preview_N is not None:
             allowed = f"at most {MAX_PREVIEW_SAMPLES} forces of 0..{MAX_FORCE_N:g} N"
             _require(len(self.preview_N) <= MAX_PREVIEW_SAMPLES, "preview_N", f"{len(self.preview_N)} values", allowed)

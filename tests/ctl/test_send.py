@@ -67,12 +67,12 @@ def test_a_preview_is_what_will_be_sent(fake_daemon, capsys):
 
 def test_a_file_is_sent_with_its_handle_motion(fake_daemon, capsys, tmp_path):
     file = tmp_path / "task.csv"
-    file.write_text("t_s,force_N,displacement_mm,rate_mm_s\n10,1,0,5\n10.1,2,10,5\n")
+    file.write_text("t_s,force_N,displacement_mm,rate_mm_s\n10,1,0,5\n10.1,2,2,5\n")
     result = send(fake_daemon, capsys, str(file), "--rate", "100")
     wait_for(fake_daemon, result["sent"])
     assert result["sent"] + result["skipped"] == 11
     last = fake_daemon.setpoints[-1]
-    assert (last.servo_cf, last.displacement_mm, last.rate_mm_s) == pytest.approx((2.0, 10.0, 5.0))
+    assert (last.servo_cf, last.displacement_mm, last.rate_mm_s) == pytest.approx((2.0, 2.0, 5.0))
 
 
 def test_duration_cuts_a_file_short(fake_daemon, capsys, tmp_path):
@@ -96,8 +96,8 @@ def test_duration_cuts_a_file_short(fake_daemon, capsys, tmp_path):
         ("t_s,force_N\n0,1\n1,-0.5\n", "row 3, force_N = -0.5: allowed is 0..1000 N"),
         ("t_s,force_N\n0,1\n1,1e9\n", "row 3, force_N = 1e9"),
         ("t_s,force_N\n-1e308,1\n1e308,1\n", "row 2, t_s = -1e308: allowed is -1e+10..1e+10 s"),
-        ("t_s,force_N,displacement_mm\n0,1,0\n1,1,1e10\n", "row 3, displacement_mm = 1e10: allowed is -1000..1000 mm"),
-        ("t_s,force_N,rate_mm_s\n0,1,0\n1,1,-1e5\n", "row 3, rate_mm_s = -1e5: allowed is -10000..10000 mm/s"),
+        ("t_s,force_N,displacement_mm\n0,1,0\n1,1,1e10\n", "row 3, displacement_mm = 1e10: allowed is 0..2 mm"),
+        ("t_s,force_N,rate_mm_s\n0,1,0\n1,1,-1e5\n", "row 3, rate_mm_s = -1e5: allowed is -300..300 mm/s"),
         ("t_s,force_N\n0,1\n0,2\n", "row 3, t_s = 0: allowed is above"),
         ("t_s,force_N\n1,1\n0,2\n", "row 3, t_s = 0: allowed is above"),
         ("t_s,force_N\n0,1\n1\n", "row 3 has 1 values: allowed is 2"),

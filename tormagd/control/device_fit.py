@@ -20,8 +20,8 @@ OFFSET_SD_N = 0.1
 "Of the offset: what relaxation and hysteresis do around 0.5 N."
 ERROR_N2_S = 0.002
 "Density of what the model does not follow, N^2 s: with these spreads a new device is learned in a tenth of a second."
-SCALE_DRIFT_1_S = 1e-4
-"Growth of the scale's variance: it warms by some kelvin an hour."
+SCALE_LASTS_S = 600.0
+"In which what was learned of the scale is forgotten: the device has warmed, by a kelvin or less."
 SURE = 2.0
 "Standard deviations within which a force is taken to lie."
 
@@ -69,13 +69,15 @@ def observe(
     bounds: tuple[float, float],
 ) -> tuple[DeviceFit, bool]:
     """The fit after `measured_N` where the model says `model_N`, `elapsed_s` after the last, and whether the scale is
-    held at one of its `bounds`. In the long run the offset is learned in `adapts_in_s`. All are finite."""
+    held at one of its `bounds`. In the long run the offset is learned in about `adapts_in_s`. All are finite."""
     if elapsed_s <= 0.0:
         return fit, False
-    offset_drift = ERROR_N2_S / adapts_in_s**2
-    scale_variance = min(fit.scale_variance + SCALE_DRIFT_1_S * elapsed_s, SCALE_SD**2)
-    offset_variance = min(fit.offset_variance_N2 + offset_drift * elapsed_s, OFFSET_SD_N**2)
-    covariance = fit.covariance_N
+    # both are forgotten towards their spread, which keeps the variances those of a believable device
+    keeps_scale = math.exp(-elapsed_s / SCALE_LASTS_S)
+    keeps_offset = math.exp(-elapsed_s * ERROR_N2_S / (2.0 * OFFSET_SD_N**2 * adapts_in_s**2))
+    scale_variance = SCALE_SD**2 + keeps_scale**2 * (fit.scale_variance - SCALE_SD**2)
+    offset_variance = OFFSET_SD_N**2 + keeps_offset**2 * (fit.offset_variance_N2 - OFFSET_SD_N**2)
+    covariance = keeps_scale * keeps_offset * fit.covariance_N
     by_scale = model_N * scale_variance + covariance
     by_offset = model_N * covariance + offset_variance
     innovation_variance = model_N * by_scale + by_offset + ERROR_N2_S / elapsed_s

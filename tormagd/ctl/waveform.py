@@ -15,7 +15,7 @@ OPTIONAL_COLUMNS = ("displacement_mm", "rate_mm_s")
 ALLOWED = {
     "t_s": (-1e10, 1e10, "s"),  # seconds since 1970 are fine
     "force_N": (0.0, MAX_FORCE_N, "N"),
-    "displacement_mm": (-MAX_DISPLACEMENT_MM, MAX_DISPLACEMENT_MM, "mm"),
+    "displacement_mm": (0.0, MAX_DISPLACEMENT_MM, "mm"),
     "rate_mm_s": (-MAX_RATE_MM_S, MAX_RATE_MM_S, "mm/s"),
 }
 "Least, most and unit of each column; of what a setpoint carries, as in the messages."

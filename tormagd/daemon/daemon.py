@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import math
 import signal
 import time
 from collections.abc import Callable
@@ -248,6 +249,7 @@ class Daemon:
             device_latched=measurement is not None and measurement.is_latched,
             requested_N=setpoint.force_N if setpoint is not None and is_current else None,
             neutral_N=least_N + self._config.limits.neutral_margin_N,
+            sensor_doubted=self._inference.state.sensor.is_doubted,
         )
 
     def _build_status(self) -> dict[str, Any]:
@@ -255,7 +257,7 @@ class Daemon:
         if snapshot_ is None:
             return {}
         known: dict[str, Any] = msgspec.to_builtins(snapshot_)
-        safety = self._control.state.safety
+        safety, planned, shown = self._control.state.safety, self._inference.state.plan, self._inference.state.device
         return known | {
             # a command of this very period has changed the state since the snapshot, and whoever gave it asks now
             "operating_state": str(safety.operating_state),
@@ -267,6 +269,13 @@ class Daemon:
             "least_N": round(self._core.planner.portrait.least_N, 3),
             "most_N": round(self._core.planner.portrait.most_N, 3),
             "trim": round(self._inference.state.trim, 4),
+            "device": {
+                "scale": round(shown.scale, 4),
+                "scale_sd": round(math.sqrt(max(shown.scale_variance, 0.0)), 4),
+                "offset_N": round(shown.offset_N, 4),
+                "offset_sd_N": round(math.sqrt(max(shown.offset_variance_N2, 0.0)), 4),
+            },
+            "least_gap_mm": round(planned.least_gap_mm, 2),
             "link": self._connection.report(),
             "setpoints": self._endpoint.inbox.report(),
             "rates": {group.name: group.report for group in self._groups},
@@ -275,7 +284,11 @@ class Daemon:
             "limit_details": explanations(
                 snapshot_.limits,
                 LIMITS,
-                {Limit.HOST_STALL: f"{self._stall}; the gap was held until the device answered"},
+                {
+                    Limit.HOST_STALL: f"{self._stall}; the gap was held until the device answered",
+                    Limit.MODEL_RANGE: "outside what the model was shown: "
+                    + ", ".join(f"{name} {asked:.4g} asked, {used:.4g} used" for name, asked, used in planned.replaced),
+                },
             ),
             "newest_stall": self._stall and {"ms": round(self._stall.took_s * 1e3, 1), "culprit": self._stall.culprit},
             "not_granted": self._refused,

@@ -52,6 +52,7 @@ class Conditions(NamedTuple):
     device_latched: bool
     requested_N: float | None
     neutral_N: float
+    sensor_doubted: bool = False
 
 
 class SafetyState(NamedTuple):
@@ -114,6 +115,12 @@ def _enable(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyS
         raise RefusedError("not_homed", "the carriages are not homed", "tormagctl home")
     if not conditions.fresh:
         raise RefusedError("not_fresh", "no fresh measurement from the device", "look at the link in tormagctl status")
+    if conditions.sensor_doubted:
+        raise RefusedError(
+            "sensor_doubted",
+            "the force sensor reads what no believable device gives with its gap open",
+            "check sensor, cable and zero, then turn the handle for a second: it is judged while friction slides",
+        )
     if conditions.requested_N is not None and not conditions.requested_N <= conditions.neutral_N:  # NaN is not neutral
         raise RefusedError(
             "not_neutral",
