@@ -29,6 +29,7 @@ from tormagd.recording.reader import RecordingError, read_recording
 from tormagd.safety.codes import FAULTS, Fault
 
 RUN_DIR = Path("run/demo")
+RECORDING = RUN_DIR / "pulse.mcap"
 ADDRESS = "ipc://run/demo/{}"
 DAEMON_FIFO = 50
 DEVICE_FIFO, PUBLISHER_FIFO = DAEMON_FIFO - 10, DAEMON_FIFO - 20
@@ -46,7 +47,7 @@ recording = "{ADDRESS.format("recording")}"
 [realtime]
 fifo_priority = {DAEMON_FIFO}  # refused where it is not allowed; then the log says so
 """
-CTL = ("-m", "tormagd.ctl.main", "--config", str(RUN_DIR / "tormagd.toml"), "--json", "--wait", "20")
+CTL = ("-m", "tormagd.ctl.main", "--config", str(RUN_DIR / "tormagd.toml"), "--json", "--wait", "60")
 RATE_HZ = 500
 "Setpoints a second."
 PATIENCE_S = 60.0
@@ -70,12 +71,13 @@ else."""
 class ShowError(Exception):
     """A show that did not get to its end: one sentence with cause and remedy.
 
-    `is_of_time` says whether a host that took the processor would explain it.
+    `is_of_time` says whether a host that took the processor would explain it; `time_s` is when it was seen.
     """
 
     def __init__(self, cause: str, remedy: str, is_of_time: bool = False) -> None:
         super().__init__(f"{cause}; {remedy}")
         self.cause = cause
+        self.time_s = time.monotonic()
         self.is_of_time = is_of_time
 
 
@@ -99,10 +101,11 @@ class Shown(NamedTuple):
 
 
 class Aborted(NamedTuple):
-    """What ended the show early, and what the host took just before."""
+    """What ended the show early, what the host took just before, and the typical time between ticks (0: no ticks)."""
 
     error: ShowError
     host: Host
+    spacing_s: float
 
 
 class Course(NamedTuple):
@@ -129,9 +132,9 @@ def show(times_s: Array, forces_N: Array) -> Shown | Aborted:
             watched.end()
             return judged(course, watched.between(course.start_s, course.end_s), times_s, forces_N)
         except ShowError as error:
-            ended_s = time.monotonic()
             watched.end()
-            return Aborted(error, watched.between(max(began_s, ended_s - BEFORE_FAULT_S), ended_s))
+            host = watched.between(max(began_s, error.time_s - BEFORE_FAULT_S), error.time_s)
+            return Aborted(error, host, typical_s(began_s, error.time_s))
 
 
 def write_profile(path: Path, times_s: Array, forces_N: Array) -> None:
@@ -157,10 +160,11 @@ def play(watched: HostWatch, duration_s: float) -> Course:
         config.write_text(CONFIG.format(port=port))
         daemon = stack.enter_context(process("tormagd", "-m", "tormagd.daemon.main", "--config", str(config)))
         watched.wait_for("daemon", daemon.pid)
+        # from the first tick on: it also says how a show went that ended early
+        recorder = stack.enter_context(process("recorder", *CTL, "record", str(RECORDING)))
         client = stack.enter_context(Client(ADDRESS.format("control"), ANSWER_S))
         wait_for_link(daemon, client)
         arm(client)
-        recorder = stack.enter_context(process("recorder", *CTL, "record", str(RUN_DIR / "pulse.mcap")))
         before, start_s = status(client), time.monotonic()
         send = ("send", str(RUN_DIR / "pulse.csv"), "--rate", str(RATE_HZ))
         publisher = stack.enter_context(process("publisher", *CTL, *send, is_read=True))
@@ -183,14 +187,12 @@ def judged(course: Course, host: Host, times_s: Array, forces_N: Array) -> Shown
     """The show's figures, from the device's own truth and the daemon's recording. Raises ShowError."""
     try:
         truth = np.genfromtxt(RUN_DIR / "truth.csv", delimiter=",", names=True)
-        ticks = read_recording(RUN_DIR / "pulse.mcap").ticks
-    except (OSError, ValueError, RecordingError) as error:
+        spacings_s = tick_spacings_s(course.start_s, course.end_s)
+    except (OSError, ValueError) as error:
         raise ShowError(f"what was recorded cannot be read: {error}", f"look at the logs in {RUN_DIR}") from error
     axis = (truth["t_ns"] - course.start_ns) * 1e-9
     inside = (axis >= times_s[0]) & (axis <= times_s[-1])
-    moments_s = ticks.numbers.get("monotonic_s", np.empty(0))
-    spacing_s = np.diff(moments_s[(moments_s >= course.start_s) & (moments_s <= course.end_s)])
-    if len(spacing_s) == 0 or not inside.any():
+    if len(spacings_s) == 0 or not inside.any():
         raise ShowError("nothing was recorded", f"look at the logs in {RUN_DIR}")
     first, last = course.before["rates"]["control"], course.after["rates"]["control"]
     runs, merged = last["runs"] - first["runs"], last["merged"] - first["merged"]
@@ -203,15 +205,30 @@ def judged(course: Course, host: Host, times_s: Array, forces_N: Array) -> Shown
         limits=course.limits,
         exit_codes=course.exit_codes,
         kept=runs / max(runs + merged, 1),
-        spacing_s=float(np.median(spacing_s)),
-        worst_stall_ms=float(spacing_s.max()) * 1e3,
+        spacing_s=float(np.median(spacings_s)),
+        worst_stall_ms=float(spacings_s.max()) * 1e3,
         host=host,
     )
 
 
+def tick_spacings_s(start_s: float, end_s: float) -> Array:
+    """Times between the recorded ticks between two times of CLOCK_MONOTONIC. Raises RecordingError."""
+    moments_s = read_recording(RECORDING).ticks.numbers.get("monotonic_s", np.empty(0))
+    return np.diff(moments_s[(moments_s >= start_s) & (moments_s <= end_s)])
+
+
+def typical_s(start_s: float, end_s: float) -> float:
+    """The typical time between ticks; 0 where none were recorded."""
+    try:
+        spacings_s = tick_spacings_s(start_s, end_s)
+    except RecordingError:
+        return 0.0
+    return float(np.median(spacings_s)) if len(spacings_s) else 0.0
+
+
 @contextlib.contextmanager
 def process(name: str, *arguments: str, is_read: bool = False) -> Iterator["subprocess.Popen[str]"]:
-    """A Python child whose messages go to a log file; killed if it is still there at the end."""
+    """A Python child whose messages go to a log file; told to end, then killed, if it is still there at the end."""
     with (RUN_DIR / f"{name}.log").open("w") as log:
         child = subprocess.Popen(
             [sys.executable, *arguments], stdout=subprocess.PIPE if is_read else log, stderr=log, text=True
@@ -220,8 +237,7 @@ def process(name: str, *arguments: str, is_read: bool = False) -> Iterator["subp
             yield child
         finally:
             if child.poll() is None:
-                child.kill()
-            child.wait()
+                end(child, signal.SIGTERM)
 
 
 def give_fifo(child: "subprocess.Popen[str]", priority: int) -> None:

@@ -20,6 +20,8 @@ from tormagd.hardware.backend import Backend, BackendError
 from tormagd.messages import VERSION, Reply, Request, decode, encode
 from tormagd.physics.errors import DomainError
 
+pytestmark = pytest.mark.live
+
 PATIENCE_S = 20.0
 WATCHDOG_MS = 100.0
 Command = Callable[[str], Awaitable[dict[str, Any]]]

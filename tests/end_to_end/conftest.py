@@ -24,14 +24,17 @@ class Rig:
     """The processes of one test, and a client to each of the daemon's sockets."""
 
     def __init__(self, folder: Path, door: str = "--pty", device: str = "") -> None:
+        self.door, self._device = door, device
+        self._start(folder)
+
+    def _start(self, folder: Path) -> None:
         self.folder = folder
-        self.door = door
         self.port = folder / "tty"
         self.truth_path = folder / "truth.csv"
         self.config = folder / "tormagd.toml"
         self.config.write_text(
             'scene = "coronary"\n[realtime]\nfifo_priority = 50\n'  # only a warning where it is refused
-            f'[device]\nport = "{self.port}"\n{device}measurement_timeout_ms = 50.0\n[endpoints]\n'
+            f'[device]\nport = "{self.port}"\n{self._device}measurement_timeout_ms = 50.0\n[endpoints]\n'
             + "".join(f'{n} = "ipc://{folder}/{n}"\n' for n in ("setpoint", "telemetry", "control", "recording"))
         )
         self.simulator: subprocess.Popen[str] | None = None
@@ -42,12 +45,23 @@ class Rig:
         self._control = self._socket(zmq.DEALER, "control")
         self._telemetry = self._socket(zmq.SUB, "telemetry")
         self._telemetry.subscribe(b"")
+        self.start_simulator()
+        self.start_daemon()
+        self.wait_for_subscription()
 
-    def start_simulator(self, *arguments: str) -> None:
+    def start_again(self, folder: Path) -> None:
+        """Ends everything and starts it anew in another folder: for a scenario that the host spoiled."""
+        self.close()
+        self._start(folder)
+
+    def start_simulator(self) -> None:
         """A device behind the port; a symbolic link stands for the stable name that udev gives a real one."""
         command = [sys.executable, "-m", "tormagd.simulation", self.door, "--seed", "1"]
-        command += ["--truth", str(self.truth_path), *arguments]
+        command += ["--truth", str(self.truth_path)]
         self.simulator = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        with contextlib.suppress(OSError):  # where it is allowed: a device does not wait for the host's processors
+            policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+            os.sched_setscheduler(self.simulator.pid, policy, os.sched_param(40))
         assert self.simulator.stdout is not None
         path = self.simulator.stdout.readline().strip()
         assert path.startswith("/")
@@ -171,9 +185,6 @@ class Rig:
 def rig(tmp_path: Path) -> Iterator[Rig]:
     """A device and a daemon that has found it."""
     with contextlib.closing(Rig(tmp_path)) as made:
-        made.start_simulator()
-        made.start_daemon()
-        made.wait_for_subscription()
         yield made
 
 
@@ -182,7 +193,4 @@ def can_rig(tmp_path: Path) -> Iterator[Rig]:
     """The same on a CAN bus."""
     device = 'backend = "can"\ninterface = "tormagsim"\n'
     with contextlib.closing(Rig(tmp_path, "--can", device)) as made:
-        made.start_simulator()
-        made.start_daemon()
-        made.wait_for_subscription()
         yield made

@@ -10,6 +10,8 @@ import pytest
 from tormagd.learning.dataset import read_csv
 from tormagd.learning.model_file import load_model
 
+pytestmark = pytest.mark.live
+
 
 def command(rig, *arguments):
     """tormagctl on this rig's daemon, patient because the machine may be busy."""

@@ -9,6 +9,8 @@ import sys
 import msgpack
 import pytest
 
+pytestmark = pytest.mark.live
+
 HOSTILE_VALUES = [math.nan, math.inf, -math.inf, -0.1, 1e9, "1.5", None, [1.0], {"N": 1.0}, True]
 
 
