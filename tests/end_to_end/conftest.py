@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ import zmq
 
 from tormagd.messages import VERSION, Reply, Request, Setpoint, Telemetry, decode, encode
 
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 "Longer than anything takes on a busy machine; only a failure waits for it."
 
 
@@ -132,6 +133,20 @@ class Rig:
         # a busy machine may find the newest measurement a little old once
         self.until(lambda: self.command("enable").ok, "enabled")
 
+    def make_neutral(self) -> None:
+        """Disabled, at rest, no fault, no setpoint in force; started anew where it does not get there."""
+        try:
+            self.ask(0.0, valid_for_ms=1.0)
+            if self.status()["operating_state"] != "FAULT":
+                self.done("disable")
+            self.until(lambda: not self.status()["is_busy"], "at rest")
+            if self.status()["faults"]:
+                self.done("clear-fault")
+            while self._telemetry.poll(0):  # what another test has not read
+                self._telemetry.recv()
+        except (AssertionError, pytest.fail.Exception):
+            self.start_again(Path(tempfile.mkdtemp(dir=self.folder.parent)))
+
     def ask(self, force_N: float, valid_for_ms: float = 30_000.0, **fields: Any) -> None:
         """Publishes one setpoint."""
         self._seq += 1
@@ -181,9 +196,23 @@ class Rig:
         return socket
 
 
+@pytest.fixture(scope="session")
+def shared_rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    """A device and a daemon that has found it, which outlive a test."""
+    with contextlib.closing(Rig(tmp_path_factory.mktemp("rig"))) as made:
+        yield made
+
+
 @pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    """A device and a daemon that has found it."""
+def rig(shared_rig: Rig) -> Rig:
+    """The shared one, disabled and at rest; for tests that end no process."""
+    shared_rig.make_neutral()
+    return shared_rig
+
+
+@pytest.fixture
+def new_rig(tmp_path: Path) -> Iterator[Rig]:
+    """One of its own: not homed yet, and its processes may be ended."""
     with contextlib.closing(Rig(tmp_path)) as made:
         yield made
 
