@@ -109,7 +109,7 @@ def is_slow(scene: Scene, spacing_s: float) -> bool:
 def slow(spacing_s: float) -> str:
     """What that means, and what to do."""
     return (
-        f"even the fastest ticks came {spacing_s * 1e3:.1f} ms after the last, so the software itself is too slow here: "
+        f"even the fastest ticks came {spacing_s * 1e3:.1f} ms after the last, so the software is too slow here: "
         f"keep {RUN_DIR} and report it"
     )
 
