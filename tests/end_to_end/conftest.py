@@ -46,8 +46,10 @@ class Rig:
         self._control = self._socket(zmq.DEALER, "control")
         self._telemetry = self._socket(zmq.SUB, "telemetry")
         self._telemetry.subscribe(b"")
-        self.start_simulator()
-        self.start_daemon()
+        self._load_simulator()
+        self._load_daemon()  # beside the simulator: both take a while to load
+        self._plug_in()
+        self._wait_for_link()
         self.wait_for_subscription()
 
     def start_again(self, folder: Path) -> None:
@@ -56,25 +58,39 @@ class Rig:
         self._start(folder)
 
     def start_simulator(self) -> None:
-        """A device behind the port; a symbolic link stands for the stable name that udev gives a real one."""
+        """A device behind the port."""
+        self._load_simulator()
+        self._plug_in()
+
+    def start_daemon(self) -> None:
+        """A daemon that has found its device."""
+        self._load_daemon()
+        self._wait_for_link()
+
+    def _load_simulator(self) -> None:
         command = [sys.executable, "-m", "tormagd.simulation", self.door, "--seed", "1"]
         command += ["--truth", str(self.truth_path)]
         self.simulator = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         with contextlib.suppress(OSError):  # where it is allowed: a device does not wait for the host's processors
             policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
             os.sched_setscheduler(self.simulator.pid, policy, os.sched_param(40))
+
+    def _plug_in(self) -> None:
+        """A symbolic link to the simulator's line stands for the stable name that udev gives a real one."""
+        assert self.simulator is not None
         assert self.simulator.stdout is not None
         path = self.simulator.stdout.readline().strip()
         assert path.startswith("/")
         self.port.unlink(missing_ok=True)
         self.port.symlink_to(path)
 
-    def start_daemon(self) -> None:
-        """A daemon that has found its device."""
+    def _load_daemon(self) -> None:
         environment = os.environ | {"OMP_NUM_THREADS": "1"}
         self.daemon = subprocess.Popen(
             [sys.executable, "-m", "tormagd.daemon.main", "--config", str(self.config)], env=environment, text=True
         )
+
+    def _wait_for_link(self) -> None:
         self.until(lambda: self.status()["link"]["state"] == "RUNNING", "the link runs")
 
     def command(self, name: str) -> Reply:
