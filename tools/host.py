@@ -31,6 +31,9 @@ LEAST_KEPT = 0.99
 MOST_WAITED = 0.1
 """Share of the time above which a process that waits for a processor has not been left enough. With FIFO the daemon
 waits for 3 to 8% of it, 30 to 80 us a wake-up; without, beside four busy loops, for a third."""
+MOST_BLOCKED = 0.02
+"""Share of the time above which waiting for disk or memory has held something up: seen where a device that writes its
+truth to a busy disk stood still for 38 ms, while every bare timer kept its beats."""
 
 
 class Counters(NamedTuple):
@@ -40,6 +43,8 @@ class Counters(NamedTuple):
     stolen: int
     ticks: int
     waited_s: dict[str, float]
+    blocked_s: float
+    "How long some process was held up by disk or memory (Documentation/accounting/psi)."
 
 
 class Host(NamedTuple):
@@ -49,6 +54,7 @@ class Host(NamedTuple):
     bare_kept: float
     bare_worst_ms: float
     waited: dict[str, float]
+    blocked: float = 0.0
 
     @property
     def took_much(self) -> bool:
@@ -57,6 +63,7 @@ class Host(NamedTuple):
             self.bare_worst_ms >= STALL_MS
             or self.bare_kept < LEAST_KEPT
             or max(self.waited.values(), default=0.0) > MOST_WAITED
+            or self.blocked > MOST_BLOCKED
         )
 
     def __str__(self) -> str:
@@ -65,7 +72,7 @@ class Host(NamedTuple):
         waited = f", and the {name} waited for a processor for {share:.0%} of the time" if share > MOST_WAITED else ""
         return (
             f"a bare timer stood still for up to {self.bare_worst_ms:.0f} ms and kept {self.bare_kept:.1%} of its "
-            f"beats{waited}"
+            f"beats{waited}; disk or memory held something up for {self.blocked:.0%} of the time"
         )
 
 
@@ -123,6 +130,7 @@ class HostWatch:
             waited={
                 name: (waited_s - first.waited_s.get(name, 0.0)) / seconds for name, waited_s in last.waited_s.items()
             },
+            blocked=(last.blocked_s - first.blocked_s) / seconds,
         )
 
     def _within(self, start_s: float, end_s: float) -> Iterator[Stall]:
@@ -155,4 +163,9 @@ def counters(pids: dict[str, int]) -> Counters:
             waited_s[name] = (
                 int(Path(f"/proc/{pid}/task/{pid}/schedstat").read_text(encoding="ascii").split()[1]) * 1e-9
             )
-    return Counters(time.monotonic(), fields[7], sum(fields), waited_s)
+    blocked_s = 0.0
+    for resource in ("io", "memory"):
+        with contextlib.suppress(OSError):  # nor is pressure known to every kernel
+            some = Path(f"/proc/pressure/{resource}").read_text(encoding="ascii").split("\n", 1)[0]
+            blocked_s += int(some.rpartition("total=")[2]) * 1e-6
+    return Counters(time.monotonic(), fields[7], sum(fields), waited_s, blocked_s)

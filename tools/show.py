@@ -136,7 +136,8 @@ def show(times_s: Array, forces_N: Array) -> Shown | Aborted:
             return judged(course, watched.between(course.start_s, course.end_s), times_s, forces_N)
         except ShowError as error:
             watched.end()
-            host = watched.between(max(began_s, error.time_s - BEFORE_FAULT_S), error.time_s)
+            until_s = fault_s(error.time_s)
+            host = watched.between(max(began_s, until_s - BEFORE_FAULT_S), until_s)
             return Aborted(error, host, fastest_s(began_s, error.time_s))
 
 
@@ -218,6 +219,19 @@ def tick_spacings_s(start_s: float, end_s: float) -> Array:
     """Times between the recorded ticks between two times of CLOCK_MONOTONIC. Raises RecordingError."""
     moments_s = read_recording(RECORDING).ticks.numbers.get("monotonic_s", np.empty(0))
     return np.diff(moments_s[(moments_s >= start_s) & (moments_s <= end_s)])
+
+
+def fault_s(seen_s: float) -> float:
+    """When the first fault was latched, by the recording: whoever saw it at `seen_s` may have been late."""
+    try:
+        ticks = read_recording(RECORDING).ticks
+    except RecordingError:
+        return seen_s
+    moments_s = ticks.numbers.get("monotonic_s", np.empty(0))
+    latched = (
+        float(moment_s) for moment_s, faults in zip(moments_s, ticks.words.get("faults", ()), strict=False) if faults
+    )
+    return next(latched, seen_s)
 
 
 def fastest_s(start_s: float, end_s: float) -> float:
