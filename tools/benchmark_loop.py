@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 import uvloop
 import zmq
+from bare_timer import beat
 from benchmark_plot import plot_histograms
 
 from tormagd.config import Config, RealTime, load_config
@@ -34,7 +35,7 @@ from tormagd.ctl.outcome import CommandError
 from tormagd.daemon.daemon import SERVED_BEFORE_NS
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
-from tormagd.daemon.realtime import freeze_garbage, prepare, priority_of_threads
+from tormagd.daemon.realtime import prepare, priority_of_threads
 from tormagd.messages import Request
 from tormagd.recording.ticks import decode_ticks
 
@@ -246,26 +247,20 @@ def bare_loop(config: Config) -> None:
 async def _bare(config: Config) -> None:
     prepare(config.realtime)
     endpoint = Endpoint(config.endpoints, priority_of_threads())
-    heartbeat = Heartbeat(1_000_000_000 // config.rates.control_hz)
     rows: list[tuple[int, float, float]] = []
     answer = {"state": "bare"} | {f"key_{index}": float(index) for index in range(60)}
 
     def reply(_request: Request) -> dict[str, Any]:
         return answer
 
-    def beat() -> None:
-        if not heartbeat.beats():
-            return
-        now_ns = time.monotonic_ns()
+    def publish(heartbeat: Heartbeat, _beats: int, now_ns: int) -> None:
         rows.append((time.time_ns(), (now_ns - heartbeat.due_ns) * 1e-3, 0.0))
         if len(rows) >= TELEMETRY_EVERY:
             endpoint.publish_ticks(("t_ns", "lateness_us", "exec_us"), rows)
             rows.clear()
             endpoint.serve(now_ns * 1e-9, reply, heartbeat.due_ns + heartbeat.period_ns - SERVED_BEFORE_NS)
 
-    freeze_garbage()
-    asyncio.get_running_loop().add_reader(heartbeat.fileno(), beat)
-    await asyncio.Event().wait()
+    await beat(1_000_000_000 // config.rates.control_hz, publish, asyncio.Event())
 
 
 def wait_for(address: str) -> None:

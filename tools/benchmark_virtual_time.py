@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 from benchmark_step import START_MM, STEP_MM, hold
 
+import firmware_protocol
+import tormagd
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
 from tormagd.control.core import build_core
@@ -104,11 +106,12 @@ def profiled(run: Run, ticks: int) -> dict[str, Any]:
 
 
 def _room(file: str) -> str:
-    parts = Path(file).parts
-    if "firmware_protocol" in parts:
-        return "firmware_protocol"
-    if "tormagd" in parts and "site-packages" not in parts:
-        return Path(*parts[parts.index("tormagd") + 1 :]).parts[0].removesuffix(".py")
+    for package in (tormagd, firmware_protocol):
+        # by where the packages are, whatever the folders above them are called
+        folder = Path(package.__path__[0])
+        if Path(file).is_relative_to(folder):
+            inside = Path(file).relative_to(folder).parts[0].removesuffix(".py")
+            return inside if package is tormagd else package.__name__
     return "Python and NumPy"
 
 

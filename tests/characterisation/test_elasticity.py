@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from tormagd.characterisation.elasticity import fit_neo_hookean, fit_ogden, fit_thesis_ogden
@@ -30,7 +30,9 @@ def measured(name: str, columns: tuple[str, str], delimiter: str = ",") -> list[
 def test_one_ogden_term_is_found_again(decades: float, exponent: float, pulled: bool) -> None:
     law = Ogden((10.0**decades,), (exponent,))
     stretch = TENSION if pulled else COMPRESSION
-    fit = fit_ogden(stretch, law.stress_Pa(stretch))
+    stress_Pa = law.stress_Pa(stretch)
+    assume(np.abs(stress_Pa).max() <= 1e12)  # beyond, a record is refused
+    fit = fit_ogden(stretch, stress_Pa)
     assert fit.law.shear_modulus_Pa == pytest.approx(law.shear_modulus_Pa, rel=1e-4)
     assert fit.law.exponents[0] == pytest.approx(exponent, rel=1e-3)
     assert fit.r2 > 1.0 - 1e-9

@@ -23,6 +23,8 @@ from tormagd.messages import VERSION, Reply, Request, decode, encode
 from tormagd.physics.errors import DomainError
 from tormagd.safety.codes import FAULTS, Fault
 
+pytestmark = pytest.mark.live
+
 PATIENCE_S = 20.0
 WATCHDOG_MS = 100.0
 Command = Callable[[str], Awaitable[dict[str, Any]]]

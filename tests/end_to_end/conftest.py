@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ import zmq
 
 from tormagd.messages import VERSION, Reply, Request, Setpoint, Telemetry, decode, encode
 
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 "Longer than anything takes on a busy machine; only a failure waits for it."
 
 
@@ -24,14 +25,17 @@ class Rig:
     """The processes of one test, and a client to each of the daemon's sockets."""
 
     def __init__(self, folder: Path, door: str = "--pty", device: str = "") -> None:
+        self.door, self._device = door, device
+        self._start(folder)
+
+    def _start(self, folder: Path) -> None:
         self.folder = folder
-        self.door = door
         self.port = folder / "tty"
         self.truth_path = folder / "truth.csv"
         self.config = folder / "tormagd.toml"
         self.config.write_text(
             'scene = "coronary"\n[realtime]\nfifo_priority = 50\n'  # only a warning where it is refused
-            f'[device]\nport = "{self.port}"\n{device}measurement_timeout_ms = 50.0\n[endpoints]\n'
+            f'[device]\nport = "{self.port}"\n{self._device}measurement_timeout_ms = 50.0\n[endpoints]\n'
             + "".join(f'{n} = "ipc://{folder}/{n}"\n' for n in ("setpoint", "telemetry", "control", "recording"))
         )
         self.simulator: subprocess.Popen[str] | None = None
@@ -42,24 +46,51 @@ class Rig:
         self._control = self._socket(zmq.DEALER, "control")
         self._telemetry = self._socket(zmq.SUB, "telemetry")
         self._telemetry.subscribe(b"")
+        self._load_simulator()
+        self._load_daemon()  # beside the simulator: both take a while to load
+        self._plug_in()
+        self._wait_for_link()
+        self.wait_for_subscription()
 
-    def start_simulator(self, *arguments: str) -> None:
-        """A device behind the port; a symbolic link stands for the stable name that udev gives a real one."""
+    def start_again(self, folder: Path) -> None:
+        """Ends everything and starts it anew in another folder: for a scenario that the host spoiled."""
+        self.close()
+        self._start(folder)
+
+    def start_simulator(self) -> None:
+        """A device behind the port."""
+        self._load_simulator()
+        self._plug_in()
+
+    def start_daemon(self) -> None:
+        """A daemon that has found its device."""
+        self._load_daemon()
+        self._wait_for_link()
+
+    def _load_simulator(self) -> None:
         command = [sys.executable, "-m", "tormagd.simulation", self.door, "--seed", "1"]
-        command += ["--truth", str(self.truth_path), *arguments]
+        command += ["--truth", str(self.truth_path)]
         self.simulator = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        with contextlib.suppress(OSError):  # where it is allowed: a device does not wait for the host's processors
+            policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+            os.sched_setscheduler(self.simulator.pid, policy, os.sched_param(40))
+
+    def _plug_in(self) -> None:
+        """A symbolic link to the simulator's line stands for the stable name that udev gives a real one."""
+        assert self.simulator is not None
         assert self.simulator.stdout is not None
         path = self.simulator.stdout.readline().strip()
         assert path.startswith("/")
         self.port.unlink(missing_ok=True)
         self.port.symlink_to(path)
 
-    def start_daemon(self) -> None:
-        """A daemon that has found its device."""
+    def _load_daemon(self) -> None:
         environment = os.environ | {"OMP_NUM_THREADS": "1"}
         self.daemon = subprocess.Popen(
             [sys.executable, "-m", "tormagd.daemon.main", "--config", str(self.config)], env=environment, text=True
         )
+
+    def _wait_for_link(self) -> None:
         self.until(lambda: self.status()["link"]["state"] == "RUNNING", "the link runs")
 
     def command(self, name: str) -> Reply:
@@ -118,6 +149,20 @@ class Rig:
         # a busy machine may find the newest measurement a little old once
         self.until(lambda: self.command("enable").ok, "enabled")
 
+    def make_neutral(self) -> None:
+        """Disabled, at rest, no fault, no setpoint in force; started anew where it does not get there."""
+        try:
+            self.ask(0.0, valid_for_ms=1.0)
+            if self.status()["operating_state"] != "FAULT":
+                self.done("disable")
+            self.until(lambda: not self.status()["is_busy"], "at rest")
+            if self.status()["faults"]:
+                self.done("clear-fault")
+            while self._telemetry.poll(0):  # what another test has not read
+                self._telemetry.recv()
+        except (AssertionError, pytest.fail.Exception):
+            self.start_again(Path(tempfile.mkdtemp(dir=self.folder.parent)))
+
     def ask(self, force_N: float, valid_for_ms: float = 30_000.0, **fields: Any) -> None:
         """Publishes one setpoint."""
         self._seq += 1
@@ -167,13 +212,24 @@ class Rig:
         return socket
 
 
+@pytest.fixture(scope="session")
+def shared_rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    """A device and a daemon that has found it, which outlive a test."""
+    with contextlib.closing(Rig(tmp_path_factory.mktemp("rig"))) as made:
+        yield made
+
+
 @pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    """A device and a daemon that has found it."""
+def rig(shared_rig: Rig) -> Rig:
+    """The shared one, disabled and at rest; for tests that end no process."""
+    shared_rig.make_neutral()
+    return shared_rig
+
+
+@pytest.fixture
+def new_rig(tmp_path: Path) -> Iterator[Rig]:
+    """One of its own: not homed yet, and its processes may be ended."""
     with contextlib.closing(Rig(tmp_path)) as made:
-        made.start_simulator()
-        made.start_daemon()
-        made.wait_for_subscription()
         yield made
 
 
@@ -182,7 +238,4 @@ def can_rig(tmp_path: Path) -> Iterator[Rig]:
     """The same on a CAN bus."""
     device = 'backend = "can"\ninterface = "tormagsim"\n'
     with contextlib.closing(Rig(tmp_path, "--can", device)) as made:
-        made.start_simulator()
-        made.start_daemon()
-        made.wait_for_subscription()
         yield made

@@ -10,6 +10,8 @@ import pytest
 from tormagd.learning.dataset import read_csv
 from tormagd.learning.model_file import load_model
 
+pytestmark = pytest.mark.live
+
 
 def command(rig, *arguments):
     """tormagctl on this rig's daemon, patient because the machine may be busy."""
@@ -17,10 +19,10 @@ def command(rig, *arguments):
     return [*program, "calibrate", "--yes", *arguments]
 
 
-def test_a_sweep_becomes_a_model_that_says_what_it_is(rig, tmp_path):
+def test_a_sweep_becomes_a_model_that_says_what_it_is(new_rig, tmp_path):
     out, data = tmp_path / "model.safetensors", tmp_path / "training.csv"
     arguments = ("--insert", "MRE-50-40", "--out", str(out), "--csv", str(data), "--rates", "1.0,1.4,1.0")
-    done = subprocess.run(command(rig, *arguments), capture_output=True, text=True, timeout=110, check=False)
+    done = subprocess.run(command(new_rig, *arguments), capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     metrics = json.loads(done.stdout)["result"]["metrics"]
     assert done.stderr.count("turn the handle") == 3
@@ -32,21 +34,21 @@ def test_a_sweep_becomes_a_model_that_says_what_it_is(rig, tmp_path):
     low, high = model.field_range_mT
     assert low < 320.0
     assert high > 480.0
-    rig.until(lambda: (rig.status()["gap_mm"] or 0.0) > 94.0, "the gap is open")
-    assert rig.status()["operating_state"] == "DISABLED"
+    new_rig.until(lambda: (new_rig.status()["gap_mm"] or 0.0) > 94.0, "the gap is open")
+    assert new_rig.status()["operating_state"] == "DISABLED"
 
 
-def test_an_interrupt_opens_the_gap_and_leaves_no_file(rig, tmp_path):
+def test_an_interrupt_opens_the_gap_and_leaves_no_file(new_rig, tmp_path):
     out = tmp_path / "log.csv"
-    running = subprocess.Popen(command(rig, "--motors", "--out", str(out)), stdout=subprocess.PIPE, text=True)
+    running = subprocess.Popen(command(new_rig, "--motors", "--out", str(out)), stdout=subprocess.PIPE, text=True)
     try:
-        rig.until(lambda: (rig.telemetry().gap_mm or 95.0) < 90.0, "the carriages move")
+        new_rig.until(lambda: (new_rig.telemetry().gap_mm or 95.0) < 90.0, "the carriages move")
         running.send_signal(signal.SIGINT)
-        printed, _ = running.communicate(timeout=30)
+        printed, _ = running.communicate(timeout=120)
     finally:
         running.kill()
     assert running.returncode == 1
     assert json.loads(printed)["error"]["code"] == "interrupted"
     assert not out.exists()
-    assert rig.status()["operating_state"] == "DISABLED"
-    rig.until(lambda: (rig.status()["gap_mm"] or 0.0) > 94.0, "the gap is open")
+    assert new_rig.status()["operating_state"] == "DISABLED"
+    new_rig.until(lambda: (new_rig.status()["gap_mm"] or 0.0) > 94.0, "the gap is open")

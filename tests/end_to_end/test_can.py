@@ -2,6 +2,10 @@
 
 import signal
 
+import pytest
+
+pytestmark = pytest.mark.live
+
 
 def test_a_device_on_a_can_bus_is_driven_lost_and_found_again_without_re_arming(can_rig):
     can_rig.arm()

@@ -9,6 +9,8 @@ import sys
 import msgpack
 import pytest
 
+pytestmark = pytest.mark.live
+
 HOSTILE_VALUES = [math.nan, math.inf, -math.inf, -0.1, 1e9, "1.5", None, [1.0], {"N": 1.0}, True]
 
 
@@ -50,20 +52,20 @@ def test_stale_setpoint_decays_to_the_least_force(rig):
     assert rig.telemetry().operating_state == "ENABLED"
 
 
-def test_enable_is_refused_until_everything_is_right(rig):
-    reply = rig.command("enable")
+def test_enable_is_refused_until_everything_is_right(new_rig):
+    reply = new_rig.command("enable")
     assert not reply.ok
     assert reply.error.code == "not_homed"
-    rig.done("home")
-    rig.until(lambda: rig.status()["is_homed"] and not rig.status()["is_busy"], "homed")
-    rig.ask(1.5)
-    rig.until(lambda: rig.telemetry().setpoint_cf == 1.5, "setpoint seen")
-    reply = rig.command("enable")
+    new_rig.done("home")
+    new_rig.until(lambda: new_rig.status()["is_homed"] and not new_rig.status()["is_busy"], "homed")
+    new_rig.ask(1.5)
+    new_rig.until(lambda: new_rig.telemetry().setpoint_cf == 1.5, "setpoint seen")
+    reply = new_rig.command("enable")
     assert not reply.ok
     assert reply.error.code == "not_neutral"
-    rig.ask(0.5)
-    rig.until(lambda: rig.telemetry().setpoint_cf == 0.5, "setpoint seen")
-    rig.until(lambda: rig.command("enable").ok, "enabled")
+    new_rig.ask(0.5)
+    new_rig.until(lambda: new_rig.telemetry().setpoint_cf == 0.5, "setpoint seen")
+    new_rig.until(lambda: new_rig.command("enable").ok, "enabled")
 
 
 def test_home_is_seen_as_busy_at_once_and_nothing_is_enabled_on_top_of_it(rig):
@@ -94,33 +96,33 @@ def test_a_second_daemon_is_refused_and_the_first_goes_on(rig):
     rig.until(lambda: rig.telemetry().setpoint_cf == 0.7, "setpoints are heard")
 
 
-def test_killed_daemon_leaves_an_open_gap_and_a_latched_reason(rig):
-    rig.arm()
-    rig.ask(1.6)
-    rig.until(lambda: abs((rig.telemetry().measured_cf or 0.0) - 1.6) < 0.1, "1.6 N")
-    assert rig.end(rig.daemon, signal.SIGKILL) == -signal.SIGKILL
-    rig.start_daemon()
-    rig.until(lambda: rig.status()["faults"] == ["DEVICE_COMMAND_TIMEOUT"], "the reason is reported")
-    assert rig.command("enable").error.code == "fault"
-    rig.until(lambda: not rig.status()["is_busy"], "the gap is open")
-    rig.done("clear-fault")
-    rig.until(lambda: rig.status()["faults"] == [], "cleared")
-    assert rig.command("enable").error.code == "not_homed"
-    rig.arm()
-    rig.end(rig.daemon, signal.SIGTERM)
-    truth = rig.truth()
+def test_killed_daemon_leaves_an_open_gap_and_a_latched_reason(new_rig):
+    new_rig.arm()
+    new_rig.ask(1.6)
+    new_rig.until(lambda: abs((new_rig.telemetry().measured_cf or 0.0) - 1.6) < 0.1, "1.6 N")
+    assert new_rig.end(new_rig.daemon, signal.SIGKILL) == -signal.SIGKILL
+    new_rig.start_daemon()
+    new_rig.until(lambda: new_rig.status()["faults"] == ["DEVICE_COMMAND_TIMEOUT"], "the reason is reported")
+    assert new_rig.command("enable").error.code == "fault"
+    new_rig.until(lambda: not new_rig.status()["is_busy"], "the gap is open")
+    new_rig.done("clear-fault")
+    new_rig.until(lambda: new_rig.status()["faults"] == [], "cleared")
+    assert new_rig.command("enable").error.code == "not_homed"
+    new_rig.arm()
+    new_rig.end(new_rig.daemon, signal.SIGTERM)
+    truth = new_rig.truth()
     closed = truth["gap_mm"].min()
     assert closed < 70.0
     assert truth["gap_mm"][-1] > 94.0
 
 
-def test_sigterm_opens_the_gap_and_exits_in_order(rig):
-    rig.arm()
-    rig.ask(1.6)
-    rig.until(lambda: abs((rig.telemetry().measured_cf or 0.0) - 1.6) < 0.1, "1.6 N")
-    assert rig.end(rig.daemon, signal.SIGTERM) == 0
-    assert rig.truth()["gap_mm"][-1] > 94.0
-    assert not (rig.folder / "setpoint").exists()
+def test_sigterm_opens_the_gap_and_exits_in_order(new_rig):
+    new_rig.arm()
+    new_rig.ask(1.6)
+    new_rig.until(lambda: abs((new_rig.telemetry().measured_cf or 0.0) - 1.6) < 0.1, "1.6 N")
+    assert new_rig.end(new_rig.daemon, signal.SIGTERM) == 0
+    assert new_rig.truth()["gap_mm"][-1] > 94.0
+    assert not (new_rig.folder / "setpoint").exists()
 
 
 def test_stop_opens_and_latches(rig):
@@ -161,18 +163,18 @@ def test_hostile_setpoints_are_refused_counted_and_do_not_disturb(rig):
     assert abs(newest.measured_cf - 1.5) < 0.1
 
 
-def test_unplugged_device_is_a_named_fault_and_comes_back_without_re_arming(rig):
-    rig.arm()
-    rig.ask(1.5)
-    rig.until(lambda: (rig.telemetry().gap_mm or 95.0) < 72.0, "closing")
-    rig.end(rig.simulator, signal.SIGKILL)
-    rig.until(lambda: "LINK_LOST" in rig.status()["faults"], "the loss is named")
-    assert rig.status()["link"]["cause"]
-    rig.start_simulator()
-    rig.until(lambda: rig.status()["link"]["state"] == "RUNNING", "the link runs again")
-    assert rig.status()["operating_state"] == "FAULT"
-    rig.until(lambda: not rig.status()["is_busy"], "the returned device has opened")
-    rig.done("clear-fault")
-    rig.ask(0.5)
-    rig.until(lambda: rig.telemetry().setpoint_cf == 0.5, "neutral again")
-    rig.arm()
+def test_unplugged_device_is_a_named_fault_and_comes_back_without_re_arming(new_rig):
+    new_rig.arm()
+    new_rig.ask(1.5)
+    new_rig.until(lambda: (new_rig.telemetry().gap_mm or 95.0) < 72.0, "closing")
+    new_rig.end(new_rig.simulator, signal.SIGKILL)
+    new_rig.until(lambda: "LINK_LOST" in new_rig.status()["faults"], "the loss is named")
+    assert new_rig.status()["link"]["cause"]
+    new_rig.start_simulator()
+    new_rig.until(lambda: new_rig.status()["link"]["state"] == "RUNNING", "the link runs again")
+    assert new_rig.status()["operating_state"] == "FAULT"
+    new_rig.until(lambda: not new_rig.status()["is_busy"], "the returned device has opened")
+    new_rig.done("clear-fault")
+    new_rig.ask(0.5)
+    new_rig.until(lambda: new_rig.telemetry().setpoint_cf == 0.5, "neutral again")
+    new_rig.arm()

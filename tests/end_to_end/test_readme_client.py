@@ -7,7 +7,10 @@ import tempfile
 from pathlib import Path
 
 import msgpack
+import pytest
 import zmq
+
+pytestmark = pytest.mark.live
 
 README = Path(__file__).parents[2] / "README.md"
 

@@ -1,23 +1,145 @@
-"""What `make run` prints at its end is a table, and the README's sample is that table."""
+"""What `make run` says: its verdict on made-up shows, its live line, and its table, which is the README's sample."""
 
 import re
 from pathlib import Path
 
 import demo
 import numpy as np
+import pytest
+import show
+from host import Host
 from rehearsal import Rehearsal
 
+from tormagd.messages import VERSION, Telemetry, Tick
+from tormagd.safety.codes import FAULTS, Fault, Limit
+from tormagd.scenes.scene import load_scene
+
 README = Path(__file__).parents[2] / "README.md"
+SCENE = load_scene("pulse")
+QUIET = Host(steal=0.001, bare_kept=0.999, bare_worst_ms=3.0, waited={"daemon": 0.04})
+STALLED = QUIET._replace(bare_worst_ms=92.0)
+AXIS_S = np.linspace(0.0, 6.0, 601)
+
+
+def shown(**changes):
+    """A show in which everything was in order."""
+    asked = 1.5 + 0.1 * np.sin(5.0 * AXIS_S)
+    group = {"hz": 500.0, "lateness_us": {"p50": 1, "p99": 2}, "exec_us": {"p50": 1, "p99": 2}}
+    link = {"frames": 7, "lost": 0, "corrupt": 0, "repeated": 0}
+    known = show.Shown(
+        time_s=AXIS_S,
+        asked_N=asked,
+        rendered_N=asked + 0.01,
+        gap_mm=AXIS_S,
+        status={"rates": {"control": group, "inference": group}, "link": link},
+        limits={"RATE": 0.1},
+        exit_codes={"tormagd": 0},
+        kept=0.996,
+        spacing_s=1e-3,
+        worst_stall_ms=4.0,
+        host=QUIET,
+    )
+    return known._replace(**changes)
+
+
+def aborted(fault, host, spacing_s=1e-3):
+    """A show that a fault has ended."""
+    with pytest.raises(show.ShowError) as caught:
+        show.raise_fault({"faults": [fault]})
+    return show.Aborted(caught.value, host, spacing_s)
+
+
+def with_lost_frame():
+    """The status of a show that lost one."""
+    status = shown().status
+    return status | {"link": status["link"] | {"lost": 1}}
+
+
+def rehearsals():
+    """Every case, well tracked."""
+    asked = 1.5 + 0.1 * np.sin(5.0 * AXIS_S)
+    return [Rehearsal(case, AXIS_S, asked, asked + 0.01, AXIS_S, AXIS_S) for case in demo.CASES]
+
+
+@pytest.mark.parametrize("host", [QUIET, STALLED])
+def test_a_show_that_met_everything_is_met_whatever_the_host_took(host):
+    assert demo.judge(SCENE, shown(host=host)) == (demo.Verdict.MET, "")
+
+
+@pytest.mark.parametrize(
+    ("missed", "named"),
+    [
+        ({"rendered_N": shown().asked_N + 0.05}, "RMS error"),
+        ({"kept": 0.85}, "control rate"),
+        ({"status": with_lost_frame()}, "no frame lost"),
+        ({"exit_codes": {"tormagd": 1}}, "every process ended in order"),
+    ],
+)
+def test_what_was_missed_is_the_softwares_unless_kernel_or_bare_timer_say_otherwise(missed, named):
+    verdict, sentence = demo.judge(SCENE, shown(**missed))
+    assert verdict is demo.Verdict.MISSED
+    assert named in sentence
+    verdict, sentence = demo.judge(SCENE, shown(host=STALLED, **missed))
+    assert verdict is demo.Verdict.HOST
+    assert named in sentence
+    assert "92 ms" in sentence
+
+
+def test_the_control_rate_is_held_against_the_worst_bare_timer():
+    poor = QUIET._replace(bare_kept=0.93)
+    assert demo.judge(SCENE, shown(kept=0.90, host=poor))[0] is demo.Verdict.MET
+    assert demo.judge(SCENE, shown(kept=0.90 - demo.MARGIN, host=poor))[0] is demo.Verdict.HOST
+    assert demo.judge(SCENE, shown(kept=0.90 - demo.MARGIN))[0] is demo.Verdict.MISSED
+
+
+@pytest.mark.parametrize("host", [QUIET, STALLED, STALLED._replace(bare_kept=0.4, waited={"daemon": 0.6})])
+def test_software_that_is_slow_in_every_tick_cannot_blame_the_host(host):
+    verdict, sentence = demo.judge(SCENE, shown(kept=0.45, spacing_s=2.2e-3, host=host))
+    assert verdict is demo.Verdict.MISSED
+    assert "2.2 ms" in sentence
+    verdict, sentence = demo.judge(SCENE, aborted("MEASUREMENT_STALE", host, 2.2e-3))
+    assert verdict is demo.Verdict.MISSED
+    assert "2.2 ms" in sentence
+
+
+@pytest.mark.parametrize("fault", list(Fault))
+def test_a_fault_is_one_sentence_with_cause_and_remedy(fault):
+    for host in (QUIET, STALLED):
+        verdict, sentence = demo.judge(SCENE, aborted(fault, host))
+        is_hosts = host is STALLED and fault in show.OF_TIME
+        assert verdict is (demo.Verdict.HOST if is_hosts else demo.Verdict.MISSED)
+        assert fault in sentence
+        assert FAULTS[fault].cause in sentence
+        assert is_hosts or FAULTS[fault].remedy in sentence
+        assert not re.search(r"[\n{}]", sentence)
+
+
+def test_the_host_line_names_steal_and_both_worst_stalls():
+    line = demo.host_line(STALLED._replace(steal=0.012), 94.0)
+    assert line.startswith("steal 1.2%, worst stall 94 ms (bare timer 92 ms,")
+
+
+@pytest.mark.parametrize("limits", [(), ("RATE",), *[(limit,) for limit in Limit], tuple(Limit), tuple(Limit)[::-1]])
+@pytest.mark.parametrize("state", ["ENABLED", "DISABLED", "PAUSED", "FAULT"])
+def test_the_live_line_fits_80_columns_and_hides_no_limit(limits, state):
+    widest = Telemetry(
+        v=VERSION, t_ns=1, seq=1, operating_state=state, is_homed=True, is_busy=False, setpoint_cf=1.7,
+        governed_cf=1.7, measured_cf=-0.01, predicted_cf=1.7, field_mT=500.0, gap_mm=95.0, gap_setpoint_mm=95.0,
+        measured_jp=(1.0, 1.0), skew_mm=0.0, duty=(0.0, 0.0), limits=tuple(map(str, limits)), faults=(),
+        setpoint_age_ms=1.0, confidence=1.0, tick=Tick(lateness_us=1.0, exec_us=1.0),
+    )  # fmt: skip
+    line = show.live_line(widest, 1e6, 24.0)
+    assert len(line) < 80
+    left_out = re.search(r" \+(\d+)$", line)
+    told = sum(re.search(rf"\b{limit}\b", line) is not None for limit in limits)
+    assert told + (int(left_out[1]) if left_out else 0) == len(limits)
+    assert state == "ENABLED" or state in line
+    assert told == len(limits) or len(limits) > 1 or state != "ENABLED"
 
 
 def printed_lines(capsys) -> list[str]:
-    axis = np.linspace(0.0, 6.0, 601)
-    asked = 1.5 + 0.1 * np.sin(axis)
-    rehearsals = [Rehearsal(case, axis, asked, asked + 0.01, axis, axis) for case in demo.CASES]
-    group = {"hz": 1e3, "merged": 3, "runs": 9, "lateness_us": {"p50": 1, "p99": 2}, "exec_us": {"p50": 1, "p99": 2}}
-    status = {"rates": {"control": group, "inference": group}, "link": {"frames": 7}}
-    shown = demo.Shown(axis, asked, asked + 0.01, axis, status, {"RATE": 0.1}, {})
-    demo.print_summary(demo.scored(axis, asked, asked + 0.01), shown, rehearsals, 0)
+    demo.print_forces(shown(), rehearsals())
+    demo.print_timing(shown())
     return [line for line in capsys.readouterr().out.splitlines() if line]
 
 
@@ -40,3 +162,26 @@ def test_the_readmes_sample_has_the_lines_that_are_printed(capsys):
         return [re.split(r"(?<=\S) {2,}", line)[0].strip() for line in lines[1:]]
 
     assert labels(sample.splitlines()) == labels(printed_lines(capsys))
+
+
+@pytest.mark.parametrize(
+    ("show_", "verdict", "exit_code"),
+    [(shown(), demo.Verdict.MET, 0), (aborted("MEASUREMENT_STALE", STALLED), demo.Verdict.HOST, 3)],
+)
+def test_the_virtual_time_cases_are_shown_in_every_case(show_, verdict, exit_code, capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
+    found, sentence = demo.judge(SCENE, show_)
+    assert found is verdict
+    assert demo.conclude(SCENE, show_, rehearsals(), found, sentence, 60.0) == exit_code
+    printed = capsys.readouterr().out
+    for case in demo.CASES:
+        assert f"virtual time, {case.label}" in printed
+    assert ("no verdict after 3 shows" in printed) == (exit_code == 3)
+    assert (tmp_path / "summary.json").is_file()
+
+
+def test_a_virtual_time_case_that_fails_is_missed_whatever_the_host_did(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
+    for verdict in (demo.Verdict.MET, demo.Verdict.HOST):
+        assert demo.conclude(SCENE, shown(), rehearsals()[1:], verdict, "", 60.0) == 1
+    assert "MISSED every case in virtual time done" in capsys.readouterr().out

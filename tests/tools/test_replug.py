@@ -1,8 +1,10 @@
 """Unplug and replug with real processes: a few cycles; `tools/replug.py --cycles 200` is the evidence."""
 
+import pytest
 import replug
 
 
+@pytest.mark.live
 def test_the_cable_is_pulled_in_motion_and_put_back() -> None:
     result = replug.run("serial", 2, seed=3, fifo_priority=50)
     assert result["cycles"] == 2

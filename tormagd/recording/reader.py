@@ -19,7 +19,8 @@ from tormagd.recording.writer import TELEMETRY_TOPIC, TICKS_TOPIC
 
 MAX_RECORD_BYTES = 64_000_000
 MAX_NESTING = 2
-UNREADABLE = (McapError, ZstdError, ValueError, OverflowError, struct.error, msgspec.MsgspecError)
+UNREADABLE = (McapError, ZstdError, ValueError, OverflowError, MemoryError, struct.error, msgspec.MsgspecError)
+"""What damage raises; MemoryError where a damaged length asks for more than there is."""
 
 
 class RecordingError(ValueError):

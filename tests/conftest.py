@@ -1,0 +1,68 @@
+"""What every test shares: a live test that the host spoiled is started again, twice at most.
+
+A live test joins processes and sockets in real time. Where the host takes the processor for longer than the device may
+be silent, device and daemon protect themselves, as they must, and the scenario is over. That is never told from the
+failure itself: the kernel's counters and bare timers on every processor say so (`tools/host.py`), or it is a failure.
+"""
+
+import os
+import signal
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+
+from host import HostWatch
+
+# no test asserts a wall-clock duration, so none fails because the machine is slow
+settings.register_profile("tormagd", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("tormagd")
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # pytest-xdist's workers ignore Ctrl-C, as what runs in the background does, and what a test starts would inherit it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+ATTEMPTS = 3
+WATCHED_ABOVE = 51
+"FIFO priority of the bare timers, where it is allowed: one above the daemon's in the tests."
+
+
+class HostWarning(UserWarning):
+    """The host took so much that a live test was started again."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Runs a live test, again after a failure that the host explains. What it asserts stays the same."""
+    if pyfuncitem.get_closest_marker("live") is None:
+        return None
+    call = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
+    for attempt in range(1, ATTEMPTS + 1):
+        with Path(os.devnull).open("w") as nowhere, HostWatch(WATCHED_ABOVE, nowhere) as watched:
+            start_s = time.monotonic()
+            try:
+                pyfuncitem.obj(**call)
+                return True
+            except (Exception, pytest.fail.Exception):
+                watched.end()
+                host = watched.between(start_s, time.monotonic())
+                if attempt == ATTEMPTS or not host.took_much:
+                    raise
+                warnings.warn(f"{pyfuncitem.nodeid} is started again: {host}", HostWarning, stacklevel=2)
+        folder = tmp_path_factory(pyfuncitem).mktemp("again")
+        if "tmp_path" in call:
+            call["tmp_path"] = folder
+        for argument in call.values():
+            if hasattr(argument, "start_again"):
+                argument.start_again(folder)
+    raise AssertionError("unreachable")
+
+
+def tmp_path_factory(item: pytest.Function) -> pytest.TempPathFactory:
+    """The session's factory of folders, for a test that did not ask for it."""
+    factory: pytest.TempPathFactory = item._request.getfixturevalue("tmp_path_factory")
+    return factory

@@ -1,0 +1,68 @@
+"""What the host takes, as bare timers and the kernel see it; made-up stalls, and one that is real."""
+
+import asyncio
+import os
+import time
+from pathlib import Path
+
+import bare_timer
+import host
+import pytest
+from bare_timer import Stall
+
+
+def test_a_stall_costs_the_beats_that_were_due_in_it():
+    assert host.kept([], 10.0, 20.0) == 1.0
+    assert host.kept([Stall(11.0, 11.0505)], 10.0, 20.0) == pytest.approx(1.0 - 50 / 10_000)
+    assert host.kept([Stall(9.0, 10.5), Stall(19.9, 30.0), Stall(40.0, 50.0)], 10.0, 20.0) == pytest.approx(0.94)
+    assert host.kept([Stall(0.0, 99.0)], 10.0, 20.0) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "took_much"),
+    [
+        ({}, False),
+        ({"bare_worst_ms": 9.9}, False),
+        ({"bare_worst_ms": 10.0}, True),
+        ({"bare_kept": 0.98}, True),
+        ({"waited": {"daemon": 0.02, "simulated device": 0.2}}, True),
+        ({"steal": 0.5}, False),  # what was stolen while nobody wanted it did no harm; a timer would have seen it
+    ],
+)
+def test_what_was_taken_is_judged_by_what_a_program_would_have_missed(changes, took_much):
+    calm = host.Host(steal=0.0, bare_kept=1.0, bare_worst_ms=1.2, waited={})
+    assert calm._replace(**changes).took_much is took_much
+
+
+def test_a_timer_on_every_processor_and_a_process_that_waits(tmp_path: Path):
+    with (tmp_path / "log").open("w") as log, host.HostWatch(0, log) as watched:
+        watched.wait_for("test", os.getpid())
+        start_s = time.monotonic()
+        while time.monotonic() < start_s + 1.5:
+            pass
+        watched.end()
+        found = watched.between(start_s, time.monotonic())
+        watched.end()
+    assert 0.0 <= found.steal <= 1.0
+    assert 0.0 <= found.bare_kept <= 1.0
+    assert set(found.waited) == {"test"}
+    assert (tmp_path / "log").read_text() == ""
+    assert len(watched._stalls) == min(len(os.sched_getaffinity(0)), host.MOST_TIMERS)
+
+
+def test_a_timer_that_is_held_up_says_for_how_long():
+    async def beats() -> list[int]:
+        ended, seen = asyncio.Event(), []
+
+        def on_beat(heartbeat, beats, now_ns):
+            seen.append(beats)
+            if len(seen) == 3:
+                time.sleep(0.02)
+            if len(seen) == 6:
+                ended.set()
+
+        await bare_timer.beat(bare_timer.PERIOD_NS, on_beat, ended)
+        return seen
+
+    assert asyncio.run(beats())[3] >= 20
+    assert Stall(1.0, 1.25).length_ms == pytest.approx(250.0)

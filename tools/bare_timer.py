@@ -1,0 +1,88 @@
+"""A bare timer: what this machine gives a thread that asks for nothing but to be woken in every control period.
+
+It has the daemon's heartbeat, event loop and scheduling, and no controller and no device: what it misses the daemon
+would have missed too. `benchmark loop` lets it carry the daemon's clients. Run as a script it stays on one processor
+until SIGTERM, and prints when it stood still.
+"""
+
+import argparse
+import asyncio
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import uvloop
+
+from tormagd.config import RealTime
+from tormagd.daemon.heartbeat import Heartbeat
+from tormagd.daemon.realtime import freeze_garbage, prepare
+
+PERIOD_NS = 1_000_000
+NS = 1_000_000_000
+
+OnBeat = Callable[[Heartbeat, int, int], None]
+"""Called with the heartbeat, the beats that this one stands for, and the time on CLOCK_MONOTONIC, ns."""
+
+
+class Stall(NamedTuple):
+    """A time without a beat: from when the first missed beat was due until the next one came, CLOCK_MONOTONIC, s."""
+
+    start_s: float
+    end_s: float
+
+    @property
+    def length_ms(self) -> float:
+        """How long it took, ms."""
+        return (self.end_s - self.start_s) * 1e3
+
+
+async def beat(period_ns: int, on_beat: OnBeat, ended: asyncio.Event) -> None:
+    """Calls `on_beat` in every period until `ended` is set. `prepare` has been called before."""
+    heartbeat = Heartbeat(period_ns)
+
+    def woken() -> None:
+        beats = heartbeat.beats()
+        if beats:
+            on_beat(heartbeat, beats, time.monotonic_ns())
+
+    freeze_garbage()
+    loop = asyncio.get_running_loop()
+    loop.add_reader(heartbeat.fileno(), woken)
+    await ended.wait()
+    loop.remove_reader(heartbeat.fileno())
+    heartbeat.close()
+
+
+async def stalls_until_ended(realtime: RealTime, period_ns: int) -> list[Stall]:
+    """Whatever kept a beat back for longer than a period, until SIGTERM or SIGINT."""
+    prepare(realtime)
+    ended = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, ended.set)
+    found: list[Stall] = []
+
+    def on_beat(heartbeat: Heartbeat, beats: int, now_ns: int) -> None:
+        first_due_ns = heartbeat.due_ns - (beats - 1) * period_ns
+        if now_ns - first_due_ns > period_ns:
+            found.append(Stall(first_due_ns / NS, now_ns / NS))
+
+    await beat(period_ns, on_beat, ended)
+    return found
+
+
+def main() -> int:
+    """Beats on one processor; prints the stalls as JSON pairs of seconds at its end."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cpu", type=int, required=True, help="the processor it stays on")
+    parser.add_argument("--fifo", type=int, default=0, help="SCHED_FIFO priority; 0, or refused: ordinary scheduling")
+    options = parser.parse_args()
+    realtime = RealTime(fifo_priority=options.fifo, cpus=(options.cpu,))
+    print(json.dumps(uvloop.run(stalls_until_ended(realtime, PERIOD_NS))))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
