@@ -40,6 +40,7 @@ BEYOND_MM = 2.0
 "The sweeps go so far beyond the scene's gaps."
 STOPS_MM = 2.5
 "The bench's switches stand so far beyond the scene's gaps."
+BENCH_MOST_N = 20.0
 GAP_STEP_MM = 3.0
 HOLD_GAP_MM, HOLD_STROKES = 46.0, 150
 BEGIN_S = 8.0
@@ -170,7 +171,10 @@ def bench_scene(scene: Scene) -> Scene:
         gap_closed_mm=scene.insert.gap_closed_mm - BEYOND_MM,
         gap_open_mm=scene.insert.gap_open_mm + STOPS_MM,
     )
-    return msgspec.structs.replace(scene, insert=stroke)
+    # and no force that they give is a fault there
+    return msgspec.structs.replace(
+        scene, insert=stroke, force=msgspec.structs.replace(scene.force, most_N=BENCH_MOST_N)
+    )
 
 
 def bench(plant: PlantParameters, scene: Scene) -> PlantParameters:

@@ -24,7 +24,7 @@ from tormagd.control.plan import Plan
 from tormagd.control.step import Stepper
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.hand import RecordedHand, SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 from tormagd.simulation.plant import Plant
 
@@ -112,7 +112,8 @@ def run(plant_name: str = "sample_1", config: Config | None = None) -> dict[str,
 
 def settled_loop(config: Config, parameters: PlantParameters) -> ClosedLoop:
     """A loop that is homed, enabled, and at rest at START_MM."""
-    device = VirtualDevice(parameters, SteadyHand(), seed=1)
+    # a handle in motion would feel forces over the scene's at the closed end, which is a fault
+    device = VirtualDevice(parameters, RecordedHand((0.0,), (0.0,)), seed=1)
     loop = ClosedLoop(config, Stepper(config, load_scene("coronary")), None, device)
     loop.arm(hold(95.0, 0.0))
     drive(loop, START_MM, 3.0)

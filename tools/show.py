@@ -59,6 +59,7 @@ FASTEST = 0.1
 "Share of the ticks that is called the fastest."
 OF_TIME = frozenset(
     {
+        Fault.HOST_STALL,
         Fault.LINK_LOST,
         Fault.MEASUREMENT_STALE,
         Fault.FOLLOWING_ERROR,

@@ -301,7 +301,7 @@ def test_a_scene_beyond_what_the_device_reaches_is_refused(
     if not is_served:
         refused = capsys.readouterr().err
         assert f"scene x: {force.splitlines()[1].removesuffix('.0').replace('most', 'force.most')}" in refused
-        assert "allowed is 0.54..4.87" in refused
+        assert "allowed is 0.65..5.43" in refused
 
 
 def test_version_and_usage(capsys) -> None:

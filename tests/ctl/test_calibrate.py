@@ -105,10 +105,12 @@ def test_a_good_sweep_gives_a_model_that_knows_what_it_was_judged_on(table):
     assert metrics["judged_rows"] == (data.cycle == 1).sum()
     assert metrics["judged_rows"] + metrics["train_rows"] + metrics["validation_rows"] == len(data)
     assert (model.metadata.insert, model.metadata.created) == (INSERT, CREATED)
-    # what the shipped model, made from a bench sweep of the same plant, says of a turning handle
+    # what the shipped model, made from bench sweeps of the same plant and freed of memory, says of a turning handle,
+    # less what the plant's elastomer has relaxed
+    relaxed = 1.0 - sum(load_plant("sample_1").relaxation.fractions)
     shipped = load_model(model_path("torque_mre_50_40", Path()), element="torque", insert=INSERT)
     asked = [[2.0, 30.0, field, 40.0] for field in np.linspace(*model.field_range_mT, 9)]
-    assert model.predict(asked) == pytest.approx(shipped.predict(asked), rel=0.08)
+    assert model.predict(asked) == pytest.approx(relaxed * shipped.predict(asked), rel=0.08)
 
 
 def test_the_whole_process_writes_model_and_training_data(sweeps, tmp_path, capsys):

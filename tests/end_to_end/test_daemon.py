@@ -36,7 +36,8 @@ def test_below_the_least_force_says_so(rig):
     rig.ask(0.1)
     rig.until(lambda: "F_MIN" in rig.telemetry().limits, "F_MIN shown")
     newest = rig.telemetry()
-    assert newest.governed_cf == pytest.approx(rig.status()["least_N"], abs=1e-3)
+    # both are what the device has shown by then, a moment apart
+    assert newest.governed_cf == pytest.approx(rig.status()["least_N"], abs=5e-3)
     explained = {detail["code"]: detail["remedy"] for detail in rig.status()["limit_details"]}
     assert explained["F_MIN"]
 

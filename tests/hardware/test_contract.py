@@ -386,6 +386,13 @@ TRANSPORTS: dict[str, Callable[[VirtualDevice, Path], FarEnd]] = {
 }
 
 
+EVERY_TRANSPORT = [
+    # all who use this group on a machine hear each other: these tests do not run beside one another
+    pytest.param(name, marks=pytest.mark.live) if name == "udp_multicast" else name
+    for name in TRANSPORTS
+]
+
+
 def _waiting(fd: int) -> int:
     """Bytes that can be read from a terminal: a kernel thread brings them across, and takes its time."""
     return int(struct.unpack("i", fcntl.ioctl(fd, termios.FIONREAD, bytes(4)))[0])
@@ -543,7 +550,7 @@ def check_limits(samples: list[Sample]) -> None:
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-@pytest.mark.parametrize("transport", TRANSPORTS)
+@pytest.mark.parametrize("transport", EVERY_TRANSPORT)
 def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     transport: str, case: Case, moving: ClosedLoop, lines: Callable[..., Line]
 ) -> None:
@@ -587,7 +594,7 @@ def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
     assert min(sample.truth.gap_mm for sample in samples) > faulted.truth.gap_mm - COASTING_MM
 
 
-@pytest.mark.parametrize("transport", TRANSPORTS)
+@pytest.mark.parametrize("transport", EVERY_TRANSPORT)
 def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Callable[..., Line]) -> None:
     device = VirtualDevice(load_plant("sample_1"), parse_hand("steady"), (), 1)
     tap = Tap(lines(transport, device, Case(Twice)))
@@ -606,7 +613,7 @@ def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Ca
 
 
 @pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES.items() if name != "cut"])
-@pytest.mark.parametrize("transport", TRANSPORTS)
+@pytest.mark.parametrize("transport", EVERY_TRANSPORT)
 def test_host_and_device_meet_on_any_line_that_is_not_cut(
     transport: str, case: Case, lines: Callable[..., Line]
 ) -> None:

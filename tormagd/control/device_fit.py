@@ -67,20 +67,22 @@ def observe(
     *,
     adapts_in_s: float,
     bounds: tuple[float, float],
+    error_N2_s: float = ERROR_N2_S,
 ) -> tuple[DeviceFit, bool]:
     """The fit after `measured_N` where the model says `model_N`, `elapsed_s` after the last, and whether the scale is
-    held at one of its `bounds`. In the long run the offset is learned in about `adapts_in_s`. All are finite."""
+    held at one of its `bounds`. In the long run the offset is learned in about `adapts_in_s`; `error_N2_s` is the
+    density of what the model does not follow. All are finite."""
     if elapsed_s <= 0.0:
         return fit, False
     # both are forgotten towards their spread, which keeps the variances those of a believable device
     keeps_scale = math.exp(-elapsed_s / SCALE_LASTS_S)
-    keeps_offset = math.exp(-elapsed_s * ERROR_N2_S / (2.0 * OFFSET_SD_N**2 * adapts_in_s**2))
+    keeps_offset = math.exp(-elapsed_s * error_N2_s / (2.0 * OFFSET_SD_N**2 * adapts_in_s**2))
     scale_variance = SCALE_SD**2 + keeps_scale**2 * (fit.scale_variance - SCALE_SD**2)
     offset_variance = OFFSET_SD_N**2 + keeps_offset**2 * (fit.offset_variance_N2 - OFFSET_SD_N**2)
     covariance = keeps_scale * keeps_offset * fit.covariance_N
     by_scale = model_N * scale_variance + covariance
     by_offset = model_N * covariance + offset_variance
-    innovation_variance = model_N * by_scale + by_offset + ERROR_N2_S / elapsed_s
+    innovation_variance = model_N * by_scale + by_offset + error_N2_s / elapsed_s
     gain_scale, gain_offset = by_scale / innovation_variance, by_offset / innovation_variance
     error_N = measured_N - fit.force_N(model_N)
     wanted = fit.scale + gain_scale * error_N

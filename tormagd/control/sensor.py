@@ -8,7 +8,7 @@ has shown; its offset goes beyond what an elastomer relaxes; or the reading stan
 import math
 from typing import NamedTuple
 
-from tormagd.control.device_fit import LEAST_SCALE, MOST_SCALE, RELAXES, SURE, DeviceFit
+from tormagd.control.device_fit import LEAST_SCALE, MOST_SCALE, RELAXES, SURE, DeviceFit, observe
 
 NOISE_N = 0.03
 "What noise, and the model's own error, leave of a mean over FILTER_S."
@@ -23,6 +23,9 @@ FROZEN_S = 0.1
 DOUBTED_S = 0.05
 "Evidence for so long is doubt."
 TRUSTED_AGAIN_S = 1.0
+"A sensor that reads, for so long, what a device gives that is like most, is believed anew."
+SLOW_S, SLOW_ERROR_N2_S = 5.0, 3e-4
+"A fit that forgets slowly, and takes the model at its word, tells an offset from a scale best."
 MEMORY_S = 900.0
 "The slowest of the elastomer's time constants."
 
@@ -42,6 +45,7 @@ class Sensor(NamedTuple):
     before: DeviceFit = DeviceFit()
     kept: DeviceFit = DeviceFit()
     kept_s: float = 0.0
+    slow: DeviceFit = DeviceFit()
 
 
 def judge(sensor: Sensor, fit: DeviceFit, model_N: float, reading_N: float, elapsed_s: float) -> Sensor:
@@ -55,14 +59,26 @@ def judge(sensor: Sensor, fit: DeviceFit, model_N: float, reading_N: float, elap
     if not is_first:
         loaded_N = sensor.loaded_N + elapsed_s / (MEMORY_S + elapsed_s) * (model_N - sensor.loaded_N)
     still_s = sensor.still_s + elapsed_s if reading_N == sensor.reading_N else 0.0
+    slow, _ = observe(
+        sensor.slow,
+        model_N,
+        reading_N,
+        elapsed_s,
+        adapts_in_s=SLOW_S,
+        bounds=(LEAST_SCALE, MOST_SCALE),
+        error_N2_s=SLOW_ERROR_N2_S,
+    )
     is_strange = (
         still_s > FROZEN_S
         or not _least_N(model_N, loaded_N) <= measured_N <= _most_N(model_N)
         or abs(measured_N - sensor.before.force_N(model_N)) > JUMP_N + SURE * sensor.before.deviation_N(model_N)
-        or _is_beyond(fit, max(model_N, loaded_N))
+        or _is_beyond(slow, max(model_N, loaded_N))
     )
+    if sensor.is_doubted:  # once doubted, it has to read what most devices do, not what one at the edge might
+        new = DeviceFit()
+        is_strange = still_s > FROZEN_S or abs(measured_N - new.force_N(model_N)) > new.deviation_N(model_N)
     return _judged(sensor, fit, is_strange, elapsed_s)._replace(
-        reading_N=reading_N, still_s=still_s, measured_N=measured_N, loaded_N=loaded_N
+        reading_N=reading_N, still_s=still_s, measured_N=measured_N, loaded_N=loaded_N, slow=slow
     )
 
 

@@ -239,7 +239,6 @@ class Daemon:
         setpoint = self._endpoint.inbox.newest
         now_s = time.monotonic()
         is_current = setpoint is not None and now_s - setpoint.stamp_s <= setpoint.valid_for_s
-        least_N = self._core.planner.portrait.least_N
         timeout_s = self._config.device.measurement_timeout_ms * 1e-3
         return Conditions(
             connected=measurement is not None,
@@ -248,9 +247,13 @@ class Daemon:
             busy=self._is_busy(),
             device_latched=measurement is not None and measurement.is_latched,
             requested_N=setpoint.force_N if setpoint is not None and is_current else None,
-            neutral_N=least_N + self._config.limits.neutral_margin_N,
+            neutral_N=self._least_N() + self._config.limits.neutral_margin_N,
             sensor_doubted=self._inference.state.sensor.is_doubted,
         )
+
+    def _least_N(self) -> float:
+        """F_min of this device, as far as it has shown itself."""
+        return self._inference.state.device.force_N(self._core.planner.portrait.least_N)
 
     def _build_status(self) -> dict[str, Any]:
         snapshot_ = self._snapshot
@@ -266,8 +269,8 @@ class Daemon:
             "version": __version__,
             "scene": self._core.scene.name,
             "uptime_s": round(time.monotonic() - self._started_s, 1),
-            "least_N": round(self._core.planner.portrait.least_N, 3),
-            "most_N": round(self._core.planner.portrait.most_N, 3),
+            "least_N": round(self._least_N(), 3),
+            "most_N": round(shown.force_N(self._core.planner.portrait.most_N), 3),
             "trim": round(self._inference.state.trim, 4),
             "device": {
                 "scale": round(shown.scale, 4),

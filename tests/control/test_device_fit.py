@@ -1,0 +1,100 @@
+"""What a device shows of itself: scale told from offset as far as its forces allow, and no further."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tormagd.control.device_fit import (
+    LEAST_SCALE,
+    MOST_SCALE,
+    OFFSET_SD_N,
+    SCALE_SD,
+    SURE,
+    DeviceFit,
+    observe,
+)
+
+PERIOD_S = 0.004
+BOUNDS = (0.6, 1.6)
+NEW = DeviceFit()
+
+
+def shown(levels: list[tuple[float, float]], scale: float, offset_N: float, fit: DeviceFit = NEW) -> DeviceFit:
+    """The fit after a device of that scale and offset has been held at model forces for some time each, with noise."""
+    random = np.random.default_rng(1)
+    for seconds, model_N in levels:
+        for noise_N in random.normal(0.0, 0.01, round(seconds / PERIOD_S)).tolist():
+            measured_N = scale * model_N + offset_N + noise_N
+            fit, _ = observe(fit, model_N, measured_N, PERIOD_S, adapts_in_s=0.5, bounds=BOUNDS)
+    return fit
+
+
+@pytest.mark.parametrize(("scale", "offset_N"), [(1.0, 0.0), (0.7, -0.05), (1.4, -0.1), (1.2, 0.05)])
+def test_two_forces_tell_scale_and_offset_apart(scale: float, offset_N: float) -> None:
+    fit = shown([(1.0, 0.7), (1.0, 2.0), (1.0, 0.7)], scale, offset_N)
+    for model_N in (0.7, 2.0):
+        assert fit.force_N(model_N) == pytest.approx(scale * model_N + offset_N, abs=0.07)
+    assert fit.scale == pytest.approx(scale, abs=0.04)
+
+
+def test_one_force_is_right_where_it_was_shown_and_uncertain_elsewhere() -> None:
+    fit = shown([(2.0, 0.7)], 1.3, 0.0)
+    assert fit.force_N(0.7) == pytest.approx(0.91, abs=0.01)
+    assert fit.deviation_N(0.7) < 0.07
+    assert fit.deviation_N(2.0) > 2.0 * fit.deviation_N(0.7)
+    # and honest about it: what it really gives there lies within what it is taken to lie within
+    assert abs(fit.force_N(2.0) - 2.6) < SURE * fit.deviation_N(2.0)
+
+
+def test_an_offset_is_learned_in_its_time_and_the_scale_stays() -> None:
+    """What relaxes is an offset: a device that is known is not believed to have become another."""
+    known = shown([(1.0, 0.7), (2.0, 2.0)], 1.1, 0.0)
+    drifted = shown([(1.5, 2.0)], 1.1, -0.1, known)
+    assert drifted.force_N(2.0) == pytest.approx(2.1, abs=0.02)
+    assert drifted.scale == pytest.approx(1.1, abs=0.05)
+
+
+def test_a_scale_beyond_its_bounds_is_held_and_said() -> None:
+    fit, is_held = observe(DeviceFit(), 1.0, 9.0, 1.0, adapts_in_s=0.5, bounds=BOUNDS)
+    assert is_held
+    assert fit.scale == BOUNDS[1]
+
+
+def test_force_and_model_are_each_others_inverse() -> None:
+    fit = DeviceFit(1.3, -0.2)
+    assert fit.model_N(fit.force_N(1.7)) == pytest.approx(1.7)
+
+
+@pytest.mark.parametrize("levels", [[], [(0.2, 0.7)], [(2.0, 0.7)], [(2.0, 0.7), (2.0, 1.6)]])
+@pytest.mark.parametrize("scale", [LEAST_SCALE, 0.8, 1.0, 1.2, MOST_SCALE])
+def test_what_is_surely_within_is_within(levels: list[tuple[float, float]], scale: float) -> None:
+    """However little has been shown, and whatever the device: never over, but for the two in a hundred of `SURE`."""
+    most_N = 2.5
+    model_N = shown(levels, scale, 0.0).surely_within_N(most_N)
+    allowed_N = most_N if levels else most_N * MOST_SCALE / (1.0 + SURE * SCALE_SD)
+    assert scale * model_N <= 1.03 * allowed_N
+    assert most_N / MOST_SCALE <= model_N <= most_N / LEAST_SCALE
+
+
+def test_the_ceiling_moves_once_a_weak_device_has_shown_itself() -> None:
+    weak = shown([(2.0, 0.7), (2.0, 1.6)], 0.75, 0.0)
+    assert weak.surely_within_N(2.5) > 1.5 * DeviceFit().surely_within_N(2.5)
+
+
+readings = st.tuples(st.floats(0.3, 8.0), st.floats(-33.0, 33.0), st.floats(0.0, 0.02))
+
+
+@settings(deadline=None)
+@given(history=st.lists(readings, max_size=60))
+def test_no_history_makes_it_impossible(history: list[tuple[float, float, float]]) -> None:
+    fit = DeviceFit()
+    for model_N, measured_N, elapsed_s in history:
+        fit, _ = observe(fit, model_N, measured_N, elapsed_s, adapts_in_s=0.5, bounds=BOUNDS)
+        assert all(math.isfinite(value) for value in fit)
+        assert 0.0 <= fit.scale_variance <= SCALE_SD**2 * (1.0 + 1e-9)
+        assert 0.0 <= fit.offset_variance_N2 <= OFFSET_SD_N**2 * (1.0 + 1e-9)
+        # a covariance matrix: no combination of both has a negative variance
+        assert fit.covariance_N**2 <= fit.scale_variance * fit.offset_variance_N2 * (1.0 + 1e-6) + 1e-15
