@@ -297,9 +297,11 @@ def judged(
     lasting = -np.inf
     if len(excess) > window:
         lasting = float(np.lib.stride_tricks.sliding_window_view(excess, window).min(axis=1).max())
-    short = np.where(arrived, wanted_N - along_N, -np.inf)
+    # below what the open gap brakes there is nothing to fall short of
+    is_reached = asked_N > floor_N
+    short = np.where(arrived & is_reached, wanted_N - along_N, -np.inf)
     under = float(np.lib.stride_tricks.sliding_window_view(short, window).min(axis=1).max())
-    steady = np.flatnonzero(slides & (waited > SETTLED_S) & even_for(speed_mm_s, SETTLED_S))[::100]
+    steady = np.flatnonzero(slides & is_reached & (waited > SETTLED_S) & even_for(speed_mm_s, SETTLED_S))[::100]
     errors = zip(np.abs(speed_mm_s[steady]), asked_N[steady], (along_N - wanted_N)[steady], strict=True)
     found = [(float(speed), float(asked), float(error)) for speed, asked, error in errors]
     settled = tuple(point for point in found if point[0] >= SLOWEST_MM_S)

@@ -14,8 +14,8 @@ SCALE_SD = 0.17
 "Spread of the scale of devices not yet seen: friction, shear modulus and field each differ evenly within 12%."
 LEAST_SCALE, MOST_SCALE = 0.64, 1.53
 "All three at their ends, and the field's exponent at its own, -1.34 and -1.26: no believable device is beyond."
-RELAXES = 0.21
-"The greatest share of its force that an elastomer loses in the course of hours."
+RELAXES = (0.1, 0.21)
+"The least and the greatest share of its force that an elastomer loses in the course of hours."
 OFFSET_SD_N = 0.1
 "Of the offset: what relaxation and hysteresis do around 0.5 N."
 ERROR_N2_S = 0.002
@@ -87,9 +87,14 @@ def observe(
     error_N = measured_N - fit.force_N(model_N)
     wanted = fit.scale + gain_scale * error_N
     scale = min(max(wanted, bounds[0]), bounds[1])
+    offset_N = fit.offset_N + gain_offset * error_N
+    if scale != wanted:
+        # a scale that is held is known: what is left of the error is the offset's alone
+        by_itself = offset_variance / (offset_variance + error_N2_s / elapsed_s)
+        offset_N = fit.offset_N + by_itself * (measured_N - scale * model_N - fit.offset_N)
     learned = DeviceFit(
         scale,
-        fit.offset_N + gain_offset * error_N,
+        offset_N,
         scale_variance - gain_scale * by_scale,
         covariance - gain_scale * by_offset,
         offset_variance - gain_offset * by_offset,

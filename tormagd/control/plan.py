@@ -224,10 +224,11 @@ class Planner:
         doubt = (Limit.SENSOR,) if state.sensor.is_doubted else ()
         if estimate is None or model_N is None or estimate.number == state.read:
             return state.sensor, state.device, doubt
-        if abs(estimate.handle.rate_mm_s) < MOVING_MM_S:
+        rate_mm_s = abs(estimate.handle.rate_mm_s)
+        if rate_mm_s < MOVING_MM_S:
             return state.sensor, state.device, doubt
         elapsed_s = min(max(now_s - state.plan.time_s, 0.0), LONGEST_LESSON_S)
-        sensor = judge(state.sensor, state.device, model_N, estimate.force_N, elapsed_s)
+        sensor = judge(state.sensor, state.device, model_N, rate_mm_s, estimate.force_N, elapsed_s)
         if sensor.is_doubted:
             return sensor, DeviceFit(), (Limit.SENSOR,)
         settings = self._config.trim

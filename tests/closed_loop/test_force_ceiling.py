@@ -1,0 +1,228 @@
+"""The brake is not closed by mistake: three layers that each hold alone, and a sensor that is judged (synthetic)."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.config import Config
+from tormagd.control import plan as planning
+from tormagd.control.core import Core, build_core
+from tormagd.control.governor import Governed, GovernorState, TimedSetpoint
+from tormagd.control.plan import Plan
+from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.operating_state import OperatingState, RefusedError
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import ReversingHand, SteadyHand
+from tormagd.simulation.parameters import load_plant
+
+
+class LyingSensor:
+    """Before a device's own force sensor from `from_s` (its time) on; `lie` makes a false reading of a true one."""
+
+    def __init__(self, device: VirtualDevice, lie: Callable[[float], float], from_s: float = 0.0) -> None:
+        self._own, self._lie, self._from_s, self._time_s = device.messages.plant._force_sensor, lie, from_s, 0.0
+        device.messages.plant._force_sensor = self  # type: ignore[assignment]
+
+    def advance(self, time_s: float, force_N: float) -> None:
+        """See `simulation.plant.ForceSensor`."""
+        self._time_s = time_s
+        self._own.advance(time_s, force_N)
+
+    @property
+    def reading_N(self) -> float:
+        """What is shown, rounded as the wire does."""
+        own = self._own.reading_N
+        return own if self._time_s < self._from_s else min(max(self._lie(own), -20.0), 20.0)
+
+
+def frozen() -> Callable[[float], float]:
+    """A sensor that goes on showing its first reading."""
+    first: list[float] = []
+
+    def lie(reading_N: float) -> float:
+        first[:] = first or [reading_N]
+        return first[0]
+
+    return lie
+
+
+CONFIG = Config(scene="coronary")
+ASKED_N, F_MIN_N, MOST_N = 1.5, 0.65, 2.0
+VALID_S = 0.2
+CEILING_N = 1.25 * MOST_N + 0.1
+
+
+def joined(core: Core, sample: str = "sample_1", hand: object = None) -> ClosedLoop:
+    device = VirtualDevice(load_plant(sample), hand or SteadyHand(), seed=1)  # type: ignore[arg-type]
+    return ClosedLoop(CONFIG, core.stepper, core.planner, device)
+
+
+def render(loop: ClosedLoop, asked_N: float, seconds: float) -> list[Sample]:
+    return list(loop.run(seconds, lambda now_s: TimedSetpoint(asked_N, now_s, VALID_S)))
+
+
+def worst_N(samples: list[Sample]) -> float:
+    return max(abs(sample.truth.force_N) for sample in samples)
+
+
+def named_s(samples: list[Sample]) -> float:
+    """When the sensor was named first, s from the first of these samples."""
+    doubted = [sample.time_s for sample in samples if Limit.SENSOR in sample.plan.limits]
+    assert doubted, "the sensor was never named"
+    return doubted[0] - samples[0].time_s
+
+
+# -- the sensor ----------------------------------------------------------------------------------------------------
+
+LIES: dict[str, Callable[[], Callable[[float], float]]] = {
+    "+0.3 N": lambda: lambda reading_N: reading_N + 0.3,
+    "-0.3 N": lambda: lambda reading_N: reading_N - 0.3,
+    "+0.5 N": lambda: lambda reading_N: reading_N + 0.5,
+    "-0.5 N": lambda: lambda reading_N: reading_N - 0.5,
+    "+1 N": lambda: lambda reading_N: reading_N + 1.0,
+    "-1 N": lambda: lambda reading_N: reading_N - 1.0,
+    "frozen": frozen,
+    "tenfold": lambda: lambda reading_N: 10.0 * reading_N,
+    "inverted": lambda: lambda reading_N: -reading_N,
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(lie: str) -> None:
+    loop = joined(build_core(CONFIG))
+    loop.arm()
+    render(loop, ASKED_N, 2.0)
+    LyingSensor(loop.device, LIES[lie](), loop.now_s)
+    samples = render(loop, ASKED_N, 3.0)
+    assert named_s(samples) < 0.5
+    assert worst_N(samples) < ASKED_N + 0.3
+
+
+@pytest.mark.parametrize("lie", ["-0.5 N", "+1 N", "-1 N", "frozen", "tenfold", "inverted"])
+def test_a_sensor_that_lies_from_the_beginning_keeps_the_device_disabled(lie: str) -> None:
+    loop = joined(build_core(CONFIG))
+    LyingSensor(loop.device, LIES[lie]())
+    loop.arm()
+    loop.command("disable")
+    for _ in range(1_500):
+        loop.tick()
+    with pytest.raises(RefusedError, match="force sensor") as refused:
+        loop.command("enable")
+    assert refused.value.code == "sensor_doubted"
+
+
+@pytest.mark.parametrize("lie", ["-0.3 N", "+0.5 N"])
+def test_an_offset_from_the_beginning_is_told_from_a_scale(lie: str) -> None:
+    loop = joined(build_core(CONFIG))
+    LyingSensor(loop.device, LIES[lie]())
+    loop.arm()
+    samples = render(loop, ASKED_N, 3.0)
+    assert named_s(samples) < 1.0
+    assert worst_N(samples) < ASKED_N + 0.3
+
+
+def test_a_sensor_that_reads_a_little_too_much_from_the_beginning_presses_less() -> None:
+    """It cannot be told from a stronger device with another field law; what it does is on the safe side."""
+    loop = joined(build_core(CONFIG))
+    LyingSensor(loop.device, LIES["+0.3 N"]())
+    loop.arm()
+    assert worst_N(render(loop, ASKED_N, 3.0)) < ASKED_N
+
+
+def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it() -> None:
+    loop = joined(build_core(CONFIG))
+    loop.arm()
+    render(loop, ASKED_N, 2.0)
+    LyingSensor(loop.device, LIES["-1 N"](), loop.now_s)
+    samples = render(loop, ASKED_N, 3.0)
+    assert samples[-1].state.safety.faults == (Fault.SENSOR,)
+    first = next(sample.time_s for sample in samples if sample.state.safety.faults)
+    assert first - samples[0].time_s == pytest.approx(2.06, abs=0.1)
+
+
+@pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
+def test_an_honest_sensor_is_believed(sample: str) -> None:
+    loop = joined(build_core(CONFIG), sample, ReversingHand(3.0))
+    loop.arm()
+    for asked_N in (0.7, 2.0, 0.7, 1.4):
+        samples = render(loop, asked_N, 3.0)
+        assert not any(Limit.SENSOR in sample.plan.limits for sample in samples)
+
+
+# -- layer a: the governed force -----------------------------------------------------------------------------------
+
+
+def test_the_governed_force_holds_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With no ceiling over gap and measured force, 1000 N asked give the scene's greatest."""
+    core = build_core(CONFIG)
+    monkeypatch.setattr(planning, "CEILING", 100.0)
+    monkeypatch.setattr(core.stepper, "_ceiling_N", math.inf)
+    loop = joined(core)
+    loop.arm()
+    samples = render(loop, 1_000.0, 2.5)
+    assert worst_N(samples) < MOST_N + 0.15
+    assert Limit.RANGE in samples[-1].plan.limits
+
+
+# -- layer b: the gap ----------------------------------------------------------------------------------------------
+
+
+def ask_for_six_newtons(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A governor that has gone mad."""
+
+    def mad(state: GovernorState, now_s: float, *_: object, **__: object) -> tuple[GovernorState, Governed]:
+        return GovernorState(now_s, 6.0), Governed(6.0, np.full(len(planning.PATH_S), 6.0), 0.0, (), 1.0)
+
+    monkeypatch.setattr(planning, "govern", mad)
+
+
+@pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
+def test_the_gap_holds_alone(monkeypatch: pytest.MonkeyPatch, sample: str) -> None:
+    core = build_core(CONFIG)
+    ask_for_six_newtons(monkeypatch)
+    monkeypatch.setattr(core.stepper, "_ceiling_N", math.inf)
+    loop = joined(core, sample)
+    loop.arm()
+    samples = render(loop, 1.0, 4.0)
+    assert MOST_N < worst_N(samples) < CEILING_N
+    assert Limit.CEILING in samples[-1].plan.limits
+    assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
+
+
+# -- layer c: the measured force -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
+def test_the_measured_force_holds_alone(sample: str) -> None:
+    """A plan that closes the gap without any word of forces: the force over the ceiling opens it, at a bounded rate."""
+    loop = joined(build_core(CONFIG), sample)
+    loop.arm()
+    shut = [loop.tick(plan=gap_plan(47.0, loop.now_s)) for _ in range(4_000)]
+    assert shut[-1].state.safety.faults == (Fault.OVER_FORCE,)
+    assert any(Limit.OVER_FORCE in sample.output.limits for sample in shut)
+    forces_N = np.array([sample.truth.force_N for sample in shut])
+    over_s = 1e-3 * np.count_nonzero(forces_N > CEILING_N)
+    assert over_s < 0.3
+    assert forces_N.max() < CEILING_N + 0.5
+    # the force does not vanish at once, which would be a hazard of its own
+    falls_N_s = (forces_N[:-20] - forces_N[20:]) / 0.02
+    assert 1.0 < falls_N_s.max() < 12.0
+    assert shut[-1].truth.gap_mm > 90.0
+
+
+def gap_plan(gap_mm: float, now_s: float) -> Plan:
+    """A plan for a gap instead of a force."""
+    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
+
+
+@pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
+def test_a_start_from_rest_is_not_over_force(sample: str) -> None:
+    """Static friction is up to 1.25 times the kinetic one."""
+    loop = joined(build_core(CONFIG), sample, ReversingHand(2.0))
+    loop.arm()
+    samples = render(loop, MOST_N, 6.0)
+    assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
+    assert worst_N(samples) < CEILING_N
