@@ -373,10 +373,10 @@ def model_on_plant() -> Json:
 
 def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures]]]:
     """Everything; the keys are those of the public contract, and `model`, `peak_N`, `settled_N`, `rows`."""
-    draws = QUICK_DRAWS if options.quick else DRAWS
+    draws = QUICK_DRAWS if options.quick else options.draws
     asked = list(cases(draws))
     holds = [(name, force) for name in held_devices(draws) for force in LOW_N]
-    lasts_s = QUICK_LOW_HOLD_S if options.quick else LOW_HOLD_S
+    lasts_s = QUICK_LOW_HOLD_S if options.quick else options.hold_s
     with concurrent.futures.ProcessPoolExecutor(max_workers=options.jobs) as pool:
         waiting = [pool.submit(run, case) for case in asked]
         low = [pool.submit(low_hold, name, force, lasts_s) for name, force in holds]
@@ -389,7 +389,9 @@ def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures
         bar.close()
     drawn = [figures.steps_N for case, figures in found if figures.steps_N and case.device.startswith("draw")]
     slow = [abs(error) for case, figures in found if case.hand == "1 mm/s" for error in figures.slow_N]
-    settled = [abs(error) for _, figures in found for _, _, error in figures.settled]
+    # where a publisher says another motion than the handle's, it gets the force for that
+    as_it_is = [figures for case, figures in found if case.displacement_mm is None and case.rate_mm_s is None]
+    settled = [abs(error) for figures in as_it_is for _, _, error in figures.settled]
     first, again, overshoot = (np.array(part) for part in zip(*drawn, strict=True))
     result: Json = {
         "over_N": max(figures.over_N for _, figures in found),
@@ -473,7 +475,10 @@ def picture(path: Path, found: list[tuple[Case, Figures]]) -> None:
     own, others = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, title, is_own in ((own, "sample 1", True), (others, "samples 2, 3 and draws", False)):
         points = [
-            point for case, figures in found if (case.device == "sample_1") is is_own for point in figures.settled
+            point
+            for case, figures in found
+            if (case.device == "sample_1") is is_own and case.displacement_mm is None and case.rate_mm_s is None
+            for point in figures.settled
         ]
         speeds, forces, errors = np.array(points).T
         jitter = np.random.default_rng(0).uniform(0.94, 1.06, (2, len(points)))
@@ -491,6 +496,10 @@ def main() -> int:
     """Measures, prints, and draws; 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a sample of it: two draws, short holds")
+    parser.add_argument("--draws", type=int, default=DRAWS, help=f"random devices ({DRAWS})")
+    parser.add_argument(
+        "--hold-s", type=float, default=LOW_HOLD_S, help=f"a force under F_min is held ({LOW_HOLD_S:g})"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--picture", type=Path, help="PNG of the force error over handle speed and asked force")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")

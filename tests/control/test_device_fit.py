@@ -37,7 +37,7 @@ def test_two_forces_tell_scale_and_offset_apart(scale: float, offset_N: float) -
     fit = shown([(1.0, 0.7), (1.0, 2.0), (1.0, 0.7)], scale, offset_N)
     for model_N in (0.7, 2.0):
         assert fit.force_N(model_N) == pytest.approx(scale * model_N + offset_N, abs=0.07)
-    assert fit.scale == pytest.approx(scale, abs=0.04)
+    assert fit.scale == pytest.approx(scale, abs=0.06)
 
 
 def test_one_force_is_right_where_it_was_shown_and_uncertain_elsewhere() -> None:

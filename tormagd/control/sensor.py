@@ -16,7 +16,9 @@ FILTER_S = 0.01
 JUMP_N = 0.15
 "A device may depart so far from its fit of a moment ago: its hysteresis and its own friction at a creep do."
 VISCOUS_N_S_MM = 6e-4
-"And so much further for each mm/s that the handle goes at another speed than then."
+"And so much further for each mm/s that the handle goes at another speed than then,"
+SHAPE = 0.25
+"and for each newton that the model says more or less: Eq. 7 is flat where the gap is open, the power law is not."
 LEAST_OFFSET_N, MOST_OFFSET_N = -0.12, 0.3
 """Of a believable device that has not relaxed: another field law than the model's looks like an offset of up to 0.2 N.
 So a sensor that reads 0.3 N too much from the beginning may pass for such a device; it makes the brake press less."""
@@ -35,8 +37,8 @@ MEMORY_S = 900.0
 
 
 class Sensor(NamedTuple):
-    """What judging remembers. `before` and `kept` are the device's fit, and the handle's rate, of up to twice and once
-    KEPT_S ago."""
+    """What judging remembers. `before` and `kept` are the device's fit of up to twice and once KEPT_S ago, and
+    `before_at` and `kept_at` the model's force and the handle's rate then, N and mm/s."""
 
     is_doubted: bool = False
     evidence_s: float = 0.0
@@ -48,9 +50,9 @@ class Sensor(NamedTuple):
     loaded_N: float = 0.0
     "Mean of the model's force over MEMORY_S, at least the present one since it began."
     before: DeviceFit = DeviceFit()
-    before_mm_s: float = 0.0
     kept: DeviceFit = DeviceFit()
-    kept_mm_s: float = 0.0
+    before_at: tuple[float, float] = (0.0, 0.0)
+    kept_at: tuple[float, float] = (0.0, 0.0)
     kept_s: float = 0.0
     slow: DeviceFit = DeviceFit()
 
@@ -86,12 +88,12 @@ def judge(
     if sensor.is_doubted:  # once doubted, it has to read what most devices do, not what one at the edge might
         new = DeviceFit()
         is_strange = still_s > FROZEN_S or abs(measured_N - new.force_N(model_N)) > new.deviation_N(model_N)
-    return _judged(sensor, fit, rate_mm_s, is_strange, elapsed_s)._replace(
+    return _judged(sensor, fit, (model_N, rate_mm_s), is_strange, elapsed_s)._replace(
         reading_N=reading_N, still_s=still_s, measured_N=measured_N, loaded_N=loaded_N, slow=slow
     )
 
 
-def _judged(sensor: Sensor, fit: DeviceFit, rate_mm_s: float, is_strange: bool, elapsed_s: float) -> Sensor:
+def _judged(sensor: Sensor, fit: DeviceFit, at: tuple[float, float], is_strange: bool, elapsed_s: float) -> Sensor:
     if sensor.is_doubted:
         # as long without evidence as it takes to be trusted again
         evidence_s = 0.0 if is_strange else sensor.evidence_s + elapsed_s
@@ -105,18 +107,16 @@ def _judged(sensor: Sensor, fit: DeviceFit, rate_mm_s: float, is_strange: bool, 
     if is_strange or kept_s < KEPT_S:
         return sensor._replace(evidence_s=evidence_s, kept_s=kept_s)
     return sensor._replace(
-        evidence_s=evidence_s,
-        before=sensor.kept,
-        before_mm_s=sensor.kept_mm_s,
-        kept=fit,
-        kept_mm_s=rate_mm_s,
-        kept_s=0.0,
+        evidence_s=evidence_s, before=sensor.kept, kept=fit, before_at=sensor.kept_at, kept_at=at, kept_s=0.0
     )
 
 
 def _jump_N(sensor: Sensor, model_N: float, rate_mm_s: float) -> float:
-    change_mm_s = max(abs(rate_mm_s - sensor.before_mm_s), abs(rate_mm_s - sensor.kept_mm_s))
-    return JUMP_N + SURE * sensor.before.deviation_N(model_N) + VISCOUS_N_S_MM * change_mm_s
+    further_N = max(
+        SHAPE * abs(model_N - then_N) + VISCOUS_N_S_MM * abs(rate_mm_s - then_mm_s)
+        for then_N, then_mm_s in (sensor.before_at, sensor.kept_at)
+    )
+    return JUMP_N + SURE * sensor.before.deviation_N(model_N) + further_N
 
 
 def _least_N(model_N: float, loaded_N: float) -> float:
