@@ -284,7 +284,7 @@ def test_a_bad_configuration_ends_with_two_and_says_why_on_stderr(write, capsys,
     ("force", "is_served"),
     [
         ("least_N = 900.0\nmost_N = 1000.0", False),
-        ("least_N = 0.5\nmost_N = 5.0", False),
+        ("least_N = 0.5\nmost_N = 6.0", False),
         ("least_N = 0.0\nmost_N = 0.5", False),
         ("least_N = 0.0\nmost_N = 4.8", True),
     ],

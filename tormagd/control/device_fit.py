@@ -51,12 +51,13 @@ class DeviceFit(NamedTuple):
     def surely_within_N(self, most_N: float) -> float:
         """The most to ask of the model for the device to give no more than `most_N`: as far as it has shown itself,
         but no believable device is weaker than LEAST_SCALE or stronger than MOST_SCALE."""
-        low_N, high_N = most_N / MOST_SCALE, most_N / LEAST_SCALE
-        for _ in range(10):  # bisection to a thousandth
-            middle_N = (low_N + high_N) / 2.0
-            upper_N = self.force_N(middle_N) + SURE * self.deviation_N(middle_N)
-            low_N, high_N = (middle_N, high_N) if upper_N <= most_N else (low_N, middle_N)
-        return low_N
+        # scale m + offset + SURE sqrt(variance of that) = most, a quadratic: the smaller root is where the sum is meant
+        room_N, sure = most_N - self.offset_N, SURE * SURE
+        square = self.scale * self.scale - sure * self.scale_variance
+        half = self.scale * room_N + sure * self.covariance_N
+        rest = room_N * room_N - sure * self.offset_variance_N2
+        root_N = (half - math.sqrt(max(half * half - square * rest, 0.0))) / square
+        return min(max(root_N, most_N / MOST_SCALE), most_N / LEAST_SCALE)
 
 
 def observe(

@@ -1,5 +1,6 @@
 """The device's phase portrait: which forces a gap gives, and how fast a gap speed changes them."""
 
+from bisect import bisect_right
 from typing import NamedTuple
 
 import numpy as np
@@ -74,8 +75,8 @@ class LawOfField(NamedTuple):
     """The magnetoelastic law of the insert (Eq. 29 to 34) over the gaps of a portrait, scaled to its force: what the
     learned model is held against. Force and field rise along the arrays."""
 
-    force_N: Array
-    fields_mT: Array
+    force_N: list[float]
+    fields_mT: list[float]
 
     @classmethod
     def beside(cls, shown: Portrait, field: FieldOfGap, elastomer: Elastomer, geometry: Geometry) -> "LawOfField":
@@ -83,11 +84,11 @@ class LawOfField(NamedTuple):
         moments_Tm: Array = np.asarray(field.law.radial_moment_Tm(shown.gap_mm), dtype=np.float64)
         forces_N: Array = np.asarray(brake_force_N(moments_Tm, elastomer, geometry), dtype=np.float64)
         scale = float(np.median(shown.force_N / forces_N))
-        return cls(scale * forces_N, np.array([field.field_mT(gap_mm) for gap_mm in shown.gap_mm.tolist()]))
+        return cls((scale * forces_N).tolist(), [field.field_mT(gap_mm) for gap_mm in shown.gap_mm.tolist()])
 
     def field_mT(self, force_N: float) -> float:
         """The field for a force; that of the nearer end where none gives it."""
-        return float(np.interp(force_N, self.force_N, self.fields_mT))
+        return _interpolated(force_N, self.force_N, self.fields_mT)
 
 
 def portrait(model: ForceModel, field: FieldOfGap, cip_percent: float, gap_range_mm: tuple[float, float]) -> Portrait:
@@ -100,3 +101,14 @@ def portrait(model: ForceModel, field: FieldOfGap, cip_percent: float, gap_range
     features = np.array([[displacement_mm, rate_mm_s, field.field_mT(float(gap)), cip_percent] for gap in gaps])
     force = model.predict(features)
     return Portrait(gaps, force, np.abs(np.gradient(force, gaps)))
+
+
+def _interpolated(x: float, xs: list[float], ys: list[float]) -> float:
+    """Linear between the points of rising `xs`, and the outermost `ys` beyond: NumPy takes longer for one point."""
+    after = bisect_right(xs, x)
+    if after == 0:
+        return ys[0]
+    if after == len(xs):
+        return ys[-1]
+    share = (x - xs[after - 1]) / (xs[after] - xs[after - 1])
+    return ys[after - 1] + share * (ys[after] - ys[after - 1])

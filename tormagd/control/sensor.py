@@ -35,26 +35,33 @@ SLOW_S, SLOW_ERROR_N2_S = 5.0, 3e-4
 MEMORY_S = 900.0
 "The slowest of the elastomer's time constants."
 
+_NEW = DeviceFit()
 
-class Sensor(NamedTuple):
-    """What judging remembers. `before` and `kept` are the device's fit of up to twice and once KEPT_S ago, and
-    `before_at` and `kept_at` the model's force and the handle's rate then, N and mm/s."""
 
-    is_doubted: bool = False
-    evidence_s: float = 0.0
-    doubted_s: float = 0.0
-    "For how long it has been doubted while the handle slid."
-    reading_N: float = math.nan
-    still_s: float = 0.0
-    measured_N: float = math.nan
-    loaded_N: float = 0.0
-    "Mean of the model's force over MEMORY_S, at least the present one since it began."
+class Past(NamedTuple):
+    """What was heard: the newest reading and for how long it has stood still, a mean over FILTER_S, the mean of the
+    model's force over MEMORY_S, and the slow fit. `before` and `kept` are the device's own fit of up to twice and once
+    KEPT_S ago, and `before_at` and `kept_at` the model's force and the handle's rate then, N and mm/s."""
+
+    reading_N: float
+    still_s: float
+    measured_N: float
+    loaded_N: float
+    slow: DeviceFit
     before: DeviceFit = DeviceFit()
-    kept: DeviceFit = DeviceFit()
     before_at: tuple[float, float] = (0.0, 0.0)
+    kept: DeviceFit = DeviceFit()
     kept_at: tuple[float, float] = (0.0, 0.0)
     kept_s: float = 0.0
-    slow: DeviceFit = DeviceFit()
+
+
+class Sensor(NamedTuple):
+    """The judgement: whether it is doubted, for how long of sliding, and since when there is, or is no, evidence."""
+
+    is_doubted: bool = False
+    doubted_s: float = 0.0
+    evidence_s: float = 0.0
+    past: Past | None = None
 
 
 def judge(
@@ -62,16 +69,28 @@ def judge(
 ) -> Sensor:
     """The judgement after one reading along the motion of a handle that slides at `rate_mm_s`, `elapsed_s` after the
     last, where the model says `model_N` and the device has shown itself to be `fit`. All are finite."""
-    is_first = math.isnan(sensor.measured_N)
-    measured_N = reading_N
-    if not is_first:
-        measured_N = sensor.measured_N + elapsed_s / (FILTER_S + elapsed_s) * (reading_N - sensor.measured_N)
-    loaded_N = model_N
-    if not is_first:
-        loaded_N = sensor.loaded_N + elapsed_s / (MEMORY_S + elapsed_s) * (model_N - sensor.loaded_N)
-    still_s = sensor.still_s + elapsed_s if reading_N == sensor.reading_N else 0.0
+    past = _heard(sensor.past, model_N, reading_N, elapsed_s)
+    if sensor.is_doubted:
+        # it has to read for long what most devices do, not what one at the edge might
+        agrees = past.still_s <= FROZEN_S and abs(past.measured_N - _NEW.force_N(model_N)) <= _NEW.deviation_N(model_N)
+        evidence_s = sensor.evidence_s + elapsed_s if agrees else 0.0
+        return (
+            Sensor() if evidence_s > TRUSTED_AGAIN_S else Sensor(True, sensor.doubted_s + elapsed_s, evidence_s, past)
+        )
+    is_strange = _is_strange(past, model_N, rate_mm_s)
+    evidence_s = max(sensor.evidence_s + (elapsed_s if is_strange else -elapsed_s), 0.0)
+    if evidence_s > DOUBTED_S:
+        return Sensor(True, past=past)
+    if past.kept_s >= KEPT_S and not is_strange:
+        past = past._replace(
+            before=past.kept, before_at=past.kept_at, kept=fit, kept_at=(model_N, rate_mm_s), kept_s=0.0
+        )
+    return Sensor(False, 0.0, evidence_s, past)
+
+
+def _heard(past: Past | None, model_N: float, reading_N: float, elapsed_s: float) -> Past:
     slow, _ = observe(
-        sensor.slow,
+        _NEW if past is None else past.slow,
         model_N,
         reading_N,
         elapsed_s,
@@ -79,55 +98,40 @@ def judge(
         bounds=(LEAST_SCALE, MOST_SCALE),
         error_N2_s=SLOW_ERROR_N2_S,
     )
-    is_strange = (
-        still_s > FROZEN_S
-        or not _least_N(model_N, loaded_N) <= measured_N <= _most_N(model_N, loaded_N)
-        or abs(measured_N - sensor.before.force_N(model_N)) > _jump_N(sensor, model_N, rate_mm_s)
-        or _is_beyond(slow, max(model_N, loaded_N))
-    )
-    if sensor.is_doubted:  # once doubted, it has to read what most devices do, not what one at the edge might
-        new = DeviceFit()
-        is_strange = still_s > FROZEN_S or abs(measured_N - new.force_N(model_N)) > new.deviation_N(model_N)
-    return _judged(sensor, fit, (model_N, rate_mm_s), is_strange, elapsed_s)._replace(
-        reading_N=reading_N, still_s=still_s, measured_N=measured_N, loaded_N=loaded_N, slow=slow
-    )
-
-
-def _judged(sensor: Sensor, fit: DeviceFit, at: tuple[float, float], is_strange: bool, elapsed_s: float) -> Sensor:
-    if sensor.is_doubted:
-        # as long without evidence as it takes to be trusted again
-        evidence_s = 0.0 if is_strange else sensor.evidence_s + elapsed_s
-        if evidence_s > TRUSTED_AGAIN_S:
-            return Sensor()
-        return sensor._replace(evidence_s=evidence_s, doubted_s=sensor.doubted_s + elapsed_s)
-    evidence_s = max(sensor.evidence_s + (elapsed_s if is_strange else -elapsed_s), 0.0)
-    if evidence_s > DOUBTED_S:
-        return sensor._replace(is_doubted=True, evidence_s=0.0, doubted_s=0.0)
-    kept_s = sensor.kept_s + elapsed_s
-    if is_strange or kept_s < KEPT_S:
-        return sensor._replace(evidence_s=evidence_s, kept_s=kept_s)
-    return sensor._replace(
-        evidence_s=evidence_s, before=sensor.kept, kept=fit, before_at=sensor.kept_at, kept_at=at, kept_s=0.0
+    if past is None:
+        return Past(reading_N, 0.0, reading_N, model_N, slow)
+    return Past(
+        reading_N,
+        past.still_s + elapsed_s if reading_N == past.reading_N else 0.0,
+        past.measured_N + elapsed_s / (FILTER_S + elapsed_s) * (reading_N - past.measured_N),
+        past.loaded_N + elapsed_s / (MEMORY_S + elapsed_s) * (model_N - past.loaded_N),
+        slow,
+        past.before,
+        past.before_at,
+        past.kept,
+        past.kept_at,
+        past.kept_s + elapsed_s,
     )
 
 
-def _jump_N(sensor: Sensor, model_N: float, rate_mm_s: float) -> float:
-    further_N = max(
-        SHAPE * abs(model_N - then_N) + VISCOUS_N_S_MM * abs(rate_mm_s - then_mm_s)
-        for then_N, then_mm_s in (sensor.before_at, sensor.kept_at)
+def _is_strange(past: Past, model_N: float, rate_mm_s: float) -> bool:
+    if past.still_s > FROZEN_S:
+        return True
+    most_loaded_N, least_loaded_N = max(model_N, past.loaded_N), min(model_N, past.loaded_N)
+    weakest_N = LEAST_SCALE * (model_N - RELAXES[1] * most_loaded_N) - NOISE_N
+    strongest_N = MOST_SCALE * (model_N - RELAXES[0] * least_loaded_N) + NOISE_N
+    if not weakest_N <= past.measured_N <= strongest_N:
+        return True
+    (before_N, before_mm_s), (kept_N, kept_mm_s) = past.before_at, past.kept_at
+    jump_N = (
+        JUMP_N
+        + SURE * past.before.deviation_N(model_N)
+        + SHAPE * max(abs(model_N - before_N), abs(model_N - kept_N))
+        + VISCOUS_N_S_MM * max(abs(rate_mm_s - before_mm_s), abs(rate_mm_s - kept_mm_s))
     )
-    return JUMP_N + SURE * sensor.before.deviation_N(model_N) + further_N
-
-
-def _least_N(model_N: float, loaded_N: float) -> float:
-    return LEAST_SCALE * (model_N - RELAXES[1] * max(model_N, loaded_N)) - NOISE_N
-
-
-def _most_N(model_N: float, loaded_N: float) -> float:
-    return MOST_SCALE * (model_N - RELAXES[0] * min(model_N, loaded_N)) + NOISE_N
-
-
-def _is_beyond(fit: DeviceFit, loaded_N: float) -> bool:
-    deviation_N = SURE * math.sqrt(max(fit.offset_variance_N2, 0.0))
-    least_N = LEAST_OFFSET_N - RELAXES[1] * fit.scale * loaded_N
-    return fit.offset_N + deviation_N < least_N or fit.offset_N - deviation_N > MOST_OFFSET_N
+    if abs(past.measured_N - past.before.force_N(model_N)) > jump_N:
+        return True
+    slow = past.slow
+    unsure_N = SURE * math.sqrt(slow.offset_variance_N2)
+    least_N = LEAST_OFFSET_N - RELAXES[1] * slow.scale * most_loaded_N
+    return slow.offset_N + unsure_N < least_N or slow.offset_N - unsure_N > MOST_OFFSET_N
