@@ -13,7 +13,7 @@ from tormagd.control.core import Core, build_core
 from tormagd.control.device_fit import DeviceFit
 from tormagd.control.estimate import Estimate, Handle
 from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import LAW_SHARE, MOST_LAG_S, Plan, PlanState
+from tormagd.control.plan import LAW_SHARE, MOST_LAG_S, Plan, PlanState, Shown
 from tormagd.inverse.solution import FieldSolution, Reach
 from tormagd.learning.displacement import MOBILISED_MM, MOVING_MM_S
 from tormagd.safety.codes import Limit
@@ -34,7 +34,7 @@ def planned(core: Core, force_N: float, estimate: Estimate | None = None, state:
     state = state or core.planner.start(0.0)
     now_s = state.plan.time_s + PERIOD_S
     if estimate is not None:  # the device says something new
-        estimate = estimate._replace(number=state.read + 1)
+        estimate = estimate._replace(number=state.shown.read + 1)
     return core.planner.plan(state, now_s, TimedSetpoint(force_N, now_s, 0.1), estimate)
 
 
@@ -111,7 +111,7 @@ def test_what_cannot_be_given_is_said_once(core, force_N: float, limit: Limit) -
 
 def test_a_device_that_gives_more_than_was_asked_at_its_open_gap_is_said(core) -> None:
     """Where the element gives 1.6 times the model's force, 0.7 N are less than the open gap gives."""
-    state = core.planner.start(0.0)._replace(device=DeviceFit(scale=1.6))
+    state = core.planner.start(0.0)._replace(shown=Shown(DeviceFit(scale=1.6)))
     plan = planned(core, 0.7, None, state).plan
     assert Limit.F_MIN in plan.limits
     assert plan.gap_mm == pytest.approx(95.0, abs=0.1)
@@ -225,7 +225,7 @@ def test_the_device_is_learned_from_measured_over_predicted_force(core) -> None:
 )
 def test_what_teaches_nothing_leaves_the_device_as_it_is(core, estimate: Estimate | None) -> None:
     known = DeviceFit(scale=1.1, scale_variance=1e-4)
-    state = core.planner.start(0.0)._replace(device=known)
+    state = core.planner.start(0.0)._replace(shown=Shown(known))
     for _ in range(20):
         state = planned(core, 1.0, estimate, state)
     assert state.device == known
@@ -233,7 +233,7 @@ def test_what_teaches_nothing_leaves_the_device_as_it_is(core, estimate: Estimat
 
 def test_one_reading_teaches_once(core) -> None:
     state = planned(core, 1.0, moving(force_N=1.4))
-    again = core.planner.plan(state, state.plan.time_s + PERIOD_S, None, moving(force_N=1.4, number=state.read))
+    again = core.planner.plan(state, state.plan.time_s + PERIOD_S, None, moving(force_N=1.4, number=state.shown.read))
     assert again.device == state.device
 
 
@@ -359,7 +359,7 @@ def test_nan_never_travels(core, history: list[tuple[float, TimedSetpoint | None
     state, now_s = core.planner.start(0.0), 0.0
     for elapsed_s, setpoint, estimate in history:
         now_s += elapsed_s
-        heard = None if estimate is None else estimate._replace(number=state.read + 1)
+        heard = None if estimate is None else estimate._replace(number=state.shown.read + 1)
         last, state = state, core.planner.plan(state, now_s, setpoint, heard)
         plan = state.plan
         numbers = (plan.governed_N, plan.field_mT, plan.gap_mm, plan.gap_speed_mm_s, plan.confidence, state.trim)

@@ -24,8 +24,8 @@ CEILING = 1.25
 "The gap stays where the device surely gives no more than this many times the scene's greatest force."
 LAW_SHARE = 0.1
 "The search's field may differ by this share from the one that the force law gives."
-LONGEST_LESSON_S = 0.02
-"One reading teaches no more than this, however long planning was interrupted."
+LESSON_S, LONGEST_LESSON_S = 0.003, 0.02
+"One reading teaches for the time since the last, no more often than that, however often is planned, and no longer."
 BEYOND_MM = 2.0
 "Beyond the closed end, where a carriage may overrun, the model is asked no further."
 LAG_TIME_S = 1.0
@@ -72,16 +72,34 @@ class Plan(NamedTuple):
     sensor_doubted_s: float = 0.0
 
 
-class PlanState(NamedTuple):
-    """What planning remembers. `device` is what the device has shown of itself, by its readings up to number `read`;
-    `lag_s` is how late its carriages are."""
+class Shown(NamedTuple):
+    """What the device has shown of itself by its readings up to number `read`, taken at `read_s`, whether its sensor is
+    believed, and the limits that come of both."""
 
-    governor: GovernorState
-    plan: Plan
     device: DeviceFit = DeviceFit()
     sensor: Sensor = Sensor()
     read: int = -1
+    read_s: float = float("-inf")
+    limits: tuple[Limit, ...] = ()
+
+
+class PlanState(NamedTuple):
+    """What planning remembers. `lag_s` is how late the device's carriages are."""
+
+    governor: GovernorState
+    plan: Plan
+    shown: Shown = Shown()
     lag_s: float = 0.0
+
+    @property
+    def device(self) -> DeviceFit:
+        """The device as far as it has shown itself."""
+        return self.shown.device
+
+    @property
+    def sensor(self) -> Sensor:
+        """The judgement of its force sensor."""
+        return self.shown.sensor
 
     @property
     def trim(self) -> float:
@@ -133,7 +151,8 @@ class Planner:
         """The next plan. `estimate` is None while the device has said nothing: nothing is learned of it then."""
         position = self._config.position
         model_N = self._mobilised_N(estimate)
-        sensor, device, learned = self._learn(state, now_s, estimate, model_N)
+        shown = self._learn(state.shown, now_s, estimate, model_N)
+        device = shown.device
         governor, governed = govern(
             state.governor,
             now_s,
@@ -157,12 +176,13 @@ class Planner:
         gap_mm = max(wanted_mm, least_mm)
         replaced += unlawful
         reached = _LIMIT_OF_REACH.get(solution.reach)
-        held = {
-            Limit.MODEL_RANGE: bool(replaced),
-            Limit.CEILING: gap_mm > wanted_mm,
-            Limit.LOW_CONFIDENCE: solution.confidence < self._config.limits.low_confidence,
-        }
-        limits = (*governed.limits, *learned, *(limit for limit, is_held in held.items() if is_held))
+        limits = (*governed.limits, *shown.limits)
+        if replaced:
+            limits = (*limits, Limit.MODEL_RANGE)
+        if gap_mm > wanted_mm:
+            limits = (*limits, Limit.CEILING)
+        if solution.confidence < self._config.limits.low_confidence:
+            limits = (*limits, Limit.LOW_CONFIDENCE)
         speed, acceleration = self._motion_ahead(governed, device)
         plan = Plan(
             number=state.plan.number + 1,
@@ -180,9 +200,9 @@ class Planner:
             foresight=governed.foresight,
             least_gap_mm=least_mm,
             replaced=replaced,
-            sensor_doubted_s=sensor.doubted_s if sensor.is_doubted else 0.0,
+            sensor_doubted_s=shown.sensor.doubted_s,
         )
-        return PlanState(governor, plan, device, sensor, state.read if estimate is None else estimate.number, lag_s)
+        return PlanState(governor, plan, shown, lag_s)
 
     def _motion(
         self, setpoint: TimedSetpoint | None, estimate: Estimate | None
@@ -216,31 +236,23 @@ class Planner:
             self._cip_percent,
         )
 
-    def _learn(
-        self, state: PlanState, now_s: float, estimate: Estimate | None, model_N: float | None
-    ) -> tuple[Sensor, DeviceFit, tuple[Limit, ...]]:
+    def _learn(self, shown: Shown, now_s: float, estimate: Estimate | None, model_N: float | None) -> Shown:
         """From the force at the *measured* gap: the model's error is learned, not the tracking error, so it cannot
         fight the position loop. A sensor that is not believed teaches nothing, and what it has taught is forgotten."""
-        doubt = (Limit.SENSOR,) if state.sensor.is_doubted else ()
-        if estimate is None or model_N is None or estimate.number == state.read:
-            return state.sensor, state.device, doubt
-        rate_mm_s = abs(estimate.handle.rate_mm_s)
+        if estimate is None or model_N is None or estimate.number == shown.read or now_s - shown.read_s < LESSON_S:
+            return shown
+        rate_mm_s, reading_N = abs(estimate.handle.rate_mm_s), estimate.force_N
         if rate_mm_s < MOVING_MM_S:
-            return state.sensor, state.device, doubt
-        elapsed_s = min(max(now_s - state.plan.time_s, 0.0), LONGEST_LESSON_S)
-        sensor = judge(state.sensor, state.device, model_N, rate_mm_s, estimate.force_N, elapsed_s)
+            return shown
+        elapsed_s = min(now_s - shown.read_s, LONGEST_LESSON_S)
+        sensor = judge(shown.sensor, shown.device, model_N, rate_mm_s, reading_N, elapsed_s)
         if sensor.is_doubted:
-            return sensor, DeviceFit(), (Limit.SENSOR,)
-        settings = self._config.trim
+            return Shown(DeviceFit(), sensor, estimate.number, now_s, (Limit.SENSOR,))
+        trim = self._config.trim
         device, is_held = observe(
-            state.device,
-            model_N,
-            estimate.force_N,
-            elapsed_s,
-            adapts_in_s=settings.time_s,
-            bounds=(settings.least, settings.most),
+            shown.device, model_N, reading_N, elapsed_s, adapts_in_s=trim.time_s, bounds=(trim.least, trim.most)
         )
-        return sensor, device, (Limit.TRIM,) if is_held else ()
+        return Shown(device, sensor, estimate.number, now_s, (Limit.TRIM,) if is_held else ())
 
     def _lawful(self, solution: FieldSolution, wanted_N: float) -> tuple[float, tuple[Replaced, ...]]:
         """The search's field, no further than LAW_SHARE from the force law's."""
