@@ -60,6 +60,9 @@ SLOWEST_MM_S = 4.9
 STILL_MM_S = 1e-6
 GAP_MM_S, GAP_MM_S2, STROKE_MM = 38.0, 1600.0, 30.0
 "An ideal carriage takes the way from 0.7 to 2 N, the longest asked for at once, with the configured speed."
+BOUNDS = {"over_N": 0.25, "over_sample_1_N": 0.15, "peak_N": 2.6, "settled_N": 0.1, "low_hold_faults": 0}
+"""What has to hold: excess over what was asked on any device and on sample 1, the greatest force at all (1.25 times the
+scene's and 0.1 N), the error after SETTLED_S of sliding, and no fault below F_min."""
 LOW_HOLD_S, QUICK_LOW_HOLD_S = 600.0, 20.0
 LOW_N = (0.2, 0.5)
 "Forces under F_min."
@@ -417,6 +420,11 @@ def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures
     return result, found
 
 
+def missed(result: Json) -> list[str]:
+    """Which of the bounds that the envelope is to keep it does not."""
+    return [f"{name} = {result[name]:.3f}: allowed is {most}" for name, most in BOUNDS.items() if result[name] > most]
+
+
 def held_devices(draws: int) -> list[str]:
     """The samples, and half of the draws, no more than 20."""
     return [*SAMPLES, *(f"draw {number}" for number in range(min(draws, 20)))]
@@ -493,7 +501,7 @@ def picture(path: Path, found: list[tuple[Case, Figures]]) -> None:
 
 
 def main() -> int:
-    """Measures, prints, and draws; 0."""
+    """Measures, prints, and draws; 0 only if the bounds were kept and nothing faulted."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a sample of it: two draws, short holds")
     parser.add_argument("--draws", type=int, default=DRAWS, help=f"random devices ({DRAWS})")
@@ -508,7 +516,10 @@ def main() -> int:
     print(json.dumps(result)) if options.json else print_table(result)
     if options.picture is not None:
         picture(options.picture, found)
-    return 0
+    wrong = missed(result)
+    for text in wrong:
+        print(f"missed: {text}", file=sys.stderr)
+    return 1 if wrong or result["faults"] else 0
 
 
 if __name__ == "__main__":

@@ -152,6 +152,16 @@ def _says_replug(figures: Figures) -> str:
     )
 
 
+def _says_envelope(figures: Figures) -> str:
+    """What is rendered at the corners, in a line."""
+    return (
+        f"{figures['cases']} runs on samples and {figures['draws']} draws: over what was asked by "
+        f"{figures['over_N'] * 1e3:.0f} mN at most ({figures['over_sample_1_N'] * 1e3:.0f} on sample 1), at most "
+        f"{figures['peak_N']:.2f} N at all, {figures['settled_N'] * 1e3:.0f} mN off after 2 s of sliding, "
+        f"{figures['low_hold_faults']} faults below F_min"
+    )
+
+
 def _says_stalls(figures: Figures) -> str:
     short = [row for row in figures["rows"] if row["asked_ms"] < 50.0]
     stops, faulted = (sum(row[name] for row in short) for name in ("stops", "faulted"))
@@ -170,6 +180,7 @@ PARTS = {
     "replug_can": Part("tools/replug.py --cycles 200 --transport can --json", _says_replug),
     "soak": Part("tools/soak.py --json", _says_soak),
     "stalls": Part("tools/stalls.py --json", _says_stalls),
+    "envelope": Part("tools/envelope.py --json --picture docs/images/envelope.png", _says_envelope),
 }
 
 

@@ -1,0 +1,85 @@
+"""The envelope's own measure, and two of its runs; all of them are `make evidence`. All devices are synthetic."""
+
+import math
+
+import device_draws
+import envelope
+import numpy as np
+import pytest
+
+FLOOR_N = 0.6
+
+
+def table(asked_N: float, along_N: np.ndarray, speed_mm_s: float = 42.0) -> np.ndarray:
+    """A handle that turns steadily, a row a millisecond; the force asked is the same from the beginning."""
+    rows = len(along_N)
+    handle_mm = speed_mm_s * 1e-3 * np.arange(1, rows + 1)
+    signed_N = along_N * math.copysign(1.0, speed_mm_s)
+    return np.column_stack((signed_N, handle_mm, np.full(rows, speed_mm_s), np.full(rows, asked_N)))
+
+
+def judged(rows: np.ndarray):
+    return envelope.judged(rows, lambda speed_mm_s: FLOOR_N, {}, ())
+
+
+def forces(rows: int, excess_N: float, at: int, lasts: int) -> np.ndarray:
+    found = np.full(rows, 1.0)
+    found[at : at + lasts] += excess_N
+    return found
+
+
+@pytest.mark.parametrize(("lasts", "over_N"), [(200, 0.3), (40, 0.0)])
+def test_an_excess_counts_where_it_lasts(lasts: int, over_N: float) -> None:
+    assert judged(table(1.0, forces(6_000, 0.3, 4_000, lasts))).over_N == pytest.approx(over_N, abs=1e-9)
+
+
+def test_before_a_carriage_could_have_arrived_nothing_counts() -> None:
+    assert judged(table(1.0, forces(6_000, 0.3, 100, 400))).over_N == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_greatest_force_counts_whenever_it_was() -> None:
+    assert judged(table(1.0, forces(6_000, 1.7, 100, 5))).peak_N == pytest.approx(2.7)
+
+
+def test_below_what_the_open_gap_brakes_there_is_nothing_to_fall_short_of() -> None:
+    found = judged(table(0.2, np.full(6_000, 0.55)))
+    assert found.under_N == -np.inf
+    assert found.settled == ()
+    assert judged(table(1.0, np.full(6_000, 0.8))).under_N == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("speed_mm_s", [42.0, -42.0])
+def test_both_ways_are_sliding(speed_mm_s: float) -> None:
+    found = judged(table(1.0, np.full(6_000, 1.1), speed_mm_s))
+    assert [round(error, 6) for _, _, error in found.settled] == [0.1] * len(found.settled)
+    assert found.settled
+
+
+def test_a_missed_bound_is_named() -> None:
+    kept = dict.fromkeys(envelope.BOUNDS, 0.0)
+    assert envelope.missed(kept) == []
+    assert envelope.missed(kept | {"peak_N": 5.1}) == ["peak_N = 5.100: allowed is 2.6"]
+
+
+def test_a_draw_is_the_same_every_time_and_another_than_the_next() -> None:
+    assert device_draws.drawn_device(4) == device_draws.drawn_device(4)
+    assert device_draws.drawn_device(4) != device_draws.drawn_device(5)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [envelope.Case("draw 17", "flicks", "steps"), envelope.Case("sample_2", "300 mm/s", "1 N", 0.0, -300.0)],
+    ids=str,
+)
+def test_a_corner_keeps_the_bounds(case) -> None:
+    found = envelope.run(case)
+    assert found.faults == ()
+    assert found.over_N <= envelope.BOUNDS["over_N"]
+    assert found.peak_N <= envelope.BOUNDS["peak_N"]
+
+
+def test_the_shipped_model_is_good_where_it_is_asked() -> None:
+    found = envelope.model_on_plant()
+    assert found["mean_N"] <= 0.03
+    assert found["worst_N"] <= 0.15
+    assert found["not_rising_share"] == 0.0
