@@ -137,8 +137,9 @@ the gap (about 0.02 mT) do not count. A scene gets the cheapest of `nearest`, `c
 greatest force error against the network stays under {share:g} of the scene's force tolerance. The others are for the
 laboratory: they need scipy or a training at start, do not use the learned model, or are baselines.
 
-The plant errors of this page belong to networks trained for it, on this workload's own device without memory. How good the
-*shipped* model is over its box is measured by `tools/envelope.py` and said in [control.md](control.md#the-envelope)."""
+The plant errors of this page belong to networks trained for it, on this workload's own device without memory. How good
+the *shipped* model is over its box is measured by `tools/envelope.py`, and said in
+[control.md](control.md#the-envelope)."""
 
 
 def plot(result: dict[str, Any], path: Path) -> None:

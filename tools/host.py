@@ -32,8 +32,8 @@ MOST_WAITED = 0.1
 """Share of the time above which a process that waits for a processor has not been left enough. With FIFO the daemon
 waits for 3 to 8% of it, 30 to 80 us a wake-up; without, beside four busy loops, for a third."""
 MOST_BLOCKED = 0.02
-"""Share of the time above which waiting for disk or memory has held something up: seen where a device that writes its
-truth to a busy disk stood still for 38 ms, while every bare timer kept its beats."""
+"""Share of the time above which waiting for disk or memory is taken for a hold-up. Once a device that writes its truth
+to a disk stood still for 38 ms while every bare timer kept its beats; that the disk was why is likely, not shown."""
 
 
 class Counters(NamedTuple):
