@@ -34,7 +34,7 @@ SHOWS = 3
 "The first, and two more where the host spoils one."
 MARGIN = 0.1
 """The control loop may keep this much less of its periods than the worst bare timer: it computes, the timer does not.
-Measured: 0.4% less on a quiet machine, 3.3 to 8.5% less beside four busy loops, over 50% less with 2 ms more in every tick."""
+Measured: 0.4% less on a quiet machine, 3 to 9% less beside four busy loops, over 50% less with 2 ms more in a tick."""
 MOST_SPACING = 1.5
 """Time between the fastest ticks, periods, above which the software itself is slow: a host takes at times, and between
 them even software that starves keeps the period."""
