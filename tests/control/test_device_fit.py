@@ -84,6 +84,10 @@ def test_the_ceiling_moves_once_a_weak_device_has_shown_itself() -> None:
     assert weak.surely_within_N(2.5) > 1.5 * DeviceFit().surely_within_N(2.5)
 
 
+def test_a_device_of_which_nothing_is_sure_is_taken_for_the_strongest() -> None:
+    assert DeviceFit(scale=2.0 * SCALE_SD).surely_within_N(2.5) == 2.5 / MOST_SCALE
+
+
 readings = st.tuples(st.floats(0.3, 8.0), st.floats(-33.0, 33.0), st.floats(0.0, 0.02))
 
 

@@ -56,6 +56,8 @@ class DeviceFit(NamedTuple):
         square = self.scale * self.scale - sure * self.scale_variance
         half = self.scale * room_N + sure * self.covariance_N
         rest = room_N * room_N - sure * self.offset_variance_N2
+        if square <= 0.0:  # so uncertain beside its scale that no force is surely within
+            return most_N / MOST_SCALE
         root_N = (half - math.sqrt(max(half * half - square * rest, 0.0))) / square
         return min(max(root_N, most_N / MOST_SCALE), most_N / LEAST_SCALE)
 
