@@ -63,6 +63,10 @@ def compare(log: Log, plant: PlantParameters, side: Side) -> dict[str, dict[str,
     }
 
 
+SHOWING_S = 1.0
+"Before the excitation the device shows itself, as it does beside a daemon."
+
+
 def record(sample: str, seed: int = 1, rounds: int = 2) -> Columns:
     """The control ticks of `tormagctl calibrate --motors` on a simulated device, in virtual time."""
     config = Config()
@@ -70,8 +74,13 @@ def record(sample: str, seed: int = 1, rounds: int = 2) -> Columns:
     device = VirtualDevice(load_plant(sample), SteadyHand(), seed=seed)
     loop = ClosedLoop(config, core.stepper, core.planner, device)
     loop.arm()
-    portrait = core.planner.portrait
-    waveform = excitation(Range(portrait.least_N, min(portrait.most_N, core.scene.force.most_N)), rounds)
+    if loop.plan_state is None:
+        raise ValueError("core.planner: allowed is one that plans")
+    for _ in loop.run(SHOWING_S):
+        pass
+    # the status of a daemon says the same: what this device gives with its gap open, as far as it has shown itself
+    least_N = loop.plan_state.device.force_N(core.planner.portrait.least_N)
+    waveform = excitation(Range(least_N, min(core.planner.portrait.most_N, core.scene.force.most_N)), rounds)
     start_s = loop.now_s
 
     def newest(now_s: float) -> TimedSetpoint:

@@ -57,8 +57,12 @@ def test_it_finds_its_own_children_only() -> None:
         with pytest.raises(LookupError):
             soak.child("http.server")
     with subprocess.Popen(
-        [sys.executable, "-c", "import sys; sys.stdin.read()", "some.module"], stdin=subprocess.PIPE
+        [sys.executable, "-c", "import sys; print(flush=True); sys.stdin.read()", "some.module"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
     ) as waiting:
+        assert waiting.stdout is not None
+        waiting.stdout.readline()  # while it is being replaced, a process has no command line
         assert soak.child("some.module") == waiting.pid
         assert soak.resident_kB(waiting.pid) > 0
         waiting.communicate()
