@@ -31,6 +31,7 @@ from tormagd.learning.features import (
     require_inputs,
     require_number,
 )
+from tormagd.learning.force_curve import ForceCurve, Known, Network
 from tormagd.physics.errors import DomainError
 
 Array: TypeAlias = NDArray[np.float64]
@@ -122,6 +123,7 @@ class ForceModel:
     output_bias: float
     physical: PhysicalLayers = field(init=False, repr=False)
     _tanh: PhysicalLayers = field(init=False, repr=False)
+    _network: Network = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         hidden = self.metadata.hidden
@@ -133,6 +135,8 @@ class ForceModel:
         weight, bias, output, constant = self.physical
         halved = PhysicalLayers(weight / 2, bias / 2, output / 2, constant + float(output.sum()) / 2)
         object.__setattr__(self, "_tanh", halved)
+        known = Known(self.feature_ranges, self.force_span_N)
+        object.__setattr__(self, "_network", Network(weight, bias, output, constant, known))
 
     def _fold(self) -> PhysicalLayers:
         scaling = self.metadata.scaling
@@ -162,6 +166,10 @@ class ForceModel:
         """Greatest less least force seen in training."""
         low, high = self.metadata.ranges["force_N"]
         return high - low
+
+    def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> ForceCurve:
+        """The force over the field for one state of the handle. Raises `DomainError` on a non-finite input."""
+        return self._network.curve(displacement_mm, rate_mm_s, cip_percent)
 
     def predict(self, features: ArrayLike) -> Array:
         """Force in N (n) for `features` (n x 4, order of `FEATURES`). Raises `DomainError` on a wrong shape or NaN."""

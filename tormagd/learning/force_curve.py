@@ -1,0 +1,169 @@
+"""For one state of the handle, the force over the field: all that searches, portrait and prediction know of a model.
+
+What stands behind a curve may be a network, a grey box with memory, or a closed form.
+"""
+
+import math
+from typing import Final, Protocol, TypeVar, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tormagd.learning.features import FEATURES, FIELD, require_inputs
+
+EXTRAPOLATION_RATE: Final = 4.0
+"""Confidence falls to 1/e when the inputs lie a quarter of their training range outside it, features summed."""
+
+RESIDUAL_RATE: Final = 20.0
+"""Confidence falls to 1/e when 5% of the training force span remains between force asked and force predicted."""
+
+LARGEST_EXPONENT: Final = 700.0
+"exp() of a little more has no float. A unit that far from its step is shut to the last digit of every force."
+
+Floats = TypeVar("Floats", NDArray[np.float32], NDArray[np.float64])
+
+
+class ForceCurve(Protocol):
+    """Force over field, the handle's displacement and rate and the share of iron fixed. Fields are finite, in mT."""
+
+    @property
+    def displacement_mm(self) -> float:
+        """The displacement that it is for."""
+
+    @property
+    def rate_mm_s(self) -> float:
+        """The handle's rate that it is for."""
+
+    @property
+    def cip_percent(self) -> float:
+        """The elastomer's share of carbonyl iron."""
+
+    def force_N(self, field_mT: float) -> float:
+        """Force at one field."""
+
+    def force_and_slope(self, field_mT: float) -> tuple[float, float]:
+        """Force, N, and dF/dB, N/mT, at one field."""
+
+    def forces_N(self, fields_mT: Floats) -> Floats:
+        """Force at each field (n), in the precision of the fields."""
+
+    def confidence(self, field_mT: float, error_N: float) -> float:
+        """Trust, 0..1, in a field that misses the force asked by `error_N` N."""
+
+
+@final
+class Known:
+    """What a model has been shown: the least and the greatest of each feature, and the span of forces, N."""
+
+    __slots__ = ("highs", "lows", "scales", "span_N")
+
+    def __init__(self, ranges: tuple[tuple[float, float], ...], span_N: float) -> None:
+        self.lows: Final = [low for low, _ in ranges]
+        self.highs: Final = [high for _, high in ranges]
+        # a feature that never varied counts as a share of its magnitude, at least 1 unit
+        self.scales: Final = [(high - low) or max(abs(low), 1.0) for low, high in ranges]
+        self.span_N: Final = span_N
+
+    def excess(self, place: int, value: float) -> float:
+        """How far the feature at `place` of `FEATURES` lies outside, as a share of its range."""
+        outside = max(self.lows[place] - value, value - self.highs[place])
+        return outside / self.scales[place] if outside > 0.0 else 0.0
+
+
+@final
+class Network:
+    """The 4-h-1 sigmoid network in physical units, as lists: F = constant + output . sigmoid(weight x + bias).
+
+    `weight` (h x 4, columns in the order of `FEATURES`), `bias` (h) and `output` (h) are finite.
+    """
+
+    __slots__ = ("_arrays", "bias", "cip", "constant_N", "displacement", "field", "known", "output", "rate")
+
+    def __init__(
+        self,
+        weight: NDArray[np.float64],
+        bias: NDArray[np.float64],
+        output: NDArray[np.float64],
+        constant_N: float,
+        known: Known,
+    ) -> None:
+        # sigmoid(z) = 1 / (1 + exp(-z)): the sign is taken into the weights
+        columns: list[list[float]] = [(-weight[:, FEATURES.index(name)]).tolist() for name in FEATURES]
+        self.displacement: Final = columns[0]
+        self.rate: Final = columns[1]
+        self.field: Final = columns[2]
+        self.cip: Final = columns[3]
+        negated: list[float] = (-bias).tolist()
+        self.bias: Final = negated
+        outputs: list[float] = output.tolist()
+        self.output: Final = outputs
+        self.constant_N: Final = constant_N
+        self.known: Final = known
+
+    def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> "NetworkCurve":
+        """The curve for a state of the handle. Raises `DomainError` naming what is not finite, or too large."""
+        require_inputs(displacement_mm, rate_mm_s, 0.0, cip_percent)
+        shift = [
+            bias + by_mm * displacement_mm + by_mm_s * rate_mm_s + by_percent * cip_percent
+            for bias, by_mm, by_mm_s, by_percent in zip(self.bias, self.displacement, self.rate, self.cip, strict=True)
+        ]
+        return NetworkCurve(self, shift, displacement_mm, rate_mm_s, cip_percent)
+
+
+@final
+class NetworkCurve:
+    """See `ForceCurve`. Made by `Network.curve`."""
+
+    __slots__ = ("_network", "_shift", "cip_percent", "displacement_mm", "rate_mm_s")
+
+    def __init__(
+        self, network: Network, shift: list[float], displacement_mm: float, rate_mm_s: float, cip_percent: float
+    ) -> None:
+        self._network = network
+        self._shift = shift
+        self.displacement_mm: Final = displacement_mm
+        self.rate_mm_s: Final = rate_mm_s
+        self.cip_percent: Final = cip_percent
+
+    def force_N(self, field_mT: float) -> float:
+        """See `ForceCurve.force_N`."""
+        network, total_N = self._network, 0.0
+        for shift, by_mT, output in zip(self._shift, network.field, network.output, strict=True):
+            exponent = shift + by_mT * field_mT
+            if exponent < LARGEST_EXPONENT:
+                total_N += output / (1.0 + math.exp(exponent))
+        return total_N + network.constant_N
+
+    def force_and_slope(self, field_mT: float) -> tuple[float, float]:
+        """See `ForceCurve.force_and_slope`."""
+        network, total_N, slope = self._network, 0.0, 0.0
+        for shift, by_mT, output in zip(self._shift, network.field, network.output, strict=True):
+            exponent = shift + by_mT * field_mT
+            if exponent < LARGEST_EXPONENT:
+                opened = 1.0 / (1.0 + math.exp(exponent))
+                total_N += output * opened
+                slope -= output * by_mT * opened * (1.0 - opened)
+        return total_N + network.constant_N, slope
+
+    def forces_N(self, fields_mT: Floats) -> Floats:
+        """See `ForceCurve.forces_N`."""
+        network, kind = self._network, fields_mT.dtype
+        # (1 + tanh(z / 2)) / 2 is the same sigmoid: NumPy's tanh takes many at once, and it cannot overflow
+        hidden = np.multiply.outer(fields_mT, np.array(network.field, dtype=kind) / -2)
+        hidden -= np.array(self._shift, dtype=kind) / 2
+        output = np.array(network.output, dtype=kind) / 2
+        forces: Floats = np.tanh(hidden, hidden).dot(output)
+        forces += kind.type(network.constant_N + math.fsum(network.output) / 2)
+        return forces
+
+    def confidence(self, field_mT: float, error_N: float) -> float:
+        """exp(-4 e - 20 r): e is how far each feature lies outside its training range, as a share of that range,
+        summed; r is the error as a share of the force span seen in training."""
+        known = self._network.known
+        excess = (
+            known.excess(0, self.displacement_mm)
+            + known.excess(1, self.rate_mm_s)
+            + known.excess(FIELD, field_mT)
+            + known.excess(3, self.cip_percent)
+        )
+        return math.exp(-EXTRAPOLATION_RATE * excess - RESIDUAL_RATE * abs(error_N) / known.span_N)
