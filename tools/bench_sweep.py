@@ -126,7 +126,7 @@ def run(plant: str, scene_name: str, course: Course) -> Array:
             estimate = sample.state.estimate
             if estimate is None or sample.state.safety.faults:
                 raise RuntimeError(f"the sweep ended at {gap_mm:.1f} mm: {sample.state.safety}")
-            signed_N = estimate.force_N * estimate.handle.direction
+            signed_N = estimate.force_N * estimate.handle.turn.direction
             rows.append((loop.now_s, estimate.handle_mm, estimate.gap_mm, signed_N))
     time_s, handle_mm, gap_mm, signed_N = np.array(rows).T
     rate_mm_s, slides = sliding(handle_mm, gap_mm)

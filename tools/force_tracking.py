@@ -132,7 +132,7 @@ def publisher(
         if setpoint is None:
             return None
         preview = np.interp(setpoint.stamp_s + ahead_s, times_s, forces_N)
-        return setpoint._replace(preview_N=tuple(preview.tolist()), preview_dt_s=period_s)
+        return setpoint.replaced(preview_N=tuple(preview.tolist()), preview_dt_s=period_s)
 
     return newest
 

@@ -16,7 +16,7 @@ import numpy as np
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.config import Position
 from tormagd.control.estimate import LEAST_DT_S, first_estimate, update
-from tormagd.control.pid import Error, PidState, pid
+from tormagd.control.pid import Error, Gains, PidState, pid
 from tormagd.control.trajectory import Reference, Speeds, follow
 from tormagd.hardware.measurement import Measurement
 from tormagd.physics.element import RateStrengthening, TorqueElement
@@ -132,7 +132,7 @@ def _element(errors: StepErrors, rng: np.random.Generator, steps_s: list[float])
 
 
 def _pid(errors: StepErrors, rng: np.random.Generator, steps_s: list[float]) -> None:
-    gains = Position()
+    gains = Gains.of(Position())
     integral = float(rng.uniform(-1.0, 1.0)) * gains.duty_limit
     limit = mp.mpf(gains.duty_limit)
     for dt_s in steps_s:
@@ -181,8 +181,10 @@ def _reference(errors: StepErrors, rng: np.random.Generator, steps_s: list[float
     for dt_s in steps_s:
         target_mm = float(rng.uniform(0.0, 1.0)) * EXTREME * 95.0
         target_speed = float(rng.uniform(-1.0, 1.0)) * EXTREME * limits.gap_speed_mm_s
-        reference, _ = follow(limits, reference, Reference(target_mm, target_speed), dt_s, speeds)
-        if not all(map(math.isfinite, reference)):
+        reference, _ = follow(
+            limits.gap_acceleration_mm_s2, reference, Reference(target_mm, target_speed), dt_s, speeds
+        )
+        if not all(map(math.isfinite, (reference.gap_mm, reference.speed_mm_s, reference.acceleration_mm_s2))):
             errors.nonfinite += 1
         excess = max(abs(reference.speed_mm_s) - limits.gap_speed_mm_s, 0.0)
         errors.take("reference speed", excess, mp.mpf(0), limits.gap_speed_mm_s)

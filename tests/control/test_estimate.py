@@ -87,8 +87,8 @@ def test_one_encoder_count_is_filtered(measure) -> None:
 def test_displacement_counts_from_the_reversal(follow_handle) -> None:
     forth = [0.1 * k for k in range(51)]
     estimate = follow_handle([*forth, 4.9, 4.5, 4.0])
-    assert estimate.handle.direction == -1.0
-    assert estimate.handle.turned_mm == pytest.approx(5.0)  # where it turned, not where that was noticed
+    assert estimate.handle.turn.direction == -1.0
+    assert estimate.handle.turn.turned_mm == pytest.approx(5.0)  # where it turned, not where that was noticed
     assert estimate.handle.displacement_mm == pytest.approx(1.0)
 
 
@@ -103,20 +103,20 @@ def test_displacement_saturates_where_friction_is_mobilised(follow_handle) -> No
 @given(wobble=st.lists(st.floats(-TURN_MM, 0.0), min_size=1, max_size=30))
 def test_a_wobble_below_the_threshold_is_no_reversal(follow_handle, wobble: list[float]) -> None:
     estimate = follow_handle([0.0, 1.0, 3.0, *(3.0 + offset for offset in wobble)])
-    assert estimate.handle.direction == 1.0
-    assert estimate.handle.furthest_mm == 3.0
+    assert estimate.handle.turn.direction == 1.0
+    assert estimate.handle.turn.furthest_mm == 3.0
 
 
 def test_encoder_noise_at_rest_is_no_reversal(follow_handle) -> None:
     estimate = follow_handle([3.0 + HANDLE_COUNT_MM * (k % 2) for k in range(500)])
-    assert estimate.handle.direction == 1.0
+    assert estimate.handle.turn.direction == 1.0
     assert abs(estimate.handle.rate_mm_s) < 1.0
 
 
 def test_slow_creep_back_is_a_reversal_in_the_end(follow_handle) -> None:
     """A reversal is counted from the furthest point: many small steps back are one."""
     steps = [3.0 - HANDLE_COUNT_MM * k for k in range(20)]
-    assert follow_handle([0.0, 3.0, *steps]).handle.direction == -1.0
+    assert follow_handle([0.0, 3.0, *steps]).handle.turn.direction == -1.0
 
 
 @settings(max_examples=60, deadline=None)
@@ -124,7 +124,7 @@ def test_slow_creep_back_is_a_reversal_in_the_end(follow_handle) -> None:
 def test_displacement_never_leaves_its_range(follow_handle, positions: list[float]) -> None:
     handle = follow_handle(positions).handle
     assert 0.0 <= handle.displacement_mm <= MOBILISED_MM
-    assert handle.direction in (-1.0, 1.0)
+    assert handle.turn.direction in (-1.0, 1.0)
     assert math.isfinite(handle.rate_mm_s)
 
 

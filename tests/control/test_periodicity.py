@@ -16,7 +16,7 @@ from tormagd.control.periodicity import (
     LONGEST_STEP_S,
     NOTHING_LEARNED,
     Periodicity,
-    Score,
+    Skill,
     forecast_N,
     observe,
 )
@@ -65,7 +65,11 @@ def follow(times_s: Array, forces_N: Array) -> Followed:
         state = observe(state, time_s, force_N, slope_N_s)
         slope_N = force_N + slope_N_s * np.minimum(AHEAD_S, 0.05)
         trust = state.trust
-        mixture_N = slope_N if trust == 0.0 else slope_N + trust * (forecast_N(state, AHEAD_S) - slope_N)
+        mixture_N = (
+            slope_N
+            if trust == 0.0
+            else slope_N + trust * (np.array(forecast_N(state, 0.0, AHEAD_S.tolist())) - slope_N)
+        )
         came_N = np.interp(time_s + AHEAD_S, times_s, forces_N)
         rows.append((time_s, trust, slope_N - came_N, mixture_N - came_N))
     return Followed(*(np.array(column) for column in zip(*rows, strict=True)))
@@ -167,7 +171,7 @@ def test_after_a_jump_nothing_is_forecast() -> None:
     state = learned()
     assert state.trust > 0.0
     while (state := observe(state, state.stamp_s + 0.005, 0.8, 0.0)).stamp_s < 4.03:
-        assert state.time_s < 4.0 or (state.changes_N, state.trust) == ((), 0.0)
+        assert state.time_s < 4.0 or (state.changes_N, state.trust) == ([], 0.0)
 
 
 def test_a_gap_or_a_stamp_from_before_begins_anew() -> None:
@@ -186,14 +190,14 @@ def test_a_stamp_again_counts_once_with_its_newest_force() -> None:
     for back_s in (0.0, 0.003):
         other = observe(state, state.stamp_s - back_s, 1.7, 0.0)
         assert (other.history, other.stamp_s, other.force_N) == (state.history, state.stamp_s, 1.7)
-        assert forecast_N(other, np.zeros(1)) == pytest.approx([1.7])
+        assert forecast_N(other, 0.0, [0.0]) == pytest.approx([1.7])
 
 
 def test_the_forecast_starts_at_the_newest_setpoint_between_two_points_of_the_grid() -> None:
     state = learned()
     state = observe(state, state.stamp_s + 0.004, 1.5, 0.0)
     assert state.stamp_s - state.time_s > 0.003
-    assert forecast_N(state, np.zeros(1)) == pytest.approx([1.5])
+    assert forecast_N(state, 0.0, [0.0]) == pytest.approx([1.5])
 
 
 def test_memory_is_bounded() -> None:
@@ -204,9 +208,9 @@ def test_a_constant_force_for_ever_is_no_division_by_zero() -> None:
     state = NOTHING_LEARNED
     for tick in range(300):
         state = observe(state, tick * GRID_S, 1.5, 0.0)
-    state = state._replace(long=Score(0.0, 0.0))
+    state = state.replaced(long=Skill(0.0, 0.0))
     assert state.trust == 0.0
-    assert forecast_N(state, AHEAD_S) == pytest.approx(np.full(3, 1.5))
+    assert np.array(forecast_N(state, 0.0, AHEAD_S.tolist())) == pytest.approx(np.full(3, 1.5))
 
 
 LEARNED = learned()
@@ -240,6 +244,6 @@ def test_nan_never_travels_and_a_replay_is_exact(setpoints: list[tuple[float, fl
         assert -1e-9 <= state.stamp_s - state.time_s < GRID_S + 1e-9
         assert all(math.isfinite(value) for score in (state.long, state.short) for value in score)
         if state.changes_N:
-            assert np.all(np.isfinite(forecast_N(state, AHEAD_S)))
+            assert np.all(np.isfinite(np.array(forecast_N(state, 0.0, AHEAD_S.tolist()))))
     assert states == replay()
     assert LEARNED.history == before

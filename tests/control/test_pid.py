@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from simple_pid import PID
 
 from tormagd.config import Config, Position
-from tormagd.control.pid import ON_TARGET_MM, Error, PidOutput, PidState, pid, rested
+from tormagd.control.pid import ON_TARGET_MM, Error, Gains, PidOutput, PidState, pid, rested
 
 DT_S = 1e-3
-GAINS = Config().position
+GAINS = Gains.of(Config().position)
 errors = st.floats(-50.0, 50.0)
 gains = st.builds(
-    Position,
+    Gains,
     proportional_per_mm=st.floats(0.1, 20.0),
     integral_time_s=st.floats(0.01, 10.0),
     derivative_time_s=st.floats(0.0, 0.05),
@@ -25,7 +25,7 @@ gains = st.builds(
 
 
 def update(
-    position: Position, state: PidState, error_mm: float, speed_error_mm_s: float = 0.0, feed_forward: float = 0.0
+    position: Gains, state: PidState, error_mm: float, speed_error_mm_s: float = 0.0, feed_forward: float = 0.0
 ) -> tuple[PidState, PidOutput]:
     """One update, a millisecond after the last."""
     return pid(position, state, Error(error_mm, speed_error_mm_s), feed_forward, DT_S)
@@ -41,7 +41,9 @@ def test_unsaturated_p_and_i_are_those_of_simple_pid(
     sequence: list[float], proportional: float, integral_time_s: float
 ) -> None:
     """simple-pid integrates before it answers and we do after, so its integral is ours one update later."""
-    position = Position(proportional_per_mm=proportional, integral_time_s=integral_time_s, derivative_time_s=0.0)
+    position = Gains.of(
+        Position(proportional_per_mm=proportional, integral_time_s=integral_time_s, derivative_time_s=0.0)
+    )
     oracle = PID(proportional, proportional / integral_time_s, 0.0, setpoint=0.0, sample_time=None)
     state = PidState()
     for error in sequence:

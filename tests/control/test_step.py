@@ -632,7 +632,7 @@ def test_the_answer_to_it_is_gone_on_from_without_a_kick(core: Core, measure, mo
     integral = state.left.integral
     for later in (0.045, 0.046):
         at_s = now_s + later
-        answer = following(measure, state._replace(reference=came), 11 + (later > 0.045), at_s)
+        answer = following(measure, state.replaced(reference=came), 11 + (later > 0.045), at_s)
         answer = answer._replace(device_time_s=at_s)
         state, output = core.stepper.step(state, at_s, answer, gap_plan(came.gap_mm, at_s))
     assert not state.safety.faults

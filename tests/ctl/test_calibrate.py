@@ -26,7 +26,7 @@ from tormagd.ctl.main import main
 from tormagd.ctl.outcome import CommandError
 from tormagd.learning import calibration
 from tormagd.learning.calibration import CalibrationError, fit, require_usable, training_rows
-from tormagd.learning.displacement import MOVING_MM_S, displacement
+from tormagd.learning.displacement import MOVING_MM_S, Turn, displacement
 from tormagd.learning.model_file import load_model
 from tormagd.learning.shipped import model_path
 from tormagd.physics.inserts import insert
@@ -193,7 +193,7 @@ def test_displacement_is_what_the_daemon_calls_it():
     """Of a whole sweep or position by position: one law."""
     rng = np.random.default_rng(1)
     path = np.cumsum(rng.normal(0.0, 0.06, 4000)) + 3.0 * np.sin(np.arange(4000) / 90.0)
-    handle = estimate.Handle(0.0, 0.0, 1.0, path[0], path[0])
+    handle = estimate.Handle(0.0, 0.0, Turn(1.0, path[0], path[0]))
     expected = []
     for position in path:
         fake = estimate.Estimate(0, True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, handle, 0.0)

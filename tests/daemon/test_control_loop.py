@@ -18,7 +18,7 @@ def test_the_measurement_that_a_step_was_given_is_kept_though_the_exchange_bring
 
     def step(state: StepState, now_s: float, measurement: Any, _plan: Any) -> tuple[StepState, StepOutput]:
         given.append(measurement)
-        return state._replace(time_s=now_s), StepOutput(DriveMode.OFF, 0.0, 0.0, DeviceRequest.NONE, 0, ())
+        return state.replaced(time_s=now_s), StepOutput(DriveMode.OFF, 0.0, 0.0, DeviceRequest.NONE, 0, ())
 
     connection.exchange = exchange
     connection.receive = lambda: given.append("received")

@@ -141,7 +141,7 @@ def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on
     def plan(state: PlanState, now_s: float, setpoint: TimedSetpoint | None, _estimate: object) -> PlanState:
         if setpoint is not None:
             raise error
-        return state._replace(plan=state.plan._replace(number=state.plan.number + 1))
+        return state.replaced(plan=state.plan.replaced(number=state.plan.number + 1))
 
     resting = Plan(0, 0.0, None, None, 0.5, None, 50.0, 95.0, 0.0, 1.0, ())
     planner: Any = SimpleNamespace(start=lambda now_s: PlanState(GovernorState(now_s, 0.5), resting), plan=plan)

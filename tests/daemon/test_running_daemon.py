@@ -142,12 +142,12 @@ def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
         control = daemon._control
 
         def stall(now_s: float, took_s: float, culprit: str) -> None:
-            control.state = control.state._replace(time_s=now_s, sight=Sight(now_s, now_s, took_s, is_blind=True))
+            control.state = control.state.replaced(time_s=now_s, sight=Sight(now_s, now_s, took_s, is_blind=True))
             daemon._note_stall(Delay(round(took_s * 1e9), culprit, 1))
 
         stall(10.0, 0.083, KERNEL)
         # a late tick that is no stall is not taken for one
-        control.state = control.state._replace(time_s=10.1)
+        control.state = control.state.replaced(time_s=10.1)
         daemon._note_stall(Delay(2_000_000, "Daemon._publish", 1_500_000))
         control.latch(Fault.HOST_STALL)
         daemon._tell(control.new_faults())

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from tormagd.config import Config, ConfigError
 from tormagd.control.motor import Margins, margins, pull_V
 from tormagd.control.plan import Planner
-from tormagd.control.portrait import FieldOfGap, Portrait
+from tormagd.control.portrait import FieldOfGap, Portrait, law_beside, portrait
 from tormagd.control.step import Stepper
 from tormagd.inverse.choice import Choice, build, choose, named, solver_table
 from tormagd.learning.metrics import falling_at
@@ -17,8 +17,9 @@ from tormagd.learning.model_file import ForceModel, ModelFileError, load_model
 from tormagd.learning.shipped import model_path
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw
+from tormagd.physics.force import Geometry
 from tormagd.physics.inserts import insert
-from tormagd.scenes.scene import AUTO, Scene, load_scene, scene_path
+from tormagd.scenes.scene import AUTO, Insert, Scene, load_scene, scene_path
 
 ELEMENT = "torque"
 LEAST_PHASE_MARGIN_DEG = 30.0
@@ -59,15 +60,18 @@ def build_core(config: Config) -> Core:
         )
     except (DomainError, ModelFileError) as error:
         raise ConfigError(f"scene {scene.name}: {error}") from error
-    field = FieldOfGap(PowerFieldLaw(), fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm * 1e-3)
+    law, cip_percent = PowerFieldLaw(), 100.0 * fitted.cip_fraction
+    field = FieldOfGap(law, fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm * 1e-3)
     try:
         fields_mT = _known_fields_mT(scene, model, field)
         choice = choose_solver(scene, model.metadata.hidden)
-        solver = build(choice, model, fields_mT)
+        search = build(choice, fields_mT, rises=True)
     except DomainError as error:
         raise ConfigError(f"scene {scene.name}: {error}") from error
-    planner = Planner(config, scene, model, solver, field, fields_mT, fitted.elastomer, 100.0 * fitted.cip_fraction)
-    _refuse_out_of_reach(scene, planner.portrait)
+    reach = portrait(model, field, cip_percent, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
+    _refuse_out_of_reach(scene, reach)
+    beside = law_beside(reach, law, field, fitted.elastomer, _geometry(scene.insert))
+    planner = Planner(config, scene, model, search, field, reach, beside, cip_percent)
     return Core(scene, planner, Stepper(config, scene), stability, choice)
 
 
@@ -88,9 +92,15 @@ def _known_fields_mT(scene: Scene, model: ForceModel, field: FieldOfGap) -> tupl
     return low_mT, high_mT
 
 
+def _geometry(fitted: Insert) -> Geometry:
+    radii_mm = fitted.inner_radius_mm, fitted.outer_radius_mm
+    return Geometry(radii_mm[0] * 1e-3, radii_mm[1] * 1e-3, fitted.thickness_mm * 1e-3, fitted.roller_radius_mm * 1e-3)
+
+
 def _refuse_too_weak(config: Config, scene: Scene) -> None:
     motor, closed_mm = config.motor, scene.insert.gap_closed_mm
-    needed_V, most_V = motor.coulomb_V + pull_V(motor, closed_mm), config.position.duty_limit * motor.supply_V / 2.0
+    needed_V = motor.coulomb_V + pull_V(motor.pull_V, closed_mm)
+    most_V = config.position.duty_limit * motor.supply_V / 2.0
     if needed_V > most_V:
         raise ConfigError(
             f"motor: coulomb_V = {motor.coulomb_V:g} and pull_V = {motor.pull_V:g} take {needed_V:.2f} V to open the "

@@ -8,32 +8,47 @@ allow, and no further: what a low force does not show of a high one is left to t
 """
 
 import math
-from typing import NamedTuple
+from typing import Final, final
 
-SCALE_SD = 0.17
+from firmware_protocol.value import Value
+
+SCALE_SD: Final = 0.17
 "Spread of the scale of devices not yet seen: friction, shear modulus and field each differ evenly within 12%."
-LEAST_SCALE, MOST_SCALE = 0.64, 1.53
+LEAST_SCALE: Final = 0.64
+MOST_SCALE: Final = 1.53
 "All three at their ends, and the field's exponent at its own, -1.34 and -1.26: no believable device is beyond."
-RELAXES = (0.1, 0.21)
+RELAXES: Final = (0.1, 0.21)
 "The least and the greatest share of its force that an elastomer loses in the course of hours."
-OFFSET_SD_N = 0.1
+OFFSET_SD_N: Final = 0.1
 "Of the offset: what relaxation and hysteresis do around 0.5 N."
-ERROR_N2_S = 0.002
+ERROR_N2_S: Final = 0.002
 "Density of what the model does not follow, N^2 s: with these spreads a new device is learned in a tenth of a second."
-SCALE_LASTS_S = 600.0
+SCALE_LASTS_S: Final = 600.0
 "In which what was learned of the scale is forgotten: the device has warmed, by a kelvin or less."
-SURE = 2.0
+SURE: Final = 2.0
 "Standard deviations within which a force is taken to lie."
 
 
-class DeviceFit(NamedTuple):
+@final
+class DeviceFit(Value):
     """Scale and offset of one device, their variances and covariance."""
 
-    scale: float = 1.0
-    offset_N: float = 0.0
-    scale_variance: float = SCALE_SD**2
-    covariance_N: float = 0.0
-    offset_variance_N2: float = OFFSET_SD_N**2
+    __match_args__ = ("scale", "offset_N", "scale_variance", "covariance_N", "offset_variance_N2")
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        scale: float = 1.0,
+        offset_N: float = 0.0,
+        scale_variance: float = SCALE_SD**2,
+        covariance_N: float = 0.0,
+        offset_variance_N2: float = OFFSET_SD_N**2,
+    ) -> None:
+        self.scale: Final = scale
+        self.offset_N: Final = offset_N
+        self.scale_variance: Final = scale_variance
+        self.covariance_N: Final = covariance_N
+        self.offset_variance_N2: Final = offset_variance_N2
 
     def force_N(self, model_N: float) -> float:
         """What the device gives where the model says `model_N`."""
@@ -60,6 +75,10 @@ class DeviceFit(NamedTuple):
             return most_N / MOST_SCALE
         root_N = (half - math.sqrt(max(half * half - square * rest, 0.0))) / square
         return min(max(root_N, most_N / MOST_SCALE), most_N / LEAST_SCALE)
+
+
+UNSEEN: Final = DeviceFit()
+"A device that has shown nothing of itself."
 
 
 def observe(

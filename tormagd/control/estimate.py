@@ -1,48 +1,80 @@
 """From a measurement to what the controller needs: gap, carriage speeds, and the handle's motion since it turned."""
 
-from typing import NamedTuple
+from typing import Final, final
 
+from firmware_protocol.value import Value
 from tormagd.hardware.measurement import Measurement
 from tormagd.learning.displacement import MOVING_MM_S, Turn
 
-RATE_FILTER_S = 0.05
-SLIDING_MM = 0.3
+RATE_FILTER_S: Final = 0.05
+SLIDING_MM: Final = 0.3
 "Friction takes on the level of another rate over some such travel; without travel it does not change."
-LEAST_DT_S = 5e-6
+LEAST_DT_S: Final = 5e-6
 "Half a step of the device's clock; positions over less time than that would give speeds without bound."
 
 
-class Handle(NamedTuple):
-    """The handle's motion; `displacement_mm` and the turn it counts from are those of `learning.displacement`.
+@final
+class Handle(Value):
+    """The handle's motion: its signed rate, the turn that displacement counts from, and how far it is from there.
 
     `sliding_mm_s` is the rate at which friction slides, of either sign of the motion: the rate over the last travel, so
-    that a handle that stops keeps it.
+    that a handle that stops keeps it. `rate_mm_s` is positive the way the handle went last.
     """
 
-    displacement_mm: float
-    rate_mm_s: float
-    direction: float
-    turned_mm: float
-    furthest_mm: float
-    sliding_mm_s: float = MOVING_MM_S
+    __match_args__ = ("displacement_mm", "rate_mm_s", "turn", "sliding_mm_s")
+    __slots__ = __match_args__
+
+    def __init__(self, displacement_mm: float, rate_mm_s: float, turn: Turn, sliding_mm_s: float = MOVING_MM_S) -> None:
+        self.displacement_mm: Final = displacement_mm
+        self.rate_mm_s: Final = rate_mm_s
+        self.turn: Final = turn
+        self.sliding_mm_s: Final = sliding_mm_s
 
 
-class Estimate(NamedTuple):
+@final
+class Estimate(Value):
     """Carriages in mm from the centre plane, speeds in mm/s (opening is positive), force in N against the motion.
 
     Where they are not homed, positions mean nothing: they count from wherever the carriages were, or counts were lost.
     """
 
-    number: int
-    is_homed: bool
-    device_time_s: float
-    left_mm: float
-    right_mm: float
-    left_mm_s: float
-    right_mm_s: float
-    force_N: float
-    handle: Handle
-    handle_mm: float
+    __match_args__ = (
+        "number",
+        "is_homed",
+        "device_time_s",
+        "left_mm",
+        "right_mm",
+        "left_mm_s",
+        "right_mm_s",
+        "force_N",
+        "handle",
+        "handle_mm",
+    )
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        number: int,
+        is_homed: bool,
+        device_time_s: float,
+        left_mm: float,
+        right_mm: float,
+        left_mm_s: float,
+        right_mm_s: float,
+        force_N: float,
+        handle: Handle,
+        handle_mm: float,
+    ) -> None:
+        self.number: Final = number
+        self.is_homed: Final = is_homed
+        self.device_time_s: Final = device_time_s
+        self.left_mm: Final = left_mm
+        self.right_mm: Final = right_mm
+        self.left_mm_s: Final = left_mm_s
+        self.right_mm_s: Final = right_mm_s
+        self.force_N: Final = force_N
+        self.handle: Final = handle
+        self.handle_mm: Final = handle_mm
 
     @property
     def gap_mm(self) -> float:
@@ -59,7 +91,6 @@ def first_estimate(measurement: Measurement, home_mm: float) -> Estimate:
     """The estimate from one measurement: everything at rest. `home_mm` is a carriage's distance from the centre
     plane when it is on its home switch.
     """
-    handle = Handle(0.0, 0.0, 1.0, measurement.handle_mm, measurement.handle_mm)
     return Estimate(
         number=measurement.number,
         is_homed=measurement.is_homed,
@@ -69,7 +100,7 @@ def first_estimate(measurement: Measurement, home_mm: float) -> Estimate:
         left_mm_s=0.0,
         right_mm_s=0.0,
         force_N=measurement.force_N,
-        handle=handle,
+        handle=Handle(0.0, 0.0, Turn(1.0, measurement.handle_mm, measurement.handle_mm)),
         handle_mm=measurement.handle_mm,
     )
 
@@ -95,7 +126,7 @@ def update(last: Estimate | None, measurement: Measurement, home_mm: float, deri
         right_mm=right,
         left_mm_s=last.left_mm_s + share * ((left - last.left_mm) / dt_s - last.left_mm_s),
         right_mm_s=last.right_mm_s + share * ((right - last.right_mm) / dt_s - last.right_mm_s),
-        force_N=measurement.force_N * handle.direction,
+        force_N=measurement.force_N * handle.turn.direction,
         handle=handle,
         handle_mm=measurement.handle_mm,
     )
@@ -104,10 +135,10 @@ def update(last: Estimate | None, measurement: Measurement, home_mm: float, deri
 def _handle(last: Estimate, position_mm: float, dt_s: float) -> Handle:
     before = last.handle
     share = dt_s / (RATE_FILTER_S + dt_s)
-    speed = before.direction * before.rate_mm_s
+    speed = before.turn.direction * before.rate_mm_s
     travel_mm = position_mm - last.handle_mm
     speed += share * (travel_mm / dt_s - speed)
     slid = abs(travel_mm) / (SLIDING_MM + abs(travel_mm))
     sliding = before.sliding_mm_s + slid * (abs(speed) - before.sliding_mm_s)
-    turn = Turn(before.direction, before.turned_mm, before.furthest_mm).moved_to(position_mm)
-    return Handle(turn.displacement_mm(position_mm), turn.direction * speed, *turn, sliding)
+    turn = before.turn.moved_to(position_mm)
+    return Handle(turn.displacement_mm(position_mm), turn.direction * speed, turn, sliding)

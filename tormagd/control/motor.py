@@ -41,13 +41,13 @@ def full_speed_mm_s(motor: Motor) -> float:
     return motor.supply_V / motor.back_emf_V_s / motor.gear_ratio * motor.screw_lead_mm / (2.0 * math.pi)
 
 
-def pull_V(motor: Motor, gap_mm: float) -> float:
-    """Voltage that the magnets' pull takes of either motor to open a gap of 0 or more: dipoles attract with the fourth
-    power of their distance.
+def pull_V(stated_V: float, gap_mm: float) -> float:
+    """Voltage that the magnets' pull takes of either motor to open a gap of 0 or more, where `motor.pull_V` is
+    `stated_V`: dipoles attract with the fourth power of their distance.
     """
     nearness = (PULL_STATED_MM + PULL_DEPTH_MM) / (gap_mm + PULL_DEPTH_MM)
     nearness *= nearness
-    return motor.pull_V * nearness * nearness
+    return stated_V * nearness * nearness
 
 
 def mechanical_time_s(motor: Motor) -> float:

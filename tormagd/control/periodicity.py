@@ -1,110 +1,173 @@
 """What comes next in a force that repeats itself, as a pulse does, where the setpoints bring no preview.
 
-No period is assumed, for heart beats vary: the newest stretch of force is compared with those remembered, and what
-followed them tells what will follow it (analogue forecasting, Lorenz, J. Atmos. Sci. 26, 1969; locally weighted linear
-regression, Cleveland and Devlin, J. Am. Stat. Assoc. 83, 1988). How far that is believed has to be earned: forecasts
-are judged by what came, beside the slope that is extrapolated otherwise.
+No period is assumed, for heart beats vary: the newest stretch of force, as a delay embedding, is compared with those
+remembered, and what followed them tells what will follow it (analogue forecasting, Lorenz, J. Atmos. Sci. 26, 1969;
+locally weighted linear regression, Cleveland and Devlin, J. Am. Stat. Assoc. 83, 1988). How far that is believed has to
+be earned: by its skill over the slope that is extrapolated otherwise, judged by what came.
 """
 
 import math
 from array import array
-from typing import NamedTuple
+from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
 
+from firmware_protocol.value import Value
+from tormagd.control.interpolation import interpolated
+
 Array = npt.NDArray[np.float64]
 
-GRID_S = 0.01
-"Forces are remembered on a grid of time, whose points everything below counts."
-HISTORY = 1_000
-LEAST_HISTORY = 100
-"With less nothing is forecast."
-LAGS = (1, 2, 4, 7, 11)
-"A stretch is compared at these points before its end, as changes from there."
-STRIDE = 3
+GRID_S: Final = 0.01
+"Forces are remembered on a grid of time, whose points everything below counts; a pulse rises in ten of them."
+HISTORY: Final = 1_000
+"Ten seconds: a dozen heart beats at rest, and twice a breath, which modulates them."
+LEAST_HISTORY: Final = 100
+"With less, which is less than a heart beat, nothing is forecast."
+DELAYS: Final = (1, 2, 4, 7, 11)
+"""Of the embedding: a stretch is compared at these points before its end, as changes from there. Close together where
+the slope and its change show, and back to the rise of a pulse, which takes a tenth of a second."""
+STRIDE: Final = 3
 "Every third stretch is looked at: the regression makes up for most of what lies between them."
-AHEAD = 8
+HORIZON: Final = 8
 "Points that are forecast; a plan looks 30 ms ahead, from as far ahead as the carriages are late."
-JUDGED = 4
-"The point ahead that forecasts are judged at."
-LONGEST_STEP_S = 0.1
+JUDGED: Final = 4
+"The point ahead that forecasts are judged at: as far as the middle of what a plan looks at, with usual carriages."
+LONGEST_STEP_S: Final = 0.1
 "Setpoints further apart than this are no stream: nothing that was learned outlives the gap."
-SAME_N = 1e-4
-"Stretches that differ by no more are the same."
-RIDGE = 0.01
+SAME_N: Final = 1e-4
+"Stretches that differ by no more are the same: a tenth of what the force sensor resolves."
+RIDGE: Final = 0.01
 "Share by which the regression's variances are raised: from stretches that hardly differ no dependence is learned."
-STRANGEST = 100.0
-"""Nothing is forecast from a stretch further than this from those most like it, as after a jump: 1 and its squared
-distance from their mean, in their standard deviations."""
-LONG_S, SHORT_S = 2.0, 0.2
-"Forecasts earn trust over the long time, and lose it over the short."
-DOUBT_N = 0.02
-"Before the first is judged they count as this far from the slope and no better."
-FORGIVEN_N = 0.003
+MOST_LEVERAGE: Final = 100.0
+"""Nothing is forecast from a stretch of more leverage, as after a jump: 1 and its squared distance from the mean of
+those most like it, in their standard deviations."""
+LONG_S: Final = 2.0
+SHORT_S: Final = 0.2
+"Skill is earned over the long time, a few beats, and lost over the short: a rhythm that breaks breaks at once."
+DOUBT_N: Final = 0.02
+"Before the first is judged, forecasts count as this far from the slope and no better."
+FORGIVEN_N: Final = 0.003
 "Differences as small as this neither earn trust nor lose it."
 
-TAPS = len(LAGS)
-_LEAST_BYTES = LEAST_HISTORY * array("d").itemsize
-_SHORTEST = LAGS[-1] + 1 + AHEAD
-_ROWS = np.array([0, *(-lag for lag in LAGS), *range(1, AHEAD + 1)])[:, None]
-_ENDS = np.arange(-1 - AHEAD, _SHORTEST - AHEAD - HISTORY - 2, -STRIDE)
-_AROUND = np.concatenate([np.minimum(_ROWS - 1, -1), _ROWS + _ENDS], axis=1)
+TAPS: Final = 5
+"Of the embedding: as many as DELAYS."
+_LEAST_BYTES: Final = LEAST_HISTORY * array("d").itemsize
+_MOST_BYTES: Final = HISTORY * array("d").itemsize
+_SHORTEST: Final = DELAYS[-1] + 1 + HORIZON
+_ROWS: Final = np.array([0, *[-delay for delay in DELAYS], *range(1, HORIZON + 1)])[:, None]
+_ENDS: Final = np.arange(-1 - HORIZON, _SHORTEST - HORIZON - HISTORY - 2, -STRIDE)
+_AROUND: Final = np.concatenate([np.minimum(_ROWS - 1, -1), _ROWS + _ENDS], axis=1)
 """Places from the end of a full history, a column for each stretch: its end, what is compared of it, what followed. The
 first column is the newest stretch, which nothing has followed yet."""
-_AHEAD_S = GRID_S * np.arange(AHEAD + 1.0)
-_CONSTANT = np.eye(TAPS + 1)[0]
-_RIDGE = np.diag(1.0 - _CONSTANT)
+_AHEAD_S: Final[list[float]] = [GRID_S * point for point in range(HORIZON + 1)]
+_CONSTANT: Final = np.eye(TAPS + 1)[0]
+_RIDGE: Final = np.diag(1.0 - _CONSTANT)
 
 
-class Score(NamedTuple):
+@final
+class Skill(Value):
     """Means of squares, N², with the newest counting most: what forecasts gained on the slope, and how far they were
     from it."""
 
-    gained: float
-    apart: float
+    __match_args__ = ("gained", "apart")
+    __slots__ = __match_args__
 
-    def after(self, forecast_error_N: float, slope_error_N: float, time_s: float) -> "Score":
+    def __init__(self, gained: float, apart: float) -> None:
+        self.gained: Final = gained
+        self.apart: Final = apart
+
+    def after(self, forecast_error_N: float, slope_error_N: float, time_s: float) -> "Skill":
         """With the errors of one forecast more; `time_s` is the time constant of forgetting."""
         share = GRID_S / (time_s + GRID_S)
-        gained = slope_error_N**2 - forecast_error_N**2
-        apart = (slope_error_N - forecast_error_N) ** 2
-        return Score(self.gained + share * (gained - self.gained), self.apart + share * (apart - self.apart))
+        gained = slope_error_N * slope_error_N - forecast_error_N * forecast_error_N
+        difference_N = slope_error_N - forecast_error_N
+        apart = difference_N * difference_N
+        return Skill(self.gained + share * (gained - self.gained), self.apart + share * (apart - self.apart))
+
+    @property
+    def score(self) -> float:
+        """Gained over apart. Of all mixtures, what was judged would have been met best by one with the share
+        (1 + score) / 2 of the forecast."""
+        return self.gained / (self.apart + FORGIVEN_N * FORGIVEN_N)
 
 
-class Periodicity(NamedTuple):
-    """What is remembered of a stream of setpoints. Compares by value; nothing changes it."""
+@final
+class Guess(Value):
+    """What forecast and slope said that a point of the grid would be, N."""
 
-    stamp_s: float = -math.inf
-    force_N: float = 0.0
-    time_s: float = -math.inf
-    "Of the newest point of the grid, not after the newest setpoint."
-    history: bytes = b""
-    "The forces on the grid, float64: bytes are immutable, and numpy reads them where they are."
-    from_s: float = -math.inf
-    "The point of the grid that `changes_N` are from."
-    changes_N: tuple[float, ...] = ()
-    "From there to itself and the points ahead; empty while nothing is forecast."
-    awaited_N: tuple[tuple[float, float] | None, ...] = (None,) * JUDGED
-    "What forecast and slope said that the next points of the grid would be."
-    long: Score = Score(0.0, DOUBT_N**2)
-    short: Score = Score(0.0, 0.0)
+    __match_args__ = ("forecast_N", "slope_N")
+    __slots__ = __match_args__
+
+    def __init__(self, forecast_N: float, slope_N: float) -> None:
+        self.forecast_N: Final = forecast_N
+        self.slope_N: Final = slope_N
+
+
+NOTHING_SAID: Final[tuple[Guess | None, ...]] = (None,) * JUDGED
+UNJUDGED_LONG: Final = Skill(0.0, DOUBT_N * DOUBT_N)
+UNJUDGED_SHORT: Final = Skill(0.0, 0.0)
+
+
+@final
+class Periodicity(Value):
+    """What is remembered of a stream of setpoints.
+
+    stamp_s, force_N  of the newest setpoint
+    time_s            of the newest point of the grid, not after the newest setpoint
+    history           the forces on the grid, float64: bytes do not change, and NumPy reads them where they are
+    from_s            the point of the grid that `changes_N` are from
+    changes_N         from there to itself and the points ahead; empty while nothing is forecast
+    awaited           what was said of the next points of the grid, to be judged by what comes
+    long, short       the skill so far
+    """
+
+    __match_args__ = (
+        "stamp_s",
+        "force_N",
+        "time_s",
+        "history",
+        "from_s",
+        "changes_N",
+        "awaited",
+        "long",
+        "short",
+    )
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        stamp_s: float = -math.inf,
+        force_N: float = 0.0,
+        time_s: float = -math.inf,
+        history: bytes = b"",
+        from_s: float = -math.inf,
+        changes_N: list[float] | None = None,
+        awaited: tuple[Guess | None, ...] = NOTHING_SAID,
+        long: Skill = UNJUDGED_LONG,
+        short: Skill = UNJUDGED_SHORT,
+    ) -> None:
+        self.stamp_s: Final = stamp_s
+        self.force_N: Final = force_N
+        self.time_s: Final = time_s
+        self.history: Final = history
+        self.from_s: Final = from_s
+        self.changes_N: Final[list[float]] = [] if changes_N is None else changes_N
+        self.awaited: Final = awaited
+        self.long: Final = long
+        self.short: Final = short
 
     @property
     def trust(self) -> float:
-        """0..1: how far the forecast takes the place of the slope.
-
-        Of all mixtures, what was judged would have been met best by one with the share (1 + gained / apart) / 2 of the
-        forecast. `gained / apart` is less, and nothing where nothing was gained.
-        """
+        """0..1: how far the forecast takes the place of the slope; half of what would have been best, and nothing where
+        nothing was gained."""
         if not self.changes_N:
             return 0.0
-        earned = self.long.gained / (self.long.apart + FORGIVEN_N**2)
-        lost = -self.short.gained / (self.short.apart + FORGIVEN_N**2)
+        earned, lost = self.long.score, -self.short.score
         return min(max(earned, 0.0), 1.0) * min(max(1.0 - lost, 0.0), 1.0)
 
 
-NOTHING_LEARNED = Periodicity()
+NOTHING_LEARNED: Final = Periodicity()
 
 
 def observe(state: Periodicity, stamp_s: float, force_N: float, slope_N_s: float) -> Periodicity:
@@ -123,20 +186,38 @@ def observe(state: Periodicity, stamp_s: float, force_N: float, slope_N_s: float
         return Periodicity(stamp_s, force_N, stamp_s, array("d", [force_N]).tobytes())
     count = int((stamp_s - state.time_s) / GRID_S)
     if count == 0 or spacing_s == 0.0:
-        is_known = spacing_s == 0.0 and force_N == state.force_N
-        return state if is_known else state._replace(stamp_s=stamp_s, force_N=force_N)
+        if spacing_s == 0.0 and force_N == state.force_N:
+            return state
+        return Periodicity(
+            stamp_s,
+            force_N,
+            state.time_s,
+            state.history,
+            state.from_s,
+            state.changes_N,
+            state.awaited,
+            state.long,
+            state.short,
+        )
+    return _advanced(state, stamp_s, force_N, count)
+
+
+def _advanced(state: Periodicity, stamp_s: float, force_N: float, count: int) -> Periodicity:
+    """The state after a setpoint that passes `count` points of the grid: what was said of them is judged."""
+    spacing_s = stamp_s - state.stamp_s
     times_s = [state.time_s + GRID_S * step for step in range(1, count + 1)]
     shares = [(time_s - state.stamp_s) / spacing_s for time_s in times_s]
-    came_N = array("d", [state.force_N + share * (force_N - state.force_N) for share in shares])
-    history = (state.history + came_N.tobytes())[-came_N.itemsize * HISTORY :]
+    came_N = [state.force_N + share * (force_N - state.force_N) for share in shares]
+    history = (state.history + array("d", came_N).tobytes())[-_MOST_BYTES:]
     long, short = state.long, state.short
-    for force, guesses in zip(came_N, state.awaited_N, strict=False):
-        if guesses is not None:
-            errors = guesses[0] - force, guesses[1] - force
-            long, short = long.after(*errors, LONG_S), short.after(*errors, SHORT_S)
-    awaited = (*state.awaited_N, *[None] * count)[-JUDGED:]
+    for came, guess in zip(came_N, state.awaited, strict=False):
+        if guess is not None:
+            forecast_error_N, slope_error_N = guess.forecast_N - came, guess.slope_N - came
+            long = long.after(forecast_error_N, slope_error_N, LONG_S)
+            short = short.after(forecast_error_N, slope_error_N, SHORT_S)
+    awaited = (*state.awaited, *NOTHING_SAID)[min(count, JUDGED) :][:JUDGED]
     # until the next forecast the last one serves, as far as it reaches
-    changes = state.changes_N if stamp_s - state.from_s < (AHEAD - 1) * GRID_S else ()
+    changes = state.changes_N if stamp_s - state.from_s < (HORIZON - 1) * GRID_S else None
     return Periodicity(stamp_s, force_N, times_s[-1], history, state.from_s, changes, awaited, long, short)
 
 
@@ -145,30 +226,38 @@ def _searched(state: Periodicity, slope_N_s: float) -> Periodicity:
     slope may know of one setpoint more, which is on the safe side.
     """
     changes = _search(np.frombuffer(state.history))
-    said = None
+    said: Guess | None = None
     if changes:
         since_s = state.stamp_s - state.time_s
         forecast = state.force_N + changes[JUDGED] - changes[1] * since_s / GRID_S
-        said = forecast, state.force_N + slope_N_s * (JUDGED * GRID_S - since_s)
-    return state._replace(from_s=state.time_s, changes_N=changes, awaited_N=(*state.awaited_N[:-1], said))
+        said = Guess(forecast, state.force_N + slope_N_s * (JUDGED * GRID_S - since_s))
+    return Periodicity(
+        state.stamp_s,
+        state.force_N,
+        state.time_s,
+        state.history,
+        state.time_s,
+        changes,
+        (*state.awaited[:-1], said),
+        state.long,
+        state.short,
+    )
 
 
-def forecast_N(state: Periodicity, ahead_s: Array) -> Array:
-    """The forces at these times, 0 or more, after the newest setpoint; they stay where the forecast ends. Only where
-    `trust` is above 0."""
+def forecast_N(state: Periodicity, begins_s: float, after_s: list[float]) -> list[float]:
+    """The forces at these times (n) after `begins_s`, 0 or more, from the newest setpoint on; they stay where the
+    forecast ends. Only where `trust` is above 0."""
     changes = state.changes_N
     since_s = state.stamp_s - state.from_s
-    points, part = divmod(since_s / GRID_S, 1.0)
-    start = int(points)
+    start = int(since_s / GRID_S)
+    part = since_s / GRID_S - start
     # the forecast starts at the newest setpoint, which may have come some steps after the point it is from
     base_N = state.force_N - changes[start] - part * (changes[start + 1] - changes[start])
-    forces: Array = np.interp(ahead_s + since_s, _AHEAD_S, changes)
-    forces += base_N
-    return forces
+    return [interpolated(begins_s + later_s + since_s, _AHEAD_S, changes) + base_N for later_s in after_s]
 
 
-def _search(history: Array) -> tuple[float, ...]:
-    """The changes from the newest point of the grid to itself and the next AHEAD; empty where nothing is like it.
+def _search(history: Array) -> list[float]:
+    """The changes from the newest point of the grid to itself and the next HORIZON; empty where nothing is like it.
 
     What followed a stretch is regressed on 1 and on how the stretch differs from the newest. The newest does not differ
     from itself, so that the regression's constant is its forecast.
@@ -187,6 +276,7 @@ def _search(history: Array) -> tuple[float, ...]:
     total = normal[0, 0]
     normal += (RIDGE / TAPS * (weight @ squared) + SAME_N**2 * total) * _RIDGE
     solution = np.linalg.solve(normal, _CONSTANT)
-    if solution[0] * total > STRANGEST:
-        return ()
-    return (0.0, *(changes[TAPS + 1 :] @ (solution @ weighted)).tolist())
+    if solution[0] * total > MOST_LEVERAGE:
+        return []
+    ahead: list[float] = (changes[TAPS + 1 :] @ (solution @ weighted)).tolist()
+    return [0.0, *ahead]

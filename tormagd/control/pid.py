@@ -1,36 +1,91 @@
 """PID on position with two degrees of freedom: filtered derivative of the measurement, feed-forward of the reference,
-back-calculation against wind-up. Pure functions; gains are those of `config.Position`.
+back-calculation against wind-up. Pure functions.
 """
 
-from typing import NamedTuple
+from typing import Final, final
 
+from firmware_protocol.value import Value
 from tormagd.config import Position
 
-ON_TARGET_MM = 0.001
+ON_TARGET_MM: Final = 0.001
 "Just over half a count of 4,480 on 8 mm: a carriage cannot be told to stand nearer."
 
 
-class Error(NamedTuple):
+@final
+class Gains(Value):
+    """What of `config.Position` the PID needs; gains per mm, times in s, the duty's limit."""
+
+    __match_args__ = (
+        "proportional_per_mm",
+        "integral_time_s",
+        "derivative_time_s",
+        "back_calculation_s",
+        "duty_limit",
+    )
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        proportional_per_mm: float,
+        integral_time_s: float,
+        derivative_time_s: float,
+        back_calculation_s: float,
+        duty_limit: float,
+    ) -> None:
+        self.proportional_per_mm: Final = proportional_per_mm
+        self.integral_time_s: Final = integral_time_s
+        self.derivative_time_s: Final = derivative_time_s
+        self.back_calculation_s: Final = back_calculation_s
+        self.duty_limit: Final = duty_limit
+
+    @classmethod
+    def of(cls, position: Position) -> "Gains":
+        """Those of a configuration."""
+        return cls(
+            position.proportional_per_mm,
+            position.integral_time_s,
+            position.derivative_time_s,
+            position.back_calculation_s,
+            position.duty_limit,
+        )
+
+
+@final
+class Error(Value):
     """How far a carriage is from where it is expected, mm and mm/s."""
 
-    position_mm: float
-    speed_mm_s: float
+    __match_args__ = ("position_mm", "speed_mm_s")
+    __slots__ = __match_args__
+
+    def __init__(self, position_mm: float, speed_mm_s: float) -> None:
+        self.position_mm: Final = position_mm
+        self.speed_mm_s: Final = speed_mm_s
 
 
-class PidState(NamedTuple):
+@final
+class PidState(Value):
     """The integral action, duty. Starting it at 0 is bumpless: holding takes no duty, because friction holds."""
 
-    integral: float = 0.0
+    __match_args__ = ("integral",)
+    __slots__ = __match_args__
+
+    def __init__(self, integral: float = 0.0) -> None:
+        self.integral: Final = integral
 
 
-class PidOutput(NamedTuple):
+@final
+class PidOutput(Value):
     """Duty in -limit..limit, and whether the limit held it back."""
 
-    duty: float
-    is_saturated: bool
+    __match_args__ = ("duty", "is_saturated")
+    __slots__ = __match_args__
+
+    def __init__(self, duty: float, is_saturated: bool) -> None:
+        self.duty: Final = duty
+        self.is_saturated: Final = is_saturated
 
 
-def rested(gains: Position, state: PidState, error: Error, dt_s: float) -> PidState:
+def rested(gains: Gains, state: PidState, error: Error, dt_s: float) -> PidState:
     """The state before an update at a reference that rests. On target friction holds the carriage, and no error would
     ever take back what the integral learned on the way, which is wrong on the way back: it forgets in its own time.
     """
@@ -40,7 +95,7 @@ def rested(gains: Position, state: PidState, error: Error, dt_s: float) -> PidSt
 
 
 def pid(
-    gains: Position, state: PidState, error: Error, feed_forward: float, dt_s: float, *, is_blocked: bool = False
+    gains: Gains, state: PidState, error: Error, feed_forward: float, dt_s: float, *, is_blocked: bool = False
 ) -> tuple[PidState, PidOutput]:
     """One update, `dt_s` > 0 after the last; the feed-forward is a duty. The speed error carries the derivative action:
     its measured half is the filtered derivative of the position, its other half the speed that is expected, so that a

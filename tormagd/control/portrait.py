@@ -1,114 +1,129 @@
 """The device's phase portrait: which forces a gap gives, and how fast a gap speed changes them."""
 
-from bisect import bisect_right
-from typing import NamedTuple
+import math
+from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
 
+from tormagd.control.interpolation import interpolated
 from tormagd.learning.displacement import MOBILISED_MM
 from tormagd.learning.model_file import ForceModel
-from tormagd.physics.field import FieldLaw, flux_density_T, radial_moment_from_flux_density_Tm
+from tormagd.physics.errors import DomainError
+from tormagd.physics.field import PowerFieldLaw, flux_density_T
 from tormagd.physics.force import Elastomer, Geometry, brake_force_N
 
 Array = npt.NDArray[np.float64]
-ROLLER_RATE_MM_S = 42.0
+ROLLER_RATE_MM_S: Final = 42.0
 "Surface speed of the roller at the thesis's 20 rpm: the portrait is drawn for a handle in motion."
-GRID = 201
+GRID: Final = 201
 
 
-class FieldOfGap(NamedTuple):
-    """The flux density at the shaft's surface, mT, over the gap, mm, in one insert."""
+@final
+class FieldOfGap:
+    """The flux density at the shaft's surface, mT, over the gap, mm, in one insert: Eq. 6 with the power law's a.
 
-    law: FieldLaw
-    relative_permeability: float
-    inner_radius_m: float
+    What `PowerFieldLaw` and `flux_density_T` compute, on floats alone: it stands in every plan. Both directions raise
+    `DomainError` outside the law's range of gaps.
+    """
+
+    __slots__ = ("_coefficient", "_exponent", "_inverse", "_per_moment_T", "_range_mm", "_strongest_mT", "_weakest_mT")
+
+    def __init__(self, law: PowerFieldLaw, relative_permeability: float, inner_radius_m: float) -> None:
+        self._coefficient: Final = law.coefficient
+        self._exponent: Final = law.exponent
+        self._inverse: Final = 1.0 / law.exponent
+        self._per_moment_T: Final = flux_density_T(1.0, relative_permeability, inner_radius_m)
+        self._range_mm: Final = law.gap_range_mm
+        nearest_mm, farthest_mm = law.gap_range_mm
+        self._strongest_mT: Final = self.field_mT(nearest_mm)
+        self._weakest_mT: Final = self.field_mT(farthest_mm)
 
     def field_mT(self, gap_mm: float) -> float:
-        """Flux density |b| at R_i (Eq. 6 with a of the field law)."""
-        moment = self.law.radial_moment_Tm(gap_mm)
-        return 1e3 * float(flux_density_T(moment, self.relative_permeability, self.inner_radius_m))
+        """Flux density |b| at R_i."""
+        if not self._range_mm[0] <= gap_mm <= self._range_mm[1]:
+            raise DomainError("gap_mm", gap_mm, f"a number from {self._range_mm[0]:g} to {self._range_mm[1]:g}")
+        return 1e3 * (self._coefficient * math.pow(gap_mm, self._exponent) * self._per_moment_T)
 
     def gap_mm(self, field_mT: float) -> float:
         """The gap that gives `field_mT`."""
-        moment = radial_moment_from_flux_density_Tm(1e-3 * field_mT, self.relative_permeability, self.inner_radius_m)
-        return float(self.law.gap_mm(moment))
+        if not self._weakest_mT <= field_mT <= self._strongest_mT:
+            raise DomainError(
+                "field_mT", field_mT, f"a number from {self._weakest_mT:g} to {self._strongest_mT:g}, which gaps give"
+            )
+        return math.pow(1e-3 * field_mT / self._per_moment_T / self._coefficient, self._inverse)
 
 
-class Portrait(NamedTuple):
-    """Force over gap with friction fully mobilised, and its slope; forces rise and gaps fall along the arrays."""
+@final
+class Portrait:
+    """Force over gap with friction fully mobilised, and its slope |dF/dgap|, N per mm, at n points: forces rise and
+    gaps fall along the lists."""
 
-    gap_mm: Array
-    force_N: Array
-    slope_N_mm: Array
-    """|dF/dgap|, N per mm."""
+    __slots__ = ("force_N", "gap_mm", "slope_N_mm")
+
+    def __init__(self, gap_mm: list[float], force_N: list[float], slope_N_mm: list[float]) -> None:
+        self.gap_mm: Final = gap_mm
+        self.force_N: Final = force_N
+        self.slope_N_mm: Final = slope_N_mm
 
     @property
     def least_N(self) -> float:
         """F_min: what the open gap gives. A passive brake gives no less."""
-        return float(self.force_N[0])
+        return self.force_N[0]
 
     @property
     def most_N(self) -> float:
         """F_max: what the closed gap gives."""
-        return float(self.force_N[-1])
+        return self.force_N[-1]
 
     def slope_at_N_mm(self, force_N: float) -> float:
         """|dF/dgap| where the gap gives this force."""
-        return float(np.interp(force_N, self.force_N, self.slope_N_mm))
-
-    def gaps_mm(self, forces_N: Array) -> Array:
-        """The gaps that give these forces; the nearest end of the range where none does."""
-        gaps: Array = np.interp(forces_N, self.force_N, self.gap_mm)
-        return gaps
+        return interpolated(force_N, self.force_N, self.slope_N_mm)
 
     def gap_mm_at(self, force_N: float) -> float:
-        """`gaps_mm` of one force."""
-        return float(np.interp(force_N, self.force_N, self.gap_mm))
+        """The gap that gives this force; the nearest end of the range where none does."""
+        return interpolated(force_N, self.force_N, self.gap_mm)
 
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
         """The fastest change of force that a gap speed renders at this force."""
         return gap_speed_mm_s * self.slope_at_N_mm(force_N)
 
 
-class LawOfField(NamedTuple):
+@final
+class LawOfField:
     """The magnetoelastic law of the insert (Eq. 29 to 34) over the gaps of a portrait, scaled to its force: what the
-    learned model is held against. Force and field rise along the arrays."""
+    learned model is held against. Force and field rise along the lists."""
 
-    force_N: list[float]
-    fields_mT: list[float]
+    __slots__ = ("fields_mT", "force_N")
 
-    @classmethod
-    def beside(cls, shown: Portrait, field: FieldOfGap, elastomer: Elastomer, geometry: Geometry) -> "LawOfField":
-        """The law beside a portrait. Raises `DomainError` where the gaps leave the law's domain."""
-        moments_Tm: Array = np.asarray(field.law.radial_moment_Tm(shown.gap_mm), dtype=np.float64)
-        forces_N: Array = np.asarray(brake_force_N(moments_Tm, elastomer, geometry), dtype=np.float64)
-        scale = float(np.median(shown.force_N / forces_N))
-        return cls((scale * forces_N).tolist(), [field.field_mT(gap_mm) for gap_mm in shown.gap_mm.tolist()])
+    def __init__(self, force_N: list[float], fields_mT: list[float]) -> None:
+        self.force_N: Final = force_N
+        self.fields_mT: Final = fields_mT
 
     def field_mT(self, force_N: float) -> float:
         """The field for a force; that of the nearer end where none gives it."""
-        return _interpolated(force_N, self.force_N, self.fields_mT)
+        return interpolated(force_N, self.force_N, self.fields_mT)
+
+
+def law_beside(
+    shown: Portrait, law: PowerFieldLaw, field: FieldOfGap, elastomer: Elastomer, geometry: Geometry
+) -> LawOfField:
+    """The law beside a portrait. Raises `DomainError` where the gaps leave the law's domain."""
+    forces_N = brake_force_N(law.radial_moment_Tm(np.array(shown.gap_mm)), elastomer, geometry)
+    scale = float(np.median(np.array(shown.force_N) / forces_N))
+    scaled_N: list[float] = (scale * forces_N).tolist()
+    return LawOfField(scaled_N, [field.field_mT(gap_mm) for gap_mm in shown.gap_mm])
 
 
 def portrait(model: ForceModel, field: FieldOfGap, cip_percent: float, gap_range_mm: tuple[float, float]) -> Portrait:
     """The portrait that the learned model predicts over a gap range, for a handle that turns at ROLLER_RATE_MM_S, or
     the nearest rate that the model knows."""
-    gaps = np.linspace(gap_range_mm[1], gap_range_mm[0], GRID)
-    (_, mobilised_mm), rates_mm_s, _, _ = model.feature_ranges
-    rate_mm_s = min(max(ROLLER_RATE_MM_S, rates_mm_s[0]), rates_mm_s[1])
-    displacement_mm = min(MOBILISED_MM, mobilised_mm)
-    features = np.array([[displacement_mm, rate_mm_s, field.field_mT(float(gap)), cip_percent] for gap in gaps])
-    force = model.predict(features)
-    return Portrait(gaps, force, np.abs(np.gradient(force, gaps)))
-
-
-def _interpolated(x: float, xs: list[float], ys: list[float]) -> float:
-    """Linear between the points of rising `xs`, and the outermost `ys` beyond: NumPy takes longer for one point."""
-    after = bisect_right(xs, x)
-    if after == 0:
-        return ys[0]
-    if after == len(xs):
-        return ys[-1]
-    share = (x - xs[after - 1]) / (xs[after] - xs[after - 1])
-    return ys[after - 1] + share * (ys[after] - ys[after - 1])
+    gaps: Array = np.linspace(gap_range_mm[1], gap_range_mm[0], GRID)
+    (_, mobilised_mm), (slowest_mm_s, fastest_mm_s), _, _ = model.feature_ranges
+    rate_mm_s = min(max(ROLLER_RATE_MM_S, slowest_mm_s), fastest_mm_s)
+    curve = model.curve(min(MOBILISED_MM, mobilised_mm), rate_mm_s, cip_percent)
+    gap_mm: list[float] = gaps.tolist()
+    forces_N = curve.forces_N(np.array([field.field_mT(gap) for gap in gap_mm]))
+    slopes: list[float] = np.abs(np.gradient(forces_N, gaps)).tolist()
+    force_N: list[float] = forces_N.tolist()
+    return Portrait(gap_mm, force_N, slopes)

@@ -6,62 +6,101 @@ has shown; its offset goes beyond what an elastomer relaxes; or the reading stan
 """
 
 import math
-from typing import NamedTuple
+from typing import Final, final
 
-from tormagd.control.device_fit import LEAST_SCALE, MOST_SCALE, RELAXES, SURE, DeviceFit, observe
+from firmware_protocol.value import Value
+from tormagd.control.device_fit import LEAST_SCALE, MOST_SCALE, RELAXES, SURE, UNSEEN, DeviceFit, observe
 
-NOISE_N = 0.03
+NOISE_N: Final = 0.03
 "What noise, and the model's own error, leave of a mean over FILTER_S."
-FILTER_S = 0.01
-JUMP_N = 0.15
+FILTER_S: Final = 0.01
+JUMP_N: Final = 0.15
 "A device may depart so far from its fit of a moment ago: its hysteresis and its own friction at a creep do."
-VISCOUS_N_S_MM = 6e-4
+VISCOUS_N_S_MM: Final = 6e-4
 "And so much further for each mm/s that the handle goes at another speed than then,"
-SHAPE = 0.25
+SHAPE: Final = 0.25
 "and for each newton that the model says more or less: Eq. 7 is flat where the gap is open, the power law is not."
-LEAST_OFFSET_N, MOST_OFFSET_N = -0.12, 0.3
+LEAST_OFFSET_N: Final = -0.12
+MOST_OFFSET_N: Final = 0.3
 """Of a believable device that has not relaxed: another field law than the model's looks like an offset of up to 0.2 N.
 So a sensor that reads 0.3 N too much from the beginning may pass for such a device; it makes the brake press less."""
-KEPT_S = 0.3
+KEPT_S: Final = 0.3
 "How old the fit is that jumps are told from."
-FROZEN_S = 0.1
+FROZEN_S: Final = 0.1
 "A sensor that measures a friction in motion shows its own noise, at 500 readings a second or more."
-DOUBTED_S = 0.05
+DOUBTED_S: Final = 0.05
 "Evidence for so long is doubt."
-TRUSTED_AGAIN_S = 1.0
+TRUSTED_AGAIN_S: Final = 1.0
 "A sensor that reads, for so long, what a device gives that is like most, is believed anew."
-SLOW_S, SLOW_ERROR_N2_S = 5.0, 3e-4
+SLOW_S: Final = 5.0
+SLOW_ERROR_N2_S: Final = 3e-4
 "A fit that forgets slowly, and takes the model at its word, tells an offset from a scale best."
-MEMORY_S = 900.0
+MEMORY_S: Final = 900.0
 "The slowest of the elastomer's time constants."
 
-_NEW = DeviceFit()
 
-
-class Past(NamedTuple):
+@final
+class Past(Value):
     """What was heard: the newest reading and for how long it has stood still, a mean over FILTER_S, the mean of the
     model's force over MEMORY_S, and the slow fit. `before` and `kept` are the device's own fit of up to twice and once
     KEPT_S ago, and `before_at` and `kept_at` the model's force and the handle's rate then, N and mm/s."""
 
-    reading_N: float
-    still_s: float
-    measured_N: float
-    loaded_N: float
-    slow: DeviceFit
-    before: DeviceFit = DeviceFit()
-    before_at: tuple[float, float] = (0.0, 0.0)
-    kept: DeviceFit = DeviceFit()
-    kept_at: tuple[float, float] = (0.0, 0.0)
-    kept_s: float = 0.0
+    __match_args__ = (
+        "reading_N",
+        "still_s",
+        "measured_N",
+        "loaded_N",
+        "slow",
+        "before",
+        "before_at",
+        "kept",
+        "kept_at",
+        "kept_s",
+    )
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        reading_N: float,
+        still_s: float,
+        measured_N: float,
+        loaded_N: float,
+        slow: DeviceFit,
+        before: DeviceFit = UNSEEN,
+        before_at: tuple[float, float] = (0.0, 0.0),
+        kept: DeviceFit = UNSEEN,
+        kept_at: tuple[float, float] = (0.0, 0.0),
+        kept_s: float = 0.0,
+    ) -> None:
+        self.reading_N: Final = reading_N
+        self.still_s: Final = still_s
+        self.measured_N: Final = measured_N
+        self.loaded_N: Final = loaded_N
+        self.slow: Final = slow
+        self.before: Final = before
+        self.before_at: Final = before_at
+        self.kept: Final = kept
+        self.kept_at: Final = kept_at
+        self.kept_s: Final = kept_s
 
 
-class Sensor(NamedTuple):
+@final
+class Sensor(Value):
     """The judgement: whether it is doubted, for how long of sliding, and since when there is, or is no, evidence."""
 
-    is_doubted: bool = False
-    doubted_s: float = 0.0
-    evidence_s: float = 0.0
-    past: Past | None = None
+    __match_args__ = ("is_doubted", "doubted_s", "evidence_s", "past")
+    __slots__ = __match_args__
+
+    def __init__(
+        self, is_doubted: bool = False, doubted_s: float = 0.0, evidence_s: float = 0.0, past: Past | None = None
+    ) -> None:
+        self.is_doubted: Final = is_doubted
+        self.doubted_s: Final = doubted_s
+        self.evidence_s: Final = evidence_s
+        self.past: Final = past
+
+
+UNJUDGED: Final = Sensor()
 
 
 def judge(
@@ -72,17 +111,19 @@ def judge(
     past = _heard(sensor.past, model_N, reading_N, elapsed_s)
     if sensor.is_doubted:
         # it has to read for long what most devices do, not what one at the edge might
-        agrees = past.still_s <= FROZEN_S and abs(past.measured_N - _NEW.force_N(model_N)) <= _NEW.deviation_N(model_N)
+        agrees = past.still_s <= FROZEN_S and abs(past.measured_N - UNSEEN.force_N(model_N)) <= UNSEEN.deviation_N(
+            model_N
+        )
         evidence_s = sensor.evidence_s + elapsed_s if agrees else 0.0
         return (
-            Sensor() if evidence_s > TRUSTED_AGAIN_S else Sensor(True, sensor.doubted_s + elapsed_s, evidence_s, past)
+            UNJUDGED if evidence_s > TRUSTED_AGAIN_S else Sensor(True, sensor.doubted_s + elapsed_s, evidence_s, past)
         )
     is_strange = _is_strange(past, model_N, rate_mm_s)
     evidence_s = max(sensor.evidence_s + (elapsed_s if is_strange else -elapsed_s), 0.0)
     if evidence_s > DOUBTED_S:
         return Sensor(True, past=past)
     if past.kept_s >= KEPT_S and not is_strange:
-        past = past._replace(
+        past = past.replaced(
             before=past.kept, before_at=past.kept_at, kept=fit, kept_at=(model_N, rate_mm_s), kept_s=0.0
         )
     return Sensor(False, 0.0, evidence_s, past)
@@ -90,7 +131,7 @@ def judge(
 
 def _heard(past: Past | None, model_N: float, reading_N: float, elapsed_s: float) -> Past:
     slow, _ = observe(
-        _NEW if past is None else past.slow,
+        UNSEEN if past is None else past.slow,
         model_N,
         reading_N,
         elapsed_s,

@@ -5,23 +5,33 @@ device does now is not known before it has answered the next Drive. Pure functio
 """
 
 import math
-from typing import NamedTuple
+from typing import Final, final
 
-BLIND_S, BLIND_PERIODS = 0.005, 5.0
+from firmware_protocol.value import Value
+
+BLIND_S: Final = 0.005
+BLIND_PERIODS: Final = 5.0
 """Without a new state for longer than both, where the carriages are is not known well enough to drive them. The answer
 to the first Drive after a stall may take twice as long: a wire that needs more is slow for a loop."""
-SHOWN_S = 0.1
+SHOWN_S: Final = 0.1
 "A stall is shown for this long after it, or nobody would see it: telemetry comes every 20 ms."
 
 
-class Sight(NamedTuple):
+@final
+class Sight(Value):
     """What is remembered of it. `seen_s` is when a new state was last found, `stalled_s` when a stall last ended."""
 
-    seen_s: float = math.inf
-    stalled_s: float = -math.inf
-    stall_s: float = 0.0
-    "How long that stall was, or the longest of those that came within SHOWN_S of each other."
-    is_blind: bool = False
+    __match_args__ = ("seen_s", "stalled_s", "stall_s", "is_blind")
+    __slots__ = __match_args__
+
+    def __init__(
+        self, seen_s: float = math.inf, stalled_s: float = -math.inf, stall_s: float = 0.0, is_blind: bool = False
+    ) -> None:
+        self.seen_s: Final = seen_s
+        self.stalled_s: Final = stalled_s
+        self.stall_s: Final = stall_s
+        "How long that stall was, or the longest of those that came within SHOWN_S of each other."
+        self.is_blind: Final = is_blind
 
     def has_stalled(self, now_s: float) -> bool:
         """Whether a stall ended not long ago."""
@@ -32,6 +42,10 @@ class Sight(NamedTuple):
         return self.is_blind and now_s - self.stalled_s < 2.0 * _blind_s(period_s)
 
 
+UNSEEING: Final = Sight()
+"Before the first step."
+
+
 def look(sight: Sight, last_s: float, now_s: float, period_s: float, is_new: bool) -> Sight:
     """The sight of a step at `now_s` after one at `last_s`; `is_new`: it was given a state that the other was not."""
     stall_s, blind_s = now_s - last_s, _blind_s(period_s)
@@ -39,8 +53,10 @@ def look(sight: Sight, last_s: float, now_s: float, period_s: float, is_new: boo
         before_s = sight.stall_s if sight.has_stalled(now_s) else 0.0
         return Sight(now_s, now_s, max(stall_s, before_s), is_blind=True)
     if is_new:
-        return sight._replace(seen_s=now_s, is_blind=False)
-    return sight._replace(is_blind=sight.is_blind or now_s - sight.seen_s > blind_s)
+        return Sight(now_s, sight.stalled_s, sight.stall_s)
+    if sight.is_blind or now_s - sight.seen_s <= blind_s:
+        return sight
+    return Sight(sight.seen_s, sight.stalled_s, sight.stall_s, is_blind=True)
 
 
 def _blind_s(period_s: float) -> float:

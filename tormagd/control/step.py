@@ -1,16 +1,17 @@
 """`step`: safety, reference, two PIDs, duty. Pure: no clock, no I/O, explicit state, the same result every time."""
 
 import math
-from typing import NamedTuple
+from typing import Final, final
 
 from firmware_protocol.codec import DeviceMode, DriveMode
+from firmware_protocol.value import Value
 from tormagd.config import Config
 from tormagd.control.device_fit import SCALE_SD
 from tormagd.control.estimate import Estimate, first_estimate, update
 from tormagd.control.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s, pull_V
-from tormagd.control.pid import Error, PidState, pid, rested
+from tormagd.control.pid import Error, Gains, PidState, pid, rested
 from tormagd.control.plan import Plan
-from tormagd.control.sight import Sight, look
+from tormagd.control.sight import UNSEEING, Sight, look
 from tormagd.control.trajectory import Expected, Reference, Speeds, expect, follow
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault, Limit, device_faults
@@ -26,85 +27,150 @@ from tormagd.safety.operating_state import (
 )
 from tormagd.scenes.scene import Scene
 
-CARRY_S = 0.012
+CARRY_S: Final = 0.012
 "A plan's gap is carried forward along its speed by no more than three inference periods."
-WEAK_MM = 1.0
+WEAK_MM: Final = 1.0
 "Carriages further behind than this have reached the top speed of motors that are weaker than they are believed to be."
-STARTING_S = 0.15
+STARTING_S: Final = 0.15
 "After enabling, the device may take this long to report that it runs."
-EXCHANGE_S = 0.0015
+EXCHANGE_S: Final = 0.0015
 "From a duty to its effect as the encoders report it: a period in the exchange, half a period that it is held."
-COULOMB_SPEED_MM_S = 0.5
+COULOMB_SPEED_MM_S: Final = 0.5
 "Below this reference speed the friction feed-forward fades, so that a resting carriage is not pushed to and fro."
-RESTING_MM_S = 0.02
+RESTING_MM_S: Final = 0.02
 "A slower reference has arrived: it comes in exponentially, and what a second of it moves is a few encoder counts."
-STILL_MM_S = 0.5
+STILL_MM_S: Final = 0.5
 "Slower than this a carriage does not move: half an encoder count a millisecond and filtered."
-STARTS_OVER = 1.25
+STARTS_OVER: Final = 1.25
 "Static over kinetic friction at most: a start from rest may take so many times the greatest force."
-OVER_N = 0.1
+OVER_N: Final = 0.1
 "What the sensor may be off besides."
-OVER_HELD_S, OVER_FAULT_S = 0.01, 0.04
+OVER_HELD_S: Final = 0.01
+OVER_FAULT_S: Final = 0.04
 "A force over the ceiling opens the gap after the first, and is a fault after the second."
-SENSOR_FAULT_S = 2.0
+SENSOR_FAULT_S: Final = 2.0
 "A sensor that has not been believed for so long of sliding is a fault: forces are then only as good as the model."
-STALL_SHARE = 0.8
+STALL_SHARE: Final = 0.8
 "Of the device's timeout: a shorter stall of ours did not make it run out."
-LAGGING_MM = 0.1
+LAGGING_MM: Final = 0.1
 "The speed limit is reported as RATE only where it leaves the reference this far behind its target."
 
+DISARMED: Final = SafetyState()
+EMPTY: Final = PidState()
+NO_LIMITS: Final[tuple[Limit, ...]] = ()
 
-class StepState(NamedTuple):
+
+@final
+class StepState(Value):
     """What a step remembers."""
 
-    time_s: float
-    safety: SafetyState = SafetyState()
-    estimate: Estimate | None = None
-    reference: Reference | None = None
-    expected: Expected | None = None
-    left: PidState = PidState()
-    right: PidState = PidState()
-    duties: tuple[float, float] = (0.0, 0.0)
-    "Of the step before, left and right."
-    enabled_s: float = math.inf
-    straying_s: float = 0.0
-    "For how long the gap has been too far from its reference, in periods: a process that stood still saw nothing."
-    still_s: float = 0.0
-    "For how long a carriage has been driven without moving, counted alike."
-    over_s: float = 0.0
-    "For how long the measured force has been over the ceiling while the handle moved, counted alike."
-    sight: Sight = Sight()
+    __match_args__ = (
+        "time_s",
+        "safety",
+        "estimate",
+        "reference",
+        "expected",
+        "left",
+        "right",
+        "duties",
+        "enabled_s",
+        "straying_s",
+        "still_s",
+        "over_s",
+        "sight",
+    )
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        time_s: float,
+        safety: SafetyState = DISARMED,
+        estimate: Estimate | None = None,
+        reference: Reference | None = None,
+        expected: Expected | None = None,
+        left: PidState = EMPTY,
+        right: PidState = EMPTY,
+        duties: tuple[float, float] = (0.0, 0.0),
+        enabled_s: float = math.inf,
+        straying_s: float = 0.0,
+        still_s: float = 0.0,
+        over_s: float = 0.0,
+        sight: Sight = UNSEEING,
+    ) -> None:
+        self.time_s: Final = time_s
+        self.safety: Final = safety
+        self.estimate: Final = estimate
+        self.reference: Final = reference
+        self.expected: Final = expected
+        self.left: Final = left
+        self.right: Final = right
+        self.duties: Final = duties
+        "Of the step before, left and right."
+        self.enabled_s: Final = enabled_s
+        self.straying_s: Final = straying_s
+        "For how long the gap has been too far from its reference, in periods: a process that stood still saw nothing."
+        self.still_s: Final = still_s
+        "For how long a carriage has been driven without moving, counted alike."
+        self.over_s: Final = over_s
+        "For how long the measured force has been over the ceiling while the handle moved, counted alike."
+        self.sight: Final = sight
 
 
-class StepOutput(NamedTuple):
+@final
+class StepOutput(Value):
     """What goes to the device, and what holds it back."""
 
-    mode: DriveMode
-    left_duty: float
-    right_duty: float
-    request: DeviceRequest
-    request_number: int
-    limits: tuple[Limit, ...]
+    __match_args__ = ("mode", "left_duty", "right_duty", "request", "request_number", "limits")
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        mode: DriveMode,
+        left_duty: float,
+        right_duty: float,
+        request: DeviceRequest,
+        request_number: int,
+        limits: tuple[Limit, ...],
+    ) -> None:
+        self.mode: Final = mode
+        self.left_duty: Final = left_duty
+        self.right_duty: Final = right_duty
+        self.request: Final = request
+        self.request_number: Final = request_number
+        self.limits: Final = limits
 
 
+@final
 class Stepper:
     """The constants of a step. Its methods change nothing."""
 
     def __init__(self, config: Config, scene: Scene) -> None:
-        self._position, self._limits, self._device = config.position, config.limits, config.device
+        position, limits, motor = config.position, config.limits, config.motor
+        # what a step reads is read from the configuration once
+        self._gains = Gains.of(position)
+        self._gap_acceleration_mm_s2 = position.gap_acceleration_mm_s2
+        self._gap_speed_mm_s = position.gap_speed_mm_s
+        self._derivative_filter_s = position.derivative_filter_s
+        self._synchronisation = position.synchronisation
+        self._duty_limit = position.duty_limit
+        self._skew_warning_mm, self._skew_fault_mm = limits.skew_warning_mm, limits.skew_fault_mm
+        self._following_error_mm, self._following_time_s = limits.following_error_mm, limits.following_time_s
+        self._no_motion_duty, self._no_motion_time_s = limits.no_motion_duty, limits.no_motion_time_s
+        self._measurement_timeout_s = config.device.measurement_timeout_ms * 1e-3
+        self._longest_own_stall_s = STALL_SHARE * config.device.command_timeout_ms * 1e-3
         self._nominal_dt_s = 1.0 / config.rates.control_hz
-        self._gaps_mm = (scene.insert.gap_closed_mm, scene.insert.gap_open_mm)
-        self._home_mm = scene.insert.gap_open_mm / 2.0
+        self._closed_mm, self._open_mm = scene.insert.gap_closed_mm, scene.insert.gap_open_mm
+        self._home_mm = self._open_mm / 2.0
         # devices not yet seen differ by SCALE_SD: a scene that tolerates that does without the sensor
         self._needs_sensor = scene.force.tolerance_rms_N < SCALE_SD * scene.force.most_N
         self._ceiling_N = STARTS_OVER * scene.force.most_N + OVER_N
-        self._motor, self._supply_V = config.motor, config.motor.supply_V
-        self._full_speed_mm_s = full_speed_mm_s(config.motor)
+        self._pull_V, self._supply_V = motor.pull_V, motor.supply_V
+        self._full_speed_mm_s = full_speed_mm_s(motor)
         self._no_load_mm_s = 2.0 * self._full_speed_mm_s
-        self._mechanical_time_s = mechanical_time_s(config.motor)
-        self._lag_s = electrical_time_s(config.motor) + EXCHANGE_S
-        self._gear_loss = 1.0 - config.motor.gear_efficiency
-        self._coulomb = config.motor.coulomb_V / config.motor.supply_V
+        self._mechanical_time_s = mechanical_time_s(motor)
+        self._lag_s = electrical_time_s(motor) + EXCHANGE_S
+        self._gear_loss = 1.0 - motor.gear_efficiency
+        self._coulomb = motor.coulomb_V / motor.supply_V
 
     def start(self, now_s: float) -> StepState:
         """The state before the first step: disabled."""
@@ -119,72 +185,72 @@ class Stepper:
                 raise RefusedError(
                     "not_fresh", "no measurement from the device yet", "look at the link in tormagctl status"
                 )
-            apart_mm, most_mm = abs(state.estimate.skew_mm), self._limits.skew_fault_mm
+            apart_mm, most_mm = abs(state.estimate.skew_mm), self._skew_fault_mm
             if not apart_mm <= most_mm:
                 raise RefusedError(
                     "skewed",
                     f"the carriages are {apart_mm:.2f} mm apart: allowed is at most {most_mm:g} mm",
                     "tormagctl home",
                 )
-            return state._replace(
+            return state.replaced(
                 safety=safety,
                 reference=Reference(state.estimate.gap_mm),
                 expected=Expected(state.estimate.gap_mm),
-                left=PidState(),
-                right=PidState(),
+                left=EMPTY,
+                right=EMPTY,
                 enabled_s=now_s,
                 straying_s=0.0,
                 still_s=0.0,
                 over_s=0.0,
             )
-        return state._replace(safety=safety)
+        return state.replaced(safety=safety)
 
     def lose_link(self, state: StepState) -> StepState:
         """The state after the link broke: a fault where the device was driven, otherwise only a forgotten estimate."""
         safety = state.safety
         if safety.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED):
             safety = latch(safety, (Fault.LINK_LOST,))
-        return state._replace(safety=safety, estimate=None)
+        return state.replaced(safety=safety, estimate=None)
 
     def step(
         self, state: StepState, now_s: float, measurement: Measurement | None, plan: Plan
     ) -> tuple[StepState, StepOutput]:
         """One control period. With no measurement the link is lost, and the device is told nothing but OFF."""
         if measurement is None:
-            state = self.lose_link(state)._replace(time_s=now_s)
-            return state, self._off(state.safety, ())
+            state = self.lose_link(state).replaced(time_s=now_s)
+            return state, self._off(state.safety, NO_LIMITS)
         is_new = state.estimate is None or measurement.number != state.estimate.number
         was_blind, sight = state.sight.is_blind, look(state.sight, state.time_s, now_s, self._nominal_dt_s, is_new)
-        estimate = update(state.estimate, measurement, self._home_mm, self._position.derivative_filter_s)
+        estimate = update(state.estimate, measurement, self._home_mm, self._derivative_filter_s)
         safety = latch(state.safety, self._watch(state, estimate, now_s, measurement, plan, sight))
         if safety.needs_homing:
-            safety, estimate = homed_again(safety, measurement.is_homed), estimate._replace(is_homed=False)
+            safety, estimate = homed_again(safety, measurement.is_homed), estimate.replaced(is_homed=False)
         if safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             if measurement.is_busy:  # homing moves the origin: what was learned about motion before it is void
                 estimate = first_estimate(measurement, self._home_mm)
-            state = state._replace(
+            state = state.replaced(
                 time_s=now_s, safety=safety, estimate=estimate, reference=None, expected=None, sight=sight
             )
-            return state, self._off(safety, ())
+            return state, self._off(safety, NO_LIMITS)
         if sight.is_blind:
-            return self._hold(state._replace(time_s=now_s, safety=safety, estimate=estimate, sight=sight))
+            return self._hold(state.replaced(time_s=now_s, safety=safety, estimate=estimate, sight=sight))
         if was_blind:
             state = self._from_where_it_is(state, estimate)
-        return self._drive(state._replace(sight=sight), safety, now_s, measurement, estimate, plan)
+        return self._drive(state, safety, now_s, measurement, estimate, plan, sight)
 
     def _hold(self, state: StepState) -> tuple[StepState, StepOutput]:
         """Asks the device for an answer without moving anything: friction holds the gap. Nothing is learned from it."""
         limit = Limit.HOST_STALL if state.sight.has_stalled(state.time_s) else Limit.DEVICE_SILENT
         safety = state.safety
         output = StepOutput(DriveMode.RUN, 0.0, 0.0, safety.request, safety.request_number, (limit,))
-        return state._replace(duties=(0.0, 0.0)), output
+        return state.replaced(duties=(0.0, 0.0)), output
 
     def _from_where_it_is(self, state: StepState, estimate: Estimate) -> StepState:
         """The device went on with its last duty, unseen: the reference goes on from what came of it, without a leap."""
         most_mm_s = self._no_load_mm_s
         speed_mm_s = min(max(estimate.left_mm_s + estimate.right_mm_s, -most_mm_s), most_mm_s)
         reference = Reference(estimate.gap_mm, speed_mm_s)
-        return state._replace(reference=reference, expected=Expected(estimate.gap_mm, speed_mm_s, speed_mm_s))
+        return state.replaced(reference=reference, expected=Expected(estimate.gap_mm, speed_mm_s, speed_mm_s))
 
     def _drive(
         self,
@@ -194,45 +260,47 @@ class Stepper:
         measurement: Measurement,
         estimate: Estimate,
         plan: Plan,
+        sight: Sight,
     ) -> tuple[StepState, StepOutput]:
         dt_s = now_s - state.time_s
         if not 0.0 < dt_s < 10.0 * self._nominal_dt_s:
             dt_s = self._nominal_dt_s  # a clock that stood still gives no period
         reference = state.reference or Reference(estimate.gap_mm)
         expected = state.expected or Expected(estimate.gap_mm)
-        expected = expect(expected, reference, dt_s, self._lag_s, self._position.derivative_filter_s)
+        expected = expect(expected, reference, dt_s, self._lag_s, self._derivative_filter_s)
         # a homed carriage that is found beyond the closed end has to come back from there
-        pull = pull_V(self._motor, max(reference.gap_mm, self._gaps_mm[0])) / self._supply_V
+        pull = pull_V(self._pull_V, max(reference.gap_mm, self._closed_mm)) / self._supply_V
         speeds = self._speeds(pull, expected, estimate)
         limits: list[Limit] = []
         if safety.operating_state is OperatingState.PAUSED:
-            reference, _ = follow(self._position, reference, Reference(reference.gap_mm), dt_s, speeds)
+            reference, _ = follow(self._gap_acceleration_mm_s2, reference, Reference(reference.gap_mm), dt_s, speeds)
         else:
             target = self._target(plan, now_s)
             if state.over_s > OVER_HELD_S:
-                target = Reference(self._gaps_mm[1])
+                target = Reference(self._open_mm)
                 limits.append(Limit.OVER_FORCE)
-            reference, is_limited = follow(self._position, reference, target, dt_s, speeds)
+            reference, is_limited = follow(self._gap_acceleration_mm_s2, reference, target, dt_s, speeds)
             if is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
                 limits.append(Limit.RATE)
         left_error, right_error = self._errors(expected, estimate)
         ahead = self._feed_forward(reference, pull)
         left_state, right_state = state.left, state.right
         if abs(reference.speed_mm_s) < RESTING_MM_S:
-            left_state = rested(self._position, left_state, left_error, dt_s)
-            right_state = rested(self._position, right_state, right_error, dt_s)
+            left_state = rested(self._gains, left_state, left_error, dt_s)
+            right_state = rested(self._gains, right_state, right_error, dt_s)
         # the firmware gives a carriage at its open switch no opening duty: nothing may be learned or concluded there
         is_left_blocked, is_right_blocked = measurement.is_left_open, measurement.is_right_open
-        left_state, left = pid(self._position, left_state, left_error, ahead, dt_s, is_blocked=is_left_blocked)
-        right_state, right = pid(self._position, right_state, right_error, ahead, dt_s, is_blocked=is_right_blocked)
-        if not math.isfinite(left.duty + right.duty + measurement.supply_V):  # a sum is finite only if all of it is
+        left_state, left = pid(self._gains, left_state, left_error, ahead, dt_s, is_blocked=is_left_blocked)
+        right_state, right = pid(self._gains, right_state, right_error, ahead, dt_s, is_blocked=is_right_blocked)
+        total = left.duty + right.duty + measurement.supply_V
+        if not -math.inf < total < math.inf:  # a sum is finite only if all of it is
             safety = latch(safety, (Fault.NOT_FINITE,))
-            return self.start(now_s)._replace(safety=safety), self._off(safety, ())
+            return self.start(now_s).replaced(safety=safety), self._off(safety, NO_LIMITS)
         if left.is_saturated or right.is_saturated:
             limits.append(Limit.SATURATED)
-        if abs(estimate.skew_mm) > self._limits.skew_warning_mm:
+        if abs(estimate.skew_mm) > self._skew_warning_mm:
             limits.append(Limit.SKEW)
-        if state.sight.has_stalled(now_s):
+        if sight.has_stalled(now_s):
             limits.append(Limit.HOST_STALL)
         state = StepState(
             time_s=now_s,
@@ -247,11 +315,11 @@ class Stepper:
             straying_s=state.straying_s + dt_s if self._is_astray(reference, estimate) else 0.0,
             over_s=state.over_s + dt_s if self._is_over(estimate) else 0.0,
             still_s=state.still_s + dt_s if self._is_still(state, estimate, left.duty, right.duty) else 0.0,
-            sight=state.sight,
+            sight=sight,
         )
         # the bridges switch the device's real supply: the same volts take less duty of a higher one
         scale = self._supply_V / max(measurement.supply_V, 0.5 * self._supply_V)
-        most = self._position.duty_limit
+        most = self._duty_limit
         output = StepOutput(
             DriveMode.RUN,
             min(max(left.duty * scale, -most), most),
@@ -267,7 +335,7 @@ class Stepper:
         age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + self._lag_s
         gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
         speed_mm_s = plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2
-        within_mm = min(max(gap_mm, self._gaps_mm[0], plan.least_gap_mm), self._gaps_mm[1])
+        within_mm = min(max(gap_mm, self._closed_mm, plan.least_gap_mm), self._open_mm)
         return Reference(within_mm, speed_mm_s, plan.gap_acceleration_mm_s2)
 
     def _speeds(self, pull: float, expected: Expected, estimate: Estimate) -> Speeds:
@@ -278,15 +346,15 @@ class Stepper:
         if abs(expected.gap_mm - estimate.gap_mm) > WEAK_MM:
             shown_mm_s = abs(estimate.left_mm_s + estimate.right_mm_s)
             motors_mm_s = min(max(shown_mm_s, motors_mm_s / 2.0), motors_mm_s)
-        closing_mm_s = min(motors_mm_s, self._position.gap_speed_mm_s)
+        closing_mm_s = min(motors_mm_s, self._gap_speed_mm_s)
         # the magnets' pull helps to close, but a reserve is worth more there than a little speed
-        opening_mm_s = self._no_load_mm_s * (self._position.duty_limit - self._coulomb - pull)
+        opening_mm_s = self._no_load_mm_s * (self._duty_limit - self._coulomb - pull)
         return Speeds(motors_mm_s, min(closing_mm_s, opening_mm_s), closing_mm_s)
 
     def _errors(self, expected: Expected, estimate: Estimate) -> tuple[Error, Error]:
         """Both carriages' errors; either also takes half of the skew, so that the faster waits for the slower."""
         half_mm, half_mm_s = expected.gap_mm / 2.0, expected.filtered_mm_s / 2.0
-        skew = self._position.synchronisation * estimate.skew_mm / 2.0
+        skew = self._synchronisation * estimate.skew_mm / 2.0
         return (
             Error(half_mm - estimate.left_mm - skew, half_mm_s - estimate.left_mm_s),
             Error(half_mm - estimate.right_mm + skew, half_mm_s - estimate.right_mm_s),
@@ -314,24 +382,24 @@ class Stepper:
         faults: list[Fault] = []
         if now_s >= state.safety.clearing_until_s:
             is_ours = Fault.HOST_STALL in state.safety.faults or (
-                sight.has_stalled(now_s) and sight.stall_s > STALL_SHARE * self._device.command_timeout_ms * 1e-3
+                sight.has_stalled(now_s) and sight.stall_s > self._longest_own_stall_s
             )
             faults.extend(device_faults(measurement.faults, is_host_stall=is_ours))
         if state.safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             return tuple(faults)
         # what has just come over a slow line is old too, and a loop around it would swing
-        is_old = now_s - measurement.received_s + measurement.delay_s > self._device.measurement_timeout_ms * 1e-3
+        is_old = now_s - measurement.received_s + measurement.delay_s > self._measurement_timeout_s
         if is_old and not sight.is_waiting(now_s, self._nominal_dt_s):
             faults.append(Fault.MEASUREMENT_STALE)
-        if abs(estimate.skew_mm) > self._limits.skew_fault_mm:
+        if abs(estimate.skew_mm) > self._skew_fault_mm:
             faults.append(Fault.SKEW)
-        if state.straying_s > self._limits.following_time_s:
+        if state.straying_s > self._following_time_s:
             faults.append(Fault.FOLLOWING_ERROR)
         if state.over_s > OVER_FAULT_S:
             faults.append(Fault.OVER_FORCE)
         if self._needs_sensor and plan.sensor_doubted_s > SENSOR_FAULT_S:
             faults.append(Fault.SENSOR)
-        if state.still_s > self._limits.no_motion_time_s:
+        if state.still_s > self._no_motion_time_s:
             faults.append(Fault.NO_MOTION)
         if measurement.mode is not DeviceMode.RUN and not faults and now_s - state.enabled_s > STARTING_S:
             faults.append(Fault.DEVICE_NOT_RUNNING)
@@ -341,10 +409,10 @@ class Stepper:
         return estimate.force_N > self._ceiling_N and abs(estimate.handle.rate_mm_s) > STILL_MM_S
 
     def _is_astray(self, reference: Reference, estimate: Estimate) -> bool:
-        return abs(reference.gap_mm - estimate.gap_mm) > self._limits.following_error_mm
+        return abs(reference.gap_mm - estimate.gap_mm) > self._following_error_mm
 
     def _is_still(self, state: StepState, estimate: Estimate, left_duty: float, right_duty: float) -> bool:
-        least = self._limits.no_motion_duty
+        least = self._no_motion_duty
         # a duty that turns round before the carriage could move drives it nowhere
         is_left_driven = left_duty * math.copysign(1.0, state.duties[0]) > least
         is_right_driven = right_duty * math.copysign(1.0, state.duties[1]) > least

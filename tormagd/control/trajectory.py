@@ -1,59 +1,73 @@
 """The gap reference: follows a moving target as fast as the motors can, and no faster."""
 
 import math
-from typing import NamedTuple
+from typing import Final, final
 
-from tormagd.config import Position
+from firmware_protocol.value import Value
 
-APPROACH_S = 0.01
+APPROACH_S: Final = 0.01
 "Time constant of the last stretch: below it the reference would chase every quantum of its target."
-LEAST_BRAKING = 0.2
+LEAST_BRAKING: Final = 0.2
 "Share of the acceleration that is left to brake with, however hard the target itself turns."
 
 
-class Reference(NamedTuple):
+@final
+class Reference(Value):
     """Where the gap is driven, mm, and how fast it is driven there, mm/s and mm/s^2."""
 
-    gap_mm: float
-    speed_mm_s: float = 0.0
-    acceleration_mm_s2: float = 0.0
+    __match_args__ = ("gap_mm", "speed_mm_s", "acceleration_mm_s2")
+    __slots__ = __match_args__
+
+    def __init__(self, gap_mm: float, speed_mm_s: float = 0.0, acceleration_mm_s2: float = 0.0) -> None:
+        self.gap_mm: Final = gap_mm
+        self.speed_mm_s: Final = speed_mm_s
+        self.acceleration_mm_s2: Final = acceleration_mm_s2
 
 
-class Speeds(NamedTuple):
+@final
+class Speeds(Value):
     """Of the gap, mm/s, > 0: where the motors have no torque left, and the fastest that the reference may be."""
 
-    no_load_mm_s: float
-    opening_mm_s: float
-    closing_mm_s: float
+    __match_args__ = ("no_load_mm_s", "opening_mm_s", "closing_mm_s")
+    __slots__ = __match_args__
+
+    def __init__(self, no_load_mm_s: float, opening_mm_s: float, closing_mm_s: float) -> None:
+        self.no_load_mm_s: Final = no_load_mm_s
+        self.opening_mm_s: Final = opening_mm_s
+        self.closing_mm_s: Final = closing_mm_s
 
 
-class Expected(NamedTuple):
+@final
+class Expected(Value):
     """Where the gap must be by now if it follows its reference: mm, mm/s, and the speed as the estimate filters it.
 
     The windings take the acceleration with a lag and the exchange brings it in and back a little later, so this is the
     reference with its jerk limited to what the drive can do. A lag has a positive kernel: it adds no overshoot.
     """
 
-    gap_mm: float
-    speed_mm_s: float = 0.0
-    filtered_mm_s: float = 0.0
+    __match_args__ = ("gap_mm", "speed_mm_s", "filtered_mm_s")
+    __slots__ = __match_args__
+
+    def __init__(self, gap_mm: float, speed_mm_s: float = 0.0, filtered_mm_s: float = 0.0) -> None:
+        self.gap_mm: Final = gap_mm
+        self.speed_mm_s: Final = speed_mm_s
+        self.filtered_mm_s: Final = filtered_mm_s
 
 
 def follow(
-    limits: Position, reference: Reference, target: Reference, dt_s: float, speeds: Speeds
+    acceleration_mm_s2: float, reference: Reference, target: Reference, dt_s: float, speeds: Speeds
 ) -> tuple[Reference, bool]:
     """The reference `dt_s` later, and whether the speed limit holds it back from the target, which moves.
 
     The closing speed is the largest from which the distance left still suffices to brake with
-    `gap_acceleration_mm_s2`, so that a step is time-optimal under the limits and does not overshoot. The target's own
+    `acceleration_mm_s2`, so that a step is time-optimal under the limits and does not overshoot. The target's own
     speed is added, so that a moving target is followed without lag, and a target that itself turns round leaves less
     to brake with. Speeding up, the acceleration falls with speed to nothing at `speeds.no_load_mm_s`, where the motors
     have no torque left.
     """
-    acceleration = limits.gap_acceleration_mm_s2
     distance = target.gap_mm - reference.gap_mm
-    relative = acceleration + math.copysign(1.0, distance) * target.acceleration_mm_s2
-    relative = max(relative, LEAST_BRAKING * acceleration)
+    relative = acceleration_mm_s2 + math.copysign(1.0, distance) * target.acceleration_mm_s2
+    relative = max(relative, LEAST_BRAKING * acceleration_mm_s2)
     change = relative * dt_s
     braking = (math.sqrt(change * change + 8.0 * relative * abs(distance)) - change) / 2.0
     closing = math.copysign(min(braking, abs(distance) / max(APPROACH_S, dt_s)), distance)
@@ -61,7 +75,11 @@ def follow(
     bounded = min(max(wanted, -speeds.closing_mm_s), speeds.opening_mm_s)
     torque = max(0.0, 1.0 - abs(reference.speed_mm_s) / speeds.no_load_mm_s)
     is_opening = reference.speed_mm_s > 0.0
-    up, down = (acceleration * torque, acceleration) if is_opening else (acceleration, acceleration * torque)
+    up, down = (
+        (acceleration_mm_s2 * torque, acceleration_mm_s2)
+        if is_opening
+        else (acceleration_mm_s2, acceleration_mm_s2 * torque)
+    )
     chosen = min(max((bounded - reference.speed_mm_s) / dt_s, -down), up)
     speed = reference.speed_mm_s + chosen * dt_s
     return Reference(reference.gap_mm + speed * dt_s, speed, chosen), bounded != wanted

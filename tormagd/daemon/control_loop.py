@@ -50,7 +50,7 @@ class ControlLoop:
 
     def latch(self, fault: Fault) -> None:
         """Latches a fault that was found outside the step."""
-        self.state = self.state._replace(safety=latch(self.state.safety, (fault,)))
+        self.state = self.state.replaced(safety=latch(self.state.safety, (fault,)))
 
     def lose_link(self) -> None:
         """Tells the core that the device is gone."""

@@ -290,7 +290,7 @@ class Daemon:
                 {
                     Limit.HOST_STALL: f"{self._stall}; the gap was held until the device answered",
                     Limit.MODEL_RANGE: "outside what the model was shown: "
-                    + ", ".join(f"{name} {asked:.4g} asked, {used:.4g} used" for name, asked, used in planned.replaced),
+                    + ", ".join(f"{it.quantity} {it.asked:.4g} asked, {it.used:.4g} used" for it in planned.outside),
                 },
             ),
             "newest_stall": self._stall and {"ms": round(self._stall.took_s * 1e3, 1), "culprit": self._stall.culprit},

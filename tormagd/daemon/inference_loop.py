@@ -88,4 +88,4 @@ class InferenceLoop:
             inbox.withdraw(f"no gap could be planned: {error}")
             self._on_failure()
             afresh = self._planner.start(now_s)
-            return afresh._replace(plan=afresh.plan._replace(number=self.state.plan.number + 1))
+            return afresh.replaced(plan=afresh.plan.replaced(number=self.state.plan.number + 1))
