@@ -5,9 +5,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from tormagd.inverse.scan import FINEST_MT, Bracket, Curve, FieldScan
+from tormagd.inverse.scan import FINEST_MT, Bracket, FieldScan
 from tormagd.inverse.solution import FieldSolution, answer
-from tormagd.learning.model_file import ForceModel
+from tormagd.learning.force_curve import ForceCurve
 
 ACCURACY_MT = 1e-3
 """A step this small ends a refinement: a twentieth of what one encoder count of the gap (1/560 mm) changes at most."""
@@ -18,12 +18,12 @@ MOST_STEPS = 40
 FINE_INTERVALS = 16
 """Intervals of a finer grid: 20 mT become 1.25 mT, on which a straight line is 1e-3 mT from the network."""
 
-Refinement: TypeAlias = Callable[[Curve, Bracket, float], tuple[float, int]]
-"""(curve, bracket, force_N) -> field in mT within the bracket, and how often the network was evaluated."""
+Refinement: TypeAlias = Callable[[ForceCurve, Bracket, float], tuple[float, int]]
+"""(curve, bracket, force_N) -> field in mT within the bracket, and how often the curve was evaluated."""
 
 
-def newton(curve: Curve, bracket: Bracket, force_N: float) -> tuple[float, int]:
-    """Newton's steps on the network's exact slope; one that leaves the shrinking bracket is replaced by bisection."""
+def newton(curve: ForceCurve, bracket: Bracket, force_N: float) -> tuple[float, int]:
+    """Newton's steps on the exact slope; one that leaves the shrinking bracket is replaced by bisection."""
     left, right, left_N, _ = bracket
     field = bracket.crossing_mT
     for step in range(1, MOST_STEPS + 1):
@@ -45,7 +45,7 @@ def newton(curve: Curve, bracket: Bracket, force_N: float) -> tuple[float, int]:
     return field, MOST_STEPS
 
 
-def finer_grid(curve: Curve, bracket: Bracket, force_N: float) -> tuple[float, int]:
+def finer_grid(curve: ForceCurve, bracket: Bracket, force_N: float) -> tuple[float, int]:
     """Finer grids inside the bracket, each evaluated at once, down to `FINEST_MT`; then a straight line across."""
     rises, evaluations = bracket.left_N < 0, 0
     while bracket.right_mT - bracket.left_mT > FINEST_MT:
@@ -59,7 +59,7 @@ def finer_grid(curve: Curve, bracket: Bracket, force_N: float) -> tuple[float, i
     return bracket.crossing_mT, evaluations
 
 
-def brent(curve: Curve, bracket: Bracket, force_N: float) -> tuple[float, int]:
+def brent(curve: ForceCurve, bracket: Bracket, force_N: float) -> tuple[float, int]:
     """Brent's method as scipy has it. For the laboratory: scipy is no daemon dependency, and Newton needs less."""
     from scipy.optimize import brentq
 
@@ -76,42 +76,33 @@ def brent(curve: Curve, bracket: Bracket, force_N: float) -> tuple[float, int]:
 class BracketedSearch:
     """A look at every `step_mT`, then `refine` on the bracket whose root lies nearest the last field.
 
-    Without a last field the lowest root wins, which is the opener gap. The answer is the network's own root to
+    Without a last field the lowest root wins, which is the opener gap. The answer is the curve's own root to
     `ACCURACY_MT` (`finer_grid`: to a straight line over 2 mT). Where nothing crosses, the force is out of reach,
-    and the field that comes nearest is the answer. `dtype` (numpy.float32 or float64) is the type it computes in.
-    Raises `DomainError` on parameters it cannot use. An instance is not reentrant: it owns its work space.
+    and the field that comes nearest is the answer. `dtype` (numpy.float32 or float64) is the type that the look
+    is computed in. Raises `DomainError` on parameters it cannot use.
     """
 
     def __init__(
         self,
-        model: ForceModel,
         *,
         field_range_mT: tuple[float, float],
         refine: Refinement,
         step_mT: float = 20.0,
         dtype: type[np.floating] = np.float64,
     ) -> None:
-        self._model, self._refine = model, refine
-        self._scan = FieldScan(model, field_range_mT=field_range_mT, step_mT=step_mT, dtype=dtype)
+        self._refine = refine
+        self._scan = FieldScan(field_range_mT=field_range_mT, step_mT=step_mT, dtype=dtype)
 
-    def solve(
-        self,
-        displacement_mm: float,
-        rate_mm_s: float,
-        force_N: float,
-        cip_percent: float,
-        last_field_mT: float | None,
-    ) -> FieldSolution:
+    def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """See `FieldSolver.solve`."""
-        look = self._scan.look(displacement_mm, rate_mm_s, force_N, cip_percent, last_field_mT)
+        look = self._scan.look(curve, force_N, last_field_mT)
         field_mT, iterations = look.candidate_mT, look.iterations
         for bracket in look.brackets:
             if field_mT is not None and abs(field_mT - look.near_mT) <= bracket.distance_mT(look.near_mT):
                 break  # nothing in this bracket or a farther one can be nearer
-            root_mT, evaluations = self._refine(look.curve, bracket, force_N)
+            root_mT, evaluations = self._refine(curve, bracket, force_N)
             iterations += evaluations
             if field_mT is None or abs(root_mT - look.near_mT) < abs(field_mT - look.near_mT):
                 field_mT = root_mT
         assert field_mT is not None, "a look shows a bracket or a candidate"
-        features = displacement_mm, rate_mm_s, field_mT, cip_percent
-        return answer(self._model, features, force_N, self._model.predict_one(*features), iterations + 1, look.reach)
+        return answer(curve, field_mT, force_N, curve.force_N(field_mT), iterations + 1, look.reach)

@@ -1,18 +1,16 @@
 """Which search a scene gets: the cheapest that its tolerance allows, by the table that `benchmark inverse` measured."""
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from importlib import resources
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import torch
 
-from tormagd.inverse.bracketed import BracketedSearch, finer_grid, newton
+from tormagd.inverse.bracketed import BracketedSearch, Refinement, finer_grid, newton
 from tormagd.inverse.nearest import NearestFieldSearch
+from tormagd.inverse.newton import RisingSearch
 from tormagd.inverse.solution import FieldSolver
-from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 
 SOLVER_SHARE = 0.1
@@ -47,40 +45,11 @@ class Choice(NamedTuple):
     reason: str
 
 
-def _nearest(model: ForceModel, field_range_mT: tuple[float, float], choice: Choice) -> FieldSolver:
-    return NearestFieldSearch(
-        model,
-        field_range_mT=field_range_mT,
-        step_mT=choice.step_mT,
-        neighbours=choice.neighbours,
-        dtype={"float32": torch.float32, "float64": torch.float64}[choice.dtype],
-    )
+_DTYPE: dict[str, type[np.floating]] = {"float32": np.float32, "float64": np.float64}
+_REFINEMENTS: dict[str, Refinement] = {"coarse-to-fine": finer_grid, "newton": newton}
 
-
-def _bracketed(
-    refine: Callable[..., tuple[float, int]],
-    model: ForceModel,
-    field_range_mT: tuple[float, float],
-    choice: Choice,
-) -> FieldSolver:
-    return BracketedSearch(
-        model,
-        field_range_mT=field_range_mT,
-        refine=refine,
-        step_mT=choice.step_mT,
-        dtype=_NUMPY_DTYPE[choice.dtype],
-    )
-
-
-_NUMPY_DTYPE: dict[str, type[np.floating]] = {"float32": np.float32, "float64": np.float64}
-_BUILDERS: dict[str, Callable[[ForceModel, tuple[float, float], Choice], FieldSolver]] = {
-    "nearest": _nearest,
-    "coarse-to-fine": partial(_bracketed, finer_grid),
-    "newton": partial(_bracketed, newton),
-}
-
-RUNTIME_SOLVERS = tuple(_BUILDERS)
-"""The searches that the daemon may run. They answer from the model alone and keep the branch of the last field.
+RUNTIME_SOLVERS = ("nearest", *_REFINEMENTS)
+"""The searches that the daemon may run. They answer from the curve alone and keep the branch of the last field.
 
 The k-d tree and Brent's method want scipy, the direct inverse a training of its own; the closed form does not use the
 learned model, and the row-by-row searches are baselines.
@@ -130,6 +99,18 @@ def named(solver: str, step_mT: float | None = None, neighbours: int | None = No
     return Choice(solver, step_mT, neighbours, "float64", "named by the scene")
 
 
-def build(choice: Choice, model: ForceModel, field_range_mT: tuple[float, float]) -> FieldSolver:
-    """The search that was chosen. Raises `DomainError` where its settings do not fit the range."""
-    return _BUILDERS[choice.solver](model, field_range_mT, choice)
+def build(choice: Choice, field_range_mT: tuple[float, float], *, rises: bool) -> FieldSolver:
+    """The search that was chosen. Raises `DomainError` where its settings do not fit the range.
+
+    `rises` says that every curve is known to rise over the range: "newton" then needs no look for other roots, and has
+    no settings.
+    """
+    if choice.solver == "newton" and rises:
+        return RisingSearch(field_range_mT)
+    dtype = _DTYPE[choice.dtype]
+    if choice.solver == "nearest":
+        return NearestFieldSearch(
+            field_range_mT=field_range_mT, step_mT=choice.step_mT, neighbours=choice.neighbours, dtype=dtype
+        )
+    refine = _REFINEMENTS[choice.solver]
+    return BracketedSearch(field_range_mT=field_range_mT, refine=refine, step_mT=choice.step_mT, dtype=dtype)

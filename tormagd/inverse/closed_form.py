@@ -4,6 +4,7 @@ import math
 
 from tormagd.inverse.solution import FieldSolution, Reach, answer, checked_near_mT
 from tormagd.learning.features import Element
+from tormagd.learning.force_curve import ForceCurve
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import flux_density_T, radial_moment_from_flux_density_Tm
@@ -15,7 +16,7 @@ class ClosedForm:
 
     It knows neither displacement nor rate: pre-sliding and Stribeck friction, which the network has learned, are its
     error. The force rises strictly with the field, so there are no branches and the last field is checked and not used.
-    What the network predicts at the answer is reported, and its disagreement lowers the confidence.
+    What the curve gives at the answer is reported, and its disagreement lowers the confidence.
     Raises `DomainError` on a model of another element, and on a field range outside the force law's domain.
     """
 
@@ -27,29 +28,21 @@ class ClosedForm:
         low_mT, high_mT = field_range_mT
         if not low_mT < high_mT:
             raise DomainError("field_range_mT", field_range_mT, "a least field below the greatest")
-        self._model, self._elastomer, self._geometry = model, elastomer, geometry
+        self._elastomer, self._geometry = elastomer, geometry
         self._range_mT = field_range_mT
         self._least_N, self._most_N = self._force_N(low_mT), self._force_N(high_mT)
 
-    def solve(
-        self,
-        displacement_mm: float,
-        rate_mm_s: float,
-        force_N: float,
-        cip_percent: float,
-        last_field_mT: float | None,
-    ) -> FieldSolution:
+    def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """See `FieldSolver.solve`; `reach` is that of the closed form."""
         low_mT, high_mT = self._range_mT
-        checked_near_mT(displacement_mm, rate_mm_s, force_N, cip_percent, last_field_mT, low_mT)
+        checked_near_mT(force_N, last_field_mT, low_mT)
         if force_N < self._least_N:
             field_mT, reach = low_mT, Reach.BELOW
         elif force_N > self._most_N:
             field_mT, reach = high_mT, Reach.ABOVE
         else:
             field_mT, reach = min(max(self._field_mT(force_N), low_mT), high_mT), Reach.INSIDE
-        features = displacement_mm, rate_mm_s, field_mT, cip_percent
-        return answer(self._model, features, force_N, self._model.predict_one(*features), 0, reach)
+        return answer(curve, field_mT, force_N, curve.force_N(field_mT), 0, reach)
 
     def _force_N(self, field_mT: float) -> float:
         """Kinetic force at a field; `DomainError` outside the law's domain."""

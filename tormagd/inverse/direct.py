@@ -8,6 +8,7 @@ from torch import nn
 from tormagd.inverse.scan import FieldScan
 from tormagd.inverse.solution import FieldSolution, answer
 from tormagd.learning.features import FIELD
+from tormagd.learning.force_curve import ForceCurve
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 
@@ -37,11 +38,10 @@ class DirectInverse:
             raise DomainError("hidden", hidden, "1 or more")
         low_mT, high_mT = field_range_mT
         self._scan = FieldScan(
-            model, field_range_mT=field_range_mT, step_mT=(high_mT - low_mT) / SCAN_INTERVALS, dtype=np.float64
+            field_range_mT=field_range_mT, step_mT=(high_mT - low_mT) / SCAN_INTERVALS, dtype=np.float64
         )
-        self._model = model
         self._low_mT, self._span_mT = low_mT, high_mT - low_mT
-        inputs, targets = self._samples()
+        inputs, targets = self._samples(model)
         self._centre, span = inputs.mean(axis=0), np.ptp(inputs, axis=0)
         # a feature that never varied must not decide anything
         self._gain = np.divide(2.0, span, out=np.zeros_like(span), where=span > 0)
@@ -52,39 +52,30 @@ class DirectInverse:
         self._output = output[0]
         self._constant = float(constant[0])
 
-    def _samples(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        axes = [np.linspace(low, high, LATTICE if high > low else 1) for low, high in self._model.feature_ranges]
+    def _samples(self, model: ForceModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        axes = [np.linspace(low, high, LATTICE if high > low else 1) for low, high in model.feature_ranges]
         axes[FIELD] = np.linspace(self._low_mT, self._low_mT + self._span_mT, FIELD_POINTS)
         # the field last, so that each row of the reshaped forces is one curve over it
         axes.append(axes.pop(FIELD))
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 4)
         features = np.insert(grid[:, :3], FIELD, grid[:, 3], axis=1)
-        curves = self._model.predict(features).reshape(-1, FIELD_POINTS)
+        curves = model.predict(features).reshape(-1, FIELD_POINTS)
         if not (np.diff(curves, axis=1) > 0).all():
             raise DomainError("model", "not rising with the field", "a force that rises with the field everywhere")
         share = (curves - curves[:, :1]) / (curves[:, -1:] - curves[:, :1])
         return np.column_stack((grid[:, :3], share.ravel())), (grid[:, 3] - self._low_mT) / self._span_mT
 
-    def solve(
-        self,
-        displacement_mm: float,
-        rate_mm_s: float,
-        force_N: float,
-        cip_percent: float,
-        last_field_mT: float | None,
-    ) -> FieldSolution:
+    def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """See `FieldSolver.solve`; the last field only decides where the force is flat."""
-        look = self._scan.look(displacement_mm, rate_mm_s, force_N, cip_percent, last_field_mT)
+        look = self._scan.look(curve, force_N, last_field_mT)
         field_mT = look.candidate_mT
         if field_mT is None:
             low_N, high_N = look.ends_N
             share = -low_N / (high_N - low_N) if high_N != low_N else 0.5
-            hidden = self._weight.dot((displacement_mm, rate_mm_s, cip_percent, share)) + self._bias
+            hidden = self._weight.dot((curve.displacement_mm, curve.rate_mm_s, curve.cip_percent, share)) + self._bias
             found = float(self._output.dot(np.tanh(hidden, hidden))) + self._constant
             field_mT = self._low_mT + self._span_mT * min(max(found, 0.0), 1.0)
-        features = displacement_mm, rate_mm_s, field_mT, cip_percent
-        predicted_N = self._model.predict_one(*features)
-        return answer(self._model, features, force_N, predicted_N, look.iterations + 2, look.reach)
+        return answer(curve, field_mT, force_N, curve.force_N(field_mT), look.iterations + 2, look.reach)
 
 
 def _fit(

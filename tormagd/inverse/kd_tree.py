@@ -5,8 +5,9 @@ from scipy.spatial import cKDTree
 
 from tormagd.inverse.nearest import field_grid
 from tormagd.inverse.scan import FieldScan
-from tormagd.inverse.solution import EXTRAPOLATION_RATE, FieldSolution, answer
+from tormagd.inverse.solution import FieldSolution, answer
 from tormagd.learning.features import FIELD
+from tormagd.learning.force_curve import EXTRAPOLATION_RATE, ForceCurve
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 
@@ -41,9 +42,8 @@ class KdTreeSearch:
             raise DomainError("lattice", lattice, "2 points or more")
         low_mT, high_mT = field_range_mT
         self._scan = FieldScan(
-            model, field_range_mT=field_range_mT, step_mT=(high_mT - low_mT) / SCAN_INTERVALS, dtype=np.float64
+            field_range_mT=field_range_mT, step_mT=(high_mT - low_mT) / SCAN_INTERVALS, dtype=np.float64
         )
-        self._model = model
         axes = [np.linspace(low, high, lattice if high > low else 1) for low, high in model.feature_ranges]
         axes[FIELD] = fields
         samples = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
@@ -58,19 +58,12 @@ class KdTreeSearch:
         self._tree = cKDTree(samples * self._scale)
         self._cell = 1 / (lattice - 1)
 
-    def solve(
-        self,
-        displacement_mm: float,
-        rate_mm_s: float,
-        force_N: float,
-        cip_percent: float,
-        last_field_mT: float | None,
-    ) -> FieldSolution:
+    def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """See `FieldSolver.solve`."""
-        look = self._scan.look(displacement_mm, rate_mm_s, force_N, cip_percent, last_field_mT)
+        look = self._scan.look(curve, force_N, last_field_mT)
         field_mT, iterations, far = look.candidate_mT, look.iterations, 0.0
         if field_mT is None:
-            point = np.array((displacement_mm, rate_mm_s, force_N, cip_percent)) * self._scale
+            point = np.array((curve.displacement_mm, curve.rate_mm_s, force_N, curve.cip_percent)) * self._scale
             distances, found = self._tree.query(point, k=self._neighbours)
             distances, fields = np.atleast_1d(distances), self._sample_mT[np.atleast_1d(found)]
             seed_mT = fields[np.abs(fields - look.near_mT).argmin()]
@@ -78,7 +71,5 @@ class KdTreeSearch:
             weights = 1 / np.maximum(distances[branch], 1e-9)
             field_mT = float(weights.dot(fields[branch]) / weights.sum())
             far = max(float(distances[0]) - self._cell, 0.0)
-        features = displacement_mm, rate_mm_s, field_mT, cip_percent
-        predicted_N = self._model.predict_one(*features)
-        solution = answer(self._model, features, force_N, predicted_N, iterations + 1, look.reach)
-        return solution._replace(confidence=solution.confidence * float(np.exp(-EXTRAPOLATION_RATE * far)))
+        solution = answer(curve, field_mT, force_N, curve.force_N(field_mT), iterations + 1, look.reach)
+        return solution.replaced(confidence=solution.confidence * float(np.exp(-EXTRAPOLATION_RATE * far)))

@@ -7,6 +7,7 @@ import torch
 from tormagd.inverse.nearest import field_grid
 from tormagd.inverse.solution import FieldSolution, Reach, answer, checked_near_mT
 from tormagd.learning.features import FEATURES, FIELD, require_number
+from tormagd.learning.force_curve import ForceCurve
 from tormagd.learning.mlp import to_network
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
@@ -22,13 +23,12 @@ class LinearFieldSearch:
     """Try the fields of a grid from the least upwards and stop at |F - NN| <= epsilon.
 
     With `epsilon_N` = 0 it sees every row and answers with the nearest. It knows no continuity: the last field is
-    checked and not used. `predict_one` is how one row is evaluated: the model's own by default, `torch_row(model)` as
-    the thesis did it. Raises `DomainError` on parameters it cannot use.
+    checked and not used. `predict_one` is how one row is evaluated: by the curve itself by default, `torch_row(model)`
+    as the thesis did it. Raises `DomainError` on parameters it cannot use.
     """
 
     def __init__(
         self,
-        model: ForceModel,
         *,
         field_range_mT: tuple[float, float],
         step_mT: float = 1.0,
@@ -38,26 +38,18 @@ class LinearFieldSearch:
         require_number("epsilon_N", epsilon_N)
         if epsilon_N < 0:
             raise DomainError("epsilon_N", epsilon_N, "0 N or more")
-        self._model = model
         self._fields_mT: list[float] = field_grid(field_range_mT, step_mT).tolist()
         self._epsilon_N = epsilon_N
-        self._predict_one = predict_one or model.predict_one
+        self._predict_one = predict_one
 
-    def solve(
-        self,
-        displacement_mm: float,
-        rate_mm_s: float,
-        force_N: float,
-        cip_percent: float,
-        last_field_mT: float | None,
-    ) -> FieldSolution:
+    def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """See `FieldSolver.solve`; a force within epsilon of what some field gives counts as inside."""
-        checked_near_mT(displacement_mm, rate_mm_s, force_N, cip_percent, last_field_mT, self._fields_mT[0])
+        checked_near_mT(force_N, last_field_mT, self._fields_mT[0])
 
         best_mT, best_N, above, below, rows = self._fields_mT[0], 0.0, False, False, 0
         best_error_N = float("inf")
         for field_mT in self._fields_mT:
-            predicted_N = self._predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
+            predicted_N = self._force_N(curve, field_mT)
             rows += 1
             error_N = abs(force_N - predicted_N)
             if error_N < best_error_N:
@@ -71,8 +63,12 @@ class LinearFieldSearch:
             reach = Reach.INSIDE
         else:
             reach = Reach.BELOW if above else Reach.ABOVE
-        features = displacement_mm, rate_mm_s, best_mT, cip_percent
-        return answer(self._model, features, force_N, best_N, rows, reach)
+        return answer(curve, best_mT, force_N, best_N, rows, reach)
+
+    def _force_N(self, curve: ForceCurve, field_mT: float) -> float:
+        if self._predict_one is None:
+            return curve.force_N(field_mT)
+        return self._predict_one(curve.displacement_mm, curve.rate_mm_s, field_mT, curve.cip_percent)
 
 
 def torch_row(model: ForceModel, dtype: torch.dtype = torch.float64) -> Callable[[float, float, float, float], float]:
@@ -103,32 +99,24 @@ class GridArgmin:
         dtype: torch.dtype = torch.float64,
     ) -> None:
         fields_mT = field_grid(field_range_mT, step_mT)
-        self._model = model
         self._network = to_network(model).to(dtype)
         self._rows = torch.zeros((len(fields_mT), len(FEATURES)), dtype=dtype)
         self._rows[:, FIELD] = torch.from_numpy(fields_mT)
         self._others = torch.tensor([column for column in range(len(FEATURES)) if column != FIELD])
         self._fields_mT: list[float] = fields_mT.tolist()
 
-    def solve(
-        self,
-        displacement_mm: float,
-        rate_mm_s: float,
-        force_N: float,
-        cip_percent: float,
-        last_field_mT: float | None,
-    ) -> FieldSolution:
+    def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """See `FieldSolver.solve`."""
-        checked_near_mT(displacement_mm, rate_mm_s, force_N, cip_percent, last_field_mT, self._fields_mT[0])
+        checked_near_mT(force_N, last_field_mT, self._fields_mT[0])
 
         with torch.inference_mode():
-            given = torch.tensor((displacement_mm, rate_mm_s, cip_percent), dtype=self._rows.dtype)
+            given = torch.tensor((curve.displacement_mm, curve.rate_mm_s, curve.cip_percent), dtype=self._rows.dtype)
             self._rows[:, self._others] = given
             excess = self._network(self._rows) - force_N
             best = int(excess.abs().argmin())
             least_N, most_N = (float(end) for end in torch.aminmax(excess))
-        features = displacement_mm, rate_mm_s, self._fields_mT[best], cip_percent
-        predicted_N = self._model.predict_one(*features)
+        field_mT = self._fields_mT[best]
+        predicted_N = curve.force_N(field_mT)
         tie_N = TIE * torch.finfo(self._rows.dtype).eps * (abs(force_N) + abs(predicted_N))
         reach = Reach.ABOVE if most_N < -tie_N else Reach.BELOW if least_N > tie_N else Reach.INSIDE
-        return answer(self._model, features, force_N, predicted_N, 1, reach)
+        return answer(curve, field_mT, force_N, predicted_N, 1, reach)

@@ -1,18 +1,14 @@
 """The search by default: the force at every field of a grid at once, the nearest of them, then interpolation."""
 
-from typing import TypeAlias
-
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from tormagd.inverse.solution import FieldSolution, Reach, answer, checked_near_mT
-from tormagd.learning.features import FEATURES, FIELD, require_number
-from tormagd.learning.model_file import ForceModel
+from tormagd.inverse.solution import FieldSolution, Reach, answer, checked_near_mT, tie_N
+from tormagd.learning.features import require_number
+from tormagd.learning.force_curve import Floats, ForceCurve
 from tormagd.physics.errors import DomainError
 
 MAX_GRID_POINTS = 100_000
-Floats: TypeAlias = NDArray[np.floating]
 
 
 def field_grid(field_range_mT: tuple[float, float], step_mT: float) -> NDArray[np.float64]:
@@ -31,11 +27,16 @@ def field_grid(field_range_mT: tuple[float, float], step_mT: float) -> NDArray[n
     return np.linspace(low, high, int(np.ceil((high - low) / step_mT)) + 1)
 
 
+def require_precision(dtype: type[np.floating]) -> None:
+    """Raise `DomainError` unless `dtype` is one that grids are computed in."""
+    if dtype not in (np.float32, np.float64):
+        raise DomainError("dtype", dtype, "numpy.float32 or numpy.float64")
+
+
 class NearestFieldSearch:
     """Nearest-neighbour search of the field (section 4.2.6 of the thesis), vectorised and continuous.
 
-    The first layer is linear, so its part that depends on the field is computed once for the grid; a solve adds the
-    rest, applies the sigmoid and the output layer, and has the force at every field. Candidates are
+    It looks at the force at every field of a grid at once. Candidates are
 
     - the root in every grid interval where predicted and asked force cross, by linear interpolation, so that the answer
       is not bound to the grid;
@@ -45,72 +46,39 @@ class NearestFieldSearch:
     The candidate nearest the last field wins; without a last field the lowest, which is the opener gap. Where nothing
     crosses, the force is out of reach, and the nearest end is the answer.
 
-    Parameters: `field_range_mT` and `step_mT` make the grid; `dtype` is torch.float32 or torch.float64. The default is
-    float64 every 2 mT, which takes the time of float32 every 1 mT and is ten times nearer the network's own root.
-    Raises `DomainError` on parameters it cannot use. Sets torch to one thread for the whole process: a second thread
-    costs more than it saves at this size, and disturbs the loop. An instance is not reentrant: it owns its work space.
+    Parameters: `field_range_mT` and `step_mT` make the grid; `dtype` is numpy.float32 or numpy.float64. The default is
+    float64 every 2 mT, which is ten times nearer the curve's own root than float32 every 1 mT.
+    Raises `DomainError` on parameters it cannot use.
     """
 
     def __init__(
         self,
-        model: ForceModel,
         *,
         field_range_mT: tuple[float, float],
         step_mT: float = 2.0,
         neighbours: int = 8,
-        dtype: torch.dtype = torch.float64,
+        dtype: type[np.floating] = np.float64,
     ) -> None:
-        if dtype not in (torch.float32, torch.float64):
-            raise DomainError("dtype", dtype, "torch.float32 or torch.float64")
+        require_precision(dtype)
         self._fields_mT = field_grid(field_range_mT, step_mT)
         points = len(self._fields_mT)
         if not 1 <= neighbours <= points:
             raise DomainError("neighbours", neighbours, f"1 to the number of grid points, {points}")
-        torch.set_num_threads(1)
-        self._model = model
+        self._grid_mT: Floats = self._fields_mT.astype(dtype)
         self._neighbours = neighbours
         self._per_mT = 1 / float(self._fields_mT[1] - self._fields_mT[0])
-        weight, bias, output, constant = model.physical
-        others = [column for column in range(len(FEATURES)) if column != FIELD]
-        self._other_weight = np.ascontiguousarray(weight[:, others])
-        self._bias = bias
-        self._constant_N = constant
-        self._field_half = torch.from_numpy(np.outer(self._fields_mT, weight[:, FIELD])).to(dtype)
-        self._output = torch.from_numpy(output.copy()).to(dtype)
-        self._other_half = torch.empty(len(bias), dtype=dtype)
-        self._hidden = torch.empty_like(self._field_half)
-        self._force = torch.empty(points, dtype=dtype)
-        # the same memory, seen by numpy: its small operations cost less than torch's
-        self._other_half_view: Floats = self._other_half.numpy()
-        self._force_view: Floats = self._force.numpy()
-        # sums of h terms, each wrong by a few units of rounding
-        self._tie_N = 16 * torch.finfo(dtype).eps * (float(np.abs(output).sum()) + abs(constant))
+        self._eps = float(np.finfo(dtype).eps)
 
-    def solve(
-        self,
-        displacement_mm: float,
-        rate_mm_s: float,
-        force_N: float,
-        cip_percent: float,
-        last_field_mT: float | None,
-    ) -> FieldSolution:
+    def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """See `FieldSolver.solve`."""
-        least_mT = float(self._fields_mT[0])
-        near = checked_near_mT(displacement_mm, rate_mm_s, force_N, cip_percent, last_field_mT, least_mT)
-
-        self._other_half_view[:] = self._other_weight.dot((displacement_mm, rate_mm_s, cip_percent)) + self._bias
-        with torch.inference_mode():
-            torch.add(self._field_half, self._other_half, out=self._hidden)
-            torch.sigmoid(self._hidden, out=self._hidden)
-            torch.mv(self._hidden, self._output, out=self._force)
-        excess_N = self._force_view - self._force_view.dtype.type(force_N - self._constant_N)
-
-        candidates, reach = self._candidates(excess_N, near)
+        near = checked_near_mT(force_N, last_field_mT, float(self._fields_mT[0]))
+        excess_N = curve.forces_N(self._grid_mT)
+        excess_N -= excess_N.dtype.type(force_N)
+        candidates, reach = self._candidates(excess_N, near, tie_N(curve, self._eps))
         field_mT = float(candidates[np.abs(candidates - near).argmin()])
-        features = displacement_mm, rate_mm_s, field_mT, cip_percent
-        return answer(self._model, features, force_N, self._model.predict_one(*features), 2, reach)
+        return answer(curve, field_mT, force_N, curve.force_N(field_mT), 2, reach)
 
-    def _candidates(self, excess_N: Floats, near_mT: float) -> tuple[NDArray[np.float64], Reach]:
+    def _candidates(self, excess_N: Floats, near_mT: float, same_N: float) -> tuple[NDArray[np.float64], Reach]:
         """Fields in mT that fit equally well, and whether they fit, from the force above the one asked on the grid."""
         fields = self._fields_mT
         below = excess_N < 0
@@ -118,15 +86,15 @@ class NearestFieldSearch:
         error_N = np.abs(excess_N)
         nearest = np.argpartition(error_N, self._neighbours - 1)[: self._neighbours]
         best_N = 0.0 if left.size else float(error_N[nearest].min())
-        candidates = fields[nearest[error_N[nearest] <= best_N + self._tie_N]]
+        candidates = fields[nearest[error_N[nearest] <= best_N + same_N]]
         # on a plateau of more points than `neighbours` it is chance which of them were taken
         here = min(max(round((near_mT - fields[0]) * self._per_mT), 0), len(fields) - 1)
-        if error_N[here] <= best_N + self._tie_N:
+        if error_N[here] <= best_N + same_N:
             candidates = np.append(candidates, fields[here])
         if left.size:
             at, to = excess_N[left], excess_N[left + 1]
             roots = fields[left] + (fields[left + 1] - fields[left]) * (at / (at - to))
             return np.concatenate((roots, candidates)), Reach.INSIDE
-        if best_N <= self._tie_N:
+        if best_N <= same_N:
             return candidates, Reach.INSIDE
         return candidates, Reach.ABOVE if below[0] else Reach.BELOW

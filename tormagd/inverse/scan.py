@@ -1,56 +1,18 @@
 """The coarse look that precedes a refinement: where along the field the learned force meets the force asked."""
 
 from bisect import bisect_left
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tormagd.inverse.nearest import field_grid
-from tormagd.inverse.solution import Reach, checked_near_mT
-from tormagd.learning.features import FEATURES, FIELD
-from tormagd.learning.model_file import ForceModel
-from tormagd.physics.errors import DomainError
-
-Floats: TypeAlias = NDArray[np.floating]
+from tormagd.inverse.nearest import field_grid, require_precision
+from tormagd.inverse.solution import Reach, checked_near_mT, tie_N
+from tormagd.learning.force_curve import Floats, ForceCurve
 
 FINEST_MT = 2.0
 """Grids are refined until their step is this small: around the nearest point where nothing crosses, too."""
 
 ZOOM_POINTS = 9
-
-
-class Curve(NamedTuple):
-    """The network along the field, other features fixed: force = constant_N + output . tanh(other + slope field)."""
-
-    slope: Floats
-    other: Floats
-    output: Floats
-    constant_N: float
-
-    def forces_N(self, fields_mT: NDArray[np.float64]) -> Floats:
-        """Force at each field."""
-        hidden = np.multiply.outer(fields_mT.astype(self.slope.dtype), self.slope)
-        hidden += self.other
-        forces: Floats = np.tanh(hidden, hidden).dot(self.output)
-        return forces + self.output.dtype.type(self.constant_N)
-
-    def force_N(self, field_mT: float) -> float:
-        """Force at one field."""
-        hidden = self.slope * field_mT
-        hidden += self.other
-        return float(self.output.dot(np.tanh(hidden, hidden))) + self.constant_N
-
-    def force_and_slope(self, field_mT: float) -> tuple[float, float]:
-        """Force in N and dF/dB in N/mT at one field."""
-        hidden = self.slope * field_mT
-        hidden += self.other
-        np.tanh(hidden, hidden)
-        force_N = float(self.output.dot(hidden)) + self.constant_N
-        hidden *= hidden
-        np.subtract(1.0, hidden, hidden)
-        hidden *= self.output
-        return force_N, float(hidden.dot(self.slope))
 
 
 class Bracket(NamedTuple):
@@ -78,7 +40,7 @@ class Look(NamedTuple):
     lies above the one asked. Out of reach there are no brackets, but a candidate.
     """
 
-    curve: Curve
+    curve: ForceCurve
     near_mT: float
     ends_N: tuple[float, float]
     brackets: list[Bracket]
@@ -88,50 +50,26 @@ class Look(NamedTuple):
 
 
 class FieldScan:
-    """Looks at the force on a coarse grid of fields (`step_mT`), the field-dependent half of the first layer hoisted.
+    """Looks at the force on a coarse grid of fields (`step_mT`).
 
-    A dip or a bump narrower than the grid's step can go unseen, except where it decides over reach. `dtype` is
-    numpy.float32 or numpy.float64. Raises `DomainError` on parameters it cannot use.
+    A dip or a bump narrower than the grid's step can go unseen, except where it decides over reach. `dtype`
+    (numpy.float32 or numpy.float64) is the type that the grid is computed in. Raises `DomainError` on parameters it
+    cannot use.
     """
 
-    def __init__(
-        self, model: ForceModel, *, field_range_mT: tuple[float, float], step_mT: float, dtype: type[np.floating]
-    ) -> None:
-        if dtype not in (np.float32, np.float64):
-            raise DomainError("dtype", dtype, "numpy.float32 or numpy.float64")
-        self._fields_mT = field_grid(field_range_mT, step_mT)
-        # sigmoid(z) = (1 + tanh(z / 2)) / 2: numpy's tanh is vectorised, and it cannot overflow
-        weight, bias, output, constant = model.physical
-        others = [column for column in range(len(FEATURES)) if column != FIELD]
-        self._other_weight = np.ascontiguousarray(weight[:, others] / 2)
-        self._bias = bias / 2
-        self._slope: Floats = (weight[:, FIELD] / 2).astype(dtype)
-        self._output: Floats = (output / 2).astype(dtype)
-        self._constant_N = constant + float(output.sum()) / 2
-        self._field_half = np.multiply.outer(self._fields_mT, weight[:, FIELD] / 2).astype(dtype)
-        self._hidden = np.empty_like(self._field_half)
-        self._list_mT: list[float] = self._fields_mT.tolist()
-        # sums of h terms, each wrong by a few units of rounding
-        self.tie_N = 16 * float(np.finfo(dtype).eps) * (float(np.abs(output).sum()) + abs(constant))
+    def __init__(self, *, field_range_mT: tuple[float, float], step_mT: float, dtype: type[np.floating]) -> None:
+        require_precision(dtype)
+        fields_mT = field_grid(field_range_mT, step_mT)
+        self._list_mT: list[float] = fields_mT.tolist()
+        self._fields_mT: Floats = fields_mT.astype(dtype)
+        self._eps = float(np.finfo(dtype).eps)
 
-    @property
-    def field_range_mT(self) -> tuple[float, float]:
-        """Least and greatest field."""
-        return self._list_mT[0], self._list_mT[-1]
-
-    def look(
-        self, displacement_mm: float, rate_mm_s: float, force_N: float, cip_percent: float, last_field_mT: float | None
-    ) -> Look:
+    def look(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> Look:
         """Where the force is met, seen from the last field, or else from the least. `DomainError` on NaN."""
         least_mT = self._list_mT[0]
-        near = checked_near_mT(displacement_mm, rate_mm_s, force_N, cip_percent, last_field_mT, least_mT)
+        near = checked_near_mT(force_N, last_field_mT, least_mT)
         near = min(max(near, least_mT), self._list_mT[-1])
-        other = self._other_weight.dot((displacement_mm, rate_mm_s, cip_percent)) + self._bias
-        curve = Curve(self._slope, other.astype(self._slope.dtype, copy=False), self._output, self._constant_N)
-        np.add(self._field_half, curve.other, out=self._hidden)
-        forces = np.tanh(self._hidden, out=self._hidden).dot(self._output)
-        lifted_N = force_N - self._constant_N
-        excess = [force - lifted_N for force in forces.tolist()]
+        excess = [predicted_N - force_N for predicted_N in curve.forces_N(self._fields_mT).tolist()]
         fields = self._list_mT
         place = bisect_left(fields, near)
         if fields[place] == near:
@@ -144,24 +82,25 @@ class FieldScan:
         return self._search(curve, near, here_N, fields, excess, force_N)
 
     def _search(
-        self, curve: Curve, near: float, here_N: float, fields: list[float], excess: list[float], force_N: float
+        self, curve: ForceCurve, near: float, here_N: float, fields: list[float], excess: list[float], force_N: float
     ) -> Look:
         ends_N, iterations = (excess[0], excess[-1]), 2
+        same_N = tie_N(curve, self._eps)
         while True:
             brackets = _brackets(fields, excess)
             best_N = min(map(abs, excess))
-            if brackets and best_N > self.tie_N:
+            if brackets and best_N > same_N:
                 brackets.sort(key=lambda bracket: bracket.distance_mT(near))
                 return Look(curve, near, ends_N, brackets, None, Reach.INSIDE, iterations)
-            tied = [field for field, error in zip(fields, excess, strict=True) if abs(error) <= best_N + self.tie_N]
+            tied = [field for field, error in zip(fields, excess, strict=True) if abs(error) <= best_N + same_N]
             nearest = min(tied, key=lambda field: abs(field - near))
-            if best_N <= self.tie_N:
+            if best_N <= same_N:
                 brackets.sort(key=lambda bracket: bracket.distance_mT(near))
                 return Look(curve, near, ends_N, brackets, nearest, Reach.INSIDE, iterations)
             at, last = fields.index(nearest), len(fields) - 1
             low, high = fields[max(at - 1, 0)], fields[min(at + 1, last)]
             if high - low <= 2 * FINEST_MT:
-                if abs(here_N) <= best_N + self.tie_N:
+                if abs(here_N) <= best_N + same_N:
                     nearest = near
                 reach = Reach.ABOVE if excess[at] < 0 else Reach.BELOW
                 return Look(curve, near, ends_N, [], nearest, reach, iterations)

@@ -1,7 +1,7 @@
 """What the network is fed: the four features of Eq. 43, their units, their scaling, and the check at the border."""
 
 from enum import StrEnum
-from typing import Self
+from typing import Final, Self
 
 import msgspec
 import numpy as np
@@ -11,9 +11,9 @@ from tormagd.physics.errors import DomainError
 
 FEATURES = ("displacement_mm", "rate_mm_s", "field_mT", "cip_percent")
 UNITS = {"displacement_mm": "mm", "rate_mm_s": "mm/s", "field_mT": "mT", "cip_percent": "%", "force_N": "N"}
-FIELD = FEATURES.index("field_mT")
+FIELD: Final = FEATURES.index("field_mT")
 
-LARGEST = 1e9
+LARGEST: Final = 1e9
 """Bound on every input and weight: no device comes near it, and the product of two does not overflow float32."""
 
 

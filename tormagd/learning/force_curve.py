@@ -4,12 +4,12 @@ What stands behind a curve may be a network, a grey box with memory, or a closed
 """
 
 import math
-from typing import Final, Protocol, TypeVar, final
+from typing import Final, Protocol, TypeAlias, final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tormagd.learning.features import FEATURES, FIELD, require_inputs
+from tormagd.learning.features import FEATURES, FIELD, LARGEST, require_inputs
 
 EXTRAPOLATION_RATE: Final = 4.0
 """Confidence falls to 1/e when the inputs lie a quarter of their training range outside it, features summed."""
@@ -20,7 +20,7 @@ RESIDUAL_RATE: Final = 20.0
 LARGEST_EXPONENT: Final = 700.0
 "exp() of a little more has no float. A unit that far from its step is shut to the last digit of every force."
 
-Floats = TypeVar("Floats", NDArray[np.float32], NDArray[np.float64])
+Floats: TypeAlias = NDArray[np.floating]
 
 
 class ForceCurve(Protocol):
@@ -37,6 +37,10 @@ class ForceCurve(Protocol):
     @property
     def cip_percent(self) -> float:
         """The elastomer's share of carbonyl iron."""
+
+    @property
+    def magnitude_N(self) -> float:
+        """The magnitudes, summed, that a force is added up from: what rounding is a share of."""
 
     def force_N(self, field_mT: float) -> float:
         """Force at one field."""
@@ -77,7 +81,7 @@ class Network:
     `weight` (h x 4, columns in the order of `FEATURES`), `bias` (h) and `output` (h) are finite.
     """
 
-    __slots__ = ("_arrays", "bias", "cip", "constant_N", "displacement", "field", "known", "output", "rate")
+    __slots__ = ("bias", "cip", "constant_N", "displacement", "field", "known", "magnitude_N", "output", "rate")
 
     def __init__(
         self,
@@ -98,14 +102,20 @@ class Network:
         outputs: list[float] = output.tolist()
         self.output: Final = outputs
         self.constant_N: Final = constant_N
+        self.magnitude_N: Final = math.fsum([abs(value) for value in outputs]) + abs(constant_N)
         self.known: Final = known
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> "NetworkCurve":
         """The curve for a state of the handle. Raises `DomainError` naming what is not finite, or too large."""
-        require_inputs(displacement_mm, rate_mm_s, 0.0, cip_percent)
+        if not (
+            -LARGEST <= displacement_mm <= LARGEST
+            and -LARGEST <= rate_mm_s <= LARGEST
+            and -LARGEST <= cip_percent <= LARGEST
+        ):
+            require_inputs(displacement_mm, rate_mm_s, 0.0, cip_percent)
         shift = [
             bias + by_mm * displacement_mm + by_mm_s * rate_mm_s + by_percent * cip_percent
-            for bias, by_mm, by_mm_s, by_percent in zip(self.bias, self.displacement, self.rate, self.cip, strict=True)
+            for bias, by_mm, by_mm_s, by_percent in zip(self.bias, self.displacement, self.rate, self.cip)  # noqa: B905
         ]
         return NetworkCurve(self, shift, displacement_mm, rate_mm_s, cip_percent)
 
@@ -125,10 +135,15 @@ class NetworkCurve:
         self.rate_mm_s: Final = rate_mm_s
         self.cip_percent: Final = cip_percent
 
+    @property
+    def magnitude_N(self) -> float:
+        """See `ForceCurve.magnitude_N`."""
+        return self._network.magnitude_N
+
     def force_N(self, field_mT: float) -> float:
         """See `ForceCurve.force_N`."""
         network, total_N = self._network, 0.0
-        for shift, by_mT, output in zip(self._shift, network.field, network.output, strict=True):
+        for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
             if exponent < LARGEST_EXPONENT:
                 total_N += output / (1.0 + math.exp(exponent))
@@ -137,7 +152,7 @@ class NetworkCurve:
     def force_and_slope(self, field_mT: float) -> tuple[float, float]:
         """See `ForceCurve.force_and_slope`."""
         network, total_N, slope = self._network, 0.0, 0.0
-        for shift, by_mT, output in zip(self._shift, network.field, network.output, strict=True):
+        for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
             if exponent < LARGEST_EXPONENT:
                 opened = 1.0 / (1.0 + math.exp(exponent))

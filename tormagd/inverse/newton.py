@@ -1,0 +1,91 @@
+"""Newton's method on the whole range, where the force is known to rise with the field: the search of the hot path."""
+
+from typing import Final, final
+
+from tormagd.inverse.solution import FieldSolution, Reach, answer, checked_near_mT, tie_N
+from tormagd.learning.features import require_number
+from tormagd.learning.force_curve import ForceCurve
+from tormagd.physics.errors import DomainError
+
+ACCURACY_MT: Final = 1e-3
+"""How near the curve's own root: a twentieth of what one encoder count of the gap (1/560 mm) changes at most."""
+
+LOOKED_AT_MT: Final = 0.25 * ACCURACY_MT
+"""A step that should end this near the root is taken for the last: only the force is looked at there, not the slope."""
+
+MOST_EVALUATIONS: Final = 60
+"""Bisection alone needs 20 from 1000 mT to `ACCURACY_MT`; thrice that is for steps that alternate with it."""
+
+EPS: Final = 2.0**-52
+"The unit of rounding that the curve's forces are computed with."
+
+
+@final
+class RisingSearch:
+    """Newton's steps from the last field, or else from the least, in a bracket that is the whole range at first.
+
+    A rising force has one root at most: there is no look for others. A step out of the bracket goes to the end of the
+    range, once, or else halves the bracket, and so does a step that is not half of the one before. The answer is the
+    root to `ACCURACY_MT`; out of reach it is the end. Raises `DomainError` on a range that is none.
+    """
+
+    __slots__ = ("_high_mT", "_low_mT")
+
+    def __init__(self, field_range_mT: tuple[float, float]) -> None:
+        low_mT, high_mT = field_range_mT
+        require_number("field_range_mT", low_mT)
+        require_number("field_range_mT", high_mT)
+        if not low_mT < high_mT:
+            raise DomainError("field_range_mT", field_range_mT, "a least field below the greatest")
+        self._low_mT = low_mT
+        self._high_mT = high_mT
+
+    def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
+        """See `FieldSolver.solve`."""
+        low, high = self._low_mT, self._high_mT
+        span = high - low
+        field = checked_near_mT(force_N, last_field_mT, low)
+        field = low if field < low else high if field > high else field
+        same_N = tie_N(curve, EPS)
+        left, right, low_is_new, high_is_new = low, high, True, True
+        # a step leaves its square times this: a parabola's over the range at first, then as the last two steps show
+        bend_per_mT, before = 1.0 / span, 2.0 * span
+        predicted_N, evaluations = 0.0, 0
+        while True:
+            predicted_N, slope = curve.force_and_slope(field)
+            evaluations += 1
+            excess_N = predicted_N - force_N
+            if abs(excess_N) <= same_N:
+                break
+            if excess_N < 0.0:
+                if field >= high:
+                    return answer(curve, field, force_N, predicted_N, evaluations, Reach.ABOVE)
+                left = field
+            else:
+                if field <= low:
+                    return answer(curve, field, force_N, predicted_N, evaluations, Reach.BELOW)
+                right = field
+            if right - left <= ACCURACY_MT or evaluations >= MOST_EVALUATIONS:
+                break
+            low_is_new, high_is_new = low_is_new and field > low, high_is_new and field < high
+            # a slope that rounding made flat gives no direction, but the force rises
+            step = -excess_N / slope if slope > 0.0 else span if excess_N < 0.0 else -span
+            following = field + step
+            if following >= high and high_is_new:
+                following = high
+            elif following <= low and low_is_new:
+                following = low
+            elif not left < following < right or 2.0 * abs(step) > abs(before):
+                following = 0.5 * (left + right)
+            else:
+                if evaluations > 1:
+                    bend_per_mT = abs(step / before / before)
+                if bend_per_mT * step * step <= LOOKED_AT_MT:
+                    there_N = curve.force_N(following)
+                    evaluations += 1
+                    # the slope holds there, too, if most of the excess is gone, and then tells how near the root is
+                    allowed_N = min(ACCURACY_MT * slope, 0.5 * abs(excess_N))
+                    if abs(there_N - force_N) <= max(allowed_N, same_N):
+                        return answer(curve, following, force_N, there_N, evaluations, Reach.INSIDE)
+            before, field = following - field, following
+        return answer(curve, field, force_N, predicted_N, evaluations, Reach.INSIDE)
