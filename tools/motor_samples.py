@@ -20,7 +20,7 @@ from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS, Columns, Range
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
-from tormagd.simulation.plant import pull_of_magnets_N
+from tormagd.simulation.static_laws import pull_of_magnets_N
 
 SAMPLES = ("sample_1", "sample_2", "sample_3")
 SIDES: tuple[Side, Side] = ("left", "right")

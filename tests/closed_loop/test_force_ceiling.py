@@ -23,8 +23,8 @@ class LyingSensor:
     """Before a device's own force sensor from `from_s` (its time) on; `lie` makes a false reading of a true one."""
 
     def __init__(self, device: VirtualDevice, lie: Callable[[float], float], from_s: float = 0.0) -> None:
-        self._own, self._lie, self._from_s, self._time_s = device.messages.plant._force_sensor, lie, from_s, 0.0
-        device.messages.plant._force_sensor = self  # type: ignore[assignment]
+        self._own, self._lie, self._from_s, self._time_s = device.messages.plant.force_sensor, lie, from_s, 0.0
+        device.messages.plant.force_sensor = self
 
     def advance(self, time_s: float, force_N: float) -> None:
         """See `simulation.plant.ForceSensor`."""

@@ -32,7 +32,7 @@ from firmware_protocol.framing import FrameDecoder, encode_frame
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
-from tormagd.simulation.firmware import TICK_S, Answer, Firmware, Sensors
+from tormagd.simulation.firmware import TICK_S, Answer, Firmware, Output, Sensors
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
 
@@ -60,14 +60,13 @@ class Carriages:
         self.held = False
         self.blind: int | None = None
 
-    def move(self, output: tuple[float, float, bool], dt_s: float) -> None:
-        left, right, enabled = output
-        for side, duty in enumerate((left, right)):
-            speed_mm_s = 0.0 if self.held else FULL_SPEED_MM_S * duty * (enabled and self.supply_V > 0.0)
+    def move(self, output: Output, dt_s: float) -> None:
+        for side, duty in enumerate((output.left_duty, output.right_duty)):
+            speed_mm_s = 0.0 if self.held else FULL_SPEED_MM_S * duty * (output.enabled and self.supply_V > 0.0)
             position_mm = self.positions_mm[side] + (speed_mm_s + self.drift_mm_s) * dt_s
             self.positions_mm[side] = min(max(position_mm, CLOSED_MM - 0.25), HOME_MM + 0.5)
 
-    def sensors(self, output: tuple[float, float, bool]) -> Sensors:
+    def sensors(self, output: Output) -> Sensors:
         left_mm, right_mm = self.positions_mm
         switches = Switches(0)
         for position_mm, opened, closed in (
@@ -81,8 +80,8 @@ class Carriages:
         return Sensors(
             left_counts=counts[0] if self.blind is None else self.blind,
             right_counts=counts[1],
-            left_current_A=output[0] if self.current_A is None else self.current_A,
-            right_current_A=output[1] if self.current_A is None else self.current_A,
+            left_current_A=output.left_duty if self.current_A is None else self.current_A,
+            right_current_A=output.right_duty if self.current_A is None else self.current_A,
             force_N=0.3 * counts[0] * MM_PER_COUNT,
             handle_counts=-7 * counts[1],
             switches=switches,
@@ -155,11 +154,12 @@ class Twins:
         assert (compiled.mode, compiled.faults, compiled.homed, compiled.output) == view
         assert encode(compiled.status(sensors)) == encode(python.status(sensors))
         self.seen |= {python.mode, *python.faults}
-        left, right, enabled = python.output
-        self.requests.append(" ".join([request, *(repr(+value) for value in sensors)]))
+        output = python.output
+        seen = [getattr(sensors, name) for name in Sensors.__match_args__]
+        self.requests.append(" ".join([request, *(repr(+value) for value in seen)]))
         self.expected.append(
             f"{answer} {int(python.mode)} {int(python.faults)} {int(python.homed)} "
-            f"{left.hex()} {right.hex()} {int(enabled)}"
+            f"{output.left_duty.hex()} {output.right_duty.hex()} {int(output.enabled)}"
         )
 
     # -- what a host and the world do ------------------------------------------------------------------------------
@@ -402,7 +402,7 @@ def test_a_copy_goes_its_own_way() -> None:
     [("supply_V", 25.6), ("temperature_C", 128.0), ("temperature_C", float("nan"))],
 )
 def test_a_status_that_does_not_fit_its_signals_is_not_sent(name: str, value: float) -> None:
-    sensors = Twins().sensors._replace(**{name: value})
+    sensors = Twins().sensors.replaced(**{name: value})
     with pytest.raises(EncodeError):
         CompiledFirmware(PLANT).status(sensors)
     with pytest.raises(EncodeError):
@@ -414,7 +414,7 @@ def test_a_status_that_does_not_fit_its_signals_is_not_sent(name: str, value: fl
     [("left_current_A", 32.8), ("right_current_A", -33.0), ("force_N", float("inf")), ("force_N", float("nan"))],
 )
 def test_a_measurement_that_does_not_fit_its_signals_is_not_sent(name: str, value: float) -> None:
-    sensors = Twins().sensors._replace(**{name: value})
+    sensors = Twins().sensors.replaced(**{name: value})
     with pytest.raises(EncodeError):
         CompiledFirmware(PLANT).measurement(0.1, sensors)
     with pytest.raises(EncodeError):
@@ -423,7 +423,7 @@ def test_a_measurement_that_does_not_fit_its_signals_is_not_sent(name: str, valu
 
 @pytest.mark.parametrize("counts", [32767, 32768, -32768, -32769, 65535, 2**31 - 1, -(2**31)])
 def test_positions_run_over_at_the_same_count(counts: int) -> None:
-    sensors = Twins().sensors._replace(left_counts=counts, right_counts=counts - 1, handle_counts=counts)
+    sensors = Twins().sensors.replaced(left_counts=counts, right_counts=counts - 1, handle_counts=counts)
     for time_s in (0.655354, 0.655356, 86400.0):
         ours = [encode(message) for message in Firmware(PLANT).measurement(time_s, sensors)]
         assert ours == [encode(message) for message in CompiledFirmware(PLANT).measurement(time_s, sensors)]

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from tormagd.simulation.axis import Axis
 from tormagd.simulation.hand import ReversingHand, SteadyHand
 from tormagd.simulation.parameters import PlantError, PlantParameters, load_plant, plant_names
-from tormagd.simulation.plant import SUBSTEP_S, Plant, holding_over_stroke
+from tormagd.simulation.plant import SUBSTEP_S, Plant
+from tormagd.simulation.static_laws import holding_over_stroke
 
 SAMPLE_1 = load_plant("sample_1")
 LEAD_M_RAD = 8e-3 / math.tau

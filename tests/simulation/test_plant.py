@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
-from tormagd.simulation.element import Element, radial_moment_Tm
+from tormagd.simulation.element import Element
 from tormagd.simulation.hand import ReversingHand, SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant, plant_names
 from tormagd.simulation.plant import Plant
+from tormagd.simulation.static_laws import radial_moment_Tm
 
 SAMPLE_1 = load_plant("sample_1")
 STEP_S = 1e-3

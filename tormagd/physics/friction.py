@@ -10,17 +10,18 @@ The force is that which resists positive motion of the handle; the hand does the
 """
 
 import math
-from dataclasses import dataclass
+from typing import Final, final
 
+from firmware_protocol.value import Value
 from tormagd.physics.errors import DomainError, require
 
-MAX_SPEED_MM_S = 1e6
-MAX_LEVEL_N = 1e6
-MAX_STEP_S = 1e6
+MAX_SPEED_MM_S: Final = 1e6
+MAX_LEVEL_N: Final = 1e6
+MAX_STEP_S: Final = 1e6
 
 
-@dataclass(frozen=True, slots=True)
-class Friction:
+@final
+class Friction(Value):
     """Friction at the roller, apart from its kinetic level, which the field sets.
 
     presliding_stiffness_N_mm  sigma0: stiffness before break-away, > 0
@@ -29,16 +30,24 @@ class Friction:
     stribeck_speed_mm_s        v_s: speed at which the level has fallen most of the way to kinetic, > 0
     """
 
-    presliding_stiffness_N_mm: float
-    viscous_N_s_mm: float
-    static_ratio: float
-    stribeck_speed_mm_s: float
+    __match_args__ = ("presliding_stiffness_N_mm", "viscous_N_s_mm", "static_ratio", "stribeck_speed_mm_s")
+    __slots__ = __match_args__
 
-    def __post_init__(self) -> None:
-        require("presliding_stiffness_N_mm", self.presliding_stiffness_N_mm, 1e-6, 1e6)
-        require("viscous_N_s_mm", self.viscous_N_s_mm, 0.0, 1e3)
-        require("static_ratio", self.static_ratio, 1.0, 10.0)
-        require("stribeck_speed_mm_s", self.stribeck_speed_mm_s, 1e-6, 1e6)
+    def __init__(
+        self,
+        presliding_stiffness_N_mm: float,
+        viscous_N_s_mm: float,
+        static_ratio: float,
+        stribeck_speed_mm_s: float,
+    ) -> None:
+        require("presliding_stiffness_N_mm", presliding_stiffness_N_mm, 1e-6, 1e6)
+        require("viscous_N_s_mm", viscous_N_s_mm, 0.0, 1e3)
+        require("static_ratio", static_ratio, 1.0, 10.0)
+        require("stribeck_speed_mm_s", stribeck_speed_mm_s, 1e-6, 1e6)
+        self.presliding_stiffness_N_mm: Final = presliding_stiffness_N_mm
+        self.viscous_N_s_mm: Final = viscous_N_s_mm
+        self.static_ratio: Final = static_ratio
+        self.stribeck_speed_mm_s: Final = stribeck_speed_mm_s
 
     def level_N(self, speed_mm_s: float, kinetic_N: float) -> float:
         """Steady level g(v) of the dry part at that speed, N."""

@@ -8,26 +8,36 @@ then lost, and it is the caller who says that a brake's level is not negative.
 """
 
 import math
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Final, TypeAlias, final
 
+from firmware_protocol.value import Value
 from tormagd.physics.errors import DomainError, require
 
 PronyState: TypeAlias = tuple[float, ...]
 """The last driving force, N, then one branch force h_i, N, for each time constant."""
 
-MAX_FORCE_N = 1e9
-MAX_STEP_S = 1e9
+MAX_FORCE_N: Final = 1e9
+MAX_STEP_S: Final = 1e9
 
 
-@dataclass(frozen=True, slots=True)
-class PronyStep:
+@final
+class PronyStep(Value):
     """The exact update of a `PronySeries` over one step length, for a driving force linear over the step."""
 
-    equilibrium_fraction: float
-    fractions: tuple[float, ...]
-    decays: tuple[float, ...]
-    gains: tuple[float, ...]
+    __match_args__ = ("equilibrium_fraction", "fractions", "decays", "gains")
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        equilibrium_fraction: float,
+        fractions: tuple[float, ...],
+        decays: tuple[float, ...],
+        gains: tuple[float, ...],
+    ) -> None:
+        self.equilibrium_fraction: Final = equilibrium_fraction
+        self.fractions: Final = fractions
+        self.decays: Final = decays
+        self.gains: Final = gains
 
     def advance(self, state: PronyState, driving_N: float) -> tuple[float, PronyState]:
         """(force_N, next state) at the end of the step, at which the driving force is `driving_N`.
@@ -48,27 +58,29 @@ class PronyStep:
         return force_N, tuple(following)
 
 
-@dataclass(frozen=True, slots=True)
-class PronySeries:
+@final
+class PronySeries(Value):
     """Relaxing fractions g_i (each >= 0, sum < 1) and their time constants tau_i, s; raises `DomainError` otherwise."""
 
-    fractions: tuple[float, ...]
-    times_s: tuple[float, ...]
+    __match_args__ = ("fractions", "times_s")
+    __slots__ = __match_args__
 
-    def __post_init__(self) -> None:
-        if len(self.fractions) != len(self.times_s):
-            raise DomainError("times_s", self.times_s, f"one time for each of the {len(self.fractions)} fractions")
-        for fraction in self.fractions:
+    def __init__(self, fractions: tuple[float, ...], times_s: tuple[float, ...]) -> None:
+        if len(fractions) != len(times_s):
+            raise DomainError("times_s", times_s, f"one time for each of the {len(fractions)} fractions")
+        for fraction in fractions:
             require("fractions", fraction, 0.0, 1.0)
-        for time_s in self.times_s:
+        for time_s in times_s:
             require("times_s", time_s, 1e-6, 1e9)
-        if not sum(self.fractions) < 1.0:
-            raise DomainError("fractions", self.fractions, "a sum below 1")
+        if not sum(fractions) < 1.0:
+            raise DomainError("fractions", fractions, "a sum below 1")
+        self.fractions: Final = fractions
+        self.times_s: Final = times_s
 
     def relaxed(self, driving_N: float) -> PronyState:
         """State after an endless rest at that driving force; at 0 N, the state of an element never loaded."""
         require("driving_N", driving_N, -MAX_FORCE_N, MAX_FORCE_N)
-        return (driving_N, *(0.0 for _ in self.fractions))
+        return (driving_N, *[0.0 for _ in self.fractions])
 
     def discretise(self, dt_s: float) -> PronyStep:
         """The update for steps of `dt_s` (0 is a jump of the driving force); keep it where the step is constant."""
@@ -77,7 +89,7 @@ class PronySeries:
         return PronyStep(
             equilibrium_fraction=1.0 - sum(self.fractions),
             fractions=self.fractions,
-            decays=tuple(math.exp(-ratio) for ratio in ratios),
+            decays=tuple([math.exp(-ratio) for ratio in ratios]),
             # mean of the decay over the step: what is left of a ramp that rose by one over it
-            gains=tuple(-math.expm1(-ratio) / ratio if ratio > 0.0 else 1.0 for ratio in ratios),
+            gains=tuple([-math.expm1(-ratio) / ratio if ratio > 0.0 else 1.0 for ratio in ratios]),
         )

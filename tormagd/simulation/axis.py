@@ -11,13 +11,15 @@ The carriage is taken as massless: its 0.3 kg at 1 m/s2 are 0.3 N beside some 60
 """
 
 import math
+from typing import Final, final
 
 from tormagd.simulation.parameters import PlantError, PlantParameters
 
-MAX_STEP_SHARE = 0.25
+MAX_STEP_SHARE: Final = 0.25
 """Largest share of a substep in the time constants it has to resolve; the samples stay under 0.07."""
 
 
+@final
 class Axis:
     """State and laws of one carriage.
 

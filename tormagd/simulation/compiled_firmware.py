@@ -7,7 +7,7 @@ codec, and the state is the C struct. The Python firmware is its twin; tests hol
 import ctypes
 import math
 from functools import cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from firmware_protocol.c.build import BuildError, load_library
 from firmware_protocol.codec import (
@@ -127,7 +127,7 @@ class CompiledFirmware:
         """Act on one message of the host; those of a device are ignored."""
         payload = encode(message)
         answer: int = _library().tormag_bridge_receive(
-            self._device, time_s, FUNCTION[type(message)], payload, len(payload), ctypes.byref(_Sensors(*sensors))
+            self._device, time_s, FUNCTION[type(message)], payload, len(payload), _seen(sensors)
         )
         if answer < 0:
             raise DecodeError(f"{message}: the C codec refuses {payload.hex()} with result {-answer}")
@@ -136,7 +136,7 @@ class CompiledFirmware:
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
         """The 1 kHz tick: motions and watches; every twentieth gives a Status. Raises EncodeError as `status` does."""
         payload = ctypes.create_string_buffer(MAX_PAYLOAD)
-        length: int = _library().tormag_bridge_tick(self._device, time_s, ctypes.byref(_Sensors(*sensors)), payload)
+        length: int = _library().tormag_bridge_tick(self._device, time_s, _seen(sensors), payload)
         _require_sent(length, sensors)
         return _decoded(Status, payload.raw) if length else None
 
@@ -146,14 +146,14 @@ class CompiledFirmware:
         Raises EncodeError for a supply or temperature that has no step on the wire.
         """
         payload = ctypes.create_string_buffer(MAX_PAYLOAD)
-        _require_sent(_library().tormag_bridge_status(self._device, ctypes.byref(_Sensors(*sensors)), payload), sensors)
+        _require_sent(_library().tormag_bridge_status(self._device, _seen(sensors), payload), sensors)
         return _decoded(Status, payload.raw)
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
         """State and Sense of that moment. Raises EncodeError for a current or force that has no step on the wire."""
         payloads = ctypes.create_string_buffer(2 * MAX_PAYLOAD)
         result: int = _library().tormag_bridge_measurement(
-            self._device, time_s, ctypes.byref(_Sensors(*sensors)), payloads
+            self._device, time_s, _seen(sensors), payloads
         )
         _require_sent(result, sensors)
         return _decoded(State, payloads.raw[:MAX_PAYLOAD]), _decoded(Sense, payloads.raw[MAX_PAYLOAD:])
@@ -189,6 +189,23 @@ class CompiledFirmware:
         view = _View()
         _library().tormag_bridge_view(self._device, ctypes.byref(view))
         return view
+
+
+def _seen(sensors: Sensors) -> Any:
+    """A reference to the sensors as the C sources see them."""
+    return ctypes.byref(
+        _Sensors(
+            sensors.left_counts,
+            sensors.right_counts,
+            sensors.left_current_A,
+            sensors.right_current_A,
+            sensors.force_N,
+            sensors.handle_counts,
+            sensors.switches,
+            sensors.supply_V,
+            sensors.temperature_C,
+        )
+    )
 
 
 def _require_sent(result: int, sensors: Sensors) -> None:

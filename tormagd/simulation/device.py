@@ -8,39 +8,107 @@ import math
 import random
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from operator import attrgetter
+from typing import Final, final
 
 from firmware_protocol.codec import FUNCTION, DecodeError, Message, Switches, decode, encode
 from firmware_protocol.framing import DELIMITER, FrameDecoder, FramingStatistics, encode_frame
+from firmware_protocol.value import Value
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.faults import Fault
-from tormagd.simulation.firmware import NO_SWITCH, OFF, TICK_S, Answer, Firmware, Output, Sensors
+from tormagd.simulation.firmware import IDENTITY, NO_ANSWER, OFF, TICK_S, Answer, Firmware, Output, Sensors
 from tormagd.simulation.hand import ROLLER_RADIUS_MM, Hand
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.plant import Plant, Truth
 
-BITS_PER_BYTE = 10  # start, eight data bits, stop
-DEFAULT_BAUD = 1_000_000
+BITS_PER_BYTE: Final = 10  # start, eight data bits, stop
+DEFAULT_BAUD: Final = 1_000_000
 FirmwareKind = Callable[[PlantParameters], Firmware | CompiledFirmware]
 """What boots: `Firmware`, or the C sources of the same rules as `CompiledFirmware`."""
-WEAR = 4.0
-MAX_BACKLOG_BYTES = 65_536
+WEAR: Final = 4.0
+MAX_BACKLOG_BYTES: Final = 65_536
 """What the serial buffers of both ends and the adapter between them hold; more is lost, as on a real port."""
+LEFT_OPEN: Final = 1
+RIGHT_OPEN: Final = 2
+LEFT_CLOSED: Final = 4
+RIGHT_CLOSED: Final = 8
+END_SWITCHES: Final = [Switches(bits) for bits in range(16)]
+"""By their bits, the four above: flags are made here, not in a tick."""
 
 
-class Packet(NamedTuple):
+@final
+class Packet(Value):
     """One message's payload and when it is handed to, or came from, the link."""
 
-    time_s: float
-    function: int
-    payload: bytes
+    __match_args__ = ("time_s", "function", "payload")
+    __slots__ = __match_args__
+
+    def __init__(self, time_s: float, function: int, payload: bytes) -> None:
+        self.time_s: Final = time_s
+        self.function: Final = function
+        self.payload: Final = payload
 
 
+@final
+class Reply(Value):
+    """What a received message called for, and when it is given."""
+
+    __match_args__ = ("time_s", "answer")
+    __slots__ = __match_args__
+
+    def __init__(self, time_s: float, answer: Answer) -> None:
+        self.time_s: Final = time_s
+        self.answer: Final = answer
+
+
+@final
+class Outgoing(Value):
+    """The part of a frame that is still to leave, and when its first bit does."""
+
+    __match_args__ = ("start_s", "data")
+    __slots__ = __match_args__
+
+    def __init__(self, start_s: float, data: bytes) -> None:
+        self.start_s: Final = start_s
+        self.data: Final = data
+
+
+@final
 class MessageDevice:
     """The device at the level of messages: payloads in, payloads out, whatever carries them.
 
     `receive` queues a payload for its time of arrival; `advance` lets time pass and fills `outbox`.
     """
+
+    __slots__ = (
+        "_answers",
+        "_boot",
+        "_boot_s",
+        "_closed_m",
+        "_counts_per_rad",
+        "_deaf",
+        "_faults",
+        "_handle_counts_per_mm",
+        "_home_m",
+        "_inbox",
+        "_jitter",
+        "_jitter_s",
+        "_left_boot_counts",
+        "_output",
+        "_pwm_steps",
+        "_rate",
+        "_right_boot_counts",
+        "_stuck_left",
+        "_supply_V",
+        "_tick_due_s",
+        "_ticks",
+        "_time_s",
+        "firmware",
+        "outbox",
+        "parameters",
+        "plant",
+        "undecodable",
+    )
 
     def __init__(
         self,
@@ -53,11 +121,11 @@ class MessageDevice:
         self.parameters = parameters
         self.plant = Plant(parameters, hand, seed)
         self._boot = boot
-        self.firmware = boot(parameters)
+        self.firmware: Firmware | CompiledFirmware = boot(parameters)
         self.outbox: deque[Packet] = deque()
         self.undecodable = 0
         """Payloads that arrived and were no message."""
-        self._faults = deque(sorted(faults, key=lambda fault: fault.at_s))
+        self._faults: deque[Fault] = deque(sorted(faults, key=attrgetter("at_s")))
         self._jitter = random.Random(f"reply jitter {seed}")
         self._jitter_s = parameters.firmware.reply_jitter_us * 1e-6
         self._rate = 1.0 + parameters.firmware.clock_ppm * 1e-6
@@ -68,11 +136,12 @@ class MessageDevice:
         self._home_m = parameters.assumed.home_mm * 1e-3
         self._closed_m = parameters.assumed.closed_mm * 1e-3
         self._inbox: deque[Packet] = deque()
-        self._answers: deque[tuple[float, Answer]] = deque()
+        self._answers: deque[Reply] = deque()
         self._deaf = False
         self._output: Output = OFF
         self._stuck_left: int | None = None
-        self._counts_at_boot = (0, 0)
+        self._left_boot_counts = 0
+        self._right_boot_counts = 0
         self._boot_s = 0.0
         self._ticks = 0
         self._tick_due_s = TICK_S / self._rate
@@ -99,8 +168,8 @@ class MessageDevice:
             self._pass_time(event_s)
             if inbox and inbox[0].time_s <= event_s:
                 self._deliver(event_s, inbox.popleft())
-            elif answers and answers[0][0] <= event_s:
-                self._send_answer(event_s, answers.popleft()[1])
+            elif answers and answers[0].time_s <= event_s:
+                self._send_answer(event_s, answers.popleft().answer)
             else:
                 self._tick(event_s)
             if self.firmware.output is not self._output:
@@ -113,7 +182,7 @@ class MessageDevice:
         event_s = self._tick_due_s
         if self._inbox and (arrival_s := self._inbox[0].time_s) < event_s:
             event_s = arrival_s
-        if self._answers and (answer_s := self._answers[0][0]) < event_s:
+        if self._answers and (answer_s := self._answers[0].time_s) < event_s:
             event_s = answer_s
         return event_s if event_s > self._time_s else self._time_s
 
@@ -154,16 +223,19 @@ class MessageDevice:
             self.undecodable += 1
             return
         answer = self.firmware.receive(self._device_time_s(time_s), message, self._sensors())
-        if answer is not Answer.NONE:
-            answer_s = time_s + self._jitter.uniform(0.0, self._jitter_s)
-            self._answers.append((max(answer_s, self._answers[-1][0] if self._answers else 0.0), answer))
+        if answer is not NO_ANSWER:
+            answers = self._answers
+            answer_s = time_s + self._jitter_s * self._jitter.random()
+            # none overtakes the one before it
+            answers.append(Reply(max(answer_s, answers[-1].time_s) if answers else answer_s, answer))
 
     def _send_answer(self, time_s: float, answer: Answer) -> None:
-        if answer is Answer.IDENTITY:
+        if answer is IDENTITY:
             self._send(time_s, self.firmware.identity())
             return
-        for message in self.firmware.measurement(self._device_time_s(time_s), self._sensors()):
-            self._send(time_s, message)
+        state, sense = self.firmware.measurement(self._device_time_s(time_s), self._sensors())
+        self._send(time_s, state)
+        self._send(time_s, sense)
 
     def _send(self, time_s: float, message: Message) -> None:
         self.outbox.append(Packet(time_s, FUNCTION[type(message)], encode(message)))
@@ -171,26 +243,25 @@ class MessageDevice:
     def _sensors(self) -> Sensors:
         plant = self.plant
         left_m, right_m = plant.left.position_m, plant.right.position_m
-        switches = NO_SWITCH
+        switches = 0
         if left_m >= self._home_m:
-            switches |= Switches.LEFT_OPEN
+            switches = LEFT_OPEN
         elif left_m <= self._closed_m:
-            switches |= Switches.LEFT_CLOSED
+            switches = LEFT_CLOSED
         if right_m >= self._home_m:
-            switches |= Switches.RIGHT_OPEN
+            switches += RIGHT_OPEN
         elif right_m <= self._closed_m:
-            switches |= Switches.RIGHT_CLOSED
+            switches += RIGHT_CLOSED
         (left_rad, left_A), (right_rad, right_A) = plant.shafts
         left_counts, right_counts = self._encoders(left_rad, right_rad)
-        left_start, right_start = self._counts_at_boot
         return Sensors(
-            left_counts - left_start,
-            right_counts - right_start,
+            left_counts - self._left_boot_counts,
+            right_counts - self._right_boot_counts,
             left_A,
             right_A,
             plant.sensed_force_N,
             math.floor(plant.handle_mm * self._handle_counts_per_mm),
-            switches,
+            END_SWITCHES[switches],
             self._supply_V,
             plant.element.temperature_C,
         )
@@ -213,7 +284,7 @@ class MessageDevice:
                 self.firmware = self._boot(self.parameters)
                 self._answers.clear()
                 (left_rad, _), (right_rad, _) = self.plant.shafts
-                self._counts_at_boot = self._encoders(left_rad, right_rad)
+                self._left_boot_counts, self._right_boot_counts = self._encoders(left_rad, right_rad)
                 self._boot_s = time_s
                 self._ticks = 0
             case "commands_vanish":
@@ -225,6 +296,7 @@ class MessageDevice:
                 raise ValueError(f"fault {fault.name!r} has no effect defined")
 
 
+@final
 class VirtualDevice:
     """The device behind a serial line: bytes in, bytes out, both paced to the baud rate.
 
@@ -234,6 +306,8 @@ class VirtualDevice:
 
     Times are the host's, seconds from power-on, and must not fall over all three (ValueError).
     """
+
+    __slots__ = ("_byte_s", "_decoder", "_line", "_receiver_free_s", "_sender_free_s", "_sequence", "messages")
 
     def __init__(
         self,
@@ -251,7 +325,7 @@ class VirtualDevice:
         self._decoder = FrameDecoder()
         self._receiver_free_s = 0.0
         self._sequence = 0
-        self._line: deque[tuple[float, bytes]] = deque()
+        self._line: deque[Outgoing] = deque()
         self._sender_free_s = 0.0
 
     @property
@@ -287,32 +361,34 @@ class VirtualDevice:
             self._sequence = (self._sequence + 1) % 256
             start_s = max(packet.time_s, self._sender_free_s)
             self._sender_free_s = start_s + len(frame) * self._byte_s
-            self._line.append((start_s, frame))
+            self._line.append(Outgoing(start_s, frame))
 
     def transmit(self, now_s: float) -> bytes:
         """The bytes that have come out of the line since the last call."""
         self.advance(now_s)
-        out = bytearray()
-        while self._line:
-            start_s, frame = self._line[0]
+        out: list[bytes] = []
+        line, byte_s = self._line, self._byte_s
+        while line:
+            frame = line[0]
+            data = frame.data
             # a millionth of a byte of tolerance: sums of times are not exact
-            done = int((now_s - start_s) / self._byte_s + 1e-6)
-            if done < len(frame):
+            done = int((now_s - frame.start_s) / byte_s + 1e-6)
+            if done < len(data):
                 if done > 0:
-                    out += frame[:done]
-                    self._line[0] = start_s + done * self._byte_s, frame[done:]
+                    out.append(data[:done])
+                    line[0] = Outgoing(frame.start_s + done * byte_s, data[done:])
                 break
-            out += frame
-            self._line.popleft()
-        return bytes(out)
+            out.append(data)
+            line.popleft()
+        return b"".join(out)
 
     @property
     def next_event_s(self) -> float:
         """When there is next something to do: a frame that ends on the line, or an event inside the device."""
         event_s = self.messages.next_event_s
         if self._line:
-            start_s, frame = self._line[0]
-            event_s = min(event_s, start_s + len(frame) * self._byte_s)
+            frame = self._line[0]
+            event_s = min(event_s, frame.start_s + len(frame.data) * self._byte_s)
         return event_s
 
 

@@ -5,76 +5,17 @@ pre-sliding friction with a Stribeck level.
 """
 
 import math
-from collections.abc import Callable
+from typing import Final, final
 
-import numpy as np
-
-from tormagd.physics.errors import FloatArray
-from tormagd.physics.field import PowerFieldLaw, ThesisFieldLaw
-from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.parameters import PlantParameters
+from tormagd.simulation.static_laws import force_over_moment, moment_over_gap
 
-GRID_MM = 2e-3
-MOMENT_POINTS = 20_000
-SMALLEST_GAP_MM = 45.0
-JOIN_MM = 10.0
-"""Width over which Eq. 7 goes over into the power law beyond 95 mm."""
+SMALLEST_GAP_MM: Final = 45.0
 
 
-class Curve:
-    """A function tabulated on a uniform grid, linear between points; plain floats, because numpy scalars are slow."""
-
-    __slots__ = ("_last", "_per_unit", "_start", "_values")
-
-    def __init__(
-        self,
-        function: Callable[[FloatArray], FloatArray],
-        start: float,
-        end: float,
-        points: int,
-    ) -> None:
-        self._start = start
-        self._per_unit = (points - 1) / (end - start)
-        self._last = points - 2
-        self._values: list[float] = function(np.linspace(start, end, points)).tolist()
-
-    def at(self, x: float) -> float:
-        """Value at x; the outermost pieces continue beyond the ends."""
-        place = (x - self._start) * self._per_unit
-        index = int(place)
-        if index < 0:
-            index = 0
-        elif index > self._last:
-            index = self._last
-        values = self._values
-        low = values[index]
-        return low + (values[index + 1] - low) * (place - index)
-
-    @classmethod
-    def over_gap(cls, function: Callable[[FloatArray], FloatArray], plant: PlantParameters) -> "Curve":
-        """Tabulate over every gap the device can reach."""
-        start, end = 2.0 * plant.closed_stop_mm, 2.0 * plant.open_stop_mm
-        return cls(function, start, end, math.ceil((end - start) / GRID_MM) + 1)
-
-
-def radial_moment_Tm(gap_mm: FloatArray, plant: PlantParameters) -> FloatArray:
-    """The plant's field law on an array of gaps, T m, without its hysteresis."""
-    power = PowerFieldLaw(plant.field.coefficient, plant.field.exponent).radial_moment_Tm(gap_mm)
-    if plant.field.law == "power":
-        return power
-    thesis = ThesisFieldLaw()
-    low_mm, high_mm = thesis.gap_range_mm
-    # under 45 mm, in the half millimetre before the stops, Eq. 7 is continued along its tangent
-    inside_mm = np.clip(gap_mm, low_mm, high_mm)
-    tangent = thesis.d_radial_moment_d_gap(low_mm) * np.minimum(gap_mm - low_mm, 0.0)
-    share = np.clip((gap_mm - high_mm) / JOIN_MM, 0.0, 1.0)
-    share = share * share * (3.0 - 2.0 * share)
-    joined: FloatArray = (1.0 - share) * (thesis.radial_moment_Tm(inside_mm) + tangent) + share * power
-    return joined
-
-
+@final
 class Element:
     """State of the element: the field's branch, the elastomer's memory, the bristles, the temperature.
 
@@ -84,22 +25,36 @@ class Element:
     tormagd.physics.errors.DomainError when the parameters leave the force law's domain somewhere in the stroke.
     """
 
+    __slots__ = (
+        "_ambient_C",
+        "_branch_Tm",
+        "_deflection_mm",
+        "_drift_K_s",
+        "_dt_s",
+        "_force",
+        "_force_per_K",
+        "_friction",
+        "_lag_Tm",
+        "_memory",
+        "_moment",
+        "_moment_Tm",
+        "_relax",
+        "_turn_Tm",
+        "_warming_K",
+        "force_N",
+        "kinetic_N",
+        "temperature_C",
+    )
+
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
         self._dt_s = dt_s
-        self._moment = Curve.over_gap(lambda gap: radial_moment_Tm(gap, plant), plant)
+        self._moment = moment_over_gap(plant)
         largest_Tm = self._moment.at(SMALLEST_GAP_MM)
         self._branch_Tm = plant.field.hysteresis_percent / 100.0 * largest_Tm
         self._turn_Tm = plant.assumed.hysteresis_scale * largest_Tm
-        elastomer = Elastomer(
-            shear_modulus_Pa=plant.elastomer.shear_modulus_kPa * 1e3,
-            relative_permeability=plant.elastomer.relative_permeability,
-            friction_coefficient=plant.elastomer.kinetic_friction,
-        )
         weakest_Tm = self._moment.at(2.0 * plant.open_stop_mm) - self._branch_Tm
         strongest_Tm = self._moment.at(2.0 * plant.closed_stop_mm) + self._branch_Tm
-        self._force = Curve(
-            lambda moment: brake_force_N(moment, elastomer, TORMAG), weakest_Tm, strongest_Tm, MOMENT_POINTS
-        )
+        self._force = force_over_moment(plant, weakest_Tm, strongest_Tm)
         friction = plant.friction
         self._friction = Friction(
             presliding_stiffness_N_mm=friction.presliding_stiffness_N_mm,

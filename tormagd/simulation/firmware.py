@@ -9,7 +9,7 @@ does not, the magnets pull it shut. So everything that ends a run opens first an
 
 import math
 from enum import Enum, auto
-from typing import NamedTuple
+from typing import Final, final
 
 from firmware_protocol.codec import (
     PROTOCOL_VERSION,
@@ -29,54 +29,92 @@ from firmware_protocol.codec import (
     Status,
     Switches,
 )
+from firmware_protocol.value import Value
 from tormagd.simulation.hand import ROLLER_RADIUS_MM
 from tormagd.simulation.motion import Carriage, Homing, Outcome, Retraction
 from tormagd.simulation.parameters import PlantParameters
 
-TICK_S = 1e-3
-STATUS_TICKS = 20  # 50 Hz
-COMMAND_TIMEOUT_S = 0.05
-OVERCURRENT_S = 0.15  # a reversal at full speed takes about 50 ms of high current
-MAX_SKEW_MM = 2.0
-MAX_SLIP_MM = 0.2
-COASTING_S = 0.1  # a carriage may go on this long before its motion counts as uncommanded
-SUPPLY_RANGE_V = (9.0, 15.0)
-MAX_TEMPERATURE_C = 60.0
-VERSION = (1, 0)
-SERIAL_NUMBER = 1
+TICK_S: Final = 1e-3
+STATUS_TICKS: Final = 20  # 50 Hz
+COMMAND_TIMEOUT_S: Final = 0.05
+OVERCURRENT_S: Final = 0.15  # a reversal at full speed takes about 50 ms of high current
+MAX_SKEW_MM: Final = 2.0
+MAX_SLIP_MM: Final = 0.2
+COASTING_S: Final = 0.1  # a carriage may go on this long before its motion counts as uncommanded
+LEAST_SUPPLY_V: Final = 9.0
+MOST_SUPPLY_V: Final = 15.0
+MAX_TEMPERATURE_C: Final = 60.0
+VERSION: Final = (1, 0)
+SERIAL_NUMBER: Final = 1
 
-# Operations on flags make new ones, at a microsecond each: what is needed in every tick is made here
-NO_SWITCH = Switches(0)
-CLOSED_SWITCHES = Switches.LEFT_CLOSED | Switches.RIGHT_CLOSED
-NO_FAULT = DeviceFault(0)
+# An operation on flags makes new ones, and a member of an enumeration is looked up in its class by Python code, at a
+# microsecond and a fifth of one: what is needed in every tick is made and named here
+NO_SWITCH: Final = Switches(0)
+CLOSED_SWITCHES: Final = Switches.LEFT_CLOSED | Switches.RIGHT_CLOSED
+NO_FAULT: Final = DeviceFault(0)
 
-MOTORS_OFF_MODES = (DeviceMode.IDLE, DeviceMode.LATCHED)
-LASTING_CAUSES = DeviceFault.SUPPLY | DeviceFault.TEMPERATURE
+IDLE: Final = DeviceMode.IDLE
+RUN: Final = DeviceMode.RUN
+HOMING: Final = DeviceMode.HOMING
+RETRACTING: Final = DeviceMode.RETRACTING
+LATCHED: Final = DeviceMode.LATCHED
+DRIVES_OFF: Final = DriveMode.OFF
 
 
-class Sensors(NamedTuple):
+@final
+class Sensors(Value):
     """What the electronics measure; encoder counts since power-on, positive opening."""
 
-    left_counts: int
-    right_counts: int
-    left_current_A: float
-    right_current_A: float
-    force_N: float
-    handle_counts: int
-    switches: Switches
-    supply_V: float
-    temperature_C: float
+    __match_args__ = (
+        "left_counts",
+        "right_counts",
+        "left_current_A",
+        "right_current_A",
+        "force_N",
+        "handle_counts",
+        "switches",
+        "supply_V",
+        "temperature_C",
+    )
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        left_counts: int,
+        right_counts: int,
+        left_current_A: float,
+        right_current_A: float,
+        force_N: float,
+        handle_counts: int,
+        switches: Switches,
+        supply_V: float,
+        temperature_C: float,
+    ) -> None:
+        self.left_counts: Final = left_counts
+        self.right_counts: Final = right_counts
+        self.left_current_A: Final = left_current_A
+        self.right_current_A: Final = right_current_A
+        self.force_N: Final = force_N
+        self.handle_counts: Final = handle_counts
+        self.switches: Final = switches
+        self.supply_V: Final = supply_V
+        self.temperature_C: Final = temperature_C
 
 
-class Output(NamedTuple):
+@final
+class Output(Value):
     """What the bridges do: duties in [-1, 1], or open."""
 
-    left_duty: float
-    right_duty: float
-    enabled: bool
+    __match_args__ = ("left_duty", "right_duty", "enabled")
+    __slots__ = __match_args__
+
+    def __init__(self, left_duty: float, right_duty: float, enabled: bool) -> None:
+        self.left_duty: Final = left_duty
+        self.right_duty: Final = right_duty
+        self.enabled: Final = enabled
 
 
-OFF = Output(0.0, 0.0, enabled=False)
+OFF: Final = Output(0.0, 0.0, enabled=False)
 
 
 class Answer(Enum):
@@ -87,8 +125,41 @@ class Answer(Enum):
     MEASUREMENT = auto()
 
 
+NO_ANSWER: Final = Answer.NONE
+IDENTITY: Final = Answer.IDENTITY
+MEASUREMENT: Final = Answer.MEASUREMENT
+
+
+@final
 class Firmware:
     """One device's firmware from its boot on. All times are device time, in seconds since the boot, never falling."""
+
+    __slots__ = (
+        "_compatible",
+        "_drive_counter",
+        "_drive_s",
+        "_handle_mm_per_count",
+        "_homing_mm_s",
+        "_lead_mm_rev",
+        "_left_calm_s",
+        "_left_zero_mm",
+        "_may_run",
+        "_mm_per_count",
+        "_motion",
+        "_nonce",
+        "_overcurrent_A",
+        "_retract_mm_s",
+        "_right_calm_s",
+        "_right_zero_mm",
+        "_state_counter",
+        "_ticks",
+        "_watch_counts",
+        "_watch_since_s",
+        "faults",
+        "homed",
+        "mode",
+        "output",
+    )
 
     def __init__(self, plant: PlantParameters) -> None:
         self._lead_mm_rev = plant.screw.lead_mm
@@ -98,18 +169,20 @@ class Firmware:
         self._homing_mm_s = plant.assumed.homing_mm_s
         self._overcurrent_A = plant.assumed.overcurrent_A
 
-        self.mode = DeviceMode.IDLE
-        self.faults = DeviceFault(0)
+        self.mode: DeviceMode = IDLE
+        self.faults: DeviceFault = NO_FAULT
         self.homed = False
-        self.output = OFF
-        self._zeros_mm = (0.0, 0.0)
+        self.output: Output = OFF
+        self._left_zero_mm = 0.0
+        self._right_zero_mm = 0.0
         self._compatible = False
         self._may_run = True
         self._motion: Retraction | Homing | None = None
         self._drive_counter: int | None = None
         self._drive_s = 0.0
         self._nonce: int | None = None
-        self._calm_s = [0.0, 0.0]
+        self._left_calm_s = 0.0
+        self._right_calm_s = 0.0
         self._watch_since_s = 0.0
         self._watch_counts: tuple[int, int] | None = None
         self._ticks = 0
@@ -119,85 +192,80 @@ class Firmware:
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
         """Act on one message of the host; those of a device are ignored."""
-        match message:
-            case Drive():
-                return self._drive(time_s, message, sensors)
-            case Hello():
-                # accepted whatever it was before, so that a new host starts from a known nonce
-                self._nonce = message.nonce
-                self._compatible = message.schema_hash == SCHEMA_HASH and message.protocol_version == PROTOCOL_VERSION
-                if not self._compatible:
-                    self._fail(time_s, DeviceFault.SCHEMA_MISMATCH, sensors)
-                return Answer.IDENTITY
-            case Retract() | Home() | Clear():
-                if message.nonce != self._nonce and self._obey(time_s, message, sensors):
-                    self._nonce = message.nonce
-                return Answer.NONE
-            case _:
-                return Answer.NONE
+        if isinstance(message, Drive):
+            return self._drive(time_s, message, sensors)
+        if isinstance(message, Hello):
+            # accepted whatever it was before, so that a new host starts from a known nonce
+            self._nonce = message.nonce
+            self._compatible = message.schema_hash == SCHEMA_HASH and message.protocol_version == PROTOCOL_VERSION
+            if not self._compatible:
+                self._fail(time_s, DeviceFault.SCHEMA_MISMATCH, sensors)
+            return IDENTITY
+        if not isinstance(message, Retract | Home | Clear):
+            return NO_ANSWER
+        if message.nonce != self._nonce and self._obey(time_s, message, sensors):
+            self._nonce = message.nonce
+        return NO_ANSWER
 
     def _drive(self, time_s: float, drive: Drive, sensors: Sensors) -> Answer:
         """A Drive with a new counter is answered in every mode, so that a host can always measure."""
         if drive.counter == self._drive_counter:
-            return Answer.NONE
+            return NO_ANSWER
         self._drive_counter = drive.counter
-        if drive.mode is DriveMode.OFF:
-            if self.mode is DeviceMode.RUN:
+        if drive.mode is DRIVES_OFF:
+            if self.mode is RUN:
                 self._retract(time_s, sensors)
             # a host that was put off RUN has to let go once before it gets there again
             self._may_run = True
-            return Answer.MEASUREMENT
-        if self.mode is DeviceMode.IDLE and self._may_run and self.homed and self._compatible and not self.faults:
-            self.mode = DeviceMode.RUN
-            self._calm_s = [time_s, time_s]
-        if self.mode is DeviceMode.RUN:
+            return MEASUREMENT
+        if self.mode is IDLE and self._may_run and self.homed and self._compatible and not self.faults:
+            self.mode = RUN
+            self._calm(time_s)
+        if self.mode is RUN:
             self._drive_s = time_s
             self.output = self._bounded(Output(drive.left_duty, drive.right_duty, enabled=True), sensors)
-        return Answer.MEASUREMENT
+        return MEASUREMENT
 
     def _obey(self, time_s: float, command: Retract | Home | Clear, sensors: Sensors) -> bool:
         """Whether the command was accepted; only an accepted one is acknowledged in Status."""
-        match command:
-            case Retract():
-                if self.mode is DeviceMode.LATCHED:
-                    return False
-                if self.mode is not DeviceMode.RETRACTING:
-                    self._retract(time_s, sensors)
-                return True
-            case Home():
-                if self.mode is not DeviceMode.IDLE:
-                    return False
-                self.mode = DeviceMode.HOMING
-                self.homed = False
-                self._calm_s = [time_s, time_s]
-                self._motion = Homing(
-                    time_s,
-                    self._carriages(sensors),
-                    lead_mm_rev=self._lead_mm_rev,
-                    stall_A=self._overcurrent_A,
-                    speed_mm_s=self._homing_mm_s,
-                )
-                return True
-            case Clear():
-                causes = self._lasting_causes(sensors)
-                mismatch = DeviceFault.SCHEMA_MISMATCH in self.faults and not self._compatible
-                if self.mode not in MOTORS_OFF_MODES or causes or mismatch:
-                    return False
-                self.faults = DeviceFault(0)
-                self._rest(time_s, DeviceMode.IDLE)
-                return True
+        if isinstance(command, Retract):
+            if self.mode is LATCHED:
+                return False
+            if self.mode is not RETRACTING:
+                self._retract(time_s, sensors)
+            return True
+        if isinstance(command, Home):
+            if self.mode is not IDLE:
+                return False
+            self.mode = HOMING
+            self.homed = False
+            self._calm(time_s)
+            self._motion = Homing(
+                time_s,
+                self._carriages(sensors),
+                lead_mm_rev=self._lead_mm_rev,
+                stall_A=self._overcurrent_A,
+                speed_mm_s=self._homing_mm_s,
+            )
+            return True
+        causes = self._lasting_causes(sensors)
+        mismatch = DeviceFault.SCHEMA_MISMATCH in self.faults and not self._compatible
+        if self._motors_on or causes or mismatch:
+            return False
+        self.faults = NO_FAULT
+        self._rest(time_s, IDLE)
+        return True
 
     # -- time ----------------------------------------------------------------------------------------------------
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
         """The 1 kHz tick: motions and watches; every twentieth gives a Status."""
-        match self.mode:
-            case DeviceMode.RUN:
-                self._tick_run(time_s, sensors)
-            case DeviceMode.HOMING | DeviceMode.RETRACTING:
-                self._tick_motion(time_s, sensors)
-            case DeviceMode.IDLE | DeviceMode.LATCHED:
-                self._tick_rest(time_s, sensors)
+        if self.mode is RUN:
+            self._tick_run(time_s, sensors)
+        elif self._motors_on:
+            self._tick_motion(time_s, sensors)
+        else:
+            self._tick_rest(time_s, sensors)
         self._ticks += 1
         return None if self._ticks % STATUS_TICKS else self.status(sensors)
 
@@ -236,9 +304,10 @@ class Firmware:
             self.faults |= DeviceFault.RETRACT_FAILED
         elif isinstance(motion, Homing):
             left_mm, right_mm = motion.zeros_mm
-            self._zeros_mm = self._zeros_mm[0] + left_mm, self._zeros_mm[1] + right_mm
+            self._left_zero_mm += left_mm
+            self._right_zero_mm += right_mm
             self.homed = True
-        self._rest(time_s, DeviceMode.LATCHED if self.faults else DeviceMode.IDLE)
+        self._rest(time_s, LATCHED if self.faults else IDLE)
 
     def _tick_rest(self, time_s: float, sensors: Sensors) -> None:
         if self._slip_mm(time_s, sensors) > MAX_SLIP_MM:
@@ -264,15 +333,15 @@ class Firmware:
     def _fail(self, time_s: float, fault: DeviceFault, sensors: Sensors) -> None:
         """Latch a fault and open the gap; drives that are off stay off, unless the carriages move by themselves."""
         self.faults |= fault
-        if self.mode in MOTORS_OFF_MODES and DeviceFault.UNCOMMANDED_MOTION not in fault:
-            self._rest(time_s, DeviceMode.LATCHED)
-        elif self.mode is not DeviceMode.RETRACTING:
+        if not self._motors_on and DeviceFault.UNCOMMANDED_MOTION not in fault:
+            self._rest(time_s, LATCHED)
+        elif self.mode is not RETRACTING:
             self._retract(time_s, sensors)
 
     def _retract(self, time_s: float, sensors: Sensors) -> None:
-        if self.mode is DeviceMode.RUN:
+        if self.mode is RUN:
             self._may_run = False
-        self.mode = DeviceMode.RETRACTING
+        self.mode = RETRACTING
         self._watch_since_s = time_s
         self._watch_counts = None
         self._motion = Retraction(
@@ -291,15 +360,19 @@ class Firmware:
         self._motion = None
         self._watch_since_s = time_s
         self._watch_counts = None
-        if mode is DeviceMode.LATCHED:
+        if mode is LATCHED:
             self.homed = False
+
+    @property
+    def _motors_on(self) -> bool:
+        return self.mode is not IDLE and self.mode is not LATCHED
 
     # -- watches -------------------------------------------------------------------------------------------------
 
     def _lasting_causes(self, sensors: Sensors) -> DeviceFault:
         """Faults whose cause is there now, whatever the device does."""
         causes = NO_FAULT
-        if not SUPPLY_RANGE_V[0] <= sensors.supply_V <= SUPPLY_RANGE_V[1]:
+        if not LEAST_SUPPLY_V <= sensors.supply_V <= MOST_SUPPLY_V:
             causes |= DeviceFault.SUPPLY
         if sensors.temperature_C > MAX_TEMPERATURE_C:
             causes |= DeviceFault.TEMPERATURE
@@ -307,29 +380,37 @@ class Firmware:
 
     def _causes(self, time_s: float, sensors: Sensors) -> DeviceFault:
         """The lasting ones, and OVERCURRENT once a motor has drawn more than the level for too long without a break."""
-        calm_s = self._calm_s
         if abs(sensors.left_current_A) < self._overcurrent_A:
-            calm_s[0] = time_s
+            self._left_calm_s = time_s
         if abs(sensors.right_current_A) < self._overcurrent_A:
-            calm_s[1] = time_s
+            self._right_calm_s = time_s
         causes = self._lasting_causes(sensors)
-        return causes | DeviceFault.OVERCURRENT if time_s - min(calm_s) > OVERCURRENT_S else causes
+        calm_s = self._left_calm_s if self._left_calm_s < self._right_calm_s else self._right_calm_s
+        return causes | DeviceFault.OVERCURRENT if time_s - calm_s > OVERCURRENT_S else causes
+
+    def _calm(self, time_s: float) -> None:
+        self._left_calm_s = time_s
+        self._right_calm_s = time_s
 
     def _slip_mm(self, time_s: float, sensors: Sensors) -> float:
         """How far a carriage has moved from where it rested; while opening, inward from where it had come to."""
-        counts = (sensors.left_counts, sensors.right_counts)
         if time_s - self._watch_since_s < COASTING_S:
             return 0.0
+        left, right = sensors.left_counts, sensors.right_counts
         if self._watch_counts is None:
-            self._watch_counts = counts
-        elif self.mode is DeviceMode.RETRACTING:
-            self._watch_counts = max(counts[0], self._watch_counts[0]), max(counts[1], self._watch_counts[1])
-        return max(abs(now - then) for now, then in zip(counts, self._watch_counts, strict=True)) * self._mm_per_count
+            self._watch_counts = left, right
+        left_then, right_then = self._watch_counts
+        if self.mode is RETRACTING and (left > left_then or right > right_then):
+            left_then, right_then = max(left, left_then), max(right, right_then)
+            self._watch_counts = left_then, right_then
+        return max(abs(left - left_then), abs(right - right_then)) * self._mm_per_count
 
     def _positions_mm(self, sensors: Sensors) -> tuple[float, float]:
-        left_mm, right_mm = self._zeros_mm
         mm_per_count = self._mm_per_count
-        return sensors.left_counts * mm_per_count - left_mm, sensors.right_counts * mm_per_count - right_mm
+        return (
+            sensors.left_counts * mm_per_count - self._left_zero_mm,
+            sensors.right_counts * mm_per_count - self._right_zero_mm,
+        )
 
     def _carriages(self, sensors: Sensors) -> tuple[Carriage, Carriage]:
         left_mm, right_mm = self._positions_mm(sensors)
@@ -342,7 +423,7 @@ class Firmware:
 
     def identity(self) -> Identity:
         """Who this device is."""
-        return Identity(SCHEMA_HASH, *VERSION, SERIAL_NUMBER)
+        return Identity(SCHEMA_HASH, VERSION[0], VERSION[1], SERIAL_NUMBER)
 
     def status(self, sensors: Sensors) -> Status:
         """Mode, switches, faults, and what was last accepted (0 before anything was)."""

@@ -3,14 +3,15 @@
 import bisect
 import csv
 import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol, final
 
-ROLLER_RADIUS_MM = 20.0
-DEFAULT_RPM = 20.0
-DEFAULT_PERIOD_S = 4.0
-REVERSING_TRAVEL_MM = 30.0
+from firmware_protocol.value import Value
+
+ROLLER_RADIUS_MM: Final = 20.0
+DEFAULT_RPM: Final = 20.0
+DEFAULT_PERIOD_S: Final = 4.0
+REVERSING_TRAVEL_MM: Final = 30.0
 KNOWN = "steady[=RPM], reversing[=PERIOD_S], or a FILE.csv with the columns t_s,position_mm"
 
 
@@ -25,21 +26,29 @@ class Hand(Protocol):
         """Travel of the roller surface since time 0, mm."""
 
 
-@dataclass(frozen=True, slots=True)
-class SteadyHand:
+@final
+class SteadyHand(Value):
     """Turns at a constant speed, 42 mm/s at the 20 rpm of the thesis's measurements."""
 
-    rpm: float = DEFAULT_RPM
+    __match_args__ = ("rpm",)
+    __slots__ = __match_args__
+
+    def __init__(self, rpm: float = DEFAULT_RPM) -> None:
+        self.rpm: Final = rpm
 
     def position_mm(self, time_s: float) -> float:
         return time_s * self.rpm / 60.0 * math.tau * ROLLER_RADIUS_MM
 
 
-@dataclass(frozen=True, slots=True)
-class ReversingHand:
+@final
+class ReversingHand(Value):
     """Forth, rest, back, rest: smooth strokes of 30 mm (0.35 of the period each) with full stops (0.15 each)."""
 
-    period_s: float = DEFAULT_PERIOD_S
+    __match_args__ = ("period_s",)
+    __slots__ = __match_args__
+
+    def __init__(self, period_s: float = DEFAULT_PERIOD_S) -> None:
+        self.period_s: Final = period_s
 
     def position_mm(self, time_s: float) -> float:
         phase = math.fmod(time_s, self.period_s) / self.period_s
@@ -49,12 +58,16 @@ class ReversingHand:
         return REVERSING_TRAVEL_MM - stroke if back else stroke
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedHand:
+@final
+class RecordedHand(Value):
     """A recording, linear between its points and standing before the first and after the last."""
 
-    times_s: tuple[float, ...]
-    positions_mm: tuple[float, ...]
+    __match_args__ = ("times_s", "positions_mm")
+    __slots__ = __match_args__
+
+    def __init__(self, times_s: tuple[float, ...], positions_mm: tuple[float, ...]) -> None:
+        self.times_s: Final = times_s
+        self.positions_mm: Final = positions_mm
 
     def position_mm(self, time_s: float) -> float:
         after = bisect.bisect_right(self.times_s, time_s)

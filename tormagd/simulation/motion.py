@@ -6,29 +6,36 @@ of a carriage whose encoder is dead.
 """
 
 from enum import Enum, auto
-from typing import NamedTuple
+from typing import Final, final
 
-RAMP_GAIN_PER_MM = 1.0  # the motor follows a duty with 15 ms: crossover at 20 rad/s leaves 70 degrees
-RAMP_LEAD_MM = 1.0  # the ramp waits for a carriage that cannot follow
-DUTY_LIMIT = 0.85
-NO_LOAD_REV_S = 2.5  # 150 rpm at full duty, for the feed-forward
-TAPER_PER_S = 8.0  # speed over distance to the open end
-CREEP_MM_S = 1.0  # final approach to the switches
-BACK_OFF_MM = 1.0
-BACK_OFF_LIMIT_S = 0.4  # three times what it takes; without an encoder it must not go on towards closed
-SETTLE_S = 0.05  # braked at the switch before the drives go off: three motor time constants
-PROGRESS_MM = 0.05
-PATIENCE_S = 0.3
-DEAD_CURRENT_A = 0.02  # a connected motor draws ten times this at the duty that stands for no progress
-TIME_LIMIT_S = 8.0  # the whole stroke at homing speed takes under 4 s
+from firmware_protocol.value import Value
+
+RAMP_GAIN_PER_MM: Final = 1.0  # the motor follows a duty with 15 ms: crossover at 20 rad/s leaves 70 degrees
+RAMP_LEAD_MM: Final = 1.0  # the ramp waits for a carriage that cannot follow
+DUTY_LIMIT: Final = 0.85
+NO_LOAD_REV_S: Final = 2.5  # 150 rpm at full duty, for the feed-forward
+TAPER_PER_S: Final = 8.0  # speed over distance to the open end
+CREEP_MM_S: Final = 1.0  # final approach to the switches
+BACK_OFF_MM: Final = 1.0
+BACK_OFF_LIMIT_S: Final = 0.4  # three times what it takes; without an encoder it must not go on towards closed
+SETTLE_S: Final = 0.05  # braked at the switch before the drives go off: three motor time constants
+PROGRESS_MM: Final = 0.05
+PATIENCE_S: Final = 0.3
+DEAD_CURRENT_A: Final = 0.02  # a connected motor draws ten times this at the duty that stands for no progress
+TIME_LIMIT_S: Final = 8.0  # the whole stroke at homing speed takes under 4 s
 
 
-class Carriage(NamedTuple):
+@final
+class Carriage(Value):
     """What the firmware knows of one carriage: encoder position, its open switch, its motor's current."""
 
-    position_mm: float
-    at_open_end: bool
-    current_A: float
+    __match_args__ = ("position_mm", "at_open_end", "current_A")
+    __slots__ = __match_args__
+
+    def __init__(self, position_mm: float, at_open_end: bool, current_A: float) -> None:
+        self.position_mm: Final = position_mm
+        self.at_open_end: Final = at_open_end
+        self.current_A: Final = current_A
 
 
 class Outcome(Enum):
@@ -39,8 +46,11 @@ class Outcome(Enum):
     FAILED = auto()
 
 
+@final
 class Ramp:
     """Moves one carriage at a bounded speed, by way of a position that runs ahead of it."""
+
+    __slots__ = ("_full_speed_mm_s", "_reference_mm")
 
     def __init__(self, position_mm: float, lead_mm_rev: float) -> None:
         self._reference_mm = position_mm
@@ -54,12 +64,15 @@ class Ramp:
         return min(max(duty, -DUTY_LIMIT), DUTY_LIMIT)
 
 
+@final
 class Opening:
     """Brings one carriage to its open switch and brakes it there.
 
     A carriage that comes no further has failed when its current says why: a stall, or no current at all. Standing still
     at a travelling current is a dead encoder, and the motion goes on.
     """
+
+    __slots__ = ("_arrived_s", "_progress_mm", "_progress_s", "_ramp", "_stall_A", "duty", "outcome")
 
     def __init__(self, time_s: float, carriage: Carriage, lead_mm_rev: float, stall_A: float) -> None:
         self._ramp = Ramp(carriage.position_mm, lead_mm_rev)
@@ -90,11 +103,14 @@ class Opening:
             self.outcome = Outcome.FAILED
 
 
+@final
 class Retraction:
     """Opens the gap: both carriages to their switches, each as far as it comes.
 
     With a valid zero the speed tapers towards the open end; without one the search for the switch is slow throughout.
     """
+
+    __slots__ = ("_deadline_s", "_left", "_right", "_speed_mm_s", "_tapered")
 
     def __init__(
         self,
@@ -109,39 +125,57 @@ class Retraction:
         self._deadline_s = time_s + TIME_LIMIT_S
         self._speed_mm_s = speed_mm_s
         self._tapered = tapered
-        self._openings = tuple(Opening(time_s, carriage, lead_mm_rev, stall_A) for carriage in carriages)
+        left, right = carriages
+        self._left = Opening(time_s, left, lead_mm_rev, stall_A)
+        self._right = Opening(time_s, right, lead_mm_rev, stall_A)
 
     @property
     def duties(self) -> tuple[float, float]:
         """Left and right duty."""
-        left, right = self._openings
-        return left.duty, right.duty
+        return self._left.duty, self._right.duty
 
     @property
     def blocked(self) -> bool:
         """Whether a carriage has been given up; its screw springs back from the stall."""
-        return any(opening.outcome is Outcome.FAILED for opening in self._openings)
+        return self._left.outcome is Outcome.FAILED or self._right.outcome is Outcome.FAILED
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
         """One tick; FAILED when a carriage could not be brought to its switch and neither moves any more."""
-        for opening, carriage in zip(self._openings, carriages, strict=True):
-            speed_mm_s = self._speed_mm_s
-            if self._tapered:
-                speed_mm_s = min(speed_mm_s, CREEP_MM_S + TAPER_PER_S * max(-carriage.position_mm, 0.0))
-            opening.step(time_s, dt_s, carriage, speed_mm_s)
-        outcomes = {opening.outcome for opening in self._openings}
-        if time_s >= self._deadline_s:
-            return Outcome.FAILED if outcomes != {Outcome.DONE} else Outcome.DONE
-        if Outcome.MOVING in outcomes:
+        left, right = carriages
+        self._left.step(time_s, dt_s, left, self._bounded_mm_s(left))
+        self._right.step(time_s, dt_s, right, self._bounded_mm_s(right))
+        outcomes = (self._left.outcome, self._right.outcome)
+        if time_s < self._deadline_s and Outcome.MOVING in outcomes:
             return Outcome.MOVING
-        return Outcome.FAILED if Outcome.FAILED in outcomes else Outcome.DONE
+        return Outcome.DONE if outcomes == (Outcome.DONE, Outcome.DONE) else Outcome.FAILED
+
+    def _bounded_mm_s(self, carriage: Carriage) -> float:
+        if not self._tapered:
+            return self._speed_mm_s
+        return min(self._speed_mm_s, CREEP_MM_S + TAPER_PER_S * max(-carriage.position_mm, 0.0))
 
 
+@final
 class Homing:
     """Finds the open switches twice: at speed, then, after backing off, creeping, so that the zero repeats.
 
     `zeros_mm` holds the encoder positions of the two switches once the outcome is DONE.
     """
+
+    __slots__ = (
+        "_back_off_since_s",
+        "_backed_off",
+        "_deadline_s",
+        "_lead_mm_rev",
+        "_left_edge_mm",
+        "_ramps",
+        "_right_edge_mm",
+        "_search",
+        "_speed_mm_s",
+        "_stall_A",
+        "_starts_mm",
+        "duties",
+    )
 
     def __init__(
         self,
@@ -156,19 +190,19 @@ class Homing:
         self._lead_mm_rev = lead_mm_rev
         self._stall_A = stall_A
         self._speed_mm_s = speed_mm_s
-        self._search: Retraction | None = self._outward(time_s, carriages, speed_mm_s)
-        self._ramps: tuple[Ramp, ...] = ()
-        self._starts_mm: tuple[float, ...] = ()
+        self._ramps = _ramps(carriages, lead_mm_rev)
+        self._starts_mm = _positions_mm(carriages)
         self._back_off_since_s = time_s
         self._backed_off = False
-        self._edges_mm: list[float | None] = [None, None]
+        self._left_edge_mm: float | None = None
+        self._right_edge_mm: float | None = None
         self.duties = (0.0, 0.0)
+        self._search: Retraction | None = self._outward(time_s, carriages, speed_mm_s)
 
     @property
     def zeros_mm(self) -> tuple[float, float]:
         """Encoder positions at which the open switches closed; 0 for one that was not found."""
-        left, right = self._edges_mm
-        return left or 0.0, right or 0.0
+        return self._left_edge_mm or 0.0, self._right_edge_mm or 0.0
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
         """One tick: outward, back off, creep outward."""
@@ -177,31 +211,38 @@ class Homing:
         if self._search is None:
             return self._back_off(time_s, dt_s, carriages)
         if self._backed_off:
-            for side, carriage in enumerate(carriages):
-                if carriage.at_open_end and self._edges_mm[side] is None:
-                    self._edges_mm[side] = carriage.position_mm
+            left, right = carriages
+            if left.at_open_end and self._left_edge_mm is None:
+                self._left_edge_mm = left.position_mm
+            if right.at_open_end and self._right_edge_mm is None:
+                self._right_edge_mm = right.position_mm
         outcome = self._search.step(time_s, dt_s, carriages)
         self.duties = self._search.duties
         if outcome is not Outcome.DONE or self._backed_off:
             return outcome
         self._search = None
         self._back_off_since_s = time_s
-        self._starts_mm = tuple(carriage.position_mm for carriage in carriages)
-        self._ramps = tuple(Ramp(carriage.position_mm, self._lead_mm_rev) for carriage in carriages)
+        self._starts_mm = _positions_mm(carriages)
+        self._ramps = _ramps(carriages, self._lead_mm_rev)
         return Outcome.MOVING
 
     def _back_off(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
         if time_s - self._back_off_since_s > BACK_OFF_LIMIT_S:
             return Outcome.FAILED
-        duties = []
-        for ramp, start_mm, carriage in zip(self._ramps, self._starts_mm, carriages, strict=True):
-            clear = carriage.position_mm <= start_mm - BACK_OFF_MM and not carriage.at_open_end
-            duties.append(0.0 if clear else ramp.duty(carriage.position_mm, -self._speed_mm_s, dt_s))
-        self.duties = duties[0], duties[1]
-        if not any(duties):
+        left, right = carriages
+        left_ramp, right_ramp = self._ramps
+        left_start_mm, right_start_mm = self._starts_mm
+        left_duty = self._inward_duty(left, left_ramp, left_start_mm, dt_s)
+        right_duty = self._inward_duty(right, right_ramp, right_start_mm, dt_s)
+        self.duties = left_duty, right_duty
+        if left_duty == 0.0 and right_duty == 0.0:
             self._backed_off = True
             self._search = self._outward(time_s, carriages, CREEP_MM_S)
         return Outcome.MOVING
+
+    def _inward_duty(self, carriage: Carriage, ramp: Ramp, start_mm: float, dt_s: float) -> float:
+        clear = carriage.position_mm <= start_mm - BACK_OFF_MM and not carriage.at_open_end
+        return 0.0 if clear else ramp.duty(carriage.position_mm, -self._speed_mm_s, dt_s)
 
     def _outward(self, time_s: float, carriages: tuple[Carriage, Carriage], speed_mm_s: float) -> Retraction:
         return Retraction(
@@ -212,3 +253,13 @@ class Homing:
             speed_mm_s=speed_mm_s,
             tapered=False,
         )
+
+
+def _positions_mm(carriages: tuple[Carriage, Carriage]) -> tuple[float, float]:
+    left, right = carriages
+    return left.position_mm, right.position_mm
+
+
+def _ramps(carriages: tuple[Carriage, Carriage], lead_mm_rev: float) -> tuple[Ramp, Ramp]:
+    left, right = carriages
+    return Ramp(left.position_mm, lead_mm_rev), Ramp(right.position_mm, lead_mm_rev)

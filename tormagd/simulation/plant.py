@@ -3,55 +3,83 @@
 import math
 import random
 from collections import deque
-from typing import NamedTuple
+from typing import Final, Protocol, final
 
-from tormagd.physics.errors import Real
-from tormagd.physics.magnets import CuboidMagnet, attraction_N
+from firmware_protocol.value import Value
 from tormagd.simulation.axis import Axis
-from tormagd.simulation.element import Curve, Element
+from tormagd.simulation.element import Element
 from tormagd.simulation.hand import Hand
 from tormagd.simulation.parameters import PlantParameters
+from tormagd.simulation.static_laws import pull_over_gap
 
-SUBSTEP_S = 5e-4
+SUBSTEP_S: Final = 5e-4
 """Step of motors and screws, at most the motors' electrical time constant; see `Axis` for what it leaves out."""
 
-ELEMENT_STEP_S = 1e-3
+ELEMENT_STEP_S: Final = 1e-3
 """Step of the element and the hand; the element's updates are exact over it."""
 
-_ROUNDING = 1e-6
+_ROUNDING: Final = 1e-6
 """Share of a substep by which sums of time steps may be off before a step is held back."""
 
 
-class Truth(NamedTuple):
+@final
+class Truth(Value):
     """What really is, as no sensor sees it; `force_N` has the sign of the motion it resists."""
 
-    time_s: float
-    force_N: float
-    gap_mm: float
-    left_mm: float
-    right_mm: float
-    left_A: float
-    right_A: float
-    temperature_C: float
-    handle_mm: float
-    handle_mm_s: float
-    kinetic_N: float
+    __match_args__ = (
+        "time_s",
+        "force_N",
+        "gap_mm",
+        "left_mm",
+        "right_mm",
+        "left_A",
+        "right_A",
+        "temperature_C",
+        "handle_mm",
+        "handle_mm_s",
+        "kinetic_N",
+    )
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        time_s: float,
+        force_N: float,
+        gap_mm: float,
+        left_mm: float,
+        right_mm: float,
+        left_A: float,
+        right_A: float,
+        temperature_C: float,
+        handle_mm: float,
+        handle_mm_s: float,
+        kinetic_N: float,
+    ) -> None:
+        self.time_s: Final = time_s
+        self.force_N: Final = force_N
+        self.gap_mm: Final = gap_mm
+        self.left_mm: Final = left_mm
+        self.right_mm: Final = right_mm
+        self.left_A: Final = left_A
+        self.right_A: Final = right_A
+        self.temperature_C: Final = temperature_C
+        self.handle_mm: Final = handle_mm
+        self.handle_mm_s: Final = handle_mm_s
+        self.kinetic_N: Final = kinetic_N
 
 
-class Holding(NamedTuple):
-    """Whether a carriage stays where it is with the power off; torques at the screw, the guide's drag not counted."""
-
-    gap_mm: float
-    attraction_N: float
-    back_driving_Nm: float
-    friction_Nm: float
+class Sensor(Protocol):
+    """What shows the force: a `ForceSensor`, or what is put in its place."""
 
     @property
-    def margin_Nm(self) -> float:
-        """Friction left over, N m; below 0 the magnets close the gap."""
-        return self.friction_Nm - self.back_driving_Nm
+    def reading_N(self) -> float:
+        """What is shown now."""
+
+    def advance(self, time_s: float, force_N: float) -> None:
+        """Bring the sensor to that time, at which the rendered force is `force_N`."""
 
 
+@final
 class Plant:
     """The device without its electronics, in fixed substeps of its own time; see `Axis` and `Element` for the laws.
 
@@ -61,13 +89,33 @@ class Plant:
     state is that at its beginning. At power-on both bridges are open.
     """
 
+    __slots__ = (
+        "_attraction",
+        "_hand",
+        "_left_V",
+        "_left_early_V",
+        "_right_V",
+        "_right_early_V",
+        "_substep_s",
+        "_substeps",
+        "_substeps_per_element",
+        "_target_s",
+        "element",
+        "force_sensor",
+        "handle_mm",
+        "handle_mm_s",
+        "left",
+        "parameters",
+        "right",
+    )
+
     def __init__(self, parameters: PlantParameters, hand: Hand, seed: int = 0, *, substep_s: float = SUBSTEP_S) -> None:
         assumed = parameters.assumed
         self.parameters = parameters
         self._hand = hand
         self._substep_s = substep_s
         self._substeps_per_element = round(ELEMENT_STEP_S / substep_s)
-        self._attraction = Curve.over_gap(lambda gap: pull_of_magnets_N(gap, parameters), parameters)
+        self._attraction = pull_over_gap(parameters)
         gap_mm = assumed.start_left_mm + assumed.start_right_mm
         pull_N = self._attraction.at(gap_mm)
         screw = parameters.screw
@@ -76,12 +124,13 @@ class Plant:
         self.element = Element(parameters, gap_mm, ELEMENT_STEP_S)
         self.handle_mm = hand.position_mm(0.0)
         self.handle_mm_s = 0.0
-        self._force_sensor = ForceSensor(parameters, random.Random(seed))
+        self.force_sensor: Sensor = ForceSensor(parameters, random.Random(seed))
         self._target_s = 0.0
         self._left_V: float | None = None
         self._right_V: float | None = None
-        self._left_early_V = self._right_early_V = 0.0
-        """What the voltages before the present ones add to the mean over the substep that has begun."""
+        # what the voltages before the present ones add to the mean over the substep that has begun
+        self._left_early_V = 0.0
+        self._right_early_V = 0.0
         self._substeps = 0
 
     @property
@@ -97,7 +146,7 @@ class Plant:
     @property
     def sensed_force_N(self) -> float:
         """What the force sensor shows now."""
-        return self._force_sensor.reading_N
+        return self.force_sensor.reading_N
 
     @property
     def shafts(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -147,13 +196,14 @@ class Plant:
         due = int(target_s / self._substep_s + _ROUNDING)
         if due == self._substeps:
             return
-        left, right, pull_at, per_element = self.left, self.right, self._attraction.at, self._substeps_per_element
+        left, right, attraction, per_element = self.left, self.right, self._attraction, self._substeps_per_element
         left_V, right_V = self._left_V, self._right_V
         left_mean_V = _mean_V(left, left_V, self._left_early_V)
         right_mean_V = _mean_V(right, right_V, self._right_early_V)
-        self._left_early_V = self._right_early_V = 0.0
+        self._left_early_V = 0.0
+        self._right_early_V = 0.0
         for substep in range(self._substeps + 1, due + 1):
-            pull_N = pull_at((left.position_m + right.position_m) * 1e3)
+            pull_N = attraction.at((left.position_m + right.position_m) * 1e3)
             left.step(left_mean_V, pull_N)
             right.step(right_mean_V, pull_N)
             left_mean_V, right_mean_V = left_V, right_V
@@ -166,7 +216,7 @@ class Plant:
         self.handle_mm_s = (handle_mm - self.handle_mm) / ELEMENT_STEP_S
         self.handle_mm = handle_mm
         self.element.advance(time_s, self.gap_mm, self.handle_mm_s)
-        self._force_sensor.advance(time_s, self.element.force_N)
+        self.force_sensor.advance(time_s, self.element.force_N)
 
     def wear(self, divisor: float) -> None:
         """Divide what holds the carriages, gearbox and screw friction, by that number."""
@@ -192,8 +242,21 @@ def _mean_V(axis: Axis, voltage_V: float | None, early_V: float) -> float | None
     return None if voltage_V is None and not early_V else _applied_V(axis, voltage_V) + early_V
 
 
+@final
 class ForceSensor:
     """Samples at its own rate, adds noise and a drifting offset, saturates, and shows each sample after a delay."""
+
+    __slots__ = (
+        "_delay_s",
+        "_drift_N_s",
+        "_in_flight",
+        "_noise",
+        "_period_s",
+        "_range_N",
+        "_samples",
+        "_spread_N",
+        "reading_N",
+    )
 
     def __init__(self, plant: PlantParameters, noise: random.Random) -> None:
         sensor = plant.force_sensor
@@ -217,27 +280,3 @@ class ForceSensor:
             self._in_flight.append((time_s + self._delay_s, sample_N))
         while self._in_flight and self._in_flight[0][0] <= time_s + 0.5 * ELEMENT_STEP_S:
             self.reading_N = self._in_flight.popleft()[1]
-
-
-def pull_of_magnets_N(gap_mm: Real, plant: PlantParameters) -> Real:
-    """Attraction between the magnets over the gap, N: the closed form in air times the factor for the iron shaft."""
-    width_mm, depth_mm, thickness_mm = plant.magnets.size_mm
-    magnet = CuboidMagnet(width_mm * 1e-3, depth_mm * 1e-3, thickness_mm * 1e-3, plant.magnets.remanence_T)
-    return plant.assumed.attraction_factor * attraction_N(gap_mm, magnet)
-
-
-def holding_over_stroke(plant: PlantParameters, points: int = 51, wear: float = 1.0) -> list[Holding]:
-    """Attraction, back-driving torque and holding friction from the smallest to the largest gap of the stroke.
-
-    `wear` divides the friction of gearbox and screw, as the fault `worn_gearbox` does with 4.
-    """
-    start_mm, end_mm = 2.0 * plant.assumed.closed_mm, 2.0 * plant.assumed.home_mm
-    lead_m_rad = plant.screw.lead_mm * 1e-3 / math.tau
-    friction_m = plant.screw.friction_coefficient * 0.5e-3 * plant.assumed.screw_mean_diameter_mm
-    rows = []
-    for index in range(points):
-        gap_mm = start_mm + (end_mm - start_mm) * index / (points - 1)
-        pull_N = pull_of_magnets_N(gap_mm, plant)
-        friction_Nm = (plant.gear.output_friction_Nm + friction_m * pull_N) / wear
-        rows.append(Holding(gap_mm, pull_N, pull_N * lead_m_rad, friction_Nm))
-    return rows

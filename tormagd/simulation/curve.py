@@ -1,0 +1,28 @@
+"""A function of one variable as a table: what a tick reads where computing it anew would take too long."""
+
+from typing import final
+
+
+@final
+class Curve:
+    """A function by its values on a uniform grid from `start` to `end`, linear between the points (two at least)."""
+
+    __slots__ = ("_last", "_per_unit", "_start", "_values")
+
+    def __init__(self, values: list[float], start: float, end: float) -> None:
+        self._start = start
+        self._per_unit = (len(values) - 1) / (end - start)
+        self._last = len(values) - 2
+        self._values = values
+
+    def at(self, x: float) -> float:
+        """Value at x; the outermost pieces continue beyond the ends."""
+        place = (x - self._start) * self._per_unit
+        index = int(place)
+        if index < 0:
+            index = 0
+        elif index > self._last:
+            index = self._last
+        values = self._values
+        low = values[index]
+        return low + (values[index + 1] - low) * (place - index)

@@ -1,0 +1,111 @@
+"""The plant's laws that know no time, from the gap to the field, the magnets' pull and the force of a fresh element.
+
+They are formulas over arrays, asked once, when a device is made; what a tick needs of them it gets as a `Curve`.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from tormagd.physics.errors import FloatArray, Real
+from tormagd.physics.field import PowerFieldLaw, ThesisFieldLaw
+from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.physics.magnets import CuboidMagnet, attraction_N
+from tormagd.simulation.curve import Curve
+from tormagd.simulation.parameters import PlantParameters
+
+GRID_MM = 2e-3
+MOMENT_POINTS = 20_000
+JOIN_MM = 10.0
+"""Width over which Eq. 7 goes over into the power law beyond 95 mm."""
+
+
+class Holding(NamedTuple):
+    """Whether a carriage stays where it is with the power off; torques at the screw, the guide's drag not counted."""
+
+    gap_mm: float
+    attraction_N: float
+    back_driving_Nm: float
+    friction_Nm: float
+
+    @property
+    def margin_Nm(self) -> float:
+        """Friction left over, N m; below 0 the magnets close the gap."""
+        return self.friction_Nm - self.back_driving_Nm
+
+
+def radial_moment_Tm(gap_mm: FloatArray, plant: PlantParameters) -> FloatArray:
+    """The plant's field law on an array of gaps, T m, without its hysteresis."""
+    power = PowerFieldLaw(plant.field.coefficient, plant.field.exponent).radial_moment_Tm(gap_mm)
+    if plant.field.law == "power":
+        return power
+    thesis = ThesisFieldLaw()
+    low_mm, high_mm = thesis.gap_range_mm
+    # under 45 mm, in the half millimetre before the stops, Eq. 7 is continued along its tangent
+    inside_mm = np.clip(gap_mm, low_mm, high_mm)
+    tangent = thesis.d_radial_moment_d_gap(low_mm) * np.minimum(gap_mm - low_mm, 0.0)
+    share = np.clip((gap_mm - high_mm) / JOIN_MM, 0.0, 1.0)
+    share = share * share * (3.0 - 2.0 * share)
+    joined: FloatArray = (1.0 - share) * (thesis.radial_moment_Tm(inside_mm) + tangent) + share * power
+    return joined
+
+
+def pull_of_magnets_N(gap_mm: Real, plant: PlantParameters) -> Real:
+    """Attraction between the magnets over the gap, N: the closed form in air times the factor for the iron shaft."""
+    width_mm, depth_mm, thickness_mm = plant.magnets.size_mm
+    magnet = CuboidMagnet(width_mm * 1e-3, depth_mm * 1e-3, thickness_mm * 1e-3, plant.magnets.remanence_T)
+    return plant.assumed.attraction_factor * attraction_N(gap_mm, magnet)
+
+
+def moment_over_gap(plant: PlantParameters) -> Curve:
+    """`radial_moment_Tm` over every gap the device can reach, mm to T m."""
+    return _over_gap(lambda gap_mm: radial_moment_Tm(gap_mm, plant), plant)
+
+
+def pull_over_gap(plant: PlantParameters) -> Curve:
+    """`pull_of_magnets_N` over every gap the device can reach, mm to N."""
+    return _over_gap(lambda gap_mm: pull_of_magnets_N(gap_mm, plant), plant)
+
+
+def force_over_moment(plant: PlantParameters, weakest_Tm: float, strongest_Tm: float) -> Curve:
+    """Kinetic friction of the fresh, cool insert over the radial moment, T m to N.
+
+    Raises tormagd.physics.errors.DomainError where the moments leave the force law's domain.
+    """
+    elastomer = Elastomer(
+        shear_modulus_Pa=plant.elastomer.shear_modulus_kPa * 1e3,
+        relative_permeability=plant.elastomer.relative_permeability,
+        friction_coefficient=plant.elastomer.kinetic_friction,
+    )
+    return _tabulated(
+        lambda moment_Tm: brake_force_N(moment_Tm, elastomer, TORMAG), weakest_Tm, strongest_Tm, MOMENT_POINTS
+    )
+
+
+def _over_gap(law: Callable[[FloatArray], FloatArray], plant: PlantParameters) -> Curve:
+    start_mm, end_mm = 2.0 * plant.closed_stop_mm, 2.0 * plant.open_stop_mm
+    return _tabulated(law, start_mm, end_mm, math.ceil((end_mm - start_mm) / GRID_MM) + 1)
+
+
+def _tabulated(law: Callable[[FloatArray], FloatArray], start: float, end: float, points: int) -> Curve:
+    values: list[float] = law(np.linspace(start, end, points)).tolist()
+    return Curve(values, start, end)
+
+
+def holding_over_stroke(plant: PlantParameters, points: int = 51, wear: float = 1.0) -> list[Holding]:
+    """Attraction, back-driving torque and holding friction from the smallest to the largest gap of the stroke.
+
+    `wear` divides the friction of gearbox and screw, as the fault `worn_gearbox` does with 4.
+    """
+    start_mm, end_mm = 2.0 * plant.assumed.closed_mm, 2.0 * plant.assumed.home_mm
+    lead_m_rad = plant.screw.lead_mm * 1e-3 / math.tau
+    friction_m = plant.screw.friction_coefficient * 0.5e-3 * plant.assumed.screw_mean_diameter_mm
+    rows = []
+    for index in range(points):
+        gap_mm = start_mm + (end_mm - start_mm) * index / (points - 1)
+        pull_N = pull_of_magnets_N(gap_mm, plant)
+        friction_Nm = (plant.gear.output_friction_Nm + friction_m * pull_N) / wear
+        rows.append(Holding(gap_mm, pull_N, pull_N * lead_m_rad, friction_Nm))
+    return rows
