@@ -97,7 +97,7 @@ def test_no_history_makes_it_impossible(history: list[tuple[float, float, float]
     fit = DeviceFit()
     for model_N, measured_N, elapsed_s in history:
         fit, _ = observe(fit, model_N, measured_N, elapsed_s, adapts_in_s=0.5, bounds=BOUNDS)
-        assert all(math.isfinite(value) for value in fit)
+        assert all(math.isfinite(getattr(fit, name)) for name in DeviceFit.__match_args__)
         assert 0.0 <= fit.scale_variance <= SCALE_SD**2 * (1.0 + 1e-9)
         assert 0.0 <= fit.offset_variance_N2 <= OFFSET_SD_N**2 * (1.0 + 1e-9)
         # a covariance matrix: no combination of both has a negative variance

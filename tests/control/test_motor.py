@@ -221,7 +221,7 @@ def test_the_pull_falls_with_the_gap_as_that_of_two_blocks(gap_mm: float) -> Non
     block = CuboidMagnet(0.04, 0.04, 0.02, 1.45)
     motor = Config().motor
     expected = attraction_N(float(gap_mm), block) / attraction_N(45.0, block)
-    assert pull_V(motor, gap_mm) / motor.pull_V == pytest.approx(expected, rel=0.03)
+    assert pull_V(motor.pull_V, gap_mm) / motor.pull_V == pytest.approx(expected, rel=0.03)
 
 
 def test_the_shipped_pull_is_what_the_devices_data_say() -> None:

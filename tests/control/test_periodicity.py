@@ -242,7 +242,7 @@ def test_nan_never_travels_and_a_replay_is_exact(setpoints: list[tuple[float, fl
         assert 0.0 <= state.trust <= 1.0
         assert len(state.history) <= 8 * HISTORY
         assert -1e-9 <= state.stamp_s - state.time_s < GRID_S + 1e-9
-        assert all(math.isfinite(value) for score in (state.long, state.short) for value in score)
+        assert all(math.isfinite(skill.gained + skill.apart) for skill in (state.long, state.short))
         if state.changes_N:
             assert np.all(np.isfinite(np.array(forecast_N(state, 0.0, AHEAD_S.tolist()))))
     assert states == replay()

@@ -2,7 +2,6 @@
 
 import math
 
-import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -64,7 +63,7 @@ def test_unsaturated_p_and_i_are_those_of_simple_pid(
     ahead=st.floats(-3.0, 3.0),
 )
 def test_the_duty_never_leaves_its_limit(
-    position: Position, integral: float, error: float, speed: float, ahead: float
+    position: Gains, integral: float, error: float, speed: float, ahead: float
 ) -> None:
     _, output = update(position, PidState(integral), error, speed, ahead)
     assert abs(output.duty) <= position.duty_limit
@@ -79,7 +78,7 @@ def test_the_duty_never_leaves_its_limit(
     history=st.lists(st.tuples(st.floats(0.0, 5.0), st.floats(0.0, 30.0), st.floats(0.0, 1.0)), min_size=1),
 )
 def test_nothing_winds_up_against_a_switch(
-    position: Position, integral: float, history: list[tuple[float, float, float]]
+    position: Gains, integral: float, history: list[tuple[float, float, float]]
 ) -> None:
     """However it is pushed there, for however long: no duty, no saturation, and closing finds no more to unlearn."""
     state = PidState(integral)
@@ -97,7 +96,7 @@ def test_a_carriage_at_its_switch_closes_as_any_other() -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(position=gains, error=st.floats(1.0, 50.0), sign=st.sampled_from([-1.0, 1.0]))
-def test_a_long_saturation_winds_nothing_up(position: Position, error: float, sign: float) -> None:
+def test_a_long_saturation_winds_nothing_up(position: Gains, error: float, sign: float) -> None:
     state, output = PidState(), PidOutput(0.0, False)
     for _ in range(2_000):
         state, output = update(position, state, sign * error)
@@ -109,9 +108,9 @@ def test_a_long_saturation_winds_nothing_up(position: Position, error: float, si
 
 @settings(max_examples=40, deadline=None)
 @given(position=gains, back_calculation_s=st.floats(0.01, 0.2), error=st.floats(15.0, 50.0))
-def test_back_calculation_balances_growth(position: Position, back_calculation_s: float, error: float) -> None:
+def test_back_calculation_balances_growth(position: Gains, back_calculation_s: float, error: float) -> None:
     """Standing saturation comes to P / Ti + (limit - P - I) / Tt = 0, within the limit."""
-    position = msgspec.structs.replace(position, back_calculation_s=back_calculation_s)
+    position = position.replaced(back_calculation_s=back_calculation_s)
     state = PidState()
     for _ in range(2_000):
         state, output = update(position, state, error)
@@ -125,7 +124,7 @@ def test_faster_back_calculation_lets_go_sooner() -> None:
     """A second of a blocked carriage: what the integral keeps of it is what delays the way back."""
     kept = []
     for back_calculation_s in (0.02, 0.05, 0.1, 1.0):
-        position = msgspec.structs.replace(GAINS, back_calculation_s=back_calculation_s)
+        position = GAINS.replaced(back_calculation_s=back_calculation_s)
         state = PidState()
         for _ in range(1_000):
             state, _ = update(position, state, 0.5)
@@ -163,7 +162,7 @@ def test_both_directions_are_alike(error: float, speed: float, integral: float) 
 
 @settings(max_examples=5, deadline=None)
 @given(position=gains, error=st.floats(0.5, 50.0), dt_s=st.sampled_from([0.01, 0.05, 0.1]))
-def test_an_hour_of_saturation_is_left_at_once(position: Position, error: float, dt_s: float) -> None:
+def test_an_hour_of_saturation_is_left_at_once(position: Gains, error: float, dt_s: float) -> None:
     """The integral stays within the whole duty, and an error of the other sign turns the duty round in one update."""
     state = PidState()
     for _ in range(round(3_600.0 / dt_s)):

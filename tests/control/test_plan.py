@@ -13,7 +13,7 @@ from tormagd.control.core import Core, build_core
 from tormagd.control.device_fit import DeviceFit
 from tormagd.control.estimate import Estimate, Handle
 from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import LAW_SHARE, MOST_LAG_S, Plan, PlanState, Shown
+from tormagd.control.plan import LAW_SHARE, MOST_LAG_S, Outside, Plan, PlanState, Shown
 from tormagd.inverse.solution import FieldSolution, Reach
 from tormagd.learning.displacement import MOBILISED_MM, MOVING_MM_S, Turn
 from tormagd.safety.codes import Limit
@@ -247,14 +247,14 @@ def test_the_model_is_never_asked_outside_what_it_was_shown(core) -> None:
     """A setpoint may be meant for any motion; the model answers for the nearest that it knows, and the plan says so."""
     fast = planned_for(core, rate_mm_s=1_000.0)
     assert Limit.MODEL_RANGE in fast.limits
-    (replaced,) = fast.replaced
+    (replaced,) = fast.outside
     assert (replaced.quantity, replaced.asked) == ("rate_mm_s", 1_000.0)
     assert 295.0 < replaced.used < 320.0
     assert fast.gap_mm == planned_for(core, rate_mm_s=replaced.used).gap_mm
     early = planned_for(core, displacement_mm=0.1)
-    assert early.replaced == (("displacement_mm", 0.1, MOBILISED_MM),)
+    assert early.outside == (Outside("displacement_mm", 0.1, MOBILISED_MM),)
     assert early.gap_mm == planned_for(core).gap_mm
-    assert planned_for(core).replaced == ()
+    assert planned_for(core).outside == ()
 
 
 def planned_for(core: Core, **motion: float) -> Plan:
@@ -277,11 +277,11 @@ class WrongSolver:
 def test_the_force_law_stands_around_the_search(wrong_mT: float) -> None:
     core = build_core(CONFIG)
     right = planned(core, 1.0, moving()).plan
-    core.planner._solver = WrongSolver(wrong_mT)
+    core.planner._search = WrongSolver(wrong_mT)
     wrong = planned(core, 1.0, moving()).plan
     assert wrong.field_mT == pytest.approx(right.field_mT, rel=LAW_SHARE + 0.01)
-    (replaced,) = wrong.replaced
-    assert replaced == ("field_mT", wrong_mT, wrong.field_mT)
+    (replaced,) = wrong.outside
+    assert replaced == Outside("field_mT", wrong_mT, wrong.field_mT)
     assert Limit.MODEL_RANGE in wrong.limits
 
 
@@ -336,9 +336,7 @@ estimates = st.none() | st.builds(
         Handle,
         displacement_mm=st.floats(0.0, MOBILISED_MM),
         rate_mm_s=st.floats(-2_000.0, 2_000.0),
-        direction=st.sampled_from([-1.0, 1.0]),
-        turned_mm=st.just(0.0),
-        furthest_mm=st.just(0.0),
+        turn=st.sampled_from([Turn(-1.0, 0.0, 0.0), Turn(1.0, 0.0, 0.0)]),
         sliding_mm_s=st.floats(0.0, 2_000.0),
     ),
 )
@@ -368,7 +366,7 @@ def test_nan_never_travels(core, history: list[tuple[float, TimedSetpoint | None
         assert plan.predicted_N is None or math.isfinite(plan.predicted_N)
         assert 45.0 <= plan.gap_mm <= 95.0
         assert CONFIG.trim.least <= state.device.scale <= CONFIG.trim.most
-        assert all(math.isfinite(value) for value in state.device)
+        assert all(math.isfinite(getattr(state.device, name)) for name in DeviceFit.__match_args__)
         assert plan.governed_N <= max(core.scene.force.most_N, state.device.force_N(core.planner.portrait.least_N))
         assert plan.gap_mm >= plan.least_gap_mm
         assert 0.0 <= state.lag_s <= MOST_LAG_S

@@ -98,18 +98,23 @@ def running(bench: Bench) -> Bench:
     return bench
 
 
+def driven(output: StepOutput) -> tuple[DriveMode, float, float]:
+    """What the bridges are told."""
+    return output.mode, output.left_duty, output.right_duty
+
+
 def is_opened(bench: Bench) -> bool:
     """Whether the drives are off and the device has been asked to open."""
     output = bench.output
     assert output is not None
-    return (output[:3], output.request) == (OFF, DeviceRequest.RETRACT) and (
+    return (driven(output), output.request) == (OFF, DeviceRequest.RETRACT) and (
         bench.state.safety.operating_state is OperatingState.FAULT
     )
 
 
 def test_disabled_means_off(bench: Bench) -> None:
     output = bench.step(gap_plan(45.0), count=10)
-    assert output[:3] == OFF
+    assert driven(output) == OFF
     assert (output.request, output.request_number, output.limits) == (DeviceRequest.NONE, 0, ())
 
 
@@ -414,11 +419,11 @@ def test_a_link_without_measurements_is_a_lost_one(running: Bench, name: str | N
     """However the link went: nothing that was armed is still armed when measurements come back."""
     if name:
         running.command(name)
-    assert running.silent(None)[:3] == OFF
+    assert driven(running.silent(None)) == OFF
     assert running.faults == (Fault.LINK_LOST,)
     running.step(count=5)
     assert running.output is not None
-    assert running.output[:3] == OFF
+    assert driven(running.output) == OFF
 
 
 def test_a_lost_link_is_no_fault_while_disabled(bench: Bench, core: Core) -> None:
@@ -436,14 +441,14 @@ def test_a_number_that_is_not_finite(running: Bench) -> None:
     running.command("clear-fault")
     running.step(count=3)
     running.command("enable")
-    assert all(math.isfinite(duty) for duty in running.step(gap_plan(79.0), count=10)[1:3])
+    assert all(math.isfinite(duty) for duty in driven(running.step(gap_plan(79.0), count=10))[1:])
 
 
 @pytest.mark.parametrize("name", ["left_mm", "right_mm", "supply_V", "device_time_s"])
 def test_a_measurement_that_is_not_finite_reaches_no_duty(running: Bench, name: str) -> None:
     for value in (math.nan, math.inf, -math.inf):
         output = running.step(gap_plan(79.0), **{name: value})
-        assert all(abs(duty) <= 1.0 for duty in output[1:3])
+        assert all(abs(duty) <= 1.0 for duty in driven(output)[1:])
 
 
 # -- commands ------------------------------------------------------------------------------------------------------
@@ -469,7 +474,7 @@ def test_pause_holds_the_gap_and_resume_goes_on(running: Bench) -> None:
 def test_disable_and_stop_open(running: Bench) -> None:
     running.command("disable")
     output = running.step()
-    assert (output[:3], output.request) == (OFF, DeviceRequest.RETRACT)
+    assert (driven(output), output.request) == (OFF, DeviceRequest.RETRACT)
     assert not running.faults
     running.command("stop")
     running.step()
@@ -551,10 +556,10 @@ def test_any_history_keeps_duties_in_bounds_and_repeats_itself(core: Core, histo
             if name is not None:
                 state = _commanded(stepper, state, name, now_s)
             state, output = stepper.step(state, now_s, measurement, plan)
-            assert all(abs(duty) <= limit for duty in output[1:3])
+            assert all(abs(duty) <= limit for duty in driven(output)[1:])
             is_driven = state.safety.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED)
             assert (output.mode is DriveMode.RUN) == is_driven
-            assert is_driven or output[:3] == OFF
+            assert is_driven or driven(output) == OFF
             assert output.request_number >= number
             number = output.request_number
             trace.append((state, output))
@@ -615,7 +620,7 @@ def test_after_a_stall_one_drive_asks_and_moves_nothing(
     state, now_s = moving
     old = following(measure, state, 11 + has_more, now_s + (elapsed_s if has_more else 0.0))
     after, output = core.stepper.step(state, now_s + elapsed_s, old, gap_plan(60.0, now_s))
-    assert output[:3] == (DriveMode.RUN, 0.0, 0.0)
+    assert driven(output) == (DriveMode.RUN, 0.0, 0.0)
     assert output.limits == (Limit.HOST_STALL,)
     assert not after.safety.faults
     assert (after.reference, after.left, after.right) == (state.reference, state.left, state.right)
@@ -628,7 +633,7 @@ def test_the_answer_to_it_is_gone_on_from_without_a_kick(core: Core, measure, mo
     """The device went on with its last duty meanwhile, and is not where it was wanted before."""
     state, now_s = moving
     assert state.reference is not None
-    came = state.reference._replace(gap_mm=state.reference.gap_mm + came_mm)
+    came = state.reference.replaced(gap_mm=state.reference.gap_mm + came_mm)
     integral = state.left.integral
     for later in (0.045, 0.046):
         at_s = now_s + later
@@ -649,7 +654,7 @@ def test_without_an_answer_in_time_the_measurement_is_stale(running: Bench) -> N
     running.ticks += round(CONFIG.device.measurement_timeout_ms) - 2
     ticks = 0
     while not running.faults:
-        assert running.silent(newest)[1:3] == (0.0, 0.0)
+        assert driven(running.silent(newest))[1:] == (0.0, 0.0)
         ticks += 1
         assert ticks < 100
     assert running.faults == (Fault.MEASUREMENT_STALE,)
@@ -679,7 +684,7 @@ def test_a_silent_device_is_held_where_it_is_and_named(running: Bench) -> None:
     held = running.state
     for _ in range(30):
         output = running.silent(newest)
-        assert output[:3] == (DriveMode.RUN, 0.0, 0.0)
+        assert driven(output) == (DriveMode.RUN, 0.0, 0.0)
         assert output.limits == (Limit.DEVICE_SILENT,)
     assert (running.state.reference, running.state.left) == (held.reference, held.left)
     assert abs(held.left.integral - before.left.integral) < 0.05
@@ -714,7 +719,7 @@ def test_stalls_that_the_device_survives_are_never_a_fault(
     bench.command("enable")
     for stall_ms, ran_ms in stalls_ms:
         bench.ticks += stall_ms
-        assert bench.step(gap_plan(79.9, bench.now_s))[:3] == (DriveMode.RUN, 0.0, 0.0)
+        assert driven(bench.step(gap_plan(79.9, bench.now_s))) == (DriveMode.RUN, 0.0, 0.0)
         bench.step(gap_plan(79.9, bench.now_s), count=ran_ms)
         assert not bench.faults
         assert abs(bench.state.left.integral) < 0.3

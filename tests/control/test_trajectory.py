@@ -61,7 +61,9 @@ def test_speed_and_acceleration_limits_hold_for_any_target(
 def test_a_step_is_reached_without_overshoot(position: Position, speeds: Speeds, start: float, target: float) -> None:
     reference = Reference(start)
     distance = abs(target - start)
-    for _ in range(round(1_000 * (distance / min(speeds) + 1.0))):
+    for _ in range(
+        round(1_000 * (distance / min(speeds.no_load_mm_s, speeds.opening_mm_s, speeds.closing_mm_s) + 1.0))
+    ):
         reference, _ = follow(position.gap_acceleration_mm_s2, reference, Reference(target), DT_S, speeds)
         assert (reference.gap_mm - target) * math.copysign(1.0, target - start) <= HALF_COUNT_MM
     assert reference.gap_mm == pytest.approx(target, abs=1e-3)
@@ -130,7 +132,7 @@ def test_a_target_at_rest_is_kept() -> None:
 
 
 def test_either_way_has_its_own_limit() -> None:
-    slow = SPEEDS._replace(opening_mm_s=30.0)
+    slow = SPEEDS.replaced(opening_mm_s=30.0)
     for target, most in ((95.0, 30.0), (45.0, LIMITS.gap_speed_mm_s)):
         reference, speeds = Reference(70.0), []
         for _ in range(500):
