@@ -18,7 +18,7 @@ MAY_IMPORT = {
     "characterisation": {"physics"},
     "design": {"physics"},
     "learning": {"physics"},
-    "inverse": {"physics", "learning"},
+    "inverse": {"firmware_protocol", "physics", "learning"},
     "scenes": {"config"},
     "safety": {"firmware_protocol"},
     "hardware": {"firmware_protocol", "config", "safety"},

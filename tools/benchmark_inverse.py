@@ -36,14 +36,16 @@ from tqdm import tqdm
 from tormagd.control.core import choose_solver
 from tormagd.daemon.realtime import freeze_garbage
 from tormagd.inverse.bracketed import BracketedSearch, brent, finer_grid, newton
-from tormagd.inverse.choice import RUNTIME_SOLVERS, Variant, choose
+from tormagd.inverse.choice import RUNTIME_SOLVERS, Variant, choose, named
 from tormagd.inverse.closed_form import ClosedForm
 from tormagd.inverse.direct import DirectInverse
 from tormagd.inverse.kd_tree import KdTreeSearch
 from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
 from tormagd.inverse.nearest import NearestFieldSearch
+from tormagd.inverse.newton import RisingSearch
 from tormagd.inverse.scan import FieldScan
 from tormagd.inverse.solution import FieldSolver
+from tormagd.learning.metrics import falling_at
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.physics.force import TORMAG
@@ -53,9 +55,10 @@ from tormagd.simulation.parameters import PlantParameters, load_plant
 OWN, MISMATCHED = "sample_1", ("sample_2", "sample_3")
 USUAL_HIDDEN = 50
 QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9}
+NEWTON, RISING = "newton", "newton-rising"
+"The daemon refuses a model that does not rise: the first is what it runs by name, and the second how that is done."
 BASELINES = ("thesis-linear", "linear-argmin", "vectorised-argmin")
 NUMPY_DTYPE: dict[str, type[np.floating]] = {"float32": np.float32, "float64": np.float64}
-TORCH_DTYPE = {"float32": torch.float32, "float64": torch.float64}
 ENCODER_FIELD_MT = 0.02
 "About what one encoder count changes (1/560 mm, 5 to 22 mT/mm): smaller differences of error decide nothing."
 
@@ -96,52 +99,59 @@ class Case(NamedTuple):
 
 def cases(effort: Effort) -> Iterator[Case]:
     """Solver x hidden size x step x k x precision x threads: everything at the usual size, the best at every size."""
-    precisions = tuple(TORCH_DTYPE)
+    precisions = tuple(NUMPY_DTYPE)
     for hidden in effort.hidden:
         usual = hidden == USUAL_HIDDEN
         for solver in ("thesis-linear", "linear-argmin", "vectorised-argmin"):
             yield Case(solver, hidden, step_mT=1.0)
-        yield Case("linear-argmin numpy", hidden, step_mT=1.0)
+        yield Case("linear-argmin curve", hidden, step_mT=1.0)
         steps, counts = ((1.0, 2.0, 5.0, 10.0, 20.0), (1, 4, 16)) if usual else ((2.0, 20.0), (4,))
         for dtype, step, count in itertools.product(precisions, steps, counts):
             yield Case("nearest", hidden, dtype, step, count)
         for solver, dtype, step in itertools.product(
-            ("coarse-to-fine", "newton", "brent"), precisions, (10.0, 20.0, 40.0) if usual else (20.0,)
+            ("coarse-to-fine", NEWTON, "brent"), precisions, (10.0, 20.0, 40.0) if usual else (20.0,)
         ):
             if solver != "brent" or dtype == "float64":
                 yield Case(solver, hidden, dtype, step)
+        yield Case(RISING, hidden)
         for count in (1, 8, 32) if usual else (8,):
             yield Case("k-d tree", hidden, step_mT=4.0, neighbours=count)
         yield Case("direct", hidden)
     yield Case("closed form")
     yield Case("vectorised-argmin", dtype="float32", step_mT=1.0)
-    for solver, threads in itertools.product(("vectorised-argmin", "nearest"), (2, 4)):
-        yield Case(solver, step_mT=1.0, neighbours=4 if solver == "nearest" else 0, threads=threads)
+    for threads in (2, 4):
+        yield Case("vectorised-argmin", step_mT=1.0, threads=threads)
 
 
 def make(case: Case, model: ForceModel) -> FieldSolver:
     """The search. Raises `DomainError` where it refuses the model."""
     span: dict[str, Any] = {"field_range_mT": FIELDS_MT}
     stepped = span | {"step_mT": case.step_mT}
-    refinements = {"coarse-to-fine": finer_grid, "newton": newton, "brent": brent}
+    refinements = {"coarse-to-fine": finer_grid, NEWTON: newton, "brent": brent}
     builders: dict[str, Callable[[], FieldSolver]] = {
         # the thesis took its network's mean error for the radius; so does this, with its own network's
         "thesis-linear": lambda: LinearFieldSearch(
-            model, epsilon_N=model.metadata.metrics["mae_N"], predict_one=torch_row(model), **stepped
+            epsilon_N=model.metadata.metrics["mae_N"], predict_one=torch_row(model), **stepped
         ),
-        "linear-argmin": lambda: LinearFieldSearch(model, epsilon_N=0.0, predict_one=torch_row(model), **stepped),
-        "linear-argmin numpy": lambda: LinearFieldSearch(model, epsilon_N=0.0, **stepped),
-        "vectorised-argmin": lambda: GridArgmin(model, dtype=TORCH_DTYPE[case.dtype], **stepped),
-        "nearest": lambda: NearestFieldSearch(
-            model, neighbours=case.neighbours, dtype=TORCH_DTYPE[case.dtype], **stepped
-        ),
+        "linear-argmin": lambda: LinearFieldSearch(epsilon_N=0.0, predict_one=torch_row(model), **stepped),
+        "linear-argmin curve": lambda: LinearFieldSearch(epsilon_N=0.0, **stepped),
+        "vectorised-argmin": lambda: GridArgmin(model, dtype=getattr(torch, case.dtype), **stepped),
+        "nearest": lambda: NearestFieldSearch(neighbours=case.neighbours, dtype=NUMPY_DTYPE[case.dtype], **stepped),
         "k-d tree": lambda: KdTreeSearch(model, neighbours=case.neighbours, **stepped),
+        RISING: lambda: rising(model),
         "direct": lambda: DirectInverse(model, **span),
         "closed form": lambda: ClosedForm(model, INSERT.elastomer, TORMAG, **span),
     }
     if case.solver in refinements:
-        return BracketedSearch(model, refine=refinements[case.solver], dtype=NUMPY_DTYPE[case.dtype], **stepped)
+        return BracketedSearch(refine=refinements[case.solver], dtype=NUMPY_DTYPE[case.dtype], **stepped)
     return builders[case.solver]()
+
+
+def rising(model: ForceModel) -> RisingSearch:
+    """Raises `DomainError` on a model that the daemon would refuse."""
+    if falling_at(model, FIELDS_MT) is not None:
+        raise DomainError("model", "not rising with the field", "a force that rises with the field everywhere")
+    return RisingSearch(FIELDS_MT)
 
 
 class Bench:
@@ -194,7 +204,7 @@ class Run:
     def advance(self, solves: int) -> None:
         """That many solves more."""
         torch.set_num_threads(self.case.threads)
-        fields, times_us = follow(self._solver, self._course, max(solves, len(self._course.field_mT)))
+        fields, times_us = follow(self._solver, self._model, self._course, max(solves, len(self._course.field_mT)))
         torch.set_num_threads(1)
         self._times_us.append(times_us)
         if self._fields is None:
@@ -238,14 +248,17 @@ def plant_errors(plant: PlantParameters, along: Course, fields: Array) -> dict[s
     }
 
 
-def follow(solver: FieldSolver, along: Course, solves: int) -> tuple[Array, Array]:
-    """Fields and times (us) of that many solves along the course, round and round; each is told the last field."""
+def follow(solver: FieldSolver, model: ForceModel, along: Course, solves: int) -> tuple[Array, Array]:
+    """Fields and times (us) of that many solves along the course, round and round; each is told the last field.
+
+    The curve belongs to the solve: it is another one for every state of the handle.
+    """
     rows = along.rows()
     fields, times_ns = np.empty(solves), np.empty(solves)
     last: float | None = None
     for index, (displacement, rate, force) in enumerate(itertools.islice(itertools.cycle(rows), solves)):
         start_ns = time.perf_counter_ns()
-        last = solver.solve(displacement, rate, force, CIP_PERCENT, last).field_mT
+        last = solver.solve(model.curve(displacement, rate, CIP_PERCENT), force, last).field_mT
         times_ns[index] = time.perf_counter_ns() - start_ns
         fields[index] = last
     return fields, times_ns * 1e-3
@@ -254,9 +267,9 @@ def follow(solver: FieldSolver, along: Course, solves: int) -> tuple[Array, Arra
 def held_bytes(owner: object) -> int:
     """Bytes of the arrays, tensors, lists and trees that a search owns, beside the network that all of them share."""
     total = 0
-    for value in vars(owner).values():
+    for value in getattr(owner, "__dict__", {}).values():
         if isinstance(value, np.ndarray):
-            total += value.nbytes if value.flags.owndata else 0  # a view of a tensor is counted there
+            total += value.nbytes
         elif isinstance(value, torch.Tensor):
             total += value.untyped_storage().nbytes()
         elif isinstance(value, list):
@@ -286,15 +299,16 @@ def precision(bench: Bench) -> dict[str, dict[str, float]]:
         ("nearest", 2.0, 4),
         ("nearest", 20.0, 4),
         ("coarse-to-fine", 20.0, 0),
-        ("newton", 20.0, 0),
+        (NEWTON, 20.0, 0),
     ):
         fields = [
             follow(
                 make(Case(solver, USUAL_HIDDEN, dtype, step, neighbours), bench.models[USUAL_HIDDEN]),
+                bench.models[USUAL_HIDDEN],
                 bench.course,
                 bench.effort.course,
             )[0]
-            for dtype in TORCH_DTYPE
+            for dtype in NUMPY_DTYPE
         ]
         difference = np.abs(fields[0] - fields[1])
         name = Case(solver, step_mT=step, neighbours=neighbours).name
@@ -312,6 +326,8 @@ def chosen(bench: Bench, rows: list[dict[str, Any]], fifo_priority: int) -> dict
         picked = choose(variants, scene.force.tolerance_rms_N, USUAL_HIDDEN)
         choice = picked if scene.solver.name == AUTO else choose_solver(scene, USUAL_HIDDEN)
         case = Case(choice.solver, USUAL_HIDDEN, choice.dtype, choice.step_mT, choice.neighbours)
+        if choice.solver == NEWTON:
+            case = Case(RISING)
         if case not in measured:
             run = Run(bench, case)
             with real_time(fifo_priority) as fifo:
@@ -331,7 +347,8 @@ def mismatched(bench: Bench, case: Case) -> dict[str, dict[str, float]]:
     for name in MISMATCHED:
         plant = load_plant(name)
         along = course(plant, bench.effort.course)
-        fields, _ = follow(make(case, bench.models[case.hidden]), along, bench.effort.course)
+        model = bench.models[case.hidden]
+        fields, _ = follow(make(case, model), model, along, bench.effort.course)
         errors[name] = plant_errors(plant, along, fields)
     return errors
 
@@ -351,11 +368,16 @@ def real_time(priority: int) -> Iterator[bool]:
 
 
 def table(rows: list[dict[str, Any]]) -> list[Variant]:
-    """The rows that `tormagd.inverse.choice` picks from: one thread, searches that the daemon may run."""
+    """The rows that `tormagd.inverse.choice` picks from: one thread, searches that the daemon may run, as it runs them.
+
+    So "newton" is measured as `RISING`; its step is that of the look it would need on a model that does not rise.
+    """
+    offered = [row for row in rows if row["threads"] == 1 and row["solver"] != NEWTON]
+    as_run = {"solver": NEWTON, "step_mT": named(NEWTON).step_mT}
     return [
         Variant(**{key: row[key] for key in Variant.__struct_fields__})
-        for row in rows
-        if row["threads"] == 1 and row["solver"] in RUNTIME_SOLVERS
+        for row in (row | as_run if row["solver"] == RISING else row for row in offered)
+        if row["solver"] in RUNTIME_SOLVERS
     ]
 
 

@@ -38,11 +38,12 @@ LEAST_SHOWN_MT = 1e-6
 MARKERS = {
     "thesis-linear": "v",
     "linear-argmin": "^",
-    "linear-argmin numpy": ">",
+    "linear-argmin curve": ">",
     "vectorised-argmin": "s",
     "nearest": "o",
     "coarse-to-fine": "D",
     "newton": "*",
+    "newton-rising": "d",
     "brent": "P",
     "k-d tree": "X",
     "direct": "h",
@@ -107,7 +108,8 @@ TEXT = """# Speed against accuracy of the inverse
 Written by `tools/benchmark.py inverse --write`; do not edit. Synthetic data throughout: {workload}.
 One process, one thread unless a row says otherwise, garbage collector frozen as in the daemon ({environment}).
 
-A solve gets displacement, rate, force, CIP and the last field, and answers with a field, its confidence and its reach.
+A solve gets a state of the handle, a force and the last field, and answers with a field, its confidence and its reach.
+The curve of force over field for that state is made in the time shown.
 Two errors are kept apart. The *solver error* is the distance to the network's own nearest root, found by bisection that
 shares no code with the searches. The *plant error* is the distance to the field at which the simulated element gives
 the force; it holds the network's error too, and no search can be better than its network. *Force* is the plant's force
@@ -119,12 +121,14 @@ relaxation: those are errors of the model whatever the search, and are measured 
 ![p50 against the solver error and against the plant error](images/inverse_trade.png)
 
 - `thesis-linear`: row by row in torch, 1 mT, stops within the network's mean error of the force (the thesis's rule).
-- `linear-argmin`: row by row in torch, every row; `linear-argmin numpy`: the same with the model's own fast prediction.
+- `linear-argmin`: row by row in torch, every row; `linear-argmin curve`: the same with the force curve.
 - `vectorised-argmin`: the whole network on the whole grid at once in torch.
-- `nearest`: the field-independent half of the network hoisted out, the rest over the grid in torch, the k nearest, then
-  interpolation. k decides only among touching points and plateaus, which this workload does not have.
+- `nearest`: the curve over the grid in numpy, the k nearest, then interpolation. k decides only among touching points
+  and plateaus, which this workload does not have.
 - `coarse-to-fine`, `newton`, `brent`: a look at a grid of that step in numpy, then a finer grid, Newton's method kept
   in its bracket, or scipy's brentq, in the bracket nearest the last field.
+- `newton-rising`: Newton's method from the last field, the whole range its bracket, where the force is known to rise.
+  It is what the daemon runs as `newton`, because it refuses a model whose force falls.
 - `k-d tree`: the mean of the k nearest of precomputed samples (scipy). `direct`: a second network that learned the
   inverse. `closed form`: the magnetoelastic law inverted, without the network.
 
@@ -133,9 +137,10 @@ p99 and p99.9 still hold whatever else ran (the load average counts this program
 measured at length under the daemon's scheduling where the kernel grants it.
 
 Pareto marks the one-thread variants that no faster one equals in plant error; differences under one encoder count of
-the gap (about 0.02 mT) do not count. A scene gets the cheapest of `nearest`, `coarse-to-fine` and `newton` whose
-greatest force error against the network stays under {share:g} of the scene's force tolerance. The others are for the
-laboratory: they need scipy or a training at start, do not use the learned model, or are baselines.
+the gap (about 0.02 mT) do not count. A scene gets the cheapest of `nearest`, `coarse-to-fine` and `newton` (measured as
+`newton-rising`) whose greatest force error against the network stays under {share:g} of the scene's force tolerance.
+The others are for the laboratory: they need scipy or a training at start, do not use the learned model, or are
+baselines.
 
 The plant errors of this page belong to networks trained for it, on this workload's own device without memory. How good
 the *shipped* model is over its box is measured by `tools/envelope.py`, and said in

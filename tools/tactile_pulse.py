@@ -15,6 +15,7 @@ from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.solution import FieldSolver, Reach
 from tormagd.learning.dataset import Array
 from tormagd.learning.grey_box import GreyBoxMemory
+from tormagd.learning.model_file import ForceModel
 from tormagd.simulation.pad import FULL_FIELD_MT, FULL_INDENTATION_MM, PADS, PadParameters, drawn_pad, worked_pad
 
 SAMPLES = 4322
@@ -84,7 +85,7 @@ HELD_S = (SAMPLES - FULL_INDENTATION_MM * RATE_HZ) / RATE_HZ
 
 
 def solve_all(
-    solver: FieldSolver, features: Array, force_N: Array, memory: GreyBoxMemory | None
+    solver: FieldSolver, model: ForceModel, features: Array, force_N: Array, memory: GreyBoxMemory | None
 ) -> tuple[Array, Array]:
     """The field for each row in turn, and the force that the solver was asked for.
 
@@ -95,7 +96,8 @@ def solve_all(
         displacement_mm, rate_mm_s, _, cip_percent = row
         if memory is not None:
             wanted[index] = memory.elastic_N(displacement_mm, rate_mm_s, asked_N, cip_percent)
-        last = solver.solve(displacement_mm, rate_mm_s, float(wanted[index]), cip_percent, last).field_mT
+        curve = model.curve(displacement_mm, rate_mm_s, cip_percent)
+        last = solver.solve(curve, float(wanted[index]), last).field_mT
         if memory is not None:
             # what the field found can give, not what was wished
             memory.advance(displacement_mm, rate_mm_s, last, cip_percent)
@@ -142,25 +144,25 @@ def course(pad: PadParameters, shape: Array, every: int = 1) -> Course:
     )
 
 
-def nearest(trained: Trained) -> NearestFieldSearch:
-    """The search of the experiment, on the relaxation-aware model."""
-    return NearestFieldSearch(trained.grey.model, field_range_mT=FIELDS_MT)
+def nearest() -> NearestFieldSearch:
+    """The search of the experiment."""
+    return NearestFieldSearch(field_range_mT=FIELDS_MT)
 
 
 def aware_fields(trained: Trained, along: Course, force_N: Array) -> Array:
     """The fields that the relaxation-aware model finds for the forces."""
-    return solve_all(nearest(trained), along.features, force_N, GreyBoxMemory(trained.grey, along.dt_s))[0]
+    memory = GreyBoxMemory(trained.grey, along.dt_s)
+    return solve_all(nearest(), trained.grey.model, along.features, force_N, memory)[0]
 
 
 def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str, Array]]:
     """Scores of each way to the field, and the traces."""
     noise_N = trained.noise_N
     noisy_N = along.force_N + np.random.default_rng(SENSOR_SEED).normal(0.0, noise_N, len(along.force_N))
-    plain = NearestFieldSearch(trained.model, field_range_mT=FIELDS_MT)
-    linear = LinearFieldSearch(trained.model, field_range_mT=FIELDS_MT)
+    linear = LinearFieldSearch(field_range_mT=FIELDS_MT)
     ways = {
-        "mlp": solve_all(plain, along.features, along.force_N, None)[0],
-        "mlp_thesis_search": solve_all(linear, along.features, along.force_N, None)[0],
+        "mlp": solve_all(nearest(), trained.model, along.features, along.force_N, None)[0],
+        "mlp_thesis_search": solve_all(linear, trained.model, along.features, along.force_N, None)[0],
         "relaxation_aware": aware_fields(trained, along, along.force_N),
         "relaxation_aware_noisy": aware_fields(trained, along, noisy_N),
     }
@@ -213,14 +215,14 @@ def hold(trained: Trained, duration_s: float) -> tuple[dict[str, Any], dict[str,
         ("with", trained.grey.model, GreyBoxMemory(trained.grey, dt_s)),
     ):
         plant = worked_pad(pad)
-        solver = NearestFieldSearch(model, field_range_mT=FIELDS_MT)
+        solver = nearest()
         rendered, last, outside = np.empty(count), 0.0, 0
         for index, place in enumerate(zip(displacement_mm.tolist(), rate_mm_s.tolist(), strict=True)):
             if index >= rising:
                 wanted_N = float(asked_N[index - rising])
                 if memory is not None:
                     wanted_N = memory.elastic_N(*place, wanted_N, pad.cip_percent)
-                answer = solver.solve(*place, wanted_N, pad.cip_percent, last)
+                answer = solver.solve(model.curve(*place, pad.cip_percent), wanted_N, last)
                 last, outside = answer.field_mT, outside + (answer.reach is not Reach.INSIDE)
             if memory is not None:
                 memory.advance(*place, last, pad.cip_percent)

@@ -43,13 +43,13 @@ def solve_times(trained: Trained, along: Course, solves: int) -> dict[str, Any]:
     """
     model = trained.grey.model
     memory = GreyBoxMemory(trained.grey, along.dt_s)
-    _, elastic_N = solve_all(nearest(trained), along.features, along.force_N, memory)
+    _, elastic_N = solve_all(nearest(), model, along.features, along.force_N, memory)
     row = torch_row(model)
     searches: dict[str, tuple[FieldSolver, bool]] = {
-        USED: (nearest(trained), False),
-        "newton 40 mT": (BracketedSearch(model, field_range_mT=FIELDS_MT, refine=newton, step_mT=40.0), False),
-        "thesis-linear": (LinearFieldSearch(model, field_range_mT=FIELDS_MT, predict_one=row), True),
-        "linear-argmin": (LinearFieldSearch(model, field_range_mT=FIELDS_MT, epsilon_N=0.0, predict_one=row), True),
+        USED: (nearest(), False),
+        "newton 40 mT": (BracketedSearch(field_range_mT=FIELDS_MT, refine=newton, step_mT=40.0), False),
+        "thesis-linear": (LinearFieldSearch(field_range_mT=FIELDS_MT, predict_one=row), True),
+        "linear-argmin": (LinearFieldSearch(field_range_mT=FIELDS_MT, epsilon_N=0.0, predict_one=row), True),
         "vectorised-argmin": (GridArgmin(model, field_range_mT=FIELDS_MT), False),
     }
     freeze_garbage()
@@ -64,7 +64,7 @@ def solve_times(trained: Trained, along: Course, solves: int) -> dict[str, Any]:
                 force_N=along.force_N[::every],
                 slope_N_mT=along.slope_N_mT[::every],
             )
-            times_us, fields = _timed(_search(solver), kept.features, elastic_N[::every], count)
+            times_us, fields = _timed(_search(solver, model), kept.features, elastic_N[::every], count)
             looked = np.flatnonzero(kept.scored)[:: max(int(kept.scored.sum()) // ROOTS, 1)]
             errors = _solver_error_mT(model, kept.features[looked], elastic_N[::every][looked], fields[looked])
             rows.append(
@@ -74,7 +74,7 @@ def solve_times(trained: Trained, along: Course, solves: int) -> dict[str, Any]:
                 | {f"plant_{key}": value for key, value in kept.scores(fields).items()}
             )
         whole = GreyBoxMemory(trained.grey, along.dt_s)
-        times_us, _ = _timed(_with_memory(nearest(trained), whole), along.features, along.force_N, len(along.force_N))
+        times_us, _ = _timed(_with_memory(nearest(), model, whole), along.features, along.force_N, len(along.force_N))
     gc.unfreeze()
     used_us = rows[0]["p50_us"]
     return {
@@ -91,17 +91,17 @@ def quantiles(times_us: Array) -> dict[str, float]:
     return {f"{name}_us": float(np.percentile(times_us, share)) for name, share in QUANTILES.items()}
 
 
-def _search(solver: FieldSolver) -> ForceSearch:
+def _search(solver: FieldSolver, model: ForceModel) -> ForceSearch:
     def field_mT(row: tuple[float, ...], force_N: float, last_mT: float | None) -> float:
-        return solver.solve(row[0], row[1], force_N, row[3], last_mT).field_mT
+        return solver.solve(model.curve(row[0], row[1], row[3]), force_N, last_mT).field_mT
 
     return field_mT
 
 
-def _with_memory(solver: FieldSolver, memory: GreyBoxMemory) -> ForceSearch:
+def _with_memory(solver: FieldSolver, model: ForceModel, memory: GreyBoxMemory) -> ForceSearch:
     def field_mT(row: tuple[float, ...], force_N: float, last_mT: float | None) -> float:
         wanted_N = memory.elastic_N(row[0], row[1], force_N, row[3])
-        found_mT = solver.solve(row[0], row[1], wanted_N, row[3], last_mT).field_mT
+        found_mT = solver.solve(model.curve(row[0], row[1], row[3]), wanted_N, last_mT).field_mT
         memory.advance(row[0], row[1], found_mT, row[3])
         return found_mT
 

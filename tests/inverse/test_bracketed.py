@@ -7,7 +7,7 @@ from tormagd.inverse.bracketed import ACCURACY_MT, BracketedSearch, Refinement, 
 from tormagd.inverse.closed_form import ClosedForm
 from tormagd.inverse.direct import DirectInverse
 from tormagd.inverse.kd_tree import KdTreeSearch
-from tormagd.inverse.solution import Reach, confidence
+from tormagd.inverse.solution import Reach
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.physics.force import TORMAG
@@ -18,15 +18,15 @@ CIP = 40.0
 REFINEMENTS = (newton, finer_grid, brent)
 
 
-def search(model: ForceModel, refine: Refinement, step_mT: float = 30.0) -> BracketedSearch:
-    return BracketedSearch(model, field_range_mT=RANGE_MT, refine=refine, step_mT=step_mT)
+def search(refine: Refinement, step_mT: float = 30.0) -> BracketedSearch:
+    return BracketedSearch(field_range_mT=RANGE_MT, refine=refine, step_mT=step_mT)
 
 
 @pytest.mark.parametrize("refine", [newton, brent])
 def test_a_step_steeper_than_the_grid_is_met_exactly(plateau: ForceModel, refine: Refinement) -> None:
     """Newton's slope is zero to the last bit on both sides of the step: bisection carries it there."""
     middle = 0.5 * sum(plateau.predict_one(0.5, 10, field, CIP) for field in RANGE_MT)
-    solution = search(plateau, refine, 60.0).solve(0.5, 10, middle, CIP, 200.0)
+    solution = search(refine, 60.0).solve(plateau.curve(0.5, 10, CIP), middle, 200.0)
     assert solution.field_mT == pytest.approx(450, abs=ACCURACY_MT)
     assert solution.predicted_force_N == pytest.approx(middle, abs=1e-3)
     assert solution.iterations < 50
@@ -37,7 +37,7 @@ def test_a_force_met_only_between_grid_points_is_not_called_out_of_reach(bump: F
     """The peak stands at 450 mT; a grid of 100 mT has points at 400 and 500, both lower."""
     peak, shoulder = (bump.predict_one(0.5, 10, field, CIP) for field in (450.0, 400.0))
     force = peak - 0.2 * (peak - shoulder)
-    solution = search(bump, refine, 100.0).solve(0.5, 10, force, CIP, 150.0)
+    solution = search(refine, 100.0).solve(bump.curve(0.5, 10, CIP), force, 150.0)
     assert solution.reach is Reach.INSIDE
     assert solution.predicted_force_N == pytest.approx(force, abs=1e-3)
     assert solution.field_mT < 450
@@ -48,14 +48,14 @@ def test_the_last_field_is_a_point_of_the_grid(bump: ForceModel, refine: Refinem
     """From near the peak both roots lie in intervals that a grid of 700 mT does not have."""
     force = bump.predict_one(0.5, 10, 440.0, CIP)
     for last, root in ((446.0, 440.0), (455.0, 460.0)):
-        solution = search(bump, refine, 700.0).solve(0.5, 10, force, CIP, last)
+        solution = search(refine, 700.0).solve(bump.curve(0.5, 10, CIP), force, last)
         assert solution.field_mT == pytest.approx(root, abs=1.0 if refine is finer_grid else 0.01)
 
 
 @pytest.mark.parametrize("refine", REFINEMENTS)
 @pytest.mark.parametrize("end", RANGE_MT)
 def test_the_ends_themselves_are_inside(rising: ForceModel, refine: Refinement, end: float) -> None:
-    solution = search(rising, refine).solve(0.5, 10, rising.predict_one(0.5, 10, end, CIP), CIP, None)
+    solution = search(refine).solve(rising.curve(0.5, 10, CIP), rising.predict_one(0.5, 10, end, CIP), None)
     assert solution.reach is Reach.INSIDE
     assert solution.field_mT == pytest.approx(end, abs=0.01)
 
@@ -65,7 +65,7 @@ def test_newton_needs_few_evaluations(rising: ForceModel) -> None:
     counts = []
     for field in rng.uniform(*RANGE_MT, 200).tolist():
         force = rising.predict_one(0.5, 10, field, CIP)
-        counts.append(search(rising, newton).solve(0.5, 10, force, CIP, field + 20).iterations)
+        counts.append(search(newton).solve(rising.curve(0.5, 10, CIP), force, field + 20).iterations)
     assert np.mean(counts) < 6
     assert max(counts) < 12
 
@@ -73,7 +73,7 @@ def test_newton_needs_few_evaluations(rising: ForceModel) -> None:
 def test_the_direct_inverse_is_the_same_for_the_same_seed(rising: ForceModel) -> None:
     answers = [
         DirectInverse(rising, field_range_mT=RANGE_MT, hidden=8, seed=seed, iterations=20)
-        .solve(0.5, 10, 3.0, CIP, None)
+        .solve(rising.curve(0.5, 10, CIP), 3.0, None)
         .field_mT
         for seed in (1, 1, 2)
     ]
@@ -84,19 +84,20 @@ def test_the_tree_trusts_an_answer_less_the_farther_its_samples(rising: ForceMod
     """Beside what the training ranges and the force left over already say."""
     tree = KdTreeSearch(rising, field_range_mT=RANGE_MT)
     for displacement, bound in ((0.5, 1.0), (1.5, 0.2)):
-        force = rising.predict_one(displacement, 10.0, 400.0, CIP)
-        solution = tree.solve(displacement, 10.0, force, CIP, 300.0)
-        elsewhere = confidence(rising, (displacement, 10.0, solution.field_mT, CIP), force, solution.predicted_force_N)
+        curve = rising.curve(displacement, 10.0, CIP)
+        force = curve.force_N(400.0)
+        solution = tree.solve(curve, force, 300.0)
+        elsewhere = curve.confidence(solution.field_mT, force - solution.predicted_force_N)
         assert solution.confidence <= bound * elsewhere
 
 
 @pytest.mark.parametrize(
     ("make", "name"),
     [
-        (lambda model: search(model, newton, 0.0), "step_mT"),
-        (lambda model: search(model, newton, 701.0), "step_mT"),
-        (lambda model: BracketedSearch(model, field_range_mT=(9.0, 9.0), refine=newton), "field_range_mT"),
-        (lambda model: BracketedSearch(model, field_range_mT=RANGE_MT, refine=newton, dtype=np.float16), "dtype"),
+        (lambda model: search(newton, 0.0), "step_mT"),
+        (lambda model: search(newton, 701.0), "step_mT"),
+        (lambda model: BracketedSearch(field_range_mT=(9.0, 9.0), refine=newton), "field_range_mT"),
+        (lambda model: BracketedSearch(field_range_mT=RANGE_MT, refine=newton, dtype=np.float16), "dtype"),
         (lambda model: KdTreeSearch(model, field_range_mT=RANGE_MT, neighbours=0), "neighbours"),
         (lambda model: KdTreeSearch(model, field_range_mT=RANGE_MT, lattice=1), "lattice"),
         (lambda model: DirectInverse(model, field_range_mT=RANGE_MT, hidden=0), "hidden"),

@@ -1,5 +1,7 @@
 """Choosing a search: by tolerance from a table, by name, from the committed table for every shipped scene."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import msgspec
@@ -10,6 +12,7 @@ from tormagd.control.core import build_core, choose_solver
 from tormagd.inverse.bracketed import BracketedSearch
 from tormagd.inverse.choice import RUNTIME_SOLVERS, SAME_TIME, Variant, build, choose, named, solver_table
 from tormagd.inverse.nearest import NearestFieldSearch
+from tormagd.inverse.newton import RisingSearch
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.scenes.scene import Solver, load_scene, scene_path, shipped_scenes
@@ -72,9 +75,13 @@ def test_searches_that_the_daemon_cannot_run_are_never_chosen() -> None:
 
 @pytest.mark.parametrize("name", RUNTIME_SOLVERS)
 def test_a_named_search_is_built_with_its_settings(rising: ForceModel, name: str) -> None:
-    built = build(named(name, step_mT=25.0), rising, (100.0, 800.0))
-    assert isinstance(built, NearestFieldSearch if name == "nearest" else BracketedSearch)
-    assert build(named(name), rising, (100.0, 800.0)).solve(0.5, 10, 3.0, 40.0, None).field_mT > 100
+    for rises in (False, True):
+        built = build(named(name, step_mT=25.0), (100.0, 800.0), rises=rises)
+        newton = RisingSearch if rises else BracketedSearch
+        expected = {"nearest": NearestFieldSearch, "coarse-to-fine": BracketedSearch, "newton": newton}
+        assert isinstance(built, expected[name])
+        usual = build(named(name), (100.0, 800.0), rises=rises)
+        assert usual.solve(rising.curve(0.5, 10, 40.0), 3.0, None).field_mT > 100
 
 
 def test_a_name_that_is_none_is_refused_with_those_that_are() -> None:
@@ -121,3 +128,11 @@ def test_a_scene_whose_search_cannot_be_is_refused(tmp_path: Path, table: str, w
     with pytest.raises(ConfigError) as caught:
         build_core(Config(scene=str(path)))
     assert all(word in str(caught.value) for word in words)
+
+
+def test_what_trains_and_what_is_for_the_laboratory_stays_out_of_the_daemon() -> None:
+    """torch takes seconds to load, and the searches that the daemon may run know nothing but a curve."""
+    loaded = "import sys, tormagd.control.core, tormagd.inverse.choice; print(*sys.modules)"
+    found = subprocess.run([sys.executable, "-c", loaded], check=True, capture_output=True, text=True).stdout.split()
+    assert "tormagd.inverse.newton" in found
+    assert not {"torch", "scipy", "sklearn", "matplotlib"} & set(found)

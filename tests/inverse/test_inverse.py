@@ -5,32 +5,33 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from tormagd.inverse.linear import THESIS_EPSILON_N, LinearFieldSearch
 from tormagd.inverse.nearest import NearestFieldSearch, field_grid
-from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach, confidence
+from tormagd.inverse.newton import RisingSearch
+from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
 from tormagd.learning.features import LARGEST
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 
 RANGE_MT = (100.0, 800.0)
 CIP = 40.0
-DTYPES = (torch.float32, torch.float64)
+DTYPES = (np.float32, np.float64)
 
 
-def nearest(model: ForceModel, **options: object) -> NearestFieldSearch:
-    return NearestFieldSearch(model, field_range_mT=RANGE_MT, **{"step_mT": 1.0, **options})  # type: ignore[arg-type]
+def nearest(**options: object) -> NearestFieldSearch:
+    return NearestFieldSearch(field_range_mT=RANGE_MT, **{"step_mT": 1.0, **options})  # type: ignore[arg-type]
 
 
-def linear(model: ForceModel, epsilon_N: float = 0.0) -> LinearFieldSearch:
-    return LinearFieldSearch(model, field_range_mT=RANGE_MT, epsilon_N=epsilon_N)
+def linear(epsilon_N: float = 0.0) -> LinearFieldSearch:
+    return LinearFieldSearch(field_range_mT=RANGE_MT, epsilon_N=epsilon_N)
 
 
-SOLVERS: tuple[Callable[[ForceModel], FieldSolver], ...] = (nearest, linear)
+EXTREME_SOLVERS = (*(nearest(step_mT=10.0, dtype=dtype) for dtype in DTYPES), RisingSearch(RANGE_MT))
+SOLVERS: tuple[Callable[[], FieldSolver], ...] = (nearest, linear)
 
 
 def attainable(model: ForceModel, displacement_mm: float, rate_mm_s: float, share: float) -> float:
@@ -47,12 +48,12 @@ def network_root(model: ForceModel, displacement_mm: float, rate_mm_s: float, fo
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_nearest_finds_the_root_of_the_network(rising: ForceModel, dtype: torch.dtype) -> None:
-    solver = nearest(rising, dtype=dtype)
+def test_nearest_finds_the_root_of_the_network(rising: ForceModel, dtype: type[np.floating]) -> None:
+    solver = nearest(dtype=dtype)
     rng = np.random.default_rng(0)
     for displacement, rate, share in rng.uniform((0, 0, 0.001), (1, 60, 0.999), (300, 3)).tolist():
         force = attainable(rising, displacement, rate, share)
-        solution = solver.solve(displacement, rate, force, CIP, None)
+        solution = solver.solve(rising.curve(displacement, rate, CIP), force, None)
         root = network_root(rising, displacement, rate, force)
         assert solution.field_mT == pytest.approx(root, abs=0.01)
         assert solution.reach is Reach.INSIDE
@@ -62,31 +63,33 @@ def test_nearest_finds_the_root_of_the_network(rising: ForceModel, dtype: torch.
 
 def test_interpolation_beats_the_grid(rising: ForceModel) -> None:
     """With a grid of 25 mT the answers stay within a hundredth of a step."""
-    solver = nearest(rising, step_mT=25.0, dtype=torch.float64)
+    solver = nearest(step_mT=25.0, dtype=np.float64)
     for share in np.linspace(0.03, 0.97, 41).tolist():
         force = attainable(rising, 0.5, 20, share)
         root = network_root(rising, 0.5, 20, force)
-        assert solver.solve(0.5, 20, force, CIP, None).field_mT == pytest.approx(root, abs=0.25)
+        assert solver.solve(rising.curve(0.5, 20, CIP), force, None).field_mT == pytest.approx(root, abs=0.25)
 
 
 def test_single_and_double_precision_agree(rising: ForceModel) -> None:
-    single, double = (nearest(rising, dtype=dtype) for dtype in DTYPES)
+    single, double = (nearest(dtype=dtype) for dtype in DTYPES)
     rng = np.random.default_rng(1)
     for displacement, rate, share in rng.uniform((0, 0, 0.01), (1, 60, 0.99), (200, 3)).tolist():
         force = attainable(rising, displacement, rate, share)
-        ends = [solver.solve(displacement, rate, force, CIP, 400.0).field_mT for solver in (single, double)]
+        ends = [
+            solver.solve(rising.curve(displacement, rate, CIP), force, 400.0).field_mT for solver in (single, double)
+        ]
         assert ends[0] == pytest.approx(ends[1], abs=0.01)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_the_branch_of_the_last_field_is_kept(bump: ForceModel, dtype: torch.dtype) -> None:
+def test_the_branch_of_the_last_field_is_kept(bump: ForceModel, dtype: type[np.floating]) -> None:
     """Follow a force down and up again on either side of the peak: the field never jumps across."""
-    solver = nearest(bump, dtype=dtype)
+    solver = nearest(dtype=dtype)
     peak = bump.predict_one(0.5, 10, 450.0, CIP)
     for start, side in ((440.0, -1), (460.0, 1)):
         last = start
         for force in peak - 0.05 - np.concatenate((np.linspace(0, 2, 60), np.linspace(2, 0, 60))):
-            solution = solver.solve(0.5, 10, float(force), CIP, last)
+            solution = solver.solve(bump.curve(0.5, 10, CIP), float(force), last)
             assert solution.reach is Reach.INSIDE
             assert (solution.field_mT - 450) * side > 0
             assert abs(solution.field_mT - last) < 60
@@ -96,16 +99,16 @@ def test_the_branch_of_the_last_field_is_kept(bump: ForceModel, dtype: torch.dty
 
 def test_without_a_last_field_the_least_of_the_roots_is_taken(bump: ForceModel) -> None:
     force = bump.predict_one(0.5, 10, 300.0, CIP)
-    assert nearest(bump).solve(0.5, 10, force, CIP, None).field_mT == pytest.approx(300, abs=0.05)
+    assert nearest().solve(bump.curve(0.5, 10, CIP), force, None).field_mT == pytest.approx(300, abs=0.05)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_on_a_plateau_the_field_moves_as_little_as_possible(plateau: ForceModel, dtype: torch.dtype) -> None:
+def test_on_a_plateau_the_field_moves_as_little_as_possible(plateau: ForceModel, dtype: type[np.floating]) -> None:
     """Where hundreds of fields give the same force, the answer is one of the nearest in force, not a far one."""
-    solver = nearest(plateau, neighbours=701, dtype=dtype)
+    solver = nearest(neighbours=701, dtype=dtype)
     top = plateau.predict_one(0.5, 10, 800.0, CIP)
-    assert solver.solve(0.5, 10, top, CIP, 700.0).field_mT == pytest.approx(700, abs=0.5)
-    above = solver.solve(0.5, 10, top + 1, CIP, 600.0)
+    assert solver.solve(plateau.curve(0.5, 10, CIP), top, 700.0).field_mT == pytest.approx(700, abs=0.5)
+    above = solver.solve(plateau.curve(0.5, 10, CIP), top + 1, 600.0)
     assert above.reach is Reach.ABOVE
     assert above.field_mT == pytest.approx(600, abs=0.5)
 
@@ -114,17 +117,17 @@ def test_a_slope_below_rounding_does_not_move_the_field(creeping: ForceModel) ->
     """The greatest force of all is at 800 mT, by a few units of rounding: no reason to travel there."""
     grid = [creeping.predict_one(0.5, 10, field, CIP) for field in (500.0, 650.0, 800.0)]
     assert 0 < grid[2] - grid[0] < 1e-14
-    solution = nearest(creeping, neighbours=701).solve(0.5, 10, grid[2] + 1, CIP, 600.0)
+    solution = nearest(neighbours=701).solve(creeping.curve(0.5, 10, CIP), grid[2] + 1, 600.0)
     assert solution.reach is Reach.ABOVE
     assert solution.field_mT == pytest.approx(600, abs=0.5)
 
 
 @pytest.mark.parametrize("make", SOLVERS)
 def test_out_of_reach_is_the_nearest_end_and_says_so(rising: ForceModel, make: Callable[..., FieldSolver]) -> None:
-    solver = make(rising)
+    solver = make()
     least, greatest = (rising.predict_one(0.5, 10, field, CIP) for field in RANGE_MT)
-    below = solver.solve(0.5, 10, least - 0.3, CIP, 500.0)
-    above = solver.solve(0.5, 10, greatest + 0.3, CIP, 500.0)
+    below = solver.solve(rising.curve(0.5, 10, CIP), least - 0.3, 500.0)
+    above = solver.solve(rising.curve(0.5, 10, CIP), greatest + 0.3, 500.0)
     assert (below.field_mT, below.reach) == (100.0, Reach.BELOW)
     assert (above.field_mT, above.reach) == (800.0, Reach.ABOVE)
     for solution in (below, above):
@@ -134,40 +137,41 @@ def test_out_of_reach_is_the_nearest_end_and_says_so(rising: ForceModel, make: C
 @pytest.mark.parametrize("make", SOLVERS)
 @pytest.mark.parametrize("end", RANGE_MT)
 def test_the_ends_themselves_are_inside(rising: ForceModel, make: Callable[..., FieldSolver], end: float) -> None:
-    solution = make(rising).solve(0.5, 10, rising.predict_one(0.5, 10, end, CIP), CIP, None)
+    solution = make().solve(rising.curve(0.5, 10, CIP), rising.predict_one(0.5, 10, end, CIP), None)
     assert solution.reach is Reach.INSIDE
     assert solution.field_mT == pytest.approx(end, abs=0.01)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_a_force_over_the_peak_of_a_bump_is_above(bump: ForceModel, dtype: torch.dtype) -> None:
-    solution = nearest(bump, dtype=dtype).solve(0.5, 10, bump.predict_one(0.5, 10, 450.0, CIP) + 0.1, CIP, 200.0)
+def test_a_force_over_the_peak_of_a_bump_is_above(bump: ForceModel, dtype: type[np.floating]) -> None:
+    solution = nearest(dtype=dtype).solve(bump.curve(0.5, 10, CIP), bump.predict_one(0.5, 10, 450.0, CIP) + 0.1, 200.0)
     assert solution.reach is Reach.ABOVE
     assert solution.field_mT == pytest.approx(450, abs=1)
 
 
 def test_linear_stops_at_the_first_row_within_epsilon(rising: ForceModel) -> None:
     force = attainable(rising, 0.5, 10, 0.7)
-    solution = linear(rising, epsilon_N=0.2).solve(0.5, 10, force, CIP, None)
-    rows = [rising.predict_one(0.5, 10, field, CIP) for field in field_grid(RANGE_MT, 1.0).tolist()]
+    curve = rising.curve(0.5, 10, CIP)
+    solution = linear(epsilon_N=0.2).solve(curve, force, None)
+    rows = [curve.force_N(field) for field in field_grid(RANGE_MT, 1.0).tolist()]
     first = next(index for index, predicted in enumerate(rows) if abs(force - predicted) <= 0.2)
     assert solution == FieldSolution(100.0 + first, rows[first], solution.confidence, first + 1, Reach.INSIDE)
-    assert linear(rising, epsilon_N=0.0).solve(0.5, 10, force, CIP, None).iterations == 701
+    assert linear(epsilon_N=0.0).solve(rising.curve(0.5, 10, CIP), force, None).iterations == 701
 
 
 def test_linear_with_no_epsilon_is_the_argmin(rising: ForceModel) -> None:
     force = attainable(rising, 0.5, 10, 0.4)
     grid = field_grid(RANGE_MT, 1.0)
     rows = rising.predict(np.column_stack((np.full(701, 0.5), np.full(701, 10.0), grid, np.full(701, CIP))))
-    assert linear(rising).solve(0.5, 10, force, CIP, None).field_mT == grid[np.abs(rows - force).argmin()]
+    assert linear().solve(rising.curve(0.5, 10, CIP), force, None).field_mT == grid[np.abs(rows - force).argmin()]
 
 
 def test_linear_has_the_radius_of_the_thesis_by_default(rising: ForceModel) -> None:
     force = rising.predict_one(0.5, 10, 100.0, CIP)
-    solver = LinearFieldSearch(rising, field_range_mT=RANGE_MT)
+    solver = LinearFieldSearch(field_range_mT=RANGE_MT)
     assert THESIS_EPSILON_N == 1.26
-    assert solver.solve(0.5, 10, force - 1.25, CIP, None).reach is Reach.INSIDE
-    assert solver.solve(0.5, 10, force - 1.27, CIP, None).reach is Reach.BELOW
+    assert solver.solve(rising.curve(0.5, 10, CIP), force - 1.25, None).reach is Reach.INSIDE
+    assert solver.solve(rising.curve(0.5, 10, CIP), force - 1.27, None).reach is Reach.BELOW
 
 
 @given(
@@ -180,10 +184,11 @@ def test_linear_has_the_radius_of_the_thesis_by_default(rising: ForceModel) -> N
 def test_extreme_inputs_give_a_defined_answer(
     rising: ForceModel, displacement: float, rate: float, force: float, cip: float, last: float | None
 ) -> None:
-    for solver in _extreme_solvers(rising):
-        solution = solver.solve(displacement, rate, force, cip, last)
+    for solver in EXTREME_SOLVERS:
+        curve = rising.curve(displacement, rate, cip)
+        solution = solver.solve(curve, force, last)
         assert 100 <= solution.field_mT <= 800
-        assert solution.predicted_force_N == rising.predict_one(displacement, rate, solution.field_mT, cip)
+        assert solution.predicted_force_N == curve.force_N(solution.field_mT)
         assert 0 <= solution.confidence <= 1
         least = rising.predict_one(displacement, rate, 100.0, cip)
         greatest = rising.predict_one(displacement, rate, 800.0, cip)
@@ -195,35 +200,27 @@ def test_extreme_inputs_give_a_defined_answer(
             assert solution.reach is Reach.ABOVE
 
 
-_MADE: dict[int, tuple[FieldSolver, ...]] = {}
-
-
-def _extreme_solvers(model: ForceModel) -> tuple[FieldSolver, ...]:
-    if id(model) not in _MADE:
-        _MADE[id(model)] = (*(nearest(model, step_mT=10.0, dtype=dtype) for dtype in DTYPES),)
-    return _MADE[id(model)]
-
-
 @pytest.mark.parametrize("make", SOLVERS)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
 @pytest.mark.parametrize(
     ("position", "name"),
-    [(0, "displacement_mm"), (1, "rate_mm_s"), (2, "force_N"), (3, "cip_percent"), (4, "field_mT")],
+    [(0, "displacement_mm"), (1, "rate_mm_s"), (2, "force_N"), (3, "cip_percent"), (4, "last_field_mT")],
 )
 def test_inputs_that_are_no_numbers_are_refused(
     rising: ForceModel, make: Callable[..., FieldSolver], value: float, position: int, name: str
 ) -> None:
     point = [0.5, 10.0, 2.0, CIP, 400.0]
     point[position] = value
+    displacement, rate, force, cip, last = point
     with pytest.raises(DomainError, match=name):
-        make(rising).solve(*point)
+        make().solve(rising.curve(displacement, rate, cip), force, last)
 
 
 def test_a_solve_leaves_no_trace_in_the_next(rising: ForceModel) -> None:
-    solver = nearest(rising)
-    first = solver.solve(0.5, 10, 2.5, CIP, 300.0)
-    solver.solve(0.9, 50, 4.0, CIP, 700.0)
-    assert solver.solve(0.5, 10, 2.5, CIP, 300.0) == first
+    solver = nearest()
+    first = solver.solve(rising.curve(0.5, 10, CIP), 2.5, 300.0)
+    solver.solve(rising.curve(0.9, 50, CIP), 4.0, 700.0)
+    assert solver.solve(rising.curve(0.5, 10, CIP), 2.5, 300.0) == first
 
 
 @pytest.mark.parametrize(
@@ -239,31 +236,21 @@ def test_a_solve_leaves_no_trace_in_the_next(rising: ForceModel) -> None:
         ({"step_mT": 701.0}, "step_mT"),
         ({"neighbours": 0}, "neighbours"),
         ({"neighbours": 702}, "neighbours"),
-        ({"dtype": torch.float16}, "dtype"),
+        ({"dtype": np.float16}, "dtype"),
     ],
 )
 def test_parameters_that_cannot_work_are_refused(rising: ForceModel, options: dict[str, object], name: str) -> None:
     with pytest.raises(DomainError, match=name):
-        NearestFieldSearch(rising, **{"field_range_mT": RANGE_MT, "step_mT": 1.0, **options})  # type: ignore[arg-type]
+        NearestFieldSearch(**{"field_range_mT": RANGE_MT, "step_mT": 1.0, **options})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("epsilon", [-1.0, math.nan, math.inf])
 def test_an_epsilon_that_cannot_work_is_refused(rising: ForceModel, epsilon: float) -> None:
     with pytest.raises(DomainError, match="epsilon_N"):
-        linear(rising, epsilon_N=epsilon)
+        linear(epsilon_N=epsilon)
 
 
 def test_the_grid_has_both_ends_and_no_wider_step() -> None:
     grid = field_grid((100.0, 800.0), 3.0)
     assert (grid[0], grid[-1]) == (100.0, 800.0)
     assert 2.9 < np.diff(grid).max() <= 3.0
-
-
-def test_confidence_follows_its_formula(rising: ForceModel) -> None:
-    inside = (0.5, 10.0, 400.0, CIP)
-    assert confidence(rising, inside, 2.0, 2.0) == 1.0
-    assert confidence(rising, inside, 2.0, 2.3) == pytest.approx(math.exp(-20 * 0.3 / 6))
-    assert confidence(rising, (1.25, 10.0, 400.0, CIP), 2.0, 2.0) == pytest.approx(math.exp(-1))
-    assert confidence(rising, (-0.25, 75.0, 400.0, CIP), 2.0, 2.0) == pytest.approx(math.exp(-2))
-    assert confidence(rising, (0.5, 10.0, 400.0, 50.0), 2.0, 2.0) == pytest.approx(math.exp(-1))
-    assert confidence(rising, (LARGEST, 10.0, 400.0, CIP), LARGEST, 0.0) == 0.0

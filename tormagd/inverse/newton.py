@@ -83,8 +83,8 @@ class RisingSearch:
                 if bend_per_mT * step * step <= LOOKED_AT_MT:
                     there_N = curve.force_N(following)
                     evaluations += 1
-                    # the slope holds there, too, if most of the excess is gone, and then tells how near the root is
-                    allowed_N = min(ACCURACY_MT * slope, 0.5 * abs(excess_N))
+                    # where no more than a tenth of the excess is left the slope still holds, and tells how near it is
+                    allowed_N = min(ACCURACY_MT * slope, 0.1 * abs(excess_N))
                     if abs(there_N - force_N) <= max(allowed_N, same_N):
                         return answer(curve, following, force_N, there_N, evaluations, Reach.INSIDE)
             before, field = following - field, following

@@ -155,9 +155,11 @@ class NetworkCurve:
         for shift, by_mT, output in zip(self._shift, network.field, network.output):  # noqa: B905
             exponent = shift + by_mT * field_mT
             if exponent < LARGEST_EXPONENT:
-                opened = 1.0 / (1.0 + math.exp(exponent))
-                total_N += output * opened
-                slope -= output * by_mT * opened * (1.0 - opened)
+                grown = math.exp(exponent)
+                whole = 1.0 + grown
+                part_N = output / whole
+                total_N += part_N
+                slope -= by_mT * part_N * (grown / whole)
         return total_N + network.constant_N, slope
 
     def forces_N(self, fields_mT: Floats) -> Floats:
