@@ -9,7 +9,7 @@ import random
 from collections import deque
 from collections.abc import Callable, Iterable
 from operator import attrgetter
-from typing import Final, final
+from typing import Final, Protocol, final
 
 from firmware_protocol.codec import FUNCTION, DecodeError, Message, Switches, decode, encode
 from firmware_protocol.framing import DELIMITER, FrameDecoder, FramingStatistics, encode_frame
@@ -311,6 +311,24 @@ class MessageDevice:
                 raise ValueError(f"fault {fault.name!r} has no effect defined")
 
 
+class SerialDevice(Protocol):
+    """What a host has of a device behind a serial line: a `VirtualDevice`, or what listens or lies in front of one."""
+
+    @property
+    def messages(self) -> MessageDevice:
+        """The device itself."""
+
+    @property
+    def truth(self) -> Truth:
+        """What really is, at the time of the last call."""
+
+    def receive(self, now_s: float, data: bytes) -> None:
+        """The host writes `data` now."""
+
+    def transmit(self, now_s: float) -> bytes:
+        """The bytes that have come out of the line since the last call."""
+
+
 @final
 class VirtualDevice:
     """The device behind a serial line: bytes in, bytes out, both paced to the baud rate.
@@ -412,4 +430,4 @@ def _stretches(data: bytes) -> list[bytes]:
     if data.find(DELIMITER) == len(data) - 1:  # one frame, as nearly always
         return [data]
     *ended, rest = data.split(DELIMITER)
-    return [*(stretch + DELIMITER for stretch in ended), rest]
+    return [*[stretch + DELIMITER for stretch in ended], rest]
