@@ -19,9 +19,10 @@ from tormagd.closed_loop import ClosedLoop
 from tormagd.config import load_config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
-from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.device import SerialDevice, VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.plant import Truth
 
 FORCE_N = 1.8
 SETTLING_S = 1.0
@@ -119,8 +120,7 @@ class Patient:
     def stuck_state_ms(self) -> float | None:
         """How long the daemon goes on with a device that repeats one State for ever; null for ever."""
         loop = copy.deepcopy(self._armed)
-        stuck = StuckSender(loop.device)
-        loop.device = stuck
+        loop.device = StuckSender(loop.device)  # type: ignore[assignment]
         started_s = loop.now_s
         for _ in range(STUCK_TICKS):
             if loop.tick(_publisher(loop.now_s)).state.safety.faults:
@@ -128,19 +128,29 @@ class Patient:
         return None
 
 
-class StuckSender(VirtualDevice):
-    """A device whose States all repeat its first one; frames, sequence numbers and checksums are right."""
+class StuckSender:
+    """A `SerialDevice` whose States all repeat its first one; frames, sequence numbers and checksums are right."""
 
-    def __init__(self, device: VirtualDevice) -> None:
-        self.__dict__.update(device.__dict__)
+    def __init__(self, device: SerialDevice) -> None:
+        self._device = device
+        self.messages = device.messages
         self._heard = FrameDecoder()
         self._sent = 0
         self._stuck: bytes | None = None
 
+    @property
+    def truth(self) -> Truth:
+        """As the device's own."""
+        return self._device.truth
+
+    def receive(self, now_s: float, data: bytes) -> None:
+        """As the device's own."""
+        self._device.receive(now_s, data)
+
     def transmit(self, now_s: float) -> bytes:
         """As the device's own, with the State replaced."""
         out = b""
-        for function, _, payload in self._heard.feed(super().transmit(now_s)):
+        for function, _, payload in self._heard.feed(self._device.transmit(now_s)):
             if function == FUNCTION[State]:
                 payload = self._stuck = self._stuck or payload
             out += encode_frame(function, self._sent, payload)

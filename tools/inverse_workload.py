@@ -21,8 +21,8 @@ from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.physics.friction import Friction
 from tormagd.physics.inserts import insert
-from tormagd.simulation.static_laws import radial_moment_Tm
 from tormagd.simulation.parameters import PlantParameters
+from tormagd.simulation.static_laws import radial_moment_Tm
 
 Array = npt.NDArray[np.float64]
 

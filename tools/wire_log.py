@@ -34,6 +34,7 @@ from tormagd.control.governor import TimedSetpoint
 from tormagd.simulation.device import DEFAULT_BAUD, VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.plant import Truth
 
 NODE = 1
 READ_BYTES = 4096
@@ -100,21 +101,27 @@ class WireLog:
 Listener = Callable[[float, bytes], None]
 
 
-class TappedDevice(VirtualDevice):
-    """A simulated device whose line is listened to."""
+class TappedDevice:
+    """A simulated device whose line is listened to: a `SerialDevice`."""
 
-    to_device: Listener
-    to_host: Listener
+    def __init__(self, device: VirtualDevice, to_device: Listener, to_host: Listener) -> None:
+        self._device, self._to_device, self._to_host = device, to_device, to_host
+        self.messages = device.messages
+
+    @property
+    def truth(self) -> Truth:
+        """As the device's own."""
+        return self._device.truth
 
     def receive(self, now_s: float, data: bytes) -> None:
         """As the device's own."""
-        self.to_device(now_s, data)
-        super().receive(now_s, data)
+        self._to_device(now_s, data)
+        self._device.receive(now_s, data)
 
     def transmit(self, now_s: float) -> bytes:
         """As the device's own."""
-        data = super().transmit(now_s)
-        self.to_host(now_s, data)
+        data = self._device.transmit(now_s)
+        self._to_host(now_s, data)
         return data
 
 
@@ -122,9 +129,9 @@ def virtual_session(seconds: float, to_device: Listener, to_host: Listener, baud
     """Connects, homes, enables and follows a swinging force for that long, in virtual time; the loop at its end."""
     config = load_config(None)
     core = build_core(config)
-    device = TappedDevice(load_plant("sample_1"), SteadyHand(), seed=1, baud=baud)
-    device.to_device, device.to_host = to_device, to_host
-    loop = ClosedLoop(config, core.stepper, core.planner, device)
+    device = VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1, baud=baud)
+    tapped = TappedDevice(device, to_device, to_host)
+    loop = ClosedLoop(config, core.stepper, core.planner, tapped)  # type: ignore[arg-type]
     loop.arm()
     ticks = round(seconds * config.rates.control_hz)
     for _ in tqdm(range(ticks), desc="virtual session", unit="tick", disable=None):

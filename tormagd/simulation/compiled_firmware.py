@@ -152,9 +152,7 @@ class CompiledFirmware:
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
         """State and Sense of that moment. Raises EncodeError for a current or force that has no step on the wire."""
         payloads = ctypes.create_string_buffer(2 * MAX_PAYLOAD)
-        result: int = _library().tormag_bridge_measurement(
-            self._device, time_s, _seen(sensors), payloads
-        )
+        result: int = _library().tormag_bridge_measurement(self._device, time_s, _seen(sensors), payloads)
         _require_sent(result, sensors)
         return _decoded(State, payloads.raw[:MAX_PAYLOAD]), _decoded(Sense, payloads.raw[MAX_PAYLOAD:])
 

@@ -9,7 +9,7 @@ import random
 from collections import deque
 from collections.abc import Callable, Iterable
 from operator import attrgetter
-from typing import Final, final
+from typing import Final, Protocol, final
 
 from firmware_protocol.codec import FUNCTION, DecodeError, Message, Switches, decode, encode
 from firmware_protocol.framing import DELIMITER, FrameDecoder, FramingStatistics, encode_frame
@@ -81,7 +81,9 @@ class MessageDevice:
     """
 
     __slots__ = (
+        "_answer_s",
         "_answers",
+        "_arrival_s",
         "_boot",
         "_boot_s",
         "_closed_m",
@@ -137,6 +139,9 @@ class MessageDevice:
         self._closed_m = parameters.assumed.closed_mm * 1e-3
         self._inbox: deque[Packet] = deque()
         self._answers: deque[Reply] = deque()
+        # when the first of each is due; infinite where there is none
+        self._arrival_s = math.inf
+        self._answer_s = math.inf
         self._deaf = False
         self._output: Output = OFF
         self._stuck_left: int | None = None
@@ -154,22 +159,28 @@ class MessageDevice:
 
     def receive(self, time_s: float, function: int, payload: bytes) -> None:
         """Queue a payload that arrives at that time. Raises ValueError for one before those already queued."""
-        latest_s = self._inbox[-1].time_s if self._inbox else self._time_s
+        waiting = self._arrival_s < math.inf
+        latest_s = self._inbox[-1].time_s if waiting else self._time_s
         if not latest_s <= time_s < math.inf:
             raise ValueError(f"time_s = {time_s}: allowed is from {latest_s} on")
         self._inbox.append(Packet(time_s, function, payload))
+        if not waiting:
+            self._arrival_s = time_s
 
     def advance(self, now_s: float) -> None:
         """Let time pass until `now_s`. Raises ValueError for a time before the last one."""
         if not self._time_s <= now_s < math.inf:
             raise ValueError(f"now_s = {now_s}: allowed is from {self._time_s} on")
-        inbox, answers = self._inbox, self._answers
         while (event_s := self.next_event_s) <= now_s:
             self._pass_time(event_s)
-            if inbox and inbox[0].time_s <= event_s:
-                self._deliver(event_s, inbox.popleft())
-            elif answers and answers[0].time_s <= event_s:
-                self._send_answer(event_s, answers.popleft().answer)
+            if self._arrival_s <= event_s:
+                packet = self._inbox.popleft()
+                self._arrival_s = self._inbox[0].time_s if self._inbox else math.inf
+                self._deliver(event_s, packet)
+            elif self._answer_s <= event_s:
+                reply = self._answers.popleft()
+                self._answer_s = self._answers[0].time_s if self._answers else math.inf
+                self._send_answer(event_s, reply.answer)
             else:
                 self._tick(event_s)
             if self.firmware.output is not self._output:
@@ -180,10 +191,10 @@ class MessageDevice:
     def next_event_s(self) -> float:
         """When something will happen next, at the latest the next tick of the firmware."""
         event_s = self._tick_due_s
-        if self._inbox and (arrival_s := self._inbox[0].time_s) < event_s:
-            event_s = arrival_s
-        if self._answers and (answer_s := self._answers[0].time_s) < event_s:
-            event_s = answer_s
+        if self._arrival_s < event_s:
+            event_s = self._arrival_s
+        if self._answer_s < event_s:
+            event_s = self._answer_s
         return event_s if event_s > self._time_s else self._time_s
 
     def _pass_time(self, time_s: float) -> None:
@@ -224,10 +235,13 @@ class MessageDevice:
             return
         answer = self.firmware.receive(self._device_time_s(time_s), message, self._sensors())
         if answer is not NO_ANSWER:
-            answers = self._answers
             answer_s = time_s + self._jitter_s * self._jitter.random()
-            # none overtakes the one before it
-            answers.append(Reply(max(answer_s, answers[-1].time_s) if answers else answer_s, answer))
+            if self._answer_s == math.inf:
+                self._answer_s = answer_s
+            else:
+                # none overtakes the one before it
+                answer_s = max(answer_s, self._answers[-1].time_s)
+            self._answers.append(Reply(answer_s, answer))
 
     def _send_answer(self, time_s: float, answer: Answer) -> None:
         if answer is IDENTITY:
@@ -283,6 +297,7 @@ class MessageDevice:
             case "reset":
                 self.firmware = self._boot(self.parameters)
                 self._answers.clear()
+                self._answer_s = math.inf
                 (left_rad, _), (right_rad, _) = self.plant.shafts
                 self._left_boot_counts, self._right_boot_counts = self._encoders(left_rad, right_rad)
                 self._boot_s = time_s
@@ -294,6 +309,24 @@ class MessageDevice:
                 self._switch()
             case _:
                 raise ValueError(f"fault {fault.name!r} has no effect defined")
+
+
+class SerialDevice(Protocol):
+    """What a host has of a device behind a serial line: a `VirtualDevice`, or what listens or lies in front of one."""
+
+    @property
+    def messages(self) -> MessageDevice:
+        """The device itself."""
+
+    @property
+    def truth(self) -> Truth:
+        """What really is, at the time of the last call."""
+
+    def receive(self, now_s: float, data: bytes) -> None:
+        """The host writes `data` now."""
+
+    def transmit(self, now_s: float) -> bytes:
+        """The bytes that have come out of the line since the last call."""
 
 
 @final
@@ -397,4 +430,4 @@ def _stretches(data: bytes) -> list[bytes]:
     if data.find(DELIMITER) == len(data) - 1:  # one frame, as nearly always
         return [data]
     *ended, rest = data.split(DELIMITER)
-    return [*(stretch + DELIMITER for stretch in ended), rest]
+    return [*[stretch + DELIMITER for stretch in ended], rest]
