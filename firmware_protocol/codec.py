@@ -7,7 +7,7 @@ CRC-8 of the protected messages. This module is its face, and says in words what
 
 import struct
 from operator import index
-from typing import Final
+from typing import Any, Final
 
 from firmware_protocol import wire
 from firmware_protocol.checksum import crc8
@@ -126,9 +126,9 @@ def _misfit(message: Message) -> EncodeError:
     return EncodeError(f"{message!r} does not fit the wire")
 
 
-def _fits(signal: Signal, value: float) -> bool:
+def _fits(signal: Signal, value: Any) -> bool:
     try:
-        step = round(value / signal.scale) if signal.type is float else index(value)  # type: ignore[arg-type]
+        step = round(value / signal.scale) if signal.type is float else index(value)
     except (TypeError, ValueError, OverflowError):  # not a number, NaN, infinite
         return False
     return signal.wraps or signal.lowest <= step <= signal.highest

@@ -39,6 +39,7 @@ from tormagd.hardware.link import (
     DeviceLink,
     LinkState,
 )
+from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import DeviceRequest
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
@@ -345,8 +346,10 @@ def test_a_measurement_takes_a_status_a_sense_and_a_state() -> None:
     link.receive(0.7, State(-3.0, -4.0, 0.25, 2))
     measurement = link.measurement
     assert measurement is not None
-    assert measurement[:9] == (0, 0.7, 0.25, -3.0, -4.0, 0.1, 0.2, 0.3, 0.0)
-    assert (measurement.supply_V, measurement.mode) == (11.5, DeviceMode.IDLE)
+    assert measurement == Measurement(
+        0, 0.7, 0.25, -3.0, -4.0, 0.1, 0.2, 0.3, 0.0, DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 11.5
+    )
+    assert link.measurement is measurement
     assert link.age_s(0.8) == pytest.approx(0.1)
 
 
