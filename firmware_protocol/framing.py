@@ -22,7 +22,8 @@ HEADER_LENGTH: Final = 2
 MAX_PAYLOAD: Final = 8
 MAX_ENCODED: Final = 1 + HEADER_LENGTH + MAX_PAYLOAD + CRC_LENGTH
 """Longest frame before its delimiter; under 254 bytes, COBS adds exactly one."""
-_DISTANCES: Final = [bytes((length + 1,)) for length in range(254)]
+_BYTES: Final = [bytes((byte,)) for byte in range(256)]
+_DISTANCES: Final = _BYTES[1:-1]
 """What stands before a run of so many bytes."""
 
 
@@ -70,18 +71,24 @@ class FramingStatistics(Value):
 
 def cobs_encode(data: bytes) -> bytes:
     """`data` (under 254 bytes) without zeros: each zero, and one before the start, becomes the distance to the next."""
-    return b"".join([_DISTANCES[len(run)] + run for run in data.split(DELIMITER)])
+    encoded = b""
+    for run in data.split(DELIMITER):
+        encoded += _DISTANCES[len(run)] + run
+    return encoded
 
 
 def cobs_decode(data: bytes) -> bytes | None:
     """Inverse of `cobs_encode` for `data` without zeros; None if the distances do not end where the data does."""
-    runs = []
-    position = 0
-    while position < len(data):
-        end = position + data[position]
-        runs.append(data[position + 1 : end])
+    length = len(data)
+    if length == 0:
+        return b""
+    end = data[0]
+    decoded = data[1:end]
+    while end < length:
         position = end
-    return DELIMITER.join(runs) if position == len(data) else None
+        end += data[position]
+        decoded += DELIMITER + data[position + 1 : end]
+    return decoded if end == length else None
 
 
 def encode_frame(function: int, sequence: int, payload: bytes) -> bytes:
@@ -91,7 +98,7 @@ def encode_frame(function: int, sequence: int, payload: bytes) -> bytes:
             f"frame of function {function}, sequence {sequence}, {len(payload)} bytes: "
             f"allowed are 0 to 255, 0 to 255, 0 to {MAX_PAYLOAD}"
         )
-    body = bytes((function, sequence)) + payload
+    body = _BYTES[function] + _BYTES[sequence] + payload
     crc = crc_hqx(body, CRC_INITIAL) ^ CRC_FINAL_XOR
     return cobs_encode(body + crc.to_bytes(CRC_LENGTH, "big")) + DELIMITER
 
