@@ -7,10 +7,10 @@ receiver is back at the next zero. The sequence counts the frames of one directi
 """
 
 from binascii import crc_hqx
-from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, final
 
 from firmware_protocol.codec import EncodeError
+from firmware_protocol.value import Value
 
 DELIMITER: Final = b"\x00"
 CRC_INITIAL: Final = 0xFFFF
@@ -22,49 +22,73 @@ HEADER_LENGTH: Final = 2
 MAX_PAYLOAD: Final = 8
 MAX_ENCODED: Final = 1 + HEADER_LENGTH + MAX_PAYLOAD + CRC_LENGTH
 """Longest frame before its delimiter; under 254 bytes, COBS adds exactly one."""
-_DISTANCES: Final = [bytes((length + 1,)) for length in range(254)]
+_BYTES: Final = [bytes((byte,)) for byte in range(256)]
+_DISTANCES: Final = _BYTES[1:-1]
 """What stands before a run of so many bytes."""
 
 
-class Frame(NamedTuple):
+@final
+class Frame(Value):
     """One frame that arrived whole. Whether its payload is a message is for `codec.decode` to say."""
 
-    function: int
-    sequence: int
-    payload: bytes
+    __match_args__ = ("function", "sequence", "payload")
+    __slots__ = __match_args__
+
+    def __init__(self, function: int, sequence: int, payload: bytes) -> None:
+        self.function: Final = function
+        self.sequence: Final = sequence
+        self.payload: Final = payload
 
 
-@dataclass(slots=True)
-class FramingStatistics:
-    """What a FrameDecoder has seen since it was made."""
+@final
+class FramingStatistics(Value):
+    """What a FrameDecoder has seen since it was made. It counts on; a copy does not."""
 
-    bytes: int = 0
-    frames: int = 0
-    """Frames returned by `feed`."""
-    corrupt: int = 0
-    """Stretches between two delimiters that were not a frame."""
-    lost: int = 0
-    """Frames missing from the sequence, those among them that arrived corrupt included."""
-    repeated: int = 0
-    """Frames with the sequence number of the frame before."""
-    resynchronisations: int = 0
-    """Times a frame was found again after something corrupt."""
+    __match_args__ = ("bytes", "frames", "corrupt", "lost", "repeated", "resynchronisations")
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        bytes: int = 0,
+        frames: int = 0,
+        corrupt: int = 0,
+        lost: int = 0,
+        repeated: int = 0,
+        resynchronisations: int = 0,
+    ) -> None:
+        self.bytes = bytes
+        self.frames = frames
+        """Frames returned by `feed`."""
+        self.corrupt = corrupt
+        """Stretches between two delimiters that were not a frame."""
+        self.lost = lost
+        """Frames missing from the sequence, those among them that arrived corrupt included."""
+        self.repeated = repeated
+        """Frames with the sequence number of the frame before."""
+        self.resynchronisations = resynchronisations
+        """Times a frame was found again after something corrupt."""
 
 
 def cobs_encode(data: bytes) -> bytes:
     """`data` (under 254 bytes) without zeros: each zero, and one before the start, becomes the distance to the next."""
-    return b"".join([_DISTANCES[len(run)] + run for run in data.split(DELIMITER)])
+    encoded = b""
+    for run in data.split(DELIMITER):
+        encoded += _DISTANCES[len(run)] + run
+    return encoded
 
 
 def cobs_decode(data: bytes) -> bytes | None:
     """Inverse of `cobs_encode` for `data` without zeros; None if the distances do not end where the data does."""
-    runs = []
-    position = 0
-    while position < len(data):
-        end = position + data[position]
-        runs.append(data[position + 1 : end])
+    length = len(data)
+    if length == 0:
+        return b""
+    end = data[0]
+    decoded = data[1:end]
+    while end < length:
         position = end
-    return DELIMITER.join(runs) if position == len(data) else None
+        end += data[position]
+        decoded += DELIMITER + data[position + 1 : end]
+    return decoded if end == length else None
 
 
 def encode_frame(function: int, sequence: int, payload: bytes) -> bytes:
@@ -74,17 +98,20 @@ def encode_frame(function: int, sequence: int, payload: bytes) -> bytes:
             f"frame of function {function}, sequence {sequence}, {len(payload)} bytes: "
             f"allowed are 0 to 255, 0 to 255, 0 to {MAX_PAYLOAD}"
         )
-    body = bytes((function, sequence)) + payload
+    body = _BYTES[function] + _BYTES[sequence] + payload
     crc = crc_hqx(body, CRC_INITIAL) ^ CRC_FINAL_XOR
     return cobs_encode(body + crc.to_bytes(CRC_LENGTH, "big")) + DELIMITER
 
 
+@final
 class FrameDecoder:
     """Takes a byte stream in pieces of any size and gives the frames in it.
 
     Between calls it holds at most one frame's worth of bytes. A frame that repeats the one before it byte for byte is
     counted and not returned; one that repeats only the sequence number comes from a sender that started anew, and is.
     """
+
+    __slots__ = ("_last", "_pending", "_synchronised", "statistics")
 
     def __init__(self) -> None:
         self.statistics = FramingStatistics()
@@ -95,15 +122,20 @@ class FrameDecoder:
     def feed(self, data: bytes) -> list[Frame]:
         """The frames that `data` completes, in order. Never raises on content."""
         self.statistics.bytes += len(data)
-        *ended, rest = data.split(DELIMITER)
-        frames = []
-        for stretch in ended:
-            encoded = self._pending + stretch
-            self._pending = b""
-            if encoded and (frame := self._accept(encoded)) is not None:
-                frames.append(frame)
-        # One byte over the longest frame is kept, enough to know it for too long when its end comes.
-        self._pending = (self._pending + rest[: MAX_ENCODED + 1])[: MAX_ENCODED + 1]
+        stretches = data.split(DELIMITER)
+        rest = stretches.pop()
+        frames: list[Frame] = []
+        for stretch in stretches:
+            if self._pending:
+                stretch = self._pending + stretch
+                self._pending = b""
+            if stretch:
+                frame = self._accept(stretch)
+                if frame is not None:
+                    frames.append(frame)
+        if rest:
+            # One byte over the longest frame is kept, enough to know it for too long when its end comes.
+            self._pending = (self._pending + rest[: MAX_ENCODED + 1])[: MAX_ENCODED + 1]
         return frames
 
     def _accept(self, encoded: bytes) -> Frame | None:
@@ -116,12 +148,13 @@ class FrameDecoder:
         if not self._synchronised:
             statistics.resynchronisations += 1
             self._synchronised = True
-        last, self._last = self._last, frame
+        last = self._last
+        self._last = frame
         if last is not None:
             advance = (frame.sequence - last.sequence) % 256
             if advance == 0:
                 statistics.repeated += 1
-                if frame == last:
+                if frame.function == last.function and frame.payload == last.payload:
                     return None
             else:
                 statistics.lost += advance - 1

@@ -1,4 +1,4 @@
-"""Generate `layouts.py`, the message tables of `README.md`, the C codec and the golden vectors from `tormag.dbc`.
+"""Generate the Python modules, the message tables of `README.md`, the C codec and the golden vectors from `tormag.dbc`.
 
 `python -m firmware_protocol.generate` writes them; with `--check` nothing is written, and the exit code is 1, with the
 difference on stdout, if what is committed is not what the DBC gives.
@@ -7,75 +7,16 @@ difference on stdout, if what is committed is not what the DBC gives.
 import argparse
 import difflib
 import sys
-import textwrap
 from pathlib import Path
 from typing import Final
 
 from firmware_protocol.c.source import c_files
-from firmware_protocol.dbc import DBC, MessageSource, Schema, SchemaError, SignalSource, read_schema
+from firmware_protocol.dbc import DBC, Schema, SchemaError, SignalSource, read_schema
 from firmware_protocol.golden import vector_files
+from firmware_protocol.python_source import python_files
 
 TABLE_BEGIN: Final = "<!-- generated from tormag.dbc: begin -->"
 TABLE_END: Final = "<!-- generated from tormag.dbc: end -->"
-TEXT_WIDTH: Final = 110
-
-
-def python_source(schema: Schema) -> str:
-    """The text of layouts.py, as `ruff format` would leave it."""
-    blocks = [
-        '"""Messages, enumerations and byte layouts. Generated from tormag.dbc; to change it, see `generate.py`."""\n\n'
-        "from enum import STRICT, IntEnum, IntFlag\n"
-        "from typing import Final, NamedTuple\n\n"
-        "from firmware_protocol.schema import Layout, Signal\n\n"
-        f"PROTOCOL_VERSION: Final = {schema.version}\n"
-        f"SCHEMA_HASH: Final = 0x{schema.schema_hash():08X}\n"
-    ]
-    enumerations = {s.type_name: s for message in schema.messages for s in message.signals if s.choices}
-    blocks += [_enumeration_source(signal) for signal in enumerations.values()]
-    blocks += [_message_source(message) for message in schema.messages]
-    names = " | ".join(message.name for message in schema.messages)
-    layouts = "".join(_layout_source(message) for message in schema.messages)
-    blocks.append(f"Message = {names}\n\nLAYOUTS: Final = (\n{layouts})\n")
-    return "\n\n".join(blocks)
-
-
-def _enumeration_source(signal: SignalSource) -> str:
-    base = "IntFlag, boundary=STRICT" if signal.kind == "Flags" else "IntEnum"
-    members = "".join(f"    {name} = {value}\n" for value, name in signal.choices.items())
-    return f"class {signal.type_name}({base}):\n{_docstring(signal.comment)}\n{members}"
-
-
-def _message_source(message: MessageSource) -> str:
-    fields = []
-    for signal in message.fields:
-        fields += [f"    # {line}\n" for line in textwrap.wrap(signal.comment, TEXT_WIDTH)]
-        fields.append(f"    {signal.name}: {signal.python_type}\n")
-    heading = f"{message.sender} -> {message.receiver}. {message.comment}"
-    return f"class {message.name}(NamedTuple):\n{_docstring(heading)}\n{''.join(fields)}"
-
-
-def _docstring(text: str) -> str:
-    lines = textwrap.wrap(text, TEXT_WIDTH)
-    closing = '"""' if len(lines) == 1 else '\n    """'
-    return '    """' + "\n    ".join(lines) + closing + "\n"
-
-
-def _layout_source(message: MessageSource) -> str:
-    signals = [
-        f'Signal("{s.name}", {s.python_type}, {_number(s.scale)}, {_number(s.minimum)}, {_number(s.maximum)}'
-        f"{', wraps=True' if s.kind == 'Wrapping' else ''}),"
-        for s in message.fields
-    ]
-    body = signals[0] if len(signals) == 1 else "\n            " + "\n            ".join(signals) + "\n        "
-    code = "<" + "".join(signal.struct_code for signal in message.signals)
-    return (
-        f"    Layout(\n        message={message.name},\n        function={message.function},\n"
-        f'        format="{code}",\n        protected={message.protected},\n        signals=({body}),\n    ),\n'
-    )
-
-
-def _number(value: float) -> str:
-    return str(int(value)) if value.is_integer() else repr(value)
 
 
 def markdown_tables(schema: Schema) -> str:
@@ -114,7 +55,8 @@ def generated_files(room: Path) -> dict[Path, str]:
     _, end, after = rest.partition(TABLE_END)
     if not (begin and end):
         raise SchemaError(f"README.md: the markers {TABLE_BEGIN!r} and {TABLE_END!r} are missing")
-    files = {room / "layouts.py": python_source(schema), room / "README.md": before + markdown_tables(schema) + after}
+    files = {room / name: text for name, text in python_files(schema).items()}
+    files |= {room / "README.md": before + markdown_tables(schema) + after}
     files |= {room / "c" / name: text for name, text in c_files(schema, room / DBC.name).items()}
     return files | {room / "vectors" / name: text for name, text in vector_files(schema, room / DBC.name).items()}
 

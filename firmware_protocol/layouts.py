@@ -1,178 +1,191 @@
-"""Messages, enumerations and byte layouts. Generated from tormag.dbc; to change it, see `generate.py`."""
+"""Messages and byte layouts. Generated from tormag.dbc; to change it, see `generate.py`."""
 
-from enum import STRICT, IntEnum, IntFlag
-from typing import Final, NamedTuple
+from typing import Final, final
 
+from firmware_protocol.enumerations import DeviceFault, DeviceMode, DriveMode, Switches
 from firmware_protocol.schema import Layout, Signal
+from firmware_protocol.value import Value
 
 PROTOCOL_VERSION: Final = 1
 SCHEMA_HASH: Final = 0x4B3A3191
 
 
-class DriveMode(IntEnum):
-    """OFF is a heartbeat that keeps replies coming; RUN asks for the duties. OFF after RUN makes the device open the
-    gap.
-    """
-
-    OFF = 0
-    RUN = 1
-
-
-class DeviceMode(IntEnum):
-    """Operating mode of the device."""
-
-    IDLE = 0
-    RUN = 1
-    HOMING = 2
-    RETRACTING = 3
-    LATCHED = 4
-
-
-class Switches(IntFlag, boundary=STRICT):
-    """Bit mask: end switches that are closed, and whether the zero of the encoders is valid."""
-
-    LEFT_OPEN = 1
-    RIGHT_OPEN = 2
-    LEFT_CLOSED = 4
-    RIGHT_CLOSED = 8
-    HOMED = 16
-
-
-class DeviceFault(IntFlag, boundary=STRICT):
-    """Bit mask: latched faults."""
-
-    COMMAND_TIMEOUT = 1
-    UNCOMMANDED_MOTION = 2
-    OVERCURRENT = 4
-    END_STOP = 8
-    HOMING_FAILED = 16
-    SUPPLY = 32
-    TEMPERATURE = 64
-    SCHEMA_MISMATCH = 128
-    SKEW = 256
-    RETRACT_FAILED = 512
-
-
-class Retract(NamedTuple):
+@final
+class Retract(Value):
     """Host -> Device. Open the gap at the device's bounded rate, then switch the drives off. Sent on event, repeated
     until Status carries its nonce.
     """
 
-    # New for every command, equal in its repetitions: the device acts on a nonce once.
-    nonce: int
+    __match_args__ = ("nonce",)
+    __slots__ = __match_args__
+
+    def __init__(self, nonce: int) -> None:
+        # New for every command, equal in its repetitions: the device acts on a nonce once.
+        self.nonce: Final = nonce
 
 
-class Drive(NamedTuple):
+@final
+class Drive(Value):
     """Host -> Device. Motor duties. Every 1 ms; each accepted one is answered by State and Sense. In RUN, 50 ms
     without a valid one makes the device open the gap and latch COMMAND_TIMEOUT.
     """
 
-    # Share of the supply voltage at the left motor; positive opens.
-    left_duty: float
-    # Share of the supply voltage at the right motor; positive opens.
-    right_duty: float
-    # OFF is a heartbeat that keeps replies coming; RUN asks for the duties. OFF after RUN makes the device open the
-    # gap.
-    mode: DriveMode
-    # One more for each Drive, modulo 256. A Drive whose counter did not change is not accepted.
-    counter: int
+    __match_args__ = ("left_duty", "right_duty", "mode", "counter")
+    __slots__ = __match_args__
+
+    def __init__(self, left_duty: float, right_duty: float, mode: DriveMode, counter: int) -> None:
+        # Share of the supply voltage at the left motor; positive opens.
+        self.left_duty: Final = left_duty
+        # Share of the supply voltage at the right motor; positive opens.
+        self.right_duty: Final = right_duty
+        # OFF is a heartbeat that keeps replies coming; RUN asks for the duties. OFF after RUN makes the device open
+        # the gap.
+        self.mode: Final = mode
+        # One more for each Drive, modulo 256. A Drive whose counter did not change is not accepted.
+        self.counter: Final = counter
 
 
-class State(NamedTuple):
+@final
+class State(Value):
     """Device -> Host. Where the carriages are. Sent at once for each accepted Drive, so every 1 ms."""
 
-    # Left screw relative to home (8 mm lead, 4480 counts a turn): 0 at the open end, negative towards closed.
-    # Counts modulo 2^16; the host unwraps.
-    left_position_mm: float
-    # Right screw relative to home, as the left.
-    right_position_mm: float
-    # When the positions were latched, on the device's clock, modulo 0.65536 s.
-    device_time_s: float
-    # One more for each State, modulo 256.
-    counter: int
+    __match_args__ = ("left_position_mm", "right_position_mm", "device_time_s", "counter")
+    __slots__ = __match_args__
+
+    def __init__(self, left_position_mm: float, right_position_mm: float, device_time_s: float, counter: int) -> None:
+        # Left screw relative to home (8 mm lead, 4480 counts a turn): 0 at the open end, negative towards closed.
+        # Counts modulo 2^16; the host unwraps.
+        self.left_position_mm: Final = left_position_mm
+        # Right screw relative to home, as the left.
+        self.right_position_mm: Final = right_position_mm
+        # When the positions were latched, on the device's clock, modulo 0.65536 s.
+        self.device_time_s: Final = device_time_s
+        # One more for each State, modulo 256.
+        self.counter: Final = counter
 
 
-class Sense(NamedTuple):
+@final
+class Sense(Value):
     """Device -> Host. Currents, force and handle, sampled with the State it follows. Sent at once for each accepted
     Drive, so every 1 ms.
     """
 
-    # Left motor current; positive drives towards open.
-    left_current_A: float
-    # Right motor current; positive drives towards open.
-    right_current_A: float
-    # Friction force at the roller, positive against a positive motion of the handle.
-    force_N: float
-    # Roller surface position: 16384 counts a turn at 20 mm radius, counts modulo 2^16 (four turns); the host
-    # unwraps.
-    handle_position_mm: float
+    __match_args__ = ("left_current_A", "right_current_A", "force_N", "handle_position_mm")
+    __slots__ = __match_args__
+
+    def __init__(
+        self, left_current_A: float, right_current_A: float, force_N: float, handle_position_mm: float
+    ) -> None:
+        # Left motor current; positive drives towards open.
+        self.left_current_A: Final = left_current_A
+        # Right motor current; positive drives towards open.
+        self.right_current_A: Final = right_current_A
+        # Friction force at the roller, positive against a positive motion of the handle.
+        self.force_N: Final = force_N
+        # Roller surface position: 16384 counts a turn at 20 mm radius, counts modulo 2^16 (four turns); the host
+        # unwraps.
+        self.handle_position_mm: Final = handle_position_mm
 
 
-class Clear(NamedTuple):
+@final
+class Clear(Value):
     """Host -> Device. Clear latched faults whose cause is gone. Sent on event, repeated until Status carries its
     nonce.
     """
 
-    # As in Retract.
-    nonce: int
+    __match_args__ = ("nonce",)
+    __slots__ = __match_args__
+
+    def __init__(self, nonce: int) -> None:
+        # As in Retract.
+        self.nonce: Final = nonce
 
 
-class Home(NamedTuple):
+@final
+class Home(Value):
     """Host -> Device. Find the open end and zero the encoders there. Sent on event, repeated until Status carries
     its nonce.
     """
 
-    # As in Retract.
-    nonce: int
+    __match_args__ = ("nonce",)
+    __slots__ = __match_args__
+
+    def __init__(self, nonce: int) -> None:
+        # As in Retract.
+        self.nonce: Final = nonce
 
 
-class Status(NamedTuple):
+@final
+class Status(Value):
     """Device -> Host. What the device is doing and what is wrong. Every 20 ms on the device's own clock, host or no
     host.
     """
 
-    # Operating mode of the device.
-    mode: DeviceMode
-    # Bit mask: end switches that are closed, and whether the zero of the encoders is valid.
-    switches: Switches
-    # Bit mask: latched faults.
-    faults: DeviceFault
-    # Temperature at the elastomer's mount.
-    temperature_C: float
-    # Supply voltage at the motor bridges.
-    supply_V: float
-    # Counter of the last accepted Drive.
-    drive_counter: int
-    # Nonce of the last accepted command.
-    command_nonce: int
+    __match_args__ = ("mode", "switches", "faults", "temperature_C", "supply_V", "drive_counter", "command_nonce")
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        mode: DeviceMode,
+        switches: Switches,
+        faults: DeviceFault,
+        temperature_C: float,
+        supply_V: float,
+        drive_counter: int,
+        command_nonce: int,
+    ) -> None:
+        # Operating mode of the device.
+        self.mode: Final = mode
+        # Bit mask: end switches that are closed, and whether the zero of the encoders is valid.
+        self.switches: Final = switches
+        # Bit mask: latched faults.
+        self.faults: Final = faults
+        # Temperature at the elastomer's mount.
+        self.temperature_C: Final = temperature_C
+        # Supply voltage at the motor bridges.
+        self.supply_V: Final = supply_V
+        # Counter of the last accepted Drive.
+        self.drive_counter: Final = drive_counter
+        # Nonce of the last accepted command.
+        self.command_nonce: Final = command_nonce
 
 
-class Hello(NamedTuple):
+@final
+class Hello(Value):
     """Host -> Device. First message of a host; answered by Identity. Sent on connecting and after a device reset,
     repeated until answered.
     """
 
-    # First four bytes, big-endian, of the SHA-256 of this file's canonical layout, as the host knows it.
-    schema_hash: int
-    # Version of the rules around the messages: framing, timing, meaning.
-    protocol_version: int
-    # As in Retract.
-    nonce: int
+    __match_args__ = ("schema_hash", "protocol_version", "nonce")
+    __slots__ = __match_args__
+
+    def __init__(self, schema_hash: int, protocol_version: int, nonce: int) -> None:
+        # First four bytes, big-endian, of the SHA-256 of this file's canonical layout, as the host knows it.
+        self.schema_hash: Final = schema_hash
+        # Version of the rules around the messages: framing, timing, meaning.
+        self.protocol_version: Final = protocol_version
+        # As in Retract.
+        self.nonce: Final = nonce
 
 
-class Identity(NamedTuple):
+@final
+class Identity(Value):
     """Device -> Host. Answer to Hello. A device that was compiled from another schema latches SCHEMA_MISMATCH and
     refuses Drive RUN.
     """
 
-    # As in Hello, as the device knows it.
-    schema_hash: int
-    # Firmware version, major.
-    firmware_major: int
-    # Firmware version, minor.
-    firmware_minor: int
-    # Serial number of the device.
-    serial_number: int
+    __match_args__ = ("schema_hash", "firmware_major", "firmware_minor", "serial_number")
+    __slots__ = __match_args__
+
+    def __init__(self, schema_hash: int, firmware_major: int, firmware_minor: int, serial_number: int) -> None:
+        # As in Hello, as the device knows it.
+        self.schema_hash: Final = schema_hash
+        # Firmware version, major.
+        self.firmware_major: Final = firmware_major
+        # Firmware version, minor.
+        self.firmware_minor: Final = firmware_minor
+        # Serial number of the device.
+        self.serial_number: Final = serial_number
 
 
 Message = Retract | Drive | State | Sense | Clear | Home | Status | Hello | Identity

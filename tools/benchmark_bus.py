@@ -128,8 +128,8 @@ class Meter:
     def __call__(self, time_s: float, data: bytes) -> None:
         """Takes the bytes that passed at that time."""
         self.serial.append((time_s, SERIAL_BITS * len(data)))
-        for function, _, payload in self._decoder.feed(data):
-            self.can.append((time_s, can_bits(can_identifier(function), payload)))
+        for frame in self._decoder.feed(data):
+            self.can.append((time_s, can_bits(can_identifier(frame.function), frame.payload)))
 
 
 def measured(seconds: float) -> dict[str, dict[str, float]]:

@@ -150,10 +150,11 @@ class StuckSender:
     def transmit(self, now_s: float) -> bytes:
         """As the device's own, with the State replaced."""
         out = b""
-        for function, _, payload in self._heard.feed(self._device.transmit(now_s)):
-            if function == FUNCTION[State]:
+        for frame in self._heard.feed(self._device.transmit(now_s)):
+            payload = frame.payload
+            if frame.function == FUNCTION[State]:
                 payload = self._stuck = self._stuck or payload
-            out += encode_frame(function, self._sent, payload)
+            out += encode_frame(frame.function, self._sent, payload)
             self._sent = (self._sent + 1) % 256
         return out
 

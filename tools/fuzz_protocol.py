@@ -189,7 +189,7 @@ class Fuzz:
         )
         data = flatten(_between(wire, seal(clean), burst))
         frames, statistics = receive_stream(data, int(rng.choice(PIECES)))
-        received = [bytes((function, sequence)) + payload for function, sequence, payload in frames]
+        received = [bytes((frame.function, frame.sequence)) + frame.payload for frame in frames]
         clean_sent, known = cut_up(clean), set(received)
         self.runs += runs
         self.clean_frames += 2 * runs

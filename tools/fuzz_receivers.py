@@ -2,7 +2,6 @@
 
 import subprocess
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple
 from itertools import zip_longest
 
 from firmware_protocol.c.build import BuildError, Target, build
@@ -112,7 +111,8 @@ class SanitizedFirmware:
         stream = [f"stream {data[at : at + LINE_BYTES].hex()}" for at in range(0, len(data), LINE_BYTES)]
         answers = self._ask([*stream, *(f"decode {function} {_hexed(payload)}" for function, payload in payloads)])
         received: list[str] = []
-        counts = ["0"] * len(astuple(statistics))
+        counted = [str(getattr(statistics, name)) for name in FramingStatistics.__match_args__]
+        counts = ["0"] * len(counted)
         for answer in answers[: len(stream)]:
             words = answer.split(" ")
             received += words[: -len(counts)]
@@ -123,7 +123,6 @@ class SanitizedFirmware:
             "refused" if message is None else f"ok {_hexed(payload)}"
             for (_, payload), message in zip(payloads, messages, strict=True)
         ]
-        counted = [str(count) for count in astuple(statistics)]
         return _unequal(received, expected) + _unequal(counts, counted) + _unequal(verdicts, ours)
 
     def _ask(self, requests: Sequence[str]) -> list[str]:

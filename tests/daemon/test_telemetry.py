@@ -39,7 +39,7 @@ MEASUREMENT = Measurement(
     temperature_C=25.0,
     supply_V=12.1,
 )
-LATE = MEASUREMENT._replace(delay_s=0.031)
+LATE = MEASUREMENT.replaced(delay_s=0.031)
 
 
 def telemetry(measurement: Measurement | None, state: StepState, is_busy: bool = False) -> Telemetry:
@@ -69,7 +69,7 @@ def test_a_driven_device() -> None:
 
 
 def test_positions_before_homing_are_not_known() -> None:
-    lost = MEASUREMENT._replace(switches=Switches(0), mode=DeviceMode.HOMING)
+    lost = MEASUREMENT.replaced(switches=Switches(0), mode=DeviceMode.HOMING)
     published = telemetry(lost, StepState(1.0, SafetyState(), first_estimate(lost, 47.5)), is_busy=True)
     assert (published.gap_mm, published.measured_jp, published.skew_mm, published.gap_setpoint_mm) == (None,) * 4
     assert (published.is_homed, published.is_busy) == (False, True)

@@ -2,6 +2,7 @@
 
 import math
 import random
+import struct
 from typing import Any
 
 import cantools
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from firmware_protocol import codec
 from firmware_protocol.codec import (
     FUNCTION,
     SCHEMA_HASH,
@@ -45,6 +47,8 @@ DRIVE = Drive(left_duty=0.5, right_duty=-0.25, mode=DriveMode.RUN, counter=7)
 STATE = State(left_position_mm=-12.5, right_position_mm=-3.25, device_time_s=0.5, counter=255)
 SENSE = Sense(left_current_A=1.5, right_current_A=-0.5, force_N=3.25, handle_position_mm=100.0)
 STATUS = Status(DeviceMode.RUN, Switches.HOMED, DeviceFault(0), 25.0, 12.0, 7, 3)
+US = Identity(SCHEMA_HASH, 1, 0, 77)
+IS_COMPILED = not str(codec.__file__).endswith(".py")
 by_name = pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.message.__name__)
 
 
@@ -56,10 +60,15 @@ def random_value(signal: Signal, generator: random.Random) -> float:
     return min(max(step * signal.scale, signal.minimum), signal.maximum) if signal.type is float else signal.type(step)
 
 
+def values_of(message: Message) -> dict[str, float]:
+    """The values of a message by their signals' names."""
+    return {name: getattr(message, name) for name in message.__match_args__}
+
+
 def cantools_payload(message: Message) -> bytes:
     """The same message packed by cantools, with a CRC computed bit by bit."""
     definition = DATABASE.get_message_by_name(type(message).__name__)
-    values: dict[str, float] = message._asdict()
+    values = values_of(message)
     if isinstance(message, Drive | State):
         body = bytes(definition.encode(values | {"crc": 0}, strict=True))[:-1]
         return body + bytes([bitwise_crc8(bytes([FUNCTION[type(message)]]) + body)])
@@ -75,7 +84,7 @@ def messages(draw: st.DrawFn) -> Message:
             values.append(draw(st.floats(signal.minimum, signal.maximum)))
         else:
             values.append(signal.type(draw(st.integers(signal.lowest, signal.highest))))
-    message: Message = layout.message._make(values)
+    message: Message = layout.message(*values)
     return message
 
 
@@ -84,12 +93,12 @@ def test_bytes_and_values_are_those_of_cantools_in_bulk(layout: Layout) -> None:
     generator = random.Random(layout.function)
     definition = DATABASE.get_message_by_name(layout.message.__name__)
     for _ in range(1000):
-        message = layout.message._make(random_value(signal, generator) for signal in layout.signals)
+        message = layout.message(*(random_value(signal, generator) for signal in layout.signals))
         payload = encode(message)
         assert payload == cantools_payload(message)
         read = definition.decode(payload, decode_choices=False)
         read.pop("crc", None)
-        assert decode(layout.function, payload)._asdict() == read
+        assert values_of(decode(layout.function, payload)) == read
 
 
 @given(messages())
@@ -102,7 +111,8 @@ def test_reading_back_gives_the_nearest_step(message: Message) -> None:
     layout = next(layout for layout in LAYOUTS if layout.message is type(message))
     read = decode(layout.function, encode(message))
     assert type(read) is type(message)
-    for signal, sent, received in zip(layout.signals, message, read, strict=True):
+    for signal in layout.signals:
+        sent, received = getattr(message, signal.name), getattr(read, signal.name)
         assert type(received) is signal.type
         if signal.type is float:
             # Half a step plus the rounding of the two floating-point operations.
@@ -197,30 +207,27 @@ def test_undefined_modes_and_flags_are_refused() -> None:
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize(
     ("message", "signal"),
-    [(m, name) for m in (DRIVE, STATE, SENSE, STATUS) for name, value in m._asdict().items() if type(value) is float],
+    [(m, name) for m in (DRIVE, STATE, SENSE, STATUS) for name, value in values_of(m).items() if type(value) is float],
 )
 def test_what_is_not_finite_is_refused_by_name(message: Any, signal: str, value: float) -> None:
     with pytest.raises(EncodeError, match=rf"{type(message).__name__}\.{signal} = -?(nan|inf).* finite|from"):
-        encode(message._replace(**{signal: value}))
+        encode(message.replaced(**{signal: value}))
 
 
 @pytest.mark.parametrize(
     ("message", "text"),
     [
-        (DRIVE._replace(left_duty=1.0001), r"Drive\.left_duty = 1\.0001: allowed are values from -1 to 1"),
-        (DRIVE._replace(right_duty=-1.0001), r"Drive\.right_duty = -1\.0001"),
-        (DRIVE._replace(mode=2), r"Drive\.mode = 2: allowed are whole numbers from 0 to 1"),  # type: ignore[arg-type]
-        (DRIVE._replace(counter=256), r"Drive\.counter = 256: allowed are whole numbers from 0 to 255"),
-        (DRIVE._replace(counter=-1), r"Drive\.counter = -1"),
-        (DRIVE._replace(counter=3.0), r"Drive\.counter = 3\.0: allowed are whole numbers"),  # type: ignore[arg-type]
-        (DRIVE._replace(left_duty="0.5"), r"Drive\.left_duty = '0\.5'"),  # type: ignore[arg-type]
-        (DRIVE._replace(left_duty=None), r"Drive\.left_duty = None"),  # type: ignore[arg-type]
-        (SENSE._replace(force_N=32.768), r"Sense\.force_N = 32\.768: allowed are values from -32\.768 to 32\.767"),
-        (STATE._replace(left_position_mm=1e308), r"State\.left_position_mm = 1e\+308: allowed are finite values"),
-        (STATUS._replace(temperature_C=127.6), r"Status\.temperature_C = 127\.6"),
-        (STATUS._replace(supply_V=-0.1), r"Status\.supply_V = -0\.1: allowed are values from 0 to 25\.5"),
-        (STATUS._replace(switches=32), r"Status\.switches = 32"),  # type: ignore[arg-type]
-        (STATUS._replace(faults=1024), r"Status\.faults = 1024"),  # type: ignore[arg-type]
+        (DRIVE.replaced(left_duty=1.0001), r"Drive\.left_duty = 1\.0001: allowed are values from -1 to 1"),
+        (DRIVE.replaced(right_duty=-1.0001), r"Drive\.right_duty = -1\.0001"),
+        (DRIVE.replaced(mode=2), r"Drive\.mode = 2: allowed are whole numbers from 0 to 1"),  # type: ignore[arg-type]
+        (DRIVE.replaced(counter=256), r"Drive\.counter = 256: allowed are whole numbers from 0 to 255"),
+        (DRIVE.replaced(counter=-1), r"Drive\.counter = -1"),
+        (SENSE.replaced(force_N=32.768), r"Sense\.force_N = 32\.768: allowed are values from -32\.768 to 32\.767"),
+        (STATE.replaced(left_position_mm=1e308), r"State\.left_position_mm = 1e\+308: allowed are finite values"),
+        (STATUS.replaced(temperature_C=127.6), r"Status\.temperature_C = 127\.6"),
+        (STATUS.replaced(supply_V=-0.1), r"Status\.supply_V = -0\.1: allowed are values from 0 to 25\.5"),
+        (STATUS.replaced(switches=32), r"Status\.switches = 32"),  # type: ignore[arg-type]
+        (STATUS.replaced(faults=1024), r"Status\.faults = 1024"),  # type: ignore[arg-type]
         (Hello(1 << 32, 1, 1), r"Hello\.schema_hash = 4294967296"),
         (Identity(SCHEMA_HASH, 1, 0, 65536), r"Identity\.serial_number = 65536"),
         (Retract(256), r"Retract\.nonce = 256"),
@@ -231,13 +238,61 @@ def test_out_of_range_is_refused_with_name_value_and_range(message: Message, tex
         encode(message)
 
 
+@pytest.mark.parametrize(
+    ("message", "changes", "text"),
+    [
+        (DRIVE, {"counter": 3.0}, r"Drive\.counter = 3\.0: allowed are whole numbers from 0 to 255"),
+        (DRIVE, {"left_duty": "0.5"}, r"Drive\.left_duty = '0\.5': allowed are values from -1 to 1"),
+        (DRIVE, {"left_duty": None}, r"Drive\.left_duty = None"),
+        (STATE, {"device_time_s": 1j}, r"State\.device_time_s = 1j: allowed are finite values"),
+        (US, {"schema_hash": 3.0}, r"Identity\.schema_hash = 3\.0: allowed are whole numbers from 0 to 4294967295"),
+        (STATUS, {"command_nonce": "1"}, r"Status\.command_nonce = '1'"),
+    ],
+)
+def test_what_is_no_number_is_refused(message: Any, changes: dict[str, object], text: str) -> None:
+    """Compiled, a message takes nothing of another type in the first place."""
+    with pytest.raises(TypeError if IS_COMPILED else EncodeError, match="" if IS_COMPILED else text):
+        encode(message.replaced(**changes))
+
+
+@given(st.sampled_from(LAYOUTS), st.data(), st.floats() | st.floats(-40.0, 40.0))
+def test_a_step_is_python_s_round_of_the_quotient(layout: Layout, data: st.DataObject, value: float) -> None:
+    """To the even one where two are as near: also far outside the range of a signal that wraps."""
+    quantities = [s for s in layout.signals if s.type is float]
+    assume(quantities)
+    signal = data.draw(st.sampled_from(quantities))
+    if data.draw(st.booleans()):
+        value = (data.draw(st.integers(2 * signal.lowest - 3, 2 * signal.highest + 3)) / 2.0) * signal.scale
+    neutral = layout.message(*(0.0 if s.type is float else s.type(0) for s in layout.signals))
+    message = neutral.replaced(**{signal.name: value})
+    step = round(value / signal.scale) if math.isfinite(value / signal.scale) else None
+    if step is not None and signal.wraps:
+        step = (step - signal.lowest) % (signal.highest - signal.lowest + 1) + signal.lowest
+    if step is None or not signal.lowest <= step <= signal.highest:
+        with pytest.raises(EncodeError, match=signal.name):
+            encode(message)
+        return
+    packed = struct.unpack(layout.format, encode(message))
+    assert packed[layout.signals.index(signal)] == step
+
+
+@pytest.mark.parametrize("power", [15, 16, 31, 50, 51, 52, 53, 60, 900])
+@pytest.mark.parametrize("less", [-1.0, -0.5, -0.25, 0.0, 0.25, 0.5, 1.0, 1.5])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_wrapping_steps_are_right_where_floats_thin_out(power: int, less: float, sign: float) -> None:
+    scale = period(State, "device_time_s") / 65536
+    value = sign * (2.0**power + less) * scale
+    (_, _, step, _, _) = struct.unpack("<hhHBB", encode(STATE.replaced(device_time_s=value)))
+    assert step == round(value / scale) % 65536
+
+
 @given(st.sampled_from(LAYOUTS), st.data(), st.floats(allow_nan=True, allow_infinity=True))
 def test_no_float_reaches_the_wire_out_of_range(layout: Layout, data: st.DataObject, value: float) -> None:
     quantities = [s for s in layout.signals if s.type is float and not s.wraps]
     assume(quantities)
     signal = data.draw(st.sampled_from(quantities))
-    neutral = layout.message._make(0.0 if s.type is float else s.type(0) for s in layout.signals)
-    message = neutral._replace(**{signal.name: value})
+    neutral = layout.message(*(0.0 if s.type is float else s.type(0) for s in layout.signals))
+    message = neutral.replaced(**{signal.name: value})
     if signal.minimum - signal.scale / 2 < value < signal.maximum + signal.scale / 2:
         encode(message)
     elif not signal.minimum - signal.scale <= value <= signal.maximum + signal.scale:  # NaN too
@@ -246,7 +301,7 @@ def test_no_float_reaches_the_wire_out_of_range(layout: Layout, data: st.DataObj
 
 
 def test_something_else_is_not_a_message() -> None:
-    with pytest.raises(EncodeError, match="not a message"):
+    with pytest.raises(TypeError if IS_COMPILED else EncodeError, match="" if IS_COMPILED else "not a message"):
         encode((0.0, 0.0, 0, 0))  # type: ignore[arg-type]
 
 
@@ -256,7 +311,7 @@ def test_something_else_is_not_a_message() -> None:
 )
 def test_wrapping_signals_are_right_modulo_their_period(signal: str, value: float) -> None:
     state: Any = STATE
-    read = decode(FUNCTION[State], encode(state._replace(**{signal: value})))
+    read = decode(FUNCTION[State], encode(state.replaced(**{signal: value})))
     span = period(State, signal)
     scale = span / 65536
     turns = (value - getattr(read, signal)) / span
@@ -272,10 +327,11 @@ def test_periods() -> None:
 
 
 def test_a_counter_at_its_end_wraps_instead_of_failing() -> None:
-    read = decode(FUNCTION[State], encode(STATE._replace(device_time_s=0.655359)))
-    assert read == STATE._replace(device_time_s=0.0)
+    read = decode(FUNCTION[State], encode(STATE.replaced(device_time_s=0.655359)))
+    assert read == STATE.replaced(device_time_s=0.0)
 
 
+@pytest.mark.skipif(IS_COMPILED, reason="compiled, a message takes floats and whole numbers of Python's only")
 def test_numpy_scalars_are_numbers() -> None:
     drive = Drive(np.float64(0.5), np.float32(-0.25), DriveMode.RUN, np.uint8(7))  # type: ignore[arg-type]
     assert encode(drive) == encode(DRIVE)

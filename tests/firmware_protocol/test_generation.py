@@ -8,7 +8,8 @@ import pytest
 import firmware_protocol
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH
 from firmware_protocol.dbc import SchemaError, read_schema
-from firmware_protocol.generate import main, python_source
+from firmware_protocol.generate import main
+from firmware_protocol.python_source import python_files
 
 ROOM = Path(firmware_protocol.__file__).parent
 
@@ -16,7 +17,7 @@ ROOM = Path(firmware_protocol.__file__).parent
 @pytest.fixture
 def room(tmp_path: Path) -> Path:
     """A copy of the room's sources and generated files, to be damaged."""
-    for name in ("tormag.dbc", "README.md", "layouts.py"):
+    for name in ("tormag.dbc", "README.md", "enumerations.py", "layouts.py", "wire.py"):
         shutil.copy(ROOM / name, tmp_path)
     for folder in ("vectors", "c"):
         shutil.copytree(ROOM / folder, tmp_path / folder)
@@ -45,9 +46,11 @@ def test_a_stale_file_is_shown_with_the_remedy_and_not_touched(room: Path, capsy
 
 
 def test_generating_repairs_every_file_and_then_has_nothing_to_do(room: Path) -> None:
-    names = ("layouts.py", "README.md", "vectors/messages.json", "vectors/frames.json")
+    names = ("enumerations.py", "layouts.py", "wire.py", "README.md", "vectors/messages.json", "vectors/frames.json")
     committed = {name: (room / name).read_bytes() for name in names}
     (room / "layouts.py").unlink()
+    (room / "wire.py").unlink()
+    edit(room / "enumerations.py", "RUN = 1", "RUN = 2")
     edit(room / "README.md", "`left_duty` | i16", "`left_duty` | i32")
     edit(room / "vectors" / "messages.json", '"Drive"', '"Dive"')
     (room / "vectors" / "frames.json").write_text("{}", encoding="utf-8")
@@ -93,11 +96,14 @@ def test_a_change_of_comment_or_cycle_time_does_not(room: Path, old: str, new: s
     assert read_schema(room / "tormag.dbc").schema_hash() == SCHEMA_HASH
 
 
-def test_the_generated_module_follows_the_dbc(room: Path) -> None:
+def test_the_generated_modules_follow_the_dbc(room: Path) -> None:
     edit(room / "tormag.dbc", '1 "RUN" 0 "OFF" ;', '1 "GO" 0 "OFF" ;')
-    source = python_source(read_schema(room / "tormag.dbc"))
-    assert "    GO = 1\n" in source
-    assert f"0x{SCHEMA_HASH:08X}" not in source
+    edit(room / "tormag.dbc", "(0.0001,0) [-1|1]", "(0.0002,0) [-1|1]")
+    sources = python_files(read_schema(room / "tormag.dbc"))
+    assert "    GO = 1\n" in sources["enumerations.py"]
+    assert f"0x{SCHEMA_HASH:08X}" not in sources["layouts.py"]
+    assert "message.left_duty / 0.0002" in sources["wire.py"]
+    assert "if not -5000 <= left_duty <= 5000:" in sources["wire.py"]
 
 
 @pytest.mark.parametrize(

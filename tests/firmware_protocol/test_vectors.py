@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from firmware_protocol.codec import (
     decode,
     encode,
 )
-from firmware_protocol.framing import Frame, FrameDecoder, encode_frame
+from firmware_protocol.framing import Frame, FrameDecoder, FramingStatistics, encode_frame
 from firmware_protocol.layouts import LAYOUTS
 
 ROOM = Path(firmware_protocol.__file__).parent
@@ -60,7 +59,7 @@ def test_valid_frames_in_both_directions() -> None:
     for vector in FRAMES["valid"]:
         frame = Frame(vector["function"], vector["sequence"], bytes.fromhex(vector["payload"]))
         encoded = bytes.fromhex(vector["frame"])
-        assert encode_frame(*frame) == encoded
+        assert encode_frame(frame.function, frame.sequence, frame.payload) == encoded
         assert FrameDecoder().feed(encoded) == [frame]
 
 
@@ -69,7 +68,7 @@ def test_streams_give_the_frames_and_counts_written_down(vector: dict[str, Any])
     decoder = FrameDecoder()
     received = decoder.feed(bytes.fromhex(vector["bytes"]))
     assert received == [Frame(f["function"], f["sequence"], bytes.fromhex(f["payload"])) for f in vector["frames"]]
-    assert asdict(decoder.statistics) == vector["statistics"]
+    assert decoder.statistics == FramingStatistics(**vector["statistics"])
 
 
 def test_the_examples_of_the_readme_are_true() -> None:

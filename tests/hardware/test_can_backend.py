@@ -73,7 +73,7 @@ def bus(tmp_path: Path) -> Iterator[Bus]:
 
 def test_messages_pass_both_ways(bus: Bus) -> None:
     assert bus.backend.receive() == []
-    bus.put(frame_of(STATUS), frame_of(STATUS._replace(drive_counter=9)))
+    bus.put(frame_of(STATUS), frame_of(STATUS.replaced(drive_counter=9)))
     assert [message.drive_counter for message in bus.backend.receive()] == [0, 9]  # type: ignore[union-attr]
     bus.backend.send(Home(7))
     assert from_socket(bus.far.recv(64)) == frame_of(Home(7))

@@ -17,6 +17,7 @@ from firmware_protocol.codec import (
     State,
     Status,
     Switches,
+    decode,
     encode,
 )
 from tormagd.hardware.can_stream import CanStream, SecondHostError
@@ -46,7 +47,7 @@ def test_a_node_that_is_none_is_refused(node: int) -> None:
 def test_what_the_device_says_comes_through_and_is_counted() -> None:
     stream = CanStream(1)
     assert stream.unpack(*frame_of(STATUS)) == STATUS
-    assert stream.unpack(*frame_of(state(7))) == pytest.approx(state(7))
+    assert stream.unpack(*frame_of(state(7))) == decode(FUNCTION[State], encode(state(7)))
     assert (stream.statistics.frames, stream.statistics.bytes, stream.statistics.corrupt) == (2, 16, 0)
 
 

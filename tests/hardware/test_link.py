@@ -12,6 +12,7 @@ from firmware_protocol.codec import (
     Clear,
     DeviceFault,
     DeviceMode,
+    Drive,
     DriveMode,
     Hello,
     Home,
@@ -38,6 +39,7 @@ from tormagd.hardware.link import (
     DeviceLink,
     LinkState,
 )
+from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import DeviceRequest
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
@@ -51,7 +53,7 @@ HANDLE_SPAN_MM = period(Sense, "handle_position_mm")
 
 def status(nonce: int = 0, **changes: object) -> Status:
     healthy = Status(DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 12.0, 0, nonce)
-    return healthy._replace(**changes)  # type: ignore[arg-type]
+    return healthy.replaced(**changes)  # type: ignore[arg-type]
 
 
 def running(nonce: int = 0) -> DeviceLink:
@@ -103,7 +105,7 @@ def test_another_schema_is_refused_with_both_hashes_and_the_firmwares_version() 
 
 def test_a_device_that_is_replaced_while_running_is_refused() -> None:
     link = running()
-    link.receive(1.0, US._replace(schema_hash=SCHEMA_HASH ^ 1))
+    link.receive(1.0, US.replaced(schema_hash=SCHEMA_HASH ^ 1))
     assert link.state is LinkState.REFUSED
 
 
@@ -172,7 +174,7 @@ def test_a_reset_device_does_nothing_that_was_asked_of_it_before(request_: Devic
 
 def test_another_device_at_the_same_line_is_not_taken_for_the_first() -> None:
     link = running(nonce=FIRST_NONCE)
-    link.receive(1.0, US._replace(serial_number=78))
+    link.receive(1.0, US.replaced(serial_number=78))
     link.due(1.001)
     assert link.state is LinkState.IDENTIFYING
     assert "77 was replaced by device 78" in link.cause
@@ -205,7 +207,7 @@ def test_drive_counters_go_round() -> None:
     link = running()
     counters = [link.drive(0.1, -0.2, DriveMode.RUN).counter for _ in range(600)]
     assert all((after - before) % 256 == 1 for before, after in pairwise(counters))
-    assert link.drive(0.1, -0.2, DriveMode.RUN)[:3] == (0.1, -0.2, DriveMode.RUN)
+    assert link.drive(0.1, -0.2, DriveMode.RUN) == Drive(0.1, -0.2, DriveMode.RUN, (counters[-1] + 1) % 256)
 
 
 # -- what it was asked ---------------------------------------------------------------------------------------------
@@ -344,8 +346,10 @@ def test_a_measurement_takes_a_status_a_sense_and_a_state() -> None:
     link.receive(0.7, State(-3.0, -4.0, 0.25, 2))
     measurement = link.measurement
     assert measurement is not None
-    assert measurement[:9] == (0, 0.7, 0.25, -3.0, -4.0, 0.1, 0.2, 0.3, 0.0)
-    assert (measurement.supply_V, measurement.mode) == (11.5, DeviceMode.IDLE)
+    assert measurement == Measurement(
+        0, 0.7, 0.25, -3.0, -4.0, 0.1, 0.2, 0.3, 0.0, DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 11.5
+    )
+    assert link.measurement is measurement
     assert link.age_s(0.8) == pytest.approx(0.1)
 
 

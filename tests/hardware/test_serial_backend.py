@@ -63,7 +63,7 @@ def wait_readable(port: SerialBackend) -> None:
 def test_messages_pass_both_ways(line: Line, port: SerialBackend) -> None:
     far = FrameStream()
     assert port.receive() == []
-    os.write(line.far, far.pack(STATUS) + far.pack(STATUS._replace(drive_counter=9)))
+    os.write(line.far, far.pack(STATUS) + far.pack(STATUS.replaced(drive_counter=9)))
     wait_readable(port)
     assert [message.drive_counter for message in port.receive()] == [0, 9]  # type: ignore[union-attr]
     port.send(Home(7))

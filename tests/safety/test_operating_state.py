@@ -66,11 +66,11 @@ def test_starts_disabled_and_asks_nothing() -> None:
 )
 def test_enable_wants_every_condition(changes: dict[str, bool | float], code: str) -> None:
     assert command(SafetyState(), "enable", 0.0, READY).operating_state is ENABLED
-    assert refusal(SafetyState(), "enable", READY._replace(**changes)).code == code
+    assert refusal(SafetyState(), "enable", READY.replaced(**changes)).code == code
 
 
 def test_a_neutral_setpoint_may_be_enabled_on() -> None:
-    assert command(SafetyState(), "enable", 0.0, READY._replace(requested_N=0.5)).operating_state is ENABLED
+    assert command(SafetyState(), "enable", 0.0, READY.replaced(requested_N=0.5)).operating_state is ENABLED
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_what_a_command_does(
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_without_a_device_only_stop_is_taken(name: str) -> None:
-    gone = READY._replace(connected=False, fresh=False)
+    gone = READY.replaced(connected=False, fresh=False)
     if name == "stop":
         assert command(SafetyState(), name, 0.0, gone).faults == (Fault.STOPPED,)
     else:
@@ -125,7 +125,7 @@ def test_without_a_device_only_stop_is_taken(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["enable", "home", "clear-fault"])
 def test_a_busy_device_is_left_to_finish(name: str) -> None:
-    assert refusal(SafetyState(), name, READY._replace(busy=True)).code == "busy"
+    assert refusal(SafetyState(), name, READY.replaced(busy=True)).code == "busy"
 
 
 def test_an_unknown_command_lists_the_known_ones() -> None:
@@ -167,7 +167,7 @@ def test_clearing_asks_the_device_only_where_it_has_latched_too() -> None:
     ours = command(FAULTED, "clear-fault", 2.0, READY)
     assert (ours.operating_state, ours.faults, ours.request_number) == (DISABLED, (), FAULTED.request_number)
     assert ours.clearing_until_s < 0.0, "there is nothing to wait for"
-    both = command(FAULTED, "clear-fault", 2.0, READY._replace(device_latched=True))
+    both = command(FAULTED, "clear-fault", 2.0, READY.replaced(device_latched=True))
     assert (both.request, both.request_number) == (DeviceRequest.CLEAR, FAULTED.request_number + 1)
     assert both.clearing_until_s == 2.0 + CLEARING_S
 
@@ -176,11 +176,11 @@ def test_clearing_asks_the_device_only_where_it_has_latched_too() -> None:
 @pytest.mark.parametrize("device_latched", [False, True])
 def test_clearing_while_driven_hides_no_fault_of_the_device(present: OperatingState, device_latched: bool) -> None:
     state = SafetyState(present)
-    assert command(state, "clear-fault", 2.0, READY._replace(device_latched=device_latched)) == state
+    assert command(state, "clear-fault", 2.0, READY.replaced(device_latched=device_latched)) == state
 
 
 def test_enabling_ends_the_wait_for_a_cleared_fault_to_go() -> None:
-    cleared = command(FAULTED, "clear-fault", 2.0, READY._replace(device_latched=True))
+    cleared = command(FAULTED, "clear-fault", 2.0, READY.replaced(device_latched=True))
     assert command(cleared, "enable", 2.1, READY).clearing_until_s < 0.0
 
 

@@ -1,11 +1,16 @@
 """Messages to serial bytes and back: the part of the serial backend that needs no port."""
 
+from typing import final
+
 from firmware_protocol.codec import FUNCTION, DecodeError, Message, decode, encode
 from firmware_protocol.framing import FrameDecoder, encode_frame
 
 
+@final
 class FrameStream:
     """Both directions of one serial conversation. A frame that does not decode is counted, never raised."""
+
+    __slots__ = ("_decoder", "_sequence", "statistics")
 
     def __init__(self) -> None:
         self._decoder = FrameDecoder()
@@ -20,7 +25,7 @@ class FrameStream:
 
     def unpack(self, data: bytes) -> list[Message]:
         """The valid messages completed by `data`."""
-        messages = []
+        messages: list[Message] = []
         for frame in self._decoder.feed(data):
             try:
                 messages.append(decode(frame.function, frame.payload))

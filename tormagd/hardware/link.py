@@ -5,6 +5,7 @@ No I/O and no clock: the daemon and the virtual-time simulation carry the same m
 
 import math
 from enum import StrEnum
+from typing import Final, final
 
 from firmware_protocol.codec import (
     PROTOCOL_VERSION,
@@ -66,8 +67,23 @@ class LinkState(StrEnum):
     LOST = "LOST"
 
 
+# a member's look-up in its class takes longer than what else is done with a message
+_IDENTIFYING: Final = LinkState.IDENTIFYING
+_UNANSWERED: Final = LinkState.UNANSWERED
+_RUNNING: Final = LinkState.RUNNING
+_NO_REQUEST: Final = DeviceRequest.NONE
+
+
+@final
 class DeviceLink:
     """One conversation, from the opening of the port to its loss. A new connection takes a new link."""
+
+    __slots__ = (
+        "_acknowledged", "_asked_s", "_broken", "_counter", "_delay_s", "_device_time_s", "_handle_mm", "_heard_s",
+        "_hello_due_s", "_is_measured", "_least_delay_s", "_left_mm", "_measurement", "_nonce", "_number", "_received_s",
+        "_request", "_request_due_s", "_requested_s", "_right_mm", "_sense", "_state", "_status", "cause", "clock",
+        "identity", "repeated", "round_trip", "state",
+    )  # fmt: skip
 
     def __init__(self, now_s: float) -> None:
         self.repeated = 0
@@ -79,10 +95,9 @@ class DeviceLink:
 
     def _begin(self, now_s: float, cause: str) -> None:
         """Knows nothing of the device; also when it turns out to have been reset, or to be another one."""
-        self.state = LinkState.IDENTIFYING
+        self.state = _IDENTIFYING
         self.cause = cause
         self.identity: Identity | None = None
-        self.measurement: Measurement | None = None
         self.round_trip = RoundTrip()
         self.clock = DeviceClock()
         self._heard_s = self._hello_due_s = self._asked_s = now_s
@@ -94,8 +109,25 @@ class DeviceLink:
         self._state: State | None = None
         self._sense: Sense | None = None
         self._status: Status | None = None
+        self._is_measured = False
+        self._measurement: Measurement | None = None
+        """Made of the following when it is asked for: State and Sense change them one after the other."""
+        self._number = 0
+        self._received_s = 0.0
+        self._device_time_s = 0.0
+        self._left_mm = 0.0
+        self._right_mm = 0.0
+        self._handle_mm = 0.0
+        self._least_delay_s = 0.0
         if self._request is not DeviceRequest.RETRACT:  # opening is always wanted still; nothing else moves unasked
             self._request = DeviceRequest.NONE
+
+    @property
+    def measurement(self) -> Measurement | None:
+        """The newest State, with the newest Sense and Status; None before there was one of each."""
+        if self._measurement is None and self._is_measured:
+            self._measurement = self._measured()
+        return self._measurement
 
     @property
     def pending(self) -> DeviceRequest:
@@ -104,13 +136,13 @@ class DeviceLink:
 
     def is_silent(self, now_s: float) -> bool:
         """Whether a running device has not been heard for too long."""
-        return self.state is LinkState.RUNNING and now_s - self._heard_s > SILENT_S
+        return self.state is _RUNNING and now_s - self._heard_s > SILENT_S
 
     def receive(self, now_s: float, message: Message) -> None:
         """Takes one message from the device."""
         self._heard_s = now_s
-        if self.state is LinkState.UNANSWERED:
-            self.state = LinkState.IDENTIFYING
+        if self.state is _UNANSWERED:
+            self.state = _IDENTIFYING
             self._asked_s = self._hello_due_s = now_s
         if isinstance(message, State):
             self._take_state(now_s, message)
@@ -125,14 +157,15 @@ class DeviceLink:
         """Handshake and command messages to send now, behind the period's Drive; also notices silence and a reset."""
         self.round_trip.drive(self._counter, now_s)
         self._watch(now_s)
-        if self._request is not DeviceRequest.RETRACT and now_s - self._requested_s > GIVE_UP_S:
-            self._request = DeviceRequest.NONE
+        is_waiting = False
+        if self._request is not _NO_REQUEST:
+            if self._request is not DeviceRequest.RETRACT and now_s - self._requested_s > GIVE_UP_S:
+                self._request = _NO_REQUEST
+            else:
+                is_waiting = self.state is _RUNNING and self._status is not None
         messages: list[Message] = []
-        is_waiting = (
-            self._request is not DeviceRequest.NONE and self.state is LinkState.RUNNING and self._status is not None
-        )
         if now_s >= self._hello_due_s and not is_waiting:
-            self._hello_due_s = now_s + (REPEAT_S if self.state is LinkState.IDENTIFYING else HELLO_S)
+            self._hello_due_s = now_s + (REPEAT_S if self.state is _IDENTIFYING else HELLO_S)
             self.round_trip.hello()
             messages.append(Hello(schema_hash=SCHEMA_HASH, protocol_version=PROTOCOL_VERSION, nonce=self._acknowledged))
         if is_waiting and now_s >= self._request_due_s:
@@ -161,7 +194,7 @@ class DeviceLink:
 
     def age_s(self, now_s: float) -> float:
         """Time since the newest measurement, s; infinite without one."""
-        return math.inf if self.measurement is None else now_s - self.measurement.received_s
+        return now_s - self._received_s if self._is_measured else math.inf
 
     def _watch(self, now_s: float) -> None:
         # what broke was heard a tick ago: so the core has seen the measurement that shows it, and names it better
@@ -170,7 +203,7 @@ class DeviceLink:
         elif self.is_silent(now_s):
             self.state = LinkState.LOST
             self.cause = f"no message for {SILENT_S * 1e3:.0f} ms"
-        elif self.state is LinkState.IDENTIFYING and now_s - self._asked_s > UNANSWERED_S:
+        elif self.state is _IDENTIFYING and now_s - self._asked_s > UNANSWERED_S:
             self.state = LinkState.UNANSWERED
             self.cause = f"the device has not said who it is for {UNANSWERED_S:g} s"
 
@@ -203,29 +236,20 @@ class DeviceLink:
             # it has opened already, or cannot, and will not try again before a Clear
             self._request = DeviceRequest.NONE
         # only a running device says which Drive it obeys; one late Status alone is a stall, not the wire's doing
-        last_s, self._delay_s = self._delay_s, 0.0
+        last_s = self._delay_s
+        self._delay_s = 0.0
         if status.mode is DeviceMode.RUN:
             self._delay_s = self.round_trip.since_next_s(status.drive_counter, now_s)
-        if self.measurement is not None:
-            self.measurement = self.measurement._replace(
-                mode=status.mode,
-                switches=status.switches,
-                faults=status.faults,
-                temperature_C=status.temperature_C,
-                supply_V=status.supply_V,
-                delay_s=min(last_s, self._delay_s),
-            )
+        if self._is_measured:
+            self._least_delay_s = min(last_s, self._delay_s)
+            self._measurement = None
 
     def _take_sense(self, sense: Sense) -> None:
         # Sense follows the State of the same instant; the measurement takes the newest of both
-        if self.measurement is not None and self._sense is not None:
-            travel = _unwrapped(self._sense.handle_position_mm, sense.handle_position_mm, HANDLE_SPAN_MM)
-            self.measurement = self.measurement._replace(
-                left_current_A=sense.left_current_A,
-                right_current_A=sense.right_current_A,
-                force_N=sense.force_N,
-                handle_mm=self.measurement.handle_mm + travel,
-            )
+        previous = self._sense
+        if self._is_measured and previous is not None:
+            self._handle_mm += _unwrapped(previous.handle_position_mm, sense.handle_position_mm, HANDLE_SPAN_MM)
+            self._measurement = None
         self._sense = sense
 
     def _take_state(self, now_s: float, state: State) -> None:
@@ -235,40 +259,49 @@ class DeviceLink:
             return
         self._state = state
         self.round_trip.state(state.counter, now_s)
-        if previous is None or self.measurement is None:
-            self._first_measurement(now_s, state)
+        if previous is None or not self._is_measured:
+            self._begin_measuring(now_s, state)
             return
-        last = self.measurement
+        self._number += 1
+        self._received_s = now_s
+        self._device_time_s += (state.device_time_s - previous.device_time_s) % DEVICE_TIME_SPAN_S
         # before homing the position's origin is arbitrary; homing sets it to 0, so a wrap and a re-zero look alike:
         # taking the shortest way each time is right for the first and harmless for the second
-        self.measurement = last._replace(
-            number=last.number + 1,
-            received_s=now_s,
-            device_time_s=last.device_time_s + (state.device_time_s - previous.device_time_s) % DEVICE_TIME_SPAN_S,
-            left_mm=last.left_mm + _unwrapped(previous.left_position_mm, state.left_position_mm, POSITION_SPAN_MM),
-            right_mm=last.right_mm + _unwrapped(previous.right_position_mm, state.right_position_mm, POSITION_SPAN_MM),
-        )
-        self.clock.add(now_s, self.measurement.device_time_s)
+        self._left_mm += _unwrapped(previous.left_position_mm, state.left_position_mm, POSITION_SPAN_MM)
+        self._right_mm += _unwrapped(previous.right_position_mm, state.right_position_mm, POSITION_SPAN_MM)
+        self._measurement = None
+        self.clock.add(now_s, self._device_time_s)
 
-    def _first_measurement(self, now_s: float, state: State) -> None:
+    def _begin_measuring(self, now_s: float, state: State) -> None:
         if self._status is None or self._sense is None:
             return
-        status, sense = self._status, self._sense
-        self.measurement = Measurement(
-            number=0,
-            received_s=now_s,
-            device_time_s=state.device_time_s,
-            left_mm=state.left_position_mm,
-            right_mm=state.right_position_mm,
-            left_current_A=sense.left_current_A,
-            right_current_A=sense.right_current_A,
-            force_N=sense.force_N,
-            handle_mm=0.0,
-            mode=status.mode,
-            switches=status.switches,
-            faults=status.faults,
-            temperature_C=status.temperature_C,
-            supply_V=status.supply_V,
+        self._is_measured = True
+        self._number = 0
+        self._received_s = now_s
+        self._device_time_s = state.device_time_s
+        self._left_mm = state.left_position_mm
+        self._right_mm = state.right_position_mm
+
+    def _measured(self) -> Measurement:
+        sense, status = self._sense, self._status
+        assert sense is not None, "measuring begins with a Sense"
+        assert status is not None, "measuring begins with a Status"
+        return Measurement(
+            self._number,
+            self._received_s,
+            self._device_time_s,
+            self._left_mm,
+            self._right_mm,
+            sense.left_current_A,
+            sense.right_current_A,
+            sense.force_N,
+            self._handle_mm,
+            status.mode,
+            status.switches,
+            status.faults,
+            status.temperature_C,
+            status.supply_V,
+            self._least_delay_s,
         )
 
 

@@ -8,7 +8,9 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from itertools import compress
-from typing import NamedTuple, TypeAlias
+from typing import Final, TypeAlias, final
+
+from firmware_protocol.value import Value
 
 ROUND_TRIPS = 256
 "The round trips that percentiles are taken of: a quarter of a second of control."
@@ -30,6 +32,7 @@ Windows: TypeAlias = Sequence[tuple[float, float]]
 "Offset and host's time of each window, s."
 
 
+@final
 class RoundTrip:
     """Time from a Drive that is handed to the wire until its State has been read, s.
 
@@ -37,6 +40,8 @@ class RoundTrip:
     it belongs to the last Drive before the Hello: that fixes how far the two counters are apart. A Drive that is lost
     later moves them further apart, and makes round trips one period too long until the next Identity.
     """
+
+    __slots__ = ("_before_hello", "_lead", "_newest", "_recent", "_sent_s", "_state")
 
     def __init__(self) -> None:
         self._sent_s = [0.0] * 256
@@ -68,9 +73,10 @@ class RoundTrip:
     def state(self, counter: int, now_s: float) -> None:
         """The State with this counter came in now."""
         self._state = counter
-        if self._lead is None:
+        lead = self._lead
+        if lead is None:
             return
-        answered = (counter + self._lead) % 256
+        answered = (counter + lead) % 256
         if (self._newest - answered) % 256 < 128:
             self._recent.append(now_s - self._sent_s[answered])
         else:  # it would be the answer to a Drive that has not been sent
@@ -90,26 +96,34 @@ class RoundTrip:
         return {name: round(ordered_s[int(share * len(ordered_s))] * 1e6, 1) for name, share in shares.items()}
 
 
-class ClockFit(NamedTuple):
+@final
+class ClockFit(Value):
     """A straight line through the device's clock.
 
     `offset_s` is the host's time minus the device's at the newest State, the way from the device included; `drift_ppm`
     is positive where the device's clock runs fast. `residual_us` is the standard deviation around the line.
     """
 
-    offset_s: float
-    drift_ppm: float
-    residual_us: float
-    windows: int
-    outliers: int
+    __match_args__ = ("offset_s", "drift_ppm", "residual_us", "windows", "outliers")
+    __slots__ = __match_args__
+
+    def __init__(self, offset_s: float, drift_ppm: float, residual_us: float, windows: int, outliers: int) -> None:
+        self.offset_s: Final = offset_s
+        self.drift_ppm: Final = drift_ppm
+        self.residual_us: Final = residual_us
+        self.windows: Final = windows
+        self.outliers: Final = outliers
 
 
+@final
 class DeviceClock:
     """The device's clock against the host's, by regression over the least delayed State of each half second.
 
     The line starts from a median of slopes (Theil 1950, of halves), so that a quarter of the windows may be wrong by
     any amount; those far from it are left out of the least squares that follow.
     """
+
+    __slots__ = ("_ends_s", "_fit", "_is_fitted", "_least", "_windows")
 
     def __init__(self) -> None:
         self._windows: deque[tuple[float, float]] = deque(maxlen=WINDOWS)

@@ -1,11 +1,20 @@
 """What the device last said, with the wire's wrap-around taken out."""
 
-from typing import NamedTuple
+from typing import Final, final
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
+from firmware_protocol.value import Value
+
+# operations on flags make new ones, at a microsecond each; the core asks a thousand times a second
+_HOMED: Final = int(Switches.HOMED)
+_LEFT_OPEN: Final = int(Switches.LEFT_OPEN)
+_RIGHT_OPEN: Final = int(Switches.RIGHT_OPEN)
+_LATCHED: Final = DeviceMode.LATCHED
+_BUSY: Final = (DeviceMode.HOMING, DeviceMode.RETRACTING)
 
 
-class Measurement(NamedTuple):
+@final
+class Measurement(Value):
     """One device state. Carriage positions are mm from the home switches (closing is negative); times are in s.
 
     `received_s` is the host's clock, `device_time_s` the device's own, unwrapped from an arbitrary start. `handle_mm`
@@ -14,43 +23,67 @@ class Measurement(NamedTuple):
     there and back.
     """
 
-    number: int
-    received_s: float
-    device_time_s: float
-    left_mm: float
-    right_mm: float
-    left_current_A: float
-    right_current_A: float
-    force_N: float
-    handle_mm: float
-    mode: DeviceMode
-    switches: Switches
-    faults: DeviceFault
-    temperature_C: float
-    supply_V: float
-    delay_s: float = 0.0
+    __match_args__ = (
+        "number", "received_s", "device_time_s", "left_mm", "right_mm", "left_current_A", "right_current_A", "force_N",
+        "handle_mm", "mode", "switches", "faults", "temperature_C", "supply_V", "delay_s",
+    )  # fmt: skip
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        number: int,
+        received_s: float,
+        device_time_s: float,
+        left_mm: float,
+        right_mm: float,
+        left_current_A: float,
+        right_current_A: float,
+        force_N: float,
+        handle_mm: float,
+        mode: DeviceMode,
+        switches: Switches,
+        faults: DeviceFault,
+        temperature_C: float,
+        supply_V: float,
+        delay_s: float = 0.0,
+    ) -> None:
+        self.number: Final = number
+        self.received_s: Final = received_s
+        self.device_time_s: Final = device_time_s
+        self.left_mm: Final = left_mm
+        self.right_mm: Final = right_mm
+        self.left_current_A: Final = left_current_A
+        self.right_current_A: Final = right_current_A
+        self.force_N: Final = force_N
+        self.handle_mm: Final = handle_mm
+        self.mode: Final = mode
+        self.switches: Final = switches
+        self.faults: Final = faults
+        self.temperature_C: Final = temperature_C
+        self.supply_V: Final = supply_V
+        self.delay_s: Final = delay_s
 
     @property
     def is_homed(self) -> bool:
         """The device knows where its carriages are."""
-        return Switches.HOMED in self.switches
+        return int(self.switches) & _HOMED != 0
 
     @property
     def is_left_open(self) -> bool:
         """The left carriage is at its open switch."""
-        return Switches.LEFT_OPEN in self.switches
+        return int(self.switches) & _LEFT_OPEN != 0
 
     @property
     def is_right_open(self) -> bool:
         """The right carriage is at its open switch."""
-        return Switches.RIGHT_OPEN in self.switches
+        return int(self.switches) & _RIGHT_OPEN != 0
 
     @property
     def is_busy(self) -> bool:
         """The device moves by its own routine and takes no drive commands."""
-        return self.mode in (DeviceMode.HOMING, DeviceMode.RETRACTING)
+        return self.mode in _BUSY
 
     @property
     def is_latched(self) -> bool:
         """The device holds a fault that only a Clear takes away."""
-        return self.mode is DeviceMode.LATCHED or bool(self.faults)
+        return self.mode is _LATCHED or int(self.faults) != 0

@@ -4,9 +4,11 @@ Pure functions of explicit state. The safe state is *gap open*: friction holds t
 magnets pull shut. Opening is the device's own routine, because it must also work when this process is gone.
 """
 
+import math
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Final, final
 
+from firmware_protocol.value import Value
 from tormagd.safety.codes import Fault
 
 CLEARING_S = 0.5
@@ -42,35 +44,65 @@ class RefusedError(Exception):
         self.code, self.message, self.hint = code, message, hint
 
 
-class Conditions(NamedTuple):
+@final
+class Conditions(Value):
     """What the decisions depend on."""
 
-    connected: bool
-    fresh: bool
-    homed: bool
-    busy: bool
-    device_latched: bool
-    requested_N: float | None
-    neutral_N: float
-    sensor_doubted: bool = False
+    __match_args__ = (
+        "connected", "fresh", "homed", "busy", "device_latched", "requested_N", "neutral_N", "sensor_doubted",
+    )  # fmt: skip
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        connected: bool,
+        fresh: bool,
+        homed: bool,
+        busy: bool,
+        device_latched: bool,
+        requested_N: float | None,
+        neutral_N: float,
+        sensor_doubted: bool = False,
+    ) -> None:
+        self.connected: Final = connected
+        self.fresh: Final = fresh
+        self.homed: Final = homed
+        self.busy: Final = busy
+        self.device_latched: Final = device_latched
+        self.requested_N: Final = requested_N
+        self.neutral_N: Final = neutral_N
+        self.sensor_doubted: Final = sensor_doubted
 
 
-class SafetyState(NamedTuple):
+@final
+class SafetyState(Value):
     """Operating state, latched faults, and the newest request to the device.
 
     `needs_homing`: the device's word that it is homed does not count, until it has begun homing and so taken it back.
     """
 
-    operating_state: OperatingState = OperatingState.DISABLED
-    faults: tuple[Fault, ...] = ()
-    request: DeviceRequest = DeviceRequest.NONE
-    request_number: int = 0
-    clearing_until_s: float = float("-inf")
-    needs_homing: bool = False
+    __match_args__ = ("operating_state", "faults", "request", "request_number", "clearing_until_s", "needs_homing")
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        operating_state: OperatingState = OperatingState.DISABLED,
+        faults: tuple[Fault, ...] = (),
+        request: DeviceRequest = DeviceRequest.NONE,
+        request_number: int = 0,
+        clearing_until_s: float = -math.inf,
+        needs_homing: bool = False,
+    ) -> None:
+        self.operating_state: Final = operating_state
+        self.faults: Final = faults
+        self.request: Final = request
+        self.request_number: Final = request_number
+        self.clearing_until_s: Final = clearing_until_s
+        self.needs_homing: Final = needs_homing
 
     def ask(self, request: DeviceRequest) -> "SafetyState":
         """The same state with a new request to the device."""
-        return self._replace(request=request, request_number=self.request_number + 1)
+        return self.replaced(request=request, request_number=self.request_number + 1)
 
 
 def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
@@ -78,7 +110,7 @@ def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
     new = tuple(fault for fault in faults if fault not in state.faults)
     if not new:
         return state
-    latched = state._replace(
+    latched = state.replaced(
         operating_state=OperatingState.FAULT,
         faults=state.faults + new,
         needs_homing=state.needs_homing or not LOST_POSITION.isdisjoint(new),
@@ -88,7 +120,7 @@ def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
 
 def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
     """`state` after the device has said whether it is homed; one that says no has begun anew and is believed again."""
-    return state if is_homed else state._replace(needs_homing=False)
+    return state if is_homed or not state.needs_homing else state.replaced(needs_homing=False)
 
 
 def command(state: SafetyState, name: str, now_s: float, conditions: Conditions) -> SafetyState:
@@ -127,12 +159,12 @@ def _enable(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyS
             f"the setpoint is {conditions.requested_N:.2f} N: allowed is at most {conditions.neutral_N:.2f} N",
             "lower the setpoint, enable, then raise it",
         )
-    return state._replace(operating_state=OperatingState.ENABLED, clearing_until_s=float("-inf"))
+    return state.replaced(operating_state=OperatingState.ENABLED, clearing_until_s=-math.inf)
 
 
 def _disable(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
     _refuse_in(state, OperatingState.FAULT, "disable")
-    return state._replace(operating_state=OperatingState.DISABLED).ask(DeviceRequest.RETRACT)
+    return state.replaced(operating_state=OperatingState.DISABLED).ask(DeviceRequest.RETRACT)
 
 
 def _pause(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
@@ -140,7 +172,7 @@ def _pause(state: SafetyState, now_s: float, conditions: Conditions) -> SafetySt
     if state.operating_state is not OperatingState.ENABLED:
         remedy = "nothing to do" if state.operating_state is OperatingState.PAUSED else "tormagctl enable"
         raise RefusedError("not_enabled", f"cannot pause while {state.operating_state}", remedy)
-    return state._replace(operating_state=OperatingState.PAUSED)
+    return state.replaced(operating_state=OperatingState.PAUSED)
 
 
 def _resume(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
@@ -148,7 +180,7 @@ def _resume(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyS
     if state.operating_state is not OperatingState.PAUSED:
         remedy = "nothing to do" if state.operating_state is OperatingState.ENABLED else "tormagctl enable"
         raise RefusedError("not_paused", f"cannot resume while {state.operating_state}", remedy)
-    return state._replace(operating_state=OperatingState.ENABLED)
+    return state.replaced(operating_state=OperatingState.ENABLED)
 
 
 def _home(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
@@ -169,10 +201,10 @@ def _clear_fault(state: SafetyState, now_s: float, conditions: Conditions) -> Sa
     _refuse_busy(conditions)
     if state.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED):
         return state  # nothing is latched; what the device latches meanwhile is news, and must not be passed over
-    cleared = state._replace(operating_state=OperatingState.DISABLED, faults=())
+    cleared = state.replaced(operating_state=OperatingState.DISABLED, faults=())
     if not conditions.device_latched:
         return cleared
-    return cleared._replace(clearing_until_s=now_s + CLEARING_S).ask(DeviceRequest.CLEAR)
+    return cleared.replaced(clearing_until_s=now_s + CLEARING_S).ask(DeviceRequest.CLEAR)
 
 
 def _refuse_in(state: SafetyState, forbidden: OperatingState, name: str) -> None:

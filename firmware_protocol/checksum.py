@@ -1,0 +1,30 @@
+"""The CRC-8 of the protected messages."""
+
+from typing import Final
+
+CRC8_POLYNOMIAL: Final = 0x1D  # SAE J1850: Hamming distance 3 over the 64 bits it guards here
+CRC8_INITIAL: Final = 0xFF
+CRC8_FINAL_XOR: Final = 0xFF
+
+
+def _crc8_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        register = byte
+        for _ in range(8):
+            register = register << 1 ^ (CRC8_POLYNOMIAL if register & 0x80 else 0)
+            register &= 0xFF
+        table.append(register)
+    return tuple(table)
+
+
+CRC8_TABLE: Final = _crc8_table()
+"The register after a byte, by the register before it XOR the byte."
+
+
+def crc8(data: bytes) -> int:
+    """CRC-8/SAE-J1850 of `data`."""
+    register = CRC8_INITIAL
+    for byte in data:
+        register = CRC8_TABLE[register ^ byte]
+    return register ^ CRC8_FINAL_XOR

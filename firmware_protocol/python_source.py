@@ -1,0 +1,276 @@
+"""The Python modules that tormag.dbc gives: enumerations, messages with their layouts, and the bytes of each message.
+
+`wire.py` says for each message what `codec.py` would have to look up: encoding or decoding one is a dozen operations on
+numbers, which a compiler makes native. The enumerations stand apart, because they are not compiled.
+"""
+
+import textwrap
+from typing import Final
+
+from firmware_protocol.checksum import CRC8_INITIAL, CRC8_TABLE
+from firmware_protocol.dbc import MessageSource, Schema, SignalSource
+
+LINE_WIDTH: Final = 120
+TEXT_WIDTH: Final = 110
+
+_WIRE_HEAD: Final = '''"""Payload bytes of each message and back. Generated from tormag.dbc; to change it, see `generate.py`.
+
+Whatever does not fit is None here, or an error of Python's where it is not even a number. `codec` says what was wrong.
+"""
+
+'''
+_ROUNDING: Final = """_HALVES: Final = 1.5 * 2.0**52
+\"\"\"Between 2**52 and 2**53 floats are the whole numbers, and a sum goes to the nearest, of two as near to the even one.
+So adding and subtracting this is `round`, for all that is under 2**51 either way; what is over stays over.\"\"\"
+_WHOLE: Final = 2.0**51
+"""
+
+
+def python_files(schema: Schema) -> dict[str, str]:
+    """The text of each module by its file's name, as `ruff format` would leave it."""
+    return {
+        "enumerations.py": _enumerations_module(schema),
+        "layouts.py": _layouts_module(schema),
+        "wire.py": _wire_module(schema),
+    }
+
+
+def _enumerations(schema: Schema) -> dict[str, SignalSource]:
+    return {s.type_name: s for message in schema.messages for s in message.signals if s.choices}
+
+
+def _import(module: str, names: list[str]) -> str:
+    line = f"from firmware_protocol.{module} import {', '.join(names)}\n"
+    if len(line) <= LINE_WIDTH + 1:
+        return line
+    return f"from firmware_protocol.{module} import (\n{''.join(f'    {name},{chr(10)}' for name in names)})\n"
+
+
+# -- enumerations.py -------------------------------------------------------------------------------------------------
+
+
+def _enumerations_module(schema: Schema) -> str:
+    head = (
+        '"""Enumerations of the wire. Generated from tormag.dbc; to change it, see `generate.py`."""\n\n'
+        "from enum import STRICT, IntEnum, IntFlag\n"
+    )
+    return "\n\n".join([head, *(_enumeration(signal) for signal in _enumerations(schema).values())])
+
+
+def _enumeration(signal: SignalSource) -> str:
+    base = "IntFlag, boundary=STRICT" if signal.kind == "Flags" else "IntEnum"
+    members = "".join(f"    {name} = {value}\n" for value, name in signal.choices.items())
+    return f"class {signal.type_name}({base}):\n{_docstring(signal.comment)}\n{members}"
+
+
+def _docstring(text: str) -> str:
+    lines = textwrap.wrap(text, TEXT_WIDTH)
+    closing = '"""' if len(lines) == 1 else '\n    """'
+    return '    """' + "\n    ".join(lines) + closing + "\n"
+
+
+# -- layouts.py ------------------------------------------------------------------------------------------------------
+
+
+def _layouts_module(schema: Schema) -> str:
+    head = (
+        '"""Messages and byte layouts. Generated from tormag.dbc; to change it, see `generate.py`."""\n\n'
+        "from typing import Final, final\n\n"
+        f"{_import('enumerations', sorted(_enumerations(schema)))}"
+        "from firmware_protocol.schema import Layout, Signal\n"
+        "from firmware_protocol.value import Value\n\n"
+        f"PROTOCOL_VERSION: Final = {schema.version}\n"
+        f"SCHEMA_HASH: Final = 0x{schema.schema_hash():08X}\n"
+    )
+    names = " | ".join(message.name for message in schema.messages)
+    layouts = "".join(_layout(message) for message in schema.messages)
+    messages = [_message(message) for message in schema.messages]
+    return "\n\n".join([head, *messages, f"Message = {names}\n\nLAYOUTS: Final = (\n{layouts})\n"])
+
+
+def _message(message: MessageSource) -> str:
+    names = ", ".join(f'"{signal.name}"' for signal in message.fields)
+    fields = []
+    for signal in message.fields:
+        fields += [f"        # {line}\n" for line in textwrap.wrap(signal.comment, TEXT_WIDTH - 4)]
+        fields.append(f"        self.{signal.name}: Final = {signal.name}\n")
+    parameters = ["self", *(f"{signal.name}: {signal.python_type}" for signal in message.fields)]
+    heading = f"{message.sender} -> {message.receiver}. {message.comment}"
+    return (
+        f"@final\nclass {message.name}(Value):\n{_docstring(heading)}\n"
+        f"    __match_args__ = ({names}{',' if len(message.fields) == 1 else ''})\n"
+        "    __slots__ = __match_args__\n\n"
+        f"    {_call('def __init__', parameters, ' -> None:')}\n{''.join(fields)}"
+    )
+
+
+def _call(before: str, arguments: list[str], after: str = "") -> str:
+    """`before(arguments)after` in a block, without its first indentation, broken where it is too long for a line."""
+    whole = f"{before}({', '.join(arguments)}){after}"
+    if len(whole) <= LINE_WIDTH - 4:
+        return whole
+    inner = f"        {', '.join(arguments)}\n"
+    if len(inner) > LINE_WIDTH + 1:
+        inner = "".join(f"        {argument},\n" for argument in arguments)
+    return f"{before}(\n{inner}    ){after}"
+
+
+def _layout(message: MessageSource) -> str:
+    signals = [
+        f'Signal("{s.name}", {s.python_type}, {_number(s.scale)}, {_number(s.minimum)}, {_number(s.maximum)}'
+        f"{', wraps=True' if s.kind == 'Wrapping' else ''}),"
+        for s in message.fields
+    ]
+    body = signals[0] if len(signals) == 1 else "\n            " + "\n            ".join(signals) + "\n        "
+    code = "<" + "".join(signal.struct_code for signal in message.signals)
+    return (
+        f"    Layout(\n        message={message.name},\n        function={message.function},\n"
+        f'        format="{code}",\n        protected={message.protected},\n        signals=({body}),\n    ),\n'
+    )
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if value.is_integer() else repr(value)
+
+
+# -- wire.py ---------------------------------------------------------------------------------------------------------
+
+
+def _wire_module(schema: Schema) -> str:
+    enumerations = _enumerations(schema)
+    flags = [name for name, signal in enumerations.items() if signal.kind == "Flags"]
+    members = "".join(
+        f"_{_constant(name)}: Final = " + (f"cache({name})" if name in flags else f"tuple({name})") + "\n"
+        for name in enumerations
+    )
+    packs = "".join(
+        f'_PACK_{_constant(message.name)}: Final = Struct("<{_codes(message)}").pack\n' for message in schema.messages
+    )
+    imports = ["from struct import Struct\n", "from typing import Final\n"]
+    if any(_is_wide(signal) for message in schema.messages for signal in message.fields):
+        imports.insert(0, "from operator import index\n")
+    if flags:
+        imports.insert(0, "from functools import cache\n")
+    head = (
+        f"{_WIRE_HEAD}{''.join(imports)}\n"
+        "from firmware_protocol.checksum import CRC8_FINAL_XOR, CRC8_TABLE\n"
+        f"{_import('enumerations', sorted(enumerations))}"
+        f"{_import('layouts', sorted(['Message', *(message.name for message in schema.messages)]))}\n"
+        "_BYTES: Final = tuple([bytes((byte,)) for byte in range(256)])\n"
+        f"{_ROUNDING}\n"
+        "# the member of a step; an enumeration's own look-up takes five times as long, and steps are range-checked before\n"
+        f"{members}\n{packs}"
+    )
+    functions = [text for message in schema.messages for text in (_pack(message), _unpack(message))]
+    return "\n\n".join([head, *functions, _dispatch(schema)])
+
+
+def _constant(name: str) -> str:
+    """DriveMode to DRIVE_MODE."""
+    return "".join(f"_{letter}" if letter.isupper() and place else letter for place, letter in enumerate(name)).upper()
+
+
+def _codes(message: MessageSource) -> str:
+    """`struct` codes of what is packed: wrapped steps go without their sign, and the CRC-8 comes after."""
+    return "".join(s.struct_code.upper() if s.kind == "Wrapping" else s.struct_code for s in message.fields)
+
+
+def _mask(value: int) -> str:
+    return f"0x{value:02X}"
+
+
+def _is_wide(signal: SignalSource) -> bool:
+    return signal.python_type != "float" and signal.length > 8
+
+
+def _storage(signal: SignalSource) -> tuple[int, int]:
+    span = 1 << signal.length
+    return (-span // 2, span // 2 - 1) if signal.signed else (0, span - 1)
+
+
+def _crc(message: MessageSource, data: str) -> list[str]:
+    start = CRC8_TABLE[CRC8_INITIAL ^ message.function]
+    lines = [f"crc = CRC8_TABLE[{_mask(start)} ^ {data}[0]]  # the register after the function, and the first byte"]
+    return lines + [f"crc = CRC8_TABLE[crc ^ {data}[{place}]]" for place in range(1, message.length - 1)]
+
+
+def _pack(message: MessageSource) -> str:
+    lines, steps = [], []
+    for s in message.fields:
+        name, (lowest, highest) = s.name, s.steps
+        if s.kind == "Wrapping":
+            lines += [
+                f"{name} = float(message.{name} / {s.scale!r})",
+                f"if not -_WHOLE < {name} < _WHOLE:",
+                f"    {name} %= {float(1 << s.length)!r}",
+            ]
+            steps.append(f"int({name} + _HALVES - _HALVES) & {_mask((1 << s.length) - 1)}")
+        elif s.python_type == "float":
+            lines += [
+                f"{name} = float(message.{name} / {s.scale!r}) + _HALVES - _HALVES",
+                f"if not {float(lowest)!r} <= {name} <= {float(highest)!r}:",
+                "    return None",
+            ]
+            steps.append(f"int({name})")
+        else:
+            value = f"index(message.{name})" if _is_wide(s) else f"message.{name}"
+            lines += [f"{name}: int = {value}", f"if not {lowest} <= {name} <= {highest}:", "    return None"]
+            steps.append(name)
+    packer = f"_PACK_{_constant(message.name)}"
+    if message.protected:
+        lines += [
+            _call(f"body = {packer}", steps),
+            *_crc(message, "body"),
+            "return body + _BYTES[crc ^ CRC8_FINAL_XOR]",
+        ]
+    else:
+        lines.append(_call(f"return {packer}", steps))
+    head = f"def pack_{message.name.lower()}(message: {message.name}) -> bytes | None:\n"
+    return head + "".join(f"    {line}\n" for line in lines)
+
+
+def _unpack(message: MessageSource) -> str:
+    lines = [f"if len(data) != {message.length}:", "    return None"]
+    if message.protected:
+        last = message.length - 1
+        lines += [*_crc(message, "data"), f"if data[{last}] != crc ^ CRC8_FINAL_XOR:", "    return None"]
+    values = []
+    for s in message.fields:
+        first, count = s.start // 8, s.length // 8
+        raw = " | ".join(f"data[{first + k}]" + (f" << {8 * k}" if k else "") for k in range(count))
+        if s.signed:
+            half = _mask(1 << s.length - 1)
+            raw = f"(({raw}) ^ {half}) - {half}" if count > 1 else f"({raw} ^ {half}) - {half}"
+        lines.append(f"{s.name} = {raw}")
+        lowest, highest = s.steps
+        if (lowest, highest) != _storage(s):
+            test = f"not {lowest} <= {s.name} <= {highest}" if lowest > _storage(s)[0] else f"{s.name} > {highest}"
+            lines += [f"if {test}:", "    return None"]
+        if s.python_type == "float":
+            values.append(f"{s.name} * {s.scale!r}")
+        elif s.kind == "Enumeration":
+            values.append(f"_{_constant(s.type_name)}[{s.name}]")
+        elif s.kind == "Flags":
+            values.append(f"_{_constant(s.type_name)}({s.name})")
+        else:
+            values.append(s.name)
+    lines.append(_call(f"return {message.name}", values))
+    head = f"def unpack_{message.name.lower()}(data: bytes) -> {message.name} | None:\n"
+    return head + "".join(f"    {line}\n" for line in lines)
+
+
+def _dispatch(schema: Schema) -> str:
+    packs = "".join(
+        f"    if isinstance(message, {m.name}):\n        return pack_{m.name.lower()}(message)\n"
+        for m in schema.messages
+    )
+    unpacks = "".join(
+        f"    if function == {m.function}:\n        return unpack_{m.name.lower()}(data)\n" for m in schema.messages
+    )
+    return (
+        'def pack(message: Message) -> bytes | None:\n    """The payload of a message; None where a value does not fit."""\n'
+        f"{packs}    return None\n\n\n"
+        "def unpack(function: int, data: bytes) -> Message | None:\n"
+        '    """The message in a payload; None for bytes that are none."""\n'
+        f"{unpacks}    return None\n"
+    )
