@@ -609,7 +609,7 @@ def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Ca
     assert states > 100
     # on serial every frame has a number, and the second is not given out; on CAN only State has, and the link knows
     expected = len(tap.heard) if transport == "serial" else states // 2
-    assert connection.report()["repeated"] == expected
+    assert connection.report().repeated == expected
 
 
 @pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES.items() if name != "cut"])
