@@ -113,6 +113,11 @@ class Connection:
         return self._remedy or _REMEDIES.get(self.state, "")
 
     @property
+    def link(self) -> DeviceLink | None:
+        """The conversation of this opening of the port; None while it is not open."""
+        return self._link
+
+    @property
     def measurement(self) -> Measurement | None:
         """The newest measurement while the link runs."""
         return self._link.measurement if self._link is not None and self._link.state is LinkState.RUNNING else None
