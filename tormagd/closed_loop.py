@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from firmware_protocol.codec import Message
-from tormagd.config import Config, Device
+from tormagd.config import Config
 from tormagd.control.conditions import conditions
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import Plan, Planner, PlanState
@@ -55,7 +55,7 @@ class VirtualPort:
         self._stream = FrameStream()
         self._unread = b""
 
-    def open(self, _device: Device) -> Self:
+    def open(self) -> Self:
         """The same port again, with a line that has carried nothing yet."""
         self._stream, self._unread = FrameStream(), b""
         return self

@@ -56,7 +56,7 @@ class FailingPlanner:
         return self._planner.plan(*arguments)
 
 
-def no_device(_device: Any) -> Backend:
+def no_device() -> Backend:
     raise BackendError("no such port", "plug it in")
 
 

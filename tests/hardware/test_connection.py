@@ -141,7 +141,7 @@ class Bench:
         return self.ports[-1] if self.ports and not self.ports[-1].is_closed else None
 
     # what the connection is given
-    def _open(self, device: Device) -> Port:
+    def _open(self) -> Port:
         self.attempts_s.append(self.now_s)
         if not self.is_there:
             raise BackendError("/dev/tormag: there is no such port", "plug the device in")

@@ -6,7 +6,6 @@ import signal
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 from tormagd.config import Config
 from tormagd.control.core import Core
@@ -36,7 +35,7 @@ log = logging.getLogger(__name__)
 class Daemon:
     """Runs one scene on one device until it is told to end."""
 
-    def __init__(self, config: Config, core: Core, open_backend: Callable[[Any], Backend], refused: list[str]) -> None:
+    def __init__(self, config: Config, core: Core, open_backend: Callable[[], Backend], refused: list[str]) -> None:
         self._config, self._core = config, core
         self._loop = asyncio.get_running_loop()
         self._callbacks = Callbacks(self._loop)

@@ -71,7 +71,7 @@ class Connection:
     def __init__(
         self,
         device: Device,
-        open_backend: Callable[[Device], Backend],
+        open_backend: Callable[[], Backend],
         on_loss: Callable[[], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -199,7 +199,7 @@ class Connection:
     def _open(self, now_s: float) -> None:
         assert self._watcher is not None, "only an opened connection is opened again"
         try:
-            self._backend = self._open_backend(self._device)
+            self._backend = self._open_backend()
         except BackendError as error:
             # the first failure is news, the same one again is not
             log.log(logging.WARNING if str(error) != self._cause else logging.DEBUG, "%s", error)
