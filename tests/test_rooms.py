@@ -23,7 +23,7 @@ MAY_IMPORT = {
     "inverse": {"firmware_protocol", "physics", "learning"},
     "scenes": {"config"},
     "safety": {"firmware_protocol"},
-    "hardware": {"firmware_protocol", "config", "safety"},
+    "hardware": LOWEST | {"safety"},
     "control": LOWEST | {"physics", "learning", "inverse", "scenes", "safety", "hardware"},
     "daemon": LOWEST | {"output", "scenes", "safety", "hardware", "control"},
     "recording": {"messages"},

@@ -32,10 +32,10 @@ from benchmark_plot import plot_histograms
 from tormagd.config import Config, RealTime, load_config
 from tormagd.ctl.client import Client
 from tormagd.ctl.outcome import CommandError
-from tormagd.daemon.daemon import SERVED_BEFORE_NS
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
+from tormagd.daemon.telemetry_loop import SERVED_BEFORE_NS
 from tormagd.messages import Request
 from tormagd.recording.ticks import decode_ticks
 
@@ -256,7 +256,7 @@ async def _bare(config: Config) -> None:
     def publish(heartbeat: Heartbeat, _beats: int, now_ns: int) -> None:
         rows.append((time.time_ns(), (now_ns - heartbeat.due_ns) * 1e-3, 0.0))
         if len(rows) >= TELEMETRY_EVERY:
-            endpoint.publish_ticks(("t_ns", "lateness_us", "exec_us"), rows)
+            endpoint.publish_ticks(rows, ("t_ns", "lateness_us", "exec_us"))
             rows.clear()
             endpoint.serve(now_ns * 1e-9, reply, heartbeat.due_ns + heartbeat.period_ns - SERVED_BEFORE_NS)
 

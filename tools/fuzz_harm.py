@@ -165,5 +165,6 @@ def _publisher(now_s: float) -> TimedSetpoint:
 
 def _inject(loop: ClosedLoop, message: Message) -> None:
     """The message comes to both ends; each makes of it what it does."""
-    loop.link.receive(loop.now_s, message)
+    if loop.connection.link is not None:
+        loop.connection.link.receive(loop.now_s, message)
     loop.device.messages.receive(loop.now_s + AFTER_DRIVE_S, FUNCTION[type(message)], encode(message))

@@ -33,7 +33,7 @@ from tormagd.messages import VERSION, Setpoint, encode
 from tormagd.recording.ticks import decode_ticks
 
 DOORS = {"serial": "--pty", "can": "--can"}
-BACKENDS = {"serial": 'backend = "serial"', "can": 'backend = "can"\ninterface = "tormagsim"'}
+BACKENDS = {"serial": 'backend = "serial"', "can": 'backend = "can"\noptions.interface = "tormagsim"'}
 ENDPOINTS = ("setpoint", "telemetry", "control", "recording")
 PATIENCE_S = 60.0
 ATTEMPTS = 10

@@ -1,22 +1,25 @@
 """The closed loop in virtual time: the daemon's core against the simulated device, as fast as the processor goes.
 
-The same `plan` and `step`, the same link, the same protocol bytes as in the daemon; only time, sockets and the port
-are replaced. It stands beside the rooms because it joins control with simulation, which no room may.
+The same `plan` and `step`, the same connection, the same protocol bytes as in the daemon; only time, sockets and the
+port are replaced. It stands beside the rooms because it joins control with simulation, which no room may.
 """
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 
+from firmware_protocol.codec import Message
 from tormagd.config import Config
+from tormagd.control.conditions import conditions
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import Plan, Planner, PlanState
 from tormagd.control.step import StepOutput, Stepper, StepState
+from tormagd.hardware.backend import LinkStatistics
+from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
-from tormagd.hardware.link import DeviceLink, LinkState
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import Conditions, OperatingState
 from tormagd.simulation.device import VirtualDevice
@@ -40,21 +43,76 @@ class Sample(NamedTuple):
     truth: Truth
 
 
+class VirtualPort:
+    """A backend whose far end is the simulated device; also the clock, and the event loop, which never calls back.
+
+    `device` may be changed for one that behaves as badly as a test wants.
+    """
+
+    def __init__(self, device: VirtualDevice) -> None:
+        self.device = device
+        self.now_s = 0.0
+        self._stream = FrameStream()
+        self._unread = b""
+
+    def open(self) -> Self:
+        """The same port again, with a line that has carried nothing yet."""
+        self._stream, self._unread = FrameStream(), b""
+        return self
+
+    def clock(self) -> float:
+        """Virtual time, s."""
+        return self.now_s
+
+    def advance(self, now_s: float) -> None:
+        """Lets time pass; what the device sends waits for its reader, as much of it as a port keeps."""
+        self.now_s = now_s
+        self._unread = self._unread[-MAX_UNREAD_BYTES:] + self.device.transmit(now_s)
+
+    @property
+    def statistics(self) -> LinkStatistics:
+        """Counters since the port was opened."""
+        return self._stream.statistics
+
+    def fileno(self) -> int:
+        """None: nothing waits in virtual time."""
+        return -1
+
+    def receive(self) -> list[Message]:
+        """All valid messages that have arrived."""
+        arrived, self._unread = self._unread, b""
+        return self._stream.unpack(arrived)
+
+    def send(self, message: Message) -> None:
+        """Hands one message to the device's line."""
+        self.device.receive(self.now_s, self._stream.pack(message))
+
+    def close(self) -> None:
+        """There is nothing to give back."""
+
+    def add_reader(self, fd: int, callback: Callable[[], None]) -> None:
+        """Takes no note of it: the closed loop reads in every tick."""
+
+    def remove_reader(self, fd: int) -> None:
+        """Nothing was noted."""
+
+
 class ClosedLoop:
     """A daemon and its device in one process and one virtual time, which starts at 0."""
 
     def __init__(self, config: Config, stepper: Stepper, planner: Planner | None, device: VirtualDevice) -> None:
         """`planner` may be missing where every tick is given its plan."""
-        self._config, self._stepper, self._planner, self.device = config, stepper, planner, device
+        self._config, self._stepper, self._planner = config, stepper, planner
         self._period_s = 1.0 / config.rates.control_hz
         self._inference_s = 1.0 / config.rates.inference_hz
-        self._stream = FrameStream()
-        self._unread = b""
-        self._requested = 0
         self._ticks = 0
-        self.link = DeviceLink(0.0)
         self.step_state = stepper.start(0.0)
         self.plan_state: PlanState | None = None if planner is None else planner.start(0.0)
+        self._output: StepOutput | None = None
+        self._setpoint: TimedSetpoint | None = None
+        self._port = VirtualPort(device)
+        self.connection = Connection(config.device, self._port.open, self._lose_link, self._port.clock)
+        self.connection.open(self._port)
 
     @property
     def now_s(self) -> float:
@@ -62,20 +120,31 @@ class ClosedLoop:
         return self._ticks * self._period_s
 
     @property
+    def device(self) -> VirtualDevice:
+        """What is at the other end of the wire."""
+        return self._port.device
+
+    @device.setter
+    def device(self, device: VirtualDevice) -> None:
+        self._port.device = device
+
+    @property
     def measurement(self) -> Measurement | None:
         """The newest measurement while the link runs."""
-        return self.link.measurement if self.link.state is LinkState.RUNNING else None
+        return self.connection.measurement
 
     def tick(self, setpoint: TimedSetpoint | None = None, plan: Plan | None = None) -> Sample:
         """One control period. A given `plan` is used instead of planning: a bench sweep asks for gaps, not forces."""
         self._ticks += 1
         now_s = self.now_s
-        arrived, self._unread = self._unread + self.device.transmit(now_s), b""
-        for message in self._stream.unpack(arrived):
-            self.link.receive(now_s, message)
+        self._port.advance(now_s)
+        self.connection.receive()
         used = self._newest_plan() if plan is None else plan
-        self.step_state, output = self._stepper.step(self.step_state, now_s, self.measurement, used)
-        self._send(now_s, output)
+        self.step_state, output = self._stepper.step(self.step_state, now_s, self.connection.measurement, used)
+        self.connection.exchange(
+            output.left_duty, output.right_duty, output.mode, output.request, output.request_number
+        )
+        self._output, self._setpoint = output, setpoint
         if plan is None:
             self._infer(now_s, setpoint)
         trim = 1.0 if self.plan_state is None else self.plan_state.trim
@@ -84,7 +153,7 @@ class ClosedLoop:
     def skip(self) -> None:
         """One control period in which the daemon does nothing: it was stopped, or killed. What comes waits for it."""
         self._ticks += 1
-        self._unread = (self._unread + self.device.transmit(self.now_s))[-MAX_UNREAD_BYTES:]
+        self._port.advance(self.now_s)
 
     def command(self, name: str) -> None:
         """An operator's command. Raises RefusedError."""
@@ -92,16 +161,17 @@ class ClosedLoop:
 
     def conditions(self) -> Conditions:
         """What commands are decided on."""
-        measurement = self.measurement
-        return Conditions(
-            connected=measurement is not None,
-            fresh=measurement is not None,
-            homed=measurement is not None and measurement.is_homed,
-            busy=measurement is not None and measurement.is_busy,
-            device_latched=measurement is not None and measurement.is_latched,
-            requested_N=None,  # an operator here arms before the publisher starts
-            neutral_N=0.0,
-            sensor_doubted=self.plan_state is not None and self.plan_state.sensor.is_doubted,
+        planner, planned = self._planner, self.plan_state
+        return conditions(
+            self.now_s,
+            self._config,
+            self.connection.measurement,
+            self.connection.pending,
+            self.step_state,
+            self._output,
+            self._setpoint,
+            planned.device.force_N(planner.portrait.least_N) if planner is not None and planned is not None else 0.0,
+            sensor_doubted=planned is not None and planned.sensor.is_doubted,
         )
 
     def run(
@@ -138,17 +208,11 @@ class ClosedLoop:
             self.tick(plan=plan)
             if self.measurement is not None and reached(self.measurement):
                 return
-        raise RuntimeError(f"the device did not {what} within {HOMING_S:g} s: {self.link.state} {self.link.cause}")
+        link = f"{self.connection.state} {self.connection.cause}"
+        raise RuntimeError(f"the device did not {what} within {HOMING_S:g} s: {link}")
 
-    def _send(self, now_s: float, output: StepOutput) -> None:
-        if output.request_number != self._requested:
-            self._requested = output.request_number
-            self.link.request(now_s, output.request)
-        if self.link.state is LinkState.RUNNING:
-            drive = self.link.drive(output.left_duty, output.right_duty, output.mode)
-            self.device.receive(now_s, self._stream.pack(drive))
-        for message in self.link.due(now_s):
-            self.device.receive(now_s, self._stream.pack(message))
+    def _lose_link(self) -> None:
+        self.step_state = self._stepper.lose_link(self.step_state)
 
 
 def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:

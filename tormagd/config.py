@@ -15,8 +15,6 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 from msgspec import Meta
 
-CAN_EXCHANGE_BITS = 395  # Drive, State and Sense with the most stuffing: firmware_protocol/README.md
-CAN_MOST_LOAD = 0.7  # what is left is for Status, commands and the bus's other nodes
 LEAST_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
 DEFAULT_RUN_DIR = "/run/tormag"
 LONGEST_IPC_PATH = 107  # bytes that the kernel takes of a socket's path
@@ -39,14 +37,8 @@ class Device(Strict, frozen=True):
     backend: str = "serial"
     port: str = "/dev/tormag"
     "Path of the serial port; with the backend `can`, the channel: `can0`, or an adapter's path."
-    baud: Annotated[int, Meta(ge=115_200, le=12_000_000)] = 1_000_000
-    "Of a serial port, also of one with a CAN adapter behind it."
-    interface: str = ""
-    "The python-can interface, for the backend `can`."
-    bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 1_000_000
-    "Of the CAN bus. socketcan takes it from the kernel (`ip link`)."
-    node: Annotated[int, Meta(ge=0, le=15)] = 1
-    "The device's node number on the CAN bus."
+    options: dict[str, Any] = msgspec.field(default_factory=dict)
+    "The backend's own settings; what they are and may be is the backend's to say."
     command_timeout_ms: Annotated[float, Meta(ge=5.0, le=1_000.0)] = 50.0
     "What the firmware does without us: its own timeout, stated here so that it can be checked against ours."
     measurement_timeout_ms: Annotated[float, Meta(ge=2.0, le=1_000.0)] = 50.0
@@ -54,10 +46,6 @@ class Device(Strict, frozen=True):
 
     def __post_init__(self) -> None:
         _order(self.port.isprintable(), "device.port", self.port, "printable characters")
-        if self.backend == "can":
-            _order(self.interface != "", "device.interface", "", "a python-can interface, as in 'socketcan'")
-        if self.backend == "serial":
-            _order(self.interface == "", "device.interface", self.interface, "'' unless device.backend = 'can'")
 
 
 class Endpoints(Strict, frozen=True):
@@ -181,13 +169,6 @@ class Config(Strict, frozen=True):
             f"a divisor of rates.control_hz = {rates.control_hz}",
         )
         _order(
-            device.backend != "can" or rates.control_hz * CAN_EXCHANGE_BITS <= CAN_MOST_LOAD * device.bitrate,
-            "device.bitrate",
-            device.bitrate,
-            f"from {math.ceil(rates.control_hz * CAN_EXCHANGE_BITS / CAN_MOST_LOAD)} on at rates.control_hz = "
-            f"{rates.control_hz}",
-        )
-        _order(
             device.command_timeout_ms < self.realtime.watchdog_ms,
             "device.command_timeout_ms",
             device.command_timeout_ms,
@@ -294,9 +275,19 @@ def convert(path: Path, kind: type[T]) -> T:
     """The file's tables as a `kind`. Raises ConfigError naming file, key, value and what is allowed."""
     tables = load_toml(path)
     try:
+        return checked(tables, kind)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
+    """The tables as a `kind`, whose root is at `where`. Raises ConfigError naming key, value and what is allowed."""
+    try:
         return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: {error}{_value_at(tables, str(error))}") from error
+        text = str(error)
+        refused = text if "`$" in text or where == "$" else f"{text} - at `$`"
+        raise ConfigError(refused.replace("`$", f"`{where}") + _value_at(tables, text)) from error
 
 
 def _value_at(tables: dict[str, Any], message: str) -> str:

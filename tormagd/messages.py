@@ -2,8 +2,12 @@
 
 `decode` is the border: msgpack unpacks with size limits, msgspec checks names and types, each message checks its own
 values. Unknown fields are ignored, so that a newer client can talk to an older daemon.
+
+What leaves the daemon has its type here: `Telemetry`, `Status`, `TickRecord`, `Reply`. docs/messages.md lists their
+fields, and says when `v` rises.
 """
 
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import msgpack
@@ -111,6 +115,204 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     tick: Tick
 
 
+class Explained(msgspec.Struct, frozen=True):
+    """A fault or a limit with its cause, in the figures of this very time where they are known, and its remedy."""
+
+    code: str
+    cause: str
+    remedy: str
+
+
+class RoundTripReport(msgspec.Struct, frozen=True):
+    """From a Drive that is handed to the wire until its State has been read: percentiles of the newest ones, us."""
+
+    least: float
+    p50: float
+    p99: float
+
+
+class ClockReport(msgspec.Struct, frozen=True):
+    """The line through the device's clock: host - device, and by how much the device's runs fast."""
+
+    offset_s: float
+    drift_ppm: float
+    residual_us: float
+    windows: int
+    outliers: int
+
+
+class LinkReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Who is at the other end of the wire, and how well it carries; `tormagctl firmware --json`.
+
+    The counters are those of this opening of the port, `losses` those since the start. What is not known is null.
+    """
+
+    state: str
+    cause: str
+    remedy: str
+    backend: str
+    port: str
+    losses: int
+    last_loss: str
+    firmware: str | None
+    serial_number: int | None
+    firmware_schema: str | None
+    daemon_schema: str
+    protocol_version: int
+    frames: int | None
+    bytes: int | None
+    corrupt: int | None
+    lost: int | None
+    repeated: int | None
+    resynchronisations: int | None
+    round_trip_us: RoundTripReport | None
+    clock: ClockReport | None
+
+
+class SetpointReport(msgspec.Struct, frozen=True, kw_only=True):
+    """What became of the setpoints since the start; `sources` has each publisher's newest `seq`."""
+
+    accepted: int
+    refused: int
+    dropped: int
+    oversize: int
+    last_refusal: str | None
+    newest_source: str
+    sources: dict[str, int]
+
+
+class ExecReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Percentiles of a duration over the last seconds, and the longest of them, us."""
+
+    p50: float
+    p99: float
+    p999: float
+    max: float
+
+
+class LatenessReport(ExecReport, frozen=True, kw_only=True):
+    """The same of how late runs began; `worst` is the longest since the start."""
+
+    worst: float
+
+
+class RateReport(msgspec.Struct, frozen=True, kw_only=True):
+    """How well a rate group keeps its time: counts since the start, percentiles over the last five to ten seconds."""
+
+    grade: str
+    hz: float
+    runs: int
+    merged: int
+    overruns: int
+    stalls: int
+    lateness_us: LatenessReport
+    exec_us: ExecReport
+
+
+class DeviceReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The device as far as it has shown itself: its force is `scale` times the model's plus `offset_N`."""
+
+    scale: float
+    scale_sd: float
+    offset_N: float
+    offset_sd_N: float
+
+
+class StallReport(msgspec.Struct, frozen=True):
+    """How long the control loop stood still, and what most of that went into."""
+
+    ms: float
+    culprit: str
+
+
+class Status(Telemetry, frozen=True, kw_only=True):
+    """The answer to the command `status`: the newest telemetry, and what is worth asking for."""
+
+    version: str
+    scene: str
+    uptime_s: float
+    least_N: float
+    most_N: float
+    trim: float
+    device: DeviceReport
+    least_gap_mm: float
+    link: LinkReport
+    setpoints: SetpointReport
+    rates: dict[str, RateReport]
+    late_ticks_by: dict[str, int]
+    fault_details: tuple[Explained, ...]
+    limit_details: tuple[Explained, ...]
+    newest_stall: StallReport | None
+    not_granted: tuple[str, ...]
+
+
+class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """One control tick: all that the step was given, and all that it gave. Units as in `Telemetry`; times in ns and s.
+
+    A row of the recording endpoint's message, its columns in this order. `device_*` is what the device said itself,
+    beside what is concluded from it. What is not known (no device, no setpoint) is null. `received_s` (of the clock of
+    `monotonic_s`) and `delay_s` are the measurement's: from them a step decides how old it is.
+    """
+
+    t_ns: int
+    monotonic_s: float
+    # the plan
+    plan: int
+    setpoint_cf: float | None
+    plan_setpoint_age_s: float | None
+    governed_cf: float | None
+    plan_governed_cf: float
+    predicted_cf: float | None
+    field_mT: float
+    plan_gap_mm: float
+    plan_gap_speed_mm_s: float
+    plan_gap_acceleration_mm_s2: float
+    plan_least_gap_mm: float
+    plan_limits: tuple[str, ...]
+    plan_outside: tuple[str, ...]
+    plan_sensor_doubted_s: float
+    foresight: float
+    plan_time_s: float
+    confidence: float
+    trim: float
+    # the measurement
+    measurement: int | None
+    received_s: float | None
+    delay_s: float | None
+    device_time_s: float | None
+    device_left_mm: float | None
+    device_right_mm: float | None
+    device_handle_mm: float | None
+    device_force_N: float | None
+    device_mode: str | None
+    device_switches: tuple[str, ...]
+    device_faults: tuple[str, ...]
+    device_temperature_C: float | None
+    left_current_A: float | None
+    right_current_A: float | None
+    supply_V: float | None
+    # what is concluded
+    reference_gap_mm: float | None
+    measured_cf: float | None
+    left_mm: float | None
+    right_mm: float | None
+    handle_mm: float | None
+    handle_rate_mm_s: float | None
+    operating_state: str
+    limits: tuple[str, ...]
+    step_limits: tuple[str, ...]
+    faults: tuple[str, ...]
+    # the command
+    drive_mode: str
+    left_duty: float
+    right_duty: float
+    request: str
+    request_number: int
+    # the tick
+    lateness_us: float
+    exec_us: float
+
+
 class Request(msgspec.Struct, frozen=True, kw_only=True):
     """A command to the daemon's control endpoint."""
 
@@ -164,6 +366,11 @@ def decode(data: bytes, message_type: type[M]) -> M:
 def encode(message: Setpoint | Telemetry | Request | Reply) -> bytes:
     """The msgpack map of `message`."""
     return _ENCODER.encode(message)
+
+
+def encode_ticks(rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> bytes:
+    """The recording endpoint's message with these rows; `tormagd.recording.ticks` reads it."""
+    return _ENCODER.encode({"v": VERSION, "columns": columns, "rows": rows})
 
 
 _ENCODER = msgspec.msgpack.Encoder()

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+import msgspec
 import pytest
 import zmq
 
@@ -45,11 +46,62 @@ def telemetry(seq: int, t_ns: int, **changes: Any) -> Telemetry:
     return Telemetry(**(known | changes))
 
 
+LINK: dict[str, Any] = {
+    "state": "RUNNING",
+    "cause": "",
+    "remedy": "",
+    "backend": "serial",
+    "port": "/dev/tormag",
+    "losses": 1,
+    "last_loss": "no message for 80 ms",
+    "firmware": "1.0",
+    "serial_number": 7,
+    "firmware_schema": "4b3a5911",
+    "daemon_schema": "4b3a5911",
+    "protocol_version": 1,
+    "frames": 55_096,
+    "bytes": 812_345,
+    "corrupt": 0,
+    "lost": 2,
+    "repeated": 0,
+    "resynchronisations": 0,
+    "round_trip_us": {"least": 351.0, "p50": 402.5, "p99": 480.0},
+    "clock": {"offset_s": 12.345678, "drift_ppm": 30.12, "residual_us": 3.2, "windows": 120, "outliers": 1},
+}
+
+
 def status(**changes: Any) -> dict[str, Any]:
     """What the daemon answers to `status`."""
-    snapshot = {name: getattr(telemetry(1, 1), name) for name in Telemetry.__struct_fields__ if name != "tick"}
+    known: dict[str, Any] = msgspec.to_builtins(telemetry(1, 1))
     return (
-        snapshot | {"version": "0", "scene": "pulse", "uptime_s": 5.0, "link": {"state": "UP", "frames": 7}} | changes
+        known
+        | {
+            "version": "0",
+            "scene": "pulse",
+            "uptime_s": 5.0,
+            "least_N": 0.6,
+            "most_N": 4.0,
+            "trim": 1.0,
+            "device": {"scale": 1.0, "scale_sd": 0.1, "offset_N": 0.0, "offset_sd_N": 0.1},
+            "least_gap_mm": 30.0,
+            "link": LINK,
+            "setpoints": {
+                "accepted": 3,
+                "refused": 1,
+                "dropped": 0,
+                "oversize": 0,
+                "last_refusal": "too much",
+                "newest_source": "a",
+                "sources": {"a": 4},
+            },
+            "rates": {},
+            "late_ticks_by": {},
+            "fault_details": [],
+            "limit_details": [],
+            "newest_stall": None,
+            "not_granted": [],
+        }
+        | changes
     )
 
 
@@ -66,6 +118,10 @@ class FakeDaemon(threading.Thread):
         self.rubbish: list[bytes] = []
         self.is_bound = threading.Event()
         self.is_over = threading.Event()
+
+    def says(self, **changes: Any) -> None:
+        """Its status is this from now on."""
+        self.answers["status"] = lambda: {"ok": True, "result": status(**changes)}
 
     def refuse(self, command: str, code: str) -> None:
         error = {"code": code, "message": f"cannot {command}", "hint": "do this first"}
@@ -102,6 +158,12 @@ class FakeDaemon(threading.Thread):
                 recording.send(data)
             seq += 1
         context.destroy(linger=0)
+
+
+@pytest.fixture
+def status_with() -> Callable[..., dict[str, Any]]:
+    """Makes an answer to `status` with some keys changed."""
+    return status
 
 
 @pytest.fixture

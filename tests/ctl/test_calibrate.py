@@ -287,8 +287,7 @@ def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, tmp_path, monk
             return ticks(300)
 
     monkeypatch.setattr(ctl_calibrate_motors, "armed", lambda *_: contextlib.nullcontext(Played()))
-    found = {"setpoint_age_ms": None, "least_N": 0.6, "most_N": 4.0}
-    fake_daemon.answers["status"] = lambda: {"ok": True, "result": found}
+    fake_daemon.says(setpoint_age_ms=None, least_N=0.6, most_N=4.0)
     out = tmp_path / "right.csv"
     arguments = ["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--motors", "--side", "right"]
     assert main([*arguments, "--out", str(out)]) == 0
@@ -320,8 +319,7 @@ def test_what_cannot_be_meant_is_a_usage_error(tmp_path, monkeypatch, capsys, ar
 
 
 def test_a_second_publisher_is_refused_before_anything_moves(fake_daemon, tmp_path, capsys):
-    found = {"setpoint_age_ms": 12.0, "least_N": 0.6, "most_N": 4.0}
-    fake_daemon.answers["status"] = lambda: {"ok": True, "result": found}
+    fake_daemon.says(setpoint_age_ms=12.0)
     out = tmp_path / "m.safetensors"
     arguments = ["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--insert", INSERT]
     assert main([*arguments, "--out", str(out)]) == 1

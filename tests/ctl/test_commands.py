@@ -5,11 +5,13 @@ from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from tormagd.ctl.main import main
 from tormagd.ctl.outcome import Colour
 from tormagd.ctl.status import status_text
+from tormagd.messages import Status
 
 
 def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
@@ -25,13 +27,36 @@ def test_status_gives_the_daemons_own_keys(fake_daemon, capsys):
     assert code == 0
     assert printed["result"]["operating_state"] == "ENABLED"
     assert printed["result"]["measured_jp"] == [35.0, 35.0]
-    assert printed["result"]["link"] == {"state": "UP", "frames": 7}
+    assert printed["result"]["link"]["frames"] == 55_096
+
+
+def test_what_a_newer_daemon_says_besides_is_shown_and_does_not_matter(fake_daemon, capsys):
+    fake_daemon.says(core_share=0.1)
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "status")
+    assert (code, printed["result"]["core_share"]) == (0, 0.1)
+
+
+@pytest.mark.parametrize("command", ["status", "firmware", "home"])
+@pytest.mark.parametrize("changes", [{"is_homed": None}, {"link": 3}, {"rates": {"control": {}}}, {"limits": None}])
+def test_a_status_that_is_not_understood_names_what_and_the_daemons_version(fake_daemon, capsys, command, changes):
+    fake_daemon.says(version="0.0.9", **changes)
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, command)
+    assert (code, printed["error"]["code"]) == (3, "unintelligible")
+    assert "tormagd 0.0.9" in printed["error"]["message"]
+    assert next(iter(changes)) in printed["error"]["message"]
+
+
+def test_a_status_without_a_key_names_it(fake_daemon, capsys):
+    fake_daemon.answers["status"] = lambda: {"ok": True, "result": {"operating_state": "ENABLED"}}
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "status")
+    assert (code, printed["error"]["code"]) == (3, "unintelligible")
+    assert "tormagd of an unknown version" in printed["error"]["message"]
+    assert "missing required field" in printed["error"]["message"]
 
 
 def test_status_in_fault_exits_4_and_names_cause_and_remedy(fake_daemon, capsys):
     details = [{"code": "SKEW", "cause": "carriages apart", "remedy": "clean the screw"}]
-    result = {"operating_state": "FAULT", "faults": ["SKEW"], "fault_details": details}
-    fake_daemon.answers["status"] = lambda: {"ok": True, "result": result}
+    fake_daemon.says(operating_state="FAULT", faults=["SKEW"], fault_details=details)
     assert main(["--endpoint", fake_daemon.control, "status"]) == 4
     text = capsys.readouterr().out
     assert "SKEW" in text
@@ -162,15 +187,21 @@ def test_scene_text_is_toml_that_loads_again(tmp_path, capsys):
     assert run_json(capsys, "scene", "show", str(copy)) == run_json(capsys, "scene", "show", "pulse")
 
 
-def states(*pairs: tuple[bool, bool], **changes: Any) -> Any:
-    """Answers to `status`, one (is_homed, is_busy) after the other, the last one for ever."""
-    sequence = chain(pairs, repeat(pairs[-1]))
-    return lambda: {
-        "ok": True,
-        "result": dict(zip(("is_homed", "is_busy"), next(sequence), strict=True))
-        | {"operating_state": "DISABLED"}
-        | changes,
-    }
+@pytest.fixture
+def states(status_with: Any) -> Any:
+    """Makes answers to `status`, one (is_homed, is_busy) after the other, the last one for ever."""
+
+    def answers(*pairs: tuple[bool, bool], **changes: Any) -> Any:
+        sequence = chain(pairs, repeat(pairs[-1]))
+
+        def answer() -> dict[str, Any]:
+            is_homed, is_busy = next(sequence)
+            shown = {"is_homed": is_homed, "is_busy": is_busy, "operating_state": "DISABLED"}
+            return {"ok": True, "result": status_with(**shown | changes)}
+
+        return answer
+
+    return answers
 
 
 @pytest.mark.parametrize(
@@ -181,7 +212,7 @@ def states(*pairs: tuple[bool, bool], **changes: Any) -> Any:
         [(False, False), (True, False)],  # over between two looks
     ],
 )
-def test_home_waits_until_the_device_is_homed(fake_daemon, capsys, sequence):
+def test_home_waits_until_the_device_is_homed(fake_daemon, capsys, states, sequence):
     fake_daemon.answers["status"] = states(*sequence)
     code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "home")
     assert code == 0
@@ -197,14 +228,14 @@ def test_home_waits_until_the_device_is_homed(fake_daemon, capsys, sequence):
         ([(True, False)], "5", "not_begun"),
     ],
 )
-def test_home_that_does_not_succeed_says_how(fake_daemon, capsys, monkeypatch, sequence, timeout, expected):
+def test_home_that_does_not_succeed_says_how(fake_daemon, capsys, monkeypatch, states, sequence, timeout, expected):
     monkeypatch.setattr("tormagd.ctl.operate.BEGIN_S", 0.2)
     fake_daemon.answers["status"] = states(*sequence)
     code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "home", "--timeout", timeout)
     assert (code, printed["error"]["code"]) == (1, expected)
 
 
-def test_a_fault_while_homing_exits_4_with_its_remedy(fake_daemon, capsys):
+def test_a_fault_while_homing_exits_4_with_its_remedy(fake_daemon, capsys, states):
     details = [{"code": "SUPPLY", "cause": "supply voltage low", "remedy": "check the power supply"}]
     fake_daemon.answers["status"] = states(
         (False, True), operating_state="FAULT", faults=["SUPPLY"], fault_details=details
@@ -214,7 +245,7 @@ def test_a_fault_while_homing_exits_4_with_its_remedy(fake_daemon, capsys):
     assert printed["error"]["hint"] == "check the power supply"
 
 
-def test_home_no_wait_returns_at_once(fake_daemon, capsys):
+def test_home_no_wait_returns_at_once(fake_daemon, capsys, states):
     fake_daemon.answers["status"] = states((False, False), (False, True))
     assert run_json(capsys, "--endpoint", fake_daemon.control, "home", "--no-wait")[0] == 0
     assert fake_daemon.commands == ["status", "home"]
@@ -236,22 +267,28 @@ def test_colours_only_on_a_terminal_and_not_with_no_color(monkeypatch):
     assert Colour(Terminal()).red("x") == "x"  # type: ignore[arg-type]
 
 
-def test_status_text_of_a_daemon_that_says_little_or_nonsense():
-    plain = Colour(sys.stderr)
-    assert "state     -" in status_text({}, plain)
-    assert "measured -" in status_text({"link": 3, "rates": None, "measured_cf": "many", "limits": None}, plain)
-    vague = status_text({"rates": {"control": {"grade": None}}, "late_ticks_by": {"kernel": "often"}}, plain)
-    assert "late by" not in vague
-    assert "control   -, -, late - (p50) - (p99), overruns -, stalls -, merged -" in vague
+def test_status_text_shows_what_is_not_known_as_such(status_with):
+    nothing = ("setpoint_cf", "governed_cf", "measured_cf", "gap_mm", "gap_setpoint_mm", "skew_mm", "setpoint_age_ms")
+    counters = dict.fromkeys(("frames", "bytes", "corrupt", "lost", "repeated", "resynchronisations"))
+    known = status_with(**dict.fromkeys(nothing), link=status_with()["link"] | counters | {"state": "BACK_OFF"})
+    lines = status_text(msgspec.convert(known, Status), Colour(sys.stderr)).splitlines()
+    assert "force     asked -, governed -, measured -" in lines
+    assert "gap       -, wanted -, skew -" in lines
+    assert "link      BACK_OFF, 1 losses" in lines
+    assert "setpoint  - old, 3 accepted, 1 refused, 0 dropped, 0 oversize" in lines
+    assert lines[-1] == "refused   too much"
+    assert "late by" not in "\n".join(lines)
 
 
-def test_status_text_says_how_each_rate_is_kept_and_who_made_ticks_late():
-    lateness_us = {"p50": 12.0, "p99": 80.0}
-    group = {"grade": "error", "hz": 999.6, "lateness_us": lateness_us, "overruns": 9, "stalls": 2, "merged": 4}
-    blamed = {"Daemon._publish": 1, "kernel": 7, "Connection.receive": 1}
-    lines = status_text({"rates": {"control": group}, "late_ticks_by": blamed}, Colour(sys.stderr)).splitlines()
+def test_status_text_says_how_each_rate_is_kept_and_who_made_ticks_late(status_with):
+    exec_us = {"p50": 12.0, "p99": 80.0, "p999": 90.0, "max": 95.0}
+    counts = {"runs": 999, "overruns": 9, "stalls": 2, "merged": 4}
+    group = {"grade": "error", "hz": 999.6, "lateness_us": exec_us | {"worst": 99.0}, "exec_us": exec_us} | counts
+    blamed = {"TelemetryLoop.publish": 1, "kernel": 7, "Connection.receive": 1}
+    known = status_with(rates={"control": group}, late_ticks_by=blamed)
+    lines = status_text(msgspec.convert(known, Status), Colour(sys.stderr)).splitlines()
     assert "control   error, 1000 Hz, late 12 us (p50) 80 us (p99), overruns 9, stalls 2, merged 4" in lines
-    assert "late by   7 kernel, 1 Connection.receive, 1 Daemon._publish" in lines
+    assert "late by   7 kernel, 1 Connection.receive, 1 TelemetryLoop.publish" in lines
 
 
 @pytest.mark.parametrize("command", [["status"], ["send", "step"], ["scene", "list"]])

@@ -250,11 +250,11 @@ def test_a_subscriber_that_does_not_read_blocks_nobody(rig: Rig) -> None:
     subscriber.subscribe(b"")
     rows = [tuple(range(30))] * 100
     for _ in range(PATIENCE_MS // 5):
-        rig.endpoint.publish_ticks(("a",), rows)
+        rig.endpoint.publish_ticks(rows, ("a",))
         if subscriber.poll(5):
             break
     for _ in range(5_000):
-        rig.endpoint.publish_ticks(("a", "b"), rows)
+        rig.endpoint.publish_ticks(rows, ("a", "b"))
     assert msgpack.unpackb(subscriber.recv()) == {"v": VERSION, "columns": ["a"], "rows": [list(range(30))] * 100}
 
 

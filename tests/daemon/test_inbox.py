@@ -3,12 +3,13 @@
 from typing import Any
 
 import msgpack
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tormagd.daemon.endpoint import AHEAD_S, SILENT_S, SOURCES, SetpointInbox
-from tormagd.messages import VERSION, Reply, decode, encode
+from tormagd.daemon.inbox import AHEAD_S, SILENT_S, SOURCES, SetpointInbox
+from tormagd.messages import VERSION, Reply, SetpointReport, decode, encode
 
 START_NS = 1_800_000_000_000_000_000
 "Some day on CLOCK_REALTIME that is second 0 of the control clock here."
@@ -98,10 +99,10 @@ def test_of_several_publishers_the_newest_stamp_wins(publishing: Publishing) -> 
     assert publishing.send(1, 2.0, "b", 0.01)
     assert not publishing.send(2, 3.0, "a", 0.015)
     assert publishing.force_N == 2.0
-    assert publishing.inbox.report()["newest_source"] == "b"
+    assert publishing.inbox.report().newest_source == "b"
     assert publishing.send(3, 4.0, "a", 0.0)
-    assert publishing.inbox.report()["newest_source"] == "a"
-    assert publishing.inbox.report()["sources"] == {"a": 3, "b": 1}
+    assert publishing.inbox.report().newest_source == "a"
+    assert publishing.inbox.report().sources == {"a": 3, "b": 1}
     assert publishing.counters() == (4, 0, 0)
 
 
@@ -158,7 +159,7 @@ def test_one_publisher_too_many_is_refused_until_one_is_silent(publishing: Publi
     # the first has been silent for long enough, the second has not
     publishing.now_s = SILENT_S + 0.005
     assert publishing.send(1, 2.0, source="one more")
-    sources = publishing.inbox.report()["sources"]
+    sources = publishing.inbox.report().sources
     assert len(sources) == SOURCES
     assert "source 0" not in sources
     assert "source 1" in sources
@@ -168,7 +169,7 @@ def test_a_flood_of_names_takes_no_memory(publishing: Publishing) -> None:
     for number in range(2_000):
         publishing.send(1, source=f"source {number}")
         publishing.now_s += 0.01
-    assert len(publishing.inbox.report()["sources"]) == SOURCES
+    assert len(publishing.inbox.report().sources) == SOURCES
     assert publishing.inbox.accepted + publishing.inbox.refused == 2_000
 
 
@@ -204,8 +205,8 @@ def test_a_refused_setpoint_changes_nothing_but_the_counter(publishing: Publishi
 def test_the_last_refusal_fits_into_an_answer(publishing: Publishing) -> None:
     hostile = {"preview_N": [-1.2345678901234567e-100] * 256, "preview_dt_ms": 1.0}
     assert not publishing.send(1, **hostile)
-    answer = Reply(v=VERSION, id=1, ok=True, result=publishing.inbox.report())
-    assert decode(encode(answer), Reply).result == publishing.inbox.report()
+    answer = Reply(v=VERSION, id=1, ok=True, result=msgspec.to_builtins(publishing.inbox.report()))
+    assert msgspec.convert(decode(encode(answer), Reply).result, SetpointReport) == publishing.inbox.report()
 
 
 @pytest.mark.parametrize("data", [b"", b"\xc1", b"\x00" * 20_000, msgpack.packb("setpoint")])

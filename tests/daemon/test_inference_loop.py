@@ -8,7 +8,7 @@ import pytest
 
 from tormagd.control.governor import GovernorState, TimedSetpoint
 from tormagd.control.plan import Plan, PlanState
-from tormagd.daemon.endpoint import SetpointInbox
+from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.physics.errors import DomainError
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import astuple
 
 from tormagd.daemon.rate_group import ERROR_PERIODS, HORIZON_NS, SHARES, Grade, Histogram, RateGroup
 
@@ -23,8 +24,8 @@ def recorded(lateness_us: list[float], exec_us: list[float] | None = None) -> Ra
 
 def test_before_the_first_run_everything_is_zero() -> None:
     report = RateGroup("test", PERIOD_NS).report
-    assert (report["hz"], report["runs"], report["merged"], report["overruns"]) == (0.0, 0, 0, 0)
-    assert set(report["lateness_us"].values()) == set(report["exec_us"].values()) == {0.0}
+    assert (report.hz, report.runs, report.merged, report.overruns) == (0.0, 0, 0, 0)
+    assert set(astuple(report.lateness_us)) == set(astuple(report.exec_us)) == {0.0}
 
 
 @settings(max_examples=100, deadline=None)
@@ -34,10 +35,10 @@ def test_percentiles_are_exact_to_the_width_of_their_bin(values: list[float]) ->
     for value in values:
         histogram.add(value)
     summary = histogram.summary()
-    assert summary["max"] == pytest.approx(max(values), abs=0.05)
+    assert summary.max == pytest.approx(max(values), abs=0.05)
     for name, share in SHARES.items():
         exact = float(np.quantile(values, share, method="inverted_cdf"))
-        assert exact - 0.05 <= summary[name] <= exact * (1.0 + 1.0 / 32.0) + 1.0
+        assert exact - 0.05 <= getattr(summary, name) <= exact * (1.0 + 1.0 / 32.0) + 1.0
 
 
 @pytest.mark.parametrize("value_us", [-5.0, 0.0, 63.99, 64.0, 65.0, 127.0, 128.0, 4_095.0, 4_096.0, 1e7])
@@ -45,14 +46,14 @@ def test_one_value_is_its_own_percentile(value_us: float) -> None:
     histogram = Histogram()
     histogram.add(value_us)
     summary = histogram.summary()
-    assert summary["p50"] == summary["p99"] == summary["p999"]
-    assert summary["p50"] == pytest.approx(max(value_us, 0.0), rel=1.0 / 32.0, abs=1.0)
+    assert summary.p50 == summary.p99 == summary.p999
+    assert summary.p50 == pytest.approx(max(value_us, 0.0), rel=1.0 / 32.0, abs=1.0)
 
 
 def test_what_is_beyond_the_last_bin_is_still_the_largest() -> None:
     histogram = Histogram()
     histogram.add(1e12)
-    assert histogram.summary()["max"] == 1e12
+    assert histogram.summary().max == 1e12
 
 
 def test_a_report_is_built_only_when_it_is_asked_for() -> None:
@@ -61,19 +62,19 @@ def test_a_report_is_built_only_when_it_is_asked_for() -> None:
     group.record(2 * PERIOD_NS, 2 * PERIOD_NS, 2 * PERIOD_NS)
     assert group.report is before
     group.refresh()
-    assert group.report["runs"] == 3
+    assert group.report.runs == 3
     assert (recorded([5.0, 7.0], [20.0, 30.0]).lateness_us, recorded([5.0], [20.0]).exec_us) == (7.0, 20.0)
 
 
 def test_the_horizon_forgets_and_the_worst_does_not() -> None:
     count = round(2.2 * HORIZON_NS / PERIOD_NS)
     report = recorded([900.0] + [5.0] * count).report
-    assert report["runs"] == count + 1
-    assert report["lateness_us"]["worst"] == 900.0
-    assert report["lateness_us"]["max"] == 5.0
-    assert report["hz"] == pytest.approx(1_000.0, rel=1e-3)
+    assert report.runs == count + 1
+    assert report.lateness_us.worst == 900.0
+    assert report.lateness_us.max == 5.0
+    assert report.hz == pytest.approx(1_000.0, rel=1e-3)
     early = recorded([900.0] + [5.0] * round(0.9 * HORIZON_NS / PERIOD_NS)).report
-    assert early["lateness_us"]["max"] == 900.0
+    assert early.lateness_us.max == 900.0
 
 
 def test_the_rate_is_that_of_the_horizon() -> None:
@@ -124,5 +125,5 @@ def test_a_stall_is_an_error_and_an_overrun_a_warning_for_as_long_as_the_horizon
     assert run(2 * HORIZON_NS + 2 * PERIOD_NS, 0) is Grade.GOOD
     assert (group.overruns, group.stalls) == (3, 1)
     group.refresh()
-    assert group.report["grade"] == "good"
-    assert group.report["stalls"] == 1
+    assert group.report.grade == "good"
+    assert group.report.stalls == 1

@@ -56,7 +56,7 @@ class FailingPlanner:
         return self._planner.plan(*arguments)
 
 
-def no_device(_device: Any) -> Backend:
+def no_device() -> Backend:
     raise BackendError("no such port", "plug it in")
 
 
@@ -139,21 +139,21 @@ def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
 
     async def tell() -> None:
         daemon = Daemon(Config(endpoints=Endpoints(**addresses)), core, no_device, [])
-        control = daemon._control
+        control, causes = daemon._control, daemon._causes
 
         def stall(now_s: float, took_s: float, culprit: str) -> None:
             control.state = control.state.replaced(time_s=now_s, sight=Sight(now_s, now_s, took_s, is_blind=True))
-            daemon._note_stall(Delay(round(took_s * 1e9), culprit, 1))
+            causes.note_stall(control.state, Delay(round(took_s * 1e9), culprit, 1))
 
         stall(10.0, 0.083, KERNEL)
         # a late tick that is no stall is not taken for one
         control.state = control.state.replaced(time_s=10.1)
-        daemon._note_stall(Delay(2_000_000, "Daemon._publish", 1_500_000))
+        causes.note_stall(control.state, Delay(2_000_000, "TelemetryLoop.publish", 1_500_000))
         control.latch(Fault.HOST_STALL)
-        daemon._tell(control.new_faults())
+        causes.tell(control.new_faults(), control.state, None)
         stall(11.0, 0.006, "somebody else")
         control.latch(Fault.PLAN_FAILED)
-        daemon._tell(control.new_faults())
+        causes.tell(control.new_faults(), control.state, None)
         assert control.new_faults() == ()
         daemon._endpoint.close()
 

@@ -1,5 +1,6 @@
 """Snapshots: what is not known is null, and nothing holds back a device that is not driven."""
 
+import time
 from pathlib import Path
 
 import msgspec
@@ -8,17 +9,17 @@ import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.control.estimate import first_estimate
-from tormagd.control.plan import Plan
+from tormagd.control.plan import Plan, Replaced
 from tormagd.control.step import StepOutput, StepState
 from tormagd.control.trajectory import Reference
-from tormagd.daemon.telemetry import TickRow, explanations, limits_held, snapshot, tick_row
+from tormagd.daemon.telemetry import limits_held, snapshot, tick_record
 from tormagd.hardware.measurement import Measurement
-from tormagd.messages import VERSION, Telemetry, decode, encode
+from tormagd.messages import Telemetry, TickRecord, decode, encode, encode_ticks
 from tormagd.recording.plot import save_plot
 from tormagd.recording.reader import read_recording
 from tormagd.recording.ticks import decode_ticks
 from tormagd.recording.writer import RecordingWriter
-from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
+from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import DeviceRequest, OperatingState, SafetyState
 
 PLAN = Plan(7, 1.0, 1.5, 0.01, 1.4, 1.38, 500.0, 64.0, -1.0, 0.9, (Limit.RANGE, Limit.SKEW))
@@ -44,9 +45,9 @@ LATE = MEASUREMENT.replaced(delay_s=0.031)
 
 def telemetry(measurement: Measurement | None, state: StepState, is_busy: bool = False) -> Telemetry:
     """What is published, as a client decodes it."""
-    row = tick_row(1.0, state, OUTPUT, PLAN, 1.1, measurement, 20.0, 150.0)
+    tick = tick_record(1.0, state, OUTPUT, PLAN, 1.1, measurement, 20.0, 150.0)
     is_homed = state.estimate is not None and state.estimate.is_homed
-    return decode(encode(snapshot(row, 3, is_homed, is_busy, 0.012)), Telemetry)
+    return decode(encode(snapshot(tick, 3, is_homed, is_busy, 0.012)), Telemetry)
 
 
 def test_a_driven_device() -> None:
@@ -84,12 +85,12 @@ def test_without_a_device_nothing_measured_is_known() -> None:
 
 def test_a_recording_says_how_old_the_measurement_of_a_tick_was(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    old = [name for name in TickRow._fields if name not in ("received_s", "delay_s")]
+    every = TickRecord.__struct_fields__
+    old = tuple(name for name in every if name not in ("received_s", "delay_s"))
     with RecordingWriter(path) as writer:
-        for columns, measurement in ((old, MEASUREMENT), (TickRow._fields, LATE), (TickRow._fields, None)):
-            row = tick_row(1.012, StepState(1.012), OUTPUT, PLAN, 1.1, measurement, 20.0, 150.0)._asdict()
-            batch = {"v": VERSION, "columns": columns, "rows": [[row[name] for name in columns]]}
-            writer.ticks(decode_ticks(msgspec.msgpack.encode(batch)))
+        for columns, measurement in ((old, MEASUREMENT), (every, LATE), (every, None)):
+            tick = tick_record(1.012, StepState(1.012), OUTPUT, PLAN, 1.1, measurement, 20.0, 150.0)
+            writer.ticks(decode_ticks(encode_ticks([[getattr(tick, name) for name in columns]], columns)))
     recording = read_recording(path)
     ages_s = [recording.ticks.numbers[name] for name in ("monotonic_s", "received_s", "delay_s")]
     assert np.array_equal(ages_s[0], [1.012] * 3)
@@ -97,6 +98,106 @@ def test_a_recording_says_how_old_the_measurement_of_a_tick_was(tmp_path: Path) 
     assert np.array_equal(ages_s[1], [np.nan, 1.0, np.nan], equal_nan=True)
     assert np.array_equal(ages_s[2], [np.nan, 0.031, np.nan], equal_nan=True)
     save_plot(recording, tmp_path / "a.png", "older and newer rows")
+
+
+def test_a_tick_is_recorded_whole() -> None:
+    """Every value differs from every other, so that none can stand in another's place."""
+    measurement = Measurement(
+        number=11,
+        received_s=1.25,
+        device_time_s=2.25,
+        left_mm=-15.0,
+        right_mm=-15.5,
+        left_current_A=0.3,
+        right_current_A=0.4,
+        force_N=1.39,
+        handle_mm=3.0,
+        mode=DeviceMode.RUN,
+        switches=Switches.HOMED | Switches.LEFT_OPEN,
+        faults=DeviceFault.SUPPLY | DeviceFault.SKEW,
+        temperature_C=25.5,
+        supply_V=12.1,
+        delay_s=0.031,
+    )
+    plan = Plan(
+        number=7,
+        time_s=1.125,
+        setpoint_N=1.5,
+        setpoint_age_s=0.012,
+        governed_N=1.4,
+        predicted_N=1.38,
+        field_mT=500.0,
+        gap_mm=64.0,
+        gap_speed_mm_s=-1.0,
+        confidence=0.9,
+        limits=(Limit.RANGE,),
+        gap_acceleration_mm_s2=-7.5,
+        foresight=0.75,
+        least_gap_mm=31.0,
+        replaced=(Replaced("rate_mm_s", 1 / 3, 300.0),),
+        sensor_doubted_s=0.0625,
+    )
+    estimate = first_estimate(measurement, 47.5)
+    safety = SafetyState(OperatingState.PAUSED, (Fault.SKEW, Fault.SENSOR), DeviceRequest.CLEAR, 99)
+    state = StepState(1.5, safety, estimate, Reference(64.2))
+    output = StepOutput(DriveMode.RUN, 0.1, -0.2, DeviceRequest.HOME, 5, (Limit.RATE,))
+    tick = tick_record(1.5, state, output, plan, 1.1, measurement, 20.0, 150.0)
+    sent = msgspec.msgpack.decode(encode_ticks([tick]))
+    row = dict(zip(sent["columns"], sent["rows"][0], strict=True))
+    assert abs(row.pop("t_ns") - time.time_ns()) < 60_000_000_000
+    assert row == {
+        "monotonic_s": 1.5,
+        "plan": 7,
+        "setpoint_cf": 1.5,
+        "plan_setpoint_age_s": 0.012,
+        "governed_cf": 1.4,
+        "plan_governed_cf": 1.4,
+        "predicted_cf": 1.38,
+        "field_mT": 500.0,
+        "plan_gap_mm": 64.0,
+        "plan_gap_speed_mm_s": -1.0,
+        "plan_gap_acceleration_mm_s2": -7.5,
+        "plan_least_gap_mm": 31.0,
+        "plan_limits": ["RANGE"],
+        "plan_outside": ["rate_mm_s 0.3333333333333333 300.0"],
+        "plan_sensor_doubted_s": 0.0625,
+        "foresight": 0.75,
+        "plan_time_s": 1.125,
+        "confidence": 0.9,
+        "trim": 1.1,
+        "measurement": 11,
+        "received_s": 1.25,
+        "delay_s": 0.031,
+        "device_time_s": 2.25,
+        "device_left_mm": -15.0,
+        "device_right_mm": -15.5,
+        "device_handle_mm": 3.0,
+        "device_force_N": 1.39,
+        "device_mode": "RUN",
+        "device_switches": ["LEFT_OPEN", "HOMED"],
+        "device_faults": ["SUPPLY", "SKEW"],
+        "device_temperature_C": 25.5,
+        "left_current_A": 0.3,
+        "right_current_A": 0.4,
+        "supply_V": 12.1,
+        "reference_gap_mm": 64.2,
+        "measured_cf": estimate.force_N,
+        "left_mm": 32.5,
+        "right_mm": 32.0,
+        "handle_mm": estimate.handle_mm,
+        "handle_rate_mm_s": estimate.handle.rate_mm_s,
+        "operating_state": "PAUSED",
+        "limits": ["RANGE", "RATE"],
+        "step_limits": ["RATE"],
+        "faults": ["SKEW", "SENSOR"],
+        "drive_mode": "RUN",
+        "left_duty": 0.1,
+        "right_duty": -0.2,
+        "request": "home",
+        "request_number": 5,
+        "lateness_us": 20.0,
+        "exec_us": 150.0,
+    }
 
 
 @pytest.mark.parametrize("present", OperatingState)
@@ -110,13 +211,3 @@ def test_no_force_is_governed_while_the_device_is_not_driven(present: OperatingS
     published = telemetry(MEASUREMENT, StepState(1.0, SafetyState(present), first_estimate(MEASUREMENT, 47.5)))
     assert published.governed_cf == (1.4 if present in (OperatingState.ENABLED, OperatingState.PAUSED) else None)
     assert published.setpoint_cf == 1.5
-
-
-def test_codes_are_explained_by_their_table() -> None:
-    (fault,) = explanations(("SKEW",), FAULTS)
-    (limit,) = explanations(("SKEW",), LIMITS)
-    assert fault == {"code": "SKEW", **FAULTS[Fault.SKEW]._asdict()}
-    assert limit == {"code": "SKEW", **LIMITS[Limit.SKEW]._asdict()}
-    assert explanations((), FAULTS) == []
-    (told,) = explanations(("HOST_STALL",), LIMITS, {"HOST_STALL": "it stood still for 9 ms", "SKEW": "no"})
-    assert told == {"code": "HOST_STALL", "cause": "it stood still for 9 ms", "remedy": LIMITS[Limit.HOST_STALL].remedy}

@@ -236,6 +236,6 @@ def new_rig(tmp_path: Path) -> Iterator[Rig]:
 @pytest.fixture
 def can_rig(tmp_path: Path) -> Iterator[Rig]:
     """The same on a CAN bus."""
-    device = 'backend = "can"\ninterface = "tormagsim"\n'
+    device = 'backend = "can"\noptions.interface = "tormagsim"\n'
     with contextlib.closing(Rig(tmp_path, "--can", device)) as made:
         yield made

@@ -9,15 +9,16 @@ import tty
 from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import can
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Drive, DriveMode, Home, Message, Status, Switches
-from tormagd.config import ConfigError, Device
+from tormagd.config import ConfigError, Device, Rates
 from tormagd.hardware import backend as backends
-from tormagd.hardware.backend import BackendError, installed, opener
-from tormagd.hardware.can_backend import FRAMES_AT_ONCE, UNSENT_FRAMES, CanBackend, open_can
+from tormagd.hardware.backend import BackendError, choose, installed
+from tormagd.hardware.can_backend import FRAMES_AT_ONCE, UNSENT_FRAMES, CanBackend, CanOptions
 from tormagd.hardware.can_stream import CanStream
 from tormagd.simulation.can_frame import ERROR_FLAG, CanFrame, from_socket, to_socket
 
@@ -35,6 +36,13 @@ def descriptors() -> int:
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
+def opened(device: Device) -> CanBackend:
+    """The backend that the configuration asks for."""
+    backend = choose(device, Rates()).open()
+    assert isinstance(backend, CanBackend)
+    return backend
+
+
 def wait_readable(backend: CanBackend) -> None:
     assert select.select([backend.fileno()], [], [], 5.0)[0]
 
@@ -46,11 +54,11 @@ class Bus:
     """A served bus whose far end the test holds."""
 
     def __init__(self, folder: Path) -> None:
-        self.device = Device(backend="can", interface="tormagsim", port=str(folder / "can"))
+        self.device = Device(backend="can", options={"interface": "tormagsim"}, port=str(folder / "can"))
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(self.device.port)
         self._listener.listen()
-        self.backend = open_can(self.device)
+        self.backend = opened(self.device)
         self.far, _ = self._listener.accept()
 
     def put(self, *frames: CanFrame) -> None:
@@ -98,7 +106,7 @@ def test_another_host_on_the_same_node_ends_the_connection(bus: Bus) -> None:
     bus.put(frame_of(Drive(0.1, 0.1, DriveMode.RUN, 1)))
     with pytest.raises(BackendError, match="another host drives node 1") as caught:
         bus.backend.receive()
-    assert "device.node" in caught.value.remedy
+    assert "device.options.node" in caught.value.remedy
 
 
 def test_a_simulator_that_goes_away_is_said_by_reading_and_writing(bus: Bus) -> None:
@@ -131,7 +139,7 @@ def test_no_more_frames_are_taken_at_once_than_the_loop_can_bear(bus: Bus) -> No
 def test_nobody_at_the_channel_and_no_channel_are_said(tmp_path: Path) -> None:
     for path in (tmp_path / "absent", tmp_path):
         with pytest.raises(BackendError, match="cannot be opened") as caught:
-            open_can(Device(backend="can", interface="tormagsim", port=str(path)))
+            opened(Device(backend="can", options={"interface": "tormagsim"}, port=str(path)))
         assert str(path) in str(caught.value)
 
 
@@ -144,7 +152,7 @@ class Adapter:
     def __init__(self) -> None:
         self.far, self.near = os.openpty()
         tty.setraw(self.near)
-        self.device = Device(backend="can", interface="slcan", port=os.ttyname(self.near))
+        self.device = Device(backend="can", options={"interface": "slcan"}, port=os.ttyname(self.near))
 
     def unplug(self) -> None:
         """Both ends: the test holds the host's too, so that lines written before it opened stay."""
@@ -161,7 +169,7 @@ def adapter() -> Iterator[Adapter]:
 
 
 def test_lines_of_an_adapter_pass_both_ways(adapter: Adapter) -> None:
-    backend = open_can(adapter.device)
+    backend = opened(adapter.device)
     backend.send(Home(7))
     said = b""
     while not said.endswith(b"t061107\r"):
@@ -179,7 +187,7 @@ def test_lines_of_an_adapter_pass_both_ways(adapter: Adapter) -> None:
 
 @pytest.mark.parametrize("damaged", [b"t07x8\r", b"t0718zz\r", b"t071\r", b"\xff\xfe071\r", b"t0719\r", b"tttt\r"])
 def test_a_damaged_line_is_counted_and_the_next_is_read(adapter: Adapter, damaged: bytes) -> None:
-    backend = open_can(adapter.device)
+    backend = opened(adapter.device)
     os.write(adapter.far, damaged)
     while not backend.statistics.corrupt:
         wait_readable(backend)
@@ -196,19 +204,19 @@ def test_a_damaged_line_is_counted_and_the_next_is_read(adapter: Adapter, damage
 
 @pytest.mark.parametrize("other", ["slcan", "serial"])
 def test_an_adapter_belongs_to_one(adapter: Adapter, other: str) -> None:
-    first = open_can(adapter.device)
+    first = opened(adapter.device)
     second = adapter.device if other == "slcan" else Device(port=adapter.device.port)
     with pytest.raises(BackendError):
-        opener(second)(second)
+        choose(second, Rates()).open()
     first.close()
-    opener(second)(second).close()
+    choose(second, Rates()).open().close()
 
 
 def test_an_adapter_that_was_unplugged_leaves_no_descriptor_behind() -> None:
     before = descriptors()
     for _ in range(3):
         adapter = Adapter()
-        backend = open_can(adapter.device)
+        backend = opened(adapter.device)
         adapter.unplug()
         with pytest.raises(BackendError, match="slcan"):
             backend.receive()
@@ -257,7 +265,7 @@ def failing() -> Iterator[Callable[..., CanBackend]]:
     with contextlib.ExitStack() as opened:
 
         def make(*events: can.Message | Exception) -> CanBackend:
-            backend = CanBackend(Device(backend="can", interface="socketcan", port="can0"), FailingBus(*events))
+            backend = CanBackend("can0", CanOptions(interface="socketcan"), FailingBus(*events))
             opened.callback(backend.close)
             return backend
 
@@ -304,11 +312,11 @@ def test_other_kinds_of_frames_are_other_peoples(failing: Callable[..., CanBacke
 
 
 def can_device(interface: str) -> Device:
-    return Device(backend="can", interface=interface, port="can0")
+    return Device(backend="can", options={"interface": interface}, port="can0")
 
 
 def test_the_can_backend_is_installed_and_so_is_the_simulators_bus() -> None:
-    assert opener(can_device("tormagsim")) is open_can
+    assert choose(can_device("tormagsim"), Rates()).options == CanOptions(interface="tormagsim")
     assert installed()["can"] == ""
 
 
@@ -321,14 +329,37 @@ def test_the_can_backend_is_installed_and_so_is_the_simulators_bus() -> None:
     ],
 )
 def test_an_interface_that_cannot_work_is_refused_before_anything_is_opened(interface: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=f"device.interface = '{interface}': .*{said}"):
-        opener(can_device(interface))
+    with pytest.raises(ConfigError, match=f"device.options.interface = '{interface}': .*{said}"):
+        choose(can_device(interface), Rates())
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({}, r"missing required field `interface` - at `\$\.device\.options`"),
+        ({"interface": "socketcan", "node": 16}, r"<= 15 - at `\$\.device\.options\.node` \(it is 16\)"),
+        ({"interface": "socketcan", "bitrate": 2_000_000}, r"<= 1000000 - at `\$\.device\.options\.bitrate` .*2000000"),
+        ({"interface": "socketcan", "nod": 1}, r"unknown field `nod` - at `\$\.device\.options`"),
+        (
+            {"interface": "socketcan", "bitrate": 500_000},
+            r"device\.options\.bitrate = 500000: allowed is from 564286 on at rates\.control_hz = 1000",
+        ),
+    ],
+)
+def test_options_that_cannot_work_are_refused_before_anything_is_opened(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        choose(Device(backend="can", options=options, port="can0"), Rates())
+
+
+def test_a_slower_bus_carries_a_slower_loop() -> None:
+    slow = Device(backend="can", options={"interface": "socketcan", "bitrate": 500_000}, port="can0")
+    assert choose(slow, Rates(control_hz=850)).options == CanOptions(interface="socketcan", bitrate=500_000)
 
 
 def test_a_driver_that_does_not_load_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(can.interfaces.BACKENDS, "broken", ("no_such_module_anywhere", "Bus"))
-    with pytest.raises(ConfigError, match=r"device\.interface = 'broken': its driver does not load"):
-        opener(can_device("broken"))
+    with pytest.raises(ConfigError, match=r"device\.options\.interface = 'broken': its driver does not load"):
+        choose(can_device("broken"), Rates())
 
 
 def test_a_broken_plugin_is_named_and_skipped(
@@ -337,14 +368,19 @@ def test_a_broken_plugin_is_named_and_skipped(
     (tmp_path / "half_a_plugin.py").write_text("def open(device:\n")
     (tmp_path / "angry_plugin.py").write_text("raise RuntimeError('not on a Friday')\n")
     monkeypatch.syspath_prepend(tmp_path)
-    entries = {"fine": "os:getpid", "absent": "no_such_module_anywhere:open"}
+    entries = {
+        "fine": "tormagd.hardware.can_backend:DRIVER",
+        "function": "os:getpid",
+        "absent": "no_such_module_anywhere:open",
+    }
     entries |= {"half": "half_a_plugin:open", "angry": "angry_plugin:open"}
     points = [metadata.EntryPoint(name, value, backends.ENTRY_POINTS) for name, value in entries.items()]
     monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == backends.ENTRY_POINTS else [])
     found = installed()
-    assert list(found) == ["absent", "angry", "fine", "half"]
+    assert list(found) == ["absent", "angry", "fine", "function", "half"]
     assert found["fine"] == ""
     assert "not on a Friday" in found["angry"]
     assert "SyntaxError" in found["half"]
-    assert [record.levelname for record in caplog.records] == ["WARNING"] * 3
-    assert opener(Device(backend="fine")) is os.getpid
+    assert "allowed is a tormagd.hardware.backend.Driver" in found["function"]
+    assert [record.levelname for record in caplog.records] == ["WARNING"] * 4
+    assert choose(Device(backend="fine", options={"interface": "socketcan"}), Rates()).options

@@ -34,6 +34,7 @@ from tormagd.config import Device
 from tormagd.hardware.backend import BackendError
 from tormagd.hardware.connection import FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S, Connection
 from tormagd.hardware.link import SILENT_S, LinkState
+from tormagd.messages import LinkReport
 from tormagd.safety.operating_state import DeviceRequest
 
 TICK_S = 1e-3
@@ -140,7 +141,7 @@ class Bench:
         return self.ports[-1] if self.ports and not self.ports[-1].is_closed else None
 
     # what the connection is given
-    def _open(self, device: Device) -> Port:
+    def _open(self) -> Port:
         self.attempts_s.append(self.now_s)
         if not self.is_there:
             raise BackendError("/dev/tormag: there is no such port", "plug the device in")
@@ -270,9 +271,9 @@ def test_each_trouble_has_its_state_cause_and_remedy_and_goes_when_it_is_mended(
     bench.pass_ms(after_ms)
     assert bench.connection.state is state
     report = bench.connection.report()
-    assert (report["state"], bench.connection.measurement) == (str(state), None)
-    assert cause in report["cause"]
-    assert remedy in report["remedy"]
+    assert (report.state, bench.connection.measurement) == (str(state), None)
+    assert cause in report.cause
+    assert remedy in report.remedy
     bench.pass_ms(3_000)  # it has given up asking often by now
     heal(bench)
     bench.pass_ms(1_200)
@@ -293,7 +294,7 @@ def test_a_device_that_was_reset_is_a_loss_without_closing_the_port(bench: Bench
     bench.pass_ms(60)
     assert bench.seen[-2:] == [LinkState.IDENTIFYING, LinkState.RUNNING]
     assert (bench.losses, bench.connection.losses, len(bench.ports)) == (1, 1, 1)
-    assert "reset" in bench.connection.report()["last_loss"]
+    assert "reset" in bench.connection.report().last_loss
 
 
 def test_the_core_is_told_of_a_loss_once_and_within_a_tenth_of_a_second(bench: Bench) -> None:
@@ -377,14 +378,14 @@ def test_a_closed_connection_stays_closed(bench: Bench) -> None:
 
 def test_what_is_not_known_is_reported_as_such(bench: Bench) -> None:
     before = bench.connection.report()
-    assert (before["state"], before["frames"], before["round_trip_us"], before["clock"]) == ("CLOSED", None, None, None)
+    assert (before.state, before.frames, before.round_trip_us, before.clock) == ("CLOSED", None, None, None)
     bench.running().pass_ms(4_000)
     after = bench.connection.report()
-    assert before.keys() == after.keys()
-    assert msgspec.msgpack.decode(msgspec.msgpack.encode(after)) == after, "it travels"
-    assert (after["firmware"], after["serial_number"], after["daemon_schema"]) == ("1.0", 7, f"{SCHEMA_HASH:08x}")
-    assert after["round_trip_us"]["p50"] == pytest.approx(1_000.0)
-    assert abs(after["clock"]["drift_ppm"]) < 1.0
+    assert msgspec.msgpack.decode(msgspec.msgpack.encode(before), type=LinkReport) == before, "it travels"
+    assert msgspec.msgpack.decode(msgspec.msgpack.encode(after), type=LinkReport) == after, "it travels"
+    assert (after.firmware, after.serial_number, after.daemon_schema) == ("1.0", 7, f"{SCHEMA_HASH:08x}")
+    assert after.round_trip_us.p50 == pytest.approx(1_000.0)
+    assert abs(after.clock.drift_ppm) < 1.0
 
 
 class Cables(RuleBasedStateMachine):

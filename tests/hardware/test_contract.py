@@ -29,7 +29,7 @@ from firmware_protocol.codec import DriveMode, Message, State
 from tormagd.closed_loop import ClosedLoop, Sample, stream
 from tormagd.config import Config, Device
 from tormagd.control.core import Core, build_core
-from tormagd.hardware.backend import Backend, opener
+from tormagd.hardware.backend import Backend, choose
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import DeviceLink, LinkState
@@ -158,6 +158,7 @@ class Case(NamedTuple):
     named: frozenset[Fault | Limit] = frozenset()
     "One of these holds at the end."
     link: LinkState = LinkState.RUNNING
+    losses: int = 0
     "Where the link ends."
     bad_s: float = 0.5
     "How long the line is like that."
@@ -178,7 +179,8 @@ CASES = {
     # what the device says answers a drive of 60 ms ago: a loop around that would swing
     "30 ms delay": Case(Delay, faults=TOO_LATE, named=TOO_LATE),
     "burst": Case(Burst, faults=TOO_LATE, named=TOO_LATE),
-    "cut": Case(Cut, faults=TOO_LATE, named=TOO_LATE, link=LinkState.LOST),
+    # lost, and since then the port was opened again and the device asked who it is
+    "cut": Case(Cut, faults=TOO_LATE, named=TOO_LATE, link=LinkState.IDENTIFYING, losses=1),
 }
 
 
@@ -265,7 +267,7 @@ class SlcanEnd(PtyEnd):
     def __init__(self, device: VirtualDevice, folder: Path) -> None:
         super().__init__()
         self.device = CanDevice(device.messages)
-        self.configured = Device(backend="can", interface="slcan", port=self._port)
+        self.configured = Device(backend="can", options={"interface": "slcan"}, port=self._port)
         self._adapter = SlcanAdapter()
         self._answers = b""
 
@@ -303,7 +305,7 @@ class TormagsimEnd(PacketEnd):
     def __init__(self, device: VirtualDevice, folder: Path) -> None:
         super().__init__(device)
         path = str(folder / "can")
-        self.configured = Device(backend="can", interface="tormagsim", port=path)
+        self.configured = Device(backend="can", options={"interface": "tormagsim"}, port=path)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(path)
         self._listener.listen()
@@ -334,7 +336,7 @@ class BusEnd(PacketEnd):
 
     def __init__(self, device: VirtualDevice, interface: str, channel: str, bus: can.BusABC) -> None:
         super().__init__(device)
-        self.configured = Device(backend="can", interface=interface, port=channel)
+        self.configured = Device(backend="can", options={"interface": interface}, port=channel)
         self._bus = bus
         self._echoes: list[bytes] = []
 
@@ -415,7 +417,7 @@ class Line:
 
     def __init__(self, far: FarEnd, case: Case, seed: int) -> None:
         self.far = far
-        self.backend = opener(far.configured)(far.configured)
+        self.backend = choose(far.configured, CONFIG.rates).open()
         self._bytewise = case.is_bytewise
         self._up, self._down = case.channel(seed), case.channel(seed + 1)
         self._to_host, self._from_host = FrameStream(), FrameStream()
@@ -570,7 +572,7 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     else:
         assert last.truth.force_N == pytest.approx(FORCE_N, abs=case.tolerance_N)
         assert case.tolerance_N > 0.05 or Limit.SATURATED not in last.output.limits
-    assert loop.link.state is case.link
+    assert (loop.connection.state, loop.connection.losses) == (case.link, case.losses)
     if case.named:
         settled = samples[-SETTLED_TICKS:]
         assert case.named & {
@@ -598,7 +600,7 @@ def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
 def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Callable[..., Line]) -> None:
     device = VirtualDevice(load_plant("sample_1"), parse_hand("steady"), (), 1)
     tap = Tap(lines(transport, device, Case(Twice)))
-    connection = Connection(CONFIG.device, lambda _: tap, lambda: None, lambda: tap.now_s)
+    connection = Connection(CONFIG.device, lambda: tap, lambda: None, lambda: tap.now_s)
     connection.open(tap)
     for tick in range(1, 300):
         tap.now_s = tick * PERIOD_S
@@ -609,7 +611,7 @@ def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Ca
     assert states > 100
     # on serial every frame has a number, and the second is not given out; on CAN only State has, and the link knows
     expected = len(tap.heard) if transport == "serial" else states // 2
-    assert connection.report()["repeated"] == expected
+    assert connection.report().repeated == expected
 
 
 @pytest.mark.parametrize("case", [pytest.param(case, id=name) for name, case in CASES.items() if name != "cut"])

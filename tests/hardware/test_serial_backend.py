@@ -14,11 +14,11 @@ from typing import NamedTuple
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Drive, DriveMode, Home, Status, Switches
-from tormagd.config import ConfigError, Device
+from tormagd.config import ConfigError, Device, Rates
 from tormagd.hardware import backend as backends
-from tormagd.hardware.backend import BackendError, opener
+from tormagd.hardware.backend import BackendError, choose
 from tormagd.hardware.frame_stream import FrameStream
-from tormagd.hardware.serial_backend import SerialBackend, open_serial
+from tormagd.hardware.serial_backend import SerialBackend, SerialOptions, open_serial
 
 STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
 
@@ -51,7 +51,7 @@ def line() -> Iterator[Line]:
 
 @pytest.fixture
 def port(line: Line) -> Iterator[SerialBackend]:
-    opened = open_serial(line.device)
+    opened = open_serial(line.device, SerialOptions())
     yield opened
     opened.close()
 
@@ -83,7 +83,7 @@ def test_a_frame_may_arrive_in_pieces(line: Line, port: SerialBackend) -> None:
 
 def test_bytes_from_before_the_opening_are_not_read(line: Line) -> None:
     os.write(line.far, b"half a frame of an earlier life")
-    port = open_serial(line.device)
+    port = open_serial(line.device, SerialOptions())
     os.write(line.far, FrameStream().pack(STATUS))
     wait_readable(port)
     assert port.receive() == [STATUS]
@@ -92,13 +92,13 @@ def test_bytes_from_before_the_opening_are_not_read(line: Line) -> None:
 
 
 def test_a_second_opening_is_refused_until_the_first_has_closed(line: Line) -> None:
-    first = open_serial(line.device)
+    first = open_serial(line.device, SerialOptions())
     with pytest.raises(BackendError, match=r"cannot be opened: another process holds it") as caught:
-        open_serial(line.device)
+        open_serial(line.device, SerialOptions())
     assert line.device.port in str(caught.value)
     assert "tormagctl ports" in caught.value.remedy
     first.close()
-    open_serial(line.device).close()
+    open_serial(line.device, SerialOptions()).close()
 
 
 def test_a_device_that_goes_away_is_said_by_reading_and_writing(line: Line, port: SerialBackend) -> None:
@@ -149,7 +149,7 @@ def test_what_the_driver_did_not_take_is_sent_before_the_next_frame(
 
 
 def test_closing_twice_or_after_the_device_has_gone_is_silent(line: Line) -> None:
-    port = open_serial(line.device)
+    port = open_serial(line.device, SerialOptions())
     os.close(line.far)
     port.close()
     port.close()
@@ -161,7 +161,7 @@ def test_a_port_that_goes_while_it_is_set_up_is_not_opened(line: Line, monkeypat
 
     monkeypatch.setattr(termios, "tcgetattr", gone)
     with pytest.raises(BackendError, match="Input/output error"):
-        open_serial(line.device)
+        open_serial(line.device, SerialOptions())
 
 
 @pytest.mark.parametrize("kind", ["absent", "a directory", "a file"])
@@ -170,11 +170,14 @@ def test_what_is_no_serial_port_is_not_opened(tmp_path: Path, kind: str) -> None
     if kind == "a file":
         path.write_text("")
     with pytest.raises(BackendError, match="cannot be opened") as caught:
-        open_serial(Device(port=str(path)))
+        open_serial(Device(port=str(path)), SerialOptions())
     assert str(caught.value).count(str(path)) == 1
 
 
 # -- finding one ---------------------------------------------------------------------------------------------------
+
+
+FINE = "tormagd.hardware.serial_backend:DRIVER"
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
@@ -184,28 +187,31 @@ def installed(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
 
 
 def test_the_serial_backend_is_installed() -> None:
-    assert opener(Device()) is open_serial
+    chosen = choose(Device(options={"baud": 115_200}), Rates())
+    assert chosen.options == SerialOptions(baud=115_200)
+    with pytest.raises(BackendError, match="/nowhere/tty: cannot be opened"):
+        choose(Device(port="/nowhere/tty"), Rates()).open()
 
 
 def test_a_plugin_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    installed(monkeypatch, other="os:getpid", serial="tormagd.hardware.serial_backend:open_serial")
-    assert opener(Device(backend="other")) is os.getpid
+    installed(monkeypatch, other=FINE, broken="no_such_module_anywhere:open")
+    assert choose(Device(backend="other"), Rates()).options == SerialOptions()
 
 
 def test_an_unknown_backend_names_the_installed_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    installed(monkeypatch, zeta="os:getpid", alpha="os:getpid")
+    installed(monkeypatch, zeta=FINE, alpha=FINE)
     with pytest.raises(ConfigError, match=r"device\.backend = 'telepathy': installed are alpha, zeta"):
-        opener(Device(backend="telepathy"))
+        choose(Device(backend="telepathy"), Rates())
     installed(monkeypatch)
     with pytest.raises(ConfigError, match="installed are none"):
-        opener(Device(backend="telepathy"))
+        choose(Device(backend="telepathy"), Rates())
 
 
-@pytest.mark.parametrize("value", ["no_such_module_anywhere:open", "os:no_such_attribute"])
+@pytest.mark.parametrize("value", ["no_such_module_anywhere:open", "os:no_such_attribute", "os:getpid"])
 def test_a_plugin_that_does_not_load_is_refused_and_stops_nobody_else(
     monkeypatch: pytest.MonkeyPatch, value: str
 ) -> None:
-    installed(monkeypatch, broken=value, fine="os:getpid")
+    installed(monkeypatch, broken=value, fine=FINE)
     with pytest.raises(ConfigError, match=r"device\.backend = 'broken': the plugin does not load"):
-        opener(Device(backend="broken"))
-    assert opener(Device(backend="fine")) is os.getpid
+        choose(Device(backend="broken"), Rates())
+    assert choose(Device(backend="fine"), Rates()).options == SerialOptions()

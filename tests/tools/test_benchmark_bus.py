@@ -11,7 +11,7 @@ from firmware_protocol.codec import FUNCTION, DecodeError, Drive, DriveMode, can
 from firmware_protocol.framing import encode_frame
 from firmware_protocol.layouts import LAYOUTS
 from firmware_protocol.schema import Layout
-from tormagd.config import CAN_EXCHANGE_BITS
+from tormagd.hardware.can_backend import EXCHANGE_BITS
 from tormagd.simulation.can_frame import CanFrame, frame_bits
 
 
@@ -69,9 +69,9 @@ def test_the_configuration_knows_what_an_exchange_takes_of_a_bus() -> None:
     each_tick = {message.name for message in schedule(1_234.0) if message.rate_hz == 1_234.0}
     layouts = [layout for layout in LAYOUTS if layout.message.__name__ in each_tick]
     assert len(layouts) == len(each_tick) == 3
-    assert sum(most_can_bits(struct.calcsize(layout.format)) for layout in layouts) == CAN_EXCHANGE_BITS
+    assert sum(most_can_bits(struct.calcsize(layout.format)) for layout in layouts) == EXCHANGE_BITS
     fullest = sum(fullest_bits(layout, node=0) for layout in layouts)
-    assert 0.95 * CAN_EXCHANGE_BITS < fullest <= CAN_EXCHANGE_BITS
+    assert 0.95 * EXCHANGE_BITS < fullest <= EXCHANGE_BITS
 
 
 def test_serial_bits_are_those_of_the_framing() -> None:

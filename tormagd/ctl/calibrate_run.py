@@ -5,9 +5,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 import zmq
@@ -47,7 +46,7 @@ class InterruptedRunError(CommandError):
         )
 
 
-class Range(msgspec.Struct, frozen=True):
+class Range(NamedTuple):
     """The forces that the daemon can give with the model it has now, N."""
 
     least_N: float
@@ -138,13 +137,12 @@ class Run:
     def _require_enabled(self, state: Value) -> None:
         if state == "ENABLED":
             return
-        status = self._client.request("status")
-        details = (status.get("fault_details") or [{}])[0]
+        first = next(iter(self._client.status().fault_details), None)
         raise CommandError(
             Exit.FAULT if state == "FAULT" else Exit.REFUSED,
             "not_enabled",
-            f"the device went {state} during the run: {details.get('code', 'somebody gave a command')}",
-            details.get("remedy", "run it again when you are ready"),
+            f"the device went {state} during the run: {'somebody gave a command' if first is None else first.code}",
+            "run it again when you are ready" if first is None else first.remedy,
         )
 
     def _values(self, batch: TickBatch, index: int, places: Sequence[int]) -> list[float]:
@@ -153,23 +151,17 @@ class Run:
 
 
 def reach(client: Client, scene_most_N: float) -> Range:
-    """What can be asked for. Raises CommandError where the daemon cannot tell, or somebody else publishes."""
-    status = client.request("status")
-    age_ms = status.get("setpoint_age_ms")
-    if isinstance(age_ms, int | float) and age_ms < RECENT_SETPOINT_MS:
+    """What can be asked for. Raises CommandError where somebody else publishes."""
+    status = client.status()
+    age_ms = status.setpoint_age_ms
+    if age_ms is not None and age_ms < RECENT_SETPOINT_MS:
         raise CommandError(
             Exit.REFUSED,
             "other_publisher",
             f"somebody published a setpoint {age_ms:.0f} ms ago",
             "stop the publisher: a calibration must be the only one",
         )
-    try:
-        found = msgspec.convert(status, Range)
-    except msgspec.ValidationError as error:
-        raise CommandError(
-            Exit.REFUSED, "no_range", f"the daemon does not say its range: {error}", "tormagctl status"
-        ) from error
-    return Range(found.least_N, min(found.most_N, scene_most_N))
+    return Range(status.least_N, min(status.most_N, scene_most_N))
 
 
 @contextmanager
@@ -190,12 +182,12 @@ def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: 
         if not setpoints.poll(round(wait_s * 1e3)):
             raise unreachable(endpoints.setpoint, f"nobody takes setpoints there within {wait_s:g} s")
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
-            status = client.request("status")
-            if not status.get("is_homed"):
+            status = client.status()
+            if not status.is_homed:
                 home(client, HOMING_S, is_waiting=True)
             if is_interrupted():
                 raise InterruptedRunError
-            if status.get("operating_state") != "ENABLED":
+            if status.operating_state != "ENABLED":
                 _enable(client)
             try:
                 _drop_old(ticks, wait_s, endpoints.recording)

@@ -7,10 +7,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import msgspec
 import zmq
 
+from tormagd import __version__
 from tormagd.ctl.outcome import CommandError, Exit, usage_error
-from tormagd.messages import VERSION, MessageError, Reply, Request, decode, encode
+from tormagd.messages import VERSION, MessageError, Reply, Request, Status, decode, encode
 
 FAULT_CODES = ("fault", "device_latched")
 "Refusals that mean: the device is in FAULT."
@@ -43,6 +45,10 @@ class Client:
                 raise CommandError(code, reply.error.code, reply.error.message, reply.error.hint)
             return reply.result or {}
         raise unreachable(self._address, f"no answer within {self._wait_s:g} s")
+
+    def status(self) -> Status:
+        """What the daemon is doing. Raises CommandError as `request` and `understood` do."""
+        return understood(self.request("status"))
 
     def close(self) -> None:
         """Close the connection without waiting for anything."""
@@ -90,6 +96,23 @@ def unreachable(address: str, what: str) -> CommandError:
                     f"you may not write to {path}: join the group tormag (sudo usermod -aG tormag $USER), log in again"
                 )
     return CommandError(Exit.UNREACHABLE, "unreachable", message, hint)
+
+
+def understood(result: dict[str, Any]) -> Status:
+    """The answer to `status`; what a newer daemon says besides is passed over.
+
+    Raises CommandError, naming the daemon's version, where something is missing or of another type.
+    """
+    try:
+        return msgspec.convert(result, Status)
+    except msgspec.ValidationError as error:
+        raise CommandError(
+            Exit.UNREACHABLE,
+            "unintelligible",
+            f"the status of tormagd {result.get('version', 'of an unknown version')} is not what tormagctl "
+            f"{__version__} knows: {error}",
+            "install tormagd and tormagctl of the same version, and start the daemon again",
+        ) from error
 
 
 def _reply(data: bytes) -> Reply:

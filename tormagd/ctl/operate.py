@@ -2,10 +2,10 @@
 
 import sys
 import time
-from typing import Any
 
 from tormagd.ctl.client import Client
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal
+from tormagd.messages import Explained, Status
 
 POLL_S = 0.05
 BEGIN_S = 2.0
@@ -38,7 +38,7 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     Raises CommandError: REFUSED (by the daemon, did not begin, ended without being homed, not within `timeout_s`),
     FAULT (the device latched a fault on the way).
     """
-    was_homed = bool(client.request("status").get("is_homed"))
+    was_homed = client.status().is_homed
     result = client.request("home")
     if not is_waiting:
         return Outcome(result, "homing; tormagctl status shows when it is done")
@@ -47,13 +47,12 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     shows_progress = is_terminal(sys.stderr)
     try:
         while (elapsed_s := time.monotonic() - started_s) < timeout_s:
-            state = client.request("status")
+            state = client.status()
             _raise_fault(state)
-            is_homed, is_busy = bool(state.get("is_homed")), bool(state.get("is_busy"))
             # a homing that was over between two looks still shows, as a device that is homed and was not
-            has_begun = has_begun or is_busy or (is_homed and not was_homed)
-            if has_begun and not is_busy:
-                if is_homed:
+            has_begun = has_begun or state.is_busy or (state.is_homed and not was_homed)
+            if has_begun and not state.is_busy:
+                if state.is_homed:
                     return Outcome({**result, "seconds": round(elapsed_s, 2)}, f"homed in {elapsed_s:.1f} s")
                 raise CommandError(
                     Exit.REFUSED, "not_homed", "homing ended, but the device is not homed", "tormagctl status"
@@ -79,19 +78,17 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     )
 
 
-def _raise_fault(state: dict[str, Any]) -> None:
-    if state.get("operating_state") != "FAULT":
+def _raise_fault(state: Status) -> None:
+    if state.operating_state != "FAULT":
         return
-    details = state.get("fault_details") or [{}]
-    faults = ", ".join(state.get("faults") or ["FAULT"])
+    first = state.fault_details[0] if state.fault_details else Explained("FAULT", "see tormagctl status", "")
     raise CommandError(
         Exit.FAULT,
         "fault",
-        f"fault while homing: {faults}: {details[0].get('cause', 'see tormagctl status')}",
-        details[0].get("remedy", "tormagctl clear-fault, then home"),
+        f"fault while homing: {', '.join(state.faults) or first.code}: {first.cause}",
+        first.remedy or "tormagctl clear-fault, then home",
     )
 
 
-def _gap(state: dict[str, Any]) -> str:
-    gap_mm = state.get("gap_mm")
-    return "not known" if gap_mm is None else f"{gap_mm:.1f} mm"
+def _gap(state: Status) -> str:
+    return "not known" if state.gap_mm is None else f"{state.gap_mm:.1f} mm"

@@ -1,11 +1,11 @@
 """`tormagctl status`: the daemon's own snapshot, as it is or as text."""
 
 import sys
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
-from tormagd.ctl.client import Client
+from tormagd.ctl.client import Client, understood
 from tormagd.ctl.outcome import Colour, Exit, Outcome
+from tormagd.messages import Explained, LinkReport, RateReport, SetpointReport, Status
 
 UNKNOWN = "-"
 SETPOINT_COUNTS = ("accepted", "refused", "dropped", "oversize")
@@ -15,91 +15,70 @@ LINK_COUNTS = ("losses", "frames", "corrupt", "lost", "repeated", "resynchronisa
 def status(client: Client) -> Outcome:
     """What the daemon is doing. The exit code is FAULT while the device is in FAULT."""
     result = client.request("status")
-    code = Exit.FAULT if result.get("operating_state") == "FAULT" else Exit.DONE
-    return Outcome(result, status_text(result, Colour(sys.stdout)), code)
+    known = understood(result)
+    code = Exit.FAULT if known.operating_state == "FAULT" else Exit.DONE
+    return Outcome(result, status_text(known, Colour(sys.stdout)), code)
 
 
-def status_text(result: Mapping[str, Any], colour: Colour) -> str:
-    """The snapshot in a dozen lines, most important first; what the daemon did not say shows as `-`."""
-    state = str(result.get("operating_state", UNKNOWN))
+def status_text(known: Status, colour: Colour) -> str:
+    """The snapshot in a dozen lines, most important first; what the daemon does not know shows as `-`."""
+    state = known.operating_state
     paint = {"ENABLED": colour.green, "PAUSED": colour.yellow, "FAULT": colour.red}.get(state, colour.bold)
-    flags = [
-        "homed" if result.get("is_homed") else colour.yellow("not homed"),
-        *(["busy"] if result.get("is_busy") else []),
-    ]
-    link = _table(result, "link")
-    link_state = str(link.get("state", UNKNOWN))
+    flags = ["homed" if known.is_homed else colour.yellow("not homed"), *(["busy"] if known.is_busy else [])]
     lines = [
         f"state     {paint(state)}, {', '.join(flags)}",
-        *_codes(result, "faults", "fault_details", "fault", colour.red),
-        *_codes(result, "limits", "limit_details", "held by", colour.yellow),
-        f"force     asked {_number(result, 'setpoint_cf', 'N')}, governed {_number(result, 'governed_cf', 'N')}, "
-        f"measured {_number(result, 'measured_cf', 'N')}",
-        f"gap       {_number(result, 'gap_mm', 'mm', 2)}, wanted {_number(result, 'gap_setpoint_mm', 'mm', 2)}, "
-        f"skew {_number(result, 'skew_mm', 'mm', 3)}",
-        f"setpoint  {_number(result, 'setpoint_age_ms', 'ms', 0)} old, "
-        f"{_counts(_table(result, 'setpoints'), SETPOINT_COUNTS)}",
-        f"link      {link_state}, {_counts(link, LINK_COUNTS)}",
-        *_explained(link.get("cause"), link.get("remedy"), colour.yellow),
-        *_rates(_table(result, "rates"), colour),
-        *_late_ticks(_table(result, "late_ticks_by")),
-        f"daemon    {result.get('version', UNKNOWN)}, scene {result.get('scene', UNKNOWN)}, "
-        f"up {_number(result, 'uptime_s', 's', 0)}",
+        *_codes(known.faults, known.fault_details, "fault", colour.red),
+        *_codes(known.limits, known.limit_details, "held by", colour.yellow),
+        f"force     asked {_number(known.setpoint_cf, 'N')}, governed {_number(known.governed_cf, 'N')}, "
+        f"measured {_number(known.measured_cf, 'N')}",
+        f"gap       {_number(known.gap_mm, 'mm', 2)}, wanted {_number(known.gap_setpoint_mm, 'mm', 2)}, "
+        f"skew {_number(known.skew_mm, 'mm', 3)}",
+        f"setpoint  {_number(known.setpoint_age_ms, 'ms', 0)} old, {_counts(known.setpoints, SETPOINT_COUNTS)}",
+        f"link      {known.link.state}, {_counts(known.link, LINK_COUNTS)}",
+        *_explained(known.link.cause, known.link.remedy, colour.yellow),
+        *(_rate(name, group, colour) for name, group in known.rates.items()),
+        *_late_ticks(known.late_ticks_by),
+        f"daemon    {known.version}, scene {known.scene}, up {_number(known.uptime_s, 's', 0)}",
     ]
-    refusal = _table(result, "setpoints").get("last_refusal")
-    if refusal:
-        lines.append(f"refused   {colour.yellow(str(refusal))}")
+    if known.setpoints.last_refusal:
+        lines.append(f"refused   {colour.yellow(known.setpoints.last_refusal)}")
     return "\n".join(lines)
 
 
-def _table(result: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    value = result.get(name)
-    return value if isinstance(value, Mapping) else {}
+def _number(value: float | None, unit: str, digits: int = 3) -> str:
+    return UNKNOWN if value is None else f"{value:.{digits}f} {unit}"
 
 
-def _number(result: Mapping[str, Any], name: str, unit: str, digits: int = 3) -> str:
-    value = result.get(name)
-    return f"{value:.{digits}f} {unit}" if isinstance(value, int | float) else UNKNOWN
+def _counts(report: LinkReport | SetpointReport, names: tuple[str, ...]) -> str:
+    numbers = [(getattr(report, name), name) for name in names]
+    return ", ".join(f"{number} {name}" for number, name in numbers if number is not None)
 
 
-def _counts(table: Mapping[str, Any], names: tuple[str, ...]) -> str:
-    numbers = [f"{table[name]} {name}" for name in names if isinstance(table.get(name), int)]
-    return ", ".join(numbers) or UNKNOWN
-
-
-def _codes(result: Mapping[str, Any], names: str, details: str, label: str, paint: Any) -> list[str]:
-    known = {entry["code"]: entry for entry in result.get(details) or () if isinstance(entry, dict) and "code" in entry}
+def _codes(codes: Sequence[str], details: Sequence[Explained], label: str, paint: Callable[[str], str]) -> list[str]:
+    known = {explained.code: explained for explained in details}
     lines = []
-    for code in result.get(names) or ():
-        lines.append(f"{label:<9} {paint(str(code))}")
-        entry = known.get(code, {})
-        lines += _explained(entry.get("cause"), entry.get("remedy"), str)
+    for code in codes:
+        lines.append(f"{label:<9} {paint(code)}")
+        if code in known:
+            lines += _explained(known[code].cause, known[code].remedy, str)
     return lines
 
 
-def _explained(cause: object, remedy: object, paint: Any) -> list[str]:
-    lines = [f"          {paint(str(cause))}"] if cause else []
+def _explained(cause: str, remedy: str, paint: Callable[[str], str]) -> list[str]:
+    lines = [f"          {paint(cause)}"] if cause else []
     return [*lines, f"          next: {remedy}"] if remedy else lines
 
 
-def _rates(rates: Mapping[str, Any], colour: Colour) -> list[str]:
-    lines = []
-    for name in rates:
-        group = _table(rates, name)
-        lateness = _table(group, "lateness_us")
-        grade = str(group.get("grade") or UNKNOWN)
-        paint = {"warning": colour.yellow, "error": colour.red}.get(grade, str)
-        lines.append(
-            f"{name:<9} {paint(grade)}, {_number(group, 'hz', 'Hz', 0)}, "
-            f"late {_number(lateness, 'p50', 'us', 0)} (p50) {_number(lateness, 'p99', 'us', 0)} (p99), "
-            f"overruns {group.get('overruns', UNKNOWN)}, stalls {group.get('stalls', UNKNOWN)}, "
-            f"merged {group.get('merged', UNKNOWN)}"
-        )
-    return lines
+def _rate(name: str, group: RateReport, colour: Colour) -> str:
+    paint = {"warning": colour.yellow, "error": colour.red}.get(group.grade, str)
+    lateness = group.lateness_us
+    return (
+        f"{name:<9} {paint(group.grade)}, {group.hz:.0f} Hz, late {lateness.p50:.0f} us (p50) {lateness.p99:.0f} us "
+        f"(p99), overruns {group.overruns}, stalls {group.stalls}, merged {group.merged}"
+    )
 
 
-def _late_ticks(blamed: Mapping[str, Any]) -> list[str]:
+def _late_ticks(blamed: Mapping[str, int]) -> list[str]:
     """Who made control ticks late, the one who made most of them first; nothing while none was late."""
-    counted = {name: count for name, count in blamed.items() if isinstance(count, int)}
-    worst_first = sorted(counted, key=lambda name: (-counted[name], name))
-    return [f"late by   {', '.join(f'{counted[name]} {name}' for name in worst_first)}"] if counted else []
+    worst_first = sorted(blamed, key=lambda name: (-blamed[name], name))
+    return [f"late by   {', '.join(f'{blamed[name]} {name}' for name in worst_first)}"] if blamed else []

@@ -14,7 +14,10 @@ from tormagd.config import Config, ConfigError, load_config
 from tormagd.output import write_line
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from tormagd.control.core import Core
+    from tormagd.hardware.backend import Backend
 
 REFUSED = 2
 
@@ -41,40 +44,41 @@ def _start(options: argparse.Namespace) -> int:
     import uvloop
 
     from tormagd.control.core import build_core
-    from tormagd.hardware.backend import opener
+    from tormagd.hardware.backend import choose
 
     torch.set_num_threads(1)  # the loop has one core; a second thread would only wait for it
     try:
         config = load_config(options.config)
         core = build_core(config)
-        open_backend = opener(config.device)
+        backend = choose(config.device, config.rates)
     except ConfigError as error:
         print(f"tormagd: {error}", file=sys.stderr)
         return REFUSED
     if options.check:
-        _print_resolved(config, core)
+        _print_resolved(config, core, backend.options)
         return 0
     try:
-        uvloop.run(_run(config, core, open_backend))
+        uvloop.run(_run(config, core, backend.open))
     except OSError as error:
         print(f"tormagd: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-async def _run(config: Config, core: "Core", open_backend: object) -> None:
+async def _run(config: Config, core: "Core", open_backend: "Callable[[], Backend]") -> None:
     from tormagd.daemon.daemon import Daemon
     from tormagd.daemon.realtime import prepare
 
     refused = prepare(config.realtime)
-    await Daemon(config, core, open_backend, refused).run()  # type: ignore[arg-type]
+    await Daemon(config, core, open_backend, refused).run()
 
 
-def _print_resolved(config: Config, core: "Core") -> None:
+def _print_resolved(config: Config, core: "Core", options: msgspec.Struct) -> None:
     from tormagd.hardware.backend import installed
 
+    device = msgspec.structs.replace(config.device, options=msgspec.to_builtins(options))
     resolved = {
-        "config": msgspec.to_builtins(config),
+        "config": msgspec.to_builtins(msgspec.structs.replace(config, device=device)),
         "scene": msgspec.to_builtins(core.scene),
         "derived": {
             "least_N": core.planner.portrait.least_N,

@@ -1,7 +1,11 @@
 """How well one rate group keeps its time: rate, lateness, execution, overruns, merged ticks."""
 
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from msgspec.structs import asdict
+
+from tormagd.messages import ExecReport, LatenessReport, RateReport
 
 WARNING_PERIODS = 1.0
 "A run that is done later than this after it was due has overrun: the next one was due already."
@@ -34,7 +38,7 @@ class Histogram:
         self._before, self._now = self._now, [0] * _BINS
         self._most_before, self._most_now = self._most_now, 0.0
 
-    def summary(self) -> dict[str, float]:
+    def summary(self) -> ExecReport:
         """p50, p99, p99.9 (upper edges of their bins) and the largest, us; all 0 while nothing was added."""
         most = max(self._most_now, self._most_before)
         used = _bin(most) + 1
@@ -47,7 +51,7 @@ class Histogram:
             seen += count
             while waiting and seen >= waiting[0][1] * total:
                 found[waiting.pop(0)[0]] = min(float(_upper_edge(index)), round(most, 1))
-        return found | {"max": round(most, 1)}
+        return ExecReport(**found, max=round(most, 1))
 
 
 def _bin(value_us: float) -> int:
@@ -102,7 +106,7 @@ class RateGroup:
         # the last two turns of the horizon: rate and grade cover what the percentiles cover
         self._marks: tuple[_Mark, _Mark] | None = None
         self._newest_ns = 0
-        self.report: dict[str, Any] = {}
+        self.report: RateReport
         self.refresh()
 
     def record(self, due_ns: int, start_ns: int, end_ns: int, merged: int = 0) -> None:
@@ -145,13 +149,14 @@ class RateGroup:
 
     def refresh(self) -> None:
         """Builds `report`: counts since the start, percentiles over the horizon."""
-        self.report = {
-            "grade": str(self.grade()),
-            "hz": round(self.rate_hz(), 2),
-            "runs": self.runs,
-            "merged": self.merged,
-            "overruns": self.overruns,
-            "stalls": self.stalls,
-            "lateness_us": self._lateness.summary() | {"worst": round(self._worst_us, 1)},
-            "exec_us": self._exec.summary(),
-        }
+        lateness = self._lateness.summary()
+        self.report = RateReport(
+            grade=str(self.grade()),
+            hz=round(self.rate_hz(), 2),
+            runs=self.runs,
+            merged=self.merged,
+            overruns=self.overruns,
+            stalls=self.stalls,
+            lateness_us=LatenessReport(**asdict(lateness), worst=round(self._worst_us, 1)),
+            exec_us=self._exec.summary(),
+        )

@@ -5,16 +5,17 @@ A backend carries typed messages over one kind of wire. It does not pace, retry 
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
-from typing import Protocol
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 from firmware_protocol.codec import Message
-from tormagd.config import ConfigError, Device
+from tormagd.config import ConfigError, Device, Rates, Strict, checked
 
 ENTRY_POINTS = "tormagd.backends"
-"""Functions that open: `Device` to `Backend`, raising BackendError."""
-CHECKS = "tormagd.backend_checks"
-"""Of the same names, where a backend has settings of its own: `Device` to None, raising ConfigError, no hardware."""
+"""Each of this group is a `Driver`."""
+OptionsT = TypeVar("OptionsT", bound=Strict)
 
 PLUGIN_ERRORS = (
     ImportError, AttributeError, NameError, TypeError, ValueError, LookupError, OSError, RuntimeError, SyntaxError,
@@ -64,6 +65,30 @@ class Backend(Protocol):
         """Gives the device back. Never raises."""
 
 
+def _accept(device: Device, options: Strict, rates: Rates) -> None:
+    """Nothing more to check."""
+
+
+@dataclass(frozen=True)
+class Driver(Generic[OptionsT]):
+    """One kind of backend, as its entry point gives it."""
+
+    options: type[OptionsT]
+    "What `[device.options]` may say; it is decoded before anything is opened."
+    open: Callable[[Device, OptionsT], Backend]
+    "Opens the device. Raises BackendError saying why not."
+    check: Callable[[Device, OptionsT, Rates], None] = _accept
+    "Refuses settings that cannot work, without any hardware. Raises ConfigError."
+
+
+class Chosen(NamedTuple):
+    """The backend that a configuration asks for, with all of its options."""
+
+    options: Strict
+    open: Callable[[], Backend]
+    "Opens the device. Raises BackendError saying why not."
+
+
 def installed() -> dict[str, str]:
     """Every backend plugin by name, with the reason why it does not load, or "".
 
@@ -72,7 +97,7 @@ def installed() -> dict[str, str]:
     found = {}
     for entry in sorted(metadata.entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
         try:
-            entry.load()
+            _load(entry)
         except PLUGIN_ERRORS as error:
             log.warning("backend %s is skipped, it does not load: %s: %s", entry.name, type(error).__name__, error)
             found[entry.name] = f"{type(error).__name__}: {error}"
@@ -81,20 +106,25 @@ def installed() -> dict[str, str]:
     return found
 
 
-def opener(device: Device) -> Callable[[Device], Backend]:
-    """The `open` function of the backend that `device.backend` names; only that plugin is imported.
+def choose(device: Device, rates: Rates) -> Chosen:
+    """The backend that `device.backend` names, ready to be opened; only that plugin is imported.
 
     Raises ConfigError: unknown (naming the installed ones), broken, or not what `device` asks for.
     """
     found = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINTS)}
     if device.backend not in found:
         raise ConfigError(f"device.backend = {device.backend!r}: installed are {', '.join(sorted(found)) or 'none'}")
-    checks = [entry for entry in metadata.entry_points(group=CHECKS) if entry.name == device.backend]
     try:
-        loaded: Callable[[Device], Backend] = found[device.backend].load()
-        loaded_checks: list[Callable[[Device], None]] = [entry.load() for entry in checks]
+        driver = _load(found[device.backend])
     except PLUGIN_ERRORS as error:
         raise ConfigError(f"device.backend = {device.backend!r}: the plugin does not load: {error}") from error
-    for check in loaded_checks:
-        check(device)
+    options = checked(device.options, driver.options, "$.device.options")
+    driver.check(device, options, rates)
+    return Chosen(options, partial(driver.open, device, options))
+
+
+def _load(entry: metadata.EntryPoint) -> Driver[Any]:
+    loaded = entry.load()
+    if not isinstance(loaded, Driver):
+        raise TypeError(f"{entry.value} is {loaded!r:.80}: allowed is a {Driver.__module__}.{Driver.__name__}")
     return loaded

@@ -8,35 +8,54 @@ import contextlib
 import errno
 import fcntl
 import importlib
+import math
 import os
 import select
-from typing import Any
+from typing import Annotated, Any
 
 import can
 from can.interfaces import BACKENDS
 from can.interfaces.slcan import slcanBus
+from msgspec import Meta
 
 from firmware_protocol.codec import Message
-from tormagd.config import ConfigError, Device
-from tormagd.hardware.backend import PLUGIN_ERRORS, BackendError, LinkStatistics
+from tormagd.config import ConfigError, Device, Rates, Strict
+from tormagd.hardware.backend import PLUGIN_ERRORS, BackendError, Driver, LinkStatistics
 from tormagd.hardware.can_stream import CanStream, SecondHostError
 
 FRAMES_AT_ONCE = 256
 """Most frames taken in one `receive`: a bus that never falls silent must not keep the loop."""
 UNSENT_FRAMES = 50
 """Frames in a row that the bus did not take; at 1 kHz, the device's own command timeout."""
+EXCHANGE_BITS = 395
+"""Drive, State and Sense with the most stuffing: firmware_protocol/README.md."""
+MOST_LOAD = 0.7
+"""What is left is for Status, commands and the bus's other nodes."""
 BUS_OFF = 0x40
 """Error class in the identifier of an error frame: linux/can/error.h, CAN_ERR_BUSOFF."""
+
+
+class CanOptions(Strict, frozen=True):
+    """`[device.options]` of a CAN bus."""
+
+    interface: str
+    "The python-can interface."
+    bitrate: Annotated[int, Meta(ge=10_000, le=1_000_000)] = 1_000_000
+    "socketcan takes it from the kernel (`ip link`)."
+    node: Annotated[int, Meta(ge=0, le=15)] = 1
+    "The device's node number on the bus."
+    baud: Annotated[int, Meta(ge=115_200, le=12_000_000)] = 1_000_000
+    "Of the serial port that an adapter is behind."
 
 
 class CanBackend:
     """An open bus and the conversation with one node on it."""
 
-    def __init__(self, device: Device, bus: can.BusABC, held: int | None = None) -> None:
+    def __init__(self, port: str, options: CanOptions, bus: can.BusABC, held: int | None = None) -> None:
         """`held` is a descriptor that keeps others from opening the adapter; it is closed with the bus."""
-        self._device, self._bus, self._held = device, bus, held
+        self._port, self._options, self._bus, self._held = port, options, bus, held
         self._fd: int = bus.fileno()
-        self._stream = CanStream(device.node)
+        self._stream = CanStream(options.node)
         self._readable, self._writable = select.poll(), select.poll()
         self._readable.register(self._fd, select.POLLIN)
         self._writable.register(self._fd, select.POLLOUT)
@@ -111,11 +130,11 @@ class CanBackend:
 
     @property
     def _name(self) -> str:
-        return f"{self._device.interface} {self._device.port}"
+        return f"{self._options.interface} {self._port}"
 
     @property
     def _look_at_the_bus(self) -> str:
-        return f"check the device's supply, wiring, termination and bit rate ({self._device.bitrate})"
+        return f"check the device's supply, wiring, termination and bit rate ({self._options.bitrate})"
 
     def _unpack(self, frame: can.Message) -> Message | None:
         if frame.is_error_frame:
@@ -132,48 +151,54 @@ class CanBackend:
             return self._stream.unpack(frame.arbitration_id, bytes(frame.data))
         except SecondHostError as error:
             raise BackendError(
-                f"{self._name}: another host drives node {self._device.node}",
-                remedy="end the other one, or give this device another node number (device.node)",
+                f"{self._name}: another host drives node {self._options.node}",
+                remedy="end the other one, or give this device another node number (device.options.node)",
             ) from error
 
     def _gone(self, what: str, error: can.CanError | OSError) -> BackendError:
         number = _errno(error)
         if number == errno.ENETDOWN:
-            up = f"sudo ip link set {self._device.port} up type can bitrate {self._device.bitrate} restart-ms 100"
+            up = f"sudo ip link set {self._port} up type can bitrate {self._options.bitrate} restart-ms 100"
             return BackendError(f"{self._name}: the interface is down", remedy=up)
         return BackendError(f"{self._name}: {what}: {os.strerror(number) if number else error}")
 
 
-def check_can(device: Device) -> None:
-    """Raises ConfigError for an interface that is not installed, or cannot be waited for."""
-    interface = device.interface
+def check_can(device: Device, options: CanOptions, rates: Rates) -> None:
+    """Raises ConfigError for an interface that is not installed or cannot be waited for, and for too slow a bus."""
+    interface = options.interface
     if interface not in BACKENDS:
-        raise ConfigError(f"device.interface = {interface!r}: installed are {', '.join(sorted(BACKENDS))}")
+        raise ConfigError(f"device.options.interface = {interface!r}: installed are {', '.join(sorted(BACKENDS))}")
     module, name = BACKENDS[interface]
     try:
         bus = getattr(importlib.import_module(module), name)
     except PLUGIN_ERRORS as error:
-        raise ConfigError(f"device.interface = {interface!r}: its driver does not load: {error}") from error
+        raise ConfigError(f"device.options.interface = {interface!r}: its driver does not load: {error}") from error
     if bus.fileno is can.BusABC.fileno:
         raise ConfigError(
-            f"device.interface = {interface!r}: this driver has no descriptor to wait for; allowed is the kernel's "
-            "driver of the same adapter, 'socketcan'"
+            f"device.options.interface = {interface!r}: this driver has no descriptor to wait for; allowed is the "
+            "kernel's driver of the same adapter, 'socketcan'"
+        )
+    least = math.ceil(rates.control_hz * EXCHANGE_BITS / MOST_LOAD)
+    if options.bitrate < least:
+        raise ConfigError(
+            f"device.options.bitrate = {options.bitrate}: allowed is from {least} on at rates.control_hz = "
+            f"{rates.control_hz}"
         )
 
 
-def open_can(device: Device) -> CanBackend:
-    """Opens `device.port` through `device.interface`. Raises BackendError saying why not."""
-    name = f"{device.interface} {device.port}"
+def open_can(device: Device, options: CanOptions) -> CanBackend:
+    """Opens `device.port` through `options.interface`. Raises BackendError saying why not."""
+    name = f"{options.interface} {device.port}"
     held = None
     try:
-        if device.interface == "slcan":
+        if options.interface == "slcan":
             held = _hold(device.port)
         bus = can.Bus(
-            interface=device.interface,
+            interface=options.interface,
             channel=device.port,
-            bitrate=device.bitrate,
+            bitrate=options.bitrate,
             ignore_config=True,  # what applies stands in our configuration, not in a file of python-can's
-            **_options(device),
+            **_of_the_interface(options),
         )
     except BlockingIOError as error:
         raise BackendError(f"{name}: another program holds it", remedy="tormagctl ports says which") from error
@@ -183,16 +208,20 @@ def open_can(device: Device) -> CanBackend:
         number = _errno(error)
         reason = os.strerror(number) if number else str(error)
         raise BackendError(f"{name}: cannot be opened: {reason}") from error
-    return CanBackend(device, bus, held)
+    return CanBackend(device.port, options, bus, held)
 
 
-def _options(device: Device) -> dict[str, Any]:
+DRIVER = Driver(CanOptions, open_can, check_can)
+"""The entry point `can`."""
+
+
+def _of_the_interface(options: CanOptions) -> dict[str, Any]:
     """What makes an interface fit the loop. Interfaces not named here must not block in `recv(0)`."""
-    match device.interface:
+    match options.interface:
         case "socketcan":  # other nodes' frames need not wake us
-            return {"can_filters": [{"can_id": device.node, "can_mask": 0xF, "extended": False}]}
+            return {"can_filters": [{"can_id": options.node, "can_mask": 0xF, "extended": False}]}
         case "slcan":  # by default it sleeps for 2 s when it opens, and for 1 ms whenever it finds nothing to read
-            return {"tty_baudrate": device.baud, "sleep_after_open": 0.0, "timeout": 0.0}
+            return {"tty_baudrate": options.baud, "sleep_after_open": 0.0, "timeout": 0.0}
         case "udp_multicast":  # stays on this machine
             return {"hop_limit": 0, "fd": False}
     return {}

@@ -10,13 +10,14 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, DriveMode
 from tormagd.config import Device
 from tormagd.hardware.backend import Backend, BackendError
 from tormagd.hardware.link import DeviceLink, LinkState
 from tormagd.hardware.measurement import Measurement
+from tormagd.messages import ClockReport, LinkReport, RoundTripReport
 from tormagd.safety.operating_state import DeviceRequest
 
 FIRST_BACK_OFF_S = 0.05
@@ -70,7 +71,7 @@ class Connection:
     def __init__(
         self,
         device: Device,
-        open_backend: Callable[[Device], Backend],
+        open_backend: Callable[[], Backend],
         on_loss: Callable[[], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -110,6 +111,11 @@ class Connection:
     def remedy(self) -> str:
         """What to do about the cause."""
         return self._remedy or _REMEDIES.get(self.state, "")
+
+    @property
+    def link(self) -> DeviceLink | None:
+        """The conversation of this opening of the port; None while it is not open."""
+        return self._link
 
     @property
     def measurement(self) -> Measurement | None:
@@ -165,48 +171,35 @@ class Connection:
         self._waiting, self._cause, self._remedy = LinkState.CLOSED, "closed", ""
         self._seen = LinkState.CLOSED
 
-    def report(self) -> dict[str, Any]:
-        """State, cause and remedy, identity, counters of this opening of the port, round trip and clock.
-
-        What is not known is None. The keys are those of `tormagctl firmware --json`.
-        """
+    def report(self) -> LinkReport:
+        """State, cause and remedy, identity, counters of this opening of the port, round trip and clock."""
         link, backend = self._link, self._backend
         identity = None if link is None else link.identity
-        fit = None if link is None else link.clock.fit()
         counted = {name: None if backend is None else getattr(backend.statistics, name) for name in COUNTERS}
         if link is not None and counted["repeated"] is not None:
             counted["repeated"] += link.repeated  # each repetition is counted by whoever drops it
-        return {
-            "state": str(self.state),
-            "cause": self.cause,
-            "remedy": self.remedy,
-            "backend": self._device.backend,
-            "port": self._device.port,
-            "losses": self.losses,
-            "last_loss": self._last_loss,
-            "firmware": identity and f"{identity.firmware_major}.{identity.firmware_minor}",
-            "serial_number": identity and identity.serial_number,
-            "firmware_schema": identity and f"{identity.schema_hash:08x}",
-            "daemon_schema": f"{SCHEMA_HASH:08x}",
-            "protocol_version": PROTOCOL_VERSION,
+        return LinkReport(
+            state=str(self.state),
+            cause=self.cause,
+            remedy=self.remedy,
+            backend=self._device.backend,
+            port=self._device.port,
+            losses=self.losses,
+            last_loss=self._last_loss,
+            firmware=None if identity is None else f"{identity.firmware_major}.{identity.firmware_minor}",
+            serial_number=None if identity is None else identity.serial_number,
+            firmware_schema=None if identity is None else f"{identity.schema_hash:08x}",
+            daemon_schema=f"{SCHEMA_HASH:08x}",
+            protocol_version=PROTOCOL_VERSION,
             **counted,
-            "round_trip_us": None if link is None else link.round_trip.report(),
-            "clock": None
-            if link is None or fit is None
-            else {
-                # a State has been on its way for about half of the shortest round trip
-                "offset_s": round(fit.offset_s - link.round_trip.least_s / 2.0, 6),
-                "drift_ppm": round(fit.drift_ppm, 2),
-                "residual_us": round(fit.residual_us, 1),
-                "windows": fit.windows,
-                "outliers": fit.outliers,
-            },
-        }
+            round_trip_us=None if link is None else _round_trip(link),
+            clock=None if link is None else _clock(link),
+        )
 
     def _open(self, now_s: float) -> None:
         assert self._watcher is not None, "only an opened connection is opened again"
         try:
-            self._backend = self._open_backend(self._device)
+            self._backend = self._open_backend()
         except BackendError as error:
             # the first failure is news, the same one again is not
             log.log(logging.WARNING if str(error) != self._cause else logging.DEBUG, "%s", error)
@@ -281,3 +274,22 @@ class Connection:
             self._on_loss()
         elif state in (LinkState.REFUSED, LinkState.UNANSWERED):
             log.warning("%s: %s; %s", self._device.port, self.cause, self.remedy)
+
+
+def _round_trip(link: DeviceLink) -> RoundTripReport | None:
+    known = link.round_trip.report()
+    return None if known is None else RoundTripReport(**known)
+
+
+def _clock(link: DeviceLink) -> ClockReport | None:
+    fit = link.clock.fit()
+    if fit is None:
+        return None
+    return ClockReport(
+        # a State has been on its way for about half of the shortest round trip
+        offset_s=round(fit.offset_s - link.round_trip.least_s / 2.0, 6),
+        drift_ppm=round(fit.drift_ppm, 2),
+        residual_us=round(fit.residual_us, 1),
+        windows=fit.windows,
+        outliers=fit.outliers,
+    )

@@ -4,12 +4,14 @@ import contextlib
 import errno
 import os
 import termios
+from typing import Annotated
 
 import serial
+from msgspec import Meta
 
 from firmware_protocol.codec import Message
-from tormagd.config import Device
-from tormagd.hardware.backend import BackendError, LinkStatistics
+from tormagd.config import Device, Strict
+from tormagd.hardware.backend import BackendError, Driver, LinkStatistics
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.usb_latency import make_prompt
 
@@ -78,10 +80,16 @@ class SerialBackend:
             self._port.close()
 
 
-def open_serial(device: Device) -> SerialBackend:
+class SerialOptions(Strict, frozen=True):
+    """`[device.options]` of a serial port."""
+
+    baud: Annotated[int, Meta(ge=115_200, le=12_000_000)] = 1_000_000
+
+
+def open_serial(device: Device, options: SerialOptions) -> SerialBackend:
     """Opens `device.port` exclusively. Raises BackendError saying why not."""
     try:
-        port = serial.Serial(device.port, device.baud, timeout=0, write_timeout=0, exclusive=True)
+        port = serial.Serial(device.port, options.baud, timeout=0, write_timeout=0, exclusive=True)
         port.reset_input_buffer()
         _tell_nothing_from_gone(port.fileno())
         make_prompt(port)
@@ -99,3 +107,7 @@ def _tell_nothing_from_gone(fd: int) -> None:
     attributes = termios.tcgetattr(fd)
     attributes[6][termios.VMIN] = 1
     termios.tcsetattr(fd, termios.TCSANOW, attributes)
+
+
+DRIVER = Driver(SerialOptions, open_serial)
+"""The entry point `serial`."""

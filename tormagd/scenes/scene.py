@@ -33,7 +33,6 @@ class Bandwidth(Strict, frozen=True):
 
     control_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 1_000
     inference_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = LEAST_INFERENCE_HZ
-    setpoint_hz: Annotated[int, Meta(ge=1, le=4_000)] = 500
 
 
 class Insert(Strict, frozen=True):

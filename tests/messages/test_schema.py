@@ -1,0 +1,116 @@
+"""What leaves the daemon keeps its keys, and the documentation lists them as they are."""
+
+import re
+import types
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+import pytest
+
+from tormagd import messages
+from tormagd.messages import (
+    ClockReport,
+    DeviceReport,
+    ExecReport,
+    Explained,
+    LatenessReport,
+    LinkReport,
+    RateReport,
+    RoundTripReport,
+    SetpointReport,
+    StallReport,
+    Status,
+    Telemetry,
+    Tick,
+    TickRecord,
+)
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs/messages.md").read_text(encoding="utf-8")
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+TELEMETRY = (
+    "v t_ns seq operating_state is_homed is_busy setpoint_cf governed_cf measured_cf predicted_cf field_mT gap_mm "
+    "gap_setpoint_mm measured_jp skew_mm duty limits faults setpoint_age_ms confidence tick"
+)
+V1: dict[type[msgspec.Struct], str] = {
+    Telemetry: TELEMETRY,
+    Tick: "lateness_us exec_us",
+    Status: f"{TELEMETRY} version scene uptime_s least_N most_N trim device least_gap_mm link setpoints rates "
+    "late_ticks_by fault_details limit_details newest_stall not_granted",
+    LinkReport: "state cause remedy backend port losses last_loss firmware serial_number firmware_schema daemon_schema "
+    "protocol_version frames bytes corrupt lost repeated resynchronisations round_trip_us clock",
+    RoundTripReport: "least p50 p99",
+    ClockReport: "offset_s drift_ppm residual_us windows outliers",
+    SetpointReport: "accepted refused dropped oversize last_refusal newest_source sources",
+    RateReport: "grade hz runs merged overruns stalls lateness_us exec_us",
+    LatenessReport: "p50 p99 p999 max worst",
+    ExecReport: "p50 p99 p999 max",
+    DeviceReport: "scale scale_sd offset_N offset_sd_N",
+    Explained: "code cause remedy",
+    StallReport: "ms culprit",
+    TickRecord: "t_ns monotonic_s plan setpoint_cf plan_setpoint_age_s governed_cf plan_governed_cf predicted_cf "
+    "field_mT plan_gap_mm plan_gap_speed_mm_s plan_gap_acceleration_mm_s2 plan_least_gap_mm plan_limits plan_outside "
+    "plan_sensor_doubted_s foresight plan_time_s confidence trim measurement received_s delay_s device_time_s "
+    "device_left_mm device_right_mm device_handle_mm device_force_N device_mode device_switches device_faults "
+    "device_temperature_C left_current_A right_current_A supply_V reference_gap_mm measured_cf left_mm right_mm "
+    "handle_mm handle_rate_mm_s operating_state limits step_limits faults drive_mode left_duty right_duty request "
+    "request_number lateness_us exec_us",
+}
+"The keys of `v: 1`, each with the meaning and the unit that docs/messages.md gives it."
+WORDS = {int: "int", float: "float", str: "str", bool: "bool"}
+
+
+@pytest.mark.parametrize("kind", V1, ids=lambda kind: kind.__name__)
+def test_no_key_of_this_version_goes(kind: type[msgspec.Struct]) -> None:
+    """A key that goes, or gets another name, takes a higher `v`; one that comes is added here and in the page."""
+    assert messages.VERSION == 1
+    assert set(kind.__struct_encode_fields__) == set(V1[kind].split())
+
+
+def test_every_struct_that_leaves_the_daemon_is_pinned() -> None:
+    taken_in = {messages.Setpoint, messages.Request, messages.Reply, messages.ErrorReply}
+    made_here = {
+        each
+        for each in vars(messages).values()
+        if isinstance(each, type) and issubclass(each, msgspec.Struct) and each.__module__ == messages.__name__
+    }
+    assert made_here == taken_in | set(V1)
+
+
+def in_words(kind: Any) -> str:
+    """A field's type as the page has it."""
+    arguments = get_args(kind)
+    if get_origin(kind) in (types.UnionType, Union):
+        (known,) = (each for each in arguments if each is not type(None))
+        return f"{in_words(known)} or null"
+    if get_origin(kind) is tuple:
+        return f"[{in_words(arguments[0])}]" if arguments[-1] is ... else f"[{', '.join(map(in_words, arguments))}]"
+    if get_origin(kind) is dict:
+        return f"{{{in_words(arguments[0])}: {in_words(arguments[1])}}}"
+    return WORDS.get(kind) or f"[{kind.__name__}](#{kind.__name__.lower()})"
+
+
+def rows(heading: str) -> list[tuple[str, str, str]]:
+    """The table under a heading of the page."""
+    (section,) = re.findall(rf"^### {heading}\n(.*?)(?=^##|\Z)", PAGE, re.DOTALL | re.MULTILINE)
+    found = re.findall(r"^\| `(\w+)` \| (.+?) \| (.+) \|$", section, re.MULTILINE)
+    assert len(found) == section.count("\n|") - 2 + section.startswith("|"), f"{heading}: a row that is none"
+    return found
+
+
+@pytest.mark.parametrize("kind", V1, ids=lambda kind: kind.__name__)
+def test_the_page_lists_every_field_with_its_type(kind: type[msgspec.Struct]) -> None:
+    inherited = set(Telemetry.__struct_fields__) if kind is Status else set()
+    hints = get_type_hints(kind)
+    fields = [(name, in_words(hints[name])) for name in kind.__struct_fields__ if name not in inherited]
+    assert [(name, shown) for name, shown, _ in rows(kind.__name__)] == fields
+
+
+def test_the_page_has_no_table_of_what_is_not_there() -> None:
+    assert set(re.findall(r"^### (\w+)$", PAGE, re.MULTILINE)) == {kind.__name__ for kind in V1}
+
+
+def test_the_readme_lists_the_telemetry_as_it_is() -> None:
+    (listed,) = re.findall(r"Telemetry, 50 times a second: `\{(.*?)\}`", README, re.DOTALL)
+    assert re.split(r",\s+", listed) == list(Telemetry.__struct_fields__)

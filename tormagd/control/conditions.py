@@ -1,0 +1,53 @@
+"""What an operator's command is decided on: what the device says, what was asked of it, and what is asked of us."""
+
+from tormagd.config import Config
+from tormagd.control.estimate import Estimate
+from tormagd.control.governor import TimedSetpoint
+from tormagd.control.step import StepOutput, StepState
+from tormagd.hardware.measurement import Measurement
+from tormagd.safety.operating_state import Conditions, DeviceRequest
+
+
+def is_homed(measurement: Measurement | None, estimate: Estimate | None) -> bool:
+    """Whether the carriages' positions are known; the device's word alone is not enough."""
+    return measurement is not None and estimate is not None and estimate.is_homed
+
+
+def is_busy(
+    measurement: Measurement | None, pending: DeviceRequest, state: StepState, output: StepOutput | None
+) -> bool:
+    """Whether the device homes or opens, or was asked to and has not said yet that it does.
+
+    `output` is the newest step's, `pending` the request that the device has not acknowledged.
+    """
+    if measurement is None:
+        return False
+    is_asked = output is not None and output.request_number != state.safety.request_number
+    return is_asked or pending is not DeviceRequest.NONE or measurement.is_busy
+
+
+def conditions(
+    now_s: float,
+    config: Config,
+    measurement: Measurement | None,
+    pending: DeviceRequest,
+    state: StepState,
+    output: StepOutput | None,
+    setpoint: TimedSetpoint | None,
+    least_N: float,
+    *,
+    sensor_doubted: bool,
+) -> Conditions:
+    """The conditions at `now_s`. `least_N` is F_min of this device, `measurement` None while the link does not run."""
+    is_current = setpoint is not None and now_s - setpoint.stamp_s <= setpoint.valid_for_s
+    timeout_s = config.device.measurement_timeout_ms * 1e-3
+    return Conditions(
+        connected=measurement is not None,
+        fresh=measurement is not None and now_s - measurement.received_s < timeout_s,
+        homed=is_homed(measurement, state.estimate),
+        busy=is_busy(measurement, pending, state, output),
+        device_latched=measurement is not None and measurement.is_latched,
+        requested_N=setpoint.force_N if setpoint is not None and is_current else None,
+        neutral_N=least_N + config.limits.neutral_margin_N,
+        sensor_doubted=sensor_doubted,
+    )

@@ -1,0 +1,80 @@
+"""Causes: what is known of a fault when it is latched, in the figures of that very time."""
+
+import logging
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from tormagd.config import Device
+from tormagd.control.step import StepState
+from tormagd.daemon.callbacks import Delay
+from tormagd.hardware.measurement import Measurement
+from tormagd.messages import Explained, StallReport
+from tormagd.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
+
+log = logging.getLogger(__name__)
+
+
+class Stall(NamedTuple):
+    """The newest stall of the control loop: how long it stood still, and who is to blame for most of that."""
+
+    took_s: float
+    culprit: str
+
+    def __str__(self) -> str:
+        return f"the control loop stood still for {self.took_s * 1e3:.0f} ms ({self.culprit})"
+
+
+class Causes:
+    """Remembers the newest stall, and of each fault what made it."""
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+        self._stall: Stall | None = None
+        self._told: dict[str, str] = {}
+
+    def note_stall(self, state: StepState, delay: Delay) -> None:
+        """A tick was late. Only what the step took for a stall, too, is one; of two close together the longer stays."""
+        sight, known = state.sight, self._stall
+        if sight.stalled_s == state.time_s and (known is None or known.took_s != sight.stall_s):
+            self._stall = Stall(sight.stall_s, delay.culprit)
+
+    def tell(self, faults: tuple[Fault, ...], state: StepState, measurement: Measurement | None) -> None:
+        """Says which faults are new, and remembers what is known of their causes now."""
+        for fault in faults:
+            self._told.pop(fault, None)
+        if Fault.HOST_STALL in faults:
+            opened = f"the device opened the gap by itself after {self._device.command_timeout_ms:g} ms"
+            self._told[Fault.HOST_STALL] = f"{self._stall}; {opened}"
+        if Fault.MEASUREMENT_STALE in faults and measurement is not None:
+            silent_ms = (state.time_s - measurement.received_s) * 1e3
+            self._told[Fault.MEASUREMENT_STALE] = (
+                f"the device had sent no new state for {silent_ms:.0f} ms"
+                if silent_ms > measurement.delay_s * 1e3
+                else f"the device was {measurement.delay_s * 1e3:.0f} ms behind with the commands that it obeyed"
+            )
+        for explained in self.of_faults(faults):
+            log.error("fault: %s: %s", explained.code, explained.cause)
+
+    def of_faults(self, faults: Iterable[str]) -> tuple[Explained, ...]:
+        """Each fault with its cause and remedy."""
+        return explanations(faults, FAULTS, self._told)
+
+    def of_limits(self, limits: Iterable[str], replaced: str) -> tuple[Explained, ...]:
+        """Each limit with its cause and remedy; `replaced` says what the model was not asked."""
+        told = {Limit.HOST_STALL: f"{self._stall}; the gap was held until the device answered"}
+        return explanations(limits, LIMITS, told | {Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}"})
+
+    def newest_stall(self) -> StallReport | None:
+        """The newest stall, None while there was none."""
+        stall = self._stall
+        return None if stall is None else StallReport(round(stall.took_s * 1e3, 1), stall.culprit)
+
+
+def explanations(
+    codes: Iterable[str], table: Mapping[Any, Explanation], told: Mapping[Any, str] = MappingProxyType({})
+) -> tuple[Explained, ...]:
+    """Each code with its cause and remedy; `told` has causes with the figures of this very time."""
+    kind = Fault if Fault.STOPPED in table else Limit
+    known = [(str(code), table[kind(code)]) for code in codes]
+    return tuple(Explained(code, told.get(code, found.cause), found.remedy) for code, found in known)

@@ -1,0 +1,196 @@
+"""The telemetry loop: at 50 Hz publish the snapshot and the ticks, answer commands and `status`, feed the watchdog."""
+
+import logging
+import math
+import time
+from typing import Any
+
+import msgspec
+
+from tormagd import __version__
+from tormagd.config import Config
+from tormagd.control.conditions import conditions, is_busy, is_homed
+from tormagd.control.core import Core
+from tormagd.control.plan import PlanState
+from tormagd.daemon import notify
+from tormagd.daemon.callbacks import Callbacks
+from tormagd.daemon.causes import Causes
+from tormagd.daemon.control_loop import ControlLoop
+from tormagd.daemon.endpoint import Endpoint
+from tormagd.daemon.inference_loop import InferenceLoop
+from tormagd.daemon.rate_group import ERROR_PERIODS, RateGroup
+from tormagd.daemon.telemetry import snapshot, tick_record
+from tormagd.hardware.connection import Connection
+from tormagd.hardware.link import LinkState
+from tormagd.messages import DeviceReport, Request, Status, Telemetry, TickRecord
+from tormagd.safety.operating_state import Conditions
+
+NS = 1_000_000_000
+MOST_TICKS = 100
+"Ticks in one recording message at most."
+SERVED_BEFORE_NS = 200_000
+"No command is taken up later than this before the next control tick: an answer takes a quarter of it."
+
+log = logging.getLogger(__name__)
+
+
+class TelemetryLoop:
+    """Tells everybody else what the control and inference loops do. It runs in their slack, after a control tick.
+
+    `not_granted` is what the kernel refused at the start.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        core: Core,
+        control: ControlLoop,
+        inference: InferenceLoop,
+        connection: Connection,
+        endpoint: Endpoint,
+        callbacks: Callbacks,
+        causes: Causes,
+        not_granted: list[str],
+    ) -> None:
+        self._config, self._core, self._not_granted = config, core, tuple(not_granted)
+        self._control, self._inference = control, inference
+        self._connection, self._endpoint = connection, endpoint
+        self._callbacks, self._causes = callbacks, causes
+        self.timing = RateGroup("telemetry", NS // config.rates.telemetry_hz)
+        self._groups = (control.timing, inference.timing, self.timing)
+        self._started_s = time.monotonic()
+        self._ticks: list[TickRecord] = []
+        self._status: dict[str, Any] | None = None
+
+    def record(self, used: PlanState) -> None:
+        """Keeps the control tick that just ran, with what had been planned when it did."""
+        control = self._control
+        if control.output is None:
+            return
+        timing = control.timing
+        self._ticks.append(
+            tick_record(
+                control.state.time_s,
+                control.state,
+                control.output,
+                used.plan,
+                used.trim,
+                control.measurement,
+                timing.lateness_us,
+                timing.exec_us,
+            )
+        )
+
+    def publish(self, due_ns: int) -> None:
+        """One telemetry period, which was due at `due_ns`."""
+        start_ns = time.monotonic_ns()
+        snapshot_ = self._snapshot(start_ns * 1e-9)
+        self._endpoint.publish(snapshot_)
+        self._endpoint.publish_ticks(self._ticks[-MOST_TICKS:])
+        self._ticks.clear()
+        self._groups[self.timing.runs % len(self._groups)].refresh()  # one a period: none costs the loop much
+        self._status = None
+        self._endpoint.serve(
+            start_ns * 1e-9,
+            lambda request: self._answer(request, snapshot_),
+            self._control.next_tick_ns - SERVED_BEFORE_NS,
+        )
+        if self._is_alive(start_ns * 1e-9):
+            notify.notify("WATCHDOG=1")
+        self._report_late_ticks()
+        self.timing.record(due_ns, start_ns, time.monotonic_ns())
+
+    def conditions(self) -> Conditions:
+        """What a command is decided on now."""
+        return conditions(
+            time.monotonic(),
+            self._config,
+            self._connection.measurement,
+            self._connection.pending,
+            self._control.state,
+            self._control.output,
+            self._endpoint.inbox.newest,
+            self._least_N(),
+            sensor_doubted=self._inference.state.sensor.is_doubted,
+        )
+
+    def is_busy(self) -> bool:
+        """Whether the device homes or opens, or is about to."""
+        connection, control = self._connection, self._control
+        return is_busy(connection.measurement, connection.pending, control.state, control.output)
+
+    def _snapshot(self, now_s: float) -> Telemetry:
+        stamp = self._endpoint.inbox.newest
+        homed = is_homed(self._connection.measurement, self._control.state.estimate)
+        age_s = None if stamp is None else now_s - stamp.stamp_s
+        return snapshot(self._ticks[-1], self.timing.runs, homed, self.is_busy(), age_s)
+
+    def _is_alive(self, now_s: float) -> bool:
+        """Whether plans and device states are as fresh as systemd's watchdog wants them; ticks are, or nobody asks."""
+        timeout_s = self._config.realtime.watchdog_ms * 1e-3
+        plan, measurement = self._inference.state.plan, self._connection.measurement
+        if plan.number == 0 or now_s - plan.time_s > timeout_s:
+            return False
+        # without a port there are no states to be fresh, and starting the daemon again would not bring one
+        return self._connection.state is not LinkState.RUNNING or (
+            measurement is not None and now_s - measurement.received_s < timeout_s
+        )
+
+    def _report_late_ticks(self) -> None:
+        news = self._callbacks.news()
+        if news is not None:
+            is_stall = news.worst.took_ns > ERROR_PERIODS * self._control.timing.period_ns
+            log.log(logging.ERROR if is_stall else logging.WARNING, "%s", news)
+
+    def _answer(self, request: Request, newest: Telemetry) -> dict[str, Any]:
+        if request.command == "status":
+            # built once for everybody who asks in this period
+            if self._status is None:
+                self._status = msgspec.to_builtins(self._build_status(newest))
+            return self._status
+        self._control.command(request.command, self.conditions())
+        self._status = None
+        return {
+            "operating_state": str(self._control.state.safety.operating_state),
+            # without a device nothing moves yet: a request to open is kept for it, and no other is taken
+            "is_connected": self._connection.measurement is not None,
+        }
+
+    def _least_N(self) -> float:
+        """F_min of this device, as far as it has shown itself."""
+        return self._inference.state.device.force_N(self._core.planner.portrait.least_N)
+
+    def _build_status(self, newest: Telemetry) -> Status:
+        safety, planned = self._control.state.safety, self._inference.state
+        plan, shown = planned.plan, planned.device
+        # a command of this very period has changed the state since the snapshot, and whoever gave it asks now
+        known = msgspec.structs.asdict(newest) | {
+            "operating_state": str(safety.operating_state),
+            "is_busy": self.is_busy(),
+            "faults": safety.faults,
+        }
+        outside = ", ".join(f"{it.quantity} {it.asked:.4g} asked, {it.used:.4g} used" for it in plan.outside)
+        return Status(
+            **known,
+            version=__version__,
+            scene=self._core.scene.name,
+            uptime_s=round(time.monotonic() - self._started_s, 1),
+            least_N=round(self._least_N(), 3),
+            most_N=round(shown.force_N(self._core.planner.portrait.most_N), 3),
+            trim=round(planned.trim, 4),
+            device=DeviceReport(
+                scale=round(shown.scale, 4),
+                scale_sd=round(math.sqrt(max(shown.scale_variance, 0.0)), 4),
+                offset_N=round(shown.offset_N, 4),
+                offset_sd_N=round(math.sqrt(max(shown.offset_variance_N2, 0.0)), 4),
+            ),
+            least_gap_mm=round(plan.least_gap_mm, 2),
+            link=self._connection.report(),
+            setpoints=self._endpoint.inbox.report(),
+            rates={group.name: group.report for group in self._groups},
+            late_ticks_by=dict(self._callbacks.blamed),
+            fault_details=self._causes.of_faults(safety.faults),
+            limit_details=self._causes.of_limits(newest.limits, replaced),
+            newest_stall=self._causes.newest_stall(),
+            not_granted=self._not_granted,
+        )
