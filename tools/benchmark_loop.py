@@ -26,7 +26,6 @@ import numpy as np
 import numpy.typing as npt
 import uvloop
 import zmq
-from bare_timer import beat
 from benchmark_plot import plot_histograms
 
 from tormagd.config import Config, RealTime, load_config
@@ -36,6 +35,7 @@ from tormagd.daemon.daemon import SERVED_BEFORE_NS
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
+from tormagd.headroom.bare_timer import beat
 from tormagd.messages import Request
 from tormagd.recording.ticks import decode_ticks
 
