@@ -2,8 +2,10 @@
 
 import argparse
 import math
+from collections.abc import Callable
 from pathlib import Path
 
+import benchmark_against
 import benchmark_latency
 import benchmark_loop
 import benchmark_virtual_time
@@ -16,6 +18,7 @@ import tormagd
 from tormagd.config import RealTime
 
 PNG = b"\x89PNG"
+ROOT = Path(__file__).parents[2]
 
 
 def block(lateness_us: float, merged: int) -> benchmark_loop.Block:
@@ -66,18 +69,71 @@ def test_histograms_are_drawn_of_any_positive_or_zero_durations(tmp_path: Path) 
 
 def test_virtual_time_is_measured_with_a_profile_of_every_room(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(benchmark_virtual_time, "SHOWN", 10_000)  # all: on a busy machine the order is anybody's
-    options = argparse.Namespace(seconds=0.2, plant="sample_1", profile=True)
+    options = argparse.Namespace(seconds=0.2, plant="sample_1", profile=True, against=ROOT)
     result = benchmark_virtual_time.measure(options)
     for name in ("whole_core", "position_loop"):
         found = result[name]
         assert found["factor"] == pytest.approx(1e3 / found["tick_us"]["p50"], rel=0.01)
         assert found["tick_us"]["p10"] <= found["tick_us"]["p50"]
+        assert result[result["build"]][name] == found["factor"]
+        assert result["against"][name] > 0.0
     shares = result["profile"]["rooms"]
     assert {"simulation", "control", "inverse", "firmware_protocol", "hardware", "closed_loop"} <= set(shares)
     assert math.isclose(sum(shares.values()), 1.0, abs_tol=0.01)
-    assert max(shares, key=shares.__getitem__) == "simulation"
     assert any(name.startswith("simulation: axis.step, 4 a tick") for name in result["profile"]["functions"])
     assert result["profile"]["calls_per_tick"] > 100
+
+
+def test_builds_take_turns_in_stretches_and_ratios_are_medians_over_them() -> None:
+    asked: list[tuple[str, str]] = []
+
+    def build(name: str, taken_us: float) -> Callable[[str, int], float]:
+        def tick_us(loop: str, ticks: int) -> float:
+            asked.append((name, loop))
+            assert ticks == benchmark_virtual_time.STRETCH_TICKS
+            # the machine gives ever less; the builds, side by side, are as much apart as they were
+            return taken_us * (1 + (len(asked) - 1) // 6) * (2 if loop == "whole_core" else 1)
+
+        return tick_us
+
+    builds = {"compiled": build("compiled", 20.0), "interpreted": build("interpreted", 100.0)}
+    found = benchmark_virtual_time.take_turns(builds | {"against": build("against", 80.0)}, 500)
+    assert all(len(taken) == 5 for loops in found.values() for taken in loops.values())
+    assert [name for name, loop in asked[6:] if loop == "whole_core"][:9:3] == ["compiled", "interpreted", "against"]
+    result = benchmark_virtual_time.summary(found, 1_000.0)
+    assert result["build"] == "compiled"
+    assert result["ratio"] == {"whole_core": 5.0, "position_loop": 5.0}
+    assert result["against"]["ratio"]["compiled"] == {"whole_core": 4.0, "position_loop": 4.0}
+    assert result["against"]["ratio"]["interpreted"] == {"whole_core": 0.8, "position_loop": 0.8}
+    assert result["whole_core"]["factor"] == result["compiled"]["whole_core"]
+    assert set(result["compiled"]) == {"whole_core", "position_loop", "tick_us"}
+
+
+def test_without_a_compiled_build_there_is_none() -> None:
+    taken = {"whole_core": [100.0, 300.0, 200.0], "position_loop": [50.0]}
+    result = benchmark_virtual_time.summary({"interpreted": taken}, 1_000.0)
+    assert result["compiled"] is None
+    assert result["build"] == "interpreted"
+    assert (result["interpreted"]["whole_core"], result["interpreted"]["position_loop"]) == (5.0, 20.0)
+    assert not {"ratio", "against"} & set(result)
+
+
+def test_only_a_checkout_is_measured_against(tmp_path: Path) -> None:
+    assert benchmark_against.checkout(str(ROOT)) == ROOT
+    with pytest.raises(argparse.ArgumentTypeError, match="allowed is the root of a checkout"):
+        benchmark_against.checkout(str(tmp_path))
+    with pytest.raises(RuntimeError, match="ended with status"):
+        benchmark_virtual_time.Build("no such plant")
+
+
+def test_a_package_that_was_not_asked_for_is_not_measured(tmp_path: Path) -> None:
+    """A folder with tools and without a package would be measured with whatever is installed."""
+    (tmp_path / "tormagd").mkdir()
+    (tmp_path / "tools").mkdir()
+    for tool in (ROOT / "tools").glob("benchmark*.py"):
+        (tmp_path / "tools" / tool.name).write_bytes(tool.read_bytes())
+    with pytest.raises(RuntimeError):
+        benchmark_virtual_time.Build("sample_1", tmp_path)
 
 
 def test_rooms_are_told_by_where_the_packages_are(tmp_path: Path) -> None:
