@@ -186,7 +186,7 @@ def quantiles(typical_us: float, p99_us: float) -> headroom.Quantiles:
     return headroom.Quantiles(mean=typical_us, p50=typical_us, p99=p99_us, p999=p99_us, max=p99_us)
 
 
-def measured(late_us: float = 100.0, step_us: float = 50.0, plan_us: float = 100.0, **others) -> headroom.Headroom:
+def measured(late_us: float = 100.0, step_us: float = 80.0, plan_us: float = 100.0, **others) -> headroom.Headroom:
     """A machine with these p99, lateness and step half as much in the middle."""
     return headroom.Headroom(
         machine_us=450.0,
@@ -207,7 +207,7 @@ def test_a_machine_with_headroom_holds_its_rates_and_says_up_to_which(good):
     assert outcome.exit_code == 0
     assert (outcome.result["fail"], outcome.result["warn"]) == (0, 0)
     control = by_rate(measured(), "control")
-    # 100 us late and twice 50 us of work in a period of 1000, 500 and 250 us
+    # 100 us late and 1.25 times 80 us of work in a period of 1000, 500 and 250 us
     assert [control[hz].used for hz in (1_000, 2_000, 4_000)] == [0.2, 0.4, 0.8]
     assert [hz for hz, row in control.items() if row.configured] == [1_000]
     assert [hz for hz, row in control.items() if not row.holds] == [4_000]
@@ -216,7 +216,7 @@ def test_a_machine_with_headroom_holds_its_rates_and_says_up_to_which(good):
 
 
 def test_inference_is_held_where_a_plan_fits_beside_the_ticks():
-    # 25 us of step in the middle, twice, and 50 us late: 900 us for a plan, and a tenth of a processor gone
+    # half as much of both in the middle: 900 us for a plan; and a seventh of the processor gone besides
     assert all(row.holds for row in by_rate(measured(plan_us=500.0), "inference").values())
     slow = by_rate(measured(plan_us=650.0), "inference")
     assert not slow[83].holds

@@ -2,10 +2,12 @@
 
 import argparse
 import math
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import benchmark_against
+import benchmark_fast
 import benchmark_latency
 import benchmark_loop
 import benchmark_virtual_time
@@ -15,7 +17,8 @@ from benchmark_plot import plot_histograms
 
 import firmware_protocol
 import tormagd
-from tormagd.config import RealTime
+from tormagd.config import RealTime, load_config
+from tormagd.control.core import build_core
 
 PNG = b"\x89PNG"
 ROOT = Path(__file__).parents[2]
@@ -38,6 +41,90 @@ def test_ratios_are_medians_over_the_pairs_and_not_of_the_sums() -> None:
     assert result["control_exec_us"]["mean"] == 50.0
     assert result["bare"]["merged_share"] == 0.0
     assert result["merged_share"] == pytest.approx(30 / 29_970)
+
+
+def test_ratios_to_another_checkout_are_medians_over_the_pairs() -> None:
+    def costing(tick_us: float, plan_us: float | None, share: float) -> benchmark_loop.Block:
+        plans = None if plan_us is None else {"p50": plan_us, "p99": 3 * plan_us}
+        return block(40.0, 0)._replace(
+            without_write_us=np.full(5, tick_us), plan_us=plans, core_share=share, core_share_without_clients=share / 2
+        )
+
+    pairs = [
+        benchmark_loop.Pair(costing(ours, 50.0, 0.2), block(40.0, 0), costing(theirs, 200.0, 0.4))
+        for ours, theirs in ((30.0, 100.0), (10.0, 100.0), (20.0, 100.0))
+    ]
+    result = benchmark_loop.summary(pairs, RealTime())
+    assert result["against"]["ratio"] == {
+        "tick_mean": 1.0,
+        "core_share": 0.5,
+        "core_share_without_clients": 0.5,
+        "tick_without_write_mean": 0.2,
+        "plan_p50": 0.25,
+        "plan_p99": 0.25,
+    }
+    assert result["plan_us"] == {"p50": 50.0, "p99": 150.0}
+    assert (result["core_share"], result["against"]["core_share"]) == (0.2, 0.4)
+    assert result["tick_without_write_us"]["mean"] == 20.0
+    # what one of the two does not tell has no ratio
+    pairs[1] = pairs[1]._replace(against=costing(1.0, None, 0.4)._replace(without_write_us=np.array([])))
+    ratio = benchmark_loop.summary(pairs, RealTime())["against"]["ratio"]
+    assert not {"plan_p50", "tick_without_write_mean"} & set(ratio)
+
+
+def ticks(start_us: list[int], exec_us: list[float], received_s: list[float]) -> benchmark_loop.Ticks:
+    """Ticks that began then, by both clocks."""
+    start_ns = np.array(start_us, dtype=np.int64) * 1_000
+    none_late = np.zeros(start_ns.size)
+    return benchmark_loop.Ticks(start_ns, start_ns, none_late, np.array(exec_us), np.array(received_s))
+
+
+def test_a_write_counts_for_the_tick_that_it_was_in(tmp_path: Path) -> None:
+    made = ticks([1_000, 2_000, 3_000], [100.0, 100.0, 100.0], [0.0, 0.0, 0.0])
+    times = [(1_010, 30), (1_050, 20), (1_500, 400), (3_099, 1)]  # two in the first, one outside, none in the second
+    file = tmp_path / "writes"
+    file.write_bytes((1_000 * np.array(times, dtype=np.int64)).tobytes())
+    written = benchmark_loop.writes(file)
+    assert written is not None
+    assert benchmark_loop.without_writes(made, *written).tolist() == [50.0, 100.0, 99.0]
+    file.write_bytes(b"")
+    assert benchmark_loop.writes(file) is None
+    assert benchmark_loop.writes(tmp_path / "never") is None
+    elsewhere = np.array([9_000_000]), np.array([1_000])
+    assert benchmark_loop.without_writes(made, *elsewhere).size == 0
+
+
+def test_a_tick_is_fresh_whose_state_came_since_the_one_before() -> None:
+    made = ticks([0, 500, 1_000, 2_000, 2_500], [50.0] * 5, [0.1, 0.2, 0.2, 0.3, 0.4])
+    result = benchmark_fast.summary(made, 2_000, np.array([]))
+    assert result["fresh_share"] == 0.75
+    assert result["fresh_share_of_periods"] == 0.6  # one period had no tick
+    assert (result["ticks"], result["merged_share"]) == (5, pytest.approx(1 / 6, abs=1e-4))
+    assert result["tick_without_write_us"] is None
+
+
+def test_what_cannot_be_run_is_told_and_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise subprocess.CalledProcessError(1, ["tormagctl"], stderr=b"not_homed\n")
+
+    monkeypatch.setattr(benchmark_fast, "daemon", refused)
+    found = benchmark_fast.course(benchmark_loop.Stand(RealTime(), 4_000, baud=4_000_000), 1.0)
+    assert found == {"rate_hz": 4_000, "baud": 4_000_000, "not_measured": "not_homed"}
+
+
+def test_both_fast_lines_are_configurations_that_tormagd_takes(tmp_path: Path) -> None:
+    for rate_hz, baud in benchmark_fast.LINES:
+        stand = benchmark_loop.Stand(RealTime(), rate_hz, benchmark_fast.INFERENCE_HZ, baud)
+        config = load_config(benchmark_loop.write_config(tmp_path, "/dev/null", stand))
+        assert (config.rates.control_hz, config.device.baud) == (rate_hz, baud)
+        build_core(config)
+
+
+def test_the_bound_is_the_hops_and_a_period_and_a_quarter_of_a_millisecond() -> None:
+    for whole_us, kept in ((1_350.0, True), (1_351.0, False)):
+        course = benchmark_latency.Course(np.array([whole_us]), np.zeros(1), np.zeros(1), np.array([100.0]))
+        result = benchmark_latency.summary(course, 1, RealTime())
+        assert (result["bound_us"], result["kept"]) == (1_350.0, kept)
 
 
 def test_the_first_tick_that_used_a_setpoint_counts() -> None:
