@@ -29,6 +29,7 @@ MAY_IMPORT = {
     "recording": {"messages"},
     "ctl": {"config", "messages", "output", "scenes", "recording"},
     "simulation": {"physics", "firmware_protocol", "output"},
+    "headroom": {"config", "output", "daemon", "control", "simulation", "closed_loop"},
     "closed_loop": LOWEST | {"control", "hardware", "safety", "simulation"},
 }
 

@@ -10,21 +10,16 @@ import asyncio
 import json
 import signal
 import sys
-import time
-from collections.abc import Callable
 from typing import NamedTuple
 
 import uvloop
 
 from tormagd.config import RealTime
 from tormagd.daemon.heartbeat import Heartbeat
-from tormagd.daemon.realtime import freeze_garbage, prepare
+from tormagd.daemon.realtime import prepare
+from tormagd.headroom.bare_timer import NS, beat
 
 PERIOD_NS = 1_000_000
-NS = 1_000_000_000
-
-OnBeat = Callable[[Heartbeat, int, int], None]
-"""Called with the heartbeat, the beats that this one stands for, and the time on CLOCK_MONOTONIC, ns."""
 
 
 class Stall(NamedTuple):
@@ -37,23 +32,6 @@ class Stall(NamedTuple):
     def length_ms(self) -> float:
         """How long it took, ms."""
         return (self.end_s - self.start_s) * 1e3
-
-
-async def beat(period_ns: int, on_beat: OnBeat, ended: asyncio.Event) -> None:
-    """Calls `on_beat` in every period until `ended` is set. `prepare` has been called before."""
-    heartbeat = Heartbeat(period_ns)
-
-    def woken() -> None:
-        beats = heartbeat.beats()
-        if beats:
-            on_beat(heartbeat, beats, time.monotonic_ns())
-
-    freeze_garbage()
-    loop = asyncio.get_running_loop()
-    loop.add_reader(heartbeat.fileno(), woken)
-    await ended.wait()
-    loop.remove_reader(heartbeat.fileno())
-    heartbeat.close()
 
 
 async def stalls_until_ended(realtime: RealTime, period_ns: int) -> list[Stall]:

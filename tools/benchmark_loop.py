@@ -3,6 +3,9 @@
 Daemon and stub run in alternating blocks, because a shared machine drifts: what counts is the ratio of a block to its
 neighbour. Both have the same heartbeat, event loop and scheduling, publish a row for each tick, and answer the same
 eight clients, each of which asks for status again as soon as it is answered; the stub has no controller and no device.
+
+Processor time is that of the daemon with its threads and children; recording is on: a subscriber reads every tick. With
+`--against` the daemon of another checkout takes its turn, on the same simulated device, this checkout's.
 """
 
 import argparse
@@ -17,6 +20,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,8 +30,9 @@ import numpy as np
 import numpy.typing as npt
 import uvloop
 import zmq
-from bare_timer import beat
+from benchmark_against import TOOLS, add_against_argument, environment
 from benchmark_plot import plot_histograms
+from host import processor_s
 
 from tormagd.config import Config, RealTime, load_config
 from tormagd.ctl.client import Client
@@ -36,55 +41,104 @@ from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
 from tormagd.daemon.telemetry_loop import SERVED_BEFORE_NS
+from tormagd.headroom.bare_timer import beat
 from tormagd.messages import Request
 from tormagd.recording.ticks import decode_ticks
 
 Array = npt.NDArray[np.float64]
+NOTHING: Array = np.array([])
 
 CLIENTS = 8
 SETPOINT_HZ = 500
 WARM_UP_S = 1.0
+ALONE_S = 4.0
+"For how long a block goes on without its clients."
 TELEMETRY_EVERY = 20
+PLAN_QUANTILES = ("p50", "p99")
+COLUMNS = ("t_ns", "monotonic_s", "lateness_us", "exec_us", "received_s")
+"What is read of a recorded tick; a stub has not all of them."
 QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 
 
 class Block(NamedTuple):
-    """The ticks of one block."""
+    """The ticks of one block; what only a daemon has is empty for the stub."""
 
     lateness_us: Array
     exec_us: Array
     ticks: int
     merged: int
     seconds: float
+    without_write_us: Array = NOTHING
+    "Of the same ticks, less what writing to the device took; empty where the writes were not seen."
+    plan_us: dict[str, float] | None = None
+    "p50 and p99 of its plans over the last 5 to 10 s as the daemon's status has them, in bins of 3%."
+    core_share: float = 0.0
+    "Processor time of all its processes over wall time, while the clients ask."
+    core_share_without_clients: float = 0.0
 
 
 class Pair(NamedTuple):
-    """A block of the daemon and one of the stub, one right after the other."""
+    """A block of the daemon and one of the stub, one right after the other, and maybe one of another checkout."""
 
     daemon: Block
     bare: Block
+    against: Block | None = None
 
 
-def run(seconds: float, pairs: int, realtime: RealTime) -> list[Pair]:
+class Stand(NamedTuple):
+    """What is measured: scheduling, rates, the serial line, how often setpoints come, and of which checkout the daemon
+    is. The device is always this checkout's. `device_fifo` is its own priority; it stands for a machine of its own."""
+
+    realtime: RealTime
+    control_hz: int = 1_000
+    inference_hz: int = 1_000
+    baud: int = 1_000_000
+    setpoint_hz: int = SETPOINT_HZ
+    root: Path | None = None
+    device_fifo: int = 0
+
+
+class Running(NamedTuple):
+    """A process that keeps time: where its sockets are, its id, and the file that has its writes once it has ended."""
+
+    config: Config
+    pid: int
+    writes: Path | None = None
+
+
+class Ticks(NamedTuple):
+    """Rows of a recording, an array each. `start_ns` is CLOCK_MONOTONIC's; empty where it was not recorded."""
+
+    stamp_ns: npt.NDArray[np.int64]
+    start_ns: npt.NDArray[np.int64]
+    lateness_us: Array
+    exec_us: Array
+    received_s: Array
+    "When the newest state had come that the tick knew; NaN before the first."
+
+
+def run(seconds: float, pairs: int, realtime: RealTime, against: Path | None = None) -> list[Pair]:
     """`pairs` blocks of each kind, `seconds` long."""
+    ours = Stand(realtime)
     return [
-        Pair(block(daemon_process, seconds, realtime), block(stub_process, seconds, realtime)) for _ in range(pairs)
+        Pair(
+            block(partial(daemon, ours), seconds),
+            block(partial(stub_process, realtime), seconds),
+            None if against is None else block(partial(daemon, ours._replace(root=against)), seconds),
+        )
+        for _ in range(pairs)
     ]
 
 
 def summary(pairs: list[Pair], realtime: RealTime) -> dict[str, Any]:
     """The contract's object."""
-    daemon, bare = merge([pair.daemon for pair in pairs]), merge([pair.bare for pair in pairs])
-    return {
-        "rate_hz": daemon.ticks / daemon.seconds,
-        "ticks": daemon.ticks,
-        "merged_ticks": daemon.merged,
-        "lateness_us": quantiles(daemon.lateness_us),
-        "control_exec_us": {"mean": float(daemon.exec_us.mean())} | quantiles(daemon.exec_us),
+    bare = merge([pair.bare for pair in pairs])
+    result = _daemon([pair.daemon for pair in pairs]) | {
         "bare": {
             "method": f"uvloop + timerfd, fifo {realtime.fifo_priority}, {CLIENTS} clients",
             "lateness_us": quantiles(bare.lateness_us),
             "merged_share": bare.merged / max(bare.ticks, 1),
+            "core_share": round(bare.core_share, 4),
         },
         "ratio": {
             name: statistics.median(
@@ -92,70 +146,167 @@ def summary(pairs: list[Pair], realtime: RealTime) -> dict[str, Any]:
             )
             for name in ("p50", "p99", "p999")
         },
-        "merged_share": daemon.merged / max(daemon.ticks, 1),
         "pairs": len(pairs),
-        "block_s": round(daemon.seconds / len(pairs), 1),
-    } | asked_for(realtime)
+    }
+    against = [pair.against for pair in pairs if pair.against is not None]
+    if against:
+        ratios = [_ratios(pair.daemon, pair.against) for pair in pairs if pair.against is not None]
+        result["against"] = _daemon(against) | {
+            "ratio": {
+                name: round(statistics.median(ratio[name] for ratio in ratios), 3)
+                for name in ratios[0]
+                if all(name in ratio for ratio in ratios)
+            }
+        }
+    return result | asked_for(realtime)
 
 
-Started = Callable[[Path, RealTime], contextlib.AbstractContextManager[Config]]
+def _daemon(blocks: list[Block]) -> dict[str, Any]:
+    whole = merge(blocks)
+    without_us, plan_us = whole.without_write_us, whole.plan_us
+    return {
+        "rate_hz": whole.ticks / whole.seconds,
+        "ticks": whole.ticks,
+        "merged_ticks": whole.merged,
+        "lateness_us": quantiles(whole.lateness_us),
+        "control_exec_us": {"mean": float(whole.exec_us.mean())} | quantiles(whole.exec_us),
+        "tick_without_write_us": {"mean": round(float(without_us.mean()), 1)} | quantiles(without_us)
+        if without_us.size
+        else None,
+        "plan_us": plan_us,
+        "core_share": round(whole.core_share, 4),
+        "core_share_without_clients": round(whole.core_share_without_clients, 4),
+        "merged_share": whole.merged / max(whole.ticks, 1),
+        "block_s": round(whole.seconds / len(blocks), 1),
+    }
 
 
-def block(start: Started, seconds: float, realtime: RealTime) -> Block:
-    """One block of one kind, under the load of the clients."""
-    with tempfile.TemporaryDirectory(prefix="tormag-") as folder, contextlib.ExitStack() as stack:
-        config = stack.enter_context(start(Path(folder), realtime))
-        stop = multiprocessing.Event()
-        load = multiprocessing.Process(target=hammer, args=(config.endpoints.control, stop), daemon=True)
-        load.start()
-        try:
-            return collect(config.endpoints.recording, seconds)
-        finally:
-            stop.set()
-            load.join(5.0)
+def _ratios(ours: Block, theirs: Block) -> dict[str, float]:
+    """What ours takes over what theirs does, as far as both are known."""
+    taken = {
+        "tick_mean": (float(ours.exec_us.mean()), float(theirs.exec_us.mean())),
+        "core_share": (ours.core_share, theirs.core_share),
+        "core_share_without_clients": (ours.core_share_without_clients, theirs.core_share_without_clients),
+    }
+    if ours.without_write_us.size and theirs.without_write_us.size:
+        taken["tick_without_write_mean"] = float(ours.without_write_us.mean()), float(theirs.without_write_us.mean())
+    if ours.plan_us and theirs.plan_us:
+        taken |= {f"plan_{name}": (ours.plan_us[name], theirs.plan_us[name]) for name in PLAN_QUANTILES}
+    return {name: own / other for name, (own, other) in taken.items() if other > 0.0}
 
 
-def collect(address: str, seconds: float) -> Block:
-    """Reads tick rows for a while, after a warm-up."""
+Started = Callable[[Path], contextlib.AbstractContextManager[Running]]
+"""Begins what is measured, with its files in the folder."""
+
+
+def block(started: Started, seconds: float) -> Block:
+    """One block of one kind, under the load of the clients; for some seconds more without them."""
+    with tempfile.TemporaryDirectory(prefix="tormag-") as folder:
+        with started(Path(folder)) as running, recording(running.config.endpoints.recording) as recorder:
+            stop = multiprocessing.Event()
+            load = multiprocessing.Process(target=hammer, args=(running.config.endpoints.control, stop), daemon=True)
+            load.start()
+            try:
+                collect(recorder, WARM_UP_S)
+                ticks, share = collect_and_weigh(recorder, running.pid, seconds)
+                plan_us = planned(running.config.endpoints.control)
+            finally:
+                stop.set()
+                load.join(5.0)
+            collect(recorder, WARM_UP_S)  # what came while nobody read
+            _, share_alone = collect_and_weigh(recorder, running.pid, min(seconds, ALONE_S))
+        written = None if running.writes is None else writes(running.writes)  # they are there when it has ended
+    return as_block(ticks, running.config.rates.control_hz)._replace(
+        without_write_us=NOTHING if written is None else without_writes(ticks, *written),
+        plan_us=plan_us,
+        core_share=share,
+        core_share_without_clients=share_alone,
+    )
+
+
+@contextlib.contextmanager
+def recording(address: str) -> Iterator["zmq.Socket[bytes]"]:
+    """A subscriber of the tick rows; while there is one, they are encoded and sent."""
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         socket.setsockopt(zmq.LINGER, 0)
         socket.subscribe(b"")
         socket.connect(address)
-        started_s = time.monotonic()
-        lateness: list[float] = []
-        execution: list[float] = []
-        stamps: list[int] = []
-        while time.monotonic() < started_s + WARM_UP_S + seconds:
-            if not socket.poll(500):
-                continue
+        yield socket
+
+
+def collect_and_weigh(socket: "zmq.Socket[bytes]", pid: int, seconds: float) -> tuple[Ticks, float]:
+    """The ticks of that time, and the share of a processor that the process and what it has begun had meanwhile."""
+    started_s, before_s = time.monotonic(), processor_s(pid)
+    ticks = collect(socket, seconds)
+    return ticks, (processor_s(pid) - before_s) / (time.monotonic() - started_s)
+
+
+def collect(socket: "zmq.Socket[bytes]", seconds: float) -> Ticks:
+    """Reads tick rows for a while. Raises RuntimeError where there are none."""
+    until_s = time.monotonic() + seconds
+    rows: list[list[Any]] = []
+    while time.monotonic() < until_s:
+        if socket.poll(100):
             batch = decode_ticks(socket.recv())
-            if time.monotonic() < started_s + WARM_UP_S:
-                continue
-            columns = {name: index for index, name in enumerate(batch.columns)}
-            for row in batch.rows:
-                stamps.append(int(row[columns["t_ns"]]))  # type: ignore[arg-type]
-                lateness.append(float(row[columns["lateness_us"]]))  # type: ignore[arg-type]
-                execution.append(float(row[columns["exec_us"]]))  # type: ignore[arg-type]
-    if len(stamps) < 2:
-        raise RuntimeError(f"no ticks at {address} within {seconds:g} s")
-    spanned_s = (stamps[-1] - stamps[0]) * 1e-9
-    return Block(
-        np.array(lateness),
-        np.array(execution),
-        len(stamps),
-        max(0, round(spanned_s * 1e3) + 1 - len(stamps)),
-        spanned_s,
+            columns = [batch.columns.index(name) if name in batch.columns else None for name in COLUMNS]
+            rows.extend([None if column is None else row[column] for column in columns] for row in batch.rows)
+    if len(rows) < 2:
+        raise RuntimeError(f"no ticks within {seconds:g} s")
+    stamp, start, lateness, execution, received = zip(*rows, strict=True)
+    starts = [] if start[0] is None else [round(second * 1e9) for second in start]
+    return Ticks(
+        np.array(stamp, dtype=np.int64),
+        np.array(starts, dtype=np.int64),
+        np.array(lateness, dtype=np.float64),
+        np.array(execution, dtype=np.float64),
+        np.array(received, dtype=np.float64),
     )
 
 
+def as_block(ticks: Ticks, rate_hz: int) -> Block:
+    """The ticks, and how many periods had none."""
+    count = ticks.stamp_ns.size
+    spanned_s = float(ticks.stamp_ns[-1] - ticks.stamp_ns[0]) * 1e-9
+    merged = max(0, round(spanned_s * rate_hz) + 1 - count)
+    return Block(ticks.lateness_us, ticks.exec_us, count, merged, spanned_s)
+
+
+def writes(file: Path) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
+    """When each write began and how long it took, ns; None where the daemon wrote some other way."""
+    pairs = np.fromfile(file, dtype=np.int64) if file.exists() else np.array([], dtype=np.int64)
+    return (pairs[0::2], pairs[1::2]) if pairs.size else None
+
+
+def without_writes(ticks: Ticks, begun_ns: npt.NDArray[np.int64], took_ns: npt.NDArray[np.int64]) -> Array:
+    """Each tick's time less that of the writes within it, us; empty where no tick wrote."""
+    spent_us = np.concatenate([[0.0], np.cumsum(took_ns * 1e-3)])
+    end_ns = ticks.start_ns + np.round(ticks.exec_us[: ticks.start_ns.size] * 1e3).astype(np.int64)
+    first, last = np.searchsorted(begun_ns, ticks.start_ns), np.searchsorted(begun_ns, end_ns)
+    if not np.any(last > first):
+        return NOTHING
+    return np.asarray(ticks.exec_us - (spent_us[last] - spent_us[first]), dtype=np.float64)
+
+
+def planned(address: str) -> dict[str, float] | None:
+    """What status says of the plans; None where it says nothing, as the stub's."""
+    with contextlib.closing(Client(address, 5.0)) as client:
+        spent = client.request("status").get("rates", {}).get("inference", {}).get("exec_us")
+    return None if spent is None else {name: float(spent[name]) for name in PLAN_QUANTILES}
+
+
 def merge(blocks: list[Block]) -> Block:
-    """All blocks as one."""
+    """All blocks as one; shares and plans in the median."""
+    plans = [block.plan_us for block in blocks if block.plan_us is not None]
     return Block(
         np.concatenate([block.lateness_us for block in blocks]),
         np.concatenate([block.exec_us for block in blocks]),
         sum(block.ticks for block in blocks),
         sum(block.merged for block in blocks),
         sum(block.seconds for block in blocks),
+        np.concatenate([block.without_write_us for block in blocks]),
+        {name: statistics.median(plan[name] for plan in plans) for name in PLAN_QUANTILES} if plans else None,
+        statistics.median(block.core_share for block in blocks),
+        statistics.median(block.core_share_without_clients for block in blocks),
     )
 
 
@@ -181,15 +332,16 @@ def hammer(address: str, stop: Event) -> None:
         client.join()
 
 
-def write_config(folder: Path, port: str, realtime: RealTime) -> Path:
+def write_config(folder: Path, port: str, stand: Stand) -> Path:
     """A configuration with its sockets in `folder`; planning in every period, as in examples/service.toml."""
     path = folder / "tormagd.toml"
     sockets = "".join(
         f'{name} = "ipc://{folder}/{name}"\n' for name in ("setpoint", "telemetry", "control", "recording")
     )
+    realtime = stand.realtime
     path.write_text(
-        f'scene = "coronary"\n[device]\nport = "{port}"\n[endpoints]\n{sockets}'
-        f"[rates]\ninference_hz = 1000\n"
+        f'scene = "coronary"\n[device]\nport = "{port}"\nbaud = {stand.baud}\n[endpoints]\n{sockets}'
+        f"[rates]\ncontrol_hz = {stand.control_hz}\ninference_hz = {stand.inference_hz}\n"
         f"[realtime]\nfifo_priority = {realtime.fifo_priority}\nkeep_awake = {str(realtime.keep_awake).lower()}\n"
         f"cpus = {list(realtime.cpus)}\n"
     )
@@ -199,41 +351,64 @@ def write_config(folder: Path, port: str, realtime: RealTime) -> Path:
 @contextlib.contextmanager
 def daemon_process(folder: Path, realtime: RealTime, setpoint_hz: int = SETPOINT_HZ) -> Iterator[Config]:
     """The daemon on a simulated device, enabled, with setpoints arriving (none where `setpoint_hz` is 0)."""
-    simulator = subprocess.Popen(
-        [sys.executable, "-m", "tormagd.simulation", "--pty"], stdout=subprocess.PIPE, text=True
-    )
-    assert simulator.stdout is not None
-    path = write_config(folder, simulator.stdout.readline().strip(), realtime)
-    config = load_config(path)
-    daemon = subprocess.Popen(
-        [sys.executable, "-m", "tormagd.daemon.main", "--config", str(path)], stderr=subprocess.DEVNULL
-    )
-    publisher = None
-    try:
-        ctl = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(path), "--wait", "20"]
-        wait_for(config.endpoints.control)
-        for command in ("home", "enable"):
-            subprocess.run([*ctl, command], check=True, capture_output=True)
-        if setpoint_hz:
-            publisher = subprocess.Popen(
-                [*ctl, "send", "pulse", "--rate", str(setpoint_hz), "--duration", "3600"], stdout=subprocess.DEVNULL
-            )
-        yield config
-    finally:
-        for child in (publisher, daemon, simulator):
-            if child is not None:
-                child.terminate()
-                child.wait(20)
+    with daemon(Stand(realtime, setpoint_hz=setpoint_hz), folder) as running:
+        yield running.config
 
 
 @contextlib.contextmanager
-def stub_process(folder: Path, realtime: RealTime) -> Iterator[Config]:
+def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
+    """The same for any stand."""
+    with contextlib.ExitStack() as stack:
+        ours = environment(None)
+        simulator = subprocess.Popen(
+            [sys.executable, "-P", "-m", "tormagd.simulation", "--pty", "--baud", str(stand.baud)],
+            stdout=subprocess.PIPE,
+            env=ours,
+            text=True,
+        )
+        stack.callback(end, simulator)
+        assert simulator.stdout is not None
+        if stand.device_fifo:
+            with contextlib.suppress(PermissionError):  # where the daemon gets none either
+                os.sched_setscheduler(simulator.pid, os.SCHED_FIFO, os.sched_param(stand.device_fifo))
+        path = write_config(folder, simulator.stdout.readline().strip(), stand)
+        config = load_config(path)
+        times = folder / "writes"
+        process = subprocess.Popen(
+            [sys.executable, "-P", str(TOOLS / "benchmark_written.py"), str(times), "--config", str(path)],
+            env=environment(stand.root),
+            stderr=subprocess.DEVNULL,
+        )
+        stack.callback(end, process)
+        ctl = [sys.executable, "-P", "-m", "tormagd.ctl.main", "--config", str(path), "--wait", "20"]
+        wait_for(config.endpoints.control)
+        for command in ("home", "enable"):
+            subprocess.run([*ctl, command], check=True, capture_output=True, env=ours)
+        if stand.setpoint_hz:
+            publisher = subprocess.Popen(
+                [*ctl, "send", "pulse", "--rate", str(stand.setpoint_hz), "--duration", "3600"],
+                stdout=subprocess.DEVNULL,
+                env=ours,
+            )
+            stack.callback(end, publisher)
+        yield Running(config, process.pid, times)
+
+
+def end(child: "subprocess.Popen[Any]") -> None:
+    """Ends what we began."""
+    child.terminate()
+    child.wait(20)
+
+
+@contextlib.contextmanager
+def stub_process(realtime: RealTime, folder: Path) -> Iterator[Running]:
     """The bare timer."""
-    config = load_config(write_config(folder, "/dev/null", realtime))
+    config = load_config(write_config(folder, "/dev/null", Stand(realtime)))
     stub = multiprocessing.Process(target=bare_loop, args=(config,), daemon=True)
     stub.start()
+    assert stub.pid is not None
     try:
-        yield config
+        yield Running(config, stub.pid)
     finally:
         stub.terminate()
         stub.join(5.0)
@@ -319,12 +494,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pairs", type=int, default=3, help="blocks of each kind")
     parser.add_argument("--without-fifo", action="store_true", help="as many pairs without FIFO after those with it")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="histograms of the lateness")
+    add_against_argument(parser)
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The object for these options; what was measured without FIFO under `without_fifo`."""
     realtime = realtime_settings(options)
-    pairs = run(options.seconds, options.pairs, realtime)
+    pairs = run(options.seconds, options.pairs, realtime, options.against)
     result = summary(pairs, realtime)
     shown = {
         "daemon": merge([pair.daemon for pair in pairs]).lateness_us,
@@ -332,7 +508,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     }
     if options.without_fifo:
         without = msgspec.structs.replace(realtime, fifo_priority=0)
-        ordinary = run(options.seconds, options.pairs, without)
+        ordinary = run(options.seconds, options.pairs, without, options.against)
         result["without_fifo"] = summary(ordinary, without)
         shown["daemon without FIFO"] = merge([pair.daemon for pair in ordinary]).lateness_us
         shown["bare stub without FIFO"] = merge([pair.bare for pair in ordinary]).lateness_us
@@ -355,8 +531,18 @@ def _print_pairs(result: dict[str, Any]) -> None:
     for name, found in (("daemon", result["lateness_us"]), ("bare", bare["lateness_us"])):
         print(f"{name:8s}" + "".join(f"{found[key]:9.1f}" for key in QUANTILES))
     print(f"{'ratio':8s}" + "".join(f"{result['ratio'][key]:9.2f}" for key in ("p50", "p99", "p999")))
-    spent = result["control_exec_us"]
-    print(
-        f"{result['rate_hz']:.1f} Hz, merged {result['merged_share']:.3%} (bare {bare['merged_share']:.3%}), "
-        f"control {spent['mean']:.0f} us mean, {spent['p99']:.0f} us p99, on {os.cpu_count()} processors"
+    print(f"merged {result['merged_share']:.3%} (bare {bare['merged_share']:.3%}), on {os.cpu_count()} processors")
+    print(_spent("this checkout", result))
+    if "against" in result:
+        print(_spent("against", result["against"]))
+        print("ratio: " + ", ".join(f"{name} {ratio:.2f}" for name, ratio in result["against"]["ratio"].items()))
+
+
+def _spent(name: str, result: dict[str, Any]) -> str:
+    tick, bare_tick, plan = result["control_exec_us"], result["tick_without_write_us"], result["plan_us"]
+    return (
+        f"{name}: {result['rate_hz']:.1f} Hz, a tick {tick['mean']:.0f} us mean, {tick['p99']:.0f} p99"
+        + (f" ({bare_tick['mean']:.0f} and {bare_tick['p99']:.0f} without the write)" if bare_tick else "")
+        + (f", a plan {plan['p50']:.0f} us p50, {plan['p99']:.0f} p99" if plan else "")
+        + f", {result['core_share']:.1%} of a core ({result['core_share_without_clients']:.1%} without the clients)"
     )

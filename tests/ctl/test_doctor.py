@@ -7,6 +7,7 @@ import pytest
 
 from tormagd.config import Config, Device, Endpoints, RealTime
 from tormagd.ctl import doctor as checks
+from tormagd.ctl import headroom
 from tormagd.ctl.doctor import Verdict, doctor, examine
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.main import main
@@ -179,3 +180,94 @@ def test_json_counts_and_lines(capsys):
     result = json.loads(capsys.readouterr().out)["result"]
     assert len(result["checks"]) == result["ok"] + result["warn"] + result["fail"] == len(checks.CHECKS)
     assert set(result["checks"][0]) == {"name", "verdict", "found", "remedy"}
+
+
+def quantiles(typical_us: float, p99_us: float) -> headroom.Quantiles:
+    return headroom.Quantiles(mean=typical_us, p50=typical_us, p99=p99_us, p999=p99_us, max=p99_us)
+
+
+def measured(late_us: float = 100.0, step_us: float = 80.0, plan_us: float = 100.0, **others) -> headroom.Headroom:
+    """A machine with these p99, lateness and step half as much in the middle."""
+    return headroom.Headroom(
+        machine_us=450.0,
+        build=others.pop("build", "interpreted"),
+        step_us=quantiles(step_us / 2, step_us),
+        plan_us=quantiles(plan_us, plan_us),
+        bare=headroom.Bare(1_000, quantiles(late_us / 2, late_us), others.pop("missed", 0.0), ()),
+        **others,
+    )
+
+
+def by_rate(found: headroom.Headroom, loop: str, config: Config = REALTIME) -> dict[int, headroom.Rate]:
+    return {row.hz: row for row in headroom.rates(config, found) if row.loop == loop}
+
+
+def test_a_machine_with_headroom_holds_its_rates_and_says_up_to_which(good):
+    outcome = doctor(REALTIME, good, measured())
+    assert outcome.exit_code == 0
+    assert (outcome.result["fail"], outcome.result["warn"]) == (0, 0)
+    control = by_rate(measured(), "control")
+    # 100 us late and 1.25 times 80 us of work in a period of 1000, 500 and 250 us
+    assert [control[hz].used for hz in (1_000, 2_000, 4_000)] == [0.2, 0.4, 0.8]
+    assert [hz for hz, row in control.items() if row.configured] == [1_000]
+    assert [hz for hz, row in control.items() if not row.holds] == [4_000]
+    assert "4000     80%  no" in outcome.text
+    assert "*" in outcome.text
+
+
+def test_inference_is_held_where_a_plan_fits_beside_the_ticks():
+    # half as much of both in the middle: 900 us for a plan; and a seventh of the processor gone besides
+    assert all(row.holds for row in by_rate(measured(plan_us=500.0), "inference").values())
+    slow = by_rate(measured(plan_us=650.0), "inference")
+    assert not slow[83].holds
+    assert slow[83].used == pytest.approx(0.75)
+    assert set(slow) == {83, 125, 250, 500, 1_000}
+
+
+def test_what_to_change_is_what_is_fullest():
+    late = by_rate(measured(late_us=900.0), "control")[1_000]
+    assert "kernel" in late.change
+    slow = by_rate(measured(step_us=450.0), "control")[1_000]
+    assert "compile" in slow.change
+    assert "faster processor" in by_rate(measured(step_us=450.0, build="compiled"), "control")[1_000].change
+    assert all(bool(row.change) != row.holds for row in headroom.rates(REALTIME, measured(late_us=900.0)))
+
+
+@pytest.mark.parametrize(
+    ("found", "name", "verdict"),
+    [
+        (measured(late_us=300.0), "bare timer", "warn"),
+        (measured(missed=0.01), "bare timer", "warn"),
+        (measured(steal=0.05), "others", "warn"),
+        (measured(waited=0.5), "others", "warn"),
+        (measured(waited=0.02, steal=0.001), "others", "ok"),
+        (measured(step_us=400.0), "control rate", "warn"),
+        (measured(step_us=600.0), "control rate", "fail"),
+        (measured(plan_us=2_000.0), "inference rate", "fail"),
+    ],
+)
+def test_each_trouble_that_was_measured_is_a_finding(good, found, name, verdict):
+    finding = {finding.name: finding for finding in checks.examine_headroom(REALTIME, found)}[name]
+    assert finding.verdict == verdict
+    assert bool(finding.remedy) == (verdict != "ok")
+    assert doctor(REALTIME, good, found).exit_code == (1 if verdict == "fail" else 0)
+
+
+def test_what_others_took_is_the_difference_of_two_looks(good):
+    write(good, "proc/stat", "cpu  100 0 0 800 0 0 0 100 0 0\ncpu0 1 2\n")
+    write(good, "proc/pressure/cpu", "some avg10=0.28 avg60=0.49 avg300=2.26 total=1000000\nfull avg10=0.0 total=7\n")
+    before = Machine(good).taken()
+    write(good, "proc/stat", "cpu  150 0 0 1700 0 0 0 150 30 30\ncpu0 1 2\n")
+    write(good, "proc/pressure/cpu", "some avg10=0.28 avg60=0.49 avg300=2.26 total=1500000\n")
+    assert headroom.shares(before, Machine(good).taken(), 5.0) == (pytest.approx(0.05), pytest.approx(0.1))
+    (good / "proc/pressure/cpu").unlink()
+    assert headroom.shares(before, Machine(good).taken(), 5.0)[1] is None
+
+
+def test_what_cannot_be_measured_says_why(tmp_path, capsys):
+    path = tmp_path / "unfit.toml"
+    path.write_text('scene = "nowhere"\n')
+    assert main(["--config", str(path), "--json", "doctor", "--measure"]) == 1
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert error["code"] == "not_measured"
+    assert "nowhere" in error["message"]

@@ -2,6 +2,9 @@
 
 import asyncio
 import os
+import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -66,3 +69,23 @@ def test_a_timer_that_is_held_up_says_for_how_long():
 
     assert asyncio.run(beats())[3] >= 20
     assert Stall(1.0, 1.25).length_ms == pytest.approx(250.0)
+
+
+def test_processor_time_is_that_of_the_whole_family():
+    spins = "import time; end = time.process_time() + 0.2\nwhile time.process_time() < end: pass"
+    child = spins + "\ntime.sleep(60)"
+    nested = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
+    with subprocess.Popen([sys.executable, "-c", nested]) as parent:
+        try:
+            while host.processor_s(parent.pid) < 0.2:  # none of it is the parent's own
+                time.sleep(0.01)
+            own = [
+                int(field) for field in Path(f"/proc/{parent.pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+            ]
+            assert sum(own) / os.sysconf("SC_CLK_TCK") < 0.2
+        finally:
+            for number in Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split():
+                os.kill(int(number), signal.SIGKILL)
+            parent.kill()
+    with pytest.raises(OSError, match="No such"):
+        host.processor_s(2**22 + 1)

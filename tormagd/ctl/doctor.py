@@ -1,7 +1,8 @@
 """`tormagctl doctor`: what on this machine would hurt real time or access, each with its remedy.
 
-Each check is a small function of the machine (and the configuration) that returns one finding. None of them changes
-anything. A *fail* keeps tormagd from doing what it is configured to do; a *warn* costs timing.
+Each check is a small function of the machine (and the configuration) that returns one finding; with `--measure` some
+more judge what was measured (`headroom.py`). None of them changes anything. A *fail* keeps tormagd from doing what it
+is configured to do; a *warn* costs timing.
 """
 
 import os
@@ -14,6 +15,7 @@ from pathlib import Path
 import msgspec
 
 from tormagd.config import Config
+from tormagd.ctl.headroom import MOST_STOLEN, MOST_USED, MOST_WAITED, Headroom, Rate, rates
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import Colour, Exit, Outcome
 
@@ -23,6 +25,10 @@ MEMORY_TO_LOCK_BYTES = 1_000_000_000
 "What the daemon occupies with its models loaded and locked, rounded up."
 GOOD_CLOCKS = ("tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page", "riscv_clocksource", "timebase")
 FAST_LATENCY_MS = 1
+LATE_SHARE = 0.25
+"Of a control period: a bare timer that is later than this at p99 leaves the daemon too little of it."
+MISSED_SHARE = 0.001
+"Of its beats that a bare timer may miss."
 
 
 class Verdict(StrEnum):
@@ -42,20 +48,79 @@ class Finding(msgspec.Struct, frozen=True):
     remedy: str = ""
 
 
-def doctor(config: Config, root: Path = Path("/")) -> Outcome:
-    """Run every check. The exit code is REFUSED where one failed."""
+def doctor(config: Config, root: Path = Path("/"), found: Headroom | None = None) -> Outcome:
+    """Run every check, those of what was measured too. The exit code is REFUSED where one failed."""
     findings = examine(config, Machine(root))
+    if found is not None:
+        findings += examine_headroom(config, found)
     count = {verdict: sum(finding.verdict is verdict for finding in findings) for verdict in Verdict}
     result = {
         "checks": [msgspec.to_builtins(finding) for finding in findings],
         **{str(verdict): number for verdict, number in count.items()},
     }
-    return Outcome(result, _text(findings), Exit.REFUSED if count[Verdict.FAIL] else Exit.DONE)
+    text = _text(findings)
+    if found is not None:
+        table = tuple(rates(config, found))
+        result["measured"] = msgspec.to_builtins(found) | {"rates": [msgspec.to_builtins(row) for row in table]}
+        text += "\n" + _table(table)
+    return Outcome(result, text, Exit.REFUSED if count[Verdict.FAIL] else Exit.DONE)
 
 
 def examine(config: Config, machine: Machine) -> tuple[Finding, ...]:
     """Every check's finding, in the order of the report."""
     return tuple(check(config, machine) for check in CHECKS)
+
+
+def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
+    """What was measured, as findings: what the machine gives, what the core takes, and whether it holds its rates."""
+    held = {row.loop: row for row in rates(config, found) if row.configured}
+    return (
+        bare_timer(found),
+        others(found),
+        core(found),
+        *(configured_rate(held[loop]) for loop in ("control", "inference")),
+    )
+
+
+def bare_timer(found: Headroom) -> Finding:
+    """How late a thread is woken that asks for nothing else."""
+    late_us, rate_hz = found.bare.lateness_us, found.bare.rate_hz
+    text = (
+        f"late p50 {late_us.p50:.0f} p99 {late_us.p99:.0f} p99.9 {late_us.p999:.0f} us, "
+        f"{found.bare.missed_share:.2%} of the beats missed at {rate_hz} Hz"
+    )
+    if late_us.p99 <= LATE_SHARE * 1e6 / rate_hz and found.bare.missed_share <= MISSED_SHARE:
+        return Finding("bare timer", Verdict.OK, text)
+    remedy = "heed the lines above; on a virtual machine also realtime.keep_awake = true, and processors of its own"
+    return Finding("bare timer", Verdict.WARN, text, remedy)
+
+
+def others(found: Headroom) -> Finding:
+    """What a hypervisor and other programs took meanwhile, by the kernel's word."""
+    waited = "not known to this kernel" if found.waited is None else f"{found.waited:.0%} of the time"
+    text = f"stolen {found.steal:.1%}; something waited for a processor: {waited}"
+    if found.steal > MOST_STOLEN:
+        return Finding("others", Verdict.WARN, text, "ask whoever runs the host for processors that are not shared")
+    if found.waited is not None and found.waited > MOST_WAITED:
+        return Finding("others", Verdict.WARN, text, "stop what else runs here; top shows it")
+    return Finding("others", Verdict.OK, text)
+
+
+def core(found: Headroom) -> Finding:
+    """What the core itself takes of a processor."""
+    step, plan = found.step_us, found.plan_us
+    text = (
+        f"{found.build}: a step p50 {step.p50:.0f} p99 {step.p99:.0f} us, a plan p50 {plan.p50:.0f} "
+        f"p99 {plan.p99:.0f} us; reference loop {found.machine_us:.0f} us"
+    )
+    return Finding("core", Verdict.OK, text)
+
+
+def configured_rate(row: Rate) -> Finding:
+    """Whether one of the configured rates is held, and with margin."""
+    text = f"{row.hz} Hz takes {row.used:.0%} of what there is"
+    verdict = Verdict.OK if row.holds else Verdict.WARN if row.used <= 1.0 else Verdict.FAIL
+    return Finding(f"{row.loop} rate", verdict, text, row.change)
 
 
 def preemption(config: Config, machine: Machine) -> Finding:
@@ -277,12 +342,24 @@ CHECKS: tuple[Callable[[Config, Machine], Finding], ...] = (
 )
 
 
+def _table(table: tuple[Rate, ...]) -> str:
+    """The rates that this machine holds, a row each."""
+    lines = [
+        f"\nrates (at most {MOST_USED:.0%} used is held with margin; * is configured):",
+        "  loop          Hz    used  held  to hold it",
+    ]
+    for row in table:
+        mark, held = "*" if row.configured else " ", "yes" if row.holds else "no"
+        lines.append(f"{mark} {row.loop:<10}{row.hz:>6}{row.used:>8.0%}  {held:<4}  {row.change}".rstrip())
+    return "\n".join(lines)
+
+
 def _text(findings: tuple[Finding, ...]) -> str:
     colour = Colour(sys.stdout)
     paint = {Verdict.OK: colour.green, Verdict.WARN: colour.yellow, Verdict.FAIL: colour.red}
     lines = []
     for finding in findings:
-        lines.append(f"{paint[finding.verdict](f'{finding.verdict:<4}')}  {finding.name:<13}  {finding.found}")
+        lines.append(f"{paint[finding.verdict](f'{finding.verdict:<4}')}  {finding.name:<14}  {finding.found}")
         if finding.remedy:
-            lines.append(f"{'':19}  next: {finding.remedy}")
+            lines.append(f"{'':20}  next: {finding.remedy}")
     return "\n".join(lines)

@@ -4,6 +4,19 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
+
+
+class Taken(NamedTuple):
+    """The kernel's counters of what others took; the difference of two says it of the time between them.
+
+    `stolen` of `ticks` the hypervisor gave to others; for `waited_us` something was ready to run and had no processor,
+    None where this kernel does not say.
+    """
+
+    stolen: int
+    ticks: int
+    waited_us: int | None
 
 
 class Machine:
@@ -46,6 +59,13 @@ class Machine:
         ranges = (self.text("/sys/devices/system/cpu/online") or "0").split(",")
         bounds = [re.findall(r"\d+", part) for part in ranges]
         return sum(int(b[-1]) - int(b[0]) + 1 for b in bounds if b) or 1
+
+    def taken(self) -> Taken:
+        """The counters now (proc_stat(5), Documentation/accounting/psi); zeros where there is no such file."""
+        first = (self.text("/proc/stat") or "").split("\n", 1)[0]
+        fields = [int(field) for field in first.split()[1:9]]  # beyond: guests, who are counted as users already
+        some = re.search(r"^some .*total=(\d+)$", self.text("/proc/pressure/cpu") or "", re.MULTILINE)
+        return Taken(fields[7] if len(fields) == 8 else 0, sum(fields), int(some[1]) if some else None)
 
     def resolved(self, absolute: str) -> str:
         """The path that `absolute` leads to, following symbolic links inside the root."""

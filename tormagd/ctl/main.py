@@ -72,9 +72,7 @@ def _run(options: argparse.Namespace) -> Outcome:
         case "calibrate":
             return _calibrate(options, config, endpoints)
         case "doctor":
-            from tormagd.ctl.doctor import doctor
-
-            return doctor(config)
+            return _doctor(options, config)
         case "ports":
             from tormagd.ctl.ports import ports
 
@@ -130,6 +128,15 @@ def _send(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
         )
     stream = Stream(options.rate, options.source, options.valid_for_ms, preview)
     return send(endpoints.setpoint, waveform, duration_s, stream, options.wait)
+
+
+def _doctor(options: argparse.Namespace, config: Config) -> Outcome:
+    from tormagd.ctl.doctor import doctor
+    from tormagd.ctl.headroom import measure
+    from tormagd.ctl.machine import Machine
+
+    root = Path("/")
+    return doctor(config, root, measure(options.config, Machine(root)) if options.measure else None)
 
 
 def _calibrate(options: argparse.Namespace, config: Config, endpoints: Endpoints) -> Outcome:
@@ -254,7 +261,8 @@ def _parser() -> argparse.ArgumentParser:
     scene = command("scene", "list the scenes, or show one (default: the configuration's)")
     scene.add_argument("action", choices=("list", "show"))
     scene.add_argument("name", nargs="?", metavar="NAME")
-    command("doctor", "what on this machine would hurt real time or access, each with its remedy")
+    doctor = command("doctor", "what on this machine would hurt real time or access, each with its remedy")
+    doctor.add_argument("--measure", action="store_true", help="also which rates it holds, measured in about 6 s")
     return parser
 
 

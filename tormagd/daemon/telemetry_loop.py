@@ -190,7 +190,7 @@ class TelemetryLoop:
             rates={group.name: group.report for group in self._groups},
             late_ticks_by=dict(self._callbacks.blamed),
             fault_details=self._causes.of_faults(safety.faults),
-            limit_details=self._causes.of_limits(newest.limits, replaced),
+            limit_details=self._causes.of_limits(newest.limits, outside),
             newest_stall=self._causes.newest_stall(),
             not_granted=self._not_granted,
         )

@@ -1,0 +1,49 @@
+"""The closed loop of one build of one checkout, run in stretches as they are asked for on the standard input.
+
+`benchmark virtual-time` starts one for everything that it compares, and lets them take turns. The tools and the package
+are those of PYTHONPATH, maybe of an older checkout: of these nothing is used but how it makes its two loops.
+"""
+
+import gc
+import importlib
+import json
+import sys
+import time
+from pathlib import Path
+
+import benchmark_virtual_time
+
+from tormagd import closed_loop
+from tormagd.config import Config
+
+
+def main() -> int:
+    """Answers each name of a loop and number of ticks with the processor time of a tick, us, until the input ends."""
+    plant = sys.argv[1]
+    runs = {
+        "whole_core": benchmark_virtual_time.force_loop(Config(), plant),
+        "position_loop": benchmark_virtual_time.gap_loop(Config(), plant),
+    }
+    gc.collect()
+    gc.freeze()  # what was imported is no garbage; a daemon does the same
+    # by a module of it: an empty folder of the package's name would pass for the package itself
+    package = Path(str(closed_loop.__file__)).parent
+    print(json.dumps({"compiled": compiled(), "package": str(package)}), flush=True)
+    for line in sys.stdin:
+        name, ticks = line.split()
+        started_s = time.thread_time()
+        runs[name](int(ticks))
+        print((time.thread_time() - started_s) / int(ticks) * 1e6, flush=True)
+    return 0
+
+
+def compiled() -> bool:
+    """Whether the core that was imported is a compiled one; checkouts from before there was any have no `build`."""
+    try:
+        return bool(importlib.import_module("tormagd.build").compiled())
+    except ModuleNotFoundError:
+        return False
+
+
+if __name__ == "__main__":
+    sys.exit(main())

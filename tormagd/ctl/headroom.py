@@ -1,0 +1,131 @@
+"""`tormagctl doctor --measure`: which control and inference rates this machine holds with margin.
+
+The measuring is `python -m tormagd.headroom`, a process of its own that needs neither daemon nor device; here its
+figures are judged. What the kernel says meanwhile of steal and of processes that waited stands beside them.
+"""
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from tormagd.config import LEAST_INFERENCE_HZ, Config
+from tormagd.ctl.machine import Machine, Taken
+from tormagd.ctl.outcome import CommandError, Exit
+
+LONGEST_S = 120.0
+"It takes 6 s on an idle machine, half of them to load the libraries."
+RATES_HZ = (LEAST_INFERENCE_HZ, 125, 250, 500, 1_000, 2_000, 4_000)
+TICK_OVER_STEP = 1.25
+"What a control tick takes over its step alone: the link and the write besides. Measured on the interpreted daemon."
+PERIOD_OVER_STEP = 3.5
+"What a period takes of the processor over the step, plans apart: reading, record, telemetry, ZeroMQ. Measured alike."
+MOST_USED = 0.7
+"Of a period, or of a processor. What is left is for clients that ask, and for hours when the machine gives less."
+MOST_STOLEN, MOST_WAITED = 0.01, 0.1
+"Shares of the time above which what others take is worth a warning."
+COMPILE = "compile the core: a C compiler and Python's headers, then install tormagd again"
+
+
+class Quantiles(msgspec.Struct, frozen=True):
+    """Of a duration, us."""
+
+    mean: float
+    p50: float
+    p99: float
+    p999: float
+    max: float
+
+
+class Bare(msgspec.Struct, frozen=True):
+    """The bare timer's lateness at the configured control rate, and the share of beats that it missed."""
+
+    rate_hz: int
+    lateness_us: Quantiles
+    missed_share: float
+    not_granted: tuple[str, ...]
+
+
+class Headroom(msgspec.Struct, frozen=True):
+    """What `python -m tormagd.headroom` prints, and what the kernel counted while it ran, as shares of the time."""
+
+    machine_us: float
+    build: str
+    step_us: Quantiles
+    plan_us: Quantiles
+    bare: Bare
+    steal: float = 0.0
+    waited: float | None = None
+
+
+class Rate(msgspec.Struct, frozen=True):
+    """One rate of one loop beside the other loop's configured one: `used` is the share of a period, or of a processor,
+    whichever is fuller; where it is not held, `change` says what to change."""
+
+    loop: str
+    hz: int
+    configured: bool
+    used: float
+    holds: bool
+    change: str
+
+
+def measure(path: Path | None, machine: Machine) -> Headroom:
+    """Measures for the configuration in `path`. Raises CommandError where that cannot be done."""
+    command = [sys.executable, "-P", "-m", "tormagd.headroom", *(["--config", str(path)] if path else [])]
+    before, started_s = machine.taken(), time.monotonic()
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise _failed(f"not done after {LONGEST_S:g} s") from error
+    took_s = time.monotonic() - started_s
+    if done.returncode:
+        raise _failed((done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1])
+    found = msgspec.json.decode(done.stdout, type=Headroom)
+    steal, waited = shares(before, machine.taken(), took_s)
+    return msgspec.structs.replace(found, steal=steal, waited=waited)
+
+
+def shares(before: Taken, after: Taken, took_s: float) -> tuple[float, float | None]:
+    """What was stolen, and for how much of the time something waited for a processor."""
+    steal = (after.stolen - before.stolen) / max(after.ticks - before.ticks, 1)
+    if before.waited_us is None or after.waited_us is None:
+        return steal, None
+    return steal, min((after.waited_us - before.waited_us) * 1e-6 / took_s, 1.0)
+
+
+def rates(config: Config, found: Headroom) -> Iterator[Rate]:
+    """Every rate that the configuration could name, both loops, the configured ones among them."""
+    control_hz, inference_hz = config.rates.control_hz, config.rates.inference_hz
+    for hz in sorted({*RATES_HZ, control_hz}):
+        yield _judged("control", hz, hz == control_hz, found, hz, min(inference_hz, hz))
+    for hz in sorted({rate for rate in RATES_HZ if rate <= control_hz} | {inference_hz}):
+        yield _judged("inference", hz, hz == inference_hz, found, control_hz, hz)
+
+
+def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: int, inference_hz: int) -> Rate:
+    """A control tick has to be done in its period however late it is woken, a plan in what the tick leaves; and
+    all of it is one thread."""
+    late_us, step, plan = found.bare.lateness_us, found.step_us, found.plan_us
+    period = 1e-6 * control_hz
+    if loop == "control":
+        in_time = (late_us.p99 + TICK_OVER_STEP * step.p99) * period
+    else:
+        in_time = (late_us.p50 + TICK_OVER_STEP * step.p50 + plan.p50) * period
+    busy = PERIOD_OVER_STEP * step.mean * period + plan.mean * 1e-6 * inference_hz
+    used = max(in_time, busy)
+    change = ""
+    if used > MOST_USED:
+        lateness_is_most = loop == "control" and late_us.p99 > TICK_OVER_STEP * step.p99 and in_time > busy
+        if lateness_is_most:
+            change = "the kernel wakes too late: the checks of real time above, fewer programs beside it"
+        else:
+            change = COMPILE if found.build == "interpreted" else f"a faster processor, or less than {hz} Hz"
+    return Rate(loop, hz, configured, round(used, 3), used <= MOST_USED, change)
+
+
+def _failed(reason: str) -> CommandError:
+    return CommandError(Exit.REFUSED, "not_measured", f"this machine could not be measured: {reason}", "try it again")

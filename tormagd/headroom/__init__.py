@@ -1,0 +1,1 @@
+"""What this machine holds, measured: a reference loop, a bare timer, the core's own cost. No daemon and no device."""

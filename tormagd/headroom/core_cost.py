@@ -1,0 +1,80 @@
+"""What `plan` and `step` cost on this machine: the scene in virtual time, then both once more, each call timed.
+
+Both are pure, so that what they were given in the closed loop can be given to them again without plant and protocol,
+and in the control period's own pace: a processor that sleeps between two ticks finds its caches colder than one that
+does not, and the same step takes two or three times as long. Processor time: what others take of the machine is the
+bare timer's to say.
+"""
+
+import asyncio
+import math
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+from tormagd.closed_loop import ClosedLoop
+from tormagd.config import Config
+from tormagd.control.core import Core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.daemon.heartbeat import Heartbeat
+from tormagd.headroom.bare_timer import NS, beat
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import load_plant
+
+PLANT = "sample_1"
+SWING_SHARE, PULSE_HZ = 0.2, 1.2
+"The force asked for: the middle of what the scene asks, and a share of it up and down, as often as a heart beats."
+
+Call = Callable[[], object]
+
+
+class CoreCost(NamedTuple):
+    """Processor time of each call, us."""
+
+    step_us: list[float]
+    plan_us: list[float]
+
+
+def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[Call]]:
+    """Each step and each plan of an armed device that renders a pulse, to be called again."""
+    planner, stepper = core.planner, core.stepper
+    period_s = 1.0 / config.rates.control_hz
+    loop = ClosedLoop(config, stepper, planner, VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
+    loop.arm()
+    force = core.scene.force
+    middle_N = 0.5 * (force.least_N + force.most_N)
+    steps: list[Call] = []
+    plans: list[Call] = []
+    for _ in range(round(seconds / period_s)):
+        now_s = loop.now_s + period_s
+        force_N = middle_N * (1.0 + SWING_SHARE * math.sin(math.tau * PULSE_HZ * now_s))
+        setpoint = TimedSetpoint(force_N, now_s, 0.1)  # a new one for every tick, so that every tick plans
+        before, planned = loop.step_state, loop.plan_state
+        sample = loop.tick(setpoint)
+        assert planned is not None, "a loop with a planner has planned"
+        steps.append(partial(stepper.step, before, now_s, loop.measurement, sample.plan))
+        plans.append(partial(planner.plan, planned, now_s, setpoint, loop.step_state.estimate))
+    return steps, plans
+
+
+async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> CoreCost:
+    """Makes one call of each kind a beat, until all are made. The thread's scheduling has been asked for before."""
+    found = CoreCost([], [])
+    ended = asyncio.Event()
+
+    def on_beat(_heartbeat: Heartbeat, _beats: int, _now_ns: int) -> None:
+        number = len(found.step_us)
+        if number == len(steps):
+            ended.set()
+            return
+        start_ns = time.thread_time_ns()
+        steps[number]()
+        stepped_ns = time.thread_time_ns()
+        plans[number]()
+        found.step_us.append((stepped_ns - start_ns) * 1e-3)
+        found.plan_us.append((time.thread_time_ns() - stepped_ns) * 1e-3)
+
+    await beat(NS // rate_hz, on_beat, ended)
+    return found
