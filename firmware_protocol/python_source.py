@@ -159,7 +159,7 @@ def _wire_module(schema: Schema) -> str:
         f"{_import('layouts', sorted(['Message', *(message.name for message in schema.messages)]))}\n"
         "_BYTES: Final = tuple([bytes((byte,)) for byte in range(256)])\n"
         f"{_ROUNDING}\n"
-        "# the member of a step; an enumeration's own look-up takes five times as long; steps are range-checked before\n"
+        "# the member of a step; an enumeration's own look-up takes five times as long; steps were range-checked\n"
         f"{members}\n{packs}"
     )
     functions = [text for message in schema.messages for text in (_pack(message), _unpack(message))]

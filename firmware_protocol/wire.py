@@ -18,7 +18,7 @@ _HALVES: Final = 1.5 * 2.0**52
 # So adding and subtracting this is `round`, for all that is under 2**51 either way; what is over stays over.
 _WHOLE: Final = 2.0**51
 
-# the member of a step; an enumeration's own look-up takes five times as long; steps are range-checked before
+# the member of a step; an enumeration's own look-up takes five times as long; steps were range-checked
 _DRIVE_MODE: Final = tuple(DriveMode)
 _DEVICE_MODE: Final = tuple(DeviceMode)
 _SWITCHES: Final = cache(Switches)
