@@ -13,15 +13,16 @@ from firmware_protocol.dbc import MessageSource, Schema, SignalSource
 LINE_WIDTH: Final = 120
 TEXT_WIDTH: Final = 110
 
-_WIRE_HEAD: Final = '''"""Payload bytes of each message and back. Generated from tormag.dbc; to change it, see `generate.py`.
+_WIRE_HEAD: Final = '''\
+"""Payload bytes of each message and back. Generated from tormag.dbc; to change it, see `generate.py`.
 
 Whatever does not fit is None here, or an error of Python's where it is not even a number. `codec` says what was wrong.
 """
 
 '''
 _ROUNDING: Final = """_HALVES: Final = 1.5 * 2.0**52
-\"\"\"Between 2**52 and 2**53 floats are the whole numbers, and a sum goes to the nearest, of two as near to the even one.
-So adding and subtracting this is `round`, for all that is under 2**51 either way; what is over stays over.\"\"\"
+# Between 2**52 and 2**53 floats are the whole numbers, and a sum goes to the nearest, of two as near to the even one.
+# So adding and subtracting this is `round`, for all that is under 2**51 either way; what is over stays over.
 _WHOLE: Final = 2.0**51
 """
 
@@ -158,7 +159,7 @@ def _wire_module(schema: Schema) -> str:
         f"{_import('layouts', sorted(['Message', *(message.name for message in schema.messages)]))}\n"
         "_BYTES: Final = tuple([bytes((byte,)) for byte in range(256)])\n"
         f"{_ROUNDING}\n"
-        "# the member of a step; an enumeration's own look-up takes five times as long, and steps are range-checked before\n"
+        "# the member of a step; an enumeration's own look-up takes five times as long; steps were range-checked\n"
         f"{members}\n{packs}"
     )
     functions = [text for message in schema.messages for text in (_pack(message), _unpack(message))]
@@ -268,7 +269,8 @@ def _dispatch(schema: Schema) -> str:
         f"    if function == {m.function}:\n        return unpack_{m.name.lower()}(data)\n" for m in schema.messages
     )
     return (
-        'def pack(message: Message) -> bytes | None:\n    """The payload of a message; None where a value does not fit."""\n'
+        "def pack(message: Message) -> bytes | None:\n"
+        '    """The payload of a message; None where a value does not fit."""\n'
         f"{packs}    return None\n\n\n"
         "def unpack(function: int, data: bytes) -> Message | None:\n"
         '    """The message in a payload; None for bytes that are none."""\n'

@@ -14,11 +14,11 @@ from firmware_protocol.layouts import Clear, Drive, Hello, Home, Identity, Messa
 
 _BYTES: Final = tuple([bytes((byte,)) for byte in range(256)])
 _HALVES: Final = 1.5 * 2.0**52
-"""Between 2**52 and 2**53 floats are the whole numbers, and a sum goes to the nearest, of two as near to the even one.
-So adding and subtracting this is `round`, for all that is under 2**51 either way; what is over stays over."""
+# Between 2**52 and 2**53 floats are the whole numbers, and a sum goes to the nearest, of two as near to the even one.
+# So adding and subtracting this is `round`, for all that is under 2**51 either way; what is over stays over.
 _WHOLE: Final = 2.0**51
 
-# the member of a step; an enumeration's own look-up takes five times as long, and steps are range-checked before
+# the member of a step; an enumeration's own look-up takes five times as long; steps were range-checked
 _DRIVE_MODE: Final = tuple(DriveMode)
 _DEVICE_MODE: Final = tuple(DeviceMode)
 _SWITCHES: Final = cache(Switches)

@@ -80,7 +80,8 @@ class DeviceLink:
 
     __slots__ = (
         "_acknowledged", "_asked_s", "_broken", "_counter", "_delay_s", "_device_time_s", "_handle_mm", "_heard_s",
-        "_hello_due_s", "_is_measured", "_least_delay_s", "_left_mm", "_measurement", "_nonce", "_number", "_received_s",
+        "_hello_due_s", "_is_measured", "_least_delay_s", "_left_mm", "_measurement", "_nonce", "_number",
+        "_received_s",
         "_request", "_request_due_s", "_requested_s", "_right_mm", "_sense", "_state", "_status", "cause", "clock",
         "identity", "repeated", "round_trip", "state",
     )  # fmt: skip

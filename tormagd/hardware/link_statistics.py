@@ -175,17 +175,17 @@ def _robust_line(windows: Windows) -> tuple[ClockFit, bool]:
     most_s = max(OUTLIER * 1.4826 * _median([abs(each_s - level_s) for each_s in levels_s]), CLOCK_STEP_S)
     on_line = [abs(each_s - level_s) <= most_s for each_s in levels_s]
     kept = list(compress(windows, on_line))
-    centre_s = sum(time_s for _, time_s in kept) / len(kept)
-    level_s = sum(offset_s for offset_s, _ in kept) / len(kept)
-    slope = sum((offset_s - level_s) * (time_s - centre_s) for offset_s, time_s in kept) / sum(
-        (time_s - centre_s) ** 2 for _, time_s in kept
+    centre_s = sum([time_s for _, time_s in kept], 0.0) / len(kept)
+    level_s = sum([offset_s for offset_s, _ in kept], 0.0) / len(kept)
+    slope = sum([(offset_s - level_s) * (time_s - centre_s) for offset_s, time_s in kept], 0.0) / sum(
+        [(time_s - centre_s) ** 2 for _, time_s in kept], 0.0
     )
     squares = [(offset_s - level_s - slope * (time_s - centre_s)) ** 2 for offset_s, time_s in kept]
     fit = ClockFit(
         offset_s=level_s + slope * (newest_s - centre_s),
         # host - device falls by the drift with every second of the host
         drift_ppm=-slope * 1e6,
-        residual_us=math.sqrt(sum(squares) / len(kept)) * 1e6,
+        residual_us=math.sqrt(sum(squares, 0.0) / len(kept)) * 1e6,
         windows=len(windows),
         outliers=len(windows) - len(kept),
     )
