@@ -82,8 +82,8 @@ class Network:
     """
 
     __slots__ = (
-        "bias", "cip", "constant_N", "displacement", "field", "field_half", "known", "magnitude_N", "middle_N", "output",
-        "output_half", "rate",
+        "bias", "cip", "constant_N", "displacement", "field", "field_half", "known", "magnitude_N", "middle_N",
+        "output", "output_half", "rate",
     )  # fmt: skip
 
     def __init__(
