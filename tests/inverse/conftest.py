@@ -4,9 +4,12 @@ import datetime
 
 import numpy as np
 import pytest
+import torch
 
 from tormagd.learning.features import UNITS, Element, Scaling
 from tormagd.learning.model_file import ForceModel, ModelMetadata
+
+torch.set_num_threads(1)  # a second thread costs more than it saves at this size, and waits for a busy processor
 
 RANGES = {
     "displacement_mm": (0.0, 1.0),

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from tormagd.inverse.bracketed import ACCURACY_MT, BracketedSearch, Refinement, brent, finer_grid, newton
+from tormagd.inverse.bracketed import BracketedSearch, Refinement, brent, finer_grid, newton
 from tormagd.inverse.closed_form import ClosedForm
 from tormagd.inverse.direct import DirectInverse
 from tormagd.inverse.kd_tree import KdTreeSearch
+from tormagd.inverse.newton import ACCURACY_MT
 from tormagd.inverse.solution import Reach
 from tormagd.learning.model_file import ForceModel
 from tormagd.physics.errors import DomainError

@@ -5,12 +5,10 @@ from typing import TypeAlias
 
 import numpy as np
 
+from tormagd.inverse.newton import ACCURACY_MT
 from tormagd.inverse.scan import FINEST_MT, Bracket, FieldScan
 from tormagd.inverse.solution import FieldSolution, answer
 from tormagd.learning.force_curve import ForceCurve
-
-ACCURACY_MT = 1e-3
-"""A step this small ends a refinement: a twentieth of what one encoder count of the gap (1/560 mm) changes at most."""
 
 MOST_STEPS = 40
 """Bisection alone needs 20 from 1000 mT to `ACCURACY_MT`; twice that is for steps that alternate with it."""

@@ -8,7 +8,7 @@ from tormagd.learning.force_curve import ForceCurve
 from tormagd.physics.errors import DomainError
 
 ACCURACY_MT: Final = 1e-3
-"""How near the curve's own root: a twentieth of what one encoder count of the gap (1/560 mm) changes at most."""
+"""How near the curve's own root a search comes: a twentieth of what one encoder count (1/560 mm) changes at most."""
 
 LOOKED_AT_MT: Final = 0.25 * ACCURACY_MT
 """A step that should end this near the root is taken for the last: only the force is looked at there, not the slope."""
@@ -83,8 +83,8 @@ class RisingSearch:
                 if bend_per_mT * step * step <= LOOKED_AT_MT:
                     there_N = curve.force_N(following)
                     evaluations += 1
-                    # where no more than a tenth of the excess is left the slope still holds, and tells how near it is
-                    allowed_N = min(ACCURACY_MT * slope, 0.1 * abs(excess_N))
+                    # with a tenth of the excess left, the slope may have changed by a third, and tells how near it is
+                    allowed_N = min(0.5 * ACCURACY_MT * slope, 0.1 * abs(excess_N))
                     if abs(there_N - force_N) <= max(allowed_N, same_N):
                         return answer(curve, following, force_N, there_N, evaluations, Reach.INSIDE)
             before, field = following - field, following

@@ -81,7 +81,10 @@ class Network:
     `weight` (h x 4, columns in the order of `FEATURES`), `bias` (h) and `output` (h) are finite.
     """
 
-    __slots__ = ("bias", "cip", "constant_N", "displacement", "field", "known", "magnitude_N", "output", "rate")
+    __slots__ = (
+        "bias", "cip", "constant_N", "displacement", "field", "field_half", "known", "magnitude_N", "middle_N",
+        "output", "output_half", "rate",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -102,6 +105,10 @@ class Network:
         outputs: list[float] = output.tolist()
         self.output: Final = outputs
         self.constant_N: Final = constant_N
+        # (1 + tanh(z / 2)) / 2 is the same sigmoid: NumPy's tanh takes many at once, and it cannot overflow
+        self.field_half: Final = weight[:, FIELD] / 2
+        self.output_half: Final = output / 2
+        self.middle_N: Final = constant_N + math.fsum(outputs) / 2
         self.magnitude_N: Final = math.fsum([abs(value) for value in outputs]) + abs(constant_N)
         self.known: Final = known
 
@@ -165,12 +172,10 @@ class NetworkCurve:
     def forces_N(self, fields_mT: Floats) -> Floats:
         """See `ForceCurve.forces_N`."""
         network, kind = self._network, fields_mT.dtype
-        # (1 + tanh(z / 2)) / 2 is the same sigmoid: NumPy's tanh takes many at once, and it cannot overflow
-        hidden = np.multiply.outer(fields_mT, np.array(network.field, dtype=kind) / -2)
+        hidden = np.multiply.outer(fields_mT, network.field_half.astype(kind, copy=False))
         hidden -= np.array(self._shift, dtype=kind) / 2
-        output = np.array(network.output, dtype=kind) / 2
-        forces: Floats = np.tanh(hidden, hidden).dot(output)
-        forces += kind.type(network.constant_N + math.fsum(network.output) / 2)
+        forces: Floats = np.tanh(hidden, hidden).dot(network.output_half.astype(kind, copy=False))
+        forces += kind.type(network.middle_N)
         return forces
 
     def confidence(self, field_mT: float, error_N: float) -> float:
