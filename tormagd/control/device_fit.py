@@ -17,7 +17,8 @@ SCALE_SD: Final = 0.17
 LEAST_SCALE: Final = 0.64
 MOST_SCALE: Final = 1.53
 "All three at their ends, and the field's exponent at its own, -1.34 and -1.26: no believable device is beyond."
-RELAXES: Final = (0.1, 0.21)
+RELAXES_LEAST: Final = 0.1
+RELAXES_MOST: Final = 0.21
 "The least and the greatest share of its force that an elastomer loses in the course of hours."
 OFFSET_SD_N: Final = 0.1
 "Of the offset: what relaxation and hysteresis do around 0.5 N."

@@ -9,7 +9,16 @@ import math
 from typing import Final, final
 
 from firmware_protocol.value import Value
-from tormagd.control.device_fit import LEAST_SCALE, MOST_SCALE, RELAXES, SURE, UNSEEN, DeviceFit, observe
+from tormagd.control.device_fit import (
+    LEAST_SCALE,
+    MOST_SCALE,
+    RELAXES_LEAST,
+    RELAXES_MOST,
+    SURE,
+    UNSEEN,
+    DeviceFit,
+    observe,
+)
 
 NOISE_N: Final = 0.03
 "What noise, and the model's own error, leave of a mean over FILTER_S."
@@ -159,8 +168,8 @@ def _is_strange(past: Past, model_N: float, rate_mm_s: float) -> bool:
     if past.still_s > FROZEN_S:
         return True
     most_loaded_N, least_loaded_N = max(model_N, past.loaded_N), min(model_N, past.loaded_N)
-    weakest_N = LEAST_SCALE * (model_N - RELAXES[1] * most_loaded_N) - NOISE_N
-    strongest_N = MOST_SCALE * (model_N - RELAXES[0] * least_loaded_N) + NOISE_N
+    weakest_N = LEAST_SCALE * (model_N - RELAXES_MOST * most_loaded_N) - NOISE_N
+    strongest_N = MOST_SCALE * (model_N - RELAXES_LEAST * least_loaded_N) + NOISE_N
     if not weakest_N <= past.measured_N <= strongest_N:
         return True
     (before_N, before_mm_s), (kept_N, kept_mm_s) = past.before_at, past.kept_at
@@ -174,5 +183,5 @@ def _is_strange(past: Past, model_N: float, rate_mm_s: float) -> bool:
         return True
     slow = past.slow
     unsure_N = SURE * math.sqrt(slow.offset_variance_N2)
-    least_N = LEAST_OFFSET_N - RELAXES[1] * slow.scale * most_loaded_N
+    least_N = LEAST_OFFSET_N - RELAXES_MOST * slow.scale * most_loaded_N
     return slow.offset_N + unsure_N < least_N or slow.offset_N - unsure_N > MOST_OFFSET_N

@@ -39,14 +39,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _start(options: argparse.Namespace) -> int:
-    # here, not above: these take a second to load, and the signal has to be seen to first
-    import torch
+    # here, not above: these take a moment to load, and the signal has to be seen to first
     import uvloop
 
     from tormagd.control.core import build_core
     from tormagd.hardware.backend import choose
 
-    torch.set_num_threads(1)  # the loop has one core; a second thread would only wait for it
     try:
         config = load_config(options.config)
         core = build_core(config)

@@ -68,6 +68,6 @@ def priority_of_threads() -> int:
 
 
 def freeze_garbage() -> None:
-    """Takes what lives now out of the collector's reach: with torch loaded, a full collection takes 80 ms."""
+    """Takes what lives now out of the collector's reach: a full collection takes tens of milliseconds."""
     gc.collect()
     gc.freeze()

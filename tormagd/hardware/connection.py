@@ -165,7 +165,8 @@ class Connection:
 
     def close(self) -> None:
         """Closes the port for good."""
-        self._watcher, watcher = None, self._watcher
+        watcher = self._watcher
+        self._watcher = None
         if watcher is not None:
             self._release(watcher)
         self._waiting, self._cause, self._remedy = LinkState.CLOSED, "closed", ""
