@@ -1,0 +1,93 @@
+"""Which build of the core runs: compiled, or the very same files interpreted.
+
+Both give the same results to the bit. `pip install` compiles where a compiler and Python's headers are (setup.py), and
+leaves a record of what it compiled. Whoever edits a file after that runs what he wrote: a source that is not the one
+that was compiled makes all of the core interpreted, with a warning, because compiled modules know each other's insides.
+TORMAG_COMPILED=0 does the same for one process. `tormagd --version`, `status` and `doctor` say which build runs, and why.
+"""
+
+import hashlib
+import importlib.machinery
+import importlib.util
+import json
+import os
+import sys
+import sysconfig
+import warnings
+from collections.abc import Sequence
+from functools import cache
+from importlib.abc import MetaPathFinder
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+SWITCH = "TORMAG_COMPILED"
+_HERE = Path(__file__).parent
+REMEDY = "install it again (pip install, or make compile) where a C compiler and Python's headers are"
+
+
+class Build(NamedTuple):
+    """Whether the core is compiled; where it is not, why."""
+
+    is_compiled: bool
+    reason: str
+
+    def __str__(self) -> str:
+        return "compiled" if self.is_compiled else f"interpreted: {self.reason}"
+
+
+class FromSource(MetaPathFinder):
+    """Finds the sources of these modules, and not what was once compiled from them."""
+
+    def __init__(self, modules: frozenset[str]) -> None:
+        self._modules = modules
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        """See `MetaPathFinder.find_spec`."""
+        if fullname not in self._modules or path is None:
+            return None
+        sources = [Path(folder, fullname.rpartition(".")[2]).with_suffix(".py") for folder in path]
+        found = next((source for source in sources if source.is_file()), None)
+        return None if found is None else importlib.util.spec_from_file_location(fullname, found)
+
+
+def judged(root: Path, switch: str | None) -> tuple[Build, frozenset[str]]:
+    """The build of the packages in `root`, and the modules that there are two of. `switch` is TORMAG_COMPILED."""
+    try:
+        record = json.loads((root / "firmware_protocol" / "core.json").read_bytes())
+        sources: dict[str, str] = record["sources"]
+        suffix, lacking = record["python"], record["interpreted"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return Build(False, "it was not compiled"), frozenset()
+    modules = frozenset(source.removesuffix(".py").replace("/", ".") for source in sources)
+    if suffix != sysconfig.get_config_var("EXT_SUFFIX"):
+        return Build(False, f"it was compiled for another Python ({suffix})"), modules
+    if lacking:
+        return Build(False, lacking), modules
+    if switch == "0":
+        return Build(False, f"{SWITCH}=0"), modules
+    edited = [source for source, known in sources.items() if _digest(root / source) != known]
+    if edited:
+        more = f" and {len(edited) - 1} more" if len(edited) > 1 else ""
+        return Build(False, f"{edited[0]}{more} changed since the core was compiled"), modules
+    return Build(True, ""), modules
+
+
+def _digest(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return ""
+
+
+@cache
+def settle() -> Build:
+    """The build that this process runs; the first call makes it so, before anything of the core is imported."""
+    build, modules = judged(_HERE.parent, os.environ.get(SWITCH))
+    if not build.is_compiled and modules:
+        sys.meta_path.insert(0, FromSource(modules))
+        if "changed since" in build.reason:
+            warnings.warn(f"the core runs {build}; {REMEDY}", RuntimeWarning, stacklevel=2)
+    return build

@@ -1,0 +1,117 @@
+"""The part of the build that pyproject.toml cannot say: the core is compiled where a compiler and Python's headers are.
+
+The very `.py` that people read are compiled by mypyc. Where that cannot be, they run as they are, with the same results
+to the bit and a fifth of the speed; `firmware_protocol/build.py` says which. TORMAG_COMPILE=require makes it an error
+not to compile, TORMAG_COMPILE=skip does not try.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import sys
+import sysconfig
+from pathlib import Path
+
+from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
+
+# the hot rooms, in the order data flows: whatever a tick or a plan runs, and the simulated device
+COMPILED = {
+    "firmware_protocol": ("value", "schema", "checksum", "layouts", "wire", "codec", "framing"),
+    "tormagd/physics": ("friction", "relaxation"),
+    "tormagd/learning": ("displacement", "force_curve"),
+    "tormagd/inverse": ("solution", "newton"),
+    "tormagd/hardware": ("frame_stream", "link", "link_statistics", "measurement", "connection"),
+    "tormagd/safety": ("operating_state",),
+    "tormagd/control": (
+        *("estimate", "device_fit", "sensor", "sight", "pid", "trajectory", "interpolation", "portrait"),
+        *("periodicity", "governor", "plan", "motor", "step", "conditions"),
+    ),
+    "tormagd/simulation": ("curve", "axis", "element", "hand", "plant", "motion", "firmware", "device"),
+    "tormagd": ("closed_loop",),
+}
+SOURCES = [f"{folder}/{name}.py" for folder, names in COMPILED.items() for name in names]
+GROUP = "firmware_protocol.core"
+"What all of it is linked into, so that calls between modules are calls between C functions."
+RECORD = Path("firmware_protocol/core.json")
+REQUIRE, SKIP, AUTO = "require", "skip", "auto"
+
+wanted = os.environ.get("TORMAG_COMPILE", AUTO)
+if wanted not in (REQUIRE, SKIP, AUTO):
+    raise SystemExit(f"TORMAG_COMPILE = {wanted!r}: allowed are {REQUIRE}, {SKIP} and {AUTO}")
+
+
+def missing() -> str:
+    """What a compiled core lacks here; empty where nothing does."""
+    if wanted == SKIP:
+        return "TORMAG_COMPILE=skip when it was installed"
+    compiler = os.environ.get("CC", sysconfig.get_config_var("CC") or "cc").split()[0]
+    if shutil.which(compiler) is None:
+        return f"no C compiler ({compiler}) when it was installed"
+    header = Path(sysconfig.get_path("include"), "Python.h")
+    if not header.is_file():
+        return f"no {header} when it was installed: the package is called python3-dev or python3-devel"
+    return ""
+
+
+class BuildCore(build_ext):
+    """Compiles, or records why not: an interpreter that could not be told would leave its user guessing."""
+
+    def run(self) -> None:
+        lacking = missing()
+        self.extensions = []
+        if not lacking:
+            try:
+                self._take(self._translated())
+                super().run()
+            except (Exception, SystemExit) as error:
+                if wanted == REQUIRE:
+                    raise
+                self.extensions = []
+                lacking = f"compiling failed when it was installed ({str(error)[:200]})"
+        elif wanted == REQUIRE:
+            raise SystemExit(f"TORMAG_COMPILE=require, but there is {lacking}")
+        if lacking:
+            print(f"the core stays interpreted: {lacking}", file=sys.stderr)
+        self._record(lacking)
+
+    def _take(self, extensions: list[Extension]) -> None:
+        """Goes on with these extensions as if they had been known from the beginning."""
+        where = self.build_lib, self.build_temp, self.inplace, self.editable_mode
+        self.distribution.ext_modules = extensions
+        self.initialize_options()
+        self.build_lib, self.build_temp, self.inplace, self.editable_mode = where
+        self.finalize_options()
+
+    def _translated(self) -> list[Extension]:
+        from mypyc.build import mypycify
+
+        Path(self.build_temp).mkdir(parents=True, exist_ok=True)
+        options = ["--config-file=", "--ignore-missing-imports", f"--cache-dir={self.build_temp}/mypy"]
+        extensions = mypycify(
+            [*options, *SOURCES], opt_level="1", debug_level="0", group_name=GROUP, target_dir=self.build_temp
+        )
+        for extension in extensions:
+            # a warning of another compiler is no reason to go without; and both builds round alike only without fusing
+            kept = [option for option in extension.extra_compile_args if option != "-Werror"]
+            extension.extra_compile_args = [*kept, "-ffp-contract=off"]
+        return extensions
+
+    def _record(self, lacking: str) -> None:
+        known = {"python": sysconfig.get_config_var("EXT_SUFFIX"), "interpreted": lacking, "sources": {}}
+        if not lacking:
+            known["sources"] = {source: hashlib.sha256(Path(source).read_bytes()).hexdigest() for source in SOURCES}
+        places = [RECORD] if self.inplace or self.editable_mode else []
+        if not self.editable_mode:
+            places.append(Path(self.build_lib, RECORD))
+        for place in places:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_text(json.dumps(known, indent=1) + "\n")
+
+
+setup(
+    cmdclass={"build_ext": BuildCore},
+    # a stand-in: what really is built is only known once the sources have been translated
+    ext_modules=[Extension(f"{GROUP}__mypyc", sources=[])],
+)
