@@ -26,14 +26,17 @@ fifth at 2 N besides."""
 
 @final
 class SlowFriction(Value):
-    """The device's force at a creep over what its fit says; the model's force as far as the bristles have followed it,
-    N; and where the handle was then, mm."""
+    """The device's force at a creep over what its fit says, and the share of that which was learned at a creep; the
+    model's force as far as the bristles have followed it, N; and where the handle was then, mm."""
 
-    __match_args__ = ("factor", "followed_N", "handle_mm")
+    __match_args__ = ("factor", "learned", "followed_N", "handle_mm")
     __slots__ = __match_args__
 
-    def __init__(self, factor: float = 1.0, followed_N: float = 0.0, handle_mm: float = 0.0) -> None:
+    def __init__(
+        self, factor: float = 1.0, learned: float = 0.0, followed_N: float = 0.0, handle_mm: float = 0.0
+    ) -> None:
         self.factor: Final = factor
+        self.learned: Final = learned
         self.followed_N: Final = followed_N
         self.handle_mm: Final = handle_mm
 
@@ -46,21 +49,23 @@ class SlowFriction(Value):
         rise_N = model_N - self.followed_N
         if rise_N > 0.0:
             rise_N *= 1.0 - math.exp(-abs(handle_mm - self.handle_mm) / REACH_MM)
-        return SlowFriction(self.factor, self.followed_N + rise_N, handle_mm)
+        return SlowFriction(self.factor, self.learned, self.followed_N + rise_N, handle_mm)
 
     def beside(self, before_N: float, after_N: float) -> "SlowFriction":
-        """Beside a fit that has learned to expect `after_N` where it expected `before_N`: the same force at a creep."""
-        if before_N == after_N or not (before_N > 0.0 and after_N > 0.0):
+        """Beside a fit that has learned to expect `after_N` where it expected `before_N`: the same force at a creep, as
+        far as that was learned there."""
+        if before_N == after_N or self.learned == 0.0 or not (before_N > 0.0 and after_N > 0.0):
             return self
-        factor = min(max(self.factor * before_N / after_N, LEAST), MOST)
-        return SlowFriction(factor, self.followed_N, self.handle_mm)
+        factor = min(max(self.factor * math.pow(before_N / after_N, self.learned), LEAST), MOST)
+        return SlowFriction(factor, self.learned, self.followed_N, self.handle_mm)
 
     def observed(self, expected_N: float, rate_mm_s: float, reading_N: float, elapsed_s: float) -> "SlowFriction":
         """After a reading along a motion at `rate_mm_s`, where the fit makes `expected_N` > 0 of what was followed."""
         slowness = _slowness(rate_mm_s)
         share = slowness * elapsed_s / (LEARNED_S + elapsed_s)
         found = self.factor + share * (1.0 + (reading_N / expected_N - 1.0) / slowness - self.factor)
-        return SlowFriction(min(max(found, LEAST), MOST), self.followed_N, self.handle_mm)
+        learned = self.learned + share * (1.0 - self.learned)
+        return SlowFriction(min(max(found, LEAST), MOST), learned, self.followed_N, self.handle_mm)
 
 
 def _slowness(rate_mm_s: float) -> float:
