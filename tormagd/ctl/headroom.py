@@ -123,7 +123,11 @@ def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: i
         if lateness_is_most:
             change = "the kernel wakes too late: the checks of real time above, fewer programs beside it"
         else:
-            change = f"compile the core: {REMEDY}" if found.build == "interpreted" else f"a faster processor, or less than {hz} Hz"
+            change = (
+                f"compile the core: {REMEDY}"
+                if found.build == "interpreted"
+                else f"a faster processor, or less than {hz} Hz"
+            )
     return Rate(loop, hz, configured, round(used, 3), used <= MOST_USED, change)
 
 
