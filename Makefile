@@ -7,7 +7,10 @@ WORKERS ?= auto
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: run test check format model reproduction evidence clean
+# which build of the core runs; where it is interpreted, why
+SAY_BUILD = $(BIN)/python -P -c 'from firmware_protocol.build import settle; print("the core runs", settle())'
+
+.PHONY: run test check format compile model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -26,6 +29,11 @@ check: $(VENV)/.dev
 format: $(VENV)/.dev
 	$(BIN)/python -P -m ruff check --fix .
 	$(BIN)/python -P -m ruff format .
+
+# after an edit of one of the compiled files; until then all of the core runs interpreted
+compile: | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable .
+	@$(SAY_BUILD)
 
 # the shipped model: a bench sweep recorded from the simulated device (sample 1), then training
 model: $(VENV)/.dev
@@ -49,10 +57,12 @@ clean:
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.demo: pyproject.toml | $(BIN)/python
+$(VENV)/.demo: pyproject.toml setup.py | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable '.[demo]'
+	@$(SAY_BUILD)
 	touch $@
 
-$(VENV)/.dev: pyproject.toml | $(BIN)/python
+$(VENV)/.dev: pyproject.toml setup.py | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@$(SAY_BUILD)
 	touch $@ $(VENV)/.demo

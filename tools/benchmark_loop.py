@@ -44,6 +44,7 @@ from tormagd.daemon.telemetry_loop import SERVED_BEFORE_NS
 from tormagd.headroom.bare_timer import beat
 from tormagd.messages import Request
 from tormagd.recording.ticks import decode_ticks
+from tormagd.simulation.device import DEFAULT_BAUD
 
 Array = npt.NDArray[np.float64]
 NOTHING: Array = np.array([])
@@ -92,7 +93,7 @@ class Stand(NamedTuple):
     realtime: RealTime
     control_hz: int = 1_000
     inference_hz: int = 1_000
-    baud: int = 1_000_000
+    baud: int = DEFAULT_BAUD
     setpoint_hz: int = SETPOINT_HZ
     root: Path | None = None
     device_fifo: int = 0
@@ -339,8 +340,10 @@ def write_config(folder: Path, port: str, stand: Stand) -> Path:
         f'{name} = "ipc://{folder}/{name}"\n' for name in ("setpoint", "telemetry", "control", "recording")
     )
     realtime = stand.realtime
+    # an older checkout knows no options, and only the other line's rate needs one
+    options = "" if stand.baud == DEFAULT_BAUD else f"[device.options]\nbaud = {stand.baud}\n"
     path.write_text(
-        f'scene = "coronary"\n[device]\nport = "{port}"\nbaud = {stand.baud}\n[endpoints]\n{sockets}'
+        f'scene = "coronary"\n[device]\nport = "{port}"\n{options}[endpoints]\n{sockets}'
         f"[rates]\ncontrol_hz = {stand.control_hz}\ninference_hz = {stand.inference_hz}\n"
         f"[realtime]\nfifo_priority = {realtime.fifo_priority}\nkeep_awake = {str(realtime.keep_awake).lower()}\n"
         f"cpus = {list(realtime.cpus)}\n"

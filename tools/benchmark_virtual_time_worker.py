@@ -5,7 +5,6 @@ are those of PYTHONPATH, maybe of an older checkout: of these nothing is used bu
 """
 
 import gc
-import importlib
 import json
 import sys
 import time
@@ -16,9 +15,12 @@ import benchmark_virtual_time
 from tormagd import closed_loop
 from tormagd.config import Config
 
+PROFILE = "profile"
+
 
 def main() -> int:
-    """Answers each name of a loop and number of ticks with the processor time of a tick, us, until the input ends."""
+    """Answers each name of a loop and number of ticks with the processor time of a tick, us, until the input ends; and
+    `profile` and a number of ticks with the whole core's profile."""
     plant = sys.argv[1]
     runs = {
         "whole_core": benchmark_virtual_time.force_loop(Config(), plant),
@@ -31,6 +33,9 @@ def main() -> int:
     print(json.dumps({"compiled": compiled(), "package": str(package)}), flush=True)
     for line in sys.stdin:
         name, ticks = line.split()
+        if name == PROFILE:
+            print(json.dumps(benchmark_virtual_time.profiled(runs["whole_core"], int(ticks))), flush=True)
+            continue
         started_s = time.thread_time()
         runs[name](int(ticks))
         print((time.thread_time() - started_s) / int(ticks) * 1e6, flush=True)
@@ -40,9 +45,10 @@ def main() -> int:
 def compiled() -> bool:
     """Whether the core that was imported is a compiled one; checkouts from before there was any have no `build`."""
     try:
-        return bool(importlib.import_module("tormagd.build").compiled())
+        from firmware_protocol.build import settle
     except ModuleNotFoundError:
         return False
+    return settle().is_compiled
 
 
 if __name__ == "__main__":

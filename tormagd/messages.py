@@ -229,6 +229,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     """The answer to the command `status`: the newest telemetry, and what is worth asking for."""
 
     version: str
+    build: str = ""
     scene: str
     uptime_s: float
     least_N: float

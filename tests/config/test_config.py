@@ -10,6 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from firmware_protocol.build import settle
+from tormagd import __version__
 from tormagd.config import LEAST_INFERENCE_HZ, Config, ConfigError, load_config
 from tormagd.daemon.main import main
 from tormagd.hardware.backend import ENTRY_POINTS, choose
@@ -305,7 +307,7 @@ def test_version_and_usage(capsys) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["--version"])
     assert ended.value.code == 0
-    assert capsys.readouterr().out.startswith("tormagd ")
+    assert capsys.readouterr().out.split() == ["tormagd", f"{__version__},", *str(settle()).split()]
     with pytest.raises(SystemExit) as ended:
         main(["--chekc"])
     assert ended.value.code == 2

@@ -77,6 +77,7 @@ def status(**changes: Any) -> dict[str, Any]:
         known
         | {
             "version": "0",
+            "build": "compiled",
             "scene": "pulse",
             "uptime_s": 5.0,
             "least_N": 0.6,

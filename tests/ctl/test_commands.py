@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from firmware_protocol.build import COST, REMEDY
 from tormagd.ctl.main import main
 from tormagd.ctl.outcome import Colour
 from tormagd.ctl.status import status_text
@@ -52,6 +53,27 @@ def test_a_status_without_a_key_names_it(fake_daemon, capsys):
     assert (code, printed["error"]["code"]) == (3, "unintelligible")
     assert "tormagd of an unknown version" in printed["error"]["message"]
     assert "missing required field" in printed["error"]["message"]
+
+
+@pytest.mark.parametrize(
+    ("build", "lines"),
+    [
+        ("compiled", ["core      compiled"]),
+        (
+            "interpreted: no C compiler",
+            ["core      interpreted: no C compiler", f"          {COST}", f"          next: {REMEDY}"],
+        ),
+        ("", []),
+    ],
+)
+def test_status_says_which_build_runs_and_what_an_interpreted_one_costs(fake_daemon, capsys, build, lines):
+    """An older daemon does not say, and nothing is made up for it."""
+    fake_daemon.says(build=build)
+    assert main(["--endpoint", fake_daemon.control, "status"]) == 0
+    shown = capsys.readouterr().out.splitlines()
+    at = shown.index(lines[0]) if lines else len(shown)
+    assert shown[at : at + len(lines)] == lines
+    assert sum(line.startswith("core") for line in shown) == bool(lines)
 
 
 def test_status_in_fault_exits_4_and_names_cause_and_remedy(fake_daemon, capsys):

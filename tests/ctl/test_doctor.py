@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from firmware_protocol.build import COST, REMEDY, Build
 from tormagd.config import Config, Device, Endpoints, RealTime
 from tormagd.ctl import doctor as checks
 from tormagd.ctl import headroom
@@ -25,8 +26,9 @@ def write(root: Path, path: str, text: str) -> None:
 
 
 @pytest.fixture
-def good(tmp_path: Path) -> Path:
+def good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A machine on which nothing is to be wished for."""
+    monkeypatch.setattr(checks, "settle", lambda: Build(True, ""))
     write(tmp_path, "proc/version", "Linux version 6.12 #1 SMP PREEMPT_RT Debian")
     write(tmp_path, "proc/self/limits", LIMITS.format(memlock="unlimited", rtprio="90"))
     write(tmp_path, "proc/self/status", "CapEff:\t0000000000000000\n")
@@ -86,6 +88,14 @@ def test_each_trouble_is_found_and_has_a_remedy(good, check, path, text, verdict
     assert finding.verdict == verdict
     assert found in finding.found
     assert bool(finding.remedy) == (verdict != "ok")
+
+
+def test_an_interpreted_core_is_a_warning_that_says_why_what_it_costs_and_what_to_do(good, monkeypatch):
+    assert checks.build(REALTIME, Machine(good)) == checks.Finding("build", Verdict.OK, "compiled")
+    monkeypatch.setattr(checks, "settle", lambda: Build(False, "no C compiler (cc) when it was installed"))
+    finding = checks.build(REALTIME, Machine(good))
+    assert finding.found == f"interpreted: no C compiler (cc) when it was installed; {COST}"
+    assert (finding.verdict, finding.remedy) == (Verdict.WARN, REMEDY)
 
 
 def test_the_preemption_model_in_force_is_read_where_root_may(good):

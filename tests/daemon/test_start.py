@@ -52,7 +52,8 @@ def test_what_is_slow_to_load_is_not_loaded_before_that():
     ("command", "module"),
     [
         ("tormagd", "tormagd.daemon.main"),
-        ("tormagd", "torch"),
+        ("tormagd", "uvloop"),
+        ("tormagd", "tormagd.control.plan"),
         ("tormagctl", "tormagd.ctl.main"),
         ("tormagctl", "tormagd.config"),
         ("simulation", "numpy"),

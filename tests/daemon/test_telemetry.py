@@ -9,7 +9,7 @@ import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.control.estimate import first_estimate
-from tormagd.control.plan import Plan, Replaced
+from tormagd.control.plan import Outside, Plan
 from tormagd.control.step import StepOutput, StepState
 from tormagd.control.trajectory import Reference
 from tormagd.daemon.telemetry import limits_held, snapshot, tick_record
@@ -134,7 +134,7 @@ def test_a_tick_is_recorded_whole() -> None:
         gap_acceleration_mm_s2=-7.5,
         foresight=0.75,
         least_gap_mm=31.0,
-        replaced=(Replaced("rate_mm_s", 1 / 3, 300.0),),
+        outside=(Outside("rate_mm_s", 1 / 3, 300.0),),
         sensor_doubted_s=0.0625,
     )
     estimate = first_estimate(measurement, 47.5)

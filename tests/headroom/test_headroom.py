@@ -2,11 +2,11 @@
 
 import asyncio
 import json
-import types
 
 import pytest
 import uvloop
 
+from firmware_protocol.build import Build
 from tormagd.config import Config, RealTime
 from tormagd.control.core import build_core
 from tormagd.headroom import __main__ as program
@@ -88,7 +88,6 @@ def test_a_configuration_that_does_not_fit_is_refused(tmp_path, capsys: pytest.C
 
 
 def test_the_build_is_what_the_package_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    for compiled, name in ((True, "compiled"), (False, "interpreted")):
-        made = types.SimpleNamespace(compiled=lambda compiled=compiled: compiled)
-        monkeypatch.setattr(program.importlib, "import_module", lambda _, made=made: made)
+    for runs, name in ((Build(True, ""), "compiled"), (Build(False, "it was not compiled"), "interpreted")):
+        monkeypatch.setattr(program, "settle", lambda runs=runs: runs)
         assert program.build() == name

@@ -36,7 +36,7 @@ TELEMETRY = (
 V1: dict[type[msgspec.Struct], str] = {
     Telemetry: TELEMETRY,
     Tick: "lateness_us exec_us",
-    Status: f"{TELEMETRY} version scene uptime_s least_N most_N trim device least_gap_mm link setpoints rates "
+    Status: f"{TELEMETRY} version build scene uptime_s least_N most_N trim device least_gap_mm link setpoints rates "
     "late_ticks_by fault_details limit_details newest_stall not_granted",
     LinkReport: "state cause remedy backend port losses last_loss firmware serial_number firmware_schema daemon_schema "
     "protocol_version frames bytes corrupt lost repeated resynchronisations round_trip_us clock",

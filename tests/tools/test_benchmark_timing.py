@@ -19,6 +19,8 @@ import firmware_protocol
 import tormagd
 from tormagd.config import RealTime, load_config
 from tormagd.control.core import build_core
+from tormagd.hardware.backend import choose
+from tormagd.hardware.serial_backend import SerialOptions
 
 PNG = b"\x89PNG"
 ROOT = Path(__file__).parents[2]
@@ -116,7 +118,8 @@ def test_both_fast_lines_are_configurations_that_tormagd_takes(tmp_path: Path) -
     for rate_hz, baud in benchmark_fast.LINES:
         stand = benchmark_loop.Stand(RealTime(), rate_hz, benchmark_fast.INFERENCE_HZ, baud)
         config = load_config(benchmark_loop.write_config(tmp_path, "/dev/null", stand))
-        assert (config.rates.control_hz, config.device.baud) == (rate_hz, baud)
+        line = choose(config.device, config.rates).options
+        assert (config.rates.control_hz, line) == (rate_hz, SerialOptions(baud=baud))
         build_core(config)
 
 

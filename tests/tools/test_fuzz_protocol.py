@@ -67,6 +67,7 @@ def test_a_codec_that_checks_nothing_is_found_out(kind: str, monkeypatch: pytest
     assert tally.false_accepts > tally.allowed
 
 
+@pytest.mark.interpreted
 def test_a_decoder_without_its_crc_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(framing, "crc_hqx", lambda data, initial: framing.CRC_RESIDUE)
     (tally,) = fuzzed("bytes overwritten").tallies.values()
@@ -74,6 +75,7 @@ def test_a_decoder_without_its_crc_is_found_out(monkeypatch: pytest.MonkeyPatch)
     assert tally.wrong_frames > tally.wrong_frames_allowed
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize("direction", [fuzz_traffic.TO_HOST, fuzz_traffic.TO_DEVICE], ids=lambda d: d.receiver)
 def test_a_crc_without_a_final_xor_is_found_out(
     direction: fuzz_traffic.Direction, monkeypatch: pytest.MonkeyPatch
@@ -88,6 +90,7 @@ def test_a_crc_without_a_final_xor_is_found_out(
     assert tally.wrong_frames > tally.wrong_frames_allowed
 
 
+@pytest.mark.interpreted
 def test_a_decoder_that_gives_repetitions_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     accept = framing.FrameDecoder._accept
 
@@ -100,6 +103,7 @@ def test_a_decoder_that_gives_repetitions_is_found_out(monkeypatch: pytest.Monke
     assert tally.false_accepts > tally.allowed
 
 
+@pytest.mark.interpreted
 def test_a_decoder_that_resynchronises_late_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     accept = framing.FrameDecoder._accept
     grudges: Counter[framing.FrameDecoder] = Counter()
@@ -117,6 +121,7 @@ def test_a_decoder_that_resynchronises_late_is_found_out(monkeypatch: pytest.Mon
     assert fuzzed("noise").lost_second > 100
 
 
+@pytest.mark.interpreted
 def test_a_decoder_without_a_bound_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(framing, "MAX_ENCODED", 100_000)
     monkeypatch.setattr(fuzz_protocol, "ENDLESS_PIECES", 2)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import msgspec
 
+from firmware_protocol.build import COST, REMEDY, settle
 from tormagd.config import Config
 from tormagd.ctl.headroom import MOST_STOLEN, MOST_USED, MOST_WAITED, Headroom, Rate, rates
 from tormagd.ctl.machine import Machine
@@ -324,7 +325,16 @@ def usb_latency(config: Config, machine: Machine) -> Finding:
     return Finding("usb latency", Verdict.WARN, f"{latency_ms} ms", remedy)
 
 
+def build(config: Config, machine: Machine) -> Finding:
+    """Which build of the core is installed; the daemon of the same installation runs the same one."""
+    runs = settle()
+    if runs.is_compiled:
+        return Finding("build", Verdict.OK, str(runs))
+    return Finding("build", Verdict.WARN, f"{runs}; {COST}", REMEDY)
+
+
 CHECKS: tuple[Callable[[Config, Machine], Finding], ...] = (
+    build,
     preemption,
     governor,
     scheduling,

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import msgspec
 
+from firmware_protocol.build import REMEDY
 from tormagd.config import LEAST_INFERENCE_HZ, Config
 from tormagd.ctl.machine import Machine, Taken
 from tormagd.ctl.outcome import CommandError, Exit
@@ -27,7 +28,6 @@ MOST_USED = 0.7
 "Of a period, or of a processor. What is left is for clients that ask, and for hours when the machine gives less."
 MOST_STOLEN, MOST_WAITED = 0.01, 0.1
 "Shares of the time above which what others take is worth a warning."
-COMPILE = "compile the core: a C compiler and Python's headers, then install tormagd again"
 
 
 class Quantiles(msgspec.Struct, frozen=True):
@@ -123,7 +123,11 @@ def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: i
         if lateness_is_most:
             change = "the kernel wakes too late: the checks of real time above, fewer programs beside it"
         else:
-            change = COMPILE if found.build == "interpreted" else f"a faster processor, or less than {hz} Hz"
+            change = (
+                f"compile the core: {REMEDY}"
+                if found.build == "interpreted"
+                else f"a faster processor, or less than {hz} Hz"
+            )
     return Rate(loop, hz, configured, round(used, 3), used <= MOST_USED, change)
 
 

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Mapping, Sequence
 
+from firmware_protocol.build import COST, REMEDY
 from tormagd.ctl.client import Client, understood
 from tormagd.ctl.outcome import Colour, Exit, Outcome
 from tormagd.messages import Explained, LinkReport, RateReport, SetpointReport, Status
@@ -39,10 +40,18 @@ def status_text(known: Status, colour: Colour) -> str:
         *(_rate(name, group, colour) for name, group in known.rates.items()),
         *_late_ticks(known.late_ticks_by),
         f"daemon    {known.version}, scene {known.scene}, up {_number(known.uptime_s, 's', 0)}",
+        *_core(known.build, colour),
     ]
     if known.setpoints.last_refusal:
         lines.append(f"refused   {colour.yellow(known.setpoints.last_refusal)}")
     return "\n".join(lines)
+
+
+def _core(build: str, colour: Colour) -> list[str]:
+    """Which build of the core runs, and what it costs; nothing where an older daemon does not say."""
+    if not build or build == "compiled":
+        return [f"core      {build}"] if build else []
+    return [f"core      {colour.yellow(build)}", *_explained(COST, REMEDY, str)]
 
 
 def _number(value: float | None, unit: str, digits: int = 3) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import Config, ConfigError, load_config
 from tormagd.output import write_line
@@ -27,7 +28,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="tormagd", description="Real-time haptic controller daemon.")
     parser.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration; defaults where it is silent")
     parser.add_argument("--check", action="store_true", help="print the resolved configuration and exit")
-    parser.add_argument("--version", action="version", version=f"tormagd {__version__}")
+    parser.add_argument("--version", action="version", version=f"tormagd {__version__}, {settle()}")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     # nothing moves until the daemon runs and takes the signal over: before that, Ctrl-C may simply end the process

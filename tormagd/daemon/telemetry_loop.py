@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 
+from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import Config
 from tormagd.control.conditions import conditions, is_busy, is_homed
@@ -173,6 +174,7 @@ class TelemetryLoop:
         return Status(
             **known,
             version=__version__,
+            build=str(settle()),
             scene=self._core.scene.name,
             uptime_s=round(time.monotonic() - self._started_s, 1),
             least_N=round(self._least_N(), 3),

@@ -5,7 +5,6 @@ with who asks.
 """
 
 import argparse
-import importlib
 import json
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 import uvloop
 
+from firmware_protocol.build import settle
 from tormagd.config import Config, ConfigError, load_config
 from tormagd.control.core import build_core
 from tormagd.headroom.bare_timer import Lateness, lateness
@@ -78,11 +78,7 @@ def quantiles(values: list[float]) -> dict[str, float]:
 
 def build() -> str:
     """Which build of the core this interpreter runs: `compiled` or `interpreted`."""
-    try:
-        found = importlib.import_module("tormagd.build")
-    except ModuleNotFoundError:
-        return "interpreted"
-    return "compiled" if found.compiled() else "interpreted"
+    return "compiled" if settle().is_compiled else "interpreted"
 
 
 if __name__ == "__main__":
