@@ -72,7 +72,7 @@ def skews_um(synchronisation: float) -> Array:
     samples = []
     for tick in range(1_600):
         gap_mm, speed_mm_s = (94.0 - 15e-3 * tick, -15.0) if tick < 800 else (82.0 + 15e-3 * (tick - 800), 15.0)
-        samples.append(loop.tick(plan=gap_plan(gap_mm, loop.now_s)._replace(gap_speed_mm_s=speed_mm_s)))
+        samples.append(loop.tick(plan=gap_plan(gap_mm, loop.now_s).replaced(gap_speed_mm_s=speed_mm_s)))
     assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
     assert_sane(samples, config)
     assert samples[-1].truth.gap_mm == pytest.approx(94.0, abs=0.1)
