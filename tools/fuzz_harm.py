@@ -124,7 +124,7 @@ class Patient:
     def stuck_state_ms(self) -> float | None:
         """How long the daemon goes on with a device that repeats one State for ever; null for ever."""
         loop = self._armed()
-        loop.device = StuckSender(loop.device)  # type: ignore[assignment]
+        loop.device = StuckSender(loop.device)
         started_s = loop.now_s
         for _ in range(STUCK_TICKS):
             if loop.tick(_publisher(loop.now_s)).state.safety.faults:

@@ -131,7 +131,7 @@ def virtual_session(seconds: float, to_device: Listener, to_host: Listener, baud
     core = build_core(config)
     device = VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1, baud=baud)
     tapped = TappedDevice(device, to_device, to_host)
-    loop = ClosedLoop(config, core.stepper, core.planner, tapped)  # type: ignore[arg-type]
+    loop = ClosedLoop(config, core.stepper, core.planner, tapped)
     loop.arm()
     ticks = round(seconds * config.rates.control_hz)
     for _ in tqdm(range(ticks), desc="virtual session", unit="tick", disable=None):

@@ -22,7 +22,7 @@ from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import Conditions, OperatingState
-from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.device import SerialDevice
 from tormagd.simulation.plant import Truth
 
 Array = npt.NDArray[np.float64]
@@ -49,7 +49,7 @@ class VirtualPort:
     `device` may be changed for one that behaves as badly as a test wants.
     """
 
-    def __init__(self, device: VirtualDevice) -> None:
+    def __init__(self, device: SerialDevice) -> None:
         self.device = device
         self.now_s = 0.0
         self._stream = FrameStream()
@@ -100,7 +100,7 @@ class VirtualPort:
 class ClosedLoop:
     """A daemon and its device in one process and one virtual time, which starts at 0."""
 
-    def __init__(self, config: Config, stepper: Stepper, planner: Planner | None, device: VirtualDevice) -> None:
+    def __init__(self, config: Config, stepper: Stepper, planner: Planner | None, device: SerialDevice) -> None:
         """`planner` may be missing where every tick is given its plan."""
         self._config, self._stepper, self._planner = config, stepper, planner
         self._period_s = 1.0 / config.rates.control_hz
@@ -120,12 +120,12 @@ class ClosedLoop:
         return self._ticks * self._period_s
 
     @property
-    def device(self) -> VirtualDevice:
+    def device(self) -> SerialDevice:
         """What is at the other end of the wire."""
         return self._port.device
 
     @device.setter
-    def device(self, device: VirtualDevice) -> None:
+    def device(self, device: SerialDevice) -> None:
         self._port.device = device
 
     @property
