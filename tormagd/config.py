@@ -112,8 +112,6 @@ class Position(Strict, frozen=True):
     gap_acceleration_mm_s2: Annotated[float, Meta(gt=0.0, le=100_000.0)] = 1_600.0
     "From rest; with speed it falls along the motors' torque-speed line."
     duty_limit: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0
-    lead_ms: Annotated[float, Meta(ge=0.0, le=50.0)] = 0.0
-    "How far ahead the gap is asked for, along the setpoint's own slope, to make up for known lags."
 
 
 class Trim(Strict, frozen=True):

@@ -87,7 +87,7 @@ def test_a_refusal_names_key_value_and_what_is_allowed(write, text: str, key: st
 @pytest.mark.parametrize("number", ["nan", "-nan", "inf", "-inf", "+inf"])
 @pytest.mark.parametrize("table", ["motor", "position"])
 def test_numbers_that_are_not_finite_are_refused(write, number: str, table: str) -> None:
-    key = {"motor": "supply_V", "position": "lead_ms"}[table]
+    key = {"motor": "supply_V", "position": "integral_time_s"}[table]
     refused = refusal(write(f"[{table}]\n{key} = {number}"))
     assert f"{table}.{key}" in refused
     assert number.strip("+-") in refused
