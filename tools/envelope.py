@@ -4,8 +4,8 @@
 
 Forces are the simulated plant's while the handle slides. *Asked* is the greater of the force asked and what this
 device brakes with its gap open at this speed; *arrived* is 0.2 s after an ideal carriage would have. Devices are the
-three samples and random draws around sample 1 (plant card); sample 1 and draws 0 and 2 were seen while constants were
-chosen, the others only judge. All devices are synthetic.
+three samples and random draws around sample 1 (plant card). Sample 1 and draws 0 to 39 were looked at while constants
+were chosen; samples 2 and 3 and the draws from 40 on only judge. All devices are synthetic.
 """
 
 import argparse
@@ -48,6 +48,8 @@ Json = dict[str, Any]
 SCENE = "coronary"
 SAMPLES = ("sample_1", "sample_2", "sample_3")
 DRAWS, QUICK_DRAWS = 40, 2
+FIRST_DRAW = 40
+"Earlier ones were seen."
 SETPOINT_S = 0.002
 VALID_S = 0.25
 ARRIVED_S = 0.2
@@ -191,9 +193,14 @@ SAID: tuple[tuple[float | None, float | None], ...] = (
 "Handle motions that a setpoint may say it is meant for: displacement_mm, rate_mm_s."
 
 
+def drawn(draws: int) -> list[str]:
+    """The names of so many draws that only judge."""
+    return [f"draw {number}" for number in range(FIRST_DRAW, FIRST_DRAW + draws)]
+
+
 def cases(draws: int) -> Iterator[Case]:
     """Every run."""
-    for name in (*SAMPLES, *(f"draw {number}" for number in range(draws))):
+    for name in (*SAMPLES, *drawn(draws)):
         for hand in HANDS:
             if hand == "ladder":
                 yield Case(name, hand, "ladder")
@@ -390,12 +397,12 @@ def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures
         found = [(case, future.result()) for case, future in zip(asked, waiting, strict=True)]
         faults = [(*hold, future.result()) for hold, future in zip(holds, low, strict=True)]
         bar.close()
-    drawn = [figures.steps_N for case, figures in found if figures.steps_N and case.device.startswith("draw")]
+    stepped = [figures.steps_N for case, figures in found if figures.steps_N and case.device.startswith("draw")]
     slow = [abs(error) for case, figures in found if case.hand == "1 mm/s" for error in figures.slow_N]
     # where a publisher says another motion than the handle's, it gets the force for that
     as_it_is = [figures for case, figures in found if case.displacement_mm is None and case.rate_mm_s is None]
     settled = [abs(error) for figures in as_it_is for _, _, error in figures.settled]
-    first, again, overshoot = (np.array(part) for part in zip(*drawn, strict=True))
+    first, again, overshoot = (np.array(part) for part in zip(*stepped, strict=True))
     result: Json = {
         "over_N": max(figures.over_N for _, figures in found),
         "over_sample_1_N": max(figures.over_N for case, figures in found if case.device == "sample_1"),
@@ -427,7 +434,7 @@ def missed(result: Json) -> list[str]:
 
 def held_devices(draws: int) -> list[str]:
     """The samples, and half of the draws, no more than 20."""
-    return [*SAMPLES, *(f"draw {number}" for number in range(min(draws, 20)))]
+    return [*SAMPLES, *drawn(min(draws, 20))]
 
 
 def row(case: Case, figures: Figures) -> Json:
