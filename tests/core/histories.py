@@ -42,8 +42,10 @@ from tormagd.simulation.plant import Truth  # noqa: E402
 CONFIG = Config()
 VECTORS = Path(firmware_protocol.__file__).parent / "vectors"
 STRANGE = [math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-300, -1e300, 1e9, -1.0]
-EPISODES, TICKS = 40, 120
+EPISODES, TICKS = 40, 150
 COMMANDS = ["enable", "disable", "pause", "resume", "home", "stop", "clear-fault"]
+NEXT = {OperatingState.DISABLED: "enable", OperatingState.FAULT: "clear-fault"}
+"What leads back to where something is driven."
 
 
 class Digest:
@@ -66,9 +68,7 @@ class Digest:
                 self.see(inner)
         elif isinstance(thing, Enum):
             self._take(f"{type(thing).__name__} {thing.value!r}")
-        elif isinstance(thing, float):
-            self._take(thing.hex())
-        elif isinstance(thing, bytes):
+        elif isinstance(thing, float | bytes):
             self._take(thing.hex())
         elif isinstance(thing, Exception):
             self._take(f"{type(thing).__name__}: {thing}")
@@ -94,15 +94,16 @@ def hostile(core: Core, seen: Digest) -> None:
     rng = random.Random(12)
     for _ in range(EPISODES):
         strangeness = rng.choice([0.0, 0.0, 0.01, 0.1])
-        now_s, number = rng.uniform(0.0, 1e5), 0
+        now_s, number, at_mm = rng.uniform(0.0, 1e5), 0, rng.uniform(-25.0, 0.0)
         state, planned = core.stepper.start(now_s), core.planner.start(now_s)
         measured: Measurement | None = None
         for _ in range(TICKS):
-            now_s += rng.choice([1e-3, 1e-3, 1e-3, 0.0, 2e-3, 0.03, 0.2, -1e-3])
+            now_s += rng.choice([0.0, 2e-3, 0.02, -1e-3]) if rng.random() < 0.05 else 1e-3
             if rng.random() < 0.9:
-                number += rng.randint(0, 1)
-                measured = measurement(rng, number, now_s, strangeness)
-            elif rng.random() < 0.2:
+                number += rng.random() < 0.95
+                at_mm += rng.uniform(-0.02, 0.02)
+                measured = measurement(rng, number, now_s, at_mm, strangeness)
+            elif rng.random() < 0.02:
                 measured = None
             plan = planned.plan
             if rng.random() < 0.5:
@@ -118,36 +119,37 @@ def hostile(core: Core, seen: Digest) -> None:
                 except (ValueError, OverflowError) as error:  # of what is not finite, and no wire brings
                     seen.see(error)
                     planned = core.planner.start(now_s)
-            if rng.random() < 0.1 or state.safety.operating_state is OperatingState.DISABLED:
-                name = rng.choice(COMMANDS) if rng.random() < 0.5 else "enable"
+            if rng.random() < 0.1:
+                name = NEXT.get(state.safety.operating_state, "resume")
+                if rng.random() < 0.2:
+                    name = rng.choice(COMMANDS)
                 try:
                     state = core.stepper.command(state, name, now_s, conditions(rng))
                 except RefusedError as error:
                     seen.see(error)
-            if rng.random() < 0.01:
+            if rng.random() < 0.003:
                 state = core.stepper.lose_link(state)
 
 
-def measurement(rng: random.Random, number: int, now_s: float, strangeness: float) -> Measurement:
-    """A homed device's, mostly."""
+def measurement(rng: random.Random, number: int, now_s: float, at_mm: float, strangeness: float) -> Measurement:
+    """A homed device's that runs, mostly; its carriages are at about the same place."""
 
     def some(low: float, high: float) -> float:
         return rng.choice(STRANGE) if rng.random() < strangeness else rng.uniform(low, high)
 
-    left_mm = some(-26.0, 1.0)
     return Measurement(
         number=number,
-        received_s=now_s - rng.choice([0.0, 0.0, 2e-3, 0.1]),
+        received_s=now_s - (rng.choice([1e-3, 4e-3, 0.1]) if rng.random() < 0.02 else 0.0),
         device_time_s=some(now_s - 2e-3, now_s),
-        left_mm=left_mm,
-        right_mm=left_mm + some(-0.05, 0.05),
+        left_mm=at_mm + some(-0.01, 0.01),
+        right_mm=at_mm + some(-0.05, 0.05),
         left_current_A=some(-3.0, 3.0),
         right_current_A=some(-3.0, 3.0),
         force_N=some(-0.5, 3.5),
         handle_mm=some(-50.0, 50.0) if rng.random() < 0.1 else 0.042 * number,
-        mode=rng.choice([DeviceMode.RUN, DeviceMode.RUN, DeviceMode.RUN, *DeviceMode]),
-        switches=Switches(rng.choice([int(Switches.HOMED), int(Switches.HOMED), rng.randrange(32)])),
-        faults=DeviceFault(rng.choice([0] * 30 + [1 << rng.randrange(10)])),
+        mode=rng.choice([*DeviceMode]) if rng.random() < 0.02 else DeviceMode.RUN,
+        switches=Switches(rng.randrange(32)) if rng.random() < 0.02 else Switches.HOMED,
+        faults=DeviceFault(1 << rng.randrange(10)) if rng.random() < 0.005 else DeviceFault(0),
         temperature_C=some(20.0, 90.0),
         supply_V=some(9.0, 13.0),
         delay_s=rng.choice([0.0, 2e-3, 0.02]),
@@ -236,12 +238,14 @@ def loop(core: Core, seen: Digest, plant: str, hand: Hand, fault: str, flips: fl
             seen.see(tuple(sample))
             seen.see(running.measurement)
 
-    for stalled_ms, then_s in ((0, 1.5), (12, 0.6), (40, 0.6), (83, 0.5)):
+    for stalled_ms, then_s in ((0, 1.5), (12, 0.5), (40, 0.5), (83, 2.4)):
         for _ in range(stalled_ms):
             running.skip()
             seen.see(running.device.truth)
         on(then_s)
-    for command in ("clear-fault", "home", "enable"):
+    for command in ("clear-fault", "enable", "home"):
+        for _ in running.run(0.1):
+            pass
         try:
             running.command(command)
         except RefusedError as error:
