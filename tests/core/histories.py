@@ -57,33 +57,36 @@ class Digest:
 
     def see(self, thing: object) -> None:
         """Takes a value with everything in it."""
-        self.things += 1
-        if isinstance(thing, Value):
-            self._take(type(thing).__name__)
-            for name in thing.__match_args__:
-                self.see(getattr(thing, name))
-        elif isinstance(thing, tuple | list):
-            self._take(f"{len(thing)}:")
-            for inner in thing:
-                self.see(inner)
-        elif isinstance(thing, Enum):
-            self._take(f"{type(thing).__name__} {thing.value!r}")
-        elif isinstance(thing, float | bytes):
-            self._take(thing.hex())
-        elif isinstance(thing, Exception):
-            self._take(f"{type(thing).__name__}: {thing}")
-        elif thing is None or isinstance(thing, int | str):
-            self._take(repr(thing))
-        else:
-            raise TypeError(f"{thing!r}: allowed is what has a text of its own, the same in both builds")
-
-    def _take(self, text: str) -> None:
-        self._hash.update(text.encode() + b"\n")
+        texts: list[str] = []
+        _write(thing, texts)
+        self.things += len(texts)
+        self._hash.update("\n".join([*texts, ""]).encode())
 
     @property
     def text(self) -> str:
         """Of all that was seen."""
         return self._hash.hexdigest()
+
+
+def _write(thing: object, texts: list[str]) -> None:
+    if isinstance(thing, float | bytes):
+        texts.append(thing.hex())
+    elif isinstance(thing, Enum):
+        texts.append(f"{type(thing).__name__} {thing._value_!r}")
+    elif thing is None or isinstance(thing, int | str):
+        texts.append(repr(thing))
+    elif isinstance(thing, Value):
+        texts.append(type(thing).__name__)
+        for name in thing.__match_args__:
+            _write(getattr(thing, name), texts)
+    elif isinstance(thing, tuple | list):
+        texts.append(f"{len(thing)}:")
+        for inner in thing:
+            _write(inner, texts)
+    elif isinstance(thing, Exception):
+        texts.append(f"{type(thing).__name__}: {thing}")
+    else:
+        raise TypeError(f"{thing!r}: allowed is what has a text of its own, the same in both builds")
 
 
 # -- step and plan, whatever is measured ---------------------------------------------------------------------------
@@ -234,9 +237,14 @@ def loop(core: Core, seen: Digest, plant: str, hand: Hand, fault: str, flips: fl
         return TimedSetpoint(1.2 + step_N + 0.25 * math.sin(2.0 * math.pi * 1.2 * stamp_s), stamp_s, 0.1)
 
     def on(seconds: float) -> None:
+        planned = None
         for sample in running.run(seconds, asked):
-            seen.see(tuple(sample))
-            seen.see(running.measurement)
+            seen.see(
+                (sample.time_s, sample.state, sample.output, sample.plan.number, sample.truth, running.measurement)
+            )
+            if planned is not running.plan_state:
+                planned = running.plan_state
+                seen.see((planned, sample.trim))
 
     for stalled_ms, then_s in ((0, 1.5), (12, 0.5), (40, 0.5), (83, 2.4)):
         for _ in range(stalled_ms):
