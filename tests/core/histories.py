@@ -1,0 +1,350 @@
+"""One run of the core over seeded histories, and a digest of all that came out: what both builds have in common.
+
+    python tests/core/histories.py     a line of JSON: which build ran, and SHA-256 by kind of history
+
+Every float goes into its digest as hexadecimal: one bit in one number of one tick is another digest.
+"""
+
+import hashlib
+import json
+import math
+import random
+from collections.abc import Callable
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import firmware_protocol
+from firmware_protocol.build import settle
+from firmware_protocol.codec import DecodeError, DeviceFault, DeviceMode, DriveMode, EncodeError, Switches
+from firmware_protocol.value import Value
+
+BUILD = settle()  # before anything of the core is imported
+
+from firmware_protocol.codec import decode, encode  # noqa: E402
+from firmware_protocol.framing import FrameDecoder, encode_frame  # noqa: E402
+from firmware_protocol.layouts import LAYOUTS  # noqa: E402
+from tormagd.closed_loop import ClosedLoop  # noqa: E402
+from tormagd.config import Config  # noqa: E402
+from tormagd.control.core import Core, build_core  # noqa: E402
+from tormagd.control.governor import TimedSetpoint  # noqa: E402
+from tormagd.control.plan import Plan  # noqa: E402
+from tormagd.hardware.frame_stream import FrameStream  # noqa: E402
+from tormagd.hardware.link import DeviceLink  # noqa: E402
+from tormagd.hardware.measurement import Measurement  # noqa: E402
+from tormagd.safety.operating_state import Conditions, OperatingState, RefusedError  # noqa: E402
+from tormagd.simulation.device import SerialDevice, VirtualDevice  # noqa: E402
+from tormagd.simulation.faults import parse_fault  # noqa: E402
+from tormagd.simulation.hand import Hand, ReversingHand, SteadyHand  # noqa: E402
+from tormagd.simulation.parameters import load_plant  # noqa: E402
+from tormagd.simulation.plant import Truth  # noqa: E402
+
+CONFIG = Config()
+VECTORS = Path(firmware_protocol.__file__).parent / "vectors"
+STRANGE = [math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-300, -1e300, 1e9, -1.0]
+EPISODES, TICKS = 40, 150
+COMMANDS = ["enable", "disable", "pause", "resume", "home", "stop", "clear-fault"]
+NEXT = {OperatingState.DISABLED: "enable", OperatingState.FAULT: "clear-fault"}
+"What leads back to where something is driven."
+
+
+class Digest:
+    """SHA-256 over whatever it is shown."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.sha256()
+        self.things = 0
+
+    def see(self, thing: object) -> None:
+        """Takes a value with everything in it."""
+        texts: list[str] = []
+        _write(thing, texts)
+        self.things += len(texts)
+        self._hash.update("\n".join([*texts, ""]).encode())
+
+    @property
+    def text(self) -> str:
+        """Of all that was seen."""
+        return self._hash.hexdigest()
+
+
+def _write(thing: object, texts: list[str]) -> None:
+    if isinstance(thing, float | bytes):
+        texts.append(thing.hex())
+    elif isinstance(thing, Enum):
+        texts.append(f"{type(thing).__name__} {thing._value_!r}")
+    elif thing is None or isinstance(thing, int | str):
+        texts.append(repr(thing))
+    elif isinstance(thing, Value):
+        texts.append(type(thing).__name__)
+        for name in thing.__match_args__:
+            _write(getattr(thing, name), texts)
+    elif isinstance(thing, tuple | list):
+        texts.append(f"{len(thing)}:")
+        for inner in thing:
+            _write(inner, texts)
+    elif isinstance(thing, Exception):
+        texts.append(f"{type(thing).__name__}: {thing}")
+    else:
+        raise TypeError(f"{thing!r}: allowed is what has a text of its own, the same in both builds")
+
+
+# -- step and plan, whatever is measured ---------------------------------------------------------------------------
+
+
+def hostile(core: Core, seen: Digest) -> None:
+    """Measurements, setpoints and commands at random; a tenth of all numbers is none that a device gives."""
+    rng = random.Random(12)
+    for _ in range(EPISODES):
+        strangeness = rng.choice([0.0, 0.0, 0.01, 0.1])
+        now_s, number, at_mm = rng.uniform(0.0, 1e5), 0, rng.uniform(-25.0, 0.0)
+        state, planned = core.stepper.start(now_s), core.planner.start(now_s)
+        measured: Measurement | None = None
+        for _ in range(TICKS):
+            now_s += rng.choice([0.0, 2e-3, 0.02, -1e-3]) if rng.random() < 0.05 else 1e-3
+            if rng.random() < 0.9:
+                number += rng.random() < 0.95
+                at_mm += rng.uniform(-0.02, 0.02)
+                measured = measurement(rng, number, now_s, at_mm, strangeness)
+            elif rng.random() < 0.02:
+                measured = None
+            plan = planned.plan
+            if rng.random() < 0.5:
+                gap_mm, speed_mm_s = rng.uniform(40.0, 100.0), rng.uniform(-40.0, 40.0)
+                plan = Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())
+            state, output = core.stepper.step(state, now_s, measured, plan)
+            seen.see((state, output))
+            if rng.random() < 0.3:
+                setpoint = None if rng.random() < 0.1 else setpoint_at(rng, now_s)
+                try:
+                    planned = core.planner.plan(planned, now_s, setpoint, state.estimate)
+                    seen.see((planned, planned.trim))
+                except (ValueError, OverflowError) as error:  # of what is not finite, and no wire brings
+                    seen.see(error)
+                    planned = core.planner.start(now_s)
+            if rng.random() < 0.1:
+                name = NEXT.get(state.safety.operating_state, "resume")
+                if rng.random() < 0.2:
+                    name = rng.choice(COMMANDS)
+                try:
+                    state = core.stepper.command(state, name, now_s, conditions(rng))
+                except RefusedError as error:
+                    seen.see(error)
+            if rng.random() < 0.003:
+                state = core.stepper.lose_link(state)
+
+
+def measurement(rng: random.Random, number: int, now_s: float, at_mm: float, strangeness: float) -> Measurement:
+    """A homed device's that runs, mostly; its carriages are at about the same place."""
+
+    def some(low: float, high: float) -> float:
+        return rng.choice(STRANGE) if rng.random() < strangeness else rng.uniform(low, high)
+
+    return Measurement(
+        number=number,
+        received_s=now_s - (rng.choice([1e-3, 4e-3, 0.1]) if rng.random() < 0.02 else 0.0),
+        device_time_s=some(now_s - 2e-3, now_s),
+        left_mm=at_mm + some(-0.01, 0.01),
+        right_mm=at_mm + some(-0.05, 0.05),
+        left_current_A=some(-3.0, 3.0),
+        right_current_A=some(-3.0, 3.0),
+        force_N=some(-0.5, 3.5),
+        handle_mm=some(-50.0, 50.0) if rng.random() < 0.1 else 0.042 * number,
+        mode=rng.choice([*DeviceMode]) if rng.random() < 0.02 else DeviceMode.RUN,
+        switches=Switches(rng.randrange(32)) if rng.random() < 0.02 else Switches.HOMED,
+        faults=DeviceFault(1 << rng.randrange(10)) if rng.random() < 0.005 else DeviceFault(0),
+        temperature_C=some(20.0, 90.0),
+        supply_V=some(9.0, 13.0),
+        delay_s=rng.choice([0.0, 2e-3, 0.02]),
+    )
+
+
+def setpoint_at(rng: random.Random, now_s: float) -> TimedSetpoint:
+    """As it may come through the endpoint: finite, but far from what the scene asks."""
+    preview_N = tuple(rng.uniform(0.0, 3.0) for _ in range(rng.choice([0, 0, 1, 7])))
+    return TimedSetpoint(
+        rng.choice([rng.uniform(0.0, 2.5), 0.0, 1e6]),
+        now_s - rng.choice([0.0, 1e-3, 0.5, -0.01]),
+        rng.choice([0.05, 0.2]),
+        rng.choice([None, 0.0, 0.4, 30.0]),
+        rng.choice([None, 0.0, -42.0, 1e4]),
+        preview_N,
+        0.01 if preview_N else 0.0,
+    )
+
+
+def conditions(rng: random.Random) -> Conditions:
+    """Mostly those under which a device can be enabled."""
+    good = [rng.random() < 0.95 for _ in range(3)]
+    return Conditions(
+        connected=good[0],
+        fresh=good[1],
+        homed=good[2],
+        busy=rng.random() < 0.05,
+        device_latched=rng.random() < 0.05,
+        requested_N=rng.choice([None, 0.0, 0.0, 1.5]),
+        neutral_N=0.65,
+    )
+
+
+# -- the closed loop -----------------------------------------------------------------------------------------------
+
+
+class BadLine:
+    """A device behind a line that flips a bit now and then, in both directions, and everything that went over it."""
+
+    def __init__(self, device: SerialDevice, seen: Digest, flips: float) -> None:
+        self._device, self._seen, self.flips = device, seen, flips
+        self._rng = random.Random(5)
+        self.messages = device.messages
+
+    @property
+    def truth(self) -> Truth:
+        """As the device's own."""
+        return self._device.truth
+
+    def receive(self, now_s: float, data: bytes) -> None:
+        """As the device's own."""
+        self._seen.see(data)
+        self._device.receive(now_s, self._spoiled(data))
+
+    def transmit(self, now_s: float) -> bytes:
+        """As the device's own."""
+        data = self._spoiled(self._device.transmit(now_s))
+        self._seen.see(data)
+        return data
+
+    def _spoiled(self, data: bytes) -> bytes:
+        if not data or self._rng.random() >= self.flips:
+            return data
+        spoiled = bytearray(data)
+        spoiled[self._rng.randrange(len(data))] ^= 1 << self._rng.randrange(8)
+        return bytes(spoiled)
+
+
+def loop(core: Core, seen: Digest, plant: str, hand: Hand, fault: str, flips: float) -> None:
+    """Armed, a pulse with steps between, two stalls that are survived and one that is not; then cleared and on."""
+    faults = [parse_fault(fault)] if fault else []
+    line = BadLine(VirtualDevice(load_plant(plant), hand, faults, seed=3), seen, 0.0)
+    running = ClosedLoop(CONFIG, core.stepper, core.planner, line)
+    running.arm()
+    line.flips = flips
+
+    def asked(now_s: float) -> TimedSetpoint:
+        # a publisher of 250 Hz, seen between its messages too
+        stamp_s = math.floor(now_s * 250.0) / 250.0
+        step_N = 0.3 if math.fmod(now_s, 2.0) > 1.6 else 0.0
+        return TimedSetpoint(1.2 + step_N + 0.25 * math.sin(2.0 * math.pi * 1.2 * stamp_s), stamp_s, 0.1)
+
+    def on(seconds: float) -> None:
+        planned = None
+        for sample in running.run(seconds, asked):
+            seen.see(
+                (sample.time_s, sample.state, sample.output, sample.plan.number, sample.truth, running.measurement)
+            )
+            if planned is not running.plan_state:
+                planned = running.plan_state
+                seen.see((planned, sample.trim))
+
+    for stalled_ms, then_s in ((0, 1.5), (12, 0.5), (40, 0.5), (83, 2.4)):
+        for _ in range(stalled_ms):
+            running.skip()
+            seen.see(running.device.truth)
+        on(then_s)
+    for command in ("clear-fault", "enable", "home"):
+        for _ in running.run(0.1):
+            pass
+        try:
+            running.command(command)
+        except RefusedError as error:
+            seen.see(error)
+        on(0.3)
+    seen.see([running._port.statistics, running.connection.losses])
+
+
+# -- bytes ---------------------------------------------------------------------------------------------------------
+
+
+def vectors(core: Core, seen: Digest) -> None:
+    """The golden vectors, right and wrong ones."""
+    messages = json.loads((VECTORS / "messages.json").read_text(encoding="utf-8"))
+    types: dict[str, Callable[..., Any]] = {layout.message.__name__: layout.message for layout in LAYOUTS}
+    for vector in messages["valid"]:
+        seen.see(encode(types[vector["message"]](**vector["values"])))
+    for vector in (*messages["valid"], *messages["invalid"]):
+        _decoded(seen, vector["function"], bytes.fromhex(vector["payload"]))
+    frames = json.loads((VECTORS / "frames.json").read_text(encoding="utf-8"))
+    for vector in (*frames["valid"], *frames["streams"]):
+        decoder = FrameDecoder()
+        seen.see(decoder.feed(bytes.fromhex(vector.get("frame") or vector["bytes"])))
+        seen.see(decoder.statistics)
+
+
+def streams(core: Core, seen: Digest) -> None:
+    """Frames of random messages, spoiled in many ways, in pieces; and what codec and link make of them."""
+    rng = random.Random(8)
+    for flips in (0.0, 0.001, 0.01, 0.1):
+        stream = bytearray()
+        for sequence in range(500):
+            layout = rng.choice(LAYOUTS)
+            values = [_signal(rng, signal.minimum, signal.maximum, signal.type) for signal in layout.signals]
+            try:
+                stream += encode_frame(layout.function, sequence % 256, encode(layout.message(*values)))
+            except EncodeError as error:
+                seen.see(error)
+        for place in range(len(stream)):
+            if rng.random() < flips:
+                stream[place] = rng.randrange(256)
+        link, pieces, decoder = DeviceLink(0.0), FrameStream(), FrameDecoder()
+        start, now_s = 0, 0.0
+        while start < len(stream):
+            piece = bytes(stream[start : start + rng.randint(1, 60)])
+            start, now_s = start + len(piece), now_s + 1e-3
+            for frame in decoder.feed(piece):
+                seen.see(frame)
+                _decoded(seen, frame.function, frame.payload)
+            for message in pieces.unpack(piece):
+                link.receive(now_s, message)
+            seen.see(list(link.due(now_s)))
+            seen.see([link.state.value, link.cause, link.measurement, link.pending])
+            seen.see(link.drive(rng.uniform(-1.0, 1.0), 0.0, DriveMode.RUN))
+        seen.see([decoder.statistics, pieces.statistics])
+    for _ in range(3_000):
+        _decoded(seen, rng.randrange(12), rng.randbytes(rng.choice([1, 1, 4, 7, 7, 8, 8, rng.randrange(12)])))
+
+
+def _signal(rng: random.Random, low: float, high: float, kind: Callable[[Any], Any]) -> Any:
+    if kind is float:
+        return rng.choice(STRANGE) if rng.random() < 0.02 else rng.uniform(low, high)
+    return kind(rng.choice([int(low), int(high), int(low)]))
+
+
+def _decoded(seen: Digest, function: int, payload: bytes) -> None:
+    try:
+        seen.see(decode(function, payload))
+    except DecodeError as error:
+        seen.see(error)
+
+
+def main() -> None:
+    """Runs all of them."""
+    core = build_core(CONFIG)
+    histories: dict[str, Callable[[Core, Digest], None]] = {
+        "vectors": vectors,
+        "streams": streams,
+        "hostile": hostile,
+        "sample 1": lambda core, seen: loop(core, seen, "sample_1", SteadyHand(), "", 0.003),
+        "sample 2": lambda core, seen: loop(core, seen, "sample_2", ReversingHand(1.5), "", 0.0),
+        "sample 3": lambda core, seen: loop(core, seen, "sample_3", ReversingHand(2.0), "drag_left=+50%@4.5", 0.0),
+        "reset": lambda core, seen: loop(core, seen, "sample_1", ReversingHand(3.0), "reset@4.2", 0.0),
+    }
+    digests, things = {}, {}
+    for name, history in histories.items():
+        seen = Digest()
+        history(core, seen)
+        digests[name], things[name] = seen.text, seen.things
+    print(json.dumps({"is_compiled": BUILD.is_compiled, "digests": digests, "things": things}))
+
+
+if __name__ == "__main__":
+    main()

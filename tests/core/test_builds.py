@@ -1,0 +1,43 @@
+"""The compiled core and the interpreted one are one core: the same histories give the same results, to the bit."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from firmware_protocol.build import SWITCH, judged
+
+ROOT = Path(__file__).parents[2]
+HISTORIES = Path(__file__).parent / "histories.py"
+LEAST_THINGS = 1_500
+"Each kind of history shows more; one that stopped early would show that two builds fail alike."
+
+
+def started(switch: str) -> subprocess.Popen[str]:
+    """All histories, in a process of their own with that build."""
+    environment = {**os.environ, SWITCH: switch, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-P", str(HISTORIES)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def told(process: subprocess.Popen[str]) -> dict[str, Any]:
+    out, _ = process.communicate()
+    assert process.returncode == 0
+    answer: dict[str, Any] = json.loads(out)
+    return answer
+
+
+def test_both_builds_give_the_same_results_to_the_bit() -> None:
+    build, _ = judged(ROOT, None)
+    if not build.is_compiled:
+        pytest.skip(f"there is one build only, {build}")
+    processes = [started("1"), started("0")]
+    compiled, interpreted = map(told, processes)
+    assert (compiled["is_compiled"], interpreted["is_compiled"]) == (True, False)
+    assert compiled["digests"] == interpreted["digests"]
+    assert compiled["things"] == interpreted["things"]
+    assert min(compiled["things"].values()) > LEAST_THINGS
