@@ -25,7 +25,17 @@ COMPILED = {
     "tormagd/hardware": ("frame_stream", "link", "link_statistics", "measurement", "connection"),
     "tormagd/safety": ("operating_state",),
     "tormagd/control": (
-        *("estimate", "device_fit", "sensor", "sight", "pid", "trajectory", "interpolation", "portrait"),
+        *(
+            "estimate",
+            "device_fit",
+            "slow_friction",
+            "sensor",
+            "sight",
+            "pid",
+            "trajectory",
+            "interpolation",
+            "portrait",
+        ),
         *("periodicity", "governor", "plan", "motor", "step", "conditions"),
     ),
     "tormagd/simulation": ("curve", "axis", "element", "hand", "plant", "motion", "firmware", "device"),
@@ -45,13 +55,13 @@ if wanted not in (REQUIRE, SKIP, AUTO):
 def missing() -> str:
     """What a compiled core lacks here; empty where nothing does."""
     if wanted == SKIP:
-        return "TORMAG_COMPILE=skip when it was installed"
+        return "TORMAG_COMPILE=skip"
     compiler = os.environ.get("CC", sysconfig.get_config_var("CC") or "cc").split()[0]
     if shutil.which(compiler) is None:
-        return f"no C compiler ({compiler}) when it was installed"
+        return f"no C compiler ({compiler})"
     header = Path(sysconfig.get_path("include"), "Python.h")
     if not header.is_file():
-        return f"no {header} when it was installed: the package is called python3-dev or python3-devel"
+        return f"no {header}, which is in python3-dev or python3-devel"
     return ""
 
 
@@ -69,9 +79,9 @@ class BuildCore(build_ext):
                 if wanted == REQUIRE:
                     raise
                 self.extensions = []
-                lacking = f"compiling failed when it was installed ({str(error)[:200]})"
+                lacking = f"compiling failed ({str(error)[:200]})"
         elif wanted == REQUIRE:
-            raise SystemExit(f"TORMAG_COMPILE=require, but there is {lacking}")
+            raise SystemExit(f"TORMAG_COMPILE=require: {lacking}")
         if lacking:
             print(f"the core stays interpreted: {lacking}", file=sys.stderr)
         self._record(lacking)

@@ -3,7 +3,7 @@
 Both give the same results to the bit. `pip install` compiles where a compiler and Python's headers are (setup.py), and
 leaves a record of what it compiled. Whoever edits a file after that runs what he wrote: a source that is not the one
 that was compiled makes all of the core interpreted, with a warning, because compiled modules know each other's insides.
-TORMAG_COMPILED=0 does the same for one process. `tormagd --version`, `status` and `doctor` say which build runs, and why.
+TORMAG_COMPILED=0 does the same for one process. `tormagd --version`, `status` and `doctor` say which build runs.
 """
 
 import hashlib
@@ -67,7 +67,7 @@ def judged(root: Path, switch: str | None) -> tuple[Build, frozenset[str]]:
     if suffix != sysconfig.get_config_var("EXT_SUFFIX"):
         return Build(False, f"it was compiled for another Python ({suffix})"), modules
     if lacking:
-        return Build(False, lacking), modules
+        return Build(False, f"when it was installed, {lacking}"), modules
     if switch == "0":
         return Build(False, f"{SWITCH}=0"), modules
     edited = [source for source, known in sources.items() if _digest(root / source) != known]

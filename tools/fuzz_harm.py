@@ -1,10 +1,9 @@
 """What a false accept can do: it is put into a running closed loop at the patient's force, and the brake is watched.
 
 The daemon's core, the link, the firmware and the plant run in virtual time, as in every closed-loop test. Each life
-starts from the same armed loop.
+starts from the same armed loop, armed anew.
 """
 
-import copy
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -74,24 +73,29 @@ class Harm:
 
 
 class Patient:
-    """An armed loop that renders a steady force, and what is done to copies of it."""
+    """A loop that renders a steady force, and what is done to it."""
 
     def __init__(self) -> None:
-        config = load_config(None)
-        core = build_core(config)
-        device = VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1, boot=firmware_kind())
-        self._duty_limit = config.position.duty_limit
-        self._armed = ClosedLoop(config, core.stepper, core.planner, device)
-        self._armed.arm()
-        for _ in self._armed.run(SETTLING_S, _publisher):
+        self._config = load_config(None)
+        self._core = build_core(self._config)
+        self._plant, self._boot = load_plant("sample_1"), firmware_kind()
+        self._duty_limit = self._config.position.duty_limit
+
+    def _armed(self) -> ClosedLoop:
+        """The same loop every time, to the bit."""
+        device = VirtualDevice(self._plant, SteadyHand(), seed=1, boot=self._boot)
+        loop = ClosedLoop(self._config, self._core.stepper, self._core.planner, device)
+        loop.arm()
+        for _ in loop.run(SETTLING_S, _publisher):
             pass
+        return loop
 
     def suffer(self, messages: Iterable[Message], at_once: int, rng: np.random.Generator, progress: str) -> Harm:
         """Each life gets `at_once` of the messages, one a tick from a random tick on."""
         harm = Harm()
         waiting = list(messages)
         for start in tqdm(range(0, len(waiting), at_once), desc=progress, unit="life", disable=None, leave=False):
-            loop = copy.deepcopy(self._armed)
+            loop = self._armed()
             volley = waiting[start : start + at_once]
             first = int(rng.integers(0, 10))
             for tick in range(first + len(volley) + LIFE_TICKS):
@@ -105,7 +109,7 @@ class Patient:
 
     def stuck_drive_ms(self) -> float | None:
         """How long a device in RUN goes on with a host that repeats one Drive for ever; null for ever."""
-        loop = copy.deepcopy(self._armed)
+        loop = self._armed()
         loop.tick(_publisher(loop.now_s))
         drive = encode(Drive(-0.2, -0.2, DriveMode.RUN, counter=77))
         loop.device.messages.receive(loop.now_s + AFTER_DRIVE_S, FUNCTION[Drive], drive)
@@ -119,8 +123,8 @@ class Patient:
 
     def stuck_state_ms(self) -> float | None:
         """How long the daemon goes on with a device that repeats one State for ever; null for ever."""
-        loop = copy.deepcopy(self._armed)
-        loop.device = StuckSender(loop.device)  # type: ignore[assignment]
+        loop = self._armed()
+        loop.device = StuckSender(loop.device)
         started_s = loop.now_s
         for _ in range(STUCK_TICKS):
             if loop.tick(_publisher(loop.now_s)).state.safety.faults:

@@ -4,7 +4,6 @@ All data here are synthetic: the device is the simulator's.
 """
 
 import math
-from itertools import accumulate
 
 import msgspec
 import numpy as np
@@ -12,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from firmware_protocol.value import Value
 from tormagd.closed_loop import Array, ClosedLoop, Sample
 from tormagd.config import Config
 from tormagd.control.plan import Plan
@@ -37,6 +37,10 @@ def on_the_way(loop: ClosedLoop, gap_mm: float, ticks: int) -> list[Sample]:
     return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(ticks)]
 
 
+def fields(value: Value | None) -> list[float]:
+    return [] if value is None else [getattr(value, name) for name in value.__match_args__]
+
+
 def assert_sane(samples: list[Sample], config: Config = CONFIG) -> None:
     """Finite everywhere, nothing wound up beyond the duty limit."""
     limit = config.position.duty_limit
@@ -45,8 +49,8 @@ def assert_sane(samples: list[Sample], config: Config = CONFIG) -> None:
         assert abs(sample.output.left_duty) <= limit
         assert abs(sample.output.right_duty) <= limit
         assert max(abs(state.left.integral), abs(state.right.integral)) <= limit
-        assert state.reference is None or all(map(math.isfinite, state.reference))
-        assert state.expected is None or all(map(math.isfinite, state.expected))
+        assert all(map(math.isfinite, fields(state.reference)))
+        assert all(map(math.isfinite, fields(state.expected)))
         assert math.isfinite(sample.truth.gap_mm)
 
 
@@ -72,7 +76,7 @@ def skews_um(synchronisation: float) -> Array:
     samples = []
     for tick in range(1_600):
         gap_mm, speed_mm_s = (94.0 - 15e-3 * tick, -15.0) if tick < 800 else (82.0 + 15e-3 * (tick - 800), 15.0)
-        samples.append(loop.tick(plan=gap_plan(gap_mm, loop.now_s)._replace(gap_speed_mm_s=speed_mm_s)))
+        samples.append(loop.tick(plan=gap_plan(gap_mm, loop.now_s).replaced(gap_speed_mm_s=speed_mm_s)))
     assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
     assert_sane(samples, config)
     assert samples[-1].truth.gap_mm == pytest.approx(94.0, abs=0.1)
@@ -100,32 +104,27 @@ def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
 # -- the clock -----------------------------------------------------------------------------------------------------
 
 
-class UnevenLoop(ClosedLoop):
-    """A loop whose ticks come after these times, and a period apart after the last."""
+def armed() -> ClosedLoop:
+    loop = ClosedLoop(CONFIG, Stepper(CONFIG, SCENE), None, VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1))
+    loop.arm(gap_plan(OPEN_MM))
+    return loop
 
-    def __init__(self, periods_s: list[float]) -> None:
-        device = VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1)
-        self._at_s: list[float] = []
-        super().__init__(CONFIG, Stepper(CONFIG, SCENE), None, device)
-        self._periods_s = periods_s
 
-    @property
-    def now_s(self) -> float:
-        return self._at_s[self._ticks] if self._ticks < len(self._at_s) else super().now_s
-
-    def play(self, gap_mm: float) -> list[Sample]:
-        """The uneven periods, from now on."""
-        even = [tick * self._period_s for tick in range(self._ticks + 1)]
-        self._at_s = even + list(accumulate(self._periods_s, initial=even[-1]))[1:]
-        return on_the_way(self, gap_mm, len(self._periods_s))
+def unevenly(loop: ClosedLoop, gap_mm: float, periods_s: list[float]) -> list[Sample]:
+    """The ticks on the way to a gap, each this long after the one before it."""
+    samples = []
+    for period_s in periods_s:
+        now_s = loop.now_s
+        loop._period_s = (now_s + period_s) / (loop._ticks + 1)
+        samples.append(loop.tick(plan=gap_plan(gap_mm, now_s)))
+        assert samples[-1].time_s - now_s == pytest.approx(period_s, abs=1e-12)
+    return samples
 
 
 @settings(max_examples=4, deadline=None, suppress_health_check=list(HealthCheck))
 @given(periods_s=st.lists(st.floats(1e-5, 4e-3), min_size=300, max_size=300))
 def test_jitter_of_a_few_periods_is_ridden_out(periods_s: list[float]) -> None:
-    loop = UnevenLoop(periods_s)
-    loop.arm(gap_plan(OPEN_MM))
-    samples = loop.play(92.0)
+    samples = unevenly(armed(), 92.0, periods_s)
     assert_sane(samples)
     assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
     assert min(sample.truth.gap_mm for sample in samples) > 92.0 - 0.2
@@ -134,9 +133,7 @@ def test_jitter_of_a_few_periods_is_ridden_out(periods_s: list[float]) -> None:
 @settings(max_examples=4, deadline=None, suppress_health_check=list(HealthCheck))
 @given(periods_s=st.lists(st.sampled_from([1e-5, 1e-3, 0.03, 0.1]), min_size=60, max_size=60))
 def test_jitter_beyond_the_timeout_ends_in_a_fault_and_not_in_motion(periods_s: list[float]) -> None:
-    loop = UnevenLoop(periods_s)
-    loop.arm(gap_plan(OPEN_MM))
-    samples = loop.play(90.0)
+    samples = unevenly(armed(), 90.0, periods_s)
     assert_sane(samples)
     if max(periods_s) > 0.05:
         assert samples[-1].state.safety.operating_state is OperatingState.FAULT
@@ -147,8 +144,7 @@ def test_jitter_beyond_the_timeout_ends_in_a_fault_and_not_in_motion(periods_s: 
 
 
 def test_a_target_that_flips_every_tick_is_averaged_and_left_behind_cleanly() -> None:
-    loop = ClosedLoop(CONFIG, Stepper(CONFIG, SCENE), None, VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1))
-    loop.arm(gap_plan(OPEN_MM))
+    loop = armed()
     on_the_way(loop, 85.0, 500)
     flipping = [loop.tick(plan=gap_plan(80.0 + 10.0 * (tick % 2), loop.now_s)) for tick in range(600)]
     assert_sane(flipping)

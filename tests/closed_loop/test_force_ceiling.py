@@ -3,15 +3,16 @@
 import math
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import pytest
 
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
-from tormagd.control import plan as planning
 from tormagd.control.core import Core, build_core
-from tormagd.control.governor import Governed, GovernorState, TimedSetpoint
+from tormagd.control.governor import Governor, TimedSetpoint
 from tormagd.control.plan import Plan
+from tormagd.control.portrait import Portrait
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd.simulation.device import VirtualDevice
@@ -158,7 +159,7 @@ def test_an_honest_sensor_is_believed(sample: str) -> None:
 def test_the_governed_force_holds_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """With no ceiling over gap and measured force, 1000 N asked give the scene's greatest."""
     core = build_core(CONFIG)
-    monkeypatch.setattr(planning, "CEILING", 100.0)
+    monkeypatch.setattr(core.planner, "_ceiling_N", 100.0 * MOST_N)
     monkeypatch.setattr(core.stepper, "_ceiling_N", math.inf)
     loop = joined(core)
     loop.arm()
@@ -170,23 +171,23 @@ def test_the_governed_force_holds_alone(monkeypatch: pytest.MonkeyPatch) -> None
 # -- layer b: the gap ----------------------------------------------------------------------------------------------
 
 
-def ask_for_six_newtons(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A governor that has gone mad."""
-
-    def mad(state: GovernorState, now_s: float, *_: object, **__: object) -> tuple[GovernorState, Governed]:
-        return GovernorState(now_s, 6.0), Governed(6.0, np.full(len(planning.PATH_S), 6.0), 0.0, (), 1.0)
-
-    monkeypatch.setattr(planning, "govern", mad)
+def ask_for_six_newtons(core: Core, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A governor that has gone mad: it takes the device for a giant, and the scene for one that wants nothing else."""
+    giant = Portrait([95.0, 45.0], [0.0, 100.0], [2.0, 2.0])
+    force = msgspec.structs.replace(core.scene.force, least_N=6.0, most_N=6.0)
+    mad = Governor(giant, force, CONFIG.limits, CONFIG.position.gap_speed_mm_s)
+    monkeypatch.setattr(core.planner, "_governor", mad)
 
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
 def test_the_gap_holds_alone(monkeypatch: pytest.MonkeyPatch, sample: str) -> None:
     core = build_core(CONFIG)
-    ask_for_six_newtons(monkeypatch)
+    ask_for_six_newtons(core, monkeypatch)
     monkeypatch.setattr(core.stepper, "_ceiling_N", math.inf)
     loop = joined(core, sample)
     loop.arm()
     samples = render(loop, 1.0, 4.0)
+    assert samples[-1].plan.governed_N == 6.0
     assert MOST_N < worst_N(samples) < CEILING_N
     assert Limit.CEILING in samples[-1].plan.limits
     assert samples[-1].state.safety.operating_state is OperatingState.ENABLED

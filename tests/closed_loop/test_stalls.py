@@ -1,7 +1,5 @@
 """Stalls of daemon and device against the simulated device, and a force below the least one, in virtual time."""
 
-import copy
-
 import pytest
 
 from firmware_protocol.codec import DeviceMode
@@ -34,18 +32,13 @@ def armed(core: Core, plant: str = "sample_1") -> ClosedLoop:
     return loop
 
 
-@pytest.fixture(scope="module")
-def holding_once(core: Core) -> ClosedLoop:
+@pytest.fixture
+def holding(core: Core) -> ClosedLoop:
+    """A loop that has settled on the force."""
     loop = armed(core)
     samples = run(loop, FORCE_N, 1.6)
     assert samples[-1].truth.force_N == pytest.approx(FORCE_N, abs=0.05)
     return loop
-
-
-@pytest.fixture
-def holding(holding_once: ClosedLoop) -> ClosedLoop:
-    """A copy of one loop that has settled on the force."""
-    return copy.deepcopy(holding_once)
 
 
 def run(loop: ClosedLoop, force_N: float, duration_s: float) -> list[Sample]:

@@ -44,6 +44,6 @@ def measure() -> MeasurementMaker:
             temperature_C=23.0,
             supply_V=12.0,
         )
-        return healthy._replace(**changes)  # type: ignore[arg-type]
+        return healthy.replaced(**changes)  # type: ignore[arg-type]
 
     return make

@@ -484,7 +484,7 @@ def test_disable_and_stop_open(running: Bench) -> None:
 
 def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench: Bench) -> None:
     bench.step(faults=DeviceFault.OVERCURRENT, mode=DeviceMode.LATCHED)
-    bench.command("clear-fault", READY._replace(device_latched=True))
+    bench.command("clear-fault", READY.replaced(device_latched=True))
     output = bench.step(faults=DeviceFault.OVERCURRENT, mode=DeviceMode.LATCHED)
     assert output.request is DeviceRequest.CLEAR
     assert bench.faults == ()
@@ -638,7 +638,7 @@ def test_the_answer_to_it_is_gone_on_from_without_a_kick(core: Core, measure, mo
     for later in (0.045, 0.046):
         at_s = now_s + later
         answer = following(measure, state.replaced(reference=came), 11 + (later > 0.045), at_s)
-        answer = answer._replace(device_time_s=at_s)
+        answer = answer.replaced(device_time_s=at_s)
         state, output = core.stepper.step(state, at_s, answer, gap_plan(came.gap_mm, at_s))
     assert not state.safety.faults
     assert state.reference is not None

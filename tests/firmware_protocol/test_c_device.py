@@ -391,9 +391,9 @@ def test_a_copy_goes_its_own_way() -> None:
     twins = Twins()
     twins.home()
     before = twins.compiled.status(twins.sensors)
-    other = copy.deepcopy(twins)
-    other.drive(-0.5, -0.5, count=5)
-    assert other.compiled.mode is DeviceMode.RUN
+    other = copy.deepcopy(twins.compiled)
+    other.receive(twins.time_s, Drive(-0.5, -0.5, DriveMode.RUN, (twins.counter + 1) % 256), twins.sensors)
+    assert other.mode is DeviceMode.RUN
     assert twins.compiled.status(twins.sensors) == before
 
 

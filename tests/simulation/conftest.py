@@ -1,6 +1,5 @@
 """A host in virtual time, for talking to the simulated device as the daemon would."""
 
-import copy
 from collections.abc import Callable, Iterable
 from typing import TypeVar
 
@@ -143,14 +142,8 @@ def make_host(sample_1: PlantParameters) -> HostMaker:
     return make
 
 
-@pytest.fixture(scope="session")
-def homed_hosts() -> dict[object, Host]:
-    """Homed and running hosts without faults, by plant and gap: homing once is enough, tests get copies."""
-    return {}
-
-
 @pytest.fixture
-def running(make_host: HostMaker, homed_hosts: dict[object, Host]) -> HostMaker:
+def running(make_host: HostMaker) -> HostMaker:
     """Like make_host, but homed and at a gap of 60 mm, in RUN, which is before 3.4 s."""
 
     def start(gap_mm: float, faults: Iterable[str], **keywords: object) -> Host:
@@ -168,11 +161,6 @@ def running(make_host: HostMaker, homed_hosts: dict[object, Host]) -> HostMaker:
         return msgspec.structs.replace(plant, assumed=assumed)
 
     def make(faults: Iterable[str] = (), *, gap_mm: float = 60.0, plant: str = "sample_1") -> Host:
-        if faults:
-            return start(gap_mm, faults, plant=near_home(plant))
-        key = (plant, gap_mm)
-        if key not in homed_hosts:
-            homed_hosts[key] = start(gap_mm, (), plant=near_home(plant))
-        return copy.deepcopy(homed_hosts[key])
+        return start(gap_mm, faults, plant=near_home(plant))
 
     return make

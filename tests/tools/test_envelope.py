@@ -68,7 +68,12 @@ def test_a_draw_is_the_same_every_time_and_another_than_the_next() -> None:
 
 @pytest.mark.parametrize(
     "case",
-    [envelope.Case("draw 17", "flicks", "steps"), envelope.Case("sample_2", "300 mm/s", "1 N", 0.0, -300.0)],
+    [
+        envelope.Case("draw 17", "flicks", "steps"),
+        envelope.Case("draw 25", "creep", "steps"),
+        envelope.Case("draw 2", "other reversals", "steps"),
+        envelope.Case("sample_2", "300 mm/s", "1 N", 0.0, -300.0),
+    ],
     ids=str,
 )
 def test_a_corner_keeps_the_bounds(case) -> None:

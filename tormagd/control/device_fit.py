@@ -64,6 +64,19 @@ class DeviceFit(Value):
         variance = model_N * (model_N * self.scale_variance + 2.0 * self.covariance_N) + self.offset_variance_N2
         return math.sqrt(max(variance, 0.0))
 
+    def times(self, factor: float) -> "DeviceFit":
+        """The fit of a device that gives `factor` > 0 times the force."""
+        if factor == 1.0:
+            return self
+        square = factor * factor
+        return DeviceFit(
+            factor * self.scale,
+            factor * self.offset_N,
+            square * self.scale_variance,
+            square * self.covariance_N,
+            square * self.offset_variance_N2,
+        )
+
     def surely_within_N(self, most_N: float) -> float:
         """The most to ask of the model for the device to give no more than `most_N`: as far as it has shown itself,
         but no believable device is weaker than LEAST_SCALE or stronger than MOST_SCALE."""

@@ -12,6 +12,7 @@ from tormagd.control.estimate import Estimate
 from tormagd.control.governor import PATH_S, Governed, Governor, GovernorState, TimedSetpoint
 from tormagd.control.portrait import FieldOfGap, LawOfField, Portrait
 from tormagd.control.sensor import UNJUDGED, Sensor, judge
+from tormagd.control.slow_friction import NOTHING_SLOW, SLOWEST_MM_S, SlowFriction
 from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
 from tormagd.learning.displacement import MOBILISED_MM, MOVING_MM_S
 from tormagd.learning.features import FEATURES
@@ -29,6 +30,10 @@ mm/s, 6% at a creep and 11% at 300 mm/s and the least force: the law knows neith
 LESSON_S: Final = 0.003
 LONGEST_LESSON_S: Final = 0.02
 "One reading teaches for the time since the last, no more often than that, however often is planned, and no longer."
+LEAST_EXPECTED_N: Final = 0.1
+"Of less force no share is told."
+GONE_BACK_MM: Final = 0.01
+"A handle that has gone back by more, just over a count of its encoder, may be turning: its friction falls already."
 BEYOND_MM: Final = 2.0
 "Beyond the closed end, where a carriage may overrun, the model is asked no further."
 LAG_TIME_S: Final = 1.0
@@ -122,10 +127,10 @@ class Plan(Value):
 
 @final
 class Shown(Value):
-    """What the device has shown of itself by its readings up to number `read`, taken at `read_s`, whether its sensor is
-    believed, and the limits that come of both."""
+    """What the device has shown of itself by its readings up to number `read`, taken at `read_s`, at speed and at a
+    creep, whether its sensor is believed, and the limits that come of it."""
 
-    __match_args__ = ("device", "sensor", "read", "read_s", "limits")
+    __match_args__ = ("device", "sensor", "read", "read_s", "limits", "slow")
     __slots__ = __match_args__
 
     def __init__(
@@ -135,8 +140,10 @@ class Shown(Value):
         read: int = -1,
         read_s: float = -math.inf,
         limits: tuple[Limit, ...] = (),
+        slow: SlowFriction = NOTHING_SLOW,
     ) -> None:
         self.device: Final = device
+        self.slow: Final = slow
         self.sensor: Final = sensor
         self.read: Final = read
         self.read_s: Final = read_s
@@ -217,9 +224,10 @@ class Planner:
         self, state: PlanState, now_s: float, setpoint: TimedSetpoint | None, estimate: Estimate | None
     ) -> PlanState:
         """The next plan. `estimate` is None while the device has said nothing: nothing is learned of it then."""
-        model_N = self._mobilised_N(estimate)
+        model_N = self._model_N(estimate)
         shown = self._learn(state.shown, now_s, estimate, model_N)
-        device = shown.device
+        sliding_mm_s = MOVING_MM_S if estimate is None else estimate.handle.sliding_mm_s
+        device = shown.device.times(shown.slow.factor_at(sliding_mm_s))
         governor, governed = self._governor.govern(state.governor, now_s, setpoint, device, state.lag_s)
         lag_s = self._learn_lag(state, now_s, estimate, governed, device)
         is_meant = setpoint is not None and Limit.STALE not in governed.limits
@@ -258,7 +266,7 @@ class Planner:
             setpoint_N=None if setpoint is None else setpoint.force_N,
             setpoint_age_s=governed.age_s,
             governed_N=governed.force_N,
-            predicted_N=None if model_N is None else device.force_N(model_N),
+            predicted_N=_predicted_N(shown, estimate, model_N),
             field_mT=field_mT,
             gap_mm=gap_mm,
             gap_speed_mm_s=speed_mm_s,
@@ -285,9 +293,9 @@ class Planner:
                 rate_mm_s = abs(setpoint.rate_mm_s)
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
 
-    def _mobilised_N(self, estimate: Estimate | None) -> float | None:
-        """What the model says at the measured gap and rate; None before break-away, of which it knows nothing."""
-        if estimate is None or not estimate.is_homed or estimate.handle.displacement_mm < MOBILISED_MM:
+    def _model_N(self, estimate: Estimate | None) -> float | None:
+        """What the model says at the measured gap and rate of friction that is mobilised; None without a gap."""
+        if estimate is None or not estimate.is_homed:
             return None
         gap_mm = max(estimate.gap_mm, self._closed_mm - BEYOND_MM)
         curve = self._model.curve(
@@ -302,17 +310,27 @@ class Planner:
         fight the position loop. A sensor that is not believed teaches nothing, and what it has taught is forgotten."""
         if estimate is None or model_N is None or estimate.number == shown.read or now_s - shown.read_s < LESSON_S:
             return shown
+        slow = shown.slow.followed(model_N, estimate.handle_mm)
         rate_mm_s, reading_N = abs(estimate.handle.rate_mm_s), estimate.force_N
-        if rate_mm_s < MOVING_MM_S:
-            return shown
         elapsed_s = min(now_s - shown.read_s, LONGEST_LESSON_S)
+        if rate_mm_s < MOVING_MM_S or not _is_mobilised(estimate):
+            if shown.sensor.is_doubted:
+                slow = NOTHING_SLOW
+            elif SLOWEST_MM_S < rate_mm_s < MOVING_MM_S:
+                expected_N = shown.device.force_N(slow.followed_N)
+                # before it is mobilised friction is less than the model's; more is more all the same
+                if expected_N > LEAST_EXPECTED_N and (_is_mobilised(estimate) or reading_N > expected_N):
+                    slow = slow.observed(expected_N, rate_mm_s, reading_N, elapsed_s)
+            return Shown(shown.device, shown.sensor, estimate.number, now_s, shown.limits, slow)
         sensor = judge(shown.sensor, shown.device, model_N, rate_mm_s, reading_N, elapsed_s)
         if sensor.is_doubted:
             return Shown(UNSEEN, sensor, estimate.number, now_s, (Limit.SENSOR,))
         device, is_held = observe(
             shown.device, model_N, reading_N, elapsed_s, adapts_in_s=self._adapts_in_s, bounds=self._scales
         )
-        return Shown(device, sensor, estimate.number, now_s, (Limit.TRIM,) if is_held else ())
+        # what is known of a creep stays what it is while the rest is learned
+        slow = slow.beside(shown.device.force_N(model_N), device.force_N(model_N))
+        return Shown(device, sensor, estimate.number, now_s, (Limit.TRIM,) if is_held else (), slow)
 
     def _lawful_mT(self, solution: FieldSolution, wanted_N: float) -> float:
         """The search's field, no further than LAW_SHARE from the force law's."""
@@ -343,6 +361,20 @@ class Planner:
             acceleration += to_acceleration * away_mm
         fastest, hardest = self._fastest_mm_s, self._hardest_mm_s2
         return min(max(speed, -fastest), fastest), min(max(acceleration, -hardest), hardest)
+
+
+def _is_mobilised(estimate: Estimate) -> bool:
+    """Whether the handle has gone far enough one way, and not begun to come back: the model knows its friction then."""
+    handle = estimate.handle
+    gone_back_mm = abs(estimate.handle_mm - handle.turn.furthest_mm)
+    return handle.displacement_mm >= MOBILISED_MM and gone_back_mm <= GONE_BACK_MM
+
+
+def _predicted_N(shown: Shown, estimate: Estimate | None, model_N: float | None) -> float | None:
+    """The force that the device is expected to show; None before break-away, of which nothing is known."""
+    if estimate is None or model_N is None or not _is_mobilised(estimate):
+        return None
+    return shown.device.force_N(model_N) * shown.slow.factor_at(abs(estimate.handle.rate_mm_s))
 
 
 def _within(value: float, ends: tuple[float, float]) -> float:

@@ -1,0 +1,76 @@
+"""Friction at a creep: more is learned at once, less only as far as static friction differs, and nothing at speed."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tormagd.control.slow_friction import LEAST, MOST, NOTHING_SLOW, REACH_MM, STRIBECK_MM_S, SlowFriction
+
+PERIOD_S = 0.003
+
+
+def crept(share: float, seconds: float, rate_mm_s: float = 1.0, start: SlowFriction = NOTHING_SLOW) -> SlowFriction:
+    """After readings of `share` times what was expected at that rate."""
+    slow = start
+    for _ in range(round(seconds / PERIOD_S)):
+        slow = slow.observed(1.5, rate_mm_s, 1.5 * share, PERIOD_S)
+    return slow
+
+
+def test_what_a_creep_shows_is_learned_and_not_believed_at_speed() -> None:
+    slow = crept(1.2, 3.0)
+    assert slow.factor_at(1.0) == pytest.approx(1.2, abs=0.01)
+    assert slow.factor_at(0.0) > 1.2
+    assert slow.factor_at(3.0 * STRIBECK_MM_S) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_it_is_learned_within_the_time_that_a_person_takes_to_notice() -> None:
+    assert crept(1.2, 0.5).factor_at(1.0) > 1.12
+
+
+def test_a_reading_that_is_too_low_closes_the_gap_by_a_tenth_at_most() -> None:
+    """Nothing judges the sensor at a creep."""
+    assert crept(0.5, 10.0).factor == LEAST
+    assert crept(5.0, 10.0).factor == MOST
+
+
+def test_friction_follows_a_rise_over_travel_and_a_fall_at_once() -> None:
+    slow = NOTHING_SLOW.followed(1.0, 0.0)
+    assert slow.followed_N == 0.0  # nothing has been travelled
+    for step in range(1, 101):
+        slow = slow.followed(1.0, 0.01 * REACH_MM * step)
+    assert slow.followed_N == pytest.approx(1.0 - math.exp(-1.0), rel=1e-9)
+    assert slow.followed(0.3, REACH_MM).followed_N == 0.3
+    # the way back bends the bristles as well
+    assert slow.followed(1.0, 0.0).followed_N > slow.followed_N
+
+
+def test_beside_a_fit_that_learned_the_force_at_a_creep_stays() -> None:
+    slow = crept(1.1, 3.0)
+    assert slow.beside(1.0, 1.05).factor * 1.05 == pytest.approx(slow.factor, rel=1e-4)
+    assert slow.beside(1.0, 1.0) is slow
+    assert slow.beside(1.0, -0.1) is slow
+    assert crept(1.0, 9.0).beside(1.0, 0.5).factor == MOST
+    # of a creep that was never seen nothing is known but what the fit says
+    assert NOTHING_SLOW.beside(1.0, 0.8) == NOTHING_SLOW
+
+
+@given(
+    start=st.floats(LEAST, MOST),
+    events=st.lists(
+        st.tuples(
+            st.floats(0.1, 5.0), st.floats(0.0, 5.0), st.floats(-33.0, 33.0), st.floats(0.0, 0.02), st.floats(-9, 9)
+        ),
+        max_size=40,
+    ),
+)
+def test_nothing_leaves_its_bounds(start: float, events: list[tuple[float, float, float, float, float]]) -> None:
+    slow = SlowFriction(start)
+    for expected_N, rate_mm_s, reading_N, elapsed_s, handle_mm in events:
+        slow = slow.followed(expected_N, handle_mm).observed(expected_N, rate_mm_s, reading_N, elapsed_s)
+        slow = slow.beside(expected_N, abs(reading_N))
+        assert LEAST <= slow.factor <= MOST
+        assert 0.0 <= slow.followed_N <= 5.0
+        assert 0.85 <= slow.factor_at(rate_mm_s) <= MOST
