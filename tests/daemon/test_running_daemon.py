@@ -11,6 +11,7 @@ import pytest
 import zmq
 import zmq.asyncio
 
+from firmware_protocol.build import settle
 from tormagd.config import Config, Endpoints, RealTime
 from tormagd.control.core import Core, build_core
 from tormagd.control.plan import PlanState
@@ -93,6 +94,7 @@ def test_stop_without_a_device_says_that_there_is_none(core: Core, tmp_path: Pat
         assert await command("stop") == {"operating_state": "FAULT", "is_connected": False}
         status = await command("status")
         assert (status["faults"], status["governed_cf"], status["is_busy"]) == (["STOPPED"], None, False)
+        assert status["build"] == str(settle())
 
     run(core, tmp_path, operate)
 

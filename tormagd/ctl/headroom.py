@@ -123,11 +123,8 @@ def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: i
         if lateness_is_most:
             change = "the kernel wakes too late: the checks of real time above, fewer programs beside it"
         else:
-            change = (
-                f"compile the core: {REMEDY}"
-                if found.build == "interpreted"
-                else f"a faster processor, or less than {hz} Hz"
-            )
+            can_compile = found.build == "interpreted"
+            change = f"compile the core: {REMEDY}" if can_compile else f"a faster processor, or less than {hz} Hz"
     return Rate(loop, hz, configured, round(used, 3), used <= MOST_USED, change)
 
 
