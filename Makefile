@@ -40,7 +40,7 @@ model: $(VENV)/.dev
 	$(BIN)/python tools/bench_sweep.py --plant sample_1 --out build/bench_sweep.csv
 	$(BIN)/python tools/train_model.py build/bench_sweep.csv --element torque --insert MRE-50-40 --without-memory \
 	    --rising --hidden 40 --epochs 120 --validation-share 0.2 \
-	    --out tormagd/learning/models/torque_mre_50_40.safetensors --plot build/training.png
+	    --out tormagd/model/models/torque_mre_50_40.safetensors --plot build/training.png
 
 # docs/reproduction.md and docs/learned_inverse.md with their plots: the thesis's tables and figures beside ours
 reproduction: $(VENV)/.dev

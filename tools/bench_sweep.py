@@ -26,14 +26,14 @@ from tormagd.config import load_config
 from tormagd.control.plan import Plan
 from tormagd.control.portrait import FieldOfGap
 from tormagd.control.step import Stepper
-from tormagd.learning.dataset import Array, Dataset, write_csv
-from tormagd.learning.displacement import MOBILISED_MM
+from tormagd.model.displacement import MOBILISED_MM
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.inserts import insert
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.training.dataset import Array, Dataset, write_csv
 
 SWEEPS = 4
 BEYOND_MM = 2.0

@@ -45,8 +45,8 @@ from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.newton import RisingSearch
 from tormagd.inverse.scan import FieldScan
 from tormagd.inverse.solution import FieldSolver
-from tormagd.learning.metrics import falling_at
-from tormagd.learning.model_file import ForceModel
+from tormagd.model.model_file import ForceModel
+from tormagd.model.rising import falling_at
 from tormagd.physics.errors import DomainError
 from tormagd.physics.force import TORMAG
 from tormagd.scenes.scene import AUTO, load_scene, shipped_scenes

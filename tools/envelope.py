@@ -29,9 +29,9 @@ from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
-from tormagd.learning.displacement import MOBILISED_MM
-from tormagd.learning.model_file import load_model
-from tormagd.learning.shipped import model_path
+from tormagd.model.displacement import MOBILISED_MM
+from tormagd.model.model_file import load_model
+from tormagd.model.shipped import model_path
 from tormagd.physics.field import PowerFieldLaw, flux_density_T
 from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.physics.inserts import insert

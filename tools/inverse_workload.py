@@ -11,18 +11,18 @@ import numpy as np
 import numpy.typing as npt
 
 from tormagd.control.portrait import FieldOfGap
-from tormagd.learning.dataset import Dataset
-from tormagd.learning.features import Element, Scaling
-from tormagd.learning.levenberg_marquardt import train
-from tormagd.learning.metrics import fit_metrics
-from tormagd.learning.mlp import ForceNetwork, to_model
-from tormagd.learning.model_file import ForceModel, ModelMetadata
+from tormagd.model.features import Element, Scaling
+from tormagd.model.model_file import ForceModel, ModelMetadata
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.physics.friction import Friction
 from tormagd.physics.inserts import insert
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import radial_moment_Tm
+from tormagd.training.dataset import Dataset
+from tormagd.training.levenberg_marquardt import train
+from tormagd.training.metrics import fit_metrics
+from tormagd.training.mlp import ForceNetwork, to_model
 
 Array = npt.NDArray[np.float64]
 

@@ -20,8 +20,8 @@ from tactile_report import write_report
 from tactile_timing import solve_times
 from tqdm import tqdm
 
-from tormagd.learning.splits import random_split
 from tormagd.simulation.pad import PADS
+from tormagd.training.splits import random_split
 
 NOISES_N = (0.05, 0.5)
 TABLE_NOISE_N = 0.5

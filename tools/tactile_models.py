@@ -9,15 +9,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from tormagd.learning.baselines import ForestForward, SupportVectorForward
-from tormagd.learning.dataset import Array, Dataset
-from tormagd.learning.features import FEATURES, FIELD
-from tormagd.learning.forward import ForwardModel, NetworkForward
-from tormagd.learning.grey_box import GreyBox, GreyBoxForward
-from tormagd.learning.metrics import force_metrics, not_rising_share
-from tormagd.learning.model_file import ForceModel
-from tormagd.learning.recurrent import RecurrentForward
-from tormagd.learning.splits import Mask, leave_cycles_out, leave_one_out, random_split
+from tormagd.model.features import FEATURES, FIELD
+from tormagd.model.model_file import ForceModel
+from tormagd.model.rising import not_rising_share
 from tormagd.simulation.pad import (
     FULL_FIELD_MT,
     FULL_INDENTATION_MM,
@@ -30,6 +24,13 @@ from tormagd.simulation.pad import (
     holding_records,
     worked_pad,
 )
+from tormagd.training.baselines import ForestForward, SupportVectorForward
+from tormagd.training.dataset import Array, Dataset
+from tormagd.training.forward import ForwardModel, NetworkForward
+from tormagd.training.grey_box import GreyBox, GreyBoxForward
+from tormagd.training.metrics import force_metrics
+from tormagd.training.recurrent import RecurrentForward
+from tormagd.training.splits import Mask, leave_cycles_out, leave_one_out, random_split
 
 CIP = FEATURES.index("cip_percent")
 SCORED_SLOPE_N_MT = 0.03

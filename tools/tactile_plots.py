@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from tactile_models import SCORED_SLOPE_N_MT
 
-from tormagd.learning.dataset import Array
-from tormagd.learning.forward import NetworkForward
-from tormagd.learning.splits import Mask
 from tormagd.simulation.pad import PadRecord
+from tormagd.training.dataset import Array
+from tormagd.training.forward import NetworkForward
+from tormagd.training.splits import Mask
 
 CLASSES = {25.0: "MRE-A, 25 %", 35.0: "MRE-B, 35 %", 45.0: "MRE-C, 45 %"}
 SHOWN_FIELDS = (0, 3, 6, 10)

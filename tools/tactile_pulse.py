@@ -13,10 +13,10 @@ from tactile_models import PAD_IN_USE, SCORED_SLOPE_N_MT, Effort, Trained, plant
 from tormagd.inverse.linear import LinearFieldSearch
 from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.solution import FieldSolver, Reach
-from tormagd.learning.dataset import Array
-from tormagd.learning.grey_box import GreyBoxMemory
-from tormagd.learning.model_file import ForceModel
+from tormagd.model.model_file import ForceModel
 from tormagd.simulation.pad import FULL_FIELD_MT, FULL_INDENTATION_MM, PADS, PadParameters, drawn_pad, worked_pad
+from tormagd.training.dataset import Array
+from tormagd.training.grey_box import GreyBoxMemory
 
 SAMPLES = 4322
 RATE_HZ = 160

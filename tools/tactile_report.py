@@ -159,7 +159,7 @@ def _comparison(comparison: list[Json]) -> str:
     return (
         "## Forward models compared\n\n"
         + _text(
-            "One interface (`tormagd.learning.forward.ForwardModel`), the same third of the rows of all classes, MAE "
+            "One interface (`tormagd.training.forward.ForwardModel`), the same third of the rows of all classes, MAE "
             "in N on rows left out. The noise floor is that of table 4.1. *Held*: an hour at 4.5 mm, MRE-C, at two "
             "fields that no model has seen; only the models with a memory have seen holds at all. Memory is what a "
             "prediction needs. Pareto: no other is faster and as good on the random split. Times hold whatever else "
@@ -184,7 +184,7 @@ def _relaxation(series: Json) -> str:
     return (
         "## The relaxation-aware model\n\n"
         + _text(
-            "`tormagd.learning.grey_box`: a 4-30-1 network for the force without memory and a Prony series for each "
+            "`tormagd.training.grey_box`: a 4-30-1 network for the force without memory and a Prony series for each "
             "of its parts, the elastomer's and the field's. Fitted to the pad in use, MRE-C alone: its cycles and its "
             "five holds. Fractions found:"
         )

@@ -19,10 +19,10 @@ from tormagd.daemon.realtime import freeze_garbage
 from tormagd.inverse.bracketed import BracketedSearch, newton
 from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
 from tormagd.inverse.solution import FieldSolver
-from tormagd.learning.dataset import Array
-from tormagd.learning.features import FIELD
-from tormagd.learning.grey_box import GreyBoxMemory
-from tormagd.learning.model_file import ForceModel
+from tormagd.model.features import FIELD
+from tormagd.model.model_file import ForceModel
+from tormagd.training.dataset import Array
+from tormagd.training.grey_box import GreyBoxMemory
 
 USED = "nearest 2 mT"
 FIFO_PRIORITY = 50

@@ -12,13 +12,13 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from tormagd.learning.dataset import Dataset, DatasetError, read_csv
-from tormagd.learning.features import Element
-from tormagd.learning.fitting import fit_model
-from tormagd.learning.levenberg_marquardt import Epoch, Training
-from tormagd.learning.model_file import ForceModel, save_model
-from tormagd.learning.unremembered import Memory, identify
+from tormagd.model.features import Element
+from tormagd.model.model_file import ForceModel, save_model
 from tormagd.physics.errors import DomainError
+from tormagd.training.dataset import Dataset, DatasetError, read_csv
+from tormagd.training.fitting import fit_model
+from tormagd.training.levenberg_marquardt import Epoch, Training
+from tormagd.training.unremembered import Memory, identify
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:

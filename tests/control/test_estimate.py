@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from firmware_protocol.codec import Switches
 from tormagd.control.estimate import Estimate, first_estimate, update
-from tormagd.learning.displacement import MOBILISED_MM, TURN_MM
+from tormagd.model.displacement import MOBILISED_MM, TURN_MM
 
 HOME_MM = 47.5
 FILTER_S = 0.003

@@ -15,7 +15,7 @@ from tormagd.control.estimate import Estimate, Handle
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import LAW_SHARE, MOST_LAG_S, Outside, Plan, PlanState, Shown
 from tormagd.inverse.solution import FieldSolution, Reach
-from tormagd.learning.displacement import MOBILISED_MM, MOVING_MM_S, Turn
+from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
 from tormagd.safety.codes import Limit
 
 PERIOD_S = 0.004

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from tormagd.learning.features import UNITS, Element, Scaling
-from tormagd.learning.model_file import ForceModel, ModelMetadata
+from tormagd.model.features import UNITS, Element, Scaling
+from tormagd.model.model_file import ForceModel, ModelMetadata
 
 torch.set_num_threads(1)  # a second thread costs more than it saves at this size, and waits for a busy processor
 

@@ -9,7 +9,7 @@ from tormagd.inverse.direct import DirectInverse
 from tormagd.inverse.kd_tree import KdTreeSearch
 from tormagd.inverse.newton import ACCURACY_MT
 from tormagd.inverse.solution import Reach
-from tormagd.learning.model_file import ForceModel
+from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.physics.force import TORMAG
 from tormagd.physics.inserts import insert

@@ -13,7 +13,7 @@ from tormagd.inverse.bracketed import BracketedSearch
 from tormagd.inverse.choice import RUNTIME_SOLVERS, SAME_TIME, Variant, build, choose, named, solver_table
 from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.newton import RisingSearch
-from tormagd.learning.model_file import ForceModel
+from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.scenes.scene import Solver, load_scene, scene_path, shipped_scenes
 

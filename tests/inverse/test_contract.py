@@ -15,8 +15,8 @@ from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
 from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.newton import ACCURACY_MT, RisingSearch
 from tormagd.inverse.solution import FieldSolver, Reach
-from tormagd.learning.features import LARGEST
-from tormagd.learning.model_file import ForceModel
+from tormagd.model.features import LARGEST
+from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import radial_moment_from_flux_density_Tm
 from tormagd.physics.force import TORMAG, brake_force_N

@@ -13,8 +13,8 @@ from tormagd.inverse.linear import THESIS_EPSILON_N, LinearFieldSearch
 from tormagd.inverse.nearest import NearestFieldSearch, field_grid
 from tormagd.inverse.newton import RisingSearch
 from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
-from tormagd.learning.features import LARGEST
-from tormagd.learning.model_file import ForceModel
+from tormagd.model.features import LARGEST
+from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 
 RANGE_MT = (100.0, 800.0)

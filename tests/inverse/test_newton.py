@@ -8,8 +8,8 @@ from scipy.optimize import brentq
 
 from tormagd.inverse.newton import ACCURACY_MT, MOST_EVALUATIONS, RisingSearch
 from tormagd.inverse.solution import FieldSolution, Reach
-from tormagd.learning.force_curve import ForceCurve, Known, Network
-from tormagd.learning.model_file import ForceModel
+from tormagd.model.force_curve import ForceCurve, Known, Network
+from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 
 RANGE_MT = (100.0, 800.0)

@@ -12,9 +12,9 @@ from tormagd.control.plan import Planner
 from tormagd.control.portrait import FieldOfGap, Portrait, law_beside, portrait
 from tormagd.control.step import Stepper
 from tormagd.inverse.choice import Choice, build, choose, named, solver_table
-from tormagd.learning.metrics import falling_at
-from tormagd.learning.model_file import ForceModel, ModelFileError, load_model
-from tormagd.learning.shipped import model_path
+from tormagd.model.model_file import ForceModel, ModelFileError, load_model
+from tormagd.model.rising import falling_at
+from tormagd.model.shipped import model_path
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import Geometry

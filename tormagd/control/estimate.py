@@ -4,7 +4,7 @@ from typing import Final, final
 
 from firmware_protocol.value import Value
 from tormagd.hardware.measurement import Measurement
-from tormagd.learning.displacement import MOVING_MM_S, Turn
+from tormagd.model.displacement import MOVING_MM_S, Turn
 
 RATE_FILTER_S: Final = 0.05
 SLIDING_MM: Final = 0.3

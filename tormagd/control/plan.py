@@ -14,9 +14,9 @@ from tormagd.control.portrait import FieldOfGap, LawOfField, Portrait
 from tormagd.control.sensor import UNJUDGED, Sensor, judge
 from tormagd.control.slow_friction import NOTHING_SLOW, SLOWEST_MM_S, SlowFriction
 from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
-from tormagd.learning.displacement import MOBILISED_MM, MOVING_MM_S
-from tormagd.learning.features import FEATURES
-from tormagd.learning.model_file import ForceModel
+from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S
+from tormagd.model.features import FEATURES
+from tormagd.model.model_file import ForceModel
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Scene
 

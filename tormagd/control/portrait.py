@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tormagd.control.interpolation import interpolated
-from tormagd.learning.displacement import MOBILISED_MM
-from tormagd.learning.model_file import ForceModel
+from tormagd.model.displacement import MOBILISED_MM
+from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw, flux_density_T
 from tormagd.physics.force import Elastomer, Geometry, brake_force_N

@@ -34,7 +34,7 @@ EVERY = 4
 PACES = ("steadily, about 20 turns a minute", "slowly, about 10 turns a minute", "quickly, about 25 turns a minute")
 MOVING_MM_S = 5.0
 HANDLE_PATIENCE_S = 30.0
-FITTING = "tormagd.learning.calibration"
+FITTING = "tormagd.training.calibration"
 POLL_S = 0.2
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from tormagd.inverse.newton import ACCURACY_MT
 from tormagd.inverse.scan import FINEST_MT, Bracket, FieldScan
 from tormagd.inverse.solution import FieldSolution, answer
-from tormagd.learning.force_curve import ForceCurve
+from tormagd.model.force_curve import ForceCurve
 
 MOST_STEPS = 40
 """Bisection alone needs 20 from 1000 mT to `ACCURACY_MT`; twice that is for steps that alternate with it."""

@@ -3,9 +3,9 @@
 import math
 
 from tormagd.inverse.solution import FieldSolution, Reach, answer, checked_near_mT
-from tormagd.learning.features import Element
-from tormagd.learning.force_curve import ForceCurve
-from tormagd.learning.model_file import ForceModel
+from tormagd.model.features import Element
+from tormagd.model.force_curve import ForceCurve
+from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import flux_density_T, radial_moment_from_flux_density_Tm
 from tormagd.physics.force import Elastomer, Geometry, brake_force_N, radial_moment_for_force_Tm

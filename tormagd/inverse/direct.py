@@ -7,9 +7,9 @@ from torch import nn
 
 from tormagd.inverse.scan import FieldScan
 from tormagd.inverse.solution import FieldSolution, answer
-from tormagd.learning.features import FIELD
-from tormagd.learning.force_curve import ForceCurve
-from tormagd.learning.model_file import ForceModel
+from tormagd.model.features import FIELD
+from tormagd.model.force_curve import ForceCurve
+from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 
 SCAN_INTERVALS = 16

@@ -6,9 +6,9 @@ from scipy.spatial import cKDTree
 from tormagd.inverse.nearest import field_grid
 from tormagd.inverse.scan import FieldScan
 from tormagd.inverse.solution import FieldSolution, answer
-from tormagd.learning.features import FIELD
-from tormagd.learning.force_curve import EXTRAPOLATION_RATE, ForceCurve
-from tormagd.learning.model_file import ForceModel
+from tormagd.model.features import FIELD
+from tormagd.model.force_curve import EXTRAPOLATION_RATE, ForceCurve
+from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 
 SCAN_INTERVALS = 16

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tormagd.inverse.solution import FieldSolution, Reach, answer, checked_near_mT, tie_N
-from tormagd.learning.features import require_number
-from tormagd.learning.force_curve import Floats, ForceCurve
+from tormagd.model.features import require_number
+from tormagd.model.force_curve import Floats, ForceCurve
 from tormagd.physics.errors import DomainError
 
 MAX_GRID_POINTS = 100_000

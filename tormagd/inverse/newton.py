@@ -3,8 +3,8 @@
 from typing import Final, final
 
 from tormagd.inverse.solution import FieldSolution, Reach, answer, checked_near_mT, tie_N
-from tormagd.learning.features import require_number
-from tormagd.learning.force_curve import ForceCurve
+from tormagd.model.features import require_number
+from tormagd.model.force_curve import ForceCurve
 from tormagd.physics.errors import DomainError
 
 ACCURACY_MT: Final = 1e-3

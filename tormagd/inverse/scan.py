@@ -7,7 +7,7 @@ import numpy as np
 
 from tormagd.inverse.nearest import field_grid, require_precision
 from tormagd.inverse.solution import Reach, checked_near_mT, tie_N
-from tormagd.learning.force_curve import Floats, ForceCurve
+from tormagd.model.force_curve import Floats, ForceCurve
 
 FINEST_MT = 2.0
 """Grids are refined until their step is this small: around the nearest point where nothing crosses, too."""

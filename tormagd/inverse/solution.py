@@ -4,8 +4,8 @@ from enum import StrEnum
 from typing import Final, Protocol, final
 
 from firmware_protocol.value import Value
-from tormagd.learning.features import LARGEST, require_number
-from tormagd.learning.force_curve import ForceCurve
+from tormagd.model.features import LARGEST, require_number
+from tormagd.model.force_curve import ForceCurve
 
 
 class Reach(StrEnum):

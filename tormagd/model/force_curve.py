@@ -9,7 +9,7 @@ from typing import Final, Protocol, TypeAlias, final
 import numpy as np
 from numpy.typing import NDArray
 
-from tormagd.learning.features import FEATURES, FIELD, LARGEST, require_inputs
+from tormagd.model.features import FEATURES, FIELD, LARGEST, require_inputs
 
 EXTRAPOLATION_RATE: Final = 4.0
 """Confidence falls to 1/e when the inputs lie a quarter of their training range outside it, features summed."""

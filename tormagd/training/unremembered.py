@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from tormagd.learning.dataset import Dataset
-from tormagd.learning.features import FEATURES, FIELD
-from tormagd.learning.memory import records, times_of
+from tormagd.model.features import FEATURES, FIELD
 from tormagd.physics.relaxation import PronySeries
+from tormagd.training.dataset import Dataset
+from tormagd.training.memory import records, times_of
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,7 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import ArrayLike, NDArray
 
-from tormagd.learning.features import (
+from tormagd.model.features import (
     FEATURES,
     FIELD,
     LARGEST,
@@ -31,7 +31,7 @@ from tormagd.learning.features import (
     require_inputs,
     require_number,
 )
-from tormagd.learning.force_curve import ForceCurve, Known, Network
+from tormagd.model.force_curve import ForceCurve, Known, Network
 from tormagd.physics.errors import DomainError
 
 Array: TypeAlias = NDArray[np.float64]

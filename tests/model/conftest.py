@@ -5,8 +5,8 @@ import datetime
 import numpy as np
 import pytest
 
-from tormagd.learning.features import Element, Scaling
-from tormagd.learning.model_file import ForceModel, ModelMetadata
+from tormagd.model.features import Element, Scaling
+from tormagd.model.model_file import ForceModel, ModelMetadata
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from typing import TextIO, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from tormagd.learning.features import FEATURES
+from tormagd.model.features import FEATURES
 
 Array: TypeAlias = NDArray[np.float64]
 

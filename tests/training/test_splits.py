@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tormagd.learning.dataset import Dataset, DatasetError
-from tormagd.learning.splits import leave_cycles_out, leave_one_out, random_split
+from tormagd.training.dataset import Dataset, DatasetError
+from tormagd.training.splits import leave_cycles_out, leave_one_out, random_split
 
 
 @pytest.fixture

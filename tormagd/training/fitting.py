@@ -5,12 +5,13 @@ from collections.abc import Callable
 
 import msgspec
 
-from tormagd.learning.dataset import Dataset
-from tormagd.learning.features import Element, Scaling
-from tormagd.learning.levenberg_marquardt import Epoch, Training, train
-from tormagd.learning.metrics import fit_metrics, not_rising_share
-from tormagd.learning.mlp import ForceNetwork, to_model
-from tormagd.learning.model_file import ForceModel, ModelMetadata
+from tormagd.model.features import Element, Scaling
+from tormagd.model.model_file import ForceModel, ModelMetadata
+from tormagd.model.rising import not_rising_share
+from tormagd.training.dataset import Dataset
+from tormagd.training.levenberg_marquardt import Epoch, Training, train
+from tormagd.training.metrics import fit_metrics
+from tormagd.training.mlp import ForceNetwork, to_model
 
 
 def fit_model(

@@ -7,11 +7,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from tormagd.learning.dataset import Dataset
-from tormagd.learning.features import FEATURES, Scaling
-from tormagd.learning.forward import require_fitted
-from tormagd.learning.memory import records, times_of
-from tormagd.learning.splits import Mask
+from tormagd.model.features import FEATURES, Scaling
+from tormagd.training.dataset import Dataset
+from tormagd.training.forward import require_fitted
+from tormagd.training.memory import records, times_of
+from tormagd.training.splits import Mask
 
 Array = NDArray[np.float64]
 

@@ -7,13 +7,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tormagd.learning.dataset import Dataset
-from tormagd.learning.features import Element, Scaling
-from tormagd.learning.levenberg_marquardt import Training, train
-from tormagd.learning.mlp import ForceNetwork, to_model
-from tormagd.learning.model_file import ForceModel, ModelMetadata
-from tormagd.learning.splits import Mask, random_split
+from tormagd.model.features import Element, Scaling
+from tormagd.model.model_file import ForceModel, ModelMetadata
 from tormagd.physics.errors import DomainError
+from tormagd.training.dataset import Dataset
+from tormagd.training.levenberg_marquardt import Training, train
+from tormagd.training.mlp import ForceNetwork, to_model
+from tormagd.training.splits import Mask, random_split
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """From a bench sweep to a model file: training rows, a fit on some sweeps, a judgement on the others, or a refusal.
 
-    python -m tormagd.learning.calibration SWEEP.csv --insert NAME --out MODEL.safetensors [--csv TRAINING.csv]
-    python -m tormagd.learning.calibration --insert NAME     only says whether the insert is known
+    python -m tormagd.training.calibration SWEEP.csv --insert NAME --out MODEL.safetensors [--csv TRAINING.csv]
+    python -m tormagd.training.calibration --insert NAME     only says whether the insert is known
 
 A process of its own, so that neither the daemon nor `tormagctl`, which starts it, carries a training. Prints one JSON
 object: `{"result": {...}}`, or `{"error": {"code", "message", "hint"}}` with exit code 1 and no model file.
@@ -21,16 +21,16 @@ import msgspec
 import numpy as np
 from tqdm import tqdm
 
-from tormagd.learning.dataset import Array, Dataset, DatasetError, write_csv
-from tormagd.learning.displacement import MOBILISED_MM, MOVING_MM_S, displacement
-from tormagd.learning.features import FEATURES, FIELD, Element
-from tormagd.learning.fitting import fit_model
-from tormagd.learning.levenberg_marquardt import Epoch
-from tormagd.learning.metrics import fit_metrics
-from tormagd.learning.model_file import ForceModel, save_model
+from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, displacement
+from tormagd.model.features import FEATURES, FIELD, Element
+from tormagd.model.model_file import ForceModel, save_model
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw, flux_density_T
 from tormagd.physics.inserts import Insert, insert
+from tormagd.training.dataset import Array, Dataset, DatasetError, write_csv
+from tormagd.training.fitting import fit_model
+from tormagd.training.levenberg_marquardt import Epoch
+from tormagd.training.metrics import fit_metrics
 
 COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 """Of a sweep file: times of one device, the number of the sweep, the measured gap, the handle's travel at the roller,

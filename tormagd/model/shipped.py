@@ -3,7 +3,7 @@
 from importlib import resources
 from pathlib import Path
 
-from tormagd.learning.model_file import ModelFileError
+from tormagd.model.model_file import ModelFileError
 
 _MODELS = resources.files(__package__) / "models"
 _ENDING = ".safetensors"

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from sklearn.ensemble import RandomForestRegressor
 from sklearn.svm import SVR
 
-from tormagd.learning.dataset import Dataset
-from tormagd.learning.features import Scaling
-from tormagd.learning.forward import require_fitted
-from tormagd.learning.splits import Mask
+from tormagd.model.features import Scaling
+from tormagd.training.dataset import Dataset
+from tormagd.training.forward import require_fitted
+from tormagd.training.splits import Mask
 
 Array = NDArray[np.float64]
 

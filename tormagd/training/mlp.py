@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from tormagd.learning.features import FEATURES, Scaling
-from tormagd.learning.model_file import MAX_HIDDEN, ForceModel, ModelMetadata
+from tormagd.model.features import FEATURES, Scaling
+from tormagd.model.model_file import MAX_HIDDEN, ForceModel, ModelMetadata
 from tormagd.physics.errors import DomainError
 
 

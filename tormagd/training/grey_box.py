@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from tormagd.learning.dataset import Dataset
-from tormagd.learning.features import FEATURES, FIELD
-from tormagd.learning.forward import NetworkForward, require_fitted
-from tormagd.learning.memory import records, relaxed_N
-from tormagd.learning.model_file import ForceModel
-from tormagd.learning.splits import Mask
+from tormagd.model.features import FEATURES, FIELD
+from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.physics.relaxation import PronySeries
+from tormagd.training.dataset import Dataset
+from tormagd.training.forward import NetworkForward, require_fitted
+from tormagd.training.memory import records, relaxed_N
+from tormagd.training.splits import Mask
 
 Array = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tormagd.learning.dataset import Dataset
-from tormagd.learning.mlp import ForceNetwork
 from tormagd.physics.errors import DomainError
+from tormagd.training.dataset import Dataset
+from tormagd.training.mlp import ForceNetwork
 
 BATCH_ROWS = 4096
 """Rows of the Jacobian held at a time: 10 MB at 50 hidden units, whatever the size of the data set."""

@@ -8,8 +8,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from tormagd.learning.dataset import Dataset, write_csv
-from tormagd.learning.model_file import load_model
+from tormagd.model.model_file import load_model
+from tormagd.training.dataset import Dataset, write_csv
 
 TOOL = Path(__file__).parents[2] / "tools" / "train_model.py"
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch.func import functional_call, jacrev
 
-from tormagd.learning.dataset import Dataset
-from tormagd.learning.features import Scaling
-from tormagd.learning.levenberg_marquardt import Epoch, jacobian, train
-from tormagd.learning.mlp import ForceNetwork
+from tormagd.model.features import Scaling
 from tormagd.physics.errors import DomainError
+from tormagd.training.dataset import Dataset
+from tormagd.training.levenberg_marquardt import Epoch, jacobian, train
+from tormagd.training.mlp import ForceNetwork
 
 NOISE_N = 0.02
 

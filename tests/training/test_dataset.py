@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tormagd.learning.dataset import ALLOWED, COLUMNS, Dataset, DatasetError, read_csv, write_csv
+from tormagd.training.dataset import ALLOWED, COLUMNS, Dataset, DatasetError, read_csv, write_csv
 
 HEADER = "displacement_mm,rate_mm_s,field_mT,cip_percent,force_N"
 GOOD = "0.5,10,300,40,1.5"

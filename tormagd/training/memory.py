@@ -6,9 +6,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from tormagd.learning.dataset import Dataset
 from tormagd.physics.errors import DomainError
 from tormagd.physics.relaxation import PronySeries
+from tormagd.training.dataset import Dataset
 
 Array = NDArray[np.float64]
 

@@ -15,13 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from safetensors import safe_open
 
-from tormagd.learning import model_file
-from tormagd.learning.dataset import Dataset
-from tormagd.learning.features import FEATURES, LARGEST, UNITS, Element
-from tormagd.learning.metrics import fit_metrics, not_rising_share
-from tormagd.learning.mlp import to_model, to_network
-from tormagd.learning.model_file import ForceModel, ModelFileError, ModelMetadata, load_model, save_model
+from tormagd.model import model_file
+from tormagd.model.features import FEATURES, LARGEST, UNITS, Element
+from tormagd.model.model_file import ForceModel, ModelFileError, ModelMetadata, load_model, save_model
+from tormagd.model.rising import not_rising_share
 from tormagd.physics.errors import DomainError
+from tormagd.training.dataset import Dataset
+from tormagd.training.metrics import fit_metrics
+from tormagd.training.mlp import to_model, to_network
 
 POINT = (0.3, 12.0, 420.0, 40.0)
 

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from tormagd.learning.dataset import Dataset, DatasetError
-from tormagd.learning.features import FEATURES
+from tormagd.model.features import FEATURES
+from tormagd.training.dataset import Dataset, DatasetError
 
 Mask = NDArray[np.bool_]
 

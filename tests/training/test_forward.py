@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from tormagd.inverse.nearest import NearestFieldSearch
-from tormagd.learning.baselines import ForestForward, SupportVectorForward
-from tormagd.learning.dataset import Dataset
-from tormagd.learning.forward import ForwardModel, NetworkForward
-from tormagd.learning.grey_box import GreyBox, GreyBoxForward, GreyBoxMemory, fit_series
-from tormagd.learning.memory import relaxed_N
-from tormagd.learning.recurrent import RecurrentForward
 from tormagd.physics.errors import DomainError
 from tormagd.physics.relaxation import PronySeries
+from tormagd.training.baselines import ForestForward, SupportVectorForward
+from tormagd.training.dataset import Dataset
+from tormagd.training.forward import ForwardModel, NetworkForward
+from tormagd.training.grey_box import GreyBox, GreyBoxForward, GreyBoxMemory, fit_series
+from tormagd.training.memory import relaxed_N
+from tormagd.training.recurrent import RecurrentForward
 
 SERIES = PronySeries((0.02, 0.06, 0.04, 0.03), (1.2, 9.0, 120.0, 900.0))
 FIELD_SERIES = PronySeries((0.03, 0.09, 0.05, 0.02), (1.2, 9.0, 120.0, 900.0))

@@ -1,0 +1,66 @@
+"""What the daemon loads, in one place: a module more shows here, and nothing of the training comes with it."""
+
+import subprocess
+import sys
+
+LOADED = """
+import sys
+import tormagd.daemon.daemon, tormagd.daemon.main, tormagd.control.core
+import tormagd.hardware.serial_backend, tormagd.hardware.can_backend
+names = sorted(sys.modules)
+print(*[name for name in names if name.startswith(("tormagd.", "firmware_protocol.")) and "__mypyc" not in name])
+print(*sorted({name.partition(".")[0] for name in names} & set(sys.argv[1:])))
+"""
+ROOMS = {
+    "config",
+    "control",
+    "daemon",
+    "hardware",
+    "inverse",
+    "messages",
+    "model",
+    "output",
+    "physics",
+    "safety",
+    "scenes",
+}
+LIBRARIES = (
+    "can",
+    "matplotlib",
+    "mcap",
+    "msgpack",
+    "msgspec",
+    "numpy",
+    "pandas",
+    "safetensors",
+    "scipy",
+    "serial",
+    "torch",
+    "zmq",
+)
+
+
+def test_the_daemon_loads_the_model_and_nothing_of_its_training() -> None:
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", LOADED, *LIBRARIES], capture_output=True, text=True, check=True, timeout=60
+    )
+    ours, libraries = done.stdout.splitlines()
+    rooms = {name.split(".")[1] for name in ours.split() if name.startswith("tormagd.")}
+    assert rooms == ROOMS
+    assert {name for name in ours.split() if name.startswith("tormagd.model.")} == {
+        "tormagd.model.displacement",
+        "tormagd.model.features",
+        "tormagd.model.force_curve",
+        "tormagd.model.model_file",
+        "tormagd.model.rising",
+        "tormagd.model.shipped",
+    }
+    assert {name for name in ours.split() if name.startswith("tormagd.inverse.")} == {
+        "tormagd.inverse.bracketed",
+        "tormagd.inverse.choice",
+        "tormagd.inverse.nearest",
+        "tormagd.inverse.newton",
+        "tormagd.inverse.scan",
+        "tormagd.inverse.solution",
+    }
+    assert libraries.split() == ["can", "msgpack", "msgspec", "numpy", "safetensors", "serial", "zmq"]

@@ -1,1 +1,0 @@
-"""What was learned: data sets, the network, its training, model files."""

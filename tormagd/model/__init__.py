@@ -1,0 +1,1 @@
+"""What was learned, as data that the daemon loads: model files, the force curves in them, what their features mean."""

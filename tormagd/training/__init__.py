@@ -1,0 +1,1 @@
+"""How it is learned: data sets, networks, fits, splits and their metrics. Nothing here runs in the daemon."""
