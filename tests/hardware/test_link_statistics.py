@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from firmware_protocol.codec import Drive, DriveMode, Message
@@ -74,6 +74,7 @@ def test_an_answer_to_what_has_not_been_sent_ends_the_count() -> None:
 
 
 @settings(max_examples=25, deadline=None)
+@example(drift_ppm=0.638671875, offset_s=-180.0, seed=198, outlier_share=0.0)  # one step of the clock in all that time
 @given(
     drift_ppm=st.floats(-300.0, 300.0),
     offset_s=st.floats(-1e5, 1e5),
@@ -98,6 +99,7 @@ def test_offset_and_drift_are_found_behind_jitter_and_outliers(
     assert fit is not None
     assert fit.drift_ppm == pytest.approx(drift_ppm, abs=2.0)
     assert fit.residual_us < 20.0
+    assert fit.windows == 39
     newest_s = 20_000 * PERIOD_S
     device_s = (newest_s - offset_s) * (1.0 + drift_ppm * 1e-6)
     assert fit.offset_s == pytest.approx(newest_s - device_s, abs=2.5e-4 + abs(drift_ppm) * 1e-6)

@@ -25,7 +25,7 @@ MOST_RESIDUAL_US = 2_000.0
 NEWEST_WINDOWS = 3
 "Where none of the newest lies on the line, the clock has left it."
 CLOCK_STEP_S = 1e-5
-"The resolution of State.device_time_s; less than this is never an outlier."
+"The resolution of State.device_time_s; a window in the next step of it, with what jitter is left, is no outlier."
 
 
 Windows: TypeAlias = Sequence[tuple[float, float]]
@@ -172,7 +172,7 @@ def _robust_line(windows: Windows) -> tuple[ClockFit, bool]:
     slope = _median([(b[0] - a[0]) / (b[1] - a[1]) for a, b in zip(windows, windows[-half:], strict=False)])
     levels_s = [offset_s - slope * (time_s - newest_s) for offset_s, time_s in windows]
     level_s = _median(levels_s)
-    most_s = max(OUTLIER * 1.4826 * _median([abs(each_s - level_s) for each_s in levels_s]), CLOCK_STEP_S)
+    most_s = max(OUTLIER * 1.4826 * _median([abs(each_s - level_s) for each_s in levels_s]), 1.5 * CLOCK_STEP_S)
     on_line = [abs(each_s - level_s) <= most_s for each_s in levels_s]
     kept = list(compress(windows, on_line))
     centre_s = sum([time_s for _, time_s in kept], 0.0) / len(kept)
