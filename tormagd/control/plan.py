@@ -30,6 +30,8 @@ mm/s, 6% at a creep and 11% at 300 mm/s and the least force: the law knows neith
 LESSON_S: Final = 0.003
 LONGEST_LESSON_S: Final = 0.02
 "One reading teaches for the time since the last, no more often than that, however often is planned, and no longer."
+CREEPING_MM_S: Final = 1.2 * MOVING_MM_S
+"A handle that has slid no faster for some travel creeps; one that has slid faster only comes to rest."
 LEAST_EXPECTED_N: Final = 0.1
 "Of less force no share is told."
 GONE_BACK_MM: Final = 0.01
@@ -316,7 +318,7 @@ class Planner:
         if rate_mm_s < MOVING_MM_S or not _is_mobilised(estimate):
             if shown.sensor.is_doubted:
                 slow = NOTHING_SLOW
-            elif SLOWEST_MM_S < rate_mm_s < MOVING_MM_S:
+            elif SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S and estimate.handle.sliding_mm_s < CREEPING_MM_S:
                 expected_N = shown.device.force_N(slow.followed_N)
                 # before it is mobilised friction is less than the model's; more is more all the same
                 if expected_N > LEAST_EXPECTED_N and (_is_mobilised(estimate) or reading_N > expected_N):
