@@ -10,15 +10,20 @@ export OMP_NUM_THREADS ?= 1
 # which build of the core runs; where it is interpreted, why
 SAY_BUILD = $(BIN)/python -P -c 'from firmware_protocol.build import settle; print("the core runs", settle())'
 
+# what the core promises, asked of the other build as well; `tests/core` holds the two against each other to the bit
+CORE_TESTS := tests/control tests/safety tests/model tests/firmware_protocol/test_codec.py tests/firmware_protocol/test_framing.py \
+    tests/hardware/test_link.py tests/hardware/test_link_statistics.py tests/closed_loop/test_force_ceiling.py
+
 .PHONY: run test check format compile model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
 
-# -P: what its owner keeps in this folder is not imported in place of a module. The live tests keep time, so they have
-# the machine for themselves
+# -P: what its owner keeps in this folder is not imported in place of a module. The core's tests run on both builds. The
+# live tests keep time, so they have the machine for themselves
 test: check
 	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live'
+	TORMAG_COMPILED=0 $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' $(CORE_TESTS)
 	$(BIN)/python -P -m pytest -q -m live
 
 check: $(VENV)/.dev
