@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= auto
+SEARCHES ?= 5
 
 export OMP_NUM_THREADS ?= 1
 
@@ -14,7 +15,7 @@ SAY_BUILD = $(BIN)/python -P -c 'from firmware_protocol.build import settle; pri
 CORE_TESTS := tests/control tests/safety tests/model tests/firmware_protocol/test_codec.py tests/firmware_protocol/test_framing.py \
     tests/hardware/test_link.py tests/hardware/test_link_statistics.py tests/closed_loop/test_force_ceiling.py
 
-.PHONY: run test check format compile model reproduction evidence clean
+.PHONY: run test search check format compile model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -25,6 +26,13 @@ test: check
 	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live'
 	TORMAG_COMPILED=0 $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' $(CORE_TESTS)
 	$(BIN)/python -P -m pytest -q -m live
+
+# other cases of every property than those of `make test`, until one fails or SEARCHES rounds are done
+search: $(VENV)/.dev
+	for round in $$(seq $(SEARCHES)); do \
+	    $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' \
+	        --hypothesis-profile=search || exit 1; \
+	done
 
 check: $(VENV)/.dev
 	$(BIN)/python -P -m ruff check .

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
@@ -64,6 +64,9 @@ def test_the_field_of_a_force_is_found_again(units: Steps, field: float, last: f
 
 
 @given(units=steps, beyond=st.floats(1e-9, 1e6), last=lasts)
+@example(units=[], beyond=1e-9, last=103.0)
+@example(units=[], beyond=1.0, last=RANGE_MT[0] + 0.5 * ACCURACY_MT)
+@example(units=[], beyond=1.0, last=RANGE_MT[1] - 0.5 * ACCURACY_MT)
 def test_out_of_reach_is_the_end_and_says_so(units: Steps, beyond: float, last: float | None) -> None:
     curve = curve_of(units)
     least_N, most_N = (curve.force_N(field) for field in RANGE_MT)

@@ -315,13 +315,14 @@ class Planner:
         slow = shown.slow.followed(model_N, estimate.handle_mm)
         rate_mm_s, reading_N = abs(estimate.handle.rate_mm_s), estimate.force_N
         elapsed_s = min(now_s - shown.read_s, LONGEST_LESSON_S)
-        if rate_mm_s < MOVING_MM_S or not _is_mobilised(estimate):
+        is_mobilised = _is_mobilised(estimate)
+        if rate_mm_s < MOVING_MM_S or not is_mobilised:
             if shown.sensor.is_doubted:
                 slow = NOTHING_SLOW
             elif SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S and estimate.handle.sliding_mm_s < CREEPING_MM_S:
                 expected_N = shown.device.force_N(slow.followed_N)
                 # before it is mobilised friction is less than the model's; more is more all the same
-                if expected_N > LEAST_EXPECTED_N and (_is_mobilised(estimate) or reading_N > expected_N):
+                if expected_N > LEAST_EXPECTED_N and (is_mobilised or reading_N > expected_N):
                     slow = slow.observed(expected_N, rate_mm_s, reading_N, elapsed_s)
             return Shown(shown.device, shown.sensor, estimate.number, now_s, shown.limits, slow)
         sensor = judge(shown.sensor, shown.device, model_N, rate_mm_s, reading_N, elapsed_s)

@@ -152,7 +152,6 @@ class Stepper:
         self._gap_speed_mm_s = position.gap_speed_mm_s
         self._derivative_filter_s = position.derivative_filter_s
         self._synchronisation = position.synchronisation
-        self._duty_limit = position.duty_limit
         self._skew_warning_mm, self._skew_fault_mm = limits.skew_warning_mm, limits.skew_fault_mm
         self._following_error_mm, self._following_time_s = limits.following_error_mm, limits.following_time_s
         self._no_motion_duty, self._no_motion_time_s = limits.no_motion_duty, limits.no_motion_time_s
@@ -319,7 +318,7 @@ class Stepper:
         )
         # the bridges switch the device's real supply: the same volts take less duty of a higher one
         scale = self._supply_V / max(measurement.supply_V, 0.5 * self._supply_V)
-        most = self._duty_limit
+        most = self._gains.duty_limit
         output = StepOutput(
             DriveMode.RUN,
             min(max(left.duty * scale, -most), most),
@@ -348,7 +347,7 @@ class Stepper:
             motors_mm_s = min(max(shown_mm_s, motors_mm_s / 2.0), motors_mm_s)
         closing_mm_s = min(motors_mm_s, self._gap_speed_mm_s)
         # the magnets' pull helps to close, but a reserve is worth more there than a little speed
-        opening_mm_s = self._no_load_mm_s * (self._duty_limit - self._coulomb - pull)
+        opening_mm_s = self._no_load_mm_s * (self._gains.duty_limit - self._coulomb - pull)
         return Speeds(motors_mm_s, min(closing_mm_s, opening_mm_s), closing_mm_s)
 
     def _errors(self, expected: Expected, estimate: Estimate) -> tuple[Error, Error]:

@@ -24,9 +24,9 @@ EPS: Final = 2.0**-52
 class RisingSearch:
     """Newton's steps from the last field, or else from the least, in a bracket that is the whole range at first.
 
-    A rising force has one root at most: there is no look for others. A step out of the bracket goes to the end of the
-    range, once, or else halves the bracket, and so does a step that is not half of the one before. The answer is the
-    root to `ACCURACY_MT`; out of reach it is the end. Raises `DomainError` on a range that is none.
+    A rising force has one root at most: there is no look for others. A step to an end of the range or past it is a look
+    at that end, once; any other out of the bracket halves it, and so does a step that is not half of the one before.
+    The answer is the root to `ACCURACY_MT`; out of reach it is the end. Raises `DomainError` on a range that is none.
     """
 
     __slots__ = ("_high_mT", "_low_mT")
@@ -47,7 +47,7 @@ class RisingSearch:
         field = checked_near_mT(force_N, last_field_mT, low)
         field = low if field < low else high if field > high else field
         same_N = tie_N(curve, EPS)
-        left, right, low_is_new, high_is_new = low, high, True, True
+        left, right, left_seen, right_seen = low, high, False, False
         # a step leaves its square times this: a parabola's over the range at first, then as the last two steps show
         bend_per_mT, before = 1.0 / span, 2.0 * span
         predicted_N, evaluations = 0.0, 0
@@ -60,21 +60,21 @@ class RisingSearch:
             if excess_N < 0.0:
                 if field >= high:
                     return answer(curve, field, force_N, predicted_N, evaluations, Reach.ABOVE)
-                left = field
+                left, left_seen = field, True
             else:
                 if field <= low:
                     return answer(curve, field, force_N, predicted_N, evaluations, Reach.BELOW)
-                right = field
-            if right - left <= ACCURACY_MT or evaluations >= MOST_EVALUATIONS:
+                right, right_seen = field, True
+            # an end of the range that was not looked at does not close the bracket: the force may be out of reach
+            if (left_seen and right_seen and right - left <= ACCURACY_MT) or evaluations >= MOST_EVALUATIONS:
                 break
-            low_is_new, high_is_new = low_is_new and field > low, high_is_new and field < high
             # a slope that rounding made flat gives no direction, but the force rises
             step = -excess_N / slope if slope > 0.0 else span if excess_N < 0.0 else -span
             following = field + step
-            if following >= high and high_is_new:
-                following = high
-            elif following <= low and low_is_new:
-                following = low
+            if following > right - ACCURACY_MT and not right_seen:
+                following = right
+            elif following < left + ACCURACY_MT and not left_seen:
+                following = left
             elif not left < following < right or 2.0 * abs(step) > abs(before):
                 following = 0.5 * (left + right)
             else:

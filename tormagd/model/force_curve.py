@@ -9,7 +9,7 @@ from typing import Final, Protocol, TypeAlias, final
 import numpy as np
 from numpy.typing import NDArray
 
-from tormagd.model.features import FEATURES, FIELD, LARGEST, require_inputs
+from tormagd.model.features import FEATURES, FIELD, require_inputs
 
 EXTRAPOLATION_RATE: Final = 4.0
 """Confidence falls to 1/e when the inputs lie a quarter of their training range outside it, features summed."""
@@ -114,12 +114,7 @@ class Network:
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> "NetworkCurve":
         """The curve for a state of the handle. Raises `DomainError` naming what is not finite, or too large."""
-        if not (
-            -LARGEST <= displacement_mm <= LARGEST
-            and -LARGEST <= rate_mm_s <= LARGEST
-            and -LARGEST <= cip_percent <= LARGEST
-        ):
-            require_inputs(displacement_mm, rate_mm_s, 0.0, cip_percent)
+        require_inputs(displacement_mm, rate_mm_s, 0.0, cip_percent)
         shift = [
             bias + by_mm * displacement_mm + by_mm_s * rate_mm_s + by_percent * cip_percent
             for bias, by_mm, by_mm_s, by_percent in zip(self.bias, self.displacement, self.rate, self.cip)  # noqa: B905
