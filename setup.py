@@ -39,6 +39,7 @@ COMPILED = {
         *("periodicity", "governor", "plan", "motor", "step", "conditions"),
     ),
     "tormagd/simulation": ("curve", "axis", "element", "hand", "plant", "motion", "firmware", "device"),
+    "tormagd/daemon": ("rate_group", "telemetry"),
     "tormagd": ("closed_loop",),
 }
 SOURCES = [f"{folder}/{name}.py" for folder, names in COMPILED.items() for name in names]

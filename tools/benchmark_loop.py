@@ -362,7 +362,7 @@ def daemon_process(folder: Path, realtime: RealTime, setpoint_hz: int = SETPOINT
 def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
     """The same for any stand."""
     with contextlib.ExitStack() as stack:
-        ours = environment(None)
+        ours, theirs = environment(None), environment(stand.root)
         simulator = subprocess.Popen(
             [sys.executable, "-P", "-m", "tormagd.simulation", "--pty", "--baud", str(stand.baud)],
             stdout=subprocess.PIPE,
@@ -379,19 +379,19 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
         times = folder / "writes"
         process = subprocess.Popen(
             [sys.executable, "-P", str(TOOLS / "benchmark_written.py"), str(times), "--config", str(path)],
-            env=environment(stand.root),
+            env=theirs,
             stderr=subprocess.DEVNULL,
         )
         stack.callback(end, process)
         ctl = [sys.executable, "-P", "-m", "tormagd.ctl.main", "--config", str(path), "--wait", "20"]
         wait_for(config.endpoints.control)
         for command in ("home", "enable"):
-            subprocess.run([*ctl, command], check=True, capture_output=True, env=ours)
+            subprocess.run([*ctl, command], check=True, capture_output=True, env=theirs)
         if stand.setpoint_hz:
             publisher = subprocess.Popen(
                 [*ctl, "send", "pulse", "--rate", str(stand.setpoint_hz), "--duration", "3600"],
                 stdout=subprocess.DEVNULL,
-                env=ours,
+                env=theirs,
             )
             stack.callback(end, publisher)
         yield Running(config, process.pid, times)

@@ -1,24 +1,25 @@
 """How well one rate group keeps its time: rate, lateness, execution, overruns, merged ticks."""
 
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Final, NamedTuple, final
 
 from msgspec.structs import asdict
 
 from tormagd.messages import ExecReport, LatenessReport, RateReport
 
-WARNING_PERIODS = 1.0
+WARNING_PERIODS: Final = 1.0
 "A run that is done later than this after it was due has overrun: the next one was due already."
-ERROR_PERIODS = 10.0
+ERROR_PERIODS: Final = 10.0
 "This late it is a stall; at 1 kHz a fifth of the time after which the firmware opens the gap."
-HORIZON_NS = 5_000_000_000
+HORIZON_NS: Final = 5_000_000_000
 "Percentiles cover the time since one to two of these ago."
 SHARES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
-_EXACT = 64  # bins of one microsecond each; beyond, 32 bins for each doubling: 3% resolution
-_DOUBLINGS = 20
-_BINS = _EXACT + 32 * _DOUBLINGS
+_EXACT: Final = 64  # bins of one microsecond each; beyond, 32 bins for each doubling: 3% resolution
+_DOUBLINGS: Final = 20
+_BINS: Final = _EXACT + 32 * _DOUBLINGS
 
 
+@final
 class Histogram:
     """Durations in microseconds, counted in bins. Adding costs a fraction of a microsecond, whatever has been added."""
 
@@ -86,6 +87,7 @@ class _Mark(NamedTuple):
     stalls: int
 
 
+@final
 class RateGroup:
     """Timing of one periodic activity. Recording is cheap; a report is built by `refresh`, and only read by others."""
 
@@ -112,7 +114,7 @@ class RateGroup:
     def record(self, due_ns: int, start_ns: int, end_ns: int, merged: int = 0) -> None:
         """One run that was due, began and ended at these times, and stands for `merged` missed ones too."""
         if self._marks is None:
-            self._marks = (_Mark(start_ns, 0, 0, 0),) * 2
+            self._marks = (_Mark(start_ns, 0, 0, 0), _Mark(start_ns, 0, 0, 0))
         elif start_ns - self._marks[1].time_ns > HORIZON_NS:
             self._marks = (self._marks[1], _Mark(start_ns, self.runs, self.overruns, self.stalls))
             self._lateness.turn()
