@@ -29,6 +29,7 @@ COMPILED = {
             "estimate",
             "device_fit",
             "slow_friction",
+            "sensor_zero",
             "sensor",
             "sight",
             "pid",

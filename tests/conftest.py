@@ -23,8 +23,8 @@ from host import HostWatch
 
 from firmware_protocol.build import SWITCH, settle
 
-# No test asserts a wall-clock duration, so none fails because the machine is slow. One commit has one verdict: the cases
-# of a property are drawn from its source, and `make search` draws others; what it finds becomes an `@example`
+# No test asserts a wall-clock duration, so none fails because the machine is slow. One commit has one verdict: a
+# property's cases are drawn from its source, and `make search` draws others; what it finds becomes an `@example`
 UNHURRIED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("tormagd", UNHURRIED, derandomize=True)
 settings.register_profile("search", UNHURRIED, print_blob=True)

@@ -201,7 +201,8 @@ class ClosedLoop:
             return
         is_new = setpoint is not None and setpoint.stamp_s > self.plan_state.governor.stamp_s
         if is_new or now_s - self.plan_state.plan.time_s >= self._inference_s - 1e-9:
-            self.plan_state = self._planner.plan(self.plan_state, now_s, setpoint, self.step_state.estimate)
+            planned = self._planner.plan(self.plan_state, now_s, setpoint, self.step_state.estimate)
+            self.plan_state = self._planner.foresee(planned)
 
     def _until(self, reached: Callable[[Measurement], bool], what: str, plan: Plan | None) -> None:
         for _ in range(round(HOMING_S / self._period_s)):

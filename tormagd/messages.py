@@ -210,12 +210,15 @@ class RateReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class DeviceReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The device as far as it has shown itself: its force is `scale` times the model's plus `offset_N`."""
+    """The device as far as it has shown itself: its force is `scale` times the model's plus `offset_N`; and what its
+    force sensor reads without one."""
 
     scale: float
     scale_sd: float
     offset_N: float
     offset_sd_N: float
+    sensor_zero_N: float
+    sensor_zero_sd_N: float
 
 
 class StallReport(msgspec.Struct, frozen=True):

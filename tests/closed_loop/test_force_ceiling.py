@@ -13,6 +13,7 @@ from tormagd.control.core import Core, build_core
 from tormagd.control.governor import Governor, TimedSetpoint
 from tormagd.control.plan import Plan
 from tormagd.control.portrait import Portrait
+from tormagd.control.sensor_zero import UNKNOWN_SD_N
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd.simulation.device import VirtualDevice
@@ -126,11 +127,59 @@ def test_an_offset_from_the_beginning_is_told_from_a_scale(lie: str) -> None:
 
 
 def test_a_sensor_that_reads_a_little_too_much_from_the_beginning_presses_less() -> None:
-    """It cannot be told from a stronger device with another field law; what it does is on the safe side."""
+    """As long as the handle goes one way it cannot be told from a stronger device with another field law; what it does
+    is on the safe side."""
     loop = joined(build_core(CONFIG))
     LyingSensor(loop.device, LIES["+0.3 N"]())
     loop.arm()
     assert worst_N(render(loop, ASKED_N, 3.0)) < ASKED_N
+
+
+@pytest.mark.parametrize("lie", ["+0.3 N", "-0.3 N"])
+def test_a_reversal_names_a_zero_that_was_wrong_from_the_beginning(lie: str) -> None:
+    loop = joined(build_core(CONFIG), hand=ReversingHand(4.0))
+    LyingSensor(loop.device, LIES[lie]())
+    loop.arm()
+    samples = render(loop, ASKED_N, 6.0)
+    told = {limit for sample in samples for limit in sample.plan.limits}
+    assert {Limit.SENSOR, Limit.SENSOR_ZERO} <= told
+    assert worst_N(samples) < ASKED_N + 0.3
+
+
+@pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
+def test_a_zero_that_drifts_is_taken_off_where_the_handle_turns(sample: str) -> None:
+    """By 0.2 N a minute, forty times what the plant card has, and turning every 2 s."""
+    loop = joined(build_core(CONFIG), sample, ReversingHand(4.0))
+    loop.arm()
+    render(loop, ASKED_N, 4.0)
+    start_s = loop.device.truth.time_s
+    LyingSensor(loop.device, lambda reading_N: reading_N + 0.2 / 60.0 * (loop.device.truth.time_s - start_s))
+    samples = render(loop, ASKED_N, 60.0)
+    sliding = [abs(each.truth.force_N) for each in samples if each.time_s > samples[-1].time_s - 8.0 and slides(each)]
+    assert np.mean(sliding) == pytest.approx(ASKED_N, abs=0.02)
+    assert np.std(sliding) < 0.04
+    assert Limit.SENSOR not in samples[-1].plan.limits
+
+
+def slides(sample: Sample) -> bool:
+    estimate = sample.state.estimate
+    return estimate is not None and estimate.handle.rate_mm_s > 20.0 and estimate.handle.displacement_mm >= 2.0
+
+
+def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_off() -> None:
+    loop = joined(build_core(CONFIG))
+    loop.arm()
+    render(loop, ASKED_N, 2.0)
+    assert loop.plan_state is not None
+    before = loop.plan_state.device
+    # as after ten minutes of turning the one way
+    aged = loop.plan_state.shown.zero.replaced(variance_N2=1.01 * UNKNOWN_SD_N**2)
+    loop.plan_state = loop.plan_state.replaced(shown=loop.plan_state.shown.replaced(zero=aged))
+    LyingSensor(loop.device, lambda reading_N: reading_N + 0.1)
+    samples = render(loop, ASKED_N, 3.0)
+    assert samples[-1].plan.limits == (Limit.OFFSET_UNKNOWN,)
+    assert loop.plan_state.device == before
+    assert abs(samples[-1].truth.force_N) == pytest.approx(ASKED_N, abs=0.05)
 
 
 def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it() -> None:

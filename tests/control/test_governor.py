@@ -27,6 +27,9 @@ AFTER_S = np.array(PATH_S)
 VALID_S = 0.1
 
 
+GOVERNOR = Governor(PORTRAIT, SCENE, LIMITS, GAP_SPEED_MM_S)
+
+
 def decide(
     state: GovernorState,
     now_s: float,
@@ -211,6 +214,7 @@ def beaten(seconds: float) -> GovernorState:
     state = GovernorState(0.0, 0.4)
     for tick in range(1, round(500 * seconds) + 1):
         state, _ = decide(state, tick / 500, TimedSetpoint(beats_N(tick / 500), tick / 500, VALID_S))
+        state = GOVERNOR.foresee(state)
     return state
 
 
@@ -225,7 +229,7 @@ def test_a_force_that_repeats_itself_is_foreseen(learned: GovernorState) -> None
     for tick in range(5_001, 5_501):
         now_s = tick / 500
         setpoint = TimedSetpoint(beats_N(now_s), now_s, VALID_S)
-        state, governed = decide(state, now_s, setpoint, lag_s=0.01)
+        state, governed = decide(GOVERNOR.foresee(state), now_s, setpoint, lag_s=0.01)
         _, blind = decide(state.replaced(periodicity=NOTHING_LEARNED), now_s, setpoint)
         assert governed.foresight > 0.9
         assert governed.limits == ()

@@ -18,6 +18,7 @@ from tormagd.control.periodicity import (
     Periodicity,
     Skill,
     forecast_N,
+    foreseen,
     observe,
 )
 
@@ -55,6 +56,11 @@ class Followed(NamedTuple):
         return tuple(float(np.sqrt(np.mean(error[inside] ** 2))) for error in (self.slope_N, self.mixture_N))
 
 
+def after(state: Periodicity, stamp_s: float, force_N: float, slope_N_s: float) -> Periodicity:
+    """With one setpoint more, and a forecast from it."""
+    return foreseen(observe(state, stamp_s, force_N), slope_N_s)
+
+
 def follow(times_s: Array, forces_N: Array) -> Followed:
     """Each setpoint observed, and what would have been planned for beside what came."""
     state, rows = NOTHING_LEARNED, []
@@ -62,7 +68,7 @@ def follow(times_s: Array, forces_N: Array) -> Followed:
     for before, (time_s, force_N) in enumerate(zip(times_s[1:].tolist(), forces_N[1:].tolist(), strict=True)):
         steepness = (force_N - forces_N[before]) / (time_s - times_s[before])
         slope_N_s += 0.5 * (float(np.clip(steepness, -STEEPEST_N_S, STEEPEST_N_S)) - slope_N_s)
-        state = observe(state, time_s, force_N, slope_N_s)
+        state = after(state, time_s, force_N, slope_N_s)
         slope_N = force_N + slope_N_s * np.minimum(AHEAD_S, 0.05)
         trust = state.trust
         mixture_N = (
@@ -81,7 +87,7 @@ def learned(seconds: float = 4.0, rate_hz: int = 200) -> Periodicity:
     forces_N = pulse_N(times_s)
     state = NOTHING_LEARNED
     for time_s, force_N, slope_N_s in zip(times_s, forces_N, np.gradient(forces_N, times_s), strict=True):
-        state = observe(state, float(time_s), float(force_N), float(slope_N_s))
+        state = after(state, float(time_s), float(force_N), float(slope_N_s))
     return state
 
 
@@ -170,32 +176,40 @@ def test_after_a_jump_nothing_is_forecast() -> None:
     """No remembered stretch is like one with a jump in it, and a regression would carry it on."""
     state = learned()
     assert state.trust > 0.0
-    while (state := observe(state, state.stamp_s + 0.005, 0.8, 0.0)).stamp_s < 4.03:
+    while (state := after(state, state.stamp_s + 0.005, 0.8, 0.0)).stamp_s < 4.03:
         assert state.time_s < 4.0 or (state.changes_N, state.trust) == ([], 0.0)
 
 
 def test_a_gap_or_a_stamp_from_before_begins_anew() -> None:
     state = learned()
     for stamp_s in (state.stamp_s + LONGEST_STEP_S + 1e-6, state.stamp_s - 1.1 * GRID_S, -5.0):
-        fresh = observe(state, stamp_s, 1.5, 0.0)
+        fresh = observe(state, stamp_s, 1.5)
         assert fresh.trust == 0.0
         assert (fresh.stamp_s, fresh.time_s, np.frombuffer(fresh.history).tolist()) == (stamp_s, stamp_s, [1.5])
-    kept = observe(state, state.stamp_s + LONGEST_STEP_S - 1e-6, 1.5, 0.0)
+    kept = observe(state, state.stamp_s + LONGEST_STEP_S - 1e-6, 1.5)
     assert len(kept.history) > len(state.history)
 
 
 def test_a_stamp_again_counts_once_with_its_newest_force() -> None:
     state = learned()
-    assert observe(state, state.stamp_s, state.force_N, 0.0) is state
+    assert observe(state, state.stamp_s, state.force_N) is state
     for back_s in (0.0, 0.003):
-        other = observe(state, state.stamp_s - back_s, 1.7, 0.0)
+        other = observe(state, state.stamp_s - back_s, 1.7)
         assert (other.history, other.stamp_s, other.force_N) == (state.history, state.stamp_s, 1.7)
         assert forecast_N(other, 0.0, [0.0]) == pytest.approx([1.7])
 
 
+def test_a_forecast_is_looked_for_once_for_each_point_of_the_grid() -> None:
+    state = learned()
+    assert foreseen(state, 0.0) is state
+    passed = observe(state, state.time_s + GRID_S, 1.5)
+    assert passed.changes_N == state.changes_N
+    assert foreseen(passed, 0.0).from_s == passed.time_s
+
+
 def test_the_forecast_starts_at_the_newest_setpoint_between_two_points_of_the_grid() -> None:
     state = learned()
-    state = observe(state, state.stamp_s + 0.004, 1.5, 0.0)
+    state = observe(state, state.stamp_s + 0.004, 1.5)
     assert state.stamp_s - state.time_s > 0.003
     assert forecast_N(state, 0.0, [0.0]) == pytest.approx([1.5])
 
@@ -207,7 +221,7 @@ def test_memory_is_bounded() -> None:
 def test_a_constant_force_for_ever_is_no_division_by_zero() -> None:
     state = NOTHING_LEARNED
     for tick in range(300):
-        state = observe(state, tick * GRID_S, 1.5, 0.0)
+        state = after(state, tick * GRID_S, 1.5, 0.0)
     state = state.replaced(long=Skill(0.0, 0.0))
     assert state.trust == 0.0
     assert np.array(forecast_N(state, 0.0, AHEAD_S.tolist())) == pytest.approx(np.full(3, 1.5))
@@ -233,7 +247,7 @@ def test_nan_never_travels_and_a_replay_is_exact(setpoints: list[tuple[float, fl
     def replay() -> list[Periodicity]:
         states = [LEARNED]
         for step_s, force_N, slope_N_s in setpoints:
-            states.append(observe(states[-1], states[-1].stamp_s + step_s, force_N, slope_N_s))
+            states.append(after(states[-1], states[-1].stamp_s + step_s, force_N, slope_N_s))
         return states
 
     before = LEARNED.history

@@ -168,7 +168,7 @@ def swung(core: Core, late_s: float, *, is_known: bool, seconds: float = 10.0) -
         estimate = moving(gap_mm(come_s), left_mm_s=side_mm_s, right_mm_s=side_mm_s, handle=RESTING.handle)
         ahead = tuple(force_N(now_s + 2e-3 * k) for k in range(1, 40)) if is_known else ()
         setpoint = TimedSetpoint(force_N(now_s), now_s, 0.1, preview_N=ahead, preview_dt_s=2e-3)
-        state = core.planner.plan(state, now_s, setpoint, estimate)
+        state = core.planner.foresee(core.planner.plan(state, now_s, setpoint, estimate))
     return state
 
 

@@ -119,6 +119,7 @@ def hostile(core: Core, seen: Digest) -> None:
                 try:
                     planned = core.planner.plan(planned, now_s, setpoint, state.estimate)
                     seen.see((planned, planned.trim))
+                    planned = core.planner.foresee(planned)
                 except (ValueError, OverflowError) as error:  # of what is not finite, and no wire brings
                     seen.see(error)
                     planned = core.planner.start(now_s)

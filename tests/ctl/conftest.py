@@ -83,7 +83,14 @@ def status(**changes: Any) -> dict[str, Any]:
             "least_N": 0.6,
             "most_N": 4.0,
             "trim": 1.0,
-            "device": {"scale": 1.0, "scale_sd": 0.1, "offset_N": 0.0, "offset_sd_N": 0.1},
+            "device": {
+                "scale": 1.0,
+                "scale_sd": 0.1,
+                "offset_N": 0.0,
+                "offset_sd_N": 0.1,
+                "sensor_zero_N": 0.0,
+                "sensor_zero_sd_N": 0.02,
+            },
             "least_gap_mm": 30.0,
             "link": LINK,
             "setpoints": {

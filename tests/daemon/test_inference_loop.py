@@ -25,13 +25,17 @@ class Rig:
         self.plan_ns = 60 * US
         self.has_arrived = False
         self.planned_ns: list[int] = []
-        planner: Any = SimpleNamespace(start=lambda now_s: None, plan=self.plan)
+        self.foreseen_ns: list[int] = []
+        planner: Any = SimpleNamespace(start=lambda now_s: None, plan=self.plan, foresee=self.foresee)
         endpoint: Any = SimpleNamespace(drain_setpoints=self.drain, inbox=SimpleNamespace(newest=None))
         self.loop = InferenceLoop(planner, endpoint, DUE_NS, 0.0, lambda: self.now_ns, on_failure=pytest.fail)
 
     def plan(self, *_arguments: Any) -> None:
         self.planned_ns.append(self.now_ns)
         self.now_ns += self.plan_ns
+
+    def foresee(self, state: None) -> None:
+        self.foreseen_ns.append(self.now_ns)
 
     def drain(self, _now_s: float) -> bool:
         arrived, self.has_arrived = self.has_arrived, False
@@ -132,6 +136,15 @@ def test_one_interrupted_plan_does_not_keep_the_slack_from_the_next(rig: Rig) ->
     assert len(rig.planned_ns) == 1
 
 
+def test_what_the_next_plans_need_is_prepared_after_a_tick_and_not_while_a_setpoint_waits(rig: Rig) -> None:
+    start_ns = rig.now_ns
+    rig.setpoint(start_ns + 900 * US, start_ns + TICK_NS)
+    assert rig.foreseen_ns == []
+    rig.now_ns = start_ns + TICK_NS
+    rig.loop.after_tick(None)
+    assert rig.foreseen_ns == [rig.now_ns]
+
+
 @pytest.mark.parametrize("error", [DomainError("displacement_mm", 1e10, "less"), ZeroDivisionError(), RuntimeError()])
 def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on(rig: Rig, error: Exception) -> None:
     """The one that makes planning fail would make it fail again and again."""
@@ -144,7 +157,9 @@ def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on
         return state.replaced(plan=state.plan.replaced(number=state.plan.number + 1))
 
     resting = Plan(0, 0.0, None, None, 0.5, None, 50.0, 95.0, 0.0, 1.0, ())
-    planner: Any = SimpleNamespace(start=lambda now_s: PlanState(GovernorState(now_s, 0.5), resting), plan=plan)
+    planner: Any = SimpleNamespace(
+        start=lambda now_s: PlanState(GovernorState(now_s, 0.5), resting), plan=plan, foresee=lambda state: state
+    )
     endpoint: Any = SimpleNamespace(drain_setpoints=rig.drain, inbox=inbox)
     loop = InferenceLoop(planner, endpoint, DUE_NS, 0.0, lambda: rig.now_ns, on_failure=lambda: failures.append(None))
     inbox.newest = TimedSetpoint(1.0, 0.0, 0.1)

@@ -48,7 +48,7 @@ class FailingPlanner:
 
     def __init__(self, core: Core) -> None:
         self._planner = core.planner
-        self.portrait, self.start = core.planner.portrait, core.planner.start
+        self.portrait, self.start, self.foresee = core.planner.portrait, core.planner.start, core.planner.foresee
         self.error: Exception | None = None
 
     def plan(self, *arguments: Any) -> PlanState:

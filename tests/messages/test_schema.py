@@ -46,7 +46,7 @@ V1: dict[type[msgspec.Struct], str] = {
     RateReport: "grade hz runs merged overruns stalls lateness_us exec_us",
     LatenessReport: "p50 p99 p999 max worst",
     ExecReport: "p50 p99 p999 max",
-    DeviceReport: "scale scale_sd offset_N offset_sd_N",
+    DeviceReport: "scale scale_sd offset_N offset_sd_N sensor_zero_N sensor_zero_sd_N",
     Explained: "code cause remedy",
     StallReport: "ms culprit",
     TickRecord: "t_ns monotonic_s plan setpoint_cf plan_setpoint_age_s governed_cf plan_governed_cf predicted_cf "

@@ -6,7 +6,7 @@ from typing import Final, final
 from firmware_protocol.value import Value
 from tormagd.config import Limits
 from tormagd.control.device_fit import DeviceFit
-from tormagd.control.periodicity import LONGEST_STEP_S, NOTHING_LEARNED, Periodicity, forecast_N, observe
+from tormagd.control.periodicity import LONGEST_STEP_S, NOTHING_LEARNED, Periodicity, forecast_N, foreseen, observe
 from tormagd.control.portrait import Portrait
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Force
@@ -146,7 +146,7 @@ class Governor:
             periodicity, foresight = NOTHING_LEARNED, 1.0
             path = _previewed_N(setpoint, soon_s + lag_s)
         else:
-            periodicity = observe(state.periodicity, setpoint.stamp_s, force, slope)
+            periodicity = observe(state.periodicity, setpoint.stamp_s, force)
             # one that has fallen silent for longer than a stream may is not believed to go on as it did
             foresight = periodicity.trust if age <= LONGEST_STEP_S else 0.0
             begins_s = soon_s + foresight * lag_s
@@ -158,6 +158,13 @@ class Governor:
         within = [min(max(force_N, least), most) for force_N in path]
         rendered = GovernorState(now_s, force, setpoint.stamp_s, slope, force, periodicity)
         return rendered, Governed(force, within, age, reasons, foresight)
+
+    def foresee(self, state: GovernorState) -> GovernorState:
+        """The state with a forecast of what comes, where one is due: for the time between decisions."""
+        periodicity = foreseen(state.periodicity, state.slope_N_s)
+        if periodicity is state.periodicity:
+            return state
+        return GovernorState(state.time_s, state.governed_N, state.stamp_s, state.slope_N_s, state.last_N, periodicity)
 
     def _ramp(
         self, state: GovernorState, now_s: float, lowest_N: float, age_s: float | None, reason: Limit

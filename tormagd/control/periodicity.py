@@ -170,15 +170,13 @@ class Periodicity(Value):
 NOTHING_LEARNED: Final = Periodicity()
 
 
-def observe(state: Periodicity, stamp_s: float, force_N: float, slope_N_s: float) -> Periodicity:
-    """The state with one setpoint more, in bounded time; `slope_N_s` is what is extrapolated otherwise.
+def observe(state: Periodicity, stamp_s: float, force_N: float) -> Periodicity:
+    """The state with one setpoint more. What comes next is not looked for here, as something waits for this setpoint:
+    `foreseen` does that afterwards.
 
     Another force with the same stamp, or one from up to GRID_S before, takes the place of the first; a stamp from
     longer before, or after LONGEST_STEP_S, begins anew.
     """
-    if state.from_s < state.time_s and len(state.history) >= _LEAST_BYTES:
-        # a plan later than the point of the grid came: the plan that a setpoint waits for has enough to do
-        state = _searched(state, slope_N_s)
     if -GRID_S < stamp_s - state.stamp_s < 0.0:
         stamp_s = state.stamp_s  # the clocks of publisher and daemon are read at slightly different times
     spacing_s = stamp_s - state.stamp_s
@@ -221,10 +219,11 @@ def _advanced(state: Periodicity, stamp_s: float, force_N: float, count: int) ->
     return Periodicity(stamp_s, force_N, times_s[-1], history, state.from_s, changes, awaited, long, short)
 
 
-def _searched(state: Periodicity, slope_N_s: float) -> Periodicity:
-    """The state with a forecast from its newest point of the grid, and what it and the slope say, to be judged by. The
-    slope may know of one setpoint more, which is on the safe side.
-    """
+def foreseen(state: Periodicity, slope_N_s: float) -> Periodicity:
+    """The state with a forecast from its newest point of the grid, once for each, and what forecast and `slope_N_s`,
+    which is extrapolated otherwise, say, to be judged by. Takes several times as long as a plan."""
+    if state.from_s >= state.time_s or len(state.history) < _LEAST_BYTES:
+        return state
     changes = _search(np.frombuffer(state.history))
     said: Guess | None = None
     if changes:

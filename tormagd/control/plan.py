@@ -12,6 +12,7 @@ from tormagd.control.estimate import Estimate
 from tormagd.control.governor import PATH_S, Governed, Governor, GovernorState, TimedSetpoint
 from tormagd.control.portrait import FieldOfGap, LawOfField, Portrait
 from tormagd.control.sensor import UNJUDGED, Sensor, judge
+from tormagd.control.sensor_zero import TARED, UNKNOWN_SD_N, SensorZero
 from tormagd.control.slow_friction import NOTHING_SLOW, SLOWEST_MM_S, SlowFriction
 from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S
@@ -36,6 +37,8 @@ LEAST_EXPECTED_N: Final = 0.1
 "Of less force no share is told."
 GONE_BACK_MM: Final = 0.01
 "A handle that has gone back by more, just over a count of its encoder, may be turning: its friction falls already."
+UNTARED_N: Final = 0.15
+"A sensor that is off by more is worth a word: it is half an hour's drift."
 BEYOND_MM: Final = 2.0
 "Beyond the closed end, where a carriage may overrun, the model is asked no further."
 LAG_TIME_S: Final = 1.0
@@ -130,9 +133,9 @@ class Plan(Value):
 @final
 class Shown(Value):
     """What the device has shown of itself by its readings up to number `read`, taken at `read_s`, at speed and at a
-    creep, whether its sensor is believed, and the limits that come of it."""
+    creep, whether its sensor is believed, what it reads without a force, and the limits that come of it."""
 
-    __match_args__ = ("device", "sensor", "read", "read_s", "limits", "slow")
+    __match_args__ = ("device", "sensor", "read", "read_s", "limits", "slow", "zero")
     __slots__ = __match_args__
 
     def __init__(
@@ -143,9 +146,11 @@ class Shown(Value):
         read_s: float = -math.inf,
         limits: tuple[Limit, ...] = (),
         slow: SlowFriction = NOTHING_SLOW,
+        zero: SensorZero = TARED,
     ) -> None:
         self.device: Final = device
         self.slow: Final = slow
+        self.zero: Final = zero
         self.sensor: Final = sensor
         self.read: Final = read
         self.read_s: Final = read_s
@@ -282,6 +287,13 @@ class Planner:
         )
         return PlanState(governor, plan, shown, lag_s)
 
+    def foresee(self, state: PlanState) -> PlanState:
+        """What can be prepared for the next plans once one is made: to be called after each, when nothing waits."""
+        governor = self._governor.foresee(state.governor)
+        if governor is state.governor:
+            return state
+        return PlanState(governor, state.plan, state.shown, state.lag_s)
+
     def _motion(self, setpoint: TimedSetpoint | None, estimate: Estimate | None) -> tuple[float, float]:
         """The displacement, mm, and the rate, mm/s, that the force is planned for."""
         # the field sets how much friction there can be, so it is asked for at full mobilisation and in motion: before
@@ -312,8 +324,11 @@ class Planner:
         fight the position loop. A sensor that is not believed teaches nothing, and what it has taught is forgotten."""
         if estimate is None or model_N is None or estimate.number == shown.read or now_s - shown.read_s < LESSON_S:
             return shown
-        slow = shown.slow.followed(model_N, estimate.handle_mm)
-        rate_mm_s, reading_N = abs(estimate.handle.rate_mm_s), estimate.force_N
+        slow, zero = shown.slow.followed(model_N, estimate.handle_mm), shown.zero
+        direction, rate_mm_s = estimate.handle.turn.direction, abs(estimate.handle.rate_mm_s)
+        reading_N = estimate.force_N - direction * zero.zero_N
+        zero_sd_N = zero.sd_N(now_s)
+        is_zero_known = zero_sd_N <= UNKNOWN_SD_N
         elapsed_s = min(now_s - shown.read_s, LONGEST_LESSON_S)
         is_mobilised = _is_mobilised(estimate)
         if rate_mm_s < MOVING_MM_S or not is_mobilised:
@@ -322,18 +337,38 @@ class Planner:
             elif SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S and estimate.handle.sliding_mm_s < CREEPING_MM_S:
                 expected_N = shown.device.force_N(slow.followed_N)
                 # before it is mobilised friction is less than the model's; more is more all the same
-                if expected_N > LEAST_EXPECTED_N and (is_mobilised or reading_N > expected_N):
+                is_lesson = is_zero_known and (is_mobilised or reading_N > expected_N)
+                if expected_N > LEAST_EXPECTED_N and is_lesson:
                     slow = slow.observed(expected_N, rate_mm_s, reading_N, elapsed_s)
-            return Shown(shown.device, shown.sensor, estimate.number, now_s, shown.limits, slow)
-        sensor = judge(shown.sensor, shown.device, model_N, rate_mm_s, reading_N, elapsed_s)
+            return Shown(shown.device, shown.sensor, estimate.number, now_s, shown.limits, slow, zero)
+        sensor = judge(shown.sensor, shown.device, model_N, rate_mm_s, reading_N, elapsed_s, direction, zero_sd_N)
+        if sensor.is_doubted and not shown.sensor.is_doubted:
+            zero = zero.doubted()
+        zero = zero.heard(
+            now_s,
+            direction,
+            estimate.force_N,
+            model_N,
+            rate_mm_s,
+            elapsed_s,
+            shown.device.scale,
+            math.sqrt(max(shown.device.scale_variance, 0.0)),
+        )
+        limits: tuple[Limit, ...] = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
         if sensor.is_doubted:
-            return Shown(UNSEEN, sensor, estimate.number, now_s, (Limit.SENSOR,))
+            return Shown(UNSEEN, sensor, estimate.number, now_s, (Limit.SENSOR, *limits), NOTHING_SLOW, zero)
+        if not is_zero_known:
+            return Shown(
+                shown.device, sensor, estimate.number, now_s, (Limit.OFFSET_UNKNOWN, *limits), shown.slow, zero
+            )
         device, is_held = observe(
             shown.device, model_N, reading_N, elapsed_s, adapts_in_s=self._adapts_in_s, bounds=self._scales
         )
         # what is known of a creep stays what it is while the rest is learned
         slow = slow.beside(shown.device.force_N(model_N), device.force_N(model_N))
-        return Shown(device, sensor, estimate.number, now_s, (Limit.TRIM,) if is_held else (), slow)
+        if is_held:
+            limits = (Limit.TRIM, *limits)
+        return Shown(device, sensor, estimate.number, now_s, limits, slow, zero)
 
     def _lawful_mT(self, solution: FieldSolution, wanted_N: float) -> float:
         """The search's field, no further than LAW_SHARE from the force law's."""

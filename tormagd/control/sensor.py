@@ -19,6 +19,7 @@ from tormagd.control.device_fit import (
     DeviceFit,
     observe,
 )
+from tormagd.control.sensor_zero import UNKNOWN_SD_N
 
 NOISE_N: Final = 0.03
 "What noise, and the model's own error, leave of a mean over FILTER_S."
@@ -52,7 +53,7 @@ MEMORY_S: Final = 900.0
 class Past(Value):
     """What was heard: the newest reading and for how long it has stood still, a mean over FILTER_S, the mean of the
     model's force over MEMORY_S, and the slow fit. `before` and `kept` are the device's own fit of up to twice and once
-    KEPT_S ago, and `before_at` and `kept_at` the model's force and the handle's rate then, N and mm/s."""
+    KEPT_S ago, and `before_at` and `kept_at` the model's force and the handle's rate then, N and mm/s, and its way."""
 
     __match_args__ = (
         "reading_N",
@@ -76,9 +77,9 @@ class Past(Value):
         loaded_N: float,
         slow: DeviceFit,
         before: DeviceFit = UNSEEN,
-        before_at: tuple[float, float] = (0.0, 0.0),
+        before_at: tuple[float, float, float] = (0.0, 0.0, 0.0),
         kept: DeviceFit = UNSEEN,
-        kept_at: tuple[float, float] = (0.0, 0.0),
+        kept_at: tuple[float, float, float] = (0.0, 0.0, 0.0),
         kept_s: float = 0.0,
     ) -> None:
         self.reading_N: Final = reading_N
@@ -113,10 +114,18 @@ UNJUDGED: Final = Sensor()
 
 
 def judge(
-    sensor: Sensor, fit: DeviceFit, model_N: float, rate_mm_s: float, reading_N: float, elapsed_s: float
+    sensor: Sensor,
+    fit: DeviceFit,
+    model_N: float,
+    rate_mm_s: float,
+    reading_N: float,
+    elapsed_s: float,
+    direction: float,
+    zero_sd_N: float,
 ) -> Sensor:
     """The judgement after one reading along the motion of a handle that slides at `rate_mm_s`, `elapsed_s` after the
-    last, where the model says `model_N` and the device has shown itself to be `fit`. All are finite."""
+    last, where the model says `model_N` and the device has shown itself to be `fit`. It slides the way `direction`, 1
+    or -1; the sensor's zero, which is off the reading, is known to within `zero_sd_N`. All are finite."""
     past = _heard(sensor.past, model_N, reading_N, elapsed_s)
     if sensor.is_doubted:
         # it has to read for long what most devices do, not what one at the edge might
@@ -127,13 +136,13 @@ def judge(
         return (
             UNJUDGED if evidence_s > TRUSTED_AGAIN_S else Sensor(True, sensor.doubted_s + elapsed_s, evidence_s, past)
         )
-    is_strange = _is_strange(past, model_N, rate_mm_s)
+    is_strange = _is_strange(past, model_N, rate_mm_s, direction, zero_sd_N)
     evidence_s = max(sensor.evidence_s + (elapsed_s if is_strange else -elapsed_s), 0.0)
     if evidence_s > DOUBTED_S:
         return Sensor(True, past=past)
     if past.kept_s >= KEPT_S and not is_strange:
         past = past.replaced(
-            before=past.kept, before_at=past.kept_at, kept=fit, kept_at=(model_N, rate_mm_s), kept_s=0.0
+            before=past.kept, before_at=past.kept_at, kept=fit, kept_at=(model_N, rate_mm_s, direction), kept_s=0.0
         )
     return Sensor(False, 0.0, evidence_s, past)
 
@@ -164,7 +173,7 @@ def _heard(past: Past | None, model_N: float, reading_N: float, elapsed_s: float
     )
 
 
-def _is_strange(past: Past, model_N: float, rate_mm_s: float) -> bool:
+def _is_strange(past: Past, model_N: float, rate_mm_s: float, direction: float, zero_sd_N: float) -> bool:
     if past.still_s > FROZEN_S:
         return True
     most_loaded_N, least_loaded_N = max(model_N, past.loaded_N), min(model_N, past.loaded_N)
@@ -172,9 +181,13 @@ def _is_strange(past: Past, model_N: float, rate_mm_s: float) -> bool:
     strongest_N = MOST_SCALE * (model_N - RELAXES_LEAST * least_loaded_N) + NOISE_N
     if not weakest_N <= past.measured_N <= strongest_N:
         return True
-    (before_N, before_mm_s), (kept_N, kept_mm_s) = past.before_at, past.kept_at
+    (before_N, before_mm_s, before_way), (kept_N, kept_mm_s, _) = past.before_at, past.kept_at
+    # a zero that is wrong is the fit's as well, but for the other way; and in time it drifts from both
+    is_turned = before_way * direction < 0.0
+    zero_N = SURE * zero_sd_N * (2.0 if is_turned else 1.0 if zero_sd_N > UNKNOWN_SD_N else 0.0)
     jump_N = (
         JUMP_N
+        + zero_N
         + SURE * past.before.deviation_N(model_N)
         + SHAPE * max(abs(model_N - before_N), abs(model_N - kept_N))
         + VISCOUS_N_S_MM * max(abs(rate_mm_s - before_mm_s), abs(rate_mm_s - kept_mm_s))
@@ -182,6 +195,6 @@ def _is_strange(past: Past, model_N: float, rate_mm_s: float) -> bool:
     if abs(past.measured_N - past.before.force_N(model_N)) > jump_N:
         return True
     slow = past.slow
-    unsure_N = SURE * math.sqrt(slow.offset_variance_N2)
+    unsure_N = SURE * math.sqrt(slow.offset_variance_N2) + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
     least_N = LEAST_OFFSET_N - RELAXES_MOST * slow.scale * most_loaded_N
     return slow.offset_N + unsure_N < least_N or slow.offset_N - unsure_N > MOST_OFFSET_N

@@ -14,6 +14,9 @@ LEARNT_SHARE = 0.01
 MOST_SLACK_NS = 400_000.0
 "Plans that take longer run into the tick, rather than let setpoints wait for one tick after another."
 
+PLAN_ERRORS = (ValueError, ArithmeticError, RuntimeError)
+"A DomainError; what NumPy raises."
+
 log = logging.getLogger(__name__)
 
 
@@ -59,6 +62,8 @@ class InferenceLoop:
         elif now_ns >= self._due_ns:
             self._plan(estimate, self._due_ns)
         self._waiting_ns = 0
+        # here the next tick is farthest: a plan for a setpoint that comes just before it has not that time
+        self._foresee(now_ns * 1e-9)
 
     def _plan(self, estimate: Estimate | None, due_ns: int) -> None:
         start_ns = self._clock_ns()
@@ -78,14 +83,24 @@ class InferenceLoop:
         self._slack_ns = min(moved_ns, MOST_SLACK_NS)
 
     def _planned(self, now_s: float, estimate: Estimate | None) -> PlanState:
-        inbox = self._endpoint.inbox
         try:
-            return self._planner.plan(self.state, now_s, inbox.newest, estimate)
-        except (ValueError, ArithmeticError, RuntimeError) as error:  # a DomainError; what numpy and torch raise
-            if str(error) != self._failure:  # the first failure is news, the same one again is not
-                self._failure = str(error)
-                log.exception("no gap could be planned for %s", inbox.newest)
-            inbox.withdraw(f"no gap could be planned: {error}")
-            self._on_failure()
-            afresh = self._planner.start(now_s)
-            return afresh.replaced(plan=afresh.plan.replaced(number=self.state.plan.number + 1))
+            return self._planner.plan(self.state, now_s, self._endpoint.inbox.newest, estimate)
+        except PLAN_ERRORS as error:
+            return self._afresh(now_s, error)
+
+    def _foresee(self, now_s: float) -> None:
+        try:
+            self.state = self._planner.foresee(self.state)
+        except PLAN_ERRORS as error:
+            self.state = self._afresh(now_s, error)
+
+    def _afresh(self, now_s: float, error: Exception) -> PlanState:
+        """The state without what could not be planned for."""
+        inbox = self._endpoint.inbox
+        if str(error) != self._failure:  # the first failure is news, the same one again is not
+            self._failure = str(error)
+            log.error("no gap could be planned for %s", inbox.newest, exc_info=error)
+        inbox.withdraw(f"no gap could be planned: {error}")
+        self._on_failure()
+        afresh = self._planner.start(now_s)
+        return afresh.replaced(plan=afresh.plan.replaced(number=self.state.plan.number + 1))

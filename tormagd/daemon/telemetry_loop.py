@@ -185,6 +185,8 @@ class TelemetryLoop:
                 scale_sd=round(math.sqrt(max(shown.scale_variance, 0.0)), 4),
                 offset_N=round(shown.offset_N, 4),
                 offset_sd_N=round(math.sqrt(max(shown.offset_variance_N2, 0.0)), 4),
+                sensor_zero_N=round(planned.shown.zero.zero_N, 4),
+                sensor_zero_sd_N=round(planned.shown.zero.sd_N(time.monotonic()), 4),
             ),
             least_gap_mm=round(plan.least_gap_mm, 2),
             link=self._connection.report(),

@@ -55,6 +55,8 @@ class Limit(StrEnum):
     CEILING = "CEILING"
     OVER_FORCE = "OVER_FORCE"
     SENSOR = "SENSOR"
+    SENSOR_ZERO = "SENSOR_ZERO"
+    OFFSET_UNKNOWN = "OFFSET_UNKNOWN"
     SATURATED = "SATURATED"
     SKEW = "SKEW"
     HOST_STALL = "HOST_STALL"
@@ -157,6 +159,14 @@ LIMITS: dict[Limit, Explanation] = {
     Limit.SENSOR: Explanation(
         "the force sensor reads what no believable device gives at this gap; nothing is learned from it",
         "check sensor, cable and zero, and that the insert is the scene's",
+    ),
+    Limit.SENSOR_ZERO: Explanation(
+        "the force sensor is far off its zero, as the handle's reversals show; that is taken off its readings",
+        "tare the sensor when the handle is free",
+    ),
+    Limit.OFFSET_UNKNOWN: Explanation(
+        "the handle has not turned back for so long that the sensor's zero may have drifted; nothing is learned of it",
+        "turn the handle back and forth once, by 10 mm",
     ),
     Limit.SATURATED: Explanation("a motor has no more voltage to give", "expect lag while it lasts"),
     Limit.SKEW: Explanation("the carriages are further apart than usual", "look at the slower screw"),

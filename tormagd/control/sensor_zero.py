@@ -1,0 +1,135 @@
+"""What the force sensor reads where there is no force: its zero, which drifts.
+
+Friction turns round with the handle and a zero does not: half the sum of the signed readings before and after a
+reversal is the zero, whatever the device. Between reversals nothing tells it from the device itself, so its uncertainty
+grows, and where that is too great nothing may be learned from readings.
+"""
+
+import math
+from typing import Final, final
+
+from firmware_protocol.value import Value
+
+TARED_SD_N: Final = 0.02
+"Of a sensor that begins: it is taken for tared."
+DRIFT_N2_S: Final = 0.05**2 / 600.0
+"A sensor that drifts by 5 mN a minute is off by 50 mN after ten (plant card)."
+MOST_SD_N: Final = 0.3
+"An hour of that. However long nothing was heard, no more is believed possible."
+UNKNOWN_SD_N: Final = 0.05
+"With more than this a force is better left to what was learned before: ten minutes without a reversal."
+MOST_ZERO_N: Final = 0.4
+"A sensor that is further off did not drift, it is broken, or was never tared: that is no zero to go on with."
+LEVEL_S: Final = 0.15
+"A level is a mean over this much sliding, in which noise leaves 2 mN."
+READ_SD_N: Final = 0.025
+"What gap, field and speed that change around a reversal leave of half the sum."
+VISCOUS_N_S_MM: Final = 5e-4
+"And so much more for each mm/s that the handle comes back at another speed: devices' viscous friction differs by that."
+RELAXES_N_S: Final = 0.01
+"And so much more for each second that lies between: the elastomer relaxes."
+LONGEST_TURN_S: Final = 10.0
+"Levels further apart are not compared."
+
+
+@final
+class Level(Value):
+    """Means over the newest sliding one way: of the readings along the motion, of the model's force there, N, and of
+    the handle's rate, mm/s, over `heard_s`, the last of it at `until_s`."""
+
+    __match_args__ = ("reading_N", "model_N", "rate_mm_s", "heard_s", "until_s")
+    __slots__ = __match_args__
+
+    def __init__(self, reading_N: float, model_N: float, rate_mm_s: float, heard_s: float, until_s: float) -> None:
+        self.reading_N: Final = reading_N
+        self.model_N: Final = model_N
+        self.rate_mm_s: Final = rate_mm_s
+        self.heard_s: Final = heard_s
+        self.until_s: Final = until_s
+
+    def heard(self, reading_N: float, model_N: float, rate_mm_s: float, elapsed_s: float, now_s: float) -> "Level":
+        """After one more reading, which stands for `elapsed_s` > 0: a plain mean at first, then one that forgets."""
+        heard_s = self.heard_s + elapsed_s
+        share = elapsed_s / min(heard_s, max(LEVEL_S, elapsed_s))
+        return Level(
+            self.reading_N + share * (reading_N - self.reading_N),
+            self.model_N + share * (model_N - self.model_N),
+            self.rate_mm_s + share * (rate_mm_s - self.rate_mm_s),
+            heard_s,
+            now_s,
+        )
+
+
+@final
+class SensorZero(Value):
+    """The zero, N, and its variance as of `told_s`; the way the handle goes, 1 or -1, with its level, and the level of
+    the way before until the two have been compared."""
+
+    __match_args__ = ("zero_N", "variance_N2", "told_s", "direction", "level", "before")
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        zero_N: float = 0.0,
+        variance_N2: float = TARED_SD_N**2,
+        told_s: float = math.inf,
+        direction: float = 0.0,
+        level: Level | None = None,
+        before: Level | None = None,
+    ) -> None:
+        self.zero_N: Final = zero_N
+        self.variance_N2: Final = variance_N2
+        self.told_s: Final = told_s
+        self.direction: Final = direction
+        self.level: Final = level
+        self.before: Final = before
+
+    def sd_N(self, now_s: float) -> float:
+        """Standard deviation of the zero by now; before the first reading no time counts."""
+        return math.sqrt(min(self.variance_N2 + DRIFT_N2_S * max(now_s - self.told_s, 0.0), MOST_SD_N * MOST_SD_N))
+
+    def doubted(self) -> "SensorZero":
+        """The same of a sensor that is not believed to have been tared."""
+        return SensorZero(self.zero_N, MOST_SD_N * MOST_SD_N, self.told_s, self.direction, self.level, self.before)
+
+    def heard(
+        self,
+        now_s: float,
+        direction: float,
+        reading_N: float,
+        model_N: float,
+        rate_mm_s: float,
+        elapsed_s: float,
+        scale: float,
+        scale_sd: float,
+    ) -> "SensorZero":
+        """After a reading along `direction`, the way of a handle that slides at `rate_mm_s`, where the model says
+        `model_N`, of a device whose scale is known to within `scale_sd`; it stands for `elapsed_s` > 0. All finite."""
+        level, told_s = self.level, min(self.told_s, now_s)
+        if level is None or direction != self.direction:
+            # what was heard for too short a time is no level
+            before = level if level is not None and level.heard_s >= LEVEL_S else None
+            level = Level(reading_N, model_N, rate_mm_s, elapsed_s, now_s)
+            return SensorZero(self.zero_N, self.variance_N2, told_s, direction, level, before)
+        began_s = now_s - level.heard_s
+        level = level.heard(reading_N, model_N, rate_mm_s, elapsed_s, now_s)
+        before = self.before
+        if before is None or level.heard_s < LEVEL_S:
+            return SensorZero(self.zero_N, self.variance_N2, told_s, direction, level, before)
+        by_model_N = level.model_N - before.model_N
+        found_N = 0.5 * direction * (level.reading_N - before.reading_N - scale * by_model_N)
+        between_s = began_s - before.until_s
+        if between_s > LONGEST_TURN_S or abs(found_N) > MOST_ZERO_N:
+            return SensorZero(self.zero_N, self.variance_N2, told_s, direction, level, None)
+        by_scale_N = 0.5 * scale_sd * by_model_N
+        by_speed_N = 0.5 * VISCOUS_N_S_MM * (level.rate_mm_s - before.rate_mm_s)
+        by_time_N = 0.5 * RELAXES_N_S * between_s
+        read_N2 = READ_SD_N * READ_SD_N + by_scale_N * by_scale_N + by_speed_N * by_speed_N + by_time_N * by_time_N
+        variance_N2 = self.sd_N(now_s) ** 2
+        gain = variance_N2 / (variance_N2 + read_N2)
+        zero_N = self.zero_N + gain * (found_N - self.zero_N)
+        return SensorZero(zero_N, (1.0 - gain) * variance_N2, now_s, direction, level, None)
+
+
+TARED: Final = SensorZero()
+"A sensor that has told nothing of its zero."
