@@ -1,0 +1,82 @@
+"""A device's profile: what is kept, what is less sure when it is read again, and what is refused."""
+
+import json
+import math
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tormagd.control.device_fit import OFFSET_SD_N, SCALE_SD, DeviceFit
+from tormagd.control.plan import Shown
+from tormagd.control.profile import MAX_BYTES, ZERO_LASTS_S, Profile, ProfileError, profile_of, read_profile
+from tormagd.control.sensor_zero import TARED, SensorZero
+from tormagd.control.slow_friction import SlowFriction
+
+OF = {"serial_number": 7, "insert": "MRE-50-40", "model": "ab" * 32}
+KNOWN = Shown(DeviceFit(1.2, -0.05, 1e-4, -1e-4, 4e-4), slow=SlowFriction(1.1, 0.6), zero=SensorZero(0.07))
+KEPT = profile_of(KNOWN, saved_ns=10**18, **OF)  # type: ignore[arg-type]
+
+
+def again(profile: Profile) -> Profile:
+    return read_profile(msgspec.json.encode(profile), **OF)  # type: ignore[arg-type]
+
+
+def test_what_was_learned_is_there_again_and_less_sure() -> None:
+    shown = again(KEPT).shown(10**18 + 60 * 10**9)
+    assert shown.device.force_N(1.5) == KNOWN.device.force_N(1.5)
+    assert shown.slow.factor_at(0.0) == KNOWN.slow.factor_at(0.0)
+    assert shown.zero.zero_N == 0.07
+    assert KNOWN.device.deviation_N(2.0) < shown.device.deviation_N(2.0) < 0.6 * DeviceFit().deviation_N(2.0)
+
+
+def test_an_old_zero_is_forgotten() -> None:
+    assert again(KEPT).shown(10**18 + round(1.01 * ZERO_LASTS_S * 1e9)).zero == TARED
+    # a clock that was set back says nothing of the age
+    assert again(KEPT).shown(0).zero == TARED
+
+
+@pytest.mark.parametrize(("name", "present"), [("serial_number", 8), ("insert", "MRE-00-50"), ("model", "cd" * 32)])
+def test_that_of_another_is_refused(name: str, present: object) -> None:
+    with pytest.raises(ProfileError, match=f"{name} = .*: it is of another"):
+        read_profile(msgspec.json.encode(KEPT), **(OF | {name: present}))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"scale": -1.0}, {"scale": 1e9}, {"scale": None}, {"offset_N": "much"}, {"slow_factor": 9.0}, {"v": 2}, {"more": 1}],
+)
+def test_what_no_device_has_is_refused(changed: dict[str, object]) -> None:
+    data = json.dumps(json.loads(msgspec.json.encode(KEPT)) | changed).encode()
+    with pytest.raises(ProfileError, match="not a profile"):
+        read_profile(data, **OF)  # type: ignore[arg-type]
+
+
+@given(data=st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
+def test_rubbish_is_refused(data: bytes) -> None:
+    with pytest.raises(ProfileError):
+        read_profile(data, **OF)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("data", [b"[" * MAX_BYTES, b" " * (MAX_BYTES + 1), b'{"scale": ' + b"9" * 4_000 + b"}", b"NaN"])
+def test_large_and_deep_rubbish_is_refused(data: bytes) -> None:
+    with pytest.raises(ProfileError):
+        read_profile(data, **OF)  # type: ignore[arg-type]
+
+
+@given(
+    scale=st.floats(0.6, 1.6),
+    scale_variance=st.floats(0.0, SCALE_SD**2),
+    offset_N=st.floats(-0.5, 0.5),
+    offset_variance=st.floats(0.0, OFFSET_SD_N**2),
+    zero_N=st.floats(-0.4, 0.4),
+)
+def test_every_fit_can_be_kept(
+    scale: float, scale_variance: float, offset_N: float, offset_variance: float, zero_N: float
+) -> None:
+    fit = DeviceFit(scale, offset_N, scale_variance, 0.0, offset_variance)
+    kept = profile_of(Shown(fit, zero=SensorZero(zero_N)), saved_ns=0, **OF)  # type: ignore[arg-type]
+    shown = again(kept).shown(0)
+    assert shown.device.force_N(1.0) == pytest.approx(fit.force_N(1.0))
+    assert math.isfinite(shown.device.surely_within_N(2.5))

@@ -1,0 +1,91 @@
+"""What is known of one device with one insert, kept for the next time: a JSON file of a few lines.
+
+What a fit has learned of a scale lasts from day to day, but for the warmth of the room; what the elastomer had relaxed and
+how far the sensor's zero had drifted do not. So a profile that is read again is less sure than the one that was kept.
+"""
+
+import math
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from tormagd.control.device_fit import OFFSET_SD_N, SCALE_SD, DeviceFit
+from tormagd.control.plan import Shown
+from tormagd.control.sensor_zero import MOST_ZERO_N, TARED, SensorZero
+from tormagd.control.slow_friction import LEAST, MOST, SlowFriction
+
+VERSION = 1
+MAX_BYTES = 4_096
+WARMTH_SD = 0.04
+"Of the scale, from one day to another: 0.7 % for each kelvin of a room that is 6 warmer or colder (plant card)."
+RELAXED_SD_N = 0.06
+"Of the offset, of an elastomer that has rested since."
+ZERO_LASTS_S = 600.0
+"An older zero is forgotten: the sensor has drifted, or was tared, and is taken for tared as at any start."
+
+Hash = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+
+
+class ProfileError(ValueError):
+    """A profile that cannot be used, and why."""
+
+
+class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A device, by its serial number, with an insert, as a model sees it. `saved_ns` is CLOCK_REALTIME; the others are
+    those of `DeviceFit`, `SlowFriction` and `SensorZero`, with standard deviations for variances."""
+
+    v: Annotated[int, Meta(ge=VERSION, le=VERSION)]
+    serial_number: Annotated[int, Meta(ge=0, lt=2**32)]
+    insert: Annotated[str, Meta(min_length=1, max_length=64)]
+    model: Hash
+    saved_ns: Annotated[int, Meta(ge=0, lt=2**63)]
+    scale: Annotated[float, Meta(gt=0.1, lt=10.0)]
+    scale_sd: Annotated[float, Meta(ge=0.0, le=2.0 * SCALE_SD)]
+    offset_N: Annotated[float, Meta(ge=-5.0, le=5.0)]
+    slow_factor: Annotated[float, Meta(ge=LEAST, le=MOST)]
+    slow_learned: Annotated[float, Meta(ge=0.0, le=1.0)]
+    sensor_zero_N: Annotated[float, Meta(ge=-MOST_ZERO_N, le=MOST_ZERO_N)]
+
+    def shown(self, now_ns: int) -> Shown:
+        """What the device counts as having shown of itself, at CLOCK_REALTIME `now_ns`."""
+        scale_sd = min(math.hypot(self.scale_sd, WARMTH_SD), SCALE_SD)
+        device = DeviceFit(self.scale, self.offset_N, scale_sd**2, 0.0, min(RELAXED_SD_N, OFFSET_SD_N) ** 2)
+        slow = SlowFriction(self.slow_factor, self.slow_learned)
+        is_recent = abs(now_ns - self.saved_ns) * 1e-9 < ZERO_LASTS_S
+        return Shown(device, slow=slow, zero=SensorZero(self.sensor_zero_N) if is_recent else TARED)
+
+
+def profile_of(shown: Shown, *, serial_number: int, insert: str, model: str, saved_ns: int) -> Profile:
+    """The profile to keep of a device that has shown this of itself."""
+    return Profile(
+        v=VERSION,
+        serial_number=serial_number,
+        insert=insert,
+        model=model,
+        saved_ns=saved_ns,
+        scale=shown.device.scale,
+        scale_sd=min(math.sqrt(max(shown.device.scale_variance, 0.0)), SCALE_SD),
+        offset_N=shown.device.offset_N,
+        slow_factor=shown.slow.factor,
+        slow_learned=shown.slow.learned,
+        sensor_zero_N=shown.zero.zero_N,
+    )
+
+
+def read_profile(data: bytes, *, serial_number: int, insert: str, model: str) -> Profile:
+    """The profile in `data`. Raises ProfileError for what is damaged, or of another device, insert or model."""
+    if len(data) > MAX_BYTES:
+        raise ProfileError(f"{len(data)} bytes: allowed is {MAX_BYTES}")
+    try:
+        profile = msgspec.json.decode(data, type=Profile)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise ProfileError(f"not a profile: {error}") from error
+    for name, kept, present in (
+        ("serial_number", profile.serial_number, serial_number),
+        ("insert", profile.insert, insert),
+        ("model", profile.model, model),
+    ):
+        if kept != present:
+            raise ProfileError(f"{name} = {kept!r}: it is of another {name.removesuffix('_number')}, here is {present!r}")
+    return profile

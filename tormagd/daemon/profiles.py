@@ -1,0 +1,144 @@
+"""Profiles of devices: read when a device says which one it is, kept when it is no longer driven. Files are read and
+written by another thread; the control thread only looks, once a telemetry period."""
+
+import asyncio
+import contextlib
+import logging
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from tormagd.control.device_fit import UNSEEN
+from tormagd.control.plan import NOTHING_SHOWN, Shown
+from tormagd.control.profile import MAX_BYTES, Profile, ProfileError, profile_of, read_profile
+from tormagd.messages import ProfileReport
+
+log = logging.getLogger(__name__)
+
+
+class ProfileFolder:
+    """The files of one scene's insert and model, one for each device."""
+
+    def __init__(self, folder: Path, insert: str, model: str) -> None:
+        self._folder, self.insert, self.model = folder, insert, model
+
+    def path(self, serial_number: int) -> Path:
+        """Where the profile of that device is."""
+        return self._folder / f"{serial_number:08x}-{self.insert}.json"
+
+    def read(self, serial_number: int) -> Profile | None:
+        """The profile of that device; None where there is none. Raises ProfileError saying why it cannot be used."""
+        path = self.path(serial_number)
+        try:
+            # whatever lies there, a pipe even: nothing is waited for, and no more read than a profile has
+            with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+                data = file.read(MAX_BYTES + 1) or b""
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise ProfileError(f"{path}: {error.strerror}") from error
+        try:
+            return read_profile(data, serial_number=serial_number, insert=self.insert, model=self.model)
+        except ProfileError as error:
+            raise ProfileError(f"{path}: {error}") from error
+
+    def write(self, profile: Profile) -> None:
+        """Keeps it: the old one or the new one is there, whatever happens. Raises ProfileError."""
+        path = self.path(profile.serial_number)
+        beside = path.with_suffix(".new")
+        try:
+            self._folder.mkdir(mode=0o750, parents=True, exist_ok=True)
+            with open(beside, "wb") as file:
+                file.write(msgspec.json.format(msgspec.json.encode(profile)) + b"\n")
+                file.flush()
+                os.fsync(file.fileno())
+            beside.replace(path)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                beside.unlink()
+            raise ProfileError(f"{path}: {error.strerror}: nothing was kept") from error
+
+
+class Profiles:
+    """Takes care that what a device shows of itself is known the next time, and of no other device.
+
+    `learned` gives what has been shown, `teach` puts something else in its place. Without a folder nothing is kept.
+    """
+
+    def __init__(self, folder: ProfileFolder | None, learned: Callable[[], Shown], teach: Callable[[Shown], None]) -> None:
+        self._folder, self._learned, self._teach = folder, learned, teach
+        self._loop = asyncio.get_running_loop()
+        self._serial_number: int | None = None
+        self._was_driven = False
+        self._writing: asyncio.Future[None] | None = None
+        self._saved_ns: int | None = None
+        self._is_used = False
+        self._refusal = "" if folder is not None else "no folder is named for profiles"
+
+    def look(self, serial_number: int | None, is_driven: bool) -> None:
+        """Once a telemetry period: which device there is, and whether it is driven."""
+        if serial_number is not None and serial_number != self._serial_number:
+            if self._serial_number is not None:
+                self._teach(NOTHING_SHOWN)  # that was another device
+            self._serial_number, self._saved_ns, self._is_used = serial_number, None, False
+            if self._folder is not None:
+                self._refusal = ""
+                self._loop.run_in_executor(None, self._folder.read, serial_number).add_done_callback(self._take)
+        if self._was_driven and not is_driven:
+            self.keep()
+        self._was_driven = is_driven
+
+    def keep(self) -> None:
+        """Keeps what has been learned, where anything has been and the sensor is believed."""
+        shown = self._learned()
+        if self._folder is None or self._serial_number is None or shown.device is UNSEEN or shown.sensor.is_doubted:
+            return
+        now_ns = time.time_ns()
+        profile = profile_of(
+            shown,
+            serial_number=self._serial_number,
+            insert=self._folder.insert,
+            model=self._folder.model,
+            saved_ns=now_ns,
+        )
+        self._saved_ns = now_ns
+        self._writing = self._loop.run_in_executor(None, self._folder.write, profile)
+        self._writing.add_done_callback(self._note)
+
+    async def finished(self) -> None:
+        """Waits until what is being kept is on the disk."""
+        if self._writing is not None:
+            await asyncio.wait([self._writing])
+
+    def report(self) -> ProfileReport:
+        """Whether the device's profile is used, how old it is, and why not."""
+        age_s = None if self._saved_ns is None else max(0.0, (time.time_ns() - self._saved_ns) * 1e-9)
+        return ProfileReport(
+            is_used=self._is_used, age_s=None if age_s is None else round(age_s, 1), refusal=self._refusal
+        )
+
+    def _take(self, reading: "asyncio.Future[Profile | None]") -> None:
+        try:
+            profile = reading.result()
+        except ProfileError as error:
+            self._refusal = str(error)
+            log.warning("the profile is not used: %s", error)
+            return
+        # another device by now, or one that has shown itself meanwhile, is not told what it is
+        if profile is None or profile.serial_number != self._serial_number or self._learned().device is not UNSEEN:
+            return
+        now_ns = time.time_ns()
+        self._teach(profile.shown(now_ns))
+        self._saved_ns, self._is_used = profile.saved_ns, True
+        hours = (now_ns - profile.saved_ns) / 3.6e12
+        log.info("the device's profile of %.1f hours ago is used: scale %.3f", hours, profile.scale)
+
+    def _note(self, writing: "asyncio.Future[None]") -> None:
+        try:
+            writing.result()
+        except ProfileError as error:
+            self._refusal = str(error)
+            log.warning("%s", error)
