@@ -1,0 +1,287 @@
+"""How well a force can be followed at all: the error that is left to the ideal carriages of a device.
+
+    bound.py FORCE.csv [--plant sample_1] [--held] [--json]
+
+The CSV has the columns `t_s,force_N`. The device is known exactly (`tools/ideal_carriage.py`): its motors' torque-speed
+line, current limit, friction and pull, the force of its gap while the handle slides at one speed, the relaxation of its
+insert. The force asked is clipped to what its open gap brakes and to the scene's greatest, every millisecond.
+
+*Without delay*: every step knows the force asked at its end, and how fast it changes, but nothing of what follows. The
+carriages close up to it as fast as they can and still brake in time. That is no bound for somebody who guesses what
+comes: a forecast that is right may be better, up to foresight.
+
+*With foresight* the whole signal is known, and the RMS error is the least that the drive allows: where the gap begins
+and how fast is free. Its optimum is found by sequential quadratic programmes (Gauss-Newton; Clarabel solves each).
+"""
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import clarabel
+import numpy as np
+import numpy.typing as npt
+from ideal_carriage import Brake, Drive, brake_of, drive_of
+from scipy import sparse
+from tqdm import tqdm
+
+from tormagd.design.recorded_task import read_task
+from tormagd.physics.errors import DomainError, require
+from tormagd.simulation.parameters import PlantError, PlantParameters, load_plant
+
+Array = npt.NDArray[np.float64]
+Json = dict[str, Any]
+
+STEP_S = 1e-3
+MOST_N = 2.0
+"The greatest force of the scenes."
+HAND_MM_S = 42.0
+"The roller's surface at the thesis's 20 rpm."
+MOST_STEPS = 300_000
+ROUNDS = 30
+SETTLED = 5e-4
+"Relative change of the RMS error from round to round, below which nothing is left to be found."
+EXACT_N = 1e-6
+SECANT_MM_S = 5.0
+"Over which a limit is taken to be straight: turning round, it has a kink, and the carriages turn elsewhere next round."
+LEAST_BRAKING_MM_S2 = 50.0
+SOLVED = ("Solved", "AlmostSolved")
+
+
+class Asked(NamedTuple):
+    """A force in even steps, clipped to what can be asked for, and the gap at which the device brakes that much.
+
+    `scale`, `offset_N` and `relaxed_N` turn the fresh insert's force into the rendered one.
+    """
+
+    force_N: Array
+    gap_mm: Array
+    relaxed_N: Array
+    scale: float
+    offset_N: float
+
+    def rendered_N(self, brake: Brake, gap_mm: Array) -> Array:
+        """The force at a gap for each step."""
+        fresh_N = np.interp(gap_mm, brake.gap_mm, brake.fresh_N)
+        rendered: Array = self.scale * (fresh_N - self.relaxed_N) + self.offset_N
+        return rendered
+
+
+class Bound(NamedTuple):
+    """The force asked, clipped, and what the ideal carriages render of it without delay and with foresight."""
+
+    time_s: Array
+    asked_N: Array
+    no_delay_N: Array
+    foresight_N: Array
+
+    def figures(self, start_s: float = -math.inf) -> Json:
+        """Of the times from `start_s` on."""
+        inside = self.time_s >= start_s
+        asked_N = self.asked_N[inside]
+        return {
+            "sd_N": float(asked_N.std()),
+            "no_delay_rms_N": rms(self.no_delay_N[inside] - asked_N),
+            "foresight_rms_N": rms(self.foresight_N[inside] - asked_N),
+        }
+
+
+def bound(
+    plant: PlantParameters,
+    time_s: Array,
+    force_N: Array,
+    *,
+    is_held: bool = False,
+    most_N: float = MOST_N,
+    hand_mm_s: float = HAND_MM_S,
+    step_s: float = STEP_S,
+    shows: bool = False,
+) -> Bound:
+    """The bound for forces at rising times, linear in between, or held until the next. Raises `DomainError`."""
+    require("step_s", step_s, 1e-5, STEP_S)
+    require("hand_mm_s", hand_mm_s, 0.5, 300.0)
+    require("most_N", most_N, 0.1, 10.0)
+    steps = (time_s[-1] - time_s[0]) / step_s
+    if not 2.0 <= steps <= MOST_STEPS:
+        raise DomainError("t_s", f"{time_s[0]} .. {time_s[-1]}", f"2 to {MOST_STEPS} steps of {step_s:g} s")
+    axis_s = time_s[0] + step_s * np.arange(math.floor(steps + 1e-6) + 1)
+    wanted_N = np.interp(axis_s, time_s, force_N)
+    if is_held:
+        wanted_N = force_N[np.searchsorted(time_s, axis_s + 1e-9, side="right") - 1]
+    brake, drive = brake_of(plant), drive_of(plant)
+    asked = asked_of(brake, wanted_N, most_N=most_N, hand_mm_s=hand_mm_s, step_s=step_s)
+    greedy_mm = no_delay_mm(drive, asked.gap_mm, step_s)
+    best_mm = foresight_mm(drive, brake, asked, step_s, shows=shows)
+    return Bound(axis_s, asked.force_N, asked.rendered_N(brake, greedy_mm), asked.rendered_N(brake, best_mm))
+
+
+def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, step_s: float) -> Asked:
+    """The force within the device's range; the insert relaxes as it does while that force is rendered exactly."""
+    offset_N = brake.sliding_N(0.0, hand_mm_s)
+    scale = brake.sliding_N(1.0, hand_mm_s) - offset_N
+    least_N, greatest_N = float(brake.fresh_N[-1]), float(brake.fresh_N[0])
+    series = brake.relaxation
+    relax, memory = series.discretise(step_s), series.relaxed(float(np.interp(brake.rested_mm, *brake[:2])))
+    relaxed_N = sum(series.fractions, 0.0) * memory[0]
+    rendered, relaxed = [], []
+    for wanted_N in force_N.tolist():
+        fresh_N = min(max((min(wanted_N, most_N) - offset_N) / scale + relaxed_N, least_N), greatest_N)
+        kinetic_N, memory = relax.advance(memory, fresh_N)
+        relaxed_N = fresh_N - kinetic_N
+        relaxed.append(relaxed_N)
+        rendered.append(scale * kinetic_N + offset_N)
+    kinetic = (np.array(rendered) - offset_N) / scale
+    gap_mm = np.interp(kinetic + np.array(relaxed), brake.fresh_N[::-1], brake.gap_mm[::-1])
+    return Asked(np.array(rendered), gap_mm, np.array(relaxed), scale, offset_N)
+
+
+def no_delay_mm(drive: Drive, wanted_mm: Array, step_s: float) -> Array:
+    """The gap that follows a gap without delay or foresight, beginning on it at rest."""
+    gap_mm, speed_mm_s = float(wanted_mm[0]), 0.0
+    before_mm = gap_mm
+    found = [gap_mm]
+    for now_mm in wanted_mm[1:].tolist():
+        highest = drive.highest_mm_s(gap_mm, speed_mm_s, step_s)
+        lowest = drive.lowest_mm_s(gap_mm, speed_mm_s, step_s)
+        moves_mm_s = (now_mm - before_mm) / step_s
+        behind_mm = before_mm - gap_mm
+        # the largest speed of approach from which the way that is left suffices to fall back to the target's own
+        slow_mm_s = min(max(moves_mm_s, lowest), highest)
+        if behind_mm > 0.0:
+            braking = (slow_mm_s - drive.lowest_mm_s(gap_mm, slow_mm_s, step_s)) / step_s
+        else:
+            braking = (drive.highest_mm_s(gap_mm, slow_mm_s, step_s) - slow_mm_s) / step_s
+        change = max(braking, LEAST_BRAKING_MM_S2) * step_s
+        closing = (math.sqrt(change * change + 8.0 * change * abs(behind_mm) / step_s) - change) / 2.0
+        wanted_mm_s = moves_mm_s + math.copysign(min(closing, abs(behind_mm) / step_s), behind_mm)
+        speed_mm_s = min(max(wanted_mm_s, lowest), highest)
+        gap_mm += speed_mm_s * step_s
+        before_mm = now_mm
+        found.append(gap_mm)
+    return np.array(found)
+
+
+def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float, *, shows: bool = False) -> Array:
+    """The gap over the steps with the least RMS error of force that the drive allows.
+
+    A round takes the force to be straight over the gap, and the speeds that a step reaches straight over the speed
+    before, both about the gap of the last round, and solves the quadratic programme that this makes. Neither is convex,
+    so that this is the optimum is tested: against a search of everything (`tests/tools/test_bound.py`).
+    Raises RuntimeError where the rounds come to no end.
+    """
+    steps = len(asked.gap_mm)
+    slope_N_mm = np.gradient(brake.fresh_N, brake.gap_mm) * asked.scale
+    gap_mm = np.full(steps, asked.gap_mm.mean())
+    differ = sparse.diags([-1.0, 1.0], [0, 1], shape=(steps - 1, steps), format="csr")
+    former, latter, ends = differ[:-1], differ[1:], sparse.identity(steps, format="csr")
+    last_N, no_load_mm_s = math.inf, drive.stall_mm_s2 / drive.per_s
+    rounds = tqdm(range(ROUNDS), desc="foresight", unit="round", disable=not (shows and sys.stderr.isatty()))
+    for _ in rounds:
+        speeds_mm_s = np.diff(gap_mm) / step_s
+        highest, highest_slope = _reached(drive.highest_mm_s, gap_mm, speeds_mm_s, step_s)
+        lowest, lowest_slope = _reached(drive.lowest_mm_s, gap_mm, speeds_mm_s, step_s)
+        error_N = asked.rendered_N(brake, gap_mm) - asked.force_N
+        weight = np.interp(gap_mm, brake.gap_mm, slope_N_mm)
+        constraints = [
+            (latter - sparse.diags(highest_slope) @ former, (highest - speeds_mm_s[1:]) * step_s),
+            (sparse.diags(lowest_slope) @ former - latter, (speeds_mm_s[1:] - lowest) * step_s),
+            # the first speed has none before it
+            (differ[:1], np.array([no_load_mm_s - speeds_mm_s[0]]) * step_s),
+            (-differ[:1], np.array([no_load_mm_s + speeds_mm_s[0]]) * step_s),
+            (ends, brake.gap_mm[-1] - gap_mm),
+            (-ends, gap_mm - brake.gap_mm[0]),
+        ]
+        gap_mm = gap_mm + _least_squares(weight, error_N, constraints)
+        now_N = rms(asked.rendered_N(brake, gap_mm) - asked.force_N)
+        rounds.set_postfix_str(f"{now_N * 1e3:.2f} mN")
+        if abs(now_N - last_N) <= SETTLED * now_N + EXACT_N:
+            rounds.close()
+            return gap_mm
+        last_N = now_N
+    raise RuntimeError(f"foresight: no end after {ROUNDS} rounds, {last_N * 1e3:.2f} mN")
+
+
+def rms(error_N: Array) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(error_N**2)))
+
+
+def _reached(
+    limit_mm_s: Callable[[float, float, float], float], gap_mm: Array, speeds_mm_s: Array, step_s: float
+) -> tuple[Array, Array]:
+    """The limit of the speed after every step but the first, and how it changes with the speed before."""
+    found = []
+    for gap, speed in zip(gap_mm[1:-1].tolist(), speeds_mm_s[:-1].tolist(), strict=True):
+        more, less = limit_mm_s(gap, speed + SECANT_MM_S, step_s), limit_mm_s(gap, speed - SECANT_MM_S, step_s)
+        found.append((limit_mm_s(gap, speed, step_s), (more - less) / (2.0 * SECANT_MM_S)))
+    reached, slope = np.array(found).T
+    return reached, slope
+
+
+def _least_squares(weight: Array, error: Array, constraints: list[tuple[sparse.spmatrix, Array]]) -> Array:
+    """The x with the least |weight x + error| for which every matrix times x is at most its bound."""
+    unit = float(np.abs(weight).max())
+    rows = sparse.vstack([matrix for matrix, _ in constraints], format="csc")
+    bounds = np.concatenate([bound for _, bound in constraints])
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    solver = clarabel.DefaultSolver(
+        sparse.diags((weight / unit) ** 2, format="csc"),
+        weight * error / unit**2,
+        rows,
+        bounds,
+        [clarabel.NonnegativeConeT(len(bounds))],
+        settings,
+    )
+    solution = solver.solve()
+    if str(solution.status) not in SOLVED:
+        raise RuntimeError(f"foresight: the quadratic programme ended with {solution.status}")
+    return np.array(solution.x)
+
+
+def main() -> int:
+    """Prints the bound; 0, or 2 for what cannot be used."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("force", type=Path, metavar="FORCE.csv", help="columns t_s,force_N")
+    parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample (sample_1)")
+    parser.add_argument("--held", action="store_true", help="each force holds until the next (linear in between)")
+    parser.add_argument("--most-N", type=float, default=MOST_N, help=f"greatest force of the scene ({MOST_N:g})")
+    parser.add_argument("--hand-mm-s", type=float, default=HAND_MM_S, help=f"speed of the handle ({HAND_MM_S:g})")
+    parser.add_argument("--step-ms", type=float, default=STEP_S * 1e3, help=f"at most {STEP_S * 1e3:g}")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    options = parser.parse_args()
+    try:
+        task = read_task(options.force)
+        found = bound(
+            load_plant(options.plant),
+            task.time_s,
+            task.force_N,
+            is_held=options.held,
+            most_N=options.most_N,
+            hand_mm_s=options.hand_mm_s,
+            step_s=options.step_ms * 1e-3,
+            shows=True,
+        )
+    except (DomainError, PlantError, OSError) as error:
+        print(f"bound: {error}", file=sys.stderr)
+        return 2
+    result = found.figures()
+    if options.json:
+        print(json.dumps(result))
+        return 0
+    print(
+        f"{options.plant} (synthetic): {found.asked_N.min():.2f}..{found.asked_N.max():.2f} N, "
+        f"{len(found.time_s)} steps\n"
+        f"standard deviation  {result['sd_N'] * 1e3:7.1f} mN\n"
+        f"without delay       {result['no_delay_rms_N'] * 1e3:7.1f} mN\n"
+        f"with foresight      {result['foresight_rms_N'] * 1e3:7.1f} mN"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
