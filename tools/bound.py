@@ -150,14 +150,13 @@ def no_delay_mm(drive: Drive, wanted_mm: Array, step_s: float) -> Array:
         moves_mm_s = (now_mm - before_mm) / step_s
         behind_mm = before_mm - gap_mm
         # the largest speed of approach from which the way that is left suffices to fall back to the target's own
-        slow_mm_s = min(max(moves_mm_s, lowest), highest)
-        if behind_mm > 0.0:
-            braking = (slow_mm_s - drive.lowest_mm_s(gap_mm, slow_mm_s, step_s)) / step_s
-        else:
-            braking = (drive.highest_mm_s(gap_mm, slow_mm_s, step_s) - slow_mm_s) / step_s
+        towards = math.copysign(1.0, behind_mm)
+        faster_mm_s = min(max(moves_mm_s, lowest), highest) + towards * SECANT_MM_S
+        slowed = drive.lowest_mm_s if behind_mm > 0.0 else drive.highest_mm_s
+        braking = towards * (faster_mm_s - slowed(gap_mm, faster_mm_s, step_s)) / step_s
         change = max(braking, LEAST_BRAKING_MM_S2) * step_s
         closing = (math.sqrt(change * change + 8.0 * change * abs(behind_mm) / step_s) - change) / 2.0
-        wanted_mm_s = moves_mm_s + math.copysign(min(closing, abs(behind_mm) / step_s), behind_mm)
+        wanted_mm_s = moves_mm_s + towards * min(closing, abs(behind_mm) / step_s)
         speed_mm_s = min(max(wanted_mm_s, lowest), highest)
         gap_mm += speed_mm_s * step_s
         before_mm = now_mm
@@ -244,7 +243,7 @@ def _least_squares(weight: Array, error: Array, constraints: list[tuple[sparse.s
 
 
 def main() -> int:
-    """Prints the bound; 0, or 2 for what cannot be used."""
+    """Prints the bound; 0, 1 where no optimum was found, or 2 for what cannot be used."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("force", type=Path, metavar="FORCE.csv", help="columns t_s,force_N")
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample (sample_1)")
@@ -269,6 +268,9 @@ def main() -> int:
     except (DomainError, PlantError, OSError) as error:
         print(f"bound: {error}", file=sys.stderr)
         return 2
+    except RuntimeError as error:
+        print(f"bound: {error}", file=sys.stderr)
+        return 1
     result = found.figures()
     if options.json:
         print(json.dumps(result))

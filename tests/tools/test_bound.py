@@ -105,6 +105,15 @@ def test_without_delay_a_step_takes_the_least_time_that_acceleration_allows() ->
     assert no_delay_N == pytest.approx(N_MM * math.sqrt(squared / lasts_s), rel=0.02)
 
 
+@pytest.mark.parametrize("name", ["sample_1", "sample_2", "sample_3"])
+@pytest.mark.parametrize(("from_mm", "to_mm"), [(60.0, 61.0), (61.0, 60.0), (80.0, 55.0), (55.0, 80.0)])
+def test_without_delay_the_carriages_of_a_device_come_to_rest_where_they_were_sent(name, from_mm, to_mm) -> None:
+    wanted_mm = np.where(time_s(1.2) < 0.1, from_mm, to_mm)
+    share = (no_delay_mm(drive_of(load_plant(name)), wanted_mm, STEP_S) - from_mm) / (to_mm - from_mm)
+    assert share.max() <= 1.001
+    assert share[-1] == pytest.approx(1.0, abs=1e-6)
+
+
 def searched_N(drive: Drive, brake: Brake, wanted: Asked, step_s: float, grid_mm_s: float, most_mm_s: float) -> float:
     """The least RMS error over everything a grid of gaps and speeds holds: a dynamic programme. Its speeds are whole
     multiples of the gaps' grid a step, so nothing is interpolated; limits of speed are rounded inwards.
