@@ -53,20 +53,21 @@ SOLVED = ("Solved", "AlmostSolved")
 
 
 class Asked(NamedTuple):
-    """A force in even steps, clipped to what can be asked for, and the gap at which the device brakes that much.
+    """A force in even steps, clipped to what can be asked for, and the strength of the field that brakes that much.
 
     `scale`, `offset_N` and `relaxed_N` turn the fresh insert's force into the rendered one.
     """
 
     force_N: Array
-    gap_mm: Array
+    strength_Tm: Array
     relaxed_N: Array
     scale: float
     offset_N: float
 
     def rendered_N(self, brake: Brake, gap_mm: Array) -> Array:
-        """The force at a gap for each step."""
-        fresh_N = np.interp(gap_mm, brake.gap_mm, brake.fresh_N)
+        """The force along a way of the gap that begins with it open."""
+        moment_Tm = np.interp(gap_mm, brake.gap_mm, brake.moment_Tm)
+        fresh_N = np.interp(moment_Tm + brake.lags_Tm(moment_Tm), brake.strength_Tm, brake.fresh_N)
         rendered: Array = self.scale * (fresh_N - self.relaxed_N) + self.offset_N
         return rendered
 
@@ -114,7 +115,7 @@ def bound(
         wanted_N = force_N[np.searchsorted(time_s, axis_s + 1e-9, side="right") - 1]
     brake, drive = brake_of(plant), drive_of(plant)
     asked = asked_of(brake, wanted_N, most_N=most_N, hand_mm_s=hand_mm_s, step_s=step_s)
-    greedy_mm = no_delay_mm(drive, asked.gap_mm, step_s)
+    greedy_mm = no_delay_mm(drive, brake, asked, step_s)
     best_mm = foresight_mm(drive, brake, asked, step_s, shows=shows)
     return Bound(axis_s, asked.force_N, asked.rendered_N(brake, greedy_mm), asked.rendered_N(brake, best_mm))
 
@@ -123,9 +124,12 @@ def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, s
     """The force within the device's range; the insert relaxes as it does while that force is rendered exactly."""
     offset_N = brake.sliding_N(0.0, hand_mm_s)
     scale = brake.sliding_N(1.0, hand_mm_s) - offset_N
-    least_N, greatest_N = float(brake.fresh_N[-1]), float(brake.fresh_N[0])
+    # a gap that has been opened brakes a little more than one that was never closed
+    least_N = brake.fresh_at_N(float(brake.moment_Tm[-1]), brake.branch_Tm)
+    greatest_N = brake.fresh_at_N(float(brake.moment_Tm[0]), -brake.branch_Tm)
     series = brake.relaxation
-    relax, memory = series.discretise(step_s), series.relaxed(float(np.interp(brake.rested_mm, *brake[:2])))
+    rested_Tm = float(np.interp(brake.rested_mm, brake.gap_mm, brake.moment_Tm))
+    relax, memory = series.discretise(step_s), series.relaxed(brake.fresh_at_N(rested_Tm))
     relaxed_N = sum(series.fractions, 0.0) * memory[0]
     rendered, relaxed = [], []
     for wanted_N in force_N.tolist():
@@ -134,72 +138,97 @@ def asked_of(brake: Brake, force_N: Array, *, most_N: float, hand_mm_s: float, s
         relaxed_N = fresh_N - kinetic_N
         relaxed.append(relaxed_N)
         rendered.append(scale * kinetic_N + offset_N)
-    kinetic = (np.array(rendered) - offset_N) / scale
-    gap_mm = np.interp(kinetic + np.array(relaxed), brake.fresh_N[::-1], brake.gap_mm[::-1])
-    return Asked(np.array(rendered), gap_mm, np.array(relaxed), scale, offset_N)
+    fresh = (np.array(rendered) - offset_N) / scale + np.array(relaxed)
+    return Asked(
+        np.array(rendered), np.interp(fresh, brake.fresh_N, brake.strength_Tm), np.array(relaxed), scale, offset_N
+    )
 
 
-def no_delay_mm(drive: Drive, wanted_mm: Array, step_s: float) -> Array:
-    """The gap that follows a gap without delay or foresight, beginning on it at rest."""
-    gap_mm, speed_mm_s = float(wanted_mm[0]), 0.0
-    before_mm = gap_mm
-    found = [gap_mm]
-    for now_mm in wanted_mm[1:].tolist():
-        highest = drive.highest_mm_s(gap_mm, speed_mm_s, step_s)
-        lowest = drive.lowest_mm_s(gap_mm, speed_mm_s, step_s)
-        moves_mm_s = (now_mm - before_mm) / step_s
-        behind_mm = before_mm - gap_mm
-        # the largest speed of approach from which the way that is left suffices to fall back to the target's own
-        towards = math.copysign(1.0, behind_mm)
-        faster_mm_s = min(max(moves_mm_s, lowest), highest) + towards * SECANT_MM_S
-        slowed = drive.lowest_mm_s if behind_mm > 0.0 else drive.highest_mm_s
-        braking = towards * (faster_mm_s - slowed(gap_mm, faster_mm_s, step_s)) / step_s
-        change = max(braking, LEAST_BRAKING_MM_S2) * step_s
-        closing = (math.sqrt(change * change + 8.0 * change * abs(behind_mm) / step_s) - change) / 2.0
-        wanted_mm_s = moves_mm_s + towards * min(closing, abs(behind_mm) / step_s)
-        speed_mm_s = min(max(wanted_mm_s, lowest), highest)
-        gap_mm += speed_mm_s * step_s
-        before_mm = now_mm
+def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Array:
+    """The gap that follows a force without delay or foresight, beginning on it at rest."""
+    gaps_mm, moments_Tm = brake.gap_mm[::-1], brake.moment_Tm[::-1]
+    moment_Tm, lag_Tm = float(brake.moment_Tm[-1]), brake.branch_Tm
+
+    def wanted_mm(strength_Tm: float) -> float:
+        return float(np.interp(brake.moment_for_Tm(strength_Tm, moment_Tm, lag_Tm), moments_Tm, gaps_mm))
+
+    strengths_Tm = asked.strength_Tm.tolist()
+    before_Tm, gap_mm, speed_mm_s = strengths_Tm[0], wanted_mm(strengths_Tm[0]), 0.0
+    found = []
+    for now_Tm in strengths_Tm:
+        if found:
+            highest = drive.highest_mm_s(gap_mm, speed_mm_s, step_s)
+            lowest = drive.lowest_mm_s(gap_mm, speed_mm_s, step_s)
+            target_mm = wanted_mm(before_Tm)
+            moves_mm_s, behind_mm = (wanted_mm(now_Tm) - target_mm) / step_s, target_mm - gap_mm
+            # the largest speed of approach from which the way that is left suffices to fall back to the target's own
+            towards = math.copysign(1.0, behind_mm)
+            faster_mm_s = min(max(moves_mm_s, lowest), highest) + towards * SECANT_MM_S
+            slowed = drive.lowest_mm_s if behind_mm > 0.0 else drive.highest_mm_s
+            braking = towards * (faster_mm_s - slowed(gap_mm, faster_mm_s, step_s)) / step_s
+            change = max(braking, LEAST_BRAKING_MM_S2) * step_s
+            closing = (math.sqrt(change * change + 8.0 * change * abs(behind_mm) / step_s) - change) / 2.0
+            wanted_mm_s = moves_mm_s + towards * min(closing, abs(behind_mm) / step_s)
+            speed_mm_s = min(max(wanted_mm_s, lowest), highest)
+            gap_mm += speed_mm_s * step_s
         found.append(gap_mm)
+        arrived_Tm = float(np.interp(gap_mm, brake.gap_mm, brake.moment_Tm))
+        if arrived_Tm != moment_Tm:
+            lag_Tm = brake.lag_after_Tm(lag_Tm, arrived_Tm - moment_Tm)
+        moment_Tm, before_Tm = arrived_Tm, now_Tm
     return np.array(found)
 
 
 def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float, *, shows: bool = False) -> Array:
     """The gap over the steps with the least RMS error of force that the drive allows.
 
-    A round takes the force to be straight over the gap, and the speeds that a step reaches straight over the speed
-    before, both about the gap of the last round, and solves the quadratic programme that this makes. Neither is convex,
-    so that this is the optimum is tested: against a search of everything (`tests/tools/test_bound.py`).
+    A round takes for straight, about the gap of the last round, what is not: the force over the gap, the field's lag,
+    and the speeds that a step reaches over the speed before. It solves the quadratic programme that this makes, whose
+    unknowns are the gaps and the lags. Nothing says that this is convex, so that it ends at the optimum is tested:
+    against a search of everything (`tests/tools/test_bound.py`).
     Raises RuntimeError where the rounds come to no end.
     """
-    steps = len(asked.gap_mm)
-    slope_N_mm = np.gradient(brake.fresh_N, brake.gap_mm) * asked.scale
-    gap_mm = np.full(steps, asked.gap_mm.mean())
+    steps = len(asked.force_N)
+    slope_Tm_mm = np.gradient(brake.moment_Tm, brake.gap_mm)
+    slope_N_Tm = asked.scale * np.gradient(brake.fresh_N, brake.strength_Tm)
+    gap_mm = np.full(steps, float(np.interp(-asked.strength_Tm.mean(), -brake.moment_Tm, brake.gap_mm)))
+    no_load_mm_s = drive.stall_mm_s2 / drive.per_s
     differ = sparse.diags([-1.0, 1.0], [0, 1], shape=(steps - 1, steps), format="csr")
-    former, latter, ends = differ[:-1], differ[1:], sparse.identity(steps, format="csr")
-    last_N, no_load_mm_s = math.inf, drive.stall_mm_s2 / drive.per_s
+    earlier, later, gaps = differ[:-1], differ[1:], sparse.identity(steps, format="csr")
+    last_N, radius_mm = math.inf, float(np.ptp(brake.gap_mm))
     rounds = tqdm(range(ROUNDS), desc="foresight", unit="round", disable=not (shows and sys.stderr.isatty()))
     for _ in rounds:
         speeds_mm_s = np.diff(gap_mm) / step_s
         highest, highest_slope = _reached(drive.highest_mm_s, gap_mm, speeds_mm_s, step_s)
         lowest, lowest_slope = _reached(drive.lowest_mm_s, gap_mm, speeds_mm_s, step_s)
-        error_N = asked.rendered_N(brake, gap_mm) - asked.force_N
-        weight = np.interp(gap_mm, brake.gap_mm, slope_N_mm)
-        constraints = [
-            (latter - sparse.diags(highest_slope) @ former, (highest - speeds_mm_s[1:]) * step_s),
-            (sparse.diags(lowest_slope) @ former - latter, (speeds_mm_s[1:] - lowest) * step_s),
+        limits = [
+            (later - sparse.diags(highest_slope) @ earlier, (highest - speeds_mm_s[1:]) * step_s),
+            (sparse.diags(lowest_slope) @ earlier - later, (speeds_mm_s[1:] - lowest) * step_s),
             # the first speed has none before it
-            (differ[:1], np.array([no_load_mm_s - speeds_mm_s[0]]) * step_s),
-            (-differ[:1], np.array([no_load_mm_s + speeds_mm_s[0]]) * step_s),
-            (ends, brake.gap_mm[-1] - gap_mm),
-            (-ends, gap_mm - brake.gap_mm[0]),
+            (differ[:1], (no_load_mm_s - speeds_mm_s[:1]) * step_s),
+            (-differ[:1], (no_load_mm_s + speeds_mm_s[:1]) * step_s),
+            (gaps, np.minimum(brake.gap_mm[-1] - gap_mm, radius_mm)),
+            (-gaps, np.minimum(gap_mm - brake.gap_mm[0], radius_mm)),
         ]
-        gap_mm = gap_mm + _least_squares(weight, error_N, constraints)
+        moment_Tm = np.interp(gap_mm, brake.gap_mm, brake.moment_Tm)
+        lag_Tm = brake.lags_Tm(moment_Tm)
+        turned = np.interp(gap_mm, brake.gap_mm, slope_Tm_mm)
+        felt = np.interp(moment_Tm + lag_Tm, brake.strength_Tm, slope_N_Tm)
+        # lags counted in millimetres of gap, as which they weigh as much as these
+        unit_Tm = float(np.abs(turned).max())
+        error_N = asked.rendered_N(brake, gap_mm) - asked.force_N
+        sensed = sparse.hstack([sparse.diags(felt * turned), sparse.diags(felt * unit_Tm)], format="csc")
+        followed = sparse.hstack([*_lagging(brake, moment_Tm, lag_Tm, turned / unit_Tm)], format="csc")
+        moved_mm = _least_squares(sensed, error_N, followed, limits)[:steps]
+        gap_mm = gap_mm + moved_mm
         now_N = rms(asked.rendered_N(brake, gap_mm) - asked.force_N)
         rounds.set_postfix_str(f"{now_N * 1e3:.2f} mN")
         if abs(now_N - last_N) <= SETTLED * now_N + EXACT_N:
             rounds.close()
             return gap_mm
+        if now_N > last_N:
+            # where the gap turns, one round may undo the other: each goes less far then
+            radius_mm = 0.5 * float(np.abs(moved_mm).max())
         last_N = now_N
     raise RuntimeError(f"foresight: no end after {ROUNDS} rounds, {last_N * 1e3:.2f} mN")
 
@@ -221,19 +250,38 @@ def _reached(
     return reached, slope
 
 
-def _least_squares(weight: Array, error: Array, constraints: list[tuple[sparse.spmatrix, Array]]) -> Array:
-    """The x with the least |weight x + error| for which every matrix times x is at most its bound."""
-    unit = float(np.abs(weight).max())
-    rows = sparse.vstack([matrix for matrix, _ in constraints], format="csc")
-    bounds = np.concatenate([bound for _, bound in constraints])
+def _lagging(brake: Brake, moment_Tm: Array, lag_Tm: Array, turned: Array) -> tuple[sparse.spmatrix, sparse.spmatrix]:
+    """Two matrices, for the changes of the gaps and of the lags, whose products with them add up to nothing."""
+    steps = len(moment_Tm)
+    change_Tm = np.diff(moment_Tm)
+    kept = np.exp(-np.abs(change_Tm) / brake.turn_Tm)
+    pulled = np.sign(change_Tm) * (lag_Tm[:-1] + np.sign(change_Tm) * brake.branch_Tm) / brake.turn_Tm * kept
+    # the first lag is what it is
+    of_gaps = sparse.diags(
+        [np.concatenate([[0.0], pulled]) * turned, -pulled * turned[:-1]], [0, -1], shape=(steps, steps)
+    )
+    of_lags = sparse.diags([np.ones(steps), -kept], [0, -1], shape=(steps, steps))
+    return of_gaps, of_lags
+
+
+def _least_squares(
+    matrix: sparse.spmatrix, error: Array, nothing: sparse.spmatrix, limits: list[tuple[sparse.spmatrix, Array]]
+) -> Array:
+    """The x with the least |matrix x + error| for which `nothing` x is zero, and limits hold: a matrix times the first
+    elements of x is at most its bounds.
+    """
+    unit = float(np.abs(matrix).max())
+    below = sparse.vstack([limit for limit, _ in limits], format="csc")
+    below.resize(below.shape[0], matrix.shape[1])
+    bounds = np.concatenate([bound for _, bound in limits])
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     solver = clarabel.DefaultSolver(
-        sparse.diags((weight / unit) ** 2, format="csc"),
-        weight * error / unit**2,
-        rows,
-        bounds,
-        [clarabel.NonnegativeConeT(len(bounds))],
+        sparse.triu(matrix.T @ matrix / unit**2, format="csc"),
+        matrix.T @ error / unit**2,
+        sparse.vstack([nothing, below], format="csc"),
+        np.concatenate([np.zeros(nothing.shape[0]), bounds]),
+        [clarabel.ZeroConeT(nothing.shape[0]), clarabel.NonnegativeConeT(len(bounds))],
         settings,
     )
     solution = solver.solve()

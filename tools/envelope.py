@@ -235,7 +235,7 @@ def armed(config: Config, plant: PlantParameters, legs: list[tuple[float, float]
 def open_gap_N(plant: PlantParameters) -> Callable[[float], float]:
     """What a device brakes with its gap open and its elastomer fresh, over the speed."""
     brake = brake_of(plant)
-    fresh_N = float(brake.fresh_N[-1])
+    fresh_N = brake.fresh_at_N(float(brake.moment_Tm[-1]))
     return lambda speed_mm_s: brake.sliding_N(fresh_N, speed_mm_s)
 
 

@@ -2,8 +2,7 @@
 
 Motors by their torque-speed line and current limit, friction of gearbox, screw and guide, the magnets' pull: the laws
 of the simulated axis (`tormagd/simulation/axis.py`), both carriages together. Left out is what only holds them back:
-windings, backlash, the field's hysteresis, the bristles of friction, sensors, the exchange. So no controller drives
-this device's gap faster.
+windings, backlash, the bristles of friction, sensors, the exchange. So no controller drives this device's gap faster.
 """
 
 import math
@@ -15,14 +14,18 @@ import numpy.typing as npt
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.curve import Curve
+from tormagd.simulation.element import SMALLEST_GAP_MM
 from tormagd.simulation.parameters import PlantParameters
-from tormagd.simulation.static_laws import force_over_moment, pull_over_gap, radial_moment_Tm
+from tormagd.simulation.static_laws import MOMENT_POINTS, force_over_moment, pull_over_gap, radial_moment_Tm
 
 Array = npt.NDArray[np.float64]
 
 
 GRID_MM = 2e-3
-"Of the force over the gap."
+"Of the moment over the gap."
+NEWTON_STEPS = 6
+LEAST_GAIN = 0.1
+"Of the field on the gap, just turned round."
 
 
 class Drive(NamedTuple):
@@ -72,11 +75,19 @@ class Drive(NamedTuple):
 
 
 class Brake(NamedTuple):
-    """What the gap brakes while the handle slides: the forces of the fresh, cool insert, `fresh_N`, over rising gaps
-    from closed to open, `gap_mm`; what relaxes of them, and where the insert has rested for long before; friction.
+    """What the gap brakes while the handle slides.
+
+    A gap gives a moment of the field (`moment_Tm` over `gap_mm`, from closed to open), which lags behind while it
+    changes: up to `branch_Tm`, and by most of that within a change of `turn_Tm`. Moment and lag together give the force
+    of the fresh, cool insert (`fresh_N` over `strength_Tm`), part of which relaxes; friction makes of it what is felt.
+    `rested_mm` is the gap at which the insert has rested before.
     """
 
     gap_mm: Array
+    moment_Tm: Array
+    branch_Tm: float
+    turn_Tm: float
+    strength_Tm: Array
     fresh_N: Array
     relaxation: PronySeries
     rested_mm: float
@@ -85,6 +96,38 @@ class Brake(NamedTuple):
     def sliding_N(self, kinetic_N: float, hand_mm_s: float) -> float:
         """The force at that level of kinetic friction, at that speed of the handle."""
         return self.friction.level_N(hand_mm_s, kinetic_N) + self.friction.viscous_N_s_mm * abs(hand_mm_s)
+
+    def fresh_at_N(self, moment_Tm: float, lag_Tm: float = 0.0) -> float:
+        """The force of the fresh insert at a moment and its lag."""
+        return float(np.interp(moment_Tm + lag_Tm, self.strength_Tm, self.fresh_N))
+
+    def lag_after_Tm(self, lag_Tm: float, change_Tm: float) -> float:
+        """The lag once the moment has changed by that much, one way."""
+        branch_Tm = math.copysign(self.branch_Tm, -change_Tm)
+        return branch_Tm + (lag_Tm - branch_Tm) * math.exp(-abs(change_Tm) / self.turn_Tm)
+
+    def lags_Tm(self, moments_Tm: Array) -> Array:
+        """The lag of every moment of a series, before whose first the gap was open."""
+        lag_Tm, before_Tm = self.branch_Tm, float(self.moment_Tm[-1])
+        found = []
+        for moment_Tm in moments_Tm.tolist():
+            if moment_Tm != before_Tm:
+                lag_Tm = self.lag_after_Tm(lag_Tm, moment_Tm - before_Tm)
+                before_Tm = moment_Tm
+            found.append(lag_Tm)
+        return np.array(found)
+
+    def moment_for_Tm(self, strength_Tm: float, moment_Tm: float, lag_Tm: float) -> float:
+        """The moment that makes that strength, from a moment and its lag: Newton's method along the branch."""
+        wanted_Tm = moment_Tm
+        for _ in range(NEWTON_STEPS):
+            change_Tm = wanted_Tm - moment_Tm
+            short_Tm = strength_Tm - wanted_Tm - self.lag_after_Tm(lag_Tm, change_Tm)
+            # where it stands still, the branch is the one that leads there
+            branch_Tm = math.copysign(self.branch_Tm, -(change_Tm or short_Tm))
+            fading = abs(lag_Tm - branch_Tm) * math.exp(-abs(change_Tm) / self.turn_Tm) / self.turn_Tm
+            wanted_Tm += short_Tm / max(1.0 - fading, LEAST_GAIN)
+        return wanted_Tm
 
 
 def drive_of(plant: PlantParameters) -> Drive:
@@ -114,10 +157,18 @@ def brake_of(plant: PlantParameters) -> Brake:
     closed_mm, open_mm = 2.0 * assumed.closed_mm, 2.0 * assumed.home_mm
     gap_mm = np.linspace(closed_mm, open_mm, math.ceil((open_mm - closed_mm) / GRID_MM) + 1)
     moment_Tm = radial_moment_Tm(gap_mm, plant)
-    force = force_over_moment(plant, float(moment_Tm.min()), float(moment_Tm.max()))
+    largest_Tm = float(radial_moment_Tm(np.array([SMALLEST_GAP_MM]), plant)[0])
+    branch_Tm = plant.field.hysteresis_percent / 100.0 * largest_Tm
+    weakest_Tm, strongest_Tm = float(moment_Tm[-1]) - branch_Tm, float(moment_Tm[0]) + branch_Tm
+    force = force_over_moment(plant, weakest_Tm, strongest_Tm)
+    strength_Tm = np.linspace(weakest_Tm, strongest_Tm, MOMENT_POINTS)
     return Brake(
         gap_mm,
-        np.array([force.at(moment) for moment in moment_Tm.tolist()]),
+        moment_Tm,
+        branch_Tm,
+        assumed.hysteresis_scale * largest_Tm,
+        strength_Tm,
+        np.array([force.at(strength) for strength in strength_Tm.tolist()]),
         PronySeries(plant.relaxation.fractions, plant.relaxation.times_s),
         assumed.start_left_mm + assumed.start_right_mm,
         Friction(

@@ -26,24 +26,35 @@ from tormagd.simulation.plant import Plant
 STEP_S = 1e-3
 SPEED_MM_S = 40.0
 AT_ONCE = Drive(stall_mm_s2=900.0 * SPEED_MM_S, per_s=900.0, most_mm_s2=1e9)
-STRAIGHT = Brake(np.array([0.0, 100.0]), np.array([11.0, 1.0]), PronySeries((), ()), 50.0, Friction(8.0, 0.0, 1.0, 5.0))
+STRAIGHT = Brake(
+    gap_mm=np.array([0.0, 100.0]),
+    moment_Tm=np.array([11.0, 1.0]),
+    branch_Tm=0.0,
+    turn_Tm=1.0,
+    strength_Tm=np.array([1.0, 11.0]),
+    fresh_N=np.array([1.0, 11.0]),
+    relaxation=PronySeries((), ()),
+    rested_mm=50.0,
+    friction=Friction(8.0, 0.0, 1.0, 5.0),
+)
 N_MM = 0.1
 
 
 def asked(gap_mm: np.ndarray) -> Asked:
     """What has the straight brake at these gaps."""
-    force_N = np.interp(gap_mm, *STRAIGHT[:2])
-    return asked_of(STRAIGHT, force_N, most_N=20.0, hand_mm_s=42.0, step_s=STEP_S)
+    force_N = np.interp(gap_mm, STRAIGHT.gap_mm, STRAIGHT.moment_Tm)
+    found = asked_of(STRAIGHT, force_N, most_N=20.0, hand_mm_s=42.0, step_s=STEP_S)
+    assert found.force_N == pytest.approx(force_N)
+    return found
 
 
 def errors_N(gap_mm: np.ndarray, drive: Drive = AT_ONCE, ends: int = 0) -> tuple[float, float]:
     """RMS without delay and with foresight of a way of the gap, less so many steps at either end."""
     wanted = asked(gap_mm)
-    assert wanted.gap_mm == pytest.approx(gap_mm)
-    return tuple(
-        rms((wanted.rendered_N(STRAIGHT, found) - wanted.force_N)[ends : len(gap_mm) - ends])
-        for found in (no_delay_mm(drive, wanted.gap_mm, STEP_S), foresight_mm(drive, STRAIGHT, wanted, STEP_S))
-    )
+    greedy_mm = no_delay_mm(drive, STRAIGHT, wanted, STEP_S)
+    best_mm = foresight_mm(drive, STRAIGHT, wanted, STEP_S)
+    inside = slice(ends, len(gap_mm) - ends)
+    return rms(N_MM * (greedy_mm - gap_mm)[inside]), rms(N_MM * (best_mm - gap_mm)[inside])
 
 
 def time_s(seconds: float) -> np.ndarray:
@@ -109,21 +120,23 @@ def test_without_delay_a_step_takes_the_least_time_that_acceleration_allows() ->
 @pytest.mark.parametrize(("from_mm", "to_mm"), [(60.0, 61.0), (61.0, 60.0), (80.0, 55.0), (55.0, 80.0)])
 def test_without_delay_the_carriages_of_a_device_come_to_rest_where_they_were_sent(name, from_mm, to_mm) -> None:
     wanted_mm = np.where(time_s(1.2) < 0.1, from_mm, to_mm)
-    share = (no_delay_mm(drive_of(load_plant(name)), wanted_mm, STEP_S) - from_mm) / (to_mm - from_mm)
+    found_mm = no_delay_mm(drive_of(load_plant(name)), STRAIGHT, asked(wanted_mm), STEP_S)
+    share = (found_mm - from_mm) / (to_mm - from_mm)
     assert share.max() <= 1.001
     assert share[-1] == pytest.approx(1.0, abs=1e-6)
 
 
 def searched_N(drive: Drive, brake: Brake, wanted: Asked, step_s: float, grid_mm_s: float, most_mm_s: float) -> float:
-    """The least RMS error over everything a grid of gaps and speeds holds: a dynamic programme. Its speeds are whole
-    multiples of the gaps' grid a step, so nothing is interpolated; limits of speed are rounded inwards.
+    """The least RMS error over everything a grid of gaps and speeds holds: a dynamic programme, of a brake without lag.
+    Its speeds are whole multiples of the gaps' grid a step: nothing is interpolated, limits are rounded inwards.
     """
     grid_mm = grid_mm_s * step_s
-    gaps = np.arange(wanted.gap_mm.min() - 1.0, wanted.gap_mm.max() + 1.0, grid_mm)
+    wanted_mm = np.interp(-wanted.strength_Tm, -brake.moment_Tm, brake.gap_mm)
+    gaps = np.arange(wanted_mm.min() - 1.0, wanted_mm.max() + 1.0, grid_mm)
     speeds = np.arange(-round(most_mm_s / grid_mm_s), round(most_mm_s / grid_mm_s) + 1)
     highest = [math.floor(drive.highest_mm_s(50.0, grid_mm_s * j, step_s) / grid_mm_s + 1e-9) for j in speeds.tolist()]
     lowest = [math.ceil(drive.lowest_mm_s(50.0, grid_mm_s * j, step_s) / grid_mm_s - 1e-9) for j in speeds.tolist()]
-    fresh_N = np.interp(gaps, brake.gap_mm, brake.fresh_N)
+    fresh_N = np.interp(np.interp(gaps, brake.gap_mm, brake.moment_Tm), brake.strength_Tm, brake.fresh_N)
     sums = np.zeros((len(speeds), len(gaps)))
     for index, (asked_N, relaxed_N) in enumerate(zip(wanted.force_N.tolist(), wanted.relaxed_N.tolist(), strict=True)):
         squared = (wanted.scale * (fresh_N - relaxed_N) + wanted.offset_N - asked_N) ** 2
@@ -145,7 +158,7 @@ def test_nothing_better_is_found_by_searching_everything(low_N: float, high_N: f
     """On the curved force of sample 1, with friction that only brakes: neither error nor limits are convex."""
     step_s = 4e-3
     drive = Drive(stall_mm_s2=1e6, per_s=1.0, most_mm_s2=1500.0, gear_mm_s2=250.0)
-    brake = brake_of(load_plant("sample_1"))
+    brake = brake_of(load_plant("sample_1"))._replace(branch_Tm=0.0)
     along_s = step_s * np.arange(150)
     force_N = low_N + (high_N - low_N) * (0.5 + 0.5 * zigzag(along_s / period_s) ** 3)
     wanted = asked_of(brake, force_N, most_N=2.0, hand_mm_s=42.0, step_s=step_s)
@@ -180,23 +193,59 @@ def test_no_carriage_of_the_plant_is_faster_and_none_much_slower(plant: PlantPar
 
 
 @pytest.mark.parametrize("plant", SAMPLES)
-def test_the_gap_that_is_wanted_renders_what_is_asked(plant: PlantParameters) -> None:
-    """On the device's own element, relaxation and Stribeck level included, once the handle slides."""
-    no_hysteresis = msgspec.structs.replace(plant.field, hysteresis_percent=0.0)
-    cool = msgspec.structs.replace(plant.thermal, drift_K_h=0.0)
-    plant = msgspec.structs.replace(plant, field=no_hysteresis, thermal=cool)
-    brake, hand_mm_s = brake_of(plant), 8.0
-    force_N = 1.3 + 0.5 * np.sin(0.2 * time_s(10.0))
-    wanted = asked_of(brake, force_N, most_N=1.7, hand_mm_s=hand_mm_s, step_s=STEP_S)
-    assert wanted.force_N == pytest.approx(np.minimum(force_N, 1.7), abs=1e-4)
-    element, rendered, kinetic = Element(plant, brake.rested_mm, STEP_S), [], []
-    for index, gap_mm in enumerate(wanted.gap_mm.tolist()):
-        element.advance(STEP_S * index, gap_mm, hand_mm_s)
-        rendered.append(element.force_N)
+def test_the_force_of_the_gap_is_that_of_the_devices_element(plant: PlantParameters) -> None:
+    """Field, its lag, relaxation and the Stribeck level, along the way of a carriage that comes too late."""
+    plant = msgspec.structs.replace(plant, thermal=msgspec.structs.replace(plant.thermal, drift_K_h=0.0))
+    brake, hand_mm_s, along_s = brake_of(plant), 8.0, time_s(6.0)
+    force_N = 1.2 + 0.5 * np.sin(4.0 * along_s) * np.cos(0.7 * along_s)
+    wanted = asked_of(brake, force_N, most_N=1.5, hand_mm_s=hand_mm_s, step_s=STEP_S)
+    assert wanted.force_N == pytest.approx(np.minimum(force_N, 1.5), abs=1e-4)
+    gap_mm = no_delay_mm(drive_of(plant), brake, wanted, STEP_S)
+    rendered_N = wanted.rendered_N(brake, gap_mm)
+    element, kinetic, felt = Element(plant, brake.rested_mm, STEP_S), [], []
+    for before_mm in (brake.gap_mm[0], brake.gap_mm[-1]):
+        element.advance(0.0, float(before_mm), 0.0)
+    for index, gap in enumerate(gap_mm.tolist()):
+        element.advance(STEP_S * index, gap, hand_mm_s)
         kinetic.append(element.kinetic_N)
-    assert wanted.scale * np.array(kinetic) + wanted.offset_N == pytest.approx(wanted.force_N, abs=2e-4)
+        felt.append(element.force_N)
+    assert wanted.scale * np.array(kinetic) + wanted.offset_N == pytest.approx(rendered_N, abs=2e-3)
     # friction follows a rising level within some hundredths of a second at this speed
-    assert np.array(rendered)[1000:] == pytest.approx(wanted.force_N[1000:], abs=5e-3)
+    assert np.median(np.abs(np.array(felt) - rendered_N)[1000:]) <= 0.02
+
+
+@pytest.mark.parametrize("plant", SAMPLES)
+def test_without_delay_a_force_within_reach_is_met_in_spite_of_the_fields_lag(plant: PlantParameters) -> None:
+    """A slow wave that turns twice, first step excepted: the greedy gap goes further after every turn."""
+    brake = brake_of(plant)
+    force_N = 1.3 - 0.3 * np.cos(2.0 * time_s(6.0))
+    wanted = asked_of(brake, force_N, most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
+    greedy_mm = no_delay_mm(drive_of(plant), brake, wanted, STEP_S)
+    assert rms(wanted.rendered_N(brake, greedy_mm) - wanted.force_N) <= 1e-3
+    assert np.ptp(greedy_mm) > np.ptp(no_delay_mm(drive_of(plant), brake._replace(branch_Tm=0.0), wanted, STEP_S))
+
+
+@pytest.mark.parametrize("plant", SAMPLES)
+def test_the_fields_lag_takes_some_of_what_foresight_gains(plant: PlantParameters) -> None:
+    """And no wave of the gap beside the optimum is better than the optimum, lag included."""
+    brake, drive, along_s = brake_of(plant), drive_of(plant), time_s(1.2)
+    force_N = 1.55 + 0.15 * zigzag(along_s / 0.25)
+    wanted = asked_of(brake, force_N, most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
+
+    def error_N(brake: Brake, gap_mm: np.ndarray) -> float:
+        return rms(wanted.rendered_N(brake, gap_mm) - wanted.force_N)
+
+    best_mm = foresight_mm(drive, brake, wanted, STEP_S)
+    best_N = error_N(brake, best_mm)
+    straight = brake._replace(branch_Tm=0.0)
+    assert best_N > error_N(straight, foresight_mm(drive, straight, wanted, STEP_S))
+    # what only moves or shrinks the way is within the drive's limits as well
+    for shift_mm in (-0.05, 0.05):
+        assert error_N(brake, best_mm + shift_mm) > best_N
+    for share in (0.9, 0.97):
+        assert error_N(brake, best_mm.mean() + share * (best_mm - best_mm.mean())) > best_N
+    for steps in (-5, 5):
+        assert error_N(brake, np.roll(best_mm, steps)) > best_N
 
 
 @pytest.mark.parametrize("plant", SAMPLES)
