@@ -157,7 +157,7 @@ def no_delay_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arra
 
     strengths_Tm = asked.strength_Tm.tolist()
     before_Tm, gap_mm, speed_mm_s = strengths_Tm[0], wanted_mm(strengths_Tm[0]), 0.0
-    found = []
+    found: list[float] = []
     for now_Tm in strengths_Tm:
         if found:
             highest = drive.highest_mm_s(gap_mm, speed_mm_s, step_s)

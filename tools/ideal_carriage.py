@@ -156,7 +156,7 @@ def brake_of(plant: PlantParameters) -> Brake:
     assumed, friction = plant.assumed, plant.friction
     closed_mm, open_mm = 2.0 * assumed.closed_mm, 2.0 * assumed.home_mm
     gap_mm = np.linspace(closed_mm, open_mm, math.ceil((open_mm - closed_mm) / GRID_MM) + 1)
-    moment_Tm = radial_moment_Tm(gap_mm, plant)
+    moment_Tm = np.asarray(radial_moment_Tm(gap_mm, plant), dtype=np.float64)
     largest_Tm = float(radial_moment_Tm(np.array([SMALLEST_GAP_MM]), plant)[0])
     branch_Tm = plant.field.hysteresis_percent / 100.0 * largest_Tm
     weakest_Tm, strongest_Tm = float(moment_Tm[-1]) - branch_Tm, float(moment_Tm[0]) + branch_Tm
