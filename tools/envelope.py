@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from device_draws import drawn_device
+from ideal_carriage import brake_of
 from tqdm import tqdm
 
 from tormagd.closed_loop import ClosedLoop
@@ -38,7 +38,6 @@ from tormagd.physics.inserts import insert
 from tormagd.safety.codes import Fault, Limit
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.element import Element
 from tormagd.simulation.hand import Hand, RecordedHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
@@ -235,17 +234,9 @@ def armed(config: Config, plant: PlantParameters, legs: list[tuple[float, float]
 
 def open_gap_N(plant: PlantParameters) -> Callable[[float], float]:
     """What a device brakes with its gap open and its elastomer fresh, over the speed."""
-    fresh = msgspec.structs.replace(plant.relaxation, fractions=(), times_s=())
-    element = Element(msgspec.structs.replace(plant, relaxation=fresh), 2.0 * plant.assumed.home_mm, 1e-3)
-    element.advance(0.0, 2.0 * plant.assumed.home_mm, 0.0)
-    friction, kinetic_N = plant.friction, element.kinetic_N
-    over, slow = friction.static_to_kinetic - 1.0, friction.stribeck_speed_mm_s
-
-    def force_N(speed_mm_s: float) -> float:
-        level = 1.0 + over * math.exp(-((speed_mm_s / slow) ** 2))
-        return kinetic_N * level + friction.viscous_N_s_mm * abs(speed_mm_s)
-
-    return force_N
+    brake = brake_of(plant)
+    fresh_N = brake.fresh_at_N(float(brake.moment_Tm[-1]))
+    return lambda speed_mm_s: brake.sliding_N(fresh_N, speed_mm_s)
 
 
 def run(case: Case) -> Figures:

@@ -3,7 +3,9 @@
     force_tracking.py [samples|draws|staircase|signals|portrait|all] [--json] [--picture FILE.png]
 
 Nothing is removed from an error: no mean, no delay. The pulse is the one of `make run`, 500 setpoints a second; "with
-preview" each carries the next 70 ms, as a publisher can that plays a file; live ones do not. All devices are synthetic.
+preview" each carries the next 70 ms, as a publisher can that plays a file; live ones do not. Beside samples and signals
+stands what the device's ideal carriages miss (`tools/bound.py`), without delay and with foresight. All devices are
+synthetic.
 """
 
 import argparse
@@ -20,6 +22,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 from benchmark_step import drive, settled_loop
+from bound import Bound, bound
 from force_signals import Signal, data_folder, recorded_signals
 from human_pulse import pulse_profile, with_approach
 from thesis_values import USE_CASES
@@ -152,20 +155,33 @@ def figures(result: Tracking) -> Json:
     }
 
 
+def ideal(plant: PlantParameters, signal: Signal) -> Bound:
+    """What the device's ideal carriages render of a signal."""
+    return bound(plant, signal.time_s, signal.force_N, is_held=not signal.is_known_ahead)
+
+
+def compared(found: Track, best: Bound, start_s: float) -> Json:
+    """The figures from a time on, and the RMS errors of the ideal carriages since then."""
+    least = best.figures(start_s)
+    return figures(found.since(start_s)) | {name: least[name] for name in ("no_delay_rms_N", "foresight_rms_N")}
+
+
 def samples(pool: concurrent.futures.Executor) -> tuple[Json, dict[str, Track]]:
     """The pulse on the three samples, with and without preview: the whole of it, and after TRIM_S."""
     cases = [(name, preview) for name in SAMPLES for preview in (PREVIEW_S, 0.0)]
     plants = [load_plant(name) for name, _ in cases]
     count = len(cases)
-    tracks = pool.map(track, plants, [pulse(PULSE_S)] * count, ["pulse"] * count, [preview for _, preview in cases])
+    played = pulse(PULSE_S)
+    tracks = pool.map(track, plants, [played] * count, ["pulse"] * count, [preview for _, preview in cases])
+    best = {name: pool.submit(ideal, load_plant(name), played) for name in SAMPLES}
     rows, kept = [], {}
     for (name, preview), found in zip(cases, tracks, strict=True):
         rows.append(
             {
                 "plant": name,
                 "preview": preview > 0.0,
-                "whole": figures(found.since(0.0)),
-                "after_trim": figures(found.since(TRIM_S)),
+                "whole": compared(found, best[name].result(), 0.0),
+                "after_trim": compared(found, best[name].result(), TRIM_S),
                 "trim": found.trim,
                 "lag_ms": found.lag_s * 1e3,
                 "limits": found.limits,
@@ -265,12 +281,14 @@ def signals(pool: concurrent.futures.Executor) -> Json:
     cases = [(signal, PREVIEW_S) for signal in found if signal.is_known_ahead] + [(signal, 0.0) for signal in found]
     count = len(cases)
     played, previews = [signal for signal, _ in cases], [preview_s for _, preview_s in cases]
-    tracks = pool.map(track, [load_plant("sample_1")] * count, played, ["coronary"] * count, previews)
+    plant = load_plant("sample_1")
+    tracks = pool.map(track, [plant] * count, played, ["coronary"] * count, previews)
+    best = {signal.name: pool.submit(ideal, plant, signal) for signal in found}
     rows = []
     for (signal, preview_s), rendered in zip(cases, tracks, strict=True):
         rows.append(
             {"signal": signal.name, "scaled": signal.scaled, "preview": preview_s > 0.0}
-            | figures(rendered.since(0.0))
+            | compared(rendered, best[signal.name].result(), 0.0)
             | {"limits": rendered.limits}
         )
     return {"rows": rows}
@@ -312,7 +330,8 @@ def print_tables(result: Json) -> None:
     """Everything that was measured, for a person."""
     if "samples" in result:
         print(
-            "pulse 1.4..1.7 N        whole                 after 10 s            trim   lag    limits (share of time)"
+            "pulse 1.4..1.7 N      whole (ideal: no delay, foresight)        after 10 s                                "
+            "trim   lag    limits (share of time)"
         )
         for row in result["samples"]["rows"]:
             label = f"{row['plant']}{', preview' if row['preview'] else ''}"
@@ -348,7 +367,8 @@ def print_tables(result: Json) -> None:
 
 
 def _short(row: Json) -> str:
-    return f"{row['rms_N'] * 1e3:5.1f} mN  VAF {row['vaf']:6.3f}"
+    ideal_mN = ", ".join(f"{row[name] * 1e3:5.1f}" for name in ("no_delay_rms_N", "foresight_rms_N"))
+    return f"{row['rms_N'] * 1e3:5.1f} mN (ideal {ideal_mN})  VAF {row['vaf']:6.3f}"
 
 
 def _limits(row: Json) -> str:

@@ -4,7 +4,19 @@ import force_tracking
 import numpy as np
 import pytest
 from force_signals import Signal, recorded_signals
-from force_tracking import DRAWN, SPREAD, STAIR_S, TRIM_S, Track, draw_plants, publisher, stair_levels, track
+from force_tracking import (
+    DRAWN,
+    SPREAD,
+    STAIR_S,
+    TRIM_S,
+    Track,
+    compared,
+    draw_plants,
+    ideal,
+    publisher,
+    stair_levels,
+    track,
+)
 
 from tormagd.simulation.parameters import load_plant
 
@@ -27,6 +39,17 @@ def test_a_swing_is_rendered_and_nothing_holds_it_back(swung: Track) -> None:
     assert swung.time_s[-1] == pytest.approx(1.6, abs=0.01)
     assert "STALE" not in swung.limits
     assert all(0.0 <= share <= 1.0 for share in swung.limits.values())
+
+
+def test_no_figure_is_better_than_that_of_the_ideal_carriages(swung: Track) -> None:
+    beside = compared(swung, ideal(load_plant("sample_1"), swing(1.6)), 0.8)
+    assert beside["rms_N"] == swung.since(0.8).rms_N
+    assert max(beside["foresight_rms_N"], beside["no_delay_rms_N"]) <= 1e-6 <= beside["rms_N"]
+    fast = swing(1.6)._replace(force_N=1.5 + 0.2 * np.sin(2.0 * np.pi * 6.0 * swing(1.6).time_s))
+    least = ideal(load_plant("sample_1"), fast).figures()
+    assert 0.01 <= least["foresight_rms_N"] < least["no_delay_rms_N"]
+    rushed = track(load_plant("sample_1"), fast, "pulse", 0.0)
+    assert rushed.since(0.0).rms_N >= least["no_delay_rms_N"]
 
 
 def test_weak_motors_render_a_live_pulse_once_it_is_foreseen() -> None:

@@ -1,0 +1,310 @@
+"""The bound on cases whose optimum is known by hand or by a search of everything. All devices are synthetic.
+
+By hand: a force that falls by 0.1 N/mm, and carriages that reach their speed, SPEED_MM_S, within a step; the closed
+forms are those of a speed that is reached at once.
+"""
+
+import json
+import math
+import sys
+
+import bound
+import msgspec
+import numpy as np
+import pytest
+from bound import Asked, asked_of, foresight_mm, no_delay_mm, rms
+from human_pulse import pulse_profile
+from ideal_carriage import Brake, Drive, brake_of, drive_of
+
+from tormagd.physics.friction import Friction
+from tormagd.physics.relaxation import PronySeries
+from tormagd.simulation.element import Element
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.plant import Plant
+
+STEP_S = 1e-3
+SPEED_MM_S = 40.0
+AT_ONCE = Drive(stall_mm_s2=900.0 * SPEED_MM_S, per_s=900.0, most_mm_s2=1e9)
+STRAIGHT = Brake(
+    gap_mm=np.array([0.0, 100.0]),
+    moment_Tm=np.array([11.0, 1.0]),
+    branch_Tm=0.0,
+    turn_Tm=1.0,
+    strength_Tm=np.array([1.0, 11.0]),
+    fresh_N=np.array([1.0, 11.0]),
+    relaxation=PronySeries((), ()),
+    rested_mm=50.0,
+    friction=Friction(8.0, 0.0, 1.0, 5.0),
+)
+N_MM = 0.1
+
+
+def asked(gap_mm: np.ndarray) -> Asked:
+    """What has the straight brake at these gaps."""
+    force_N = np.interp(gap_mm, STRAIGHT.gap_mm, STRAIGHT.moment_Tm)
+    found = asked_of(STRAIGHT, force_N, most_N=20.0, hand_mm_s=42.0, step_s=STEP_S)
+    assert found.force_N == pytest.approx(force_N)
+    return found
+
+
+def errors_N(gap_mm: np.ndarray, drive: Drive = AT_ONCE, ends: int = 0) -> tuple[float, float]:
+    """RMS without delay and with foresight of a way of the gap, less so many steps at either end."""
+    wanted = asked(gap_mm)
+    greedy_mm = no_delay_mm(drive, STRAIGHT, wanted, STEP_S)
+    best_mm = foresight_mm(drive, STRAIGHT, wanted, STEP_S)
+    inside = slice(ends, len(gap_mm) - ends)
+    return rms(N_MM * (greedy_mm - gap_mm)[inside]), rms(N_MM * (best_mm - gap_mm)[inside])
+
+
+def time_s(seconds: float) -> np.ndarray:
+    return STEP_S * np.arange(round(seconds / STEP_S))
+
+
+def zigzag(phase: np.ndarray) -> np.ndarray:
+    """Between -1 and 1, from 0 upward, of period 1."""
+    return 2.0 / np.pi * np.arcsin(np.sin(2.0 * np.pi * phase))
+
+
+def test_what_is_slower_than_the_carriages_is_followed_exactly() -> None:
+    ramp_mm = 40.0 + 0.9 * SPEED_MM_S * time_s(0.5)
+    no_delay_N, foresight_N = errors_N(ramp_mm)
+    assert no_delay_N <= 1e-3 * N_MM  # it starts from rest
+    assert foresight_N <= 1e-6
+    assert errors_N(np.full(200, 60.0)) == pytest.approx((0.0, 0.0), abs=1e-6)
+
+
+def test_a_step_is_begun_half_its_way_before_it_comes() -> None:
+    """The way D takes D/V: without delay the error falls from D, D^3/3V in all; begun D/2V before, D^3/12V."""
+    way_mm, lasts_s = 6.0, 1.0
+    along_s = time_s(lasts_s)
+    no_delay_N, foresight_N = errors_N(np.where(along_s < 0.5, 50.0, 50.0 + way_mm))
+    assert no_delay_N == pytest.approx(N_MM * math.sqrt(way_mm**3 / (3.0 * SPEED_MM_S) / lasts_s), rel=0.01)
+    assert foresight_N == pytest.approx(N_MM * math.sqrt(way_mm**3 / (12.0 * SPEED_MM_S) / lasts_s), rel=0.01)
+
+
+def test_a_square_wave_that_is_too_fast_is_met_by_a_zigzag_in_phase() -> None:
+    """Amplitude A, period P: the gap turns in the middle of every half, and is off by A - Vt for P/4 on either side.
+    Without delay it turns at the edges, a quarter of a period late, and misses more than a gap that never moved.
+    """
+    amplitude_mm, period_s = 5.0, 0.2
+    along_s = time_s(8 * period_s)
+    wave_mm = 50.0 + np.where(along_s % period_s < period_s / 2.0, amplitude_mm, -amplitude_mm)
+    no_delay_N, foresight_N = errors_N(wave_mm, ends=200)
+    reach_mm = SPEED_MM_S * period_s / 4.0
+    best_mm = math.sqrt(amplitude_mm**2 - amplitude_mm * reach_mm + reach_mm**2 / 3.0)
+    assert foresight_N == pytest.approx(N_MM * best_mm, rel=0.02)
+    assert no_delay_N > N_MM * amplitude_mm
+
+
+def test_a_zigzag_that_is_too_fast_is_met_by_a_slower_one_in_phase() -> None:
+    """At V against S the error grows from every crossing to (S - V)P/4 at every turn."""
+    amplitude_mm, period_s = 4.0, 0.2
+    along_s = time_s(10 * period_s)
+    _, foresight_N = errors_N(50.0 + amplitude_mm * zigzag(along_s / period_s), ends=200)
+    most_mm = amplitude_mm - SPEED_MM_S * period_s / 4.0
+    assert foresight_N == pytest.approx(N_MM * most_mm / math.sqrt(3.0), rel=0.02)
+
+
+def test_without_delay_a_step_takes_the_least_time_that_acceleration_allows() -> None:
+    """Half the way speeding up, half of it braking, sqrt(D/a) each: 23/30 D^2 sqrt(D/a) of squared error."""
+    way_mm, acceleration_mm_s2, lasts_s = 2.0, 1600.0, 0.5
+    drive = Drive(stall_mm_s2=1e6, per_s=1.0, most_mm_s2=acceleration_mm_s2)
+    along_s = time_s(lasts_s)
+    no_delay_N, _ = errors_N(np.where(along_s < 0.1, 50.0, 50.0 + way_mm), drive)
+    squared = 23.0 / 30.0 * way_mm**2 * math.sqrt(way_mm / acceleration_mm_s2)
+    assert no_delay_N == pytest.approx(N_MM * math.sqrt(squared / lasts_s), rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["sample_1", "sample_2", "sample_3"])
+@pytest.mark.parametrize(("from_mm", "to_mm"), [(60.0, 61.0), (61.0, 60.0), (80.0, 55.0), (55.0, 80.0)])
+def test_without_delay_the_carriages_of_a_device_come_to_rest_where_they_were_sent(name, from_mm, to_mm) -> None:
+    wanted_mm = np.where(time_s(1.2) < 0.1, from_mm, to_mm)
+    found_mm = no_delay_mm(drive_of(load_plant(name)), STRAIGHT, asked(wanted_mm), STEP_S)
+    share = (found_mm - from_mm) / (to_mm - from_mm)
+    assert share.max() <= 1.001
+    assert share[-1] == pytest.approx(1.0, abs=1e-6)
+
+
+def searched_N(drive: Drive, brake: Brake, wanted: Asked, step_s: float, grid_mm_s: float, most_mm_s: float) -> float:
+    """The least RMS error over everything a grid of gaps and speeds holds: a dynamic programme, of a brake without lag.
+    Its speeds are whole multiples of the gaps' grid a step: nothing is interpolated, limits are rounded inwards.
+    """
+    grid_mm = grid_mm_s * step_s
+    wanted_mm = np.interp(-wanted.strength_Tm, -brake.moment_Tm, brake.gap_mm)
+    gaps = np.arange(wanted_mm.min() - 1.0, wanted_mm.max() + 1.0, grid_mm)
+    speeds = np.arange(-round(most_mm_s / grid_mm_s), round(most_mm_s / grid_mm_s) + 1)
+    highest = [math.floor(drive.highest_mm_s(50.0, grid_mm_s * j, step_s) / grid_mm_s + 1e-9) for j in speeds.tolist()]
+    lowest = [math.ceil(drive.lowest_mm_s(50.0, grid_mm_s * j, step_s) / grid_mm_s - 1e-9) for j in speeds.tolist()]
+    fresh_N = np.interp(np.interp(gaps, brake.gap_mm, brake.moment_Tm), brake.strength_Tm, brake.fresh_N)
+    sums = np.zeros((len(speeds), len(gaps)))
+    for index, (asked_N, relaxed_N) in enumerate(zip(wanted.force_N.tolist(), wanted.relaxed_N.tolist(), strict=True)):
+        squared = (wanted.scale * (fresh_N - relaxed_N) + wanted.offset_N - asked_N) ** 2
+        following = np.full_like(sums, np.inf)
+        for row, speed in enumerate(speeds.tolist()):
+            sources = [at for at in range(len(speeds)) if lowest[at] <= speed <= highest[at]]
+            best = sums[sources[0] : sources[-1] + 1].min(axis=0) if index else sums[row]
+            shift = speed if index else 0
+            if shift >= 0:
+                following[row, shift:] = best[: len(best) - shift]
+            else:
+                following[row, :shift] = best[-shift:]
+        sums = following + squared
+    return math.sqrt(float(sums.min()) / len(wanted.force_N))
+
+
+@pytest.mark.parametrize(("low_N", "high_N", "period_s"), [(1.4, 1.7, 0.16), (0.9, 1.3, 0.3)])
+def test_nothing_better_is_found_by_searching_everything(low_N: float, high_N: float, period_s: float) -> None:
+    """On the curved force of sample 1, with friction that only brakes: neither error nor limits are convex."""
+    step_s = 4e-3
+    drive = Drive(stall_mm_s2=1e6, per_s=1.0, most_mm_s2=1500.0, gear_mm_s2=250.0)
+    brake = brake_of(load_plant("sample_1"))._replace(branch_Tm=0.0)
+    along_s = step_s * np.arange(150)
+    force_N = low_N + (high_N - low_N) * (0.5 + 0.5 * zigzag(along_s / period_s) ** 3)
+    wanted = asked_of(brake, force_N, most_N=2.0, hand_mm_s=42.0, step_s=step_s)
+    found_N = rms(wanted.rendered_N(brake, foresight_mm(drive, brake, wanted, step_s)) - wanted.force_N)
+    searched = searched_N(drive, brake, wanted, step_s, 1.0, 80.0)
+    assert found_N >= 0.002
+    assert found_N == pytest.approx(searched, rel=0.03)
+
+
+SAMPLES = [load_plant(name) for name in ("sample_1", "sample_2", "sample_3")]
+
+
+@pytest.mark.parametrize("plant", SAMPLES)
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_no_carriage_of_the_plant_is_faster_and_none_much_slower(plant: PlantParameters, direction: float) -> None:
+    """Full voltage from rest for 0.15 s, then against: what windings and backlash take is less than 0.12 mm."""
+    start_mm = 70.0
+    at_rest = msgspec.structs.replace(plant.assumed, start_left_mm=start_mm / 2, start_right_mm=start_mm / 2)
+    device = Plant(msgspec.structs.replace(plant, assumed=at_rest), SteadyHand(), substep_s=1e-4)
+    drive, gap_mm, speed_mm_s = drive_of(plant), start_mm, 0.0
+    for voltage_share, lasts_s in ((direction, 0.15), (-direction, 0.06)):
+        volts = voltage_share * plant.electronics.supply_V
+        reach = drive.highest_mm_s if voltage_share > 0.0 else drive.lowest_mm_s
+        device.drive(volts, volts)
+        begun_mm, ideal_begun_mm = device.gap_mm, gap_mm
+        for _ in range(round(lasts_s / STEP_S)):
+            device.advance(STEP_S)
+            speed_mm_s = reach(gap_mm, speed_mm_s, STEP_S)
+            gap_mm += STEP_S * speed_mm_s
+            ahead_mm = voltage_share * ((gap_mm - ideal_begun_mm) - (device.gap_mm - begun_mm))
+            assert -1e-3 <= ahead_mm <= 0.12
+
+
+@pytest.mark.parametrize("plant", SAMPLES)
+def test_the_force_of_the_gap_is_that_of_the_devices_element(plant: PlantParameters) -> None:
+    """Field, its lag, relaxation and the Stribeck level, along the way of a carriage that comes too late."""
+    plant = msgspec.structs.replace(plant, thermal=msgspec.structs.replace(plant.thermal, drift_K_h=0.0))
+    brake, hand_mm_s, along_s = brake_of(plant), 8.0, time_s(6.0)
+    force_N = 1.2 + 0.5 * np.sin(4.0 * along_s) * np.cos(0.7 * along_s)
+    wanted = asked_of(brake, force_N, most_N=1.5, hand_mm_s=hand_mm_s, step_s=STEP_S)
+    assert wanted.force_N == pytest.approx(np.minimum(force_N, 1.5), abs=1e-4)
+    gap_mm = no_delay_mm(drive_of(plant), brake, wanted, STEP_S)
+    rendered_N = wanted.rendered_N(brake, gap_mm)
+    element, kinetic, felt = Element(plant, brake.rested_mm, STEP_S), [], []
+    for before_mm in (brake.gap_mm[0], brake.gap_mm[-1]):
+        element.advance(0.0, float(before_mm), 0.0)
+    for index, gap in enumerate(gap_mm.tolist()):
+        element.advance(STEP_S * index, gap, hand_mm_s)
+        kinetic.append(element.kinetic_N)
+        felt.append(element.force_N)
+    assert wanted.scale * np.array(kinetic) + wanted.offset_N == pytest.approx(rendered_N, abs=2e-3)
+    # friction follows a rising level within some hundredths of a second at this speed
+    assert np.median(np.abs(np.array(felt) - rendered_N)[1000:]) <= 0.02
+
+
+@pytest.mark.parametrize("plant", SAMPLES)
+def test_without_delay_a_force_within_reach_is_met_in_spite_of_the_fields_lag(plant: PlantParameters) -> None:
+    """A slow wave that turns twice, first step excepted: the greedy gap goes further after every turn."""
+    brake = brake_of(plant)
+    force_N = 1.3 - 0.3 * np.cos(2.0 * time_s(6.0))
+    wanted = asked_of(brake, force_N, most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
+    greedy_mm = no_delay_mm(drive_of(plant), brake, wanted, STEP_S)
+    assert rms(wanted.rendered_N(brake, greedy_mm) - wanted.force_N) <= 1e-3
+    assert np.ptp(greedy_mm) > np.ptp(no_delay_mm(drive_of(plant), brake._replace(branch_Tm=0.0), wanted, STEP_S))
+
+
+@pytest.mark.parametrize("plant", SAMPLES)
+def test_the_fields_lag_takes_some_of_what_foresight_gains(plant: PlantParameters) -> None:
+    """And no wave of the gap beside the optimum is better than the optimum, lag included."""
+    brake, drive, along_s = brake_of(plant), drive_of(plant), time_s(1.2)
+    force_N = 1.55 + 0.15 * zigzag(along_s / 0.25)
+    wanted = asked_of(brake, force_N, most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
+
+    def error_N(brake: Brake, gap_mm: np.ndarray) -> float:
+        return rms(wanted.rendered_N(brake, gap_mm) - wanted.force_N)
+
+    best_mm = foresight_mm(drive, brake, wanted, STEP_S)
+    best_N = error_N(brake, best_mm)
+    straight = brake._replace(branch_Tm=0.0)
+    assert best_N > error_N(straight, foresight_mm(drive, straight, wanted, STEP_S))
+    # what only moves or shrinks the way is within the drive's limits as well
+    for shift_mm in (-0.05, 0.05):
+        assert error_N(brake, best_mm + shift_mm) > best_N
+    for share in (0.9, 0.97):
+        assert error_N(brake, best_mm.mean() + share * (best_mm - best_mm.mean())) > best_N
+    for steps in (-5, 5):
+        assert error_N(brake, np.roll(best_mm, steps)) > best_N
+
+
+@pytest.mark.parametrize("plant", SAMPLES)
+def test_finer_steps_find_the_same(plant: PlantParameters) -> None:
+    found = [bound.bound(plant, *pulse_profile(1.5, 1.4, 1.8, 500), step_s=step_s).figures() for step_s in (1e-3, 5e-4)]
+    coarse, fine = found
+    assert coarse["foresight_rms_N"] == pytest.approx(fine["foresight_rms_N"], rel=0.03)
+    assert coarse["no_delay_rms_N"] == pytest.approx(fine["no_delay_rms_N"], rel=0.03)
+    assert 1e-3 <= coarse["foresight_rms_N"] < coarse["no_delay_rms_N"] < coarse["sd_N"]
+
+
+def test_forces_out_of_range_are_clipped_before_they_count() -> None:
+    """Below what the open gap brakes and above the scene's greatest nothing is missed: the rest is a slow ramp."""
+    times_s, forces_N = np.array([0.0, 0.5, 4.0, 4.5]), np.array([0.1, 0.1, 2.6, 2.6])
+    found = bound.bound(SAMPLES[0], times_s, forces_N)
+    assert 0.4 <= found.asked_N.min() <= 0.7
+    assert found.asked_N.max() == pytest.approx(2.0, abs=1e-4)
+    assert found.figures()["foresight_rms_N"] <= 0.002
+    assert bound.bound(SAMPLES[0], times_s, forces_N, most_N=1.5).asked_N.max() == pytest.approx(1.5, abs=1e-4)
+
+
+def test_a_force_may_be_held_until_the_next() -> None:
+    times_s, forces_N = np.array([0.0, 0.5, 1.0]), np.array([1.0, 1.5, 1.5])
+    held, ramped = (bound.bound(SAMPLES[0], times_s, forces_N, is_held=is_held) for is_held in (True, False))
+    assert held.asked_N[[0, 499, 500, 1000]] == pytest.approx([1.0, 1.0, 1.5, 1.5], abs=1e-4)
+    assert ramped.asked_N[250] == pytest.approx(1.25, abs=1e-3)
+    assert held.figures(0.9)["no_delay_rms_N"] <= 1e-3
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["bound.py", *arguments])
+    return bound.main()
+
+
+def test_the_command_prints_the_three_figures(monkeypatch, capsys, tmp_path) -> None:
+    path = tmp_path / "force.csv"
+    path.write_text("t_s,force_N\n0,1.0\n0.2,1.0\n0.21,1.4\n0.5,1.4\n")
+    assert run(monkeypatch, str(path), "--plant", "sample_3", "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert set(result) == {"sd_N", "no_delay_rms_N", "foresight_rms_N"}
+    assert 0.0 < result["foresight_rms_N"] < result["no_delay_rms_N"]
+    assert run(monkeypatch, str(path)) == 0
+    assert "without delay" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "said"),
+    [
+        ("t_s,force_N\n0,1\n1,nan\n2,1\n", [], "force_N = nan"),
+        ("t_s,force_N\n0,1\n1,1\n1,1\n", [], "t_s = 1.0"),
+        ("t_s,force_N\n0,1\n1,1\n1e4,1\n", [], "t_s = 0.0 .. 10000.0"),
+        ("t_s,force_N\n0,1\n1,1\n2,1\n", ["--step-ms", "2"], "step_s = 0.002"),
+        ("t_s,force_N\n0,1\n1,1\n2,1\n", ["--hand-mm-s", "0"], "hand_mm_s = 0.0"),
+        ("t_s,force_N\n0,1\n1,1\n2,1\n", ["--most-N", "nan"], "most_N = nan"),
+        ("t_s,force_N\n0,1\n1,1\n2,1\n", ["--plant", "sample_9"], "sample_9"),
+    ],
+)
+def test_what_cannot_be_used_is_named(monkeypatch, capsys, tmp_path, text, arguments, said) -> None:
+    path = tmp_path / "force.csv"
+    path.write_text(text)
+    assert run(monkeypatch, str(path), *arguments) == 2
+    assert said in capsys.readouterr().err
