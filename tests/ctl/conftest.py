@@ -122,6 +122,7 @@ class FakeDaemon(threading.Thread):
         self.control = f"ipc://{directory}/control"
         self.answers: dict[str, Callable[[], dict[str, Any]]] = {"status": lambda: {"ok": True, "result": status()}}
         self.commands: list[str] = []
+        self.requests: list[dict[str, Any]] = []
         self.setpoints: list[Setpoint] = []
         self.rubbish: list[bytes] = []
         self.is_bound = threading.Event()
@@ -154,6 +155,7 @@ class FakeDaemon(threading.Thread):
                 *envelope, data = router.recv_multipart()
                 request = msgpack.unpackb(data)
                 self.commands.append(request["command"])
+                self.requests.append(request)
                 answer = self.answers.get(request["command"], lambda: {"ok": True, "result": {}})()
                 router.send_multipart([*envelope, msgpack.packb({"v": VERSION, "id": request["id"], **answer})])
             while setpoints.poll(0):

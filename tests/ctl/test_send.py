@@ -45,7 +45,8 @@ def test_a_second_run_of_the_same_source_is_newer(fake_daemon, capsys):
     first = send(fake_daemon, capsys, *options)
     second = send(fake_daemon, capsys, *options)
     wait_for(fake_daemon, first["sent"] + second["sent"])
-    numbers = [setpoint.seq for setpoint in fake_daemon.setpoints]
+    numbers = [(setpoint.session, setpoint.seq) for setpoint in fake_daemon.setpoints]
+    assert numbers[0][1] == numbers[first["sent"]][1] == 0
     assert numbers == sorted(set(numbers))
     assert {(s.source, s.valid_for_ms) for s in fake_daemon.setpoints} == {("me", 70.0)}
 

@@ -50,14 +50,15 @@ log = logging.getLogger(__name__)
 
 class Endpoint:
     """The daemon's sockets. With an `io_priority` above 0, ZeroMQ's own threads run at this priority of SCHED_FIFO.
+    `priority` is the inbox's.
 
     Raises OSError naming the endpoint that cannot be bound, and why: another daemon has it, say.
     """
 
-    def __init__(self, endpoints: Endpoints, io_priority: int = 0) -> None:
+    def __init__(self, endpoints: Endpoints, io_priority: int = 0, priority: tuple[str, ...] = ()) -> None:
         self._context = context(io_priority)
         self._files: list[SocketFile] = []
-        self.inbox = SetpointInbox()
+        self.inbox = SetpointInbox(priority)
         try:
             self._setpoints = self._bind(zmq.SUB, "setpoint", endpoints.setpoint)
             self._telemetry = self._bind(zmq.PUB, "telemetry", endpoints.telemetry)
