@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tormagd.config import Config, ConfigError
+from tormagd.control.device_fit import LEAST_SCALE
 from tormagd.control.motor import Margins, margins, pull_V
 from tormagd.control.plan import CEILING, Planner
 from tormagd.control.portrait import FieldOfGap, Portrait, law_beside, portrait
@@ -117,16 +118,19 @@ def _refuse_out_of_reach(scene: Scene, reach: Portrait) -> None:
 
 
 def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
-    # from the greatest force that the gap's ceiling allows, where a gap's speed is the most force
-    device, position, most_N = config.device, config.position, CEILING * scene.force.most_N
+    # the weakest believable device makes a force with the least gap, where a gap's speed is the most force; and the
+    # ceiling lets no gap make more than CEILING times the scene's greatest
     opening_mm_s, key = max(
-        (2.0 * device.retract_mm_s, "device.retract_mm_s"), (position.gap_speed_mm_s, "position.gap_speed_mm_s")
+        (2.0 * config.device.retract_mm_s, "device.retract_mm_s"),
+        (config.position.gap_speed_mm_s, "position.gap_speed_mm_s"),
     )
-    lost_N_s = reach.force_rate_N_s(min(most_N, reach.most_N), opening_mm_s)
+    model_N = min(CEILING * scene.force.most_N / LEAST_SCALE, reach.most_N)
+    lost_N_s = LEAST_SCALE * reach.force_rate_N_s(model_N, opening_mm_s)
     if lost_N_s > scene.force.most_release_N_s:
         raise ConfigError(
             f"scene {scene.name}: force.most_release_N_s = {scene.force.most_release_N_s:g}: allowed is at least "
-            f"{lost_N_s:.2f}: {key} opens the gap by {opening_mm_s:g} mm/s, which at {most_N:g} N loses so much"
+            f"{lost_N_s:.2f}: {key} opens the gap by {opening_mm_s:g} mm/s, which at {LEAST_SCALE * model_N:.2g} N "
+            "loses so much"
         )
 
 
