@@ -218,7 +218,7 @@ def test_a_wrong_clock_makes_no_setpoint_stale_and_is_named(armed: ClosedLoop, n
     assert not [time_s for time_s in done.held_by(Limit.STALE) if time_s > settled_s]
     assert done.error_N(swell_N, 1.5) < 0.06
     ages_s = [each.plan.setpoint_age_s or 0.0 for each in done.samples if each.time_s - done.start_s > settled_s]
-    assert 0.0 <= min(ages_s)
+    assert min(ages_s) >= 0.0
     assert max(ages_s) < 0.04
     found = done.of("a")
     assert found.clock_behind_ms == pytest.approx(behind_ms, abs=4.0)
@@ -249,7 +249,7 @@ def test_the_whole_way_is_measured_part_by_part(armed: ClosedLoop) -> None:
     assert 0.0 < found.to_duty_us.p50 - delay_us.p50 <= 1_000.0 + 0.04 * delay_us.p50
     assert delay_us.p50 == pytest.approx(81e3, rel=0.04)
     assert found.carriages_ms is not None
-    assert abs(found.carriages_ms) < 10.0
+    assert 0.0 < found.carriages_ms < 20.0  # no speed is foreseen that far, so the reference trails its target
     assert found.total_ms == pytest.approx(
         (found.to_duty_us.p99 + 400.0) * 1e-3 + max(found.carriages_ms, 0.0), abs=0.02
     )
