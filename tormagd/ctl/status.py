@@ -100,7 +100,15 @@ def _way(way: WayReport | None, colour: Colour) -> list[str]:
         f"device {_number(None if way.device_us is None else way.device_us * 1e-3, 'ms', 1)}",
         f"carriages {_number(way.carriages_ms, 'ms', 1)}",
     ]
-    return [f"way       {', '.join(parts)}"]
+    lines = [f"way       {', '.join(parts)}"]
+    if total_ms is not None and total_ms > way.budget_ms:
+        shares = {
+            "from the stamp to the duty: look at the delay of the source": to_duty.p99 * 1e-3,
+            "at the device: look at the round trip in tormagctl firmware": (way.device_us or 0.0) * 1e-3,
+            "in the carriages: ask for slower changes, or look at the motors": way.carriages_ms or 0.0,
+        }
+        lines += _explained("the force comes too late", f"most is {max(shares, key=lambda part: shares[part])}", str)
+    return lines
 
 
 def _codes(codes: Sequence[str], details: Sequence[Explained], label: str, paint: Callable[[str], str]) -> list[str]:

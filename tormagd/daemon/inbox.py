@@ -308,7 +308,8 @@ def _of_clock(clock: SourceClock, drift_ppm: float | None) -> tuple[str, str]:
     causes = []
     if clock.is_wrong:
         side = "behind" if clock.offset_s > 0.0 else "ahead of"
-        causes.append(f"it is {abs(clock.offset_s):.3f} s {side} this machine's, and is corrected")
+        or_way = " (or its way takes that long)" if clock.offset_s > 0.0 and not clock.steps else ""
+        causes.append(f"it is {abs(clock.offset_s):.3f} s {side} this machine's{or_way}, and is corrected")
     if clock.steps:
         way, often = "forward" if clock.stepped_s > 0.0 else "back", f", the last of {clock.steps} times"
         causes.append(f"it was set {way} by {abs(clock.stepped_s):.3f} s{often if clock.steps > 1 else ''}")
