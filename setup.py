@@ -16,7 +16,7 @@ from pathlib import Path
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
-# the hot rooms, in the order data flows: whatever a tick or a plan runs, and the simulated device
+# the hot rooms, in the order data flows: whatever a setpoint, a tick or a plan runs, and the simulated device
 COMPILED = {
     "firmware_protocol": ("value", "schema", "checksum", "layouts", "wire", "codec", "framing"),
     "tormagd/physics": ("friction", "relaxation"),
@@ -39,6 +39,7 @@ COMPILED = {
         ),
         *("periodicity", "governor", "plan", "motor", "step", "conditions"),
     ),
+    "tormagd/daemon": ("sequence", "source_clock"),
     "tormagd/simulation": ("curve", "axis", "element", "hand", "plant", "motion", "firmware", "device"),
     "tormagd/daemon": ("rate_group", "telemetry"),
     "tormagd": ("closed_loop",),
