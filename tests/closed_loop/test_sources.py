@@ -124,7 +124,7 @@ def run(
         samples.append(loop.tick(inbox.newest))
         way.ticked(samples[-1].state, used)
     for _ in range(8):
-        inbox.refresh()
+        inbox.refresh(loop.now_s)
     way.refresh()
     return Run(samples, inbox, way, start_s)
 

@@ -249,7 +249,7 @@ def test_a_clock_that_is_a_second_off_is_corrected_and_named(publishing: Publish
         if publishing.now_s > SETTLED_S + 0.002:
             assert publishing.inbox.newest is not None
             assert 0.0 <= publishing.now_s - publishing.inbox.newest.stamp_s < 1e-3
-    publishing.inbox.refresh()
+    publishing.inbox.refresh(publishing.now_s)
     found = publishing.inbox.report(publishing.now_s).by_source["a"]
     assert found.clock_behind_ms == pytest.approx(1e3 * age_s, abs=0.5)
     words = "behind this machine's (or its way takes that long)" if age_s > 0.0 else "ahead of this machine's"
@@ -266,7 +266,7 @@ def test_a_clock_that_is_set_makes_no_setpoint_older_or_younger(publishing: Publ
         assert publishing.inbox.newest is not None
         assert publishing.now_s - publishing.inbox.newest.stamp_s == pytest.approx(0.0, abs=1e-3)
     assert publishing.counters() == (100, 0, 0)
-    publishing.inbox.refresh()
+    publishing.inbox.refresh(publishing.now_s)
     found = publishing.inbox.report(publishing.now_s).by_source["a"]
     assert found.clock_steps == 1
     assert f"it was set {'forward' if by_s > 0.0 else 'back'} by 0.500 s" in found.cause
@@ -297,7 +297,7 @@ def test_losses_and_delays_are_counted_for_each_source(publishing: Publishing) -
         publishing.now_s = tick * 0.002
         if tick % 10:
             publishing.send(tick, 1.0, "a", 0.003 if tick % 2 else 0.001)
-    publishing.inbox.refresh()
+    publishing.inbox.refresh(publishing.now_s)
     found = publishing.inbox.report(publishing.now_s).by_source["a"]
     assert found.lost == 99
     assert (found.delay_us.p50, found.delay_us.p99) == pytest.approx((3_000.0, 3_000.0), rel=0.04)
@@ -372,7 +372,7 @@ def test_the_report_fits_into_an_answer_whatever_the_sources_call_themselves(pub
         for number in range(SOURCES):
             name = f"{number:2d}" + 62 * "\U00010348"  # four bytes each
             publishing.send(2**63 - 100 + tick, 1.0, name, 1e3, session=2**63 - 1)
-            publishing.inbox.refresh()
+            publishing.inbox.refresh(publishing.now_s)
     report = publishing.inbox.report(publishing.now_s)
     assert len(report.by_source) == REPORTED
     answer = encode(Reply(v=VERSION, id=1, ok=True, result=msgspec.to_builtins(report)))

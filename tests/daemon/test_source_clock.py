@@ -146,6 +146,18 @@ def test_until_it_is_settled_a_message_is_as_old_as_it_says() -> None:
         assert clock.is_settled
 
 
+def test_a_reader_that_is_held_up_blames_no_clock() -> None:
+    """What has waited for 30 ms is read at once; the messages are late, and no stamp has run back."""
+    clock = SourceClock()
+    for number in range(100):
+        now_s = number * 0.002
+        clock.hear(now_s, 0.001)
+    for number in range(100, 115):
+        late_s = 0.23 - number * 0.002
+        assert clock.hear(0.23 + number * 1e-6, late_s) == pytest.approx(late_s, abs=1e-4)
+    assert (clock.steps, clock.offset_s) == (0, pytest.approx(0.0, abs=1e-4))
+
+
 def test_after_a_long_silence_a_clock_may_have_been_set() -> None:
     clock, _ = listen(lambda t: t, lambda t: 0.001)
     later_s = 10.0 + FORGOTTEN_S + 1.0

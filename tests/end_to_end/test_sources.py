@@ -104,6 +104,7 @@ def test_a_second_publisher_is_refused_and_named_until_it_is_given_the_brake(rig
     assert told["cause"] == "'console' sends setpoints too, and 'patient' holds the brake"
     assert told["remedy"].endswith("tormagctl take console")
     assert {rig.telemetry().setpoint_cf for _ in range(25)} == {0.9}
+    assert rig.command("take").error.code == "bad_source"
     assert rig.command("take", source="nobody").error.code == "unknown_source"
     assert rig.command("take", source="console").result == {"source": "console", "instead_of": "patient"}
     governed = []

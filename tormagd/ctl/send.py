@@ -81,7 +81,7 @@ def _publish(
         setpoint = Setpoint(
             v=VERSION,
             source=stream.source,
-            seq=index,
+            seq=sent,
             session=start_ns,  # above every earlier run's
             stamp_ns=start_ns + round(index / rate_hz * 1e9),  # when the force is meant, whenever it gets sent
             servo_cf=sample.force_N,

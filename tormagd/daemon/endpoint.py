@@ -76,7 +76,7 @@ class Endpoint:
         """The descriptor that becomes readable when setpoints may have arrived (edge-triggered: drain them)."""
         return self._setpoints.fileno()
 
-    def drain_setpoints(self, now_s: float) -> bool:
+    def drain_setpoints(self) -> bool:
         """Reads what has arrived, at most DRAIN messages; True if there is a newer setpoint."""
         is_newer = False
         for _ in range(DRAIN):
@@ -85,7 +85,8 @@ class Endpoint:
             except zmq.Again:
                 return is_newer
             data = parts[0] if len(parts) == 1 else b""
-            is_newer = self.inbox.take(data, now_s, time.time_ns()) or is_newer
+            # both clocks at once, for each message: how they part says which clock was set, and a drain may be held up
+            is_newer = self.inbox.take(data, time.monotonic(), time.time_ns()) or is_newer
         return is_newer
 
     def publish(self, telemetry: Telemetry) -> None:

@@ -28,6 +28,8 @@ MOST_DRIFT_PPM = 100.0
 "A clock that drifts faster than quartz does is named."
 NEWS, NEWS_S = 4, 1.0
 "Lines for the log that wait, and how long each waits after the one before."
+STEP_NAMED_S = 60.0
+"A clock that was set is named for so long."
 HORIZON_S = HORIZON_NS * 1e-9
 
 
@@ -56,11 +58,11 @@ class _Source:
         self.clock = SourceClock()
         self.delays = Histogram()
         self.accepted = self.refused = 0
-        self.refresh()
+        self.refresh(now_s)
 
-    def refresh(self) -> None:
+    def refresh(self, now_s: float) -> None:
         self.fit, self.summary = self.clock.fit(), self.delays.summary()
-        self.cause, self.remedy = _of_clock(self.clock, None if self.fit is None else self.fit.drift_ppm)
+        self.cause, self.remedy = _of_clock(self.clock, None if self.fit is None else self.fit.drift_ppm, now_s)
 
     def is_stale(self, now_s: float) -> bool:
         return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
@@ -148,14 +150,14 @@ class SetpointInbox:
             return {}
         return {Limit.STALE: self._why_stale(holder, now_s), Limit.OTHER_SOURCE: self._why_other(holder, now_s)}
 
-    def refresh(self) -> None:
+    def refresh(self, now_s: float) -> None:
         """Makes the figures of one source anew, for `report`: of each in turn."""
         if self._sources:
             self._turn += 1
             name = tuple(self._sources)[self._turn % len(self._sources)]
             source = self._sources[name]
             was_wrong = bool(source.cause)
-            source.refresh()
+            source.refresh(now_s)
             if source.cause and not was_wrong:
                 self._news.append(f"source {name!r}: {source.cause}: {source.remedy}")
 
@@ -301,7 +303,7 @@ class SetpointInbox:
         )
 
 
-def _of_clock(clock: SourceClock, drift_ppm: float | None) -> tuple[str, str]:
+def _of_clock(clock: SourceClock, drift_ppm: float | None, now_s: float) -> tuple[str, str]:
     """What is wrong with a publisher's clock, and what to do; empty where nothing is."""
     if not clock.is_settled:
         return "its stamps are far from this machine's clock: it is watched which of the two it is", "wait a moment"
@@ -310,7 +312,7 @@ def _of_clock(clock: SourceClock, drift_ppm: float | None) -> tuple[str, str]:
         side = "behind" if clock.offset_s > 0.0 else "ahead of"
         or_way = " (or its way takes that long)" if clock.offset_s > 0.0 and not clock.steps else ""
         causes.append(f"it is {abs(clock.offset_s):.3f} s {side} this machine's{or_way}, and is corrected")
-    if clock.steps:
+    if now_s - clock.stepped_at_s < STEP_NAMED_S:
         way, often = "forward" if clock.stepped_s > 0.0 else "back", f", the last of {clock.steps} times"
         causes.append(f"it was set {way} by {abs(clock.stepped_s):.3f} s{often if clock.steps > 1 else ''}")
     if drift_ppm is not None and abs(drift_ppm) > MOST_DRIFT_PPM:

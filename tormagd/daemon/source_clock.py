@@ -9,6 +9,7 @@ constant way stay one number without a round trip: what a way can take (MOST_WAY
 No I/O and no clock: times are handed in.
 """
 
+import math
 from typing import final
 
 from tormagd.hardware.link_statistics import ClockFit, DeviceClock
@@ -42,6 +43,7 @@ class SourceClock:
         "_settles_s",
         "jitter_s",
         "offset_s",
+        "stepped_at_s",
         "stepped_s",
         "steps",
         "way_s",
@@ -58,6 +60,8 @@ class SourceClock:
         "How often the clock was seen to be set."
         self.stepped_s = 0.0
         "By how much it was set last; forward is positive."
+        self.stepped_at_s = -math.inf
+        "When that was seen."
         self._lateness_s = self._leaked_s = 0.0
         self._heard_s: float | None = None
         self._settles_s: float | None = None
@@ -118,7 +122,7 @@ class SourceClock:
         elif rise_s > gap_s + STEP_S:
             # sent later and stamped earlier: by no delay. The way is taken to be what it was a moment ago
             self.offset_s += rise_s
-            self._set(-rise_s)
+            self._set(now_s, -rise_s)
         else:
             self.jitter_s += JITTER_SHARE * (abs(rise_s) - self.jitter_s)
             leak_s = DRIFT * gap_s
@@ -126,9 +130,9 @@ class SourceClock:
             self._leaked_s += leak_s
         fall_s = self.offset_s + self.way_s - lateness_s
         if fall_s >= 0.0:
-            self._fall(fall_s)
+            self._fall(now_s, fall_s)
 
-    def _fall(self, fall_s: float) -> None:
+    def _fall(self, now_s: float, fall_s: float) -> None:
         """The least lateness so far: first it takes back what was granted to drift, then the way is shorter than was
         thought, and what no way explains is the clock."""
         granted_s = min(fall_s, self._leaked_s)
@@ -139,9 +143,9 @@ class SourceClock:
         ahead_s = fall_s - granted_s - shorter_s
         self.offset_s -= ahead_s
         if ahead_s > STEP_S and self.is_settled:
-            self._set(ahead_s)
+            self._set(now_s, ahead_s)
 
-    def _set(self, by_s: float) -> None:
+    def _set(self, now_s: float, by_s: float) -> None:
         self.steps += 1
-        self.stepped_s = by_s
+        self.stepped_s, self.stepped_at_s = by_s, now_s
         self._line = DeviceClock()

@@ -92,7 +92,7 @@ class TelemetryLoop:
         self._endpoint.publish(snapshot_)
         self._endpoint.publish_ticks(self._ticks[-MOST_TICKS:])
         self._ticks.clear()
-        self._refresh()
+        self._refresh(start_ns * 1e-9)
         self._status = None
         self._endpoint.serve(
             start_ns * 1e-9,
@@ -147,7 +147,7 @@ class TelemetryLoop:
             is_stall = news.worst.took_ns > ERROR_PERIODS * self._control.timing.period_ns
             log.log(logging.ERROR if is_stall else logging.WARNING, "%s", news)
 
-    def _refresh(self) -> None:
+    def _refresh(self, now_s: float) -> None:
         """Makes one report anew: all of them at once would make a tick wait."""
         turn = self.timing.runs % (len(self._groups) + 2)
         if turn < len(self._groups):
@@ -155,7 +155,7 @@ class TelemetryLoop:
         elif turn == len(self._groups):
             self._way.refresh()
         else:
-            self._endpoint.inbox.refresh()
+            self._endpoint.inbox.refresh(now_s)
 
     def _report_sources(self, now_s: float) -> None:
         news = self._endpoint.inbox.news(now_s)
