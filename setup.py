@@ -39,9 +39,8 @@ COMPILED = {
         ),
         *("periodicity", "governor", "plan", "motor", "step", "conditions"),
     ),
-    "tormagd/daemon": ("sequence", "source_clock"),
     "tormagd/simulation": ("curve", "axis", "element", "hand", "plant", "motion", "firmware", "device"),
-    "tormagd/daemon": ("rate_group", "telemetry"),
+    "tormagd/daemon": ("sequence", "source_clock", "rate_group", "telemetry"),
     "tormagd": ("closed_loop",),
 }
 SOURCES = [f"{folder}/{name}.py" for folder, names in COMPILED.items() for name in names]

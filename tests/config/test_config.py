@@ -78,7 +78,7 @@ def test_a_resolved_configuration_is_a_configuration(write) -> None:
         ("[sources]\npriority = 'a'", "$.sources.priority", "'a'", "`array`"),
         ("[sources]\npriority = ['']", "$.sources.priority", "['']", ">= 1"),
         ("[sources]\npriority = ['a', 'a']", "sources.priority", "('a', 'a')", "different printable names"),
-        ("[sources]\npriority = ['\\u001b[2J']", "sources.priority", "x1b", "different printable names"),
+        ('[sources]\npriority = ["\\u001b[2J"]', "sources.priority", "x1b", "different printable names"),
     ],
 )
 def test_a_refusal_names_key_value_and_what_is_allowed(write, text: str, key: str, value: str, allowed: str) -> None:

@@ -25,7 +25,7 @@ AFTER_S = np.array(PATH_S)
 VALID_S = 0.1
 
 
-GOVERNOR = Governor(PORTRAIT, SCENE, LIMITS, GAP_SPEED_MM_S)
+GOVERNOR = Governor(PORTRAIT, SCENE, GAP_SPEED_MM_S)
 
 
 def decide(
