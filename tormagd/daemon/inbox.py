@@ -22,7 +22,7 @@ SILENT_S = 1.0
 "A source that was silent this long makes room for another; one that was refused is named for so long."
 LONGEST_REFUSAL = 200
 "Characters kept of the last refusal."
-REPORTED = 8
+REPORTED = 6
 "Sources that are reported in full, the newest ones: an answer has to stay under its limit."
 MOST_DRIFT_PPM = 100.0
 "A clock that drifts faster than quartz does is named."
