@@ -323,35 +323,12 @@ def test_status_text_says_how_each_rate_is_kept_and_who_made_ticks_late(status_w
     assert "late by   7 kernel, 1 Connection.receive, 1 TelemetryLoop.publish" in lines
 
 
-def test_status_text_shows_each_source_and_the_way(status_with):
-    delay_us = {"p50": 1_200.0, "p99": 3_400.0, "p999": 4_000.0, "max": 4_100.0}
-    clock = {"offset_s": 1.002, "drift_ppm": -201.3, "residual_us": 8.0, "windows": 60, "outliers": 0}
-    source = {
-        "state": "holds",
-        "silent_ms": 1.0,
-        "session": None,
-        "seq": 4,
-        "accepted": 5,
-        "refused": 0,
-        "lost": 3,
-        "restarts": 1,
-        "delay_us": delay_us,
-        "jitter_us": 450.0,
-        "clock_behind_ms": 1001.0,
-        "clock_steps": 0,
-        "clock": clock,
-        "cause": "its clock: it is 1.001 s behind this machine's, and is corrected",
-        "remedy": "keep the clocks",
-    }
-    other = source | {
-        "state": "refused",
-        "clock_behind_ms": None,
-        "clock": None,
-        "restarts": 0,
-        "cause": "",
-        "remedy": "",
-    }
-    silent = source | {"state": "stale", "silent_ms": 2_340.0, "cause": "", "remedy": ""}
+def test_status_text_shows_each_source_and_the_way(status_with, source_with):
+    fine = {"cause": "", "remedy": ""}
+    source = source_with()
+    other = source_with(state="refused", clock_behind_ms=None, clock=None, restarts=0, **fine)
+    silent = source_with(state="stale", silent_ms=2_340.0, **fine)
+    delay_us = source["delay_us"]
     setpoints = status_with()["setpoints"] | {"by_source": {"a": source, "b\x1b[2J": other, "c": silent}}
     way = {"to_duty_us": delay_us, "device_us": 400.0, "carriages_ms": 12.3, "total_ms": 16.1, "budget_ms": 400.0}
     known = msgspec.convert(status_with(setpoints=setpoints, way=way), Status)
