@@ -16,7 +16,7 @@ from pathlib import Path
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
-# the hot rooms, in the order data flows: whatever a tick or a plan runs, and the simulated device
+# the hot rooms, in the order data flows: whatever a setpoint, a tick or a plan runs, and the simulated device
 COMPILED = {
     "firmware_protocol": ("value", "schema", "checksum", "layouts", "wire", "codec", "framing"),
     "tormagd/physics": ("friction", "relaxation"),
@@ -40,7 +40,7 @@ COMPILED = {
         *("periodicity", "governor", "plan", "motor", "step", "conditions"),
     ),
     "tormagd/simulation": ("curve", "axis", "element", "hand", "plant", "motion", "firmware", "device"),
-    "tormagd/daemon": ("rate_group", "telemetry"),
+    "tormagd/daemon": ("sequence", "source_clock", "rate_group", "telemetry"),
     "tormagd": ("closed_loop",),
 }
 SOURCES = [f"{folder}/{name}.py" for folder, names in COMPILED.items() for name in names]

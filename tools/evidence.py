@@ -123,9 +123,10 @@ def _says_bus(figures: Figures) -> str:
 def _says_faults(figures: Figures) -> str:
     cells = figures["cells"]
     below = [cell["below_1N_ms"] for cell in cells if cell["below_1N_ms"] is not None]
-    opened = sum(cell["open_ms"] is not None for cell in cells)
+    open_ = sum(cell["open_ms"] is not None for cell in cells)
     return (
-        f"of {len(cells)} faults at 1.8 N {len(below)} end below 1 N, after at most {max(below)} ms; {opened} end open"
+        f"of {len(cells)} faults at 1.8 N {len(below)} end below 1 N, after at most {max(below)} ms; {open_} end open; "
+        f"no force is lost faster than by {max(cell['loss_N_s'] for cell in cells)} N/s"
     )
 
 

@@ -1,12 +1,14 @@
 """The fault matrix: each fault injected at 1.8 N in virtual time, what notices it, what happens, how long until safe.
 
-Safe means: the plant's force is below 1 N, and the gap is open. Times count from the injection.
+Safe means: the plant's force is below 1 N, and the gap is open. Times count from the injection. How fast the force is
+lost on the way is measured too: a force that vanishes at once is a hazard of its own.
 """
 
 import argparse
 import json
 import math
 import sys
+from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -30,6 +32,10 @@ INJECTED_S = 5.0
 "Virtual time of the injection: homed, enabled and settled by then."
 USUAL_S = 2.0
 WATCHED_S = 6.0
+LOSS_MS = 50
+"A loss of force is what a hand feels of it: the greatest over so long."
+OTHER_N = 0.6
+"What the source asks for that takes over."
 
 
 class Injection(NamedTuple):
@@ -53,6 +59,7 @@ MATRIX = (
     Injection("worn gearbox", device="worn_gearbox"),
     Injection("worn gearbox, then daemon killed", device="worn_gearbox", host="silent"),
     Injection("publisher silent", host="stale"),
+    Injection("another source takes over", host="other"),
     Injection("operator: stop", host="stop"),
     Injection("operator: disable", host="disable"),
 )
@@ -69,6 +76,7 @@ class Cell(NamedTuple):
     noticed_ms: float | None
     below_1N_ms: float | None
     open_ms: float | None
+    loss_N_s: float
 
 
 def main() -> int:
@@ -101,7 +109,7 @@ def inject(injection: Injection, plant: str) -> Cell:
             usual |= dict.fromkeys(map(str, (*sample.plan.limits, *sample.output.limits)))
     if injection.host in ("stop", "disable"):
         loop.command(injection.host)
-    setpoint.is_silent = injection.host == "stale"
+    setpoint.is_silent, setpoint.is_other = injection.host == "stale", injection.host == "other"
     watch = Watch(usual)
     for tick in range(round(WATCHED_S * config.rates.control_hz)):
         if injection.host == "silent" or tick < injection.stall_ms:
@@ -116,12 +124,14 @@ class Publisher:
     """A force setpoint every 2 ms, until it falls silent; it swings a little, because a fault may hide from a rest."""
 
     def __init__(self) -> None:
-        self.is_silent = False
+        self.is_silent = self.is_other = False
         self._stamp_s = 0.0
 
     def __call__(self, now_s: float) -> TimedSetpoint:
         if not self.is_silent:
             self._stamp_s = now_s - now_s % 0.002
+        if self.is_other:
+            return TimedSetpoint(OTHER_N, self._stamp_s, 0.1, holder=1)
         return TimedSetpoint(FORCE_N + SWING_N * math.sin(math.tau * self._stamp_s), self._stamp_s, 0.1)
 
 
@@ -134,6 +144,8 @@ class Watch:
         self._host: dict[str, None] = {}
         self._device: dict[str, None] = {}
         self._limits: dict[str, None] = {}
+        self._forces_N: deque[float] = deque(maxlen=LOSS_MS + 1)
+        self._loss_N_s = 0.0
         self._noticed_s: float | None = None
         self._below_s: float | None = None
         self._open_s: float | None = None
@@ -146,6 +158,9 @@ class Watch:
             held = map(str, (*sample.plan.limits, *sample.output.limits))
             self._limits |= dict.fromkeys(limit for limit in held if limit not in self._usual)
         self._device |= dict.fromkeys(fault.name or "" for fault in firmware.faults)
+        self._forces_N.append(truth.force_N)
+        if len(self._forces_N) > LOSS_MS:
+            self._loss_N_s = max(self._loss_N_s, (self._forces_N[0] - truth.force_N) / (LOSS_MS * 1e-3))
         first = _first(loop.now_s)
         if self._host or self._device or self._limits:
             self._noticed_s = first(self._noticed_s)
@@ -166,6 +181,7 @@ class Watch:
             _since(self._noticed_s),
             _since(self._below_s),
             _since(self._open_s),
+            round(self._loss_N_s, 2),
         )
 
 
@@ -179,11 +195,12 @@ def _since(time_s: float | None) -> float | None:
 
 def print_table(cells: list[Cell]) -> None:
     """The matrix for a person."""
-    print(f"{'injected at 1.8 N':34s}{'noticed':>9s}{'< 1 N':>9s}{'open':>9s}  noticed as; end state")
+    print(f"{'injected at 1.8 N':34s}{'noticed':>9s}{'< 1 N':>9s}{'open':>9s}{'loss':>10s}  noticed as; end state")
     for cell in cells:
         times = (cell.noticed_ms, cell.below_1N_ms, cell.open_ms)
         columns = "".join(f"{'-' if time is None else f'{time:.0f} ms':>9s}" for time in times)
         named = [*cell.host_faults, *(f"device:{fault}" for fault in cell.device_faults), *cell.limits]
+        columns += f"{cell.loss_N_s:6.1f} N/s"
         print(f"{cell.injected:34s}{columns}  {', '.join(named) or 'nothing'}; {cell.reaction}")
 
 

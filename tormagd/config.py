@@ -17,6 +17,8 @@ from msgspec import Meta
 
 LEAST_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
 DEFAULT_RUN_DIR = "/run/tormag"
+MOST_LISTED = 8
+"Sources in the order of priority: fewer than are kept apart, so that one that is not listed is heard, too."
 LONGEST_IPC_PATH = 107  # bytes that the kernel takes of a socket's path
 
 T = TypeVar("T")
@@ -43,6 +45,8 @@ class Device(Strict, frozen=True):
     "What the firmware does without us: its own timeout, stated here so that it can be checked against ours."
     measurement_timeout_ms: Annotated[float, Meta(ge=2.0, le=1_000.0)] = 50.0
     "Oldest device state the controller accepts while it drives; from some milliseconds on it only holds the gap."
+    retract_mm_s: Annotated[float, Meta(gt=0.0, le=100.0)] = 15.0
+    "What the firmware does without us: how fast a carriage opens, stated here for scenes to be checked against."
 
     def __post_init__(self) -> None:
         _order(self.port.isprintable(), "device.port", self.port, "printable characters")
@@ -55,6 +59,22 @@ class Endpoints(Strict, frozen=True):
     telemetry: str = f"ipc://{DEFAULT_RUN_DIR}/telemetry"
     control: str = f"ipc://{DEFAULT_RUN_DIR}/control"
     recording: str = f"ipc://{DEFAULT_RUN_DIR}/recording"
+
+
+class Sources(Strict, frozen=True):
+    """Who may hold the brake before whom."""
+
+    priority: tuple[Annotated[str, Meta(min_length=1, max_length=64)], ...] = ()
+    "Names of sources. Each takes the brake over from those after it, and from all that are not listed."
+
+    def __post_init__(self) -> None:
+        names = self.priority
+        _order(
+            len(set(names)) == len(names) <= MOST_LISTED and all(name.isprintable() for name in names),
+            "sources.priority",
+            names,
+            f"at most {MOST_LISTED} different printable names",
+        )
 
 
 class Rates(Strict, frozen=True):
@@ -134,7 +154,6 @@ class Limits(Strict, frozen=True):
     no_motion_time_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.06
     following_time_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.25
     low_confidence: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.5
-    stale_ramp_N_s: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 2.0
     neutral_margin_N: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.1
 
 
@@ -145,6 +164,7 @@ class Config(Strict, frozen=True):
     "A scene file, or the name of a shipped one."
     device: Device = msgspec.field(default_factory=Device)
     endpoints: Endpoints = msgspec.field(default_factory=Endpoints)
+    sources: Sources = msgspec.field(default_factory=Sources)
     rates: Rates = msgspec.field(default_factory=Rates)
     realtime: RealTime = msgspec.field(default_factory=RealTime)
     motor: Motor = msgspec.field(default_factory=Motor)

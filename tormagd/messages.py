@@ -41,7 +41,7 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     `displacement_mm` (since the handle turned) and `rate_mm_s` say at which handle motion the force is meant; without
     them the daemon uses the motion it measures. `preview_N` holds the forces that follow this one, `preview_dt_ms`
-    apart.
+    apart. A publisher that is started again raises its `session` and starts `seq` anew.
     """
 
     v: int
@@ -54,11 +54,14 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     rate_mm_s: float | None = None
     preview_N: tuple[float, ...] | None = None
     preview_dt_ms: float | None = None
+    session: int | None = None
 
     def __post_init__(self) -> None:
         _require(self.v == VERSION, "v", self.v, f"{VERSION}")
-        _require(0 < len(self.source) <= MAX_SOURCE_CHARACTERS, "source", self.source, "1..64 characters")
+        is_named = 0 < len(self.source) <= MAX_SOURCE_CHARACTERS and self.source.isprintable()
+        _require(is_named, "source", self.source, "1..64 printable characters")
         _require(0 <= self.seq < 2**63, "seq", self.seq, "0..2^63-1")
+        _require(self.session is None or 0 <= self.session < 2**63, "session", self.session, "0..2^63-1")
         _require(0 <= self.stamp_ns < 2**63, "stamp_ns", self.stamp_ns, "0..2^63-1 ns since 1970")
         _require(0.0 <= self.servo_cf <= MAX_FORCE_N, "servo_cf", self.servo_cf, f"0..{MAX_FORCE_N:g} N")
         _require(0.0 < self.valid_for_ms <= MAX_VALIDITY_MS, "valid_for_ms", self.valid_for_ms, "above 0, to 60000 ms")
@@ -169,6 +172,39 @@ class LinkReport(msgspec.Struct, frozen=True, kw_only=True):
     clock: ClockReport | None
 
 
+class ExecReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Percentiles of a duration over the last seconds, and the longest of them, us."""
+
+    p50: float
+    p99: float
+    p999: float
+    max: float
+
+
+class SourceReport(msgspec.Struct, frozen=True, kw_only=True):
+    """One publisher: whether it holds the brake, how its messages come, and its clock against this machine's.
+
+    `delay_us` is from the stamp, by the corrected clock, until the message was read; counters are since it was first
+    heard. `clock_behind_ms` is what its stamps are corrected by; null while that is not known.
+    """
+
+    state: str
+    silent_ms: float
+    session: int | None
+    seq: int
+    accepted: int
+    refused: int
+    lost: int
+    restarts: int
+    delay_us: ExecReport
+    jitter_us: float
+    clock_behind_ms: float | None
+    clock_steps: int
+    clock: ClockReport | None
+    cause: str
+    remedy: str
+
+
 class SetpointReport(msgspec.Struct, frozen=True, kw_only=True):
     """What became of the setpoints since the start; `sources` has each publisher's newest `seq`."""
 
@@ -179,15 +215,21 @@ class SetpointReport(msgspec.Struct, frozen=True, kw_only=True):
     last_refusal: str | None
     newest_source: str
     sources: dict[str, int]
+    by_source: dict[str, SourceReport] = msgspec.field(default_factory=dict)
 
 
-class ExecReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Percentiles of a duration over the last seconds, and the longest of them, us."""
+class WayReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The whole way of a setpoint, from its stamp to the force, against a budget. What is not known yet is null.
 
-    p50: float
-    p99: float
-    p999: float
-    max: float
+    `to_duty_us`: from the stamp, by the corrected clock, until the first duty that follows it. `device_us`: from a
+    Drive to its State, median. `carriages_ms`: how far the gap is behind where it was wanted, in time.
+    """
+
+    to_duty_us: ExecReport
+    device_us: float | None
+    carriages_ms: float | None
+    total_ms: float | None
+    budget_ms: float
 
 
 class LatenessReport(ExecReport, frozen=True, kw_only=True):
@@ -248,6 +290,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     limit_details: tuple[Explained, ...]
     newest_stall: StallReport | None
     not_granted: tuple[str, ...]
+    way: WayReport | None = None
 
 
 class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):

@@ -75,6 +75,10 @@ def test_a_resolved_configuration_is_a_configuration(write) -> None:
         ("[position]\nproportional_per_mm = -6.0", "$.position.proportional_per_mm", "-6.0", "> 0.0"),
         ("rates = 1000", "$.rates", "1000", "`object`"),
         ("[trim]\nmost = 0.9", "$.trim.most", "0.9", ">= 1.0"),
+        ("[sources]\npriority = 'a'", "$.sources.priority", "'a'", "`array`"),
+        ("[sources]\npriority = ['']", "$.sources.priority", "['']", ">= 1"),
+        ("[sources]\npriority = ['a', 'a']", "sources.priority", "('a', 'a')", "different printable names"),
+        ('[sources]\npriority = ["\\u001b[2J"]', "sources.priority", "x1b", "different printable names"),
     ],
 )
 def test_a_refusal_names_key_value_and_what_is_allowed(write, text: str, key: str, value: str, allowed: str) -> None:

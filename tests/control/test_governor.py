@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tormagd.config import Limits
 from tormagd.control.device_fit import DeviceFit
 from tormagd.control.governor import AHEAD_S, PATH_S, Governed, Governor, GovernorState, TimedSetpoint
 from tormagd.control.periodicity import NOTHING_LEARNED
@@ -21,13 +20,12 @@ PORTRAIT = Portrait(
     np.linspace(95.0, 45.0, 19).tolist(), np.linspace(0.4, 2.2, 19).tolist(), np.linspace(0.01, 0.1, 19).tolist()
 )
 SCENE = Force(least_N=0.0, most_N=2.0, resolution_N=0.1, tolerance_rms_N=0.05)
-LIMITS = Limits()
 GAP_SPEED_MM_S = 38.0
 AFTER_S = np.array(PATH_S)
 VALID_S = 0.1
 
 
-GOVERNOR = Governor(PORTRAIT, SCENE, LIMITS, GAP_SPEED_MM_S)
+GOVERNOR = Governor(PORTRAIT, SCENE, GAP_SPEED_MM_S)
 
 
 def decide(
@@ -40,7 +38,7 @@ def decide(
     portrait: Portrait = PORTRAIT,
 ) -> tuple[GovernorState, Governed]:
     """One decision on the device of these tests."""
-    governor = Governor(portrait, scene, LIMITS, GAP_SPEED_MM_S)
+    governor = Governor(portrait, scene, GAP_SPEED_MM_S)
     return governor.govern(state, now_s, setpoint, DeviceFit(), lag_s)
 
 
@@ -99,10 +97,75 @@ def test_a_stale_setpoint_decays_along_the_ramp_and_not_below_the_least() -> Non
         assert governed.limits == (Limit.STALE,)
         assert governed.age_s == pytest.approx(now_s - 1.0)
         assert np.all(path_N(governed) == governed.force_N)
-        assert last_N - governed.force_N <= LIMITS.stale_ramp_N_s * 1e-3 + 1e-8
-        assert governed.force_N == pytest.approx(max(0.4, 1.6 - LIMITS.stale_ramp_N_s * tick * 1e-3))
+        assert last_N - governed.force_N <= SCENE.release_N_s * 1e-3 + 1e-8
+        assert governed.force_N == pytest.approx(max(0.4, 1.6 - SCENE.release_N_s * tick * 1e-3))
         last_N = governed.force_N
     assert last_N == 0.4
+
+
+def test_a_setpoint_that_goes_stale_on_a_slope_is_let_go_from_where_the_force_is() -> None:
+    """It was carried on along its slope; the ramp begins there, not at the setpoint."""
+    state, governed = stream_of([1.0 + 0.02 * number for number in range(20)])
+    for tick in range(1, 400):
+        last_N = governed.path_N[0]
+        state, governed = decide(state, 0.2 + tick * 1e-3, TimedSetpoint(1.38, 0.2, VALID_S))
+        assert last_N - governed.path_N[0] <= SCENE.release_N_s * 1e-3 + 1e-8
+    assert governed.path_N[0] < 1.0
+
+
+@pytest.mark.parametrize(("before_N", "after_N"), [(1.6, 0.8), (0.8, 1.6)])
+def test_from_one_holder_to_the_next_the_force_goes_along_the_ramp(before_N: float, after_N: float) -> None:
+    state, governed = decide(GovernorState(0.0, before_N), 0.001, TimedSetpoint(before_N, 0.001, VALID_S))
+    reached = 0
+    for tick in range(2, 1_000):
+        now_s, last_N = tick * 1e-3, governed.force_N
+        state, governed = decide(state, now_s, TimedSetpoint(after_N, now_s, VALID_S, holder=1, is_contested=True))
+        assert abs(governed.force_N - last_N) <= SCENE.release_N_s * 1e-3 + 1e-9
+        assert Limit.OTHER_SOURCE in governed.limits
+        assert (Limit.TAKEOVER in governed.limits) == (governed.force_N != after_N)
+        reached = reached or tick * (governed.force_N == after_N)
+    assert reached == pytest.approx(0.8 / SCENE.release_N_s * 1e3, abs=5)
+    # and it is followed as any other from then on
+    state, governed = decide(state, 1.001, TimedSetpoint(1.2, 1.001, VALID_S, holder=1))
+    assert (governed.force_N, governed.limits) == (1.2, ())
+
+
+def test_a_takeover_after_a_silence_begins_from_the_decayed_force() -> None:
+    state, _ = decide(GovernorState(0.0, 1.6), 0.001, TimedSetpoint(1.6, 0.001, VALID_S))
+    for tick in range(2, 301):
+        state, governed = decide(state, tick * 1e-3, TimedSetpoint(1.6, 0.001, VALID_S))
+    decayed_N = governed.force_N
+    state, governed = decide(state, 0.301, TimedSetpoint(1.6, 0.301, VALID_S, holder=1))
+    assert governed.force_N == pytest.approx(decayed_N + SCENE.release_N_s * 1e-3)
+
+
+def test_another_holders_forces_teach_no_slope_and_no_period() -> None:
+    state, _ = stream_of([1.0, 1.1, 1.2])
+    assert state.slope_N_s != 0.0
+    state, _ = decide(state, 0.04, TimedSetpoint(1.0, 0.04, VALID_S, holder=1))
+    assert state.slope_N_s == 0.0
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 3), st.sampled_from([0.0, 0.02, 0.2, 2.0]), st.floats(1e-4, 0.01)),
+        min_size=1,
+        max_size=100,
+    )
+)
+def test_no_loss_of_force_that_was_not_asked_for_is_faster_than_the_ramp(
+    events: list[tuple[int, float, float]],
+) -> None:
+    """Each holder asks for a constant force; publishers fall silent, come late, and take over from each other."""
+    state, now_s = GovernorState(0.0, 2.0), 0.0
+    for holder, age_s, elapsed_s in events:
+        now_s += elapsed_s
+        before_N = state.asked_N
+        state, governed = decide(state, now_s, TimedSetpoint(0.5 + 0.5 * holder, now_s - age_s, VALID_S, holder=holder))
+        # a first publisher takes over from nobody, and one that comes back says itself what it wants
+        if state.is_passing or Limit.STALE in governed.limits:
+            assert before_N - state.asked_N <= SCENE.release_N_s * elapsed_s + 1e-9
+        assert state.asked_N == governed.path_N[0]
 
 
 def test_a_publisher_that_comes_back_is_followed_again_without_a_slope_from_before() -> None:
@@ -265,7 +328,7 @@ def test_no_forecast_holds_a_force_of_a_stale_setpoint(learned: GovernorState) -
         assert governed.foresight == 0.0
         assert np.all(path_N(governed) == governed.force_N)
         assert state.periodicity == NOTHING_LEARNED
-    assert state.governed_N == PORTRAIT.least_N
+    assert state.asked_N == PORTRAIT.least_N
 
 
 def test_a_silent_stream_is_not_believed_to_go_on(learned: GovernorState) -> None:
@@ -309,7 +372,7 @@ def test_nan_never_travels(history: list[tuple[float | None, list[float], float,
         assert math.isfinite(state.slope_N_s)
         assert PORTRAIT.least_N <= governed.force_N <= PORTRAIT.most_N
         assert np.all((path_N(governed) >= PORTRAIT.least_N) & (path_N(governed) <= PORTRAIT.most_N))
-        assert math.isfinite(state.governed_N)
+        assert math.isfinite(state.asked_N)
         is_stale = setpoint is not None and now_s - setpoint.stamp_s > valid_s
         assert (Limit.STALE in governed.limits) == is_stale
         assert (Limit.NO_SETPOINT in governed.limits) == (setpoint is None)

@@ -70,6 +70,26 @@ LINK: dict[str, Any] = {
 }
 
 
+SOURCE: dict[str, Any] = {
+    "state": "holds",
+    "silent_ms": 1.0,
+    "session": None,
+    "seq": 4,
+    "accepted": 5,
+    "refused": 0,
+    "lost": 3,
+    "restarts": 1,
+    "delay_us": {"p50": 1_200.0, "p99": 3_400.0, "p999": 4_000.0, "max": 4_100.0},
+    "jitter_us": 450.0,
+    "clock_behind_ms": 1001.0,
+    "clock_steps": 0,
+    "clock": {"offset_s": 1.002, "drift_ppm": -201.3, "residual_us": 8.0, "windows": 60, "outliers": 0},
+    "cause": "its clock: it is 1.001 s behind this machine's, and is corrected",
+    "remedy": "keep the clocks",
+}
+"What the daemon says of a publisher that holds the brake, and whose clock is wrong."
+
+
 def status(**changes: Any) -> dict[str, Any]:
     """What the daemon answers to `status`."""
     known: dict[str, Any] = msgspec.to_builtins(telemetry(1, 1))
@@ -122,6 +142,7 @@ class FakeDaemon(threading.Thread):
         self.control = f"ipc://{directory}/control"
         self.answers: dict[str, Callable[[], dict[str, Any]]] = {"status": lambda: {"ok": True, "result": status()}}
         self.commands: list[str] = []
+        self.requests: list[dict[str, Any]] = []
         self.setpoints: list[Setpoint] = []
         self.rubbish: list[bytes] = []
         self.is_bound = threading.Event()
@@ -154,6 +175,7 @@ class FakeDaemon(threading.Thread):
                 *envelope, data = router.recv_multipart()
                 request = msgpack.unpackb(data)
                 self.commands.append(request["command"])
+                self.requests.append(request)
                 answer = self.answers.get(request["command"], lambda: {"ok": True, "result": {}})()
                 router.send_multipart([*envelope, msgpack.packb({"v": VERSION, "id": request["id"], **answer})])
             while setpoints.poll(0):
@@ -172,6 +194,12 @@ class FakeDaemon(threading.Thread):
 def status_with() -> Callable[..., dict[str, Any]]:
     """Makes an answer to `status` with some keys changed."""
     return status
+
+
+@pytest.fixture
+def source_with() -> Callable[..., dict[str, Any]]:
+    """Makes what the daemon says of a source with some keys changed."""
+    return lambda **changes: SOURCE | changes
 
 
 @pytest.fixture

@@ -318,8 +318,13 @@ def test_what_cannot_be_meant_is_a_usage_error(tmp_path, monkeypatch, capsys, ar
     assert Path("there").read_text() == "precious"
 
 
-def test_a_second_publisher_is_refused_before_anything_moves(fake_daemon, tmp_path, capsys):
-    fake_daemon.says(setpoint_age_ms=12.0)
+@pytest.mark.parametrize(("age_ms", "state"), [(12.0, "stale"), (20_000.0, "holds")])
+def test_a_second_publisher_is_refused_before_anything_moves(
+    fake_daemon, status_with, source_with, tmp_path, capsys, age_ms, state
+):
+    """One that sends, and one whose old setpoint is still valid and keeps ours out."""
+    setpoints = status_with()["setpoints"] | {"by_source": {"a": source_with(state=state)}}
+    fake_daemon.says(setpoint_age_ms=age_ms, setpoints=setpoints)
     out = tmp_path / "m.safetensors"
     arguments = ["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--insert", INSERT]
     assert main([*arguments, "--out", str(out)]) == 1

@@ -94,6 +94,16 @@ def test_a_command_reaches_the_daemon_under_its_name(fake_daemon, capsys, comman
     assert fake_daemon.commands == [command]
 
 
+@pytest.mark.parametrize(
+    ("before", "said"), [("a", "'b' holds the brake instead of 'a'"), ("b", "'b' holds the brake already")]
+)
+def test_take_names_the_source_and_the_one_before(fake_daemon, capsys, before, said):
+    fake_daemon.answers["take"] = lambda: {"ok": True, "result": {"source": "b", "instead_of": before}}
+    assert main(["--endpoint", fake_daemon.control, "take", "b"]) == 0
+    assert said in capsys.readouterr().out
+    assert fake_daemon.requests[-1]["args"] == {"source": "b"}
+
+
 @pytest.mark.parametrize(("is_connected", "said"), [(True, "the gap opens"), (False, "nothing could be sent")])
 def test_stop_says_whether_a_device_was_there_to_be_told(fake_daemon, capsys, is_connected, said):
     answer = {"ok": True, "result": {"operating_state": "FAULT", "is_connected": is_connected}}
@@ -311,6 +321,32 @@ def test_status_text_says_how_each_rate_is_kept_and_who_made_ticks_late(status_w
     lines = status_text(msgspec.convert(known, Status), Colour(sys.stderr)).splitlines()
     assert "control   error, 1000 Hz, late 12 us (p50) 80 us (p99), overruns 9, stalls 2, merged 4" in lines
     assert "late by   7 kernel, 1 Connection.receive, 1 TelemetryLoop.publish" in lines
+
+
+def test_status_text_shows_each_source_and_the_way(status_with, source_with):
+    fine = {"cause": "", "remedy": ""}
+    source = source_with()
+    other = source_with(state="refused", clock_behind_ms=None, clock=None, restarts=0, **fine)
+    silent = source_with(state="stale", silent_ms=2_340.0, **fine)
+    delay_us = source["delay_us"]
+    setpoints = status_with()["setpoints"] | {"by_source": {"a": source, "b\x1b[2J": other, "c": silent}}
+    way = {"to_duty_us": delay_us, "device_us": 400.0, "carriages_ms": 12.3, "total_ms": 16.1, "budget_ms": 400.0}
+    known = msgspec.convert(status_with(setpoints=setpoints, way=way), Status)
+    lines = status_text(known, Colour(sys.stderr)).splitlines()
+    at = lines.index(
+        "source    'a': holds the brake, delay 1.2 ms (p50) 3.4 ms (p99), jitter 0.5 ms, 3 lost, "
+        "clock 1001.0 ms behind, -201 ppm, 1 restarts"
+    )
+    assert lines[at + 1 : at + 3] == [f"          {source['cause']}", "          next: keep the clocks"]
+    assert lines[at + 3].startswith("source    'b\\x1b[2J': refused, ")
+    assert lines[at + 3].endswith("clock not known yet")
+    assert lines[at + 4].startswith("source    'c': silent for 2.3 s, ")
+    assert lines[at + 5] == (
+        "way       16.1 ms of 400 ms, stamp to duty 1.2 ms (p50) 3.4 ms (p99), device 0.4 ms, carriages 12.3 ms"
+    )
+    late = way | {"to_duty_us": delay_us | {"p99": 420e3}, "total_ms": 432.7}
+    text = status_text(msgspec.convert(status_with(way=late), Status), Colour(sys.stderr))
+    assert "the force comes too late\n          next: most is from the stamp to the duty" in text
 
 
 @pytest.mark.parametrize("command", [["status"], ["send", "step"], ["scene", "list"]])

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from tormagd.ctl.main import main
 from tormagd.ctl.waveform import SHAPES, WaveformError, beat, read_csv, shape
+from tormagd.messages import Setpoint
 
 
 def send(daemon, capsys, *arguments: str) -> dict:
@@ -26,6 +27,11 @@ def wait_for(daemon, count: int) -> None:
     raise AssertionError(f"{len(daemon.setpoints)} of {count} setpoints arrived")
 
 
+def after_s(setpoint: Setpoint, first: Setpoint) -> float:
+    """How long after the first one it is meant."""
+    return (setpoint.stamp_ns - first.stamp_ns) * 1e-9
+
+
 def test_every_setpoint_arrives_from_the_first_on(fake_daemon, capsys):
     result = send(fake_daemon, capsys, "ramp", "--duration", "0.3", "--rate", "200", "--from-N", "1", "--to-N", "2")
     wait_for(fake_daemon, result["sent"])
@@ -37,7 +43,9 @@ def test_every_setpoint_arrives_from_the_first_on(fake_daemon, capsys):
     assert all(b.seq > a.seq and b.stamp_ns > a.stamp_ns for a, b in pairwise(arrived))
     # the force belongs to the setpoint's own deadline, whatever was left out
     for setpoint in arrived:
-        assert setpoint.servo_cf == pytest.approx(1.0 + (setpoint.seq - arrived[0].seq) / 60, abs=1e-9)
+        assert setpoint.servo_cf == pytest.approx(1.0 + after_s(setpoint, arrived[0]) / 0.3, abs=1e-6)
+    # who counts what is missing finds nothing: what was left out was never sent
+    assert [setpoint.seq for setpoint in arrived] == list(range(result["sent"]))
 
 
 def test_a_second_run_of_the_same_source_is_newer(fake_daemon, capsys):
@@ -45,7 +53,8 @@ def test_a_second_run_of_the_same_source_is_newer(fake_daemon, capsys):
     first = send(fake_daemon, capsys, *options)
     second = send(fake_daemon, capsys, *options)
     wait_for(fake_daemon, first["sent"] + second["sent"])
-    numbers = [setpoint.seq for setpoint in fake_daemon.setpoints]
+    numbers = [(setpoint.session, setpoint.seq) for setpoint in fake_daemon.setpoints]
+    assert numbers[0][1] == numbers[first["sent"]][1] == 0
     assert numbers == sorted(set(numbers))
     assert {(s.source, s.valid_for_ms) for s in fake_daemon.setpoints} == {("me", 70.0)}
 
@@ -54,12 +63,12 @@ def test_a_preview_is_what_will_be_sent(fake_daemon, capsys):
     result = send(fake_daemon, capsys, "sine", "--duration", "0.2", "--rate", "100", "--preview-ms", "50")
     wait_for(fake_daemon, result["sent"])
     arrived = fake_daemon.setpoints
-    forces = {setpoint.seq - arrived[0].seq: setpoint.servo_cf for setpoint in arrived}
+    forces = {round(100.0 * after_s(setpoint, arrived[0])): setpoint.servo_cf for setpoint in arrived}
     for setpoint in arrived:
         assert len(setpoint.preview_N) == 5
         assert setpoint.preview_dt_ms == 10.0
         for after, force in enumerate(setpoint.preview_N, start=1):
-            later = min(setpoint.seq - arrived[0].seq + after, 20)
+            later = min(round(100.0 * after_s(setpoint, arrived[0])) + after, 20)
             assert force == pytest.approx(forces.get(later, force), abs=1e-9)
     assert main(["--endpoint", fake_daemon.control, "send", "sine", "--rate", "1000", "--preview-ms", "300"]) == 2
     assert "--preview-ms = 300" in capsys.readouterr().err

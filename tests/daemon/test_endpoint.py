@@ -79,7 +79,7 @@ class Rig:
         waiting = zmq.Poller()
         waiting.register(self.endpoint.fileno(), zmq.POLLIN)
         for _ in range(PATIENCE_MS // 5):
-            self.endpoint.drain_setpoints(self.now_s)
+            self.endpoint.drain_setpoints()
             if reached():
                 return
             waiting.poll(5)
@@ -156,7 +156,7 @@ def test_a_flood_is_drained_in_bounded_portions(rig: Rig) -> None:
     def everything() -> bool:
         nonlocal most
         before = rig.endpoint.inbox.accepted
-        rig.endpoint.drain_setpoints(0.0)
+        rig.endpoint.drain_setpoints()
         most = max(most, rig.endpoint.inbox.accepted - before)
         return rig.endpoint.inbox.accepted == 3 * DRAIN
 
@@ -194,7 +194,7 @@ def test_a_publisher_that_leaves_is_not_one_that_was_cut_off(rig: Rig) -> None:
     first.close(linger=0)
     for _ in range(20):
         rig.endpoint.serve(rig.now_s, never, NEVER)
-        rig.endpoint.drain_setpoints(rig.now_s)
+        rig.endpoint.drain_setpoints()
         rig.context.socket(zmq.PULL).poll(5)
     rig.now_s = 2.0
     rig.publisher().send(setpoint(2))

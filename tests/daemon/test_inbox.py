@@ -8,8 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tormagd.daemon.inbox import AHEAD_S, SILENT_S, SOURCES, SetpointInbox
-from tormagd.messages import VERSION, Reply, SetpointReport, decode, encode
+from tormagd.daemon.inbox import REPORTED, SILENT_S, SOURCES, SetpointInbox
+from tormagd.daemon.source_clock import AHEAD_S, SETTLED_S
+from tormagd.messages import MAX_MESSAGE_BYTES, VERSION, Reply, SetpointReport, decode, encode
+from tormagd.safety.codes import Limit
+from tormagd.safety.operating_state import RefusedError
 
 START_NS = 1_800_000_000_000_000_000
 "Some day on CLOCK_REALTIME that is second 0 of the control clock here."
@@ -18,8 +21,8 @@ START_NS = 1_800_000_000_000_000_000
 class Publishing:
     """An inbox on a clock that the test moves."""
 
-    def __init__(self) -> None:
-        self.inbox = SetpointInbox()
+    def __init__(self, priority: tuple[str, ...] = ()) -> None:
+        self.inbox = SetpointInbox(priority)
         self.now_s = 0.0
         self.step_s = 0.0
         "By how much somebody has set the time of day forward."
@@ -74,72 +77,212 @@ def test_an_older_or_repeated_number_is_dropped(publishing: Publishing, seq: int
     assert publishing.send(6, 2.0)
 
 
-def test_a_publisher_that_was_silent_may_start_again(publishing: Publishing) -> None:
+def test_a_publisher_that_starts_at_0_is_heard_at_once_when_what_it_said_is_over(publishing: Publishing) -> None:
     publishing.send(1_000)
-    publishing.now_s = SILENT_S - 0.01
+    publishing.now_s = 0.049
     assert not publishing.send(0, 2.0)
-    publishing.now_s = SILENT_S
+    publishing.now_s = 0.051
     assert publishing.send(0, 2.0)
     assert publishing.force_N == 2.0
 
 
-def test_dropped_messages_keep_no_publisher_alive(publishing: Publishing) -> None:
-    """A publisher that restarted at 0 is heard after a second, although it never paused."""
+def test_a_publisher_that_starts_at_0_without_a_pause_is_heard_after_three_messages(publishing: Publishing) -> None:
     publishing.send(1_000)
-    for tick in range(1, 200):
-        publishing.now_s = tick * 0.01
-        publishing.send(tick, 2.0)
-    assert publishing.force_N == 2.0
-    assert publishing.inbox.dropped == pytest.approx(SILENT_S / 0.01, abs=2)
+    heard = []
+    for tick in range(6):
+        publishing.now_s = tick * 0.002
+        heard.append(publishing.send(tick, 2.0))
+    assert heard == [False, False, True, True, True, True]
 
 
-def test_of_several_publishers_the_newest_stamp_wins(publishing: Publishing) -> None:
-    publishing.now_s = 1.0
-    assert publishing.send(1, 1.0, "a", 0.02)
-    assert publishing.send(1, 2.0, "b", 0.01)
-    assert not publishing.send(2, 3.0, "a", 0.015)
-    assert publishing.force_N == 2.0
-    assert publishing.inbox.report().newest_source == "b"
-    assert publishing.send(3, 4.0, "a", 0.0)
-    assert publishing.inbox.report().newest_source == "a"
-    assert publishing.inbox.report().sources == {"a": 3, "b": 1}
-    assert publishing.counters() == (4, 0, 0)
+def test_a_publisher_that_says_so_is_restarted_without_a_gap(publishing: Publishing) -> None:
+    publishing.send(1_000, session=1)
+    publishing.now_s = 0.002
+    assert publishing.send(0, 2.0, session=2)
+    newest = publishing.inbox.newest
+    assert newest is not None
+    assert (newest.force_N, newest.holder) == (2.0, 1)
+    # what the one before left on the way
+    assert not publishing.send(1_001, 1.0, session=1)
+    assert publishing.send(1, 2.1, session=2)
+    assert publishing.inbox.report(publishing.now_s).by_source["a"].restarts == 1
+
+
+@pytest.mark.parametrize("numbers", [{"seq": 2**63 - 1}, {"session": 2**63 - 1, "seq": 7}])
+def test_no_number_locks_a_source_out(publishing: Publishing, numbers: dict[str, int]) -> None:
+    """Somebody sends one such message in its name, valid for a minute; two messages later it is heard again."""
+    for tick in range(100):
+        publishing.now_s = tick * 0.002
+        assert publishing.send(tick)
+    publishing.send(0, 9.0, valid_for_ms=60_000.0, **numbers)
+    heard = []
+    for tick in range(100, 110):
+        publishing.now_s = tick * 0.002
+        heard.append(publishing.send(tick))
+    assert heard.count(False) <= 2
+    assert all(heard[2:])
+    assert publishing.force_N == 1.0
+
+
+# -- who holds the brake -------------------------------------------------------------------------------------------
+
+
+def test_one_source_holds_the_brake_and_another_is_refused_and_named_until_it_is_stale(publishing: Publishing) -> None:
+    assert publishing.send(1, 1.0, "a")
+    publishing.now_s = 0.04
+    assert not publishing.send(1, 2.0, "b")
+    assert publishing.counters() == (1, 1, 0)
+    assert publishing.force_N == 1.0
+    assert publishing.send(2, 1.0, "a")
+    newest = publishing.inbox.newest
+    assert newest is not None
+    assert newest.is_contested
+    report = publishing.inbox.report(publishing.now_s)
+    assert (report.newest_source, report.sources) == ("a", {"a": 2, "b": 1})
+    assert (report.by_source["a"].state, report.by_source["b"].state) == ("holds", "refused")
+    told = publishing.inbox.told(publishing.now_s)[Limit.OTHER_SOURCE]
+    assert told.cause == "'b' sends setpoints too, and 'a' holds the brake"
+    assert told.remedy.endswith("tormagctl take b")
+    publishing.now_s = 0.0901
+    assert publishing.send(2, 2.0, "b")
+    newest = publishing.inbox.newest
+    assert (newest.force_N, newest.holder, newest.is_contested) == (2.0, 1, False)
+    assert "'b' holds the brake instead of 'a': that is stale" in str(publishing.inbox.news(publishing.now_s))
+    # and now the first is the other one
+    assert not publishing.send(3, 1.0, "a")
+
+
+def test_a_limit_that_is_over_is_over(publishing: Publishing) -> None:
+    publishing.send(1, 1.0, "a")
+    publishing.send(1, 2.0, "b")
+    for tick in range(2, 200):
+        publishing.now_s += 0.01
+        assert publishing.send(tick, 1.0, "a")
+        newest = publishing.inbox.newest
+        assert newest is not None
+        assert newest.is_contested == (publishing.now_s < SILENT_S)
+
+
+def test_a_source_that_is_late_itself_takes_nothing_over(publishing: Publishing) -> None:
+    publishing.send(1, 1.0, "a")
+    publishing.now_s = 0.2
+    assert not publishing.send(1, 2.0, "b", 0.06)
+    assert publishing.inbox.hold.source == "a"
+
+
+def test_an_operator_gives_the_brake_to_a_source(publishing: Publishing) -> None:
+    with pytest.raises(RefusedError, match="no source 'b' has sent setpoints"):
+        publishing.inbox.give("b", 0.0)
+    publishing.send(1, 1.0, "a")
+    publishing.send(1, 2.0, "b")
+    publishing.inbox.give("b", publishing.now_s)
+    newest = publishing.inbox.newest
+    assert newest is not None
+    assert (newest.force_N, newest.holder, newest.is_contested) == (2.0, 1, False)
+    assert not publishing.send(2, 1.0, "a")
+    assert publishing.send(2, 2.1, "b")
+    publishing.now_s = 0.2
+    with pytest.raises(RefusedError, match="newest setpoint of 'a' is 200 ms old"):
+        publishing.inbox.give("a", publishing.now_s)
+    # it holds the brake no longer than any other
+    assert publishing.send(3, 1.0, "a")
+
+
+def test_a_listed_source_takes_over_from_those_after_it(publishing: Publishing) -> None:
+    publishing.inbox = SetpointInbox(("patient", "console"))
+    assert publishing.send(1, 1.0, "a")
+    assert publishing.send(1, 1.1, "console")
+    assert publishing.send(1, 1.2, "patient")
+    assert not publishing.send(2, 1.1, "console")
+    assert publishing.force_N == 1.2
+    # an operator's choice goes before the list
+    publishing.inbox.give("console", publishing.now_s)
+    assert not publishing.send(2, 1.2, "patient")
+    assert publishing.send(3, 1.1, "console")
+
+
+def test_two_publishers_of_one_name_do_not_alternate_on_the_brake(publishing: Publishing) -> None:
+    forces = []
+    for tick in range(200):
+        publishing.now_s = tick * 0.004
+        publishing.send(tick + 1, 0.9)
+        forces.append(publishing.force_N)
+        publishing.send(tick + 1_000_000, 1.6)
+        forces.append(publishing.force_N)
+    assert set(forces[4:]) == {0.9} or set(forces[4:]) == {1.6}
+    assert publishing.inbox.newest is not None
+    assert publishing.inbox.newest.is_contested
+    assert "two publishers call themselves 'a'" in publishing.inbox.told(publishing.now_s)[Limit.OTHER_SOURCE].cause
+
+
+def test_why_it_is_stale_is_said(publishing: Publishing) -> None:
+    publishing.send(1)
+    publishing.now_s = 0.3
+    told = publishing.inbox.told(publishing.now_s)[Limit.STALE]
+    assert told.cause.startswith("'a' has sent nothing for 300 ms")
+    publishing.send(2, 1.0, "a", 0.12)
+    told = publishing.inbox.told(publishing.now_s)[Limit.STALE]
+    assert told.cause.startswith("setpoints of 'a' come 120 ms late, and are valid for 50 ms")
+
+
+# -- clocks --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("step_s", [-3_600.0, -0.5, 0.5, 3_600.0])
 def test_setting_the_time_of_this_machine_keeps_no_setpoint_out(publishing: Publishing, step_s: float) -> None:
-    """Publisher and daemon read the same clock: the ages stay what they are, also between sources."""
+    """Publisher and daemon read the same clock: the ages stay what they are."""
     publishing.send(1, 1.0, "a", 0.01)
-    publishing.send(1, 1.5, "b", 0.005)
     publishing.step_s = step_s
     for tick in range(2, 5):
         publishing.now_s += 0.002
         assert publishing.send(tick, float(tick), "a", 0.001)
         assert publishing.force_N == tick
         assert publishing.inbox.newest is not None
-        assert publishing.now_s - publishing.inbox.newest.stamp_s == pytest.approx(0.001, abs=1e-6)
-    assert not publishing.send(2, 9.0, "b", 0.3)
-    assert publishing.force_N == 4.0
+        assert publishing.now_s - publishing.inbox.newest.stamp_s == pytest.approx(0.001, abs=1e-5)
 
 
-def test_a_publisher_whose_clock_is_set_back_is_heard_on_with_older_setpoints(publishing: Publishing) -> None:
-    """Its seq goes on, so it is newer; by the stamp it is half a second old, and the governor lets that decay."""
-    publishing.send(1, 1.0, "a", 0.0)
-    publishing.now_s = 0.002
-    assert publishing.send(2, 1.2, "a", 0.5)
-    assert publishing.force_N == 1.2
-    assert publishing.inbox.newest is not None
-    assert publishing.inbox.newest.stamp_s == pytest.approx(-0.498)
+@pytest.mark.parametrize("age_s", [1.0, -1.0])
+def test_a_clock_that_is_a_second_off_is_corrected_and_named(publishing: Publishing, age_s: float) -> None:
+    for tick in range(200):
+        publishing.now_s = tick * 0.002
+        publishing.send(tick, 1.0, "a", age_s)
+        if publishing.now_s > SETTLED_S + 0.002:
+            assert publishing.inbox.newest is not None
+            assert 0.0 <= publishing.now_s - publishing.inbox.newest.stamp_s < 1e-3
+    publishing.inbox.refresh(publishing.now_s)
+    found = publishing.inbox.report(publishing.now_s).by_source["a"]
+    assert found.clock_behind_ms == pytest.approx(1e3 * age_s, abs=0.5)
+    words = "behind this machine's (or its way takes that long)" if age_s > 0.0 else "ahead of this machine's"
+    assert found.cause == f"its clock: it is 1.000 s {words}, and is corrected"
+    assert "chrony" in found.remedy
+    assert found.cause in str(publishing.inbox.news(publishing.now_s))
 
 
-def test_a_stamp_ahead_of_the_clock_is_refused(publishing: Publishing) -> None:
-    assert publishing.send(1, 1.0, "a", -AHEAD_S)
-    assert not publishing.send(2, 2.0, "a", -AHEAD_S - 0.001)
-    assert publishing.counters() == (1, 1, 0)
+@pytest.mark.parametrize("by_s", [-0.5, 0.5])
+def test_a_clock_that_is_set_makes_no_setpoint_older_or_younger(publishing: Publishing, by_s: float) -> None:
+    for tick in range(100):
+        publishing.now_s = tick * 0.002
+        publishing.send(tick, 1.0, "a", 0.0 if tick < 50 else -by_s)
+        assert publishing.inbox.newest is not None
+        assert publishing.now_s - publishing.inbox.newest.stamp_s == pytest.approx(0.0, abs=1e-3)
+    assert publishing.counters() == (100, 0, 0)
+    publishing.inbox.refresh(publishing.now_s)
+    found = publishing.inbox.report(publishing.now_s).by_source["a"]
+    assert found.clock_steps == 1
+    assert f"it was set {'forward' if by_s > 0.0 else 'back'} by 0.500 s" in found.cause
+
+
+def test_a_stamp_ahead_of_the_clock_is_refused_until_it_is_known_to_be_the_clock(publishing: Publishing) -> None:
+    assert not publishing.send(1, 2.0, "a", -AHEAD_S - 0.001)
+    assert publishing.counters() == (0, 1, 0)
     assert publishing.inbox.last_refusal is not None
     assert "51 ms ahead" in publishing.inbox.last_refusal
-    # the refused one does not use up its number
-    assert publishing.send(2, 3.0, "a", -AHEAD_S)
+    publishing.now_s = SETTLED_S
+    assert publishing.send(2, 2.0, "a", -AHEAD_S - 0.001)
+    # of a source that is known, it is the clock; and no setpoint is younger than its arrival
+    assert publishing.send(1, 1.0, "b", 0.0, valid_for_ms=1.0) is False
+    assert publishing.inbox.newest is not None
+    assert publishing.inbox.newest.stamp_s == SETTLED_S
 
 
 def test_a_stamp_of_long_ago_is_taken_and_is_as_old_as_it_says(publishing: Publishing) -> None:
@@ -149,28 +292,43 @@ def test_a_stamp_of_long_ago_is_taken_and_is_as_old_as_it_says(publishing: Publi
     assert publishing.now_s - newest.stamp_s == pytest.approx(START_NS * 1e-9)
 
 
+def test_losses_and_delays_are_counted_for_each_source(publishing: Publishing) -> None:
+    for tick in range(1_000):
+        publishing.now_s = tick * 0.002
+        if tick % 10:
+            publishing.send(tick, 1.0, "a", 0.003 if tick % 2 else 0.001)
+    publishing.inbox.refresh(publishing.now_s)
+    found = publishing.inbox.report(publishing.now_s).by_source["a"]
+    assert found.lost == 99
+    assert (found.delay_us.p50, found.delay_us.p99) == pytest.approx((3_000.0, 3_000.0), rel=0.04)
+    assert found.jitter_us == pytest.approx(1_800.0, rel=0.2)
+    assert (found.clock_behind_ms, found.cause) == (pytest.approx(0.0, abs=0.1), "")
+
+
 def test_one_publisher_too_many_is_refused_until_one_is_silent(publishing: Publishing) -> None:
     for number in range(SOURCES):
         publishing.now_s = number * 0.01
-        assert publishing.send(1, source=f"source {number}")
-    assert not publishing.send(1, 2.0, source="one more")
+        publishing.send(1, source=f"source {number}", valid_for_ms=60_000.0)
+    publishing.send(1, 2.0, source="one more")
     assert "one more" in str(publishing.inbox.last_refusal)
-    assert publishing.send(2, source="source 3")
-    # the first has been silent for long enough, the second has not
-    publishing.now_s = SILENT_S + 0.005
-    assert publishing.send(1, 2.0, source="one more")
-    sources = publishing.inbox.report().sources
+    # the first holds the brake and stays; the second has been silent for long enough, the third has not
+    publishing.now_s = SILENT_S + 0.015
+    publishing.send(1, 2.0, source="one more")
+    sources = publishing.inbox.report(publishing.now_s).sources
     assert len(sources) == SOURCES
-    assert "source 0" not in sources
-    assert "source 1" in sources
+    assert {"source 0", "source 2", "one more"} <= set(sources)
+    assert "source 1" not in sources
 
 
-def test_a_flood_of_names_takes_no_memory(publishing: Publishing) -> None:
+def test_a_flood_of_names_takes_no_memory_and_keeps_no_listed_source_out() -> None:
+    publishing = Publishing(("patient",))
     for number in range(2_000):
         publishing.send(1, source=f"source {number}")
         publishing.now_s += 0.01
-    assert len(publishing.inbox.report().sources) == SOURCES
+    assert len(publishing.inbox.report(publishing.now_s).sources) == SOURCES
     assert publishing.inbox.accepted + publishing.inbox.refused == 2_000
+    assert publishing.send(1, 1.5, "patient")
+    assert publishing.inbox.hold.source == "patient"
 
 
 @pytest.mark.parametrize(
@@ -183,6 +341,10 @@ def test_a_flood_of_names_takes_no_memory(publishing: Publishing) -> None:
         {"valid_for_ms": 0.0},
         {"v": 2},
         {"source": ""},
+        {"source": "\x1b[2J"},
+        {"session": -1},
+        {"session": 2**63},
+        {"session": "1"},
         {"seq": -1},
         {"seq": None},
         {"stamp_ns": 1.5},
@@ -202,11 +364,21 @@ def test_a_refused_setpoint_changes_nothing_but_the_counter(publishing: Publishi
     assert publishing.send(2, 1.1)
 
 
-def test_the_last_refusal_fits_into_an_answer(publishing: Publishing) -> None:
+def test_the_report_fits_into_an_answer_whatever_the_sources_call_themselves(publishing: Publishing) -> None:
     hostile = {"preview_N": [-1.2345678901234567e-100] * 256, "preview_dt_ms": 1.0}
     assert not publishing.send(1, **hostile)
-    answer = Reply(v=VERSION, id=1, ok=True, result=msgspec.to_builtins(publishing.inbox.report()))
-    assert msgspec.convert(decode(encode(answer), Reply).result, SetpointReport) == publishing.inbox.report()
+    for tick in range(30):
+        publishing.now_s += 0.01
+        for number in range(SOURCES):
+            name = f"{number:2d}" + 62 * "\U00010348"  # four bytes each
+            publishing.send(2**63 - 100 + tick, 1.0, name, 1e3, session=2**63 - 1)
+            publishing.inbox.refresh(publishing.now_s)
+    report = publishing.inbox.report(publishing.now_s)
+    assert len(report.by_source) == REPORTED
+    answer = encode(Reply(v=VERSION, id=1, ok=True, result=msgspec.to_builtins(report)))
+    # what is left is for the rest of the status
+    assert len(answer) < MAX_MESSAGE_BYTES - 4_000
+    assert msgspec.convert(decode(answer, Reply).result, SetpointReport) == report
 
 
 @pytest.mark.parametrize("data", [b"", b"\xc1", b"\x00" * 20_000, msgpack.packb("setpoint")])
@@ -220,21 +392,32 @@ def test_garbage_is_counted(publishing: Publishing, data: bytes) -> None:
 @given(
     events=st.lists(
         st.tuples(
-            st.sampled_from("abc"), st.integers(0, 8), st.floats(-0.1, 0.5), st.floats(0.0, 2.0), st.floats(0.0, 0.4)
+            st.sampled_from("abc"),
+            st.one_of(st.integers(0, 8), st.sampled_from([2**62, 2**63 - 1])),
+            st.floats(-2.0, 2.0),
+            st.floats(0.0, 2.0),
+            st.floats(0.0, 0.4),
+            st.sampled_from([None, 0, 2**63 - 1]),
         ),
         max_size=60,
     )
 )
-def test_every_message_is_counted_once_and_no_source_supersedes_a_newer_one(
-    events: list[tuple[str, int, float, float, float]],
+def test_every_message_is_counted_once_and_no_source_takes_the_brake_from_one_that_is_valid(
+    events: list[tuple[str, int, float, float, float, int | None]],
 ) -> None:
     publishing = Publishing()
-    last_source, last_stamp_ns = "", 0
-    for source, seq, age_s, force_N, elapsed_s in events:
+    for source, seq, age_s, force_N, elapsed_s, session in events:
         publishing.now_s += elapsed_s
-        stamp_ns = publishing.realtime_ns - round(age_s * 1e9)
-        if publishing.send(seq, force_N, source, stamp_ns=stamp_ns):
-            assert stamp_ns >= last_stamp_ns or source == last_source
-            last_source, last_stamp_ns = source, stamp_ns
+        before = publishing.inbox.newest
+        held = publishing.inbox.hold.source
+        is_newest = publishing.send(seq, force_N, source, age_s, session=session)
+        assert is_newest == (publishing.inbox.newest is not before)
+        if is_newest:
+            assert publishing.inbox.newest is not None
             assert publishing.force_N == force_N
+            assert publishing.inbox.newest.stamp_s <= publishing.now_s
+            assert publishing.inbox.hold.source == source
+            if before is not None and held != source:
+                assert publishing.now_s - before.stamp_s > before.valid_for_s
+                assert publishing.inbox.newest.holder == before.holder + 1
     assert sum(publishing.counters()) == len(events)

@@ -37,7 +37,7 @@ class Rig:
     def foresee(self, state: None) -> None:
         self.foreseen_ns.append(self.now_ns)
 
-    def drain(self, _now_s: float) -> bool:
+    def drain(self) -> bool:
         arrived, self.has_arrived = self.has_arrived, False
         return arrived
 

@@ -35,7 +35,7 @@ def test_percentiles_are_exact_to_the_width_of_their_bin(values: list[float]) ->
     for value in values:
         histogram.add(value)
     summary = histogram.summary()
-    assert summary.max == pytest.approx(max(values), abs=0.05)
+    assert summary.max == pytest.approx(max(values), abs=0.05 + 1e-9)  # half a tenth rounds either way
     for name, share in SHARES.items():
         exact = float(np.quantile(values, share, method="inverted_cdf"))
         assert exact - 0.05 <= getattr(summary, name) <= exact * (1.0 + 1.0 / 32.0) + 1.0

@@ -93,10 +93,10 @@ class Rig:
     def _wait_for_link(self) -> None:
         self.until(lambda: self.status()["link"]["state"] == "RUNNING", "the link runs")
 
-    def command(self, name: str) -> Reply:
+    def command(self, name: str, **args: Any) -> Reply:
         """The daemon's answer."""
         self._seq += 1
-        self._control.send(encode(Request(v=VERSION, id=self._seq, command=name)))
+        self._control.send(encode(Request(v=VERSION, id=self._seq, command=name, args=args)))
         until_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < until_s:
             if self._control.poll(1_000):

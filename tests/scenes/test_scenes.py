@@ -90,6 +90,7 @@ def test_a_name_that_no_file_can_have_is_refused(write) -> None:
     [
         ("force__least_N", "2.0", "force__most_N", "2.0"),
         ("force__least_N", "3.0", "force__most_N", "2.0"),
+        ("force__release_N_s", "30.0", "force__most_release_N_s", "20.0"),
         ("insert__gap_closed_mm", "95.0", "insert__gap_open_mm", "45.0"),
         ("insert__gap_closed_mm", "60.0", "insert__gap_open_mm", "60.0"),
         ("insert__inner_radius_mm", "11.0", "insert__outer_radius_mm", "4.0"),
@@ -131,6 +132,7 @@ def test_a_refusal_names_file_key_value_and_what_is_allowed(
         ("insert__model", '"no_such_model"', "no_such_model"),
         ("bandwidth__control_hz", "2000", "rates.control_hz = 1000: allowed is at least 2000"),
         ("bandwidth__inference_hz", "500", "rates.inference_hz = 250: allowed is at least 500"),
+        ("force__most_release_N_s", "3.0", r"allowed is at least 6.20: position.gap_speed_mm_s opens the gap by 38"),
     ],
 )
 def test_a_scene_that_does_not_fit_model_or_rates_gives_no_core(write, key: str, value: str, word: str) -> None:

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tormagd.config import Config, ConfigError
+from tormagd.control.device_fit import LEAST_SCALE
 from tormagd.control.motor import Margins, margins, pull_V
-from tormagd.control.plan import Planner
+from tormagd.control.plan import CEILING, Planner
 from tormagd.control.portrait import FieldOfGap, Portrait, law_beside, portrait
 from tormagd.control.step import Stepper
 from tormagd.inverse.choice import Choice, build, choose, named, solver_table
@@ -70,6 +71,7 @@ def build_core(config: Config) -> Core:
         raise ConfigError(f"scene {scene.name}: {error}") from error
     reach = portrait(model, field, cip_percent, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
     _refuse_out_of_reach(scene, reach)
+    _refuse_too_sudden(config, scene, reach)
     beside = law_beside(reach, law, field, fitted.elastomer, _geometry(scene.insert))
     planner = Planner(config, scene, model, search, field, reach, beside, cip_percent)
     return Core(scene, planner, Stepper(config, scene), stability, choice)
@@ -113,6 +115,23 @@ def _refuse_out_of_reach(scene: Scene, reach: Portrait) -> None:
     between = f"allowed is {reach.least_N:.2f}..{reach.most_N:.2f}, what model {scene.insert.model} gives in these gaps"
     if not reach.least_N < scene.force.most_N <= reach.most_N:
         raise ConfigError(f"scene {scene.name}: force.most_N = {scene.force.most_N:g}: {between}")
+
+
+def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
+    # the weakest believable device makes a force with the least gap, where a gap's speed is the most force; and the
+    # ceiling lets no gap make more than CEILING times the scene's greatest
+    opening_mm_s, key = max(
+        (2.0 * config.device.retract_mm_s, "device.retract_mm_s"),
+        (config.position.gap_speed_mm_s, "position.gap_speed_mm_s"),
+    )
+    model_N = min(CEILING * scene.force.most_N / LEAST_SCALE, reach.most_N)
+    lost_N_s = LEAST_SCALE * reach.force_rate_N_s(model_N, opening_mm_s)
+    if lost_N_s > scene.force.most_release_N_s:
+        raise ConfigError(
+            f"scene {scene.name}: force.most_release_N_s = {scene.force.most_release_N_s:g}: allowed is at least "
+            f"{lost_N_s:.2f}: {key} opens the gap by {opening_mm_s:g} mm/s, which at {LEAST_SCALE * model_N:.2g} N "
+            "loses so much"
+        )
 
 
 def choose_solver(scene: Scene, hidden: int) -> Choice:

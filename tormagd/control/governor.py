@@ -4,7 +4,6 @@ import math
 from typing import Final, final
 
 from firmware_protocol.value import Value
-from tormagd.config import Limits
 from tormagd.control.device_fit import DeviceFit
 from tormagd.control.periodicity import LONGEST_STEP_S, NOTHING_LEARNED, Periodicity, forecast_N, foreseen, observe
 from tormagd.control.portrait import Portrait
@@ -21,7 +20,8 @@ PATH_S: Final = [0.0, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03]
 @final
 class TimedSetpoint(Value):
     """The newest valid setpoint. `stamp_s` is when the publisher meant it, on the clock of `now_s`; `preview_N` are the
-    forces that follow it, `preview_dt_s` apart.
+    forces that follow it, `preview_dt_s` apart. `holder` numbers the publishers that have held the brake, one after the
+    other; with `is_contested` somebody else sends setpoints too.
     """
 
     __match_args__ = (
@@ -32,6 +32,8 @@ class TimedSetpoint(Value):
         "rate_mm_s",
         "preview_N",
         "preview_dt_s",
+        "holder",
+        "is_contested",
     )
     __slots__ = __match_args__
 
@@ -44,6 +46,8 @@ class TimedSetpoint(Value):
         rate_mm_s: float | None = None,
         preview_N: tuple[float, ...] = (),
         preview_dt_s: float = 0.0,
+        holder: int = 0,
+        is_contested: bool = False,
     ) -> None:
         self.force_N: Final = force_N
         self.stamp_s: Final = stamp_s
@@ -52,30 +56,46 @@ class TimedSetpoint(Value):
         self.rate_mm_s: Final = rate_mm_s
         self.preview_N: Final = preview_N
         self.preview_dt_s: Final = preview_dt_s
+        self.holder: Final = holder
+        self.is_contested: Final = is_contested
 
 
 @final
 class GovernorState(Value):
-    """What the governor remembers between plans."""
+    """What the governor remembers between plans: `asked_N` is the force that the last one asked of the device, `holder`
+    whose setpoints it followed; while `is_passing` the force is on its way to those of a new holder."""
 
-    __match_args__ = ("time_s", "governed_N", "stamp_s", "slope_N_s", "last_N", "periodicity")
+    __match_args__ = (
+        "time_s",
+        "asked_N",
+        "stamp_s",
+        "slope_N_s",
+        "last_N",
+        "periodicity",
+        "holder",
+        "is_passing",
+    )
     __slots__ = __match_args__
 
     def __init__(
         self,
         time_s: float,
-        governed_N: float,
+        asked_N: float,
         stamp_s: float = -math.inf,
         slope_N_s: float = 0.0,
         last_N: float = 0.0,
         periodicity: Periodicity = NOTHING_LEARNED,
+        holder: int = 0,
+        is_passing: bool = False,
     ) -> None:
         self.time_s: Final = time_s
-        self.governed_N: Final = governed_N
+        self.asked_N: Final = asked_N
         self.stamp_s: Final = stamp_s
         self.slope_N_s: Final = slope_N_s
         self.last_N: Final = last_N
         self.periodicity: Final = periodicity
+        self.holder: Final = holder
+        self.is_passing: Final = is_passing
 
 
 @final
@@ -108,13 +128,13 @@ class Governed(Value):
 class Governor:
     """The constants of governing: what the scene allows, and the fastest that the gap may be driven."""
 
-    __slots__ = ("_gap_speed_mm_s", "_least_N", "_most_N", "_portrait", "_stale_ramp_N_s")
+    __slots__ = ("_gap_speed_mm_s", "_least_N", "_most_N", "_portrait", "_release_N_s")
 
-    def __init__(self, portrait: Portrait, scene: Force, limits: Limits, gap_speed_mm_s: float) -> None:
+    def __init__(self, portrait: Portrait, scene: Force, gap_speed_mm_s: float) -> None:
         self._portrait: Final = portrait
         self._least_N: Final = scene.least_N
         self._most_N: Final = scene.most_N
-        self._stale_ramp_N_s: Final = limits.stale_ramp_N_s
+        self._release_N_s: Final = scene.release_N_s
         self._gap_speed_mm_s: Final = gap_speed_mm_s
 
     def govern(
@@ -122,7 +142,8 @@ class Governor:
     ) -> tuple[GovernorState, Governed]:
         """One decision, for now and, where what comes is known, for up to `lag_s` later: an extrapolation that far is a
         guess. The force is within what the scene allows and `device`, as far as it has shown itself, gives. A missing
-        or stale setpoint decays to F_min along `limits.stale_ramp_N_s`: never a jump, never a force held for ever.
+        or stale setpoint decays to F_min along the scene's `release_N_s`, and from one holder's force to the next one's
+        it goes as fast: never a jump, never a force held for ever.
         """
         portrait = self._portrait
         lowest = max(device.force_N(portrait.least_N), 0.0)
@@ -130,12 +151,17 @@ class Governor:
             return self._ramp(state, now_s, lowest, None, Limit.NO_SETPOINT)
         age = now_s - setpoint.stamp_s
         if age > setpoint.valid_for_s:
-            return self._ramp(state, now_s, lowest, age, Limit.STALE)
+            return self._ramp(state, now_s, lowest, age, Limit.STALE, setpoint.is_contested)
         highest = max(device.force_N(portrait.most_N), 0.0)
         force, reasons = self._within_range(setpoint.force_N, lowest, highest)
-        slope = state.slope_N_s
+        if setpoint.is_contested:
+            reasons = (*reasons, Limit.OTHER_SOURCE)
+        is_new_holder = setpoint.holder != state.holder
+        slope, learned = state.slope_N_s, state.periodicity
         spacing = setpoint.stamp_s - state.stamp_s
-        if spacing > LONGEST_STEP_S:
+        if is_new_holder:  # another publisher's forces say nothing of this one's
+            slope, learned = 0.0, NOTHING_LEARNED
+        elif spacing > LONGEST_STEP_S:
             slope = 0.0
         elif spacing > 0.0:
             renderable = device.scale * portrait.force_rate_N_s(device.model_N(force), self._gap_speed_mm_s)
@@ -146,7 +172,7 @@ class Governor:
             periodicity, foresight = NOTHING_LEARNED, 1.0
             path = _previewed_N(setpoint, soon_s + lag_s)
         else:
-            periodicity = observe(state.periodicity, setpoint.stamp_s, force)
+            periodicity = observe(learned, setpoint.stamp_s, force)
             # one that has fallen silent for longer than a stream may is not believed to go on as it did
             foresight = periodicity.trust if age <= LONGEST_STEP_S else 0.0
             begins_s = soon_s + foresight * lag_s
@@ -156,22 +182,50 @@ class Governor:
                     path[place] += foresight * (forecast - path[place])
         least, most = min(max(self._least_N, lowest), highest), min(max(self._most_N, lowest), highest)
         within = [min(max(force_N, least), most) for force_N in path]
-        rendered = GovernorState(now_s, force, setpoint.stamp_s, slope, force, periodicity)
-        return rendered, Governed(force, within, age, reasons, foresight)
+        governed, is_passing = force, is_new_holder or state.is_passing
+        if is_passing:
+            step_N = self._release_N_s * max(0.0, now_s - state.time_s)
+            left_N = within[0] - state.asked_N
+            is_passing = abs(left_N) > step_N
+            if is_passing:
+                governed = state.asked_N + math.copysign(step_N, left_N)
+                within = [governed] * len(PATH_S)
+                reasons, foresight = (*reasons, Limit.TAKEOVER), 0.0
+        rendered = GovernorState(
+            now_s, within[0], setpoint.stamp_s, slope, force, periodicity, setpoint.holder, is_passing
+        )
+        return rendered, Governed(governed, within, age, reasons, foresight)
 
     def foresee(self, state: GovernorState) -> GovernorState:
         """The state with a forecast of what comes, where one is due: for the time between decisions."""
         periodicity = foreseen(state.periodicity, state.slope_N_s)
         if periodicity is state.periodicity:
             return state
-        return GovernorState(state.time_s, state.governed_N, state.stamp_s, state.slope_N_s, state.last_N, periodicity)
+        return GovernorState(
+            state.time_s,
+            state.asked_N,
+            state.stamp_s,
+            state.slope_N_s,
+            state.last_N,
+            periodicity,
+            state.holder,
+            state.is_passing,
+        )
 
     def _ramp(
-        self, state: GovernorState, now_s: float, lowest_N: float, age_s: float | None, reason: Limit
+        self,
+        state: GovernorState,
+        now_s: float,
+        lowest_N: float,
+        age_s: float | None,
+        reason: Limit,
+        is_contested: bool = False,
     ) -> tuple[GovernorState, Governed]:
         elapsed = max(0.0, now_s - state.time_s)
-        force = max(lowest_N, state.governed_N - self._stale_ramp_N_s * elapsed)
-        return GovernorState(now_s, force), Governed(force, [force] * len(PATH_S), age_s, (reason,))
+        force = max(lowest_N, state.asked_N - self._release_N_s * elapsed)
+        reasons: tuple[Limit, ...] = (reason, Limit.OTHER_SOURCE) if is_contested else (reason,)
+        decayed = GovernorState(now_s, force, holder=state.holder, is_passing=state.is_passing)
+        return decayed, Governed(force, [force] * len(PATH_S), age_s, reasons)
 
     def _within_range(self, asked_N: float, lowest_N: float, highest_N: float) -> tuple[float, tuple[Limit, ...]]:
         """The force nearest the one asked that the scene allows and the device gives: never over the scene's greatest,

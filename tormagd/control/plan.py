@@ -209,7 +209,7 @@ class Planner:
         position, trim = config.position, config.trim
         self.portrait: Final = portrait
         self._model, self._search, self._field, self._law = model, search, field, law
-        self._governor = Governor(portrait, scene.force, config.limits, position.gap_speed_mm_s)
+        self._governor = Governor(portrait, scene.force, position.gap_speed_mm_s)
         self._cip_percent = cip_percent
         self._closed_mm, self._open_mm = scene.insert.gap_closed_mm, scene.insert.gap_open_mm
         self._ceiling_N = CEILING * scene.force.most_N

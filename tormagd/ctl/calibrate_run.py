@@ -153,8 +153,10 @@ class Run:
 def reach(client: Client, scene_most_N: float) -> Range:
     """What can be asked for. Raises CommandError where somebody else publishes."""
     status = client.status()
-    age_ms = status.setpoint_age_ms
-    if age_ms is not None and age_ms < RECENT_SETPOINT_MS:
+    age_ms, setpoints = status.setpoint_age_ms, status.setpoints
+    holder = setpoints.by_source.get(setpoints.newest_source)
+    is_held = holder is not None and holder.state == "holds"  # an old setpoint may be valid for long
+    if age_ms is not None and (age_ms < RECENT_SETPOINT_MS or is_held):
         raise CommandError(
             Exit.REFUSED,
             "other_publisher",

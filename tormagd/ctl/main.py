@@ -84,7 +84,7 @@ def _run(options: argparse.Namespace) -> Outcome:
 def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
     from tormagd.ctl.client import Client
     from tormagd.ctl.firmware import firmware
-    from tormagd.ctl.operate import home, operate
+    from tormagd.ctl.operate import home, operate, take
     from tormagd.ctl.status import status
 
     with Client(endpoints.control, options.wait) as client:
@@ -93,6 +93,8 @@ def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
                 return status(client)
             case "firmware":
                 return firmware(client)
+            case "take":
+                return take(client, options.source)
             case "home":
                 return home(client, options.timeout, not options.no_wait)
             case _:
@@ -214,6 +216,8 @@ def _parser() -> argparse.ArgumentParser:
     command("ports", "where a device could be connected, and who holds what is there")
     for name, help_text in STATE_COMMANDS.items():
         command(name, help_text)
+    taking = command("take", "give the brake to another source; the force goes to its setpoints along a ramp")
+    taking.add_argument("source", type=_source, metavar="SOURCE", help="as tormagctl status names it")
     home = command("home", "find the home switches of both carriages")
     home.add_argument("--timeout", type=_above_zero, default=30.0, metavar="S", help="wait this long (30)")
     home.add_argument("--no-wait", action="store_true", help="do not wait until it is done")

@@ -1,4 +1,4 @@
-"""The commands that change what the device does: enable, disable, pause, resume, stop, clear-fault, home."""
+"""The commands that change what the device does: enable, disable, pause, resume, stop, clear-fault, take, home."""
 
 import sys
 import time
@@ -30,6 +30,16 @@ def operate(client: Client, command: str) -> Outcome:
     result = client.request(command)
     is_without_device = command == "stop" and result.get("is_connected") is False
     return Outcome(result, STOPPED_WITHOUT_DEVICE if is_without_device else DONE_TEXT[command])
+
+
+def take(client: Client, source: str) -> Outcome:
+    """Give the brake to `source`, whoever holds it."""
+    result = client.request("take", source=source)
+    before = result.get("instead_of")
+    instead = (
+        f" instead of {before!r}; the force goes to its setpoints along a ramp" if before != source else " already"
+    )
+    return Outcome(result, f"{source!r} holds the brake{instead}")
 
 
 def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:

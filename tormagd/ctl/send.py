@@ -56,7 +56,6 @@ def _publish(
     rate_hz = stream.rate_hz
     sent = skipped = index = 0
     worst_late_s = 0.0
-    first_seq = time.time_ns()  # above every earlier run's, so that none of ours looks repeated
     start_s, start_ns = time.monotonic(), time.time_ns()
     # the margin keeps the last one where the times of a file are off by a rounding error
     last = int(duration_s * rate_hz + 1e-6)
@@ -82,7 +81,8 @@ def _publish(
         setpoint = Setpoint(
             v=VERSION,
             source=stream.source,
-            seq=first_seq + index,
+            seq=sent,
+            session=start_ns,  # above every earlier run's
             stamp_ns=start_ns + round(index / rate_hz * 1e9),  # when the force is meant, whenever it gets sent
             servo_cf=sample.force_N,
             valid_for_ms=stream.valid_for_ms,

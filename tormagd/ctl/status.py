@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from firmware_protocol.build import COST, REMEDY
 from tormagd.ctl.client import Client, understood
 from tormagd.ctl.outcome import Colour, Exit, Outcome
-from tormagd.messages import Explained, LinkReport, RateReport, SetpointReport, Status
+from tormagd.messages import Explained, LinkReport, RateReport, SetpointReport, SourceReport, Status, WayReport
 
 UNKNOWN = "-"
 SETPOINT_COUNTS = ("accepted", "refused", "dropped", "oversize")
@@ -35,6 +35,8 @@ def status_text(known: Status, colour: Colour) -> str:
         f"gap       {_number(known.gap_mm, 'mm', 2)}, wanted {_number(known.gap_setpoint_mm, 'mm', 2)}, "
         f"skew {_number(known.skew_mm, 'mm', 3)}",
         f"setpoint  {_number(known.setpoint_age_ms, 'ms', 0)} old, {_counts(known.setpoints, SETPOINT_COUNTS)}",
+        *(line for name, source in known.setpoints.by_source.items() for line in _source(name, source, colour)),
+        *_way(known.way, colour),
         f"link      {known.link.state}, {_counts(known.link, LINK_COUNTS)}",
         *_explained(known.link.cause, known.link.remedy, colour.yellow),
         *(_rate(name, group, colour) for name, group in known.rates.items()),
@@ -61,6 +63,52 @@ def _number(value: float | None, unit: str, digits: int = 3) -> str:
 def _counts(report: LinkReport | SetpointReport, names: tuple[str, ...]) -> str:
     numbers = [(getattr(report, name), name) for name in names]
     return ", ".join(f"{number} {name}" for number, name in numbers if number is not None)
+
+
+def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
+    """A source's line, and what is wrong with its clock."""
+    paint = {"holds": colour.green, "refused": colour.yellow}.get(source.state, str)
+    delay, behind = source.delay_us, source.clock_behind_ms
+    words = {"holds": "holds the brake", "refused": "refused", "stale": f"silent for {source.silent_ms * 1e-3:.1f} s"}
+    parts = [
+        paint(words.get(source.state, source.state)),
+        f"delay {delay.p50 * 1e-3:.1f} ms (p50) {delay.p99 * 1e-3:.1f} ms (p99)",
+        f"jitter {source.jitter_us * 1e-3:.1f} ms",
+        f"{source.lost} lost",
+        "clock not known yet" if behind is None else f"clock {_clock(behind)}",
+    ]
+    if source.clock is not None:
+        parts[-1] += f", {source.clock.drift_ppm:+.0f} ppm"
+    if source.restarts:
+        parts.append(f"{source.restarts} restarts")
+    return [f"source    {name!r}: {', '.join(parts)}", *_explained(source.cause, source.remedy, colour.yellow)]
+
+
+def _clock(behind_ms: float) -> str:
+    return f"{abs(behind_ms):.1f} ms {'behind' if behind_ms >= 0.0 else 'ahead'}"
+
+
+def _way(way: WayReport | None, colour: Colour) -> list[str]:
+    """From the stamp to the force, part by part; nothing before the first setpoint."""
+    if way is None or way.to_duty_us.max == 0.0:
+        return []
+    to_duty, total_ms = way.to_duty_us, way.total_ms
+    paint = colour.yellow if total_ms is not None and total_ms > way.budget_ms else str
+    parts = [
+        f"{paint(_number(total_ms, 'ms', 1))} of {way.budget_ms:g} ms",
+        f"stamp to duty {to_duty.p50 * 1e-3:.1f} ms (p50) {to_duty.p99 * 1e-3:.1f} ms (p99)",
+        f"device {_number(None if way.device_us is None else way.device_us * 1e-3, 'ms', 1)}",
+        f"carriages {_number(way.carriages_ms, 'ms', 1)}",
+    ]
+    lines = [f"way       {', '.join(parts)}"]
+    if total_ms is not None and total_ms > way.budget_ms:
+        shares = {
+            "from the stamp to the duty: look at the delay of the source": to_duty.p99 * 1e-3,
+            "at the device: look at the round trip in tormagctl firmware": (way.device_us or 0.0) * 1e-3,
+            "in the carriages: ask for slower changes, or look at the motors": way.carriages_ms or 0.0,
+        }
+        lines += _explained("the force comes too late", f"most is {max(shares, key=lambda part: shares[part])}", str)
+    return lines
 
 
 def _codes(codes: Sequence[str], details: Sequence[Explained], label: str, paint: Callable[[str], str]) -> list[str]:

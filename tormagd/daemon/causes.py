@@ -60,10 +60,14 @@ class Causes:
         """Each fault with its cause and remedy."""
         return explanations(faults, FAULTS, self._told)
 
-    def of_limits(self, limits: Iterable[str], replaced: str) -> tuple[Explained, ...]:
-        """Each limit with its cause and remedy; `replaced` says what the model was not asked."""
+    def of_limits(
+        self, limits: Iterable[str], replaced: str, of_sources: Mapping[Limit, Explanation]
+    ) -> tuple[Explained, ...]:
+        """Each limit with its cause and remedy; `replaced` says what the model was not asked, `of_sources` what is
+        known of those that publish."""
         told = {Limit.HOST_STALL: f"{self._stall}; the gap was held until the device answered"}
-        return explanations(limits, LIMITS, told | {Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}"})
+        told |= {Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}"}
+        return explanations(limits, {**LIMITS, **of_sources}, told)
 
     def newest_stall(self) -> StallReport | None:
         """The newest stall, None while there was none."""

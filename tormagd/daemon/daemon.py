@@ -41,7 +41,7 @@ class Daemon:
         self._callbacks = Callbacks(self._loop)
         self._causes = Causes(config.device)
         self._connection = Connection(config.device, open_backend, self._lose_link)
-        self._endpoint = Endpoint(config.endpoints, priority_of_threads())
+        self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources.priority)
         rates = config.rates
         self._control = ControlLoop(core.stepper, self._connection, NS // rates.control_hz)
         self._inference = InferenceLoop(

@@ -50,14 +50,15 @@ log = logging.getLogger(__name__)
 
 class Endpoint:
     """The daemon's sockets. With an `io_priority` above 0, ZeroMQ's own threads run at this priority of SCHED_FIFO.
+    `priority` is the inbox's.
 
     Raises OSError naming the endpoint that cannot be bound, and why: another daemon has it, say.
     """
 
-    def __init__(self, endpoints: Endpoints, io_priority: int = 0) -> None:
+    def __init__(self, endpoints: Endpoints, io_priority: int = 0, priority: tuple[str, ...] = ()) -> None:
         self._context = context(io_priority)
         self._files: list[SocketFile] = []
-        self.inbox = SetpointInbox()
+        self.inbox = SetpointInbox(priority)
         try:
             self._setpoints = self._bind(zmq.SUB, "setpoint", endpoints.setpoint)
             self._telemetry = self._bind(zmq.PUB, "telemetry", endpoints.telemetry)
@@ -75,7 +76,7 @@ class Endpoint:
         """The descriptor that becomes readable when setpoints may have arrived (edge-triggered: drain them)."""
         return self._setpoints.fileno()
 
-    def drain_setpoints(self, now_s: float) -> bool:
+    def drain_setpoints(self) -> bool:
         """Reads what has arrived, at most DRAIN messages; True if there is a newer setpoint."""
         is_newer = False
         for _ in range(DRAIN):
@@ -84,7 +85,8 @@ class Endpoint:
             except zmq.Again:
                 return is_newer
             data = parts[0] if len(parts) == 1 else b""
-            is_newer = self.inbox.take(data, now_s, time.time_ns()) or is_newer
+            # both clocks at once, for each message: how they part says which clock was set, and a drain may be held up
+            is_newer = self.inbox.take(data, time.monotonic(), time.time_ns()) or is_newer
         return is_newer
 
     def publish(self, telemetry: Telemetry) -> None:

@@ -1,69 +1,132 @@
-"""The inbox: which of the setpoints that several publishers sent is the one to plan for."""
+"""The inbox: which of the setpoints that several publishers sent is the one to plan for.
+
+Each message goes through three judgements, a module each: is it newer than what its source sent before (`sequence`),
+how old is it by a clock that may be wrong (`source_clock`), and does its source hold the brake (`hold`)?
+"""
+
+import shlex
+from collections import deque
 
 from tormagd.control.governor import TimedSetpoint
-from tormagd.messages import MessageError, Setpoint, SetpointReport, decode
+from tormagd.daemon.hold import Hold, is_passed
+from tormagd.daemon.rate_group import HORIZON_NS, Histogram
+from tormagd.daemon.sequence import Order, Sequence
+from tormagd.daemon.source_clock import AHEAD_S, SourceClock
+from tormagd.messages import ClockReport, MessageError, Setpoint, SetpointReport, SourceReport, decode
+from tormagd.safety.codes import Explanation, Limit
+from tormagd.safety.operating_state import RefusedError
 
 SOURCES = 16
 "Publishers that are kept apart; another one is refused until an old one has been silent."
 SILENT_S = 1.0
-"A source that was silent this long may start again at any sequence number."
-AHEAD_S = 0.05
-"A stamp may be this far ahead of our clock."
+"A source that was silent this long makes room for another; one that was refused is named for so long."
 LONGEST_REFUSAL = 200
 "Characters kept of the last refusal."
+REPORTED = 6
+"Sources that are reported in full, the newest ones: an answer has to stay under its limit."
+MOST_DRIFT_PPM = 100.0
+"A clock that drifts faster than quartz does is named."
+NEWS, NEWS_S = 4, 1.0
+"Lines for the log that wait, and how long each waits after the one before."
+STEP_NAMED_S = 60.0
+"A clock that was set is named for so long."
+HORIZON_S = HORIZON_NS * 1e-9
 
 
 class _Source:
-    __slots__ = ("heard_s", "newest", "seq")
+    """What is known of one publisher."""
 
-    def __init__(self, newest: Setpoint, heard_s: float) -> None:
-        self.newest, self.seq, self.heard_s = newest, newest.seq, heard_s
+    __slots__ = (
+        "accepted",
+        "cause",
+        "clock",
+        "delays",
+        "fit",
+        "heard_s",
+        "refused",
+        "remedy",
+        "sequence",
+        "setpoint",
+        "stamp_s",
+        "summary",
+        "turned_s",
+    )
+
+    def __init__(self, setpoint: Setpoint, now_s: float) -> None:
+        self.setpoint, self.stamp_s, self.heard_s, self.turned_s = setpoint, now_s, now_s, now_s
+        self.sequence = Sequence(setpoint.session, setpoint.seq)
+        self.clock = SourceClock()
+        self.delays = Histogram()
+        self.accepted = self.refused = 0
+        self.refresh(now_s)
+
+    def refresh(self, now_s: float) -> None:
+        self.fit, self.summary = self.clock.fit(), self.delays.summary()
+        self.cause, self.remedy = _of_clock(self.clock, None if self.fit is None else self.fit.drift_ppm, now_s)
+
+    def is_stale(self, now_s: float) -> bool:
+        return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
+
+    def keep(self, setpoint: Setpoint, now_s: float, delay_s: float) -> None:
+        if now_s - self.turned_s > HORIZON_S:
+            self.delays.turn()
+            self.turned_s = now_s
+        if self.clock.is_settled:
+            self.delays.add(delay_s * 1e6)
+        # the worse of arrival and corrected stamp: a stamp of the time to come is of now
+        self.setpoint, self.heard_s, self.stamp_s = setpoint, now_s, now_s - max(delay_s, 0.0)
 
 
 class SetpointInbox:
-    """Chooses among what the publishers sent: the newest valid setpoint. No sockets, no clock."""
+    """Chooses among what the publishers sent: the newest valid setpoint of the source that holds the brake.
 
-    def __init__(self) -> None:
+    No sockets, no clock. `priority` names sources, the one that goes before all others first.
+    """
+
+    def __init__(self, priority: tuple[str, ...] = ()) -> None:
         self.accepted = 0
         self.refused = 0
         self.dropped = 0
         self.oversize = 0
         self.last_refusal: str | None = None
         self.newest: TimedSetpoint | None = None
-        self._newest_source = ""
+        self.hold = Hold()
+        self._priority = priority
         self._sources: dict[str, _Source] = {}
+        self._other, self._other_s = "", -SILENT_S
+        "The source that was refused last, because another holds the brake, and when."
+        self._news: deque[str] = deque(maxlen=NEWS)
+        self._told_s = -NEWS_S
+        self._turn = 0
 
     def take(self, data: bytes, now_s: float, realtime_ns: int) -> bool:
         """Takes one message; True if it became the newest setpoint. `now_s` is the control clock."""
         try:
             setpoint = decode(data, Setpoint)
-            self._admit(setpoint, now_s, realtime_ns)
+            return self._judge(setpoint, now_s, (realtime_ns - setpoint.stamp_ns) * 1e-9)
         except MessageError as error:
             self.refused += 1
             self.last_refusal = str(error)[:LONGEST_REFUSAL]
             return False
-        known = self._sources.get(setpoint.source)
-        if known is not None and setpoint.seq <= known.seq and now_s - known.heard_s < SILENT_S:
-            self.dropped += 1
-            return False
-        self._sources[setpoint.source] = _Source(setpoint, now_s)
-        self.accepted += 1
-        # Both on the control clock, which no setting of the time moves. Of one publisher `seq` alone says what is
-        # newer: when its own clock was set back, its setpoints are older than they were, not out of order.
-        stamp_s = now_s - (realtime_ns - setpoint.stamp_ns) * 1e-9
-        if self.newest is not None and setpoint.source != self._newest_source and stamp_s < self.newest.stamp_s:
-            return False
-        self._newest_source = setpoint.source
-        self.newest = TimedSetpoint(
-            force_N=setpoint.servo_cf,
-            stamp_s=stamp_s,
-            valid_for_s=setpoint.valid_for_ms * 1e-3,
-            displacement_mm=setpoint.displacement_mm,
-            rate_mm_s=setpoint.rate_mm_s,
-            preview_N=setpoint.preview_N or (),
-            preview_dt_s=(setpoint.preview_dt_ms or 0.0) * 1e-3,
-        )
-        return True
+
+    def give(self, name: str, now_s: float) -> None:
+        """Gives the brake to a source on purpose. Raises RefusedError where it has sent nothing that is still valid."""
+        source = self._sources.get(name)
+        if source is None:
+            known = ", ".join(sorted(self._sources)) or "none"
+            raise RefusedError("unknown_source", f"no source {name!r} has sent setpoints", f"known: {known}"[:200])
+        if source.is_stale(now_s):
+            silent_ms = (now_s - source.stamp_s) * 1e3
+            raise RefusedError(
+                "source_stale",
+                f"the newest setpoint of {name!r} is {silent_ms:.0f} ms old",
+                "let its publisher send, then take again",
+            )
+        if name == self.hold.source:
+            self.hold = self.hold._replace(is_given=True)
+            return
+        self._pass(name, "an operator's choice", is_given=True)
+        self.newest = self._timed(source, now_s)
 
     def withdraw(self, reason: str) -> None:
         """Forgets the newest setpoint: nothing can be planned for it. It counts as refused, too."""
@@ -72,26 +135,188 @@ class SetpointInbox:
             self.refused += 1
             self.last_refusal = reason[:LONGEST_REFUSAL]
 
-    def report(self) -> SetpointReport:
-        """Counters, the last refusal, and each source with its newest sequence number."""
+    def news(self, now_s: float) -> str | None:
+        """A line for the log, where there is one: who holds the brake now, whose clock is wrong. At most one in
+        NEWS_S."""
+        if not self._news or now_s - self._told_s < NEWS_S:
+            return None
+        self._told_s = now_s
+        return self._news.popleft()
+
+    def told(self, now_s: float) -> dict[Limit, Explanation]:
+        """What is known now of the limits that are about sources."""
+        holder = self._sources.get(self.hold.source)
+        if holder is None:
+            return {}
+        return {Limit.STALE: self._why_stale(holder, now_s), Limit.OTHER_SOURCE: self._why_other(holder, now_s)}
+
+    def refresh(self, now_s: float) -> None:
+        """Makes the figures of one source anew, for `report`: of each in turn."""
+        if self._sources:
+            self._turn += 1
+            name = tuple(self._sources)[self._turn % len(self._sources)]
+            source = self._sources[name]
+            was_wrong = bool(source.cause)
+            source.refresh(now_s)
+            if source.cause and not was_wrong:
+                self._news.append(f"source {name!r}: {source.cause}: {source.remedy}")
+
+    def report(self, now_s: float) -> SetpointReport:
+        """Counters, the last refusal, and each source with its newest sequence number; the newest ones in full."""
+        newest = sorted(self._sources, key=lambda name: (name != self.hold.source, -self._sources[name].heard_s))
         return SetpointReport(
             accepted=self.accepted,
             refused=self.refused,
             dropped=self.dropped,
             oversize=self.oversize,
             last_refusal=self.last_refusal,
-            newest_source=self._newest_source,
-            sources={name: source.seq for name, source in self._sources.items()},
+            newest_source=self.hold.source,
+            sources={name: source.sequence.seq for name, source in self._sources.items()},
+            by_source={name: self._source_report(name, now_s) for name in newest[:REPORTED]},
         )
 
-    def _admit(self, setpoint: Setpoint, now_s: float, realtime_ns: int) -> None:
-        ahead_s = (setpoint.stamp_ns - realtime_ns) * 1e-9
-        if ahead_s > AHEAD_S:
+    def _judge(self, setpoint: Setpoint, now_s: float, lateness_s: float) -> bool:
+        source, order = self._sources.get(setpoint.source), Order.NEWER
+        if source is None:
+            self._make_room(setpoint.source, now_s)
+            source = self._sources[setpoint.source] = _Source(setpoint, now_s)
+        else:
+            is_over = source.is_stale(now_s)
+            order = source.sequence.order(now_s, setpoint.session, setpoint.seq, is_over=is_over)
+            if order is Order.STRAY:
+                self.dropped += 1
+                return False
+        delay_s = source.clock.hear(now_s, lateness_s, is_continued=order is not Order.REPLACED)
+        if delay_s < -AHEAD_S:
             raise MessageError(
-                f"stamp_ns is {ahead_s * 1e3:.0f} ms ahead of this clock: allowed is {AHEAD_S * 1e3:.0f} ms"
+                f"stamp_ns is {-delay_s * 1e3:.0f} ms ahead of this clock: allowed is {AHEAD_S * 1e3:.0f} ms, "
+                "until the clock of its source has shown itself"
             )
-        if setpoint.source not in self._sources and len(self._sources) >= SOURCES:
-            silent = [name for name, source in self._sources.items() if now_s - source.heard_s > SILENT_S]
-            if not silent:
-                raise MessageError(f"source = {setpoint.source!r}: allowed are {SOURCES} publishers at a time")
-            del self._sources[silent[0]]
+        source.keep(setpoint, now_s, delay_s)
+        hold = self.hold
+        if source.setpoint.source != hold.source:
+            is_free = self.newest is None or now_s - self.newest.stamp_s > self.newest.valid_for_s
+            if hold.source and (
+                source.is_stale(now_s) or not is_passed(hold, setpoint.source, self._priority, is_stale=is_free)
+            ):
+                self._other, self._other_s = setpoint.source, now_s
+                source.refused += 1
+                self.refused += 1
+                return False
+            self._pass(setpoint.source, "that is stale" if is_free else "it goes before that")
+        elif order is not Order.NEWER:
+            self.hold = hold.restarted()
+        source.accepted += 1
+        self.accepted += 1
+        self.newest = self._timed(source, now_s)
+        return True
+
+    def _pass(self, name: str, why: str, *, is_given: bool = False) -> None:
+        if self.hold.source:
+            self._news.append(f"source {name!r} holds the brake instead of {self.hold.source!r}: {why}")
+        self.hold = self.hold.passed_to(name, is_given=is_given)
+        if self._other == name:
+            self._other_s = -SILENT_S
+
+    def _timed(self, source: _Source, now_s: float) -> TimedSetpoint:
+        """The source's newest setpoint, on the control clock, which no setting of the time moves."""
+        setpoint = source.setpoint
+        return TimedSetpoint(
+            setpoint.servo_cf,
+            source.stamp_s,
+            setpoint.valid_for_ms * 1e-3,
+            setpoint.displacement_mm,
+            setpoint.rate_mm_s,
+            setpoint.preview_N or (),
+            (setpoint.preview_dt_ms or 0.0) * 1e-3,
+            self.hold.number,
+            now_s - self._other_s < SILENT_S or source.sequence.is_doubled(now_s),
+        )
+
+    def _make_room(self, name: str, now_s: float) -> None:
+        if len(self._sources) < SOURCES:
+            return
+        others = [other for other in self._sources if other != self.hold.source]
+        oldest = min(others, key=lambda other: self._sources[other].heard_s)
+        if now_s - self._sources[oldest].heard_s <= SILENT_S:
+            unlisted = [other for other in others if other not in self._priority]
+            if name not in self._priority or not unlisted:
+                raise MessageError(f"source = {name!r}: allowed are {SOURCES} publishers at a time")
+            oldest = min(unlisted, key=lambda other: self._sources[other].heard_s)
+        del self._sources[oldest]
+
+    def _why_stale(self, holder: _Source, now_s: float) -> Explanation:
+        name, silent_ms = self.hold.source, (now_s - holder.heard_s) * 1e3
+        valid_ms = holder.setpoint.valid_for_ms
+        if silent_ms > valid_ms:
+            return Explanation(
+                f"{name!r} has sent nothing for {silent_ms:.0f} ms, and its setpoints are valid for {valid_ms:g} ms; "
+                "the force decays to F_min",
+                "check the publisher and the network",
+            )
+        late_ms = (holder.heard_s - holder.stamp_s) * 1e3
+        return Explanation(
+            f"setpoints of {name!r} come {late_ms:.0f} ms late, and are valid for {valid_ms:g} ms; the force decays to "
+            "F_min",
+            "look for a queue in the network; if its clock was set while it paused, start the publisher again",
+        )
+
+    def _why_other(self, holder: _Source, now_s: float) -> Explanation:
+        if holder.sequence.is_doubled(now_s):
+            return Explanation(
+                f"two publishers call themselves {self.hold.source!r}, or one repeats itself: one of them is followed",
+                "end one of them, or let it use another `source`",
+            )
+        return Explanation(
+            f"{self._other!r} sends setpoints too, and {self.hold.source!r} holds the brake",
+            f"end the other one, or give it the brake: tormagctl take {shlex.quote(self._other)}",
+        )
+
+    def _source_report(self, name: str, now_s: float) -> SourceReport:
+        source = self._sources[name]
+        clock, sequence = source.clock, source.sequence
+        if name == self.hold.source:
+            state = "stale" if source.is_stale(now_s) else "holds"
+        else:
+            state = "stale" if source.is_stale(now_s) else "refused"
+        fit = source.fit
+        return SourceReport(
+            state=state,
+            silent_ms=round((now_s - source.heard_s) * 1e3, 1),
+            session=sequence.session,
+            seq=sequence.seq,
+            accepted=source.accepted,
+            refused=source.refused,
+            lost=sequence.lost,
+            restarts=sequence.restarts,
+            delay_us=source.summary,
+            jitter_us=round(clock.jitter_s * 1e6, 1),
+            clock_behind_ms=round(clock.offset_s * 1e3, 3) if clock.is_settled else None,
+            clock_steps=clock.steps,
+            clock=None
+            if fit is None
+            else ClockReport(
+                round(fit.offset_s, 6), round(fit.drift_ppm, 2), round(fit.residual_us, 1), fit.windows, fit.outliers
+            ),
+            cause=source.cause,
+            remedy=source.remedy,
+        )
+
+
+def _of_clock(clock: SourceClock, drift_ppm: float | None, now_s: float) -> tuple[str, str]:
+    """What is wrong with a publisher's clock, and what to do; empty where nothing is."""
+    if not clock.is_settled:
+        return "its stamps are far from this machine's clock: it is watched which of the two it is", "wait a moment"
+    causes = []
+    if clock.is_wrong:
+        side = "behind" if clock.offset_s > 0.0 else "ahead of"
+        or_way = " (or its way takes that long)" if clock.offset_s > 0.0 and not clock.steps else ""
+        causes.append(f"it is {abs(clock.offset_s):.3f} s {side} this machine's{or_way}, and is corrected")
+    if now_s - clock.stepped_at_s < STEP_NAMED_S:
+        way, often = "forward" if clock.stepped_s > 0.0 else "back", f", the last of {clock.steps} times"
+        causes.append(f"it was set {way} by {abs(clock.stepped_s):.3f} s{often if clock.steps > 1 else ''}")
+    if drift_ppm is not None and abs(drift_ppm) > MOST_DRIFT_PPM:
+        causes.append(f"it runs {abs(drift_ppm):.0f} ppm {'fast' if drift_ppm > 0.0 else 'slow'}")
+    if not causes:
+        return "", ""
+    return f"its clock: {'; '.join(causes)}", "keep the clocks of both machines by chrony or ptp4l"

@@ -48,7 +48,7 @@ class InferenceLoop:
             # not even reading: the tick would wait for that, and the plan come no sooner. The descriptor stays
             # readable, so this is asked again and again until the tick: at 500 setpoints a second 1 % of the time
             self._waiting_ns = self._waiting_ns or start_ns
-        elif self._endpoint.drain_setpoints(start_ns * 1e-9):
+        elif self._endpoint.drain_setpoints():
             self._plan(estimate, start_ns)
             self._learn_slack(start_ns)
 
@@ -56,7 +56,7 @@ class InferenceLoop:
         """Plans if a setpoint is waiting or a plan is due; called in the slack after a control tick."""
         now_ns = self._clock_ns()
         # reading here too makes the edge-triggered descriptor harmless: nothing waits longer than a tick
-        if self._endpoint.drain_setpoints(now_ns * 1e-9):
+        if self._endpoint.drain_setpoints():
             self._plan(estimate, self._waiting_ns or now_ns)
             self._learn_slack(now_ns)
         elif now_ns >= self._due_ns:

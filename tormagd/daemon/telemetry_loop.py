@@ -21,10 +21,11 @@ from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.rate_group import ERROR_PERIODS, RateGroup
 from tormagd.daemon.telemetry import snapshot, tick_record
+from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.link import LinkState
 from tormagd.messages import DeviceReport, Request, Status, Telemetry, TickRecord
-from tormagd.safety.operating_state import Conditions
+from tormagd.safety.operating_state import Conditions, RefusedError
 
 NS = 1_000_000_000
 MOST_TICKS = 100
@@ -61,6 +62,7 @@ class TelemetryLoop:
         self._groups = (control.timing, inference.timing, self.timing)
         self._started_s = time.monotonic()
         self._ticks: list[TickRecord] = []
+        self._way = Way()
         self._status: dict[str, Any] | None = None
 
     def record(self, used: PlanState) -> None:
@@ -68,6 +70,7 @@ class TelemetryLoop:
         control = self._control
         if control.output is None:
             return
+        self._way.ticked(control.state, used)
         timing = control.timing
         self._ticks.append(
             tick_record(
@@ -89,7 +92,7 @@ class TelemetryLoop:
         self._endpoint.publish(snapshot_)
         self._endpoint.publish_ticks(self._ticks[-MOST_TICKS:])
         self._ticks.clear()
-        self._groups[self.timing.runs % len(self._groups)].refresh()  # one a period: none costs the loop much
+        self._refresh(start_ns * 1e-9)
         self._status = None
         self._endpoint.serve(
             start_ns * 1e-9,
@@ -99,6 +102,7 @@ class TelemetryLoop:
         if self._is_alive(start_ns * 1e-9):
             notify.notify("WATCHDOG=1")
         self._report_late_ticks()
+        self._report_sources(start_ns * 1e-9)
         self.timing.record(due_ns, start_ns, time.monotonic_ns())
 
     def conditions(self) -> Conditions:
@@ -143,19 +147,45 @@ class TelemetryLoop:
             is_stall = news.worst.took_ns > ERROR_PERIODS * self._control.timing.period_ns
             log.log(logging.ERROR if is_stall else logging.WARNING, "%s", news)
 
+    def _refresh(self, now_s: float) -> None:
+        """Makes one report anew: all of them at once would make a tick wait."""
+        turn = self.timing.runs % (len(self._groups) + 2)
+        if turn < len(self._groups):
+            self._groups[turn].refresh()
+        elif turn == len(self._groups):
+            self._way.refresh()
+        else:
+            self._endpoint.inbox.refresh(now_s)
+
+    def _report_sources(self, now_s: float) -> None:
+        news = self._endpoint.inbox.news(now_s)
+        if news is not None:
+            log.warning("%s", news)
+
     def _answer(self, request: Request, newest: Telemetry) -> dict[str, Any]:
         if request.command == "status":
             # built once for everybody who asks in this period
             if self._status is None:
                 self._status = msgspec.to_builtins(self._build_status(newest))
             return self._status
-        self._control.command(request.command, self.conditions())
         self._status = None
+        if request.command == "take":
+            return self._give(request.args.get("source"))
+        self._control.command(request.command, self.conditions())
         return {
             "operating_state": str(self._control.state.safety.operating_state),
             # without a device nothing moves yet: a request to open is kept for it, and no other is taken
             "is_connected": self._connection.measurement is not None,
         }
+
+    def _give(self, source: object) -> dict[str, Any]:
+        if not isinstance(source, str):
+            raise RefusedError("bad_source", "args.source is no text", "tormagctl take SOURCE")
+        inbox = self._endpoint.inbox
+        before = inbox.hold.source
+        inbox.give(source, time.monotonic())
+        log.info("take: %r", source)
+        return {"source": source, "instead_of": before}
 
     def _least_N(self) -> float:
         """F_min of this device, as far as it has shown itself."""
@@ -170,6 +200,7 @@ class TelemetryLoop:
             "is_busy": self.is_busy(),
             "faults": safety.faults,
         }
+        now_s, inbox, link = time.monotonic(), self._endpoint.inbox, self._connection.report()
         outside = ", ".join(f"{it.quantity} {it.asked:.4g} asked, {it.used:.4g} used" for it in plan.outside)
         return Status(
             **known,
@@ -189,12 +220,13 @@ class TelemetryLoop:
                 sensor_zero_sd_N=round(planned.shown.zero.sd_N(time.monotonic()), 4),
             ),
             least_gap_mm=round(plan.least_gap_mm, 2),
-            link=self._connection.report(),
-            setpoints=self._endpoint.inbox.report(),
+            link=link,
+            setpoints=inbox.report(now_s),
             rates={group.name: group.report for group in self._groups},
             late_ticks_by=dict(self._callbacks.blamed),
             fault_details=self._causes.of_faults(safety.faults),
-            limit_details=self._causes.of_limits(newest.limits, outside),
+            limit_details=self._causes.of_limits(newest.limits, outside, inbox.told(now_s)),
             newest_stall=self._causes.newest_stall(),
             not_granted=self._not_granted,
+            way=self._way.report(None if link.round_trip_us is None else link.round_trip_us.p50),
         )

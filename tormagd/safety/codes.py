@@ -45,6 +45,8 @@ class Limit(StrEnum):
 
     NO_SETPOINT = "NO_SETPOINT"
     STALE = "STALE"
+    OTHER_SOURCE = "OTHER_SOURCE"
+    TAKEOVER = "TAKEOVER"
     RANGE = "RANGE"
     F_MIN = "F_MIN"
     F_MAX = "F_MAX"
@@ -134,6 +136,13 @@ LIMITS: dict[Limit, Explanation] = {
     Limit.NO_SETPOINT: Explanation("no publisher has sent a setpoint", "start the patient-side robot's publisher"),
     Limit.STALE: Explanation(
         "the newest setpoint is older than its valid_for_ms; the force decays to F_min", "check the publisher"
+    ),
+    Limit.OTHER_SOURCE: Explanation(
+        "another source sends setpoints too, and does not hold the brake",
+        "end it, or give it the brake: tormagctl take SOURCE",
+    ),
+    Limit.TAKEOVER: Explanation(
+        "the brake has passed to another publisher; the force goes to what it asks for along a ramp", "wait a moment"
     ),
     Limit.RANGE: Explanation("the setpoint is outside the scene's range", "ask within the range, or change the scene"),
     Limit.F_MIN: Explanation("less force was asked for than the open gap gives", "an insert with less iron goes lower"),

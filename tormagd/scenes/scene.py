@@ -26,6 +26,10 @@ class Force(Strict, frozen=True):
     resolution_N: Annotated[float, Meta(gt=0.0, le=100.0)]
     tolerance_rms_N: Annotated[float, Meta(gt=0.0, le=100.0)]
     least_variance_accounted_for: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    release_N_s: Annotated[float, Meta(gt=0.0, le=100.0)] = 2.0
+    "How fast the force is let go when its publisher is gone, and how fast it goes to another publisher's."
+    most_release_N_s: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 20.0
+    "How fast it may be lost at most, whatever fails. A device that opens faster than that is refused."
 
 
 class Bandwidth(Strict, frozen=True):
@@ -77,6 +81,7 @@ class Scene(Strict, frozen=True):
 
     def __post_init__(self) -> None:
         pairs = (
+            ("force.release_N_s", self.force.release_N_s, "force.most_release_N_s", self.force.most_release_N_s),
             ("force.least_N", self.force.least_N, "force.most_N", self.force.most_N),
             ("insert.gap_closed_mm", self.insert.gap_closed_mm, "insert.gap_open_mm", self.insert.gap_open_mm),
             (

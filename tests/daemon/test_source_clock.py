@@ -1,0 +1,205 @@
+"""A publisher's clock: whatever it does, its setpoints are as old as they are, and what it does is said.
+
+Here the truth is known: when each message was sent, and how long it was on the way.
+"""
+
+import math
+import random
+from collections.abc import Callable
+from itertools import pairwise
+from typing import NamedTuple
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tormagd.daemon.source_clock import (
+    AHEAD_S,
+    DRIFT,
+    FORGOTTEN_S,
+    MOST_WAY_S,
+    SETTLED_S,
+    SourceClock,
+)
+
+PERIOD_S = 0.01
+JITTER_S = 0.002
+
+
+class Heard(NamedTuple):
+    """One message: when it was sent, how long it was on the way, and how long it is believed to have been."""
+
+    sent_s: float
+    way_s: float
+    believed_s: float
+
+
+def exponential(seed: int, least_s: float = 0.001, mean_s: float = JITTER_S) -> Callable[[float], float]:
+    noise = random.Random(seed)
+    return lambda sent_s: least_s + noise.expovariate(1.0 / mean_s)
+
+
+def listen(
+    clock_s: Callable[[float], float],
+    way_s: Callable[[float], float],
+    lasts_s: float = 10.0,
+    period_s: float = PERIOD_S,
+    lost: Callable[[int], bool] = lambda number: False,
+) -> tuple[SourceClock, list[Heard]]:
+    """A stream whose clock shows `clock_s` at a time, in order of arrival, which is that of sending."""
+    clock, heard, last_s = SourceClock(), [], -math.inf
+    for number in range(round(lasts_s / period_s)):
+        if lost(number):
+            continue
+        sent_s = number * period_s
+        # nobody overtakes: who would be there before the one before comes with it
+        last_s = max(last_s, sent_s + way_s(sent_s))
+        believed_s = clock.hear(last_s, last_s - clock_s(sent_s))
+        heard.append(Heard(sent_s, last_s - sent_s, believed_s))
+    return clock, heard
+
+
+def worst_error_s(heard: list[Heard], from_s: float) -> float:
+    return max(abs(each.believed_s - each.way_s) for each in heard if each.sent_s >= from_s)
+
+
+CLOCKS: dict[str, tuple[Callable[[float], float], float]] = {
+    "right": (lambda t: t, 0.0),
+    "1 s behind": (lambda t: t - 1.0, 1.0),
+    "1 s ahead": (lambda t: t + 1.0, -1.0),
+    "since 1970": (lambda t: t - 1.8e9, 1.8e9),
+    "set back by 1 s": (lambda t: t - 1.0 * (t > 4.0), 1.0),
+    "set forward by 1 s": (lambda t: t + 1.0 * (t > 4.0), -1.0),
+    "set back by 60 ms": (lambda t: t - 0.06 * (t > 4.0), 0.06),
+    "set to and fro": (lambda t: t + (t > 3.0) - 2.0 * (t > 6.0), 1.0),
+    "1 s behind, 200 ppm fast": (lambda t: t * (1.0 + 200e-6) - 1.0, 0.998),
+    "200 ppm slow": (lambda t: t * (1.0 - 200e-6), 0.002),
+}
+
+
+@pytest.mark.parametrize("name", CLOCKS)
+def test_the_delay_is_believed_to_be_what_it_is_whatever_the_clock_shows(name: str) -> None:
+    clock_s, behind_s = CLOCKS[name]
+    clock, heard = listen(clock_s, exponential(1))
+    # the constant part of the way goes with the clock where that is wrong; and a clock that is set hides the jitter of
+    # that moment
+    assert worst_error_s(heard, SETTLED_S + PERIOD_S) <= 0.001 + 5.0 * JITTER_S
+    assert clock.is_settled
+    assert clock.offset_s == pytest.approx(behind_s, abs=0.001 + 5.0 * JITTER_S)
+    assert clock.is_wrong == (abs(behind_s) > AHEAD_S)
+
+
+@pytest.mark.parametrize("drift_ppm", [200.0, -200.0, 0.0])
+def test_a_drifting_clock_is_followed_for_an_hour_and_its_drift_told(drift_ppm: float) -> None:
+    clock, heard = listen(lambda t: t * (1.0 + drift_ppm * 1e-6), exponential(2), 3_600.0, period_s=0.1)
+    assert worst_error_s(heard, 1.0) < 0.006
+    assert clock.steps == 0
+    fit = clock.fit()
+    assert fit is not None
+    # one message in ten of the half second's five comes without a queue
+    assert fit.drift_ppm == pytest.approx(drift_ppm, abs=40.0)
+
+
+def test_a_step_is_counted_with_its_size() -> None:
+    clock, _ = listen(lambda t: t - 1.0 * (t > 4.0), exponential(3))
+    assert (clock.steps, clock.stepped_s) == (1, pytest.approx(-1.0, abs=PERIOD_S))
+    clock, _ = listen(lambda t: t + 1.0 * (t > 4.0), exponential(3))
+    assert (clock.steps, clock.stepped_s) == (1, pytest.approx(1.0, abs=5.0 * JITTER_S))
+
+
+def test_a_way_that_becomes_longer_is_no_clock() -> None:
+    """A queue of 0.4 s that fills and stays: what is on the way is old, and no patience makes it young."""
+    clock, heard = listen(lambda t: t - 1.0, lambda t: 0.001 + (0.4 if 4.0 < t < 40.0 else 0.0), 44.0)
+    assert clock.steps == 0
+    assert worst_error_s(heard, 1.0) <= 0.001 + DRIFT * 37.0
+    assert heard[-1].believed_s < 0.001
+
+
+def test_a_backlog_is_as_old_as_it_is() -> None:
+    """The link stood still for a second; then everything comes at once."""
+    _, heard = listen(lambda t: t, lambda t: 0.001 + (5.0 - t if 4.0 < t < 5.0 else 0.0))
+    assert worst_error_s(heard, 0.0) < 1.1 * DRIFT
+
+
+@pytest.mark.parametrize("behind_s", [0.0, 1.0])
+def test_a_backlog_at_first_contact_is_not_taken_for_a_clock(behind_s: float) -> None:
+    """What is heard first was sent 0.8 s ago."""
+    clock, heard = listen(lambda t: t - behind_s, lambda t: max(0.8 - t, 0.0) + 0.001)
+    assert clock.offset_s == pytest.approx(behind_s, abs=0.002)
+    assert worst_error_s(heard, 0.81 + SETTLED_S) < 0.0011
+
+
+def test_a_constant_way_is_believed_while_a_way_may_be_so_long() -> None:
+    for way_s, believed_s in ((0.0, 0.0), (0.08, 0.08), (MOST_WAY_S, MOST_WAY_S), (0.5, 0.0)):
+        clock, heard = listen(lambda t: t, lambda t, way_s=way_s: way_s, 60.0)  # type: ignore[misc]
+        assert heard[-1].believed_s == pytest.approx(believed_s, abs=1e-5)
+        assert clock.is_wrong == (way_s > MOST_WAY_S)
+
+
+def test_until_it_is_settled_a_message_is_as_old_as_it_says() -> None:
+    for lateness_s in (1.0, -1.0):
+        clock = SourceClock()
+        assert clock.hear(0.0, lateness_s) == lateness_s
+        assert clock.hear(SETTLED_S - 0.01, lateness_s) == lateness_s
+        assert not clock.is_settled
+        assert clock.hear(SETTLED_S, lateness_s) == 0.0
+        assert clock.is_settled
+
+
+def test_a_reader_that_is_held_up_blames_no_clock() -> None:
+    """What has waited for 30 ms is read at once; the messages are late, and no stamp has run back."""
+    clock = SourceClock()
+    for number in range(100):
+        now_s = number * 0.002
+        clock.hear(now_s, 0.001)
+    for number in range(100, 115):
+        late_s = 0.23 - number * 0.002
+        assert clock.hear(0.23 + number * 1e-6, late_s) == pytest.approx(late_s, abs=1e-4)
+    assert (clock.steps, clock.offset_s) == (0, pytest.approx(0.0, abs=1e-4))
+
+
+def test_after_a_long_silence_a_clock_may_have_been_set() -> None:
+    clock, _ = listen(lambda t: t, lambda t: 0.001)
+    later_s = 10.0 + FORGOTTEN_S + 1.0
+    assert clock.hear(later_s, 0.9) == 0.9
+    assert not clock.is_settled
+    clock.hear(later_s + SETTLED_S, 0.9)
+    assert clock.hear(later_s + 2.0 * SETTLED_S, 0.901) == pytest.approx(0.001, abs=1e-4)
+    # but a message that fits into what was known is believed at once
+    clock, _ = listen(lambda t: t, lambda t: 0.001)
+    assert clock.hear(later_s, 0.15) == pytest.approx(0.15, abs=1e-4)
+    assert clock.is_settled
+
+
+@given(
+    st.integers(0, 2**32),
+    st.floats(-5.0, 5.0),
+    st.floats(-200e-6, 200e-6),
+    st.floats(0.0, 0.02),
+    st.floats(0.0, 0.5),
+    st.lists(st.tuples(st.floats(1.0, 9.0), st.floats(-3.0, 3.0)), max_size=3),
+)
+def test_any_clock_any_jitter_any_losses(
+    seed: int, behind_s: float, drift: float, jitter_s: float, losses: float, steps: list[tuple[float, float]]
+) -> None:
+    """No delay is negative once the clock is settled, none is over what it was by more than the way shows, and the
+    error is no more than the way's constant part and its jitter, for each time that the clock was set."""
+    noise = random.Random(seed)
+    lost = {number for number in range(1_000) if noise.random() < losses}
+
+    def clock_s(sent_s: float) -> float:
+        return sent_s * (1.0 + drift) - behind_s + sum(by_s for at_s, by_s in steps if sent_s >= at_s)
+
+    way_s = exponential(seed, 0.001, jitter_s + 1e-6)
+    clock, heard = listen(clock_s, way_s, lost=lambda number: number in lost)
+    settled = [each for each in heard if each.sent_s > SETTLED_S + 1.0]
+    if not settled:
+        return
+    assert clock.is_settled
+    assert min(each.believed_s for each in settled) >= 0.0
+    longest_s = max(each.way_s for each in heard)
+    gap_s = max(b.sent_s + b.way_s - a.sent_s - a.way_s for a, b in pairwise(heard))
+    # a step back that is shorter than the pause in which it falls cannot be told from a longer way
+    # the rest: a plausible lateness at the start that was the clock's is kept as way
+    bound_s = longest_s + MOST_WAY_S + (1.0 + len(steps)) * (longest_s + gap_s + 0.005)
+    assert worst_error_s(settled, 0.0) <= bound_s

@@ -1,0 +1,36 @@
+"""Who holds the brake: one source at a time, until it is stale, gives way to one that goes before it, or is relieved.
+
+Pure: what is decided on is handed in.
+"""
+
+from typing import NamedTuple
+
+
+class Hold(NamedTuple):
+    """The source that holds the brake; "" before the first. `number` grows with every change of the publisher behind
+    it, so that the force goes from one to the other along a ramp. With `is_given`, an operator has chosen it."""
+
+    source: str = ""
+    number: int = 0
+    is_given: bool = False
+
+    def passed_to(self, source: str, *, is_given: bool = False) -> "Hold":
+        """The hold of this source, from another one; of the first ever, there is nobody to take over from."""
+        return Hold(source, self.number + 1 if self.source else self.number, is_given)
+
+    def restarted(self) -> "Hold":
+        """The same source's, behind which there is another process now."""
+        return self._replace(number=self.number + 1)
+
+
+def rank(source: str, priority: tuple[str, ...]) -> int:
+    """The place in the configured order; what is not listed comes after all that is."""
+    return priority.index(source) if source in priority else len(priority)
+
+
+def is_passed(hold: Hold, source: str, priority: tuple[str, ...], *, is_stale: bool) -> bool:
+    """Whether a message of another source makes it the holder. `is_stale`: the holder's newest setpoint is too old."""
+    if is_stale:
+        return True
+    # an operator's choice goes before the configured order
+    return not hold.is_given and rank(source, priority) < rank(hold.source, priority)

@@ -1,0 +1,151 @@
+"""A publisher's clock against ours, and how long its messages are on the way, from stamps and arrivals alone.
+
+One way tells a difference, not its parts: `lateness`, our time minus the stamp, is what the clock is behind plus what
+the way took. What parts them is that no message is there before it was sent, that one publisher's messages do not
+overtake each other, and that a clock drifts slowly. So the least lateness is an envelope, the sum of the clock's offset
+and of the constant part of the way; what is above it is delay, what moves it is the clock. A constant offset and a
+constant way stay one number without a round trip: what a way can take (MOST_WAY_S) counts as the way.
+
+No I/O and no clock: times are handed in.
+"""
+
+import math
+from typing import final
+
+from tormagd.hardware.link_statistics import ClockFit, DeviceClock
+
+MOST_WAY_S = 0.2
+"""A least lateness up to this is taken for the way: half of what the whole way from sensor to force may take. More is
+the clock."""
+AHEAD_S = 0.05
+"A stamp may be this far ahead before its clock has shown itself; a clock that is further off than this is wrong."
+SETTLED_S = 0.2
+"A new publisher's clock is believed to be wrong once its stamps have said so for this long: a backlog is drained."
+STEP_S = 0.005
+"Stamps of one publisher that run back by more than this prove that its clock was set back."
+DRIFT = 500e-6
+"No clock drifts faster, and no faster rise of the envelope is taken for drift."
+FORGOTTEN_S = 5.0
+"After a longer silence the clock may have been set by any amount."
+JITTER_SHARE = 1.0 / 16.0
+"Of each new difference, as in RFC 3550."
+
+
+@final
+class SourceClock:
+    """The clock of one publisher, fed with each of its messages, in the order in which they were sent."""
+
+    __slots__ = (
+        "_heard_s",
+        "_lateness_s",
+        "_leaked_s",
+        "_line",
+        "_settles_s",
+        "jitter_s",
+        "offset_s",
+        "stepped_at_s",
+        "stepped_s",
+        "steps",
+        "way_s",
+    )
+
+    def __init__(self) -> None:
+        self.offset_s = 0.0
+        "By how much the clock is behind ours, as far as it can be told."
+        self.way_s = 0.0
+        "The constant part of the way, as far as it can be told."
+        self.jitter_s = 0.0
+        "How much the delay varies from message to message: RFC 3550's interarrival jitter."
+        self.steps = 0
+        "How often the clock was seen to be set."
+        self.stepped_s = 0.0
+        "By how much it was set last; forward is positive."
+        self.stepped_at_s = -math.inf
+        "When that was seen."
+        self._lateness_s = self._leaked_s = 0.0
+        self._heard_s: float | None = None
+        self._settles_s: float | None = None
+        self._line = DeviceClock()
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether it is known how far the clock is off."""
+        return self._settles_s is None
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the clock is so far off that it should be set."""
+        return self.is_settled and not -AHEAD_S <= self.offset_s <= AHEAD_S
+
+    def hear(self, now_s: float, lateness_s: float, *, is_continued: bool = True) -> float:
+        """One message came at `now_s` and was that late by its stamp: its delay, s.
+
+        Not negative, unless the clock is ahead and not settled. With `is_continued` False the publisher may be another
+        process than before, on another machine.
+        """
+        if self._heard_s is None:
+            self._begin(now_s, lateness_s)
+        else:
+            self._follow(now_s, lateness_s, now_s - self._heard_s, is_continued)
+        self._heard_s, self._lateness_s = now_s, lateness_s
+        self._line.add(now_s, now_s - lateness_s)
+        if self._settles_s is not None:
+            if now_s < self._settles_s:
+                return lateness_s
+            self._settle()
+        return max(lateness_s - self.offset_s, 0.0)
+
+    def fit(self) -> ClockFit | None:
+        """The line through the last half minute, or since the clock was set; None before some seconds."""
+        return self._line.fit()
+
+    def _begin(self, now_s: float, lateness_s: float) -> None:
+        """Nothing is known: a lateness that no way takes is the clock's, if it stays."""
+        self.offset_s, self.way_s, self._leaked_s, self.jitter_s = lateness_s, 0.0, 0.0, 0.0
+        self._settles_s = now_s + SETTLED_S
+        self._line = DeviceClock()
+        if -AHEAD_S <= lateness_s <= MOST_WAY_S:
+            self._settle()
+
+    def _settle(self) -> None:
+        self._settles_s = None
+        if 0.0 < self.offset_s <= MOST_WAY_S:
+            self.offset_s, self.way_s = 0.0, self.offset_s
+
+    def _follow(self, now_s: float, lateness_s: float, gap_s: float, is_continued: bool) -> None:
+        rise_s = lateness_s - self._lateness_s
+        if not is_continued or gap_s > FORGOTTEN_S:
+            above_s = lateness_s - self.offset_s - self.way_s
+            if not -STEP_S <= above_s <= MOST_WAY_S:
+                self._begin(now_s, lateness_s)
+                return
+        elif rise_s > gap_s + STEP_S:
+            # sent later and stamped earlier: by no delay. The way is taken to be what it was a moment ago
+            self.offset_s += rise_s
+            self._set(now_s, -rise_s)
+        else:
+            self.jitter_s += JITTER_SHARE * (abs(rise_s) - self.jitter_s)
+            leak_s = DRIFT * gap_s
+            self.offset_s += leak_s
+            self._leaked_s += leak_s
+        fall_s = self.offset_s + self.way_s - lateness_s
+        if fall_s >= 0.0:
+            self._fall(now_s, fall_s)
+
+    def _fall(self, now_s: float, fall_s: float) -> None:
+        """The least lateness so far: first it takes back what was granted to drift, then the way is shorter than was
+        thought, and what no way explains is the clock."""
+        granted_s = min(fall_s, self._leaked_s)
+        self.offset_s -= granted_s
+        self._leaked_s -= granted_s
+        shorter_s = min(fall_s - granted_s, self.way_s)
+        self.way_s -= shorter_s
+        ahead_s = fall_s - granted_s - shorter_s
+        self.offset_s -= ahead_s
+        if ahead_s > STEP_S and self.is_settled:
+            self._set(now_s, ahead_s)
+
+    def _set(self, now_s: float, by_s: float) -> None:
+        self.steps += 1
+        self.stepped_s, self.stepped_at_s = by_s, now_s
+        self._line = DeviceClock()
