@@ -41,6 +41,9 @@ class Device(Strict, frozen=True):
     "Path of the serial port; with the backend `can`, the channel: `can0`, or an adapter's path."
     options: dict[str, Any] = msgspec.field(default_factory=dict)
     "The backend's own settings; what they are and may be is the backend's to say."
+    profiles: str = ""
+    """Folder in which it is kept what each device has shown of itself; without one that of the service
+    ($STATE_DIRECTORY/profiles), and where there is none nothing is kept."""
     command_timeout_ms: Annotated[float, Meta(ge=5.0, le=1_000.0)] = 50.0
     "What the firmware does without us: its own timeout, stated here so that it can be checked against ours."
     measurement_timeout_ms: Annotated[float, Meta(ge=2.0, le=1_000.0)] = 50.0

@@ -263,6 +263,14 @@ class DeviceReport(msgspec.Struct, frozen=True, kw_only=True):
     sensor_zero_sd_N: float
 
 
+class ProfileReport(msgspec.Struct, frozen=True, kw_only=True):
+    """What was kept of this device: whether it is in use, how old what is on the disk is, and why there is nothing."""
+
+    is_used: bool
+    age_s: float | None
+    refusal: str
+
+
 class StallReport(msgspec.Struct, frozen=True):
     """How long the control loop stood still, and what most of that went into."""
 
@@ -281,6 +289,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     most_N: float
     trim: float
     device: DeviceReport
+    profile: ProfileReport
     least_gap_mm: float
     link: LinkReport
     setpoints: SetpointReport

@@ -45,7 +45,15 @@ def test_that_of_another_is_refused(name: str, present: object) -> None:
 
 @pytest.mark.parametrize(
     "changed",
-    [{"scale": -1.0}, {"scale": 1e9}, {"scale": None}, {"offset_N": "much"}, {"slow_factor": 9.0}, {"v": 2}, {"more": 1}],
+    [
+        {"scale": -1.0},
+        {"scale": 1e9},
+        {"scale": None},
+        {"offset_N": "much"},
+        {"slow_factor": 9.0},
+        {"v": 2},
+        {"more": 1},
+    ],
 )
 def test_what_no_device_has_is_refused(changed: dict[str, object]) -> None:
     data = json.dumps(json.loads(msgspec.json.encode(KEPT)) | changed).encode()
@@ -59,7 +67,9 @@ def test_rubbish_is_refused(data: bytes) -> None:
         read_profile(data, **OF)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("data", [b"[" * MAX_BYTES, b" " * (MAX_BYTES + 1), b'{"scale": ' + b"9" * 4_000 + b"}", b"NaN"])
+@pytest.mark.parametrize(
+    "data", [b"[" * MAX_BYTES, b" " * (MAX_BYTES + 1), b'{"scale": ' + b"9" * 4_000 + b"}", b"NaN"]
+)
 def test_large_and_deep_rubbish_is_refused(data: bytes) -> None:
     with pytest.raises(ProfileError):
         read_profile(data, **OF)  # type: ignore[arg-type]

@@ -111,6 +111,7 @@ def status(**changes: Any) -> dict[str, Any]:
                 "sensor_zero_N": 0.0,
                 "sensor_zero_sd_N": 0.02,
             },
+            "profile": {"is_used": False, "age_s": None, "refusal": ""},
             "least_gap_mm": 30.0,
             "link": LINK,
             "setpoints": {

@@ -16,6 +16,7 @@ from tormagd.messages import (
     Explained,
     LatenessReport,
     LinkReport,
+    ProfileReport,
     RateReport,
     RoundTripReport,
     SetpointReport,
@@ -38,8 +39,8 @@ TELEMETRY = (
 V1: dict[type[msgspec.Struct], str] = {
     Telemetry: TELEMETRY,
     Tick: "lateness_us exec_us",
-    Status: f"{TELEMETRY} version build scene uptime_s least_N most_N trim device least_gap_mm link setpoints rates "
-    "late_ticks_by fault_details limit_details newest_stall not_granted way",
+    Status: f"{TELEMETRY} version build scene uptime_s least_N most_N trim device profile least_gap_mm link setpoints "
+    "rates late_ticks_by fault_details limit_details newest_stall not_granted way",
     LinkReport: "state cause remedy backend port losses last_loss firmware serial_number firmware_schema daemon_schema "
     "protocol_version frames bytes corrupt lost repeated resynchronisations round_trip_us clock",
     RoundTripReport: "least p50 p99",
@@ -51,6 +52,7 @@ V1: dict[type[msgspec.Struct], str] = {
     RateReport: "grade hz runs merged overruns stalls lateness_us exec_us",
     LatenessReport: "p50 p99 p999 max worst",
     ExecReport: "p50 p99 p999 max",
+    ProfileReport: "is_used age_s refusal",
     DeviceReport: "scale scale_sd offset_N offset_sd_N sensor_zero_N sensor_zero_sd_N",
     Explained: "code cause remedy",
     StallReport: "ms culprit",

@@ -35,6 +35,8 @@ class Core(NamedTuple):
     stepper: Stepper
     margins: Margins
     solver: Choice
+    model: str
+    "The model's fingerprint."
 
 
 def build_core(config: Config) -> Core:
@@ -74,7 +76,7 @@ def build_core(config: Config) -> Core:
     _refuse_too_sudden(config, scene, reach)
     beside = law_beside(reach, law, field, fitted.elastomer, _geometry(scene.insert))
     planner = Planner(config, scene, model, search, field, reach, beside, cip_percent)
-    return Core(scene, planner, Stepper(config, scene), stability, choice)
+    return Core(scene, planner, Stepper(config, scene), stability, choice, model.fingerprint)
 
 
 def _known_fields_mT(scene: Scene, model: ForceModel, field: FieldOfGap) -> tuple[float, float]:

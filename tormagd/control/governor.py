@@ -62,8 +62,9 @@ class TimedSetpoint(Value):
 
 @final
 class GovernorState(Value):
-    """What the governor remembers between plans: `asked_N` is the force that the last one asked of the device, `holder`
-    whose setpoints it followed; while `is_passing` the force is on its way to those of a new holder."""
+    """What the governor remembers between plans: `asked_N` is the force that the last one asked of the device, and
+    `above_N` how far that was above the least that the device then seemed to make; `holder` whose setpoints it
+    followed; while `is_passing` the force is on its way to those of a new holder."""
 
     __match_args__ = (
         "time_s",
@@ -74,6 +75,7 @@ class GovernorState(Value):
         "periodicity",
         "holder",
         "is_passing",
+        "above_N",
     )
     __slots__ = __match_args__
 
@@ -87,8 +89,10 @@ class GovernorState(Value):
         periodicity: Periodicity = NOTHING_LEARNED,
         holder: int = 0,
         is_passing: bool = False,
+        above_N: float = math.inf,
     ) -> None:
         self.time_s: Final = time_s
+        self.above_N: Final = above_N
         self.asked_N: Final = asked_N
         self.stamp_s: Final = stamp_s
         self.slope_N_s: Final = slope_N_s
@@ -153,7 +157,9 @@ class Governor:
         if age > setpoint.valid_for_s:
             return self._ramp(state, now_s, lowest, age, Limit.STALE, setpoint.is_contested)
         highest = max(device.force_N(portrait.most_N), 0.0)
-        force, reasons = self._within_range(setpoint.force_N, lowest, highest)
+        # what comes is told from what is asked: the force that the device makes at its least is learned, and so it varies
+        asked_N = min(max(setpoint.force_N, self._least_N), self._most_N)
+        force, reasons = self._within_range(setpoint.force_N, asked_N, lowest, highest)
         if setpoint.is_contested:
             reasons = (*reasons, Limit.OTHER_SOURCE)
         is_new_holder = setpoint.holder != state.holder
@@ -165,18 +171,18 @@ class Governor:
             slope = 0.0
         elif spacing > 0.0:
             renderable = device.scale * portrait.force_rate_N_s(device.model_N(force), self._gap_speed_mm_s)
-            between = min(max((force - state.last_N) / spacing, -renderable), renderable)
+            between = min(max((asked_N - state.last_N) / spacing, -renderable), renderable)
             slope += spacing / (SLOPE_FILTER_S + spacing) * (between - slope)
         soon_s = max(age, 0.0)
         if setpoint.preview_N:
             periodicity, foresight = NOTHING_LEARNED, 1.0
             path = _previewed_N(setpoint, soon_s + lag_s)
         else:
-            periodicity = observe(learned, setpoint.stamp_s, force)
+            periodicity = observe(learned, setpoint.stamp_s, asked_N)
             # one that has fallen silent for longer than a stream may is not believed to go on as it did
             foresight = periodicity.trust if age <= LONGEST_STEP_S else 0.0
             begins_s = soon_s + foresight * lag_s
-            path = [force + slope * min(begins_s + after_s, AHEAD_S) for after_s in PATH_S]
+            path = [asked_N + slope * min(begins_s + after_s, AHEAD_S) for after_s in PATH_S]
             if foresight > 0.0:
                 for place, forecast in enumerate(forecast_N(periodicity, begins_s, PATH_S)):
                     path[place] += foresight * (forecast - path[place])
@@ -192,7 +198,15 @@ class Governor:
                 within = [governed] * len(PATH_S)
                 reasons, foresight = (*reasons, Limit.TAKEOVER), 0.0
         rendered = GovernorState(
-            now_s, within[0], setpoint.stamp_s, slope, force, periodicity, setpoint.holder, is_passing
+            now_s,
+            within[0],
+            setpoint.stamp_s,
+            slope,
+            asked_N,
+            periodicity,
+            setpoint.holder,
+            is_passing,
+            max(within[0] - lowest, 0.0),
         )
         return rendered, Governed(governed, within, age, reasons, foresight)
 
@@ -210,6 +224,7 @@ class Governor:
             periodicity,
             state.holder,
             state.is_passing,
+            state.above_N,
         )
 
     def _ramp(
@@ -222,21 +237,24 @@ class Governor:
         is_contested: bool = False,
     ) -> tuple[GovernorState, Governed]:
         elapsed = max(0.0, now_s - state.time_s)
-        force = max(lowest_N, state.asked_N - self._release_N_s * elapsed)
+        # a device that is found to make less than was believed is not asked for more above its least than it was
+        above_N = max(min(state.above_N, state.asked_N - lowest_N) - self._release_N_s * elapsed, 0.0)
+        force = lowest_N + above_N
         reasons: tuple[Limit, ...] = (reason, Limit.OTHER_SOURCE) if is_contested else (reason,)
-        decayed = GovernorState(now_s, force, holder=state.holder, is_passing=state.is_passing)
+        decayed = GovernorState(now_s, force, holder=state.holder, is_passing=state.is_passing, above_N=above_N)
         return decayed, Governed(force, [force] * len(PATH_S), age_s, reasons)
 
-    def _within_range(self, asked_N: float, lowest_N: float, highest_N: float) -> tuple[float, tuple[Limit, ...]]:
-        """The force nearest the one asked that the scene allows and the device gives: never over the scene's greatest,
-        unless the open gap itself makes more."""
-        force = min(max(asked_N, self._least_N), self._most_N)
-        reasons: tuple[Limit, ...] = () if force == asked_N else (Limit.RANGE,)
-        if force < lowest_N:
+    def _within_range(
+        self, setpoint_N: float, allowed_N: float, lowest_N: float, highest_N: float
+    ) -> tuple[float, tuple[Limit, ...]]:
+        """Of the setpoint, what the scene allows of it and the device gives: never over the scene's greatest, unless
+        the open gap itself makes more."""
+        reasons: tuple[Limit, ...] = () if allowed_N == setpoint_N else (Limit.RANGE,)
+        if allowed_N < lowest_N:
             return lowest_N, (*reasons, Limit.F_MIN)
-        if force > highest_N:
+        if allowed_N > highest_N:
             return highest_N, (*reasons, Limit.F_MAX)
-        return force, reasons
+        return allowed_N, reasons
 
 
 def _previewed_N(setpoint: TimedSetpoint, begins_s: float) -> list[float]:

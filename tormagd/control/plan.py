@@ -225,7 +225,7 @@ class Planner:
         least = self.portrait.least_N
         field_mT = self._field.field_mT(open_mm)
         resting = Plan(0, now_s, None, None, least, None, field_mT, open_mm, 0.0, 1.0, (Limit.NO_SETPOINT,))
-        return PlanState(GovernorState(now_s, least), resting)
+        return PlanState(GovernorState(now_s, least, above_N=0.0), resting)
 
     def plan(
         self, state: PlanState, now_s: float, setpoint: TimedSetpoint | None, estimate: Estimate | None

@@ -1,7 +1,7 @@
 """What is known of one device with one insert, kept for the next time: a JSON file of a few lines.
 
-What a fit has learned of a scale lasts from day to day, but for the warmth of the room; what the elastomer had relaxed and
-how far the sensor's zero had drifted do not. So a profile that is read again is less sure than the one that was kept.
+What a fit has learned of a scale lasts from day to day, but for the warmth of the room; what the elastomer had relaxed
+and how far the sensor's zero had drifted do not. So a profile that is read again is less sure than when it was kept.
 """
 
 import math
@@ -39,7 +39,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     serial_number: Annotated[int, Meta(ge=0, lt=2**32)]
     insert: Annotated[str, Meta(min_length=1, max_length=64)]
     model: Hash
-    saved_ns: Annotated[int, Meta(ge=0, lt=2**63)]
+    saved_ns: Annotated[int, Meta(ge=0, le=2**63 - 1)]
     scale: Annotated[float, Meta(gt=0.1, lt=10.0)]
     scale_sd: Annotated[float, Meta(ge=0.0, le=2.0 * SCALE_SD)]
     offset_N: Annotated[float, Meta(ge=-5.0, le=5.0)]
@@ -87,5 +87,7 @@ def read_profile(data: bytes, *, serial_number: int, insert: str, model: str) ->
         ("model", profile.model, model),
     ):
         if kept != present:
-            raise ProfileError(f"{name} = {kept!r}: it is of another {name.removesuffix('_number')}, here is {present!r}")
+            raise ProfileError(
+                f"{name} = {kept!r}: it is of another {name.removesuffix('_number')}, here is {present!r}"
+            )
     return profile

@@ -16,6 +16,7 @@ from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.inference_loop import InferenceLoop
+from tormagd.daemon.profiles import ProfileFolder, Profiles, profile_folder
 from tormagd.daemon.realtime import freeze_garbage, priority_of_threads
 from tormagd.daemon.telemetry_loop import TelemetryLoop
 from tormagd.hardware.backend import Backend
@@ -51,11 +52,18 @@ class Daemon:
             time.monotonic(),
             on_failure=partial(self._control.latch, Fault.PLAN_FAILED),
         )
+        folder = profile_folder(config.device.profiles)
+        self._profiles = Profiles(
+            None if folder is None else ProfileFolder(folder, core.scene.insert.name, core.model),
+            lambda: self._inference.state.shown,
+            self._inference.teach,
+        )
         self._telemetry = TelemetryLoop(
             config,
             core,
             self._control,
             self._inference,
+            self._profiles,
             self._connection,
             self._endpoint,
             self._callbacks,
@@ -88,6 +96,8 @@ class Daemon:
         await self._ended.wait()
         notify.notify("STOPPING=1")
         await self._open_gap()
+        self._profiles.look(None, is_driven=False)
+        await self._profiles.finished()
         self._loop.remove_reader(heartbeat.fileno())
         self._callbacks.remove_reader(self._endpoint.fileno())
         self._connection.close()

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 
 from tormagd.control.estimate import Estimate
-from tormagd.control.plan import Planner, PlanState
+from tormagd.control.plan import Planner, PlanState, Shown
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.rate_group import RateGroup
 
@@ -40,6 +40,10 @@ class InferenceLoop:
         self._due_ns = clock_ns() + period_ns
         self._waiting_ns = 0
         self._slack_ns = 200_000.0
+
+    def teach(self, shown: Shown) -> None:
+        """Plans from now on for a device that has shown this of itself."""
+        self.state = self.state.replaced(shown=shown)
 
     def receive(self, estimate: Estimate | None, next_tick_ns: int) -> None:
         """Something has arrived: reads it, and plans on a new setpoint, if the next control tick leaves the time."""

@@ -19,6 +19,14 @@ from tormagd.messages import ProfileReport
 log = logging.getLogger(__name__)
 
 
+def profile_folder(configured: str) -> Path | None:
+    """The folder for profiles: the one that is configured, or else the service's; None where there is neither."""
+    if configured:
+        return Path(configured)
+    state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    return Path(state, "profiles") if state else None
+
+
 class ProfileFolder:
     """The files of one scene's insert and model, one for each device."""
 
@@ -34,8 +42,11 @@ class ProfileFolder:
         path = self.path(serial_number)
         try:
             # whatever lies there, a pipe even: nothing is waited for, and no more read than a profile has
-            with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-                data = file.read(MAX_BYTES + 1) or b""
+            descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+            try:
+                data = os.read(descriptor, MAX_BYTES + 1)
+            finally:
+                os.close(descriptor)
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -51,7 +62,7 @@ class ProfileFolder:
         beside = path.with_suffix(".new")
         try:
             self._folder.mkdir(mode=0o750, parents=True, exist_ok=True)
-            with open(beside, "wb") as file:
+            with beside.open("wb") as file:
                 file.write(msgspec.json.format(msgspec.json.encode(profile)) + b"\n")
                 file.flush()
                 os.fsync(file.fileno())
@@ -68,7 +79,9 @@ class Profiles:
     `learned` gives what has been shown, `teach` puts something else in its place. Without a folder nothing is kept.
     """
 
-    def __init__(self, folder: ProfileFolder | None, learned: Callable[[], Shown], teach: Callable[[Shown], None]) -> None:
+    def __init__(
+        self, folder: ProfileFolder | None, learned: Callable[[], Shown], teach: Callable[[Shown], None]
+    ) -> None:
         self._folder, self._learned, self._teach = folder, learned, teach
         self._loop = asyncio.get_running_loop()
         self._serial_number: int | None = None

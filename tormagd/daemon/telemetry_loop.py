@@ -19,8 +19,9 @@ from tormagd.daemon.causes import Causes
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.inference_loop import InferenceLoop
+from tormagd.daemon.profiles import Profiles
 from tormagd.daemon.rate_group import ERROR_PERIODS, RateGroup
-from tormagd.daemon.telemetry import snapshot, tick_record
+from tormagd.daemon.telemetry import is_driven, snapshot, tick_record
 from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.link import LinkState
@@ -48,6 +49,7 @@ class TelemetryLoop:
         core: Core,
         control: ControlLoop,
         inference: InferenceLoop,
+        profiles: Profiles,
         connection: Connection,
         endpoint: Endpoint,
         callbacks: Callbacks,
@@ -55,7 +57,7 @@ class TelemetryLoop:
         not_granted: list[str],
     ) -> None:
         self._config, self._core, self._not_granted = config, core, tuple(not_granted)
-        self._control, self._inference = control, inference
+        self._control, self._inference, self._profiles = control, inference, profiles
         self._connection, self._endpoint = connection, endpoint
         self._callbacks, self._causes = callbacks, causes
         self.timing = RateGroup("telemetry", NS // config.rates.telemetry_hz)
@@ -90,6 +92,9 @@ class TelemetryLoop:
         start_ns = time.monotonic_ns()
         snapshot_ = self._snapshot(start_ns * 1e-9)
         self._endpoint.publish(snapshot_)
+        link = self._connection.link
+        identity = None if link is None else link.identity
+        self._profiles.look(None if identity is None else identity.serial_number, is_driven(self._control.state))
         self._endpoint.publish_ticks(self._ticks[-MOST_TICKS:])
         self._ticks.clear()
         self._refresh(start_ns * 1e-9)
@@ -219,6 +224,7 @@ class TelemetryLoop:
                 sensor_zero_N=round(planned.shown.zero.zero_N, 4),
                 sensor_zero_sd_N=round(planned.shown.zero.sd_N(time.monotonic()), 4),
             ),
+            profile=self._profiles.report(),
             least_gap_mm=round(plan.least_gap_mm, 2),
             link=link,
             setpoints=inbox.report(now_s),

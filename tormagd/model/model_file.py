@@ -11,6 +11,7 @@ import math
 import re
 import struct
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -166,6 +167,11 @@ class ForceModel:
         """Greatest less least force seen in training."""
         low, high = self.metadata.ranges["force_N"]
         return high - low
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of all that the file holds, 64 hexadecimal digits: which model it is."""
+        return _checksum(_header(self.metadata), _tensors(self))
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> ForceCurve:
         """The force over the field for one state of the handle. Raises `DomainError` on a non-finite input."""
