@@ -28,6 +28,8 @@ REPORTED = 6
 "Sources that are reported in full, the newest ones: an answer has to stay under its limit."
 MOST_DRIFT_PPM = 100.0
 "A clock that drifts faster than quartz does is named."
+SURE_WINDOWS = 20
+"Of fewer half seconds the scatter around the line says little of how sure its slope is."
 NEWS, NEWS_S = 4, 1.0
 "Lines for the log that wait, and how long each waits after the one before."
 STEP_NAMED_S = 60.0
@@ -318,7 +320,7 @@ def _of_clock(clock: SourceClock, fit: ClockFit | None, now_s: float) -> tuple[s
     if now_s - clock.stepped_at_s < STEP_NAMED_S:
         way, often = "forward" if clock.stepped_s > 0.0 else "back", f", the last of {clock.steps} times"
         causes.append(f"it was set {way} by {abs(clock.stepped_s):.3f} s{often if clock.steps > 1 else ''}")
-    if fit is not None:
+    if fit is not None and fit.windows >= SURE_WINDOWS:
         # the slope's standard deviation, ppm: that of points at even spacing around a line
         sd_ppm = fit.residual_us * math.sqrt(12.0 / fit.windows) / (fit.windows * WINDOW_S)
         if abs(fit.drift_ppm) - 3.0 * sd_ppm > MOST_DRIFT_PPM:
