@@ -1,5 +1,6 @@
 """The setpoint inbox: whatever is published, the newest valid setpoint wins and everything else is counted."""
 
+import random
 from typing import Any
 
 import msgpack
@@ -182,7 +183,7 @@ def test_an_operator_gives_the_brake_to_a_source(publishing: Publishing) -> None
     assert not publishing.send(2, 1.0, "a")
     assert publishing.send(2, 2.1, "b")
     publishing.now_s = 0.2
-    with pytest.raises(RefusedError, match="newest setpoint of 'a' is 200 ms old"):
+    with pytest.raises(RefusedError, match="source 'a' has sent nothing that is still valid"):
         publishing.inbox.give("a", publishing.now_s)
     # it holds the brake no longer than any other
     assert publishing.send(3, 1.0, "a")
@@ -290,6 +291,25 @@ def test_a_stamp_of_long_ago_is_taken_and_is_as_old_as_it_says(publishing: Publi
     newest = publishing.inbox.newest
     assert newest is not None
     assert publishing.now_s - newest.stamp_s == pytest.approx(START_NS * 1e-9)
+
+
+def test_a_line_through_a_few_noisy_stamps_is_no_drift(publishing: Publishing) -> None:
+    noise, drifts_ppm = random.Random(1), []
+    for tick in range(800):
+        publishing.now_s = tick * 0.05
+        publishing.send(tick, 1.0, "a", noise.uniform(0.0, 0.045), valid_for_ms=200.0)
+        publishing.inbox.refresh(publishing.now_s)
+        found = publishing.inbox.report(publishing.now_s).by_source["a"]
+        assert found.cause == ""
+        if found.clock is not None:
+            drifts_ppm.append(abs(found.clock.drift_ppm))
+    assert max(drifts_ppm) > 200.0
+
+
+def test_nothing_is_given_to_a_source_whose_stamps_were_refused(publishing: Publishing) -> None:
+    publishing.send(1, 1.0, "a", -3.0)
+    with pytest.raises(RefusedError, match="nothing that is still valid"):
+        publishing.inbox.give("a", publishing.now_s)
 
 
 def test_losses_and_delays_are_counted_for_each_source(publishing: Publishing) -> None:

@@ -9,6 +9,8 @@ from tormagd.ctl.outcome import Colour, Exit, Outcome
 from tormagd.messages import Explained, LinkReport, RateReport, SetpointReport, SourceReport, Status, WayReport
 
 UNKNOWN = "-"
+SURE_WINDOWS = 20
+"A drift is shown once it is that of ten seconds."
 SETPOINT_COUNTS = ("accepted", "refused", "dropped", "oversize")
 LINK_COUNTS = ("losses", "frames", "corrupt", "lost", "repeated", "resynchronisations")
 
@@ -77,7 +79,7 @@ def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
         f"{source.lost} lost",
         "clock not known yet" if behind is None else f"clock {_clock(behind)}",
     ]
-    if source.clock is not None:
+    if source.clock is not None and source.clock.windows >= SURE_WINDOWS:
         parts[-1] += f", {source.clock.drift_ppm:+.0f} ppm"
     if source.restarts:
         parts.append(f"{source.restarts} restarts")

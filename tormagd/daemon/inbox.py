@@ -4,6 +4,7 @@ Each message goes through three judgements, a module each: is it newer than what
 how old is it by a clock that may be wrong (`source_clock`), and does its source hold the brake (`hold`)?
 """
 
+import math
 import shlex
 from collections import deque
 
@@ -12,6 +13,7 @@ from tormagd.daemon.hold import Hold, is_passed
 from tormagd.daemon.rate_group import HORIZON_NS, Histogram
 from tormagd.daemon.sequence import Order, Sequence
 from tormagd.daemon.source_clock import AHEAD_S, SourceClock
+from tormagd.hardware.link_statistics import WINDOW_S, ClockFit
 from tormagd.messages import ClockReport, MessageError, Setpoint, SetpointReport, SourceReport, decode
 from tormagd.safety.codes import Explanation, Limit
 from tormagd.safety.operating_state import RefusedError
@@ -26,6 +28,8 @@ REPORTED = 6
 "Sources that are reported in full, the newest ones: an answer has to stay under its limit."
 MOST_DRIFT_PPM = 100.0
 "A clock that drifts faster than quartz does is named."
+SURE_WINDOWS = 20
+"Of fewer half seconds the scatter around the line says little of how sure its slope is."
 NEWS, NEWS_S = 4, 1.0
 "Lines for the log that wait, and how long each waits after the one before."
 STEP_NAMED_S = 60.0
@@ -43,6 +47,7 @@ class _Source:
         "delays",
         "fit",
         "heard_s",
+        "is_named",
         "refused",
         "remedy",
         "sequence",
@@ -53,16 +58,21 @@ class _Source:
     )
 
     def __init__(self, setpoint: Setpoint, now_s: float) -> None:
-        self.setpoint, self.stamp_s, self.heard_s, self.turned_s = setpoint, now_s, now_s, now_s
+        self.setpoint, self.heard_s, self.turned_s = setpoint, now_s, now_s
+        self.stamp_s = -math.inf  # nothing of it has been taken yet
         self.sequence = Sequence(setpoint.session, setpoint.seq)
         self.clock = SourceClock()
         self.delays = Histogram()
         self.accepted = self.refused = 0
+        self.is_named = False
         self.refresh(now_s)
 
-    def refresh(self, now_s: float) -> None:
+    def refresh(self, now_s: float) -> bool:
+        """Makes the figures anew; True if there is something wrong with the clock that was not named before."""
         self.fit, self.summary = self.clock.fit(), self.delays.summary()
-        self.cause, self.remedy = _of_clock(self.clock, None if self.fit is None else self.fit.drift_ppm, now_s)
+        self.cause, self.remedy = _of_clock(self.clock, self.fit, now_s)
+        was_named, self.is_named = self.is_named, self.clock.is_settled and bool(self.cause)
+        return self.is_named and not was_named
 
     def is_stale(self, now_s: float) -> bool:
         return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
@@ -116,11 +126,8 @@ class SetpointInbox:
             known = ", ".join(sorted(self._sources)) or "none"
             raise RefusedError("unknown_source", f"no source {name!r} has sent setpoints", f"known: {known}"[:200])
         if source.is_stale(now_s):
-            silent_ms = (now_s - source.stamp_s) * 1e3
             raise RefusedError(
-                "source_stale",
-                f"the newest setpoint of {name!r} is {silent_ms:.0f} ms old",
-                "let its publisher send, then take again",
+                "source_stale", f"source {name!r} has sent nothing that is still valid", "let it send, then take again"
             )
         if name == self.hold.source:
             self.hold = self.hold._replace(is_given=True)
@@ -156,9 +163,7 @@ class SetpointInbox:
             self._turn += 1
             name = tuple(self._sources)[self._turn % len(self._sources)]
             source = self._sources[name]
-            was_wrong = bool(source.cause)
-            source.refresh(now_s)
-            if source.cause and not was_wrong:
+            if source.refresh(now_s):
                 self._news.append(f"source {name!r}: {source.cause}: {source.remedy}")
 
     def report(self, now_s: float) -> SetpointReport:
@@ -303,7 +308,7 @@ class SetpointInbox:
         )
 
 
-def _of_clock(clock: SourceClock, drift_ppm: float | None, now_s: float) -> tuple[str, str]:
+def _of_clock(clock: SourceClock, fit: ClockFit | None, now_s: float) -> tuple[str, str]:
     """What is wrong with a publisher's clock, and what to do; empty where nothing is."""
     if not clock.is_settled:
         return "its stamps are far from this machine's clock: it is watched which of the two it is", "wait a moment"
@@ -315,8 +320,11 @@ def _of_clock(clock: SourceClock, drift_ppm: float | None, now_s: float) -> tupl
     if now_s - clock.stepped_at_s < STEP_NAMED_S:
         way, often = "forward" if clock.stepped_s > 0.0 else "back", f", the last of {clock.steps} times"
         causes.append(f"it was set {way} by {abs(clock.stepped_s):.3f} s{often if clock.steps > 1 else ''}")
-    if drift_ppm is not None and abs(drift_ppm) > MOST_DRIFT_PPM:
-        causes.append(f"it runs {abs(drift_ppm):.0f} ppm {'fast' if drift_ppm > 0.0 else 'slow'}")
+    if fit is not None and fit.windows >= SURE_WINDOWS:
+        # the slope's standard deviation, ppm: that of points at even spacing around a line
+        sd_ppm = fit.residual_us * math.sqrt(12.0 / fit.windows) / (fit.windows * WINDOW_S)
+        if abs(fit.drift_ppm) - 3.0 * sd_ppm > MOST_DRIFT_PPM:
+            causes.append(f"it runs {abs(fit.drift_ppm):.0f} ppm {'fast' if fit.drift_ppm > 0.0 else 'slow'}")
     if not causes:
         return "", ""
     return f"its clock: {'; '.join(causes)}", "keep the clocks of both machines by chrony or ptp4l"
