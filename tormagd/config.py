@@ -20,6 +20,8 @@ DEFAULT_RUN_DIR = "/run/tormag"
 MOST_LISTED = 8
 "Sources in the order of priority: fewer than are kept apart, so that one that is not listed is heard, too."
 LONGEST_IPC_PATH = 107  # bytes that the kernel takes of a socket's path
+ENDPOINTS = ("setpoint", "telemetry", "control", "recording")
+ROLES = ("publish", "operate", "observe")
 
 T = TypeVar("T")
 _TCP = re.compile(r"tcp://(localhost|[0-9.]+):([0-9]{1,5})")
@@ -55,6 +57,27 @@ class Device(Strict, frozen=True):
         _order(self.port.isprintable(), "device.port", self.port, "printable characters")
 
 
+class Curve(Strict, frozen=True):
+    """Key files. The daemon has `server_secret` and a folder of public keys for each role, a client the last two keys.
+
+    A folder that is not named is the one of its role's name beside `server_secret`.
+    """
+
+    server_secret: str = ""
+    publish: str = ""
+    "Who may send setpoints, and nothing else."
+    operate: str = ""
+    "Who may give commands, and look."
+    observe: str = ""
+    "Who may look: telemetry, recording, `status`."
+    also_local: bool = False
+    "Whether `ipc://` and loopback demand keys, too."
+    client_secret: str = ""
+    "What `tormagctl` shows."
+    server_public: str = ""
+    "The daemon that `tormagctl` believes; by default the `.key` beside `server_secret`."
+
+
 class Endpoints(Strict, frozen=True):
     """ZeroMQ addresses. Only `ipc://` and loopback are open; any other address is refused without CURVE keys."""
 
@@ -62,6 +85,11 @@ class Endpoints(Strict, frozen=True):
     telemetry: str = f"ipc://{DEFAULT_RUN_DIR}/telemetry"
     control: str = f"ipc://{DEFAULT_RUN_DIR}/control"
     recording: str = f"ipc://{DEFAULT_RUN_DIR}/recording"
+    curve: Curve | None = None
+
+    def is_guarded(self, name: str) -> bool:
+        """Whether the daemon lets in only whom it has the key of."""
+        return not _is_local(getattr(self, name)) or (self.curve is not None and self.curve.also_local)
 
 
 class Sources(Strict, frozen=True):
@@ -208,9 +236,17 @@ class Config(Strict, frozen=True):
             f"at most limits.skew_fault_mm = {limits.skew_fault_mm:g}",
         )
         taken: dict[str, str] = {}
-        for name in ("setpoint", "telemetry", "control", "recording"):
+        curve = self.endpoints.curve
+        has_keys = curve is not None and bool(curve.server_secret or curve.client_secret)
+        _order(
+            has_keys or curve is None or not curve.also_local,
+            "endpoints.curve.also_local",
+            True,
+            "false without keys, which are server_secret or client_secret",
+        )
+        for name in ENDPOINTS:
             address = getattr(self.endpoints, name)
-            place = _ipc_place(name, address) if address.startswith("ipc://") else _tcp_place(name, address)
+            place = _ipc_place(name, address) if address.startswith("ipc://") else _tcp_place(name, address, has_keys)
             _order(
                 place not in taken,
                 f"endpoints.{name}",
@@ -235,26 +271,36 @@ def _ipc_place(name: str, address: str) -> str:
     return path if path.startswith("@") else os.path.realpath(path)
 
 
-def _tcp_place(name: str, address: str) -> str:
+def _tcp_place(name: str, address: str, has_keys: bool) -> str:
     """The same of a `tcp://` address. IPv4 only: a ZeroMQ socket speaks no IPv6 unless it is told to, at both ends."""
     matched = _TCP.fullmatch(address)
     host, port = matched.groups() if matched else ("", "0")
     _order(
-        _is_loopback(host) and 0 < int(port) < 65_536,
+        (_is_loopback(host) or (has_keys and _is_ipv4(host))) and 0 < int(port) < 65_536,
         f"endpoints.{name}",
         address,
-        "ipc:// or a loopback tcp:// address with a port of 1..65535; others need CURVE keys",
+        "ipc:// or tcp:// with an IPv4 address and a port of 1..65535"
+        if has_keys
+        else "ipc:// or a loopback tcp:// address with a port of 1..65535; others need CURVE keys in [endpoints.curve]",
     )
     return f"{'127.0.0.1' if host == 'localhost' else host}:{int(port)}"
 
 
+def _is_local(address: str) -> bool:
+    matched = _TCP.fullmatch(address)
+    return matched is None or _is_loopback(matched[1])
+
+
 def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
+    return host == "localhost" or (_is_ipv4(host) and ipaddress.IPv4Address(host).is_loopback)
+
+
+def _is_ipv4(host: str) -> bool:
     try:
-        return ipaddress.IPv4Address(host).is_loopback
+        ipaddress.IPv4Address(host)
     except ValueError:
         return False
+    return True
 
 
 def _order(condition: bool, key: str, value: object, allowed: str) -> None:

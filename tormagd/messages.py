@@ -278,6 +278,33 @@ class StallReport(msgspec.Struct, frozen=True):
     culprit: str
 
 
+class PeerReport(msgspec.Struct, frozen=True):
+    """A peer that was refused, or whose messages were dropped: where, who, why, and how often.
+
+    `address` is a host or a process, `key` the fingerprint of the key it showed, with the name that we know it by;
+    empty where it showed none.
+    """
+
+    endpoint: str
+    address: str
+    key: str
+    reason: str
+    count: int
+
+
+class PeersReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Who connects: open connections by endpoint, peers that were not let in, and messages that were not read.
+
+    Counts since the start. Of both kinds the newest or worst are named, the rest are `others`.
+    """
+
+    connections: dict[str, int] = msgspec.field(default_factory=dict)
+    refused: int = 0
+    dropped: int = 0
+    refusals: tuple[PeerReport, ...] = ()
+    drops: tuple[PeerReport, ...] = ()
+
+
 class Status(Telemetry, frozen=True, kw_only=True):
     """The answer to the command `status`: the newest telemetry, and what is worth asking for."""
 
@@ -293,6 +320,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     least_gap_mm: float
     link: LinkReport
     setpoints: SetpointReport
+    peers: PeersReport = PeersReport()
     rates: dict[str, RateReport]
     late_ticks_by: dict[str, int]
     fault_details: tuple[Explained, ...]

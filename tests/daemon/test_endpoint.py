@@ -15,7 +15,8 @@ import pytest
 import zmq
 
 from tormagd.config import Endpoints
-from tormagd.daemon.endpoint import DRAIN, REQUESTS, Endpoint
+from tormagd.daemon.endpoint import DRAIN, REQUESTS, SETPOINT_BURST, Endpoint
+from tormagd.daemon.requests import WAITING_PER_CLIENT
 from tormagd.messages import VERSION, Reply, Request, Telemetry, Tick, decode, encode
 from tormagd.safety.operating_state import RefusedError
 
@@ -60,6 +61,7 @@ class Rig:
 
     def connect(self, kind: int, name: str) -> "zmq.Socket[bytes]":
         made = self.context.socket(kind)
+        made.linger = 0
         made.connect(self.addresses[name])
         return made
 
@@ -356,6 +358,152 @@ def test_when_the_slack_is_over_one_command_is_still_answered_and_the_others_wai
             break
         client.poll(5)
     assert answered == list(range(5))
+
+
+# -- what goes first -----------------------------------------------------------------------------------------------
+
+
+def command(name: str, request_id: int = 1, **args: Any) -> bytes:
+    return encode(Request(v=VERSION, id=request_id, command=name, args=args))
+
+
+def taken(rig: Rig, answered: list[str], reached: Callable[[], bool]) -> None:
+    """Takes requests, as the daemon does each tick, and serves none of those that wait."""
+
+    def answer(request: Request) -> dict[str, Any]:
+        answered.append(request.command)
+        return {}
+
+    for _ in range(PATIENCE_MS // 5):
+        rig.endpoint.take_requests(answer)
+        if reached():
+            return
+        rig.context.socket(zmq.PULL).poll(5)
+    pytest.fail("not reached")
+
+
+@pytest.mark.parametrize("kind", [zmq.REQ, zmq.DEALER])
+@pytest.mark.parametrize("name", ["stop", "disable"])
+def test_what_opens_the_gap_waits_behind_nobody(rig: Rig, kind: int, name: str) -> None:
+    busy = [rig.connect(zmq.DEALER, "control") for _ in range(20)]
+    for client in busy:
+        for number in range(30):
+            client.send(command("status", number))
+    answered: list[str] = []
+    operator = rig.connect(kind, "control")
+    operator.send(command(name))
+    taken(rig, answered, lambda: operator.poll(0) > 0)
+    assert decode(operator.recv_multipart()[-1], Reply).ok
+    assert answered == [name]
+    assert not any(client.poll(0) for client in busy)
+
+
+def test_what_was_asked_before_the_gap_was_told_to_open_is_not_done_after_it(rig: Rig) -> None:
+    client = rig.connect(zmq.DEALER, "control")
+    for number, name in enumerate(("enable", "status", "disable", "enable")):
+        client.send(command(name, number))
+    done: list[str] = []
+    taken(rig, done, lambda: client.poll(0) > 0)
+    replies = [decode(client.recv_multipart()[-1], Reply)]
+
+    def answer(request: Request) -> dict[str, Any]:
+        done.append(request.command)
+        return {}
+
+    while len(replies) < 4:
+        replies.append(rig.serve(client, answer))
+    assert [reply.id for reply in replies] == [2, 0, 1, 3]
+    assert [reply.error and reply.error.code for reply in replies] == [None, "overtaken", None, None]
+    assert done == ["disable", "status", "enable"]
+
+
+def test_a_disable_that_is_refused_overtakes_nothing(rig: Rig) -> None:
+    def answer(request: Request) -> dict[str, Any]:
+        if request.command == "disable":
+            raise RefusedError("not_connected", "no device", "plug it in")
+        return {}
+
+    client = rig.connect(zmq.DEALER, "control")
+    client.send(command("home", 0))
+    client.send(command("disable", 1))
+    replies = {reply.id: reply.ok for reply in (rig.serve(client, answer), rig.serve(client, answer))}
+    assert replies == {0: True, 1: False}
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"stop",
+        b"disable" * 100,
+        command("status", note="stop"),
+        command("stopped"),
+        msgpack.packb({"v": 1, "id": 1, "command": ["stop"]}),
+    ],
+    ids=range(5),
+)
+def test_what_only_looks_like_it_waits_its_turn(rig: Rig, data: bytes) -> None:
+    client, operator = rig.connect(zmq.DEALER, "control"), rig.connect(zmq.DEALER, "control")
+    for _ in range(10):
+        client.send(data)
+    client.poll(20)
+    operator.send(command("stop"))
+    answered: list[str] = []
+    taken(rig, answered, lambda: operator.poll(0) > 0)
+    assert answered == ["stop"]
+    assert not client.poll(0)
+
+
+def test_a_message_in_countless_parts_is_read_in_portions_and_answered_once(rig: Rig) -> None:
+    client, operator = rig.connect(zmq.DEALER, "control"), rig.connect(zmq.DEALER, "control")
+    client.send_multipart([b"stop"] * 5_000)
+    client.send(command("status", 7))
+    operator.send(command("stop"))
+    answered: list[str] = []
+    taken(rig, answered, lambda: operator.poll(0) > 0)
+    reply = rig.serve(client, lambda request: {})
+    assert reply.error is not None
+    assert reply.error.code == "bad_request"
+    assert rig.serve(client, lambda request: {}).id == 7
+    publisher = rig.publisher()
+    publisher.send_multipart([setpoint(1)] * 5_000)
+    publisher.send(setpoint(2, 1.5))
+    rig.until(lambda: rig.endpoint.inbox.accepted == 1)
+    assert rig.endpoint.inbox.refused == 1
+
+
+# -- floods --------------------------------------------------------------------------------------------------------
+
+
+def test_a_publisher_that_sends_too_much_is_dropped_unread_and_named(rig: Rig) -> None:
+    publisher = rig.publisher()
+    numbers = itertools.count()
+
+    def is_dropped() -> bool:
+        for _ in range(1_000):
+            publisher.send(setpoint(next(numbers)))
+        for _ in range(100):
+            rig.endpoint.drain_setpoints()
+        rig.endpoint.serve(rig.now_s, never, NEVER)
+        return rig.endpoint.report().dropped > 0
+
+    # once a burst's worth has been sent faster than the rate, which any machine can
+    rig.until(is_dropped)
+    assert rig.endpoint.inbox.accepted >= SETPOINT_BURST - 1
+    assert rig.endpoint.inbox.refused == 0
+    (drop,) = rig.endpoint.report().drops
+    assert (drop.endpoint, drop.address) == ("setpoint", f"process {os.getpid()} of user {os.getuid()}")
+    assert (drop.key, drop.reason) == ("", "sent too much")
+
+
+def test_a_client_that_asks_too_much_is_dropped_and_others_are_answered(rig: Rig) -> None:
+    flood, other = rig.connect(zmq.DEALER, "control"), rig.connect(zmq.DEALER, "control")
+    for number in range(900):
+        flood.send(command("status", number))
+    taken(rig, [], lambda: rig.endpoint.report().dropped == 900 - WAITING_PER_CLIENT)
+    other.send(command("status", 7))
+    assert rig.serve(other, lambda request: {}).id == 7
+    (drop,) = rig.endpoint.report().drops
+    assert (drop.endpoint, drop.reason) == ("control", "sent too much")
 
 
 # -- opening and closing -------------------------------------------------------------------------------------------

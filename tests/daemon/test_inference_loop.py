@@ -27,7 +27,9 @@ class Rig:
         self.planned_ns: list[int] = []
         self.foreseen_ns: list[int] = []
         planner: Any = SimpleNamespace(start=lambda now_s: None, plan=self.plan, foresee=self.foresee)
-        endpoint: Any = SimpleNamespace(drain_setpoints=self.drain, inbox=SimpleNamespace(newest=None))
+        endpoint: Any = SimpleNamespace(
+            drain_setpoints=self.drain, is_flooded=False, inbox=SimpleNamespace(newest=None)
+        )
         self.loop = InferenceLoop(planner, endpoint, DUE_NS, 0.0, lambda: self.now_ns, on_failure=pytest.fail)
 
     def plan(self, *_arguments: Any) -> None:
@@ -160,7 +162,7 @@ def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on
     planner: Any = SimpleNamespace(
         start=lambda now_s: PlanState(GovernorState(now_s, 0.5), resting), plan=plan, foresee=lambda state: state
     )
-    endpoint: Any = SimpleNamespace(drain_setpoints=rig.drain, inbox=inbox)
+    endpoint: Any = SimpleNamespace(drain_setpoints=rig.drain, is_flooded=False, inbox=inbox)
     loop = InferenceLoop(planner, endpoint, DUE_NS, 0.0, lambda: rig.now_ns, on_failure=lambda: failures.append(None))
     inbox.newest = TimedSetpoint(1.0, 0.0, 0.1)
     rig.has_arrived = True

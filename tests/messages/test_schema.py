@@ -16,6 +16,8 @@ from tormagd.messages import (
     Explained,
     LatenessReport,
     LinkReport,
+    PeerReport,
+    PeersReport,
     ProfileReport,
     RateReport,
     RoundTripReport,
@@ -40,6 +42,7 @@ V1: dict[type[msgspec.Struct], str] = {
     Telemetry: TELEMETRY,
     Tick: "lateness_us exec_us",
     Status: f"{TELEMETRY} version build scene uptime_s least_N most_N trim device profile least_gap_mm link setpoints "
+    "peers "
     "rates late_ticks_by fault_details limit_details newest_stall not_granted way",
     LinkReport: "state cause remedy backend port losses last_loss firmware serial_number firmware_schema daemon_schema "
     "protocol_version frames bytes corrupt lost repeated resynchronisations round_trip_us clock",
@@ -49,6 +52,8 @@ V1: dict[type[msgspec.Struct], str] = {
     SourceReport: "state silent_ms session seq accepted refused lost restarts delay_us jitter_us clock_behind_ms "
     "clock_steps clock cause remedy",
     WayReport: "to_duty_us device_us carriages_ms total_ms budget_ms",
+    PeersReport: "connections refused dropped refusals drops",
+    PeerReport: "endpoint address key reason count",
     RateReport: "grade hz runs merged overruns stalls lateness_us exec_us",
     LatenessReport: "p50 p99 p999 max worst",
     ExecReport: "p50 p99 p999 max",

@@ -13,7 +13,7 @@ import zmq
 from tqdm import tqdm
 
 from tormagd.config import Endpoints
-from tormagd.ctl.client import Client, connect, unreachable
+from tormagd.ctl.client import Client, connect, keys_of, unreachable
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.operate import home
 from tormagd.ctl.outcome import CommandError, Exit, is_terminal
@@ -179,8 +179,9 @@ def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: 
         for option, value in ((zmq.RCVHWM, QUEUE), (zmq.MAXMSGSIZE, MAX_BATCH_BYTES)):
             ticks.setsockopt(option, value)
         ticks.subscribe(b"")
-        connect(setpoints, endpoints.setpoint)
-        connect(ticks, endpoints.recording)
+        keys = keys_of(endpoints.curve)
+        connect(setpoints, endpoints.setpoint, keys)
+        connect(ticks, endpoints.recording, keys)
         if not setpoints.poll(round(wait_s * 1e3)):
             raise unreachable(endpoints.setpoint, f"nobody takes setpoints there within {wait_s:g} s")
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:

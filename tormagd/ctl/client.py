@@ -5,29 +5,39 @@ import os
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import msgspec
 import zmq
 
 from tormagd import __version__
+from tormagd.config import ConfigError, Curve
 from tormagd.ctl.outcome import CommandError, Exit, usage_error
+from tormagd.keys import PUBLIC, SECRET, KeyPair, load_pair, load_public
 from tormagd.messages import VERSION, MessageError, Reply, Request, Status, decode, encode
 
 FAULT_CODES = ("fault", "device_latched")
 "Refusals that mean: the device is in FAULT."
 
 
-class Client:
-    """A connection to the control endpoint; a context manager."""
+class Keys(NamedTuple):
+    """What a client shows, and the only daemon that it believes."""
 
-    def __init__(self, address: str, wait_s: float) -> None:
+    client: KeyPair
+    server_public: bytes
+    also_local: bool
+
+
+class Client:
+    """A connection to the control endpoint; a context manager. `keys` are shown where the address wants them."""
+
+    def __init__(self, address: str, wait_s: float, keys: Keys | None = None) -> None:
         self._address, self._wait_s = address, wait_s
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._ids = itertools.count(1)
-        connect(self._socket, address)
+        connect(self._socket, address, keys)
 
     def request(self, command: str, **args: Any) -> dict[str, Any]:
         """The result of `command`. Raises CommandError: UNREACHABLE without an answer in time, REFUSED or FAULT."""
@@ -63,8 +73,29 @@ class Client:
         self.close()
 
 
-def connect(socket: "zmq.Socket[bytes]", address: str) -> None:
-    """Connect `socket`. Raises CommandError (USAGE) for an address that ZeroMQ cannot use."""
+def keys_of(curve: Curve | None) -> Keys | None:
+    """The client's keys in a configuration; None where it has none. Raises CommandError (USAGE): a file is no good."""
+    if curve is None or not curve.client_secret:
+        return None
+    server_public = curve.server_public or curve.server_secret.removesuffix(SECRET) + PUBLIC
+    if server_public == PUBLIC:
+        raise usage_error(
+            "the daemon's public key is not given", f"--server-key FILE: the server{PUBLIC} of the daemon's machine"
+        )
+    try:
+        return Keys(load_pair(Path(curve.client_secret)), load_public(Path(server_public)), curve.also_local)
+    except ConfigError as error:
+        raise usage_error(str(error), "correct the file, or what --key and --server-key name") from error
+
+
+def connect(socket: "zmq.Socket[bytes]", address: str, keys: Keys | None) -> None:
+    """Connect `socket`, showing the keys at `tcp://`, and at `ipc://` where the configuration says so.
+
+    Raises CommandError (USAGE) for an address that ZeroMQ cannot use.
+    """
+    if keys is not None and (address.startswith("tcp://") or keys.also_local):
+        socket.curve_publickey, socket.curve_secretkey = keys.client
+        socket.curve_serverkey = keys.server_public
     try:
         socket.connect(address)
     except zmq.ZMQError as error:
@@ -77,6 +108,11 @@ def connect(socket: "zmq.Socket[bytes]", address: str) -> None:
 def unreachable(address: str, what: str) -> CommandError:
     """Nobody answers at `address`: says why where that can be seen, and what to do."""
     message, hint = f"daemon not reachable at {address}: {what}", "is it running? systemctl status tormagd"
+    if address.startswith("tcp://"):
+        hint += (
+            "; --key and --server-key have to be the pair that is listed there and that daemon's own: its tormagctl "
+            "status and log name those that it refused"
+        )
     if address.startswith("ipc:///"):
         path = Path(address.removeprefix("ipc://"))
         try:

@@ -5,6 +5,7 @@ Every command imports what it needs when it runs: `tormagctl status` answers wit
 
 import argparse
 import math
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from tormagd import __version__
-from tormagd.config import Config, ConfigError, Endpoints, load_config
+from tormagd.config import ENDPOINTS, ROLES, Config, ConfigError, Curve, Endpoints, load_config
 from tormagd.ctl.outcome import CommandError, Outcome, print_error, print_outcome, usage_error
 from tormagd.output import write_line
 
@@ -25,6 +26,8 @@ STATE_COMMANDS = {
     "clear-fault": "forget latched faults; stays disabled",
 }
 EXTRAS = {"mcap": "record", "zstandard": "record", "matplotlib": "plot", "tqdm": "lab"}
+KEY, SERVER_KEY = "TORMAG_KEY", "TORMAG_SERVER_KEY"
+"Environment variables that stand for `--key` and `--server-key`."
 EXIT_TEXT = """exit codes: 0 done, 1 refused or not done (doctor: a failure was found), 2 usage, 3 daemon not reachable,
 4 device in FAULT. With --json stdout carries one object: {command, ok, result, error}."""
 
@@ -52,8 +55,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> Outcome:
+    if options.command == "keys":
+        return _keys(options)
     config = _configuration(options.config)
-    endpoints = _endpoints(config.endpoints, options.endpoint)
+    endpoints = _endpoints(config.endpoints, options)
     match options.command:
         case "send":
             return _send(options, endpoints)
@@ -81,13 +86,21 @@ def _run(options: argparse.Namespace) -> Outcome:
             return _ask(options, endpoints)
 
 
+def _keys(options: argparse.Namespace) -> Outcome:
+    from tormagd.ctl.keys import generate_keys, show_keys
+
+    if options.action == "show":
+        return show_keys(options.path)
+    return generate_keys(options.path, {role: getattr(options, role) for role in ROLES}, options.client)
+
+
 def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
-    from tormagd.ctl.client import Client
+    from tormagd.ctl.client import Client, keys_of
     from tormagd.ctl.firmware import firmware
     from tormagd.ctl.operate import home, operate, take
     from tormagd.ctl.status import status
 
-    with Client(endpoints.control, options.wait) as client:
+    with Client(endpoints.control, options.wait, keys_of(endpoints.curve)) as client:
         match options.command:
             case "status":
                 return status(client)
@@ -102,6 +115,7 @@ def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
 
 
 def _send(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
+    from tormagd.ctl.client import keys_of
     from tormagd.ctl.send import Stream, send
     from tormagd.ctl.waveform import WaveformError, read_csv, shape
     from tormagd.messages import MAX_PREVIEW_SAMPLES
@@ -129,7 +143,7 @@ def _send(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
             "look less far ahead",
         )
     stream = Stream(options.rate, options.source, options.valid_for_ms, preview)
-    return send(endpoints.setpoint, waveform, duration_s, stream, options.wait)
+    return send(endpoints.setpoint, waveform, duration_s, stream, options.wait, keys_of(endpoints.curve))
 
 
 def _doctor(options: argparse.Namespace, config: Config) -> Outcome:
@@ -181,19 +195,29 @@ def _configuration(path: Path | None) -> Config:
         ) from error
 
 
-def _endpoints(configured: Endpoints, address: str | None) -> Endpoints:
-    """`address` in place of the configured control endpoint. An ipc address's neighbours go with it: they are in one
+def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
+    """The configured ones with what the options say instead. An ipc address's neighbours go with it: they are in one
     directory wherever the daemon uses its own names."""
-    if address is None:
-        return configured
-    changed = {"control": address}
-    if address.startswith("ipc://") and address.endswith("/control"):
-        directory = address.removesuffix("control")
-        changed = {name: directory + name for name in Endpoints.__struct_fields__}
+    changed: dict[str, object] = {}
+    curve = configured.curve or Curve()
+    client_secret, server_public = options.key or os.environ.get(KEY), options.server_key or os.environ.get(SERVER_KEY)
+    if client_secret:
+        changed["curve"] = curve = msgspec.structs.replace(curve, client_secret=client_secret)
+    if server_public:
+        changed["curve"] = msgspec.structs.replace(curve, server_public=server_public)
+    address = options.endpoint
+    if address is not None:
+        changed["control"] = address
+        if address.startswith("ipc://") and address.endswith("/control"):
+            directory = address.removesuffix("control")
+            changed |= {name: directory + name for name in ENDPOINTS}
     try:
         return Config(endpoints=msgspec.structs.replace(configured, **changed)).endpoints
     except ValueError as error:
-        raise usage_error(f"--endpoint: {error}", "give an address such as ipc:///run/tormag/control") from error
+        raise usage_error(
+            f"--endpoint: {error}",
+            "give an address such as ipc:///run/tormag/control; for another machine's also --key and --server-key",
+        ) from error
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -204,7 +228,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="tormagctl", description="Operate the tormagd haptic controller.", epilog=EXIT_TEXT
     )
     _add_common(parser)
-    parser.set_defaults(config=None, endpoint=None, json=False, wait=1.0)
+    parser.set_defaults(config=None, endpoint=None, key=None, server_key=None, json=False, wait=1.0)
     parser.add_argument("--version", action="version", version=f"tormagctl {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -265,6 +289,16 @@ def _parser() -> argparse.ArgumentParser:
     scene = command("scene", "list the scenes, or show one (default: the configuration's)")
     scene.add_argument("action", choices=("list", "show"))
     scene.add_argument("name", nargs="?", metavar="NAME")
+    keys = command("keys", "make key pairs for the daemon and its clients, or show a key's fingerprint")
+    keys.add_argument("action", choices=("generate", "show"))
+    keys.add_argument("path", type=Path, metavar="DIR|FILE", help="where the keys are made; whose fingerprint is shown")
+    for role in ROLES:
+        keys.add_argument(
+            f"--{role}", action="append", default=[], metavar="NAME", help=f"also a client, listed for {role}"
+        )
+    keys.add_argument(
+        "--client", metavar="NAME", help="a client's pair alone, made on its own machine: send NAME.key to the daemon's"
+    )
     doctor = command("doctor", "what on this machine would hurt real time or access, each with its remedy")
     doctor.add_argument("--measure", action="store_true", help="also which rates it holds, measured in about 6 s")
     return parser
@@ -275,6 +309,8 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--endpoint", metavar="URL", help="the control endpoint; ipc://DIR/control stands for all in DIR"
     )
+    parser.add_argument("--key", metavar="FILE", help=f"the .key_secret to show at a tcp:// endpoint ({KEY})")
+    parser.add_argument("--server-key", metavar="FILE", help=f"the daemon's .key ({SERVER_KEY})")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.add_argument("--wait", type=_above_zero, metavar="S", help="longest wait for the daemon (1)")
 

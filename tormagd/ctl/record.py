@@ -9,7 +9,7 @@ from pathlib import Path
 import zmq
 
 from tormagd.config import Endpoints
-from tormagd.ctl.client import connect, unreachable
+from tormagd.ctl.client import Keys, connect, keys_of, unreachable
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.messages import MessageError, Telemetry, decode
@@ -29,10 +29,11 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
     `wait_s`; then there is no file. REFUSED where the disk takes no more; what it took stays. A message that cannot be
     read is counted, and the first one's reason told.
     """
+    keys = keys_of(endpoints.curve)
     context = zmq.Context()
     try:
-        telemetry = _subscribe(context, endpoints.telemetry)
-        ticks = _subscribe(context, endpoints.recording)
+        telemetry = _subscribe(context, endpoints.telemetry, keys)
+        ticks = _subscribe(context, endpoints.recording, keys)
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
             if not _any_ready((telemetry, ticks), wait_s, is_interrupted):
                 raise unreachable(endpoints.telemetry, f"nothing is published there within {wait_s:g} s")
@@ -56,12 +57,12 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
         context.destroy(linger=0)
 
 
-def _subscribe(context: "zmq.Context[zmq.Socket[bytes]]", address: str) -> "zmq.Socket[bytes]":
+def _subscribe(context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None) -> "zmq.Socket[bytes]":
     socket = context.socket(zmq.SUB)
     socket.setsockopt(zmq.RCVHWM, QUEUE)
     socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
     socket.subscribe(b"")
-    connect(socket, address)
+    connect(socket, address, keys)
     return socket
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import zmq
 
-from tormagd.ctl.client import connect, unreachable
+from tormagd.ctl.client import Keys, connect, unreachable
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ctl.waveform import Waveform
@@ -23,7 +23,9 @@ class Stream(NamedTuple):
     preview: int = 0
 
 
-def send(address: str, waveform: Waveform, duration_s: float, stream: Stream, wait_s: float) -> Outcome:
+def send(
+    address: str, waveform: Waveform, duration_s: float, stream: Stream, wait_s: float, keys: Keys | None = None
+) -> Outcome:
     """Publish `waveform` for `duration_s` or until interrupted.
 
     Each setpoint has its own deadline, counted from the start, so that lateness does not add up. A setpoint whose
@@ -35,7 +37,7 @@ def send(address: str, waveform: Waveform, duration_s: float, stream: Stream, wa
     socket = context.socket(zmq.XPUB)
     socket.setsockopt(zmq.LINGER, 200)
     try:
-        connect(socket, address)
+        connect(socket, address, keys)
         if not socket.poll(round(wait_s * 1e3)):
             raise unreachable(address, f"nobody takes setpoints there within {wait_s:g} s")
         socket.recv()

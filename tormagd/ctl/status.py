@@ -6,7 +6,17 @@ from collections.abc import Callable, Mapping, Sequence
 from firmware_protocol.build import COST, REMEDY
 from tormagd.ctl.client import Client, understood
 from tormagd.ctl.outcome import Colour, Exit, Outcome
-from tormagd.messages import Explained, LinkReport, RateReport, SetpointReport, SourceReport, Status, WayReport
+from tormagd.messages import (
+    Explained,
+    LinkReport,
+    PeerReport,
+    PeersReport,
+    RateReport,
+    SetpointReport,
+    SourceReport,
+    Status,
+    WayReport,
+)
 
 UNKNOWN = "-"
 SURE_WINDOWS = 20
@@ -39,6 +49,7 @@ def status_text(known: Status, colour: Colour) -> str:
         f"setpoint  {_number(known.setpoint_age_ms, 'ms', 0)} old, {_counts(known.setpoints, SETPOINT_COUNTS)}",
         *(line for name, source in known.setpoints.by_source.items() for line in _source(name, source, colour)),
         *_way(known.way, colour),
+        *_peers(known.peers, colour),
         f"link      {known.link.state}, {_counts(known.link, LINK_COUNTS)}",
         *_explained(known.link.cause, known.link.remedy, colour.yellow),
         *(_rate(name, group, colour) for name, group in known.rates.items()),
@@ -49,6 +60,20 @@ def status_text(known: Status, colour: Colour) -> str:
     if known.setpoints.last_refusal:
         lines.append(f"refused   {colour.yellow(known.setpoints.last_refusal)}")
     return "\n".join(lines)
+
+
+def _peers(peers: PeersReport, colour: Colour) -> list[str]:
+    """Who was not let in or sent too much, with the newest and the worst of them; nothing while nobody was."""
+    lines = []
+    if peers.refused:
+        lines.append(f"peers     {colour.yellow(f'{peers.refused} refused')}")
+    if peers.dropped:
+        lines.append(f"peers     {colour.yellow(f'{peers.dropped} messages not read')}")
+    return [*lines, *(f"          {_peer(each)}" for each in (*peers.refusals[-1:], *peers.drops[:1]))]
+
+
+def _peer(peer: PeerReport) -> str:
+    return f"{peer.endpoint}: {peer.address}{f', key {peer.key}' if peer.key else ''}: {peer.reason} ({peer.count})"
 
 
 def _core(build: str, colour: Colour) -> list[str]:

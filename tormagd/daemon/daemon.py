@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import signal
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -21,12 +22,17 @@ from tormagd.daemon.realtime import freeze_garbage, priority_of_threads
 from tormagd.daemon.telemetry_loop import TelemetryLoop
 from tormagd.hardware.backend import Backend
 from tormagd.hardware.connection import Connection
+from tormagd.keys import KeyRing
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import OperatingState
 
 NS = 1_000_000_000
 OPENING_LOOK_S = 0.02
 "How often the end of the opening is looked for: Status comes as often."
+SWITCH_S = 1e-4
+"For so long another thread may keep the interpreter's lock while this one waits for it; Python's own is 5 ms."
+TAKEN_BEFORE_NS = 200_000
+"Requests are taken no later than this before the next control tick."
 LONGEST_RETRACT_S = 10.0
 "A full stroke takes the firmware 3 s at its own retract speed; longer means that it cannot, and it says so itself."
 
@@ -36,13 +42,20 @@ log = logging.getLogger(__name__)
 class Daemon:
     """Runs one scene on one device until it is told to end."""
 
-    def __init__(self, config: Config, core: Core, open_backend: Callable[[], Backend], refused: list[str]) -> None:
+    def __init__(
+        self,
+        config: Config,
+        core: Core,
+        open_backend: Callable[[], Backend],
+        refused: list[str],
+        keys: KeyRing | None = None,
+    ) -> None:
         self._config, self._core = config, core
         self._loop = asyncio.get_running_loop()
         self._callbacks = Callbacks(self._loop)
         self._causes = Causes(config.device)
         self._connection = Connection(config.device, open_backend, self._lose_link)
-        self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources.priority)
+        self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources.priority, keys)
         rates = config.rates
         self._control = ControlLoop(core.stepper, self._connection, NS // rates.control_hz)
         self._inference = InferenceLoop(
@@ -77,9 +90,12 @@ class Daemon:
         """Runs until SIGTERM or SIGINT; opens the gap before it returns."""
         for number in (signal.SIGTERM, signal.SIGINT):
             self._loop.add_signal_handler(number, self._ended.set)
+        self._loop.add_signal_handler(signal.SIGHUP, self._endpoint.admission.reload)
         self._connection.open(self._callbacks)
         freeze_garbage()
+        sys.setswitchinterval(SWITCH_S)
         self._callbacks.add_reader(self._endpoint.fileno(), self._receive_setpoints)
+        self._callbacks.add_reader(self._endpoint.control_fileno(), self._receive_requests)
         heartbeat = Heartbeat(NS // self._config.rates.control_hz)
         # not on one account: its parts have their own
         self._loop.add_reader(heartbeat.fileno(), self._beat, heartbeat)
@@ -100,6 +116,7 @@ class Daemon:
         await self._profiles.finished()
         self._loop.remove_reader(heartbeat.fileno())
         self._callbacks.remove_reader(self._endpoint.fileno())
+        self._callbacks.remove_reader(self._endpoint.control_fileno())
         self._connection.close()
         heartbeat.close()
         self._endpoint.close()
@@ -119,6 +136,9 @@ class Daemon:
             self._causes.note_stall(control.state, callbacks.blame(driven_ns - timing.delay_ns, driven_ns))
         else:
             callbacks.forget()
+        if self._endpoint.has_requests:
+            self._telemetry.take_requests()
+            callbacks.ran(TelemetryLoop.take_requests.__qualname__, driven_ns, time.monotonic_ns())
         if faults := control.new_faults():
             self._causes.tell(faults, control.state, control.measurement)
         try:
@@ -133,6 +153,16 @@ class Daemon:
 
     def _receive_setpoints(self) -> None:
         self._inference.receive(self._control.state.estimate, self._control.next_tick_ns)
+
+    def _receive_requests(self) -> None:
+        # shortly before a tick they wait for it, as setpoints do: it goes first, and sends what they ask for. A flood
+        # waits for it anyway: it would leave the processor nothing else
+        if self._endpoint.has_requests:
+            return
+        if time.monotonic_ns() + TAKEN_BEFORE_NS < self._control.next_tick_ns:
+            self._telemetry.take_requests()
+        else:
+            self._endpoint.has_requests = True
 
     def _lose_link(self) -> None:
         self._control.lose_link()

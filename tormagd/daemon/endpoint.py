@@ -1,30 +1,33 @@
 """The ZeroMQ endpoint: setpoints in, telemetry and recording out, commands answered.
 
 Everything that arrives is hostile until `messages.decode` has passed it. A refused message is counted, its reason kept,
-and control goes on.
+and control goes on. Who may connect at all is `admission`'s to say; how much each may send, `allowance`'s.
 """
 
 import contextlib
 import logging
 import os
-import socket
-import struct
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import zmq
-import zmq.utils.monitor
 
-from tormagd.config import Endpoints
+from tormagd.config import ENDPOINTS, Endpoints
+from tormagd.daemon.admission import MAY, OTHERS, Admission, shown
+from tormagd.daemon.allowance import Allowance
 from tormagd.daemon.inbox import SOURCES, SetpointInbox
+from tormagd.daemon.requests import FIRST, Requests, Waiting, may_go_first
 from tormagd.daemon.socket_file import SocketFile, ipc_path
+from tormagd.keys import KeyRing
 from tormagd.messages import (
     MAX_MESSAGE_BYTES,
     VERSION,
     ErrorReply,
     MessageError,
+    PeerReport,
+    PeersReport,
     Reply,
     Request,
     Telemetry,
@@ -35,15 +38,27 @@ from tormagd.messages import (
 )
 from tormagd.safety.operating_state import RefusedError
 
-DRAIN = 64
-"Setpoints read per tick at most; more wait for the next, so that a flood cannot stall control."
+DRAIN = 32
+"Setpoints read at once at most; more wait for the next tick, so that a flood cannot stall control."
+SETPOINTS_PER_S, SETPOINT_BURST = 4_000.0, 1_000.0
+"What one publisher may send; the rest is dropped unread. The burst is what comes at once after a network's pause."
+TAKEN, TAKEN_NS = 64, 150_000
+"Requests taken from the socket at once at most, and for how long."
 REQUESTS = 16
 "Commands answered per telemetry period at most."
+FIRST_AT_ONCE = 4
+"Requests that may be a `stop`, looked at in one go at most."
 RECONNECT_S = 0.5
 "A peer that was cut off comes back within this time (libzmq's default is 0.1 s)."
-
-_CREDENTIALS = struct.Struct("3i")
-_Peer = tuple[int, ...] | str
+NEWS_S = 10.0
+"At most one log line about what was not read in this time."
+PEERS = 16
+"Peers whose messages were not read, as many as are named."
+TOO_MUCH, NOT_ALLOWED, OFF_THE_LIST = "sent too much", "command not allowed", "key taken off the list"
+OBSERVED = frozenset({"status"})
+"What an observer may ask."
+OPERATOR = frozenset({"operate"})
+PUBLISHER = frozenset({"publish"})
 
 log = logging.getLogger(__name__)
 
@@ -55,10 +70,18 @@ class Endpoint:
     Raises OSError naming the endpoint that cannot be bound, and why: another daemon has it, say.
     """
 
-    def __init__(self, endpoints: Endpoints, io_priority: int = 0, priority: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self,
+        endpoints: Endpoints,
+        io_priority: int = 0,
+        priority: tuple[str, ...] = (),
+        keys: KeyRing | None = None,
+    ) -> None:
         self._context = context(io_priority)
         self._files: list[SocketFile] = []
+        self._guarded = {name for name in ENDPOINTS if endpoints.is_guarded(name)}
         self.inbox = SetpointInbox(priority)
+        self.admission = Admission(self._context, keys, io_priority)
         try:
             self._setpoints = self._bind(zmq.SUB, "setpoint", endpoints.setpoint)
             self._telemetry = self._bind(zmq.PUB, "telemetry", endpoints.telemetry)
@@ -68,25 +91,51 @@ class Endpoint:
             self._release()
             raise
         self._setpoints.subscribe(b"")
-        self._monitor = self._setpoints.get_monitor_socket(zmq.EVENT_DISCONNECTED | zmq.EVENT_ACCEPTED)
-        self._peers: dict[int, _Peer] = {}
-        self._cut_off: deque[tuple[_Peer, float]] = deque(maxlen=SOURCES)
+        self.admission.start()
+        self._is_in_parts = False
+        self._is_in_parts_of_request = False
+        self._requests = Requests()
+        self.has_requests = False
+        "Whether requests may be waiting in the socket that its descriptor says nothing of any more."
+        self.is_flooded = False
+        "Whether there were more setpoints than are read at once."
+        self._allowance = Allowance(SETPOINTS_PER_S, SETPOINT_BURST)
+        self._drops: Counter[tuple[str, str, str]] = Counter()
+        self._dropped = self._told = 0
+        self._tell_s = 0.0
+        self._cut_off: deque[tuple[str, float]] = deque(maxlen=SOURCES)
 
     def fileno(self) -> int:
         """The descriptor that becomes readable when setpoints may have arrived (edge-triggered: drain them)."""
         return self._setpoints.fileno()
+
+    def control_fileno(self) -> int:
+        """The same of requests (`take_requests`)."""
+        return self._control.fileno()
 
     def drain_setpoints(self) -> bool:
         """Reads what has arrived, at most DRAIN messages; True if there is a newer setpoint."""
         is_newer = False
         for _ in range(DRAIN):
             try:
-                parts = self._setpoints.recv_multipart(zmq.NOBLOCK)
+                frame = self._setpoints.recv(zmq.NOBLOCK, copy=False)
             except zmq.Again:
+                self.is_flooded = False
                 return is_newer
-            data = parts[0] if len(parts) == 1 else b""
+            is_rest, self._is_in_parts = self._is_in_parts, frame.more
+            if is_rest:
+                continue  # of a message that was refused by its first part
             # both clocks at once, for each message: how they part says which clock was set, and a drain may be held up
-            is_newer = self.inbox.take(data, time.monotonic(), time.time_ns()) or is_newer
+            now_s, realtime_ns = time.monotonic(), time.time_ns()
+            public, peer = self._sender(frame, "setpoint")
+            if not self._allowance.grants(peer, now_s):
+                continue
+            if public and not self.admission.has_role(public, PUBLISHER):
+                self._drop("setpoint", peer, OFF_THE_LIST, 1)
+                continue
+            data = b"" if frame.more else frame.bytes
+            is_newer = self.inbox.take(data, now_s, realtime_ns) or is_newer
+        self.is_flooded = True
         return is_newer
 
     def publish(self, telemetry: Telemetry) -> None:
@@ -97,30 +146,67 @@ class Endpoint:
         """Sends the control ticks since the last time, a row each."""
         self._send(self._recording, encode_ticks(rows, columns))
 
+    def take_requests(self, answer: Callable[[Request], dict[str, Any]]) -> None:
+        """Takes what has arrived, at most TAKEN in TAKEN_NS; answers `stop` and `disable`, the rest waits for `serve`.
+
+        `answer` returns the result or raises RefusedError.
+        """
+        looked_at, until_ns = 0, time.monotonic_ns() + TAKEN_NS
+        self.has_requests = True
+        for _ in range(TAKEN):
+            try:
+                waiting = self._next_request()
+            except zmq.Again:
+                self.has_requests = False
+                return
+            if waiting is None:
+                continue
+            if may_go_first(waiting.data):
+                looked_at += 1
+                is_answered = self._is_answered_first(waiting, answer)
+            else:
+                is_answered = False
+            if not is_answered and not self._requests.put(waiting):
+                self._drop("control", waiting.peer, TOO_MUCH, 1)
+            if looked_at == FIRST_AT_ONCE or time.monotonic_ns() >= until_ns:
+                return
+
     def serve(self, now_s: float, answer: Callable[[Request], dict[str, Any]], until_ns: int) -> None:
         """Answers waiting commands, at most REQUESTS, and none but the first from `until_ns` (monotonic) on.
 
         `answer` returns the result or raises RefusedError.
         """
         self._count_oversize(now_s)
+        self._tell_drops(now_s)
+        if not self._requests.any_waiting:
+            self.take_requests(answer)
         for number in range(REQUESTS):
             if number and time.monotonic_ns() >= until_ns:
                 return
-            try:
-                envelope = self._control.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
+            waiting = self._requests.next()
+            if waiting is None:
                 return
-            reply = _reply(envelope[-1], answer)
-            # a client that has gone meanwhile is not our business
-            with contextlib.suppress(zmq.ZMQError):
-                self._control.send_multipart([*envelope[:-1], encode(reply)], zmq.NOBLOCK)
+            self._reply(waiting, self._answered(waiting, answer))
+
+    def report(self) -> PeersReport:
+        """Who connects, who was refused, who sent too much."""
+        return PeersReport(
+            connections=self.admission.connections(),
+            refused=self.admission.refused,
+            dropped=self._dropped,
+            refusals=self.admission.refusals(),
+            drops=tuple(
+                PeerReport(name, *self._known(peer), reason, count)
+                for (name, peer, reason), count in self._drops.most_common()
+            ),
+        )
 
     def close(self) -> None:
         """Closes the sockets without waiting for anybody."""
-        self._setpoints.disable_monitor()
         self._release()
 
     def _release(self) -> None:
+        self.admission.close()
         for file in self._files:
             file.close()
         self._context.destroy(linger=0)
@@ -133,6 +219,7 @@ class Endpoint:
         made.setsockopt(zmq.SNDHWM, 1_000)
         path = ipc_path(address)
         try:
+            self.admission.guard(made, name, name in self._guarded)
             if path is not None:
                 file = SocketFile(path)
                 self._files.append(file)
@@ -149,22 +236,113 @@ class Endpoint:
         with contextlib.suppress(zmq.Again):
             to.send(data, zmq.NOBLOCK)
 
+    def _sender(self, frame: zmq.Frame, name: str) -> tuple[str, str]:
+        """The key that a message was sent with, empty at an open endpoint; and what its sender is counted by."""
+        # its host, or for a local socket its process
+        address = str(frame.get("Peer-Address"))
+        if name not in self._guarded:
+            return "", address
+        public = str(frame.get("User-Id"))
+        return public, f"{address} {public}"
+
+    def _known(self, peer: str) -> tuple[str, str]:
+        """Address and key of a sender, as people know them."""
+        address, _, public = peer.partition(" ")
+        return address if address == OTHERS else shown(address), self.admission.name(public) if public else ""
+
+    def _next_request(self) -> Waiting | None:
+        """The next message; None for a further part of one that had too many. Raises zmq.Again.
+
+        A message that is no request has nothing in it, and is answered as what is no request.
+        """
+        if self._is_in_parts_of_request:
+            self._is_in_parts_of_request = self._control.recv(zmq.NOBLOCK, copy=False).more
+            return None
+        envelope = [self._control.recv(zmq.NOBLOCK)]
+        part = self._control.recv(zmq.NOBLOCK, copy=False)
+        if part.more and not part.bytes:  # the delimiter of a REQ socket
+            envelope.append(b"")
+            part = self._control.recv(zmq.NOBLOCK, copy=False)
+        self._is_in_parts_of_request = part.more
+        public, peer = self._sender(part, "control")
+        return Waiting(envelope, b"" if part.more else part.bytes, public, peer, self._requests.opens)
+
+    def _is_answered_first(self, waiting: Waiting, answer: Callable[[Request], dict[str, Any]]) -> bool:
+        try:
+            request = decode(waiting.data, Request)
+        except MessageError:
+            return False
+        if request.command not in FIRST:
+            return False
+        reply = self._answered(waiting, answer)
+        if reply.ok:
+            self._requests.opens += 1
+        self._reply(waiting, reply)
+        return True
+
+    def _answered(self, waiting: Waiting, answer: Callable[[Request], dict[str, Any]]) -> Reply:
+        try:
+            request = decode(waiting.data, Request)
+        except MessageError as error:
+            refused = ErrorReply("bad_request", str(error), "see the message table in the README")
+            return Reply(v=VERSION, id=None, ok=False, error=refused)
+        try:
+            self._require_permitted(request, waiting)
+            return Reply(v=VERSION, id=request.id, ok=True, result=answer(request))
+        except RefusedError as error:
+            return Reply(v=VERSION, id=request.id, ok=False, error=ErrorReply(error.code, error.message, error.hint))
+
+    def _require_permitted(self, request: Request, waiting: Waiting) -> None:
+        is_observed = request.command in OBSERVED
+        roles = MAY["control"] if is_observed else OPERATOR
+        if waiting.public and not self.admission.has_role(waiting.public, roles):
+            self._drop("control", waiting.peer, NOT_ALLOWED, 1)
+            raise RefusedError(
+                "forbidden",
+                f"{request.command!r} is not for the key {self.admission.name(waiting.public)}",
+                "its .key belongs in the daemon's folder of operators (operate), which SIGHUP reads again",
+            )
+        if self._requests.is_overtaken(waiting) and not is_observed:
+            raise RefusedError(
+                "overtaken",
+                f"stop or disable came after {request.command!r} and went first",
+                "give it again if it is meant",
+            )
+
+    def _reply(self, waiting: Waiting, reply: Reply) -> None:
+        self.has_requests = True
+        # a client that has gone meanwhile is not our business
+        with contextlib.suppress(zmq.ZMQError):
+            self._control.send_multipart([*waiting.envelope, encode(reply)], zmq.NOBLOCK)
+
+    def _drop(self, name: str, peer: str, reason: str, count: int) -> None:
+        self._dropped += count
+        if (name, peer, reason) not in self._drops and len(self._drops) >= PEERS:
+            peer = OTHERS
+        self._drops[name, peer, reason] += count
+
+    def _tell_drops(self, now_s: float) -> None:
+        beyond = self._allowance.dropped
+        while beyond:
+            peer, count = beyond.popitem()
+            self._drop("setpoint", peer, TOO_MUCH, count)
+        if self._dropped > self._told and now_s >= self._tell_s:
+            (name, peer, reason), count = self._drops.most_common(1)[0]
+            who = " ".join(self._known(peer)).strip()
+            news = self._dropped - self._told
+            log.warning("%d messages were not read; most of all from %s at %s: %d, %s", news, who, name, count, reason)
+            self._told, self._tell_s = self._dropped, now_s + NEWS_S
+
     def _count_oversize(self, now_s: float) -> None:
         # libzmq cuts off a peer that sends more than MAXMSGSIZE and delivers nothing. The only trace is a peer that is
         # disconnected and, unlike one that leaves, connects again at once by itself. A process that closes its socket
         # and opens another that soon looks the same; over TCP, where only the machine is known, so do two processes
-        while self._monitor.poll(0):
-            event = zmq.utils.monitor.recv_monitor_message(self._monitor)
-            descriptor = event["value"]
-            if event["event"] == zmq.EVENT_DISCONNECTED:
-                gone = self._peers.pop(descriptor, None)
-                if gone is not None:
-                    self._cut_off.append((gone, now_s))
+        moves = self.admission.moves
+        while moves:
+            peer, has_left = moves.popleft()
+            if has_left:
+                self._cut_off.append((peer, now_s))
                 continue
-            peer = _peer(descriptor)
-            if peer is None:
-                continue
-            self._peers[descriptor] = peer
             for cut_off in self._cut_off:
                 if cut_off[0] == peer and now_s - cut_off[1] < RECONNECT_S:
                     self._cut_off.remove(cut_off)
@@ -182,32 +360,3 @@ def context(io_priority: int) -> "zmq.Context[zmq.Socket[bytes]]":
         made.set(zmq.THREAD_SCHED_POLICY, os.SCHED_FIFO)
         made.set(zmq.THREAD_PRIORITY, io_priority)
     return made
-
-
-def _peer(descriptor: int) -> _Peer | None:
-    """The process at the other end of an accepted connection, over TCP its host; None where it has gone already."""
-    try:
-        connection = socket.socket(fileno=os.dup(descriptor))
-    except OSError:
-        return None
-    with connection:
-        try:
-            if connection.family == socket.AF_UNIX:
-                return _CREDENTIALS.unpack(
-                    connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-                )
-            return str(connection.getpeername()[0])
-        except OSError:
-            return None
-
-
-def _reply(data: bytes, answer: Callable[[Request], dict[str, Any]]) -> Reply:
-    try:
-        request = decode(data, Request)
-    except MessageError as error:
-        refused = ErrorReply("bad_request", str(error), "see the message table in the README")
-        return Reply(v=VERSION, id=None, ok=False, error=refused)
-    try:
-        return Reply(v=VERSION, id=request.id, ok=True, result=answer(request))
-    except RefusedError as error:
-        return Reply(v=VERSION, id=request.id, ok=False, error=ErrorReply(error.code, error.message, error.hint))

@@ -52,6 +52,8 @@ class InferenceLoop:
             # not even reading: the tick would wait for that, and the plan come no sooner. The descriptor stays
             # readable, so this is asked again and again until the tick: at 500 setpoints a second 1 % of the time
             self._waiting_ns = self._waiting_ns or start_ns
+        elif self._endpoint.is_flooded:
+            pass  # it goes on once a tick: between ticks a flood would leave the processor nothing else
         elif self._endpoint.drain_setpoints():
             self._plan(estimate, start_ns)
             self._learn_slack(start_ns)

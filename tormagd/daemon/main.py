@@ -11,7 +11,7 @@ import msgspec
 
 from firmware_protocol.build import settle
 from tormagd import __version__
-from tormagd.config import Config, ConfigError, load_config
+from tormagd.config import ENDPOINTS, Config, ConfigError, Endpoints, load_config
 from tormagd.output import write_line
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from tormagd.control.core import Core
     from tormagd.hardware.backend import Backend
+    from tormagd.keys import KeyRing
 
 REFUSED = 2
 
@@ -48,6 +49,7 @@ def _start(options: argparse.Namespace) -> int:
 
     try:
         config = load_config(options.config)
+        keys = _keys(config.endpoints)
         core = build_core(config)
         backend = choose(config.device, config.rates)
     except ConfigError as error:
@@ -57,19 +59,26 @@ def _start(options: argparse.Namespace) -> int:
         _print_resolved(config, core, backend.options)
         return 0
     try:
-        uvloop.run(_run(config, core, backend.open))
+        uvloop.run(_run(config, core, backend.open, keys))
     except OSError as error:
         print(f"tormagd: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-async def _run(config: Config, core: "Core", open_backend: "Callable[[], Backend]") -> None:
+def _keys(endpoints: Endpoints) -> "KeyRing | None":
+    """The daemon's keys where an endpoint demands them. Raises ConfigError."""
+    from tormagd.keys import KeyRing
+
+    return KeyRing(endpoints) if any(endpoints.is_guarded(name) for name in ENDPOINTS) else None
+
+
+async def _run(config: Config, core: "Core", open_backend: "Callable[[], Backend]", keys: "KeyRing | None") -> None:
     from tormagd.daemon.daemon import Daemon
     from tormagd.daemon.realtime import prepare
 
     refused = prepare(config.realtime)
-    await Daemon(config, core, open_backend, refused).run()
+    await Daemon(config, core, open_backend, refused, keys).run()
 
 
 def _print_resolved(config: Config, core: "Core", options: msgspec.Struct) -> None:

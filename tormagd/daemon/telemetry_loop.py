@@ -110,6 +110,10 @@ class TelemetryLoop:
         self._report_sources(start_ns * 1e-9)
         self.timing.record(due_ns, start_ns, time.monotonic_ns())
 
+    def take_requests(self) -> None:
+        """Takes the requests that have arrived: `stop` and `disable` are carried out, the rest waits for `publish`."""
+        self._endpoint.take_requests(self._command)
+
     def conditions(self) -> Conditions:
         """What a command is decided on now."""
         return conditions(
@@ -173,6 +177,9 @@ class TelemetryLoop:
             if self._status is None:
                 self._status = msgspec.to_builtins(self._build_status(newest))
             return self._status
+        return self._command(request)
+
+    def _command(self, request: Request) -> dict[str, Any]:
         self._status = None
         if request.command == "take":
             return self._give(request.args.get("source"))
@@ -228,6 +235,7 @@ class TelemetryLoop:
             least_gap_mm=round(plan.least_gap_mm, 2),
             link=link,
             setpoints=inbox.report(now_s),
+            peers=self._endpoint.report(),
             rates={group.name: group.report for group in self._groups},
             late_ticks_by=dict(self._callbacks.blamed),
             fault_details=self._causes.of_faults(safety.faults),

@@ -1,0 +1,183 @@
+"""Key files: what is made, and what is refused with a sentence."""
+
+import os
+import stat
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+import zmq
+
+from tormagd.config import ENDPOINTS, Config, ConfigError, Curve, Endpoints
+from tormagd.keys import (
+    MAX_KEY_FILE_BYTES,
+    KeyRing,
+    fingerprint,
+    generate,
+    load_folder,
+    load_pair,
+    load_public,
+)
+
+FAR = {name: f"tcp://192.0.2.1:{5_555 + number}" for number, name in enumerate(ENDPOINTS)}
+
+
+def ring(folder: Path) -> KeyRing:
+    curve = Curve(server_secret=str(folder / "server.key_secret"))
+    return KeyRing(Config(endpoints=Endpoints(**FAR, curve=curve)).endpoints)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """What `tormagctl keys generate` makes."""
+    generate("server", tmp_path, tmp_path)
+    for role in ("publish", "operate", "observe"):
+        generate(f"{role}r", tmp_path, tmp_path / role)
+    return tmp_path
+
+
+def test_keys_are_their_owners_only_and_a_pair(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        secret, public = generate("robot", tmp_path / "a", tmp_path / "a/publish")
+    finally:
+        os.umask(before)
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (secret, public)] == [0o600, 0o600]
+    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o700
+    pair = load_pair(secret)
+    assert zmq.curve_public(pair.secret) == pair.public == load_public(public) == load_public(secret)
+    assert "secret-key" not in public.read_text()
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["publish", "robot.key_secret"]
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    secret, public = generate("robot", tmp_path, tmp_path / "publish")
+    kept = secret.read_bytes(), public.read_bytes()
+    with pytest.raises(ConfigError, match=f"^{secret} exists: keys are never overwritten"):
+        generate("robot", tmp_path, tmp_path / "publish")
+    secret.unlink()
+    with pytest.raises(ConfigError, match=f"^{public} exists"):
+        generate("robot", tmp_path, tmp_path / "publish")
+    assert not secret.exists()
+    assert public.read_bytes() == kept[1]
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../robot", "a/b", "-robot", "a\x1b[2J", "x" * 65, "robot\n"])
+def test_a_name_is_a_files_name(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ConfigError, match=r"^name = "):
+        generate(name, tmp_path, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_lists_say_who_may_do_what(folder: Path) -> None:
+    (folder / "observe/other.key").write_bytes((folder / "publish/publishr.key").read_bytes())
+    (folder / "observe/other.key").chmod(0o644)
+    (folder / "observe/README").write_text("not a key")
+    keys = ring(folder)
+    assert keys.server == load_pair(folder / "server.key_secret")
+    roles = sorted((listed.name, sorted(listed.roles)) for listed in keys.allowed.values())
+    assert roles == [("observer", ["observe"]), ("operater", ["operate"]), ("other", ["observe", "publish"])]
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o644])
+def test_a_secret_that_others_can_read_is_refused(folder: Path, mode: int) -> None:
+    secret = folder / "server.key_secret"
+    secret.chmod(mode)
+    with pytest.raises(ConfigError, match=rf"^{secret} can be read by others \(mode {mode:04o}\).*chmod 600 {secret}"):
+        ring(folder)
+
+
+@pytest.mark.parametrize("path", ["publish", "operate/operater.key"])
+def test_a_list_that_others_can_write_is_refused(folder: Path, path: str) -> None:
+    (folder / path).chmod(0o770)
+    with pytest.raises(ConfigError, match=rf"^{folder / path} can be written by others \(mode 0770\).*chmod go-w"):
+        ring(folder)
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        ("", "holds no public key"),
+        ("curve\n    public-key\n", "holds no public key"),
+        ('curve\n    public-key = "short"\n', "40 characters"),
+        (f'curve\n    public-key = "{"~" * 40}"\n', "40 characters"),
+        (f'curve\n    public-key = "{"#" * 40}"\n', "40 characters"),
+        ("x" * (MAX_KEY_FILE_BYTES + 1), "at most 4096 bytes"),
+        (b"\xff" * 100, "holds no public key"),
+    ],
+    ids=range(7),
+)
+def test_a_file_that_is_no_key_is_named(folder: Path, content: str | bytes, named: str) -> None:
+    path = folder / "publish/broken.key"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    path.chmod(0o600)
+    with pytest.raises(ConfigError, match=f"^{path}.*{named}"):
+        ring(folder)
+
+
+def test_what_is_no_file_is_not_waited_for(folder: Path) -> None:
+    os.mkfifo(folder / "publish/pipe.key", 0o600)
+    with pytest.raises(ConfigError, match=r"pipe.key: allowed is a regular file"):
+        ring(folder)
+    with pytest.raises(ConfigError, match=r"^/dev/zero: allowed is a regular file"):
+        load_pair(Path("/dev/zero"))
+
+
+def test_what_is_missing_is_named(folder: Path) -> None:
+    (folder / "observe/observer.key").unlink()
+    (folder / "observe").rmdir()
+    with pytest.raises(ConfigError, match=f"^{folder}/observe: No such file or directory: it is to hold"):
+        ring(folder)
+    with pytest.raises(ConfigError, match=r"^/nowhere/a.key_secret: No such file"):
+        load_pair(Path("/nowhere/a.key_secret"))
+
+
+def test_keys_that_do_not_belong_together_are_refused(folder: Path) -> None:
+    mine, other = (folder / f"{name}.key_secret" for name in ("server", "publishr"))
+    mine.write_text(mine.read_text().replace(load_pair(mine).public.decode(), load_pair(other).public.decode()))
+    with pytest.raises(ConfigError, match="do not belong together"):
+        load_pair(mine)
+    public = folder / "publish/publishr.key"
+    with pytest.raises(ConfigError, match="holds no secret key"):
+        load_pair(public)
+
+
+def test_a_fingerprint_is_the_keys_own() -> None:
+    first, second = (fingerprint(zmq.curve_keypair()[0]) for _ in range(2))
+    assert first != second
+    assert len(first) == 19
+    # the key of ZeroMQ's own documentation (zmq_curve), as text and as bytes
+    key = bytes.fromhex("BB88471D65E2659B30C55A5321CEBB5AAB2B70A398645C26DCA2B2FCB43FC518")
+    assert fingerprint(b"Yne@$w-vo<fVvi]a<NY6T1ed:M$fCG*[IaLV{hID").replace(":", "") == sha256(key).hexdigest()[:16]
+
+
+def test_an_empty_folder_lets_nobody_in(tmp_path: Path) -> None:
+    assert list(load_folder(tmp_path)) == []
+
+
+# -- the configuration ---------------------------------------------------------------------------------------------
+
+
+def test_other_machines_are_taken_with_keys_only() -> None:
+    with pytest.raises(ValueError, match=r"endpoints.setpoint = 'tcp://192.0.2.1:5555': .* CURVE keys in \[endpoints"):
+        Config(endpoints=Endpoints(**FAR))
+    with pytest.raises(ValueError, match="CURVE"):
+        Config(endpoints=Endpoints(**FAR, curve=Curve()))
+    for curve in (Curve(server_secret="a"), Curve(client_secret="a")):
+        assert all(Config(endpoints=Endpoints(**FAR, curve=curve)).endpoints.is_guarded(name) for name in ENDPOINTS)
+
+
+@pytest.mark.parametrize("address", ["tcp://eth0:5555", "tcp://300.0.0.1:1", "tcp://[::1]:1", "tcp://192.0.2.1:0", "*"])
+def test_with_keys_too_an_address_has_to_be_one(address: str) -> None:
+    with pytest.raises(ValueError, match="IPv4 address and a port"):
+        Config(endpoints=Endpoints(setpoint=address, curve=Curve(server_secret="a")))
+
+
+def test_local_endpoints_are_open_unless_the_configuration_says_so() -> None:
+    local = {"setpoint": "tcp://127.0.0.1:5555", "control": "ipc:///tmp/control"}
+    for also_local in (False, True):
+        curve = Curve(server_secret="a", also_local=also_local)
+        endpoints = Config(endpoints=Endpoints(**local, curve=curve)).endpoints
+        assert [endpoints.is_guarded(name) for name in ENDPOINTS] == [also_local] * 4
+    with pytest.raises(ValueError, match="also_local"):
+        Config(endpoints=Endpoints(**local, curve=Curve(also_local=True)))

@@ -1,0 +1,148 @@
+"""`tormagctl keys`, and clients that show a key: to a daemon made of guarded sockets only."""
+
+import json
+import stat
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+import zmq
+from zmq.auth import load_certificate
+from zmq.utils import z85
+
+from tormagd.ctl.main import KEY, SERVER_KEY, main
+from tormagd.messages import VERSION
+
+
+def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
+    capsys.readouterr()
+    code = main(["--json", *arguments])
+    return code, json.loads(capsys.readouterr().out)
+
+
+@pytest.fixture
+def keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    code, _ = run_json(capsys, "keys", "generate", str(tmp_path / "keys"), "--operate", "console", "--publish", "robot")
+    assert code == 0
+    return tmp_path / "keys"
+
+
+def test_one_command_makes_the_server_its_clients_and_the_lists(keys: Path) -> None:
+    made = {str(path.relative_to(keys)) for path in keys.rglob("*")}
+    assert made == {
+        *("server.key", "server.key_secret", "console.key_secret", "robot.key_secret"),
+        *("publish", "operate", "observe", "publish/robot.key", "operate/console.key"),
+    }
+    for path in keys.rglob("*"):
+        assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600)
+
+
+def test_a_client_is_added_later_and_nothing_is_made_twice(keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (keys / "server.key_secret").read_bytes()
+    code, printed = run_json(capsys, "keys", "generate", str(keys), "--observe", "screen")
+    assert code == 0
+    assert [made["name"] for made in printed["result"]["made"]] == ["screen"]
+    for arguments in ((), ("--observe", "screen"), ("--publish", "server"), ("--client", "robot")):
+        code, printed = run_json(capsys, "keys", "generate", str(keys), *arguments)
+        assert code == 2
+        assert "exists: keys are never overwritten" in printed["error"]["message"]
+    assert (keys / "server.key_secret").read_bytes() == before
+
+
+def test_a_client_makes_its_own_pair_and_its_secret_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, printed = run_json(capsys, "keys", "generate", str(tmp_path / "mine"), "--client", "robot")
+    assert code == 0
+    assert sorted(path.name for path in (tmp_path / "mine").iterdir()) == ["robot.key", "robot.key_secret"]
+    (made,) = printed["result"]["made"]
+    shown = run_json(capsys, "keys", "show", made["public"])[1]["result"]["keys"]
+    assert shown == [{"name": "robot", "fingerprint": made["fingerprint"]}]
+    code, printed = run_json(capsys, "keys", "generate", str(tmp_path), "--client", "a", "--publish", "b")
+    assert code == 2
+    assert not list(tmp_path.glob("*.key*"))
+
+
+def test_a_folder_of_keys_is_shown(keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["keys", "show", str(keys / "publish")]) == 0
+    assert capsys.readouterr().out.endswith("  robot\n")
+    assert run_json(capsys, "keys", "show", "/nowhere")[0] == 2
+
+
+@pytest.fixture
+def guarded(keys: Path) -> Iterator[str]:
+    """A control endpoint that believes `console` only."""
+    context = zmq.Context()
+    zap, router = context.socket(zmq.REP), context.socket(zmq.ROUTER)
+    zap.bind("inproc://zeromq.zap.01")
+    router.curve_server = True
+    router.curve_secretkey = load_certificate(keys / "server.key_secret")[1]
+    router.setsockopt(zmq.ZAP_DOMAIN, b"control")
+    port = router.bind_to_random_port("tcp://127.0.0.1")
+    known = z85.decode(load_certificate(keys / "operate/console.key")[0])
+    is_over = threading.Event()
+
+    def serve() -> None:
+        while not is_over.is_set():
+            if zap.poll(2):
+                version, number, *_, public = zap.recv_multipart()
+                zap.send_multipart([version, number, b"200" if public == known else b"400", b"", b"", b""])
+            while router.poll(0):
+                *envelope, data = router.recv_multipart()
+                reply = {"v": VERSION, "id": msgpack.unpackb(data)["id"], "ok": True, "result": {"seen": True}}
+                router.send_multipart([*envelope, msgpack.packb(reply)])
+        context.destroy(linger=0)
+
+    serving = threading.Thread(target=serve)
+    serving.start()
+    yield f"tcp://127.0.0.1:{port}"
+    is_over.set()
+    serving.join(5.0)
+
+
+Ask = Callable[..., tuple[int, dict[str, Any]]]
+
+
+def test_a_key_is_shown_by_option_by_environment_and_by_configuration(
+    keys: Path, guarded: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    mine, server = str(keys / "console.key_secret"), str(keys / "server.key")
+    code, printed = run_json(capsys, "--endpoint", guarded, "--key", mine, "--server-key", server, "disable")
+    assert (code, printed["result"]) == (0, {"seen": True})
+    config = tmp_path / "client.toml"
+    config.write_text(
+        f'[endpoints]\ncontrol = "{guarded}"\n[endpoints.curve]\nclient_secret = "{mine}"\nserver_public = "{server}"\n'
+    )
+    assert run_json(capsys, "--config", str(config), "disable")[0] == 0
+    monkeypatch.setenv(KEY, mine)
+    monkeypatch.setenv(SERVER_KEY, server)
+    assert run_json(capsys, "--endpoint", guarded, "disable")[0] == 0
+
+
+def test_another_key_or_none_is_not_answered_and_the_hint_says_where_to_look(
+    keys: Path, guarded: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments in ((), ("--key", str(keys / "robot.key_secret"), "--server-key", str(keys / "server.key"))):
+        code, printed = run_json(capsys, "--endpoint", guarded, "--wait", "0.3", *arguments, "disable")
+        assert (code, printed["error"]["code"]) == (3, "unreachable")
+        assert "--key and --server-key" in printed["error"]["hint"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("--key", "KEYS/console.key_secret"), "--server-key"),
+        (("--key", "/nowhere/a.key_secret", "--server-key", "KEYS/server.key"), "/nowhere/a.key_secret: No such file"),
+        (("--key", "KEYS/operate/console.key", "--server-key", "KEYS/server.key"), "holds no secret key"),
+        (("--key", "KEYS/console.key_secret", "--server-key", "/dev/zero"), "/dev/zero: allowed is a regular file"),
+    ],
+    ids=range(4),
+)
+def test_a_key_that_is_no_good_is_a_usage_error(
+    keys: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], named: str
+) -> None:
+    placed = [each.replace("KEYS", str(keys)) for each in arguments]
+    code, printed = run_json(capsys, "--endpoint", "tcp://192.0.2.1:5555", *placed, "status")
+    assert code == 2
+    assert named in printed["error"]["message"] + printed["error"]["hint"]

@@ -1,0 +1,341 @@
+"""Who is let in, over real sockets: listed keys for what they are listed for, and nobody else; everybody is counted."""
+
+import contextlib
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+import zmq
+
+from tormagd.config import Config, Curve, Endpoints
+from tormagd.daemon import admission
+from tormagd.daemon.admission import CONNECTIONS_PER_PEER, PLAIN
+from tormagd.daemon.endpoint import Endpoint
+from tormagd.keys import KeyPair, KeyRing, fingerprint, generate, load_pair
+from tormagd.messages import VERSION, PeerReport, Reply, Request, decode, encode
+
+PATIENCE_S = 8.0
+NAMES = ("setpoint", "telemetry", "control", "recording")
+NEVER = 2**63
+KINDS = {"setpoint": zmq.XPUB, "control": zmq.DEALER, "telemetry": zmq.SUB, "recording": zmq.SUB}
+STRANGER = KeyPair(*zmq.curve_keypair())
+GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Rig:
+    """An endpoint that is guarded although it is local, and its peers."""
+
+    def __init__(self, folder: Path, scheme: str) -> None:
+        self.keys = folder / "keys"
+        generate("server", self.keys, self.keys)
+        for name, role in (("robot", "publish"), ("console", "operate"), ("viewer", "observe")):
+            generate(name, self.keys, self.keys / role)
+        # one that is listed for everything
+        generate("bench", self.keys, self.keys / "publish")
+        listed = (self.keys / "publish/bench.key").read_bytes()
+        (self.keys / "operate/bench.key").write_bytes(listed)
+        (self.keys / "operate/bench.key").chmod(0o600)
+        self.addresses = {
+            name: f"ipc://{folder}/{name}" if scheme == "ipc" else f"tcp://127.0.0.1:{free_port()}" for name in NAMES
+        }
+        curve = Curve(server_secret=str(self.keys / "server.key_secret"), also_local=True)
+        endpoints = Config(endpoints=Endpoints(**self.addresses, curve=curve)).endpoints
+        self.endpoint = Endpoint(endpoints, keys=KeyRing(endpoints))
+        self.server = load_pair(self.keys / "server.key_secret").public
+        self.context = zmq.Context()
+        self.answered: list[str] = []
+        self.peers: list[zmq.Socket[bytes]] = []
+        "All of them: one that nobody holds is closed."
+
+    def pair(self, name: str) -> KeyPair:
+        return load_pair(self.keys / f"{name}.key_secret")
+
+    def peer(self, kind: int, name: str, keys: KeyPair | None, server: bytes | None = None) -> "zmq.Socket[bytes]":
+        made = self.context.socket(kind)
+        made.linger = 0
+        made.reconnect_ivl = 60_000  # each is one try
+        if keys is not None:
+            made.curve_publickey, made.curve_secretkey = keys
+            made.curve_serverkey = server or self.server
+        made.connect(self.addresses[name])
+        self.peers.append(made)
+        return made
+
+    def until(self, reached: Callable[[], Any], what: str = "reached") -> None:
+        """Serves until it is so."""
+        until_s = time.monotonic() + PATIENCE_S
+        while not reached():
+            assert time.monotonic() < until_s, f"not {what}: {self.endpoint.report()}"
+            self.endpoint.drain_setpoints()
+            self.endpoint.serve(time.monotonic(), self.answer, NEVER)
+            self.endpoint.publish_ticks([(1,)], ("a",))
+            time.sleep(0.002)
+
+    def answer(self, request: Request) -> dict[str, Any]:
+        self.answered.append(request.command)
+        return {}
+
+    def reasons(self) -> dict[tuple[str, str, str], int]:
+        """How many were refused by endpoint, reason and key."""
+        found: dict[tuple[str, str, str], int] = {}
+        for each in self.endpoint.report().refusals:
+            place = (each.endpoint, each.reason, each.key)
+            found[place] = found.get(place, 0) + each.count
+        return found
+
+    def close(self) -> None:
+        self.endpoint.close()
+        self.context.destroy(linger=0)
+
+
+@pytest.fixture(params=["tcp", "ipc"])
+def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path, request.param)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def tcp_rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path, "tcp")
+    yield made
+    made.close()
+
+
+def setpoint(seq: int) -> bytes:
+    fields = {"v": 1, "source": "a", "seq": seq, "stamp_ns": 1, "servo_cf": 1.0, "valid_for_ms": 50.0}
+    packed: bytes = msgpack.packb(fields)
+    return packed
+
+
+def request(command: str) -> bytes:
+    return encode(Request(v=VERSION, id=1, command=command))
+
+
+# -- who is let in -------------------------------------------------------------------------------------------------
+
+
+def test_a_listed_publisher_is_heard(rig: Rig) -> None:
+    publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair("robot"))
+    rig.until(lambda: publisher.poll(0))
+    publisher.send(setpoint(1))
+    rig.until(lambda: rig.endpoint.inbox.accepted == 1)
+    assert rig.endpoint.report().refused == rig.endpoint.report().dropped == 0
+    assert rig.endpoint.report().connections["setpoint"] == 1
+
+
+def test_an_operator_commands_and_an_observer_only_looks(rig: Rig) -> None:
+    replies = {}
+    for name, commands in (("console", ("enable", "stop", "status")), ("viewer", ("stop", "enable", "status"))):
+        client = rig.peer(zmq.DEALER, "control", rig.pair(name))
+        for command in commands:
+            client.send(request(command))
+            rig.until(lambda client=client: client.poll(0))
+            reply = decode(client.recv_multipart()[-1], Reply)
+            replies[name, command] = reply.error.code if reply.error else "ok"
+    assert replies == {
+        ("console", "enable"): "ok",
+        ("console", "stop"): "ok",
+        ("console", "status"): "ok",
+        ("viewer", "stop"): "forbidden",
+        ("viewer", "enable"): "forbidden",
+        ("viewer", "status"): "ok",
+    }
+    assert rig.answered == ["enable", "stop", "status", "status"]
+    (drop,) = rig.endpoint.report().drops
+    assert (drop.endpoint, drop.reason, drop.count) == ("control", "command not allowed", 2)
+    assert drop.key == f"{fingerprint(rig.pair('viewer').public)} (viewer)"
+    assert drop.address
+
+
+@pytest.mark.parametrize("name", ["telemetry", "recording"])
+@pytest.mark.parametrize("who", ["viewer", "console"])
+def test_operators_and_observers_see(rig: Rig, name: str, who: str) -> None:
+    subscriber = rig.peer(zmq.SUB, name, rig.pair(who))
+    subscriber.subscribe(b"")
+    if name == "recording":
+        rig.until(lambda: subscriber.poll(0))
+    else:
+        rig.until(lambda: rig.endpoint.report().connections[name] == 1)
+    assert rig.endpoint.report().refused == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "who"),
+    [
+        ("setpoint", "console"),
+        ("setpoint", "viewer"),
+        ("control", "robot"),
+        ("telemetry", "robot"),
+        ("recording", "robot"),
+    ],
+)
+def test_a_key_opens_only_what_it_is_listed_for(rig: Rig, name: str, who: str) -> None:
+    role = {"console": "operate", "viewer": "observe", "robot": "publish"}[who]
+    for _ in range(3):
+        rig.peer(KINDS[name], name, rig.pair(who))
+    rig.until(lambda: rig.endpoint.report().refused == 3, "refused")
+    assert rig.reasons() == {(name, f"role not allowed: {role}", f"{fingerprint(rig.pair(who).public)} ({who})"): 3}
+    # nor does it, whatever it calls itself; one that takes offence at our kind of socket itself may count twice
+    peers = [rig.peer(kind, name, rig.pair(who)) for kind in (zmq.DEALER, zmq.XPUB, zmq.SUB)]
+    peers[-1].subscribe(b"")
+    rig.until(lambda: rig.endpoint.report().refused >= 6, "refused")
+    assert not any(peer.poll(20) for peer in peers)
+    assert rig.answered == []
+
+
+def test_a_key_in_two_folders_has_both_roles(rig: Rig) -> None:
+    publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair("bench"))
+    client = rig.peer(zmq.DEALER, "control", rig.pair("bench"))
+    client.send(request("enable"))
+    rig.until(lambda: client.poll(0) and publisher.poll(0))
+    assert rig.answered == ["enable"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("what", "keys", "server", "reason", "key"),
+    [
+        ("plain", None, None, PLAIN, ""),
+        ("unlisted", STRANGER, None, "key not listed", fingerprint(STRANGER.public)),
+        ("wrong server", STRANGER, STRANGER.public, "another server's key", ""),
+    ],
+)
+def test_nobody_else_is_let_in_and_everybody_is_counted(
+    rig: Rig, name: str, what: str, keys: KeyPair | None, server: bytes | None, reason: str, key: str
+) -> None:
+    kind = KINDS[name]
+    peers = [rig.peer(kind, name, keys, server) for _ in range(5)]
+    for peer in peers:
+        if kind == zmq.SUB:
+            peer.subscribe(b"")
+        else:
+            with contextlib.suppress(zmq.Again):  # one that was refused already has nobody to send it to
+                peer.send(request("stop") if name == "control" else setpoint(1), zmq.NOBLOCK)
+    rig.until(lambda: rig.endpoint.report().refused == 5, "refused")
+    assert rig.reasons() == {(name, reason, key): 5}
+    assert not any(peer.poll(5) for peer in peers)
+    assert rig.answered == []
+    assert (rig.endpoint.inbox.accepted, rig.endpoint.inbox.refused, rig.endpoint.inbox.oversize) == (0, 0, 0)
+    for report in rig.endpoint.report().refusals:
+        # whoever left at once has taken his address with him
+        if rig.addresses[name].startswith("tcp"):
+            assert report.address in ("127.0.0.1", "gone before it was seen")
+        else:
+            assert report.address == f"process {os.getpid()} of user {os.getuid()}" or "gone" in report.address
+
+
+@pytest.mark.parametrize(
+    ("sent", "reason"),
+    [
+        (GREETING, PLAIN),
+        (b"\x01\x00hello, I speak an old ZMTP", PLAIN),
+        (b"", PLAIN),
+        (b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"CURVE".ljust(20, b"\0") + bytes(32), PLAIN),
+        (
+            b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"CURVE".ljust(20, b"\0") + bytes(32) + b"\x04\xc8" + bytes(200),
+            "broken handshake",
+        ),
+    ],
+    ids=range(5),
+)
+def test_a_stranger_gets_nothing_but_the_greeting_and_its_mechanism(tcp_rig: Rig, sent: bytes, reason: str) -> None:
+    port = int(tcp_rig.addresses["setpoint"].rsplit(":", 1)[1])
+    with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as stranger:
+        stranger.sendall(sent)
+        stranger.settimeout(0.2)
+        got = b""
+        try:
+            while part := stranger.recv(1_000):
+                got += part
+        except OSError:
+            pass
+        assert len(got) <= 64
+        assert got[:1] in (b"", b"\xff")
+        if len(got) == 64:
+            assert got[12:32] == b"CURVE".ljust(20, b"\0")
+    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused == 1, "refused")
+    assert [place[:2] for place in tcp_rig.reasons()] == [("setpoint", reason)]
+
+
+# -- lists that change ---------------------------------------------------------------------------------------------
+
+
+def test_a_list_that_is_read_again_lets_in_and_shuts_out(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    robot = rig.peer(zmq.XPUB, "setpoint", rig.pair("robot"))
+    viewer = rig.peer(zmq.SUB, "recording", rig.pair("viewer"))
+    viewer.subscribe(b"")
+    rig.until(lambda: robot.poll(0) and viewer.poll(0))
+    (rig.keys / "publish/robot.key").rename(rig.keys / "robot.key")
+    (rig.keys / "observe/viewer.key").rename(rig.keys / "viewer.key")
+    generate("second", rig.keys, rig.keys / "publish")
+    rig.endpoint.admission.reload()
+    rig.until(lambda: "let in no more" in caplog.text, "read again")
+    robot.send(setpoint(1))
+    second = rig.peer(zmq.XPUB, "setpoint", rig.pair("second"))
+    rig.until(lambda: second.poll(0))
+    second.send(setpoint(2))
+    rig.until(lambda: rig.endpoint.inbox.accepted == 1, "the second heard")
+    rig.until(lambda: rig.endpoint.report().dropped == 1, "the first dropped")
+    assert rig.endpoint.inbox.accepted == 1
+    rig.until(lambda: rig.endpoint.report().connections["recording"] == 0, "the viewer cut off")
+
+
+def test_lists_that_are_no_good_leave_the_old_ones(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    (rig.keys / "publish/broken.key").write_text("nothing")
+    rig.endpoint.admission.reload()
+    rig.until(lambda: "stay as they were" in caplog.text, "told")
+    assert "broken.key holds no public key" in caplog.text
+    publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair("robot"))
+    rig.until(lambda: publisher.poll(0))
+
+
+# -- how many ------------------------------------------------------------------------------------------------------
+
+
+def test_an_address_has_so_many_connections_and_no_more(tcp_rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(admission, "CONNECTIONS_PER_PEER", 5)
+    port = int(tcp_rig.addresses["setpoint"].rsplit(":", 1)[1])
+    strangers = [socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) for _ in range(12)]
+    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused >= 7, "refused")
+    assert ("setpoint", "too many connections", "") in tcp_rig.reasons()
+    tcp_rig.until(lambda: tcp_rig.endpoint.report().connections["setpoint"] <= 5, "cut off")
+    for stranger in strangers:
+        stranger.close()
+    tcp_rig.until(lambda: tcp_rig.endpoint.report().connections["setpoint"] == 0, "closed")
+    publisher = tcp_rig.peer(zmq.XPUB, "setpoint", tcp_rig.pair("robot"))
+    tcp_rig.until(lambda: publisher.poll(0))
+    assert CONNECTIONS_PER_PEER > 100
+
+
+def test_refused_peers_beyond_those_that_are_told_apart_are_counted_together(
+    tcp_rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(admission, "PEERS", 4)
+    for _ in range(10):
+        tcp_rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
+    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused == 10, "refused")
+    reports: tuple[PeerReport, ...] = tcp_rig.endpoint.report().refusals
+    assert len(reports) == 5
+    assert sum(each.count for each in reports) == 10
+    assert [each.count for each in reports if each.address == "others"] == [6]
+
+
+def test_the_log_names_the_newest_and_is_not_flooded(tcp_rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+    for _ in range(10):
+        tcp_rig.peer(zmq.XPUB, "setpoint", STRANGER)
+    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused == 10, "refused")
+    lines = [record.getMessage() for record in caplog.records if "refused" in record.getMessage()]
+    assert len(lines) == 1
+    assert f"setpoint: 127.0.0.1, key {fingerprint(STRANGER.public)}: key not listed" in lines[0]

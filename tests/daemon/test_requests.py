@@ -1,0 +1,83 @@
+"""Requests in their turns, and what a peer may send: no sockets, no clock."""
+
+import msgpack
+import pytest
+
+from tormagd.daemon.allowance import PEERS, Allowance
+from tormagd.daemon.requests import FIRST, WAITING, WAITING_PER_CLIENT, Requests, Waiting, may_go_first
+
+
+def waiting(client: str, number: int = 0, opens: int = 0) -> Waiting:
+    return Waiting([client.encode()], str(number).encode(), "", "", opens)
+
+
+def taken(requests: Requests) -> list[str]:
+    order = []
+    while (each := requests.next()) is not None:
+        order.append(f"{each.envelope[0].decode()}{each.data.decode()}")
+    return order
+
+
+def test_every_client_has_its_turn_and_each_keeps_its_order() -> None:
+    requests = Requests()
+    for number in range(3):
+        assert requests.put(waiting("a", number))
+    assert requests.put(waiting("b"))
+    assert requests.put(waiting("c"))
+    assert taken(requests) == ["a0", "b0", "c0", "a1", "a2"]
+    assert requests.next() is None
+
+
+def test_one_client_takes_no_place_of_another() -> None:
+    requests = Requests()
+    assert [requests.put(waiting("a", number)) for number in range(WAITING_PER_CLIENT + 3)].count(True) == 64
+    assert requests.put(waiting("b"))
+    assert taken(requests)[:3] == ["a0", "b0", "a1"]
+    assert requests.put(waiting("a"))
+
+
+def test_all_together_are_bounded() -> None:
+    requests = Requests()
+    assert sum(requests.put(waiting(f"c{number}")) for number in range(WAITING + 5)) == WAITING
+    assert requests.next() is not None
+    assert requests.put(waiting("late"))
+
+
+def test_what_came_before_the_gap_was_told_to_open_is_overtaken() -> None:
+    requests = Requests()
+    before = waiting("a", opens=requests.opens)
+    requests.opens += 1
+    assert requests.is_overtaken(before)
+    assert not requests.is_overtaken(waiting("a", opens=requests.opens))
+
+
+@pytest.mark.parametrize("command", FIRST)
+def test_no_packing_of_a_first_command_is_overlooked(command: str) -> None:
+    """msgpack has four ways to write a string; a client of another language may choose any."""
+    for header in (bytes([0xA0 | len(command)]), b"\xd9", b"\xda", b"\xdb"):
+        size = {0xD9: 1, 0xDA: 2, 0xDB: 4}.get(header[0])
+        text = header + (b"" if size is None else len(command).to_bytes(size, "big")) + command.encode()
+        data = b"\x83" + msgpack.packb("v") + b"\x01" + msgpack.packb("id") + b"\x01" + msgpack.packb("command") + text
+        assert msgpack.unpackb(data)["command"] == command
+        assert may_go_first(data)
+    assert not may_go_first(msgpack.packb({"v": 1, "id": 1, "command": "status"}))
+
+
+def test_a_peer_may_send_a_burst_and_then_its_rate() -> None:
+    allowance = Allowance(100.0, 10.0)
+    assert [allowance.grants("a", 0.0) for _ in range(15)].count(True) == 10
+    assert allowance.dropped == {"a": 5}
+    assert [allowance.grants("a", 0.05) for _ in range(9)].count(True) == 5
+    assert [allowance.grants("b", 0.05) for _ in range(10)].count(True) == 10
+    assert [allowance.grants("a", 9.0) for _ in range(15)].count(True) == 10
+    assert set(allowance.dropped) == {"a"}
+
+
+def test_more_peers_than_are_kept_apart_cost_the_one_that_was_silent_longest() -> None:
+    allowance = Allowance(1.0, 1.0)
+    for number in range(PEERS):
+        assert allowance.grants(f"p{number}", float(number) * 1e-3)
+    assert not allowance.grants("p0", 0.5)
+    assert allowance.grants("new", 0.6)
+    assert not allowance.grants("p0", 0.6)
+    assert allowance.grants("p1", 0.6)

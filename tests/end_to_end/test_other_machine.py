@@ -1,0 +1,228 @@
+"""The patient unit on another machine: the daemon in one network namespace, everybody else in another.
+
+The addresses are made for the test (192.0.2.0/30, RFC 5737). Where namespaces are not permitted, it is skipped.
+"""
+
+import contextlib
+import itertools
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tormagd.config import ENDPOINTS
+
+pytestmark = pytest.mark.live
+
+PATIENCE_S = 60.0
+HERE, THERE = "192.0.2.1", "192.0.2.2"
+CTL = [sys.executable, "-m", "tormagd.ctl.main"]
+STRANGERS = """
+import sys, time, zmq, zmq.auth
+address, keys, kind = sys.argv[1:]
+context = zmq.Context()
+server = zmq.auth.load_certificate(f"{keys}/server.key")[0]
+for _ in range(20):
+    peer = context.socket(zmq.PUB)
+    peer.linger, peer.reconnect_ivl = 0, 60_000
+    if kind != "plain":
+        pair = zmq.auth.load_certificate(f"{keys}/{kind}.key_secret") if kind == "console" else zmq.curve_keypair()
+        peer.curve_publickey, peer.curve_secretkey = pair
+        peer.curve_serverkey = zmq.curve_keypair()[0] if kind == "wrong" else server
+    peer.connect(address)
+    for _ in range(3):
+        peer.send(b"anything")
+        time.sleep(0.02)
+"""
+
+
+class Machines:
+    """Two network namespaces with a cable between them; a device and a daemon in the first."""
+
+    numbers = itertools.count(1)
+
+    def __init__(self, folder: Path) -> None:
+        number = f"{os.getpid() % 10_000}{next(self.numbers)}"
+        self.names = [f"tormag{number}{end}" for end in "ab"]
+        self._links = [f"t{number}{end}" for end in "ab"]
+        self.children: list[subprocess.Popen[str]] = []
+        self.start_again(folder)
+
+    def start_again(self, folder: Path) -> None:
+        """Everything anew in another folder."""
+        self.close()
+        self.folder, self.keys = folder, folder / "keys"
+        self._wire()
+        clients = ("--publish", "robot", "--operate", "console", "--observe", "screen")
+        subprocess.run([*CTL, "keys", "generate", str(self.keys), *clients], check=True, capture_output=True)
+        addresses = "".join(f'{name} = "tcp://{HERE}:{5_555 + n}"\n' for n, name in enumerate(ENDPOINTS))
+        simulator = self.start(0, sys.executable, "-m", "tormagd.simulation", "--pty", "--seed", "1")
+        with contextlib.suppress(OSError):  # a device does not wait for the host's processors
+            policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+            os.sched_setscheduler(simulator.pid, policy, os.sched_param(40))
+        assert simulator.stdout is not None
+        port = simulator.stdout.readline().strip()
+        self.config = folder / "tormagd.toml"
+        self.config.write_text(
+            f'scene = "coronary"\n[realtime]\nfifo_priority = 50\n[device]\nport = "{port}"\n[endpoints]\n{addresses}'
+            f'[endpoints.curve]\nserver_secret = "{self.keys}/server.key_secret"\n'
+        )
+        for name in ("robot", "console", "screen"):
+            (folder / f"{name}.toml").write_text(
+                f'scene = "coronary"\n[endpoints]\n{addresses}[endpoints.curve]\n'
+                f'client_secret = "{self.keys}/{name}.key_secret"\nserver_public = "{self.keys}/server.key"\n'
+            )
+        self.daemon = self.start(0, sys.executable, "-m", "tormagd.daemon.main", "--config", str(self.config))
+        self.until(lambda: self.status()["link"]["state"] == "RUNNING", "the link runs")
+
+    def _wire(self) -> None:
+        a, b = self.names
+        for line in (
+            f"netns add {a}",
+            f"netns add {b}",
+            f"link add {self._links[0]} netns {a} type veth peer name {self._links[1]} netns {b}",
+            f"-n {a} addr add {HERE}/30 dev {self._links[0]}",
+            f"-n {b} addr add {THERE}/30 dev {self._links[1]}",
+            f"-n {a} link set {self._links[0]} up",
+            f"-n {b} link set {self._links[1]} up",
+        ):
+            try:
+                subprocess.run(["ip", *line.split()], check=True, capture_output=True, text=True)
+            except (OSError, subprocess.CalledProcessError) as error:
+                self.close()
+                reason = getattr(error, "stderr", "") or str(error)
+                pytest.skip(f"network namespaces are not permitted here: ip {line}: {reason.strip()}")
+
+    def start(self, machine: int, *command: str) -> "subprocess.Popen[str]":
+        """A process on one of the two machines."""
+        made = subprocess.Popen(
+            ["ip", "netns", "exec", self.names[machine], *command],
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.children.append(made)
+        return made
+
+    def ctl(self, who: str, *arguments: str) -> dict[str, Any]:
+        """What tormagctl answers to somebody on the other machine."""
+        asked = self.start(1, *CTL, "--json", "--config", str(self.folder / f"{who}.toml"), *arguments)
+        printed, _ = asked.communicate(timeout=PATIENCE_S)
+        answer: dict[str, Any] = json.loads(printed)
+        return answer
+
+    def status(self) -> dict[str, Any]:
+        """The daemon's status as the console sees it."""
+        until_s = time.monotonic() + PATIENCE_S
+        while not (answer := self.ctl("console", "status"))["result"]:
+            assert time.monotonic() < until_s, answer
+        result: dict[str, Any] = answer["result"]
+        return result
+
+    def until(self, reached: Callable[[], bool], what: str) -> None:
+        """Looks until it is so."""
+        until_s = time.monotonic() + PATIENCE_S
+        while not reached():
+            assert time.monotonic() < until_s, f"not within {PATIENCE_S:g} s: {what}: {self.status()['peers']}"
+
+    def close(self) -> None:
+        """Ends the processes, and takes the namespaces away."""
+        for child in self.children:
+            if child.poll() is None:
+                child.kill()
+                child.wait()
+        self.children = []
+        for name in self.names:
+            subprocess.run(["ip", "netns", "del", name], check=False, capture_output=True)
+
+
+@pytest.fixture(scope="module")
+def machines(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machines]:
+    with contextlib.closing(Machines(tmp_path_factory.mktemp("machines"))) as made:
+        yield made
+
+
+def test_a_publisher_on_another_machine_drives_the_brake(machines: Machines) -> None:
+    assert machines.ctl("console", "home")["ok"]
+    machines.until(lambda: machines.ctl("console", "enable")["ok"], "enabled")
+    publisher = str(machines.folder / "robot.toml")
+    sending = machines.start(1, *CTL, "--config", publisher, "send", "pulse", "--duration", "30")
+    machines.until(lambda: (machines.status()["governed_cf"] or 0.0) > 1.35, "the pulse is rendered")
+    sending.send_signal(signal.SIGINT)
+    assert machines.ctl("console", "stop")["ok"]
+    status = machines.status()
+    assert status["operating_state"] == "FAULT"
+    assert status["setpoints"]["newest_source"] == "tormagctl"
+    assert status["peers"]["refused"] == 0
+
+
+def test_nobody_else_is_let_in_from_there_and_each_is_counted(machines: Machines) -> None:
+    before = machines.status()
+    # the publisher's key neither commands nor looks, the screen's only looks
+    for command in ("stop", "enable", "status"):
+        assert machines.ctl("robot", command)["error"]["code"] == "unreachable"
+    assert machines.ctl("screen", "status")["result"]["version"] == before["version"]
+    assert machines.ctl("screen", "stop")["error"]["code"] == "forbidden"
+    for kind in ("plain", "unlisted", "wrong", "console"):
+        machines.start(1, sys.executable, "-c", STRANGERS, f"tcp://{HERE}:5555", str(machines.keys), kind).wait()
+    expected = before["peers"]["refused"] + 3 + 4 * 20
+    machines.until(lambda: machines.status()["peers"]["refused"] >= expected, f"{expected} refused")
+    status = machines.status()
+    refused = status["peers"]["refusals"]
+    assert status["peers"]["refused"] == expected
+    assert {each["address"] for each in refused} <= {THERE, "others", "gone before it was seen"}
+    assert any("(console)" in each["key"] and each["reason"] == "role not allowed: operate" for each in refused)
+    assert (status["setpoints"]["accepted"], status["setpoints"]["refused"]) == (
+        before["setpoints"]["accepted"],
+        before["setpoints"]["refused"],
+    )
+    assert status["peers"]["drops"][0]["reason"] == "command not allowed"
+
+
+def test_a_stranger_on_the_wire_gets_the_greeting_only(machines: Machines) -> None:
+    listen = (
+        "import socket, sys\ns = socket.create_connection((sys.argv[1], 5555), 5)\n"
+        "s.sendall(bytes.fromhex(sys.argv[2]))\nwhile part := s.recv(1000): sys.stdout.write(part.hex())"
+    )
+    plain = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
+    got, _ = machines.start(1, sys.executable, "-c", listen, HERE, plain.hex()).communicate(timeout=PATIENCE_S)
+    assert len(bytes.fromhex(got)) <= 64
+    assert bytes.fromhex(got)[12:32] in (b"", b"CURVE".ljust(20, b"\0"))
+
+
+def test_a_guarded_address_without_keys_is_refused_before_anything_is_opened(tmp_path: Path) -> None:
+    """Exit 2, with the key and the remedy; and a secret that others can read is none."""
+    config = tmp_path / "tormagd.toml"
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+
+    def refusal() -> str:
+        done = subprocess.run(
+            [sys.executable, "-m", "tormagd.daemon.main", "--check", "--config", str(config)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 2
+        return done.stderr
+
+    config.write_text(f'[endpoints]\nsetpoint = "tcp://192.0.2.1:{port}"\n')
+    assert "others need CURVE keys in [endpoints.curve]" in refusal()
+    keys = tmp_path / "keys"
+    subprocess.run([*CTL, "keys", "generate", str(keys)], check=True, capture_output=True)
+    curve = f'[endpoints.curve]\nserver_secret = "{keys}/server.key_secret"\n'
+    config.write_text(f'[endpoints]\nsetpoint = "tcp://192.0.2.1:{port}"\n{curve}')
+    (keys / "server.key_secret").chmod(0o644)
+    assert "server.key_secret can be read by others (mode 0644)" in refusal()
+    curve = curve.replace("server_secret", "client_secret")
+    config.write_text(f'[endpoints]\nsetpoint = "tcp://192.0.2.1:{port}"\n{curve}')
+    assert "endpoints.curve.server_secret is missing" in refusal()

@@ -1,0 +1,66 @@
+"""`tormagctl keys`: make key pairs, show fingerprints."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tormagd.config import ConfigError
+from tormagd.ctl.outcome import Outcome, usage_error
+from tormagd.keys import PUBLIC, SERVER, fingerprint, generate, load_folder, load_public
+
+HINT = "tormagctl keys generate --help; the guide has the whole exchange"
+
+
+def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: str | None) -> Outcome:
+    """Make the daemon's pair where there is none, and a pair for each of `clients`, by role; or one `client`'s alone.
+
+    The folder gets `server.key_secret`, `server.key`, each `NAME.key_secret`, and a folder for each role, with every
+    `NAME.key` that is let in. Raises CommandError (USAGE): something is there already, or cannot be made.
+    """
+    names = [name for listed in clients.values() for name in listed]
+    if client is not None and names:
+        raise usage_error("--client stands alone: it makes a pair that no list of this machine has", HINT)
+    try:
+        if client is not None:
+            return _outcome([_made(client, "client", folder, folder)])
+        made = []
+        if not (folder / f"{SERVER}{PUBLIC}").exists() or not names:
+            made.append(_made(SERVER, SERVER, folder, folder))
+        for role, listed in clients.items():
+            (folder / role).mkdir(mode=0o700, exist_ok=True)
+            made += [_made(name, role, folder, folder / role) for name in listed]
+        return _outcome(made)
+    except OSError as error:
+        raise usage_error(f"{error.filename}: {error.strerror}", HINT) from error
+    except ConfigError as error:
+        raise usage_error(str(error), HINT) from error
+
+
+def show_keys(path: Path) -> Outcome:
+    """The fingerprint of the key in a file, or of every `NAME.key` in a folder."""
+    try:
+        found = load_folder(path) if path.is_dir() else [(path.stem, load_public(path).decode())]
+        keys = [{"name": name, "fingerprint": fingerprint(public)} for name, public in found]
+    except ConfigError as error:
+        raise usage_error(str(error), "give a .key or .key_secret file, or a folder of them") from error
+    return Outcome({"keys": keys}, "\n".join(f"{key['fingerprint']}  {key['name']}" for key in keys) or "no keys")
+
+
+def _made(name: str, role: str, secret_in: Path, public_in: Path) -> dict[str, str]:
+    secret, public = generate(name, secret_in, public_in)
+    return {
+        "name": name,
+        "role": role,
+        "secret": str(secret),
+        "public": str(public),
+        "fingerprint": fingerprint(load_public(public)),
+    }
+
+
+def _outcome(made: list[dict[str, str]]) -> Outcome:
+    result: dict[str, Any] = {"made": made}
+    lines = [
+        f"{key['name']} ({key['role']}) {key['fingerprint']}\n  secret {key['secret']}\n  public {key['public']}"
+        for key in made
+    ]
+    return Outcome(result, "\n".join(lines))

@@ -1,0 +1,368 @@
+"""Who is let in: the CURVE keys of the guarded endpoints, and how many connections an address may have.
+
+libzmq asks here (ZAP, RFC 27) about every peer whose handshake has proved that it has the secret key of the public one
+it shows, and tells here (socket monitors) about those that came no further, which send nothing to us and get nothing
+but ZMTP's greeting. All of it is the work of one thread beside the control thread: a handshake takes longer than a tick
+has to spare.
+"""
+
+import contextlib
+import logging
+import os
+import socket
+import struct
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+
+import zmq
+import zmq.utils.monitor
+from zmq.utils import z85
+
+from tormagd.config import ROLES, ConfigError
+from tormagd.keys import Allowed, KeyRing, fingerprint
+from tormagd.messages import PeerReport
+
+CONNECTIONS = 200
+CONNECTIONS_PER_PEER = 160
+"Of one endpoint, and of one address or process among them. More are cut off as soon as they are accepted."
+PEERS = 32
+"Refused peers that are told apart; the one that was refused longest ago joins the others."
+OTHERS = "others"
+HANDSHAKE_MS = 2_000
+NEWS_S = 10.0
+"At most one log line in this time."
+AT_ONCE = 8
+"Events taken from one socket before the next one's turn."
+_CREDENTIALS = struct.Struct("3i")
+_ZAP = "inproc://zeromq.zap.01"
+_KEY_BYTES = 32
+
+MAY: dict[str, frozenset[str]] = {
+    "setpoint": frozenset({"publish"}),
+    "telemetry": frozenset({"observe", "operate"}),
+    "recording": frozenset({"observe", "operate"}),
+    "control": frozenset({"observe", "operate"}),
+}
+"Which roles an endpoint is for. On `control` an observer may ask for the status only."
+
+PLAIN = "no CURVE handshake"
+"It speaks without CURVE, leaves when it is asked for it, or says nothing: which of these is seen first varies."
+REASONS: dict[int, str] = {
+    zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH: PLAIN,
+    zmq.PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC: "another server's key",
+}
+UNLISTED, WRONG_ROLE = "key not listed", "role not allowed"
+TOO_MANY = "too many connections"
+UNASKED_KEY = "no handshake that an open endpoint knows: a key is not to be shown here"
+BROKEN_HANDSHAKE, LEFT = "broken handshake", "left in the handshake"
+
+log = logging.getLogger(__name__)
+
+
+class _Connections:
+    """The connections of one endpoint, as its monitor tells of them."""
+
+    def __init__(self, name: str, is_guarded: bool) -> None:
+        self.name, self.is_guarded = name, is_guarded
+        self.addresses: dict[int, str] = {}
+        self.of_address: Counter[str] = Counter()
+        self.admitted: Counter[str] = Counter()
+        self.turned_away: deque[str] = deque(maxlen=CONNECTIONS)
+        "Addresses whose keys were refused, and whose connections are not closed yet."
+        self.failed: str | None = None
+        "Why the handshake failed of the connection that is closed next: libzmq closes it at once."
+        self.cut: set[int] = set()
+
+    def was_turned_away(self, address: str) -> bool:
+        """Whether a connection that is closed is one whose key was refused."""
+        if not address and self.turned_away:  # it had gone before it was seen
+            self.turned_away.popleft()
+            return True
+        if address not in self.turned_away:
+            return False
+        self.turned_away.remove(address)
+        return True
+
+
+class Admission:
+    """Guards sockets while they are made, then watches them in a thread. `priority` is the thread's, SCHED_FIFO."""
+
+    def __init__(
+        self,
+        context: "zmq.Context[zmq.Socket[bytes]]",
+        keys: KeyRing | None,
+        priority: int = 0,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._keys, self._priority, self._clock_s = keys, priority, clock_s
+        self.allowed: Allowed = keys.allowed if keys else {}
+        self._refusals: dict[tuple[str, str, str, str], int] = {}
+        self.refused = 0
+        self.moves: deque[tuple[str, bool]] = deque(maxlen=64)
+        "Publishers that came (False) or, after a handshake that went well, left (True), by their address."
+        self._told = 0
+        self._newest = ""
+        self._tell_s = 0.0
+        self._endpoints: dict[zmq.Socket[bytes], _Connections] = {}
+        self._watched: list[zmq.Socket[bytes]] = []
+        self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._is_over = self._is_to_reload = False
+        # before any guarded socket is bound: libzmq lets nobody in (ZAP_ENFORCE_DOMAIN) while nobody can be asked
+        self._zap = context.socket(zmq.ROUTER)
+        self._zap.linger = 0
+        self._zap.bind(_ZAP)
+        self._thread = threading.Thread(target=self._run, name="admission", daemon=True)
+
+    def guard(self, endpoint: "zmq.Socket[bytes]", name: str, is_guarded: bool) -> None:
+        """To be called before the socket is bound; `start` once all are."""
+        if is_guarded:
+            if self._keys is None:
+                raise OSError("CURVE keys are needed: endpoints.curve.server_secret")
+            endpoint.curve_secretkey = self._keys.server.secret
+            endpoint.curve_server = True
+            endpoint.setsockopt(zmq.ZAP_DOMAIN, name.encode())
+            endpoint.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
+            endpoint.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+            # a machine that has gone without a word frees its connection after half a minute
+            for option, value in ((zmq.TCP_KEEPALIVE, 1), (zmq.TCP_KEEPALIVE_IDLE, 10), (zmq.TCP_KEEPALIVE_INTVL, 5)):
+                endpoint.setsockopt(option, value)
+            endpoint.setsockopt(zmq.TCP_KEEPALIVE_CNT, 4)
+        events = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
+        events |= zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+        self._endpoints[endpoint.get_monitor_socket(events)] = _Connections(name, is_guarded)
+        self._watched.append(endpoint)
+
+    def start(self) -> None:
+        """Begins to let in."""
+        self._thread.start()
+
+    def reload(self) -> None:
+        """Reads the lists again, in the thread; those that are no good are told in the log, and the old ones stay."""
+        self._is_to_reload = True
+        os.eventfd_write(self._wake, 1)
+
+    def close(self) -> None:
+        """Ends the thread; the sockets are the context's to close."""
+        if self._thread.is_alive():
+            self._is_over = True
+            os.eventfd_write(self._wake, 1)
+            self._thread.join()
+        for endpoint in self._watched:
+            # or ZeroMQ's thread would wait for ever for a monitor that has gone
+            endpoint.disable_monitor()
+        os.close(self._wake)
+
+    def has_role(self, public: str, roles: frozenset[str]) -> bool:
+        """Whether the key is listed for one of these now: one that was let in may have been taken off the list."""
+        listed = self.allowed.get(public)
+        return listed is not None and not roles.isdisjoint(listed.roles)
+
+    def name(self, public: str) -> str:
+        """A key as people know it: its fingerprint, and the name of its file."""
+        listed = self.allowed.get(public)
+        return fingerprint(public) if listed is None else f"{fingerprint(public)} ({listed.name})"
+
+    def connections(self) -> dict[str, int]:
+        """How many connections each endpoint has."""
+        return {each.name: len(each.addresses) for each in self._endpoints.values()}
+
+    def refusals(self) -> tuple[PeerReport, ...]:
+        """Who was refused, the newest last."""
+        # one step of the interpreter, so that the thread cannot change it meanwhile
+        return tuple(PeerReport(*peer, count) for peer, count in list(self._refusals.items()))
+
+    # -- the thread ------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        if self._priority:
+            # as ZeroMQ's own threads: an ordinary one could lose its processor while the control thread waits for it
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(self._priority))
+        poller = zmq.Poller()
+        for each in (self._zap, self._wake, *self._endpoints):
+            poller.register(each, zmq.POLLIN)
+        while not self._is_over:
+            for ready, _ in poller.poll(None if self.refused == self._told else round(NEWS_S * 1e3)):
+                if ready is self._zap:
+                    self._admit()
+                elif isinstance(ready, int):
+                    os.eventfd_read(self._wake)
+                    if self._is_to_reload:
+                        self._is_to_reload = False
+                        self._reload()
+                else:
+                    self._watch(ready, self._endpoints[ready])
+            self._tell()
+
+    def _admit(self) -> None:
+        for _ in range(AT_ONCE):
+            try:
+                frames = self._zap.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            envelope, (version, request, domain, address, _, mechanism, *credentials) = frames[:2], frames[2:]
+            public = ""
+            if mechanism == b"CURVE" and len(credentials) == 1 and len(credentials[0]) == _KEY_BYTES:
+                public = z85.encode(credentials[0]).decode()
+            name = domain.decode()
+            is_admitted = self._is_admitted(name, address.decode(errors="replace"), public)
+            status, text = (b"200", b"OK") if is_admitted else (b"400", b"")
+            self._zap.send_multipart([*envelope, version, request, status, text, public.encode(), b""])
+
+    def _is_admitted(self, name: str, address: str, public: str) -> bool:
+        (known,) = (each for each in self._endpoints.values() if each.name == name)
+        if self.has_role(public, MAY[name]):
+            self._moved(name, address, has_left=False)
+            known.admitted[address] += 1
+            return True
+        known.turned_away.append(address)
+        listed = self.allowed.get(public)
+        reason = UNLISTED if listed is None else f"{WRONG_ROLE}: {', '.join(sorted(listed.roles))}"
+        self._refuse(name, address, self.name(public) if public else "", reason)
+        return False
+
+    def _watch(self, monitor: "zmq.Socket[bytes]", known: _Connections) -> None:
+        for _ in range(AT_ONCE):
+            try:
+                event = zmq.utils.monitor.recv_monitor_message(monitor, zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            kind, value = event["event"], event["value"]
+            if kind == zmq.EVENT_ACCEPTED:
+                self._accepted(known, value)
+            elif kind == zmq.EVENT_DISCONNECTED:
+                self._disconnected(known, value)
+            elif kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+                known.failed = REASONS.get(value, BROKEN_HANDSHAKE) if known.is_guarded else UNASKED_KEY
+            elif kind == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL:
+                known.failed = PLAIN if known.is_guarded else LEFT
+
+    def _accepted(self, known: _Connections, descriptor: int) -> None:
+        connection = _connection(descriptor)
+        if connection is None:  # it has gone already, and its address with it
+            known.addresses[descriptor] = ""
+            return
+        with connection:
+            address = _address(connection)
+            known.addresses[descriptor] = address
+            if not address:
+                return
+            known.of_address[address] += 1
+            if known.of_address[address] > CONNECTIONS_PER_PEER or len(known.addresses) > CONNECTIONS:
+                known.cut.add(descriptor)
+                with contextlib.suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
+                self._refuse(known.name, address, "", TOO_MANY)
+            elif not known.is_guarded:
+                self._moved(known.name, address, has_left=False)
+
+    def _disconnected(self, known: _Connections, descriptor: int) -> None:
+        address = known.addresses.pop(descriptor, "")
+        failed, known.failed = known.failed, None
+        if address:
+            known.of_address[address] -= 1
+            if not known.of_address[address]:
+                del known.of_address[address]
+        if descriptor in known.cut:
+            known.cut.discard(descriptor)
+        elif failed is not None:
+            self._refuse(known.name, address, "", failed)
+        elif known.was_turned_away(address):
+            pass  # counted when it was asked about
+        elif not known.is_guarded:
+            self._moved(known.name, address, has_left=True)
+        elif known.admitted[address]:
+            known.admitted[address] -= 1
+            if not known.admitted[address]:
+                del known.admitted[address]
+            self._moved(known.name, address, has_left=True)
+        else:
+            # a peer of an old version is closed without an event of its own
+            self._refuse(known.name, address, "", PLAIN)
+
+    def _moved(self, name: str, address: str, has_left: bool) -> None:
+        if name == "setpoint" and address:
+            self.moves.append((address, has_left))
+
+    def _refuse(self, name: str, address: str, key: str, reason: str) -> None:
+        self.refused += 1
+        peer = (name, shown(address), key, reason)
+        self._newest = f"{name}: {peer[1]}{f', key {key}' if key else ''}: {reason}"
+        self._refusals[peer] = self._refusals.pop(peer, 0) + 1
+        if len(self._refusals) > PEERS:
+            first = next(each for each in self._refusals if each[1] != OTHERS)
+            others = (first[0], OTHERS, "", first[3].split(":")[0])
+            self._refusals[others] = self._refusals.pop(others, 0) + self._refusals.pop(first)
+
+    def _tell(self) -> None:
+        new, now_s = self.refused - self._told, self._clock_s()
+        if new and now_s >= self._tell_s:
+            log.warning("refused %d peers, the newest at %s", new, self._newest)
+            self._told, self._tell_s = self.refused, now_s + NEWS_S
+
+    def _reload(self) -> None:
+        if self._keys is None:
+            log.info("no list of keys to read again: there is no endpoints.curve")
+            return
+        before = self.allowed
+        try:
+            self.allowed = self._keys.load_allowed()
+        except ConfigError as error:
+            log.error("the lists of keys stay as they were: %s", error)
+            return
+        log.info("%d keys are let in: %s", len(self.allowed), _counts(self.allowed))
+        lost = [key for key, listed in before.items() if not listed.roles <= self.roles(key)]
+        if lost:
+            # what they send is looked at again each time; what is sent to them is not. Who may stay is back in a moment
+            log.warning("keys that are let in no more, or for less: %s", ", ".join(before[key].name for key in lost))
+            for known in self._endpoints.values():
+                if known.is_guarded and known.name in ("telemetry", "recording"):
+                    self._cut_all(known)
+
+    def roles(self, public: str) -> frozenset[str]:
+        """What a key may do now."""
+        listed = self.allowed.get(public)
+        return listed.roles if listed else frozenset()
+
+    def _cut_all(self, known: _Connections) -> None:
+        for descriptor, address in known.addresses.items():
+            connection = _connection(descriptor)
+            if connection is not None:
+                with connection:
+                    if _address(connection) == address:  # or its number has gone to another one since
+                        with contextlib.suppress(OSError):
+                            connection.shutdown(socket.SHUT_RDWR)
+
+
+def shown(address: str) -> str:
+    """A peer's address for people: the host, or the process."""
+    if not address:
+        return "gone before it was seen"
+    parts = address.split(":")
+    return f"process {parts[3]} of user {parts[1]}" if len(parts) == 4 else address
+
+
+def _counts(allowed: Allowed) -> str:
+    roles = Counter(role for listed in allowed.values() for role in listed.roles)
+    return ", ".join(f"{role} {roles[role]}" for role in ROLES)
+
+
+def _connection(descriptor: int) -> socket.socket | None:
+    try:
+        return socket.socket(fileno=os.dup(descriptor))
+    except OSError:
+        return None
+
+
+def _address(connection: socket.socket) -> str:
+    """The peer as libzmq names it: its host, or `localhost:USER:GROUP:PROCESS`; empty where it has gone."""
+    try:
+        if connection.family == socket.AF_UNIX:
+            made = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+            process, user, group = _CREDENTIALS.unpack(made)
+            return f"localhost:{user}:{group}:{process}"
+        return str(connection.getpeername()[0])
+    except OSError:
+        return ""
