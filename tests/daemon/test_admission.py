@@ -211,6 +211,7 @@ def test_a_key_in_two_folders_has_both_roles(rig: Rig) -> None:
         ("unlisted", STRANGER, None, "key not listed", fingerprint(STRANGER.public)),
         ("wrong server", STRANGER, STRANGER.public, "another server's key", ""),
     ],
+    ids=["plain", "unlisted", "wrong server"],  # keys are drawn anew in every process
 )
 def test_nobody_else_is_let_in_and_everybody_is_counted(
     rig: Rig, name: str, what: str, keys: KeyPair | None, server: bytes | None, reason: str, key: str

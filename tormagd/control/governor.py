@@ -157,7 +157,7 @@ class Governor:
         if age > setpoint.valid_for_s:
             return self._ramp(state, now_s, lowest, age, Limit.STALE, setpoint.is_contested)
         highest = max(device.force_N(portrait.most_N), 0.0)
-        # what comes is told from what is asked: the force that the device makes at its least is learned, and so it varies
+        # what comes is told from what is asked: the least that the device makes is learned, and so it varies
         asked_N = min(max(setpoint.force_N, self._least_N), self._most_N)
         force, reasons = self._within_range(setpoint.force_N, asked_N, lowest, highest)
         if setpoint.is_contested:
