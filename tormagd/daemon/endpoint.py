@@ -42,7 +42,7 @@ DRAIN = 32
 "Setpoints read at once at most; more wait for the next tick, so that a flood cannot stall control."
 SETPOINTS_PER_S, SETPOINT_BURST = 4_000.0, 1_000.0
 "What one publisher may send; the rest is dropped unread. The burst is what comes at once after a network's pause."
-TAKEN, TAKEN_NS = 64, 150_000
+TAKEN, TAKEN_NS = 64, 80_000
 "Requests taken from the socket at once at most, and for how long."
 REQUESTS = 16
 "Commands answered per telemetry period at most."
