@@ -165,8 +165,7 @@ class ClosedLoop:
         return conditions(
             self.now_s,
             self._config,
-            self.connection.measurement,
-            self.connection.pending,
+            self.connection,
             self.step_state,
             self._output,
             self._setpoint,

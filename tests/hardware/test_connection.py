@@ -75,7 +75,9 @@ class Port:
     def __init__(self, bench: "Bench", fd: int) -> None:
         self.bench, self.fd = bench, fd
         self.waiting: deque[Message] = deque()
-        self.statistics = SimpleNamespace(frames=0, bytes=0, corrupt=0, lost=0, repeated=0, resynchronisations=0)
+        self.statistics = SimpleNamespace(
+            frames=0, bytes=0, corrupt=0, lost=0, repeated=0, resynchronisations=0, unsent=0, refused={}
+        )
         self.is_dead = self.is_closed = False
 
     def fileno(self) -> int:
