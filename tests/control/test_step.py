@@ -10,12 +10,22 @@ from hypothesis import strategies as st
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.config import Config
 from tormagd.control.core import Core
-from tormagd.control.motor import electrical_time_s
+from tormagd.control.motor import delay_margin_s, electrical_time_s
 from tormagd.control.plan import Plan
 from tormagd.control.plausible import LEAP_MM
-from tormagd.control.sight import BLIND_S
-from tormagd.control.step import CARRY_S, EXCHANGE_S, STARTING_S, StepOutput, Stepper, StepState
+from tormagd.control.sight import BLIND_S, UNSENSED_S
+from tormagd.control.step import (
+    CARRY_S,
+    EXCHANGE_S,
+    SENSE_FAULT_S,
+    STARTING_S,
+    STATUS_FAULT_S,
+    StepOutput,
+    Stepper,
+    StepState,
+)
 from tormagd.control.trajectory import APPROACH_S
+from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import CLEARING_S, Conditions, DeviceRequest, OperatingState, RefusedError
@@ -322,6 +332,10 @@ def test_skew(running: Bench, side: float) -> None:
     apart(running, side * 0.98 * allowed)
     most = {"left_mm": -7.5 + side * 0.49 * allowed, "right_mm": -7.5 - side * 0.49 * allowed}
     running.step(count=20, **most)
+    for back_mm in (0.004, 0.008, 0.012, 0.016):  # as the loop wants it, so that nothing goes the wrong way
+        back = {"left_mm": most["left_mm"] - side * back_mm, "right_mm": most["right_mm"] + side * back_mm}
+        running.step(**back)
+    running.step(count=20, **back)
     assert not running.faults
     more = {"left_mm": -7.5 + side * 0.51 * allowed, "right_mm": -7.5 - side * 0.51 * allowed}
     assert running.run_into(Fault.SKEW, **more) == 1
@@ -798,3 +812,122 @@ def test_carriages_beyond_the_closed_end_are_driven_back(bench: Bench, gap_mm: f
         assert reference is not None
         assert reference.speed_mm_s >= 0.0
     assert min(output.left_duty, output.right_duty) > 0.5
+
+
+# -- streams, wire and directions ------------------------------------------------------------------------------------
+
+
+def test_a_sense_that_stops_is_a_limit_and_then_a_fault_where_the_scene_needs_it(running: Bench) -> None:
+    running.step(count=200)
+    last_s = running.now_s
+    assert Limit.SENSE_STALE not in running.step(count=round(UNSENSED_S / PERIOD_S), sensed_s=last_s).limits
+    assert running.step(count=2, sensed_s=last_s).limits == (Limit.SENSE_STALE,)
+    running.run_into(Fault.SENSE_STALE, sensed_s=last_s)
+    assert running.now_s - last_s == pytest.approx(SENSE_FAULT_S, abs=1.5 * PERIOD_S)
+    assert is_opened(running)
+
+
+def test_a_scene_that_does_without_the_sensor_does_without_its_messages(core: Core, measure) -> None:
+    force = msgspec.structs.replace(core.scene.force, tolerance_rms_N=0.5 * core.scene.force.most_N)
+    bench = Bench(Stepper(CONFIG, msgspec.structs.replace(core.scene, force=force)), measure)
+    bench.step(count=3)
+    bench.command("enable")
+    bench.step(count=200)
+    assert bench.step(count=500, sensed_s=bench.now_s).limits == (Limit.SENSE_STALE,)
+    assert not bench.faults
+
+
+def test_a_status_that_stops_is_a_fault(running: Bench) -> None:
+    running.step(count=200)
+    last_s = running.now_s
+    running.step(count=round(STATUS_FAULT_S / PERIOD_S) - 1, reported_s=last_s)
+    assert not running.faults
+    assert running.run_into(Fault.STATUS_STALE, reported_s=last_s) <= 2
+    assert is_opened(running)
+
+
+@pytest.mark.parametrize(
+    ("link", "limits"),
+    [
+        (LinkQuality(), ()),
+        (LinkQuality(unanswered=0.019, damaged=0.019, unsent=0.019, round_trip_s=5e-3, clock_drift=0.0099), ()),
+        (LinkQuality(unanswered=0.021), (Limit.LINK_DEGRADED,)),
+        (LinkQuality(damaged=0.021), (Limit.LINK_DEGRADED,)),
+        (LinkQuality(unsent=0.021), (Limit.LINK_DEGRADED,)),
+        (LinkQuality(round_trip_s=7e-3), (Limit.LINK_DEGRADED,)),
+        (LinkQuality(clock_drift=0.011), (Limit.CLOCK,)),
+        (LinkQuality(clock_drift=-0.011), (Limit.CLOCK,)),
+    ],
+)
+def test_a_wire_or_a_clock_that_is_not_what_it_should_be_is_a_limit(running: Bench, link, limits) -> None:
+    assert running.step(count=50, link=link).limits == limits
+    assert not running.faults
+
+
+@pytest.mark.parametrize(
+    ("link", "fault", "code"),
+    [
+        (LinkQuality(round_trip_s=0.012), Fault.LINK_DEGRADED, "link_degraded"),
+        (LinkQuality(clock_drift=0.11), Fault.CLOCK, "clock"),
+        (LinkQuality(clock_drift=-1.0), Fault.CLOCK, "clock"),
+    ],
+)
+def test_what_would_swing_is_opened_and_not_enabled_in_the_first_place(
+    bench: Bench, link: LinkQuality, fault: Fault, code: str
+) -> None:
+    bench.step(count=3)
+    with pytest.raises(RefusedError) as caught:
+        bench.command("enable", READY.replaced(round_trip_s=link.round_trip_s, clock_drift=link.clock_drift))
+    assert caught.value.code == code
+    assert "allowed is" in str(caught.value)
+    bench.command("enable")
+    bench.step(count=20)
+    assert bench.run_into(fault, link=link) == 1
+    assert is_opened(bench)
+
+
+def test_the_round_trip_that_is_refused_is_within_what_the_loop_bears(core: Core) -> None:
+    bears_s = delay_margin_s(CONFIG.motor, CONFIG.position, PERIOD_S)
+    assert 0.005 < bears_s < 0.05
+    assert bears_s == pytest.approx(core.margins.phase_margin_deg / 360.0 / core.margins.crossover_Hz)
+
+
+@pytest.mark.parametrize("target_mm", [60.0, 90.0])
+def test_carriages_that_go_the_other_way_are_named(running: Bench, target_mm: float) -> None:
+    """Both, so that nothing skews; what the loop does about it makes it worse."""
+    at_mm, ticks = -7.5, 0
+    while not running.faults:
+        output = running.step(gap_plan(target_mm, running.now_s), left_mm=at_mm, right_mm=at_mm)
+        at_mm -= 15.0 * output.left_duty * PERIOD_S
+        ticks += 1
+        assert ticks < 300
+    assert running.faults[0] is Fault.WRONG_DIRECTION
+    assert abs(at_mm + 7.5) < 2.5
+    assert is_opened(running)
+    assert running.state.safety.needs_homing
+
+
+def test_a_carriage_that_goes_the_other_way_into_its_stop_is_named(running: Bench) -> None:
+    at_mm, ticks = -7.5, 0
+    while not running.faults:
+        running.step(gap_plan(60.0, running.now_s), left_mm=at_mm, right_mm=at_mm)
+        at_mm = min(at_mm + 0.015, -7.0)
+        ticks += 1
+        assert ticks < 300
+    assert set(running.faults) <= {Fault.WRONG_DIRECTION, Fault.NO_MOTION}
+    assert running.faults[0] is Fault.WRONG_DIRECTION
+
+
+def test_a_homing_that_presses_shut_is_ended_and_named(bench: Bench) -> None:
+    at_mm = -7.5
+    bench.step(count=3)
+    bench.command("home")
+    while not bench.faults:
+        at_mm -= 0.012
+        bench.step(left_mm=at_mm, right_mm=-7.5, mode=DeviceMode.HOMING, switches=Switches(0))
+        assert at_mm > -12.0
+    assert bench.faults == (Fault.WRONG_DIRECTION,)
+    assert bench.output is not None
+    assert bench.output.request is DeviceRequest.RETRACT
+    assert bench.state.homing is not None
+    assert bench.state.homing.went_back_mm[0] > 2.9

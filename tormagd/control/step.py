@@ -57,8 +57,8 @@ STATUS_FAULT_S: Final = 0.1
 "Without a Sense, and without a Status, for so long: Status comes every 20 ms, Sense with every State."
 OPPOSED_S: Final = 0.1
 "A carriage that moves against its duty for so long does not brake: it brakes from full speed within 0.06 s."
-SKEWED_AGAINST_S: Final = 0.015
-"Carriages that come apart while one of them has gone against its duty for so long do so for that."
+WENT_AGAINST_S: Final = 0.015
+"Carriages that come apart, or to a stop, after one of them has gone against its duty for so long do so for that."
 SLOW_SHARE: Final = 0.4
 TOO_SLOW_SHARE: Final = 0.8
 """Of the delay that the position loop bears besides its own period: from the first on a round trip is a limit, from the
@@ -390,7 +390,7 @@ class Stepper:
             over_s=state.over_s + dt_s if self._is_over(estimate) else 0.0,
             still_s=state.still_s + dt_s if self._is_still(state, estimate, left.duty, right.duty) else 0.0,
             sight=sight,
-            opposed_s=state.opposed_s + dt_s if self._is_opposed(estimate, left.duty, right.duty) else 0.0,
+            opposed_s=self._opposed_s(state, estimate, left.duty, right.duty, dt_s),
             homing=state.homing,
         )
         # the bridges switch the device's real supply: the same volts take less duty of a higher one
@@ -488,7 +488,8 @@ class Stepper:
         if leap is not None:
             return tuple(faults)  # what follows from positions says nothing now
         is_skewed = abs(estimate.skew_mm) > self._skew_fault_mm
-        if state.opposed_s > (SKEWED_AGAINST_S if is_skewed else OPPOSED_S):
+        is_still = state.still_s > self._no_motion_time_s
+        if state.opposed_s > (WENT_AGAINST_S if is_skewed or is_still else OPPOSED_S):
             faults.append(Fault.WRONG_DIRECTION)
         if is_skewed:
             faults.append(Fault.SKEW)
@@ -498,7 +499,7 @@ class Stepper:
             faults.append(Fault.OVER_FORCE)
         if self._needs_sensor and plan.sensor_doubted_s > SENSOR_FAULT_S:
             faults.append(Fault.SENSOR)
-        if state.still_s > self._no_motion_time_s:
+        if is_still:
             faults.append(Fault.NO_MOTION)
         if measurement.mode is not DeviceMode.RUN and not faults and now_s - state.enabled_s > STARTING_S:
             faults.append(Fault.DEVICE_NOT_RUNNING)
@@ -522,12 +523,20 @@ class Stepper:
         is_right_still = is_right_driven and abs(estimate.right_mm_s) < STILL_MM_S
         return is_left_still or is_right_still
 
-    def _is_opposed(self, estimate: Estimate, left_duty: float, right_duty: float) -> bool:
-        """Whether a carriage that is driven well moves the other way."""
-        least = self._no_motion_duty
-        is_left = abs(left_duty) > least and estimate.left_mm_s * math.copysign(1.0, left_duty) < -STILL_MM_S
-        is_right = abs(right_duty) > least and estimate.right_mm_s * math.copysign(1.0, right_duty) < -STILL_MM_S
-        return is_left or is_right
+    def _opposed_s(
+        self, state: StepState, estimate: Estimate, left_duty: float, right_duty: float, dt_s: float
+    ) -> float:
+        """For how long a carriage that is driven well has moved the other way; one that comes to a stop there, did."""
+        least, left_mm_s, right_mm_s = self._no_motion_duty, 0.0, 0.0
+        if abs(left_duty) > least:
+            left_mm_s = estimate.left_mm_s * math.copysign(1.0, left_duty)
+        if abs(right_duty) > least:
+            right_mm_s = estimate.right_mm_s * math.copysign(1.0, right_duty)
+        if left_mm_s < -STILL_MM_S or right_mm_s < -STILL_MM_S:
+            return state.opposed_s + dt_s
+        is_driven = abs(left_duty) > least or abs(right_duty) > least
+        is_forward = left_mm_s > STILL_MM_S or right_mm_s > STILL_MM_S
+        return state.opposed_s if is_driven and not is_forward else 0.0
 
     @staticmethod
     def _off(safety: SafetyState, limits: tuple[Limit, ...]) -> StepOutput:
