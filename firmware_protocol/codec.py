@@ -68,7 +68,7 @@ class DecodeError(ValueError):
     a word: "function", "length", "CRC-8" or "range".
     """
 
-    def __init__(self, text: str, name: str = "", check: str = "") -> None:
+    def __init__(self, text: str = "", name: str = "", check: str = "") -> None:
         super().__init__(text)
         self.name, self.check = name, check
 

@@ -84,12 +84,16 @@ class Succession:
     __slots__ = ("_missing", "newest")
 
     def __init__(self) -> None:
-        self.newest = -1
+        self.newest = -2  # before the first
         self._missing = 0  # of the OVERTAKEN before the newest, a bit each, the nearest lowest
 
     def lost(self, number: int) -> int:
         """By how many more are missing with this number: -1 for one that was counted before, 0 for one that came."""
         ahead = (number - self.newest) % 256
+        if ahead == 1:  # as nearly always
+            self.newest = number
+            self._missing = self._missing << 1 & ALL_MISSING
+            return 0
         if self.newest < 0:
             self.newest = number
             return 0

@@ -61,7 +61,7 @@ def leap_between(
     left_mm, right_mm = estimate.left_mm - last.left_mm, estimate.right_mm - last.right_mm
     within_s = max(estimate.device_time_s - last.device_time_s, now_s - seen_s)
     most_mm = LEAP_SPEEDS * full_speed_mm_s * within_s + LEAP_MM
-    if abs(left_mm) <= most_mm and abs(right_mm) <= most_mm:
+    if -most_mm <= left_mm <= most_mm and -most_mm <= right_mm <= most_mm:
         return None
     return Leap(now_s, left_mm, right_mm, within_s, last.left_mm, last.right_mm)
 

@@ -108,6 +108,7 @@ class MessageDevice:
         "_duty_sign",
         "_faults",
         "_handle_counts_per_mm",
+        "_has_bad_encoders",
         "_home_m",
         "_inbox",
         "_is_state_damaged",
@@ -177,6 +178,7 @@ class MessageDevice:
         self._drives = 0
         self._left_motor_sign = 1.0
         self._duty_sign = 1.0
+        self._has_bad_encoders = False
         self._left_count_sign = 1
         self._left_extra_counts = 0
         self._right_extra_counts = 0
@@ -241,9 +243,10 @@ class MessageDevice:
         """Let the bridges do what the firmware wants of them now."""
         self._output = output = self.firmware.output
         if output.enabled and self._supply_V > 0.0:
-            sign = self._duty_sign if self.firmware.mode is DeviceMode.RUN else 1.0
-            left_V = self._left_motor_sign * sign * self._volts(output.left_duty)
-            self.plant.drive(left_V, sign * self._volts(output.right_duty))
+            left_V, right_V = self._volts(output.left_duty), self._volts(output.right_duty)
+            if self._duty_sign < 0.0 and self.firmware.mode is DeviceMode.RUN:
+                left_V, right_V = -left_V, -right_V
+            self.plant.drive(self._left_motor_sign * left_V, right_V)
         else:
             self.plant.drive(None, None)
 
@@ -329,9 +332,12 @@ class MessageDevice:
     def _encoders(self, left_rad: float, right_rad: float) -> tuple[int, int]:
         stuck = self._stuck_left
         left_counts = math.floor(left_rad * self._counts_per_rad) if stuck is None else stuck
+        right_counts = math.floor(right_rad * self._counts_per_rad)
+        if not self._has_bad_encoders:
+            return left_counts, right_counts
         return (
             self._left_count_sign * left_counts + self._left_extra_counts,
-            math.floor(right_rad * self._counts_per_rad) + self._right_extra_counts,
+            right_counts + self._right_extra_counts,
         )
 
     def _strike(self, time_s: float, fault: Fault) -> None:
@@ -364,6 +370,7 @@ class MessageDevice:
             case "answers_half":
                 self._answering_every = 2
             case "encoder_jump" | "encoder_jump_left":
+                self._has_bad_encoders = True
                 counts_rev = self.parameters.electronics.encoder_counts_per_rev
                 counts = round(JUMP_MM / self.parameters.screw.lead_mm * counts_rev)
                 self._left_extra_counts += counts
@@ -372,6 +379,7 @@ class MessageDevice:
             case "encoder_reversed_left":
                 (left_rad, _), (right_rad, _) = self.plant.shafts
                 left_counts, _ = self._encoders(left_rad, right_rad)
+                self._has_bad_encoders = True
                 self._left_count_sign = -self._left_count_sign
                 self._left_extra_counts += left_counts - self._encoders(left_rad, right_rad)[0]
             case "motor_reversed_left":
