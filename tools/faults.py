@@ -390,9 +390,8 @@ def _first(now_s: float) -> Callable[[float | None], float]:
 
 def print_table(cells: list[Cell]) -> None:
     """The matrix for a person."""
-    print(
-        f"{'injected':40s}{'bus':7s}{'noticed':>9s}{'< 1 N':>9s}{'open':>9s}{'loss':>10s}  {'must be':13s}noticed as; end state"
-    )
+    times_heads = "".join(f"{head:>9s}" for head in ("noticed", "< 1 N", "open"))
+    print(f"{'injected':40s}{'bus':7s}{times_heads}{'loss':>10s}  {'must be':14s}noticed as; end state")
     for cell in cells:
         times = (cell.noticed_ms, cell.below_1N_ms, cell.open_ms)
         columns = "".join(f"{'-' if time is None else f'{time:.0f} ms':>9s}" for time in times)
@@ -402,7 +401,7 @@ def print_table(cells: list[Cell]) -> None:
             "" if cell.named and cell.safe else f" {'' if cell.named else 'UNNAMED '}{'' if cell.safe else 'UNSAFE'}"
         )
         print(
-            f"{cell.fault:40s}{cell.bus:7s}{columns}  {cell.expected:13s}{', '.join(named) or 'nothing'}; "
+            f"{cell.fault:40s}{cell.bus:7s}{columns}  {cell.expected:14s}{', '.join(named) or 'nothing'}; "
             f"{cell.reaction}{verdict}"
         )
 
