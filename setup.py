@@ -22,7 +22,7 @@ COMPILED = {
     "tormagd/physics": ("friction", "relaxation"),
     "tormagd/model": ("displacement", "force_curve"),
     "tormagd/inverse": ("solution", "newton"),
-    "tormagd/hardware": ("frame_stream", "link", "link_statistics", "measurement", "connection"),
+    "tormagd/hardware": ("frame_stream", "link", "link_quality", "link_statistics", "measurement", "connection"),
     "tormagd/safety": ("operating_state",),
     "tormagd/control": (
         *(
@@ -32,6 +32,8 @@ COMPILED = {
             "sensor_zero",
             "sensor",
             "sight",
+            "plausible",
+            "homing",
             "pid",
             "trajectory",
             "interpolation",

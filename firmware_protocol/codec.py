@@ -62,7 +62,15 @@ class EncodeError(ValueError):
 
 
 class DecodeError(ValueError):
-    """Bytes from the wire are not a message. The text names what was expected and what was received."""
+    """Bytes from the wire are not a message. The text names what was expected and what was received.
+
+    `name` is the message that it would have been, empty where none has this function; `check` what it did not pass, in
+    a word: "function", "length", "CRC-8" or "range".
+    """
+
+    def __init__(self, text: str = "", name: str = "", check: str = "") -> None:
+        super().__init__(text)
+        self.name, self.check = name, check
 
 
 _BY_TYPE: Final[dict[type[object], Layout]] = {layout.message: layout for layout in LAYOUTS}
@@ -138,19 +146,22 @@ def _no_message(function: int, payload: bytes) -> DecodeError:
     """Why bytes are no message: the function, then the length, the CRC-8, and the first step out of its range."""
     layout = _BY_FUNCTION.get(function)
     if layout is None:
-        return DecodeError(f"function {function}: known are {', '.join(map(str, _BY_FUNCTION))}")
+        return DecodeError(f"function {function}: known are {', '.join(map(str, _BY_FUNCTION))}", check="function")
     name, length = layout.message.__name__, struct.calcsize(layout.format)
     if len(payload) != length:
-        return DecodeError(f"{name}: {length} bytes expected, {len(payload)} received")
+        return DecodeError(f"{name}: {length} bytes expected, {len(payload)} received", name, "length")
     steps = struct.unpack(layout.format, payload)
     if layout.protected:
         expected = crc8(bytes((function,)) + payload[:-1])
         if steps[-1] != expected:
-            return DecodeError(f"{name}: CRC {expected:#04x} expected, {steps[-1]:#04x} received ({payload.hex()})")
+            text = f"{name}: CRC {expected:#04x} expected, {steps[-1]:#04x} received ({payload.hex()})"
+            return DecodeError(text, name, "CRC-8")
     for place, signal in enumerate(layout.signals):
         if not signal.lowest <= steps[place] <= signal.highest:
             return DecodeError(
                 f"{name}.{signal.name}: {signal.minimum:.10g} to {signal.maximum:.10g} expected, "
-                f"{steps[place] * signal.scale:.10g} received"
+                f"{steps[place] * signal.scale:.10g} received",
+                name,
+                "range",
             )
-    return DecodeError(f"{name}: {payload.hex()} is no message")
+    return DecodeError(f"{name}: {payload.hex()} is no message", name, "range")

@@ -20,6 +20,9 @@ CRC_RESIDUE: Final = 0x1D0F
 CRC_LENGTH: Final = 2
 HEADER_LENGTH: Final = 2
 MAX_PAYLOAD: Final = 8
+OVERTAKEN: Final = 16
+"A frame behind the newest by less than this was overtaken, or repeated, or its sender has started anew."
+ALL_MISSING: Final = (1 << (OVERTAKEN - 1)) - 1
 MAX_ENCODED: Final = 1 + HEADER_LENGTH + MAX_PAYLOAD + CRC_LENGTH
 """Longest frame before its delimiter; under 254 bytes, COBS adds exactly one."""
 _BYTES: Final = [bytes((byte,)) for byte in range(256)]
@@ -45,7 +48,7 @@ class FramingStatistics(Value):
     """What a FrameDecoder has seen since it was made. It counts on; a copy does not."""
 
     __match_args__ = ("bytes", "frames", "corrupt", "lost", "repeated", "resynchronisations")
-    __slots__ = __match_args__
+    __slots__ = ("bytes", "corrupt", "frames", "lost", "refused", "repeated", "resynchronisations", "unsent")
 
     def __init__(
         self,
@@ -62,11 +65,50 @@ class FramingStatistics(Value):
         self.corrupt = corrupt
         """Stretches between two delimiters that were not a frame."""
         self.lost = lost
-        """Frames missing from the sequence, those among them that arrived corrupt included."""
+        """Frames missing from the sequence, those among them that arrived corrupt included; not those that were only
+        overtaken."""
         self.repeated = repeated
         """Frames with the sequence number of the frame before."""
         self.resynchronisations = resynchronisations
         """Times a frame was found again after something corrupt."""
+        self.unsent = 0
+        """Sent frames that the port did not take at once; whoever writes to it counts them."""
+        self.refused: dict[str, str] = {}
+        """By what it was, "frame" or a message, why the newest one of it was refused."""
+
+
+@final
+class Succession:
+    """How many are missing from a sequence modulo 256. One that comes late was overtaken, and is missing no more."""
+
+    __slots__ = ("_missing", "newest")
+
+    def __init__(self) -> None:
+        self.newest = -2  # before the first
+        self._missing = 0  # of the OVERTAKEN before the newest, a bit each, the nearest lowest
+
+    def lost(self, number: int) -> int:
+        """By how many more are missing with this number: -1 for one that was counted before, 0 for one that came."""
+        ahead = (number - self.newest) % 256
+        if ahead == 1:  # as nearly always
+            self.newest = number
+            self._missing = self._missing << 1 & ALL_MISSING
+            return 0
+        if self.newest < 0:
+            self.newest = number
+            return 0
+        behind = (256 - ahead) % 256
+        if behind < OVERTAKEN:
+            bit = 1 << behind >> 1
+            if not self._missing & bit:
+                return 0
+            self._missing ^= bit
+            return -1
+        self.newest = number
+        # all that lie between the two are missing, the nearest first
+        missing = ALL_MISSING if ahead >= OVERTAKEN else (self._missing << ahead) | ((1 << (ahead - 1)) - 1)
+        self._missing = missing & ALL_MISSING
+        return ahead - 1
 
 
 def cobs_encode(data: bytes) -> bytes:
@@ -111,12 +153,13 @@ class FrameDecoder:
     counted and not returned; one that repeats only the sequence number comes from a sender that started anew, and is.
     """
 
-    __slots__ = ("_last", "_pending", "_synchronised", "statistics")
+    __slots__ = ("_last", "_pending", "_succession", "_synchronised", "statistics")
 
     def __init__(self) -> None:
         self.statistics = FramingStatistics()
         self._pending = b""
         self._last: Frame | None = None
+        self._succession = Succession()
         self._synchronised = True
 
     def feed(self, data: bytes) -> list[Frame]:
@@ -143,6 +186,7 @@ class FrameDecoder:
         frame = _parse(encoded)
         if frame is None:
             statistics.corrupt += 1
+            statistics.refused["frame"] = _why_refused(encoded)
             self._synchronised = False
             return None
         if not self._synchronised:
@@ -150,16 +194,22 @@ class FrameDecoder:
             self._synchronised = True
         last = self._last
         self._last = frame
-        if last is not None:
-            advance = (frame.sequence - last.sequence) % 256
-            if advance == 0:
-                statistics.repeated += 1
-                if frame.function == last.function and frame.payload == last.payload:
-                    return None
-            else:
-                statistics.lost += advance - 1
+        if last is not None and frame.sequence == last.sequence:
+            statistics.repeated += 1
+            if frame.function == last.function and frame.payload == last.payload:
+                return None
+        statistics.lost += self._succession.lost(frame.sequence)
         statistics.frames += 1
         return frame
+
+
+def _why_refused(encoded: bytes) -> str:
+    if len(encoded) > MAX_ENCODED:
+        return f"over {MAX_ENCODED} bytes"
+    body = cobs_decode(encoded)
+    if body is None:
+        return "COBS"
+    return "too short" if len(body) < HEADER_LENGTH + CRC_LENGTH else "CRC-16"
 
 
 def _parse(encoded: bytes) -> Frame | None:

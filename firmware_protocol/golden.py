@@ -194,6 +194,8 @@ def _streams() -> Iterator[Json]:
     yield stream("a zero less than a whole frame", a + shorter + c, [a, c], **damaged)
     yield stream("COBS distance past the end", a + b"\x09\x01\x02\x00" + c, [a, c], **damaged)
     yield stream("one missing", a + c + d, [a, c, d], lost=1)
+    yield stream("one overtaken", a + c + b + d, [a, c, b, d])
+    yield stream("a late repetition", a + b + c + a + d, [a, b, c, a, d])
     yield stream("the same frame twice", a + b + b + c, [a, b, c], repeated=1)
     yield stream("same sequence, another frame", a + another + b, [a, another, b], repeated=1)
     yield stream("unfinished", a + b[:-1], [a])

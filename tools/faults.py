@@ -1,7 +1,8 @@
-"""The fault matrix: each fault injected at 1.8 N in virtual time, what notices it, what happens, how long until safe.
+"""The fault matrix: each fault on a serial line and on a CAN bus, in virtual time: its name, and how it ends safe.
 
-Safe means: the plant's force is below 1 N, and the gap is open. Times count from the injection. How fast the force is
-lost on the way is measured too: a force that vanishes at once is a hazard of its own.
+Driven faults are injected at 1.8 N, and times count from then; the others are there from the beginning, and times count
+from the command `home`. What is safe is stated for each. How fast the force is lost on the way is measured too: a force
+that vanishes at once is a hazard of its own.
 """
 
 import argparse
@@ -10,15 +11,19 @@ import math
 import sys
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import msgspec
+from bad_lines import BadBus, BadSerialLine, Damaging, Delaying, Doubling, Losing, MakeWay, Reordering
 from tqdm import tqdm
 
-from tormagd.closed_loop import ClosedLoop, Sample
-from tormagd.config import load_config
-from tormagd.control.core import build_core
+from tormagd.closed_loop import ClosedLoop, Sample, VirtualBus
+from tormagd.config import Config, load_config
+from tormagd.control.core import Core, build_core
 from tormagd.control.governor import TimedSetpoint
+from tormagd.safety.operating_state import OperatingState, RefusedError
+from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import SteadyHand
@@ -36,38 +41,117 @@ LOSS_MS = 50
 "A loss of force is what a hand feels of it: the greatest over so long."
 OTHER_N = 0.6
 "What the source asks for that takes over."
+CONNECTED_S = 0.5
+ARMING_S = 14.0
+MOST_OFF_N = 0.15
+"A force that is held is off by no more, in the mean of the last second,"
+MOST_OVER_N = 0.3
+"and never too great by more."
+MOST_CLOSED_MM = 3.0
+"What is not driven, or homed, closes by no more than a few mm."
+
+OPENS = "opens"
+"The gap is open and the force below 1 N."
+HELD = "held"
+"The force goes on as asked, and no fault opens the gap."
+FOLLOWED = "followed"
+"The force goes to what is asked now, and no fault opens the gap."
+HELD_OR_OPENS = "held or opens"
+STAYS = "stays"
+"Nothing can open the gap, or nothing has been driven: it closes by no more than MOST_CLOSED_MM."
+
+SERIAL, CAN = "serial", "can"
 
 
 class Injection(NamedTuple):
-    """A fault: of the simulated device (a `--fault` word), of the host, or of the publisher."""
+    """A fault: of the simulated device (a `--fault` word), of the host, of the publisher, or of the line.
+
+    `names` are the codes of which one has to be told, `safe` is how it has to end. One that is not driven is there from
+    the beginning, and the device is homed and enabled with it, as far as that goes.
+    """
 
     name: str
+    names: tuple[str, ...]
+    safe: str = OPENS
     device: str | None = None
     host: str | None = None
     stall_ms: int = 0
+    way: MakeWay | None = None
+    fill_frames_ms: float = 0.0
+    is_driven: bool = True
+    buses: tuple[str, ...] = (SERIAL, CAN)
 
 
 MATRIX = (
-    Injection("daemon killed or cable cut", host="silent"),
-    Injection("daemon stalls for 45 ms", stall_ms=45),
-    Injection("daemon stalls for 83 ms", stall_ms=83),
-    Injection("device hears nothing", device="commands_vanish"),
-    Injection("device resets", device="reset"),
-    Injection("motor supply fails", device="supply_loss"),
-    Injection("left encoder stuck", device="encoder_stuck_left"),
-    Injection("left drag +50%", device="drag_left=+50%"),
-    Injection("worn gearbox", device="worn_gearbox"),
-    Injection("worn gearbox, then daemon killed", device="worn_gearbox", host="silent"),
-    Injection("publisher silent", host="stale"),
-    Injection("another source takes over", host="other"),
-    Injection("operator: stop", host="stop"),
-    Injection("operator: disable", host="disable"),
+    Injection("daemon killed or cable cut", ("device:COMMAND_TIMEOUT",), host="silent"),
+    Injection("daemon stalls for 45 ms", ("HOST_STALL",), HELD, stall_ms=45),
+    Injection("daemon stalls for 83 ms", ("HOST_STALL",), stall_ms=83),
+    Injection("device hears nothing", ("MEASUREMENT_STALE",), device="commands_vanish"),
+    Injection("device resets", ("DEVICE_NOT_RUNNING",), device="reset"),
+    Injection("motor supply fails", ("DEVICE_SUPPLY",), STAYS, device="supply_loss"),
+    Injection("left encoder stuck", ("NO_MOTION",), device="encoder_stuck_left"),
+    Injection("left drag +50%", (), HELD, device="drag_left=+50%"),
+    Injection("worn gearbox", (), HELD, device="worn_gearbox"),
+    Injection("worn gearbox, then daemon killed", ("device:COMMAND_TIMEOUT",), device="worn_gearbox", host="silent"),
+    Injection("publisher silent", ("STALE",), host="stale"),
+    Injection("another source takes over", (), FOLLOWED, host="other"),
+    Injection("operator: stop", ("STOPPED",), host="stop"),
+    Injection("operator: disable", (), host="disable"),
+    # one of its streams stops
+    Injection("no State any more", ("MEASUREMENT_STALE",), device="no_state"),
+    Injection("no Sense any more", ("SENSE_STALE",), device="no_sense"),
+    Injection("no Status any more", ("STATUS_STALE",), device="no_status"),
+    Injection("wrong CRC-8 in State", ("MEASUREMENT_STALE",), device="state_crc"),
+    # measurements against physics
+    Injection("both encoders jump by 4 mm", ("ENCODER",), device="encoder_jump"),
+    Injection("left encoder jumps by 4 mm", ("ENCODER", "DEVICE_SKEW"), device="encoder_jump_left"),
+    Injection("left encoder turns round", ("WRONG_DIRECTION",), device="encoder_reversed_left"),
+    Injection("duties taken the other way", ("WRONG_DIRECTION",), device="duties_reversed"),
+    Injection("device clock 2% fast", ("CLOCK",), HELD, device="clock=+2%"),
+    Injection("device clock 30% slow", ("CLOCK",), device="clock=-30%"),
+    # the line
+    Injection("5% of the frames lost", ("LINK_DEGRADED",), HELD, way=partial(Losing, 0.05)),
+    Injection("5% of the frames damaged", ("LINK_DEGRADED", "LINK_LOST"), HELD_OR_OPENS, way=partial(Damaging, 0.05)),
+    Injection("every frame twice", (), HELD, way=Doubling),
+    Injection("20% of the frames overtaken", (), HELD, way=partial(Reordering, 0.2)),
+    Injection("round trip of 7 ms", ("LINK_DEGRADED",), HELD, way=partial(Delaying, 0.003)),
+    Injection("round trip of 15 ms", ("LINK_DEGRADED",), way=partial(Delaying, 0.007)),
+    Injection("every other Drive answered", ("LINK_DEGRADED",), HELD, device="answers_half"),
+    Injection("bus full", ("LINK_DEGRADED", "STATUS_STALE"), HELD_OR_OPENS, fill_frames_ms=6.5, buses=(CAN,)),
+    # there from the beginning
+    Injection(
+        "homing: left motor wired the wrong way", ("WRONG_DIRECTION",), STAYS, "motor_reversed_left", is_driven=False
+    ),
+    Injection(
+        "homing: left encoder counts backwards", ("WRONG_DIRECTION",), STAYS, "encoder_reversed_left", is_driven=False
+    ),
+    Injection("homing: left switch never closes", ("DEVICE_OVERCURRENT",), STAYS, "switch_dead_left", is_driven=False),
+    Injection("first motion the wrong way", ("WRONG_DIRECTION",), OPENS, "duties_reversed", is_driven=False),
+    Injection("from the start: no Sense", ("not_connected: no Sense yet",), STAYS, "no_sense", is_driven=False),
+    Injection("from the start: no Status", ("not_connected: no Status yet",), STAYS, "no_status", is_driven=False),
+    Injection(
+        "from the start: wrong CRC-8 in State",
+        ("not_connected: State refused: CRC-8",),
+        STAYS,
+        "state_crc",
+        is_driven=False,
+    ),
+    Injection(
+        "from the start: round trip of 15 ms", ("link_degraded",), STAYS, way=partial(Delaying, 0.007), is_driven=False
+    ),
+    Injection("from the start: device clock 30% slow", ("clock",), STAYS, "clock=-30%", is_driven=False),
 )
 
 
 class Cell(NamedTuple):
-    """One row of the matrix. A time is null where it did not come to that within 6 s."""
+    """One row of the matrix. A time is null where it did not come to that within 6 s.
 
+    `named`: one of the codes that it should have was told, and no other fault before. `safe`: it ended as stated, and
+    `seconds` is when that began; for a force that is held, when it was named.
+    """
+
+    bus: str
+    fault: str
     injected: str
     host_faults: tuple[str, ...]
     device_faults: tuple[str, ...]
@@ -77,47 +161,111 @@ class Cell(NamedTuple):
     below_1N_ms: float | None
     open_ms: float | None
     loss_N_s: float
+    expected: str
+    named: bool
+    safe: bool
+    seconds: float | None
 
 
 def main() -> int:
-    """Prints the matrix; returns 0."""
+    """Prints the matrix; returns 1 where a cell is not named or not safe."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
+    parser.add_argument("--bus", choices=(SERIAL, CAN), help="only this one")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    steps = tqdm(MATRIX, desc="faults", unit="fault", disable=not sys.stderr.isatty())
-    cells = [inject(injection, options.plant) for injection in steps]
+    todo = [(injection, bus) for injection in MATRIX for bus in injection.buses if options.bus in (None, bus)]
+    steps = tqdm(todo, desc="faults", unit="fault", disable=not sys.stderr.isatty())
+    cells = [inject(injection, options.plant, bus) for injection, bus in steps]
     if options.json:
         print(json.dumps({"plant": options.plant, "cells": [cell._asdict() for cell in cells]}))
     else:
         print_table(cells)
-    return 0
+    return 0 if all(cell.named and cell.safe for cell in cells) else 1
 
 
-def inject(injection: Injection, plant: str) -> Cell:
+class Rig:
+    """A daemon's core and a device, with a line between them that may go bad."""
+
+    def __init__(self, injection: Injection, plant: str, bus: str, injected_s: float) -> None:
+        self.config: Config = msgspec.structs.replace(load_config(None), scene="coronary")
+        core: Core = build_core(self.config)
+        faults = [parse_fault(f"{injection.device}@{injected_s}")] if injection.device else []
+        device = VirtualDevice(load_plant(plant), SteadyHand(), faults, seed=1)
+        self.line: BadSerialLine | BadBus
+        if bus == SERIAL:
+            self.line = serial = BadSerialLine(device)
+            self.loop = ClosedLoop(self.config, core.stepper, core.planner, serial)
+        else:
+            self.line = can = BadBus(CanDevice(device.messages))
+            self.loop = ClosedLoop(self.config, core.stepper, core.planner, VirtualBus(can))
+
+    def spoil(self, injection: Injection) -> None:
+        """The line goes bad now."""
+        if injection.way is not None:
+            self.line.spoil(injection.way)
+        if isinstance(self.line, BadBus):
+            self.line.fill(injection.fill_frames_ms)
+
+
+def inject(injection: Injection, plant: str, bus: str = SERIAL) -> Cell:
     """Runs one fault."""
-    config = msgspec.structs.replace(load_config(None), scene="coronary")
-    core = build_core(config)
-    faults = [parse_fault(f"{injection.device}@{INJECTED_S}")] if injection.device else []
-    device = VirtualDevice(load_plant(plant), SteadyHand(), faults, seed=1)
-    loop = ClosedLoop(config, core.stepper, core.planner, device)
+    return _inject_driven(injection, plant, bus) if injection.is_driven else _begin_with(injection, plant, bus)
+
+
+def _inject_driven(injection: Injection, plant: str, bus: str) -> Cell:
+    rig = Rig(injection, plant, bus, INJECTED_S)
+    loop = rig.loop
     loop.arm()
     setpoint = Publisher()
     usual: dict[str, None] = {}
     for sample in loop.run(INJECTED_S - loop.now_s, setpoint):
         if sample.time_s > INJECTED_S - USUAL_S:
             usual |= dict.fromkeys(map(str, (*sample.plan.limits, *sample.output.limits)))
+    rig.spoil(injection)
     if injection.host in ("stop", "disable"):
         loop.command(injection.host)
     setpoint.is_silent, setpoint.is_other = injection.host == "stale", injection.host == "other"
-    watch = Watch(usual)
-    for tick in range(round(WATCHED_S * config.rates.control_hz)):
+    watch = Watch(usual, INJECTED_S, loop.simulated.truth.gap_mm)
+    for tick in range(round(WATCHED_S * rig.config.rates.control_hz)):
         if injection.host == "silent" or tick < injection.stall_ms:
             loop.skip()
             watch.see(loop, None)
         else:
             watch.see(loop, loop.tick(setpoint(loop.now_s)))
-    return watch.cell(injection.name, loop)
+    return watch.cell(injection, bus, loop)
+
+
+def _begin_with(injection: Injection, plant: str, bus: str) -> Cell:
+    """Connects, homes and enables as far as the device lets one, and asks for the force then."""
+    rig = Rig(injection, plant, bus, 0.0)
+    loop = rig.loop
+    rig.spoil(injection)
+    for _ in loop.run(CONNECTED_S):
+        pass
+    setpoint = Publisher()
+    setpoint.is_silent = True
+    watch = Watch({}, loop.now_s, loop.simulated.truth.gap_mm)
+    is_enabled = _is_taken(loop, watch, "home")
+    if is_enabled:
+        for sample in loop.run(ARMING_S):
+            watch.see(loop, sample)
+            if sample.state.safety.faults:
+                break
+        is_enabled = not loop.step_state.safety.faults and _is_taken(loop, watch, "enable")
+    setpoint.is_silent = not is_enabled
+    for sample in loop.run(WATCHED_S, setpoint if is_enabled else lambda now_s: None):
+        watch.see(loop, sample)
+    return watch.cell(injection, bus, loop)
+
+
+def _is_taken(loop: ClosedLoop, watch: "Watch", command: str) -> bool:
+    try:
+        loop.command(command)
+    except RefusedError as error:
+        watch.refuse(loop, error)
+        return False
+    return True
 
 
 class Publisher:
@@ -138,25 +286,31 @@ class Publisher:
 class Watch:
     """What the injection brought about, tick by tick."""
 
-    def __init__(self, usual: dict[str, None]) -> None:
+    def __init__(self, usual: dict[str, None], from_s: float, gap_mm: float) -> None:
         """`usual` are the limits that were held before the injection too: they notice nothing."""
-        self._usual = usual
+        self._usual, self._from_s, self._from_mm = usual, from_s, gap_mm
         self._host: dict[str, None] = {}
         self._device: dict[str, None] = {}
         self._limits: dict[str, None] = {}
+        self._refusal = ""
         self._forces_N: deque[float] = deque(maxlen=LOSS_MS + 1)
         self._loss_N_s = 0.0
         self._noticed_s: float | None = None
         self._below_s: float | None = None
         self._open_s: float | None = None
+        self._resting_s: float | None = None
+        self._least_mm = gap_mm
+        self._over_N = 0.0
+        self._off_N: list[float] = []
 
     def see(self, loop: ClosedLoop, sample: Sample | None) -> None:
         """Takes one tick; `sample` is None while the daemon is dead."""
-        truth, firmware = loop.device.truth, loop.device.messages.firmware
+        truth, firmware = loop.simulated.truth, loop.simulated.firmware
         if sample is not None:
             self._host |= dict.fromkeys(map(str, sample.state.safety.faults))
-            held = map(str, (*sample.plan.limits, *sample.output.limits))
-            self._limits |= dict.fromkeys(limit for limit in held if limit not in self._usual)
+            if sample.state.safety.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED):
+                held = map(str, (*sample.plan.limits, *sample.output.limits))
+                self._limits |= dict.fromkeys(limit for limit in held if limit not in self._usual)
         self._device |= dict.fromkeys(fault.name or "" for fault in firmware.faults)
         self._forces_N.append(truth.force_N)
         if len(self._forces_N) > LOSS_MS:
@@ -167,41 +321,89 @@ class Watch:
         # a force that is let go and comes back was not safe
         self._below_s = first(self._below_s) if truth.force_N < SAFE_N else None
         self._open_s = first(self._open_s) if truth.gap_mm > OPEN_MM else None
+        self._resting_s = None if firmware.output.enabled else first(self._resting_s)
+        self._least_mm = min(self._least_mm, truth.gap_mm)
+        off_N = truth.force_N - FORCE_N - SWING_N * math.sin(math.tau * loop.now_s)
+        self._over_N = max(self._over_N, off_N)
+        self._off_N.append(off_N)
 
-    def cell(self, name: str, loop: ClosedLoop) -> Cell:
+    def refuse(self, loop: ClosedLoop, error: RefusedError) -> None:
+        """A command was refused."""
+        self._refusal = f"{error.code}: {error.message.partition(': ')[2]}"
+        self._noticed_s = _first(loop.now_s)(self._noticed_s)
+
+    def cell(self, injection: Injection, bus: str, loop: ClosedLoop) -> Cell:
         """The row."""
         state = loop.step_state.safety.operating_state
-        mode = loop.device.messages.firmware.mode.name
+        mode = loop.simulated.firmware.mode.name
+        noticed_ms = self._since(self._noticed_s)
+        is_safe, safe_ms = self._ended(injection.safe, noticed_ms)
         return Cell(
-            name,
+            bus,
+            injection.name,
+            injection.name,
             tuple(self._host),
             tuple(self._device),
-            tuple(self._limits),
+            (*self._limits, *([self._refusal] if self._refusal else [])),
             f"daemon {state}, device {mode}",
-            _since(self._noticed_s),
-            _since(self._below_s),
-            _since(self._open_s),
+            noticed_ms,
+            self._since(self._below_s),
+            self._since(self._open_s),
             round(self._loss_N_s, 2),
+            injection.safe,
+            self._is_named(injection.names),
+            is_safe,
+            None if safe_ms is None else round(safe_ms * 1e-3, 4),
         )
+
+    def _is_named(self, names: tuple[str, ...]) -> bool:
+        if not names:
+            return not self._host
+        told = [*self._host, *self._limits, *(f"device:{fault}" for fault in self._device)]
+        is_told = any(name in told or (self._refusal and self._refusal.startswith(name)) for name in names)
+        first = next(iter(self._host), None)
+        # what is latched first is what a person reads first
+        return is_told and (first is None or first in names or names[0].startswith("device:"))
+
+    def _ended(self, safe: str, noticed_ms: float | None) -> tuple[bool, float | None]:
+        """Whether it ended as stated, and since when."""
+        has_opened = self._open_s is not None and self._below_s is not None
+        last_second = self._off_N[-1000:]
+        is_held = abs(sum(last_second) / len(last_second)) < MOST_OFF_N and self._over_N < MOST_OVER_N
+        if safe == STAYS:
+            is_still = self._resting_s is not None and self._least_mm > self._from_mm - MOST_CLOSED_MM
+            return is_still, self._since(self._resting_s)
+        if safe == FOLLOWED:
+            is_there = abs(self._forces_N[-1] - OTHER_N) < MOST_OFF_N and self._over_N < MOST_OVER_N
+            return is_there and not self._host, self._since(self._below_s)
+        if has_opened and safe in (OPENS, HELD_OR_OPENS):
+            return True, self._since(self._open_s)
+        return safe in (HELD, HELD_OR_OPENS) and is_held and not self._host, noticed_ms
+
+    def _since(self, time_s: float | None) -> float | None:
+        return None if time_s is None else round((time_s - self._from_s) * 1e3, 1)
 
 
 def _first(now_s: float) -> Callable[[float | None], float]:
     return lambda known: now_s if known is None else known
 
 
-def _since(time_s: float | None) -> float | None:
-    return None if time_s is None else round((time_s - INJECTED_S) * 1e3, 1)
-
-
 def print_table(cells: list[Cell]) -> None:
     """The matrix for a person."""
-    print(f"{'injected at 1.8 N':34s}{'noticed':>9s}{'< 1 N':>9s}{'open':>9s}{'loss':>10s}  noticed as; end state")
+    times_heads = "".join(f"{head:>9s}" for head in ("noticed", "< 1 N", "open"))
+    print(f"{'injected':40s}{'bus':7s}{times_heads}{'loss':>10s}  {'must be':14s}noticed as; end state")
     for cell in cells:
         times = (cell.noticed_ms, cell.below_1N_ms, cell.open_ms)
         columns = "".join(f"{'-' if time is None else f'{time:.0f} ms':>9s}" for time in times)
-        named = [*cell.host_faults, *(f"device:{fault}" for fault in cell.device_faults), *cell.limits]
         columns += f"{cell.loss_N_s:6.1f} N/s"
-        print(f"{cell.injected:34s}{columns}  {', '.join(named) or 'nothing'}; {cell.reaction}")
+        named = [*cell.host_faults, *(f"device:{fault}" for fault in cell.device_faults), *cell.limits]
+        verdict = (
+            "" if cell.named and cell.safe else f" {'' if cell.named else 'UNNAMED '}{'' if cell.safe else 'UNSAFE'}"
+        )
+        print(
+            f"{cell.fault:40s}{cell.bus:7s}{columns}  {cell.expected:14s}{', '.join(named) or 'nothing'}; "
+            f"{cell.reaction}{verdict}"
+        )
 
 
 if __name__ == "__main__":

@@ -206,6 +206,8 @@ def _measurement(number: int, time_s: float, left_mm: float) -> Measurement:
         faults=DeviceFault(0),
         temperature_C=25.0,
         supply_V=12.0,
+        sensed_s=time_s,
+        reported_s=time_s,
     )
 
 

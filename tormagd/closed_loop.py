@@ -18,11 +18,14 @@ from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import Plan, Planner, PlanState
 from tormagd.control.step import StepOutput, Stepper, StepState
 from tormagd.hardware.backend import LinkStatistics
+from tormagd.hardware.can_stream import CanStream
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import Conditions, OperatingState
-from tormagd.simulation.device import SerialDevice
+from tormagd.simulation.can_device import DEFAULT_NODE, DEVICE, CanLine
+from tormagd.simulation.can_frame import CanFrame
+from tormagd.simulation.device import MessageDevice, SerialDevice
 from tormagd.simulation.plant import Truth
 
 Array = npt.NDArray[np.float64]
@@ -30,6 +33,8 @@ HOMING_S = 10.0
 "Longer than the slowest homing from a closed gap."
 MAX_UNREAD_BYTES = 4096
 "What a serial port keeps for a program that does not read."
+MAX_UNREAD_FRAMES = 512
+"What a CAN socket keeps, about."
 
 
 class Sample(NamedTuple):
@@ -97,11 +102,73 @@ class VirtualPort:
         """Nothing was noted."""
 
 
+class VirtualBus:
+    """The same with a device on a CAN bus, through the backend's own codec of frames."""
+
+    def __init__(self, device: CanLine) -> None:
+        self.device = device
+        self.now_s = 0.0
+        self._stream = CanStream(DEFAULT_NODE)
+        self._unread: list[CanFrame] = []
+
+    def open(self) -> Self:
+        """The same bus again."""
+        self._stream = CanStream(DEFAULT_NODE)
+        self._unread.clear()
+        return self
+
+    def clock(self) -> float:
+        """Virtual time, s."""
+        return self.now_s
+
+    def advance(self, now_s: float) -> None:
+        """Lets time pass; what goes by waits for its reader, as much of it as a socket keeps."""
+        self.now_s = now_s
+        arrived = [delivery.frame for delivery in self.device.transmit(now_s) if delivery.sender == DEVICE]
+        self._unread = [*self._unread, *arrived][-MAX_UNREAD_FRAMES:]
+
+    @property
+    def statistics(self) -> LinkStatistics:
+        """Counters since the bus was opened."""
+        return self._stream.statistics
+
+    def fileno(self) -> int:
+        """None: nothing waits in virtual time."""
+        return -1
+
+    def receive(self) -> list[Message]:
+        """All valid messages of the device that have arrived."""
+        arrived, self._unread = self._unread, []
+        messages: list[Message] = []
+        for frame in arrived:
+            message = self._stream.unpack(frame.identifier, frame.data)
+            if message is not None:
+                messages.append(message)
+        return messages
+
+    def send(self, message: Message) -> None:
+        """Hands one frame to the bus."""
+        identifier, data = self._stream.pack(message)
+        self.device.receive(self.now_s, CanFrame(identifier, data))
+
+    def close(self) -> None:
+        """There is nothing to give back."""
+
+    def add_reader(self, fd: int, callback: Callable[[], None]) -> None:
+        """Takes no note of it: the closed loop reads in every tick."""
+
+    def remove_reader(self, fd: int) -> None:
+        """Nothing was noted."""
+
+
 class ClosedLoop:
     """A daemon and its device in one process and one virtual time, which starts at 0."""
 
-    def __init__(self, config: Config, stepper: Stepper, planner: Planner | None, device: SerialDevice) -> None:
-        """`planner` may be missing where every tick is given its plan."""
+    def __init__(
+        self, config: Config, stepper: Stepper, planner: Planner | None, device: SerialDevice | VirtualBus
+    ) -> None:
+        """`planner` may be missing where every tick is given its plan. The device is behind a serial line, or it comes
+        with its bus."""
         self._config, self._stepper, self._planner = config, stepper, planner
         self._period_s = 1.0 / config.rates.control_hz
         self._inference_s = 1.0 / config.rates.inference_hz
@@ -110,7 +177,7 @@ class ClosedLoop:
         self.plan_state: PlanState | None = None if planner is None else planner.start(0.0)
         self._output: StepOutput | None = None
         self._setpoint: TimedSetpoint | None = None
-        self._port = VirtualPort(device)
+        self._port: VirtualPort | VirtualBus = device if isinstance(device, VirtualBus) else VirtualPort(device)
         self.connection = Connection(config.device, self._port.open, self._lose_link, self._port.clock)
         self.connection.open(self._port)
 
@@ -121,12 +188,21 @@ class ClosedLoop:
 
     @property
     def device(self) -> SerialDevice:
-        """What is at the other end of the wire."""
+        """What is at the other end of the serial line. Raises TypeError where it is a bus."""
+        if isinstance(self._port, VirtualBus):
+            raise TypeError("this device is on a bus: allowed are `simulated` and `truth`")
         return self._port.device
 
     @device.setter
     def device(self, device: SerialDevice) -> None:
+        if isinstance(self._port, VirtualBus):
+            raise TypeError("this device is on a bus")
         self._port.device = device
+
+    @property
+    def simulated(self) -> MessageDevice:
+        """The device itself, whatever carries its messages."""
+        return self._port.device.messages
 
     @property
     def measurement(self) -> Measurement | None:
@@ -148,7 +224,7 @@ class ClosedLoop:
         if plan is None:
             self._infer(now_s, setpoint)
         trim = 1.0 if self.plan_state is None else self.plan_state.trim
-        return Sample(now_s, self.step_state, output, used, trim, self.device.truth)
+        return Sample(now_s, self.step_state, output, used, trim, self._port.device.truth)
 
     def skip(self) -> None:
         """One control period in which the daemon does nothing: it was stopped, or killed. What comes waits for it."""
@@ -165,8 +241,7 @@ class ClosedLoop:
         return conditions(
             self.now_s,
             self._config,
-            self.connection.measurement,
-            self.connection.pending,
+            self.connection,
             self.step_state,
             self._output,
             self._setpoint,

@@ -170,6 +170,10 @@ class LinkReport(msgspec.Struct, frozen=True, kw_only=True):
     resynchronisations: int | None
     round_trip_us: RoundTripReport | None
     clock: ClockReport | None
+    unsent: int | None = None
+    refused: dict[str, str] = {}
+    unanswered_share: float | None = None
+    damaged_share: float | None = None
 
 
 class ExecReport(msgspec.Struct, frozen=True, kw_only=True):
@@ -334,8 +338,9 @@ class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """One control tick: all that the step was given, and all that it gave. Units as in `Telemetry`; times in ns and s.
 
     A row of the recording endpoint's message, its columns in this order. `device_*` is what the device said itself,
-    beside what is concluded from it. What is not known (no device, no setpoint) is null. `received_s` (of the clock of
-    `monotonic_s`) and `delay_s` are the measurement's: from them a step decides how old it is.
+    beside what is concluded from it. What is not known (no device, no setpoint) is null. `received_s`, `sensed_s` and
+    `reported_s` (of the clock of `monotonic_s`) and `delay_s` are the measurement's: from them a step decides how old
+    it is.
     """
 
     t_ns: int
@@ -363,6 +368,13 @@ class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
     measurement: int | None
     received_s: float | None
     delay_s: float | None
+    sensed_s: float | None
+    reported_s: float | None
+    link_unanswered: float | None
+    link_damaged: float | None
+    link_unsent: float | None
+    link_round_trip_s: float | None
+    device_clock_drift: float | None
     device_time_s: float | None
     device_left_mm: float | None
     device_right_mm: float | None

@@ -371,7 +371,10 @@ static void tick_homing(struct tormag_device *device, double time_s, const struc
         device->output.duty[side] = homing->duties[side];
     }
     device->output.enabled = true;
-    if (outcome == TORMAG_FAILED) {
+    if (outcome == TORMAG_REVERSED) { /* to open is just what cannot be: friction holds the gap where it is */
+        device->faults |= HOMING_FAILED;
+        rest(device, time_s, LATCHED);
+    } else if (outcome == TORMAG_FAILED) {
         fail(device, time_s, HOMING_FAILED, sensors);
     } else if (outcome == TORMAG_DONE) {
         for (int side = 0; side < TORMAG_SIDES; side++) {

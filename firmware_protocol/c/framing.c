@@ -7,6 +7,8 @@
 #define HEADER_LENGTH 2u
 #define CRC_LENGTH 2u
 #define TOO_LONG (TORMAG_MAX_ENCODED + 1u)
+#define OVERTAKEN 16u /* a frame behind the newest by less was overtaken, or repeated, or its sender has started anew */
+#define ALL_MISSING ((1u << (OVERTAKEN - 1u)) - 1u)
 
 /* COBS: each zero, and one before the start, becomes the distance to the next. `length` is under 254. */
 static size_t cobs_encode(uint8_t *encoded, const uint8_t *data, size_t length)
@@ -89,6 +91,28 @@ static bool parse(struct tormag_frame *frame, const uint8_t *encoded, size_t len
     return true;
 }
 
+/* Counts what is missing before this frame; one that was counted and comes late is missing no more. */
+static void count_lost(struct tormag_frame_decoder *decoder, uint8_t sequence)
+{
+    const uint8_t ahead = (uint8_t)(sequence - decoder->newest);
+    const uint8_t behind = (uint8_t)(decoder->newest - sequence);
+    if (behind < OVERTAKEN) {
+        const uint16_t bit = (uint16_t)((1u << behind) >> 1);
+        if ((decoder->missing & bit) != 0u) {
+            decoder->missing = (uint16_t)(decoder->missing ^ bit);
+            decoder->statistics.lost--;
+        }
+        return;
+    }
+    uint32_t missing = ALL_MISSING;
+    if (ahead < OVERTAKEN) {
+        missing = ((uint32_t)decoder->missing << ahead) | ((1u << (ahead - 1u)) - 1u);
+    }
+    decoder->newest = sequence;
+    decoder->missing = (uint16_t)(missing & ALL_MISSING);
+    decoder->statistics.lost += ahead - 1u;
+}
+
 /* Whether the caller gets the frame. */
 static bool accept(struct tormag_frame_decoder *decoder, const struct tormag_frame *frame)
 {
@@ -97,17 +121,15 @@ static bool accept(struct tormag_frame_decoder *decoder, const struct tormag_fra
         statistics->resynchronisations++;
         decoder->synchronised = true;
     }
-    if (decoder->has_last) {
-        const uint8_t advance = (uint8_t)(frame->sequence - decoder->last.sequence);
-        if (advance != 0u) {
-            statistics->lost += advance - 1u;
-        } else {
-            statistics->repeated++;
-            if (memcmp(frame, &decoder->last, sizeof *frame) == 0) {
-                return false;
-            }
+    if (!decoder->has_last) {
+        decoder->newest = frame->sequence;
+    } else if (frame->sequence == decoder->last.sequence) {
+        statistics->repeated++;
+        if (memcmp(frame, &decoder->last, sizeof *frame) == 0) {
+            return false;
         }
     }
+    count_lost(decoder, frame->sequence);
     decoder->has_last = true;
     decoder->last = *frame;
     statistics->frames++;

@@ -30,7 +30,7 @@ struct tormag_framing_statistics {
     uint32_t bytes;
     uint32_t frames;            /* given to the caller */
     uint32_t corrupt;           /* stretches between two delimiters that were not a frame */
-    uint32_t lost;              /* missing from the sequence */
+    uint32_t lost;              /* missing from the sequence, and not only overtaken on their way */
     uint32_t repeated;          /* with the sequence number of the frame before */
     uint32_t resynchronisations; /* frames found again after something corrupt */
 };
@@ -42,6 +42,8 @@ struct tormag_frame_decoder {
     bool synchronised;
     bool has_last;
     struct tormag_frame last;
+    uint8_t newest;   /* sequence number that is furthest on */
+    uint16_t missing; /* of those before it, a bit each, the nearest lowest */
 };
 
 /*

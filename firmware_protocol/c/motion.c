@@ -15,6 +15,7 @@
 #define PROGRESS_MM 0.05
 #define PATIENCE_S 0.3
 #define DEAD_CURRENT_A 0.02 /* a connected motor draws ten times this at the duty that stands for no progress */
+#define WRONG_WAY_MM 1.0     /* back, while homing drives the carriage open: its motor or its encoder is reversed */
 #define TIME_LIMIT_S 8.0    /* the whole stroke at homing speed takes under 4 s */
 
 static double lesser(double a, double b)
@@ -160,6 +161,17 @@ void tormag_homing_start(
 static enum tormag_outcome homing_search(
     struct tormag_homing *homing, double time_s, const struct tormag_carriage carriages[TORMAG_SIDES])
 {
+    for (int side = 0; side < TORMAG_SIDES && !homing->reversed; side++) {
+        if (carriages[side].position_mm < homing->search.openings[side].progress_mm - WRONG_WAY_MM) {
+            homing->reversed = true;
+            homing->reversed_s = time_s;
+        }
+    }
+    if (homing->reversed) {
+        homing->duties[TORMAG_LEFT] = 0.0;
+        homing->duties[TORMAG_RIGHT] = 0.0;
+        return time_s - homing->reversed_s >= SETTLE_S ? TORMAG_REVERSED : TORMAG_MOVING;
+    }
     const enum tormag_outcome outcome = tormag_retraction_step(&homing->search, time_s, carriages);
     for (int side = 0; side < TORMAG_SIDES; side++) {
         homing->duties[side] = homing->search.openings[side].duty;

@@ -16,7 +16,7 @@
 
 enum tormag_side { TORMAG_LEFT = 0, TORMAG_RIGHT = 1, TORMAG_SIDES = 2 };
 
-enum tormag_outcome { TORMAG_MOVING = 0, TORMAG_DONE, TORMAG_FAILED };
+enum tormag_outcome { TORMAG_MOVING = 0, TORMAG_DONE, TORMAG_FAILED, TORMAG_REVERSED };
 
 /* What is known of one carriage: encoder position, its open switch, its motor's current. */
 struct tormag_carriage {
@@ -69,6 +69,8 @@ struct tormag_homing {
     struct tormag_ramp ramps[TORMAG_SIDES];
     double starts_mm[TORMAG_SIDES];
     double back_off_since_s;
+    bool reversed; /* a carriage has gone back; both are braked before the drives go off */
+    double reversed_s;
     bool found[TORMAG_SIDES];
     double zeros_mm[TORMAG_SIDES]; /* encoder positions of the two switches once the outcome is TORMAG_DONE */
     double duties[TORMAG_SIDES];
@@ -104,7 +106,7 @@ void tormag_homing_start(
     const struct tormag_drive_train *drive_train,
     double speed_mm_s);
 
-/* One tick: outward, back off, creep outward. */
+/* One tick: outward, back off, creep outward. REVERSED when a carriage has gone back, and was braked. */
 enum tormag_outcome tormag_homing_step(
     struct tormag_homing *homing, double time_s, const struct tormag_carriage carriages[TORMAG_SIDES]);
 

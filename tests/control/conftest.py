@@ -25,7 +25,7 @@ def core(config: Config) -> Core:
 
 @pytest.fixture(scope="session")
 def measure() -> MeasurementMaker:
-    """A healthy homed device's measurement number `number`, a millisecond apart, at a gap of 80 mm."""
+    """A healthy homed device's measurement `number`, a millisecond apart, at a gap of 80 mm. All streams come."""
 
     def make(number: int, **changes: object) -> Measurement:
         healthy = Measurement(
@@ -43,7 +43,10 @@ def measure() -> MeasurementMaker:
             faults=DeviceFault(0),
             temperature_C=23.0,
             supply_V=12.0,
+            sensed_s=number * 1e-3,
+            reported_s=number * 1e-3,
         )
-        return healthy.replaced(**changes)  # type: ignore[arg-type]
+        came = dict.fromkeys(("sensed_s", "reported_s"), changes.get("received_s", healthy.received_s))
+        return healthy.replaced(**{**came, **changes})  # type: ignore[arg-type]
 
     return make

@@ -73,7 +73,25 @@ def test_late_delivery_is_not_slow_motion(measure) -> None:
             late = measure(number, left_mm=-20.0 + 0.01 * number, received_s=number * 1e-3 + delay_s * (number % 2))
             estimate = update(estimate, late, HOME_MM, FILTER_S)
         estimates.append(estimate)
-    assert estimates[0] == estimates[1]
+    assert estimates[0] == estimates[1].replaced(sensed_s=estimates[0].sensed_s)
+
+
+@pytest.mark.parametrize("missing", [1, 10, 100])
+def test_a_handle_that_nobody_hears_of_has_not_stopped(measure, missing: int) -> None:
+    """States come without a Sense for a while; the handle goes on at 42 mm/s meanwhile."""
+    estimate = None
+    for number in range(300):
+        estimate = update(estimate, measure(number), HOME_MM, FILTER_S)
+    before = estimate.handle
+    assert before.rate_mm_s == pytest.approx(42.0, rel=0.01)
+    old = measure(299)
+    for number in range(300, 300 + missing):
+        unsensed = measure(number, handle_mm=old.handle_mm, force_N=old.force_N, sensed_s=old.sensed_s)
+        estimate = update(estimate, unsensed, HOME_MM, FILTER_S)
+        assert (estimate.handle, estimate.sensed_s) == (before, old.sensed_s)
+    estimate = update(estimate, measure(300 + missing), HOME_MM, FILTER_S)
+    assert estimate.handle.rate_mm_s == pytest.approx(42.0, rel=0.01)
+    assert estimate.handle.sliding_mm_s == pytest.approx(42.0, rel=0.01)
 
 
 def test_one_encoder_count_is_filtered(measure) -> None:

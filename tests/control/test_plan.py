@@ -24,9 +24,9 @@ TURN = Turn(1.0, 0.0, 100.0)
 
 
 def moving(gap_mm: float = 78.1, force_N: float = 1.0871, **changes: object) -> Estimate:
-    """A homed device whose handle has long been moving, and which gives what the shipped model says."""
+    """A homed device whose handle has long moved, which gives what the shipped model says. Its Sense never ages."""
     handle = Handle(MOBILISED_MM, 42.0, TURN, 42.0)
-    estimate = Estimate(1, True, 0.0, gap_mm / 2.0, gap_mm / 2.0, 0.0, 0.0, force_N, handle, 100.0)
+    estimate = Estimate(1, True, 0.0, gap_mm / 2.0, gap_mm / 2.0, 0.0, 0.0, force_N, handle, 100.0, math.inf, 0.0)
     return estimate.replaced(**changes)
 
 

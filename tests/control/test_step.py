@@ -10,11 +10,22 @@ from hypothesis import strategies as st
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.config import Config
 from tormagd.control.core import Core
-from tormagd.control.motor import electrical_time_s
+from tormagd.control.motor import delay_margin_s, electrical_time_s
 from tormagd.control.plan import Plan
-from tormagd.control.sight import BLIND_S
-from tormagd.control.step import CARRY_S, EXCHANGE_S, STARTING_S, StepOutput, Stepper, StepState
+from tormagd.control.plausible import LEAP_MM
+from tormagd.control.sight import BLIND_S, UNSENSED_S
+from tormagd.control.step import (
+    CARRY_S,
+    EXCHANGE_S,
+    SENSE_FAULT_S,
+    STARTING_S,
+    STATUS_FAULT_S,
+    StepOutput,
+    Stepper,
+    StepState,
+)
 from tormagd.control.trajectory import APPROACH_S
+from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import CLEARING_S, Conditions, DeviceRequest, OperatingState, RefusedError
@@ -192,9 +203,13 @@ def test_the_reference_stays_in_the_gap_range(core: Core, measure, gap_mm: float
 
 @pytest.mark.parametrize("jump_mm", [0.0018, 0.05, 0.4, -0.4])
 def test_counts_that_jump_and_come_back_do_no_harm(running: Bench, jump_mm: float) -> None:
-    """A burst on an encoder line, shorter than any motion: a push, no fault, and nothing left of it soon."""
+    """A burst on an encoder line, shorter than any motion: a push where a carriage may have gone so far, none where no
+    carriage goes; no fault, and nothing left of it soon."""
     pushed = running.step(left_mm=-7.5 + jump_mm)
-    assert -1.0 <= pushed.left_duty * math.copysign(1.0, jump_mm) < 0.0
+    if abs(jump_mm) < LEAP_MM:
+        assert -1.0 <= pushed.left_duty * math.copysign(1.0, jump_mm) < 0.0
+    else:
+        assert (driven(pushed), pushed.limits) == ((DriveMode.RUN, 0.0, 0.0), (Limit.ENCODER,))
     settled = running.step(count=400)
     assert not running.faults
     assert abs(settled.left_duty) < 0.05
@@ -203,9 +218,53 @@ def test_counts_that_jump_and_come_back_do_no_harm(running: Bench, jump_mm: floa
 
 @pytest.mark.parametrize("jump_mm", [-120.0, -37.4, 1.5, 8.0])
 def test_counts_that_jump_away_are_a_fault(running: Bench, jump_mm: float) -> None:
-    """A lost or wrapped counter is not followed: the carriages seem apart, which is tripped in one period."""
-    assert running.run_into(Fault.SKEW, left_mm=-7.5 + jump_mm) == 1
+    """A lost or wrapped counter is not followed, and is a fault as soon as the device says that it was not reset."""
+    held = running.step(left_mm=-7.5 + jump_mm)
+    assert (driven(held), held.limits) == ((DriveMode.RUN, 0.0, 0.0), (Limit.ENCODER,))
+    assert running.run_into(Fault.ENCODER, left_mm=-7.5 + jump_mm) == 1
     assert is_opened(running)
+
+
+@pytest.mark.parametrize("jump_mm", [-4.0, 0.5, 4.0])
+def test_counts_of_both_sides_that_jump_alike_are_a_fault_too(running: Bench, jump_mm: float) -> None:
+    """No skew shows them, and a gap that seems 8 mm wider is closed by as much."""
+    running.step(left_mm=-7.5 + jump_mm, right_mm=-7.5 + jump_mm, reported_s=0.0)
+    assert not running.faults, "it may have been reset"
+    running.run_into(Fault.ENCODER, left_mm=-7.5 + jump_mm, right_mm=-7.5 + jump_mm)
+    assert is_opened(running)
+    assert running.state.safety.needs_homing
+
+
+def test_counts_that_a_reset_sets_back_are_the_resets(running: Bench) -> None:
+    running.step(count=round(STARTING_S / PERIOD_S))
+    running.step(left_mm=0.0, right_mm=0.0, reported_s=running.now_s, count=10)
+    assert not running.faults
+    running.step(count=200, left_mm=0.0, right_mm=0.0, mode=DeviceMode.IDLE, switches=Switches(0))
+    assert running.faults == (Fault.DEVICE_NOT_RUNNING,)
+
+
+@pytest.mark.parametrize("speed_mm_s", [-19.0, 19.0])
+@pytest.mark.parametrize("missing", [1, 5, 40])
+def test_what_a_carriage_does_at_full_speed_is_no_leap(bench: Bench, speed_mm_s: float, missing: int) -> None:
+    """Also where States are missing in between."""
+    at_mm = -7.5
+    for _ in range(10):
+        bench.ticks += missing - 1
+        at_mm += missing * PERIOD_S * speed_mm_s
+        at_mm = min(max(at_mm, -24.0), 0.0)
+        bench.step(left_mm=at_mm, right_mm=at_mm)
+    assert bench.state.leap is None
+    assert not bench.faults
+
+
+def apart(running: Bench, skew_mm: float) -> None:
+    """The carriages come apart, no faster than carriages do."""
+    assert running.state.estimate is not None
+    start_mm = running.state.estimate.skew_mm
+    for part in range(1, 41):
+        side_mm = (start_mm + (skew_mm - start_mm) * part / 40.0) / 2.0
+        if not running.faults:
+            running.step(left_mm=-7.5 + side_mm, right_mm=-7.5 - side_mm)
 
 
 def test_less_supply_takes_more_duty(core: Core, measure) -> None:
@@ -270,11 +329,16 @@ def test_a_measurement_over_a_slow_line(running: Bench) -> None:
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_skew(running: Bench, side: float) -> None:
     allowed = CONFIG.limits.skew_fault_mm
-    running.step(left_mm=-7.5 + side * 0.49 * allowed, right_mm=-7.5 - side * 0.49 * allowed, count=2)
+    apart(running, side * 0.98 * allowed)
+    most = {"left_mm": -7.5 + side * 0.49 * allowed, "right_mm": -7.5 - side * 0.49 * allowed}
+    running.step(count=20, **most)
+    for back_mm in (0.004, 0.008, 0.012, 0.016):  # as the loop wants it, so that nothing goes the wrong way
+        back = {"left_mm": most["left_mm"] - side * back_mm, "right_mm": most["right_mm"] + side * back_mm}
+        running.step(**back)
+    running.step(count=20, **back)
     assert not running.faults
-    assert (
-        running.run_into(Fault.SKEW, left_mm=-7.5 + side * 0.51 * allowed, right_mm=-7.5 - side * 0.51 * allowed) == 1
-    )
+    more = {"left_mm": -7.5 + side * 0.51 * allowed, "right_mm": -7.5 - side * 0.51 * allowed}
+    assert running.run_into(Fault.SKEW, **more) == 1
     assert is_opened(running)
 
 
@@ -296,9 +360,11 @@ def test_a_gap_that_does_not_follow(core: Core, measure) -> None:
 
 
 def test_following_again_in_time_is_no_fault(running: Bench) -> None:
+    away_mm = [-7.5 - 1.75 * part / 16.0 for part in range(1, 17)]
     for _ in range(3):
         # the gap is 3.5 mm away from where the reference rests, for less than the time allowed
-        running.step(left_mm=-9.25, right_mm=-9.25, count=round(CONFIG.limits.no_motion_time_s / PERIOD_S) - 20)
+        for side_mm in (*away_mm, *[away_mm[-1]] * 20, *reversed(away_mm)):
+            running.step(left_mm=side_mm, right_mm=side_mm)
         running.step(count=20)
     assert not running.faults
 
@@ -345,7 +411,7 @@ def test_one_carriage_at_its_switch_excuses_no_other(bench: Bench, side: str) ->
 
 
 def test_after_an_encoder_fault_positions_are_unknown_until_the_device_has_homed(running: Bench) -> None:
-    running.run_into(Fault.SKEW, left_mm=-5.0)
+    running.run_into(Fault.ENCODER, left_mm=-5.0)
     assert running.state.estimate is not None
     assert not running.state.estimate.is_homed
     running.command("clear-fault")
@@ -358,7 +424,7 @@ def test_after_an_encoder_fault_positions_are_unknown_until_the_device_has_homed
         with pytest.raises(RefusedError) as caught:
             running.command(name)
         assert caught.value.code == "not_homed"
-    running.step(count=30, mode=DeviceMode.HOMING, switches=Switches(0))
+    running.step(count=30, mode=DeviceMode.HOMING, switches=Switches.LEFT_OPEN | Switches.RIGHT_OPEN)
     assert not running.state.estimate.is_homed
     running.step(count=2)
     assert running.state.estimate.is_homed
@@ -532,6 +598,8 @@ measurements = st.none() | st.builds(
     faults=st.sampled_from([DeviceFault(0), DeviceFault(0), DeviceFault(0), *DeviceFault]),
     temperature_C=st.floats(-40.0, 125.0),
     supply_V=st.floats(0.0, 25.5),
+    sensed_s=st.floats(0.0, 1.0),
+    reported_s=st.floats(0.0, 1.0),
 )
 plans = st.builds(
     gap_plan, gap_mm=st.floats(45.0, 95.0), time_s=st.floats(-1.0, 1.0), gap_speed_mm_s=st.floats(-38.0, 38.0)
@@ -725,9 +793,16 @@ def test_stalls_that_the_device_survives_are_never_a_fault(
         assert abs(bench.state.left.integral) < 0.3
 
 
-@pytest.mark.parametrize("gap_mm", [-64.0, -40.0, -5.0, 0.0, 30.0])
+@pytest.mark.parametrize("gap_mm", [-64.0, -40.0, -5.0, 0.0, 30.0, 100.5, 140.0])
+def test_carriages_where_none_can_be_are_a_fault_before_anything_is_driven(bench: Bench, gap_mm: float) -> None:
+    bench.step(left_mm=gap_mm / 2.0 - 47.5, right_mm=gap_mm / 2.0 - 47.5)
+    assert bench.faults == (Fault.OUT_OF_STROKE,)
+    assert is_opened(bench)
+    assert bench.state.safety.needs_homing
+
+
+@pytest.mark.parametrize("gap_mm", [40.5, 42.0, 44.9])
 def test_carriages_beyond_the_closed_end_are_driven_back(bench: Bench, gap_mm: float) -> None:
-    """The law of the magnets' pull has no meaning there, and below -32 mm another sign."""
     there = {"left_mm": gap_mm / 2.0 - 47.5, "right_mm": gap_mm / 2.0 - 47.5}
     bench.step(count=3, **there)
     bench.command("enable")
@@ -737,3 +812,122 @@ def test_carriages_beyond_the_closed_end_are_driven_back(bench: Bench, gap_mm: f
         assert reference is not None
         assert reference.speed_mm_s >= 0.0
     assert min(output.left_duty, output.right_duty) > 0.5
+
+
+# -- streams, wire and directions ------------------------------------------------------------------------------------
+
+
+def test_a_sense_that_stops_is_a_limit_and_then_a_fault_where_the_scene_needs_it(running: Bench) -> None:
+    running.step(count=200)
+    last_s = running.now_s
+    assert Limit.SENSE_STALE not in running.step(count=round(UNSENSED_S / PERIOD_S), sensed_s=last_s).limits
+    assert running.step(count=2, sensed_s=last_s).limits == (Limit.SENSE_STALE,)
+    running.run_into(Fault.SENSE_STALE, sensed_s=last_s)
+    assert running.now_s - last_s == pytest.approx(SENSE_FAULT_S, abs=1.5 * PERIOD_S)
+    assert is_opened(running)
+
+
+def test_a_scene_that_does_without_the_sensor_does_without_its_messages(core: Core, measure) -> None:
+    force = msgspec.structs.replace(core.scene.force, tolerance_rms_N=0.5 * core.scene.force.most_N)
+    bench = Bench(Stepper(CONFIG, msgspec.structs.replace(core.scene, force=force)), measure)
+    bench.step(count=3)
+    bench.command("enable")
+    bench.step(count=200)
+    assert bench.step(count=500, sensed_s=bench.now_s).limits == (Limit.SENSE_STALE,)
+    assert not bench.faults
+
+
+def test_a_status_that_stops_is_a_fault(running: Bench) -> None:
+    running.step(count=200)
+    last_s = running.now_s
+    running.step(count=round(STATUS_FAULT_S / PERIOD_S) - 1, reported_s=last_s)
+    assert not running.faults
+    assert running.run_into(Fault.STATUS_STALE, reported_s=last_s) <= 2
+    assert is_opened(running)
+
+
+@pytest.mark.parametrize(
+    ("link", "limits"),
+    [
+        (LinkQuality(), ()),
+        (LinkQuality(unanswered=0.019, damaged=0.019, unsent=0.019, round_trip_s=5e-3, clock_drift=0.0099), ()),
+        (LinkQuality(unanswered=0.021), (Limit.LINK_DEGRADED,)),
+        (LinkQuality(damaged=0.021), (Limit.LINK_DEGRADED,)),
+        (LinkQuality(unsent=0.021), (Limit.LINK_DEGRADED,)),
+        (LinkQuality(round_trip_s=7e-3), (Limit.LINK_DEGRADED,)),
+        (LinkQuality(clock_drift=0.011), (Limit.CLOCK,)),
+        (LinkQuality(clock_drift=-0.011), (Limit.CLOCK,)),
+    ],
+)
+def test_a_wire_or_a_clock_that_is_not_what_it_should_be_is_a_limit(running: Bench, link, limits) -> None:
+    assert running.step(count=50, link=link).limits == limits
+    assert not running.faults
+
+
+@pytest.mark.parametrize(
+    ("link", "fault", "code"),
+    [
+        (LinkQuality(round_trip_s=0.012), Fault.LINK_DEGRADED, "link_degraded"),
+        (LinkQuality(clock_drift=0.11), Fault.CLOCK, "clock"),
+        (LinkQuality(clock_drift=-1.0), Fault.CLOCK, "clock"),
+    ],
+)
+def test_what_would_swing_is_opened_and_not_enabled_in_the_first_place(
+    bench: Bench, link: LinkQuality, fault: Fault, code: str
+) -> None:
+    bench.step(count=3)
+    with pytest.raises(RefusedError) as caught:
+        bench.command("enable", READY.replaced(round_trip_s=link.round_trip_s, clock_drift=link.clock_drift))
+    assert caught.value.code == code
+    assert "allowed is" in str(caught.value)
+    bench.command("enable")
+    bench.step(count=20)
+    assert bench.run_into(fault, link=link) == 1
+    assert is_opened(bench)
+
+
+def test_the_round_trip_that_is_refused_is_within_what_the_loop_bears(core: Core) -> None:
+    bears_s = delay_margin_s(CONFIG.motor, CONFIG.position, PERIOD_S)
+    assert 0.005 < bears_s < 0.05
+    assert bears_s == pytest.approx(core.margins.phase_margin_deg / 360.0 / core.margins.crossover_Hz)
+
+
+@pytest.mark.parametrize("target_mm", [60.0, 90.0])
+def test_carriages_that_go_the_other_way_are_named(running: Bench, target_mm: float) -> None:
+    """Both, so that nothing skews; what the loop does about it makes it worse."""
+    at_mm, ticks = -7.5, 0
+    while not running.faults:
+        output = running.step(gap_plan(target_mm, running.now_s), left_mm=at_mm, right_mm=at_mm)
+        at_mm -= 15.0 * output.left_duty * PERIOD_S
+        ticks += 1
+        assert ticks < 300
+    assert running.faults[0] is Fault.WRONG_DIRECTION
+    assert abs(at_mm + 7.5) < 2.5
+    assert is_opened(running)
+    assert running.state.safety.needs_homing
+
+
+def test_a_carriage_that_goes_the_other_way_into_its_stop_is_named(running: Bench) -> None:
+    at_mm, ticks = -7.5, 0
+    while not running.faults:
+        running.step(gap_plan(60.0, running.now_s), left_mm=at_mm, right_mm=at_mm)
+        at_mm = min(at_mm + 0.015, -7.0)
+        ticks += 1
+        assert ticks < 300
+    assert set(running.faults) <= {Fault.WRONG_DIRECTION, Fault.NO_MOTION}
+    assert running.faults[0] is Fault.WRONG_DIRECTION
+
+
+def test_a_homing_that_presses_shut_is_ended_and_named(bench: Bench) -> None:
+    at_mm = -7.5
+    bench.step(count=3)
+    bench.command("home")
+    while not bench.faults:
+        at_mm -= 0.012
+        bench.step(left_mm=at_mm, right_mm=-7.5, mode=DeviceMode.HOMING, switches=Switches(0))
+        assert at_mm > -12.0
+    assert bench.faults == (Fault.WRONG_DIRECTION,)
+    assert bench.output is not None
+    assert bench.output.request is DeviceRequest.RETRACT
+    assert bench.state.homing is not None
+    assert bench.state.homing.went_back_mm[0] > 2.9

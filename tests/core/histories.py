@@ -31,6 +31,7 @@ from tormagd.control.governor import TimedSetpoint  # noqa: E402
 from tormagd.control.plan import Plan  # noqa: E402
 from tormagd.hardware.frame_stream import FrameStream  # noqa: E402
 from tormagd.hardware.link import DeviceLink  # noqa: E402
+from tormagd.hardware.link_quality import LinkQuality  # noqa: E402
 from tormagd.hardware.measurement import Measurement  # noqa: E402
 from tormagd.safety.operating_state import Conditions, OperatingState, RefusedError  # noqa: E402
 from tormagd.simulation.device import SerialDevice, VirtualDevice  # noqa: E402
@@ -156,7 +157,12 @@ def measurement(rng: random.Random, number: int, now_s: float, at_mm: float, str
         faults=DeviceFault(1 << rng.randrange(10)) if rng.random() < 0.005 else DeviceFault(0),
         temperature_C=some(20.0, 90.0),
         supply_V=some(9.0, 13.0),
+        sensed_s=now_s - (rng.choice([1e-3, 0.03, 0.2]) if rng.random() < 0.02 else 0.0),
+        reported_s=now_s - (rng.choice([0.02, 0.2]) if rng.random() < 0.02 else 0.0),
         delay_s=rng.choice([0.0, 2e-3, 0.02]),
+        link=LinkQuality(
+            rng.choice([0.0, 0.01, 0.5]), 0.0, 0.0, rng.choice([1e-3, 6e-3]), rng.choice([0.0, 3e-5, 0.02])
+        ),
     )
 
 

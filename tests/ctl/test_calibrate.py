@@ -196,7 +196,7 @@ def test_displacement_is_what_the_daemon_calls_it():
     handle = estimate.Handle(0.0, 0.0, Turn(1.0, path[0], path[0]))
     expected = []
     for position in path:
-        fake = estimate.Estimate(0, True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, handle, 0.0)
+        fake = estimate.Estimate(0, True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
         handle = estimate._handle(fake, float(position), 1e-3)
         expected.append(handle.displacement_mm)
     found = displacement(path)

@@ -13,6 +13,7 @@ from tormagd.control.plan import Outside, Plan
 from tormagd.control.step import StepOutput, StepState
 from tormagd.control.trajectory import Reference
 from tormagd.daemon.telemetry import limits_held, snapshot, tick_record
+from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.messages import Telemetry, TickRecord, decode, encode, encode_ticks
 from tormagd.recording.plot import save_plot
@@ -39,6 +40,8 @@ MEASUREMENT = Measurement(
     faults=DeviceFault(0),
     temperature_C=25.0,
     supply_V=12.1,
+    sensed_s=1.0,
+    reported_s=1.0,
 )
 LATE = MEASUREMENT.replaced(delay_s=0.031)
 
@@ -117,7 +120,10 @@ def test_a_tick_is_recorded_whole() -> None:
         faults=DeviceFault.SUPPLY | DeviceFault.SKEW,
         temperature_C=25.5,
         supply_V=12.1,
+        sensed_s=1.2505,
+        reported_s=1.2405,
         delay_s=0.031,
+        link=LinkQuality(0.021, 0.022, 0.023, 0.00071, -0.0005),
     )
     plan = Plan(
         number=7,
@@ -168,6 +174,13 @@ def test_a_tick_is_recorded_whole() -> None:
         "measurement": 11,
         "received_s": 1.25,
         "delay_s": 0.031,
+        "sensed_s": 1.2505,
+        "reported_s": 1.2405,
+        "link_unanswered": 0.021,
+        "link_damaged": 0.022,
+        "link_unsent": 0.023,
+        "link_round_trip_s": 0.00071,
+        "device_clock_drift": -0.0005,
         "device_time_s": 2.25,
         "device_left_mm": -15.0,
         "device_right_mm": -15.5,

@@ -472,3 +472,22 @@ def test_the_simulated_device_says_the_same_with_either_firmware() -> None:
     assert said == conversation(Firmware, "sample_2")
     functions = [frame.function for frame in FrameDecoder().feed(said)]
     assert functions.count(FUNCTION[Sense]) > 5900
+
+
+@pytest.mark.parametrize("reversed_part", ["motor_reversed_left", "encoder_reversed_left"])
+def test_both_give_up_a_homing_that_goes_the_wrong_way_at_the_same_tick(reversed_part: str) -> None:
+    said = []
+    for boot in (Firmware, CompiledFirmware):
+        device = VirtualDevice(load_plant("sample_1"), SteadyHand(), [parse_fault(reversed_part)], seed=5, boot=boot)
+        sent = b""
+        for tick in range(1_500):
+            messages: list[Message] = [Drive(0.0, 0.0, DriveMode.OFF, tick % 256)]
+            if tick == 10:
+                messages = [Hello(SCHEMA_HASH, PROTOCOL_VERSION, 0), Home(1)]
+            for message in messages:
+                device.receive(tick * 1e-3, encode_frame(FUNCTION[type(message)], tick % 256, encode(message)))
+            sent += device.transmit((tick + 1) * 1e-3)
+        assert device.messages.firmware.mode is DeviceMode.LATCHED
+        assert device.messages.firmware.faults == DeviceFault.HOMING_FAILED
+        said.append(sent)
+    assert said[0] == said[1]

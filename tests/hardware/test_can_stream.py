@@ -86,7 +86,7 @@ def test_what_is_damaged_is_counted_and_the_next_good_one_found_again() -> None:
         ([3, 4, 7], 2),
         ([250, 3], 8),
         ([5, 5, 5, 6], 0),
-        ([5, 7, 6, 8], 1),
+        ([5, 7, 6, 8], 0),
         ([200, 0, 1], 55),
     ],
     ids=["over the end", "a gap", "a gap over the end", "a stuck sender", "overtaken", "a device that began anew"],

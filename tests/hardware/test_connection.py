@@ -50,7 +50,7 @@ class Firmware:
         self.reset()
 
     def reset(self) -> None:
-        self.nonce, self.counter, self.boot_ms = 0, 0, 0
+        self.nonce, self.counter, self.boot_ms, self.drive_counter = 0, 0, 0, 0
 
     def answers(self, message: Message) -> list[Message]:
         if isinstance(message, Hello):
@@ -58,6 +58,7 @@ class Firmware:
             return [self.identity]
         if isinstance(message, Drive):
             self.counter = (self.counter + 1) % 256
+            self.drive_counter = message.counter
             time_s = self.boot_ms * 1e-3 % period(State, "device_time_s")
             return [State(-1.0, -1.0, time_s, self.counter), Sense(0.1, 0.1, 1.0, 0.0)]
         if isinstance(message, Home | Retract | Clear) and message.nonce != self.nonce:
@@ -66,7 +67,7 @@ class Firmware:
         return []
 
     def status(self) -> Status:
-        return Status(DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 12.0, 0, self.nonce)
+        return Status(DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 12.0, self.drive_counter, self.nonce)
 
 
 class Port:
@@ -75,7 +76,9 @@ class Port:
     def __init__(self, bench: "Bench", fd: int) -> None:
         self.bench, self.fd = bench, fd
         self.waiting: deque[Message] = deque()
-        self.statistics = SimpleNamespace(frames=0, bytes=0, corrupt=0, lost=0, repeated=0, resynchronisations=0)
+        self.statistics = SimpleNamespace(
+            frames=0, bytes=0, corrupt=0, lost=0, repeated=0, resynchronisations=0, unsent=0, refused={}
+        )
         self.is_dead = self.is_closed = False
 
     def fileno(self) -> int:
@@ -446,8 +449,9 @@ class Cables(RuleBasedStateMachine):
     def a_state_says_why_and_what_to_do(self) -> None:
         connection = self.bench.connection
         is_running = connection.state is LinkState.RUNNING
-        assert bool(connection.cause) != is_running
-        assert bool(connection.remedy) == (connection.state not in (LinkState.RUNNING, LinkState.IDENTIFYING))
+        assert bool(connection.cause) == (connection.measurement is None)
+        is_asking = connection.state is LinkState.IDENTIFYING
+        assert bool(connection.remedy) == (bool(connection.cause) and not is_asking)
         assert is_running or connection.measurement is None
 
     @invariant()

@@ -347,8 +347,9 @@ def test_a_measurement_takes_a_status_a_sense_and_a_state() -> None:
     measurement = link.measurement
     assert measurement is not None
     assert measurement == Measurement(
-        0, 0.7, 0.25, -3.0, -4.0, 0.1, 0.2, 0.3, 0.0, DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 11.5
-    )
+        0, 0.7, 0.25, -3.0, -4.0, 0.1, 0.2, 0.3, 0.0, DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 11.5,
+        0.0, 0.0,
+    )  # fmt: skip
     assert link.measurement is measurement
     assert link.age_s(0.8) == pytest.approx(0.1)
 
@@ -425,3 +426,54 @@ def test_wraps_are_taken_out(
     assert last.right_mm - first.right_mm == pytest.approx(right - start[1], abs=2e-3)
     assert last.device_time_s - first.device_time_s == pytest.approx(time_s - start[2], abs=2e-5)
     assert last.handle_mm == pytest.approx(handle - start[3], abs=8e-3)
+
+
+# -- each of its streams -------------------------------------------------------------------------------------------
+
+
+def test_each_stream_says_when_it_came_last() -> None:
+    link = running()
+    link.receive(0.5, State(-1.0, -1.0, 0.1, 1))
+    link.receive(0.6, Sense(0.0, 0.0, 1.5, 2.0))
+    link.receive(0.7, status(supply_V=11.0))
+    measurement = link.measurement
+    assert measurement is not None
+    assert (measurement.received_s, measurement.sensed_s, measurement.reported_s) == (0.5, 0.6, 0.7)
+
+
+@pytest.mark.parametrize(
+    ("heard", "refused", "missing"),
+    [
+        ((), {}, "no State yet, no Sense yet, no Status yet"),
+        ((State(0.0, 0.0, 0.0, 1), status()), {}, "no Sense yet"),
+        ((Sense(0.0, 0.0, 0.0, 0.0), status()), {"State": "CRC-8"}, "State refused: CRC-8"),
+        ((State(0.0, 0.0, 0.0, 1), Sense(0.0, 0.0, 0.0, 0.0)), {"State": "CRC-8"}, "no Status yet"),
+    ],
+)
+def test_what_is_missing_for_a_measurement_is_said(heard, refused, missing: str) -> None:
+    link = DeviceLink(0.0)
+    assert not link.missing(refused), "it does not run yet"
+    link.receive(0.0, US)
+    for message in heard:
+        link.receive(0.01, message)
+    assert link.missing(refused) == missing
+
+
+def test_nothing_is_missing_where_there_is_a_measurement() -> None:
+    assert running().missing({"Status": "range"}) == ""
+
+
+def test_the_quality_goes_with_the_measurement() -> None:
+    link = running()
+    for tick in range(1, 1_500):
+        now_s = tick * 1e-3
+        link.drive(0.0, 0.0, DriveMode.OFF)
+        if tick % 2:
+            link.receive(now_s, State(0.0, 0.0, 0.0, tick // 2 % 256))
+        if link.is_judging(now_s):
+            link.judge(now_s, frames=tick, damaged=tick, unsent=tick // 10)
+    measurement = link.measurement
+    assert measurement is not None
+    assert measurement.link.unanswered == pytest.approx(0.5, abs=0.01)
+    assert measurement.link.damaged == pytest.approx(0.5)
+    assert measurement.link.unsent == pytest.approx(0.1, abs=0.001)

@@ -31,12 +31,16 @@ def exchange(trip: RoundTrip, ticks: Iterable[int], way_ticks: int, lost: frozen
         for answer in answers.pop(tick, ()):
             if answer == "identity":
                 trip.identity()
+            elif answer.startswith("status"):
+                trip.status(int(answer.split()[1]))
             else:
                 states += 1
                 trip.state(states % 256, now_s)
         trip.drive(tick % 256, now_s)
         if tick not in lost:
             answers.setdefault(tick + way_ticks, []).append("state")
+        if tick % 20 == 0 and tick not in lost:
+            answers[tick + way_ticks].append(f"status {tick % 256}")
         if tick % 1_000 == 0:
             trip.hello()
             answers.setdefault(tick + way_ticks, []).append("identity")
@@ -181,3 +185,62 @@ def test_the_simulated_devices_line_and_clock(clock_ppm: float) -> None:
 def probe() -> tuple[Message, Message]:
     """A Drive, and a State, which is as long."""
     return Drive(0.0, 0.0, DriveMode.OFF, 0), Drive(0.0, 0.0, DriveMode.OFF, 1)
+
+
+# -- what a step is told of both -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way_ticks", [1, 5, 15])
+@pytest.mark.parametrize("every", [2, 3])
+def test_a_device_that_answers_every_other_drive_is_matched_by_number(way_ticks: int, every: int) -> None:
+    """Its States fall behind the Drives by hundreds a second."""
+    trip = RoundTrip()
+    unanswered = frozenset(tick for tick in range(1, 4_000) if tick % every)
+    exchange(trip, range(1, 4_000), way_ticks, lost=unanswered)
+    report = trip.report()
+    assert report is not None
+    assert report["p99"] <= way_ticks * 1e3 + 1.0
+    assert trip.usual_s == pytest.approx(way_ticks * PERIOD_S, abs=1e-6)
+
+
+@pytest.mark.parametrize("way_ticks", [1, 15])
+def test_drives_that_are_lost_now_and_then_make_no_round_trip_long(way_ticks: int) -> None:
+    noise = random.Random(1)
+    trip = RoundTrip()
+    lost = frozenset(tick for tick in range(1, 20_000) if noise.random() < 0.05)
+    exchange(trip, range(1, 20_000), way_ticks, lost=lost)
+    report = trip.report()
+    assert report is not None
+    assert report["least"] >= (way_ticks - 1) * 1e3
+    assert report["p99"] <= (way_ticks + 2) * 1e3, "one lost Drive alone looks like an answer that is on its way"
+    assert trip.usual_s == pytest.approx(way_ticks * PERIOD_S, abs=1.5 * PERIOD_S)
+
+
+@pytest.mark.parametrize("drift", [-0.5, -0.02, 3e-5, 0.015, 0.3])
+def test_a_clock_that_runs_wrong_is_known_within_four_seconds(drift: float) -> None:
+    clock = DeviceClock()
+    for tick in range(4_100):
+        clock.add(tick * PERIOD_S, round(tick * PERIOD_S * (1.0 + drift), 5))
+    assert clock.drift == pytest.approx(drift, rel=0.02, abs=2e-5)
+
+
+@pytest.mark.parametrize("delay_s", [0.005, 0.03, 0.1])
+def test_a_delay_that_begins_is_no_drift(delay_s: float) -> None:
+    clock, most = DeviceClock(), 0.0
+    for tick in range(15_000):
+        now_s = tick * PERIOD_S
+        clock.add(now_s, now_s - (delay_s if tick > 6_000 else 0.0))
+        most = max(most, abs(clock.drift))
+    assert most < 0.01
+
+
+def test_a_clock_that_stands_is_known_at_once_and_forgiven_when_it_goes() -> None:
+    clock = DeviceClock()
+    for tick in range(1_000):
+        clock.add(tick * PERIOD_S, tick * PERIOD_S)
+    for tick in range(30):
+        clock.add((1_000 + tick) * PERIOD_S, 1.0)
+    assert clock.drift == -1.0
+    for tick in range(10_000):
+        clock.add((1_030 + tick) * PERIOD_S, 1.0 + tick * PERIOD_S)
+    assert abs(clock.drift) < 1e-4

@@ -45,7 +45,8 @@ V1: dict[type[msgspec.Struct], str] = {
     "peers "
     "rates late_ticks_by fault_details limit_details newest_stall not_granted way",
     LinkReport: "state cause remedy backend port losses last_loss firmware serial_number firmware_schema daemon_schema "
-    "protocol_version frames bytes corrupt lost repeated resynchronisations round_trip_us clock",
+    "protocol_version frames bytes corrupt lost repeated resynchronisations round_trip_us clock unsent refused "
+    "unanswered_share damaged_share",
     RoundTripReport: "least p50 p99",
     ClockReport: "offset_s drift_ppm residual_us windows outliers",
     SetpointReport: "accepted refused dropped oversize last_refusal newest_source sources by_source",
@@ -63,7 +64,8 @@ V1: dict[type[msgspec.Struct], str] = {
     StallReport: "ms culprit",
     TickRecord: "t_ns monotonic_s plan setpoint_cf plan_setpoint_age_s governed_cf plan_governed_cf predicted_cf "
     "field_mT plan_gap_mm plan_gap_speed_mm_s plan_gap_acceleration_mm_s2 plan_least_gap_mm plan_limits plan_outside "
-    "plan_sensor_doubted_s foresight plan_time_s confidence trim measurement received_s delay_s device_time_s "
+    "plan_sensor_doubted_s foresight plan_time_s confidence trim measurement received_s delay_s sensed_s "
+    "reported_s link_unanswered link_damaged link_unsent link_round_trip_s device_clock_drift device_time_s "
     "device_left_mm device_right_mm device_handle_mm device_force_N device_mode device_switches device_faults "
     "device_temperature_C left_current_A right_current_A supply_V reference_gap_mm measured_cf left_mm right_mm "
     "handle_mm handle_rate_mm_s operating_state limits step_limits faults drive_mode left_duty right_duty request "

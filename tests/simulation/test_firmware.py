@@ -379,3 +379,19 @@ def test_a_stiff_guide_still_opens(running) -> None:
     host.wait_for(DeviceMode.LATCHED)
     assert host.status.faults == DeviceFault.COMMAND_TIMEOUT
     assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
+
+
+@pytest.mark.parametrize("reversed_part", ["motor_reversed_left", "encoder_reversed_left"])
+def test_homing_that_goes_the_wrong_way_ends_where_it_is(make_host, reversed_part: str) -> None:
+    """It does not press shut until its time is up; and it does not open either, which such a drive cannot."""
+    host = make_host([reversed_part])
+    before = host.device.truth
+    host.command(Home)
+    while host.status.mode is not DeviceMode.LATCHED:
+        host.heartbeat(0.01)
+        assert host.time_s < 2.0
+    host.heartbeat(3.0)
+    assert host.status.mode is DeviceMode.LATCHED
+    assert host.status.faults == DeviceFault.HOMING_FAILED
+    assert not host.device.messages.firmware.output.enabled
+    assert abs(host.device.truth.left_mm - before.left_mm) < 2.0

@@ -3,7 +3,7 @@ import math
 
 import pytest
 
-from tormagd.simulation.faults import KNOWN, Fault, FaultError, parse_fault
+from tormagd.simulation.faults import KNOWN, SIZED, Fault, FaultError, parse_fault
 from tormagd.simulation.hand import HandError, ReversingHand, SteadyHand, parse_hand
 
 
@@ -70,12 +70,24 @@ def test_fault_specifications() -> None:
     assert parse_fault("drag_left=+50%@5") == Fault("drag_left", 5.0, 50.0)
     assert parse_fault("drag_left=-20.5%") == Fault("drag_left", 0.0, -20.5)
     assert parse_fault("encoder_stuck_left@3.25").at_s == 3.25
-    assert all(math.isfinite(parse_fault(f"{name}=1%@1" if name == "drag_left" else name).at_s) for name in KNOWN)
+    assert all(math.isfinite(parse_fault(f"{name}=1%@1" if name in SIZED else name).at_s) for name in KNOWN)
 
 
 @pytest.mark.parametrize(
     "spec",
-    ["", "gremlins", "reset@", "reset@x", "reset@1.2.3", "reset=5%", "drag_left", "drag_left=5", "drag_left=-101%"],
+    [
+        "",
+        "gremlins",
+        "reset@",
+        "reset@x",
+        "reset@1.2.3",
+        "reset=5%",
+        "drag_left",
+        "drag_left=5",
+        "drag_left=-101%",
+        "clock",
+        "clock=-100%",
+    ],
 )
 def test_an_unknown_or_malformed_fault_is_refused(spec: str) -> None:
     with pytest.raises(FaultError):

@@ -3,7 +3,8 @@
 from tormagd.config import Config
 from tormagd.control.estimate import Estimate
 from tormagd.control.governor import TimedSetpoint
-from tormagd.control.step import StepOutput, StepState
+from tormagd.control.step import SENSE_FAULT_S, STATUS_FAULT_S, StepOutput, StepState
+from tormagd.hardware.connection import Connection
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import Conditions, DeviceRequest
 
@@ -29,8 +30,7 @@ def is_busy(
 def conditions(
     now_s: float,
     config: Config,
-    measurement: Measurement | None,
-    pending: DeviceRequest,
+    connection: Connection,
     state: StepState,
     output: StepOutput | None,
     setpoint: TimedSetpoint | None,
@@ -38,16 +38,33 @@ def conditions(
     *,
     sensor_doubted: bool,
 ) -> Conditions:
-    """The conditions at `now_s`. `least_N` is F_min of this device, `measurement` None while the link does not run."""
+    """The conditions at `now_s`. `least_N` is F_min of this device."""
+    measurement = connection.measurement
     is_current = setpoint is not None and now_s - setpoint.stamp_s <= setpoint.valid_for_s
-    timeout_s = config.device.measurement_timeout_ms * 1e-3
+    old = "" if measurement is None else _old(now_s, measurement, config.device.measurement_timeout_ms * 1e-3)
     return Conditions(
         connected=measurement is not None,
-        fresh=measurement is not None and now_s - measurement.received_s < timeout_s,
+        fresh=measurement is not None and not old,
         homed=is_homed(measurement, state.estimate),
-        busy=is_busy(measurement, pending, state, output),
+        busy=is_busy(measurement, connection.pending, state, output),
         device_latched=measurement is not None and measurement.is_latched,
         requested_N=setpoint.force_N if setpoint is not None and is_current else None,
         neutral_N=least_N + config.limits.neutral_margin_N,
         sensor_doubted=sensor_doubted,
+        cause=old or connection.cause,
+        remedy=connection.remedy,
+        round_trip_s=0.0 if measurement is None else measurement.link.round_trip_s,
+        clock_drift=0.0 if measurement is None else measurement.link.clock_drift,
     )
+
+
+def _old(now_s: float, measurement: Measurement, timeout_s: float) -> str:
+    """Which of the three streams has stopped, as in "no Sense for 312 ms"; empty where none has."""
+    for name, came_s, longest_s in (
+        ("State", measurement.received_s, timeout_s),
+        ("Sense", measurement.sensed_s, SENSE_FAULT_S),
+        ("Status", measurement.reported_s, STATUS_FAULT_S),
+    ):
+        if not now_s - came_s < longest_s:
+            return f"no {name} for {(now_s - came_s) * 1e3:.0f} ms"
+    return ""

@@ -36,6 +36,7 @@ class Estimate(Value):
     """Carriages in mm from the centre plane, speeds in mm/s (opening is positive), force in N against the motion.
 
     Where they are not homed, positions mean nothing: they count from wherever the carriages were, or counts were lost.
+    Force and handle are of a Sense that came at `sensed_s` on the host's clock, `handle_time_s` on the device's.
     """
 
     __match_args__ = (
@@ -49,6 +50,8 @@ class Estimate(Value):
         "force_N",
         "handle",
         "handle_mm",
+        "sensed_s",
+        "handle_time_s",
     )
     __slots__ = __match_args__
 
@@ -64,6 +67,8 @@ class Estimate(Value):
         force_N: float,
         handle: Handle,
         handle_mm: float,
+        sensed_s: float,
+        handle_time_s: float,
     ) -> None:
         self.number: Final = number
         self.is_homed: Final = is_homed
@@ -75,6 +80,8 @@ class Estimate(Value):
         self.force_N: Final = force_N
         self.handle: Final = handle
         self.handle_mm: Final = handle_mm
+        self.sensed_s: Final = sensed_s
+        self.handle_time_s: Final = handle_time_s
 
     @property
     def gap_mm(self) -> float:
@@ -102,6 +109,8 @@ def first_estimate(measurement: Measurement, home_mm: float) -> Estimate:
         force_N=measurement.force_N,
         handle=Handle(0.0, 0.0, Turn(1.0, measurement.handle_mm, measurement.handle_mm)),
         handle_mm=measurement.handle_mm,
+        sensed_s=measurement.sensed_s,
+        handle_time_s=measurement.device_time_s,
     )
 
 
@@ -117,7 +126,11 @@ def update(last: Estimate | None, measurement: Measurement, home_mm: float, deri
         return last
     left, right = home_mm + measurement.left_mm, home_mm + measurement.right_mm
     share = dt_s / (derivative_filter_s + dt_s)
-    handle = _handle(last, measurement.handle_mm, dt_s)
+    # without news of the handle it has not stopped: its motion is judged over all the time since the last
+    handle, handle_time_s = last.handle, last.handle_time_s
+    if measurement.sensed_s != last.sensed_s:
+        handle = _handle(last, measurement.handle_mm, measurement.device_time_s - handle_time_s)
+        handle_time_s = measurement.device_time_s
     return Estimate(
         number=measurement.number,
         is_homed=measurement.is_homed,
@@ -129,6 +142,8 @@ def update(last: Estimate | None, measurement: Measurement, home_mm: float, deri
         force_N=measurement.force_N * handle.turn.direction,
         handle=handle,
         handle_mm=measurement.handle_mm,
+        sensed_s=measurement.sensed_s,
+        handle_time_s=handle_time_s,
     )
 
 

@@ -100,6 +100,12 @@ def _exponential(matrix: Array) -> Array:
     return total
 
 
+def delay_margin_s(motor: Motor, position: Position, period_s: float) -> float:
+    """The delay besides that of one exchange which the position loop bears before it swings, s."""
+    known = margins(motor, position, period_s)
+    return max(known.phase_margin_deg, 0.0) / 360.0 / known.crossover_Hz
+
+
 def margins(motor: Motor, position: Position, period_s: float, *, delay_periods: float = 1.0) -> Margins:
     """Margins of the position loop as it is computed: PID and its filter in z, H(z), and the delay of one exchange."""
     frequency = np.geomspace(0.05, 0.4999 / period_s, 4_000)

@@ -13,6 +13,7 @@ from tormagd.control.governor import PATH_S, Governed, Governor, GovernorState, 
 from tormagd.control.portrait import FieldOfGap, LawOfField, Portrait
 from tormagd.control.sensor import UNJUDGED, Sensor, judge
 from tormagd.control.sensor_zero import TARED, UNKNOWN_SD_N, SensorZero
+from tormagd.control.sight import unsensed_s
 from tormagd.control.slow_friction import NOTHING_SLOW, SLOWEST_MM_S, SlowFriction
 from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S
@@ -218,6 +219,7 @@ class Planner:
         self._fastest_mm_s, self._hardest_mm_s2 = position.gap_speed_mm_s, position.gap_acceleration_mm_s2
         self._adapts_in_s, self._scales = trim.time_s, (trim.least, trim.most)
         self._low_confidence = config.limits.low_confidence
+        self._unsensed_s = unsensed_s(1.0 / config.rates.control_hz)
 
     def start(self, now_s: float) -> PlanState:
         """The state before the first plan: gap open."""
@@ -324,6 +326,8 @@ class Planner:
         fight the position loop. A sensor that is not believed teaches nothing, and what it has taught is forgotten."""
         if estimate is None or model_N is None or estimate.number == shown.read or now_s - shown.read_s < LESSON_S:
             return shown
+        if now_s - estimate.sensed_s > self._unsensed_s:
+            return shown  # its force is an old one
         slow, zero = shown.slow.followed(model_N, estimate.handle_mm), shown.zero
         direction, rate_mm_s = estimate.handle.turn.direction, abs(estimate.handle.rate_mm_s)
         reading_N = estimate.force_N - direction * zero.zero_N

@@ -13,6 +13,8 @@ BLIND_S: Final = 0.005
 BLIND_PERIODS: Final = 5.0
 """Without a new state for longer than both, where the carriages are is not known well enough to drive them. The answer
 to the first Drive after a stall may take twice as long: a wire that needs more is slow for a loop."""
+UNSENSED_S: Final = 0.02
+"Without a new Sense for longer than this and BLIND_PERIODS, force and handle are not measured."
 SHOWN_S: Final = 0.1
 "A stall is shown for this long after it, or nobody would see it: telemetry comes every 20 ms."
 
@@ -57,6 +59,11 @@ def look(sight: Sight, last_s: float, now_s: float, period_s: float, is_new: boo
     if sight.is_blind or now_s - sight.seen_s <= blind_s:
         return sight
     return Sight(sight.seen_s, sight.stalled_s, sight.stall_s, is_blind=True)
+
+
+def unsensed_s(period_s: float) -> float:
+    """How old a Sense may be: force and handle of an older one are not measured."""
+    return max(UNSENSED_S, BLIND_PERIODS * period_s)
 
 
 def _blind_s(period_s: float) -> float:

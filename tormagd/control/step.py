@@ -8,10 +8,12 @@ from firmware_protocol.value import Value
 from tormagd.config import Config
 from tormagd.control.device_fit import SCALE_SD
 from tormagd.control.estimate import Estimate, first_estimate, update
-from tormagd.control.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s, pull_V
+from tormagd.control.homing import Homing, watch
+from tormagd.control.motor import delay_margin_s, electrical_time_s, full_speed_mm_s, mechanical_time_s, pull_V
 from tormagd.control.pid import Error, Gains, PidState, pid, rested
 from tormagd.control.plan import Plan
-from tormagd.control.sight import UNSEEING, Sight, look
+from tormagd.control.plausible import Leap, is_outside, leap_between
+from tormagd.control.sight import UNSEEING, Sight, look, unsensed_s
 from tormagd.control.trajectory import Expected, Reference, Speeds, expect, follow
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault, Limit, device_faults
@@ -50,6 +52,20 @@ OVER_FAULT_S: Final = 0.04
 "A force over the ceiling opens the gap after the first, and is a fault after the second."
 SENSOR_FAULT_S: Final = 2.0
 "A sensor that has not been believed for so long of sliding is a fault: forces are then only as good as the model."
+SENSE_FAULT_S: Final = 0.1
+STATUS_FAULT_S: Final = 0.1
+"Without a Sense, and without a Status, for so long: Status comes every 20 ms, Sense with every State."
+OPPOSED_S: Final = 0.1
+"A carriage that moves against its duty for so long does not brake: it brakes from full speed within 0.06 s."
+WENT_AGAINST_S: Final = 0.015
+"Carriages that come apart, or to a stop, after one of them has gone against its duty for so long do so for that."
+SLOW_SHARE: Final = 0.4
+TOO_SLOW_SHARE: Final = 0.8
+"""Of the delay that the position loop bears besides its own period: from the first on a round trip is a limit, from the
+second on a fault, and no enabling: carriages swing from about the whole on."""
+CLOCK_OFF: Final = 0.01
+CLOCK_FAULT: Final = 0.1
+"A clock that is off by a greater share is a limit, and a fault."
 STALL_SHARE: Final = 0.8
 "Of the device's timeout: a shorter stall of ours did not make it run out."
 LAGGING_MM: Final = 0.1
@@ -78,6 +94,9 @@ class StepState(Value):
         "still_s",
         "over_s",
         "sight",
+        "opposed_s",
+        "leap",
+        "homing",
     )
     __slots__ = __match_args__
 
@@ -96,6 +115,9 @@ class StepState(Value):
         still_s: float = 0.0,
         over_s: float = 0.0,
         sight: Sight = UNSEEING,
+        opposed_s: float = 0.0,
+        leap: Leap | None = None,
+        homing: Homing | None = None,
     ) -> None:
         self.time_s: Final = time_s
         self.safety: Final = safety
@@ -114,6 +136,12 @@ class StepState(Value):
         self.over_s: Final = over_s
         "For how long the measured force has been over the ceiling while the handle moved, counted alike."
         self.sight: Final = sight
+        self.opposed_s: Final = opposed_s
+        "For how long a carriage has moved against its duty, counted alike."
+        self.leap: Final = leap
+        "Of the encoders, until the device has said whether it was reset."
+        self.homing: Final = homing
+        "The newest."
 
 
 @final
@@ -158,6 +186,10 @@ class Stepper:
         self._measurement_timeout_s = config.device.measurement_timeout_ms * 1e-3
         self._longest_own_stall_s = STALL_SHARE * config.device.command_timeout_ms * 1e-3
         self._nominal_dt_s = 1.0 / config.rates.control_hz
+        self._unsensed_s = unsensed_s(self._nominal_dt_s)
+        bears_s = delay_margin_s(config.motor, position, self._nominal_dt_s)
+        self._slow_s = self._nominal_dt_s + SLOW_SHARE * bears_s
+        self._too_slow_s = self._nominal_dt_s + TOO_SLOW_SHARE * bears_s
         self._closed_mm, self._open_mm = scene.insert.gap_closed_mm, scene.insert.gap_open_mm
         self._home_mm = self._open_mm / 2.0
         # devices not yet seen differ by SCALE_SD: a scene that tolerates that does without the sensor
@@ -191,6 +223,7 @@ class Stepper:
                     f"the carriages are {apart_mm:.2f} mm apart: allowed is at most {most_mm:g} mm",
                     "tormagctl home",
                 )
+            self._refuse_degraded(conditions)
             return state.replaced(
                 safety=safety,
                 reference=Reference(state.estimate.gap_mm),
@@ -201,8 +234,25 @@ class Stepper:
                 straying_s=0.0,
                 still_s=0.0,
                 over_s=0.0,
+                opposed_s=0.0,
             )
         return state.replaced(safety=safety)
+
+    def _refuse_degraded(self, conditions: Conditions) -> None:
+        """Before anything swings."""
+        if not conditions.round_trip_s <= self._too_slow_s:
+            raise RefusedError(
+                "link_degraded",
+                f"the round trip to the device is {conditions.round_trip_s * 1e3:.1f} ms: allowed is at most "
+                f"{self._too_slow_s * 1e3:.1f} ms, or the carriages swing",
+                "look at the round trip in tormagctl firmware; tormagctl doctor finds a USB adapter's latency timer",
+            )
+        if not abs(conditions.clock_drift) <= CLOCK_FAULT:
+            raise RefusedError(
+                "clock",
+                f"the device's clock is off by {conditions.clock_drift:+.1%}: allowed is {CLOCK_FAULT:.0%}",
+                "check the firmware's timer and its clock source",
+            )
 
     def lose_link(self, state: StepState) -> StepState:
         """The state after the link broke: a fault where the device was driven, otherwise only a forgotten estimate."""
@@ -221,18 +271,34 @@ class Stepper:
         is_new = state.estimate is None or measurement.number != state.estimate.number
         was_blind, sight = state.sight.is_blind, look(state.sight, state.time_s, now_s, self._nominal_dt_s, is_new)
         estimate = update(state.estimate, measurement, self._home_mm, self._derivative_filter_s)
-        safety = latch(state.safety, self._watch(state, estimate, now_s, measurement, plan, sight))
+        leap = state.leap
+        if leap is not None:
+            # it was reset, which it says itself; or it was a burst on a line, and the counts are right again
+            is_over = state.safety.needs_homing or not measurement.is_homed
+            if is_over or leap.has_come_back(estimate, self._full_speed_mm_s, now_s):
+                leap = None
+        elif is_new and state.estimate is not None and state.estimate.is_homed and measurement.is_homed:
+            leap = leap_between(state.estimate, estimate, self._full_speed_mm_s, now_s, state.sight.seen_s)
+        homing = watch(state.homing, now_s, measurement, self._ceiling_N)
+        safety = latch(state.safety, self._watch(state, estimate, now_s, measurement, plan, sight, leap, homing))
         if safety.needs_homing:
             safety, estimate = homed_again(safety, measurement.is_homed), estimate.replaced(is_homed=False)
         if safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             if measurement.is_busy:  # homing moves the origin: what was learned about motion before it is void
                 estimate = first_estimate(measurement, self._home_mm)
             state = state.replaced(
-                time_s=now_s, safety=safety, estimate=estimate, reference=None, expected=None, sight=sight
+                time_s=now_s,
+                safety=safety,
+                estimate=estimate,
+                reference=None,
+                expected=None,
+                sight=sight,
+                leap=leap,
+                homing=homing,
             )
             return state, self._off(safety, NO_LIMITS)
-        if sight.is_blind:
-            return self._hold(state.replaced(time_s=now_s, safety=safety, estimate=estimate, sight=sight))
+        if sight.is_blind or leap is not None:
+            return self._hold(state.replaced(time_s=now_s, safety=safety, estimate=estimate, sight=sight, leap=leap))
         if was_blind:
             state = self._from_where_it_is(state, estimate)
         return self._drive(state, safety, now_s, measurement, estimate, plan, sight)
@@ -240,6 +306,8 @@ class Stepper:
     def _hold(self, state: StepState) -> tuple[StepState, StepOutput]:
         """Asks the device for an answer without moving anything: friction holds the gap. Nothing is learned from it."""
         limit = Limit.HOST_STALL if state.sight.has_stalled(state.time_s) else Limit.DEVICE_SILENT
+        if state.leap is not None:
+            limit = Limit.ENCODER
         safety = state.safety
         output = StepOutput(DriveMode.RUN, 0.0, 0.0, safety.request, safety.request_number, (limit,))
         return state.replaced(duties=(0.0, 0.0)), output
@@ -301,6 +369,13 @@ class Stepper:
             limits.append(Limit.SKEW)
         if sight.has_stalled(now_s):
             limits.append(Limit.HOST_STALL)
+        if now_s - measurement.sensed_s > self._unsensed_s:
+            limits.append(Limit.SENSE_STALE)
+        link = measurement.link
+        if link.is_lossy or link.round_trip_s > self._slow_s:
+            limits.append(Limit.LINK_DEGRADED)
+        if abs(link.clock_drift) > CLOCK_OFF:
+            limits.append(Limit.CLOCK)
         state = StepState(
             time_s=now_s,
             safety=safety,
@@ -315,6 +390,8 @@ class Stepper:
             over_s=state.over_s + dt_s if self._is_over(estimate) else 0.0,
             still_s=state.still_s + dt_s if self._is_still(state, estimate, left.duty, right.duty) else 0.0,
             sight=sight,
+            opposed_s=self._opposed_s(state, estimate, left.duty, right.duty, dt_s),
+            homing=state.homing,
         )
         # the bridges switch the device's real supply: the same volts take less duty of a higher one
         scale = self._supply_V / max(measurement.supply_V, 0.5 * self._supply_V)
@@ -377,20 +454,44 @@ class Stepper:
         measurement: Measurement,
         plan: Plan,
         sight: Sight,
+        leap: Leap | None,
+        homing: Homing | None,
     ) -> tuple[Fault, ...]:
         faults: list[Fault] = []
+        if homing is not None and homing.faults:
+            faults.extend(homing.faults)
         if now_s >= state.safety.clearing_until_s:
             is_ours = Fault.HOST_STALL in state.safety.faults or (
                 sight.has_stalled(now_s) and sight.stall_s > self._longest_own_stall_s
             )
             faults.extend(device_faults(measurement.faults, is_host_stall=is_ours))
+        if leap is not None:
+            if measurement.reported_s > leap.seen_s:  # so it was not reset in between
+                faults.append(Fault.ENCODER)
+        elif estimate.is_homed and not state.safety.needs_homing and self._is_outside(estimate):
+            faults.append(Fault.OUT_OF_STROKE)
         if state.safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             return tuple(faults)
         # what has just come over a slow line is old too, and a loop around it would swing
         is_old = now_s - measurement.received_s + measurement.delay_s > self._measurement_timeout_s
-        if is_old and not sight.is_waiting(now_s, self._nominal_dt_s):
-            faults.append(Fault.MEASUREMENT_STALE)
-        if abs(estimate.skew_mm) > self._skew_fault_mm:
+        if not sight.is_waiting(now_s, self._nominal_dt_s):
+            if is_old:
+                faults.append(Fault.MEASUREMENT_STALE)
+            if self._needs_sensor and now_s - measurement.sensed_s > SENSE_FAULT_S:
+                faults.append(Fault.SENSE_STALE)
+            if now_s - measurement.reported_s > STATUS_FAULT_S:
+                faults.append(Fault.STATUS_STALE)
+        if measurement.link.round_trip_s > self._too_slow_s:
+            faults.append(Fault.LINK_DEGRADED)
+        if abs(measurement.link.clock_drift) > CLOCK_FAULT:
+            faults.append(Fault.CLOCK)
+        if leap is not None:
+            return tuple(faults)  # what follows from positions says nothing now
+        is_skewed = abs(estimate.skew_mm) > self._skew_fault_mm
+        is_still = state.still_s > self._no_motion_time_s
+        if state.opposed_s > (WENT_AGAINST_S if is_skewed or is_still else OPPOSED_S):
+            faults.append(Fault.WRONG_DIRECTION)
+        if is_skewed:
             faults.append(Fault.SKEW)
         if state.straying_s > self._following_time_s:
             faults.append(Fault.FOLLOWING_ERROR)
@@ -398,11 +499,14 @@ class Stepper:
             faults.append(Fault.OVER_FORCE)
         if self._needs_sensor and plan.sensor_doubted_s > SENSOR_FAULT_S:
             faults.append(Fault.SENSOR)
-        if state.still_s > self._no_motion_time_s:
+        if is_still:
             faults.append(Fault.NO_MOTION)
         if measurement.mode is not DeviceMode.RUN and not faults and now_s - state.enabled_s > STARTING_S:
             faults.append(Fault.DEVICE_NOT_RUNNING)
         return tuple(faults)
+
+    def _is_outside(self, estimate: Estimate) -> bool:
+        return is_outside(estimate, self._closed_mm, self._open_mm)
 
     def _is_over(self, estimate: Estimate) -> bool:
         return estimate.force_N > self._ceiling_N and abs(estimate.handle.rate_mm_s) > STILL_MM_S
@@ -418,6 +522,21 @@ class Stepper:
         is_left_still = is_left_driven and abs(estimate.left_mm_s) < STILL_MM_S
         is_right_still = is_right_driven and abs(estimate.right_mm_s) < STILL_MM_S
         return is_left_still or is_right_still
+
+    def _opposed_s(
+        self, state: StepState, estimate: Estimate, left_duty: float, right_duty: float, dt_s: float
+    ) -> float:
+        """For how long a carriage that is driven well has moved the other way; one that comes to a stop there, did."""
+        least, left_mm_s, right_mm_s = self._no_motion_duty, 0.0, 0.0
+        if abs(left_duty) > least:
+            left_mm_s = estimate.left_mm_s * math.copysign(1.0, left_duty)
+        if abs(right_duty) > least:
+            right_mm_s = estimate.right_mm_s * math.copysign(1.0, right_duty)
+        if left_mm_s < -STILL_MM_S or right_mm_s < -STILL_MM_S:
+            return state.opposed_s + dt_s
+        is_driven = abs(left_duty) > least or abs(right_duty) > least
+        is_forward = left_mm_s > STILL_MM_S or right_mm_s > STILL_MM_S
+        return state.opposed_s if is_driven and not is_forward else 0.0
 
     @staticmethod
     def _off(safety: SafetyState, limits: tuple[Limit, ...]) -> StepOutput:

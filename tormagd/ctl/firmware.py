@@ -37,7 +37,9 @@ def firmware_text(link: LinkReport, colour: Colour) -> str:
         f"schema      {_shown(theirs)} ({fits}), protocol {link.protocol_version}",
         f"losses      {losses}",
         f"received    {', '.join(f'{_shown(getattr(link, name))} {name}' for name in COUNTERS)}",
+        f"refused     {', '.join(f'{name}: {why}' for name, why in sorted(link.refused.items())) or 'nothing'}",
         f"round trip  {_round_trip(link.round_trip_us)}",
+        f"quality     {_quality(link)}",
         f"clock       {_clock(link.clock)}",
     ]
     return "\n".join(lines)
@@ -51,6 +53,15 @@ def _round_trip(known: RoundTripReport | None) -> str:
     if known is None:
         return "not known yet"
     return f"{known.p50:.0f} us (p50), {known.p99:.0f} us (p99), {known.least:.0f} us at least"
+
+
+def _quality(link: LinkReport) -> str:
+    if link.unanswered_share is None or link.damaged_share is None:
+        return "not known yet"
+    return (
+        f"{link.unanswered_share:.1%} of the Drives unanswered, {link.damaged_share:.1%} of the frames damaged in the "
+        f"last second; {_shown(link.unsent)} messages found the wire full"
+    )
 
 
 def _clock(known: ClockReport | None) -> str:

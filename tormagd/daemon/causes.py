@@ -53,20 +53,47 @@ class Causes:
                 if silent_ms > measurement.delay_s * 1e3
                 else f"the device was {measurement.delay_s * 1e3:.0f} ms behind with the commands that it obeyed"
             )
+        if measurement is not None:
+            self._tell_what_was_measured(faults, state, measurement)
         for explained in self.of_faults(faults):
             log.error("fault: %s: %s", explained.code, explained.cause)
+
+    def _tell_what_was_measured(self, faults: tuple[Fault, ...], state: StepState, measurement: Measurement) -> None:
+        """The causes whose figures are the measurement's, or what the step has remembered of it."""
+        figures: dict[Fault, str] = {
+            Fault.SENSE_STALE: f"for {(state.time_s - measurement.sensed_s) * 1e3:.0f} ms",
+            Fault.STATUS_STALE: f"for {(state.time_s - measurement.reported_s) * 1e3:.0f} ms",
+            Fault.LINK_DEGRADED: str(measurement.link),
+            Fault.CLOCK: f"by {measurement.link.clock_drift:+.1%}",
+            Fault.OUT_OF_STROKE: f"left {measurement.left_mm:.1f} mm, right {measurement.right_mm:.1f} mm from home",
+        }
+        if state.leap is not None:
+            figures[Fault.ENCODER] = str(state.leap)
+        homing = state.homing
+        if homing is not None:
+            figures.update({fault: str(homing) for fault in homing.faults})
+        for fault in faults:
+            if fault in figures:
+                self._told[fault] = f"{FAULTS[fault].cause}: {figures[fault]}"
 
     def of_faults(self, faults: Iterable[str]) -> tuple[Explained, ...]:
         """Each fault with its cause and remedy."""
         return explanations(faults, FAULTS, self._told)
 
     def of_limits(
-        self, limits: Iterable[str], replaced: str, of_sources: Mapping[Limit, Explanation]
+        self,
+        limits: Iterable[str],
+        replaced: str,
+        of_sources: Mapping[Limit, Explanation],
+        measurement: Measurement | None,
     ) -> tuple[Explained, ...]:
         """Each limit with its cause and remedy; `replaced` says what the model was not asked, `of_sources` what is
-        known of those that publish."""
+        known of those that publish, `measurement` is the newest."""
         told = {Limit.HOST_STALL: f"{self._stall}; the gap was held until the device answered"}
         told |= {Limit.MODEL_RANGE: f"outside what the model was shown: {replaced}"}
+        if measurement is not None:
+            told[Limit.LINK_DEGRADED] = f"{LIMITS[Limit.LINK_DEGRADED].cause}: {measurement.link}"
+            told[Limit.CLOCK] = f"{LIMITS[Limit.CLOCK].cause}: {measurement.link.clock_drift:+.1%}"
         return explanations(limits, {**LIMITS, **of_sources}, told)
 
     def newest_stall(self) -> StallReport | None:

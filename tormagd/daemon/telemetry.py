@@ -24,6 +24,7 @@ def tick_record(
     """The record of one tick. By position, as by name it would take ten times as long: in the order of its fields."""
     estimate, safety = state.estimate, state.safety
     is_placed = estimate is not None and estimate.is_homed
+    link = None if measurement is None else measurement.link
     return TickRecord(
         time.time_ns(),
         now_s,
@@ -48,6 +49,13 @@ def tick_record(
         None if measurement is None else measurement.number,
         None if measurement is None else measurement.received_s,
         None if measurement is None else measurement.delay_s,
+        None if measurement is None else measurement.sensed_s,
+        None if measurement is None else measurement.reported_s,
+        None if link is None else link.unanswered,
+        None if link is None else link.damaged,
+        None if link is None else link.unsent,
+        None if link is None else link.round_trip_s,
+        None if link is None else link.clock_drift,
         None if measurement is None else measurement.device_time_s,
         None if measurement is None else measurement.left_mm,
         None if measurement is None else measurement.right_mm,

@@ -43,6 +43,10 @@ class LinkStatistics(Protocol):
     repeated: int
     """What the backend knew for a repetition; not the States it gives out that are no news, which the link counts."""
     resynchronisations: int
+    unsent: int
+    """Messages that the wire did not take at once."""
+    refused: dict[str, str]
+    """By message (or "frame", where it was none yet), why the newest one was refused: `{"State": "CRC-8"}`."""
 
 
 class Backend(Protocol):

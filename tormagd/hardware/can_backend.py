@@ -113,6 +113,7 @@ class CanBackend:
                 self._unsent = 0
                 return
         self._unsent += 1
+        self._stream.statistics.unsent += 1
         if self._unsent > UNSENT_FRAMES:
             raise BackendError(
                 f"{self._name}: the bus takes no frames: nobody acknowledges them", remedy=self._look_at_the_bus

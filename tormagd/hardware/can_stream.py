@@ -1,7 +1,7 @@
 """Messages to CAN frames and back: the part of the CAN backend that needs no bus."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from firmware_protocol.codec import (
     FUNCTION,
@@ -16,7 +16,7 @@ from firmware_protocol.codec import (
     decode,
     encode,
 )
-from tormagd.hardware.link import OVERTAKEN
+from firmware_protocol.framing import Succession
 
 FROM_DEVICE = (State, Sense, Status, Identity)
 
@@ -40,11 +40,16 @@ class CanStatistics:
     corrupt: int = 0
     """Frames of our node that are no message, and error frames; what the bus itself discards is not seen."""
     lost: int = 0
-    """State messages missing from their counter, those among them that arrived corrupt included."""
+    """State messages missing from their counter, those among them that arrived corrupt included; not those that were
+    only overtaken."""
     repeated: int = 0
     """Always 0: only State has a counter on CAN, and one that is no news is given out for the link to count."""
     resynchronisations: int = 0
     """Times a message was found again after something corrupt."""
+    unsent: int = 0
+    """Sent frames that the bus did not take at once; whoever sends them counts."""
+    refused: dict[str, str] = field(default_factory=dict)
+    """By message, why the newest one was refused."""
 
 
 class CanStream:
@@ -55,7 +60,7 @@ class CanStream:
         self.node = node
         self.statistics = CanStatistics()
         self._identifiers = {message: can_identifier(function, node) for message, function in FUNCTION.items()}
-        self._counter: int | None = None
+        self._states = Succession()
         self._drives: deque[bytes] = deque(maxlen=ECHOES)
         self._synchronised = True
 
@@ -76,8 +81,9 @@ class CanStream:
         self.statistics.bytes += len(data)
         try:
             message = decode(identifier >> 4, data)
-        except DecodeError:
+        except DecodeError as error:
             self.count_corrupt()
+            self.statistics.refused[error.name or f"function {identifier >> 4}"] = error.check
             return None
         if isinstance(message, Drive) and data not in self._drives:
             raise SecondHostError
@@ -87,7 +93,7 @@ class CanStream:
             self.statistics.resynchronisations += 1
             self._synchronised = True
         if isinstance(message, State):
-            self._count_lost(message.counter)
+            self.statistics.lost += self._states.lost(message.counter)
         self.statistics.frames += 1
         return message
 
@@ -95,11 +101,3 @@ class CanStream:
         """Counts a frame that could not even be taken apart."""
         self.statistics.corrupt += 1
         self._synchronised = False
-
-    def _count_lost(self, counter: int) -> None:
-        last = self._counter
-        if last is not None and (last - counter) % 256 < OVERTAKEN:
-            return
-        self._counter = counter
-        if last is not None:
-            self.statistics.lost += (counter - last) % 256 - 1

@@ -96,20 +96,25 @@ class Connection:
 
     @property
     def cause(self) -> str:
-        """Why it does not run; empty while it does."""
+        """Why it does not run, or what is missing for a measurement; empty while nothing is."""
         link, backend = self._link, self._backend
         if link is None or backend is None:
             return self._cause
+        heard = backend.statistics
+        if link.state is LinkState.RUNNING:
+            return link.missing(heard.refused)
         if link.state is not LinkState.UNANSWERED:
             return link.cause
-        heard = backend.statistics
+        refused = f" ({_refusals(heard.refused)})" if heard.refused else ""
         if heard.frames:
-            return f"{link.cause}, though it sends messages"
-        return f"{link.cause}; " + ("what it sends is not this protocol" if heard.corrupt else "it is silent")
+            return f"{link.cause}, though it sends messages{refused}"
+        return f"{link.cause}; " + (f"what it sends is not this protocol{refused}" if heard.corrupt else "it is silent")
 
     @property
     def remedy(self) -> str:
         """What to do about the cause."""
+        if self.state is LinkState.RUNNING:
+            return "look at what the firmware sends, and at its CRC-8" if self.cause else ""
         return self._remedy or _REMEDIES.get(self.state, "")
 
     @property
@@ -159,6 +164,9 @@ class Connection:
         except BackendError as error:
             self._lose(error)
             return
+        if link.is_judging(now_s):
+            heard = backend.statistics
+            link.judge(now_s, heard.frames, heard.corrupt, heard.unsent)
         self._notice()
         if link.state is LinkState.LOST:
             self._give_back(link.cause, "")
@@ -195,6 +203,10 @@ class Connection:
             **counted,
             round_trip_us=None if link is None else _round_trip(link),
             clock=None if link is None else _clock(link),
+            unsent=None if backend is None else backend.statistics.unsent,
+            refused={} if backend is None else dict(backend.statistics.refused),
+            unanswered_share=None if link is None or link.measurement is None else round(link.quality.unanswered, 4),
+            damaged_share=None if link is None or link.measurement is None else round(link.quality.damaged, 4),
         )
 
     def _open(self, now_s: float) -> None:
@@ -275,6 +287,10 @@ class Connection:
             self._on_loss()
         elif state in (LinkState.REFUSED, LinkState.UNANSWERED):
             log.warning("%s: %s; %s", self._device.port, self.cause, self.remedy)
+
+
+def _refusals(refused: Mapping[str, str]) -> str:
+    return ", ".join([f"{name}: {why}" for name, why in sorted(refused.items())])
 
 
 def _round_trip(link: DeviceLink) -> RoundTripReport | None:

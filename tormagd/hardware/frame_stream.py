@@ -29,6 +29,7 @@ class FrameStream:
         for frame in self._decoder.feed(data):
             try:
                 messages.append(decode(frame.function, frame.payload))
-            except DecodeError:
+            except DecodeError as error:
                 self.statistics.corrupt += 1
+                self.statistics.refused[error.name or f"function {frame.function}"] = error.check
         return messages

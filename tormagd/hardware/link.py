@@ -4,6 +4,7 @@ No I/O and no clock: the daemon and the virtual-time simulation carry the same m
 """
 
 import math
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import Final, final
 
@@ -24,6 +25,7 @@ from firmware_protocol.codec import (
     Status,
     period,
 )
+from tormagd.hardware.link_quality import UNKNOWN_QUALITY, Counts, LinkQuality, LinkWatch
 from tormagd.hardware.link_statistics import DeviceClock, RoundTrip
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import DeviceRequest
@@ -79,16 +81,17 @@ class DeviceLink:
     """One conversation, from the opening of the port to its loss. A new connection takes a new link."""
 
     __slots__ = (
-        "_acknowledged", "_asked_s", "_broken", "_counter", "_delay_s", "_device_time_s", "_handle_mm", "_heard_s",
-        "_hello_due_s", "_is_measured", "_least_delay_s", "_left_mm", "_measurement", "_nonce", "_number",
-        "_received_s",
-        "_request", "_request_due_s", "_requested_s", "_right_mm", "_sense", "_state", "_status", "cause", "clock",
-        "identity", "repeated", "round_trip", "state",
+        "_acknowledged", "_asked_s", "_broken", "_counter", "_delay_s", "_device_time_s", "_drives", "_handle_mm",
+        "_heard_s", "_hello_due_s", "_is_measured", "_least_delay_s", "_left_mm", "_measurement", "_nonce",
+        "_number", "_quality_watch", "_received_s", "_reported_s", "_request", "_request_due_s", "_requested_s",
+        "_right_mm", "_sense", "_sensed_s", "_state", "_states", "_status", "cause", "clock", "identity",
+        "quality", "repeated", "round_trip", "state",
     )  # fmt: skip
 
     def __init__(self, now_s: float) -> None:
         self.repeated = 0
         """States that were no news: from a sender that is stuck, or overtaken on their way."""
+        self._drives = self._states = 0
         self._counter = 0
         self._request = DeviceRequest.NONE
         self._request_due_s = self._requested_s = now_s
@@ -101,6 +104,8 @@ class DeviceLink:
         self.identity: Identity | None = None
         self.round_trip = RoundTrip()
         self.clock = DeviceClock()
+        self.quality: LinkQuality = UNKNOWN_QUALITY
+        self._quality_watch = LinkWatch(now_s)
         self._heard_s = self._hello_due_s = self._asked_s = now_s
         self._broken = ""
         self._delay_s = 0.0
@@ -115,6 +120,8 @@ class DeviceLink:
         """Made of the following when it is asked for: State and Sense change them one after the other."""
         self._number = 0
         self._received_s = 0.0
+        self._sensed_s = 0.0
+        self._reported_s = 0.0
         self._device_time_s = 0.0
         self._left_mm = 0.0
         self._right_mm = 0.0
@@ -148,7 +155,7 @@ class DeviceLink:
         if isinstance(message, State):
             self._take_state(now_s, message)
         elif isinstance(message, Sense):
-            self._take_sense(message)
+            self._take_sense(now_s, message)
         elif isinstance(message, Status):
             self._take_status(now_s, message)
         elif isinstance(message, Identity):
@@ -177,6 +184,7 @@ class DeviceLink:
     def drive(self, left_duty: float, right_duty: float, mode: DriveMode) -> Drive:
         """The Drive message of this period; duties in -1..1."""
         self._counter = (self._counter + 1) % 256
+        self._drives += 1
         return Drive(left_duty=left_duty, right_duty=right_duty, mode=mode, counter=self._counter)
 
     def request(self, now_s: float, request: DeviceRequest) -> None:
@@ -187,6 +195,31 @@ class DeviceLink:
         self._nonce = _next_nonce(self._nonce)
         self._request = request
         self._request_due_s = self._requested_s = now_s
+
+    def missing(self, refused: Mapping[str, str]) -> str:
+        """What a running device has not said yet that a measurement needs, as in "no Sense yet, State refused: CRC-8".
+
+        `refused` says by message why the newest one of it was refused. Empty where there is a measurement.
+        """
+        if self.state is not _RUNNING or self._is_measured:
+            return ""
+        lacking: list[str] = []
+        for name, message in (("State", self._state), ("Sense", self._sense), ("Status", self._status)):
+            if message is None:
+                lacking.append(f"{name} refused: {refused[name]}" if name in refused else f"no {name} yet")
+        return ", ".join(lacking) or "no State after the first Sense and Status yet"
+
+    def judge(self, now_s: float, frames: int, damaged: int, unsent: int) -> None:
+        """Makes the link's quality anew, where it is time to. The backend's counters only grow."""
+        if not self._quality_watch.is_due(now_s):
+            return
+        counts = Counts(self._drives, self._states, frames, damaged, unsent)
+        self.quality = self._quality_watch.look(now_s, counts, self.round_trip.usual_s, self.clock.drift)
+        self._measurement = None
+
+    def is_judging(self, now_s: float) -> bool:
+        """Whether it is time to."""
+        return self._quality_watch.is_due(now_s)
 
     def lose(self, cause: str) -> None:
         """The port failed: the conversation is over."""
@@ -230,6 +263,8 @@ class DeviceLink:
         elif self._status.command_nonce != 0 and status.command_nonce == 0:
             self._broken = "the device was reset"
         self._status = status
+        self._reported_s = now_s
+        self.round_trip.status(status.drive_counter)
         if status.command_nonce == self._nonce:
             self._request = DeviceRequest.NONE
             self._acknowledged = self._nonce
@@ -245,8 +280,9 @@ class DeviceLink:
             self._least_delay_s = min(last_s, self._delay_s)
             self._measurement = None
 
-    def _take_sense(self, sense: Sense) -> None:
+    def _take_sense(self, now_s: float, sense: Sense) -> None:
         # Sense follows the State of the same instant; the measurement takes the newest of both
+        self._sensed_s = now_s
         previous = self._sense
         if self._is_measured and previous is not None:
             self._handle_mm += _unwrapped(previous.handle_position_mm, sense.handle_position_mm, HANDLE_SPAN_MM)
@@ -259,6 +295,7 @@ class DeviceLink:
             self.repeated += 1
             return
         self._state = state
+        self._states += 1
         self.round_trip.state(state.counter, now_s)
         if previous is None or not self._is_measured:
             self._begin_measuring(now_s, state)
@@ -302,7 +339,10 @@ class DeviceLink:
             status.faults,
             status.temperature_C,
             status.supply_V,
+            self._sensed_s,
+            self._reported_s,
             self._least_delay_s,
+            self.quality,
         )
 
 

@@ -14,6 +14,7 @@ from firmware_protocol.value import Value
 
 ROUND_TRIPS = 256
 "The round trips that percentiles are taken of: a quarter of a second of control."
+USUAL_OF: Final = 32.0
 WINDOW_S = 0.5
 "The least delayed State of this time stands for all of it: queues on the way only ever add."
 WINDOWS = 60
@@ -24,6 +25,10 @@ MOST_RESIDUAL_US = 2_000.0
 "More than this around the line, and it is no line."
 NEWEST_WINDOWS = 3
 "Where none of the newest lies on the line, the clock has left it."
+DRIFT_WINDOWS: Final = 8
+"What the drift is watched by: a clock that runs wrong is known after four seconds."
+STANDING: Final = 20
+"States with the same time: a millisecond is a hundred steps of the device's clock."
 CLOCK_STEP_S = 1e-5
 "The resolution of State.device_time_s; a window in the next step of it, with what jitter is left, is no outlier."
 
@@ -38,10 +43,13 @@ class RoundTrip:
 
     A State does not name the Drive it answers. The device answers in order, so when an Identity comes, the State before
     it belongs to the last Drive before the Hello: that fixes how far the two counters are apart. A Drive that is lost
-    later moves them further apart, and makes round trips one period too long until the next Identity.
+    later, or not answered, moves them further apart. A Status, which names the last Drive that the device accepted,
+    shows that: until it has come round trips are not counted, and where it does not fit they are forgotten but for that
+    of the Drive it names. One lost Drive alone looks like an answer that is still on its way, and makes round trips one
+    period too long until the next Identity.
     """
 
-    __slots__ = ("_before_hello", "_lead", "_newest", "_recent", "_sent_s", "_state")
+    __slots__ = ("_before_hello", "_lead", "_newest", "_newest_s", "_recent", "_sent_s", "_state", "_unsure", "usual_s")
 
     def __init__(self) -> None:
         self._sent_s = [0.0] * 256
@@ -49,7 +57,11 @@ class RoundTrip:
         self._before_hello: int | None = None
         self._state: int | None = None
         self._lead: int | None = None
+        self._newest_s = 0.0
+        self._unsure: deque[float] = deque(maxlen=ROUND_TRIPS)
         self._recent: deque[float] = deque(maxlen=ROUND_TRIPS)
+        self.usual_s = 0.0
+        """A mean of about the newest USUAL_OF round trips; 0 while none is known."""
 
     def drive(self, counter: int, now_s: float) -> None:
         """The Drive with this counter goes out now."""
@@ -72,15 +84,37 @@ class RoundTrip:
 
     def state(self, counter: int, now_s: float) -> None:
         """The State with this counter came in now."""
-        self._state = counter
+        self._state, self._newest_s = counter, now_s
         lead = self._lead
         if lead is None:
             return
         answered = (counter + lead) % 256
         if (self._newest - answered) % 256 < 128:
-            self._recent.append(now_s - self._sent_s[answered])
+            self._unsure.append(now_s - self._sent_s[answered])
         else:  # it would be the answer to a Drive that has not been sent
             self._lead = None
+
+    def status(self, drive_counter: int) -> None:
+        """The device has said that this Drive was the last that it accepted."""
+        state, lead = self._state, self._lead
+        if state is None:
+            return
+        if lead is not None and (drive_counter - state - lead + 1) % 256 <= 2:
+            # the answer to that Drive is the newest State, or on its way, or the next has overtaken the Status
+            for round_trip_s in self._unsure:
+                self._take(round_trip_s)
+        else:
+            self._lead = drive_counter - state
+            self._recent.clear()
+            round_trip_s = self._newest_s - self._sent_s[drive_counter]
+            if round_trip_s >= 0.0 and (self._newest - drive_counter) % 256 < 128:
+                self._take(round_trip_s)
+        self._unsure.clear()
+
+    def _take(self, round_trip_s: float) -> None:
+        self._recent.append(round_trip_s)
+        known_s = self.usual_s or round_trip_s
+        self.usual_s = known_s + (round_trip_s - known_s) / USUAL_OF
 
     @property
     def least_s(self) -> float:
@@ -123,7 +157,7 @@ class DeviceClock:
     any amount; those far from it are left out of the least squares that follow.
     """
 
-    __slots__ = ("_ends_s", "_fit", "_is_fitted", "_least", "_windows")
+    __slots__ = ("_ends_s", "_fit", "_is_fitted", "_least", "_newest_s", "_standing", "_windows", "drift")
 
     def __init__(self) -> None:
         self._windows: deque[tuple[float, float]] = deque(maxlen=WINDOWS)
@@ -131,9 +165,19 @@ class DeviceClock:
         self._ends_s = -math.inf
         self._fit: ClockFit | None = None
         self._is_fitted = True
+        self._newest_s = -math.inf
+        self._standing = 0
+        self.drift = 0.0
+        """By which share the clock runs fast, by the newest windows; 0 while not known, -1 for a clock that stands."""
 
     def add(self, host_s: float, device_s: float) -> None:
         """A State that was latched at `device_s` on the device's clock, unwrapped, was read at `host_s`."""
+        if device_s != self._newest_s:
+            self._newest_s, self._standing = device_s, 0
+        else:
+            self._standing += 1
+            if self._standing > STANDING:
+                self.drift = -1.0
         offset_s = host_s - device_s
         if host_s >= self._ends_s:
             self._turn(host_s)
@@ -151,6 +195,9 @@ class DeviceClock:
         if self._least[0] < math.inf:
             self._windows.append(self._least)
             self._is_fitted = False
+            newest = _newest_line(list(self._windows)[-DRIFT_WINDOWS:])
+            if self._standing <= STANDING:
+                self.drift = 0.0 if newest is None else newest.drift_ppm * 1e-6
         self._least = (math.inf, 0.0)
         self._ends_s = host_s + WINDOW_S
 

@@ -4,6 +4,7 @@ from typing import Final, final
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from firmware_protocol.value import Value
+from tormagd.hardware.link_quality import UNKNOWN_QUALITY, LinkQuality
 
 # operations on flags make new ones, at a microsecond each; the core asks a thousand times a second
 _HOMED: Final = int(Switches.HOMED)
@@ -18,14 +19,17 @@ class Measurement(Value):
     """One device state. Carriage positions are mm from the home switches (closing is negative); times are in s.
 
     `received_s` is the host's clock, `device_time_s` the device's own, unwrapped from an arbitrary start. `handle_mm`
-    is the travel of the roller's surface, unwrapped. `number` counts the states of this connection. `delay_s` is how
+    is the travel of the roller's surface, unwrapped. `number` counts the states of this connection. Three streams make
+    it, and any of them may stop: `received_s` is when the newest State came, `sensed_s` the newest Sense (currents,
+    force, handle), `reported_s` the newest Status (mode, switches, faults, temperature, supply). `delay_s` is how
     long ago the first Drive was sent that the device had not obeyed when it last said which it does: at most the way
-    there and back.
+    there and back. `link` is how well the wire carried it.
     """
 
     __match_args__ = (
         "number", "received_s", "device_time_s", "left_mm", "right_mm", "left_current_A", "right_current_A", "force_N",
-        "handle_mm", "mode", "switches", "faults", "temperature_C", "supply_V", "delay_s",
+        "handle_mm", "mode", "switches", "faults", "temperature_C", "supply_V", "sensed_s", "reported_s", "delay_s",
+        "link",
     )  # fmt: skip
     __slots__ = __match_args__
 
@@ -45,7 +49,10 @@ class Measurement(Value):
         faults: DeviceFault,
         temperature_C: float,
         supply_V: float,
+        sensed_s: float,
+        reported_s: float,
         delay_s: float = 0.0,
+        link: LinkQuality = UNKNOWN_QUALITY,
     ) -> None:
         self.number: Final = number
         self.received_s: Final = received_s
@@ -61,7 +68,10 @@ class Measurement(Value):
         self.faults: Final = faults
         self.temperature_C: Final = temperature_C
         self.supply_V: Final = supply_V
+        self.sensed_s: Final = sensed_s
+        self.reported_s: Final = reported_s
         self.delay_s: Final = delay_s
+        self.link: Final = link
 
     @property
     def is_homed(self) -> bool:

@@ -68,6 +68,8 @@ class SerialBackend:
         except OSError as error:
             raise BackendError(f"{self._port.port}: writing failed: {error.strerror}") from error
         self._unsent = data[written:]
+        if self._unsent:
+            self._stream.statistics.unsent += 1
         if len(self._unsent) > UNSENT_BYTES:
             raise BackendError(f"{self._port.port}: nobody reads at the other end")
 

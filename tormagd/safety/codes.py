@@ -18,7 +18,15 @@ class Fault(StrEnum):
 
     LINK_LOST = "LINK_LOST"
     HOST_STALL = "HOST_STALL"
+    LINK_DEGRADED = "LINK_DEGRADED"
     MEASUREMENT_STALE = "MEASUREMENT_STALE"
+    SENSE_STALE = "SENSE_STALE"
+    STATUS_STALE = "STATUS_STALE"
+    CLOCK = "CLOCK"
+    ENCODER = "ENCODER"
+    OUT_OF_STROKE = "OUT_OF_STROKE"
+    WRONG_DIRECTION = "WRONG_DIRECTION"
+    HOMING = "HOMING"
     SKEW = "SKEW"
     FOLLOWING_ERROR = "FOLLOWING_ERROR"
     NO_MOTION = "NO_MOTION"
@@ -63,6 +71,10 @@ class Limit(StrEnum):
     SKEW = "SKEW"
     HOST_STALL = "HOST_STALL"
     DEVICE_SILENT = "DEVICE_SILENT"
+    SENSE_STALE = "SENSE_STALE"
+    ENCODER = "ENCODER"
+    LINK_DEGRADED = "LINK_DEGRADED"
+    CLOCK = "CLOCK"
 
 
 FAULTS: dict[Fault, Explanation] = {
@@ -77,6 +89,39 @@ FAULTS: dict[Fault, Explanation] = {
     Fault.MEASUREMENT_STALE: Explanation(
         "the device fell silent, or its states came too late to close the loop",
         "check cable and supply, and the round trip in `tormagctl firmware`; then clear-fault",
+    ),
+    Fault.LINK_DEGRADED: Explanation(
+        "the answers of the device come so late that the position loop would swing",
+        "look at the round trip in `tormagctl firmware`: a USB adapter's latency timer (`tormagctl doctor`), a hub, a "
+        "full bus; then clear-fault",
+    ),
+    Fault.SENSE_STALE: Explanation(
+        "the device sends no Sense any more: force and handle are not measured, and the scene needs them",
+        "look at the firmware and at `refused` in `tormagctl firmware`; then clear-fault",
+    ),
+    Fault.STATUS_STALE: Explanation(
+        "the device sends no Status any more: its faults, switches and supply are not known",
+        "look at the firmware and at `refused` in `tormagctl firmware`; then clear-fault",
+    ),
+    Fault.CLOCK: Explanation(
+        "the device's clock runs far too fast or too slow, or stands: no speed and no timeout of its is what it says",
+        "check the firmware's timer and its clock source; then clear-fault",
+    ),
+    Fault.ENCODER: Explanation(
+        "an encoder moved faster than any motor can: it has lost or invented counts",
+        "check the encoder's cable and screen, then clear-fault and home",
+    ),
+    Fault.OUT_OF_STROKE: Explanation(
+        "a homed carriage reads a position where none can be: counts were lost, or homing found a wrong zero",
+        "check switches and encoders, then clear-fault and home",
+    ),
+    Fault.WRONG_DIRECTION: Explanation(
+        "a carriage moved the other way than it was driven",
+        "swap the two wires of its motor, or the two phases of its encoder; do not enable before homing opens the gap",
+    ),
+    Fault.HOMING: Explanation(
+        "homing took too long, or ended without having found both switches",
+        "check the open switches and the screws, then clear-fault and home",
     ),
     Fault.SKEW: Explanation(
         "the two carriages moved apart from each other",
@@ -186,6 +231,22 @@ LIMITS: dict[Limit, Explanation] = {
     Limit.DEVICE_SILENT: Explanation(
         "the device has sent no new state for some milliseconds; the gap is held until it does",
         "look at the round trip in `tormagctl firmware`",
+    ),
+    Limit.SENSE_STALE: Explanation(
+        "the device sends no Sense: force and handle are not measured, and nothing is learned",
+        "look at the firmware and at `refused` in `tormagctl firmware`",
+    ),
+    Limit.ENCODER: Explanation(
+        "an encoder has leapt; the gap is held until the device has said whether it was reset",
+        "check the encoder's cable and screen",
+    ),
+    Limit.LINK_DEGRADED: Explanation(
+        "the wire loses or damages messages, or takes so long that little is left of the loop's margin",
+        "check cable, termination and adapter; look at the link in `tormagctl firmware`",
+    ),
+    Limit.CLOCK: Explanation(
+        "the device's clock is off by more than 1 %, and with it all speeds and the device's own timeouts",
+        "check the firmware's timer and its clock source",
     ),
 }
 

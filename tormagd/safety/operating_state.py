@@ -13,7 +13,17 @@ from tormagd.safety.codes import Fault
 
 CLEARING_S = 0.5
 "How long the device may take to report that a cleared fault is gone."
-LOST_POSITION = frozenset({Fault.SKEW, Fault.FOLLOWING_ERROR, Fault.NO_MOTION})
+LOST_POSITION = frozenset(
+    {
+        Fault.SKEW,
+        Fault.FOLLOWING_ERROR,
+        Fault.NO_MOTION,
+        Fault.ENCODER,
+        Fault.OUT_OF_STROKE,
+        Fault.WRONG_DIRECTION,
+        Fault.HOMING,
+    }
+)
 """After these faults the counts of an encoder are not believed any more. The device does not know, and goes on calling
 itself homed; where it has latched a fault of its own it does not."""
 
@@ -49,7 +59,8 @@ class Conditions(Value):
     """What the decisions depend on."""
 
     __match_args__ = (
-        "connected", "fresh", "homed", "busy", "device_latched", "requested_N", "neutral_N", "sensor_doubted",
+        "connected", "fresh", "homed", "busy", "device_latched", "requested_N", "neutral_N", "sensor_doubted", "cause",
+        "remedy", "round_trip_s", "clock_drift",
     )  # fmt: skip
     __slots__ = __match_args__
 
@@ -63,6 +74,10 @@ class Conditions(Value):
         requested_N: float | None,
         neutral_N: float,
         sensor_doubted: bool = False,
+        cause: str = "",
+        remedy: str = "",
+        round_trip_s: float = 0.0,
+        clock_drift: float = 0.0,
     ) -> None:
         self.connected: Final = connected
         self.fresh: Final = fresh
@@ -72,6 +87,11 @@ class Conditions(Value):
         self.requested_N: Final = requested_N
         self.neutral_N: Final = neutral_N
         self.sensor_doubted: Final = sensor_doubted
+        self.cause: Final = cause
+        "What keeps the device from being connected or its measurements from being fresh; empty where nothing does."
+        self.remedy: Final = remedy
+        self.round_trip_s: Final = round_trip_s
+        self.clock_drift: Final = clock_drift
 
 
 @final
@@ -129,7 +149,11 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
     if transition is None:
         raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(_TRANSITIONS)}")
     if name != "stop" and not conditions.connected:
-        raise RefusedError("not_connected", "the device is not connected", "check port, cable and supply")
+        raise RefusedError(
+            "not_connected",
+            f"the device is not connected: {conditions.cause}" if conditions.cause else "the device is not connected",
+            conditions.remedy or "check port, cable and supply",
+        )
     return transition(state, now_s, conditions)
 
 
@@ -146,7 +170,10 @@ def _enable(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyS
     if not conditions.homed:
         raise RefusedError("not_homed", "the carriages are not homed", "tormagctl home")
     if not conditions.fresh:
-        raise RefusedError("not_fresh", "no fresh measurement from the device", "look at the link in tormagctl status")
+        said = f": {conditions.cause}" if conditions.cause else ""
+        raise RefusedError(
+            "not_fresh", f"no fresh measurement from the device{said}", "look at the link in tormagctl status"
+        )
     if conditions.sensor_doubted:
         raise RefusedError(
             "sensor_doubted",

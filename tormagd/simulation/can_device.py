@@ -5,7 +5,7 @@ One bus: whoever has something to send waits until it is free, then the lowest i
 
 from collections import deque
 from heapq import heappop, heappush
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from tormagd.simulation.can_frame import MAX_IDENTIFIER, CanFrame, frame_bits
 from tormagd.simulation.device import MessageDevice
@@ -31,6 +31,24 @@ class _Flight(NamedTuple):
     delivery: Delivery
 
 
+class CanLine(Protocol):
+    """What a host has of a device on a bus: a `CanDevice`, or what lies in front of one."""
+
+    @property
+    def messages(self) -> MessageDevice:
+        """The device itself."""
+
+    @property
+    def truth(self) -> Truth:
+        """What really is, at the time of the last call."""
+
+    def receive(self, now_s: float, frame: CanFrame) -> None:
+        """The host hands a frame to its controller now."""
+
+    def transmit(self, now_s: float) -> list[Delivery]:
+        """The frames that have gone by since the last call."""
+
+
 class CanDevice:
     """One device and the bus it is on.
 
@@ -46,7 +64,7 @@ class CanDevice:
             raise ValueError(f"bitrate = {bitrate}: allowed are numbers over 0")
         if not 0 <= node <= 15:
             raise ValueError(f"node = {node}: allowed are 0 to 15")
-        self.messages = messages
+        self._messages = messages
         self.lost = 0
         """Frames that found the queue full."""
         self.busy_s = 0.0
@@ -61,9 +79,14 @@ class CanDevice:
         self._delivered: deque[Delivery] = deque()
 
     @property
+    def messages(self) -> MessageDevice:
+        """The device itself."""
+        return self._messages
+
+    @property
     def truth(self) -> Truth:
         """What really is, at the time of the last call."""
-        return self.messages.truth
+        return self._messages.truth
 
     @property
     def next_event_s(self) -> float:

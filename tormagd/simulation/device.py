@@ -11,7 +11,19 @@ from collections.abc import Callable, Iterable
 from operator import attrgetter
 from typing import Final, Protocol, final
 
-from firmware_protocol.codec import FUNCTION, DecodeError, Message, Switches, decode, encode
+from firmware_protocol.codec import (
+    FUNCTION,
+    DecodeError,
+    DeviceMode,
+    Drive,
+    Message,
+    Sense,
+    State,
+    Status,
+    Switches,
+    decode,
+    encode,
+)
 from firmware_protocol.framing import DELIMITER, FrameDecoder, FramingStatistics, encode_frame
 from firmware_protocol.value import Value
 from tormagd.simulation.compiled_firmware import CompiledFirmware
@@ -26,6 +38,8 @@ DEFAULT_BAUD: Final = 1_000_000
 FirmwareKind = Callable[[PlantParameters], Firmware | CompiledFirmware]
 """What boots: `Firmware`, or the C sources of the same rules as `CompiledFirmware`."""
 WEAR: Final = 4.0
+JUMP_MM: Final = 4.0
+"Of an encoder."
 MAX_BACKLOG_BYTES: Final = 65_536
 """What the serial buffers of both ends and the adapter between them hold; more is lost, as on a real port."""
 LEFT_OPEN: Final = 1
@@ -82,6 +96,7 @@ class MessageDevice:
 
     __slots__ = (
         "_answer_s",
+        "_answering_every",
         "_answers",
         "_arrival_s",
         "_boot",
@@ -89,17 +104,27 @@ class MessageDevice:
         "_closed_m",
         "_counts_per_rad",
         "_deaf",
+        "_drives",
+        "_duty_sign",
         "_faults",
         "_handle_counts_per_mm",
+        "_has_bad_encoders",
         "_home_m",
         "_inbox",
+        "_is_state_damaged",
+        "_is_switch_dead_left",
         "_jitter",
         "_jitter_s",
         "_left_boot_counts",
+        "_left_count_sign",
+        "_left_extra_counts",
+        "_left_motor_sign",
         "_output",
         "_pwm_steps",
         "_rate",
         "_right_boot_counts",
+        "_right_extra_counts",
+        "_silent",
         "_stuck_left",
         "_supply_V",
         "_tick_due_s",
@@ -145,6 +170,18 @@ class MessageDevice:
         self._deaf = False
         self._output: Output = OFF
         self._stuck_left: int | None = None
+        self._silent = 0
+        """The functions that are not sent, a bit each."""
+        self._is_state_damaged = False
+        self._is_switch_dead_left = False
+        self._answering_every = 1
+        self._drives = 0
+        self._left_motor_sign = 1.0
+        self._duty_sign = 1.0
+        self._has_bad_encoders = False
+        self._left_count_sign = 1
+        self._left_extra_counts = 0
+        self._right_extra_counts = 0
         self._left_boot_counts = 0
         self._right_boot_counts = 0
         self._boot_s = 0.0
@@ -206,7 +243,10 @@ class MessageDevice:
         """Let the bridges do what the firmware wants of them now."""
         self._output = output = self.firmware.output
         if output.enabled and self._supply_V > 0.0:
-            self.plant.drive(self._volts(output.left_duty), self._volts(output.right_duty))
+            left_V, right_V = self._volts(output.left_duty), self._volts(output.right_duty)
+            if self._duty_sign < 0.0 and self.firmware.mode is DeviceMode.RUN:
+                left_V, right_V = -left_V, -right_V
+            self.plant.drive(self._left_motor_sign * left_V, right_V)
         else:
             self.plant.drive(None, None)
 
@@ -233,6 +273,10 @@ class MessageDevice:
         except DecodeError:
             self.undecodable += 1
             return
+        if self._answering_every > 1 and isinstance(message, Drive):
+            self._drives += 1
+            if self._drives % self._answering_every:
+                return
         answer = self.firmware.receive(self._device_time_s(time_s), message, self._sensors())
         if answer is not NO_ANSWER:
             answer_s = time_s + self._jitter_s * self._jitter.random()
@@ -252,13 +296,18 @@ class MessageDevice:
         self._send(time_s, sense)
 
     def _send(self, time_s: float, message: Message) -> None:
-        self.outbox.append(Packet(time_s, FUNCTION[type(message)], encode(message)))
+        function, payload = FUNCTION[type(message)], encode(message)
+        if self._silent and self._silent >> function & 1:
+            return
+        if self._is_state_damaged and isinstance(message, State):
+            payload = payload[:-1] + bytes((payload[-1] ^ 0xFF,))
+        self.outbox.append(Packet(time_s, function, payload))
 
     def _sensors(self) -> Sensors:
         plant = self.plant
         left_m, right_m = plant.left.position_m, plant.right.position_m
         switches = 0
-        if left_m >= self._home_m:
+        if left_m >= self._home_m and not self._is_switch_dead_left:
             switches = LEFT_OPEN
         elif left_m <= self._closed_m:
             switches = LEFT_CLOSED
@@ -283,7 +332,13 @@ class MessageDevice:
     def _encoders(self, left_rad: float, right_rad: float) -> tuple[int, int]:
         stuck = self._stuck_left
         left_counts = math.floor(left_rad * self._counts_per_rad) if stuck is None else stuck
-        return left_counts, math.floor(right_rad * self._counts_per_rad)
+        right_counts = math.floor(right_rad * self._counts_per_rad)
+        if not self._has_bad_encoders:
+            return left_counts, right_counts
+        return (
+            self._left_count_sign * left_counts + self._left_extra_counts,
+            right_counts + self._right_extra_counts,
+        )
 
     def _strike(self, time_s: float, fault: Fault) -> None:
         match fault.name:
@@ -307,6 +362,40 @@ class MessageDevice:
             case "supply_loss":
                 self._supply_V = 0.0
                 self._switch()
+            case "no_state" | "no_sense" | "no_status":
+                kinds: dict[str, type[Message]] = {"no_state": State, "no_sense": Sense, "no_status": Status}
+                self._silent |= 1 << FUNCTION[kinds[fault.name]]
+            case "state_crc":
+                self._is_state_damaged = True
+            case "answers_half":
+                self._answering_every = 2
+            case "encoder_jump" | "encoder_jump_left":
+                self._has_bad_encoders = True
+                counts_rev = self.parameters.electronics.encoder_counts_per_rev
+                counts = round(JUMP_MM / self.parameters.screw.lead_mm * counts_rev)
+                self._left_extra_counts += counts
+                if fault.name == "encoder_jump":
+                    self._right_extra_counts += counts
+            case "encoder_reversed_left":
+                (left_rad, _), (right_rad, _) = self.plant.shafts
+                left_counts, _ = self._encoders(left_rad, right_rad)
+                self._has_bad_encoders = True
+                self._left_count_sign = -self._left_count_sign
+                self._left_extra_counts += left_counts - self._encoders(left_rad, right_rad)[0]
+            case "motor_reversed_left":
+                self._left_motor_sign = -1.0
+                self._switch()
+            case "duties_reversed":
+                self._duty_sign = -1.0
+                self._switch()
+            case "switch_dead_left":
+                self._is_switch_dead_left = True
+            case "clock":
+                rate = self._rate * (1.0 + fault.percent / 100.0)
+                # the clock goes on from where it is
+                self._boot_s = time_s - (time_s - self._boot_s) * self._rate / rate
+                self._rate = rate
+                self._tick_due_s = self._boot_s + (self._ticks + 1) * TICK_S / rate
             case _:
                 raise ValueError(f"fault {fault.name!r} has no effect defined")
 

@@ -11,7 +11,20 @@ KNOWN = {
     "reset": "the firmware restarts: mode, zero, handshake and clock are lost",
     "commands_vanish": "nothing that the host sends arrives",
     "supply_loss": "the motors' supply fails; the logic goes on",
+    "no_state": "no State is sent any more",
+    "no_sense": "no Sense is sent any more",
+    "no_status": "no Status is sent any more",
+    "state_crc": "the CRC-8 of every State is wrong",
+    "answers_half": "every other Drive is neither taken nor answered",
+    "encoder_jump": "both encoders gain 4 mm at once",
+    "encoder_jump_left": "the left encoder does",
+    "encoder_reversed_left": "the left encoder counts backwards from now on",
+    "motor_reversed_left": "the left motor turns the other way",
+    "duties_reversed": "in RUN the firmware takes an opening duty for a closing one",
+    "switch_dead_left": "the left open switch never closes",
+    "clock": "the device's clock runs fast by VALUE percent, as in clock=+2%",
 }
+SIZED = ("drag_left", "clock")
 FORMS = "NAME[=PERCENT%][@SECONDS] with NAME one of: " + "; ".join(f"{name}: {what}" for name, what in KNOWN.items())
 _FORM = re.compile(r"(?P<name>\w+)(?:=(?P<percent>[+-]?[\d.]+)%)?(?:@(?P<at_s>[\d.]+))?")
 
@@ -34,12 +47,12 @@ def parse_fault(spec: str) -> Fault:
     name = match["name"] if match else spec
     if match is None or name not in KNOWN:
         raise FaultError(f"fault {spec!r}: allowed is {FORMS}")
-    if (match["percent"] is not None) != (name == "drag_left"):
-        raise FaultError(f"fault {spec!r}: drag_left takes a size, as in drag_left=+50%, and no other fault does")
+    if (match["percent"] is not None) != (name in SIZED):
+        raise FaultError(f"fault {spec!r}: {' and '.join(SIZED)} take a size, as in drag_left=+50%, and no other fault")
     try:
         at_s, percent = float(match["at_s"] or 0.0), float(match["percent"] or 0.0)
     except ValueError as error:
         raise FaultError(f"fault {spec!r}: {error}") from error
-    if not (at_s < math.inf and -100.0 <= percent <= 10_000.0):
+    if not (at_s < math.inf and -100.0 <= percent <= 10_000.0 and (name != "clock" or percent > -100.0)):
         raise FaultError(f"fault {spec!r}: allowed are finite times and -100% to +10000%")
     return Fault(name, at_s, percent)

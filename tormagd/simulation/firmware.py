@@ -297,6 +297,11 @@ class Firmware:
         self.output = Output(left_duty, right_duty, enabled=True)
         if outcome is Outcome.MOVING:
             return
+        if outcome is Outcome.REVERSED:
+            # to open is just what cannot be: friction holds the gap where it is
+            self.faults |= DeviceFault.HOMING_FAILED
+            self._rest(time_s, LATCHED)
+            return
         if outcome is Outcome.FAILED and homing:
             self._fail(time_s, DeviceFault.HOMING_FAILED, sensors)
             return

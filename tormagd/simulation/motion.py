@@ -22,6 +22,7 @@ SETTLE_S: Final = 0.05  # braked at the switch before the drives go off: three m
 PROGRESS_MM: Final = 0.05
 PATIENCE_S: Final = 0.3
 DEAD_CURRENT_A: Final = 0.02  # a connected motor draws ten times this at the duty that stands for no progress
+WRONG_WAY_MM: Final = 1.0  # back, while homing drives the carriage open: its motor or its encoder is reversed
 TIME_LIMIT_S: Final = 8.0  # the whole stroke at homing speed takes under 4 s
 
 
@@ -44,6 +45,7 @@ class Outcome(Enum):
     MOVING = auto()
     DONE = auto()
     FAILED = auto()
+    REVERSED = auto()
 
 
 @final
@@ -102,6 +104,10 @@ class Opening:
             self.duty = 0.0
             self.outcome = Outcome.FAILED
 
+    def went_back(self, carriage: Carriage) -> bool:
+        """Whether the carriage has gone towards closed while it was driven open."""
+        return carriage.position_mm < self._progress_mm - WRONG_WAY_MM
+
 
 @final
 class Retraction:
@@ -139,6 +145,11 @@ class Retraction:
         """Whether a carriage has been given up; its screw springs back from the stall."""
         return self._left.outcome is Outcome.FAILED or self._right.outcome is Outcome.FAILED
 
+    def is_reversed(self, carriages: tuple[Carriage, Carriage]) -> bool:
+        """Whether a carriage has gone back towards closed."""
+        left, right = carriages
+        return self._left.went_back(left) or self._right.went_back(right)
+
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
         """One tick; FAILED when a carriage could not be brought to its switch and neither moves any more."""
         left, right = carriages
@@ -169,6 +180,7 @@ class Homing:
         "_lead_mm_rev",
         "_left_edge_mm",
         "_ramps",
+        "_reversed_s",
         "_right_edge_mm",
         "_search",
         "_speed_mm_s",
@@ -194,6 +206,7 @@ class Homing:
         self._starts_mm = _positions_mm(carriages)
         self._back_off_since_s = time_s
         self._backed_off = False
+        self._reversed_s: float | None = None
         self._left_edge_mm: float | None = None
         self._right_edge_mm: float | None = None
         self.duties = (0.0, 0.0)
@@ -205,11 +218,16 @@ class Homing:
         return self._left_edge_mm or 0.0, self._right_edge_mm or 0.0
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
-        """One tick: outward, back off, creep outward."""
+        """One tick: outward, back off, creep outward. REVERSED when a carriage has gone back, and was braked."""
         if time_s >= self._deadline_s:
             return Outcome.FAILED
         if self._search is None:
             return self._back_off(time_s, dt_s, carriages)
+        if self._reversed_s is None and self._search.is_reversed(carriages):
+            self._reversed_s = time_s
+        if self._reversed_s is not None:
+            self.duties = (0.0, 0.0)
+            return Outcome.REVERSED if time_s - self._reversed_s >= SETTLE_S else Outcome.MOVING
         if self._backed_off:
             left, right = carriages
             if left.at_open_end and self._left_edge_mm is None:

@@ -1,0 +1,72 @@
+"""Whether the encoders say what carriages can do: no step beyond any motor's speed, no place outside the stroke."""
+
+from typing import Final, final
+
+from firmware_protocol.value import Value
+from tormagd.control.estimate import Estimate
+
+LEAP_SPEEDS: Final = 3.0
+"No motor, and no pull of the magnets, moves a carriage faster than so many times the motor's own full speed,"
+LEAP_MM: Final = 0.1
+"and backlash, a screw that springs back and the encoder's counts come to less than this."
+OVERRUN_MM: Final = 2.5
+"A carriage may overrun its switches, and have been found beyond the closed end, by less than this."
+CLOSED_END_MM: Final = 45.0
+"The device's smallest gap; a scene may close less far, and begin with a device that another one has closed further."
+
+
+@final
+class Leap(Value):
+    """A step of the encoders that no carriage takes: seen at `seen_s`, by so much either side, within `within_s`, away
+    from `left_from_mm` and `right_from_mm`."""
+
+    __match_args__ = ("seen_s", "left_mm", "right_mm", "within_s", "left_from_mm", "right_from_mm")
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        seen_s: float,
+        left_mm: float,
+        right_mm: float,
+        within_s: float,
+        left_from_mm: float,
+        right_from_mm: float,
+    ) -> None:
+        self.seen_s: Final = seen_s
+        self.left_mm: Final = left_mm
+        self.right_mm: Final = right_mm
+        self.within_s: Final = within_s
+        self.left_from_mm: Final = left_from_mm
+        self.right_from_mm: Final = right_from_mm
+
+    def has_come_back(self, estimate: Estimate, full_speed_mm_s: float, now_s: float) -> bool:
+        """Whether the counts are where carriages can have come to since before the leap: it was a burst on a line."""
+        most_mm = LEAP_SPEEDS * full_speed_mm_s * (self.within_s + now_s - self.seen_s) + LEAP_MM
+        return (
+            abs(estimate.left_mm - self.left_from_mm) <= most_mm
+            and abs(estimate.right_mm - self.right_from_mm) <= most_mm
+        )
+
+    def __str__(self) -> str:
+        return f"left {self.left_mm:+.2f} mm, right {self.right_mm:+.2f} mm within {self.within_s * 1e3:.1f} ms"
+
+
+def leap_between(
+    last: Estimate, estimate: Estimate, full_speed_mm_s: float, now_s: float, seen_s: float
+) -> Leap | None:
+    """The leap from `last` to `estimate`, the first that was seen since `seen_s`; None for what a carriage can do.
+
+    The device's clock says how long it took, unless there was nothing to see for longer, and the clock ran over.
+    """
+    left_mm, right_mm = estimate.left_mm - last.left_mm, estimate.right_mm - last.right_mm
+    within_s = max(estimate.device_time_s - last.device_time_s, now_s - seen_s)
+    most_mm = LEAP_SPEEDS * full_speed_mm_s * within_s + LEAP_MM
+    if -most_mm <= left_mm <= most_mm and -most_mm <= right_mm <= most_mm:
+        return None
+    return Leap(now_s, left_mm, right_mm, within_s, last.left_mm, last.right_mm)
+
+
+def is_outside(estimate: Estimate, closed_mm: float, open_mm: float) -> bool:
+    """Whether a carriage of a homed device reads a place where none can be, for gaps from `closed_mm` to `open_mm`."""
+    least_mm, most_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
+    return not (least_mm <= estimate.left_mm <= most_mm and least_mm <= estimate.right_mm <= most_mm)

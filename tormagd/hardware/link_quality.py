@@ -1,0 +1,107 @@
+"""How well the wire carries, in the figures of the last second: before anything swings, it should be known that it may.
+
+A `LinkQuality` goes with every measurement, so that a step decides on what it was given, and a replay decides the same.
+"""
+
+from collections import deque
+from typing import Final, final
+
+from firmware_protocol.value import Value
+
+LOOKED_S: Final = 0.1
+"How often the figures are made anew."
+LOOKS: Final = 10
+"They are of so many of these times: of a second."
+SETTLING_LOOKS: Final = 3
+"In the first of a conversation the answers of the last Drives are still on their way."
+LOSES: Final = 0.02
+"A wire that loses or damages a greater share does not what it should: a serial cable or a CAN bus loses none."
+
+
+@final
+class LinkQuality(Value):
+    """Shares of the last second: of the Drives that no State answered, of the received frames that were damaged, of the
+    sent messages that the wire did not take at once. `round_trip_s` is the usual one, 0 while it is not known;
+    `clock_drift` is by which share the device's clock runs fast, 0 while that is not known, -1 for one that stands.
+    """
+
+    __match_args__ = ("unanswered", "damaged", "unsent", "round_trip_s", "clock_drift")
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        unanswered: float = 0.0,
+        damaged: float = 0.0,
+        unsent: float = 0.0,
+        round_trip_s: float = 0.0,
+        clock_drift: float = 0.0,
+    ) -> None:
+        self.unanswered: Final = unanswered
+        self.damaged: Final = damaged
+        self.unsent: Final = unsent
+        self.round_trip_s: Final = round_trip_s
+        self.clock_drift: Final = clock_drift
+
+    @property
+    def is_lossy(self) -> bool:
+        """Whether messages are lost or damaged by more than a wire in order does."""
+        return self.unanswered > LOSES or self.damaged > LOSES or self.unsent > LOSES
+
+    def __str__(self) -> str:
+        return (
+            f"{self.unanswered:.1%} of the Drives were not answered, {self.damaged:.1%} of the frames came damaged, "
+            f"{self.unsent:.1%} were not taken by the wire, the round trip is {self.round_trip_s * 1e3:.1f} ms"
+        )
+
+
+UNKNOWN_QUALITY: Final = LinkQuality()
+
+
+@final
+class Counts(Value):
+    """Counters that only grow: Drives, States that were news, frames received and damaged, messages not taken."""
+
+    __match_args__ = ("drives", "states", "frames", "damaged", "unsent")
+    __slots__ = __match_args__
+
+    def __init__(self, drives: int = 0, states: int = 0, frames: int = 0, damaged: int = 0, unsent: int = 0) -> None:
+        self.drives: Final = drives
+        self.states: Final = states
+        self.frames: Final = frames
+        self.damaged: Final = damaged
+        self.unsent: Final = unsent
+
+
+@final
+class LinkWatch:
+    """Makes the shares of one conversation. Asked whether it is time in every period, it looks ten times a second."""
+
+    __slots__ = ("_counts", "_due_s")
+
+    def __init__(self, now_s: float) -> None:
+        self._due_s = now_s + SETTLING_LOOKS * LOOKED_S
+        self._counts: deque[Counts] = deque(maxlen=LOOKS + 1)
+
+    def is_due(self, now_s: float) -> bool:
+        """Whether the counters are to be looked at."""
+        return now_s >= self._due_s
+
+    def look(self, now_s: float, counts: Counts, round_trip_s: float, clock_drift: float) -> LinkQuality:
+        """The quality now."""
+        self._due_s = now_s + LOOKED_S
+        self._counts.append(counts)
+        before = self._counts[0]
+        return LinkQuality(
+            1.0 - _share(counts.states - before.states, counts.drives - before.drives, of_none=1.0),
+            _share(
+                counts.damaged - before.damaged,
+                counts.frames + counts.damaged - before.frames - before.damaged,
+            ),
+            _share(counts.unsent - before.unsent, counts.drives - before.drives),
+            round_trip_s,
+            clock_drift,
+        )
+
+
+def _share(part: int, whole: int, of_none: float = 0.0) -> float:
+    return min(part / whole, 1.0) if whole > 0 else of_none
