@@ -238,9 +238,7 @@ class TelemetryLoop:
             rates={group.name: group.report for group in self._groups},
             late_ticks_by=dict(self._callbacks.blamed),
             fault_details=self._causes.of_faults(safety.faults),
-            limit_details=self._causes.of_limits(
-                newest.limits, outside, inbox.told(now_s), self._control.measurement
-            ),
+            limit_details=self._causes.of_limits(newest.limits, outside, inbox.told(now_s), self._control.measurement),
             newest_stall=self._causes.newest_stall(),
             not_granted=self._not_granted,
             way=self._way.report(None if link.round_trip_us is None else link.round_trip_us.p50),
