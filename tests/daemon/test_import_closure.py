@@ -17,6 +17,7 @@ ROOMS = {
     "daemon",
     "hardware",
     "inverse",
+    "keys",
     "messages",
     "model",
     "output",

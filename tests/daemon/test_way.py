@@ -21,7 +21,7 @@ def resting() -> PlanState:
 
 @pytest.fixture
 def estimate() -> Estimate:
-    return Estimate(1, True, 0.0, 35.0, 35.0, 0.0, 0.0, 1.0, Handle(0.0, 0.0, Turn(1.0, 0.0, 0.0)), 0.0)
+    return Estimate(1, True, 0.0, 35.0, 35.0, 0.0, 0.0, 1.0, Handle(0.0, 0.0, Turn(1.0, 0.0, 0.0)), 0.0, 0.0, 0.0)
 
 
 def planned(resting: PlanState, stamp_s: float, gap_mm: float = 70.0) -> PlanState:
