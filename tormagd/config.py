@@ -168,7 +168,7 @@ class Position(Strict, frozen=True):
 class Trim(Strict, frozen=True):
     """What the force sensor may correct of the force model: a device's scale within bounds, its offset at a speed."""
 
-    time_s: Annotated[float, Meta(ge=0.05, le=1_000.0)] = 0.12
+    time_s: Annotated[float, Meta(ge=0.05, le=1_000.0)] = 0.5
     "In which the force's offset is learned anew in the long run; a new device shows itself sooner."
     least: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.6
     most: Annotated[float, Meta(ge=1.0, le=5.0)] = 1.6

@@ -1,0 +1,65 @@
+"""What a device shows of itself is learned while a step arrives, and noise alone moves nothing (synthetic)."""
+
+import numpy as np
+import pytest
+
+from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.config import Config
+from tormagd.control.core import Core, build_core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import load_plant
+
+CONFIG = Config(scene="coronary")
+VALID_S = 0.2
+SAMPLES = ("sample_1", "sample_2", "sample_3")
+
+
+@pytest.fixture(scope="module")
+def core() -> Core:
+    return build_core(CONFIG)
+
+
+def armed(core: Core, sample: str) -> ClosedLoop:
+    loop = ClosedLoop(CONFIG, core.stepper, core.planner, VirtualDevice(load_plant(sample), SteadyHand(), seed=1))
+    loop.arm()
+    return loop
+
+
+def render(loop: ClosedLoop, asked_N: float, seconds: float) -> list[Sample]:
+    return list(loop.run(seconds, lambda now_s: TimedSetpoint(asked_N, now_s, VALID_S)))
+
+
+@pytest.mark.parametrize("sample", SAMPLES)
+def test_a_step_of_a_new_device_settles_soon_after_its_carriages_have(core: Core, sample: str) -> None:
+    loop = armed(core, sample)
+    render(loop, 0.7, 2.0)
+    for overshoots_N, settles_N in ((0.1, 0.02), (0.08, 0.02)):
+        forces_N = [abs(each.truth.force_N) for each in render(loop, 2.0, 3.0)]
+        assert max(forces_N) < 2.0 + overshoots_N
+        assert np.mean(forces_N[1_500:1_600]) == pytest.approx(2.0, abs=settles_N)
+        render(loop, 0.7, 2.0)
+
+
+@pytest.mark.parametrize("sample", SAMPLES)
+def test_noise_alone_hardly_moves_the_gap(core: Core, sample: str) -> None:
+    loop = armed(core, sample)
+    render(loop, 1.2, 5.0)
+    gaps_mm = np.array([each.plan.gap_mm for each in render(loop, 1.2, 3.0)])
+    assert np.std(gaps_mm - np.linspace(gaps_mm[0], gaps_mm[-1], len(gaps_mm))) < 0.1
+
+
+def test_a_device_that_was_known_before_is_right_at_once(core: Core) -> None:
+    """What a profile brings: sample 2 is a quarter weaker than the model."""
+    loop = armed(core, "sample_2")
+    render(loop, 0.7, 1.0)
+    render(loop, 2.0, 2.0)
+    assert loop.plan_state is not None
+    shown = loop.plan_state.shown
+    again = armed(core, "sample_2")
+    assert again.plan_state is not None
+    again.plan_state = again.plan_state.replaced(shown=shown.replaced(read=-1, read_s=-1.0))
+    forces_N = [abs(each.truth.force_N) for each in render(again, 2.0, 2.5)]
+    assert max(forces_N) < 2.0 + 0.06
+    assert np.mean(forces_N[1_200:1_300]) == pytest.approx(2.0, abs=0.03)
