@@ -62,4 +62,4 @@ def test_a_device_that_was_known_before_is_right_at_once(core: Core) -> None:
     again.plan_state = again.plan_state.replaced(shown=shown.replaced(read=-1, read_s=-1.0))
     forces_N = [abs(each.truth.force_N) for each in render(again, 2.0, 2.5)]
     assert max(forces_N) < 2.0 + 0.06
-    assert np.mean(forces_N[1_200:1_300]) == pytest.approx(2.0, abs=0.03)
+    assert np.mean(forces_N[1_200:1_300]) == pytest.approx(2.0, abs=0.04)

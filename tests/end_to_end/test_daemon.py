@@ -126,6 +126,20 @@ def test_sigterm_opens_the_gap_and_exits_in_order(new_rig):
     assert not (new_rig.folder / "setpoint").exists()
 
 
+def test_a_device_that_has_shown_itself_is_known_the_next_time(new_rig):
+    assert not new_rig.status()["profile"]["is_used"]
+    new_rig.arm()
+    new_rig.ask(1.6)
+    new_rig.until(lambda: abs((new_rig.telemetry().measured_cf or 0.0) - 1.6) < 0.05, "1.6 N")
+    assert new_rig.end(new_rig.daemon, signal.SIGTERM) == 0
+    assert len(list((new_rig.folder / "profiles").iterdir())) == 1
+    new_rig.start_daemon()
+    new_rig.until(lambda: new_rig.status()["profile"]["is_used"], "the profile is used")
+    again = new_rig.status()
+    assert again["device"]["scale_sd"] < 0.1
+    assert again["profile"]["age_s"] < 3600.0
+
+
 def test_stop_opens_and_latches(rig):
     rig.arm()
     rig.ask(1.5)

@@ -50,6 +50,7 @@ def status_text(known: Status, colour: Colour) -> str:
         *(line for name, source in known.setpoints.by_source.items() for line in _source(name, source, colour)),
         *_way(known.way, colour),
         *_peers(known.peers, colour),
+        _device(known),
         f"link      {known.link.state}, {_counts(known.link, LINK_COUNTS)}",
         *_explained(known.link.cause, known.link.remedy, colour.yellow),
         *(_rate(name, group, colour) for name, group in known.rates.items()),
@@ -74,6 +75,16 @@ def _peers(peers: PeersReport, colour: Colour) -> list[str]:
 
 def _peer(peer: PeerReport) -> str:
     return f"{peer.endpoint}: {peer.address}{f', key {peer.key}' if peer.key else ''}: {peer.reason} ({peer.count})"
+
+
+def _device(known: Status) -> str:
+    """What the device has shown of itself, and since when it is known."""
+    shown, kept = known.device, known.profile
+    age = "" if kept.age_s is None else f", kept {kept.age_s / 3600.0:.1f} h ago"
+    return (
+        f"device    {shown.scale:.2f} ± {shown.scale_sd:.2f} times the model {shown.offset_N:+.3f} N, sensor's zero "
+        f"{shown.sensor_zero_N:+.3f} ± {shown.sensor_zero_sd_N:.3f} N{age}"
+    )
 
 
 def _core(build: str, colour: Colour) -> list[str]:
