@@ -333,6 +333,24 @@ def test_a_second_host_homes_a_device_that_the_first_one_homed() -> None:
             device.transmit(ticks * 1e-3)
 
 
+def test_a_device_that_has_homed_is_homed_from_the_first_position_in_its_new_origin() -> None:
+    """The Status that says so comes between two States; with the last one's position a carriage were out of stroke."""
+    link = DeviceLink(0.0)
+    homing = status(mode=DeviceMode.HOMING, switches=Switches(0))
+    for message in (US, homing, Sense(0.0, 0.0, 0.0, 0.0), State(7.5, 8.5, 0.0, 0)):
+        link.receive(0.0, message)
+    open_switches = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
+    link.receive(0.001, status(switches=open_switches | Switches.HOMED))
+    before = link.measurement
+    assert before is not None
+    assert (before.is_homed, before.is_busy, before.left_mm) == (False, True, 7.5)
+    link.receive(0.001, State(0.1, 0.2, 0.001, 1))
+    after = link.measurement
+    assert after is not None
+    assert (after.is_homed, after.is_busy) == (True, False)
+    assert (after.left_mm, after.right_mm) == (pytest.approx(0.1), pytest.approx(0.2))
+
+
 # -- what it measured ----------------------------------------------------------------------------------------------
 
 

@@ -23,6 +23,7 @@ from firmware_protocol.codec import (
     Sense,
     State,
     Status,
+    Switches,
     period,
 )
 from tormagd.hardware.link_quality import UNKNOWN_QUALITY, Counts, LinkQuality, LinkWatch
@@ -50,6 +51,7 @@ POSITION_SPAN_MM = period(State, "left_position_mm")
 DEVICE_TIME_SPAN_S = period(State, "device_time_s")
 HANDLE_SPAN_MM = period(Sense, "handle_position_mm")
 
+_HOMED: Final = int(Switches.HOMED)
 _COMMANDS: dict[DeviceRequest, type[Home] | type[Retract] | type[Clear]] = {
     DeviceRequest.HOME: Home,
     DeviceRequest.RETRACT: Retract,
@@ -84,7 +86,7 @@ class DeviceLink:
         "_acknowledged", "_asked_s", "_broken", "_counter", "_delay_s", "_device_time_s", "_drives", "_handle_mm",
         "_heard_s", "_hello_due_s", "_is_measured", "_least_delay_s", "_left_mm", "_measurement", "_nonce",
         "_number", "_quality_watch", "_received_s", "_reported_s", "_request", "_request_due_s", "_requested_s",
-        "_right_mm", "_sense", "_sensed_s", "_state", "_states", "_status", "cause", "clock", "identity",
+        "_right_mm", "_sense", "_sensed_s", "_state", "_states", "_status", "_told", "cause", "clock", "identity",
         "quality", "repeated", "round_trip", "state",
     )  # fmt: skip
 
@@ -115,6 +117,7 @@ class DeviceLink:
         self._state: State | None = None
         self._sense: Sense | None = None
         self._status: Status | None = None
+        self._told: Status | None = None
         self._is_measured = False
         self._measurement: Measurement | None = None
         """Made of the following when it is asked for: State and Sense change them one after the other."""
@@ -210,9 +213,7 @@ class DeviceLink:
         return ", ".join(lacking) or "no State after the first Sense and Status yet"
 
     def judge(self, now_s: float, frames: int, damaged: int, unsent: int) -> None:
-        """Makes the link's quality anew, where it is time to. The backend's counters only grow."""
-        if not self._quality_watch.is_due(now_s):
-            return
+        """Makes the link's quality anew; to be asked for where `is_judging`. The backend's counters only grow."""
         counts = Counts(self._drives, self._states, frames, damaged, unsent)
         self.quality = self._quality_watch.look(now_s, counts, self.round_trip.usual_s, self.clock.drift)
         self._measurement = None
@@ -262,7 +263,11 @@ class DeviceLink:
             self._nonce = _next_nonce(status.command_nonce)
         elif self._status.command_nonce != 0 and status.command_nonce == 0:
             self._broken = "the device was reset"
+        # a device that has just homed has a new origin: the position that is known here is from before
+        has_new_origin = self._status is not None and _is_homed(status) and not _is_homed(self._status)
         self._status = status
+        if not has_new_origin:
+            self._told = status
         self._reported_s = now_s
         self.round_trip.status(status.drive_counter)
         if status.command_nonce == self._nonce:
@@ -294,7 +299,7 @@ class DeviceLink:
         if previous is not None and (previous.counter - state.counter) % 256 < OVERTAKEN:
             self.repeated += 1
             return
-        self._state = state
+        self._state, self._told = state, self._status
         self._states += 1
         self.round_trip.state(state.counter, now_s)
         if previous is None or not self._is_measured:
@@ -321,7 +326,7 @@ class DeviceLink:
         self._right_mm = state.right_position_mm
 
     def _measured(self) -> Measurement:
-        sense, status = self._sense, self._status
+        sense, status = self._sense, self._told
         assert sense is not None, "measuring begins with a Sense"
         assert status is not None, "measuring begins with a Status"
         return Measurement(
@@ -344,6 +349,10 @@ class DeviceLink:
             self._least_delay_s,
             self.quality,
         )
+
+
+def _is_homed(status: Status) -> bool:
+    return int(status.switches) & _HOMED != 0
 
 
 def _next_nonce(nonce: int) -> int:
