@@ -2,6 +2,7 @@
 
 import random
 from collections.abc import Callable
+from typing import Generic, TypeVar
 
 from tormagd.simulation.can_device import CanDevice, Delivery
 from tormagd.simulation.can_frame import CanFrame
@@ -90,13 +91,15 @@ class Delaying(Way):
 MakeWay = Callable[[], Way]
 
 
-class BadSerialLine:
-    """A serial line in front of a device that may go bad, in both directions."""
+DeviceT = TypeVar("DeviceT", bound=SerialDevice | CanDevice)
 
-    def __init__(self, device: SerialDevice) -> None:
+
+class _Spoilt(Generic[DeviceT]):
+    """A device behind a wire that is in order until it is spoilt."""
+
+    def __init__(self, device: DeviceT) -> None:
         self._device = device
         self._up, self._down = Way(), Way()
-        self._unfinished = b""
 
     @property
     def messages(self) -> MessageDevice:
@@ -109,6 +112,14 @@ class BadSerialLine:
     def spoil(self, way: MakeWay) -> None:
         """From now on."""
         self._up, self._down = way(), way()
+
+
+class BadSerialLine(_Spoilt[SerialDevice]):
+    """A serial line in front of a device that may go bad, in both directions."""
+
+    def __init__(self, device: SerialDevice) -> None:
+        super().__init__(device)
+        self._unfinished = b""
 
     def receive(self, now_s: float, data: bytes) -> None:
         for unit in self._down.carry(now_s, [data]):
@@ -121,26 +132,13 @@ class BadSerialLine:
         return b"".join(self._up.carry(now_s, [unit + DELIMITER for unit in units]))
 
 
-class BadBus:
+class BadBus(_Spoilt[CanDevice]):
     """The same on a bus, above its own CRC: in an adapter, or in a driver. Another node may fill it too."""
 
     def __init__(self, device: CanDevice) -> None:
-        self._device = device
-        self._up, self._down = Way(), Way()
+        super().__init__(device)
         self._foreign_frames_ms = 0.0
         self._owed = 0.0
-
-    @property
-    def messages(self) -> MessageDevice:
-        return self._device.messages
-
-    @property
-    def truth(self) -> Truth:
-        return self._device.truth
-
-    def spoil(self, way: MakeWay) -> None:
-        """From now on."""
-        self._up, self._down = way(), way()
 
     def fill(self, frames_ms: float) -> None:
         """Another node sends so many frames a millisecond from now on, and wins every arbitration."""

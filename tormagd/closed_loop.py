@@ -48,49 +48,19 @@ class Sample(NamedTuple):
     truth: Truth
 
 
-class VirtualPort:
-    """A backend whose far end is the simulated device; also the clock, and the event loop, which never calls back.
+class VirtualWire:
+    """What every virtual wire is besides: the clock, and the event loop, which never calls back."""
 
-    `device` may be changed for one that behaves as badly as a test wants.
-    """
-
-    def __init__(self, device: SerialDevice) -> None:
-        self.device = device
+    def __init__(self) -> None:
         self.now_s = 0.0
-        self._stream = FrameStream()
-        self._unread = b""
-
-    def open(self) -> Self:
-        """The same port again, with a line that has carried nothing yet."""
-        self._stream, self._unread = FrameStream(), b""
-        return self
 
     def clock(self) -> float:
         """Virtual time, s."""
         return self.now_s
 
-    def advance(self, now_s: float) -> None:
-        """Lets time pass; what the device sends waits for its reader, as much of it as a port keeps."""
-        self.now_s = now_s
-        self._unread = self._unread[-MAX_UNREAD_BYTES:] + self.device.transmit(now_s)
-
-    @property
-    def statistics(self) -> LinkStatistics:
-        """Counters since the port was opened."""
-        return self._stream.statistics
-
     def fileno(self) -> int:
         """None: nothing waits in virtual time."""
         return -1
-
-    def receive(self) -> list[Message]:
-        """All valid messages that have arrived."""
-        arrived, self._unread = self._unread, b""
-        return self._stream.unpack(arrived)
-
-    def send(self, message: Message) -> None:
-        """Hands one message to the device's line."""
-        self.device.receive(self.now_s, self._stream.pack(message))
 
     def close(self) -> None:
         """There is nothing to give back."""
@@ -102,12 +72,49 @@ class VirtualPort:
         """Nothing was noted."""
 
 
-class VirtualBus:
+class VirtualPort(VirtualWire):
+    """A backend whose far end is the simulated device.
+
+    `device` may be changed for one that behaves as badly as a test wants.
+    """
+
+    def __init__(self, device: SerialDevice) -> None:
+        super().__init__()
+        self.device = device
+        self._stream = FrameStream()
+        self._unread = b""
+
+    def open(self) -> Self:
+        """The same port again, with a line that has carried nothing yet."""
+        self._stream, self._unread = FrameStream(), b""
+        return self
+
+    def advance(self, now_s: float) -> None:
+        """Lets time pass; what the device sends waits for its reader, as much of it as a port keeps."""
+        self.now_s = now_s
+        self._unread = self._unread[-MAX_UNREAD_BYTES:] + self.device.transmit(now_s)
+
+    @property
+    def statistics(self) -> LinkStatistics:
+        """Counters since the port was opened."""
+        return self._stream.statistics
+
+    def receive(self) -> list[Message]:
+        """All valid messages that have arrived."""
+        arrived, self._unread = self._unread, b""
+        return self._stream.unpack(arrived)
+
+    def send(self, message: Message) -> None:
+        """Hands one message to the device's line."""
+        self.device.receive(self.now_s, self._stream.pack(message))
+
+
+class VirtualBus(VirtualWire):
     """The same with a device on a CAN bus, through the backend's own codec of frames."""
 
     def __init__(self, device: CanLine) -> None:
+        super().__init__()
         self.device = device
-        self.now_s = 0.0
         self._stream = CanStream(DEFAULT_NODE)
         self._unread: list[CanFrame] = []
 
@@ -116,10 +123,6 @@ class VirtualBus:
         self._stream = CanStream(DEFAULT_NODE)
         self._unread.clear()
         return self
-
-    def clock(self) -> float:
-        """Virtual time, s."""
-        return self.now_s
 
     def advance(self, now_s: float) -> None:
         """Lets time pass; what goes by waits for its reader, as much of it as a socket keeps."""
@@ -131,10 +134,6 @@ class VirtualBus:
     def statistics(self) -> LinkStatistics:
         """Counters since the bus was opened."""
         return self._stream.statistics
-
-    def fileno(self) -> int:
-        """None: nothing waits in virtual time."""
-        return -1
 
     def receive(self) -> list[Message]:
         """All valid messages of the device that have arrived."""
@@ -150,15 +149,6 @@ class VirtualBus:
         """Hands one frame to the bus."""
         identifier, data = self._stream.pack(message)
         self.device.receive(self.now_s, CanFrame(identifier, data))
-
-    def close(self) -> None:
-        """There is nothing to give back."""
-
-    def add_reader(self, fd: int, callback: Callable[[], None]) -> None:
-        """Takes no note of it: the closed loop reads in every tick."""
-
-    def remove_reader(self, fd: int) -> None:
-        """Nothing was noted."""
 
 
 class ClosedLoop:

@@ -52,6 +52,16 @@ class DeviceFit(Value):
         self.covariance_N: Final = covariance_N
         self.offset_variance_N2: Final = offset_variance_N2
 
+    @property
+    def scale_sd(self) -> float:
+        """Standard deviation of the scale."""
+        return math.sqrt(max(self.scale_variance, 0.0))
+
+    @property
+    def offset_sd_N(self) -> float:
+        """Standard deviation of the offset."""
+        return math.sqrt(max(self.offset_variance_N2, 0.0))
+
     def force_N(self, model_N: float) -> float:
         """What the device gives where the model says `model_N`."""
         return self.scale * model_N + self.offset_N

@@ -215,17 +215,7 @@ class Governor:
         periodicity = foreseen(state.periodicity, state.slope_N_s)
         if periodicity is state.periodicity:
             return state
-        return GovernorState(
-            state.time_s,
-            state.asked_N,
-            state.stamp_s,
-            state.slope_N_s,
-            state.last_N,
-            periodicity,
-            state.holder,
-            state.is_passing,
-            state.above_N,
-        )
+        return state.replaced(periodicity=periodicity)
 
     def _ramp(
         self,

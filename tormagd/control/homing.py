@@ -131,19 +131,7 @@ def _ended(homing: Homing, now_s: float, measurement: Measurement) -> Homing:
             faults = (Fault.HOMING,)
     elif measurement.is_latched and max(homing.went_back_mm) > WENT_BACK_MM:
         faults = (Fault.WRONG_DIRECTION,)
-    return Homing(
-        homing.began_s,
-        now_s,
-        homing.left_mm,
-        homing.right_mm,
-        homing.left_at_mm,
-        homing.right_at_mm,
-        switches,
-        homing.most_N,
-        homing.over_s,
-        True,
-        faults,
-    )
+    return homing.replaced(time_s=now_s, switches=switches, has_ended=True, faults=faults)
 
 
 def _open_switches(measurement: Measurement) -> int:

@@ -302,7 +302,7 @@ class Planner:
         governor = self._governor.foresee(state.governor)
         if governor is state.governor:
             return state
-        return PlanState(governor, state.plan, state.shown, state.lag_s)
+        return state.replaced(governor=governor)
 
     def _motion(self, setpoint: TimedSetpoint | None, estimate: Estimate | None) -> tuple[float, float]:
         """The displacement, mm, and the rate, mm/s, that the force is planned for."""
@@ -364,7 +364,7 @@ class Planner:
             rate_mm_s,
             elapsed_s,
             shown.device.scale,
-            math.sqrt(max(shown.device.scale_variance, 0.0)),
+            shown.device.scale_sd,
         )
         limits: tuple[Limit, ...] = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
         if sensor.is_doubted:

@@ -65,7 +65,7 @@ def profile_of(shown: Shown, *, serial_number: int, insert: str, model: str, sav
         model=model,
         saved_ns=saved_ns,
         scale=shown.device.scale,
-        scale_sd=min(math.sqrt(max(shown.device.scale_variance, 0.0)), SCALE_SD),
+        scale_sd=min(shown.device.scale_sd, SCALE_SD),
         offset_N=shown.device.offset_N,
         slow_factor=shown.slow.factor,
         slow_learned=shown.slow.learned,

@@ -90,7 +90,7 @@ class SensorZero(Value):
 
     def doubted(self) -> "SensorZero":
         """The same of a sensor that is not believed to have been tared."""
-        return SensorZero(self.zero_N, MOST_SD_N * MOST_SD_N, self.told_s, self.direction, self.level, self.before)
+        return self.replaced(variance_N2=MOST_SD_N * MOST_SD_N)
 
     def heard(
         self,

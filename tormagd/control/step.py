@@ -468,7 +468,9 @@ class Stepper:
         if leap is not None:
             if measurement.reported_s > leap.seen_s:  # so it was not reset in between
                 faults.append(Fault.ENCODER)
-        elif estimate.is_homed and not state.safety.needs_homing and self._is_outside(estimate):
+        elif (
+            estimate.is_homed and not state.safety.needs_homing and is_outside(estimate, self._closed_mm, self._open_mm)
+        ):
             faults.append(Fault.OUT_OF_STROKE)
         if state.safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             return tuple(faults)
@@ -504,9 +506,6 @@ class Stepper:
         if measurement.mode is not DeviceMode.RUN and not faults and now_s - state.enabled_s > STARTING_S:
             faults.append(Fault.DEVICE_NOT_RUNNING)
         return tuple(faults)
-
-    def _is_outside(self, estimate: Estimate) -> bool:
-        return is_outside(estimate, self._closed_mm, self._open_mm)
 
     def _is_over(self, estimate: Estimate) -> bool:
         return estimate.force_N > self._ceiling_N and abs(estimate.handle.rate_mm_s) > STILL_MM_S

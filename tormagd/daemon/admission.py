@@ -154,10 +154,14 @@ class Admission:
             endpoint.disable_monitor()
         os.close(self._wake)
 
+    def roles(self, public: str) -> frozenset[str]:
+        """What a key may do now."""
+        listed = self.allowed.get(public)
+        return listed.roles if listed else frozenset()
+
     def has_role(self, public: str, roles: frozenset[str]) -> bool:
         """Whether the key is listed for one of these now: one that was let in may have been taken off the list."""
-        listed = self.allowed.get(public)
-        return listed is not None and not roles.isdisjoint(listed.roles)
+        return not roles.isdisjoint(self.roles(public))
 
     def name(self, public: str) -> str:
         """A key as people know it: its fingerprint, and the name of its file."""
@@ -320,11 +324,6 @@ class Admission:
             for known in self._endpoints.values():
                 if known.is_guarded and known.name in ("telemetry", "recording"):
                     self._cut_all(known)
-
-    def roles(self, public: str) -> frozenset[str]:
-        """What a key may do now."""
-        listed = self.allowed.get(public)
-        return listed.roles if listed else frozenset()
 
     def _cut_all(self, known: _Connections) -> None:
         for descriptor, address in known.addresses.items():

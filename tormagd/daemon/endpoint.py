@@ -274,7 +274,7 @@ class Endpoint:
             return False
         if request.command not in FIRST:
             return False
-        reply = self._answered(waiting, answer)
+        reply = self._carried_out(request, waiting, answer)
         if reply.ok:
             self._requests.opens += 1
         self._reply(waiting, reply)
@@ -286,6 +286,9 @@ class Endpoint:
         except MessageError as error:
             refused = ErrorReply("bad_request", str(error), "see the message table in the README")
             return Reply(v=VERSION, id=None, ok=False, error=refused)
+        return self._carried_out(request, waiting, answer)
+
+    def _carried_out(self, request: Request, waiting: Waiting, answer: Callable[[Request], dict[str, Any]]) -> Reply:
         try:
             self._require_permitted(request, waiting)
             return Reply(v=VERSION, id=request.id, ok=True, result=answer(request))

@@ -10,7 +10,7 @@ from collections import deque
 
 from tormagd.control.governor import TimedSetpoint
 from tormagd.daemon.hold import Hold, is_passed
-from tormagd.daemon.rate_group import HORIZON_NS, Histogram
+from tormagd.daemon.rate_group import RecentHistogram
 from tormagd.daemon.sequence import Order, Sequence
 from tormagd.daemon.source_clock import AHEAD_S, SourceClock
 from tormagd.hardware.link_statistics import WINDOW_S, ClockFit
@@ -34,7 +34,6 @@ NEWS, NEWS_S = 4, 1.0
 "Lines for the log that wait, and how long each waits after the one before."
 STEP_NAMED_S = 60.0
 "A clock that was set is named for so long."
-HORIZON_S = HORIZON_NS * 1e-9
 
 
 class _Source:
@@ -54,15 +53,14 @@ class _Source:
         "setpoint",
         "stamp_s",
         "summary",
-        "turned_s",
     )
 
     def __init__(self, setpoint: Setpoint, now_s: float) -> None:
-        self.setpoint, self.heard_s, self.turned_s = setpoint, now_s, now_s
+        self.setpoint, self.heard_s = setpoint, now_s
         self.stamp_s = -math.inf  # nothing of it has been taken yet
         self.sequence = Sequence(setpoint.session, setpoint.seq)
         self.clock = SourceClock()
-        self.delays = Histogram()
+        self.delays = RecentHistogram()
         self.accepted = self.refused = 0
         self.is_named = False
         self.refresh(now_s)
@@ -78,11 +76,8 @@ class _Source:
         return now_s - self.stamp_s > self.setpoint.valid_for_ms * 1e-3
 
     def keep(self, setpoint: Setpoint, now_s: float, delay_s: float) -> None:
-        if now_s - self.turned_s > HORIZON_S:
-            self.delays.turn()
-            self.turned_s = now_s
         if self.clock.is_settled:
-            self.delays.add(delay_s * 1e6)
+            self.delays.add(now_s, delay_s * 1e6)
         # the worse of arrival and corrected stamp: a stamp of the time to come is of now
         self.setpoint, self.heard_s, self.stamp_s = setpoint, now_s, now_s - max(delay_s, 0.0)
 

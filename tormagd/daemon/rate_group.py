@@ -1,5 +1,6 @@
 """How well one rate group keeps its time: rate, lateness, execution, overruns, merged ticks."""
 
+import math
 from enum import StrEnum
 from typing import Final, NamedTuple, final
 
@@ -53,6 +54,26 @@ class Histogram:
             while waiting and seen >= waiting[0][1] * total:
                 found[waiting.pop(0)[0]] = min(float(_upper_edge(index)), round(most, 1))
         return ExecReport(**found, max=round(most, 1))
+
+
+@final
+class RecentHistogram:
+    """A histogram of the time since one to two horizons ago."""
+
+    def __init__(self) -> None:
+        self._histogram = Histogram()
+        self._turned_s = -math.inf
+
+    def add(self, now_s: float, value_us: float) -> None:
+        """Counts one duration, at `now_s`."""
+        if now_s - self._turned_s > HORIZON_NS * 1e-9:
+            self._histogram.turn()
+            self._turned_s = now_s
+        self._histogram.add(value_us)
+
+    def summary(self) -> ExecReport:
+        """See `Histogram.summary`."""
+        return self._histogram.summary()
 
 
 def _bin(value_us: float) -> int:

@@ -1,7 +1,6 @@
 """The telemetry loop: at 50 Hz publish the snapshot and the ticks, answer commands and `status`, feed the watchdog."""
 
 import logging
-import math
 import time
 from typing import Any
 
@@ -224,9 +223,9 @@ class TelemetryLoop:
             trim=round(planned.trim, 4),
             device=DeviceReport(
                 scale=round(shown.scale, 4),
-                scale_sd=round(math.sqrt(max(shown.scale_variance, 0.0)), 4),
+                scale_sd=round(shown.scale_sd, 4),
                 offset_N=round(shown.offset_N, 4),
-                offset_sd_N=round(math.sqrt(max(shown.offset_variance_N2, 0.0)), 4),
+                offset_sd_N=round(shown.offset_sd_N, 4),
                 sensor_zero_N=round(planned.shown.zero.zero_N, 4),
                 sensor_zero_sd_N=round(planned.shown.zero.sd_N(time.monotonic()), 4),
             ),

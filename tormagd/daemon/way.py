@@ -9,7 +9,7 @@ import math
 
 from tormagd.control.plan import PlanState
 from tormagd.control.step import StepState
-from tormagd.daemon.rate_group import HORIZON_NS, Histogram
+from tormagd.daemon.rate_group import RecentHistogram
 from tormagd.messages import ExecReport, WayReport
 
 BUDGET_MS = 400.0
@@ -20,15 +20,13 @@ LEAST_MOVED_MM2_S = 5.0
 "Of less movement, speed squared over time, no delay is told: 5 mm/s for 0.2 s."
 MOST_BEHIND_MM = 1.0
 "A gap that is further behind is on its way after a jump."
-HORIZON_S = HORIZON_NS * 1e-9
 
 
 class Way:
     """Takes every control tick; remembers a bounded number of figures."""
 
     def __init__(self) -> None:
-        self._to_duty = Histogram()
-        self._turned_s = -math.inf
+        self._to_duty = RecentHistogram()
         self._stamp_s = -math.inf
         self._tick_s = -math.inf
         self._behind = self._moved = 0.0
@@ -40,10 +38,7 @@ class Way:
         if stamp_s != self._stamp_s:
             self._stamp_s = stamp_s
             if stamp_s > -math.inf:  # a duty that follows no setpoint ends no way
-                if now_s - self._turned_s > HORIZON_S:
-                    self._to_duty.turn()
-                    self._turned_s = now_s
-                self._to_duty.add((now_s - stamp_s) * 1e6)
+                self._to_duty.add(now_s, (now_s - stamp_s) * 1e6)
         elapsed_s, self._tick_s = now_s - self._tick_s, now_s
         reference, estimate = state.reference, state.estimate
         if reference is None or estimate is None or not 0.0 < elapsed_s < MEMORY_S:
