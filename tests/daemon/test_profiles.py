@@ -66,6 +66,44 @@ def test_what_is_learned_while_driven_is_there_after_a_restart(tmp_path: Path) -
     run(scene)
 
 
+def test_a_profile_that_nothing_was_added_to_does_not_get_younger(tmp_path: Path) -> None:
+    keep(tmp_path, 7)
+    path = tmp_path / "00000007-MRE-50-40.json"
+    before = path.read_bytes()
+
+    async def scene() -> None:
+        rig = Rig(tmp_path)
+        rig.profiles.look(7, is_driven=False)
+        await rig.settled()
+        for is_driven in (True, False):
+            rig.profiles.look(7, is_driven=is_driven)
+        await rig.settled()
+        assert path.read_bytes() == before
+        rig.profiles.look(7, is_driven=True)
+        rig.shown = rig.shown.replaced(device=DeviceFit(1.31, 0.02, 1e-4, 0.0, 1e-4))
+        rig.profiles.look(7, is_driven=False)
+        await rig.settled()
+        assert b"1.31" in path.read_bytes()
+
+    run(scene)
+
+
+def test_a_refusal_is_over_when_a_profile_has_been_kept(tmp_path: Path) -> None:
+    (tmp_path / "00000007-MRE-50-40.json").write_bytes(b"nothing")
+
+    async def scene() -> None:
+        rig = Rig(tmp_path)
+        rig.profiles.look(7, is_driven=True)
+        await rig.settled()
+        assert "not a profile" in rig.profiles.report().refusal
+        rig.shown = STRONG
+        rig.profiles.look(7, is_driven=False)
+        await rig.settled()
+        assert rig.profiles.report().refusal == ""
+
+    run(scene)
+
+
 def test_another_device_is_not_taken_for_the_one_before(tmp_path: Path) -> None:
     keep(tmp_path, 7)
 

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import msgspec
 
-from tormagd.control.device_fit import UNSEEN
+from tormagd.control.device_fit import UNSEEN, DeviceFit
 from tormagd.control.plan import NOTHING_SHOWN, Shown
 from tormagd.control.profile import MAX_BYTES, Profile, ProfileError, profile_of, read_profile
+from tormagd.control.slow_friction import SlowFriction
 from tormagd.messages import ProfileReport
 
 log = logging.getLogger(__name__)
@@ -88,6 +89,7 @@ class Profiles:
         self._was_driven = False
         self._writing: asyncio.Future[None] | None = None
         self._saved_ns: int | None = None
+        self._on_disk: tuple[DeviceFit, SlowFriction, float] | None = None
         self._is_used = False
         self._refusal = "" if folder is not None else "no folder is named for profiles"
 
@@ -97,6 +99,7 @@ class Profiles:
             if self._serial_number is not None:
                 self._teach(NOTHING_SHOWN)  # that was another device
             self._serial_number, self._saved_ns, self._is_used = serial_number, None, False
+            self._on_disk = None
             if self._folder is not None:
                 self._refusal = ""
                 self._loop.run_in_executor(None, self._folder.read, serial_number).add_done_callback(self._take)
@@ -105,9 +108,13 @@ class Profiles:
         self._was_driven = is_driven
 
     def keep(self) -> None:
-        """Keeps what has been learned, where anything has been and the sensor is believed."""
+        """Keeps what has been learned, where anything has been and the sensor is believed.
+
+        A profile that nothing was added to stays as it is: it does not get younger by being used."""
         shown = self._learned()
         if self._folder is None or self._serial_number is None or shown.device is UNSEEN or shown.sensor.is_doubted:
+            return
+        if _kept(shown) == self._on_disk:
             return
         now_ns = time.time_ns()
         profile = profile_of(
@@ -117,7 +124,7 @@ class Profiles:
             model=self._folder.model,
             saved_ns=now_ns,
         )
-        self._saved_ns = now_ns
+        self._saved_ns, self._on_disk = now_ns, _kept(shown)
         self._writing = self._loop.run_in_executor(None, self._folder.write, profile)
         self._writing.add_done_callback(self._note)
 
@@ -144,8 +151,9 @@ class Profiles:
         if profile is None or profile.serial_number != self._serial_number or self._learned().device is not UNSEEN:
             return
         now_ns = time.time_ns()
-        self._teach(profile.shown(now_ns))
-        self._saved_ns, self._is_used = profile.saved_ns, True
+        shown = profile.shown(now_ns)
+        self._teach(shown)
+        self._saved_ns, self._on_disk, self._is_used = profile.saved_ns, _kept(shown), True
         hours = (now_ns - profile.saved_ns) / 3.6e12
         log.info("the device's profile of %.1f hours ago is used: scale %.3f", hours, profile.scale)
 
@@ -153,5 +161,12 @@ class Profiles:
         try:
             writing.result()
         except ProfileError as error:
-            self._refusal = str(error)
+            self._refusal, self._on_disk = str(error), None
             log.warning("%s", error)
+        else:
+            self._refusal = ""
+
+
+def _kept(shown: Shown) -> tuple[DeviceFit, SlowFriction, float]:
+    """What of it a profile holds."""
+    return shown.device, shown.slow, shown.zero.zero_N
