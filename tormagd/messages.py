@@ -268,11 +268,13 @@ class DeviceReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ProfileReport(msgspec.Struct, frozen=True, kw_only=True):
-    """What was kept of this device: whether it is in use, how old what is on the disk is, and why there is nothing."""
+    """What was kept of this device: whether it is in use, how old what is on the disk is, why there is nothing, and the
+    folder of the profiles, empty where none are kept."""
 
     is_used: bool
     age_s: float | None
     refusal: str
+    folder: str = ""
 
 
 class StallReport(msgspec.Struct, frozen=True):

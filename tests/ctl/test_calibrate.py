@@ -18,6 +18,7 @@ from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
 from tormagd.ctl import calibrate as ctl_calibrate
 from tormagd.ctl import calibrate_motors as ctl_calibrate_motors
+from tormagd.ctl import calibrate_run
 from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, up_and_down, write_sweeps
 from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS
 from tormagd.ctl.calibrate_motors import excitation, motor_log
@@ -207,7 +208,7 @@ def test_displacement_is_what_the_daemon_calls_it():
 
 def test_what_ctl_may_not_import_is_equal():
     assert calibration.COLUMNS == FILE_COLUMNS
-    assert ctl_calibrate.MOVING_MM_S == MOVING_MM_S
+    assert calibrate_run.MOVING_MM_S == MOVING_MM_S
 
 
 def test_a_sweep_file_that_is_none_says_why(tmp_path):
@@ -302,6 +303,9 @@ def test_the_log_file_has_the_columns_of_a_motor_log(fake_daemon, tmp_path, monk
     ("arguments", "told"),
     [
         (("--out", "m"), "--motors"),
+        (("--device", "--out", "m"), "--out"),
+        (("--device", "--motors", "--out", "m"), "--device"),
+        (("--motors",), "--out"),
         (("--insert", "A", "--motors", "--out", "m"), "--motors"),
         (("--motors", "--csv", "t", "--out", "m"), "--csv"),
         (("--insert", "A", "--out", "there"), "exists"),

@@ -58,7 +58,7 @@ V1: dict[type[msgspec.Struct], str] = {
     RateReport: "grade hz runs merged overruns stalls lateness_us exec_us",
     LatenessReport: "p50 p99 p999 max worst",
     ExecReport: "p50 p99 p999 max",
-    ProfileReport: "is_used age_s refusal",
+    ProfileReport: "is_used age_s refusal folder",
     DeviceReport: "scale scale_sd offset_N offset_sd_N sensor_zero_N sensor_zero_sd_N",
     Explained: "code cause remedy",
     StallReport: "ms culprit",

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -32,8 +31,6 @@ EVERY = 4
 "Every fourth tick is kept: neighbours say nearly the same."
 
 PACES = ("steadily, about 20 turns a minute", "slowly, about 10 turns a minute", "quickly, about 25 turns a minute")
-MOVING_MM_S = 5.0
-HANDLE_PATIENCE_S = 30.0
 FITTING = "tormagd.training.calibration"
 POLL_S = 0.2
 
@@ -78,22 +75,9 @@ def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> 
     waveform = up_and_down(forces, rates_N_s[number])
     label = f"sweep {number + 1} of {len(rates_N_s)}"
     print(f"{label}: turn the handle to and fro {PACES[number % len(PACES)]}", file=sys.stderr)
-    _wait_for_handle(run, forces.least_N)
+    run.wait_for_handle(forces.least_N)
     with seconds_bar(waveform.duration_s, label) as bar:
         return run.play(waveform, bar)
-
-
-def _wait_for_handle(run: Run, force_N: float) -> None:
-    rate = COLUMNS.index("handle_rate_mm_s")
-    until_s = time.monotonic() + HANDLE_PATIENCE_S
-    while not any(abs(row[rate]) >= MOVING_MM_S for row in run.exchange(force_N)):
-        if time.monotonic() > until_s:
-            raise CommandError(
-                Exit.REFUSED,
-                "handle_still",
-                f"the handle stood still for {HANDLE_PATIENCE_S:g} s",
-                "turn it to and fro, at 5 mm/s or more at the roller, while the sweep runs",
-            )
 
 
 def up_and_down(forces: Range, rate_N_s: float) -> Waveform:

@@ -32,6 +32,8 @@ SILENT_S = 1.0
 RECENT_SETPOINT_MS = 1_000.0
 QUEUE = 10_000
 HOMING_S = 30.0
+MOVING_MM_S = 5.0
+HANDLE_PATIENCE_S = 30.0
 
 
 class InterruptedRunError(CommandError):
@@ -117,6 +119,20 @@ class Run:
         if time.monotonic() - self._heard_s > SILENT_S:
             raise unreachable(self._endpoints.recording, f"no control ticks for {SILENT_S:g} s")
         return rows
+
+    def wait_for_handle(self, force_N: float) -> None:
+        """Publish one force until the handle moves. Needs the column `handle_rate_mm_s`. Raises as `play`, and REFUSED
+        where it stands still for HANDLE_PATIENCE_S."""
+        rate = self._columns.index("handle_rate_mm_s")
+        until_s = time.monotonic() + HANDLE_PATIENCE_S
+        while not any(abs(row[rate]) >= MOVING_MM_S for row in self.exchange(force_N)):
+            if time.monotonic() > until_s:
+                raise CommandError(
+                    Exit.REFUSED,
+                    "handle_still",
+                    f"the handle stood still for {HANDLE_PATIENCE_S:g} s",
+                    f"turn it to and fro, at {MOVING_MM_S:g} mm/s or more at the roller, while it runs",
+                )
 
     def _rows(self, data: bytes) -> list[list[float]]:
         try:

@@ -157,14 +157,21 @@ def _doctor(options: argparse.Namespace, config: Config) -> Outcome:
 
 def _calibrate(options: argparse.Namespace, config: Config, endpoints: Endpoints) -> Outcome:
     from tormagd.ctl.calibrate import calibrate, require_new
+    from tormagd.ctl.calibrate_device import calibrate_device
     from tormagd.ctl.calibrate_motors import calibrate_motors
     from tormagd.scenes.scene import load_scene
 
-    if options.motors == (options.insert is not None):
-        raise usage_error("give either --insert NAME or --motors", "tormagctl calibrate --help shows both")
-    if options.motors and options.csv is not None:
+    if [options.insert is not None, options.motors, options.device].count(True) != 1:
+        raise usage_error("give one of --insert NAME, --motors and --device", "tormagctl calibrate --help shows them")
+    if options.insert is None and options.csv is not None:
         raise usage_error("--csv is the training data of an insert", "with --motors, --out is the log")
-    require_new(options.out, "--out")
+    if options.device is (options.out is not None):
+        raise usage_error(
+            "--out is the file of a model or of a log",
+            "leave it out: the daemon keeps the profile" if options.device else "give one",
+        )
+    if options.out is not None:
+        require_new(options.out, "--out")
     if options.csv is not None:
         require_new(options.csv, "--csv")
     try:
@@ -173,6 +180,8 @@ def _calibrate(options: argparse.Namespace, config: Config, endpoints: Endpoints
         raise usage_error(str(error), "correct the scene, or give the daemon's own --config") from error
     if not options.yes:
         _agree()
+    if options.device:
+        return calibrate_device(endpoints, scene.force.most_N, options.wait)
     if options.motors:
         return calibrate_motors(endpoints, scene.force.most_N, options.out, options.side, options.wait)
     return calibrate(endpoints, scene, options.insert, options.out, options.csv, options.rates, options.wait)
@@ -267,10 +276,13 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("file", type=Path, metavar="FILE.mcap")
     record.add_argument("--duration", type=_above_zero, default=math.inf, metavar="S", help="end after this time")
 
-    calibrate = command("calibrate", "guided sweep of an insert into a model file, or of the motors into a log")
+    calibrate = command(
+        "calibrate", "guided: let the daemon learn its device, sweep an insert into a model file, or motors into a log"
+    )
+    calibrate.add_argument("--device", action="store_true", help="what this device shows of itself becomes its profile")
     calibrate.add_argument("--insert", metavar="NAME", help="the insert that is fitted, such as MRE-50-40")
     calibrate.add_argument("--motors", action="store_true", help="record a motor log instead")
-    calibrate.add_argument("--out", type=Path, required=True, metavar="FILE", help="MODEL.safetensors, or LOG.csv")
+    calibrate.add_argument("--out", type=Path, metavar="FILE", help="MODEL.safetensors, or LOG.csv")
     calibrate.add_argument("--csv", type=Path, metavar="FILE", help="write the training data too")
     calibrate.add_argument(
         "--rates",

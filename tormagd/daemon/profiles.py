@@ -32,11 +32,11 @@ class ProfileFolder:
     """The files of one scene's insert and model, one for each device."""
 
     def __init__(self, folder: Path, insert: str, model: str) -> None:
-        self._folder, self.insert, self.model = folder, insert, model
+        self.folder, self.insert, self.model = folder, insert, model
 
     def path(self, serial_number: int) -> Path:
         """Where the profile of that device is."""
-        return self._folder / f"{serial_number:08x}-{self.insert}.json"
+        return self.folder / f"{serial_number:08x}-{self.insert}.json"
 
     def read(self, serial_number: int) -> Profile | None:
         """The profile of that device; None where there is none. Raises ProfileError saying why it cannot be used."""
@@ -62,7 +62,7 @@ class ProfileFolder:
         path = self.path(profile.serial_number)
         beside = path.with_suffix(".new")
         try:
-            self._folder.mkdir(mode=0o750, parents=True, exist_ok=True)
+            self.folder.mkdir(mode=0o750, parents=True, exist_ok=True)
             with beside.open("wb") as file:
                 file.write(msgspec.json.format(msgspec.json.encode(profile)) + b"\n")
                 file.flush()
@@ -137,7 +137,10 @@ class Profiles:
         """Whether the device's profile is used, how old it is, and why not."""
         age_s = None if self._saved_ns is None else max(0.0, (time.time_ns() - self._saved_ns) * 1e-9)
         return ProfileReport(
-            is_used=self._is_used, age_s=None if age_s is None else round(age_s, 1), refusal=self._refusal
+            is_used=self._is_used,
+            age_s=None if age_s is None else round(age_s, 1),
+            refusal=self._refusal,
+            folder="" if self._folder is None else str(self._folder.folder),
         )
 
     def _take(self, reading: "asyncio.Future[Profile | None]") -> None:

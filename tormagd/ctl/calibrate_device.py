@@ -1,0 +1,179 @@
+"""`tormagctl calibrate --device`: the running daemon learns this device in under a minute, and keeps it as its profile.
+
+Nothing is fitted here. The daemon learns while it drives; what it lacks on its first day is the occasion: forces over
+the whole range, and a handle that turns back often enough for the sensor's zero. Then steps say how good that is.
+"""
+
+import bisect
+import sys
+import time
+from typing import Any
+
+import numpy as np
+
+from tormagd.config import Endpoints
+from tormagd.ctl.calibrate_run import MOVING_MM_S, Columns, Range, armed, reach, seconds_bar
+from tormagd.ctl.client import Client, keys_of
+from tormagd.ctl.outcome import CommandError, Exit, Outcome
+from tormagd.ctl.waveform import Sample, Waveform
+from tormagd.messages import ProfileReport, Status
+
+COLUMNS = ("monotonic_s", "measured_cf", "handle_rate_mm_s")
+"Of the control ticks, what the steps are judged by."
+
+CLEAR_N = 0.1
+"Kept from F_min, which grows with the device that shows itself stronger."
+RAMPS_S = (6.0, 4.0, 4.0)
+"Time from the least to the most force; then the same time back."
+STEP_SHARES = (1.0, 0.0, 0.5, 1.0, 0.25, 0.75)
+"Levels of the steps that judge, as shares of the range: none was held before."
+STEP_S = 2.0
+ARRIVED_S = 1.0
+"Of every step this much is left to the carriages and the fit."
+LEAST_SLIDING = 0.3
+"A handle that moves for less than this share of the time has taught little."
+KEPT_WITHIN_S = 5.0
+DOUBTS = ("SENSOR", "OFFSET_UNKNOWN")
+
+
+def lesson(forces: Range) -> tuple[Waveform, Waveform]:
+    """What is asked so that the device shows itself, and the steps that judge what came of it."""
+    low_N = forces.least_N + CLEAR_N
+    ramps: list[tuple[float, float]] = [(0.0, low_N)]
+    for ramp_s in RAMPS_S:
+        for force_N in (forces.most_N, low_N):
+            ramps.append((ramps[-1][0] + ramp_s, force_N))
+    levels_N = [low_N + share * (forces.most_N - low_N) for share in STEP_SHARES]
+
+    def on_ramps(t_s: float) -> Sample:
+        right = min(max(bisect.bisect_right(ramps, (t_s, np.inf)), 1), len(ramps) - 1)
+        (before_s, before_N), (after_s, after_N) = ramps[right - 1], ramps[right]
+        return Sample(before_N + (after_N - before_N) * min((t_s - before_s) / (after_s - before_s), 1.0))
+
+    def on_steps(t_s: float) -> Sample:
+        return Sample(levels_N[min(int(t_s / STEP_S), len(levels_N) - 1)])
+
+    return Waveform(ramps[-1][0], on_ramps), Waveform(STEP_S * len(levels_N), on_steps)
+
+
+def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -> Outcome:
+    """Let the daemon learn the device, judge it by steps, and see that its profile is kept. The gap opens in the end.
+
+    Raises CommandError: REFUSED (also where no profile is kept, the handle hardly moves, or the force sensor is not
+    believed), FAULT, UNREACHABLE, `InterruptedRunError`.
+    """
+    with Client(endpoints.control, wait_s, keys_of(endpoints.curve)) as client:
+        profile = client.status().profile
+        if not profile.folder:
+            raise _not_kept(profile)
+        learning, judging = lesson(reach(client, scene_most_N))
+        with armed(endpoints, client, COLUMNS, wait_s) as run:
+            print("turn the handle to and fro, about 20 turns a minute, until the gap opens", file=sys.stderr)
+            run.wait_for_handle(learning.at(0.0).force_N)
+            with seconds_bar(learning.duration_s + judging.duration_s, "device") as bar:
+                require_sliding(run.play(learning, bar))
+                steps = run.play(judging, bar)
+            status = client.status()
+            require_believed(status)
+        result = _device(status) | judged(steps, judging, status.device.sensor_zero_N)
+        result["profile"] = _kept(client).folder
+    return Outcome(result, _text(result))
+
+
+def judged(steps: Columns, waveform: Waveform, zero_N: float) -> dict[str, Any]:
+    """How far the force that the sensor shows is from what was asked, once it has arrived, N: `mean_error_N` and
+    `worst_error_N` over the steps' own means, and `noise_N`, the standard deviation within them. Raises CommandError
+    (REFUSED) where the handle hardly moved."""
+    require_sliding(steps)
+    begin_s = float(steps["monotonic_s"][0])
+    since_s = steps["monotonic_s"] - begin_s
+    moving = _sliding(steps) & np.isfinite(steps["measured_cf"])
+    errors: list[float] = []
+    noises: list[float] = []
+    for start_s in np.arange(0.0, waveform.duration_s, STEP_S):
+        arrived = moving & (since_s >= start_s + ARRIVED_S) & (since_s < start_s + STEP_S)
+        if arrived.any():
+            force_N = steps["measured_cf"][arrived] - zero_N
+            errors.append(float(force_N.mean()) - waveform.at(float(start_s)).force_N)
+            noises.append(float(force_N.std()))
+    if not errors:
+        raise _still(0.0)
+    return {
+        "steps": len(errors),
+        "mean_error_N": round(float(np.mean(errors)), 4),
+        "worst_error_N": round(max(max(errors), -min(errors)), 4),
+        "noise_N": round(float(np.median(noises)), 4),
+    }
+
+
+def require_sliding(ticks: Columns) -> None:
+    """Raise CommandError (REFUSED) where the handle moved too little to teach anything."""
+    share = float(_sliding(ticks).mean()) if ticks["handle_rate_mm_s"].size else 0.0
+    if share < LEAST_SLIDING:
+        raise _still(share)
+
+
+def require_believed(status: Status) -> None:
+    """Raise CommandError (REFUSED) where the daemon does not believe the force sensor: then nothing was learned."""
+    doubt = next((limit for limit in status.limit_details if limit.code in DOUBTS), None)
+    if doubt is not None:
+        raise CommandError(
+            Exit.REFUSED, "sensor_doubted", f"{doubt.code}: {doubt.cause}: no profile is kept", doubt.remedy
+        )
+
+
+def _sliding(ticks: Columns) -> "np.ndarray[Any, np.dtype[np.bool_]]":
+    return np.abs(ticks["handle_rate_mm_s"]) >= MOVING_MM_S
+
+
+def _still(share: float) -> CommandError:
+    return CommandError(
+        Exit.REFUSED,
+        "handle_still",
+        f"the handle moved in {share:.0%} of the time: needed are {LEAST_SLIDING:.0%}, at {MOVING_MM_S:g} mm/s",
+        "turn it to and fro until the gap opens",
+    )
+
+
+def _kept(client: Client) -> ProfileReport:
+    began_s = time.monotonic()
+    while True:
+        profile = client.status().profile
+        if profile.age_s is not None and profile.age_s < time.monotonic() - began_s + 1.0 and not profile.refusal:
+            return profile
+        if profile.refusal or time.monotonic() - began_s > KEPT_WITHIN_S:
+            raise _not_kept(profile)
+        time.sleep(0.05)
+
+
+def _not_kept(profile: ProfileReport) -> CommandError:
+    return CommandError(
+        Exit.REFUSED,
+        "not_kept",
+        f"no profile is kept: {profile.refusal or 'the daemon has written none'}",
+        "name a folder that the daemon may write to in [device] profiles, and start it again",
+    )
+
+
+def _device(status: Status) -> dict[str, Any]:
+    device = status.device
+    return {
+        "serial_number": status.link.serial_number,
+        "scale": device.scale,
+        "scale_sd": device.scale_sd,
+        "offset_N": device.offset_N,
+        "offset_sd_N": device.offset_sd_N,
+        "sensor_zero_N": device.sensor_zero_N,
+        "sensor_zero_sd_N": device.sensor_zero_sd_N,
+    }
+
+
+def _text(result: dict[str, Any]) -> str:
+    return (
+        f"device {result['serial_number']}: {result['scale']:.3f} +- {result['scale_sd']:.3f} times the model's force, "
+        f"{result['offset_N'] * 1e3:+.0f} +- {result['offset_sd_N'] * 1e3:.0f} mN; its sensor reads "
+        f"{result['sensor_zero_N'] * 1e3:+.0f} +- {result['sensor_zero_sd_N'] * 1e3:.0f} mN without a force\n"
+        f"{result['steps']} steps, by that sensor: {result['mean_error_N'] * 1e3:+.0f} mN off in the mean, "
+        f"{result['worst_error_N'] * 1e3:.0f} at worst (its noise: {result['noise_N'] * 1e3:.0f})\n"
+        f"kept in {result['profile']}; the daemon begins with it the next time"
+    )
