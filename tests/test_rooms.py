@@ -15,6 +15,8 @@ MAY_IMPORT = {
     "config": set(),
     "messages": set(),
     "output": set(),
+    "exact": set(),
+    "keeping": set(),
     "keys": {"config"},
     "entry": set(),  # it loads the daemon or tormagctl by name, never both
     "physics": set(),
@@ -26,12 +28,15 @@ MAY_IMPORT = {
     "scenes": {"config"},
     "safety": {"firmware_protocol"},
     "hardware": LOWEST | {"safety"},
-    "control": LOWEST | {"physics", "model", "inverse", "scenes", "safety", "hardware"},
-    "daemon": LOWEST | {"output", "keys", "scenes", "safety", "hardware", "control"},
-    "recording": {"messages"},
+    "control": LOWEST | {"exact", "physics", "model", "inverse", "scenes", "safety", "hardware"},
+    "daemon": LOWEST | {"output", "keys", "keeping", "scenes", "safety", "hardware", "control"},
+    "recording": {"messages", "output", "keeping"},
     "ctl": {"config", "messages", "output", "keys", "scenes", "recording"},
     "simulation": {"physics", "firmware_protocol", "output"},
     "headroom": {"config", "output", "daemon", "control", "simulation", "closed_loop"},
+    "replay": LOWEST
+    | {"exact", "output", "recording", "model", "scenes", "safety", "hardware", "control", "daemon", "simulation"}
+    | {"closed_loop"},
     "closed_loop": LOWEST | {"control", "hardware", "safety", "simulation"},
 }
 

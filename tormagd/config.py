@@ -188,6 +188,14 @@ class Limits(Strict, frozen=True):
     neutral_margin_N: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.1
 
 
+class BlackBox(Strict, frozen=True):
+    """What is kept of the last half minute, to be written on a fault."""
+
+    folder: str = ""
+    """For the files; without one that of the service ($STATE_DIRECTORY/blackbox), and where there is none nothing is
+    kept."""
+
+
 class Config(Strict, frozen=True):
     """Everything `tormagd` can be told."""
 
@@ -202,6 +210,7 @@ class Config(Strict, frozen=True):
     position: Position = msgspec.field(default_factory=Position)
     trim: Trim = msgspec.field(default_factory=Trim)
     limits: Limits = msgspec.field(default_factory=Limits)
+    black_box: BlackBox = msgspec.field(default_factory=BlackBox)
 
     def __post_init__(self) -> None:
         rates, device, limits = self.rates, self.device, self.limits

@@ -277,6 +277,15 @@ class ProfileReport(msgspec.Struct, frozen=True, kw_only=True):
     folder: str = ""
 
 
+class BlackBoxReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Where black boxes are kept, the newest of this run, why there is none, and parts that were lost on the way."""
+
+    folder: str = ""
+    newest: str = ""
+    refusal: str = ""
+    dropped: int = 0
+
+
 class StallReport(msgspec.Struct, frozen=True):
     """How long the control loop stood still, and what most of that went into."""
 
@@ -334,6 +343,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     newest_stall: StallReport | None
     not_granted: tuple[str, ...]
     way: WayReport | None = None
+    black_box: BlackBoxReport = BlackBoxReport()
 
 
 class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):

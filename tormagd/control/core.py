@@ -3,6 +3,7 @@
 The daemon, the virtual-time simulation and the tests build it here, so that all of them run the same one.
 """
 
+import hashlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +26,8 @@ from tormagd.scenes.scene import AUTO, Insert, Scene, load_scene, scene_path
 ELEMENT = "torque"
 LEAST_PHASE_MARGIN_DEG = 30.0
 LEAST_GAIN_MARGIN_DB = 4.0
+SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("physics", "model", "inverse", "safety", "scenes")))
+SOURCES += ("tormagd/hardware", "tormagd/control")
 
 
 class Core(NamedTuple):
@@ -37,11 +40,17 @@ class Core(NamedTuple):
     solver: Choice
     model: str
     "The model's fingerprint."
+    models: Path
+    "Where the scene's model was looked for, where it is no shipped one."
 
 
-def build_core(config: Config) -> Core:
-    """The core for `config.scene`. Raises ConfigError where scene, model and configuration do not fit each other."""
-    scene = load_scene(config.scene)
+def build_core(config: Config, scene: Scene | None = None, models: Path | None = None) -> Core:
+    """The core for `config.scene`. Raises ConfigError where scene, model and configuration do not fit each other.
+
+    A given `scene` takes the place of the one in the file, with its model in the folder `models`.
+    """
+    if scene is None or models is None:
+        scene, models = load_scene(config.scene), Path(scene_path(config.scene)).parent.absolute()
     for name in ("control_hz", "inference_hz"):
         offered, needed = getattr(config.rates, name), getattr(scene.bandwidth, name)
         if offered < needed:
@@ -57,7 +66,7 @@ def build_core(config: Config) -> Core:
     try:
         fitted = insert(scene.insert.name)
         model = load_model(
-            model_path(scene.insert.model, beside=Path(scene_path(config.scene)).parent),
+            model_path(scene.insert.model, beside=models),
             element=ELEMENT,
             insert=scene.insert.name,
         )
@@ -76,7 +85,17 @@ def build_core(config: Config) -> Core:
     _refuse_too_sudden(config, scene, reach)
     beside = law_beside(reach, law, field, fitted.elastomer, _geometry(scene.insert))
     planner = Planner(config, scene, model, search, field, reach, beside, cip_percent)
-    return Core(scene, planner, Stepper(config, scene), stability, choice, model.fingerprint)
+    return Core(scene, planner, Stepper(config, scene), stability, choice, model.fingerprint, models)
+
+
+def sources_hash() -> str:
+    """SHA-256 of the sources that decide: all that `plan` and `step` run. Both builds of them have the same."""
+    root, digest = Path(__file__).parents[2], hashlib.sha256()
+    for room in SOURCES:
+        for path in sorted((root / room).glob("**/*.py")):
+            digest.update(f"{path.relative_to(root).as_posix()} {path.stat().st_size}\n".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def _known_fields_mT(scene: Scene, model: ForceModel, field: FieldOfGap) -> tuple[float, float]:

@@ -70,6 +70,10 @@ def _run(options: argparse.Namespace) -> Outcome:
             from tormagd.ctl.plot import plot
 
             return plot(options.file, options.output)
+        case "replay":
+            from tormagd.ctl.replay import replay
+
+            return replay(options.file, options.from_s, options.settings, options.plant, options.faults, options.config)
         case "scene":
             from tormagd.ctl.scene import list_scenes, show_scene
 
@@ -95,6 +99,7 @@ def _keys(options: argparse.Namespace) -> Outcome:
 
 
 def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
+    from tormagd.ctl.black_box import black_box
     from tormagd.ctl.client import Client, keys_of
     from tormagd.ctl.firmware import firmware
     from tormagd.ctl.operate import home, operate, take
@@ -106,6 +111,8 @@ def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
                 return status(client)
             case "firmware":
                 return firmware(client)
+            case "blackbox":
+                return black_box(client, options.file)
             case "take":
                 return take(client, options.source)
             case "home":
@@ -275,6 +282,35 @@ def _parser() -> argparse.ArgumentParser:
     record = command("record", "write telemetry and control ticks to an MCAP file until Ctrl-C")
     record.add_argument("file", type=Path, metavar="FILE.mcap")
     record.add_argument("--duration", type=_above_zero, default=math.inf, metavar="S", help="end after this time")
+
+    box = command("blackbox", "have the daemon write the last half minute, as it does by itself on a fault")
+    box.add_argument("file", type=Path, nargs="?", metavar="FILE.mcap", help="copy it to this file")
+    replay = command(
+        "replay",
+        "run a black box again: the core over what it was given, bit for bit; with --set or --fault the simulator "
+        "instead of the device",
+    )
+    replay.add_argument("file", type=Path, metavar="FILE.mcap")
+    replay.add_argument(
+        "--from", dest="from_s", type=_number, default=0.0, metavar="S", help="begin at the snapshot before this (0)"
+    )
+    replay.add_argument(
+        "--set",
+        dest="settings",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="what would have happened with this in the configuration, as in limits.skew_fault_mm=2",
+    )
+    replay.add_argument("--plant", default="sample_1", metavar="P", help="of the simulator (sample_1)")
+    replay.add_argument(
+        "--fault",
+        dest="faults",
+        action="append",
+        default=[],
+        metavar="NAME[@S]",
+        help="of the simulated device, as tormagd.simulation --fault has them, S from the file's first tick",
+    )
 
     calibrate = command(
         "calibrate", "guided: let the daemon learn its device, sweep an insert into a model file, or motors into a log"

@@ -3,6 +3,7 @@
 import logging
 import time
 
+from tormagd.control.journal import Journal
 from tormagd.control.plan import Plan
 from tormagd.control.step import StepOutput, Stepper, StepState
 from tormagd.daemon.rate_group import RateGroup
@@ -17,8 +18,8 @@ log = logging.getLogger(__name__)
 class ControlLoop:
     """Carries the newest measurement through `step` to the device, once a period."""
 
-    def __init__(self, stepper: Stepper, connection: Connection, period_ns: int) -> None:
-        self._stepper, self._connection = stepper, connection
+    def __init__(self, stepper: Stepper, connection: Connection, period_ns: int, journal: Journal) -> None:
+        self._stepper, self._connection, self._journal = stepper, connection, journal
         self.state: StepState = stepper.start(time.monotonic())
         self.output: StepOutput | None = None
         self.measurement: Measurement | None = None
@@ -35,6 +36,7 @@ class ControlLoop:
         if merged:
             self._connection.receive()  # what came before or during the pause is not to be taken for an answer after it
         self.measurement = self._connection.measurement
+        self._journal.stepped()
         self.state, output = self._stepper.step(self.state, now_s, self.measurement, plan)
         self._connection.exchange(
             output.left_duty, output.right_duty, output.mode, output.request, output.request_number
@@ -45,15 +47,19 @@ class ControlLoop:
 
     def command(self, name: str, conditions: Conditions) -> None:
         """An operator's command. Raises RefusedError."""
-        self.state = self._stepper.command(self.state, name, time.monotonic(), conditions)
+        now_s = time.monotonic()
+        self._journal.commanded(name, now_s, conditions)
+        self.state = self._stepper.command(self.state, name, now_s, conditions)
         log.info("%s: %s", name, self.state.safety.operating_state)
 
     def latch(self, fault: Fault) -> None:
         """Latches a fault that was found outside the step."""
+        self._journal.latched(fault)
         self.state = self.state.replaced(safety=latch(self.state.safety, (fault,)))
 
     def lose_link(self) -> None:
         """Tells the core that the device is gone."""
+        self._journal.lost_link()
         self.state = self._stepper.lose_link(self.state)
 
     def new_faults(self) -> tuple[Fault, ...]:

@@ -1,6 +1,7 @@
 """The daemon put together: one thread, one event loop, three loops in it."""
 
 import asyncio
+import contextlib
 import logging
 import signal
 import sys
@@ -11,6 +12,7 @@ from functools import partial
 from tormagd.config import Config
 from tormagd.control.core import Core
 from tormagd.daemon import notify
+from tormagd.daemon.black_box import AFTER_FAULT_S, BlackBox
 from tormagd.daemon.callbacks import Callbacks
 from tormagd.daemon.causes import Causes
 from tormagd.daemon.control_loop import ControlLoop
@@ -24,7 +26,7 @@ from tormagd.hardware.backend import Backend
 from tormagd.hardware.connection import Connection
 from tormagd.keys import KeyRing
 from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import OperatingState
+from tormagd.safety.operating_state import OperatingState, RefusedError
 
 NS = 1_000_000_000
 OPENING_LOOK_S = 0.02
@@ -49,7 +51,9 @@ class Daemon:
         open_backend: Callable[[], Backend],
         refused: list[str],
         keys: KeyRing | None = None,
+        box: BlackBox | None = None,
     ) -> None:
+        """`box` is one whose process runs already; without it none is kept."""
         self._config, self._core = config, core
         self._loop = asyncio.get_running_loop()
         self._callbacks = Callbacks(self._loop)
@@ -57,12 +61,14 @@ class Daemon:
         self._connection = Connection(config.device, open_backend, self._lose_link)
         self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources.priority, keys)
         rates = config.rates
-        self._control = ControlLoop(core.stepper, self._connection, NS // rates.control_hz)
+        self._box = box or BlackBox(None, {}, rates.control_hz)
+        self._control = ControlLoop(core.stepper, self._connection, NS // rates.control_hz, self._box.journal)
         self._inference = InferenceLoop(
             core.planner,
             self._endpoint,
             NS // rates.inference_hz,
             time.monotonic(),
+            journal=self._box.journal,
             on_failure=partial(self._control.latch, Fault.PLAN_FAILED),
         )
         folder = profile_folder(config.device.profiles)
@@ -81,8 +87,10 @@ class Daemon:
             self._endpoint,
             self._callbacks,
             self._causes,
+            self._box,
             refused,
         )
+        self._box.begin(self._control.state, self._inference.state)
         self._ticks_per_snapshot = rates.control_hz // rates.telemetry_hz
         self._ended = asyncio.Event()
 
@@ -120,6 +128,7 @@ class Daemon:
         self._connection.close()
         heartbeat.close()
         self._endpoint.close()
+        self._box.close()
         log.info("ended")
 
     def _beat(self, heartbeat: Heartbeat) -> None:
@@ -141,6 +150,8 @@ class Daemon:
             callbacks.ran(TelemetryLoop.take_requests.__qualname__, driven_ns, time.monotonic_ns())
         if faults := control.new_faults():
             self._causes.tell(faults, control.state, control.measurement)
+            with contextlib.suppress(RefusedError):  # where none is kept
+                self._telemetry.keep(str(faults[0]), AFTER_FAULT_S)
         try:
             self._inference.after_tick(control.state.estimate)
         finally:  # whatever becomes of planning, the daemon can be seen and stopped

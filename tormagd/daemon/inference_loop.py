@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 
 from tormagd.control.estimate import Estimate
+from tormagd.control.journal import Journal
 from tormagd.control.plan import Planner, PlanState, Shown
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.rate_group import RateGroup
@@ -31,9 +32,10 @@ class InferenceLoop:
         now_s: float,
         clock_ns: Callable[[], int] = time.monotonic_ns,
         *,
+        journal: Journal,
         on_failure: Callable[[], None],
     ) -> None:
-        self._planner, self._endpoint, self._clock_ns = planner, endpoint, clock_ns
+        self._planner, self._endpoint, self._clock_ns, self._journal = planner, endpoint, clock_ns, journal
         self._on_failure, self._failure = on_failure, ""
         self.state: PlanState = planner.start(now_s)
         self.timing = RateGroup("inference", period_ns)
@@ -43,6 +45,7 @@ class InferenceLoop:
 
     def teach(self, shown: Shown) -> None:
         """Plans from now on for a device that has shown this of itself."""
+        self._journal.taught(shown)
         self.state = self.state.replaced(shown=shown)
 
     def receive(self, estimate: Estimate | None, next_tick_ns: int) -> None:
@@ -89,16 +92,23 @@ class InferenceLoop:
         self._slack_ns = min(moved_ns, MOST_SLACK_NS)
 
     def _planned(self, now_s: float, estimate: Estimate | None) -> PlanState:
+        setpoint = self._endpoint.inbox.newest
         try:
-            return self._planner.plan(self.state, now_s, self._endpoint.inbox.newest, estimate)
+            planned = self._planner.plan(self.state, now_s, setpoint, estimate)
         except PLAN_ERRORS as error:
             return self._afresh(now_s, error)
+        self._journal.planned(now_s, setpoint)
+        return planned
 
     def _foresee(self, now_s: float) -> None:
         try:
-            self.state = self._planner.foresee(self.state)
+            foreseen = self._planner.foresee(self.state)
         except PLAN_ERRORS as error:
-            self.state = self._afresh(now_s, error)
+            foreseen = self._afresh(now_s, error)
+        else:
+            if foreseen is not self.state:
+                self._journal.foresaw()
+        self.state = foreseen
 
     def _afresh(self, now_s: float, error: Exception) -> PlanState:
         """The state without what could not be planned for."""
@@ -108,5 +118,6 @@ class InferenceLoop:
             log.error("no gap could be planned for %s", inbox.newest, exc_info=error)
         inbox.withdraw(f"no gap could be planned: {error}")
         self._on_failure()
+        self._journal.began_afresh(now_s)
         afresh = self._planner.start(now_s)
         return afresh.replaced(plan=afresh.plan.replaced(number=self.state.plan.number + 1))

@@ -74,11 +74,15 @@ def _keys(endpoints: Endpoints) -> "KeyRing | None":
 
 
 async def _run(config: Config, core: "Core", open_backend: "Callable[[], Backend]", keys: "KeyRing | None") -> None:
+    from tormagd.daemon.black_box import BlackBox, black_box_folder, header
     from tormagd.daemon.daemon import Daemon
     from tormagd.daemon.realtime import prepare
 
+    # before this thread is a real-time one: the process that is started keeps off its processors
+    folder = black_box_folder(config.black_box.folder)
+    box = BlackBox(folder, header(config, core), config.rates.control_hz)
     refused = prepare(config.realtime)
-    await Daemon(config, core, open_backend, refused, keys).run()
+    await Daemon(config, core, open_backend, refused, keys, box).run()
 
 
 def _print_resolved(config: Config, core: "Core", options: msgspec.Struct) -> None:

@@ -3,6 +3,7 @@ written by another thread; the control thread only looks, once a telemetry perio
 
 import asyncio
 import contextlib
+import hashlib
 import logging
 import os
 import time
@@ -22,10 +23,13 @@ log = logging.getLogger(__name__)
 
 def profile_folder(configured: str) -> Path | None:
     """The folder for profiles: the one that is configured, or else the service's; None where there is neither."""
-    if configured:
-        return Path(configured)
+    return Path(configured) if configured else state_folder("profiles")
+
+
+def state_folder(name: str) -> Path | None:
+    """The folder of that name in which the service may keep things; None where it is no service."""
     state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
-    return Path(state, "profiles") if state else None
+    return Path(state, name) if state else None
 
 
 class ProfileFolder:
@@ -91,6 +95,8 @@ class Profiles:
         self._saved_ns: int | None = None
         self._on_disk: tuple[DeviceFit, SlowFriction, float] | None = None
         self._is_used = False
+        self.digest = ""
+        "SHA-256 of the profile that was read; empty without one."
         self._refusal = "" if folder is not None else "no folder is named for profiles"
 
     def look(self, serial_number: int | None, is_driven: bool) -> None:
@@ -99,7 +105,7 @@ class Profiles:
             if self._serial_number is not None:
                 self._teach(NOTHING_SHOWN)  # that was another device
             self._serial_number, self._saved_ns, self._is_used = serial_number, None, False
-            self._on_disk = None
+            self._on_disk, self.digest = None, ""
             if self._folder is not None:
                 self._refusal = ""
                 self._loop.run_in_executor(None, self._folder.read, serial_number).add_done_callback(self._take)
@@ -156,6 +162,7 @@ class Profiles:
         now_ns = time.time_ns()
         shown = profile.shown(now_ns)
         self._teach(shown)
+        self.digest = hashlib.sha256(msgspec.json.encode(profile)).hexdigest()
         self._saved_ns, self._on_disk, self._is_used = profile.saved_ns, _kept(shown), True
         hours = (now_ns - profile.saved_ns) / 3.6e12
         log.info("the device's profile of %.1f hours ago is used: scale %.3f", hours, profile.scale)

@@ -2,6 +2,7 @@
 
 import logging
 import time
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -13,6 +14,7 @@ from tormagd.control.conditions import conditions, is_busy, is_homed
 from tormagd.control.core import Core
 from tormagd.control.plan import PlanState
 from tormagd.daemon import notify
+from tormagd.daemon.black_box import ASKED, BlackBox
 from tormagd.daemon.callbacks import Callbacks
 from tormagd.daemon.causes import Causes
 from tormagd.daemon.control_loop import ControlLoop
@@ -53,12 +55,13 @@ class TelemetryLoop:
         endpoint: Endpoint,
         callbacks: Callbacks,
         causes: Causes,
+        box: BlackBox,
         not_granted: list[str],
     ) -> None:
         self._config, self._core, self._not_granted = config, core, tuple(not_granted)
         self._control, self._inference, self._profiles = control, inference, profiles
         self._connection, self._endpoint = connection, endpoint
-        self._callbacks, self._causes = callbacks, causes
+        self._callbacks, self._causes, self._box = callbacks, causes, box
         self.timing = RateGroup("telemetry", NS // config.rates.telemetry_hz)
         self._groups = (control.timing, inference.timing, self.timing)
         self._started_s = time.monotonic()
@@ -73,18 +76,18 @@ class TelemetryLoop:
             return
         self._way.ticked(control.state, used)
         timing = control.timing
-        self._ticks.append(
-            tick_record(
-                control.state.time_s,
-                control.state,
-                control.output,
-                used.plan,
-                used.trim,
-                control.measurement,
-                timing.lateness_us,
-                timing.exec_us,
-            )
+        record = tick_record(
+            control.state.time_s,
+            control.state,
+            control.output,
+            used.plan,
+            used.trim,
+            control.measurement,
+            timing.lateness_us,
+            timing.exec_us,
         )
+        self._ticks.append(record)
+        self._box.ticked(record, control.state, self._inference.state)
 
     def publish(self, due_ns: int) -> None:
         """One telemetry period, which was due at `due_ns`."""
@@ -97,6 +100,7 @@ class TelemetryLoop:
         self._endpoint.publish_ticks(self._ticks[-MOST_TICKS:])
         self._ticks.clear()
         self._refresh(start_ns * 1e-9)
+        self._box.look()
         self._status = None
         self._endpoint.serve(
             start_ns * 1e-9,
@@ -112,6 +116,16 @@ class TelemetryLoop:
     def take_requests(self) -> None:
         """Takes the requests that have arrived: `stop` and `disable` are carried out, the rest waits for `publish`."""
         self._endpoint.take_requests(self._command)
+
+    def keep(self, reason: str, after_s: float) -> Path:
+        """Has a black box written, with what comes `after_s` later; where it will be. Raises RefusedError."""
+        link, profile = self._connection.report(), self._profiles.report()
+        details = {
+            "firmware": link.firmware or "",
+            "serial_number": "" if link.serial_number is None else f"{link.serial_number:08x}",
+            "profile_sha256": self._profiles.digest if profile.is_used else "",
+        }
+        return self._box.write(reason, after_s, details)
 
     def conditions(self) -> Conditions:
         """What a command is decided on now."""
@@ -181,6 +195,8 @@ class TelemetryLoop:
         self._status = None
         if request.command == "take":
             return self._give(request.args.get("source"))
+        if request.command == "blackbox":
+            return {"file": str(self.keep(ASKED, 0.0))}
         self._control.command(request.command, self.conditions())
         return {
             "operating_state": str(self._control.state.safety.operating_state),
@@ -241,4 +257,5 @@ class TelemetryLoop:
             newest_stall=self._causes.newest_stall(),
             not_granted=self._not_granted,
             way=self._way.report(None if link.round_trip_us is None else link.round_trip_us.p50),
+            black_box=self._box.report(),
         )

@@ -1,0 +1,114 @@
+"""What the core was given, in the order it was given: with it and a state to begin with, all that it did can be rerun.
+
+`plan` and `step` are pure, so nothing that they gave has to be kept: it stands in the tick's record, to compare with.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import msgspec
+
+from firmware_protocol.value import Value
+from tormagd.control.governor import TimedSetpoint
+from tormagd.control.plan import PlanState, Shown
+from tormagd.control.step import StepState
+from tormagd.exact import plain
+from tormagd.messages import TickRecord
+from tormagd.safety.codes import Fault
+from tormagd.safety.operating_state import Conditions
+
+FORMAT = 1
+"Of the entries: raised when one is removed or changes its meaning."
+STEP = "step"
+"The step ran here; what it was given stands in the next record."
+PLAN, FORESEE, AFRESH, TEACH = "plan", "foresee", "afresh", "teach"
+COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
+STATE, MISSING = "state", "missing"
+MOST_ENTRIES = 4_096
+"That nobody took: then the journal begins anew, and says that something is missing."
+
+Entry = str | TickRecord | tuple[Any, ...]
+
+
+class Journal:
+    """Entries that wait to be taken. Writing one is a reference in a list: values do not change. One that is not kept
+    takes no note of anything."""
+
+    def __init__(self, *, is_kept: bool = True) -> None:
+        self.is_kept = is_kept
+        self._entries: list[Entry] = []
+
+    def stepped(self) -> None:
+        """A step ran."""
+        self._add(STEP)
+
+    def ticked(self, record: TickRecord) -> None:
+        """The control period is over in which the last step ran: its record."""
+        self._add(record)
+
+    def planned(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
+        """A plan was made, with the newest estimate."""
+        self._add((PLAN, now_s, setpoint))
+
+    def foresaw(self) -> None:
+        """What comes was looked for, and found anew."""
+        self._add((FORESEE,))
+
+    def began_afresh(self, now_s: float) -> None:
+        """No plan could be made: planning began anew."""
+        self._add((AFRESH, now_s))
+
+    def taught(self, shown: Shown) -> None:
+        """What the device has shown was put in the place of what was known of it."""
+        self._add((TEACH, shown))
+
+    def commanded(self, name: str, now_s: float, conditions: Conditions) -> None:
+        """An operator's command was given, and taken or refused."""
+        self._add((COMMAND, name, now_s, conditions))
+
+    def latched(self, fault: Fault) -> None:
+        """A fault was latched that was found outside the step."""
+        self._add((LATCH, str(fault)))
+
+    def lost_link(self) -> None:
+        """The link to the device broke."""
+        self._add((LOSE_LINK,))
+
+    def snapshot(self, step: StepState, plan: PlanState) -> None:
+        """All that the core remembers now: a replay may begin here."""
+        self._add((STATE, step, plan))
+
+    def missed(self) -> None:
+        """Entries before this were lost."""
+        self._add((MISSING,))
+
+    def take(self) -> list[Entry]:
+        """The entries since the last time."""
+        entries, self._entries = self._entries, []
+        return entries
+
+    def _add(self, entry: Entry) -> None:
+        if not self.is_kept:
+            return
+        if len(self._entries) >= MOST_ENTRIES:
+            self._entries = [(MISSING,)]
+        self._entries.append(entry)
+
+
+def encode_entries(entries: Sequence[Entry]) -> bytes:
+    """msgpack: an array of the entries. Values in it are as `exact` writes them; a setpoint is its fields alone."""
+    return _ENCODER.encode(entries)
+
+
+def _of_value(thing: Any) -> Any:
+    if type(thing) is TimedSetpoint:
+        return fields_of(thing)
+    return plain(thing)
+
+
+def fields_of(value: Value) -> Iterable[Any]:
+    """In the order of its constructor."""
+    return [getattr(value, name) for name in value.__match_args__]
+
+
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_of_value)

@@ -1,0 +1,43 @@
+"""`tormagctl blackbox`: have the last half minute written, and fetch it."""
+
+import shutil
+import time
+from pathlib import Path
+
+from tormagd.ctl.client import Client
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+
+POLL_S = 0.1
+LONGEST_S = 30.0
+"Writing takes a second or two, at the lowest priority."
+
+
+def black_box(client: Client, copy: Path | None) -> Outcome:
+    """Asks for it and waits until it is on the disk; `copy` is where it is copied to.
+
+    Raises CommandError: USAGE where `copy` exists or cannot be made, REFUSED where the daemon keeps none, or it could
+    not be written.
+    """
+    if copy is not None and copy.exists():
+        raise usage_error(f"{copy} exists", "give another name; nothing is overwritten")
+    written = Path(client.request("blackbox")["file"])
+    until_s = time.monotonic() + LONGEST_S
+    while (box := client.status().black_box).newest != written.name:
+        if box.refusal or time.monotonic() > until_s:
+            raise CommandError(
+                Exit.REFUSED,
+                "not_written",
+                box.refusal or f"{written} was not written within {LONGEST_S:g} s",
+                "make room in [black_box] folder, or name another; the daemon's log says more",
+            )
+        time.sleep(POLL_S)
+    if copy is None:
+        return Outcome({"file": str(written)}, f"{written}\ntormagctl replay runs it again, tormagctl plot draws it")
+    try:
+        with written.open("rb") as source, copy.open("xb") as target:
+            shutil.copyfileobj(source, target)
+    except OSError as error:
+        raise usage_error(
+            f"{error.filename}: {error.strerror}", f"it is {written} on the daemon's machine: fetch it from there"
+        ) from error
+    return Outcome({"file": str(copy), "original": str(written)}, f"{copy} (also {written})")

@@ -1,0 +1,236 @@
+"""The black box: all that the core decides on is handed to another process, which keeps the newest of it.
+
+The control thread writes references into a journal; every 20 ticks, in the slack behind one, they become bytes and go
+into a socket. It waits for nobody: what the socket does not take is lost and counted. Files are the other's business,
+and it outlives this process, however that ends.
+"""
+
+import hashlib
+import importlib.util
+import json
+import logging
+import platform
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from firmware_protocol.build import settle
+from tormagd import __version__
+from tormagd.config import Config
+from tormagd.control.core import Core, sources_hash
+from tormagd.control.journal import FORMAT, Journal, encode_entries
+from tormagd.control.plan import PlanState
+from tormagd.control.step import StepState
+from tormagd.daemon.profiles import state_folder
+from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
+from tormagd.messages import BlackBoxReport, TickRecord
+from tormagd.safety.operating_state import RefusedError
+
+PART_TICKS = 20
+"Control periods that are handed over at once; between two telemetry messages, where telemetry has as many."
+SNAPSHOT_S = 1.0
+"A replay may begin so often."
+AFTER_FAULT_S = 2.0
+"So much of what follows a fault is in its black box: the gap opens."
+BUFFER_BYTES = 4_000_000
+"What the kernel is asked to keep for a process that is held up; it may grant less, which is a third of a second."
+LEAVING_S = 2.0
+MOST_ASKED = 8
+ASKED = "REQUEST"
+
+log = logging.getLogger(__name__)
+Start = Callable[[socket.socket], "subprocess.Popen[bytes]"]
+
+
+def black_box_folder(configured: str) -> Path | None:
+    """The folder for black boxes: the one that is configured, or else the service's; None where there is neither."""
+    return Path(configured) if configured else state_folder("blackbox")
+
+
+def header(config: Config, core: Core) -> dict[str, str]:
+    """What a black box says of the core besides: all that it takes to build it again, and hashes to know it by."""
+    configured, scene = msgspec.json.encode(config), msgspec.json.encode(core.scene)
+    return {
+        "format": str(FORMAT),
+        "version": __version__,
+        "build": str(settle()),
+        "sources_sha256": sources_hash(),
+        "platform": f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}",
+        "config": configured.decode(),
+        "config_sha256": hashlib.sha256(configured).hexdigest(),
+        "scene": scene.decode(),
+        "scene_sha256": hashlib.sha256(scene).hexdigest(),
+        "scene_folder": str(core.models),
+        "model_sha256": core.model,
+        "columns": json.dumps(TickRecord.__struct_fields__),
+    }
+
+
+def start_keeper(its_end: socket.socket) -> "subprocess.Popen[bytes]":
+    """The process that keeps. To be called before this one becomes a real-time one, whose processors it would have."""
+    number = its_end.fileno()
+    command = [sys.executable, "-P", "-m", KEEPER, str(number)]
+    # no signal for our group is meant for it: it ends when we have ended
+    return subprocess.Popen(command, pass_fds=(number,), stdin=subprocess.DEVNULL, start_new_session=True)
+
+
+class BlackBox:
+    """Hands over what the journal has. Without a `folder` nothing is kept, and `report` says so."""
+
+    def __init__(
+        self, folder: Path | None, header: dict[str, str], control_hz: int, start: Start = start_keeper
+    ) -> None:
+        self._folder = folder
+        self._refusal, self._newest, self._dropped = "", "", 0
+        self._socket: socket.socket | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        if folder is None:
+            self._refusal = "no folder is named for black boxes"
+        elif importlib.util.find_spec("mcap") is None:
+            self._refusal = "mcap is not installed: pip install 'tormagd[record]'"
+            log.warning("no black box: %s", self._refusal)
+        else:
+            self._start(Begin(str(folder), header), start)
+        self.journal = Journal(is_kept=self._socket is not None)
+        self._ticks = PART_TICKS // 2
+        self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
+        self._encoder = msgspec.msgpack.Encoder()
+        self._has_state = False
+        self._asked: deque[Write] = deque(maxlen=MOST_ASKED)
+
+    def begin(self, step: StepState, plan: PlanState) -> None:
+        """With these states the first tick is run."""
+        self._snapshot(step, plan)
+
+    def ticked(self, record: TickRecord, step: StepState, plan: PlanState) -> None:
+        """A control period is over, with these states."""
+        if self._socket is None:
+            return
+        self.journal.ticked(record)
+        self._ticks += 1
+        if self._ticks % PART_TICKS:
+            return
+        try:
+            entries = encode_entries(self.journal.take())
+        except (TypeError, ValueError, OverflowError) as error:  # control goes on, whatever is in it
+            self._lose(f"an entry that cannot be written: {error}")
+            return
+        is_taken = self._say(Part(record.monotonic_s, record.t_ns, self._has_state, entries))
+        self._has_state = False
+        if not is_taken:
+            self._dropped += 1
+            self.journal.missed()
+        if not is_taken or self._ticks % self._ticks_per_snapshot == 0:
+            self._snapshot(step, plan)
+
+    def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
+        """Asks for a black box, and says where it will be. Raises RefusedError."""
+        if self._folder is None or self._socket is None:
+            raise RefusedError(
+                "no_black_box",
+                f"there is no black box: {self._refusal}",
+                "[black_box] folder in the daemon's configuration names where they go",
+            )
+        now_ns = time.time_ns()
+        stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime(now_ns // 1_000_000_000))
+        name = f"{stamp}.{now_ns // 1_000_000 % 1_000:03d}Z-{reason}.mcap"
+        self._asked.append(Write(name, reason, after_s, details))
+        self._ask()
+        return self._folder / name
+
+    def look(self) -> None:
+        """Takes what the other process has said: once a telemetry period."""
+        self._ask()
+        while self._socket is not None:
+            try:
+                data = self._socket.recv(65_536)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                self._lose(error.strerror or str(error))
+                return
+            if not data:
+                self._lose("the process that keeps it has ended")
+                return
+            answer = msgspec.msgpack.decode(data, type=Written)
+            self._refusal = answer.refusal
+            if answer.refusal:
+                log.error("no black box %s: %s", answer.name, answer.refusal)
+            else:
+                self._newest = answer.name
+                log.info("black box: %s/%s", self._folder, answer.name)
+
+    def report(self) -> BlackBoxReport:
+        """For `status`."""
+        return BlackBoxReport(
+            folder="" if self._folder is None else str(self._folder),
+            newest=self._newest,
+            refusal=self._refusal,
+            dropped=self._dropped,
+        )
+
+    def close(self) -> None:
+        """Lets the other process end, once it has written what it was asked for."""
+        if self._socket is not None and self._process is not None:
+            self._say(End())
+            self._socket.close()
+            self._socket = None
+            try:
+                self._process.wait(LEAVING_S)
+            except subprocess.TimeoutExpired:
+                log.info("the black box is still being written")
+
+    def _start(self, first: Begin, start: Start) -> None:
+        ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours.setblocking(False)
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+        with its:
+            try:
+                self._process = start(its)
+            except OSError as error:
+                ours.close()
+                self._refusal = f"the process that keeps it did not start: {error.strerror}"
+                log.warning("no black box: %s", self._refusal)
+                return
+        self._socket = ours
+        ours.send(msgspec.msgpack.encode(first))
+
+    def _ask(self) -> None:
+        """Passes on what it has not heard yet: it may have been held up."""
+        while self._asked and self._say(self._asked[0]):
+            self._asked.popleft()
+
+    def _snapshot(self, step: StepState, plan: PlanState) -> None:
+        self.journal.snapshot(step, plan)
+        self._has_state = True
+
+    def _say(self, what: Said) -> bool:
+        """Whether the socket took it."""
+        if self._socket is None:
+            return False
+        try:
+            self._socket.send(self._encoder.encode(what))
+        except BlockingIOError:
+            return False
+        except OSError as error:
+            if not isinstance(error, BrokenPipeError | ConnectionError):
+                return False  # more than a packet holds
+            self._lose("the process that keeps it has ended")
+            return False
+        return True
+
+    def _lose(self, reason: str) -> None:
+        self._refusal = reason
+        log.error("no black box any more: %s", reason)
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+        self.journal.is_kept = False
+        self.journal.take()

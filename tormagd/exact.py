@@ -1,0 +1,114 @@
+"""Values as plain data, and back, with nothing lost: every float to the bit, every type by its name.
+
+Plain data are what msgpack holds. What it does not know is a map with one key, the type's name:
+
+    a value        {"Turn": {"direction": 1.0, ...}}
+    an enumerator  {"Limit": "RATE"}
+    a list         {"list": [...]}, as a bare one is a tuple
+
+Two equal values come back as two: nothing in the core asks whether a value is the very one that it made before.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from enum import Enum
+from typing import Any
+
+import msgspec
+
+from firmware_protocol.value import Value
+
+LIST = "list"
+_AS_THEY_ARE = (float, int, bool, str, bytes, type(None))
+
+Kinds = Mapping[str, type[Value] | type[Enum]]
+"By name, what may come back."
+
+
+_ENCODER = msgspec.msgpack.Encoder()
+
+
+class InexactError(ValueError):
+    """Plain data that stand for no value of a known kind: the text says which, and what is wrong with it."""
+
+
+def kinds(*types: type[Value] | type[Enum]) -> Kinds:
+    """These types by name."""
+    return {each.__name__: each for each in types}
+
+
+def plain(thing: object) -> Any:
+    """`thing` as plain data. Raises TypeError for what is neither plain, a value, an enumerator, a tuple nor a list."""
+    if type(thing) in _AS_THEY_ARE:
+        return thing
+    if isinstance(thing, Value):
+        return {type(thing).__name__: {name: plain(getattr(thing, name)) for name in thing.__match_args__}}
+    if isinstance(thing, Enum):
+        return {type(thing).__name__: thing.value}
+    if isinstance(thing, float):  # NumPy's, which has the same bits
+        return float(thing)
+    if type(thing) is tuple:
+        return [plain(each) for each in thing]
+    if type(thing) is list:
+        return {LIST: [plain(each) for each in thing]}
+    raise TypeError(f"{thing!r}: allowed are values, enumerators, tuples, lists and what msgpack knows")
+
+
+def restored(data: Any, known: Kinds) -> Any:
+    """What `data` stand for. Raises InexactError."""
+    if type(data) in _AS_THEY_ARE:
+        return data
+    if isinstance(data, list | tuple):
+        return tuple([restored(each, known) for each in data])
+    if not isinstance(data, dict) or len(data) != 1:
+        raise InexactError(f"{str(data)[:60]}: allowed is a map with one type's name")
+    ((name, inner),) = data.items()
+    if name == LIST and isinstance(inner, list | tuple):
+        return [restored(each, known) for each in inner]
+    kind = known.get(name)
+    if kind is None:
+        raise InexactError(f"{str(name)[:60]!r}: a type that is not known here")
+    try:
+        if issubclass(kind, Enum):
+            return kind(inner)
+        fields = {field: restored(each, known) for field, each in inner.items()}
+        if set(fields) != set(kind.__match_args__):
+            odd = sorted(str(field) for field in set(fields) ^ set(kind.__match_args__))
+            raise InexactError(f"{name}: its fields differ from those here: {', '.join(odd)[:200]}")
+        return kind(**fields)
+    except (TypeError, AttributeError, OverflowError) as error:
+        raise InexactError(f"{name}: {str(error)[:200]}") from error
+    except InexactError:
+        raise
+    except ValueError as error:
+        raise InexactError(f"{name}: {str(error)[:200]}") from error
+
+
+def packed(data: Any) -> bytes:
+    """Plain data as msgpack: the same bytes for the same data, and for no others."""
+    return _ENCODER.encode(data)
+
+
+def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
+    """Where two plain data differ first, as in "estimate.handle.rate_mm_s", and what is there; None where they are the
+    same to the bit."""
+    if packed(left) == packed(right):
+        return None
+    for (path, one), (other_path, other) in zip(_leaves("", left), _leaves("", right), strict=False):
+        if path != other_path or packed(one) != packed(other):
+            return path, one, other if path == other_path else None
+    return "length", len(list(_leaves("", left))), len(list(_leaves("", right)))
+
+
+def _leaves(path: str, data: Any) -> Iterator[tuple[str, Any]]:
+    inner: Iterable[tuple[Any, Any]]
+    if isinstance(data, dict):
+        inner = data.items()
+    elif isinstance(data, list | tuple):
+        inner = enumerate(data)
+    else:
+        yield path, data
+        return
+    for name, each in inner:
+        # a type's name says nothing that its field's does not
+        is_kind = isinstance(data, dict) and len(data) == 1 and isinstance(each, dict | list | tuple)
+        yield from _leaves(path if is_kind else f"{path}.{name}" if path else str(name), each)

@@ -1,0 +1,127 @@
+"""The black box's file: MCAP with two channels, and all that it takes to run the core again.
+
+`/ticks` is that of a recording, for viewers and `tormagctl plot`. `/core` has the same ticks with whatever else the
+core was given, in its order, to the bit: msgpack, a message for each part that the daemon handed over. The metadata
+`black_box` are its header. `tormagctl replay` runs it.
+"""
+
+import contextlib
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from mcap.records import Channel, Message, Metadata
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+
+from tormagd import __version__
+from tormagd.keeping import Part
+from tormagd.messages import VERSION
+from tormagd.recording.reader import MAX_RECORD_BYTES, UNREADABLE, RecordingError
+from tormagd.recording.ticks import TickBatch
+from tormagd.recording.writer import CHUNK_BYTES, TICKS_TOPIC, tick_schema
+
+CORE_TOPIC = "/core"
+HEADER = "black_box"
+MAX_PARTS = 100_000
+MAX_BYTES = 200_000_000
+"""Of all parts of a file that is read: a black box is a tenth of it."""
+
+
+class BlackBoxFile(msgspec.Struct, frozen=True):
+    """One file: its header, and the entries of all its parts in their order, as plain data; a tick's record is a list
+    whose first value is an integer, any other entry a word or a list that begins with one."""
+
+    header: dict[str, str]
+    entries: list[Any]
+    is_complete: bool = True
+    "False for one that ends in the middle: what came before is there."
+
+
+def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part]) -> int:
+    """Writes a new file, whole or not at all; returns how many ticks are in it. Raises FileExistsError, OSError."""
+    beside = path.with_name(f"{path.name}.part")
+    if path.exists():
+        raise FileExistsError(17, "exists", str(path))
+    try:
+        ticks = _write(beside, header, parts)
+        beside.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            beside.unlink()
+        raise
+    return ticks
+
+
+def _write(path: Path, header: dict[str, str], parts: Iterable[Part]) -> int:
+    columns = tuple(json.loads(header["columns"]))
+    ticks = 0
+    with path.open("wb") as file:
+        mcap = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        mcap.start(profile="", library=f"tormagd {__version__}")
+        mcap.add_metadata(HEADER, header)
+        mcap.add_metadata("tormagd", {"version": __version__, "kind": HEADER})
+        core = mcap.register_channel(topic=CORE_TOPIC, message_encoding="msgpack", schema_id=0)
+        rows_channel: int | None = None
+        for number, part in enumerate(parts):
+            mcap.add_message(core, log_time=part.t_ns, data=part.entries, publish_time=part.t_ns, sequence=number)
+            rows = tuple(tuple(entry) for entry in msgspec.msgpack.decode(part.entries) if is_tick(entry))
+            if not rows:
+                continue
+            if rows_channel is None:
+                schema = tick_schema(TickBatch(v=VERSION, columns=columns, rows=_of_words(rows[:1])))
+                data = msgspec.json.encode(schema)
+                schema_id = mcap.register_schema(name="tormagd.Tick", encoding="jsonschema", data=data)
+                rows_channel = mcap.register_channel(topic=TICKS_TOPIC, message_encoding="json", schema_id=schema_id)
+            for row in rows:
+                data = msgspec.json.encode(dict(zip(columns, row, strict=True)))
+                mcap.add_message(rows_channel, log_time=row[0], data=data, publish_time=row[0], sequence=ticks)
+                ticks += 1
+        mcap.finish()  # type: ignore[no-untyped-call]
+    return ticks
+
+
+def is_tick(entry: Any) -> bool:
+    """Whether an entry is a tick's record."""
+    return isinstance(entry, list) and bool(entry) and type(entry[0]) is int
+
+
+def _of_words(rows: Iterable[tuple[Any, ...]]) -> tuple[tuple[Any, ...], ...]:
+    return tuple(tuple(tuple(each) if isinstance(each, list) else each for each in row) for row in rows)
+
+
+def read_black_box(path: Path) -> BlackBoxFile:
+    """The black box in `path`. Raises RecordingError: not readable, not MCAP, damaged, or no black box."""
+    header: dict[str, str] = {}
+    entries: list[Any] = []
+    cores: set[int] = set()
+    size, parts, is_complete = 0, 0, True
+    try:
+        with path.open("rb") as file:
+            try:
+                for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:
+                    if isinstance(record, Channel) and record.topic == CORE_TOPIC:
+                        if record.message_encoding != "msgpack":
+                            raise ValueError(f"{CORE_TOPIC} is {record.message_encoding[:20]!r}: allowed is msgpack")
+                        cores.add(record.id)
+                    elif isinstance(record, Metadata) and record.name == HEADER:
+                        header.update(record.metadata)
+                    elif isinstance(record, Message) and record.channel_id in cores:
+                        size, parts = size + len(record.data), parts + 1
+                        if size > MAX_BYTES or parts > MAX_PARTS:
+                            raise ValueError(f"over {MAX_BYTES} bytes or {MAX_PARTS} parts")
+                        entries.extend(msgspec.msgpack.decode(record.data, type=list[Any]))
+            except UNREADABLE:
+                # a record that runs into the end of the file was being written when its writer died
+                if file.read(1) or not entries:
+                    raise
+                is_complete = False
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from error
+    except (*UNREADABLE, RecursionError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path}: not an intact MCAP file ({str(error)[:200]})") from error
+    if not header or not cores:
+        raise RecordingError(f"{path}: no black box of tormagd: it has no {CORE_TOPIC} or no header {HEADER!r}")
+    return BlackBoxFile(header, entries, is_complete)

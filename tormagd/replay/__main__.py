@@ -1,0 +1,75 @@
+"""`python -m tormagd.replay FILE`: runs a black box again, and prints one JSON object; `tormagctl replay` shows it."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from firmware_protocol.build import settle
+from tormagd.config import ConfigError, load_config
+from tormagd.output import write_line
+from tormagd.recording.black_box import BlackBoxFile, read_black_box
+from tormagd.recording.reader import RecordingError
+from tormagd.replay.rebuild import Recorded, ReplayError, differences, rebuilt, recorded
+from tormagd.replay.rehearse import changed, rehearse, script
+from tormagd.replay.rerun import rerun
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Returns 0, or 2 where the file or an option cannot be used: why is on stderr, in one line."""
+    parser = argparse.ArgumentParser(prog="python -m tormagd.replay", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--from", dest="from_s", type=float, default=0.0)
+    parser.add_argument("--set", dest="settings", action="append", default=[])
+    parser.add_argument("--plant", default="sample_1")
+    parser.add_argument("--fault", dest="faults", action="append", default=[])
+    parser.add_argument("--config", type=Path)
+    options = parser.parse_args(arguments)
+    try:
+        configured = None if options.config is None else load_config(options.config)
+        box = read_black_box(options.file)
+        try:
+            known = recorded(box, options.file.absolute().parent)
+            result: dict[str, Any] = {
+                "file": str(options.file),
+                "version": known.header["version"],
+                "reason": box.header.get("reason", ""),
+                "build": str(settle()),
+                "is_complete": box.is_complete,
+                "differences": differences(known, configured),
+            }
+            if options.settings or options.faults:
+                result |= _rehearsed(known, box, options)
+            else:
+                result |= _rerun(known, box, options.from_s)
+        except ReplayError as error:
+            raise ReplayError(f"{options.file}: {error}") from error
+    except (ConfigError, RecordingError, ReplayError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0 if write_line(json.dumps(result), sys.stdout) is None else 1
+
+
+def _rerun(known: Recorded, box: BlackBoxFile, from_s: float) -> dict[str, Any]:
+    done = rerun(rebuilt(known), known.columns, box.entries, from_s)
+    difference = None if done.difference is None else done.difference._asdict()
+    return {"rerun": done._asdict() | {"difference": difference}}
+
+
+def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) -> dict[str, Any]:
+    todo = script(known.columns, box.entries)
+    config = changed(known.config, options.settings)
+    as_it_was = rehearse(rebuilt(known), known.config, todo, options.plant, options.faults)
+    instead = rehearse(rebuilt(known, config), config, todo, options.plant, options.faults)
+    return {
+        "plant": options.plant,
+        "settings": options.settings,
+        "recorded": todo.recorded._asdict(),
+        "simulated": as_it_was._asdict(),
+        "instead": instead._asdict(),
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,132 @@
+"""The core that a black box is of, built again from the file; and what differs between there and here."""
+
+import hashlib
+import json
+import platform
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from tormagd import __version__
+from tormagd.config import Config, ConfigError, checked
+from tormagd.control.core import Core, build_core, sources_hash
+from tormagd.control.journal import FORMAT
+from tormagd.messages import TickRecord
+from tormagd.recording.black_box import BlackBoxFile
+from tormagd.scenes.scene import Scene, load_scene
+
+NEEDED = (
+    "format", "version", "sources_sha256", "platform", "config", "config_sha256", "scene", "scene_sha256",
+    "scene_folder", "model_sha256", "columns",
+)  # fmt: skip
+SHOWN = 12
+"Digits of a hash that are told."
+
+
+class ReplayError(ValueError):
+    """A black box that cannot be run again here, and why, in one sentence."""
+
+
+class Recorded(NamedTuple):
+    """What a black box says of itself, checked."""
+
+    config: Config
+    scene: Scene
+    model: str
+    model_folders: tuple[Path, ...]
+    columns: tuple[str, ...]
+    header: dict[str, str]
+
+
+def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
+    """The header's contents; the model is looked for where it was, and in the folder `beside`. Raises ReplayError."""
+    header = box.header
+    missing = [name for name in NEEDED if name not in header]
+    if missing:
+        raise ReplayError(f"its header has no {missing[0]!r}: it is no black box of this version")
+    if header["format"] != str(FORMAT):
+        raise ReplayError(
+            f"format = {header['format'][:20]!r}, written by tormagd {header['version'][:20]!r}: allowed is {FORMAT}, "
+            f"which tormagd {__version__} writes"
+        )
+    columns = _json(header, "columns")
+    if not isinstance(columns, list) or not all(isinstance(name, str) for name in columns):
+        raise ReplayError("columns: allowed is a list of names")
+    lacking = [name for name in TickRecord.__struct_fields__ if name not in columns]
+    if lacking:
+        raise ReplayError(f"its ticks have no column {lacking[0]!r}: tormagd {header['version'][:20]!r} wrote it")
+    try:
+        return Recorded(
+            checked(_intact(header, "config"), Config),
+            checked(_intact(header, "scene"), Scene),
+            header["model_sha256"],
+            (Path(header["scene_folder"]), beside),
+            tuple(columns),
+            header,
+        )
+    except (ConfigError, RecursionError) as error:
+        raise ReplayError(f"its configuration is refused: {error}") from error
+
+
+def rebuilt(known: Recorded, config: Config | None = None) -> Core:
+    """The core, with another configuration if one is given. Raises ReplayError: the model is not here, or does not
+    fit."""
+    found = ""
+    for folder in known.model_folders:
+        try:
+            core = build_core(config or known.config, known.scene, folder)
+        except (ConfigError, ValueError, OSError) as error:
+            found = found or str(error)
+            continue
+        if core.model == known.model:
+            return core
+        found = f"the model {known.scene.insert.model!r} that is here has the hash {core.model[:SHOWN]}"
+    raise ReplayError(f"the model with the hash {known.model[:SHOWN]!r} has to be beside the file: {found}")
+
+
+def differences(known: Recorded, configured: Config | None) -> list[str]:
+    """What is not as it was when the file was written, in plain words. `configured` is this machine's, if known."""
+    found = []
+    here, there = sources_hash(), known.header["sources_sha256"]
+    if here != there:
+        found.append(
+            f"build: tormagd {known.header['version'][:20]} with the sources {there[:SHOWN]} was recorded, here is "
+            f"tormagd {__version__} with {here[:SHOWN]}"
+        )
+    machine = f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}"
+    if known.header["platform"] != machine:
+        found.append(f"platform: {known.header['platform'][:80]} was recorded, here is {machine}")
+    try:
+        scene = load_scene((configured or known.config).scene)
+    except ConfigError as error:
+        found.append(f"scene: the recorded one is used; here is none: {error}")
+    else:
+        _compare(found, "scene", known.header["scene_sha256"], msgspec.json.encode(scene))
+    if configured is not None:
+        _compare(found, "configuration", known.header["config_sha256"], msgspec.json.encode(configured))
+    return found
+
+
+def _compare(found: list[str], what: str, there: str, data: bytes) -> None:
+    here = hashlib.sha256(data).hexdigest()
+    if here != there:
+        found.append(f"{what}: {there[:SHOWN]} was recorded and is used, here is {here[:SHOWN]}")
+
+
+def _intact(header: dict[str, str], name: str) -> dict[str, Any]:
+    told = hashlib.sha256(header[name].encode()).hexdigest()
+    if told != header[f"{name}_sha256"]:
+        raise ReplayError(f"{name}: its hash is {told[:SHOWN]}, beside it stands {header[f'{name}_sha256'][:SHOWN]!r}")
+    tables = _json(header, name)
+    if not isinstance(tables, dict):
+        raise ReplayError(f"{name}: allowed is an object")
+    return tables
+
+
+def _json(header: dict[str, str], name: str) -> Any:
+    try:
+        return json.loads(header[name])
+    except (ValueError, RecursionError) as error:
+        raise ReplayError(f"{name}: {str(error)[:100]}") from error

@@ -1,0 +1,176 @@
+"""What would have happened instead: the simulated device in place of the real one, in virtual time, with the setpoints,
+commands and the handle's motion of a black box, and a configuration that may be another.
+
+The simulator is not the device that was recorded: so it runs with the recorded configuration too, to compare with.
+"""
+
+import tomllib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import msgspec
+
+from tormagd.closed_loop import ClosedLoop
+from tormagd.config import Config, ConfigError, checked
+from tormagd.control import journal
+from tormagd.control.core import Core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.messages import TickRecord
+from tormagd.replay.rebuild import ReplayError
+from tormagd.replay.rerun import SETPOINT, ticks_of
+from tormagd.safety.operating_state import OperatingState, RefusedError
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.faults import FaultError, parse_fault
+from tormagd.simulation.hand import RecordedHand
+from tormagd.simulation.parameters import PlantError, load_plant
+
+BEGINS_S = 15.0
+"In virtual time: the device is homed by then, and renders the first setpoint where it did at the file's beginning."
+SEED = 1
+DRIVEN = (OperatingState.ENABLED, OperatingState.PAUSED)
+
+
+class Happened(NamedTuple):
+    """Faults with when each first was latched, and limits with for how long each was held, s; times from the file's
+    first tick. `refused` are commands that were."""
+
+    faults: dict[str, float]
+    limits: dict[str, float]
+    refused: list[str]
+
+
+class Script(NamedTuple):
+    """What a black box's core was asked for: times in s from its first tick."""
+
+    lasts_s: float
+    is_driven: bool
+    hand: RecordedHand
+    setpoints: list[tuple[float, TimedSetpoint | None]]
+    commands: list[tuple[float, str]]
+    recorded: Happened
+
+
+def changed(config: Config, settings: Sequence[str]) -> Config:
+    """With `KEY=VALUE` settings, as in limits.skew_fault_mm=2. Raises ReplayError."""
+    tables: dict[str, Any] = msgspec.to_builtins(config)
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        table, names = tables, key.strip().split(".")
+        for name in names[:-1]:
+            inner = table.get(name)
+            if not isinstance(inner, dict):
+                raise ReplayError(f"--set {setting[:80]}: there is no {key.strip()[:60]!r} in the configuration")
+            table = inner
+        if not equals or names[-1] not in table:
+            raise ReplayError(f"--set {setting[:80]}: allowed is KEY=VALUE, as in limits.skew_fault_mm=2")
+        try:
+            table[names[-1]] = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            table[names[-1]] = text.strip()
+    try:
+        return checked(tables, Config)
+    except ConfigError as error:
+        raise ReplayError(f"--set: {error}") from error
+
+
+def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
+    """What there is to be done again. Raises ReplayError."""
+    records = ticks_of(columns, entries)
+    ticks = list(records.values())
+    first_s = ticks[0].monotonic_s
+    setpoints: list[tuple[float, TimedSetpoint | None]] = []
+    commands: list[tuple[float, str]] = []
+    try:
+        for entry in entries:
+            if isinstance(entry, list) and entry and entry[0] == journal.PLAN:
+                now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
+                setpoints.append((now_s - first_s, None if fields is None else _moved(TimedSetpoint(*fields), first_s)))
+            elif isinstance(entry, list) and entry and entry[0] == journal.COMMAND:
+                name, now_s = msgspec.convert(entry[1:3], tuple[str, float])
+                commands.append((now_s - first_s, name))
+    except msgspec.ValidationError as error:
+        raise ReplayError(str(error)) from error
+    is_driven = ticks[0].operating_state in DRIVEN
+    return Script(ticks[-1].monotonic_s - first_s, is_driven, _hand(ticks), setpoints, commands, _recorded(ticks))
+
+
+def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Sequence[str]) -> Happened:
+    """The script in the closed loop. `faults` are those of the simulated device, as in encoder_jump@12.5, from the
+    file's first tick. Raises ReplayError."""
+    try:
+        injected = [parse_fault(fault) for fault in faults]
+        device = VirtualDevice(
+            load_plant(plant), todo.hand, [fault._replace(at_s=fault.at_s + BEGINS_S) for fault in injected], SEED
+        )
+    except (FaultError, PlantError) as error:
+        raise ReplayError(str(error)) from error
+    loop = ClosedLoop(config, core.stepper, core.planner, device)
+    try:
+        loop.arm()
+        if not todo.is_driven:
+            loop.command("disable")
+    except (RuntimeError, RefusedError) as error:
+        raise ReplayError(f"the simulated device could not be prepared: {error}") from error
+    newest = next((setpoint for _, setpoint in todo.setpoints), None)
+    while loop.now_s < BEGINS_S:
+        # as if it had been asked for all along
+        loop.tick(None if newest is None else newest.replaced(stamp_s=loop.now_s, valid_for_s=1.0))
+    return _run(loop, todo, 1.0 / config.rates.control_hz)
+
+
+def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
+    happened = Happened({}, {}, [])
+    setpoints, commands = list(reversed(todo.setpoints)), list(reversed(todo.commands))
+    newest: TimedSetpoint | None = None
+    while (time_s := loop.now_s - BEGINS_S) < todo.lasts_s:
+        while commands and commands[-1][0] <= time_s:
+            _, name = commands.pop()
+            try:
+                loop.command(name)
+            except RefusedError as error:
+                happened.refused.append(f"{name} at {time_s:.3f} s: {error.message}")
+        while setpoints and setpoints[-1][0] <= time_s:
+            _, setpoint = setpoints.pop()
+            newest = None if setpoint is None else setpoint.replaced(stamp_s=setpoint.stamp_s + BEGINS_S)
+        sample = loop.tick(newest)
+        for fault in sample.state.safety.faults:
+            happened.faults.setdefault(str(fault), round(time_s, 3))
+        if sample.state.safety.operating_state in DRIVEN:
+            _add_limits(happened.limits, (*sample.plan.limits, *sample.output.limits), period_s)
+    return happened
+
+
+def _recorded(ticks: list[TickRecord]) -> Happened:
+    happened, first_s = Happened({}, {}, []), ticks[0].monotonic_s
+    before_s = first_s
+    for tick in ticks:
+        for fault in tick.faults:
+            happened.faults.setdefault(fault, round(tick.monotonic_s - first_s, 3))
+        _add_limits(happened.limits, tick.limits, tick.monotonic_s - before_s)
+        before_s = tick.monotonic_s
+    return happened
+
+
+def _add_limits(limits: dict[str, float], held: Sequence[str], time_s: float) -> None:
+    for limit in dict.fromkeys(map(str, held)):
+        limits[limit] = round(limits.get(limit, 0.0) + time_s, 6)
+
+
+def _moved(setpoint: TimedSetpoint, first_s: float) -> TimedSetpoint:
+    return setpoint.replaced(stamp_s=setpoint.stamp_s - first_s)
+
+
+def _hand(ticks: list[TickRecord]) -> RecordedHand:
+    """As the encoder of the handle saw it; it rests before, and after."""
+    times_s, positions_mm = [0.0], [0.0]
+    for tick in ticks:
+        if tick.sensed_s is not None and tick.device_handle_mm is not None:
+            time_s = BEGINS_S + tick.sensed_s - ticks[0].monotonic_s
+            if time_s > times_s[-1]:
+                if len(times_s) == 1:
+                    times_s.append(time_s - 1e-6)
+                    positions_mm[0] = tick.device_handle_mm
+                    positions_mm.append(tick.device_handle_mm)
+                times_s.append(time_s)
+                positions_mm.append(tick.device_handle_mm)
+    return RecordedHand(tuple(times_s), tuple(positions_mm))

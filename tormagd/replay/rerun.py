@@ -1,0 +1,295 @@
+"""The core over what it was given: bit for bit the same, or the first tick and field that differ."""
+
+from bisect import bisect_right
+from typing import Any, NamedTuple
+
+import msgspec
+
+from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
+from tormagd.control import journal
+from tormagd.control.core import Core
+from tormagd.control.device_fit import DeviceFit
+from tormagd.control.estimate import Estimate, Handle
+from tormagd.control.governor import GovernorState, TimedSetpoint
+from tormagd.control.homing import Homing
+from tormagd.control.periodicity import Guess, Periodicity, Skill
+from tormagd.control.pid import PidState
+from tormagd.control.plan import Outside, Plan, PlanState, Shown
+from tormagd.control.plausible import Leap
+from tormagd.control.sensor import Past, Sensor
+from tormagd.control.sensor_zero import Level, SensorZero
+from tormagd.control.sight import Sight
+from tormagd.control.slow_friction import SlowFriction
+from tormagd.control.step import StepOutput, StepState
+from tormagd.control.trajectory import Expected, Reference
+from tormagd.daemon.inference_loop import PLAN_ERRORS
+from tormagd.daemon.telemetry import tick_record
+from tormagd.exact import first_difference, kinds, packed, plain, restored
+from tormagd.hardware.link_quality import LinkQuality
+from tormagd.hardware.measurement import Measurement
+from tormagd.messages import TickRecord
+from tormagd.model.displacement import Turn
+from tormagd.recording.black_box import is_tick
+from tormagd.replay.rebuild import ReplayError
+from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.operating_state import (
+    Conditions,
+    DeviceRequest,
+    OperatingState,
+    RefusedError,
+    SafetyState,
+    latch,
+)
+
+KNOWN = kinds(
+    *(StepState, SafetyState, OperatingState, DeviceRequest, Fault, Limit, Estimate, Handle, Turn, Reference, Expected),
+    *(PidState, Sight, Leap, Homing, PlanState, GovernorState, Periodicity, Skill, Guess, Plan, Outside, Shown),
+    *(DeviceFit, Sensor, Past, SlowFriction, SensorZero, Level, Conditions, DeviceMode, Switches),
+)
+"All that the core's states consist of."
+UNTAKEN = (TypeError, AttributeError, ValueError, ArithmeticError, LookupError, RuntimeError, RecursionError)
+"What the core raises at values of a kind that no part of it makes."
+SETPOINT = tuple[float, float, float, float | None, float | None, tuple[float, ...], float, int, bool]
+NOT_THE_CORES = 1
+"The first column of a record is the clock's."
+
+
+class Difference(NamedTuple):
+    """Where a replay first gave something else. `tick` counts from 1 at the file's first, `time_s` from there."""
+
+    tick: int
+    time_s: float
+    field: str
+    recorded: str
+    replayed: str
+
+
+class Rerun(NamedTuple):
+    """What came of it: `ticks` were the same to the bit, from `from_s` to `to_s` after the file's first; `snapshots` of
+    the whole state were compared too; over `gaps` something is missing, and it went on from the next snapshot."""
+
+    ticks: int
+    from_s: float
+    to_s: float
+    snapshots: int
+    gaps: int
+    difference: Difference | None
+
+
+def ticks_of(columns: tuple[str, ...], entries: list[Any]) -> dict[int, TickRecord]:
+    """The records, by the place of their entry. Raises ReplayError."""
+    own = TickRecord.__struct_fields__
+    order = None if columns == own else [columns.index(name) for name in own]
+    records: dict[int, TickRecord] = {}
+    for place, entry in enumerate(entries):
+        if is_tick(entry):
+            if len(entry) != len(columns):
+                raise ReplayError(f"tick {len(records) + 1} has {len(entry)} values: allowed is {len(columns)}")
+            try:
+                row = entry if order is None else [entry[index] for index in order]
+                records[place] = msgspec.convert(row, TickRecord)
+            except msgspec.ValidationError as error:
+                raise ReplayError(f"tick {len(records) + 1}: {error}") from error
+    if not records:
+        raise ReplayError("there is no tick in it")
+    return records
+
+
+def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: float = 0.0) -> Rerun:
+    """Runs `core` from the newest snapshot that is not after `from_s`, or the first. Raises ReplayError."""
+    records = ticks_of(columns, entries)
+    places = list(records)
+    first_s = records[places[0]].monotonic_s
+    lasts_s = records[places[-1]].monotonic_s - first_s
+    if not 0.0 <= from_s <= lasts_s:
+        raise ReplayError(f"--from = {from_s:g}: allowed is 0..{lasts_s:.3f} s")
+    start = _start(entries, records, first_s + from_s)
+    running = _Running(core)
+    number = bisect_right(places, start)
+    from_s, ticks, to_s = records[places[number]].monotonic_s - first_s, 0, 0.0
+    for place in range(start, places[-1] + 1):
+        # a step's inputs stand in the record of its period, which comes after whatever else happened in that
+        record = records[places[number]]
+        time_s = record.monotonic_s - first_s
+        try:
+            differs = running.compare(record) if place in records else running.take(entries[place], record)
+        except RefusedError:
+            continue  # as it was then
+        except UNTAKEN as error:
+            raise ReplayError(
+                f"tick {number + 1}: the core does not take what stands there: {_short(error)}"
+            ) from error
+        if differs is not None:
+            difference = Difference(number + 1, round(time_s, 6), differs[0], _short(differs[1]), _short(differs[2]))
+            return Rerun(ticks, from_s, to_s, running.snapshots, running.gaps, difference)
+        if place in records:
+            number += 1
+            if running.is_known:
+                ticks, to_s = ticks + 1, time_s
+    return Rerun(ticks, from_s, to_s, running.snapshots, running.gaps, None)
+
+
+def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -> int:
+    """The place of the newest snapshot whose next tick is not after that, or of the first."""
+    found: int | None = None
+    waiting: int | None = None
+    for place, entry in enumerate(entries):
+        if _name(entry) == journal.STATE:
+            waiting = place
+        elif place in records and waiting is not None:
+            if found is not None and records[place].monotonic_s > until_s:
+                return found
+            found, waiting = waiting, None
+    if found is None:
+        raise ReplayError("there is no snapshot in it that is followed by a tick: under a second was kept")
+    return found
+
+
+class _Running:
+    """The core's states between two entries."""
+
+    def __init__(self, core: Core) -> None:
+        self._stepper, self._planner = core.stepper, core.planner
+        self._step: StepState = core.stepper.start(0.0)
+        self._plan: PlanState = core.planner.start(0.0)
+        self._used = self._plan
+        self._output: StepOutput | None = None
+        self._measurement: Measurement | None = None
+        self.is_known = False
+        "Whether the states are the recorded core's."
+        self.snapshots = self.gaps = 0
+
+    def take(self, entry: Any, record: TickRecord) -> tuple[str, Any, Any] | None:
+        """One entry that is no tick; what differs. `record` is the next tick's. Raises RefusedError, UNTAKEN."""
+        name = _name(entry)
+        if name == journal.STATE:
+            return self._begin(entry)
+        if name == journal.MISSING:
+            self.gaps += self.is_known
+            self.is_known = False
+        elif self.is_known:
+            return self._run(name, entry, record)
+        return None
+
+    def _run(self, name: str, entry: Any, record: TickRecord) -> tuple[str, Any, Any] | None:
+        match name:
+            case journal.STEP:
+                self._measurement = measurement_of(record)
+                self._used = self._plan
+                self._step, self._output = self._stepper.step(
+                    self._step, record.monotonic_s, self._measurement, self._used.plan
+                )
+            case journal.PLAN:
+                now_s, setpoint = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
+                timed = None if setpoint is None else TimedSetpoint(*setpoint)
+                try:
+                    self._plan = self._planner.plan(self._plan, now_s, timed, self._step.estimate)
+                except PLAN_ERRORS as error:
+                    return "plan", "made", f"failed: {error}"
+            case journal.FORESEE:
+                self._plan = self._planner.foresee(self._plan)
+            case journal.AFRESH:
+                afresh = self._planner.start(msgspec.convert(entry[1], float))
+                self._plan = afresh.replaced(plan=afresh.plan.replaced(number=self._plan.plan.number + 1))
+            case journal.TEACH:
+                self._plan = self._plan.replaced(shown=restored(entry[1], KNOWN))
+            case journal.COMMAND:
+                command, now_s, given = msgspec.convert(entry[1:], tuple[str, float, dict[str, Any]])
+                self._step = self._stepper.command(self._step, command, now_s, restored(given, KNOWN))
+            case journal.LATCH:
+                self._step = self._step.replaced(safety=latch(self._step.safety, (Fault(entry[1]),)))
+            case journal.LOSE_LINK:
+                self._step = self._stepper.lose_link(self._step)
+            case _:
+                raise ValueError(f"{name[:40]!r}: no entry of a black box")
+        return None
+
+    def compare(self, record: TickRecord) -> tuple[str, Any, Any] | None:
+        """The first column that differs from the recorded one."""
+        if not self.is_known:
+            return None
+        if self._output is None:
+            raise ValueError("a tick without a step")
+        timing = record.lateness_us, record.exec_us
+        plan, trim = self._used.plan, self._used.trim
+        given = tick_record(self._step.time_s, self._step, self._output, plan, trim, self._measurement, *timing)
+        left, right = msgspec.structs.astuple(record), msgspec.structs.astuple(given)
+        if packed(left[NOT_THE_CORES:]) == packed(right[NOT_THE_CORES:]):
+            return None
+        for name, recorded, replayed in zip(TickRecord.__struct_fields__, left, right, strict=True):
+            if name != TickRecord.__struct_fields__[0] and packed(recorded) != packed(replayed):
+                return name, recorded, replayed
+        return None
+
+    def _begin(self, entry: Any) -> tuple[str, Any, Any] | None:
+        """Compares the states with the recorded ones, and goes on from these."""
+        differs = None
+        if self.is_known:
+            self.snapshots += 1
+            for what, recorded, own in (("step", entry[1], self._step), ("plan", entry[2], self._plan)):
+                found = first_difference(recorded, plain(own))
+                if found is not None and differs is None:
+                    differs = f"state.{what}.{found[0]}", found[1], found[2]
+        step, plan = restored(entry[1], KNOWN), restored(entry[2], KNOWN)
+        if not isinstance(step, StepState) or not isinstance(plan, PlanState):
+            raise ValueError("a snapshot: allowed are a StepState and a PlanState")
+        self._step, self._plan, self.is_known = step, plan, True
+        return differs
+
+
+def measurement_of(record: TickRecord) -> Measurement | None:
+    """What the step was given."""
+    if record.measurement is None:
+        return None
+    told = [
+        record.received_s, record.device_time_s, record.device_left_mm, record.device_right_mm, record.left_current_A,
+        record.right_current_A, record.device_force_N, record.device_handle_mm, record.device_temperature_C,
+        record.supply_V, record.sensed_s, record.reported_s, record.delay_s, record.link_unanswered,
+        record.link_damaged, record.link_unsent, record.link_round_trip_s, record.device_clock_drift,
+    ]  # fmt: skip
+    numbers = [number for number in told if number is not None]
+    if len(numbers) < len(told) or record.device_mode is None:
+        raise ValueError("a measurement in parts: allowed is a whole one, or none")
+    (
+        received_s, device_time_s, left_mm, right_mm, left_A, right_A, force_N, handle_mm, temperature_C, supply_V,
+        sensed_s, reported_s, delay_s, *link,
+    ) = numbers  # fmt: skip
+    switches, faults = Switches(0), DeviceFault(0)
+    for name in record.device_switches:
+        switches |= Switches[name]
+    for name in record.device_faults:
+        faults |= DeviceFault[name]
+    return Measurement(
+        record.measurement,
+        received_s,
+        device_time_s,
+        left_mm,
+        right_mm,
+        left_A,
+        right_A,
+        force_N,
+        handle_mm,
+        DeviceMode[record.device_mode],
+        switches,
+        faults,
+        temperature_C,
+        supply_V,
+        sensed_s,
+        reported_s,
+        delay_s,
+        LinkQuality(*link),
+    )
+
+
+def _name(entry: Any) -> str:
+    """An entry's name; empty for a tick."""
+    if isinstance(entry, str):
+        return entry
+    if isinstance(entry, list) and entry and isinstance(entry[0], str):
+        return entry[0]
+    return ""
+
+
+def _short(thing: object) -> str:
+    text = str(thing) if isinstance(thing, Exception | str) else repr(thing)
+    return text if len(text) <= 200 else f"{text[:197]}..."
