@@ -3,12 +3,12 @@
 `plan` and `step` are pure, so nothing that they gave has to be kept: it stands in the tick's record, to compare with.
 """
 
-from collections.abc import Iterable, Sequence
+import struct
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 
-from firmware_protocol.value import Value
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import PlanState, Shown
 from tormagd.control.step import StepState
@@ -26,6 +26,10 @@ COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
 STATE, MISSING = "state", "missing"
 MOST_ENTRIES = 4_096
 "That nobody took: then the journal begins anew, and says that something is missing."
+
+_LENGTH = struct.Struct(">I")
+_NONE = b"\xdd" + _LENGTH.pack(0)
+"An array of none, in msgpack's form whose length has four bytes."
 
 Entry = str | TickRecord | tuple[Any, ...]
 
@@ -62,9 +66,9 @@ class Journal:
         """What the device has shown was put in the place of what was known of it."""
         self._add((TEACH, shown))
 
-    def commanded(self, name: str, now_s: float, conditions: Conditions) -> None:
+    def commanded(self, name: str, now_s: float, conditions: Conditions, *, is_refused: bool) -> None:
         """An operator's command was given, and taken or refused."""
-        self._add((COMMAND, name, now_s, conditions))
+        self._add((COMMAND, name, now_s, is_refused, conditions))
 
     def latched(self, fault: Fault) -> None:
         """A fault was latched that was found outside the step."""
@@ -95,20 +99,31 @@ class Journal:
         self._entries.append(entry)
 
 
-def encode_entries(entries: Sequence[Entry]) -> bytes:
-    """msgpack: an array of the entries. Values in it are as `exact` writes them; a setpoint is its fields alone."""
-    return _ENCODER.encode(entries)
+class Packer:
+    """msgpack: an array of entries, which grows tick by tick. Values in it are as `exact` writes them; a setpoint is
+    its fields alone, in the order of its constructor."""
+
+    def __init__(self) -> None:
+        self._bytes, self._count = bytearray(_NONE), 0
+
+    def add(self, entries: Sequence[Entry]) -> None:
+        """Writes some more. Raises TypeError, ValueError or OverflowError for what cannot be written."""
+        for entry in entries:
+            _ENCODER.encode_into(entry, self._bytes, -1)
+            self._count += 1
+
+    def take(self) -> bytes:
+        """The array, and begins a new one."""
+        _LENGTH.pack_into(self._bytes, 1, self._count)
+        packed = bytes(self._bytes)
+        self._bytes, self._count = bytearray(_NONE), 0
+        return packed
 
 
 def _of_value(thing: Any) -> Any:
     if type(thing) is TimedSetpoint:
-        return fields_of(thing)
+        return [getattr(thing, name) for name in thing.__match_args__]
     return plain(thing)
-
-
-def fields_of(value: Value) -> Iterable[Any]:
-    """In the order of its constructor."""
-    return [getattr(value, name) for name in value.__match_args__]
 
 
 _ENCODER = msgspec.msgpack.Encoder(enc_hook=_of_value)

@@ -38,7 +38,7 @@ def replay(
         raise usage_error(f"{path}: not done after {LONGEST_S:g} s", "is it a black box?") from error
     if done.returncode:
         lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-        raise usage_error(lines[-1], "give a file that tormagctl blackbox or the daemon has made")
+        raise usage_error(lines[-1], "tormagctl blackbox makes one, and the daemon on a fault; tormagctl replay --help")
     result: dict[str, Any] = msgspec.json.decode(done.stdout)
     notes = "".join(f"\nnot as it was: {each}" for each in result["differences"])
     if not result["is_complete"]:
@@ -62,14 +62,16 @@ def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
 
 
 def _instead(result: dict[str, Any]) -> str:
-    changes = ", ".join(result["settings"]) or "nothing changed"
+    told = {"recorded": result["recorded"], "simulated as configured then": result["simulated"]}
+    if result["instead"] is not None:
+        told[f"simulated with {', '.join(result['settings'])}"] = result["instead"]
+    lines = [f"{name}: {_happened(what)}" for name, what in told.items()]
+    faults = "".join(f", with {fault}" for fault in result["faults"])
     return "\n".join(
         (
-            f"recorded:                  {_happened(result['recorded'])}",
-            f"simulated, as configured:  {_happened(result['simulated'])}",
-            f"simulated, {changes}: {_happened(result['instead'])}",
-            f"The simulated device is {result['plant']} with the recorded setpoints, commands and handle; what it was "
-            "that the recorded one did, it does where --fault says so.",
+            *lines,
+            f"The simulated device is {result['plant']}{faults}, with the recorded setpoints, commands and handle. "
+            "What else the recorded device did, it does only where --fault says so.",
         )
     )
 

@@ -1,8 +1,8 @@
 """The black box: all that the core decides on is handed to another process, which keeps the newest of it.
 
-The control thread writes references into a journal; every 20 ticks, in the slack behind one, they become bytes and go
-into a socket. It waits for nobody: what the socket does not take is lost and counted. Files are the other's business,
-and it outlives this process, however that ends.
+The control thread writes references into a journal, which become bytes in the slack behind each tick; those of 20 ticks
+go into a socket. It waits for nobody: what the socket does not take is lost and counted. Files are the other's
+business, and it outlives this process, however that ends.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import Config
 from tormagd.control.core import Core, sources_hash
-from tormagd.control.journal import FORMAT, Journal, encode_entries
+from tormagd.control.journal import FORMAT, Journal, Packer
 from tormagd.control.plan import PlanState
 from tormagd.control.step import StepState
 from tormagd.daemon.profiles import state_folder
@@ -99,6 +99,7 @@ class BlackBox:
         else:
             self._start(Begin(str(folder), header), start)
         self.journal = Journal(is_kept=self._socket is not None)
+        self._packer = Packer()
         self._ticks = PART_TICKS // 2
         self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
         self._encoder = msgspec.msgpack.Encoder()
@@ -114,15 +115,15 @@ class BlackBox:
         if self._socket is None:
             return
         self.journal.ticked(record)
-        self._ticks += 1
-        if self._ticks % PART_TICKS:
-            return
         try:
-            entries = encode_entries(self.journal.take())
+            self._packer.add(self.journal.take())
         except (TypeError, ValueError, OverflowError) as error:  # control goes on, whatever is in it
             self._lose(f"an entry that cannot be written: {error}")
             return
-        is_taken = self._say(Part(record.monotonic_s, record.t_ns, self._has_state, entries))
+        self._ticks += 1
+        if self._ticks % PART_TICKS:
+            return
+        is_taken = self._say(Part(record.monotonic_s, record.t_ns, self._has_state, self._packer.take()))
         self._has_state = False
         if not is_taken:
             self._dropped += 1

@@ -10,7 +10,7 @@ from tormagd.daemon.rate_group import RateGroup
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import Conditions, latch
+from tormagd.safety.operating_state import Conditions, RefusedError, latch
 
 log = logging.getLogger(__name__)
 
@@ -48,8 +48,12 @@ class ControlLoop:
     def command(self, name: str, conditions: Conditions) -> None:
         """An operator's command. Raises RefusedError."""
         now_s = time.monotonic()
-        self._journal.commanded(name, now_s, conditions)
-        self.state = self._stepper.command(self.state, name, now_s, conditions)
+        try:
+            self.state = self._stepper.command(self.state, name, now_s, conditions)
+        except RefusedError:
+            self._journal.commanded(name, now_s, conditions, is_refused=True)
+            raise
+        self._journal.commanded(name, now_s, conditions, is_refused=False)
         log.info("%s: %s", name, self.state.safety.operating_state)
 
     def latch(self, fault: Fault) -> None:

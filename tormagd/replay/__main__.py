@@ -60,14 +60,17 @@ def _rerun(known: Recorded, box: BlackBoxFile, from_s: float) -> dict[str, Any]:
 def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) -> dict[str, Any]:
     todo = script(known.columns, box.entries)
     config = changed(known.config, options.settings)
-    as_it_was = rehearse(rebuilt(known), known.config, todo, options.plant, options.faults)
-    instead = rehearse(rebuilt(known, config), config, todo, options.plant, options.faults)
+    simulated = rehearse(rebuilt(known), known.config, todo, options.plant, options.faults)
+    instead = None
+    if options.settings:
+        instead = rehearse(rebuilt(known, config), config, todo, options.plant, options.faults)
     return {
         "plant": options.plant,
+        "faults": options.faults,
         "settings": options.settings,
         "recorded": todo.recorded._asdict(),
-        "simulated": as_it_was._asdict(),
-        "instead": instead._asdict(),
+        "simulated": simulated._asdict(),
+        "instead": None if instead is None else instead._asdict(),
     }
 
 

@@ -25,7 +25,9 @@ from tormagd.simulation.hand import RecordedHand
 from tormagd.simulation.parameters import PlantError, load_plant
 
 BEGINS_S = 15.0
-"In virtual time: the device is homed by then, and renders the first setpoint where it did at the file's beginning."
+"In virtual time: by then the device is homed, and renders the first setpoint, where it did at the file's beginning."
+PATIENCE_S = 0.5
+"A command that is refused is given again for so long: the simulated device may come to a rest later, and it was taken."
 SEED = 1
 DRIVEN = (OperatingState.ENABLED, OperatingState.PAUSED)
 
@@ -43,10 +45,12 @@ class Script(NamedTuple):
     """What a black box's core was asked for: times in s from its first tick."""
 
     lasts_s: float
+    is_homed: bool
     is_driven: bool
     hand: RecordedHand
     setpoints: list[tuple[float, TimedSetpoint | None]]
     commands: list[tuple[float, str]]
+    "Those that were taken."
     recorded: Happened
 
 
@@ -86,12 +90,21 @@ def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
                 now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
                 setpoints.append((now_s - first_s, None if fields is None else _moved(TimedSetpoint(*fields), first_s)))
             elif isinstance(entry, list) and entry and entry[0] == journal.COMMAND:
-                name, now_s = msgspec.convert(entry[1:3], tuple[str, float])
-                commands.append((now_s - first_s, name))
+                name, now_s, was_refused = msgspec.convert(entry[1:4], tuple[str, float, bool])
+                if not was_refused:
+                    commands.append((now_s - first_s, name))
     except msgspec.ValidationError as error:
         raise ReplayError(str(error)) from error
-    is_driven = ticks[0].operating_state in DRIVEN
-    return Script(ticks[-1].monotonic_s - first_s, is_driven, _hand(ticks), setpoints, commands, _recorded(ticks))
+    met = next((tick for tick in ticks if tick.measurement is not None), ticks[0])
+    return Script(
+        lasts_s=ticks[-1].monotonic_s - first_s,
+        is_homed=met.left_mm is not None,
+        is_driven=ticks[0].operating_state in DRIVEN,
+        hand=_hand(ticks),
+        setpoints=setpoints,
+        commands=commands,
+        recorded=_recorded(ticks),
+    )
 
 
 def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Sequence[str]) -> Happened:
@@ -106,12 +119,13 @@ def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Seque
         raise ReplayError(str(error)) from error
     loop = ClosedLoop(config, core.stepper, core.planner, device)
     try:
-        loop.arm()
-        if not todo.is_driven:
-            loop.command("disable")
+        if todo.is_homed or todo.is_driven:
+            loop.arm()
+            if not todo.is_driven:
+                loop.command("disable")
     except (RuntimeError, RefusedError) as error:
         raise ReplayError(f"the simulated device could not be prepared: {error}") from error
-    newest = next((setpoint for _, setpoint in todo.setpoints), None)
+    newest = next((setpoint for _, setpoint in todo.setpoints), None) if todo.is_driven else None
     while loop.now_s < BEGINS_S:
         # as if it had been asked for all along
         loop.tick(None if newest is None else newest.replaced(stamp_s=loop.now_s, valid_for_s=1.0))
@@ -124,11 +138,14 @@ def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
     newest: TimedSetpoint | None = None
     while (time_s := loop.now_s - BEGINS_S) < todo.lasts_s:
         while commands and commands[-1][0] <= time_s:
-            _, name = commands.pop()
+            at_s, name = commands[-1]
             try:
                 loop.command(name)
             except RefusedError as error:
-                happened.refused.append(f"{name} at {time_s:.3f} s: {error.message}")
+                if time_s - at_s < PATIENCE_S:
+                    break
+                happened.refused.append(f"{name} at {at_s:.3f} s: {error.message}")
+            commands.pop()
         while setpoints and setpoints[-1][0] <= time_s:
             _, setpoint = setpoints.pop()
             newest = None if setpoint is None else setpoint.replaced(stamp_s=setpoint.stamp_s + BEGINS_S)

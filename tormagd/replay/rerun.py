@@ -113,8 +113,6 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
         time_s = record.monotonic_s - first_s
         try:
             differs = running.compare(record) if place in records else running.take(entries[place], record)
-        except RefusedError:
-            continue  # as it was then
         except UNTAKEN as error:
             raise ReplayError(
                 f"tick {number + 1}: the core does not take what stands there: {_short(error)}"
@@ -160,7 +158,7 @@ class _Running:
         self.snapshots = self.gaps = 0
 
     def take(self, entry: Any, record: TickRecord) -> tuple[str, Any, Any] | None:
-        """One entry that is no tick; what differs. `record` is the next tick's. Raises RefusedError, UNTAKEN."""
+        """One entry that is no tick; what differs. `record` is the next tick's. Raises UNTAKEN."""
         name = _name(entry)
         if name == journal.STATE:
             return self._begin(entry)
@@ -194,8 +192,13 @@ class _Running:
             case journal.TEACH:
                 self._plan = self._plan.replaced(shown=restored(entry[1], KNOWN))
             case journal.COMMAND:
-                command, now_s, given = msgspec.convert(entry[1:], tuple[str, float, dict[str, Any]])
-                self._step = self._stepper.command(self._step, command, now_s, restored(given, KNOWN))
+                command, now_s, was_refused, given = msgspec.convert(entry[1:], tuple[str, float, bool, dict[str, Any]])
+                try:
+                    self._step = self._stepper.command(self._step, command, now_s, restored(given, KNOWN))
+                except RefusedError as error:
+                    return None if was_refused else (command, "taken", f"refused: {error.message}")
+                if was_refused:
+                    return command, "refused", "taken"
             case journal.LATCH:
                 self._step = self._step.replaced(safety=latch(self._step.safety, (Fault(entry[1]),)))
             case journal.LOSE_LINK:

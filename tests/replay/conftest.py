@@ -1,0 +1,62 @@
+"""What the replay's tests share: one core, and one flight that ended with a fault."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from flight import Flight
+
+from tormagd.closed_loop import ClosedLoop
+from tormagd.config import Config
+from tormagd.control.core import Core, build_core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.faults import parse_fault
+from tormagd.simulation.hand import ReversingHand
+from tormagd.simulation.parameters import load_plant
+
+Fly = Callable[..., Flight]
+
+
+def asked(now_s: float) -> TimedSetpoint:
+    """A pulse at 250 Hz."""
+    stamp_s = math.floor(now_s * 250.0) / 250.0
+    return TimedSetpoint(1.3 + 0.3 * math.sin(math.tau * 1.2 * stamp_s), stamp_s, 0.1)
+
+
+@pytest.fixture(scope="session")
+def core() -> Core:
+    return build_core(Config())
+
+
+@pytest.fixture(scope="session")
+def fly(core: Core) -> Fly:
+    """A flight of a simulated device with these faults, armed, which renders a pulse until `until_s`."""
+
+    def make(*faults: str, until_s: float = 6.0, silent_s: float = 0.0) -> Flight:
+        config = Config()
+        device = VirtualDevice(load_plant("sample_1"), ReversingHand(2.0), [parse_fault(it) for it in faults], 1)
+        flight = Flight(config, core, ClosedLoop(config, core.stepper, core.planner, device))
+        flight.arm()
+        while flight.loop.now_s < until_s:
+            flight.tick(asked(flight.loop.now_s))
+        for _ in range(round(silent_s * 1e3)):
+            flight.loop.skip()
+        for _ in range(200 if silent_s else 0):
+            flight.tick(asked(flight.loop.now_s))
+        return flight
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def ended(fly: Fly) -> Flight:
+    """Both encoders jump: ENCODER at 4.5 s."""
+    return fly("encoder_jump@4.5", until_s=5.5)
+
+
+@pytest.fixture(scope="session")
+def path(ended: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its black box."""
+    return ended.write(tmp_path_factory.mktemp("boxes") / "ended.mcap")

@@ -1,0 +1,102 @@
+"""A run in virtual time with its black box: what the daemon does with its journal, done around the closed loop."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.config import Config
+from tormagd.control.core import Core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.control.journal import Journal, Packer
+from tormagd.daemon.black_box import header
+from tormagd.daemon.telemetry import tick_record
+from tormagd.keeping import Part
+from tormagd.recording.black_box import write_black_box
+from tormagd.recording.keeper import Ring
+from tormagd.safety.operating_state import RefusedError
+
+PART_TICKS, SNAPSHOT_TICKS = 20, 500
+
+
+class Flight:
+    """A closed loop that is written down."""
+
+    def __init__(self, config: Config, core: Core, loop: ClosedLoop) -> None:
+        self.config, self.core, self.loop = config, core, loop
+        self.ring, self._journal, self._ticks = Ring(), Journal(), 0
+        self._remember()
+
+    def tick(self, setpoint: TimedSetpoint | None = None) -> Sample:
+        """One control period."""
+        before = self.loop.plan_state
+        assert before is not None
+        self._journal.stepped()
+        sample = self.loop.tick(setpoint)
+        planned = self.loop.plan_state
+        assert planned is not None
+        if planned.plan is not before.plan:
+            self._journal.planned(sample.time_s, setpoint)
+            self._journal.foresaw()
+        measured = self.loop.measurement
+        record = tick_record(
+            sample.time_s, self.loop.step_state, sample.output, sample.plan, before.trim, measured, 0.0, 0.0
+        )
+        self._journal.ticked(record)
+        self._ticks += 1
+        if self._ticks % PART_TICKS == 0:
+            has_state = self._ticks % SNAPSHOT_TICKS == PART_TICKS
+            self.ring.put(Part(sample.time_s, record.t_ns, has_state, self._packed()))
+            if self._ticks % SNAPSHOT_TICKS == 0:
+                self._remember()
+        return sample
+
+    def _remember(self) -> None:
+        assert self.loop.plan_state is not None
+        self._journal.snapshot(self.loop.step_state, self.loop.plan_state)
+
+    def _packed(self) -> bytes:
+        packer = Packer()
+        packer.add(self._journal.take())
+        return packer.take()
+
+    def command(self, name: str) -> None:
+        """An operator's command, taken or refused."""
+        conditions, is_refused = self.loop.conditions(), False
+        try:
+            self.loop.command(name)
+        except RefusedError:
+            is_refused = True
+        self._journal.commanded(name, self.loop.now_s, conditions, is_refused=is_refused)
+
+    def until(self, reached: Callable[[], bool]) -> None:
+        """Ticks until then."""
+        for _ in range(10_000):
+            self.tick()
+            if reached():
+                return
+        raise AssertionError("it did not come to that")
+
+    def arm(self) -> None:
+        """As an operator does."""
+        self.until(lambda: self.loop.measurement is not None)
+        self.command("enable")  # not homed: a refusal is part of what happened
+        self.command("home")
+        self.until(lambda: self.loop.measurement is not None and self.loop.measurement.is_busy)
+        self.until(lambda: not self.loop.measurement.is_busy and self.loop.measurement.is_homed)  # type: ignore[union-attr]
+        self.command("enable")
+
+    def write(self, path: Path, **changes: str) -> Path:
+        """Its black box; `changes` are of the header."""
+        write_black_box(path, {**header(self.config, self.core), "reason": "TEST", **changes}, self.ring.parts())
+        return path
+
+
+def planted(box_entries: list[Any], tick: int, column: int, value: Any) -> list[Any]:
+    """The entries with one value of one tick (1 is the first) changed."""
+    entries, seen = [], 0
+    for entry in box_entries:
+        is_tick = isinstance(entry, list) and type(entry[0]) is int
+        seen += is_tick
+        entries.append([*entry[:column], value, *entry[column + 1 :]] if is_tick and seen == tick else entry)
+    return entries
