@@ -4,6 +4,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from firmware_protocol.codec import DriveMode
+from tormagd.control.journal import Journal
 from tormagd.control.step import StepOutput, StepState
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.safety.operating_state import DeviceRequest
@@ -23,7 +24,7 @@ def test_the_measurement_that_a_step_was_given_is_kept_though_the_exchange_bring
     connection.exchange = exchange
     connection.receive = lambda: given.append("received")
     stepper: Any = SimpleNamespace(start=StepState, step=step)
-    loop = ControlLoop(stepper, connection, 1_000_000)
+    loop = ControlLoop(stepper, connection, 1_000_000, Journal())
     plan: Any = None
     for seen in ("old", "new"):
         loop.tick(0, 0, plan)

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from tormagd.control.governor import GovernorState, TimedSetpoint
+from tormagd.control.journal import Journal
 from tormagd.control.plan import Plan, PlanState
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.inference_loop import InferenceLoop
@@ -30,7 +31,10 @@ class Rig:
         endpoint: Any = SimpleNamespace(
             drain_setpoints=self.drain, is_flooded=False, inbox=SimpleNamespace(newest=None)
         )
-        self.loop = InferenceLoop(planner, endpoint, DUE_NS, 0.0, lambda: self.now_ns, on_failure=pytest.fail)
+        self.journal = Journal()
+        self.loop = InferenceLoop(
+            planner, endpoint, DUE_NS, 0.0, lambda: self.now_ns, journal=self.journal, on_failure=pytest.fail
+        )
 
     def plan(self, *_arguments: Any) -> None:
         self.planned_ns.append(self.now_ns)
@@ -163,7 +167,16 @@ def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on
         start=lambda now_s: PlanState(GovernorState(now_s, 0.5), resting), plan=plan, foresee=lambda state: state
     )
     endpoint: Any = SimpleNamespace(drain_setpoints=rig.drain, is_flooded=False, inbox=inbox)
-    loop = InferenceLoop(planner, endpoint, DUE_NS, 0.0, lambda: rig.now_ns, on_failure=lambda: failures.append(None))
+    journal = Journal()
+    loop = InferenceLoop(
+        planner,
+        endpoint,
+        DUE_NS,
+        0.0,
+        lambda: rig.now_ns,
+        journal=journal,
+        on_failure=lambda: failures.append(None),
+    )
     inbox.newest = TimedSetpoint(1.0, 0.0, 0.1)
     rig.has_arrived = True
     loop.after_tick(None)
@@ -172,3 +185,6 @@ def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on
     rig.has_arrived = True
     loop.after_tick(None)
     assert (len(failures), inbox.refused, loop.state.plan.number) == (1, 1, 2)
+    # and it is written down in that order: what a replay has to do
+    first_s = rig.now_ns * 1e-9
+    assert journal.take() == [("afresh", first_s), ("plan", first_s, None)]

@@ -1,10 +1,14 @@
 """What the replay's tests share: one core, and one flight that ended with a fault."""
 
 import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
 from flight import Flight
 
 from tormagd.closed_loop import ClosedLoop
@@ -34,7 +38,7 @@ def core() -> Core:
 def fly(core: Core) -> Fly:
     """A flight of a simulated device with these faults, armed, which renders a pulse until `until_s`."""
 
-    def make(*faults: str, until_s: float = 6.0, silent_s: float = 0.0) -> Flight:
+    def make(*faults: str, until_s: float, silent_s: float = 0.0) -> Flight:
         config = Config()
         device = VirtualDevice(load_plant("sample_1"), ReversingHand(2.0), [parse_fault(it) for it in faults], 1)
         flight = Flight(config, core, ClosedLoop(config, core.stepper, core.planner, device))
@@ -52,8 +56,8 @@ def fly(core: Core) -> Fly:
 
 @pytest.fixture(scope="session")
 def ended(fly: Fly) -> Flight:
-    """Both encoders jump: ENCODER at 4.5 s."""
-    return fly("encoder_jump@4.5", until_s=5.5)
+    """Both encoders jump: ENCODER at 3.5 s."""
+    return fly("encoder_jump@3.5", until_s=4.0)
 
 
 @pytest.fixture(scope="session")

@@ -43,6 +43,7 @@ BUFFER_BYTES = 4_000_000
 "What the kernel is asked to keep for a process that is held up; it may grant less, which is a third of a second."
 LEAVING_S = 2.0
 MOST_ASKED = 8
+GONE = "the process that keeps it has ended"
 ASKED = "REQUEST"
 
 log = logging.getLogger(__name__)
@@ -154,11 +155,10 @@ class BlackBox:
                 data = self._socket.recv(65_536)
             except BlockingIOError:
                 return
-            except OSError as error:
-                self._lose(error.strerror or str(error))
-                return
+            except OSError:
+                data = b""
             if not data:
-                self._lose("the process that keeps it has ended")
+                self._lose(GONE)
                 return
             answer = msgspec.msgpack.decode(data, type=Written)
             self._refusal = answer.refusal
@@ -223,7 +223,7 @@ class BlackBox:
         except OSError as error:
             if not isinstance(error, BrokenPipeError | ConnectionError):
                 return False  # more than a packet holds
-            self._lose("the process that keeps it has ended")
+            self._lose(GONE)
             return False
         return True
 

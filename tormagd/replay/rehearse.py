@@ -24,8 +24,9 @@ from tormagd.simulation.faults import FaultError, parse_fault
 from tormagd.simulation.hand import RecordedHand
 from tormagd.simulation.parameters import PlantError, load_plant
 
-BEGINS_S = 15.0
-"In virtual time: by then the device is homed, and renders the first setpoint, where it did at the file's beginning."
+HOMED_S, CONNECTED_S = 8.0, 0.5
+"""In virtual time: by then the device is homed, and renders the first setpoint where the recorded one did at the file's
+beginning; or it is only connected, where that was not homed."""
 PATIENCE_S = 0.5
 "A command that is refused is given again for so long: the simulated device may come to a rest later, and it was taken."
 SEED = 1
@@ -52,6 +53,11 @@ class Script(NamedTuple):
     commands: list[tuple[float, str]]
     "Those that were taken."
     recorded: Happened
+
+    @property
+    def begins_s(self) -> float:
+        """When its first tick is, in virtual time."""
+        return HOMED_S if self.is_homed else CONNECTED_S
 
 
 def changed(config: Config, settings: Sequence[str]) -> Config:
@@ -96,10 +102,11 @@ def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
     except msgspec.ValidationError as error:
         raise ReplayError(str(error)) from error
     met = next((tick for tick in ticks if tick.measurement is not None), ticks[0])
+    is_driven = ticks[0].operating_state in DRIVEN
     return Script(
         lasts_s=ticks[-1].monotonic_s - first_s,
-        is_homed=met.left_mm is not None,
-        is_driven=ticks[0].operating_state in DRIVEN,
+        is_homed=is_driven or met.left_mm is not None,
+        is_driven=is_driven,
         hand=_hand(ticks),
         setpoints=setpoints,
         commands=commands,
@@ -112,21 +119,22 @@ def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Seque
     file's first tick. Raises ReplayError."""
     try:
         injected = [parse_fault(fault) for fault in faults]
-        device = VirtualDevice(
-            load_plant(plant), todo.hand, [fault._replace(at_s=fault.at_s + BEGINS_S) for fault in injected], SEED
-        )
+        delayed = [fault._replace(at_s=fault.at_s + todo.begins_s) for fault in injected]
+        device = VirtualDevice(load_plant(plant), _later(todo.hand, todo.begins_s), delayed, SEED)
     except (FaultError, PlantError) as error:
         raise ReplayError(str(error)) from error
     loop = ClosedLoop(config, core.stepper, core.planner, device)
     try:
-        if todo.is_homed or todo.is_driven:
+        if todo.is_homed:
             loop.arm()
             if not todo.is_driven:
                 loop.command("disable")
     except (RuntimeError, RefusedError) as error:
         raise ReplayError(f"the simulated device could not be prepared: {error}") from error
     newest = next((setpoint for _, setpoint in todo.setpoints), None) if todo.is_driven else None
-    while loop.now_s < BEGINS_S:
+    if loop.now_s > todo.begins_s:
+        raise ReplayError(f"the simulated device took {loop.now_s:.1f} s to home: allowed is {todo.begins_s:g} s")
+    while loop.now_s < todo.begins_s:
         # as if it had been asked for all along
         loop.tick(None if newest is None else newest.replaced(stamp_s=loop.now_s, valid_for_s=1.0))
     return _run(loop, todo, 1.0 / config.rates.control_hz)
@@ -136,7 +144,7 @@ def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
     happened = Happened({}, {}, [])
     setpoints, commands = list(reversed(todo.setpoints)), list(reversed(todo.commands))
     newest: TimedSetpoint | None = None
-    while (time_s := loop.now_s - BEGINS_S) < todo.lasts_s:
+    while (time_s := loop.now_s - todo.begins_s) < todo.lasts_s:
         while commands and commands[-1][0] <= time_s:
             at_s, name = commands[-1]
             try:
@@ -148,7 +156,7 @@ def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
             commands.pop()
         while setpoints and setpoints[-1][0] <= time_s:
             _, setpoint = setpoints.pop()
-            newest = None if setpoint is None else setpoint.replaced(stamp_s=setpoint.stamp_s + BEGINS_S)
+            newest = None if setpoint is None else setpoint.replaced(stamp_s=setpoint.stamp_s + todo.begins_s)
         sample = loop.tick(newest)
         for fault in sample.state.safety.faults:
             happened.faults.setdefault(str(fault), round(time_s, 3))
@@ -179,15 +187,13 @@ def _moved(setpoint: TimedSetpoint, first_s: float) -> TimedSetpoint:
 
 def _hand(ticks: list[TickRecord]) -> RecordedHand:
     """As the encoder of the handle saw it; it rests before, and after."""
-    times_s, positions_mm = [0.0], [0.0]
+    places: dict[float, float] = {}
     for tick in ticks:
         if tick.sensed_s is not None and tick.device_handle_mm is not None:
-            time_s = BEGINS_S + tick.sensed_s - ticks[0].monotonic_s
-            if time_s > times_s[-1]:
-                if len(times_s) == 1:
-                    times_s.append(time_s - 1e-6)
-                    positions_mm[0] = tick.device_handle_mm
-                    positions_mm.append(tick.device_handle_mm)
-                times_s.append(time_s)
-                positions_mm.append(tick.device_handle_mm)
-    return RecordedHand(tuple(times_s), tuple(positions_mm))
+            places.setdefault(tick.sensed_s - ticks[0].monotonic_s, tick.device_handle_mm)
+    times_s = sorted(places) or [0.0]
+    return RecordedHand(tuple(times_s), tuple(places.get(time_s, 0.0) for time_s in times_s))
+
+
+def _later(hand: RecordedHand, by_s: float) -> RecordedHand:
+    return RecordedHand(tuple(time_s + by_s for time_s in hand.times_s), hand.positions_mm)

@@ -1,0 +1,171 @@
+"""The daemon's side of the black box: it waits for nobody, and what is lost is said."""
+
+import socket
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+
+from tormagd.config import Config
+from tormagd.control.core import Core, build_core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.control.journal import MOST_ENTRIES, Journal
+from tormagd.daemon.black_box import PART_TICKS, BlackBox, black_box_folder
+from tormagd.daemon.telemetry import tick_record
+from tormagd.keeping import Begin, End, Part, Said, Write, Written
+from tormagd.safety.operating_state import RefusedError
+
+
+@pytest.fixture(scope="module")
+def core() -> Core:
+    return build_core(Config())
+
+
+class Rig:
+    """A black box, whose other process is this one."""
+
+    def __init__(self, core: Core) -> None:
+        self.waited = 0
+        self.step, self.plan = core.stepper.start(0.0), core.planner.start(0.0)
+        self.step, self.output = core.stepper.step(self.step, 1.0, None, self.plan.plan)
+        self.box = BlackBox(Path("/boxes"), {"format": "1"}, 1_000, self.start)
+        self.box.begin(self.step, self.plan)
+
+    def start(self, its: socket.socket) -> Any:
+        self.its = its.dup()
+        self.its.setblocking(False)
+        return SimpleNamespace(wait=self.wait)
+
+    def wait(self, _timeout_s: float) -> None:
+        self.waited += 1
+
+    def tick(self, times: int = 1) -> None:
+        for _ in range(times):
+            self.box.journal.stepped()
+            record = tick_record(1.0, self.step, self.output, self.plan.plan, 1.0, None, 0.0, 0.0)
+            self.box.ticked(record, self.step, self.plan)
+
+    def heard(self) -> list[Said]:
+        said: list[Said] = []
+        while True:
+            try:
+                data = self.its.recv(4_000_000)
+            except BlockingIOError:
+                return said
+            if not data:
+                return said
+            said.append(msgspec.msgpack.decode(data, type=Said))
+
+
+@pytest.fixture
+def rig(core: Core) -> Rig:
+    return Rig(core)
+
+
+def names(part: Part) -> list[str]:
+    entries = msgspec.msgpack.decode(part.entries)
+    return [each if isinstance(each, str) else each[0] if isinstance(each[0], str) else "tick" for each in entries]
+
+
+def test_parts_have_the_ticks_in_their_order_and_a_state_every_second(rig: Rig) -> None:
+    rig.tick(PART_TICKS // 2 - 1)
+    rig.box.journal.planned(1.0, TimedSetpoint(1.5, 1.0, 0.1))
+    first, *parts = rig.heard()
+    for _ in range(302):
+        rig.tick(10)
+        parts += rig.heard()
+    assert first == Begin("/boxes", {"format": "1"})
+    assert all(isinstance(part, Part) for part in parts)
+    assert names(parts[0])[:3] == ["state", "step", "tick"]
+    assert names(parts[0])[-3:] == ["plan", "step", "tick"]
+    assert [number for number, part in enumerate(parts) if part.has_state] == [0, 50, 100, 150]
+    assert all(("state" in names(part)) == part.has_state for part in parts)
+    assert sum(names(part).count("tick") for part in parts) == 3_010
+
+
+def test_what_the_other_process_does_not_take_is_counted_and_control_goes_on(rig: Rig) -> None:
+    while not rig.box.report().dropped:
+        rig.tick(PART_TICKS)
+    rig.heard()
+    rig.tick(2 * PART_TICKS)
+    after = rig.heard()
+    assert names(after[0])[:2] == ["missing", "state"]
+    assert after[0].has_state
+    assert not after[1].has_state
+
+
+def test_a_request_waits_for_a_process_that_is_held_up(rig: Rig) -> None:
+    while not rig.box.report().dropped:
+        rig.tick(PART_TICKS)
+    path = rig.box.write("SKEW", 2.0, {"firmware": "1.0"})
+    assert path.parent == Path("/boxes")
+    assert path.name.endswith("Z-SKEW.mcap")
+    assert not any(isinstance(said, Write) for said in rig.heard())
+    rig.box.look()
+    assert rig.heard() == [Write(path.name, "SKEW", 2.0, {"firmware": "1.0"})]
+    rig.its.send(msgspec.msgpack.encode(Written(path.name)))
+    rig.box.look()
+    assert (rig.box.report().newest, rig.box.report().refusal) == (path.name, "")
+    rig.its.send(msgspec.msgpack.encode(Written("b.mcap", "No space left on device")))
+    rig.box.look()
+    assert (rig.box.report().newest, rig.box.report().refusal) == (path.name, "No space left on device")
+
+
+@pytest.mark.parametrize("notices", ["look", "tick"])
+def test_a_process_that_ends_is_named_and_nothing_piles_up(rig: Rig, notices: str) -> None:
+    rig.its.close()
+    rig.box.look() if notices == "look" else rig.tick(PART_TICKS)
+    assert "ended" in rig.box.report().refusal
+    rig.tick(100)
+    assert rig.box.journal.take() == []
+    with pytest.raises(RefusedError, match="has ended"):
+        rig.box.write("REQUEST", 0.0, {})
+    rig.box.close()
+
+
+def test_an_entry_that_cannot_be_written_ends_the_box_and_not_control(rig: Rig) -> None:
+    rig.box.journal.taught(SimpleNamespace())  # type: ignore[arg-type]
+    rig.tick()
+    assert "cannot be written" in rig.box.report().refusal
+    rig.tick(100)
+
+
+def test_it_says_when_it_ends(rig: Rig) -> None:
+    rig.heard()
+    rig.box.close()
+    assert rig.heard() == [End()]
+    assert rig.waited == 1
+
+
+def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    assert black_box_folder("") is None
+    box = BlackBox(None, {}, 1_000)
+    box.begin(core.stepper.start(0.0), core.planner.start(0.0))
+    box.journal.stepped()
+    assert box.journal.take() == []
+    with pytest.raises(RefusedError, match="no folder is named"):
+        box.write("REQUEST", 0.0, {})
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/tormag:/more")
+    assert black_box_folder("") == Path("/var/lib/tormag/blackbox")
+    assert black_box_folder("/elsewhere") == Path("/elsewhere")
+
+
+def test_a_process_that_does_not_start_is_no_reason_not_to_run(core: Core) -> None:
+    def fail(_its: socket.socket) -> Any:
+        raise OSError(11, "Resource temporarily unavailable")
+
+    box = BlackBox(Path("/boxes"), {}, 1_000, fail)
+    assert "did not start" in box.report().refusal
+    box.close()
+
+
+def test_a_journal_that_nobody_takes_is_bounded_and_says_so() -> None:
+    journal = Journal()
+    for _ in range(3 * MOST_ENTRIES + 5):
+        journal.stepped()
+    entries = journal.take()
+    assert len(entries) < MOST_ENTRIES
+    assert entries[0] == ("missing",)

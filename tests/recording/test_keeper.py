@@ -1,0 +1,122 @@
+"""The process that keeps the black box: bounded, and it outlives the daemon."""
+
+import json
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
+from tormagd.recording.black_box import read_black_box
+from tormagd.recording.keeper import DIED, KEPT_S, MOST_BYTES, MOST_FILES, Ring
+
+PATIENCE_S = 60.0
+HEADER = {"columns": json.dumps(["t_ns", "x"]), "config": "{}"}
+
+
+def part(time_s: float, size: int = 100) -> Part:
+    return Part(time_s, round(time_s * 1e9), True, bytes(size))
+
+
+def test_the_ring_keeps_half_a_minute_of_a_day() -> None:
+    ring, sizes = Ring(), []
+    for number in range(100_000):
+        ring.put(part(0.02 * number))
+        sizes.append(len(ring.parts()) if number % 10_000 == 0 else 0)
+    parts = ring.parts()
+    assert parts[-1].time_s - parts[0].time_s == pytest.approx(KEPT_S, abs=0.021)
+    assert ring.bytes == sum(len(each.entries) for each in parts)
+
+
+def test_the_ring_holds_no_more_bytes_than_it_may() -> None:
+    ring = Ring()
+    for number in range(300):
+        ring.put(part(0.001 * number, 1_000_000))
+    assert MOST_BYTES - 1_000_000 < ring.bytes <= MOST_BYTES
+    ring.put(part(1.0, MOST_BYTES + 1))
+    assert [each.time_s for each in ring.parts()] == [1.0]  # the newest is always there
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 2.0), st.integers(0, 60)), max_size=60))
+def test_neither_bound_is_passed(steps: list[tuple[float, int]]) -> None:
+    ring, now_s = Ring(5.0, 200), 0.0
+    for step_s, size in steps:
+        now_s += step_s
+        ring.put(part(now_s, size))
+        parts = ring.parts()
+        assert ring.bytes == sum(len(each.entries) for each in parts) <= 200
+        assert parts[-1].time_s - parts[0].time_s <= 5.0
+        assert parts[-1].time_s == now_s
+
+
+class Process:
+    """A keeper, and the daemon's end of its socket."""
+
+    def __init__(self) -> None:
+        self.ours, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.ours.settimeout(PATIENCE_S)
+        with its:
+            number = its.fileno()
+            command = [sys.executable, "-P", "-m", KEEPER, str(number)]
+            self.child = subprocess.Popen(command, pass_fds=(number,), stderr=subprocess.PIPE, text=True)
+
+    def say(self, *words: Said) -> None:
+        for word in words:
+            self.ours.send(msgspec.msgpack.encode(word))
+
+    def heard(self) -> Written:
+        return msgspec.msgpack.decode(self.ours.recv(65_536), type=Written)
+
+
+@pytest.fixture
+def process() -> Iterator[Process]:
+    made = Process()
+    yield made
+    made.ours.close()
+    if made.child.poll() is None:
+        made.child.kill()
+    made.child.communicate()
+
+
+def ticks(first: int, count: int) -> Part:
+    entries = [item for number in range(first, first + count) for item in ("step", [number, 0.5])]
+    return Part(first * 1e-3, first, True, msgspec.msgpack.encode(entries))
+
+
+def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process, tmp_path: Path) -> None:
+    folder = tmp_path / "boxes"
+    folder.mkdir()
+    for number in range(MOST_FILES + 3):
+        (folder / f"20200101T0000{number:02d}.000Z-OLD.mcap").touch()
+    process.say(Begin(str(folder), HEADER), ticks(1, 20), ticks(21, 20))
+    process.say(Write("20300101T000000.000Z-SKEW.mcap", "SKEW", 0.0, {"firmware": "1.2"}))
+    assert process.heard() == Written("20300101T000000.000Z-SKEW.mcap")
+    box = read_black_box(folder / "20300101T000000.000Z-SKEW.mcap")
+    assert (box.header["reason"], box.header["firmware"], box.is_complete) == ("SKEW", "1.2", True)
+    assert [entry[0] for entry in box.entries if entry != "step"] == list(range(1, 41))
+    assert len(list(folder.iterdir())) == MOST_FILES
+    # a name that is taken, or a folder that is none, says so
+    process.say(Write("20300101T000000.000Z-SKEW.mcap", "SKEW", 0.0, {}))
+    assert "exists" in process.heard().refusal
+    process.say(Begin(str(folder / "20300101T000000.000Z-SKEW.mcap"), HEADER))
+    process.say(Write("x.mcap", "SKEW", 0.0, {}))
+    assert "x.mcap" in process.heard().refusal
+    # no word, no daemon: it was killed
+    process.say(Begin(str(folder), HEADER), ticks(41, 20), Write("2031Z-LATER.mcap", "LATER", 3_600.0, {}))
+    process.ours.close()
+    assert process.child.wait(PATIENCE_S) == 0
+    (left,) = folder.glob(f"*{DIED}.mcap")
+    assert [entry[0] for entry in read_black_box(left).entries if entry != "step"] == list(range(1, 61))
+    assert (folder / "2031Z-LATER.mcap").is_file()  # what was still due was written too
+
+
+def test_it_ends_with_the_daemon_and_leaves_nothing(process: Process, tmp_path: Path) -> None:
+    process.say(Begin(str(tmp_path / "boxes"), HEADER), ticks(1, 20), End())
+    assert process.child.wait(PATIENCE_S) == 0
+    assert not (tmp_path / "boxes").exists()

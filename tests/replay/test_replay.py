@@ -1,0 +1,303 @@
+"""A black box run again: bit for bit, from the middle too; what was changed in it is found; what is none is refused."""
+
+import contextlib
+import json
+import os
+import random
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from flight import Flight, planted
+from mcap.writer import Writer
+
+from firmware_protocol.build import SWITCH, settle
+from tormagd.config import Config
+from tormagd.control.core import Core
+from tormagd.control.journal import MISSING
+from tormagd.keeping import Part
+from tormagd.messages import TickRecord
+from tormagd.recording.black_box import BlackBoxFile, read_black_box, write_black_box
+from tormagd.recording.reader import RecordingError, read_recording
+from tormagd.replay.rebuild import ReplayError, differences, rebuilt, recorded
+from tormagd.replay.rerun import Rerun, rerun, ticks_of
+from tormagd.safety.codes import Fault
+
+COLUMNS = TickRecord.__struct_fields__
+CHANGED_TICK = 3_210
+TICKS = 4_000
+ROOT = Path(__file__).parents[2]
+NO_TICKS = [Part(0.0, 1, True, msgspec.msgpack.encode(["step"]))]
+
+
+@pytest.fixture(scope="module")
+def box(path: Path) -> BlackBoxFile:
+    return read_black_box(path)
+
+
+def again(core: Core, box: BlackBoxFile, from_s: float = 0.0) -> Rerun:
+    return rerun(core, COLUMNS, box.entries, from_s)
+
+
+# -- the same again ------------------------------------------------------------------------------------------------
+
+
+def test_a_fault_is_replayed_bit_for_bit_from_the_file_alone(ended: Flight, box: BlackBoxFile, path: Path) -> None:
+    assert ended.loop.step_state.safety.faults == (Fault.ENCODER,)
+    known = recorded(box, path.parent)
+    assert known.config == ended.config
+    done = rerun(rebuilt(known), known.columns, box.entries)
+    assert (done.difference, done.gaps) == (None, 0)
+    assert (done.ticks, done.from_s, done.snapshots) == (TICKS, 0.0, 7)
+    assert differences(known, Config()) == []
+
+
+@pytest.mark.parametrize(("from_s", "begins_s"), [(0.2, 0.0), (2.9, 2.5), (3.7, 3.5)])
+def test_it_is_from_the_middle_of_the_run(core: Core, box: BlackBoxFile, from_s: float, begins_s: float) -> None:
+    done = again(core, box, from_s)
+    assert done.difference is None
+    assert done.from_s == pytest.approx(begins_s, abs=1e-9)
+    assert done.ticks == TICKS - round(1e3 * begins_s)
+
+
+@pytest.mark.parametrize(
+    ("fault", "silent_s", "told"),
+    [
+        ("no_sense@3.0", 0.0, "SENSE_STALE"),
+        ("commands_vanish@3.0", 0.0, "MEASUREMENT_STALE"),
+        ("", 0.083, "HOST_STALL"),
+    ],
+)
+def test_black_boxes_of_planted_faults_replay(fly: Any, core: Core, tmp_path: Path, fault, silent_s, told) -> None:
+    """The force sensor falls silent, the device does, and the daemon stands still."""
+    flight = fly(*([fault] if fault else []), until_s=3.3, silent_s=silent_s)
+    assert str(flight.loop.step_state.safety.faults[0]) == told
+    box = read_black_box(flight.write(tmp_path / "planted.mcap"))
+    done = again(core, box)
+    assert done.difference is None
+    ticks = ticks_of(COLUMNS, box.entries)
+    assert done.ticks == len(ticks) > 3_200
+    assert told in {name for tick in ticks.values() for name in tick.faults}
+
+
+def test_the_other_build_replays_it_to_the_bit(path: Path) -> None:
+    """This process wrote it."""
+    switch = "0" if settle().is_compiled else "1"
+    command = [sys.executable, "-P", "-m", "tormagd.replay", str(path), "--from", "3"]
+    environment = os.environ | {SWITCH: switch, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    result = json.loads(done.stdout)
+    assert result["rerun"]["difference"] is None
+    assert result["rerun"]["ticks"] == TICKS - 3_000
+    assert switch == "1" or result["build"].startswith("interpreted")
+
+
+def test_a_black_box_is_drawn_like_a_recording(path: Path) -> None:
+    recording = read_recording(path)
+    assert recording.is_complete
+    assert recording.ticks.t_ns.size == TICKS
+    assert recording.ticks.words["faults"][-1] == ("ENCODER",)
+    assert set(recording.ticks.numbers) | set(recording.ticks.words) == set(COLUMNS)
+
+
+def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxFile) -> None:
+    """A part was lost: 20 ticks are missing, and the rest up to the next snapshot says nothing."""
+    places = list(ticks_of(COLUMNS, box.entries))
+    entries = [*box.entries[: places[3_100] + 1], [MISSING], *box.entries[places[3_120] + 1 :]]
+    done = rerun(core, COLUMNS, entries)
+    assert (done.difference, done.gaps) == (None, 1)
+    assert done.ticks == TICKS - 3_500 + 3_101
+
+
+# -- what was changed is found -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("column", "add", "shows"),
+    [
+        ("device_left_mm", 0.05, "left_mm"),
+        ("device_force_N", 1e-12, "measured_cf"),
+        ("left_duty", 1e-15, "left_duty"),
+        ("device_time_s", 1e-4, "handle_rate_mm_s"),
+        ("plan_gap_mm", 1e-9, "plan_gap_mm"),
+    ],
+)
+def test_a_changed_number_is_found_in_its_tick(core: Core, box: BlackBoxFile, column, add, shows) -> None:
+    record = list(ticks_of(COLUMNS, box.entries).values())[CHANGED_TICK - 1]
+    entries = planted(box.entries, CHANGED_TICK, COLUMNS.index(column), getattr(record, column) + add)
+    done = rerun(core, COLUMNS, entries)
+    assert done.difference is not None
+    assert (done.difference.tick, done.difference.field) == (CHANGED_TICK, shows)
+    assert done.ticks == CHANGED_TICK - 1
+
+
+def test_a_changed_setpoint_is_found_in_the_next_tick(core: Core, box: BlackBoxFile) -> None:
+    places = list(ticks_of(COLUMNS, box.entries))
+    place = next(p for p in range(places[3_400], len(box.entries)) if box.entries[p][0] == "plan")
+    entries = list(box.entries)
+    _, now_s, setpoint = entries[place]
+    entries[place] = ["plan", now_s, [setpoint[0] + 1e-9, *setpoint[1:]]]
+    tick = 1 + next(number for number, p in enumerate(places) if p > place)
+    found = rerun(core, COLUMNS, entries).difference
+    assert found is not None
+    # the plan is made at the end of a period, for the next one's step
+    assert (found.tick, found.field) == (tick + 1, "setpoint_cf")
+
+
+def test_a_command_that_is_missing_is_found(core: Core, box: BlackBoxFile) -> None:
+    entries = [it for it in box.entries if not (it[0] == "command" and it[1] == "home")]
+    found = rerun(core, COLUMNS, entries).difference
+    assert found is not None
+    assert found.field == "request"
+
+
+def test_a_state_that_differs_is_found_where_no_tick_shows_it(core: Core, box: BlackBoxFile) -> None:
+    entries = [*box.entries]
+    place = [p for p, it in enumerate(entries) if it[0] == "state"][4]
+    state = msgspec.msgpack.decode(msgspec.msgpack.encode(entries[place]))
+    state[1]["StepState"]["estimate"]["Estimate"]["handle"]["Handle"]["sliding_mm_s"] += 1e-12
+    entries[place] = state
+    found = rerun(core, COLUMNS, entries).difference
+    assert found is not None
+    assert found.field == "state.step.estimate.handle.sliding_mm_s"
+
+
+def test_another_limit_gives_another_first_tick(box: BlackBoxFile, path: Path) -> None:
+    known = recorded(box, path.parent)
+    limits = msgspec.structs.replace(known.config.limits, no_motion_duty=0.9, low_confidence=1.0)
+    done = rerun(rebuilt(known, msgspec.structs.replace(known.config, limits=limits)), COLUMNS, box.entries)
+    assert done.difference is not None
+    assert done.difference.field in ("plan_limits", "limits")
+
+
+def test_what_is_not_as_it_was_is_told(box: BlackBoxFile, path: Path) -> None:
+    changed = msgspec.structs.replace(box, header={**box.header, "sources_sha256": "0" * 64, "platform": "PDP-11"})
+    device = msgspec.structs.replace(Config().device, port="/dev/another")
+    configured = msgspec.structs.replace(Config(), device=device, scene="pulse")
+    told = differences(recorded(changed, path.parent), configured)
+    assert [line.partition(":")[0] for line in told] == ["build", "platform", "scene", "configuration"]
+
+
+# -- what is no black box ------------------------------------------------------------------------------------------
+
+
+def run(path: Path) -> None:
+    found = read_black_box(path)
+    known = recorded(found, path.parent)
+    rerun(rebuilt(known), known.columns, found.entries)
+
+
+def refusal(path: Path) -> str:
+    """What `tormagd.replay` says of a file, which is one line."""
+    with pytest.raises((RecordingError, ReplayError)) as refused:
+        run(path)
+    text = str(refused.value)
+    assert "\n" not in text
+    assert len(text) < 600
+    return text
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.01])
+def test_one_that_breaks_off_early_is_refused(path: Path, tmp_path: Path, share: float) -> None:
+    broken = tmp_path / "broken.mcap"
+    data = path.read_bytes()
+    broken.write_bytes(data[: int(share * len(data))])
+    assert refusal(broken)
+
+
+def test_one_that_breaks_off_late_is_replayed_so_far(core: Core, path: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.mcap"
+    data = path.read_bytes()
+    broken.write_bytes(data[: len(data) * 2 // 3])
+    box = read_black_box(broken)
+    assert not box.is_complete
+    done = again(core, box)
+    assert done.difference is None
+    assert 1_000 < done.ticks < TICKS
+
+
+def test_random_and_damaged_bytes_are_refused(path: Path, tmp_path: Path) -> None:
+    rng, broken, data = random.Random(3), tmp_path / "broken.mcap", path.read_bytes()
+    broken.write_bytes(rng.randbytes(5_000))
+    assert "not an intact MCAP file" in refusal(broken)
+    for _ in range(5):
+        damaged = bytearray(data)
+        for place in rng.sample(range(len(data) // 2), 20):
+            damaged[place] ^= 1 << rng.randrange(8)
+        broken.write_bytes(damaged)
+        assert refusal(broken)
+
+
+def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Path) -> None:
+    other = tmp_path / "other.mcap"
+    with other.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel(topic="/core", message_encoding="json", schema_id=0)
+        writer.add_message(channel, log_time=1, data=b"{}", publish_time=1)
+        writer.finish()
+    assert "allowed is msgpack" in refusal(other)
+    changes = {
+        "format": ("2", "format = '2'"),
+        "config": ('{"scene": "pulse"}', "config: its hash"),
+        "model_sha256": ("f" * 64, "the model with the hash 'ffffffffffff'"),
+        "columns": (json.dumps(["t_ns"]), "no column 'monotonic_s'"),
+    }
+    for name, (value, said) in changes.items():
+        path = tmp_path / f"{name}.mcap"
+        write_black_box(path, box.header | {name: value}, NO_TICKS)
+        assert said in refusal(path)
+    path = tmp_path / "no scene.mcap"
+    write_black_box(path, {name: text for name, text in box.header.items() if name != "scene"}, NO_TICKS)
+    assert "its header has no 'scene'" in refusal(path)
+    path = tmp_path / "empty.mcap"
+    write_black_box(path, box.header, NO_TICKS)
+    assert "no tick in it" in refusal(path)
+
+
+def test_no_entries_break_it(core: Core, box: BlackBoxFile) -> None:
+    """Anything at all in the place of an entry, or of a value in one, is found, passed over or refused."""
+    rng = random.Random(5)
+    rubbish: list[Any] = [
+        None,
+        -1,
+        2**63,
+        "x",
+        [],
+        {},
+        [[]],
+        ["plan"],
+        ["state", 1, 2],
+        ["command", "stop", 1.0, False],
+    ]
+    rubbish += [["latch", "SKEWED"], ["teach", {"Shown": {}}], ["afresh", "now"], ["unheard"], float("nan"), [1], b"\0"]
+    first = list(ticks_of(COLUMNS, box.entries))[60]
+    head = box.entries[: first + 1]
+    for _ in range(300):
+        entries = list(head)
+        place = rng.randrange(len(entries))
+        victim = entries[place]
+        if isinstance(victim, list) and victim and rng.random() < 0.7:
+            victim = list(victim)
+            victim[rng.randrange(len(victim))] = rng.choice(rubbish)
+            entries[place] = victim
+        else:
+            entries[place] = rng.choice(rubbish)
+        with contextlib.suppress(ReplayError):
+            assert rerun(core, COLUMNS, entries).ticks <= 61
+
+
+def test_a_list_that_says_it_is_endless_is_refused(box: BlackBoxFile, tmp_path: Path) -> None:
+    other = tmp_path / "lies.mcap"
+    with other.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata("black_box", box.header)
+        channel = writer.register_channel(topic="/core", message_encoding="msgpack", schema_id=0)
+        writer.add_message(channel, log_time=1, data=b"\xdd" + struct.pack(">I", 2**32 - 1), publish_time=1)
+        writer.finish()
+    assert "not an intact MCAP file" in refusal(other)
