@@ -364,3 +364,36 @@ def test_a_command_loads_only_what_it_needs(command, run_dir):
         cwd=Path(__file__).parent,
     )
     assert ran.stderr.splitlines()[-1] == "[]"
+
+
+def test_a_black_box_is_fetched_once_it_is_written(fake_daemon, status_with, capsys, tmp_path):
+    original, copy = tmp_path / "20260101T000000.000Z-REQUEST.mcap", tmp_path / "mine.mcap"
+    original.write_bytes(b"what is in it")
+    boxes = iter([{"newest": "an older one"}, {"newest": original.name}])
+    fake_daemon.answers["blackbox"] = lambda: {"ok": True, "result": {"file": str(original)}}
+    fake_daemon.answers["status"] = lambda: {
+        "ok": True,
+        "result": status_with(black_box={"folder": str(tmp_path)} | next(boxes)),
+    }
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "blackbox", str(copy))
+    assert (code, printed["result"]) == (0, {"file": str(copy), "original": str(original)})
+    assert copy.read_bytes() == b"what is in it"
+    # nothing is overwritten, and nothing asked for
+    asked = list(fake_daemon.commands)
+    assert run_json(capsys, "--endpoint", fake_daemon.control, "blackbox", str(copy))[0] == 2
+    assert fake_daemon.commands == asked
+
+
+def test_a_black_box_that_cannot_be_had_says_why(fake_daemon, capsys, tmp_path):
+    fake_daemon.answers["blackbox"] = lambda: {"ok": True, "result": {"file": "/nowhere/a.mcap"}}
+    fake_daemon.says(black_box={"folder": "/nowhere", "refusal": "/nowhere/a.mcap: No space left on device"})
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "blackbox")
+    assert (code, printed["error"]["code"]) == (1, "not_written")
+    assert "No space left" in printed["error"]["message"]
+    fake_daemon.refuse("blackbox", "no_black_box")
+    assert run_json(capsys, "--endpoint", fake_daemon.control, "blackbox")[1]["error"]["code"] == "no_black_box"
+    fake_daemon.answers["blackbox"] = lambda: {"ok": True, "result": {"file": "/nowhere/b.mcap"}}
+    fake_daemon.says(black_box={"newest": "b.mcap"})
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "blackbox", str(tmp_path / "a.mcap"))
+    assert (code, printed["error"]["code"]) == (2, "usage")
+    assert "/nowhere/b.mcap on the daemon's machine" in printed["error"]["hint"]

@@ -36,7 +36,7 @@ class Rig:
         self.config.write_text(
             'scene = "coronary"\n[realtime]\nfifo_priority = 50\n'  # only a warning where it is refused
             f'[device]\nport = "{self.port}"\nprofiles = "{folder}/profiles"\n'
-            f"{self._device}measurement_timeout_ms = 50.0\n[endpoints]\n"
+            f'{self._device}measurement_timeout_ms = 50.0\n[black_box]\nfolder = "{folder}/boxes"\n[endpoints]\n'
             + "".join(f'{n} = "ipc://{folder}/{n}"\n' for n in ("setpoint", "telemetry", "control", "recording"))
         )
         self.simulator: subprocess.Popen[str] | None = None

@@ -1,5 +1,6 @@
 """The daemon as its users meet it: real processes, a real pty, real sockets. Nothing here asserts a duration."""
 
+import json
 import math
 import random
 import signal
@@ -193,3 +194,22 @@ def test_unplugged_device_is_a_named_fault_and_comes_back_without_re_arming(new_
     new_rig.ask(0.5)
     new_rig.until(lambda: new_rig.telemetry().setpoint_cf == 0.5, "neutral again")
     new_rig.arm()
+
+
+def test_the_black_box_of_a_fault_is_run_again_bit_for_bit(rig):
+    """By another process, of a run in real time: whatever was late in it, the core gives the same again."""
+    rig.arm()
+    for force_N in (1.0, 1.5):
+        rig.ask(force_N)
+        rig.until(lambda asked=force_N: rig.telemetry().governed_cf == asked, "governed")
+    rig.done("stop")
+    rig.until(lambda: rig.status()["black_box"]["newest"].endswith("-STOPPED.mcap"), "written")
+    box = rig.status()["black_box"]
+    path = rig.folder / "boxes" / box["newest"]
+    command = [sys.executable, "-m", "tormagd.replay", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120.0)
+    result = json.loads(done.stdout)
+    assert (result["reason"], result["differences"]) == ("STOPPED", [])
+    assert result["rerun"]["difference"] is None
+    assert result["rerun"]["ticks"] > 1_000
+    assert result["rerun"]["gaps"] <= box["dropped"]

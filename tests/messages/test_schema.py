@@ -10,6 +10,7 @@ import pytest
 
 from tormagd import messages
 from tormagd.messages import (
+    BlackBoxReport,
     ClockReport,
     DeviceReport,
     ExecReport,
@@ -43,7 +44,8 @@ V1: dict[type[msgspec.Struct], str] = {
     Tick: "lateness_us exec_us",
     Status: f"{TELEMETRY} version build scene uptime_s least_N most_N trim device profile least_gap_mm link setpoints "
     "peers "
-    "rates late_ticks_by fault_details limit_details newest_stall not_granted way",
+    "rates late_ticks_by fault_details limit_details newest_stall not_granted way "
+    "black_box",
     LinkReport: "state cause remedy backend port losses last_loss firmware serial_number firmware_schema daemon_schema "
     "protocol_version frames bytes corrupt lost repeated resynchronisations round_trip_us clock unsent refused "
     "unanswered_share damaged_share",
@@ -62,6 +64,7 @@ V1: dict[type[msgspec.Struct], str] = {
     DeviceReport: "scale scale_sd offset_N offset_sd_N sensor_zero_N sensor_zero_sd_N",
     Explained: "code cause remedy",
     StallReport: "ms culprit",
+    BlackBoxReport: "folder newest refusal dropped",
     TickRecord: "t_ns monotonic_s plan setpoint_cf plan_setpoint_age_s governed_cf plan_governed_cf predicted_cf "
     "field_mT plan_gap_mm plan_gap_speed_mm_s plan_gap_acceleration_mm_s2 plan_least_gap_mm plan_limits plan_outside "
     "plan_sensor_doubted_s foresight plan_time_s confidence trim measurement received_s delay_s sensed_s "

@@ -58,6 +58,11 @@ def status_text(known: Status, colour: Colour) -> str:
         f"daemon    {known.version}, scene {known.scene}, up {_number(known.uptime_s, 's', 0)}",
         *_core(known.build, colour),
     ]
+    box = known.black_box
+    if box.newest:
+        lines.append(f"black box {box.newest}")
+    if box.folder and box.refusal:
+        lines.append(f"black box {colour.yellow(box.refusal)}")
     if known.setpoints.last_refusal:
         lines.append(f"refused   {colour.yellow(known.setpoints.last_refusal)}")
     return "\n".join(lines)

@@ -143,6 +143,7 @@ class BlackBox:
         now_ns = time.time_ns()
         stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime(now_ns // 1_000_000_000))
         name = f"{stamp}.{now_ns // 1_000_000 % 1_000:03d}Z-{reason}.mcap"
+        self._refusal = ""
         self._asked.append(Write(name, reason, after_s, details))
         self._ask()
         return self._folder / name
