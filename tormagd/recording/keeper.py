@@ -107,7 +107,7 @@ class Keeper:
         from tormagd.recording.black_box import write_black_box
 
         with contextlib.suppress(OSError):
-            os.nice(10)  # of this thread alone
+            os.nice(5)  # of this thread alone
         folder, refusal = Path(begun.folder), ""
         try:
             if not parts:
