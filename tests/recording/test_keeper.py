@@ -9,12 +9,12 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
 from tormagd.recording.black_box import read_black_box
-from tormagd.recording.keeper import DIED, KEPT_S, MOST_BYTES, MOST_FILES, Ring
+from tormagd.recording.keeper import DIED, KEPT_S, MOST_BYTES, MOST_DUE, MOST_FILES, Ring
 
 PATIENCE_S = 60.0
 HEADER = {"columns": json.dumps(["t_ns", "x"]), "config": "{}"}
@@ -43,6 +43,7 @@ def test_the_ring_holds_no_more_bytes_than_it_may() -> None:
     assert [each.time_s for each in ring.parts()] == [1.0]  # the newest is always there
 
 
+@settings(max_examples=30)
 @given(st.lists(st.tuples(st.floats(0.0, 2.0), st.integers(0, 60)), max_size=60))
 def test_neither_bound_is_passed(steps: list[tuple[float, int]]) -> None:
     ring, now_s = Ring(5.0, 200), 0.0
@@ -114,6 +115,22 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     (left,) = folder.glob(f"*{DIED}.mcap")
     assert [entry[0] for entry in read_black_box(left).entries if entry != "step"] == list(range(1, 61))
     assert (folder / "2031Z-LATER.mcap").is_file()  # what was still due was written too
+
+
+def test_one_that_asks_for_too_many_is_refused_and_gets_the_others(process: Process, tmp_path: Path) -> None:
+    process.say(Begin(str(tmp_path), HEADER), ticks(1, 20))
+    process.say(*(Write(f"{number}Z-X.mcap", "X", 3_600.0, {}) for number in range(MOST_DUE + 1)))
+    assert "others are still to be written" in process.heard().refusal
+    process.say(End())
+    assert process.child.wait(PATIENCE_S) == 0
+    assert len(list(tmp_path.iterdir())) == MOST_DUE
+
+
+def test_a_daemon_that_did_not_get_so_far_leaves_nothing(process: Process, tmp_path: Path) -> None:
+    process.say(Begin(str(tmp_path / "boxes"), HEADER))
+    process.ours.close()
+    assert process.child.communicate(timeout=PATIENCE_S) == (None, "")
+    assert not (tmp_path / "boxes").exists()
 
 
 def test_it_ends_with_the_daemon_and_leaves_nothing(process: Process, tmp_path: Path) -> None:

@@ -27,6 +27,10 @@ previews for which this is too little, it reaches less far back."""
 MOST_FILES = 20
 "The oldest goes when there are more."
 MOST_PACKET = 4_000_000
+MOST_DUE = 8
+"Files that wait to be written."
+LOOK_S = 0.05
+"How often it is looked whether one is due."
 DIED = "DAEMON-DIED"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -60,29 +64,41 @@ class Keeper:
         self._ring = Ring()
         self._begun = Begin("", {})
         self._due: list[tuple[float, Write]] = []
-        self._writing: list[threading.Thread] = []
+        self._writing: threading.Thread | None = None
 
     def run(self) -> None:
         """Until the daemon ends."""
-        while True:
-            wait_s = max(0.0, min((due_s for due_s, _ in self._due), default=3600.0) - time.monotonic())
-            ready, _, _ = select.select([self._socket], [], [], wait_s)
-            if ready:
-                try:
-                    data = self._socket.recv(MOST_PACKET)
-                except OSError:
-                    data = b""
-                said: Said = msgspec.msgpack.decode(data, type=Said) if data else End()
-                if not data:
-                    stamp = time.strftime("%Y%m%dT%H%M%S.000Z", time.gmtime())
-                    self._due.append((0.0, Write(f"{stamp}-{DIED}.mcap", DIED, 0.0, {})))
-                if isinstance(said, End):
-                    self._write_due(None)
-                    for thread in self._writing:
-                        thread.join()
-                    return
-                self._take(said)
-            self._write_due(time.monotonic())
+        while self._is_heard():
+            if self._writing is not None and self._writing.is_alive():
+                continue  # one at a time
+            due = next((each for each in self._due if each[0] <= time.monotonic()), None)
+            if due is not None:
+                self._due.remove(due)
+                # in a thread of its own: what the daemon says meanwhile is kept
+                self._writing = threading.Thread(target=self._write, args=(due[1], self._begun, self._ring.parts()))
+                self._writing.start()
+        if self._writing is not None:
+            self._writing.join()
+        for _, write in self._due:
+            self._write(write, self._begun, self._ring.parts())
+
+    def _is_heard(self) -> bool:
+        """Waits a little for what the daemon says; False once it has ended."""
+        ready, _, _ = select.select([self._socket], [], [], LOOK_S if self._due else None)
+        if not ready:
+            return True
+        try:
+            data = self._socket.recv(MOST_PACKET)
+        except OSError:
+            data = b""
+        if not data:
+            if self._ring.parts():
+                stamp = time.strftime("%Y%m%dT%H%M%S.000Z", time.gmtime())
+                self._due.append((0.0, Write(f"{stamp}-{DIED}.mcap", DIED, 0.0, {})))
+            return False
+        said: Said = msgspec.msgpack.decode(data, type=Said)
+        self._take(said)
+        return not isinstance(said, End)
 
     def _take(self, said: Said) -> None:
         match said:
@@ -90,18 +106,10 @@ class Keeper:
                 self._ring.put(said)
             case Begin():
                 self._begun = said
-            case Write():
+            case Write() if len(self._due) < MOST_DUE:
                 self._due.append((time.monotonic() + said.after_s, said))
-
-    def _write_due(self, now_s: float | None) -> None:
-        """What is due by then; everything without a time."""
-        due = [write for due_s, write in self._due if now_s is None or due_s <= now_s]
-        self._due = [(due_s, write) for due_s, write in self._due if write not in due]
-        for write in due:
-            # in a thread of its own: what the daemon says meanwhile is kept
-            thread = threading.Thread(target=self._write, args=(write, self._begun, self._ring.parts()))
-            thread.start()
-            self._writing = [*(each for each in self._writing if each.is_alive()), thread]
+            case Write():
+                self._answer(Written(said.name, f"{said.name}: {MOST_DUE} others are still to be written"))
 
     def _write(self, write: Write, begun: Begin, parts: list[Part]) -> None:
         from tormagd.recording.black_box import write_black_box
@@ -120,8 +128,11 @@ class Keeper:
         except OSError as error:
             refusal = f"{folder / write.name}: {error.strerror}"
             write_line(f"tormagd: no black box: {refusal}", sys.stderr)
+        self._answer(Written(write.name, refusal))
+
+    def _answer(self, answer: Written) -> None:
         with contextlib.suppress(OSError):  # there may be nobody any more
-            self._socket.send(msgspec.msgpack.encode(Written(write.name, refusal)))
+            self._socket.send(msgspec.msgpack.encode(answer), socket.MSG_DONTWAIT)
 
 
 def main() -> None:
