@@ -37,9 +37,11 @@ def core() -> Core:
 @pytest.fixture(scope="session")
 def fly(core: Core) -> Fly:
     """A flight of a simulated device with these faults, armed, which renders a pulse until `until_s`."""
+    shipped = core
 
-    def make(*faults: str, until_s: float, silent_s: float = 0.0) -> Flight:
-        config = Config()
+    def make(*faults: str, until_s: float, silent_s: float = 0.0, config: Config | None = None) -> Flight:
+        core = shipped if config is None else build_core(config)
+        config = config or Config()
         device = VirtualDevice(load_plant("sample_1"), ReversingHand(2.0), [parse_fault(it) for it in faults], 1)
         flight = Flight(config, core, ClosedLoop(config, core.stepper, core.planner, device))
         flight.arm()

@@ -38,7 +38,7 @@ def through_msgpack(thing: object) -> Any:
     return restored(msgspec.msgpack.decode(packed(plain(thing))), KNOWN | kinds(Switches))
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(THINGS)
 def test_what_comes_back_is_what_went(thing: object) -> None:
     back = through_msgpack(thing)

@@ -1,16 +1,21 @@
 """What would have happened instead: the simulator, with what was asked of the recorded one."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from flight import Flight
 
-from tormagd.config import Config
+from tormagd.config import Config, Limits
 from tormagd.ctl.main import main
+from tormagd.ctl.replay import _instead
 from tormagd.recording.black_box import read_black_box
 from tormagd.replay.__main__ import main as run
 from tormagd.replay.rebuild import ReplayError, rebuilt, recorded
 from tormagd.replay.rehearse import changed, rehearse, script
+
+Fly = Callable[..., Flight]
 
 
 def test_the_simulator_does_it_again_and_a_changed_configuration_something_else(path: Path) -> None:
@@ -25,6 +30,20 @@ def test_the_simulator_does_it_again_and_a_changed_configuration_something_else(
     instead = rehearse(rebuilt(known, config), config, todo, "sample_1", [])
     assert next(iter(instead.faults)) == "FOLLOWING_ERROR"
     assert instead.faults["FOLLOWING_ERROR"] < 3.5
+
+
+def test_a_limit_that_was_too_narrow(fly: Fly, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Recorded: carriages that were 0.02 mm apart; with 2 mm that would have been no fault."""
+    narrow = Config(limits=Limits(skew_warning_mm=0.02, skew_fault_mm=0.02))
+    path = fly("drag_left=+300%@2.5", until_s=3.6, config=narrow).write(tmp_path / "narrow.mcap")
+    assert run([str(path), "--set", "limits.skew_fault_mm=2", "--fault", "drag_left=+300%@2.5"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [list(result[name]["faults"]) for name in ("recorded", "simulated", "instead")] == [["SKEW"], ["SKEW"], []]
+    text = _instead(result)
+    assert "simulated with limits.skew_fault_mm=2: no fault" in text
+    assert "not known" not in text
+    result["simulated"]["faults"] = {}
+    assert "SKEW did not come in the simulation as configured then" in _instead(result)
 
 
 def test_one_that_begins_in_the_middle_begins_with_a_device_that_is_driven(path: Path) -> None:

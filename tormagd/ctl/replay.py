@@ -67,6 +67,12 @@ def _instead(result: dict[str, Any]) -> str:
         told[f"simulated with {', '.join(result['settings'])}"] = result["instead"]
     lines = [f"{name}: {_happened(what)}" for name, what in told.items()]
     faults = "".join(f", with {fault}" for fault in result["faults"])
+    missing = set(result["recorded"]["faults"]) - set(result["simulated"]["faults"])
+    if missing:
+        lines.append(
+            f"{', '.join(sorted(missing))} did not come in the simulation as configured then: what the change does to "
+            "that is not known"
+        )
     return "\n".join(
         (
             *lines,
