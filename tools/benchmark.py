@@ -20,6 +20,7 @@ MEASUREMENTS = {
     "fast": "control at 2 and 4 kHz on fast serial lines",
     "step": "how fast and how exactly the gap follows, in virtual time",
     "virtual-time": "how much faster than real time that is, and what limits it",
+    "black-box": "what the black box costs a control tick",
     "bus": "load of the bus at 1 kHz control, and what the codec costs",
 }
 
