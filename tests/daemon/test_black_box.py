@@ -169,3 +169,10 @@ def test_a_journal_that_nobody_takes_is_bounded_and_says_so() -> None:
     entries = journal.take()
     assert len(entries) < MOST_ENTRIES
     assert entries[0] == ("missing",)
+
+
+def test_without_what_writes_the_files_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    box = BlackBox(Path("/boxes"), {}, 1_000, lambda _its: pytest.fail("a process for nothing"))
+    assert box.report().refusal == "mcap is not installed: pip install 'tormagd[record]'"
+    assert not box.journal.is_kept
