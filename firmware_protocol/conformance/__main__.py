@@ -1,0 +1,161 @@
+"""`python -m firmware_protocol.conformance PORT|CHANNEL`: does this device do what firmware_protocol/README.md says?"""
+
+import argparse
+import json
+import signal
+import sys
+from collections.abc import Sequence
+from typing import Any, Final
+
+from firmware_protocol.codec import Identity
+from firmware_protocol.conformance.check import Check, Result, run
+from firmware_protocol.conformance.examination import CHECKS, checks_on
+from firmware_protocol.conformance.host import INSIDE_MM, MOST_DUTY, Host
+from firmware_protocol.conformance.line import Line
+from firmware_protocol.conformance.overall import left_open
+from firmware_protocol.conformance.ports import open_line
+
+PASSED, FAILED, USAGE = 0, 1, 2
+PAGE: Final = "firmware_protocol/README.md"
+WARNING: Final = f"""\
+{{line}}: THE DEVICE'S MOTORS WILL MOVE, for about a minute: homings, duties of up to {MOST_DUTY:g}, ways of
+{INSIDE_MM:g} mm, openings because this program falls silent on purpose. A firmware that is wrong may do anything: keep the
+motors' supply switch in reach, take hands and patient's side off the brake, and end the daemon."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """0 where all checks passed, 1 where one did not, 2 where it could not be begun."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.list:
+        for one in CHECKS:
+            print(f"{one.name}: {one.sent}: {one.expected} ({one.page})")
+        return PASSED
+    if options.line is None:
+        parser.error("the following arguments are required: PORT|CHANNEL")
+    if not (options.yes or _is_agreed(options.line)):
+        print(f"{parser.prog}: nothing was sent; say yes, or --yes where nobody can be asked", file=sys.stderr)
+        return USAGE
+    try:
+        line = open_line(options.line, options.baud, options.bitrate, options.node)
+    except OSError as error:
+        print(f"{parser.prog}: {error}", file=sys.stderr)
+        return USAGE
+    try:
+        results = _examined(line, options)
+    except ValueError as error:
+        parser.error(str(error))
+    finally:
+        line.close()
+    return PASSED if results and all(result.passed for result in results) else FAILED
+
+
+def report(results: Sequence[Result]) -> dict[str, Any]:
+    """What `--json` prints."""
+    return {
+        "checks": [
+            {
+                "name": result.check.name,
+                "passed": result.passed,
+                "seen": result.seen,
+                "expected": result.check.expected,
+                "sent": result.check.sent,
+                "page": f"{PAGE}: {result.check.page}",
+            }
+            for result in results
+        ]
+    }
+
+
+def told(result: Result) -> str:
+    """One check for a person: a line where it passed; where not, what to look at."""
+    one = result.check
+    if result.passed:
+        return f"ok    {one.name}: {result.seen}"
+    return (
+        f"FAIL  {one.name}\n      sent      {one.sent}\n      seen      {result.seen}\n"
+        f"      expected  {one.expected}\n      page      {PAGE}: {one.page}"
+    )
+
+
+def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
+    """Raises ValueError for a check that there is not."""
+    checks = _chosen(checks_on(line), options.only)
+    out = sys.stderr if options.json else sys.stdout
+    host = Host(line)
+    results: list[Result] = []
+
+    def tell(result: Result) -> None:
+        results.append(result)
+        print(told(result), file=out, flush=True)
+
+    # a request to end ends the check, not the promise to leave the gap open
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        run(host, checks, tell)
+    except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        print("ended; opening the gap", file=sys.stderr, flush=True)
+        results.clear()
+        run(host, [left_open], tell)
+        return []
+    except OSError as error:
+        print(f"the line is gone ({error}): by the page the device opens the gap by itself now", file=sys.stderr)
+        return []
+    passed = sum(result.passed for result in results)
+    print(f"{options.line}: {_name(host)}: {passed} of {len(results)} checks passed", file=out, flush=True)
+    if options.json:
+        print(json.dumps(report(results), indent=2))
+    return results
+
+
+def _name(host: Host) -> str:
+    heard = host.newest.get(Identity)
+    if heard is None or not isinstance(heard.message, Identity):
+        return "nobody"
+    identity = heard.message
+    return f"device {identity.serial_number}, firmware {identity.firmware_major}.{identity.firmware_minor}"
+
+
+def _chosen(checks: Sequence[Check], only: Sequence[str]) -> Sequence[Check]:
+    """Those asked for, and always the one that leaves the device open."""
+    names = {one.name for one in checks}
+    if unknown := [name for name in only if name not in names]:
+        raise ValueError(f"--only {unknown[0]}: checks on this line are {', '.join(sorted(names))}")
+    return [one for one in checks if not only or one.name in only or one is left_open]
+
+
+def _is_agreed(line: str) -> bool:
+    print(WARNING.format(line=line), file=sys.stderr, flush=True)
+    if not sys.stdin.isatty():
+        return False
+    print("Type yes to go on: ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() == "yes"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m firmware_protocol.conformance",
+        description="Plays the host against a device and says what of firmware_protocol/README.md it does not keep. "
+        "The device's motors move; the gap is left open. Exit code 0: all checks passed, 1: not all, 2: not begun.",
+    )
+    parser.add_argument(
+        "line",
+        nargs="?",
+        metavar="PORT|CHANNEL",
+        help="a serial port by its path, a CAN bus as INTERFACE:CHANNEL: socketcan:can0, slcan:/dev/ttyACM0, "
+        "tormagsim:PATH of the simulated device",
+    )
+    parser.add_argument("--yes", action="store_true", help="the motors may move: do not ask")
+    parser.add_argument("--json", action="store_true", help="results on stdout as JSON, what is going on on stderr")
+    parser.add_argument("--only", action="append", default=[], metavar="CHECK", help="may be repeated; and left_open")
+    parser.add_argument("--list", action="store_true", help="print the checks that every line has, and end")
+    parser.add_argument("--baud", type=int, default=1_000_000, metavar="N", help="of a serial port; default 1000000")
+    parser.add_argument("--bitrate", type=int, default=1_000_000, metavar="N", help="of a CAN bus; default 1000000")
+    parser.add_argument("--node", type=int, choices=range(16), default=1, metavar="N", help="on a CAN bus; default 1")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

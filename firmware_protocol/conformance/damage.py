@@ -1,0 +1,165 @@
+"""Frames that are damaged, cut off, too long, or not for this device: not obeyed, not answered, and soon forgotten.
+
+What is damaged is a Drive OFF or a Clear, so that a device that obeys does no harm by it.
+"""
+
+import struct
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from firmware_protocol.codec import FUNCTION, Clear, Drive, DriveMode, Hello, Identity, State, crc8, encode
+from firmware_protocol.conformance.check import Check, check
+from firmware_protocol.conformance.host import ANSWER_S, PERIOD_S, SEEN_S, Beat, Host, Unmet
+
+DRIVE: Final = FUNCTION[Drive]
+RECOVERED = 3
+"Good Drives after the damage, of which the first is answered."
+SILENT = "no State, drive_counter unchanged; the good Drive after it is answered"
+
+
+def _raw_drive(duty_steps: int, mode: int, counter: int) -> bytes:
+    """A Drive that an encoder would refuse, with the right CRC-8."""
+    body = struct.pack("<hhBB", duty_steps, 0, mode, counter)
+    return body + bytes((crc8(bytes((DRIVE,)) + body),))
+
+
+def _drive(counter: int) -> bytes:
+    return encode(Drive(0.0, 0.0, DriveMode.OFF, counter))
+
+
+def _ignores(host: Host, put: Iterable[Callable[[int], None]]) -> str:
+    """Each of `put` sends a bad Drive with that counter."""
+    tried = 0
+    for send in put:
+        host.pass_time(3 * PERIOD_S, Beat.OFF)
+        host.pass_time(ANSWER_S)
+        good = host.counter
+        host.begin()
+        send((good + 1) % 256)
+        host.pass_time(ANSWER_S)
+        tried += 1
+        if states := len(host.all_of(State)):
+            raise Unmet(f"form {tried}: {states} State")
+        host.next_status(Beat.NOTHING)
+        shown = host.next_status(Beat.NOTHING).drive_counter
+        if shown != good:
+            raise Unmet(f"form {tried}: drive_counter {shown} in Status, the last good Drive had {good}")
+        host.counter = (good + 1) % 256
+        host.beat(Beat.OFF)
+        host.pass_time(ANSWER_S)
+        if not host.all_of(State):
+            raise Unmet(f"form {tried}: ignored, and so was the good Drive after it")
+    return f"{tried} {'form' if tried == 1 else 'forms'} ignored"
+
+
+@check("Carriers", "a Drive with a wrong CRC-8 in a whole frame", SILENT)
+def drive_crc_8(host: Host) -> str:
+    """One bit of the CRC, one of a duty."""
+    return _ignores(
+        host,
+        [
+            lambda counter: host.line.send(DRIVE, _drive(counter)[:-1] + bytes((_drive(counter)[-1] ^ 1,))),
+            lambda counter: host.line.send(DRIVE, bytes((_drive(counter)[0] ^ 4,)) + _drive(counter)[1:]),
+        ],
+    )
+
+
+@check("Who says what when, 2", "a Drive with a duty of 1.0001 or -3.2768, its CRC-8 right", SILENT)
+def drive_range(host: Host) -> str:
+    """A value out of range is no value."""
+    return _ignores(
+        host,
+        [
+            lambda counter: host.line.send(DRIVE, _raw_drive(10_001, 0, counter)),
+            lambda counter: host.line.send(DRIVE, _raw_drive(-32_768, 0, counter)),
+        ],
+    )
+
+
+@check("Who says what when, 2", "a Drive of mode 2 or 255, its CRC-8 right", SILENT)
+def drive_mode(host: Host) -> str:
+    """A mode that there is not."""
+    return _ignores(
+        host,
+        [
+            lambda counter: host.line.send(DRIVE, _raw_drive(0, 2, counter)),
+            lambda counter: host.line.send(DRIVE, _raw_drive(0, 255, counter)),
+        ],
+    )
+
+
+@check("Carriers", "a Drive of 6 and of 8 bytes, and of none", SILENT)
+def drive_length(host: Host) -> str:
+    """A whole frame is not yet a message."""
+    return _ignores(
+        host,
+        [
+            lambda counter: host.line.send(DRIVE, _drive(counter)[:-1]),
+            lambda counter: host.line.send(DRIVE, _drive(counter) + b"\x00"),
+            lambda _: host.line.send(DRIVE, b""),
+        ],
+    )
+
+
+@check("Carriers", "functions 10 and 127, and a device's own State and Identity", SILENT)
+def other_functions(host: Host) -> str:
+    """What is not a host's message is nobody's."""
+
+    def send(function: int) -> Callable[[int], None]:
+        return lambda counter: host.line.send(function, _drive(counter) + b"\x00")
+
+    return _ignores(host, [send(function) for function in (10, 127, FUNCTION[State], FUNCTION[Identity])])
+
+
+@check("Carriers", "a Clear of 2 bytes and of none, a Hello of 5 and of 7", "not acknowledged, not answered")
+def command_length(host: Host) -> str:
+    """Commands carry no CRC-8: their length is what is left to check."""
+    host.idle()
+    nonce = host.new_nonce()
+    hello = encode(Hello(0, 0, nonce))  # of no schema: a device that takes it latches, and no more
+    host.begin()
+    for function, payload in (
+        (FUNCTION[Clear], bytes((nonce, nonce))),
+        (FUNCTION[Clear], b""),
+        (FUNCTION[Hello], hello[:-1]),
+        (FUNCTION[Hello], hello + bytes((nonce,))),
+    ):
+        host.line.send(function, payload)
+        host.pass_time(SEEN_S)
+        shown = host.status.command_nonce
+        if shown == nonce or host.all_of(Identity):
+            what = f"nonce {shown} in Status, {len(host.all_of(Identity))} Identity"
+            raise Unmet(f"function {function} with {len(payload)} bytes: {what}")
+    return "4 forms ignored"
+
+
+SENT: Final = {
+    "frame_crc_16": "a Drive with a bit flipped under its CRC-16",
+    "frame_cut_off": "a Drive cut off after its first byte, in the middle, before its last",
+    "frame_too_long": "a Drive with a byte more, with 300 more, three with no delimiter between them",
+    "frame_zero_inside": "a Drive with a delimiter in its middle",
+    "noise": "30, 11 and 1200 bytes of noise, then a delimiter",
+    "other_node": "a Drive to another node, from which nothing was heard",
+}
+
+
+def _of_carrier(name: str) -> Check:
+    def perform(host: Host) -> str:
+        def send(at: int) -> Callable[[int], None]:
+            return lambda counter: host.line.send_damaged(host.line.damages(DRIVE, _drive(counter))[name][at])
+
+        return _ignores(host, [send(at) for at in range(len(host.line.damages(DRIVE, _drive(0))[name]))])
+
+    return Check(name, "Carriers", SENT[name], SILENT, perform, moves=False, is_gate=False)
+
+
+CHECKS: Final = (
+    drive_crc_8,
+    drive_range,
+    drive_mode,
+    drive_length,
+    other_functions,
+    command_length,
+)
+ON_A_CARRIER: Final = tuple(_of_carrier(name) for name in SENT)
+"""Which of these a line has, its `damages` say."""

@@ -1,0 +1,27 @@
+"""All checks in their order: first what moves nothing."""
+
+from collections.abc import Sequence
+
+from firmware_protocol.codec import FUNCTION, Drive
+from firmware_protocol.conformance import damage, homing, meeting, overall, running, silence, streams
+from firmware_protocol.conformance.check import Check
+from firmware_protocol.conformance.line import Line
+
+
+def checks_on(line: Line) -> Sequence[Check]:
+    """Those that can be made on this line."""
+    damages = line.damages(FUNCTION[Drive], b"")
+    return [one for one in CHECKS if one not in damage.ON_A_CARRIER or one.name in damages]
+
+
+CHECKS = (
+    *meeting.CHECKS,
+    *streams.CHECKS,
+    *damage.CHECKS,
+    *damage.ON_A_CARRIER,
+    *homing.CHECKS,
+    *running.CHECKS,
+    *silence.CHECKS,
+    *overall.CHECKS,
+)
+"""Of every line."""

@@ -1,0 +1,161 @@
+"""Home: what it does, where the zero is, and from which State on."""
+
+from typing import Final
+
+from firmware_protocol.codec import Clear, DeviceMode, Home, Retract, State
+from firmware_protocol.conformance.check import check
+from firmware_protocol.conformance.host import (
+    HOMED_S,
+    OPENED_S,
+    SEEN_S,
+    Beat,
+    Homing,
+    Host,
+    Unmet,
+    is_homed,
+    is_open,
+    positions,
+    shown,
+)
+from firmware_protocol.conformance.meeting import schema_mismatch
+
+PAGE: Final = "Homing"
+TAKES: Final = "What each mode takes"
+ZERO_MM = 1.0
+"""A carriage rests behind its switch, where it was braked from a creep."""
+JUMP_MM = 0.2
+"""It is braked when HOMED shows: a State that is further from the next ones was of the old origin."""
+
+
+def _homings(host: Host) -> list[Homing]:
+    """Those of before, or one from here on: the first after a boot says the most."""
+    if not host.homings:
+        schema_mismatch.perform(host)  # takes the zero away, and moves nothing
+        host.idle()
+        host.home()
+    return host.homings
+
+
+@check(
+    PAGE,
+    "Home to an idle device without a zero",
+    "acknowledged; HOMING, then IDLE, HOMED, at both open switches, no fault",
+    moves=True,
+    is_gate=True,
+)
+def home_homes(host: Host) -> str:
+    """The device finds its open end by itself."""
+    homing = _homings(host)[0]
+    modes = " ".join(mode.name for mode in homing.modes)
+    seen = f"{modes} in {homing.seconds:.1f} s, {shown(homing.status)}"
+    if not homing.was_acknowledged:
+        raise Unmet(f"not acknowledged; {seen}")
+    is_right = homing.status.mode is DeviceMode.IDLE and is_homed(homing.status) and is_open(homing.status)
+    if not is_right or homing.status.faults or homing.seconds > HOMED_S:
+        raise Unmet(seen)
+    if DeviceMode.HOMING not in homing.modes:
+        raise Unmet(f"{seen}: never HOMING")
+    return seen
+
+
+@check(PAGE, "Home, Drive OFF every 1 ms", f"both positions within {ZERO_MM:g} mm of 0 afterwards", moves=True)
+def home_zeroes(host: Host) -> str:
+    """The origin is the open switch, found at a creep."""
+    seen = ""
+    for homing in _homings(host):
+        state = homing.last
+        if state is None or not is_homed(homing.status):
+            raise Unmet("no State" if state is None else shown(homing.status))
+        seen = positions(state)
+        if max(abs(state.left_position_mm), abs(state.right_position_mm)) > ZERO_MM:
+            raise Unmet(seen)
+    return seen
+
+
+@check(
+    PAGE,
+    "Home, Drive OFF every 1 ms",
+    "the first State after a Status with HOMED is in the new origin",
+    moves=True,
+)
+def homed_is_in_new_origin(host: Host) -> str:
+    """The host takes the device for homed from that State on."""
+    seen = ""
+    for homing in _homings(host):
+        first, last = homing.first, homing.last
+        if first is None or last is None:
+            raise Unmet(f"no State after HOMED: {shown(homing.status)}")
+        seen = f"first {positions(first)}, then {positions(last)}"
+        left_mm = abs(first.left_position_mm - last.left_position_mm)
+        if max(left_mm, abs(first.right_position_mm - last.right_position_mm)) > JUMP_MM:
+            raise Unmet(seen)
+    return seen
+
+
+@check("Who says what when, 5", "Home, and when it is done the same Home again", "not done again", moves=True)
+def repeated_command(host: Host) -> str:
+    """A device acts on a nonce once."""
+    host.homed()
+    if not host.command(Home):
+        raise Unmet(f"Home not acknowledged: {shown(host.status)}")
+    nonce = host.status.command_nonce
+    host.until(lambda: host.status.mode is not DeviceMode.HOMING, HOMED_S)
+    for _ in range(3):
+        host.send(Home(nonce))
+        host.pass_time(SEEN_S, Beat.OFF)
+        if host.status.mode is not DeviceMode.IDLE or not is_homed(host.status):
+            raise Unmet(f"after the same nonce again: {shown(host.status)}")
+    return shown(host.status)
+
+
+@check(
+    TAKES,
+    "Retract to an idle device",
+    "acknowledged; IDLE at both open switches, HOMED as before",
+    moves=True,
+)
+def retract_when_idle(host: Host) -> str:
+    """Retract is taken in every mode but LATCHED."""
+    host.homed()
+    was_acknowledged = host.command(Retract)
+    host.until(lambda: host.status.mode is DeviceMode.IDLE, OPENED_S)
+    status = host.next_status(Beat.OFF)
+    seen = f"{'acknowledged' if was_acknowledged else 'not acknowledged'}, {shown(status)}"
+    if not (was_acknowledged and status.mode is DeviceMode.IDLE and is_open(status) and is_homed(status)):
+        raise Unmet(seen)
+    return f"{seen}, {positions(host.last(State))}"
+
+
+@check(
+    TAKES,
+    "Home; while HOMING a Clear, another Home, then a Retract",
+    "only Retract acknowledged; IDLE, open, not HOMED",
+    moves=True,
+)
+def homing_takes_only_retract(host: Host) -> str:
+    """A homing is ended by a Retract, and by nothing else that a host says."""
+    host.homed()
+    if not host.command(Home):
+        raise Unmet(f"Home not acknowledged: {shown(host.status)}")
+    for kind in (Clear, Home):
+        if not host.is_refused(kind):
+            raise Unmet(f"{kind.__name__} acknowledged: {shown(host.status)}")
+        if host.status.mode is not DeviceMode.HOMING:
+            raise Unmet(f"after {kind.__name__}: {shown(host.status)}")
+    was_acknowledged = host.command(Retract)
+    host.until(lambda: host.status.mode is DeviceMode.IDLE, OPENED_S)
+    status = host.next_status(Beat.OFF)
+    seen = f"Retract {'acknowledged' if was_acknowledged else 'not acknowledged'}, {shown(status)}"
+    if not was_acknowledged or status.mode is not DeviceMode.IDLE or is_homed(status) or not is_open(status):
+        raise Unmet(seen)
+    return seen
+
+
+CHECKS: Final = (
+    home_homes,
+    home_zeroes,
+    homed_is_in_new_origin,
+    repeated_command,
+    retract_when_idle,
+    homing_takes_only_retract,
+)

@@ -1,0 +1,435 @@
+"""The host of one device: it keeps the rhythm, remembers what was said, and brings the device to where a check begins.
+
+A device that does not follow ends the check that wanted it to (`Unmet`). Duties are small, and nothing goes further in
+than INSIDE_MM.
+"""
+
+import math
+from collections.abc import Callable
+from enum import Enum, auto
+from typing import Final, NamedTuple, TypeVar
+
+from firmware_protocol.codec import (
+    FUNCTION,
+    PROTOCOL_VERSION,
+    SCHEMA_HASH,
+    Clear,
+    DecodeError,
+    DeviceFault,
+    DeviceMode,
+    Drive,
+    DriveMode,
+    Hello,
+    Home,
+    Identity,
+    Message,
+    Retract,
+    Sense,
+    State,
+    Status,
+    Switches,
+    decode,
+    encode,
+)
+from firmware_protocol.conformance.line import Line
+
+PERIOD_S: Final = 1e-3
+REPEAT_S: Final = 0.05
+"A command or Hello without its acknowledgement is sent again after this time."
+ANSWER_S: Final = 0.02
+"Within this time an answer that is sent at once has arrived, on any carrier that the position loop bears."
+STATUS_S: Final = 0.02
+SEEN_S: Final = 0.065
+"Three Status: what has happened by now shows in one of them, even where one was lost."
+ACKNOWLEDGED_S: Final = 0.5
+OPENED_S: Final = 10.0
+HOMED_S: Final = 12.0
+"What the daemon allows a homing."
+HELLO_NONCE: Final = 255
+MOST_NONCE: Final = 254
+INSIDE_MM: Final = 2.0
+"How far a carriage is brought from its open switch where a check needs room."
+MOST_DUTY: Final = 0.5
+DUTY_PER_MM: Final = 2.0
+ARRIVED_MM: Final = 0.5
+MOVED_S: Final = 3.0
+OPEN: Final = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
+NO_FAULT: Final = DeviceFault(0)
+STALLED_S: Final = 0.005
+"This process was this late: what the device did then may have been our doing."
+
+M = TypeVar("M", bound=Message)
+Command = type[Retract] | type[Clear] | type[Home]
+
+
+class Unmet(Exception):  # noqa: N818  (what a device leaves unmet; nothing has gone wrong here)
+    """The device does not do what the page says; the text is what was seen."""
+
+
+class Beat(Enum):
+    """What is sent every millisecond."""
+
+    NOTHING = auto()
+    OFF = auto()
+    RUN = auto()
+
+
+class Heard(NamedTuple):
+    """A message of the device, and when it was here."""
+
+    time_s: float
+    message: Message
+
+
+class Homing(NamedTuple):
+    """How one homing went."""
+
+    was_acknowledged: bool
+    seconds: float
+    status: Status
+    """The last one."""
+    modes: tuple[DeviceMode, ...]
+    """As Status showed them, each once in a row."""
+    first: State | None
+    """The first State after the first Status with HOMED."""
+    last: State | None
+    """One a little later, when all has come to rest."""
+
+
+class Silence(NamedTuple):
+    """What a device in RUN did when no Drive came any more."""
+
+    statuses: tuple[tuple[float, Status], ...]
+    """With the time since the last Drive."""
+    seconds: float
+    """Until the drives were off."""
+    status: Status
+    """The last one."""
+
+
+class Host:
+    """One conversation. `heard` is what came since `begin`; `newest` the last message of each kind."""
+
+    def __init__(self, line: Line) -> None:
+        self.line = line
+        self.heard: list[Heard] = []
+        self.newest: dict[type[object], Heard] = {}
+        self.refused: dict[str, int] = {}
+        """What came in whole frames and was no message of a device, and how often."""
+        self.resets = 0
+        """Times a nonce of 0 came after another one."""
+        self.contradictions: dict[str, int] = {}
+        """What Status said of itself that cannot be, and how often."""
+        self.homings: list[Homing] = []
+        self.stalled_s = 0.0
+        """How late this process was at worst since `begin`."""
+        self.drive_s = line.now_s()
+        """When the last good Drive was sent."""
+        self.counter = 0
+        self._nonce = 0
+        self._next_s = line.now_s()
+
+    # -- what is sent ------------------------------------------------------------------------------------------------
+
+    def send(self, message: Message) -> None:
+        """One message, whole."""
+        self.line.send(FUNCTION[type(message)], encode(message))
+
+    def drive(self, mode: DriveMode, left: float = 0.0, right: float = 0.0) -> None:
+        """The next Drive."""
+        self.counter = (self.counter + 1) % 256
+        self.drive_s = self.line.now_s()
+        self.send(Drive(left, right, mode, self.counter))
+
+    def hello(
+        self,
+        schema_hash: int = SCHEMA_HASH,
+        version: int = PROTOCOL_VERSION,
+        nonce: int = HELLO_NONCE,
+        beat: Beat = Beat.NOTHING,
+    ) -> None:
+        """One Hello, and the time for its answer."""
+        self.send(Hello(schema_hash, version, nonce))
+        self.pass_time(ANSWER_S, beat)
+
+    def new_nonce(self) -> int:
+        """One that the device has not accepted."""
+        shown = self.newest.get(Status)
+        taken = shown.message.command_nonce if shown and isinstance(shown.message, Status) else 0
+        self._nonce = self._nonce % MOST_NONCE + 1
+        if self._nonce == taken:
+            self._nonce = self._nonce % MOST_NONCE + 1
+        return self._nonce
+
+    def command(self, kind: Command, beat: Beat = Beat.OFF, limit_s: float = ACKNOWLEDGED_S) -> bool:
+        """Sends a command until it is acknowledged; whether it was."""
+        nonce = self.new_nonce()
+        start_s = due_s = self._next_s
+        while self.status.command_nonce != nonce:
+            if self._next_s - start_s >= limit_s:
+                return False
+            if self._next_s >= due_s:
+                due_s += REPEAT_S
+                self.send(kind(nonce))
+            self.beat(beat)
+        return True
+
+    def is_refused(self, kind: Command, beat: Beat = Beat.OFF) -> bool:
+        """Whether a command is not acknowledged."""
+        return not self.command(kind, beat, SEEN_S)
+
+    def beat(self, beat: Beat, left: float = 0.0, right: float = 0.0) -> None:
+        """One millisecond: a Drive, where one is wanted, and whatever comes."""
+        if beat is not Beat.NOTHING:
+            self.drive(DriveMode.RUN if beat is Beat.RUN else DriveMode.OFF, left, right)
+        self._listen()
+
+    def pass_time(self, seconds: float, beat: Beat = Beat.NOTHING) -> None:
+        """That many milliseconds of it."""
+        for _ in range(round(seconds / PERIOD_S)):
+            self.beat(beat)
+
+    def until(self, reached: Callable[[], bool], limit_s: float, beat: Beat = Beat.OFF) -> bool:
+        """Goes on until then, or for so long; whether it was reached."""
+        end_s = self._next_s + limit_s
+        while not reached():
+            if self._next_s >= end_s:
+                return False
+            self.beat(beat)
+        return True
+
+    # -- what came ---------------------------------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Forgets what was heard; what is newest is kept."""
+        self.heard.clear()
+        self.stalled_s = 0.0
+        self._next_s = self.line.now_s()
+
+    def all_of(self, kind: type[M]) -> list[tuple[float, M]]:
+        """Those since `begin`, with their times."""
+        return [(heard.time_s, heard.message) for heard in self.heard if isinstance(heard.message, kind)]
+
+    def last(self, kind: type[M]) -> M:
+        """The newest message of a kind. Raises Unmet where there was none."""
+        message = self.newest[kind].message if kind in self.newest else None
+        if not isinstance(message, kind):
+            raise Unmet(f"no {kind.__name__} ever came")
+        return message
+
+    @property
+    def status(self) -> Status:
+        """The newest Status; one is waited for where there was none."""
+        if Status not in self.newest:
+            self.until(lambda: Status in self.newest, 10 * STATUS_S, Beat.NOTHING)
+        return self.last(Status)
+
+    def next_status(self, beat: Beat) -> Status:
+        """One that comes from now on, and shows what has happened by now. Raises Unmet where none comes."""
+        before = self.newest.get(Status)
+        if not self.until(lambda: self.newest.get(Status) is not before, 5 * STATUS_S, beat):
+            raise Unmet(f"no Status for {5 * STATUS_S * 1e3:.0f} ms")
+        return self.last(Status)
+
+    def _listen(self) -> None:
+        self._next_s += PERIOD_S
+        for arrival in self.line.receive(self._next_s):
+            try:
+                message = decode(arrival.function, arrival.payload)
+            except DecodeError as error:
+                self._refuse(f"{error.name or f'function {arrival.function}'}: {error.check}")
+                continue
+            if isinstance(message, State | Sense | Status | Identity):
+                self._take(Heard(arrival.time_s, message))
+            else:
+                self._refuse(f"{type(message).__name__}: a host's message")
+        late_s = self.line.now_s() - self._next_s
+        if late_s > PERIOD_S:  # no burst makes up for what was missed
+            self.stalled_s = max(self.stalled_s, late_s)
+            self._next_s += late_s
+
+    def _refuse(self, what: str) -> None:
+        self.refused[what] = self.refused.get(what, 0) + 1
+
+    def _take(self, heard: Heard) -> None:
+        message = heard.message
+        if isinstance(message, Status):
+            before = self.newest.get(Status)
+            was = before.message.command_nonce if before and isinstance(before.message, Status) else 0
+            self.resets += was != 0 and message.command_nonce == 0
+            for what in contradictions(message):
+                self.contradictions[what] = self.contradictions.get(what, 0) + 1
+        self.heard.append(heard)
+        self.newest[type(message)] = heard
+
+    # -- where a check begins ----------------------------------------------------------------------------------------
+
+    def idle(self) -> None:
+        """IDLE, without a fault, met. Raises Unmet."""
+        self.hello()
+        self.pass_time(SEEN_S, Beat.OFF)
+        resting = (DeviceMode.IDLE, DeviceMode.LATCHED)
+        if not self.until(lambda: self.status.mode in resting, HOMED_S):
+            raise Unmet(f"not IDLE after {HOMED_S:g} s of Drive OFF: {shown(self.status)}")
+        if self.status.mode is DeviceMode.LATCHED and not self.command(Clear):
+            raise Unmet(f"Clear was not acknowledged: {shown(self.status)}")
+        status = self.next_status(Beat.OFF)
+        if status.mode is not DeviceMode.IDLE or status.faults:
+            raise Unmet(f"not IDLE without a fault after Hello, Drive OFF and Clear: {shown(status)}")
+
+    def homed(self) -> None:
+        """IDLE and homed, at the open end. Raises Unmet."""
+        self.idle()
+        if not is_homed(self.status):
+            self.home()
+            if not is_homed(self.status):
+                raise Unmet(f"not homed: {shown(self.status)}")
+        if not is_open(self.status) and not (self.command(Retract) and self.until(self._is_resting, OPENED_S)):
+            raise Unmet(f"Retract does not open: {shown(self.status)}")
+
+    def home(self, beat: Beat = Beat.OFF) -> Homing:
+        """One homing of an idle device, whatever comes of it."""
+        start_s = self._next_s
+        first_heard = len(self.heard)
+        was_acknowledged = self.command(Home, beat)
+        if was_acknowledged:
+            self.until(lambda: self.status.mode is not DeviceMode.HOMING, HOMED_S, beat)
+        seconds = self._next_s - start_s
+        self.pass_time(SEEN_S, beat)
+        heard = self.heard[first_heard:]
+        modes: list[DeviceMode] = []
+        first: State | None = None
+        last: State | None = None
+        homed = False
+        for one in heard:
+            message = one.message
+            if isinstance(message, Status):
+                homed = homed or is_homed(message)
+                if not modes or modes[-1] is not message.mode:
+                    modes.append(message.mode)
+            elif isinstance(message, State):
+                last = message
+                if homed and first is None:
+                    first = message
+        homing = Homing(was_acknowledged, seconds, self.status, tuple(modes), first, last)
+        self.homings.append(homing)
+        return homing
+
+    def running(self, inside_mm: float = 0.0) -> None:
+        """RUN with a duty of 0, the carriages that far from their open switches. Raises Unmet."""
+        self.homed()
+        self.pass_time(2 * PERIOD_S, Beat.OFF)
+        if not self.until(lambda: self.status.mode is DeviceMode.RUN, SEEN_S, Beat.RUN):
+            raise Unmet(f"Drive RUN does not lead to RUN: {shown(self.status)}")
+        if inside_mm > 0.0:
+            self._go_in(inside_mm)
+
+    def _go_in(self, inside_mm: float) -> None:
+        end_s = self._next_s + MOVED_S
+        while True:
+            state = self.last(State)
+            errors = -inside_mm - state.left_position_mm, -inside_mm - state.right_position_mm
+            if max(abs(error) for error in errors) < ARRIVED_MM:
+                break
+            left, right = (min(max(DUTY_PER_MM * error, -MOST_DUTY), MOST_DUTY) for error in errors)
+            self.beat(Beat.RUN, left, right)
+            if self.status.mode is not DeviceMode.RUN or self._next_s > end_s:
+                raise Unmet(
+                    f"duties of up to {MOST_DUTY:g} did not bring the carriages {inside_mm:g} mm in: "
+                    f"{positions(state)}, {shown(self.status)}"
+                )
+        self.pass_time(SEEN_S, Beat.RUN)
+
+    def fall_silent(self, meanwhile: Callable[[], None] | None = None) -> Silence:
+        """In RUN, no Drive any more, until the drives are off; `meanwhile` is sent every millisecond.
+
+        The last Drive goes out so that a Status is due 57 ms after it, when the device has to have noticed.
+        """
+        self.next_status(Beat.RUN)
+        self.pass_time(3 * PERIOD_S, Beat.RUN)
+        silent_s, first_heard = self.drive_s, len(self.heard)
+        end_s = self._next_s + OPENED_S
+        while self._next_s < end_s:
+            if meanwhile is not None:
+                meanwhile()
+            self.beat(Beat.NOTHING)
+            if self._next_s > silent_s + SEEN_S + 2 * STATUS_S and self._is_resting():
+                break
+            if self._next_s > silent_s + 0.5 and self.status.mode is DeviceMode.RUN:
+                break  # it will not notice any more
+        seconds = self._next_s - silent_s
+        statuses = tuple(
+            (one.time_s - silent_s, one.message) for one in self.heard[first_heard:] if isinstance(one.message, Status)
+        )
+        return Silence(statuses, seconds, self.status)
+
+    def latched(self) -> None:
+        """LATCHED, by silence in RUN. Raises Unmet."""
+        status = self.next_status(Beat.NOTHING)
+        if status.mode is not DeviceMode.LATCHED or DeviceFault.COMMAND_TIMEOUT not in status.faults:
+            self.running(INSIDE_MM)
+            self.fall_silent()
+            if self.status.mode is not DeviceMode.LATCHED:
+                raise Unmet(f"silence in RUN does not lead to LATCHED: {shown(self.status)}")
+
+    def leave_open(self) -> str:
+        """Opens the gap, whatever the device was doing; what hinders it, in words, empty where it is open."""
+        self.hello()
+        for _ in range(2):
+            if Status not in self.newest and not self.until(lambda: Status in self.newest, 0.2):
+                return "the device sends no Status"
+            self.until(self._is_resting, OPENED_S)
+            if is_open(self.next_status(Beat.OFF)) and self._is_resting():
+                return ""
+            if self.status.mode is DeviceMode.LATCHED:
+                self.command(Clear)
+            self.command(Retract)
+            self.until(self._is_resting, OPENED_S)
+        status = self.next_status(Beat.OFF)
+        return "" if is_open(status) and self._is_resting() else shown(status)
+
+    def _is_resting(self) -> bool:
+        return self.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED)
+
+
+def is_homed(status: Status) -> bool:
+    """Whether the zero is valid."""
+    return Switches.HOMED in status.switches
+
+
+def is_open(status: Status) -> bool:
+    """Whether both carriages are at their open switches."""
+    return OPEN in status.switches
+
+
+def shown(status: Status) -> str:
+    """A Status in a few words."""
+    faults = "|".join(fault.name or "" for fault in DeviceFault if fault in status.faults) or "no fault"
+    switches = "|".join(switch.name or "" for switch in Switches if switch in status.switches) or "no switch"
+    return f"{status.mode.name}, {faults}, {switches}, nonce {status.command_nonce}"
+
+
+def positions(state: State) -> str:
+    """Where the carriages are, in a few words."""
+    return f"left {state.left_position_mm:+.2f} mm, right {state.right_position_mm:+.2f} mm"
+
+
+def contradictions(status: Status) -> list[str]:
+    """What cannot be true of one Status at once."""
+    found = [
+        f"{side}_OPEN with {side}_CLOSED"
+        for side in ("LEFT", "RIGHT")
+        if Switches[f"{side}_OPEN"] in status.switches and Switches[f"{side}_CLOSED"] in status.switches
+    ]
+    if is_homed(status) and status.mode in (DeviceMode.HOMING, DeviceMode.LATCHED):
+        found.append(f"HOMED while {status.mode.name}")
+    if status.mode is DeviceMode.LATCHED and not status.faults:
+        found.append("LATCHED without a fault")
+    if status.faults and status.mode in (DeviceMode.IDLE, DeviceMode.RUN):
+        found.append(f"a fault while {status.mode.name}")
+    return found
+
+
+def usual(values: list[float]) -> float:
+    """The median; NaN of nothing."""
+    return sorted(values)[len(values) // 2] if values else math.nan

@@ -1,0 +1,195 @@
+"""What carries messages between this host and a device, with its clock; and what can be damaged on it."""
+
+from collections.abc import Mapping
+from typing import Final, NamedTuple, Protocol
+
+from firmware_protocol.codec import can_identifier
+from firmware_protocol.framing import DELIMITER, MAX_ENCODED, FrameDecoder, encode_frame
+
+NODES: Final = 16
+NOISE: Final = bytes((0x55, 0xAA, 0xFF, 0x01, 0x7E, 0x80, 0x0D, 0x0A, 0x11, 0x13)) * 3
+"Neither a frame nor without the bytes that terminals take for more than bytes."
+
+
+class Arrival(NamedTuple):
+    """The payload of one whole frame, and when it was here."""
+
+    time_s: float
+    function: int
+    payload: bytes
+
+
+class BytePort(Protocol):
+    """A serial port and a clock, real or virtual."""
+
+    def now_s(self) -> float:
+        """The time, from any start; it never falls."""
+
+    def write(self, data: bytes) -> None:
+        """Sends bytes. Raises OSError when the port is gone."""
+
+    def read(self, until_s: float) -> list[tuple[float, bytes]]:
+        """Waits until then; what came, with its times. Raises OSError when the port is gone."""
+
+    def close(self) -> None:
+        """Gives the port back."""
+
+
+class FramePort(Protocol):
+    """A CAN bus and a clock, real or virtual. Classical frames with 11-bit identifiers."""
+
+    def now_s(self) -> float:
+        """The time, from any start; it never falls."""
+
+    def write(self, identifier: int, data: bytes) -> None:
+        """Sends a frame. Raises OSError when the bus is gone."""
+
+    def read(self, until_s: float) -> list[tuple[float, int, bytes]]:
+        """Waits until then; times, identifiers and data of what came. Raises OSError when the bus is gone."""
+
+    def close(self) -> None:
+        """Gives the bus back."""
+
+
+class Line(Protocol):
+    """One conversation with one device."""
+
+    @property
+    def frame_errors(self) -> dict[str, int]:
+        """What was wrong with the device's frames, and how often."""
+
+    def now_s(self) -> float:
+        """The time, from any start; it never falls."""
+
+    def send(self, function: int, payload: bytes) -> None:
+        """One whole frame. Raises OSError when the line is gone."""
+
+    def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
+        """What this carrier can do to a frame, by name, as what `send_damaged` takes, each to be ignored."""
+
+    def send_damaged(self, unit: bytes) -> None:
+        """Puts one of those on the line. Raises OSError when the line is gone."""
+
+    def receive(self, until_s: float) -> list[Arrival]:
+        """Waits until then; the device's whole frames that came. Raises OSError when the line is gone."""
+
+    def close(self) -> None:
+        """Gives the line back."""
+
+
+class SerialLine:
+    """Frames of COBS and CRC-16 on a serial port."""
+
+    def __init__(self, port: BytePort) -> None:
+        self._port = port
+        self._decoder = FrameDecoder()
+        self._sequence = 0
+        self._before: tuple[int, int, int] | None = None
+        port.write(DELIMITER)  # ends whatever was there before
+
+    def now_s(self) -> float:
+        """The port's clock."""
+        return self._port.now_s()
+
+    def send(self, function: int, payload: bytes) -> None:
+        """One frame, with the next sequence number."""
+        self._port.write(self._frame(function, payload))
+
+    def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
+        """Each ends with a delimiter, so that the frame after it is whole."""
+        frame = self._frame(function, payload)
+        body = frame[:-1]
+        middle = len(body) // 2
+        flipped = body[middle] ^ 0x10 or 0x20  # not to zero, which would end the frame
+        return {
+            "frame_crc_16": (body[:middle] + bytes((flipped,)) + body[middle + 1 :] + DELIMITER,),
+            "frame_cut_off": tuple(body[:length] + DELIMITER for length in (1, middle, len(body) - 1)),
+            "frame_too_long": (body + b"\x01" + DELIMITER, body + b"\x07" * 300 + DELIMITER, body[:-1] * 3 + DELIMITER),
+            "frame_zero_inside": (body[:middle] + DELIMITER + body[middle:] + DELIMITER,),
+            "noise": (NOISE + DELIMITER, NOISE[: MAX_ENCODED - 2] + DELIMITER, NOISE * 40 + DELIMITER),
+        }
+
+    def send_damaged(self, unit: bytes) -> None:
+        """Bytes as they are."""
+        self._port.write(unit)
+
+    def receive(self, until_s: float) -> list[Arrival]:
+        """The whole frames."""
+        arrivals = [
+            Arrival(time_s, frame.function, frame.payload)
+            for time_s, data in self._port.read(until_s)
+            for frame in self._decoder.feed(data)
+        ]
+        if self._before is None and arrivals:
+            statistics = self._decoder.statistics
+            self._before = statistics.corrupt, statistics.lost, statistics.repeated
+        return arrivals
+
+    def close(self) -> None:
+        """Gives the port back."""
+        self._port.close()
+
+    def _frame(self, function: int, payload: bytes) -> bytes:
+        frame = encode_frame(function, self._sequence, payload)
+        self._sequence = (self._sequence + 1) % 256
+        return frame
+
+    @property
+    def frame_errors(self) -> dict[str, int]:
+        """From the first whole frame on, if one ever came: before it the line was not ours."""
+        statistics = self._decoder.statistics
+        now = statistics.corrupt, statistics.lost, statistics.repeated
+        corrupt, lost, repeated = (count - before for count, before in zip(now, self._before or (1, 0, 0), strict=True))
+        errors = {
+            f"not a frame ({statistics.refused.get('frame', '')})": corrupt,
+            "missing from the sequence": lost - corrupt,  # one that came damaged is missing, and is one error
+            "sequence number repeated": repeated,
+        }
+        return {what: count for what, count in errors.items() if count > 0}
+
+
+class CanLine:
+    """Payloads as data of CAN frames of one node."""
+
+    def __init__(self, port: FramePort, node: int) -> None:
+        """Raises EncodeError for a node outside 0..15."""
+        can_identifier(1, node)
+        self._port, self._node = port, node
+        self._others: set[int] = set()
+
+    @property
+    def frame_errors(self) -> dict[str, int]:
+        """None: the controllers check frames, and what they discard is not seen."""
+        return {}
+
+    def now_s(self) -> float:
+        """The bus's clock."""
+        return self._port.now_s()
+
+    def send(self, function: int, payload: bytes) -> None:
+        """One frame to our node."""
+        self._port.write(can_identifier(function, self._node), payload)
+
+    def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
+        """A whole frame to a node that nobody has spoken for: a Drive to another brake would be obeyed there."""
+        free = [node for node in range(NODES) if node != self._node and node not in self._others]
+        frames = tuple(can_identifier(function, node).to_bytes(2, "big") + payload for node in free[:2])
+        return {"other_node": frames} if frames else {}
+
+    def send_damaged(self, unit: bytes) -> None:
+        """Two bytes of identifier, then the data."""
+        self._port.write(int.from_bytes(unit[:2], "big"), unit[2:])
+
+    def receive(self, until_s: float) -> list[Arrival]:
+        """The frames of our node."""
+        arrivals = []
+        for time_s, identifier, data in self._port.read(until_s):
+            if identifier & 0xF == self._node:
+                arrivals.append(Arrival(time_s, identifier >> 4, data))
+            else:
+                self._others.add(identifier & 0xF)
+        return arrivals
+
+    def close(self) -> None:
+        """Gives the bus back."""
+        self._port.close()

@@ -1,0 +1,140 @@
+"""Hello and Identity, schema and version, and what a mismatch leads to. Nothing moves."""
+
+from typing import Final
+
+from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, Clear, DeviceFault, DeviceMode, Identity
+from firmware_protocol.conformance.check import check
+from firmware_protocol.conformance.host import SEEN_S, Beat, Host, Unmet, is_homed, shown
+
+PAGE = "Who says what when, 1"
+CLEARING = "What each mode takes"
+HELLOS = 3
+
+
+@check(PAGE, f"{HELLOS} Hellos", "one Identity each, at once", is_gate=True)
+def identity_answers_hello(host: Host) -> str:
+    """Who is there, and does it answer always."""
+    for _ in range(HELLOS):
+        host.hello()
+    count = len(host.all_of(Identity))
+    seen = f"{count} Identity for {HELLOS} Hellos"
+    if count != HELLOS:
+        if host.refused:
+            seen += f"; refused: {', '.join(host.refused)}"
+        raise Unmet(seen)
+    return seen
+
+
+@check(
+    PAGE,
+    "Hello",
+    f"Identity with schema {SCHEMA_HASH:08X}, bytes {SCHEMA_HASH.to_bytes(4, 'little').hex(' ')}",
+    is_gate=True,
+)
+def schema_hash(host: Host) -> str:
+    """Both were built from the same tormag.dbc."""
+    host.hello()
+    theirs = host.last(Identity).schema_hash
+    seen = f"schema {theirs:08X}, bytes {theirs.to_bytes(4, 'little').hex(' ')}"
+    if theirs == int.from_bytes(SCHEMA_HASH.to_bytes(4, "little"), "big"):
+        raise Unmet(f"{seen}: its bytes are the wrong way round")
+    if theirs != SCHEMA_HASH:
+        raise Unmet(f"{seen}: firmware and this program are built from different tormag.dbc")
+    return seen
+
+
+@check("Who says what when, 5", "Hello with nonce 255, 77, 77, 255", "the next Status shows each")
+def hello_nonce(host: Host) -> str:
+    """A Hello's nonce counts as accepted."""
+    seen = []
+    for nonce in (255, 77, 77, 255):
+        host.hello(nonce=nonce)
+        seen.append(host.next_status(Beat.NOTHING).command_nonce)
+        if seen[-1] != nonce:
+            raise Unmet(f"nonce {seen[-1]} in Status after a Hello with {nonce}")
+    return f"nonces {seen}"
+
+
+def _mismatch(host: Host, schema: int, version: int) -> str:
+    host.idle()
+    host.begin()
+    host.hello(schema, version)
+    answers = len(host.all_of(Identity))
+    status = host.next_status(Beat.OFF)
+    seen = f"{answers} Identity, {shown(status)}"
+    is_right = (
+        answers == 1
+        and DeviceFault.SCHEMA_MISMATCH in status.faults
+        and status.mode is DeviceMode.LATCHED
+        and not is_homed(status)
+    )
+    if not is_right:
+        raise Unmet(seen)
+    return seen
+
+
+@check(PAGE, "Hello with another schema hash", "Identity; Status LATCHED with SCHEMA_MISMATCH, not HOMED")
+def schema_mismatch(host: Host) -> str:
+    """A device does not run for a host of another schema."""
+    return _mismatch(host, SCHEMA_HASH ^ 1, PROTOCOL_VERSION)
+
+
+@check(PAGE, "Hello with another protocol version", "Identity; Status LATCHED with SCHEMA_MISMATCH, not HOMED")
+def version_mismatch(host: Host) -> str:
+    """Nor for one of another version."""
+    return _mismatch(host, SCHEMA_HASH, (PROTOCOL_VERSION + 1) % 256)
+
+
+@check(CLEARING, "Hello with another schema hash, then Clear", "Clear not acknowledged, still LATCHED")
+def mismatch_holds(host: Host) -> str:
+    """The cause is not gone."""
+    schema_mismatch.perform(host)
+    is_refused = host.is_refused(Clear)
+    status = host.next_status(Beat.OFF)
+    if not is_refused or DeviceFault.SCHEMA_MISMATCH not in status.faults:
+        raise Unmet(f"Clear {'refused' if is_refused else 'acknowledged'}, {shown(status)}")
+    return shown(status)
+
+
+@check(
+    CLEARING,
+    "Hello with another schema hash, the right Hello, then Clear",
+    "Clear acknowledged; IDLE, no fault, not HOMED",
+)
+def clear_clears(host: Host) -> str:
+    """Clear takes away a fault whose cause is gone, and brings back no zero."""
+    schema_mismatch.perform(host)
+    host.hello()
+    status = host.next_status(Beat.OFF)
+    if DeviceFault.SCHEMA_MISMATCH not in status.faults:
+        raise Unmet(f"after the right Hello, before Clear: {shown(status)}")
+    was_acknowledged = host.command(Clear)
+    status = host.next_status(Beat.OFF)
+    seen = f"Clear {'acknowledged' if was_acknowledged else 'not acknowledged'}, {shown(status)}"
+    if not was_acknowledged or status.mode is not DeviceMode.IDLE or status.faults or is_homed(status):
+        raise Unmet(seen)
+    return seen
+
+
+@check("Modes", "not homed, Drive OFF, then Drive RUN with a duty of 0", "stays IDLE")
+def run_needs_homing(host: Host) -> str:
+    """Without a zero nothing runs."""
+    schema_mismatch.perform(host)
+    host.idle()
+    host.pass_time(SEEN_S, Beat.RUN)
+    status = host.next_status(Beat.RUN)
+    if status.mode is not DeviceMode.IDLE:
+        raise Unmet(shown(status))
+    return shown(status)
+
+
+CHECKS: Final = (
+    identity_answers_hello,
+    schema_hash,
+    hello_nonce,
+    schema_mismatch,
+    version_mismatch,
+    mismatch_holds,
+    clear_clears,
+    run_needs_homing,
+)

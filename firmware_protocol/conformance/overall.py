@@ -1,0 +1,66 @@
+"""What can only be said at the end: of all that came, and of how the device is left."""
+
+from typing import Final
+
+from firmware_protocol.conformance.check import check
+from firmware_protocol.conformance.host import Host, Unmet, shown
+
+ALL = "everything, from the start on"
+
+
+@check("Messages", ALL, "only messages that pass: length, CRC-8, ranges; those of a device")
+def own_messages(host: Host) -> str:
+    """No message of the device was refused."""
+    if host.refused:
+        raise Unmet(listed(host.refused))
+    return "all passed"
+
+
+@check("Carriers", ALL, "whole frames, their sequence one more each time (on CAN the controllers see to it)")
+def own_frames(host: Host) -> str:
+    """COBS, CRC-16 and sequence of the device's frames."""
+    if errors := host.line.frame_errors:
+        raise Unmet(listed(errors))
+    return "all whole"
+
+
+@check("Who says what when, 5", ALL, "no reset: the nonce in Status never falls back to 0")
+def no_reset(host: Host) -> str:
+    """Nothing that a host says resets a device."""
+    if host.resets:
+        raise Unmet(f"the nonce fell back to 0 {host.resets} times")
+    return "none"
+
+
+@check("Modes", ALL, "Status does not contradict itself")
+def status_consistent(host: Host) -> str:
+    """No switch at both ends, no LATCHED without a fault or with a zero, no fault in IDLE or RUN."""
+    if host.contradictions:
+        raise Unmet(listed(host.contradictions))
+    return f"at last {shown(host.status)}"
+
+
+@check(
+    "Who says what when, 7",
+    "Drive OFF; where that does not open, Clear and Retract",
+    "both open switches, drives off",
+)
+def left_open(host: Host) -> str:
+    """However it went, the device is left in its safe state."""
+    if hindrance := host.leave_open():
+        raise Unmet(f"THE GAP MAY BE SHUT: {hindrance}")
+    return shown(host.status)
+
+
+def listed(counts: dict[str, int]) -> str:
+    """Things and how often, in words."""
+    return ", ".join(f"{what}, {count} times" for what, count in counts.items())
+
+
+CHECKS: Final = (
+    own_messages,
+    own_frames,
+    no_reset,
+    status_consistent,
+    left_open,
+)

@@ -1,0 +1,137 @@
+"""Real ports in real time: pyserial for a serial line, python-can for a bus."""
+
+import contextlib
+import errno
+import os
+import select
+import termios
+import time
+from pathlib import Path
+from typing import Any, Final, final
+
+import can
+import serial
+from can.interfaces import BACKENDS
+from can.interfaces.slcan import slcanBus
+
+from firmware_protocol.conformance.line import CanLine, Line, SerialLine
+
+READ_BYTES: Final = 4096
+PATIENCE_S: Final = 1.0
+"A port that takes nothing for so long is gone."
+
+
+@final
+class SerialPort:
+    """An open, exclusively held serial port: a `BytePort`."""
+
+    def __init__(self, path: str, baud: int) -> None:
+        """Raises OSError."""
+        try:
+            self._port = serial.Serial(path, baud, timeout=0, write_timeout=PATIENCE_S, exclusive=True)
+            self._port.reset_input_buffer()
+        except termios.error as error:  # no OSError; unplugged while it was set up
+            raise OSError(f"{path}: {error.args[-1]}") from error
+        # USB serial chips keep bytes back for 16 ms unless they are told otherwise; a pty has no such mode
+        with contextlib.suppress(OSError, ValueError, NotImplementedError):
+            self._port.set_low_latency_mode(True)
+
+    def now_s(self) -> float:
+        """The monotonic clock."""
+        return time.monotonic()
+
+    def write(self, data: bytes) -> None:
+        """Raises OSError."""
+        self._port.write(data)
+
+    def read(self, until_s: float) -> list[tuple[float, bytes]]:
+        """Raises OSError."""
+        came: list[tuple[float, bytes]] = []
+        while (left_s := until_s - time.monotonic()) > 0.0 or not came:
+            if select.select([self._port.fileno()], [], [], max(left_s, 0.0))[0]:
+                data = os.read(self._port.fileno(), READ_BYTES)
+                if not data:
+                    raise OSError(errno.ENODEV, "the device was unplugged")
+                came.append((time.monotonic(), data))
+            elif left_s <= 0.0:
+                break
+        return came
+
+    def close(self) -> None:
+        """Gives the port back, and does not wait for what was not sent."""
+        with contextlib.suppress(OSError, termios.error):  # it may be gone
+            self._port.reset_output_buffer()
+            self._port.close()
+
+
+@final
+class CanPort:
+    """An open bus: a `FramePort`."""
+
+    def __init__(self, interface: str, channel: str, bitrate: int, baud: int) -> None:
+        """Raises OSError."""
+        settings: dict[str, Any] = {}
+        if interface == "slcan":  # by default it sleeps for 2 s when it opens
+            settings = {"tty_baudrate": baud, "sleep_after_open": 0.0, "timeout": 0.0}
+        elif interface == "udp_multicast":
+            settings = {"hop_limit": 0, "fd": False}
+        try:
+            self._bus = can.Bus(interface=interface, channel=channel, bitrate=bitrate, ignore_config=True, **settings)
+            self._fd: int = self._bus.fileno()
+        except NotImplementedError as error:
+            raise OSError(f"{interface}: this driver cannot be waited for; use the kernel's, socketcan") from error
+        except (can.CanError, ValueError, OSError) as error:
+            raise OSError(f"{interface}:{channel}: cannot be opened: {error}") from error
+
+    def now_s(self) -> float:
+        """The monotonic clock."""
+        return time.monotonic()
+
+    def write(self, identifier: int, data: bytes) -> None:
+        """Raises OSError."""
+        try:
+            self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=PATIENCE_S)
+        except can.CanError as error:
+            raise OSError(str(error)) from error
+
+    def read(self, until_s: float) -> list[tuple[float, int, bytes]]:
+        """Raises OSError."""
+        came: list[tuple[float, int, bytes]] = []
+        while True:
+            left_s = until_s - time.monotonic()
+            if select.select([self._fd], [], [], max(left_s, 0.0))[0]:
+                frame = self._received()
+                if frame is not None:
+                    came.append((time.monotonic(), frame.arbitration_id, bytes(frame.data)))
+            elif left_s <= 0.0:
+                return came
+
+    def close(self) -> None:
+        """Gives the bus back."""
+        with contextlib.suppress(can.CanError, OSError):  # it may be gone
+            self._bus.shutdown()
+
+    def _received(self) -> can.Message | None:
+        try:
+            frame = self._bus.recv(0)
+        except (can.CanError, OSError) as error:
+            if isinstance(self._bus, slcanBus) and isinstance(error.__cause__, UnicodeDecodeError):
+                self._bus.flush()  # it would keep a line that is no text for ever
+                return None
+            raise OSError(str(error)) from error
+        except (ValueError, IndexError):  # how slcan says that a line of the adapter's is damaged
+            return None
+        if frame is None or frame.is_error_frame or frame.is_extended_id or frame.is_remote_frame or frame.is_fd:
+            return None
+        return frame
+
+
+def open_line(name: str, baud: int, bitrate: int, node: int) -> Line:
+    """A serial line by its path, a bus as INTERFACE:CHANNEL. Raises OSError saying why not."""
+    interface, colon, channel = name.partition(":")
+    if colon and interface in BACKENDS:
+        return CanLine(CanPort(interface, channel, bitrate, baud), node)
+    if colon and not Path(name).exists():
+        known = ", ".join(sorted(BACKENDS))
+        raise OSError(f"{name}: no such port, and {interface!r} is no python-can interface: installed are {known}")
+    return SerialLine(SerialPort(name, baud))

@@ -1,0 +1,268 @@
+"""RUN: how it is entered, what the duties do, what ends it and what does not. Duties are small, ways are short."""
+
+from typing import Final
+
+from firmware_protocol.codec import (
+    SCHEMA_HASH,
+    Clear,
+    DeviceFault,
+    DeviceMode,
+    Home,
+    Identity,
+    Retract,
+    Sense,
+    State,
+)
+from firmware_protocol.conformance.check import check
+from firmware_protocol.conformance.host import (
+    INSIDE_MM,
+    MOST_DUTY,
+    OPENED_S,
+    PERIOD_S,
+    SEEN_S,
+    Beat,
+    Host,
+    Unmet,
+    is_homed,
+    is_open,
+    positions,
+    shown,
+)
+
+PAGE: Final = "Modes"
+RAMP_PER_S: Final = 1.0
+MOVED_MM: Final = 0.3
+AT_STOP_DUTY: Final = 0.3
+AT_STOP_MM: Final = 0.1
+AT_STOP_A: Final = 0.3
+"""A motor that pushes into the stop draws several times this at that duty."""
+RUNNING: Final = f"in RUN, {INSIDE_MM:g} mm in, "
+
+
+@check(PAGE, "homed, Drive OFF, then Drive RUN with a duty of 0", "RUN", moves=True)
+def run_is_entered(host: Host) -> str:
+    """Homed, met, no fault: a Drive that asks for it is enough."""
+    host.running()
+    return shown(host.status)
+
+
+@check(
+    "Drive",
+    f"in RUN, a left duty that falls from 0 to -{MOST_DUTY:g} at most, right 0",
+    f"the left carriage goes in by {MOVED_MM:g} mm, the right one stays",
+    moves=True,
+    is_gate=True,
+)
+def left_duty(host: Host) -> str:
+    """Side and sign: with either wrong, every safe state closes the gap."""
+    return _duty_moves(host, is_left=True)
+
+
+@check(
+    "Drive",
+    f"in RUN, a right duty that falls from 0 to -{MOST_DUTY:g} at most, left 0",
+    f"the right carriage goes in by {MOVED_MM:g} mm, the left one stays",
+    moves=True,
+    is_gate=True,
+)
+def right_duty(host: Host) -> str:
+    """The other side."""
+    return _duty_moves(host, is_left=False)
+
+
+def _duty_moves(host: Host, *, is_left: bool) -> str:
+    host.running()
+    start = host.last(State)
+    for step in range(round(MOST_DUTY / RAMP_PER_S / PERIOD_S)):
+        duty = -RAMP_PER_S * PERIOD_S * step
+        host.beat(Beat.RUN, duty if is_left else 0.0, 0.0 if is_left else duty)
+        state = host.last(State)
+        left_mm = state.left_position_mm - start.left_position_mm
+        right_mm = state.right_position_mm - start.right_position_mm
+        moved_mm, other_mm = (left_mm, right_mm) if is_left else (right_mm, left_mm)
+        seen = f"left by {left_mm:+.2f} mm, right by {right_mm:+.2f} mm at a duty of {duty:.2f}"
+        if moved_mm <= -MOVED_MM and abs(other_mm) < MOVED_MM / 2:
+            return seen
+        if max(abs(moved_mm), abs(other_mm)) >= MOVED_MM:
+            raise Unmet(seen)
+    raise Unmet(f"{seen}, {shown(host.status)}")
+
+
+@check(
+    PAGE,
+    f"in RUN at both open switches, duties of +{AT_STOP_DUTY:g} for 0.2 s",
+    f"no motion over {AT_STOP_MM:g} mm, no current over {AT_STOP_A:g} A",
+    moves=True,
+)
+def open_switch_stops(host: Host) -> str:
+    """A carriage at its open switch is not driven out into the stop."""
+    host.running()
+    if not is_open(host.status):
+        raise Unmet(f"not at the open switches: {shown(host.status)}")
+    start = host.last(State)
+    host.begin()
+    for _ in range(200):
+        host.beat(Beat.RUN, AT_STOP_DUTY, AT_STOP_DUTY)
+    senses = [sense for _, sense in host.all_of(Sense)]
+    state = host.last(State)
+    most_A = max((max(abs(sense.left_current_A), abs(sense.right_current_A)) for sense in senses), default=0.0)
+    left_mm = state.left_position_mm - start.left_position_mm
+    right_mm = state.right_position_mm - start.right_position_mm
+    seen = f"left by {left_mm:+.2f} mm, right by {right_mm:+.2f} mm, {most_A:.2f} A at most, {shown(host.status)}"
+    if most_A > AT_STOP_A or max(abs(left_mm), abs(right_mm)) > AT_STOP_MM or host.status.mode is not DeviceMode.RUN:
+        raise Unmet(seen)
+    return seen
+
+
+@check(PAGE, f"{RUNNING}Drive OFF", "RETRACTING, then IDLE at both open switches, HOMED, no fault", moves=True)
+def off_opens(host: Host) -> str:
+    """Parting: the gap opens, and nothing is latched."""
+    host.running(INSIDE_MM)
+    return _opens(host, Beat.OFF)
+
+
+@check(
+    PAGE,
+    f"{RUNNING}Retract, while Drive RUN goes on",
+    "acknowledged; RETRACTING, then IDLE at both open switches, HOMED, no fault",
+    moves=True,
+)
+def retract_opens(host: Host) -> str:
+    """A Retract is stronger than a Drive."""
+    host.running(INSIDE_MM)
+    if not host.command(Retract, Beat.RUN):
+        raise Unmet(f"not acknowledged: {shown(host.status)}")
+    return _opens(host, Beat.RUN)
+
+
+def _opens(host: Host, beat: Beat) -> str:
+    before = positions(host.last(State))
+    first = host.next_status(beat)
+    host.until(lambda: host.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED), OPENED_S, beat)
+    status = host.next_status(beat)
+    seen = f"from {before}: first {first.mode.name}, then {shown(status)}, {positions(host.last(State))}"
+    is_right = status.mode is DeviceMode.IDLE and is_open(status) and is_homed(status) and not status.faults
+    if first.mode is not DeviceMode.RETRACTING or not is_right:
+        raise Unmet(seen)
+    return seen
+
+
+@check(
+    PAGE,
+    "Retract in RUN while Drive RUN goes on; then one Drive OFF",
+    "IDLE until the Drive OFF, RUN after it",
+    moves=True,
+)
+def let_go_after_retract(host: Host) -> str:
+    """Who was put off RUN has to let go once before it gets there again."""
+    host.running()
+    if not host.command(Retract, Beat.RUN):
+        raise Unmet(f"Retract not acknowledged: {shown(host.status)}")
+    host.until(lambda: host.status.mode is DeviceMode.IDLE, OPENED_S, Beat.RUN)
+    return has_to_let_go(host)
+
+
+def has_to_let_go(host: Host) -> str:
+    """From IDLE, Drive RUN going on. Raises Unmet where RUN comes before a Drive OFF, or not after it."""
+    host.pass_time(SEEN_S, Beat.RUN)
+    status = host.next_status(Beat.RUN)
+    if status.mode is not DeviceMode.IDLE:
+        raise Unmet(f"before a Drive OFF: {shown(status)}")
+    host.beat(Beat.OFF)
+    host.pass_time(SEEN_S, Beat.RUN)
+    status = host.next_status(Beat.RUN)
+    if status.mode is not DeviceMode.RUN:
+        raise Unmet(f"after a Drive OFF and Drive RUN again: {shown(status)}")
+    return "IDLE, then RUN"
+
+
+@check("What each mode takes", "Home in RUN", "not acknowledged, stays RUN and HOMED", moves=True)
+def home_refused_in_run(host: Host) -> str:
+    """A homing would take the brake out of the host's hands."""
+    return _refused_in_run(host, Home)
+
+
+@check("What each mode takes", "Clear in RUN", "not acknowledged, stays RUN and HOMED", moves=True)
+def clear_refused_in_run(host: Host) -> str:
+    """Clear is for drives that are off."""
+    return _refused_in_run(host, Clear)
+
+
+def _refused_in_run(host: Host, kind: type[Home] | type[Clear]) -> str:
+    host.running()
+    is_refused = host.is_refused(kind, Beat.RUN)
+    status = host.next_status(Beat.RUN)
+    seen = f"{'not acknowledged' if is_refused else 'acknowledged'}, {shown(status)}"
+    if not is_refused or status.mode is not DeviceMode.RUN or not is_homed(status):
+        raise Unmet(seen)
+    return seen
+
+
+@check("Who says what when, 1", "the right Hello in RUN", "Identity; stays RUN and HOMED", moves=True)
+def hello_in_run(host: Host) -> str:
+    """The host says it every second, to hear of a device that was reset."""
+    host.running()
+    host.begin()
+    for nonce in (host.status.command_nonce, 77):
+        host.hello(nonce=nonce, beat=Beat.RUN)
+    status = host.next_status(Beat.RUN)
+    seen = f"{len(host.all_of(Identity))} Identity for 2 Hellos, {shown(status)}"
+    if status.mode is not DeviceMode.RUN or not is_homed(status) or len(host.all_of(Identity)) != 2:
+        raise Unmet(seen)
+    return seen
+
+
+@check(
+    "Who says what when, 1",
+    f"{RUNNING}a Hello with another schema hash",
+    "opens; LATCHED with SCHEMA_MISMATCH",
+    moves=True,
+)
+def mismatch_in_run(host: Host) -> str:
+    """Another host has come, that does not know what it says."""
+    host.running(INSIDE_MM)
+    host.hello(SCHEMA_HASH ^ 1, beat=Beat.RUN)
+    host.until(lambda: host.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED), OPENED_S, Beat.RUN)
+    status = host.next_status(Beat.RUN)
+    if status.mode is not DeviceMode.LATCHED or DeviceFault.SCHEMA_MISMATCH not in status.faults or not is_open(status):
+        raise Unmet(shown(status))
+    return shown(status)
+
+
+@check(
+    "What each mode takes",
+    f"{RUNNING}Drive OFF; while RETRACTING Home, then Retract",
+    "only Retract acknowledged; IDLE, open, HOMED",
+    moves=True,
+)
+def retracting_takes_only_retract(host: Host) -> str:
+    """What opens is not turned round."""
+    host.running(INSIDE_MM)
+    if host.next_status(Beat.OFF).mode is not DeviceMode.RETRACTING:
+        raise Unmet(f"after Drive OFF: {shown(host.status)}")
+    is_refused = host.is_refused(Home)
+    was_acknowledged = host.command(Retract)
+    host.until(lambda: host.status.mode is DeviceMode.IDLE, OPENED_S)
+    status = host.next_status(Beat.OFF)
+    home, retract = ("acknowledged" if one else "not acknowledged" for one in (not is_refused, was_acknowledged))
+    seen = f"Home {home}, Retract {retract}, {shown(status)}"
+    is_right = status.mode is DeviceMode.IDLE and is_homed(status) and is_open(status)
+    if not is_refused or not was_acknowledged or not is_right:
+        raise Unmet(seen)
+    return seen
+
+
+CHECKS: Final = (
+    run_is_entered,
+    left_duty,
+    right_duty,
+    open_switch_stops,
+    off_opens,
+    retract_opens,
+    retracting_takes_only_retract,
+    let_go_after_retract,
+    home_refused_in_run,
+    clear_refused_in_run,
+    hello_in_run,
+    mismatch_in_run,
+)

@@ -1,0 +1,211 @@
+"""The host falls silent in RUN: when that is noticed, what the device does, and what it takes until it runs again."""
+
+from typing import Final
+
+from firmware_protocol.codec import (
+    FUNCTION,
+    PROTOCOL_VERSION,
+    SCHEMA_HASH,
+    Clear,
+    DeviceFault,
+    DeviceMode,
+    Drive,
+    DriveMode,
+    Hello,
+    Home,
+    Retract,
+    State,
+    encode,
+)
+from firmware_protocol.conformance.check import check
+from firmware_protocol.conformance.host import (
+    HELLO_NONCE,
+    INSIDE_MM,
+    SEEN_S,
+    Beat,
+    Host,
+    Silence,
+    Unmet,
+    is_homed,
+    is_open,
+    positions,
+    shown,
+)
+from firmware_protocol.conformance.running import has_to_let_go
+
+PAGE: Final = "Who says what when, 6"
+LATCHES: Final = "What each mode takes"
+SHORT_S: Final = 0.044
+"""With a period of the host's and a device's tick it is under 50 ms."""
+NOTICED_S: Final = 0.054
+"""50 ms, a tick of the device, and what a Status takes to get here."""
+SILENT: Final = f"in RUN, {INSIDE_MM:g} mm in, no Drive any more"
+LATCHED: Final = "LATCHED by silence, "
+
+
+@check(PAGE, f"in RUN, {SHORT_S * 1e3:g} ms without a Drive, three times", "stays RUN, no fault", moves=True)
+def short_silence_is_borne(host: Host) -> str:
+    """50 ms are the host's to use."""
+    host.running()
+    for _ in range(3):
+        host.pass_time(SHORT_S)
+        host.pass_time(SEEN_S, Beat.RUN)
+        if host.status.mode is not DeviceMode.RUN or host.status.faults:
+            raise Unmet(shown(host.status))
+    return shown(host.status)
+
+
+def _judged(silence: Silence) -> str:
+    """Raises Unmet where the device was too early or too late."""
+    late = [(at_s, status) for at_s, status in silence.statuses if at_s > NOTICED_S]
+    if not late:
+        raise Unmet("no Status after the last Drive")
+    at_s, status = late[0]
+    seen = f"{at_s * 1e3:.0f} ms after the last Drive: {shown(status)}"
+    if status.mode is DeviceMode.RUN or DeviceFault.COMMAND_TIMEOUT not in status.faults:
+        raise Unmet(seen)
+    return seen
+
+
+@check(
+    PAGE,
+    SILENT,
+    f"the first Status later than {NOTICED_S * 1e3:.0f} ms shows COMMAND_TIMEOUT and no RUN",
+    moves=True,
+)
+def silence_is_noticed(host: Host) -> str:
+    """50 ms on the device's clock, and a tick."""
+    host.running(INSIDE_MM)
+    return _judged(host.fall_silent())
+
+
+@check(PAGE, SILENT, "both carriages go to their open switches, then the drives are off", moves=True)
+def silence_opens(host: Host) -> str:
+    """Opening is the safe way: friction holds, and the magnets pull shut."""
+    host.running(INSIDE_MM)
+    before = positions(host.last(State))
+    silence = host.fall_silent()
+    modes = {status.mode.name for _, status in silence.statuses}
+    seen = f"from {before}: {shown(silence.status)} after {silence.seconds:.2f} s, by way of {', '.join(sorted(modes))}"
+    if not is_open(silence.status) or silence.status.mode is DeviceMode.RUN:
+        raise Unmet(seen)
+    return seen
+
+
+@check(
+    PAGE,
+    f"{SILENT}, but every 1 ms a repeated Drive, one with a wrong CRC-8, a Clear and Hellos",
+    "noticed as before",
+    moves=True,
+)
+def only_good_drives_extend(host: Host) -> str:
+    """Nothing but a good Drive extends the 50 ms."""
+    host.running()
+    bad_counter = 0
+
+    def chatter() -> None:
+        nonlocal bad_counter
+        bad_counter = (bad_counter + 1) % 256
+        repeated = encode(Drive(0.0, 0.0, DriveMode.RUN, host.counter))
+        bad = encode(Drive(0.0, 0.0, DriveMode.RUN, (host.counter + 1 + bad_counter) % 256))
+        host.line.send(FUNCTION[Drive], repeated)
+        host.line.send(FUNCTION[Drive], bad[:-1] + bytes((bad[-1] ^ 0x55,)))
+        if bad_counter % 10 == 0:
+            host.send(Hello(SCHEMA_HASH, PROTOCOL_VERSION, HELLO_NONCE))
+        elif bad_counter % 10 == 5:
+            host.send(Clear(host.new_nonce()))
+
+    return _judged(host.fall_silent(chatter))
+
+
+@check(PAGE, f"{LATCHED}Drive OFF every 1 ms for 0.3 s", "stays LATCHED with COMMAND_TIMEOUT, not HOMED", moves=True)
+def silence_latches(host: Host) -> str:
+    """A fault stays until it is cleared, and takes the zero away."""
+    host.running(INSIDE_MM)
+    host.fall_silent()
+    host.pass_time(0.3, Beat.OFF)
+    status = host.next_status(Beat.OFF)
+    if status.mode is not DeviceMode.LATCHED or DeviceFault.COMMAND_TIMEOUT not in status.faults or is_homed(status):
+        raise Unmet(shown(status))
+    return shown(status)
+
+
+@check(LATCHES, f"{LATCHED}Drive RUN with a duty of 0", "stays LATCHED; each Drive is answered", moves=True)
+def latched_refuses_run(host: Host) -> str:
+    """Measuring goes on, running does not."""
+    host.latched()
+    host.begin()
+    host.pass_time(SEEN_S, Beat.RUN)
+    status = host.next_status(Beat.RUN)
+    states = len(host.all_of(State))
+    seen = f"{shown(status)}, {states} State"
+    if status.mode is not DeviceMode.LATCHED or states < SEEN_S * 900:
+        raise Unmet(seen)
+    return seen
+
+
+@check(LATCHES, f"{LATCHED}Home", "not acknowledged, stays LATCHED", moves=True)
+def latched_refuses_home(host: Host) -> str:
+    """First the fault is cleared."""
+    return _refused(host, Home)
+
+
+@check(LATCHES, f"{LATCHED}Retract", "not acknowledged, stays LATCHED", moves=True)
+def latched_refuses_retract(host: Host) -> str:
+    """It has opened already, or cannot."""
+    return _refused(host, Retract)
+
+
+def _refused(host: Host, kind: type[Home] | type[Retract]) -> str:
+    host.latched()
+    is_refused = host.is_refused(kind)
+    status = host.next_status(Beat.OFF)
+    seen = f"{'not acknowledged' if is_refused else 'acknowledged'}, {shown(status)}"
+    if not is_refused or status.mode is not DeviceMode.LATCHED:
+        raise Unmet(seen)
+    return seen
+
+
+@check(LATCHES, f"{LATCHED}Clear, then Drive RUN", "acknowledged, no fault, not HOMED; stays IDLE", moves=True)
+def cleared_is_not_homed(host: Host) -> str:
+    """After a fault the zero is found anew."""
+    host.latched()
+    was_acknowledged = host.command(Clear)
+    host.pass_time(SEEN_S, Beat.RUN)
+    status = host.next_status(Beat.RUN)
+    seen = f"{'acknowledged' if was_acknowledged else 'not acknowledged'}, {shown(status)}"
+    if not was_acknowledged or status.mode is not DeviceMode.IDLE or status.faults or is_homed(status):
+        raise Unmet(seen)
+    return seen
+
+
+@check(
+    "Modes",
+    f"{LATCHED}Clear and Home, Drive RUN going on all the time; then one Drive OFF",
+    "IDLE until the Drive OFF, RUN after it",
+    moves=True,
+)
+def let_go_after_fault(host: Host) -> str:
+    """A host that knows of no fault does not run on through it."""
+    host.running(INSIDE_MM)
+    host.fall_silent()
+    if not host.command(Clear, Beat.RUN):
+        raise Unmet(f"Clear not acknowledged: {shown(host.status)}")
+    homing = host.home(Beat.RUN)
+    if not is_homed(homing.status):
+        raise Unmet(f"not homed: {shown(homing.status)}")
+    return has_to_let_go(host)
+
+
+CHECKS: Final = (
+    short_silence_is_borne,
+    silence_is_noticed,
+    silence_opens,
+    only_good_drives_extend,
+    silence_latches,
+    latched_refuses_run,
+    latched_refuses_home,
+    latched_refuses_retract,
+    cleared_is_not_homed,
+    let_go_after_fault,
+)

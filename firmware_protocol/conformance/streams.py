@@ -1,0 +1,235 @@
+"""State, Sense and Status: how often, in which order, how soon, by which clock. Nothing moves."""
+
+from itertools import pairwise
+from typing import Final
+
+from firmware_protocol.codec import DriveMode, Sense, State, Status, period
+from firmware_protocol.conformance.check import check
+from firmware_protocol.conformance.host import (
+    ANSWER_S,
+    PERIOD_S,
+    STATUS_S,
+    Beat,
+    Host,
+    Unmet,
+    shown,
+    usual,
+)
+
+DRIVE, ANSWERS, STATUS = (f"Who says what when, {number}" for number in (2, 3, 4))
+LISTENED_S = 1.0
+CLOCKED_S = 3.0
+WINDOW = 200
+"""States at either end of the clock's comparison; the promptest of them counts."""
+MOST_LOST = 0.01
+STATUS_TOLERANCE = 0.03
+MOST_DRIFT = 0.01
+MOST_ANSWER_S = 5e-3
+"""What the daemon calls LINK_DEGRADED."""
+TIME_SPAN_S = period(State, "device_time_s")
+
+
+@check(STATUS, f"nothing for {LISTENED_S:g} s", "50 Status a second, 3 % more or less, on the device's own clock")
+def status_without_host(host: Host) -> str:
+    """Status needs nobody."""
+    return _status_rate(host, Beat.NOTHING)
+
+
+@check(STATUS, f"Drive OFF every 1 ms for {LISTENED_S:g} s", "50 Status a second, 3 % more or less")
+def status_with_host(host: Host) -> str:
+    """Nor do Drives hinder it."""
+    return _status_rate(host, Beat.OFF)
+
+
+def _status_rate(host: Host, beat: Beat) -> str:
+    host.pass_time(LISTENED_S, beat)
+    times = [time_s for time_s, _ in host.all_of(Status)]
+    if len(times) < 2:
+        raise Unmet(f"{len(times)} Status in {LISTENED_S:g} s")
+    period_s = (times[-1] - times[0]) / (len(times) - 1)
+    widest_s = max(after - before for before, after in pairwise(times))
+    seen = f"one every {period_s * 1e3:.1f} ms, {widest_s * 1e3:.0f} ms apart at most"
+    # a lost one, or a late one of ours, makes one gap of two; a sender that lags makes more
+    if abs(period_s / STATUS_S - 1.0) > STATUS_TOLERANCE or widest_s > 2.5 * STATUS_S:
+        raise Unmet(seen)
+    return seen
+
+
+@check(ANSWERS, f"{LISTENED_S * 1e3:.0f} Drive OFF, one every 1 ms", "a State for each, 99 % at least")
+def state_answers_drive(host: Host) -> str:
+    """Positions at the rate of the control loop."""
+    return _answered(host, State)
+
+
+@check(ANSWERS, f"{LISTENED_S * 1e3:.0f} Drive OFF, one every 1 ms", "a Sense for each, 99 % at least")
+def sense_answers_drive(host: Host) -> str:
+    """And force, handle and currents."""
+    return _answered(host, Sense)
+
+
+def _answered(host: Host, kind: type[State] | type[Sense]) -> str:
+    host.pass_time(LISTENED_S, Beat.OFF)
+    host.pass_time(ANSWER_S)
+    sent, came = round(LISTENED_S / PERIOD_S), len(host.all_of(kind))
+    seen = f"{came} {kind.__name__} for {sent} Drives"
+    refused = {what: count for what, count in host.refused.items() if what.startswith(kind.__name__)}
+    if refused:
+        seen += f"; refused since the start: {refused}"
+    if abs(came - sent) > MOST_LOST * sent:
+        raise Unmet(seen)
+    return seen
+
+
+@check(ANSWERS, "Drive OFF every 1 ms", "each State before its Sense")
+def state_before_sense(host: Host) -> str:
+    """The control loop waits for positions."""
+    host.pass_time(LISTENED_S / 2, Beat.OFF)
+    order = [type(one.message) for one in host.heard if isinstance(one.message, State | Sense)]
+    pairs = [pair for pair in pairwise(order) if pair[0] is not pair[1]]
+    if not pairs:
+        raise Unmet(f"{order.count(State)} State, {order.count(Sense)} Sense")
+    wrong = sum(order[at] is order[at + 1] for at in range(len(order) - 1))
+    if order[0] is not State or wrong > MOST_LOST * len(order):
+        raise Unmet(f"first came {order[0].__name__}; the same one twice in a row {wrong} times")
+    return f"{len(order) // 2} pairs"
+
+
+@check(ANSWERS, "no Drive for 0.2 s", "no State and no Sense")
+def no_answer_without_drive(host: Host) -> str:
+    """They answer, they do not stream."""
+    host.pass_time(ANSWER_S)
+    host.begin()
+    host.pass_time(0.2)
+    states, senses = len(host.all_of(State)), len(host.all_of(Sense))
+    seen = f"{states} State, {senses} Sense"
+    if states or senses:
+        raise Unmet(seen)
+    return seen
+
+
+@check(ANSWERS, "Drive OFF every 1 ms", f"State within {MOST_ANSWER_S * 1e3:g} ms as a rule, at once on the device")
+def answer_time(host: Host) -> str:
+    """Sent at once: what the position loop bears, with the adapter's delay in it."""
+    delays_s = []
+    for _ in range(200):
+        host.beat(Beat.OFF)
+        if not host.until(lambda: bool(host.all_of(State)), ANSWER_S, Beat.NOTHING):
+            continue
+        delays_s.append(host.all_of(State)[0][0] - host.drive_s)
+        host.begin()
+    if not delays_s:
+        raise Unmet("no State ever came")
+    seen = f"{usual(delays_s) * 1e3:.2f} ms as a rule, {max(delays_s) * 1e3:.1f} ms at most"
+    if usual(delays_s) > MOST_ANSWER_S:
+        raise Unmet(seen)
+    return seen
+
+
+@check("State", "Drive OFF every 1 ms for 0.6 s", "State's counter is one more each time, modulo 256")
+def state_counter(host: Host) -> str:
+    """By it the host knows a State for news, and counts those that were lost."""
+    host.pass_time(0.6, Beat.OFF)
+    counters = [state.counter for _, state in host.all_of(State)]
+    if len(counters) < 2:
+        raise Unmet(f"{len(counters)} State")
+    steps = [(after - before) % 256 for before, after in pairwise(counters)]
+    wrong = [step for step in steps if step != 1]
+    if len(wrong) > MOST_LOST * len(steps):
+        raise Unmet(f"{len(wrong)} of {len(steps)} steps are not 1: {sorted(set(wrong))[:5]}, first {counters[:5]}")
+    return f"{len(steps)} steps, {len(wrong)} of them after a loss"
+
+
+@check(
+    "State",
+    f"Drive OFF every 1 ms for {CLOCKED_S:g} s",
+    "device_time_s runs by 1 s in a second, 1 % more or less",
+)
+def device_clock(host: Host) -> str:
+    """Steps of 10 us, and true ones: speeds come from them."""
+    host.pass_time(CLOCKED_S, Beat.OFF)
+    states = host.all_of(State)
+    if len(states) < 2 * WINDOW:
+        raise Unmet(f"{len(states)} State in {CLOCKED_S:g} s")
+    device_s, offsets = 0.0, []
+    for at, (time_s, state) in enumerate(states):
+        if at:
+            device_s += (state.device_time_s - states[at - 1][1].device_time_s) % TIME_SPAN_S
+        offsets.append((time_s - device_s, time_s))
+    # of each end the one that came with the least delay
+    (first_offset, first_s), (last_offset, last_s) = min(offsets[:WINDOW]), min(offsets[-WINDOW:])
+    drift = (first_offset - last_offset) / (last_s - first_s)
+    seen = f"{1.0 + drift:.4f} s in a second, {drift:+.2%}"
+    if abs(drift) > MOST_DRIFT:
+        raise Unmet(seen)
+    return seen
+
+
+@check(STATUS, "Drive OFF, its counter going up, then none", "Status shows the counter of the last Drive")
+def drive_counter_shown(host: Host) -> str:
+    """So the host sees what arrived."""
+    for _ in range(3):
+        host.pass_time(7 * PERIOD_S, Beat.OFF)
+        host.pass_time(ANSWER_S)
+        status = host.next_status(Beat.NOTHING)
+        if status.drive_counter != host.counter:
+            raise Unmet(f"drive_counter {status.drive_counter} after a Drive with {host.counter}")
+    return f"drive_counter {host.counter}"
+
+
+@check(DRIVE, "a Drive OFF, then five more with the same counter", "one State")
+def repeated_drive(host: Host) -> str:
+    """A repetition is not accepted, so it is not answered."""
+    host.pass_time(2 * PERIOD_S, Beat.OFF)
+    host.pass_time(ANSWER_S)
+    host.begin()
+    host.beat(Beat.OFF)
+    for _ in range(5):
+        host.counter = (host.counter - 1) % 256
+        host.drive(DriveMode.OFF)
+        host.pass_time(3 * PERIOD_S)
+    host.pass_time(ANSWER_S)
+    count = len(host.all_of(State))
+    if count != 1:
+        raise Unmet(f"{count} State")
+    return "1 State"
+
+
+@check("Status", "Drive OFF", "a supply of 9 to 15 V, an element of -20 to 60 degC, no SUPPLY or TEMPERATURE")
+def status_plausible(host: Host) -> str:
+    """A wrong unit or a wire that is off shows here."""
+    status = host.next_status(Beat.OFF)
+    seen = f"{status.supply_V:.1f} V, {status.temperature_C:.0f} degC, {shown(status)}"
+    causes = [fault.name for fault in status.faults if fault.name in ("SUPPLY", "TEMPERATURE")]
+    if not (9.0 <= status.supply_V <= 15.0 and -20.0 <= status.temperature_C <= 60.0) or causes:
+        raise Unmet(seen)
+    return seen
+
+
+@check("Sense", "Drive OFF, nothing moving", "currents under 0.2 A, a force under 5 N")
+def sense_plausible(host: Host) -> str:
+    """At rest there is next to nothing to measure."""
+    host.idle()
+    host.pass_time(0.1, Beat.OFF)
+    sense = host.last(Sense)
+    currents, force_N = (sense.left_current_A, sense.right_current_A), sense.force_N
+    seen = f"{currents[0]:+.3f} A, {currents[1]:+.3f} A, {force_N:+.3f} N"
+    if max(map(abs, currents)) > 0.2 or abs(force_N) > 5.0:
+        raise Unmet(seen)
+    return seen
+
+
+CHECKS: Final = (
+    status_without_host,
+    status_with_host,
+    state_answers_drive,
+    sense_answers_drive,
+    state_before_sense,
+    no_answer_without_drive,
+    answer_time,
+    state_counter,
+    device_clock,
+    drive_counter_shown,
+    repeated_drive,
+    status_plausible,
+    sense_plausible,
+)
