@@ -19,8 +19,8 @@ PASSED, FAILED, USAGE = 0, 1, 2
 PAGE: Final = "firmware_protocol/README.md"
 WARNING: Final = f"""\
 {{line}}: THE DEVICE'S MOTORS WILL MOVE, for about a minute: homings, duties of up to {MOST_DUTY:g}, ways of
-{INSIDE_MM:g} mm, openings because this program falls silent on purpose. A firmware that is wrong may do anything: keep the
-motors' supply switch in reach, take hands and patient's side off the brake, and end the daemon."""
+{INSIDE_MM:g} mm, openings because this program falls silent on purpose. A firmware that is wrong may do anything: keep
+the motors' supply switch in reach, take hands and patient's side off the brake, and end the daemon."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
