@@ -34,7 +34,7 @@ def _ignores(host: Host, put: Iterable[Callable[[int], None]]) -> str:
         host.pass_time(3 * PERIOD_S, Beat.OFF)
         host.pass_time(ANSWER_S)
         good = host.counter
-        host.begin()
+        host.forget()
         send((good + 1) % 256)
         host.pass_time(ANSWER_S)
         tried += 1
@@ -117,7 +117,7 @@ def command_length(host: Host) -> str:
     host.idle()
     nonce = host.new_nonce()
     hello = encode(Hello(0, 0, nonce))  # of no schema: a device that takes it latches, and no more
-    host.begin()
+    host.forget()
     for function, payload in (
         (FUNCTION[Clear], bytes((nonce, nonce))),
         (FUNCTION[Clear], b""),
@@ -134,7 +134,7 @@ def command_length(host: Host) -> str:
 
 
 SENT: Final = {
-    "frame_crc_16": "a Drive with a bit flipped under its CRC-16",
+    "frame_crc_16": "a Drive with a wrong CRC-16, one without its final XOR, one with another sequence under it",
     "frame_cut_off": "a Drive cut off after its first byte, in the middle, before its last",
     "frame_too_long": "a Drive with a byte more, with 300 more, three with no delimiter between them",
     "frame_zero_inside": "a Drive with a delimiter in its middle",

@@ -108,7 +108,7 @@ class Silence(NamedTuple):
 
 
 class Host:
-    """One conversation. `heard` is what came since `begin`; `newest` the last message of each kind."""
+    """One conversation. `heard` is what came since `forget`; `newest` the last message of each kind."""
 
     def __init__(self, line: Line) -> None:
         self.line = line
@@ -129,6 +129,11 @@ class Host:
         self._nonce = 0
         self._next_s = line.now_s()
 
+    @property
+    def now_s(self) -> float:
+        """The line's clock."""
+        return self.line.now_s()
+
     # -- what is sent ------------------------------------------------------------------------------------------------
 
     def send(self, message: Message) -> None:
@@ -138,7 +143,7 @@ class Host:
     def drive(self, mode: DriveMode, left: float = 0.0, right: float = 0.0) -> None:
         """The next Drive."""
         self.counter = (self.counter + 1) % 256
-        self.drive_s = self.line.now_s()
+        self.drive_s = self.now_s
         self.send(Drive(left, right, mode, self.counter))
 
     def hello(
@@ -201,13 +206,17 @@ class Host:
     # -- what came ---------------------------------------------------------------------------------------------------
 
     def begin(self) -> None:
+        """A check begins: nothing was heard, and this process was not late."""
+        self.forget()
+        self.stalled_s = 0.0
+        self._next_s = self.now_s
+
+    def forget(self) -> None:
         """Forgets what was heard; what is newest is kept."""
         self.heard.clear()
-        self.stalled_s = 0.0
-        self._next_s = self.line.now_s()
 
     def all_of(self, kind: type[M]) -> list[tuple[float, M]]:
-        """Those since `begin`, with their times."""
+        """Those since `forget`, with their times."""
         return [(heard.time_s, heard.message) for heard in self.heard if isinstance(heard.message, kind)]
 
     def last(self, kind: type[M]) -> M:
@@ -243,7 +252,7 @@ class Host:
                 self._take(Heard(arrival.time_s, message))
             else:
                 self._refuse(f"{type(message).__name__}: a host's message")
-        late_s = self.line.now_s() - self._next_s
+        late_s = self.now_s - self._next_s
         if late_s > PERIOD_S:  # no burst makes up for what was missed
             self.stalled_s = max(self.stalled_s, late_s)
             self._next_s += late_s

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple, Protocol
 
 from firmware_protocol.codec import can_identifier
-from firmware_protocol.framing import DELIMITER, MAX_ENCODED, FrameDecoder, encode_frame
+from firmware_protocol.framing import DELIMITER, MAX_ENCODED, FrameDecoder, cobs_decode, cobs_encode, encode_frame
 
 NODES: Final = 16
 NOISE: Final = bytes((0x55, 0xAA, 0xFF, 0x01, 0x7E, 0x80, 0x0D, 0x0A, 0x11, 0x13)) * 3
@@ -100,9 +100,13 @@ class SerialLine:
         frame = self._frame(function, payload)
         body = frame[:-1]
         middle = len(body) // 2
-        flipped = body[middle] ^ 0x10 or 0x20  # not to zero, which would end the frame
+        whole = cobs_decode(body) or b""
         return {
-            "frame_crc_16": (body[:middle] + bytes((flipped,)) + body[middle + 1 :] + DELIMITER,),
+            "frame_crc_16": (
+                cobs_encode(whole[:-1] + bytes((whole[-1] ^ 0x10,))) + DELIMITER,
+                cobs_encode(whole[:-2] + bytes(byte ^ 0xFF for byte in whole[-2:])) + DELIMITER,
+                cobs_encode(bytes((whole[0], whole[1] ^ 0x40)) + whole[2:]) + DELIMITER,
+            ),
             "frame_cut_off": tuple(body[:length] + DELIMITER for length in (1, middle, len(body) - 1)),
             "frame_too_long": (body + b"\x01" + DELIMITER, body + b"\x07" * 300 + DELIMITER, body[:-1] * 3 + DELIMITER),
             "frame_zero_inside": (body[:middle] + DELIMITER + body[middle:] + DELIMITER,),

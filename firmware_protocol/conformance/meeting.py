@@ -57,7 +57,7 @@ def hello_nonce(host: Host) -> str:
 
 def _mismatch(host: Host, schema: int, version: int) -> str:
     host.idle()
-    host.begin()
+    host.forget()
     host.hello(schema, version)
     answers = len(host.all_of(Identity))
     status = host.next_status(Beat.OFF)

@@ -100,7 +100,7 @@ def open_switch_stops(host: Host) -> str:
     if not is_open(host.status):
         raise Unmet(f"not at the open switches: {shown(host.status)}")
     start = host.last(State)
-    host.begin()
+    host.forget()
     for _ in range(200):
         host.beat(Beat.RUN, AT_STOP_DUTY, AT_STOP_DUTY)
     senses = [sense for _, sense in host.all_of(Sense)]
@@ -202,7 +202,7 @@ def _refused_in_run(host: Host, kind: type[Home] | type[Clear]) -> str:
 def hello_in_run(host: Host) -> str:
     """The host says it every second, to hear of a device that was reset."""
     host.running()
-    host.begin()
+    host.forget()
     for nonce in (host.status.command_nonce, 77):
         host.hello(nonce=nonce, beat=Beat.RUN)
     status = host.next_status(Beat.RUN)

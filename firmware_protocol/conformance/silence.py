@@ -134,7 +134,7 @@ def silence_latches(host: Host) -> str:
 def latched_refuses_run(host: Host) -> str:
     """Measuring goes on, running does not."""
     host.latched()
-    host.begin()
+    host.forget()
     host.pass_time(SEEN_S, Beat.RUN)
     status = host.next_status(Beat.RUN)
     states = len(host.all_of(State))
