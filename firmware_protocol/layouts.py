@@ -152,15 +152,16 @@ class Status(Value):
 
 @final
 class Hello(Value):
-    """Host -> Device. First message of a host; answered by Identity. Sent on connecting and after a device reset,
-    repeated until answered.
+    """Host -> Device. First message of a host; answered by Identity. Every 50 ms until it is answered, every second
+    after that.
     """
 
     __match_args__ = ("schema_hash", "protocol_version", "nonce")
     __slots__ = __match_args__
 
     def __init__(self, schema_hash: int, protocol_version: int, nonce: int) -> None:
-        # First four bytes, big-endian, of the SHA-256 of this file's canonical layout, as the host knows it.
+        # First four bytes of the SHA-256 of this file's canonical layout, read as a big-endian number, as the host
+        # knows it; on the wire little-endian, as every number.
         self.schema_hash: Final = schema_hash
         # Version of the rules around the messages: framing, timing, meaning.
         self.protocol_version: Final = protocol_version

@@ -436,13 +436,13 @@ struct tormag_status_t {
 /**
  * Signals in message Hello.
  *
- * First message of a host; answered by Identity. Sent on connecting and after a device reset, repeated until answered.
+ * First message of a host; answered by Identity. Every 50 ms until it is answered, every second after that.
  *
  * All signal values are as on the CAN bus.
  */
 struct tormag_hello_t {
     /**
-     * First four bytes, big-endian, of the SHA-256 of this file's canonical layout, as the host knows it.
+     * First four bytes of the SHA-256 of this file's canonical layout, read as a big-endian number, as the host knows it; on the wire little-endian, as every number.
      *
      * Range: 0..4294967295 (0..4294967295 -)
      * Scale: 1

@@ -1,6 +1,7 @@
 """The golden vectors, and the worked examples of the README, in both directions."""
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -13,15 +14,23 @@ from firmware_protocol.codec import (
     PROTOCOL_VERSION,
     SCHEMA_HASH,
     DecodeError,
+    DeviceFault,
+    DeviceMode,
     Drive,
     DriveMode,
+    Hello,
+    Home,
+    Identity,
     Message,
     State,
+    Status,
+    Switches,
     can_identifier,
     decode,
     encode,
 )
 from firmware_protocol.framing import Frame, FrameDecoder, FramingStatistics, encode_frame
+from firmware_protocol.golden import bitwise_crc8, bitwise_crc16
 from firmware_protocol.layouts import LAYOUTS
 
 ROOM = Path(firmware_protocol.__file__).parent
@@ -76,11 +85,46 @@ def test_the_examples_of_the_readme_are_true() -> None:
     examples = re.findall(
         r"```frame\n([0-9a-f ]+)\n```\n\n\| bytes \| meaning \|\n\| --- \| --- \|\n((?:\|.*\n)+)", text
     )
-    messages: tuple[Message, ...] = (
-        Drive(left_duty=0.125, right_duty=0.1234, mode=DriveMode.RUN, counter=200),
-        State(left_position_mm=-12.0, right_position_mm=-12.1, device_time_s=0.25, counter=0),
+    open_ends = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
+    shown: tuple[tuple[int, Message], ...] = (
+        (42, Drive(left_duty=0.125, right_duty=0.1234, mode=DriveMode.RUN, counter=200)),
+        (42, State(left_position_mm=-12.0, right_position_mm=-12.1, device_time_s=0.25, counter=0)),
+        (0, Hello(SCHEMA_HASH, PROTOCOL_VERSION, nonce=255)),
+        (17, Identity(SCHEMA_HASH, firmware_major=1, firmware_minor=0, serial_number=1)),
+        (60, Home(nonce=1)),
+        (93, Status(DeviceMode.HOMING, open_ends, DeviceFault(0), 25.0, 12.0, drive_counter=44, command_nonce=1)),
     )
-    for (line, rows), message in zip(examples, messages, strict=True):
-        assert bytes.fromhex(line) == encode_frame(FUNCTION[type(message)], 42, encode(message))
+    for (line, rows), (sequence, message) in zip(examples, shown, strict=True):
+        assert bytes.fromhex(line) == encode_frame(FUNCTION[type(message)], sequence, encode(message))
+        assert f"function {FUNCTION[type(message)]}, {type(message).__name__} |" in rows
         annotated = re.findall(r"^\| `([0-9a-f ]+)` \|", rows, re.MULTILINE)
         assert " ".join(annotated) == line
+
+
+def test_the_crcs_of_the_readmes_examples_are_over_what_it_says() -> None:
+    text = (ROOM / "README.md").read_text(encoding="utf-8")
+    checked = re.findall(r"^\| `([0-9a-f ]+)` \| CRC-(8|16) over `([0-9a-f ]+)` \|$", text, re.MULTILINE)
+    assert len(checked) == 4
+    for crc, width, data in checked:
+        expected = bitwise_crc8 if width == "8" else bitwise_crc16
+        assert int.from_bytes(bytes.fromhex(crc), "big") == expected(bytes.fromhex(data))
+
+
+def test_the_readme_says_which_way_round_the_schema_hash_is() -> None:
+    text = (ROOM / "README.md").read_text(encoding="utf-8")
+    assert f"`{SCHEMA_HASH.to_bytes(4, 'big').hex(' ')} ..` is 0x{SCHEMA_HASH:08X}" in text
+    assert f"`{SCHEMA_HASH.to_bytes(4, 'little').hex(' ')}`)" in text
+
+
+def test_the_readmes_timing_is_what_the_codecs_frames_take() -> None:
+    """At 1 Mbaud a byte takes 10 us, at 1 Mbit/s a bit takes 1."""
+    text = (ROOM / "README.md").read_text(encoding="utf-8")
+    for message, said in (
+        (Drive(0.0, 0.0, DriveMode.OFF, 1), "Drive on its way"),
+        (State(0, 0, 0, 1), "State on its way"),
+    ):
+        payload = encode(message)
+        serial_ms = 0.01 * len(encode_frame(FUNCTION[type(message)], 0, payload))
+        # ISO 11898-1 with the most stuffing: a bit for every four after the first of the 34 + 8 n that are stuffed
+        can_ms = 0.001 * (47 + 8 * len(payload) + (34 + 8 * len(payload) - 1) // 4)
+        assert f"| {said} | {serial_ms:.2f} ms serial, at most {math.ceil(100 * can_ms) / 100:.2f} ms CAN |" in text
