@@ -1,4 +1,4 @@
-"""The golden vectors, and the worked examples of the README, in both directions."""
+"""The golden vectors, and what the README shows: its examples in both directions, its times, its table of modes."""
 
 import json
 import math
@@ -13,6 +13,7 @@ from firmware_protocol.codec import (
     FUNCTION,
     PROTOCOL_VERSION,
     SCHEMA_HASH,
+    Clear,
     DecodeError,
     DeviceFault,
     DeviceMode,
@@ -22,6 +23,7 @@ from firmware_protocol.codec import (
     Home,
     Identity,
     Message,
+    Retract,
     State,
     Status,
     Switches,
@@ -32,6 +34,8 @@ from firmware_protocol.codec import (
 from firmware_protocol.framing import Frame, FrameDecoder, FramingStatistics, encode_frame
 from firmware_protocol.golden import bitwise_crc8, bitwise_crc16
 from firmware_protocol.layouts import LAYOUTS
+from tormagd.simulation.firmware import Answer, Firmware, Sensors
+from tormagd.simulation.parameters import load_plant
 
 ROOM = Path(firmware_protocol.__file__).parent
 MESSAGES: dict[str, Any] = json.loads((ROOM / "vectors" / "messages.json").read_text(encoding="utf-8"))
@@ -128,3 +132,72 @@ def test_the_readmes_timing_is_what_the_codecs_frames_take() -> None:
         # ISO 11898-1 with the most stuffing: a bit for every four after the first of the 34 + 8 n that are stuffed
         can_ms = 0.001 * (47 + 8 * len(payload) + (34 + 8 * len(payload) - 1) // 4)
         assert f"| {said} | {serial_ms:.2f} ms serial, at most {math.ceil(100 * can_ms) / 100:.2f} ms CAN |" in text
+
+
+# -- what each mode takes, as the page says --------------------------------------------------------------------------
+
+AT_REST = Sensors(0, 0, 0.0, 0.0, 0.0, 0, Switches(0), 12.0, 25.0)
+ASKED = 0.25
+"""A duty."""
+
+
+def in_mode(mode: DeviceMode) -> Firmware:
+    """A homed device that has met its host, brought there by what a host says."""
+    firmware = Firmware(load_plant("sample_1"))
+    firmware.receive(0.0, Hello(SCHEMA_HASH, PROTOCOL_VERSION, 255), AT_REST)
+    firmware.homed = True
+    before: dict[DeviceMode, tuple[Message, ...]] = {
+        DeviceMode.IDLE: (),
+        DeviceMode.RUN: (Drive(0.0, 0.0, DriveMode.RUN, 1),),
+        DeviceMode.HOMING: (Home(1),),
+        DeviceMode.RETRACTING: (Retract(1),),
+        DeviceMode.LATCHED: (Hello(SCHEMA_HASH ^ 1, PROTOCOL_VERSION, 255), Hello(SCHEMA_HASH, PROTOCOL_VERSION, 255)),
+    }
+    for message in before[mode]:
+        firmware.receive(0.0, message, AT_REST)
+    assert firmware.mode is mode
+    return firmware
+
+
+SAID: dict[str, Message] = {
+    "Drive OFF": Drive(0.0, 0.0, DriveMode.OFF, 2),
+    "Drive RUN": Drive(ASKED, 0.0, DriveMode.RUN, 2),
+    "Hello that fits": Hello(SCHEMA_HASH, PROTOCOL_VERSION, 9),
+    "Hello that does not": Hello(SCHEMA_HASH ^ 1, PROTOCOL_VERSION, 9),
+    "Retract": Retract(9),
+    "Home": Home(9),
+    "Clear": Clear(9),
+}
+
+
+def taken() -> list[tuple[str, DeviceMode, str]]:
+    """The cells of the page's table: what is said, in which mode, and what comes of it."""
+    text = (ROOM / "README.md").read_text(encoding="utf-8")
+    head, _, *rows = re.findall(r"^\|(.*)\|$", text.partition("### What each mode takes")[2].partition("###")[0], re.M)
+    modes = [DeviceMode[name.strip()] for name in head.split("|")[1:]]
+    cells = [[cell.strip() for cell in row.split("|")] for row in rows]
+    return [(said, mode, what) for said, *row in cells for mode, what in zip(modes, row, strict=True)]
+
+
+def test_the_table_of_the_page_is_whole() -> None:
+    assert [(said, mode) for said, mode, _ in taken()] == [(said, mode) for said in SAID for mode in DeviceMode]
+
+
+@pytest.mark.parametrize(("said", "mode", "what"), taken())
+def test_the_firmware_does_what_the_pages_table_says(said: str, mode: DeviceMode, what: str) -> None:
+    firmware = in_mode(mode)
+    answer = firmware.receive(0.001, SAID[said], AT_REST)
+    first = re.match(r"\w+", what)
+    assert first is not None
+    assert firmware.mode is DeviceMode.__members__.get(first[0], mode)
+    nonce = firmware.status(AT_REST).command_nonce
+    if said.startswith("Drive"):
+        assert answer is Answer.MEASUREMENT
+        assert (firmware.output.left_duty == ASKED) == (firmware.mode is DeviceMode.RUN)
+    elif said.startswith("Hello"):
+        assert (answer, nonce) == (Answer.IDENTITY, 9)
+        assert (DeviceFault.SCHEMA_MISMATCH in firmware.faults) == ("not" in said or mode is DeviceMode.LATCHED)
+    else:
+        assert (answer, nonce == 9) == (Answer.NONE, what != "refused")
+    if "not homed" in what:
+        assert not firmware.homed
