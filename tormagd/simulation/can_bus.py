@@ -8,6 +8,7 @@ import errno
 import os
 import select
 import socket
+from pathlib import Path
 from typing import Any
 
 import can
@@ -32,6 +33,8 @@ class SimulatorBus(can.BusABC):
     def __init__(self, channel: str, can_filters: Any = None, **settings: object) -> None:
         """Raises can.CanInitializationError if no simulator serves `channel`. The bit rate is the simulator's."""
         self.channel_info = f"tormagsim {channel}"
+        self._name = "".join(Path(channel).name.split())
+        """In the frames. A log's fields are separated by spaces, so a name has none."""
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
@@ -79,7 +82,7 @@ class SimulatorBus(can.BusABC):
             is_extended_id=False,
             is_error_frame=bool(frame.identifier & ERROR_FLAG),
             data=frame.data,
-            channel=self.channel_info,
+            channel=self._name,
         )
         return message, False
 
