@@ -17,7 +17,6 @@ from firmware_protocol.conformance.host import (
     positions,
     shown,
 )
-from firmware_protocol.conformance.meeting import schema_mismatch
 
 PAGE: Final = "Homing"
 TAKES: Final = "What each mode takes"
@@ -30,8 +29,7 @@ JUMP_MM = 0.2
 def _homings(host: Host) -> list[Homing]:
     """Those of before, or one from here on: the first after a boot says the most."""
     if not host.homings:
-        schema_mismatch.perform(host)  # takes the zero away, and moves nothing
-        host.idle()
+        host.without_zero()
         host.home()
     return host.homings
 

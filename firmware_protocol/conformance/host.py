@@ -286,6 +286,11 @@ class Host:
         if status.mode is not DeviceMode.IDLE or status.faults:
             raise Unmet(f"not IDLE without a fault after Hello, Drive OFF and Clear: {shown(status)}")
 
+    def without_zero(self) -> None:
+        """IDLE and not homed, if a mismatch takes the zero away as it should; nothing moves. Raises Unmet."""
+        self.hello(SCHEMA_HASH ^ 1)
+        self.idle()
+
     def homed(self) -> None:
         """IDLE and homed, at the open end. Raises Unmet."""
         self.idle()

@@ -119,8 +119,9 @@ def clear_clears(host: Host) -> str:
 @check("Modes", "not homed, Drive OFF, then Drive RUN with a duty of 0", "stays IDLE")
 def run_needs_homing(host: Host) -> str:
     """Without a zero nothing runs."""
-    schema_mismatch.perform(host)
-    host.idle()
+    host.without_zero()
+    if is_homed(host.status):
+        raise Unmet(f"HOMED even after a mismatch and a Clear: {shown(host.status)}")
     host.pass_time(SEEN_S, Beat.RUN)
     status = host.next_status(Beat.RUN)
     if status.mode is not DeviceMode.IDLE:

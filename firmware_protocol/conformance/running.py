@@ -138,11 +138,13 @@ def retract_opens(host: Host) -> str:
 def _opens(host: Host, beat: Beat) -> str:
     before = positions(host.last(State))
     first = host.next_status(beat)
+    if first.mode is not DeviceMode.RETRACTING:
+        raise Unmet(f"from {before}: {shown(first)}")
     host.until(lambda: host.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED), OPENED_S, beat)
     status = host.next_status(beat)
-    seen = f"from {before}: first {first.mode.name}, then {shown(status)}, {positions(host.last(State))}"
+    seen = f"from {before}: RETRACTING, then {shown(status)}, {positions(host.last(State))}"
     is_right = status.mode is DeviceMode.IDLE and is_open(status) and is_homed(status) and not status.faults
-    if first.mode is not DeviceMode.RETRACTING or not is_right:
+    if not is_right:
         raise Unmet(seen)
     return seen
 
@@ -158,7 +160,7 @@ def let_go_after_retract(host: Host) -> str:
     host.running()
     if not host.command(Retract, Beat.RUN):
         raise Unmet(f"Retract not acknowledged: {shown(host.status)}")
-    host.until(lambda: host.status.mode is DeviceMode.IDLE, OPENED_S, Beat.RUN)
+    host.until(lambda: host.status.mode is not DeviceMode.RETRACTING, OPENED_S, Beat.RUN)
     return has_to_let_go(host)
 
 
@@ -222,6 +224,8 @@ def mismatch_in_run(host: Host) -> str:
     """Another host has come, that does not know what it says."""
     host.running(INSIDE_MM)
     host.hello(SCHEMA_HASH ^ 1, beat=Beat.RUN)
+    if (status := host.next_status(Beat.RUN)).mode is DeviceMode.RUN:
+        raise Unmet(shown(status))
     host.until(lambda: host.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED), OPENED_S, Beat.RUN)
     status = host.next_status(Beat.RUN)
     if status.mode is not DeviceMode.LATCHED or DeviceFault.SCHEMA_MISMATCH not in status.faults or not is_open(status):
