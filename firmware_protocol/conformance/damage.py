@@ -32,19 +32,18 @@ def _ignores(host: Host, put: Iterable[Callable[[int], None]]) -> str:
     tried = 0
     for send in put:
         host.pass_time(3 * PERIOD_S, Beat.OFF)
-        host.pass_time(ANSWER_S)
-        good = host.counter
+        before = host.next_status(Beat.NOTHING).drive_counter
         host.forget()
-        send((good + 1) % 256)
+        send((host.counter + 1) % 256)
         host.pass_time(ANSWER_S)
         tried += 1
         if states := len(host.all_of(State)):
             raise Unmet(f"form {tried}: {states} State")
         host.next_status(Beat.NOTHING)
         shown = host.next_status(Beat.NOTHING).drive_counter
-        if shown != good:
-            raise Unmet(f"form {tried}: drive_counter {shown} in Status, the last good Drive had {good}")
-        host.counter = (good + 1) % 256
+        if shown != before:
+            raise Unmet(f"form {tried}: drive_counter {shown} in Status, {before} before it")
+        host.counter = (host.counter + 1) % 256
         host.beat(Beat.OFF)
         host.pass_time(ANSWER_S)
         if not host.all_of(State):
