@@ -32,6 +32,7 @@ def _ignores(host: Host, put: Iterable[Callable[[int], None]]) -> str:
     tried = 0
     for send in put:
         host.pass_time(3 * PERIOD_S, Beat.OFF)
+        host.pass_time(ANSWER_S)
         before = host.next_status(Beat.NOTHING).drive_counter
         host.forget()
         send((host.counter + 1) % 256)
