@@ -386,7 +386,7 @@ class NonceNotShown(Rogue):
 
 class ClearEndsAnything(Rogue):
     def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        if isinstance(message, Clear):
+        if isinstance(message, Clear) and self.real.output.enabled:
             self.real._nonce = message.nonce
             self.real._rest(time_s, DeviceMode.IDLE)
             return Answer.NONE
