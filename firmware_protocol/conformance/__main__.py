@@ -1,11 +1,12 @@
 """`python -m firmware_protocol.conformance PORT|CHANNEL`: does this device do what firmware_protocol/README.md says?"""
 
 import argparse
+import contextlib
 import json
 import signal
 import sys
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 from firmware_protocol.codec import Identity
 from firmware_protocol.conformance.check import Check, Result, run
@@ -87,27 +88,33 @@ def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
 
     def tell(result: Result) -> None:
         results.append(result)
-        print(told(result), file=out, flush=True)
+        _say(told(result), out)
 
     # a request to end ends the check, not the promise to leave the gap open
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        run(host, checks, tell)
-    except KeyboardInterrupt:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        print("ended; opening the gap", file=sys.stderr, flush=True)
-        results.clear()
-        run(host, [left_open], tell)
-        return []
+        try:
+            run(host, checks, tell)
+        except KeyboardInterrupt:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            print("ended; opening the gap", file=sys.stderr, flush=True)
+            run(host, [left_open], tell)
+            return []
     except OSError as error:
         print(f"the line is gone ({error}): by the page the device opens the gap by itself now", file=sys.stderr)
         return []
     passed = sum(result.passed for result in results)
-    print(f"{options.line}: {_name(host)}: {passed} of {len(results)} checks passed", file=out, flush=True)
+    _say(f"{options.line}: {_name(host)}: {passed} of {len(results)} checks passed", out)
     if options.json:
-        print(json.dumps(report(results), indent=2))
+        _say(json.dumps(report(results), indent=2), sys.stdout)
     return results
+
+
+def _say(text: str, out: TextIO) -> None:
+    """A reader that has gone is no reason to leave the device as it is."""
+    with contextlib.suppress(OSError):
+        print(text, file=out, flush=True)
 
 
 def _name(host: Host) -> str:

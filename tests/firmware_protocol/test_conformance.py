@@ -1069,6 +1069,21 @@ def test_a_line_that_goes_is_told_and_no_success(
     assert "the line is gone" in capsys.readouterr().err
 
 
+def test_a_reader_that_goes_does_not_end_the_run(
+    monkeypatch: pytest.MonkeyPatch, opened: Callable[[Line], None]
+) -> None:
+    class Closed(io.StringIO):
+        def write(self, text: str) -> int:
+            raise BrokenPipeError
+
+    device = VirtualDevice(NEAR_HOME, SteadyHand())
+    opened(SerialLine(Wire(device)))
+    monkeypatch.setattr(sys, "stdout", Closed())
+    with signals_kept():
+        assert command.main(["virtual", "--yes", "--only", "run_is_entered"]) == 0
+    assert device.messages.firmware.mode is DeviceMode.IDLE
+
+
 def test_every_check_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["--list"]) == 0
     lines = capsys.readouterr().out.splitlines()
