@@ -90,20 +90,23 @@ def _examined(line: Line, options: argparse.Namespace) -> Sequence[Result]:
         results.append(result)
         _say(told(result), out)
 
-    # a request to end ends the check, not the promise to leave the gap open
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
+    with contextlib.ExitStack() as kept:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            kept.callback(signal.signal, number, signal.getsignal(number))
+        # a request to end ends the check, not the promise to leave the gap open
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
-            run(host, checks, tell)
-        except KeyboardInterrupt:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)
-            print("ended; opening the gap", file=sys.stderr, flush=True)
-            run(host, [left_open], tell)
+            try:
+                run(host, checks, tell)
+            except KeyboardInterrupt:
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
+                signal.signal(signal.SIGTERM, signal.SIG_IGN)
+                print("ended; opening the gap", file=sys.stderr, flush=True)
+                run(host, [left_open], tell)
+                return []
+        except OSError as error:
+            print(f"the line is gone ({error}): by the page the device opens the gap by itself now", file=sys.stderr)
             return []
-    except OSError as error:
-        print(f"the line is gone ({error}): by the page the device opens the gap by itself now", file=sys.stderr)
-        return []
     passed = sum(result.passed for result in results)
     _say(f"{options.line}: {_name(host)}: {passed} of {len(results)} checks passed", out)
     if options.json:

@@ -4,14 +4,13 @@ Everything runs in virtual time but one live session. A wrong device is the simu
 firmware (`Rogue`), on its wire (`Wire`), or as a fault of the simulator's own.
 """
 
-import contextlib
 import io
 import json
 import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -1037,25 +1036,14 @@ class Unplugged(Interrupted):
     error = OSError
 
 
-@contextlib.contextmanager
-def signals_kept() -> Iterator[None]:
-    """The command takes the signals; a test gives them back."""
-    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in kept.items():
-            signal.signal(number, handler)
-
-
 def test_an_interrupted_run_leaves_the_gap_open(
     opened: Callable[[Line], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     device = VirtualDevice(NEAR_HOME, SteadyHand())
     opened(SerialLine(Interrupted(device)))
-    with signals_kept():
-        assert command.main(["virtual", "--yes", "--only", "silence_opens"]) == 1
+    assert command.main(["virtual", "--yes", "--only", "silence_opens"]) == 1
     assert "ok    left_open" in capsys.readouterr().out
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert device.messages.firmware.mode is DeviceMode.IDLE
     assert device.truth.gap_mm > 94.0
 
@@ -1064,8 +1052,7 @@ def test_a_line_that_goes_is_told_and_no_success(
     opened: Callable[[Line], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     opened(serial_line(wire=Unplugged))
-    with signals_kept():
-        assert command.main(["virtual", "--yes", "--only", "off_opens"]) == 1
+    assert command.main(["virtual", "--yes", "--only", "off_opens"]) == 1
     assert "the line is gone" in capsys.readouterr().err
 
 
@@ -1079,8 +1066,7 @@ def test_a_reader_that_goes_does_not_end_the_run(
     device = VirtualDevice(NEAR_HOME, SteadyHand())
     opened(SerialLine(Wire(device)))
     monkeypatch.setattr(sys, "stdout", Closed())
-    with signals_kept():
-        assert command.main(["virtual", "--yes", "--only", "run_is_entered"]) == 0
+    assert command.main(["virtual", "--yes", "--only", "run_is_entered"]) == 0
     assert device.messages.firmware.mode is DeviceMode.IDLE
 
 
