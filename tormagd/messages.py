@@ -3,7 +3,7 @@
 `decode` is the border: msgpack unpacks with size limits, msgspec checks names and types, each message checks its own
 values. Unknown fields are ignored, so that a newer client can talk to an older daemon.
 
-What leaves the daemon has its type here: `Telemetry`, `Status`, `TickRecord`, `Reply`. docs/messages.md lists their
+What leaves the daemon has its type here: `Telemetry`, `Status`, `Description`, `TickRecord`, `Reply`. docs/messages.md lists their
 fields, and says when `v` rises.
 """
 
@@ -346,6 +346,19 @@ class Status(Telemetry, frozen=True, kw_only=True):
     black_box: BlackBoxReport = BlackBoxReport()
 
 
+class Description(msgspec.Struct, frozen=True, kw_only=True):
+    """The answer to the command `describe`: what a recording is of. What is not known is null."""
+
+    version: str
+    build: str
+    configuration: dict[str, Any]
+    scene: dict[str, Any]
+    model: str
+    profile: ProfileReport
+    firmware: str | None
+    serial_number: int | None
+
+
 class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """One control tick: all that the step was given, and all that it gave. Units as in `Telemetry`; times in ns and s.
 
@@ -419,6 +432,7 @@ class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
     # the tick
     lateness_us: float
     exec_us: float
+    tick: int = 0
 
 
 class Request(msgspec.Struct, frozen=True, kw_only=True):

@@ -134,6 +134,18 @@ def status(**changes: Any) -> dict[str, Any]:
     )
 
 
+DESCRIPTION: dict[str, Any] = {
+    "version": "0",
+    "build": "compiled",
+    "configuration": {"rates": {"control_hz": 1_000}},
+    "scene": {"name": "pulse"},
+    "model": 16 * "0123",
+    "profile": {"is_used": False, "age_s": None, "refusal": ""},
+    "firmware": "1.0",
+    "serial_number": 7,
+}
+
+
 class FakeDaemon(threading.Thread):
     """Binds the four endpoints in `directory`. `answers[command]` makes the reply's fields; setpoints are kept."""
 
@@ -141,7 +153,12 @@ class FakeDaemon(threading.Thread):
         super().__init__(daemon=True)
         self.directory = directory
         self.control = f"ipc://{directory}/control"
-        self.answers: dict[str, Callable[[], dict[str, Any]]] = {"status": lambda: {"ok": True, "result": status()}}
+        self.answers: dict[str, Callable[[], dict[str, Any]]] = {
+            "status": lambda: {"ok": True, "result": status()},
+            "describe": lambda: {"ok": True, "result": DESCRIPTION},
+        }
+        self.is_silent = False
+        "Publishes nothing, as one that has been killed."
         self.commands: list[str] = []
         self.requests: list[dict[str, Any]] = []
         self.setpoints: list[Setpoint] = []
@@ -181,6 +198,8 @@ class FakeDaemon(threading.Thread):
                 router.send_multipart([*envelope, msgpack.packb({"v": VERSION, "id": request["id"], **answer})])
             while setpoints.poll(0):
                 self.setpoints.append(decode(setpoints.recv(), Setpoint))
+            if self.is_silent:
+                continue
             t_ns = start_ns + seq * 20_000_000
             telemetry_out.send(encode(telemetry(seq, t_ns)))
             rows = [(t_ns + k * 1_000_000, 1.5, 1.5, 1.5 + 0.1 * math.sin(k), 35.0, 36.0, 0.1, -0.1) for k in range(20)]

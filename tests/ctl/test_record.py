@@ -4,9 +4,11 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 
 import msgpack
 import pytest
+from mcap.reader import make_reader
 
 from tormagd.ctl.main import main
 from tormagd.recording.reader import read_recording
@@ -20,13 +22,58 @@ def test_record_then_plot(fake_daemon, tmp_path, capsys):
     assert recording.is_complete
     assert recording.ticks.t_ns.size == result["ticks"] > 0
     assert recording.telemetry.t_ns.size == result["telemetry"] > 0
-    assert (result["gaps"], result["telemetry_lost"], result["unreadable"]) == (0, 0, 0)
+    assert (result["gaps"], result["ticks_lost"], result["telemetry_lost"], result["unreadable"]) == (0, 0, 0, 0)
 
     assert main(["--json", "plot", str(file), "-o", str(picture)]) == 0
     drawn = json.loads(capsys.readouterr().out)["result"]
     assert drawn["ticks"] == result["ticks"]
     assert drawn["tracking_rms_N"] == pytest.approx(0.1 / 2**0.5, rel=0.1)
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_recording_says_what_it_is_of(fake_daemon, tmp_path):
+    file = tmp_path / "a.mcap"
+    assert main(["--endpoint", fake_daemon.control, "record", str(file), "--duration", "0.1"]) == 0
+    about = read_recording(file).metadata
+    assert json.loads(about["configuration"]) == {"rates": {"control_hz": 1_000}}
+    assert json.loads(about["scene"])["name"] == "pulse"
+    assert (about["model"], about["firmware"], about["serial_number"]) == (16 * "0123", "1.0", "7")
+    assert json.loads(about["profile"])["is_used"] is False
+
+
+def test_a_daemon_that_does_not_say_what_it_runs_is_not_recorded(fake_daemon, tmp_path, capsys):
+    fake_daemon.answers["describe"] = lambda: {"ok": True, "result": {"version": "0.0.9"}}
+    assert main(["--endpoint", fake_daemon.control, "record", str(tmp_path / "a.mcap")]) == 3
+    assert "the description of tormagd 0.0.9" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_silent_end_is_a_gap_and_a_daemon_that_has_gone(fake_daemon, tmp_path, capsys):
+    file = tmp_path / "a.mcap"
+    silencer = threading.Timer(0.3, lambda: setattr(fake_daemon, "is_silent", True))
+    silencer.start()
+    try:
+        code = main(["--endpoint", fake_daemon.control, "--json", "record", str(file), "--duration", "2"])
+    finally:
+        silencer.join()
+    printed = json.loads(capsys.readouterr().out)
+    assert (code, printed["ok"], printed["result"]["gaps"]) == (3, False, 1)
+    assert printed["result"]["longest_gap_ms"] == pytest.approx(printed["result"]["silent_ms"])
+    assert printed["result"]["silent_ms"] > 1_000.0
+    assert read_recording(file).ticks.t_ns.size == printed["result"]["ticks"]
+
+
+def test_lost_ticks_are_counted_and_are_no_success(fake_daemon, tmp_path, capsys):
+    columns = ("t_ns", "tick")
+    numbers = (3, 4, 8, 9, 0, 1, 2)  # 5, 6 and 7 are lost; then the daemon restarts; and so on
+    fake_daemon.rubbish += [
+        msgpack.packb({"v": 1, "columns": columns, "rows": [[2**60 + number, number]]}) for number in numbers
+    ]
+    code = main(["--endpoint", fake_daemon.control, "--json", "record", str(tmp_path / "a.mcap"), "--duration", "0.3"])
+    result = json.loads(capsys.readouterr().out)["result"]
+    assert code == 1
+    assert result["ticks_lost"] > 0
+    assert result["ticks_lost"] % 3 == 0
 
 
 def test_a_recording_is_never_overwritten(fake_daemon, tmp_path, capsys):
@@ -80,7 +127,18 @@ def test_a_full_disk_ends_a_recording_that_can_still_be_read(fake_daemon, tmp_pa
     received = int(re.findall(r"File too large, after (\d+) ticks", error["message"])[0])
     recording = read_recording(file)
     assert not recording.is_complete
+    assert "File too large" in recording.metadata["cut_by"]
     assert 0 < recording.ticks.t_ns.size <= received
+    # and by the index, as any other program reads it
+    with file.open("rb") as opened:
+        reader = make_reader(opened)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        messages = [message for _, _, message in reader.iter_messages()]
+        assert len(messages) == summary.statistics.message_count
+        assert len(messages) == recording.ticks.t_ns.size + recording.telemetry.t_ns.size
+        assert {metadata.name for metadata in reader.iter_metadata()} == {"tormagd"}
 
 
 def test_an_interrupt_ends_a_recording_cleanly(fake_daemon, tmp_path):

@@ -12,6 +12,7 @@ from tormagd import messages
 from tormagd.messages import (
     BlackBoxReport,
     ClockReport,
+    Description,
     DeviceReport,
     ExecReport,
     Explained,
@@ -72,10 +73,11 @@ V1: dict[type[msgspec.Struct], str] = {
     "device_left_mm device_right_mm device_handle_mm device_force_N device_mode device_switches device_faults "
     "device_temperature_C left_current_A right_current_A supply_V reference_gap_mm measured_cf left_mm right_mm "
     "handle_mm handle_rate_mm_s operating_state limits step_limits faults drive_mode left_duty right_duty request "
-    "request_number lateness_us exec_us",
+    "request_number lateness_us exec_us tick",
+    Description: "version build configuration scene model profile firmware serial_number",
 }
 "The keys of `v: 1`, each with the meaning and the unit that docs/messages.md gives it."
-WORDS = {int: "int", float: "float", str: "str", bool: "bool"}
+WORDS = {int: "int", float: "float", str: "str", bool: "bool", Any: "any"}
 
 
 @pytest.mark.parametrize("kind", V1, ids=lambda kind: kind.__name__)

@@ -5,7 +5,7 @@ import os
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeVar
 
 import msgspec
 import zmq
@@ -14,7 +14,9 @@ from tormagd import __version__
 from tormagd.config import ConfigError, Curve
 from tormagd.ctl.outcome import CommandError, Exit, usage_error
 from tormagd.keys import PUBLIC, SECRET, KeyPair, load_pair, load_public
-from tormagd.messages import VERSION, MessageError, Reply, Request, Status, decode, encode
+from tormagd.messages import VERSION, Description, MessageError, Reply, Request, Status, decode, encode
+
+T = TypeVar("T", Status, Description)
 
 FAULT_CODES = ("fault", "device_latched")
 "Refusals that mean: the device is in FAULT."
@@ -59,6 +61,10 @@ class Client:
     def status(self) -> Status:
         """What the daemon is doing. Raises CommandError as `request` and `understood` do."""
         return understood(self.request("status"))
+
+    def describe(self) -> Description:
+        """What the daemon runs. Raises CommandError as `request` does, also for an answer that is not understood."""
+        return _known(self.request("describe"), Description)
 
     def close(self) -> None:
         """Close the connection without waiting for anything."""
@@ -139,14 +145,18 @@ def understood(result: dict[str, Any]) -> Status:
 
     Raises CommandError, naming the daemon's version, where something is missing or of another type.
     """
+    return _known(result, Status)
+
+
+def _known(result: dict[str, Any], kind: type[T]) -> T:
     try:
-        return msgspec.convert(result, Status)
+        return msgspec.convert(result, kind)
     except msgspec.ValidationError as error:
         raise CommandError(
             Exit.UNREACHABLE,
             "unintelligible",
-            f"the status of tormagd {result.get('version', 'of an unknown version')} is not what tormagctl "
-            f"{__version__} knows: {error}",
+            f"the {kind.__name__.lower()} of tormagd {result.get('version', 'of an unknown version')} is not what "
+            f"tormagctl {__version__} knows: {error}",
             "install tormagd and tormagctl of the same version, and start the daemon again",
         ) from error
 

@@ -1,15 +1,17 @@
 """`tormagctl record`: write what the daemon publishes to an MCAP file, in a process of its own."""
 
+import contextlib
 import signal
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import zmq
 
 from tormagd.config import Endpoints
-from tormagd.ctl.client import Keys, connect, keys_of, unreachable
+from tormagd.ctl.client import Client, Keys, connect, keys_of, unreachable
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.messages import MessageError, Telemetry, decode
@@ -20,14 +22,20 @@ from tormagd.recording.writer import RecordingWriter
 POLL_MS = 100
 QUEUE = 10_000
 "Batches that may wait while the disk is slow: over three minutes."
+SILENT_S = 1.0
+"A daemon that was silent for so long at the end has gone."
 
 
 def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
     """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM.
 
+    What is recorded is asked of the daemon and written down first, and again at the end: a device may have been connected,
+    or have shown itself, meanwhile.
+
     Raises CommandError: USAGE where the file exists or cannot be made, UNREACHABLE where nothing is published within
-    `wait_s`; then there is no file. REFUSED where the disk takes no more; what it took stays. A message that cannot be
-    read is counted, and the first one's reason told.
+    `wait_s`, or the daemon cannot be asked what it runs; then there is no file. REFUSED where the disk takes no more;
+    what it took stays. A message that cannot be read is counted, and the first one's reason told. The outcome's exit
+    code is REFUSED where ticks were lost, UNREACHABLE where the daemon was gone at the end.
     """
     keys = keys_of(endpoints.curve)
     context = zmq.Context()
@@ -37,24 +45,39 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
             if not _any_ready((telemetry, ticks), wait_s, is_interrupted):
                 raise unreachable(endpoints.telemetry, f"nothing is published there within {wait_s:g} s")
+            about = _about(endpoints, wait_s, keys)
             try:
-                writer = RecordingWriter(path)
+                writer = RecordingWriter(path, about)
             except FileExistsError as error:
                 raise usage_error(f"{path} exists", "give another name; recordings are never overwritten") from error
             except OSError as error:
                 raise usage_error(f"{path}: {error.strerror}", "give a file in a directory you may write to") from error
             try:
                 with writer:
-                    return _record(writer, path, telemetry, ticks, duration_s, is_interrupted)
+                    outcome = _record(writer, path, telemetry, ticks, duration_s, is_interrupted)
+                    with contextlib.suppress(CommandError):  # the daemon has gone: what was true at the start stands
+                        writer.describe(_about(endpoints, wait_s, keys))
+                    return outcome
             except OSError as error:
                 raise CommandError(
                     Exit.REFUSED,
                     "not_written",
                     f"{path}: {error.strerror}, after {writer.tick_count} ticks and {writer.telemetry_count} snapshots",
-                    "make room; what is in the file, all but about the last second, can be plotted",
+                    "make room; what is in the file, all but about the last second, reads like any other recording",
                 ) from error
     finally:
         context.destroy(linger=0)
+
+
+def _about(endpoints: Endpoints, wait_s: float, keys: Keys | None) -> dict[str, str]:
+    """What is recorded, as metadata: what is not a text of its own is JSON; what is not known is left out."""
+    with Client(endpoints.control, wait_s, keys) as client:
+        known = msgspec.to_builtins(client.describe())
+    return {
+        name: value if isinstance(value, str) else msgspec.json.encode(value).decode()
+        for name, value in known.items()
+        if value is not None
+    }
 
 
 def _subscribe(context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None) -> "zmq.Socket[bytes]":
@@ -85,7 +108,7 @@ def _record(
     is_interrupted: Callable[[], bool],
 ) -> Outcome:
     unreadable = 0
-    start_s = time.monotonic()
+    start_s = heard_s = time.monotonic()
     while not is_interrupted() and (left_s := start_s + duration_s - time.monotonic()) > 0.0:
         _any_ready((telemetry, ticks), min(left_s, POLL_MS / 1e3), is_interrupted)
         for socket in (telemetry, ticks):
@@ -96,20 +119,32 @@ def _record(
                         writer.telemetry(decode(data, Telemetry))
                     else:
                         writer.ticks(decode_ticks(data))
+                        heard_s = time.monotonic()
                 except MessageError as error:
                     unreadable += 1
                     if unreadable == 1:
                         write_line(f"tormagctl record: left out a message: {error}", sys.stderr)
+    end_s = time.monotonic()
+    silent_s = end_s - heard_s
+    is_silent = writer.note_silence(round(silent_s * 1e9))
     result = {
         "file": str(path),
-        "seconds": round(time.monotonic() - start_s, 3),
+        "seconds": round(end_s - start_s, 3),
         "telemetry": writer.telemetry_count,
         "telemetry_lost": writer.telemetry_lost,
         "ticks": writer.tick_count,
+        "ticks_lost": writer.ticks_lost,
         "gaps": writer.gaps,
         "longest_gap_ms": round(writer.longest_gap_ms, 3),
+        "silent_ms": round(silent_s * 1e3, 3) if is_silent else 0.0,
         "unreadable": unreadable,
     }
-    losses = f"{writer.gaps} gaps (longest {writer.longest_gap_ms:.0f} ms), {writer.telemetry_lost} snapshots lost"
+    losses = (
+        f"{writer.gaps} gaps (longest {writer.longest_gap_ms:.0f} ms), {writer.ticks_lost} ticks and "
+        f"{writer.telemetry_lost} snapshots lost"
+    )
     text = f"{path}: {writer.tick_count} ticks, {writer.telemetry_count} snapshots; {losses}"
-    return Outcome(result, text)
+    if is_silent and silent_s > SILENT_S:
+        text += f"; nothing came in the last {silent_s:.1f} s: the daemon has gone, or does not run any more"
+        return Outcome(result, text, Exit.UNREACHABLE)
+    return Outcome(result, text, Exit.REFUSED if writer.ticks_lost else Exit.DONE)

@@ -55,7 +55,7 @@ NEWS_S = 10.0
 PEERS = 16
 "Peers whose messages were not read, as many as are named."
 TOO_MUCH, NOT_ALLOWED, OFF_THE_LIST = "sent too much", "command not allowed", "key taken off the list"
-OBSERVED = frozenset({"status"})
+OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."
 OPERATOR = frozenset({"operate"})
 PUBLISHER = frozenset({"publish"})

@@ -20,6 +20,7 @@ def tick_record(
     measurement: Measurement | None,
     lateness_us: float,
     exec_us: float,
+    number: int = 0,
 ) -> TickRecord:
     """The record of one tick. By position, as by name it would take ten times as long: in the order of its fields."""
     estimate, safety = state.estimate, state.safety
@@ -85,6 +86,7 @@ def tick_record(
         output.request_number,
         lateness_us,
         exec_us,
+        number,
     )
 
 

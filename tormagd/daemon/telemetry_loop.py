@@ -26,7 +26,7 @@ from tormagd.daemon.telemetry import is_driven, snapshot, tick_record
 from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.link import LinkState
-from tormagd.messages import DeviceReport, Request, Status, Telemetry, TickRecord
+from tormagd.messages import Description, DeviceReport, Request, Status, Telemetry, TickRecord
 from tormagd.safety.operating_state import Conditions, RefusedError
 
 NS = 1_000_000_000
@@ -85,6 +85,7 @@ class TelemetryLoop:
             control.measurement,
             timing.lateness_us,
             timing.exec_us,
+            timing.runs,
         )
         self._ticks.append(record)
         self._box.ticked(record, control.state, self._inference.state)
@@ -189,7 +190,24 @@ class TelemetryLoop:
             if self._status is None:
                 self._status = msgspec.to_builtins(self._build_status(newest))
             return self._status
+        if request.command == "describe":
+            return self._describe()
         return self._command(request)
+
+    def _describe(self) -> dict[str, Any]:
+        link = self._connection.report()
+        description = Description(
+            version=__version__,
+            build=str(settle()),
+            configuration=msgspec.to_builtins(self._config),
+            scene=msgspec.to_builtins(self._core.scene),
+            model=self._core.model,
+            profile=self._profiles.report(),
+            firmware=link.firmware,
+            serial_number=link.serial_number,
+        )
+        described: dict[str, Any] = msgspec.to_builtins(description)
+        return described
 
     def _command(self, request: Request) -> dict[str, Any]:
         self._status = None

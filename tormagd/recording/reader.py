@@ -10,11 +10,12 @@ from typing import Any
 import msgspec
 import numpy as np
 from mcap.exceptions import McapError
-from mcap.records import Channel, Message, Metadata
+from mcap.records import Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 from zstandard import ZstdError
 
+from tormagd.recording.closing import ABOUT, CUT
 from tormagd.recording.writer import TELEMETRY_TOPIC, TICKS_TOPIC
 
 MAX_RECORD_BYTES = 64_000_000
@@ -31,8 +32,8 @@ class RecordingError(ValueError):
 class Columns:
     """The messages of one topic, one row each, in the order they were written.
 
-    `numbers[name]` is float64 of shape (rows,), with NaN where a value was null or the row had no such column; true and
-    false are 1 and 0. `words[name]` holds a tuple of strings for each row. An object's or a list's members get names of
+    `numbers[name]` is float64 of shape (rows,), with NaN where a value was not known or the row had no such column; true
+    and false are 1 and 0. `words[name]` holds a tuple of strings for each row. An object's or a list's members get names of
     their own: `tick.exec_us`, `duty.0`.
     """
 
@@ -43,7 +44,8 @@ class Columns:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """One file. `is_complete` is false where the recorder was killed: what was written before that is there."""
+    """One file. `is_complete` is false where the recorder was killed or the disk was full: what was written before that
+    is there."""
 
     telemetry: Columns
     ticks: Columns
@@ -56,14 +58,19 @@ def read_recording(path: Path) -> Recording:
     builders = {TELEMETRY_TOPIC: _Builder(), TICKS_TOPIC: _Builder()}
     metadata: dict[str, str] = {}
     topics: dict[int, str] = {}
+    schemas: dict[int, bytes] = {}
     is_complete = True
     try:
         with path.open("rb") as file:
             try:
                 for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:
-                    if isinstance(record, Channel):
+                    if isinstance(record, Schema):
+                        schemas[record.id] = record.data
+                    elif isinstance(record, Channel):
                         topics[record.id] = record.topic
-                    elif isinstance(record, Metadata) and record.name == "tormagd":
+                        if record.topic in builders and record.schema_id in schemas:
+                            builders[record.topic].expect(msgspec.json.decode(schemas[record.schema_id]))
+                    elif isinstance(record, Metadata) and record.name == ABOUT:
                         metadata.update(record.metadata)
                     elif isinstance(record, Message) and topics.get(record.channel_id) in builders:
                         builders[topics[record.channel_id]].add(record.log_time, msgspec.json.decode(record.data))
@@ -81,7 +88,7 @@ def read_recording(path: Path) -> Recording:
         raise RecordingError(
             f"{path}: no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
         )
-    return Recording(telemetry, ticks, metadata, is_complete)
+    return Recording(telemetry, ticks, metadata, is_complete and CUT not in metadata)
 
 
 class _Builder:
@@ -107,6 +114,14 @@ class _Builder:
                 numbers.extend([math.nan] * (row - len(numbers)))
                 numbers.append(value)
 
+    def expect(self, schema: object) -> None:
+        """The columns that the schema names are there, whether anything is ever known of them or not."""
+        for name, kind in _columns("", schema, MAX_NESTING):
+            if kind in ("number", "integer", "boolean"):
+                self._numbers.setdefault(name, [])
+            elif kind in ("string", "array"):
+                self._words.setdefault(name, [])
+
     def columns(self) -> Columns:
         rows = len(self._t_ns)
         for numbers in self._numbers.values():
@@ -119,6 +134,18 @@ class _Builder:
             {n: np.array(v, dtype=np.float64) for n, v in self._numbers.items() if n not in self._words},
             self._words,
         )
+
+
+def _columns(prefix: str, schema: object, depth: int) -> Iterator[tuple[str, object]]:
+    """The columns in a plain JSON schema, each with its dotted name and type; of lists, those of words."""
+    properties = schema.get("properties") if isinstance(schema, dict) else None
+    for name, inner in (properties if isinstance(properties, dict) else {}).items():
+        if not isinstance(inner, dict):
+            continue
+        if inner.get("type") == "object" and depth > 0:
+            yield from _columns(f"{prefix}{name}.", inner, depth - 1)
+        elif inner.get("type") != "array" or inner.get("items") == {"type": "string"}:
+            yield f"{prefix}{name}", inner.get("type")
 
 
 def _flat(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, float | tuple[str, ...]]]:

@@ -1,24 +1,32 @@
 """Writing a recording: MCAP with JSON messages and JSON schemas, compressed with zstd.
 
 Two channels: `/telemetry`, the daemon's snapshots as published, and `/ticks`, one message for every control tick. Such
-files open in Foxglove and PlotJuggler as they are.
+files open in Foxglove and PlotJuggler as they are. What is not known is left out of its message: viewers read plain
+schemas only, in which a number cannot be null.
 """
 
 import contextlib
+import math
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import msgspec
+from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
 from tormagd import __version__
-from tormagd.messages import Telemetry
+from tormagd.messages import Telemetry, TickRecord
+from tormagd.recording.closing import ABOUT, CUT, close_cut
 from tormagd.recording.ticks import TickBatch, Value
 
 TELEMETRY_TOPIC = "/telemetry"
 TICKS_TOPIC = "/ticks"
-CHUNK_BYTES = 256 * 1024  # what a power cut can cost: about half a second of ticks
+NUMBER_COLUMN = "tick"
+"The control tick's number: one that is missing is a tick that was lost."
+CHUNK_BYTES = 1024 * 1024
+CHUNK_NS = 500_000_000
+"So much is written at once, and lost where the recorder is killed."
 GAP_NS = 10_000_000
 "A step between two ticks that counts as a gap. Under one lost batch (20 ms), above a few merged ticks."
 
@@ -26,64 +34,98 @@ GAP_NS = 10_000_000
 class RecordingWriter:
     """One MCAP file, open for writing until `close`; also a context manager.
 
-    `telemetry_count`, `tick_count`, `telemetry_lost` (missing `seq`), `gaps` (steps between ticks above GAP_NS, or back
-    in time) and `longest_gap_ms` count what was written. Raises FileExistsError rather than overwrite a recording, and
-    OSError where the file cannot be made or, from `telemetry`, `ticks` and `close`, written.
+    `telemetry_count`, `tick_count`, `telemetry_lost` (missing `seq`), `ticks_lost` (missing numbers), `gaps` (steps
+    between ticks above GAP_NS, or back in time) and `longest_gap_ms` count what was written. Raises FileExistsError
+    rather than overwrite a recording, and OSError where the file cannot be made or, from `telemetry`, `ticks`,
+    `describe` and `close`, written. What the disk took of it is closed in order then, and reads like any other.
     """
 
     def __init__(self, path: Path, metadata: dict[str, str] | None = None) -> None:
-        self._file = path.open("xb")
+        self._path, self._file = path, path.open("xb")
         self._mcap = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._schemas: list[Schema] = []
+        self._channels: list[Channel] = []
         self._mcap.start(profile="", library=f"tormagd {__version__}")
-        self._mcap.add_metadata("tormagd", {"version": __version__, **(metadata or {})})
+        self.describe({"version": __version__, **(metadata or {})})
         self._telemetry_channel = self._channel(TELEMETRY_TOPIC, "tormagd.Telemetry", telemetry_schema())
-        self._tick_channels: dict[tuple[str, ...], int] = {}
+        self._tick_channels: dict[tuple[tuple[str, str], ...], int] = {}
+        self._columns: tuple[str, ...] = ()
+        self._kinds: dict[str, str] = {}
+        "What is known of the columns' types; of one that has been null until now, nothing."
+        self._tick_channel = 0
         self._last_seq: int | None = None
+        self._last_tick: int | None = None
         self._last_tick_ns: int | None = None
+        self._batch_ns = 0
+        self._chunk_ns: int | None = None
         self.telemetry_count = 0
         self.telemetry_lost = 0
         self.tick_count = 0
+        self.ticks_lost = 0
         self.gaps = 0
         self.longest_gap_ms = 0.0
+
+    def describe(self, metadata: dict[str, str]) -> None:
+        """Write down what is recorded: names and values. Of a name that is described twice, the later one counts."""
+        self._mcap.add_metadata(ABOUT, metadata)
 
     def telemetry(self, message: Telemetry) -> None:
         """Write one snapshot. A `seq` that starts over (a restarted daemon) is not a loss."""
         if self._last_seq is not None and message.seq > self._last_seq + 1:
             self.telemetry_lost += message.seq - self._last_seq - 1
         self._last_seq = message.seq
-        # msgspec writes NaN and infinities as null, which is what "not known" is in a telemetry message
-        self._add(self._telemetry_channel, message.t_ns, msgspec.json.encode(message), self.telemetry_count)
+        data = msgspec.json.encode(_known(msgspec.to_builtins(message)))
+        self._add(self._telemetry_channel, message.t_ns, data, self.telemetry_count)
         self.telemetry_count += 1
 
     def ticks(self, batch: TickBatch) -> None:
-        """Write each row as one message. Other columns than before get a channel of their own under the same topic."""
+        """Write each row as one message. Other columns than before, or values of another kind, get a channel of their
+        own under the same topic. Numbers that start over (a restarted daemon) are not a loss."""
         if not batch.rows:
             return
-        channel = self._tick_channels.get(batch.columns)
-        if channel is None:
-            channel = self._channel(TICKS_TOPIC, "tormagd.Tick", tick_schema(batch))
-            self._tick_channels[batch.columns] = channel
+        if batch.columns != self._columns:
+            self._columns, self._tick_channel = batch.columns, 0
+            self._kinds = {name: _TICK_KINDS[name] for name in batch.columns if name in _TICK_KINDS}
+        number_at = batch.columns.index(NUMBER_COLUMN) if NUMBER_COLUMN in batch.columns else None
+        before_ns = self._last_tick_ns
         for row in batch.rows:
             t_ns = row[0]
             assert isinstance(t_ns, int)  # TickBatch has checked it
             if self._last_tick_ns is not None and not 0 <= t_ns - self._last_tick_ns <= GAP_NS:
-                self.gaps += 1
-                self.longest_gap_ms = max(self.longest_gap_ms, abs(t_ns - self._last_tick_ns) / 1e6)
+                self._note_gap(abs(t_ns - self._last_tick_ns))
             self._last_tick_ns = t_ns
-            data = msgspec.json.encode(dict(zip(batch.columns, row, strict=True)))
-            self._add(channel, t_ns, data, self.tick_count)
+            if number_at is not None and isinstance(number := row[number_at], int):
+                if self._last_tick is not None and number > self._last_tick + 1:
+                    self.ticks_lost += number - self._last_tick - 1
+                self._last_tick = number
+            message = {name: value for name, value in zip(batch.columns, row, strict=True) if _is_known(value)}
+            self._add(self._channel_of(message), t_ns, msgspec.json.encode(message), self.tick_count)
             self.tick_count += 1
+        if before_ns is not None and self._last_tick_ns is not None:
+            self._batch_ns = self._last_tick_ns - before_ns
+
+    def note_silence(self, silence_ns: int) -> bool:
+        """Count the time in which no batch came, until the recording ended, as a gap; True where it is one.
+
+        Batches come some time apart: twice that is none yet.
+        """
+        if silence_ns <= 2 * self._batch_ns + GAP_NS:
+            return False
+        self._note_gap(silence_ns)
+        return True
 
     def close(self) -> None:
         """Write the index and close the file. Without it the file still reads, up to its last whole chunk.
 
-        Raises OSError where the index or the last chunk could not be written; the file is closed then too.
+        Raises OSError where the index or the last chunk could not be written; what was is closed in order then too.
         """
         if not self._file.closed:
             try:
                 self._mcap.finish()  # type: ignore[no-untyped-call]
-            finally:
                 self._file.close()
+            except OSError as error:
+                self._close_cut(error)
+                raise
 
     def __enter__(self) -> Self:
         return self
@@ -92,18 +134,48 @@ class RecordingWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         if isinstance(error, OSError):
-            # behind a chunk that was cut, an index would make the whole file unreadable
-            with contextlib.suppress(OSError):
-                self._file.close()
+            self._close_cut(error)
         else:
             self.close()
 
+    def _close_cut(self, error: OSError) -> None:
+        """Behind a chunk that was cut, an index would make the whole file unreadable: it goes in the chunk's place."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+        with contextlib.suppress(OSError):  # a disk that takes nothing any more; up to the cut, the file still reads
+            close_cut(self._path, self._schemas, self._channels, {CUT: error.strerror or str(error)})
+
+    def _note_gap(self, gap_ns: int) -> None:
+        self.gaps += 1
+        self.longest_gap_ms = max(self.longest_gap_ms, gap_ns / 1e6)
+
+    def _channel_of(self, message: dict[str, Value]) -> int:
+        """The tick channel whose schema `message` obeys."""
+        for name, value in message.items():
+            if self._kinds.get(name) != _KINDS[type(value)]:
+                break
+        else:
+            if self._tick_channel:
+                return self._tick_channel
+        self._kinds |= {name: _KINDS[type(value)] for name, value in message.items()}
+        key = tuple(self._kinds.items())
+        if key not in self._tick_channels:
+            self._tick_channels[key] = self._channel(TICKS_TOPIC, "tormagd.Tick", tick_schema(self._kinds))
+        self._tick_channel = self._tick_channels[key]
+        return self._tick_channel
+
     def _channel(self, topic: str, name: str, schema: dict[str, Any]) -> int:
-        schema_id = self._mcap.register_schema(name=name, encoding="jsonschema", data=msgspec.json.encode(schema))
+        data = msgspec.json.encode(schema)
+        schema_id = self._mcap.register_schema(name=name, encoding="jsonschema", data=data)
         channel: int = self._mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
+        self._schemas.append(Schema(schema_id, data, "jsonschema", name))
+        self._channels.append(Channel(channel, topic, "json", {}, schema_id))
         return channel
 
     def _add(self, channel: int, t_ns: int, data: bytes, sequence: int) -> None:
+        if self._chunk_ns is None or abs(t_ns - self._chunk_ns) > CHUNK_NS:
+            self._mcap.flush()
+            self._chunk_ns = t_ns
         self._mcap.add_message(channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=sequence % 2**32)
 
 
@@ -127,19 +199,39 @@ def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any
     return {"type": schema["type"]}
 
 
-def tick_schema(batch: TickBatch) -> dict[str, Any]:
-    """The JSON schema of one row, from the types in the first one. A null there is taken for a number."""
-    properties = {name: _json_type(value) for name, value in zip(batch.columns, batch.rows[0], strict=True)}
+def tick_schema(kinds: dict[str, str]) -> dict[str, Any]:
+    """The JSON schema of a tick with columns of these types; lists are of words."""
+    properties = {
+        name: {"type": "array", "items": {"type": "string"}} if kind == "array" else {"type": kind}
+        for name, kind in kinds.items()
+    }
     return {"title": "tormagd.Tick", "type": "object", "properties": properties}
 
 
-def _json_type(value: Value) -> dict[str, Any]:
-    match value:
-        case bool():
-            return {"type": "boolean"}
-        case str():
-            return {"type": "string"}
-        case tuple():
-            return {"type": "array", "items": {"type": "string"}}
-        case _:
-            return {"type": "number"}
+def _tick_kinds() -> dict[str, str]:
+    """The types of the columns that this version's daemon publishes."""
+    (schema,), definitions = msgspec.json.schema_components([TickRecord], ref_template="{name}")
+    items = definitions[schema["$ref"]]["prefixItems"]
+    kinds = {
+        name: _plain(item, definitions)["type"] for name, item in zip(TickRecord.__struct_fields__, items, strict=True)
+    }
+    return {name: "number" if kind == "integer" else kind for name, kind in kinds.items()}
+
+
+_KINDS = {bool: "boolean", str: "string", tuple: "array", int: "number", float: "number"}
+_TICK_KINDS = _tick_kinds()
+
+
+def _is_known(value: object) -> bool:
+    return value is not None and not (isinstance(value, float) and not math.isfinite(value))
+
+
+def _known(value: Any) -> Any:
+    """`value` without what is not known in it; a list in which something is not, is not."""
+    if isinstance(value, dict):
+        return {name: _known(inner) for name, inner in value.items() if _is_known(inner) and _is_whole(inner)}
+    return value
+
+
+def _is_whole(value: object) -> bool:
+    return not isinstance(value, list | tuple) or all(_is_known(item) for item in value)
