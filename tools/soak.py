@@ -1,28 +1,39 @@
 """The same thing for a long time: does memory grow, do descriptors leak, does anything drift?
 
 First the closed loop in virtual time, then a daemon on a simulated device in real time, under 500 setpoints a second,
-whose status a new client asks for every half second. Growth counts from a quarter of the time on, when what is made
-once has been made. Exit status 0 if neither grew, nothing latched a fault, and the last minute tracked as the first.
+recorded, whose status a new client asks for every half second. Growth counts after two minutes (a quarter of a shorter
+time), when what is made once has been made. At the end recorder and daemon are killed. Exit status 0 if nothing grew,
+nothing latched a fault, the last minute tracked as the first, no tick came too late for the device, every number is in
+the recording, and what was killed lost a second of it at most.
 """
 
 import argparse
+import contextlib
 import json
 import math
 import os
+import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from benchmark_loop import daemon_process
+import msgspec
+from benchmark_loop import Stand, end, wait_for, write_config
+from mcap.exceptions import EndOfFile
+from mcap.records import Channel, Message
+from mcap.stream_reader import StreamReader
 from tqdm import tqdm
 
 from tormagd.closed_loop import ClosedLoop
-from tormagd.config import RealTime, load_config
+from tormagd.config import Config, RealTime, load_config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
 from tormagd.ctl.client import Client
+from tormagd.recording.writer import TELEMETRY_TOPIC, TICKS_TOPIC
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
@@ -30,6 +41,9 @@ from tormagd.simulation.parameters import load_plant
 MEAN_N, SWING_N, SWING_HZ = 1.5, 0.3, 1.2
 SETTLING_TICKS = 5_000
 SAMPLE_S = 0.5
+SETTLED_S = 120.0
+WITNESS_S = 3.0
+MISSING_ALLOWED_MS = 1_000.0
 GROWTH_ALLOWED_KB = 2_048
 DRIFT_ALLOWED_N = 0.02
 FIFO_PRIORITY = 50
@@ -71,56 +85,167 @@ def virtual(minutes: float) -> dict[str, Any]:
 
 
 def daemon(minutes: float) -> dict[str, Any]:
-    """A daemon in real time: memory, descriptors, faults, and what its link counted."""
-    memory_kB, descriptors = [], []
+    """A daemon in real time, recorded: memory and descriptors of both, faults, late ticks, what its link counted, what
+    is in the file, and what `kill -9` of recorder and daemon costs."""
+    memory_kB: dict[str, list[int]] = {"daemon": [], "recorder": []}
+    descriptors: dict[str, list[int]] = {"daemon": [], "recorder": []}
     faults: set[str] = set()
-    realtime = RealTime(fifo_priority=FIFO_PRIORITY)
-    with tempfile.TemporaryDirectory(prefix="tormag-") as folder, daemon_process(Path(folder), realtime) as config:
-        process = child("tormagd.daemon.main")
+    with tempfile.TemporaryDirectory(prefix="tormag-") as name, contextlib.ExitStack() as stack:
+        folder = Path(name)
+        config, process = _running(folder, stack)
+        processes = {"daemon": process, "recorder": _recorder(folder, "soak", stack)}
         for _ in tqdm(range(round(60.0 * minutes / SAMPLE_S)), desc="real time", unit="sample", disable=None):
             time.sleep(SAMPLE_S)
             with Client(config.endpoints.control, PATIENCE_S) as client:
                 status = client.request("status")
             faults.update(status["faults"])
-            memory_kB.append(resident_kB(process))
-            descriptors.append(len(list((PROC / str(process) / "fd").iterdir())))
-    link = status["link"]
+            for each, running in processes.items():
+                memory_kB[each].append(resident_kB(running.pid))
+                descriptors[each].append(len(list((PROC / str(running.pid) / "fd").iterdir())))
+        missing_ms = {"recorder": _killed(processes["recorder"], folder / "soak.mcap")}
+        witness = _recorder(folder, "killed", stack)
+        time.sleep(WITNESS_S)
+        missing_ms["daemon"] = _killed(processes["daemon"], folder / "killed.mcap", witness)
+        recorded = recording(folder / "soak.mcap", 1e3 / config.rates.control_hz, config.device.command_timeout_ms)
+    link, control = status["link"], status["rates"]["control"]
     return {
         "minutes": minutes,
-        "clients": len(memory_kB),
-        "memory_kB": memory_kB[-1],
-        "growth_kB": growth(memory_kB),
-        "descriptors": descriptors[-1],
-        "descriptor_growth": growth(descriptors),
+        "clients": len(memory_kB["daemon"]),
+        "memory_kB": memory_kB["daemon"][-1],
+        "growth_kB": growth(memory_kB["daemon"]),
+        "descriptors": descriptors["daemon"][-1],
+        "descriptor_growth": growth(descriptors["daemon"]),
+        "recorder": {
+            "memory_kB": memory_kB["recorder"][-1],
+            "growth_kB": growth(memory_kB["recorder"]),
+            "descriptor_growth": growth(descriptors["recorder"]),
+        },
         "faults": sorted(faults),
         "operating_state": status["operating_state"],
+        "control": {name: control[name] for name in ("runs", "merged", "overruns", "stalls")},
+        "worst_lateness_ms": round(control["lateness_us"]["worst"] * 1e-3, 3),
         "link": {name: link[name] for name in ("frames", "corrupt", "lost", "repeated", "resynchronisations")},
+        "recording": recorded,
+        "killed_missing_ms": missing_ms,
     }
 
 
+def recording(path: Path, period_ms: float, deadline_ms: float) -> dict[str, Any]:
+    """What is in a recording: ticks and snapshots, numbers that are missing, and the longest time between two ticks.
+
+    Two that are `deadline_ms` apart are a deadline that was missed: so long the device waits for a command.
+    """
+    counts, missing, last = Counter[str](), Counter[str](), dict[str, int]()
+    longest_ms = 0.0
+    late = 0
+    for topic, t_ns, number in _numbered(path):
+        if topic in last:
+            missing[topic] += number != last[topic] + 1
+        if topic == TICKS_TOPIC and counts[topic]:
+            between_ms = (t_ns - before_ns) * 1e-6
+            longest_ms, late = max(longest_ms, between_ms), late + (between_ms >= deadline_ms)
+        if topic == TICKS_TOPIC:
+            before_ns = t_ns
+        counts[topic] += 1
+        last[topic] = number
+    return {
+        "bytes": path.stat().st_size,
+        "ticks": counts[TICKS_TOPIC],
+        "ticks_out_of_sequence": missing[TICKS_TOPIC],
+        "telemetry": counts[TELEMETRY_TOPIC],
+        "telemetry_out_of_sequence": missing[TELEMETRY_TOPIC],
+        "period_ms": period_ms,
+        "longest_between_ticks_ms": round(longest_ms, 3),
+        "deadline_ms": deadline_ms,
+        "missed_deadlines": late,
+    }
+
+
+def _numbered(path: Path) -> Iterator[tuple[str, int, int]]:
+    """Topic, time and number of each message of a recording, up to where it was cut."""
+    topics: dict[int, str] = {}
+    with path.open("rb") as file, contextlib.suppress(EndOfFile):
+        for record in StreamReader(file).records:
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Message):
+                message = _DECODER.decode(record.data)
+                topic = topics[record.channel_id]
+                yield topic, message.t_ns, message.tick if topic == TICKS_TOPIC else message.seq
+
+
+class _Numbered(msgspec.Struct):
+    """What is looked at of a message: a snapshot's `tick` is something else than a tick's."""
+
+    t_ns: int
+    tick: Any = None
+    seq: int = 0
+
+
+_DECODER = msgspec.json.Decoder(_Numbered)
+
+
+def _running(folder: Path, stack: contextlib.ExitStack) -> tuple[Config, "subprocess.Popen[Any]"]:
+    """A daemon on a simulated device, enabled, with setpoints arriving; all of it ends with `stack`."""
+    simulator = _begun(["-m", "tormagd.simulation", "--pty"], stack, stdout=subprocess.PIPE)
+    assert simulator.stdout is not None
+    stand = Stand(RealTime(fifo_priority=FIFO_PRIORITY))
+    path = write_config(folder, simulator.stdout.readline().decode().strip(), stand)
+    process = _begun(["-m", "tormagd.daemon.main", "--config", str(path)], stack, stderr=subprocess.DEVNULL)
+    config = load_config(path)
+    wait_for(config.endpoints.control)
+    for command in ("home", "enable"):
+        subprocess.run([*_ctl(folder), command], check=True, capture_output=True)
+    _begun([*_ctl(folder)[1:], "send", "pulse", "--duration", "1e6"], stack, stdout=subprocess.DEVNULL)
+    return config, process
+
+
+def _recorder(folder: Path, name: str, stack: contextlib.ExitStack) -> "subprocess.Popen[Any]":
+    path = folder / f"{name}.mcap"
+    recorder = _begun([*_ctl(folder)[1:], "record", str(path)], stack, stdout=subprocess.DEVNULL)
+    until_s = time.monotonic() + PATIENCE_S
+    while not path.exists():
+        if time.monotonic() > until_s:
+            raise RuntimeError(f"{path.name} was not begun within {PATIENCE_S:g} s")
+        time.sleep(0.05)
+    return recorder
+
+
+def _ctl(folder: Path) -> list[str]:
+    return [sys.executable, "-m", "tormagd.ctl.main", "--config", str(folder / "tormagd.toml"), "--wait", "20"]
+
+
+def _begun(arguments: list[str], stack: contextlib.ExitStack, **streams: int) -> "subprocess.Popen[Any]":
+    child = subprocess.Popen([sys.executable, *arguments], **streams)  # type: ignore[call-overload]
+    stack.callback(end, child)
+    begun: subprocess.Popen[Any] = child
+    return begun
+
+
+def _killed(
+    victim: "subprocess.Popen[Any]", path: Path, recorder: "subprocess.Popen[Any] | None" = None
+) -> float:
+    """Kills `victim` and ends the `recorder`, if it is another: how much of the time before is not in the file, ms."""
+    killed_ns = time.time_ns()
+    victim.kill()
+    victim.wait(PATIENCE_S)
+    if recorder is not None:
+        end(recorder)
+    newest_ns = max((t_ns for topic, t_ns, _ in _numbered(path) if topic == TICKS_TOPIC), default=0)
+    return round((killed_ns - newest_ns) * 1e-6, 1)
+
+
 def growth(values: list[int]) -> int:
-    """The largest of the last quarter over the largest of the second, of at least four values."""
-    quarter = len(values) // 4
-    return max(values[-quarter:]) - max(values[quarter : 2 * quarter])
+    """By how much the largest is above the first, once what is made once has been made: after two minutes, or after a
+    quarter of a shorter time."""
+    settled = min(len(values) // 4, round(SETTLED_S / SAMPLE_S))
+    return max(values[settled:]) - values[settled]
 
 
 def resident_kB(process: int) -> int:
     """Memory of a process. Raises OSError where there is no /proc or no such process."""
     pages = int((PROC / str(process) / "statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") // 1024
-
-
-def child(module: str) -> int:
-    """The process that we started with `python -m module`. Raises LookupError without one."""
-    for folder in PROC.glob("[0-9]*"):
-        try:
-            words = (folder / "cmdline").read_bytes().split(b"\0")
-            parent = int((folder / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()[1])
-        except OSError:  # it ended while we looked
-            continue
-        if parent == os.getpid() and module.encode() in words:
-            return int(folder.name)
-    raise LookupError(f"no child process runs {module}")
 
 
 def failures(result: dict[str, Any]) -> list[str]:
@@ -132,8 +257,20 @@ def failures(result: dict[str, Any]) -> list[str]:
             found.append(f"{name}: memory grew by {part['growth_kB']} kB, allowed {GROWTH_ALLOWED_KB}")
         if part["faults"]:
             found.append(f"{name}: faults {', '.join(part['faults'])}")
-    if result["daemon"]["descriptor_growth"] > 0:
-        found.append(f"daemon: {result['daemon']['descriptor_growth']} more descriptors")
+    daemon, recorder, recorded = result["daemon"], result["daemon"]["recorder"], result["daemon"]["recording"]
+    if recorder["growth_kB"] > GROWTH_ALLOWED_KB:
+        found.append(f"recorder: memory grew by {recorder['growth_kB']} kB, allowed {GROWTH_ALLOWED_KB}")
+    for name, part in (("daemon", daemon), ("recorder", recorder)):
+        if part["descriptor_growth"] > 0:
+            found.append(f"{name}: {part['descriptor_growth']} more descriptors")
+    if recorded["missed_deadlines"]:
+        found.append(f"daemon: {recorded['missed_deadlines']} ticks were {recorded['deadline_ms']:g} ms apart or more")
+    for name in ("ticks", "telemetry"):
+        if recorded[f"{name}_out_of_sequence"] or not recorded[name]:
+            found.append(f"recording: {recorded[f'{name}_out_of_sequence']} of {recorded[name]} {name} out of sequence")
+    for name, missing_ms in daemon["killed_missing_ms"].items():
+        if missing_ms > MISSING_ALLOWED_MS:
+            found.append(f"{name}: {missing_ms:g} ms missing after kill -9, allowed {MISSING_ALLOWED_MS:g}")
     drift_N = result["virtual"]["mean_error_last_N"] - result["virtual"]["mean_error_first_N"]
     if drift_N > DRIFT_ALLOWED_N:
         found.append(f"virtual: the force error grew by {drift_N:.3f} N, allowed {DRIFT_ALLOWED_N}")
@@ -150,6 +287,14 @@ def print_table(result: dict[str, Any]) -> None:
     part = result["daemon"]
     print(f"{part['descriptors']} descriptors, {part['descriptor_growth']} more than before {part['clients']} clients")
     print(f"{part['operating_state']}, link {part['link']}")
+    recorder, recorded, killed = part["recorder"], part["recording"], part["killed_missing_ms"]
+    print(f"recorder: memory grew by {recorder['growth_kB']} kB to {recorder['memory_kB']} kB")
+    print(
+        f"recorded: {recorded['ticks']} ticks, {recorded['ticks_out_of_sequence']} out of sequence, at most "
+        f"{recorded['longest_between_ticks_ms']} ms apart; {recorded['telemetry']} snapshots, "
+        f"{recorded['telemetry_out_of_sequence']} out of sequence"
+    )
+    print(f"kill -9: {killed['recorder']} ms missing of the recorder's, {killed['daemon']} ms of the daemon's")
     for failure in result["failures"]:
         print(f"FAILED: {failure}")
 
@@ -158,12 +303,12 @@ def main() -> int:
     """Runs both; returns 0 if all held."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--virtual-minutes", type=float, default=5.0)
-    parser.add_argument("--daemon-minutes", type=float, default=3.0)
+    parser.add_argument("--virtual-minutes", type=float, default=5.0, help="in virtual time (5)")
+    parser.add_argument("--minutes", type=float, default=3.0, help="in real time (3)")
     options = parser.parse_args()
-    if not (0.1 <= options.virtual_minutes <= 1e4 and 0.1 <= options.daemon_minutes <= 1e4):
-        parser.error("--virtual-minutes and --daemon-minutes are 0.1 to 10000")
-    result: dict[str, Any] = {"virtual": virtual(options.virtual_minutes), "daemon": daemon(options.daemon_minutes)}
+    if not (0.1 <= options.virtual_minutes <= 1e4 and 0.1 <= options.minutes <= 1e4):
+        parser.error("--virtual-minutes and --minutes are 0.1 to 10000")
+    result: dict[str, Any] = {"virtual": virtual(options.virtual_minutes), "daemon": daemon(options.minutes)}
     result["failures"] = failures(result)
     result["passed"] = not result["failures"]
     if options.json:

@@ -56,7 +56,7 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
                 with writer:
                     outcome = _record(writer, path, telemetry, ticks, duration_s, is_interrupted)
                     with contextlib.suppress(CommandError):  # the daemon has gone: what was true at the start stands
-                        writer.describe(_about(endpoints, wait_s, keys))
+                        writer.describe(_about(endpoints, min(wait_s, SILENT_S), keys))
                     return outcome
             except OSError as error:
                 raise CommandError(
