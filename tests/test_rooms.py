@@ -8,31 +8,34 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LOWEST = {"firmware_protocol", "config", "messages"}
+FILES = {"bounded_file", "toml_file"}
 NO_ROOM = {"firmware_protocol.value", "firmware_protocol.build"}
 """What all values are made of, and which build runs: they know nothing of any room, the protocol's included."""
 MAY_IMPORT = {
     "firmware_protocol": set(),
-    "config": set(),
+    "bounded_file": set(),
+    "toml_file": {"bounded_file"},
+    "config": {"toml_file"},
     "messages": set(),
     "output": set(),
     "exact": set(),
     "keeping": set(),
-    "keys": {"config"},
+    "keys": FILES | {"config"},
     "entry": set(),  # it loads the daemon or tormagctl by name, never both
-    "physics": set(),
-    "characterisation": {"physics"},
-    "design": {"physics"},
-    "model": {"physics"},
-    "training": {"physics", "model"},
+    "physics": FILES,
+    "characterisation": FILES | {"physics"},
+    "design": FILES | {"physics"},
+    "model": FILES | {"physics"},
+    "training": FILES | {"physics", "model"},
     "inverse": {"firmware_protocol", "physics", "model", "training"},
     "scenes": {"config"},
     "safety": {"firmware_protocol"},
     "hardware": LOWEST | {"safety"},
     "control": LOWEST | {"exact", "physics", "model", "inverse", "scenes", "safety", "hardware"},
-    "daemon": LOWEST | {"output", "keys", "keeping", "scenes", "safety", "hardware", "control"},
-    "recording": {"messages", "output", "keeping"},
-    "ctl": {"config", "messages", "output", "keys", "scenes", "recording"},
-    "simulation": {"physics", "firmware_protocol", "output"},
+    "daemon": LOWEST | FILES | {"output", "keys", "keeping", "scenes", "safety", "hardware", "control"},
+    "recording": FILES | {"messages", "output", "keeping"},
+    "ctl": FILES | {"config", "messages", "output", "keys", "scenes", "recording"},
+    "simulation": FILES | {"physics", "firmware_protocol", "output"},
     "headroom": {"config", "output", "daemon", "control", "simulation", "closed_loop"},
     "replay": LOWEST
     | {"exact", "output", "recording", "model", "scenes", "safety", "hardware", "control", "daemon", "simulation"}

@@ -137,10 +137,11 @@ def _says_numerics(figures: Figures) -> str:
 
 def _says_soak(figures: Figures) -> str:
     virtual, daemon = figures["virtual"], figures["daemon"]
+    recorded = daemon["recording"]
     return (
         f"{virtual['minutes']:g} min virtual, {virtual['growth_kB']:+} kB; {daemon['minutes']:g} min daemon, "
         f"{daemon['growth_kB']:+} kB, {daemon['descriptor_growth']:+} descriptors, {daemon['clients']} clients; "
-        f"{daemon['recording']['ticks']:,} ticks recorded, {daemon['recording']['ticks_out_of_sequence']} out of sequence"
+        f"{recorded['ticks']:,} ticks recorded, {recorded['ticks_out_of_sequence']} out of sequence"
     )
 
 

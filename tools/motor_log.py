@@ -9,6 +9,8 @@ import numpy.typing as npt
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
+from tormagd.bounded_file import MOST_TABLE_BYTES, require_regular
+
 Array = npt.NDArray[np.float64]
 
 COLUMNS = ("t_s", "input_V", "position_mm")
@@ -64,6 +66,7 @@ def read_log(path: Path) -> Log:
 
 def _read_mat(path: Path) -> Log:
     try:
+        require_regular(path, MOST_TABLE_BYTES)
         data = loadmat(path)
         t_s, input_V, position_m = (np.asarray(data[name], dtype=np.float64).ravel() for name in ("t", "vir", "qm"))
         gain = float(np.asarray(data["gtau"]).item())
@@ -80,6 +83,7 @@ def _read_mat(path: Path) -> Log:
 def _read_csv(path: Path) -> Log:
     rows: list[tuple[float, ...]] = []
     try:
+        require_regular(path, MOST_TABLE_BYTES)
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
             header = reader.fieldnames or ()

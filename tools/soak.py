@@ -124,6 +124,8 @@ def daemon(minutes: float) -> dict[str, Any]:
         "operating_state": status["operating_state"],
         "control": {name: control[name] for name in ("runs", "merged", "overruns", "stalls")},
         "worst_lateness_ms": round(control["lateness_us"]["worst"] * 1e-3, 3),
+        "late_ticks_by": status["late_ticks_by"],
+        "newest_stall": status["newest_stall"],
         "link": {name: link[name] for name in ("frames", "corrupt", "lost", "repeated", "resynchronisations")},
         "recording": recorded,
         "killed_missing_ms": missing_ms,
@@ -136,8 +138,7 @@ def recording(path: Path, period_ms: float, deadline_ms: float) -> dict[str, Any
     Two that are `deadline_ms` apart are a deadline that was missed: so long the device waits for a command.
     """
     counts, missing, last = Counter[str](), Counter[str](), dict[str, int]()
-    longest_ms = 0.0
-    late = 0
+    longest_ms, late, before_ns = 0.0, 0, 0
     for topic, t_ns, number in _numbered(path):
         if topic in last:
             missing[topic] += number != last[topic] + 1
@@ -189,6 +190,8 @@ def _running(folder: Path, stack: contextlib.ExitStack) -> tuple[Config, "subpro
     """A daemon on a simulated device, enabled, with setpoints arriving; all of it ends with `stack`."""
     simulator = _begun(["-m", "tormagd.simulation", "--pty"], stack, stdout=subprocess.PIPE)
     assert simulator.stdout is not None
+    with contextlib.suppress(PermissionError):  # where the daemon gets none either
+        os.sched_setscheduler(simulator.pid, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY - 1))
     stand = Stand(RealTime(fifo_priority=FIFO_PRIORITY))
     path = write_config(folder, simulator.stdout.readline().decode().strip(), stand)
     process = _begun(["-m", "tormagd.daemon.main", "--config", str(path)], stack, stderr=subprocess.DEVNULL)
@@ -222,9 +225,7 @@ def _begun(arguments: list[str], stack: contextlib.ExitStack, **streams: int) ->
     return begun
 
 
-def _killed(
-    victim: "subprocess.Popen[Any]", path: Path, recorder: "subprocess.Popen[Any] | None" = None
-) -> float:
+def _killed(victim: "subprocess.Popen[Any]", path: Path, recorder: "subprocess.Popen[Any] | None" = None) -> float:
     """Kills `victim` and ends the `recorder`, if it is another: how much of the time before is not in the file, ms."""
     killed_ns = time.time_ns()
     victim.kill()
@@ -265,9 +266,11 @@ def failures(result: dict[str, Any]) -> list[str]:
             found.append(f"{name}: {part['descriptor_growth']} more descriptors")
     if recorded["missed_deadlines"]:
         found.append(f"daemon: {recorded['missed_deadlines']} ticks were {recorded['deadline_ms']:g} ms apart or more")
-    for name in ("ticks", "telemetry"):
-        if recorded[f"{name}_out_of_sequence"] or not recorded[name]:
-            found.append(f"recording: {recorded[f'{name}_out_of_sequence']} of {recorded[name]} {name} out of sequence")
+    found += [
+        f"recording: {recorded[f'{name}_out_of_sequence']} of {recorded[name]} {name} out of sequence"
+        for name in ("ticks", "telemetry")
+        if recorded[f"{name}_out_of_sequence"] or not recorded[name]
+    ]
     for name, missing_ms in daemon["killed_missing_ms"].items():
         if missing_ms > MISSING_ALLOWED_MS:
             found.append(f"{name}: {missing_ms:g} ms missing after kill -9, allowed {MISSING_ALLOWED_MS:g}")

@@ -5,15 +5,15 @@ orderings are refused with the key's path, the value and what is allowed.
 """
 
 import ipaddress
-import math
 import os
 import re
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
 from msgspec import Meta
+
+from tormagd.toml_file import TomlError, in_short, read_toml
 
 LEAST_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
 DEFAULT_RUN_DIR = "/run/tormag"
@@ -314,30 +314,7 @@ def _is_ipv4(host: str) -> bool:
 
 def _order(condition: bool, key: str, value: object, allowed: str) -> None:
     if not condition:
-        raise ValueError(f"{key} = {value!r}: allowed is {allowed}")
-
-
-def load_toml(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file. Raises ConfigError: not readable, not TOML (with its line), a number not finite."""
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: {error}") from error
-    _refuse_nonfinite(tables, str(path))
-    return tables
-
-
-def _refuse_nonfinite(value: Any, where: str) -> None:
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ConfigError(f"{where} = {value}: allowed is a finite number")
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            _refuse_nonfinite(inner, f"{where}: {key}" if ":" not in where else f"{where}.{key}")
-    if isinstance(value, list):
-        for inner in value:
-            _refuse_nonfinite(inner, where)
+        raise ValueError(f"{key} = {in_short(value)}: allowed is {allowed}")
 
 
 def load_config(path: Path | None) -> Config:
@@ -349,10 +326,11 @@ def load_config(path: Path | None) -> Config:
 
 def convert(path: Path, kind: type[T]) -> T:
     """The file's tables as a `kind`. Raises ConfigError naming file, key, value and what is allowed."""
-    tables = load_toml(path)
     try:
-        return checked(tables, kind)
-    except ConfigError as error:
+        return checked(read_toml(path), kind)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except (TomlError, ConfigError) as error:
         raise ConfigError(f"{path}: {error}") from error
 
 
@@ -378,4 +356,4 @@ def _value_at(tables: dict[str, Any], message: str) -> str:
         if not isinstance(value, dict) or key not in value:
             return ""
         value = value[key]
-    return "" if isinstance(value, dict) else f" (it is {value!r})"
+    return "" if isinstance(value, dict) else f" (it is {in_short(value)})"

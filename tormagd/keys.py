@@ -17,6 +17,7 @@ import zmq
 import zmq.auth
 from zmq.utils import z85
 
+from tormagd.bounded_file import require_regular
 from tormagd.config import ROLES, ConfigError, Endpoints
 
 PUBLIC, SECRET = ".key", ".key_secret"
@@ -152,12 +153,9 @@ def generate(name: str, secret_in: Path, public_in: Path) -> tuple[Path, Path]:
 
 def _regular(path: Path) -> os.stat_result:
     try:
-        information = path.stat()
+        return require_regular(path, MAX_KEY_FILE_BYTES)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
-    if not stat.S_ISREG(information.st_mode) or information.st_size > MAX_KEY_FILE_BYTES:
-        raise ConfigError(f"{path}: allowed is a regular file of at most {MAX_KEY_FILE_BYTES} bytes")
-    return information
 
 
 def _refuse_writable(path: Path, mode: int) -> None:

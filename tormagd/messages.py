@@ -3,8 +3,8 @@
 `decode` is the border: msgpack unpacks with size limits, msgspec checks names and types, each message checks its own
 values. Unknown fields are ignored, so that a newer client can talk to an older daemon.
 
-What leaves the daemon has its type here: `Telemetry`, `Status`, `Description`, `TickRecord`, `Reply`. docs/messages.md lists their
-fields, and says when `v` rises.
+What leaves the daemon has its type here: `Telemetry`, `Status`, `Description`, `TickRecord`, `Reply`. docs/messages.md
+lists their fields, and says when `v` rises.
 """
 
 from collections.abc import Sequence

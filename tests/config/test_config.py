@@ -212,7 +212,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, write) -> None:
     assert "line 2" in refusal(write("scene = 'pulse'\nscene == 3"))
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b"scene = '\xff'")
-    assert "utf-8" in refusal(binary)
+    assert "UTF-8 text (byte 9)" in refusal(binary)
 
 
 SCALARS = st.one_of(st.integers(), st.floats(), st.booleans(), st.text(max_size=5))

@@ -160,7 +160,7 @@ def another_device(path: Path) -> None:
     [
         (lambda path: path.write_bytes(b"\x00" * 100), "not a profile"),
         (lambda path: path.write_bytes(b"[" * 100_000), "allowed is"),
-        (os.mkfifo, "not a profile"),
+        (os.mkfifo, "this is a pipe"),
         (Path.mkdir, "directory"),
         (wrong_model, "model = "),
         (another_device, "serial_number = 8"),

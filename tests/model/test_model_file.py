@@ -204,7 +204,7 @@ def test_what_is_no_model_file_is_refused(tmp_path: Path, model: ForceModel) -> 
     with pytest.raises(ModelFileError):
         load_model(pickled, element="torque")
     pickled.write_bytes(b"\0" * (model_file.MAX_FILE_BYTES + 1))
-    with pytest.raises(ModelFileError, match="more than 1048576 bytes"):
+    with pytest.raises(ModelFileError, match="at most 1048576 bytes; this has 1048577"):
         load_model(pickled, element="torque")
 
 

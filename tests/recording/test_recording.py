@@ -164,11 +164,16 @@ def test_what_a_full_disk_took_is_closed_in_order(tmp_path, room_bytes):
     writer = RecordingWriter(path)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (6_000 + room_bytes, hard))
-    try:
-        with pytest.raises(OSError, match="too large"), writer:
+
+    def fill() -> None:
+        with writer:
             for k in range(400):
                 writer.ticks(batch(*((20 * k + i, *rng.random(5).tolist()) for i in range(20))))
                 writer.telemetry(telemetry(20 * k, k))
+
+    try:
+        with pytest.raises(OSError, match="too large"):
+            fill()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     recording = read_recording(path)

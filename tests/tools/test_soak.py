@@ -2,16 +2,32 @@
 
 import copy
 import os
-import subprocess
-import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
 import soak
 
+from tormagd.recording.ticks import TickBatch
+from tormagd.recording.writer import RecordingWriter
+
 QUIET: dict[str, Any] = {
     "virtual": {"growth_kB": 100, "faults": [], "mean_error_first_N": 0.02, "mean_error_last_N": 0.021},
-    "daemon": {"growth_kB": -4, "faults": [], "descriptor_growth": 0},
+    "daemon": {
+        "growth_kB": -4,
+        "faults": [],
+        "descriptor_growth": 0,
+        "recorder": {"growth_kB": 9, "descriptor_growth": 0},
+        "recording": {
+            "ticks": 9,
+            "ticks_out_of_sequence": 0,
+            "telemetry": 9,
+            "telemetry_out_of_sequence": 0,
+            "missed_deadlines": 0,
+            "deadline_ms": 50.0,
+        },
+        "killed_missing_ms": {"recorder": 400.0, "daemon": 30.0},
+    },
 }
 
 
@@ -23,10 +39,12 @@ def test_the_virtual_loop_tracks_without_a_fault() -> None:
     assert result["memory_kB"] > 10_000
 
 
-def test_growth_is_over_the_second_quarter() -> None:
+def test_growth_is_above_the_first_once_everything_is_made() -> None:
     assert soak.growth([1, 90, 100, 100, 100, 100, 100, 100]) == 0
-    assert soak.growth([1, 90, 100, 101, 102, 103, 104, 110]) == 9
-    assert soak.growth([5, 5, 5, 4]) == -1
+    assert soak.growth([1, 90, 100, 101, 102, 110, 104, 103]) == 10
+    assert soak.growth([1, 5, 5, 4]) == 0
+    # of a long run the first two minutes do not count: 240 samples
+    assert soak.growth([*range(240), *(2_000 * [240]), 245]) == 5
 
 
 @pytest.mark.parametrize(
@@ -38,32 +56,34 @@ def test_growth_is_over_the_second_quarter() -> None:
         ("daemon", "growth_kB", 5_000, "daemon: memory grew"),
         ("daemon", "descriptor_growth", 1, "1 more descriptors"),
         ("daemon", "faults", ["LINK_LOST"], "LINK_LOST"),
+        ("recorder", "growth_kB", 5_000, "recorder: memory grew"),
+        ("recorder", "descriptor_growth", 2, "recorder: 2 more descriptors"),
+        ("recording", "missed_deadlines", 1, "1 ticks were 50 ms apart"),
+        ("recording", "ticks_out_of_sequence", 3, "3 of 9 ticks out of sequence"),
+        ("recording", "telemetry", 0, "0 of 0 telemetry"),
+        ("killed_missing_ms", "recorder", 1_001.0, "recorder: 1001 ms missing"),
     ],
 )
 def test_what_grows_or_fails_is_named(part: str, key: str, value: object, says: str) -> None:
     assert soak.failures(QUIET) == []
     result = copy.deepcopy(QUIET)
-    result[part][key] = value
+    (result[part] if part in result else result["daemon"][part])[key] = value
     (failure,) = soak.failures(result)
     assert says in failure
 
 
-def test_it_finds_its_own_children_only() -> None:
-    with pytest.raises(LookupError):
-        soak.child("tormagd.daemon.main")
-    with subprocess.Popen([sys.executable, "-m", "http.server", "--help"], stdout=subprocess.PIPE) as other:
-        other.wait()
-        # a zombie's command line is empty
-        with pytest.raises(LookupError):
-            soak.child("http.server")
-    with subprocess.Popen(
-        [sys.executable, "-c", "import sys; print(flush=True); sys.stdin.read()", "some.module"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    ) as waiting:
-        assert waiting.stdout is not None
-        waiting.stdout.readline()  # while it is being replaced, a process has no command line
-        assert soak.child("some.module") == waiting.pid
-        assert soak.resident_kB(waiting.pid) > 0
-        waiting.communicate()
+def test_numbers_and_times_of_a_recording_are_looked_at(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        for tick in (1, 2, 5, 6, 60):  # 3 and 4 are missing, then what the device does not wait for
+            writer.ticks(TickBatch(v=1, columns=("t_ns", "tick"), rows=((10**18 + tick * 1_000_000, tick),)))
+    found = soak.recording(path, 1.0, 50.0)
+    assert (found["ticks"], found["ticks_out_of_sequence"], found["missed_deadlines"]) == (5, 2, 1)
+    assert found["longest_between_ticks_ms"] == 54.0
+    # one that was killed is read as far as it goes
+    path.write_bytes(path.read_bytes()[:-500])
+    assert soak.recording(path, 1.0, 50.0)["ticks"] == 5
+
+
+def test_the_memory_of_a_process_is_its_own() -> None:
     assert soak.resident_kB(os.getpid()) > 10_000

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tormagd.bounded_file import MOST_TABLE_BYTES, require_regular
+
 MAX_ROWS = 1_000_000
 
 
@@ -22,6 +24,7 @@ def read_columns(path: Path, names: tuple[str, ...], delimiter: str = ",") -> li
     number (with its line), no rows, more than a million lines.
     """
     try:
+        require_regular(path, MOST_TABLE_BYTES)
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = list(enumerate(csv.reader(file, delimiter=delimiter), start=1))[: MAX_ROWS + 1]
     except (OSError, UnicodeDecodeError, csv.Error) as error:

@@ -29,8 +29,8 @@ SILENT_S = 1.0
 def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
     """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM.
 
-    What is recorded is asked of the daemon and written down first, and again at the end: a device may have been connected,
-    or have shown itself, meanwhile.
+    What is recorded is asked of the daemon and written down first, and again at the end: a device may have been
+    connected, or have shown itself, meanwhile.
 
     Raises CommandError: USAGE where the file exists or cannot be made, UNREACHABLE where nothing is published within
     `wait_s`, or the daemon cannot be asked what it runs; then there is no file. REFUSED where the disk takes no more;

@@ -1,13 +1,15 @@
 """What `tormagctl send` sends: a force over time, computed or from a CSV file. All computed shapes are synthetic."""
 
 import csv
+import io
 import math
-import stat
+from array import array
 from bisect import bisect_right
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from tormagd.bounded_file import read_bounded
 from tormagd.messages import MAX_DISPLACEMENT_MM, MAX_FORCE_N, MAX_RATE_MM_S
 
 REQUIRED_COLUMNS = ("t_s", "force_N")
@@ -19,7 +21,8 @@ ALLOWED = {
     "rate_mm_s": (-MAX_RATE_MM_S, MAX_RATE_MM_S, "mm/s"),
 }
 "Least, most and unit of each column; of what a setpoint carries, as in the messages."
-MAX_FILE_BYTES = 64_000_000
+MAX_FILE_BYTES = 16_000_000
+"More than a quarter of an hour at 1 kHz."
 
 
 class WaveformError(ValueError):
@@ -85,47 +88,45 @@ def read_csv(path: Path) -> Waveform:
 
     Time is counted from the first row. Raises WaveformError.
     """
-    columns, rows = _read_rows(path)
-    start_s = rows[0][columns.index("t_s")]
-    times_s = [row[columns.index("t_s")] - start_s for row in rows]
+    table = _read_table(path)
+    start_s = table["t_s"][0]
+    times_s = array("d", (time_s - start_s for time_s in table["t_s"]))
     # in the order of Sample's fields; None for a column that the file does not have
-    places = [columns.index(name) if name in columns else None for name in ("force_N", *OPTIONAL_COLUMNS)]
+    columns = [table.get(name) for name in ("force_N", *OPTIONAL_COLUMNS)]
 
     def at(t_s: float) -> Sample:
-        right = min(max(bisect_right(times_s, t_s), 1), len(rows) - 1)
+        right = min(max(bisect_right(times_s, t_s), 1), len(times_s) - 1)
         share = (t_s - times_s[right - 1]) / (times_s[right] - times_s[right - 1])
         share = min(1.0, max(0.0, share))
-        before, after = rows[right - 1], rows[right]
-        values = [None if c is None else before[c] + (after[c] - before[c]) * share for c in places]
+        values = [None if c is None else c[right - 1] + (c[right] - c[right - 1]) * share for c in columns]
         assert values[0] is not None  # force_N is a required column
         return Sample(values[0], values[1], values[2])
 
     return Waveform(times_s[-1], at)
 
 
-def _read_rows(path: Path) -> tuple[list[str], list[list[float]]]:
+def _read_table(path: Path) -> dict[str, "array[float]"]:
+    """The columns by name: arrays, for a million rows of lists would not fit in the memory that a command may take."""
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):  # opening a named pipe would wait for a writer
-            raise WaveformError(f"{path}: allowed is a regular file")
-        if status.st_size > MAX_FILE_BYTES:
-            raise WaveformError(f"{path}: {status.st_size} bytes: allowed is {MAX_FILE_BYTES}")
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        data = io.BytesIO(read_bounded(path, MAX_FILE_BYTES))
+        with io.TextIOWrapper(data, encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True)
             columns = _check_header(path, [name.strip() for name in next(reader, [])])
-            rows: list[list[float]] = []
+            table = {name: array("d") for name in columns}
             for cells in reader:
                 if cells:
-                    rows.append(_check_row(path, reader.line_num, columns, cells, rows[-1] if rows else None))
+                    row = _check_row(path, reader.line_num, columns, cells, table["t_s"][-1:])
+                    for name, value in zip(columns, row, strict=True):
+                        table[name].append(value)
     except OSError as error:
         raise WaveformError(f"{path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise WaveformError(f"{path}: not UTF-8 text (byte {error.start})") from error
     except csv.Error as error:
         raise WaveformError(f"{path}: not CSV: {error}") from error
-    if len(rows) < 2:
-        raise WaveformError(f"{path}: {len(rows)} rows: allowed is at least 2")
-    return columns, rows
+    if len(table["t_s"]) < 2:
+        raise WaveformError(f"{path}: {len(table['t_s'])} rows: allowed is at least 2")
+    return table
 
 
 def _check_header(path: Path, columns: list[str]) -> list[str]:
@@ -141,16 +142,14 @@ def _check_header(path: Path, columns: list[str]) -> list[str]:
     return columns
 
 
-def _check_row(
-    path: Path, line: int, columns: list[str], cells: list[str], previous: list[float] | None
-) -> list[float]:
+def _check_row(path: Path, line: int, columns: list[str], cells: list[str], before_s: "array[float]") -> list[float]:
     if len(cells) != len(columns):
         raise WaveformError(f"{path}: row {line} has {len(cells)} values: allowed is {len(columns)}")
     row = [_number(path, line, name, text) for name, text in zip(columns, cells, strict=True)]
     time = columns.index("t_s")
-    if previous is not None and not row[time] > previous[time]:
+    if before_s and not row[time] > before_s[0]:
         raise WaveformError(
-            f"{path}: row {line}, t_s = {cells[time]}: allowed is above the row before, {previous[time]:g}"
+            f"{path}: row {line}, t_s = {cells[time]}: allowed is above the row before, {before_s[0]:g}"
         )
     return row
 

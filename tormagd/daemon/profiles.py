@@ -12,6 +12,7 @@ from pathlib import Path
 
 import msgspec
 
+from tormagd.bounded_file import read_bounded
 from tormagd.control.device_fit import UNSEEN, DeviceFit
 from tormagd.control.plan import NOTHING_SHOWN, Shown
 from tormagd.control.profile import MAX_BYTES, Profile, ProfileError, profile_of, read_profile
@@ -46,12 +47,7 @@ class ProfileFolder:
         """The profile of that device; None where there is none. Raises ProfileError saying why it cannot be used."""
         path = self.path(serial_number)
         try:
-            # whatever lies there, a pipe even: nothing is waited for, and no more read than a profile has
-            descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-            try:
-                data = os.read(descriptor, MAX_BYTES + 1)
-            finally:
-                os.close(descriptor)
+            data = read_bounded(path, MAX_BYTES)
         except FileNotFoundError:
             return None
         except OSError as error:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import butter, sosfiltfilt
 
+from tormagd.bounded_file import MOST_TABLE_BYTES, require_regular
 from tormagd.physics.errors import DomainError, require
 
 Array = npt.NDArray[np.float64]
@@ -33,6 +34,7 @@ def read_task(path: Path, cutoff_Hz: float | None = None) -> RecordedTask:
     Raises `DomainError` naming file, line and value for a file that is not that, and `OSError`.
     """
     times, forces = [], []
+    require_regular(path, MOST_TABLE_BYTES)
     with path.open(newline="", encoding="utf-8") as file:
         try:
             rows = csv.DictReader(file, strict=True)

@@ -11,10 +11,12 @@ from pathlib import Path
 
 import msgspec
 
+from tormagd.bounded_file import read_bounded
 from tormagd.design.optimisation import Outcome, Run, solve
 from tormagd.physics.errors import DomainError
 
 STATE_VERSION = 1
+MAX_STATE_BYTES = 64_000_000
 
 
 class _State(msgspec.Struct, forbid_unknown_fields=True):
@@ -57,7 +59,7 @@ def read_state(path: Path) -> dict[Run, Outcome]:
     if not path.exists():
         return {}
     try:
-        state = msgspec.json.decode(path.read_bytes(), type=_State)
+        state = msgspec.json.decode(read_bounded(path, MAX_STATE_BYTES), type=_State)
     except msgspec.DecodeError as error:
         raise DomainError(str(path), error, "the state file of a sweep") from error
     if state.version != STATE_VERSION:

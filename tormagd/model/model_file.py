@@ -21,6 +21,7 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import ArrayLike, NDArray
 
+from tormagd.bounded_file import read_bounded
 from tormagd.model.features import (
     FEATURES,
     FIELD,
@@ -219,8 +220,7 @@ def load_model(path: Path | str, *, element: Element | str, insert: str | None =
     """
     source = Path(path)
     try:
-        with source.open("rb") as file:
-            model = _decode(file.read(MAX_FILE_BYTES + 1))
+        model = _decode(read_bounded(source, MAX_FILE_BYTES))
     except OSError as error:
         raise ModelFileError(f"{source}: cannot be read: {error.strerror}") from error
     except safetensors.SafetensorError as error:
@@ -238,8 +238,6 @@ def load_model(path: Path | str, *, element: Element | str, insert: str | None =
 
 
 def _decode(data: bytes) -> ForceModel:
-    if len(data) > MAX_FILE_BYTES:
-        raise ModelFileError(f"more than {MAX_FILE_BYTES} bytes, which no force model has")
     # the library proves that the header is whole and that the tensors lie inside the file
     tensors = {name: _tensor(name, content) for name, content in safetensors.deserialize(data)}  # type: ignore[no-untyped-call]
     header = _json_header(data).get("__metadata__", {})

@@ -17,7 +17,7 @@ def model_path(name_or_path: str, beside: Path) -> Path:
         return Path(str(_MODELS / f"{name_or_path}{_ENDING}"))
     path, allowed = beside / name_or_path, f"allowed is a model file or one of {', '.join(shipped)}"
     try:
-        if path.is_file():
+        if path.exists():
             return path
     except OSError as error:  # a name that no file can have, or a directory that may not be entered
         raise ModelFileError(f"model {name_or_path[:LONGEST_SHOWN]!r}: {error.strerror}; {allowed}") from error

@@ -4,7 +4,6 @@ An insert MRE-xx-yy has an Ecoflex 00-xx matrix with yy % of carbonyl iron powde
 this module holds the data and says how a laboratory adds its own.
 """
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from msgspec import Meta, Struct
 
 from tormagd.physics.errors import DomainError, require
 from tormagd.physics.force import Elastomer
+from tormagd.toml_file import TomlError, read_toml
 
 CIP_DENSITY_G_CC = 7.87
 SLACKER_DENSITY_G_CC = 0.97
@@ -167,10 +167,10 @@ def load_inserts(*paths: Path) -> Mapping[str, Insert]:
 
 def _read(path: Path) -> _File:
     try:
-        return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), _File)
+        return msgspec.convert(read_toml(path), _File)
     except OSError as error:
         raise InsertFileError(f"{path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
+    except (TomlError, msgspec.ValidationError) as error:
         raise InsertFileError(f"{path}: {error}") from error
 
 

@@ -44,12 +44,12 @@ class _Whole(NamedTuple):
     """A chunk with its message indexes: where both end, how the index lists it, and its messages by channel."""
 
     end: int
-    index: ChunkIndex
+    entry: ChunkIndex
     messages: Counter[int]
 
 
 def close_cut(path: Path, schemas: Sequence[Schema], channels: Sequence[Channel], about: dict[str, str]) -> None:
-    """Close the recording in `path`, whose end is missing, with an index and `about` why, in place of what is not whole.
+    """Close the recording in `path`, whose end is missing, with `about` why and an index in place of what is not whole.
 
     Raises OSError where not even that can be written; the file is then as it was, up to its last whole chunk.
     """
@@ -92,8 +92,8 @@ def _read(file: BinaryIO) -> tuple[int, list[MetadataIndex], list[_Whole]]:
                 whole.append(_Whole(here, _chunk_index(record, before, here - before), Counter()))
             elif isinstance(record, MessageIndex) and whole:
                 last = whole.pop()
-                last.index.message_index_offsets[record.channel_id] = before
-                last.index.message_index_length += here - before
+                last.entry.message_index_offsets[record.channel_id] = before
+                last.entry.message_index_length += here - before
                 last.messages[record.channel_id] = len(record.records)
                 whole.append(last._replace(end=here))
             elif isinstance(record, DataEnd):
@@ -104,7 +104,9 @@ def _read(file: BinaryIO) -> tuple[int, list[MetadataIndex], list[_Whole]]:
     except (McapError, struct.error, UnicodeDecodeError):
         pass  # here it was cut
     # a chunk without all of its message indexes: readers that use them would not find all that is in it
-    if newest is not None and whole[-1].messages.total() != sum(isinstance(it, Message) for it in breakup_chunk(newest)):
+    if newest is not None and whole[-1].messages.total() != sum(
+        isinstance(it, Message) for it in breakup_chunk(newest)
+    ):
         whole.pop()
     return start, metadata, whole
 
@@ -144,17 +146,18 @@ def _ending(
         channel_message_counts=dict(messages),
         chunk_count=len(whole),
         message_count=messages.total(),
-        message_end_time=max((each.index.message_end_time for each in whole), default=0),
-        message_start_time=min((each.index.message_start_time for each in whole), default=0),
+        message_end_time=max((each.entry.message_end_time for each in whole), default=0),
+        message_start_time=min((each.entry.message_start_time for each in whole), default=0),
         metadata_count=len(metadata) + 1,
         schema_count=len(schemas),
     )
-    summary, offsets = RecordBuilder(), []
+    summary: RecordBuilder = RecordBuilder()
+    offsets = []
     for opcode, records in (
         (Opcode.SCHEMA, schemas),
         (Opcode.CHANNEL, channels),
         (Opcode.STATISTICS, [statistics]),
-        (Opcode.CHUNK_INDEX, [each.index for each in whole]),
+        (Opcode.CHUNK_INDEX, [each.entry for each in whole]),
         (Opcode.METADATA_INDEX, [*metadata, reason]),
     ):
         group_start = summary.count
@@ -164,8 +167,12 @@ def _ending(
     offsets_start = summary_start + summary.count
     for offset in offsets:
         offset.write(summary)
-    written = summary.end()
+    written = _bytes(summary)
     crc = zlib.crc32(_FOOTER.pack(Opcode.FOOTER, _FOOTER_BYTES, summary_start, offsets_start), zlib.crc32(written))
     footer = RecordBuilder()
     Footer(summary_start, offsets_start, crc).write(footer)
-    return bytes(data.end() + written + footer.end() + MCAP0_MAGIC)
+    return _bytes(data) + written + _bytes(footer) + MCAP0_MAGIC
+
+
+def _bytes(builder: RecordBuilder) -> bytes:
+    return bytes(builder.end())  # type: ignore[no-untyped-call]

@@ -15,9 +15,11 @@ from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 from zstandard import ZstdError
 
+from tormagd.bounded_file import require_regular
 from tormagd.recording.closing import ABOUT, CUT
 from tormagd.recording.writer import TELEMETRY_TOPIC, TICKS_TOPIC
 
+MAX_FILE_BYTES = 1 << 40
 MAX_RECORD_BYTES = 64_000_000
 MAX_NESTING = 2
 UNREADABLE = (McapError, ZstdError, ValueError, OverflowError, MemoryError, struct.error, msgspec.MsgspecError)
@@ -32,9 +34,9 @@ class RecordingError(ValueError):
 class Columns:
     """The messages of one topic, one row each, in the order they were written.
 
-    `numbers[name]` is float64 of shape (rows,), with NaN where a value was not known or the row had no such column; true
-    and false are 1 and 0. `words[name]` holds a tuple of strings for each row. An object's or a list's members get names of
-    their own: `tick.exec_us`, `duty.0`.
+    `numbers[name]` is float64 of shape (rows,), with NaN where a value was not known or the row had no such column;
+    true and false are 1 and 0. `words[name]` holds a tuple of strings for each row. An object's or a list's members get
+    names of their own: `tick.exec_us`, `duty.0`.
     """
 
     t_ns: NDArray[np.int64]
@@ -61,6 +63,7 @@ def read_recording(path: Path) -> Recording:
     schemas: dict[int, bytes] = {}
     is_complete = True
     try:
+        require_regular(path, MAX_FILE_BYTES)
         with path.open("rb") as file:
             try:
                 for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:

@@ -174,7 +174,7 @@ class RecordingWriter:
 
     def _add(self, channel: int, t_ns: int, data: bytes, sequence: int) -> None:
         if self._chunk_ns is None or abs(t_ns - self._chunk_ns) > CHUNK_NS:
-            self._mcap.flush()
+            self._mcap.flush()  # type: ignore[no-untyped-call]
             self._chunk_ns = t_ns
         self._mcap.add_message(channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=sequence % 2**32)
 

@@ -109,7 +109,7 @@ def scene_path(name_or_path: str) -> Path:
         return Path(str(_SHIPPED / f"{name_or_path}.toml"))
     path, allowed = Path(name_or_path), f"allowed is a scene file or one of {', '.join(shipped_scenes())}"
     try:
-        if path.is_file():
+        if path.exists():
             return path
     except OSError as error:  # a name that no file can have, or a directory that may not be entered
         raise ConfigError(f"scene = {name_or_path[:LONGEST_SHOWN]!r}: {error.strerror}; {allowed}") from error

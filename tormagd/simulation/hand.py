@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final, Protocol, final
 
 from firmware_protocol.value import Value
+from tormagd.bounded_file import MOST_TABLE_BYTES, require_regular
 
 ROLLER_RADIUS_MM: Final = 20.0
 DEFAULT_RPM: Final = 20.0
@@ -107,6 +108,7 @@ def read_recording(path: Path) -> RecordedHand:
     times_s: list[float] = []
     positions_mm: list[float] = []
     try:
+        require_regular(path, MOST_TABLE_BYTES)
         with path.open(newline="", encoding="utf-8") as file:
             rows = csv.DictReader(file)
             if not {"t_s", "position_mm"} <= set(rows.fieldnames or ()):

@@ -1,14 +1,15 @@
 """What a simulated device is made of: the plant file, typed, bounded and refused when it makes no sense."""
 
-import math
 import re
-import tomllib
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
+
+from tormagd.bounded_file import read_bounded
+from tormagd.toml_file import MOST_BYTES, TomlError, in_short, toml_tables
 
 
 class PlantError(ValueError):
@@ -188,20 +189,19 @@ def load_plant(path_or_name: str | Path) -> PlantParameters:
         text = resources.files(__package__).joinpath("plants", f"{name}.toml").read_text(encoding="utf-8")
     else:
         try:
-            text = Path(path_or_name).read_text(encoding="utf-8")
+            text = read_bounded(Path(path_or_name), MOST_BYTES).decode("utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            known = ", ".join(plant_names())
-            raise PlantError(f"plant {name!r}: neither a readable file ({error}) nor one of {known}") from error
+            known, reason = ", ".join(plant_names()), getattr(error, "strerror", None) or error
+            raise PlantError(f"plant {name!r}: neither a readable file ({reason}) nor one of {known}") from error
     return parse_plant(text, name)
 
 
 def parse_plant(text: str, name: str = "plant") -> PlantParameters:
     """Turn the TOML text of a plant into parameters; `name` is what errors call it. Raises PlantError."""
     try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise PlantError(f"{name}: not TOML: {error}") from error
-    _require_finite(raw, "", name)
+        raw = toml_tables(text)
+    except TomlError as error:
+        raise PlantError(f"{name}: {error}") from error
     try:
         parameters = msgspec.convert(raw, PlantParameters)
     except msgspec.ValidationError as error:
@@ -212,21 +212,10 @@ def parse_plant(text: str, name: str = "plant") -> PlantParameters:
     return parameters
 
 
-def _require_finite(value: Any, path: str, name: str) -> None:
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            _require_finite(inner, f"{path}.{key}" if path else key, name)
-    elif isinstance(value, list):
-        for index, inner in enumerate(value):
-            _require_finite(inner, f"{path}[{index}]", name)
-    elif isinstance(value, float) and not math.isfinite(value):
-        raise PlantError(f"{name}: {path} = {value}: allowed are finite numbers")
-
-
 def _value_at(raw: Any, path: str) -> str:
     for key, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
         raw = raw[int(index)] if index else raw.get(key)
-    return "" if isinstance(raw, dict) else f" = {raw!r}"
+    return "" if isinstance(raw, dict) else f" = {in_short(raw)}"
 
 
 def _require_consistent(plant: PlantParameters, name: str) -> None:

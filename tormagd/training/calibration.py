@@ -21,6 +21,7 @@ import msgspec
 import numpy as np
 from tqdm import tqdm
 
+from tormagd.bounded_file import MOST_TABLE_BYTES, require_regular
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, displacement
 from tormagd.model.features import FEATURES, FIELD, Element
 from tormagd.model.model_file import ForceModel, save_model
@@ -248,6 +249,7 @@ def calibrate(
 def read_sweep(path: Path) -> Array:
     """The table of a sweep file. Raises DatasetError naming the file and what is wrong."""
     try:
+        require_regular(path, MOST_TABLE_BYTES)
         with path.open(encoding="utf-8") as file:
             header = file.readline().strip()
             if header != ",".join(COLUMNS):

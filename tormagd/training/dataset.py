@@ -11,6 +11,7 @@ from typing import TextIO, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from tormagd.bounded_file import MOST_TABLE_BYTES, require_regular
 from tormagd.model.features import FEATURES
 
 Array: TypeAlias = NDArray[np.float64]
@@ -139,6 +140,7 @@ def read_csv(path: Path | str) -> Dataset:
     """
     source = Path(path)
     try:
+        require_regular(source, MOST_TABLE_BYTES)
         with source.open(newline="", encoding="utf-8") as file:
             return _read_rows(source, file)
     except OSError as error:
