@@ -31,6 +31,7 @@ from tormagd.closed_loop import ClosedLoop
 from tormagd.config import load_config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
+from tormagd.output import printable
 from tormagd.simulation.device import DEFAULT_BAUD, VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
@@ -207,7 +208,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             else:
                 _tap_until_stopped(options.port, options.baud, log)
     except (OSError, ValueError) as error:
-        print(error, file=sys.stderr)
+        print(printable(str(error)), file=sys.stderr)
         return 1
     print(f"{options.file}: {log.frames} frames, {log.damaged} damaged stretches", file=sys.stderr)
     return 0

@@ -1,7 +1,24 @@
-"""Lines on a standard stream that may be closed or full, or whose reader may have gone."""
+"""Lines on a standard stream that may be closed or full, or whose reader may have gone.
 
+A terminal obeys what is printed to it. Words of a file, a device or somebody else's process are made `printable` where
+they come in; whatever else is not printable is escaped where it goes out, all but line ends and our own colours.
+"""
+
+import json
+import logging
 import os
+import re
 from typing import TextIO
+
+_OURS = re.compile("(\n|\t|\x1b\\[(?:0|1|31|32|33)m)")
+"What a line may hold besides printable characters: its end, a tabulator, and the colours of `ctl.outcome.Colour`."
+
+
+def printable(text: str) -> str:
+    """`text` on one line, with each character that is not printable as JSON escapes it: `\\n`, `\\u001b`."""
+    if text.isprintable():
+        return text
+    return "".join(each if each.isprintable() else json.dumps(each)[1:-1] for each in text)
 
 
 def write_line(text: str, stream: TextIO | None) -> OSError | None:
@@ -13,7 +30,7 @@ def write_line(text: str, stream: TextIO | None) -> OSError | None:
     if stream is None:
         return None
     try:
-        print(text, file=stream, flush=True)
+        print(_escaped(text), file=stream, flush=True)
     except OSError as error:
         # or the interpreter would try again at its end, complain, and change the exit code
         nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -21,3 +38,21 @@ def write_line(text: str, stream: TextIO | None) -> OSError | None:
         os.close(nowhere)
         return error
     return None
+
+
+class LogFormatter(logging.Formatter):
+    """One line for each record, whatever stands in it; a traceback keeps its lines."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """The record's line."""
+        return printable(super().formatMessage(record))
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line and the traceback."""
+        return _escaped(super().format(record))
+
+
+def _escaped(text: str) -> str:
+    parts = _OURS.split(text)
+    parts[::2] = [printable(part) for part in parts[::2]]
+    return "".join(parts)

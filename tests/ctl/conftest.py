@@ -4,6 +4,7 @@ import math
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -138,7 +139,7 @@ DESCRIPTION: dict[str, Any] = {
     "version": "0",
     "build": "compiled",
     "configuration": {"rates": {"control_hz": 1_000}},
-    "scene": {"name": "pulse"},
+    "scene": {"name": "pulse", "force": {"least_N": 0.0, "most_N": 5.0}},
     "model": 16 * "0123",
     "profile": {"is_used": False, "age_s": None, "refusal": ""},
     "firmware": "1.0",
@@ -154,9 +155,11 @@ class FakeDaemon(threading.Thread):
         self.directory = directory
         self.control = f"ipc://{directory}/control"
         self.answers: dict[str, Callable[[], dict[str, Any]]] = {
-            "status": lambda: {"ok": True, "result": status()},
+            "status": lambda: {"ok": True, "result": status(setpoints=self.taken())},
             "describe": lambda: {"ok": True, "result": DESCRIPTION},
         }
+        self.taken_by_source = True
+        "Whether its status has the setpoints that it was sent."
         self.is_silent = False
         "Publishes nothing, as one that has been killed."
         self.commands: list[str] = []
@@ -168,7 +171,13 @@ class FakeDaemon(threading.Thread):
 
     def says(self, **changes: Any) -> None:
         """Its status is this from now on."""
-        self.answers["status"] = lambda: {"ok": True, "result": status(**changes)}
+        self.answers["status"] = lambda: {"ok": True, "result": status(**{"setpoints": self.taken()} | changes)}
+
+    def taken(self) -> dict[str, Any]:
+        """Of its status, what became of the setpoints."""
+        counts = Counter(setpoint.source for setpoint in self.setpoints)
+        by_source = {name: SOURCE | {"accepted": count} for name, count in counts.items()}
+        return status()["setpoints"] | {"by_source": by_source if self.taken_by_source else {}}
 
     def refuse(self, command: str, code: str) -> None:
         error = {"code": code, "message": f"cannot {command}", "hint": "do this first"}
@@ -194,6 +203,8 @@ class FakeDaemon(threading.Thread):
                 request = msgpack.unpackb(data)
                 self.commands.append(request["command"])
                 self.requests.append(request)
+                while setpoints.poll(0):
+                    self.setpoints.append(decode(setpoints.recv(), Setpoint))
                 answer = self.answers.get(request["command"], lambda: {"ok": True, "result": {}})()
                 router.send_multipart([*envelope, msgpack.packb({"v": VERSION, "id": request["id"], **answer})])
             while setpoints.poll(0):

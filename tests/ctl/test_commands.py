@@ -10,6 +10,7 @@ import pytest
 
 from firmware_protocol.build import COST, REMEDY
 from tormagd.ctl.main import main
+from tormagd.ctl.operate import DONE_STATES
 from tormagd.ctl.outcome import Colour
 from tormagd.ctl.status import status_text
 from tormagd.messages import Status
@@ -88,10 +89,41 @@ def test_status_in_fault_exits_4_and_names_cause_and_remedy(fake_daemon, capsys)
 
 @pytest.mark.parametrize("command", ["enable", "disable", "pause", "resume", "stop", "clear-fault"])
 def test_a_command_reaches_the_daemon_under_its_name(fake_daemon, capsys, command):
-    fake_daemon.answers[command] = lambda: {"ok": True, "result": {"operating_state": "PAUSED"}}
+    done = {"operating_state": DONE_STATES[command][0]}
+    fake_daemon.answers[command] = lambda: {"ok": True, "result": done}
     code, printed = run_json(capsys, "--endpoint", fake_daemon.control, command)
-    assert (code, printed["command"], printed["result"]) == (0, command, {"operating_state": "PAUSED"})
-    assert fake_daemon.commands == [command]
+    assert (code, printed["command"], printed["result"]) == (0, command, done)
+    assert fake_daemon.commands[0] == command
+    assert set(fake_daemon.commands[1:]) == ({"status"} if command == "clear-fault" else set())
+
+
+@pytest.mark.parametrize("command", ["enable", "disable", "pause", "resume", "stop", "clear-fault"])
+@pytest.mark.parametrize("result", [{}, {"operating_state": None}, {"operating_state": "ASLEEP"}])
+def test_an_answer_that_does_not_say_it_was_done_is_no_success(fake_daemon, capsys, command, result):
+    fake_daemon.answers[command] = lambda: {"ok": True, "result": result}
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, command)
+    assert (code, printed["error"]["code"]) == (1, "not_done")
+
+
+def test_a_fault_that_comes_back_was_not_cleared(fake_daemon, capsys):
+    fake_daemon.answers["clear-fault"] = lambda: {"ok": True, "result": {"operating_state": "DISABLED"}}
+    details = [{"code": "DEVICE_SUPPLY", "cause": "the supply voltage is out of range", "remedy": "check it"}]
+    fake_daemon.says(operating_state="FAULT", faults=["DEVICE_SUPPLY"], fault_details=details)
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "clear-fault")
+    assert (code, printed["error"]["code"]) == (4, "fault")
+    assert "came back: DEVICE_SUPPLY: the supply voltage" in printed["error"]["message"]
+
+
+def test_clearing_what_is_not_latched_says_so(fake_daemon, capsys):
+    fake_daemon.answers["clear-fault"] = lambda: {"ok": True, "result": {"operating_state": "PAUSED"}}
+    assert main(["--endpoint", fake_daemon.control, "clear-fault"]) == 0
+    assert "no fault is latched; it is PAUSED" in capsys.readouterr().out
+
+
+def test_take_that_gave_the_brake_to_somebody_else_is_no_success(fake_daemon, capsys):
+    fake_daemon.answers["take"] = lambda: {"ok": True, "result": {"source": "c", "instead_of": "a"}}
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "take", "b")
+    assert (code, printed["error"]["code"]) == (1, "not_done")
 
 
 @pytest.mark.parametrize(
@@ -104,11 +136,13 @@ def test_take_names_the_source_and_the_one_before(fake_daemon, capsys, before, s
     assert fake_daemon.requests[-1]["args"] == {"source": "b"}
 
 
-@pytest.mark.parametrize(("is_connected", "said"), [(True, "the gap opens"), (False, "nothing could be sent")])
-def test_stop_says_whether_a_device_was_there_to_be_told(fake_daemon, capsys, is_connected, said):
+@pytest.mark.parametrize(
+    ("is_connected", "code", "said"), [(True, 0, "the gap opens"), (False, 1, "nothing could be sent")]
+)
+def test_stop_says_whether_a_device_was_there_to_be_told(fake_daemon, capsys, is_connected, code, said):
     answer = {"ok": True, "result": {"operating_state": "FAULT", "is_connected": is_connected}}
     fake_daemon.answers["stop"] = lambda: answer
-    assert main(["--endpoint", fake_daemon.control, "stop"]) == 0
+    assert main(["--endpoint", fake_daemon.control, "stop"]) == code
     assert said in capsys.readouterr().out
 
 
@@ -139,8 +173,23 @@ def test_without_a_daemon_every_command_ends_with_3(run_dir, capsys, arguments, 
     assert list(run_dir.iterdir()) == []
 
 
-def test_an_answer_that_is_no_reply_is_not_believed(fake_daemon, capsys):
-    fake_daemon.answers["pause"] = lambda: {"ok": "perhaps"}
+@pytest.mark.parametrize(
+    "answer",
+    [
+        {"ok": "perhaps"},
+        {"ok": False},
+        {"ok": True},
+        {"ok": True, "result": None},
+        {"ok": True, "result": [1]},
+        {"ok": True, "result": {"operating_state": "PAUSED"}, "error": {"code": "a", "message": "b", "hint": "c"}},
+        {"ok": True, "result": {"operating_state": "PAUSED"}, "id": None},
+        {"ok": True, "result": {"operating_state": "PAUSED"}, "v": 2},
+        {"ok": False, "error": {"code": "a"}},
+        {"ok": True, "result": {"operating_state": "PAUSED" * 1_000}},
+    ],
+)
+def test_an_answer_that_is_no_reply_is_not_believed(fake_daemon, capsys, answer):
+    fake_daemon.answers["pause"] = lambda: answer
     code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "pause")
     assert (code, printed["error"]["code"]) == (3, "unintelligible")
 

@@ -88,7 +88,7 @@ def up_and_down(forces: Range, rate_N_s: float) -> Waveform:
     def at(t_s: float) -> Sample:
         return Sample(forces.least_N + span_N * (1.0 - min(1.0, abs(t_s / half_s - 1.0))))
 
-    return Waveform(2.0 * half_s, at)
+    return Waveform(2.0 * half_s, at, forces.least_N, forces.most_N)
 
 
 def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:

@@ -70,7 +70,7 @@ def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
         share = min(max((t_s - before_s) / (after_s - before_s), 0.0), 1.0)
         return Sample(before_N + share * (after_N - before_N))
 
-    return Waveform(times[-1], at)
+    return Waveform(times[-1], at, low, high)
 
 
 def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side: Side, wait_s: float) -> Outcome:

@@ -15,6 +15,7 @@ from tormagd.config import ConfigError, Curve
 from tormagd.ctl.outcome import CommandError, Exit, usage_error
 from tormagd.keys import PUBLIC, SECRET, KeyPair, load_pair, load_public
 from tormagd.messages import VERSION, Description, MessageError, Reply, Request, Status, decode, encode
+from tormagd.output import printable
 
 T = TypeVar("T", Status, Description)
 
@@ -43,12 +44,22 @@ class Client:
 
     def request(self, command: str, **args: Any) -> dict[str, Any]:
         """The result of `command`. Raises CommandError: UNREACHABLE without an answer in time, REFUSED or FAULT."""
+        result = self.answer(self.ask(command, **args), self._wait_s)
+        if result is None:
+            raise unreachable(self._address, f"no answer within {self._wait_s:g} s")
+        return result
+
+    def ask(self, command: str, **args: Any) -> int:
+        """Give `command` and do not wait; the number that `answer` knows it by."""
         request_id = next(self._ids)
         self._socket.send(encode(Request(v=VERSION, id=request_id, command=command, args=args)))
-        deadline_s = time.monotonic() + self._wait_s
-        while (left_s := deadline_s - time.monotonic()) > 0.0:
-            if not self._socket.poll(max(1, round(left_s * 1e3))):
-                break
+        return request_id
+
+    def answer(self, request_id: int, wait_s: float = 0.0) -> dict[str, Any] | None:
+        """The result of what was asked; None where it does not come within `wait_s`. Raises CommandError: REFUSED or
+        FAULT."""
+        deadline_s = time.monotonic() + wait_s
+        while self._socket.poll(max(0, round((deadline_s - time.monotonic()) * 1e3))):
             reply = _reply(self._socket.recv_multipart()[-1])
             if reply.id not in (request_id, None):
                 continue  # the late answer to a request that was given up
@@ -56,7 +67,7 @@ class Client:
                 code = Exit.FAULT if reply.error.code in FAULT_CODES else Exit.REFUSED
                 raise CommandError(code, reply.error.code, reply.error.message, reply.error.hint)
             return reply.result or {}
-        raise unreachable(self._address, f"no answer within {self._wait_s:g} s")
+        return None
 
     def status(self) -> Status:
         """What the daemon is doing. Raises CommandError as `request` and `understood` do."""
@@ -143,15 +154,16 @@ def unreachable(address: str, what: str) -> CommandError:
 def understood(result: dict[str, Any]) -> Status:
     """The answer to `status`; what a newer daemon says besides is passed over.
 
-    Raises CommandError, naming the daemon's version, where something is missing or of another type.
+    Its texts are made printable: they are a person's to read. Raises CommandError, naming the daemon's version, where
+    something is missing or of another type.
     """
     return _known(result, Status)
 
 
 def _known(result: dict[str, Any], kind: type[T]) -> T:
     try:
-        return msgspec.convert(result, kind)
-    except msgspec.ValidationError as error:
+        return msgspec.convert(_printable(result), kind)
+    except (msgspec.ValidationError, RecursionError) as error:
         raise CommandError(
             Exit.UNREACHABLE,
             "unintelligible",
@@ -161,9 +173,22 @@ def _known(result: dict[str, Any], kind: type[T]) -> T:
         ) from error
 
 
+def _printable(value: Any) -> Any:
+    if isinstance(value, str):
+        return printable(value)
+    if isinstance(value, dict):
+        return {_printable(key): _printable(inner) for key, inner in value.items()}
+    return [_printable(inner) for inner in value] if isinstance(value, list) else value
+
+
 def _reply(data: bytes) -> Reply:
     try:
-        return decode(data, Reply)
+        reply = decode(data, Reply)
+        if reply.v != VERSION:
+            raise MessageError(f"v = {reply.v}: allowed is {VERSION}")
+        if (reply.error is None) != reply.ok or (reply.ok and (reply.result is None or reply.id is None)):
+            raise MessageError("it says neither what was done nor why it was not")
+        return reply
     except MessageError as error:
         raise CommandError(
             Exit.UNREACHABLE,

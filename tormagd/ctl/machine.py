@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from tormagd.output import printable
+
 
 class Taken(NamedTuple):
     """The kernel's counters of what others took; the difference of two says it of the time between them.
@@ -104,7 +106,7 @@ class Machine:
 
     def process_name(self, process_id: int) -> str:
         """What a process calls itself; `?` where there is none."""
-        return self.text(f"/proc/{process_id}/comm") or "?"
+        return printable(self.text(f"/proc/{process_id}/comm") or "?")
 
     def lock_owners(self, absolute: str) -> list[int]:
         """The processes that hold a lock on a file, other users' too: the kernel lists locks for everybody."""

@@ -122,7 +122,6 @@ def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
 
 
 def _send(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
-    from tormagd.ctl.client import keys_of
     from tormagd.ctl.send import Stream, send
     from tormagd.ctl.waveform import WaveformError, read_csv, shape
     from tormagd.messages import MAX_PREVIEW_SAMPLES
@@ -150,7 +149,7 @@ def _send(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
             "look less far ahead",
         )
     stream = Stream(options.rate, options.source, options.valid_for_ms, preview)
-    return send(endpoints.setpoint, waveform, duration_s, stream, options.wait, keys_of(endpoints.curve))
+    return send(endpoints, waveform, duration_s, stream, options.wait, is_blind=options.blind)
 
 
 def _doctor(options: argparse.Namespace, config: Config) -> Outcome:
@@ -262,7 +261,9 @@ def _parser() -> argparse.ArgumentParser:
     home.add_argument("--timeout", type=_above_zero, default=30.0, metavar="S", help="wait this long (30)")
     home.add_argument("--no-wait", action="store_true", help="do not wait until it is done")
 
-    send = command("send", "publish setpoints: a synthetic shape or a CSV file t_s,force_N")
+    send = command(
+        "send", "publish setpoints (a synthetic shape, or a CSV file t_s,force_N); done if they were rendered"
+    )
     send.add_argument("what", metavar="{step|sine|ramp|pulse|FILE.csv}")
     send.add_argument("--rate", type=_rate, default=500.0, metavar="HZ", help="setpoints per second (500)")
     send.add_argument("--duration", type=_above_zero, metavar="S", help="seconds (10, or the file's length)")
@@ -277,6 +278,11 @@ def _parser() -> argparse.ArgumentParser:
         default=0.0,
         metavar="MS",
         help="each setpoint carries what follows it so long (0)",
+    )
+    send.add_argument(
+        "--blind",
+        action="store_true",
+        help="do not ask the daemon what becomes of them, with a key that may only publish",
     )
 
     record = command("record", "write telemetry and control ticks to an MCAP file until Ctrl-C")

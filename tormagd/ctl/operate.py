@@ -19,22 +19,66 @@ DONE_TEXT = {
     "stop": "stopped and latched; the gap opens. tormagctl clear-fault when it is safe to go on",
     "clear-fault": "fault cleared. tormagctl home, then enable",
 }
+DONE_STATES = {
+    "enable": ("ENABLED",),
+    "disable": ("DISABLED",),
+    "pause": ("PAUSED",),
+    "resume": ("ENABLED",),
+    "stop": ("FAULT",),
+    # while nothing is latched there is nothing to clear
+    "clear-fault": ("DISABLED", "ENABLED", "PAUSED"),
+}
+"The operating states after a command that was carried out."
 STOPPED_WITHOUT_DEVICE = (
-    "stopped and latched, but no device is connected: nothing could be sent. It is told to open the gap when it is "
-    "back; tormagctl status shows the link"
+    "latched, but no device is connected: nothing could be sent, and the gap does not open. The device is told to open it "
+    "when it is back; tormagctl status shows the link"
 )
+COMES_BACK_S = 0.6
+"So long the daemon waits for the device to say that a fault is gone (CLEARING_S), and then calls it a fault again."
 
 
 def operate(client: Client, command: str) -> Outcome:
-    """Give one command that the daemon carries out or refuses at once. Without a device it takes `stop` only."""
+    """Give one command that the daemon carries out or refuses at once. Without a device it takes `stop` only.
+
+    The outcome of that is REFUSED: the gap was to open. Raises CommandError also where the answer does not say that it
+    was done, and FAULT where what was cleared comes back.
+    """
     result = client.request(command)
-    is_without_device = command == "stop" and result.get("is_connected") is False
-    return Outcome(result, STOPPED_WITHOUT_DEVICE if is_without_device else DONE_TEXT[command])
+    state = result.get("operating_state")
+    if state not in DONE_STATES[command]:
+        raise CommandError(
+            Exit.REFUSED,
+            "not_done",
+            f"the daemon answers {command} with operating_state = {state!r}: it was not done",
+            "tormagctl status",
+        )
+    if command == "stop" and result.get("is_connected") is False:
+        return Outcome(result, STOPPED_WITHOUT_DEVICE, Exit.REFUSED)
+    if command == "clear-fault":
+        if state != "DISABLED":
+            return Outcome(result, f"no fault is latched; it is {state}")
+        _watch_clearing(client)
+    return Outcome(result, DONE_TEXT[command])
+
+
+def _watch_clearing(client: Client) -> None:
+    """Raises CommandError (FAULT) where the device has not let go of its fault."""
+    until_s = time.monotonic() + COMES_BACK_S
+    while time.monotonic() < until_s:
+        _raise_fault(client.status(), "the fault came back")
+        time.sleep(POLL_S)
 
 
 def take(client: Client, source: str) -> Outcome:
     """Give the brake to `source`, whoever holds it."""
     result = client.request("take", source=source)
+    if result.get("source") != source:
+        raise CommandError(
+            Exit.REFUSED,
+            "not_done",
+            f"the daemon answers that {result.get('source')!r} holds the brake, not {source!r}",
+            "tormagctl status",
+        )
     before = result.get("instead_of")
     instead = (
         f" instead of {before!r}; the force goes to its setpoints along a ramp" if before != source else " already"
@@ -58,7 +102,7 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     try:
         while (elapsed_s := time.monotonic() - started_s) < timeout_s:
             state = client.status()
-            _raise_fault(state)
+            _raise_fault(state, "fault while homing")
             # a homing that was over between two looks still shows, as a device that is homed and was not
             has_begun = has_begun or state.is_busy or (state.is_homed and not was_homed)
             if has_begun and not state.is_busy:
@@ -88,14 +132,14 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     )
 
 
-def _raise_fault(state: Status) -> None:
+def _raise_fault(state: Status, what: str) -> None:
     if state.operating_state != "FAULT":
         return
     first = state.fault_details[0] if state.fault_details else Explained("FAULT", "see tormagctl status", "")
     raise CommandError(
         Exit.FAULT,
         "fault",
-        f"fault while homing: {', '.join(state.faults) or first.code}: {first.cause}",
+        f"{what}: {', '.join(state.faults) or first.code}: {first.cause}",
         first.remedy or "tormagctl clear-fault, then home",
     )
 

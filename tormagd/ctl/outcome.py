@@ -7,7 +7,7 @@ from typing import Any, TextIO
 
 import msgspec
 
-from tormagd.output import write_line
+from tormagd.output import printable, write_line
 
 
 class Exit(IntEnum):
@@ -52,7 +52,8 @@ def print_outcome(command: str, outcome: Outcome, as_json: bool) -> None:
 def print_error(command: str, error: CommandError, as_json: bool) -> None:
     """The error and its remedy on stderr, and with `--json` the object on stdout as well."""
     colour = Colour(sys.stderr)
-    write_line(f"tormagctl {command}: {colour.red(error.message)}\n  next: {error.hint}", sys.stderr)
+    said, hint = colour.red(printable(error.message)), printable(error.hint)
+    write_line(f"tormagctl {command}: {said}\n  next: {hint}", sys.stderr)
     if as_json:
         _print_json(command, False, None, {"code": error.code, "message": error.message, "hint": error.hint})
 

@@ -16,6 +16,7 @@ import msgspec
 from tormagd.config import Config
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import Colour, Outcome
+from tormagd.output import printable
 
 DETECTION_S = 2.0
 "python-can asks every interface at once; what has not answered by then is left out."
@@ -92,9 +93,9 @@ def _serial_port(
     has_usb_id = info is not None and info.vid is not None
     return SerialPort(
         port=path,
-        description="pseudo-terminal" if info is None else str(info.description),
+        description="pseudo-terminal" if info is None else printable(str(info.description)),
         usb_id=f"{info.vid:04x}:{info.pid:04x}" if has_usb_id else None,
-        serial_number=None if info is None else info.serial_number,
+        serial_number=None if info is None or info.serial_number is None else printable(str(info.serial_number)),
         is_configured=is_configured,
         is_accessible=os.access(machine.path(path), os.R_OK | os.W_OK),
         latency_ms=machine.number(f"/sys/bus/usb-serial/devices/{Path(path).name}/latency_timer"),

@@ -15,7 +15,7 @@ from tormagd.ctl.client import Client, Keys, connect, keys_of, unreachable
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.messages import MessageError, Telemetry, decode
-from tormagd.output import write_line
+from tormagd.output import printable, write_line
 from tormagd.recording.ticks import MAX_BATCH_BYTES, decode_ticks
 from tormagd.recording.writer import RecordingWriter
 
@@ -123,7 +123,7 @@ def _record(
                 except MessageError as error:
                     unreadable += 1
                     if unreadable == 1:
-                        write_line(f"tormagctl record: left out a message: {error}", sys.stderr)
+                        write_line(f"tormagctl record: left out a message: {printable(str(error))}", sys.stderr)
     end_s = time.monotonic()
     silent_s = end_s - heard_s
     is_silent = writer.note_silence(round(silent_s * 1e9))

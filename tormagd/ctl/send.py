@@ -1,15 +1,19 @@
 """`tormagctl send`: publish setpoints at a steady rate."""
 
+import contextlib
 import signal
 import time
 from collections.abc import Callable
 from typing import NamedTuple
 
+import msgspec
 import zmq
 
-from tormagd.ctl.client import Keys, connect, unreachable
+from tormagd.config import Endpoints
+from tormagd.ctl.client import Client, connect, keys_of, unreachable
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
+from tormagd.ctl.watch import Watch, require_range
 from tormagd.ctl.waveform import Waveform
 from tormagd.messages import VERSION, Setpoint, encode
 
@@ -24,27 +28,33 @@ class Stream(NamedTuple):
 
 
 def send(
-    address: str, waveform: Waveform, duration_s: float, stream: Stream, wait_s: float, keys: Keys | None = None
+    endpoints: Endpoints, waveform: Waveform, duration_s: float, stream: Stream, wait_s: float, *, is_blind: bool
 ) -> Outcome:
-    """Publish `waveform` for `duration_s` or until interrupted.
+    """Publish `waveform` for `duration_s` or until interrupted, and see what becomes of it, unless `is_blind`.
 
     Each setpoint has its own deadline, counted from the start, so that lateness does not add up. A setpoint whose
-    successor is due already is left out: the newest one wins anyway. Raises CommandError (UNREACHABLE) where no daemon
-    subscribes within `wait_s`, or where it leaves on the way.
+    successor is due already is left out: the newest one wins anyway. Raises CommandError: UNREACHABLE where no daemon
+    answers or subscribes within `wait_s`, or where it leaves on the way; FAULT as soon as the device is in FAULT;
+    REFUSED where the scene does not allow such forces (nothing is sent), or the setpoints were not rendered.
     """
+    address, keys = endpoints.setpoint, keys_of(endpoints.curve)
     context = zmq.Context()
     # XPUB speaks to SUB as PUB does, and it is told of the subscription: without that the first setpoints would be lost
     socket = context.socket(zmq.XPUB)
     socket.setsockopt(zmq.LINGER, 200)
-    try:
+    with contextlib.ExitStack() as stack:
+        stack.callback(context.destroy)
+        watch = None
+        if not is_blind:
+            client = stack.enter_context(Client(endpoints.control, wait_s, keys))
+            require_range(client.describe(), waveform.least_N, waveform.most_N)
+            watch = Watch(client, stream.source)
         connect(socket, address, keys)
         if not socket.poll(round(wait_s * 1e3)):
             raise unreachable(address, f"nobody takes setpoints there within {wait_s:g} s")
         socket.recv()
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
-            return _publish(socket, address, waveform, duration_s, stream, is_interrupted)
-    finally:
-        context.destroy()
+            return _publish(socket, address, waveform, duration_s, stream, is_interrupted, watch)
 
 
 def _publish(
@@ -54,6 +64,7 @@ def _publish(
     duration_s: float,
     stream: Stream,
     is_interrupted: Callable[[], bool],
+    watch: Watch | None,
 ) -> Outcome:
     rate_hz = stream.rate_hz
     sent = skipped = index = 0
@@ -96,6 +107,8 @@ def _publish(
         socket.send(encode(setpoint))
         sent += 1
         index += 1
+        if watch is not None:
+            watch.look()
     seconds = time.monotonic() - start_s
     result = {
         "source": stream.source,
@@ -106,5 +119,12 @@ def _publish(
         "worst_late_ms": round(worst_late_s * 1e3, 3),
         "interrupted": bool(is_interrupted()),
     }
+    fate = "whether they were taken is not known"
+    if watch is not None:
+        became = watch.finish(sent)
+        result |= msgspec.structs.asdict(became)
+        fate = f"{became.accepted} taken and rendered"
+        if became.limits:
+            fate += f", held by {', '.join(became.limits)} at times"
     left_out = f", {skipped} left out because this machine was late" if skipped else ""
-    return Outcome(result, f"sent {sent} setpoints as {stream.source!r} in {seconds:.1f} s{left_out}")
+    return Outcome(result, f"sent {sent} setpoints as {stream.source!r} in {seconds:.1f} s{left_out}; {fate}")

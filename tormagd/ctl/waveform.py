@@ -38,10 +38,13 @@ class Sample(NamedTuple):
 
 
 class Waveform(NamedTuple):
-    """`at(t_s)` for t_s in 0..duration_s. A shape that can go on for ever has duration_s = inf."""
+    """`at(t_s)` for t_s in 0..duration_s, of forces from `least_N` to `most_N`. A shape that can go on for ever has
+    duration_s = inf."""
 
     duration_s: float
     at: Callable[[float], Sample]
+    least_N: float
+    most_N: float
 
 
 SHAPES = ("step", "sine", "ramp", "pulse")
@@ -73,7 +76,7 @@ def shape(name: str, from_N: float, to_N: float, frequency_hz: float, duration_s
                 share = beat(t_s * frequency_hz % 1.0)
         return Sample(from_N + (to_N - from_N) * share)
 
-    return Waveform(duration_s, at)
+    return Waveform(duration_s, at, min(from_N, to_N), max(from_N, to_N))
 
 
 def beat(phase: float) -> float:
@@ -102,7 +105,7 @@ def read_csv(path: Path) -> Waveform:
         assert values[0] is not None  # force_N is a required column
         return Sample(values[0], values[1], values[2])
 
-    return Waveform(times_s[-1], at)
+    return Waveform(times_s[-1], at, min(table["force_N"]), max(table["force_N"]))
 
 
 def _read_table(path: Path) -> dict[str, "array[float]"]:

@@ -12,7 +12,7 @@ import msgspec
 from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import ENDPOINTS, Config, ConfigError, Endpoints, load_config
-from tormagd.output import write_line
+from tormagd.output import LogFormatter, printable, write_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--check", action="store_true", help="print the resolved configuration and exit")
     parser.add_argument("--version", action="version", version=f"tormagd {__version__}, {settle()}")
     options = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    _log_to_stderr()
     # nothing moves until the daemon runs and takes the signal over: before that, Ctrl-C may simply end the process
     interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
@@ -53,7 +53,7 @@ def _start(options: argparse.Namespace) -> int:
         core = build_core(config)
         backend = choose(config.device, config.rates)
     except ConfigError as error:
-        print(f"tormagd: {error}", file=sys.stderr)
+        write_line(f"tormagd: {printable(str(error))}", sys.stderr)
         return REFUSED
     if options.check:
         _print_resolved(config, core, backend.options)
@@ -61,9 +61,15 @@ def _start(options: argparse.Namespace) -> int:
     try:
         uvloop.run(_run(config, core, backend.open, keys))
     except OSError as error:
-        print(f"tormagd: {error}", file=sys.stderr)
+        write_line(f"tormagd: {printable(str(error))}", sys.stderr)
         return 1
     return 0
+
+
+def _log_to_stderr() -> None:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(LogFormatter("%(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 
 def _keys(endpoints: Endpoints) -> "KeyRing | None":

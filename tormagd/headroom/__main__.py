@@ -19,7 +19,7 @@ from tormagd.control.core import build_core
 from tormagd.headroom.bare_timer import Lateness, lateness
 from tormagd.headroom.core_cost import Call, CoreCost, calls, core_cost
 from tormagd.headroom.machine_loop import machine_us
-from tormagd.output import write_line
+from tormagd.output import printable, write_line
 
 TIMER_S = 2.0
 CORE_S = 0.7
@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         result = measured(load_config(options.config), TIMER_S, CORE_S)
     except ConfigError as error:
-        print(error, file=sys.stderr)
+        write_line(printable(str(error)), sys.stderr)
         return 2
     return 0 if write_line(json.dumps(result), sys.stdout) is None else 1
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from firmware_protocol.c.build import BuildError
-from tormagd.output import write_line
+from tormagd.output import printable, write_line
 from tormagd.physics.errors import DomainError
 from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevice
 from tormagd.simulation.can_door import CanDoor
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             device, door = _opened(options, resources)
             truth = options.truth and resources.enter_context(options.truth.open("w", encoding="utf-8"))
         except (PlantError, HandError, FaultError, DomainError, BuildError, OSError) as error:
-            parser.error(str(error))
+            parser.error(printable(str(error)))
         if write_line(door.address, sys.stdout) is not None:
             print(f"{parser.prog}: {door.address} could not be written to stdout; it ends", file=sys.stderr)
             return 1

@@ -1,0 +1,185 @@
+"""What becomes of the setpoints that are sent: whether the daemon takes them, and the device renders them."""
+
+import sys
+import time
+
+import msgspec
+
+from tormagd.ctl.client import Client, understood
+from tormagd.ctl.outcome import CommandError, Exit
+from tormagd.messages import Description, Explained, Status
+from tormagd.output import write_line
+
+LOOK_S = 0.1
+"Between two looks at the daemon's status. It is a new one every 20 ms, and reading it takes a quarter of one."
+LEAST_TAKEN = 0.9
+"Share of the setpoints that has to be taken; the first ones of a clock that is not known yet may not be."
+SPOILING = ("RANGE", "F_MAX")
+"Limits that say: another force than the one asked for. Below F_min a device gives F_min, which is what 0 N means."
+
+
+class _Force(msgspec.Struct):
+    least_N: float
+    most_N: float
+
+
+class _Scene(msgspec.Struct):
+    name: str
+    force: _Force
+
+
+class Fate(msgspec.Struct, frozen=True):
+    """How many setpoints were taken, in which share of the looks they were rendered (None: there was none in so short a
+    time), and what held the force at times."""
+
+    accepted: int
+    rendered_share: float | None
+    limits: tuple[str, ...]
+
+
+def require_range(known: Description, least_N: float, most_N: float) -> None:
+    """Raises CommandError (REFUSED) where the daemon's scene does not allow forces of that range."""
+    try:
+        scene = msgspec.convert(known.scene, _Scene)
+    except msgspec.ValidationError as error:
+        raise CommandError(
+            Exit.UNREACHABLE,
+            "unintelligible",
+            f"the scene of tormagd {known.version} is not understood: {error}",
+            "install tormagd and tormagctl of the same version, and start the daemon again",
+        ) from error
+    if not scene.force.least_N <= least_N <= most_N <= scene.force.most_N:
+        raise CommandError(
+            Exit.REFUSED,
+            "out_of_range",
+            f"{least_N:g}..{most_N:g} N is asked: allowed is {scene.force.least_N:g}..{scene.force.most_N:g} N "
+            f"in scene {scene.name}; nothing was sent",
+            "ask within the range, or let the daemon run another scene",
+        )
+
+
+def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandError | None:
+    """Why the setpoints of `source` are not rendered, as the error that it is; None while they are.
+
+    With `is_over` they have been: whether the newest one is still valid does not matter any more.
+    """
+    if status.operating_state == "FAULT":
+        first = status.fault_details[0] if status.fault_details else Explained("FAULT", "see tormagctl status", "")
+        return CommandError(
+            Exit.FAULT,
+            "fault",
+            f"the device is in FAULT: {', '.join(status.faults) or first.code}: {first.cause}",
+            first.remedy or "tormagctl clear-fault, then home",
+        )
+    if status.operating_state != "ENABLED":
+        next_ = {"PAUSED": "tormagctl resume"}.get(status.operating_state)
+        return CommandError(
+            Exit.REFUSED,
+            status.operating_state.lower(),
+            f"the device is {status.operating_state}",
+            next_ or f"{'' if status.is_homed else 'tormagctl home, then '}tormagctl enable",
+        )
+    report = status.setpoints.by_source.get(source)
+    why = {each.code: each for each in status.limit_details}
+    if report is None:
+        heard = f": {status.setpoints.last_refusal}" if status.setpoints.last_refusal else ""
+        return CommandError(
+            Exit.REFUSED, "not_heard", f"the daemon has taken nothing of {source!r}{heard}", "tormagctl status"
+        )
+    if report.state == "refused":
+        other = why.get("OTHER_SOURCE")
+        holder = status.setpoints.newest_source
+        return CommandError(
+            Exit.REFUSED,
+            "other_source",
+            other.cause if other else f"{holder!r} holds the brake, not {source!r}",
+            other.remedy if other else f"end the other one, or tormagctl take {source}",
+        )
+    if report.state == "stale" and not is_over:
+        return _by_limit("STALE", why, f"the setpoints of {source!r} come too late, or not at all")
+    for code in SPOILING:
+        if code in status.limits and not is_over:
+            return _by_limit(code, why, f"the force is held by the limit {code}")
+    return None
+
+
+class Watch:
+    """Looks at the daemon's status now and then while setpoints of one source are sent. Waits for nothing."""
+
+    def __init__(self, client: Client, source: str) -> None:
+        self._client, self._source = client, source
+        before = client.status()
+        self._raise_fault(held_back(before, source))
+        self._before = _accepted(before, source)
+        self._asked: int | None = None
+        self._look_s = time.monotonic()
+        self._looks = self._rendered = 0
+        self._held: CommandError | None = None
+        self._spoilt: CommandError | None = None
+        self._limits: dict[str, None] = {}
+
+    def look(self) -> None:
+        """Between two setpoints. Raises CommandError (FAULT) where the device is in FAULT; tells a person on stderr
+        of what else keeps the force from being rendered."""
+        if self._asked is None:
+            if time.monotonic() >= self._look_s:
+                self._asked = self._client.ask("status")
+            return
+        result = self._client.answer(self._asked)
+        if result is None:
+            return
+        self._asked, self._look_s = None, time.monotonic() + LOOK_S
+        status = understood(result)
+        held = held_back(status, self._source)
+        self._raise_fault(held)
+        self._limits |= dict.fromkeys(status.limits)
+        self._looks += 1
+        if held is None:
+            self._rendered += 1
+        elif self._held is None or held.code != self._held.code:
+            write_line(f"tormagctl send: not rendered: {held.message}\n  next: {held.hint}", sys.stderr)
+        # what comes before the first force that is rendered is waiting, as for tormagctl enable
+        if held is not None and self._rendered:
+            self._spoilt = held
+        self._held = held
+
+    def finish(self, sent: int) -> Fate:
+        """What became of the `sent` setpoints. Raises CommandError where they were not all taken and rendered."""
+        status = self._client.status()
+        held = held_back(status, self._source, is_over=True)
+        self._raise_fault(held)
+        accepted = _accepted(status, self._source) - self._before
+        why = held or self._spoilt or (self._held if self._looks and not self._rendered else None)
+        if why is not None:
+            share = f"{self._rendered / self._looks:.0%} of the time" if self._looks else "none of them"
+            raise CommandError(
+                why.exit_code, why.code, f"sent {sent} setpoints, rendered {share}: {why.message}", why.hint
+            )
+        if accepted < LEAST_TAKEN * sent:
+            raise CommandError(
+                Exit.REFUSED,
+                "not_taken",
+                f"sent {sent} setpoints, and {accepted} were taken: {status.setpoints.last_refusal or 'see the log'}",
+                "look at the source in tormagctl status: another publisher of its name, or a loss on the way",
+            )
+        share_rendered = round(self._rendered / self._looks, 3) if self._looks else None
+        return Fate(accepted, share_rendered, tuple(self._limits))
+
+    def _raise_fault(self, held: CommandError | None) -> None:
+        if held is not None and held.exit_code is Exit.FAULT:
+            raise held
+
+
+def _accepted(status: Status, source: str) -> int:
+    report = status.setpoints.by_source.get(source)
+    return 0 if report is None else report.accepted
+
+
+def _by_limit(code: str, why: dict[str, Explained], otherwise: str) -> CommandError:
+    known = why.get(code)
+    return CommandError(
+        Exit.REFUSED,
+        code.lower(),
+        f"{code}: {known.cause}" if known else otherwise,
+        known.remedy if known else "tormagctl status",
+    )
