@@ -90,7 +90,12 @@ def guarded(keys: Path) -> Iterator[str]:
                 zap.send_multipart([version, number, b"200" if public == known else b"400", b"", b"", b""])
             while router.poll(0):
                 *envelope, data = router.recv_multipart()
-                reply = {"v": VERSION, "id": msgpack.unpackb(data)["id"], "ok": True, "result": {"seen": True}}
+                reply = {
+                    "v": VERSION,
+                    "id": msgpack.unpackb(data)["id"],
+                    "ok": True,
+                    "result": {"operating_state": "DISABLED"},
+                }
                 router.send_multipart([*envelope, msgpack.packb(reply)])
         context.destroy(linger=0)
 
@@ -109,7 +114,7 @@ def test_a_key_is_shown_by_option_by_environment_and_by_configuration(
 ) -> None:
     mine, server = str(keys / "console.key_secret"), str(keys / "server.key")
     code, printed = run_json(capsys, "--endpoint", guarded, "--key", mine, "--server-key", server, "disable")
-    assert (code, printed["result"]) == (0, {"seen": True})
+    assert (code, printed["result"]) == (0, {"operating_state": "DISABLED"})
     config = tmp_path / "client.toml"
     config.write_text(
         f'[endpoints]\ncontrol = "{guarded}"\n[endpoints.curve]\nclient_secret = "{mine}"\nserver_public = "{server}"\n'

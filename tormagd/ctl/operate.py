@@ -30,8 +30,8 @@ DONE_STATES = {
 }
 "The operating states after a command that was carried out."
 STOPPED_WITHOUT_DEVICE = (
-    "latched, but no device is connected: nothing could be sent, and the gap does not open. The device is told to open it "
-    "when it is back; tormagctl status shows the link"
+    "latched, but no device is connected: nothing could be sent, and the gap does not open. The device is told to open "
+    "it when it is back; tormagctl status shows the link"
 )
 COMES_BACK_S = 0.6
 "So long the daemon waits for the device to say that a fault is gone (CLEARING_S), and then calls it a fault again."

@@ -12,6 +12,8 @@ from tormagd.output import write_line
 
 LOOK_S = 0.1
 "Between two looks at the daemon's status. It is a new one every 20 ms, and reading it takes a quarter of one."
+ARRIVAL_S = 0.2
+"By then the last setpoint has arrived: an answer may overtake it."
 LEAST_TAKEN = 0.9
 "Share of the setpoints that has to be taken; the first ones of a clock that is not known yet may not be."
 SPOILING = ("RANGE", "F_MAX")
@@ -145,10 +147,14 @@ class Watch:
 
     def finish(self, sent: int) -> Fate:
         """What became of the `sent` setpoints. Raises CommandError where they were not all taken and rendered."""
-        status = self._client.status()
+        until_s = time.monotonic() + ARRIVAL_S
+        while True:
+            status = self._client.status()
+            accepted = _accepted(status, self._source) - self._before
+            if accepted >= sent or time.monotonic() > until_s:
+                break
         held = held_back(status, self._source, is_over=True)
         self._raise_fault(held)
-        accepted = _accepted(status, self._source) - self._before
         why = held or self._spoilt or (self._held if self._looks and not self._rendered else None)
         if why is not None:
             share = f"{self._rendered / self._looks:.0%} of the time" if self._looks else "none of them"

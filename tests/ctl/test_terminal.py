@@ -1,0 +1,135 @@
+"""What others say reaches the terminal as text: nothing that a daemon, a device or a file says is obeyed by it."""
+
+import io
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tormagd.ctl.main import main
+from tormagd.ctl.outcome import Colour
+from tormagd.output import LogFormatter, printable, write_line
+
+EVIL = "\x1b[2J\x1b]0;owned\x07\r\n\x9b31m\u202eevil\x7f"
+HARMLESS = r"\u001b[2J\u001b]0;owned\u0007\r\n\u009b31m\u202eevil\u007f"
+
+
+def spoil(value: Any) -> Any:
+    """The same with something evil in each text and each name."""
+    if isinstance(value, str):
+        return value + EVIL
+    if isinstance(value, dict):
+        return {name: spoil(inner) for name, inner in value.items()}
+    return [spoil(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
+def is_harmless(text: str) -> bool:
+    return text.replace("\n", "").isprintable()
+
+
+def test_a_text_is_made_one_printable_line() -> None:
+    assert printable(EVIL) == HARMLESS
+    assert printable("a ± b, 5 µs") == "a ± b, 5 µs"
+    assert printable("\ud800") == r"\ud800"
+
+
+@given(st.text())
+def test_whatever_is_written_is_printable_and_json_stays_json(text: str) -> None:
+    stream = io.StringIO()
+    assert write_line(text, stream) is None
+    assert is_harmless(stream.getvalue().replace("\t", ""))
+    stream = io.StringIO()
+    write_line(json.dumps({"said": text}, ensure_ascii=False), stream)
+    assert json.loads(stream.getvalue()) == {"said": text}
+
+
+def test_our_own_colours_and_lines_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    stream = Terminal()
+    colour = Colour(stream)
+    text = "\n".join(paint("x") for paint in (colour.red, colour.green, colour.yellow, colour.bold))
+    write_line(text, stream)
+    assert stream.getvalue() == text + "\n"
+    assert "\x1b" in text
+
+
+@pytest.mark.parametrize("command", ["status", "firmware"])
+def test_a_daemon_cannot_write_to_the_terminal(fake_daemon, capsys, status_with, source_with, command):
+    told = spoil(
+        status_with(
+            limits=["RATE"],
+            faults=["SKEW"],
+            fault_details=[{"code": "SKEW", "cause": "a", "remedy": "b"}],
+            setpoints=status_with()["setpoints"] | {"by_source": {"me": source_with()}, "last_refusal": "x"},
+            late_ticks_by={"somebody": 3},
+            peers={
+                "refused": 1,
+                "refusals": [{"endpoint": "e", "address": "a", "key": "k", "reason": "r", "count": 1}],
+            },
+        )
+    )
+    told["late_ticks_by"] = {EVIL: 3}  # names, too
+    told["setpoints"]["by_source"] = {EVIL: told["setpoints"]["by_source"]["me"]}
+    fake_daemon.answers["status"] = lambda: {"ok": True, "result": told}
+    assert main(["--endpoint", fake_daemon.control, command]) == 0
+    captured = capsys.readouterr()
+    assert is_harmless(captured.out + captured.err)
+    # one line each: nobody makes up a line of ours
+    assert not any(line.startswith("evil") for line in captured.out.splitlines())
+    assert HARMLESS in captured.out
+    assert main(["--endpoint", fake_daemon.control, "--json", command]) == 0
+    printed = capsys.readouterr().out
+    assert is_harmless(printed)
+    known = json.loads(printed)["result"]
+    assert (known["link"] if command == "status" else known)["port"].endswith(EVIL)
+
+
+def test_a_refusal_is_one_printable_line_and_a_hint(fake_daemon, capsys):
+    error = {"code": EVIL, "message": "no" + EVIL, "hint": "next" + EVIL}
+    fake_daemon.answers["pause"] = lambda: {"ok": False, "error": error}
+    assert main(["--endpoint", fake_daemon.control, "pause"]) == 1
+    said = capsys.readouterr().err
+    assert is_harmless(said)
+    assert len(said.splitlines()) == 2
+
+
+@pytest.mark.parametrize("what", ["key", "value", "name"])
+def test_a_file_cannot_either(tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str) -> None:
+    path = tmp_path / ("\x1b[2J.toml" if what == "name" else "a.toml")
+    path.write_text({"key": '"\\u001b[2J" = 1', "value": 'scene = "\\u001b[2J\\n"', "name": "x = 1"}[what])
+    assert main(["--config", str(path), "scene", "show"]) == 2
+    captured = capsys.readouterr()
+    assert is_harmless(captured.out + captured.err)
+    assert r"\u001b[2J" in captured.err or r"\x1b[2J" in captured.err
+
+
+def test_a_scene_is_shown_without_obeying_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scene", "show", "pulse"]) == 0
+    path = tmp_path / "a.toml"
+    path.write_text(capsys.readouterr().out.replace('description = "', 'description = "\\u009b2J\\u001b[2J'))
+    assert main(["scene", "show", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert is_harmless(printed)
+    assert r'description = "\u009b2J\u001b[2J' in printed
+
+
+def test_the_log_has_a_line_for_each_record_and_a_traceback_its_own() -> None:
+    formatter = LogFormatter("%(levelname)s %(name)s: %(message)s")
+    record = logging.LogRecord("a.b", logging.INFO, "", 1, "device %s", (EVIL,), None)
+    assert formatter.format(record) == f"INFO a.b: device {HARMLESS}"
+    try:
+        raise ValueError(EVIL)
+    except ValueError as error:
+        record.exc_info = (type(error), error, error.__traceback__)
+    text = formatter.format(record)
+    assert is_harmless(text)
+    assert "Traceback" in text.splitlines()[1]

@@ -1,0 +1,169 @@
+"""`tormagctl send` is done when its setpoints were rendered, and says why when they were not."""
+
+import json
+from itertools import chain, repeat
+from typing import Any
+
+import msgspec
+import pytest
+
+from tormagd.ctl.main import main
+from tormagd.ctl.watch import held_back
+from tormagd.messages import Status
+
+EXPLAINED = {
+    "STALE": "setpoints of 'me' come 300 ms late",
+    "OTHER_SOURCE": "'me' sends setpoints too, and 'robot' holds the brake",
+    "F_MAX": "more force was asked for than the closed gap gives",
+}
+
+
+@pytest.fixture
+def seen(status_with: Any, source_with: Any) -> Any:
+    """Makes a status as the watch sees it, with what it says of the source `me`."""
+
+    def made(source: dict[str, Any] | None = None, **changes: Any) -> Status:
+        by_source = {} if source is None else {"me": source_with(**source)}
+        setpoints = status_with()["setpoints"] | {"by_source": by_source, "newest_source": "robot"}
+        details = [{"code": code, "cause": cause, "remedy": "do this"} for code, cause in EXPLAINED.items()]
+        known = {"setpoints": setpoints, "limit_details": details}
+        return msgspec.convert(status_with(**known | changes), Status)
+
+    return made
+
+
+def test_setpoints_that_are_taken_while_enabled_are_rendered(seen):
+    assert held_back(seen({"state": "holds"}), "me") is None
+    assert held_back(seen({"state": "holds"}, limits=["F_MIN", "RATE", "TAKEOVER"]), "me") is None
+
+
+@pytest.mark.parametrize(
+    ("source", "changes", "code", "exit_code", "said", "hint"),
+    [
+        ({}, {"operating_state": "DISABLED"}, "disabled", 1, "the device is DISABLED", "tormagctl enable"),
+        ({}, {"operating_state": "DISABLED", "is_homed": False}, "disabled", 1, "DISABLED", "tormagctl home, then"),
+        ({}, {"operating_state": "PAUSED"}, "paused", 1, "PAUSED", "tormagctl resume"),
+        ({}, {"operating_state": "FAULT", "faults": ["SKEW"]}, "fault", 4, "in FAULT: SKEW", "clear-fault"),
+        (None, {}, "not_heard", 1, "nothing of 'me': too much", "status"),
+        ({"state": "refused"}, {}, "other_source", 1, "'robot' holds the brake", "do this"),
+        ({"state": "refused"}, {"limit_details": []}, "other_source", 1, "'robot' holds", "tormagctl take me"),
+        ({"state": "stale"}, {}, "stale", 1, "300 ms late", "do this"),
+        ({"state": "stale"}, {"limit_details": []}, "stale", 1, "come too late", "status"),
+        ({}, {"limits": ["F_MAX"]}, "f_max", 1, "more force was asked", "do this"),
+        ({}, {"limits": ["RANGE"]}, "range", 1, "the limit RANGE", "status"),
+    ],
+)
+def test_what_holds_a_force_back_is_named_with_its_remedy(seen, source, changes, code, exit_code, said, hint):
+    held = held_back(seen(source, **changes), "me")
+    assert (held.code, held.exit_code) == (code, exit_code)
+    assert said in held.message
+    assert hint in held.hint
+
+
+def test_when_sending_is_over_the_newest_may_be_stale(seen):
+    assert held_back(seen({"state": "stale"}, limits=["RANGE"]), "me", is_over=True) is None
+    assert held_back(seen({"state": "refused"}), "me", is_over=True).code == "other_source"
+
+
+def send(daemon: Any, capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any], str]:
+    command = ["--endpoint", daemon.control, "--json", "send", "step", "--duration", "0.4", "--rate", "50"]
+    code = main([*command, *arguments])
+    captured = capsys.readouterr()
+    return code, json.loads(captured.out), captured.err
+
+
+def test_what_was_rendered_is_told(fake_daemon, capsys):
+    fake_daemon.says(limits=["RATE"])
+    code, printed, said = send(fake_daemon, capsys)
+    assert (code, said) == (0, "")
+    result = printed["result"]
+    assert result["accepted"] == result["sent"]
+    assert (result["rendered_share"], result["limits"]) == (1.0, ["RATE"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected", "code", "says"),
+    [
+        ({"operating_state": "DISABLED"}, 1, "disabled", "rendered 0% of the time: the device is DISABLED"),
+        ({"operating_state": "PAUSED"}, 1, "paused", "PAUSED"),
+        ({"operating_state": "FAULT", "faults": ["SKEW"]}, 4, "fault", "in FAULT: SKEW"),
+    ],
+)
+def test_what_is_not_rendered_is_no_success(fake_daemon, capsys, changes, expected, code, says):
+    fake_daemon.says(**changes)
+    exit_code, printed, said = send(fake_daemon, capsys)
+    assert (exit_code, printed["result"], printed["error"]["code"]) == (expected, None, code)
+    assert says in printed["error"]["message"]
+    assert says[-10:] in said
+    # in FAULT nothing is sent at all
+    assert bool(fake_daemon.setpoints) == (expected == 1)
+
+
+def test_setpoints_may_wait_for_enable_but_not_for_what_comes_after(fake_daemon, capsys, status_with):
+    """`enable` wants a neutral setpoint, so that a publisher is there before."""
+
+    def states(*names: str) -> Any:
+        each = chain(names, repeat(names[-1]))
+        return lambda: {
+            "ok": True,
+            "result": status_with(operating_state=next(each), setpoints=fake_daemon.taken()),
+        }
+
+    fake_daemon.answers["status"] = states("DISABLED", "DISABLED", "ENABLED")
+    code, printed, said = send(fake_daemon, capsys)
+    assert code == 0
+    assert 0.0 < printed["result"]["rendered_share"] < 1.0
+    assert said.count("not rendered: the device is DISABLED") == 1
+    fake_daemon.setpoints.clear()
+    fake_daemon.answers["status"] = states("ENABLED", "ENABLED", "PAUSED", "ENABLED")
+    code, printed, _ = send(fake_daemon, capsys)
+    assert (code, printed["error"]["code"]) == (1, "paused")
+
+
+def test_setpoints_that_nobody_took_are_no_success(fake_daemon, capsys):
+    fake_daemon.taken_by_source = False
+    code, printed, _ = send(fake_daemon, capsys)
+    assert (code, printed["error"]["code"]) == (1, "not_heard")
+    # taken in part: another publisher of the same name, or a loss
+    fake_daemon.taken_by_source = True
+    taken = fake_daemon.taken
+    fake_daemon.taken = lambda: (
+        taken()
+        | {
+            "by_source": {
+                name: each | {"accepted": each["accepted"] // 2} for name, each in taken()["by_source"].items()
+            }
+        }
+    )
+    fake_daemon.setpoints.clear()
+    code, printed, _ = send(fake_daemon, capsys)
+    assert (code, printed["error"]["code"]) == (1, "not_taken")
+
+
+@pytest.mark.parametrize("arguments", [("--to-N", "5.5"), ("--from-N", "0.4", "--to-N", "6")])
+def test_what_the_scene_does_not_allow_is_not_sent(fake_daemon, capsys, arguments):
+    code, printed, _ = send(fake_daemon, capsys, *arguments)
+    assert (code, printed["error"]["code"]) == (1, "out_of_range")
+    assert "allowed is 0..5 N in scene pulse; nothing was sent" in printed["error"]["message"]
+    assert fake_daemon.setpoints == []
+
+
+def test_a_file_that_leaves_the_range_is_not_sent(fake_daemon, capsys, tmp_path):
+    file = tmp_path / "task.csv"
+    file.write_text("t_s,force_N\n0,1\n1,7\n")
+    assert main(["--endpoint", fake_daemon.control, "send", str(file)]) == 1
+    assert "1..7 N is asked" in capsys.readouterr().err
+
+
+def test_blind_it_asks_nothing_and_says_that_it_does_not_know(fake_daemon, capsys):
+    fake_daemon.says(operating_state="DISABLED")
+    assert main(["--endpoint", fake_daemon.control, "send", "step", "--duration", "0.05", "--blind"]) == 0
+    assert "whether they were taken is not known" in capsys.readouterr().out
+    assert fake_daemon.commands == []
+
+
+def test_a_daemon_that_takes_setpoints_and_does_not_answer_is_not_reached(fake_daemon, run_dir, tmp_path, capsys):
+    config = tmp_path / "tormagd.toml"
+    config.write_text(f'[endpoints]\ncontrol = "ipc://{run_dir}/nobody"\nsetpoint = "ipc://{run_dir}/setpoint"\n')
+    assert main(["--config", str(config), "--wait", "0.1", "send", "step"]) == 3
+    assert fake_daemon.setpoints == []

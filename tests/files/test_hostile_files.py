@@ -1,0 +1,141 @@
+"""Twenty hostile files of each kind are refused by size, kind or shape, in one sentence, by whoever reads that kind.
+
+Nothing here takes time or memory: `tools/hostile_files.py` measures both, in processes of their own.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hostile_files import HOSTILE, KINDS, make
+
+from tormagd.bounded_file import read_bounded, require_regular
+from tormagd.config import ConfigError, load_config
+from tormagd.control.profile import ProfileError
+from tormagd.ctl.waveform import WaveformError, read_csv
+from tormagd.daemon.profiles import ProfileFolder
+from tormagd.keys import load_pair
+from tormagd.model.model_file import ModelFileError, load_model
+from tormagd.output import printable
+from tormagd.scenes.scene import load_scene
+from tormagd.simulation.parameters import PlantError, load_plant
+from tormagd.toml_file import MOST_DEPTH, TomlError, toml_tables
+
+
+def read_profile(path: Path) -> object:
+    folder = ProfileFolder(path.parent, "MRE-50-40", "ab" * 32)
+    path.rename(folder.path(7))
+    profile = folder.read(7)
+    if profile is None:
+        raise ProfileError("No such file")
+    return profile
+
+
+def read_key(path: Path) -> object:
+    if path.is_file():
+        path.chmod(0o600)
+    return load_pair(path)
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "config": lambda path: load_scene(load_config(path).scene),
+    "scene": lambda path: load_scene(str(path)),
+    "plant": load_plant,
+    "model": lambda path: load_model(path, element="torque"),
+    "csv": read_csv,
+    "key": read_key,
+    "profile": read_profile,
+}
+REFUSALS = (ConfigError, PlantError, ModelFileError, WaveformError, ProfileError)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", HOSTILE)
+def test_it_is_refused_in_one_printable_sentence(tmp_path: Path, kind: str, name: str) -> None:
+    path = make(name, tmp_path)
+    with pytest.raises(REFUSALS) as refused:
+        READERS[kind](path)
+    said = printable(str(refused.value))
+    assert said.isprintable()
+    assert len(said) < 600
+    assert len(HOSTILE) >= 20
+
+
+@pytest.mark.parametrize("name", ["pipe", "directory", "zeros without end", "socket", "sparse, 1 TB"])
+def test_the_kind_or_the_size_is_named_and_nothing_opened(tmp_path: Path, name: str) -> None:
+    path = make(name, tmp_path)
+    with pytest.raises(OSError, match=r"allowed is a regular file of at most 100 bytes; this (is a|has 1)"):
+        read_bounded(path, 100)
+    with pytest.raises(OSError, match="allowed is a regular file"):
+        require_regular(path, 100)
+
+
+def test_a_file_that_does_not_know_its_size_is_read_to_the_limit_only() -> None:
+    with pytest.raises(OSError, match="at most 10 bytes; this has more"):
+        read_bounded(Path("/proc/self/status"), 10)
+    assert b"Name:" in read_bounded(Path("/proc/self/status"), 100_000)
+
+
+def test_a_file_of_the_greatest_size_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(bytes(100))
+    assert read_bounded(path, 100) == bytes(100)
+    path.write_bytes(bytes(101))
+    with pytest.raises(OSError, match="this has 101"):
+        read_bounded(path, 100)
+
+
+def test_a_name_that_no_file_can_have_is_refused() -> None:
+    with pytest.raises(OSError, match="no file can have this name"):
+        read_bounded(Path("a\0b"), 100)
+
+
+def test_a_link_to_what_may_be_read_is_followed(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("x")
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    assert read_bounded(tmp_path / "b", 100) == b"x"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{'.'.join('a' * MOST_DEPTH)} = 1",
+        f"[{'.'.join('a' * MOST_DEPTH)}]",
+        "a = " + "[" * MOST_DEPTH + "]" * MOST_DEPTH,
+        "a = " + "[1.5, " * (MOST_DEPTH - 1) + "1.5" + "]" * (MOST_DEPTH - 1),
+        "a = [" + ",".join(["0.5"] * 1_000) + "]",
+        'a = "' + "[." * 100 + '"',
+        "a = '" + "[." * 100 + "'",
+        'a = """' + "[.\n" * 100 + '"""',
+        "a = '''" + "[.\n" * 100 + "'''",
+        "# " + "[." * 100 + "\na = 1",
+        'a = "\\"[[[[[[[[[[[[[[[[[[[[[[" # "',
+        'a = """one " two "" three \\""" four"""',
+        f"a = {-(2**63)}",
+        f"a = {2**63 - 1}",
+    ],
+)
+def test_what_is_as_deep_as_allowed_or_only_looks_deeper_is_read(text: str) -> None:
+    assert "a" in toml_tables(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (f"{'.'.join('a' * (MOST_DEPTH + 1))} = 1", "parts of a key (line 1)"),
+        ("\n\n[" + " . ".join("a" * (MOST_DEPTH + 1)) + "]", "parts of a key (line 3)"),
+        ('"a"' + '."a"' * MOST_DEPTH + " = 1", "parts of a key"),
+        ("a = " + "[" * (MOST_DEPTH + 1), "arrays or tables in each other"),
+        ("a = " + "{a=[" * MOST_DEPTH, "arrays or tables in each other"),
+        ('a = "" ' + "[" * (MOST_DEPTH + 1), "arrays or tables in each other"),
+        ("a = inf", "a = inf: allowed is a finite number"),
+        ("[t]\na = [1, {b = nan}]", "t.a[1].b = nan: allowed is a finite number"),
+        (f"a = {2**63}", "a: an integer of 64 bits"),
+        ("a = 0x" + "f" * 20_000, "a: an integer of 80000 bits"),
+        ("a = " + "9" * 5_001, "more digits than any that is allowed"),
+    ],
+)
+def test_what_is_deeper_or_no_number_is_refused_with_its_place(text: str, said: str) -> None:
+    with pytest.raises(TomlError) as refused:
+        toml_tables(text)
+    assert said in str(refused.value)
