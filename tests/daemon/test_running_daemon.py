@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import zmq
 import zmq.asyncio
@@ -20,7 +21,7 @@ from tormagd.daemon import notify
 from tormagd.daemon.callbacks import KERNEL, Delay
 from tormagd.daemon.daemon import Daemon
 from tormagd.hardware.backend import Backend, BackendError
-from tormagd.messages import VERSION, Reply, Request, decode, encode
+from tormagd.messages import VERSION, Description, Reply, Request, decode, encode
 from tormagd.physics.errors import DomainError
 from tormagd.safety.codes import FAULTS, Fault
 
@@ -95,6 +96,17 @@ def test_stop_without_a_device_says_that_there_is_none(core: Core, tmp_path: Pat
         status = await command("status")
         assert (status["faults"], status["governed_cf"], status["is_busy"]) == (["STOPPED"], None, False)
         assert status["build"] == str(settle())
+
+    run(core, tmp_path, operate)
+
+
+def test_a_daemon_describes_what_it_runs(core: Core, tmp_path: Path) -> None:
+    async def operate(command: Command, _planner: FailingPlanner) -> None:
+        described = msgspec.convert(await command("describe"), Description)
+        assert described.scene["name"] == core.scene.name
+        assert described.configuration["realtime"]["watchdog_ms"] == WATCHDOG_MS
+        assert (described.model, described.build) == (core.model, str(settle()))
+        assert (described.firmware, described.serial_number) == (None, None)
 
     run(core, tmp_path, operate)
 

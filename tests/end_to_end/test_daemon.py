@@ -8,7 +8,13 @@ import subprocess
 import sys
 
 import msgpack
+import numpy as np
 import pytest
+from jsonschema import Draft202012Validator
+from mcap.reader import make_reader
+
+from tormagd.ctl.main import main
+from tormagd.recording.reader import read_recording
 
 pytestmark = pytest.mark.live
 
@@ -139,6 +145,65 @@ def test_a_device_that_has_shown_itself_is_known_the_next_time(new_rig):
     again = new_rig.status()
     assert again["device"]["scale_sd"] < 0.1
     assert again["profile"]["age_s"] < 3600.0
+
+
+def test_send_says_whether_a_real_daemon_renders_it(rig, capsys):
+    sine = ["--config", str(rig.config), "--wait", "30", "--json", "send", "sine", "--duration", "0.5"]
+    assert main(sine) == 1
+    assert json.loads(capsys.readouterr().out)["error"]["code"] == "disabled"
+    assert main([*sine, "--to-N", "2.5"]) == 1
+    assert json.loads(capsys.readouterr().out)["error"]["code"] == "out_of_range"
+    rig.arm()
+    rig.ask(1.5)  # it holds the brake for half a minute
+    rig.until(lambda: rig.status()["setpoints"]["newest_source"] == "test", "held")
+    assert main(sine) == 1
+    assert json.loads(capsys.readouterr().out)["error"]["code"] == "other_source"
+    rig.ask(1.5, valid_for_ms=1.0)
+    # on a busy machine a publisher may be late, and says so
+    rig.until(lambda: main(sine) == 0, "rendered")
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])["result"]
+    assert result["accepted"] == result["sent"]
+    rig.done("stop")
+    assert main(sine) == 4
+    assert json.loads(capsys.readouterr().out)["error"]["message"].startswith("the device is in FAULT: STOPPED")
+
+
+def test_a_real_recording_is_whole_says_what_it_is_of_and_outlives_the_daemon(new_rig):
+    path = new_rig.folder / "a.mcap"
+    ctl = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(new_rig.config), "--wait", "30"]
+    recorder = subprocess.Popen([*ctl, "record", str(path)])
+    try:
+        new_rig.until(path.exists, "recording")
+        new_rig.arm()
+        new_rig.ask(1.6)
+        new_rig.until(lambda: abs((new_rig.telemetry().measured_cf or 0.0) - 1.6) < 0.1, "1.6 N")
+        newest = new_rig.telemetry()
+        new_rig.daemon.kill()
+        new_rig.daemon.wait()
+        new_rig.end(recorder, signal.SIGINT)
+    finally:
+        recorder.kill()
+        recorder.wait()
+    recording = read_recording(path)
+    assert recording.is_complete
+    assert recording.ticks.t_ns[-1] >= newest.t_ns
+    for numbers in (recording.ticks.numbers["tick"], recording.telemetry.numbers["seq"]):
+        assert np.array_equal(np.diff(numbers), np.ones(numbers.size - 1))
+    about = recording.metadata
+    assert json.loads(about["configuration"])["device"]["port"] == str(new_rig.port)
+    assert json.loads(about["scene"])["name"] == "coronary"
+    assert (len(about["model"]), about["firmware"]) == (64, "1.0")
+    assert int(about["serial_number"]) >= 0
+    assert json.loads(about["profile"])["is_used"] is False
+    validators = {}
+    with path.open("rb") as file:
+        for schema, _, message in make_reader(file).iter_messages():
+            if schema.id not in validators:
+                validators[schema.id] = Draft202012Validator(json.loads(schema.data))
+            # one in a while, for it takes 10 ms
+            if message.sequence % 500 == 0:
+                validators[schema.id].validate(json.loads(message.data))
+    assert len(validators) == 2
 
 
 def test_stop_opens_and_latches(rig):

@@ -22,6 +22,8 @@ from tormagd.recording.writer import RecordingWriter
 POLL_MS = 100
 QUEUE = 10_000
 "Batches that may wait while the disk is slow: over three minutes."
+LONGEST_END_S = 60.0
+"What has arrived until the end is written down, but no longer than that."
 SILENT_S = 1.0
 "A daemon that was silent for so long at the end has gone."
 
@@ -109,10 +111,16 @@ def _record(
 ) -> Outcome:
     unreadable = 0
     start_s = heard_s = time.monotonic()
-    while not is_interrupted() and (left_s := start_s + duration_s - time.monotonic()) > 0.0:
-        _any_ready((telemetry, ticks), min(left_s, POLL_MS / 1e3), is_interrupted)
+    is_over = False
+    while not is_over:
+        left_s = start_s + duration_s - time.monotonic()
+        is_over = is_interrupted() or left_s <= 0.0
+        if not is_over:
+            _any_ready((telemetry, ticks), min(left_s, POLL_MS / 1e3), is_interrupted)
+        # what waits when it is over came before that, and belongs into the file
+        until_s = time.monotonic() + (LONGEST_END_S if is_over else POLL_MS / 1e3)
         for socket in (telemetry, ticks):
-            while socket.poll(0) and not is_interrupted():
+            while socket.poll(0) and time.monotonic() < until_s:
                 data = socket.recv_multipart()[-1]
                 try:
                     if socket is telemetry:
