@@ -70,7 +70,7 @@ HOSTILE: dict[str, Callable[[Path], object]] = {
     "number of 60,000 hexadecimal digits": _write(b"scene = 0x" + b"f" * 60_000),
     "text of 60,000 characters": _write(b'scene = "' + b"x" * 60_000 + b'"'),
     "30,000 unclosed texts": _write(b'a = """\\"' * 8_000),
-    "escape sequences": _write('scene = "\\u001b]0;x\\u0007"\n"\\u001b[2J\\u009b1m\\n" = 1\n'),
+    "escape sequences": _write(b'scene = "\\u001b]0;x\\u0007"\n"\\u001b[2J\\u009b1m\\n" = 1\n'),
     "raw escape sequences": _write(b"\x1b[2J\x1b]0;owned\x07\xc2\x9b31m = \x1b[1m\n"),
     "no UTF-8": _write(b"\xff\xfe" * 100),
     "a header of 2^63 bytes": _write((2**63 - 1).to_bytes(8, "little") + b"{}"),

@@ -199,7 +199,7 @@ class BlackBox(Strict, frozen=True):
 class Config(Strict, frozen=True):
     """Everything `tormagd` can be told."""
 
-    scene: str = "coronary"
+    scene: Annotated[str, Meta(max_length=4_096)] = "coronary"
     "A scene file, or the name of a shipped one."
     device: Device = msgspec.field(default_factory=Device)
     endpoints: Endpoints = msgspec.field(default_factory=Endpoints)

@@ -53,7 +53,10 @@ def lesson(forces: Range) -> tuple[Waveform, Waveform]:
     def on_steps(t_s: float) -> Sample:
         return Sample(levels_N[min(int(t_s / STEP_S), len(levels_N) - 1)])
 
-    return Waveform(ramps[-1][0], on_ramps), Waveform(STEP_S * len(levels_N), on_steps)
+    return (
+        Waveform(ramps[-1][0], on_ramps, low_N, forces.most_N),
+        Waveform(STEP_S * len(levels_N), on_steps, low_N, forces.most_N),
+    )
 
 
 def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -> Outcome:
