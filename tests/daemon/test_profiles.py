@@ -3,6 +3,7 @@
 import asyncio
 import os
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -36,7 +37,12 @@ class Rig:
 
 
 def run(scene: Callable[[], Awaitable[None]]) -> None:
-    asyncio.run(scene())  # type: ignore[arg-type]
+    async def with_one_thread() -> None:
+        # what is given to it is done in turn, so that what comes last says that all is done
+        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(1))
+        await scene()
+
+    asyncio.run(with_one_thread())
 
 
 def keep(folder: Path, serial_number: int, shown: Shown = STRONG) -> None:

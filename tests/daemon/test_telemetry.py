@@ -147,7 +147,7 @@ def test_a_tick_is_recorded_whole() -> None:
     safety = SafetyState(OperatingState.PAUSED, (Fault.SKEW, Fault.SENSOR), DeviceRequest.CLEAR, 99)
     state = StepState(1.5, safety, estimate, Reference(64.2))
     output = StepOutput(DriveMode.RUN, 0.1, -0.2, DeviceRequest.HOME, 5, (Limit.RATE,))
-    tick = tick_record(1.5, state, output, plan, 1.1, measurement, 20.0, 150.0)
+    tick = tick_record(1.5, state, output, plan, 1.1, measurement, 20.0, 150.0, 9)
     sent = msgspec.msgpack.decode(encode_ticks([tick]))
     row = dict(zip(sent["columns"], sent["rows"][0], strict=True))
     assert abs(row.pop("t_ns") - time.time_ns()) < 60_000_000_000
@@ -210,6 +210,7 @@ def test_a_tick_is_recorded_whole() -> None:
         "request_number": 5,
         "lateness_us": 20.0,
         "exec_us": 150.0,
+        "tick": 9,
     }
 
 

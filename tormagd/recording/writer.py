@@ -98,7 +98,12 @@ class RecordingWriter:
                 if self._last_tick is not None and number > self._last_tick + 1:
                     self.ticks_lost += number - self._last_tick - 1
                 self._last_tick = number
-            message = {name: value for name, value in zip(batch.columns, row, strict=True) if _is_known(value)}
+            # as _is_known, without a call for each of some sixty values, a thousand times a second
+            message: dict[str, Value] = {
+                name: value
+                for name, value in zip(batch.columns, row, strict=True)
+                if value is not None and (value.__class__ is not float or math.isfinite(value))
+            }
             self._add(self._channel_of(message), t_ns, msgspec.json.encode(message), self.tick_count)
             self.tick_count += 1
         if before_ns is not None and self._last_tick_ns is not None:
