@@ -162,6 +162,14 @@ def test_blind_it_asks_nothing_and_says_that_it_does_not_know(fake_daemon, capsy
     assert fake_daemon.commands == []
 
 
+def test_a_key_that_may_only_publish_is_told_how(run_dir, tmp_path, capsys):
+    assert main(["keys", "generate", str(tmp_path / "keys"), "--publish", "robot"]) == 0
+    keys = ("--key", str(tmp_path / "keys/robot.key_secret"), "--server-key", str(tmp_path / "keys/server.key"))
+    endpoint = f"ipc://{run_dir}/control"
+    assert main(["--endpoint", endpoint, *keys, "--wait", "0.05", "send", "step"]) == 3
+    assert "with a key that may only publish: --blind" in capsys.readouterr().err
+
+
 def test_a_daemon_that_takes_setpoints_and_does_not_answer_is_not_reached(fake_daemon, run_dir, tmp_path, capsys):
     config = tmp_path / "tormagd.toml"
     config.write_text(f'[endpoints]\ncontrol = "ipc://{run_dir}/nobody"\nsetpoint = "ipc://{run_dir}/setpoint"\n')

@@ -47,7 +47,13 @@ def send(
         watch = None
         if not is_blind:
             client = stack.enter_context(Client(endpoints.control, wait_s, keys))
-            require_range(client.describe(), waveform.least_N, waveform.most_N)
+            try:
+                known = client.describe()
+            except CommandError as error:
+                if keys is not None and error.exit_code is Exit.UNREACHABLE:
+                    error.hint += "; with a key that may only publish: --blind"
+                raise
+            require_range(known, waveform.least_N, waveform.most_N)
             watch = Watch(client, stream.source)
         connect(socket, address, keys)
         if not socket.poll(round(wait_s * 1e3)):

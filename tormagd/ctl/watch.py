@@ -12,7 +12,7 @@ from tormagd.output import write_line
 
 LOOK_S = 0.1
 "Between two looks at the daemon's status. It is a new one every 20 ms, and reading it takes a quarter of one."
-ARRIVAL_S = 0.2
+ARRIVAL_S = 0.5
 "By then the last setpoint has arrived: an answer may overtake it."
 LEAST_TAKEN = 0.9
 "Share of the setpoints that has to be taken; the first ones of a clock that is not known yet may not be."
@@ -114,7 +114,7 @@ class Watch:
         self._raise_fault(held_back(before, source))
         self._before = _accepted(before, source)
         self._asked: int | None = None
-        self._look_s = time.monotonic()
+        self._look_s: float | None = None
         self._looks = self._rendered = 0
         self._held: CommandError | None = None
         self._spoilt: CommandError | None = None
@@ -123,6 +123,8 @@ class Watch:
     def look(self) -> None:
         """Between two setpoints. Raises CommandError (FAULT) where the device is in FAULT; tells a person on stderr
         of what else keeps the force from being rendered."""
+        if self._look_s is None:  # an answer may overtake the first setpoint
+            self._look_s = time.monotonic() + LOOK_S
         if self._asked is None:
             if time.monotonic() >= self._look_s:
                 self._asked = self._client.ask("status")
