@@ -17,11 +17,10 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from tormagd import __version__
+from tormagd.bounded_file import require_regular
 from tormagd.keeping import Part
-from tormagd.messages import VERSION
-from tormagd.recording.reader import MAX_RECORD_BYTES, UNREADABLE, RecordingError
-from tormagd.recording.ticks import TickBatch
-from tormagd.recording.writer import CHUNK_BYTES, TICKS_TOPIC, tick_schema
+from tormagd.recording.reader import MAX_FILE_BYTES, MAX_RECORD_BYTES, UNREADABLE, RecordingError
+from tormagd.recording.writer import CHUNK_BYTES, TICK_KINDS, TICKS_TOPIC, known_values, tick_schema
 
 CORE_TOPIC = "/core"
 HEADER = "black_box"
@@ -71,12 +70,12 @@ def _write(path: Path, header: dict[str, str], parts: Iterable[Part]) -> int:
             if not rows:
                 continue
             if rows_channel is None:
-                schema = tick_schema(TickBatch(v=VERSION, columns=columns, rows=_of_words(rows[:1])))
-                data = msgspec.json.encode(schema)
+                kinds = {name: TICK_KINDS[name] for name in columns if name in TICK_KINDS}
+                data = msgspec.json.encode(tick_schema(kinds))
                 schema_id = mcap.register_schema(name="tormagd.Tick", encoding="jsonschema", data=data)
                 rows_channel = mcap.register_channel(topic=TICKS_TOPIC, message_encoding="json", schema_id=schema_id)
             for row in rows:
-                data = msgspec.json.encode(dict(zip(columns, row, strict=True)))
+                data = msgspec.json.encode(known_values(columns, row))
                 mcap.add_message(rows_channel, log_time=row[0], data=data, publish_time=row[0], sequence=ticks)
                 ticks += 1
         mcap.finish()  # type: ignore[no-untyped-call]
@@ -88,10 +87,6 @@ def is_tick(entry: Any) -> bool:
     return isinstance(entry, list) and bool(entry) and type(entry[0]) is int
 
 
-def _of_words(rows: Iterable[tuple[Any, ...]]) -> tuple[tuple[Any, ...], ...]:
-    return tuple(tuple(tuple(each) if isinstance(each, list) else each for each in row) for row in rows)
-
-
 def read_black_box(path: Path) -> BlackBoxFile:
     """The black box in `path`. Raises RecordingError: not readable, not MCAP, damaged, or no black box."""
     header: dict[str, str] = {}
@@ -99,6 +94,7 @@ def read_black_box(path: Path) -> BlackBoxFile:
     cores: set[int] = set()
     size, parts, is_complete = 0, 0, True
     try:
+        require_regular(path, MAX_FILE_BYTES)
         with path.open("rb") as file:
             try:
                 for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:

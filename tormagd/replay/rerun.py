@@ -213,7 +213,7 @@ class _Running:
             return None
         if self._output is None:
             raise ValueError("a tick without a step")
-        timing = record.lateness_us, record.exec_us
+        timing = record.lateness_us, record.exec_us, record.tick
         plan, trim = self._used.plan, self._used.trim
         given = tick_record(self._step.time_s, self._step, self._output, plan, trim, self._measurement, *timing)
         left, right = msgspec.structs.astuple(record), msgspec.structs.astuple(given)
