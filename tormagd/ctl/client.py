@@ -1,6 +1,7 @@
 """One request to the daemon's control endpoint, and its answer, within a bounded time."""
 
 import itertools
+import math
 import os
 import time
 from pathlib import Path
@@ -69,9 +70,14 @@ class Client:
             return reply.result or {}
         return None
 
-    def status(self) -> Status:
-        """What the daemon is doing. Raises CommandError as `request` and `understood` do."""
-        return understood(self.request("status"))
+    def status(self, wait_s: float = math.inf) -> Status:
+        """What the daemon is doing; an answer is waited for no longer than `wait_s` or what the client waits for any.
+        Raises CommandError as `request` and `understood` do."""
+        longest_s = min(wait_s, self._wait_s)
+        result = self.answer(self.ask("status"), longest_s)
+        if result is None:
+            raise unreachable(self._address, f"no answer within {longest_s:g} s")
+        return understood(result)
 
     def describe(self) -> Description:
         """What the daemon runs. Raises CommandError as `request` does, also for an answer that is not understood."""

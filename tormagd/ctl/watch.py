@@ -12,6 +12,8 @@ from tormagd.output import write_line
 
 LOOK_S = 0.1
 "Between two looks at the daemon's status. It is a new one every 20 ms, and reading it takes a quarter of one."
+LAST_ANSWER_S = 1.0
+"It has answered all the time: a daemon that has gone is not waited for."
 ARRIVAL_S = 0.5
 "By then the last setpoint has arrived: an answer may overtake it."
 LEAST_TAKEN = 0.9
@@ -151,7 +153,7 @@ class Watch:
         """What became of the `sent` setpoints. Raises CommandError where they were not all taken and rendered."""
         until_s = time.monotonic() + ARRIVAL_S
         while True:
-            status = self._client.status()
+            status = self._client.status(LAST_ANSWER_S)
             accepted = _accepted(status, self._source) - self._before
             if accepted >= sent or time.monotonic() > until_s:
                 break
