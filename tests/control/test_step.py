@@ -228,6 +228,11 @@ def test_counts_that_jump_away_are_a_fault(running: Bench, jump_mm: float) -> No
     assert is_opened(running)
 
 
+@pytest.mark.parametrize("side", ["left_mm", "right_mm"])
+def test_counts_of_either_side_that_jump_are_held_at_once(running: Bench, side: str) -> None:
+    assert running.step(**{side: -6.6}).limits == (Limit.ENCODER,), "less than is skew"
+
+
 @pytest.mark.parametrize("jump_mm", [-4.0, 0.5, 4.0])
 def test_counts_of_both_sides_that_jump_alike_are_a_fault_too(running: Bench, jump_mm: float) -> None:
     """No skew shows them, and a gap that seems 8 mm wider is closed by as much."""
@@ -855,9 +860,10 @@ def test_a_sensor_that_stays_doubted_is_a_fault(running: Bench) -> None:
     assert running.faults == (Fault.SENSOR,)
 
 
-def test_an_open_switch_far_from_where_its_carriage_reads_is_a_fault(running: Bench) -> None:
+@pytest.mark.parametrize("switch", [Switches.LEFT_OPEN, Switches.RIGHT_OPEN])
+def test_an_open_switch_far_from_where_its_carriage_reads_is_a_fault(running: Bench, switch: Switches) -> None:
     """Counts were lost, or the switch is stuck: then nothing is driven by either."""
-    assert running.run_into(Fault.OUT_OF_STROKE, switches=Switches.HOMED | Switches.RIGHT_OPEN) == 1
+    assert running.run_into(Fault.OUT_OF_STROKE, switches=Switches.HOMED | switch) == 1
     assert is_opened(running)
 
 
