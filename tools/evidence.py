@@ -122,11 +122,23 @@ def _says_bus(figures: Figures) -> str:
 
 def _says_faults(figures: Figures) -> str:
     cells = figures["cells"]
-    named, safe = (sum(cell[name] for cell in cells) for name in ("named", "safe"))
+    named, safe, in_time = (sum(cell[name] for cell in cells) for name in ("named", "safe", "in_time"))
     opens = [cell["open_ms"] for cell in cells if cell["expected"] == "opens" and cell["open_ms"] is not None]
     return (
-        f"{len(cells)} cells on serial and CAN: {named} named, {safe} ended safe; what is to open is open after at "
+        f"{len(cells)} cells on serial and CAN: {named} named, {safe} ended safe, {in_time} reacted in their "
+        f"stated time; what is to open is open after at "
         f"most {max(opens):g} ms; no force is lost faster than by {max(cell['loss_N_s'] for cell in cells)} N/s"
+    )
+
+
+def _says_planted(figures: Figures) -> str:
+    return f"{figures['caught']} of {figures['planted']} faults planted in safety, step, governor and link are caught"
+
+
+def _says_walk(figures: Figures) -> str:
+    return (
+        f"{figures['steps']:,} steps, {figures['driven']:,} of them driven, {len(figures['faults'])} kinds of faults: "
+        f"{figures['broken'] or 'no duty over its limit, nothing driven while disabled, no way beside the table'}"
     )
 
 
@@ -178,6 +190,8 @@ PARTS = {
     "fuzz": Part("tools/fuzz_protocol.py --json", _says_fuzz),
     "bus": Part("tools/benchmark.py bus --json", _says_bus),
     "faults": Part("tools/faults.py --json", _says_faults),
+    "planted": Part("tools/planted_faults.py --json", _says_planted),
+    "walk": Part("tools/random_walk.py --json", _says_walk),
     "numerics": Part("tools/numerics.py --json", _says_numerics),
     "replug_serial": Part("tools/replug.py --cycles 200 --transport serial --json", _says_replug),
     "replug_can": Part("tools/replug.py --cycles 200 --transport can --json", _says_replug),

@@ -181,7 +181,7 @@ def _reference(errors: StepErrors, rng: np.random.Generator, steps_s: list[float
     for dt_s in steps_s:
         target_mm = float(rng.uniform(0.0, 1.0)) * EXTREME * 95.0
         target_speed = float(rng.uniform(-1.0, 1.0)) * EXTREME * limits.gap_speed_mm_s
-        reference, _ = follow(
+        reference, _, _ = follow(
             limits.gap_acceleration_mm_s2, reference, Reference(target_mm, target_speed), dt_s, speeds
         )
         if not all(map(math.isfinite, (reference.gap_mm, reference.speed_mm_s, reference.acceleration_mm_s2))):

@@ -333,8 +333,8 @@ def raise_fault(state: dict[str, Any]) -> None:
         return
     fault = Fault(state["faults"][0])
     others = "".join(f", then {code}" for code in state["faults"][1:])
-    cause, remedy = FAULTS[fault]
-    raise ShowError(f"{fault}{others}: {cause}", remedy, is_of_time=fault in OF_TIME)
+    known = FAULTS[fault]
+    raise ShowError(f"{fault}{others}: {known.cause}", known.remedy, is_of_time=fault in OF_TIME)
 
 
 def watch(

@@ -320,6 +320,17 @@ class PeersReport(msgspec.Struct, frozen=True, kw_only=True):
     drops: tuple[PeerReport, ...] = ()
 
 
+class OutputReport(msgspec.Struct, frozen=True, kw_only=True):
+    """In how many control ticks each stage of the output has acted since the start, in the order in which they stand:
+    the speed and the acceleration of the gap's reference were limited, a number was not finite, a duty was cut.
+    """
+
+    rate: int = 0
+    slew: int = 0
+    not_finite: int = 0
+    range: int = 0
+
+
 class Status(Telemetry, frozen=True, kw_only=True):
     """The answer to the command `status`: the newest telemetry, and what is worth asking for."""
 
@@ -344,6 +355,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     not_granted: tuple[str, ...]
     way: WayReport | None = None
     black_box: BlackBoxReport = BlackBoxReport()
+    output: OutputReport = OutputReport()
 
 
 class Description(msgspec.Struct, frozen=True, kw_only=True):

@@ -17,9 +17,12 @@ from tormagd.control.sight import BLIND_S, UNSENSED_S
 from tormagd.control.step import (
     CARRY_S,
     EXCHANGE_S,
+    NEVER,
     SENSE_FAULT_S,
+    SENSOR_FAULT_S,
     STARTING_S,
     STATUS_FAULT_S,
+    Acted,
     StepOutput,
     Stepper,
     StepState,
@@ -225,6 +228,11 @@ def test_counts_that_jump_away_are_a_fault(running: Bench, jump_mm: float) -> No
     assert is_opened(running)
 
 
+@pytest.mark.parametrize("side", ["left_mm", "right_mm"])
+def test_counts_of_either_side_that_jump_are_held_at_once(running: Bench, side: str) -> None:
+    assert running.step(**{side: -6.6}).limits == (Limit.ENCODER,), "less than is skew"
+
+
 @pytest.mark.parametrize("jump_mm", [-4.0, 0.5, 4.0])
 def test_counts_of_both_sides_that_jump_alike_are_a_fault_too(running: Bench, jump_mm: float) -> None:
     """No skew shows them, and a gap that seems 8 mm wider is closed by as much."""
@@ -290,6 +298,33 @@ def test_limits_name_what_holds_back(running: Bench) -> None:
     assert Limit.SATURATED in far[-1]
     assert Limit.SKEW not in far[-1]
     assert not running.faults
+
+
+def test_each_stage_of_the_output_is_counted_when_it_acts(running: Bench, core: Core, measure) -> None:
+    running.step(count=5)
+    assert running.state.acted == NEVER, "a gap that is where it should be is held back by nothing"
+    running.step(gap_plan(79.95))
+    assert running.state.acted == Acted(slew=1), "a short way takes no speed, but the reference does not leap"
+    for _ in range(40):  # and is not followed: the duty grows beyond what may be given
+        running.step(gap_plan(50.0))
+    far = running.state.acted
+    assert 0 < far.rate < far.slew + far.rate <= 2 * 41
+    assert 0 < far.range <= 40
+    assert far.not_finite == 0
+    before = far.range
+    _, *duties = driven(running.step(gap_plan(50.0), supply_V=6.0))
+    assert duties == [-CONFIG.position.duty_limit] * 2, "and is cut, whatever the supply would take"
+    assert running.state.acted.range == before + 1
+    running.step(gap_plan(math.nan))
+    assert running.state.acted.not_finite == 1, "counters outlive a start afresh"
+    assert running.state.acted.range == before + 1
+    running.command("clear-fault")
+    running.step(count=3)
+    running.command("enable")
+    running.command("pause")
+    held = running.state.acted
+    running.step(gap_plan(50.0), count=5)
+    assert running.state.acted == held, "where the gap stands there is nothing to hold back"
 
 
 # -- every way a run can fail --------------------------------------------------------------------------------------
@@ -799,6 +834,47 @@ def test_carriages_where_none_can_be_are_a_fault_before_anything_is_driven(bench
     assert bench.faults == (Fault.OUT_OF_STROKE,)
     assert is_opened(bench)
     assert bench.state.safety.needs_homing
+
+
+@pytest.mark.parametrize("least_gap_mm", [0.0, 79.8])
+def test_the_gap_is_closed_no_further_than_this_device_allows(running: Bench, least_gap_mm: float) -> None:
+    running.step(gap_plan(50.0).replaced(least_gap_mm=least_gap_mm), count=40)
+    assert running.state.reference is not None
+    assert (running.state.reference.gap_mm >= 79.7) == (least_gap_mm > 0.0)
+
+
+def test_too_much_force_opens_and_is_then_a_fault(running: Bench) -> None:
+    limits = [running.step(force_N=3.0).limits for _ in range(35)]
+    assert Limit.OVER_FORCE not in limits[5]
+    assert Limit.OVER_FORCE in limits[30]
+    assert running.state.reference is not None
+    assert running.state.reference.gap_mm > 80.0
+    assert running.run_into(Fault.OVER_FORCE, force_N=3.0) < 20
+    assert is_opened(running)
+
+
+def test_a_sensor_that_stays_doubted_is_a_fault(running: Bench) -> None:
+    running.step(gap_plan(80.0).replaced(sensor_doubted_s=SENSOR_FAULT_S))
+    assert not running.faults
+    running.step(gap_plan(80.0).replaced(sensor_doubted_s=1.01 * SENSOR_FAULT_S))
+    assert running.faults == (Fault.SENSOR,)
+
+
+@pytest.mark.parametrize("switch", [Switches.LEFT_OPEN, Switches.RIGHT_OPEN])
+def test_an_open_switch_far_from_where_its_carriage_reads_is_a_fault(running: Bench, switch: Switches) -> None:
+    """Counts were lost, or the switch is stuck: then nothing is driven by either."""
+    assert running.run_into(Fault.OUT_OF_STROKE, switches=Switches.HOMED | switch) == 1
+    assert is_opened(running)
+
+
+def test_a_switch_that_is_newer_than_the_position_says_nothing(running: Bench, measure) -> None:
+    """Status comes without a State, too: by then the carriage may have come to its switch."""
+    last = running.ticks
+    running.silent(measure(last), 8)
+    assert running.state.sight.is_blind
+    open_now = Switches.HOMED | Switches.RIGHT_OPEN
+    running.silent(measure(last, switches=open_now, reported_s=running.now_s), 20)
+    assert not running.faults
 
 
 @pytest.mark.parametrize("gap_mm", [40.5, 42.0, 44.9])

@@ -39,7 +39,7 @@ def test_speed_and_acceleration_limits_hold_for_any_target(
     reference = Reference(start)
     for target, speed, turning, dt_s in targets:
         last = reference
-        reference, _ = follow(position.gap_acceleration_mm_s2, last, Reference(target, speed, turning), dt_s, speeds)
+        reference, _, _ = follow(position.gap_acceleration_mm_s2, last, Reference(target, speed, turning), dt_s, speeds)
         assert math.isfinite(reference.gap_mm + reference.speed_mm_s + reference.acceleration_mm_s2)
         rounding = 1.0 + 1e-12
         assert -speeds.closing_mm_s * rounding <= reference.speed_mm_s <= speeds.opening_mm_s * rounding
@@ -64,7 +64,7 @@ def test_a_step_is_reached_without_overshoot(position: Position, speeds: Speeds,
     for _ in range(
         round(1_000 * (distance / min(speeds.no_load_mm_s, speeds.opening_mm_s, speeds.closing_mm_s) + 1.0))
     ):
-        reference, _ = follow(position.gap_acceleration_mm_s2, reference, Reference(target), DT_S, speeds)
+        reference, _, _ = follow(position.gap_acceleration_mm_s2, reference, Reference(target), DT_S, speeds)
         assert (reference.gap_mm - target) * math.copysign(1.0, target - start) <= HALF_COUNT_MM
     assert reference.gap_mm == pytest.approx(target, abs=1e-3)
     assert abs(reference.speed_mm_s) < 0.1
@@ -74,7 +74,7 @@ def test_a_step_takes_hardly_longer_than_its_limits_ask() -> None:
     """1 mm of gap: time-optimal with this acceleration is 2 sqrt(d / a); the last stretch is a little slower."""
     reference, ticks = Reference(70.0), 0
     while abs(reference.gap_mm - 69.0) > 0.1:
-        reference, _ = follow(MOST_MM_S2, reference, Reference(69.0), DT_S, SPEEDS)
+        reference, _, _ = follow(MOST_MM_S2, reference, Reference(69.0), DT_S, SPEEDS)
         ticks += 1
     assert ticks * DT_S < 1.3 * 2.0 * math.sqrt(1.0 / LIMITS.gap_acceleration_mm_s2)
 
@@ -85,7 +85,7 @@ def test_a_ramp_slower_than_the_limit_is_followed_without_lag(start: float, spee
     reference, target, is_limited = Reference(start), start, True
     for _ in range(800):
         target += speed * DT_S
-        reference, is_limited = follow(MOST_MM_S2, reference, Reference(target, speed), DT_S, SPEEDS)
+        reference, is_limited, _ = follow(MOST_MM_S2, reference, Reference(target, speed), DT_S, SPEEDS)
     # its sampling is one period late at most
     assert abs(reference.gap_mm - target) <= abs(speed) * DT_S + 1e-6
     assert reference.speed_mm_s == pytest.approx(speed, abs=1e-3)
@@ -93,11 +93,11 @@ def test_a_ramp_slower_than_the_limit_is_followed_without_lag(start: float, spee
 
 
 def test_being_held_back_is_said() -> None:
-    reference, is_limited = follow(MOST_MM_S2, Reference(95.0), Reference(45.0), DT_S, SPEEDS)
+    reference, is_limited, _ = follow(MOST_MM_S2, Reference(95.0), Reference(45.0), DT_S, SPEEDS)
     assert is_limited
-    _, is_limited = follow(MOST_MM_S2, reference, Reference(reference.gap_mm), DT_S, SPEEDS)
+    _, is_limited, _ = follow(MOST_MM_S2, reference, Reference(reference.gap_mm), DT_S, SPEEDS)
     assert not is_limited
-    _, is_limited = follow(
+    _, is_limited, _ = follow(
         MOST_MM_S2, reference, Reference(reference.gap_mm, 2.0 * LIMITS.gap_speed_mm_s), DT_S, SPEEDS
     )
     assert is_limited
@@ -112,7 +112,7 @@ def test_any_period_stays_finite_and_arrives(start: float, target: float, dt_s: 
     # one period of full braking covers a dt^2 / 2: a slow loop cannot stop more exactly than a part of that
     grain = HALF_COUNT_MM + 0.2 * LIMITS.gap_acceleration_mm_s2 * dt_s**2
     for _ in range(400):
-        reference, _ = follow(MOST_MM_S2, reference, Reference(target), dt_s, SPEEDS)
+        reference, _, _ = follow(MOST_MM_S2, reference, Reference(target), dt_s, SPEEDS)
         assert math.isfinite(reference.gap_mm + reference.speed_mm_s + reference.acceleration_mm_s2)
         assert min(start, target) - grain <= reference.gap_mm <= max(start, target) + grain
     if dt_s * 400 > 4.0:
@@ -121,13 +121,13 @@ def test_any_period_stays_finite_and_arrives(start: float, target: float, dt_s: 
 
 @given(start=gaps, target=gaps, speed=st.floats(-100.0, 100.0), turning=st.floats(-1e4, 1e4), dt_s=periods)
 def test_opening_and_closing_are_alike(start: float, target: float, speed: float, turning: float, dt_s: float) -> None:
-    forth, _ = follow(MOST_MM_S2, Reference(start, 10.0), Reference(target, speed, turning), dt_s, SPEEDS)
-    back, _ = follow(MOST_MM_S2, Reference(-start, -10.0), Reference(-target, -speed, -turning), dt_s, SPEEDS)
+    forth, _, _ = follow(MOST_MM_S2, Reference(start, 10.0), Reference(target, speed, turning), dt_s, SPEEDS)
+    back, _, _ = follow(MOST_MM_S2, Reference(-start, -10.0), Reference(-target, -speed, -turning), dt_s, SPEEDS)
     assert back == Reference(-forth.gap_mm, -forth.speed_mm_s, -forth.acceleration_mm_s2)
 
 
 def test_a_target_at_rest_is_kept() -> None:
-    reference, is_limited = follow(MOST_MM_S2, Reference(70.0), Reference(70.0), DT_S, SPEEDS)
+    reference, is_limited, _ = follow(MOST_MM_S2, Reference(70.0), Reference(70.0), DT_S, SPEEDS)
     assert (reference, is_limited) == (Reference(70.0), False)
 
 
@@ -136,7 +136,7 @@ def test_either_way_has_its_own_limit() -> None:
     for target, most in ((95.0, 30.0), (45.0, LIMITS.gap_speed_mm_s)):
         reference, speeds = Reference(70.0), []
         for _ in range(500):
-            reference, _ = follow(MOST_MM_S2, reference, Reference(target), DT_S, slow)
+            reference, _, _ = follow(MOST_MM_S2, reference, Reference(target), DT_S, slow)
             speeds.append(abs(reference.speed_mm_s))
         assert max(speeds) == pytest.approx(most, rel=1e-3)
 
@@ -150,7 +150,7 @@ def test_a_target_that_turns_is_met_where_it_turns() -> None:
             phase = 2.0 * math.pi * 3.0 * tick * DT_S
             rate = 2.0 * math.pi * 3.0
             target = Reference(71.0 - math.cos(phase), rate * math.sin(phase), rate**2 * math.cos(phase) * is_known)
-            reference, _ = follow(MOST_MM_S2, reference, target, DT_S, SPEEDS)
+            reference, _, _ = follow(MOST_MM_S2, reference, target, DT_S, SPEEDS)
             worst = max(worst, abs(reference.gap_mm - target.gap_mm))
         excess[is_known] = worst
     assert excess[True] <= excess[False]

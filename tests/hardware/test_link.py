@@ -475,6 +475,7 @@ def test_what_is_missing_for_a_measurement_is_said(heard, refused, missing: str)
     for message in heard:
         link.receive(0.01, message)
     assert link.missing(refused) == missing
+    assert link.measurement is None
 
 
 def test_nothing_is_missing_where_there_is_a_measurement() -> None:

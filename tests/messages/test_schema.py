@@ -18,6 +18,7 @@ from tormagd.messages import (
     Explained,
     LatenessReport,
     LinkReport,
+    OutputReport,
     PeerReport,
     PeersReport,
     ProfileReport,
@@ -46,7 +47,8 @@ V1: dict[type[msgspec.Struct], str] = {
     Status: f"{TELEMETRY} version build scene uptime_s least_N most_N trim device profile least_gap_mm link setpoints "
     "peers "
     "rates late_ticks_by fault_details limit_details newest_stall not_granted way "
-    "black_box",
+    "black_box output",
+    OutputReport: "rate slew not_finite range",
     LinkReport: "state cause remedy backend port losses last_loss firmware serial_number firmware_schema daemon_schema "
     "protocol_version frames bytes corrupt lost repeated resynchronisations round_trip_us clock unsent refused "
     "unanswered_share damaged_share",

@@ -8,18 +8,24 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import (
     CLEARING_S,
+    COMMANDS,
     LOST_POSITION,
+    ROWS,
+    TRANSITIONS,
     Conditions,
     DeviceRequest,
+    Event,
     OperatingState,
+    Refusal,
     RefusedError,
     SafetyState,
+    Transition,
     command,
     homed_again,
     latch,
+    reason,
 )
 
-COMMANDS = ("enable", "disable", "pause", "resume", "home", "stop", "clear-fault")
 READY = Conditions(
     connected=True, fresh=True, homed=True, busy=False, device_latched=False, requested_N=None, neutral_N=0.5
 )
@@ -62,6 +68,12 @@ def test_starts_disabled_and_asks_nothing() -> None:
         ({"fresh": False}, "not_fresh"),
         ({"requested_N": 0.501}, "not_neutral"),
         ({"requested_N": float("nan")}, "not_neutral"),
+        ({"sensor_doubted": True}, "sensor_doubted"),
+        ({"apart_mm": 1.01, "most_apart_mm": 1.0}, "skewed"),
+        ({"apart_mm": float("nan"), "most_apart_mm": 1.0}, "skewed"),
+        ({"round_trip_s": 0.0111, "most_round_trip_s": 0.011}, "link_degraded"),
+        ({"clock_drift": -0.101, "most_clock_drift": 0.1}, "clock"),
+        ({"clock_drift": 0.101, "most_clock_drift": 0.1}, "clock"),
     ],
 )
 def test_enable_wants_every_condition(changes: dict[str, bool | float], code: str) -> None:
@@ -121,6 +133,12 @@ def test_without_a_device_only_stop_is_taken(name: str) -> None:
         assert command(SafetyState(), name, 0.0, gone).faults == (Fault.STOPPED,)
     else:
         assert refusal(SafetyState(), name, gone).code == "not_connected"
+
+
+@pytest.mark.parametrize("name", ["enable", "home"])
+def test_a_device_that_has_latched_is_cleared_first(name: str) -> None:
+    refused = refusal(SafetyState(), name, READY.replaced(device_latched=True))
+    assert (refused.code, refused.hint.split(",")[0]) == ("device_latched", "tormagctl clear-fault")
 
 
 @pytest.mark.parametrize("name", ["enable", "home", "clear-fault"])
@@ -196,6 +214,12 @@ def test_an_encoder_fault_takes_homing_away_until_the_device_has_homed_again(fau
     assert command(homed_again(homing, is_homed=True), "enable", 2.0, READY).operating_state is ENABLED
 
 
+def test_a_fault_that_comes_later_gives_no_position_back() -> None:
+    both = latch(latch(SafetyState(), (Fault.SKEW,)), (Fault.STOPPED,))
+    assert both.needs_homing
+    assert refusal(command(both, "clear-fault", 2.0, READY), "enable").code == "not_homed"
+
+
 def test_other_faults_leave_homing_to_the_device() -> None:
     others = tuple(fault for fault in Fault if fault not in LOST_POSITION)
     cleared = command(latch(SafetyState(), others), "clear-fault", 2.0, READY)
@@ -205,6 +229,57 @@ def test_other_faults_leave_homing_to_the_device() -> None:
 def test_faults_are_kept_in_the_order_they_came() -> None:
     state = latch(latch(SafetyState(), (Fault.SKEW,)), (Fault.STOPPED, Fault.SKEW, Fault.LINK_LOST))
     assert state.faults == (Fault.SKEW, Fault.STOPPED, Fault.LINK_LOST)
+
+
+@given(found=st.lists(st.sampled_from(Fault), unique=True, max_size=len(Fault)))
+def test_faults_that_show_at_once_are_named_in_the_order_of_their_table(found: list[Fault]) -> None:
+    """Causes before what follows of them, whatever order a step looked in."""
+    assert latch(SafetyState(), tuple(found)).faults == tuple(fault for fault in Fault if fault in found)
+
+
+def test_the_table_has_a_row_for_every_event_in_every_state() -> None:
+    assert len(TRANSITIONS) == len(ROWS) == len(Event) * len(OperatingState)
+    for (event, source), row in TRANSITIONS.items():
+        assert (row.event, row.source) == (event, source)
+
+
+def test_what_the_table_promises() -> None:
+    """The rules of arming, as the rows have them."""
+    taken = [row for row in ROWS if isinstance(row, Transition)]
+    assert [(row.event, row.source) for row in taken if row.target is ENABLED and row.source is not ENABLED] == [
+        (Event.ENABLE, DISABLED),
+        (Event.RESUME, PAUSED),
+    ]
+    assert {row.event for row in taken if row.source is FAULT and row.target is not FAULT} == {Event.CLEAR_FAULT}
+    for row in taken:
+        if row.target is FAULT or (row.source in (ENABLED, PAUSED) and row.target is DISABLED):
+            assert row.request is DeviceRequest.RETRACT
+        if row.event in (Event.STOP, Event.FAULT):
+            assert (row.target, row.guards) == (FAULT, ())
+        elif row.event is not Event.FAULT:
+            assert row.guards[0].code == "not_connected"
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.event} in {row.source}")
+def test_a_command_does_what_its_row_says(row: Transition | Refusal) -> None:
+    before = FAULTED if row.source is FAULT else SafetyState(row.source)
+    if isinstance(row, Refusal):
+        assert (refused := refusal(before, row.event)).code == row.code
+        assert refused.hint == row.remedy
+        assert reason(row.event, row.source) == ""
+        return
+    # a device that has latched keeps one from homing and enabling, and is what there is to be cleared
+    present = READY.replaced(device_latched=row.request is DeviceRequest.CLEAR)
+    found = (Fault.SKEW,)
+    after = latch(before, found) if row.event is Event.FAULT else command(before, row.event, 1.0, present)
+    assert after.operating_state is row.target
+    assert after.request_number - before.request_number == (row.request is not DeviceRequest.NONE)
+    if row.request is not DeviceRequest.NONE:
+        assert after.request is row.request
+    assert reason(row.event, row.source) == f"{row.source} to {row.target}: {row.reason}"
+    for guard in row.guards:
+        assert guard.wants
+        assert guard.remedy
 
 
 @given(present=faults, again=faults)
@@ -238,6 +313,9 @@ class Operating(RuleBasedStateMachine):
             return
         self.state = after
         self._check_request(before)
+        row = TRANSITIONS[Event(name), before.operating_state]
+        assert isinstance(row, Transition)
+        assert self.state.operating_state is row.target
         if name == "enable":
             assert before.operating_state is DISABLED
             assert present.homed
@@ -267,7 +345,7 @@ class Operating(RuleBasedStateMachine):
             assert self.state.request_number == before.request_number + 1
         else:
             assert self.state is before
-        self.is_position_lost |= not LOST_POSITION.isdisjoint(self.state.faults)
+        self.is_position_lost |= not LOST_POSITION.isdisjoint(set(found) - set(before.faults))
         assert set(self.state.faults) == {*before.faults, *found}
 
     def _commanded(self, name: str, present: Conditions) -> SafetyState | None:

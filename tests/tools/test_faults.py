@@ -5,7 +5,11 @@ import pytest
 
 from tormagd.scenes.scene import load_scene
 
-DRIVEN = [injection for injection in faults.MATRIX if injection.is_driven]
+DRIVEN = [
+    item
+    for item in faults.MATRIX
+    if item.is_driven and item.sensor is None and item.publisher is None and item.device not in faults.UNLIKE_LOSSES
+]
 SAMPLED = (
     "daemon killed or cable cut",
     "daemon stalls for 45 ms",
@@ -23,6 +27,8 @@ SAMPLED = (
     "20% of the frames overtaken",
     "round trip of 15 ms",
     "every other Drive answered",
+    "left open switch stuck",
+    "setpoints of NaN",
     "homing: left motor wired the wrong way",
     "from the start: wrong CRC-8 in State",
 )
@@ -40,6 +46,7 @@ def test_a_fault_is_named_and_ends_safe(name: str, bus: str) -> None:
     assert (cell.bus, cell.fault) == (bus, name)
     assert cell.named, cell
     assert cell.safe, cell
+    assert cell.in_time, cell
     if cell.expected == faults.OPENS:
         assert cell.open_ms is not None
         assert cell.below_1N_ms is not None
@@ -59,8 +66,8 @@ def test_no_force_is_lost_faster_than_the_scene_allows(item: faults.Injection, p
 def test_a_cell_that_is_not_named_or_not_safe_is_told_from_one_that_is() -> None:
     """The judge has to be able to say no."""
     (stuck,) = (item for item in faults.MATRIX if item.name == "left encoder stuck")
-    unnamed = faults.inject(stuck._replace(names=("SENSOR",)), "sample_1")
-    assert (unnamed.named, unnamed.safe) == (False, True)
+    unnamed = faults.inject(stuck._replace(names=("SENSOR",), within_ms=10.0), "sample_1")
+    assert (unnamed.named, unnamed.safe, unnamed.in_time) == (False, True, False)
     (supply,) = (item for item in faults.MATRIX if item.name == "motor supply fails")
     unsafe = faults.inject(supply._replace(safe=faults.OPENS), "sample_1")
     assert (unsafe.named, unsafe.safe) == (True, False)

@@ -66,7 +66,11 @@ def leap_between(
     return Leap(now_s, left_mm, right_mm, within_s, last.left_mm, last.right_mm)
 
 
-def is_outside(estimate: Estimate, closed_mm: float, open_mm: float) -> bool:
-    """Whether a carriage of a homed device reads a place where none can be, for gaps from `closed_mm` to `open_mm`."""
+def is_outside(estimate: Estimate, closed_mm: float, open_mm: float, is_left_open: bool, is_right_open: bool) -> bool:
+    """Whether a carriage of a homed device reads a place where none can be, for gaps from `closed_mm` to `open_mm`, or
+    where it cannot be because its open switch is closed: there it was homed."""
     least_mm, most_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
-    return not (least_mm <= estimate.left_mm <= most_mm and least_mm <= estimate.right_mm <= most_mm)
+    home_mm = open_mm / 2.0 - OVERRUN_MM
+    left_least_mm = home_mm if is_left_open else least_mm
+    right_least_mm = home_mm if is_right_open else least_mm
+    return not (left_least_mm <= estimate.left_mm <= most_mm and right_least_mm <= estimate.right_mm <= most_mm)

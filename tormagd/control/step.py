@@ -21,7 +21,6 @@ from tormagd.safety.operating_state import (
     Conditions,
     DeviceRequest,
     OperatingState,
-    RefusedError,
     SafetyState,
     command,
     homed_again,
@@ -77,6 +76,28 @@ NO_LIMITS: Final[tuple[Limit, ...]] = ()
 
 
 @final
+class Acted(Value):
+    """In how many steps each stage of the output has acted, in the order in which they stand: the speed and then the
+    acceleration of the gap's reference were limited, a number was not finite, a duty was out of its range.
+
+    Duties have no slew limit: the reference's acceleration bounds what is asked of the motors, their windings smooth
+    the rest within `motor.inductance`, and a limit in between would only take phase away from the position loop.
+    """
+
+    __match_args__ = ("rate", "slew", "not_finite", "range")
+    __slots__ = __match_args__
+
+    def __init__(self, rate: int = 0, slew: int = 0, not_finite: int = 0, range: int = 0) -> None:
+        self.rate: Final = rate
+        self.slew: Final = slew
+        self.not_finite: Final = not_finite
+        self.range: Final = range
+
+
+NEVER: Final = Acted()
+
+
+@final
 class StepState(Value):
     """What a step remembers."""
 
@@ -97,6 +118,7 @@ class StepState(Value):
         "opposed_s",
         "leap",
         "homing",
+        "acted",
     )
     __slots__ = __match_args__
 
@@ -118,6 +140,7 @@ class StepState(Value):
         opposed_s: float = 0.0,
         leap: Leap | None = None,
         homing: Homing | None = None,
+        acted: Acted = NEVER,
     ) -> None:
         self.time_s: Final = time_s
         self.safety: Final = safety
@@ -142,6 +165,7 @@ class StepState(Value):
         "Of the encoders, until the device has said whether it was reset."
         self.homing: Final = homing
         "The newest."
+        self.acted: Final = acted
 
 
 @final
@@ -209,25 +233,22 @@ class Stepper:
 
     def command(self, state: StepState, name: str, now_s: float, conditions: Conditions) -> StepState:
         """The state after an operator's command. Raises RefusedError."""
-        safety = command(state.safety, name, now_s, conditions)
+        estimate = state.estimate
+        known = conditions.replaced(
+            fresh=conditions.fresh and estimate is not None,
+            apart_mm=math.inf if estimate is None else abs(estimate.skew_mm),
+            most_apart_mm=self._skew_fault_mm,
+            most_round_trip_s=self._too_slow_s,
+            most_clock_drift=CLOCK_FAULT,
+        )
+        safety = command(state.safety, name, now_s, known)
         if safety.operating_state is OperatingState.ENABLED and state.safety.operating_state is OperatingState.DISABLED:
+            assert estimate is not None, "nothing is fresh without one"
             # bumpless: from where the gap is, at rest, with empty integrators
-            if state.estimate is None:
-                raise RefusedError(
-                    "not_fresh", "no measurement from the device yet", "look at the link in tormagctl status"
-                )
-            apart_mm, most_mm = abs(state.estimate.skew_mm), self._skew_fault_mm
-            if not apart_mm <= most_mm:
-                raise RefusedError(
-                    "skewed",
-                    f"the carriages are {apart_mm:.2f} mm apart: allowed is at most {most_mm:g} mm",
-                    "tormagctl home",
-                )
-            self._refuse_degraded(conditions)
             return state.replaced(
                 safety=safety,
-                reference=Reference(state.estimate.gap_mm),
-                expected=Expected(state.estimate.gap_mm),
+                reference=Reference(estimate.gap_mm),
+                expected=Expected(estimate.gap_mm),
                 left=EMPTY,
                 right=EMPTY,
                 enabled_s=now_s,
@@ -237,22 +258,6 @@ class Stepper:
                 opposed_s=0.0,
             )
         return state.replaced(safety=safety)
-
-    def _refuse_degraded(self, conditions: Conditions) -> None:
-        """Before anything swings."""
-        if not conditions.round_trip_s <= self._too_slow_s:
-            raise RefusedError(
-                "link_degraded",
-                f"the round trip to the device is {conditions.round_trip_s * 1e3:.1f} ms: allowed is at most "
-                f"{self._too_slow_s * 1e3:.1f} ms, or the carriages swing",
-                "look at the round trip in tormagctl firmware; tormagctl doctor finds a USB adapter's latency timer",
-            )
-        if not abs(conditions.clock_drift) <= CLOCK_FAULT:
-            raise RefusedError(
-                "clock",
-                f"the device's clock is off by {conditions.clock_drift:+.1%}: allowed is {CLOCK_FAULT:.0%}",
-                "check the firmware's timer and its clock source",
-            )
 
     def lose_link(self, state: StepState) -> StepState:
         """The state after the link broke: a fault where the device was driven, otherwise only a forgotten estimate."""
@@ -340,13 +345,14 @@ class Stepper:
         speeds = self._speeds(pull, expected, estimate)
         limits: list[Limit] = []
         if safety.operating_state is OperatingState.PAUSED:
-            reference, _ = follow(self._gap_acceleration_mm_s2, reference, Reference(reference.gap_mm), dt_s, speeds)
+            target = Reference(reference.gap_mm)
+            reference, is_limited, is_slewed = follow(self._gap_acceleration_mm_s2, reference, target, dt_s, speeds)
         else:
             target = self._target(plan, now_s)
             if state.over_s > OVER_HELD_S:
                 target = Reference(self._open_mm)
                 limits.append(Limit.OVER_FORCE)
-            reference, is_limited = follow(self._gap_acceleration_mm_s2, reference, target, dt_s, speeds)
+            reference, is_limited, is_slewed = follow(self._gap_acceleration_mm_s2, reference, target, dt_s, speeds)
             if is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
                 limits.append(Limit.RATE)
         left_error, right_error = self._errors(expected, estimate)
@@ -361,8 +367,9 @@ class Stepper:
         right_state, right = pid(self._gains, right_state, right_error, ahead, dt_s, is_blocked=is_right_blocked)
         total = left.duty + right.duty + measurement.supply_V
         if not -math.inf < total < math.inf:  # a sum is finite only if all of it is
-            safety = latch(safety, (Fault.NOT_FINITE,))
-            return self.start(now_s).replaced(safety=safety), self._off(safety, NO_LIMITS)
+            safety, acted = latch(safety, (Fault.NOT_FINITE,)), state.acted
+            acted = acted.replaced(not_finite=acted.not_finite + 1)
+            return self.start(now_s).replaced(safety=safety, acted=acted), self._off(safety, NO_LIMITS)
         if left.is_saturated or right.is_saturated:
             limits.append(Limit.SATURATED)
         if abs(estimate.skew_mm) > self._skew_warning_mm:
@@ -376,6 +383,14 @@ class Stepper:
             limits.append(Limit.LINK_DEGRADED)
         if abs(link.clock_drift) > CLOCK_OFF:
             limits.append(Limit.CLOCK)
+        # the bridges switch the device's real supply: the same volts take less duty of a higher one
+        scale = self._supply_V / max(measurement.supply_V, 0.5 * self._supply_V)
+        most = self._gains.duty_limit
+        left_duty, right_duty = left.duty * scale, right.duty * scale
+        is_out = left.is_saturated or right.is_saturated or max(abs(left_duty), abs(right_duty)) > most
+        acted = state.acted
+        if is_limited or is_slewed or is_out:
+            acted = Acted(acted.rate + is_limited, acted.slew + is_slewed, acted.not_finite, acted.range + is_out)
         state = StepState(
             time_s=now_s,
             safety=safety,
@@ -392,14 +407,12 @@ class Stepper:
             sight=sight,
             opposed_s=self._opposed_s(state, estimate, left.duty, right.duty, dt_s),
             homing=state.homing,
+            acted=acted,
         )
-        # the bridges switch the device's real supply: the same volts take less duty of a higher one
-        scale = self._supply_V / max(measurement.supply_V, 0.5 * self._supply_V)
-        most = self._gains.duty_limit
         output = StepOutput(
             DriveMode.RUN,
-            min(max(left.duty * scale, -most), most),
-            min(max(right.duty * scale, -most), most),
+            min(max(left_duty, -most), most),
+            min(max(right_duty, -most), most),
             safety.request,
             safety.request_number,
             tuple(limits),
@@ -457,6 +470,7 @@ class Stepper:
         leap: Leap | None,
         homing: Homing | None,
     ) -> tuple[Fault, ...]:
+        """All that show now; `latch` names them in the order of their table."""
         faults: list[Fault] = []
         if homing is not None and homing.faults:
             faults.extend(homing.faults)
@@ -468,10 +482,12 @@ class Stepper:
         if leap is not None:
             if measurement.reported_s > leap.seen_s:  # so it was not reset in between
                 faults.append(Fault.ENCODER)
-        elif (
-            estimate.is_homed and not state.safety.needs_homing and is_outside(estimate, self._closed_mm, self._open_mm)
-        ):
-            faults.append(Fault.OUT_OF_STROKE)
+        elif estimate.is_homed and not state.safety.needs_homing:
+            # switches come with Status: without a State, positions are older than they are
+            is_left_open = not sight.is_blind and measurement.is_left_open
+            is_right_open = not sight.is_blind and measurement.is_right_open
+            if is_outside(estimate, self._closed_mm, self._open_mm, is_left_open, is_right_open):
+                faults.append(Fault.OUT_OF_STROKE)
         if state.safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             return tuple(faults)
         # what has just come over a slow line is old too, and a loop around it would swing

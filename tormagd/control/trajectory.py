@@ -56,8 +56,9 @@ class Expected(Value):
 
 def follow(
     acceleration_mm_s2: float, reference: Reference, target: Reference, dt_s: float, speeds: Speeds
-) -> tuple[Reference, bool]:
-    """The reference `dt_s` later, and whether the speed limit holds it back from the target, which moves.
+) -> tuple[Reference, bool, bool]:
+    """The reference `dt_s` later, whether the speed limit holds it back from the target, which moves, and whether the
+    limit of its acceleration does.
 
     The closing speed is the largest from which the distance left still suffices to brake with
     `acceleration_mm_s2`, so that a step is time-optimal under the limits and does not overshoot. The target's own
@@ -80,9 +81,10 @@ def follow(
         if is_opening
         else (acceleration_mm_s2, acceleration_mm_s2 * torque)
     )
-    chosen = min(max((bounded - reference.speed_mm_s) / dt_s, -down), up)
+    asked = (bounded - reference.speed_mm_s) / dt_s
+    chosen = min(max(asked, -down), up)
     speed = reference.speed_mm_s + chosen * dt_s
-    return Reference(reference.gap_mm + speed * dt_s, speed, chosen), bounded != wanted
+    return Reference(reference.gap_mm + speed * dt_s, speed, chosen), bounded != wanted, chosen != asked
 
 
 def expect(expected: Expected, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> Expected:

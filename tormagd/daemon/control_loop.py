@@ -10,7 +10,7 @@ from tormagd.daemon.rate_group import RateGroup
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import Conditions, RefusedError, latch
+from tormagd.safety.operating_state import Conditions, RefusedError, latch, reason
 
 log = logging.getLogger(__name__)
 
@@ -47,14 +47,14 @@ class ControlLoop:
 
     def command(self, name: str, conditions: Conditions) -> None:
         """An operator's command. Raises RefusedError."""
-        now_s = time.monotonic()
+        now_s, source = time.monotonic(), self.state.safety.operating_state
         try:
             self.state = self._stepper.command(self.state, name, now_s, conditions)
         except RefusedError:
             self._journal.commanded(name, now_s, conditions, is_refused=True)
             raise
         self._journal.commanded(name, now_s, conditions, is_refused=False)
-        log.info("%s: %s", name, self.state.safety.operating_state)
+        log.info("%s: %s", name, reason(name, source))
 
     def latch(self, fault: Fault) -> None:
         """Latches a fault that was found outside the step."""

@@ -26,7 +26,7 @@ from tormagd.daemon.telemetry import is_driven, snapshot, tick_record
 from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.link import LinkState
-from tormagd.messages import Description, DeviceReport, Request, Status, Telemetry, TickRecord
+from tormagd.messages import Description, DeviceReport, OutputReport, Request, Status, Telemetry, TickRecord
 from tormagd.safety.operating_state import Conditions, RefusedError
 
 NS = 1_000_000_000
@@ -237,7 +237,7 @@ class TelemetryLoop:
 
     def _build_status(self, newest: Telemetry) -> Status:
         safety, planned = self._control.state.safety, self._inference.state
-        plan, shown = planned.plan, planned.device
+        plan, shown, acted = planned.plan, planned.device, self._control.state.acted
         # a command of this very period has changed the state since the snapshot, and whoever gave it asks now
         known = msgspec.structs.asdict(newest) | {
             "operating_state": str(safety.operating_state),
@@ -276,4 +276,5 @@ class TelemetryLoop:
             not_granted=self._not_granted,
             way=self._way.report(None if link.round_trip_us is None else link.round_trip_us.p50),
             black_box=self._box.report(),
+            output=OutputReport(rate=acted.rate, slew=acted.slew, not_finite=acted.not_finite, range=acted.range),
         )

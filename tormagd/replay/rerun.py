@@ -20,7 +20,7 @@ from tormagd.control.sensor import Past, Sensor
 from tormagd.control.sensor_zero import Level, SensorZero
 from tormagd.control.sight import Sight
 from tormagd.control.slow_friction import SlowFriction
-from tormagd.control.step import StepOutput, StepState
+from tormagd.control.step import Acted, StepOutput, StepState
 from tormagd.control.trajectory import Expected, Reference
 from tormagd.daemon.inference_loop import PLAN_ERRORS
 from tormagd.daemon.telemetry import tick_record
@@ -42,7 +42,20 @@ from tormagd.safety.operating_state import (
 )
 
 KNOWN = kinds(
-    *(StepState, SafetyState, OperatingState, DeviceRequest, Fault, Limit, Estimate, Handle, Turn, Reference, Expected),
+    *(
+        StepState,
+        Acted,
+        SafetyState,
+        OperatingState,
+        DeviceRequest,
+        Fault,
+        Limit,
+        Estimate,
+        Handle,
+        Turn,
+        Reference,
+        Expected,
+    ),
     *(PidState, Sight, Leap, Homing, PlanState, GovernorState, Periodicity, Skill, Guess, Plan, Outside, Shown),
     *(DeviceFit, Sensor, Past, SlowFriction, SensorZero, Level, Conditions, DeviceMode, Switches),
 )

@@ -6,46 +6,83 @@ from typing import NamedTuple
 from firmware_protocol.codec import DeviceFault
 
 
+class Reaction(StrEnum):
+    """How it ends: what is safe in view of a code."""
+
+    OPENING = "opening"
+    "The gap opens at a bounded speed, and the drives go off there."
+    LIMITED = "limited"
+    "The force is held away from what is asked, and the device stays driven."
+    HELD = "held"
+    "The gap stays where it is, or the force goes on as asked: nothing closes the gap."
+
+
+class Position(StrEnum):
+    """What is known of the carriages' places afterwards."""
+
+    KEPT = "kept"
+    LOST_HERE = "lost"
+    "Not what the encoders say. The device does not know, and goes on calling itself homed."
+    LOST_THERE = "given up by the device"
+    "A device that has latched, or was reset, does not call itself homed."
+
+
 class Explanation(NamedTuple):
-    """What a person needs to know about a code."""
+    """What a person needs to know about a code, and how soon what is safe is on its way."""
 
     cause: str
     remedy: str
+    reaction: Reaction = Reaction.HELD
+    safe_ms: float = 100.0
+    "The longest from its being there, and showing, to the beginning of the reaction. 50 ms are the device's timeout."
+    shows: str = "at once"
+    "What it takes to be seen: many faults hide from a device at rest."
+    position: Position = Position.KEPT
+
+    @property
+    def clears(self) -> str:
+        """What takes a fault with this explanation away, and what is wanted before `enable`."""
+        return "clear-fault" if self.position is Position.KEPT else "clear-fault, then home"
 
 
 class Fault(StrEnum):
-    """Why the device was opened. Latched until `clear-fault`."""
+    """Why the device was opened. Latched until `clear-fault`.
 
-    LINK_LOST = "LINK_LOST"
+    In the order in which those are named that show at once: what somebody did and what stopped the loop, a motor that
+    goes the wrong way, what the device says of itself, which readings are not to be believed, and last what is
+    concluded from readings: causes before what follows of them.
+    """
+
+    STOPPED = "STOPPED"
     HOST_STALL = "HOST_STALL"
-    LINK_DEGRADED = "LINK_DEGRADED"
+    LINK_LOST = "LINK_LOST"
+    PLAN_FAILED = "PLAN_FAILED"
+    NOT_FINITE = "NOT_FINITE"
+    WRONG_DIRECTION = "WRONG_DIRECTION"
+    DEVICE_SCHEMA_MISMATCH = "DEVICE_SCHEMA_MISMATCH"
+    DEVICE_SUPPLY = "DEVICE_SUPPLY"
+    DEVICE_TEMPERATURE = "DEVICE_TEMPERATURE"
+    DEVICE_COMMAND_TIMEOUT = "DEVICE_COMMAND_TIMEOUT"
+    DEVICE_OVERCURRENT = "DEVICE_OVERCURRENT"
+    DEVICE_END_STOP = "DEVICE_END_STOP"
+    DEVICE_SKEW = "DEVICE_SKEW"
+    DEVICE_UNCOMMANDED_MOTION = "DEVICE_UNCOMMANDED_MOTION"
+    DEVICE_HOMING_FAILED = "DEVICE_HOMING_FAILED"
+    DEVICE_RETRACT_FAILED = "DEVICE_RETRACT_FAILED"
+    HOMING = "HOMING"
+    ENCODER = "ENCODER"
+    OUT_OF_STROKE = "OUT_OF_STROKE"
     MEASUREMENT_STALE = "MEASUREMENT_STALE"
     SENSE_STALE = "SENSE_STALE"
     STATUS_STALE = "STATUS_STALE"
+    LINK_DEGRADED = "LINK_DEGRADED"
     CLOCK = "CLOCK"
-    ENCODER = "ENCODER"
-    OUT_OF_STROKE = "OUT_OF_STROKE"
-    WRONG_DIRECTION = "WRONG_DIRECTION"
-    HOMING = "HOMING"
     SKEW = "SKEW"
     FOLLOWING_ERROR = "FOLLOWING_ERROR"
-    NO_MOTION = "NO_MOTION"
     OVER_FORCE = "OVER_FORCE"
     SENSOR = "SENSOR"
-    NOT_FINITE = "NOT_FINITE"
-    PLAN_FAILED = "PLAN_FAILED"
-    STOPPED = "STOPPED"
+    NO_MOTION = "NO_MOTION"
     DEVICE_NOT_RUNNING = "DEVICE_NOT_RUNNING"
-    DEVICE_COMMAND_TIMEOUT = "DEVICE_COMMAND_TIMEOUT"
-    DEVICE_UNCOMMANDED_MOTION = "DEVICE_UNCOMMANDED_MOTION"
-    DEVICE_OVERCURRENT = "DEVICE_OVERCURRENT"
-    DEVICE_END_STOP = "DEVICE_END_STOP"
-    DEVICE_HOMING_FAILED = "DEVICE_HOMING_FAILED"
-    DEVICE_SUPPLY = "DEVICE_SUPPLY"
-    DEVICE_TEMPERATURE = "DEVICE_TEMPERATURE"
-    DEVICE_SCHEMA_MISMATCH = "DEVICE_SCHEMA_MISMATCH"
-    DEVICE_SKEW = "DEVICE_SKEW"
-    DEVICE_RETRACT_FAILED = "DEVICE_RETRACT_FAILED"
 
 
 class Limit(StrEnum):
@@ -78,175 +115,404 @@ class Limit(StrEnum):
 
 
 FAULTS: dict[Fault, Explanation] = {
-    Fault.LINK_LOST: Explanation(
-        "the device stopped answering or its port disappeared",
-        "check cable and supply; the device opens by itself; then clear-fault and home",
+    Fault.STOPPED: Explanation(
+        "somebody gave the stop command", "clear-fault when it is safe to go on", Reaction.OPENING, 100.0, "at once"
     ),
     Fault.HOST_STALL: Explanation(
         "the control loop stood still for longer than the device waits, and the device opened the gap by itself",
         "run `tormagctl doctor`; look for load on this machine; then clear-fault and home",
+        Reaction.OPENING,
+        51.0,
+        "once the loop runs again; the device opens before that",
+        Position.LOST_THERE,
     ),
-    Fault.MEASUREMENT_STALE: Explanation(
-        "the device fell silent, or its states came too late to close the loop",
-        "check cable and supply, and the round trip in `tormagctl firmware`; then clear-fault",
+    Fault.LINK_LOST: Explanation(
+        "the device stopped answering or its port disappeared",
+        "check cable and supply; the device opens by itself; then clear-fault and home",
+        Reaction.OPENING,
+        51.0,
+        "at once; the device opens by itself, the daemon knows after 80 ms",
+        Position.LOST_THERE,
     ),
-    Fault.LINK_DEGRADED: Explanation(
-        "the answers of the device come so late that the position loop would swing",
-        "look at the round trip in `tormagctl firmware`: a USB adapter's latency timer (`tormagctl doctor`), a hub, a "
-        "full bus; then clear-fault",
+    Fault.PLAN_FAILED: Explanation(
+        "no gap could be planned: model or search refused a number",
+        "report it with the daemon's log; clear-fault",
+        Reaction.OPENING,
+        100.0,
+        "at once",
     ),
-    Fault.SENSE_STALE: Explanation(
-        "the device sends no Sense any more: force and handle are not measured, and the scene needs them",
-        "look at the firmware and at `refused` in `tormagctl firmware`; then clear-fault",
-    ),
-    Fault.STATUS_STALE: Explanation(
-        "the device sends no Status any more: its faults, switches and supply are not known",
-        "look at the firmware and at `refused` in `tormagctl firmware`; then clear-fault",
-    ),
-    Fault.CLOCK: Explanation(
-        "the device's clock runs far too fast or too slow, or stands: no speed and no timeout of its is what it says",
-        "check the firmware's timer and its clock source; then clear-fault",
-    ),
-    Fault.ENCODER: Explanation(
-        "an encoder moved faster than any motor can: it has lost or invented counts",
-        "check the encoder's cable and screen, then clear-fault and home",
-    ),
-    Fault.OUT_OF_STROKE: Explanation(
-        "a homed carriage reads a position where none can be: counts were lost, or homing found a wrong zero",
-        "check switches and encoders, then clear-fault and home",
+    Fault.NOT_FINITE: Explanation(
+        "a number in the loop was not finite",
+        "keep the recording and report it; clear-fault starts afresh",
+        Reaction.OPENING,
+        100.0,
+        "at once",
     ),
     Fault.WRONG_DIRECTION: Explanation(
         "a carriage moved the other way than it was driven",
         "swap the two wires of its motor, or the two phases of its encoder; do not enable before homing opens the gap",
+        Reaction.OPENING,
+        200.0,
+        "while a carriage moves",
+        Position.LOST_HERE,
+    ),
+    Fault.DEVICE_SCHEMA_MISMATCH: Explanation(
+        "daemon and firmware speak different versions of the protocol",
+        "install the firmware that fits this daemon",
+        Reaction.OPENING,
+        100.0,
+        "at the first Hello",
+        Position.LOST_THERE,
+    ),
+    Fault.DEVICE_SUPPLY: Explanation(
+        "the supply voltage is out of range",
+        "check the power supply",
+        Reaction.HELD,
+        100.0,
+        "at once",
+        Position.LOST_THERE,
+    ),
+    Fault.DEVICE_TEMPERATURE: Explanation(
+        "the device is too hot",
+        "let it cool down, then clear-fault",
+        Reaction.OPENING,
+        100.0,
+        "at once",
+        Position.LOST_THERE,
+    ),
+    Fault.DEVICE_COMMAND_TIMEOUT: Explanation(
+        "the device heard no valid drive command in time and opened the gap",
+        "clear-fault, then home",
+        Reaction.OPENING,
+        51.0,
+        "at once",
+        Position.LOST_THERE,
+    ),
+    Fault.DEVICE_OVERCURRENT: Explanation(
+        "a motor drew more current than allowed",
+        "look for a blocked carriage, then clear-fault and home",
+        Reaction.OPENING,
+        500.0,
+        "while a blocked carriage is driven",
+        Position.LOST_THERE,
+    ),
+    Fault.DEVICE_END_STOP: Explanation(
+        "a carriage reached its closed end stop",
+        "clear-fault, then home",
+        Reaction.OPENING,
+        100.0,
+        "at once",
+        Position.LOST_THERE,
+    ),
+    Fault.DEVICE_SKEW: Explanation(
+        "the device saw its carriages apart",
+        "look for a blocked carriage, then home",
+        Reaction.OPENING,
+        100.0,
+        "at once",
+        Position.LOST_THERE,
+    ),
+    Fault.DEVICE_UNCOMMANDED_MOTION: Explanation(
+        "a carriage moved with its drive off",
+        "the gearbox may be worn and let the magnets pull shut; do not use it",
+        Reaction.OPENING,
+        300.0,
+        "while drives are off, or open",
+        Position.LOST_THERE,
+    ),
+    Fault.DEVICE_HOMING_FAILED: Explanation(
+        "a home switch was not found in time",
+        "check the switches and the screws, then clear-fault and home",
+        Reaction.HELD,
+        12000.0,
+        "while it homes",
+        Position.LOST_THERE,
+    ),
+    Fault.DEVICE_RETRACT_FAILED: Explanation(
+        "the device could not open the gap",
+        "remove the insert by hand; check motors and supply",
+        Reaction.HELD,
+        12000.0,
+        "while it opens",
+        Position.LOST_THERE,
     ),
     Fault.HOMING: Explanation(
         "homing took too long, or ended without having found both switches",
         "check the open switches and the screws, then clear-fault and home",
+        Reaction.OPENING,
+        12100.0,
+        "while it homes",
+        Position.LOST_HERE,
+    ),
+    Fault.ENCODER: Explanation(
+        "an encoder moved faster than any motor can: it has lost or invented counts",
+        "check the encoder's cable and screen, then clear-fault and home",
+        Reaction.OPENING,
+        100.0,
+        "at once",
+        Position.LOST_HERE,
+    ),
+    Fault.OUT_OF_STROKE: Explanation(
+        "a homed carriage reads a position where none can be, or one far from its open switch while that is closed: "
+        "counts were lost, homing found a wrong zero, or the switch is stuck",
+        "check switches and encoders, then clear-fault and home",
+        Reaction.OPENING,
+        100.0,
+        "at once",
+        Position.LOST_HERE,
+    ),
+    Fault.MEASUREMENT_STALE: Explanation(
+        "the device fell silent, or its states came too late to close the loop",
+        "check cable and supply, and the round trip in `tormagctl firmware`; then clear-fault",
+        Reaction.OPENING,
+        53.0,
+        "at once; 50 ms, a tick, and the way to the device",
+    ),
+    Fault.SENSE_STALE: Explanation(
+        "the device sends no Sense any more: force and handle are not measured, and the scene needs them",
+        "look at the firmware and at `refused` in `tormagctl firmware`; then clear-fault",
+        Reaction.OPENING,
+        105.0,
+        "at once",
+    ),
+    Fault.STATUS_STALE: Explanation(
+        "the device sends no Status any more: its faults, switches and supply are not known",
+        "look at the firmware and at `refused` in `tormagctl firmware`; then clear-fault",
+        Reaction.OPENING,
+        105.0,
+        "at once",
+    ),
+    Fault.LINK_DEGRADED: Explanation(
+        "the answers of the device come so late that the position loop would swing",
+        "look at the round trip in `tormagctl firmware`: a USB adapter's latency timer (`tormagctl doctor`), a hub, "
+        "a full bus; then clear-fault",
+        Reaction.OPENING,
+        500.0,
+        "over some round trips",
+    ),
+    Fault.CLOCK: Explanation(
+        "the device's clock runs far too fast or too slow, or stands: no speed and no timeout of its is what it says",
+        "check the firmware's timer and its clock source; then clear-fault",
+        Reaction.OPENING,
+        4000.0,
+        "over some seconds",
     ),
     Fault.SKEW: Explanation(
         "the two carriages moved apart from each other",
         "look for dirt or wear on the slower screw, then clear-fault and home",
+        Reaction.OPENING,
+        100.0,
+        "while a carriage moves",
+        Position.LOST_HERE,
     ),
     Fault.FOLLOWING_ERROR: Explanation(
         "the gap did not follow its reference",
         "look for something that blocks a carriage, then clear-fault and home",
-    ),
-    Fault.NO_MOTION: Explanation(
-        "a carriage away from its open end was driven and its encoder did not move",
-        "look for a block or a loose encoder, then clear-fault and home",
+        Reaction.OPENING,
+        1000.0,
+        "while the gap is to move",
+        Position.LOST_HERE,
     ),
     Fault.OVER_FORCE: Explanation(
         "the measured force stayed over what the scene allows; the gap opens at the device's own bounded speed",
         "compare force sensor and gap: is it the insert and the model that the scene names? Then clear-fault, home",
+        Reaction.OPENING,
+        100.0,
+        "while the handle moves",
     ),
     Fault.SENSOR: Explanation(
         "the force sensor reads what no believable device gives at this gap, and the scene needs it",
         "check sensor, cable and zero, and that the insert is the scene's; then clear-fault",
+        Reaction.OPENING,
+        3000.0,
+        "over 2 s of sliding",
     ),
-    Fault.NOT_FINITE: Explanation(
-        "a number in the loop was not finite", "keep the recording and report it; clear-fault starts afresh"
+    Fault.NO_MOTION: Explanation(
+        "a carriage away from its open end was driven and its encoder did not move",
+        "look for a block or a loose encoder, then clear-fault and home",
+        Reaction.OPENING,
+        250.0,
+        "while a carriage is driven",
+        Position.LOST_HERE,
     ),
-    Fault.PLAN_FAILED: Explanation(
-        "no gap could be planned: model or search refused a number", "report it with the daemon's log; clear-fault"
-    ),
-    Fault.STOPPED: Explanation("somebody gave the stop command", "clear-fault when it is safe to go on"),
     Fault.DEVICE_NOT_RUNNING: Explanation(
-        "the device stopped taking drive commands by itself, as after a reset", "check its supply; clear-fault, home"
-    ),
-    Fault.DEVICE_COMMAND_TIMEOUT: Explanation(
-        "the device heard no valid drive command in time and opened the gap", "clear-fault, then home"
-    ),
-    Fault.DEVICE_UNCOMMANDED_MOTION: Explanation(
-        "a carriage moved with its drive off", "the gearbox may be worn and let the magnets pull shut; do not use it"
-    ),
-    Fault.DEVICE_OVERCURRENT: Explanation(
-        "a motor drew more current than allowed", "look for a blocked carriage, then clear-fault and home"
-    ),
-    Fault.DEVICE_END_STOP: Explanation("a carriage reached its closed end stop", "clear-fault, then home"),
-    Fault.DEVICE_HOMING_FAILED: Explanation(
-        "a home switch was not found in time", "check the switches and the screws, then clear-fault and home"
-    ),
-    Fault.DEVICE_SUPPLY: Explanation("the supply voltage is out of range", "check the power supply"),
-    Fault.DEVICE_TEMPERATURE: Explanation("the device is too hot", "let it cool down, then clear-fault"),
-    Fault.DEVICE_SCHEMA_MISMATCH: Explanation(
-        "daemon and firmware speak different versions of the protocol", "install the firmware that fits this daemon"
-    ),
-    Fault.DEVICE_SKEW: Explanation("the device saw its carriages apart", "look for a blocked carriage, then home"),
-    Fault.DEVICE_RETRACT_FAILED: Explanation(
-        "the device could not open the gap", "remove the insert by hand; check motors and supply"
+        "the device stopped taking drive commands by itself, as after a reset",
+        "check its supply; clear-fault, home",
+        Reaction.OPENING,
+        100.0,
+        "at once",
+        Position.LOST_THERE,
     ),
 }
 
 LIMITS: dict[Limit, Explanation] = {
-    Limit.NO_SETPOINT: Explanation("no publisher has sent a setpoint", "start the patient-side robot's publisher"),
+    Limit.NO_SETPOINT: Explanation(
+        "no publisher has sent a setpoint",
+        "start the patient-side robot's publisher",
+        Reaction.LIMITED,
+        100.0,
+        "at once",
+    ),
     Limit.STALE: Explanation(
-        "the newest setpoint is older than its valid_for_ms; the force decays to F_min", "check the publisher"
+        "the newest setpoint is older than its valid_for_ms; the force decays to F_min",
+        "check the publisher",
+        Reaction.LIMITED,
+        110.0,
+        "after `valid_for_ms`, 100 ms in the matrix",
     ),
     Limit.OTHER_SOURCE: Explanation(
         "another source sends setpoints too, and does not hold the brake",
         "end it, or give it the brake: tormagctl take SOURCE",
+        Reaction.HELD,
+        100.0,
+        "at once",
     ),
     Limit.TAKEOVER: Explanation(
-        "the brake has passed to another publisher; the force goes to what it asks for along a ramp", "wait a moment"
+        "the brake has passed to another publisher; the force goes to what it asks for along a ramp",
+        "wait a moment",
+        Reaction.LIMITED,
+        100.0,
+        "at once",
     ),
-    Limit.RANGE: Explanation("the setpoint is outside the scene's range", "ask within the range, or change the scene"),
-    Limit.F_MIN: Explanation("less force was asked for than the open gap gives", "an insert with less iron goes lower"),
-    Limit.F_MAX: Explanation("more force was asked for than the closed gap gives", "an insert with more iron goes on"),
-    Limit.RATE: Explanation("the force was asked to change faster than the carriages travel", "ask for slower changes"),
+    Limit.RANGE: Explanation(
+        "the setpoint is outside the scene's range",
+        "ask within the range, or change the scene",
+        Reaction.LIMITED,
+        100.0,
+        "at once",
+    ),
+    Limit.F_MIN: Explanation(
+        "less force was asked for than the open gap gives",
+        "an insert with less iron goes lower",
+        Reaction.LIMITED,
+        100.0,
+        "at once",
+    ),
+    Limit.F_MAX: Explanation(
+        "more force was asked for than the closed gap gives",
+        "an insert with more iron goes on",
+        Reaction.LIMITED,
+        100.0,
+        "at once",
+    ),
+    Limit.RATE: Explanation(
+        "the force was asked to change faster than the carriages travel",
+        "ask for slower changes",
+        Reaction.LIMITED,
+        100.0,
+        "at once",
+    ),
     Limit.LOW_CONFIDENCE: Explanation(
-        "the model was asked outside what it was trained on", "calibrate with this insert and these motions"
+        "the model was asked outside what it was trained on",
+        "calibrate with this insert and these motions",
+        Reaction.HELD,
+        100.0,
+        "at once",
     ),
     Limit.TRIM: Explanation(
-        "the measured force is further from the model than the trim may correct", "calibrate this insert"
+        "the measured force is further from the model than the trim may correct",
+        "calibrate this insert",
+        Reaction.LIMITED,
+        1000.0,
+        "while the handle slides",
     ),
     Limit.MODEL_RANGE: Explanation(
         "the model was about to be asked what it was not shown; it was asked the nearest that it knows",
         "move or ask within its range, or calibrate with these motions",
+        Reaction.LIMITED,
+        100.0,
+        "at once",
     ),
     Limit.CEILING: Explanation(
         "the gap is held where this device, as far as it has shown itself, surely keeps to the scene's greatest force",
         "turn the handle, so that the device shows its force; ask for less",
+        Reaction.LIMITED,
+        100.0,
+        "at once",
     ),
     Limit.OVER_FORCE: Explanation(
-        "the measured force is over what the scene allows; the gap opens", "look at the force sensor and the insert"
+        "the measured force is over what the scene allows; the gap opens",
+        "look at the force sensor and the insert",
+        Reaction.OPENING,
+        100.0,
+        "while the handle moves",
     ),
     Limit.SENSOR: Explanation(
         "the force sensor reads what no believable device gives at this gap; nothing is learned from it",
         "check sensor, cable and zero, and that the insert is the scene's",
+        Reaction.HELD,
+        1000.0,
+        "while the handle slides",
     ),
     Limit.SENSOR_ZERO: Explanation(
         "the force sensor is far off its zero, as the handle's reversals show; that is taken off its readings",
         "tare the sensor when the handle is free",
+        Reaction.HELD,
+        5000.0,
+        "at reversals of the handle",
     ),
     Limit.OFFSET_UNKNOWN: Explanation(
         "the handle has not turned back for so long that the sensor's zero may have drifted; nothing is learned of it",
         "turn the handle back and forth once, by 10 mm",
+        Reaction.HELD,
+        480100.0,
+        "while the handle turns one way",
     ),
-    Limit.SATURATED: Explanation("a motor has no more voltage to give", "expect lag while it lasts"),
-    Limit.SKEW: Explanation("the carriages are further apart than usual", "look at the slower screw"),
+    Limit.SATURATED: Explanation(
+        "a motor has no more voltage to give",
+        "expect lag while it lasts",
+        Reaction.HELD,
+        100.0,
+        "while a carriage is driven",
+    ),
+    Limit.SKEW: Explanation(
+        "the carriages are further apart than usual",
+        "look at the slower screw",
+        Reaction.HELD,
+        100.0,
+        "while a carriage moves",
+    ),
     Limit.HOST_STALL: Explanation(
         "the control loop stood still for some milliseconds; then the gap was held until the device had answered",
         "run `tormagctl doctor`; look for load on this machine",
+        Reaction.HELD,
+        51.0,
+        "once the loop runs again",
     ),
     Limit.DEVICE_SILENT: Explanation(
         "the device has sent no new state for some milliseconds; the gap is held until it does",
         "look at the round trip in `tormagctl firmware`",
+        Reaction.HELD,
+        51.0,
+        "at once",
     ),
     Limit.SENSE_STALE: Explanation(
         "the device sends no Sense: force and handle are not measured, and nothing is learned",
         "look at the firmware and at `refused` in `tormagctl firmware`",
+        Reaction.HELD,
+        51.0,
+        "at once",
     ),
     Limit.ENCODER: Explanation(
         "an encoder has leapt; the gap is held until the device has said whether it was reset",
         "check the encoder's cable and screen",
+        Reaction.HELD,
+        100.0,
+        "at once",
     ),
     Limit.LINK_DEGRADED: Explanation(
         "the wire loses or damages messages, or takes so long that little is left of the loop's margin",
         "check cable, termination and adapter; look at the link in `tormagctl firmware`",
+        Reaction.HELD,
+        1000.0,
+        "over some hundred messages",
     ),
     Limit.CLOCK: Explanation(
         "the device's clock is off by more than 1 %, and with it all speeds and the device's own timeouts",
         "check the firmware's timer and its clock source",
+        Reaction.HELD,
+        4000.0,
+        "over some seconds",
     ),
 }
 

@@ -1,29 +1,21 @@
 """The operating state: armed on purpose, opened on every fault, never re-armed by itself.
 
-Pure functions of explicit state. The safe state is *gap open*: friction holds the force when power goes, and the
-magnets pull shut. Opening is the device's own routine, because it must also work when this process is gone.
+Which event leads where, what guards it and what the device is asked then stands in one table, TRANSITIONS, and nothing
+else changes the state. The safe state is *gap open*: friction holds the force when power goes, and the magnets pull
+shut. Opening is the device's own routine, because it must also work when this process is gone. Pure functions.
 """
 
 import math
+from collections.abc import Callable
 from enum import StrEnum
-from typing import Final, final
+from typing import Final, NamedTuple, final
 
 from firmware_protocol.value import Value
-from tormagd.safety.codes import Fault
+from tormagd.safety.codes import FAULTS, Fault, Position
 
 CLEARING_S = 0.5
 "How long the device may take to report that a cleared fault is gone."
-LOST_POSITION = frozenset(
-    {
-        Fault.SKEW,
-        Fault.FOLLOWING_ERROR,
-        Fault.NO_MOTION,
-        Fault.ENCODER,
-        Fault.OUT_OF_STROKE,
-        Fault.WRONG_DIRECTION,
-        Fault.HOMING,
-    }
-)
+LOST_POSITION = frozenset({fault for fault, row in FAULTS.items() if row.position is Position.LOST_HERE})
 """After these faults the counts of an encoder are not believed any more. The device does not know, and goes on calling
 itself homed; where it has latched a fault of its own it does not."""
 
@@ -32,9 +24,26 @@ class OperatingState(StrEnum):
     """CRTK operating states."""
 
     DISABLED = "DISABLED"
+    "The gap is open or on its way there, and nothing is driven from here."
     ENABLED = "ENABLED"
+    "The force follows the setpoint."
     PAUSED = "PAUSED"
+    "The gap is held where it is."
     FAULT = "FAULT"
+    "As DISABLED, with one fault or more latched."
+
+
+class Event(StrEnum):
+    """What may change the operating state: an operator's command, or faults that show."""
+
+    ENABLE = "enable"
+    DISABLE = "disable"
+    PAUSE = "pause"
+    RESUME = "resume"
+    HOME = "home"
+    STOP = "stop"
+    CLEAR_FAULT = "clear-fault"
+    FAULT = "a fault shows"
 
 
 class DeviceRequest(StrEnum):
@@ -60,7 +69,7 @@ class Conditions(Value):
 
     __match_args__ = (
         "connected", "fresh", "homed", "busy", "device_latched", "requested_N", "neutral_N", "sensor_doubted", "cause",
-        "remedy", "round_trip_s", "clock_drift",
+        "remedy", "round_trip_s", "clock_drift", "apart_mm", "most_apart_mm", "most_round_trip_s", "most_clock_drift",
     )  # fmt: skip
     __slots__ = __match_args__
 
@@ -78,6 +87,10 @@ class Conditions(Value):
         remedy: str = "",
         round_trip_s: float = 0.0,
         clock_drift: float = 0.0,
+        apart_mm: float = 0.0,
+        most_apart_mm: float = math.inf,
+        most_round_trip_s: float = math.inf,
+        most_clock_drift: float = math.inf,
     ) -> None:
         self.connected: Final = connected
         self.fresh: Final = fresh
@@ -92,6 +105,10 @@ class Conditions(Value):
         self.remedy: Final = remedy
         self.round_trip_s: Final = round_trip_s
         self.clock_drift: Final = clock_drift
+        self.apart_mm: Final = apart_mm
+        self.most_apart_mm: Final = most_apart_mm
+        self.most_round_trip_s: Final = most_round_trip_s
+        self.most_clock_drift: Final = most_clock_drift
 
 
 @final
@@ -125,17 +142,213 @@ class SafetyState(Value):
         return self.replaced(request=request, request_number=self.request_number + 1)
 
 
+Refuses = Callable[[SafetyState, Conditions], str]
+"""Of a guard: what is wrong, in a sentence with the figures; empty where nothing is."""
+
+
+class Guard(NamedTuple):
+    """A condition of a transition. Where it does not hold, the event is refused with `code`, and nothing changes."""
+
+    code: str
+    wants: str
+    "What has to be so, for the page of the table."
+    refuses: Refuses
+    remedy: str
+
+
+class Transition(NamedTuple):
+    """One row of the table: where `event` leads from `source`."""
+
+    event: Event
+    source: OperatingState
+    target: OperatingState
+    reason: str
+    "What the log says of it."
+    guards: tuple[Guard, ...] = ()
+    "In the order in which they are asked; the first that does not hold is told."
+    request: DeviceRequest = DeviceRequest.NONE
+    "What the device is asked for. CLEAR is asked only of a device that has latched something."
+
+
+class Refusal(NamedTuple):
+    """The other kind of row: `event` is not taken in `source`."""
+
+    event: Event
+    source: OperatingState
+    code: str
+    remedy: str
+
+
+def _not_connected(state: SafetyState, present: Conditions) -> str:
+    if present.connected:
+        return ""
+    return f"the device is not connected{_because(present)}"
+
+
+def _latched(state: SafetyState, present: Conditions) -> str:
+    return "the device has latched a fault" if present.device_latched else ""
+
+
+def _busy(state: SafetyState, present: Conditions) -> str:
+    return "the device is homing or opening" if present.busy else ""
+
+
+def _lost(state: SafetyState, present: Conditions) -> str:
+    return "a fault took the carriages' positions away" if state.needs_homing else ""
+
+
+def _unhomed(state: SafetyState, present: Conditions) -> str:
+    return "" if present.homed else "the carriages are not homed"
+
+
+def _stale(state: SafetyState, present: Conditions) -> str:
+    return "" if present.fresh else f"no fresh measurement from the device{_because(present)}"
+
+
+def _doubted(state: SafetyState, present: Conditions) -> str:
+    return "the force sensor reads what no believable device gives with its gap open" if present.sensor_doubted else ""
+
+
+def _loaded(state: SafetyState, present: Conditions) -> str:
+    if present.requested_N is None or present.requested_N <= present.neutral_N:  # NaN is not neutral
+        return ""
+    return f"the setpoint is {present.requested_N:.2f} N: allowed is at most {present.neutral_N:.2f} N"
+
+
+def _apart(state: SafetyState, present: Conditions) -> str:
+    if present.apart_mm <= present.most_apart_mm:
+        return ""
+    return f"the carriages are {present.apart_mm:.2f} mm apart: allowed is at most {present.most_apart_mm:g} mm"
+
+
+def _slow(state: SafetyState, present: Conditions) -> str:
+    if present.round_trip_s <= present.most_round_trip_s:
+        return ""
+    return (
+        f"the round trip to the device is {present.round_trip_s * 1e3:.1f} ms: allowed is at most "
+        f"{present.most_round_trip_s * 1e3:.1f} ms, or the carriages swing"
+    )
+
+
+def _wrong_clock(state: SafetyState, present: Conditions) -> str:
+    if abs(present.clock_drift) <= present.most_clock_drift:
+        return ""
+    return f"the device's clock is off by {present.clock_drift:+.1%}: allowed is {present.most_clock_drift:.0%}"
+
+
+def _because(present: Conditions) -> str:
+    return f": {present.cause}" if present.cause else ""
+
+
+CONNECTED = Guard("not_connected", "the device is connected", _not_connected, "check port, cable and supply")
+NOT_BUSY = Guard("busy", "the device neither homes nor opens", _busy, "wait until is_busy is false")
+HOMABLE = Guard("device_latched", "the device has latched nothing", _latched, "tormagctl clear-fault")
+READY: tuple[Guard, ...] = (
+    CONNECTED,
+    Guard("device_latched", "the device has latched nothing", _latched, "tormagctl clear-fault, then home"),
+    NOT_BUSY,
+    Guard("not_homed", "it has homed since the last fault that took positions away", _lost, "tormagctl home"),
+    Guard("not_homed", "the device is homed", _unhomed, "tormagctl home"),
+    Guard("not_fresh", "State, Sense and Status are fresh", _stale, "look at the link in tormagctl status"),
+    Guard(
+        "sensor_doubted",
+        "the force sensor is believed",
+        _doubted,
+        "check sensor, cable and zero, then turn the handle for a second: it is judged while friction slides",
+    ),
+    Guard(
+        "not_neutral",
+        "the setpoint, where there is one, is at most F_min + `limits.neutral_margin_N`",
+        _loaded,
+        "lower the setpoint, enable, then raise it",
+    ),
+    Guard("skewed", "the carriages are no further apart than `limits.skew_fault_mm`", _apart, "tormagctl home"),
+    Guard(
+        "link_degraded",
+        "the round trip is one that the position loop bears",
+        _slow,
+        "look at the round trip in tormagctl firmware; tormagctl doctor finds a USB adapter's latency timer",
+    ),
+    Guard(
+        "clock",
+        "the device's clock is off by less than the fault CLOCK says",
+        _wrong_clock,
+        "check the firmware's timer and its clock source",
+    ),
+)
+"What is wanted before anything is driven."
+
+DISABLED: Final = OperatingState.DISABLED
+ENABLED: Final = OperatingState.ENABLED
+PAUSED: Final = OperatingState.PAUSED
+FAULTED: Final = OperatingState.FAULT
+RETRACT: Final = DeviceRequest.RETRACT
+NOTHING_TO_DO: Final = "nothing to do"
+CLEAR_FIRST: Final = "tormagctl clear-fault"
+
+_OPENS = "the device is asked to open the gap"
+_CLEARED = "faults are cleared; nothing moves"
+ROWS: tuple[Transition | Refusal, ...] = (
+    Transition(Event.ENABLE, DISABLED, ENABLED, "the force follows the setpoint from here", READY),
+    Refusal(Event.ENABLE, ENABLED, "already_enabled", NOTHING_TO_DO),
+    Refusal(Event.ENABLE, PAUSED, "already_enabled", "tormagctl resume"),
+    Refusal(Event.ENABLE, FAULTED, "fault", CLEAR_FIRST),
+    Transition(Event.DISABLE, DISABLED, DISABLED, _OPENS, (CONNECTED,), RETRACT),
+    Transition(Event.DISABLE, ENABLED, DISABLED, _OPENS, (CONNECTED,), RETRACT),
+    Transition(Event.DISABLE, PAUSED, DISABLED, _OPENS, (CONNECTED,), RETRACT),
+    Refusal(Event.DISABLE, FAULTED, "fault", CLEAR_FIRST),
+    Refusal(Event.PAUSE, DISABLED, "not_enabled", "tormagctl enable"),
+    Transition(Event.PAUSE, ENABLED, PAUSED, "the gap is held where it is", (CONNECTED,)),
+    Refusal(Event.PAUSE, PAUSED, "not_enabled", NOTHING_TO_DO),
+    Refusal(Event.PAUSE, FAULTED, "fault", CLEAR_FIRST),
+    Refusal(Event.RESUME, DISABLED, "not_paused", "tormagctl enable"),
+    Refusal(Event.RESUME, ENABLED, "not_paused", NOTHING_TO_DO),
+    Transition(Event.RESUME, PAUSED, ENABLED, "the force follows the setpoint again", (CONNECTED,)),
+    Refusal(Event.RESUME, FAULTED, "fault", CLEAR_FIRST),
+    Transition(
+        Event.HOME,
+        DISABLED,
+        DISABLED,
+        "the device is asked to look for its open switches",
+        (CONNECTED, HOMABLE, NOT_BUSY),
+        DeviceRequest.HOME,
+    ),
+    Refusal(Event.HOME, ENABLED, "not_disabled", "tormagctl disable"),
+    Refusal(Event.HOME, PAUSED, "not_disabled", "tormagctl disable"),
+    Refusal(Event.HOME, FAULTED, "fault", CLEAR_FIRST),
+    # stop is never refused, and needs no device: whatever comes back finds a fault that somebody has to clear
+    *[Transition(Event.STOP, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
+    Transition(Event.CLEAR_FAULT, DISABLED, DISABLED, _CLEARED, (CONNECTED, NOT_BUSY), DeviceRequest.CLEAR),
+    # nothing is latched here; what the device latches meanwhile is news, and must not be passed over
+    Transition(Event.CLEAR_FAULT, ENABLED, ENABLED, "there is nothing to clear", (CONNECTED, NOT_BUSY)),
+    Transition(Event.CLEAR_FAULT, PAUSED, PAUSED, "there is nothing to clear", (CONNECTED, NOT_BUSY)),
+    Transition(Event.CLEAR_FAULT, FAULTED, DISABLED, _CLEARED, (CONNECTED, NOT_BUSY), DeviceRequest.CLEAR),
+    *[Transition(Event.FAULT, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
+)
+TRANSITIONS: dict[tuple[Event, OperatingState], Transition | Refusal] = {(row.event, row.source): row for row in ROWS}
+"""All there are. A fault that is latched already is no event; `stop` is one as a fault, STOPPED, is."""
+COMMANDS: tuple[str, ...] = tuple([str(event) for event in Event if event is not Event.FAULT])
+_RANK: dict[Fault, int] = {fault: place for place, fault in enumerate(Fault)}
+
+
 def latch(state: SafetyState, faults: tuple[Fault, ...]) -> SafetyState:
-    """`state` with `faults` latched and the device asked to open; unchanged where there is nothing new."""
-    new = tuple(fault for fault in faults if fault not in state.faults)
+    """`state` with `faults` latched and the device asked to open; unchanged where there is nothing new.
+
+    Those that show at once are latched, and so named, in the order of their table, causes before what follows of them.
+    """
+    if not faults:  # as nearly always, a thousand times a second
+        return state
+    new = [fault for fault in faults if fault not in state.faults]
     if not new:
         return state
+    new.sort(key=_RANK.__getitem__)
+    row = TRANSITIONS[Event.FAULT, state.operating_state]
+    assert isinstance(row, Transition), "a fault is latched in every state"
     latched = state.replaced(
-        operating_state=OperatingState.FAULT,
-        faults=state.faults + new,
+        faults=state.faults + tuple(new),
         needs_homing=state.needs_homing or not LOST_POSITION.isdisjoint(new),
     )
-    return latched.ask(DeviceRequest.RETRACT)
+    return _taken(latched, row.target, row.request)
 
 
 def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
@@ -145,111 +358,51 @@ def homed_again(state: SafetyState, is_homed: bool) -> SafetyState:
 
 def command(state: SafetyState, name: str, now_s: float, conditions: Conditions) -> SafetyState:
     """The state after an operator's command. Raises RefusedError with code, message and what to do."""
-    transition = _TRANSITIONS.get(name)
-    if transition is None:
-        raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(_TRANSITIONS)}")
-    if name != "stop" and not conditions.connected:
-        raise RefusedError(
-            "not_connected",
-            f"the device is not connected: {conditions.cause}" if conditions.cause else "the device is not connected",
-            conditions.remedy or "check port, cable and supply",
-        )
-    return transition(state, now_s, conditions)
+    if name not in COMMANDS:
+        raise RefusedError("unknown_command", f"no command {name!r}", f"commands: {', '.join(COMMANDS)}")
+    event = Event(name)
+    row = TRANSITIONS[event, state.operating_state]
+    if isinstance(row, Refusal):
+        if not conditions.connected:  # whatever else is in the way, this is first
+            _ask(CONNECTED, state, conditions)
+        raise RefusedError(row.code, _refused(row, state), row.remedy)
+    for guard in row.guards:
+        _ask(guard, state, conditions)
+    if event is Event.STOP:
+        return latch(state, (Fault.STOPPED,))
+    request = row.request
+    if event is Event.ENABLE:
+        state = state.replaced(clearing_until_s=-math.inf)
+    elif event is Event.CLEAR_FAULT:
+        state = state.replaced(faults=())
+        if not conditions.device_latched:
+            request = DeviceRequest.NONE
+        elif request is DeviceRequest.CLEAR:
+            state = state.replaced(clearing_until_s=now_s + CLEARING_S)
+    return _taken(state, row.target, request)
 
 
-def _enable(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
-    _refuse_in(state, OperatingState.FAULT, "enable")
-    if state.operating_state is not OperatingState.DISABLED:
-        remedy = "tormagctl resume" if state.operating_state is OperatingState.PAUSED else "nothing to do"
-        raise RefusedError("already_enabled", f"already {state.operating_state}", remedy)
-    if conditions.device_latched:
-        raise RefusedError("device_latched", "the device has latched a fault", "tormagctl clear-fault, then home")
-    _refuse_busy(conditions)
-    if state.needs_homing:
-        raise RefusedError("not_homed", "a fault took the carriages' positions away", "tormagctl home")
-    if not conditions.homed:
-        raise RefusedError("not_homed", "the carriages are not homed", "tormagctl home")
-    if not conditions.fresh:
-        said = f": {conditions.cause}" if conditions.cause else ""
-        raise RefusedError(
-            "not_fresh", f"no fresh measurement from the device{said}", "look at the link in tormagctl status"
-        )
-    if conditions.sensor_doubted:
-        raise RefusedError(
-            "sensor_doubted",
-            "the force sensor reads what no believable device gives with its gap open",
-            "check sensor, cable and zero, then turn the handle for a second: it is judged while friction slides",
-        )
-    if conditions.requested_N is not None and not conditions.requested_N <= conditions.neutral_N:  # NaN is not neutral
-        raise RefusedError(
-            "not_neutral",
-            f"the setpoint is {conditions.requested_N:.2f} N: allowed is at most {conditions.neutral_N:.2f} N",
-            "lower the setpoint, enable, then raise it",
-        )
-    return state.replaced(operating_state=OperatingState.ENABLED, clearing_until_s=-math.inf)
+def reason(name: str, source: OperatingState) -> str:
+    """What the log says of a command that was taken in `source`: where it led, and why. Empty where none is taken."""
+    row = TRANSITIONS[Event(name), source]
+    return f"{source} to {row.target}: {row.reason}" if isinstance(row, Transition) else ""
 
 
-def _disable(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
-    _refuse_in(state, OperatingState.FAULT, "disable")
-    return state.replaced(operating_state=OperatingState.DISABLED).ask(DeviceRequest.RETRACT)
+def _taken(state: SafetyState, target: OperatingState, request: DeviceRequest) -> SafetyState:
+    """The only place where the operating state changes."""
+    after = state.replaced(operating_state=target)
+    return after if request is DeviceRequest.NONE else after.ask(request)
 
 
-def _pause(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
-    _refuse_in(state, OperatingState.FAULT, "pause")
-    if state.operating_state is not OperatingState.ENABLED:
-        remedy = "nothing to do" if state.operating_state is OperatingState.PAUSED else "tormagctl enable"
-        raise RefusedError("not_enabled", f"cannot pause while {state.operating_state}", remedy)
-    return state.replaced(operating_state=OperatingState.PAUSED)
+def _ask(guard: Guard, state: SafetyState, conditions: Conditions) -> None:
+    message = guard.refuses(state, conditions)
+    if message:
+        is_told_better = guard is CONNECTED and conditions.remedy
+        raise RefusedError(guard.code, message, conditions.remedy if is_told_better else guard.remedy)
 
 
-def _resume(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
-    _refuse_in(state, OperatingState.FAULT, "resume")
-    if state.operating_state is not OperatingState.PAUSED:
-        remedy = "nothing to do" if state.operating_state is OperatingState.ENABLED else "tormagctl enable"
-        raise RefusedError("not_paused", f"cannot resume while {state.operating_state}", remedy)
-    return state.replaced(operating_state=OperatingState.ENABLED)
-
-
-def _home(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
-    _refuse_in(state, OperatingState.FAULT, "home")
-    if state.operating_state is not OperatingState.DISABLED:
-        raise RefusedError("not_disabled", f"cannot home while {state.operating_state}", "tormagctl disable")
-    if conditions.device_latched:
-        raise RefusedError("device_latched", "the device has latched a fault", "tormagctl clear-fault")
-    _refuse_busy(conditions)
-    return state.ask(DeviceRequest.HOME)
-
-
-def _stop(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
-    return latch(state, (Fault.STOPPED,))
-
-
-def _clear_fault(state: SafetyState, now_s: float, conditions: Conditions) -> SafetyState:
-    _refuse_busy(conditions)
-    if state.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED):
-        return state  # nothing is latched; what the device latches meanwhile is news, and must not be passed over
-    cleared = state.replaced(operating_state=OperatingState.DISABLED, faults=())
-    if not conditions.device_latched:
-        return cleared
-    return cleared.replaced(clearing_until_s=now_s + CLEARING_S).ask(DeviceRequest.CLEAR)
-
-
-def _refuse_in(state: SafetyState, forbidden: OperatingState, name: str) -> None:
-    if state.operating_state is forbidden:
-        raise RefusedError("fault", f"cannot {name} in {forbidden}: {', '.join(state.faults)}", "tormagctl clear-fault")
-
-
-def _refuse_busy(conditions: Conditions) -> None:
-    if conditions.busy:
-        raise RefusedError("busy", "the device is homing or opening", "wait until is_busy is false")
-
-
-_TRANSITIONS = {
-    "enable": _enable,
-    "disable": _disable,
-    "pause": _pause,
-    "resume": _resume,
-    "home": _home,
-    "stop": _stop,
-    "clear-fault": _clear_fault,
-}
+def _refused(row: Refusal, state: SafetyState) -> str:
+    if row.source is FAULTED:
+        return f"cannot {row.event} in {row.source}: {', '.join(state.faults)}"
+    already = f"already {row.source}"
+    return already if row.event is Event.ENABLE else f"cannot {row.event} while {row.source}"

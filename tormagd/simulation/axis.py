@@ -29,7 +29,6 @@ class Axis:
     """
 
     __slots__ = (
-        "_backlash_m",
         "_closed_stop_m",
         "_coupling_Nm_A",
         "_current_limit_A",
@@ -46,6 +45,7 @@ class Axis:
         "_resistance_Ohm",
         "_stiffness_N_m",
         "angle_rad",
+        "backlash_m",
         "contact_N",
         "current_A",
         "drag_N",
@@ -70,7 +70,7 @@ class Axis:
         self._impulse_rad_s_Nm = dt_s / (motor.inertia_kg_m2 * gear.ratio**2)
         self._mesh_loss = 1.0 - gear.efficiency
         self._lead_m_rad = screw.lead_mm * 1e-3 / math.tau
-        self._backlash_m = 0.5e-6 * screw.backlash_um
+        self.backlash_m = 0.5e-6 * screw.backlash_um
         self._stiffness_N_m = screw.stiffness_N_um * 1e6
         self._closed_stop_m = plant.closed_stop_mm * 1e-3
         self._open_stop_m = plant.open_stop_mm * 1e-3
@@ -155,7 +155,7 @@ class Axis:
         # the carriage follows the nut: it stands while the guide's drag holds it, else slides to the limit
         nut_m = self._nut_zero_m + angle_rad * lead_m_rad
         position_m, drag_N = self.position_m, self.drag_N
-        backlash_m, stiffness_N_m = self._backlash_m, self._stiffness_N_m
+        backlash_m, stiffness_N_m = self.backlash_m, self._stiffness_N_m
         inward_N = attraction_N + drag_N
         innermost_m = nut_m - ((backlash_m if inward_N > 0.0 else -backlash_m) + inward_N / stiffness_N_m)
         if position_m < innermost_m:
@@ -191,5 +191,5 @@ class Axis:
 
     def _lead_of(self, contact_N: float) -> float:
         """How far the nut is outward of the carriage, m, when it pushes with that force."""
-        flank_m = self._backlash_m if contact_N > 0.0 else -self._backlash_m
+        flank_m = self.backlash_m if contact_N > 0.0 else -self.backlash_m
         return flank_m + contact_N / self._stiffness_N_m

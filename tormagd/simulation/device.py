@@ -16,6 +16,7 @@ from firmware_protocol.codec import (
     DecodeError,
     DeviceMode,
     Drive,
+    Identity,
     Message,
     Sense,
     State,
@@ -40,6 +41,11 @@ FirmwareKind = Callable[[PlantParameters], Firmware | CompiledFirmware]
 WEAR: Final = 4.0
 JUMP_MM: Final = 4.0
 "Of an encoder."
+WATCHDOG_S: Final = 0.1
+"A firmware that hangs is reset after this time."
+HOT_C: Final = 70.0
+JAMMED_N: Final = 1e5
+"More drag than any motor overcomes."
 MAX_BACKLOG_BYTES: Final = 65_536
 """What the serial buffers of both ends and the adapter between them hold; more is lost, as on a real port."""
 LEFT_OPEN: Final = 1
@@ -107,12 +113,18 @@ class MessageDevice:
         "_drives",
         "_duty_sign",
         "_faults",
+        "_frozen_until_s",
         "_handle_counts_per_mm",
         "_has_bad_encoders",
+        "_has_hit_left",
+        "_has_other_schema",
         "_home_m",
         "_inbox",
+        "_is_hot",
+        "_is_left_motor_dead",
         "_is_state_damaged",
         "_is_switch_dead_left",
+        "_is_switch_stuck_left",
         "_jitter",
         "_jitter_s",
         "_left_boot_counts",
@@ -125,6 +137,7 @@ class MessageDevice:
         "_right_boot_counts",
         "_right_extra_counts",
         "_silent",
+        "_stuck_handle",
         "_stuck_left",
         "_supply_V",
         "_tick_due_s",
@@ -174,6 +187,13 @@ class MessageDevice:
         """The functions that are not sent, a bit each."""
         self._is_state_damaged = False
         self._is_switch_dead_left = False
+        self._is_switch_stuck_left = False
+        self._has_hit_left = False
+        self._has_other_schema = False
+        self._is_left_motor_dead = False
+        self._is_hot = False
+        self._stuck_handle: int | None = None
+        self._frozen_until_s = -math.inf
         self._answering_every = 1
         self._drives = 0
         self._left_motor_sign = 1.0
@@ -246,7 +266,7 @@ class MessageDevice:
             left_V, right_V = self._volts(output.left_duty), self._volts(output.right_duty)
             if self._duty_sign < 0.0 and self.firmware.mode is DeviceMode.RUN:
                 left_V, right_V = -left_V, -right_V
-            self.plant.drive(self._left_motor_sign * left_V, right_V)
+            self.plant.drive(None if self._is_left_motor_dead else self._left_motor_sign * left_V, right_V)
         else:
             self.plant.drive(None, None)
 
@@ -261,12 +281,17 @@ class MessageDevice:
         while self._faults and self._faults[0].at_s <= time_s:
             self._strike(time_s, self._faults.popleft())
         self._tick_due_s = self._boot_s + (self._ticks + 1) * TICK_S / self._rate
+        if self._frozen_until_s > 0.0:
+            if time_s < self._frozen_until_s:
+                return
+            self._frozen_until_s = -math.inf
+            self._reset(time_s)
         status = self.firmware.tick(self._device_time_s(time_s), self._sensors())
         if status is not None:
             self._send(time_s, status)
 
     def _deliver(self, time_s: float, packet: Packet) -> None:
-        if self._deaf:
+        if self._deaf or time_s < self._frozen_until_s:
             return
         try:
             message = decode(packet.function, packet.payload)
@@ -289,7 +314,10 @@ class MessageDevice:
 
     def _send_answer(self, time_s: float, answer: Answer) -> None:
         if answer is IDENTITY:
-            self._send(time_s, self.firmware.identity())
+            known = self.firmware.identity()
+            if self._has_other_schema:
+                known = Identity(known.schema_hash ^ 1, known.firmware_major, known.firmware_minor, known.serial_number)
+            self._send(time_s, known)
             return
         state, sense = self.firmware.measurement(self._device_time_s(time_s), self._sensors())
         self._send(time_s, state)
@@ -307,9 +335,9 @@ class MessageDevice:
         plant = self.plant
         left_m, right_m = plant.left.position_m, plant.right.position_m
         switches = 0
-        if left_m >= self._home_m and not self._is_switch_dead_left:
+        if (left_m >= self._home_m and not self._is_switch_dead_left) or self._is_switch_stuck_left:
             switches = LEFT_OPEN
-        elif left_m <= self._closed_m:
+        elif left_m <= self._closed_m or self._has_hit_left:
             switches = LEFT_CLOSED
         if right_m >= self._home_m:
             switches += RIGHT_OPEN
@@ -323,11 +351,24 @@ class MessageDevice:
             left_A,
             right_A,
             plant.sensed_force_N,
-            math.floor(plant.handle_mm * self._handle_counts_per_mm),
+            self._handle_counts() if self._stuck_handle is None else self._stuck_handle,
             END_SWITCHES[switches],
             self._supply_V,
-            plant.element.temperature_C,
+            HOT_C if self._is_hot else plant.element.temperature_C,
         )
+
+    def _handle_counts(self) -> int:
+        return math.floor(self.plant.handle_mm * self._handle_counts_per_mm)
+
+    def _reset(self, time_s: float) -> None:
+        self.firmware = self._boot(self.parameters)
+        self._answers.clear()
+        self._answer_s = math.inf
+        (left_rad, _), (right_rad, _) = self.plant.shafts
+        self._left_boot_counts, self._right_boot_counts = self._encoders(left_rad, right_rad)
+        self._boot_s = time_s
+        self._ticks = 0
+        self._tick_due_s = time_s + TICK_S / self._rate
 
     def _encoders(self, left_rad: float, right_rad: float) -> tuple[int, int]:
         stuck = self._stuck_left
@@ -346,17 +387,35 @@ class MessageDevice:
                 self.plant.wear(WEAR)
             case "drag_left":
                 self.plant.left.drag_N *= 1.0 + fault.percent / 100.0
+            case "blocked_left":
+                self.plant.left.drag_N = JAMMED_N
+            case "blocked_right":
+                self.plant.right.drag_N = JAMMED_N
+            case "backlash":
+                self.plant.left.backlash_m *= 1.0 + fault.percent / 100.0
+                self.plant.right.backlash_m *= 1.0 + fault.percent / 100.0
+            case "motor_dead_left":
+                self._is_left_motor_dead = True
+                self._switch()
+            case "overheated":
+                self._is_hot = True
+            case "end_stop_left":
+                self._has_hit_left = True
+            case "switch_stuck_left":
+                self._is_switch_stuck_left = True
+            case "no_handle":
+                self._stuck_handle = self._handle_counts()
+            case "frozen":
+                self._frozen_until_s = time_s + WATCHDOG_S
+                self._answers.clear()
+                self._answer_s = math.inf
+            case "other_schema":
+                self._has_other_schema = True
             case "encoder_stuck_left":
                 (left_rad, _), (right_rad, _) = self.plant.shafts
                 self._stuck_left, _ = self._encoders(left_rad, right_rad)
             case "reset":
-                self.firmware = self._boot(self.parameters)
-                self._answers.clear()
-                self._answer_s = math.inf
-                (left_rad, _), (right_rad, _) = self.plant.shafts
-                self._left_boot_counts, self._right_boot_counts = self._encoders(left_rad, right_rad)
-                self._boot_s = time_s
-                self._ticks = 0
+                self._reset(time_s)
             case "commands_vanish":
                 self._deaf = True
             case "supply_loss":

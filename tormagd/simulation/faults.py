@@ -7,6 +7,16 @@ from typing import NamedTuple
 KNOWN = {
     "worn_gearbox": "a quarter of the friction in gearboxes and screws: the carriages no longer hold by themselves",
     "drag_left": "the left guide's drag changes by VALUE percent, as in drag_left=+50%",
+    "blocked_left": "the left carriage is jammed in its guide",
+    "blocked_right": "the right carriage is",
+    "backlash": "that of both screws changes by VALUE percent, as in backlash=+900%",
+    "motor_dead_left": "the left motor's bridge stays open",
+    "overheated": "the device measures 70 degrees in itself",
+    "end_stop_left": "the left closed end stop is reported",
+    "switch_stuck_left": "the left open switch is always closed",
+    "no_handle": "the handle's position stays what it was",
+    "frozen": "the firmware hangs with its last duties; after 100 ms its watchdog resets it",
+    "other_schema": "the firmware is of another version of the protocol",
     "encoder_stuck_left": "the left encoder stays at its last count",
     "reset": "the firmware restarts: mode, zero, handshake and clock are lost",
     "commands_vanish": "nothing that the host sends arrives",
@@ -24,7 +34,7 @@ KNOWN = {
     "switch_dead_left": "the left open switch never closes",
     "clock": "the device's clock runs fast by VALUE percent, as in clock=+2%",
 }
-SIZED = ("drag_left", "clock")
+SIZED = ("drag_left", "backlash", "clock")
 FORMS = "NAME[=PERCENT%][@SECONDS] with NAME one of: " + "; ".join(f"{name}: {what}" for name, what in KNOWN.items())
 _FORM = re.compile(r"(?P<name>\w+)(?:=(?P<percent>[+-]?[\d.]+)%)?(?:@(?P<at_s>[\d.]+))?")
 
@@ -48,7 +58,7 @@ def parse_fault(spec: str) -> Fault:
     if match is None or name not in KNOWN:
         raise FaultError(f"fault {spec!r}: allowed is {FORMS}")
     if (match["percent"] is not None) != (name in SIZED):
-        raise FaultError(f"fault {spec!r}: {' and '.join(SIZED)} take a size, as in drag_left=+50%, and no other fault")
+        raise FaultError(f"fault {spec!r}: {', '.join(SIZED)} take a size, as in drag_left=+50%, and no other fault")
     try:
         at_s, percent = float(match["at_s"] or 0.0), float(match["percent"] or 0.0)
     except ValueError as error:
