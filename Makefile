@@ -1,10 +1,17 @@
-# Two commands for users, `make run` and `make test`; the others are for developers.
+# Two commands for users, `make run` and `make test`, and `make install` beside a console (systemd/README.md); the others are
+# for developers.
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= auto
 SEARCHES ?= 5
+
+DESTDIR ?=
+PREFIX ?= /usr/local
+LIBRARY := $(PREFIX)/lib/tormagd
+# what the service's users have besides: recordings, their pictures, calibration
+SERVICE_EXTRAS ?= record,plot,lab
 
 export OMP_NUM_THREADS ?= 1
 
@@ -16,7 +23,9 @@ SAY_BUILD = $(BIN)/python -P -c 'from firmware_protocol.build import settle; pri
 CORE_TESTS := tests/control tests/safety tests/model tests/firmware_protocol/test_codec.py tests/firmware_protocol/test_framing.py \
     tests/hardware/test_link.py tests/hardware/test_link_statistics.py tests/tools/test_fuzz_protocol.py
 
-.PHONY: run test unhurried search check format compile model reproduction evidence clean
+PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
+
+.PHONY: install uninstall deb run test unhurried search check format compile model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -69,6 +78,37 @@ reproduction: $(VENV)/.dev
 evidence: $(VENV)/.dev
 	$(BIN)/python tools/evidence.py
 
+# The library stands in one folder of its own, with all that it imports, so that it can be put under any DESTDIR; both
+# commands find it there. It is built for, and run by, the interpreter that PYTHON names.
+install: $(VENV)/.man
+	rm -rf '$(DESTDIR)$(LIBRARY)'
+	$(PIP_TO) '$(DESTDIR)$(LIBRARY)' '.[$(SERVICE_EXTRAS)]'
+	rm -rf '$(DESTDIR)$(LIBRARY)/bin'
+	BUILD_PYTHON=$(BIN)/python BUILD_LIBRARY='$(DESTDIR)$(LIBRARY)' \
+	    systemd/install.sh '$(DESTDIR)' '$(PREFIX)' "$$(command -v $(PYTHON))" '$(LIBRARY)'
+
+# leaves the configuration and what was recorded
+uninstall:
+	rm -rf $(addprefix '$(DESTDIR)$(PREFIX)'/,lib/tormagd share/tormagd share/doc/tormagd bin/tormagd bin/tormagctl) \
+	    '$(DESTDIR)$(PREFIX)'/lib/systemd/system/tormag* '$(DESTDIR)$(PREFIX)'/lib/*/tormag.conf \
+	    '$(DESTDIR)$(PREFIX)'/lib/udev/rules.d/60-tormag.rules '$(DESTDIR)$(PREFIX)'/share/man/man1/tormag* \
+	    '$(DESTDIR)$(PREFIX)'/share/bash-completion/completions/tormagctl \
+	    '$(DESTDIR)$(PREFIX)'/share/zsh/site-functions/_tormagctl
+
+# a Debian package in build/, for the Python of this Debian: without torch, which only `tormagctl calibrate` needs
+deb: $(VENV)/.man
+	$(BIN)/python -c 'import sys, subprocess as s; v = "%d.%d" % sys.version_info[:2]; a = s.check_output(["/usr/bin/python3", \
+	    "-c", "import sys; print(\"%d.%d\" % sys.version_info[:2], end=\"\")"], text=True); \
+	    sys.exit(None if a == v else f"the package runs with Python {a}, but .venv has {v}: make clean, make deb PYTHON=/usr/bin/python3")'
+	rm -rf build/library
+	$(PIP_TO) build/library --no-deps .
+	$(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; e = p["optional-dependencies"]; \
+	    print(*(d for d in (*p["dependencies"], *e["record"], *e["plot"]) if not d.startswith("torch")), sep="\n")' \
+	    > build/requirements.txt
+	$(PIP_TO) build/library --requirement build/requirements.txt
+	rm -rf build/library/bin
+	BUILD_PYTHON=$(BIN)/python BUILD_LIBRARY=$(CURDIR)/build/library systemd/deb.sh build/library build
+
 clean:
 	rm -rf $(VENV) build run .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
@@ -78,6 +118,10 @@ $(BIN)/python:
 $(VENV)/.demo: pyproject.toml setup.py | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable '.[demo]'
 	@$(SAY_BUILD)
+	touch $@
+
+$(VENV)/.man: pyproject.toml setup.py | $(BIN)/python
+	$(BIN)/python -m pip install --quiet 'argparse-manpage>=4.6'
 	touch $@
 
 $(VENV)/.dev: pyproject.toml setup.py | $(BIN)/python

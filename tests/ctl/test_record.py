@@ -84,6 +84,13 @@ def test_a_recording_is_never_overwritten(fake_daemon, tmp_path, capsys):
     assert file.read_text() == "precious"
 
 
+def test_in_a_folder_a_recording_has_a_name_of_its_own(fake_daemon, tmp_path, capsys):
+    assert main(["--endpoint", fake_daemon.control, "--json", "record", str(tmp_path), "--duration", "0.1"]) == 0
+    (file,) = tmp_path.iterdir()
+    assert json.loads(capsys.readouterr().out)["result"]["file"] == str(file)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.mcap", file.name)
+
+
 def test_a_file_that_cannot_be_made_is_a_usage_error(fake_daemon, tmp_path, capsys):
     assert main(["--endpoint", fake_daemon.control, "record", str(tmp_path / "none" / "a.mcap")]) == 2
     assert "No such file" in capsys.readouterr().err

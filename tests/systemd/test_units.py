@@ -1,28 +1,64 @@
+import argparse
+import gzip
 import os
 import re
 import shutil
 import socket
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+from tormagd import __version__
 from tormagd.config import Config
+from tormagd.ctl.main import parser
 from tormagd.daemon.notify import notify
 
 UNITS = Path(__file__).parents[2] / "systemd"
 needs_analyze = pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="systemd-analyze is not installed")
 
 
+INSTALLED = sorted(
+    f"lib/{name}"
+    for name in (
+        *(f"systemd/system/{unit}{kind}.service" for unit in ("tormagd", "tormag-record") for kind in ("", "@")),
+        *(f"{kind}.d/tormag.conf" for kind in ("sysusers", "tmpfiles", "modules-load")),
+        "systemd/system/tormag.target",
+        "udev/rules.d/60-tormag.rules",
+    )
+)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `make install DESTDIR=ROOT PREFIX=/usr` puts there besides the library."""
+    made: Path = tmp_path_factory.mktemp("root")
+    command = ["sh", str(UNITS / "install.sh"), str(made), "/usr", sys.executable, str(UNITS.parent)]
+    subprocess.run(command, check=True, timeout=60)
+    return made
+
+
 @pytest.fixture
 def unit(tmp_path: Path) -> Path:
     """The unit with a program that exists here in place of /usr/bin/tormagd."""
-    text = (UNITS / "tormagd.service").read_text()
-    copy = tmp_path / "tormagd.service"
-    changed = re.sub(r"^ExecStart=/usr/bin/tormagd ", f"ExecStart={shutil.which('true')} ", text, flags=re.MULTILINE)
-    assert changed != text
+    return runnable(UNITS / "tormagd.service", tmp_path)
+
+
+def runnable(unit: Path, folder: Path) -> Path:
+    """A copy whose program exists here, in a folder in which the names of others are known."""
+    copy = folder / unit.name
+    program = shutil.which("true")
+    changed = re.sub(r"^ExecStart=/usr/bin/\w+ ", f"ExecStart={program} ", unit.read_text(), flags=re.MULTILINE)
+    assert changed != unit.read_text()
     copy.write_text(changed)
     return copy
+
+
+def commands() -> dict[str, argparse.ArgumentParser]:
+    """The commands of `tormagctl` by name."""
+    (chosen,) = (action for action in parser()._actions if isinstance(action.choices, dict))
+    return dict(chosen.choices)
 
 
 def analyze(*arguments: object) -> "subprocess.CompletedProcess[str]":
@@ -44,9 +80,87 @@ def test_verification_would_notice_an_unknown_key(unit):
 
 
 @needs_analyze
-def test_the_unit_is_closed_to_what_it_does_not_need(unit):
-    examined = analyze("security", "--offline=true", "--threshold=20", unit)
+def test_every_installed_unit_is_understood(root, tmp_path):
+    shutil.copy(root / "usr/lib/systemd/system/tormag.target", tmp_path)
+    services = [runnable(path, tmp_path) for path in sorted((root / "usr/lib/systemd/system").glob("*.service"))]
+    assert len(services) == 4
+    for service in services:
+        instance = tmp_path / service.name.replace("@.", "@left.")
+        if not instance.exists():
+            instance.symlink_to(service)
+        # no man pages here; no user and no group either, which are made by sysusers.d
+        verified = analyze("verify", "--man=no", instance)
+        assert (verified.returncode, verified.stderr) == (0, ""), instance.name
+
+
+@needs_analyze
+@pytest.mark.parametrize(("drop_ins", "most"), [((), 5), (("can", "tcp"), 15)])
+def test_the_unit_is_closed_to_what_it_does_not_need(unit, drop_ins, most):
+    """A serial line and ipc: at most 0.5. A CAN bus and tcp: at most 1.5."""
+    opened = unit.parent / "tormagd.service.d"
+    opened.mkdir()
+    for name in drop_ins:
+        shutil.copy(UNITS / f"drop-ins/{name}.conf", opened)
+    examined = analyze("security", "--offline=true", f"--threshold={most}", unit)
     assert examined.returncode == 0, examined.stdout
+    # and they are looked at: the open one is more open than that
+    assert analyze("security", "--offline=true", "--threshold=4", unit).returncode != 0
+
+
+def test_what_is_installed_lies_in_its_places(root):
+    installed = sorted(str(path.relative_to(root / "usr")) for path in (root / "usr/lib").rglob("*") if path.is_file())
+    assert installed == INSTALLED
+    assert (root / "etc/tormag/tormagd.toml").read_bytes() == (UNITS.parent / "examples/service.toml").read_bytes()
+    assert (root / "usr/share/tormagd/drop-ins/tcp.conf").is_file()
+    # nothing of the folder that it was put together in: that is moved, or packed
+    for path in root.rglob("*"):
+        assert path.is_dir() or str(root).encode() not in path.read_bytes()
+
+
+def test_an_instance_shares_nothing_with_another(root):
+    units = root / "usr/lib/systemd/system"
+    for name in ("tormagd", "tormag-record"):
+        alone, several = ((units / f"{name}{kind}.service").read_text().splitlines() for kind in ("", "@"))
+        own = {line.split("=")[0] for line, of_one in zip(several, alone, strict=True) if line != of_one}
+        assert own >= {"Description", "ExecStart", "StateDirectory"}
+    text = (units / "tormagd@.service").read_text()
+    assert "\nRuntimeDirectory=tormag-%i\n" in text  # not in /run/tormag, which goes when that service stops
+    assert "\nExecStart=/usr/bin/tormagd --config /etc/tormag/%i.toml\n" in text
+
+
+def test_the_installed_commands_run(root):
+    for name in ("tormagd", "tormagctl"):
+        told = subprocess.run([str(root / f"usr/bin/{name}"), "--version"], capture_output=True, text=True, check=True)
+        assert told.stdout.startswith(f"{name} {__version__}")
+
+
+def test_man_pages_name_every_command_and_option(root):
+    pages = {path.name: gzip.decompress(path.read_bytes()).decode() for path in (root / "usr/share/man/man1").iterdir()}
+    assert sorted(pages) == ["tormagctl.1.gz", "tormagd.1.gz"]
+    plain = pages["tormagctl.1.gz"].replace("\\-", "-").replace("\\fB", "").replace("\\fR", "")
+    for name, command in commands().items():
+        assert f"tormagctl {name}" in plain
+        for action in command._actions:
+            assert all(option in plain for option in action.option_strings if option != "--help")
+    assert "SIGHUP" in pages["tormagd.1.gz"]
+
+
+@pytest.mark.skipif(not shutil.which("bash"), reason="bash is not installed")
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [(["st"], {"status", "stop"}), (["send", "--val"], {"--valid-for-ms"}), (["scene", ""], {"list", "show"})],
+)
+def test_bash_completes_commands_options_and_choices(root, words, offered):
+    script = root / "usr/share/bash-completion/completions/tormagctl"
+    line = " ".join(f"'{word}'" for word in ["tormagctl", *words])
+    asked = f"""
+        source {script}
+        COMP_WORDS=({line}); COMP_CWORD={len(words)}
+        $(complete -p tormagctl | sed 's/.*-F \\([^ ]*\\).*/\\1/') tormagctl '{words[-1]}' x
+        printf '%s\\n' "${{COMPREPLY[@]}}"
+    """
+    told = subprocess.run(["bash", "--norc", "-c", asked], capture_output=True, text=True, check=True, timeout=60)
+    assert set(told.stdout.split()) >= offered
 
 
 def seconds(key: str) -> float:

@@ -26,6 +26,7 @@ STATE_COMMANDS = {
     "clear-fault": "forget latched faults; stays disabled",
 }
 EXTRAS = {"mcap": "record", "zstandard": "record", "matplotlib": "plot", "tqdm": "lab"}
+SHELLS = ("bash", "zsh")
 KEY, SERVER_KEY = "TORMAG_KEY", "TORMAG_SERVER_KEY"
 "Environment variables that stand for `--key` and `--server-key`."
 EXIT_TEXT = """exit codes: 0 done, 1 refused or not done (doctor: a failure was found), 2 usage, 3 daemon not reachable,
@@ -34,7 +35,7 @@ EXIT_TEXT = """exit codes: 0 done, 1 refused or not done (doctor: a failure was 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
-    options = _parser().parse_args(arguments)
+    options = parser().parse_args(arguments)
     try:
         outcome = _run(options)
     except CommandError as error:
@@ -57,6 +58,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> Outcome:
     if options.command == "keys":
         return _keys(options)
+    if options.command == "completion":
+        from tormagd.ctl.completion import completion
+
+        script = completion(parser(), options.shell)
+        return Outcome({"shell": options.shell, "script": script}, script)
     config = _configuration(options.config)
     endpoints = _endpoints(config.endpoints, options)
     match options.command:
@@ -235,17 +241,18 @@ def _endpoints(configured: Endpoints, options: argparse.Namespace) -> Endpoints:
         ) from error
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """What `tormagctl` understands; completions and man pages are made from it, too."""
     # the common options may stand before or after the command; SUPPRESS keeps the second parser from undoing the first
     shared = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
     _add_common(shared)
-    parser = argparse.ArgumentParser(
+    made = argparse.ArgumentParser(
         prog="tormagctl", description="Operate the tormagd haptic controller.", epilog=EXIT_TEXT
     )
-    _add_common(parser)
-    parser.set_defaults(config=None, endpoint=None, key=None, server_key=None, json=False, wait=1.0)
-    parser.add_argument("--version", action="version", version=f"tormagctl {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_common(made)
+    made.set_defaults(config=None, endpoint=None, key=None, server_key=None, json=False, wait=1.0)
+    made.add_argument("--version", action="version", version=f"tormagctl {__version__}")
+    commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def command(name: str, help_text: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=help_text, description=help_text, parents=[shared], epilog=EXIT_TEXT)
@@ -286,7 +293,7 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     record = command("record", "write telemetry and control ticks to an MCAP file until Ctrl-C")
-    record.add_argument("file", type=Path, metavar="FILE.mcap")
+    record.add_argument("file", type=Path, metavar="FILE.mcap|DIR", help="a folder: a new file, named by the time")
     record.add_argument("--duration", type=_above_zero, default=math.inf, metavar="S", help="end after this time")
 
     box = command("blackbox", "have the daemon write the last half minute, as it does by itself on a fault")
@@ -355,7 +362,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     doctor = command("doctor", "what on this machine would hurt real time or access, each with its remedy")
     doctor.add_argument("--measure", action="store_true", help="also which rates it holds, measured in about 6 s")
-    return parser
+    completing = command("completion", "print what a shell needs to complete commands, options and files")
+    completing.add_argument("shell", choices=SHELLS)
+    return made
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:

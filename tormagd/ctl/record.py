@@ -5,6 +5,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 
 import msgspec
@@ -29,7 +30,7 @@ SILENT_S = 1.0
 
 
 def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
-    """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM.
+    """Record telemetry and ticks for `duration_s` or until SIGINT or SIGTERM; in a folder, to a file of its own.
 
     What is recorded is asked of the daemon and written down first, and again at the end: a device may have been
     connected, or have shown itself, meanwhile.
@@ -48,6 +49,8 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
             if not _any_ready((telemetry, ticks), wait_s, is_interrupted):
                 raise unreachable(endpoints.telemetry, f"nothing is published there within {wait_s:g} s")
             about = _about(endpoints, wait_s, keys)
+            if path.is_dir():
+                path /= f"{datetime.now():%Y-%m-%dT%H-%M-%S}.mcap"
             try:
                 writer = RecordingWriter(path, about)
             except FileExistsError as error:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from tormagd.config import Config
+from tormagd.config import Config, ConfigError
 from tormagd.control.core import Core
 from tormagd.daemon import notify
 from tormagd.daemon.black_box import AFTER_FAULT_S, BlackBox
@@ -21,6 +21,7 @@ from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import ProfileFolder, Profiles, profile_folder
 from tormagd.daemon.realtime import freeze_garbage, priority_of_threads
+from tormagd.daemon.reload import reread
 from tormagd.daemon.telemetry_loop import TelemetryLoop
 from tormagd.hardware.backend import Backend
 from tormagd.hardware.connection import Connection
@@ -42,7 +43,7 @@ log = logging.getLogger(__name__)
 
 
 class Daemon:
-    """Runs one scene on one device until it is told to end."""
+    """Runs one scene on one device until it is told to end. `read_again` gives the configuration as it is now."""
 
     def __init__(
         self,
@@ -52,9 +53,10 @@ class Daemon:
         refused: list[str],
         keys: KeyRing | None = None,
         box: BlackBox | None = None,
+        read_again: Callable[[], Config] | None = None,
     ) -> None:
         """`box` is one whose process runs already; without it none is kept."""
-        self._config, self._core = config, core
+        self._config, self._core, self._read_again = config, core, read_again
         self._loop = asyncio.get_running_loop()
         self._callbacks = Callbacks(self._loop)
         self._causes = Causes(config.device)
@@ -98,7 +100,7 @@ class Daemon:
         """Runs until SIGTERM or SIGINT; opens the gap before it returns."""
         for number in (signal.SIGTERM, signal.SIGINT):
             self._loop.add_signal_handler(number, self._ended.set)
-        self._loop.add_signal_handler(signal.SIGHUP, self._endpoint.admission.reload)
+        self._loop.add_signal_handler(signal.SIGHUP, self._reload)
         self._connection.open(self._callbacks)
         freeze_garbage()
         sys.setswitchinterval(SWITCH_S)
@@ -107,7 +109,6 @@ class Daemon:
         heartbeat = Heartbeat(NS // self._config.rates.control_hz)
         # not on one account: its parts have their own
         self._loop.add_reader(heartbeat.fileno(), self._beat, heartbeat)
-        notify.notify("READY=1")
         solver = self._core.solver
         log.info(
             "running scene %s with the %s solver at %g mT, %s (%s)",
@@ -174,6 +175,28 @@ class Daemon:
             self._telemetry.take_requests()
         else:
             self._endpoint.has_requests = True
+
+    def _reload(self) -> None:
+        self._endpoint.admission.reload()
+        if self._read_again is not None:
+            # in a thread: reading a file is nothing that a tick should wait for
+            reading = self._loop.run_in_executor(None, self._read_again)
+            reading.add_done_callback(self._take_over)
+
+    def _take_over(self, reading: "asyncio.Future[Config]") -> None:
+        try:
+            read = reading.result()
+        except ConfigError as error:
+            log.error("the configuration stays as it was: %s", error)
+            return
+        again = reread(self._config, read)
+        self._config = again.config
+        self._telemetry.take_over(again.config)
+        log.info(
+            "configuration read again: %s", f"now in force: {', '.join(again.taken)}" if again.taken else "no news"
+        )
+        if again.waiting:
+            log.warning("not before a restart (systemctl restart tormagd): %s", ", ".join(again.waiting))
 
     def _lose_link(self) -> None:
         self._control.lose_link()

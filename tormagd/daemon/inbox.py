@@ -96,7 +96,8 @@ class SetpointInbox:
         self.last_refusal: str | None = None
         self.newest: TimedSetpoint | None = None
         self.hold = Hold()
-        self._priority = priority
+        self.priority = priority
+        "May be set anew at any time; who holds the brake goes on holding it until another message comes."
         self._sources: dict[str, _Source] = {}
         self._other, self._other_s = "", -SILENT_S
         "The source that was refused last, because another holds the brake, and when."
@@ -197,7 +198,7 @@ class SetpointInbox:
         if source.setpoint.source != hold.source:
             is_free = self.newest is None or now_s - self.newest.stamp_s > self.newest.valid_for_s
             if hold.source and (
-                source.is_stale(now_s) or not is_passed(hold, setpoint.source, self._priority, is_stale=is_free)
+                source.is_stale(now_s) or not is_passed(hold, setpoint.source, self.priority, is_stale=is_free)
             ):
                 self._other, self._other_s = setpoint.source, now_s
                 source.refused += 1
@@ -239,8 +240,8 @@ class SetpointInbox:
         others = [other for other in self._sources if other != self.hold.source]
         oldest = min(others, key=lambda other: self._sources[other].heard_s)
         if now_s - self._sources[oldest].heard_s <= SILENT_S:
-            unlisted = [other for other in others if other not in self._priority]
-            if name not in self._priority or not unlisted:
+            unlisted = [other for other in others if other not in self.priority]
+            if name not in self.priority or not unlisted:
                 raise MessageError(f"source = {name!r}: allowed are {SOURCES} publishers at a time")
             oldest = min(unlisted, key=lambda other: self._sources[other].heard_s)
         del self._sources[oldest]

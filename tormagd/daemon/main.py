@@ -4,6 +4,7 @@ import argparse
 import logging
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,15 +23,22 @@ if TYPE_CHECKING:
     from tormagd.keys import KeyRing
 
 REFUSED = 2
+EXIT_TEXT = """exit codes: 0 ended on request, 1 could not run, 2 configuration refused. SIGTERM opens the gap and ends;
+SIGHUP reads keys and configuration again."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """What `tormagd` understands; its man page is made from it, too."""
+    made = argparse.ArgumentParser(prog="tormagd", description="Real-time haptic controller daemon.", epilog=EXIT_TEXT)
+    made.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration; defaults where it is silent")
+    made.add_argument("--check", action="store_true", help="print the resolved configuration and exit")
+    made.add_argument("--version", action="version", version=f"tormagd {__version__}, {settle()}")
+    return made
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the daemon; returns the exit code: 0 ended on request, 1 could not run, 2 configuration refused."""
-    parser = argparse.ArgumentParser(prog="tormagd", description="Real-time haptic controller daemon.")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration; defaults where it is silent")
-    parser.add_argument("--check", action="store_true", help="print the resolved configuration and exit")
-    parser.add_argument("--version", action="version", version=f"tormagd {__version__}, {settle()}")
-    options = parser.parse_args(arguments)
+    options = parser().parse_args(arguments)
     _log_to_stderr()
     # nothing moves until the daemon runs and takes the signal over: before that, Ctrl-C may simply end the process
     interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -59,7 +67,7 @@ def _start(options: argparse.Namespace) -> int:
         _print_resolved(config, core, backend.options)
         return 0
     try:
-        uvloop.run(_run(config, core, backend.open, keys))
+        uvloop.run(_run(config, core, backend.open, keys, partial(load_config, options.config)))
     except OSError as error:
         write_line(f"tormagd: {printable(str(error))}", sys.stderr)
         return 1
@@ -79,7 +87,13 @@ def _keys(endpoints: Endpoints) -> "KeyRing | None":
     return KeyRing(endpoints) if any(endpoints.is_guarded(name) for name in ENDPOINTS) else None
 
 
-async def _run(config: Config, core: "Core", open_backend: "Callable[[], Backend]", keys: "KeyRing | None") -> None:
+async def _run(
+    config: Config,
+    core: "Core",
+    open_backend: "Callable[[], Backend]",
+    keys: "KeyRing | None",
+    read_again: "Callable[[], Config]",
+) -> None:
     from tormagd.daemon.black_box import BlackBox, black_box_folder, header
     from tormagd.daemon.daemon import Daemon
     from tormagd.daemon.realtime import prepare
@@ -88,7 +102,7 @@ async def _run(config: Config, core: "Core", open_backend: "Callable[[], Backend
     folder = black_box_folder(config.black_box.folder)
     box = BlackBox(folder, header(config, core), config.rates.control_hz)
     refused = prepare(config.realtime)
-    await Daemon(config, core, open_backend, refused, keys, box).run()
+    await Daemon(config, core, open_backend, refused, keys, box, read_again).run()
 
 
 def _print_resolved(config: Config, core: "Core", options: msgspec.Struct) -> None:

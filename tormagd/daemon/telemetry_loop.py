@@ -22,10 +22,10 @@ from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import Profiles
 from tormagd.daemon.rate_group import ERROR_PERIODS, RateGroup
+from tormagd.daemon.service import READY, Service, status_line
 from tormagd.daemon.telemetry import is_driven, snapshot, tick_record
 from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
-from tormagd.hardware.link import LinkState
 from tormagd.messages import Description, DeviceReport, OutputReport, Request, Status, Telemetry, TickRecord
 from tormagd.safety.operating_state import Conditions, RefusedError
 
@@ -67,6 +67,7 @@ class TelemetryLoop:
         self._started_s = time.monotonic()
         self._ticks: list[TickRecord] = []
         self._way = Way()
+        self._service = Service()
         self._status: dict[str, Any] | None = None
 
     def record(self, used: PlanState) -> None:
@@ -108,8 +109,7 @@ class TelemetryLoop:
             lambda request: self._answer(request, snapshot_),
             self._control.next_tick_ns - SERVED_BEFORE_NS,
         )
-        if self._is_alive(start_ns * 1e-9):
-            notify.notify("WATCHDOG=1")
+        self._tell_service(start_ns * 1e-9, snapshot_.is_homed)
         self._report_late_ticks()
         self._report_sources(start_ns * 1e-9)
         self.timing.record(due_ns, start_ns, time.monotonic_ns())
@@ -152,16 +152,35 @@ class TelemetryLoop:
         age_s = None if stamp is None else now_s - stamp.stamp_s
         return snapshot(self._ticks[-1], self.timing.runs, homed, self.is_busy(), age_s)
 
-    def _is_alive(self, now_s: float) -> bool:
-        """Whether plans and device states are as fresh as systemd's watchdog wants them; ticks are, or nobody asks."""
-        timeout_s = self._config.realtime.watchdog_ms * 1e-3
-        plan, measurement = self._inference.state.plan, self._connection.measurement
-        if plan.number == 0 or now_s - plan.time_s > timeout_s:
-            return False
-        # without a port there are no states to be fresh, and starting the daemon again would not bring one
-        return self._connection.state is not LinkState.RUNNING or (
-            measurement is not None and now_s - measurement.received_s < timeout_s
+    def take_over(self, config: Config) -> None:
+        """Goes on with another configuration, of which only what a loop looks at each time may differ."""
+        self._config = config
+        self._endpoint.inbox.priority = config.sources.priority
+
+    def _tell_service(self, now_s: float, is_homed_: bool) -> None:
+        """Says to systemd how it stands, and feeds its watchdog while plans and device states are fresh."""
+        connection, safety, service = self._connection, self._control.state.safety, self._service
+        plan, measurement, link = self._inference.state.plan, connection.measurement, connection.state
+        is_alive = service.is_alive(
+            now_s,
+            self._config.realtime.watchdog_ms * 1e-3,
+            plan.time_s if plan.number else None,
+            link,
+            None if measurement is None else measurement.received_s,
         )
+        status = status_line(
+            link,
+            connection.cause,
+            connection.remedy,
+            str(safety.operating_state),
+            is_homed_,
+            [str(fault) for fault in safety.faults],
+            self._core.scene.name,
+        )
+        for message in service.news(now_s, is_alive, link, status):
+            if message == READY:
+                log.info("ready: the device is identified; next: %s", "enable" if is_homed_ else "home")
+            notify.notify(message)
 
     def _report_late_ticks(self) -> None:
         news = self._callbacks.news()

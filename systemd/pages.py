@@ -1,0 +1,36 @@
+"""Completions and man pages of both commands, made from their argument parsers: python -P systemd/pages.py SHARE."""
+
+import gzip
+import sys
+from argparse import ArgumentParser
+from pathlib import Path
+
+from argparse_manpage.manpage import Manpage
+
+from tormagd import __version__
+from tormagd.ctl.completion import completion
+from tormagd.ctl.main import SHELLS
+from tormagd.ctl.main import parser as ctl
+from tormagd.daemon.main import parser as daemon
+
+
+def page(parser: ArgumentParser) -> bytes:
+    """The man page in section 1, compressed; the same bytes for the same parser."""
+    known = {"project_name": "tormagd", "version": __version__, "manual_title": "Haptic controller"}
+    made = Manpage(parser, known, format="single-commands-section")
+    made.date = ""  # that of the build says nothing
+    return gzip.compress(str(made).encode(), mtime=0)
+
+
+def main(share: Path) -> None:
+    """Writes all of them under `share`, in folders that are there."""
+    for shell, path in zip(
+        SHELLS, ("bash-completion/completions/tormagctl", "zsh/site-functions/_tormagctl"), strict=True
+    ):
+        (share / path).write_text(completion(ctl(), shell), encoding="utf-8")
+    for parser in (daemon(), ctl()):
+        (share / "man/man1" / f"{parser.prog}.1.gz").write_bytes(page(parser))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,102 @@
+from typing import Any
+
+import pytest
+
+from tormagd.daemon.service import EXTENSION_S, Service, status_line
+from tormagd.hardware.link import LinkState
+
+LIMIT_S = 0.5
+SILENT = (LinkState.IDENTIFYING, LinkState.UNANSWERED)
+ABSENT = (LinkState.LOST, LinkState.BACK_OFF, LinkState.CLOSED)
+
+
+def ready() -> Service:
+    """One whose device was identified at 0 s."""
+    service = Service()
+    assert service.is_alive(0.0, LIMIT_S, 0.0, LinkState.RUNNING, 0.0)
+    assert service.news(0.0, True, LinkState.RUNNING, "up") == ["READY=1", "STATUS=up", "WATCHDOG=1"]
+    return service
+
+
+def is_fed(service: Service, now_s: float, link: LinkState, received_s: float | None = None) -> bool:
+    alive = service.is_alive(now_s, LIMIT_S, now_s, link, received_s)
+    return "WATCHDOG=1" in service.news(now_s, alive, link, "up")
+
+
+def test_ready_is_said_once_and_only_when_the_device_is_identified():
+    service = Service()
+    for link in (*ABSENT, *SILENT, LinkState.REFUSED):
+        assert "READY=1" not in service.news(0.0, True, link, "")
+    assert "READY=1" in service.news(0.0, True, LinkState.RUNNING, "")
+    assert "READY=1" not in service.news(0.0, True, LinkState.RUNNING, "")
+
+
+def test_while_it_waits_a_daemon_that_lives_is_given_more_time_to_start():
+    service = Service()
+    extension = f"EXTEND_TIMEOUT_USEC={EXTENSION_S * 1e6:.0f}"
+    told = {ms: extension in service.news(ms * 1e-3, True, LinkState.BACK_OFF, "") for ms in range(0, 3000, 20)}
+    assert [ms for ms, is_told in told.items() if is_told] == [0, 1000, 2000]
+    assert extension not in service.news(4.0, False, LinkState.BACK_OFF, "")  # one that hangs is given none
+    assert service.news(5.0, True, LinkState.RUNNING, "") == ["READY=1", "WATCHDOG=1"]
+
+
+def test_a_status_is_said_when_it_changes():
+    service = ready()
+    assert service.news(1.0, False, LinkState.RUNNING, "up") == []
+    assert service.news(2.0, False, LinkState.RUNNING, "FAULT") == ["STATUS=FAULT"]
+
+
+@pytest.mark.parametrize("link", SILENT)
+def test_a_device_that_was_there_and_is_silent_behind_an_open_port_ends_the_feeding(link):
+    service = ready()
+    assert is_fed(service, 0.49, link)
+    assert not is_fed(service, 0.51, link)
+    assert not is_fed(service, 60.0, link)
+    assert is_fed(service, 61.0, LinkState.RUNNING, 61.0)
+
+
+@pytest.mark.parametrize("link", [*ABSENT, LinkState.REFUSED])
+def test_without_a_port_or_with_a_firmware_that_does_not_fit_there_is_nothing_to_start_again_for(link):
+    service = ready()
+    assert all(is_fed(service, tenths * 0.1, link) for tenths in range(100))
+
+
+def test_a_device_that_never_came_is_waited_for():
+    service = Service()
+    assert all(is_fed(service, tenths * 0.1, link) for tenths in range(100) for link in SILENT)
+
+
+@pytest.mark.parametrize("received_s", [0.0, None])
+def test_a_running_link_without_new_states_ends_the_feeding(received_s):
+    service = ready()
+    assert is_fed(service, 0.4, LinkState.RUNNING, received_s)
+    assert not is_fed(service, 0.6, LinkState.RUNNING, received_s)
+
+
+@pytest.mark.parametrize("planned_s", [None, 0.4])
+def test_without_fresh_plans_it_is_not_fed(planned_s):
+    assert not ready().is_alive(1.0, LIMIT_S, planned_s, LinkState.RUNNING, 1.0)
+
+
+def line(**changes: Any) -> str:
+    known: dict[str, Any] = {
+        "link": LinkState.RUNNING,
+        "cause": "",
+        "remedy": "",
+        "state": "DISABLED",
+        "is_homed": True,
+        "faults": [],
+        "scene": "coronary",
+    }
+    return status_line(**(known | changes))
+
+
+def test_the_status_line_says_how_it_stands_and_what_is_next():
+    assert line(state="ENABLED") == "ENABLED, scene coronary"
+    assert line(is_homed=False) == "DISABLED, scene coronary; next: tormagctl home"
+    assert line(state="FAULT", faults=["SKEW", "STOPPED"]) == "FAULT: SKEW, STOPPED; next: tormagctl status"
+
+
+def test_what_the_device_or_the_kernel_says_makes_no_lines_of_its_own():
+    told = line(link=LinkState.BACK_OFF, cause="no port\nREADY=1", remedy="plug it in")
+    assert told == "DISABLED, scene coronary; waiting for the device (BACK_OFF): no port READY=1; plug it in"

@@ -1,0 +1,175 @@
+"""A package, and a machine of its own to install it on: systemd as process 1 of fresh namespaces, `boot.sh`."""
+
+import contextlib
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).parents[2]
+BOOT = Path(__file__).with_name("boot.sh")
+NAMESPACES = ("--pid", "--fork", "--mount", "--mount-proc", "--cgroup", "--uts", "--ipc", "--net", "--kill-child")
+PYTHON = f"env LD_LIBRARY_PATH=/opt/base/lib /opt/base/bin/python{sys.version_info[0]}.{sys.version_info[1]}"
+LIBRARY = "/opt/checkout:/opt/packages"
+"Where the machine finds this interpreter, and what it imports."
+PATIENCE_S = 60.0
+"Longer than anything takes on a busy machine; only a failure waits for it."
+
+
+def missing() -> str:
+    """Why no such machine can be made here; empty where it can."""
+    if os.geteuid() != 0:
+        return "not root"
+    for program in ("unshare", "nsenter", "pivot_root", "systemctl"):
+        if shutil.which(program) is None:
+            return f"{program} is not installed"
+    if not Path("/usr/lib/systemd/systemd").exists():
+        return "systemd is not installed"
+    if "overlay" not in Path("/proc/filesystems").read_text():
+        return "the kernel has no overlayfs"
+    allowed = subprocess.run(["unshare", *NAMESPACES, "true"], capture_output=True, text=True, check=False)
+    return f"namespaces are not allowed: {allowed.stderr.strip()}" if allowed.returncode else ""
+
+
+class Machine:
+    """A booted machine, which has `shared` as /opt/shared. Nothing of it is left when it is closed."""
+
+    def __init__(self, folder: Path, shared: Path) -> None:
+        self._folder, self._shared = folder, shared
+        self._boot()
+
+    def _boot(self) -> None:
+        place = self._folder / "machine"
+        place.mkdir(exist_ok=True)
+        packages = sysconfig.get_path("purelib")
+        # a control group of its own: the new process 1 is its root's, and sees nothing of this machine's
+        self._group = _own_group(f"tormag-test-{os.getpid()}")
+        self.log = self._folder / "console.log"
+        command = ["unshare", *NAMESPACES, "sh", str(BOOT)]
+        command += [str(place), str(self._shared), str(CHECKOUT), sys.base_prefix, packages]
+        with self.log.open("w") as log:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                preexec_fn=self._enter_group,
+            )
+        self.until(lambda: self.run("systemctl", "is-active", "basic.target", check=False) == "active", "booted")
+
+    def start_again(self, folder: Path) -> None:
+        """Another one in its place, for a scenario that the host spoiled."""
+        self.close()
+        self._folder = folder
+        self._boot()
+
+    def run(self, *command: str, check: bool = True) -> str:
+        """What a command says on the machine, without the last line end."""
+        inner = self._inner()
+        if inner is None:
+            assert self._process.poll() is None, self.log.read_text()
+            return ""
+        done = subprocess.run(
+            ["nsenter", "--target", inner, "--all", *command],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=PATIENCE_S,
+            env={"PATH": "/usr/bin:/usr/sbin:/bin"},
+        )
+        assert not check or done.returncode == 0, f"{command}: {done.stdout}{done.stderr}"
+        return done.stdout.strip()
+
+    def shows(self, unit: str, *names: str) -> list[str]:
+        """Properties of a unit."""
+        shown = self.run("systemctl", "show", unit, *(f"--property={name}" for name in names))
+        values = dict(line.split("=", 1) for line in shown.splitlines())
+        return [values.get(name, "") for name in names]
+
+    def until(self, reached: Callable[[], bool], what: str) -> None:
+        """Waits for a condition; fails saying what was waited for."""
+        until_s = time.monotonic() + PATIENCE_S
+        while not reached():
+            assert time.monotonic() < until_s, f"not within {PATIENCE_S:g} s: {what}\n{self.log.read_text()}"
+            time.sleep(0.05)
+
+    def close(self) -> None:
+        """Ends all that runs on it."""
+        self._process.kill()  # with --kill-child, its process 1 and so everything else
+        self._process.wait()
+        if self._group is not None:
+            # the kernel takes away a process after it has ended it
+            until_s = time.monotonic() + PATIENCE_S
+            while self._group.exists() and time.monotonic() < until_s:
+                for folder, _, _ in os.walk(self._group, topdown=False):
+                    with contextlib.suppress(OSError):
+                        Path(folder).rmdir()
+
+    def _inner(self) -> str | None:
+        children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children")
+        with contextlib.suppress(OSError):
+            return next(iter(children.read_text().split()), None)
+        return None
+
+    def _enter_group(self) -> None:
+        if self._group is not None:
+            (self._group / "cgroup.procs").write_text("0")
+
+
+def _own_group(name: str) -> Path | None:
+    for mounted in (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified")):
+        if (mounted / "cgroup.procs").exists():
+            group = mounted / name
+            group.mkdir(exist_ok=True)
+            return group
+    return None
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """The package with this checkout in it, and links to where a `Machine` has what it imports in place of that."""
+    if shutil.which("dpkg-deb") is None:
+        pytest.skip("dpkg-deb is not installed")
+    library, out = tmp_path / "library", tmp_path / "package"
+    library.mkdir()
+    for name in ("tormagd", "firmware_protocol"):
+        shutil.copytree(CHECKOUT / name, library / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for imported in Path(sysconfig.get_path("purelib")).iterdir():
+        if not (library / imported.name).exists():
+            (library / imported.name).symlink_to(f"/opt/packages/{imported.name}")
+    for core in CHECKOUT.glob("*.so"):
+        shutil.copy(core, library)
+    environment = os.environ | {"PYTHON": sys.executable, "RUN_PYTHON": PYTHON, "COMPRESSION": "none"}
+    made = subprocess.run(
+        ["sh", str(CHECKOUT / "systemd/deb.sh"), str(library), str(out)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert made.returncode == 0, made.stderr
+    shutil.rmtree(library)
+    (path,) = out.iterdir()
+    return path
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Iterator[Machine]:
+    """A machine without the service, which sees `tmp_path` as /opt/shared."""
+    why_not = missing()
+    if why_not:
+        pytest.skip(f"no machine of its own: {why_not}")
+    with contextlib.closing(Machine(tmp_path, tmp_path)) as made:
+        yield made
+
+
+@pytest.fixture
+def imports() -> dict[str, str]:
+    """The interpreter on a `Machine`, and where it imports from."""
+    return {"python": PYTHON, "library": LIBRARY}

@@ -1,0 +1,74 @@
+"""What systemd is told: ready once the device is identified, a line on how it stands, and that we live.
+
+No socket, no clock: `notify` sends what this says.
+"""
+
+from collections.abc import Sequence
+
+from tormagd.hardware.link import LinkState
+
+READY = "READY=1"
+EXTENSION_S = 30.0
+"Before it is ready, a daemon that lives is given so much longer to start, each time it says so."
+REPEAT_S = 1.0
+_EXTEND = f"EXTEND_TIMEOUT_USEC={round(EXTENSION_S * 1e6)}"
+_NOT_THERE = frozenset({LinkState.CLOSED, LinkState.LOST, LinkState.BACK_OFF})
+"Nobody can be silent behind a port that is not open, and starting the daemon again would not bring one."
+
+
+class Service:
+    """The service as systemd knows it."""
+
+    def __init__(self) -> None:
+        self.is_ready = False
+        "Whether a device has been identified; from then on systemd's watchdog runs."
+        self._heard_s = 0.0
+        self._extended_s = -REPEAT_S
+        self._status = ""
+
+    def is_alive(
+        self, now_s: float, limit_s: float, planned_s: float | None, link: LinkState, received_s: float | None
+    ) -> bool:
+        """Whether plans and what the device says are fresh. `planned_s` and `received_s`: when the newest of
+        each came; `limit_s`: how old they may be.
+
+        A device that was identified and says nothing any more while its port is open counts as silent, however often
+        it is asked again; one that answers, if only that its firmware does not fit, does not.
+        """
+        if planned_s is None or now_s - planned_s > limit_s:
+            return False
+        if link is LinkState.RUNNING:
+            self._heard_s = self._heard_s if received_s is None else received_s
+        elif not self.is_ready or link in _NOT_THERE or link is LinkState.REFUSED:
+            self._heard_s = now_s
+        return now_s - self._heard_s < limit_s
+
+    def news(self, now_s: float, is_alive: bool, link: LinkState, status: str) -> list[str]:
+        """The messages that are due: READY once, STATUS when it has changed, WATCHDOG while the daemon lives."""
+        messages = []
+        if not self.is_ready and link is LinkState.RUNNING:
+            self.is_ready = True
+            messages.append(READY)
+        if status != self._status:
+            self._status = status
+            messages.append(f"STATUS={status}")
+        if is_alive:
+            messages.append("WATCHDOG=1")
+            if not self.is_ready and now_s - self._extended_s >= REPEAT_S:
+                self._extended_s = now_s
+                messages.append(_EXTEND)
+        return messages
+
+
+def status_line(
+    link: LinkState, cause: str, remedy: str, state: str, is_homed: bool, faults: Sequence[str], scene: str
+) -> str:
+    """One line for `systemctl status`: how the device stands, or why there is none and what to do about it."""
+    told = f"{state}: {', '.join(faults)}" if faults else f"{state}, scene {scene}"
+    if link is not LinkState.RUNNING:
+        # what is wrong may come from the device or the kernel: it must not become lines of its own
+        why = " ".join(f"{cause}; {remedy}".split())
+        return f"{told}; waiting for the device ({link}): {why}"
+    if faults:
+        return f"{told}; next: tormagctl status"
+    return told if is_homed else f"{told}; next: tormagctl home"
