@@ -28,6 +28,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Runs the daemon; returns the exit code: 0 ended on request, 1 could not run, 2 configuration refused."""
     parser = argparse.ArgumentParser(prog="tormagd", description="Real-time haptic controller daemon.")
     parser.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration; defaults where it is silent")
+    parser.add_argument("--scene", metavar="NAME", help="this scene, or scene file, in place of the configuration's")
     parser.add_argument("--check", action="store_true", help="print the resolved configuration and exit")
     parser.add_argument("--version", action="version", version=f"tormagd {__version__}, {settle()}")
     options = parser.parse_args(arguments)
@@ -44,11 +45,15 @@ def _start(options: argparse.Namespace) -> int:
     # here, not above: these take a moment to load, and the signal has to be seen to first
     import uvloop
 
-    from tormagd.control.core import build_core
+    from tormagd.control.core import at_rates_of, build_core
     from tormagd.hardware.backend import choose
+    from tormagd.scenes.scene import load_scene
 
     try:
         config = load_config(options.config)
+        if options.scene is not None:
+            config = msgspec.structs.replace(config, scene=options.scene)
+        config = at_rates_of(load_scene(config.scene), config)
         keys = _keys(config.endpoints)
         core = build_core(config)
         backend = choose(config.device, config.rates)
@@ -86,7 +91,9 @@ async def _run(config: Config, core: "Core", open_backend: "Callable[[], Backend
 
 
 def _print_resolved(config: Config, core: "Core", options: msgspec.Struct) -> None:
+    from tormagd.control.core import least_resolution_N
     from tormagd.hardware.backend import installed
+    from tormagd.scenes.scene import terms_of
 
     device = msgspec.structs.replace(config.device, options=msgspec.to_builtins(options))
     resolved = {
@@ -98,6 +105,11 @@ def _print_resolved(config: Config, core: "Core", options: msgspec.Struct) -> No
             "phase_margin_deg": core.margins.phase_margin_deg,
             "gain_margin_dB": core.margins.gain_margin_dB,
             "solver": core.solver._asdict(),
+            "fingerprint": core.scene.fingerprint,
+            "terms_out": terms_of(core.scene).left_out,
+            "least_resolution_N": least_resolution_N(core.planner.portrait, core.scene.force.most_N),
+            "missed_rms_N": None if core.missed is None else core.missed.rms_N,
+            "missed_share": None if core.missed is None else core.missed.share,
         },
         "backends": {name: reason or "loads" for name, reason in installed().items()},
     }

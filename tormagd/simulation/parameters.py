@@ -10,6 +10,11 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
+from tormagd.physics.inserts import insert
+
+PLANTS_INSERT = "MRE-50-40"
+"What the committed samples have in them."
+
 
 class PlantError(ValueError):
     """A plant file that cannot be used: the message names the file, the key path, the value and what is allowed."""
@@ -210,6 +215,19 @@ def parse_plant(text: str, name: str = "plant") -> PlantParameters:
         raise PlantError(f"{name}: {path or 'top level'}{_value_at(raw, path)}: {reason}") from error
     _require_consistent(parameters, name)
     return parameters
+
+
+def with_insert(plant: PlantParameters, name: str) -> PlantParameters:
+    """The device with another insert in it. By how much the plant's own elastomer is off the registry's PLANTS_INSERT,
+    the other one is off, too: a sample of the kind stays what it is. Raises `DomainError` for an unknown insert."""
+    nominal, other = insert(PLANTS_INSERT).elastomer, insert(name).elastomer
+    own = plant.elastomer
+    fitted = Elastomer(
+        own.shear_modulus_kPa * other.shear_modulus_Pa / nominal.shear_modulus_Pa,
+        max(own.relative_permeability * other.relative_permeability / nominal.relative_permeability, 1.0),
+        own.kinetic_friction * other.friction_coefficient / nominal.friction_coefficient,
+    )
+    return plant if name == PLANTS_INSERT else msgspec.structs.replace(plant, elastomer=fitted)
 
 
 def _require_finite(value: Any, path: str, name: str) -> None:
