@@ -132,6 +132,8 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
     for judged in found.judged:
         how = "learning" if judged.is_learning else "frozen"
         lines.append(f"{judged.plant} {how:9s} {1e3 * judged.full_N:7.1f} mN {1e3 * judged.chosen_N:10.1f} mN")
+    if max(item.full_N for item in found.judged if item.is_learning) > tolerance_N:
+        lines.append("NOT MET: the full model itself is over the tolerance")
     lines += ["", "control  inference  RMS on sample 1"]
     for at in found.rates:
         mark = "  cheapest within 0.8 of the tolerance" if at == rates else ""
