@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from required_terms import is_met
 from scene_runs import ROOT
 
 from tormagd.config import Config
@@ -81,7 +82,7 @@ def page() -> str:
         f"at 1,000 ticks and 500 plans a second, {file.build} core, beside a `machine_us` of {file.machine_us:g}; "
         "figures of one term alone are within the noise of a busy machine where they are under 0.15 %.",
         f"![what the scenes ask for, and what error costs](<{PICTURE.as_posix()}>)",
-        _counts(file.scenes),
+        _counts(tuple(scene for scene in file.scenes if is_met(scene.judged, scene.tolerance_N))),
         _rates(file.scenes),
         _solver(file.scenes),
         *(_scene(scene, file.share) for scene in file.scenes),
@@ -135,7 +136,9 @@ def _row(stated: Scene, found: MeasuredScene | None) -> str:
     if found is None:
         return "| " + " | ".join([*cells, "not measured yet", "", "", "", ""]) + " |"
     data = figures(found)
-    runs = "" if terms_of(stated).left_out else " (runs with all)"
+    runs = " (runs with all)" if found.left_out and not terms_of(stated).left_out else ""
+    if not is_met(found.judged, found.tolerance_N):
+        runs = ": **not met**"
     cells += [
         (", ".join(found.left_out) or "none") + runs,
         data["solver"],
@@ -163,7 +166,7 @@ def _counts(scenes: tuple[MeasuredScene, ...]) -> str:
         else "Each is required by some scene."
     )
     table = "| term | required by | most that its absence adds |\n| --- | --- | --- |\n" + "\n".join(rows)
-    return f"## Which terms count\n\n{table}\n\n{said}"
+    return f"## Which terms count\n\nOf the scenes that are met.\n\n{table}\n\n{said}"
 
 
 def _added(scene: MeasuredScene, term: str) -> float:
@@ -195,8 +198,8 @@ def _solver(scenes: tuple[MeasuredScene, ...]) -> str:
         "`newton` wins at every tolerance from 1 mN to 1 N and for every network from 10 to 200 units, because the "
         "[table](inverse_trade.md) has no search that is cheaper and none that is more exact; a shipped model rises "
         "with the field everywhere, so that one neighbour is enough. float32 saves nothing on one root. "
-        "`nearest` and `coarse-to-fine` run only where a scene names them: `pulse` does, to show the k-nearest search in "
-        "`make run`, and pays for it in the table above."
+        "`nearest` and `coarse-to-fine` run only where a scene names them: `pulse` does, to show the k-nearest search "
+        "in `make run`, and pays for it in the table above."
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 import required_terms
 import scene_runs
 from distributed import Client, LocalCluster
-from required_terms import FROM_HZ, JUDGED, SHARE, is_good, measure
+from required_terms import FROM_HZ, JUDGED, SHARE, is_good, is_met, measure
 from scene_runs import Case, Cost, key, run, run_all
 
 from tormagd.config import ConfigError
@@ -29,7 +29,9 @@ def test_what_is_stored_follows_from_its_own_numbers(scene: MeasuredScene) -> No
     assert not set(required(scene.terms, scene.tolerance_N, STORED.share)) & set(scene.left_out)
     assert all(is_good(item, scene.tolerance_N) for item in scene.judged)
     assert {item.plant for item in scene.judged} == {"sample_1", "sample_2", "sample_3"}
-    assert 0.0 < scene.cost_us_s < scene.cost_full_us_s
+    assert scene.cost_us_s > 0.0
+    assert scene.cost_us_s < scene.cost_full_us_s or not scene.left_out
+    assert is_met(scene.judged, scene.tolerance_N) or not scene.left_out
     if terms_of(stated).left_out:
         assert terms_of(stated).left_out == scene.left_out
 
@@ -75,6 +77,12 @@ def test_what_is_only_missed_together_is_put_back(monkeypatch: pytest.MonkeyPatc
     found = measure("coronary", outcomes)
     assert set(TERMS) - set(found.left_out) == {"rate", "scale"}
     assert all(item.chosen_N < 0.01 for item in found.judged)
+
+
+def test_a_scene_that_the_full_model_does_not_meet_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(required_terms, "costs", lambda case, without: [Cost(1.0, 1.0)] * len(without))
+    found = measure("coronary", lambda cases: dict.fromkeys(cases, 0.3))
+    assert found.left_out == ()
 
 
 def test_a_scene_without_a_signal_cannot_be_measured(tmp_path: Path) -> None:
