@@ -62,12 +62,18 @@ compile: | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable .
 	@$(SAY_BUILD)
 
-# the shipped model: a bench sweep recorded from the simulated device (sample 1), then training
+# the shipped models: bench sweeps recorded from the simulated device (sample 1, with each insert), then training
 model: $(VENV)/.dev
 	$(BIN)/python tools/bench_sweep.py --plant sample_1 --out build/bench_sweep.csv
 	$(BIN)/python tools/train_model.py build/bench_sweep.csv --element torque --insert MRE-50-40 --without-memory \
 	    --rising --hidden 40 --epochs 120 --validation-share 0.2 \
 	    --out tormagd/model/models/torque_mre_50_40.safetensors --plot build/training.png
+	for pair in brain:10-10 cardiovascular:10-20; do \
+	    $(BIN)/python tools/bench_sweep.py --plant sample_1 --scene $${pair%:*} --out build/$${pair%:*}.csv && \
+	    $(BIN)/python tools/train_model.py build/$${pair%:*}.csv --element torque --insert MRE-$${pair#*:} \
+	        --without-memory --rising --hidden 40 --epochs 120 --validation-share 0.2 \
+	        --out tormagd/model/models/torque_mre_$$(echo $${pair#*:} | tr - _).safetensors || exit 1; \
+	done
 
 # docs/reproduction.md and docs/learned_inverse.md with their plots: the thesis's tables and figures beside ours
 reproduction: $(VENV)/.dev

@@ -32,7 +32,7 @@ from tormagd.physics.inserts import insert
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand
-from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.parameters import PlantParameters, load_plant, with_insert
 from tormagd.training.dataset import Array, Dataset, write_csv
 
 SWEEPS = 4
@@ -114,7 +114,7 @@ def run(plant: str, scene_name: str, course: Course) -> Array:
     fitted = insert(scene.insert.name)
     field = FieldOfGap(PowerFieldLaw(), fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm * 1e-3)
     hand, ends_s = strokes(len(course.gaps_mm), course.seed)
-    device = VirtualDevice(bench(load_plant(plant), scene), hand, seed=course.seed)
+    device = VirtualDevice(bench(with_insert(load_plant(plant), scene.insert.name), scene), hand, seed=course.seed)
     loop = ClosedLoop(config, Stepper(config, scene), None, device)
     loop.arm(_plan(scene.insert.gap_open_mm, 0.0))
     while loop.now_s < BEGIN_S:

@@ -216,6 +216,10 @@ class ClosedLoop:
         trim = 1.0 if self.plan_state is None else self.plan_state.trim
         return Sample(now_s, self.step_state, output, used, trim, self._port.device.truth)
 
+    def plan_with(self, planner: Planner) -> None:
+        """Plans from now on are another planner's, which goes on from the state as it is."""
+        self._planner = planner
+
     def skip(self) -> None:
         """One control period in which the daemon does nothing: it was stopped, or killed. What comes waits for it."""
         self._ticks += 1

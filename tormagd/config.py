@@ -114,6 +114,8 @@ class Rates(Strict, frozen=True):
     control_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 1_000
     inference_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 250
     telemetry_hz: Annotated[int, Meta(ge=1, le=200)] = 50
+    of_scene: bool = False
+    "Whether the daemon runs at the rates that its scene needs, in place of these two; control at 500 Hz at the least."
 
 
 class RealTime(Strict, frozen=True):

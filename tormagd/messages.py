@@ -337,6 +337,9 @@ class Status(Telemetry, frozen=True, kw_only=True):
     version: str
     build: str = ""
     scene: str
+    scene_fingerprint: str = ""
+    terms_out: tuple[str, ...] = ()
+    solver: str = ""
     uptime_s: float
     least_N: float
     most_N: float

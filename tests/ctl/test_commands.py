@@ -14,6 +14,7 @@ from tormagd.ctl.operate import DONE_STATES
 from tormagd.ctl.outcome import Colour
 from tormagd.ctl.status import status_text
 from tormagd.messages import Status
+from tormagd.scenes.scene import TERMS, scene_path
 
 
 def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:
@@ -253,7 +254,7 @@ def test_a_port_that_no_file_can_have_is_refused_before_it_is_opened(tmp_path, c
 
 def test_scenes_are_listed_and_shown(capsys):
     names = [scene["name"] for scene in run_json(capsys, "scene", "list")[1]["result"]["scenes"]]
-    assert names == ["coronary", "pulse"]
+    assert {"coronary", "pulse", "brain"} <= set(names)
     shown = run_json(capsys, "scene", "show", "pulse")[1]["result"]
     assert shown["name"] == "pulse"
     assert shown["insert"]["gap_open_mm"] == 95.0
@@ -266,6 +267,53 @@ def test_scene_text_is_toml_that_loads_again(tmp_path, capsys):
     copy = tmp_path / "copy.toml"
     copy.write_text(capsys.readouterr().out)
     assert run_json(capsys, "scene", "show", str(copy)) == run_json(capsys, "scene", "show", "pulse")
+
+
+def test_a_scene_without_a_signal_is_shown_as_toml(tmp_path, capsys):
+    scene = tmp_path / "scene.toml"
+    text = 'name = "x"\ndescription = ""\n[force]\nleast_N = 0.0\nmost_N = 2.0\nresolution_N = 0.1\n'
+    scene.write_text(f'{text}tolerance_rms_N = 0.05\n[insert]\nname = "MRE-50-40"\nmodel = "torque_mre_50_40"\n')
+    assert main(["scene", "show", str(scene)]) == 0
+    shown = capsys.readouterr().out
+    assert "signal" not in shown
+    assert "rate = true" in shown
+
+
+def test_a_scene_is_checked_as_the_daemon_does(tmp_path, capsys):
+    code, printed = run_json(capsys, "scene", "check", "brain")
+    assert code == 0
+    result = printed["result"]
+    assert result["least_N"] == pytest.approx(0.157, abs=0.01)
+    assert 0.0 < result["core_share"] < result["core_share_allowed"]
+    assert result["missed_rms_N"] < 0.001
+    fast = tmp_path / "fast.toml"
+    fast.write_text(Path(scene_path("coronary")).read_text().replace("step_N = 0.1\n", ""))
+    code, printed = run_json(capsys, "scene", "check", str(fast))
+    assert code == 1
+    assert "N/s at" in printed["error"]["message"]
+
+
+def test_a_scene_over_its_budget_is_refused(tmp_path, capsys):
+    poor = tmp_path / "poor.toml"
+    poor.write_text(Path(scene_path("brain")).read_text() + "\n[budget]\ncore_share = 1e-6\n")
+    code, printed = run_json(capsys, "scene", "check", str(poor))
+    assert code == 1
+    assert printed["error"]["code"] == "budget"
+    assert "budget.core_share = 1e-06" in printed["error"]["message"]
+
+
+def test_a_decision_is_explained_with_what_was_measured(tmp_path, capsys):
+    assert main(["scene", "explain", "brain"]) == 0
+    text = capsys.readouterr().out
+    assert all(term in text for term in TERMS)
+    assert "cheapest within 0.8 of the tolerance" in text
+    assert "sample_3 learning" in text
+    other = tmp_path / "other.toml"
+    other.write_text(Path(scene_path("coronary")).read_text().replace("most_N = 2.0", "most_N = 1.9"))
+    code, printed = run_json(capsys, "scene", "explain", str(other))
+    assert code == 1
+    assert printed["error"]["code"] == "not_measured"
+    assert "required_terms.py" in printed["error"]["hint"]
 
 
 @pytest.fixture

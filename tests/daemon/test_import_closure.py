@@ -12,6 +12,7 @@ print(*[name for name in names if name.startswith(("tormagd.", "firmware_protoco
 print(*sorted({name.partition(".")[0] for name in names} & set(sys.argv[1:])))
 """
 ROOMS = {
+    "bounded_file",
     "config",
     "control",
     "daemon",
@@ -26,6 +27,7 @@ ROOMS = {
     "physics",
     "safety",
     "scenes",
+    "toml_file",
 }
 LIBRARIES = (
     "can",

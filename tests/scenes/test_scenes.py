@@ -1,14 +1,15 @@
 """Scenes: the shipped ones give a working core, contradictions and misfits are refused."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from tormagd.config import Config, ConfigError
-from tormagd.control.core import build_core
-from tormagd.scenes.scene import Scene, load_scene, scene_path, shipped_scenes
+from tormagd.config import Config, ConfigError, Rates
+from tormagd.control.core import at_rates_of, build_core
+from tormagd.scenes.scene import EVERY_TERM, Scene, Terms, load_scene, scene_path, shipped_scenes
 
 BASE = {
     "name": '"bench"',
@@ -43,8 +44,10 @@ def refusal(name_or_path: str) -> str:
     return str(caught.value)
 
 
-def test_two_scenes_are_shipped() -> None:
-    assert set(shipped_scenes()) >= {"coronary", "pulse"}
+def test_the_thesiss_tasks_are_shipped() -> None:
+    table_2_5 = {"cardiovascular", "brain", "bronchoscopy", "vitreoretinal", "laparoscopy"}
+    assert set(shipped_scenes()) == {"aorta_1", "aorta_2", "coronary", "pulse"} | table_2_5
+    assert all(load_scene(name).signal is not None for name in shipped_scenes())
 
 
 @pytest.mark.parametrize("name", shipped_scenes())
@@ -138,6 +141,110 @@ def test_a_refusal_names_file_key_value_and_what_is_allowed(
 def test_a_scene_that_does_not_fit_model_or_rates_gives_no_core(write, key: str, value: str, word: str) -> None:
     with pytest.raises(ConfigError, match=word):
         build_core(Config(scene=write(**{key: value})))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"force__resolution_N": "0.0005"}, ("force.resolution_N = 0.0005", "at least 0.001", "force sensor")),
+        (
+            {"force__most_N": "5.0", "force__most_release_N_s": "20.0", "force__resolution_N": "0.0015"},
+            ("at least 0.00", "settles to 7 um"),
+        ),
+        ({"handle__most_mm_s": "400.0"}, ("handle.most_mm_s = 400", "0.46..310", "trained on")),
+        ({"element": '"tactile"'}, ("element = 'tactile'", "whole history")),
+    ],
+)
+def test_a_scene_that_its_device_cannot_serve_is_refused(
+    write, changes: dict[str, str], words: tuple[str, ...]
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        build_core(Config(scene=write(**changes)))
+    assert all(word in str(caught.value) for word in words)
+
+
+def test_a_force_that_is_too_fast_for_the_gap_is_refused_with_the_failing_points(write) -> None:
+    build_core(Config(scene=write(signal__bandwidth_hz="0.2")))
+    with pytest.raises(ConfigError, match=r"they miss it by 0\.[0-9]+, .*% of the time is faster") as caught:
+        build_core(Config(scene=write(signal__bandwidth_hz="1.0")))
+    points = re.findall(r"([0-9.]+) N/s at ([0-9.]+) N \(the device: ([0-9.]+)\)", str(caught.value))
+    assert len(points) == 3
+    assert all(float(asked) > float(given) and 0.65 <= float(force) <= 2.0 for asked, force, given in points)
+
+
+def test_the_scenes_own_gap_speed_counts_where_it_is_the_lower_one(write) -> None:
+    """The thesis's 8.33 mm/s."""
+    slow = {"insert__gap_speed_mm_s": "8.33"}
+    path = write(signal__bandwidth_hz="0.2", **slow)
+    with pytest.raises(ConfigError, match=r"gaps of 8\.33 mm/s"):
+        build_core(Config(scene=path))
+    build_core(Config(scene=write(signal__bandwidth_hz="0.02", **slow)))
+    sudden = write(force__most_release_N_s="5.0", **slow)
+    assert build_core(Config(scene=sudden)).scene.insert.gap_speed_mm_s == 8.33
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"signal__file": '"a.csv"', "signal__hold_s": "1.0"}, ("signal.hold_s = 1.0", "without signal.file")),
+        ({"signal__hold_s": "1.0"}, ("signal.bandwidth_hz is missing",)),
+        ({"signal__bandwidth_hz": "0.0"}, ("$.signal.bandwidth_hz", "> 0.0")),
+        ({"signal__bandwidth_hz": "1.0", "signal__hold_s": "90000.0"}, ("$.signal.hold_s", "<= 86400.0")),
+        ({"handle__least_mm_s": "50.0"}, ("handle.least_mm_s = 50", "at most handle.most_mm_s = 42")),
+        ({"handle__least_mm_s": "0.1"}, ("$.handle.least_mm_s", ">= 0.5")),
+        ({"budget__core_share": "0.0"}, ("$.budget.core_share", "> 0.0")),
+        ({"force__tolerance_rms_N": "0.0"}, ("$.force.tolerance_rms_N", "> 0.0")),
+        ({"terms": '"some"'}, ("$.terms", "'some'")),
+        ({"terms__gravity": "false"}, ("gravity", "unknown field")),
+    ],
+)
+def test_a_task_that_says_nothing_sensible_is_refused(write, changes: dict[str, str], words: tuple[str, ...]) -> None:
+    refused = refusal(write(**changes))
+    assert all(word in refused for word in words)
+
+
+def test_a_day_of_holding_is_looked_at_as_far_as_it_changes(write) -> None:
+    build_core(Config(scene=write(signal__bandwidth_hz="0.2", signal__hold_s="86400.0")))
+
+
+def test_a_thousand_scenes_are_a_thousand_fingerprints(write) -> None:
+    base = load_scene(write())
+    seen = {
+        msgspec.structs.replace(base, force=msgspec.structs.replace(base.force, most_N=1.0 + number / 1000)).fingerprint
+        for number in range(1000)
+    }
+    assert len(seen) == 1000
+    renamed = msgspec.structs.replace(base, name="other", terms=EVERY_TERM.without("rate"))
+    assert renamed.fingerprint == base.fingerprint
+
+
+def test_terms_are_named_in_the_scene(write) -> None:
+    assert load_scene(write()).terms == EVERY_TERM
+    assert load_scene(write(terms='"all"')).terms == EVERY_TERM
+    named = load_scene(write(terms__rate="false", terms__pull="false")).terms
+    assert isinstance(named, Terms)
+    assert named.left_out == ("rate", "pull")
+    with pytest.raises(ValueError, match="term 'gravity': allowed is one of rate, creep"):
+        EVERY_TERM.without("gravity")
+
+
+def test_terms_that_nobody_measured_are_not_known_to_be_required(write) -> None:
+    refused = refusal(write(terms='"required"', force__most_N="1.9"))
+    assert "was not measured as it is now" in refused
+    assert "required_terms.py" in refused
+
+
+def test_a_daemon_may_run_at_the_rates_of_its_scene(write) -> None:
+    own = Config(rates=Rates(of_scene=True))
+    assert at_rates_of(load_scene("coronary"), Config()) == Config()
+    slow = load_scene(write(bandwidth__control_hz="250", bandwidth__inference_hz="100"))
+    rates = at_rates_of(slow, own).rates
+    # nothing is watched less often than that
+    assert (rates.control_hz, rates.inference_hz, rates.telemetry_hz) == (500, 100, 50)
+    assert at_rates_of(load_scene(write(bandwidth__control_hz="2000")), own).rates.control_hz == 2000
+    odd = load_scene(write(bandwidth__control_hz="510"))
+    with pytest.raises(ConfigError, match=r"scene bench: rates.of_scene: rates.telemetry_hz = 50"):
+        at_rates_of(odd, own)
 
 
 def test_a_model_stands_beside_its_scene(write, tmp_path: Path) -> None:

@@ -2,7 +2,9 @@ from importlib import resources
 
 import pytest
 
-from tormagd.simulation.parameters import PlantError, load_plant, parse_plant, plant_names
+from tormagd.physics.errors import DomainError
+from tormagd.physics.inserts import insert
+from tormagd.simulation.parameters import PlantError, load_plant, parse_plant, plant_names, with_insert
 
 SAMPLE_1 = resources.files("tormagd.simulation").joinpath("plants/sample_1.toml").read_text(encoding="utf-8")
 
@@ -67,3 +69,18 @@ def test_a_missing_plant_names_the_known_ones(tmp_path) -> None:
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(PlantError, match="readable"):
         load_plant(tmp_path / "binary.toml")
+
+
+def test_another_insert_keeps_what_the_sample_is_off_its_kind() -> None:
+    """Sample 1 has the registry's own MRE-50-40; sample 2 is softer by 8 %, and stays so."""
+    soft = insert("MRE-10-10").elastomer
+    first = with_insert(load_plant("sample_1"), "MRE-10-10")
+    assert first.elastomer.shear_modulus_kPa == pytest.approx(1e-3 * soft.shear_modulus_Pa)
+    assert first.elastomer.relative_permeability == pytest.approx(soft.relative_permeability)
+    assert first.elastomer.kinetic_friction == pytest.approx(soft.friction_coefficient)
+    second = with_insert(load_plant("sample_2"), "MRE-10-10")
+    assert second.elastomer.shear_modulus_kPa == pytest.approx(1e-3 * soft.shear_modulus_Pa * 255.0 / 277.3)
+    assert second.motor == load_plant("sample_2").motor
+    assert with_insert(load_plant("sample_2"), "MRE-50-40") == load_plant("sample_2")
+    with pytest.raises(DomainError, match="MRE-99-99"):
+        with_insert(load_plant("sample_1"), "MRE-99-99")

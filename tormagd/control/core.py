@@ -7,11 +7,15 @@ import hashlib
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
+from msgspec import UNSET
+
 from tormagd.config import Config, ConfigError
 from tormagd.control.device_fit import LEAST_SCALE
 from tormagd.control.motor import Margins, margins, pull_V
 from tormagd.control.plan import CEILING, Planner
-from tormagd.control.portrait import FieldOfGap, Portrait, law_beside, portrait
+from tormagd.control.portrait import FieldOfGap, Portrait, PortraitSearch, law_beside, portrait
+from tormagd.control.renderable import Missed, missed
 from tormagd.control.step import Stepper
 from tormagd.inverse.choice import Choice, build, choose, named, solver_table
 from tormagd.model.model_file import ForceModel, ModelFileError, load_model
@@ -21,13 +25,23 @@ from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import Geometry
 from tormagd.physics.inserts import insert
-from tormagd.scenes.scene import AUTO, Insert, Scene, load_scene, scene_path
+from tormagd.scenes.scene import AUTO, Insert, Scene, load_scene, scene_path, terms_of
+from tormagd.scenes.signal import asked
 
 ELEMENT = "torque"
 LEAST_PHASE_MARGIN_DEG = 30.0
 LEAST_GAIN_MARGIN_DB = 4.0
 SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("physics", "model", "inverse", "safety", "scenes")))
 SOURCES += ("tormagd/hardware", "tormagd/control")
+LEAST_CONTROL_HZ = 500
+"What is watched for safety is watched in every control tick."
+SENSED_N = 0.001
+"A step of the force sensor's message."
+SETTLES_MM = 4.0 * 8.0 / 4480.0
+"To within four counts of the encoders the gap comes to rest, wherever in its stroke: friction holds it there."
+LOOKED_AT_S, LOOKED_AT_HZ = 30.0, 100
+"So much of a scene's signal is held against the device's speed."
+IN_PORTRAIT = Choice("portrait", 0.0, 0, "float64", "the scene requires no rate: force over gap is one table")
 
 
 class Core(NamedTuple):
@@ -42,15 +56,24 @@ class Core(NamedTuple):
     "The model's fingerprint."
     models: Path
     "Where the scene's model was looked for, where it is no shipped one."
+    missed: Missed | None = None
+    "What the gap's speed alone leaves of the scene's signal; None where it states none."
 
 
 def build_core(config: Config, scene: Scene | None = None, models: Path | None = None) -> Core:
     """The core for `config.scene`. Raises ConfigError where scene, model and configuration do not fit each other.
 
-    A given `scene` takes the place of the one in the file, with its model in the folder `models`.
+    A given `scene` takes the place of the one in the file; its files are beside that one, or its model in the folder
+    `models`: then it has been checked, and its signal is not looked for.
     """
-    if scene is None or models is None:
-        scene, models = load_scene(config.scene), Path(scene_path(config.scene)).parent.absolute()
+    beside = scene_path(config.scene).parent.absolute() if models is None else models
+    scene = load_scene(config.scene) if scene is None else scene
+    config = _slowed(config, scene)
+    if scene.element != ELEMENT:
+        raise ConfigError(
+            f"scene {scene.name}: element = {scene.element!r}: allowed is {ELEMENT!r}: a pad's force depends on its "
+            "whole history, which no model that the daemon can run knows yet"
+        )
     for name in ("control_hz", "inference_hz"):
         offered, needed = getattr(config.rates, name), getattr(scene.bandwidth, name)
         if offered < needed:
@@ -66,8 +89,8 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
     try:
         fitted = insert(scene.insert.name)
         model = load_model(
-            model_path(scene.insert.model, beside=models),
-            element=ELEMENT,
+            model_path(scene.insert.model, beside=beside),
+            element=scene.element,
             insert=scene.insert.name,
         )
     except (DomainError, ModelFileError) as error:
@@ -76,16 +99,19 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
     field = FieldOfGap(law, fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm * 1e-3)
     try:
         fields_mT = _known_fields_mT(scene, model, field)
+        reach = portrait(model, field, cip_percent, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
         choice = choose_solver(scene, model.metadata.hidden)
-        search = build(choice, fields_mT, rises=True)
+        search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, rises=True)
     except DomainError as error:
         raise ConfigError(f"scene {scene.name}: {error}") from error
-    reach = portrait(model, field, cip_percent, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
     _refuse_out_of_reach(scene, reach)
+    _refuse_too_fine(scene, reach)
+    _refuse_unknown_handle(scene, model)
+    too_fast = _refuse_too_fast(config, scene, reach, beside) if models is None else None
     _refuse_too_sudden(config, scene, reach)
-    beside = law_beside(reach, law, field, fitted.elastomer, _geometry(scene.insert))
-    planner = Planner(config, scene, model, search, field, reach, beside, cip_percent)
-    return Core(scene, planner, Stepper(config, scene), stability, choice, model.fingerprint, models)
+    law_of_field = law_beside(reach, law, field, fitted.elastomer, _geometry(scene.insert))
+    planner = Planner(config, scene, model, search, field, reach, law_of_field, cip_percent)
+    return Core(scene, planner, Stepper(config, scene), stability, choice, model.fingerprint, beside, too_fast)
 
 
 def sources_hash() -> str:
@@ -138,6 +164,72 @@ def _refuse_out_of_reach(scene: Scene, reach: Portrait) -> None:
         raise ConfigError(f"scene {scene.name}: force.most_N = {scene.force.most_N:g}: {between}")
 
 
+def at_rates_of(scene: Scene, config: Config) -> Config:
+    """The configuration with the rates that the scene needs, where `rates.of_scene` says so. Raises ConfigError."""
+    if not config.rates.of_scene:
+        return config
+    needed = scene.bandwidth
+    control_hz = max(needed.control_hz, LEAST_CONTROL_HZ)
+    rates = msgspec.structs.replace(config.rates, control_hz=control_hz, inference_hz=needed.inference_hz)
+    try:
+        return msgspec.structs.replace(config, rates=rates)
+    except ValueError as error:
+        raise ConfigError(f"scene {scene.name}: rates.of_scene: {error}") from error
+
+
+def _slowed(config: Config, scene: Scene) -> Config:
+    """The configuration with the scene's gap speed, where that is the lower one."""
+    position, asked_mm_s = config.position, scene.insert.gap_speed_mm_s
+    if asked_mm_s is UNSET or asked_mm_s >= position.gap_speed_mm_s:
+        return config
+    return msgspec.structs.replace(config, position=msgspec.structs.replace(position, gap_speed_mm_s=asked_mm_s))
+
+
+def least_resolution_N(reach: Portrait, most_N: float) -> float:
+    """The smallest difference of force that the device makes and measures, up to this force."""
+    return max(SENSED_N, SETTLES_MM * reach.slope_at_N_mm(most_N))
+
+
+def _refuse_too_fine(scene: Scene, reach: Portrait) -> None:
+    least_N = least_resolution_N(reach, scene.force.most_N)
+    if scene.force.resolution_N < least_N:
+        raise ConfigError(
+            f"scene {scene.name}: force.resolution_N = {scene.force.resolution_N:g}: allowed is at least {least_N:.2g}"
+            f": the force sensor has steps of {SENSED_N:g} N, and the gap settles to {1e3 * SETTLES_MM:.0f} um"
+        )
+
+
+def _refuse_unknown_handle(scene: Scene, model: ForceModel) -> None:
+    slowest_mm_s, fastest_mm_s = model.feature_ranges[1]
+    handle = scene.handle
+    for key, value in (("least_mm_s", handle.least_mm_s), ("most_mm_s", handle.most_mm_s)):
+        if not slowest_mm_s <= value <= fastest_mm_s:
+            raise ConfigError(
+                f"scene {scene.name}: handle.{key} = {value:g}: allowed is {slowest_mm_s:.2g}..{fastest_mm_s:.0f}, the "
+                f"rates that model {scene.insert.model} was trained on"
+            )
+
+
+def _refuse_too_fast(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Missed | None:
+    if scene.signal is None:
+        return None
+    force, speed_mm_s = scene.force, config.position.gap_speed_mm_s
+    range_N = max(force.least_N, reach.least_N), force.most_N
+    times_s, forces_N = asked(scene.signal, beside, range_N, LOOKED_AT_S, LOOKED_AT_HZ)
+    miss = missed(reach, times_s.tolist(), forces_N.tolist(), speed_mm_s)
+    if miss.rms_N > force.tolerance_rms_N:
+        worst = ", ".join(
+            f"{point.asked_N_s:.2g} N/s at {point.force_N:.2f} N (the device: {point.given_N_s:.2g})"
+            for point in miss.worst
+        )
+        raise ConfigError(
+            f"scene {scene.name}: signal: allowed is what gaps of {speed_mm_s:g} mm/s follow within "
+            f"force.tolerance_rms_N = {force.tolerance_rms_N:g}: they miss it by {miss.rms_N:.3f}, {miss.share:.0%} of "
+            f"the time is faster: {worst}"
+        )
+    return miss
+
+
 def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
     # the weakest believable device makes a force with the least gap, where a gap's speed is the most force; and the
     # ceiling lets no gap make more than CEILING times the scene's greatest
@@ -156,8 +248,11 @@ def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
 
 
 def choose_solver(scene: Scene, hidden: int) -> Choice:
-    """The search that `scene` names, or that its tolerance picks from the measured table. Raises DomainError."""
+    """The search that `scene` names; else the portrait where the rate is no term, or what the scene's tolerance picks
+    from the measured table. Raises DomainError."""
     wanted = scene.solver
     if wanted.name == AUTO:
+        if not terms_of(scene).rate:
+            return IN_PORTRAIT
         return choose(solver_table(), scene.force.tolerance_rms_N, hidden)
     return named(wanted.name, wanted.step_mT or None, wanted.neighbours or None)

@@ -115,10 +115,13 @@ def observe(
     adapts_in_s: float,
     bounds: tuple[float, float],
     error_N2_s: float = ERROR_N2_S,
+    learns_scale: bool = True,
+    learns_offset: bool = True,
 ) -> tuple[DeviceFit, bool]:
     """The fit after `measured_N` where the model says `model_N`, `elapsed_s` after the last, and whether the scale is
     held at one of its `bounds`. In the long run the offset is learned in about `adapts_in_s`; `error_N2_s` is the
-    density of what the model does not follow. All are finite."""
+    density of what the model does not follow. All are finite. What is not learned keeps its value and stays as
+    uncertain as it is, and the other's gain counts with that (Schmidt's filter)."""
     if elapsed_s <= 0.0:
         return fit, False
     # both are forgotten towards their spread, which keeps the variances those of a believable device
@@ -130,12 +133,13 @@ def observe(
     by_scale = model_N * scale_variance + covariance
     by_offset = model_N * covariance + offset_variance
     innovation_variance = model_N * by_scale + by_offset + error_N2_s / elapsed_s
-    gain_scale, gain_offset = by_scale / innovation_variance, by_offset / innovation_variance
+    gain_scale = by_scale / innovation_variance if learns_scale else 0.0
+    gain_offset = by_offset / innovation_variance if learns_offset else 0.0
     error_N = measured_N - fit.force_N(model_N)
     wanted = fit.scale + gain_scale * error_N
     scale = min(max(wanted, bounds[0]), bounds[1])
     offset_N = fit.offset_N + gain_offset * error_N
-    if scale != wanted:
+    if scale != wanted and learns_offset:
         # a scale that is held is known: what is left of the error is the offset's alone
         by_itself = offset_variance / (offset_variance + error_N2_s / elapsed_s)
         offset_N = fit.offset_N + by_itself * (measured_N - scale * model_N - fit.offset_N)
@@ -143,7 +147,7 @@ def observe(
         scale,
         offset_N,
         scale_variance - gain_scale * by_scale,
-        covariance - gain_scale * by_offset,
+        covariance - (gain_scale * by_offset if learns_scale else gain_offset * by_scale),
         offset_variance - gain_offset * by_offset,
     )
     return learned, scale != wanted

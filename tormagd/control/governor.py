@@ -8,7 +8,7 @@ from tormagd.control.device_fit import DeviceFit
 from tormagd.control.periodicity import LONGEST_STEP_S, NOTHING_LEARNED, Periodicity, forecast_N, foreseen, observe
 from tormagd.control.portrait import Portrait
 from tormagd.safety.codes import Limit
-from tormagd.scenes.scene import Force
+from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 
 SLOPE_FILTER_S: Final = 0.003
 AHEAD_S: Final = 0.05
@@ -132,9 +132,21 @@ class Governed(Value):
 class Governor:
     """The constants of governing: what the scene allows, and the fastest that the gap may be driven."""
 
-    __slots__ = ("_gap_speed_mm_s", "_least_N", "_most_N", "_portrait", "_release_N_s")
+    __slots__ = (
+        "_gap_speed_mm_s",
+        "_has_forecast",
+        "_has_preview",
+        "_has_slope",
+        "_least_N",
+        "_most_N",
+        "_portrait",
+        "_release_N_s",
+    )
 
-    def __init__(self, portrait: Portrait, scene: Force, gap_speed_mm_s: float) -> None:
+    def __init__(self, portrait: Portrait, scene: Force, gap_speed_mm_s: float, terms: Terms = EVERY_TERM) -> None:
+        self._has_slope: Final = terms.slope
+        self._has_forecast: Final = terms.forecast
+        self._has_preview: Final = terms.preview
         self._portrait: Final = portrait
         self._least_N: Final = scene.least_N
         self._most_N: Final = scene.most_N
@@ -167,18 +179,18 @@ class Governor:
         spacing = setpoint.stamp_s - state.stamp_s
         if is_new_holder:  # another publisher's forces say nothing of this one's
             slope, learned = 0.0, NOTHING_LEARNED
-        elif spacing > LONGEST_STEP_S:
+        elif spacing > LONGEST_STEP_S or not self._has_slope:
             slope = 0.0
         elif spacing > 0.0:
             renderable = device.scale * portrait.force_rate_N_s(device.model_N(force), self._gap_speed_mm_s)
             between = min(max((asked_N - state.last_N) / spacing, -renderable), renderable)
             slope += spacing / (SLOPE_FILTER_S + spacing) * (between - slope)
         soon_s = max(age, 0.0)
-        if setpoint.preview_N:
+        if setpoint.preview_N and self._has_preview:
             periodicity, foresight = NOTHING_LEARNED, 1.0
             path = _previewed_N(setpoint, soon_s + lag_s)
         else:
-            periodicity = observe(learned, setpoint.stamp_s, asked_N)
+            periodicity = observe(learned, setpoint.stamp_s, asked_N) if self._has_forecast else NOTHING_LEARNED
             # one that has fallen silent for longer than a stream may is not believed to go on as it did
             foresight = periodicity.trust if age <= LONGEST_STEP_S else 0.0
             begins_s = soon_s + foresight * lag_s
@@ -212,6 +224,8 @@ class Governor:
 
     def foresee(self, state: GovernorState) -> GovernorState:
         """The state with a forecast of what comes, where one is due: for the time between decisions."""
+        if not self._has_forecast:
+            return state
         periodicity = foreseen(state.periodicity, state.slope_N_s)
         if periodicity is state.periodicity:
             return state

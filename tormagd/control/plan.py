@@ -10,7 +10,7 @@ from tormagd.config import Config
 from tormagd.control.device_fit import UNSEEN, DeviceFit, observe
 from tormagd.control.estimate import Estimate
 from tormagd.control.governor import PATH_S, Governed, Governor, GovernorState, TimedSetpoint
-from tormagd.control.portrait import FieldOfGap, LawOfField, Portrait
+from tormagd.control.portrait import ROLLER_RATE_MM_S, FieldOfGap, LawOfField, Portrait
 from tormagd.control.sensor import UNJUDGED, Sensor, judge
 from tormagd.control.sensor_zero import TARED, UNKNOWN_SD_N, SensorZero
 from tormagd.control.sight import unsensed_s
@@ -20,7 +20,7 @@ from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S
 from tormagd.model.features import FEATURES
 from tormagd.model.model_file import ForceModel
 from tormagd.safety.codes import Limit
-from tormagd.scenes.scene import Scene
+from tormagd.scenes.scene import Scene, terms_of
 
 CREEP_MM_S: Final = 0.5
 "A slower handle is planned for as if it crept: its friction is static."
@@ -218,7 +218,8 @@ class Planner:
         position, trim = config.position, config.trim
         self.portrait: Final = portrait
         self._model, self._search, self._field, self._law = model, search, field, law
-        self._governor = Governor(portrait, scene.force, position.gap_speed_mm_s)
+        terms = terms_of(scene)
+        self._governor = Governor(portrait, scene.force, position.gap_speed_mm_s, terms)
         self._cip_percent = cip_percent
         self._closed_mm, self._open_mm = scene.insert.gap_closed_mm, scene.insert.gap_open_mm
         self._ceiling_N = CEILING * scene.force.most_N
@@ -228,6 +229,12 @@ class Planner:
         self._adapts_in_s, self._scales = trim.time_s, (trim.least, trim.most)
         self._low_confidence = config.limits.low_confidence
         self._unsensed_s = unsensed_s(1.0 / config.rates.control_hz)
+        self._has_rate, self._has_creep, self._has_lag = terms.rate, terms.creep, terms.lag and terms.learning
+        self._learns, self._fits = terms.learning, terms.learning and (terms.scale or terms.offset)
+        self._learns_scale, self._learns_offset = terms.scale, terms.offset
+        self._only_curve = model.curve(
+            _within(MOBILISED_MM, displacements_mm), _within(ROLLER_RATE_MM_S, rates_mm_s), cip_percent
+        )
 
     def start(self, now_s: float) -> PlanState:
         """The state before the first plan: gap open."""
@@ -243,14 +250,21 @@ class Planner:
         """The next plan. `estimate` is None while the device has said nothing: nothing is learned of it then."""
         model_N = self._model_N(estimate)
         shown = self._learn(state.shown, now_s, estimate, model_N)
-        sliding_mm_s = MOVING_MM_S if estimate is None else estimate.handle.sliding_mm_s
-        device = shown.device.times(shown.slow.factor_at(sliding_mm_s))
+        device = shown.device
+        if self._has_creep:
+            sliding_mm_s = MOVING_MM_S if estimate is None else estimate.handle.sliding_mm_s
+            device = device.times(shown.slow.factor_at(sliding_mm_s))
         governor, governed = self._governor.govern(state.governor, now_s, setpoint, device, state.lag_s)
         lag_s = self._learn_lag(state, now_s, estimate, governed, device)
         is_meant = setpoint is not None and Limit.STALE not in governed.limits
-        displacement_mm, rate_mm_s = self._motion(setpoint if is_meant else None, estimate)
-        known_mm, known_mm_s = _within(displacement_mm, self._displacements_mm), _within(rate_mm_s, self._rates_mm_s)
-        curve = self._model.curve(known_mm, known_mm_s, self._cip_percent)
+        curve = self._only_curve
+        displacement_mm, rate_mm_s = curve.displacement_mm, curve.rate_mm_s
+        known_mm, known_mm_s = displacement_mm, rate_mm_s
+        if self._has_rate:
+            displacement_mm, rate_mm_s = self._motion(setpoint if is_meant else None, estimate)
+            known_mm = _within(displacement_mm, self._displacements_mm)
+            known_mm_s = _within(rate_mm_s, self._rates_mm_s)
+            curve = self._model.curve(known_mm, known_mm_s, self._cip_percent)
         wanted_N = device.model_N(governed.path_N[0])
         solution = self._search.solve(curve, wanted_N, state.plan.field_mT)
         field_mT = self._lawful_mT(solution, wanted_N)
@@ -322,11 +336,13 @@ class Planner:
         if estimate is None or not estimate.is_homed:
             return None
         gap_mm = max(estimate.gap_mm, self._closed_mm - BEYOND_MM)
-        curve = self._model.curve(
-            _within(MOBILISED_MM, self._displacements_mm),
-            _within(abs(estimate.handle.rate_mm_s), self._rates_mm_s),
-            self._cip_percent,
-        )
+        curve = self._only_curve
+        if self._has_rate:
+            curve = self._model.curve(
+                _within(MOBILISED_MM, self._displacements_mm),
+                _within(abs(estimate.handle.rate_mm_s), self._rates_mm_s),
+                self._cip_percent,
+            )
         return curve.force_N(_within(self._field.field_mT(gap_mm), self._fields_mT))
 
     def _learn(self, shown: Shown, now_s: float, estimate: Estimate | None, model_N: float | None) -> Shown:
@@ -336,7 +352,9 @@ class Planner:
             return shown
         if now_s - estimate.sensed_s > self._unsensed_s:
             return shown  # its force is an old one
-        slow, zero = shown.slow.followed(model_N, estimate.handle_mm), shown.zero
+        slow, zero = shown.slow, shown.zero
+        if self._has_creep:
+            slow = slow.followed(model_N, estimate.handle_mm)
         direction, rate_mm_s = estimate.handle.turn.direction, abs(estimate.handle.rate_mm_s)
         reading_N = estimate.force_N - direction * zero.zero_N
         zero_sd_N = zero.sd_N(now_s)
@@ -346,6 +364,8 @@ class Planner:
         if rate_mm_s < MOVING_MM_S or not is_mobilised:
             if shown.sensor.is_doubted:
                 slow = NOTHING_SLOW
+            elif not (self._has_creep and self._learns):
+                pass  # it is not learned
             elif SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S and estimate.handle.sliding_mm_s < CREEPING_MM_S:
                 expected_N = shown.device.force_N(slow.followed_N)
                 # before it is mobilised friction is less than the model's; more is more all the same
@@ -373,6 +393,8 @@ class Planner:
             return Shown(
                 shown.device, sensor, estimate.number, now_s, (Limit.OFFSET_UNKNOWN, *limits), shown.slow, zero
             )
+        if not self._fits:
+            return Shown(shown.device, sensor, estimate.number, now_s, limits, slow, zero)
         error_N = reading_N - shown.device.force_N(model_N)
         surprise_N = shown.surprise_N + elapsed_s / (SURPRISE_S + elapsed_s) * (error_N - shown.surprise_N)
         adapts_in_s = self._adapts_in_s / (1.0 + (surprise_N / SURPRISE_N) ** 2)
@@ -383,6 +405,8 @@ class Planner:
             elapsed_s,
             adapts_in_s=max(adapts_in_s, LEAST_ADAPTS_IN_S),
             bounds=self._scales,
+            learns_scale=self._learns_scale,
+            learns_offset=self._learns_offset,
         )
         # what is known of a creep stays what it is while the rest is learned
         slow = slow.beside(shown.device.force_N(model_N), device.force_N(model_N))
@@ -399,7 +423,7 @@ class Planner:
         self, state: PlanState, now_s: float, estimate: Estimate | None, governed: Governed, device: DeviceFit
     ) -> float:
         """How far the gap is behind over how fast it moves: a motor weaker than it is believed to be comes late."""
-        if estimate is None or not estimate.is_homed or governed.foresight < LEAST_FORESIGHT:
+        if not self._has_lag or estimate is None or not estimate.is_homed or governed.foresight < LEAST_FORESIGHT:
             return state.lag_s
         behind_mm = self.portrait.gap_mm_at(device.model_N(governed.force_N)) - estimate.gap_mm
         if abs(behind_mm) > MOST_LAG_S * self._fastest_mm_s:

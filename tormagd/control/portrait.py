@@ -7,7 +7,9 @@ import numpy as np
 import numpy.typing as npt
 
 from tormagd.control.interpolation import interpolated
+from tormagd.inverse.solution import FieldSolution, Reach, checked_near_mT
 from tormagd.model.displacement import MOBILISED_MM
+from tormagd.model.force_curve import ForceCurve
 from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw, flux_density_T
@@ -87,6 +89,28 @@ class Portrait:
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
         """The fastest change of force that a gap speed renders at this force."""
         return gap_speed_mm_s * self.slope_at_N_mm(force_N)
+
+
+@final
+class PortraitSearch:
+    """The search where the handle's rate is no input: the portrait itself, by straight lines, and no network."""
+
+    __slots__ = ("_field", "_portrait")
+
+    def __init__(self, shown: Portrait, field: FieldOfGap) -> None:
+        self._portrait: Final = shown
+        self._field: Final = field
+
+    def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
+        """See `FieldSolver.solve`; of `curve` only the confidence is asked, where no field gives the force."""
+        checked_near_mT(force_N, last_field_mT, 0.0)
+        shown = self._portrait
+        field_mT = self._field.field_mT(shown.gap_mm_at(force_N))
+        least_N, most_N = shown.least_N, shown.most_N
+        if least_N <= force_N <= most_N:
+            return FieldSolution(field_mT, force_N, 1.0, 1, Reach.INSIDE)
+        nearest_N, reach = (least_N, Reach.BELOW) if force_N < least_N else (most_N, Reach.ABOVE)
+        return FieldSolution(field_mT, nearest_N, curve.confidence(field_mT, force_N - nearest_N), 1, reach)
 
 
 @final

@@ -81,9 +81,7 @@ def _run(options: argparse.Namespace) -> Outcome:
 
             return replay(options.file, options.from_s, options.settings, options.plant, options.faults, options.config)
         case "scene":
-            from tormagd.ctl.scene import list_scenes, show_scene
-
-            return list_scenes() if options.action == "list" else show_scene(options.name or config.scene)
+            return _scene(options, config.scene)
         case "calibrate":
             return _calibrate(options, config, endpoints)
         case "doctor":
@@ -102,6 +100,21 @@ def _keys(options: argparse.Namespace) -> Outcome:
     if options.action == "show":
         return show_keys(options.path)
     return generate_keys(options.path, {role: getattr(options, role) for role in ROLES}, options.client)
+
+
+def _scene(options: argparse.Namespace, configured: str) -> Outcome:
+    from tormagd.ctl.scene import check_scene, explain_scene, list_scenes, show_scene
+
+    name = options.name or configured
+    match options.action:
+        case "list":
+            return list_scenes()
+        case "show":
+            return show_scene(name)
+        case "check":
+            return check_scene(name, options.config)
+        case _:
+            return explain_scene(name, options.config)
 
 
 def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
@@ -347,9 +360,13 @@ def parser() -> argparse.ArgumentParser:
     plot.add_argument("file", type=Path, metavar="FILE.mcap")
     plot.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.png")
 
-    scene = command("scene", "list the scenes, or show one (default: the configuration's)")
-    scene.add_argument("action", choices=("list", "show"))
-    scene.add_argument("name", nargs="?", metavar="NAME")
+    scene = command("scene", "list the scenes, or show, check or explain one (default: the configuration's)")
+    scene.add_argument(
+        "action",
+        choices=("list", "show", "check", "explain"),
+        help="check: does the daemon take it, and what does the device give of it; explain: which terms, and why",
+    )
+    scene.add_argument("name", nargs="?", metavar="NAME|FILE")
     keys = command("keys", "make key pairs for the daemon and its clients, or show a key's fingerprint")
     keys.add_argument("action", choices=("generate", "show"))
     keys.add_argument("path", type=Path, metavar="DIR|FILE", help="where the keys are made; whose fingerprint is shown")

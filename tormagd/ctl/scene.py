@@ -1,10 +1,25 @@
-"""`tormagctl scene`: which scenes there are, and what one of them asks for."""
+"""`tormagctl scene`: which scenes there are, what one asks for, whether this configuration can give it, and how."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from tormagd.config import ConfigError
-from tormagd.ctl.outcome import Outcome, usage_error
-from tormagd.scenes.scene import load_scene, shipped_scenes
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+from tormagd.scenes.measured import AtRates, Measured, MeasuredScene, measured, required
+from tormagd.scenes.scene import Scene, load_scene, shipped_scenes
+
+LONGEST_S = 30.0
+"Of the daemon's own check, which takes half a second."
+TOLERANCES = (0.5, 1.0, 2.0)
+"Times the scene's own, for which the terms are stated."
+MARGIN = 0.8
+"Of a tolerance: an error within it is one that a rate may be chosen for."
+LEAST_CONTROL_HZ = 500
+"Slower than this nothing is watched."
 
 
 def list_scenes() -> Outcome:
@@ -20,9 +35,10 @@ def list_scenes() -> Outcome:
 def show_scene(name: str) -> Outcome:
     """Everything one scene states, defaults included. Raises CommandError (USAGE) for an unknown or faulty one."""
     try:
-        tables = msgspec.to_builtins(load_scene(name))
+        stated = msgspec.to_builtins(load_scene(name))
     except ConfigError as error:
         raise usage_error(str(error), "tormagctl scene list shows the shipped ones") from error
+    tables = {key: value for key, value in stated.items() if value is not None}
     lines = [_line(key, value) for key, value in tables.items() if not isinstance(value, dict)]
     for title, table in tables.items():
         if isinstance(table, dict):
@@ -33,3 +49,131 @@ def show_scene(name: str) -> Outcome:
 def _line(key: str, value: object) -> str:
     # a number or a text reads the same in JSON and TOML
     return f"{key} = {msgspec.json.encode(value).decode()}"
+
+
+def check_scene(name: str, config: Path | None) -> Outcome:
+    """Whether a daemon with this configuration takes the scene, what its device gives of it, and whether its cost is
+    within its budget. Raises CommandError where it does not, and for a faulty scene."""
+    derived = _derived(name, config)
+    scene = _loaded(name)
+    known = _known(scene)
+    share = None if known is None else known[1].cost_us_s * 1e-6
+    least_N, most_N = derived["least_N"], derived["most_N"]
+    result = {"scene": scene.name, "core_share": share, "core_share_allowed": scene.budget.core_share} | derived
+    lines = [
+        f"{scene.name}: taken",
+        f"forces     {scene.force.least_N:g}..{scene.force.most_N:g} N of the device's {least_N:.2f}..{most_N:.2f}",
+        f"resolution {scene.force.resolution_N:g} N, the device's is {derived['least_resolution_N']:.2g}",
+    ]
+    if scene.force.least_N < least_N:
+        lines.append(f"           below {least_N:.2f} N it gets that: a brake has a least force (limit F_MIN)")
+    if derived["missed_rms_N"] is None:
+        lines.append("signal     not stated: nothing is known of how fast the force changes")
+    else:
+        lines.append(
+            f"signal     the gap's speed alone misses {1e3 * derived['missed_rms_N']:.1f} mN of a tolerance of "
+            f"{1e3 * scene.force.tolerance_rms_N:g}, {derived['missed_share']:.1%} of the time is faster"
+        )
+    if share is None:
+        lines.append("cost       not measured: tools/required_terms.py does")
+    else:
+        lines.append(f"cost       {share:.1%} of a processor, {scene.budget.core_share:.0%} are allowed")
+        if share > scene.budget.core_share:
+            raise CommandError(
+                Exit.REFUSED,
+                "budget",
+                f"scene {scene.name}: its steps and plans take {share:.1%} of a processor: allowed is "
+                f"budget.core_share = {scene.budget.core_share:g}",
+                "leave terms out, or lower the rates: tormagctl scene explain says what that costs",
+            )
+    return Outcome(result, "\n".join(lines))
+
+
+def explain_scene(name: str, config: Path | None) -> Outcome:
+    """The decision on one scene, as it was measured, as a table. Raises CommandError where nothing was measured, for a
+    scene that the daemon refuses, and for a faulty one."""
+    derived = _derived(name, config)
+    scene = _loaded(name)
+    known = _known(scene)
+    if known is None:
+        raise CommandError(
+            Exit.REFUSED,
+            "not_measured",
+            f"scene {scene.name} was not measured as it is now",
+            f"tools/required_terms.py {name} measures it, in some minutes",
+        )
+    file, found = known
+    tolerance_N = found.tolerance_N
+    needed = {factor: required(found.terms, factor * tolerance_N, file.share) for factor in TOLERANCES}
+    out = set(derived["terms_out"])
+    rates = cheapest_rates(found)
+    solver = derived["solver"]
+    lines = [
+        f"{scene.name}: {scene.description}",
+        f"tolerance  {1e3 * tolerance_N:g} mN rms; a term is required that adds more than {file.share:.0%} of it",
+        f"search     {solver['solver']}, {solver['dtype']} ({solver['reason']})",
+        f"cost       {found.cost_full_us_s / 1e4:.2f}% of a processor with every term, {found.cost_us_s / 1e4:.2f}% "
+        f"with those that are required (1000 ticks, 500 plans a second, {file.build}, machine_us {file.machine_us:g})",
+        "",
+        "term       runs   required  added, frozen  added, learning      saved    at half  at twice the tolerance",
+    ]
+    for item in found.terms:
+        is_required = item.term not in found.left_out
+        at_half, at_twice = ("in" if item.term in needed[factor] else "out" for factor in (0.5, 2.0))
+        lines.append(
+            f"{item.term:10s} {'out' if item.term in out else 'in':6s} {'in' if is_required else 'out':8s} "
+            f"{1e3 * item.frozen_added_N:11.1f} mN {1e3 * item.learning_added_N:13.1f} mN "
+            f"{item.saved_us_s / 1e4:8.2f}% {at_half:>10s} {at_twice:>9s}"
+        )
+    back = [item.term for item in found.terms if item.term not in needed[1.0] and item.term not in found.left_out]
+    if back:
+        lines.append(f"{', '.join(back)}: not required alone, but with the others out")
+    lines += ["", "true force, RMS    every term   required ones"]
+    for judged in found.judged:
+        how = "learning" if judged.is_learning else "frozen"
+        lines.append(f"{judged.plant} {how:9s} {1e3 * judged.full_N:7.1f} mN {1e3 * judged.chosen_N:10.1f} mN")
+    if max(item.full_N for item in found.judged if item.is_learning) > tolerance_N:
+        lines.append("NOT MET: the full model itself is over the tolerance")
+    lines += ["", "control  inference  RMS on sample 1"]
+    for at in found.rates:
+        mark = "  cheapest within 0.8 of the tolerance" if at == rates else ""
+        lines.append(f"{at.control_hz:4d} Hz  {at.inference_hz:6d} Hz  {1e3 * at.rms_N:7.1f} mN{mark}")
+    result = msgspec.to_builtins(found) | {
+        "derived": derived,
+        "required": {f"{factor:g}": names for factor, names in needed.items()},
+        "cheapest_rates": None if rates is None else msgspec.to_builtins(rates),
+    }
+    return Outcome(result, "\n".join(lines))
+
+
+def cheapest_rates(found: MeasuredScene) -> AtRates | None:
+    """The lowest rates that keep to MARGIN of the tolerance, of those at which safety is watched often enough."""
+    good = [at for at in found.rates if at.control_hz >= LEAST_CONTROL_HZ and at.rms_N <= MARGIN * found.tolerance_N]
+    return min(good, key=lambda at: (at.control_hz, at.inference_hz), default=None)
+
+
+def _known(scene: Scene) -> tuple[Measured, MeasuredScene] | None:
+    file = measured()
+    return next(((file, found) for found in file.scenes if found.fingerprint == scene.fingerprint), None)
+
+
+def _loaded(name: str) -> Scene:
+    try:
+        return load_scene(name)
+    except ConfigError as error:
+        raise usage_error(str(error), "tormagctl scene list shows the shipped ones") from error
+
+
+def _derived(name: str, config: Path | None) -> dict[str, Any]:
+    """What the daemon's own check says of the scene. It loads what no command of this tool does: model and solvers."""
+    command = [sys.executable, "-P", "-m", "tormagd.daemon.main", "--check", "--scene", name]
+    command += [] if config is None else ["--config", str(config)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise CommandError(Exit.REFUSED, "not_checked", f"not done after {LONGEST_S:g} s", "try it again") from error
+    if done.returncode:
+        reason = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1].removeprefix("tormagd: ")
+        raise CommandError(Exit.REFUSED, "refused", reason, "docs/scenes.md says what each key asks of the device")
+    derived: dict[str, Any] = msgspec.json.decode(done.stdout)["derived"]
+    return derived

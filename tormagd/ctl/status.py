@@ -56,6 +56,7 @@ def status_text(known: Status, colour: Colour) -> str:
         *(_rate(name, group, colour) for name, group in known.rates.items()),
         *_late_ticks(known.late_ticks_by),
         f"daemon    {known.version}, scene {known.scene}, up {_number(known.uptime_s, 's', 0)}",
+        *([f"terms out {', '.join(known.terms_out)}"] if known.terms_out else []),
         *_core(known.build, colour),
     ]
     box = known.black_box

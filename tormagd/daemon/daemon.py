@@ -28,6 +28,7 @@ from tormagd.hardware.connection import Connection
 from tormagd.keys import KeyRing
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import OperatingState, RefusedError
+from tormagd.scenes.scene import terms_of
 
 NS = 1_000_000_000
 OPENING_LOOK_S = 0.02
@@ -109,10 +110,12 @@ class Daemon:
         heartbeat = Heartbeat(NS // self._config.rates.control_hz)
         # not on one account: its parts have their own
         self._loop.add_reader(heartbeat.fileno(), self._beat, heartbeat)
-        solver = self._core.solver
+        scene, solver = self._core.scene, self._core.solver
         log.info(
-            "running scene %s with the %s solver at %g mT, %s (%s)",
-            self._core.scene.name,
+            "running scene %s (%s), without the terms: %s; with the %s solver at %g mT, %s (%s)",
+            scene.name,
+            scene.fingerprint,
+            ", ".join(terms_of(scene).left_out) or "none",
             solver.solver,
             solver.step_mT,
             solver.dtype,

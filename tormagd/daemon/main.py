@@ -31,6 +31,7 @@ def parser() -> argparse.ArgumentParser:
     """What `tormagd` understands; its man page is made from it, too."""
     made = argparse.ArgumentParser(prog="tormagd", description="Real-time haptic controller daemon.", epilog=EXIT_TEXT)
     made.add_argument("--config", type=Path, metavar="FILE", help="TOML configuration; defaults where it is silent")
+    made.add_argument("--scene", metavar="NAME", help="this scene, or scene file, in place of the configuration's")
     made.add_argument("--check", action="store_true", help="print the resolved configuration and exit")
     made.add_argument("--version", action="version", version=f"tormagd {__version__}, {settle()}")
     return made
@@ -56,7 +57,7 @@ def _start(options: argparse.Namespace) -> int:
     from tormagd.hardware.backend import choose
 
     try:
-        config = load_config(options.config)
+        config = _configured(options)
         keys = _keys(config.endpoints)
         core = build_core(config)
         backend = choose(config.device, config.rates)
@@ -67,11 +68,22 @@ def _start(options: argparse.Namespace) -> int:
         _print_resolved(config, core, backend.options)
         return 0
     try:
-        uvloop.run(_run(config, core, backend.open, keys, partial(load_config, options.config)))
+        uvloop.run(_run(config, core, backend.open, keys, partial(_configured, options)))
     except OSError as error:
         write_line(f"tormagd: {printable(str(error))}", sys.stderr)
         return 1
     return 0
+
+
+def _configured(options: argparse.Namespace) -> Config:
+    """What the file says, and the command line beside it. Raises ConfigError."""
+    from tormagd.control.core import at_rates_of
+    from tormagd.scenes.scene import load_scene
+
+    config = load_config(options.config)
+    if options.scene is not None:
+        config = msgspec.structs.replace(config, scene=options.scene)
+    return at_rates_of(load_scene(config.scene), config)
 
 
 def _log_to_stderr() -> None:
@@ -106,7 +118,9 @@ async def _run(
 
 
 def _print_resolved(config: Config, core: "Core", options: msgspec.Struct) -> None:
+    from tormagd.control.core import least_resolution_N
     from tormagd.hardware.backend import installed
+    from tormagd.scenes.scene import terms_of
 
     device = msgspec.structs.replace(config.device, options=msgspec.to_builtins(options))
     resolved = {
@@ -118,6 +132,11 @@ def _print_resolved(config: Config, core: "Core", options: msgspec.Struct) -> No
             "phase_margin_deg": core.margins.phase_margin_deg,
             "gain_margin_dB": core.margins.gain_margin_dB,
             "solver": core.solver._asdict(),
+            "fingerprint": core.scene.fingerprint,
+            "terms_out": terms_of(core.scene).left_out,
+            "least_resolution_N": least_resolution_N(core.planner.portrait, core.scene.force.most_N),
+            "missed_rms_N": None if core.missed is None else core.missed.rms_N,
+            "missed_share": None if core.missed is None else core.missed.share,
         },
         "backends": {name: reason or "loads" for name, reason in installed().items()},
     }

@@ -28,6 +28,7 @@ from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
 from tormagd.messages import Description, DeviceReport, OutputReport, Request, Status, Telemetry, TickRecord
 from tormagd.safety.operating_state import Conditions, RefusedError
+from tormagd.scenes.scene import terms_of
 
 NS = 1_000_000_000
 MOST_TICKS = 100
@@ -270,6 +271,9 @@ class TelemetryLoop:
             version=__version__,
             build=str(settle()),
             scene=self._core.scene.name,
+            scene_fingerprint=self._core.scene.fingerprint,
+            terms_out=terms_of(self._core.scene).left_out,
+            solver=self._core.solver.solver,
             uptime_s=round(time.monotonic() - self._started_s, 1),
             least_N=round(self._least_N(), 3),
             most_N=round(shown.force_N(self._core.planner.portrait.most_N), 3),

@@ -1,16 +1,18 @@
-"""A scene states what one task requires: force range, tolerance, insert, geometry, rates.
+"""A scene states what one task requires: forces over time, resolution, tolerance, handle, insert, geometry, rates.
 
 The daemon runs one scene. Nothing that a scene does not ask for is modelled or computed.
 """
 
+import hashlib
 from importlib import resources
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 from tormagd.config import LEAST_INFERENCE_HZ, ConfigError, Strict, convert
+from tormagd.scenes.measured import measured
 
 AUTO = "auto"
 LONGEST_SHOWN = 200  # characters of a refused name
@@ -24,6 +26,7 @@ class Force(Strict, frozen=True):
     "What the task would like as its lowest force; below the device's F_min it gets F_min, and the limit F_MIN shows."
     most_N: Annotated[float, Meta(gt=0.0, le=1_000.0)]
     resolution_N: Annotated[float, Meta(gt=0.0, le=100.0)]
+    "The smallest difference of force that matters. A device that cannot make or measure it is refused."
     tolerance_rms_N: Annotated[float, Meta(gt=0.0, le=100.0)]
     least_variance_accounted_for: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     release_N_s: Annotated[float, Meta(gt=0.0, le=100.0)] = 2.0
@@ -39,6 +42,96 @@ class Bandwidth(Strict, frozen=True):
     inference_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = LEAST_INFERENCE_HZ
 
 
+class Signal(Strict, frozen=True):
+    """The force that the task asks for over time: a recording, or `force`'s range up and down, as much of it as the
+    device gives. A device whose carriages are too slow for it is refused."""
+
+    file: str = ""
+    "A CSV with the columns t_s,force_N, relative to the scene file; forces between its rows are on a smooth curve."
+    bandwidth_hz: Annotated[float, Meta(gt=0.0, le=100.0)] | UnsetType = UNSET
+    "Each rise and each fall is half a period of a cosine of this frequency."
+    step_N: Annotated[float, Meta(gt=0.0, le=1_000.0)] | UnsetType = UNSET
+    "Of each rise and fall; the whole range where it is not given."
+    hold_s: Annotated[float, Meta(ge=0.0, le=86_400.0)] | UnsetType = UNSET
+    "After each rise and each fall; 0 where it is not given."
+    is_known_ahead: bool = False
+    "Whether the publisher knows what comes, and sends it as a preview."
+
+    def __post_init__(self) -> None:
+        shaped = {key: getattr(self, key) for key in ("bandwidth_hz", "step_N", "hold_s")}
+        stated = {key: value for key, value in shaped.items() if value is not UNSET}
+        if self.file and stated:
+            key, value = next(iter(stated.items()))
+            raise ValueError(f"signal.{key} = {value}: allowed only without signal.file")
+        if not self.file and self.bandwidth_hz is UNSET:
+            raise ValueError("signal.bandwidth_hz is missing: allowed is that or signal.file")
+
+
+class Handle(Strict, frozen=True):
+    """How fast the handle slides, mm/s at the roller's surface. A model that does not know such handles is refused."""
+
+    least_mm_s: Annotated[float, Meta(ge=0.5, le=1_000.0)] = 42.0
+    most_mm_s: Annotated[float, Meta(ge=0.5, le=1_000.0)] = 42.0
+    "By default the thesis's 20 rpm."
+
+
+class Budget(Strict, frozen=True):
+    """What the control of the scene may cost; `tormagctl scene check` says whether it does."""
+
+    core_share: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.5
+    "Of one processor's time, for steps and plans."
+
+
+class Terms(Strict, frozen=True):
+    """The parts of the controller's model. One that is left out is not computed.
+
+    `rate`      the handle's rate and displacement are inputs of the learned model; without it the force over the gap is
+                one table, that of a handle at the thesis's 42 mm/s, and there is no search
+    `creep`     what friction does beside that of sliding at a creep, Stribeck's and static, is learned
+    `scale`     the device's force over the model's is learned: friction, modulus, field
+    `offset`    the device's offset is learned: what the elastomer relaxes, and what the field's hysteresis holds back
+    `slope`     setpoints are carried along their slope to now and ahead
+    `forecast`  a force that repeats itself is foreseen
+    `preview`   what a publisher says will follow is used
+    `lag`       how late the carriages are is learned, and made up for
+    `motor`     the duty for the reference's speed and acceleration is fed forward
+    `friction`  the duty that overcomes the dry friction of gearbox and screw is fed forward
+    `pull`      the duty against the magnets' pull is fed forward, and limits the opening speed
+
+    What safety rests on is no term: the ceiling, the judgement of the sensor, the force law beside the search.
+    """
+
+    rate: bool = True
+    creep: bool = True
+    scale: bool = True
+    offset: bool = True
+    slope: bool = True
+    forecast: bool = True
+    preview: bool = True
+    lag: bool = True
+    motor: bool = True
+    friction: bool = True
+    pull: bool = True
+    learning: bool = True
+    "No part of the model, but whether `creep`, `scale`, `offset` and `lag` go on learning, or stay what they are."
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """The names of the terms that are out."""
+        return tuple(name for name in TERMS if not getattr(self, name))
+
+    def without(self, *names: str) -> "Terms":
+        """These terms with some more left out. Raises ValueError for a name that is none."""
+        for name in names:
+            if name not in TERMS:
+                raise ValueError(f"term {name!r}: allowed is one of {', '.join(TERMS)}")
+        return msgspec.structs.replace(self, **dict.fromkeys(names, False))
+
+
+TERMS = tuple(name for name in Terms.__struct_fields__ if name != "learning")
+EVERY_TERM = Terms()
+
+
 class Insert(Strict, frozen=True):
     """Which elastomer is fitted, which device it is in, and the model learned from the two."""
 
@@ -51,6 +144,8 @@ class Insert(Strict, frozen=True):
     outer_radius_mm: Annotated[float, Meta(gt=0.0, le=100.0)] = 11.0
     thickness_mm: Annotated[float, Meta(gt=0.0, le=200.0)] = 20.0
     roller_radius_mm: Annotated[float, Meta(gt=0.0, le=200.0)] = 20.0
+    gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] | UnsetType = UNSET
+    "The fastest that the task lets the gap move, where that is less than the configuration's."
 
 
 class Solver(Strict, frozen=True):
@@ -76,6 +171,15 @@ class Scene(Strict, frozen=True):
     description: str
     force: Force
     insert: Insert
+    element: Literal["torque", "tactile"] = "torque"
+    "What the force is made with: the brake on the handle's shaft, or a pad under a finger."
+    signal: Signal | None = None
+    "Without one nothing is known of how the force changes, and nothing is refused for it."
+    handle: Handle = msgspec.field(default_factory=Handle)
+    budget: Budget = msgspec.field(default_factory=Budget)
+    terms: Terms | Literal["all", "required"] = EVERY_TERM
+    """Which parts of the controller's model run. "required": those that `tools/required_terms.py` found this very scene
+    to require. `load_scene` puts the terms themselves in the words' place."""
     bandwidth: Bandwidth = msgspec.field(default_factory=Bandwidth)
     solver: Solver = msgspec.field(default_factory=Solver)
 
@@ -94,6 +198,22 @@ class Scene(Strict, frozen=True):
         for low_name, low, high_name, high in pairs:
             if not low < high:
                 raise ValueError(f"{low_name} = {low:g}: allowed is under {high_name} = {high:g}")
+        slowest, fastest = self.handle.least_mm_s, self.handle.most_mm_s
+        if slowest > fastest:
+            raise ValueError(f"handle.least_mm_s = {slowest:g}: allowed is at most handle.most_mm_s = {fastest:g}")
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the task: of all that is stated but how it is called, and how often and by which terms it is served."""
+        task = msgspec.structs.replace(
+            self, name="", description="", terms=EVERY_TERM, bandwidth=Bandwidth(), budget=Budget()
+        )
+        return hashlib.sha256(msgspec.json.encode(task)).hexdigest()[:16]
+
+
+def terms_of(scene: Scene) -> Terms:
+    """The terms of a scene that was loaded, or made."""
+    return scene.terms if isinstance(scene.terms, Terms) else EVERY_TERM
 
 
 def shipped_scenes() -> tuple[str, ...]:
@@ -117,5 +237,20 @@ def scene_path(name_or_path: str) -> Path:
 
 
 def load_scene(name_or_path: str) -> Scene:
-    """The scene in a file or of a shipped name. Raises ConfigError naming file, key, value and what is allowed."""
-    return convert(scene_path(name_or_path), Scene)
+    """The scene in a file or of a shipped name, its terms resolved. Raises ConfigError naming file, key, value and what
+    is allowed."""
+    path = scene_path(name_or_path)
+    scene = convert(path, Scene)
+    if scene.terms == "required":
+        return msgspec.structs.replace(scene, terms=_required(scene, path))
+    return scene if isinstance(scene.terms, Terms) else msgspec.structs.replace(scene, terms=EVERY_TERM)
+
+
+def _required(scene: Scene, path: Path) -> Terms:
+    for known in measured().scenes:
+        if known.fingerprint == scene.fingerprint:
+            return EVERY_TERM.without(*known.left_out)
+    raise ConfigError(
+        f'{path}: terms = "required": this scene was not measured as it is now: allowed is a scene of '
+        "tools/required_terms.py, which also says what stands in its place in a table [terms]"
+    )

@@ -9,7 +9,11 @@ import msgspec
 from msgspec import Meta, Struct
 
 from tormagd.bounded_file import read_bounded
+from tormagd.physics.inserts import insert
 from tormagd.toml_file import MOST_BYTES, TomlError, in_short, toml_tables
+
+PLANTS_INSERT = "MRE-50-40"
+"What the committed samples have in them."
 
 
 class PlantError(ValueError):
@@ -210,6 +214,19 @@ def parse_plant(text: str, name: str = "plant") -> PlantParameters:
         raise PlantError(f"{name}: {path or 'top level'}{_value_at(raw, path)}: {reason}") from error
     _require_consistent(parameters, name)
     return parameters
+
+
+def with_insert(plant: PlantParameters, name: str) -> PlantParameters:
+    """The device with another insert in it. By how much the plant's own elastomer is off the registry's PLANTS_INSERT,
+    the other one is off, too: a sample of the kind stays what it is. Raises `DomainError` for an unknown insert."""
+    nominal, other = insert(PLANTS_INSERT).elastomer, insert(name).elastomer
+    own = plant.elastomer
+    fitted = Elastomer(
+        own.shear_modulus_kPa * other.shear_modulus_Pa / nominal.shear_modulus_Pa,
+        max(own.relative_permeability * other.relative_permeability / nominal.relative_permeability, 1.0),
+        own.kinetic_friction * other.friction_coefficient / nominal.friction_coefficient,
+    )
+    return plant if name == PLANTS_INSERT else msgspec.structs.replace(plant, elastomer=fitted)
 
 
 def _value_at(raw: Any, path: str) -> str:

@@ -1,0 +1,147 @@
+"""The measurement of required terms: what is stored follows from its own numbers, and a case gives them again."""
+
+from collections.abc import Iterable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import required_terms
+import scene_runs
+from distributed import Client, LocalCluster
+from required_terms import FROM_HZ, JUDGED, SHARE, is_good, is_met, measure
+from scene_runs import Case, Cost, key, run, run_all
+
+from tormagd.config import ConfigError
+from tormagd.scenes.measured import Judged, MeasuredScene, Without, measured, required
+from tormagd.scenes.scene import TERMS, load_scene, shipped_scenes, terms_of
+
+STORED = measured()
+
+
+@pytest.mark.parametrize("scene", STORED.scenes, ids=lambda scene: scene.name)
+def test_what_is_stored_follows_from_its_own_numbers(scene: MeasuredScene) -> None:
+    assert scene.name in shipped_scenes()
+    stated = load_scene(scene.name)
+    assert (scene.fingerprint, scene.tolerance_N) == (stated.fingerprint, stated.force.tolerance_rms_N)
+    assert tuple(item.term for item in scene.terms) == TERMS
+    assert not set(required(scene.terms, scene.tolerance_N, STORED.share)) & set(scene.left_out)
+    assert all(is_good(item, scene.tolerance_N) for item in scene.judged)
+    assert {item.plant for item in scene.judged} == {"sample_1", "sample_2", "sample_3"}
+    assert scene.cost_us_s > 0.0
+    assert scene.cost_us_s < scene.cost_full_us_s or not scene.left_out
+    assert is_met(scene.judged, scene.tolerance_N) or not scene.left_out
+    if terms_of(stated).left_out:
+        assert terms_of(stated).left_out == scene.left_out
+
+
+def test_a_case_gives_what_was_stored() -> None:
+    """The whole device again, for one scene with what it leaves out: the file belongs to this model and this plant."""
+    brain = next(scene for scene in STORED.scenes if scene.name == "brain")
+    case = Case("brain", "sample_1", tuple(sorted(brain.left_out)), True, *FROM_HZ, STORED.seconds)
+    then_N = next(item.chosen_N for item in brain.judged if item.plant == "sample_1" and item.is_learning)
+    assert run(case) == pytest.approx(then_N, rel=0.05)
+
+
+def table(added_N: dict[str, float]) -> tuple[Without, ...]:
+    return tuple(Without(term, added_N.get(term, 0.0), 0.0) for term in TERMS)
+
+
+def test_a_term_is_required_that_costs_more_than_its_share_learning_or_not() -> None:
+    terms = (Without("rate", 0.011, 0.0), Without("creep", 0.0, 0.011), Without("pull", 0.0099, -0.5))
+    assert required(terms, 0.05, 0.2) == ("rate", "creep")
+    assert required(terms, 0.025, 0.2) == ("rate", "creep", "pull")
+
+
+def test_a_choice_is_good_within_the_tolerance_or_beside_the_full_model() -> None:
+    assert is_good(Judged("sample_2", True, 0.001, JUDGED * 0.05), 0.05)
+    assert not is_good(Judged("sample_2", True, 0.001, 0.041), 0.05)
+    assert is_good(Judged("sample_2", True, 0.060, 0.060 + SHARE * 0.05), 0.05)
+    assert not is_good(Judged("sample_2", True, 0.060, 0.071), 0.05)
+
+
+def test_what_is_only_missed_together_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two terms that stand in for each other: either may go, and not both."""
+    monkeypatch.setattr(required_terms, "costs", lambda case, without: [Cost(1.0, 1.0)] * len(without))
+
+    def outcomes(cases: Iterable[Case]) -> dict[Case, float]:
+        return {
+            case: 0.001
+            + 0.004 * ("scale" in case.left_out)
+            + 0.1 * ("rate" in case.left_out)
+            + 0.1 * ({"scale", "offset"} <= set(case.left_out))
+            for case in cases
+        }
+
+    found = measure("coronary", outcomes)
+    assert set(TERMS) - set(found.left_out) == {"rate", "scale"}
+    assert all(item.chosen_N < 0.01 for item in found.judged)
+
+
+def test_a_scene_that_the_full_model_does_not_meet_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(required_terms, "costs", lambda case, without: [Cost(1.0, 1.0)] * len(without))
+    found = measure("coronary", lambda cases: dict.fromkeys(cases, 0.3))
+    assert found.left_out == ()
+
+
+def test_a_scene_without_a_signal_cannot_be_measured(tmp_path: Path) -> None:
+    bare = tmp_path / "bare.toml"
+    bare.write_text(
+        'name = "bare"\ndescription = ""\n[force]\nleast_N = 0.0\nmost_N = 2.0\nresolution_N = 0.1\n'
+        'tolerance_rms_N = 0.05\n[insert]\nname = "MRE-50-40"\nmodel = "torque_mre_50_40"\n'
+    )
+    with pytest.raises(ConfigError, match="signal is missing"):
+        measure(str(bare), lambda cases: {})
+
+
+class Refusing(Executor):
+    """Takes no run at all."""
+
+    def submit(self, function: Any, /, *arguments: Any, **keywords: Any) -> Future[Any]:
+        raise ConnectionError("worker lost")
+
+
+def test_runs_are_kept_by_what_they_depend_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(scene_runs, "run", lambda case: 0.01 * len(case.left_out))
+    kept = tmp_path / "deep" / "kept.json"
+    cases = [Case("brain"), Case("brain", left_out=("rate",)), Case("brain")]
+    calls: list[tuple[int, int]] = []
+    with ThreadPoolExecutor(1) as pool:
+        first = run_all(cases, pool, kept, lambda finished, total: calls.append((finished, total)))
+    assert list(first.values()) == [0.0, 0.01]
+    assert calls == [(0, 2), (1, 2), (2, 2)]
+    assert run_all(cases, Refusing(), kept) == first
+    with pytest.raises(ConnectionError):
+        run_all([Case("coronary")], Refusing(), kept)
+    # other sources, other outcomes
+    monkeypatch.setattr(scene_runs, "sources_hash", lambda: "edited")
+    with pytest.raises(ConnectionError):
+        run_all(cases, Refusing(), kept)
+
+
+def test_every_part_of_a_case_is_in_its_key() -> None:
+    case = Case("brain")
+    changed = {
+        "scene": "bronchoscopy",
+        "plant": "sample_2",
+        "left_out": ("rate",),
+        "is_learning": False,
+        "control_hz": 500,
+        "inference_hz": 83,
+        "seconds": 1.0,
+    }
+    others = [msgspec.structs.replace(case, **{name: value}) for name, value in changed.items()]
+    assert len({key(each) for each in [case, *others]}) == 1 + len(Case.__struct_fields__)
+
+
+def test_dask_workers_give_what_this_process_gives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cases and outcomes go there and back; what a case takes on its way is the same everywhere, so it is not run."""
+    monkeypatch.setattr(scene_runs, "run", key)
+    cases = [Case("brain"), Case("coronary", "sample_3", ("pull", "rate"), False)]
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+        client.get_executor() as executor,
+    ):
+        assert run_all(cases, executor) == {case: key(case) for case in cases}

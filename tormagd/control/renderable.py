@@ -1,0 +1,48 @@
+"""Whether a device can follow a force at all: carriages that lose no time to anything but their top speed."""
+
+import math
+from typing import NamedTuple
+
+from tormagd.control.portrait import Portrait
+
+SHOWN = 3
+
+
+class Point(NamedTuple):
+    """A force, N, the rate that is asked there, N/s, and the greatest that the device gives there."""
+
+    force_N: float
+    asked_N_s: float
+    given_N_s: float
+
+
+class Missed(NamedTuple):
+    """What such carriages miss of a signal: RMS, N; the share of time in which it is faster than they are; and of that
+    the points furthest out, each of another tenth of the signal's range, worst first."""
+
+    rms_N: float
+    share: float
+    worst: tuple[Point, ...]
+
+
+def missed(shown: Portrait, times_s: list[float], forces_N: list[float], gap_speed_mm_s: float) -> Missed:
+    """What carriages miss of forces (n, N) at rising times (n, s), from the first on. They do not know what comes."""
+    tenth_N = max(max(forces_N) - min(forces_N), 1e-9) / 10.0
+    furthest: dict[int, Point] = {}
+    at_N, squares, outside = forces_N[0], 0.0, 0
+    for index in range(1, len(forces_N)):
+        step_s, force_N = times_s[index] - times_s[index - 1], forces_N[index]
+        most_N = shown.force_rate_N_s(at_N, gap_speed_mm_s) * step_s
+        at_N += min(max(force_N - at_N, -most_N), most_N)
+        squares += (force_N - at_N) ** 2
+        asked_N_s = abs(force_N - forces_N[index - 1]) / step_s
+        given_N_s = shown.force_rate_N_s(force_N, gap_speed_mm_s)
+        if asked_N_s > given_N_s:
+            outside += 1
+            tenth = int(force_N / tenth_N)
+            known = furthest.get(tenth)
+            if known is None or asked_N_s / given_N_s > known.asked_N_s / known.given_N_s:
+                furthest[tenth] = Point(force_N, asked_N_s, given_N_s)
+    worst = sorted(furthest.values(), key=lambda point: point.given_N_s / point.asked_N_s)
+    count = len(forces_N) - 1
+    return Missed(math.sqrt(squares / count), outside / count, tuple(worst[:SHOWN]))

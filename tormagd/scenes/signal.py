@@ -1,0 +1,84 @@
+"""The force that a scene asks for over time, as numbers."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import UNSET
+
+from tormagd.config import ConfigError
+from tormagd.scenes.scene import Signal
+
+Array = npt.NDArray[np.float64]
+
+COLUMNS = "t_s,force_N"
+MOST_ROWS = 1_000_000
+MOST_N = 1_000.0
+
+
+def recorded(path: Path) -> tuple[Array, Array]:
+    """Times, s, and forces, N (n each), of a CSV with the columns t_s,force_N. Raises ConfigError: file and value."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            header = file.readline(200).strip()
+            if header != COLUMNS:
+                raise ConfigError(f"signal.file = {path}: its first line is {header!r}: allowed is {COLUMNS}")
+            rows = np.loadtxt(file, delimiter=",", ndmin=2, max_rows=MOST_ROWS + 1)
+    except (OSError, ValueError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"signal.file = {path}: {error}") from error
+    if not 2 <= len(rows) <= MOST_ROWS or rows.shape[1] != 2:
+        raise ConfigError(f"signal.file = {path}: {rows.shape} values: allowed are 2 columns of 2..{MOST_ROWS} rows")
+    time_s, force_N = rows.T
+    if not (np.all(np.isfinite(rows)) and np.all(np.diff(time_s) > 0.0)):
+        raise ConfigError(f"signal.file = {path}: allowed are finite numbers, and times that rise from row to row")
+    if not (force_N.min() >= 0.0 and force_N.max() <= MOST_N):
+        raise ConfigError(
+            f"signal.file = {path}: forces of {force_N.min():g}..{force_N.max():g} N: allowed is 0..{MOST_N:g}"
+        )
+    return time_s - time_s[0], force_N
+
+
+def asked(
+    signal: Signal, beside: Path, range_N: tuple[float, float], longest_s: float, rate_hz: int
+) -> tuple[Array, Array]:
+    """Times, s, and forces, N, at `rate_hz` until the signal, or once up and down, ends, at most `longest_s`.
+
+    Only forces within `range_N` are asked for: a brake has a least one, and says so with the limit F_MIN.
+    """
+    low_N, high_N = range_N
+    if signal.file:
+        known_s, known_N = recorded(beside / signal.file)
+        time_s = np.arange(max(round(min(longest_s, known_s[-1]) * rate_hz), 2)) / rate_hz
+        return time_s, np.clip(_through(time_s, known_s, known_N), low_N, high_N)
+    assert signal.bandwidth_hz is not UNSET, "a signal without a file has a bandwidth"
+    turn_s = 0.5 / signal.bandwidth_hz
+    hold_s = 0.0 if signal.hold_s is UNSET else signal.hold_s
+    steps = 1 if signal.step_N is UNSET else max(math.ceil((high_N - low_N) / signal.step_N - 1e-9), 1)
+    levels_N = np.linspace(low_N, high_N, steps + 1)
+    levels_N = np.concatenate([levels_N, levels_N[-2::-1]])
+    each_s = turn_s + hold_s
+    time_s = np.arange(max(round(min(longest_s, each_s * 2 * steps) * rate_hz), 2)) / rate_hz
+    place = np.minimum(time_s // each_s, 2 * steps - 1).astype(np.int64)
+    share = np.minimum((time_s - place * each_s) / turn_s, 1.0)
+    rise = 0.5 - 0.5 * np.cos(math.pi * share)
+    return time_s, levels_N[place] + rise * (levels_N[place + 1] - levels_N[place])
+
+
+def _through(time_s: Array, known_s: Array, known_N: Array) -> Array:
+    """Cubic Hermite curves through the rows, with the slopes of their neighbours: a corner at every row would shake the
+    carriages."""
+    slope = np.gradient(known_N, known_s)
+    after = np.clip(np.searchsorted(known_s, time_s, side="right"), 1, len(known_s) - 1)
+    start = after - 1
+    width_s = known_s[after] - known_s[start]
+    share = (time_s - known_s[start]) / width_s
+    rest = 1.0 - share
+    return (
+        known_N[start] * (1.0 + 2.0 * share) * rest**2
+        + width_s * slope[start] * share * rest**2
+        + known_N[after] * (1.0 + 2.0 * rest) * share**2
+        - width_s * slope[after] * rest * share**2
+    )
