@@ -28,7 +28,7 @@ MAY_IMPORT = {
     "model": FILES | {"physics"},
     "training": FILES | {"physics", "model"},
     "inverse": {"firmware_protocol", "physics", "model", "training"},
-    "scenes": {"config"},
+    "scenes": {"bounded_file", "config"},
     "safety": {"firmware_protocol"},
     "hardware": LOWEST | {"safety"},
     "control": LOWEST | {"exact", "physics", "model", "inverse", "scenes", "safety", "hardware"},

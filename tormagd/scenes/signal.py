@@ -1,5 +1,6 @@
 """The force that a scene asks for over time, as numbers."""
 
+import io
 import math
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET
 
+from tormagd.bounded_file import read_bounded
 from tormagd.config import ConfigError
 from tormagd.scenes.scene import Signal
 
@@ -14,20 +16,24 @@ Array = npt.NDArray[np.float64]
 
 COLUMNS = "t_s,force_N"
 MOST_ROWS = 1_000_000
+MOST_BYTES = 64_000_000
 MOST_N = 1_000.0
 
 
 def recorded(path: Path) -> tuple[Array, Array]:
     """Times, s, and forces, N (n each), of a CSV with the columns t_s,force_N. Raises ConfigError: file and value."""
     try:
-        with path.open(encoding="utf-8") as file:
-            header = file.readline(200).strip()
-            if header != COLUMNS:
-                raise ConfigError(f"signal.file = {path}: its first line is {header!r}: allowed is {COLUMNS}")
-            rows = np.loadtxt(file, delimiter=",", ndmin=2, max_rows=MOST_ROWS + 1)
-    except (OSError, ValueError) as error:
-        if isinstance(error, ConfigError):
-            raise
+        file = io.StringIO(read_bounded(path, MOST_BYTES).decode())
+    except OSError as error:
+        raise ConfigError(f"signal.file = {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"signal.file = {path}: {error}: allowed is UTF-8") from error
+    header = file.readline(200).strip()
+    if header != COLUMNS:
+        raise ConfigError(f"signal.file = {path}: its first line is {header!r}: allowed is {COLUMNS}")
+    try:
+        rows = np.loadtxt(file, delimiter=",", ndmin=2, max_rows=MOST_ROWS + 1)
+    except ValueError as error:
         raise ConfigError(f"signal.file = {path}: {error}") from error
     if not 2 <= len(rows) <= MOST_ROWS or rows.shape[1] != 2:
         raise ConfigError(f"signal.file = {path}: {rows.shape} values: allowed are 2 columns of 2..{MOST_ROWS} rows")
