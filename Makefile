@@ -25,7 +25,7 @@ CORE_TESTS := tests/control tests/safety tests/model tests/firmware_protocol/tes
 
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
-.PHONY: install uninstall deb run test unhurried search check format compile model reproduction evidence clean
+.PHONY: install uninstall deb run test unhurried search check format compile core fetched model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -34,7 +34,7 @@ run: $(VENV)/.demo
 # themselves
 test: $(VENV)/.dev
 	$(MAKE) --no-print-directory --jobs=2 check unhurried
-	$(BIN)/python -P -m pytest -q -m live
+	$(BIN)/python -P -m pytest -q -m live $$(grep -rlE 'mark\.live' tests --include='test_*.py')
 
 # -P: what its owner keeps in this folder is not imported in place of a module. The core's tests run on both builds
 unhurried: $(VENV)/.dev
@@ -58,8 +58,7 @@ format: $(VENV)/.dev
 	$(BIN)/python -P -m ruff format .
 
 # after an edit of one of the compiled files; until then all of the core runs interpreted
-compile: | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable .
+compile: core
 	@$(SAY_BUILD)
 
 # the shipped models: bench sweeps recorded from the simulated device (sample 1, with each insert), then training
@@ -122,7 +121,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.demo: pyproject.toml setup.py | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable '.[demo]'
+	$(MAKE) --no-print-directory --jobs=2 core fetched EXTRAS=demo
 	@$(SAY_BUILD)
 	touch $@
 
@@ -131,6 +130,14 @@ $(VENV)/.man: pyproject.toml setup.py | $(BIN)/python
 	touch $@
 
 $(VENV)/.dev: pyproject.toml setup.py | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(MAKE) --no-print-directory --jobs=2 core fetched EXTRAS=dev
 	@$(SAY_BUILD)
 	touch $@ $(VENV)/.demo
+
+# the core is compiled while what it needs is fetched: each takes a minute, and a processor
+core: | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --no-deps --editable .
+
+fetched: | $(BIN)/python
+	$(BIN)/python tools/dependencies.py $(EXTRAS) > $(VENV)/$(EXTRAS).txt
+	$(BIN)/python -m pip install --quiet --requirement $(VENV)/$(EXTRAS).txt

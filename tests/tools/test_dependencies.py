@@ -1,0 +1,24 @@
+"""What is fetched beside the core is what pip would fetch with it."""
+
+import re
+from importlib.metadata import requires
+
+import pytest
+from dependencies import requirements
+
+
+def named(requirement: str) -> str:
+    return re.split(r"[^A-Za-z0-9_.-]", requirement, maxsplit=1)[0].lower()
+
+
+def test_extras_of_extras_are_followed() -> None:
+    everything = requirements(["dev"])
+    assert set(requirements(["demo"])) < set(everything)
+    assert not any(requirement.startswith("tormagd") for requirement in everything)
+    installed = {named(requirement) for requirement in requires("tormagd") or []} - {"tormagd"}
+    assert {named(requirement) for requirement in everything} == installed
+
+
+def test_an_extra_that_is_none_is_refused() -> None:
+    with pytest.raises(KeyError, match="deb"):
+        requirements(["deb"])

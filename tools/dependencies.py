@@ -1,0 +1,29 @@
+"""The requirements of this project and some of its extras, for `pip install -r`: so they are fetched while the core is
+compiled, which takes as long."""
+
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
+
+
+def requirements(extras: list[str]) -> list[str]:
+    """What `pip install '.[extras]'` would fetch, but for the project. Raises KeyError for an extra that is none."""
+    project = tomllib.loads(PYPROJECT.read_text(encoding="utf-8"))["project"]
+    ours = re.compile(rf"{project['name']}\[(.*)\]")
+    found: list[str] = list(project["dependencies"])
+    waiting = list(extras)
+    while waiting:
+        for requirement in project["optional-dependencies"][waiting.pop(0)]:
+            own = ours.fullmatch(requirement)
+            if own is None:
+                found.append(requirement)
+            else:
+                waiting += own[1].split(",")
+    return sorted(set(found))
+
+
+if __name__ == "__main__":
+    print(*requirements(sys.argv[1:]), sep="\n")
