@@ -16,7 +16,6 @@ import sysconfig
 import warnings
 from collections.abc import Sequence
 from functools import cache
-from importlib.abc import MetaPathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -38,8 +37,11 @@ class Build(NamedTuple):
         return "compiled" if self.is_compiled else f"interpreted: {self.reason}"
 
 
-class FromSource(MetaPathFinder):
-    """Finds the sources of these modules, and not what was once compiled from them."""
+class FromSource:
+    """Finds the sources of these modules, and not what was once compiled from them: a finder for `sys.meta_path`.
+
+    It does not derive from `MetaPathFinder`: what that brings is a tenth of the time that a command takes to answer.
+    """
 
     def __init__(self, modules: frozenset[str]) -> None:
         self._modules = modules
@@ -47,7 +49,7 @@ class FromSource(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """See `MetaPathFinder.find_spec`."""
+        """See `importlib.abc.MetaPathFinder.find_spec`."""
         if fullname not in self._modules or path is None:
             return None
         sources = [Path(folder, fullname.rpartition(".")[2]).with_suffix(".py") for folder in path]

@@ -34,7 +34,8 @@ MAY_IMPORT = {
     "control": LOWEST | {"exact", "physics", "model", "inverse", "scenes", "safety", "hardware"},
     "daemon": LOWEST | FILES | {"output", "keys", "keeping", "scenes", "safety", "hardware", "control"},
     "recording": FILES | {"messages", "output", "keeping"},
-    "ctl": FILES | {"config", "messages", "output", "keys", "scenes", "recording"},
+    "client": {"config", "keys", "messages", "output"},
+    "ctl": FILES | {"client", "config", "messages", "output", "keys", "scenes", "recording"},
     "simulation": FILES | {"physics", "firmware_protocol", "output"},
     "headroom": {"config", "output", "daemon", "control", "simulation", "closed_loop"},
     "replay": LOWEST

@@ -35,7 +35,7 @@ from benchmark_loop import (
     writes,
 )
 
-from tormagd.ctl.outcome import CommandError
+from tormagd.client import ClientError
 
 LINES = ((2_000, 3_000_000), (4_000, 4_000_000))
 "Control rate, Hz, and baud."
@@ -57,7 +57,7 @@ def course(stand: Stand, seconds: float) -> dict[str, Any]:
             written = writes(running.writes)
     except subprocess.CalledProcessError as error:
         return line | {"not_measured": (error.stderr or b"").decode(errors="replace").strip() or str(error)}
-    except (RuntimeError, CommandError) as error:
+    except (RuntimeError, ClientError) as error:
         return line | {"not_measured": str(error)}
     without_us = NOTHING if written is None else without_writes(ticks, *written)
     return line | summary(ticks, stand.control_hz, without_us) | {"plan_us": plan_us, "core_share": round(share, 4)}

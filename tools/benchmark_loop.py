@@ -34,9 +34,8 @@ from benchmark_against import TOOLS, add_against_argument, environment
 from benchmark_plot import plot_histograms
 from host import processor_s
 
-from tormagd.config import Config, RealTime, load_config
-from tormagd.ctl.client import Client
-from tormagd.ctl.outcome import CommandError
+from tormagd.client import Client, ClientError
+from tormagd.config import Config, Endpoints, RealTime, load_config
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
@@ -290,7 +289,7 @@ def without_writes(ticks: Ticks, begun_ns: npt.NDArray[np.int64], took_ns: npt.N
 
 def planned(address: str) -> dict[str, float] | None:
     """What status says of the plans; None where it says nothing, as the stub's."""
-    with contextlib.closing(Client(address, 5.0)) as client:
+    with contextlib.closing(Client(Endpoints(control=address), 5.0)) as client:
         spent = client.request("status").get("rates", {}).get("inference", {}).get("exec_us")
     return None if spent is None else {name: float(spent[name]) for name in PLAN_QUANTILES}
 
@@ -320,9 +319,9 @@ def hammer(address: str, stop: Event) -> None:
     """Eight clients that each ask for status as fast as they are answered."""
 
     def ask() -> None:
-        client = Client(address, 2.0)
+        client = Client(Endpoints(control=address), 2.0)
         while not stop.is_set():
-            with contextlib.suppress(CommandError):
+            with contextlib.suppress(ClientError):
                 client.request("status")
         client.close()
 
@@ -444,9 +443,9 @@ async def _bare(config: Config) -> None:
 def wait_for(address: str) -> None:
     """Until the daemon answers and its device does."""
     until_s = time.monotonic() + 60.0
-    client = Client(address, 1.0)
+    client = Client(Endpoints(control=address), 1.0)
     while time.monotonic() < until_s:
-        with contextlib.suppress(CommandError):
+        with contextlib.suppress(ClientError):
             if client.request("status").get("link", {}).get("state") == "RUNNING":
                 client.close()
                 return

@@ -27,8 +27,7 @@ from replug_cable import Cable
 from tqdm import tqdm
 
 from firmware_protocol.codec import DeviceMode
-from tormagd.ctl.client import Client
-from tormagd.ctl.outcome import CommandError
+from tormagd.client import Client, ClientError
 from tormagd.messages import VERSION, Setpoint, encode
 from tormagd.recording.ticks import decode_ticks
 
@@ -99,7 +98,7 @@ class Stand:
             self._setpoints = _socket(context, zmq.PUB, f"ipc://{folder}/setpoint")
             self._ticks = _socket(context, zmq.SUB, f"ipc://{folder}/recording")
             self._ticks.subscribe(b"")
-            self._client = self._stack.enter_context(Client(f"ipc://{folder}/control", 2.0))
+            self._client = self._stack.enter_context(Client.local(str(folder), 2.0))
         except BaseException:
             self._stack.close()
             raise
@@ -111,13 +110,13 @@ class Stand:
 
     def status(self) -> dict[str, Any]:
         """The daemon's status; empty while it does not answer."""
-        with contextlib.suppress(CommandError):
+        with contextlib.suppress(ClientError):
             return self._client.request("status")
         return {}
 
     def command(self, name: str) -> bool:
         """Whether the daemon carried it out."""
-        with contextlib.suppress(CommandError):
+        with contextlib.suppress(ClientError):
             self._client.request(name)
             return True
         return False

@@ -21,9 +21,8 @@ import zmq
 from host import Host, HostWatch
 from human_pulse import Array
 
-from tormagd.ctl.client import Client
+from tormagd.client import Client, ClientError, UnreachableError
 from tormagd.ctl.operate import home, operate
-from tormagd.ctl.outcome import CommandError, Exit
 from tormagd.messages import MessageError, Telemetry, decode
 from tormagd.recording.reader import RecordingError, read_recording
 from tormagd.safety.codes import FAULTS, Fault
@@ -167,7 +166,7 @@ def play(watched: HostWatch, duration_s: float) -> Course:
         watched.wait_for("daemon", daemon.pid)
         # from the first tick on: it also says how a show went that ended early
         recorder = stack.enter_context(process("recorder", *CTL, "record", str(RECORDING)))
-        client = stack.enter_context(Client(ADDRESS.format("control"), ANSWER_S))
+        client = stack.enter_context(Client.local(ADDRESS.format("").removeprefix("ipc://").rstrip("/"), ANSWER_S))
         wait_for_link(daemon, client)
         arm(client)
         before, start_s = status(client), time.monotonic()
@@ -289,7 +288,7 @@ def wait_for_link(daemon: "subprocess.Popen[str]", client: Client) -> None:
     while time.monotonic() < until_s:
         if daemon.poll() is not None:
             raise ended("tormagd")
-        with contextlib.suppress(CommandError):
+        with contextlib.suppress(ClientError):
             if client.request("status").get("link", {}).get("state") == "RUNNING":
                 return
         time.sleep(0.1)
@@ -308,23 +307,23 @@ def arm(client: Client) -> None:
             try:
                 operate(client, "enable")
                 return
-            except CommandError as error:
+            except ClientError as error:
                 # a busy machine may find the newest measurement a little old for a moment
                 if error.code not in ("not_fresh", "busy") or time.monotonic() > until_s:
                     raise
                 time.sleep(0.05)
-    except CommandError as error:
+    except ClientError as error:
         raise_fault(status(client))
-        is_late = error.exit_code is Exit.UNREACHABLE or error.code in ("not_fresh", "timeout", "not_begun")
-        raise ShowError(str(error), error.hint, is_of_time=is_late) from error
+        is_late = isinstance(error, UnreachableError) or error.code in ("not_fresh", "timeout", "not_begun")
+        raise ShowError(error.message, error.hint, is_of_time=is_late) from error
 
 
 def status(client: Client) -> dict[str, Any]:
     """The daemon's status. Raises ShowError."""
     try:
         return client.request("status")
-    except CommandError as error:
-        raise ShowError(str(error), f"look at {RUN_DIR / 'tormagd.log'}", is_of_time=True) from error
+    except ClientError as error:
+        raise ShowError(error.message, f"look at {RUN_DIR / 'tormagd.log'}", is_of_time=True) from error
 
 
 def raise_fault(state: dict[str, Any]) -> None:

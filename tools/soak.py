@@ -28,11 +28,11 @@ from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from tqdm import tqdm
 
+from tormagd.client import Client
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, RealTime, load_config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
-from tormagd.ctl.client import Client
 from tormagd.recording.writer import TELEMETRY_TOPIC, TICKS_TOPIC
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
@@ -98,7 +98,7 @@ def daemon(minutes: float) -> dict[str, Any]:
         processes = {"daemon": process, "recorder": _recorder(folder, "soak", stack)}
         for _ in tqdm(range(round(60.0 * minutes / SAMPLE_S)), desc="real time", unit="sample", disable=None):
             time.sleep(SAMPLE_S)
-            with Client(config.endpoints.control, PATIENCE_S) as client:
+            with Client(config.endpoints, PATIENCE_S) as client:
                 status = client.request("status")
             faults.update(status["faults"])
             for each, running in processes.items():

@@ -24,8 +24,7 @@ import numpy as np
 import zmq
 from tqdm import tqdm
 
-from tormagd.ctl.client import Client
-from tormagd.ctl.outcome import CommandError
+from tormagd.client import Client, ClientError
 from tormagd.messages import VERSION, Setpoint, Telemetry, decode, encode
 
 FORCE_N, NEUTRAL_N = 1.5, 0.3
@@ -101,7 +100,7 @@ class Rig:
         self._telemetry = self._context.socket(zmq.SUB)
         self._telemetry.connect(f"ipc://{folder}/telemetry")
         self._telemetry.subscribe(b"")
-        self._client = Client(f"ipc://{folder}/control", PATIENCE_S)
+        self._client = Client.local(str(folder), PATIENCE_S)
         self._seq = 0
         self._until(lambda status: status["link"]["state"] == "RUNNING", "the link runs")
         if not self._setpoints.poll(round(PATIENCE_S * 1e3)):
@@ -183,7 +182,7 @@ class Rig:
     def _is_done(self, name: str) -> bool:
         try:
             self._client.request(name)
-        except CommandError:
+        except ClientError:
             return False
         return True
 

@@ -319,6 +319,15 @@ def _order(condition: bool, key: str, value: object, allowed: str) -> None:
         raise ValueError(f"{key} = {in_short(value)}: allowed is {allowed}")
 
 
+def in_folder(folder: str) -> Endpoints:
+    """The endpoints of a daemon whose sockets are in `folder`. Raises ConfigError: the path is too long, or none."""
+    try:
+        placed = msgspec.convert({name: f"ipc://{folder}/{name}" for name in ENDPOINTS}, Endpoints)
+        return Config(endpoints=placed).endpoints
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
 def load_config(path: Path | None) -> Config:
     """The configuration in `path`, or the defaults. Raises ConfigError."""
     if path is None:

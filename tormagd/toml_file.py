@@ -2,7 +2,6 @@
 
 import math
 import re
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +39,8 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 def toml_tables(text: str) -> dict[str, Any]:
     """The tables in `text`, all numbers finite and of 64 bits. Raises TomlError."""
+    import tomllib  # not above: who reads no file, as most commands of tormagctl, need not wait for it
+
     _require_shallow(text)
     try:
         tables = tomllib.loads(text)

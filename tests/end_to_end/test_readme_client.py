@@ -34,7 +34,7 @@ def test_the_client_waits_for_the_end_of_homing_and_publishes_nothing_when_it_is
     asked = []
     refusals = iter([("busy", "homing"), ("not_neutral", "the setpoint is 1.40 N")])
     with tempfile.TemporaryDirectory() as folder:  # a short path, as sockets need
-        control, setpoints = context.socket(zmq.REP), context.socket(zmq.SUB)
+        control, setpoints = context.socket(zmq.ROUTER), context.socket(zmq.SUB)
         setpoints.subscribe(b"")
         control.bind(f"ipc://{folder}/control")
         setpoints.bind(f"ipc://{folder}/setpoint")
@@ -43,12 +43,14 @@ def test_the_client_waits_for_the_end_of_homing_and_publishes_nothing_when_it_is
         )
         try:
             while len(asked) < 3 and control.poll(30_000):
-                asked.append(msgpack.unpackb(control.recv())["command"])
-                reply = {"v": 1, "id": 1, "ok": asked[-1] == "home", "result": {}}
+                *envelope, data = control.recv_multipart()
+                request = msgpack.unpackb(data)
+                asked.append(request["command"])
+                reply = {"v": 1, "id": request["id"], "ok": asked[-1] == "home", "result": {}}
                 if asked[-1] == "enable":
                     code, message = next(refusals)
                     reply["error"] = {"code": code, "message": message, "hint": "lower it"}
-                control.send(msgpack.packb(reply))
+                control.send_multipart([*envelope, msgpack.packb(reply)])
             _, said = playing.communicate(timeout=30)
         finally:
             playing.kill()
@@ -63,7 +65,7 @@ def test_the_client_waits_for_the_end_of_homing_and_publishes_nothing_when_it_is
 
 def test_the_client_in_the_readme_sees_the_force_follow(rig, tmp_path):
     script = client()
-    assert len(script.splitlines()) <= 30
+    assert len(script.splitlines()) <= 18
     profile = tmp_path / "profile.csv"
     rows = [(k * 0.02, 0.6 + min(k * 0.01, 0.9)) for k in range(150)]
     profile.write_text("t_s,force_N\n" + "".join(f"{t:.3f},{force:.3f}\n" for t, force in rows))

@@ -4,7 +4,7 @@ import shutil
 import time
 from pathlib import Path
 
-from tormagd.ctl.client import Client
+from tormagd.client.blocking import Client
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 
 POLL_S = 0.1

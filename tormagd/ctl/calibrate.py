@@ -16,9 +16,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from tormagd.client.blocking import Client
 from tormagd.config import Endpoints
 from tormagd.ctl.calibrate_run import Columns, InterruptedRunError, Range, Run, armed, reach, seconds_bar
-from tormagd.ctl.client import Client, keys_of
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.ctl.waveform import Sample, Waveform
@@ -50,7 +50,7 @@ def calibrate(
     enough, and then there is no model file), FAULT, UNREACHABLE, `InterruptedRunError`.
     """
     _ask_fitter("--insert", insert)  # an unknown insert is told now, not after the sweeps
-    with Client(endpoints.control, wait_s, keys_of(endpoints.curve)) as client:
+    with Client(endpoints, wait_s) as client:
         forces = reach(client, scene.force.most_N)
         if not forces.most_N > forces.least_N:
             raise CommandError(

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from tormagd.client.blocking import Client
 from tormagd.config import Endpoints
 from tormagd.ctl.calibrate_run import MOVING_MM_S, Columns, Range, armed, reach, seconds_bar
-from tormagd.ctl.client import Client, keys_of
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ctl.waveform import Sample, Waveform
 from tormagd.messages import ProfileReport, Status
@@ -65,7 +65,7 @@ def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -
     Raises CommandError: REFUSED (also where no profile is kept, the handle hardly moves, or the force sensor is not
     believed), FAULT, UNREACHABLE, `InterruptedRunError`.
     """
-    with Client(endpoints.control, wait_s, keys_of(endpoints.curve)) as client:
+    with Client(endpoints, wait_s) as client:
         profile = client.status().profile
         if not profile.folder:
             raise _not_kept(profile)

@@ -11,9 +11,9 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from tormagd.client.blocking import Client
 from tormagd.config import Endpoints
 from tormagd.ctl.calibrate_run import Columns, Range, armed, reach, seconds_bar
-from tormagd.ctl.client import Client, keys_of
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ctl.waveform import Sample, Waveform
 
@@ -78,7 +78,7 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
 
     Raises CommandError: USAGE where the file exists or cannot be made, REFUSED, FAULT, UNREACHABLE.
     """
-    with Client(endpoints.control, wait_s, keys_of(endpoints.curve)) as client:
+    with Client(endpoints, wait_s) as client:
         waveform = excitation(reach(client, scene_most_N))
         with (
             armed(endpoints, client, COLUMNS, wait_s) as run,

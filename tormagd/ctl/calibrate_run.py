@@ -12,13 +12,15 @@ import numpy.typing as npt
 import zmq
 from tqdm import tqdm
 
+from tormagd.client.blocking import Client
+from tormagd.client.errors import ClientError, unreachable
+from tormagd.client.wire import Numbering, connect, keys_of
 from tormagd.config import Endpoints
-from tormagd.ctl.client import Client, connect, keys_of, unreachable
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.operate import home
 from tormagd.ctl.outcome import CommandError, Exit, is_terminal
 from tormagd.ctl.waveform import Waveform
-from tormagd.messages import VERSION, MessageError, Setpoint, encode
+from tormagd.messages import MessageError
 from tormagd.recording.ticks import MAX_BATCH_BYTES, TickBatch, Value, decode_ticks
 
 Columns = dict[str, npt.NDArray[np.float64]]
@@ -79,7 +81,7 @@ class Run:
         self._endpoints, self._client, self._columns = endpoints, client, tuple(columns)
         self._setpoints, self._ticks = sockets
         self._is_interrupted = is_interrupted
-        self._seq = time.time_ns()  # above every earlier run's, so that none of ours looks repeated
+        self._numbering = Numbering(SOURCE)
         self._heard_s = time.monotonic()
 
     def play(self, waveform: Waveform, bar: "tqdm[Any] | None" = None) -> Columns:
@@ -102,16 +104,7 @@ class Run:
         if self._is_interrupted():
             raise InterruptedRunError
         due_s = time.monotonic() + 1.0 / RATE_HZ
-        self._seq += 1
-        setpoint = Setpoint(
-            v=VERSION,
-            source=SOURCE,
-            seq=self._seq,
-            stamp_ns=time.time_ns(),
-            servo_cf=force_N,
-            valid_for_ms=VALID_FOR_MS,
-        )
-        self._setpoints.send(encode(setpoint))
+        self._setpoints.send(self._numbering.setpoint(force_N, VALID_FOR_MS))
         rows: list[list[float]] = []
         while (left_s := due_s - time.monotonic()) > 0.0:
             if self._ticks.poll(max(1, round(left_s * 1e3))):
@@ -213,7 +206,7 @@ def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: 
                 yield Run(endpoints, client, (setpoints, ticks), columns, is_interrupted)
             except BaseException:
                 # in FAULT the gap opens already, and a daemon that has gone has opened it: the first error counts
-                with suppress(CommandError):
+                with suppress(ClientError):
                     client.request("disable")
                 raise
             client.request("disable")
@@ -241,7 +234,7 @@ def _enable(client: Client) -> None:
     while True:
         try:
             client.request("enable")
-        except CommandError as error:
+        except ClientError as error:
             if error.code != "not_fresh" or time.monotonic() > until_s:
                 raise
         else:

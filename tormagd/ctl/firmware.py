@@ -2,7 +2,8 @@
 
 import sys
 
-from tormagd.ctl.client import Client, understood
+from tormagd.client.blocking import Client
+from tormagd.client.wire import understood
 from tormagd.ctl.outcome import Colour, Outcome
 from tormagd.messages import ClockReport, LinkReport, RoundTripReport
 

@@ -13,8 +13,9 @@ from pathlib import Path
 import msgspec
 
 from tormagd import __version__
+from tormagd.client.errors import ClientError
 from tormagd.config import ENDPOINTS, ROLES, Config, ConfigError, Curve, Endpoints, load_config
-from tormagd.ctl.outcome import CommandError, Outcome, print_error, print_outcome, usage_error
+from tormagd.ctl.outcome import Outcome, exit_code, print_error, print_outcome, usage_error
 from tormagd.output import write_line
 
 STATE_COMMANDS = {
@@ -38,16 +39,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     try:
         outcome = _run(options)
-    except CommandError as error:
+    except ClientError as error:
         print_error(options.command, error, options.json)
-        return error.exit_code
+        return exit_code(error)
     except ModuleNotFoundError as error:
         extra = EXTRAS.get(error.name or "")
         if extra is None:
             raise
         missing = usage_error(f"{error.name} is not installed", f"pip install 'tormagd[{extra}]'")
         print_error(options.command, missing, options.json)
-        return missing.exit_code
+        return exit_code(missing)
     except KeyboardInterrupt:
         write_line(f"tormagctl {options.command}: interrupted; the daemon goes on", sys.stderr)
         return 130
@@ -118,13 +119,13 @@ def _scene(options: argparse.Namespace, configured: str) -> Outcome:
 
 
 def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
+    from tormagd.client.blocking import Client
     from tormagd.ctl.black_box import black_box
-    from tormagd.ctl.client import Client, keys_of
     from tormagd.ctl.firmware import firmware
     from tormagd.ctl.operate import home, operate, take
     from tormagd.ctl.status import status
 
-    with Client(endpoints.control, options.wait, keys_of(endpoints.curve)) as client:
+    with Client(endpoints, options.wait) as client:
         match options.command:
             case "status":
                 return status(client)

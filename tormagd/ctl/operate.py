@@ -3,7 +3,7 @@
 import sys
 import time
 
-from tormagd.ctl.client import Client
+from tormagd.client.blocking import Client
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal
 from tormagd.messages import Explained, Status
 

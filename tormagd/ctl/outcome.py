@@ -7,6 +7,7 @@ from typing import Any, TextIO
 
 import msgspec
 
+from tormagd.client.errors import ClientError, InFaultError, SettingError, UnreachableError
 from tormagd.output import printable, write_line
 
 
@@ -20,12 +21,26 @@ class Exit(IntEnum):
     FAULT = 4
 
 
-class CommandError(Exception):
-    """A command that did not do what was asked: exit code, a stable code, what happened, and what to do next."""
+class CommandError(ClientError):
+    """A command that did not do what was asked, for a reason that `tormagctl` itself has found."""
 
     def __init__(self, exit_code: Exit, code: str, message: str, hint: str) -> None:
-        super().__init__(message)
-        self.exit_code, self.code, self.message, self.hint = exit_code, code, message, hint
+        super().__init__(code, message, hint)
+        self.exit_code = exit_code
+
+
+def exit_code(error: ClientError) -> Exit:
+    """What `tormagctl` ends with after this error."""
+    if isinstance(error, CommandError):
+        return error.exit_code
+    for kind, code in (
+        (InFaultError, Exit.FAULT),
+        (UnreachableError, Exit.UNREACHABLE),
+        (SettingError, Exit.USAGE),
+    ):
+        if isinstance(error, kind):
+            return code
+    return Exit.REFUSED
 
 
 def usage_error(message: str, hint: str) -> CommandError:
@@ -49,7 +64,7 @@ def print_outcome(command: str, outcome: Outcome, as_json: bool) -> None:
         _print(command, outcome.text)
 
 
-def print_error(command: str, error: CommandError, as_json: bool) -> None:
+def print_error(command: str, error: ClientError, as_json: bool) -> None:
     """The error and its remedy on stderr, and with `--json` the object on stdout as well."""
     colour = Colour(sys.stderr)
     said, hint = colour.red(printable(error.message)), printable(error.hint)

@@ -11,8 +11,10 @@ from pathlib import Path
 import msgspec
 import zmq
 
+from tormagd.client.blocking import Client
+from tormagd.client.errors import ClientError, unreachable
+from tormagd.client.wire import Keys, connect, keys_of
 from tormagd.config import Endpoints
-from tormagd.ctl.client import Client, Keys, connect, keys_of, unreachable
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.messages import MessageError, Telemetry, decode
@@ -48,7 +50,7 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
             if not _any_ready((telemetry, ticks), wait_s, is_interrupted):
                 raise unreachable(endpoints.telemetry, f"nothing is published there within {wait_s:g} s")
-            about = _about(endpoints, wait_s, keys)
+            about = _about(endpoints, wait_s)
             if path.is_dir():
                 path /= f"{datetime.now():%Y-%m-%dT%H-%M-%S}.mcap"
             try:
@@ -60,8 +62,8 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
             try:
                 with writer:
                     outcome = _record(writer, path, telemetry, ticks, duration_s, is_interrupted)
-                    with contextlib.suppress(CommandError):  # the daemon has gone: what was true at the start stands
-                        writer.describe(_about(endpoints, min(wait_s, SILENT_S), keys))
+                    with contextlib.suppress(ClientError):  # the daemon has gone: what was true at the start stands
+                        writer.describe(_about(endpoints, min(wait_s, SILENT_S)))
                     return outcome
             except OSError as error:
                 raise CommandError(
@@ -74,9 +76,9 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
         context.destroy(linger=0)
 
 
-def _about(endpoints: Endpoints, wait_s: float, keys: Keys | None) -> dict[str, str]:
+def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
     """What is recorded, as metadata: what is not a text of its own is JSON; what is not known is left out."""
-    with Client(endpoints.control, wait_s, keys) as client:
+    with Client(endpoints, wait_s) as client:
         known = msgspec.to_builtins(client.describe())
     return {
         name: value if isinstance(value, str) else msgspec.json.encode(value).decode()

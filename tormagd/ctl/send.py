@@ -9,13 +9,14 @@ from typing import NamedTuple
 import msgspec
 import zmq
 
+from tormagd.client.blocking import Client
+from tormagd.client.errors import UnreachableError, unreachable
+from tormagd.client.wire import Numbering, connect, keys_of
 from tormagd.config import Endpoints
-from tormagd.ctl.client import Client, connect, keys_of, unreachable
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ctl.watch import Watch, require_range
 from tormagd.ctl.waveform import Waveform
-from tormagd.messages import VERSION, Setpoint, encode
 
 
 class Stream(NamedTuple):
@@ -46,11 +47,11 @@ def send(
         stack.callback(context.destroy)
         watch = None
         if not is_blind:
-            client = stack.enter_context(Client(endpoints.control, wait_s, keys))
+            client = stack.enter_context(Client(endpoints, wait_s))
             try:
                 known = client.describe()
-            except CommandError as error:
-                if keys is not None and error.exit_code is Exit.UNREACHABLE:
+            except UnreachableError as error:
+                if keys is not None:
                     error.hint += "; with a key that may only publish: --blind"
                 raise
             require_range(known, waveform.least_N, waveform.most_N)
@@ -73,7 +74,8 @@ def _publish(
     watch: Watch | None,
 ) -> Outcome:
     rate_hz = stream.rate_hz
-    sent = skipped = index = 0
+    numbering = Numbering(stream.source)
+    skipped = index = 0
     worst_late_s = 0.0
     start_s, start_ns = time.monotonic(), time.time_ns()
     # the margin keeps the last one where the times of a file are off by a rounding error
@@ -92,33 +94,28 @@ def _publish(
             raise CommandError(
                 Exit.UNREACHABLE,
                 "gone",
-                f"the daemon at {address} went away after {sent} setpoints",
+                f"the daemon at {address} went away after {numbering.sent} setpoints",
                 unreachable(address, "").hint,
             )
         sample = waveform.at(index / rate_hz)
         ahead = range(index + 1, index + 1 + stream.preview)
-        setpoint = Setpoint(
-            v=VERSION,
-            source=stream.source,
-            seq=sent,
-            session=start_ns,  # above every earlier run's
-            stamp_ns=start_ns + round(index / rate_hz * 1e9),  # when the force is meant, whenever it gets sent
-            servo_cf=sample.force_N,
-            valid_for_ms=stream.valid_for_ms,
+        setpoint = numbering.setpoint(
+            sample.force_N,
+            stream.valid_for_ms,
+            start_ns + round(index / rate_hz * 1e9),  # when the force is meant, whenever it gets sent
             displacement_mm=sample.displacement_mm,
             rate_mm_s=sample.rate_mm_s,
             preview_N=tuple(waveform.at(min(later / rate_hz, duration_s)).force_N for later in ahead) or None,
             preview_dt_ms=1e3 / rate_hz if ahead else None,
         )
-        socket.send(encode(setpoint))
-        sent += 1
+        socket.send(setpoint)
         index += 1
         if watch is not None:
             watch.look()
     seconds = time.monotonic() - start_s
     result = {
         "source": stream.source,
-        "sent": sent,
+        "sent": numbering.sent,
         "skipped": skipped,
         "start_ns": start_ns,
         "seconds": round(seconds, 3),
@@ -127,10 +124,10 @@ def _publish(
     }
     fate = "whether they were taken is not known"
     if watch is not None:
-        became = watch.finish(sent)
+        became = watch.finish(numbering.sent)
         result |= msgspec.structs.asdict(became)
         fate = f"{became.accepted} taken and rendered"
         if became.limits:
             fate += f", held by {', '.join(became.limits)} at times"
     left_out = f", {skipped} left out because this machine was late" if skipped else ""
-    return Outcome(result, f"sent {sent} setpoints as {stream.source!r} in {seconds:.1f} s{left_out}; {fate}")
+    return Outcome(result, f"sent {numbering.sent} setpoints as {stream.source!r} in {seconds:.1f} s{left_out}; {fate}")

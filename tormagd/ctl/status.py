@@ -4,7 +4,8 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 
 from firmware_protocol.build import COST, REMEDY
-from tormagd.ctl.client import Client, understood
+from tormagd.client.blocking import Client
+from tormagd.client.wire import understood
 from tormagd.ctl.outcome import Colour, Exit, Outcome
 from tormagd.messages import (
     Explained,

@@ -5,7 +5,8 @@ import time
 
 import msgspec
 
-from tormagd.ctl.client import Client, understood
+from tormagd.client.blocking import Client
+from tormagd.client.wire import Pending, understood
 from tormagd.ctl.outcome import CommandError, Exit
 from tormagd.messages import Description, Explained, Status
 from tormagd.output import write_line
@@ -115,7 +116,7 @@ class Watch:
         before = client.status()
         self._raise_fault(held_back(before, source))
         self._before = _accepted(before, source)
-        self._asked: int | None = None
+        self._asked: Pending | None = None
         self._look_s: float | None = None
         self._looks = self._rendered = 0
         self._held: CommandError | None = None

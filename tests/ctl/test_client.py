@@ -1,0 +1,185 @@
+"""`tormagd.client`, blocking and for asyncio, at a daemon made of sockets."""
+
+import asyncio
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tormagd.client import Client, ClientError, InFaultError, RefusedError, SettingError, UnreachableError
+from tormagd.client.aio import AsyncClient
+from tormagd.config import ConfigError, Curve, Endpoints, in_folder
+
+PATIENCE_S = 20.0
+
+
+class Blocking:
+    """Calls the asynchronous client as if it blocked, in a loop of its own: one set of tests for both."""
+
+    def __init__(self, folder: str, wait_s: float) -> None:
+        self._runner = asyncio.Runner()
+        self._client = self._runner.run(self._made(folder, wait_s))
+
+    async def _made(self, folder: str, wait_s: float) -> AsyncClient:
+        return AsyncClient.local(folder, wait_s, source="me")
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        return lambda *arguments, **named: self._runner.run(getattr(self._client, name)(*arguments, **named))
+
+    def telemetry(self, wait_s: float) -> list[Any]:
+        async def first() -> list[Any]:
+            async for message in self._client.telemetry():
+                return [message]
+            return []
+
+        return self._runner.run(asyncio.wait_for(first(), wait_s))
+
+    def close(self) -> None:
+        self._client.close()
+        self._runner.close()
+
+
+@pytest.fixture(params=["blocking", "asyncio"])
+def client(request, fake_daemon):
+    folder = str(fake_daemon.directory)
+    made = Client.local(folder, 5.0, source="me") if request.param == "blocking" else Blocking(folder, 5.0)
+    yield made
+    made.close()
+
+
+def test_commands_and_status_are_answered(client, fake_daemon):
+    assert client.request("take", source="robot") == {}
+    assert fake_daemon.requests[-1]["args"] == {"source": "robot"}
+    assert client.status().operating_state == "ENABLED"
+
+
+@pytest.mark.parametrize(("code", "kind"), [("busy", RefusedError), ("fault", InFaultError)])
+def test_a_refusal_names_command_reason_and_remedy(client, fake_daemon, code, kind):
+    fake_daemon.refuse("enable", code)
+    with pytest.raises(kind) as refused:
+        client.request("enable")
+    assert (refused.value.code, refused.value.message, refused.value.hint) == (code, "cannot enable", "do this first")
+    assert str(refused.value) == "enable: cannot enable; do this first"
+    assert client.status().is_homed  # and the client goes on
+
+
+def test_what_the_daemon_says_reaches_no_terminal_raw(client, fake_daemon):
+    error = {"code": "busy", "message": "\x1b[2Jgone", "hint": "a\nb"}
+    fake_daemon.answers["enable"] = lambda: {"ok": False, "error": error}
+    with pytest.raises(RefusedError) as refused:
+        client.request("enable")
+    assert str(refused.value) == r"enable: \u001b[2Jgone; a\nb"
+    fake_daemon.says(fault_details=[{"code": "X", "cause": "\x1b[2J", "remedy": ""}])
+    assert client.status().fault_details[0].cause == r"\u001b[2J"
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [
+        {"ok": True, "result": {}, "v": 2},
+        {"ok": True},
+        {"ok": False},
+        {"ok": True, "result": {}, "id": None},
+        {"ok": True, "result": {}, "error": {"code": "busy", "message": "", "hint": ""}},
+    ],
+)
+def test_an_answer_that_says_neither_is_none(client, fake_daemon, reply):
+    fake_daemon.answers["enable"] = lambda: reply
+    with pytest.raises(UnreachableError, match="not one of tormagd's") as refused:
+        client.request("enable")
+    assert refused.value.code == "unintelligible"
+
+
+def test_what_the_daemon_runs_is_typed_and_what_is_none_is_told(client, fake_daemon):
+    assert client.describe().scene["name"] == "pulse"
+    fake_daemon.answers["describe"] = lambda: {"ok": True, "result": {"version": "9"}}
+    with pytest.raises(UnreachableError, match="the description of tormagd 9 is not what"):
+        client.describe()
+
+
+def test_late_answers_do_not_hold_a_call_nor_are_they_taken_for_its_own(fake_daemon):
+    with Client.local(str(fake_daemon.directory), 5.0) as client:
+        given_up = client.ask("status")
+        newer = client.ask("take", source="robot")
+        assert client.answer(newer, PATIENCE_S) == {}
+        assert client.answer(given_up) is None
+
+
+def test_arming_waits_for_what_goes_away_by_itself_and_for_nothing_else(client, fake_daemon):
+    codes = iter(["busy", "not_fresh"])
+
+    def enable() -> dict[str, Any]:
+        code = next(codes, None)
+        error = {"code": code, "message": "not yet", "hint": ""}
+        return {"ok": True, "result": {}} if code is None else {"ok": False, "error": error}
+
+    fake_daemon.answers["enable"] = enable
+    client.arm()
+    assert fake_daemon.commands == ["home", "enable", "enable", "enable"]
+    fake_daemon.refuse("enable", "not_neutral")
+    with pytest.raises(RefusedError, match="cannot enable"):
+        client.arm()
+
+
+def test_setpoints_are_numbered_stamped_and_checked(client, fake_daemon):
+    before_ns = time.time_ns()
+    client.publish(1.5)
+    client.publish(1.6, valid_for_ms=500.0, stamp_ns=7, rate_mm_s=5.0)
+    with pytest.raises(ValueError, match=r"servo_cf = -1\.0: allowed is"):
+        client.publish(-1.0)
+    client.publish(1.7)
+    until_s = time.monotonic() + PATIENCE_S
+    while len(fake_daemon.setpoints) < 3 and time.monotonic() < until_s:
+        client.request("status")
+    first, second, third = fake_daemon.setpoints
+    assert [(it.source, it.seq, it.servo_cf) for it in fake_daemon.setpoints] == [
+        ("me", 0, 1.5),
+        ("me", 1, 1.6),
+        ("me", 2, 1.7),
+    ]
+    assert first.session == second.session == third.session is not None
+    assert (first.valid_for_ms, second.valid_for_ms, second.stamp_ns, second.rate_mm_s) == (100.0, 500.0, 7, 5.0)
+    assert before_ns <= first.stamp_ns <= time.time_ns()
+
+
+def publish_for(client, seconds: float) -> None:
+    until_s = time.monotonic() + seconds
+    while time.monotonic() < until_s:
+        client.publish(1.5)
+
+
+@pytest.mark.parametrize("kind", [Client.local, Blocking])
+def test_a_daemon_that_has_gone_takes_no_setpoints(run_dir, fake_daemon, kind):
+    client = kind(str(run_dir), 1.0)
+    client.publish(1.5)
+    fake_daemon.is_over.set()
+    fake_daemon.join(PATIENCE_S)
+    with pytest.raises(UnreachableError, match="nobody takes setpoints"):
+        publish_for(client, PATIENCE_S)  # the system tells of the end in its own time
+    client.close()
+
+
+def test_telemetry_is_typed(client):
+    newest = client.telemetry(PATIENCE_S)
+    assert newest[0].operating_state == "ENABLED"
+    assert newest[0].measured_jp == (35.0, 35.0)
+
+
+@pytest.mark.parametrize("call", [lambda it: it.request("status"), lambda it: it.publish(1.0)])
+@pytest.mark.parametrize("kind", [lambda folder: Client.local(folder, 0.05), lambda folder: Blocking(folder, 0.05)])
+def test_nobody_there_is_told_with_what_to_do(run_dir, kind, call):
+    client = kind(str(run_dir))
+    with pytest.raises(UnreachableError, match="there is no socket"):
+        call(client)
+    with pytest.raises(UnreachableError, match="there is no socket"):
+        call(client)  # and is told again
+    client.close()
+
+
+def test_settings_that_cannot_be_used_are_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"endpoints\.setpoint.*at most 107 bytes"):
+        in_folder("/" + "a" * 110)
+    with pytest.raises(SettingError, match=r"robot\.key_secret"):
+        Client(Endpoints(curve=Curve(client_secret=str(tmp_path / "robot.key_secret"), server_public="server.key")))
+    assert issubclass(SettingError, ClientError)

@@ -1,0 +1,152 @@
+"""A client whose calls return when they are done."""
+
+import itertools
+import math
+import time
+from types import TracebackType
+from typing import Any, Self
+
+import zmq
+
+from tormagd.client.errors import RefusedError, unreachable
+from tormagd.client.wire import (
+    NOT_YET,
+    SUBSCRIBED,
+    Keys,
+    Numbering,
+    Pending,
+    answered,
+    asked,
+    connect,
+    described,
+    keys_of,
+    understood,
+)
+from tormagd.config import Endpoints, in_folder
+from tormagd.messages import MAX_MESSAGE_BYTES, Description, Status, Telemetry, decode
+
+RETRY_S = 0.1
+
+
+class Client:
+    """The daemon at `endpoints`: commands, setpoints, telemetry. A context manager; sockets open as they are needed.
+
+    `wait_s` is the longest wait for the daemon. `source` names the publisher. Not to be shared between threads.
+    """
+
+    def __init__(self, endpoints: Endpoints, wait_s: float = 1.0, source: str = "client") -> None:
+        self._endpoints, self._wait_s = endpoints, wait_s
+        self._keys: Keys | None = keys_of(endpoints.curve)
+        self._numbering = Numbering(source)
+        self._context = zmq.Context()
+        self._ids = itertools.count(1)
+        self._control: zmq.Socket[bytes] | None = None
+        self._setpoints: zmq.Socket[bytes] | None = None
+        self._telemetry: zmq.Socket[bytes] | None = None
+        self._is_taken = False
+
+    @classmethod
+    def local(cls, folder: str, wait_s: float = 1.0, source: str = "client") -> Self:
+        """The daemon of this machine whose sockets are in `folder`."""
+        return cls(in_folder(folder), wait_s, source)
+
+    def request(self, command: str, **args: Any) -> dict[str, Any]:
+        """The result of `command`. Raises UnreachableError without an answer in time, RefusedError, InFaultError."""
+        return self._result(self.ask(command, **args), self._wait_s)
+
+    def ask(self, command: str, **args: Any) -> Pending:
+        """Give `command` and do not wait: what `answer` is asked with."""
+        if self._control is None:
+            self._control = self._opened(zmq.DEALER, self._endpoints.control)
+        pending = Pending(next(self._ids), command)
+        self._control.send(asked(pending, args))
+        return pending
+
+    def answer(self, pending: Pending, wait_s: float = 0.0) -> dict[str, Any] | None:
+        """The result of what was asked; None where it does not come within `wait_s`. Raises as `request`."""
+        deadline_s = time.monotonic() + wait_s
+        left_s = wait_s
+        while self._control is not None and left_s >= 0.0 and self._control.poll(round(left_s * 1e3)):
+            result = answered(self._control.recv_multipart()[-1], pending)
+            if result is not None:
+                return result
+            left_s = deadline_s - time.monotonic()  # it was the late answer to a request that was given up
+        return None
+
+    def status(self, wait_s: float = math.inf) -> Status:
+        """What the daemon is doing; an answer is waited for no longer than `wait_s` or what the client waits for any.
+        Raises as `request` and `understood` do."""
+        return understood(self._result(self.ask("status"), min(wait_s, self._wait_s)))
+
+    def describe(self) -> Description:
+        """What the daemon runs. Raises as `request` and `described` do."""
+        return described(self.request("describe"))
+
+    def arm(self, timeout_s: float = 30.0) -> None:
+        """Home both carriages and enable: whoever holds the handle has to know. Raises as `request`."""
+        until_s = time.monotonic() + timeout_s
+        for command in ("home", "enable"):
+            while True:
+                try:
+                    self.request(command)
+                    break
+                except RefusedError as error:
+                    if error.code not in NOT_YET or time.monotonic() > until_s:
+                        raise
+                time.sleep(RETRY_S)
+
+    def publish(self, force_N: float, valid_for_ms: float = 100.0, stamp_ns: int | None = None, **fields: Any) -> None:
+        """Ask for a force at the roller. `stamp_ns` (now) is when it is meant; `fields` as in `messages.Setpoint`.
+
+        Waits until the daemon takes setpoints: the first time, and where it has gone since. Raises ValueError naming
+        what is not allowed, and UnreachableError where nobody takes setpoints within `wait_s`.
+        """
+        if self._setpoints is None:
+            # XPUB speaks to SUB as PUB does, and is told of the subscription: without that the first would be lost
+            self._setpoints = self._opened(zmq.XPUB, self._endpoints.setpoint)
+        while self._setpoints.poll(0 if self._is_taken else round(self._wait_s * 1e3)):
+            self._is_taken = self._setpoints.recv().startswith(SUBSCRIBED)
+        if not self._is_taken:
+            raise unreachable(self._endpoints.setpoint, f"nobody takes setpoints there within {self._wait_s:g} s")
+        self._setpoints.send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
+
+    def telemetry(self, wait_s: float = 0.0) -> list[Telemetry]:
+        """What has arrived since the last call, the oldest first; waits up to `wait_s` for the first. Listens from the
+        first call on. Raises MessageError for what is none."""
+        if self._telemetry is None:
+            self._telemetry = self._opened(zmq.SUB, self._endpoints.telemetry)
+        arrived: list[Telemetry] = []
+        while self._telemetry.poll(0 if arrived else round(wait_s * 1e3)):
+            arrived.append(decode(self._telemetry.recv_multipart()[-1], Telemetry))
+        return arrived
+
+    def close(self) -> None:
+        """Close the connections; setpoints that are on their way get a moment."""
+        for socket in (self._control, self._setpoints, self._telemetry):
+            if socket is not None:
+                socket.close()
+        self._context.term()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _result(self, pending: Pending, wait_s: float) -> dict[str, Any]:
+        result = self.answer(pending, wait_s)
+        if result is None:
+            raise unreachable(self._endpoints.control, f"no answer within {wait_s:g} s")
+        return result
+
+    def _opened(self, kind: int, address: str) -> "zmq.Socket[bytes]":
+        socket: zmq.Socket[bytes] = self._context.socket(kind)
+        socket.setsockopt(zmq.LINGER, 200 if kind == zmq.XPUB else 0)
+        socket.setsockopt(zmq.IMMEDIATE, 1 if kind == zmq.XPUB else 0)  # or it is not told who goes
+        socket.setsockopt(zmq.MAXMSGSIZE, 16 * MAX_MESSAGE_BYTES)
+        if kind == zmq.SUB:
+            socket.subscribe(b"")
+        connect(socket, address, self._keys)
+        return socket

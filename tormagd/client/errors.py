@@ -1,0 +1,69 @@
+"""What can go wrong between a program and the daemon; each error says what happened, and what to do next."""
+
+import os
+from pathlib import Path
+
+from tormagd.output import printable
+
+
+class ClientError(Exception):
+    """Something that was asked for was not done: a stable code, what happened, and what to do next.
+
+    `message` and `hint` may be the daemon's own words; as a text the error is printable, on one line.
+    """
+
+    def __init__(self, code: str, message: str, hint: str) -> None:
+        super().__init__(printable(f"{message}; {hint}" if hint else message))
+        self.code, self.message, self.hint = code, message, hint
+
+
+class RefusedError(ClientError):
+    """The daemon refused a command."""
+
+    def __init__(self, command: str, code: str, message: str, hint: str) -> None:
+        super().__init__(code, message, hint)
+        self.command = command
+
+    def __str__(self) -> str:
+        return f"{self.command}: {super().__str__()}"
+
+
+class InFaultError(RefusedError):
+    """It refused because the device is in FAULT."""
+
+
+class UnreachableError(ClientError):
+    """Nobody answers, or what answers is not understood."""
+
+
+class SettingError(ClientError):
+    """An address or a key file that cannot be used."""
+
+
+def unreachable(address: str, what: str) -> UnreachableError:
+    """Nobody answers at `address`: says why where that can be seen, and what to do."""
+    message, hint = f"daemon not reachable at {address}: {what}", "is it running? systemctl status tormagd"
+    if address.startswith("tcp://"):
+        hint += (
+            "; --key and --server-key have to be the pair that is listed there and that daemon's own: its tormagctl "
+            "status and log name those that it refused"
+        )
+    if address.startswith("ipc:///"):
+        path = Path(address.removeprefix("ipc://"))
+        try:
+            path.stat()
+        except PermissionError:
+            hint = (
+                f"you may not enter {path.parent}: join the group tormag (sudo usermod -aG tormag $USER), log in again"
+            )
+        except OSError:
+            hint = (
+                f"there is no socket {path}: start the daemon (systemctl start tormagd), or give --config or "
+                "--endpoint; one that runs although its directory was removed cannot be reached: restart it"
+            )
+        else:
+            if not os.access(path, os.W_OK):
+                hint = (
+                    f"you may not write to {path}: join the group tormag (sudo usermod -aG tormag $USER), log in again"
+                )
+    return UnreachableError("unreachable", message, hint)

@@ -1,0 +1,168 @@
+"""What goes over the sockets, whoever waits for it: addresses and keys, requests and their answers, setpoints."""
+
+import time
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+import zmq
+
+from tormagd import __version__
+from tormagd.client.errors import InFaultError, RefusedError, SettingError, UnreachableError
+from tormagd.config import ConfigError, Curve
+from tormagd.messages import VERSION, Description, MessageError, Reply, Request, Setpoint, Status, decode, encode
+from tormagd.output import printable
+
+T = TypeVar("T", Status, Description)
+
+FAULT_CODES = ("fault", "device_latched")
+"Refusals that mean: the device is in FAULT."
+NOT_YET = ("busy", "not_homed", "not_fresh")
+"Refusals of `enable` that go away by themselves once homing is over and the newest measurement is new."
+
+SUBSCRIBED = b"\x01"
+"What an XPUB socket is told starts with this when somebody subscribes, and with 0 when the last one has gone."
+
+
+class Keys(NamedTuple):
+    """What a client shows, and the only daemon that it believes."""
+
+    public: bytes
+    secret: bytes
+    server_public: bytes
+    also_local: bool
+
+
+class Pending(NamedTuple):
+    """A request whose answer may still come."""
+
+    number: int
+    command: str
+
+
+def keys_of(curve: Curve | None) -> Keys | None:
+    """The client's keys in a configuration; None where it has none. Raises SettingError: a file is no good."""
+    if curve is None or not curve.client_secret:
+        return None
+    from tormagd.keys import PUBLIC, SECRET, load_pair, load_public  # takes a moment, and most have no keys
+
+    server_public = curve.server_public or curve.server_secret.removesuffix(SECRET) + PUBLIC
+    if server_public == PUBLIC:
+        raise SettingError(
+            "usage",
+            "the daemon's public key is not given",
+            f"--server-key FILE: the server{PUBLIC} of the daemon's machine",
+        )
+    try:
+        pair = load_pair(Path(curve.client_secret))
+        return Keys(pair.public, pair.secret, load_public(Path(server_public)), curve.also_local)
+    except ConfigError as error:
+        raise SettingError("usage", str(error), "correct the file, or what --key and --server-key name") from error
+
+
+def connect(socket: "zmq.Socket[Any]", address: str, keys: Keys | None) -> None:
+    """Connect `socket`, showing the keys at `tcp://`, and at `ipc://` where the configuration says so.
+
+    Raises SettingError for an address that ZeroMQ cannot use.
+    """
+    if keys is not None and (address.startswith("tcp://") or keys.also_local):
+        socket.curve_publickey, socket.curve_secretkey = keys.public, keys.secret
+        socket.curve_serverkey = keys.server_public
+    try:
+        socket.connect(address)
+    except zmq.ZMQError as error:
+        raise SettingError(
+            "usage",
+            f"endpoint {address!r}: {error}",
+            f"give an address such as ipc:///run/tormag/control (a path of at most {zmq.IPC_PATH_MAX_LEN} characters)",
+        ) from error
+
+
+def asked(pending: Pending, args: dict[str, Any]) -> bytes:
+    """A request to the control endpoint."""
+    return encode(Request(v=VERSION, id=pending.number, command=pending.command, args=args))
+
+
+def answered(data: bytes, pending: Pending) -> dict[str, Any] | None:
+    """The result in an answer; None where it is one to an earlier request, which was given up.
+
+    Raises RefusedError, InFaultError, or UnreachableError for what is no answer.
+    """
+    try:
+        reply = decode(data, Reply)
+        if reply.v != VERSION:
+            raise MessageError(f"v = {reply.v}: allowed is {VERSION}")
+        if (reply.error is None) != reply.ok or (reply.ok and (reply.result is None or reply.id is None)):
+            raise MessageError("it says neither what was done nor why it was not")
+    except MessageError as error:
+        raise UnreachableError(
+            "unintelligible",
+            f"the answer is not one of tormagd's: {error}",
+            "check the endpoint, and that tormagd and tormagctl are of the same version",
+        ) from error
+    if reply.id not in (pending.number, None):
+        return None
+    if reply.error is not None:
+        kind = InFaultError if reply.error.code in FAULT_CODES else RefusedError
+        raise kind(pending.command, reply.error.code, reply.error.message, reply.error.hint)
+    return reply.result or {}
+
+
+def understood(result: dict[str, Any]) -> Status:
+    """The answer to `status`; what a newer daemon says besides is passed over.
+
+    Its texts are made printable: they are a person's to read. Raises UnreachableError, naming the daemon's version,
+    where something is missing or of another type.
+    """
+    return _known(result, Status)
+
+
+def described(result: dict[str, Any]) -> Description:
+    """The answer to `describe`, as `understood` has the one to `status`."""
+    return _known(result, Description)
+
+
+def _known(result: dict[str, Any], kind: type[T]) -> T:
+    try:
+        return msgspec.convert(_printable(result), kind)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise UnreachableError(
+            "unintelligible",
+            f"the {kind.__name__.lower()} of tormagd {result.get('version', 'of an unknown version')} is not what "
+            f"tormagctl {__version__} knows: {error}",
+            "install tormagd and tormagctl of the same version, and start the daemon again",
+        ) from error
+
+
+def _printable(value: Any) -> Any:
+    if isinstance(value, str):
+        return printable(value)
+    if isinstance(value, dict):
+        return {_printable(key): _printable(inner) for key, inner in value.items()}
+    return [_printable(inner) for inner in value] if isinstance(value, list) else value
+
+
+class Numbering:
+    """Numbers the setpoints of one publisher, from 0. Its session is above every earlier one of the same source."""
+
+    def __init__(self, source: str) -> None:
+        self.source, self.session = source, time.time_ns()
+        self.sent = 0
+
+    def setpoint(self, force_N: float, valid_for_ms: float, stamp_ns: int | None = None, **fields: Any) -> bytes:
+        """The next one. `stamp_ns`: when the force is meant, now by default; `fields` as in `messages.Setpoint`.
+
+        Raises ValueError naming what is not allowed.
+        """
+        made = Setpoint(
+            v=VERSION,
+            source=self.source,
+            seq=self.sent,
+            session=self.session,
+            stamp_ns=time.time_ns() if stamp_ns is None else stamp_ns,
+            servo_cf=force_N,
+            valid_for_ms=valid_for_ms,
+            **fields,
+        )
+        self.sent += 1
+        return encode(made)
