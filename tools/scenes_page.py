@@ -255,13 +255,13 @@ def draw(path: Path) -> None:
         right.plot(costs[1], errors[1], "o", color=line.get_color(), label=scene.name)
     right.axhline(MARGIN, color="#444444", linestyle="--", linewidth=0.8)
     right.set(
+        yscale="log",
         xlabel="processor time of steps and plans, %",
         ylabel="RMS error on sample 1 over the tolerance",
         xlim=(0.0, None),
-        ylim=(0.0, None),
         title="With all terms (open) and with the required ones (filled)",
     )
-    right.legend(fontsize=8)
+    right.legend(fontsize=8, loc="upper right", ncols=2)
     figure.savefig(path, dpi=90)
     plt.close(figure)
 
