@@ -6,6 +6,8 @@
 set -eu
 root=$1 prefix=$2 python=$3 library=$4
 build_python=${BUILD_PYTHON:-$python} build_library=${BUILD_LIBRARY:-$library}
+# a path may have spaces; anything else is a command with its arguments
+[ ! -x "$python" ] || python="'$python'"
 here=$(cd "$(dirname "$0")" && pwd)
 checkout=$(dirname "$here")
 lib=$root$prefix/lib share=$root$prefix/share
@@ -17,7 +19,7 @@ for program in daemon:tormagd ctl:tormagctl; do
     # children, such as the fitting of a calibration, find the library by the same variable
     cat > "$root$prefix/bin/${program#*:}" <<END
 #!/bin/sh
-PYTHONPATH=$library exec $python -P -s -c 'import sys; from tormagd.entry import ${program%:*}; sys.exit(${program%:*}())' "\$@"
+PYTHONPATH='$library' exec $python -P -s -c 'import sys; from tormagd.entry import ${program%:*}; sys.exit(${program%:*}())' "\$@"
 END
     chmod 755 "$root$prefix/bin/${program#*:}"
 done
@@ -47,4 +49,4 @@ done
 [ -e "$root/etc/tormag/tormagd.toml" ] || put "$checkout/examples/service.toml" "$root/etc/tormag/tormagd.toml"
 
 install -d "$share/bash-completion/completions" "$share/zsh/site-functions" "$share/man/man1"
-PYTHONPATH=$build_library $build_python -P "$here/pages.py" "$share"
+PYTHONPATH=$build_library "$build_python" -P "$here/pages.py" "$share"
