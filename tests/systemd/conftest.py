@@ -1,8 +1,10 @@
 """A package, and a machine of its own to install it on: systemd as process 1 of fresh namespaces, `boot.sh`."""
 
 import contextlib
+import ctypes
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import sysconfig
@@ -18,6 +20,12 @@ NAMESPACES = ("--pid", "--fork", "--mount", "--mount-proc", "--cgroup", "--uts",
 PYTHON = f"env LD_LIBRARY_PATH=/opt/base/lib /opt/base/bin/python{sys.version_info[0]}.{sys.version_info[1]}"
 LIBRARY = "/opt/checkout:/opt/packages"
 "Where the machine finds this interpreter, and what it imports."
+TRIAL = """mount -t tmpfs tmpfs /mnt && mkdir /mnt/upper /mnt/work /mnt/root /mnt/group
+mount -t overlay overlay -o lowerdir=/,upperdir=/mnt/upper,workdir=/mnt/work /mnt/root
+mount -t cgroup2 cgroup2 /mnt/group"""
+GROUPS = (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified"))
+DEATH_SIGNAL = 1
+"PR_SET_PDEATHSIG: a test that is killed leaves no machine behind."
 PATIENCE_S = 60.0
 "Longer than anything takes on a busy machine; only a failure waits for it."
 
@@ -33,8 +41,12 @@ def missing() -> str:
         return "systemd is not installed"
     if "overlay" not in Path("/proc/filesystems").read_text():
         return "the kernel has no overlayfs"
-    allowed = subprocess.run(["unshare", *NAMESPACES, "true"], capture_output=True, text=True, check=False)
-    return f"namespaces are not allowed: {allowed.stderr.strip()}" if allowed.returncode else ""
+    # a container may allow the namespaces, and neither a view of its files nor a control group
+    tried = subprocess.run(["unshare", *NAMESPACES, "sh", "-ec", TRIAL], capture_output=True, text=True, check=False)
+    if tried.returncode:
+        return f"namespaces or mounts are not allowed: {tried.stderr.strip()}"
+    group = next((group for group in GROUPS if (group / "cgroup.procs").exists()), None)
+    return f"{group} may not be written" if group is not None and not os.access(group, os.W_OK) else ""
 
 
 class Machine:
@@ -118,12 +130,13 @@ class Machine:
         return None
 
     def _enter_group(self) -> None:
+        ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGKILL)
         if self._group is not None:
             (self._group / "cgroup.procs").write_text("0")
 
 
 def _own_group(name: str) -> Path | None:
-    for mounted in (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/unified")):
+    for mounted in GROUPS:
         if (mounted / "cgroup.procs").exists():
             group = mounted / name
             group.mkdir(exist_ok=True)
