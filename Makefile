@@ -107,12 +107,10 @@ deb: $(VENV)/.man
 	    sys.exit(None if a == v else f"the package runs with Python {a}, but .venv has {v}: make clean, make deb PYTHON=/usr/bin/python3")'
 	rm -rf build/library
 	$(PIP_TO) build/library --no-deps .
-	$(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; e = p["optional-dependencies"]; \
-	    print(*(d for d in (*p["dependencies"], *e["record"], *e["plot"]) if not d.startswith("torch")), sep="\n")' \
-	    > build/requirements.txt
+	$(BIN)/python tools/dependencies.py record plot | grep -v '^torch=' > build/requirements.txt
 	$(PIP_TO) build/library --requirement build/requirements.txt
 	rm -rf build/library/bin
-	BUILD_PYTHON=$(BIN)/python BUILD_LIBRARY=$(CURDIR)/build/library systemd/deb.sh build/library build
+	BUILD_PYTHON=$(BIN)/python BUILD_LIBRARY='$(CURDIR)/build/library' systemd/deb.sh build/library build
 
 clean:
 	rm -rf $(VENV) build run .mypy_cache .ruff_cache .pytest_cache .hypothesis

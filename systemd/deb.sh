@@ -8,7 +8,7 @@ python=${PYTHON:-/usr/bin/python3}
 here=$(cd "$(dirname "$0")" && pwd)
 checkout=$(dirname "$here")
 version=$(sed -n 's/^__version__ = "\(.*\)"/\1/p' "$checkout/tormagd/__init__.py")
-abi=$($python -c 'import sys; print(*sys.version_info[:2], sep=".")')
+abi=$("$python" -c 'import sys; print(*sys.version_info[:2], sep=".")')
 next=${abi%.*}.$((${abi#*.} + 1))
 root=$(mktemp -d)
 trap 'rm -rf "$root"' EXIT
