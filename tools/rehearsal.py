@@ -9,6 +9,7 @@ import numpy.typing as npt
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
 from tormagd.control.core import build_core
+from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import parse_hand
 from tormagd.simulation.parameters import load_plant
@@ -49,7 +50,8 @@ def rehearse(config: Config, case: Case, times_s: Array, forces_N: Array) -> Reh
     if case.gap_speed_mm_s is not None:
         slow = msgspec.structs.replace(config.position, gap_speed_mm_s=case.gap_speed_mm_s)
         config = msgspec.structs.replace(config, position=slow)
-    core = build_core(config)
+    # what is played is not the scene's own signal, which the daemon refuses where the gap is too slow for it
+    core = build_core(config, msgspec.structs.replace(load_scene(config.scene), signal=None))
     device = VirtualDevice(load_plant(case.plant), parse_hand(case.hand), seed=case.seed)
     loop = ClosedLoop(config, core.stepper, core.planner, device)
     loop.arm()
