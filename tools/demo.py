@@ -22,7 +22,7 @@ from rehearsal import Case, Rehearsal, rehearse
 from show import RATE_HZ, RECORDING, RUN_DIR, Aborted, Shown, show
 from tracking import Tracking, tracking
 
-from tormagd.config import Config
+from tormagd.config import Config, ConfigError
 from tormagd.scenes.scene import Scene, load_scene
 
 LEAST_N, MOST_N = 1.4, 1.7
@@ -147,8 +147,8 @@ def rehearse_all(config: Config, times_s: Array, forces_N: Array) -> list[Rehear
             try:
                 done.append(future.result())
                 print(f"  {number}/{len(CASES)} {case.label}", flush=True)
-            except RuntimeError as error:
-                print(f"  {number}/{len(CASES)} failed: {error}", flush=True)
+            except (ConfigError, RuntimeError) as error:
+                print(f"  {number}/{len(CASES)} {case.label} failed: {error}", flush=True)
     return done
 
 
