@@ -26,10 +26,10 @@ from tormagd.config import ConfigError
 from tormagd.headroom.__main__ import build
 from tormagd.headroom.machine_loop import machine_us
 from tormagd.output import write_line
-from tormagd.scenes.measured import FILE, AtRates, Judged, Measured, MeasuredScene, Without, measured, required
+from tormagd.scenes.measured import FILE, JUDGED, AtRates, Judged, Measured, MeasuredScene, Without, measured, required
 from tormagd.scenes.scene import TERMS, load_scene, shipped_scenes
 
-SHARE, JUDGED = 0.2, 0.8
+SHARE = 0.2
 KEPT = ROOT / "build" / "required_terms.json"
 STORED = ROOT / "tormagd" / "scenes" / FILE
 SECONDS, QUICK_S = 5.0, 2.0

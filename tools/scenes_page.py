@@ -18,8 +18,8 @@ from scene_runs import ROOT
 
 from tormagd.config import Config
 from tormagd.control.core import Core, build_core
-from tormagd.ctl.scene import MARGIN, TOLERANCES, cheapest_rates
-from tormagd.scenes.measured import MeasuredScene, measured, required
+from tormagd.ctl.scene import TOLERANCES, cheapest_rates
+from tormagd.scenes.measured import JUDGED, MeasuredScene, measured, required
 from tormagd.scenes.scene import EVERY_TERM, TERMS, Scene, load_scene, scene_path, shipped_scenes, terms_of
 from tormagd.scenes.signal import asked
 
@@ -116,7 +116,7 @@ def _head(share: float) -> str:
         "left out is decided against when the daemon starts, and not computed. A term is *required* where its absence "
         f"adds more than {share:.0%} of the tolerance to the RMS error of the force on sample 1, with the device "
         "learned before and frozen, or while it is learned: learning hides what a term does. What is out is left out "
-        f"together, and judged on samples 1, 2 and 3: within {MARGIN:g} of the tolerance, or no more than {share:.0%} "
+        f"together, and judged on samples 1, 2 and 3: within {JUDGED:g} of the tolerance, or no more than {share:.0%} "
         "of it worse than with all terms; otherwise the term that counts most is put back. `tormagctl scene explain "
         "NAME` prints a decision, and what changes at half and at twice the tolerance."
     )
@@ -253,7 +253,7 @@ def draw(path: Path) -> None:
         (line,) = right.plot(costs, errors, "-", linewidth=1.0)
         right.plot(costs[0], errors[0], "o", mfc="white", color=line.get_color())
         right.plot(costs[1], errors[1], "o", color=line.get_color(), label=scene.name)
-    right.axhline(MARGIN, color="#444444", linestyle="--", linewidth=0.8)
+    right.axhline(JUDGED, color="#444444", linestyle="--", linewidth=0.8)
     right.set(
         yscale="log",
         xlabel="processor time of steps and plans, %",

@@ -162,9 +162,15 @@ def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on
             raise error
         return state.replaced(plan=state.plan.replaced(number=state.plan.number + 1))
 
+    def afresh(state: PlanState, now_s: float) -> PlanState:
+        return PlanState(GovernorState(now_s, 0.5), resting.replaced(number=state.plan.number + 1))
+
     resting = Plan(0, 0.0, None, None, 0.5, None, 50.0, 95.0, 0.0, 1.0, ())
     planner: Any = SimpleNamespace(
-        start=lambda now_s: PlanState(GovernorState(now_s, 0.5), resting), plan=plan, foresee=lambda state: state
+        start=lambda now_s: PlanState(GovernorState(now_s, 0.5), resting),
+        plan=plan,
+        foresee=lambda state: state,
+        afresh=afresh,
     )
     endpoint: Any = SimpleNamespace(drain_setpoints=rig.drain, is_flooded=False, inbox=inbox)
     journal = Journal()

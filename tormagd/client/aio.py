@@ -19,13 +19,13 @@ from tormagd.client.wire import (
     Pending,
     answered,
     asked,
-    connect,
     described,
     keys_of,
+    opened,
     understood,
 )
 from tormagd.config import Endpoints, in_folder
-from tormagd.messages import MAX_MESSAGE_BYTES, Description, Status, Telemetry, decode
+from tormagd.messages import Description, Status, Telemetry, decode
 
 
 class AsyncClient:
@@ -120,11 +120,5 @@ class AsyncClient:
 
     def _socket(self, kind: int, address: str) -> zmq.asyncio.Socket:
         if kind not in self._sockets:
-            made = self._sockets[kind] = self._context.socket(kind)
-            made.setsockopt(zmq.LINGER, 200 if kind == zmq.XPUB else 0)
-            made.setsockopt(zmq.IMMEDIATE, 1 if kind == zmq.XPUB else 0)  # or it is not told who goes
-            made.setsockopt(zmq.MAXMSGSIZE, 16 * MAX_MESSAGE_BYTES)
-            if kind == zmq.SUB:
-                made.subscribe(b"")
-            connect(made, address, self._keys)
+            self._sockets[kind] = opened(self._context.socket(kind), address, self._keys)
         return self._sockets[kind]

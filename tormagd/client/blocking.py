@@ -17,13 +17,13 @@ from tormagd.client.wire import (
     Pending,
     answered,
     asked,
-    connect,
     described,
     keys_of,
+    opened,
     understood,
 )
 from tormagd.config import Endpoints, in_folder
-from tormagd.messages import MAX_MESSAGE_BYTES, Description, Status, Telemetry, decode
+from tormagd.messages import Description, Status, Telemetry, decode
 
 RETRY_S = 0.1
 
@@ -142,11 +142,4 @@ class Client:
         return result
 
     def _opened(self, kind: int, address: str) -> "zmq.Socket[bytes]":
-        socket: zmq.Socket[bytes] = self._context.socket(kind)
-        socket.setsockopt(zmq.LINGER, 200 if kind == zmq.XPUB else 0)
-        socket.setsockopt(zmq.IMMEDIATE, 1 if kind == zmq.XPUB else 0)  # or it is not told who goes
-        socket.setsockopt(zmq.MAXMSGSIZE, 16 * MAX_MESSAGE_BYTES)
-        if kind == zmq.SUB:
-            socket.subscribe(b"")
-        connect(socket, address, self._keys)
-        return socket
+        return opened(self._context.socket(kind), address, self._keys)

@@ -10,10 +10,22 @@ import zmq
 from tormagd import __version__
 from tormagd.client.errors import InFaultError, RefusedError, SettingError, UnreachableError
 from tormagd.config import ConfigError, Curve
-from tormagd.messages import VERSION, Description, MessageError, Reply, Request, Setpoint, Status, decode, encode
+from tormagd.messages import (
+    MAX_MESSAGE_BYTES,
+    VERSION,
+    Description,
+    MessageError,
+    Reply,
+    Request,
+    Setpoint,
+    Status,
+    decode,
+    encode,
+)
 from tormagd.output import printable
 
 T = TypeVar("T", Status, Description)
+SocketT = TypeVar("SocketT", bound="zmq.Socket[Any]")
 
 FAULT_CODES = ("fault", "device_latched")
 "Refusals that mean: the device is in FAULT."
@@ -76,6 +88,18 @@ def connect(socket: "zmq.Socket[Any]", address: str, keys: Keys | None) -> None:
             f"endpoint {address!r}: {error}",
             f"give an address such as ipc:///run/tormag/control (a path of at most {zmq.IPC_PATH_MAX_LEN} characters)",
         ) from error
+
+
+def opened(socket: SocketT, address: str, keys: Keys | None) -> SocketT:
+    """A client's socket, blocking or of asyncio, with its bounds, connected. Raises SettingError as `connect` does."""
+    is_setpoints = socket.type == zmq.XPUB
+    socket.setsockopt(zmq.LINGER, 200 if is_setpoints else 0)
+    socket.setsockopt(zmq.IMMEDIATE, 1 if is_setpoints else 0)  # or it is not told who goes
+    socket.setsockopt(zmq.MAXMSGSIZE, 16 * MAX_MESSAGE_BYTES)
+    if socket.type == zmq.SUB:
+        socket.subscribe(b"")
+    connect(socket, address, keys)
+    return socket
 
 
 def asked(pending: Pending, args: dict[str, Any]) -> bytes:

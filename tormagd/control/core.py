@@ -25,7 +25,7 @@ from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import Geometry
 from tormagd.physics.inserts import insert
-from tormagd.scenes.scene import AUTO, Insert, Scene, load_scene, scene_path, terms_of
+from tormagd.scenes.scene import AUTO, LEAST_CONTROL_HZ, Insert, Scene, load_scene, scene_path, terms_of
 from tormagd.scenes.signal import asked
 
 ELEMENT = "torque"
@@ -33,8 +33,6 @@ LEAST_PHASE_MARGIN_DEG = 30.0
 LEAST_GAIN_MARGIN_DB = 4.0
 SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("physics", "model", "inverse", "safety", "scenes")))
 SOURCES += ("tormagd/hardware", "tormagd/control")
-LEAST_CONTROL_HZ = 500
-"What is watched for safety is watched in every control tick."
 SENSED_N = 0.001
 "A step of the force sensor's message."
 SETTLES_MM = 4.0 * 8.0 / 4480.0

@@ -230,7 +230,8 @@ class Planner:
         self._low_confidence = config.limits.low_confidence
         self._unsensed_s = unsensed_s(1.0 / config.rates.control_hz)
         self._has_rate, self._has_creep, self._has_lag = terms.rate, terms.creep, terms.lag and terms.learning
-        self._learns, self._fits = terms.learning, terms.learning and (terms.scale or terms.offset)
+        self._learns_creep = terms.learning and terms.creep
+        self._fits = terms.learning and (terms.scale or terms.offset)
         self._learns_scale, self._learns_offset = terms.scale, terms.offset
         self._only_curve = model.curve(
             _within(MOBILISED_MM, displacements_mm), _within(ROLLER_RATE_MM_S, rates_mm_s), cip_percent
@@ -243,6 +244,11 @@ class Planner:
         field_mT = self._field.field_mT(open_mm)
         resting = Plan(0, now_s, None, None, least, None, field_mT, open_mm, 0.0, 1.0, (Limit.NO_SETPOINT,))
         return PlanState(GovernorState(now_s, least, above_N=0.0), resting)
+
+    def afresh(self, state: PlanState, now_s: float) -> PlanState:
+        """Begins anew after `state`, for which no plan could be made: plans go on being numbered."""
+        begun = self.start(now_s)
+        return begun.replaced(plan=begun.plan.replaced(number=state.plan.number + 1))
 
     def plan(
         self, state: PlanState, now_s: float, setpoint: TimedSetpoint | None, estimate: Estimate | None
@@ -364,9 +370,11 @@ class Planner:
         if rate_mm_s < MOVING_MM_S or not is_mobilised:
             if shown.sensor.is_doubted:
                 slow = NOTHING_SLOW
-            elif not (self._has_creep and self._learns):
-                pass  # it is not learned
-            elif SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S and estimate.handle.sliding_mm_s < CREEPING_MM_S:
+            elif (
+                self._learns_creep
+                and SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S
+                and estimate.handle.sliding_mm_s < CREEPING_MM_S
+            ):
                 expected_N = shown.device.force_N(slow.followed_N)
                 # before it is mobilised friction is less than the model's; more is more all the same
                 is_lesson = is_zero_known and (is_mobilised or reading_N > expected_N)

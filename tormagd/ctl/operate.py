@@ -133,10 +133,14 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
 
 
 def _raise_fault(state: Status, what: str) -> None:
-    if state.operating_state != "FAULT":
-        return
+    if state.operating_state == "FAULT":
+        raise in_fault(state, what)
+
+
+def in_fault(state: Status, what: str) -> CommandError:
+    """That the device is in FAULT: which, why, and what to do."""
     first = state.fault_details[0] if state.fault_details else Explained("FAULT", "see tormagctl status", "")
-    raise CommandError(
+    return CommandError(
         Exit.FAULT,
         "fault",
         f"{what}: {', '.join(state.faults) or first.code}: {first.cause}",

@@ -9,17 +9,13 @@ import msgspec
 
 from tormagd.config import ConfigError
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
-from tormagd.scenes.measured import AtRates, Measured, MeasuredScene, measured, required
-from tormagd.scenes.scene import Scene, load_scene, shipped_scenes
+from tormagd.scenes.measured import JUDGED, AtRates, Measured, MeasuredScene, measured, required
+from tormagd.scenes.scene import LEAST_CONTROL_HZ, Scene, load_scene, shipped_scenes
 
 LONGEST_S = 30.0
 "Of the daemon's own check, which takes half a second."
 TOLERANCES = (0.5, 1.0, 2.0)
 "Times the scene's own, for which the terms are stated."
-MARGIN = 0.8
-"Of a tolerance: an error within it is one that a rate may be chosen for."
-LEAST_CONTROL_HZ = 500
-"Slower than this nothing is watched."
 
 
 def list_scenes() -> Outcome:
@@ -147,8 +143,8 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
 
 
 def cheapest_rates(found: MeasuredScene) -> AtRates | None:
-    """The lowest rates that keep to MARGIN of the tolerance, of those at which safety is watched often enough."""
-    good = [at for at in found.rates if at.control_hz >= LEAST_CONTROL_HZ and at.rms_N <= MARGIN * found.tolerance_N]
+    """The lowest rates that keep to JUDGED of the tolerance, of those at which safety is watched often enough."""
+    good = [at for at in found.rates if at.control_hz >= LEAST_CONTROL_HZ and at.rms_N <= JUDGED * found.tolerance_N]
     return min(good, key=lambda at: (at.control_hz, at.inference_hz), default=None)
 
 

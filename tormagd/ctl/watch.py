@@ -7,6 +7,7 @@ import msgspec
 
 from tormagd.client.blocking import Client
 from tormagd.client.wire import Pending, understood
+from tormagd.ctl.operate import in_fault
 from tormagd.ctl.outcome import CommandError, Exit
 from tormagd.messages import Description, Explained, Status
 from tormagd.output import write_line
@@ -69,13 +70,7 @@ def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandE
     With `is_over` they have been: whether the newest one is still valid does not matter any more.
     """
     if status.operating_state == "FAULT":
-        first = status.fault_details[0] if status.fault_details else Explained("FAULT", "see tormagctl status", "")
-        return CommandError(
-            Exit.FAULT,
-            "fault",
-            f"the device is in FAULT: {', '.join(status.faults) or first.code}: {first.cause}",
-            first.remedy or "tormagctl clear-fault, then home",
-        )
+        return in_fault(status, "the device is in FAULT")
     if status.operating_state != "ENABLED":
         next_ = {"PAUSED": "tormagctl resume"}.get(status.operating_state)
         return CommandError(

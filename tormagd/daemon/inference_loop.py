@@ -119,5 +119,4 @@ class InferenceLoop:
         inbox.withdraw(f"no gap could be planned: {error}")
         self._on_failure()
         self._journal.began_afresh(now_s)
-        afresh = self._planner.start(now_s)
-        return afresh.replaced(plan=afresh.plan.replaced(number=self.state.plan.number + 1))
+        return self._planner.afresh(self.state, now_s)

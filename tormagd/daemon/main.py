@@ -112,7 +112,7 @@ async def _run(
 
     # before this thread is a real-time one: the process that is started keeps off its processors
     folder = black_box_folder(config.black_box.folder)
-    box = BlackBox(folder, header(config, core), config.rates.control_hz)
+    box = BlackBox(folder, {} if folder is None else header(config, core), config.rates.control_hz)
     refused = prepare(config.realtime)
     await Daemon(config, core, open_backend, refused, keys, box, read_again).run()
 

@@ -200,8 +200,7 @@ class _Running:
             case journal.FORESEE:
                 self._plan = self._planner.foresee(self._plan)
             case journal.AFRESH:
-                afresh = self._planner.start(msgspec.convert(entry[1], float))
-                self._plan = afresh.replaced(plan=afresh.plan.replaced(number=self._plan.plan.number + 1))
+                self._plan = self._planner.afresh(self._plan, msgspec.convert(entry[1], float))
             case journal.TEACH:
                 self._plan = self._plan.replaced(shown=restored(entry[1], KNOWN))
             case journal.COMMAND:

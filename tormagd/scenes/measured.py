@@ -66,6 +66,8 @@ class Measured(Struct, frozen=True):
 
 
 FILE = "required_terms.json"
+JUDGED = 0.8
+"Of a scene's tolerance: an error within it is one that terms and rates may be chosen for."
 
 
 def measured() -> Measured:

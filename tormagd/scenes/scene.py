@@ -15,6 +15,8 @@ from tormagd.config import LEAST_INFERENCE_HZ, ConfigError, Strict, convert
 from tormagd.scenes.measured import measured
 
 AUTO = "auto"
+LEAST_CONTROL_HZ = 500
+"What is watched for safety is watched in every control tick: slower than this is none that a scene is run at."
 LONGEST_SHOWN = 200  # characters of a refused name
 _SHIPPED = resources.files(__package__)
 
