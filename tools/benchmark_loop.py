@@ -33,6 +33,7 @@ import zmq
 from benchmark_against import TOOLS, add_against_argument, environment
 from benchmark_plot import plot_histograms
 from host import processor_s
+from own_machine import own_machine
 
 from tormagd.client import Client, ClientError
 from tormagd.config import Config, Endpoints, RealTime, load_config
@@ -345,6 +346,7 @@ def write_config(folder: Path, port: str, stand: Stand) -> Path:
         f'scene = "coronary"\n[device]\nport = "{port}"\n{options}[endpoints]\n{sockets}'
         f"[rates]\ncontrol_hz = {stand.control_hz}\ninference_hz = {stand.inference_hz}\n"
         f"[realtime]\nfifo_priority = {realtime.fifo_priority}\nkeep_awake = {str(realtime.keep_awake).lower()}\n"
+        f"lock_memory = {str(realtime.lock_memory).lower()}\n"
         f"cpus = {list(realtime.cpus)}\n"
     )
     return path
@@ -362,17 +364,10 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
     """The same for any stand."""
     with contextlib.ExitStack() as stack:
         ours, theirs = environment(None), environment(stand.root)
-        simulator = subprocess.Popen(
-            [sys.executable, "-P", "-m", "tormagd.simulation", "--pty", "--baud", str(stand.baud)],
-            stdout=subprocess.PIPE,
-            env=ours,
-            text=True,
-        )
+        device = own_machine(stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud))
+        simulator = subprocess.Popen([sys.executable, *device], stdout=subprocess.PIPE, env=ours, text=True)
         stack.callback(end, simulator)
         assert simulator.stdout is not None
-        if stand.device_fifo:
-            with contextlib.suppress(PermissionError):  # where the daemon gets none either
-                os.sched_setscheduler(simulator.pid, os.SCHED_FIFO, os.sched_param(stand.device_fifo))
         path = write_config(folder, simulator.stdout.readline().strip(), stand)
         config = load_config(path)
         times = folder / "writes"
@@ -477,7 +472,7 @@ def realtime_settings(options: argparse.Namespace) -> RealTime:
         if not set(options.cpus) <= usable or not others:
             raise SystemExit(f"--cpus {options.cpus}: allowed are some, not all, of {sorted(usable)}")
         os.sched_setaffinity(0, others)
-    return RealTime(fifo_priority=options.fifo, keep_awake=options.keep_awake, cpus=tuple(options.cpus))
+    return RealTime(options.fifo, lock_memory=True, cpus=tuple(options.cpus), keep_awake=options.keep_awake)
 
 
 def asked_for(realtime: RealTime) -> dict[str, Any]:

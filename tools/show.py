@@ -20,6 +20,7 @@ import numpy as np
 import zmq
 from host import Host, HostWatch
 from human_pulse import Array
+from own_machine import own_machine
 
 from tormagd.client import Client, ClientError, UnreachableError
 from tormagd.ctl.operate import home, operate
@@ -44,7 +45,8 @@ control = "{ADDRESS.format("control")}"
 recording = "{ADDRESS.format("recording")}"
 
 [realtime]
-fifo_priority = {DAEMON_FIFO}  # refused where it is not allowed; then the log says so
+fifo_priority = {DAEMON_FIFO}  # each is refused where it is not allowed; then the log says so
+lock_memory = true
 """
 CTL = ("-m", "tormagd.ctl.main", "--config", str(RUN_DIR / "tormagd.toml"), "--json", "--wait", "60")
 RATE_HZ = 500
@@ -152,13 +154,13 @@ def play(watched: HostWatch, duration_s: float) -> Course:
     codes: dict[str, int] = {}
     truth = str(RUN_DIR / "truth.csv")
     with contextlib.ExitStack() as stack:
-        arguments = ("--pty", "--plant", "sample_1", "--seed", "1", "--truth", truth)
-        simulator = stack.enter_context(process("simulator", "-m", "tormagd.simulation", *arguments, is_read=True))
+        options = ("--pty", "--plant", "sample_1", "--seed", "1", "--truth", truth)
+        device = own_machine(DEVICE_FIFO, "tormagd.simulation", *options)
+        simulator = stack.enter_context(process("simulator", *device, is_read=True))
         assert simulator.stdout is not None
         port = simulator.stdout.readline().strip()
         if not port:
             raise ended("simulator")
-        give_fifo(simulator, DEVICE_FIFO)
         watched.wait_for("simulated device", simulator.pid)
         config = RUN_DIR / "tormagd.toml"
         config.write_text(CONFIG.format(port=port))
@@ -170,9 +172,8 @@ def play(watched: HostWatch, duration_s: float) -> Course:
         wait_for_link(daemon, client)
         arm(client)
         before, start_s = status(client), time.monotonic()
-        send = ("send", str(RUN_DIR / "pulse.csv"), "--rate", str(RATE_HZ))
-        publisher = stack.enter_context(process("publisher", *CTL, *send, is_read=True))
-        give_fifo(publisher, PUBLISHER_FIFO)
+        robot = own_machine(PUBLISHER_FIFO, *CTL[1:], "send", str(RUN_DIR / "pulse.csv"), "--rate", str(RATE_HZ))
+        publisher = stack.enter_context(process("publisher", *robot, is_read=True))
         limits = watch(publisher, daemon, client, duration_s)
         printed, _ = publisher.communicate(timeout=PATIENCE_S)
         after, end_s = status(client), time.monotonic()
@@ -255,13 +256,6 @@ def process(name: str, *arguments: str, is_read: bool = False) -> Iterator["subp
         finally:
             if child.poll() is None:
                 end(child, signal.SIGTERM)
-
-
-def give_fifo(child: "subprocess.Popen[str]", priority: int) -> None:
-    """Real-time scheduling where it is allowed; the host line says what came of it where it is not."""
-    with contextlib.suppress(OSError):
-        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-        os.sched_setscheduler(child.pid, policy, os.sched_param(priority))
 
 
 def end(child: "subprocess.Popen[str]", number: signal.Signals) -> int:

@@ -26,6 +26,7 @@ from benchmark_loop import Stand, end, wait_for, write_config
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
+from own_machine import own_machine
 from tqdm import tqdm
 
 from tormagd.client import Client
@@ -190,11 +191,10 @@ _DECODER = msgspec.json.Decoder(_Numbered)
 
 def _running(folder: Path, stack: contextlib.ExitStack) -> tuple[Config, "subprocess.Popen[Any]"]:
     """A daemon on a simulated device, enabled, with setpoints arriving; all of it ends with `stack`."""
-    simulator = _begun(["-m", "tormagd.simulation", "--pty"], stack, stdout=subprocess.PIPE)
+    device = own_machine(FIFO_PRIORITY - 1, "tormagd.simulation", "--pty")
+    simulator = _begun(device, stack, stdout=subprocess.PIPE)
     assert simulator.stdout is not None
-    with contextlib.suppress(PermissionError):  # where the daemon gets none either
-        os.sched_setscheduler(simulator.pid, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY - 1))
-    stand = Stand(RealTime(fifo_priority=FIFO_PRIORITY))
+    stand = Stand(RealTime(fifo_priority=FIFO_PRIORITY, lock_memory=True))
     path = write_config(folder, simulator.stdout.readline().decode().strip(), stand)
     process = _begun(["-m", "tormagd.daemon.main", "--config", str(path)], stack, stderr=subprocess.DEVNULL)
     config = load_config(path)

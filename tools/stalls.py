@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import zmq
+from own_machine import own_machine
 from tqdm import tqdm
 
 from tormagd.client import Client, ClientError
@@ -79,13 +80,15 @@ class Rig:
 
     def __init__(self, folder: Path, fifo_priority: int) -> None:
         self.truth = folder / "truth.csv"
-        command = [sys.executable, "-m", "tormagd.simulation", "--pty", "--seed", "1", "--truth", str(self.truth)]
-        self.device = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        options = ("--pty", "--seed", "1", "--truth", str(self.truth))
+        device = own_machine(DEVICE_PRIORITY, "tormagd.simulation", *options)
+        self.device = subprocess.Popen([sys.executable, *device], stdout=subprocess.PIPE, text=True)
         assert self.device.stdout is not None
         port = self.device.stdout.readline().strip()
         config = folder / "tormagd.toml"
         config.write_text(
-            f'scene = "coronary"\n[realtime]\nfifo_priority = {fifo_priority}\n[device]\nport = "{port}"\n[endpoints]\n'
+            f'scene = "coronary"\n[realtime]\nfifo_priority = {fifo_priority}\nlock_memory = true\n'
+            f'[device]\nport = "{port}"\n[endpoints]\n'
             + "".join(f'{name} = "ipc://{folder}/{name}"\n' for name in ENDPOINTS),
             encoding="utf-8",
         )
@@ -211,9 +214,7 @@ def measure(each: int, fifo_priority: int) -> dict[str, Any]:
     random.shuffle(plan)
     with tempfile.TemporaryDirectory(prefix="stalls-") as folder:
         rig = Rig(Path(folder), fifo_priority)
-        # a real device has a processor of its own; where this is refused, pauses are longer on a busy machine
-        with contextlib.suppress(PermissionError):
-            os.sched_setscheduler(rig.device.pid, os.SCHED_FIFO, os.sched_param(DEVICE_PRIORITY))
+        with contextlib.suppress(PermissionError):  # where this is refused, pauses are longer on a busy machine
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(SENDER_PRIORITY))
         stops: list[Stop] = []
         disturbed: list[str] = []

@@ -52,6 +52,13 @@ def test_each_share_is_of_its_own_and_forgotten_after_a_second(change, name: str
     assert not watched([bad] * 12 + [GOOD] * 12).is_lossy
 
 
+def test_a_round_trip_is_long_once_two_looks_have_found_it_so() -> None:
+    watch = LinkWatch(0.0)
+    found = [watch.look(0.1 * look, GOOD, trip_s, 0.0).round_trip_s for look, trip_s in enumerate((1e-3, 2e-2, 1e-3))]
+    assert found[1:] == [1e-3, 1e-3]
+    assert [watch.look(1.0, GOOD, 2e-2, 0.0).round_trip_s for _ in range(2)] == [1e-3, 2e-2]
+
+
 def test_it_says_its_figures() -> None:
     text = str(LinkQuality(0.05, 0.021, 0.3, 0.0152, 0.0))
     assert all(figure in text for figure in ("5.0%", "2.1%", "30.0%", "15.2 ms"))

@@ -22,8 +22,11 @@ PERIOD_S = 1e-3
 # -- round trip ----------------------------------------------------------------------------------------------------
 
 
-def exchange(trip: RoundTrip, ticks: Iterable[int], way_ticks: int, lost: frozenset[int] = frozenset()) -> None:
-    """Drives every millisecond; each that is not lost is answered `way_ticks` later. A Hello goes every second."""
+def exchange(
+    trip: RoundTrip, ticks: Iterable[int], way_ticks: int, lost: frozenset[int] = frozenset(), paused: range = range(0)
+) -> None:
+    """Drives every millisecond; each that is not lost is answered `way_ticks` later, and where that is while the device
+    is `paused`, right after. A Hello goes every second."""
     states = 0
     answers: dict[int, list[str]] = {}
     for tick in ticks:
@@ -37,13 +40,14 @@ def exchange(trip: RoundTrip, ticks: Iterable[int], way_ticks: int, lost: frozen
                 states += 1
                 trip.state(states % 256, now_s)
         trip.drive(tick % 256, now_s)
+        answered = paused.stop if tick + way_ticks in paused else tick + way_ticks
         if tick not in lost:
-            answers.setdefault(tick + way_ticks, []).append("state")
+            answers.setdefault(answered, []).append("state")
         if tick % 20 == 0 and tick not in lost:
-            answers[tick + way_ticks].append(f"status {tick % 256}")
+            answers[answered].append(f"status {tick % 256}")
         if tick % 1_000 == 0:
             trip.hello()
-            answers.setdefault(tick + way_ticks, []).append("identity")
+            answers.setdefault(answered, []).append("identity")
 
 
 @pytest.mark.parametrize("way_ticks", [1, 2, 16, 120])
@@ -214,6 +218,14 @@ def test_drives_that_are_lost_now_and_then_make_no_round_trip_long(way_ticks: in
     assert report["least"] >= (way_ticks - 1) * 1e3
     assert report["p99"] <= (way_ticks + 2) * 1e3, "one lost Drive alone looks like an answer that is on its way"
     assert trip.usual_s == pytest.approx(way_ticks * PERIOD_S, abs=1.5 * PERIOD_S)
+
+
+@pytest.mark.parametrize("after_ticks", [1, 20, 40, 70, 150])
+def test_a_device_that_stood_still_for_its_timeout_has_the_round_trip_that_it_had(after_ticks: int) -> None:
+    trip = RoundTrip()
+    paused = range(2_010, 2_058)
+    exchange(trip, range(1, paused.stop + after_ticks), 1, paused=paused)
+    assert trip.usual_s == pytest.approx(PERIOD_S)
 
 
 @pytest.mark.parametrize("drift", [-0.5, -0.02, 3e-5, 0.015, 0.3])

@@ -14,7 +14,8 @@ from firmware_protocol.value import Value
 
 ROUND_TRIPS = 256
 "The round trips that percentiles are taken of: a quarter of a second of control."
-USUAL_OF: Final = 32.0
+USUAL_OF: Final = 101
+"More than twice as many as a device that stands still for its whole timeout answers late, at 1 kHz."
 WINDOW_S = 0.5
 "The least delayed State of this time stands for all of it: queues on the way only ever add."
 WINDOWS = 60
@@ -49,7 +50,7 @@ class RoundTrip:
     period too long until the next Identity.
     """
 
-    __slots__ = ("_before_hello", "_lead", "_newest", "_newest_s", "_recent", "_sent_s", "_state", "_unsure", "usual_s")
+    __slots__ = ("_before_hello", "_lead", "_newest", "_newest_s", "_recent", "_sent_s", "_state", "_unsure", "_usual")
 
     def __init__(self) -> None:
         self._sent_s = [0.0] * 256
@@ -60,8 +61,7 @@ class RoundTrip:
         self._newest_s = 0.0
         self._unsure: deque[float] = deque(maxlen=ROUND_TRIPS)
         self._recent: deque[float] = deque(maxlen=ROUND_TRIPS)
-        self.usual_s = 0.0
-        """A mean of about the newest USUAL_OF round trips; 0 while none is known."""
+        self._usual: deque[float] = deque(maxlen=USUAL_OF)
 
     def drive(self, counter: int, now_s: float) -> None:
         """The Drive with this counter goes out now."""
@@ -113,8 +113,14 @@ class RoundTrip:
 
     def _take(self, round_trip_s: float) -> None:
         self._recent.append(round_trip_s)
-        known_s = self.usual_s or round_trip_s
-        self.usual_s = known_s + (round_trip_s - known_s) / USUAL_OF
+        self._usual.append(round_trip_s)
+
+    @property
+    def usual_s(self) -> float:
+        """The median of the newest USUAL_OF round trips; 0 while none is known. A device that stood still once answers
+        all that has waited for it late, which a mean would call a slow line."""
+        ordered_s = sorted(self._usual)
+        return ordered_s[len(ordered_s) // 2] if ordered_s else 0.0
 
     @property
     def least_s(self) -> float:
