@@ -39,6 +39,7 @@ class Device(Strict, frozen=True):
     """Where the firmware is. `backend` names an entry point of the group `tormagd.backends`."""
 
     backend: str = "serial"
+    "How the device is reached: `serial`, `can`, or an installed plugin's. A USB serial line is what most have."
     port: str = "/dev/tormag"
     "Path of the serial port; with the backend `can`, the channel: `can0`, or an adapter's path."
     options: dict[str, Any] = msgspec.field(default_factory=dict)
@@ -64,6 +65,7 @@ class Curve(Strict, frozen=True):
     """
 
     server_secret: str = ""
+    "The daemon's own pair, `server.key_secret`, which `tormagctl keys generate` makes."
     publish: str = ""
     "Who may send setpoints, and nothing else."
     operate: str = ""
@@ -82,10 +84,15 @@ class Endpoints(Strict, frozen=True):
     """ZeroMQ addresses. Only `ipc://` and loopback are open; any other address is refused without CURVE keys."""
 
     setpoint: str = f"ipc://{DEFAULT_RUN_DIR}/setpoint"
+    "Where publishers connect; in the service's own folder, as all four are."
     telemetry: str = f"ipc://{DEFAULT_RUN_DIR}/telemetry"
+    "Where whoever looks subscribes."
     control: str = f"ipc://{DEFAULT_RUN_DIR}/control"
+    "Where commands are given."
     recording: str = f"ipc://{DEFAULT_RUN_DIR}/recording"
+    "Where the recorder hears every control tick."
     curve: Curve | None = None
+    "Keys, for who connects from elsewhere."
 
     def is_guarded(self, name: str) -> bool:
         """Whether the daemon lets in only whom it has the key of."""
@@ -112,8 +119,11 @@ class Rates(Strict, frozen=True):
     """How often each rate group runs, Hz."""
 
     control_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 1_000
+    "Ticks: the position loop's gains are for it, and a serial line and a CAN bus carry it."
     inference_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 250
+    "Plans that are made at the least; a setpoint that arrives is planned for at once. Below 83 the thesis was faster."
     telemetry_hz: Annotated[int, Meta(ge=1, le=200)] = 50
+    "Messages: as often as an eye sees, and no load."
     of_scene: bool = False
     "Whether the daemon runs at the rates that its scene needs, in place of these two; control at 500 Hz at the least."
 
@@ -122,8 +132,11 @@ class RealTime(Strict, frozen=True):
     """Each of these is optional; one that is refused by the kernel is a plain warning and a line of `doctor`."""
 
     fifo_priority: Annotated[int, Meta(ge=0, le=90)] = 0
+    "Of SCHED_FIFO; 0 asks for none, because only a machine that is set up for it allows one."
     lock_memory: bool = False
+    "Whether no page may be swapped out: it keeps all of the daemon in memory."
     cpus: tuple[Annotated[int, Meta(ge=0, le=4095)], ...] = ()
+    "Processors for the control thread; none named: any."
     keep_awake: bool = False
     "Idle processors do not sleep while the daemon runs: they wake up at once, and take the power for it."
     watchdog_ms: Annotated[float, Meta(ge=100.0, le=60_000.0)] = 500.0
@@ -134,13 +147,21 @@ class Motor(Strict, frozen=True):
     """The DC motor and lead screw the controller believes in (37D class, 70:1); see `control/motor.py`."""
 
     supply_V: Annotated[float, Meta(ge=3.0, le=60.0)] = 12.0
+    "What full duty puts on the motor: its rated voltage."
     resistance_ohm: Annotated[float, Meta(ge=0.05, le=100.0)] = 2.2
+    "Of the armature: 12 V over the stall current of 5.5 A."
     inductance_mH: Annotated[float, Meta(ge=0.01, le=100.0)] = 1.5
+    "Of the armature; with the resistance the motor's fastest time constant, 0.7 ms."
     back_emf_V_s: Annotated[float, Meta(ge=1e-4, le=1.0)] = 0.011
+    "V at 1 rad/s of the motor, and N m at 1 A: what its no-load speed at 12 V comes to."
     inertia_kg_m2: Annotated[float, Meta(ge=1e-9, le=1e-2)] = 8e-7
+    "Of the rotor; gears and screw add little behind the gears."
     gear_ratio: Annotated[float, Meta(ge=1.0, le=1_000.0)] = 70.0
+    "Turns of the motor to one of the screw."
     screw_lead_mm: Annotated[float, Meta(ge=0.2, le=50.0)] = 8.0
+    "A carriage's way in one turn of the screw."
     gear_efficiency: Annotated[float, Meta(gt=0.1, le=1.0)] = 0.7
+    "What the gears leave of the torque."
     coulomb_V: Annotated[float, Meta(ge=0.0, le=12.0)] = 0.5
     "Voltage that just overcomes the dry friction of gearbox and screw."
     pull_V: Annotated[float, Meta(ge=0.0, le=12.0)] = 0.5
@@ -155,16 +176,23 @@ class Position(Strict, frozen=True):
     """
 
     proportional_per_mm: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 3.6
+    "Duty for 1 mm of error: the most that keeps 6 dB and 45 degrees at every corner of the motor's parameters."
     integral_time_s: Annotated[float, Meta(ge=0.005, le=100.0)] = 0.1
+    "Shorter, and stiction makes the carriages hunt by a count."
     derivative_time_s: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.02
+    "Near the motor's mechanical time constant of 15 ms, which it makes up for."
     derivative_filter_s: Annotated[float, Meta(ge=1e-4, le=0.1)] = 0.003
+    "Takes the encoder's steps out of the derivative."
     back_calculation_s: Annotated[float, Meta(ge=0.001, le=10.0)] = 0.1
+    "In which the integral lets go once the duty is limited: as fast as it winds up."
     synchronisation: Annotated[float, Meta(ge=0.0, le=10.0)] = 1.0
     "Extra proportional action on the skew between the carriages, as a multiple of the carriage's own."
     gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] = 38.0
+    "How fast the gap may change: both carriages together, less than motors on a full supply reach."
     gap_acceleration_mm_s2: Annotated[float, Meta(gt=0.0, le=100_000.0)] = 1_600.0
     "From rest; with speed it falls along the motors' torque-speed line."
     duty_limit: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0
+    "The most that a motor is given; less spares it, and makes the gap slower."
 
 
 class Trim(Strict, frozen=True):
@@ -173,21 +201,30 @@ class Trim(Strict, frozen=True):
     time_s: Annotated[float, Meta(ge=0.05, le=1_000.0)] = 0.5
     "In which the force's offset is learned anew in the long run; a new device shows itself sooner."
     least: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.6
+    "Of a device's force over the model's; what is below is not corrected, and the limit `TRIM` says so."
     most: Annotated[float, Meta(ge=1.0, le=5.0)] = 1.6
+    "The same for what is above."
 
 
 class Limits(Strict, frozen=True):
     """What counts as a fault, and what only as a warning."""
 
     skew_warning_mm: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.2
+    "Carriages further apart than usual: the limit `SKEW`."
     skew_fault_mm: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
+    "The fault `SKEW`: before the firmware's own, at 2 mm."
     following_error_mm: Annotated[float, Meta(gt=0.0, le=50.0)] = 3.0
+    "How far the gap may be from its reference for a moment."
     no_motion_duty: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.35
     "A carriage driven harder than this must move: it is well above what friction and the magnets hold."
     no_motion_time_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.06
+    "For how long it may not: a motor that turns shows hundreds of counts by then."
     following_time_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.25
+    "For how long, before it is the fault `FOLLOWING_ERROR`."
     low_confidence: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.5
+    "Below it the limit `LOW_CONFIDENCE` says that the model was asked outside its training."
     neutral_margin_N: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.1
+    "So much above the least force a setpoint may be when the device is enabled: nothing jumps."
 
 
 class BlackBox(Strict, frozen=True):

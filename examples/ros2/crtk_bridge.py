@@ -2,7 +2,7 @@
 
     python crtk_bridge.py --ros-args -r __ns:=/brake -p folder:=/run/tormag
 
-It takes rclpy, crtk_msgs, geometry_msgs and sensor_msgs, which a ROS 2 installation has, and tormagd in the same Python.
+It takes rclpy, crtk_msgs, geometry_msgs and sensor_msgs of a ROS 2 installation, and tormagd in the same Python.
 """
 
 import rclpy

@@ -1,4 +1,5 @@
-"""Between CRTK's messages and tormagd's: pure, and without ROS. CRTK has seconds, metres and newtons; z is along the shaft."""
+"""Between CRTK's messages and tormagd's: pure, and without ROS. CRTK counts in seconds, metres and newtons; the shaft
+lies along z."""
 
 from typing import Any
 
