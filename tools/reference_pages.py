@@ -1,4 +1,4 @@
-"""Writes docs/reference: the configuration from the types in `tormagd/config.py`, the commands from the argument parsers.
+"""Writes docs/reference: the configuration from the types in `tormagd/config.py`, the commands from their parsers.
 
 A test holds the pages to what they are made from. `python tools/reference_pages.py` after a change of either.
 """
@@ -6,8 +6,9 @@ A test holds the pages to what they are made from. `python tools/reference_pages
 import argparse
 import ast
 import inspect
+import itertools
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -25,6 +26,16 @@ BACKENDS = {
     "`[device.options]`, `serial`": serial_backend.DRIVER.options,
     "`[device.options]`, `can`": can_backend.DRIVER.options,
 }
+_CONFIGURATION_HEAD = """# Configuration: every key
+
+Written by `python tools/reference_pages.py` from the types that refuse a wrong one. [Configure](../guides/configure.md) says
+how they are used, `tormagd --check --config FILE` what is in force.
+"""
+_COMMANDS_HEAD = """# Commands: every option
+
+Written by `python tools/reference_pages.py` from the argument parsers; `--help`, the man pages and completion come from
+the same.
+"""
 BOUNDS = {"ge": "from {}", "gt": "above {}", "le": "to {}", "lt": "under {}"}
 
 
@@ -47,10 +58,7 @@ def main() -> int:
 
 def configuration_page() -> str:
     """Every key with its default, what is allowed, and why."""
-    parts = [
-        "# Configuration: every key\n\nWritten by `python tools/reference_pages.py` from the types that refuse a wrong one. "
-        "[Configure](../guides/configure.md) says\nhow they are used, `tormagd --check --config FILE` what is in force.\n"
-    ]
+    parts = [_CONFIGURATION_HEAD]
     for table, kind in (*tables(config.Config, ""), *BACKENDS.items()):
         says = " ".join(inspect.cleandoc(kind.__doc__ or "").split())
         parts.append(f"## {table or 'At the top'}\n\n{says}\n")
@@ -81,10 +89,7 @@ def keys(kind: type[msgspec.Struct]) -> list[Key]:
 
 def commands_page() -> str:
     """Every command and option."""
-    parts = [
-        "# Commands: every option\n\nWritten by `python tools/reference_pages.py` from the argument parsers; `--help`, the man pages "
-        "and completion come from\nthe same.\n"
-    ]
+    parts = [_COMMANDS_HEAD]
     for parser in (daemon.parser(), ctl.parser(), simulation.parser(), conformance.parser()):
         parts.append(f"## {parser.prog}\n\n{parser.description}\n")
         shared = _options(parser)
@@ -117,8 +122,8 @@ def _says(action: argparse.Action) -> str:
     return says.replace("|", "\\|") or "-"
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    lines = [head, tuple("---" for _ in head), *rows]
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+    lines = [head, ("---",) * len(head), *rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
@@ -159,7 +164,7 @@ def _field_docs(kind: type[msgspec.Struct]) -> dict[str, str]:
     (body,) = (node.body for node in ast.parse(inspect.getsource(kind)).body if isinstance(node, ast.ClassDef))
     return {
         field.target.id: " ".join(says.value.value.split())
-        for field, says in zip(body, body[1:], strict=False)
+        for field, says in itertools.pairwise(body)
         if isinstance(field, ast.AnnAssign)
         and isinstance(field.target, ast.Name)
         and isinstance(says, ast.Expr)

@@ -1,7 +1,7 @@
 """mkdocs's hooks: the site is `docs`, and the pages that stand beside the code they tell of.
 
 Links are written as they hold in the repository, where most are read. Here each is brought to where its file is on the
-site; the examples and the licence come along as files.
+site; the examples come along as files.
 """
 
 import posixpath
@@ -14,8 +14,14 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[1]
 DOCS = "docs/"
-BESIDE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "systemd/README.md", "firmware_protocol/README.md")
-BESIDE += ("firmware_protocol/c/README.md",)
+BESIDE = (
+    "README.md",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    "systemd/README.md",
+    "firmware_protocol/README.md",
+    "firmware_protocol/c/README.md",
+)
 EXAMPLES = "examples/**/*.*"
 _LINK = re.compile(r"(\]\(<?)(?!https?:|#)([^)#>]+)")
 "What a Markdown link begins with, and its path."
