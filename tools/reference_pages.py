@@ -28,8 +28,8 @@ BACKENDS = {
 }
 _CONFIGURATION_HEAD = """# Configuration: every key
 
-Written by `python tools/reference_pages.py` from the types that refuse a wrong one. [Configure](../guides/configure.md) says
-how they are used, `tormagd --check --config FILE` what is in force.
+Written by `python tools/reference_pages.py` from the types that refuse a wrong one.
+[Configure](../guides/configure.md) says how they are used, `tormagd --check --config FILE` what is in force.
 """
 _COMMANDS_HEAD = """# Commands: every option
 
