@@ -71,7 +71,7 @@ def tables(kind: type[msgspec.Struct], path: str) -> Iterator[tuple[str, type[ms
     """The tables of a configuration with their names in the file, each before those in it."""
     yield f"`[{path}]`" if path else "", kind
     for field in msgspec.structs.fields(kind):
-        inner = _struct(field.type)
+        inner = config.table_in(field.type)
         if inner is not None:
             yield from tables(inner, f"{path}.{field.name}".removeprefix("."))
 
@@ -83,7 +83,7 @@ def keys(kind: type[msgspec.Struct]) -> list[Key]:
     return [
         Key(field.name, _default(field), _allowed(hints[field.name]), says.get(field.name, ""))
         for field in msgspec.structs.fields(kind)
-        if _struct(field.type) is None
+        if config.table_in(field.type) is None
     ]
 
 
@@ -125,14 +125,6 @@ def _says(action: argparse.Action) -> str:
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     lines = [head, ("---",) * len(head), *rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
-def _struct(kind: Any) -> type[msgspec.Struct] | None:
-    """The table that a field holds, optional or not."""
-    for each in (kind, *get_args(kind)):
-        if isinstance(each, type) and issubclass(each, msgspec.Struct):
-            return each
-    return None
 
 
 def _default(field: msgspec.structs.FieldInfo) -> str:

@@ -7,13 +7,14 @@ orderings are refused with the key's path, the value and what is allowed.
 import ipaddress
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args
 
 import msgspec
 from msgspec import Meta
 
-from tormagd.toml_file import TomlError, in_short, read_toml
+from tormagd.toml_file import TomlError, in_short, line_of, toml_tables, toml_text
 
 LEAST_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
 DEFAULT_RUN_DIR = "/run/tormag"
@@ -24,6 +25,11 @@ ENDPOINTS = ("setpoint", "telemetry", "control", "recording")
 ROLES = ("publish", "operate", "observe")
 
 T = TypeVar("T")
+_OURS, _PLACE, _UNKNOWN = (
+    re.compile(r"([a-z_A-Z.]+) = "),
+    re.compile(r"`\$([^`]*)`"),
+    re.compile(r"unknown field `(\w+)`"),
+)
 _TCP = re.compile(r"tcp://(localhost|[0-9.]+):([0-9]{1,5})")
 
 
@@ -373,13 +379,23 @@ def load_config(path: Path | None) -> Config:
 
 
 def convert(path: Path, kind: type[T]) -> T:
-    """The file's tables as a `kind`. Raises ConfigError naming file, key, value and what is allowed."""
+    """The file's tables as a `kind`. Raises ConfigError naming file, key, value, what is allowed, and the line."""
     try:
-        return checked(read_toml(path), kind)
+        text = toml_text(path)
+        try:
+            return checked(toml_tables(text), kind)
+        except ConfigError as error:
+            raise ConfigError(f"{error}{_line(text, str(error))}") from error
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
     except (TomlError, ConfigError) as error:
         raise ConfigError(f"{path}: {error}") from error
+
+
+def placed(path: Path | None, message: str) -> str:
+    """A refusal of what a file, which has been read, says: with its name and the line, where it names a key there."""
+    where = "" if path is None else _line(toml_text(path), message)
+    return f"{path}: {message}{where}" if where else message
 
 
 def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
@@ -388,8 +404,50 @@ def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
         return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:
         text = str(error)
+        told = _value_at(tables, text) + _known_key(kind, text)
         refused = text if "`$" in text or where == "$" else f"{text} - at `$`"
-        raise ConfigError(refused.replace("`$", f"`{where}") + _value_at(tables, text)) from error
+        raise ConfigError(refused.replace("`$", f"`{where}") + told) from error
+
+
+def did_you_mean(word: str, allowed: Iterable[str]) -> str:
+    """`; did you mean ...?` where one of the allowed words is near, or nothing."""
+    import difflib  # takes a moment, and most configurations are right
+
+    near = difflib.get_close_matches(word, list(allowed), n=1)
+    return f"; did you mean `{near[0]}`?" if near else ""
+
+
+def table_in(kind: Any) -> type[msgspec.Struct] | None:
+    """The table that a field of this type holds, optional or not; None where it is a plain value."""
+    structs = (each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, msgspec.Struct))
+    return next(structs, None)
+
+
+def _known_key(kind: Any, message: str) -> str:
+    """The known key that is nearest to an unknown one of msgspec's message."""
+    if (unknown := _UNKNOWN.search(message)) is None:
+        return ""
+    *tables, key = _key_in(message)
+    table = table_in(kind)
+    for name in tables:
+        fields = {field.name: field.type for field in msgspec.structs.fields(table)} if table else {}
+        table = table_in(fields.get(name))
+    return did_you_mean(unknown[1], [field.name for field in msgspec.structs.fields(table)]) if table else ""
+
+
+def _line(text: str, message: str) -> str:
+    """` (line N)` of the key that the message is about; nothing where it is none of the text's."""
+    line = line_of(text, _key_in(message))
+    return "" if line is None else f" (line {line})"
+
+
+def _key_in(message: str) -> list[str]:
+    """The key that a refusal names: ours begin with it, msgspec's end with its place, and may name an unknown one."""
+    if ours := _OURS.match(message):
+        return ours[1].split(".")
+    place, unknown = _PLACE.search(message), _UNKNOWN.search(message)
+    key = [name for name in place[1].split("[")[0].split(".") if name] if place else []
+    return [*key, unknown[1]] if unknown else key
 
 
 def _value_at(tables: dict[str, Any], message: str) -> str:

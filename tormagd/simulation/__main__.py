@@ -17,7 +17,7 @@ from firmware_protocol.c.build import BuildError
 from tormagd.output import printable, write_line
 from tormagd.physics.errors import DomainError
 from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevice
-from tormagd.simulation.can_door import CanDoor
+from tormagd.simulation.can_door import FOLDER_PREFIX, CanDoor
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import DEFAULT_BAUD, FirmwareKind, MessageDevice, VirtualDevice
 from tormagd.simulation.faults import FORMS as KNOWN_FAULTS
@@ -83,7 +83,7 @@ def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tup
 
         door = BusDoor(device, options.bus)
     else:
-        folder = resources.enter_context(tempfile.TemporaryDirectory(prefix="tormagsim-"))
+        folder = resources.enter_context(tempfile.TemporaryDirectory(prefix=FOLDER_PREFIX))
         door = CanDoor(device, Path(options.can or f"{folder}/can"))
     resources.callback(door.close)
     return device, door
