@@ -427,9 +427,8 @@ def _known_key(kind: Any, message: str) -> str:
     """The known key that is nearest to an unknown one of msgspec's message."""
     if (unknown := _UNKNOWN.search(message)) is None:
         return ""
-    *tables, key = _key_in(message)
     table = table_in(kind)
-    for name in tables:
+    for name in _key_in(message)[:-1]:
         fields = {field.name: field.type for field in msgspec.structs.fields(table)} if table else {}
         table = table_in(fields.get(name))
     return did_you_mean(unknown[1], [field.name for field in msgspec.structs.fields(table)]) if table else ""

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import can
+from can.typechecking import AutoDetectedConfig
 
 from tormagd.simulation.can_door import FOLDER_PREFIX
 from tormagd.simulation.can_frame import (
@@ -48,7 +49,7 @@ class SimulatorBus(can.BusABC):
         super().__init__(channel=channel, can_filters=can_filters, **settings)
 
     @staticmethod
-    def _detect_available_configs() -> list[dict[str, str]]:
+    def _detect_available_configs() -> list[AutoDetectedConfig]:
         """The channels of simulated devices that were given no path of their own; python-can asks for them."""
         listening = Path("/proc/net/unix").read_text(encoding="utf-8", errors="replace").split()
         found = sorted(str(path) for path in Path(tempfile.gettempdir()).glob(f"{FOLDER_PREFIX}*/can"))
