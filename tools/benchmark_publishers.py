@@ -17,20 +17,8 @@ from typing import Any
 
 import numpy as np
 from human_pulse import Array, pulse_profile, with_approach
-from show import (
-    ADDRESS,
-    ANSWER_S,
-    CONFIG,
-    CTL,
-    DEVICE_FIFO,
-    RUN_DIR,
-    arm,
-    end,
-    give_fifo,
-    process,
-    wait_for_link,
-    write_profile,
-)
+from own_machine import own_machine
+from show import ADDRESS, ANSWER_S, CONFIG, CTL, DEVICE_FIFO, RUN_DIR, end, process, wait_for_link, write_profile
 from tracking import tracking
 
 from tormagd.client import Client
@@ -85,21 +73,25 @@ def rendered_rms_N(command: list[str], times_s: Array, forces_N: Array) -> float
     RUN_DIR.mkdir(parents=True)
     write_profile(PROFILE, times_s, forces_N)
     truth_path = RUN_DIR / "truth.csv"
-    device = ("-m", "tormagd.simulation", "--pty", "--seed", "1", "--truth", str(truth_path))
+    options = ("--pty", "--seed", "1", "--truth", str(truth_path))
+    device = own_machine(DEVICE_FIFO, "tormagd.simulation", *options)
     with process("simulator", *device, is_read=True) as simulator:
         assert simulator.stdout is not None
         config = RUN_DIR / "tormagd.toml"
         config.write_text(CONFIG.format(port=simulator.stdout.readline().strip()))
-        give_fifo(simulator, DEVICE_FIFO)
         with process("tormagd", "-m", "tormagd.daemon.main", "--config", str(config)) as daemon:
             with Client.local(FOLDER, ANSWER_S) as client:
                 wait_for_link(daemon, client)
                 if command[0] == sys.executable:  # the others home and enable by themselves
-                    arm(client)
-            said = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
+                    client.arm()
+            played = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
         end(simulator, signal.SIGTERM)
-    first = FIRST_NS.search(said)
-    assert first is not None, f"{command[0]} does not say when it began: {said!r}"
+    if played.returncode:
+        sys.exit(
+            f"{Path(command[0]).name} ended with {played.returncode}: what it said is above, the logs are in {RUN_DIR}"
+        )
+    first = FIRST_NS.search(played.stdout)
+    assert first is not None, f"{command[0]} does not say when it began: {played.stdout!r}"
     truth = np.genfromtxt(truth_path, delimiter=",", names=True)
     axis_s = (truth["t_ns"] - int(first[1])) * 1e-9
     inside = (axis_s >= times_s[0]) & (axis_s <= times_s[-1])

@@ -25,11 +25,11 @@ ENDPOINTS = ("setpoint", "telemetry", "control", "recording")
 ROLES = ("publish", "operate", "observe")
 
 T = TypeVar("T")
-_OURS, _PLACE, _UNKNOWN = (
-    re.compile(r"([a-z_A-Z.]+) = "),
-    re.compile(r"`\$([^`]*)`"),
-    re.compile(r"unknown field `(\w+)`"),
-)
+_OURS = re.compile(r"([a-z_A-Z.]+) = ")
+"The key that a refusal of ours begins with."
+_PLACE = re.compile(r"`\$([^`]*)`")
+"The place that one of msgspec's ends with."
+_UNKNOWN = re.compile(r"unknown field `(\w+)`")
 _TCP = re.compile(r"tcp://(localhost|[0-9.]+):([0-9]{1,5})")
 
 

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,10 @@ MOST_BYTES = 65_536
 "Ten times the longest configuration with all its comments."
 MOST_DEPTH = 16
 "Parts of a key, and arrays and tables in each other: the parser takes their square, or all of the stack."
-MOST_LINES = 32
-"Lines of one value, to be told where it stands."
+MOST_GUESSES = 16
+"Lines that may give a key, of those that have its name in them: a file may be full of them."
+MOST_LINES = 8
+"Of one value, to be told where it stands."
 LONGEST_SHOWN = 80
 "Characters of a value that a refusal shows."
 
@@ -63,13 +66,12 @@ def toml_tables(text: str) -> dict[str, Any]:
 def line_of(text: str, key: Sequence[str]) -> int | None:
     """The line of `text`, which is TOML, that gives `key`, a path through its tables; None where none of them does.
 
-    The parser keeps no lines. So it is asked after each line that could: the first to make the key known gives it.
+    The parser keeps no lines. So it is asked after each that has the key's name in it: the first to make the key known
+    gives it. None, too, where that name stands in many lines before.
     """
     lines = text.splitlines()
-    for number, line in enumerate(lines, start=1):
-        if key and key[-1] in line and _is_known(lines, number, key):
-            return number
-    return None
+    guesses = (number for number, line in enumerate(lines, start=1) if key and key[-1] in line)
+    return next((number for number in islice(guesses, MOST_GUESSES) if _is_known(lines, number, key)), None)
 
 
 def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
