@@ -79,17 +79,17 @@ def rendered_rms_N(command: list[str], times_s: Array, forces_N: Array) -> float
         assert simulator.stdout is not None
         config = RUN_DIR / "tormagd.toml"
         config.write_text(CONFIG.format(port=simulator.stdout.readline().strip()))
-        with process("tormagd", "-m", "tormagd.daemon.main", "--config", str(config)) as daemon:
-            with Client.local(FOLDER, ANSWER_S) as client:
-                wait_for_link(daemon, client)
-                if command[0] == sys.executable:  # the others home and enable by themselves
-                    client.arm()
+        started = process("tormagd", "-m", "tormagd.daemon.main", "--config", str(config))
+        with started as daemon, Client.local(FOLDER, ANSWER_S) as client:
+            wait_for_link(daemon, client)
+            if command[0] == sys.executable:  # the others home and enable by themselves
+                client.arm()
             played = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+            faults = client.status().faults
         end(simulator, signal.SIGTERM)
-    if played.returncode:
-        sys.exit(
-            f"{Path(command[0]).name} ended with {played.returncode}: what it said is above, the logs are in {RUN_DIR}"
-        )
+    if played.returncode or faults:
+        why = ", ".join(faults) or f"exit code {played.returncode}, what it said is above"
+        sys.exit(f"{Path(command[0]).name} did not get to its end: {why}; the logs are in {RUN_DIR}")
     first = FIRST_NS.search(played.stdout)
     assert first is not None, f"{command[0]} does not say when it began: {played.stdout!r}"
     truth = np.genfromtxt(truth_path, delimiter=",", names=True)
