@@ -23,9 +23,12 @@ SAY_BUILD = $(BIN)/python -P -c 'from firmware_protocol.build import settle; pri
 CORE_TESTS := tests/control tests/safety tests/model tests/firmware_protocol/test_codec.py tests/firmware_protocol/test_framing.py \
     tests/hardware/test_link.py tests/hardware/test_link_statistics.py tests/tools/test_fuzz_protocol.py
 
+# the variable: mkdocs-material's notice of its own end of life, 2027, is no warning of ours
+SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict --quiet
+
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
-.PHONY: install uninstall deb run test unhurried search check format compile core fetched model reproduction evidence clean
+.PHONY: install uninstall deb run test unhurried search check docs format compile core fetched model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -52,6 +55,11 @@ check: $(VENV)/.dev
 	$(BIN)/python -P -m ruff check .
 	$(BIN)/python -P -m ruff format --check .
 	$(BIN)/python -P -m mypy
+	$(SITE) --site-dir build/checked_site
+
+# the documentation as a site, in build/site
+docs: $(VENV)/.dev
+	$(SITE)
 
 format: $(VENV)/.dev
 	$(BIN)/python -P -m ruff check --fix .

@@ -21,6 +21,7 @@ MEASUREMENTS = {
     "step": "how fast and how exactly the gap follows, in virtual time",
     "virtual-time": "how much faster than real time that is, and what limits it",
     "black-box": "what the black box costs a control tick",
+    "publishers": "the pulse as C++, JavaScript and Python publish it",
     "command": "how long tormagctl status takes until it has answered",
     "bus": "load of the bus at 1 kHz control, and what the codec costs",
 }

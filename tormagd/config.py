@@ -7,13 +7,14 @@ orderings are refused with the key's path, the value and what is allowed.
 import ipaddress
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args
 
 import msgspec
 from msgspec import Meta
 
-from tormagd.toml_file import TomlError, in_short, read_toml
+from tormagd.toml_file import TomlError, in_short, line_of, toml_tables, toml_text
 
 LEAST_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
 DEFAULT_RUN_DIR = "/run/tormag"
@@ -24,6 +25,11 @@ ENDPOINTS = ("setpoint", "telemetry", "control", "recording")
 ROLES = ("publish", "operate", "observe")
 
 T = TypeVar("T")
+_OURS = re.compile(r"([a-z_A-Z.]+) = ")
+"The key that a refusal of ours begins with."
+_PLACE = re.compile(r"`\$([^`]*)`")
+"The place that one of msgspec's ends with."
+_UNKNOWN = re.compile(r"unknown field `(\w+)`")
 _TCP = re.compile(r"tcp://(localhost|[0-9.]+):([0-9]{1,5})")
 
 
@@ -39,6 +45,7 @@ class Device(Strict, frozen=True):
     """Where the firmware is. `backend` names an entry point of the group `tormagd.backends`."""
 
     backend: str = "serial"
+    "How the device is reached: `serial`, `can`, or an installed plugin's. A USB serial line is what most have."
     port: str = "/dev/tormag"
     "Path of the serial port; with the backend `can`, the channel: `can0`, or an adapter's path."
     options: dict[str, Any] = msgspec.field(default_factory=dict)
@@ -64,6 +71,7 @@ class Curve(Strict, frozen=True):
     """
 
     server_secret: str = ""
+    "The daemon's own pair, `server.key_secret`, which `tormagctl keys generate` makes."
     publish: str = ""
     "Who may send setpoints, and nothing else."
     operate: str = ""
@@ -82,10 +90,15 @@ class Endpoints(Strict, frozen=True):
     """ZeroMQ addresses. Only `ipc://` and loopback are open; any other address is refused without CURVE keys."""
 
     setpoint: str = f"ipc://{DEFAULT_RUN_DIR}/setpoint"
+    "Where publishers connect; in the service's own folder, as all four are."
     telemetry: str = f"ipc://{DEFAULT_RUN_DIR}/telemetry"
+    "Where whoever looks subscribes."
     control: str = f"ipc://{DEFAULT_RUN_DIR}/control"
+    "Where commands are given."
     recording: str = f"ipc://{DEFAULT_RUN_DIR}/recording"
+    "Where the recorder hears every control tick."
     curve: Curve | None = None
+    "Keys, for who connects from elsewhere."
 
     def is_guarded(self, name: str) -> bool:
         """Whether the daemon lets in only whom it has the key of."""
@@ -112,8 +125,11 @@ class Rates(Strict, frozen=True):
     """How often each rate group runs, Hz."""
 
     control_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 1_000
+    "Ticks: the position loop's gains are for it, and a serial line and a CAN bus carry it."
     inference_hz: Annotated[int, Meta(ge=LEAST_INFERENCE_HZ, le=4_000)] = 250
+    "Plans that are made at the least; a setpoint that arrives is planned for at once. Below 83 the thesis was faster."
     telemetry_hz: Annotated[int, Meta(ge=1, le=200)] = 50
+    "Messages: as often as an eye sees, and no load."
     of_scene: bool = False
     "Whether the daemon runs at the rates that its scene needs, in place of these two; control at 500 Hz at the least."
 
@@ -122,8 +138,11 @@ class RealTime(Strict, frozen=True):
     """Each of these is optional; one that is refused by the kernel is a plain warning and a line of `doctor`."""
 
     fifo_priority: Annotated[int, Meta(ge=0, le=90)] = 0
+    "Of SCHED_FIFO; 0 asks for none, because only a machine that is set up for it allows one."
     lock_memory: bool = False
+    "Whether no page may be swapped out: it keeps all of the daemon in memory."
     cpus: tuple[Annotated[int, Meta(ge=0, le=4095)], ...] = ()
+    "Processors for the control thread; none named: any."
     keep_awake: bool = False
     "Idle processors do not sleep while the daemon runs: they wake up at once, and take the power for it."
     watchdog_ms: Annotated[float, Meta(ge=100.0, le=60_000.0)] = 500.0
@@ -134,13 +153,21 @@ class Motor(Strict, frozen=True):
     """The DC motor and lead screw the controller believes in (37D class, 70:1); see `control/motor.py`."""
 
     supply_V: Annotated[float, Meta(ge=3.0, le=60.0)] = 12.0
+    "What full duty puts on the motor: its rated voltage."
     resistance_ohm: Annotated[float, Meta(ge=0.05, le=100.0)] = 2.2
+    "Of the armature: 12 V over the stall current of 5.5 A."
     inductance_mH: Annotated[float, Meta(ge=0.01, le=100.0)] = 1.5
+    "Of the armature; with the resistance the motor's fastest time constant, 0.7 ms."
     back_emf_V_s: Annotated[float, Meta(ge=1e-4, le=1.0)] = 0.011
+    "V at 1 rad/s of the motor, and N m at 1 A: what its no-load speed at 12 V comes to."
     inertia_kg_m2: Annotated[float, Meta(ge=1e-9, le=1e-2)] = 8e-7
+    "Of the rotor; gears and screw add little behind the gears."
     gear_ratio: Annotated[float, Meta(ge=1.0, le=1_000.0)] = 70.0
+    "Turns of the motor to one of the screw."
     screw_lead_mm: Annotated[float, Meta(ge=0.2, le=50.0)] = 8.0
+    "A carriage's way in one turn of the screw."
     gear_efficiency: Annotated[float, Meta(gt=0.1, le=1.0)] = 0.7
+    "What the gears leave of the torque."
     coulomb_V: Annotated[float, Meta(ge=0.0, le=12.0)] = 0.5
     "Voltage that just overcomes the dry friction of gearbox and screw."
     pull_V: Annotated[float, Meta(ge=0.0, le=12.0)] = 0.5
@@ -155,16 +182,23 @@ class Position(Strict, frozen=True):
     """
 
     proportional_per_mm: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 3.6
+    "Duty for 1 mm of error: the most that keeps 6 dB and 45 degrees at every corner of the motor's parameters."
     integral_time_s: Annotated[float, Meta(ge=0.005, le=100.0)] = 0.1
+    "Shorter, and stiction makes the carriages hunt by a count."
     derivative_time_s: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.02
+    "Near the motor's mechanical time constant of 15 ms, which it makes up for."
     derivative_filter_s: Annotated[float, Meta(ge=1e-4, le=0.1)] = 0.003
+    "Takes the encoder's steps out of the derivative."
     back_calculation_s: Annotated[float, Meta(ge=0.001, le=10.0)] = 0.1
+    "In which the integral lets go once the duty is limited: as fast as it winds up."
     synchronisation: Annotated[float, Meta(ge=0.0, le=10.0)] = 1.0
     "Extra proportional action on the skew between the carriages, as a multiple of the carriage's own."
     gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] = 38.0
+    "How fast the gap may change: both carriages together, less than motors on a full supply reach."
     gap_acceleration_mm_s2: Annotated[float, Meta(gt=0.0, le=100_000.0)] = 1_600.0
     "From rest; with speed it falls along the motors' torque-speed line."
     duty_limit: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0
+    "The most that a motor is given; less spares it, and makes the gap slower."
 
 
 class Trim(Strict, frozen=True):
@@ -173,21 +207,30 @@ class Trim(Strict, frozen=True):
     time_s: Annotated[float, Meta(ge=0.05, le=1_000.0)] = 0.5
     "In which the force's offset is learned anew in the long run; a new device shows itself sooner."
     least: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.6
+    "Of a device's force over the model's; what is below is not corrected, and the limit `TRIM` says so."
     most: Annotated[float, Meta(ge=1.0, le=5.0)] = 1.6
+    "The same for what is above."
 
 
 class Limits(Strict, frozen=True):
     """What counts as a fault, and what only as a warning."""
 
     skew_warning_mm: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.2
+    "Carriages further apart than usual: the limit `SKEW`."
     skew_fault_mm: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
+    "The fault `SKEW`: before the firmware's own, at 2 mm."
     following_error_mm: Annotated[float, Meta(gt=0.0, le=50.0)] = 3.0
+    "How far the gap may be from its reference for a moment."
     no_motion_duty: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.35
     "A carriage driven harder than this must move: it is well above what friction and the magnets hold."
     no_motion_time_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.06
+    "For how long it may not: a motor that turns shows hundreds of counts by then."
     following_time_s: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.25
+    "For how long, before it is the fault `FOLLOWING_ERROR`."
     low_confidence: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.5
+    "Below it the limit `LOW_CONFIDENCE` says that the model was asked outside its training."
     neutral_margin_N: Annotated[float, Meta(gt=0.0, le=10.0)] = 0.1
+    "So much above the least force a setpoint may be when the device is enabled: nothing jumps."
 
 
 class BlackBox(Strict, frozen=True):
@@ -336,13 +379,23 @@ def load_config(path: Path | None) -> Config:
 
 
 def convert(path: Path, kind: type[T]) -> T:
-    """The file's tables as a `kind`. Raises ConfigError naming file, key, value and what is allowed."""
+    """The file's tables as a `kind`. Raises ConfigError naming file, key, value, what is allowed, and the line."""
     try:
-        return checked(read_toml(path), kind)
+        text = toml_text(path)
+        try:
+            return checked(toml_tables(text), kind)
+        except ConfigError as error:
+            raise ConfigError(f"{error}{_line(text, str(error))}") from error
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
     except (TomlError, ConfigError) as error:
         raise ConfigError(f"{path}: {error}") from error
+
+
+def placed(path: Path | None, message: str) -> str:
+    """A refusal of what a file, which has been read, says: with its name and the line, where it names a key there."""
+    where = "" if path is None else _line(toml_text(path), message)
+    return f"{path}: {message}{where}" if where else message
 
 
 def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
@@ -351,8 +404,49 @@ def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
         return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:
         text = str(error)
+        told = _value_at(tables, text) + _known_key(kind, text)
         refused = text if "`$" in text or where == "$" else f"{text} - at `$`"
-        raise ConfigError(refused.replace("`$", f"`{where}") + _value_at(tables, text)) from error
+        raise ConfigError(refused.replace("`$", f"`{where}") + told) from error
+
+
+def did_you_mean(word: str, allowed: Iterable[str]) -> str:
+    """`; did you mean ...?` where one of the allowed words is near, or nothing."""
+    import difflib  # takes a moment, and most configurations are right
+
+    near = difflib.get_close_matches(word, list(allowed), n=1)
+    return f"; did you mean `{near[0]}`?" if near else ""
+
+
+def table_in(kind: Any) -> type[msgspec.Struct] | None:
+    """The table that a field of this type holds, optional or not; None where it is a plain value."""
+    structs = (each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, msgspec.Struct))
+    return next(structs, None)
+
+
+def _known_key(kind: Any, message: str) -> str:
+    """The known key that is nearest to an unknown one of msgspec's message."""
+    if (unknown := _UNKNOWN.search(message)) is None:
+        return ""
+    table = table_in(kind)
+    for name in _key_in(message)[:-1]:
+        fields = {field.name: field.type for field in msgspec.structs.fields(table)} if table else {}
+        table = table_in(fields.get(name))
+    return did_you_mean(unknown[1], [field.name for field in msgspec.structs.fields(table)]) if table else ""
+
+
+def _line(text: str, message: str) -> str:
+    """` (line N)` of the key that the message is about; nothing where it is none of the text's."""
+    line = line_of(text, _key_in(message))
+    return "" if line is None else f" (line {line})"
+
+
+def _key_in(message: str) -> list[str]:
+    """The key that a refusal names: ours begin with it, msgspec's end with its place, and may name an unknown one."""
+    if ours := _OURS.match(message):
+        return ours[1].split(".")
+    place, unknown = _PLACE.search(message), _UNKNOWN.search(message)
+    key = [name for name in place[1].split("[")[0].split(".") if name] if place else []
+    return [*key, unknown[1]] if unknown else key
 
 
 def _value_at(tables: dict[str, Any], message: str) -> str:

@@ -2,6 +2,8 @@
 
 import math
 import re
+from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,10 @@ MOST_BYTES = 65_536
 "Ten times the longest configuration with all its comments."
 MOST_DEPTH = 16
 "Parts of a key, and arrays and tables in each other: the parser takes their square, or all of the stack."
+MOST_GUESSES = 16
+"Lines that may give a key, of those that have its name in them: a file may be full of them."
+MOST_LINES = 8
+"Of one value, to be told where it stands."
 LONGEST_SHOWN = 80
 "Characters of a value that a refusal shows."
 
@@ -30,9 +36,14 @@ class TomlError(ValueError):
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The tables in a file. Raises OSError, whose `strerror` says why it is not read, and TomlError."""
+    """The tables in a file. Raises as `toml_text` and `toml_tables` do."""
+    return toml_tables(toml_text(path))
+
+
+def toml_text(path: Path) -> str:
+    """What is in a file. Raises OSError, whose `strerror` says why it is not read, and TomlError."""
     try:
-        return toml_tables(read_bounded(path, MOST_BYTES).decode("utf-8"))
+        return read_bounded(path, MOST_BYTES).decode("utf-8-sig")  # editors on Windows put a mark before the first line
     except UnicodeDecodeError as error:
         raise TomlError(f"not UTF-8 text (byte {error.start})") from error
 
@@ -50,6 +61,33 @@ def toml_tables(text: str) -> dict[str, Any]:
         raise TomlError("not TOML: an integer has more digits than any that is allowed here") from error
     _require_numbers(tables, "")
     return tables
+
+
+def line_of(text: str, key: Sequence[str]) -> int | None:
+    """The line of `text`, which is TOML, that gives `key`, a path through its tables; None where none of them does.
+
+    The parser keeps no lines. So it is asked after each that has the key's name in it: the first to make the key known
+    gives it. None, too, where that name stands in many lines before.
+    """
+    lines = text.splitlines()
+    guesses = (number for number, line in enumerate(lines, start=1) if key and key[-1] in line)
+    return next((number for number in islice(guesses, MOST_GUESSES) if _is_known(lines, number, key)), None)
+
+
+def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
+    import tomllib
+
+    for end in range(number, min(number + MOST_LINES, len(lines)) + 1):  # a value may go on in the lines below
+        try:
+            table: Any = tomllib.loads("\n".join(lines[:end]))
+        except ValueError:
+            continue
+        for name in key:
+            if not isinstance(table, dict) or name not in table:
+                return False
+            table = table[name]
+        return True
+    return False
 
 
 def in_short(value: object) -> str:

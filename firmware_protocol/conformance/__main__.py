@@ -26,26 +26,26 @@ the motors' supply switch in reach, take hands and patient's side off the brake,
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """0 where all checks passed, 1 where one did not, 2 where it could not be begun."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    command = parser()
+    options = command.parse_args(arguments)
     if options.list:
         for one in CHECKS:
             print(f"{one.name}: {one.sent}: {one.expected} ({one.page})")
         return PASSED
     if options.line is None:
-        parser.error("the following arguments are required: PORT|CHANNEL")
+        command.error("the following arguments are required: PORT|CHANNEL")
     if not (options.yes or _is_agreed(options.line)):
-        print(f"{parser.prog}: nothing was sent; say yes, or --yes where nobody can be asked", file=sys.stderr)
+        print(f"{command.prog}: nothing was sent; say yes, or --yes where nobody can be asked", file=sys.stderr)
         return USAGE
     try:
         line = open_line(options.line, options.baud, options.bitrate, options.node)
     except OSError as error:
-        print(f"{parser.prog}: {error}", file=sys.stderr)
+        print(f"{command.prog}: {error}", file=sys.stderr)
         return USAGE
     try:
         results = _examined(line, options)
     except ValueError as error:
-        parser.error(str(error))
+        command.error(str(error))
     finally:
         line.close()
     return PASSED if results and all(result.passed for result in results) else FAILED
@@ -144,27 +144,28 @@ def _is_agreed(line: str) -> bool:
     return sys.stdin.readline().strip().lower() == "yes"
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def parser() -> argparse.ArgumentParser:
+    """What the kit understands; the reference of commands is made from it, too."""
+    made = argparse.ArgumentParser(
         prog="python -m firmware_protocol.conformance",
         description="Plays the host against a device and says what of firmware_protocol/README.md it does not keep. "
         "The device's motors move; the gap is left open. Exit code 0: all checks passed, 1: not all, 2: not begun.",
     )
-    parser.add_argument(
+    made.add_argument(
         "line",
         nargs="?",
         metavar="PORT|CHANNEL",
         help="a serial port by its path, a CAN bus as INTERFACE:CHANNEL: socketcan:can0, slcan:/dev/ttyACM0, "
         "tormagsim:PATH of the simulated device",
     )
-    parser.add_argument("--yes", action="store_true", help="the motors may move: do not ask")
-    parser.add_argument("--json", action="store_true", help="results on stdout as JSON, what is going on on stderr")
-    parser.add_argument("--only", action="append", default=[], metavar="CHECK", help="may be repeated; and left_open")
-    parser.add_argument("--list", action="store_true", help="print the checks that every line has, and end")
-    parser.add_argument("--baud", type=int, default=1_000_000, metavar="N", help="of a serial port; default 1000000")
-    parser.add_argument("--bitrate", type=int, default=1_000_000, metavar="N", help="of a CAN bus; default 1000000")
-    parser.add_argument("--node", type=int, choices=range(16), default=1, metavar="N", help="on a CAN bus; default 1")
-    return parser
+    made.add_argument("--yes", action="store_true", help="the motors may move: do not ask")
+    made.add_argument("--json", action="store_true", help="results on stdout as JSON, what is going on on stderr")
+    made.add_argument("--only", action="append", default=[], metavar="CHECK", help="may be repeated; and left_open")
+    made.add_argument("--list", action="store_true", help="print the checks that every line has, and end")
+    made.add_argument("--baud", type=int, default=1_000_000, metavar="N", help="of a serial port; default 1000000")
+    made.add_argument("--bitrate", type=int, default=1_000_000, metavar="N", help="of a CAN bus; default 1000000")
+    made.add_argument("--node", type=int, choices=range(16), default=1, metavar="N", help="on a CAN bus; default 1")
+    return made
 
 
 if __name__ == "__main__":

@@ -150,7 +150,7 @@ def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(make: Maker) -
 
 def test_without_a_publisher_the_gap_stays_open(armed: ClosedLoop) -> None:
     samples = list(armed.run(0.5))
-    assert all(sample.plan.limits[0] is Limit.NO_SETPOINT for sample in samples)
+    assert all(sample.plan.limits == (Limit.NO_SETPOINT,) for sample in samples)
     assert min(sample.truth.gap_mm for sample in samples) > OPEN_MM - 1.0
 
 
@@ -161,6 +161,8 @@ def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Co
     samples = list(armed.run(1.2, silent))
     stale = [sample for sample in samples if Limit.STALE in sample.plan.limits]
     assert stale[0].time_s - at_s == pytest.approx(0.1, abs=0.01)
+    # nobody asks for less than the least force: no advice about that
+    assert not any(Limit.F_MIN in sample.plan.limits for sample in stale)
     # 2 N/s down to the least force, and no faster
     governed = [sample.plan.governed_N for sample in stale]
     assert max(before - after for before, after in pairwise(governed)) <= 2.0 * 0.0061

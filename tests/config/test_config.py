@@ -51,6 +51,48 @@ def test_what_a_file_says_is_taken_and_the_rest_stays(write) -> None:
     assert config.device.options == {}
 
 
+def test_a_mark_of_the_byte_order_is_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "windows.toml"
+    path.write_bytes(b'\xef\xbb\xbfscene = "pulse"\r\n')
+    assert load_config(path).scene == "pulse"
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "meant"),
+    [
+        ('scene = "pulse"\n\n[device]\nprot = "x"\n', 4, "port"),
+        ('[devise]\nport = "x"\n', 1, "device"),
+        ("# skew_fault_mm = 1\n[limits]\nskew_fault_mm = 90.0\n", 3, None),
+        ("limits.skew_fault_mm = 90.0\n", 1, None),
+        ("[realtime]\ncpus = [\n  1,\n  9999,\n]\n", 2, None),
+        ("[rates]\ncontrol_hz = 1000\ninference_hz = 2000\n", 3, None),
+        ('[endpoints.curve]\nserver_secrets = ""\n', 2, "server_secret"),
+        ("limits = { skew_fault_mm = 90.0 }\n", 1, None),
+    ],
+)
+def test_a_refusal_names_the_line_and_the_key_that_may_have_been_meant(write, text: str, line: int, meant: str) -> None:
+    told = refusal(write(text))
+    assert told.endswith(f" (line {line})")
+    assert ("did you mean" in told) == (meant is not None)
+    assert meant is None or f"did you mean `{meant}`?" in told
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "meant"),
+    [
+        ('\nscene = "pulsee"\n', 2, "pulse"),
+        ('[device]\nbackend = "cann"\n', 2, "can"),
+        ("[device.options]\nbuad = 9600\n", 2, "baud"),
+    ],
+)
+def test_so_does_a_refusal_that_takes_more_than_the_file(write, capsys, text: str, line: int, meant: str) -> None:
+    path = write(text)
+    assert main(["--config", str(path), "--check"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"tormagd: {path}: ")
+    assert told.endswith(f"did you mean `{meant}`? (line {line})\n")
+
+
 def test_a_resolved_configuration_is_a_configuration(write) -> None:
     tables = msgspec.to_builtins(load_config(write("[motor]\nsupply_V = 24.0\n")))
     assert msgspec.convert(tables, Config).motor.supply_V == 24.0

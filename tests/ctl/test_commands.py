@@ -94,8 +94,7 @@ def test_a_command_reaches_the_daemon_under_its_name(fake_daemon, capsys, comman
     fake_daemon.answers[command] = lambda: {"ok": True, "result": done}
     code, printed = run_json(capsys, "--endpoint", fake_daemon.control, command)
     assert (code, printed["command"], printed["result"]) == (0, command, done)
-    assert fake_daemon.commands[0] == command
-    assert set(fake_daemon.commands[1:]) == ({"status"} if command == "clear-fault" else set())
+    assert fake_daemon.commands == (["status", command] if command == "clear-fault" else [command])
 
 
 @pytest.mark.parametrize("command", ["enable", "disable", "pause", "resume", "stop", "clear-fault"])
@@ -115,10 +114,24 @@ def test_a_fault_that_comes_back_was_not_cleared(fake_daemon, capsys):
     assert "came back: DEVICE_SUPPLY: the supply voltage" in printed["error"]["message"]
 
 
-def test_clearing_what_is_not_latched_says_so(fake_daemon, capsys):
-    fake_daemon.answers["clear-fault"] = lambda: {"ok": True, "result": {"operating_state": "PAUSED"}}
+@pytest.mark.parametrize("state", ["DISABLED", "PAUSED"])
+def test_clearing_what_is_not_latched_says_so(fake_daemon, capsys, state):
+    fake_daemon.answers["clear-fault"] = lambda: {"ok": True, "result": {"operating_state": state}}
     assert main(["--endpoint", fake_daemon.control, "clear-fault"]) == 0
-    assert "no fault is latched; it is PAUSED" in capsys.readouterr().out
+    assert f"no fault is latched; it is {state}" in capsys.readouterr().out
+
+
+def test_a_fault_that_is_cleared_is_watched_until_it_would_have_come_back(fake_daemon, capsys):
+    def clear():
+        fake_daemon.says(operating_state="DISABLED")
+        return {"ok": True, "result": {"operating_state": "DISABLED"}}
+
+    fake_daemon.answers["clear-fault"] = clear
+    fake_daemon.says(operating_state="FAULT", faults=["STOPPED"])
+    assert main(["--endpoint", fake_daemon.control, "clear-fault"]) == 0
+    assert "fault cleared. tormagctl home, then enable" in capsys.readouterr().out
+    assert fake_daemon.commands[:2] == ["status", "clear-fault"]
+    assert set(fake_daemon.commands[2:]) == {"status"}
 
 
 def test_take_that_gave_the_brake_to_somebody_else_is_no_success(fake_daemon, capsys):

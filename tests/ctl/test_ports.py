@@ -90,6 +90,20 @@ def test_can_channels_say_whether_they_are_up(root: Path) -> None:
     ]
 
 
+def test_a_configured_channel_is_no_serial_port_whether_it_is_detected_or_not(root: Path) -> None:
+    (root / "tmp").mkdir()
+    (root / "tmp/can").write_text("")
+    device = Device(backend="can", port="/tmp/can", options={"interface": "tormagsim"})
+    other = {"interface": "tormagsim", "channel": "/tmp/tormagsim-1/can"}
+    for detected in ([other], [other, {"interface": "tormagsim", "channel": "/tmp/can"}]):
+        found = survey(Config(device=device), Machine(root), [], detected)
+        assert found.serial == ()
+        assert [(each.channel, each.is_configured, each.is_up) for each in found.can] == [
+            ("/tmp/tormagsim-1/can", False, False),
+            ("/tmp/can", True, True),
+        ]
+
+
 def test_the_text_says_what_it_cannot_see(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     process(root, 4242, "minicom", "/dev/ttyUSB0")
     process(root, 5, "secret")

@@ -97,12 +97,18 @@ def test_without_setpoints_it_plans_when_due_and_never_chases_what_it_missed(rig
     for time_ns in after_ns:
         rig.now_ns = start_ns + time_ns
         rig.loop.after_tick(None)
-    assert len(rig.planned_ns) == 100
+    assert len(rig.planned_ns) == 1 + 100  # with the first tick, then when due
     rig.planned_ns.clear()
     rig.now_ns += 60 * TICK_NS
     for _ in range(3):
         rig.loop.after_tick(None)
     assert len(rig.planned_ns) == 1
+
+
+def test_what_the_daemon_does_before_its_first_tick_is_no_stall_of_planning(rig: Rig) -> None:
+    rig.now_ns += 50 * DUE_NS
+    rig.loop.after_tick(None)
+    assert (rig.loop.timing.runs, rig.loop.timing.stalls, rig.loop.timing.lateness_us) == (1, 0, 0.0)
 
 
 @pytest.mark.parametrize("plan_us", [60, 300])

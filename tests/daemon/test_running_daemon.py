@@ -174,6 +174,6 @@ def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
     asyncio.run(tell())
     assert [record.getMessage() for record in caplog.records if record.getMessage().startswith("fault")] == [
         "fault: HOST_STALL: the control loop stood still for 83 ms (kernel); "
-        "the device opened the gap by itself after 50 ms",
-        f"fault: PLAN_FAILED: {FAULTS[Fault.PLAN_FAILED].cause}",
+        f"the device opened the gap by itself after 50 ms; next: {FAULTS[Fault.HOST_STALL].remedy}",
+        f"fault: PLAN_FAILED: {FAULTS[Fault.PLAN_FAILED].cause}; next: {FAULTS[Fault.PLAN_FAILED].remedy}",
     ]

@@ -82,6 +82,7 @@ def test_hosts_come_and_go_on_the_simulators_bus_and_hear_each_other(start: Star
     process = start("--can")
     path = channel(process)
     assert Path(path).is_socket()
+    assert {"interface": "tormagsim", "channel": path} in can.detect_available_configs(["tormagsim"])
     for _ in range(2):
         with can.Bus(interface="tormagsim", channel=path, ignore_config=True) as bus:
             meet(bus)

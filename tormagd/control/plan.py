@@ -294,7 +294,8 @@ class Planner:
             limits = (*limits, Limit.LOW_CONFIDENCE)
         if solution.reach is not Reach.INSIDE:
             reached = Limit.F_MIN if solution.reach is Reach.BELOW else Limit.F_MAX
-            if reached not in limits:
+            # where nobody asks for a force, none is held back for being too low
+            if reached not in limits and (is_meant or reached is Limit.F_MAX):
                 limits = (*limits, reached)
         speed_mm_s, acceleration_mm_s2 = self._motion_ahead(governed, device)
         plan = Plan(

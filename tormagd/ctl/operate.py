@@ -43,6 +43,7 @@ def operate(client: Client, command: str) -> Outcome:
     The outcome of that is REFUSED: the gap was to open. Raises CommandError also where the answer does not say that it
     was done, and FAULT where what was cleared comes back.
     """
+    is_needless = command == "clear-fault" and not client.status().faults
     result = client.request(command)
     state = result.get("operating_state")
     if state not in DONE_STATES[command]:
@@ -54,9 +55,9 @@ def operate(client: Client, command: str) -> Outcome:
         )
     if command == "stop" and result.get("is_connected") is False:
         return Outcome(result, STOPPED_WITHOUT_DEVICE, Exit.REFUSED)
+    if is_needless:
+        return Outcome(result, f"no fault is latched; it is {state}")
     if command == "clear-fault":
-        if state != "DISABLED":
-            return Outcome(result, f"no fault is latched; it is {state}")
         _watch_clearing(client)
     return Outcome(result, DONE_TEXT[command])
 

@@ -50,6 +50,7 @@ class CanChannel(msgspec.Struct, frozen=True):
 
     interface: str
     channel: str
+    is_configured: bool
     is_up: bool | None
 
 
@@ -71,16 +72,17 @@ def ports(config: Config, root: Path = Path("/")) -> Outcome:
 def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: Iterable[Mapping[str, Any]]) -> Ports:
     """The ports among `listed` (pyserial's ListPortInfo) and the configured one; the channels python-can `detected`."""
     known = {machine.resolved(info.device): info for info in listed}
-    configured = machine.resolved(config.device.port) if config.device.port.startswith("/") else ""
+    configured = machine.resolved(config.device.port) if _is_line(config) else ""
     if configured and machine.path(configured).exists():
         known.setdefault(configured, None)
     holding, hidden = machine.all_holders(list(known))
+    channels = [(str(entry["interface"]), str(entry["channel"])) for entry in detected]
+    own = (str(config.device.options.get("interface")), config.device.port) if config.device.backend == "can" else None
+    if own is not None and own not in channels:
+        channels.append(own)
     return Ports(
         tuple(_serial_port(machine, path, known[path], path == configured, holding[path]) for path in sorted(known)),
-        tuple(
-            CanChannel(str(entry["interface"]), str(entry["channel"]), _is_up(machine, str(entry["channel"])))
-            for entry in detected
-        ),
+        tuple(CanChannel(*entry, entry == own, _is_up(machine, entry[1])) for entry in channels),
         hidden,
     )
 
@@ -103,8 +105,17 @@ def _serial_port(
     )
 
 
+def _is_line(config: Config) -> bool:
+    """Whether the configured port is a serial port: a CAN adapter may be one, too."""
+    is_adapter = config.device.options.get("interface") == "slcan"
+    return config.device.port.startswith("/") and (config.device.backend != "can" or is_adapter)
+
+
 def _is_up(machine: Machine, channel: str) -> bool | None:
-    state = machine.text(f"/sys/class/net/{channel}/operstate") if "/" not in channel else None
+    """None where nobody can tell; a channel that is a path is one where it is there."""
+    if "/" in channel:
+        return machine.path(channel).exists()
+    state = machine.text(f"/sys/class/net/{channel}/operstate")
     return None if state is None else state in ("up", "unknown")
 
 
@@ -136,11 +147,12 @@ def _text(found: Ports, config: Config, colour: Colour) -> str:
         for holder in entry.holders:
             how = ", exclusively" if holder.is_locking else ""
             lines.append(f"          held by {holder.name} (process {holder.process_id}{how})")
-    if not any(entry.is_configured for entry in found.serial) and config.device.port.startswith("/"):
+    if not any(entry.is_configured for entry in found.serial) and _is_line(config):
         lines.append(f"serial  {config.device.port}, {colour.yellow('configured, but not there')}")
     for channel in found.can:
         state = {None: "", True: ", up", False: f", {colour.yellow('down')}"}[channel.is_up]
-        lines.append(f"can     {channel.interface} {channel.channel}{state}")
+        mark = f", {colour.bold('configured')}" if channel.is_configured else ""
+        lines.append(f"can     {channel.interface} {channel.channel}{mark}{state}")
     if found.hidden_processes:
         lines.append(
             f"{found.hidden_processes} processes of other users may hold a port too without locking it: sudo shows them"

@@ -56,7 +56,7 @@ class Causes:
         if measurement is not None:
             self._tell_what_was_measured(faults, state, measurement)
         for explained in self.of_faults(faults):
-            log.error("fault: %s: %s", explained.code, explained.cause)
+            log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)
 
     def _tell_what_was_measured(self, faults: tuple[Fault, ...], state: StepState, measurement: Measurement) -> None:
         """The causes whose figures are the measurement's, or what the step has remembered of it."""

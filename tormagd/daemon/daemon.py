@@ -107,9 +107,6 @@ class Daemon:
         sys.setswitchinterval(SWITCH_S)
         self._callbacks.add_reader(self._endpoint.fileno(), self._receive_setpoints)
         self._callbacks.add_reader(self._endpoint.control_fileno(), self._receive_requests)
-        heartbeat = Heartbeat(NS // self._config.rates.control_hz)
-        # not on one account: its parts have their own
-        self._loop.add_reader(heartbeat.fileno(), self._beat, heartbeat)
         scene, solver = self._core.scene, self._core.solver
         log.info(
             "running scene %s (%s), without the terms: %s; with the %s solver at %g mT, %s (%s)",
@@ -121,6 +118,9 @@ class Daemon:
             solver.dtype,
             solver.reason,
         )
+        heartbeat = Heartbeat(NS // self._config.rates.control_hz)
+        # not on one account: its parts have their own
+        self._loop.add_reader(heartbeat.fileno(), self._beat, heartbeat)
         await self._ended.wait()
         notify.notify("STOPPING=1")
         await self._open_gap()

@@ -39,7 +39,7 @@ class InferenceLoop:
         self._on_failure, self._failure = on_failure, ""
         self.state: PlanState = planner.start(now_s)
         self.timing = RateGroup("inference", period_ns)
-        self._due_ns = clock_ns() + period_ns
+        self._due_ns = 0  # the first is due with the first tick: what the daemon does before that is no stall
         self._waiting_ns = 0
         self._slack_ns = 200_000.0
 
@@ -69,7 +69,7 @@ class InferenceLoop:
             self._plan(estimate, self._waiting_ns or now_ns)
             self._learn_slack(now_ns)
         elif now_ns >= self._due_ns:
-            self._plan(estimate, self._due_ns)
+            self._plan(estimate, self._due_ns or now_ns)
         self._waiting_ns = 0
         # here the next tick is farthest: a plan for a setpoint that comes just before it has not that time
         self._foresee(now_ns * 1e-9)

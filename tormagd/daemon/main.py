@@ -12,7 +12,7 @@ import msgspec
 
 from firmware_protocol.build import settle
 from tormagd import __version__
-from tormagd.config import ENDPOINTS, Config, ConfigError, Endpoints, load_config
+from tormagd.config import ENDPOINTS, Config, ConfigError, Endpoints, load_config, placed
 from tormagd.output import LogFormatter, printable, write_line
 
 if TYPE_CHECKING:
@@ -50,7 +50,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _start(options: argparse.Namespace) -> int:
-    # here, not above: these take a moment to load, and the signal has to be seen to first
+    try:
+        load_config(options.config)  # what is wrong with it is said before the rest is loaded, which takes a moment
+    except ConfigError as error:
+        return _refused(str(error))
+    # here, not above: the signal has to be seen to first
     import uvloop
 
     from tormagd.control.core import build_core
@@ -62,8 +66,7 @@ def _start(options: argparse.Namespace) -> int:
         core = build_core(config)
         backend = choose(config.device, config.rates)
     except ConfigError as error:
-        write_line(f"tormagd: {printable(str(error))}", sys.stderr)
-        return REFUSED
+        return _refused(placed(options.config, str(error)))
     if options.check:
         _print_resolved(config, core, backend.options)
         return 0
@@ -73,6 +76,11 @@ def _start(options: argparse.Namespace) -> int:
         write_line(f"tormagd: {printable(str(error))}", sys.stderr)
         return 1
     return 0
+
+
+def _refused(why: str) -> int:
+    write_line(f"tormagd: {printable(why)}", sys.stderr)
+    return REFUSED
 
 
 def _configured(options: argparse.Namespace) -> Config:
@@ -88,7 +96,8 @@ def _configured(options: argparse.Namespace) -> Config:
 
 def _log_to_stderr() -> None:
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(LogFormatter("%(levelname)s %(name)s: %(message)s"))
+    time_first = "%(asctime)s " if sys.stderr is not None and sys.stderr.isatty() else ""  # the journal has its own
+    handler.setFormatter(LogFormatter(f"{time_first}%(levelname)s %(name)s: %(message)s"))
     logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 

@@ -11,7 +11,7 @@ from importlib import metadata
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 from firmware_protocol.codec import Message
-from tormagd.config import ConfigError, Device, Rates, Strict, checked
+from tormagd.config import ConfigError, Device, Rates, Strict, checked, did_you_mean
 
 ENTRY_POINTS = "tormagd.backends"
 """Each of this group is a `Driver`."""
@@ -117,7 +117,8 @@ def choose(device: Device, rates: Rates) -> Chosen:
     """
     found = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINTS)}
     if device.backend not in found:
-        raise ConfigError(f"device.backend = {device.backend!r}: installed are {', '.join(sorted(found)) or 'none'}")
+        installed_are = f"installed are {', '.join(sorted(found)) or 'none'}"
+        raise ConfigError(f"device.backend = {device.backend!r}: {installed_are}{did_you_mean(device.backend, found)}")
     try:
         driver = _load(found[device.backend])
     except PLUGIN_ERRORS as error:

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from tormagd.config import LEAST_INFERENCE_HZ, ConfigError, Strict, convert
+from tormagd.config import LEAST_INFERENCE_HZ, ConfigError, Strict, convert, did_you_mean
 from tormagd.scenes.measured import measured
 
 AUTO = "auto"
@@ -235,7 +235,8 @@ def scene_path(name_or_path: str) -> Path:
             return path
     except OSError as error:  # a name that no file can have, or a directory that may not be entered
         raise ConfigError(f"scene = {name_or_path[:LONGEST_SHOWN]!r}: {error.strerror}; {allowed}") from error
-    raise ConfigError(f"scene = {name_or_path[:LONGEST_SHOWN]!r}: {allowed}")
+    near = did_you_mean(name_or_path, shipped_scenes())
+    raise ConfigError(f"scene = {name_or_path[:LONGEST_SHOWN]!r}: {allowed}{near}")
 
 
 def load_scene(name_or_path: str) -> Scene:

@@ -17,7 +17,7 @@ from firmware_protocol.c.build import BuildError
 from tormagd.output import printable, write_line
 from tormagd.physics.errors import DomainError
 from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevice
-from tormagd.simulation.can_door import CanDoor
+from tormagd.simulation.can_door import FOLDER_PREFIX, CanDoor
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import DEFAULT_BAUD, FirmwareKind, MessageDevice, VirtualDevice
 from tormagd.simulation.faults import FORMS as KNOWN_FAULTS
@@ -36,8 +36,8 @@ FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the device until SIGTERM or SIGINT; the first line on stdout says where. Usage errors exit with 2."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    command = parser()
+    options = command.parse_args(arguments)
     stopping = False
 
     def stop(_signal: int, _frame: object) -> None:
@@ -51,9 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             device, door = _opened(options, resources)
             truth = options.truth and resources.enter_context(options.truth.open("w", encoding="utf-8"))
         except (PlantError, HandError, FaultError, DomainError, BuildError, OSError) as error:
-            parser.error(printable(str(error)))
+            command.error(printable(str(error)))
         if write_line(door.address, sys.stdout) is not None:
-            print(f"{parser.prog}: {door.address} could not be written to stdout; it ends", file=sys.stderr)
+            print(f"{command.prog}: {door.address} could not be written to stdout; it ends", file=sys.stderr)
             return 1
         punctuality = serve(device, door, lambda: stopping, truth)
     if punctuality.late:
@@ -83,15 +83,16 @@ def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tup
 
         door = BusDoor(device, options.bus)
     else:
-        folder = resources.enter_context(tempfile.TemporaryDirectory(prefix="tormagsim-"))
+        folder = resources.enter_context(tempfile.TemporaryDirectory(prefix=FOLDER_PREFIX))
         door = CanDoor(device, Path(options.can or f"{folder}/can"))
     resources.callback(door.close)
     return device, door
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m tormagd.simulation", description="A simulated TorMag device.")
-    doors = parser.add_mutually_exclusive_group(required=True)
+def parser() -> argparse.ArgumentParser:
+    """What the simulated device understands; the reference of commands is made from it, too."""
+    made = argparse.ArgumentParser(prog="python -m tormagd.simulation", description="A simulated TorMag device.")
+    doors = made.add_mutually_exclusive_group(required=True)
     doors.add_argument("--pty", action="store_true", help="serial line on a pseudo-terminal, its path printed first")
     doors.add_argument("--slcan", action="store_true", help="CAN adapter on a pseudo-terminal, its path printed first")
     doors.add_argument(
@@ -104,27 +105,27 @@ def _parser() -> argparse.ArgumentParser:
     doors.add_argument(
         "--bus", metavar="INTERFACE:CHANNEL", help="node of an existing bus, as in socketcan:vcan0, printed first"
     )
-    parser.add_argument("--plant", default="sample_1", metavar="FILE", help=f"TOML file, or {', '.join(plant_names())}")
-    parser.add_argument("--hand", default="steady", metavar="SPEC", help=KNOWN_HANDS)
-    parser.add_argument(
+    made.add_argument("--plant", default="sample_1", metavar="FILE", help=f"TOML file, or {', '.join(plant_names())}")
+    made.add_argument("--hand", default="steady", metavar="SPEC", help=KNOWN_HANDS)
+    made.add_argument(
         "--fault",
         action="append",
         default=[],
         metavar="SPEC",
         help=f"may be repeated; {KNOWN_FAULTS}".replace("%", "%%"),
     )
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of noise and jitter")
-    parser.add_argument("--baud", type=_baud, default=DEFAULT_BAUD, metavar="N", help=f"default {DEFAULT_BAUD}")
-    parser.add_argument("--bitrate", type=_bitrate, default=DEFAULT_BITRATE, metavar="N", help="of the CAN bus")
-    parser.add_argument("--node", type=int, choices=range(16), default=DEFAULT_NODE, metavar="N", help="on the CAN bus")
-    parser.add_argument(
+    made.add_argument("--seed", type=int, default=0, metavar="N", help="of noise and jitter")
+    made.add_argument("--baud", type=_baud, default=DEFAULT_BAUD, metavar="N", help=f"default {DEFAULT_BAUD}")
+    made.add_argument("--bitrate", type=_bitrate, default=DEFAULT_BITRATE, metavar="N", help="of the CAN bus")
+    made.add_argument("--node", type=int, choices=range(16), default=DEFAULT_NODE, metavar="N", help="on the CAN bus")
+    made.add_argument(
         "--firmware",
         choices=FIRMWARES,
         default="python",
         help="c compiles and runs the firmware's own C sources; default python, which needs no compiler",
     )
-    parser.add_argument("--truth", type=Path, metavar="FILE.csv", help="record what no sensor sees, 1000 rows a second")
-    return parser
+    made.add_argument("--truth", type=Path, metavar="FILE.csv", help="record what no sensor sees, 1000 rows a second")
+    return made
 
 
 def _baud(text: str) -> int:

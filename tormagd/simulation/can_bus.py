@@ -8,11 +8,14 @@ import errno
 import os
 import select
 import socket
+import tempfile
 from pathlib import Path
 from typing import Any
 
 import can
+from can.typechecking import AutoDetectedConfig
 
+from tormagd.simulation.can_door import FOLDER_PREFIX
 from tormagd.simulation.can_frame import (
     ERROR_FLAG,
     MAX_DATA,
@@ -44,6 +47,13 @@ class SimulatorBus(can.BusABC):
             self._socket.close()
             raise can.CanInitializationError(os.strerror(error.errno or 0), error.errno) from error
         super().__init__(channel=channel, can_filters=can_filters, **settings)
+
+    @staticmethod
+    def _detect_available_configs() -> list[AutoDetectedConfig]:
+        """The channels of simulated devices that were given no path of their own; python-can asks for them."""
+        listening = Path("/proc/net/unix").read_text(encoding="utf-8", errors="replace").split()
+        found = sorted(str(path) for path in Path(tempfile.gettempdir()).glob(f"{FOLDER_PREFIX}*/can"))
+        return [{"interface": "tormagsim", "channel": path} for path in found if path in listening]
 
     def fileno(self) -> int:
         """The socket's descriptor, -1 once it is shut down."""

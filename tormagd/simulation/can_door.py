@@ -10,6 +10,8 @@ from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, from_socket, 
 
 MAX_HOSTS = 8
 FRAMES_AT_ONCE = 16
+FOLDER_PREFIX = "tormagsim-"
+"Of the folder in which a simulated device makes its channel, where it is given no path."
 
 
 class CanDoor:

@@ -1,0 +1,152 @@
+"""The documentation says what is there: pages written from types are up to date, and what is shown can be typed."""
+
+import argparse
+import importlib.util
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import reference_pages
+
+from firmware_protocol.conformance import __main__ as conformance
+from tormagd.config import Config, checked
+from tormagd.ctl import main as ctl
+from tormagd.daemon import main as daemon
+from tormagd.simulation import __main__ as simulation
+from tormagd.toml_file import toml_tables
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+PAGES += sorted(page for folder in ("docs", "systemd", "firmware_protocol") for page in (ROOT / folder).rglob("*.md"))
+PARSERS = {
+    "tormagd": daemon.parser,
+    "tormagctl": ctl.parser,
+    "python -m tormagd.simulation": simulation.parser,
+    "python -m firmware_protocol.conformance": conformance.parser,
+}
+MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
+COMMAND = re.compile(r"(?:sudo (?:-u \w+ )?)?((?:tormagctl|tormagd|make|python (?:-m |tools/)[\w./]+)(?: [ -~]*)?)")
+FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
+INDENTED = re.compile(r"^(?: {4}| {8})(\S.*)$", re.MULTILINE)
+DECISION = ["Question", "Decision", "Why", "Given up"]
+
+
+def name_of(page):
+    """As it is told in a failure."""
+    return str(page.relative_to(ROOT))
+
+
+def blocks(text):
+    """Lines of code blocks, without what follows as a comment."""
+    for _, language, body in FENCE.findall(text):
+        if language in ("", "sh", "bash"):
+            yield from body.splitlines()
+    yield from INDENTED.findall(FENCE.sub("", text))
+
+
+def spans(text):
+    """Code within a line."""
+    return re.findall(r"`([^`\n]+)`", FENCE.sub("", text))
+
+
+def commands(lines):
+    """What of it is ours to check, as lists of words."""
+    for line in lines:
+        for part in re.split(r" && | \| |; ", line.split(" #")[0].split(" < ")[0].strip()):
+            found = COMMAND.fullmatch(part)
+            if found and "..." not in part:
+                yield shlex.split(found[1])
+
+
+def parser_of(words):
+    """The parser of a command, and its arguments; None where it has none here."""
+    for begin, make in PARSERS.items():
+        size = len(begin.split())
+        if words[:size] == begin.split():
+            return make(), words[size:]
+    return None
+
+
+def known_options(parser):
+    """Every option of a command and of its subcommands."""
+    options = set()
+    for action in parser._actions:
+        options.update(action.option_strings)
+        if isinstance(action, argparse._SubParsersAction):
+            for each in action.choices.values():
+                options |= known_options(each)
+    return options
+
+
+def require_there(words):
+    """A tool, a module or a target that exists, with options that it names."""
+    if words[0] == "make":
+        targets = [word for word in words[1:] if "=" not in word]
+        assert all(re.search(rf"^{target}:", MAKEFILE, re.MULTILINE) for target in targets), words
+    elif words[1] == "-m":
+        assert importlib.util.find_spec(words[2]), words
+    else:
+        tool = ROOT / words[1]
+        beside = [tool.with_name(f"{tool.stem}_{word.replace('-', '_')}.py") for word in words[2:3]]
+        source = "".join(file.read_text(encoding="utf-8") for file in (tool, *beside) if file.exists())
+        assert all(f'"{word}"' in source for word in words[2:] if word.startswith("--")), words
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_command_in_a_block_is_understood(page, capsys):
+    for words in commands(blocks(page.read_text(encoding="utf-8"))):
+        found = parser_of(words)
+        if found is None:
+            require_there(words)
+            continue
+        parser, arguments = found
+        try:
+            parser.parse_args(arguments)
+        except SystemExit:
+            pytest.fail(f"{' '.join(words)}: {capsys.readouterr().err}")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_command_in_a_line_has_the_options_that_are_named(page):
+    for words in commands(spans(page.read_text(encoding="utf-8"))):
+        found = parser_of(words)
+        if found is None:
+            require_there(words)
+            continue
+        parser, arguments = found
+        options = {word for word in arguments if word.startswith("--")}
+        assert options <= known_options(parser), words
+        if words[0] == "tormagctl" and arguments and not arguments[0].startswith("--"):
+            (subparsers,) = (each for each in parser._actions if isinstance(each, argparse._SubParsersAction))
+            assert arguments[0] in subparsers.choices, words
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs/guides").glob("*.md")), ids=name_of)
+def test_every_table_of_a_configuration_in_a_guide_is_taken(page):
+    for _, language, body in FENCE.findall(page.read_text(encoding="utf-8")):
+        if language == "toml":
+            checked(toml_tables(body), Config)
+
+
+def test_the_pages_of_reference_are_those_of_the_types():
+    """`python tools/reference_pages.py` writes them."""
+    assert (ROOT / "docs/reference/configuration.md").read_text(
+        encoding="utf-8"
+    ) == reference_pages.configuration_page()
+    assert (ROOT / "docs/reference/commands.md").read_text(encoding="utf-8") == reference_pages.commands_page()
+
+
+def test_every_key_of_the_configuration_says_what_it_is_for():
+    silent = [
+        f"{table} {key.name}"
+        for table, kind in reference_pages.tables(Config, "")
+        for key in reference_pages.keys(kind)
+        if not key.why
+    ]
+    assert silent == []
+
+
+@pytest.mark.parametrize("page", sorted((ROOT / "docs/decisions").glob("0*.md")), ids=name_of)
+def test_every_decision_has_the_same_four_parts(page):
+    assert re.findall(r"^## (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE) == DECISION

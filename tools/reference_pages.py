@@ -1,0 +1,169 @@
+"""Writes docs/reference: the configuration from the types in `tormagd/config.py`, the commands from their parsers.
+
+A test holds the pages to what they are made from. `python tools/reference_pages.py` after a change of either.
+"""
+
+import argparse
+import ast
+import inspect
+import itertools
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import msgspec
+
+from firmware_protocol.conformance import __main__ as conformance
+from tormagd import config
+from tormagd.ctl import main as ctl
+from tormagd.daemon import main as daemon
+from tormagd.hardware import can_backend, serial_backend
+from tormagd.simulation import __main__ as simulation
+
+FOLDER = Path(__file__).parents[1] / "docs" / "reference"
+BACKENDS = {
+    "`[device.options]`, `serial`": serial_backend.DRIVER.options,
+    "`[device.options]`, `can`": can_backend.DRIVER.options,
+}
+_CONFIGURATION_HEAD = """# Configuration: every key
+
+Written by `python tools/reference_pages.py` from the types that refuse a wrong one.
+[Configure](../guides/configure.md) says how they are used, `tormagd --check --config FILE` what is in force.
+"""
+_COMMANDS_HEAD = """# Commands: every option
+
+Written by `python tools/reference_pages.py` from the argument parsers; `--help`, the man pages and completion come from
+the same.
+"""
+BOUNDS = {"ge": "from {}", "gt": "above {}", "le": "to {}", "lt": "under {}"}
+
+
+class Key(msgspec.Struct, frozen=True):
+    """One key of the configuration; `default` as TOML has it, `why` empty where the source says nothing."""
+
+    name: str
+    default: str
+    allowed: str
+    why: str
+
+
+def main() -> int:
+    """Writes both pages."""
+    FOLDER.mkdir(exist_ok=True)
+    for name, page in (("configuration.md", configuration_page()), ("commands.md", commands_page())):
+        (FOLDER / name).write_text(page, encoding="utf-8")
+    return 0
+
+
+def configuration_page() -> str:
+    """Every key with its default, what is allowed, and why."""
+    parts = [_CONFIGURATION_HEAD]
+    for table, kind in (*tables(config.Config, ""), *BACKENDS.items()):
+        says = " ".join(inspect.cleandoc(kind.__doc__ or "").split())
+        parts.append(f"## {table or 'At the top'}\n\n{says}\n")
+        rows = [(f"`{key.name}`", key.default, key.allowed, key.why) for key in keys(kind)]
+        parts.append(_table(("key", "default", "allowed", "what and why"), rows))
+    return "\n".join(parts)
+
+
+def tables(kind: type[msgspec.Struct], path: str) -> Iterator[tuple[str, type[msgspec.Struct]]]:
+    """The tables of a configuration with their names in the file, each before those in it."""
+    yield f"`[{path}]`" if path else "", kind
+    for field in msgspec.structs.fields(kind):
+        inner = config.table_in(field.type)
+        if inner is not None:
+            yield from tables(inner, f"{path}.{field.name}".removeprefix("."))
+
+
+def keys(kind: type[msgspec.Struct]) -> list[Key]:
+    """The keys of one table, without the tables in it."""
+    says = _field_docs(kind)
+    hints = get_type_hints(kind, include_extras=True)
+    return [
+        Key(field.name, _default(field), _allowed(hints[field.name]), says.get(field.name, ""))
+        for field in msgspec.structs.fields(kind)
+        if config.table_in(field.type) is None
+    ]
+
+
+def commands_page() -> str:
+    """Every command and option."""
+    parts = [_COMMANDS_HEAD]
+    for parser in (daemon.parser(), ctl.parser(), simulation.parser(), conformance.parser()):
+        parts.append(f"## {parser.prog}\n\n{parser.description}\n")
+        shared = _options(parser)
+        parts.append(_table(("option", "what"), shared))
+        for name, command in _subparsers(parser):
+            own = [row for row in _options(command) if row not in shared]
+            parts.append(f"### {parser.prog} {name}\n\n{command.description}\n")
+            if own:
+                parts.append(_table(("option", "what"), own))
+    return "\n".join(parts)
+
+
+def _subparsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            yield from action.choices.items()
+
+
+def _options(parser: argparse.ArgumentParser) -> list[tuple[str, ...]]:
+    formatter = parser._get_formatter()
+    return [
+        (f"`{formatter._format_action_invocation(action)}`".replace("|", "\\|"), _says(action))
+        for action in parser._actions
+        if not isinstance(action, argparse._SubParsersAction | argparse._HelpAction)
+    ]
+
+
+def _says(action: argparse.Action) -> str:
+    says = (action.help or "").replace("%(default)s", str(action.default)).replace("%%", "%")
+    return says.replace("|", "\\|") or "-"
+
+
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+    lines = [head, ("---",) * len(head), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _default(field: msgspec.structs.FieldInfo) -> str:
+    if field.required:
+        return "-"
+    value = field.default_factory() if field.default is msgspec.NODEFAULT else field.default
+    if isinstance(value, dict):
+        return "`{}`"
+    return f"`{msgspec.json.encode(value).decode()}`"  # which TOML writes alike
+
+
+def _allowed(hint: Any) -> str:
+    inner, *metas = get_args(hint) if hasattr(hint, "__metadata__") else (hint,)
+    elements = [each for each in get_args(inner) if each is not ...]
+    if getattr(inner, "__origin__", None) is tuple:
+        return f"a list, each {_allowed(elements[0])}"
+    bounds = [
+        text.format(f"{getattr(meta, name):,}")
+        for meta in metas
+        for name, text in BOUNDS.items()
+        if getattr(meta, name) is not None
+    ]
+    words = {int: "a whole number", float: "a number", str: "a text", bool: "true, false"}
+    return " ".join((words.get(inner, "a table"), *bounds))
+
+
+def _field_docs(kind: type[msgspec.Struct]) -> dict[str, str]:
+    """The string below each field: Python keeps it in the source only."""
+    (body,) = (node.body for node in ast.parse(inspect.getsource(kind)).body if isinstance(node, ast.ClassDef))
+    return {
+        field.target.id: " ".join(says.value.value.split())
+        for field, says in itertools.pairwise(body)
+        if isinstance(field, ast.AnnAssign)
+        and isinstance(field.target, ast.Name)
+        and isinstance(says, ast.Expr)
+        and isinstance(says.value, ast.Constant)
+        and isinstance(says.value.value, str)
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())
