@@ -346,7 +346,9 @@ def write_config(folder: Path, port: str, stand: Stand) -> Path:
     """A configuration with its sockets in `folder`; planning in every period, as in examples/service.toml."""
     path = folder / "tormagd.toml"
     sockets = "".join(
-        f'{name} = "tcp://{stand.host}:{free_port()}"\n' if name in stand.guarded else f'{name} = "ipc://{folder}/{name}"\n'
+        f'{name} = "tcp://{stand.host}:{free_port()}"\n'
+        if name in stand.guarded
+        else f'{name} = "ipc://{folder}/{name}"\n'
         for name in ENDPOINTS
     )
     if stand.guarded:

@@ -1,4 +1,4 @@
-"""A daemon that somebody troubles: it runs on a simulated device, is recorded, and afterwards says what became of it."""
+"""A daemon that somebody troubles: on a simulated device, recorded, and asked afterwards what became of it."""
 
 import contextlib
 import tempfile

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import zmq
 from benchmark_loop import WARM_UP_S, Block, as_block, collect, recording, stub_process
-from besieged import ANSWER_S, Line, besieged, stand
+from besieged import Line, besieged, stand
 from tqdm import tqdm
 
 from tormagd.config import ENDPOINTS, Endpoints
@@ -32,6 +32,7 @@ MOST_LESS = 0.01
 "Of the bare timer's rate."
 SOCKETS = {"setpoint": zmq.PUB, "control": zmq.DEALER, "telemetry": zmq.XSUB, "recording": zmq.XSUB}
 SOURCE = "flood"
+PATIENCE_S = 20.0
 
 
 class Flooded(NamedTuple):
@@ -57,13 +58,14 @@ def messages(name: str) -> list[bytes]:
     return [sign + topic for topic in topics for sign in (b"\x01", b"\x00")]
 
 
-def flood(name: str, endpoints: Endpoints, stop: Event, per_s: "multiprocessing.sharedctypes.Synchronized[float]") -> None:
-    """Sends until `stop`, and says at the end how many a second."""
+def flood(name: str, endpoints: Endpoints, begun: Event, stop: Event, per_s: Any) -> None:
+    """Sends until `stop`; `per_s`, a shared number, becomes how many a second."""
     data, burst = messages(name), round(PER_S * BURST_S)
     with zmq.Context() as context, context.socket(SOCKETS[name]) as socket:
         socket.linger = 0
         socket.connect(getattr(endpoints, name))
         start_s, sent = time.monotonic(), 0
+        begun.set()
         while not stop.is_set():
             for number in range(sent, sent + burst):
                 with contextlib.suppress(zmq.Again):
@@ -74,17 +76,19 @@ def flood(name: str, endpoints: Endpoints, stop: Event, per_s: "multiprocessing.
 
 
 @contextlib.contextmanager
-def flooding(name: str, endpoints: Endpoints) -> Iterator[Any]:
-    """A process that floods this endpoint, and its rate once it has ended."""
+def flooding(name: str, endpoints: Endpoints) -> Iterator[tuple[int | None, Any]]:
+    """A process that floods this endpoint: its id, and its rate once it has ended. Raises TimeoutError."""
     outside = multiprocessing.get_context("spawn")
-    stop, per_s = outside.Event(), outside.Value("d", 0.0)
-    sender = outside.Process(target=flood, args=(name, endpoints, stop, per_s), daemon=True)
+    begun, stop, per_s = outside.Event(), outside.Event(), outside.Value("d", 0.0)
+    sender = outside.Process(target=flood, args=(name, endpoints, begun, stop, per_s), daemon=True)
     sender.start()
     try:
+        if not begun.wait(PATIENCE_S):
+            raise TimeoutError(f"the flood did not begin within {PATIENCE_S:g} s")
         yield sender.pid, per_s
     finally:
         stop.set()
-        sender.join(ANSWER_S)
+        sender.join(PATIENCE_S)
 
 
 def flooded(name: str, seconds: float) -> Flooded:

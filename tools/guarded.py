@@ -1,4 +1,4 @@
-"""A daemon's keys for a measurement: a pair of its own, a client that may do everything, and one of each narrower role."""
+"""A daemon's keys for a measurement: its own, a client's that may do everything, and two of a single role each."""
 
 import shutil
 import socket

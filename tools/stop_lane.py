@@ -119,7 +119,9 @@ def measure(share: float) -> Line:
         with besieged(stand(setpoint_hz=0, device=("--seed", "1", "--truth", str(truth)))) as daemon:
             retracts = Retracts(daemon.recorder)
             with busy(daemon.config.endpoints):
-                took_ms = [_stop(daemon, retracts).took_ms for _ in tqdm(range(stops), "stop", unit="stop", disable=None)]
+                took_ms = [
+                    _stop(daemon, retracts).took_ms for _ in tqdm(range(stops), "stop", unit="stop", disable=None)
+                ]
                 closing = [
                     _stop_while_closing(daemon, retracts)
                     for _ in tqdm(range(closing_stops), "stop while closing", unit="stop", disable=None)

@@ -1,0 +1,74 @@
+"""Who troubles the daemon gets nowhere: strangers, floods, hostile messages; and `stop` is heard beside a hundred clients.
+
+Each part starts a daemon on a simulated device and counts what becomes of it; one that judges control's time measures
+the same without the trouble, or a bare timer beside it, in the same run. Exit status 0 if all held. The whole takes
+about 20 minutes, and the machine for itself.
+"""
+
+import argparse
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import floods
+import hostile_messages
+import pulse_from_afar
+import stop_lane
+import strangers
+from besieged import Line
+
+PARTS: dict[str, Callable[[float], Line]] = {
+    "strangers": strangers.measure,
+    "pulse": pulse_from_afar.measure,
+    "stop": stop_lane.measure,
+    "floods": floods.measure,
+    "messages": hostile_messages.measure,
+}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the named parts, or all; 0 if all held, 1 if not."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "part", nargs="*", choices=[[], *PARTS], metavar="PART", help=f"of {', '.join(PARTS)}; default all"
+    )
+    parser.add_argument("--share", type=float, default=1.0, help="of the counts and times, to try it (1)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args(arguments)
+    if not 0.0 < options.share <= 1.0:
+        parser.error(f"--share {options.share:g}: allowed is above 0, to 1")
+    lines = {}
+    for name in options.part or PARTS:
+        load = os.getloadavg()[0]
+        lines[name] = PARTS[name](options.share), round(load, 2)
+        if not options.json:
+            print_line(*lines[name])
+    result = as_json(lines)
+    if options.json:
+        print(json.dumps(result))
+    return 0 if result["passed"] else 1
+
+
+def as_json(lines: dict[str, tuple[Line, float]]) -> dict[str, Any]:
+    """What is printed with --json: lines with the load of the machine before each."""
+    failures = [failure for line, _ in lines.values() for failure in line.failures]
+    return {
+        "lines": {name: line._asdict() | {"load_before": load} for name, (line, load) in lines.items()},
+        "failures": failures,
+        "passed": not failures,
+    }
+
+
+def print_line(line: Line, load: float) -> None:
+    """One line for people."""
+    print(f"{line.says}; load {load:g} before", flush=True)
+    for failure in line.failures:
+        print(f"  FAILED: {failure}", flush=True)
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # either way every process is ended
+    sys.exit(main())
