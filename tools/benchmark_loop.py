@@ -387,9 +387,9 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
         path = write_config(folder, simulator.stdout.readline().strip(), stand)
         config = load_config(path)
         times = folder / "writes"
-        command = [sys.executable, "-P", str(TOOLS / "benchmark_written.py"), str(times), "--config", str(path)]
+        written = [sys.executable, "-P", str(TOOLS / "benchmark_written.py"), str(times), "--config", str(path)]
         with (folder / LOG).open("w") as log:
-            process = subprocess.Popen([*stand.within, *command], env=theirs, stderr=log)
+            process = subprocess.Popen([*stand.within, *written], env=theirs, stderr=log)
         stack.callback(end, process)
         ctl = [sys.executable, "-P", "-m", "tormagd.ctl.main", "--config", str(path), "--wait", "20"]
         wait_for(config.endpoints)

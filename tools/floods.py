@@ -103,10 +103,10 @@ def flooded(name: str, seconds: float) -> Flooded:
         tempfile.TemporaryDirectory(prefix="tormag-") as folder,
         partial(stub_process, stand().realtime)(Path(folder)) as stub,
         recording(stub.config.endpoints) as recorder,
+        flooding(name, stub.config.endpoints) as (_, second_per_s),
     ):
-        with flooding(name, stub.config.endpoints) as (_, second_per_s):
-            collect(recorder, WARM_UP_S)
-            bare = as_block(collect(recorder, seconds), stub.config.rates.control_hz)
+        collect(recorder, WARM_UP_S)
+        bare = as_block(collect(recorder, seconds), stub.config.rates.control_hz)
     named = any(each["endpoint"] == name and f"process {pid} " in each["address"] for each in drops)
     return Flooded(block, bare, min(first_per_s.value, second_per_s.value), named, troubles)
 

@@ -1,4 +1,4 @@
-"""Who troubles the daemon gets nowhere: strangers, floods, hostile messages; and `stop` is heard beside a hundred clients.
+"""Who troubles the daemon gets nowhere: strangers, floods, hostile messages; `stop` is heard beside 100 clients.
 
 Each part starts a daemon on a simulated device and counts what becomes of it; one that judges control's time measures
 the same without the trouble, or a bare timer beside it, in the same run. Exit status 0 if all held. The whole takes
@@ -32,12 +32,13 @@ PARTS: dict[str, Callable[[float], Line]] = {
 def main(arguments: list[str] | None = None) -> int:
     """Runs the named parts, or all; 0 if all held, 1 if not."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "part", nargs="*", choices=[[], *PARTS], metavar="PART", help=f"of {', '.join(PARTS)}; default all"
-    )
+    parser.add_argument("part", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; default all")
     parser.add_argument("--share", type=float, default=1.0, help="of the counts and times, to try it (1)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(arguments)
+    unknown = [name for name in options.part if name not in PARTS]
+    if unknown:
+        parser.error(f"{', '.join(unknown)}: allowed are {', '.join(PARTS)}")
     if not 0.0 < options.share <= 1.0:
         parser.error(f"--share {options.share:g}: allowed is above 0, to 1")
     lines = {}

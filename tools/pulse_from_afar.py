@@ -1,7 +1,7 @@
 """The demo's pulse from a listed publisher on another machine (a network namespace), beside the same from this one.
 
-Both drive a daemon and a device of their own, in turns, so that what else runs here falls on both: here over `ipc://`, as
-in the demo, there over TCP with keys and a cable between. Rendered is the plant's force.
+Both drive a daemon and a device of their own, in turns, so that what else runs here falls on both: here over `ipc://`,
+as in the demo, there over TCP with keys and a cable between. Rendered is the plant's force.
 """
 
 import json
@@ -78,8 +78,8 @@ def judged(local_N: list[float], far_N: list[float]) -> Line:
         failures.append(f"the pulse from afar differs by {apart_N * 1e3:+.2f} mN RMS, allowed {WITHIN_N * 1e3:g}")
     local_mN, far_mN = ([round(rms * 1e3, 2) for rms in each] for each in (local_N, far_N))
     says = (
-        f"the demo's pulse from a listed publisher in another namespace: RMS {statistics.median(far_mN):.1f} mN, from here "
-        f"{statistics.median(local_mN):.1f}, {apart_N * 1e3:+.2f} in the median of {len(far_N)} pairs (allowed "
+        f"the demo's pulse from a listed publisher in another namespace: RMS {statistics.median(far_mN):.1f} mN, from "
+        f"here {statistics.median(local_mN):.1f}, {apart_N * 1e3:+.2f} in the median of {len(far_N)} pairs (allowed "
         f"{WITHIN_N * 1e3:g})"
     )
     return Line(says, failures, {"local_mN": local_mN, "far_mN": far_mN, "apart_mN": round(apart_N * 1e3, 3)})

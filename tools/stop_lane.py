@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import zmq
@@ -94,7 +94,7 @@ class Retracts:
         while self._recorder.poll(0):
             batch = decode_ticks(self._recorder.recv())
             for row in batch.rows:
-                tick = dict(zip(batch.columns, row, strict=True))
+                tick: dict[str, Any] = dict(zip(batch.columns, row, strict=True))
                 if tick["request_number"] != self._number and tick["request"] == DeviceRequest.RETRACT:
                     self.written_s.append(tick["monotonic_s"] + tick["exec_us"] * 1e-6)
                 self._number = tick["request_number"]
@@ -120,11 +120,11 @@ def measure(share: float) -> Line:
             retracts = Retracts(daemon.recorder)
             with busy(daemon.config.endpoints):
                 took_ms = [
-                    _stop(daemon, retracts).took_ms for _ in tqdm(range(stops), "stop", unit="stop", disable=None)
+                    _stop(daemon, retracts).took_ms for _ in tqdm(range(stops), desc="stop", unit="stop", disable=None)
                 ]
                 closing = [
                     _stop_while_closing(daemon, retracts)
-                    for _ in tqdm(range(closing_stops), "stop while closing", unit="stop", disable=None)
+                    for _ in tqdm(range(closing_stops), desc="stop while closing", unit="stop", disable=None)
                 ]
         gap = np.loadtxt(truth, delimiter=",", skiprows=1, usecols=(0, 2))
     took_ms += [stop.took_ms for stop in closing]
@@ -200,8 +200,8 @@ def judged(took_ms: Array, before_mm_s: Array, after_mm_s: Array) -> Line:
         "speed_60_ms_later_mm_s": [round(float(speed), 2) for speed in after_mm_s],
     }
     says = (
-        f"{took_ms.size:,} stops beside {CLIENTS} busy clients: RETRACT {p99_ms:.2f} ms after stop was sent (p99, allowed "
-        f"{WITHIN_MS:g}), {took_ms.max():.2f} ms at most; of {after_mm_s.size} gaps that closed by "
-        f"{-before_mm_s.max():.0f} mm/s or more the slowest opened by {after_mm_s.min():.1f} mm/s 60 ms later (allowed 0)"
+        f"{took_ms.size:,} stops beside {CLIENTS} busy clients: RETRACT {p99_ms:.2f} ms after stop was sent (p99, "
+        f"allowed {WITHIN_MS:g}), {took_ms.max():.2f} ms at most; {after_mm_s.size} gaps that closed by "
+        f"{-before_mm_s.max():.0f} mm/s or more opened by {after_mm_s.min():.0f} mm/s or more 60 ms later (allowed 0)"
     )
     return Line(says, failures, figures)

@@ -1,7 +1,7 @@
 """Peers that are not let in: plain, with another server's key, with a key that is not listed, or not for this endpoint.
 
-Each try is a ZeroMQ socket of its own that connects to an endpoint of the daemon in turn, through a relay that keeps what
-the daemon says to it. Control's lateness meanwhile is held against that of the time before, of the same run.
+Each try is a ZeroMQ socket of its own that connects to an endpoint of the daemon in turn, through a relay that keeps
+what the daemon says to it. Control's lateness meanwhile is held against that of the time before, of the same run.
 """
 
 import asyncio

@@ -43,7 +43,6 @@ def two_machines() -> Iterator[Machines]:
                 reason = getattr(error, "stderr", "") or str(error)
                 raise NotPermittedError(f"no network namespaces here: ip {line}: {reason.strip()}") from error
             if line.startswith("netns"):
-                stack.callback(
-                    subprocess.run, ["ip", "netns", "del", line.split()[-1]], check=False, capture_output=True
-                )
+                name = line.split()[-1]
+                stack.callback(subprocess.run, ["ip", "netns", "del", name], check=False, capture_output=True)
         yield Machines(*(("ip", "netns", "exec", name) for name in (here, there)))
