@@ -1,6 +1,7 @@
 """A daemon that somebody troubles: on a simulated device, recorded, and asked afterwards what became of it."""
 
 import contextlib
+import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ from tormagd.client import Client
 from tormagd.config import Config, RealTime
 
 FIFO_PRIORITY = 50
+DEVICE_PRIORITY, OTHERS_PRIORITY = FIFO_PRIORITY - 10, FIFO_PRIORITY - 20
 ANSWER_S = 10.0
 "A client waits for its turn among those that trouble the daemon."
 UNHANDLED = ("Traceback", "CRITICAL", "Exception ignored")
@@ -58,13 +60,25 @@ class Besieged(NamedTuple):
 def stand(**fields: Any) -> Stand:
     """A stand with the scheduling of the service; `fields` as of Stand."""
     realtime = RealTime(fifo_priority=FIFO_PRIORITY)
-    return Stand(realtime, device_fifo=FIFO_PRIORITY - 10, **fields)
+    return Stand(realtime, device_fifo=DEVICE_PRIORITY, **fields)
+
+
+@contextlib.contextmanager
+def elsewhere() -> Iterator[None]:
+    """What this process does and begins meanwhile stands for other machines: it waits for no processor but for those
+    that daemon and device take. Where that is not allowed, for all."""
+    with contextlib.suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(OTHERS_PRIORITY))
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 @contextlib.contextmanager
 def besieged(stood: Stand) -> Iterator[Besieged]:
     """Starts it, enabled, with setpoints arriving; ends it."""
-    with tempfile.TemporaryDirectory(prefix="tormag-") as name, daemon(stood, Path(name)) as running:
+    with tempfile.TemporaryDirectory(prefix="tormag-") as name, daemon(stood, Path(name)) as running, elsewhere():
         endpoints = running.config.endpoints
         with recording(endpoints) as recorder, Client(endpoints, ANSWER_S) as client:
             yield Besieged(Path(name), running, client, recorder)

@@ -186,6 +186,10 @@ def _says_stalls(figures: Figures) -> str:
     )
 
 
+def _says_intruders(figures: Figures) -> str:
+    return "; ".join(line["says"] for line in figures["lines"].values())
+
+
 PARTS = {
     "fuzz": Part("tools/fuzz_protocol.py --json", _says_fuzz),
     "bus": Part("tools/benchmark.py bus --json", _says_bus),
@@ -197,6 +201,7 @@ PARTS = {
     "replug_can": Part("tools/replug.py --cycles 200 --transport can --json", _says_replug),
     "soak": Part("tools/soak.py --json", _says_soak),
     "stalls": Part("tools/stalls.py --json", _says_stalls),
+    "intruders": Part("tools/intruders.py --json", _says_intruders),
     "envelope": Part("tools/envelope.py --json --picture docs/images/envelope.png", _says_envelope),
 }
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import zmq
 from benchmark_loop import WARM_UP_S, Block, as_block, collect, recording, stub_process
-from besieged import Line, besieged, stand
+from besieged import Line, besieged, elsewhere, stand
 from tqdm import tqdm
 
 from tormagd.config import ENDPOINTS, Endpoints
@@ -102,6 +102,7 @@ def flooded(name: str, seconds: float) -> Flooded:
     with (
         tempfile.TemporaryDirectory(prefix="tormag-") as folder,
         partial(stub_process, stand().realtime)(Path(folder)) as stub,
+        elsewhere(),
         recording(stub.config.endpoints) as recorder,
         flooding(name, stub.config.endpoints) as (_, second_per_s),
     ):

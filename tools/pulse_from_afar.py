@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from benchmark_loop import daemon
-from besieged import Line, stand
+from besieged import Line, elsewhere, stand
 from demo import HOLD_S, LEAST_N, MOST_N, PULSE_S, RAMP_S, START_N, scored
 from human_pulse import Array, pulse_profile, with_approach
 from show import RATE_HZ, write_profile
@@ -57,7 +57,7 @@ def played(machines: Machines, times_s: Array, forces_N: Array) -> float:
             within=machines.here,
         )
         send = ["-m", "tormagd.ctl.main", "--config", str(folder / "tormagd.toml"), "--json", "send"]
-        with daemon(stood, folder):
+        with daemon(stood, folder), elsewhere():
             done = subprocess.run(
                 [*machines.there, sys.executable, *send, str(folder / "pulse.csv"), "--rate", str(RATE_HZ)],
                 check=True,

@@ -15,6 +15,7 @@ import stop_lane
 import strangers
 from benchmark_loop import Block
 from besieged import Line
+from host import Host
 
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.messages import MessageError, Request, decode
@@ -180,6 +181,7 @@ def test_a_pulse_from_afar_is_held_against_the_one_from_here_pair_by_pair() -> N
 def test_the_status_says_whether_all_held(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], failures: list[str], status: int
 ) -> None:
+    monkeypatch.setattr(intruders, "watched", lambda part, share: (part(share), Host(0.0, 1.0, 0.0, {})))
     parts = {"good": lambda share: Line("good", [], {}), "other": lambda share: Line("other", failures, {"n": share})}
     monkeypatch.setattr(intruders, "PARTS", parts)
     assert intruders.main(["--json", "--share", "0.5"]) == status
