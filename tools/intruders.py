@@ -8,7 +8,6 @@ takes about 20 minutes.
 
 import argparse
 import json
-import signal
 import sys
 import time
 from collections.abc import Callable
@@ -81,5 +80,4 @@ def print_line(line: Line, host: Host) -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # either way every process is ended
     sys.exit(main())

@@ -102,6 +102,9 @@ class Admission:
         self.refused = 0
         self.moves: deque[tuple[str, bool]] = deque(maxlen=64)
         "Publishers that came (False) or, after a handshake that went well, left (True), by their address."
+        self.pause_s: Callable[[], float] = lambda: 0.0
+        """How long to wait before each next event: the control thread, which needs the interpreter's lock, too, is late
+        by every event that it meets."""
         self._told = 0
         self._newest = ""
         self._tell_s = 0.0
@@ -212,6 +215,7 @@ class Admission:
 
     def _admit(self) -> None:
         for _ in range(AT_ONCE):
+            time.sleep(self.pause_s())
             try:
                 frames = self._zap.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
@@ -243,6 +247,7 @@ class Admission:
 
     def _watch(self, monitor: "zmq.Socket[bytes]", known: _Connections) -> None:
         for _ in range(AT_ONCE):
+            time.sleep(self.pause_s())
             try:
                 event = zmq.utils.monitor.recv_monitor_message(monitor, zmq.NOBLOCK)
             except zmq.Again:
