@@ -378,9 +378,7 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
     """The same for any stand."""
     with contextlib.ExitStack() as stack:
         ours, theirs = environment(None), environment(stand.root)
-        device = own_machine(
-            stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud), *stand.device
-        )
+        device = own_machine(stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud), *stand.device)
         simulator = subprocess.Popen([sys.executable, *device], stdout=subprocess.PIPE, env=ours, text=True)
         stack.callback(end, simulator)
         assert simulator.stdout is not None

@@ -59,7 +59,7 @@ class Besieged(NamedTuple):
 
 def stand(**fields: Any) -> Stand:
     """A stand with the scheduling of the service; `fields` as of Stand."""
-    realtime = RealTime(fifo_priority=FIFO_PRIORITY)
+    realtime = RealTime(fifo_priority=FIFO_PRIORITY, lock_memory=True)
     return Stand(realtime, device_fifo=DEVICE_PRIORITY, **fields)
 
 
