@@ -10,10 +10,11 @@ import multiprocessing
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from multiprocessing.synchronize import Event
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import zmq
@@ -45,6 +46,8 @@ class Flooded(NamedTuple):
     named: bool
     "Whether `status` names the process and the endpoint."
     troubles: list[str]
+    late_ticks_by: Mapping[str, int] = MappingProxyType({})
+    "What ran into how many of the daemon's ticks."
 
 
 def messages(name: str) -> list[bytes]:
@@ -97,7 +100,7 @@ def flooded(name: str, seconds: float) -> Flooded:
         with flooding(name, daemon.config.endpoints) as (pid, first_per_s):
             collect(daemon.recorder, WARM_UP_S)
             block = as_block(collect(daemon.recorder, seconds), daemon.config.rates.control_hz)
-            drops = daemon.status()["peers"]["drops"]
+            status = daemon.status()
         troubles = daemon.troubles()
     with (
         tempfile.TemporaryDirectory(prefix="tormag-") as folder,
@@ -108,8 +111,9 @@ def flooded(name: str, seconds: float) -> Flooded:
     ):
         collect(recorder, WARM_UP_S)
         bare = as_block(collect(recorder, seconds), stub.config.rates.control_hz)
-    named = any(each["endpoint"] == name and f"process {pid} " in each["address"] for each in drops)
-    return Flooded(block, bare, min(first_per_s.value, second_per_s.value), named, troubles)
+    named = any(each["endpoint"] == name and f"process {pid} " in each["address"] for each in status["peers"]["drops"])
+    per_s = min(first_per_s.value, second_per_s.value)
+    return Flooded(block, bare, per_s, named, troubles, status["late_ticks_by"])
 
 
 def measure(share: float) -> Line:
@@ -131,6 +135,7 @@ def judged(floods: dict[str, Flooded]) -> Line:
             "ratio": round(rate_hz / bare_hz, 4),
             "named": found.named,
             "seconds": round(found.daemon.seconds, 1),
+            "late_ticks_by": dict(found.late_ticks_by),
         }
         failures += [f"flood of {name}: {trouble}" for trouble in found.troubles]
         if found.per_s < LEAST_PER_S:

@@ -46,7 +46,7 @@ SUBSCRIPTIONS = 16
 """What waits of one subscriber's subscriptions: libzmq works off all that there are in the thread that publishes. Of a
 thousand, as of all else, that took 0.7 ms in the median, and 3 ms now and then."""
 SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
-"What one subscriber may say; who says more is cut off, and comes back without what he had subscribed to."
+"What one subscriber may say. Who says more is cut off, and comes back as anybody."
 TAKEN, TAKEN_NS = 64, 80_000
 "Requests taken from the socket at once at most, and for how long."
 REQUESTS = 16
