@@ -33,7 +33,7 @@ MOST_LESS = 0.01
 "Of the bare timer's rate."
 SOCKETS = {"setpoint": zmq.PUB, "control": zmq.DEALER, "telemetry": zmq.XSUB, "recording": zmq.XSUB}
 SOURCE = "flood"
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 class Flooded(NamedTuple):
