@@ -87,7 +87,7 @@ reproduction: $(VENV)/.dev
 	$(BIN)/python tools/reproduce_thesis.py
 	$(BIN)/python tools/tactile_experiment.py --out docs
 
-# docs/evidence: fuzz, fault matrix, planted faults, random walk, numerics, replug and soak in full (well over an hour); `make test` samples them
+# docs/evidence: fuzz, fault matrix, planted faults, random walk, numerics, replug, soak and intruders in full (well over an hour); `make test` samples them
 evidence: $(VENV)/.dev
 	$(BIN)/python tools/evidence.py
 

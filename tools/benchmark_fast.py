@@ -49,7 +49,7 @@ def course(stand: Stand, seconds: float) -> dict[str, Any]:
     line = {"rate_hz": stand.control_hz, "baud": stand.baud}
     try:
         with tempfile.TemporaryDirectory(prefix="tormag-") as folder:
-            with daemon(stand, Path(folder)) as running, recording(running.config.endpoints.recording) as recorder:
+            with daemon(stand, Path(folder)) as running, recording(running.config.endpoints) as recorder:
                 collect(recorder, WARM_UP_S)
                 ticks, share = collect_and_weigh(recorder, running.pid, seconds)
                 plan_us = planned(running.config.endpoints.control)

@@ -32,11 +32,13 @@ import uvloop
 import zmq
 from benchmark_against import TOOLS, add_against_argument, environment
 from benchmark_plot import plot_histograms
+from guarded import curve_table, free_port
 from host import processor_s
 from own_machine import own_machine
 
 from tormagd.client import Client, ClientError
-from tormagd.config import Config, Endpoints, RealTime, load_config
+from tormagd.client.wire import keys_of, opened
+from tormagd.config import ENDPOINTS, Config, Endpoints, RealTime, load_config
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
@@ -49,6 +51,8 @@ from tormagd.simulation.device import DEFAULT_BAUD
 Array = npt.NDArray[np.float64]
 NOTHING: Array = np.array([])
 
+LOG = "tormagd.log"
+"What the daemon says, in its folder."
 CLIENTS = 8
 SETPOINT_HZ = 500
 WARM_UP_S = 1.0
@@ -88,7 +92,8 @@ class Pair(NamedTuple):
 
 class Stand(NamedTuple):
     """What is measured: scheduling, rates, the serial line, how often setpoints come, and of which checkout the daemon
-    is. The device is always this checkout's. `device_fifo` is its own priority; it stands for a machine of its own."""
+    is. The device is always this checkout's. `device_fifo` is its own priority; it stands for a machine of its own.
+    `within` runs the daemon on another machine (`ip netns exec NAME`), which is reached at `host`."""
 
     realtime: RealTime
     control_hz: int = 1_000
@@ -97,6 +102,13 @@ class Stand(NamedTuple):
     setpoint_hz: int = SETPOINT_HZ
     root: Path | None = None
     device_fifo: int = 0
+    scene: str = "coronary"
+    device: tuple[str, ...] = ()
+    "More arguments of the simulated device."
+    guarded: tuple[str, ...] = ()
+    "Endpoints at tcp:// addresses of `host` that demand keys; the others are at ipc://."
+    host: str = "127.0.0.1"
+    within: tuple[str, ...] = ()
 
 
 class Running(NamedTuple):
@@ -203,7 +215,7 @@ Started = Callable[[Path], contextlib.AbstractContextManager[Running]]
 def block(started: Started, seconds: float) -> Block:
     """One block of one kind, under the load of the clients; for some seconds more without them."""
     with tempfile.TemporaryDirectory(prefix="tormag-") as folder:
-        with started(Path(folder)) as running, recording(running.config.endpoints.recording) as recorder:
+        with started(Path(folder)) as running, recording(running.config.endpoints) as recorder:
             stop = multiprocessing.Event()
             load = multiprocessing.Process(target=hammer, args=(running.config.endpoints.control, stop), daemon=True)
             load.start()
@@ -226,13 +238,10 @@ def block(started: Started, seconds: float) -> Block:
 
 
 @contextlib.contextmanager
-def recording(address: str) -> Iterator["zmq.Socket[bytes]"]:
+def recording(endpoints: Endpoints) -> Iterator["zmq.Socket[bytes]"]:
     """A subscriber of the tick rows; while there is one, they are encoded and sent."""
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.subscribe(b"")
-        socket.connect(address)
-        yield socket
+        yield opened(socket, endpoints.recording, keys_of(endpoints.curve))
 
 
 def collect_and_weigh(socket: "zmq.Socket[bytes]", pid: int, seconds: float) -> tuple[Ticks, float]:
@@ -337,13 +346,18 @@ def write_config(folder: Path, port: str, stand: Stand) -> Path:
     """A configuration with its sockets in `folder`; planning in every period, as in examples/service.toml."""
     path = folder / "tormagd.toml"
     sockets = "".join(
-        f'{name} = "ipc://{folder}/{name}"\n' for name in ("setpoint", "telemetry", "control", "recording")
+        f'{name} = "tcp://{stand.host}:{free_port()}"\n'
+        if name in stand.guarded
+        else f'{name} = "ipc://{folder}/{name}"\n'
+        for name in ENDPOINTS
     )
+    if stand.guarded:
+        sockets += curve_table(folder / "keys", also_local=len(stand.guarded) == len(ENDPOINTS))
     realtime = stand.realtime
     # an older checkout knows no options, and only the other line's rate needs one
     options = "" if stand.baud == DEFAULT_BAUD else f"[device.options]\nbaud = {stand.baud}\n"
     path.write_text(
-        f'scene = "coronary"\n[device]\nport = "{port}"\n{options}[endpoints]\n{sockets}'
+        f'scene = "{stand.scene}"\n[device]\nport = "{port}"\n{options}[endpoints]\n{sockets}'
         f"[rates]\ncontrol_hz = {stand.control_hz}\ninference_hz = {stand.inference_hz}\n"
         f"[realtime]\nfifo_priority = {realtime.fifo_priority}\nkeep_awake = {str(realtime.keep_awake).lower()}\n"
         f"lock_memory = {str(realtime.lock_memory).lower()}\n"
@@ -364,21 +378,19 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
     """The same for any stand."""
     with contextlib.ExitStack() as stack:
         ours, theirs = environment(None), environment(stand.root)
-        device = own_machine(stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud))
+        device = own_machine(stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud), *stand.device)
         simulator = subprocess.Popen([sys.executable, *device], stdout=subprocess.PIPE, env=ours, text=True)
         stack.callback(end, simulator)
         assert simulator.stdout is not None
         path = write_config(folder, simulator.stdout.readline().strip(), stand)
         config = load_config(path)
         times = folder / "writes"
-        process = subprocess.Popen(
-            [sys.executable, "-P", str(TOOLS / "benchmark_written.py"), str(times), "--config", str(path)],
-            env=theirs,
-            stderr=subprocess.DEVNULL,
-        )
+        written = [sys.executable, "-P", str(TOOLS / "benchmark_written.py"), str(times), "--config", str(path)]
+        with (folder / LOG).open("w") as log:
+            process = subprocess.Popen([*stand.within, *written], env=theirs, stderr=log)
         stack.callback(end, process)
         ctl = [sys.executable, "-P", "-m", "tormagd.ctl.main", "--config", str(path), "--wait", "20"]
-        wait_for(config.endpoints.control)
+        wait_for(config.endpoints)
         for command in ("home", "enable"):
             subprocess.run([*ctl, command], check=True, capture_output=True, env=theirs)
         if stand.setpoint_hz:
@@ -435,10 +447,10 @@ async def _bare(config: Config) -> None:
     await beat(1_000_000_000 // config.rates.control_hz, publish, asyncio.Event())
 
 
-def wait_for(address: str) -> None:
+def wait_for(endpoints: Endpoints) -> None:
     """Until the daemon answers and its device does."""
     until_s = time.monotonic() + 60.0
-    client = Client(Endpoints(control=address), 1.0)
+    client = Client(endpoints, 1.0)
     while time.monotonic() < until_s:
         with contextlib.suppress(ClientError):
             if client.request("status").get("link", {}).get("state") == "RUNNING":

@@ -186,6 +186,13 @@ def _says_stalls(figures: Figures) -> str:
     )
 
 
+def _says_intruders(figures: Figures) -> str:
+    (line,) = figures["lines"].values()
+    host = line["host"]
+    kept = f"meanwhile a bare timer kept {host['bare_kept']:.1%}, stood still for up to {host['bare_worst_ms']:.0f} ms"
+    return f"{line['says']}; {kept}"
+
+
 PARTS = {
     "fuzz": Part("tools/fuzz_protocol.py --json", _says_fuzz),
     "bus": Part("tools/benchmark.py bus --json", _says_bus),
@@ -197,6 +204,11 @@ PARTS = {
     "replug_can": Part("tools/replug.py --cycles 200 --transport can --json", _says_replug),
     "soak": Part("tools/soak.py --json", _says_soak),
     "stalls": Part("tools/stalls.py --json", _says_stalls),
+    "strangers": Part("tools/intruders.py strangers --json", _says_intruders),
+    "pulse": Part("tools/intruders.py pulse --json", _says_intruders),
+    "stop": Part("tools/intruders.py stop --json", _says_intruders),
+    "floods": Part("tools/intruders.py floods --json", _says_intruders),
+    "messages": Part("tools/intruders.py messages --json", _says_intruders),
     "envelope": Part("tools/envelope.py --json --picture docs/images/envelope.png", _says_envelope),
 }
 

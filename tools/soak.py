@@ -198,7 +198,7 @@ def _running(folder: Path, stack: contextlib.ExitStack) -> tuple[Config, "subpro
     path = write_config(folder, simulator.stdout.readline().decode().strip(), stand)
     process = _begun(["-m", "tormagd.daemon.main", "--config", str(path)], stack, stderr=subprocess.DEVNULL)
     config = load_config(path)
-    wait_for(config.endpoints.control)
+    wait_for(config.endpoints)
     for command in ("home", "enable"):
         subprocess.run([*_ctl(folder), command], check=True, capture_output=True)
     _begun([*_ctl(folder)[1:], "send", "pulse", "--duration", "1e6"], stack, stdout=subprocess.DEVNULL)

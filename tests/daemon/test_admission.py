@@ -340,3 +340,18 @@ def test_the_log_names_the_newest_and_is_not_flooded(tcp_rig: Rig, caplog: pytes
     lines = [record.getMessage() for record in caplog.records if "refused" in record.getMessage()]
     assert len(lines) == 1
     assert f"setpoint: 127.0.0.1, key {fingerprint(STRANGER.public)}: key not listed" in lines[0]
+
+
+def test_the_thread_waits_before_each_event_for_as_long_as_it_is_told_to(tcp_rig: Rig) -> None:
+    waits = iter([0.0, 0.01] * 1_000)
+    asked: list[float] = []
+
+    def pause_s() -> float:
+        asked.append(next(waits))
+        return asked[-1]
+
+    tcp_rig.endpoint.admission.pause_s = pause_s
+    peers = [tcp_rig.peer(zmq.DEALER, "control", STRANGER) for _ in range(5)]
+    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused == 5, "refused")
+    # each was seen to come and asked about
+    assert len(asked) >= 2 * len(peers)

@@ -506,6 +506,33 @@ def test_a_client_that_asks_too_much_is_dropped_and_others_are_answered(rig: Rig
     assert (drop.endpoint, drop.reason) == ("control", "sent too much")
 
 
+@pytest.mark.parametrize("name", ["telemetry", "recording"])
+def test_a_subscriber_that_says_too_much_is_cut_off_and_named_and_may_come_back(rig: Rig, name: str) -> None:
+    churning = rig.connect(zmq.XSUB, name)
+    cut_off = churning.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+    for number in range(PATIENCE_MS // 5):
+        topic = str(number).encode()
+        for sign in (b"\x01", b"\x00") * 20:
+            churning.send(sign + topic)
+        rig.endpoint.publish(TELEMETRY)
+        rig.endpoint.publish_ticks([(1,)], ("a",))
+        rig.endpoint.serve(rig.now_s, never, NEVER)
+        if cut_off.poll(5):
+            break
+    (drop,) = rig.endpoint.report().drops
+    assert (drop.endpoint, drop.address) == (name, f"process {os.getpid()} of user {os.getuid()}")
+    assert (drop.key, drop.reason) == ("", "sent too much")
+    churning.close()
+    subscriber = rig.connect(zmq.SUB, name)
+    subscriber.subscribe(b"")
+    for _ in range(PATIENCE_MS // 5):
+        rig.endpoint.publish(TELEMETRY)
+        rig.endpoint.publish_ticks([(1,)], ("a",))
+        if subscriber.poll(5):
+            break
+    assert subscriber.poll(0)
+
+
 # -- opening and closing -------------------------------------------------------------------------------------------
 
 

@@ -1,10 +1,10 @@
 """The patient unit on another machine: the daemon in one network namespace, everybody else in another.
 
-The addresses are made for the test (192.0.2.0/30, RFC 5737). Where namespaces are not permitted, it is skipped.
+Where namespaces are not permitted, it is skipped. How well a pulse from there is rendered beside one from here:
+`tools/intruders.py pulse`.
 """
 
 import contextlib
-import itertools
 import json
 import os
 import signal
@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from two_machines import HERE, THERE, NotPermittedError, two_machines
 
 from tormagd.config import ENDPOINTS
 
 pytestmark = pytest.mark.live
 
 PATIENCE_S = 60.0
-HERE, THERE = "192.0.2.1", "192.0.2.2"
 CTL = [sys.executable, "-m", "tormagd.ctl.main"]
 STRANGERS = """
 import sys, time, zmq, zmq.auth
@@ -47,12 +47,8 @@ for _ in range(20):
 class Machines:
     """Two network namespaces with a cable between them; a device and a daemon in the first."""
 
-    numbers = itertools.count(1)
-
     def __init__(self, folder: Path) -> None:
-        number = f"{os.getpid() % 10_000}{next(self.numbers)}"
-        self.names = [f"tormag{number}{end}" for end in "ab"]
-        self._links = [f"t{number}{end}" for end in "ab"]
+        self._stack = contextlib.ExitStack()
         self.children: list[subprocess.Popen[str]] = []
         self.start_again(folder)
 
@@ -60,7 +56,10 @@ class Machines:
         """Everything anew in another folder."""
         self.close()
         self.folder, self.keys = folder, folder / "keys"
-        self._wire()
+        try:
+            self._within = self._stack.enter_context(two_machines())
+        except NotPermittedError as error:
+            pytest.skip(str(error))
         clients = ("--publish", "robot", "--operate", "console", "--observe", "screen")
         subprocess.run([*CTL, "keys", "generate", str(self.keys), *clients], check=True, capture_output=True)
         addresses = "".join(f'{name} = "tcp://{HERE}:{5_555 + n}"\n' for n, name in enumerate(ENDPOINTS))
@@ -83,28 +82,10 @@ class Machines:
         self.daemon = self.start(0, sys.executable, "-m", "tormagd.daemon.main", "--config", str(self.config))
         self.until(lambda: self.status()["link"]["state"] == "RUNNING", "the link runs")
 
-    def _wire(self) -> None:
-        a, b = self.names
-        for line in (
-            f"netns add {a}",
-            f"netns add {b}",
-            f"link add {self._links[0]} netns {a} type veth peer name {self._links[1]} netns {b}",
-            f"-n {a} addr add {HERE}/30 dev {self._links[0]}",
-            f"-n {b} addr add {THERE}/30 dev {self._links[1]}",
-            f"-n {a} link set {self._links[0]} up",
-            f"-n {b} link set {self._links[1]} up",
-        ):
-            try:
-                subprocess.run(["ip", *line.split()], check=True, capture_output=True, text=True)
-            except (OSError, subprocess.CalledProcessError) as error:
-                self.close()
-                reason = getattr(error, "stderr", "") or str(error)
-                pytest.skip(f"network namespaces are not permitted here: ip {line}: {reason.strip()}")
-
     def start(self, machine: int, *command: str) -> "subprocess.Popen[str]":
         """A process on one of the two machines."""
         made = subprocess.Popen(
-            ["ip", "netns", "exec", self.names[machine], *command],
+            [*self._within[machine], *command],
             env=os.environ | {"OMP_NUM_THREADS": "1"},
             stdout=subprocess.PIPE,
             text=True,
@@ -140,8 +121,7 @@ class Machines:
                 child.kill()
                 child.wait()
         self.children = []
-        for name in self.names:
-            subprocess.run(["ip", "netns", "del", name], check=False, capture_output=True)
+        self._stack.close()
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import msgpack
 import pytest
 import zmq
 
@@ -146,9 +147,12 @@ def test_a_wrong_number_locks_nobody_out(rig, publish):
     rig.until(lambda: holds(rig, "robot"), "heard")
     before = rig.status()["setpoints"]
     robot.say_once(2**63 - 1)
+    # the next one is no number of a setpoint at all
+    rig.publish(msgpack.packb({"v": VERSION, "source": "robot", "seq": 2**63, "stamp_ns": 1, "servo_cf": 2.0}))
     robot.force_N = 1.1
     rig.until(lambda: rig.status()["setpoint_cf"] == 1.1, "heard on")
     rig.until(lambda: rig.status()["setpoints"]["dropped"] == before["dropped"] + 1, "only the wrong one is dropped")
+    rig.until(lambda: rig.status()["setpoints"]["refused"] == before["refused"] + 1, "and the impossible one refused")
     assert of(rig, "robot")["seq"] < 2**62
     assert of(rig, "robot")["restarts"] == 0
 

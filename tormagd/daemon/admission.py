@@ -102,6 +102,9 @@ class Admission:
         self.refused = 0
         self.moves: deque[tuple[str, bool]] = deque(maxlen=64)
         "Publishers that came (False) or, after a handshake that went well, left (True), by their address."
+        self.pause_s: Callable[[], float] = lambda: 0.0
+        """How long to wait before each next event: the control thread, which needs the interpreter's lock, too, is late
+        by every event that it meets."""
         self._told = 0
         self._newest = ""
         self._tell_s = 0.0
@@ -109,6 +112,7 @@ class Admission:
         self._watched: list[zmq.Socket[bytes]] = []
         self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._is_over = self._is_to_reload = False
+        self._to_cut: deque[tuple[str, str]] = deque(maxlen=PEERS)
         # before any guarded socket is bound: libzmq lets nobody in (ZAP_ENFORCE_DOMAIN) while nobody can be asked
         self._zap = context.socket(zmq.ROUTER)
         self._zap.linger = 0
@@ -142,6 +146,12 @@ class Admission:
         """Reads the lists again, in the thread; those that are no good are told in the log, and the old ones stay."""
         self._is_to_reload = True
         os.eventfd_write(self._wake, 1)
+
+    def cut_off(self, name: str, address: str) -> None:
+        """Ends the connections that an address has to an endpoint, in the thread; whoever may connect comes back."""
+        if (name, address) not in self._to_cut:
+            self._to_cut.append((name, address))
+            os.eventfd_write(self._wake, 1)
 
     def close(self) -> None:
         """Ends the thread; the sockets are the context's to close."""
@@ -196,12 +206,16 @@ class Admission:
                     if self._is_to_reload:
                         self._is_to_reload = False
                         self._reload()
+                    while self._to_cut:
+                        name, address = self._to_cut.popleft()
+                        self._cut(self._of(name), address)
                 else:
                     self._watch(ready, self._endpoints[ready])
             self._tell()
 
     def _admit(self) -> None:
         for _ in range(AT_ONCE):
+            time.sleep(self.pause_s())
             try:
                 frames = self._zap.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
@@ -216,7 +230,7 @@ class Admission:
             self._zap.send_multipart([*envelope, version, request, status, text, public.encode(), b""])
 
     def _is_admitted(self, name: str, address: str, public: str) -> bool:
-        (known,) = (each for each in self._endpoints.values() if each.name == name)
+        known = self._of(name)
         if self.has_role(public, MAY[name]):
             self._moved(name, address, has_left=False)
             known.admitted[address] += 1
@@ -227,8 +241,13 @@ class Admission:
         self._refuse(name, address, self.name(public) if public else "", reason)
         return False
 
+    def _of(self, name: str) -> _Connections:
+        (known,) = (each for each in self._endpoints.values() if each.name == name)
+        return known
+
     def _watch(self, monitor: "zmq.Socket[bytes]", known: _Connections) -> None:
         for _ in range(AT_ONCE):
+            time.sleep(self.pause_s())
             try:
                 event = zmq.utils.monitor.recv_monitor_message(monitor, zmq.NOBLOCK)
             except zmq.Again:
@@ -323,11 +342,12 @@ class Admission:
             log.warning("keys that are let in no more, or for less: %s", ", ".join(before[key].name for key in lost))
             for known in self._endpoints.values():
                 if known.is_guarded and known.name in ("telemetry", "recording"):
-                    self._cut_all(known)
+                    self._cut(known)
 
-    def _cut_all(self, known: _Connections) -> None:
+    def _cut(self, known: _Connections, whose: str = "") -> None:
+        """Ends the connections of an address, or all."""
         for descriptor, address in known.addresses.items():
-            connection = _connection(descriptor)
+            connection = _connection(descriptor) if address == whose or not whose else None
             if connection is not None:
                 with connection:
                     if _address(connection) == address:  # or its number has gone to another one since

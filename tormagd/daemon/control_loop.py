@@ -12,6 +12,9 @@ from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions, RefusedError, latch, reason
 
+TICK_SHARE, BEFORE_SHARE = 0.3, 0.1
+"Of the period: what a tick is given, and what is kept clear before it."
+
 log = logging.getLogger(__name__)
 
 
@@ -55,6 +58,15 @@ class ControlLoop:
             raise
         self._journal.commanded(name, now_s, conditions, is_refused=False)
         log.info("%s: %s", name, reason(name, source))
+
+    def until_slack_s(self) -> float:
+        """How long another thread should wait so as not to hold the interpreter's lock when a tick needs it, s; 0 in
+        the slack. To be asked from any thread."""
+        period_ns = self.timing.period_ns
+        since_due_ns = (time.monotonic_ns() - self.next_tick_ns) % period_ns
+        if since_due_ns > (1.0 - BEFORE_SHARE) * period_ns:
+            since_due_ns -= period_ns
+        return max(0.0, TICK_SHARE * period_ns - since_due_ns) * 1e-9
 
     def latch(self, fault: Fault) -> None:
         """Latches a fault that was found outside the step."""

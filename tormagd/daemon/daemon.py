@@ -66,6 +66,7 @@ class Daemon:
         rates = config.rates
         self._box = box or BlackBox(None, {}, rates.control_hz)
         self._control = ControlLoop(core.stepper, self._connection, NS // rates.control_hz, self._box.journal)
+        self._endpoint.admission.pause_s = self._control.until_slack_s
         self._inference = InferenceLoop(
             core.planner,
             self._endpoint,

@@ -42,6 +42,11 @@ DRAIN = 32
 "Setpoints read at once at most; more wait for the next tick, so that a flood cannot stall control."
 SETPOINTS_PER_S, SETPOINT_BURST = 4_000.0, 1_000.0
 "What one publisher may send; the rest is dropped unread. The burst is what comes at once after a network's pause."
+SUBSCRIPTIONS = 16
+"""What waits of one subscriber's subscriptions: libzmq works off all that there are in the thread that publishes, and of
+a thousand, as of all else, a tick would be late (`tools/intruders.py floods`)."""
+SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
+"What one subscriber may say. Who says more is cut off, and comes back as anybody."
 TAKEN, TAKEN_NS = 64, 80_000
 "Requests taken from the socket at once at most, and for how long."
 REQUESTS = 16
@@ -84,8 +89,9 @@ class Endpoint:
         self.admission = Admission(self._context, keys, io_priority)
         try:
             self._setpoints = self._bind(zmq.SUB, "setpoint", endpoints.setpoint)
-            self._telemetry = self._bind(zmq.PUB, "telemetry", endpoints.telemetry)
-            self._recording = self._bind(zmq.PUB, "recording", endpoints.recording)
+            # XPUB is a PUB that tells what its subscribers say
+            self._telemetry = self._bind(zmq.XPUB, "telemetry", endpoints.telemetry)
+            self._recording = self._bind(zmq.XPUB, "recording", endpoints.recording)
             self._control = self._bind(zmq.ROUTER, "control", endpoints.control)
         except OSError:
             self._release()
@@ -100,6 +106,9 @@ class Endpoint:
         self.is_flooded = False
         "Whether there were more setpoints than are read at once."
         self._allowance = Allowance(SETPOINTS_PER_S, SETPOINT_BURST)
+        self._subscriptions = {
+            name: Allowance(SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST) for name in ("telemetry", "recording")
+        }
         self._drops: Counter[tuple[str, str, str]] = Counter()
         self._dropped = self._told = 0
         self._tell_s = 0.0
@@ -140,11 +149,11 @@ class Endpoint:
 
     def publish(self, telemetry: Telemetry) -> None:
         """Sends one telemetry message to whoever listens."""
-        self._send(self._telemetry, encode(telemetry))
+        self._send(self._telemetry, "telemetry", encode(telemetry))
 
     def publish_ticks(self, rows: Sequence[object], columns: tuple[str, ...] = TickRecord.__struct_fields__) -> None:
         """Sends the control ticks since the last time, a row each."""
-        self._send(self._recording, encode_ticks(rows, columns))
+        self._send(self._recording, "recording", encode_ticks(rows, columns))
 
     def take_requests(self, answer: Callable[[Request], dict[str, Any]]) -> None:
         """Takes what has arrived, at most TAKEN in TAKEN_NS; answers `stop` and `disable`, the rest waits for `serve`.
@@ -215,7 +224,9 @@ class Endpoint:
         made = self._context.socket(kind)
         made.setsockopt(zmq.LINGER, 0)
         made.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        made.setsockopt(zmq.RCVHWM, 1_000)
+        made.setsockopt(zmq.RCVHWM, SUBSCRIPTIONS if kind == zmq.XPUB else 1_000)
+        if kind == zmq.XPUB:
+            made.setsockopt(zmq.XPUB_VERBOSER, 1)  # every word, not only the first of each topic
         made.setsockopt(zmq.SNDHWM, 1_000)
         path = ipc_path(address)
         try:
@@ -231,10 +242,26 @@ class Endpoint:
             raise OSError(f"endpoints.{name} = {address!r}: {error}") from error
         return made
 
-    def _send(self, to: "zmq.Socket[bytes]", data: bytes) -> None:
-        # PUB drops for a subscriber that does not keep up; it never blocks
+    def _send(self, to: "zmq.Socket[bytes]", name: str, data: bytes) -> None:
+        # drops for a subscriber that does not keep up; it never blocks
         with contextlib.suppress(zmq.Again):
             to.send(data, zmq.NOBLOCK)
+        self._hear_subscribers(to, name)
+
+    def _hear_subscribers(self, publisher: "zmq.Socket[bytes]", name: str) -> None:
+        """Cuts off who says more than subscribers need to."""
+        now_s, allowance = time.monotonic(), self._subscriptions[name]
+        for _ in range(DRAIN):
+            try:
+                frame = publisher.recv(zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                return
+            try:
+                _, peer = self._sender(frame, name)
+            except zmq.ZMQError:
+                continue  # what libzmq says for one that has gone
+            if not allowance.grants(peer, now_s):
+                self.admission.cut_off(name, peer.partition(" ")[0])
 
     def _sender(self, frame: zmq.Frame, name: str) -> tuple[str, str]:
         """The key that a message was sent with, empty at an open endpoint; and what its sender is counted by."""
@@ -325,10 +352,10 @@ class Endpoint:
         self._drops[name, peer, reason] += count
 
     def _tell_drops(self, now_s: float) -> None:
-        beyond = self._allowance.dropped
-        while beyond:
-            peer, count = beyond.popitem()
-            self._drop("setpoint", peer, TOO_MUCH, count)
+        for name, allowance in ({"setpoint": self._allowance} | self._subscriptions).items():
+            while allowance.dropped:
+                peer, count = allowance.dropped.popitem()
+                self._drop(name, peer, TOO_MUCH, count)
         if self._dropped > self._told and now_s >= self._tell_s:
             (name, peer, reason), count = self._drops.most_common(1)[0]
             who = " ".join(self._known(peer)).strip()
