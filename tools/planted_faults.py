@@ -162,11 +162,11 @@ PLANTED = (
     Planted(STEP, "min(max(left_duty, -most), most),", "left_duty,", "a duty over its limit on a low supply"),
     Planted(
         STEP,
-        "if self._needs_sensor and now_s - measurement.sensed_s > SENSE_FAULT_S:",
+        "if self._needs_sensor and at_s - measurement.sensed_s > SENSE_FAULT_S:",
         "if False:",
         "no Sense, no fault",
     ),
-    Planted(STEP, "if now_s - measurement.reported_s > STATUS_FAULT_S:", "if False:", "no Status, no fault"),
+    Planted(STEP, "if at_s - measurement.reported_s > STATUS_FAULT_S:", "if False:", "no Status, no fault"),
     Planted(STEP, "            if is_old:\n", "            if False:\n", "a loop around an old measurement"),
     Planted(STEP, "if measurement.link.round_trip_s > self._too_slow_s:", "if False:", "carriages swing"),
     Planted(
