@@ -37,8 +37,8 @@ Written by `python tools/safety_pages.py` from [evidence/faults.json](evidence/f
 command is refused. It is what [the table of codes](states.md#faults) says of the code that is to be named, or the
 injection's own time, and `-` where nothing has to be named. *Reacted* is what was measured, *open* when the gap was.
 
-*Recovery* is [what the daemon names](messages.md#status) as the way to ENABLED (`next_commands`), tried twice. *Before* is
-what it came to while the cause lasted: a command is refused, a fault shows again, or the limit is told all the while;
+*Recovery* is [what the daemon names](messages.md#status) as the way to ENABLED (`next_commands`), tried twice. *Before*
+is what it came to while the cause lasted: a command is refused, a fault shows again, or a limit is told all the while;
 `-` where the cause had gone by itself, or the daemon was dead. Then the cause is ended, and the commands of the last
 column are given: afterwards the force is followed again within 0.15 N, and nothing of the fault is told any more.
 
