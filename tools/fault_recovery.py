@@ -70,8 +70,7 @@ class Followed(NamedTuple):
 
 
 def _follow(rig: Rig) -> Followed:
-    """Publishes, until a fault shows; then, and where nothing is enabled, the force is not followed."""
-    rig.publisher.is_silent = rig.publisher.is_silent and not _is_enabled(rig)
+    """The force over the next seconds, until a fault shows; then, and where nothing is enabled, it is not followed."""
     off_N: list[float] = []
     told: set[str] = set()
     for _ in rig.run(FOLLOWED_S - JUDGED_S):
@@ -86,10 +85,12 @@ def _follow(rig: Rig) -> Followed:
 
 
 def _obeyed(rig: Rig, commands: tuple[Event, ...], patience_s: float) -> str:
-    """Gives the commands; those that were taken and what came in the way then, empty where nothing did."""
-    if commands:
-        rig.publisher.is_silent = True
-        _rest(rig, SILENT_S)
+    """Gives the commands, and has the force published again; those that were taken and what came in the way then, empty
+    where nothing did."""
+    if not commands:
+        return ""
+    rig.publisher.is_silent = True
+    _rest(rig, SILENT_S)
     taken: list[str] = []
     for event in commands:
         _rest_until_ready(rig)
@@ -100,6 +101,7 @@ def _obeyed(rig: Rig, commands: tuple[Event, ...], patience_s: float) -> str:
             return ", ".join((*taken, f"{event} refused: {refusal}"))
         taken.append(str(event))
         _rest(rig, CLEARED_S if event is Event.CLEAR_FAULT else 0.0)
+    rig.publisher.is_silent = False
     return ""
 
 

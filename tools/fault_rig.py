@@ -132,7 +132,6 @@ class BadSensor:
         self._sensor, self._how, self._last_N = sensor, how, sensor.reading_N
 
     @property
-    @property
     def mended(self) -> Sensor:
         """The sensor itself."""
         return self._sensor

@@ -465,6 +465,7 @@ def test_each_stream_says_when_it_came_last() -> None:
     [
         ((), {}, "no State yet, no Sense yet, no Status yet"),
         ((State(0.0, 0.0, 0.0, 1), status()), {}, "no Sense yet"),
+        ((status(), State(0.0, 0.0, 0.0, 1)), {}, "no Sense yet"),
         ((Sense(0.0, 0.0, 0.0, 0.0), status()), {"State": "CRC-8"}, "State refused: CRC-8"),
         ((State(0.0, 0.0, 0.0, 1), Sense(0.0, 0.0, 0.0, 0.0)), {"State": "CRC-8"}, "no Status yet"),
     ],
