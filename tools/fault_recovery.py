@@ -11,6 +11,7 @@ from fault_cases import Injection
 from fault_rig import Rig
 from fault_watch import MOST_OFF_N, MOST_OVER_N, Cell
 
+from tormagd.safety.codes import Limit
 from tormagd.safety.operating_state import Event, OperatingState, RefusedError, next_commands
 
 MENDED_S = 1.5
@@ -38,10 +39,15 @@ def recover(rig: Rig, injection: Injection, cell: Cell) -> Cell:
     trouble = _obeyed(rig, commands, PATIENCE_S)
     back_s = rig.loop.now_s - mended_s
     followed = _follow(rig)
+    done = list(map(str, commands))
+    if Limit.OFFSET_UNKNOWN in followed.told:
+        rig.hand.turn_back(rig.loop.now_s)
+        done.append("turn the handle back and forth")
+        followed = _follow(rig)
     is_back = not trouble and not rig.safety.faults and followed.is_held and not _named(injection, followed.told)
     return cell._replace(
         tried=tried,
-        recovery=tuple(map(str, commands)),
+        recovery=tuple(done),
         back_s=round(back_s, 3) if is_back and commands else None,
         recovered=is_held_back and is_back,
     )
