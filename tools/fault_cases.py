@@ -92,7 +92,7 @@ MATRIX = (
         HELD_OR_OPENS,
         way=partial(Damaging, 0.05),
         within_ms=1_000.0,
-        excitation=f"{DRIVEN}; it depends on which frame is hit",
+        excitation=f"{DRIVEN}; a Hello that is hit opens the device at once, States have to be counted",
     ),
     Injection("every frame twice", (), HELD, way=Doubling),
     Injection("20% of the frames overtaken", (), HELD, way=partial(Reordering, 0.2)),
@@ -102,7 +102,13 @@ MATRIX = (
     Injection("bus full", ("LINK_DEGRADED", "STATUS_STALE"), HELD_OR_OPENS, fill_frames_ms=6.5, buses=(CAN,)),
     Injection("cable pulled: nothing goes either way", ("LINK_LOST", "MEASUREMENT_STALE"), way=partial(Losing, 1.0)),
     Injection("daemon stalls for 12 ms, ten times a second", ("HOST_STALL",), HELD, host="hogged"),
-    Injection("firmware hangs, its watchdog resets it", ("MEASUREMENT_STALE",), device="frozen", within_ms=151.0),
+    Injection(
+        "firmware hangs, its watchdog resets it",
+        ("MEASUREMENT_STALE",),
+        device="frozen",
+        within_ms=151.0,
+        excitation=f"{DRIVEN}; nothing can act before the watchdog has, after 100 ms",
+    ),
     # the force sensor and the handle
     Injection("force sensor stuck", ("SENSOR",), sensor="stuck"),
     Injection("force sensor 0.8 N too high", ("SENSOR", "OVER_FORCE"), sensor="high"),
