@@ -58,7 +58,7 @@ def test_friction_at_rest_falls_with_the_gap_and_does_not_come_back() -> None:
         assert not watch.is_lost
 
 
-@pytest.mark.parametrize("speed_mm_s", [0.1, 0.5, 42.0])
+@pytest.mark.parametrize("speed_mm_s", [-42.0, -0.1, 0.1, 0.5, 42.0])
 def test_a_handle_that_moves_is_none_that_is_lost(speed_mm_s: float) -> None:
     assert not watched(5.0, lambda now_s: speed_mm_s * now_s, swinging, swinging).is_lost
 
