@@ -39,7 +39,7 @@ COMPILED = {
             "interpolation",
             "portrait",
         ),
-        *("periodicity", "governor", "plan", "motor", "step", "conditions"),
+        *("periodicity", "governor", "handle", "plan", "motor", "step", "conditions"),
     ),
     "tormagd/simulation": ("curve", "axis", "element", "hand", "plant", "motion", "firmware", "device"),
     "tormagd/daemon": ("sequence", "source_clock", "rate_group", "telemetry"),

@@ -122,11 +122,12 @@ def _says_bus(figures: Figures) -> str:
 
 def _says_faults(figures: Figures) -> str:
     cells = figures["cells"]
-    named, safe, in_time = (sum(cell[name] for cell in cells) for name in ("named", "safe", "in_time"))
+    verdicts = ("named", "safe", "in_time", "recovered")
+    named, safe, in_time, recovered = (sum(cell[name] for cell in cells) for name in verdicts)
     opens = [cell["open_ms"] for cell in cells if cell["expected"] == "opens" and cell["open_ms"] is not None]
     return (
         f"{len(cells)} cells on serial and CAN: {named} named, {safe} ended safe, {in_time} reacted in their "
-        f"stated time; what is to open is open after at "
+        f"stated time, {recovered} recovered as documented; what is to open is open after at "
         f"most {max(opens):g} ms; no force is lost faster than by {max(cell['loss_N_s'] for cell in cells)} N/s"
     )
 

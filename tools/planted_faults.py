@@ -22,7 +22,7 @@ LEAST_CAUGHT = 0.9
 COPIED = ("tormagd", "firmware_protocol", "tests", "tools", "docs", "pyproject.toml", "setup.py")
 STATE, CODES = "tormagd/safety/operating_state.py", "tormagd/safety/codes.py"
 STEP, GOVERNOR, LINK = "tormagd/control/step.py", "tormagd/control/governor.py", "tormagd/hardware/link.py"
-SIGHT, PLAUSIBLE, HOMING = (f"tormagd/control/{name}.py" for name in ("sight", "plausible", "homing"))
+SIGHT, PLAUSIBLE, HOMING, HANDLE = (f"tormagd/control/{name}.py" for name in ("sight", "plausible", "homing", "handle"))
 TESTS = {
     STATE: ("tests/safety",),
     CODES: ("tests/safety",),
@@ -30,6 +30,7 @@ TESTS = {
     SIGHT: ("tests/control/test_step.py",),
     PLAUSIBLE: ("tests/control/test_step.py",),
     HOMING: ("tests/control/test_homing.py", "tests/control/test_step.py"),
+    HANDLE: ("tests/control/test_handle.py",),
     GOVERNOR: ("tests/control/test_governor.py",),
     LINK: ("tests/hardware/test_link.py",),
 }
@@ -162,11 +163,11 @@ PLANTED = (
     Planted(STEP, "min(max(left_duty, -most), most),", "left_duty,", "a duty over its limit on a low supply"),
     Planted(
         STEP,
-        "if self._needs_sensor and now_s - measurement.sensed_s > SENSE_FAULT_S:",
+        "if self._needs_sensor and at_s - measurement.sensed_s > SENSE_FAULT_S:",
         "if False:",
         "no Sense, no fault",
     ),
-    Planted(STEP, "if now_s - measurement.reported_s > STATUS_FAULT_S:", "if False:", "no Status, no fault"),
+    Planted(STEP, "if at_s - measurement.reported_s > STATUS_FAULT_S:", "if False:", "no Status, no fault"),
     Planted(STEP, "            if is_old:\n", "            if False:\n", "a loop around an old measurement"),
     Planted(STEP, "if measurement.link.round_trip_s > self._too_slow_s:", "if False:", "carriages swing"),
     Planted(
@@ -315,6 +316,13 @@ PLANTED = (
     ),
     Planted(GOVERNOR, "min(at_s - ends_s, AHEAD_S, ends_s)", "(at_s - ends_s)", "a preview goes on for ever"),
     Planted(GOVERNOR, "min(begins_s + after_s, AHEAD_S)", "(begins_s + after_s)", "a slope goes on for ever"),
+    # the handle
+    Planted(
+        HANDLE, "abs(handle_mm - self.at_mm) > STANDS_MM:", "handle_mm - self.at_mm > STANDS_MM:", "back is no motion"
+    ),
+    Planted(HANDLE, " and model_N - least_model_N > MODEL_RISES_N", "", "a sensor that leaps is a lost handle"),
+    Planted(HANDLE, "still_s < SETTLES_S or force_N", "force_N", "a handle that comes to rest is a lost one"),
+    Planted(HANDLE, "self.is_lost or has_risen", "has_risen", "a lost handle is told for an instant"),
     # the link
     Planted(LINK, "% 256 < OVERTAKEN:", "% 256 < 1:", "a State that was overtaken is a measurement"),
     Planted(

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from faults import LEFT_OUT
+from fault_cases import LEFT_OUT
 
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.safety.operating_state import ROWS, DeviceRequest, Event, Guard, OperatingState, Refusal, Transition
@@ -17,6 +17,9 @@ from tormagd.safety.operating_state import ROWS, DeviceRequest, Event, Guard, Op
 DOCS = Path(__file__).parents[1] / "docs"
 STATES, MATRIX = DOCS / "states.md", DOCS / "fault-matrix.md"
 EVIDENCE = DOCS / "evidence" / "faults.json"
+
+FAILED = {"named": "unnamed", "safe": "unsafe", "in_time": "late", "recovered": "not recovered"}
+"What a cell is called that is not what it should be."
 
 _STATES_HEAD = """# Operating states, faults and limits
 
@@ -33,6 +36,11 @@ Written by `python tools/safety_pages.py` from [evidence/faults.json](evidence/f
 *Stated* is by when the reaction has to be on its way: the device begins to open or lets go, the limit is told, the
 command is refused. It is what [the table of codes](states.md#faults) says of the code that is to be named, or the
 injection's own time, and `-` where nothing has to be named. *Reacted* is what was measured, *open* when the gap was.
+
+*Recovery* is [what the daemon names](messages.md#status) as the way to ENABLED (`next_commands`), tried twice. *Before*
+is what it came to while the cause lasted: a command is refused, a fault shows again, or a limit is told all the while;
+`-` where the cause had gone by itself, or the daemon was dead. Then the cause is ended, and the commands of the last
+column are given: afterwards the force is followed again within 0.15 N, and nothing of the fault is told any more.
 
 """
 
@@ -53,23 +61,25 @@ def matrix_page(record: dict[str, Any]) -> str:
     """The page of a run of the matrix."""
     cells = record["figures"]["cells"]
     faults = dict.fromkeys(cell["fault"] for cell in cells)
-    kept = [sum(cell[name] for cell in cells) for name in ("named", "safe", "in_time")]
+    kept = [sum(cell[name] for cell in cells) for name in ("named", "safe", "in_time", "recovered")]
     says = (
         f"{len(faults)} faults, {len(cells)} cells on `{record['figures']['plant']}`, version {record['version']}: "
-        f"{kept[0]} named, {kept[1]} ended safe, {kept[2]} reacted in their stated time.\n\n"
+        f"{kept[0]} named, {kept[1]} ended safe, {kept[2]} reacted in their stated time, {kept[3]} recovered as "
+        "documented.\n\n"
     )
-    head = ("fault", "bus", "named as", "reaction", "excitation", "stated", "reacted", "open")
+    head = ("fault", "bus", "named as", "reaction", "excitation", "stated", "reacted", "open", "before", "recovery")
     never = "\n## What is no row, and why\n\n" + _table(("fault", "why"), [*LEFT_OUT.items()])
     return _MATRIX_HEAD + says + _table(head, [_cell(cell) for cell in cells]) + never
 
 
 def _cell(cell: dict[str, Any]) -> tuple[str, ...]:
     told = [*cell["host_faults"], *(f"device:{name}" for name in cell["device_faults"]), *cell["limits"]]
-    failed = [word for word, name in (("unnamed", "named"), ("unsafe", "safe"), ("late", "in_time")) if not cell[name]]
+    failed = [word for name, word in FAILED.items() if not cell[name]]
     reaction = cell["expected"] + (f" (**{', '.join(failed)}**)" if failed else "")
     named = ", ".join(dict.fromkeys(told)) or "-"
     times = [_ms(cell[name]) for name in ("stated_ms", "reacted_ms", "open_ms")]
-    return cell["fault"], cell["bus"], named, reaction, cell["excitation"], *times
+    recovery = ", ".join(cell["recovery"]) or "by itself"
+    return cell["fault"], cell["bus"], named, reaction, cell["excitation"], *times, cell["tried"] or "-", recovery
 
 
 def _ms(time_ms: float | None) -> str:

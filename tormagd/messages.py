@@ -359,6 +359,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     way: WayReport | None = None
     black_box: BlackBoxReport = BlackBoxReport()
     output: OutputReport = OutputReport()
+    next_commands: tuple[str, ...] = ()
 
 
 class Description(msgspec.Struct, frozen=True, kw_only=True):

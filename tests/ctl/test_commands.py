@@ -422,6 +422,12 @@ def test_status_text_shows_what_is_not_known_as_such(status_with):
     assert "late by" not in "\n".join(lines)
 
 
+def test_status_text_says_what_to_do_next(status_with):
+    known = msgspec.convert(status_with(next_commands=("clear-fault", "home", "enable")), Status)
+    assert "next      clear-fault, home, enable" in status_text(known, Colour(sys.stderr)).splitlines()
+    assert "next  " not in status_text(msgspec.convert(status_with(), Status), Colour(sys.stderr))
+
+
 def test_status_text_says_how_each_rate_is_kept_and_who_made_ticks_late(status_with):
     exec_us = {"p50": 12.0, "p99": 80.0, "p999": 90.0, "max": 95.0}
     counts = {"runs": 999, "overruns": 9, "stalls": 2, "merged": 4}

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from tormagd.safety.codes import Fault
+from tormagd.safety.codes import FAULTS, Fault, Position
 from tormagd.safety.operating_state import (
     CLEARING_S,
     COMMANDS,
@@ -23,6 +23,7 @@ from tormagd.safety.operating_state import (
     command,
     homed_again,
     latch,
+    next_commands,
     reason,
 )
 
@@ -370,3 +371,39 @@ class Operating(RuleBasedStateMachine):
 
 TestOperating = Operating.TestCase
 TestOperating.settings = settings(max_examples=150, stateful_step_count=30, deadline=None)
+
+
+@pytest.mark.parametrize(
+    ("state", "is_homed", "commands"),
+    [
+        (SafetyState(OperatingState.ENABLED), True, ()),
+        (SafetyState(OperatingState.PAUSED), True, ("resume",)),
+        (SafetyState(), True, ("enable",)),
+        (SafetyState(), False, ("home", "enable")),
+        (SafetyState(needs_homing=True), True, ("home", "enable")),
+        (SafetyState(OperatingState.FAULT, (Fault.STOPPED,)), True, ("clear-fault", "enable")),
+        (SafetyState(OperatingState.FAULT, (Fault.STOPPED,)), False, ("clear-fault", "home", "enable")),
+        (SafetyState(OperatingState.FAULT, (Fault.STOPPED, Fault.LINK_LOST)), True, ("clear-fault", "home", "enable")),
+        (SafetyState(OperatingState.FAULT, (Fault.SKEW,)), True, ("clear-fault", "home", "enable")),
+    ],
+)
+def test_the_next_commands_lead_to_a_force_that_is_followed(
+    state: SafetyState, is_homed: bool, commands: tuple[str, ...]
+) -> None:
+    assert next_commands(state, is_homed) == commands
+
+
+@pytest.mark.parametrize("fault", Fault)
+def test_the_next_commands_of_each_fault_are_taken_and_arm_it(fault: Fault) -> None:
+    """On a device that has been put right: what it had latched it has given up, and its place with it."""
+    state = latch(SafetyState(OperatingState.ENABLED), (fault,))
+    is_homed = FAULTS[fault].position is not Position.LOST_THERE
+    commands = next_commands(state, is_homed)
+    assert ", then ".join(commands[:-1]) == FAULTS[fault].clears
+    for name in commands:
+        state = command(state, name, 0.0, READY.replaced(homed=is_homed))
+        if name == "home":
+            is_homed = True
+            state = homed_again(state, is_homed=False)
+    assert state.operating_state is OperatingState.ENABLED
+    assert next_commands(state, is_homed) == ()

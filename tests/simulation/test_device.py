@@ -13,19 +13,24 @@ from firmware_protocol.codec import (
     FUNCTION,
     PROTOCOL_VERSION,
     SCHEMA_HASH,
+    Clear,
     Drive,
     DriveMode,
     Hello,
+    Home,
     Identity,
+    Message,
     Sense,
     State,
     Status,
+    Switches,
     decode,
     encode,
     period,
 )
 from firmware_protocol.framing import FrameDecoder, encode_frame
-from tormagd.simulation.device import MessageDevice, VirtualDevice
+from tormagd.simulation.device import MessageDevice, Packet, VirtualDevice
+from tormagd.simulation.faults import KNOWN, SIZED, parse_fault
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
 
@@ -204,3 +209,32 @@ def test_next_event_is_never_behind_and_always_comes() -> None:
         device.transmit(now_s)
         events += 1
     assert 100 <= events < 300
+
+
+def test_a_device_that_is_mended_homes_as_a_healthy_one() -> None:
+    """After all faults that last have struck it at rest; what they made it latch, it clears."""
+    passing = ("frozen", "reset", "encoder_jump", "encoder_jump_left")
+    lasting = [f"{name}=+20%" if name in SIZED else name for name in KNOWN if name not in passing]
+    mended = MessageDevice(SAMPLE_1, SteadyHand(), [parse_fault(f"{fault}@0.1") for fault in lasting])
+    healthy = MessageDevice(SAMPLE_1, SteadyHand())
+    for device in (mended, healthy):
+        device.advance(0.2)
+    assert mended.firmware.faults
+    mended.mend()
+    for device in (mended, healthy):
+        for message in (Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1), Clear(2), Home(3), Drive(0.0, 0.0, DriveMode.OFF, 1)):
+            device.receive(0.2, FUNCTION[type(message)], encode(message))
+        device.outbox.clear()
+        device.advance(6.0)
+        device.receive(6.0, FUNCTION[Drive], encode(Drive(0.0, 0.0, DriveMode.OFF, 2)))
+        device.advance(6.1)
+    last, usual = ({type(it): it for it in map(_decoded, device.outbox)} for device in (mended, healthy))
+    assert set(last) == set(usual) == {Identity, State, Sense, Status}
+    assert last[Status] == usual[Status]
+    assert Switches.HOMED in last[Status].switches
+    assert last[State].left_position_mm == pytest.approx(usual[State].left_position_mm, abs=0.01)
+    assert last[Sense].handle_position_mm == usual[Sense].handle_position_mm
+
+
+def _decoded(packet: Packet) -> Message:
+    return decode(packet.function, packet.payload)

@@ -2,13 +2,16 @@
 
 import faults
 import pytest
+from fault_cases import CAN, MATRIX, OPENS, SERIAL, UNLIKE_LOSSES, Injection
+from fault_recovery import recover
+from fault_watch import Cell
 
 from tormagd.scenes.scene import load_scene
 
 DRIVEN = [
     item
-    for item in faults.MATRIX
-    if item.is_driven and item.sensor is None and item.publisher is None and item.device not in faults.UNLIKE_LOSSES
+    for item in MATRIX
+    if item.is_driven and item.sensor is None and item.publisher is None and item.device not in UNLIKE_LOSSES
 ]
 SAMPLED = (
     "daemon killed or cable cut",
@@ -34,12 +37,13 @@ SAMPLED = (
 )
 
 
-def cell_of(name: str, bus: str) -> faults.Cell:
-    (injection,) = (item for item in faults.MATRIX if item.name == name)
-    return faults.inject(injection, "sample_1", bus)
+def cell_of(name: str, bus: str) -> Cell:
+    (injection,) = (item for item in MATRIX if item.name == name)
+    _, cell = faults.inject(injection, "sample_1", bus)
+    return cell
 
 
-@pytest.mark.parametrize("bus", [faults.SERIAL, faults.CAN])
+@pytest.mark.parametrize("bus", [SERIAL, CAN])
 @pytest.mark.parametrize("name", SAMPLED)
 def test_a_fault_is_named_and_ends_safe(name: str, bus: str) -> None:
     cell = cell_of(name, bus)
@@ -47,7 +51,7 @@ def test_a_fault_is_named_and_ends_safe(name: str, bus: str) -> None:
     assert cell.named, cell
     assert cell.safe, cell
     assert cell.in_time, cell
-    if cell.expected == faults.OPENS:
+    if cell.expected == OPENS:
         assert cell.open_ms is not None
         assert cell.below_1N_ms is not None
         assert cell.below_1N_ms < 1_000.0
@@ -55,9 +59,9 @@ def test_a_fault_is_named_and_ends_safe(name: str, bus: str) -> None:
 
 @pytest.mark.parametrize("plant", ["sample_1", "sample_2", "sample_3"])
 @pytest.mark.parametrize("item", DRIVEN, ids=lambda item: item.name)
-def test_no_force_is_lost_faster_than_the_scene_allows(item: faults.Injection, plant: str) -> None:
+def test_no_force_is_lost_faster_than_the_scene_allows(item: Injection, plant: str) -> None:
     force = load_scene("coronary").force
-    cell = faults.inject(item, plant, item.buses[0])
+    _, cell = faults.inject(item, plant, item.buses[0])
     # the carriages may have been behind the ramp, and catch up: half as fast again
     within_N_s = 1.5 * force.release_N_s if item.host in ("stale", "other") else force.most_release_N_s
     assert cell.loss_N_s <= within_N_s
@@ -65,16 +69,47 @@ def test_no_force_is_lost_faster_than_the_scene_allows(item: faults.Injection, p
 
 def test_a_cell_that_is_not_named_or_not_safe_is_told_from_one_that_is() -> None:
     """The judge has to be able to say no."""
-    (stuck,) = (item for item in faults.MATRIX if item.name == "left encoder stuck")
-    unnamed = faults.inject(stuck._replace(names=("SENSOR",), within_ms=10.0), "sample_1")
+    (stuck,) = (item for item in MATRIX if item.name == "left encoder stuck")
+    _, unnamed = faults.inject(stuck._replace(names=("SENSOR",), within_ms=10.0), "sample_1")
     assert (unnamed.named, unnamed.safe, unnamed.in_time) == (False, True, False)
-    (supply,) = (item for item in faults.MATRIX if item.name == "motor supply fails")
-    unsafe = faults.inject(supply._replace(safe=faults.OPENS), "sample_1")
+    (supply,) = (item for item in MATRIX if item.name == "motor supply fails")
+    _, unsafe = faults.inject(supply._replace(safe=OPENS), "sample_1")
     assert (unsafe.named, unsafe.safe) == (True, False)
 
 
+RECOVERED = (
+    # a sensor is doubted until it is believed, and then its zero is not known before the handle has turned
+    (
+        "force sensor 0.8 N too high",
+        SERIAL,
+        "clear-fault, enable refused: sensor_doubted",
+        ("enable", "turn the handle back and forth"),
+    ),
+    # what the device has latched comes back while its cause stands
+    ("device too hot", CAN, "clear-fault, DEVICE_TEMPERATURE again", ("clear-fault", "home", "enable")),
+    ("handle's encoder lost", SERIAL, "HANDLE_LOST still told", ()),
+)
+
+
+@pytest.mark.parametrize(("name", "bus", "tried", "recovery"), RECOVERED, ids=str)
+def test_what_leads_out_of_a_fault_does_so_when_its_cause_has_gone(
+    name: str, bus: str, tried: str, recovery: tuple[str, ...]
+) -> None:
+    (injection,) = (item for item in MATRIX if item.name == name)
+    cell = faults.try_out(injection, "sample_1", bus)
+    assert (cell.tried, cell.recovery, cell.recovered) == (tried, recovery, True)
+
+
+def test_a_fault_that_is_not_mended_is_not_recovered_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The judge has to be able to say no here, too."""
+    (injection,) = (item for item in MATRIX if item.name == "device too hot")
+    rig, cell = faults.inject(injection, "sample_1")
+    monkeypatch.setattr(rig, "mend", lambda: None)
+    assert not recover(rig, injection, cell).recovered
+
+
 def test_names_are_codes_and_faults_stand_once() -> None:
-    names = [injection.name for injection in faults.MATRIX]
+    names = [injection.name for injection in MATRIX]
     assert len(set(names)) == len(names)
     assert set(SAMPLED) <= set(names)
-    assert all(bus in (faults.SERIAL, faults.CAN) for injection in faults.MATRIX for bus in injection.buses)
+    assert all(bus in (SERIAL, CAN) for injection in MATRIX for bus in injection.buses)

@@ -10,6 +10,7 @@ from tormagd.config import Config
 from tormagd.control.device_fit import UNSEEN, DeviceFit, observe
 from tormagd.control.estimate import Estimate
 from tormagd.control.governor import PATH_S, Governed, Governor, GovernorState, TimedSetpoint
+from tormagd.control.handle import UNHEARD, HandleWatch
 from tormagd.control.portrait import ROLLER_RATE_MM_S, FieldOfGap, LawOfField, Portrait
 from tormagd.control.sensor import UNJUDGED, Sensor, judge
 from tormagd.control.sensor_zero import TARED, UNKNOWN_SD_N, SensorZero
@@ -173,14 +174,22 @@ NOTHING_SHOWN: Final = Shown()
 class PlanState(Value):
     """What planning remembers. `lag_s` is how late the device's carriages are."""
 
-    __match_args__ = ("governor", "plan", "shown", "lag_s")
+    __match_args__ = ("governor", "plan", "shown", "lag_s", "handle")
     __slots__ = __match_args__
 
-    def __init__(self, governor: GovernorState, plan: Plan, shown: Shown = NOTHING_SHOWN, lag_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        governor: GovernorState,
+        plan: Plan,
+        shown: Shown = NOTHING_SHOWN,
+        lag_s: float = 0.0,
+        handle: HandleWatch = UNHEARD,
+    ) -> None:
         self.governor: Final = governor
         self.plan: Final = plan
         self.shown: Final = shown
         self.lag_s: Final = lag_s
+        self.handle: Final = handle
 
     @property
     def device(self) -> DeviceFit:
@@ -256,6 +265,9 @@ class Planner:
         """The next plan. `estimate` is None while the device has said nothing: nothing is learned of it then."""
         model_N = self._model_N(estimate)
         shown = self._learn(state.shown, now_s, estimate, model_N)
+        handle = state.handle
+        if estimate is not None and model_N is not None:
+            handle = handle.heard(estimate.sensed_s, estimate.handle_mm, estimate.force_N, model_N)
         device = shown.device
         if self._has_creep:
             sliding_mm_s = MOVING_MM_S if estimate is None else estimate.handle.sliding_mm_s
@@ -286,6 +298,8 @@ class Planner:
         if field_mT != solution.field_mT:
             outside = (*outside, Outside(FEATURES[2], solution.field_mT, field_mT))
         limits = (*governed.limits, *shown.limits)
+        if handle.is_lost:
+            limits = (*limits, Limit.HANDLE_LOST)
         if outside:
             limits = (*limits, Limit.MODEL_RANGE)
         if gap_mm > wanted_mm:
@@ -316,7 +330,7 @@ class Planner:
             outside=outside,
             sensor_doubted_s=shown.sensor.doubted_s,
         )
-        return PlanState(governor, plan, shown, lag_s)
+        return PlanState(governor, plan, shown, lag_s, handle)
 
     def foresee(self, state: PlanState) -> PlanState:
         """What can be prepared for the next plans once one is made: to be called after each, when nothing waits."""

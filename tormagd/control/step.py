@@ -500,14 +500,16 @@ class Stepper:
                 faults.append(Fault.OUT_OF_STROKE)
         if state.safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
             return tuple(faults)
+        # the tick that is nearest to a time's end judges it: the next one would be a period late
+        at_s = now_s + self._nominal_dt_s / 2.0
         # what has just come over a slow line is old too, and a loop around it would swing
-        is_old = now_s - measurement.received_s + measurement.delay_s > self._measurement_timeout_s
+        is_old = at_s - measurement.received_s + measurement.delay_s > self._measurement_timeout_s
         if not sight.is_waiting(now_s, self._nominal_dt_s):
             if is_old:
                 faults.append(Fault.MEASUREMENT_STALE)
-            if self._needs_sensor and now_s - measurement.sensed_s > SENSE_FAULT_S:
+            if self._needs_sensor and at_s - measurement.sensed_s > SENSE_FAULT_S:
                 faults.append(Fault.SENSE_STALE)
-            if now_s - measurement.reported_s > STATUS_FAULT_S:
+            if at_s - measurement.reported_s > STATUS_FAULT_S:
                 faults.append(Fault.STATUS_STALE)
         if measurement.link.round_trip_s > self._too_slow_s:
             faults.append(Fault.LINK_DEGRADED)

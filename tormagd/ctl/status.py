@@ -42,6 +42,7 @@ def status_text(known: Status, colour: Colour) -> str:
     lines = [
         f"state     {paint(state)}, {', '.join(flags)}",
         *_codes(known.faults, known.fault_details, "fault", colour.red),
+        *([f"next      {', '.join(known.next_commands)}"] if known.next_commands else []),
         *_codes(known.limits, known.limit_details, "held by", colour.yellow),
         f"force     asked {_number(known.setpoint_cf, 'N')}, governed {_number(known.governed_cf, 'N')}, "
         f"measured {_number(known.measured_cf, 'N')}",

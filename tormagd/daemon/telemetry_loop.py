@@ -27,7 +27,7 @@ from tormagd.daemon.telemetry import is_driven, snapshot, tick_record
 from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
 from tormagd.messages import Description, DeviceReport, OutputReport, Request, Status, Telemetry, TickRecord
-from tormagd.safety.operating_state import Conditions, RefusedError
+from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
 from tormagd.scenes.scene import terms_of
 
 NS = 1_000_000_000
@@ -300,4 +300,5 @@ class TelemetryLoop:
             way=self._way.report(None if link.round_trip_us is None else link.round_trip_us.p50),
             black_box=self._box.report(),
             output=OutputReport(rate=acted.rate, slew=acted.slew, not_finite=acted.not_finite, range=acted.range),
+            next_commands=tuple(map(str, next_commands(safety, newest.is_homed))),
         )

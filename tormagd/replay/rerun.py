@@ -11,6 +11,7 @@ from tormagd.control.core import Core
 from tormagd.control.device_fit import DeviceFit
 from tormagd.control.estimate import Estimate, Handle
 from tormagd.control.governor import GovernorState, TimedSetpoint
+from tormagd.control.handle import HandleWatch
 from tormagd.control.homing import Homing
 from tormagd.control.periodicity import Guess, Periodicity, Skill
 from tormagd.control.pid import PidState
@@ -57,7 +58,7 @@ KNOWN = kinds(
         Expected,
     ),
     *(PidState, Sight, Leap, Homing, PlanState, GovernorState, Periodicity, Skill, Guess, Plan, Outside, Shown),
-    *(DeviceFit, Sensor, Past, SlowFriction, SensorZero, Level, Conditions, DeviceMode, Switches),
+    *(DeviceFit, Sensor, Past, SlowFriction, SensorZero, Level, HandleWatch, Conditions, DeviceMode, Switches),
 )
 "All that the core's states consist of."
 UNTAKEN = (TypeError, AttributeError, ValueError, ArithmeticError, LookupError, RuntimeError, RecursionError)

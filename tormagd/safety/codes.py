@@ -104,6 +104,7 @@ class Limit(StrEnum):
     SENSOR = "SENSOR"
     SENSOR_ZERO = "SENSOR_ZERO"
     OFFSET_UNKNOWN = "OFFSET_UNKNOWN"
+    HANDLE_LOST = "HANDLE_LOST"
     SATURATED = "SATURATED"
     SKEW = "SKEW"
     HOST_STALL = "HOST_STALL"
@@ -265,22 +266,22 @@ FAULTS: dict[Fault, Explanation] = {
         "the device fell silent, or its states came too late to close the loop",
         "check cable and supply, and the round trip in `tormagctl firmware`; then clear-fault",
         Reaction.OPENING,
-        53.0,
-        "at once; 50 ms, a tick, and the way to the device",
+        52.0,
+        "at once; 50 ms of nothing, which begin with a tick, and a tick to tell the device",
     ),
     Fault.SENSE_STALE: Explanation(
         "the device sends no Sense any more: force and handle are not measured, and the scene needs them",
         "look at the firmware and at `refused` in `tormagctl firmware`; then clear-fault",
         Reaction.OPENING,
-        105.0,
-        "at once",
+        102.0,
+        "at once; 100 ms of nothing, which begin with a tick, and a tick to tell the device",
     ),
     Fault.STATUS_STALE: Explanation(
         "the device sends no Status any more: its faults, switches and supply are not known",
         "look at the firmware and at `refused` in `tormagctl firmware`; then clear-fault",
         Reaction.OPENING,
-        105.0,
-        "at once",
+        102.0,
+        "at once; 100 ms of nothing, which begin with a tick, and a tick to tell the device",
     ),
     Fault.LINK_DEGRADED: Explanation(
         "the answers of the device come so late that the position loop would swing",
@@ -332,7 +333,7 @@ FAULTS: dict[Fault, Explanation] = {
         "look for a block or a loose encoder, then clear-fault and home",
         Reaction.OPENING,
         250.0,
-        "while a carriage is driven",
+        "while a carriage is driven: 60 ms of a duty that moves one, which takes a following error to come about",
         Position.LOST_HERE,
     ),
     Fault.DEVICE_NOT_RUNNING: Explanation(
@@ -457,6 +458,14 @@ LIMITS: dict[Limit, Explanation] = {
         Reaction.HELD,
         480100.0,
         "while the handle turns one way",
+    ),
+    Limit.HANDLE_LOST: Explanation(
+        "the force rises with the gap's, as it does only while the shaft moves, and the handle's encoder stands still: "
+        "rate and displacement are not known, and nothing is learned",
+        "check the handle's encoder and its cable, then turn the handle; if they are in order, the force sensor",
+        Reaction.HELD,
+        2000.0,
+        "while the force rises by 0.15 N or more",
     ),
     Limit.SATURATED: Explanation(
         "a motor has no more voltage to give",

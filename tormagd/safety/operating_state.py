@@ -382,6 +382,26 @@ def command(state: SafetyState, name: str, now_s: float, conditions: Conditions)
     return _taken(state, row.target, request)
 
 
+def next_commands(state: SafetyState, is_homed: bool) -> tuple[Event, ...]:
+    """The commands that lead from `state` to one in which the force follows the setpoint, in their order; none where
+    it does. They are taken once the causes of its faults have gone."""
+    if state.operating_state is ENABLED:
+        return ()
+    if state.operating_state is PAUSED:
+        return (Event.RESUME,)
+    commands: list[Event] = []
+    needs_homing = state.needs_homing or not is_homed
+    if state.operating_state is FAULTED:
+        commands.append(Event.CLEAR_FAULT)
+        for fault in state.faults:
+            if FAULTS[fault].position is not Position.KEPT:
+                needs_homing = True
+    if needs_homing:
+        commands.append(Event.HOME)
+    commands.append(Event.ENABLE)
+    return tuple(commands)
+
+
 def reason(name: str, source: OperatingState) -> str:
     """What the log says of a command that was taken in `source`: where it led, and why. Empty where none is taken."""
     row = TRANSITIONS[Event(name), source]

@@ -125,6 +125,7 @@ class MessageDevice:
         "_is_state_damaged",
         "_is_switch_dead_left",
         "_is_switch_stuck_left",
+        "_is_worn",
         "_jitter",
         "_jitter_s",
         "_left_boot_counts",
@@ -192,6 +193,7 @@ class MessageDevice:
         self._has_other_schema = False
         self._is_left_motor_dead = False
         self._is_hot = False
+        self._is_worn = False
         self._stuck_handle: int | None = None
         self._frozen_until_s = -math.inf
         self._answering_every = 1
@@ -381,9 +383,42 @@ class MessageDevice:
             right_counts + self._right_extra_counts,
         )
 
+    def _count_on(self, stuck_left: int | None, left_count_sign: int) -> None:
+        """The left encoder counts another way from where it stands."""
+        (left_rad, _), (right_rad, _) = self.plant.shafts
+        left_counts, _ = self._encoders(left_rad, right_rad)
+        self._has_bad_encoders = True
+        self._stuck_left, self._left_count_sign = stuck_left, left_count_sign
+        self._left_extra_counts += left_counts - self._encoders(left_rad, right_rad)[0]
+
+    def mend(self) -> None:
+        """Ends, at the time of the last `advance`, whatever a fault does to the device.
+
+        What came of it stays: a firmware that was reset, counts that an encoder gained or missed, what was latched.
+        """
+        plant, parameters, time_s = self.plant, self.parameters, self._time_s
+        if self._is_worn:
+            self._is_worn = False
+            plant.wear(1.0 / WEAR)
+        plant.left.drag_N, plant.right.drag_N = parameters.screw.drag_left_N, parameters.screw.drag_right_N
+        for axis in (plant.left, plant.right):
+            axis.backlash_m = 0.5e-6 * parameters.screw.backlash_um
+        self._supply_V = parameters.electronics.supply_V
+        self._silent = 0
+        self._deaf = self._is_hot = self._has_hit_left = self._has_other_schema = self._is_state_damaged = False
+        self._is_left_motor_dead = self._is_switch_dead_left = self._is_switch_stuck_left = False
+        self._stuck_handle = None
+        self._answering_every = 1
+        self._left_motor_sign = self._duty_sign = 1.0
+        if self._stuck_left is not None or self._left_count_sign < 0:
+            self._count_on(None, 1)
+        self._run_clock_at(time_s, 1.0 + parameters.firmware.clock_ppm * 1e-6)
+        self._switch()
+
     def _strike(self, time_s: float, fault: Fault) -> None:
         match fault.name:
             case "worn_gearbox":
+                self._is_worn = True
                 self.plant.wear(WEAR)
             case "drag_left":
                 self.plant.left.drag_N *= 1.0 + fault.percent / 100.0
@@ -436,11 +471,7 @@ class MessageDevice:
                 if fault.name == "encoder_jump":
                     self._right_extra_counts += counts
             case "encoder_reversed_left":
-                (left_rad, _), (right_rad, _) = self.plant.shafts
-                left_counts, _ = self._encoders(left_rad, right_rad)
-                self._has_bad_encoders = True
-                self._left_count_sign = -self._left_count_sign
-                self._left_extra_counts += left_counts - self._encoders(left_rad, right_rad)[0]
+                self._count_on(None, -self._left_count_sign)
             case "motor_reversed_left":
                 self._left_motor_sign = -1.0
                 self._switch()
@@ -451,12 +482,15 @@ class MessageDevice:
                 self._is_switch_dead_left = True
             case "clock":
                 rate = self._rate * (1.0 + fault.percent / 100.0)
-                # the clock goes on from where it is
-                self._boot_s = time_s - (time_s - self._boot_s) * self._rate / rate
-                self._rate = rate
-                self._tick_due_s = self._boot_s + (self._ticks + 1) * TICK_S / rate
+                self._run_clock_at(time_s, rate)
             case _:
                 raise ValueError(f"fault {fault.name!r} has no effect defined")
+
+    def _run_clock_at(self, time_s: float, rate: float) -> None:
+        """The clock goes on from where it is."""
+        self._boot_s = time_s - (time_s - self._boot_s) * self._rate / rate
+        self._rate = rate
+        self._tick_due_s = self._boot_s + (self._ticks + 1) * TICK_S / rate
 
 
 class SerialDevice(Protocol):

@@ -1,0 +1,105 @@
+"""A handle whose encoder is lost: what its force shows, and what no resting hand's does."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+
+from tormagd.control.handle import FORGETS_S, MODEL_RISES_N, RISES_N, SETTLES_S, STANDS_MM, UNHEARD, HandleWatch
+
+PERIOD_S = 0.002
+STIFFEST_N_MM = 12.0
+"Of a believable elastomer."
+
+
+def watched(
+    duration_s: float,
+    handle_mm: Callable[[float], float],
+    force_N: Callable[[float], float],
+    model_N: Callable[[float], float],
+    watch: HandleWatch = UNHEARD,
+) -> HandleWatch:
+    """After so long of readings, of functions of time; time goes on from the reading before."""
+    from_s = max(watch.heard_s, 0.0)
+    for reading in range(1, round(duration_s / PERIOD_S) + 1):
+        now_s = from_s + reading * PERIOD_S
+        watch = watch.heard(now_s, handle_mm(now_s), force_N(now_s), model_N(now_s))
+    return watch
+
+
+def still(now_s: float) -> float:
+    """A handle that stands, or says so."""
+    return 3.0
+
+
+def swinging(now_s: float) -> float:
+    """A force, or what the model gives at the gap."""
+    return 1.5 + 0.2 * math.sin(math.tau * now_s)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_force_that_swings_with_the_gap_under_a_handle_that_stands_is_a_lost_encoder(sign: float) -> None:
+    watch = watched(SETTLES_S + 1.5, still, lambda now_s: sign * swinging(now_s), swinging)
+    assert watch.is_lost
+
+
+def test_it_is_lost_until_it_moves() -> None:
+    lost = watched(2.0, still, swinging, swinging)
+    assert watched(10.0, lambda now_s: 3.0 + 0.9 * STANDS_MM, lambda now_s: 1.5, swinging, lost).is_lost
+    assert not watched(PERIOD_S, lambda now_s: 3.0 + 1.1 * STANDS_MM, swinging, swinging, lost).is_lost
+
+
+def test_friction_at_rest_falls_with_the_gap_and_does_not_come_back() -> None:
+    """What a hand leaves of its force when it rests: no more than the open gap held, however it closes again."""
+    watch, held_N = UNHEARD, 2.0
+    for reading in range(1, 5_000):
+        held_N = min(held_N, swinging(reading * PERIOD_S))
+        watch = watch.heard(reading * PERIOD_S, 3.0, held_N, swinging(reading * PERIOD_S))
+        assert not watch.is_lost
+
+
+@pytest.mark.parametrize("speed_mm_s", [-42.0, -0.1, 0.1, 0.5, 42.0])
+def test_a_handle_that_moves_is_none_that_is_lost(speed_mm_s: float) -> None:
+    assert not watched(5.0, lambda now_s: speed_mm_s * now_s, swinging, swinging).is_lost
+
+
+def test_a_hand_that_presses_within_a_count_is_a_resting_one() -> None:
+    """What bends of the stiffest elastomer before its encoder could show it."""
+    assert STIFFEST_N_MM * STANDS_MM < RISES_N
+
+    def pressing(now_s: float) -> float:
+        return 1.0 + STIFFEST_N_MM * STANDS_MM / 2.0 * math.sin(math.tau * now_s)
+
+    assert not watched(10.0, still, pressing, swinging).is_lost
+
+
+def test_a_force_that_leaps_while_the_gap_stands_is_the_sensors_own() -> None:
+    watch = watched(2.0, still, lambda now_s: 1.5, lambda now_s: 1.5)
+    assert not watched(2.0, still, lambda now_s: 2.3, lambda now_s: 1.5 + 0.9 * MODEL_RISES_N, watch).is_lost
+
+
+def test_what_the_handles_last_motion_leaves_is_not_taken_for_a_rise() -> None:
+    """The rate's filter and the sensor's delay say something of a motion for a while after it."""
+
+    def still_moving(now_s: float) -> float:
+        return 2.0 - math.exp(-now_s / 0.05)
+
+    assert not watched(3.0, still, still_moving, still_moving).is_lost
+
+
+def test_a_zero_that_drifts_is_forgotten() -> None:
+
+    def drifting(now_s: float) -> float:
+        return 1.0 + 0.3 * RISES_N / FORGETS_S * now_s
+
+    assert not watched(20.0 * FORGETS_S, still, drifting, swinging).is_lost
+
+
+def test_a_silence_and_times_that_are_none_are_no_time_of_standing() -> None:
+    watch = watched(0.6, still, swinging, swinging)
+    assert not watch.is_lost
+    assert watch.heard(watch.heard_s, 9.0, 9.0, 9.0) is watch
+    assert watch.heard(math.nan, 9.0, 9.0, 9.0) is watch
+    assert watch.heard(watch.heard_s + 60.0, 3.0, 9.0, 9.0).still_s == 0.0
+    endless = watch.heard(math.inf, 3.0, 1.0, 1.0)
+    assert endless.heard(math.inf, 3.0, 1.0, 1.0) is endless
