@@ -26,7 +26,7 @@ STATE_COMMANDS = {
     "stop": "open the gap and latch; needs clear-fault",
     "clear-fault": "forget latched faults; stays disabled",
 }
-EXTRAS = {"mcap": "record", "zstandard": "record", "matplotlib": "plot", "tqdm": "lab"}
+EXTRAS = {"mcap": "record", "zstandard": "record", "matplotlib": "plot", "rich": "top", "tqdm": "lab"}
 SHELLS = ("bash", "zsh")
 KEY, SERVER_KEY = "TORMAG_KEY", "TORMAG_SERVER_KEY"
 "Environment variables that stand for `--key` and `--server-key`."
@@ -129,6 +129,10 @@ def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
         match options.command:
             case "status":
                 return status(client)
+            case "top":
+                from tormagd.ctl.top import top
+
+                return top(client)
             case "firmware":
                 return firmware(client)
             case "blackbox":
@@ -272,6 +276,7 @@ def parser() -> argparse.ArgumentParser:
         return commands.add_parser(name, help=help_text, description=help_text, parents=[shared], epilog=EXIT_TEXT)
 
     command("status", "what the daemon is doing")
+    command("top", "the same live in this terminal: force, gap, field, timing, and what holds the force back; q ends")
     command("firmware", "who is at the other end of the wire, and how well the wire carries")
     command("ports", "where a device could be connected, and who holds what is there")
     for name, help_text in STATE_COMMANDS.items():
