@@ -112,7 +112,9 @@ def test_a_daemon_describes_what_it_runs(core: Core, tmp_path: Path) -> None:
         assert told is not None
         assert told.force_N == pytest.approx(shown.force_N[::5], abs=1e-4)
         speed_mm_s = described.configuration["position"]["gap_speed_mm_s"]
-        assert told.rate_N_s == pytest.approx([shown.force_rate_N_s(f, speed_mm_s) for f in shown.force_N[::5]], abs=1e-4)
+        assert told.rate_N_s == pytest.approx(
+            [shown.force_rate_N_s(f, speed_mm_s) for f in shown.force_N[::5]], abs=1e-4
+        )
 
     run(core, tmp_path, operate)
 

@@ -1,0 +1,158 @@
+"""The pictures of `tormagctl top` and `tormagctl dashboard` in the documentation, of a daemon that runs.
+
+    python tools/screenshots.py --config my.toml --page http://127.0.0.1:8733/ --out docs/images
+
+beside the daemon of `my.toml` and `tormagctl --config my.toml dashboard`. It takes a headless Chromium.
+"""
+
+import argparse
+import asyncio
+import base64
+import itertools
+import shutil
+import tempfile
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from aiohttp import ClientSession, ClientWebSocketResponse
+from rich.console import Console
+
+from tormagd.client.blocking import Client
+from tormagd.config import load_config
+from tormagd.ctl.top import REDRAW_S, Watcher
+from tormagd.ctl.top_screen import Seen, screen
+
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), ""
+)
+OPTIONS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars")
+
+
+PHONE = 600
+"A narrower window is a phone's."
+TERMINALS = ((80, 24), (160, 50))
+PAGES = {"wide": (1440, 900), "phone": (390, 844)}
+WATCHED_S = 22.0
+"Until all that is shown is of the run."
+
+
+class Page:
+    """One page. `complaints` are its errors, and what its content policy has refused."""
+
+    def __init__(self, socket: ClientWebSocketResponse) -> None:
+        self._socket, self._ids = socket, itertools.count(1)
+        self.complaints: list[str] = []
+
+    async def tell(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """The result of a command of the protocol."""
+        number = next(self._ids)
+        await self._socket.send_json({"id": number, "method": method, "params": parameters})
+        while True:
+            said = await self._socket.receive_json()
+            if said.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
+                self.complaints.append(str(said["params"]))
+            if said.get("id") == number:
+                if "error" in said:
+                    raise RuntimeError(f"{method}: {said['error']}")
+                result: dict[str, Any] = said["result"]
+                return result
+
+    async def open(self, address: str, width: int, height: int) -> None:
+        """Goes to a page, in a window of this size."""
+        for domain in ("Runtime", "Log", "Page"):
+            await self.tell(f"{domain}.enable")
+        await self.resize(width, height)
+        await self.tell("Page.navigate", url=address)
+
+    async def resize(self, width: int, height: int) -> None:
+        """Gives the window another size."""
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < PHONE}
+        await self.tell("Emulation.setDeviceMetricsOverride", **metrics)
+
+    async def ask(self, expression: str) -> Any:
+        """The value of a JavaScript expression."""
+        said = await self.tell("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        if "exceptionDetails" in said:
+            raise RuntimeError(f"{expression}: {said['exceptionDetails']}")
+        return said["result"].get("value")
+
+    async def until(self, expression: str) -> None:
+        """Waits for it to be true."""
+        while not await self.ask(expression):
+            await asyncio.sleep(0.05)
+
+    async def picture(self, path: Path) -> None:
+        """What the window shows, as PNG."""
+        said = await self.tell("Page.captureScreenshot")
+        path.write_bytes(base64.b64decode(said["data"]))
+
+
+@asynccontextmanager
+async def browser(profile: Path) -> AsyncIterator[Page]:
+    """A browser of its own, with its files in the folder `profile`; ends with it."""
+    process = await asyncio.create_subprocess_exec(
+        CHROMIUM,
+        *OPTIONS,
+        f"--user-data-dir={profile}",
+        "--remote-debugging-port=0",
+        "about:blank",
+        stderr=asyncio.subprocess.PIPE,
+    )
+    try:
+        assert process.stderr is not None  # a pipe
+        async for line in process.stderr:
+            if b"DevTools listening on ws://" in line:
+                port = line.split(b":")[2].split(b"/")[0].decode()
+                break
+        async with ClientSession() as session:
+            async with session.get(f"http://127.0.0.1:{port}/json") as answer:
+                target = next(each for each in await answer.json() if each["type"] == "page")
+            async with session.ws_connect(target["webSocketDebuggerUrl"], max_msg_size=1 << 26) as socket:
+                yield Page(socket)
+    finally:
+        process.kill()
+        await process.wait()
+
+
+def look(config: Path | None) -> Seen:
+    """What `tormagctl top` would have gathered of the daemon by now."""
+    with Client(load_config(config).endpoints) as client:
+        watcher, end_s = Watcher(client), time.monotonic() + WATCHED_S
+        while time.monotonic() < end_s:
+            seen = watcher.look()
+            time.sleep(REDRAW_S)
+        return seen
+
+
+async def main(config: Path | None, address: str, out: Path) -> None:
+    """Takes all of them."""
+    seen = look(config)
+    with tempfile.TemporaryDirectory() as folder:
+        async with browser(Path(folder)) as page:
+            for width, height in TERMINALS:
+                drawn = Path(folder, "top.svg")
+                console = Console(width=width, height=height, record=True, quiet=True, force_terminal=True)
+                console.print(screen(seen, width, height))
+                console.save_svg(str(drawn), title="tormagctl top")
+                await page.open(drawn.as_uri(), 1200, 900)
+                box = await page.ask("(({width, height}) => [width, height])(document.documentElement.viewBox.baseVal)")
+                await page.resize(*(round(size * 1000 / box[0]) for size in box))
+                await page.picture(out / f"top_{width}x{height}.png")
+            for name, (width, height) in PAGES.items():
+                await page.open(address, width, height)
+                await asyncio.sleep(1.0)
+                await page.resize(width, await page.ask("document.documentElement.scrollHeight"))
+                await asyncio.sleep(1.0)
+                await page.picture(out / f"dashboard_{name}.png")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--config", type=Path)
+    parser.add_argument("--page", default="http://127.0.0.1:8733/")
+    parser.add_argument("--out", type=Path, default=Path("docs/images"))
+    options = parser.parse_args()
+    asyncio.run(main(options.config, options.page, options.out))
