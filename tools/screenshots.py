@@ -52,8 +52,9 @@ class Page:
         await self._socket.send_json({"id": number, "method": method, "params": parameters})
         while True:
             said = await self._socket.receive_json()
-            if said.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
-                self.complaints.append(str(said["params"]))
+            known = said.get("params", {})
+            if "exceptionDetails" in known or known.get("entry", {}).get("level") == "error":
+                self.complaints.append(str(known))
             if said.get("id") == number:
                 if "error" in said:
                     raise RuntimeError(f"{method}: {said['error']}")

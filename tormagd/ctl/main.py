@@ -88,6 +88,10 @@ def _run(options: argparse.Namespace) -> Outcome:
             from tormagd.ctl.dashboard import dashboard
 
             return dashboard(endpoints, options.file, options.port, options.wait)
+        case "metrics":
+            from tormagd.ctl.metrics import metrics
+
+            return metrics(endpoints, options.port, options.wait)
         case "replay":
             from tormagd.ctl.replay import replay
 
@@ -382,6 +386,9 @@ def parser() -> argparse.ArgumentParser:
     )
     page.add_argument("file", type=Path, nargs="?", metavar="FILE.mcap", help="the recording; live without")
     page.add_argument("--port", type=_port, default=8733, metavar="N", help="of 127.0.0.1 (8733); 0: one that is free")
+
+    exporting = command("metrics", "what status says, for Prometheus: printed once, or served with --port")
+    exporting.add_argument("--port", type=_port, metavar="N", help="of 127.0.0.1, for Prometheus to scrape")
 
     scene = command("scene", "list the scenes, or show, check or explain one (default: the configuration's)")
     scene.add_argument(
