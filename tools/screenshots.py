@@ -8,6 +8,7 @@ beside the daemon of `my.toml` and `tormagctl --config my.toml dashboard`. It ta
 import argparse
 import asyncio
 import base64
+import io
 import itertools
 import shutil
 import tempfile
@@ -135,16 +136,16 @@ async def main(config: Path | None, address: str, out: Path) -> None:
         async with browser(Path(folder)) as page:
             for width, height in TERMINALS:
                 drawn = Path(folder, "top.svg")
-                console = Console(width=width, height=height, record=True, quiet=True, force_terminal=True)
+                console = Console(width=width, height=height, record=True, file=io.StringIO(), force_terminal=True)
                 console.print(screen(seen, width, height))
                 console.save_svg(str(drawn), title="tormagctl top")
                 await page.open(drawn.as_uri(), 1200, 900)
                 box = await page.ask("(({width, height}) => [width, height])(document.documentElement.viewBox.baseVal)")
-                await page.resize(*(round(size * 1000 / box[0]) for size in box))
+                await page.resize(*map(round, box))
                 await page.picture(out / f"top_{width}x{height}.png")
             for name, (width, height) in PAGES.items():
                 await page.open(address, width, height)
-                await asyncio.sleep(1.0)
+                await page.until("document.querySelector('#late td') !== null && portrait !== null")
                 await page.resize(width, await page.ask("document.documentElement.scrollHeight"))
                 await asyncio.sleep(1.0)
                 await page.picture(out / f"dashboard_{name}.png")

@@ -67,9 +67,17 @@ def test_the_screen_fits_and_says_what_the_device_does(seen: Seen, width: int, h
     assert len(lines) <= height
     assert all(len(line) <= width for line in lines)
     text = "\n".join(lines)
-    for said in ("ENABLED", "homed", "up 2.0 h", "warning, 1000 Hz, late 41 us (p50) 304 us (p99), 3 stalls"):
+    for said in ("ENABLED", "homed", "up 2.0 h", "warning, 1000 Hz, late 41 us (p50) 304 us (p99), stalls 3"):
         assert said in text
-    for said in ("RUNNING", "round trip 0.40 ms", "RATE 10% of the time", "next: ask for slower changes"):
+    for said in (
+        "control",
+        "inference",
+        "setpoints",
+        "RUNNING",
+        "round trip 0.40 ms",
+        "RATE 10% of the time",
+        "next: ask for slower changes",
+    ):
         assert said in text
     assert all(any(line.strip().startswith(curve.label) for line in lines) for curve in CURVES)
     # a sine fills its rows from bottom to top

@@ -65,7 +65,7 @@ def screen(seen: Seen, width: int, height: int) -> RenderableType:
     parts = (
         _head(seen, wide),
         _curves(seen, wide, max(more, 1), is_apart=more > 0),
-        _timing(seen.status),
+        _timing(seen.status, wide),
         _codes(seen, wide),
     )
     return Padding(Group(*(line for part in parts for line in (part, Text()))), (0, 1))
@@ -74,7 +74,8 @@ def screen(seen: Seen, width: int, height: int) -> RenderableType:
 def _head(seen: Seen, width: int) -> Text:
     newest, status = seen.telemetry[-1] if seen.telemetry else seen.status, seen.status
     state = printable(newest.operating_state)
-    head = Text(f" {state} ", STATE_STYLES.get(state, "reverse"), no_wrap=True, overflow="ellipsis")
+    head = Text(no_wrap=True, overflow="ellipsis")
+    head.append(f" {state} ", STATE_STYLES.get(state, "reverse"))
     flags = ["homed" if newest.is_homed else "not homed", *(["busy"] if newest.is_busy else [])]
     head.append(f"  {', '.join(flags)}", "" if newest.is_homed else "yellow")
     if seen.silent_s > SILENT_S:
@@ -118,22 +119,22 @@ def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
     return table
 
 
-def _grid(*widths: int | None) -> Table:
-    """Columns of these widths; one without takes what is left and is cut where that is not enough."""
+def _grid(*widths: int) -> Table:
+    """Columns of these widths; what is longer is cut."""
     table = Table.grid(padding=(0, 1, 0, 0))
     for width in widths:
         table.add_column(width=width, no_wrap=True, overflow="ellipsis")
     return table
 
 
-def _timing(status: Status) -> Table:
+def _timing(status: Status, width: int) -> Table:
     """How well the loops keep their time, how the wire carries, and who publishes."""
-    table = _grid(LABEL, None)
+    table = _grid(LABEL, width - LABEL - 1)
     for name in ("control", "inference"):
         group = status.rates.get(name)
         if group is not None:
             late = group.lateness_us
-            said = f", {group.hz:.0f} Hz, late {late.p50:.0f} us (p50) {late.p99:.0f} us (p99), {group.stalls} stalls"
+            said = f", {group.hz:.0f} Hz, late {late.p50:.0f} us (p50) {late.p99:.0f} us (p99), stalls {group.stalls}"
             table.add_row(
                 Text(name, "bold"), Text.assemble((group.grade, GRADE_STYLES.get(group.grade, "green")), said)
             )
@@ -141,7 +142,7 @@ def _timing(status: Status) -> Table:
     trip = "" if trip_us is None else f", round trip {trip_us.p50 * 1e-3:.2f} ms (p50)"
     state = (link.state, "green" if link.state == "RUNNING" else "red")
     table.add_row(
-        Text("link", "bold"), Text.assemble(state, f", {link.losses} losses{trip}, {link.backend} {link.port}")
+        Text("link", "bold"), Text.assemble(state, f", losses {link.losses}{trip}, {link.backend} {link.port}")
     )
     heard = f"from {setpoints.newest_source!r}" if setpoints.accepted else "none yet"
     table.add_row(Text("setpoints", "bold"), f"{heard}, {setpoints.accepted} accepted, {setpoints.refused} refused")
@@ -158,7 +159,7 @@ def _codes(seen: Seen, width: int) -> Table:
     for code in newest.faults:
         table.add_row(Text("FAULT", "bold red"), _code(code, "", "bold red", seen.explained))
     for code, count in times.most_common():
-        share = f" {count / len(seen.telemetry):.0%} of the time"
+        share = f" {_percent(count / len(seen.telemetry))} of the time"
         style = "yellow" if code in newest.limits else "dim yellow"
         table.add_row(Text("held by", style), _code(code, share, style, seen.explained))
     if not table.row_count:
@@ -166,11 +167,14 @@ def _codes(seen: Seen, width: int) -> Table:
     return table
 
 
+def _percent(share: float) -> str:
+    return "under 1%" if share < 0.01 else f"{share:.0%}"
+
+
 def _code(code: str, how_long: str, style: str, explained: Mapping[str, Explained]) -> Text:
-    text = Text(printable(code), style)
-    text.append(how_long, "default")
+    text = Text.assemble((printable(code), style), how_long)
     known = explained.get(code)
     if known is not None:
-        text.append(f": {known.cause}", "default")
+        text.append(f": {known.cause}")
         text.append(f"\nnext: {known.remedy}", "italic")
     return text
