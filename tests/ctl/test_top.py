@@ -35,7 +35,9 @@ def seen(status_with, telemetry_with) -> Seen:
     rate = {"grade": "warning", "hz": 1000.0, "runs": 9, "merged": 1, "overruns": 2, "stalls": 3}
     times = {"p50": 41.0, "p99": 304.0, "p999": 500.0, "max": 900.0}
     rate |= {"lateness_us": times | {"worst": 2000.0}, "exec_us": times}
-    known = msgspec.convert(status_with(rates={"control": rate, "inference": rate}, uptime_s=7200.0), Status)
+    link = status_with()["link"] | {"port": f"/tmp/{'a-port-with-a-long-name' * 9}"}
+    loops = {"control": rate, "inference": rate}
+    known = msgspec.convert(status_with(rates=loops, link=link, uptime_s=7200.0), Status)
     snapshots = [
         telemetry_with(
             k,
@@ -69,17 +71,10 @@ def test_the_screen_fits_and_says_what_the_device_does(seen: Seen, width: int, h
     text = "\n".join(lines)
     for said in ("ENABLED", "homed", "up 2.0 h", "warning, 1000 Hz, late 41 us (p50) 304 us (p99), stalls 3"):
         assert said in text
-    for said in (
-        "control",
-        "inference",
-        "setpoints",
-        "RUNNING",
-        "round trip 0.40 ms",
-        "RATE 10% of the time",
-        "next: ask for slower changes",
-    ):
+    for said in ("RUNNING", "round trip 0.40 ms", "RATE 10% of the time", "next: ask for slower changes"):
         assert said in text
-    assert all(any(line.strip().startswith(curve.label) for line in lines) for curve in CURVES)
+    labels = ("control", "inference", "link", "setpoints", *(curve.label for curve in CURVES))
+    assert all(any(line.startswith(f" {label} ") for line in lines) for label in labels)
     # a sine fills its rows from bottom to top
     assert {"▁", "█"} <= set(text)
 
