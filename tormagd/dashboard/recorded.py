@@ -37,8 +37,9 @@ class Recorded:
         self._late = series(recording, "lateness_us") or series(recording, "tick.lateness_us")
         self._states = bands(recording, "operating_state")
         self._limits, self._faults = bands(recording, "limits"), bands(recording, "faults")
-        last_ns = max(int(each.t_ns.max()) for each in (recording.ticks, recording.telemetry) if each.t_ns.size)
-        self.duration_s = (last_ns - self._start_ns) * 1e-9
+        # the curves are the ticks' where there are any, and end with them
+        shown = recording.ticks if recording.ticks.t_ns.size else recording.telemetry
+        self.duration_s = (int(shown.t_ns.max()) - self._start_ns) * 1e-9
 
     @property
     def about(self) -> dict[str, Any]:

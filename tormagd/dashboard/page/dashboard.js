@@ -86,14 +86,17 @@ function path(forces) {
   return points;
 }
 
+// around the forces of the time shown, or the whole of it before there are any
 function portraitForces() {
-  const forces = portrait?.force_N ?? kept.asked_N.filter((force) => known(force));
-  return forces.length ? atLeast(0.1)(null, Math.min(...forces), Math.max(...forces)) : [0, 1];
+  const shown = [...kept.asked_N, ...kept.governed_N].filter((force) => known(force));
+  const forces = shown.length ? shown : portrait?.force_N ?? [0];
+  return atLeast(1)(null, Math.min(...forces), Math.max(...forces));
 }
 
 function portraitRates() {
-  const rates = portrait?.rate_N_s ?? path(kept.asked_N).map(([, change]) => Math.abs(change));
-  const most = 1.15 * Math.max(1, ...rates);
+  const [, most_N] = portraitForces();
+  const renderable = portrait?.rate_N_s.filter((rate_N_s, i) => portrait.force_N[i] <= most_N) ?? [];
+  const most = 1.15 * Math.max(1, ...renderable, ...path(kept.asked_N).map(([, change]) => Math.abs(change)));
   return [-most, most];
 }
 
