@@ -246,10 +246,13 @@ def test_the_command_says_where_it_serves_and_ends_in_order(fake_daemon: Any) ->
     command = [sys.executable, "-m", "tormagd.ctl.main", "--endpoint", fake_daemon.control, "--wait", "5", "--json"]
     command += ["dashboard", "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        assert process.stderr.readline().startswith("tormagctl dashboard: http://127.0.0.1:")
-        process.send_signal(signal.SIGINT)
-        said, _ = process.communicate(timeout=20.0)
+        try:
+            assert process.stderr is not None
+            assert any(line.startswith("tormagctl dashboard: http://127.0.0.1:") for line in process.stderr)
+            process.send_signal(signal.SIGINT)
+            said, _ = process.communicate(timeout=60.0)
+        finally:
+            process.kill()
     assert process.returncode == 0
     assert json.loads(said)["ok"]
 
