@@ -16,7 +16,7 @@ import pytest
 import zmq
 from aiohttp import ClientResponse
 from aiohttp.test_utils import TestClient, TestServer
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from screenshots import CHROMIUM, Page, browser
 
@@ -218,6 +218,7 @@ def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
     assert [held.is_now for held in recorded.frame(6.0).held] == [True]
 
 
+@settings(max_examples=25)
 @given(at_s=st.floats(-1e300, 1e300) | st.floats(0.0, SECONDS))
 def test_every_moment_has_a_frame(recorded: Recorded, at_s: float) -> None:
     frame = msgspec.json.decode(msgspec.json.encode(recorded.frame(at_s)), type=Frame)
