@@ -10,8 +10,8 @@ SEARCHES ?= 5
 DESTDIR ?=
 PREFIX ?= /usr/local
 LIBRARY := $(PREFIX)/lib/tormagd
-# what the service's users have besides: recordings, their pictures, calibration
-SERVICE_EXTRAS ?= record,plot,lab
+# what the service's users have besides: recordings, their pictures, calibration, and what they look at it with
+SERVICE_EXTRAS ?= record,plot,lab,top,dashboard,metrics
 
 export OMP_NUM_THREADS ?= 1
 
@@ -115,7 +115,7 @@ deb: $(VENV)/.man
 	    sys.exit(None if a == v else f"the package runs with Python {a}, but .venv has {v}: make clean, make deb PYTHON=/usr/bin/python3")'
 	rm -rf build/library
 	$(PIP_TO) build/library --no-deps .
-	$(BIN)/python tools/dependencies.py record plot | grep -v '^torch=' > build/requirements.txt
+	$(BIN)/python tools/dependencies.py record plot top dashboard metrics | grep -v '^torch=' > build/requirements.txt
 	$(PIP_TO) build/library --requirement build/requirements.txt
 	rm -rf build/library/bin
 	BUILD_PYTHON=$(BIN)/python BUILD_LIBRARY='$(CURDIR)/build/library' systemd/deb.sh build/library build

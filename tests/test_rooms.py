@@ -35,7 +35,8 @@ MAY_IMPORT = {
     "daemon": LOWEST | FILES | {"output", "keys", "keeping", "scenes", "safety", "hardware", "control"},
     "recording": FILES | {"messages", "output", "keeping"},
     "client": {"config", "keys", "messages", "output"},
-    "ctl": FILES | {"client", "config", "messages", "output", "keys", "scenes", "recording"},
+    "dashboard": {"client", "messages", "output", "recording", "safety"},
+    "ctl": FILES | {"dashboard", "client", "config", "messages", "output", "keys", "scenes", "recording"},
     "simulation": FILES | {"physics", "firmware_protocol", "output"},
     "headroom": {"config", "output", "daemon", "control", "simulation", "closed_loop"},
     "replay": LOWEST

@@ -362,6 +362,14 @@ class Status(Telemetry, frozen=True, kw_only=True):
     next_commands: tuple[str, ...] = ()
 
 
+class PortraitReport(msgspec.Struct, frozen=True, kw_only=True):
+    """The device's phase portrait, as far as it has shown itself: forces, rising, and how fast each may change at most,
+    either way, by the speed of the gap."""
+
+    force_N: tuple[float, ...]
+    rate_N_s: tuple[float, ...]
+
+
 class Description(msgspec.Struct, frozen=True, kw_only=True):
     """The answer to the command `describe`: what a recording is of. What is not known is null."""
 
@@ -373,6 +381,7 @@ class Description(msgspec.Struct, frozen=True, kw_only=True):
     profile: ProfileReport
     firmware: str | None
     serial_number: int | None
+    portrait: PortraitReport | None = None
 
 
 class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):

@@ -228,6 +228,12 @@ def status_with() -> Callable[..., dict[str, Any]]:
 
 
 @pytest.fixture
+def telemetry_with() -> Callable[..., Telemetry]:
+    """Makes a snapshot, of a number and a time in ns, with some keys changed."""
+    return telemetry
+
+
+@pytest.fixture
 def source_with() -> Callable[..., dict[str, Any]]:
     """Makes what the daemon says of a source with some keys changed."""
     return lambda **changes: SOURCE | changes

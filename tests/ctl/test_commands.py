@@ -469,7 +469,8 @@ def test_status_text_shows_each_source_and_the_way(status_with, source_with):
 def test_a_command_loads_only_what_it_needs(command, run_dir):
     script = (
         "import sys; from tormagd.ctl.main import main; main(sys.argv[1:]);"
-        "print([m for m in ('torch', 'matplotlib', 'can', 'mcap', 'numpy', 'scipy', 'tormagd.daemon', 'serial')"
+        "print([m for m in ('torch', 'matplotlib', 'can', 'mcap', 'numpy', 'scipy', 'tormagd.daemon', 'serial',"
+        "'rich', 'aiohttp', 'prometheus_client')"
         " if m in sys.modules], file=sys.stderr)"
     )
     ran = subprocess.run(

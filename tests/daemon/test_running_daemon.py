@@ -107,6 +107,14 @@ def test_a_daemon_describes_what_it_runs(core: Core, tmp_path: Path) -> None:
         assert described.configuration["realtime"]["watchdog_ms"] == WATCHDOG_MS
         assert (described.model, described.build) == (core.model, str(settle()))
         assert (described.firmware, described.serial_number) == (None, None)
+        # a device that has shown nothing yet is the model, at the gap speed of the configuration
+        shown, told = core.planner.portrait, described.portrait
+        assert told is not None
+        assert told.force_N == pytest.approx(shown.force_N[::5], abs=1e-4)
+        speed_mm_s = described.configuration["position"]["gap_speed_mm_s"]
+        assert told.rate_N_s == pytest.approx(
+            [shown.force_rate_N_s(f, speed_mm_s) for f in shown.force_N[::5]], abs=1e-4
+        )
 
     run(core, tmp_path, operate)
 

@@ -21,6 +21,7 @@ from tormagd.messages import (
     OutputReport,
     PeerReport,
     PeersReport,
+    PortraitReport,
     ProfileReport,
     RateReport,
     RoundTripReport,
@@ -76,7 +77,8 @@ V1: dict[type[msgspec.Struct], str] = {
     "device_temperature_C left_current_A right_current_A supply_V reference_gap_mm measured_cf left_mm right_mm "
     "handle_mm handle_rate_mm_s operating_state limits step_limits faults drive_mode left_duty right_duty request "
     "request_number lateness_us exec_us tick",
-    Description: "version build configuration scene model profile firmware serial_number",
+    Description: "version build configuration scene model profile firmware serial_number portrait",
+    PortraitReport: "force_N rate_N_s",
 }
 "The keys of `v: 1`, each with the meaning and the unit that docs/messages.md gives it."
 WORDS = {int: "int", float: "float", str: "str", bool: "bool", Any: "any"}

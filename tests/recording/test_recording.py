@@ -15,8 +15,9 @@ from mcap.reader import make_reader
 
 from tormagd.messages import MessageError, Telemetry, Tick, encode
 from tormagd.recording.closing import close_cut
-from tormagd.recording.plot import bands, figure, save_plot, series, tracking_rms_N
+from tormagd.recording.plot import figure, save_plot
 from tormagd.recording.reader import Recording, RecordingError, read_recording
+from tormagd.recording.series import bands, series, tracking_rms_N
 from tormagd.recording.ticks import TickBatch, decode_ticks
 from tormagd.recording.writer import RecordingWriter, telemetry_schema
 

@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+from tormagd import __version__
 from tormagd.output import printable
 
 
@@ -38,6 +39,15 @@ class UnreachableError(ClientError):
 
 class SettingError(ClientError):
     """An address or a key file that cannot be used."""
+
+
+def not_understood(what: str, why: Exception) -> UnreachableError:
+    """What was heard is of another version's making, or of another program's."""
+    return UnreachableError(
+        "unintelligible",
+        f"the {what} that came is not what tormagctl {__version__} knows: {why}",
+        "check the endpoint; install tormagd and tormagctl of the same version",
+    )
 
 
 def unreachable(address: str, what: str) -> UnreachableError:

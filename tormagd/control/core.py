@@ -54,6 +54,8 @@ class Core(NamedTuple):
     "The model's fingerprint."
     models: Path
     "Where the scene's model was looked for, where it is no shipped one."
+    gap_speed_mm_s: float
+    "The fastest that the gap is moved."
     missed: Missed | None = None
     "What the gap's speed alone leaves of the scene's signal; None where it states none."
 
@@ -109,7 +111,8 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
     _refuse_too_sudden(config, scene, reach)
     law_of_field = law_beside(reach, law, field, fitted.elastomer, _geometry(scene.insert))
     planner = Planner(config, scene, model, search, field, reach, law_of_field, cip_percent)
-    return Core(scene, planner, Stepper(config, scene), stability, choice, model.fingerprint, beside, too_fast)
+    stepper, speed_mm_s = Stepper(config, scene), config.position.gap_speed_mm_s
+    return Core(scene, planner, stepper, stability, choice, model.fingerprint, beside, speed_mm_s, too_fast)
 
 
 def sources_hash() -> str:

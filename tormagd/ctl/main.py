@@ -26,7 +26,14 @@ STATE_COMMANDS = {
     "stop": "open the gap and latch; needs clear-fault",
     "clear-fault": "forget latched faults; stays disabled",
 }
-EXTRAS = {"mcap": "record", "zstandard": "record", "matplotlib": "plot", "tqdm": "lab"}
+EXTRAS = {
+    "mcap": "record",
+    "zstandard": "record",
+    "matplotlib": "plot",
+    "rich": "top",
+    "aiohttp": "dashboard",
+    "tqdm": "lab",
+}
 SHELLS = ("bash", "zsh")
 KEY, SERVER_KEY = "TORMAG_KEY", "TORMAG_SERVER_KEY"
 "Environment variables that stand for `--key` and `--server-key`."
@@ -77,6 +84,14 @@ def _run(options: argparse.Namespace) -> Outcome:
             from tormagd.ctl.plot import plot
 
             return plot(options.file, options.output)
+        case "dashboard":
+            from tormagd.ctl.dashboard import dashboard
+
+            return dashboard(endpoints, options.file, options.port, options.wait)
+        case "metrics":
+            from tormagd.ctl.metrics import metrics
+
+            return metrics(endpoints, options.port, options.wait)
         case "replay":
             from tormagd.ctl.replay import replay
 
@@ -129,6 +144,10 @@ def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
         match options.command:
             case "status":
                 return status(client)
+            case "top":
+                from tormagd.ctl.top import top
+
+                return top(client)
             case "firmware":
                 return firmware(client)
             case "blackbox":
@@ -272,6 +291,7 @@ def parser() -> argparse.ArgumentParser:
         return commands.add_parser(name, help=help_text, description=help_text, parents=[shared], epilog=EXIT_TEXT)
 
     command("status", "what the daemon is doing")
+    command("top", "the same live in this terminal: force, gap, field, timing, and what holds the force back; q ends")
     command("firmware", "who is at the other end of the wire, and how well the wire carries")
     command("ports", "where a device could be connected, and who holds what is there")
     for name, help_text in STATE_COMMANDS.items():
@@ -361,6 +381,15 @@ def parser() -> argparse.ArgumentParser:
     plot.add_argument("file", type=Path, metavar="FILE.mcap")
     plot.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.png")
 
+    page = command(
+        "dashboard", "a page for the browser on this machine: the daemon live, or a recording to scrub through"
+    )
+    page.add_argument("file", type=Path, nargs="?", metavar="FILE.mcap", help="the recording; live without")
+    page.add_argument("--port", type=_port, default=8733, metavar="N", help="of 127.0.0.1 (8733); 0: one that is free")
+
+    exporting = command("metrics", "what status says, for Prometheus: printed once, or served with --port")
+    exporting.add_argument("--port", type=_port, metavar="N", help="of 127.0.0.1, for Prometheus to scrape")
+
     scene = command("scene", "list the scenes, or show, check or explain one (default: the configuration's)")
     scene.add_argument(
         "action",
@@ -427,6 +456,10 @@ def _validity(text: str) -> float:
 
 def _preview(text: str) -> float:
     return _within(text, 0.0, 1_000.0, " ms")
+
+
+def _port(text: str) -> int:
+    return int(_within(text, 0, 65_535, ""))
 
 
 def _rates(text: str) -> tuple[float, ...]:

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from tormagd.ctl.outcome import Outcome, usage_error
-from tormagd.recording.plot import bands, save_plot, tracking_rms_N
+from tormagd.recording.plot import save_plot
 from tormagd.recording.reader import RecordingError, read_recording
+from tormagd.recording.series import bands, tracking_rms_N
 
 
 def plot(source: Path, target: Path) -> Outcome:

@@ -26,7 +26,16 @@ from tormagd.daemon.service import READY, Service, status_line
 from tormagd.daemon.telemetry import is_driven, snapshot, tick_record
 from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
-from tormagd.messages import Description, DeviceReport, OutputReport, Request, Status, Telemetry, TickRecord
+from tormagd.messages import (
+    Description,
+    DeviceReport,
+    OutputReport,
+    PortraitReport,
+    Request,
+    Status,
+    Telemetry,
+    TickRecord,
+)
 from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
 from tormagd.scenes.scene import terms_of
 
@@ -35,6 +44,8 @@ MOST_TICKS = 100
 "Ticks in one recording message at most."
 SERVED_BEFORE_NS = 200_000
 "No command is taken up later than this before the next control tick: an answer takes a quarter of it."
+PORTRAIT_STEP = 5
+"Every fifth point of the portrait is told: it is smooth."
 
 log = logging.getLogger(__name__)
 
@@ -225,9 +236,18 @@ class TelemetryLoop:
             profile=self._profiles.report(),
             firmware=link.firmware,
             serial_number=link.serial_number,
+            portrait=self._portrait(),
         )
         described: dict[str, Any] = msgspec.to_builtins(description)
         return described
+
+    def _portrait(self) -> PortraitReport:
+        portrait, device = self._core.planner.portrait, self._inference.state.device
+        scaled_mm_s = device.scale * self._core.gap_speed_mm_s
+        return PortraitReport(
+            force_N=tuple(round(device.force_N(force_N), 4) for force_N in portrait.force_N[::PORTRAIT_STEP]),
+            rate_N_s=tuple(round(scaled_mm_s * slope, 4) for slope in portrait.slope_N_mm[::PORTRAIT_STEP]),
+        )
 
     def _command(self, request: Request) -> dict[str, Any]:
         self._status = None

@@ -1,120 +1,25 @@
-"""One picture of a recording: what was asked, what was rendered, and what held it back.
-
-Quantities are taken from the control ticks where they are recorded there, else from telemetry. Their names are those of
-`Telemetry`; where a tick spells them otherwise, `SPELLINGS` says how.
-"""
+"""One picture of a recording: what was asked, what was rendered, and what held it back."""
 
 import contextlib
 import io
 from collections.abc import Iterable
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from tormagd.recording.reader import Recording
-
-Floats = NDArray[np.float64]
+from tormagd.recording.series import BREAK_S, Band, Series, bands, series, start_ns, tracking_rms_N
 
 FORMATS = (".png", ".svg", ".pdf")
-BREAK_S = 0.1
-"Rows further apart than this are not joined by a line: nothing is known between them."
 
 # Okabe and Ito's palette, which stays apart for colour-blind eyes; red is kept for faults
 BLACK, BLUE, ORANGE, SKY, GREEN, PINK = "#222222", "#0072b2", "#e69f00", "#56b4e9", "#009e73", "#cc79a7"
 RED, GREY = "#d32f2f", "#9e9e9e"
 STATE_COLOURS = {"DISABLED": "#d0d0d0", "ENABLED": GREEN, "PAUSED": SKY, "FAULT": RED}
 LIMIT_COLOURS = (ORANGE, PINK, BLUE, "#8d6e63", "#7e57c2", "#f0c419")
-SPELLINGS: dict[str, tuple[tuple[str, ...], ...]] = {
-    "gap_mm": (("gap_mm",), ("left_mm", "right_mm")),
-    "gap_setpoint_mm": (("gap_setpoint_mm",), ("reference_gap_mm",)),
-    "left_duty": (("left_duty",), ("duty.0",)),
-    "right_duty": (("right_duty",), ("duty.1",)),
-}
-"The columns whose sum is the quantity, in the order they are looked for."
-
-
-@dataclass(frozen=True, slots=True)
-class Series:
-    """One quantity over time since the recording's start; shapes (n,) both."""
-
-    t_s: Floats
-    values: Floats
-
-
-@dataclass(frozen=True, slots=True)
-class Band:
-    """A code (a limit, a fault, an operating state) and the stretches of time it was there, seconds from the start."""
-
-    name: str
-    spans_s: tuple[tuple[float, float], ...]
-
-
-def start_ns(recording: Recording) -> int:
-    """The first message's time. Raises ValueError for a recording without messages."""
-    times = [int(columns.t_ns.min()) for columns in (recording.ticks, recording.telemetry) if columns.t_ns.size]
-    if not times:
-        raise ValueError("the recording has no messages: was the daemon running?")
-    return min(times)
-
-
-def series(recording: Recording, name: str) -> Series | None:
-    """The quantity `name`, from the ticks or else from telemetry; None where neither has a known value of it."""
-    begin = start_ns(recording)
-    for columns in (recording.ticks, recording.telemetry):
-        for spelling in SPELLINGS.get(name, ((name,),)):
-            if not all(part in columns.numbers for part in spelling):
-                continue
-            values = np.sum([columns.numbers[part] for part in spelling], axis=0)
-            if np.isfinite(values).any():
-                return Series((columns.t_ns - begin) / 1e9, values)
-    return None
-
-
-def bands(recording: Recording, name: str) -> tuple[Band, ...]:
-    """The codes in the words `name`, in the order of their first appearance, each with its stretches of time."""
-    begin = start_ns(recording)
-    for columns in (recording.ticks, recording.telemetry):
-        words = columns.words.get(name)
-        if words is not None and any(words):
-            return _bands((columns.t_ns - begin) / 1e9, words)
-    return ()
-
-
-def _bands(t_s: Floats, words: list[tuple[str, ...]]) -> tuple[Band, ...]:
-    period = float(np.median(np.diff(t_s))) if t_s.size > 1 else 0.0
-    ends = np.minimum(np.append(t_s[1:], t_s[-1] + period), t_s + max(BREAK_S, period))
-    spans: dict[str, list[tuple[float, float]]] = {}
-    for start, end, codes in zip(t_s.tolist(), ends.tolist(), words, strict=True):
-        for code in codes:
-            known = spans.setdefault(code, [])
-            if known and start <= known[-1][1]:
-                known[-1] = (known[-1][0], end)
-            else:
-                known.append((start, end))
-    return tuple(Band(code, tuple(known)) for code, known in spans.items())
-
-
-def tracking_rms_N(recording: Recording) -> float | None:
-    """RMS of measured minus asked force while ENABLED (all of it where no state is recorded); None without both."""
-    asked, measured = series(recording, "setpoint_cf"), series(recording, "measured_cf")
-    if asked is None or measured is None:
-        return None
-    wanted = np.interp(measured.t_s, asked.t_s, asked.values)
-    states = {band.name: band.spans_s for band in bands(recording, "operating_state")}
-    used = np.isfinite(wanted) & np.isfinite(measured.values)
-    if states:
-        enabled = np.zeros(used.shape, dtype=bool)
-        for start, end in states.get("ENABLED", ()):
-            enabled |= (measured.t_s >= start) & (measured.t_s < end)
-        used &= enabled
-    if not used.any():
-        return None
-    return float(np.sqrt(np.mean(np.square(measured.values[used] - wanted[used]))))
 
 
 def figure(recording: Recording, title: str) -> Figure:

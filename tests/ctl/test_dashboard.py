@@ -1,0 +1,329 @@
+"""`tormagctl dashboard`: what it serves, to whom, and the page in a headless Chromium where there is one."""
+
+import asyncio
+import json
+import math
+import signal
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zmq
+from aiohttp import ClientResponse
+from aiohttp.test_utils import TestClient, TestServer
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from screenshots import CHROMIUM, Page, browser
+
+from tormagd.client.aio import AsyncClient
+from tormagd.config import in_folder
+from tormagd.ctl.main import main
+from tormagd.dashboard.frame import LATE_US, SHOWN_S, Frame, late_counts
+from tormagd.dashboard.live import WAITING, Live
+from tormagd.dashboard.recorded import Recorded
+from tormagd.dashboard.server import application
+from tormagd.messages import Description, Status, encode
+from tormagd.recording.reader import read_recording
+from tormagd.recording.ticks import TickBatch
+from tormagd.recording.writer import RecordingWriter
+from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
+
+START_NS = 1_790_000_000_000_000_000
+PORTRAIT = {"force_N": [0.5, 1.0, 3.0], "rate_N_s": [1.0, 2.0, 8.0]}
+SECONDS = 30.0
+COLUMNS = ("t_ns", "setpoint_cf", "governed_cf", "measured_cf", "left_mm", "right_mm", "reference_gap_mm", "field_mT")
+COLUMNS += ("operating_state", "limits", "faults", "lateness_us")
+Browser = TestClient[Any, Any]
+
+
+def tick(k: int) -> tuple[Any, ...]:
+    """Every 10 ms: a sine of 1.2 Hz; RATE from 5 to 7 s, SKEW from 29 s on."""
+    t_s = 0.01 * k
+    force_N = 1.5 + 0.3 * math.sin(2.4 * math.pi * t_s)
+    state, faults = ("FAULT", ("SKEW",)) if t_s >= 29.0 else ("ENABLED", ())
+    limits = ("RATE",) if 5.0 <= t_s < 7.0 else ()
+    row = (START_NS + k * 10_000_000, force_N, force_N, force_N + 0.01, 34.0, 36.0, 70.0, 120.0)
+    return *row, state, limits, faults, 30.0 if k % 100 else 300.0
+
+
+@pytest.fixture(scope="module")
+def recorded_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path: Path = tmp_path_factory.mktemp("recorded") / "a.mcap"
+    about = {"scene": json.dumps({"name": "pulse"}), "portrait": json.dumps(PORTRAIT)}
+    with RecordingWriter(path, about) as writer:
+        writer.ticks(TickBatch(v=1, columns=COLUMNS, rows=tuple(tick(k) for k in range(round(100 * SECONDS)))))
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded(recorded_path: Path) -> Recorded:
+    return Recorded(read_recording(recorded_path), recorded_path.name)
+
+
+@asynccontextmanager
+async def served(shown: Live | Recorded) -> AsyncIterator[Browser]:
+    async with TestClient(TestServer(application(shown))) as asks:
+        yield asks
+
+
+@asynccontextmanager
+async def live(folder: Path) -> AsyncIterator[Live]:
+    """What is shown of the daemon in `folder`, while it is listened to."""
+    async with AsyncClient(in_folder(str(folder)), 5.0) as client:
+        shown = Live(client, await client.status(), await client.describe())
+        listening = asyncio.create_task(shown.run())
+        yield shown
+        listening.cancel()
+
+
+async def event(stream: ClientResponse, wanted: str) -> Any:
+    """The next event of this name."""
+    while True:
+        name = (await stream.content.readline()).decode().removeprefix("event: ").strip()
+        data = (await stream.content.readline()).decode().removeprefix("data: ")
+        assert await stream.content.readline() == b"\n"
+        if name == wanted:
+            return json.loads(data)
+
+
+def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
+    why = {"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}
+    fake_daemon.says(limit_details=[why])
+    described = fake_daemon.answers["describe"]()["result"] | {"portrait": PORTRAIT}
+    fake_daemon.answers["describe"] = lambda: {"ok": True, "result": described}
+
+    async def look() -> None:
+        async with live(fake_daemon.directory) as shown, served(shown) as asks:
+            about = await (await asks.get("/about")).json()
+            assert (about["kind"], about["shown_s"], tuple(about["late_us"])) == ("live", SHOWN_S, LATE_US)
+            stream = await asks.get("/live")
+            assert stream.content_type == "text/event-stream"
+            told = await event(stream, "status")
+            assert told["status"]["link"]["state"] == "RUNNING"
+            assert told["explained"] == {"RATE": {"cause": "too fast", "remedy": "ask for slower changes"}}
+            assert await event(stream, "portrait") == {"portrait": PORTRAIT}
+            first = msgspec.convert(await event(stream, "frame"), Frame)
+            then = msgspec.convert(await event(stream, "frame"), Frame)
+            assert (first.asked_N[-1], first.gap_mm[-1], first.operating_state) == (1.5, 70.0, "ENABLED")
+            assert then.t_s[0] > first.t_s[-1]
+            # one that comes later begins with the seconds that were
+            other = msgspec.convert(await event(await asks.get("/live"), "frame"), Frame)
+            assert other.t_s[0] <= first.t_s[0]
+            assert sum(then.late_counts) >= len(first.t_s)
+            fake_daemon.is_silent = True
+            silence = await event(stream, "silence")
+            assert silence["seconds"] >= 0.5
+
+    asyncio.run(look())
+    assert set(fake_daemon.commands) == {"status", "describe"}
+    assert not fake_daemon.setpoints
+
+
+def test_ten_browsers_are_one_subscriber(run_dir: Path, status_with, telemetry_with) -> None:
+    described = {"version": "0", "build": "", "configuration": {}, "scene": {}, "model": "", "firmware": None}
+    described |= {"profile": {"is_used": False, "age_s": None, "refusal": ""}, "serial_number": None}
+
+    async def look() -> None:
+        context = zmq.Context()
+        publishes = context.socket(zmq.XPUB)
+        publishes.setsockopt(zmq.XPUB_VERBOSE, 1)  # or only the first of them is told
+        publishes.bind(f"ipc://{run_dir}/telemetry")
+        async with AsyncClient(in_folder(str(run_dir)), 0.1) as client:
+            known = msgspec.convert(status_with(), Status), msgspec.convert(described, Description)
+            shown = Live(client, *known)
+            listening = asyncio.create_task(shown.run())
+            async with served(shown) as asks:
+                streams = [await asks.get("/live") for _ in range(10)]
+                publishes.send(encode(telemetry_with(1, START_NS)))
+                while not publishes.poll(0):
+                    await asyncio.sleep(0.01)
+                for seq in range(2, 5):
+                    publishes.send(encode(telemetry_with(seq, START_NS + seq * 20_000_000)))
+                frames = [await event(stream, "frame") for stream in streams]
+                assert all(frame == frames[0] for frame in frames)
+            listening.cancel()
+        subscribed = 0
+        while publishes.poll(100):
+            subscribed += publishes.recv().startswith(b"\x01")
+        assert subscribed == 1
+        context.destroy(linger=0)
+
+    asyncio.run(look())
+
+
+def test_a_browser_that_does_not_read_misses_the_oldest_and_holds_nobody_up(fake_daemon: Any) -> None:
+    async def look() -> None:
+        async with live(fake_daemon.directory) as shown:
+            with shown.browser() as events:
+                for number in range(3 * WAITING):
+                    shown._publish("status", number)
+                assert events.qsize() == WAITING
+                assert events.get_nowait() == b"event: status\ndata: %d\n\n" % (2 * WAITING)
+            assert not shown.browsers
+
+    asyncio.run(look())
+
+
+def test_nobody_from_elsewhere_reads_along_and_nobody_writes(recorded: Recorded) -> None:
+    async def look() -> None:
+        async with served(recorded) as asks:
+            assert (await asks.get("/about", headers={"Host": "evil.example"})).status == 403
+            for name in ("localhost", "127.0.0.1:8733"):
+                assert (await asks.get("/about", headers={"Host": name})).status == 200
+            for path in ("/", "/about", "/frame"):
+                assert (await asks.post(path)).status == 405
+            page = await asks.get("/")
+            assert page.headers["Content-Security-Policy"].startswith("default-src 'self'")
+            text = await page.text()
+            for asset in ("page/dashboard.css", "page/dashboard.js", "page/vendor/uPlot.iife.min.js"):
+                assert asset in text
+                assert (await asks.get(f"/{asset}")).status == 200
+            # works without a network: everything is asked of where the page came from
+            assert "http://" not in text
+            assert "https://" not in text
+            assert (await asks.get("/page/../server.py")).status == 404
+            assert (await asks.get("/live")).status == 404
+
+    asyncio.run(look())
+
+
+def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
+    about = recorded.about
+    assert (about["kind"], about["scene"], about["duration_s"]) == (
+        "recording",
+        "pulse",
+        pytest.approx(SECONDS, abs=0.1),
+    )
+    assert about["tracking_rms_N"] == pytest.approx(0.01)
+    assert msgspec.to_builtins(about["portrait"]) == {name: tuple(values) for name, values in PORTRAIT.items()}
+    assert about["overview"]["limits"] == [pytest.approx((5.0, 7.0))]
+    assert max(known for known in about["overview"]["high_N"] if known is not None) == pytest.approx(1.81, abs=1e-3)
+    for code, known in ((Limit.RATE, LIMITS[Limit.RATE]), (Fault.SKEW, FAULTS[Fault.SKEW])):
+        assert about["explained"][code].remedy == known.remedy
+    frame = recorded.frame(20.0)
+    assert (frame.t_s[0], frame.t_s[-1]) == pytest.approx((START_NS * 1e-9, START_NS * 1e-9 + 20.0))
+    assert frame.asked_N[-1] == pytest.approx(1.5 + 0.3 * math.sin(48.0 * math.pi))
+    assert (frame.gap_mm[-1], frame.gap_wanted_mm[-1], frame.field_mT[-1]) == (70.0, 70.0, 120.0)
+    assert [(held.code, round(held.share, 3), held.is_now) for held in frame.held] == [("RATE", 0.1, False)]
+    assert (frame.operating_state, frame.faults) == ("ENABLED", [])
+    # all ticks are counted, not those alone that are drawn
+    assert sum(frame.late_counts) == pytest.approx(2_000, abs=2)
+    assert frame.late_counts[LATE_US.index(500.0)] == pytest.approx(20, abs=1)
+    assert recorded.frame(29.5).faults == ["SKEW"]
+    assert [held.is_now for held in recorded.frame(6.0).held] == [True]
+
+
+@settings(max_examples=25)
+@given(at_s=st.floats(-1e300, 1e300) | st.floats(0.0, SECONDS))
+def test_every_moment_has_a_frame(recorded: Recorded, at_s: float) -> None:
+    frame = msgspec.json.decode(msgspec.json.encode(recorded.frame(at_s)), type=Frame)
+    lengths = {len(getattr(frame, name)) for name in ("t_s", "asked_N", "measured_N", "gap_mm", "field_mT")}
+    assert len(lengths) == 1
+    assert list(frame.t_s) == sorted(frame.t_s)
+
+
+@pytest.mark.parametrize("at_s", ["", "nan", "inf", "x" * 1000])
+def test_a_moment_that_is_none_is_refused(recorded: Recorded, at_s: str) -> None:
+    async def look() -> None:
+        async with served(recorded) as asks:
+            answer = await asks.get("/frame", params={"at_s": at_s})
+            assert answer.status == 400
+            assert "allowed is a finite number" in await answer.text()
+
+    asyncio.run(look())
+
+
+def test_lateness_falls_into_the_bar_that_names_it() -> None:
+    counts = late_counts([0.0, 9.9, 10.0, 4_999.0, 5_000.0, 1e6])
+    assert (counts[0], counts[1], counts[-2], counts[-1], sum(counts)) == (2, 1, 1, 2, 6)
+
+
+def test_the_command_says_where_it_serves_and_ends_in_order(fake_daemon: Any) -> None:
+    command = [sys.executable, "-m", "tormagd.ctl.main", "--endpoint", fake_daemon.control, "--wait", "5", "--json"]
+    command += ["dashboard", "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            assert any(line.startswith("tormagctl dashboard: http://127.0.0.1:") for line in process.stderr)
+            process.send_signal(signal.SIGINT)
+            said, _ = process.communicate(timeout=60.0)
+        finally:
+            process.kill()
+    assert process.returncode == 0
+    assert json.loads(said)["ok"]
+
+
+@pytest.mark.parametrize(("what", "code"), [([], 3), (["/nowhere.mcap"], 2), (["--port", "70000"], 2)])
+def test_what_cannot_be_shown_is_refused(run_dir: Path, capsys: pytest.CaptureFixture[str], what: list[str], code: int):
+    command = ["--endpoint", f"ipc://{run_dir}/control", "--wait", "0.01", "dashboard", *what]
+    if "--port" in what:
+        with pytest.raises(SystemExit, match="2"):
+            main(command)
+    else:
+        assert main(command) == code
+    assert capsys.readouterr().err
+
+
+def in_chromium(shown: Callable[[], Any], tmp_path: Path, act: Callable[[Page, str], Awaitable[None]]) -> None:
+    async def look() -> None:
+        async with shown() as what, served(what) as asks, browser(tmp_path) as page:
+            await act(page, str(asks.make_url("/")))
+            assert page.complaints == []
+
+    asyncio.run(look())
+
+
+@asynccontextmanager
+async def only(shown: Recorded) -> AsyncIterator[Recorded]:
+    yield shown
+
+
+DRAWN = """[...document.querySelectorAll("canvas")].every((it) => it.width * it.height > 0 &&
+    it.getContext("2d").getImageData(0, 0, it.width, it.height).data.some((value) => value))"""
+FITS = "document.documentElement.scrollWidth <= window.innerWidth"
+needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="there is no chromium here")
+
+
+@needs_chromium
+def test_the_page_shows_the_daemon_as_it_is(fake_daemon: Any, tmp_path: Path) -> None:
+    async def act(page: Page, address: str) -> None:
+        await page.open(address, 1440, 900)
+        await page.until("document.querySelector('#state')?.textContent === 'ENABLED'")
+        await page.until("document.querySelector('#source').textContent.includes('RUNNING on /dev/tormag')")
+        assert await page.ask("document.querySelector('#asked_N').textContent") == "1.500"
+        assert await page.ask("document.querySelector('#codes').textContent.startsWith('No fault')")
+        assert await page.ask("document.querySelectorAll('canvas').length") == 3
+        for width, height in ((1440, 900), (390, 844)):
+            await page.resize(width, height)
+            await page.until(FITS)
+            await page.until(DRAWN)
+        fake_daemon.is_silent = True
+        await page.until("document.querySelector('#silence').textContent.startsWith('nothing heard for')")
+
+    in_chromium(lambda: live(fake_daemon.directory), tmp_path, act)
+
+
+@needs_chromium
+def test_the_page_scrubs_through_a_recording(recorded: Recorded, tmp_path: Path) -> None:
+    async def act(page: Page, address: str) -> None:
+        await page.open(address, 390, 844)
+        # it begins where the first fault is
+        await page.until("document.querySelector('#moment')?.textContent.startsWith('29.')")
+        await page.until("document.querySelector('#state').textContent === 'FAULT'")
+        said = await page.ask("document.querySelector('#codes').textContent")
+        assert f"Next: {FAULTS[Fault.SKEW].remedy}" in said
+        await page.ask("at('at').value = 6; at('at').dispatchEvent(new Event('input'))")
+        await page.until("document.querySelector('#codes').textContent.startsWith('RATE')")
+        assert await page.ask("document.querySelector('#state').textContent") == "ENABLED"
+        await page.ask("at('play').click()")
+        await page.until("parseFloat(document.querySelector('#moment').textContent) > 6.2")
+        assert await page.ask("at('play').textContent") == "Pause"
+        await page.until(DRAWN)
+        await page.until(FITS)
+
+    in_chromium(lambda: only(recorded), tmp_path, act)

@@ -1,0 +1,141 @@
+"""`tormagctl metrics`, read as Prometheus reads it."""
+
+import json
+import math
+import os
+import re
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import pytest
+from prometheus_client.metrics_core import Metric
+from prometheus_client.parser import text_string_to_metric_families
+
+from tormagd.ctl.main import main
+
+ROOT = Path(__file__).parents[2]
+BOARD = ROOT / "examples/grafana.json"
+BASE_UNITS = ("seconds", "newtons", "meters", "teslas", "hertz", "ratio")
+TIMES = {"p50": 41.0, "p99": 304.0, "p999": 500.0, "max": 900.0}
+
+
+def read(text: str) -> dict[str, Metric]:
+    return {family.name: family for family in text_string_to_metric_families(text)}
+
+
+def value(families: dict[str, Metric], name: str, **labels: str) -> float:
+    (sample,) = (each for each in families[name].samples if each.labels == labels)
+    return sample.value
+
+
+@pytest.fixture
+def full(
+    fake_daemon: Any, source_with: Callable[..., dict[str, Any]], status_with: Callable[..., dict[str, Any]]
+) -> Any:
+    """A daemon of which everything is known."""
+    rate = {"grade": "ok", "hz": 1000.0, "runs": 9, "merged": 1, "overruns": 2, "stalls": 3}
+    rate |= {"lateness_us": TIMES | {"worst": 2000.0}, "exec_us": TIMES}
+    setpoints = status_with()["setpoints"] | {"by_source": {'"\\\n': source_with()}}
+    fake_daemon.says(
+        rates={"control": rate, "inference": rate},
+        setpoints=setpoints,
+        faults=["SKEW"],
+        limits=["RATE"],
+        late_ticks_by={"kernel": 2},
+    )
+    return fake_daemon
+
+
+def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(["--endpoint", *arguments, "metrics"]) == 0
+    return capsys.readouterr().out
+
+
+def test_the_status_is_there_in_base_units(full: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    families = read(printed(capsys, full.control))
+    assert value(families, "tormag_up") == 1.0
+    assert value(families, "tormag_force_measured_newtons") == 1.49
+    assert value(families, "tormag_gap_meters") == pytest.approx(0.07)
+    assert value(families, "tormag_field_teslas") == pytest.approx(0.12)
+    assert value(families, "tormag_operating_state", tormag_operating_state="ENABLED") == 1.0
+    assert value(families, "tormag_operating_state", tormag_operating_state="FAULT") == 0.0
+    assert value(families, "tormag_fault", code="SKEW") == 1.0
+    assert value(families, "tormag_limit", code="RATE") == 1.0
+    assert value(families, "tormag_loop_stalls", loop="control") == 3.0
+    assert value(families, "tormag_loop_lateness_seconds", loop="control", percentile="p99") == pytest.approx(304e-6)
+    assert value(families, "tormag_late_ticks", culprit="kernel") == 2.0
+    assert value(families, "tormag_link_round_trip_seconds", percentile="p50") == pytest.approx(402.5e-6)
+    assert value(families, "tormag_setpoints_accepted") == 3.0
+    # a name with a quote, a backslash and a line's end comes as one label: printable, as everything that a daemon says
+    assert value(families, "tormag_source_lost", source='"\\\\n') == 3.0
+
+
+def test_names_and_types_keep_to_the_conventions(full: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, family in read(printed(capsys, full.control)).items():
+        assert re.fullmatch(r"tormag(_[a-z]+)*", name)
+        assert family.documentation
+        assert family.type in ("gauge", "counter"), name
+        if family.type == "counter":
+            assert all(sample.name == f"{name}_total" for sample in family.samples)
+        for unit in ("_N", "_mm", "_mT", "_us", "_ms"):
+            assert not name.endswith(unit)
+        if re.search("force|gap|skew|field|age|delay|lateness|execution|round_trip|uptime", name):
+            assert name.endswith(BASE_UNITS), name
+
+
+def test_what_is_not_known_has_no_sample(fake_daemon: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    fake_daemon.says(measured_cf=None, gap_mm=None, faults=[])
+    text = printed(capsys, fake_daemon.control)
+    families = read(text)
+    assert "tormag_force_measured_newtons" not in families
+    assert not families["tormag_fault"].samples
+    assert all(math.isfinite(sample.value) for family in families.values() for sample in family.samples)
+    assert main(["--endpoint", fake_daemon.control, "--json", "metrics"]) == 0
+    assert read(json.loads(capsys.readouterr().out)["result"]["metrics"]).keys() == families.keys()
+
+
+def test_a_scrape_asks_anew_and_says_when_the_daemon_has_gone(full: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    scraped: list[dict[str, Metric]] = []
+
+    def scrape() -> None:
+        try:
+            while "tormagctl metrics: " not in (said := capsys.readouterr().err):
+                pass
+            address = said.split()[2]
+            for _ in range(2):
+                with urlopen(address, timeout=30.0) as answer:
+                    scraped.append(read(answer.read().decode()))
+            full.is_over.set()
+            full.join()
+            with urlopen(address, timeout=30.0) as answer:
+                scraped.append(read(answer.read().decode()))
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    scraper = threading.Thread(target=scrape)
+    scraper.start()
+    assert main(["--endpoint", full.control, "--wait", "0.5", "metrics", "--port", "0"]) == 0
+    scraper.join()
+    assert [value(families, "tormag_up") for families in scraped] == [1.0, 1.0, 0.0]
+    assert scraped[2].keys() == {"tormag_up"}
+    assert full.commands == ["status"] * 3
+
+
+def test_without_a_daemon_it_does_not_begin(run_dir: Path) -> None:
+    assert main(["--endpoint", f"ipc://{run_dir}/control", "--wait", "0.01", "metrics"]) == 3
+
+
+def test_the_board_asks_for_what_there_is(full: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    known = {sample.name for family in read(printed(capsys, full.control)).values() for sample in family.samples}
+    board = json.loads(BOARD.read_text(encoding="utf-8"))
+    asked = [target["expr"] for panel in board["panels"] for target in panel["targets"]]
+    names = {name for expression in asked for name in re.findall(r"tormag_[a-z_]+", expression)}
+    assert names <= known
+    assert len(asked) >= 10
+    for panel in board["panels"]:
+        assert panel["title"]
+        assert all(target["datasource"]["uid"] == "${prometheus}" for target in panel["targets"])

@@ -1,0 +1,175 @@
+"""`tormagctl top`: its screen as a pure function at two sizes, and the whole in a terminal of its own."""
+
+import math
+import os
+import pty
+import signal
+import subprocess
+import sys
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from tormagd.ctl.main import main
+from tormagd.ctl.sparkline import EIGHTHS, columns, span, sparkline
+from tormagd.ctl.top_screen import CURVES, Seen, screen
+from tormagd.messages import Explained, Status
+
+SIZES = ((80, 24), (160, 50))
+RATE = Explained("RATE", "the force was asked to change faster than the carriages travel", "ask for slower changes")
+SKEW = Explained(
+    "SKEW",
+    "the carriages are 1.31 mm apart, 1 mm is allowed: one screw is slower than the other, or an encoder lost counts",
+    "look for dirt or wear on the slower screw, then clear-fault and home",
+)
+EVIL = "\x1b[2J\x07\u202e"
+
+
+@pytest.fixture
+def seen(status_with, telemetry_with) -> Seen:
+    """20 s of a sine, the last tenth of it held by RATE."""
+    rate = {"grade": "warning", "hz": 1000.0, "runs": 9, "merged": 1, "overruns": 2, "stalls": 3}
+    times = {"p50": 41.0, "p99": 304.0, "p999": 500.0, "max": 900.0}
+    rate |= {"lateness_us": times | {"worst": 2000.0}, "exec_us": times}
+    link = status_with()["link"] | {"port": f"/tmp/{'a-port-with-a-long-name' * 9}"}
+    loops = {"control": rate, "inference": rate}
+    known = msgspec.convert(status_with(rates=loops, link=link, uptime_s=7200.0), Status)
+    snapshots = [
+        telemetry_with(
+            k,
+            k * 20_000_000,
+            setpoint_cf=1.5 + 0.2 * math.sin(k / 20),
+            measured_cf=1.5 + 0.19 * math.sin(k / 20),
+            limits=("RATE",) if k >= 900 else (),
+        )
+        for k in range(1_000)
+    ]
+    return Seen(snapshots, known, {"RATE": RATE})
+
+
+def in_fault(seen: Seen) -> Seen:
+    last = msgspec.structs.replace(seen.telemetry[-1], operating_state="FAULT", faults=("SKEW",), gap_mm=None)
+    return seen._replace(telemetry=[*seen.telemetry[:-1], last], explained={"RATE": RATE, "SKEW": SKEW})
+
+
+def drawn(seen: Seen, width: int, height: int) -> list[str]:
+    console = Console(width=width, height=height, color_system=None)
+    with console.capture() as captured:
+        console.print(screen(seen, width, height))
+    return captured.get().splitlines()
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_the_screen_fits_and_says_what_the_device_does(seen: Seen, width: int, height: int) -> None:
+    lines = drawn(seen, width, height)
+    assert len(lines) <= height
+    assert all(len(line) <= width for line in lines)
+    text = "\n".join(lines)
+    for said in ("ENABLED", "homed", "up 2.0 h", "warning, 1000 Hz, late 41 us (p50) 304 us (p99), stalls 3"):
+        assert said in text
+    for said in ("RUNNING", "round trip 0.40 ms", "RATE 10% of the time", "next: ask for slower changes"):
+        assert said in text
+    labels = ("control", "inference", "link", "setpoints", *(curve.label for curve in CURVES))
+    assert all(any(line.startswith(f" {label} ") for line in lines) for label in labels)
+    # a sine fills its rows from bottom to top
+    assert {"▁", "█"} <= set(text)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_a_fault_and_its_remedy_come_before_the_limits(seen: Seen, width: int, height: int) -> None:
+    lines = drawn(in_fault(seen), width, height)
+    assert len(lines) <= height
+    text = " ".join(" ".join(lines).split())
+    assert f"FAULT SKEW: {SKEW.cause} next: {SKEW.remedy} held by RATE" in text
+    assert "gap - mm" in text
+
+
+def test_a_taller_terminal_has_taller_curves(seen: Seen) -> None:
+    low, high = (sum("█" in line for line in drawn(seen, 80, height)) for height in (24, 50))
+    assert high > low
+
+
+@pytest.mark.parametrize(("width", "height"), [(20, 5), (79, 23), (400, 120)])
+def test_any_size_can_be_drawn_on(seen: Seen, width: int, height: int) -> None:
+    assert all(len(line) <= width for line in drawn(seen, width, height))
+
+
+def test_before_the_first_snapshot_and_after_the_last_it_says_so(seen: Seen) -> None:
+    assert "nothing, and there is no fault" in "\n".join(drawn(seen._replace(telemetry=[]), 80, 24))
+    assert "nothing heard for 3 s" in drawn(seen._replace(silent_s=3.2), 80, 24)[0]
+
+
+def test_nothing_that_telemetry_says_is_obeyed_by_the_terminal(seen: Seen) -> None:
+    last = msgspec.structs.replace(
+        seen.telemetry[-1], operating_state=f"A{EVIL}", faults=(f"B{EVIL}",), limits=(f"C{EVIL}",)
+    )
+    text = "".join(drawn(seen._replace(telemetry=[last]), 160, 50))
+    assert text.isprintable()
+    assert all(rf"{name}\u001b[2J" in text for name in "ABC")
+
+
+@given(
+    values=st.lists(st.none() | st.floats(-1e3, 1e3), min_size=1, max_size=40),
+    rows=st.integers(1, 6),
+    least=st.floats(0.1, 10),
+)
+def test_a_bar_is_as_high_as_its_value(values: list[float | None], rows: int, least: float) -> None:
+    low, high = span(values, least)
+    lines = sparkline(values, low, high, rows)
+    assert [len(line) for line in lines] == [len(values)] * rows
+    heights = [sum(EIGHTHS.index(line[column]) for line in lines) for column in range(len(values))]
+    for value, height in zip(values, heights, strict=True):
+        assert (height == 0) == (value is None)
+    known = sorted((value, height) for value, height in zip(values, heights, strict=True) if value is not None)
+    assert [height for _, height in known] == sorted(height for _, height in known)
+    if known and known[-1][0] - known[0][0] >= least:
+        assert (known[0][1], known[-1][1]) == (1, 8 * rows)
+
+
+def test_a_column_stays_what_it_is_while_time_goes_on() -> None:
+    times_ns, values = [0, 4, 10, 14, 31], [1.0, 3.0, None, math.nan, 7.0]
+    assert columns(times_ns, values, 4, 10, max) == [3.0, None, None, 7.0]
+    assert columns([*times_ns, 40], [*values, 9.0], 4, 10, max) == [None, None, 7.0, 9.0]
+    assert columns([], [], 2, 10, max) == [None, None]
+
+
+def in_terminal(control: str, end: bytes | signal.Signals) -> tuple[int, str]:
+    """`top` in a terminal of its own until it has drawn, then ended by a key or a signal: exit code, what was drawn."""
+    far, near = pty.openpty()
+    environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": "80", "LINES": "24"}
+    command = [sys.executable, "-m", "tormagd.ctl.main", "--endpoint", control, "--wait", "5", "top"]
+    process = subprocess.Popen(command, stdin=near, stdout=near, stderr=near, env=environment)
+    os.close(near)
+    text = b""
+    try:
+        while b"late" not in text:
+            text += os.read(far, 65_536)
+        if isinstance(end, bytes):
+            os.write(far, end)
+        else:
+            process.send_signal(end)
+        while b"the daemon goes on" not in text:
+            text += os.read(far, 65_536)
+        return process.wait(20.0), text.decode()
+    finally:
+        process.kill()
+        process.wait()
+        os.close(far)
+
+
+@pytest.mark.parametrize("end", [b"q", signal.SIGINT, signal.SIGTERM], ids=["q", "Ctrl-C", "SIGTERM"])
+def test_it_is_ended_by_a_key_or_a_signal_and_only_looks(fake_daemon: Any, end: bytes | signal.Signals) -> None:
+    code, text = in_terminal(fake_daemon.control, end)
+    assert code == 0
+    assert "ENABLED" in text
+    assert set(fake_daemon.commands) == {"status"}
+    assert not fake_daemon.setpoints
+
+
+def test_without_a_terminal_it_is_refused(fake_daemon: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--endpoint", fake_daemon.control, "top"]) == 2
+    assert "tormagctl status" in capsys.readouterr().err

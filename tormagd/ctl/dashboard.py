@@ -1,0 +1,53 @@
+"""`tormagctl dashboard`: a page for a browser on this machine, of the daemon live or of a recording. It only looks."""
+
+import asyncio
+import sys
+import time
+from pathlib import Path
+
+from tormagd.client.aio import AsyncClient
+from tormagd.config import Endpoints
+from tormagd.ctl.outcome import Outcome, usage_error
+from tormagd.dashboard.live import Live
+from tormagd.dashboard.recorded import Recorded
+from tormagd.dashboard.server import LOOPBACK, serve
+from tormagd.output import write_line
+from tormagd.recording.reader import read_recording
+
+
+def dashboard(endpoints: Endpoints, path: Path | None, port: int, wait_s: float) -> Outcome:
+    """Serves the page until Ctrl-C or SIGTERM.
+
+    Raises CommandError (USAGE) where the port is taken or `path` cannot be read, and as `AsyncClient.status`.
+    """
+    start_s = time.monotonic()
+    try:
+        asyncio.run(_live(endpoints, port, wait_s) if path is None else _recorded(path, port))
+    except OSError as error:
+        raise usage_error(
+            f"{LOOPBACK}:{port}: {error.strerror}", "give another --port; 0 takes one that is free"
+        ) from error
+    seconds = time.monotonic() - start_s
+    return Outcome({"seconds": round(seconds, 1)}, f"shown for {seconds:.0f} s")
+
+
+async def _live(endpoints: Endpoints, port: int, wait_s: float) -> None:
+    async with AsyncClient(endpoints, wait_s) as client:
+        shown = Live(client, await client.status(), await client.describe())
+        listening = asyncio.create_task(shown.run())
+        try:
+            await serve(shown, port, _ready)
+        finally:
+            listening.cancel()
+
+
+async def _recorded(path: Path, port: int) -> None:
+    try:
+        shown = Recorded(read_recording(path), path.name)
+    except ValueError as error:
+        raise usage_error(str(error), "give a file that tormagctl record has made") from error
+    await serve(shown, port, _ready)
+
+
+def _ready(address: str) -> None:
+    write_line(f"tormagctl dashboard: {address}  (Ctrl-C ends)", sys.stderr)

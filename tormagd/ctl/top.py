@@ -1,0 +1,96 @@
+"""`tormagctl top`: what the daemon does, live in a terminal. It only looks."""
+
+import contextlib
+import select
+import signal
+import sys
+import termios
+import time
+import tty
+from collections import deque
+from collections.abc import Iterator
+
+from rich.console import Console
+from rich.live import Live
+
+from tormagd.client.blocking import Client
+from tormagd.client.errors import not_understood
+from tormagd.client.wire import Pending, understood
+from tormagd.ctl.interrupt import interrupted_by
+from tormagd.ctl.outcome import Outcome, is_terminal, usage_error
+from tormagd.ctl.top_screen import Seen, screen
+from tormagd.messages import Explained, MessageError, Telemetry
+
+REDRAW_S = 0.2
+ASK_S = 1.0
+"Between two looks at the daemon's status; sooner where a code shows that has not been explained yet."
+KEPT = 1_000
+"Snapshots: what held the force back in the last 20 s is shown, or it would come and go too fast to be read."
+
+
+def top(client: Client) -> Outcome:
+    """Shows it until `q`, Ctrl-C or SIGTERM. Raises CommandError (USAGE) without a terminal, and as `Client.status`."""
+    console = Console(highlight=False)
+    if not (is_terminal(sys.stdin) and console.is_terminal) or console.is_dumb_terminal:
+        raise usage_error("top needs a terminal that can be drawn on", "tormagctl status, with --json for a script")
+    watcher = Watcher(client)
+    start_s = time.monotonic()
+    with (
+        interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted,
+        _single_keys(),
+        Live(console=console, screen=True, auto_refresh=False) as live,
+    ):
+        while not is_interrupted():
+            live.update(screen(watcher.look(), *console.size), refresh=True)
+            if select.select([sys.stdin], [], [], REDRAW_S)[0] and sys.stdin.read(1) in ("q", ""):
+                break
+    seconds = time.monotonic() - start_s
+    return Outcome({"seconds": round(seconds, 1)}, f"watched for {seconds:.0f} s; the daemon goes on")
+
+
+class Watcher:
+    """Gathers what is to be shown. Waits for nothing but the first status."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._telemetry: deque[Telemetry] = deque(maxlen=KEPT)
+        self._status = client.status()
+        self._explained: dict[str, Explained] = {}
+        self._asked: Pending | None = None
+        self._ask_s = self._heard_s = time.monotonic()
+
+    def look(self) -> Seen:
+        """What is known by now. Raises as `Client.answer`, and UnreachableError for what is no telemetry."""
+        now_s = time.monotonic()
+        try:
+            arrived = self._client.telemetry()
+        except MessageError as error:
+            raise not_understood("telemetry", error) from error
+        if arrived:
+            self._heard_s = now_s
+            self._telemetry += arrived
+            self._ask(now_s, {*arrived[-1].faults, *arrived[-1].limits})
+        for each in (*self._status.limit_details, *self._status.fault_details):
+            self._explained[each.code] = each
+        return Seen(self._telemetry, self._status, self._explained, now_s - self._heard_s)
+
+    def _ask(self, now_s: float, codes: set[str]) -> None:
+        """Asks for the status now and then, and takes the answer; only of a daemon that is heard."""
+        result = None if self._asked is None else self._client.answer(self._asked)
+        if result is not None:
+            self._status = understood(result)
+            self._asked = None
+        if now_s >= self._ask_s or (self._asked is None and not codes <= self._explained.keys()):
+            self._asked = self._client.ask("status")
+            self._ask_s = now_s + ASK_S
+
+
+@contextlib.contextmanager
+def _single_keys() -> Iterator[None]:
+    """Keys are read as they are struck, and not shown."""
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin)
+    try:
+        yield
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

@@ -1,0 +1,180 @@
+"""What `tormagctl top` shows: a pure function of what is known and of the terminal's size."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from statistics import fmean
+from typing import NamedTuple
+
+from rich.console import Group, RenderableType
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from tormagd.ctl.sparkline import columns, span, sparkline
+from tormagd.messages import Explained, Status, Telemetry
+from tormagd.output import printable
+
+COLUMN_NS = 100_000_000
+"What one character of a sparkline stands for."
+STANDARD_ROWS = 24
+"A terminal of so many rows has sparklines of one row; what it has more, they share."
+LABEL, VALUE, ENDS = 10, 10, 12
+"Characters of a row's name, of its newest value with the unit, and of the ends of its scale."
+SILENT_S = 0.5
+STATE_STYLES = {"ENABLED": "black on green", "PAUSED": "black on yellow", "FAULT": "bold white on red"}
+GRADE_STYLES = {"warning": "yellow", "error": "red"}
+
+
+class Seen(NamedTuple):
+    """What is known: snapshots, the oldest first, the newest status, the newest explanation of each code, and for how
+    long nothing has come."""
+
+    telemetry: Sequence[Telemetry]
+    status: Status
+    explained: Mapping[str, Explained]
+    silent_s: float = 0.0
+
+
+class Curve(NamedTuple):
+    """A row with a sparkline. Curves of one `scale` are drawn to the same; it is no narrower than `least`."""
+
+    label: str
+    unit: str
+    digits: int
+    style: str
+    scale: str
+    least: float
+    value: Callable[[Telemetry], float | None]
+    of_column: Callable[[list[float]], float] = fmean
+
+
+CURVES = (
+    Curve("asked", "N", 3, "bright_white", "force", 0.05, lambda it: it.setpoint_cf),
+    Curve("governed", "N", 3, "dodger_blue1", "force", 0.05, lambda it: it.governed_cf),
+    Curve("measured", "N", 3, "orange1", "force", 0.05, lambda it: it.measured_cf),
+    Curve("gap", "mm", 2, "cyan", "gap", 0.5, lambda it: it.gap_mm),
+    Curve("field", "mT", 1, "green", "field", 1.0, lambda it: it.field_mT),
+    Curve("late", "us", 0, "magenta", "late", 100.0, lambda it: it.tick.lateness_us, max),
+)
+
+
+def screen(seen: Seen, width: int, height: int) -> RenderableType:
+    """All of it: state, curves, loops and link, then faults and limits with their remedies, as far as they fit."""
+    more = max(height - STANDARD_ROWS, 0) // len(CURVES)
+    wide = width - 2
+    parts = (
+        _head(seen, wide),
+        _curves(seen, wide, max(more, 1), is_apart=more > 0),
+        _timing(seen.status, wide),
+        _codes(seen, wide),
+    )
+    return Padding(Group(*(line for part in parts for line in (part, Text()))), (0, 1))
+
+
+def _head(seen: Seen, width: int) -> Text:
+    newest, status = seen.telemetry[-1] if seen.telemetry else seen.status, seen.status
+    state = printable(newest.operating_state)
+    head = Text(no_wrap=True, overflow="ellipsis")
+    head.append(f" {state} ", STATE_STYLES.get(state, "reverse"))
+    flags = ["homed" if newest.is_homed else "not homed", *(["busy"] if newest.is_busy else [])]
+    head.append(f"  {', '.join(flags)}", "" if newest.is_homed else "yellow")
+    if seen.silent_s > SILENT_S:
+        head.append(f"  nothing heard for {seen.silent_s:.0f} s", "bold red")
+    about = f"{status.scene} · up {_duration(status.uptime_s)} · tormagd {status.version} · q ends"
+    head.append(about.rjust(width - head.cell_len), "dim")
+    return head
+
+
+def _duration(seconds: float) -> str:
+    minutes, hours = seconds / 60.0, seconds / 3600.0
+    return f"{hours:.1f} h" if hours >= 1.0 else f"{minutes:.0f} min" if minutes >= 1.0 else f"{seconds:.0f} s"
+
+
+def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
+    """Each curve with its name, newest value, course and the ends of its scale."""
+    count = max(width - LABEL - VALUE - ENDS - 3, 8)
+    table = _grid(LABEL, VALUE, count, ENDS)
+    times_ns = [each.t_ns for each in seen.telemetry]
+    courses = [
+        columns(times_ns, [curve.value(it) for it in seen.telemetry], count, COLUMN_NS, curve.of_column)
+        for curve in CURVES
+    ]
+    scales: dict[str, list[float | None]] = {}
+    for curve, course in zip(CURVES, courses, strict=True):
+        scales.setdefault(curve.scale, []).extend(course)
+    for curve, course in zip(CURVES, courses, strict=True):
+        low, high = span(scales[curve.scale], curve.least)
+        newest = curve.value(seen.telemetry[-1]) if seen.telemetry else None
+        shown = "-" if newest is None else f"{newest:.{curve.digits}f}"
+        digits = min(curve.digits, 2)
+        ends = [f"{high:.{digits}f}", *[""] * (rows - 2), f"{low:.{digits}f}"]
+        table.add_row(
+            Text(curve.label, "bold"),
+            Text(f"{shown:>7} {curve.unit}"),
+            Text("\n".join(sparkline(course, low, high, rows)), curve.style),
+            Text("\n".join(ends) if rows > 1 else "..".join(reversed(ends)), "dim"),
+        )
+        if is_apart and curve is not CURVES[-1]:
+            table.add_row()
+    return table
+
+
+def _grid(*widths: int) -> Table:
+    """Columns of these widths; what is longer is cut."""
+    table = Table.grid(padding=(0, 1, 0, 0))
+    for width in widths:
+        table.add_column(width=width, no_wrap=True, overflow="ellipsis")
+    return table
+
+
+def _timing(status: Status, width: int) -> Table:
+    """How well the loops keep their time, how the wire carries, and who publishes."""
+    table = _grid(LABEL, width - LABEL - 1)
+    for name in ("control", "inference"):
+        group = status.rates.get(name)
+        if group is not None:
+            late = group.lateness_us
+            said = f", {group.hz:.0f} Hz, late {late.p50:.0f} us (p50) {late.p99:.0f} us (p99), stalls {group.stalls}"
+            table.add_row(
+                Text(name, "bold"), Text.assemble((group.grade, GRADE_STYLES.get(group.grade, "green")), said)
+            )
+    link, setpoints, trip_us = status.link, status.setpoints, status.link.round_trip_us
+    trip = "" if trip_us is None else f", round trip {trip_us.p50 * 1e-3:.2f} ms (p50)"
+    state = (link.state, "green" if link.state == "RUNNING" else "red")
+    table.add_row(
+        Text("link", "bold"), Text.assemble(state, f", losses {link.losses}{trip}, {link.backend} {link.port}")
+    )
+    heard = f"from {setpoints.newest_source!r}" if setpoints.accepted else "none yet"
+    table.add_row(Text("setpoints", "bold"), f"{heard}, {setpoints.accepted} accepted, {setpoints.refused} refused")
+    return table
+
+
+def _codes(seen: Seen, width: int) -> Table:
+    """Faults first, then what has held the force back lately, the longest first, each with cause and remedy."""
+    newest = seen.telemetry[-1] if seen.telemetry else seen.status
+    times = Counter(code for each in seen.telemetry for code in each.limits)
+    table = Table.grid(padding=(0, 1, 0, 0))
+    table.add_column(width=LABEL)
+    table.add_column(width=width - LABEL - 1)
+    for code in newest.faults:
+        table.add_row(Text("FAULT", "bold red"), _code(code, "", "bold red", seen.explained))
+    for code, count in times.most_common():
+        share = f" {_percent(count / len(seen.telemetry))} of the time"
+        style = "yellow" if code in newest.limits else "dim yellow"
+        table.add_row(Text("held by", style), _code(code, share, style, seen.explained))
+    if not table.row_count:
+        table.add_row(Text("held by", "bold"), Text("nothing, and there is no fault", "green"))
+    return table
+
+
+def _percent(share: float) -> str:
+    return "under 1%" if share < 0.01 else f"{share:.0%}"
+
+
+def _code(code: str, how_long: str, style: str, explained: Mapping[str, Explained]) -> Text:
+    text = Text.assemble((printable(code), style), how_long)
+    known = explained.get(code)
+    if known is not None:
+        text.append(f": {known.cause}")
+        text.append(f"\nnext: {known.remedy}", "italic")
+    return text

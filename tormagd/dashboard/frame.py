@@ -1,0 +1,53 @@
+"""What the page shows of one moment, live or recorded: the seconds before it, and what holds the force back."""
+
+from bisect import bisect_right
+from collections.abc import Iterable, Sequence
+
+import msgspec
+
+SHOWN_S = 20.0
+LATE_US = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1_000.0, 2_000.0, 5_000.0)
+"Where one bar of the lateness histogram ends and the next begins."
+
+
+class Held(msgspec.Struct, frozen=True):
+    """A limit: in which share of the seconds shown it was there, and whether it is there at their end."""
+
+    code: str
+    share: float
+    is_now: bool
+
+
+class Explanation(msgspec.Struct, frozen=True):
+    """Why a fault or a limit is there, and what to do about it."""
+
+    cause: str
+    remedy: str
+
+
+class Frame(msgspec.Struct, frozen=True, kw_only=True):
+    """Curves of the same length, the oldest first, `t_s` since 1970; what is not known is null.
+
+    Live ones hold what is new, and the codes and `late_counts` (control ticks by lateness, between LATE_US) of all the
+    seconds shown.
+    """
+
+    t_s: Sequence[float]
+    asked_N: Sequence[float | None]
+    governed_N: Sequence[float | None]
+    measured_N: Sequence[float | None]
+    gap_mm: Sequence[float | None]
+    gap_wanted_mm: Sequence[float | None]
+    field_mT: Sequence[float | None]
+    operating_state: str
+    held: Sequence[Held]
+    faults: Sequence[str]
+    late_counts: Sequence[int]
+
+
+def late_counts(lateness_us: Iterable[float]) -> list[int]:
+    """How many of these are in each bar of the histogram."""
+    counts = [0] * (len(LATE_US) + 1)
+    for late_us in lateness_us:
+        counts[bisect_right(LATE_US, late_us)] += 1
+    return counts

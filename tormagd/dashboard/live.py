@@ -1,0 +1,148 @@
+"""The daemon as it is now: one subscriber, however many browsers look."""
+
+import asyncio
+import contextlib
+import time
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import msgspec
+
+from tormagd.client.aio import AsyncClient
+from tormagd.client.errors import ClientError
+from tormagd.dashboard.frame import Explanation, Frame, Held, late_counts
+from tormagd.messages import Description, MessageError, Status, Telemetry
+from tormagd.output import printable
+
+FRAME_S = 0.1
+STATUS_S = 1.0
+PORTRAIT_S = 10.0
+"Between two looks at what the device can render: it shows itself slowly."
+SILENT_S = 0.5
+KEPT = 1_000
+"Snapshots: those of `frame.SHOWN_S`."
+WAITING = 50
+"Events that may wait for one browser; then it misses the oldest."
+
+
+class Live:
+    """Listens to the daemon of `client`, and tells every browser the same bytes. `run` it beside them."""
+
+    def __init__(self, client: AsyncClient, status: Status, description: Description) -> None:
+        self._client, self._status = client, status
+        self._kept: deque[Telemetry] = deque(maxlen=KEPT)
+        self._new: list[Telemetry] = []
+        self.browsers: set[asyncio.Queue[bytes]] = set()
+        self._explained: dict[str, Explanation] = {}
+        self._heard_s = time.monotonic()
+        self._why_silent = ""
+        self._portrait = _portrait(description)
+        self._learn(status)
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What the page begins with."""
+        return {"kind": "live"}
+
+    async def run(self) -> None:
+        """Never ends by itself; a daemon that goes is waited for."""
+        async with asyncio.TaskGroup() as tasks:
+            for each in (self._listen(), self._tell(), self._ask(), self._look_at_portrait()):
+                tasks.create_task(each)
+
+    @contextlib.contextmanager
+    def browser(self) -> Iterator[asyncio.Queue[bytes]]:
+        """One more that looks: what it is to be sent, beginning with the seconds that were."""
+        events: asyncio.Queue[bytes] = asyncio.Queue(WAITING)
+        if self._kept:
+            events.put_nowait(event("frame", self._frame(self._kept)))
+        events.put_nowait(event("status", self._shown_status()))
+        events.put_nowait(event("portrait", self._portrait))
+        self.browsers.add(events)
+        try:
+            yield events
+        finally:
+            self.browsers.discard(events)
+
+    async def _listen(self) -> None:
+        while True:
+            try:
+                async for snapshot in self._client.telemetry():
+                    self._heard_s, self._why_silent = time.monotonic(), ""
+                    self._kept.append(snapshot)
+                    self._new.append(snapshot)
+            except MessageError as error:
+                self._why_silent = f"what comes is not understood: {printable(str(error))}"
+
+    async def _tell(self) -> None:
+        while True:
+            await asyncio.sleep(FRAME_S)
+            silent_s = time.monotonic() - self._heard_s
+            if self._new:
+                self._publish("frame", self._frame(self._new))
+                self._new.clear()
+            elif silent_s > SILENT_S:
+                self._publish("silence", {"seconds": round(silent_s, 1), "why": self._why_silent})
+
+    async def _ask(self) -> None:
+        while True:
+            await asyncio.sleep(STATUS_S)
+            if self._is_heard:
+                with contextlib.suppress(ClientError):  # the page says that nothing is heard
+                    self._status = await self._client.status()
+                    self._learn(self._status)
+                    self._publish("status", self._shown_status())
+
+    async def _look_at_portrait(self) -> None:
+        while True:
+            await asyncio.sleep(PORTRAIT_S)
+            if self._is_heard:
+                with contextlib.suppress(ClientError):
+                    self._portrait = _portrait(await self._client.describe())
+                    self._publish("portrait", self._portrait)
+
+    @property
+    def _is_heard(self) -> bool:
+        """Requests to a daemon that is not there would wait for it, and all come at once."""
+        return time.monotonic() - self._heard_s < SILENT_S
+
+    def _publish(self, name: str, value: object) -> None:
+        data = event(name, value)
+        for events in self.browsers:
+            if events.full():
+                events.get_nowait()
+            events.put_nowait(data)
+
+    def _learn(self, status: Status) -> None:
+        for each in (*status.fault_details, *status.limit_details):
+            self._explained[each.code] = Explanation(each.cause, each.remedy)
+
+    def _shown_status(self) -> dict[str, object]:
+        return {"status": self._status, "explained": self._explained}
+
+    def _frame(self, snapshots: Sequence[Telemetry]) -> Frame:
+        newest, kept = snapshots[-1], self._kept
+        times = Counter(code for each in kept for code in each.limits)
+        return Frame(
+            t_s=[each.t_ns * 1e-9 for each in snapshots],
+            asked_N=[each.setpoint_cf for each in snapshots],
+            governed_N=[each.governed_cf for each in snapshots],
+            measured_N=[each.measured_cf for each in snapshots],
+            gap_mm=[each.gap_mm for each in snapshots],
+            gap_wanted_mm=[each.gap_setpoint_mm for each in snapshots],
+            field_mT=[each.field_mT for each in snapshots],
+            operating_state=newest.operating_state,
+            held=[Held(code, count / len(kept), code in newest.limits) for code, count in times.most_common()],
+            faults=newest.faults,
+            late_counts=late_counts(each.tick.lateness_us for each in kept),
+        )
+
+
+def event(name: str, value: object) -> bytes:
+    """A server-sent event with `value` as JSON."""
+    return b"event: %s\ndata: %s\n\n" % (name.encode(), msgspec.json.encode(value))
+
+
+def _portrait(description: Description) -> dict[str, object]:
+    return {"portrait": description.portrait}

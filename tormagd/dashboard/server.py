@@ -1,0 +1,100 @@
+"""The page and what it asks for: on this machine's own address only, and nothing but to be read."""
+
+import asyncio
+import contextlib
+import math
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+from aiohttp import web
+from aiohttp.typedefs import Handler
+
+from tormagd.dashboard.frame import LATE_US, SHOWN_S
+from tormagd.dashboard.live import Live
+from tormagd.dashboard.recorded import Recorded
+
+LOOPBACK = "127.0.0.1"
+NAMES = (LOOPBACK, "localhost")
+"What a browser on this machine calls it. By another name that leads here, a page from elsewhere would read along."
+MOST_BROWSERS = 32
+PAGE = Path(__file__).parent / "page"
+HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src data:; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
+
+
+def application(shown: Live | Recorded) -> web.Application:
+    """The page for what is shown. Every route is a GET."""
+
+    async def page(request: web.Request) -> web.StreamResponse:
+        return web.FileResponse(PAGE / "index.html")
+
+    async def about(request: web.Request) -> web.Response:
+        return _json({"shown_s": SHOWN_S, "late_us": LATE_US, **shown.about})
+
+    async def live(request: web.Request) -> web.StreamResponse:
+        assert isinstance(shown, Live)
+        if len(shown.browsers) >= MOST_BROWSERS:
+            raise web.HTTPServiceUnavailable(text=f"{MOST_BROWSERS} browsers look already")
+        response = web.StreamResponse(headers={"Content-Type": "text/event-stream"})
+        await response.prepare(request)
+        with shown.browser() as events, contextlib.suppress(ConnectionError):
+            while True:
+                await response.write(await events.get())
+        return response
+
+    async def frame(request: web.Request) -> web.Response:
+        assert isinstance(shown, Recorded)
+        return _json(shown.frame(_seconds(request.query.get("at_s", ""))))
+
+    made = web.Application(middlewares=[_only_this_machine])
+    made.on_response_prepare.append(_headers)
+    made.router.add_get("/", page)
+    made.router.add_get("/about", about)
+    made.router.add_get("/live", live) if isinstance(shown, Live) else made.router.add_get("/frame", frame)
+    made.router.add_static("/page", PAGE)
+    return made
+
+
+async def serve(shown: Live | Recorded, port: int, ready: Callable[[str], None]) -> None:
+    """Serves until SIGINT or SIGTERM; calls `ready` with the address. Raises OSError where the port is taken."""
+    over = asyncio.Event()
+    runner = web.AppRunner(application(shown), access_log=None, shutdown_timeout=0.5)
+    await runner.setup()
+    try:
+        await web.TCPSite(runner, LOOPBACK, port).start()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, over.set)
+        ready(f"http://{LOOPBACK}:{runner.addresses[0][1]}/")
+        await over.wait()
+    finally:
+        await runner.cleanup()
+
+
+@web.middleware
+async def _only_this_machine(request: web.Request, handler: Handler) -> web.StreamResponse:
+    if request.url.host not in NAMES:
+        raise web.HTTPForbidden(text=f"allowed hosts are {' and '.join(NAMES)}")
+    return await handler(request)
+
+
+async def _headers(request: web.Request, response: web.StreamResponse) -> None:
+    response.headers.update(HEADERS)
+
+
+def _json(value: object) -> web.Response:
+    return web.Response(body=msgspec.json.encode(value), content_type="application/json")
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise web.HTTPBadRequest(text=f"at_s = {text[:80]!r}: allowed is a finite number of seconds")
+    return seconds
