@@ -1,9 +1,9 @@
-"""Train the shipped tactile model: a pad is cycled and held on the bench, and its relaxation-aware model becomes a file.
+"""Train the shipped tactile model: a pad is cycled and held on the bench, its relaxation-aware model becomes a file.
 
     tactile_model.py --out FILE.safetensors [--plant pad_1] [--quick] [--json]
 
-The bench gives the plant's pad eleven fields, twelve cycles each at four rates, and an hour's hold at each of five fields;
-its force sensor has the noise of the plant's. Synthetic.
+The bench gives the plant's pad eleven fields, twelve cycles each at four rates, and an hour's hold at each of five
+fields; its force sensor has the noise of the plant's. Synthetic.
 """
 
 import argparse
@@ -63,7 +63,9 @@ def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceMod
     metrics = {f"validation_{name}": value for name, value in known.items()} | {
         "rmse_N": float(np.sqrt(np.mean(error_N**2))),
         "noise_N": noise_N,
-        "unseen_holds_share": float(np.abs(grey.predict(unseen) / unseen.force_N - 1.0)[unseen.features[:, 0] > 1.0].max()),
+        "unseen_holds_share": float(
+            np.abs(grey.predict(unseen) / unseen.force_N - 1.0)[unseen.features[:, 0] > 1.0].max()
+        ),
         "not_rising_share": not_rising_share(grey.model),
     }
     metadata = msgspec.structs.replace(

@@ -40,8 +40,8 @@ class Contact:
 
 @final
 class Sliding(Contact):
-    """The brake's handle, planned for at full mobilisation and in motion: the field sets how much friction there can be;
-    before break-away the force is the hand's choice, and the inverse is ill-posed."""
+    """The brake's handle, planned for at full mobilisation and in motion: the field sets how much friction there can
+    be. Before break-away the force is the hand's choice, and the inverse is ill-posed."""
 
     def __init__(self) -> None:
         super().__init__(MOBILISED_MM, ROLLER_RATE_MM_S, slides=True)

@@ -118,8 +118,8 @@ def first_estimate(measurement: Measurement, home_mm: float) -> Estimate:
 def update(
     last: Estimate | None, measurement: Measurement, home_mm: float, derivative_filter_s: float, turns: bool = True
 ) -> Estimate:
-    """The estimate after one more measurement; the same one again where the device has said nothing new. `turns` tells a
-    handle from a finger, whose force always pushes the same way.
+    """The estimate after one more measurement; the same one again where the device has said nothing new. `turns` tells
+    a handle from a finger, whose force always pushes the same way.
 
     Speeds are filtered derivatives over the *device's* clock, so that late delivery is not mistaken for slow motion.
     """

@@ -170,7 +170,8 @@ NOTHING_SHOWN: Final = Shown()
 
 @final
 class PlanState(Value):
-    """What planning remembers. `lag_s` is how late the device's carriages are, `memory` what its elastomer has relaxed."""
+    """What planning remembers. `lag_s` is how late the device's carriages are, `memory` what its elastomer has
+    relaxed."""
 
     __match_args__ = ("governor", "plan", "shown", "lag_s", "memory")
     __slots__ = __match_args__
@@ -222,7 +223,7 @@ class Planner:
         cip_percent: float,
         contact: Contact,
     ) -> None:
-        """`portrait` and `law` are those of the gaps whose fields `search` may answer with; no law is known of a pad."""
+        """`portrait` and `law` are of the gaps whose fields `search` may answer with; of a pad no law is known."""
         position, trim = config.position, config.trim
         self.portrait: Final = portrait
         self._model, self._search, self._field, self._law = model, search, field, law
@@ -258,8 +259,8 @@ class Planner:
         return PlanState(GovernorState(now_s, least, above_N=0.0), resting, memory=memory)
 
     def afresh(self, state: PlanState, now_s: float) -> PlanState:
-        """Begins anew after `state`, for which no plan could be made: plans go on being numbered, and what the elastomer
-        has relaxed it has not forgotten."""
+        """Begins anew after `state`, for which no plan could be made: plans go on being numbered, and the elastomer has
+        not forgotten."""
         begun = self.start(now_s)
         return begun.replaced(plan=begun.plan.replaced(number=state.plan.number + 1), memory=state.memory)
 
@@ -359,8 +360,8 @@ class Planner:
         return _within(self._field.field_mT(gap_mm), self._fields_mT)
 
     def _remember(self, memory: Memory, now_s: float, estimate: Estimate | None) -> Memory:
-        """What the elastomer has relaxed by now, from what it was put to since. Until the gap is known it counts as open,
-        where homing leads to."""
+        """What the elastomer has relaxed by now, from what it was put to since. Until the gap is known it counts as
+        open, where homing leads to."""
         relaxing = self._relaxing
         if relaxing is None or estimate is None:
             return memory

@@ -1,8 +1,8 @@
 """What an elastomer remembers, for a model that knows how it relaxes: the daemon's side of the relaxation-aware model.
 
 The network gives F0, the force without memory. What of it is there without field and what the field adds relax each by
-fractions of their own (`tormagd.physics.relaxation`). A field that changes now changes F0 alone, so the memory is a shift,
-the same for every field: the force is F0 less what has relaxed away, and any search finds the field for F0.
+fractions of their own (`tormagd.physics.relaxation`). A field that changes now changes F0 alone, so the memory is a
+shift, the same for every field: the force is F0 less what has relaxed away, and any search finds the field for F0.
 """
 
 from typing import Final, final

@@ -74,7 +74,8 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     `insert` names the insert the data were measured on; `ranges` holds the least and the greatest value seen in
     training for each feature and for `force_N`; `metrics` whatever the trainer measured; `created` is given, never
-    read from a clock; `relaxation` is there where the network's force is one without memory. Raises `DomainError` on anything that could not be saved and loaded again.
+    read from a clock; `relaxation` is there where the network's force is one without memory. Raises `DomainError` on
+    anything that could not be saved and loaded again.
     """
 
     element: Element

@@ -70,8 +70,8 @@ class Signal(Strict, frozen=True):
 
 
 class Handle(Strict, frozen=True):
-    """How fast the handle slides, mm/s at the roller's surface. A model that does not know such handles is refused. Of the
-    brake only."""
+    """How fast the brake's handle slides, mm/s at the roller's surface. A model that does not know such handles is
+    refused."""
 
     least_mm_s: Annotated[float, Meta(ge=0.5, le=1_000.0)] = 42.0
     most_mm_s: Annotated[float, Meta(ge=0.5, le=1_000.0)] = 42.0
@@ -221,7 +221,9 @@ class Scene(Strict, frozen=True):
             if not low < high:
                 raise ValueError(f"{low_name} = {low:g}: allowed is under {high_name} = {high:g}")
         if (self.finger is UNSET) != (self.element == "torque"):
-            raise ValueError(f"element = {self.element}: allowed is a table [finger] where it is tactile, and only there")
+            raise ValueError(
+                f"element = {self.element}: allowed is a table [finger] where it is tactile, and only there"
+            )
         if self.element == "tactile":
             self._require_no_brake()
         slowest, fastest = self.handle.least_mm_s, self.handle.most_mm_s

@@ -106,9 +106,7 @@ def _parser() -> argparse.ArgumentParser:
         "--bus", metavar="INTERFACE:CHANNEL", help="node of an existing bus, as in socketcan:vcan0, printed first"
     )
     parser.add_argument("--plant", default="sample_1", metavar="FILE", help=f"TOML file, or {', '.join(plant_names())}")
-    parser.add_argument(
-        "--hand", metavar="SPEC", help=f"{KNOWN_HANDS}; default steady, for a pad's plant pressing"
-    )
+    parser.add_argument("--hand", metavar="SPEC", help=f"{KNOWN_HANDS}; default steady, for a pad's plant pressing")
     parser.add_argument(
         "--fault",
         action="append",

@@ -11,7 +11,7 @@ SMALLEST_GAP_MM: Final = 45.0
 
 @final
 class GapField:
-    """The radial moment, T m, of a plant's magnets; `lag_Tm` is what hysteresis adds, at most `branch_Tm` either way."""
+    """The radial moment, T m, of a plant's magnets, off by at most `branch_Tm` either way for its hysteresis."""
 
     __slots__ = ("_lag_Tm", "_moment", "_moment_Tm", "_turn_Tm", "branch_Tm")
 

@@ -64,8 +64,8 @@ class ReversingHand(Value):
 
 @final
 class PressingHand(Value):
-    """The dummy finger of the thesis's pulse experiment: it touches the pad after 10 s, when the device is homed, presses
-    in at 1 mm/s, and stays."""
+    """The dummy finger of the thesis's pulse experiment: it touches the pad after 10 s, when the device is homed,
+    presses in at 1 mm/s, and stays."""
 
     __match_args__ = ("depth_mm",)
     __slots__ = __match_args__

@@ -1,8 +1,8 @@
-"""The tactile element of chapter 4 in the laboratory: the thesis's pads, and records of what is done to them. Synthetic.
+"""The tactile element of chapter 4 in the laboratory: the thesis's pads, and records of what is done to them.
 
 The data of the thesis are not public. What is printed of them is met: pad size, classes, moduli at 0 and 365 mT, force
 at full indentation. The rest (shape of the stiffening, relaxing fractions and times, conditioning, rates) is assumed,
-with sizes that the literature gives for such elastomers. `TactilePad` is the pad's law.
+with sizes that the literature gives for such elastomers. `TactilePad` is the pad's law. All of it is synthetic.
 """
 
 from collections.abc import Iterable

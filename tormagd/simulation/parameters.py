@@ -62,8 +62,8 @@ class Relaxation(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PadParameters(Struct, frozen=True, forbid_unknown_fields=True):
-    """A tactile pad between plates, in the place of insert and shaft: see `TactilePad`. Moduli are those of the worked pad
-    at small strain."""
+    """A tactile pad between plates, in the place of insert and shaft: see `TactilePad`. Moduli are those of the worked
+    pad at small strain."""
 
     cip_percent: Annotated[float, Meta(ge=0.0, le=60.0)]
     modulus_kPa: Annotated[float, Meta(ge=1.0, le=10_000.0)]

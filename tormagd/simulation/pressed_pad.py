@@ -1,7 +1,8 @@
 """The tactile element: from the magnets' gap and the finger's depth in the pad to the force that the finger feels.
 
-The same magnets, screws and field as the brake's, with a `TactilePad` between them. Richer than any model the controller
-uses: field with hysteresis, Gent law, saturation, Payne effect, rate, eight relaxing branches, conditioning, warmth.
+The same magnets, screws and field as the brake's, with a `TactilePad` between them. Richer than any model the
+controller uses: field with hysteresis, Gent law, saturation, Payne effect, rate, eight relaxing branches, conditioning,
+warmth.
 """
 
 from typing import Final, final
@@ -18,7 +19,7 @@ MT_PER_TM: Final = 1e3 / PAD_RADIUS_M
 
 @final
 class PressedPad:
-    """State of the element: the field's branch, the pad with its past, the temperature. It was worked before, and rested.
+    """State of the element: the field's branch, the pad with its past, the temperature. It was worked, and rested.
 
     `force_N` pushes the finger out, and is never negative: plates only push. Deeper than 6 mm the plates meet: the pad
     gives no more there.
