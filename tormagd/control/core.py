@@ -43,7 +43,8 @@ DEPTHS = 9
 "Between the scene's depth and the model's greatest, at which a pad's force is looked at whether it rises."
 LOOKED_AT_S, LOOKED_AT_HZ = 30.0, 100
 "So much of a scene's signal is held against the device's speed."
-SEVERAL_BRANCHES = named("nearest")._replace(reason="the model's force does not rise everywhere: branches are compared")
+SEVERAL_BRANCHES = named("nearest", neighbours=16)._replace(reason="the force falls with the field somewhere")
+"With fewer neighbours answers jump between branches, more gain little: docs/tactile.md."
 IN_PORTRAIT = Choice("portrait", 0.0, 0, "float64", "the scene requires no rate: force over gap is one table")
 
 
@@ -99,9 +100,9 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
         law = _law(scene, reach, field)
     except (DomainError, ModelFileError) as error:
         raise ConfigError(f"scene {scene.name}: {error}") from error
+    _refuse_unknown_hand(scene, model)
     _refuse_out_of_reach(scene, reach)
     _refuse_too_fine(scene, reach)
-    _refuse_unknown_hand(scene, model)
     too_fast = _refuse_too_fast(config, scene, reach, beside) if models is None else None
     _refuse_too_sudden(config, scene, reach)
     planner = Planner(config, scene, model, search, field, reach, law, part.cip_percent, part.contact)

@@ -242,7 +242,7 @@ class Planner:
         self._has_rate, self._has_lag = terms.rate, terms.lag and terms.learning
         self._has_creep = terms.creep and contact.slides
         self._learns_creep = terms.learning and self._has_creep
-        self._relaxing = model.relaxing if terms.relaxation else None
+        self._relaxing = None if terms.relaxation is False else model.relaxing
         self._fits = terms.learning and (terms.scale or terms.offset)
         self._learns_scale, self._learns_offset = terms.scale, terms.offset
         self._only_curve = model.curve(
@@ -367,13 +367,8 @@ class Planner:
             return memory
         curve = self._present_curve(estimate)
         field_mT = self._present_mT(estimate) if estimate.is_homed else self._field.field_mT(self._open_mm)
-        # a model knows nothing of a finger that hardly touches: towards none, the force falls to none
-        touched_mm, _ = self._displacements_mm
-        touches = 1.0
-        if estimate.handle.displacement_mm < touched_mm:
-            touches = estimate.handle.displacement_mm / touched_mm
-        free_N = touches * curve.force_N(0.0)
-        return relaxing.advance(memory, now_s, free_N, touches * curve.force_N(field_mT) - free_N)
+        free_N = curve.force_N(0.0)
+        return relaxing.advance(memory, now_s, free_N, curve.force_N(field_mT) - free_N)
 
     def _learn(self, shown: Shown, now_s: float, estimate: Estimate | None, model_N: float | None) -> Shown:
         """From the force at the *measured* gap: the model's error is learned, not the tracking error, so it cannot

@@ -95,8 +95,7 @@ class Budget(Strict, frozen=True):
 
 
 class Terms(Strict, frozen=True):
-    """The parts of the controller's model. One that is left out is not computed; `creep` is of the brake alone, and
-    `relaxation` of a model that knows it, as the pads' do.
+    """The parts of the controller's model. One that is left out is not computed.
 
     `rate`      the handle's rate and displacement are inputs of the learned model; without it the force over the gap is
                 one table, that of a handle at the thesis's 42 mm/s, and there is no search
@@ -110,7 +109,8 @@ class Terms(Strict, frozen=True):
     `motor`     the duty for the reference's speed and acceleration is fed forward
     `friction`  the duty that overcomes the dry friction of gearbox and screw is fed forward
     `pull`      the duty against the magnets' pull is fed forward, and limits the opening speed
-    `relaxation` what the elastomer has relaxed away of its force is known from what it was put to
+    `relaxation` of a pad alone, where nothing is said of it: what its elastomer has relaxed away of the force is told
+                by the model from what it was put to. A pad in its turn has no `creep`
 
     What safety rests on is no term: the ceiling, the judgement of the sensor, the force law beside the search.
     """
@@ -126,30 +126,27 @@ class Terms(Strict, frozen=True):
     motor: bool = True
     friction: bool = True
     pull: bool = True
-    relaxation: bool = True
+    relaxation: bool | UnsetType = UNSET
     learning: bool = True
     "No part of the model, but whether `creep`, `scale`, `offset` and `lag` go on learning, or stay what they are."
 
     @property
     def left_out(self) -> tuple[str, ...]:
         """The names of the terms that are out."""
-        return tuple(name for name in TERMS if not getattr(self, name))
+        return tuple(name for name in (*TERMS, RELAXATION) if getattr(self, name) is False)
 
     def without(self, *names: str) -> "Terms":
         """These terms with some more left out. Raises ValueError for a name that is none."""
         for name in names:
-            if name not in TERMS:
+            if name not in (*TERMS, RELAXATION):
                 raise ValueError(f"term {name!r}: allowed is one of {', '.join(TERMS)}")
         return msgspec.structs.replace(self, **dict.fromkeys(names, False))
 
 
-TERMS = tuple(name for name in Terms.__struct_fields__ if name != "learning")
+RELAXATION = "relaxation"
+TERMS = tuple(name for name in Terms.__struct_fields__ if name not in (RELAXATION, "learning"))
+"Those of the brake."
 EVERY_TERM = Terms()
-OF_ELEMENT = {
-    "torque": tuple(name for name in TERMS if name != "relaxation"),
-    "tactile": tuple(name for name in TERMS if name != "creep"),
-}
-"The terms that there are for each element."
 
 
 class Insert(Strict, frozen=True):
@@ -226,6 +223,8 @@ class Scene(Strict, frozen=True):
             )
         if self.element == "tactile":
             self._require_no_brake()
+        elif isinstance(self.terms, Terms) and self.terms.relaxation is not UNSET:
+            raise ValueError("terms.relaxation: allowed only where element is tactile")
         slowest, fastest = self.handle.least_mm_s, self.handle.most_mm_s
         if slowest > fastest:
             raise ValueError(f"handle.least_mm_s = {slowest:g}: allowed is at most handle.most_mm_s = {fastest:g}")
@@ -243,7 +242,7 @@ class Scene(Strict, frozen=True):
     def fingerprint(self) -> str:
         """Of the task: of all that is stated but how it is called, and how often and by which terms it is served."""
         task = msgspec.structs.replace(
-            self, name="", description="", terms="all", bandwidth=Bandwidth(), budget=Budget()
+            self, name="", description="", terms=EVERY_TERM, bandwidth=Bandwidth(), budget=Budget()
         )
         return hashlib.sha256(msgspec.json.encode(task)).hexdigest()[:16]
 
