@@ -1,11 +1,11 @@
-"""What the neighbours of the k-nearest search decide: on the tactile pad, whose force falls somewhere, and on the brake.
+"""What the neighbours of the k-nearest search decide: on the tactile pad, whose force falls somewhere, and the brake.
 
     tactile_branches.py [--json]
 
 Contacts are drawn from the model's box, of the pad those at which its force falls with the field somewhere. At each the
-field goes smoothly up and down again, and the search is asked for the model's force there, answer by answer. A *jump* is
-an answer further than JUMP_MT from the last; *travel* is the answers' way over the field's own. Where the force rises
-everywhere there are none, however few neighbours.
+field goes smoothly up and down again, and the search is asked for the model's force there, answer by answer. A *jump*
+is an answer further than JUMP_MT from the last; *travel* is the answers' way over the field's own. Where the force
+rises everywhere there are none, however few neighbours.
 """
 
 import argparse
@@ -116,7 +116,9 @@ def main() -> int:
         write_line(json.dumps(result), sys.stdout)
         return 0
     for name in MODELS:
-        write_line(f"{name}: dF/dB <= 0 on {result[name]['not_rising_share_of_box']:.1%} of the model's box", sys.stdout)
+        write_line(
+            f"{name}: dF/dB <= 0 on {result[name]['not_rising_share_of_box']:.1%} of the model's box", sys.stdout
+        )
         for row in result[name]["rows"]:
             write_line(
                 f"  {row['search']:42} jumps {row['jump_share']:7.3%}, travel {row['travel']:5.2f}, "
