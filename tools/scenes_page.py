@@ -198,7 +198,8 @@ def _solver(scenes: tuple[MeasuredScene, ...]) -> str:
         f"for {', '.join(table) or 'no measured scene'}, unless the scene names a search. Where a search runs, "
         "`newton` wins at every tolerance from 1 mN to 1 N and for every network from 10 to 200 units, because the "
         "[table](inverse_trade.md) has no search that is cheaper and none that is more exact; a brake's model rises "
-        "with the field everywhere, so that one neighbour is enough, as it is not on [the pad](tactile.md). float32 saves nothing on one root. "
+        "with the field everywhere, so that one neighbour is enough, as it is not on [the pad](tactile.md). float32 "
+        "saves nothing on one root. "
         "`nearest` and `coarse-to-fine` run only where a scene names them: `pulse` does, to show the k-nearest search "
         "in `make run`, and pays for it in the table above."
     )

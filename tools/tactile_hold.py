@@ -5,8 +5,8 @@
 A constant force is asked for; the finger presses, and the device is learned for some seconds. From then on the error of
 the pad's true force counts, as a share of the force asked, and frozen runs learn no more. It is the daemon's own loop
 with the whole device, at the scene's own rates. With --coarse the plans alone run, fifty a second, and the gap is where
-they lead, which takes a tenth of the time; the two differ by less than 0.1 % of the force (tests/closed_loop/test_pad.py).
-All pads are synthetic.
+they lead, which takes a tenth of the time; the two differ by less than 0.1 % of the force, as a
+test holds. A hold that latches a fault ends there. All pads are synthetic.
 """
 
 import argparse
@@ -28,8 +28,10 @@ from tormagd.control.core import build_core
 from tormagd.control.estimate import Estimate, Handle
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import PlanState
+from tormagd.control.step import SENSOR_FAULT_S
 from tormagd.model.displacement import Turn
 from tormagd.output import write_line
+from tormagd.safety.codes import Fault
 from tormagd.scenes.scene import load_scene, terms_of
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, PressingHand
@@ -45,6 +47,7 @@ CONTROL_HZ = 500
 COARSE_S = 0.02
 VALID_S = 0.1
 SHOWN_S = 10.0
+OFFSET: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "color": "#d32f2f"}
 MODES = ((True, False), (False, False), (True, True), (False, True))
 
 
@@ -59,21 +62,25 @@ class Case(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """Once a second: the pad's true force, the gap, and what was planned. A fault leaves no state."""
+    """Once a second: the pad's true force, the gap, what was planned, and the fault that ends the hold."""
 
     force_N: float
     gap_mm: float
-    state: PlanState | None
+    state: PlanState
+    fault: str
 
 
 def hold(case: Case) -> dict[str, Any]:
-    """The greatest, the mean and the last error of the true force, as shares of the force asked, and the share of time
-    that each limit was there. A fault is an error of the whole."""
-    shares, limits, gap_mm = [], dict[str, int](), math.nan
+    """The greatest, the mean and the last error of the true force, as shares of the force asked, the share of time that
+    each limit was there, and the fault that ended it, if any."""
+    shares, limits, gap_mm, fault = [], dict[str, int](), math.nan, ""
     for moment in (_coarse if case.coarse else _whole)(case):
-        shares.append(moment.force_N / FORCE_N - 1.0 if moment.state is not None else -1.0)
+        fault = moment.fault
+        if fault:
+            break
+        shares.append(moment.force_N / FORCE_N - 1.0)
         gap_mm = moment.gap_mm
-        for limit in () if moment.state is None else moment.state.plan.limits:
+        for limit in moment.state.plan.limits:
             limits[str(limit)] = limits.get(str(limit), 0) + 1
     absolute = np.abs(shares)
     return case._asdict() | {
@@ -81,6 +88,8 @@ def hold(case: Case) -> dict[str, Any]:
         "mean_force_error": float(absolute.mean()),
         "last_force_error": shares[-1],
         "last_gap_mm": gap_mm,
+        "held_s": len(shares),
+        "fault": fault,
         "limits": {name: count / len(shares) for name, count in limits.items()},
         "every_s": SHOWN_S,
         "shares": shares[:: round(SHOWN_S)],
@@ -98,8 +107,8 @@ class _Prepared:
         terms = terms_of(stated) if case.relaxation else terms_of(stated).without("relaxation")
         frozen = msgspec.structs.replace(terms, learning=False)
         self.core = build_core(self.config, msgspec.structs.replace(stated, terms=terms))
-        self.later = self.core if case.is_learning else build_core(
-            self.config, msgspec.structs.replace(stated, terms=frozen)
+        self.later = (
+            self.core if case.is_learning else build_core(self.config, msgspec.structs.replace(stated, terms=frozen))
         )
         self.hand, self.plant = PressingHand(stated.finger.depth_mm), load_plant(case.plant)
         self.begins_s = PRESSES_AT_S + stated.finger.depth_mm / PRESSING_MM_S + LEARN_S
@@ -119,8 +128,9 @@ def _whole(case: Case) -> Iterator[Moment]:
     for _ in range(round(case.seconds)):
         for _ in loop.run(1.0, asked):
             pass
-        truth = loop.device.truth
-        yield Moment(truth.force_N, truth.gap_mm, None if loop.step_state.safety.faults else loop.plan_state)
+        truth, state = loop.device.truth, loop.plan_state
+        assert state is not None, "this loop plans"
+        yield Moment(truth.force_N, truth.gap_mm, state, ", ".join(map(str, loop.step_state.safety.faults)))
 
 
 def _coarse(case: Case) -> Iterator[Moment]:
@@ -143,7 +153,8 @@ def _coarse(case: Case) -> Iterator[Moment]:
         if tick == begins:
             planner = made.later.planner
         elif tick > begins and tick % each_s == 0:
-            yield Moment(element.force_N, gap_mm, state)
+            is_doubted = state.plan.sensor_doubted_s > SENSOR_FAULT_S
+            yield Moment(element.force_N, gap_mm, state, str(Fault.SENSOR) if is_doubted else "")
 
 
 def draw(path: Path, holds: list[dict[str, Any]]) -> None:
@@ -167,6 +178,9 @@ def draw(path: Path, holds: list[dict[str, Any]]) -> None:
                 label=f"{'with' if held['relaxation'] else 'without'} relaxation, "
                 f"{'learning' if held['is_learning'] else 'frozen'}",
             )
+            if held["fault"]:
+                axes.plot(minutes[-1], 100.0 * held["shares"][-1], "x", color="#d32f2f", markersize=9)
+                axes.annotate(f"fault {held['fault']}", (minutes[-1], 100.0 * held["shares"][-1]), (8, -3), **OFFSET)
         axes.set(title=plant.replace("_", " "), xlabel="held for, min")
     panels[0].set(ylabel="error of the true force, %")
     panels[0].legend(fontsize=8, loc="lower left")
@@ -193,7 +207,8 @@ def main() -> int:
             write_line(
                 f"{held['plant']}  {'with' if held['relaxation'] else 'without':8}relaxation, "
                 f"{'learning' if held['is_learning'] else 'frozen':9} worst {held['force_error']:6.2%}, "
-                f"mean {held['mean_force_error']:6.2%}, last {held['last_force_error']:+6.2%}",
+                f"mean {held['mean_force_error']:6.2%}, last {held['last_force_error']:+6.2%} after {held['held_s']} s"
+                f"{held['fault'] and ': ' + held['fault']}",
                 sys.stdout,
             )
     if options.json:

@@ -51,14 +51,15 @@ def test_a_pulse_is_felt_on_the_pad(core: Core, plant: str) -> None:
 
 
 def test_a_held_force_stays_with_the_memory_and_falls_without() -> None:
-    """The first quarter of an hour of `tools/tactile_hold.py --coarse`, frozen."""
-    within, without = (hold(Case("pad_1", remembers, False, 900.0, coarse=True)) for remembers in (True, False))
+    """The first minutes of `tools/tactile_hold.py --coarse`, frozen."""
+    within, without = (hold(Case("pad_1", remembers, False, 200.0, coarse=True)) for remembers in (True, False))
     assert within["force_error"] < 0.01
+    assert not within["fault"]
     assert without["last_force_error"] < -0.05
 
 
 def test_a_hold_of_plans_alone_is_that_of_the_whole_device() -> None:
-    whole, coarse = (hold(Case("pad_1", False, False, 20.0, is_coarse)) for is_coarse in (False, True))
+    whole, coarse = (hold(Case("pad_1", False, False, 10.0, is_coarse)) for is_coarse in (False, True))
     assert whole["last_force_error"] == pytest.approx(coarse["last_force_error"], abs=1e-3)
 
 
