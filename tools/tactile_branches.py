@@ -111,15 +111,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args()
-    result = {"synthetic": True, "jump_mT": JUMP_MT} | {name: measured(name) for name in MODELS}
+    found = {name: measured(name) for name in MODELS}
     if options.json:
-        write_line(json.dumps(result), sys.stdout)
+        write_line(json.dumps({"synthetic": True, "jump_mT": JUMP_MT, **found}), sys.stdout)
         return 0
-    for name in MODELS:
-        write_line(
-            f"{name}: dF/dB <= 0 on {result[name]['not_rising_share_of_box']:.1%} of the model's box", sys.stdout
-        )
-        for row in result[name]["rows"]:
+    for name, model in found.items():
+        write_line(f"{name}: dF/dB <= 0 on {model['not_rising_share_of_box']:.1%} of the model's box", sys.stdout)
+        for row in model["rows"]:
             write_line(
                 f"  {row['search']:42} jumps {row['jump_share']:7.3%}, travel {row['travel']:5.2f}, "
                 f"other answers than 64 neighbours {row['other_answers']:6.2%}, {row['p50_us']:4.0f} us",
