@@ -47,7 +47,7 @@ CONTROL_HZ = 500
 COARSE_S = 0.02
 VALID_S = 0.1
 SHOWN_S = 10.0
-OFFSET: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "color": "#d32f2f"}
+FAULT_NOTE: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "color": "#d32f2f"}
 MODES = ((True, False), (False, False), (True, True), (False, True))
 
 
@@ -180,7 +180,9 @@ def draw(path: Path, holds: list[dict[str, Any]]) -> None:
             )
             if held["fault"]:
                 axes.plot(minutes[-1], 100.0 * held["shares"][-1], "x", color="#d32f2f", markersize=9)
-                axes.annotate(f"fault {held['fault']}", (minutes[-1], 100.0 * held["shares"][-1]), (8, -3), **OFFSET)
+                axes.annotate(
+                    f"fault {held['fault']}", (minutes[-1], 100.0 * held["shares"][-1]), (8, -3), **FAULT_NOTE
+                )
         axes.set(title=plant.replace("_", " "), xlabel="held for, min")
     panels[0].set(ylabel="error of the true force, %")
     panels[0].legend(fontsize=8, loc="lower left")

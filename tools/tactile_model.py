@@ -58,14 +58,12 @@ def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceMod
     forward = GreyBoxForward(holds, HIDDEN, epochs=effort.epochs, settling_epochs=effort.settling_epochs)
     grey = forward.fit(cycles, ~held_out)
     unseen = dataset(holding_records(plant.pad, 0.0, SEED, fields_mT=UNSEEN_FIELDS_MT, samples=effort.hold_samples))
-    error_N = forward.predict(cycles)[held_out] - cycles.force_N[held_out]
-    known = force_metrics(forward.predict(cycles)[held_out], cycles.force_N[held_out], grey.model.force_span_N)
-    metrics = {f"validation_{name}": value for name, value in known.items()} | {
-        "rmse_N": float(np.sqrt(np.mean(error_N**2))),
+    is_pressed = unseen.features[:, 0] > 1.0
+    predicted_N = forward.predict(cycles)[held_out]
+    scores = force_metrics(predicted_N, cycles.force_N[held_out], grey.model.force_span_N)
+    metrics = {f"validation_{name}": value for name, value in scores.items()} | {
         "noise_N": noise_N,
-        "unseen_holds_share": float(
-            np.abs(grey.predict(unseen) / unseen.force_N - 1.0)[unseen.features[:, 0] > 1.0].max()
-        ),
+        "unseen_holds_share": float(np.abs(grey.predict(unseen)[is_pressed] / unseen.force_N[is_pressed] - 1.0).max()),
         "not_rising_share": not_rising_share(grey.model),
     }
     metadata = msgspec.structs.replace(
