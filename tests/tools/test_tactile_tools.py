@@ -19,7 +19,7 @@ def test_neighbours_decide_on_the_pad_and_nothing_on_the_brake(monkeypatch: pyte
     pad, brake = (tactile_branches.measured(name)["rows"] for name in ("pad", "brake"))
     one, sixteen = (next(row for row in pad if row["search"] == f"nearest, {count} neighbours") for count in (1, 16))
     forgetful = next(row for row in pad if row["search"].endswith("last field unknown"))
-    assert one["travel"] > 1.5 * sixteen["travel"]
+    assert one["travel"] > 1.2 * sixteen["travel"]
     assert one["other_answers"] > 0.02 > sixteen["jump_share"]
     assert forgetful["jump_share"] > sixteen["jump_share"]
     assert all(row["worst_force_error_N"] < 1e-3 for row in pad)
@@ -27,7 +27,7 @@ def test_neighbours_decide_on_the_pad_and_nothing_on_the_brake(monkeypatch: pyte
 
 
 def test_a_pads_model_is_trained_and_taken_by_a_scene(tmp_path: Path) -> None:
-    effort = tactile_model.Effort(samples_per_cycle=12, hold_samples=120, epochs=12, settling_epochs=3)
+    effort = tactile_model.Effort(samples_per_cycle=8, hold_samples=80, epochs=8, settling_epochs=2)
     model = tactile_model.trained("pad_1", effort, datetime.date(2026, 11, 22))
     assert isinstance(model.metadata.relaxation, Relaxation)
     assert sum(model.metadata.relaxation.fractions) == pytest.approx(0.108, abs=0.03)
