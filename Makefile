@@ -28,7 +28,7 @@ SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict --quiet
 
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
-.PHONY: install uninstall deb run test unhurried search check docs format compile core fetched model reproduction evidence clean
+.PHONY: install uninstall deb run test unhurried search check docs format compile core fetched model tactile-model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -81,6 +81,10 @@ model: $(VENV)/.dev
 	        --without-memory --rising --hidden 40 --epochs 120 --validation-share 0.2 \
 	        --out tormagd/model/models/torque_mre_$$(echo $${pair#*:} | tr - _).safetensors || exit 1; \
 	done
+
+# the shipped model of the tactile pad: cycles and holds of the simulated pad 1 on the bench, then training
+tactile-model: $(VENV)/.dev
+	$(BIN)/python tools/tactile_model.py --out tormagd/model/models/tactile_mre_c.safetensors
 
 # docs/reproduction.md and docs/learned_inverse.md with their plots: the thesis's tables and figures beside ours
 reproduction: $(VENV)/.dev

@@ -20,7 +20,7 @@ from setuptools.command.build_ext import build_ext
 COMPILED = {
     "firmware_protocol": ("value", "schema", "checksum", "layouts", "wire", "codec", "framing"),
     "tormagd/physics": ("friction", "relaxation"),
-    "tormagd/model": ("displacement", "force_curve"),
+    "tormagd/model": ("displacement", "force_curve", "memory"),
     "tormagd/inverse": ("solution", "newton"),
     "tormagd/hardware": ("frame_stream", "link", "link_quality", "link_statistics", "measurement", "connection"),
     "tormagd/safety": ("operating_state",),
@@ -38,10 +38,14 @@ COMPILED = {
             "trajectory",
             "interpolation",
             "portrait",
+            "contact",
         ),
         *("periodicity", "governor", "handle", "plan", "motor", "step", "conditions"),
     ),
-    "tormagd/simulation": ("curve", "axis", "element", "hand", "plant", "motion", "firmware", "device"),
+    "tormagd/simulation": (
+        *("curve", "axis", "gap_field", "warmth", "element", "tactile_pad", "pressed_pad"),
+        *("hand", "plant", "motion", "firmware", "device"),
+    ),
     "tormagd/daemon": ("sequence", "source_clock", "rate_group", "telemetry"),
     "tormagd": ("closed_loop",),
 }

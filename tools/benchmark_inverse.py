@@ -149,7 +149,7 @@ def make(case: Case, model: ForceModel) -> FieldSolver:
 
 def rising(model: ForceModel) -> RisingSearch:
     """Raises `DomainError` on a model that the daemon would refuse."""
-    if falling_at(model, FIELDS_MT) is not None:
+    if falling_at(model, FIELDS_MT, model.feature_ranges[0][1]) is not None:
         raise DomainError("model", "not rising with the field", "a force that rises with the field everywhere")
     return RisingSearch(FIELDS_MT)
 

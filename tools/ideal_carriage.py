@@ -14,7 +14,7 @@ import numpy.typing as npt
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.curve import Curve
-from tormagd.simulation.element import SMALLEST_GAP_MM
+from tormagd.simulation.gap_field import SMALLEST_GAP_MM
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import MOMENT_POINTS, force_over_moment, pull_over_gap, radial_moment_Tm
 

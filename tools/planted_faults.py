@@ -183,7 +183,7 @@ PLANTED = (
         "skew to one side only",
     ),
     Planted(STEP, "if state.straying_s > self._following_time_s:", "if False:", "a gap that does not follow"),
-    Planted(STEP, "if state.over_s > OVER_FAULT_S:", "if False:", "too much force for ever"),
+    Planted(STEP, "if state.over_s > OVER_FAULT_S and self._slides:", "if False:", "too much force for ever"),
     Planted(STEP, "if state.over_s > OVER_HELD_S:", "if False:", "too much force does not open"),
     Planted(
         STEP,

@@ -29,8 +29,8 @@ from tormagd.hardware.measurement import Measurement
 from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, load_scene, scene_path, terms_of
 from tormagd.scenes.signal import asked
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import RecordedHand
-from tormagd.simulation.parameters import load_plant, with_insert
+from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, Hand, PressingHand, RecordedHand
+from tormagd.simulation.parameters import PlantParameters, load_plant, with_insert
 
 Array = npt.NDArray[np.float64]
 Call = Callable[[], object]
@@ -153,14 +153,16 @@ class _Play:
         scene = _left_out(msgspec.structs.replace(stated, bandwidth=free), case.left_out)
         self.core = build_core(config, scene)
         self._frozen = None if case.is_learning else _frozen(config, scene)
-        plant = with_insert(load_plant(case.plant), scene.insert.name)
         self._loop = ClosedLoop(
-            config, self.core.stepper, self.core.planner, VirtualDevice(plant, _hand(scene), seed=1)
+            config, self.core.stepper, self.core.planner, VirtualDevice(_plant(scene, case), _hand(scene), seed=1)
         )
         self._loop.arm()
         self.time_s, self.force_N = signal_of(self.core, case.scene, LEARN_S + case.seconds, case.inference_hz)
-        before_s = np.arange(round(APPROACH_S * case.inference_hz)) / case.inference_hz
-        self.begins_s = self._loop.now_s + APPROACH_S
+        approach_s = APPROACH_S
+        if scene.finger is not msgspec.UNSET:
+            approach_s += PRESSES_AT_S + scene.finger.depth_mm / PRESSING_MM_S - self._loop.now_s
+        before_s = np.arange(round(approach_s * case.inference_hz)) / case.inference_hz
+        self.begins_s = self._loop.now_s + approach_s
         times = np.concatenate([self._loop.now_s + before_s, self.begins_s + self.time_s])
         forces = np.concatenate([np.full(len(before_s), self.force_N[0]), self.force_N])
         is_known = scene.signal is not None and scene.signal.is_known_ahead
@@ -199,7 +201,16 @@ def signal_of(core: Core, scene_name: str, longest_s: float, rate_hz: int) -> tu
     return time_s, force_N
 
 
-def _hand(scene: Scene) -> RecordedHand:
+def _plant(scene: Scene, case: Case) -> PlantParameters:
+    """The sample with the scene's insert in it, or the pad on the sample's carriages."""
+    if scene.element == "tactile":
+        return load_plant(case.plant.replace("sample", "pad"))
+    return with_insert(load_plant(case.plant), scene.insert.name)
+
+
+def _hand(scene: Scene) -> Hand:
+    if scene.finger is not msgspec.UNSET:
+        return PressingHand(scene.finger.depth_mm)
     low, high = math.log(scene.handle.least_mm_s), math.log(scene.handle.most_mm_s)
     time_s = np.arange(0.0, HAND_LASTS_S, HAND_STEP_S)
     speed_mm_s = np.exp((low + high) / 2.0 + (high - low) / 2.0 * np.sin(2.0 * math.pi * time_s / HAND_S))

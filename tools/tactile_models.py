@@ -13,17 +13,16 @@ from tormagd.model.features import FEATURES, FIELD
 from tormagd.model.model_file import ForceModel
 from tormagd.model.rising import not_rising_share
 from tormagd.simulation.pad import (
-    FULL_FIELD_MT,
-    FULL_INDENTATION_MM,
     PADS,
     RATES_MM_S,
     TOUCHING_MM,
-    PadParameters,
     PadRecord,
     cyclic_records,
     holding_records,
     worked_pad,
 )
+from tormagd.simulation.parameters import PadParameters
+from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM
 from tormagd.training.baselines import ForestForward, SupportVectorForward
 from tormagd.training.dataset import Array, Dataset
 from tormagd.training.forward import ForwardModel, NetworkForward

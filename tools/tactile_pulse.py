@@ -14,7 +14,9 @@ from tormagd.inverse.linear import LinearFieldSearch
 from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.solution import FieldSolver, Reach
 from tormagd.model.model_file import ForceModel
-from tormagd.simulation.pad import FULL_FIELD_MT, FULL_INDENTATION_MM, PADS, PadParameters, drawn_pad, worked_pad
+from tormagd.simulation.pad import PADS, drawn_pad, worked_pad
+from tormagd.simulation.parameters import PadParameters
+from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM
 from tormagd.training.dataset import Array
 from tormagd.training.grey_box import GreyBoxMemory
 

@@ -228,6 +228,10 @@ def _pulse(pulse: Json) -> str:
             "The other pads (constants drawn 3 to 15 % off, not trained on) show what a model is worth on a pad that "
             "it was not made for: a pad has to be measured itself."
         )
+        + _text(
+            "Why 17 mT and not 1.14: `tools/tactile_drift.py` repeats the experiment on pads that relax by a share of "
+            "what ours does, each with a network of its own; see [the pad](tactile.md)."
+        )
         + "![the pulse experiment](images/tactile_pulse.png)\n"
     )
 

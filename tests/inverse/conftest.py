@@ -53,6 +53,14 @@ def bump() -> ForceModel:
 
 
 @pytest.fixture(scope="session")
+def lopsided() -> ForceModel:
+    """Force that rises steeply to its greatest value near 450 mT and falls gently."""
+    weight = np.zeros((2, 4))
+    weight[:, 2] = 40.0, -4.0
+    return make_model(weight, np.array([4.0, 4.0]), np.array([1.5, 1.5]), -2.0)
+
+
+@pytest.fixture(scope="session")
 def plateau() -> ForceModel:
     """Force that climbs steeply at 450 mT and is flat to the last bit on both sides."""
     weight = np.zeros((1, 4))

@@ -97,6 +97,29 @@ def test_the_branch_of_the_last_field_is_kept(bump: ForceModel, dtype: type[np.f
             last = solution.field_mT
 
 
+@pytest.mark.parametrize(("neighbours", "keeps"), [(1, False), (2, False), (16, True)])
+def test_neighbours_decide_where_the_force_falls(lopsided: ForceModel, neighbours: int, keeps: bool) -> None:
+    """Steep up, gently down: of the points nearest in force the first few are all on the gentle side."""
+    solver, curve = nearest(neighbours=neighbours, step_mT=5.0), lopsided.curve(0.5, 10, CIP)
+    last, strayed = 440.0, False
+    for force in np.linspace(curve.force_N(440.0), curve.force_N(420.0), 80).tolist():
+        solution = solver.solve(curve, force, last)
+        assert solution.reach is Reach.INSIDE
+        strayed |= solution.field_mT > 450.0
+        last = solution.field_mT
+    assert strayed is not keeps
+
+
+def test_one_neighbour_is_enough_where_the_force_rises(rising: ForceModel) -> None:
+    one, many = nearest(neighbours=1), nearest(neighbours=64)
+    last = None
+    for displacement, rate, share in np.random.default_rng(5).uniform((0, 0, -0.1), (1, 60, 1.1), (200, 3)).tolist():
+        curve, force = rising.curve(displacement, rate, CIP), attainable(rising, displacement, rate, share)
+        solution = one.solve(curve, force, last)
+        assert solution == many.solve(curve, force, last)
+        last = solution.field_mT
+
+
 def test_without_a_last_field_the_least_of_the_roots_is_taken(bump: ForceModel) -> None:
     force = bump.predict_one(0.5, 10, 300.0, CIP)
     assert nearest().solve(bump.curve(0.5, 10, CIP), force, None).field_mT == pytest.approx(300, abs=0.05)

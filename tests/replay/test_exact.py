@@ -11,14 +11,17 @@ from hypothesis import strategies as st
 
 from firmware_protocol.codec import Switches
 from tormagd.control.device_fit import UNSEEN
-from tormagd.control.plan import NOTHING_SHOWN, Outside
+from tormagd.control.governor import GovernorState
+from tormagd.control.plan import NOTHING_SHOWN, Outside, Plan, PlanState
 from tormagd.control.step import StepState
 from tormagd.exact import InexactError, first_difference, kinds, packed, plain, restored
 from tormagd.model.displacement import Turn
+from tormagd.model.memory import Memory
 from tormagd.replay.rerun import KNOWN
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import SafetyState
 
+PLAN = Plan(1, 0.5, 3.5, 0.001, 3.5, None, 180.0, 78.0, 0.0, 1.0, (Limit.F_MIN,))
 FLOATS = st.one_of(st.floats(), st.sampled_from([-0.0, math.nan, -math.inf, 5e-324]))
 LEAVES = st.one_of(FLOATS, st.integers(-(2**63), 2**64 - 1), st.booleans(), st.none(), st.text(), st.binary())
 LEAVES |= st.sampled_from([Limit.RATE, Fault.SKEW, Switches.HOMED | Switches.LEFT_OPEN])
@@ -36,6 +39,11 @@ THINGS = st.recursive(
 
 def through_msgpack(thing: object) -> Any:
     return restored(msgspec.msgpack.decode(packed(plain(thing))), KNOWN | kinds(Switches))
+
+
+def test_what_a_pad_remembers_comes_back() -> None:
+    state = PlanState(GovernorState(1.0, 2.0), PLAN, memory=Memory(1.0, (3.5, 0.25), (0.5, 0.125), 0.0625))
+    assert through_msgpack(state) == state
 
 
 @settings(max_examples=25)

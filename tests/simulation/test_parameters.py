@@ -10,8 +10,9 @@ SAMPLE_1 = resources.files("tormagd.simulation").joinpath("plants/sample_1.toml"
 
 
 def test_the_three_samples_of_the_plant_card_are_packaged() -> None:
-    assert plant_names() == ["sample_1", "sample_2", "sample_3"]
-    plants = [load_plant(name) for name in plant_names()]
+    names = ["sample_1", "sample_2", "sample_3"]
+    assert plant_names() == ["pad_1", "pad_2", "pad_3", *names]
+    plants = [load_plant(name) for name in names]
     assert [plant.elastomer.shear_modulus_kPa for plant in plants] == [277.3, 255.0, 300.0]
     assert [plant.field.law for plant in plants] == ["power", "thesis", "power"]
     assert [plant.firmware.clock_ppm for plant in plants] == [30.0, -80.0, 120.0]

@@ -8,27 +8,29 @@ from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
+import numpy as np
 from msgspec import UNSET
 
 from tormagd.config import Config, ConfigError
+from tormagd.control.contact import PRESSED, Contact, Pressing, Sliding
 from tormagd.control.device_fit import LEAST_SCALE
 from tormagd.control.motor import Margins, margins, pull_V
 from tormagd.control.plan import CEILING, Planner
-from tormagd.control.portrait import FieldOfGap, Portrait, PortraitSearch, law_beside, portrait
+from tormagd.control.portrait import FieldOfGap, LawOfField, Portrait, PortraitSearch, law_beside, portrait
 from tormagd.control.renderable import Missed, missed
 from tormagd.control.step import Stepper
 from tormagd.inverse.choice import Choice, build, choose, named, solver_table
+from tormagd.model.force_curve import ForceCurve
 from tormagd.model.model_file import ForceModel, ModelFileError, load_model
 from tormagd.model.rising import falling_at
 from tormagd.model.shipped import model_path
 from tormagd.physics.errors import DomainError
-from tormagd.physics.field import PowerFieldLaw
+from tormagd.physics.field import PAD_RADIUS_M, REFERENCE_PERMEABILITY, PowerFieldLaw
 from tormagd.physics.force import Geometry
 from tormagd.physics.inserts import insert
-from tormagd.scenes.scene import AUTO, LEAST_CONTROL_HZ, Insert, Scene, load_scene, scene_path, terms_of
+from tormagd.scenes.scene import AUTO, LEAST_CONTROL_HZ, Finger, Scene, load_scene, scene_path, terms_of
 from tormagd.scenes.signal import asked
 
-ELEMENT = "torque"
 LEAST_PHASE_MARGIN_DEG = 30.0
 LEAST_GAIN_MARGIN_DB = 4.0
 SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("physics", "model", "inverse", "safety", "scenes")))
@@ -37,8 +39,12 @@ SENSED_N = 0.001
 "A step of the force sensor's message."
 SETTLES_MM = 4.0 * 8.0 / 4480.0
 "To within four counts of the encoders the gap comes to rest, wherever in its stroke: friction holds it there."
+DEPTHS = 9
+"Between the scene's depth and the model's greatest, at which a pad's force is looked at whether it rises."
 LOOKED_AT_S, LOOKED_AT_HZ = 30.0, 100
 "So much of a scene's signal is held against the device's speed."
+SEVERAL_BRANCHES = named("nearest", neighbours=16)._replace(reason="the force falls with the field somewhere")
+"With fewer neighbours answers jump between branches, more gain little: docs/tactile.md."
 IN_PORTRAIT = Choice("portrait", 0.0, 0, "float64", "the scene requires no rate: force over gap is one table")
 
 
@@ -69,11 +75,6 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
     beside = scene_path(config.scene).parent.absolute() if models is None else models
     scene = load_scene(config.scene) if scene is None else scene
     config = _slowed(config, scene)
-    if scene.element != ELEMENT:
-        raise ConfigError(
-            f"scene {scene.name}: element = {scene.element!r}: allowed is {ELEMENT!r}: a pad's force depends on its "
-            "whole history, which no model that the daemon can run knows yet"
-        )
     for name in ("control_hz", "inference_hz"):
         offered, needed = getattr(config.rates, name), getattr(scene.bandwidth, name)
         if offered < needed:
@@ -87,30 +88,26 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
         )
     _refuse_too_weak(config, scene)
     try:
-        fitted = insert(scene.insert.name)
         model = load_model(
             model_path(scene.insert.model, beside=beside),
             element=scene.element,
             insert=scene.insert.name,
         )
+        part = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
+        field = part.field
+        fields_mT, rises = _known_fields_mT(scene, model, part)
+        reach = portrait(_curve(model, part), field, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
+        choice = choose_solver(scene, model.metadata.hidden, rises=rises)
+        search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, rises=rises)
+        law = _law(scene, reach, field)
     except (DomainError, ModelFileError) as error:
         raise ConfigError(f"scene {scene.name}: {error}") from error
-    law, cip_percent = PowerFieldLaw(), 100.0 * fitted.cip_fraction
-    field = FieldOfGap(law, fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm * 1e-3)
-    try:
-        fields_mT = _known_fields_mT(scene, model, field)
-        reach = portrait(model, field, cip_percent, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
-        choice = choose_solver(scene, model.metadata.hidden)
-        search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, rises=True)
-    except DomainError as error:
-        raise ConfigError(f"scene {scene.name}: {error}") from error
+    _refuse_unknown_hand(scene, model)
     _refuse_out_of_reach(scene, reach)
     _refuse_too_fine(scene, reach)
-    _refuse_unknown_handle(scene, model)
     too_fast = _refuse_too_fast(config, scene, reach, beside) if models is None else None
     _refuse_too_sudden(config, scene, reach)
-    law_of_field = law_beside(reach, law, field, fitted.elastomer, _geometry(scene.insert))
-    planner = Planner(config, scene, model, search, field, reach, law_of_field, cip_percent)
+    planner = Planner(config, scene, model, search, field, reach, law, part.cip_percent, part.contact)
     stepper, speed_mm_s = Stepper(config, scene), config.position.gap_speed_mm_s
     return Core(scene, planner, stepper, stability, choice, model.fingerprint, beside, speed_mm_s, too_fast)
 
@@ -125,26 +122,69 @@ def sources_hash() -> str:
     return digest.hexdigest()
 
 
-def _known_fields_mT(scene: Scene, model: ForceModel, field: FieldOfGap) -> tuple[float, float]:
-    """The fields of the scene's gaps, as far as the model knows them and knows that they give more force."""
+class Part(NamedTuple):
+    """What the scene's element is to the core: how it is touched, the field in it over the gap, and its iron."""
+
+    contact: Contact
+    field: FieldOfGap
+    cip_percent: float
+
+
+def _brake(scene: Scene) -> Part:
+    fitted = insert(scene.insert.name)
+    permeability, radius_mm = fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm
+    return Part(Sliding(), FieldOfGap(PowerFieldLaw(), permeability, radius_mm * 1e-3), 100.0 * fitted.cip_fraction)
+
+
+def _pad(finger: Finger, model: ForceModel) -> Part:
+    *_, (cip_percent, _) = model.feature_ranges
+    return Part(
+        Pressing(finger.depth_mm), FieldOfGap(PowerFieldLaw(), REFERENCE_PERMEABILITY, PAD_RADIUS_M), cip_percent
+    )
+
+
+def _curve(model: ForceModel, part: Part) -> ForceCurve:
+    """Of the contact that the portrait is drawn for, or the nearest that the model knows."""
+    (_, most_mm), (slowest_mm_s, fastest_mm_s), _, _ = model.feature_ranges
+    contact = part.contact
+    rate_mm_s = min(max(contact.rate_mm_s, slowest_mm_s), fastest_mm_s)
+    return model.curve(min(contact.displacement_mm, most_mm), rate_mm_s, part.cip_percent)
+
+
+def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField | None:
+    """The force law beside the brake's model; of a pad none is printed that could judge one."""
+    if scene.element != "torque":
+        return None
+    fitted, metres = scene.insert, 1e-3
+    geometry = Geometry(
+        fitted.inner_radius_mm * metres,
+        fitted.outer_radius_mm * metres,
+        fitted.thickness_mm * metres,
+        fitted.roller_radius_mm * metres,
+    )
+    return law_beside(reach, PowerFieldLaw(), field, insert(fitted.name).elastomer, geometry)
+
+
+def _known_fields_mT(scene: Scene, model: ForceModel, part: Part) -> tuple[tuple[float, float], bool]:
+    """The fields of the scene's gaps, as far as the model knows them; and whether it knows that they give more force
+    however the element is touched. Where it is touched as the portrait is, they have to."""
     low_mT, high_mT = model.field_range_mT
-    low_mT = max(low_mT, field.field_mT(scene.insert.gap_open_mm))
-    high_mT = min(high_mT, field.field_mT(scene.insert.gap_closed_mm))
+    low_mT = max(low_mT, part.field.field_mT(scene.insert.gap_open_mm))
+    high_mT = min(high_mT, part.field.field_mT(scene.insert.gap_closed_mm))
     if not low_mT < high_mT:
         raise DomainError("insert.model", f"trained on {model.field_range_mT} mT", "fields that the scene's gaps give")
-    falling_mm_s = falling_at(model, (low_mT, high_mT))
+    (_, most_mm), *_ = model.feature_ranges
+    falling_mm_s = falling_at(model, (low_mT, high_mT), min(part.contact.displacement_mm, most_mm))
     if falling_mm_s is not None:
         raise DomainError(
             "insert.model",
             f"force that falls with the field at {falling_mm_s:.3g} mm/s",
             "a force that rises with the field: train it on more data, as tools/train_model.py --rising checks",
         )
-    return low_mT, high_mT
-
-
-def _geometry(fitted: Insert) -> Geometry:
-    radii_mm = fitted.inner_radius_mm, fitted.outer_radius_mm
-    return Geometry(radii_mm[0] * 1e-3, radii_mm[1] * 1e-3, fitted.thickness_mm * 1e-3, fitted.roller_radius_mm * 1e-3)
+    if part.contact.slides:
+        return (low_mT, high_mT), True
+    depths_mm = np.linspace(PRESSED * part.contact.displacement_mm, most_mm, DEPTHS).tolist()
+    return (low_mT, high_mT), all(falling_at(model, (low_mT, high_mT), depth) is None for depth in depths_mm)
 
 
 def _refuse_too_weak(config: Config, scene: Scene) -> None:
@@ -200,14 +240,17 @@ def _refuse_too_fine(scene: Scene, reach: Portrait) -> None:
         )
 
 
-def _refuse_unknown_handle(scene: Scene, model: ForceModel) -> None:
-    slowest_mm_s, fastest_mm_s = model.feature_ranges[1]
-    handle = scene.handle
-    for key, value in (("least_mm_s", handle.least_mm_s), ("most_mm_s", handle.most_mm_s)):
-        if not slowest_mm_s <= value <= fastest_mm_s:
+def _refuse_unknown_hand(scene: Scene, model: ForceModel) -> None:
+    depths_mm, rates_mm_s, *_ = model.feature_ranges
+    handle, finger = scene.handle, scene.finger
+    stated = [("handle.least_mm_s", handle.least_mm_s, rates_mm_s), ("handle.most_mm_s", handle.most_mm_s, rates_mm_s)]
+    if finger is not UNSET:
+        stated = [("finger.depth_mm", finger.depth_mm, depths_mm), ("finger.most_mm_s", finger.most_mm_s, rates_mm_s)]
+    for key, value, (least, most) in stated:
+        if not least <= value <= most:
             raise ConfigError(
-                f"scene {scene.name}: handle.{key} = {value:g}: allowed is {slowest_mm_s:.2g}..{fastest_mm_s:.0f}, the "
-                f"rates that model {scene.insert.model} was trained on"
+                f"scene {scene.name}: {key} = {value:g}: allowed is {least:.2g}..{most:.3g}, what model "
+                f"{scene.insert.model} was trained on"
             )
 
 
@@ -248,12 +291,14 @@ def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
         )
 
 
-def choose_solver(scene: Scene, hidden: int) -> Choice:
-    """The search that `scene` names; else the portrait where the rate is no term, or what the scene's tolerance picks
-    from the measured table. Raises DomainError."""
+def choose_solver(scene: Scene, hidden: int, *, rises: bool = True) -> Choice:
+    """The search that `scene` names; else the portrait where the rate is no term, the k-nearest where the force is not
+    known to rise, or what the scene's tolerance picks from the measured table. Raises DomainError."""
     wanted = scene.solver
     if wanted.name == AUTO:
         if not terms_of(scene).rate:
             return IN_PORTRAIT
+        if not rises:
+            return SEVERAL_BRANCHES
         return choose(solver_table(), scene.force.tolerance_rms_N, hidden)
     return named(wanted.name, wanted.step_mT or None, wanted.neighbours or None)

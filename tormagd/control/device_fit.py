@@ -75,6 +75,18 @@ class DeviceFit(Value):
         variance = model_N * (model_N * self.scale_variance + 2.0 * self.covariance_N) + self.offset_variance_N2
         return math.sqrt(max(variance, 0.0))
 
+    def relaxed(self, lost_N: float) -> "DeviceFit":
+        """The fit of the device while `lost_N` of the model's force have relaxed away."""
+        if lost_N == 0.0:
+            return self
+        return DeviceFit(
+            self.scale,
+            self.offset_N - self.scale * lost_N,
+            self.scale_variance,
+            self.covariance_N,
+            self.offset_variance_N2,
+        )
+
     def times(self, factor: float) -> "DeviceFit":
         """The fit of a device that gives `factor` > 0 times the force."""
         if factor == 1.0:

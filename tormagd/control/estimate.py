@@ -15,7 +15,8 @@ LEAST_DT_S: Final = 5e-6
 
 @final
 class Handle(Value):
-    """The handle's motion: its signed rate, the turn that displacement counts from, and how far it is from there.
+    """The handle's motion: its signed rate, the turn that displacement counts from, and how far it is from there. Of a
+    finger in a pad, which does not turn: how deep it is, and how fast it presses in.
 
     `sliding_mm_s` is the rate at which friction slides, of either sign of the motion: the rate over the last travel, so
     that a handle that stops keeps it. `rate_mm_s` is positive the way the handle went last.
@@ -114,8 +115,11 @@ def first_estimate(measurement: Measurement, home_mm: float) -> Estimate:
     )
 
 
-def update(last: Estimate | None, measurement: Measurement, home_mm: float, derivative_filter_s: float) -> Estimate:
-    """The estimate after one more measurement; the same one again where the device has said nothing new.
+def update(
+    last: Estimate | None, measurement: Measurement, home_mm: float, derivative_filter_s: float, turns: bool = True
+) -> Estimate:
+    """The estimate after one more measurement; the same one again where the device has said nothing new. `turns` tells
+    a handle from a finger, whose force always pushes the same way.
 
     Speeds are filtered derivatives over the *device's* clock, so that late delivery is not mistaken for slow motion.
     """
@@ -129,7 +133,7 @@ def update(last: Estimate | None, measurement: Measurement, home_mm: float, deri
     # without news of the handle it has not stopped: its motion is judged over all the time since the last
     handle, handle_time_s = last.handle, last.handle_time_s
     if measurement.sensed_s != last.sensed_s:
-        handle = _handle(last, measurement.handle_mm, measurement.device_time_s - handle_time_s)
+        handle = _handle(last, measurement.handle_mm, measurement.device_time_s - handle_time_s, turns)
         handle_time_s = measurement.device_time_s
     return Estimate(
         number=measurement.number,
@@ -147,7 +151,7 @@ def update(last: Estimate | None, measurement: Measurement, home_mm: float, deri
     )
 
 
-def _handle(last: Estimate, position_mm: float, dt_s: float) -> Handle:
+def _handle(last: Estimate, position_mm: float, dt_s: float, turns: bool) -> Handle:
     before = last.handle
     share = dt_s / (RATE_FILTER_S + dt_s)
     speed = before.turn.direction * before.rate_mm_s
@@ -155,5 +159,7 @@ def _handle(last: Estimate, position_mm: float, dt_s: float) -> Handle:
     speed += share * (travel_mm / dt_s - speed)
     slid = abs(travel_mm) / (SLIDING_MM + abs(travel_mm))
     sliding = before.sliding_mm_s + slid * (abs(speed) - before.sliding_mm_s)
+    if not turns:
+        return Handle(max(position_mm, 0.0), speed, before.turn, sliding)
     turn = before.turn.moved_to(position_mm)
     return Handle(turn.displacement_mm(position_mm), turn.direction * speed, turn, sliding)

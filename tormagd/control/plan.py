@@ -7,24 +7,25 @@ import numpy as np
 
 from firmware_protocol.value import Value
 from tormagd.config import Config
+from tormagd.control.contact import Contact
 from tormagd.control.device_fit import UNSEEN, DeviceFit, observe
 from tormagd.control.estimate import Estimate
 from tormagd.control.governor import PATH_S, Governed, Governor, GovernorState, TimedSetpoint
 from tormagd.control.handle import UNHEARD, HandleWatch
-from tormagd.control.portrait import ROLLER_RATE_MM_S, FieldOfGap, LawOfField, Portrait
+from tormagd.control.portrait import FieldOfGap, LawOfField, Portrait
 from tormagd.control.sensor import UNJUDGED, Sensor, judge
 from tormagd.control.sensor_zero import TARED, UNKNOWN_SD_N, SensorZero
 from tormagd.control.sight import unsensed_s
 from tormagd.control.slow_friction import NOTHING_SLOW, SLOWEST_MM_S, SlowFriction
 from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
-from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S
+from tormagd.model.displacement import MOVING_MM_S
 from tormagd.model.features import FEATURES
+from tormagd.model.force_curve import ForceCurve
+from tormagd.model.memory import NOTHING_REMEMBERED, Memory
 from tormagd.model.model_file import ForceModel
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Scene, terms_of
 
-CREEP_MM_S: Final = 0.5
-"A slower handle is planned for as if it crept: its friction is static."
 CEILING: Final = 1.25
 "The gap stays where the device surely gives no more than this many times the scene's greatest force."
 LAW_SHARE: Final = 0.12
@@ -37,8 +38,6 @@ CREEPING_MM_S: Final = 1.2 * MOVING_MM_S
 "A handle that has slid no faster for some travel creeps; one that has slid faster only comes to rest."
 LEAST_EXPECTED_N: Final = 0.1
 "Of less force no share is told."
-GONE_BACK_MM: Final = 0.01
-"A handle that has gone back by more, just over a count of its encoder, may be turning: its friction falls already."
 UNTARED_N: Final = 0.15
 "A sensor that is off by more is worth a word: it is half an hour's drift."
 SURPRISE_S: Final = 0.03
@@ -172,9 +171,10 @@ NOTHING_SHOWN: Final = Shown()
 
 @final
 class PlanState(Value):
-    """What planning remembers. `lag_s` is how late the device's carriages are."""
+    """What planning remembers. `lag_s` is how late the device's carriages are, `memory` what its elastomer has
+    relaxed."""
 
-    __match_args__ = ("governor", "plan", "shown", "lag_s", "handle")
+    __match_args__ = ("governor", "plan", "shown", "lag_s", "handle", "memory")
     __slots__ = __match_args__
 
     def __init__(
@@ -184,17 +184,19 @@ class PlanState(Value):
         shown: Shown = NOTHING_SHOWN,
         lag_s: float = 0.0,
         handle: HandleWatch = UNHEARD,
+        memory: Memory = NOTHING_REMEMBERED,
     ) -> None:
         self.governor: Final = governor
         self.plan: Final = plan
         self.shown: Final = shown
         self.lag_s: Final = lag_s
         self.handle: Final = handle
+        self.memory: Final = memory
 
     @property
     def device(self) -> DeviceFit:
-        """The device as far as it has shown itself."""
-        return self.shown.device
+        """The device as far as it has shown itself, and as its elastomer is relaxed now."""
+        return self.shown.device.relaxed(self.memory.lost_N)
 
     @property
     def sensor(self) -> Sensor:
@@ -220,13 +222,15 @@ class Planner:
         search: FieldSolver,
         field: FieldOfGap,
         portrait: Portrait,
-        law: LawOfField,
+        law: LawOfField | None,
         cip_percent: float,
+        contact: Contact,
     ) -> None:
-        """`portrait` and `law` are those of the gaps whose fields `search` may answer with."""
+        """`portrait` and `law` are of the gaps whose fields `search` may answer with; of a pad no law is known."""
         position, trim = config.position, config.trim
         self.portrait: Final = portrait
         self._model, self._search, self._field, self._law = model, search, field, law
+        self._contact = contact
         terms = terms_of(scene)
         self._governor = Governor(portrait, scene.force, position.gap_speed_mm_s, terms)
         self._cip_percent = cip_percent
@@ -238,12 +242,14 @@ class Planner:
         self._adapts_in_s, self._scales = trim.time_s, (trim.least, trim.most)
         self._low_confidence = config.limits.low_confidence
         self._unsensed_s = unsensed_s(1.0 / config.rates.control_hz)
-        self._has_rate, self._has_creep, self._has_lag = terms.rate, terms.creep, terms.lag and terms.learning
-        self._learns_creep = terms.learning and terms.creep
+        self._has_rate, self._has_lag = terms.rate, terms.lag and terms.learning
+        self._has_creep = terms.creep and contact.slides
+        self._learns_creep = terms.learning and self._has_creep
+        self._relaxing = None if terms.relaxation is False else model.relaxing
         self._fits = terms.learning and (terms.scale or terms.offset)
         self._learns_scale, self._learns_offset = terms.scale, terms.offset
         self._only_curve = model.curve(
-            _within(MOBILISED_MM, displacements_mm), _within(ROLLER_RATE_MM_S, rates_mm_s), cip_percent
+            _within(contact.displacement_mm, displacements_mm), _within(contact.rate_mm_s, rates_mm_s), cip_percent
         )
 
     def start(self, now_s: float) -> PlanState:
@@ -252,23 +258,28 @@ class Planner:
         least = self.portrait.least_N
         field_mT = self._field.field_mT(open_mm)
         resting = Plan(0, now_s, None, None, least, None, field_mT, open_mm, 0.0, 1.0, (Limit.NO_SETPOINT,))
-        return PlanState(GovernorState(now_s, least, above_N=0.0), resting)
+        memory = NOTHING_REMEMBERED if self._relaxing is None else self._relaxing.rested(now_s)
+        return PlanState(GovernorState(now_s, least, above_N=0.0), resting, memory=memory)
 
     def afresh(self, state: PlanState, now_s: float) -> PlanState:
-        """Begins anew after `state`, for which no plan could be made: plans go on being numbered."""
+        """Begins anew after `state`, for which no plan could be made: plans go on being numbered, and the elastomer has
+        not forgotten."""
         begun = self.start(now_s)
-        return begun.replaced(plan=begun.plan.replaced(number=state.plan.number + 1))
+        return begun.replaced(plan=begun.plan.replaced(number=state.plan.number + 1), memory=state.memory)
 
     def plan(
         self, state: PlanState, now_s: float, setpoint: TimedSetpoint | None, estimate: Estimate | None
     ) -> PlanState:
         """The next plan. `estimate` is None while the device has said nothing: nothing is learned of it then."""
+        memory = self._remember(state.memory, now_s, estimate)
         model_N = self._model_N(estimate)
+        if model_N is not None:
+            model_N -= memory.lost_N
         shown = self._learn(state.shown, now_s, estimate, model_N)
         handle = state.handle
         if estimate is not None and model_N is not None:
             handle = handle.heard(estimate.sensed_s, estimate.handle_mm, estimate.force_N, model_N)
-        device = shown.device
+        device = shown.device.relaxed(memory.lost_N)
         if self._has_creep:
             sliding_mm_s = MOVING_MM_S if estimate is None else estimate.handle.sliding_mm_s
             device = device.times(shown.slow.factor_at(sliding_mm_s))
@@ -279,7 +290,7 @@ class Planner:
         displacement_mm, rate_mm_s = curve.displacement_mm, curve.rate_mm_s
         known_mm, known_mm_s = displacement_mm, rate_mm_s
         if self._has_rate:
-            displacement_mm, rate_mm_s = self._motion(setpoint if is_meant else None, estimate)
+            displacement_mm, rate_mm_s = self._contact.planned(setpoint if is_meant else None, estimate)
             known_mm = _within(displacement_mm, self._displacements_mm)
             known_mm_s = _within(rate_mm_s, self._rates_mm_s)
             curve = self._model.curve(known_mm, known_mm_s, self._cip_percent)
@@ -318,7 +329,7 @@ class Planner:
             setpoint_N=None if setpoint is None else setpoint.force_N,
             setpoint_age_s=governed.age_s,
             governed_N=governed.force_N,
-            predicted_N=_predicted_N(shown, estimate, model_N),
+            predicted_N=self._predicted_N(shown, estimate, model_N),
             field_mT=field_mT,
             gap_mm=gap_mm,
             gap_speed_mm_s=speed_mm_s,
@@ -330,7 +341,7 @@ class Planner:
             outside=outside,
             sensor_doubted_s=shown.sensor.doubted_s,
         )
-        return PlanState(governor, plan, shown, lag_s, handle)
+        return PlanState(governor, plan, shown, lag_s, handle, memory)
 
     def foresee(self, state: PlanState) -> PlanState:
         """What can be prepared for the next plans once one is made: to be called after each, when nothing waits."""
@@ -339,32 +350,34 @@ class Planner:
             return state
         return state.replaced(governor=governor)
 
-    def _motion(self, setpoint: TimedSetpoint | None, estimate: Estimate | None) -> tuple[float, float]:
-        """The displacement, mm, and the rate, mm/s, that the force is planned for."""
-        # the field sets how much friction there can be, so it is asked for at full mobilisation and in motion: before
-        # break-away the force is the hand's choice, not the field's, and the inverse there is ill-posed
-        displacement_mm = MOBILISED_MM
-        rate_mm_s = MOVING_MM_S if estimate is None else estimate.handle.sliding_mm_s
-        if setpoint is not None:
-            if setpoint.displacement_mm is not None:
-                displacement_mm = setpoint.displacement_mm
-            if setpoint.rate_mm_s is not None:
-                rate_mm_s = abs(setpoint.rate_mm_s)
-        return displacement_mm, max(rate_mm_s, CREEP_MM_S)
-
     def _model_N(self, estimate: Estimate | None) -> float | None:
-        """What the model says at the measured gap and rate of friction that is mobilised; None without a gap."""
+        """What the model says of the force of now, without memory, at the measured gap; None without a gap."""
         if estimate is None or not estimate.is_homed:
             return None
+        return self._present_curve(estimate).force_N(self._present_mT(estimate))
+
+    def _present_curve(self, estimate: Estimate) -> ForceCurve:
+        if not self._has_rate:
+            return self._only_curve
+        displacement_mm, rate_mm_s = self._contact.present(estimate)
+        return self._model.curve(
+            _within(displacement_mm, self._displacements_mm), _within(rate_mm_s, self._rates_mm_s), self._cip_percent
+        )
+
+    def _present_mT(self, estimate: Estimate) -> float:
         gap_mm = max(estimate.gap_mm, self._closed_mm - BEYOND_MM)
-        curve = self._only_curve
-        if self._has_rate:
-            curve = self._model.curve(
-                _within(MOBILISED_MM, self._displacements_mm),
-                _within(abs(estimate.handle.rate_mm_s), self._rates_mm_s),
-                self._cip_percent,
-            )
-        return curve.force_N(_within(self._field.field_mT(gap_mm), self._fields_mT))
+        return _within(self._field.field_mT(gap_mm), self._fields_mT)
+
+    def _remember(self, memory: Memory, now_s: float, estimate: Estimate | None) -> Memory:
+        """What the elastomer has relaxed by now, from what it was put to since. Until the gap is known it counts as
+        open, where homing leads to."""
+        relaxing = self._relaxing
+        if relaxing is None or estimate is None:
+            return memory
+        curve = self._present_curve(estimate)
+        field_mT = self._present_mT(estimate) if estimate.is_homed else self._field.field_mT(self._open_mm)
+        free_N = curve.force_N(0.0)
+        return relaxing.advance(memory, now_s, free_N, curve.force_N(field_mT) - free_N)
 
     def _learn(self, shown: Shown, now_s: float, estimate: Estimate | None, model_N: float | None) -> Shown:
         """From the force at the *measured* gap: the model's error is learned, not the tracking error, so it cannot
@@ -381,8 +394,8 @@ class Planner:
         zero_sd_N = zero.sd_N(now_s)
         is_zero_known = zero_sd_N <= UNKNOWN_SD_N
         elapsed_s = min(now_s - shown.read_s, LONGEST_LESSON_S)
-        is_mobilised = _is_mobilised(estimate)
-        if rate_mm_s < MOVING_MM_S or not is_mobilised:
+        is_mobilised = self._contact.is_known(estimate)
+        if not is_mobilised or (self._contact.slides and rate_mm_s < MOVING_MM_S):
             if shown.sensor.is_doubted:
                 slow = NOTHING_SLOW
             elif (
@@ -439,6 +452,8 @@ class Planner:
 
     def _lawful_mT(self, solution: FieldSolution, wanted_N: float) -> float:
         """The search's field, no further than LAW_SHARE from the force law's."""
+        if self._law is None:
+            return solution.field_mT
         law_mT = self._law.field_mT(wanted_N)
         return min(max(solution.field_mT, (1.0 - LAW_SHARE) * law_mT), (1.0 + LAW_SHARE) * law_mT)
 
@@ -467,19 +482,11 @@ class Planner:
         fastest, hardest = self._fastest_mm_s, self._hardest_mm_s2
         return min(max(speed, -fastest), fastest), min(max(acceleration, -hardest), hardest)
 
-
-def _is_mobilised(estimate: Estimate) -> bool:
-    """Whether the handle has gone far enough one way, and not begun to come back: the model knows its friction then."""
-    handle = estimate.handle
-    gone_back_mm = abs(estimate.handle_mm - handle.turn.furthest_mm)
-    return handle.displacement_mm >= MOBILISED_MM and gone_back_mm <= GONE_BACK_MM
-
-
-def _predicted_N(shown: Shown, estimate: Estimate | None, model_N: float | None) -> float | None:
-    """The force that the device is expected to show; None before break-away, of which nothing is known."""
-    if estimate is None or model_N is None or not _is_mobilised(estimate):
-        return None
-    return shown.device.force_N(model_N) * shown.slow.factor_at(abs(estimate.handle.rate_mm_s))
+    def _predicted_N(self, shown: Shown, estimate: Estimate | None, model_N: float | None) -> float | None:
+        """The force that the device is expected to show; None where nothing is known of it, as before break-away."""
+        if estimate is None or model_N is None or not self._contact.is_known(estimate):
+            return None
+        return shown.device.force_N(model_N) * shown.slow.factor_at(abs(estimate.handle.rate_mm_s))
 
 
 def _within(value: float, ends: tuple[float, float]) -> float:

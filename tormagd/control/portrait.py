@@ -8,16 +8,12 @@ import numpy.typing as npt
 
 from tormagd.control.interpolation import interpolated
 from tormagd.inverse.solution import FieldSolution, Reach, checked_near_mT
-from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.force_curve import ForceCurve
-from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw, flux_density_T
 from tormagd.physics.force import Elastomer, Geometry, brake_force_N
 
 Array = npt.NDArray[np.float64]
-ROLLER_RATE_MM_S: Final = 42.0
-"Surface speed of the roller at the thesis's 20 rpm: the portrait is drawn for a handle in motion."
 GRID: Final = 201
 
 
@@ -58,7 +54,7 @@ class FieldOfGap:
 
 @final
 class Portrait:
-    """Force over gap with friction fully mobilised, and its slope |dF/dgap|, N per mm, at n points: forces rise and
+    """Force over gap for one contact, without memory, and its slope |dF/dgap|, N per mm, at n points: forces rise and
     gaps fall along the lists."""
 
     __slots__ = ("force_N", "gap_mm", "slope_N_mm")
@@ -70,7 +66,7 @@ class Portrait:
 
     @property
     def least_N(self) -> float:
-        """F_min: what the open gap gives. A passive brake gives no less."""
+        """F_min: what the open gap gives. A passive device gives no less."""
         return self.force_N[0]
 
     @property
@@ -139,13 +135,9 @@ def law_beside(
     return LawOfField(scaled_N, [field.field_mT(gap_mm) for gap_mm in shown.gap_mm])
 
 
-def portrait(model: ForceModel, field: FieldOfGap, cip_percent: float, gap_range_mm: tuple[float, float]) -> Portrait:
-    """The portrait that the learned model predicts over a gap range, for a handle that turns at ROLLER_RATE_MM_S, or
-    the nearest rate that the model knows."""
+def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> Portrait:
+    """The portrait that a curve of the learned model predicts over a gap range."""
     gaps: Array = np.linspace(gap_range_mm[1], gap_range_mm[0], GRID)
-    (_, mobilised_mm), (slowest_mm_s, fastest_mm_s), _, _ = model.feature_ranges
-    rate_mm_s = min(max(ROLLER_RATE_MM_S, slowest_mm_s), fastest_mm_s)
-    curve = model.curve(min(MOBILISED_MM, mobilised_mm), rate_mm_s, cip_percent)
     gap_mm: list[float] = gaps.tolist()
     forces_N = curve.forces_N(np.array([field.field_mT(gap) for gap in gap_mm]))
     slopes: list[float] = np.abs(np.gradient(forces_N, gaps)).tolist()

@@ -216,6 +216,7 @@ class Stepper:
         self._too_slow_s = self._nominal_dt_s + TOO_SLOW_SHARE * bears_s
         self._closed_mm, self._open_mm = scene.insert.gap_closed_mm, scene.insert.gap_open_mm
         self._home_mm = self._open_mm / 2.0
+        self._slides = scene.element == "torque"
         # devices not yet seen differ by SCALE_SD: a scene that tolerates that does without the sensor
         self._needs_sensor = scene.force.tolerance_rms_N < SCALE_SD * scene.force.most_N
         self._ceiling_N = STARTS_OVER * scene.force.most_N + OVER_N
@@ -279,7 +280,7 @@ class Stepper:
             return state, self._off(state.safety, NO_LIMITS)
         is_new = state.estimate is None or measurement.number != state.estimate.number
         was_blind, sight = state.sight.is_blind, look(state.sight, state.time_s, now_s, self._nominal_dt_s, is_new)
-        estimate = update(state.estimate, measurement, self._home_mm, self._derivative_filter_s)
+        estimate = update(state.estimate, measurement, self._home_mm, self._derivative_filter_s, self._slides)
         leap = state.leap
         if leap is not None:
             # it was reset, which it says itself; or it was a burst on a line, and the counts are right again
@@ -525,7 +526,7 @@ class Stepper:
             faults.append(Fault.SKEW)
         if state.straying_s > self._following_time_s:
             faults.append(Fault.FOLLOWING_ERROR)
-        if state.over_s > OVER_FAULT_S:
+        if state.over_s > OVER_FAULT_S and self._slides:  # of a pad it is the finger that presses so hard
             faults.append(Fault.OVER_FORCE)
         if self._needs_sensor and plan.sensor_doubted_s > SENSOR_FAULT_S:
             faults.append(Fault.SENSOR)
@@ -536,7 +537,8 @@ class Stepper:
         return tuple(faults)
 
     def _is_over(self, estimate: Estimate) -> bool:
-        return estimate.force_N > self._ceiling_N and abs(estimate.handle.rate_mm_s) > STILL_MM_S
+        is_felt = not self._slides or abs(estimate.handle.rate_mm_s) > STILL_MM_S
+        return estimate.force_N > self._ceiling_N and is_felt
 
     def _is_astray(self, reference: Reference, estimate: Estimate) -> bool:
         return abs(reference.gap_mm - estimate.gap_mm) > self._following_error_mm

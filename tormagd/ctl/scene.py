@@ -62,7 +62,7 @@ def check_scene(name: str, config: Path | None) -> Outcome:
         f"resolution {scene.force.resolution_N:g} N, the device's is {derived['least_resolution_N']:.2g}",
     ]
     if scene.force.least_N < least_N:
-        lines.append(f"           below {least_N:.2f} N it gets that: a brake has a least force (limit F_MIN)")
+        lines.append(f"           below {least_N:.2f} N it gets that: a passive device has a least force (limit F_MIN)")
     if derived["missed_rms_N"] is None:
         lines.append("signal     not stated: nothing is known of how fast the force changes")
     else:

@@ -1,4 +1,4 @@
-"""The search by default: the force at every field of a grid at once, the nearest of them, then interpolation."""
+"""The k-nearest search: the force at every field of a grid at once, the nearest of them, and of those one branch."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,15 +36,15 @@ def require_precision(dtype: type[np.floating]) -> None:
 class NearestFieldSearch:
     """Nearest-neighbour search of the field (section 4.2.6 of the thesis), vectorised and continuous.
 
-    It looks at the force at every field of a grid at once. Candidates are
+    It looks at the force at every field of a grid at once. Candidates are the `neighbours` points of the grid that are
+    nearest in force. Where predicted and asked force cross beside one, the root takes its place, by linear
+    interpolation, so that the answer is not bound to the grid. Where none do, those candidates count that are as near
+    as the best within the rounding of `dtype`, and the point nearest the last field if it is: plateaus, touching points
+    and the ends of reach.
 
-    - the root in every grid interval where predicted and asked force cross, by linear interpolation, so that the answer
-      is not bound to the grid;
-    - of the `neighbours` grid points nearest in force and the one nearest the last field, those as near as the best
-      answer within the rounding of `dtype`: the plateaus and touching points that no crossing marks.
-
-    The candidate nearest the last field wins; without a last field the lowest, which is the opener gap. Where nothing
-    crosses, the force is out of reach, and the nearest end is the answer.
+    The candidate nearest the last field wins; without a last field the lowest, which is the opener gap. Where the force
+    rises with the field there is one root, and one neighbour finds it. Where it also falls there are several, each on
+    a branch of its own: with too few neighbours all of them may lie on another branch than the last field's.
 
     Parameters: `field_range_mT` and `step_mT` make the grid; `dtype` is numpy.float32 or numpy.float64. The default is
     float64 every 2 mT, which is ten times nearer the curve's own root than float32 every 1 mT.
@@ -82,9 +82,11 @@ class NearestFieldSearch:
         """Fields in mT that fit equally well, and whether they fit, from the force above the one asked on the grid."""
         fields = self._fields_mT
         below = excess_N < 0
-        left = np.flatnonzero(below[1:] != below[:-1])
+        crosses = below[1:] != below[:-1]
         error_N = np.abs(excess_N)
         nearest = np.argpartition(error_N, self._neighbours - 1)[: self._neighbours]
+        beside = np.concatenate((nearest[nearest > 0] - 1, nearest[nearest < len(crosses)]))
+        left = beside[crosses[beside]]
         best_N = 0.0 if left.size else float(error_N[nearest].min())
         candidates = fields[nearest[error_N[nearest] <= best_N + same_N]]
         # on a plateau of more points than `neighbours` it is chance which of them were taken
@@ -95,6 +97,6 @@ class NearestFieldSearch:
             at, to = excess_N[left], excess_N[left + 1]
             roots = fields[left] + (fields[left + 1] - fields[left]) * (at / (at - to))
             return np.concatenate((roots, candidates)), Reach.INSIDE
-        if best_N <= same_N:
+        if best_N <= same_N or crosses.any():
             return candidates, Reach.INSIDE
         return candidates, Reach.ABOVE if below[0] else Reach.BELOW

@@ -16,11 +16,12 @@ def not_rising_share(model: ForceModel, points: int = 17) -> float:
     return float((model.field_slope_N_per_mT(grid) <= 0).mean())
 
 
-def falling_at(model: ForceModel, fields_mT: tuple[float, float], points: int = 33) -> float | None:
-    """The first rate, mm/s, of a grid over the rates seen in training at which the force of friction that is mobilised
-    does not rise with the field, somewhere between two fields; None where it rises everywhere."""
+def falling_at(
+    model: ForceModel, fields_mT: tuple[float, float], displacement_mm: float, points: int = 33
+) -> float | None:
+    """The first rate, mm/s, of a grid over the rates seen in training at which the force at this displacement does not
+    rise with the field, somewhere between two fields; None where it rises everywhere."""
     _, (slowest, fastest), _, (cip_percent, _) = model.feature_ranges
-    displacement_mm = model.feature_ranges[0][1]
     fields = np.linspace(*fields_mT, points)
     for rate_mm_s in np.linspace(slowest, fastest, points).tolist():
         rows = np.column_stack([np.full(points, value) for value in (displacement_mm, rate_mm_s, 0.0, cip_percent)])

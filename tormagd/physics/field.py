@@ -14,6 +14,10 @@ from tormagd.physics.errors import Real, require
 REFERENCE_PERMEABILITY = 4.0
 """Relative permeability at which both field laws were fitted: b = (mu_r / 4) a / R."""
 
+PAD_RADIUS_M = 8.55e-3
+"""The mean field in a tactile pad between the magnets is that of a / R here: 365 mT, the greatest that the thesis
+states, at the least gap by the power law. How it falls over the gap is then the law's, which is an assumption."""
+
 _TM_PER_MT_MM = 1e-6
 _EQ7_C1, _EQ7_C2, _EQ7_P = 1.206, 1256.0, 1.867
 _EQ7_MIN_MM, _EQ7_MAX_MM = 45.0, 95.0

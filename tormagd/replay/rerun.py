@@ -30,6 +30,7 @@ from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.messages import TickRecord
 from tormagd.model.displacement import Turn
+from tormagd.model.memory import Memory
 from tormagd.recording.black_box import is_tick
 from tormagd.replay.rebuild import ReplayError
 from tormagd.safety.codes import Fault, Limit
@@ -54,6 +55,7 @@ KNOWN = kinds(
         Estimate,
         Handle,
         Turn,
+        Memory,
         Reference,
         Expected,
     ),

@@ -70,11 +70,21 @@ class Signal(Strict, frozen=True):
 
 
 class Handle(Strict, frozen=True):
-    """How fast the handle slides, mm/s at the roller's surface. A model that does not know such handles is refused."""
+    """How fast the brake's handle slides, mm/s at the roller's surface. A model that does not know such handles is
+    refused."""
 
     least_mm_s: Annotated[float, Meta(ge=0.5, le=1_000.0)] = 42.0
     most_mm_s: Annotated[float, Meta(ge=0.5, le=1_000.0)] = 42.0
     "By default the thesis's 20 rpm."
+
+
+class Finger(Strict, frozen=True):
+    """How a finger presses into the pad. A model that does not know so deep a pad, or one so fast, is refused."""
+
+    depth_mm: Annotated[float, Meta(gt=0.0, le=20.0)]
+    "In which the forces are asked for; a finger that is less deep gets the gap of this depth."
+    most_mm_s: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 1.0
+    "Pressing in and drawing back; by default the thesis's."
 
 
 class Budget(Strict, frozen=True):
@@ -99,6 +109,8 @@ class Terms(Strict, frozen=True):
     `motor`     the duty for the reference's speed and acceleration is fed forward
     `friction`  the duty that overcomes the dry friction of gearbox and screw is fed forward
     `pull`      the duty against the magnets' pull is fed forward, and limits the opening speed
+    `relaxation` of a pad alone, where nothing is said of it: what its elastomer has relaxed away of the force is told
+                by the model from what it was put to. A pad in its turn has no `creep`
 
     What safety rests on is no term: the ceiling, the judgement of the sensor, the force law beside the search.
     """
@@ -114,23 +126,26 @@ class Terms(Strict, frozen=True):
     motor: bool = True
     friction: bool = True
     pull: bool = True
+    relaxation: bool | UnsetType = UNSET
     learning: bool = True
     "No part of the model, but whether `creep`, `scale`, `offset` and `lag` go on learning, or stay what they are."
 
     @property
     def left_out(self) -> tuple[str, ...]:
         """The names of the terms that are out."""
-        return tuple(name for name in TERMS if not getattr(self, name))
+        return tuple(name for name in (*TERMS, RELAXATION) if getattr(self, name) is False)
 
     def without(self, *names: str) -> "Terms":
         """These terms with some more left out. Raises ValueError for a name that is none."""
         for name in names:
-            if name not in TERMS:
+            if name not in (*TERMS, RELAXATION):
                 raise ValueError(f"term {name!r}: allowed is one of {', '.join(TERMS)}")
         return msgspec.structs.replace(self, **dict.fromkeys(names, False))
 
 
-TERMS = tuple(name for name in Terms.__struct_fields__ if name != "learning")
+RELAXATION = "relaxation"
+TERMS = tuple(name for name in Terms.__struct_fields__ if name not in (RELAXATION, "learning"))
+"Those of the brake."
 EVERY_TERM = Terms()
 
 
@@ -178,6 +193,8 @@ class Scene(Strict, frozen=True):
     signal: Signal | None = None
     "Without one nothing is known of how the force changes, and nothing is refused for it."
     handle: Handle = msgspec.field(default_factory=Handle)
+    finger: Finger | UnsetType = UNSET
+    "What presses into a pad; a tactile scene has it, and no other."
     budget: Budget = msgspec.field(default_factory=Budget)
     terms: Terms | Literal["all", "required"] = EVERY_TERM
     """Which parts of the controller's model run. "required": those that `tools/required_terms.py` found this very scene
@@ -200,9 +217,26 @@ class Scene(Strict, frozen=True):
         for low_name, low, high_name, high in pairs:
             if not low < high:
                 raise ValueError(f"{low_name} = {low:g}: allowed is under {high_name} = {high:g}")
+        if (self.finger is UNSET) != (self.element == "torque"):
+            raise ValueError(
+                f"element = {self.element}: allowed is a table [finger] where it is tactile, and only there"
+            )
+        if self.element == "tactile":
+            self._require_no_brake()
+        elif isinstance(self.terms, Terms) and self.terms.relaxation is not UNSET:
+            raise ValueError("terms.relaxation: allowed only where element is tactile")
         slowest, fastest = self.handle.least_mm_s, self.handle.most_mm_s
         if slowest > fastest:
             raise ValueError(f"handle.least_mm_s = {slowest:g}: allowed is at most handle.most_mm_s = {fastest:g}")
+
+    def _require_no_brake(self) -> None:
+        usual = Insert(self.insert.name, self.insert.model)
+        for key in ("inner_radius_mm", "outer_radius_mm", "thickness_mm", "roller_radius_mm"):
+            value = getattr(self.insert, key)
+            if value != getattr(usual, key):
+                raise ValueError(f"insert.{key} = {value:g}: allowed only where element is torque")
+        if self.handle != Handle():
+            raise ValueError("handle: allowed only where element is torque, [finger] tells how a pad is pressed")
 
     @property
     def fingerprint(self) -> str:

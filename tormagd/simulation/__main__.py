@@ -68,7 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _opened(options: argparse.Namespace, resources: contextlib.ExitStack) -> tuple[PacedDevice, Door]:
     """The device and the door asked for. Raises what the parts of the device raise, and OSError."""
     boot = FIRMWARES[options.firmware]
-    plant, hand = load_plant(options.plant), parse_hand(options.hand)
+    plant = load_plant(options.plant)
+    hand = parse_hand(options.hand or ("steady" if plant.pad is None else "pressing"))
     faults = [parse_fault(spec) for spec in options.fault]
     door: Door
     if options.pty:
@@ -106,7 +107,7 @@ def parser() -> argparse.ArgumentParser:
         "--bus", metavar="INTERFACE:CHANNEL", help="node of an existing bus, as in socketcan:vcan0, printed first"
     )
     made.add_argument("--plant", default="sample_1", metavar="FILE", help=f"TOML file, or {', '.join(plant_names())}")
-    made.add_argument("--hand", default="steady", metavar="SPEC", help=KNOWN_HANDS)
+    made.add_argument("--hand", metavar="SPEC", help=f"{KNOWN_HANDS}; default steady, for a pad's plant pressing")
     made.add_argument(
         "--fault",
         action="append",

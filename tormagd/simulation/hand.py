@@ -1,4 +1,4 @@
-"""The hand that turns the handle: where the roller's surface is at a time."""
+"""The hand at the device: where the roller's surface is at a time, or how deep a finger is in the pad."""
 
 import bisect
 import csv
@@ -13,7 +13,10 @@ ROLLER_RADIUS_MM: Final = 20.0
 DEFAULT_RPM: Final = 20.0
 DEFAULT_PERIOD_S: Final = 4.0
 REVERSING_TRAVEL_MM: Final = 30.0
-KNOWN = "steady[=RPM], reversing[=PERIOD_S], or a FILE.csv with the columns t_s,position_mm"
+DEFAULT_DEPTH_MM: Final = 2.0
+PRESSES_AT_S: Final = 10.0
+PRESSING_MM_S: Final = 1.0
+KNOWN = "steady[=RPM], reversing[=PERIOD_S], pressing[=DEPTH_MM], or a FILE.csv with the columns t_s,position_mm"
 
 
 class HandError(ValueError):
@@ -21,10 +24,10 @@ class HandError(ValueError):
 
 
 class Hand(Protocol):
-    """A motion of the roller's surface."""
+    """A motion of the roller's surface, or of a finger."""
 
     def position_mm(self, time_s: float) -> float:
-        """Travel of the roller surface since time 0, mm."""
+        """Travel of the roller surface since time 0, or the depth in the pad, mm."""
 
 
 @final
@@ -60,6 +63,21 @@ class ReversingHand(Value):
 
 
 @final
+class PressingHand(Value):
+    """The dummy finger of the thesis's pulse experiment: it touches the pad after 10 s, when the device is homed,
+    presses in at 1 mm/s, and stays."""
+
+    __match_args__ = ("depth_mm",)
+    __slots__ = __match_args__
+
+    def __init__(self, depth_mm: float = DEFAULT_DEPTH_MM) -> None:
+        self.depth_mm: Final = depth_mm
+
+    def position_mm(self, time_s: float) -> float:
+        return min(max(PRESSING_MM_S * (time_s - PRESSES_AT_S), 0.0), self.depth_mm)
+
+
+@final
 class RecordedHand(Value):
     """A recording, linear between its points and standing before the first and after the last."""
 
@@ -88,6 +106,8 @@ def parse_hand(spec: str) -> Hand:
         return SteadyHand(_number(spec, value, -300.0, 300.0) if value else DEFAULT_RPM)
     if name == "reversing":
         return ReversingHand(_number(spec, value, 0.1, 1000.0) if value else DEFAULT_PERIOD_S)
+    if name == "pressing":
+        return PressingHand(_number(spec, value, 0.1, 6.0) if value else DEFAULT_DEPTH_MM)
     if spec.endswith(".csv"):
         return read_recording(Path(spec))
     raise HandError(f"hand {spec!r}: allowed are {KNOWN}")

@@ -61,6 +61,29 @@ class Relaxation(Struct, frozen=True, forbid_unknown_fields=True):
     times_s: Annotated[tuple[Positive, ...], Meta(min_length=1, max_length=8)]
 
 
+class PadParameters(Struct, frozen=True, forbid_unknown_fields=True):
+    """A tactile pad between plates, in the place of insert and shaft: see `TactilePad`. Moduli are those of the worked
+    pad at small strain."""
+
+    cip_percent: Annotated[float, Meta(ge=0.0, le=60.0)]
+    modulus_kPa: Annotated[float, Meta(ge=1.0, le=10_000.0)]
+    full_field_modulus_kPa: Annotated[float, Meta(ge=1.0, le=10_000.0)]
+    breakdown: Annotated[float, Meta(ge=0.0, le=1.0)]
+    "Share of the field's stiffening that strain destroys."
+    diameter_mm: Annotated[float, Meta(ge=1.0, le=100.0)] = 30.0
+    height_mm: Annotated[float, Meta(ge=10.0, le=100.0)] = 12.5
+    breakdown_strain: Positive = 0.15
+    gent_limit: Annotated[float, Meta(ge=3.0, le=100.0)] = 3.5
+    saturation_mT: Positive = 260.0
+    rate_gain: Annotated[float, Meta(ge=0.0, le=0.1)] = 0.018
+    field_rate_gain: Annotated[float, Meta(ge=0.0, le=0.1)] = 0.026
+    rate_scale_mm_s: Positive = 0.8
+    mullins_share: Share = 0.15
+    mullins_travel_mm: Positive = 20.0
+    relaxing: Relaxation = Relaxation((0.015, 0.040, 0.028, 0.025), (1.2, 9.5, 95.0, 1100.0))
+    field_relaxing: Relaxation = Relaxation((0.018, 0.048, 0.034, 0.030), (0.8, 6.5, 70.0, 800.0))
+
+
 class Thermal(Struct, frozen=True, forbid_unknown_fields=True):
     """Temperature of the insert: its effect on the force, and how fast it starts to warm."""
 
@@ -164,6 +187,8 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
     force_sensor: ForceSensor
     firmware: FirmwareTiming
     assumed: Assumed = Assumed()
+    pad: PadParameters | None = None
+    "With one the device is a pad under a finger: `elastomer`, `friction` and `relaxation` are of no part of it."
 
     @property
     def closed_stop_mm(self) -> float:
@@ -206,6 +231,9 @@ def parse_plant(text: str, name: str = "plant") -> PlantParameters:
         raw = toml_tables(text)
     except TomlError as error:
         raise PlantError(f"{name}: {error}") from error
+    carriages = raw.pop("carriages", None)
+    if carriages is not None:
+        raw = _carried(raw, carriages, name)
     try:
         parameters = msgspec.convert(raw, PlantParameters)
     except msgspec.ValidationError as error:
@@ -214,6 +242,16 @@ def parse_plant(text: str, name: str = "plant") -> PlantParameters:
         raise PlantError(f"{name}: {path or 'top level'}{_value_at(raw, path)}: {reason}") from error
     _require_consistent(parameters, name)
     return parameters
+
+
+def _carried(raw: dict[str, Any], carriages: Any, name: str) -> dict[str, Any]:
+    """The tables of a pad and, beside it, those of the packaged plant whose magnets and carriages it stands between."""
+    if carriages not in plant_names():
+        raise PlantError(f"{name}: carriages = {in_short(carriages)}: allowed is one of {', '.join(plant_names())}")
+    if set(raw) != {"pad"}:
+        raise PlantError(f"{name}: tables {', '.join(sorted(raw))}: allowed beside carriages is pad alone")
+    carried: dict[str, Any] = msgspec.to_builtins(load_plant(carriages))
+    return carried | raw
 
 
 def with_insert(plant: PlantParameters, name: str) -> PlantParameters:
@@ -246,6 +284,12 @@ def _require_consistent(plant: PlantParameters, name: str) -> None:
         f"relaxation.fractions has {len(fractions)} values, relaxation.times_s {len(times)}: allowed are equal counts",
     )
     require(sum(fractions) < 1.0, f"relaxation.fractions = {list(fractions)}: allowed is a sum under 1")
+    if plant.pad is not None:
+        for key, series in (("relaxing", plant.pad.relaxing), ("field_relaxing", plant.pad.field_relaxing)):
+            require(
+                len(series.fractions) == len(series.times_s) and sum(series.fractions) < 1.0,
+                f"pad.{key}.fractions = {list(series.fractions)}: allowed is one for each time, and a sum under 1",
+            )
     assumed = plant.assumed
     require(
         plant.closed_stop_mm > 0.0 and assumed.closed_mm < assumed.home_mm,

@@ -1,4 +1,4 @@
-"""The plant: two carriages, the magnets between them, the torque element, the hand and the force sensor."""
+"""The plant: two carriages, the magnets, the element between them (insert or pad), the hand and the force sensor."""
 
 import math
 import random
@@ -10,6 +10,7 @@ from tormagd.simulation.axis import Axis
 from tormagd.simulation.element import Element
 from tormagd.simulation.hand import Hand
 from tormagd.simulation.parameters import PlantParameters
+from tormagd.simulation.pressed_pad import PressedPad
 from tormagd.simulation.static_laws import pull_over_gap
 
 SUBSTEP_S: Final = 5e-4
@@ -24,7 +25,8 @@ _ROUNDING: Final = 1e-6
 
 @final
 class Truth(Value):
-    """What really is, as no sensor sees it; `force_N` has the sign of the motion it resists."""
+    """What really is, as no sensor sees it; `force_N` has the sign of the motion it resists. Of a pad the handle is the
+    finger's depth in it, and force pushes the finger out."""
 
     __match_args__ = (
         "time_s",
@@ -121,7 +123,11 @@ class Plant:
         screw = parameters.screw
         self.left = Axis(parameters, screw.drag_left_N, assumed.start_left_mm, pull_N, substep_s)
         self.right = Axis(parameters, screw.drag_right_N, assumed.start_right_mm, pull_N, substep_s)
-        self.element = Element(parameters, gap_mm, ELEMENT_STEP_S)
+        self.element: Element | PressedPad = (
+            Element(parameters, gap_mm, ELEMENT_STEP_S)
+            if parameters.pad is None
+            else PressedPad(parameters, gap_mm, ELEMENT_STEP_S)
+        )
         self.handle_mm = hand.position_mm(0.0)
         self.handle_mm_s = 0.0
         self.force_sensor: Sensor = ForceSensor(parameters, random.Random(seed))
@@ -215,8 +221,12 @@ class Plant:
         handle_mm = self._hand.position_mm(time_s)
         self.handle_mm_s = (handle_mm - self.handle_mm) / ELEMENT_STEP_S
         self.handle_mm = handle_mm
-        self.element.advance(time_s, self.gap_mm, self.handle_mm_s)
-        self.force_sensor.advance(time_s, self.element.force_N)
+        element = self.element
+        if isinstance(element, PressedPad):
+            element.advance(time_s, self.gap_mm, handle_mm, self.handle_mm_s)
+        else:
+            element.advance(time_s, self.gap_mm, self.handle_mm_s)
+        self.force_sensor.advance(time_s, element.force_N)
 
     def wear(self, divisor: float) -> None:
         """Divide what holds the carriages, gearbox and screw friction, by that number."""

@@ -1,0 +1,134 @@
+"""The tactile element in the core: how a finger touches it, what its elastomer remembers, what the core refuses."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from tormagd.config import Config, ConfigError
+from tormagd.control.contact import PRESSED, Pressing
+from tormagd.control.core import SEVERAL_BRANCHES, Core, build_core, choose_solver
+from tormagd.control.estimate import Estimate, Handle, update
+from tormagd.control.governor import TimedSetpoint
+from tormagd.control.plan import PlanState
+from tormagd.model.displacement import Turn
+from tormagd.model.memory import NOTHING_REMEMBERED
+from tormagd.safety.codes import Limit
+from tormagd.scenes.scene import EVERY_TERM, load_scene, scene_path
+
+CONFIG = Config(scene="radial_pulse")
+SCENE = load_scene("radial_pulse")
+DEPTH_MM = 2.0
+PERIOD_S = 0.1
+
+
+@pytest.fixture(scope="module")
+def pad_core() -> Core:
+    return build_core(CONFIG)
+
+
+def pressed(depth_mm: float, rate_mm_s: float = 0.0, *, gap_mm: float = 78.0, number: int = 1) -> Estimate:
+    """A homed device with a finger that deep in its pad."""
+    handle = Handle(depth_mm, rate_mm_s, Turn(1.0, 0.0, 0.0))
+    half_mm = gap_mm / 2.0
+    return Estimate(number, True, 0.0, half_mm, half_mm, 0.0, 0.0, 3.5, handle, depth_mm, 0.0, 0.0)
+
+
+def held(core: Core, seconds: float, force_N: float = 3.5, *, depth_mm: float = DEPTH_MM) -> PlanState:
+    """The state after that force was asked for so long, the gap at once where it should be, and nothing learned."""
+    state = core.planner.start(0.0)
+    for tick in range(1, round(seconds / PERIOD_S) + 1):
+        now_s = tick * PERIOD_S
+        estimate = pressed(depth_mm, gap_mm=state.plan.gap_mm).replaced(sensed_s=-1.0)
+        state = core.planner.plan(state, now_s, TimedSetpoint(force_N, now_s, 0.1), estimate)
+    return state
+
+
+def test_a_finger_on_its_way_is_planned_for_at_the_scenes_depth() -> None:
+    contact = Pressing(DEPTH_MM)
+    assert contact.planned(None, None) == (DEPTH_MM, 0.0)
+    assert contact.planned(None, pressed(1.0, 1.0)) == (DEPTH_MM, 0.0)
+    assert contact.planned(None, pressed(1.9, -0.5)) == (1.9, -0.5)
+    assert contact.planned(TimedSetpoint(3.5, 0.0, 0.1, 1.5, 0.25), pressed(1.9)) == (1.5, 0.25)
+    assert not contact.is_known(pressed(0.99 * PRESSED * DEPTH_MM))
+    assert contact.is_known(pressed(PRESSED * DEPTH_MM))
+    assert not contact.slides
+
+
+def test_a_finger_that_draws_back_is_still_pushed_out(measure) -> None:
+    """The force of a handle turns round with its motion; a pad's does not."""
+    estimate = None
+    for number in range(1, 60):
+        depth_mm = 2.0 - 0.02 * number
+        estimate = update(estimate, measure(number, handle_mm=depth_mm, force_N=3.0), 47.5, 0.002, turns=False)
+    assert estimate is not None
+    assert estimate.force_N == 3.0
+    assert estimate.handle.displacement_mm == pytest.approx(depth_mm)
+    assert estimate.handle.rate_mm_s == pytest.approx(-20.0, rel=0.4)
+
+
+def test_a_pad_that_is_held_is_pressed_harder_as_it_relaxes(pad_core: Core) -> None:
+    fresh, later = held(pad_core, PERIOD_S), held(pad_core, 60.0)
+    assert fresh.memory.lost_N == pytest.approx(0.0, abs=0.01)
+    assert 0.15 < later.memory.lost_N < 0.35
+    assert later.plan.field_mT > fresh.plan.field_mT + 20.0
+    assert later.plan.predicted_N == pytest.approx(3.5, abs=0.01)
+    # what the device gives at most has fallen by as much
+    assert later.device.force_N(pad_core.planner.portrait.most_N) == pytest.approx(
+        pad_core.planner.portrait.most_N - later.memory.lost_N
+    )
+
+
+def test_without_the_term_nothing_is_remembered(pad_core: Core) -> None:
+    without = build_core(CONFIG, msgspec.structs.replace(SCENE, terms=EVERY_TERM.without("relaxation")))
+    forgetful = held(without, 60.0)
+    assert forgetful.memory is NOTHING_REMEMBERED
+    assert forgetful.plan.field_mT == pytest.approx(held(without, PERIOD_S).plan.field_mT, abs=0.01)
+
+
+def test_planning_that_begins_anew_has_not_forgotten(pad_core: Core) -> None:
+    state = held(pad_core, 5.0)
+    assert pad_core.planner.afresh(state, 5.1).memory == state.memory
+
+
+def test_a_force_out_of_the_pads_reach_says_so(pad_core: Core) -> None:
+    assert Limit.F_MIN in held(pad_core, 0.1, 3.21).plan.limits
+    assert Limit.F_MAX in held(pad_core, 20.0, 3.9, depth_mm=1.82).plan.limits
+
+
+def test_where_the_force_falls_branches_are_compared() -> None:
+    assert choose_solver(SCENE, 30, rises=False) is SEVERAL_BRANCHES
+    assert choose_solver(SCENE, 30, rises=True).solver == "newton"
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"[finger]\ndepth_mm = 2.0": ""}, "element = tactile: allowed is a table [finger]"),
+        ({"depth_mm = 2.0": "depth_mm = 5.0"}, "finger.depth_mm = 5: allowed is 0..4.5"),
+        ({"depth_mm = 2.0": "depth_mm = 2.0\nmost_mm_s = 9.0"}, "finger.most_mm_s = 9: allowed is -4..4"),
+        ({"[finger]": "[handle]\nmost_mm_s = 50.0\n[finger]"}, "handle: allowed only where element is torque"),
+        ({'model = "t': 'thickness_mm = 12.0\nmodel = "t'}, "insert.thickness_mm = 12: allowed only where element is"),
+        ({"tactile_mre_c": "torque_mre_50_40"}, "trained on the torque element, but the tactile element is in use"),
+        ({"most_N = 3.9": "most_N = 6.0"}, "force.most_N = 6: allowed is"),
+    ],
+)
+def test_what_a_pad_cannot_serve_is_refused(tmp_path: Path, changes: dict[str, str], said: str) -> None:
+    text = Path(scene_path("radial_pulse")).read_text().replace('file = "radial_pulse.csv"', "bandwidth_hz = 0.1")
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "scene.toml").write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        build_core(Config(scene=str(tmp_path / "scene.toml")))
+    assert said in str(caught.value)
+
+
+def test_a_brake_knows_of_no_finger_and_no_memory(tmp_path: Path) -> None:
+    text = Path(scene_path("coronary")).read_text()
+    for added, said in (("[finger]\ndepth_mm = 2.0", "[finger]"), ("[terms]\nrelaxation = true", "terms.relaxation")):
+        (tmp_path / "scene.toml").write_text(f"{text}\n{added}\n")
+        with pytest.raises(ConfigError) as caught:
+            load_scene(str(tmp_path / "scene.toml"))
+        assert said in str(caught.value)
+    assert build_core(Config()).planner.start(0.0).memory is NOTHING_REMEMBERED

@@ -1,0 +1,44 @@
+"""The field between the magnets: their moment over the gap, with the branch that hysteresis leaves it on."""
+
+import math
+from typing import Final, final
+
+from tormagd.simulation.parameters import PlantParameters
+from tormagd.simulation.static_laws import moment_over_gap
+
+SMALLEST_GAP_MM: Final = 45.0
+
+
+@final
+class GapField:
+    """The radial moment, T m, of a plant's magnets, off by at most `branch_Tm` either way for its hysteresis."""
+
+    __slots__ = ("_lag_Tm", "_moment", "_moment_Tm", "_turn_Tm", "branch_Tm")
+
+    def __init__(self, plant: PlantParameters, gap_mm: float) -> None:
+        self._moment = moment_over_gap(plant)
+        largest_Tm = self._moment.at(SMALLEST_GAP_MM)
+        self.branch_Tm: Final = plant.field.hysteresis_percent / 100.0 * largest_Tm
+        self._turn_Tm: Final = plant.assumed.hysteresis_scale * largest_Tm
+        self._moment_Tm = self._moment.at(gap_mm)
+        self._lag_Tm = 0.0
+
+    @property
+    def moment_Tm(self) -> float:
+        """At the newest gap, hysteresis and all."""
+        return self._moment_Tm + self._lag_Tm
+
+    def static_Tm(self, gap_mm: float) -> float:
+        """At a gap, without hysteresis."""
+        return self._moment.at(gap_mm)
+
+    def advance(self, gap_mm: float) -> float:
+        """The moment once the gap has become `gap_mm`."""
+        moment_Tm = self._moment.at(gap_mm)
+        change_Tm = moment_Tm - self._moment_Tm
+        if change_Tm != 0.0:
+            # rate-independent: the lag moves along |change| towards the branch that change leads to
+            branch_Tm = -self.branch_Tm if change_Tm > 0.0 else self.branch_Tm
+            self._lag_Tm += (self._lag_Tm - branch_Tm) * math.expm1(-abs(change_Tm) / self._turn_Tm)
+            self._moment_Tm = moment_Tm
+        return moment_Tm + self._lag_Tm

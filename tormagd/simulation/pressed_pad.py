@@ -1,0 +1,54 @@
+"""The tactile element: from the magnets' gap and the finger's depth in the pad to the force that the finger feels.
+
+The same magnets, screws and field as the brake's, with a `TactilePad` between them. Richer than any model the
+controller uses: field with hysteresis, Gent law, saturation, Payne effect, rate, eight relaxing branches, conditioning,
+warmth.
+"""
+
+from typing import Final, final
+
+from tormagd.physics.field import PAD_RADIUS_M
+from tormagd.simulation.gap_field import GapField
+from tormagd.simulation.pad import worked_pad
+from tormagd.simulation.parameters import PlantParameters
+from tormagd.simulation.tactile_pad import DEEPEST_MM, FASTEST_MM_S, TactilePad
+from tormagd.simulation.warmth import Warmth
+
+MT_PER_TM: Final = 1e3 / PAD_RADIUS_M
+
+
+@final
+class PressedPad:
+    """State of the element: the field's branch, the pad with its past, the temperature. It was worked, and rested.
+
+    `force_N` pushes the finger out, and is never negative: plates only push. Deeper than 6 mm the plates meet: the pad
+    gives no more there.
+    """
+
+    __slots__ = ("_dt_s", "_field", "_pad", "_warmth", "force_N")
+
+    def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
+        if plant.pad is None:
+            raise ValueError("plant.pad = None: allowed is the plant of a pad")
+        self._dt_s = dt_s
+        self._field = GapField(plant, gap_mm)
+        self._pad: TactilePad = worked_pad(plant.pad)
+        self._warmth = Warmth(plant)
+        self.force_N = 0.0
+
+    @property
+    def kinetic_N(self) -> float:
+        """The level that the force is at: nothing slides."""
+        return self.force_N
+
+    @property
+    def temperature_C(self) -> float:
+        """Of the pad."""
+        return self._warmth.temperature_C
+
+    def advance(self, time_s: float, gap_mm: float, depth_mm: float, speed_mm_s: float) -> None:
+        """One step that ends at that time, at that gap, with the finger that deep and pressing in at that speed."""
+        field_mT = MT_PER_TM * self._field.advance(gap_mm)
+        depth_mm = min(max(depth_mm, 0.0), DEEPEST_MM)
+        speed_mm_s = min(max(speed_mm_s, -FASTEST_MM_S), FASTEST_MM_S)
+        self.force_N = self._warmth.advance(time_s) * self._pad.advance(self._dt_s, depth_mm, speed_mm_s, field_mT)

@@ -1,0 +1,132 @@
+"""The tactile pad's law: an elastomer between plates, compressed in a field, with what it remembers.
+
+Elastic force of each part: modulus times the Gent law in compression. The field's part of the modulus grows with the
+square of the field and saturates with the particles; it breaks down with strain, the more the more filler there is
+(Payne effect). Both parts stiffen with rate (Eyring) and relax, each with times of its own, the field's part by more. A
+pad not yet worked is stiffer (Mullins). Plates only push.
+"""
+
+import math
+from typing import Final, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tormagd.physics.errors import require
+from tormagd.physics.relaxation import PronySeries, PronyState, PronyStep
+from tormagd.simulation.parameters import PadParameters
+
+Array = NDArray[np.float64]
+
+FULL_INDENTATION_MM: Final = 4.5
+FULL_FIELD_MT: Final = 365.0
+DEEPEST_MM: Final = 6.0
+FASTEST_MM_S: Final = 100.0
+STRONGEST_MT: Final = 500.0
+
+
+@final
+class TactilePad:
+    """One pad with its past: what it has been worked, and what its stress remembers. New pads are unworked."""
+
+    __slots__ = (
+        "_area",
+        "_breakdown",
+        "_breakdown_strain",
+        "_damage",
+        "_deepest_mm",
+        "_displacement_mm",
+        "_dt_s",
+        "_field_memory",
+        "_field_modulus_kPa",
+        "_field_rate_gain",
+        "_field_series",
+        "_field_step",
+        "_gent_limit",
+        "_height_mm",
+        "_memory",
+        "_modulus_kPa",
+        "_mullins_share",
+        "_mullins_travel_mm",
+        "_rate_gain",
+        "_rate_scale_mm_s",
+        "_saturation",
+        "_series",
+        "_step",
+    )
+
+    def __init__(self, parameters: PadParameters) -> None:
+        # kPa mm^2 is 1e-3 N
+        self._area: float = 1e-3 * math.pi / 4.0 * parameters.diameter_mm**2
+        self._height_mm: float = parameters.height_mm
+        self._modulus_kPa: float = parameters.modulus_kPa
+        self._field_modulus_kPa: float = parameters.full_field_modulus_kPa - parameters.modulus_kPa
+        self._breakdown: float = parameters.breakdown
+        self._breakdown_strain: float = parameters.breakdown_strain
+        self._gent_limit: float = parameters.gent_limit
+        self._saturation: float = parameters.saturation_mT * parameters.saturation_mT
+        self._rate_gain: float = parameters.rate_gain
+        self._field_rate_gain: float = parameters.field_rate_gain
+        self._rate_scale_mm_s: float = parameters.rate_scale_mm_s
+        self._mullins_share: float = parameters.mullins_share
+        self._mullins_travel_mm: float = parameters.mullins_travel_mm
+        relaxing, field_relaxing = parameters.relaxing, parameters.field_relaxing
+        self._series: PronySeries = PronySeries(relaxing.fractions, relaxing.times_s)
+        self._field_series: PronySeries = PronySeries(field_relaxing.fractions, field_relaxing.times_s)
+        self._damage: float = 0.0
+        self._deepest_mm: float = 0.0
+        self._dt_s: float = 0.0
+        self._step: PronyStep = self._series.discretise(0.0)
+        self._field_step: PronyStep = self._field_series.discretise(0.0)
+        self._displacement_mm: float = 0.0
+        self._memory: PronyState = self._series.relaxed(0.0)
+        self._field_memory: PronyState = self._field_series.relaxed(0.0)
+
+    def rest(self) -> None:
+        """Take the load off for long enough that the stress forgets; what was worked stays worked."""
+        self._displacement_mm = 0.0
+        self._memory, self._field_memory = self._series.relaxed(0.0), self._field_series.relaxed(0.0)
+
+    def elastic_parts_N(self, displacement_mm: float, rate_mm_s: float, field_mT: float) -> tuple[float, float]:
+        """Force without memory: of the elastomer as it is worked now, and what the field adds.
+
+        Raises `DomainError` outside 0..6 mm, +-100 mm/s, 0..500 mT.
+        """
+        require("displacement_mm", displacement_mm, 0.0, DEEPEST_MM)
+        require("rate_mm_s", rate_mm_s, -FASTEST_MM_S, FASTEST_MM_S)
+        require("field_mT", field_mT, 0.0, STRONGEST_MT)
+        strain = displacement_mm / self._height_mm
+        stretch = 1.0 - strain
+        invariant = stretch * stretch + 2.0 / stretch - 3.0
+        gent = (1.0 / (stretch * stretch) - stretch) / 3.0 * self._gent_limit / (self._gent_limit - invariant)
+        speed = math.asinh(rate_mm_s / self._rate_scale_mm_s)
+        unworked = 1.0 + self._mullins_share - self._damage
+        matrix_N = self._modulus_kPa * self._area * gent * unworked * (1.0 + self._rate_gain * speed)
+        square = field_mT * field_mT
+        full = FULL_FIELD_MT * FULL_FIELD_MT
+        stiffening = square / (square + self._saturation) * (full + self._saturation) / full
+        share = strain / self._breakdown_strain
+        intact = 1.0 - self._breakdown + self._breakdown / (1.0 + share * share)
+        added_kPa = self._field_modulus_kPa * stiffening * intact
+        return matrix_N, added_kPa * self._area * gent * (1.0 + self._field_rate_gain * speed)
+
+    def advance(self, dt_s: float, displacement_mm: float, rate_mm_s: float, field_mT: float) -> float:
+        """Force, N, at the end of a step of `dt_s` that ends at that displacement, rate and field."""
+        if dt_s != self._dt_s:
+            self._step, self._field_step = self._series.discretise(dt_s), self._field_series.discretise(dt_s)
+            self._dt_s = dt_s
+        self._deepest_mm = max(self._deepest_mm, displacement_mm)
+        travel_mm = abs(displacement_mm - self._displacement_mm)
+        possible = self._mullins_share * min(self._deepest_mm / FULL_INDENTATION_MM, 1.0)
+        self._damage += max(possible - self._damage, 0.0) * -math.expm1(-travel_mm / self._mullins_travel_mm)
+        self._displacement_mm = displacement_mm
+        matrix_N, added_N = self.elastic_parts_N(displacement_mm, rate_mm_s, field_mT)
+        relaxed_N, self._memory = self._step.advance(self._memory, matrix_N)
+        field_N, self._field_memory = self._field_step.advance(self._field_memory, added_N)
+        return max(relaxed_N + field_N, 0.0)
+
+    def run(self, time_s: Array, displacement_mm: Array, rate_mm_s: Array, field_mT: Array) -> Array:
+        """Forces, N, along a program; the first sample comes one step after what was before, or at once at time 0."""
+        steps = np.round(np.diff(time_s, prepend=0.0 if time_s[0] == 0.0 else 2 * time_s[0] - time_s[1]), 9)
+        columns = zip(steps.tolist(), displacement_mm.tolist(), rate_mm_s.tolist(), field_mT.tolist(), strict=True)
+        return np.array([self.advance(*row) for row in columns])
