@@ -38,6 +38,7 @@ COMPILED = {
             "trajectory",
             "interpolation",
             "portrait",
+            "remembered",
         ),
         *("periodicity", "governor", "plan", "motor", "step", "conditions"),
     ),

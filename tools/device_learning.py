@@ -31,7 +31,7 @@ from tormagd.config import Config
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import NOTHING_SHOWN, Shown
 from tormagd.control.profile import profile_of
-from tormagd.control.slow_friction import LEAST, MOST
+from tormagd.control.slow_friction import believable
 from tormagd.safety.codes import Limit
 from tormagd.simulation.parameters import PlantParameters
 
@@ -107,7 +107,9 @@ def is_railed(loop: ClosedLoop, config: Config) -> bool:
     """Whether a learned value stands at its bound."""
     assert loop.plan_state is not None
     shown = loop.plan_state.shown
-    return shown.device.scale in (config.trim.least, config.trim.most) or shown.slow.factor in (LEAST, MOST)
+    return shown.device.scale in (config.trim.least, config.trim.most) or (
+        shown.slow.learned > 0.0 and shown.slow.factor in believable(shown.device, shown.slow.followed_N)
+    )
 
 
 # -- steps ---------------------------------------------------------------------------------------------------------

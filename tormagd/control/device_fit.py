@@ -88,6 +88,19 @@ class DeviceFit(Value):
             square * self.offset_variance_N2,
         )
 
+    def relaxed(self, relaxed_N: float) -> "DeviceFit":
+        """The fit over the model's force without memory, of a device whose force it is without `relaxed_N` of that."""
+        if relaxed_N == 0.0:
+            return self
+        by_scale_N = relaxed_N * self.scale_variance
+        return DeviceFit(
+            self.scale,
+            self.offset_N - relaxed_N * self.scale,
+            self.scale_variance,
+            self.covariance_N - by_scale_N,
+            self.offset_variance_N2 + relaxed_N * (by_scale_N - 2.0 * self.covariance_N),
+        )
+
     def surely_within_N(self, most_N: float) -> float:
         """The most to ask of the model for the device to give no more than `most_N`: as far as it has shown itself,
         but no believable device is weaker than LEAST_SCALE or stronger than MOST_SCALE."""

@@ -11,6 +11,7 @@ from tormagd.control.device_fit import UNSEEN, DeviceFit, observe
 from tormagd.control.estimate import Estimate
 from tormagd.control.governor import PATH_S, Governed, Governor, GovernorState, TimedSetpoint
 from tormagd.control.portrait import ROLLER_RATE_MM_S, FieldOfGap, LawOfField, Portrait
+from tormagd.control.remembered import NOTHING_REMEMBERED, Remembered, Remembering
 from tormagd.control.sensor import UNJUDGED, Sensor, judge
 from tormagd.control.sensor_zero import TARED, UNKNOWN_SD_N, SensorZero
 from tormagd.control.sight import unsensed_s
@@ -33,7 +34,8 @@ LESSON_S: Final = 0.003
 LONGEST_LESSON_S: Final = 0.02
 "One reading teaches for the time since the last, no more often than that, however often is planned, and no longer."
 CREEPING_MM_S: Final = 1.2 * MOVING_MM_S
-"A handle that has slid no faster for some travel creeps; one that has slid faster only comes to rest."
+COMES_TO_REST: Final = 3.0
+"A handle that has slid no faster for some travel creeps; one that has slid so many times faster only comes to rest."
 LEAST_EXPECTED_N: Final = 0.1
 "Of less force no share is told."
 GONE_BACK_MM: Final = 0.01
@@ -171,16 +173,24 @@ NOTHING_SHOWN: Final = Shown()
 
 @final
 class PlanState(Value):
-    """What planning remembers. `lag_s` is how late the device's carriages are."""
+    """What planning remembers, and what the element does. `lag_s` is how late the device's carriages are."""
 
-    __match_args__ = ("governor", "plan", "shown", "lag_s")
+    __match_args__ = ("governor", "plan", "shown", "lag_s", "remembered")
     __slots__ = __match_args__
 
-    def __init__(self, governor: GovernorState, plan: Plan, shown: Shown = NOTHING_SHOWN, lag_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        governor: GovernorState,
+        plan: Plan,
+        shown: Shown = NOTHING_SHOWN,
+        lag_s: float = 0.0,
+        remembered: Remembered = NOTHING_REMEMBERED,
+    ) -> None:
         self.governor: Final = governor
         self.plan: Final = plan
         self.shown: Final = shown
         self.lag_s: Final = lag_s
+        self.remembered: Final = remembered
 
     @property
     def device(self) -> DeviceFit:
@@ -221,6 +231,7 @@ class Planner:
         terms = terms_of(scene)
         self._governor = Governor(portrait, scene.force, position.gap_speed_mm_s, terms)
         self._cip_percent = cip_percent
+        self._memory = Remembering(model.metadata.memory)
         self._closed_mm, self._open_mm = scene.insert.gap_closed_mm, scene.insert.gap_open_mm
         self._ceiling_N = CEILING * scene.force.most_N
         displacements_mm, rates_mm_s, fields_mT, _ = model.feature_ranges
@@ -254,14 +265,16 @@ class Planner:
         self, state: PlanState, now_s: float, setpoint: TimedSetpoint | None, estimate: Estimate | None
     ) -> PlanState:
         """The next plan. `estimate` is None while the device has said nothing: nothing is learned of it then."""
-        model_N = self._model_N(estimate)
-        shown = self._learn(state.shown, now_s, estimate, model_N)
-        device = shown.device
+        remembered = self._remember(state.remembered, now_s, estimate)
+        model_N = self._model_N(estimate, remembered)
+        shown = self._learn(state.shown, now_s, estimate, model_N, remembered.relaxed_N)
+        # from here on over the model's force without memory, which searches and portrait know
+        device = shown.device.relaxed(remembered.relaxed_N)
         if self._has_creep:
             sliding_mm_s = MOVING_MM_S if estimate is None else estimate.handle.sliding_mm_s
             device = device.times(shown.slow.factor_at(sliding_mm_s))
         governor, governed = self._governor.govern(state.governor, now_s, setpoint, device, state.lag_s)
-        lag_s = self._learn_lag(state, now_s, estimate, governed, device)
+        lag_s = self._learn_lag(state, now_s, estimate, remembered, governed, device)
         is_meant = setpoint is not None and Limit.STALE not in governed.limits
         curve = self._only_curve
         displacement_mm, rate_mm_s = curve.displacement_mm, curve.rate_mm_s
@@ -272,8 +285,9 @@ class Planner:
             known_mm_s = _within(rate_mm_s, self._rates_mm_s)
             curve = self._model.curve(known_mm, known_mm_s, self._cip_percent)
         wanted_N = device.model_N(governed.path_N[0])
-        solution = self._search.solve(curve, wanted_N, state.plan.field_mT)
-        field_mT = self._lawful_mT(solution, wanted_N)
+        solution = self._search.solve(curve, wanted_N, state.plan.field_mT - state.remembered.lag_mT)
+        lawful_mT = self._lawful_mT(solution, wanted_N)
+        field_mT = lawful_mT + self._memory.lag_at_mT(remembered, lawful_mT + remembered.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
         wanted_mm = min(max(self._field.gap_mm(field_mT), self._closed_mm), self._open_mm)
         least_mm = self.portrait.gap_mm_at(device.surely_within_N(self._ceiling_N))
@@ -283,8 +297,8 @@ class Planner:
             outside = (Outside(FEATURES[0], displacement_mm, known_mm),)
         if known_mm_s != rate_mm_s:
             outside = (*outside, Outside(FEATURES[1], rate_mm_s, known_mm_s))
-        if field_mT != solution.field_mT:
-            outside = (*outside, Outside(FEATURES[2], solution.field_mT, field_mT))
+        if lawful_mT != solution.field_mT:
+            outside = (*outside, Outside(FEATURES[2], solution.field_mT, lawful_mT))
         limits = (*governed.limits, *shown.limits)
         if outside:
             limits = (*limits, Limit.MODEL_RANGE)
@@ -315,7 +329,7 @@ class Planner:
             outside=outside,
             sensor_doubted_s=shown.sensor.doubted_s,
         )
-        return PlanState(governor, plan, shown, lag_s)
+        return PlanState(governor, plan, shown, lag_s, remembered)
 
     def foresee(self, state: PlanState) -> PlanState:
         """What can be prepared for the next plans once one is made: to be called after each, when nothing waits."""
@@ -337,11 +351,22 @@ class Planner:
                 rate_mm_s = abs(setpoint.rate_mm_s)
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
 
-    def _model_N(self, estimate: Estimate | None) -> float | None:
+    def _remember(self, remembered: Remembered, now_s: float, estimate: Estimate | None) -> Remembered:
+        """The element's memory after the measured gap. Before one was known it rested long where it is found."""
+        if estimate is None or not estimate.is_homed:
+            return remembered
+        field_mT = self._field.field_mT(max(estimate.gap_mm, self._closed_mm - BEYOND_MM))
+        is_found = remembered.time_s == -math.inf
+        lag_mT = 0.0 if is_found else self._memory.lag_at_mT(remembered, field_mT)
+        force_N = self._only_curve.force_N(_within(field_mT - lag_mT, self._fields_mT))
+        if is_found:
+            return self._memory.rested(field_mT, force_N, now_s)
+        return self._memory.followed(remembered, field_mT, lag_mT, force_N, now_s)
+
+    def _model_N(self, estimate: Estimate | None, remembered: Remembered) -> float | None:
         """What the model says at the measured gap and rate of friction that is mobilised; None without a gap."""
         if estimate is None or not estimate.is_homed:
             return None
-        gap_mm = max(estimate.gap_mm, self._closed_mm - BEYOND_MM)
         curve = self._only_curve
         if self._has_rate:
             curve = self._model.curve(
@@ -349,9 +374,12 @@ class Planner:
                 _within(abs(estimate.handle.rate_mm_s), self._rates_mm_s),
                 self._cip_percent,
             )
-        return curve.force_N(_within(self._field.field_mT(gap_mm), self._fields_mT))
+        element_mT = remembered.field_mT - remembered.lag_mT
+        return curve.force_N(_within(element_mT, self._fields_mT)) - remembered.relaxed_N
 
-    def _learn(self, shown: Shown, now_s: float, estimate: Estimate | None, model_N: float | None) -> Shown:
+    def _learn(
+        self, shown: Shown, now_s: float, estimate: Estimate | None, model_N: float | None, relaxed_N: float
+    ) -> Shown:
         """From the force at the *measured* gap: the model's error is learned, not the tracking error, so it cannot
         fight the position loop. A sensor that is not believed teaches nothing, and what it has taught is forgotten."""
         if estimate is None or model_N is None or estimate.number == shown.read or now_s - shown.read_s < LESSON_S:
@@ -373,15 +401,25 @@ class Planner:
             elif (
                 self._learns_creep
                 and SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S
-                and estimate.handle.sliding_mm_s < CREEPING_MM_S
+                and estimate.handle.sliding_mm_s < min(CREEPING_MM_S, COMES_TO_REST * rate_mm_s)
             ):
                 expected_N = shown.device.force_N(slow.followed_N)
                 # before it is mobilised friction is less than the model's; more is more all the same
                 is_lesson = is_zero_known and (is_mobilised or reading_N > expected_N)
                 if expected_N > LEAST_EXPECTED_N and is_lesson:
-                    slow = slow.observed(expected_N, rate_mm_s, reading_N, elapsed_s)
+                    slow = slow.observed(shown.device, rate_mm_s, reading_N, elapsed_s)
             return Shown(shown.device, shown.sensor, estimate.number, now_s, shown.limits, slow, zero)
-        sensor = judge(shown.sensor, shown.device, model_N, rate_mm_s, reading_N, elapsed_s, direction, zero_sd_N)
+        # the sensor is judged by all that an elastomer may do, whatever this one is thought to remember
+        sensor = judge(
+            shown.sensor,
+            shown.device.relaxed(relaxed_N),
+            model_N + relaxed_N,
+            rate_mm_s,
+            reading_N,
+            elapsed_s,
+            direction,
+            zero_sd_N,
+        )
         if sensor.is_doubted and not shown.sensor.is_doubted:
             zero = zero.doubted()
         zero = zero.heard(
@@ -428,12 +466,20 @@ class Planner:
         return min(max(solution.field_mT, (1.0 - LAW_SHARE) * law_mT), (1.0 + LAW_SHARE) * law_mT)
 
     def _learn_lag(
-        self, state: PlanState, now_s: float, estimate: Estimate | None, governed: Governed, device: DeviceFit
+        self,
+        state: PlanState,
+        now_s: float,
+        estimate: Estimate | None,
+        remembered: Remembered,
+        governed: Governed,
+        device: DeviceFit,
     ) -> float:
         """How far the gap is behind over how fast it moves: a motor weaker than it is believed to be comes late."""
         if not self._has_lag or estimate is None or not estimate.is_homed or governed.foresight < LEAST_FORESIGHT:
             return state.lag_s
-        behind_mm = self.portrait.gap_mm_at(device.model_N(governed.force_N)) - estimate.gap_mm
+        # the gap that would do the same without the field's lag
+        gap_mm = self._field.gap_mm(remembered.field_mT - remembered.lag_mT)
+        behind_mm = self.portrait.gap_mm_at(device.model_N(governed.force_N)) - gap_mm
         if abs(behind_mm) > MOST_LAG_S * self._fastest_mm_s:
             return state.lag_s  # on its way after a jump
         travel_mm_s = estimate.left_mm_s + estimate.right_mm_s

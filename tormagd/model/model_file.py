@@ -34,6 +34,7 @@ from tormagd.model.features import (
     require_number,
 )
 from tormagd.model.force_curve import ForceCurve, Known, Network
+from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.physics.errors import DomainError
 
 Array: TypeAlias = NDArray[np.float64]
@@ -56,7 +57,8 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     `insert` names the insert the data were measured on; `ranges` holds the least and the greatest value seen in
     training for each feature and for `force_N`; `metrics` whatever the trainer measured; `created` is given, never
-    read from a clock. Raises `DomainError` on anything that could not be saved and loaded again.
+    read from a clock; `memory` is what the network leaves out. Raises `DomainError` on anything that could not be saved
+    and loaded again.
     """
 
     element: Element
@@ -69,6 +71,7 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     created: datetime.date
     features: tuple[str, ...] = FEATURES
     units: dict[str, str] = msgspec.field(default_factory=lambda: dict(UNITS))
+    memory: Memory = NO_MEMORY
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\x21-\x7e]{1,64}", self.insert):
@@ -95,6 +98,9 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             raise DomainError("scaling", scaling, f"finite numbers within +-{LARGEST:g}")
         if not scaling.output_gain > 0:
             raise DomainError("scaling.output_gain", scaling.output_gain, "above 0")
+        if not self.memory.lag_mT <= 0.25 * self.memory.turn_mT:
+            # otherwise a gap that follows the lag might run after itself
+            raise DomainError("memory.lag_mT", self.memory.lag_mT, "at most a quarter of memory.turn_mT")
         for name, value in self.metrics.items():
             if not math.isfinite(value):
                 raise DomainError(f"metrics.{name}", value, "a finite number")

@@ -16,6 +16,7 @@ from tormagd.control.periodicity import Guess, Periodicity, Skill
 from tormagd.control.pid import PidState
 from tormagd.control.plan import Outside, Plan, PlanState, Shown
 from tormagd.control.plausible import Leap
+from tormagd.control.remembered import Remembered
 from tormagd.control.sensor import Past, Sensor
 from tormagd.control.sensor_zero import Level, SensorZero
 from tormagd.control.sight import Sight
@@ -57,7 +58,8 @@ KNOWN = kinds(
         Expected,
     ),
     *(PidState, Sight, Leap, Homing, PlanState, GovernorState, Periodicity, Skill, Guess, Plan, Outside, Shown),
-    *(DeviceFit, Sensor, Past, SlowFriction, SensorZero, Level, Conditions, DeviceMode, Switches),
+    *(DeviceFit, Sensor, Past, SlowFriction, SensorZero, Level, Remembered),
+    *(Conditions, DeviceMode, Switches),
 )
 "All that the core's states consist of."
 UNTAKEN = (TypeError, AttributeError, ValueError, ArithmeticError, LookupError, RuntimeError, RecursionError)
