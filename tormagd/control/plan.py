@@ -352,16 +352,25 @@ class Planner:
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
 
     def _remember(self, remembered: Remembered, now_s: float, estimate: Estimate | None) -> Remembered:
-        """The element's memory after the measured gap. Before one was known it rested long where it is found."""
-        if estimate is None or not estimate.is_homed:
+        """The element's memory after the measured gap. It rested long at the gap at which the device was switched on."""
+        if estimate is None:
             return remembered
+        is_new = remembered.time_s == -math.inf
+        if not estimate.is_homed:
+            # until the switches are found, positions count from where the carriages were, as if they were open
+            return Remembered(opened_mm=estimate.gap_mm - self._open_mm) if is_new else remembered
+        if is_new:
+            found_mm = estimate.gap_mm - remembered.opened_mm
+            is_known = self._closed_mm - BEYOND_MM <= found_mm <= self._open_mm + BEYOND_MM
+            rested_mT = self._field.field_mT(found_mm if is_known else estimate.gap_mm)
+            remembered = self._memory.rested(rested_mT, self._sliding_N(rested_mT), now_s)
         field_mT = self._field.field_mT(max(estimate.gap_mm, self._closed_mm - BEYOND_MM))
-        is_found = remembered.time_s == -math.inf
-        lag_mT = 0.0 if is_found else self._memory.lag_at_mT(remembered, field_mT)
-        force_N = self._only_curve.force_N(_within(field_mT - lag_mT, self._fields_mT))
-        if is_found:
-            return self._memory.rested(field_mT, force_N, now_s)
-        return self._memory.followed(remembered, field_mT, lag_mT, force_N, now_s)
+        lag_mT = self._memory.lag_at_mT(remembered, field_mT)
+        return self._memory.followed(remembered, field_mT, lag_mT, self._sliding_N(field_mT - lag_mT), now_s)
+
+    def _sliding_N(self, field_mT: float) -> float:
+        """The model's force of a handle at the roller's speed."""
+        return self._only_curve.force_N(_within(field_mT, self._fields_mT))
 
     def _model_N(self, estimate: Estimate | None, remembered: Remembered) -> float | None:
         """What the model says at the measured gap and rate of friction that is mobilised; None without a gap."""

@@ -14,9 +14,10 @@ from tormagd.model.memory import Memory
 @final
 class Remembered(Value):
     """The field of the newest gap, mT, and how far the element's own is behind it; the force without memory behind a
-    low-pass of each time, N; how much of the force has relaxed, N; all at `time_s`, before which nothing is known."""
+    low-pass of each time, N; how much of the force has relaxed, N; all at `time_s`, before which nothing is known but
+    by how much the gap has opened since the device was switched on, mm."""
 
-    __match_args__ = ("field_mT", "lag_mT", "slow_N", "relaxed_N", "time_s")
+    __match_args__ = ("field_mT", "lag_mT", "slow_N", "relaxed_N", "time_s", "opened_mm")
     __slots__ = __match_args__
 
     def __init__(
@@ -26,12 +27,14 @@ class Remembered(Value):
         slow_N: tuple[float, ...] = (),
         relaxed_N: float = 0.0,
         time_s: float = -math.inf,
+        opened_mm: float = 0.0,
     ) -> None:
         self.field_mT: Final = field_mT
         self.lag_mT: Final = lag_mT
         self.slow_N: Final = slow_N
         self.relaxed_N: Final = relaxed_N
         self.time_s: Final = time_s
+        self.opened_mm: Final = opened_mm
 
 
 NOTHING_REMEMBERED: Final = Remembered()
