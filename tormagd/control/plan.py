@@ -352,13 +352,14 @@ class Planner:
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
 
     def _remember(self, remembered: Remembered, now_s: float, estimate: Estimate | None) -> Remembered:
-        """The element's memory after the measured gap. It rested long at the gap at which the device was switched on."""
+        """The element's memory after the measured gap. It rested long where the device was switched on."""
         if estimate is None:
             return remembered
         is_new = remembered.time_s == -math.inf
         if not estimate.is_homed:
-            # until the switches are found, positions count from where the carriages were, as if they were open
-            return Remembered(opened_mm=estimate.gap_mm - self._open_mm) if is_new else remembered
+            # until both switches are found, positions count from where the carriages were, as if they were open
+            opened_mm = max(estimate.gap_mm - self._open_mm, remembered.opened_mm)
+            return Remembered(opened_mm=opened_mm) if is_new else remembered
         if is_new:
             found_mm = estimate.gap_mm - remembered.opened_mm
             is_known = self._closed_mm - BEYOND_MM <= found_mm <= self._open_mm + BEYOND_MM

@@ -15,7 +15,7 @@ from tormagd.model.memory import Memory
 class Remembered(Value):
     """The field of the newest gap, mT, and how far the element's own is behind it; the force without memory behind a
     low-pass of each time, N; how much of the force has relaxed, N; all at `time_s`, before which nothing is known but
-    by how much the gap has opened since the device was switched on, mm."""
+    by how much the gap had been opened, mm, since the device was switched on."""
 
     __match_args__ = ("field_mT", "lag_mT", "slow_N", "relaxed_N", "time_s", "opened_mm")
     __slots__ = __match_args__
