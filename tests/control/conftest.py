@@ -1,13 +1,19 @@
 """What the control tests share: one core, and a device that is described instead of simulated."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
+import msgspec
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.config import Config
 from tormagd.control.core import Core, build_core
 from tormagd.hardware.measurement import Measurement
+from tormagd.model.memory import NO_MEMORY
+from tormagd.model.model_file import load_model, save_model
+from tormagd.model.shipped import model_path
+from tormagd.scenes.scene import load_scene
 
 MeasurementMaker = Callable[..., Measurement]
 
@@ -18,9 +24,21 @@ def config() -> Config:
 
 
 @pytest.fixture(scope="session")
-def core(config: Config) -> Core:
-    """The core of the shipped coronary scene; nothing in it changes."""
-    return build_core(config)
+def make_core(config: Config, tmp_path_factory: pytest.TempPathFactory) -> Callable[[], Core]:
+    """Makes cores of the shipped coronary scene with a model that remembers nothing: so a gap and a force say the same
+    at any time. What is remembered has tests of its own."""
+    scene, folder = load_scene(config.scene), tmp_path_factory.mktemp("models")
+    shipped = load_model(model_path(scene.insert.model, folder), element=scene.element)
+    forgetful = replace(shipped, metadata=msgspec.structs.replace(shipped.metadata, memory=NO_MEMORY))
+    save_model(folder / "model.safetensors", forgetful)
+    fitted = msgspec.structs.replace(scene.insert, model="model.safetensors")
+    return lambda: build_core(config, msgspec.structs.replace(scene, insert=fitted), folder)
+
+
+@pytest.fixture(scope="session")
+def core(make_core: Callable[[], Core]) -> Core:
+    """Such a core, in which nothing changes."""
+    return make_core()
 
 
 @pytest.fixture(scope="session")

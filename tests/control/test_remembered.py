@@ -6,7 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tormagd.config import Config
+from tormagd.control.core import build_core
+from tormagd.control.estimate import Estimate, Handle
+from tormagd.control.plan import PlanState
 from tormagd.control.remembered import NOTHING_REMEMBERED, Remembered, Remembering
+from tormagd.model.displacement import Turn
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.physics.relaxation import PronySeries
 
@@ -42,6 +47,45 @@ def test_an_element_without_memory_is_as_its_gap() -> None:
     )
     assert (remembered.lag_mT, remembered.relaxed_N) == (0.0, 0.0)
     assert NOTHING_REMEMBERED.time_s == -math.inf
+
+
+RELAXED = 0.13
+"Of what the shipped model's element has relaxed after a long rest, about."
+
+
+def remembering(*estimates: Estimate) -> PlanState:
+    """The state after plans that found the device as in these estimates, half a second apart."""
+    core = build_core(Config())
+    state = core.planner.start(0.0)
+    for place, estimate in enumerate(estimates):
+        state = core.planner.plan(state, 0.5 * place, None, estimate)
+    return state
+
+
+def found(gap_mm: float, *, is_homed: bool = True) -> Estimate:
+    """A device at that gap, whose handle has not moved."""
+    handle = Handle(0.0, 0.0, Turn(1.0, 0.0, 0.0))
+    return Estimate(1, is_homed, 0.0, gap_mm / 2.0, gap_mm / 2.0, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
+
+
+def test_a_device_that_is_found_homed_has_rested_there() -> None:
+    remembered = remembering(found(95.0)).remembered
+    assert remembered.relaxed_N == pytest.approx(RELAXED * 0.62, rel=0.1)
+    assert remembered.lag_mT == 0.0
+
+
+def test_one_that_has_to_be_homed_has_rested_where_it_was_switched_on() -> None:
+    """Its counts are 0 there, and once more where the switches are; the flag comes later than that."""
+    on_its_way = [found(95.0 + opened_mm, is_homed=False) for opened_mm in (0.0, 10.0, 16.0, 15.5, 0.0)]
+    remembered = remembering(*on_its_way, found(95.0)).remembered
+    at_79_N = remembering(found(79.0)).remembered.relaxed_N
+    assert remembered.relaxed_N == pytest.approx(at_79_N, rel=0.02)
+    assert remembered.lag_mT < 0.0  # the field fell
+
+
+def test_a_gap_that_no_device_has_is_not_believed_to_have_been_one() -> None:
+    remembered = remembering(found(900.0, is_homed=False), found(95.0)).remembered
+    assert remembered.relaxed_N == pytest.approx(RELAXED * 0.62, rel=0.1)
 
 
 @given(
