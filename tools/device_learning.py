@@ -1,6 +1,6 @@
 """How soon and how well the controller knows a device: what is left of the force's error, in virtual time.
 
-    device_learning.py [steps|creep|speeds|drift|pulse ...] [--draws N] [--tuning] [--json]
+    device_learning.py [steps|creep|speeds|drift|pulse ...] [--draws N] [--drift-s S] [--tuning] [--json]
 
 Forces are the simulated plant's at the roller; nothing is subtracted from an error. A step has *arrived* ARRIVES_S
 after the device's ideal carriages (`tools/ideal_carriage.py`) would have brought the force. Devices are the three
@@ -215,19 +215,19 @@ def speeds(name: str) -> Json:
 # -- the sensor, and what the model knows alone ---------------------------------------------------------------------
 
 
-def drift(name: str) -> Json:
-    """An hour with a force sensor that drifts, a handle that turns back every TURN_S, and one that never does: the
-    worst error of a second's mean, and how far the force went from when OFFSET_UNKNOWN was first shown."""
+def drift(name: str, lasts_s: float = DRIFT_S) -> Json:
+    """A force sensor that drifts, with a handle that turns back every TURN_S, and one that never does: the worst error
+    of a second's mean, and how far the force went from when OFFSET_UNKNOWN was first shown."""
     plant = device(name)
     sensor = msgspec.structs.replace(plant.force_sensor, drift_mN_min=DRIFT_MN_MIN)
     plant = msgspec.structs.replace(plant, force_sensor=sensor)
-    turns = [(TURN_S, HAND_MM_S), (TURN_S, -HAND_MM_S)] * round(DRIFT_S / TURN_S / 2.0)
+    turns = [(TURN_S, HAND_MM_S), (TURN_S, -HAND_MM_S)] * round(lasts_s / TURN_S / 2.0)
     result: Json = {}
-    for key, legs in (("turning", turns), ("one_way", [(DRIFT_S, HAND_MM_S)])):
+    for key, legs in (("turning", turns), ("one_way", [(lasts_s, HAND_MM_S)])):
         loop = armed(Config(scene=SCENE), plant, legs)
         begins_s, means_N, unknown_s = loop.now_s, [], None
         second: list[float] = []
-        for sample in loop.run(DRIFT_S, lambda now_s: TimedSetpoint(DRIFT_N, now_s, VALID_S)):
+        for sample in loop.run(lasts_s, lambda now_s: TimedSetpoint(DRIFT_N, now_s, VALID_S)):
             if unknown_s is None and Limit.OFFSET_UNKNOWN in sample.plan.limits:
                 unknown_s = sample.time_s - begins_s
             second.append(abs(sample.truth.force_N) - DRIFT_N)
@@ -272,14 +272,17 @@ PARTS: dict[str, Callable[[str], Json]] = {
 }
 
 
-def measure(parts: list[str], draws: int, *, is_tuning: bool, jobs: int) -> Json:
+def measure(parts: list[str], draws: int, drift_s: float, *, is_tuning: bool, jobs: int) -> Json:
     """The figures of every device, by part; drift and pulse only of the samples."""
     samples = ["sample_1"] if is_tuning else ["sample_1", "sample_2", "sample_3"]
     first = 0 if is_tuning else FIRST_DRAW
     drawn = [f"draw {number}" for number in range(first, first + draws)]
     runs = [(part, name) for part in parts for name in (samples if part in ("drift", "pulse") else [*samples, *drawn])]
     with concurrent.futures.ProcessPoolExecutor(max_workers=jobs) as pool:
-        waiting = [pool.submit(PARTS[part], name) for part, name in runs]
+        waiting = [
+            pool.submit(drift, name, drift_s) if part == "drift" else pool.submit(PARTS[part], name)
+            for part, name in runs
+        ]
         bar = tqdm(waiting, desc="runs", unit="run", disable=not sys.stderr.isatty())
         result: Json = {part: {} for part in parts}
         for (part, name), future in zip(runs, bar, strict=True):
@@ -340,13 +343,15 @@ def main() -> int:
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"any of {', '.join(PARTS)}; default: all")
     parser.add_argument("--draws", type=int, default=DRAWS, help=f"random devices ({DRAWS})")
     parser.add_argument("--tuning", action="store_true", help="the devices that constants may be chosen on")
+    parser.add_argument("--drift-s", type=float, default=DRIFT_S, help=f"how long a sensor drifts ({DRIFT_S:g})")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
     options = parser.parse_args()
     unknown = [part for part in options.parts if part not in PARTS]
     if unknown:
         parser.error(f"{unknown[0]}: allowed are {', '.join(PARTS)}")
-    result = measure(options.parts or list(PARTS), options.draws, is_tuning=options.tuning, jobs=options.jobs)
+    parts = options.parts or list(PARTS)
+    result = measure(parts, options.draws, options.drift_s, is_tuning=options.tuning, jobs=options.jobs)
     print(json.dumps(result)) if options.json else print_table(result)
     return 0
 

@@ -68,7 +68,7 @@ def test_a_device_that_was_known_before_is_right_at_once(core: Core) -> None:
     assert np.mean(forces_N[1_200:1_300]) == pytest.approx(2.0, abs=0.04)
 
 
-def test_the_model_alone_renders_the_pulse_of_the_device_that_it_was_trained_on() -> None:
+def test_the_model_alone_renders_the_forces_of_the_device_that_it_was_trained_on() -> None:
     """It knows what the elastomer has relaxed and how its field lags; nothing is learned."""
     config, scene = Config(scene="pulse"), load_scene("pulse")
     alone = build_core(config, msgspec.structs.replace(scene, terms=Terms(learning=False)))
