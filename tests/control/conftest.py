@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -11,9 +12,7 @@ from tormagd.config import Config
 from tormagd.control.core import Core, build_core
 from tormagd.hardware.measurement import Measurement
 from tormagd.model.memory import NO_MEMORY
-from tormagd.model.model_file import load_model, save_model
-from tormagd.model.shipped import model_path
-from tormagd.scenes.scene import load_scene
+from tormagd.model.model_file import ForceModel, load_model
 
 MeasurementMaker = Callable[..., Measurement]
 
@@ -23,16 +22,32 @@ def config() -> Config:
     return Config()
 
 
+LOADED = "tormagd.control.core.load_model"
+
+
+def load_forgetful(path: Path, **meant: str) -> ForceModel:
+    """A model that remembers nothing: with it a gap and a force say the same at any time. What is remembered has tests
+    of its own."""
+    model = load_model(path, **meant)
+    return replace(model, metadata=msgspec.structs.replace(model.metadata, memory=NO_MEMORY))
+
+
+@pytest.fixture
+def forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cores are built with such a model."""
+    monkeypatch.setattr(LOADED, load_forgetful)
+
+
 @pytest.fixture(scope="session")
-def make_core(config: Config, tmp_path_factory: pytest.TempPathFactory) -> Callable[[], Core]:
-    """Makes cores of the shipped coronary scene with a model that remembers nothing: so a gap and a force say the same
-    at any time. What is remembered has tests of its own."""
-    scene, folder = load_scene(config.scene), tmp_path_factory.mktemp("models")
-    shipped = load_model(model_path(scene.insert.model, folder), element=scene.element)
-    forgetful = replace(shipped, metadata=msgspec.structs.replace(shipped.metadata, memory=NO_MEMORY))
-    save_model(folder / "model.safetensors", forgetful)
-    fitted = msgspec.structs.replace(scene.insert, model="model.safetensors")
-    return lambda: build_core(config, msgspec.structs.replace(scene, insert=fitted), folder)
+def make_core(config: Config) -> Callable[[], Core]:
+    """Makes cores of the shipped coronary scene, with such a model."""
+
+    def make() -> Core:
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(LOADED, load_forgetful)
+            return build_core(config)
+
+    return make
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,5 @@
 """What the element remembers, beside the laws that it follows: a Prony series, and a lag that goes along changes."""
 
-import math
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -32,8 +30,8 @@ def test_it_relaxes_as_its_series_does() -> None:
 
 
 def test_the_field_lags_along_its_way_and_not_in_time() -> None:
-    start = Remembered(400.0, 3.0)
-    halfway = Remembered(430.0, REMEMBERING.lag_at_mT(start, 430.0))
+    start = Remembered(400.0, 3.0, time_s=0.0)
+    halfway = Remembered(430.0, REMEMBERING.lag_at_mT(start, 430.0), time_s=0.0)
     assert REMEMBERING.lag_at_mT(halfway, 460.0) == pytest.approx(REMEMBERING.lag_at_mT(start, 460.0))
     assert REMEMBERING.lag_at_mT(start, 400.0) == 3.0
     assert REMEMBERING.lag_at_mT(start, 2_000.0) == pytest.approx(8.0)
@@ -43,10 +41,14 @@ def test_the_field_lags_along_its_way_and_not_in_time() -> None:
 def test_an_element_without_memory_is_as_its_gap() -> None:
     forgetful = Remembering(NO_MEMORY)
     remembered = forgetful.followed(
-        forgetful.rested(300.0, 0.6, 0.0), 500.0, forgetful.lag_at_mT(Remembered(), 500.0), 2.0, 1.0
+        forgetful.rested(300.0, 0.6, 0.0), 500.0, forgetful.lag_at_mT(Remembered(time_s=0.0), 500.0), 2.0, 1.0
     )
     assert (remembered.lag_mT, remembered.relaxed_N) == (0.0, 0.0)
-    assert NOTHING_REMEMBERED.time_s == -math.inf
+
+
+def test_before_anything_is_known_nothing_is_expected() -> None:
+    assert REMEMBERING.lag_at_mT(NOTHING_REMEMBERED, 500.0) == 0.0
+    assert NOTHING_REMEMBERED.relaxed_N == 0.0
 
 
 RELAXED = 0.13

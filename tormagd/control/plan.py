@@ -360,12 +360,13 @@ class Planner:
             # until both switches are found, positions count from where the carriages were, as if they were open
             opened_mm = max(estimate.gap_mm - self._open_mm, remembered.opened_mm)
             return Remembered(opened_mm=opened_mm) if is_new else remembered
+        gap_mm = max(estimate.gap_mm, self._closed_mm - BEYOND_MM)
         if is_new:
-            found_mm = estimate.gap_mm - remembered.opened_mm
+            found_mm = gap_mm - remembered.opened_mm
             is_known = self._closed_mm - BEYOND_MM <= found_mm <= self._open_mm + BEYOND_MM
-            rested_mT = self._field.field_mT(found_mm if is_known else estimate.gap_mm)
+            rested_mT = self._field.field_mT(found_mm if is_known else gap_mm)
             remembered = self._memory.rested(rested_mT, self._sliding_N(rested_mT), now_s)
-        field_mT = self._field.field_mT(max(estimate.gap_mm, self._closed_mm - BEYOND_MM))
+        field_mT = self._field.field_mT(gap_mm)
         lag_mT = self._memory.lag_at_mT(remembered, field_mT)
         return self._memory.followed(remembered, field_mT, lag_mT, self._sliding_N(field_mT - lag_mT), now_s)
 

@@ -60,7 +60,10 @@ class Remembering:
         return Remembered(field_mT, 0.0, tuple([force_N for _ in self._fractions]), relaxed_N, now_s)
 
     def lag_at_mT(self, before: Remembered, field_mT: float) -> float:
-        """How far the element's field is behind the gap's once that is `field_mT`, on a straight way from `before`."""
+        """How far the element's field is behind the gap's once that is `field_mT`, on a straight way from `before`; 0
+        before anything is known."""
+        if before.time_s == -math.inf:
+            return 0.0
         change_mT = field_mT - before.field_mT
         if change_mT == 0.0:
             return before.lag_mT
