@@ -20,7 +20,7 @@ from setuptools.command.build_ext import build_ext
 COMPILED = {
     "firmware_protocol": ("value", "schema", "checksum", "layouts", "wire", "codec", "framing"),
     "tormagd/physics": ("friction", "relaxation"),
-    "tormagd/model": ("displacement", "force_curve", "memory"),
+    "tormagd/model": ("displacement", "force_curve", "relaxing"),
     "tormagd/inverse": ("solution", "newton"),
     "tormagd/hardware": ("frame_stream", "link", "link_quality", "link_statistics", "measurement", "connection"),
     "tormagd/safety": ("operating_state",),
@@ -39,6 +39,7 @@ COMPILED = {
             "interpolation",
             "portrait",
             "contact",
+            "remembered",
         ),
         *("periodicity", "governor", "handle", "plan", "motor", "step", "conditions"),
     ),

@@ -29,6 +29,7 @@ from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
+from tormagd.control.plan import NOTHING_SHOWN, Shown
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.model_file import load_model
 from tormagd.model.shipped import model_path
@@ -217,8 +218,11 @@ def cases(draws: int) -> Iterator[Case]:
 # -- running --------------------------------------------------------------------------------------------------------
 
 
-def armed(config: Config, plant: PlantParameters, legs: list[tuple[float, float]]) -> ClosedLoop:
-    """A device that was homed and enabled with the handle at rest; the hand begins at the loop's time then."""
+def armed(
+    config: Config, plant: PlantParameters, legs: list[tuple[float, float]], shown: Shown = NOTHING_SHOWN
+) -> ClosedLoop:
+    """A device that was homed and enabled with the handle at rest; the hand begins at the loop's time then. The device
+    counts as having `shown` so much of itself."""
     core = build_core(config)
     start: list[Hand] = []
 
@@ -227,6 +231,7 @@ def armed(config: Config, plant: PlantParameters, legs: list[tuple[float, float]
             return start[0].position_mm(time_s) if start else 0.0
 
     loop = ClosedLoop(config, core.stepper, core.planner, VirtualDevice(plant, Waiting(), seed=1))
+    loop.plan_state = core.planner.start(loop.now_s).replaced(shown=shown)
     loop.arm()
     start.append(moved(legs, loop.now_s))
     return loop

@@ -32,11 +32,13 @@ from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
+from tormagd.control.plan import NOTHING_SHOWN, Shown
 from tormagd.design.brake import Brake
 from tormagd.design.phase_portrait import PhasePortrait
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import TORMAG
 from tormagd.physics.inserts import insert
+from tormagd.scenes.scene import load_scene, terms_of
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
@@ -77,6 +79,7 @@ class Track(NamedTuple):
     limits: dict[str, float]
     trim: float
     lag_s: float
+    shown: Shown
 
     def since(self, start_s: float) -> Tracking:
         """The figures from a time on."""
@@ -84,11 +87,22 @@ class Track(NamedTuple):
         return tracking(self.asked_N[inside], self.rendered_N[inside])
 
 
-def track(plant: PlantParameters, signal: Signal, scene: str, preview_s: float) -> Track:
-    """Plays a signal behind an approach; time counts from its first force. Raises RuntimeError for a fault."""
-    config = Config(scene=scene)
-    core = build_core(config)
+def track(
+    plant: PlantParameters,
+    signal: Signal,
+    scene: str,
+    preview_s: float,
+    *,
+    is_learning: bool = True,
+    shown: Shown = NOTHING_SHOWN,
+) -> Track:
+    """Plays a signal behind an approach; time counts from its first force. The device counts as having `shown` so much
+    of itself, and goes on doing so where `is_learning`. Raises RuntimeError for a fault."""
+    config, stated = Config(scene=scene), load_scene(scene)
+    terms = msgspec.structs.replace(terms_of(stated), learning=is_learning)
+    core = build_core(config, msgspec.structs.replace(stated, terms=terms))
     loop = ClosedLoop(config, core.stepper, core.planner, VirtualDevice(plant, SteadyHand(), seed=1))
+    loop.plan_state = core.planner.start(loop.now_s).replaced(shown=shown)
     loop.arm()
     even_s = 1.0 / RATE_HZ
     approach_s, approach_N = with_approach(
@@ -117,7 +131,7 @@ def track(plant: PlantParameters, signal: Signal, scene: str, preview_s: float) 
     if not signal.is_known_ahead:  # what comes as an event holds until the next
         asked = signal.force_N[np.searchsorted(signal.time_s, axis, side="right") - 1]
     shares = {str(limit): count / len(axis) for limit, count in sorted(held.items())}
-    return Track(axis, asked, rendered, shares, sample.trim, loop.plan_state.lag_s)
+    return Track(axis, asked, rendered, shares, sample.trim, loop.plan_state.lag_s, loop.plan_state.shown)
 
 
 def publisher(

@@ -13,12 +13,13 @@ from pathlib import Path
 from tqdm import tqdm
 
 from tormagd.model.features import Element
+from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, save_model
 from tormagd.physics.errors import DomainError
 from tormagd.training.dataset import Dataset, DatasetError, read_csv
 from tormagd.training.fitting import fit_model
 from tormagd.training.levenberg_marquardt import Epoch, Training
-from tormagd.training.unremembered import Memory, identify
+from tormagd.training.unremembered import identify
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -47,7 +48,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Training]:
     """Train on `data` and return the model with its metrics, and how it went. Raises DomainError."""
-    data_sha256 = data.sha256()
+    data_sha256, memory = data.sha256(), NO_MEMORY
     if options.without_memory:
         memory, data = identify(data)
         print(memory_line(memory), file=sys.stderr)
@@ -65,6 +66,7 @@ def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Trainin
             insert=options.insert,
             data_sha256=data_sha256,
             created=options.created or datetime.date.today(),
+            memory=memory,
             hidden=options.hidden,
             epochs=options.epochs,
             seed=options.seed,
@@ -78,7 +80,7 @@ def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Trainin
 
 def memory_line(memory: Memory) -> str:
     """What was identified, for a person."""
-    terms = zip(memory.series.fractions, memory.series.times_s, strict=True)
+    terms = zip(memory.fractions, memory.times_s, strict=True)
     relaxing = ", ".join(f"{fraction:.1%} in {time_s:.0f} s" for fraction, time_s in terms)
     return f"taken out: relaxation of {relaxing}; a field {memory.lag_mT:.1f} mT behind"
 

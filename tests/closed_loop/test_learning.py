@@ -1,12 +1,15 @@
 """What a device shows of itself is learned while a step arrives, and noise alone moves nothing (synthetic)."""
 
+import msgspec
 import numpy as np
 import pytest
 
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
 from tormagd.control.core import Core, build_core
+from tormagd.control.device_fit import UNSEEN
 from tormagd.control.governor import TimedSetpoint
+from tormagd.scenes.scene import Terms, load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
@@ -63,3 +66,22 @@ def test_a_device_that_was_known_before_is_right_at_once(core: Core) -> None:
     forces_N = [abs(each.truth.force_N) for each in render(again, 2.0, 2.5)]
     assert max(forces_N) < 2.0 + 0.06
     assert np.mean(forces_N[1_200:1_300]) == pytest.approx(2.0, abs=0.04)
+
+
+def test_the_model_alone_renders_the_forces_of_the_device_that_it_was_trained_on() -> None:
+    """It knows what the elastomer has relaxed and how its field lags; nothing is learned."""
+    config, scene = Config(scene="pulse"), load_scene("pulse")
+    alone = build_core(config, msgspec.structs.replace(scene, terms=Terms(learning=False)))
+    loop = ClosedLoop(config, alone.stepper, alone.planner, VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1))
+    loop.arm()
+    begins_s = loop.now_s
+    render(loop, 1.55, 2.0)
+    errors_N = [
+        each.truth.force_N - (1.55 + 0.1 * np.sin(7.0 * (each.truth.time_s - begins_s)))
+        for each in loop.run(
+            6.0, lambda now_s: TimedSetpoint(1.55 + 0.1 * np.sin(7.0 * (now_s - begins_s)), now_s, VALID_S)
+        )
+    ]
+    assert np.sqrt(np.mean(np.square(errors_N))) < 0.02
+    assert loop.plan_state is not None
+    assert loop.plan_state.device == UNSEEN

@@ -1,13 +1,18 @@
 """What the control tests share: one core, and a device that is described instead of simulated."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
+import msgspec
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.config import Config
 from tormagd.control.core import Core, build_core
 from tormagd.hardware.measurement import Measurement
+from tormagd.model.memory import NO_MEMORY
+from tormagd.model.model_file import ForceModel, load_model
 
 MeasurementMaker = Callable[..., Measurement]
 
@@ -17,10 +22,38 @@ def config() -> Config:
     return Config()
 
 
+LOADED = "tormagd.control.core.load_model"
+
+
+def load_forgetful(path: Path, **meant: str) -> ForceModel:
+    """A model that remembers nothing: with it a gap and a force say the same at any time. What is remembered has tests
+    of its own."""
+    model = load_model(path, **meant)
+    return replace(model, metadata=msgspec.structs.replace(model.metadata, memory=NO_MEMORY))
+
+
+@pytest.fixture
+def forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cores are built with such a model."""
+    monkeypatch.setattr(LOADED, load_forgetful)
+
+
 @pytest.fixture(scope="session")
-def core(config: Config) -> Core:
-    """The core of the shipped coronary scene; nothing in it changes."""
-    return build_core(config)
+def make_core(config: Config) -> Callable[[], Core]:
+    """Makes cores of the shipped coronary scene, with such a model."""
+
+    def make() -> Core:
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(LOADED, load_forgetful)
+            return build_core(config)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def core(make_core: Callable[[], Core]) -> Core:
+    """Such a core, in which nothing changes."""
+    return make_core()
 
 
 @pytest.fixture(scope="session")

@@ -102,3 +102,12 @@ def test_no_history_makes_it_impossible(history: list[tuple[float, float, float]
         assert 0.0 <= fit.offset_variance_N2 <= OFFSET_SD_N**2 * (1.0 + 1e-9)
         # a covariance matrix: no combination of both has a negative variance
         assert fit.covariance_N**2 <= fit.scale_variance * fit.offset_variance_N2 * (1.0 + 1e-6) + 1e-15
+
+
+@pytest.mark.parametrize("relaxed_N", [0.0, 0.1, 0.25])
+def test_over_the_force_without_memory_it_says_the_same(relaxed_N: float) -> None:
+    fit = DeviceFit(0.9, -0.05, 0.01, -0.004, 0.006)
+    over = fit.relaxed(relaxed_N)
+    for model_N in (0.5, 1.0, 2.0):
+        assert over.force_N(model_N) == pytest.approx(fit.force_N(model_N - relaxed_N))
+        assert over.deviation_N(model_N) == pytest.approx(fit.deviation_N(model_N - relaxed_N))

@@ -1,6 +1,7 @@
 """`plan`: from setpoint to gap with the shipped model, and a trim that learns the model's error only where it can."""
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
+from tormagd.control.core import Core
 from tormagd.control.device_fit import DeviceFit
 from tormagd.control.estimate import Estimate, Handle
 from tormagd.control.governor import TimedSetpoint
@@ -274,8 +275,8 @@ class WrongSolver:
 
 
 @pytest.mark.parametrize("wrong_mT", [1.0, 780.0])
-def test_the_force_law_stands_around_the_search(wrong_mT: float) -> None:
-    core = build_core(CONFIG)
+def test_the_force_law_stands_around_the_search(make_core: Callable[[], Core], wrong_mT: float) -> None:
+    core = make_core()
     right = planned(core, 1.0, moving()).plan
     core.planner._search = WrongSolver(wrong_mT)
     wrong = planned(core, 1.0, moving()).plan

@@ -1,4 +1,4 @@
-"""Friction at a creep: more is learned at once, less only as far as static friction differs, and nothing at speed."""
+"""Friction at a creep: learned as far as static friction differs and the fit is uncertain, and nothing at speed."""
 
 import math
 
@@ -6,16 +6,29 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tormagd.control.slow_friction import LEAST, MOST, NOTHING_SLOW, REACH_MM, STRIBECK_MM_S, SlowFriction
+from tormagd.control.device_fit import UNSEEN, DeviceFit
+from tormagd.control.slow_friction import (
+    LEAST,
+    LEAST_SHARE,
+    MOST,
+    NOTHING_SLOW,
+    REACH_MM,
+    STATIC_LEAST,
+    STATIC_MOST,
+    STRIBECK_MM_S,
+    SlowFriction,
+)
 
 PERIOD_S = 0.003
+KNOWN = DeviceFit(scale_variance=0.0, offset_variance_N2=0.0)
+"A device of which everything is known."
 
 
-def crept(share: float, seconds: float, rate_mm_s: float = 1.0, start: SlowFriction = NOTHING_SLOW) -> SlowFriction:
-    """After readings of `share` times what was expected at that rate."""
-    slow = start
+def crept(share: float, seconds: float, rate_mm_s: float = 1.0, fit: DeviceFit = UNSEEN) -> SlowFriction:
+    """After readings of `share` times what was expected at that rate of a fit that makes the model's force."""
+    slow = SlowFriction(followed_N=1.5)
     for _ in range(round(seconds / PERIOD_S)):
-        slow = slow.observed(1.5, rate_mm_s, 1.5 * share, PERIOD_S)
+        slow = slow.observed(fit, rate_mm_s, 1.5 * share, PERIOD_S)
     return slow
 
 
@@ -30,10 +43,22 @@ def test_it_is_learned_within_the_time_that_a_person_takes_to_notice() -> None:
     assert crept(1.2, 0.5).factor_at(1.0) > 1.12
 
 
-def test_a_reading_that_is_too_low_closes_the_gap_by_a_tenth_at_most() -> None:
-    """Nothing judges the sensor at a creep."""
-    assert crept(0.5, 10.0).factor == LEAST
-    assert crept(5.0, 10.0).factor == MOST
+def test_of_a_known_device_a_creep_shows_its_static_friction_and_no_more() -> None:
+    """Nothing judges the sensor at a creep: one that reads too little closes the gap by a tenth at most."""
+    assert crept(0.6, 10.0, fit=KNOWN).factor == STATIC_LEAST
+    assert crept(5.0, 10.0, fit=KNOWN).factor == STATIC_MOST
+
+
+def test_of_a_device_that_was_never_seen_a_creep_shows_nearly_all() -> None:
+    assert crept(0.75, 10.0).factor_at(1.0) == pytest.approx(0.75, abs=0.01)
+    assert crept(1.35, 10.0).factor_at(1.0) == pytest.approx(1.35, abs=0.01)
+    assert crept(0.55, 10.0).factor == LEAST
+    assert crept(5.0, 10.0).factor <= MOST
+
+
+def test_a_sensor_that_reads_less_than_any_device_makes_teaches_nothing() -> None:
+    assert crept(0.0, 10.0) == SlowFriction(followed_N=1.5)
+    assert crept(0.9 * LEAST_SHARE, 10.0) == SlowFriction(followed_N=1.5)
 
 
 def test_friction_follows_a_rise_over_travel_and_a_fall_at_once() -> None:
@@ -52,7 +77,7 @@ def test_beside_a_fit_that_learned_the_force_at_a_creep_stays() -> None:
     assert slow.beside(1.0, 1.05).factor * 1.05 == pytest.approx(slow.factor, rel=1e-4)
     assert slow.beside(1.0, 1.0) is slow
     assert slow.beside(1.0, -0.1) is slow
-    assert crept(1.0, 9.0).beside(1.0, 0.5).factor == MOST
+    assert crept(1.0, 9.0).beside(1.0, 0.5).factor == MOST  # of twice the force
     # of a creep that was never seen nothing is known but what the fit says
     assert NOTHING_SLOW.beside(1.0, 0.8) == NOTHING_SLOW
 
@@ -67,10 +92,10 @@ def test_beside_a_fit_that_learned_the_force_at_a_creep_stays() -> None:
     ),
 )
 def test_nothing_leaves_its_bounds(start: float, events: list[tuple[float, float, float, float, float]]) -> None:
-    slow = SlowFriction(start)
+    slow, fit = SlowFriction(start), DeviceFit(0.9, 0.05)
     for expected_N, rate_mm_s, reading_N, elapsed_s, handle_mm in events:
-        slow = slow.followed(expected_N, handle_mm).observed(expected_N, rate_mm_s, reading_N, elapsed_s)
+        slow = slow.followed(expected_N, handle_mm).observed(fit, rate_mm_s, reading_N, elapsed_s)
         slow = slow.beside(expected_N, abs(reading_N))
         assert LEAST <= slow.factor <= MOST
         assert 0.0 <= slow.followed_N <= 5.0
-        assert 0.85 <= slow.factor_at(rate_mm_s) <= MOST
+        assert LEAST <= slow.factor_at(rate_mm_s) <= MOST

@@ -20,6 +20,8 @@ from tormagd.safety.codes import Limit
 from tormagd.safety.operating_state import Conditions
 from tormagd.scenes.scene import EVERY_TERM, TERMS, Terms, load_scene
 
+pytestmark = pytest.mark.usefixtures("forgetful")
+
 CONFIG = Config()
 PERIOD_S = 0.004
 READY = Conditions(

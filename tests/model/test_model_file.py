@@ -4,6 +4,7 @@ import datetime
 import json
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from safetensors import safe_open
 
 from tormagd.model import model_file
 from tormagd.model.features import FEATURES, LARGEST, UNITS, Element
+from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelFileError, ModelMetadata, load_model, save_model
 from tormagd.model.rising import not_rising_share
 from tormagd.physics.errors import DomainError
@@ -121,6 +123,11 @@ def test_a_flipped_bit_anywhere_is_refused(saved: Path) -> None:
             "output_gain",
         ),
         ("metrics", {"r2": "good"}, "metrics"),
+        ("memory", {"fractions": [0.5], "times_s": []}, r"memory\.times_s"),
+        ("memory", {"fractions": [0.5, 0.6], "times_s": [1.0, 2.0]}, r"memory\.fractions"),
+        ("memory", {"fractions": [0.1, 0.1], "times_s": [2.0, 1.0]}, r"memory\.times_s"),
+        ("memory", {"lag_mT": 5.0, "turn_mT": 19.0}, r"memory\.lag_mT"),
+        ("memory", {"lag_mT": -1.0}, r"memory\.lag_mT"),
         ("colour", "red", "colour"),
     ],
 )
@@ -128,6 +135,17 @@ def test_a_signed_file_with_another_meaning_is_refused(saved: Path, field: str, 
     rewritten(saved, lambda header: header["__metadata__"].update({field: json.dumps(value)}))
     with pytest.raises(ModelFileError, match=message):
         load_model(saved, element="torque")
+
+
+def test_a_file_without_a_memory_is_of_an_element_that_remembers_nothing(saved: Path, tmp_path: Path) -> None:
+    rewritten(saved, lambda header: header["__metadata__"].pop("memory"))
+    without = load_model(saved, element="torque")
+    assert without.metadata.memory == NO_MEMORY
+    memory = Memory(fractions=(0.05, 0.04), times_s=(8.0, 90.0), lag_mT=7.5, turn_mT=75.0)
+    with_memory = replace(without, metadata=msgspec.structs.replace(without.metadata, memory=memory))
+    save_model(tmp_path / "with.safetensors", with_memory)
+    assert load_model(tmp_path / "with.safetensors", element="torque").metadata.memory == memory
+    assert with_memory.fingerprint != without.fingerprint
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from tormagd.control.plan import NOTHING_SHOWN, Outside, Plan, PlanState
 from tormagd.control.step import StepState
 from tormagd.exact import InexactError, first_difference, kinds, packed, plain, restored
 from tormagd.model.displacement import Turn
-from tormagd.model.memory import Memory
+from tormagd.model.relaxing import Relaxed
 from tormagd.replay.rerun import KNOWN
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import SafetyState
@@ -42,7 +42,7 @@ def through_msgpack(thing: object) -> Any:
 
 
 def test_what_a_pad_remembers_comes_back() -> None:
-    state = PlanState(GovernorState(1.0, 2.0), PLAN, memory=Memory(1.0, (3.5, 0.25), (0.5, 0.125), 0.0625))
+    state = PlanState(GovernorState(1.0, 2.0), PLAN, relaxed=Relaxed(1.0, (3.5, 0.25), (0.5, 0.125), 0.0625))
     assert through_msgpack(state) == state
 
 

@@ -8,6 +8,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import load_model
 from tormagd.training.dataset import Dataset, write_csv
 
@@ -65,6 +66,17 @@ def test_the_same_command_gives_the_same_bytes(tool: ModuleType, data: Path, tmp
         assert tool.main(command(data, file, "--epochs", "5", "--seed", seed)) == 0
     assert files[0].read_bytes() == files[1].read_bytes()
     assert files[0].read_bytes() != files[2].read_bytes()
+
+
+def test_what_was_taken_out_of_the_data_is_in_the_file(
+    tool: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = Memory(fractions=(0.05,), times_s=(8.0,), lag_mT=7.0, turn_mT=70.0)
+    monkeypatch.setattr(tool, "identify", lambda rows: (memory, rows))
+    for name, more, expected in (("with", ["--without-memory"], memory), ("plain", [], NO_MEMORY)):
+        out = tmp_path / f"{name}.safetensors"
+        assert tool.main(command(data, out, "--epochs", "2", *more)) == 0
+        assert load_model(out, element="torque").metadata.memory == expected
 
 
 def test_a_table_for_people(tool: ModuleType, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

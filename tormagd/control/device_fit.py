@@ -75,18 +75,6 @@ class DeviceFit(Value):
         variance = model_N * (model_N * self.scale_variance + 2.0 * self.covariance_N) + self.offset_variance_N2
         return math.sqrt(max(variance, 0.0))
 
-    def relaxed(self, lost_N: float) -> "DeviceFit":
-        """The fit of the device while `lost_N` of the model's force have relaxed away."""
-        if lost_N == 0.0:
-            return self
-        return DeviceFit(
-            self.scale,
-            self.offset_N - self.scale * lost_N,
-            self.scale_variance,
-            self.covariance_N,
-            self.offset_variance_N2,
-        )
-
     def times(self, factor: float) -> "DeviceFit":
         """The fit of a device that gives `factor` > 0 times the force."""
         if factor == 1.0:
@@ -98,6 +86,19 @@ class DeviceFit(Value):
             square * self.scale_variance,
             square * self.covariance_N,
             square * self.offset_variance_N2,
+        )
+
+    def relaxed(self, relaxed_N: float) -> "DeviceFit":
+        """The fit over the model's force without memory, of a device whose force it is without `relaxed_N` of that."""
+        if relaxed_N == 0.0:
+            return self
+        by_scale_N = relaxed_N * self.scale_variance
+        return DeviceFit(
+            self.scale,
+            self.offset_N - relaxed_N * self.scale,
+            self.scale_variance,
+            self.covariance_N - by_scale_N,
+            self.offset_variance_N2 + relaxed_N * (by_scale_N - 2.0 * self.covariance_N),
         )
 
     def surely_within_N(self, most_N: float) -> float:

@@ -13,6 +13,7 @@ from tormagd.control.estimate import Estimate
 from tormagd.control.governor import PATH_S, Governed, Governor, GovernorState, TimedSetpoint
 from tormagd.control.handle import UNHEARD, HandleWatch
 from tormagd.control.portrait import FieldOfGap, LawOfField, Portrait
+from tormagd.control.remembered import NOTHING_REMEMBERED, Remembered, Remembering
 from tormagd.control.sensor import UNJUDGED, Sensor, judge
 from tormagd.control.sensor_zero import TARED, UNKNOWN_SD_N, SensorZero
 from tormagd.control.sight import unsensed_s
@@ -21,8 +22,8 @@ from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
 from tormagd.model.displacement import MOVING_MM_S
 from tormagd.model.features import FEATURES
 from tormagd.model.force_curve import ForceCurve
-from tormagd.model.memory import NOTHING_REMEMBERED, Memory
 from tormagd.model.model_file import ForceModel
+from tormagd.model.relaxing import NOTHING_RELAXED, Relaxed
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Scene, terms_of
 
@@ -35,7 +36,8 @@ LESSON_S: Final = 0.003
 LONGEST_LESSON_S: Final = 0.02
 "One reading teaches for the time since the last, no more often than that, however often is planned, and no longer."
 CREEPING_MM_S: Final = 1.2 * MOVING_MM_S
-"A handle that has slid no faster for some travel creeps; one that has slid faster only comes to rest."
+COMES_TO_REST: Final = 3.0
+"A handle that has slid no faster for some travel creeps; one that has slid so many times faster only comes to rest."
 LEAST_EXPECTED_N: Final = 0.1
 "Of less force no share is told."
 UNTARED_N: Final = 0.15
@@ -171,10 +173,10 @@ NOTHING_SHOWN: Final = Shown()
 
 @final
 class PlanState(Value):
-    """What planning remembers. `lag_s` is how late the device's carriages are, `memory` what its elastomer has
-    relaxed."""
+    """What planning remembers, and what the element does. `lag_s` is how late the device's carriages are, `relaxed`
+    what a pad's elastomer has relaxed."""
 
-    __match_args__ = ("governor", "plan", "shown", "lag_s", "handle", "memory")
+    __match_args__ = ("governor", "plan", "shown", "lag_s", "handle", "remembered", "relaxed")
     __slots__ = __match_args__
 
     def __init__(
@@ -184,19 +186,21 @@ class PlanState(Value):
         shown: Shown = NOTHING_SHOWN,
         lag_s: float = 0.0,
         handle: HandleWatch = UNHEARD,
-        memory: Memory = NOTHING_REMEMBERED,
+        remembered: Remembered = NOTHING_REMEMBERED,
+        relaxed: Relaxed = NOTHING_RELAXED,
     ) -> None:
         self.governor: Final = governor
         self.plan: Final = plan
         self.shown: Final = shown
         self.lag_s: Final = lag_s
         self.handle: Final = handle
-        self.memory: Final = memory
+        self.remembered: Final = remembered
+        self.relaxed: Final = relaxed
 
     @property
     def device(self) -> DeviceFit:
         """The device as far as it has shown itself, and as its elastomer is relaxed now."""
-        return self.shown.device.relaxed(self.memory.lost_N)
+        return self.shown.device.relaxed(self.relaxed.lost_N)
 
     @property
     def sensor(self) -> Sensor:
@@ -234,6 +238,7 @@ class Planner:
         terms = terms_of(scene)
         self._governor = Governor(portrait, scene.force, position.gap_speed_mm_s, terms)
         self._cip_percent = cip_percent
+        self._memory = Remembering(model.metadata.memory)
         self._closed_mm, self._open_mm = scene.insert.gap_closed_mm, scene.insert.gap_open_mm
         self._ceiling_N = CEILING * scene.force.most_N
         displacements_mm, rates_mm_s, fields_mT, _ = model.feature_ranges
@@ -258,33 +263,35 @@ class Planner:
         least = self.portrait.least_N
         field_mT = self._field.field_mT(open_mm)
         resting = Plan(0, now_s, None, None, least, None, field_mT, open_mm, 0.0, 1.0, (Limit.NO_SETPOINT,))
-        memory = NOTHING_REMEMBERED if self._relaxing is None else self._relaxing.rested(now_s)
-        return PlanState(GovernorState(now_s, least, above_N=0.0), resting, memory=memory)
+        relaxed = NOTHING_RELAXED if self._relaxing is None else self._relaxing.rested(now_s)
+        return PlanState(GovernorState(now_s, least, above_N=0.0), resting, relaxed=relaxed)
 
     def afresh(self, state: PlanState, now_s: float) -> PlanState:
         """Begins anew after `state`, for which no plan could be made: plans go on being numbered, and the elastomer has
         not forgotten."""
         begun = self.start(now_s)
-        return begun.replaced(plan=begun.plan.replaced(number=state.plan.number + 1), memory=state.memory)
+        return begun.replaced(plan=begun.plan.replaced(number=state.plan.number + 1), relaxed=state.relaxed)
 
     def plan(
         self, state: PlanState, now_s: float, setpoint: TimedSetpoint | None, estimate: Estimate | None
     ) -> PlanState:
         """The next plan. `estimate` is None while the device has said nothing: nothing is learned of it then."""
-        memory = self._remember(state.memory, now_s, estimate)
-        model_N = self._model_N(estimate)
+        relaxed = self._relax(state.relaxed, now_s, estimate)
+        remembered = self._remember(state.remembered, now_s, estimate)
+        model_N = self._model_N(estimate, remembered)
         if model_N is not None:
-            model_N -= memory.lost_N
-        shown = self._learn(state.shown, now_s, estimate, model_N)
+            model_N -= relaxed.lost_N
+        shown = self._learn(state.shown, now_s, estimate, model_N, remembered.relaxed_N)
         handle = state.handle
         if estimate is not None and model_N is not None:
             handle = handle.heard(estimate.sensed_s, estimate.handle_mm, estimate.force_N, model_N)
-        device = shown.device.relaxed(memory.lost_N)
+        # from here on over the model's force without memory, which searches and portrait know
+        device = shown.device.relaxed(remembered.relaxed_N + relaxed.lost_N)
         if self._has_creep:
             sliding_mm_s = MOVING_MM_S if estimate is None else estimate.handle.sliding_mm_s
             device = device.times(shown.slow.factor_at(sliding_mm_s))
         governor, governed = self._governor.govern(state.governor, now_s, setpoint, device, state.lag_s)
-        lag_s = self._learn_lag(state, now_s, estimate, governed, device)
+        lag_s = self._learn_lag(state, now_s, estimate, remembered, governed, device)
         is_meant = setpoint is not None and Limit.STALE not in governed.limits
         curve = self._only_curve
         displacement_mm, rate_mm_s = curve.displacement_mm, curve.rate_mm_s
@@ -295,8 +302,9 @@ class Planner:
             known_mm_s = _within(rate_mm_s, self._rates_mm_s)
             curve = self._model.curve(known_mm, known_mm_s, self._cip_percent)
         wanted_N = device.model_N(governed.path_N[0])
-        solution = self._search.solve(curve, wanted_N, state.plan.field_mT)
-        field_mT = self._lawful_mT(solution, wanted_N)
+        solution = self._search.solve(curve, wanted_N, state.plan.field_mT - state.remembered.lag_mT)
+        lawful_mT = self._lawful_mT(solution, wanted_N)
+        field_mT = lawful_mT + self._memory.lag_at_mT(remembered, lawful_mT + remembered.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
         wanted_mm = min(max(self._field.gap_mm(field_mT), self._closed_mm), self._open_mm)
         least_mm = self.portrait.gap_mm_at(device.surely_within_N(self._ceiling_N))
@@ -306,8 +314,8 @@ class Planner:
             outside = (Outside(FEATURES[0], displacement_mm, known_mm),)
         if known_mm_s != rate_mm_s:
             outside = (*outside, Outside(FEATURES[1], rate_mm_s, known_mm_s))
-        if field_mT != solution.field_mT:
-            outside = (*outside, Outside(FEATURES[2], solution.field_mT, field_mT))
+        if lawful_mT != solution.field_mT:
+            outside = (*outside, Outside(FEATURES[2], solution.field_mT, lawful_mT))
         limits = (*governed.limits, *shown.limits)
         if handle.is_lost:
             limits = (*limits, Limit.HANDLE_LOST)
@@ -341,7 +349,7 @@ class Planner:
             outside=outside,
             sensor_doubted_s=shown.sensor.doubted_s,
         )
-        return PlanState(governor, plan, shown, lag_s, handle, memory)
+        return PlanState(governor, plan, shown, lag_s, handle, remembered, relaxed)
 
     def foresee(self, state: PlanState) -> PlanState:
         """What can be prepared for the next plans once one is made: to be called after each, when nothing waits."""
@@ -350,11 +358,12 @@ class Planner:
             return state
         return state.replaced(governor=governor)
 
-    def _model_N(self, estimate: Estimate | None) -> float | None:
-        """What the model says of the force of now, without memory, at the measured gap; None without a gap."""
+    def _model_N(self, estimate: Estimate | None, remembered: Remembered) -> float | None:
+        """What the model says of the force of now, at the measured gap; None without a gap."""
         if estimate is None or not estimate.is_homed:
             return None
-        return self._present_curve(estimate).force_N(self._present_mT(estimate))
+        element_mT = _within(remembered.field_mT - remembered.lag_mT, self._fields_mT)
+        return self._present_curve(estimate).force_N(element_mT) - remembered.relaxed_N
 
     def _present_curve(self, estimate: Estimate) -> ForceCurve:
         if not self._has_rate:
@@ -364,22 +373,44 @@ class Planner:
             _within(displacement_mm, self._displacements_mm), _within(rate_mm_s, self._rates_mm_s), self._cip_percent
         )
 
-    def _present_mT(self, estimate: Estimate) -> float:
-        gap_mm = max(estimate.gap_mm, self._closed_mm - BEYOND_MM)
-        return _within(self._field.field_mT(gap_mm), self._fields_mT)
-
-    def _remember(self, memory: Memory, now_s: float, estimate: Estimate | None) -> Memory:
-        """What the elastomer has relaxed by now, from what it was put to since. Until the gap is known it counts as
-        open, where homing leads to."""
+    def _relax(self, relaxed: Relaxed, now_s: float, estimate: Estimate | None) -> Relaxed:
+        """What the pad has relaxed by now, from what it was put to since. Until the gap is known it counts as open,
+        where homing leads to."""
         relaxing = self._relaxing
         if relaxing is None or estimate is None:
-            return memory
+            return relaxed
         curve = self._present_curve(estimate)
-        field_mT = self._present_mT(estimate) if estimate.is_homed else self._field.field_mT(self._open_mm)
+        gap_mm = max(estimate.gap_mm, self._closed_mm - BEYOND_MM) if estimate.is_homed else self._open_mm
+        field_mT = self._field.field_mT(gap_mm)
         free_N = curve.force_N(0.0)
-        return relaxing.advance(memory, now_s, free_N, curve.force_N(field_mT) - free_N)
+        return relaxing.advance(relaxed, now_s, free_N, curve.force_N(_within(field_mT, self._fields_mT)) - free_N)
 
-    def _learn(self, shown: Shown, now_s: float, estimate: Estimate | None, model_N: float | None) -> Shown:
+    def _remember(self, remembered: Remembered, now_s: float, estimate: Estimate | None) -> Remembered:
+        """The element's memory after the measured gap. It rested long where the device was switched on."""
+        if estimate is None:
+            return remembered
+        is_new = remembered.time_s == -math.inf
+        if not estimate.is_homed:
+            # until both switches are found, positions count from where the carriages were, as if they were open
+            opened_mm = max(estimate.gap_mm - self._open_mm, remembered.opened_mm)
+            return Remembered(opened_mm=opened_mm) if is_new else remembered
+        gap_mm = max(estimate.gap_mm, self._closed_mm - BEYOND_MM)
+        if is_new:
+            found_mm = gap_mm - remembered.opened_mm
+            is_known = self._closed_mm - BEYOND_MM <= found_mm <= self._open_mm + BEYOND_MM
+            rested_mT = self._field.field_mT(found_mm if is_known else gap_mm)
+            remembered = self._memory.rested(rested_mT, self._sliding_N(rested_mT), now_s)
+        field_mT = self._field.field_mT(gap_mm)
+        lag_mT = self._memory.lag_at_mT(remembered, field_mT)
+        return self._memory.followed(remembered, field_mT, lag_mT, self._sliding_N(field_mT - lag_mT), now_s)
+
+    def _sliding_N(self, field_mT: float) -> float:
+        """The model's force of a handle at the roller's speed."""
+        return self._only_curve.force_N(_within(field_mT, self._fields_mT))
+
+    def _learn(
+        self, shown: Shown, now_s: float, estimate: Estimate | None, model_N: float | None, relaxed_N: float
+    ) -> Shown:
         """From the force at the *measured* gap: the model's error is learned, not the tracking error, so it cannot
         fight the position loop. A sensor that is not believed teaches nothing, and what it has taught is forgotten."""
         if estimate is None or model_N is None or estimate.number == shown.read or now_s - shown.read_s < LESSON_S:
@@ -401,15 +432,25 @@ class Planner:
             elif (
                 self._learns_creep
                 and SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S
-                and estimate.handle.sliding_mm_s < CREEPING_MM_S
+                and estimate.handle.sliding_mm_s < min(CREEPING_MM_S, COMES_TO_REST * rate_mm_s)
             ):
                 expected_N = shown.device.force_N(slow.followed_N)
                 # before it is mobilised friction is less than the model's; more is more all the same
                 is_lesson = is_zero_known and (is_mobilised or reading_N > expected_N)
                 if expected_N > LEAST_EXPECTED_N and is_lesson:
-                    slow = slow.observed(expected_N, rate_mm_s, reading_N, elapsed_s)
+                    slow = slow.observed(shown.device, rate_mm_s, reading_N, elapsed_s)
             return Shown(shown.device, shown.sensor, estimate.number, now_s, shown.limits, slow, zero)
-        sensor = judge(shown.sensor, shown.device, model_N, rate_mm_s, reading_N, elapsed_s, direction, zero_sd_N)
+        # the sensor is judged by all that an elastomer may do, whatever this one is thought to remember
+        sensor = judge(
+            shown.sensor,
+            shown.device.relaxed(relaxed_N),
+            model_N + relaxed_N,
+            rate_mm_s,
+            reading_N,
+            elapsed_s,
+            direction,
+            zero_sd_N,
+        )
         if sensor.is_doubted and not shown.sensor.is_doubted:
             zero = zero.doubted()
         zero = zero.heard(
@@ -458,12 +499,20 @@ class Planner:
         return min(max(solution.field_mT, (1.0 - LAW_SHARE) * law_mT), (1.0 + LAW_SHARE) * law_mT)
 
     def _learn_lag(
-        self, state: PlanState, now_s: float, estimate: Estimate | None, governed: Governed, device: DeviceFit
+        self,
+        state: PlanState,
+        now_s: float,
+        estimate: Estimate | None,
+        remembered: Remembered,
+        governed: Governed,
+        device: DeviceFit,
     ) -> float:
         """How far the gap is behind over how fast it moves: a motor weaker than it is believed to be comes late."""
         if not self._has_lag or estimate is None or not estimate.is_homed or governed.foresight < LEAST_FORESIGHT:
             return state.lag_s
-        behind_mm = self.portrait.gap_mm_at(device.model_N(governed.force_N)) - estimate.gap_mm
+        # the gap that would do the same without the field's lag
+        gap_mm = self._field.gap_mm(remembered.field_mT - remembered.lag_mT)
+        behind_mm = self.portrait.gap_mm_at(device.model_N(governed.force_N)) - gap_mm
         if abs(behind_mm) > MOST_LAG_S * self._fastest_mm_s:
             return state.lag_s  # on its way after a jump
         travel_mm_s = estimate.left_mm_s + estimate.right_mm_s

@@ -1,15 +1,16 @@
 """What friction does at a creep, beside what the device has shown at speed: static friction differs from device to
 device, and a fit that was learned at other forces may be wrong at this one.
 
-Learned while the handle slides slowly, and believed there only: slow motion says nothing of what holds at speed. More
-force than expected is learned freely, because that opens the gap; less only as far as static friction differs, because
-nothing judges the sensor at a creep.
+Learned while the handle slides slowly, and believed there only: slow motion says nothing of what holds at speed. It is
+learned as far as static friction differs from device to device, and the fit is uncertain: of a device that was never
+seen at speed a creep shows nearly all, of one that is known it shows its static friction and no more.
 """
 
 import math
 from typing import Final, final
 
 from firmware_protocol.value import Value
+from tormagd.control.device_fit import LEAST_SCALE, MOST_SCALE, RELAXES_MOST, SURE, DeviceFit
 
 STRIBECK_MM_S: Final = 5.0
 "Handles of this speed have left most of static friction behind (plant card)."
@@ -18,10 +19,16 @@ SLOWEST_MM_S: Final = 0.3
 REACH_MM: Final = 0.35
 "Over this travel friction follows a field that rises: 2.5 N bend the bristles so far before they slide."
 LEARNED_S: Final = 0.3
-LEAST: Final = 0.9
-MOST: Final = 1.45
-"""Static over kinetic friction is 1.08 to 1.25, and 1.15 on the device of the model. A fit from 0.7 N may be wrong by a
-fifth at 2 N besides."""
+STATIC_LEAST: Final = 0.9
+STATIC_MOST: Final = 1.15
+"""Static over kinetic friction is 1.08 to 1.25, and 1.15 on the device of the model; and the speeds at which it fades
+differ."""
+LEAST: Final = LEAST_SCALE * STATIC_LEAST
+MOST: Final = MOST_SCALE * STATIC_MOST
+"Of any device."
+LEAST_SHARE: Final = LEAST_SCALE * (1.0 - RELAXES_MOST)
+NOISE_N: Final = 0.03
+"A sensor that reads less than this share of the model's force, and its noise, teaches nothing: no device is so weak."
 
 
 @final
@@ -59,13 +66,22 @@ class SlowFriction(Value):
         factor = min(max(self.factor * math.pow(before_N / after_N, self.learned), LEAST), MOST)
         return SlowFriction(factor, self.learned, self.followed_N, self.handle_mm)
 
-    def observed(self, expected_N: float, rate_mm_s: float, reading_N: float, elapsed_s: float) -> "SlowFriction":
-        """After a reading along a motion at `rate_mm_s`, where the fit makes `expected_N` > 0 of what was followed."""
+    def observed(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, elapsed_s: float) -> "SlowFriction":
+        """After a reading along a motion at `rate_mm_s`, where the fit makes more than nothing of what was followed."""
+        if reading_N < LEAST_SHARE * self.followed_N - NOISE_N:
+            return self
         slowness = _slowness(rate_mm_s)
         share = slowness * elapsed_s / (LEARNED_S + elapsed_s)
-        found = self.factor + share * (1.0 + (reading_N / expected_N - 1.0) / slowness - self.factor)
+        found = self.factor + share * (1.0 + (reading_N / fit.force_N(self.followed_N) - 1.0) / slowness - self.factor)
         learned = self.learned + share * (1.0 - self.learned)
-        return SlowFriction(min(max(found, LEAST), MOST), learned, self.followed_N, self.handle_mm)
+        least, most = believable(fit, self.followed_N)
+        return SlowFriction(min(max(found, least), most), learned, self.followed_N, self.handle_mm)
+
+
+def believable(fit: DeviceFit, model_N: float) -> tuple[float, float]:
+    """The least and the greatest factor of a device with that fit, where the model says `model_N`."""
+    unsure = SURE * fit.deviation_N(model_N) / fit.force_N(model_N)
+    return max(STATIC_LEAST - unsure, LEAST), min(STATIC_MOST + unsure, MOST)
 
 
 def _slowness(rate_mm_s: float) -> float:

@@ -1,51 +1,43 @@
-"""What an elastomer remembers, for a model that knows how it relaxes: the daemon's side of the relaxation-aware model.
+"""What an element remembers, as a model file carries it: its elastomer relaxes, and its field lags behind the gap's.
 
-The network gives F0, the force without memory. What of it is there without field and what the field adds relax each by
-fractions of their own (`tormagd.physics.relaxation`). A field that changes now changes F0 alone, so the memory is a
-shift, the same for every field: the force is F0 less what has relaxed away, and any search finds the field for F0.
+    F = D(B - h) - sum g_i q_i        q_i: D(B - h) behind a low-pass of time constant tau_i
+
+D is the force without memory, which the network knows; h follows the field's changes towards +-h_max.
 """
 
-from typing import Final, final
+from itertools import pairwise
 
-from firmware_protocol.value import Value
-from tormagd.physics.relaxation import PronySeries, PronyState
+import msgspec
 
+from tormagd.physics.errors import DomainError, require
 
-@final
-class Memory(Value):
-    """The branches of both parts as of `time_s`, N, and what has relaxed away of the force by then, N."""
-
-    __match_args__ = ("time_s", "free", "added", "lost_N")
-    __slots__ = __match_args__
-
-    def __init__(self, time_s: float, free: PronyState, added: PronyState, lost_N: float = 0.0) -> None:
-        self.time_s: Final = time_s
-        self.free: Final = free
-        self.added: Final = added
-        self.lost_N: Final = lost_N
+MOST_TERMS = 8
+LONGEST_S = 1e5
 
 
-@final
-class Relaxing:
-    """How one elastomer relaxes: the force it has without field, and what the field adds."""
+class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The fractions g_i and times tau_i of relaxation, the shortest first, and the field's lag h: at most `lag_mT`,
+    which is reached over changes of `turn_mT`. Without any of them an element remembers nothing. Raises `DomainError`.
+    """
 
-    __slots__ = ("_added", "_free")
+    fractions: tuple[float, ...] = ()
+    times_s: tuple[float, ...] = ()
+    lag_mT: float = 0.0
+    turn_mT: float = 1.0
 
-    def __init__(self, free: PronySeries, added: PronySeries) -> None:
-        self._free: Final = free
-        self._added: Final = added
+    def __post_init__(self) -> None:
+        if len(self.times_s) != len(self.fractions) or len(self.fractions) > MOST_TERMS:
+            raise DomainError("memory.times_s", self.times_s, f"one for each fraction, at most {MOST_TERMS}")
+        for fraction in self.fractions:
+            require("memory.fractions", fraction, 0.0, 1.0)
+        if not sum(self.fractions, 0.0) < 1.0:
+            raise DomainError("memory.fractions", self.fractions, "a sum below 1")
+        for time_s in self.times_s:
+            require("memory.times_s", time_s, 1e-3, LONGEST_S)
+        if any(before >= after for before, after in pairwise(self.times_s)):
+            raise DomainError("memory.times_s", self.times_s, "rising times")
+            require("memory.lag_mT", self.lag_mT, 0.0, 1e4)
+        require("memory.turn_mT", self.turn_mT, 4.0 * self.lag_mT, 1e5)
 
-    def rested(self, time_s: float) -> Memory:
-        """Of an elastomer that has rested for long without load."""
-        return Memory(time_s, self._free.relaxed(0.0), self._added.relaxed(0.0))
 
-    def advance(self, memory: Memory, now_s: float, free_N: float, added_N: float) -> Memory:
-        """At `now_s`, when F0 is `free_N` without field and the field adds `added_N`; both went there evenly."""
-        dt_s = max(now_s - memory.time_s, 0.0)
-        relaxed_N, free = self._free.discretise(dt_s).advance(memory.free, free_N)
-        field_N, added = self._added.discretise(dt_s).advance(memory.added, added_N)
-        return Memory(now_s, free, added, free_N + added_N - relaxed_N - field_N)
-
-
-NOTHING_REMEMBERED: Final = Memory(0.0, (), ())
-"Of a model that knows of no relaxation."
+NO_MEMORY = Memory()

@@ -34,7 +34,8 @@ from tormagd.model.features import (
     require_number,
 )
 from tormagd.model.force_curve import ForceCurve, Known, Network
-from tormagd.model.memory import Relaxing
+from tormagd.model.memory import NO_MEMORY, Memory
+from tormagd.model.relaxing import Relaxing
 from tormagd.physics.errors import DomainError
 from tormagd.physics.relaxation import PronySeries
 
@@ -74,8 +75,8 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     `insert` names the insert the data were measured on; `ranges` holds the least and the greatest value seen in
     training for each feature and for `force_N`; `metrics` whatever the trainer measured; `created` is given, never
-    read from a clock; `relaxation` is there where the network's force is one without memory. Raises `DomainError` on
-    anything that could not be saved and loaded again.
+    read from a clock; `memory` is what a brake's network leaves out, `relaxation` what a pad's does. Raises
+    `DomainError` on anything that could not be saved and loaded again.
     """
 
     element: Element
@@ -89,6 +90,7 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     features: tuple[str, ...] = FEATURES
     units: dict[str, str] = msgspec.field(default_factory=lambda: dict(UNITS))
     relaxation: Relaxation | msgspec.UnsetType = msgspec.UNSET
+    memory: Memory = NO_MEMORY
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\x21-\x7e]{1,64}", self.insert):
@@ -115,6 +117,9 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             raise DomainError("scaling", scaling, f"finite numbers within +-{LARGEST:g}")
         if not scaling.output_gain > 0:
             raise DomainError("scaling.output_gain", scaling.output_gain, "above 0")
+        if not self.memory.lag_mT <= 0.25 * self.memory.turn_mT:
+            # otherwise a gap that follows the lag might run after itself
+            raise DomainError("memory.lag_mT", self.memory.lag_mT, "at most a quarter of memory.turn_mT")
         for name, value in self.metrics.items():
             if not math.isfinite(value):
                 raise DomainError(f"metrics.{name}", value, "a finite number")

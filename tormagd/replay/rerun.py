@@ -17,6 +17,7 @@ from tormagd.control.periodicity import Guess, Periodicity, Skill
 from tormagd.control.pid import PidState
 from tormagd.control.plan import Outside, Plan, PlanState, Shown
 from tormagd.control.plausible import Leap
+from tormagd.control.remembered import Remembered
 from tormagd.control.sensor import Past, Sensor
 from tormagd.control.sensor_zero import Level, SensorZero
 from tormagd.control.sight import Sight
@@ -30,7 +31,7 @@ from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.messages import TickRecord
 from tormagd.model.displacement import Turn
-from tormagd.model.memory import Memory
+from tormagd.model.relaxing import Relaxed
 from tormagd.recording.black_box import is_tick
 from tormagd.replay.rebuild import ReplayError
 from tormagd.safety.codes import Fault, Limit
@@ -55,12 +56,13 @@ KNOWN = kinds(
         Estimate,
         Handle,
         Turn,
-        Memory,
+        Relaxed,
         Reference,
         Expected,
     ),
     *(PidState, Sight, Leap, Homing, PlanState, GovernorState, Periodicity, Skill, Guess, Plan, Outside, Shown),
-    *(DeviceFit, Sensor, Past, SlowFriction, SensorZero, Level, HandleWatch, Conditions, DeviceMode, Switches),
+    *(DeviceFit, Sensor, Past, SlowFriction, SensorZero, Level, HandleWatch, Remembered),
+    *(Conditions, DeviceMode, Switches),
 )
 "All that the core's states consist of."
 UNTAKEN = (TypeError, AttributeError, ValueError, ArithmeticError, LookupError, RuntimeError, RecursionError)

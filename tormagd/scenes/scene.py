@@ -101,7 +101,8 @@ class Terms(Strict, frozen=True):
                 one table, that of a handle at the thesis's 42 mm/s, and there is no search
     `creep`     what friction does beside that of sliding at a creep, Stribeck's and static, is learned
     `scale`     the device's force over the model's is learned: friction, modulus, field
-    `offset`    the device's offset is learned: what the elastomer relaxes, and what the field's hysteresis holds back
+    `offset`    the device's offset is learned: what the elastomer relaxes, and what the field's hysteresis holds back,
+                beyond what its model expects
     `slope`     setpoints are carried along their slope to now and ahead
     `forecast`  a force that repeats itself is foreseen
     `preview`   what a publisher says will follow is used

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import msgspec
 
 from tormagd.model.features import Element, Scaling
+from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelMetadata
 from tormagd.model.rising import not_rising_share
 from tormagd.training.dataset import Dataset
@@ -22,12 +23,14 @@ def fit_model(
     insert: str,
     data_sha256: str,
     created: datetime.date,
+    memory: Memory = NO_MEMORY,
     hidden: int = 50,
     epochs: int = 200,
     seed: int = 0,
     progress: Callable[[Epoch], None] | None = None,
 ) -> tuple[ForceModel, Training]:
-    """Train on `training`, stop by `validation`, and return the model with its metrics on both, and how it went.
+    """Train on `training`, stop by `validation`, and return the model with its metrics on both, and how it went. What
+    was taken out of the data before is their `memory`.
 
     Deterministic for given data and seed. Raises `DomainError` on a name or a count that a model file may not have.
     """
@@ -42,6 +45,7 @@ def fit_model(
         training_data_sha256=data_sha256,
         metrics={},
         created=created,
+        memory=memory,
     )
     result = train(network, training, validation, epochs=epochs, progress=progress)
     model = to_model(network, metadata)

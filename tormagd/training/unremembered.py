@@ -9,14 +9,12 @@ D is the force of the field at rest, a smooth curve; S = 1 + s exp(-(v / v_s)^2)
 h follows the field's changes towards +-h_max. A record begins after a long rest at its first row's field.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from tormagd.model.features import FEATURES, FIELD
-from tormagd.physics.relaxation import PronySeries
+from tormagd.model.memory import Memory
 from tormagd.training.dataset import Dataset
 from tormagd.training.memory import records, times_of
 
@@ -36,14 +34,6 @@ ROBUST_N = 0.05
 "Errors beyond this count less: rows near a reversal of the field."
 
 
-class Memory(NamedTuple):
-    """Relaxation, and the field's lag: at most `lag_mT`, reached over changes of `turn_mT`."""
-
-    series: PronySeries
-    lag_mT: float
-    turn_mT: float
-
-
 def identify(data: Dataset) -> tuple[Memory, Dataset]:
     """The memory in the records of `data`, and the same rows with the forces that they would have had without it.
 
@@ -58,8 +48,11 @@ def identify(data: Dataset) -> tuple[Memory, Dataset]:
     def split(parameters: Array) -> tuple[Array, Array, Memory]:
         shape, friction = parameters[: DEGREE + 1], parameters[DEGREE + 1 : DEGREE + 4]
         fractions, times, lag = parameters[-2 * terms - 2 : -terms - 2], parameters[-terms - 2 : -2], parameters[-2:]
-        series = PronySeries(tuple(fractions.tolist()), tuple(np.exp(times).tolist()))
-        return shape, friction, Memory(series, greatest_mT * float(lag[0]), greatest_mT * float(lag[1]))
+        lag_mT, turn_mT = (greatest_mT * lag).tolist()
+        memory = Memory(
+            fractions=tuple(fractions.tolist()), times_s=tuple(np.exp(times).tolist()), lag_mT=lag_mT, turn_mT=turn_mT
+        )
+        return shape, friction, memory
 
     def level_N(shape: Array, field_mT: Array) -> Array:
         level: Array = np.exp(np.polynomial.polynomial.polyval(np.log(field_mT) - middle, shape))
@@ -71,7 +64,7 @@ def identify(data: Dataset) -> tuple[Memory, Dataset]:
         lagging_mT = field_mT - _lag_mT(memory, field_mT, rows)
         free_N = level_N(shape, field_mT)
         lagging_N = level_N(shape, lagging_mT)
-        return free_N, lagging_N - _relaxed_away_N(memory.series, lagging_N, rows)
+        return free_N, lagging_N - _relaxed_away_N(memory, lagging_N, rows)
 
     def residual(parameters: Array) -> Array:
         shape, (static, speed_mm_s, viscous), memory = split(parameters)
@@ -110,13 +103,13 @@ def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:
     return lag_mT
 
 
-def _relaxed_away_N(series: PronySeries, driving_N: Array, rows: Dataset) -> Array:
+def _relaxed_away_N(memory: Memory, driving_N: Array, rows: Dataset) -> Array:
     """What the elastomer has relaxed of `driving_N` (n) since the rest before each record."""
     times, away_N = times_of(rows), np.zeros_like(driving_N)
-    fractions = np.array(series.fractions)
+    fractions = np.array(memory.fractions)
     for record in records(rows):
         steps_s = np.diff(times[record], prepend=times[record.start])
-        decays = np.exp(-steps_s[:, np.newaxis] / np.array(series.times_s))
+        decays = np.exp(-steps_s[:, np.newaxis] / np.array(memory.times_s))
         driving = driving_N[record]
         mean_N = (driving + np.concatenate((driving[:1], driving[:-1]))) / 2.0
         slow_N, found = np.full(len(fractions), driving[0]), np.empty_like(driving)

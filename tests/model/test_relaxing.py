@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from tormagd.model.memory import Relaxing
 from tormagd.model.model_file import ModelFileError, Relaxation, load_model, save_model
+from tormagd.model.relaxing import Relaxing
 from tormagd.model.shipped import model_path
 from tormagd.physics.errors import DomainError
 from tormagd.physics.relaxation import PronySeries
