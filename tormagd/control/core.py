@@ -4,6 +4,7 @@ The daemon, the virtual-time simulation and the tests build it here, so that all
 """
 
 import hashlib
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from tormagd.control.plan import CEILING, Planner
 from tormagd.control.portrait import FieldOfGap, Portrait, PortraitSearch, law_beside, portrait
 from tormagd.control.renderable import Missed, missed
 from tormagd.control.step import Stepper
-from tormagd.inverse.choice import Choice, build, choose, named, solver_table
+from tormagd.inverse.choice import Choice, build, named
 from tormagd.model.model_file import ForceModel, ModelFileError, load_model
 from tormagd.model.rising import falling_at
 from tormagd.model.shipped import model_path
@@ -37,9 +38,11 @@ SENSED_N = 0.001
 "A step of the force sensor's message."
 SETTLES_MM = 4.0 * 8.0 / 4480.0
 "To within four counts of the encoders the gap comes to rest, wherever in its stroke: friction holds it there."
-LOOKED_AT_S, LOOKED_AT_HZ = 30.0, 100
-"So much of a scene's signal is held against the device's speed."
-IN_PORTRAIT = Choice("portrait", 0.0, 0, "float64", "the scene requires no rate: force over gap is one table")
+LOOKED_AT_S, LOOKED_AT_HZ, LOOKS = 30.0, 100, 20
+"So much of a scene's signal is held against the device's speed, as often as this, and so often in a period."
+IN_PORTRAIT = Choice("portrait", 0.0, 0, "the scene requires no rate: force over gap is one table")
+BY_NEWTON = named("newton", reason="of the searches the cheapest, and the most exact")
+"At every tolerance and for every size of network: docs/inverse_trade.md, and docs/scenes.md on the device."
 
 
 class Core(NamedTuple):
@@ -100,7 +103,7 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
     try:
         fields_mT = _known_fields_mT(scene, model, field)
         reach = portrait(model, field, cip_percent, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
-        choice = choose_solver(scene, model.metadata.hidden)
+        choice = choose_solver(scene)
         search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, rises=True)
     except DomainError as error:
         raise ConfigError(f"scene {scene.name}: {error}") from error
@@ -216,7 +219,9 @@ def _refuse_too_fast(config: Config, scene: Scene, reach: Portrait, beside: Path
         return None
     force, speed_mm_s = scene.force, config.position.gap_speed_mm_s
     range_N = max(force.least_N, reach.least_N), force.most_N
-    times_s, forces_N = asked(scene.signal, beside, range_N, LOOKED_AT_S, LOOKED_AT_HZ)
+    bandwidth_hz = 0.0 if scene.signal.bandwidth_hz is UNSET else scene.signal.bandwidth_hz
+    rate_hz = max(LOOKED_AT_HZ, math.ceil(LOOKS * bandwidth_hz))
+    times_s, forces_N = asked(scene.signal, beside, range_N, LOOKED_AT_S, rate_hz)
     miss = missed(reach, times_s.tolist(), forces_N.tolist(), speed_mm_s)
     if miss.rms_N > force.tolerance_rms_N:
         worst = ", ".join(
@@ -248,12 +253,10 @@ def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
         )
 
 
-def choose_solver(scene: Scene, hidden: int) -> Choice:
-    """The search that `scene` names; else the portrait where the rate is no term, or what the scene's tolerance picks
-    from the measured table. Raises DomainError."""
+def choose_solver(scene: Scene) -> Choice:
+    """The search that `scene` names; else the portrait where the rate is no term, or Newton's method. Raises
+    DomainError."""
     wanted = scene.solver
     if wanted.name == AUTO:
-        if not terms_of(scene).rate:
-            return IN_PORTRAIT
-        return choose(solver_table(), scene.force.tolerance_rms_N, hidden)
+        return BY_NEWTON if terms_of(scene).rate else IN_PORTRAIT
     return named(wanted.name, wanted.step_mT or None, wanted.neighbours or None)
