@@ -15,6 +15,7 @@ from tormagd.headroom.machine_loop import machine_us
 
 MEASUREMENTS = {
     "inverse": "speed against accuracy of the searches for the field",
+    "scenes": "what each scene costs with all terms and with those it requires",
     "loop": "lateness of the control loop beside a bare timer",
     "latency": "from a setpoint to the first drive frame that reflects it",
     "fast": "control at 2 and 4 kHz on fast serial lines",

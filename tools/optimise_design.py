@@ -16,7 +16,8 @@ import numpy as np
 from thesis_values import USE_CASES
 from tqdm import tqdm
 
-from tormagd.design.optimisation import Design, Outcome, Problem, Run
+from tormagd.config import Position
+from tormagd.design.optimisation import Design, Outcome, Problem, Run, coverage_as_made
 from tormagd.design.phase_portrait import Region
 from tormagd.design.recorded_task import read_task
 from tormagd.design.sweep import sweep
@@ -32,7 +33,10 @@ def main() -> int:
     task.add_argument("--region", type=float, nargs=4, metavar=names, help="required forces, N, and rates, N/s")
     parser.add_argument("--measure", choices=("true", "trapezoid", "corners"), default="true")
     parser.add_argument("--solver", choices=("global", "local"), default="global")
-    parser.add_argument("--gap-speed", type=float, default=40.0, help="mm/s")
+    parser.add_argument(
+        "--gap-speed", type=float, default=Position().gap_speed_mm_s, help="mm/s (what the controller was measured at)"
+    )
+    parser.add_argument("--off", type=float, default=1.0, help="how far off a dimension may be made, percent (1)")
     parser.add_argument("--starts", type=int, default=5, help="random starts of a region")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--points", type=Path, help="CSV t_s,force_N: how much of this task the best design renders")
@@ -53,7 +57,11 @@ def main() -> int:
         print(f"optimise_design: {error}", file=sys.stderr)
         return 2
     ranked = sorted(outcomes.items(), key=lambda item: _merit(options.measure, item[1]))
-    result: dict[str, object] = {"outcomes": [msgspec.to_builtins(outcome) for _, outcome in ranked]}
+    made = [coverage_as_made(run.problem, outcome.design, 0.01 * options.off) for run, outcome in ranked]
+    outcomes_made = zip(ranked, made, strict=True)
+    result: dict[str, object] = {
+        "outcomes": [msgspec.to_builtins(each) | {"coverage_as_made": least} for (_, each), least in outcomes_made]
+    }
     if recorded is not None:
         run, outcome = ranked[0]
         cloud = run.problem.portrait(outcome.design).true_cloud(recorded.force_N, recorded.rate_N_s)
@@ -65,11 +73,12 @@ def main() -> int:
     if options.json:
         print(json.dumps(result))
         return 0
-    print("  R_o mm    t mm  s_max mm  coverage  elastomer cm3  corner cost")
-    for _, outcome in ranked:
+    print(f"  R_o mm    t mm  s_max mm  coverage  +-{options.off:g}%  elastomer cm3  corner cost")
+    for (_, outcome), least in zip(ranked, made, strict=True):
         design = outcome.design
         print(
             f"{design.outer_radius_mm:8.2f}{design.thickness_mm:8.2f}{design.open_mm:10.1f}{outcome.coverage:10.2%}"
+            f"{least:8.2%}"
             f"{1e-3 * outcome.volume_mm3:15.2f}{outcome.corner_cost:13.4g}"
         )
     if recorded is not None:

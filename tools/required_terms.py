@@ -2,12 +2,14 @@
 
     required_terms.py [SCENE ...] [--quick] [--costs] [--json] [--store] [--dask ADDRESS]
 
-Sample 1 chooses: a term whose absence adds more than SHARE of the scene's tolerance to the RMS error of the force, with
-the device learned beforehand and frozen or while it is learned, is in. All others are left out together, and what that
-does is judged on samples 1 (frozen, too), 2 and 3: it stays within JUDGED of the tolerance, or adds no more than SHARE
-of it; otherwise the term that counts most is put back. A scene that the full model does not meet decides nothing. Costs
-are of this machine. Finished runs are kept, by what they depend on, in build/required_terms.json. `--store` puts every
-scene, as it is done, into the file that comes with the package. All devices are synthetic.
+First the rates: the lowest at which all terms do what they do at the fastest. At these, sample 1 chooses: a term whose
+absence adds more than SHARE of the scene's tolerance to the RMS error of the force, with the device learned beforehand
+and frozen or while it is learned, is in. All others are left out together. What rates and terms do is judged on samples
+1 (frozen, too), 2 and 3: it stays within JUDGED of the tolerance, or adds no more than SHARE of it; otherwise the rates
+are none, and the term that counts most is put back. A scene that the full model does not meet decides nothing. With the
+choice every search is tried. Costs are of this machine. Finished runs are kept, by what they depend on, in
+build/required_terms.json. `--store` puts every scene, as it is done, into the file that comes with the package. All
+devices are synthetic.
 """
 
 import argparse
@@ -25,18 +27,34 @@ from tqdm import tqdm
 from tormagd.config import ConfigError
 from tormagd.headroom.__main__ import build
 from tormagd.headroom.machine_loop import machine_us
+from tormagd.inverse.choice import RUNTIME_SOLVERS
 from tormagd.output import write_line
-from tormagd.scenes.measured import FILE, JUDGED, AtRates, Judged, Measured, MeasuredScene, Without, measured, required
-from tormagd.scenes.scene import TERMS, load_scene, shipped_scenes
+from tormagd.scenes.measured import (
+    FILE,
+    JUDGED,
+    AtRates,
+    Cost,
+    Judged,
+    Measured,
+    MeasuredScene,
+    Without,
+    WithSearch,
+    is_met,
+    measured,
+    on_first,
+    required,
+)
+from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_scene, shipped_scenes
 
 SHARE = 0.2
 KEPT = ROOT / "build" / "required_terms.json"
 STORED = ROOT / "tormagd" / "scenes" / FILE
 SECONDS, QUICK_S = 5.0, 2.0
-FROM_HZ = 1_000, 500
-"Rates at which terms are chosen: of control, and of setpoints and plans."
-RATES_HZ = ((250, 250), (500, 500), (500, 83), (1_000, 83))
-MODES = (True, False)
+RATES_HZ = (1_000, 500), (1_000, 83), (500, 500), (500, 83), (250, 250)
+"Of control, and of setpoints and plans. The full model at the first of them is what all others are held against."
+MODES = False, True
+"Frozen, and while the device is learned."
+NO_COST = Cost(0.0, 0.0)
 
 Runs = Callable[[Iterable[Case]], dict[Case, float]]
 
@@ -47,62 +65,72 @@ def measure(name: str, runs: Runs, samples: tuple[str, ...] = SAMPLES, seconds: 
     if scene.signal is None:
         raise ConfigError(f"scene {scene.name}: signal is missing: without one nothing is known of what it asks for")
     tolerance_N = scene.force.tolerance_rms_N
-    told_ahead = scene.signal.is_known_ahead
+    on = [(samples[0], False), *((plant, True) for plant in samples)]
 
-    def case(left_out: Iterable[str], is_learning: bool, plant: str = samples[0]) -> Case:
-        return Case(name, plant, tuple(sorted(left_out)), is_learning, *FROM_HZ, seconds)
+    def case(left_out: Iterable[str], hz: tuple[int, int], plant: str, is_learning: bool, search: str = "") -> Case:
+        return Case(name, plant, tuple(sorted(left_out)), search, is_learning, *hz, seconds)
 
-    # without a preview in the setpoints nothing changes where it is not used
-    tried = [term for term in TERMS if told_ahead or term != "preview"]
-    alone = runs([case(out, mode) for mode in MODES for out in [(), *((term,) for term in tried)]])
-    terms = []
-    for term in TERMS:
-        added = [alone[case((term,), mode)] - alone[case((), mode)] if term in tried else 0.0 for mode in (False, True)]
-        terms.append(Without(term, *added))
-    needed = set(required(tuple(terms), tolerance_N, SHARE))
+    def judge(left_out: Iterable[str], hz: tuple[int, int]) -> tuple[Judged, ...]:
+        full, chosen = (
+            [case(*model, plant, mode) for plant, mode in on] for model in (((), RATES_HZ[0]), (left_out, hz))
+        )
+        found = runs([*full, *chosen])
+        pairs = zip(full, chosen, strict=True)
+        return tuple(Judged(best.plant, best.is_learning, found[best], found[each]) for best, each in pairs)
+
+    rates = tuple(AtRates(*hz, judge((), hz)) for hz in RATES_HZ)
+    hz = cheapest(rates, tolerance_N)
+    terms = _alone(lambda out, mode: case(out, hz, samples[0], mode), scene.signal.is_known_ahead, runs)
+    needed = set(required(terms, tolerance_N, SHARE))
+    if not is_met(rates[0].judged, tolerance_N):
+        needed = set(TERMS)  # nothing can be told from a scene that the full model does not meet
     while True:
         left_out = tuple(term for term in TERMS if term not in needed)
-        on = [(samples[0], False), *((plant, True) for plant in samples)]
-        full, chosen = (runs([case(out, mode, plant) for plant, mode in on]) for out in ((), left_out))
-        judged = tuple(
-            Judged(plant, mode, full[case((), mode, plant)], chosen[case(left_out, mode, plant)]) for plant, mode in on
-        )
-        if all(is_good(item, tolerance_N) for item in judged):
-            if is_met(judged, tolerance_N) or not left_out:
-                break
-            needed = set(TERMS)  # nothing can be told from a scene that the full model does not meet
-            continue
+        judged = judge(left_out, hz)
+        if not left_out or all(is_good(item, tolerance_N) for item in judged):
+            break
         needed.add(max((item for item in terms if item.term in left_out), key=lambda item: item.added_N).term)
-    at_rates = [Case(name, samples[0], tuple(sorted(left_out)), True, *hz, seconds) for hz in (FROM_HZ, *RATES_HZ)]
-    found = runs(at_rates)
-    return with_costs(
-        MeasuredScene(
-            scene.name,
-            scene.fingerprint,
-            tolerance_N,
-            left_out,
-            tuple(terms),
-            judged,
-            tuple(AtRates(item.control_hz, item.inference_hz, found[item]) for item in at_rates),
-        ),
-        name,
+    searched = {search: case(left_out, hz, samples[0], True, search) for search in RUNTIME_SOLVERS}
+    found = runs(searched.values())
+    searches = tuple(WithSearch(search, found[each], NO_COST) for search, each in searched.items())
+    unpriced = MeasuredScene(
+        scene.name, scene.fingerprint, tolerance_N, *hz, left_out, terms, judged, rates, searches, NO_COST, NO_COST
     )
+    return with_costs(unpriced, name)
+
+
+def _alone(case: Callable[[Iterable[str], bool], Case], is_known_ahead: bool, runs: Runs) -> tuple[Without, ...]:
+    """Each term left out alone. Without a preview in the setpoints nothing changes where it is not used."""
+    tried = [term for term in TERMS if is_known_ahead or term != "preview"]
+    found = runs([case(out, mode) for mode in MODES for out in [(), *((term,) for term in tried)]])
+    terms = []
+    for term in TERMS:
+        frozen_N, learning_N = (
+            found[case((term,), mode)] - found[case((), mode)] if term in tried else 0.0 for mode in MODES
+        )
+        terms.append(Without(term, frozen_N, learning_N, NO_COST))
+    return tuple(terms)
+
+
+def cheapest(rates: tuple[AtRates, ...], tolerance_N: float) -> tuple[int, int]:
+    """The lowest rates that a scene may be run at and that do what the fastest do; those, where it is not met."""
+    if not is_met(rates[0].judged, tolerance_N):
+        return RATES_HZ[0]
+    good = [(at.control_hz, at.inference_hz) for at in rates if all(is_good(item, tolerance_N) for item in at.judged)]
+    return min(hz for hz in good if hz[0] >= LEAST_CONTROL_HZ)
 
 
 def with_costs(found: MeasuredScene, name: str) -> MeasuredScene:
-    """The same scene, of that name or file, with what its terms cost on this machine now."""
-    spent = costs(Case(name), [(), found.left_out, *((item.term,) for item in found.terms)])
-    full_us_s, chosen_us_s, *alone_us_s = (item.us_s(*FROM_HZ) for item in spent)
-    terms = tuple(
-        msgspec.structs.replace(item, saved_us_s=full_us_s - us_s)
-        for item, us_s in zip(found.terms, alone_us_s, strict=True)
-    )
-    return msgspec.structs.replace(found, terms=terms, cost_full_us_s=full_us_s, cost_us_s=chosen_us_s)
-
-
-def is_met(judged: Iterable[Judged], tolerance_N: float) -> bool:
-    """Whether the full model keeps to the tolerance while the device is learned."""
-    return all(item.full_N <= tolerance_N for item in judged if item.is_learning)
+    """The same scene, of that name or file, with what its choices cost on this machine now."""
+    chosen = Case(name, left_out=found.left_out)
+    others = [Case(name), chosen]
+    others += [msgspec.structs.replace(chosen, search=item.search) for item in found.searches]
+    others += [Case(name, left_out=(item.term,)) for item in found.terms]
+    full, cost, *rest = costs(Case(name), others)
+    priced = iter(rest)
+    searches = tuple(msgspec.structs.replace(item, cost=next(priced)) for item in found.searches)
+    terms = tuple(msgspec.structs.replace(item, cost=next(priced)) for item in found.terms)
+    return msgspec.structs.replace(found, terms=terms, searches=searches, full=full, chosen=cost)
 
 
 def is_good(item: Judged, tolerance_N: float) -> bool:
@@ -183,14 +211,14 @@ def table(result: Measured) -> str:
     for scene in result.scenes:
         lines += [
             f"{scene.name}: tolerance {1e3 * scene.tolerance_N:.0f} mN, {scene.cost_full_us_s:.0f} us/s full, "
-            f"{scene.cost_us_s:.0f} chosen",
+            f"{scene.cost_us_s:.0f} chosen, at {scene.control_hz} / {scene.inference_hz} Hz",
             "  term      added, frozen  learning     saved",
         ]
         for item in scene.terms:
             stays = "out" if item.term in scene.left_out else "in"
             lines.append(
                 f"  {item.term:9s} {1e3 * item.frozen_added_N:12.1f}  {1e3 * item.learning_added_N:8.1f}  "
-                f"{item.saved_us_s:8.0f}  {stays}"
+                f"{scene.saved_us_s(item):8.0f}  {stays}"
             )
         for judged in scene.judged:
             how = "learning" if judged.is_learning else "frozen"
@@ -198,7 +226,10 @@ def table(result: Measured) -> str:
                 f"  {judged.plant}, {how}: full {1e3 * judged.full_N:.1f}, chosen {1e3 * judged.chosen_N:.1f} mN"
             )
         for at in scene.rates:
-            lines.append(f"  {at.control_hz} Hz control, {at.inference_hz} Hz inference: {1e3 * at.rms_N:.1f} mN")
+            rms_mN = 1e3 * on_first(at.judged).chosen_N
+            lines.append(f"  {at.control_hz} Hz control, {at.inference_hz} Hz inference: {rms_mN:.1f} mN")
+        for named in scene.searches:
+            lines.append(f"  {named.search}: {1e3 * named.rms_N:.1f} mN, {scene.us_s(named.cost):.0f} us/s")
         lines += ["  to name its terms in a scene file:", "    [terms]"]
         lines += [f"    {term} = false" for term in scene.left_out]
     return "\n".join(lines)

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, as_completed
 from functools import cache, partial
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -26,7 +25,8 @@ from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import Planner, PlanState
 from tormagd.control.step import StepState
 from tormagd.hardware.measurement import Measurement
-from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, load_scene, scene_path, terms_of
+from tormagd.scenes.measured import Cost
+from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Solver, load_scene, scene_path, terms_of
 from tormagd.scenes.signal import asked
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, Hand, PressingHand, RecordedHand
@@ -56,26 +56,17 @@ DEPENDS_ON = (
 
 
 class Case(msgspec.Struct, frozen=True):
-    """One run. `left_out` are names of terms; setpoints come `inference_hz` times a second."""
+    """One run. `left_out` are names of terms, `search` takes the place of the scene's own where it is given; setpoints
+    come `inference_hz` times a second."""
 
     scene: str
     plant: str = "sample_1"
     left_out: tuple[str, ...] = ()
+    search: str = ""
     is_learning: bool = True
     control_hz: int = 1_000
     inference_hz: int = 500
     seconds: float = 5.0
-
-
-class Cost(NamedTuple):
-    """Processor time of a step and a plan, us: of each the least of ROUNDS, and of those the mean."""
-
-    step_us: float
-    plan_us: float
-
-    def us_s(self, control_hz: int, inference_hz: int) -> float:
-        """Of a second of control."""
-        return control_hz * self.step_us + inference_hz * self.plan_us
 
 
 def run(case: Case) -> float:
@@ -94,9 +85,10 @@ def run(case: Case) -> float:
     return float(np.sqrt(np.mean(np.where(is_least, 0.0, error_N) ** 2)))
 
 
-def costs(case: Case, without: Sequence[tuple[str, ...]]) -> list[Cost]:
-    """What steps and plans take with each of these sets of terms left out: all are given what the full model was given
-    in the loop, in rounds over all sets, so that a disturbance of the machine meets all alike."""
+def costs(case: Case, others: Sequence[Case]) -> list[Cost]:
+    """What steps and plans take in the other cases' models: all are given what the case's own was given in the loop, in
+    rounds over all of them, so that a disturbance of the machine meets all alike. Of each step and plan the least of
+    ROUNDS counts, and of those the mean."""
     played = _Play(case)
     given: list[tuple[StepState, PlanState, float, TimedSetpoint | None, Measurement | None, Estimate | None]] = []
     before = None
@@ -106,7 +98,7 @@ def costs(case: Case, without: Sequence[tuple[str, ...]]) -> list[Cost]:
             given.append((*before, now_s, played.publish(now_s), loop.measurement, loop.step_state.estimate))
         if loop.plan_state is not None:
             before = loop.step_state, loop.plan_state
-    cores = [build_core(played.config, _left_out(played.core.scene, names)) for names in without]
+    cores = [build_core(played.config, _modelled(played.core.scene, other)) for other in others]
     made: list[tuple[list[Call], list[Call]]] = []
     for core in cores:
         planner, stepper = core.planner, core.stepper
@@ -118,13 +110,15 @@ def costs(case: Case, without: Sequence[tuple[str, ...]]) -> list[Cost]:
         made.append((steps, plans))
     rounds = [[(_each_us(steps), _each_us(plans)) for steps, plans in made] for _ in range(ROUNDS)]
     return [
-        Cost(*(float(np.mean(np.min([one[index][kind] for one in rounds], axis=0))) for kind in range(2)))
-        for index in range(len(without))
+        Cost(*(round(float(np.mean(np.min([one[index][kind] for one in rounds], axis=0))), 3) for kind in range(2)))
+        for index in range(len(others))
     ]
 
 
-def _left_out(scene: Scene, names: Iterable[str]) -> Scene:
-    return msgspec.structs.replace(scene, terms=EVERY_TERM.without(*names))
+def _modelled(scene: Scene, case: Case) -> Scene:
+    """The scene with the case's terms and search."""
+    solver = Solver(name=case.search) if case.search else scene.solver
+    return msgspec.structs.replace(scene, terms=EVERY_TERM.without(*case.left_out), solver=solver)
 
 
 def _planned(
@@ -150,7 +144,7 @@ class _Play:
         self.config = config = Config(scene=case.scene, rates=rates)
         stated = load_scene(case.scene)
         free = Bandwidth(control_hz=case.control_hz, inference_hz=rates.inference_hz)
-        scene = _left_out(msgspec.structs.replace(stated, bandwidth=free), case.left_out)
+        scene = _modelled(msgspec.structs.replace(stated, bandwidth=free), case)
         self.core = build_core(config, scene)
         self._frozen = None if case.is_learning else _frozen(config, scene)
         self._loop = ClosedLoop(

@@ -97,8 +97,8 @@ def test_a_force_out_of_the_pads_reach_says_so(pad_core: Core) -> None:
 
 
 def test_where_the_force_falls_branches_are_compared() -> None:
-    assert choose_solver(SCENE, 30, rises=False) is SEVERAL_BRANCHES
-    assert choose_solver(SCENE, 30, rises=True).solver == "newton"
+    assert choose_solver(SCENE, rises=False) is SEVERAL_BRANCHES
+    assert choose_solver(SCENE, rises=True).solver == "newton"
 
 
 @pytest.mark.parametrize(

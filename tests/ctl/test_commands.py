@@ -319,7 +319,8 @@ def test_a_decision_is_explained_with_what_was_measured(tmp_path, capsys):
     assert main(["scene", "explain", "brain"]) == 0
     text = capsys.readouterr().out
     assert all(term in text for term in TERMS)
-    assert "cheapest within 0.8 of the tolerance" in text
+    assert "500 Hz      83 Hz" in text
+    assert "coarse-to-fine" in text
     assert "sample_3 learning" in text
     other = tmp_path / "other.toml"
     other.write_text(Path(scene_path("coronary")).read_text().replace("most_N = 2.0", "most_N = 1.9"))

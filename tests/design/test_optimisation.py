@@ -5,7 +5,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from tormagd.design.optimisation import SLACK, Design, Problem, Run, corner_cost, coverage, solve
+from tormagd.design.optimisation import SLACK, Design, Problem, Run, corner_cost, coverage, coverage_as_made, solve
 from tormagd.design.phase_portrait import Region
 from tormagd.physics.errors import DomainError
 
@@ -111,3 +111,19 @@ def test_starts_outside_the_bounds_are_refused(problem: Problem) -> None:
         Run(problem, Design(5.0, 20.0, 95.0), "global")
     with pytest.raises(DomainError, match=r"start\.open_mm"):
         Run(problem, Design(11.0, 20.0, math.nan), "local")
+
+
+def test_what_a_design_covers_as_it_is_made_is_the_least_of_its_neighbours(use_case_1: Region) -> None:
+    """The thesis's printed optimum of use case 1: what rounding to its printed digits does, and a percent of each."""
+    problem, printed = Problem(use_case_1, "trapezoid", THESIS_SPEED_MM_S), Design(7.3, 12.5, 197.0)
+    assert coverage_as_made(problem, printed, 0.0) == coverage(problem, printed)
+    least = coverage_as_made(problem, printed, 0.01)
+    assert least < coverage_as_made(problem, printed, 0.001) < coverage(problem, printed)
+    off = msgspec.structs.replace(printed, thickness_mm=0.99 * printed.thickness_mm)
+    assert least <= coverage(problem, off)
+
+
+def test_a_design_that_cannot_bear_its_field_as_made_covers_nothing(use_case_1: Region) -> None:
+    soft = Problem(use_case_1, "true", 38.0, shear_modulus_Pa=10e3)
+    assert soft.load_margin(Design(6.5, 12.5, 197.0)) < 0.0
+    assert coverage_as_made(soft, Design(6.5, 12.5, 197.0), 0.01) == 0.0

@@ -1,4 +1,4 @@
-"""Choosing a search: by tolerance from a table, by name, from the committed table for every shipped scene."""
+"""The search of a scene: by name, or Newton's method, which no measured scene has a reason to leave."""
 
 import subprocess
 import sys
@@ -10,67 +10,13 @@ import pytest
 from tormagd.config import Config, ConfigError
 from tormagd.control.core import build_core, choose_solver
 from tormagd.inverse.bracketed import BracketedSearch
-from tormagd.inverse.choice import RUNTIME_SOLVERS, SAME_TIME, Variant, build, choose, named, solver_table
+from tormagd.inverse.choice import RUNTIME_SOLVERS, build, named
 from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.newton import RisingSearch
 from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
+from tormagd.scenes.measured import measured
 from tormagd.scenes.scene import Solver, load_scene, scene_path, shipped_scenes, terms_of
-
-
-def variant(solver: str, p50_us: float, force_max_N: float, hidden: int = 50, step_mT: float = 20.0) -> Variant:
-    return Variant(
-        solver=solver,
-        step_mT=step_mT,
-        neighbours=4,
-        dtype="float64",
-        hidden=hidden,
-        p50_us=p50_us,
-        solver_force_max_N=force_max_N,
-    )
-
-
-TABLE = (
-    variant("nearest", 10.0, 1e-2),
-    variant("coarse-to-fine", 20.0, 1e-3),
-    variant("newton", 30.0, 1e-9),
-    variant("newton", 300.0, 1e-9, hidden=200),
-)
-
-
-@pytest.mark.parametrize(
-    ("tolerance_N", "expected"),
-    [(0.1, "nearest"), (0.099, "coarse-to-fine"), (0.01, "coarse-to-fine"), (1e-3, "newton")],
-)
-def test_the_cheapest_within_a_tenth_of_the_tolerance(tolerance_N: float, expected: str) -> None:
-    assert choose(TABLE, tolerance_N, hidden=50).solver == expected
-
-
-def test_where_none_is_accurate_enough_the_best_is_taken_and_the_reason_says_so() -> None:
-    choice = choose(TABLE, 1e-12, hidden=50)
-    assert choice.solver == "newton"
-    assert "outside" in choice.reason
-    assert "within" in choose(TABLE, 0.1, hidden=50).reason
-
-
-def test_rows_of_the_next_larger_network_count() -> None:
-    table = (*TABLE, variant("nearest", 100.0, 1e-9, hidden=100))
-    assert choose(table, 0.1, hidden=51).solver == "nearest"
-    assert choose(table, 0.1, hidden=200).solver == "newton"
-    assert choose(table, 0.1, hidden=4096).solver == "newton"
-
-
-def test_among_equally_fast_searches_the_more_accurate_is_taken() -> None:
-    table = (variant("nearest", 20.0, 1e-3), variant("newton", 20.0 * SAME_TIME, 1e-9))
-    assert choose(table, 0.1, hidden=50).solver == "newton"
-    table = (variant("nearest", 20.0, 1e-3), variant("newton", 20.1 * SAME_TIME, 1e-9))
-    assert choose(table, 0.1, hidden=50).solver == "nearest"
-
-
-def test_searches_that_the_daemon_cannot_run_are_never_chosen() -> None:
-    assert choose((*TABLE, variant("brent", 1.0, 0.0), variant("direct", 0.1, 0.0)), 0.1, 50).solver == "nearest"
-    with pytest.raises(DomainError, match="no rows"):
-        choose((variant("brent", 1.0, 0.0),), 0.1, 50)
 
 
 @pytest.mark.parametrize("name", RUNTIME_SOLVERS)
@@ -89,33 +35,33 @@ def test_a_name_that_is_none_is_refused_with_those_that_are() -> None:
         named("bisection")
 
 
-def test_the_committed_table_serves_every_size() -> None:
-    table = solver_table()
-    assert {row.solver for row in table} == set(RUNTIME_SOLVERS)
-    assert min(row.hidden for row in table) <= 10
-    assert max(row.hidden for row in table) >= 200
-    assert all(row.p50_us > 0 and row.solver_force_max_N >= 0 for row in table)
-
-
 @pytest.mark.parametrize("name", shipped_scenes())
-def test_a_shipped_scene_gets_a_search_within_its_tolerance(name: str) -> None:
-    """By the table; one that names its search gets that."""
+def test_a_scene_gets_the_search_that_it_names_or_newton_where_there_is_one(name: str) -> None:
     scene = load_scene(name)
-    choice = choose(solver_table(), scene.force.tolerance_rms_N, hidden=50)
-    assert choice.reason.startswith("the cheapest within")
     built = build_core(Config(scene=name)).solver
     if scene.solver.name != "auto":
         assert built.solver == scene.solver.name
     elif "rate" in terms_of(scene).left_out:
         assert built.solver == "portrait"  # there is nothing to search
     else:
-        assert built == choice
+        assert built.solver == "newton"
+
+
+def test_no_other_search_is_cheaper_or_more_exact_in_any_measured_scene() -> None:
+    """Why nothing picks among them: on the device, by what `tools/required_terms.py --store` measured."""
+    for scene in measured().scenes:
+        found = {item.search: item for item in scene.searches}
+        assert set(found) == set(RUNTIME_SOLVERS)
+        newton = found.pop("newton")
+        for other in found.values():
+            assert scene.us_s(newton.cost) < scene.us_s(other.cost)
+            assert newton.rms_N < other.rms_N + 0.01 * scene.tolerance_N
 
 
 def test_a_scene_may_name_its_search() -> None:
     scene = load_scene(shipped_scenes()[0])
     wanted = msgspec.structs.replace(scene, solver=Solver(name="nearest", step_mT=5.0, neighbours=2))
-    choice = choose_solver(wanted, hidden=50)
+    choice = choose_solver(wanted)
     assert (choice.solver, choice.step_mT, choice.neighbours) == ("nearest", 5.0, 2)
 
 

@@ -250,3 +250,43 @@ def test_a_model_stands_beside_its_scene(write, tmp_path: Path) -> None:
     (tmp_path / "mine.safetensors").write_bytes(b"not a model")
     with pytest.raises(ConfigError, match=r"mine\.safetensors"):
         build_core(Config(scene=write(insert__model='"mine.safetensors"')))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"force__most_N": "0.0"}, ("$.force.most_N", "> 0.0")),
+        ({"force__tolerance_rms_N": "0.0"}, ("$.force.tolerance_rms_N", "> 0.0")),
+        ({"force__resolution_N": "0.0"}, ("$.force.resolution_N", "> 0.0")),
+        ({"budget__core_share": "0.0"}, ("$.budget.core_share", "> 0.0")),
+        ({"force__most_N": "40.0"}, ("force.most_N = 40", "allowed is 0.65..")),
+        ({"force__most_N": "0.1"}, ("force.most_N = 0.1", "allowed is 0.65..")),
+        ({"signal__bandwidth_hz": "100.0"}, ("they miss it by",)),
+        ({"signal__bandwidth_hz": "101.0"}, ("$.signal.bandwidth_hz", "<= 100.0")),
+        ({"bandwidth__inference_hz": "1000"}, ("rates.inference_hz = 250: allowed is at least 1000",)),
+    ],
+)
+def test_a_scene_at_its_extreme_is_refused_with_what_is_allowed(write, changes: dict[str, str], words) -> None:
+    with pytest.raises(ConfigError) as caught:
+        build_core(Config(scene=write(**changes)))
+    assert all(word in str(caught.value) for word in words)
+
+
+def test_a_hold_of_a_day_and_a_recording_at_1_khz_are_taken(write, tmp_path: Path) -> None:
+    build_core(Config(scene=write(signal__bandwidth_hz="0.2", signal__hold_s="86400.0")))
+    rows = "".join(f"{n / 1000:.3f},{1.2 + 0.3 * (n % 2000) / 2000:.5f}\n" for n in range(2000))
+    (tmp_path / "fast.csv").write_text(f"t_s,force_N\n{rows}")
+    core = build_core(Config(scene=write(signal__file='"fast.csv"')))
+    assert core.missed is not None
+    assert core.missed.rms_N < 1e-3
+
+
+def test_a_thousand_scenes_differ_by_what_they_state(write) -> None:
+    """By their fingerprints, too, which is what a measured decision is found by."""
+    scene = load_scene(write())
+    tolerances_N = [0.01 + 1e-5 * n for n in range(1000)]
+    others = [
+        msgspec.structs.replace(scene, force=msgspec.structs.replace(scene.force, tolerance_rms_N=tolerance_N))
+        for tolerance_N in tolerances_N
+    ]
+    assert len({other.fingerprint for other in others}) == 1000

@@ -60,7 +60,7 @@ def test_no_search_is_better_than_its_network(result):
     assert min(errors) > 0.01
 
 
-def test_a_scene_gets_a_search_that_is_in_the_table(result):
+def test_a_scene_gets_a_search_that_is_measured_and_exact_enough(result):
     assert set(result["chosen"]) >= {"coronary", "pulse"}
     for chosen in result["chosen"].values():
         assert chosen["solver_force_max_N"] <= 0.1 * chosen["tolerance_rms_N"]

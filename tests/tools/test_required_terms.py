@@ -10,12 +10,12 @@ import pytest
 import required_terms
 import scene_runs
 from distributed import Client, LocalCluster
-from required_terms import FROM_HZ, JUDGED, SHARE, is_good, is_met, measure
-from scene_runs import Case, Cost, key, run, run_all
+from required_terms import JUDGED, NO_COST, RATES_HZ, SHARE, is_good, measure
+from scene_runs import Case, key, run, run_all
 
 from tormagd.config import ConfigError
-from tormagd.scenes.measured import Judged, MeasuredScene, Without, measured, required
-from tormagd.scenes.scene import TERMS, load_scene, shipped_scenes, terms_of
+from tormagd.scenes.measured import Cost, Judged, MeasuredScene, Without, is_met, measured, on_first, required
+from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_scene, shipped_scenes, terms_of
 
 STORED = measured()
 
@@ -34,22 +34,32 @@ def test_what_is_stored_follows_from_its_own_numbers(scene: MeasuredScene) -> No
     assert is_met(scene.judged, scene.tolerance_N) or not scene.left_out
     if terms_of(stated).left_out:
         assert terms_of(stated).left_out == scene.left_out
+    assert [(at.control_hz, at.inference_hz) for at in scene.rates] == list(RATES_HZ)
+    chosen = next(
+        at for at in scene.rates if (at.control_hz, at.inference_hz) == (scene.control_hz, scene.inference_hz)
+    )
+    assert scene.control_hz >= LEAST_CONTROL_HZ
+    assert all(is_good(item, scene.tolerance_N) for item in chosen.judged)
 
 
 def test_a_case_gives_what_was_stored() -> None:
     """The whole device again, for one scene with what it leaves out: the file belongs to this model and this plant."""
     brain = next(scene for scene in STORED.scenes if scene.name == "brain")
-    case = Case("brain", "sample_1", tuple(sorted(brain.left_out)), True, *FROM_HZ, STORED.seconds)
-    then_N = next(item.chosen_N for item in brain.judged if item.plant == "sample_1" and item.is_learning)
-    assert run(case) == pytest.approx(then_N, rel=0.05)
+    hz = brain.control_hz, brain.inference_hz
+    case = Case("brain", "sample_1", tuple(sorted(brain.left_out)), "", True, *hz, STORED.seconds)
+    assert run(case) == pytest.approx(on_first(brain.judged).chosen_N, rel=0.05)
 
 
 def table(added_N: dict[str, float]) -> tuple[Without, ...]:
-    return tuple(Without(term, added_N.get(term, 0.0), 0.0) for term in TERMS)
+    return tuple(Without(term, added_N.get(term, 0.0), 0.0, NO_COST) for term in TERMS)
 
 
 def test_a_term_is_required_that_costs_more_than_its_share_learning_or_not() -> None:
-    terms = (Without("rate", 0.011, 0.0), Without("creep", 0.0, 0.011), Without("pull", 0.0099, -0.5))
+    terms = (
+        Without("rate", 0.011, 0.0, NO_COST),
+        Without("creep", 0.0, 0.011, NO_COST),
+        Without("pull", 0.0099, -0.5, NO_COST),
+    )
     assert required(terms, 0.05, 0.2) == ("rate", "creep")
     assert required(terms, 0.025, 0.2) == ("rate", "creep", "pull")
 
@@ -63,7 +73,7 @@ def test_a_choice_is_good_within_the_tolerance_or_beside_the_full_model() -> Non
 
 def test_what_is_only_missed_together_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two terms that stand in for each other: either may go, and not both."""
-    monkeypatch.setattr(required_terms, "costs", lambda case, without: [Cost(1.0, 1.0)] * len(without))
+    monkeypatch.setattr(required_terms, "costs", lambda case, others: [Cost(1.0, 1.0)] * len(others))
 
     def outcomes(cases: Iterable[Case]) -> dict[Case, float]:
         return {
@@ -79,8 +89,22 @@ def test_what_is_only_missed_together_is_put_back(monkeypatch: pytest.MonkeyPatc
     assert all(item.chosen_N < 0.01 for item in found.judged)
 
 
+def test_the_lowest_rates_are_taken_that_do_what_the_fastest_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(required_terms, "costs", lambda case, others: [Cost(1.0, 1.0)] * len(others))
+
+    def outcomes(cases: Iterable[Case]) -> dict[Case, float]:
+        """Of samples 2 and 3 the second is missed at the slow plans, and 250 Hz would do best of all."""
+        return {
+            case: 0.001 * case.control_hz / 1000 + 0.1 * (case.inference_hz == 83 and case.plant == "sample_3")
+            for case in cases
+        }
+
+    found = measure("coronary", outcomes)
+    assert (found.control_hz, found.inference_hz) == (500, 500)
+
+
 def test_a_scene_that_the_full_model_does_not_meet_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(required_terms, "costs", lambda case, without: [Cost(1.0, 1.0)] * len(without))
+    monkeypatch.setattr(required_terms, "costs", lambda case, others: [Cost(1.0, 1.0)] * len(others))
     found = measure("coronary", lambda cases: dict.fromkeys(cases, 0.3))
     assert found.left_out == ()
 
@@ -126,6 +150,7 @@ def test_every_part_of_a_case_is_in_its_key() -> None:
         "scene": "bronchoscopy",
         "plant": "sample_2",
         "left_out": ("rate",),
+        "search": "nearest",
         "is_learning": False,
         "control_hz": 500,
         "inference_hz": 83,
@@ -138,7 +163,7 @@ def test_every_part_of_a_case_is_in_its_key() -> None:
 def test_dask_workers_give_what_this_process_gives(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cases and outcomes go there and back; what a case takes on its way is the same everywhere, so it is not run."""
     monkeypatch.setattr(scene_runs, "run", key)
-    cases = [Case("brain"), Case("coronary", "sample_3", ("pull", "rate"), False)]
+    cases = [Case("brain"), Case("coronary", "sample_3", ("pull", "rate"), "nearest", False)]
     with (
         LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
         Client(cluster) as client,

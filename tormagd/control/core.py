@@ -4,6 +4,7 @@ The daemon, the virtual-time simulation and the tests build it here, so that all
 """
 
 import hashlib
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from tormagd.control.plan import CEILING, Planner
 from tormagd.control.portrait import FieldOfGap, LawOfField, Portrait, PortraitSearch, law_beside, portrait
 from tormagd.control.renderable import Missed, missed
 from tormagd.control.step import Stepper
-from tormagd.inverse.choice import Choice, build, choose, named, solver_table
+from tormagd.inverse.choice import Choice, build, named
 from tormagd.model.force_curve import ForceCurve
 from tormagd.model.model_file import ForceModel, ModelFileError, load_model
 from tormagd.model.rising import falling_at
@@ -41,11 +42,13 @@ SETTLES_MM = 4.0 * 8.0 / 4480.0
 "To within four counts of the encoders the gap comes to rest, wherever in its stroke: friction holds it there."
 DEPTHS = 9
 "Between the scene's depth and the model's greatest, at which a pad's force is looked at whether it rises."
-LOOKED_AT_S, LOOKED_AT_HZ = 30.0, 100
-"So much of a scene's signal is held against the device's speed."
-SEVERAL_BRANCHES = named("nearest", neighbours=16)._replace(reason="the force falls with the field somewhere")
+LOOKED_AT_S, LOOKED_AT_HZ, LOOKS = 30.0, 100, 20
+"So much of a scene's signal is held against the device's speed, as often as this, and so often in a period."
+SEVERAL_BRANCHES = named("nearest", neighbours=16, reason="the force falls with the field somewhere")
 "With fewer neighbours answers jump between branches, more gain little: docs/tactile.md."
-IN_PORTRAIT = Choice("portrait", 0.0, 0, "float64", "the scene requires no rate: force over gap is one table")
+IN_PORTRAIT = Choice("portrait", 0.0, 0, "the scene requires no rate: force over gap is one table")
+BY_NEWTON = named("newton", reason="of the searches the cheapest, and the most exact")
+"At every tolerance and for every size of network: docs/inverse_trade.md, and docs/scenes.md on the device."
 
 
 class Core(NamedTuple):
@@ -97,7 +100,7 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
         field = part.field
         fields_mT, rises = _known_fields_mT(scene, model, part)
         reach = portrait(_curve(model, part), field, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
-        choice = choose_solver(scene, model.metadata.hidden, rises=rises)
+        choice = choose_solver(scene, rises=rises)
         search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, rises=rises)
         law = _law(scene, reach, field)
     except (DomainError, ModelFileError) as error:
@@ -259,7 +262,9 @@ def _refuse_too_fast(config: Config, scene: Scene, reach: Portrait, beside: Path
         return None
     force, speed_mm_s = scene.force, config.position.gap_speed_mm_s
     range_N = max(force.least_N, reach.least_N), force.most_N
-    times_s, forces_N = asked(scene.signal, beside, range_N, LOOKED_AT_S, LOOKED_AT_HZ)
+    bandwidth_hz = 0.0 if scene.signal.bandwidth_hz is UNSET else scene.signal.bandwidth_hz
+    rate_hz = max(LOOKED_AT_HZ, math.ceil(LOOKS * bandwidth_hz))
+    times_s, forces_N = asked(scene.signal, beside, range_N, LOOKED_AT_S, rate_hz)
     miss = missed(reach, times_s.tolist(), forces_N.tolist(), speed_mm_s)
     if miss.rms_N > force.tolerance_rms_N:
         worst = ", ".join(
@@ -291,14 +296,12 @@ def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
         )
 
 
-def choose_solver(scene: Scene, hidden: int, *, rises: bool = True) -> Choice:
+def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:
     """The search that `scene` names; else the portrait where the rate is no term, the k-nearest where the force is not
-    known to rise, or what the scene's tolerance picks from the measured table. Raises DomainError."""
+    known to rise, or Newton's method. Raises DomainError."""
     wanted = scene.solver
     if wanted.name == AUTO:
         if not terms_of(scene).rate:
             return IN_PORTRAIT
-        if not rises:
-            return SEVERAL_BRANCHES
-        return choose(solver_table(), scene.force.tolerance_rms_N, hidden)
+        return BY_NEWTON if rises else SEVERAL_BRANCHES
     return named(wanted.name, wanted.step_mT or None, wanted.neighbours or None)

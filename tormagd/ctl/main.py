@@ -129,8 +129,18 @@ def _scene(options: argparse.Namespace, configured: str) -> Outcome:
             return show_scene(name)
         case "check":
             return check_scene(name, options.config)
+        case "new":
+            return _new_scene(options)
         case _:
             return explain_scene(name, options.config)
+
+
+def _new_scene(options: argparse.Namespace) -> Outcome:
+    from tormagd.ctl.scene_new import new_scene
+
+    if options.name is None:
+        raise usage_error("scene new: the file to write is missing", "tormagctl scene new FILE.toml")
+    return new_scene(Path(options.name), options.force, options.config)
 
 
 def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
@@ -390,13 +400,15 @@ def parser() -> argparse.ArgumentParser:
     exporting = command("metrics", "what status says, for Prometheus: printed once, or served with --port")
     exporting.add_argument("--port", type=_port, metavar="N", help="of 127.0.0.1, for Prometheus to scrape")
 
-    scene = command("scene", "list the scenes, or show, check or explain one (default: the configuration's)")
+    scene = command("scene", "list the scenes, or show, check, explain or make one (default: the configuration's)")
     scene.add_argument(
         "action",
-        choices=("list", "show", "check", "explain"),
-        help="check: does the daemon take it, and what does the device give of it; explain: which terms, and why",
+        choices=("list", "show", "check", "explain", "new"),
+        help="check: does the daemon take it, and what does the device give of it; explain: which terms, and why; new: "
+        "write one, asking for what the task needs",
     )
     scene.add_argument("name", nargs="?", metavar="NAME|FILE")
+    scene.add_argument("--force", type=Path, metavar="FORCE.csv", help="new: propose a scene for this recorded force")
     keys = command("keys", "make key pairs for the daemon and its clients, or show a key's fingerprint")
     keys.add_argument("action", choices=("generate", "show"))
     keys.add_argument("path", type=Path, metavar="DIR|FILE", help="where the keys are made; whose fingerprint is shown")

@@ -9,8 +9,8 @@ import msgspec
 
 from tormagd.config import ConfigError
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
-from tormagd.scenes.measured import JUDGED, AtRates, Measured, MeasuredScene, measured, required
-from tormagd.scenes.scene import LEAST_CONTROL_HZ, Scene, load_scene, shipped_scenes
+from tormagd.scenes.measured import Measured, MeasuredScene, is_met, measured, on_first, required
+from tormagd.scenes.scene import Scene, load_scene, shipped_scenes
 
 LONGEST_S = 30.0
 "Of the daemon's own check, which takes half a second."
@@ -35,11 +35,16 @@ def show_scene(name: str) -> Outcome:
     except ConfigError as error:
         raise usage_error(str(error), "tormagctl scene list shows the shipped ones") from error
     tables = {key: value for key, value in stated.items() if value is not None}
+    return Outcome(tables, as_toml(tables))
+
+
+def as_toml(tables: dict[str, Any]) -> str:
+    """The text of a scene file with these keys and tables."""
     lines = [_line(key, value) for key, value in tables.items() if not isinstance(value, dict)]
     for title, table in tables.items():
         if isinstance(table, dict):
             lines += ["", f"[{title}]", *(_line(key, value) for key, value in table.items())]
-    return Outcome(tables, "\n".join(lines))
+    return "\n".join(lines)
 
 
 def _line(key: str, value: object) -> str:
@@ -53,7 +58,7 @@ def check_scene(name: str, config: Path | None) -> Outcome:
     derived = _derived(name, config)
     scene = _loaded(name)
     known = _known(scene)
-    share = None if known is None else known[1].cost_us_s * 1e-6
+    share = None if known is None else _core_share(known[1], derived)
     least_N, most_N = derived["least_N"], derived["most_N"]
     result = {"scene": scene.name, "core_share": share, "core_share_allowed": scene.budget.core_share} | derived
     lines = [
@@ -102,14 +107,14 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
     tolerance_N = found.tolerance_N
     needed = {factor: required(found.terms, factor * tolerance_N, file.share) for factor in TOLERANCES}
     out = set(derived["terms_out"])
-    rates = cheapest_rates(found)
     solver = derived["solver"]
     lines = [
         f"{scene.name}: {scene.description}",
         f"tolerance  {1e3 * tolerance_N:g} mN rms; a term is required that adds more than {file.share:.0%} of it",
-        f"search     {solver['solver']}, {solver['dtype']} ({solver['reason']})",
-        f"cost       {found.cost_full_us_s / 1e4:.2f}% of a processor with every term, {found.cost_us_s / 1e4:.2f}% "
-        f"with those that are required (1000 ticks, 500 plans a second, {file.build}, machine_us {file.machine_us:g})",
+        f"search     {solver['solver']} ({solver['reason']})",
+        f"cost       {found.cost_full_us_s / 1e4:.2f}% of a processor with every term at the fastest rates, "
+        f"{found.cost_us_s / 1e4:.2f}% with those that are required at {found.control_hz} / {found.inference_hz} Hz "
+        f"({file.build}, machine_us {file.machine_us:g})",
         "",
         "term       runs   required  added, frozen  added, learning      saved    at half  at twice the tolerance",
     ]
@@ -119,7 +124,7 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
         lines.append(
             f"{item.term:10s} {'out' if item.term in out else 'in':6s} {'in' if is_required else 'out':8s} "
             f"{1e3 * item.frozen_added_N:11.1f} mN {1e3 * item.learning_added_N:13.1f} mN "
-            f"{item.saved_us_s / 1e4:8.2f}% {at_half:>10s} {at_twice:>9s}"
+            f"{found.saved_us_s(item) / 1e4:8.2f}% {at_half:>10s} {at_twice:>9s}"
         )
     back = [item.term for item in found.terms if item.term not in needed[1.0] and item.term not in found.left_out]
     if back:
@@ -128,24 +133,28 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
     for judged in found.judged:
         how = "learning" if judged.is_learning else "frozen"
         lines.append(f"{judged.plant} {how:9s} {1e3 * judged.full_N:7.1f} mN {1e3 * judged.chosen_N:10.1f} mN")
-    if max(item.full_N for item in found.judged if item.is_learning) > tolerance_N:
+    if not is_met(found.judged, tolerance_N):
         lines.append("NOT MET: the full model itself is over the tolerance")
-    lines += ["", "control  inference  RMS on sample 1"]
+    lines += ["", "every term  control  inference  RMS on sample 1"]
     for at in found.rates:
-        mark = "  cheapest within 0.8 of the tolerance" if at == rates else ""
-        lines.append(f"{at.control_hz:4d} Hz  {at.inference_hz:6d} Hz  {1e3 * at.rms_N:7.1f} mN{mark}")
+        is_chosen = (at.control_hz, at.inference_hz) == (found.control_hz, found.inference_hz)
+        mark = "  chosen" if is_chosen else ""
+        rms_mN = 1e3 * on_first(at.judged).chosen_N
+        lines.append(f"            {at.control_hz:4d} Hz  {at.inference_hz:6d} Hz  {rms_mN:7.1f} mN{mark}")
+    lines += ["", "search named     RMS on sample 1    core share"]
+    for named in found.searches:
+        lines.append(f"{named.search:15s} {1e3 * named.rms_N:12.1f} mN  {found.us_s(named.cost) / 1e4:10.2f}%")
     result = msgspec.to_builtins(found) | {
         "derived": derived,
         "required": {f"{factor:g}": names for factor, names in needed.items()},
-        "cheapest_rates": None if rates is None else msgspec.to_builtins(rates),
     }
     return Outcome(result, "\n".join(lines))
 
 
-def cheapest_rates(found: MeasuredScene) -> AtRates | None:
-    """The lowest rates that keep to JUDGED of the tolerance, of those at which safety is watched often enough."""
-    good = [at for at in found.rates if at.control_hz >= LEAST_CONTROL_HZ and at.rms_N <= JUDGED * found.tolerance_N]
-    return min(good, key=lambda at: (at.control_hz, at.inference_hz), default=None)
+def _core_share(found: MeasuredScene, derived: dict[str, Any]) -> float:
+    """Of the terms and at the rates that the daemon runs; a set of terms that was not measured counts as all."""
+    cost = found.chosen if tuple(derived["terms_out"]) == found.left_out else found.full
+    return 1e-6 * cost.us_s(derived["control_hz"], derived["inference_hz"])
 
 
 def _known(scene: Scene) -> tuple[Measured, MeasuredScene] | None:

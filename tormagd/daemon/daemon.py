@@ -110,13 +110,12 @@ class Daemon:
         self._callbacks.add_reader(self._endpoint.control_fileno(), self._receive_requests)
         scene, solver = self._core.scene, self._core.solver
         log.info(
-            "running scene %s (%s), without the terms: %s; with the %s solver at %g mT, %s (%s)",
+            "running scene %s (%s), without the terms: %s; with the %s solver at %g mT (%s)",
             scene.name,
             scene.fingerprint,
             ", ".join(terms_of(scene).left_out) or "none",
             solver.solver,
             solver.step_mT,
-            solver.dtype,
             solver.reason,
         )
         heartbeat = Heartbeat(NS // self._config.rates.control_hz)

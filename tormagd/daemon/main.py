@@ -141,6 +141,8 @@ def _print_resolved(config: Config, core: "Core", options: msgspec.Struct) -> No
             "phase_margin_deg": core.margins.phase_margin_deg,
             "gain_margin_dB": core.margins.gain_margin_dB,
             "solver": core.solver._asdict(),
+            "control_hz": config.rates.control_hz,
+            "inference_hz": config.rates.inference_hz,
             "fingerprint": core.scene.fingerprint,
             "terms_out": terms_of(core.scene).left_out,
             "least_resolution_N": least_resolution_N(core.planner.portrait, core.scene.force.most_N),

@@ -12,6 +12,7 @@ generation, followed by a derivative-free local search (COBYQA).
 A constraint is told to the solvers as one: the elastomer must bear the field of the closed gap (lambda1 >= 0.05).
 """
 
+import itertools
 import math
 import time
 from collections.abc import Callable
@@ -143,6 +144,14 @@ def coverage(problem: Problem, design: Design) -> float:
     if problem.measure == "true":
         return portrait.true_coverage(problem.region)
     return portrait.trapezoid_coverage(problem.region)
+
+
+def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
+    """The least coverage where every dimension may be off by `share`, down, not at all, or up; 0 where one of these
+    designs does not bear its field."""
+    factors = itertools.product((1.0 - share, 1.0, 1.0 + share), repeat=len(Design.__struct_fields__))
+    made = [Design(*(value * factor for value, factor in zip(_tuple(design), each, strict=True))) for each in factors]
+    return min(coverage(problem, each) if problem.load_margin(each) >= 0.0 else 0.0 for each in made)
 
 
 def corner_cost(problem: Problem, design: Design) -> float:

@@ -6,14 +6,25 @@ import msgspec
 from msgspec import Struct
 
 
+class Cost(Struct, frozen=True):
+    """Processor time of a step and of a plan, us."""
+
+    step_us: float
+    plan_us: float
+
+    def us_s(self, control_hz: int, inference_hz: int) -> float:
+        """Of a second of control."""
+        return control_hz * self.step_us + inference_hz * self.plan_us
+
+
 class Without(Struct, frozen=True):
     """One term left out: the RMS error of the force that this adds on sample 1, N, after the device was learned and
-    then no more (`frozen`), and while it is learned; and the processor's time that it saves, us per s of control."""
+    then no more (`frozen`), and while it is learned; and what steps and plans cost without it."""
 
     term: str
     frozen_added_N: float
     learning_added_N: float
-    saved_us_s: float = 0.0
+    cost: Cost
 
     @property
     def added_N(self) -> float:
@@ -22,7 +33,7 @@ class Without(Struct, frozen=True):
 
 
 class Judged(Struct, frozen=True):
-    """RMS errors of the force on one sample, N: of the full model, and of the one that was chosen on sample 1."""
+    """RMS errors of the force on one sample, N: of the full model at the fastest rates, and of another choice."""
 
     plant: str
     is_learning: bool
@@ -31,25 +42,55 @@ class Judged(Struct, frozen=True):
 
 
 class AtRates(Struct, frozen=True):
-    """The chosen model's RMS error on sample 1 at other rates, N, while the device is learned."""
+    """All terms at other rates."""
 
     control_hz: int
     inference_hz: int
+    judged: tuple[Judged, ...]
+
+
+class WithSearch(Struct, frozen=True):
+    """The chosen terms and rates with a search that is named: RMS error on sample 1 while the device is learned, N."""
+
+    search: str
     rms_N: float
+    cost: Cost
 
 
 class MeasuredScene(Struct, frozen=True):
-    """One scene as it was measured. Costs are of the processor, us per s of control, steps and plans."""
+    """One scene as it was measured, and what was chosen: the rates by all terms, then the terms at these rates."""
 
     name: str
     fingerprint: str
     tolerance_N: float
+    control_hz: int
+    inference_hz: int
     left_out: tuple[str, ...]
     terms: tuple[Without, ...]
     judged: tuple[Judged, ...]
     rates: tuple[AtRates, ...]
-    cost_full_us_s: float = 0.0
-    cost_us_s: float = 0.0
+    "The first are the fastest."
+    searches: tuple[WithSearch, ...]
+    full: Cost
+    chosen: Cost
+
+    @property
+    def cost_full_us_s(self) -> float:
+        """Of the processor, for a second of control with every term at the fastest rates."""
+        return self.full.us_s(self.rates[0].control_hz, self.rates[0].inference_hz)
+
+    @property
+    def cost_us_s(self) -> float:
+        """The same with what was chosen."""
+        return self.us_s(self.chosen)
+
+    def us_s(self, cost: Cost) -> float:
+        """Of a second of control at the chosen rates."""
+        return cost.us_s(self.control_hz, self.inference_hz)
+
+    def saved_us_s(self, without: Without) -> float:
+        """What leaving one term out saves of that, all others in."""
+        return self.us_s(self.full) - self.us_s(without.cost)
 
 
 class Measured(Struct, frozen=True):
@@ -78,3 +119,13 @@ def measured() -> Measured:
 def required(terms: tuple[Without, ...], tolerance_N: float, share: float) -> tuple[str, ...]:
     """The terms of a scene whose absence adds more than `share` of a tolerance."""
     return tuple(item.term for item in terms if item.added_N > share * tolerance_N)
+
+
+def is_met(judged: tuple[Judged, ...], tolerance_N: float) -> bool:
+    """Whether the full model keeps to the tolerance while the device is learned."""
+    return all(item.full_N <= tolerance_N for item in judged if item.is_learning)
+
+
+def on_first(judged: tuple[Judged, ...]) -> Judged:
+    """The outcomes on the first sample, while it is learned."""
+    return next(item for item in judged if item.is_learning)

@@ -167,7 +167,7 @@ class Insert(Strict, frozen=True):
 
 
 class Solver(Strict, frozen=True):
-    """The field search. "auto": the cheapest that the scene's force tolerance allows, by the measured table."""
+    """The field search. "auto": none where the rate is no term, else Newton's method, the cheapest and most exact."""
 
     name: str = AUTO
     step_mT: Annotated[float, Meta(gt=0.0, le=50.0)] | UnsetType = UNSET

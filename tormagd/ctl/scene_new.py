@@ -1,0 +1,142 @@
+"""`tormagctl scene new`: a scene file from a recorded force, or from answers; an insert is found by trying them."""
+
+import math
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from tormagd.config import ConfigError
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal, usage_error
+from tormagd.ctl.scene import as_toml, check_scene
+from tormagd.scenes.scene import Scene
+from tormagd.scenes.signal import recorded
+
+INSERTS = ("MRE-10-10", "MRE-10-20", "MRE-50-40")
+"Those with a shipped model, from the softest, whose least force is the lowest."
+TOLERATED, TOLERATED_OF_MOST = 0.05, 0.02
+"Of the range, half of a tenth; and of the greatest force, where a hand tells a tenth apart, at the least."
+LEAST_CONTROL_HZ, LEAST_INFERENCE_HZ = 500, 83
+
+Tables = dict[str, Any]
+
+
+def new_scene(out: Path, force_file: Path | None, config: Path | None) -> Outcome:
+    """Writes the scene file `out`, a new one. Raises CommandError: USAGE for files and answers that cannot be
+    used, and where nobody can be asked; REFUSED where no shipped insert renders what the scene asks for."""
+    if out.exists() or not out.parent.is_dir():
+        raise usage_error(f"{out}: allowed is a new file in a folder that exists", "name another file")
+    tables = _from_answers(out.stem) if force_file is None else _from_recording(out, force_file)
+    try:
+        msgspec.convert(tables | {"insert": {"name": INSERTS[0], "model": _model(INSERTS[0])}}, Scene)
+    except msgspec.ValidationError as error:
+        raise usage_error(f"no scene can be made of this: {error}", "docs/scenes.md says what each key asks") from error
+    refused = {}
+    for insert in INSERTS:
+        out.write_text(as_toml(tables | {"insert": {"name": insert, "model": _model(insert)}}) + "\n", encoding="utf-8")
+        try:
+            checked = check_scene(str(out), config)
+        except CommandError as error:
+            if error.code != "refused":  # such as a machine too busy to say
+                out.unlink()
+                raise
+            refused[insert] = error.message
+            continue
+        text = (
+            f"{checked.text}\n\n{out} is written, with insert {insert}: its tolerance, handle and rates are proposals"
+        )
+        return Outcome(checked.result | {"file": str(out), "insert": insert}, text)
+    out.unlink()
+    raise CommandError(
+        Exit.REFUSED,
+        "refused",
+        "no shipped insert renders this: " + "; ".join(f"{insert}: {reason}" for insert, reason in refused.items()),
+        "record or ask for slower or lower forces, or train a model of another insert (tormagctl calibrate --insert)",
+    )
+
+
+def _model(insert: str) -> str:
+    return "torque_" + insert.lower().replace("-", "_")
+
+
+def _from_recording(out: Path, force_file: Path) -> Tables:
+    try:
+        time_s, force_N = recorded(force_file)
+    except ConfigError as error:
+        raise usage_error(str(error), "a CSV with the columns t_s,force_N") from error
+    least_N, most_N = _rounded(float(force_N.min()), math.floor), _rounded(float(force_N.max()), math.ceil)
+    if not least_N < most_N:
+        raise usage_error(
+            f"{force_file}: a force of {most_N:g} N throughout has no range: allowed is one that changes",
+            "a scene that holds one force is made by answering: tormagctl scene new FILE.toml",
+        )
+    tolerance_N = _rounded(max(TOLERATED * (most_N - least_N), TOLERATED_OF_MOST * most_N), math.ceil)
+    said = f"What {force_file.name} asks for in {time_s[-1]:.0f} s: {least_N:g} to {most_N:g} N."
+    signal = {"file": os.path.relpath(force_file, out.parent)}
+    return _tables(out.stem, said, least_N, most_N, 2.0 * tolerance_N, tolerance_N, signal, (42.0, 42.0))
+
+
+def _from_answers(name: str) -> Tables:
+    if not is_terminal(sys.stdin):
+        raise usage_error("there is nobody to ask", "give a recorded force: --force FORCE.csv, columns t_s,force_N")
+    print("A scene states one task; Enter takes what stands in brackets.", file=sys.stderr)
+    said = _answer("what is done, in a sentence", f"{name}.")
+    least_N = _number("least force, N", 0.0)
+    most_N = _number("greatest force, N", 2.0)
+    tolerance_N = _number("RMS error of the force that is tolerated, N", TOLERATED * (most_N - least_N))
+    resolution_N = _number("smallest difference of force that matters, N", 2.0 * tolerance_N)
+    bandwidth_hz = _number("how fast a force rises: it takes half a period of, Hz", 0.2)
+    hold_s = _number("and is held then, s", 0.0)
+    slowest_mm_s = _number("slowest handle, mm/s at the roller", 42.0)
+    fastest_mm_s = _number("fastest handle, mm/s", slowest_mm_s)
+    signal = {"bandwidth_hz": bandwidth_hz, "hold_s": hold_s}
+    return _tables(name, said, least_N, most_N, resolution_N, tolerance_N, signal, (slowest_mm_s, fastest_mm_s))
+
+
+def _answer(question: str, usual: str) -> str:
+    print(f"{question} [{usual}]: ", end="", file=sys.stderr, flush=True)
+    line = sys.stdin.readline()
+    if not line:
+        raise usage_error("the answers ended", "answer all questions, or give --force FORCE.csv")
+    return line.strip() or usual
+
+
+def _number(question: str, usual: float) -> float:
+    while True:
+        answer = _answer(question, f"{usual:g}")
+        try:
+            return float(answer)
+        except ValueError:
+            print("  allowed is a number", file=sys.stderr)
+
+
+def _tables(
+    name: str,
+    description: str,
+    least_N: float,
+    most_N: float,
+    resolution_N: float,
+    tolerance_N: float,
+    signal: Tables,
+    handle_mm_s: tuple[float, float],
+) -> Tables:
+    force = {"least_N": least_N, "most_N": most_N, "resolution_N": resolution_N, "tolerance_rms_N": tolerance_N}
+    return {
+        "name": name,
+        "description": description,
+        "force": {key: float(f"{value:.3g}") for key, value in force.items()},
+        "signal": signal,
+        "handle": dict(zip(("least_mm_s", "most_mm_s"), handle_mm_s, strict=True)),
+        "bandwidth": {"control_hz": LEAST_CONTROL_HZ, "inference_hz": LEAST_INFERENCE_HZ},
+    }
+
+
+def _rounded(value: float, direction: Callable[[float], int]) -> float:
+    """To two digits."""
+    if value == 0.0:
+        return 0.0
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{direction(round(value / unit, 6)) * unit:.3g}")
