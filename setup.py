@@ -38,6 +38,7 @@ COMPILED = {
             "trajectory",
             "interpolation",
             "portrait",
+            "pursuit",
         ),
         *("periodicity", "governor", "plan", "motor", "step", "conditions"),
     ),
