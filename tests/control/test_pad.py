@@ -86,6 +86,17 @@ def test_without_the_term_nothing_is_remembered(pad_core: Core) -> None:
     assert forgetful.plan.field_mT == pytest.approx(held(without, PERIOD_S).plan.field_mT, abs=0.01)
 
 
+def test_a_finger_that_stands_while_the_force_rises_has_not_lost_its_encoder(pad_core: Core) -> None:
+    """On a brake it has: friction comes back only with a motion. A pad stiffens under a finger that does not move."""
+    state = pad_core.planner.start(0.0)
+    for tick in range(1, 200):
+        now_s = 0.01 * tick
+        estimate = pressed(DEPTH_MM, gap_mm=95.0 - 0.2 * tick, number=tick)
+        estimate = estimate.replaced(sensed_s=now_s, force_N=3.3 + 0.005 * tick)
+        state = pad_core.planner.plan(state, now_s, TimedSetpoint(3.8, now_s, 0.1), estimate)
+    assert not state.handle.is_lost
+
+
 def test_planning_that_begins_anew_has_not_forgotten(pad_core: Core) -> None:
     state = held(pad_core, 5.0)
     assert pad_core.planner.afresh(state, 5.1).relaxed == state.relaxed

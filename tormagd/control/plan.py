@@ -283,7 +283,7 @@ class Planner:
             model_N -= relaxed.lost_N
         shown = self._learn(state.shown, now_s, estimate, model_N, remembered.relaxed_N)
         handle = state.handle
-        if estimate is not None and model_N is not None:
+        if self._contact.slides and estimate is not None and model_N is not None:
             handle = handle.heard(estimate.sensed_s, estimate.handle_mm, estimate.force_N, model_N)
         # from here on over the model's force without memory, which searches and portrait know
         device = shown.device.relaxed(remembered.relaxed_N + relaxed.lost_N)
