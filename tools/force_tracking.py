@@ -90,7 +90,7 @@ class Track(NamedTuple):
     limits: dict[str, float]
     trim: float
     lag_s: float
-    shown: Shown
+    shown: Shown = NOTHING_SHOWN
 
     def since(self, start_s: float) -> Tracking:
         """The figures from a time on."""
