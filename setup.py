@@ -40,6 +40,7 @@ COMPILED = {
             "portrait",
             "contact",
             "remembered",
+            "pursuit",
         ),
         *("periodicity", "governor", "handle", "plan", "motor", "step", "conditions"),
     ),

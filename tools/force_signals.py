@@ -4,6 +4,7 @@ Shape and rhythm are measured; where a signal is not a force, the newtons are ch
 """
 
 import os
+from enum import StrEnum
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +26,21 @@ HAPTIC_S = 40.0
 "Of the 98 s recorded."
 SHIFT_N = 0.6
 "Above the device's least force."
+SCALED_N = (0.62, 2.0)
+"From the shipped model's least force to the scenes' greatest."
+RISE_S = 0.1
+LASTS_S = (0.1, 0.6)
+"Of a touch of the palpation, and of the time between two."
+TOUCHES_N = (0.9, 2.0)
+TOUCHED_S = 16.0
+
+
+class Kind(StrEnum):
+    """What a signal is judged as: a pulse, or the force of a hand that moves as it likes."""
+
+    PULSE = "pulse"
+    HAND = "hand"
+    OTHER = "other"
 
 
 class Signal(NamedTuple):
@@ -36,6 +52,7 @@ class Signal(NamedTuple):
     force_N: Array
     is_known_ahead: bool = True
     valid_for_s: float = 0.1
+    kind: Kind = Kind.OTHER
 
 
 def recorded_signals(folder: Path) -> list[Signal]:
@@ -45,7 +62,27 @@ def recorded_signals(folder: Path) -> list[Signal]:
         *(_pulse(path, "arterial pressure") for path in sorted((folder / "wfdb_mimicdb").glob("*_ABP.csv"))),
         *(_tool(path) for path in sorted((folder / "umn_mis_tool").glob("*.TXT"))),
         *(_haptic(path) for path in sorted((folder / "kit_cataract_haptic").glob("*.csv"))),
+        *(_scaled_haptic(path) for path in sorted((folder / "kit_cataract_haptic").glob("*.csv"))),
     ]
+
+
+def palpation(seed: int) -> Signal:
+    """A hand that feels its way: touches of random force, each within RISE_S, at random times (synthetic)."""
+    random = np.random.default_rng(seed)
+    time_s = np.arange(round(TOUCHED_S * RATE_HZ)) / RATE_HZ
+    force_N = np.full(len(time_s), SCALED_N[0])
+    begins_s = random.uniform(*LASTS_S)
+    while begins_s < TOUCHED_S:
+        ends_s = begins_s + RISE_S + random.uniform(*LASTS_S)
+        more_N = random.uniform(*TOUCHES_N) - SCALED_N[0]
+        force_N += more_N * (_rising(time_s - begins_s) - _rising(time_s - ends_s))
+        begins_s = ends_s + RISE_S + random.uniform(*LASTS_S)
+    return Signal(f"palpation {seed}", f"touches within {RISE_S:g} s", time_s, force_N, kind=Kind.HAND)
+
+
+def _rising(since_s: Array) -> Array:
+    rising: Array = 0.5 - 0.5 * np.cos(np.pi * np.clip(since_s / RISE_S, 0.0, 1.0))
+    return rising
 
 
 def data_folder() -> Path | None:
@@ -67,7 +104,9 @@ def _pulse(path: Path, what: str) -> Signal:
     part = np.interp(time_s, np.arange(len(smooth)) * period_s, smooth)
     low, high = PULSE_N
     force = low + (part - part.min()) / np.ptp(part) * (high - low)
-    return Signal(f"{what} {path.stem}", f"least..most to {low}..{high} N, {LOW_PASS_HZ:g} Hz", time_s, force)
+    return Signal(
+        f"{what} {path.stem}", f"least..most to {low}..{high} N, {LOW_PASS_HZ:g} Hz", time_s, force, kind=Kind.PULSE
+    )
 
 
 def _tool(path: Path) -> Signal:
@@ -81,9 +120,26 @@ def _tool(path: Path) -> Signal:
 
 
 def _haptic(path: Path) -> Signal:
+    time_s, forces = _commands(path)
+    # live: sent when it came, nothing of it known before; over the recording's pauses the last one goes stale
+    return Signal(
+        f"haptic commands {path.stem}", f"|F| + {SHIFT_N:g} N, at its own times", time_s, SHIFT_N + forces, False, 0.25
+    )
+
+
+def _scaled_haptic(path: Path) -> Signal:
+    """The same hand, as a force that somebody sends who plays the file: straight lines between the commands."""
+    sent_s, sent_N = _commands(path)
+    least_N, most_N = SCALED_N
+    scaled = least_N + (sent_N - sent_N.min()) / np.ptp(sent_N) * (most_N - least_N)
+    time_s = np.arange(0.0, sent_s[-1], 1.0 / RATE_HZ)
+    forces = np.interp(time_s, sent_s, scaled)
+    return Signal(f"haptic scaled {path.stem}", f"|F| to {least_N}..{most_N} N", time_s, forces, kind=Kind.HAND)
+
+
+def _commands(path: Path) -> tuple[Array, Array]:
+    """Times, s, and forces, N, of the commands of the first HAPTIC_S."""
     raw = np.loadtxt(path, delimiter=",", skiprows=1)
     time_s, first = np.unique(raw[:, 0], return_index=True)
-    forces = SHIFT_N + np.linalg.norm(raw[first, 1:4], axis=1)
-    time_s, forces = time_s[time_s <= HAPTIC_S], forces[time_s <= HAPTIC_S]
-    # live: sent when it came, nothing of it known before; over the recording's pauses the last one goes stale
-    return Signal(f"haptic commands {path.stem}", f"|F| + {SHIFT_N:g} N, at its own times", time_s, forces, False, 0.25)
+    inside = time_s <= HAPTIC_S
+    return time_s[inside], np.linalg.norm(raw[first, 1:4], axis=1)[inside]

@@ -1,6 +1,7 @@
 """The governor: every difference between force asked and force rendered has a reason, and none of them jumps."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -113,13 +114,20 @@ def test_a_setpoint_that_goes_stale_on_a_slope_is_let_go_from_where_the_force_is
     assert governed.path_N[0] < 1.0
 
 
+@pytest.mark.parametrize("ahead_N", [(), (1.0,) * 40])
 @pytest.mark.parametrize(("before_N", "after_N"), [(1.6, 0.8), (0.8, 1.6)])
-def test_from_one_holder_to_the_next_the_force_goes_along_the_ramp(before_N: float, after_N: float) -> None:
+def test_from_one_holder_to_the_next_the_force_goes_along_the_ramp(
+    before_N: float, after_N: float, ahead_N: tuple[float, ...]
+) -> None:
     state, governed = decide(GovernorState(0.0, before_N), 0.001, TimedSetpoint(before_N, 0.001, VALID_S))
     reached = 0
     for tick in range(2, 1_000):
         now_s, last_N = tick * 1e-3, governed.force_N
-        state, governed = decide(state, now_s, TimedSetpoint(after_N, now_s, VALID_S, holder=1, is_contested=True))
+        preview_N = tuple(after_N * share for share in ahead_N)
+        setpoint = TimedSetpoint(
+            after_N, now_s, VALID_S, preview_N=preview_N, preview_dt_s=0.002, holder=1, is_contested=True
+        )
+        state, governed = decide(state, now_s, setpoint)
         assert abs(governed.force_N - last_N) <= SCENE.release_N_s * 1e-3 + 1e-9
         assert Limit.OTHER_SOURCE in governed.limits
         assert (Limit.TAKEOVER in governed.limits) == (governed.force_N != after_N)
@@ -229,34 +237,94 @@ def test_a_clock_that_stands_still_or_goes_back_lets_nothing_jump() -> None:
         assert governed.force_N == 1.5
 
 
-@pytest.mark.parametrize("waited_s", [0.0, 0.003, 0.02])
-def test_a_preview_is_what_comes(waited_s: float) -> None:
-    """A swing that no slope foresees; the path goes along it, from the age of the setpoint on."""
-    times = 2e-3 * np.arange(60)
-    forces = 1.0 + 0.3 * np.sin(2.0 * math.pi * 5.0 * times)
-    setpoint = TimedSetpoint(forces[0], 0.5, VALID_S, preview_N=tuple(forces[1:].tolist()), preview_dt_s=2e-3)
-    _, governed = decide(GovernorState(0.0, 0.4), 0.5 + waited_s, setpoint, lag_s=0.01)
-    expected = 1.0 + 0.3 * np.sin(2.0 * math.pi * 5.0 * (waited_s + 0.01 + AFTER_S))
-    assert path_N(governed) == pytest.approx(expected, abs=1e-3)
-    assert governed.force_N == pytest.approx(1.0)
-    assert governed.limits == ()
+def told(
+    force_N: Callable[[float], float], seconds: float, *, ahead_s: float = 0.4, lag_s: float = 0.0
+) -> tuple[GovernorState, Governed]:
+    """The last decision on setpoints that carry what follows, 500 times a second from 0 s on."""
+    state, governed = decide(GovernorState(0.0, force_N(0.0)), 0.0, None)
+    state = state.replaced(asked_N=force_N(0.0))
+    for tick in range(1, round(500 * seconds) + 1):
+        now_s = tick / 500
+        ahead_N = tuple(force_N(now_s + 0.002 * place) for place in range(1, round(500 * ahead_s) + 1))
+        setpoint = TimedSetpoint(force_N(now_s), now_s, VALID_S, preview_N=ahead_N, preview_dt_s=0.002)
+        state, governed = decide(state, now_s, setpoint, lag_s=lag_s)
+    return state, governed
+
+
+def swing_N(time_s: float) -> float:
+    """As slow as the gap of these tests can follow."""
+    return 1.5 + 0.05 * math.sin(2.0 * math.pi * 2.0 * time_s)
+
+
+@pytest.mark.parametrize("seconds", [0.3, 0.5, 0.82])
+@pytest.mark.parametrize("ahead_s", [0.07, 0.4])
+def test_a_preview_is_what_comes(seconds: float, ahead_s: float) -> None:
+    """A swing that no slope foresees; the path goes along it."""
+    _, governed = told(swing_N, seconds, ahead_s=ahead_s)
+    assert path_N(governed) == pytest.approx([swing_N(seconds + after_s) for after_s in PATH_S], abs=2e-3)
+    assert governed.force_N == governed.path_N[0]
+    assert (governed.limits, governed.foresight) == ((), 1.0)
+
+
+def step_N(time_s: float) -> float:
+    """Too fast for any gap."""
+    return 1.2 if time_s < 1.0 else 1.8
+
+
+def test_what_is_too_fast_is_missed_before_and_after() -> None:
+    """The carriages set out before a step that they know of, and the limit says that they are too slow for it."""
+    _, long_before = told(step_N, 0.6)
+    assert path_N(long_before) == pytest.approx(1.2)
+    _, there = told(step_N, 1.0)
+    assert 1.4 < there.force_N < 1.6
+    assert there.limits == (Limit.RATE,)
+    _, long_after = told(step_N, 1.4)
+    assert path_N(long_after) == pytest.approx(1.8, abs=2e-3)
+    assert long_after.limits == ()
+    # of what is not known nobody can be ahead
+    _, surprised = told(step_N, 0.88, ahead_s=0.05)
+    assert surprised.force_N == pytest.approx(1.2)
+
+
+def test_late_carriages_set_out_sooner() -> None:
+    _, prompt = told(step_N, 0.75)
+    _, late = told(step_N, 0.75, lag_s=0.03)
+    assert late.force_N > prompt.force_N + 1e-3
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.floats(0.0, 4.0), min_size=1, max_size=60), st.floats(1e-4, 1.0), st.floats(0.0, 0.03))
+def test_no_path_is_faster_than_the_gap_or_beyond_what_was_asked(
+    ahead_N: list[float], spacing_s: float, lag_s: float
+) -> None:
+    """However the preview leaps, and whatever it says: the path goes on from where the last one was."""
+    state, steepest_N_s = GovernorState(0.0, 1.0), GAP_SPEED_MM_S * max(PORTRAIT.slope_N_mm)
+    for tick in range(1, 6):
+        before_N, now_s = state.asked_N, 0.004 * tick
+        leap = tuple(ahead_N[tick:] + ahead_N[:tick])
+        setpoint = TimedSetpoint(leap[0], now_s, VALID_S, preview_N=leap, preview_dt_s=spacing_s)
+        state, governed = decide(state, now_s, setpoint, lag_s=lag_s)
+        assert abs(governed.path_N[0] - before_N) <= steepest_N_s * 0.004 + 1e-9
+        assert np.all(np.abs(np.diff(path_N(governed))) <= steepest_N_s * 0.005 + 1e-9)
+        assert np.all((path_N(governed) >= PORTRAIT.least_N) & (path_N(governed) <= SCENE.most_N))
 
 
 def test_a_preview_beyond_the_range_is_held_at_its_ends() -> None:
-    setpoint = TimedSetpoint(1.0, 0.5, VALID_S, preview_N=(3.0,) * 8 + (0.0,) * 8, preview_dt_s=2e-3)
-    _, governed = decide(GovernorState(0.0, 0.4), 0.5, setpoint)
-    assert path_N(governed).max() == SCENE.most_N
-    assert path_N(governed).min() == PORTRAIT.least_N
+    _, above = told(lambda time_s: 3.0, 1.5)
+    assert path_N(above) == pytest.approx(SCENE.most_N)
+    _, below = told(lambda time_s: 0.0, 1.5)
+    assert path_N(below) == pytest.approx(PORTRAIT.least_N)
 
 
 def test_a_short_preview_goes_on_as_it_ran_and_not_for_long() -> None:
-    rising = TimedSetpoint(1.0, 0.5, 10.0, preview_N=(1.01, 1.02), preview_dt_s=5e-3)
-    _, soon = decide(GovernorState(0.0, 0.4), 0.5, rising)
-    assert path_N(soon)[:5] == pytest.approx(1.0 + 2.0 * AFTER_S[:5])
+    rising = TimedSetpoint(1.0, 0.5, 10.0, preview_N=(1.005, 1.01), preview_dt_s=5e-3)
+    state, soon = decide(GovernorState(0.499, 1.0), 0.5, rising)
+    assert np.all(np.diff(path_N(soon)) > 0.0)
     # no further than it was known
-    assert path_N(soon)[-1] == pytest.approx(1.04)
-    _, late = decide(GovernorState(0.0, 0.4), 5.0, rising)
-    assert path_N(late) == pytest.approx(np.full(len(PATH_S), 1.04))
+    assert path_N(soon)[-1] < 1.02
+    for tick in range(1, 100):
+        state, late = decide(state, 0.5 + 0.01 * tick, rising)
+    assert path_N(late) == pytest.approx(np.full(len(PATH_S), 1.02))
 
 
 def test_a_preview_does_not_outlive_its_validity() -> None:
@@ -310,10 +378,6 @@ def test_a_lag_is_made_up_for_as_far_as_it_is_known_what_comes() -> None:
     _, extrapolated = decide(state, 0.4, live, lag_s=0.02)
     assert extrapolated.foresight == 0.0
     assert path_N(extrapolated)[0] == pytest.approx(1.39)
-    preview = tuple(1.39 + 0.01 * k for k in range(1, 9))
-    _, known = decide(state, 0.4, live.replaced(preview_N=preview, preview_dt_s=0.01), lag_s=0.02)
-    assert known.foresight == 1.0
-    assert path_N(known)[0] == pytest.approx(1.41)
 
 
 def test_no_forecast_holds_a_force_of_a_stale_setpoint(learned: GovernorState) -> None:

@@ -1,15 +1,18 @@
 """The force-tracking tool: its signals, its draws, and its figures on one short run. All devices are synthetic."""
 
+import math
+
 import force_tracking
 import numpy as np
 import pytest
-from force_signals import Signal, recorded_signals
+from force_signals import SCALED_N, Kind, Signal, palpation, recorded_signals
 from force_tracking import (
     DRAWN,
     SPREAD,
     STAIR_S,
     TRIM_S,
     Track,
+    allowed_N,
     compared,
     draw_plants,
     ideal,
@@ -111,7 +114,26 @@ def test_recorded_signals_are_in_the_devices_range(recordings) -> None:
     assert {signal.name.split()[0] for signal in found} == {"finger", "arterial", "tool", "haptic"}
     for signal in found:
         assert np.all(np.diff(signal.time_s) > 0.0)
-        assert 0.55 <= signal.force_N.min() <= signal.force_N.max() <= 1.75
+        assert 0.55 <= signal.force_N.min() <= signal.force_N.max() <= (2.0 if signal.kind is Kind.HAND else 1.75)
+
+
+def test_a_palpation_touches_at_random_and_again_alike() -> None:
+    touched = palpation(1)
+    assert np.all(touched.force_N == palpation(1).force_N)
+    assert not np.all(touched.force_N == palpation(2).force_N)
+    assert SCALED_N[0] <= touched.force_N.min() <= touched.force_N.max() <= SCALED_N[1]
+    # a touch of a newton within a tenth of a second, smoothly
+    assert 10.0 < np.abs(np.gradient(touched.force_N, touched.time_s)).max() < 30.0
+
+
+def test_what_is_allowed_grows_with_what_the_ideal_carriages_miss() -> None:
+    row = {"sd_N": 0.3, "no_delay_rms_N": 0.2, "foresight_rms_N": 0.1}
+    assert allowed_N(Kind.OTHER, "sample_1", True, row) is None
+    assert allowed_N(Kind.PULSE, "sample_1", False, row) == pytest.approx(math.hypot(0.26, 0.006))
+    assert allowed_N(Kind.PULSE, "sample_2", True, row) == pytest.approx(math.hypot(0.13, 0.015))
+    assert allowed_N(Kind.HAND, "sample_2", True, row) == pytest.approx(math.hypot(0.13, 0.01))
+    assert allowed_N(Kind.HAND, "sample_1", False, row) == pytest.approx(0.27)
+    assert allowed_N(Kind.HAND, "sample_1", False, row | {"no_delay_rms_N": 0.25}) == pytest.approx(0.315)
 
 
 def test_a_folder_without_data_gives_no_signals(tmp_path) -> None:

@@ -57,12 +57,14 @@ class Portrait:
     """Force over gap for one contact, without memory, and its slope |dF/dgap|, N per mm, at n points: forces rise and
     gaps fall along the lists."""
 
-    __slots__ = ("force_N", "gap_mm", "slope_N_mm")
+    __slots__ = ("_falling_N", "_rising_mm", "force_N", "gap_mm", "slope_N_mm")
 
     def __init__(self, gap_mm: list[float], force_N: list[float], slope_N_mm: list[float]) -> None:
         self.gap_mm: Final = gap_mm
         self.force_N: Final = force_N
         self.slope_N_mm: Final = slope_N_mm
+        self._rising_mm: Final[list[float]] = gap_mm[::-1]
+        self._falling_N: Final[list[float]] = force_N[::-1]
 
     @property
     def least_N(self) -> float:
@@ -81,6 +83,10 @@ class Portrait:
     def gap_mm_at(self, force_N: float) -> float:
         """The gap that gives this force; the nearest end of the range where none does."""
         return interpolated(force_N, self.force_N, self.gap_mm)
+
+    def force_N_at(self, gap_mm: float) -> float:
+        """What this gap gives; of the nearest end of the range outside of it."""
+        return interpolated(gap_mm, self._rising_mm, self._falling_N)
 
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
         """The fastest change of force that a gap speed renders at this force."""
