@@ -26,7 +26,7 @@ MOST_STEPS: Final = 40
 and what comes later can wait."""
 STARTING_S: Final = 0.01
 """Time constant with which the gap comes to another speed where its carriages are not late. Chosen on sample 1: a pulse
-of 1.1 to 1.7 N, which is too steep, is missed by 54 and 51 mN with 5 and 15 ms, and by 67 with none."""
+of 1.1 to 1.7 N, which is too steep, is missed by 54 and 51 mN with 5 and 15 ms, 1.4 to 1.7 N by 2.4 and 3.5."""
 FLATTEST_N_MM: Final = 1e-3
 "A force that hardly depends on the gap counts as if it did by this much."
 OUTRUN_N: Final = 0.02
