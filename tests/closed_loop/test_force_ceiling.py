@@ -172,14 +172,14 @@ def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_of
     loop.arm()
     render(loop, ASKED_N, 2.0)
     assert loop.plan_state is not None
-    before = loop.plan_state.device
+    before = loop.plan_state.shown.device
     # as after ten minutes of turning the one way
     aged = loop.plan_state.shown.zero.replaced(variance_N2=1.01 * UNKNOWN_SD_N**2)
     loop.plan_state = loop.plan_state.replaced(shown=loop.plan_state.shown.replaced(zero=aged))
     LyingSensor(loop.device, lambda reading_N: reading_N + 0.1)
     samples = render(loop, ASKED_N, 3.0)
     assert samples[-1].plan.limits == (Limit.OFFSET_UNKNOWN,)
-    assert loop.plan_state.device == before
+    assert loop.plan_state.shown.device == before
     assert abs(samples[-1].truth.force_N) == pytest.approx(ASKED_N, abs=0.05)
 
 

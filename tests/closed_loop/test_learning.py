@@ -84,4 +84,4 @@ def test_the_model_alone_renders_the_forces_of_the_device_that_it_was_trained_on
     ]
     assert np.sqrt(np.mean(np.square(errors_N))) < 0.02
     assert loop.plan_state is not None
-    assert loop.plan_state.device == UNSEEN
+    assert loop.plan_state.shown.device == UNSEEN

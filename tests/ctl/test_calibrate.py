@@ -198,7 +198,7 @@ def test_displacement_is_what_the_daemon_calls_it():
     expected = []
     for position in path:
         fake = estimate.Estimate(0, True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
-        handle = estimate._handle(fake, float(position), 1e-3)
+        handle = estimate._handle(fake, float(position), 1e-3, True)
         expected.append(handle.displacement_mm)
     found = displacement(path)
     known = np.isfinite(found)

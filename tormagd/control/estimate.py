@@ -1,6 +1,5 @@
 """From a measurement to what the controller needs: gap, carriage speeds, and the handle's motion since it turned."""
 
-import math
 from typing import Final, final
 
 from firmware_protocol.value import Value
@@ -10,8 +9,8 @@ from tormagd.model.displacement import MOVING_MM_S, Turn
 RATE_FILTER_S: Final = 0.05
 SLIDING_MM: Final = 0.3
 "Friction takes on the level of another rate over some such travel; without travel it does not change."
-SLOWEST_MM_S: Final = 0.1
-"Slower is no sliding, but standing."
+FAST_MM_S: Final = 2.0 * MOVING_MM_S
+"From here on friction hardly depends on the rate: what Stribeck's part there is has faded."
 LEAST_DT_S: Final = 5e-6
 "Half a step of the device's clock; positions over less time than that would give speeds without bound."
 
@@ -161,8 +160,9 @@ def _handle(last: Estimate, position_mm: float, dt_s: float, turns: bool) -> Han
     travel_mm = position_mm - last.handle_mm
     speed += share * (travel_mm / dt_s - speed)
     slid = abs(travel_mm) / (SLIDING_MM + abs(travel_mm))
-    # by its logarithm: friction's level is one of 300 and 42 mm/s, and another of 4
-    sliding = before.sliding_mm_s * math.pow(max(abs(speed), SLOWEST_MM_S) / before.sliding_mm_s, slid)
+    # friction's level is one of 300 and 42 mm/s, and another of 4: how much faster it has been does not count
+    from_mm_s = min(before.sliding_mm_s, max(abs(speed), FAST_MM_S))
+    sliding = from_mm_s + slid * (abs(speed) - from_mm_s)
     if not turns:
         return Handle(max(position_mm, 0.0), speed, before.turn, sliding)
     turn = before.turn.moved_to(position_mm)

@@ -200,7 +200,7 @@ class PlanState(Value):
     @property
     def device(self) -> DeviceFit:
         """The device as far as it has shown itself, and as its elastomer is relaxed now."""
-        return self.shown.device.relaxed(self.relaxed.lost_N)
+        return self.shown.device.relaxed(self.remembered.relaxed_N + self.relaxed.lost_N)
 
     @property
     def sensor(self) -> Sensor:

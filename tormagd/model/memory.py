@@ -36,8 +36,9 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             require("memory.times_s", time_s, 1e-3, LONGEST_S)
         if any(before >= after for before, after in pairwise(self.times_s)):
             raise DomainError("memory.times_s", self.times_s, "rising times")
-            require("memory.lag_mT", self.lag_mT, 0.0, 1e4)
-        require("memory.turn_mT", self.turn_mT, 4.0 * self.lag_mT, 1e5)
+        require("memory.turn_mT", self.turn_mT, 0.1, 1e5)
+        # a gap that follows a greater lag might run after itself
+        require("memory.lag_mT", self.lag_mT, 0.0, 0.25 * self.turn_mT)
 
 
 NO_MEMORY = Memory()

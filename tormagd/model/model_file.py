@@ -117,9 +117,6 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             raise DomainError("scaling", scaling, f"finite numbers within +-{LARGEST:g}")
         if not scaling.output_gain > 0:
             raise DomainError("scaling.output_gain", scaling.output_gain, "above 0")
-        if not self.memory.lag_mT <= 0.25 * self.memory.turn_mT:
-            # otherwise a gap that follows the lag might run after itself
-            raise DomainError("memory.lag_mT", self.memory.lag_mT, "at most a quarter of memory.turn_mT")
         for name, value in self.metrics.items():
             if not math.isfinite(value):
                 raise DomainError(f"metrics.{name}", value, "a finite number")
