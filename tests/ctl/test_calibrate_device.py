@@ -34,7 +34,7 @@ def played(loop, waveform):
     return dict(zip(COLUMNS, np.array(rows).T, strict=True))
 
 
-# where a hand turns it is planned for as the slow one that it is, by the model's Stribeck friction: sample 2's fades sooner
+# where a hand turns it is planned for as slow, by the model's Stribeck friction: sample 2's fades sooner
 @pytest.mark.parametrize(
     ("plant", "mean_N", "worst_N"),
     [(load_plant("sample_2"), 0.04, 0.065), (drawn_device(41), 0.03, 0.06), (drawn_device(57), 0.03, 0.06)],
