@@ -27,10 +27,13 @@ STRANGER = KeyPair(*zmq.curve_keypair())
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+def free_ports(count: int) -> list[int]:
+    """So many, and no two the same: each is held until all are known."""
+    with contextlib.ExitStack() as held:
+        probes = [held.enter_context(socket.socket()) for _ in range(count)]
+        for probe in probes:
+            probe.bind(("127.0.0.1", 0))
+        return [int(probe.getsockname()[1]) for probe in probes]
 
 
 class Rig:
@@ -47,7 +50,8 @@ class Rig:
         (self.keys / "operate/bench.key").write_bytes(listed)
         (self.keys / "operate/bench.key").chmod(0o600)
         self.addresses = {
-            name: f"ipc://{folder}/{name}" if scheme == "ipc" else f"tcp://127.0.0.1:{free_port()}" for name in NAMES
+            name: f"ipc://{folder}/{name}" if scheme == "ipc" else f"tcp://127.0.0.1:{port}"
+            for name, port in zip(NAMES, free_ports(len(NAMES)), strict=True)
         }
         curve = Curve(server_secret=str(self.keys / "server.key_secret"), also_local=True)
         endpoints = Config(endpoints=Endpoints(**self.addresses, curve=curve)).endpoints

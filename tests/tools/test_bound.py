@@ -259,7 +259,7 @@ def test_finer_steps_find_the_same(plant: PlantParameters) -> None:
 
 def test_forces_out_of_range_are_clipped_before_they_count() -> None:
     """Below what the open gap brakes and above the scene's greatest nothing is missed: the rest is a slow ramp."""
-    times_s, forces_N = np.array([0.0, 0.5, 4.0, 4.5]), np.array([0.1, 0.1, 2.6, 2.6])
+    times_s, forces_N = np.array([0.0, 0.2, 3.7, 3.9]), np.array([0.1, 0.1, 2.6, 2.6])
     found = bound.bound(SAMPLES[0], times_s, forces_N)
     assert 0.4 <= found.asked_N.min() <= 0.7
     assert found.asked_N.max() == pytest.approx(2.0, abs=1e-4)
