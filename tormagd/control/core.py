@@ -102,7 +102,7 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
         reach = portrait(_curve(model, part), field, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
         choice = choose_solver(scene, rises=rises)
         search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, rises=rises)
-        law = _law(scene, reach, field)
+        law = _law(scene, reach, field) if part.contact.slides else None
     except (DomainError, ModelFileError) as error:
         raise ConfigError(f"scene {scene.name}: {error}") from error
     _refuse_unknown_hand(scene, model)
@@ -154,10 +154,8 @@ def _curve(model: ForceModel, part: Part) -> ForceCurve:
     return model.curve(min(contact.displacement_mm, most_mm), rate_mm_s, part.cip_percent)
 
 
-def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField | None:
+def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
     """The force law beside the brake's model; of a pad none is printed that could judge one."""
-    if scene.element != "torque":
-        return None
     fitted, metres = scene.insert, 1e-3
     geometry = Geometry(
         fitted.inner_radius_mm * metres,

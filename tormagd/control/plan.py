@@ -380,8 +380,7 @@ class Planner:
         if relaxing is None or estimate is None:
             return relaxed
         curve = self._present_curve(estimate)
-        gap_mm = max(estimate.gap_mm, self._closed_mm - BEYOND_MM) if estimate.is_homed else self._open_mm
-        field_mT = self._field.field_mT(gap_mm)
+        field_mT = self._field.field_mT(self._gap_mm(estimate) if estimate.is_homed else self._open_mm)
         free_N = curve.force_N(0.0)
         return relaxing.advance(relaxed, now_s, free_N, curve.force_N(_within(field_mT, self._fields_mT)) - free_N)
 
@@ -394,7 +393,7 @@ class Planner:
             # until both switches are found, positions count from where the carriages were, as if they were open
             opened_mm = max(estimate.gap_mm - self._open_mm, remembered.opened_mm)
             return Remembered(opened_mm=opened_mm) if is_new else remembered
-        gap_mm = max(estimate.gap_mm, self._closed_mm - BEYOND_MM)
+        gap_mm = self._gap_mm(estimate)
         if is_new:
             found_mm = gap_mm - remembered.opened_mm
             is_known = self._closed_mm - BEYOND_MM <= found_mm <= self._open_mm + BEYOND_MM
@@ -404,9 +403,13 @@ class Planner:
         lag_mT = self._memory.lag_at_mT(remembered, field_mT)
         return self._memory.followed(remembered, field_mT, lag_mT, self._sliding_N(field_mT - lag_mT), now_s)
 
+    def _gap_mm(self, estimate: Estimate) -> float:
+        """The measured gap, no closer than one whose field means something."""
+        return max(estimate.gap_mm, self._closed_mm - BEYOND_MM)
+
     def _sliding_N(self, field_mT: float) -> float:
-        """The model's force of a handle at the roller's speed."""
-        return self._only_curve.force_N(_within(field_mT, self._fields_mT))
+        """The model's force of a handle at the roller's speed, of which its elastomer relaxes; 0 where it does not."""
+        return self._only_curve.force_N(_within(field_mT, self._fields_mT)) if self._memory.relaxes else 0.0
 
     def _learn(
         self, shown: Shown, now_s: float, estimate: Estimate | None, model_N: float | None, relaxed_N: float

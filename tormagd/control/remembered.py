@@ -42,15 +42,16 @@ NOTHING_REMEMBERED: Final = Remembered()
 
 @final
 class Remembering:
-    """The constants of an element's memory. Its methods change nothing."""
+    """The constants of an element's memory; `relaxes` says whether a force is followed. Its methods change nothing."""
 
-    __slots__ = ("_fractions", "_lag_mT", "_times_s", "_turn_mT")
+    __slots__ = ("_fractions", "_lag_mT", "_times_s", "_turn_mT", "relaxes")
 
     def __init__(self, memory: Memory) -> None:
         self._fractions: Final = list(memory.fractions)
         self._times_s: Final = list(memory.times_s)
         self._lag_mT: Final = memory.lag_mT
         self._turn_mT: Final = memory.turn_mT
+        self.relaxes: Final = len(memory.fractions) > 0
 
     def rested(self, field_mT: float, force_N: float, now_s: float) -> Remembered:
         """After a long rest at that field, where the force without memory is `force_N`."""
