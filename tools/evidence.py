@@ -203,7 +203,7 @@ PARTS = {
     "numerics": Part("tools/numerics.py --json", _says_numerics),
     "replug_serial": Part("tools/replug.py --cycles 200 --transport serial --json", _says_replug),
     "replug_can": Part("tools/replug.py --cycles 200 --transport can --json", _says_replug),
-    "soak": Part("tools/soak.py --json", _says_soak),
+    "soak": Part("tools/soak.py --minutes 30 --json", _says_soak),
     "stalls": Part("tools/stalls.py --json", _says_stalls),
     "strangers": Part("tools/intruders.py strangers --json", _says_intruders),
     "pulse": Part("tools/intruders.py pulse --json", _says_intruders),

@@ -12,6 +12,7 @@ import contextlib
 import json
 import math
 import os
+import struct
 import subprocess
 import sys
 import tempfile
@@ -141,15 +142,15 @@ def recording(path: Path, period_ms: float, deadline_ms: float) -> dict[str, Any
     Two that are `deadline_ms` apart are a deadline that was missed: so long the device waits for a command.
     """
     counts, missing, last = Counter[str](), Counter[str](), dict[str, int]()
-    longest_ms, late, before_ns = 0.0, 0, 0
-    for topic, t_ns, number in _numbered(path):
+    longest_ms, late, before_s = 0.0, 0, 0.0
+    for topic, monotonic_s, number in _numbered(path):
         if topic in last:
             missing[topic] += number != last[topic] + 1
         if topic == TICKS_TOPIC and counts[topic]:
-            between_ms = (t_ns - before_ns) * 1e-6
+            between_ms = 1e3 * (monotonic_s - before_s)
             longest_ms, late = max(longest_ms, between_ms), late + (between_ms >= deadline_ms)
         if topic == TICKS_TOPIC:
-            before_ns = t_ns
+            before_s = monotonic_s
         counts[topic] += 1
         last[topic] = number
     return {
@@ -165,23 +166,24 @@ def recording(path: Path, period_ms: float, deadline_ms: float) -> dict[str, Any
     }
 
 
-def _numbered(path: Path) -> Iterator[tuple[str, int, int]]:
-    """Topic, time and number of each message of a recording, up to where it was cut."""
+def _numbered(path: Path) -> Iterator[tuple[str, float, int]]:
+    """Topic, time and number of each message of a recording, up to where it was cut: a tick's time is the monotonic
+    clock's, because the wall clock may be set meanwhile."""
     topics: dict[int, str] = {}
-    with path.open("rb") as file, contextlib.suppress(EndOfFile):
+    with path.open("rb") as file, contextlib.suppress(EndOfFile, struct.error):
         for record in StreamReader(file).records:
             if isinstance(record, Channel):
                 topics[record.id] = record.topic
             elif isinstance(record, Message):
                 message = _DECODER.decode(record.data)
                 topic = topics[record.channel_id]
-                yield topic, message.t_ns, message.tick if topic == TICKS_TOPIC else message.seq
+                yield topic, message.monotonic_s, message.tick if topic == TICKS_TOPIC else message.seq
 
 
 class _Numbered(msgspec.Struct):
     """What is looked at of a message: a snapshot's `tick` is something else than a tick's."""
 
-    t_ns: int
+    monotonic_s: float = 0.0
     tick: Any = None
     seq: int = 0
 
@@ -229,13 +231,13 @@ def _begun(arguments: list[str], stack: contextlib.ExitStack, **streams: int) ->
 
 def _killed(victim: "subprocess.Popen[Any]", path: Path, recorder: "subprocess.Popen[Any] | None" = None) -> float:
     """Kills `victim` and ends the `recorder`, if it is another: how much of the time before is not in the file, ms."""
-    killed_ns = time.time_ns()
+    killed_s = time.monotonic()
     victim.kill()
     victim.wait(PATIENCE_S)
     if recorder is not None:
         end(recorder)
-    newest_ns = max((t_ns for topic, t_ns, _ in _numbered(path) if topic == TICKS_TOPIC), default=0)
-    return round((killed_ns - newest_ns) * 1e-6, 1)
+    newest_s = max((monotonic_s for topic, monotonic_s, _ in _numbered(path) if topic == TICKS_TOPIC), default=0.0)
+    return round(1e3 * (killed_s - newest_s), 1)
 
 
 def staying(values: list[int]) -> int:
