@@ -20,7 +20,7 @@ from setuptools.command.build_ext import build_ext
 COMPILED = {
     "firmware_protocol": ("value", "schema", "checksum", "layouts", "wire", "codec", "framing"),
     "tormagd/physics": ("friction", "relaxation"),
-    "tormagd/model": ("displacement", "force_curve", "relaxing"),
+    "tormagd/model": ("displacement", "force_curve"),
     "tormagd/inverse": ("solution", "newton"),
     "tormagd/hardware": ("frame_stream", "link", "link_quality", "link_statistics", "measurement", "connection"),
     "tormagd/safety": ("operating_state",),

@@ -20,7 +20,8 @@ import numpy as np
 import torch
 from tactile_models import dataset
 
-from tormagd.model.model_file import ForceModel, Relaxation, save_model
+from tormagd.model.memory import Memory
+from tormagd.model.model_file import ForceModel, save_model
 from tormagd.model.rising import not_rising_share
 from tormagd.simulation.pad import cyclic_records, holding_records
 from tormagd.simulation.parameters import PlantError, load_plant
@@ -72,7 +73,9 @@ def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceMod
         metrics=metrics,
         created=created,
         training_data_sha256=cycles.sha256(),
-        relaxation=Relaxation(grey.series.times_s, grey.series.fractions, grey.field_series.fractions),
+        memory=Memory(
+            fractions=grey.series.fractions, times_s=grey.series.times_s, field_fractions=grey.field_series.fractions
+        ),
     )
     return dataclasses.replace(grey.model, metadata=metadata)
 

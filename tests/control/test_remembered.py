@@ -1,5 +1,7 @@
 """What the element remembers, beside the laws that it follows: a Prony series, and a lag that goes along changes."""
 
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,22 +13,46 @@ from tormagd.control.plan import PlanState
 from tormagd.control.remembered import NOTHING_REMEMBERED, Remembered, Remembering
 from tormagd.model.displacement import Turn
 from tormagd.model.memory import NO_MEMORY, Memory
+from tormagd.model.model_file import load_model
+from tormagd.model.shipped import model_path
 from tormagd.physics.relaxation import PronySeries
 
 MEMORY = Memory(fractions=(0.05, 0.04, 0.04), times_s=(8.0, 90.0, 900.0), lag_mT=8.0, turn_mT=80.0)
-REMEMBERING = Remembering(MEMORY)
+FIELDS_MT = (50.0, 900.0)
+STEADY = MEMORY.of(relaxation=True, hysteresis=False)
+REMEMBERING = Remembering(MEMORY, FIELDS_MT)
+CURVE = load_model(model_path("torque_mre_50_40", Path()), element="torque").curve(1.5, 42.0, 40.0)
 
 
 def test_it_relaxes_as_its_series_does() -> None:
     series = PronySeries(MEMORY.fractions, MEMORY.times_s)
-    after_rest, jump, step = series.relaxed(0.6), series.discretise(0.0), series.discretise(0.5)
-    _, state = jump.advance(after_rest, 2.0)
-    remembered = REMEMBERING.rested(300.0, 0.6, 0.0)
-    assert 0.6 - remembered.relaxed_N == pytest.approx(0.6 * 0.87)
+    before_N, after_N = CURVE.force_N(300.0), CURVE.force_N(700.0)
+    step, state = series.discretise(0.5), series.relaxed(before_N)
+    remembered = Remembering(STEADY, FIELDS_MT).rested(CURVE, 300.0, 0.0)
+    assert remembered.relaxed_N == pytest.approx(before_N * 0.13)
     for place in range(1, 41):
-        true_N, state = step.advance(state, 2.0)
-        remembered = REMEMBERING.followed(remembered, 300.0, 0.0, 2.0, 0.5 * place)
-        assert 2.0 - remembered.relaxed_N == pytest.approx(true_N, abs=1e-12)
+        true_N, state = step.advance(state, after_N)
+        remembered = Remembering(STEADY, FIELDS_MT).followed(remembered, CURVE, 700.0, 0.5 * place)
+        assert after_N - remembered.relaxed_N == pytest.approx(true_N, abs=1e-12)
+
+
+def test_what_the_field_adds_relaxes_by_fractions_of_its_own() -> None:
+    memory = Memory(fractions=(0.05, 0.04), times_s=(1.0, 30.0), field_fractions=(0.1, 0.02))
+    remembering = Remembering(memory, FIELDS_MT)
+    remembered = remembering.unloaded(700.0, 5.0)
+    assert remembered.relaxed_N == 0.0
+    remembered = remembering.followed(remembered, CURVE, 700.0, 5.0)
+    assert remembered.relaxed_N == pytest.approx(0.0)
+    remembered = remembering.followed(remembered, CURVE, 700.0, 1e4)
+    free_N = CURVE.force_N(FIELDS_MT[0])
+    assert remembered.relaxed_N == pytest.approx(0.09 * free_N + 0.12 * (CURVE.force_N(700.0) - free_N))
+
+
+def test_time_that_goes_back_ages_nothing() -> None:
+    remembered = REMEMBERING.rested(CURVE, 300.0, 10.0)
+    remembered = REMEMBERING.followed(remembered, CURVE, 700.0, 11.0)
+    earlier = REMEMBERING.followed(remembered, CURVE, 700.0, 10.0)
+    assert earlier.relaxed_N == pytest.approx(remembered.relaxed_N)
 
 
 def test_the_field_lags_along_its_way_and_not_in_time() -> None:
@@ -38,17 +64,31 @@ def test_the_field_lags_along_its_way_and_not_in_time() -> None:
     assert REMEMBERING.lag_at_mT(start, -2_000.0) == pytest.approx(-8.0)
 
 
+def test_what_relaxes_is_the_force_of_the_element_s_own_field() -> None:
+    remembered = REMEMBERING.followed(REMEMBERING.rested(CURVE, 300.0, 0.0), CURVE, 500.0, 0.0)
+    lag_mT = REMEMBERING.lag_at_mT(Remembered(300.0, time_s=0.0), 500.0)
+    assert remembered.lag_mT == lag_mT
+    steady = Remembering(STEADY, FIELDS_MT)
+    without_lag = steady.followed(steady.rested(CURVE, 300.0, 0.0), CURVE, 500.0 - lag_mT, 0.0)
+    assert remembered.relaxed_N == pytest.approx(without_lag.relaxed_N, abs=1e-12)
+
+
 def test_an_element_without_memory_is_as_its_gap() -> None:
-    forgetful = Remembering(NO_MEMORY)
-    remembered = forgetful.followed(
-        forgetful.rested(300.0, 0.6, 0.0), 500.0, forgetful.lag_at_mT(Remembered(time_s=0.0), 500.0), 2.0, 1.0
-    )
+    forgetful = Remembering(NO_MEMORY, FIELDS_MT)
+    remembered = forgetful.followed(forgetful.rested(CURVE, 300.0, 0.0), CURVE, 500.0, 1.0)
     assert (remembered.lag_mT, remembered.relaxed_N) == (0.0, 0.0)
 
 
 def test_before_anything_is_known_nothing_is_expected() -> None:
+    assert NOTHING_REMEMBERED.is_empty
     assert REMEMBERING.lag_at_mT(NOTHING_REMEMBERED, 500.0) == 0.0
     assert NOTHING_REMEMBERED.relaxed_N == 0.0
+
+
+def test_either_can_be_left_out() -> None:
+    assert MEMORY.of(relaxation=True, hysteresis=True) == MEMORY
+    assert MEMORY.of(relaxation=True, hysteresis=False) == STEADY
+    assert MEMORY.of(relaxation=False, hysteresis=True) == Memory(lag_mT=8.0, turn_mT=80.0)
 
 
 RELAXED = 0.13
@@ -90,16 +130,11 @@ def test_a_gap_that_no_device_has_is_not_believed_to_have_been_one() -> None:
     assert remembered.relaxed_N == pytest.approx(RELAXED * 0.62, rel=0.1)
 
 
-@given(
-    steps=st.lists(
-        st.tuples(st.floats(100.0, 900.0), st.floats(0.0, 8.0), st.floats(-1.0, 1e6)), min_size=1, max_size=30
-    )
-)
-def test_it_never_remembers_more_than_there_was(steps: list[tuple[float, float, float]]) -> None:
-    remembered, most_N = REMEMBERING.rested(300.0, 0.6, 0.0), 0.6
-    for field_mT, force_N, time_s in steps:
-        lag_mT = REMEMBERING.lag_at_mT(remembered, field_mT)
-        remembered = REMEMBERING.followed(remembered, field_mT, lag_mT, force_N, time_s)
-        most_N = max(most_N, force_N)
+@given(steps=st.lists(st.tuples(st.floats(100.0, 900.0), st.floats(0.0, 1e6)), min_size=1, max_size=30))
+def test_it_never_remembers_more_than_there_was(steps: list[tuple[float, float]]) -> None:
+    remembered, most_N = REMEMBERING.rested(CURVE, 300.0, 0.0), CURVE.force_N(300.0)
+    for field_mT, time_s in steps:
+        remembered = REMEMBERING.followed(remembered, CURVE, field_mT, time_s)
+        most_N = max(most_N, CURVE.force_N(min(field_mT - remembered.lag_mT, FIELDS_MT[1])))
         assert abs(remembered.lag_mT) <= MEMORY.lag_mT
-        assert 0.0 <= remembered.relaxed_N <= sum(MEMORY.fractions) * most_N * (1.0 + 1e-12)
+        assert remembered.relaxed_N <= sum(MEMORY.fractions) * most_N * (1.0 + 1e-12)

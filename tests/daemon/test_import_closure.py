@@ -58,7 +58,6 @@ def test_the_daemon_loads_the_model_and_nothing_of_its_training() -> None:
         "tormagd.model.force_curve",
         "tormagd.model.memory",
         "tormagd.model.model_file",
-        "tormagd.model.relaxing",
         "tormagd.model.rising",
         "tormagd.model.shipped",
     }

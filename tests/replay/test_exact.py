@@ -13,10 +13,10 @@ from firmware_protocol.codec import Switches
 from tormagd.control.device_fit import UNSEEN
 from tormagd.control.governor import GovernorState
 from tormagd.control.plan import NOTHING_SHOWN, Outside, Plan, PlanState
+from tormagd.control.remembered import Remembered
 from tormagd.control.step import StepState
 from tormagd.exact import InexactError, first_difference, kinds, packed, plain, restored
 from tormagd.model.displacement import Turn
-from tormagd.model.relaxing import Relaxed
 from tormagd.replay.rerun import KNOWN
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import SafetyState
@@ -41,8 +41,9 @@ def through_msgpack(thing: object) -> Any:
     return restored(msgspec.msgpack.decode(packed(plain(thing))), KNOWN | kinds(Switches))
 
 
-def test_what_a_pad_remembers_comes_back() -> None:
-    state = PlanState(GovernorState(1.0, 2.0), PLAN, relaxed=Relaxed(1.0, (3.5, 0.25), (0.5, 0.125), 0.0625))
+def test_what_an_element_remembers_comes_back() -> None:
+    remembered = Remembered(400.0, 1.5, (3.5, 0.25), (0.5, 0.125), 0.0625, 1.0)
+    state = PlanState(GovernorState(1.0, 2.0), PLAN, remembered=remembered)
     assert through_msgpack(state) == state
 
 

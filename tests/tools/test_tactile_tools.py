@@ -9,7 +9,7 @@ import tactile_model
 
 from tormagd.config import Config
 from tormagd.control.core import build_core
-from tormagd.model.model_file import Relaxation, save_model
+from tormagd.model.model_file import save_model
 from tormagd.scenes.scene import scene_path
 
 
@@ -29,8 +29,7 @@ def test_neighbours_decide_on_the_pad_and_nothing_on_the_brake(monkeypatch: pyte
 def test_a_pads_model_is_trained_and_taken_by_a_scene(tmp_path: Path) -> None:
     effort = tactile_model.Effort(samples_per_cycle=8, hold_samples=80, epochs=8, settling_epochs=2)
     model = tactile_model.trained("pad_1", effort, datetime.date(2026, 11, 22))
-    assert isinstance(model.metadata.relaxation, Relaxation)
-    assert sum(model.metadata.relaxation.fractions) == pytest.approx(0.108, abs=0.03)
+    assert sum(model.metadata.memory.fractions) == pytest.approx(0.108, abs=0.03)
     assert model.metadata.metrics["unseen_holds_share"] < 0.1
     save_model(tmp_path / "mine.safetensors", model)
     text = Path(scene_path("radial_pulse")).read_text().replace('"tactile_mre_c"', '"mine.safetensors"')

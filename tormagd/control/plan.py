@@ -23,7 +23,6 @@ from tormagd.model.displacement import MOVING_MM_S
 from tormagd.model.features import FEATURES
 from tormagd.model.force_curve import ForceCurve
 from tormagd.model.model_file import ForceModel
-from tormagd.model.relaxing import NOTHING_RELAXED, Relaxed
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Scene, terms_of
 
@@ -173,10 +172,9 @@ NOTHING_SHOWN: Final = Shown()
 
 @final
 class PlanState(Value):
-    """What planning remembers, and what the element does. `lag_s` is how late the device's carriages are, `relaxed`
-    what a pad's elastomer has relaxed."""
+    """What planning remembers, and what the element does. `lag_s` is how late the device's carriages are."""
 
-    __match_args__ = ("governor", "plan", "shown", "lag_s", "handle", "remembered", "relaxed")
+    __match_args__ = ("governor", "plan", "shown", "lag_s", "handle", "remembered")
     __slots__ = __match_args__
 
     def __init__(
@@ -187,7 +185,6 @@ class PlanState(Value):
         lag_s: float = 0.0,
         handle: HandleWatch = UNHEARD,
         remembered: Remembered = NOTHING_REMEMBERED,
-        relaxed: Relaxed = NOTHING_RELAXED,
     ) -> None:
         self.governor: Final = governor
         self.plan: Final = plan
@@ -195,12 +192,11 @@ class PlanState(Value):
         self.lag_s: Final = lag_s
         self.handle: Final = handle
         self.remembered: Final = remembered
-        self.relaxed: Final = relaxed
 
     @property
     def device(self) -> DeviceFit:
         """The device as far as it has shown itself, and as its elastomer is relaxed now."""
-        return self.shown.device.relaxed(self.remembered.relaxed_N + self.relaxed.lost_N)
+        return self.shown.device.relaxed(self.remembered.relaxed_N)
 
     @property
     def sensor(self) -> Sensor:
@@ -238,11 +234,12 @@ class Planner:
         terms = terms_of(scene)
         self._governor = Governor(portrait, scene.force, position.gap_speed_mm_s, terms)
         self._cip_percent = cip_percent
-        self._memory = Remembering(model.metadata.memory)
         self._closed_mm, self._open_mm = scene.insert.gap_closed_mm, scene.insert.gap_open_mm
         self._ceiling_N = CEILING * scene.force.most_N
         displacements_mm, rates_mm_s, fields_mT, _ = model.feature_ranges
         self._displacements_mm, self._rates_mm_s, self._fields_mT = displacements_mm, rates_mm_s, fields_mT
+        memory = model.metadata.memory.of(relaxation=terms.relaxation, hysteresis=terms.hysteresis)
+        self._memory = Remembering(memory, fields_mT)
         self._fastest_mm_s, self._hardest_mm_s2 = position.gap_speed_mm_s, position.gap_acceleration_mm_s2
         self._adapts_in_s, self._scales = trim.time_s, (trim.least, trim.most)
         self._low_confidence = config.limits.low_confidence
@@ -250,7 +247,6 @@ class Planner:
         self._has_rate, self._has_lag = terms.rate, terms.lag and terms.learning
         self._has_creep = terms.creep and contact.slides
         self._learns_creep = terms.learning and self._has_creep
-        self._relaxing = None if terms.relaxation is False else model.relaxing
         self._fits = terms.learning and (terms.scale or terms.offset)
         self._learns_scale, self._learns_offset = terms.scale, terms.offset
         self._only_curve = model.curve(
@@ -263,30 +259,26 @@ class Planner:
         least = self.portrait.least_N
         field_mT = self._field.field_mT(open_mm)
         resting = Plan(0, now_s, None, None, least, None, field_mT, open_mm, 0.0, 1.0, (Limit.NO_SETPOINT,))
-        relaxed = NOTHING_RELAXED if self._relaxing is None else self._relaxing.rested(now_s)
-        return PlanState(GovernorState(now_s, least, above_N=0.0), resting, relaxed=relaxed)
+        return PlanState(GovernorState(now_s, least, above_N=0.0), resting)
 
     def afresh(self, state: PlanState, now_s: float) -> PlanState:
         """Begins anew after `state`, for which no plan could be made: plans go on being numbered, and the elastomer has
         not forgotten."""
         begun = self.start(now_s)
-        return begun.replaced(plan=begun.plan.replaced(number=state.plan.number + 1), relaxed=state.relaxed)
+        return begun.replaced(plan=begun.plan.replaced(number=state.plan.number + 1), remembered=state.remembered)
 
     def plan(
         self, state: PlanState, now_s: float, setpoint: TimedSetpoint | None, estimate: Estimate | None
     ) -> PlanState:
         """The next plan. `estimate` is None while the device has said nothing: nothing is learned of it then."""
-        relaxed = self._relax(state.relaxed, now_s, estimate)
         remembered = self._remember(state.remembered, now_s, estimate)
         model_N = self._model_N(estimate, remembered)
-        if model_N is not None:
-            model_N -= relaxed.lost_N
         shown = self._learn(state.shown, now_s, estimate, model_N, remembered.relaxed_N)
         handle = state.handle
         if self._contact.slides and estimate is not None and model_N is not None:
             handle = handle.heard(estimate.sensed_s, estimate.handle_mm, estimate.force_N, model_N)
         # from here on over the model's force without memory, which searches and portrait know
-        device = shown.device.relaxed(remembered.relaxed_N + relaxed.lost_N)
+        device = shown.device.relaxed(remembered.relaxed_N)
         if self._has_creep:
             sliding_mm_s = MOVING_MM_S if estimate is None else estimate.handle.sliding_mm_s
             device = device.times(shown.slow.factor_at(sliding_mm_s))
@@ -349,7 +341,7 @@ class Planner:
             outside=outside,
             sensor_doubted_s=shown.sensor.doubted_s,
         )
-        return PlanState(governor, plan, shown, lag_s, handle, remembered, relaxed)
+        return PlanState(governor, plan, shown, lag_s, handle, remembered)
 
     def foresee(self, state: PlanState) -> PlanState:
         """What can be prepared for the next plans once one is made: to be called after each, when nothing waits."""
@@ -373,43 +365,26 @@ class Planner:
             _within(displacement_mm, self._displacements_mm), _within(rate_mm_s, self._rates_mm_s), self._cip_percent
         )
 
-    def _relax(self, relaxed: Relaxed, now_s: float, estimate: Estimate | None) -> Relaxed:
-        """What the pad has relaxed by now, from what it was put to since. Until the gap is known it counts as open,
-        where homing leads to."""
-        relaxing = self._relaxing
-        if relaxing is None or estimate is None:
-            return relaxed
-        curve = self._present_curve(estimate)
-        field_mT = self._field.field_mT(self._gap_mm(estimate) if estimate.is_homed else self._open_mm)
-        free_N = curve.force_N(0.0)
-        return relaxing.advance(relaxed, now_s, free_N, curve.force_N(_within(field_mT, self._fields_mT)) - free_N)
-
     def _remember(self, remembered: Remembered, now_s: float, estimate: Estimate | None) -> Remembered:
-        """The element's memory after the measured gap. It rested long where the device was switched on."""
+        """The element's memory after the measured gap. A brake has rested where the device was switched on, and relaxes
+        of what a handle at the roller's speed would feel; a pad was not touched, and relaxes of what presses it."""
         if estimate is None:
             return remembered
-        is_new = remembered.time_s == -math.inf
-        if not estimate.is_homed:
+        if self._contact.slides and not estimate.is_homed:
             # until both switches are found, positions count from where the carriages were, as if they were open
             opened_mm = max(estimate.gap_mm - self._open_mm, remembered.opened_mm)
-            return Remembered(opened_mm=opened_mm) if is_new else remembered
-        gap_mm = self._gap_mm(estimate)
-        if is_new:
+            return Remembered(opened_mm=opened_mm) if remembered.is_empty else remembered
+        gap_mm = max(estimate.gap_mm, self._closed_mm - BEYOND_MM) if estimate.is_homed else self._open_mm
+        field_mT = self._field.field_mT(gap_mm)
+        curve = self._only_curve if self._contact.slides else self._present_curve(estimate)
+        if remembered.is_empty and self._contact.slides:
             found_mm = gap_mm - remembered.opened_mm
             is_known = self._closed_mm - BEYOND_MM <= found_mm <= self._open_mm + BEYOND_MM
             rested_mT = self._field.field_mT(found_mm if is_known else gap_mm)
-            remembered = self._memory.rested(rested_mT, self._sliding_N(rested_mT), now_s)
-        field_mT = self._field.field_mT(gap_mm)
-        lag_mT = self._memory.lag_at_mT(remembered, field_mT)
-        return self._memory.followed(remembered, field_mT, lag_mT, self._sliding_N(field_mT - lag_mT), now_s)
-
-    def _gap_mm(self, estimate: Estimate) -> float:
-        """The measured gap, no closer than one whose field means something."""
-        return max(estimate.gap_mm, self._closed_mm - BEYOND_MM)
-
-    def _sliding_N(self, field_mT: float) -> float:
-        """The model's force of a handle at the roller's speed, of which its elastomer relaxes; 0 where it does not."""
-        return self._only_curve.force_N(_within(field_mT, self._fields_mT)) if self._memory.relaxes else 0.0
+            remembered = self._memory.rested(curve, rested_mT, now_s)
+        elif remembered.is_empty:
+            remembered = self._memory.unloaded(field_mT, now_s)
+        return self._memory.followed(remembered, curve, field_mT, now_s)
 
     def _learn(
         self, shown: Shown, now_s: float, estimate: Estimate | None, model_N: float | None, relaxed_N: float

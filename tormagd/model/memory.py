@@ -1,8 +1,9 @@
 """What an element remembers, as a model file carries it: its elastomer relaxes, and its field lags behind the gap's.
 
-    F = D(B - h) - sum g_i q_i        q_i: D(B - h) behind a low-pass of time constant tau_i
+    F = F0(B - h) less what has relaxed of it      h follows the field's changes towards +-h_max
 
-D is the force without memory, which the network knows; h follows the field's changes towards +-h_max.
+F0 is the force without memory, which the network knows. What of it is there without field, and what the field adds,
+relax each by a Prony series (`tormagd.physics.relaxation`); a brake's by the same, of a pad's they differ.
 """
 
 from itertools import pairwise
@@ -10,28 +11,31 @@ from itertools import pairwise
 import msgspec
 
 from tormagd.physics.errors import DomainError, require
+from tormagd.physics.relaxation import PronySeries
 
 MOST_TERMS = 8
 LONGEST_S = 1e5
 
 
 class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The fractions g_i and times tau_i of relaxation, the shortest first, and the field's lag h: at most `lag_mT`,
-    which is reached over changes of `turn_mT`. Without any of them an element remembers nothing. Raises `DomainError`.
-    """
+    """The fractions g_i and times tau_i of relaxation, the shortest first, `field_fractions` of what the field adds
+    where those differ, and the field's lag h: at most `lag_mT`, which is reached over changes of `turn_mT`. Without any
+    of them an element remembers nothing. Raises `DomainError`."""
 
     fractions: tuple[float, ...] = ()
     times_s: tuple[float, ...] = ()
+    field_fractions: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET
     lag_mT: float = 0.0
     turn_mT: float = 1.0
 
     def __post_init__(self) -> None:
-        if len(self.times_s) != len(self.fractions) or len(self.fractions) > MOST_TERMS:
-            raise DomainError("memory.times_s", self.times_s, f"one for each fraction, at most {MOST_TERMS}")
-        for fraction in self.fractions:
-            require("memory.fractions", fraction, 0.0, 1.0)
-        if not sum(self.fractions, 0.0) < 1.0:
-            raise DomainError("memory.fractions", self.fractions, "a sum below 1")
+        for name, fractions in (("fractions", self.fractions), ("field_fractions", self._field_fractions)):
+            if len(self.times_s) != len(fractions) or len(fractions) > MOST_TERMS:
+                raise DomainError("memory.times_s", self.times_s, f"one for each of {name}, at most {MOST_TERMS}")
+            for fraction in fractions:
+                require(f"memory.{name}", fraction, 0.0, 1.0)
+            if not sum(fractions, 0.0) < 1.0:
+                raise DomainError(f"memory.{name}", fractions, "a sum below 1")
         for time_s in self.times_s:
             require("memory.times_s", time_s, 1e-3, LONGEST_S)
         if any(before >= after for before, after in pairwise(self.times_s)):
@@ -39,6 +43,31 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         require("memory.turn_mT", self.turn_mT, 0.1, 1e5)
         # a gap that follows a greater lag might run after itself
         require("memory.lag_mT", self.lag_mT, 0.0, 0.25 * self.turn_mT)
+
+    @property
+    def free(self) -> PronySeries:
+        """How the force without field relaxes."""
+        return PronySeries(self.fractions, self.times_s)
+
+    @property
+    def added(self) -> PronySeries:
+        """How what the field adds relaxes."""
+        return PronySeries(self._field_fractions, self.times_s)
+
+    @property
+    def _field_fractions(self) -> tuple[float, ...]:
+        return self.fractions if isinstance(self.field_fractions, msgspec.UnsetType) else self.field_fractions
+
+    def of(self, *, relaxation: bool, hysteresis: bool) -> "Memory":
+        """Of these alone."""
+        relaxing = self if relaxation else NO_MEMORY
+        return Memory(
+            fractions=relaxing.fractions,
+            times_s=relaxing.times_s,
+            field_fractions=relaxing.field_fractions,
+            lag_mT=self.lag_mT if hysteresis else 0.0,
+            turn_mT=self.turn_mT,
+        )
 
 
 NO_MEMORY = Memory()

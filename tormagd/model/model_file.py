@@ -35,9 +35,7 @@ from tormagd.model.features import (
 )
 from tormagd.model.force_curve import ForceCurve, Known, Network
 from tormagd.model.memory import NO_MEMORY, Memory
-from tormagd.model.relaxing import Relaxing
 from tormagd.physics.errors import DomainError
-from tormagd.physics.relaxation import PronySeries
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -54,29 +52,13 @@ class ModelFileError(ValueError):
     """A model file that is missing, damaged, or meant for something else; the text says which and what to do."""
 
 
-class Relaxation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the elastomer relaxes whose force without memory the network gives: of that force without field, and of what
-    the field adds, the shares that die away with each time constant. Raises `DomainError` as `PronySeries` does."""
-
-    times_s: tuple[float, ...]
-    fractions: tuple[float, ...]
-    field_fractions: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        self.relaxing()
-
-    def relaxing(self) -> Relaxing:
-        """The same as what the daemon remembers by."""
-        return Relaxing(PronySeries(self.fractions, self.times_s), PronySeries(self.field_fractions, self.times_s))
-
-
 class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What a force model is and where it came from.
 
     `insert` names the insert the data were measured on; `ranges` holds the least and the greatest value seen in
     training for each feature and for `force_N`; `metrics` whatever the trainer measured; `created` is given, never
-    read from a clock; `memory` is what a brake's network leaves out, `relaxation` what a pad's does. Raises
-    `DomainError` on anything that could not be saved and loaded again.
+    read from a clock; `memory` is what the network leaves out. Raises `DomainError` on anything that could not be saved
+    and loaded again.
     """
 
     element: Element
@@ -89,7 +71,6 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     created: datetime.date
     features: tuple[str, ...] = FEATURES
     units: dict[str, str] = msgspec.field(default_factory=lambda: dict(UNITS))
-    relaxation: Relaxation | msgspec.UnsetType = msgspec.UNSET
     memory: Memory = NO_MEMORY
 
     def __post_init__(self) -> None:
@@ -190,12 +171,6 @@ class ForceModel:
         """Greatest less least force seen in training."""
         low, high = self.metadata.ranges["force_N"]
         return high - low
-
-    @cached_property
-    def relaxing(self) -> Relaxing | None:
-        """How the elastomer relaxes; None where the model knows nothing of it."""
-        known = self.metadata.relaxation
-        return None if isinstance(known, msgspec.UnsetType) else known.relaxing()
 
     @cached_property
     def fingerprint(self) -> str:

@@ -31,7 +31,6 @@ from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.messages import TickRecord
 from tormagd.model.displacement import Turn
-from tormagd.model.relaxing import Relaxed
 from tormagd.recording.black_box import is_tick
 from tormagd.replay.rebuild import ReplayError
 from tormagd.safety.codes import Fault, Limit
@@ -56,7 +55,6 @@ KNOWN = kinds(
         Estimate,
         Handle,
         Turn,
-        Relaxed,
         Reference,
         Expected,
     ),

@@ -97,29 +97,32 @@ class Budget(Strict, frozen=True):
 class Terms(Strict, frozen=True):
     """The parts of the controller's model. One that is left out is not computed.
 
-    `rate`      the handle's rate and displacement are inputs of the learned model; without it the force over the gap is
-                one table, that of a handle at the thesis's 42 mm/s, and there is no search
-    `creep`     what friction does beside that of sliding at a creep, Stribeck's and static, is learned
-    `scale`     the device's force over the model's is learned: friction, modulus, field
-    `offset`    the device's offset is learned: what the elastomer relaxes, and what the field's hysteresis holds back,
-                beyond what its model expects
-    `slope`     setpoints are carried along their slope to now and ahead
-    `forecast`  a force that repeats itself is foreseen
-    `preview`   what a publisher says will follow is used
-    `lag`       how late the carriages are is learned, and made up for
-    `motor`     the duty for the reference's speed and acceleration is fed forward
-    `friction`  the duty that overcomes the dry friction of gearbox and screw is fed forward
-    `pull`      the duty against the magnets' pull is fed forward, and limits the opening speed
-    `relaxation` of a pad alone, where nothing is said of it: what its elastomer has relaxed away of the force is told
-                by the model from what it was put to. A pad in its turn has no `creep`
+    `rate`        the handle's rate and displacement are inputs of the learned model; without it the force over the
+                  gap is one table, that of a handle at the thesis's 42 mm/s, and there is no search
+    `creep`       what friction does beside that of sliding at a creep, Stribeck's and static, is learned
+    `scale`       the device's force over the model's is learned: friction, modulus, field
+    `offset`      the device's offset is learned: what the elastomer relaxes, and what the field's hysteresis holds
+                  back, beyond what its model expects
+    `relaxation`  what the elastomer has relaxed away of the force is told by the model, from what it was put to
+    `hysteresis`  how far the field lags behind that of its gap is told by the model, from where the gap has been
+    `slope`       setpoints are carried along their slope to now and ahead
+    `forecast`    a force that repeats itself is foreseen
+    `preview`     what a publisher says will follow is used
+    `lag`         how late the carriages are is learned, and made up for
+    `motor`       the duty for the reference's speed and acceleration is fed forward
+    `friction`    the duty that overcomes the dry friction of gearbox and screw is fed forward
+    `pull`        the duty against the magnets' pull is fed forward, and limits the opening speed
 
-    What safety rests on is no term: the ceiling, the judgement of the sensor, the force law beside the search.
+    A pad has no `creep`. What safety rests on is no term: the ceiling, the judgement of the sensor, the force law beside
+    the search.
     """
 
     rate: bool = True
     creep: bool = True
     scale: bool = True
     offset: bool = True
+    relaxation: bool = True
+    hysteresis: bool = True
     slope: bool = True
     forecast: bool = True
     preview: bool = True
@@ -127,26 +130,23 @@ class Terms(Strict, frozen=True):
     motor: bool = True
     friction: bool = True
     pull: bool = True
-    relaxation: bool | UnsetType = UNSET
     learning: bool = True
     "No part of the model, but whether `creep`, `scale`, `offset` and `lag` go on learning, or stay what they are."
 
     @property
     def left_out(self) -> tuple[str, ...]:
         """The names of the terms that are out."""
-        return tuple(name for name in (*TERMS, RELAXATION) if getattr(self, name) is False)
+        return tuple(name for name in TERMS if not getattr(self, name))
 
     def without(self, *names: str) -> "Terms":
         """These terms with some more left out. Raises ValueError for a name that is none."""
         for name in names:
-            if name not in (*TERMS, RELAXATION):
+            if name not in TERMS:
                 raise ValueError(f"term {name!r}: allowed is one of {', '.join(TERMS)}")
         return msgspec.structs.replace(self, **dict.fromkeys(names, False))
 
 
-RELAXATION = "relaxation"
-TERMS = tuple(name for name in Terms.__struct_fields__ if name not in (RELAXATION, "learning"))
-"Those of the brake."
+TERMS = tuple(name for name in Terms.__struct_fields__ if name != "learning")
 EVERY_TERM = Terms()
 
 
@@ -224,8 +224,6 @@ class Scene(Strict, frozen=True):
             )
         if self.element == "tactile":
             self._require_no_brake()
-        elif isinstance(self.terms, Terms) and self.terms.relaxation is not UNSET:
-            raise ValueError("terms.relaxation: allowed only where element is tactile")
         slowest, fastest = self.handle.least_mm_s, self.handle.most_mm_s
         if slowest > fastest:
             raise ValueError(f"handle.least_mm_s = {slowest:g}: allowed is at most handle.most_mm_s = {fastest:g}")

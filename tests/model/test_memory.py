@@ -1,0 +1,54 @@
+"""What a model knows of relaxation: the same as the laboratory's grey box, and it survives its file."""
+
+import dataclasses
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from tormagd.control.remembered import Remembering
+from tormagd.model.memory import NO_MEMORY, Memory
+from tormagd.model.model_file import ModelFileError, load_model, save_model
+from tormagd.model.shipped import model_path
+from tormagd.physics.errors import DomainError
+from tormagd.training.grey_box import GreyBox, GreyBoxMemory
+
+HERE = Path(__file__).parent
+
+
+def test_the_daemon_remembers_what_the_grey_box_does() -> None:
+    model = load_model(model_path("tactile_mre_c", HERE), element="tactile")
+    grey = GreyBox(model, model.metadata.memory.free, model.metadata.memory.added)
+    lab, remembering = GreyBoxMemory(grey, 0.01), Remembering(model.metadata.memory, (0.0, 360.0))
+    remembered = remembering.unloaded(140.0, 0.0)
+    draw = np.random.default_rng(4)
+    for step in range(1, 300):
+        place = min(0.01 * step, 2.0), 0.3, float(draw.uniform(140.0, 360.0))
+        expected_N = lab.advance(*place, 45.0)
+        curve = model.curve(*place[:2], 45.0)
+        remembered = remembering.followed(remembered, curve, place[2], 0.01 * step)
+        assert curve.force_N(place[2]) - remembered.relaxed_N == pytest.approx(expected_N, abs=1e-6)
+
+
+def test_memory_survives_its_file_and_is_part_of_the_fingerprint(tmp_path: Path) -> None:
+    model = load_model(model_path("tactile_mre_c", HERE), element="tactile", insert="MRE-C")
+    save_model(tmp_path / "same.safetensors", model)
+    again = load_model(tmp_path / "same.safetensors", element="tactile")
+    assert again.metadata == model.metadata
+    assert again.fingerprint == model.fingerprint
+    forgetful = dataclasses.replace(model, metadata=msgspec.structs.replace(model.metadata, memory=NO_MEMORY))
+    assert forgetful.fingerprint != model.fingerprint
+
+
+def test_a_pads_model_is_not_a_brakes() -> None:
+    with pytest.raises(ModelFileError, match="trained on the tactile element, but the torque element is in use"):
+        load_model(model_path("tactile_mre_c", HERE), element="torque")
+
+
+@pytest.mark.parametrize("fractions", [(0.6, 0.6), (0.1,), (-0.1, 0.1)])
+def test_series_that_cannot_be_are_refused(fractions: tuple[float, ...]) -> None:
+    with pytest.raises(DomainError):
+        Memory(times_s=(1.0, 10.0), fractions=fractions)
+    with pytest.raises(DomainError):
+        Memory(times_s=(1.0, 10.0), fractions=(0.1, 0.1), field_fractions=fractions)
