@@ -113,8 +113,8 @@ class Terms(Strict, frozen=True):
     `friction`    the duty that overcomes the dry friction of gearbox and screw is fed forward
     `pull`        the duty against the magnets' pull is fed forward, and limits the opening speed
 
-    A pad has no `creep`. What safety rests on is no term: the ceiling, the judgement of the sensor, the force law beside
-    the search.
+    A pad has no `creep`. What safety rests on is no term: the ceiling, the judgement of the sensor, the force law
+    beside the search.
     """
 
     rate: bool = True
