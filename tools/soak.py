@@ -113,7 +113,7 @@ def daemon(minutes: float) -> dict[str, Any]:
                 status = client.request("status")
             if status["faults"]:
                 latched.append(((before_s, time.monotonic()), ", ".join(status["faults"])))
-                subprocess.run([*_ctl(folder), "clear-fault"], check=True, capture_output=True)
+                subprocess.run([*_ctl(folder), "clear-fault"], check=True, stdout=subprocess.DEVNULL)
                 _driven(folder, stack)
             for each, running in processes.items():
                 memory_kB[each].append(resident_kB(running.pid))
@@ -223,14 +223,14 @@ def _running(folder: Path, stack: contextlib.ExitStack) -> tuple[Config, "subpro
     process = _begun(["-m", "tormagd.daemon.main", "--config", str(path)], stack, stderr=subprocess.DEVNULL)
     config = load_config(path)
     wait_for(config.endpoints)
-    subprocess.run([*_ctl(folder), "home"], check=True, capture_output=True)
+    subprocess.run([*_ctl(folder), "home"], check=True, stdout=subprocess.DEVNULL)
     _driven(folder, stack)
     return config, process
 
 
 def _driven(folder: Path, stack: contextlib.ExitStack) -> None:
     """Enables the device, with setpoints arriving, until a fault."""
-    subprocess.run([*_ctl(folder), "enable"], check=True, capture_output=True)
+    subprocess.run([*_ctl(folder), "enable"], check=True, stdout=subprocess.DEVNULL)
     _begun([*_ctl(folder)[1:], "send", "pulse", "--duration", "1e6"], stack, stdout=subprocess.DEVNULL)
 
 
