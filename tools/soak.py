@@ -113,8 +113,7 @@ def daemon(minutes: float) -> dict[str, Any]:
                 status = client.request("status")
             if status["faults"]:
                 latched.append(((before_s, time.monotonic()), ", ".join(status["faults"])))
-                subprocess.run([*_ctl(folder), "clear-fault"], check=True, stdout=subprocess.DEVNULL)
-                _driven(folder, stack)
+                _armed_again(folder, stack)
             for each, running in processes.items():
                 memory_kB[each].append(resident_kB(running.pid))
                 descriptors[each].append(len(list((PROC / str(running.pid) / "fd").iterdir())))
@@ -226,6 +225,16 @@ def _running(folder: Path, stack: contextlib.ExitStack) -> tuple[Config, "subpro
     subprocess.run([*_ctl(folder), "home"], check=True, stdout=subprocess.DEVNULL)
     _driven(folder, stack)
     return config, process
+
+
+def _armed_again(folder: Path, stack: contextlib.ExitStack) -> None:
+    """Clears a fault, once the gap is open, and drives on. Raises RuntimeError if it stays."""
+    until_s = time.monotonic() + PATIENCE_S
+    while subprocess.run([*_ctl(folder), "clear-fault"], stdout=subprocess.DEVNULL).returncode:
+        if time.monotonic() > until_s:
+            raise RuntimeError(f"the fault could not be cleared within {PATIENCE_S:g} s")
+        time.sleep(SAMPLE_S)
+    _driven(folder, stack)
 
 
 def _driven(folder: Path, stack: contextlib.ExitStack) -> None:
