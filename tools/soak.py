@@ -24,12 +24,12 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from benchmark_loop import Stand, end, wait_for, write_config
-from host import HostWatch
+from benchmarks.loop import Stand, end, wait_for, write_config
+from machines.host import HostWatch
+from machines.own import own_machine
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
-from own_machine import own_machine
 from tqdm import tqdm
 
 from tormagd.client import Client

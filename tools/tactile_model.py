@@ -18,7 +18,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import torch
-from tactile_models import dataset
+from tactile.models import dataset
 
 from tormagd.model.model_file import ForceModel, Relaxation, save_model
 from tormagd.model.rising import not_rising_share
