@@ -3,7 +3,8 @@ fault into the core's sources runs where these are interpreted.
 
 A live test joins processes and sockets in real time. Where the host takes the processor for longer than the device may
 be silent, device and daemon protect themselves, as they must, and the scenario is over. That is never told from the
-failure itself: the kernel's counters and bare timers on every processor say so (`tools/host.py`), or it is a failure.
+failure itself: the kernel's counters and bare timers on every processor say so (`tools/machines/host.py`), or it is a
+failure.
 """
 
 import os
@@ -16,10 +17,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
-
-from host import HostWatch
+from machines.host import HostWatch
 
 from firmware_protocol.build import SWITCH, settle
 

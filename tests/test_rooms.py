@@ -1,6 +1,7 @@
 """Imports go one way: each room may import only what stands here (and itself)."""
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -44,6 +45,20 @@ MAY_IMPORT = {
     | {"closed_loop"},
     "closed_loop": LOWEST | {"control", "hardware", "safety", "simulation"},
 }
+TOOLS = ROOT / "tools"
+TOOL_ROOMS = {
+    "machines": set(),
+    "wire": set(),
+    "thesis": set(),
+    "motor": set(),
+    "extremes": set(),
+    "rendering": {"machines"},
+    "fault_matrix": {"wire"},
+    "benchmarks": {"machines", "wire", "thesis", "rendering"},
+    "tactile": {"thesis", "rendering", "benchmarks"},
+    "intrusion": {"machines", "rendering", "benchmarks"},
+}
+"""Of the tools; beside them stand the scripts, which no room imports. What is the product's is open to all."""
 
 
 def sources() -> Iterator[Path]:
@@ -61,17 +76,14 @@ def room(parts: tuple[str, ...]) -> str | None:
     return None
 
 
-def imported_rooms(path: Path) -> set[str]:
-    """The rooms that a module imports, also inside functions."""
-    found = set()
+def imported(path: Path) -> Iterator[str]:
+    """The full names that a module imports, also inside functions."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        names = []
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and node.module not in NO_ROOM:
-            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-        found |= {room(tuple(name.split("."))) for name in names}
-    return found - {None}
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 @pytest.mark.parametrize("path", list(sources()), ids=lambda path: str(path.relative_to(ROOT)))
@@ -80,4 +92,17 @@ def test_a_room_imports_only_what_stands_left_of_it(path):
     if here is None:
         assert path.name == "__init__.py", f"{path} stands in no room"
         return
-    assert imported_rooms(path) <= MAY_IMPORT[here] | {here}
+    rooms = {room(tuple(name.split("."))) for name in imported(path)} - {None}
+    assert rooms <= MAY_IMPORT[here] | {here}
+
+
+@pytest.mark.parametrize("here", TOOL_ROOMS)
+def test_a_room_of_the_tools_imports_no_script_and_only_what_stands_left_of_it(here):
+    ours = {path.stem for path in TOOLS.iterdir()}
+    for path in (TOOLS / here).glob("*.py"):
+        assert {name.split(".")[0] for name in imported(path)} & ours <= TOOL_ROOMS[here] | {here}, path
+
+
+def test_the_table_names_every_room_of_the_tools():
+    table = re.findall(r"^\| `tools/(\w+)/` \|", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(table) == sorted(TOOL_ROOMS) == sorted(path.parent.name for path in TOOLS.glob("*/__init__.py"))

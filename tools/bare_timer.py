@@ -10,28 +10,14 @@ import asyncio
 import json
 import signal
 import sys
-from typing import NamedTuple
 
 import uvloop
+from machines.host import PERIOD_NS, Stall
 
 from tormagd.config import RealTime
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare
 from tormagd.headroom.bare_timer import NS, beat
-
-PERIOD_NS = 1_000_000
-
-
-class Stall(NamedTuple):
-    """A time without a beat: from when the first missed beat was due until the next one came, CLOCK_MONOTONIC, s."""
-
-    start_s: float
-    end_s: float
-
-    @property
-    def length_ms(self) -> float:
-        """How long it took, ms."""
-        return (self.end_s - self.start_s) * 1e3
 
 
 async def stalls_until_ended(realtime: RealTime, period_ns: int) -> list[Stall]:

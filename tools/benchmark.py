@@ -1,7 +1,7 @@
 """Measurements of tormagd, one a subcommand. Each prints one JSON object with --json, a table otherwise.
 
 Each also says, as `machine_us`, what the interpreter and the processor were worth meanwhile: the time of a fixed loop
-of pure Python. A measurement is a module beside this one (`_` for `-`) with `add_arguments(parser)`, `measure(options)`
+of pure Python. A measurement is a module of `benchmarks` (`_` for `-`) with `add_arguments(parser)`, `measure(options)`
 that returns the object, and `print_table(object)`.
 """
 
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     measurements = parser.add_subparsers(dest="measurement", required=True)
     modules = {}
     for name, says in MEASUREMENTS.items():
-        modules[name] = importlib.import_module(f"benchmark_{name.replace('-', '_')}")
+        modules[name] = importlib.import_module(f"benchmarks.{name.replace('-', '_')}")
         subparser = measurements.add_parser(name, help=says, description=modules[name].__doc__)
         subparser.add_argument("--json", action="store_true", help="print JSON")
         modules[name].add_arguments(subparser)

@@ -2,10 +2,10 @@
 
     bound.py FORCE.csv [--plant sample_1] [--held] [--json]
 
-The CSV has the columns `t_s,force_N`. The device is known exactly (`tools/ideal_carriage.py`): its motors' torque-speed
-line, current limit, friction and pull, the field of its gap with the lag that remanence gives it, the relaxation of its
-insert, the friction of a handle that slides at one speed. The force asked is clipped to what the open gap brakes and to
-the scene's greatest; all of it in steps of a millisecond or less.
+The CSV has the columns `t_s,force_N`. The device is known exactly (`tools/rendering/ideal_carriage.py`): its motors'
+torque-speed line, current limit, friction and pull, the field of its gap with the lag that remanence gives it, the
+relaxation of its insert, the friction of a handle that slides at one speed. The force asked is clipped to what the open
+gap brakes and to the scene's greatest; all of it in steps of a millisecond or less.
 
 *Without delay*: a step knows the force asked at its end, and how fast it changes, but nothing of what follows. The
 carriages close up to it as fast as they can while they still can brake in time. For what repeats itself or is noise
@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import clarabel
 import numpy as np
 import numpy.typing as npt
-from ideal_carriage import Brake, Drive, brake_of, drive_of
+from rendering.ideal_carriage import Brake, Drive, brake_of, drive_of
 from scipy import sparse
 from tqdm import tqdm
 

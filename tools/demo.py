@@ -2,9 +2,10 @@
 
     publisher --ZeroMQ--> tormagd --serial, a pty--> virtual firmware --> plant
 
-Each part is a process of its own, as it would be beside a console; `show.py` starts them and watches, this one judges
-and sums up. What is called rendered is the plant's friction force at the roller, never the controller's prediction.
-A show that the host disturbed is told as that, and started again; the same pulse in virtual time needs no host.
+Each part is a process of its own, as it would be beside a console; `rendering/show.py` starts them and watches, this
+one judges and sums up. What is called rendered is the plant's friction force at the roller, never the controller's
+prediction. A show that the host disturbed is told as that, and started again; the same pulse in virtual time needs no
+host.
 """
 
 import concurrent.futures
@@ -15,21 +16,16 @@ from enum import IntEnum
 from typing import Any
 
 import msgspec
-from demo_figure import draw
-from host import Host
-from human_pulse import Array, pulse_profile, with_approach
-from rehearsal import Case, Rehearsal, rehearse
-from show import RATE_HZ, RECORDING, RUN_DIR, Aborted, Shown, show
-from tracking import Tracking, tracking
+from machines.host import Host
+from rendering.human_pulse import Array
+from rendering.rehearsal import Case, Rehearsal, rehearse
+from rendering.show import HOLD_S, LEAST_N, MOST_N, RAMP_S, RECORDING, RUN_DIR, Aborted, Shown, profile, scored, show
+from rendering.show_figure import draw
+from rendering.tracking import Tracking
 
 from tormagd.config import Config, ConfigError
 from tormagd.scenes.scene import Scene, load_scene
 
-LEAST_N, MOST_N = 1.4, 1.7
-PULSE_S = 20.0
-RAMP_S, HOLD_S = 1.0, 3.0
-"Approach to the pulse's first force, and a hold there in which the trim learns this device."
-START_N = 0.6
 SHOWS = 3
 "The first, and two more where the host spoils one."
 MARGIN = 0.1
@@ -59,7 +55,7 @@ class Verdict(IntEnum):
 def main() -> int:
     """Runs the demonstration; 0: what the scene states was met, 1: missed, 3: the host left too little to say."""
     started_s = time.monotonic()
-    times_s, forces_N = with_approach(*pulse_profile(PULSE_S, LEAST_N, MOST_N, RATE_HZ), START_N, RAMP_S, HOLD_S)
+    times_s, forces_N = profile()
     config = Config(scene="pulse")
     scene = load_scene(config.scene)
     print("A measured human pulse (photoplethysmogram, heartpy) as a force, through the daemon and a simulated device.")
@@ -150,12 +146,6 @@ def rehearse_all(config: Config, times_s: Array, forces_N: Array) -> list[Rehear
             except (ConfigError, RuntimeError) as error:
                 print(f"  {number}/{len(CASES)} {case.label} failed: {error}", flush=True)
     return done
-
-
-def scored(time_s: Array, asked_N: Array, rendered_N: Array) -> Tracking:
-    """Tracking over the pulse, without the approach."""
-    pulse = time_s >= RAMP_S + HOLD_S
-    return tracking(asked_N[pulse], rendered_N[pulse])
 
 
 def conclude(

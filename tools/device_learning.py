@@ -3,9 +3,9 @@
     device_learning.py [steps|creep|speeds|drift|pulse ...] [--draws N] [--drift-s S] [--tuning] [--json]
 
 Forces are the simulated plant's at the roller; nothing is subtracted from an error. A step has *arrived* ARRIVES_S
-after the device's ideal carriages (`tools/ideal_carriage.py`) would have brought the force. Devices are the three
-samples and draws 40 to 79 of the plant card; but for sample 1 they only judge. `--tuning` takes those that constants
-may be chosen on: sample 1 and draws 0 to 39. All devices are synthetic.
+after the device's ideal carriages (`tools/rendering/ideal_carriage.py`) would have brought the force. Devices are the
+three samples and draws 40 to 79 of the plant card; but for sample 1 they only judge. `--tuning` takes those that
+constants may be chosen on: sample 1 and draws 0 to 39. All devices are synthetic.
 """
 
 import argparse
@@ -23,7 +23,7 @@ import numpy.typing as npt
 from bound import HAND_MM_S, asked_of, no_delay_mm
 from envelope import FIRST_DRAW, SCENE, armed, asked_at, device, open_gap_N
 from force_tracking import PULSE_S, pulse, track
-from ideal_carriage import brake_of, drive_of
+from rendering.ideal_carriage import brake_of, drive_of
 from tqdm import tqdm
 
 from tormagd.closed_loop import ClosedLoop

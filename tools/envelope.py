@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from device_draws import drawn_device
-from ideal_carriage import brake_of
+from rendering.device_draws import drawn_device
+from rendering.ideal_carriage import brake_of
 from tqdm import tqdm
 
 from tormagd.closed_loop import ClosedLoop

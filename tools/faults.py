@@ -11,10 +11,10 @@ import argparse
 import json
 import sys
 
-from fault_cases import CAN, MATRIX, SERIAL, Injection
-from fault_recovery import recover
-from fault_rig import Rig
-from fault_watch import Cell, Watch
+from fault_matrix.cases import CAN, MATRIX, SERIAL, Injection
+from fault_matrix.recovery import recover
+from fault_matrix.rig import Rig
+from fault_matrix.watch import Cell, Watch
 from tqdm import tqdm
 
 from tormagd.safety.operating_state import RefusedError

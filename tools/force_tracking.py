@@ -14,24 +14,24 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from benchmark_step import drive, settled_loop
+from benchmarks.step import drive, settled_loop
 from bound import Bound, bound
-from force_signals import Kind, Signal, data_folder, palpation, recorded_signals
-from human_pulse import pulse_profile, with_approach
-from thesis_values import USE_CASES
-from tracking import Tracking, tracking
+from rendering.human_pulse import pulse_profile, with_approach
+from rendering.publisher import PREVIEW_S, RATE_HZ, publisher
+from rendering.signals import Kind, Signal, data_folder, palpation, recorded_signals
+from rendering.tracking import Tracking, tracking
+from thesis.values import USE_CASES
 
-from tormagd.closed_loop import ClosedLoop, stream
+from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
 from tormagd.control.core import build_core
-from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import NOTHING_SHOWN, Shown
 from tormagd.design.brake import Brake
 from tormagd.design.phase_portrait import PhasePortrait
@@ -47,13 +47,12 @@ Array = npt.NDArray[np.float64]
 Json = dict[str, Any]
 
 SAMPLES = ("sample_1", "sample_2", "sample_3")
-LEAST_N, MOST_N, RATE_HZ = 1.4, 1.7, 500
+LEAST_N, MOST_N = 1.4, 1.7
 START_N, RAMP_S, HOLD_S = 0.6, 1.0, 1.0
 TRIM_S = 10.0
 "The time the trim is given before the figures of other devices than sample 1 begin."
 PULSE_S = 20.0
 DRAWN_PULSE_S = 15.0
-PREVIEW_S = 0.07
 FILE_PREVIEW_S = 0.4
 "Of recorded signals."
 PALPATION_SEEDS = 1, 2
@@ -143,26 +142,6 @@ def track(
         asked = signal.force_N[np.searchsorted(signal.time_s, axis, side="right") - 1]
     shares = {str(limit): count / len(axis) for limit, count in sorted(held.items())}
     return Track(axis, asked, rendered, shares, sample.trim, loop.plan_state.lag_s, loop.plan_state.shown)
-
-
-def publisher(
-    times_s: Array, forces_N: Array, preview_s: float, valid_for_s: float
-) -> Callable[[float], TimedSetpoint | None]:
-    """Each force at its time; with a preview, what follows it up to `preview_s` in even steps."""
-    live = stream(times_s, forces_N, valid_for_s)
-    period_s = 1.0 / RATE_HZ
-    ahead_s = period_s * np.arange(1, round(preview_s / period_s) + 1)
-    if not ahead_s.size:
-        return live
-
-    def newest(now_s: float) -> TimedSetpoint | None:
-        setpoint = live(now_s)
-        if setpoint is None:
-            return None
-        preview = np.interp(setpoint.stamp_s + ahead_s, times_s, forces_N)
-        return setpoint.replaced(preview_N=tuple(preview.tolist()), preview_dt_s=period_s)
-
-    return newest
 
 
 def pulse(duration_s: float) -> Signal:
@@ -448,7 +427,7 @@ def main() -> int:
         result["portrait"] = portrait()
     print(json.dumps(result)) if options.json else print_tables(result)
     if options.picture is not None:
-        from force_tracking_figure import picture
+        from rendering.tracking_figure import picture
 
         picture(options.picture, pulses, stairs, result.get("draws", []))
     return 0

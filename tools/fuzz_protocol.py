@@ -27,9 +27,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from fuzz_harm import BARRAGE, RISE_ALLOWED_N, Harm, Patient
-from fuzz_receivers import SanitizedFirmware, accepted, answered, firmware_kind, measured, receive_stream
-from fuzz_traffic import (
+from scipy import stats
+from tqdm import tqdm
+from wire.harm import BARRAGE, RISE_ALLOWED_N, Harm, Patient
+from wire.receivers import SanitizedFirmware, accepted, answered, firmware_kind, measured, receive_stream
+from wire.traffic import (
     PAYLOAD_DAMAGE,
     TO_DEVICE,
     TO_HOST,
@@ -45,8 +47,6 @@ from fuzz_traffic import (
     seal,
     stuck_counters,
 )
-from scipy import stats
-from tqdm import tqdm
 
 from firmware_protocol.c.build import BuildError
 from firmware_protocol.codec import Message, can_identifier

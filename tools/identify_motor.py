@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from motor_fit import THINNED_HZ, fit_volts
-from motor_identification import identify
-from motor_log import Log, LogError, read_log
+from motor.fit import THINNED_HZ, fit_volts
+from motor.identification import identify
+from motor.log import Log, LogError, read_log
 
 from tormagd.config import Config, ConfigError, Motor, load_config
 
@@ -41,9 +41,9 @@ def main() -> int:
     if options.samples == (options.log is not None):
         parser.error("give either a log or --samples")
     if options.samples:
-        import motor_samples  # with the simulator behind it, which a log does not need
+        from motor import samples  # with the simulator behind it, which a log does not need
 
-        return motor_samples.main(options.json)
+        return samples.main(options.json)
     try:
         log = read_log(options.log)
         result = identify(log, options.gain if options.gain is not None else log.gain_N_V)

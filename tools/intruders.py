@@ -13,20 +13,16 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import floods
-import hostile_messages
-import pulse_from_afar
-import stop_lane
-import strangers
-from besieged import FIFO_PRIORITY, Line
-from host import Host, HostWatch
+from intrusion import floods, messages, pulse_from_afar, stop_lane, strangers
+from intrusion.besieged import FIFO_PRIORITY, Line
+from machines.host import Host, HostWatch
 
 PARTS: dict[str, Callable[[float], Line]] = {
     "strangers": strangers.measure,
     "pulse": pulse_from_afar.measure,
     "stop": stop_lane.measure,
     "floods": floods.measure,
-    "messages": hostile_messages.measure,
+    "messages": messages.measure,
 }
 
 

@@ -25,8 +25,8 @@ from typing import Any
 
 import mpmath as mp
 import numpy as np
-from numerics_cases import DIGITS, Batch, draw_batch, reference
-from numerics_steps import worst_step_errors
+from extremes.cases import DIGITS, Batch, draw_batch, reference
+from extremes.steps import worst_step_errors
 from numpy.typing import NDArray
 from tqdm import tqdm
 

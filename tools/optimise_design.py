@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from thesis_values import USE_CASES
+from thesis.values import USE_CASES
 from tqdm import tqdm
 
 from tormagd.config import Position

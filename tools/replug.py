@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import zmq
-from replug_cable import Cable
 from tqdm import tqdm
+from wire.cable import Cable
 
 from firmware_protocol.codec import DeviceMode
 from tormagd.client import Client, ClientError

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from human_pulse import pulse_profile
-from reproduction_page import print_summary, write_page
-from step_test import StepTest, step_test
+from rendering.human_pulse import pulse_profile
+from tactile.models import FULL, QUICK
 from tactile_experiment import reproduced
-from tactile_models import FULL, QUICK
-from thesis_errata import errata, table_2_4_errors
-from thesis_values import (
+from thesis.errata import errata, table_2_4_errors
+from thesis.page import print_summary, write_page
+from thesis.step_test import StepTest, step_test
+from thesis.values import (
     AS_BUILT,
     FIGURE_2_5_MEASURED_N,
     FIGURE_2_5_N,

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import msgspec
 from force_tracking import SAMPLES
-from scene_runs import ROOT, Case, costs, run_all
+from rendering.scene_runs import ROOT, Case, costs, run_all
 from tqdm import tqdm
 
 from tormagd.config import ConfigError

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fault_cases import LEFT_OUT
+from fault_matrix.cases import LEFT_OUT
 
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.safety.operating_state import ROWS, DeviceRequest, Event, Guard, OperatingState, Refusal, Transition

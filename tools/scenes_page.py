@@ -7,9 +7,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from benchmark_scenes import core_without, draw, figures
+from benchmarks.scenes import core_without, draw, figures
 from matplotlib.figure import Figure
-from scene_runs import ROOT
+from rendering.scene_runs import ROOT
 
 from tormagd.ctl.scene import TOLERANCES
 from tormagd.scenes.measured import JUDGED, MeasuredScene, is_met, measured, on_first, required

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import zmq
-from own_machine import own_machine
+from machines.own import own_machine
 from tqdm import tqdm
 
 from tormagd.client import Client, ClientError

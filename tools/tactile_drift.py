@@ -16,9 +16,9 @@ from typing import Any
 import msgspec
 import numpy as np
 import torch
-from tactile_models import PAD_IN_USE, dataset
-from tactile_pulse import HELD_S, RATE_HZ, course, nearest, pulse_shape, solve_all
-from thesis_values import PULSE_MAE_MT
+from tactile.models import PAD_IN_USE, dataset
+from tactile.pulse import HELD_S, RATE_HZ, course, nearest, pulse_shape, solve_all
+from thesis.values import PULSE_MAE_MT
 
 from tormagd.output import write_line
 from tormagd.simulation.pad import PADS, cyclic_records, holding_records

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tactile_models import FULL, PAD_IN_USE, QUICK, SPLIT_SEED, Effort, Trained, comparison, table_4_1, train
-from tactile_plots import Material
-from tactile_pulse import HELD_S, RATE_HZ, course, hold, pulse, pulse_shape
-from tactile_report import write_report
-from tactile_timing import solve_times
+from tactile.models import FULL, PAD_IN_USE, QUICK, SPLIT_SEED, Effort, Trained, comparison, table_4_1, train
+from tactile.plots import Material
+from tactile.pulse import HELD_S, RATE_HZ, course, hold, pulse, pulse_shape
+from tactile.report import write_report
+from tactile.timing import solve_times
 from tqdm import tqdm
 
 from tormagd.simulation.pad import PADS

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import torch
-from tactile_models import dataset
+from tactile.models import dataset
 
 from tormagd.model.memory import Memory
 from tormagd.model.model_file import ForceModel, save_model

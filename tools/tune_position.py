@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
-from benchmark_step import corner_margins
+from benchmarks.step import corner_margins
 from tqdm import tqdm
 
 from tormagd.config import Config, load_config

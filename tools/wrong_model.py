@@ -10,7 +10,7 @@ import argparse
 import json
 import sys
 
-from scene_runs import Case, run
+from rendering.scene_runs import Case, run
 
 from tormagd.scenes.measured import measured
 from tormagd.scenes.scene import TERMS

@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from device_draws import drawn_device
+from rendering.device_draws import drawn_device
 
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config

@@ -88,8 +88,8 @@ def require_there(words):
         assert importlib.util.find_spec(words[2]), words
     else:
         tool = ROOT / words[1]
-        beside = [tool.with_name(f"{tool.stem}_{word.replace('-', '_')}.py") for word in words[2:3]]
-        source = "".join(file.read_text(encoding="utf-8") for file in (tool, *beside) if file.exists())
+        parts = tool.parent.glob(f"*/{words[2].replace('-', '_')}.py") if words[2:] else ()
+        source = "".join(file.read_text(encoding="utf-8") for file in (tool, *parts))
         assert all(f'"{word}"' in source for word in words[2:] if word.startswith("--")), words
 
 

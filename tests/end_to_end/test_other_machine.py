@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from two_machines import HERE, THERE, NotPermittedError, two_machines
+from machines.two import HERE, THERE, NotPermittedError, two_machines
 
 from tormagd.config import ENDPOINTS
 

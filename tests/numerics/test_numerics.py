@@ -5,10 +5,11 @@ import math
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
+import numerics
 import numpy as np
 import pytest
+from extremes import steps
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -26,19 +27,11 @@ from tormagd.physics.force import (
     stretch_minus_one,
 )
 
-TOOLS = Path(__file__).parents[2] / "tools"
-
-
-@pytest.fixture
-def tool(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(TOOLS))
-    import numerics
-
-    return numerics
+TOOL = Path(__file__).parents[2] / "tools" / "numerics.py"
 
 
 def test_a_sampled_run_passes_and_has_the_agreed_keys() -> None:
-    command = [sys.executable, str(TOOLS / "numerics.py"), "--json", "--cases", "20000", "--reference", "400"]
+    command = [sys.executable, str(TOOL), "--json", "--cases", "20000", "--reference", "400"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(done.stdout)
@@ -54,34 +47,31 @@ def test_a_sampled_run_passes_and_has_the_agreed_keys() -> None:
     assert found["force_evaluations_per_s"] > 0
 
 
-def test_an_error_in_the_physics_is_seen(tool: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_in_the_physics_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     """One part in 1e11 on the force, far below what any plot would show."""
     original = BrakeCurve.force
     monkeypatch.setattr(BrakeCurve, "force", lambda self, eps, load: original(self, eps, load) * (1.0 + 1e-11))
-    tally = tool.check_chunk(seed=3, devices=8, references=20)
+    tally = numerics.check_chunk(seed=3, devices=8, references=20)
     assert tally.of("float64", "force").over_allowed > 5.0
     assert tally.of("float64", "stretch").over_allowed < 1.0
 
 
-def test_a_naive_formula_is_seen(tool: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_naive_formula_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     """lambda1 from the printed difference, as Eq. 29 has it, cancels while the field is weak."""
     monkeypatch.setattr(
         BrakeCurve,
         "compression",
         lambda self, y: ((1 - self.a * y) ** 2 + 2 * self.b * y) ** 0.5 - (1 - self.a * y),
     )
-    tally = tool.check_chunk(seed=3, devices=8, references=20)
+    tally = numerics.check_chunk(seed=3, devices=8, references=20)
     assert tally.of("float64", "stretch").over_allowed > 10.0
 
 
 def test_wrong_time_steps_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(TOOLS))
-    import numerics_steps
-
-    assert max(numerics_steps.worst_step_errors(1, 20).over_allowed.values()) <= 1.0
+    assert max(steps.worst_step_errors(1, 20).over_allowed.values()) <= 1.0
     # a decay by a difference of nearly equal numbers loses its digits at 1 us
     monkeypatch.setattr("tormagd.physics.relaxation.math.expm1", lambda x: math.exp(x) - 1.0)
-    assert numerics_steps.worst_step_errors(1, 20).over_allowed["relaxation"] > 1.0
+    assert steps.worst_step_errors(1, 20).over_allowed["relaxation"] > 1.0
 
 
 devices = st.tuples(

@@ -1,13 +1,11 @@
-"""The tools are scripts; their folder is put on the path as it is when they are run."""
+"""Where the measured data are that some tools play."""
 
 import os
-import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "tools"))
 
 
 @pytest.fixture

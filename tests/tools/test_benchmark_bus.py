@@ -3,9 +3,9 @@
 import random
 import struct
 
-import benchmark_bus
 import pytest
-from benchmark_bus import Meter, can_bits, computed, most_can_bits, schedule, serial_bits
+from benchmarks import bus
+from benchmarks.bus import Meter, can_bits, computed, most_can_bits, schedule, serial_bits
 
 from firmware_protocol.codec import FUNCTION, DecodeError, Drive, DriveMode, can_identifier, crc8, decode, encode
 from firmware_protocol.framing import encode_frame
@@ -85,10 +85,10 @@ def test_serial_bits_are_those_of_the_framing() -> None:
 
 def test_a_third_of_every_bus_is_free_and_the_device_needs_no_more_than_computed() -> None:
     bits = computed(schedule())
-    seen = benchmark_bus.measured(0.5)
+    seen = bus.measured(0.5)
     assert set(bits) == set(seen)
     for way, rate in bits.items():
-        bitrate = benchmark_bus.CAN_BITRATE if way == "CAN" else benchmark_bus.SERIAL_BAUD
+        bitrate = bus.CAN_BITRATE if way == "CAN" else bus.SERIAL_BAUD
         assert max(rate, seen[way]["fullest"]) <= 0.7 * bitrate
         # homing, with its handshake and commands, is in the mean too
         assert 0.7 * rate < seen[way]["mean"] <= rate

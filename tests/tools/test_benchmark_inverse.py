@@ -5,10 +5,10 @@ import io
 import json
 
 import benchmark
-import inverse_workload
 import msgspec
 import numpy as np
 import pytest
+from benchmarks import inverse_workload
 
 from tormagd.simulation.element import Element
 from tormagd.simulation.parameters import load_plant

@@ -3,7 +3,7 @@
 import json
 
 import benchmark
-from benchmark_scenes import Variant, front
+from benchmarks.scenes import Variant, front
 
 from tormagd.scenes.scene import shipped_scenes
 

@@ -1,8 +1,8 @@
 """The step benchmark on the plant: figures of the position loop that are promised to users."""
 
-import benchmark_step
 import msgspec
 import pytest
+from benchmarks import step
 from tune_position import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG
 
 from tormagd.config import Config
@@ -12,7 +12,7 @@ from tormagd.simulation.parameters import load_plant
 @pytest.fixture(scope="module")
 def measured():
     """One run on the sample the loop was tuned on."""
-    return benchmark_step.run("sample_1")
+    return step.run("sample_1")
 
 
 def test_a_millimetre_is_nearly_time_optimal(measured):
@@ -36,10 +36,10 @@ def test_the_transfer_function_is_the_plants(measured):
 def test_a_wrong_motor_is_noticed_in_the_comparison():
     """With twice the inertia the same comparison fails: it can."""
     heavy = msgspec.structs.replace(Config().motor, inertia_kg_m2=1.6e-6)
-    assert benchmark_step.model_step(heavy, load_plant("sample_1"), benchmark_step.MODEL_DUTY).nrmse > 0.1
+    assert step.model_step(heavy, load_plant("sample_1"), step.MODEL_DUTY).nrmse > 0.1
 
 
 def test_the_shipped_gains_are_robust():
-    corners = benchmark_step.corner_margins(Config())
+    corners = step.corner_margins(Config())
     assert corners["gain_margin_dB"] >= LEAST_GAIN_MARGIN_DB
     assert corners["phase_margin_deg"] >= LEAST_PHASE_MARGIN_DEG

@@ -2,18 +2,16 @@
 
 import argparse
 import math
+import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
-import benchmark_against
-import benchmark_fast
-import benchmark_latency
-import benchmark_loop
-import benchmark_virtual_time
 import numpy as np
 import pytest
-from benchmark_plot import plot_histograms
+from benchmarks import fast, latency, loop, virtual_time
+from benchmarks.against import checkout
+from benchmarks.histograms import plot_histograms
 
 import firmware_protocol
 import tormagd
@@ -26,16 +24,16 @@ PNG = b"\x89PNG"
 ROOT = Path(__file__).parents[2]
 
 
-def block(lateness_us: float, merged: int) -> benchmark_loop.Block:
+def block(lateness_us: float, merged: int) -> loop.Block:
     """Ten seconds in which every tick was equally late."""
     ticks = 10_000 - merged
-    return benchmark_loop.Block(np.full(ticks, lateness_us), np.full(ticks, 50.0), ticks, merged, 10.0)
+    return loop.Block(np.full(ticks, lateness_us), np.full(ticks, 50.0), ticks, merged, 10.0)
 
 
 def test_ratios_are_medians_over_the_pairs_and_not_of_the_sums() -> None:
     lateness = [(30.0, 20.0), (900.0, 300.0), (44.0, 40.0)]
-    pairs = [benchmark_loop.Pair(block(daemon, 10), block(bare, 0)) for daemon, bare in lateness]
-    result = benchmark_loop.summary(pairs, RealTime(fifo_priority=50))
+    pairs = [loop.Pair(block(daemon, 10), block(bare, 0)) for daemon, bare in lateness]
+    result = loop.summary(pairs, RealTime(fifo_priority=50))
     assert result["ratio"] == {"p50": 1.5, "p99": 1.5, "p999": 1.5}
     assert result["rate_hz"] == pytest.approx(999.0)
     assert (result["ticks"], result["merged_ticks"]) == (29_970, 30)
@@ -46,17 +44,17 @@ def test_ratios_are_medians_over_the_pairs_and_not_of_the_sums() -> None:
 
 
 def test_ratios_to_another_checkout_are_medians_over_the_pairs() -> None:
-    def costing(tick_us: float, plan_us: float | None, share: float) -> benchmark_loop.Block:
+    def costing(tick_us: float, plan_us: float | None, share: float) -> loop.Block:
         plans = None if plan_us is None else {"p50": plan_us, "p99": 3 * plan_us}
         return block(40.0, 0)._replace(
             without_write_us=np.full(5, tick_us), plan_us=plans, core_share=share, core_share_without_clients=share / 2
         )
 
     pairs = [
-        benchmark_loop.Pair(costing(ours, 50.0, 0.2), block(40.0, 0), costing(theirs, 200.0, 0.4))
+        loop.Pair(costing(ours, 50.0, 0.2), block(40.0, 0), costing(theirs, 200.0, 0.4))
         for ours, theirs in ((30.0, 100.0), (10.0, 100.0), (20.0, 100.0))
     ]
-    result = benchmark_loop.summary(pairs, RealTime())
+    result = loop.summary(pairs, RealTime())
     assert result["against"]["ratio"] == {
         "tick_mean": 1.0,
         "core_share": 0.5,
@@ -70,15 +68,15 @@ def test_ratios_to_another_checkout_are_medians_over_the_pairs() -> None:
     assert result["tick_without_write_us"]["mean"] == 20.0
     # what one of the two does not tell has no ratio
     pairs[1] = pairs[1]._replace(against=costing(1.0, None, 0.4)._replace(without_write_us=np.array([])))
-    ratio = benchmark_loop.summary(pairs, RealTime())["against"]["ratio"]
+    ratio = loop.summary(pairs, RealTime())["against"]["ratio"]
     assert not {"plan_p50", "tick_without_write_mean"} & set(ratio)
 
 
-def ticks(start_us: list[int], exec_us: list[float], received_s: list[float]) -> benchmark_loop.Ticks:
+def ticks(start_us: list[int], exec_us: list[float], received_s: list[float]) -> loop.Ticks:
     """Ticks that began then, by both clocks."""
     start_ns = np.array(start_us, dtype=np.int64) * 1_000
     none_late = np.zeros(start_ns.size)
-    return benchmark_loop.Ticks(start_ns, start_ns, none_late, np.array(exec_us), np.array(received_s))
+    return loop.Ticks(start_ns, start_ns, none_late, np.array(exec_us), np.array(received_s))
 
 
 def test_a_write_counts_for_the_tick_that_it_was_in(tmp_path: Path) -> None:
@@ -86,19 +84,19 @@ def test_a_write_counts_for_the_tick_that_it_was_in(tmp_path: Path) -> None:
     times = [(1_010, 30), (1_050, 20), (1_500, 400), (3_099, 1)]  # two in the first, one outside, none in the second
     file = tmp_path / "writes"
     file.write_bytes((1_000 * np.array(times, dtype=np.int64)).tobytes())
-    written = benchmark_loop.writes(file)
+    written = loop.writes(file)
     assert written is not None
-    assert benchmark_loop.without_writes(made, *written).tolist() == [50.0, 100.0, 99.0]
+    assert loop.without_writes(made, *written).tolist() == [50.0, 100.0, 99.0]
     file.write_bytes(b"")
-    assert benchmark_loop.writes(file) is None
-    assert benchmark_loop.writes(tmp_path / "never") is None
+    assert loop.writes(file) is None
+    assert loop.writes(tmp_path / "never") is None
     elsewhere = np.array([9_000_000]), np.array([1_000])
-    assert benchmark_loop.without_writes(made, *elsewhere).size == 0
+    assert loop.without_writes(made, *elsewhere).size == 0
 
 
 def test_a_tick_is_fresh_whose_state_came_since_the_one_before() -> None:
     made = ticks([0, 500, 1_000, 2_000, 2_500], [50.0] * 5, [0.1, 0.2, 0.2, 0.3, 0.4])
-    result = benchmark_fast.summary(made, 2_000, np.array([]))
+    result = fast.summary(made, 2_000, np.array([]))
     assert result["fresh_share"] == 0.75
     assert result["fresh_share_of_periods"] == 0.6  # one period had no tick
     assert (result["ticks"], result["merged_share"]) == (5, pytest.approx(1 / 6, abs=1e-4))
@@ -109,15 +107,15 @@ def test_what_cannot_be_run_is_told_and_not_measured(monkeypatch: pytest.MonkeyP
     def refused(*_: object) -> None:
         raise subprocess.CalledProcessError(1, ["tormagctl"], stderr=b"not_homed\n")
 
-    monkeypatch.setattr(benchmark_fast, "daemon", refused)
-    found = benchmark_fast.course(benchmark_loop.Stand(RealTime(), 4_000, baud=4_000_000), 1.0)
+    monkeypatch.setattr(fast, "daemon", refused)
+    found = fast.course(loop.Stand(RealTime(), 4_000, baud=4_000_000), 1.0)
     assert found == {"rate_hz": 4_000, "baud": 4_000_000, "not_measured": "not_homed"}
 
 
 def test_both_fast_lines_are_configurations_that_tormagd_takes(tmp_path: Path) -> None:
-    for rate_hz, baud in benchmark_fast.LINES:
-        stand = benchmark_loop.Stand(RealTime(), rate_hz, benchmark_fast.INFERENCE_HZ, baud)
-        config = load_config(benchmark_loop.write_config(tmp_path, "/dev/null", stand))
+    for rate_hz, baud in fast.LINES:
+        stand = loop.Stand(RealTime(), rate_hz, fast.INFERENCE_HZ, baud)
+        config = load_config(loop.write_config(tmp_path, "/dev/null", stand))
         line = choose(config.device, config.rates).options
         assert (config.rates.control_hz, line) == (rate_hz, SerialOptions(baud=baud))
         build_core(config)
@@ -125,25 +123,25 @@ def test_both_fast_lines_are_configurations_that_tormagd_takes(tmp_path: Path) -
 
 def test_the_bound_is_the_hops_and_a_period_and_a_quarter_of_a_millisecond() -> None:
     for whole_us, kept in ((1_350.0, True), (1_351.0, False)):
-        course = benchmark_latency.Course(np.array([whole_us]), np.zeros(1), np.zeros(1), np.array([100.0]))
-        result = benchmark_latency.summary(course, 1, RealTime())
+        course = latency.Course(np.array([whole_us]), np.zeros(1), np.zeros(1), np.array([100.0]))
+        result = latency.summary(course, 1, RealTime())
         assert (result["bound_us"], result["kept"]) == (1_350.0, kept)
 
 
 def test_the_first_tick_that_used_a_setpoint_counts() -> None:
     rows = [{"setpoint_cf": force, "t_ns": number} for number, force in enumerate((None, 1.0, 1.0, 1.5, 9.0))]
-    found = benchmark_latency.first_ticks({1.0: 100, 1.5: 200}, rows)
+    found = latency.first_ticks({1.0: 100, 1.5: 200}, rows)
     assert [(stamp, row["t_ns"]) for stamp, row in found] == [(100, 1), (200, 3)]
 
 
 def test_stages_add_up_to_the_whole() -> None:
-    course = benchmark_latency.Course(
+    course = latency.Course(
         sent_to_plan_us=np.array([200.0, 400.0]),
         plan_to_tick_us=np.array([700.0, 100.0]),
         tick_to_wire_us=np.array([60.0, 70.0]),
         hop_us=np.array([100.0, 120.0]),
     )
-    result = benchmark_latency.summary(course, 3, RealTime())
+    result = latency.summary(course, 3, RealTime())
     assert result["setpoint_to_wire_us"]["p50"] == pytest.approx(765.0)
     assert result["setpoint_to_wire_us"]["max"] == pytest.approx(960.0)
     assert result["ratio"] == pytest.approx(765.0 / 110.0, abs=0.01)
@@ -158,9 +156,9 @@ def test_histograms_are_drawn_of_any_positive_or_zero_durations(tmp_path: Path) 
 
 
 def test_virtual_time_is_measured_with_a_profile_of_every_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(benchmark_virtual_time, "SHOWN", 10_000)  # all: on a busy machine the order is anybody's
+    monkeypatch.setattr(virtual_time, "SHOWN", 10_000)  # all: on a busy machine the order is anybody's
     options = argparse.Namespace(seconds=0.2, plant="sample_1", profile=True, against=ROOT)
-    result = benchmark_virtual_time.measure(options)
+    result = virtual_time.measure(options)
     for name in ("whole_core", "position_loop"):
         found = result[name]
         assert found["factor"] == pytest.approx(1e3 / found["tick_us"]["p50"], rel=0.01)
@@ -178,19 +176,19 @@ def test_builds_take_turns_in_stretches_and_ratios_are_medians_over_them() -> No
     asked: list[tuple[str, str]] = []
 
     def build(name: str, taken_us: float) -> Callable[[str, int], float]:
-        def tick_us(loop: str, ticks: int) -> float:
-            asked.append((name, loop))
-            assert ticks == benchmark_virtual_time.STRETCH_TICKS
+        def tick_us(run: str, ticks: int) -> float:
+            asked.append((name, run))
+            assert ticks == virtual_time.STRETCH_TICKS
             # the machine gives ever less; the builds, side by side, are as much apart as they were
-            return taken_us * (1 + (len(asked) - 1) // 6) * (2 if loop == "whole_core" else 1)
+            return taken_us * (1 + (len(asked) - 1) // 6) * (2 if run == "whole_core" else 1)
 
         return tick_us
 
     builds = {"compiled": build("compiled", 20.0), "interpreted": build("interpreted", 100.0)}
-    found = benchmark_virtual_time.take_turns(builds | {"against": build("against", 80.0)}, 500)
+    found = virtual_time.take_turns(builds | {"against": build("against", 80.0)}, 500)
     assert all(len(taken) == 5 for loops in found.values() for taken in loops.values())
-    assert [name for name, loop in asked[6:] if loop == "whole_core"][:9:3] == ["compiled", "interpreted", "against"]
-    result = benchmark_virtual_time.summary(found, 1_000.0)
+    assert [name for name, run in asked[6:] if run == "whole_core"][:9:3] == ["compiled", "interpreted", "against"]
+    result = virtual_time.summary(found, 1_000.0)
     assert result["build"] == "compiled"
     assert result["ratio"] == {"whole_core": 5.0, "position_loop": 5.0}
     assert result["against"]["ratio"]["compiled"] == {"whole_core": 4.0, "position_loop": 4.0}
@@ -201,7 +199,7 @@ def test_builds_take_turns_in_stretches_and_ratios_are_medians_over_them() -> No
 
 def test_without_a_compiled_build_there_is_none() -> None:
     taken = {"whole_core": [100.0, 300.0, 200.0], "position_loop": [50.0]}
-    result = benchmark_virtual_time.summary({"interpreted": taken}, 1_000.0)
+    result = virtual_time.summary({"interpreted": taken}, 1_000.0)
     assert result["compiled"] is None
     assert result["build"] == "interpreted"
     assert (result["interpreted"]["whole_core"], result["interpreted"]["position_loop"]) == (5.0, 20.0)
@@ -209,28 +207,26 @@ def test_without_a_compiled_build_there_is_none() -> None:
 
 
 def test_only_a_checkout_is_measured_against(tmp_path: Path) -> None:
-    assert benchmark_against.checkout(str(ROOT)) == ROOT
+    assert checkout(str(ROOT)) == ROOT
     with pytest.raises(argparse.ArgumentTypeError, match="allowed is the root of a checkout"):
-        benchmark_against.checkout(str(tmp_path))
+        checkout(str(tmp_path))
     with pytest.raises(RuntimeError, match="ended with status"):
-        benchmark_virtual_time.Build("no such plant")
+        virtual_time.Build("no such plant")
 
 
 def test_a_package_that_was_not_asked_for_is_not_measured(tmp_path: Path) -> None:
     """A folder with tools and without a package would be measured with whatever is installed."""
     (tmp_path / "tormagd").mkdir()
-    (tmp_path / "tools").mkdir()
-    for tool in (ROOT / "tools").glob("benchmark*.py"):
-        (tmp_path / "tools" / tool.name).write_bytes(tool.read_bytes())
+    shutil.copytree(ROOT / "tools", tmp_path / "tools")
     with pytest.raises(RuntimeError):
-        benchmark_virtual_time.Build("sample_1", tmp_path)
+        virtual_time.Build("sample_1", tmp_path)
 
 
 def test_rooms_are_told_by_where_the_packages_are(tmp_path: Path) -> None:
     """A checkout may stand in a folder that is called as a package is."""
     control = Path(tormagd.__path__[0], "control", "step.py")
-    assert benchmark_virtual_time._room(str(control)) == "control"
-    assert benchmark_virtual_time._room(str(Path(tormagd.__path__[0], "messages.py"))) == "messages"
-    assert benchmark_virtual_time._room(str(Path(firmware_protocol.__path__[0], "codec.py"))) == "firmware_protocol"
+    assert virtual_time._room(str(control)) == "control"
+    assert virtual_time._room(str(Path(tormagd.__path__[0], "messages.py"))) == "messages"
+    assert virtual_time._room(str(Path(firmware_protocol.__path__[0], "codec.py"))) == "firmware_protocol"
     for elsewhere in (tmp_path / "tormagd" / "tools" / "demo.py", Path(np.__file__), "~", "<string>"):
-        assert benchmark_virtual_time._room(str(elsewhere)) == "Python and NumPy"
+        assert virtual_time._room(str(elsewhere)) == "Python and NumPy"

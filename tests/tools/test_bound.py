@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 import pytest
 from bound import Asked, asked_of, foresight_mm, no_delay_mm, rms
-from human_pulse import pulse_profile
-from ideal_carriage import Brake, Drive, brake_of, drive_of
+from rendering.human_pulse import pulse_profile
+from rendering.ideal_carriage import Brake, Drive, brake_of, drive_of
 
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries

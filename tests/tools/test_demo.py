@@ -6,9 +6,9 @@ from pathlib import Path
 import demo
 import numpy as np
 import pytest
-import show
-from host import Host
-from rehearsal import Rehearsal
+from machines.host import Host
+from rendering import show
+from rendering.rehearsal import Rehearsal
 
 from tormagd.messages import VERSION, Telemetry, Tick
 from tormagd.safety.codes import FAULTS, Fault, Limit

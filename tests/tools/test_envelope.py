@@ -2,10 +2,10 @@
 
 import math
 
-import device_draws
 import envelope
 import numpy as np
 import pytest
+from rendering import device_draws
 
 FLOOR_N = 0.6
 

@@ -2,9 +2,9 @@
 
 import faults
 import pytest
-from fault_cases import CAN, MATRIX, OPENS, SERIAL, UNLIKE_LOSSES, Injection
-from fault_recovery import recover
-from fault_watch import Cell
+from fault_matrix.cases import CAN, MATRIX, OPENS, SERIAL, UNLIKE_LOSSES, Injection
+from fault_matrix.recovery import recover
+from fault_matrix.watch import Cell
 
 from tormagd.scenes.scene import load_scene
 

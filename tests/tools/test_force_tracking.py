@@ -5,7 +5,6 @@ import math
 import force_tracking
 import numpy as np
 import pytest
-from force_signals import SCALED_N, Kind, Signal, palpation, recorded_signals
 from force_tracking import (
     DRAWN,
     SPREAD,
@@ -16,10 +15,11 @@ from force_tracking import (
     compared,
     draw_plants,
     ideal,
-    publisher,
     stair_levels,
     track,
 )
+from rendering.publisher import publisher
+from rendering.signals import SCALED_N, Kind, Signal, palpation, recorded_signals
 
 from tormagd.simulation.parameters import load_plant
 

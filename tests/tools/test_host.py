@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 
 import bare_timer
-import host
 import pytest
-from bare_timer import Stall
+from machines import host
+from machines.host import Stall
 
 
 def test_a_stall_costs_the_beats_that_were_due_in_it():

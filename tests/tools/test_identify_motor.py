@@ -3,11 +3,9 @@
 import json
 
 import identify_motor
-import motor_fit
-import motor_identification
-import motor_samples
 import numpy as np
 import pytest
+from motor import fit, identification, samples
 
 from tormagd.config import Config, load_config
 from tormagd.ctl.calibrate_motors import motor_log
@@ -63,21 +61,21 @@ def test_emps_is_within_the_published_values(recordings, capsys):
 @pytest.fixture(scope="module")
 def sample_log():
     """Half of what `tormagctl calibrate --motors` records, on simulated sample 3, in virtual time."""
-    return motor_samples.to_log(motor_log(motor_samples.record("sample_3", rounds=1), "left"))
+    return samples.to_log(motor_log(samples.record("sample_3", rounds=1), "left"))
 
 
 def test_true_values_of_a_simulated_sample_are_inside_their_intervals(sample_log):
     """The plant is richer than the models: backlash, a springy screw, losses in the gears, friction under load."""
     plant = load_plant("sample_3")
-    found = motor_samples.compare(sample_log, plant, "left")
+    found = samples.compare(sample_log, plant, "left")
     assert {name for name, row in found.items() if not row["inside"]} == set()
     # intervals that say something
     assert found["back_emf_V_s_m"]["ci95"] < 0.01 * found["back_emf_V_s_m"]["true"]
     for name, share in (("mass_kg", 0.15), ("gear_efficiency", 0.15), ("coulomb_N", 0.3), ("gain_N_V", 0.15)):
         assert found[name]["ci95"] < share * found[name]["true"]
-    without_current = motor_samples.compare(sample_log._replace(current_A=None), plant, "left")
+    without_current = samples.compare(sample_log._replace(current_A=None), plant, "left")
     assert {name for name, row in without_current.items() if not row["inside"]} == set()
-    assert set(without_current) == {*motor_identification.PARAMETERS, "delay_s", "time_constant_s"}
+    assert set(without_current) == {*identification.PARAMETERS, "delay_s", "time_constant_s"}
 
 
 def test_the_identified_motor_is_a_configuration(sample_log, tmp_path):
@@ -104,7 +102,7 @@ def test_intervals_cover_what_hangs_together():
     inside = 0
     for _ in range(200):
         noise = np.repeat(rng.normal(size=200), 20) + 0.1 * rng.normal(size=4000)
-        fitted = motor_fit.linear(np.ones((4000, 1)), 1.0 + noise, blocks)
+        fitted = fit.linear(np.ones((4000, 1)), 1.0 + noise, blocks)
         inside += abs(fitted.values[0] - 1.0) <= fitted.half_widths[0]
     assert 180 <= inside <= 199
     assert 0.3 * fitted.half_widths[0] > 1.96 / 4000**0.5

@@ -5,17 +5,13 @@ import json
 import random
 from typing import Any
 
-import floods
-import hostile_messages
 import intruders
 import numpy as np
-import pulse_from_afar
 import pytest
-import stop_lane
-import strangers
-from benchmark_loop import Block
-from besieged import Line
-from host import Host
+from benchmarks.loop import Block
+from intrusion import floods, messages, pulse_from_afar, stop_lane, strangers
+from intrusion.besieged import Line
+from machines.host import Host
 
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.messages import MessageError, Request, decode
@@ -128,11 +124,11 @@ def test_no_hostile_message_is_valid() -> None:
     """Otherwise one that is taken would be no failure of the daemon's."""
     random_, inbox = random.Random(1), SetpointInbox()
     for _ in range(3_000):
-        parts = hostile_messages.hostile(random_, hostile_messages.SETPOINT, hostile_messages.NO_SETPOINT)
+        parts = messages.hostile(random_, messages.SETPOINT, messages.NO_SETPOINT)
         assert sum(map(len, parts)) < 16_384
         if len(parts) == 1:
-            assert not inbox.take(parts[0], 0.0, hostile_messages.SETPOINT["stamp_ns"])
-        parts = hostile_messages.hostile(random_, hostile_messages.REQUEST, hostile_messages.NO_REQUEST)
+            assert not inbox.take(parts[0], 0.0, messages.SETPOINT["stamp_ns"])
+        parts = messages.hostile(random_, messages.REQUEST, messages.NO_REQUEST)
         if len(parts) == 1:
             with contextlib.suppress(MessageError):
                 assert decode(parts[0], Request).command not in COMMANDS
@@ -145,8 +141,8 @@ def refused(**changed: Any) -> Line:
         "peers": {"drops": []},
         "operating_state": "ENABLED",
     }
-    asked = changed.pop("asked", hostile_messages.Asked(100, 100, 0))
-    return hostile_messages.judged(800, asked, 100, status | changed, [])
+    asked = changed.pop("asked", messages.Asked(100, 100, 0))
+    return messages.judged(800, asked, 100, status | changed, [])
 
 
 def test_messages_that_nobody_took() -> None:
@@ -156,8 +152,8 @@ def test_messages_that_nobody_took() -> None:
 @pytest.mark.parametrize(
     ("changed", "says"),
     [
-        ({"asked": hostile_messages.Asked(100, 100, 1)}, "1 requests were carried out"),
-        ({"asked": hostile_messages.Asked(100, 99, 0)}, "99 of 100 requests were answered"),
+        ({"asked": messages.Asked(100, 100, 1)}, "1 requests were carried out"),
+        ({"asked": messages.Asked(100, 99, 0)}, "99 of 100 requests were answered"),
         ({"setpoints": {"refused": 799, "oversize": 0, "sources": {}}}, "799 of 800 setpoints"),
         ({"setpoints": {"refused": 800, "oversize": 0, "sources": {"hostile": 7}}}, "1 sources taken for one"),
         ({"operating_state": "FAULT"}, "the device was FAULT"),

@@ -1,9 +1,9 @@
 """The demonstration's profile and its score."""
 
-import human_pulse
 import numpy as np
 import pytest
-from tracking import tracking
+from rendering import human_pulse
+from rendering.tracking import tracking
 
 
 def test_the_pulse_spans_what_was_asked_and_has_no_images():

@@ -3,7 +3,7 @@
 import demo
 import numpy as np
 import pytest
-from rehearsal import Case, rehearse
+from rendering.rehearsal import Case, rehearse
 
 from tormagd.config import Config
 

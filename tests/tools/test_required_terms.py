@@ -8,10 +8,10 @@ from typing import Any
 import msgspec
 import pytest
 import required_terms
-import scene_runs
 from distributed import Client, LocalCluster
+from rendering import scene_runs
+from rendering.scene_runs import Case, key, run, run_all
 from required_terms import JUDGED, NO_COST, RATES_HZ, SHARE, is_good, measure
-from scene_runs import Case, key, run, run_all
 
 from tormagd.config import ConfigError
 from tormagd.scenes.measured import Cost, Judged, MeasuredScene, Without, is_met, measured, on_first, required

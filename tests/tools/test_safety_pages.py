@@ -4,7 +4,7 @@ import json
 
 import pytest
 import safety_pages
-from fault_cases import MATRIX
+from fault_matrix.cases import MATRIX
 
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.safety.operating_state import ROWS, Refusal

@@ -5,18 +5,17 @@ import math
 
 import numpy as np
 import pytest
-import reproduction_page
 import tactile_experiment
-import tactile_models
-import tactile_pulse
-import tactile_report
+from tactile import models, report
+from tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_shape, recorded_shapes
+from thesis.page import pulse_experiment, table_4_1
 
 from tormagd.simulation.pad import PADS
 
 
 @pytest.fixture(scope="module")
 def run():
-    return tactile_experiment.run(tactile_models.QUICK)
+    return tactile_experiment.run(models.QUICK)
 
 
 def test_the_contract_s_keys_are_there_and_finite(run):
@@ -51,7 +50,7 @@ def test_without_relaxation_the_field_drifts(run):
 
 
 def test_the_page_and_its_pictures_are_written(run, tmp_path):
-    tactile_report.write_report(tmp_path, *run)
+    report.write_report(tmp_path, *run)
     page = (tmp_path / "learned_inverse.md").read_text(encoding="utf-8")
     assert "synthetic" in page
     for line in page.splitlines():
@@ -62,7 +61,7 @@ def test_the_page_and_its_pictures_are_written(run, tmp_path):
 
 def test_thesis_and_ours_stand_side_by_side(run):
     figures, _ = run
-    section = reproduction_page.table_4_1(figures["table_4_1"]) + reproduction_page.pulse_experiment(figures["pulse"])
+    section = table_4_1(figures["table_4_1"]) + pulse_experiment(figures["pulse"])
     ours = figures["table_4_1"]["rows"][2]["test"]
     line = next(line for line in section.splitlines() if line.startswith("| MRE-C, test"))
     assert "2.7 ± 2.21" in line
@@ -85,7 +84,7 @@ def test_the_searches_are_timed_and_the_two_errors_kept_apart(run):
 
 def test_every_model_is_compared_on_every_split(run):
     rows = {row["model"]: row for row in run[0]["comparison"]}
-    assert len(rows) == 5 + len(tactile_models.QUICK.sizes)
+    assert len(rows) == 5 + len(models.QUICK.sizes)
     for name in ("network, 50 units (thesis)", "support vectors", "forest", "GRU", "grey box, 50 units"):
         assert {f"{split}_mae_N" for split in ("random", "field", "class", "cycles", "hold")} <= set(rows[name])
     assert rows["network, 10 units"]["memory_kB"] < rows["network, 50 units (thesis)"]["memory_kB"]
@@ -97,8 +96,8 @@ def test_without_heartpy_the_pulse_is_synthetic_and_says_so(monkeypatch):
     def missing(*_):
         raise FileNotFoundError
 
-    monkeypatch.setattr(tactile_pulse, "pulse_profile", missing)
-    shape, source = tactile_pulse.pulse_shape(5.0, 100)
+    monkeypatch.setattr("tactile.pulse.pulse_profile", missing)
+    shape, source = pulse_shape(5.0, 100)
     assert "synthetic" in source
     assert (shape.min(), shape.max()) == (0.0, 1.0)
     spectrum = np.abs(np.fft.rfft(shape - shape.mean()))
@@ -107,19 +106,19 @@ def test_without_heartpy_the_pulse_is_synthetic_and_says_so(monkeypatch):
 
 def test_arterial_pulses_are_read_where_the_recordings_are(recordings, monkeypatch):
     monkeypatch.setenv("TORMAG_DATA", str(recordings))
-    shapes = tactile_pulse.recorded_shapes(10.0, 160)
+    shapes = recorded_shapes(10.0, 160)
     assert shapes
     for shape in shapes.values():
         assert len(shape) == 1600
         assert (shape.min(), shape.max()) == (0.0, 1.0)
         assert np.abs(np.diff(shape)).max() < 0.25
     monkeypatch.delenv("TORMAG_DATA")
-    assert tactile_pulse.recorded_shapes(10.0, 160) == {}
+    assert recorded_shapes(10.0, 160) == {}
 
 
 def test_the_program_is_the_thesis_s():
-    shape, _ = tactile_pulse.pulse_shape(tactile_pulse.HELD_S, tactile_pulse.RATE_HZ)
-    done = tactile_pulse.program(shape)
+    shape, _ = pulse_shape(HELD_S, RATE_HZ)
+    done = program(shape)
     assert len(done.time_s) == 4322
     held = done.displacement_mm == 4.5
     assert done.rate_mm_s[~held] == pytest.approx(1.0)
@@ -129,8 +128,8 @@ def test_the_program_is_the_thesis_s():
 
 
 def test_field_errors_count_only_where_the_force_depends_on_the_field():
-    shape, _ = tactile_pulse.pulse_shape(tactile_pulse.HELD_S, tactile_pulse.RATE_HZ)
-    along = tactile_pulse.course(PADS["MRE-C"], shape, 20)
+    shape, _ = pulse_shape(HELD_S, RATE_HZ)
+    along = course(PADS["MRE-C"], shape, 20)
     reference = along.features[:, 2]
     scores = along.scores(np.where(along.scored, reference + 2.0, 300.0))
     assert scores["mae_mT"] == pytest.approx(2.0)

@@ -1,0 +1,1 @@
+"""The measurements of `benchmark.py`, one a module, and what several of them need."""

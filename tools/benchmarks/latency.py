@@ -1,0 +1,223 @@
+"""`benchmark latency`: from a setpoint that is sent to the first drive frame that reflects it.
+
+Each setpoint has a force of its own, so that the recording shows the first control tick whose plan used it; the frame
+of that tick has just been written when its row is stamped. A bare ZeroMQ hop of the same message is measured in the
+same run. Where the daemon has a real-time priority, the publisher and the far end of the hop have a lower one: what is
+measured is the way, not how long a sender waits for a processor.
+
+At worst a setpoint just misses the slack: it waits for a plan's time, then for the next control tick and the one after.
+"""
+
+import argparse
+import multiprocessing
+import os
+import random
+import tempfile
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgpack
+import numpy as np
+import numpy.typing as npt
+import zmq
+
+from benchmarks.histograms import plot_histograms
+from benchmarks.loop import Stand, add_realtime_arguments, asked_for, daemon_process, quantiles, realtime_settings
+from tormagd.config import Config, RealTime
+from tormagd.daemon.endpoint import context
+from tormagd.daemon.realtime import prepare, priority_of_threads
+from tormagd.messages import VERSION, Setpoint, encode
+from tormagd.recording.ticks import decode_ticks
+
+Array = npt.NDArray[np.float64]
+
+LEAST_N, GRAIN_N = 1.0, 1e-4
+SPACING_S = (0.0015, 0.0025)
+"500 a second, as in `make run`; random, so that they meet every phase of the control period."
+SETTLE_NS = 500_000_000
+ALLOWED_US = 250.0
+"""From a setpoint to its frame p99 is to take no longer than the bare hop's of the same run, a control period, which it
+may just have missed, and this: the plan, the tick and the write."""
+PERIOD_US = 1e6 / Stand(RealTime()).control_hz
+BELOW = 10
+"The measurement's own processes are this far below the daemon's real-time priority."
+
+
+class Course(NamedTuple):
+    """One array over the setpoints that were seen on the wire, us each, and one over the bare hops."""
+
+    sent_to_plan_us: Array
+    plan_to_tick_us: Array
+    tick_to_wire_us: Array
+    hop_us: Array
+
+    @property
+    def whole_us(self) -> Array:
+        """From the setpoint's stamp to its drive frame."""
+        return self.sent_to_plan_us + self.plan_to_tick_us + self.tick_to_wire_us
+
+
+def run(count: int, realtime: RealTime) -> Course:
+    """`count` setpoints through the daemon, then as many through the bare hop."""
+    with tempfile.TemporaryDirectory(prefix="tormag-") as name, daemon_process(Path(name), realtime, 0) as config:
+        prepare(RealTime(fifo_priority=max(realtime.fifo_priority - BELOW, 0), keep_awake=realtime.keep_awake))
+        sent, rows = exchange(config, count)
+    first = first_ticks(sent, rows)
+    ticks = [tick for _, tick in first]
+    stamp_ns = np.array([stamp for stamp, _ in first], dtype=np.int64)
+    written_ns = np.array([tick["t_ns"] for tick in ticks], dtype=np.int64)
+    tick_us = np.array([tick["exec_us"] for tick in ticks])
+    # plan and tick are stamped on the monotonic clock, the frame on that of the setpoint's stamp
+    plan_us = np.array([(tick["monotonic_s"] - tick["plan_time_s"]) * 1e6 for tick in ticks])
+    return Course((written_ns - stamp_ns) * 1e-3 - tick_us - plan_us, plan_us, tick_us, bare_hop(count))
+
+
+def summary(course: Course, count: int, realtime: RealTime) -> dict[str, Any]:
+    """The contract's object. `bound_us` is what p99 may come to, and `kept` whether it does."""
+    whole_us, hop_us = quantiles(course.whole_us), quantiles(course.hop_us)
+    bound_us = round(hop_us["p99"] + PERIOD_US + ALLOWED_US, 1)
+    return {
+        "setpoint_to_wire_us": whole_us,
+        "bare_zmq_us": hop_us,
+        "bound_us": bound_us,
+        "kept": whole_us["p99"] <= bound_us,
+        "ratio": round(float(np.median(course.whole_us) / np.median(course.hop_us)), 2),
+        "stages_us": {
+            "sent, until planning begins": quantiles(course.sent_to_plan_us),
+            "then until the tick begins": quantiles(course.plan_to_tick_us),
+            "tick, until written": quantiles(course.tick_to_wire_us),
+        },
+        "setpoints": count,
+        "seen": course.whole_us.size,
+    } | asked_for(realtime)
+
+
+def exchange(config: Config, count: int) -> tuple[dict[float, int], list[dict[str, Any]]]:
+    """Publishes and records: when each force was sent, ns, and the ticks of that time."""
+    with context(priority_of_threads()) as ours, ours.socket(zmq.XPUB) as publisher, ours.socket(zmq.SUB) as recording:
+        for socket in (publisher, recording):
+            socket.setsockopt(zmq.LINGER, 0)
+        recording.setsockopt(zmq.RCVHWM, 0)  # read when the last one has been sent: reading would set the pace
+        recording.subscribe(b"")
+        recording.connect(config.endpoints.recording)
+        publisher.connect(config.endpoints.setpoint)
+        if not publisher.poll(5_000):
+            raise RuntimeError("the daemon does not take setpoints")
+        publisher.recv()
+        sent: dict[float, int] = {}
+        spacing = random.Random(1)
+        for number in range(count):
+            force = round(LEAST_N + GRAIN_N * (number % 5_000), 6)
+            stamp = time.time_ns()
+            setpoint = Setpoint(
+                v=VERSION, source="latency", seq=number, stamp_ns=stamp, servo_cf=force, valid_for_ms=500.0
+            )
+            publisher.send(encode(setpoint))
+            sent[force] = stamp
+            time.sleep(spacing.uniform(*SPACING_S))
+        return sent, rows_until(recording, time.time_ns() + SETTLE_NS)
+
+
+def rows_until(recording: "zmq.Socket[bytes]", until_ns: int) -> list[dict[str, Any]]:
+    """What the daemon has recorded, up to that time. Raises RuntimeError where it records no more."""
+    rows: list[dict[str, Any]] = []
+    while not rows or rows[-1]["t_ns"] < until_ns:
+        if not recording.poll(5_000):
+            raise RuntimeError("the daemon records nothing")
+        batch = decode_ticks(recording.recv())
+        rows.extend(dict(zip(batch.columns, row, strict=True)) for row in batch.rows)
+    return rows
+
+
+def first_ticks(sent: dict[float, int], rows: list[dict[str, Any]]) -> list[tuple[int, dict[str, Any]]]:
+    """For each setpoint the first tick whose plan used it."""
+    first: dict[float, dict[str, Any]] = {}
+    for row in rows:
+        force = row["setpoint_cf"]
+        if force in sent and force not in first:
+            first[force] = row
+    return [(sent[force], row) for force, row in first.items()]
+
+
+def bare_hop(count: int) -> Array:
+    """The same message from PUB to SUB between two processes, us."""
+    with tempfile.TemporaryDirectory(prefix="tormag-") as folder:
+        address = f"ipc://{folder}/hop"
+        ours, theirs = multiprocessing.Pipe()
+        scheduling = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
+        process = multiprocessing.Process(target=receive, args=(address, count, scheduling, theirs), daemon=True)
+        process.start()
+        send(address, count)
+        if not ours.poll(10):
+            raise RuntimeError("the bare hop lost messages")
+        found: Array = ours.recv()
+        process.join(5.0)
+    return found
+
+
+def send(address: str, count: int) -> None:
+    """The near end of the bare hop."""
+    with context(priority_of_threads()) as ours, ours.socket(zmq.XPUB) as publisher:
+        publisher.setsockopt(zmq.LINGER, 1_000)
+        publisher.connect(address)
+        publisher.poll(10_000)
+        publisher.recv()
+        spacing = random.Random(2)
+        for number in range(count):
+            time.sleep(spacing.uniform(*SPACING_S))
+            stamp = time.time_ns()
+            publisher.send(
+                encode(Setpoint(v=VERSION, source="hop", seq=number, stamp_ns=stamp, servo_cf=1.0, valid_for_ms=500.0))
+            )
+
+
+def receive(address: str, count: int, scheduling: tuple[int, int], result: Connection) -> None:
+    """The far end of the bare hop, scheduled like the near one."""
+    os.sched_setscheduler(0, scheduling[0], os.sched_param(scheduling[1]))
+    with context(priority_of_threads()) as ours, ours.socket(zmq.SUB) as socket:
+        socket.subscribe(b"")
+        socket.bind(address)
+        hops = np.zeros(count)
+        for index in range(count):
+            data = socket.recv()
+            hops[index] = (time.time_ns() - _stamp(data)) * 1e-3
+        result.send(hops)
+
+
+def _stamp(data: bytes) -> int:
+    return int(msgpack.unpackb(data)["stamp_ns"])
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `benchmark latency`."""
+    add_realtime_arguments(parser)
+    parser.add_argument("--count", type=int, default=1_000, help="setpoints")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="histograms of the whole, its stages and the hop")
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """The object for these options."""
+    realtime = realtime_settings(options)
+    course = run(options.count, realtime)
+    if options.plot:
+        shown = {
+            "setpoint to wire": course.whole_us,
+            "bare ZeroMQ hop": course.hop_us,
+            "sent, until planning begins": course.sent_to_plan_us,
+            "tick, until written": course.tick_to_wire_us,
+        }
+        plot_histograms(options.plot, f"From {course.whole_us.size} setpoints to their first drive frames", shown)
+    return summary(course, options.count, realtime)
+
+
+def print_table(result: dict[str, Any]) -> None:
+    """The object for a person."""
+    print(f"{'':28s}{'p50':>9s}{'p99':>9s}{'p99.9':>9s}   us (fifo {result['fifo_priority']})")
+    rows = {"setpoint to wire": result["setpoint_to_wire_us"], "bare ZeroMQ hop": result["bare_zmq_us"]}
+    for name, found in (rows | result["stages_us"]).items():
+        print(f"{name:28s}" + "".join(f"{found[key]:9.0f}" for key in ("p50", "p99", "p999")))
+    verdict = "kept" if result["kept"] else "NOT KEPT"
+    print(f"p99 at most {result['bound_us']:.0f} us, the hop's and a period and {ALLOWED_US:.0f} us: {verdict}")
+    print(f"{result['seen']} of {result['setpoints']} setpoints seen on the wire")

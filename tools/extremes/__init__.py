@@ -1,0 +1,1 @@
+"""The cases of `numerics.py`, and their steps through time."""

@@ -1,0 +1,1 @@
+"""The faults of `faults.py`: what is put where, what came of it, and what leads out."""

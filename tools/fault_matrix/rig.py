@@ -1,0 +1,265 @@
+"""What a fault is put into: a daemon's core, a device, the line between them, and who publishes the force."""
+
+import math
+from collections import deque
+from collections.abc import Iterator
+
+import msgpack
+import msgspec
+from wire.bad_lines import BadBus, BadSerialLine, Way
+
+from fault_matrix.cases import SERIAL, Injection
+from tormagd.closed_loop import ClosedLoop, Sample, VirtualBus
+from tormagd.config import Config, load_config
+from tormagd.control.conditions import is_homed
+from tormagd.control.core import Core, build_core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.daemon.inbox import SetpointInbox
+from tormagd.safety.operating_state import SafetyState
+from tormagd.simulation.can_device import CanDevice
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.faults import parse_fault
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.plant import Sensor
+
+FORCE_N = 1.8
+SWING_N = 0.1
+TURNED_MM = 10.0
+"The limit OFFSET_UNKNOWN asks for so much, back and forth."
+OFFSET_N = 0.8
+SATURATED_N = 20.0
+"Of a broken force sensor."
+HOGGED_MS = 12
+HOGGED_EVERY_MS = 100
+OTHER_N = 0.6
+"What the source asks for that takes over."
+REPLAYED_MESSAGES = 500
+CLOCK_STEP_S = 3_600
+REALTIME_S = 1_700_000_000
+"What the computers' clocks show at the beginning."
+
+
+class Rig:
+    """A daemon's core and a device, with a line between them that may go bad, and a publisher that may, too."""
+
+    def __init__(self, injection: Injection, plant: str, bus: str, injected_s: float) -> None:
+        """The device's own fault begins at `injected_s`; `spoil` begins all others."""
+        self.config: Config = msgspec.structs.replace(load_config(None), scene="coronary")
+        core: Core = build_core(self.config)
+        self.most_N = core.scene.force.most_N
+        faults = [parse_fault(f"{fault}@{injected_s}") for fault in (injection.device or "").split()]
+        self.hand = TurningHand()
+        device = VirtualDevice(load_plant(plant), self.hand, faults, seed=1)
+        self.line: BadSerialLine | BadBus
+        if bus == SERIAL:
+            self.line = serial = BadSerialLine(device)
+            self.loop = ClosedLoop(self.config, core.stepper, core.planner, serial)
+        else:
+            self.line = can = BadBus(CanDevice(device.messages))
+            self.loop = ClosedLoop(self.config, core.stepper, core.planner, VirtualBus(can))
+        self.publisher = Publisher() if injection.publisher is None else DaemonsBorder()
+        self.is_dead = False
+        self._stalled_ms = 0
+        self._hogged_ms: int | None = None
+
+    @property
+    def safety(self) -> SafetyState:
+        """Operating state and faults."""
+        return self.loop.step_state.safety
+
+    @property
+    def is_homed(self) -> bool:
+        """As telemetry says it."""
+        return is_homed(self.loop.measurement, self.loop.step_state.estimate)
+
+    @property
+    def off_N(self) -> float:
+        """By how much the rendered force is more than what is asked for."""
+        return self.loop.simulated.truth.force_N - asked_N(self.loop.now_s)
+
+    def tick(self) -> Sample | None:
+        """One control period; None where the daemon does nothing in it. Periods are 1 ms."""
+        is_away = self.is_dead or self._stalled_ms > 0
+        self._stalled_ms -= 1
+        if self._hogged_ms is not None:
+            is_away = is_away or self._hogged_ms % HOGGED_EVERY_MS < HOGGED_MS
+            self._hogged_ms += 1
+        if is_away:
+            self.loop.skip()
+            return None
+        return self.loop.tick(self.publisher(self.loop.now_s))
+
+    def run(self, duration_s: float) -> Iterator[Sample | None]:
+        """The ticks of the next `duration_s`."""
+        for _ in range(round(duration_s * self.config.rates.control_hz)):
+            yield self.tick()
+
+    def spoil(self, injection: Injection) -> None:
+        """Line, force sensor, host and publisher go bad now."""
+        if injection.way is not None:
+            self.line.spoil(injection.way)
+        if isinstance(self.line, BadBus):
+            self.line.fill(injection.fill_frames_ms)
+        plant = self.loop.simulated.plant
+        if injection.sensor is not None:
+            plant.force_sensor = BadSensor(plant.force_sensor, injection.sensor)
+        if injection.host in ("stop", "disable"):
+            self.loop.command(injection.host)
+        self.is_dead, self._stalled_ms = injection.host == "silent", injection.stall_ms
+        self._hogged_ms = 0 if injection.host == "hogged" else None
+        self.publisher.spoil(injection)
+
+    def mend(self) -> None:
+        """All that is wrong is put right now; what came of it stays."""
+        self.line.spoil(Way)
+        if isinstance(self.line, BadBus):
+            self.line.fill(0.0)
+        plant = self.loop.simulated.plant
+        if isinstance(plant.force_sensor, BadSensor):
+            plant.force_sensor = plant.force_sensor.mended
+        self.loop.simulated.mend()
+        self.is_dead, self._hogged_ms = False, None
+        self.publisher.mend()
+
+
+class TurningHand:
+    """A hand that turns steadily, and back for a moment where it is told to."""
+
+    def __init__(self) -> None:
+        self._steady = SteadyHand()
+        self._back_s = math.inf
+
+    def turn_back(self, now_s: float) -> None:
+        """From now on it goes back by TURNED_MM, and then forth again. Once."""
+        self._back_s = now_s
+
+    def position_mm(self, time_s: float) -> float:
+        """See `Hand`."""
+        forth_mm = self._steady.position_mm(time_s)
+        if time_s <= self._back_s:
+            return forth_mm
+        return forth_mm - 2.0 * min(forth_mm - self._steady.position_mm(self._back_s), TURNED_MM)
+
+
+def asked_N(now_s: float) -> float:
+    """The force that is asked for; it swings a little, because a fault may hide from a rest."""
+    return FORCE_N + SWING_N * math.sin(math.tau * now_s)
+
+
+class BadSensor:
+    """A force sensor that is broken from now on, one way or another."""
+
+    def __init__(self, sensor: Sensor, how: str) -> None:
+        self._sensor, self._how, self._last_N = sensor, how, sensor.reading_N
+
+    @property
+    def mended(self) -> Sensor:
+        """The sensor itself."""
+        return self._sensor
+
+    @property
+    def reading_N(self) -> float:
+        """What is shown now; the handle turns forwards, and so readings are positive."""
+        true_N = self._sensor.reading_N
+        shown = {
+            "stuck": self._last_N,
+            "high": true_N + OFFSET_N,
+            "low": true_N - OFFSET_N,
+            "saturated": SATURATED_N,
+            "dead": 0.0,
+        }
+        return shown[self._how]
+
+    def advance(self, time_s: float, force_N: float) -> None:
+        """As the sensor itself."""
+        self._sensor.advance(time_s, force_N)
+
+
+class Publisher:
+    """A force setpoint every 2 ms, until it falls silent."""
+
+    def __init__(self) -> None:
+        self.is_silent = self.is_other = False
+        self._newest: TimedSetpoint | None = None
+
+    def __call__(self, now_s: float) -> TimedSetpoint | None:
+        """The newest one at that time; None before the first."""
+        if not self.is_silent:
+            stamp_s = now_s - now_s % 0.002
+            self._newest = TimedSetpoint(asked_N(stamp_s), stamp_s, 0.1)
+            if self.is_other:
+                self._newest = TimedSetpoint(OTHER_N, stamp_s, 0.1, holder=1)
+        return self._newest
+
+    def spoil(self, injection: Injection) -> None:
+        """It falls silent, or another one takes over, where the injection says so."""
+        self.is_silent, self.is_other = injection.host == "stale", injection.host == "other"
+
+    def mend(self) -> None:
+        """It publishes as before."""
+        self.is_silent = self.is_other = False
+
+
+class DaemonsBorder:
+    """A publisher whose messages go through the daemon's inbox, as bytes; something may be wrong with them."""
+
+    def __init__(self) -> None:
+        self.is_silent = False
+        self._inbox, self._wrong = SetpointInbox(), ""
+        self._ticks, self._seq, self._session = 0, 0, 1
+        self._earlier: deque[bytes] = deque(maxlen=REPLAYED_MESSAGES)
+        self._kept: bytes | None = None
+
+    def __call__(self, now_s: float) -> TimedSetpoint | None:
+        """The newest one at that time that was taken."""
+        self._ticks += 1
+        if self._ticks % 2 and not self.is_silent:
+            realtime_ns = round((REALTIME_S + now_s) * 1e9)
+            for data in self._messages(now_s, realtime_ns):
+                self._inbox.take(data, now_s, realtime_ns)
+        return self._inbox.newest
+
+    def spoil(self, injection: Injection) -> None:
+        """From now on something is wrong."""
+        self._wrong = injection.publisher or ""
+        if self._wrong == "restarted":
+            self._session, self._seq = 2, 0
+
+    def mend(self) -> None:
+        """And from now on nothing."""
+        self.is_silent, self._wrong, self._kept = False, "", None
+
+    def _messages(self, now_s: float, realtime_ns: int) -> list[bytes]:
+        wrong = self._wrong
+        self._seq += 1
+        force_N = {"nan": math.nan, "negative": -1.0, "huge": 1e3}.get(wrong, asked_N(now_s))
+        stamp_ns = realtime_ns + (CLOCK_STEP_S * 10**9 if wrong == "clock" else 0)
+        data = self._message("robot", force_N, stamp_ns, self._seq, self._session)
+        self._earlier.append(data)
+        if wrong == "disordered":
+            if self._kept is None:
+                self._kept = data
+                return []
+            data, self._kept = self._kept, None
+            return [self._earlier[-1], data]
+        if wrong == "replayed":
+            return [data, self._earlier[0]]
+        if wrong == "second":
+            return [data, self._message("bystander", OTHER_N, realtime_ns, self._seq, 1)]
+        return [data]
+
+    @staticmethod
+    def _message(source: str, force_N: float, stamp_ns: int, seq: int, session: int) -> bytes:
+        packed: bytes = msgpack.packb(
+            {
+                "v": 1,
+                "source": source,
+                "seq": seq,
+                "session": session,
+                "stamp_ns": stamp_ns,
+                "servo_cf": force_N,
+                "valid_for_ms": 100.0,
+            }
+        )
+        return packed

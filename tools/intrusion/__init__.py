@@ -1,0 +1,1 @@
+"""Who troubles the daemon in `intruders.py`: strangers, floods, hostile messages."""

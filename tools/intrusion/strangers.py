@@ -1,0 +1,262 @@
+"""Peers that are not let in: plain, with another server's key, with a key that is not listed, or not for this endpoint.
+
+Each try is a ZeroMQ socket of its own that connects to an endpoint of the daemon in turn, through a relay that keeps
+what the daemon says to it. Control's lateness meanwhile is held against that of the time before, of the same run.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import uvloop
+import zmq
+from benchmarks.keys import OBSERVER, PUBLISHER
+from benchmarks.loop import WARM_UP_S, Array
+from tqdm import tqdm
+
+from intrusion.besieged import Besieged, Line, besieged, p99_us, stand
+from tormagd.config import ENDPOINTS
+from tormagd.keys import PUBLIC, SECRET, SERVER, KeyPair, load_pair, load_public
+
+TRIES = 10_000
+LEAST_PER_S, PER_S = 500.0, 530.0
+UNDISTURBED_S = 10.0
+MOST_RATIO, MOST_MORE_US = 1.3, 20.0
+LIVES_S = 0.5
+"A try is given up after this time, where the daemon has not ended it before."
+COUNTED_S = 5.0
+GREETING_BYTES = 64
+LONG, COMMAND = 2, 4
+"Flags of a ZMTP frame (RFC 37)."
+OF_MECHANISM = (b"\x07WELCOME", b"\x05ERROR")
+"What CURVE says to a peer that it has not let in (RFC 26)."
+SOCKETS = {"setpoint": zmq.PUB, "control": zmq.DEALER, "telemetry": zmq.SUB, "recording": zmq.SUB}
+
+
+class Keys(NamedTuple):
+    """What a stranger shows, and the daemon that it believes; None where it shows nothing."""
+
+    pair: KeyPair
+    server: bytes
+
+
+Shows = Callable[[Path, str], Keys | None]
+"""What is shown at an endpoint, given the folder of the daemon's keys."""
+
+
+_pair, _public = cache(load_pair), cache(load_public)
+
+
+def _plain(folder: Path, endpoint: str) -> Keys | None:
+    return None
+
+
+def _wrong_key(folder: Path, endpoint: str) -> Keys:
+    return Keys(KeyPair(*zmq.curve_keypair()), zmq.curve_keypair()[0])
+
+
+def _unlisted(folder: Path, endpoint: str) -> Keys:
+    return Keys(KeyPair(*zmq.curve_keypair()), _public(folder / f"{SERVER}{PUBLIC}"))
+
+
+def _wrong_role(folder: Path, endpoint: str) -> Keys:
+    name = OBSERVER if endpoint == "setpoint" else PUBLISHER
+    return Keys(_pair(folder / f"{name}{SECRET}"), _public(folder / f"{SERVER}{PUBLIC}"))
+
+
+KINDS: dict[str, Shows] = {"plain": _plain, "wrong key": _wrong_key, "unlisted": _unlisted, "wrong role": _wrong_role}
+
+
+class Heard(NamedTuple):
+    """What a kind of strangers heard in all its tries."""
+
+    tries: int
+    seconds: float
+    most_bytes: int
+    beyond: int
+    "Tries in which the daemon said more than ZMTP's greeting and its mechanism."
+
+
+class _Half(asyncio.Protocol):
+    """One end of a relayed connection: keeps what it hears, and passes it on."""
+
+    def __init__(self) -> None:
+        self.heard = b""
+        self.transport: asyncio.Transport | None = None
+        self.other: _Half | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # a stream's always is one
+        self.transport = transport
+
+    def data_received(self, data: bytes) -> None:
+        self.heard += data
+        if self.other is not None and self.other.transport is not None:
+            self.other.transport.write(data)
+
+    def connection_lost(self, _error: Exception | None) -> None:
+        if self.other is not None and self.other.transport is not None:
+            self.other.transport.close()
+
+
+class Relay:
+    """A way to one port of this machine; `said` has what was heard from there, an entry for each connection."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._host, self._port = host, port
+        self._ends: list[_Half] = []
+        self._connecting: set[asyncio.Task[None]] = set()
+
+    async def open(self) -> str:
+        """The address of its near end."""
+        server = await asyncio.get_running_loop().create_server(self._near, "127.0.0.1", 0)
+        return f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+
+    def said(self) -> list[bytes]:
+        """What was heard from the far end."""
+        return [end.heard for end in self._ends]
+
+    def _near(self) -> _Half:
+        near = _Half()
+        joining = asyncio.get_running_loop().create_task(self._join(near))
+        self._connecting.add(joining)
+        joining.add_done_callback(self._connecting.discard)
+        return near
+
+    async def _join(self, near: _Half) -> None:
+        far = _Half()
+        self._ends.append(far)
+        far.other = near
+        await asyncio.get_running_loop().create_connection(lambda: far, self._host, self._port)
+        assert far.transport is not None
+        far.transport.write(near.heard)  # what came meanwhile
+        near.other = far
+        if near.transport is not None and near.transport.is_closing():
+            far.transport.close()
+
+
+def beyond_mechanism(said: bytes) -> bytes:
+    """What somebody was told after ZMTP's greeting and the mechanism's own commands; empty where there was nothing."""
+    rest = said[GREETING_BYTES:]
+    while rest:
+        flags, head = rest[0], 9 if rest[0] & LONG else 2
+        size = int.from_bytes(rest[1:head], "big")
+        if not flags & COMMAND or not rest[head:].startswith(OF_MECHANISM):
+            return rest
+        rest = rest[head + size :]
+    return b""
+
+
+def knock(kind: str, folder: Path, addresses: dict[str, str], tries: int) -> Heard:
+    """All tries of one kind, at the daemon's endpoints in turn."""
+    return uvloop.run(_knock(kind, folder, addresses, tries))
+
+
+async def _knock(kind: str, folder: Path, addresses: dict[str, str], tries: int) -> Heard:
+    relays = {}
+    for name, address in addresses.items():
+        host, port = address.removeprefix("tcp://").split(":")
+        relays[name] = Relay(host, int(port))
+    near = {name: await relay.open() for name, relay in relays.items()}
+    alive: deque[tuple[float, zmq.Socket[bytes]]] = deque()
+    start_s = time.monotonic()
+    with zmq.Context() as context:
+        for number in tqdm(range(tries), desc=kind, unit="try", disable=None):
+            name = ENDPOINTS[number % len(ENDPOINTS)]
+            alive.append((time.monotonic(), _stranger(context, name, near[name], KINDS[kind](folder, name))))
+            while alive[0][0] < time.monotonic() - LIVES_S:
+                alive.popleft()[1].close()
+            await asyncio.sleep(max(0.0, start_s + (number + 1) / PER_S - time.monotonic()))
+        seconds = time.monotonic() - start_s
+        await asyncio.sleep(LIVES_S)
+        context.destroy(linger=0)
+    await asyncio.sleep(LIVES_S)
+    said = [each for relay in relays.values() for each in relay.said()]
+    return Heard(len(said), seconds, max(map(len, said)), sum(bool(beyond_mechanism(each)) for each in said))
+
+
+def _stranger(context: "zmq.Context[Any]", endpoint: str, address: str, keys: Keys | None) -> "zmq.Socket[bytes]":
+    peer: zmq.Socket[bytes] = context.socket(SOCKETS[endpoint])
+    peer.linger, peer.reconnect_ivl = 0, -1  # each is one try
+    if keys is not None:
+        peer.curve_publickey, peer.curve_secretkey = keys.pair
+        peer.curve_serverkey = keys.server
+    if SOCKETS[endpoint] == zmq.SUB:
+        peer.subscribe(b"")
+    peer.connect(address)
+    if SOCKETS[endpoint] != zmq.SUB:
+        with contextlib.suppress(zmq.Again):
+            peer.send(b"anything", zmq.NOBLOCK)
+    return peer
+
+
+def measure(share: float) -> Line:
+    """All kinds one after the other, each after a while without. `share` of the tries."""
+    tries = max(len(ENDPOINTS), round(TRIES * share))
+    before: list[Array] = []
+    figures: dict[str, Any] = {}
+    late: dict[str, Array] = {}
+    with (
+        besieged(stand(guarded=ENDPOINTS)) as daemon,
+        ProcessPoolExecutor(1, mp_context=get_context("spawn")) as outside,
+    ):
+        addresses = {name: getattr(daemon.config.endpoints, name) for name in ENDPOINTS}
+        for kind in KINDS:
+            daemon.lateness_us(WARM_UP_S)
+            before.append(daemon.lateness_us(max(2.0, UNDISTURBED_S * share)))
+            refused = daemon.status()["peers"]["refused"]
+            knocking = outside.submit(knock, kind, daemon.folder / "keys", addresses, tries)
+            late[kind] = _until(knocking, daemon)
+            heard = knocking.result()
+            counted = _counted(daemon, refused, heard.tries)
+            figures[kind] = heard._asdict() | {"per_s": round(heard.tries / heard.seconds, 1), "counted": counted}
+        troubles = daemon.troubles()
+    return judged(figures, np.concatenate(before), late, troubles)
+
+
+def _until(knocking: "Future[Heard]", daemon: Besieged) -> Array:
+    late = []
+    while not knocking.done():
+        late.append(daemon.lateness_us(0.5))
+    return np.concatenate(late)
+
+
+def _counted(daemon: Besieged, before: int, expected: int) -> int:
+    """How many more were refused, once that does not change any more."""
+    until_s = time.monotonic() + COUNTED_S
+    while (counted := int(daemon.status()["peers"]["refused"]) - before) < expected and time.monotonic() < until_s:
+        time.sleep(0.1)
+    return counted
+
+
+def judged(figures: dict[str, Any], before: Array, late: dict[str, Array], troubles: list[str]) -> Line:
+    """The line's figures and what did not hold. `before` and `late` are lateness without and beside each kind, us."""
+    undisturbed_us = p99_us(before)
+    allowed_us = round(MOST_RATIO * undisturbed_us + MOST_MORE_US, 1)
+    failures = list(troubles)
+    for kind, found in figures.items():
+        found["late_p99_us"] = p99_us(late[kind])
+        if found["beyond"]:
+            failures.append(f"{kind}: {found['beyond']} were told more than ZMTP's greeting and mechanism")
+        if found["counted"] != found["tries"]:
+            failures.append(f"{kind}: {found['counted']} of {found['tries']} counted")
+        if found["per_s"] < LEAST_PER_S:
+            failures.append(f"{kind}: only {found['per_s']:g} tries a second, {LEAST_PER_S:g} are needed")
+        if found["late_p99_us"] > allowed_us:
+            failures.append(f"{kind}: control late by {found['late_p99_us']:g} us (p99), allowed {allowed_us:g}")
+    tries, counted = (sum(found[name] for found in figures.values()) for name in ("tries", "counted"))
+    worst_us = max(found["late_p99_us"] for found in figures.values())
+    says = (
+        f"{tries:,} strangers over tcp at {min(found['per_s'] for found in figures.values()):.0f} a second: "
+        f"{sum(found['beyond'] for found in figures.values())} heard more than greeting and mechanism (allowed 0), "
+        f"{counted:,} counted (all); control late by {worst_us:.0f} us p99 beside the worst kind, "
+        f"{undisturbed_us:.0f} without (allowed {allowed_us:.0f})"
+    )
+    return Line(says, failures, {"undisturbed_p99_us": undisturbed_us, "allowed_p99_us": allowed_us, "kinds": figures})

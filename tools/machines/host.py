@@ -1,0 +1,204 @@
+"""What the host takes from a real-time program while it runs, as the kernel and bare timers see it.
+
+Nothing here asks the program itself: a program that holds itself up must not be able to blame the host. Bare timers
+(`bare_timer.py`) stand on every processor, above the daemon's priority where that is allowed, so each of them misses
+exactly what its processor did not give. `steal` is what the hypervisor gave to others, and a process has *waited* where
+it was ready to run and stood in a queue.
+"""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, NamedTuple
+
+PERIOD_NS = 1_000_000
+"Between the beats of a bare timer."
+MOST_TIMERS = 8
+"Processors that are watched at most; a timer costs 2% of one."
+LOOK_S = 0.2
+"How often the kernel's counters are read."
+STALL_MS = 10.0
+"A bare timer that stood still so long has found a stall: a fifth of the time after which a device opens by itself."
+LEAST_KEPT = 0.99
+"Share of its beats below which a bare timer says that the host does not leave enough."
+MOST_WAITED = 0.1
+"""Share of the time above which a process that waits for a processor has not been left enough. With FIFO the daemon
+waits for 3 to 8% of it, 30 to 80 us a wake-up; without, beside four busy loops, for a third."""
+MOST_BLOCKED = 0.02
+"""Share of the time above which waiting for disk or memory is taken for a hold-up. Once a device that writes its truth
+to a disk stood still for 38 ms while every bare timer kept its beats; that the disk was why is likely, not shown."""
+
+
+class Stall(NamedTuple):
+    """A time without a beat: from when the first missed beat was due until the next one came, CLOCK_MONOTONIC, s."""
+
+    start_s: float
+    end_s: float
+
+    @property
+    def length_ms(self) -> float:
+        """How long it took, ms."""
+        return (self.end_s - self.start_s) * 1e3
+
+
+class Counters(NamedTuple):
+    """The kernel's counters at one time: ticks stolen and in all, and how long each watched process has waited, s."""
+
+    time_s: float
+    stolen: int
+    ticks: int
+    waited_s: dict[str, float]
+    blocked_s: float
+    "How long some process was held up by disk or memory (Documentation/accounting/psi)."
+
+
+class Host(NamedTuple):
+    """What was taken in a span of time. `bare_kept` is the share of its beats that the worst bare timer kept."""
+
+    steal: float
+    bare_kept: float
+    bare_worst_ms: float
+    waited: dict[str, float]
+    blocked: float = 0.0
+
+    @property
+    def took_much(self) -> bool:
+        """Whether a real-time program could not have kept its time."""
+        return (
+            self.bare_worst_ms >= STALL_MS
+            or self.bare_kept < LEAST_KEPT
+            or max(self.waited.values(), default=0.0) > MOST_WAITED
+            or self.blocked > MOST_BLOCKED
+        )
+
+    def __str__(self) -> str:
+        """One clause for a sentence."""
+        name, share = max(self.waited.items(), key=lambda item: item[1], default=("", 0.0))
+        waited = f", and the {name} waited for a processor for {share:.0%} of the time" if share > MOST_WAITED else ""
+        return (
+            f"a bare timer stood still for up to {self.bare_worst_ms:.0f} ms and kept {self.bare_kept:.1%} of its "
+            f"beats{waited}; disk or memory held something up for {self.blocked:.0%} of the time"
+        )
+
+
+class HostWatch:
+    """Bare timers on the processors, and a thread that reads the kernel's counters. A context manager.
+
+    `fifo_priority` is the timers' own; it is refused where the daemon's is refused. `log` takes what they complain of.
+    """
+
+    def __init__(self, fifo_priority: int, log: IO[str]) -> None:
+        command = [sys.executable, str(Path(__file__).parents[1] / "bare_timer.py"), "--fifo", str(fifo_priority)]
+        self._timers = [
+            subprocess.Popen([*command, "--cpu", str(cpu)], stdout=subprocess.PIPE, stderr=log, text=True)
+            for cpu in sorted(os.sched_getaffinity(0))[:MOST_TIMERS]
+        ]
+        self._stalls: list[list[Stall]] = []
+        self._pids: dict[str, int] = {}
+        self._looks = [counters({})]
+        self._ended = threading.Event()
+        self._looking = threading.Thread(target=self._look, daemon=True)
+
+    def __enter__(self) -> "HostWatch":
+        self._looking.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def wait_for(self, name: str, pid: int) -> None:
+        """Also watches how long this process waits for a processor; by its main thread."""
+        self._pids = self._pids | {name: pid}
+
+    def end(self) -> None:
+        """Ends the timers and collects what they found; more than once does nothing."""
+        if self._ended.is_set():
+            return
+        self._ended.set()
+        self._looking.join()
+        for timer in self._timers:
+            timer.send_signal(signal.SIGTERM)
+        for timer in self._timers:
+            printed, _ = timer.communicate(timeout=30)
+            with contextlib.suppress(ValueError):  # one that ended before it could listen has seen nothing
+                self._stalls.append([Stall(*pair) for pair in json.loads(printed)])
+
+    def between(self, start_s: float, end_s: float) -> Host:
+        """What was taken between two times of CLOCK_MONOTONIC. Only after `end`."""
+        looks = [look for look in self._looks if start_s - LOOK_S <= look.time_s <= end_s]
+        first, last = (looks[0], looks[-1]) if len(looks) > 1 else (self._looks[0], self._looks[-1])
+        seconds = max(last.time_s - first.time_s, 1e-9)
+        return Host(
+            steal=(last.stolen - first.stolen) / max(last.ticks - first.ticks, 1),
+            bare_kept=min((kept(stalls, start_s, end_s) for stalls in self._stalls), default=1.0),
+            bare_worst_ms=max((stall.length_ms for stall in self._within(start_s, end_s)), default=0.0),
+            waited={
+                name: (waited_s - first.waited_s.get(name, 0.0)) / seconds for name, waited_s in last.waited_s.items()
+            },
+            blocked=(last.blocked_s - first.blocked_s) / seconds,
+        )
+
+    def _within(self, start_s: float, end_s: float) -> Iterator[Stall]:
+        for stalls in self._stalls:
+            yield from (stall for stall in stalls if stall.start_s < end_s and stall.end_s > start_s)
+
+    def _look(self) -> None:
+        while not self._ended.wait(LOOK_S):
+            self._looks.append(counters(self._pids))
+
+
+def kept(stalls: list[Stall], start_s: float, end_s: float) -> float:
+    """Share of its beats that a bare timer with these stalls kept between two times: each stall is one beat."""
+    period_s = PERIOD_NS * 1e-9
+    missed = sum(
+        int((min(stall.end_s, end_s) - max(stall.start_s, start_s)) / period_s)
+        for stall in stalls
+        if stall.start_s < end_s and stall.end_s > start_s
+    )
+    return 1.0 - min(missed * period_s / max(end_s - start_s, period_s), 1.0)
+
+
+def processor_s(pid: int) -> float:
+    """Processor time that a process and all that it has begun have had, s; what has ended counts where it was waited
+    for. Raises OSError where there is no such process."""
+    ticks = 0
+    waiting = [pid]
+    while waiting:
+        member = waiting.pop()
+        try:
+            stat = Path(f"/proc/{member}/stat").read_text(encoding="ascii", errors="replace")
+        except OSError:
+            if member == pid:
+                raise
+            continue  # it ended while we looked
+        with contextlib.suppress(OSError):  # so may a thread
+            for thread in Path(f"/proc/{member}/task").iterdir():
+                waiting.extend(int(child) for child in (thread / "children").read_text(encoding="ascii").split())
+        # a name may hold spaces and parentheses: what is counted stands behind the last one (proc_pid_stat(5))
+        ticks += sum(int(field) for field in stat.rpartition(")")[2].split()[11:15])
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def counters(pids: dict[str, int]) -> Counters:
+    """The counters now (proc_stat(5), Documentation/scheduler/sched-stats), without processes that are gone."""
+    fields = [int(field) for field in Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]]
+    waited_s = {}
+    for name, pid in pids.items():
+        # a kernel without schedstats has no such file: then nobody is known to have waited
+        with contextlib.suppress(OSError, IndexError):
+            waited_s[name] = (
+                int(Path(f"/proc/{pid}/task/{pid}/schedstat").read_text(encoding="ascii").split()[1]) * 1e-9
+            )
+    blocked_s = 0.0
+    for resource in ("io", "memory"):
+        with contextlib.suppress(OSError):  # nor is pressure known to every kernel
+            some = Path(f"/proc/pressure/{resource}").read_text(encoding="ascii").split("\n", 1)[0]
+            blocked_s += int(some.rpartition("total=")[2]) * 1e-6
+    return Counters(time.monotonic(), fields[7], sum(fields), waited_s, blocked_s)

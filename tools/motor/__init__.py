@@ -1,0 +1,1 @@
+"""A motor log, and what it says of motor and screw."""

@@ -1,0 +1,420 @@
+"""The real-time part of `make run`: the processes, the live view, and what became of it.
+
+What stands for other machines (the device, the robot that publishes) gets FIFO below the daemon's where that is
+allowed: outside the demonstration they do not share the daemon's processors.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import zmq
+from machines.host import Host, HostWatch
+from machines.own import own_machine
+
+from rendering.human_pulse import Array, pulse_profile, with_approach
+from rendering.tracking import Tracking, tracking
+from tormagd.client import Client, ClientError, UnreachableError
+from tormagd.ctl.operate import home, operate
+from tormagd.messages import MessageError, Telemetry, decode
+from tormagd.recording.reader import RecordingError, read_recording
+from tormagd.safety.codes import FAULTS, Fault
+
+RUN_DIR = Path("run/demo")
+RECORDING = RUN_DIR / "pulse.mcap"
+ADDRESS = "ipc://run/demo/{}"
+DAEMON_FIFO = 50
+DEVICE_FIFO, PUBLISHER_FIFO = DAEMON_FIFO - 10, DAEMON_FIFO - 20
+CONFIG = f"""scene = "pulse"
+
+[device]
+port = "{{port}}"
+
+[endpoints]
+setpoint = "{ADDRESS.format("setpoint")}"
+telemetry = "{ADDRESS.format("telemetry")}"
+control = "{ADDRESS.format("control")}"
+recording = "{ADDRESS.format("recording")}"
+
+[realtime]
+fifo_priority = {DAEMON_FIFO}  # each is refused where it is not allowed; then the log says so
+lock_memory = true
+"""
+CTL = ("-m", "tormagd.ctl.main", "--config", str(RUN_DIR / "tormagd.toml"), "--json", "--wait", "60")
+LEAST_N, MOST_N = 1.4, 1.7
+PULSE_S = 20.0
+RAMP_S, HOLD_S = 1.0, 3.0
+"Approach to the pulse's first force, and a hold there in which the trim learns this device."
+START_N = 0.6
+RATE_HZ = 500
+"Setpoints a second."
+PATIENCE_S = 60.0
+"For a start on a busy machine; only a failure waits for it."
+ANSWER_S = 5.0
+BEFORE_FAULT_S = 1.0
+"A stall that is to explain a fault was over for less than this when the fault was seen."
+FASTEST = 0.1
+"Share of the ticks that is called the fastest."
+OF_TIME = frozenset(
+    {
+        Fault.HOST_STALL,
+        Fault.LINK_LOST,
+        Fault.MEASUREMENT_STALE,
+        Fault.FOLLOWING_ERROR,
+        Fault.DEVICE_COMMAND_TIMEOUT,
+        Fault.DEVICE_NOT_RUNNING,
+    }
+)
+"""Faults by which daemon or device protect themselves from one that stands still; without a stall they mean something
+else."""
+
+
+class ShowError(Exception):
+    """A show that did not get to its end: one sentence with cause and remedy.
+
+    `is_of_time` says whether a host that took the processor would explain it; `time_s` is when it was seen.
+    """
+
+    def __init__(self, cause: str, remedy: str, is_of_time: bool = False) -> None:
+        super().__init__(f"{cause}; {remedy}")
+        self.cause = cause
+        self.time_s = time.monotonic()
+        self.is_of_time = is_of_time
+
+
+class Shown(NamedTuple):
+    """What was asked and rendered, and how daemon and host kept time meanwhile.
+
+    `kept` is the share of control periods that began a tick of their own, `spacing_s` the time between
+    ticks that the fastest tenth of them keeps: what the software takes where nobody is in its way.
+    """
+
+    time_s: Array
+    asked_N: Array
+    rendered_N: Array
+    gap_mm: Array
+    status: dict[str, Any]
+    limits: dict[str, float]
+    exit_codes: dict[str, int]
+    kept: float
+    spacing_s: float
+    worst_stall_ms: float
+    host: Host
+
+
+class Aborted(NamedTuple):
+    """What ended the show early, what the host took just before, and the least time between ticks (0: no ticks)."""
+
+    error: ShowError
+    host: Host
+    spacing_s: float
+
+
+class Course(NamedTuple):
+    """What the processes left behind: the daemon's status before and after, and when the pulse was played."""
+
+    start_s: float
+    end_s: float
+    start_ns: int
+    before: dict[str, Any]
+    after: dict[str, Any]
+    limits: dict[str, float]
+    exit_codes: dict[str, int]
+
+
+def profile(duration_s: float = PULSE_S) -> tuple[Array, Array]:
+    """Times, s, and forces, N, of the pulse behind its approach."""
+    return with_approach(*pulse_profile(duration_s, LEAST_N, MOST_N, RATE_HZ), START_N, RAMP_S, HOLD_S)
+
+
+def scored(time_s: Array, asked_N: Array, rendered_N: Array) -> Tracking:
+    """Tracking over the pulse, without the approach."""
+    pulse = time_s >= RAMP_S + HOLD_S
+    return tracking(asked_N[pulse], rendered_N[pulse])
+
+
+def show(times_s: Array, forces_N: Array) -> Shown | Aborted:
+    """Starts the processes, plays the profile with a live view, ends them in order."""
+    shutil.rmtree(RUN_DIR, ignore_errors=True)
+    RUN_DIR.mkdir(parents=True)
+    write_profile(RUN_DIR / "pulse.csv", times_s, forces_N)
+    with (RUN_DIR / "bare_timer.log").open("w") as log, HostWatch(DAEMON_FIFO + 1, log) as watched:
+        began_s = time.monotonic()
+        try:
+            course = play(watched, float(times_s[-1]))
+            watched.end()
+            return judged(course, watched.between(course.start_s, course.end_s), times_s, forces_N)
+        except ShowError as error:
+            watched.end()
+            until_s = fault_s(error.time_s)
+            host = watched.between(max(began_s, until_s - BEFORE_FAULT_S), until_s)
+            return Aborted(error, host, fastest_s(began_s, error.time_s))
+
+
+def write_profile(path: Path, times_s: Array, forces_N: Array) -> None:
+    """A setpoint CSV."""
+    rows = (f"{t:.4f},{f:.5f}" for t, f in zip(times_s, forces_N, strict=True))
+    path.write_text("t_s,force_N\n" + "\n".join(rows) + "\n")
+
+
+def play(watched: HostWatch, duration_s: float) -> Course:
+    """One show from the first process to the last. Raises ShowError."""
+    codes: dict[str, int] = {}
+    truth = str(RUN_DIR / "truth.csv")
+    with contextlib.ExitStack() as stack:
+        options = ("--pty", "--plant", "sample_1", "--seed", "1", "--truth", truth)
+        device = own_machine(DEVICE_FIFO, "tormagd.simulation", *options)
+        simulator = stack.enter_context(process("simulator", *device, is_read=True))
+        assert simulator.stdout is not None
+        port = simulator.stdout.readline().strip()
+        if not port:
+            raise ended("simulator")
+        watched.wait_for("simulated device", simulator.pid)
+        config = RUN_DIR / "tormagd.toml"
+        config.write_text(CONFIG.format(port=port))
+        daemon = stack.enter_context(process("tormagd", "-m", "tormagd.daemon.main", "--config", str(config)))
+        watched.wait_for("daemon", daemon.pid)
+        # from the first tick on: it also says how a show went that ended early
+        recorder = stack.enter_context(process("recorder", *CTL, "record", str(RECORDING)))
+        client = stack.enter_context(Client.local(ADDRESS.format("").removeprefix("ipc://").rstrip("/"), ANSWER_S))
+        wait_for_link(daemon, client)
+        arm(client)
+        before, start_s = status(client), time.monotonic()
+        robot = own_machine(PUBLISHER_FIFO, *CTL[1:], "send", str(RUN_DIR / "pulse.csv"), "--rate", str(RATE_HZ))
+        publisher = stack.enter_context(process("publisher", *robot, is_read=True))
+        limits = watch(publisher, daemon, client, duration_s)
+        printed, _ = publisher.communicate(timeout=PATIENCE_S)
+        after, end_s = status(client), time.monotonic()
+        raise_fault(after)
+        codes["publisher"] = publisher.returncode
+        codes["recorder"] = end(recorder, signal.SIGINT)
+        codes["tormagd"] = end(daemon, signal.SIGTERM)
+        codes["simulator"] = end(simulator, signal.SIGTERM)
+    answer = json.loads(printed)
+    if not answer["ok"]:
+        raise ShowError(f"the publisher: {answer['error']['message']}", answer["error"]["hint"], is_of_time=True)
+    return Course(start_s, end_s, answer["result"]["start_ns"], before, after, limits, codes)
+
+
+def judged(course: Course, host: Host, times_s: Array, forces_N: Array) -> Shown:
+    """The show's figures, from the device's own truth and the daemon's recording. Raises ShowError."""
+    try:
+        truth = np.genfromtxt(RUN_DIR / "truth.csv", delimiter=",", names=True)
+        spacings_s = tick_spacings_s(course.start_s, course.end_s)
+    except (OSError, ValueError) as error:
+        raise ShowError(f"what was recorded cannot be read: {error}", f"look at the logs in {RUN_DIR}") from error
+    axis = (truth["t_ns"] - course.start_ns) * 1e-9
+    inside = (axis >= times_s[0]) & (axis <= times_s[-1])
+    if len(spacings_s) == 0 or not inside.any():
+        raise ShowError("nothing was recorded", f"look at the logs in {RUN_DIR}")
+    first, last = course.before["rates"]["control"], course.after["rates"]["control"]
+    runs, merged = last["runs"] - first["runs"], last["merged"] - first["merged"]
+    return Shown(
+        time_s=axis[inside],
+        asked_N=np.interp(axis[inside], times_s, forces_N),
+        rendered_N=truth["force_N"][inside],
+        gap_mm=truth["gap_mm"][inside],
+        status=course.after,
+        limits=course.limits,
+        exit_codes=course.exit_codes,
+        kept=runs / max(runs + merged, 1),
+        spacing_s=float(np.quantile(spacings_s, FASTEST)),
+        worst_stall_ms=float(spacings_s.max()) * 1e3,
+        host=host,
+    )
+
+
+def tick_spacings_s(start_s: float, end_s: float) -> Array:
+    """Times between the recorded ticks between two times of CLOCK_MONOTONIC. Raises RecordingError."""
+    moments_s = read_recording(RECORDING).ticks.numbers.get("monotonic_s", np.empty(0))
+    return np.diff(moments_s[(moments_s >= start_s) & (moments_s <= end_s)])
+
+
+def fault_s(seen_s: float) -> float:
+    """When the first fault was latched, by the recording: whoever saw it at `seen_s` may have been late."""
+    try:
+        ticks = read_recording(RECORDING).ticks
+    except RecordingError:
+        return seen_s
+    moments_s = ticks.numbers.get("monotonic_s", np.empty(0))
+    latched = (
+        float(moment_s) for moment_s, faults in zip(moments_s, ticks.words.get("faults", ()), strict=False) if faults
+    )
+    return next(latched, seen_s)
+
+
+def fastest_s(start_s: float, end_s: float) -> float:
+    """Time between ticks that the fastest tenth of them keeps; 0 where none were recorded."""
+    try:
+        spacings_s = tick_spacings_s(start_s, end_s)
+    except RecordingError:
+        return 0.0
+    return float(np.quantile(spacings_s, FASTEST)) if len(spacings_s) else 0.0
+
+
+@contextlib.contextmanager
+def process(name: str, *arguments: str, is_read: bool = False) -> Iterator["subprocess.Popen[str]"]:
+    """A Python child whose messages go to a log file; told to end, then killed, if it is still there at the end."""
+    with (RUN_DIR / f"{name}.log").open("w") as log:
+        child = subprocess.Popen(
+            [sys.executable, *arguments], stdout=subprocess.PIPE if is_read else log, stderr=log, text=True
+        )
+        try:
+            yield child
+        finally:
+            if child.poll() is None:
+                end(child, signal.SIGTERM)
+
+
+def end(child: "subprocess.Popen[str]", number: signal.Signals) -> int:
+    """Sends a signal and waits for the orderly end it asks for."""
+    child.send_signal(number)
+    try:
+        return child.wait(timeout=15)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        return child.wait()
+
+
+def ended(name: str) -> ShowError:
+    """A process that is gone, by the last line of its log."""
+    log = RUN_DIR / f"{name}.log"
+    lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
+    said = next((line.strip() for line in reversed(lines) if line.strip()), "it said nothing")
+    return ShowError(f"the process {name} ended by itself: {said[:200]}", f"all that it said is in {log}")
+
+
+def wait_for_link(daemon: "subprocess.Popen[str]", client: Client) -> None:
+    """Until the link to the device runs. Raises ShowError."""
+    until_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < until_s:
+        if daemon.poll() is not None:
+            raise ended("tormagd")
+        with contextlib.suppress(ClientError):
+            if client.request("status").get("link", {}).get("state") == "RUNNING":
+                return
+        time.sleep(0.1)
+    raise ShowError(
+        f"the daemon did not reach its device within {PATIENCE_S:.0f} s", f"look at the logs in {RUN_DIR}", True
+    )
+
+
+def arm(client: Client) -> None:
+    """Homes and enables. Raises ShowError."""
+    try:
+        home(client, PATIENCE_S, True)
+        print("homed; enabling")
+        until_s = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                operate(client, "enable")
+                return
+            except ClientError as error:
+                # a busy machine may find the newest measurement a little old for a moment
+                if error.code not in ("not_fresh", "busy") or time.monotonic() > until_s:
+                    raise
+                time.sleep(0.05)
+    except ClientError as error:
+        raise_fault(status(client))
+        is_late = isinstance(error, UnreachableError) or error.code in ("not_fresh", "timeout", "not_begun")
+        raise ShowError(error.message, error.hint, is_of_time=is_late) from error
+
+
+def status(client: Client) -> dict[str, Any]:
+    """The daemon's status. Raises ShowError."""
+    try:
+        return client.request("status")
+    except ClientError as error:
+        raise ShowError(error.message, f"look at {RUN_DIR / 'tormagd.log'}", is_of_time=True) from error
+
+
+def raise_fault(state: dict[str, Any]) -> None:
+    """Raises ShowError with the first fault that the daemon has latched, if it has."""
+    if not state["faults"]:
+        return
+    fault = Fault(state["faults"][0])
+    others = "".join(f", then {code}" for code in state["faults"][1:])
+    known = FAULTS[fault]
+    raise ShowError(f"{fault}{others}: {known.cause}", known.remedy, is_of_time=fault in OF_TIME)
+
+
+def watch(
+    publisher: "subprocess.Popen[str]", daemon: "subprocess.Popen[str]", client: Client, duration_s: float
+) -> dict[str, float]:
+    """The live view; the share of telemetry messages in which each limit was held. Raises ShowError."""
+    is_terminal = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
+    held: dict[str, int] = {}
+    seen = 0
+    start_s = shown_s = time.monotonic()
+    until_s = start_s + duration_s + PATIENCE_S
+    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.subscribe(b"")
+        socket.connect(ADDRESS.format("telemetry"))
+        while publisher.poll() is None and time.monotonic() < until_s:
+            if daemon.poll() is not None:
+                raise ended("tormagd")
+            if not socket.poll(200):
+                continue
+            try:
+                telemetry = decode(socket.recv(), Telemetry)
+            except MessageError as error:
+                print(f"telemetry: {error}", file=sys.stderr)
+                continue
+            if telemetry.faults:
+                if is_terminal:
+                    print()
+                raise_fault(status(client))
+            seen += 1
+            for limit in telemetry.limits:
+                held[limit] = held.get(limit, 0) + 1
+            now_s = time.monotonic()
+            if now_s - shown_s >= (0.1 if is_terminal else 1.0):
+                shown_s = now_s
+                line = live_line(telemetry, now_s - start_s, duration_s)
+                print(f"\r\x1b[K{line}" if is_terminal else line, end="" if is_terminal else "\n", flush=True)
+    if is_terminal:
+        print()
+    if publisher.poll() is None:
+        raise ShowError(
+            f"the publisher was not done {PATIENCE_S:.0f} s after the pulse's end",
+            f"look at the logs in {RUN_DIR}",
+            True,
+        )
+    return {limit: count / max(seen, 1) for limit, count in held.items()}
+
+
+COLUMNS = 79
+"One less than the narrowest usual terminal has: a full line would wrap there."
+
+
+def live_line(telemetry: Telemetry, elapsed_s: float, duration_s: float) -> str:
+    """One line: a bar of the measured force with a mark where it was asked, gap, limits; as many as fit."""
+    width, most = 20, 2.0
+    measured, asked = telemetry.measured_cf or 0.0, telemetry.setpoint_cf or 0.0
+    shown = "-" if telemetry.setpoint_cf is None else f"{asked:.2f}"
+    filled = round(min(max(measured / most, 0.0), 1.0) * width)
+    bar = list("#" * filled + "-" * (width - filled))
+    bar[min(round(asked / most * width), width - 1)] = "|"
+    line = (
+        f"{min(elapsed_s, duration_s):4.1f}/{duration_s:.0f} s [{''.join(bar)}] asked {shown:>4s} "
+        f"got {measured:4.2f} N {telemetry.gap_mm or 0.0:4.1f} mm"
+    )
+    if telemetry.operating_state != "ENABLED":
+        line += f" {telemetry.operating_state}"
+    for number, limit in enumerate(telemetry.limits):
+        more = f" +{len(telemetry.limits) - number}"
+        is_last = number == len(telemetry.limits) - 1
+        if len(line) + 1 + len(limit) + (0 if is_last else len(more)) > COLUMNS:
+            return line + more
+        line += f" {limit}"
+    return line

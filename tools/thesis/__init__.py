@@ -1,0 +1,1 @@
+"""What the thesis prints, where it contradicts itself, and docs/reproduction.md."""

@@ -1,0 +1,1 @@
+"""What may happen between host and device: bad lines, a pulled cable, and damage by the million."""
