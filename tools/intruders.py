@@ -16,6 +16,7 @@ from typing import Any
 from intrusion import floods, messages, pulse_from_afar, stop_lane, strangers
 from intrusion.besieged import FIFO_PRIORITY, Line
 from machines.host import Host, HostWatch
+from machines.wire import carried
 
 PARTS: dict[str, Callable[[float], Line]] = {
     "strangers": strangers.measure,
@@ -51,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def watched(part: Callable[[float], Line], share: float) -> tuple[Line, Host]:
     """What a part came to, and what the machine took meanwhile."""
-    with HostWatch(FIFO_PRIORITY + 1, sys.stderr) as watch:
+    with carried(FIFO_PRIORITY - 1), HostWatch(FIFO_PRIORITY + 1, sys.stderr) as watch:
         start_s = time.monotonic()
         line = part(share)
         end_s = time.monotonic()

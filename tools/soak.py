@@ -27,6 +27,7 @@ import msgspec
 from benchmarks.loop import Stand, end, wait_for, write_config
 from machines.host import HostWatch
 from machines.own import own_machine
+from machines.wire import carried
 from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
@@ -104,6 +105,7 @@ def daemon(minutes: float) -> dict[str, Any]:
         folder = Path(name)
         log = stack.enter_context((folder / "bare_timer.log").open("w", encoding="utf-8"))
         watched = stack.enter_context(HostWatch(FIFO_PRIORITY + 1, log))
+        is_carried = stack.enter_context(carried(FIFO_PRIORITY - 1))
         config, process = _running(folder, stack)
         processes = {"daemon": process, "recorder": _recorder(folder, "soak", stack)}
         for _ in tqdm(range(round(60.0 * minutes / SAMPLE_S)), desc="real time", unit="sample", disable=None):
@@ -143,6 +145,7 @@ def daemon(minutes: float) -> dict[str, Any]:
         },
         "held_up": held_up,
         "host_worst_ms": round(host_worst_ms, 1),
+        "pty_workers_fifo": is_carried,
         "operating_state": status["operating_state"],
         "control": {name: control[name] for name in ("runs", "merged", "overruns", "stalls")},
         "worst_lateness_ms": round(control["lateness_us"]["worst"] * 1e-3, 3),

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import zmq
 from machines.own import own_machine
+from machines.wire import carried
 from tqdm import tqdm
 
 from tormagd.client import Client, ClientError
@@ -212,7 +213,7 @@ def measure(each: int, fifo_priority: int) -> dict[str, Any]:
     ]
     random.seed(1)
     random.shuffle(plan)
-    with tempfile.TemporaryDirectory(prefix="stalls-") as folder:
+    with tempfile.TemporaryDirectory(prefix="stalls-") as folder, carried(DEVICE_PRIORITY):
         rig = Rig(Path(folder), fifo_priority)
         with contextlib.suppress(PermissionError):  # where this is refused, pauses are longer on a busy machine
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(SENDER_PRIORITY))

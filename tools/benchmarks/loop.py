@@ -32,6 +32,7 @@ import uvloop
 import zmq
 from machines.host import processor_s
 from machines.own import own_machine
+from machines.wire import carried
 
 from benchmarks.against import add_against_argument, environment
 from benchmarks.histograms import plot_histograms
@@ -378,6 +379,8 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
     """The same for any stand."""
     with contextlib.ExitStack() as stack:
         ours, theirs = environment(None), environment(stand.root)
+        if stand.device_fifo:
+            stack.enter_context(carried(stand.device_fifo))
         device = own_machine(stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud), *stand.device)
         simulator = subprocess.Popen([sys.executable, *device], stdout=subprocess.PIPE, env=ours, text=True)
         stack.callback(end, simulator)

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from machines.own import own_machine
+from machines.wire import carried
 from rendering.human_pulse import Array, pulse_profile, with_approach
 from rendering.show import (
     ADDRESS,
@@ -86,7 +87,7 @@ def rendered_rms_N(command: list[str], times_s: Array, forces_N: Array) -> float
     truth_path = RUN_DIR / "truth.csv"
     options = ("--pty", "--seed", "1", "--truth", str(truth_path))
     device = own_machine(DEVICE_FIFO, "tormagd.simulation", *options)
-    with process("simulator", *device, is_read=True) as simulator:
+    with carried(DEVICE_FIFO), process("simulator", *device, is_read=True) as simulator:
         assert simulator.stdout is not None
         config = RUN_DIR / "tormagd.toml"
         config.write_text(CONFIG.format(port=simulator.stdout.readline().strip()))

@@ -20,6 +20,7 @@ import numpy as np
 import zmq
 from machines.host import Host, HostWatch
 from machines.own import own_machine
+from machines.wire import carried
 
 from rendering.human_pulse import Array, pulse_profile, with_approach
 from rendering.tracking import Tracking, tracking
@@ -147,7 +148,11 @@ def show(times_s: Array, forces_N: Array) -> Shown | Aborted:
     shutil.rmtree(RUN_DIR, ignore_errors=True)
     RUN_DIR.mkdir(parents=True)
     write_profile(RUN_DIR / "pulse.csv", times_s, forces_N)
-    with (RUN_DIR / "bare_timer.log").open("w") as log, HostWatch(DAEMON_FIFO + 1, log) as watched:
+    with (
+        (RUN_DIR / "bare_timer.log").open("w") as log,
+        HostWatch(DAEMON_FIFO + 1, log) as watched,
+        carried(DEVICE_FIFO),
+    ):
         began_s = time.monotonic()
         try:
             course = play(watched, float(times_s[-1]))
