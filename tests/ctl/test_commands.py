@@ -330,6 +330,15 @@ def test_a_decision_is_explained_with_what_was_measured(tmp_path, capsys):
     assert "required_terms.py" in printed["error"]["hint"]
 
 
+@pytest.mark.parametrize(("link", "is_shown"), [("RUNNING", True), ("BACK_OFF", False), ("REFUSED", False)])
+def test_no_command_is_said_to_be_next_that_a_missing_device_would_refuse(status_with, link, is_shown):
+    report = status_with()["link"] | {"state": link, "cause": "there is no such port", "remedy": "plug the device in"}
+    known = status_with(next_commands=("home", "enable"), link=report)
+    shown = status_text(msgspec.convert(known, Status), Colour(sys.stdout))
+    assert ("next      home, enable" in shown) == is_shown
+    assert "next: plug the device in" in shown
+
+
 @pytest.fixture
 def states(status_with: Any) -> Any:
     """Makes answers to `status`, one (is_homed, is_busy) after the other, the last one for ever."""
@@ -421,6 +430,13 @@ def test_status_text_shows_what_is_not_known_as_such(status_with):
     assert "setpoint  - old, 3 accepted, 1 refused, 0 dropped, 0 oversize" in lines
     assert lines[-1] == "refused   too much"
     assert "late by" not in "\n".join(lines)
+
+
+@pytest.mark.parametrize("folder", ["", "/var/lib/tormag/profiles"])
+def test_status_text_says_why_a_profile_is_not_used_where_one_was_to_be(status_with, folder):
+    profile = {"is_used": False, "age_s": None, "refusal": "it is of another serial", "folder": folder}
+    shown = status_text(msgspec.convert(status_with(profile=profile), Status), Colour(sys.stdout))
+    assert ("it is of another serial\n          next: tormagctl calibrate --device" in shown) == bool(folder)
 
 
 def test_status_text_says_what_to_do_next(status_with):
