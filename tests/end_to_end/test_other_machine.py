@@ -8,7 +8,6 @@ import contextlib
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -95,7 +94,14 @@ class Machines:
 
     def ctl(self, who: str, *arguments: str) -> dict[str, Any]:
         """What tormagctl answers to somebody on the other machine."""
-        asked = self.start(1, *CTL, "--json", "--config", str(self.folder / f"{who}.toml"), *arguments)
+        return self.answer(self.asked(who, *arguments))
+
+    def asked(self, who: str, *arguments: str) -> "subprocess.Popen[str]":
+        """tormagctl on the other machine, which will `answer`."""
+        return self.start(1, *CTL, "--json", "--config", str(self.folder / f"{who}.toml"), *arguments)
+
+    def answer(self, asked: "subprocess.Popen[str]") -> dict[str, Any]:
+        """What it prints."""
         printed, _ = asked.communicate(timeout=PATIENCE_S)
         answer: dict[str, Any] = json.loads(printed)
         return answer
@@ -147,12 +153,15 @@ def test_a_publisher_on_another_machine_drives_the_brake(machines: Machines) -> 
 def test_nobody_else_is_let_in_from_there_and_each_is_counted(machines: Machines) -> None:
     before = machines.status()
     # the publisher's key neither commands nor looks, the screen's only looks
-    for command in ("stop", "enable", "status"):
-        assert machines.ctl("robot", command)["error"]["code"] == "unreachable"
+    for asked in [machines.asked("robot", command) for command in ("stop", "enable", "status")]:
+        assert machines.answer(asked)["error"]["code"] == "unreachable"
     assert machines.ctl("screen", "status")["result"]["version"] == before["version"]
     assert machines.ctl("screen", "stop")["error"]["code"] == "forbidden"
-    for kind in ("plain", "unlisted", "wrong", "console"):
-        machines.start(1, sys.executable, "-c", STRANGERS, f"tcp://{HERE}:5555", str(machines.keys), kind).wait()
+    for stranger in [
+        machines.start(1, sys.executable, "-c", STRANGERS, f"tcp://{HERE}:5555", str(machines.keys), kind)
+        for kind in ("plain", "unlisted", "wrong", "console")
+    ]:
+        stranger.wait()
     expected = before["peers"]["refused"] + 3 + 4 * 20
     machines.until(lambda: machines.status()["peers"]["refused"] >= expected, f"{expected} refused")
     status = machines.status()
@@ -176,33 +185,3 @@ def test_a_stranger_on_the_wire_gets_the_greeting_only(machines: Machines) -> No
     got, _ = machines.start(1, sys.executable, "-c", listen, HERE, plain.hex()).communicate(timeout=PATIENCE_S)
     assert len(bytes.fromhex(got)) <= 64
     assert bytes.fromhex(got)[12:32] in (b"", b"CURVE".ljust(20, b"\0"))
-
-
-def test_a_guarded_address_without_keys_is_refused_before_anything_is_opened(tmp_path: Path) -> None:
-    """Exit 2, with the key and the remedy; and a secret that others can read is none."""
-    config = tmp_path / "tormagd.toml"
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-
-    def refusal() -> str:
-        done = subprocess.run(
-            [sys.executable, "-m", "tormagd.daemon.main", "--check", "--config", str(config)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 2
-        return done.stderr
-
-    config.write_text(f'[endpoints]\nsetpoint = "tcp://192.0.2.1:{port}"\n')
-    assert "others need CURVE keys in [endpoints.curve]" in refusal()
-    keys = tmp_path / "keys"
-    subprocess.run([*CTL, "keys", "generate", str(keys)], check=True, capture_output=True)
-    curve = f'[endpoints.curve]\nserver_secret = "{keys}/server.key_secret"\n'
-    config.write_text(f'[endpoints]\nsetpoint = "tcp://192.0.2.1:{port}"\n{curve}')
-    (keys / "server.key_secret").chmod(0o644)
-    assert "server.key_secret can be read by others (mode 0644)" in refusal()
-    curve = curve.replace("server_secret", "client_secret")
-    config.write_text(f'[endpoints]\nsetpoint = "tcp://192.0.2.1:{port}"\n{curve}')
-    assert "endpoints.curve.server_secret is missing" in refusal()
