@@ -48,6 +48,7 @@ MAY_IMPORT = {
 TOOLS = ROOT / "tools"
 TOOL_ROOMS = {
     "machines": set(),
+    "consoles": set(),
     "wire": set(),
     "thesis": set(),
     "motor": set(),
@@ -55,7 +56,7 @@ TOOL_ROOMS = {
     "first_use": set(),
     "rendering": {"machines"},
     "fault_matrix": {"wire"},
-    "benchmarks": {"machines", "wire", "thesis", "rendering"},
+    "benchmarks": {"machines", "consoles", "wire", "thesis", "rendering"},
     "tactile": {"thesis", "rendering", "benchmarks"},
     "intrusion": {"machines", "rendering", "benchmarks"},
 }
