@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 import pytest
 
 from tormagd.messages import Telemetry
-from tormagd.recording.writer import TELEMETRY_TOPIC, TICK_KINDS, TICKS_TOPIC, telemetry_schema, tick_schema
+from tormagd.recording.writer import TELEMETRY_TOPIC, TICK_KINDS, TICKS_TOPIC, plain_schema, tick_schema
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-SCHEMAS = {TELEMETRY_TOPIC: telemetry_schema(), TICKS_TOPIC: tick_schema(TICK_KINDS)}
+SCHEMAS = {TELEMETRY_TOPIC: plain_schema(Telemetry), TICKS_TOPIC: tick_schema(TICK_KINDS)}
 PAIRS = ("duty", "measured_jp")
 "Lists of a number for each carriage; the others are of codes, as many as there are."
 
@@ -41,7 +41,7 @@ def leaves(node: str | dict[str, Any]) -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
-    ("name", "topics"), [("plotjuggler_recording.xml", SCHEMAS), ("plotjuggler_live.xml", {"": telemetry_schema()})]
+    ("name", "topics"), [("plotjuggler_recording.xml", SCHEMAS), ("plotjuggler_live.xml", {"": plain_schema(Telemetry)})]
 )
 def test_plotjuggler_finds_its_curves(name: str, topics: dict[str, dict[str, Any]]) -> None:
     """It names a series by topic, slash and field, and shows numbers; a message of one frame has no topic."""
