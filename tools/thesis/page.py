@@ -163,8 +163,9 @@ def table_2_5(table: Json) -> str:
     low, high = table["implied_gap_resolution_mm"]
     parts = [
         "## Table 2.5: inserts for tasks\n\n"
-        f"`tools/reproduce_thesis.py --table-2-5` prints it alone. {table['note']} Gap steps of {table['gap_resolution_mm']:g} mm; the "
-        f"resolutions the thesis states correspond to {low:.2f}..{high:.2f} mm at the closed gap. "
+        f"`tools/reproduce_thesis.py --table-2-5` prints it alone. {table['note']} "
+        f"Gap steps of {table['gap_resolution_mm']:g} mm; "
+        f"the resolutions the thesis states correspond to {low:.2f}..{high:.2f} mm at the closed gap. "
         "Required resolution: the thesis's 0.1 N for cardiovascular work, else a tenth of the range (about the JND of "
         "force). With the magnets 95 mm apart no insert gets low enough for a task that starts at 0 N and is sensitive "
         "there; the gap that would do is given.\n\n"
