@@ -6,7 +6,6 @@ on the simulated device, and table 4.1 and the pulse on a simulated pad (synthet
 
 import argparse
 import json
-import math
 import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -20,6 +19,7 @@ from tactile_experiment import reproduced
 from thesis.errata import errata, table_2_4_errors
 from thesis.page import print_summary, write_page
 from thesis.step_test import StepTest, step_test
+from thesis.table_2_5 import CLOSED_MM, OPEN_MM, print_table, table_2_5
 from thesis.values import (
     AS_BUILT,
     FIGURE_2_5_MEASURED_N,
@@ -28,7 +28,6 @@ from thesis.values import (
     TABLE_2_3_MASSES_G,
     TABLE_2_4_MAX_PERCENT,
     TABLE_2_4_MEAN_PERCENT,
-    TABLE_2_5,
     USE_CASES,
 )
 from tqdm import tqdm
@@ -38,7 +37,6 @@ from tormagd.design.optimisation import Design, Outcome, Problem, Run, coverage
 from tormagd.design.phase_portrait import PhasePortrait
 from tormagd.design.range_fit import RangeFit, fit_exponent, fit_friction, leave_one_out, mean_relative_error
 from tormagd.design.recorded_task import task_of
-from tormagd.design.selection import rank
 from tormagd.design.sweep import sweep
 from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
 from tormagd.physics.force import TORMAG, Elastomer
@@ -46,11 +44,8 @@ from tormagd.physics.inserts import INSERTS, Insert, insert
 
 Json = dict[str, Any]
 
-CLOSED_MM, OPEN_MM = 45.0, 95.0
 CONTROLLER_SPEED_MM_S = 40.0
 "Gap speed of two carriages at 150 rpm on 8 mm screws; the controller's own, once measured, goes in with --gap-speed."
-GAP_RESOLUTION_MM = 0.1
-"Where a plain position loop stands against the screws' backlash; table 2.5 of the thesis implies 0.05..0.09 mm."
 STEP_INSERTS = ("MRE-50-40", "MRE-30-30", "MRE-10-20")
 PULSE_N = (1.4, 1.7)
 PULSE_S, PULSE_HZ = 20.0, 500
@@ -67,7 +62,15 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--quick", action="store_true", help="one start, few rows and epochs: shows only that it runs")
+    parser.add_argument("--table-2-5", action="store_true", help="print table 2.5 in both its readings, and no more")
     options = parser.parse_args()
+    if options.table_2_5:
+        found = table_2_5()
+        if options.json:
+            print(json.dumps(found))
+        else:
+            print_table(found)
+        return 0
     with ProcessPoolExecutor(options.workers) as pool:
         learned = pool.submit(reproduced, QUICK if options.quick else FULL)
         steps = [pool.submit(step_test, insert(name), options.seed) for name in STEP_INSERTS]
@@ -125,6 +128,7 @@ def table_2_4() -> Json:
         **ours,
         "power_field_law": {name: value for name, value in beside.items() if name != "rows"},
         "thesis": {"mean_rel_error": TABLE_2_4_MEAN_PERCENT / 100, "max_rel_error": TABLE_2_4_MAX_PERCENT / 100},
+        "registry": _registry_errors(),
         "thesis_errors": table_2_4_errors(),
         "measure": "F(45 mm) - F(95 mm) against the measured range of table 2.4; one friction coefficient per matrix, "
         "chosen for the least mean relative error; field law Eq. 7",
@@ -150,6 +154,18 @@ def _range_fit(law: FieldLaw) -> Json:
     }
 
 
+def _registry_errors() -> Json:
+    """The same of the friction that inserts and simulated device have: the least squares of the relative errors."""
+    known = list(INSERTS.values())
+    friction = {item.shore_hardness: item.elastomer.friction_coefficient for item in known}
+    used = RangeFit(ThesisFieldLaw(), friction, exponent=1.0)
+    return {
+        "friction": friction,
+        "mean_rel_error": mean_relative_error(used, known),
+        "max_rel_error": max(used.relative_error(item) for item in known),
+    }
+
+
 def _range_row(item: Insert, fixed: RangeFit, free: RangeFit, left_out: float) -> Json:
     ranges = item.force_range
     return {
@@ -164,57 +180,6 @@ def _range_row(item: Insert, fixed: RangeFit, free: RangeFit, left_out: float) -
         "rel_error_free_exponent": free.relative_error(item),
         "leave_one_out_rel_error": left_out,
     }
-
-
-def table_2_5() -> Json:
-    """Every insert before every task of table 2.5."""
-    # the open gap is that of the device, but the law must hold beyond it where a task asks for less force
-    fit = fit_friction(INSERTS.values(), PowerFieldLaw())
-    brakes = {item.name: _fitted_brake(item, fit) for item in INSERTS.values()}
-    tasks = []
-    for task, named in TABLE_2_5:
-        verdicts = rank(brakes, task, GAP_RESOLUTION_MM)
-        tasks.append(
-            {
-                "task": task.name,
-                "range_N": [task.least_N, task.most_N],
-                "resolution_N": task.resolution_N,
-                "thesis_mN": named,
-                "ranked": [
-                    {
-                        "insert": verdict.insert,
-                        "serves": verdict.serves,
-                        "force_N": [verdict.least_N, verdict.most_N],
-                        "resolution_mN": 1e3 * verdict.resolution_N,
-                        "served_share": verdict.served_share,
-                        "reasons": list(verdict.reasons),
-                        "sufficient_gap_mm": None
-                        if math.isnan(verdict.sufficient_gap_mm)
-                        else verdict.sufficient_gap_mm,
-                    }
-                    for verdict in verdicts
-                ],
-            }
-        )
-    steps = [
-        1e-3 * resolution_mN / brakes[name].slope_N_mm(CLOSED_MM)
-        for _, named in TABLE_2_5
-        for name, resolution_mN in named.items()
-    ]
-    return {
-        "tasks": tasks,
-        "gap_resolution_mm": GAP_RESOLUTION_MM,
-        "implied_gap_resolution_mm": [min(steps), max(steps)],
-        "note": "The thesis compares ranges only. Here the least force counts too: a passive brake does not reach 0 N. "
-        "Resolution is the force of one gap step where the insert is steepest within the task's range. Forces by the "
-        "power field law with the friction fitted to table 2.4.",
-    }
-
-
-def _fitted_brake(item: Insert, fit: RangeFit) -> Brake:
-    elastomer = item.elastomer
-    fitted = Elastomer(elastomer.shear_modulus_Pa, elastomer.relative_permeability, fit.friction[item.shore_hardness])
-    return Brake(fit.field, fitted, TORMAG, CLOSED_MM, OPEN_MM)
 
 
 def figure_2_5() -> Json:

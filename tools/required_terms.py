@@ -2,7 +2,7 @@
 
     required_terms.py [SCENE ...] [--quick] [--costs] [--json] [--store] [--dask ADDRESS]
 
-First the rates: the lowest at which all terms do what they do at the fastest. At these, sample 1 chooses: a term whose
+First the rates: the lowest at which all terms do what they do at the usual. At these, sample 1 chooses: a term whose
 absence adds more than SHARE of the scene's tolerance to the RMS error of the force, with the device learned beforehand
 and frozen or while it is learned, is in. All others are left out together. What rates and terms do is judged on samples
 1 (frozen, too), 2 and 3: it stays within JUDGED of the tolerance, or adds no more than SHARE of it; otherwise the rates
@@ -49,8 +49,12 @@ SHARE = 0.2
 KEPT = ROOT / "build" / "required_terms.json"
 STORED = ROOT / "tormagd" / "scenes" / FILE
 SECONDS, QUICK_S = 5.0, 2.0
-RATES_HZ = (1_000, 500), (1_000, 83), (500, 500), (500, 83), (250, 250)
-"Of control, and of setpoints and plans. The full model at the first of them is what all others are held against."
+RATES_HZ = (
+    *((1_000, 500), (2_000, 1_000), (1_000, 1_000), (1_000, 83)),
+    *((500, 500), (500, 83), (250, 250), (250, 83)),
+)
+"""Of control, and of setpoints and plans. The full model at the first of them, the usual, is what all others are held
+against."""
 MODES = False, True
 "Frozen, and while the device is learned."
 NO_COST = Cost(0.0, 0.0)
@@ -77,7 +81,7 @@ def measure(name: str, runs: Runs, samples: tuple[str, ...] = SAMPLES, seconds: 
         pairs = zip(full, chosen, strict=True)
         return tuple(Judged(best.plant, best.is_learning, found[best], found[each]) for best, each in pairs)
 
-    rates = tuple(AtRates(*hz, judge((), hz)) for hz in RATES_HZ)
+    rates = tuple(AtRates(*hz, judge((), hz), NO_COST) for hz in RATES_HZ)
     hz = cheapest(rates, tolerance_N)
     terms = _alone(lambda out, mode: case(out, hz, samples[0], mode), scene.signal.is_known_ahead, runs)
     needed = set(required(terms, tolerance_N, SHARE))
@@ -93,7 +97,7 @@ def measure(name: str, runs: Runs, samples: tuple[str, ...] = SAMPLES, seconds: 
     found = runs(searched.values())
     searches = tuple(WithSearch(search, found[each], NO_COST) for search, each in searched.items())
     unpriced = MeasuredScene(
-        scene.name, scene.fingerprint, tolerance_N, *hz, left_out, terms, judged, rates, searches, NO_COST, NO_COST
+        scene.name, scene.fingerprint, tolerance_N, *hz, left_out, terms, judged, rates, searches, NO_COST
     )
     return with_costs(unpriced, name)
 
@@ -112,24 +116,33 @@ def _alone(case: Callable[[Iterable[str], bool], Case], is_known_ahead: bool, ru
 
 
 def cheapest(rates: tuple[AtRates, ...], tolerance_N: float) -> tuple[int, int]:
-    """The lowest rates that a scene may be run at and that do what the fastest do; those, where it is not met."""
+    """The lowest rates that a scene may be run at and that do what the usual do; those, where it is not met."""
     if not is_met(rates[0].judged, tolerance_N):
         return RATES_HZ[0]
-    good = [(at.control_hz, at.inference_hz) for at in rates if all(is_good(item, tolerance_N) for item in at.judged)]
+    good = [at.hz for at in rates if all(is_good(item, tolerance_N) for item in at.judged)]
     return min(hz for hz in good if hz[0] >= LEAST_CONTROL_HZ)
 
 
 def with_costs(found: MeasuredScene, name: str) -> MeasuredScene:
     """The same scene, of that name or file, with what its choices cost on this machine now."""
-    chosen = Case(name, left_out=found.left_out)
-    others = [Case(name), chosen]
+    case = Case(name, control_hz=found.control_hz, inference_hz=found.inference_hz)
+    chosen = msgspec.structs.replace(case, left_out=found.left_out)
+    others = [case, chosen]
     others += [msgspec.structs.replace(chosen, search=item.search) for item in found.searches]
-    others += [Case(name, left_out=(item.term,)) for item in found.terms]
-    full, cost, *rest = costs(Case(name), others)
+    others += [msgspec.structs.replace(case, left_out=(item.term,)) for item in found.terms]
+    full, cost, *rest = costs(others)
     priced = iter(rest)
     searches = tuple(msgspec.structs.replace(item, cost=next(priced)) for item in found.searches)
     terms = tuple(msgspec.structs.replace(item, cost=next(priced)) for item in found.terms)
-    return msgspec.structs.replace(found, terms=terms, searches=searches, full=full, chosen=cost)
+    rates = tuple(
+        msgspec.structs.replace(at, cost=full if at is found.at_chosen else _cost_at(name, at.hz)) for at in found.rates
+    )
+    return msgspec.structs.replace(found, terms=terms, searches=searches, rates=rates, chosen=cost)
+
+
+def _cost_at(name: str, hz: tuple[int, int]) -> Cost:
+    (cost,) = costs([Case(name, control_hz=hz[0], inference_hz=hz[1])])
+    return cost
 
 
 def is_good(item: Judged, tolerance_N: float) -> bool:

@@ -40,11 +40,13 @@ def test_a_recorded_force_becomes_a_scene_with_the_softest_insert_that_renders_i
     assert main(["scene", "check", str(out)]) == 0
 
 
-def test_a_greater_force_gets_a_stiffer_insert(tmp_path, capsys):
-    forces = recording(tmp_path / "forces.csv", 0.8, 3.0, 0.1)
-    code, printed = new(capsys, str(tmp_path / "mine.toml"), "--force", str(forces))
-    assert code == 0
-    assert printed["result"]["insert"] == "MRE-50-40"
+@pytest.mark.parametrize(("rate_hz", "insert", "is_told"), [(0.1, "MRE-50-40", False), (4.5, "MRE-10-20", True)])
+def test_a_greater_force_gets_a_stiffer_insert_that_is_not_too_slow(tmp_path, capsys, rate_hz, insert, is_told):
+    """A weak device does not give 1.7 N with MRE-10-20, whose model gives 1.9."""
+    forces, out = recording(tmp_path / "forces.csv", 1.4, 1.7, rate_hz), tmp_path / "mine.toml"
+    assert main(["scene", "new", str(out), "--force", str(forces)]) == 0
+    assert ("a weak device" in capsys.readouterr().out) == is_told
+    assert load_scene(str(out)).insert.name == insert
 
 
 @pytest.mark.parametrize(

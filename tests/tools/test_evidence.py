@@ -47,6 +47,14 @@ def test_all_parts_run_and_the_status_tells_of_the_failed(tmp_path: Path) -> Non
     assert "| measured | 5 cases |" in rows["measured"]
 
 
+def test_figures_of_an_earlier_form_are_told_and_hide_no_others(tmp_path: Path) -> None:
+    parts = {"old": printing({"rows": 1}), "good": printing({"cases": 1})}
+    assert evidence.collect(parts, tmp_path) == 0
+    page = (tmp_path / "README.md").read_text(encoding="utf-8")
+    assert "measured before this part had 'cases': run it again" in page
+    assert "1 cases" in page
+
+
 def test_nothing_failed(tmp_path: Path) -> None:
     assert evidence.collect({"good": printing({"cases": 1})}, tmp_path) == 0
 

@@ -10,7 +10,7 @@ import pytest
 import required_terms
 from distributed import Client, LocalCluster
 from rendering import scene_runs
-from rendering.scene_runs import Case, key, run, run_all
+from rendering.scene_runs import LEARN_S, Case, _Play, core_run, key, run, run_all
 from required_terms import NO_COST, RATES_HZ, SHARE, is_good, measure
 
 from tormagd.config import ConfigError
@@ -34,12 +34,9 @@ def test_what_is_stored_follows_from_its_own_numbers(scene: MeasuredScene) -> No
     assert is_met(scene.judged, scene.tolerance_N) or not scene.left_out
     if terms_of(stated).left_out:
         assert terms_of(stated).left_out == scene.left_out
-    assert [(at.control_hz, at.inference_hz) for at in scene.rates] == list(RATES_HZ)
-    chosen = next(
-        at for at in scene.rates if (at.control_hz, at.inference_hz) == (scene.control_hz, scene.inference_hz)
-    )
+    assert [at.hz for at in scene.rates] == list(RATES_HZ)
     assert scene.control_hz >= LEAST_CONTROL_HZ
-    assert all(is_good(item, scene.tolerance_N) for item in chosen.judged)
+    assert all(is_good(item, scene.tolerance_N) for item in scene.at_chosen.judged)
 
 
 def test_a_case_gives_what_was_stored() -> None:
@@ -48,6 +45,16 @@ def test_a_case_gives_what_was_stored() -> None:
     hz = brain.control_hz, brain.inference_hz
     case = Case("brain", "sample_1", tuple(sorted(brain.left_out)), "", True, *hz, STORED.seconds)
     assert run(case) == pytest.approx(on_first(brain.judged).chosen_N, rel=0.05)
+
+
+def test_the_core_alone_does_what_it_did_in_the_loop() -> None:
+    """Frozen, too, which begins with the seconds that are done again."""
+    case = Case("brain", "sample_1", (), "", False, 500, 83, 0.2)
+    played = _Play(case)
+    *_, (time_s, loop) = played.ticks(case.seconds)
+    assert time_s > LEARN_S
+    again = core_run(case)
+    assert again() == again() == (loop.step_state, loop.plan_state)
 
 
 def table(added_N: dict[str, float]) -> tuple[Without, ...]:
@@ -73,7 +80,7 @@ def test_a_choice_is_good_within_the_tolerance_or_beside_the_full_model() -> Non
 
 def test_what_is_only_missed_together_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two terms that stand in for each other: either may go, and not both."""
-    monkeypatch.setattr(required_terms, "costs", lambda case, others: [Cost(1.0, 1.0)] * len(others))
+    monkeypatch.setattr(required_terms, "costs", lambda cases: [Cost(1.0, 1.0)] * len(cases))
 
     def outcomes(cases: Iterable[Case]) -> dict[Case, float]:
         return {
@@ -90,7 +97,7 @@ def test_what_is_only_missed_together_is_put_back(monkeypatch: pytest.MonkeyPatc
 
 
 def test_the_lowest_rates_are_taken_that_do_what_the_fastest_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(required_terms, "costs", lambda case, others: [Cost(1.0, 1.0)] * len(others))
+    monkeypatch.setattr(required_terms, "costs", lambda cases: [Cost(1.0, 1.0)] * len(cases))
 
     def outcomes(cases: Iterable[Case]) -> dict[Case, float]:
         """Of samples 2 and 3 the second is missed at the slow plans, and 250 Hz would do best of all."""
@@ -104,7 +111,7 @@ def test_the_lowest_rates_are_taken_that_do_what_the_fastest_do(monkeypatch: pyt
 
 
 def test_a_scene_that_the_full_model_does_not_meet_leaves_nothing_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(required_terms, "costs", lambda case, others: [Cost(1.0, 1.0)] * len(others))
+    monkeypatch.setattr(required_terms, "costs", lambda cases: [Cost(1.0, 1.0)] * len(cases))
     found = measure("coronary", lambda cases: dict.fromkeys(cases, 0.3))
     assert found.left_out == ()
 

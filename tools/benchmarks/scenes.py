@@ -50,7 +50,7 @@ def measure(options: argparse.Namespace) -> Json:
 
 
 def figures(scene: MeasuredScene) -> Json:
-    """One scene's decision as numbers. `full` is every term at the fastest rates."""
+    """One scene's decision as numbers. `full` is every term at the usual rates."""
     on_sample_1 = on_first(scene.judged)
     return {
         "name": scene.name,
@@ -75,12 +75,18 @@ def core_without(name: str, left_out: tuple[str, ...]) -> Core:
 
 def variants(scene: MeasuredScene) -> list[Variant]:
     """All terms at every rate, each term left out and every search at the chosen rates, and what was chosen last."""
-    chosen_hz = scene.control_hz, scene.inference_hz
-    at_rates = {(at.control_hz, at.inference_hz): on_first(at.judged).chosen_N for at in scene.rates}
+    all_N = on_first(scene.at_chosen.judged).chosen_N
     return [
-        *(Variant(f"all terms, {hz[0]} / {hz[1]} Hz", scene.full.us_s(*hz), rms_N) for hz, rms_N in at_rates.items()),
         *(
-            Variant(f"without {item.term}", scene.us_s(item.cost), at_rates[chosen_hz] + item.learning_added_N)
+            Variant(
+                f"all terms, {at.control_hz} / {at.inference_hz} Hz",
+                at.cost.us_s(*at.hz),
+                on_first(at.judged).chosen_N,
+            )
+            for at in scene.rates
+        ),
+        *(
+            Variant(f"without {item.term}", scene.us_s(item.cost), all_N + item.learning_added_N)
             for item in scene.terms
         ),
         *(Variant(f"required terms, {item.search}", scene.us_s(item.cost), item.rms_N) for item in scene.searches),

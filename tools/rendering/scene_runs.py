@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, as_completed
 from functools import cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -26,7 +27,7 @@ from tormagd.control.plan import Planner, PlanState
 from tormagd.control.step import StepState
 from tormagd.hardware.measurement import Measurement
 from tormagd.scenes.measured import Cost
-from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Solver, load_scene, scene_path, terms_of
+from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Handle, Scene, Solver, load_scene, scene_path, terms_of
 from tormagd.scenes.signal import asked
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, Hand, PressingHand, RecordedHand
@@ -43,7 +44,7 @@ HAND_S, HAND_STEP_S, HAND_LASTS_S = 5.3, 0.02, 90.0
 "The handle's speed swings between the scene's in this time, evenly in its logarithm."
 OPEN_MM = 0.1
 "So near its open end a gap is open: too much force there is the device's, and no error of any model."
-TIMED_S, ROUNDS = 0.5, 7
+TIMED_S, ROUNDS = 1.0, 7
 VALID_S = 0.1
 DEPENDS_ON = (
     "tools/rendering/scene_runs.py",
@@ -69,9 +70,10 @@ class Case(msgspec.Struct, frozen=True):
     seconds: float = 5.0
 
 
-def run(case: Case) -> float:
-    """RMS of the true force less the force asked, N; a run that ends in a fault counts as no force at all."""
-    played = _Play(case)
+def run(case: Case, plant: PlantParameters | None = None, hand: Hand | None = None) -> float:
+    """RMS of the true force less the force asked, N; a run that ends in a fault counts as no force at all. `plant` and
+    `hand` take the place of those that case and scene name."""
+    played = _Play(case, plant, hand)
     rows = []
     for time_s, loop in played.ticks(case.seconds):
         truth = loop.device.truth
@@ -85,34 +87,31 @@ def run(case: Case) -> float:
     return float(np.sqrt(np.mean(np.where(is_least, 0.0, error_N) ** 2)))
 
 
-def costs(case: Case, others: Sequence[Case]) -> list[Cost]:
-    """What steps and plans take in the other cases' models: all are given what the case's own was given in the loop, in
-    rounds over all of them, so that a disturbance of the machine meets all alike. Of each step and plan the least of
-    ROUNDS counts, and of those the mean."""
-    played = _Play(case)
-    given: list[tuple[StepState, PlanState, float, TimedSetpoint | None, Measurement | None, Estimate | None]] = []
-    before = None
-    for time_s, loop in played.ticks(TIMED_S):
-        if before is not None and time_s >= LEARN_S:
-            now_s = loop.now_s
-            given.append((*before, now_s, played.publish(now_s), loop.measurement, loop.step_state.estimate))
-        if loop.plan_state is not None:
-            before = loop.step_state, loop.plan_state
-    cores = [build_core(played.config, _modelled(played.core.scene, other)) for other in others]
+def costs(cases: Sequence[Case]) -> list[Cost]:
+    """What steps and plans take in the models of cases at equal rates: all are given what the first was given in the
+    loop, in rounds over all of them, so that a disturbance of the machine meets all alike. Of each step and plan the
+    least of ROUNDS counts."""
+    played = _Play(cases[0])
+    given = [moment for moment in played.moments(TIMED_S) if moment.time_s >= LEARN_S]
+    cores = [build_core(played.config, _modelled(played.core.scene, case)) for case in cases]
     made: list[tuple[list[Call], list[Call]]] = []
     for core in cores:
         planner, stepper = core.planner, core.stepper
         steps: list[Call] = []
         plans: list[Call] = []
-        for step_state, plan_state, now_s, setpoint, measurement, estimate in given:
-            steps.append(partial(stepper.step, step_state, now_s, measurement, plan_state.plan))
-            plans.append(partial(_planned, planner, plan_state, now_s, setpoint, estimate))
+        for each in given:
+            steps.append(partial(stepper.step, each.step_state, each.now_s, each.measurement, each.plan_state.plan))
+            if each.is_planned:
+                plans.append(partial(_planned, planner, each.plan_state, each.now_s, each.setpoint, each.estimate))
         made.append((steps, plans))
     rounds = [[(_each_us(steps), _each_us(plans)) for steps, plans in made] for _ in range(ROUNDS)]
-    return [
-        Cost(*(round(float(np.mean(np.min([one[index][kind] for one in rounds], axis=0))), 3) for kind in range(2)))
-        for index in range(len(others))
+    # a setpoint that comes a little late makes a plan more: what all have cost is shared by those that were asked for
+    asked = len(given) * cases[0].inference_hz / cases[0].control_hz
+    totals_us = [
+        [float(np.min([one[index][kind] for one in rounds], axis=0).sum()) for kind in range(2)]
+        for index in range(len(cases))
     ]
+    return [Cost(round(steps_us / len(given), 3), round(plans_us / asked, 3)) for steps_us, plans_us in totals_us]
 
 
 def _modelled(scene: Scene, case: Case) -> Scene:
@@ -123,8 +122,8 @@ def _modelled(scene: Scene, case: Case) -> Scene:
 
 def _planned(
     planner: Planner, state: PlanState, now_s: float, setpoint: TimedSetpoint | None, estimate: Estimate | None
-) -> None:
-    planner.foresee(planner.plan(state, now_s, setpoint, estimate))
+) -> PlanState:
+    return planner.foresee(planner.plan(state, now_s, setpoint, estimate))
 
 
 def _each_us(calls: list[Call]) -> list[float]:
@@ -136,20 +135,50 @@ def _each_us(calls: list[Call]) -> list[float]:
     return spent
 
 
+def core_run(case: Case) -> Callable[[], tuple[StepState, PlanState]]:
+    """What the core did in the case's seconds, to be done again without device and protocol: each step and each plan
+    from the state before it, with what it was given in the loop. Gives the states that it ends in."""
+    played = _Play(case)
+    given = [moment for moment in played.moments(case.seconds) if moment.time_s >= LEARN_S]
+    stepper, planner = played.core.stepper, played.planner
+
+    def again() -> tuple[StepState, PlanState]:
+        step_state, plan_state = given[0].step_state, given[0].plan_state
+        for each in given:
+            step_state, _ = stepper.step(step_state, each.now_s, each.measurement, plan_state.plan)
+            if each.is_planned:
+                plan_state = _planned(planner, plan_state, each.now_s, each.setpoint, step_state.estimate)
+        return step_state, plan_state
+
+    return again
+
+
+class _Moment(NamedTuple):
+    """What the core was given in one tick, behind the states before it. `time_s` counts from the signal's beginning."""
+
+    time_s: float
+    step_state: StepState
+    plan_state: PlanState
+    now_s: float
+    setpoint: TimedSetpoint | None
+    measurement: Measurement | None
+    estimate: Estimate | None
+    is_planned: bool
+
+
 class _Play:
     """A case's loop, armed, and its signal behind an approach."""
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: Case, plant: PlantParameters | None = None, hand: Hand | None = None) -> None:
         rates = Rates(control_hz=case.control_hz, inference_hz=min(case.inference_hz, case.control_hz))
         self.config = config = Config(scene=case.scene, rates=rates)
         stated = load_scene(case.scene)
         free = Bandwidth(control_hz=case.control_hz, inference_hz=rates.inference_hz)
         scene = _modelled(msgspec.structs.replace(stated, bandwidth=free), case)
         self.core = build_core(config, scene)
-        self._frozen = None if case.is_learning else _frozen(config, scene)
-        self._loop = ClosedLoop(
-            config, self.core.stepper, self.core.planner, VirtualDevice(_plant(scene, case), _hand(scene), seed=1)
-        )
+        self.planner = (self.core if case.is_learning else _frozen(config, scene)).planner
+        device = VirtualDevice(plant or plant_of(scene, case.plant), hand or _hand(scene), seed=1)
+        self._loop = ClosedLoop(config, self.core.stepper, self.core.planner, device)
         self._loop.arm()
         self.time_s, self.force_N = signal_of(self.core, case.scene, LEARN_S + case.seconds, case.inference_hz)
         approach_s = APPROACH_S
@@ -170,11 +199,28 @@ class _Play:
         ends_s = self.begins_s + min(LEARN_S + seconds, float(self.time_s[-1]))
         while loop.now_s < ends_s:
             time_s = loop.now_s - self.begins_s
-            if self._frozen is not None and time_s >= LEARN_S:
-                loop.plan_with(self._frozen.planner)
-                self._frozen = None
+            if time_s >= LEARN_S:
+                loop.plan_with(self.planner)
             loop.tick(self.publish(loop.now_s))
             yield time_s, loop
+
+    def moments(self, seconds: float) -> Iterable[_Moment]:
+        """The same ticks as the core saw them."""
+        loop = self._loop
+        step_state, plan_state, before_s = loop.step_state, loop.plan_state, loop.now_s
+        for time_s, _ in self.ticks(seconds):
+            assert plan_state is not None, "a loop with a planner has a state of it"
+            yield _Moment(
+                time_s,
+                step_state,
+                plan_state,
+                loop.now_s,
+                self.publish(before_s),
+                loop.measurement,
+                loop.step_state.estimate,
+                loop.plan_state is not plan_state,
+            )
+            step_state, plan_state, before_s = loop.step_state, loop.plan_state, loop.now_s
 
 
 def _frozen(config: Config, scene: Scene) -> Core:
@@ -195,19 +241,25 @@ def signal_of(core: Core, scene_name: str, longest_s: float, rate_hz: int) -> tu
     return time_s, force_N
 
 
-def _plant(scene: Scene, case: Case) -> PlantParameters:
+def plant_of(scene: Scene, sample: str) -> PlantParameters:
     """The sample with the scene's insert in it, or the pad on the sample's carriages."""
     if scene.element == "tactile":
-        return load_plant(case.plant.replace("sample", "pad"))
-    return with_insert(load_plant(case.plant), scene.insert.name)
+        return load_plant(sample.replace("sample", "pad"))
+    return with_insert(load_plant(sample), scene.insert.name)
 
 
 def _hand(scene: Scene) -> Hand:
     if scene.finger is not msgspec.UNSET:
         return PressingHand(scene.finger.depth_mm)
-    low, high = math.log(scene.handle.least_mm_s), math.log(scene.handle.most_mm_s)
+    return turning(scene.handle)
+
+
+def turning(handle: Handle, first_mm_s: float = 0.0, first_s: float = 0.0) -> Hand:
+    """A hand whose speed swings between a scene's, behind the first seconds at another speed."""
+    low, high = math.log(handle.least_mm_s), math.log(handle.most_mm_s)
     time_s = np.arange(0.0, HAND_LASTS_S, HAND_STEP_S)
     speed_mm_s = np.exp((low + high) / 2.0 + (high - low) / 2.0 * np.sin(2.0 * math.pi * time_s / HAND_S))
+    speed_mm_s[time_s < first_s] = first_mm_s
     return RecordedHand(tuple(time_s.tolist()), tuple((np.cumsum(speed_mm_s) * HAND_STEP_S).tolist()))
 
 

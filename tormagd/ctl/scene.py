@@ -106,13 +106,14 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
     file, found = known
     tolerance_N = found.tolerance_N
     needed = {factor: required(found.terms, factor * tolerance_N, file.share) for factor in TOLERANCES}
-    out = set(derived["terms_out"])
+    out, usual = set(derived["terms_out"]), found.rates[0]
     solver = derived["solver"]
     lines = [
         f"{scene.name}: {scene.description}",
         f"tolerance  {1e3 * tolerance_N:g} mN rms; a term is required that adds more than {file.share:.0%} of it",
         f"search     {solver['solver']} ({solver['reason']})",
-        f"cost       {found.cost_full_us_s / 1e4:.2f}% of a processor with every term at the fastest rates, "
+        f"cost       {found.cost_full_us_s / 1e4:.2f}% of a processor with every term at "
+        f"{usual.control_hz} / {usual.inference_hz} Hz, "
         f"{found.cost_us_s / 1e4:.2f}% with those that are required at {found.control_hz} / {found.inference_hz} Hz "
         f"({file.build}, machine_us {file.machine_us:g})",
         "",
@@ -137,8 +138,7 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
         lines.append("NOT MET: the full model itself is over the tolerance")
     lines += ["", "every term  control  inference  RMS on sample 1"]
     for at in found.rates:
-        is_chosen = (at.control_hz, at.inference_hz) == (found.control_hz, found.inference_hz)
-        mark = "  chosen" if is_chosen else ""
+        mark = "  chosen" if at is found.at_chosen else ""
         rms_mN = 1e3 * on_first(at.judged).chosen_N
         lines.append(f"            {at.control_hz:4d} Hz  {at.inference_hz:6d} Hz  {rms_mN:7.1f} mN{mark}")
     lines += ["", "search named     RMS on sample 1    core share"]
@@ -152,9 +152,14 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
 
 
 def _core_share(found: MeasuredScene, derived: dict[str, Any]) -> float:
-    """Of the terms and at the rates that the daemon runs; a set of terms that was not measured counts as all."""
-    cost = found.chosen if tuple(derived["terms_out"]) == found.left_out else found.full
-    return 1e-6 * cost.us_s(derived["control_hz"], derived["inference_hz"])
+    """Of the terms and at the rates that the daemon runs; a set of terms that was not measured counts as all. A plan is
+    dearest at slow rates: at rates that were not measured the share is at most this."""
+    hz = derived["control_hz"], derived["inference_hz"]
+    if tuple(derived["terms_out"]) == found.left_out:
+        cost = found.chosen
+    else:
+        cost = next((at.cost for at in found.rates if at.hz == hz), found.at_chosen.cost)
+    return 1e-6 * cost.us_s(*hz)
 
 
 def _known(scene: Scene) -> tuple[Measured, MeasuredScene] | None:

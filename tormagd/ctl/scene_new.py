@@ -19,6 +19,9 @@ INSERTS = ("MRE-10-10", "MRE-10-20", "MRE-50-40")
 "Those with a shipped model, from the softest, whose least force is the lowest."
 TOLERATED, TOLERATED_OF_MOST = 0.05, 0.02
 "Of the range, half of a tenth; and of the greatest force, where a hand tells a tenth apart, at the least."
+RESERVED = 0.8
+"""Of the greatest force that the model gives: a device may be a fifth weaker than its model, by friction, modulus,
+field and what its elastomer relaxes. A soft insert is asked for more only where no stiffer one follows fast enough."""
 LEAST_CONTROL_HZ, LEAST_INFERENCE_HZ = 500, 83
 
 Tables = dict[str, Any]
@@ -34,21 +37,33 @@ def new_scene(out: Path, force_file: Path | None, config: Path | None) -> Outcom
         msgspec.convert(tables | {"insert": {"name": INSERTS[0], "model": _model(INSERTS[0])}}, Scene)
     except msgspec.ValidationError as error:
         raise usage_error(f"no scene can be made of this: {error}", "docs/scenes.md says what each key asks") from error
+    insert, checked = _softest(out, tables, config)
+    text = f"{checked.text}\n\n{out} is written, with insert {insert}: its tolerance, handle and rates are proposals"
+    if not _has_reserve(tables, checked):
+        text += f"\nits greatest force is over {RESERVED:.0%} of the device's: a weak device does not give it"
+    return Outcome(checked.result | {"file": str(out), "insert": insert}, text)
+
+
+def _softest(out: Path, tables: Tables, config: Path | None) -> tuple[str, Outcome]:
+    """Writes the file with the softest insert that renders it in reserve, or else with the softest that renders it."""
+    taken: dict[str, Outcome] = {}
     refused = {}
     for insert in INSERTS:
-        out.write_text(as_toml(tables | {"insert": {"name": insert, "model": _model(insert)}}) + "\n", encoding="utf-8")
+        _write(out, tables, insert)
         try:
-            checked = check_scene(str(out), config)
+            taken[insert] = check_scene(str(out), config)
         except CommandError as error:
             if error.code != "refused":  # such as a machine too busy to say
                 out.unlink()
                 raise
             refused[insert] = error.message
             continue
-        text = (
-            f"{checked.text}\n\n{out} is written, with insert {insert}: its tolerance, handle and rates are proposals"
-        )
-        return Outcome(checked.result | {"file": str(out), "insert": insert}, text)
+        if _has_reserve(tables, taken[insert]):
+            return insert, taken[insert]
+    if taken:
+        insert = next(iter(taken))
+        _write(out, tables, insert)
+        return insert, taken[insert]
     out.unlink()
     raise CommandError(
         Exit.REFUSED,
@@ -56,6 +71,15 @@ def new_scene(out: Path, force_file: Path | None, config: Path | None) -> Outcom
         "no shipped insert renders this: " + "; ".join(f"{insert}: {reason}" for insert, reason in refused.items()),
         "record or ask for slower or lower forces, or train a model of another insert (tormagctl calibrate --insert)",
     )
+
+
+def _write(out: Path, tables: Tables, insert: str) -> None:
+    out.write_text(as_toml(tables | {"insert": {"name": insert, "model": _model(insert)}}) + "\n", encoding="utf-8")
+
+
+def _has_reserve(tables: Tables, checked: Outcome) -> bool:
+    most_N: float = checked.result["most_N"]
+    return bool(tables["force"]["most_N"] <= RESERVED * most_N)
 
 
 def _model(insert: str) -> str:

@@ -7,7 +7,8 @@ from msgspec import Struct
 
 
 class Cost(Struct, frozen=True):
-    """Processor time of a step and of a plan, us."""
+    """Processor time of a step and of a plan, us, at the rates that they were measured at: what is done by the time and
+    not by the plan, such as the forecast, makes a plan dearer that comes seldom."""
 
     step_us: float
     plan_us: float
@@ -33,7 +34,7 @@ class Without(Struct, frozen=True):
 
 
 class Judged(Struct, frozen=True):
-    """RMS errors of the force on one sample, N: of the full model at the fastest rates, and of another choice."""
+    """RMS errors of the force on one sample, N: of the full model at the usual rates, and of another choice."""
 
     plant: str
     is_learning: bool
@@ -47,6 +48,12 @@ class AtRates(Struct, frozen=True):
     control_hz: int
     inference_hz: int
     judged: tuple[Judged, ...]
+    cost: Cost
+
+    @property
+    def hz(self) -> tuple[int, int]:
+        """Of control and of inference."""
+        return self.control_hz, self.inference_hz
 
 
 class WithSearch(Struct, frozen=True):
@@ -69,15 +76,25 @@ class MeasuredScene(Struct, frozen=True):
     terms: tuple[Without, ...]
     judged: tuple[Judged, ...]
     rates: tuple[AtRates, ...]
-    "The first are the fastest."
+    "The first are the usual ones."
     searches: tuple[WithSearch, ...]
-    full: Cost
     chosen: Cost
 
     @property
+    def hz(self) -> tuple[int, int]:
+        """The chosen rates, of control and of inference."""
+        return self.control_hz, self.inference_hz
+
+    @property
+    def at_chosen(self) -> AtRates:
+        """All terms at the chosen rates."""
+        return next(at for at in self.rates if at.hz == self.hz)
+
+    @property
     def cost_full_us_s(self) -> float:
-        """Of the processor, for a second of control with every term at the fastest rates."""
-        return self.full.us_s(self.rates[0].control_hz, self.rates[0].inference_hz)
+        """Of the processor, for a second of control with every term at the usual rates."""
+        usual = self.rates[0]
+        return usual.cost.us_s(*usual.hz)
 
     @property
     def cost_us_s(self) -> float:
@@ -86,11 +103,11 @@ class MeasuredScene(Struct, frozen=True):
 
     def us_s(self, cost: Cost) -> float:
         """Of a second of control at the chosen rates."""
-        return cost.us_s(self.control_hz, self.inference_hz)
+        return cost.us_s(*self.hz)
 
     def saved_us_s(self, without: Without) -> float:
         """What leaving one term out saves of that, all others in."""
-        return self.us_s(self.full) - self.us_s(without.cost)
+        return self.us_s(self.at_chosen.cost) - self.us_s(without.cost)
 
 
 class Measured(Struct, frozen=True):

@@ -1,0 +1,30 @@
+"""What docs/scenes.md says of wrong models and of the scene that is not met belongs to the decisions as they are."""
+
+import json
+
+import pytest
+from evidence import FOLDER
+from unmet_scene import OTHERS, SCENE, missed_N
+from wrong_model import ALLOWED
+
+from tormagd.scenes.measured import is_met, measured
+from tormagd.scenes.scene import load_scene
+
+SCENES = {scene.name: scene for scene in measured().scenes}
+
+
+def test_the_predictions_are_those_of_the_decisions_and_hold() -> None:
+    """`python tools/evidence.py wrong_model` measures them again."""
+    found = json.loads((FOLDER / "wrong_model.json").read_text(encoding="utf-8"))["figures"]
+    hold, pulse = found["cheapest"], found["fullest"]
+    added_N = sum(item.frozen_added_N for item in SCENES[hold["scene"]].terms)
+    times = SCENES[pulse["scene"]].cost_full_us_s / SCENES[pulse["scene"]].cost_us_s - 1.0
+    assert (hold["predicted_N"], pulse["predicted"]) == (pytest.approx(added_N), pytest.approx(times))
+    assert max(hold["off"], pulse["off"]) <= ALLOWED
+
+
+def test_a_handle_that_teaches_what_the_device_is_meets_what_is_not_met() -> None:
+    tolerance_N = load_scene(SCENE).force.tolerance_rms_N
+    assert not is_met(SCENES[SCENE].judged, tolerance_N)
+    as_it_is, known = (missed_N(other, ("sample_1",))["sample_1"] for other in (OTHERS[0], OTHERS[-1]))
+    assert known < tolerance_N < as_it_is
