@@ -43,7 +43,7 @@ from tormagd.scenes.measured import (
     on_first,
     required,
 )
-from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_scene, shipped_scenes
+from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_task, shipped_scenes
 
 SHARE = 0.2
 KEPT = ROOT / "build" / "required_terms.json"
@@ -64,7 +64,7 @@ Runs = Callable[[Iterable[Case]], dict[Case, float]]
 
 def measure(name: str, runs: Runs, samples: tuple[str, ...] = SAMPLES, seconds: float = SECONDS) -> MeasuredScene:
     """One scene, whole; `runs` gives the outcomes of cases. Raises ConfigError for a scene that has no signal."""
-    scene = load_scene(name)
+    scene = load_task(name)
     if scene.signal is None:
         raise ConfigError(f"scene {scene.name}: signal is missing: without one nothing is known of what it asks for")
     tolerance_N = scene.force.tolerance_rms_N

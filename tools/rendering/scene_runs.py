@@ -27,7 +27,7 @@ from tormagd.control.plan import Planner, PlanState
 from tormagd.control.step import StepState
 from tormagd.hardware.measurement import Measurement
 from tormagd.scenes.measured import Cost
-from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Handle, Scene, Solver, load_scene, scene_path, terms_of
+from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Handle, Scene, Solver, load_task, scene_path, terms_of
 from tormagd.scenes.signal import asked
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, Hand, PressingHand, RecordedHand
@@ -172,7 +172,7 @@ class _Play:
     def __init__(self, case: Case, plant: PlantParameters | None = None, hand: Hand | None = None) -> None:
         rates = Rates(control_hz=case.control_hz, inference_hz=min(case.inference_hz, case.control_hz))
         self.config = config = Config(scene=case.scene, rates=rates)
-        stated = load_scene(case.scene)
+        stated = load_task(case.scene)
         free = Bandwidth(control_hz=case.control_hz, inference_hz=rates.inference_hz)
         scene = _modelled(msgspec.structs.replace(stated, bandwidth=free), case)
         self.core = build_core(config, scene)
@@ -278,7 +278,7 @@ def sources_hash() -> str:
 
 def key(case: Case) -> str:
     """The content hash under which a case's outcome is kept: sources, scene and case."""
-    scene = load_scene(case.scene)
+    scene = load_task(case.scene)
     named = msgspec.structs.replace(case, scene=scene.fingerprint)
     file = b""
     if scene.signal is not None and scene.signal.file:
