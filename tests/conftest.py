@@ -7,6 +7,7 @@ failure itself: the kernel's counters and bare timers on every processor say so 
 failure.
 """
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -35,6 +36,7 @@ INTERPRETED_LIMIT_S = 300
 ATTEMPTS = 3
 WATCHED_ABOVE = 51
 "FIFO priority of the bare timers, where it is allowed: one above the daemon's in the tests."
+WATCHED = pytest.StashKey[HostWatch]()
 
 
 class HostWarning(UserWarning):
@@ -71,17 +73,18 @@ def run_live(pyfuncitem: pytest.Function) -> bool | None:
         return None
     call = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
     for attempt in range(1, ATTEMPTS + 1):
-        with Path(os.devnull).open("w") as nowhere, HostWatch(WATCHED_ABOVE, nowhere) as watched:
-            start_s = time.monotonic()
-            try:
-                pyfuncitem.obj(**call)
-                return True
-            except (Exception, pytest.fail.Exception):
-                watched.end()
-                host = watched.between(start_s, time.monotonic())
-                if attempt == ATTEMPTS or not host.took_much:
-                    raise
-                warnings.warn(f"{pyfuncitem.nodeid} is started again: {host}", HostWarning, stacklevel=2)
+        watched = host_watch(pyfuncitem.config)
+        start_s = time.monotonic()
+        try:
+            pyfuncitem.obj(**call)
+            return True
+        except (Exception, pytest.fail.Exception):
+            del pyfuncitem.config.stash[WATCHED]
+            watched.end()
+            host = watched.between(start_s, time.monotonic())
+            if attempt == ATTEMPTS or not host.took_much:
+                raise
+            warnings.warn(f"{pyfuncitem.nodeid} is started again: {host}", HostWarning, stacklevel=2)
         folder = tmp_path_factory(pyfuncitem).mktemp("again")
         if "tmp_path" in call:
             call["tmp_path"] = folder
@@ -89,6 +92,17 @@ def run_live(pyfuncitem: pytest.Function) -> bool | None:
             if hasattr(argument, "start_again"):
                 argument.start_again(folder)
     raise AssertionError("unreachable")
+
+
+def host_watch(config: pytest.Config) -> HostWatch:
+    """The bare timers of this session, which outlive a test: to start them for each costs more than some tests do. They
+    say what they saw when they end, so after a failure there are others."""
+    if WATCHED not in config.stash:
+        with contextlib.ExitStack() as stack:
+            nowhere = stack.enter_context(Path(os.devnull).open("w"))
+            config.stash[WATCHED] = stack.enter_context(HostWatch(WATCHED_ABOVE, nowhere))
+            config.add_cleanup(stack.pop_all().close)
+    return config.stash[WATCHED]
 
 
 def tmp_path_factory(item: pytest.Function) -> pytest.TempPathFactory:

@@ -95,7 +95,14 @@ class Machines:
 
     def ctl(self, who: str, *arguments: str) -> dict[str, Any]:
         """What tormagctl answers to somebody on the other machine."""
-        asked = self.start(1, *CTL, "--json", "--config", str(self.folder / f"{who}.toml"), *arguments)
+        return self.answer(self.asked(who, *arguments))
+
+    def asked(self, who: str, *arguments: str) -> "subprocess.Popen[str]":
+        """tormagctl on the other machine, which will `answer`."""
+        return self.start(1, *CTL, "--json", "--config", str(self.folder / f"{who}.toml"), *arguments)
+
+    def answer(self, asked: "subprocess.Popen[str]") -> dict[str, Any]:
+        """What it prints."""
         printed, _ = asked.communicate(timeout=PATIENCE_S)
         answer: dict[str, Any] = json.loads(printed)
         return answer
@@ -147,12 +154,15 @@ def test_a_publisher_on_another_machine_drives_the_brake(machines: Machines) -> 
 def test_nobody_else_is_let_in_from_there_and_each_is_counted(machines: Machines) -> None:
     before = machines.status()
     # the publisher's key neither commands nor looks, the screen's only looks
-    for command in ("stop", "enable", "status"):
-        assert machines.ctl("robot", command)["error"]["code"] == "unreachable"
+    for asked in [machines.asked("robot", command) for command in ("stop", "enable", "status")]:
+        assert machines.answer(asked)["error"]["code"] == "unreachable"
     assert machines.ctl("screen", "status")["result"]["version"] == before["version"]
     assert machines.ctl("screen", "stop")["error"]["code"] == "forbidden"
-    for kind in ("plain", "unlisted", "wrong", "console"):
-        machines.start(1, sys.executable, "-c", STRANGERS, f"tcp://{HERE}:5555", str(machines.keys), kind).wait()
+    for stranger in [
+        machines.start(1, sys.executable, "-c", STRANGERS, f"tcp://{HERE}:5555", str(machines.keys), kind)
+        for kind in ("plain", "unlisted", "wrong", "console")
+    ]:
+        stranger.wait()
     expected = before["peers"]["refused"] + 3 + 4 * 20
     machines.until(lambda: machines.status()["peers"]["refused"] >= expected, f"{expected} refused")
     status = machines.status()

@@ -123,6 +123,7 @@ class HostWatch:
             return
         self._ended.set()
         self._looking.join()
+        self._looks.append(counters(self._pids))
         for timer in self._timers:
             timer.send_signal(signal.SIGTERM)
         for timer in self._timers:
