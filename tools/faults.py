@@ -58,10 +58,16 @@ def try_out(injection: Injection, plant: str, bus: str) -> Cell:
 
 def inject(injection: Injection, plant: str, bus: str = SERIAL) -> tuple[Rig, Cell]:
     """Runs one fault; also the rig, where it still lasts."""
-    return _inject_driven(injection, plant, bus) if injection.is_driven else _begin_with(injection, plant, bus)
+    if not injection.is_driven:
+        return _begin_with(injection, plant, bus)
+    rig, watch = spoiled(injection, plant, bus)
+    for sample in rig.run(WATCHED_S):
+        watch.see(sample)
+    return rig, watch.cell(injection, bus)
 
 
-def _inject_driven(injection: Injection, plant: str, bus: str) -> tuple[Rig, Cell]:
+def spoiled(injection: Injection, plant: str, bus: str) -> tuple[Rig, Watch]:
+    """A rig that renders the force and is spoiled now, and who watches it."""
     rig = Rig(injection, plant, bus, INJECTED_S)
     rig.loop.arm()
     usual: dict[str, None] = {}
@@ -69,10 +75,7 @@ def _inject_driven(injection: Injection, plant: str, bus: str) -> tuple[Rig, Cel
         if sample is not None and sample.time_s > INJECTED_S - USUAL_S:
             usual |= dict.fromkeys(map(str, (*sample.plan.limits, *sample.output.limits)))
     rig.spoil(injection)
-    watch = Watch(rig, usual, is_driven=True)
-    for sample in rig.run(WATCHED_S):
-        watch.see(sample)
-    return rig, watch.cell(injection, bus)
+    return rig, Watch(rig, usual, is_driven=True)
 
 
 def _begin_with(injection: Injection, plant: str, bus: str) -> tuple[Rig, Cell]:

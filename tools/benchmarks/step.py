@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
 
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config, Motor
@@ -183,6 +182,8 @@ def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> Modell
     geared = msgspec.structs.replace(motor, inertia_kg_m2=motor.inertia_kg_m2 / motor.gear_efficiency)
     transfer = zero_order_hold(geared, TICK_S)
     driving = np.full(count + 1, duty - math.copysign(motor.coulomb_V / motor.supply_V, duty))
+    from scipy.signal import lfilter  # takes 0.6 s to import, and who only runs a loop needs it not
+
     modelled: Array = lfilter(transfer.numerator, transfer.denominator, driving)
     return Modelled(TICK_S * np.arange(count + 1, dtype=np.float64), measured, modelled)
 

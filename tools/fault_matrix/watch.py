@@ -123,6 +123,11 @@ class Watch:
         self._over_N = max(self._over_N, off_N)
         self._off_N.append(off_N)
 
+    @property
+    def is_open(self) -> bool:
+        """Whether the gap is open, and no force left that could be lost."""
+        return self._open_s is not None
+
     def refuse(self, error: RefusedError) -> None:
         """A command was refused."""
         self._refusal = f"{error.code}: {error.message.partition(': ')[2]}"

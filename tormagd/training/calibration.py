@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -29,9 +29,10 @@ from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw, flux_density_T
 from tormagd.physics.inserts import Insert, insert
 from tormagd.training.dataset import Array, Dataset, DatasetError, write_csv
-from tormagd.training.fitting import fit_model
-from tormagd.training.levenberg_marquardt import Epoch
 from tormagd.training.metrics import fit_metrics
+
+if TYPE_CHECKING:
+    from tormagd.training.levenberg_marquardt import Epoch
 
 COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 """Of a sweep file: times of one device, the number of the sweep, the measured gap, the handle's travel at the roller,
@@ -152,13 +153,15 @@ def noise_sd_N(data: Dataset) -> float:
 def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int = 50, epochs: int = 200) -> ForceModel:
     """A model from all sweeps but the judging ones, with the judgement in its metrics. Raises CalibrationError
     (poor_fit, not_rising) where it is not good enough to be used."""
+    from tormagd.training.fitting import fit_model  # with torch, two seconds: whatever is refused is told without it
+
     assert data.cycle is not None  # training_rows sets it
     numbers = np.unique(data.cycle)
     is_judging = np.isin(data.cycle, numbers[JUDGING[1] :: JUDGING[0]])
     training, validation = data.subset(~is_judging).split(VALIDATION_SHARE, seed=0)
     with tqdm(total=epochs, desc="fit", unit="epoch", disable=not sys.stderr.isatty(), leave=False) as bar:
 
-        def show(epoch: Epoch) -> None:
+        def show(epoch: "Epoch") -> None:
             bar.set_postfix_str(f"{epoch.validation_rmse_N:.4f} N rms")
             bar.update()
 
