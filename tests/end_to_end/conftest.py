@@ -144,8 +144,9 @@ class Rig:
             self._telemetry.poll(50)
 
     def arm(self) -> None:
-        """Homes and enables."""
-        self.done("home")
+        """Homes, where that is still to do, and enables."""
+        if not self.status()["is_homed"]:
+            self.done("home")
         self.until(lambda: self.status()["is_homed"] and not self.status()["is_busy"], "homed")
         # a busy machine may find the newest measurement a little old once
         self.until(lambda: self.command("enable").ok, "enabled")

@@ -8,7 +8,6 @@ import contextlib
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -186,33 +185,3 @@ def test_a_stranger_on_the_wire_gets_the_greeting_only(machines: Machines) -> No
     got, _ = machines.start(1, sys.executable, "-c", listen, HERE, plain.hex()).communicate(timeout=PATIENCE_S)
     assert len(bytes.fromhex(got)) <= 64
     assert bytes.fromhex(got)[12:32] in (b"", b"CURVE".ljust(20, b"\0"))
-
-
-def test_a_guarded_address_without_keys_is_refused_before_anything_is_opened(tmp_path: Path) -> None:
-    """Exit 2, with the key and the remedy; and a secret that others can read is none."""
-    config = tmp_path / "tormagd.toml"
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-
-    def refusal() -> str:
-        done = subprocess.run(
-            [sys.executable, "-m", "tormagd.daemon.main", "--check", "--config", str(config)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 2
-        return done.stderr
-
-    config.write_text(f'[endpoints]\nsetpoint = "tcp://192.0.2.1:{port}"\n')
-    assert "others need CURVE keys in [endpoints.curve]" in refusal()
-    keys = tmp_path / "keys"
-    subprocess.run([*CTL, "keys", "generate", str(keys)], check=True, capture_output=True)
-    curve = f'[endpoints.curve]\nserver_secret = "{keys}/server.key_secret"\n'
-    config.write_text(f'[endpoints]\nsetpoint = "tcp://192.0.2.1:{port}"\n{curve}')
-    (keys / "server.key_secret").chmod(0o644)
-    assert "server.key_secret can be read by others (mode 0644)" in refusal()
-    curve = curve.replace("server_secret", "client_secret")
-    config.write_text(f'[endpoints]\nsetpoint = "tcp://192.0.2.1:{port}"\n{curve}')
-    assert "endpoints.curve.server_secret is missing" in refusal()

@@ -44,12 +44,12 @@ def frame_bits(frame: CanFrame) -> int:
     crc, last, run, bits = _header(frame.identifier, len(frame.data))
     for byte in frame.data:
         crc = _crc_table()[crc >> 7 ^ byte] ^ crc << 8 & CRC_MASK
-        last, run, count = _stuffing_table()[last, run, byte]
+        last, run, count = _stuffing_table(8)[last, run, byte]
         bits += count
-    for position in range(CRC_BITS - 1, -1, -1):
-        last, run, count = _stuffed(last, run, crc >> position & 1)
-        bits += count
-    return bits + UNSTUFFED_BITS
+    last, run, count = _stuffing_table(8)[last, run, crc >> CRC_BITS - 8]
+    bits += count
+    _, _, count = _stuffing_table(CRC_BITS - 8)[last, run, crc & 0x7F]
+    return bits + count + UNSTUFFED_BITS
 
 
 def to_socket(frame: CanFrame) -> bytes:
@@ -103,14 +103,15 @@ def _crc_table() -> tuple[int, ...]:
 
 
 @cache
-def _stuffing_table() -> dict[tuple[int, int, int], tuple[int, int, int]]:
+def _stuffing_table(width: int) -> dict[tuple[int, int, int], tuple[int, int, int]]:
+    """What the last bit and the run before so many bits become, and how many bits are sent."""
     table = {}
     for start in ((bit, run) for bit in (0, 1) for run in range(LONGEST_RUN)):
-        for byte in range(256):
+        for value in range(1 << width):
             last, run = start
             sent = 0
-            for position in range(7, -1, -1):
-                last, run, count = _stuffed(last, run, byte >> position & 1)
+            for position in range(width - 1, -1, -1):
+                last, run, count = _stuffed(last, run, value >> position & 1)
                 sent += count
-            table[*start, byte] = last, run, sent
+            table[*start, value] = last, run, sent
     return table
