@@ -57,6 +57,12 @@ VALID_S = 0.2
 CEILING_N = 1.25 * MOST_N + 0.1
 
 
+@pytest.fixture(scope="module")
+def core() -> Core:
+    """A core keeps nothing of what it is stepped through."""
+    return build_core(CONFIG)
+
+
 def joined(core: Core, sample: str = "sample_1", hand: object = None) -> ClosedLoop:
     device = VirtualDevice(load_plant(sample), hand or SteadyHand(), seed=1)  # type: ignore[arg-type]
     return ClosedLoop(CONFIG, core.stepper, core.planner, device)
@@ -93,8 +99,8 @@ LIES: dict[str, Callable[[], Callable[[float], float]]] = {
 
 
 @pytest.mark.parametrize("lie", LIES)
-def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(lie: str) -> None:
-    loop = joined(build_core(CONFIG))
+def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(core: Core, lie: str) -> None:
+    loop = joined(core)
     loop.arm()
     render(loop, ASKED_N, 2.0)
     LyingSensor(loop.device, LIES[lie](), loop.now_s)
@@ -104,8 +110,8 @@ def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(lie: str) -> No
 
 
 @pytest.mark.parametrize("lie", ["-0.5 N", "+1 N", "-1 N", "frozen", "tenfold", "inverted"])
-def test_a_sensor_that_lies_from_the_beginning_keeps_the_device_disabled(lie: str) -> None:
-    loop = joined(build_core(CONFIG))
+def test_a_sensor_that_lies_from_the_beginning_keeps_the_device_disabled(core: Core, lie: str) -> None:
+    loop = joined(core)
     LyingSensor(loop.device, LIES[lie]())
     loop.arm()
     loop.command("disable")
@@ -117,8 +123,8 @@ def test_a_sensor_that_lies_from_the_beginning_keeps_the_device_disabled(lie: st
 
 
 @pytest.mark.parametrize("lie", ["-0.3 N", "+0.5 N"])
-def test_an_offset_from_the_beginning_is_told_from_a_scale(lie: str) -> None:
-    loop = joined(build_core(CONFIG))
+def test_an_offset_from_the_beginning_is_told_from_a_scale(core: Core, lie: str) -> None:
+    loop = joined(core)
     LyingSensor(loop.device, LIES[lie]())
     loop.arm()
     samples = render(loop, ASKED_N, 3.0)
@@ -126,18 +132,18 @@ def test_an_offset_from_the_beginning_is_told_from_a_scale(lie: str) -> None:
     assert worst_N(samples) < ASKED_N + 0.3
 
 
-def test_a_sensor_that_reads_a_little_too_much_from_the_beginning_presses_less() -> None:
+def test_a_sensor_that_reads_a_little_too_much_from_the_beginning_presses_less(core: Core) -> None:
     """As long as the handle goes one way it cannot be told from a stronger device with another field law; what it does
     is on the safe side."""
-    loop = joined(build_core(CONFIG))
+    loop = joined(core)
     LyingSensor(loop.device, LIES["+0.3 N"]())
     loop.arm()
     assert worst_N(render(loop, ASKED_N, 3.0)) < ASKED_N
 
 
 @pytest.mark.parametrize("lie", ["+0.3 N", "-0.3 N"])
-def test_a_reversal_names_a_zero_that_was_wrong_from_the_beginning(lie: str) -> None:
-    loop = joined(build_core(CONFIG), hand=ReversingHand(4.0))
+def test_a_reversal_names_a_zero_that_was_wrong_from_the_beginning(core: Core, lie: str) -> None:
+    loop = joined(core, hand=ReversingHand(4.0))
     LyingSensor(loop.device, LIES[lie]())
     loop.arm()
     samples = render(loop, ASKED_N, 6.0)
@@ -147,9 +153,9 @@ def test_a_reversal_names_a_zero_that_was_wrong_from_the_beginning(lie: str) -> 
 
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_3"])
-def test_a_zero_that_drifts_is_taken_off_where_the_handle_turns(sample: str) -> None:
+def test_a_zero_that_drifts_is_taken_off_where_the_handle_turns(core: Core, sample: str) -> None:
     """By 0.2 N a minute, forty times what the plant card has, and turning every second."""
-    loop = joined(build_core(CONFIG), sample, ReversingHand(2.0))
+    loop = joined(core, sample, ReversingHand(2.0))
     loop.arm()
     render(loop, ASKED_N, 2.0)
     start_s = loop.device.truth.time_s
@@ -167,8 +173,8 @@ def slides(sample: Sample) -> bool:
     return estimate is not None and estimate.handle.rate_mm_s > 20.0 and estimate.handle.displacement_mm >= 2.0
 
 
-def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_off() -> None:
-    loop = joined(build_core(CONFIG))
+def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_off(core: Core) -> None:
+    loop = joined(core)
     loop.arm()
     render(loop, ASKED_N, 2.0)
     assert loop.plan_state is not None
@@ -183,8 +189,8 @@ def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_of
     assert abs(samples[-1].truth.force_N) == pytest.approx(ASKED_N, abs=0.05)
 
 
-def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it() -> None:
-    loop = joined(build_core(CONFIG))
+def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(core: Core) -> None:
+    loop = joined(core)
     loop.arm()
     render(loop, ASKED_N, 2.0)
     LyingSensor(loop.device, LIES["-1 N"](), loop.now_s)
@@ -195,8 +201,8 @@ def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it() -> No
 
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
-def test_an_honest_sensor_is_believed(sample: str) -> None:
-    loop = joined(build_core(CONFIG), sample, ReversingHand(3.0))
+def test_an_honest_sensor_is_believed(core: Core, sample: str) -> None:
+    loop = joined(core, sample, ReversingHand(3.0))
     loop.arm()
     for asked_N in (0.7, 2.0, 0.7, 1.4):
         samples = render(loop, asked_N, 3.0)
@@ -271,9 +277,9 @@ def gap_plan(gap_mm: float, now_s: float) -> Plan:
 
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
-def test_a_start_from_rest_is_not_over_force(sample: str) -> None:
+def test_a_start_from_rest_is_not_over_force(core: Core, sample: str) -> None:
     """Static friction is up to 1.25 times the kinetic one."""
-    loop = joined(build_core(CONFIG), sample, ReversingHand(2.0))
+    loop = joined(core, sample, ReversingHand(2.0))
     loop.arm()
     samples = render(loop, MOST_N, 6.0)
     assert samples[-1].state.safety.operating_state is OperatingState.ENABLED

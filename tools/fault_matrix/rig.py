@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Iterator
+from functools import cache
 
 import msgpack
 import msgspec
@@ -45,8 +46,7 @@ class Rig:
 
     def __init__(self, injection: Injection, plant: str, bus: str, injected_s: float) -> None:
         """The device's own fault begins at `injected_s`; `spoil` begins all others."""
-        self.config: Config = msgspec.structs.replace(load_config(None), scene="coronary")
-        core: Core = build_core(self.config)
+        self.config, core = _coronary()
         self.most_N = core.scene.force.most_N
         faults = [parse_fault(f"{fault}@{injected_s}") for fault in (injection.device or "").split()]
         self.hand = TurningHand()
@@ -121,6 +121,13 @@ class Rig:
         self.loop.simulated.mend()
         self.is_dead, self._hogged_ms = False, None
         self.publisher.mend()
+
+
+@cache
+def _coronary() -> tuple[Config, Core]:
+    """A core keeps nothing of what it is stepped through: one does for every rig."""
+    config = msgspec.structs.replace(load_config(None), scene="coronary")
+    return config, build_core(config)
 
 
 class TurningHand:
