@@ -7,7 +7,7 @@ receiver is back at the next zero. The sequence counts the frames of one directi
 """
 
 from binascii import crc_hqx
-from typing import Final, final
+from typing import ClassVar, Final, final
 
 from firmware_protocol.codec import EncodeError
 from firmware_protocol.value import Value
@@ -81,7 +81,8 @@ class FramingStatistics(Value):
 class Succession:
     """How many are missing from a sequence modulo 256. One that comes late was overtaken, and is missing no more."""
 
-    __slots__ = ("_missing", "newest")
+    __match_args__: ClassVar = ("_missing", "newest")
+    __slots__ = __match_args__
 
     def __init__(self) -> None:
         self.newest = -2  # before the first
@@ -153,7 +154,8 @@ class FrameDecoder:
     counted and not returned; one that repeats only the sequence number comes from a sender that started anew, and is.
     """
 
-    __slots__ = ("_last", "_pending", "_succession", "_synchronised", "statistics")
+    __match_args__: ClassVar = ("_last", "_pending", "_succession", "_synchronised", "statistics")
+    __slots__ = __match_args__
 
     def __init__(self) -> None:
         self.statistics = FramingStatistics()

@@ -46,6 +46,8 @@ class Sample(NamedTuple):
     plan: Plan
     trim: float
     truth: Truth
+    measurement: Measurement | None
+    "What the step was given; what it drove may have changed the connection's by now."
 
 
 class VirtualWire:
@@ -81,12 +83,12 @@ class VirtualPort(VirtualWire):
     def __init__(self, device: SerialDevice) -> None:
         super().__init__()
         self.device = device
-        self._stream = FrameStream()
+        self.stream = FrameStream()
         self._unread = b""
 
     def open(self) -> Self:
         """The same port again, with a line that has carried nothing yet."""
-        self._stream, self._unread = FrameStream(), b""
+        self.stream, self._unread = FrameStream(), b""
         return self
 
     def advance(self, now_s: float) -> None:
@@ -97,16 +99,16 @@ class VirtualPort(VirtualWire):
     @property
     def statistics(self) -> LinkStatistics:
         """Counters since the port was opened."""
-        return self._stream.statistics
+        return self.stream.statistics
 
     def receive(self) -> list[Message]:
         """All valid messages that have arrived."""
         arrived, self._unread = self._unread, b""
-        return self._stream.unpack(arrived)
+        return self.stream.unpack(arrived)
 
     def send(self, message: Message) -> None:
         """Hands one message to the device's line."""
-        self.device.receive(self.now_s, self._stream.pack(message))
+        self.device.receive(self.now_s, self.stream.pack(message))
 
 
 class VirtualBus(VirtualWire):
@@ -115,12 +117,12 @@ class VirtualBus(VirtualWire):
     def __init__(self, device: CanLine) -> None:
         super().__init__()
         self.device = device
-        self._stream = CanStream(DEFAULT_NODE)
+        self.stream = CanStream(DEFAULT_NODE)
         self._unread: list[CanFrame] = []
 
     def open(self) -> Self:
         """The same bus again."""
-        self._stream = CanStream(DEFAULT_NODE)
+        self.stream = CanStream(DEFAULT_NODE)
         self._unread.clear()
         return self
 
@@ -133,21 +135,17 @@ class VirtualBus(VirtualWire):
     @property
     def statistics(self) -> LinkStatistics:
         """Counters since the bus was opened."""
-        return self._stream.statistics
+        return self.stream.statistics
 
     def receive(self) -> list[Message]:
         """All valid messages of the device that have arrived."""
         arrived, self._unread = self._unread, []
-        messages: list[Message] = []
-        for frame in arrived:
-            message = self._stream.unpack(frame.identifier, frame.data)
-            if message is not None:
-                messages.append(message)
-        return messages
+        self.stream.received = []
+        return self.stream.unpack_all(arrived)
 
     def send(self, message: Message) -> None:
         """Hands one frame to the bus."""
-        identifier, data = self._stream.pack(message)
+        identifier, data = self.stream.pack(message)
         self.device.receive(self.now_s, CanFrame(identifier, data))
 
 
@@ -206,7 +204,8 @@ class ClosedLoop:
         self._port.advance(now_s)
         self.connection.receive()
         used = self._newest_plan() if plan is None else plan
-        self.step_state, output = self._stepper.step(self.step_state, now_s, self.connection.measurement, used)
+        measurement = self.connection.measurement
+        self.step_state, output = self._stepper.step(self.step_state, now_s, measurement, used)
         self.connection.exchange(
             output.left_duty, output.right_duty, output.mode, output.request, output.request_number
         )
@@ -214,7 +213,7 @@ class ClosedLoop:
         if plan is None:
             self._infer(now_s, setpoint)
         trim = 1.0 if self.plan_state is None else self.plan_state.trim
-        return Sample(now_s, self.step_state, output, used, trim, self._port.device.truth)
+        return Sample(now_s, self.step_state, output, used, trim, self._port.device.truth, measurement)
 
     def plan_with(self, planner: Planner) -> None:
         """Plans from now on are another planner's, which goes on from the state as it is."""

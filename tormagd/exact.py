@@ -4,11 +4,13 @@ Plain data are what msgpack holds. What it does not know is a map with one key, 
 
     a value        {"Turn": {"direction": 1.0, ...}}
     an enumerator  {"Limit": "RATE"}
-    a list         {"list": [...]}, as a bare one is a tuple
+    a list         {"list": [...]}, as a bare one is a tuple; a deque, too
 
-Two equal values come back as two: nothing in the core asks whether a value is the very one that it made before.
+Two equal values come back as two: nothing in the core asks whether a value is the very one that it made before. What
+changes in place, such as the device's link, is written like a value, and read into one that is there already.
 """
 
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from enum import Enum
 from typing import Any
@@ -37,20 +39,26 @@ def kinds(*types: type[Value] | type[Enum]) -> Kinds:
 
 
 def plain(thing: object) -> Any:
-    """`thing` as plain data. Raises TypeError for what is neither plain, a value, an enumerator, a tuple nor a list."""
+    """`thing` as plain data. Raises TypeError for what names no fields in `__match_args__`, and is neither plain, an
+    enumerator, a tuple, a list nor a deque."""
     if type(thing) in _AS_THEY_ARE:
         return thing
-    if isinstance(thing, Value):
-        return {type(thing).__name__: {name: plain(getattr(thing, name)) for name in thing.__match_args__}}
+    names = getattr(type(thing), "__match_args__", None)
+    if names is not None:
+        return {type(thing).__name__: {name: plain(getattr(thing, name)) for name in names}}
     if isinstance(thing, Enum):
         return {type(thing).__name__: thing.value}
     if isinstance(thing, float):  # NumPy's, which has the same bits
         return float(thing)
     if type(thing) is tuple:
         return [plain(each) for each in thing]
-    if type(thing) is list:
-        return {LIST: [plain(each) for each in thing]}
+    if isinstance(thing, list | deque):
+        return {LIST: [each if type(each) is float else plain(each) for each in thing]}  # hundreds of round trips
     raise TypeError(f"{thing!r}: allowed are values, enumerators, tuples, lists and what msgpack knows")
+
+
+def _changes(thing: object) -> bool:
+    return hasattr(type(thing), "__match_args__") and not isinstance(thing, Value)
 
 
 def restored(data: Any, known: Kinds) -> Any:
@@ -75,12 +83,30 @@ def restored(data: Any, known: Kinds) -> Any:
             odd = sorted(str(field) for field in set(fields) ^ set(kind.__match_args__))
             raise InexactError(f"{name}: its fields differ from those here: {', '.join(odd)[:200]}")
         return kind(**fields)
-    except (TypeError, AttributeError, OverflowError) as error:
-        raise InexactError(f"{name}: {str(error)[:200]}") from error
     except InexactError:
         raise
-    except ValueError as error:
+    except (TypeError, AttributeError, OverflowError, ValueError) as error:
         raise InexactError(f"{name}: {str(error)[:200]}") from error
+
+
+def restore(thing: Any, data: Any, known: Kinds) -> None:
+    """Gives `thing`, which changes in place, the fields that `data` stand for. Raises InexactError."""
+    name = type(thing).__name__
+    fields = data.get(name) if isinstance(data, dict) else None
+    if not isinstance(fields, dict) or set(fields) != set(thing.__match_args__):
+        raise InexactError(f"{str(data)[:60]}: allowed are the fields of {name}")
+    for field, told in fields.items():
+        own = getattr(thing, field)
+        try:
+            if _changes(own):
+                restore(own, told, known)
+            elif isinstance(own, deque):
+                own.clear()
+                own.extend(restored(told, known))
+            else:
+                setattr(thing, field, restored(told, known))
+        except (TypeError, AttributeError, OverflowError) as error:
+            raise InexactError(f"{name}.{field}: {str(error)[:200]}") from error
 
 
 def packed(data: Any) -> bytes:

@@ -20,7 +20,7 @@ from firmware_protocol.codec import (
     decode,
     encode,
 )
-from tormagd.hardware.can_stream import CanStream, SecondHostError
+from tormagd.hardware.can_stream import UNREADABLE, CanStream, SecondHostError
 
 STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
 
@@ -113,3 +113,20 @@ def test_no_frame_raises_or_is_more_than_it_is(frames: list[tuple[int, bytes]]) 
             assert identifier >> 4 in functions
             assert len(encode(message)) == len(data)
     assert stream.statistics.frames + stream.statistics.corrupt <= len(frames)
+
+
+def test_what_was_taken_apart_gives_the_same_to_another_stream() -> None:
+    stream, other = CanStream(1), CanStream(1)
+    frames = [
+        frame_of(state(7)),
+        frame_of(state(8), node=2),
+        (frame_of(state(8))[0], b"?"),
+        UNREADABLE,
+        frame_of(STATUS),
+    ]
+    messages = stream.unpack_all(frames)
+    assert [type(message) for message in messages] == [State, Status]
+    assert stream.received == [frames[0], *frames[2:]]
+    assert (other.unpack_all(stream.received), other.statistics) == (messages, stream.statistics)
+    assert stream.statistics.corrupt == 2
+    assert stream.pack(Home(3)) == stream.sent

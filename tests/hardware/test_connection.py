@@ -31,6 +31,7 @@ from firmware_protocol.codec import (
     period,
 )
 from tormagd.config import Device
+from tormagd.control.journal import Journal
 from tormagd.hardware.backend import BackendError
 from tormagd.hardware.connection import FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S, Connection
 from tormagd.hardware.link import SILENT_S, LinkState
@@ -368,6 +369,14 @@ def test_opening_the_gap_waits_for_a_device_that_went_before_it_had_heard(bench:
     heal(bench)
     bench.pass_ms(1_200)
     assert bench.firmware.accepted == [Retract]
+
+
+def test_a_backend_that_shows_no_stream_has_no_frames_in_a_black_box(bench: Bench) -> None:
+    journal = bench.connection.traffic = Journal()
+    bench.running()
+    bench.connection.close()
+    assert journal.take() == [("connected", None), ("connected", None)]
+    assert bench.connection.memory() is None
 
 
 def test_a_closed_connection_stays_closed(bench: Bench) -> None:

@@ -8,10 +8,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 from firmware_protocol.codec import Message
 from tormagd.config import ConfigError, Device, Rates, Strict, checked, did_you_mean
+from tormagd.hardware.can_stream import CanStream
+from tormagd.hardware.frame_stream import FrameStream
 
 ENTRY_POINTS = "tormagd.backends"
 """Each of this group is a `Driver`."""
@@ -49,8 +51,16 @@ class LinkStatistics(Protocol):
     """By message (or "frame", where it was none yet), why the newest one was refused: `{"State": "CRC-8"}`."""
 
 
+Stream: TypeAlias = FrameStream | CanStream
+"What a backend takes its bytes apart with."
+Received: TypeAlias = bytes | list[tuple[int, bytes]]
+"What came at once: a serial port's bytes, or a bus's frames, identifier and data each."
+Sent: TypeAlias = bytes | tuple[int, bytes]
+"What one message became."
+
+
 class Backend(Protocol):
-    """An open connection to one device."""
+    """An open connection to one device. One that has a `stream: Stream` besides has its frames in the black box."""
 
     @property
     def statistics(self) -> LinkStatistics:

@@ -55,7 +55,7 @@ class CanBackend:
         """`held` is a descriptor that keeps others from opening the adapter; it is closed with the bus."""
         self._port, self._options, self._bus, self._held = port, options, bus, held
         self._fd: int = bus.fileno()
-        self._stream = CanStream(options.node)
+        self.stream = CanStream(options.node)
         self._readable, self._writable = select.poll(), select.poll()
         self._readable.register(self._fd, select.POLLIN)
         self._writable.register(self._fd, select.POLLOUT)
@@ -64,7 +64,7 @@ class CanBackend:
     @property
     def statistics(self) -> LinkStatistics:
         """Counters since the bus was opened."""
-        return self._stream.statistics
+        return self.stream.statistics
 
     def fileno(self) -> int:
         """The bus's descriptor."""
@@ -75,6 +75,7 @@ class CanBackend:
 
         Raises BackendError when the bus is off or gone, or when another host drives the node.
         """
+        self.stream.received = []
         messages: list[Message] = []
         for _ in range(FRAMES_AT_ONCE):
             try:
@@ -83,10 +84,10 @@ class CanBackend:
                 if not (isinstance(self._bus, slcanBus) and isinstance(error.__cause__, UnicodeDecodeError)):
                     raise self._gone("receiving failed", error) from error
                 self._bus.flush()  # it would keep a line that is no text for ever
-                self._stream.count_corrupt()
+                self.stream.count_unreadable()
                 continue
             except (ValueError, IndexError):  # how slcan says that a line of the adapter's is damaged
-                self._stream.count_corrupt()
+                self.stream.count_unreadable()
                 continue
             if frame is None:
                 # an adapter's own chatter is no frame, and more may stand behind it
@@ -101,7 +102,7 @@ class CanBackend:
 
         Raises BackendError when the bus is off or gone, or has not taken any for UNSENT_FRAMES.
         """
-        identifier, data = self._stream.pack(message)
+        identifier, data = self.stream.pack(message)
         frame = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
         if self._writable.poll(0):
             try:
@@ -113,7 +114,7 @@ class CanBackend:
                 self._unsent = 0
                 return
         self._unsent += 1
-        self._stream.statistics.unsent += 1
+        self.stream.statistics.unsent += 1
         if self._unsent > UNSENT_FRAMES:
             raise BackendError(
                 f"{self._name}: the bus takes no frames: nobody acknowledges them", remedy=self._look_at_the_bus
@@ -144,12 +145,12 @@ class CanBackend:
                     f"{self._name}: bus-off: the controller met too many errors and left the bus",
                     remedy=f"{self._look_at_the_bus}; restart-ms 100 (ip link) brings a socketcan interface back",
                 )
-            self._stream.count_corrupt()
+            self.stream.count_unreadable()
             return None
         if frame.is_extended_id or frame.is_remote_frame or frame.is_fd:
             return None  # somebody else's conversation on the same bus
         try:
-            return self._stream.unpack(frame.arbitration_id, bytes(frame.data))
+            return self.stream.unpack(frame.arbitration_id, bytes(frame.data))
         except SecondHostError as error:
             raise BackendError(
                 f"{self._name}: another host drives node {self._options.node}",

@@ -10,11 +10,14 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
-from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, DriveMode
+from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, DriveMode, Message
 from tormagd.config import Device
-from tormagd.hardware.backend import Backend, BackendError
+from tormagd.exact import Kinds, plain, restore
+from tormagd.hardware.backend import Backend, BackendError, Received, Sent, Stream
+from tormagd.hardware.can_stream import CanStream
+from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import DeviceLink, LinkState
 from tormagd.hardware.measurement import Measurement
 from tormagd.messages import ClockReport, LinkReport, RoundTripReport
@@ -61,6 +64,19 @@ class Watcher(Protocol):
         """Stops that."""
 
 
+class Traffic(Protocol):
+    """Who is told of all that passes, as it was."""
+
+    def read(self, now_s: float, raw: Received) -> None:
+        """This was read, and taken in at this time."""
+
+    def wrote(self, now_s: float, raw: list[Sent], unsent: int) -> None:
+        """One period's messages; the wire has not taken at once so many in all."""
+
+    def connected(self, memory: Any) -> None:
+        """A conversation began; None: it is over."""
+
+
 class Connection:
     """One device, however often its cable is pulled.
 
@@ -78,6 +94,7 @@ class Connection:
         self._device, self._open_backend, self._on_loss, self._clock = device, open_backend, on_loss, clock
         self._watcher: Watcher | None = None
         self._backend: Backend | None = None
+        self._stream: Stream | None = None
         self._link: DeviceLink | None = None
         self._waiting = LinkState.CLOSED
         self._cause, self._remedy = "not opened yet", ""
@@ -88,6 +105,8 @@ class Connection:
         self._seen = LinkState.CLOSED
         self.losses = 0
         self._last_loss = ""
+        self.traffic: Traffic | None = None
+        """Nobody is told unless it is set."""
 
     @property
     def state(self) -> LinkState:
@@ -147,23 +166,26 @@ class Connection:
         link, backend = self._link, self._backend
         if link is None or backend is None:
             return
+        if link.is_silent(now_s):
+            self.receive()  # a process that was not run itself finds here what it took for silence
+        if self._link is not link:
+            return
         if number != self._requested:
             self._requested = number
             # opening the gap waits for a device; nothing else may move one that has come since it was asked for
             if request is DeviceRequest.RETRACT or link.state is LinkState.RUNNING:
                 link.request(now_s, request)
-        if link.is_silent(now_s):
-            self.receive()  # a process that was not run itself finds here what it took for silence
-        if self._link is not link:
-            return
+        sent: list[Sent] = []
         try:
             if link.state is LinkState.RUNNING:
-                backend.send(link.drive(left_duty, right_duty, mode))
+                self._send(backend, link.drive(left_duty, right_duty, mode), sent)
             for message in link.due(now_s):
-                backend.send(message)
+                self._send(backend, message, sent)
         except BackendError as error:
             self._lose(error)
             return
+        if self.traffic is not None and self._stream is not None:
+            self.traffic.wrote(now_s, sent, backend.statistics.unsent)
         if link.is_judging(now_s):
             heard = backend.statistics
             link.judge(now_s, heard.frames, heard.corrupt, heard.unsent)
@@ -179,6 +201,20 @@ class Connection:
             self._release(watcher)
         self._waiting, self._cause, self._remedy = LinkState.CLOSED, "closed", ""
         self._seen = LinkState.CLOSED
+
+    def memory(self) -> Any:
+        """What the conversation remembers, as plain data: with it, and with what is read from now on, it goes on as it
+        does here. None where there is none, or its backend shows no stream."""
+        if self._link is None or self._stream is None:
+            return None
+        return {"requested": self._requested, "link": plain(self._link), "stream": plain(self._stream)}
+
+    def remember(self, memory: Any, known: Kinds) -> None:
+        """Goes on with an open port as another connection did. Raises InexactError."""
+        self._requested = memory["requested"]
+        restore(self._link, memory["link"], known)
+        restore(self._stream, memory["stream"], known)
+        self._seen = self.state
 
     def report(self) -> LinkReport:
         """State, cause and remedy, identity, counters of this opening of the port, round trip and clock."""
@@ -224,6 +260,10 @@ class Connection:
         if self._unfinished is DeviceRequest.RETRACT:
             self._link.request(now_s, self._unfinished)
         self._unfinished = DeviceRequest.NONE
+        stream = getattr(self._backend, "stream", None)
+        self._stream = stream if isinstance(stream, FrameStream | CanStream) else None
+        if self.traffic is not None:
+            self.traffic.connected(self.memory())
         self._watcher.add_reader(self._backend.fileno(), self.receive)
         log.info("%s is open", self._device.port)
         self._notice()
@@ -239,10 +279,17 @@ class Connection:
             self._lose(error)
             return
         now_s = self._clock()
+        if self.traffic is not None and self._stream is not None and self._stream.received:
+            self.traffic.read(now_s, self._stream.received)
         for message in messages:
             link.receive(now_s, message)
             if link.state is not self._seen:
                 self._notice()
+
+    def _send(self, backend: Backend, message: Message, sent: list[Sent]) -> None:
+        backend.send(message)
+        if self._stream is not None:
+            sent.append(self._stream.sent)
 
     def _lose(self, error: BackendError) -> None:
         """The port failed."""
@@ -263,7 +310,9 @@ class Connection:
         if self._backend is not None:
             watcher.remove_reader(self._backend.fileno())
             self._backend.close()
-        self._backend = self._link = None
+            if self.traffic is not None:
+                self.traffic.connected(None)
+        self._backend = self._link = self._stream = None
 
     def _wait(self, state: LinkState, cause: str, remedy: str) -> None:
         self._waiting, self._cause, self._remedy = state, cause, remedy

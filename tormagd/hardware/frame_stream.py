@@ -1,30 +1,41 @@
 """Messages to serial bytes and back: the part of the serial backend that needs no port."""
 
-from typing import final
+from typing import ClassVar, final
 
 from firmware_protocol.codec import FUNCTION, DecodeError, Message, decode, encode
-from firmware_protocol.framing import FrameDecoder, encode_frame
+from firmware_protocol.framing import FrameDecoder, FramingStatistics, encode_frame
 
 
 @final
 class FrameStream:
     """Both directions of one serial conversation. A frame that does not decode is counted, never raised."""
 
-    __slots__ = ("_decoder", "_sequence", "statistics")
+    __match_args__: ClassVar = ("_decoder", "_sequence")
+    __slots__ = (*__match_args__, "received", "sent")
 
     def __init__(self) -> None:
         self._decoder = FrameDecoder()
         self._sequence = 0
-        self.statistics = self._decoder.statistics
+        self.received = b""
+        """What was last taken apart."""
+        self.sent = b""
+        """The newest outgoing frame."""
+
+    @property
+    def statistics(self) -> FramingStatistics:
+        """Counters since the conversation began."""
+        return self._decoder.statistics
 
     def pack(self, message: Message) -> bytes:
         """The bytes of the next outgoing frame. Raises EncodeError for a value that does not fit the wire."""
         frame = encode_frame(FUNCTION[type(message)], self._sequence, encode(message))
         self._sequence = (self._sequence + 1) % 256
+        self.sent = frame
         return frame
 
     def unpack(self, data: bytes) -> list[Message]:
         """The valid messages completed by `data`."""
+        self.received = data
         messages: list[Message] = []
         for frame in self._decoder.feed(data):
             try:

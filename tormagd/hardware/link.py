@@ -6,7 +6,7 @@ No I/O and no clock: the daemon and the virtual-time simulation carry the same m
 import math
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Final, final
+from typing import ClassVar, Final, final
 
 from firmware_protocol.codec import (
     PROTOCOL_VERSION,
@@ -82,13 +82,14 @@ _NO_REQUEST: Final = DeviceRequest.NONE
 class DeviceLink:
     """One conversation, from the opening of the port to its loss. A new connection takes a new link."""
 
-    __slots__ = (
+    __match_args__: ClassVar = (
         "_acknowledged", "_asked_s", "_broken", "_counter", "_delay_s", "_device_time_s", "_drives", "_handle_mm",
-        "_heard_s", "_hello_due_s", "_is_measured", "_least_delay_s", "_left_mm", "_measurement", "_nonce",
-        "_number", "_quality_watch", "_received_s", "_reported_s", "_request", "_request_due_s", "_requested_s",
-        "_right_mm", "_sense", "_sensed_s", "_state", "_states", "_status", "_told", "cause", "clock", "identity",
-        "quality", "repeated", "round_trip", "state",
+        "_heard_s", "_hello_due_s", "_is_measured", "_least_delay_s", "_left_mm", "_nonce", "_number", "_quality_watch",
+        "_received_s", "_reported_s", "_request", "_request_due_s", "_requested_s", "_right_mm", "_sense", "_sensed_s",
+        "_state", "_states", "_status", "_told", "cause", "clock", "identity", "quality", "repeated", "round_trip",
+        "state",
     )  # fmt: skip
+    __slots__ = (*__match_args__, "_measurement")
 
     def __init__(self, now_s: float) -> None:
         self.repeated = 0

@@ -4,7 +4,7 @@ A `LinkQuality` goes with every measurement, so that a step decides on what it w
 """
 
 from collections import deque
-from typing import Final, final
+from typing import ClassVar, Final, final
 
 from firmware_protocol.value import Value
 
@@ -77,7 +77,8 @@ class Counts(Value):
 class LinkWatch:
     """Makes the figures of one conversation. Asked whether it is time in every period, it looks ten times a second."""
 
-    __slots__ = ("_counts", "_due_s", "_round_trip_s")
+    __match_args__: ClassVar = ("_counts", "_due_s", "_round_trip_s")
+    __slots__ = __match_args__
 
     def __init__(self, now_s: float) -> None:
         self._due_s = now_s + SETTLING_LOOKS * LOOKED_S

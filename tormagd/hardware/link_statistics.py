@@ -8,7 +8,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from itertools import compress
-from typing import Final, TypeAlias, final
+from typing import ClassVar, Final, TypeAlias, final
 
 from firmware_protocol.value import Value
 
@@ -50,7 +50,10 @@ class RoundTrip:
     period too long until the next Identity.
     """
 
-    __slots__ = ("_before_hello", "_lead", "_newest", "_newest_s", "_recent", "_sent_s", "_state", "_unsure", "_usual")
+    __match_args__: ClassVar = (
+        "_before_hello", "_lead", "_newest", "_newest_s", "_recent", "_sent_s", "_state", "_unsure", "_usual",
+    )  # fmt: skip
+    __slots__ = __match_args__
 
     def __init__(self) -> None:
         self._sent_s = [0.0] * 256
@@ -163,7 +166,8 @@ class DeviceClock:
     any amount; those far from it are left out of the least squares that follow.
     """
 
-    __slots__ = ("_ends_s", "_fit", "_is_fitted", "_least", "_newest_s", "_standing", "_windows", "drift")
+    __match_args__: ClassVar = ("_ends_s", "_least", "_newest_s", "_standing", "_windows", "drift")
+    __slots__ = (*__match_args__, "_fit", "_is_fitted")
 
     def __init__(self) -> None:
         self._windows: deque[tuple[float, float]] = deque(maxlen=WINDOWS)

@@ -34,13 +34,13 @@ class SerialBackend:
     def __init__(self, port: serial.Serial) -> None:
         self._port = port
         self._fd: int = port.fileno()
-        self._stream = FrameStream()
+        self.stream = FrameStream()
         self._unsent = b""
 
     @property
     def statistics(self) -> LinkStatistics:
         """Counters since the port was opened."""
-        return self._stream.statistics
+        return self.stream.statistics
 
     def fileno(self) -> int:
         """The port's descriptor."""
@@ -51,16 +51,16 @@ class SerialBackend:
         try:
             data = os.read(self._fd, READ_BYTES)
         except BlockingIOError:
-            return []
+            return self.stream.unpack(b"")
         except OSError as error:
             raise BackendError(f"{self._port.port}: reading failed: {error.strerror}") from error
         if not data:
             raise BackendError(f"{self._port.port}: the device was unplugged")
-        return self._stream.unpack(data)
+        return self.stream.unpack(data)
 
     def send(self, message: Message) -> None:
         """Writes one frame. Raises BackendError when the port is gone or its far end has stopped reading."""
-        data = self._unsent + self._stream.pack(message)
+        data = self._unsent + self.stream.pack(message)
         try:
             written = os.write(self._fd, data)
         except BlockingIOError:
@@ -69,7 +69,7 @@ class SerialBackend:
             raise BackendError(f"{self._port.port}: writing failed: {error.strerror}") from error
         self._unsent = data[written:]
         if self._unsent:
-            self._stream.statistics.unsent += 1
+            self.stream.statistics.unsent += 1
         if len(self._unsent) > UNSENT_BYTES:
             raise BackendError(f"{self._port.port}: nobody reads at the other end")
 
