@@ -4,6 +4,8 @@ import msgspec
 
 KEEPER = "tormagd.recording.keeper"
 "The module that runs there; the descriptor of its socket is the argument."
+READ, WROTE = "read", "wrote"
+"Entries of what passed between daemon and device: `[READ, time_s, raw, ...]`, raw as `hardware/backend.py` has it."
 
 
 class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):

@@ -8,14 +8,22 @@ from typing import Any
 import msgspec
 import pytest
 
+from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, Hello
+from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
 from tormagd.control.core import Core, build_core
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.journal import MOST_ENTRIES, Journal
 from tormagd.daemon.black_box import PART_TICKS, BlackBox, black_box_folder
 from tormagd.daemon.telemetry import tick_record
+from tormagd.exact import plain
+from tormagd.hardware.connection import Connection
+from tormagd.hardware.frame_stream import FrameStream
 from tormagd.keeping import Begin, End, Part, Said, Write, Written
 from tormagd.safety.operating_state import RefusedError
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import ReversingHand
+from tormagd.simulation.parameters import load_plant
 
 
 @pytest.fixture(scope="module")
@@ -23,15 +31,21 @@ def core() -> Core:
     return build_core(Config())
 
 
+def closed_loop(core: Core) -> ClosedLoop:
+    device = VirtualDevice(load_plant("sample_1"), ReversingHand(2.0))
+    return ClosedLoop(Config(), core.stepper, core.planner, device)
+
+
 class Rig:
     """A black box, whose other process is this one."""
 
-    def __init__(self, core: Core) -> None:
+    def __init__(self, core: Core, connection: Connection | None = None) -> None:
         self.waited = 0
         self.step, self.plan = core.stepper.start(0.0), core.planner.start(0.0)
         self.step, self.output = core.stepper.step(self.step, 1.0, None, self.plan.plan)
         self.box = BlackBox(Path("/boxes"), {"format": "1"}, 1_000, self.start)
-        self.box.begin(self.step, self.plan)
+        connection = connection or Connection(Config().device, lambda: pytest.fail("nobody opens it"), lambda: None)
+        self.box.begin(self.step, self.plan, connection)
 
     def start(self, its: socket.socket) -> Any:
         self.its = its.dup()
@@ -83,6 +97,19 @@ def test_parts_have_the_ticks_in_their_order_and_a_state_every_second(rig: Rig) 
     assert [number for number, part in enumerate(parts) if part.has_state] == [0, 50, 100, 150]
     assert all(("state" in names(part)) == part.has_state for part in parts)
     assert sum(names(part).count("tick") for part in parts) == 3_010
+
+
+def test_what_passes_between_daemon_and_device_is_kept_in_its_order(core: Core) -> None:
+    loop = closed_loop(core)
+    rig = Rig(core, loop.connection)
+    for _ in range(PART_TICKS):
+        loop.tick()
+        rig.tick()
+    _, part = rig.heard()
+    assert names(part)[:6] == ["state", "wrote", "step", "tick", "read", "wrote"]
+    state, (_, time_s, sent, unsent), *_ = msgspec.msgpack.decode(part.entries)
+    assert state[3]["stream"] == plain(FrameStream())
+    assert (time_s, sent, unsent) == (1e-3, [FrameStream().pack(Hello(SCHEMA_HASH, PROTOCOL_VERSION, 255))], 0)
 
 
 def test_what_the_other_process_does_not_take_is_counted_and_control_goes_on(rig: Rig) -> None:
@@ -143,7 +170,9 @@ def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.Monkey
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     assert black_box_folder("") is None
     box = BlackBox(None, {}, 1_000)
-    box.begin(core.stepper.start(0.0), core.planner.start(0.0))
+    loop = closed_loop(core)
+    box.begin(core.stepper.start(0.0), core.planner.start(0.0), loop.connection)
+    loop.tick()
     box.journal.stepped()
     assert box.journal.take() == []
     with pytest.raises(RefusedError, match="no folder is named"):

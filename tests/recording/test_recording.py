@@ -19,7 +19,7 @@ from tormagd.recording.plot import figure, save_plot
 from tormagd.recording.reader import Recording, RecordingError, read_recording
 from tormagd.recording.series import bands, series, tracking_rms_N
 from tormagd.recording.ticks import TickBatch, decode_ticks
-from tormagd.recording.writer import RecordingWriter, telemetry_schema
+from tormagd.recording.writer import RecordingWriter, plain_schema
 
 START_NS = 1_790_000_000_000_000_000
 COLUMNS = ("t_ns", "setpoint_cf", "measured_cf", "left_mm", "right_mm", "left_duty")
@@ -89,7 +89,7 @@ def test_other_tools_find_json_messages_with_schemas(written):
 
 
 def test_the_telemetry_schema_has_every_field_in_plain_form():
-    schema = telemetry_schema()
+    schema = plain_schema(Telemetry)
     assert set(schema["properties"]) == set(Telemetry.__struct_fields__)
     assert schema["properties"]["setpoint_cf"] == {"type": "number"}
     assert schema["properties"]["duty"] == {"type": "array", "items": {"type": "number"}}

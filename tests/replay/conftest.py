@@ -11,10 +11,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from flight import Flight
 
-from tormagd.closed_loop import ClosedLoop
+from tormagd.closed_loop import ClosedLoop, VirtualBus
 from tormagd.config import Config
 from tormagd.control.core import Core, build_core
 from tormagd.control.governor import TimedSetpoint
+from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import ReversingHand
@@ -36,14 +37,18 @@ def core() -> Core:
 
 @pytest.fixture(scope="session")
 def fly(core: Core) -> Fly:
-    """A flight of a simulated device with these faults, armed, which renders a pulse until `until_s`."""
+    """A flight of a simulated device with these faults, armed, which renders a pulse until `until_s`; on a bus, or else
+    behind a serial port."""
     shipped = core
 
-    def make(*faults: str, until_s: float, silent_s: float = 0.0, config: Config | None = None) -> Flight:
+    def make(
+        *faults: str, until_s: float, silent_s: float = 0.0, config: Config | None = None, bus: bool = False
+    ) -> Flight:
         core = shipped if config is None else build_core(config)
         config = config or Config()
         device = VirtualDevice(load_plant("sample_1"), ReversingHand(2.0), [parse_fault(it) for it in faults], 1)
-        flight = Flight(config, core, ClosedLoop(config, core.stepper, core.planner, device))
+        line = VirtualBus(CanDevice(device.messages)) if bus else device
+        flight = Flight(config, core, ClosedLoop(config, core.stepper, core.planner, line))
         flight.arm()
         while flight.loop.now_s < until_s:
             flight.tick(asked(flight.loop.now_s))

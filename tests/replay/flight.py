@@ -1,8 +1,11 @@
 """A run in virtual time with its black box: what the daemon does with its journal, done around the closed loop."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from mcap.reader import make_reader
 
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
@@ -25,22 +28,24 @@ class Flight:
     def __init__(self, config: Config, core: Core, loop: ClosedLoop) -> None:
         self.config, self.core, self.loop = config, core, loop
         self.ring, self._journal, self._ticks = Ring(), Journal(), 0
+        self._is_stepped = False
+        loop.connection.traffic = self
         self._remember()
 
     def tick(self, setpoint: TimedSetpoint | None = None) -> Sample:
         """One control period."""
         before = self.loop.plan_state
         assert before is not None
-        self._journal.stepped()
+        self._is_stepped = False
         sample = self.loop.tick(setpoint)
+        self._stepped()
         planned = self.loop.plan_state
         assert planned is not None
         if planned.plan is not before.plan:
             self._journal.planned(sample.time_s, setpoint)
             self._journal.foresaw()
-        measured = self.loop.measurement
         record = tick_record(
-            sample.time_s, self.loop.step_state, sample.output, sample.plan, before.trim, measured, 0.0, 0.0
+            sample.time_s, self.loop.step_state, sample.output, sample.plan, before.trim, sample.measurement, 0.0, 0.0
         )
         self._journal.ticked(record)
         self._ticks += 1
@@ -51,9 +56,29 @@ class Flight:
                 self._remember()
         return sample
 
+    def read(self, now_s: float, raw: Any) -> None:
+        """Something came: before the step."""
+        self._journal.read(now_s, raw)
+
+    def wrote(self, now_s: float, raw: list[Any], unsent: int) -> None:
+        """And went out: after it."""
+        self._stepped()
+        self._journal.wrote(now_s, raw, unsent)
+
+    def connected(self, memory: Any) -> None:
+        """A port was opened; or it is closed, and the core knows."""
+        if memory is None:
+            self._journal.lost_link()
+        self._journal.connected(memory)
+
+    def _stepped(self) -> None:
+        if not self._is_stepped:
+            self._journal.stepped()
+        self._is_stepped = True
+
     def _remember(self) -> None:
         assert self.loop.plan_state is not None
-        self._journal.snapshot(self.loop.step_state, self.loop.plan_state)
+        self._journal.snapshot(self.loop.step_state, self.loop.plan_state, self.loop.connection.memory())
 
     def _packed(self) -> bytes:
         packer = Packer()
@@ -90,6 +115,12 @@ class Flight:
         """Its black box; `changes` are of the header."""
         write_black_box(path, {**header(self.config, self.core), "reason": "TEST", **changes}, self.ring.parts())
         return path
+
+
+def frames(path: Path) -> list[dict[str, Any]]:
+    """What passed, as a stock reader finds it in a black box."""
+    with path.open("rb") as file:
+        return [json.loads(message.data) for _, _, message in make_reader(file).iter_messages(topics="/frames")]
 
 
 def planted(box_entries: list[Any], tick: int, column: int, value: Any) -> list[Any]:

@@ -9,14 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from firmware_protocol.codec import Switches
+from firmware_protocol.codec import SCHEMA_HASH, Identity, Switches
 from tormagd.control.device_fit import UNSEEN
 from tormagd.control.governor import GovernorState
 from tormagd.control.plan import NOTHING_SHOWN, Outside, Plan, PlanState
 from tormagd.control.step import StepState
-from tormagd.exact import InexactError, first_difference, kinds, packed, plain, restored
+from tormagd.exact import InexactError, first_difference, kinds, packed, plain, restore, restored
+from tormagd.hardware.link import DeviceLink
+from tormagd.hardware.link_statistics import RoundTrip
 from tormagd.model.displacement import Turn
 from tormagd.model.relaxing import Relaxed
+from tormagd.replay import conversation
 from tormagd.replay.rerun import KNOWN
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import SafetyState
@@ -99,3 +102,24 @@ def test_what_stands_for_no_value_is_refused(data: Any) -> None:
 def test_what_has_no_plain_form_is_refused() -> None:
     with pytest.raises(TypeError, match="allowed are values"):
         plain({"a": 1})
+
+
+def test_what_changes_in_place_is_given_what_another_remembered() -> None:
+    one, other = DeviceLink(1.0), DeviceLink(2.0)
+    one.receive(1.5, Identity(SCHEMA_HASH, 1, 0, 7))
+    one.round_trip.drive(3, 1.5)
+    restore(other, msgspec.msgpack.decode(msgspec.msgpack.encode(plain(one))), conversation.KNOWN)
+    assert first_difference(plain(one), plain(other)) is None
+    assert (other.state, other.identity) == (one.state, one.identity)
+    other.round_trip.drive(4, 2.5)
+    assert first_difference(plain(one), plain(other)) == ("round_trip._newest", 3, 4)
+
+
+@pytest.mark.parametrize(
+    "data", [None, {}, {"RoundTrip": 1}, {"RoundTrip": {"_lead": 1}}, {"DeviceLink": {}}, "_recent", "_sent_s"]
+)
+def test_what_nobody_remembers_is_refused(data: Any) -> None:
+    if isinstance(data, str):
+        data = {"RoundTrip": plain(RoundTrip())["RoundTrip"] | {data: {"Unheard": {}}}}
+    with pytest.raises(InexactError):
+        restore(RoundTrip(), data, conversation.KNOWN)

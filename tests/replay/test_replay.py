@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from flight import Flight, planted
+from flight import Flight, frames, planted
 from mcap.writer import Writer
 
 from firmware_protocol.build import SWITCH, settle
@@ -53,6 +53,7 @@ def test_a_fault_is_replayed_bit_for_bit_from_the_file_alone(ended: Flight, box:
     done = rerun(rebuilt(known), known.columns, box.entries)
     assert (done.difference, done.gaps) == (None, 0)
     assert (done.ticks, done.from_s, done.snapshots) == (TICKS, 0.0, 7)
+    assert (done.frames, done.damaged) == (len(frames(path)), 0)
     assert differences(known, Config()) == []
 
 
@@ -242,7 +243,7 @@ def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Pa
         writer.finish()
     assert "allowed is msgpack" in refusal(other)
     changes = {
-        "format": ("2", "format = '2'"),
+        "format": ("3", "format = '3'"),
         "config": ('{"scene": "pulse"}', "config: its hash"),
         "model_sha256": ("f" * 64, "the model with the hash 'ffffffffffff'"),
         "columns": (json.dumps(["t_ns"]), "no column 'monotonic_s'"),

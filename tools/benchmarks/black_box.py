@@ -1,7 +1,8 @@
 """`benchmark black-box`: what the black box costs the control thread, in processor time.
 
-A pulse is rendered in virtual time; its ticks, setpoints and states are then written down by the daemon's own black box
-in the pace of the control loop, with an idle millisecond after every part, and handed to the process that keeps them.
+A pulse is rendered in virtual time; its ticks, frames, setpoints and states are then written down by the daemon's own
+black box in the pace of the control loop, with an idle millisecond after every part, and handed to the process that
+keeps them.
 The time is this thread's alone: what the kernel gives to others meanwhile does not count.
 """
 
@@ -17,10 +18,13 @@ from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
+from tormagd.control.journal import Journal
 from tormagd.control.plan import PlanState
 from tormagd.control.step import StepState
 from tormagd.daemon.black_box import PART_TICKS, BlackBox, header
 from tormagd.daemon.telemetry import tick_record
+from tormagd.hardware.connection import Connection
+from tormagd.keeping import READ
 from tormagd.messages import TickRecord
 from tormagd.recording.keeper import KEPT_S
 from tormagd.simulation.device import VirtualDevice
@@ -37,6 +41,8 @@ IDLE_S = 0.001
 class Kept(NamedTuple):
     """What one tick gives the black box."""
 
+    passed: list[Any]
+    "Read and written: a journal's entries."
     record: TickRecord
     setpoint: TimedSetpoint
     step: StepState
@@ -52,10 +58,10 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     `bytes_per_tick` are kept, `ring_MB` of them in half a minute."""
     config = Config()
     core = build_core(config)
-    ticks = rendered(config)
+    ticks, connection = rendered(config)
     with tempfile.TemporaryDirectory() as folder:
         box = BlackBox(Path(folder), header(config, core), config.rates.control_hz)
-        box.begin(ticks[0].step, ticks[0].plan)
+        box.begin(ticks[0].step, ticks[0].plan, connection)
         rounds_us = [_round_us(box, ticks) for _ in range(ROUNDS + 1)][1:]
         dropped, size = box.report().dropped, box.handed_over / (len(ticks) * (ROUNDS + 1))
         box.close()
@@ -68,11 +74,12 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def rendered(config: Config) -> list[Kept]:
-    """The ticks of a pulse in virtual time."""
+def rendered(config: Config) -> tuple[list[Kept], Connection]:
+    """The ticks of a pulse in virtual time, and the connection after them."""
     core = build_core(config)
     loop = ClosedLoop(config, core.stepper, core.planner, VirtualDevice(load_plant("sample_1"), ReversingHand(2.0)))
     loop.arm()
+    journal = loop.connection.traffic = Journal()
     kept: list[Kept] = []
     while len(kept) < PULSE_S * config.rates.control_hz:
         stamp_s = math.floor(loop.now_s * 500.0) / 500.0
@@ -80,10 +87,10 @@ def rendered(config: Config) -> list[Kept]:
         sample = loop.tick(setpoint)
         assert loop.plan_state is not None
         record = tick_record(
-            sample.time_s, sample.state, sample.output, sample.plan, sample.trim, loop.measurement, 0.0, 0.0
+            sample.time_s, sample.state, sample.output, sample.plan, sample.trim, sample.measurement, 0.0, 0.0
         )
-        kept.append(Kept(record, setpoint, sample.state, loop.plan_state))
-    return kept
+        kept.append(Kept(journal.take(), record, setpoint, sample.state, loop.plan_state))
+    return kept, loop.connection
 
 
 def _round_us(box: BlackBox, ticks: list[Kept]) -> float:
@@ -91,7 +98,12 @@ def _round_us(box: BlackBox, ticks: list[Kept]) -> float:
     for start in range(0, len(ticks), PART_TICKS):
         begun_ns = time.thread_time_ns()
         for number, tick in enumerate(ticks[start : start + PART_TICKS]):
-            box.journal.stepped()
+            for direction, *what in tick.passed:
+                if direction == READ:
+                    box.journal.read(*what)
+                    box.journal.stepped()
+                else:
+                    box.journal.wrote(*what)
             if number % PLANNED_EVERY == 0:
                 box.journal.planned(tick.record.monotonic_s, tick.setpoint)
             if number % FORESEEN_EVERY == 0:

@@ -5,6 +5,7 @@ The daemon, the virtual-time simulation and the tests build it here, so that all
 
 import hashlib
 import math
+import platform
 from pathlib import Path
 from typing import NamedTuple
 
@@ -123,6 +124,11 @@ def sources_hash() -> str:
             digest.update(f"{path.relative_to(root).as_posix()} {path.stat().st_size}\n".encode())
             digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def platform_name() -> str:
+    """What else the bits of a result depend on: the processor's kind, Python and NumPy."""
+    return f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}"
 
 
 class Part(NamedTuple):

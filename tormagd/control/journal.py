@@ -1,6 +1,7 @@
 """What the core was given, in the order it was given: with it and a state to begin with, all that it did can be rerun.
 
 `plan` and `step` are pure, so nothing that they gave has to be kept: it stands in the tick's record, to compare with.
+So is the conversation with the device, once it is known what was read and when: what was written is kept to compare.
 """
 
 import struct
@@ -13,16 +14,22 @@ from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import PlanState, Shown
 from tormagd.control.step import StepState
 from tormagd.exact import plain
+from tormagd.hardware.backend import Received, Sent
+from tormagd.keeping import READ, WROTE
 from tormagd.messages import TickRecord
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions
 
-FORMAT = 1
-"Of the entries: raised when one is removed or changes its meaning."
+FORMAT = 2
+"Of the entries: raised when one comes, is removed or changes its meaning."
+FORMATS = (1, FORMAT)
+"Those that can be rerun: in the first there is nothing of the conversation."
 STEP = "step"
 "The step ran here; what it was given stands in the next record."
 PLAN, FORESEE, AFRESH, TEACH = "plan", "foresee", "afresh", "teach"
 COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
+CONNECTED = "connected"
+"Besides READ and WROTE, which the process that keeps them knows, too."
 STATE, MISSING = "state", "missing"
 MOST_ENTRIES = 4_096
 "That nobody took: then the journal begins anew, and says that something is missing."
@@ -78,9 +85,21 @@ class Journal:
         """The link to the device broke."""
         self._add((LOSE_LINK,))
 
-    def snapshot(self, step: StepState, plan: PlanState) -> None:
-        """All that the core remembers now: a replay may begin here."""
-        self._add((STATE, step, plan))
+    def read(self, now_s: float, raw: Received) -> None:
+        """This was read from the device, and taken in at this time."""
+        self._add((READ, now_s, raw))
+
+    def wrote(self, now_s: float, raw: list[Sent], unsent: int) -> None:
+        """This was written to it in one period, after a step; what the port did not take at once is counted."""
+        self._add((WROTE, now_s, raw, unsent))
+
+    def connected(self, memory: Any) -> None:
+        """A conversation with the device begins, which remembers this; None: it has ended."""
+        self._add((CONNECTED, memory))
+
+    def snapshot(self, step: StepState, plan: PlanState, connection: Any) -> None:
+        """All that the core and the conversation remember now: a replay may begin here."""
+        self._add((STATE, step, plan, connection))
 
     def missed(self) -> None:
         """Entries before this were lost."""

@@ -52,13 +52,25 @@ def replay(
 def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
     gaps = f"; {done['gaps']} gaps in it were passed over" if done["gaps"] else ""
     span = f"{done['ticks']:,} ticks from {done['from_s']:.3f} to {done['to_s']:.3f} s"
-    difference = done["difference"]
+    difference, notes = done["difference"], gaps + _damage(done)
     if difference is None:
-        return f"bit-exact, {span}; {done['snapshots']} snapshots of the state between them, too{gaps}", True
+        frames = f"{done['frames']:,} frames give the measurements again" if done["frames"] else "no frames are in it"
+        return f"bit-exact, {span}; {done['snapshots']} snapshots of the state between them, too; {frames}{notes}", True
+    frame = "" if difference["frame"] is None else f" at frame {difference['frame']:,}"
     return (
-        f"tick {difference['tick']:,} at {difference['time_s']:.3f} s differs: {difference['field']} was "
-        f"{difference['recorded']}, is {difference['replayed']}; before it bit-exact, {done['ticks']:,} ticks{gaps}"
+        f"tick {difference['tick']:,} at {difference['time_s']:.3f} s differs{frame}: {difference['field']} was "
+        f"{difference['recorded']}, is {difference['replayed']}; before it bit-exact, {done['ticks']:,} ticks{notes}"
     ), False
+
+
+def _damage(done: dict[str, Any]) -> str:
+    first = done["first_damage"]
+    if first is None:
+        return ""
+    return (
+        f"; {done['damaged']:,} of them came damaged ({done['resynchronised']:,} resynchronisations), the first is "
+        f"frame {first['frame']:,} at {first['time_s']:.3f} s: {first['why']}"
+    )
 
 
 def _instead(result: dict[str, Any]) -> str:

@@ -1,4 +1,5 @@
-"""The black box: all that the core decides on is handed to another process, which keeps the newest of it.
+"""The black box: all that the core decides on, and all that passes between it and the device, is handed to another
+process, which keeps the newest of it.
 
 The control thread writes references into a journal, which become bytes in the slack behind each tick; those of 20 ticks
 go into a socket. It waits for nobody: what the socket does not take is lost and counted. Files are the other's
@@ -9,7 +10,6 @@ import hashlib
 import importlib.util
 import json
 import logging
-import platform
 import socket
 import subprocess
 import sys
@@ -19,16 +19,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
 from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import Config
-from tormagd.control.core import Core, sources_hash
+from tormagd.control.core import Core, platform_name, sources_hash
 from tormagd.control.journal import FORMAT, Journal, Packer
 from tormagd.control.plan import PlanState
 from tormagd.control.step import StepState
 from tormagd.daemon.profiles import state_folder
+from tormagd.hardware.connection import Connection
 from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
 from tormagd.messages import BlackBoxReport, TickRecord
 from tormagd.safety.operating_state import RefusedError
@@ -63,7 +63,7 @@ def header(config: Config, core: Core) -> dict[str, str]:
         "version": __version__,
         "build": str(settle()),
         "sources_sha256": sources_hash(),
-        "platform": f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}",
+        "platform": platform_name(),
         "config": configured.decode(),
         "config_sha256": hashlib.sha256(configured).hexdigest(),
         "scene": scene.decode(),
@@ -107,10 +107,13 @@ class BlackBox:
         self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
         self._encoder = msgspec.msgpack.Encoder()
         self._has_state = False
+        self._connection: Connection | None = None
         self._asked: deque[Write] = deque(maxlen=MOST_ASKED)
 
-    def begin(self, step: StepState, plan: PlanState) -> None:
-        """With these states the first tick is run."""
+    def begin(self, step: StepState, plan: PlanState, connection: Connection) -> None:
+        """With these states the first tick is run, and with what comes through this connection."""
+        if self._socket is not None:
+            self._connection, connection.traffic = connection, self.journal
         self._snapshot(step, plan)
 
     def ticked(self, record: TickRecord, step: StepState, plan: PlanState) -> None:
@@ -214,7 +217,7 @@ class BlackBox:
             self._asked.popleft()
 
     def _snapshot(self, step: StepState, plan: PlanState) -> None:
-        self.journal.snapshot(step, plan)
+        self.journal.snapshot(step, plan, None if self._connection is None else self._connection.memory())
         self._has_state = True
 
     def _say(self, what: Said) -> bool:
@@ -223,12 +226,10 @@ class BlackBox:
             return False
         try:
             self._socket.send(self._encoder.encode(what))
-        except BlockingIOError:
-            return False
-        except OSError as error:
-            if not isinstance(error, BrokenPipeError | ConnectionError):
-                return False  # more than a packet holds
+        except ConnectionError:
             self._lose(GONE)
+            return False
+        except OSError:  # it does not take any now, or this is more than a packet holds
             return False
         return True
 

@@ -94,7 +94,7 @@ class Daemon:
             self._box,
             refused,
         )
-        self._box.begin(self._control.state, self._inference.state)
+        self._box.begin(self._control.state, self._inference.state, self._connection)
         self._ticks_per_snapshot = rates.control_hz // rates.telemetry_hz
         self._ended = asyncio.Event()
 

@@ -1,13 +1,13 @@
-"""The black box's file: MCAP with two channels, and all that it takes to run the core again.
+"""The black box's file: MCAP with three channels, and all that it takes to run the core again.
 
-`/ticks` is that of a recording, for viewers and `tormagctl plot`. `/core` has the same ticks with whatever else the
-core was given, in its order, to the bit: msgpack, a message for each part that the daemon handed over. The metadata
-`black_box` are its header. `tormagctl replay` runs it.
+`/ticks` is that of a recording, for viewers and `tormagctl plot`, and `/frames` what passed between daemon and device.
+`/core` has both with whatever else the core was given, in its order, to the bit: msgpack, a message for each part that
+the daemon handed over. The metadata `black_box` are its header. `tormagctl replay` runs it.
 """
 
 import contextlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,12 @@ from mcap.writer import CompressionType, Writer
 
 from tormagd import __version__
 from tormagd.bounded_file import require_regular
-from tormagd.keeping import Part
+from tormagd.keeping import READ, WROTE, Part
+from tormagd.recording.closing import ABOUT
 from tormagd.recording.reader import MAX_FILE_BYTES, MAX_RECORD_BYTES, UNREADABLE, RecordingError
-from tormagd.recording.writer import CHUNK_BYTES, TICK_KINDS, TICKS_TOPIC, known_values, tick_schema
+from tormagd.recording.writer import CHUNK_BYTES, TICK_KINDS, TICKS_TOPIC, known_values, plain_schema, tick_schema
 
-CORE_TOPIC = "/core"
+CORE_TOPIC, FRAMES_TOPIC = "/core", "/frames"
 HEADER = "black_box"
 MAX_PARTS = 100_000
 MAX_BYTES = 200_000_000
@@ -39,8 +40,29 @@ class BlackBoxFile(msgspec.Struct, frozen=True):
     "False for one that ends in the middle: what came before is there."
 
 
+class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What passed: on a bus one frame, on a serial port what was read at once, or one frame that was written. The time
+    is that of the ticks' `monotonic_s`, `data` are hexadecimal; without an `identifier` it is a serial port's."""
+
+    monotonic_s: float
+    direction: str
+    "read or wrote."
+    data: str
+    identifier: int | None = None
+
+
+def frames_in(entry: Any) -> list[Frame]:
+    """The frames of an entry, none for one of another kind. Raises ValueError, TypeError for an odd one."""
+    if not isinstance(entry, list) or not entry or entry[0] not in (READ, WROTE):
+        return []
+    direction, time_s, raw, *_ = entry
+    pieces = [(None, each) if isinstance(each, bytes) else each for each in (raw if isinstance(raw, list) else [raw])]
+    return [Frame(time_s, direction, data.hex(), identifier) for identifier, data in pieces]
+
+
 def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part]) -> int:
-    """Writes a new file, whole or not at all; returns how many ticks are in it. Raises FileExistsError, OSError."""
+    """Writes a new file of some parts, whole or not at all; returns how many ticks are in it. Raises FileExistsError,
+    OSError."""
     beside = path.with_name(f"{path.name}.part")
     if path.exists():
         raise FileExistsError(17, "exists", str(path))
@@ -54,32 +76,40 @@ def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part]) -
     return ticks
 
 
-def _write(path: Path, header: dict[str, str], parts: Iterable[Part]) -> int:
+def _write(path: Path, header: dict[str, str], parts: Sequence[Part]) -> int:
     columns = tuple(json.loads(header["columns"]))
-    ticks = 0
+    ticks = frames = 0
     with path.open("wb") as file:
         mcap = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         mcap.start(profile="", library=f"tormagd {__version__}")
         mcap.add_metadata(HEADER, header)
-        mcap.add_metadata("tormagd", {"version": __version__, "kind": HEADER})
+        mcap.add_metadata(ABOUT, {"version": __version__, "kind": HEADER})
         core = mcap.register_channel(topic=CORE_TOPIC, message_encoding="msgpack", schema_id=0)
-        rows_channel: int | None = None
+        kinds = {name: TICK_KINDS[name] for name in columns if name in TICK_KINDS}
+        tick_channel = _channel(mcap, TICKS_TOPIC, tick_schema(kinds))
+        frame_channel = _channel(mcap, FRAMES_TOPIC, plain_schema(Frame))
+        began = parts[0]
         for number, part in enumerate(parts):
             mcap.add_message(core, log_time=part.t_ns, data=part.entries, publish_time=part.t_ns, sequence=number)
-            rows = tuple(tuple(entry) for entry in msgspec.msgpack.decode(part.entries) if is_tick(entry))
-            if not rows:
-                continue
-            if rows_channel is None:
-                kinds = {name: TICK_KINDS[name] for name in columns if name in TICK_KINDS}
-                data = msgspec.json.encode(tick_schema(kinds))
-                schema_id = mcap.register_schema(name="tormagd.Tick", encoding="jsonschema", data=data)
-                rows_channel = mcap.register_channel(topic=TICKS_TOPIC, message_encoding="json", schema_id=schema_id)
-            for row in rows:
-                data = msgspec.json.encode(known_values(columns, row))
-                mcap.add_message(rows_channel, log_time=row[0], data=data, publish_time=row[0], sequence=ticks)
-                ticks += 1
+            for entry in msgspec.msgpack.decode(part.entries):
+                if is_tick(entry):
+                    data = msgspec.json.encode(known_values(columns, entry))
+                    mcap.add_message(tick_channel, log_time=entry[0], data=data, publish_time=entry[0], sequence=ticks)
+                    ticks += 1
+                for frame in frames_in(entry):
+                    frames += 1
+                    t_ns = began.t_ns + round((frame.monotonic_s - began.time_s) * 1e9)  # so they stay in their order
+                    data = msgspec.json.encode(frame)
+                    mcap.add_message(frame_channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=frames)
         mcap.finish()  # type: ignore[no-untyped-call]
     return ticks
+
+
+def _channel(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:
+    data = msgspec.json.encode(schema)
+    schema_id = mcap.register_schema(name=schema["title"], encoding="jsonschema", data=data)
+    channel: int = mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
+    return channel
 
 
 def is_tick(entry: Any) -> bool:

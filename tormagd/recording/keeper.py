@@ -22,7 +22,7 @@ from tormagd.output import write_line
 
 KEPT_S = 30.0
 MOST_BYTES = 48_000_000
-"""The ring holds no more than either. Half a minute at 1 kHz with 500 setpoints a second is 24 MB; at rates or with
+"""The ring holds no more than either. Half a minute at 1 kHz with 500 setpoints a second is 18 MB; at rates or with
 previews for which this is too little, it reaches less far back."""
 MOST_FILES = 20
 "The oldest goes when there are more."

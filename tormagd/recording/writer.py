@@ -48,7 +48,7 @@ class RecordingWriter:
         self._channels: list[Channel] = []
         self._mcap.start(profile="", library=f"tormagd {__version__}")
         self.describe({"version": __version__, **(metadata or {})})
-        self._telemetry_channel = self._channel(TELEMETRY_TOPIC, "tormagd.Telemetry", telemetry_schema())
+        self._telemetry_channel = self._channel(TELEMETRY_TOPIC, "tormagd.Telemetry", plain_schema(Telemetry))
         self._tick_channels: dict[tuple[tuple[str, str], ...], int] = {}
         self._columns: tuple[str, ...] = ()
         self._kinds: dict[str, str] = {}
@@ -180,10 +180,10 @@ class RecordingWriter:
         self._mcap.add_message(channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=sequence % 2**32)
 
 
-def telemetry_schema() -> dict[str, Any]:
-    """The JSON schema of a telemetry message, without `$ref`, `anyOf` and tuples: viewers read only the plain forms."""
-    (schema,), definitions = msgspec.json.schema_components([Telemetry], ref_template="{name}")
-    return {"title": "tormagd.Telemetry", **_plain(schema, definitions)}
+def plain_schema(message: type[msgspec.Struct]) -> dict[str, Any]:
+    """The JSON schema of a type of message, without `$ref`, `anyOf` and tuples: viewers read only the plain forms."""
+    (schema,), definitions = msgspec.json.schema_components([message], ref_template="{name}")
+    return {"title": f"tormagd.{message.__name__}", **_plain(schema, definitions)}
 
 
 def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:

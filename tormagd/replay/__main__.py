@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import logging
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,9 @@ from tormagd.replay.rebuild import Recorded, ReplayError, differences, rebuilt, 
 from tormagd.replay.rehearse import changed, rehearse, script
 from tormagd.replay.rerun import rerun
 
+NESTED = ("first_damage", "difference")
+"Of a rerun: tuples with names, or None."
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Returns 0, or 2 where the file or an option cannot be used: why is on stderr, in one line."""
@@ -26,6 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--fault", dest="faults", action="append", default=[])
     parser.add_argument("--config", type=Path)
     options = parser.parse_args(arguments)
+    logging.disable()  # a connection that is run again has no news
     try:
         configured = None if options.config is None else load_config(options.config)
         box = read_black_box(options.file)
@@ -53,8 +58,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _rerun(known: Recorded, box: BlackBoxFile, from_s: float) -> dict[str, Any]:
     done = rerun(rebuilt(known), known.columns, box.entries, from_s)
-    difference = None if done.difference is None else done.difference._asdict()
-    return {"rerun": done._asdict() | {"difference": difference}}
+    nested = {name: each and each._asdict() for name, each in done._asdict().items() if name in NESTED}
+    return {"rerun": done._asdict() | nested}
 
 
 def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) -> dict[str, Any]:

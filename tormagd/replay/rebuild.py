@@ -2,17 +2,15 @@
 
 import hashlib
 import json
-import platform
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
 
 from tormagd import __version__
 from tormagd.config import Config, ConfigError, checked
-from tormagd.control.core import Core, build_core, sources_hash
-from tormagd.control.journal import FORMAT
+from tormagd.control.core import Core, build_core, platform_name, sources_hash
+from tormagd.control.journal import FORMATS
 from tormagd.messages import TickRecord
 from tormagd.recording.black_box import BlackBoxFile
 from tormagd.scenes.scene import Scene, load_scene
@@ -46,10 +44,10 @@ def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
     missing = [name for name in NEEDED if name not in header]
     if missing:
         raise ReplayError(f"its header has no {missing[0]!r}: it is no black box of this version")
-    if header["format"] != str(FORMAT):
+    if header["format"] not in map(str, FORMATS):
         raise ReplayError(
-            f"format = {header['format'][:20]!r}, written by tormagd {header['version'][:20]!r}: allowed is {FORMAT}, "
-            f"which tormagd {__version__} writes"
+            f"format = {header['format'][:20]!r}, written by tormagd {header['version'][:20]!r}: allowed are "
+            f"{' and '.join(map(str, FORMATS))}; tormagd {__version__} writes the last"
         )
     columns = _json(header, "columns")
     if not isinstance(columns, list) or not all(isinstance(name, str) for name in columns):
@@ -95,9 +93,8 @@ def differences(known: Recorded, configured: Config | None) -> list[str]:
             f"build: tormagd {known.header['version'][:20]} with the sources {there[:SHOWN]} was recorded, here is "
             f"tormagd {__version__} with {here[:SHOWN]}"
         )
-    machine = f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}"
-    if known.header["platform"] != machine:
-        found.append(f"platform: {known.header['platform'][:80]} was recorded, here is {machine}")
+    if known.header["platform"] != platform_name():
+        found.append(f"platform: {known.header['platform'][:80]} was recorded, here is {platform_name()}")
     try:
         scene = load_scene((configured or known.config).scene)
     except ConfigError as error:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
+from tormagd import keeping
 from tormagd.control import journal
 from tormagd.control.core import Core
 from tormagd.control.device_fit import DeviceFit
@@ -32,7 +33,8 @@ from tormagd.hardware.measurement import Measurement
 from tormagd.messages import TickRecord
 from tormagd.model.displacement import Turn
 from tormagd.model.relaxing import Relaxed
-from tormagd.recording.black_box import is_tick
+from tormagd.recording.black_box import frames_in, is_tick
+from tormagd.replay.conversation import Conversation, Damage, Found
 from tormagd.replay.rebuild import ReplayError
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import (
@@ -65,7 +67,9 @@ KNOWN = kinds(
     *(Conditions, DeviceMode, Switches),
 )
 "All that the core's states consist of."
-UNTAKEN = (TypeError, AttributeError, ValueError, ArithmeticError, LookupError, RuntimeError, RecursionError)
+UNTAKEN = (
+    TypeError, AttributeError, ValueError, ArithmeticError, LookupError, AssertionError, RuntimeError, RecursionError,
+)  # fmt: skip
 "What the core raises at values of a kind that no part of it makes."
 SETPOINT = tuple[float, float, float, float | None, float | None, tuple[float, ...], float, int, bool]
 NOT_THE_CORES = 1
@@ -73,24 +77,34 @@ NOT_THE_CORES = 1
 
 
 class Difference(NamedTuple):
-    """Where a replay first gave something else. `tick` counts from 1 at the file's first, `time_s` from there."""
+    """Where a replay first gave something else. `tick` counts from 1 at the file's first, `time_s` from there. `frame`
+    is where it is about what was written, or what was measured and remembered after that frame; it counts likewise."""
 
     tick: int
     time_s: float
     field: str
     recorded: str
     replayed: str
+    frame: int | None
 
 
 class Rerun(NamedTuple):
     """What came of it: `ticks` were the same to the bit, from `from_s` to `to_s` after the file's first; `snapshots` of
-    the whole state were compared too; over `gaps` something is missing, and it went on from the next snapshot."""
+    the whole state were compared too; over `gaps` something is missing, and it went on from the next snapshot.
+
+    `frames` that were read and written went through the same link, with the same measurements to the bit; `damaged` and
+    `resynchronised` count what was wrong with those that were read, and `first_damage` is where that began.
+    """
 
     ticks: int
     from_s: float
     to_s: float
     snapshots: int
     gaps: int
+    frames: int
+    damaged: int
+    resynchronised: int
+    first_damage: Damage | None
     difference: Difference | None
 
 
@@ -122,9 +136,10 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
     if not 0.0 <= from_s <= lasts_s:
         raise ReplayError(f"--from = {from_s:g}: allowed is 0..{lasts_s:.3f} s")
     start = _start(entries, records, first_s + from_s)
-    running = _Running(core)
+    running = _Running(core, sum(len(frames_in(entry)) for entry in entries[:start]))
     number = bisect_right(places, start)
     from_s, ticks, to_s = records[places[number]].monotonic_s - first_s, 0, 0.0
+    difference: Difference | None = None
     for place in range(start, places[-1] + 1):
         # a step's inputs stand in the record of its period, which comes after whatever else happened in that
         record = records[places[number]]
@@ -136,13 +151,17 @@ def rerun(core: Core, columns: tuple[str, ...], entries: list[Any], from_s: floa
                 f"tick {number + 1}: the core does not take what stands there: {_short(error)}"
             ) from error
         if differs is not None:
-            difference = Difference(number + 1, round(time_s, 6), differs[0], _short(differs[1]), _short(differs[2]))
-            return Rerun(ticks, from_s, to_s, running.snapshots, running.gaps, difference)
+            told = _short(differs.recorded), _short(differs.replayed)
+            difference = Difference(number + 1, round(time_s, 6), differs.field, *told, differs.frame)
+            break
         if place in records:
             number += 1
             if running.is_known:
                 ticks, to_s = ticks + 1, time_s
-    return Rerun(ticks, from_s, to_s, running.snapshots, running.gaps, None)
+    passed = running.conversation
+    damage = passed.first_damage and passed.first_damage._replace(time_s=passed.first_damage.time_s - first_s)
+    link = passed.frames, passed.damaged, passed.resynchronised, damage
+    return Rerun(ticks, from_s, to_s, running.snapshots, running.gaps, *link, difference)
 
 
 def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -> int:
@@ -162,9 +181,12 @@ def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -
 
 
 class _Running:
-    """The core's states between two entries."""
+    """The core's states between two entries, and the conversation's."""
 
-    def __init__(self, core: Core) -> None:
+    def __init__(self, core: Core, frame: int) -> None:
+        self.conversation = Conversation(frame)
+        self._of_frames: Found | None = None
+        "What frames show to differ: told with the tick, behind what its record shows."
         self._stepper, self._planner = core.stepper, core.planner
         self._step: StepState = core.stepper.start(0.0)
         self._plan: PlanState = core.planner.start(0.0)
@@ -175,33 +197,44 @@ class _Running:
         "Whether the states are the recorded core's."
         self.snapshots = self.gaps = 0
 
-    def take(self, entry: Any, record: TickRecord) -> tuple[str, Any, Any] | None:
+    def take(self, entry: Any, record: TickRecord) -> Found | None:
         """One entry that is no tick; what differs. `record` is the next tick's. Raises UNTAKEN."""
         name = _name(entry)
+        self.conversation.frame += len(frames_in(entry))
         if name == journal.STATE:
             return self._begin(entry)
         if name == journal.MISSING:
             self.gaps += self.is_known
             self.is_known = False
+            self.conversation.begin(None)
+        elif name == keeping.READ:
+            self.conversation.read(entry)
+        elif name == journal.CONNECTED:
+            self.conversation.begin(entry[1])
         elif self.is_known:
             return self._run(name, entry, record)
         return None
 
-    def _run(self, name: str, entry: Any, record: TickRecord) -> tuple[str, Any, Any] | None:
+    def _run(self, name: str, entry: Any, record: TickRecord) -> Found | None:
         match name:
             case journal.STEP:
                 self._measurement = measurement_of(record)
+                self._of_frames = self.conversation.compare(self._measurement)
                 self._used = self._plan
                 self._step, self._output = self._stepper.step(
                     self._step, record.monotonic_s, self._measurement, self._used.plan
                 )
+            case keeping.WROTE:
+                if self._output is None:
+                    raise ValueError("something written without a step")
+                self._of_frames = self._of_frames or self.conversation.wrote(entry, self._output)
             case journal.PLAN:
                 now_s, setpoint = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
                 timed = None if setpoint is None else TimedSetpoint(*setpoint)
                 try:
                     self._plan = self._planner.plan(self._plan, now_s, timed, self._step.estimate)
                 except PLAN_ERRORS as error:
-                    return "plan", "made", f"failed: {error}"
+                    return Found("plan", "made", f"failed: {error}")
             case journal.FORESEE:
                 self._plan = self._planner.foresee(self._plan)
             case journal.AFRESH:
@@ -213,9 +246,9 @@ class _Running:
                 try:
                     self._step = self._stepper.command(self._step, command, now_s, restored(given, KNOWN))
                 except RefusedError as error:
-                    return None if was_refused else (command, "taken", f"refused: {error.message}")
+                    return None if was_refused else Found(command, "taken", f"refused: {error.message}")
                 if was_refused:
-                    return command, "refused", "taken"
+                    return Found(command, "refused", "taken")
             case journal.LATCH:
                 self._step = self._step.replaced(safety=latch(self._step.safety, (Fault(entry[1]),)))
             case journal.LOSE_LINK:
@@ -224,8 +257,8 @@ class _Running:
                 raise ValueError(f"{name[:40]!r}: no entry of a black box")
         return None
 
-    def compare(self, record: TickRecord) -> tuple[str, Any, Any] | None:
-        """The first column that differs from the recorded one."""
+    def compare(self, record: TickRecord) -> Found | None:
+        """The first column that differs from the recorded one, or else what its frames show."""
         if not self.is_known:
             return None
         if self._output is None:
@@ -233,23 +266,23 @@ class _Running:
         timing = record.lateness_us, record.exec_us, record.tick
         plan, trim = self._used.plan, self._used.trim
         given = tick_record(self._step.time_s, self._step, self._output, plan, trim, self._measurement, *timing)
-        left, right = msgspec.structs.astuple(record), msgspec.structs.astuple(given)
-        if packed(left[NOT_THE_CORES:]) == packed(right[NOT_THE_CORES:]):
-            return None
-        for name, recorded, replayed in zip(TickRecord.__struct_fields__, left, right, strict=True):
-            if name != TickRecord.__struct_fields__[0] and packed(recorded) != packed(replayed):
-                return name, recorded, replayed
-        return None
+        left, right = msgspec.structs.astuple(record)[NOT_THE_CORES:], msgspec.structs.astuple(given)[NOT_THE_CORES:]
+        if packed(left) == packed(right):
+            return self._of_frames
+        rows = zip(TickRecord.__struct_fields__[NOT_THE_CORES:], left, right, strict=True)
+        return next(Found(*row) for row in rows if packed(row[1]) != packed(row[2]))
 
-    def _begin(self, entry: Any) -> tuple[str, Any, Any] | None:
+    def _begin(self, entry: Any) -> Found | None:
         """Compares the states with the recorded ones, and goes on from these."""
-        differs = None
+        differs, connection = None, entry[3] if len(entry) > 3 else None
         if self.is_known:
             self.snapshots += 1
             for what, recorded, own in (("step", entry[1], self._step), ("plan", entry[2], self._plan)):
                 found = first_difference(recorded, plain(own))
                 if found is not None and differs is None:
-                    differs = f"state.{what}.{found[0]}", found[1], found[2]
+                    differs = Found(f"state.{what}.{found[0]}", *found[1:])
+            differs = differs or self.conversation.compare_memory(connection)
+        self.conversation.begin(connection)
         step, plan = restored(entry[1], KNOWN), restored(entry[2], KNOWN)
         if not isinstance(step, StepState) or not isinstance(plan, PlanState):
             raise ValueError("a snapshot: allowed are a StepState and a PlanState")

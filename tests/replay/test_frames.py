@@ -1,0 +1,175 @@
+"""What passed between daemon and device: kept as it was, and run again through the same link, on both buses."""
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from flight import Flight, frames
+from mcap.reader import make_reader
+
+from firmware_protocol.codec import FUNCTION, Drive, Home, State, can_identifier, decode
+from firmware_protocol.framing import FrameDecoder
+from tormagd.control.core import Core
+from tormagd.keeping import Part
+from tormagd.messages import TickRecord
+from tormagd.recording.black_box import BlackBoxFile, read_black_box, write_black_box
+from tormagd.replay.rebuild import rebuilt, recorded
+from tormagd.replay.rerun import Rerun, rerun, ticks_of
+from tormagd.safety.codes import Fault
+
+COLUMNS = TickRecord.__struct_fields__
+DAMAGED_TICK, SNAPSHOT_S = 2_710, 2.5
+"And when the newest snapshot before it is, one of two a second."
+DAMAGED_FROM_S = 3.0
+
+
+@pytest.fixture(scope="module")
+def on_can(fly: Any) -> Flight:
+    """On a bus; from DAMAGED_FROM_S on every State is damaged."""
+    return fly(f"state_crc@{DAMAGED_FROM_S}", until_s=3.3, bus=True)
+
+
+@pytest.fixture(scope="module")
+def can_path(on_can: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return on_can.write(tmp_path_factory.mktemp("boxes") / "can.mcap")
+
+
+@pytest.fixture(scope="module", params=["serial", "can"])
+def box(request: pytest.FixtureRequest, path: Path, can_path: Path) -> BlackBoxFile:
+    return read_black_box(path if request.param == "serial" else can_path)
+
+
+def again(core: Core, entries: list[Any], from_s: float = 0.0) -> Rerun:
+    return rerun(core, COLUMNS, entries, from_s)
+
+
+def place_of(entries: list[Any], name: str, tick: int) -> int:
+    """Of the entry with this name that comes before that tick's record."""
+    end = list(ticks_of(COLUMNS, entries))[tick - 1]
+    return next(place for place in range(end, 0, -1) if entries[place][0] == name)
+
+
+def changed(entries: list[Any], place: int, raw: Any) -> list[Any]:
+    """The entries with something else read or written there."""
+    direction, time_s, _, *rest = entries[place]
+    return [*entries[:place], [direction, time_s, raw, *rest], *entries[place + 1 :]]
+
+
+def damaged(raw: Any) -> Any:
+    """With one bit of a State turned over."""
+    if isinstance(raw, bytes):
+        return raw[:4] + bytes((raw[4] ^ 0x10,)) + raw[5:]
+    (identifier, data), *others = raw
+    return [[identifier, bytes((data[0] ^ 0x10,)) + data[1:]], *others]
+
+
+def number_of(entries: list[Any], place: int) -> int:
+    """Of the newest frame in that entry, as the file counts."""
+    return sum(len(entry[2]) if isinstance(entry[2], list) else 1 for entry in entries[: place + 1] if _passed(entry))
+
+
+def _passed(entry: Any) -> bool:
+    return isinstance(entry, list) and entry[0] in ("read", "wrote")
+
+
+def test_frames_are_messages_that_anybody_can_read(path: Path, can_path: Path) -> None:
+    """The bytes are the device's and ours, decoded by the protocol alone."""
+    serial, can = frames(path), frames(can_path)
+    assert serial[0].keys() == {"monotonic_s", "direction", "data"}
+    line = b"".join(bytes.fromhex(frame["data"]) for frame in serial if frame["direction"] == "read")
+    wrote = b"".join(bytes.fromhex(frame["data"]) for frame in serial if frame["direction"] == "wrote")
+    functions = Counter(type(decode(frame.function, frame.payload)) for frame in FrameDecoder().feed(line + wrote))
+    assert functions[State] == pytest.approx(4_000, abs=30)
+    assert functions[Drive] == pytest.approx(4_000, abs=30)
+    assert functions[Home] >= 1
+    identifiers = Counter(frame["identifier"] for frame in can if frame["direction"] == "wrote")
+    assert identifiers[can_identifier(FUNCTION[Drive])] == pytest.approx(3_300, abs=30)
+    with path.open("rb") as file:
+        schema, _, message = next(iter(make_reader(file).iter_messages(topics="/frames")))
+    assert schema is not None
+    assert set(json.loads(schema.data)["properties"]) == {"monotonic_s", "direction", "data", "identifier"}
+    assert message.log_time > 1_700_000_000_000_000_000
+
+
+@pytest.mark.parametrize(("from_s", "begins_s"), [(1.6, 1.5), (2.9, 2.5)])
+def test_the_link_measures_and_writes_the_same_again(core: Core, box: BlackBoxFile, from_s, begins_s) -> None:
+    """From the middle of the run too: a snapshot has what the link and the decoder remembered."""
+    done = again(core, box.entries, from_s)
+    assert (done.difference, done.from_s) == (None, pytest.approx(begins_s, abs=1e-9))
+    assert done.frames > 2 * done.ticks
+
+
+def test_what_came_damaged_is_counted_and_measured_alike(core: Core, on_can: Flight, can_path: Path) -> None:
+    entries = read_black_box(can_path).entries
+    assert on_can.loop.step_state.safety.faults[0] is Fault.MEASUREMENT_STALE
+    done = again(core, entries)
+    assert done.difference is None
+    assert done.damaged == pytest.approx(300, abs=2)
+    assert done.first_damage is not None
+    assert done.first_damage.time_s == pytest.approx(DAMAGED_FROM_S, abs=0.003)
+    assert done.first_damage.why == "State: CRC-8"
+    assert frames(can_path)[done.first_damage.frame - 1]["identifier"] == can_identifier(FUNCTION[State])
+
+
+def test_a_damaged_frame_is_found_in_its_place(core: Core, box: BlackBoxFile) -> None:
+    place = place_of(box.entries, "read", DAMAGED_TICK)
+    done = again(core, changed(box.entries, place, damaged(box.entries[place][2])), SNAPSHOT_S)
+    assert (done.damaged, done.ticks) == (1, DAMAGED_TICK - 1 - round(1e3 * SNAPSHOT_S))
+    assert done.first_damage is not None
+    assert done.first_damage.frame == number_of(box.entries, place - 1) + 1
+    found = done.difference
+    assert found is not None
+    assert (found.tick, found.field) == (DAMAGED_TICK, "measurement.number")
+    assert found.frame == number_of(box.entries, place)
+
+
+def test_a_frame_that_is_missing_is_found_in_its_place(core: Core, box: BlackBoxFile) -> None:
+    place = place_of(box.entries, "read", DAMAGED_TICK)
+    found = again(core, [*box.entries[:place], *box.entries[place + 1 :]], SNAPSHOT_S).difference
+    assert found is not None
+    assert (found.tick, found.field) == (DAMAGED_TICK, "measurement.number")
+
+
+def test_another_frame_that_was_written_is_found(core: Core, box: BlackBoxFile) -> None:
+    place = place_of(box.entries, "wrote", DAMAGED_TICK)
+    found = again(core, changed(box.entries, place, []), SNAPSHOT_S).difference
+    assert found is not None
+    assert (found.tick, found.field, found.recorded) == (DAMAGED_TICK, "written", "nothing")
+    assert found.frame == number_of(box.entries, place - 1) + 1
+
+
+def test_a_memory_that_differs_is_found_where_no_tick_shows_it(core: Core, box: BlackBoxFile) -> None:
+    place = place_of(box.entries, "state", DAMAGED_TICK)
+    _, step, plan, connection = box.entries[place]
+    link = connection["link"]["DeviceLink"]
+    altered = {**connection, "link": {"DeviceLink": link | {"_least_delay_s": link["_least_delay_s"] + 1e-9}}}
+    entries = [*box.entries[:place], ["state", step, plan, altered], *box.entries[place + 1 :]]
+    found = again(core, entries, SNAPSHOT_S - 0.5).difference
+    assert found is not None
+    assert found.field == "state.connection.link._least_delay_s"
+
+
+def test_a_link_that_was_lost_and_came_back_is_run_again(fly: Any, core: Core, tmp_path: Path) -> None:
+    """The firmware hangs, the port is given back and opened again; a new conversation begins."""
+    flight = fly("frozen@2.9", until_s=3.4)
+    assert (flight.loop.connection.losses, flight.loop.measurement is None) == (1, False)
+    entries = read_black_box(flight.write(tmp_path / "frozen.mcap")).entries
+    assert [entry[1] is None for entry in entries if entry[0] == "connected"] == [True, False]
+    done = again(core, entries)
+    assert (done.difference, done.ticks) == (None, 3_400)
+    assert done.frames == number_of(entries, len(entries) - 1)
+
+
+def test_one_from_before_frames_were_kept_is_replayed_without(path: Path, tmp_path: Path) -> None:
+    """Format 1 had neither frames nor a conversation's memory."""
+    before = tmp_path / "before.mcap"
+    box = read_black_box(path)
+    entries = [entry[:3] if entry[0] == "state" else entry for entry in box.entries if not _passed(entry)]
+    write_black_box(before, box.header | {"format": "1"}, [Part(1.0, 1, True, msgspec.msgpack.encode(entries))])
+    box = read_black_box(before)
+    known = recorded(box, tmp_path)
+    done = rerun(rebuilt(known), known.columns, box.entries)
+    assert (done.difference, done.ticks, done.frames) == (None, 4_000, 0)
