@@ -96,21 +96,7 @@ def test_parts_have_the_ticks_in_their_order_and_a_state_every_second(rig: Rig) 
     assert names(parts[0])[-3:] == ["plan", "step", "tick"]
     assert [number for number, part in enumerate(parts) if part.has_state] == [0, 50, 100, 150]
     assert all(("state" in names(part)) == part.has_state for part in parts)
-    ticks = [names(part).count("tick") for part in parts]
-    assert sum(ticks) == 3_010
-
-
-def test_what_passes_between_daemon_and_device_is_kept_in_its_order(core: Core) -> None:
-    loop = closed_loop(core)
-    rig = Rig(core, loop.connection)
-    for _ in range(PART_TICKS):
-        loop.tick()
-        rig.tick()
-    _, part = rig.heard()
-    assert names(part)[:6] == ["state", "wrote", "step", "tick", "read", "wrote"]
-    state, (_, time_s, sent, unsent), *_ = msgspec.msgpack.decode(part.entries)
-    assert state[3]["stream"] == plain(FrameStream())
-    assert (time_s, sent, unsent) == (1e-3, [FrameStream().pack(Hello(SCHEMA_HASH, PROTOCOL_VERSION, 255))], 0)
+    assert sum(names(part).count("tick") for part in parts) == 3_010
 
 
 def test_what_passes_between_daemon_and_device_is_kept_in_its_order(core: Core) -> None:
