@@ -145,7 +145,8 @@ def generate(name: str, secret_in: Path, public_in: Path) -> tuple[Path, Path]:
                 secret_path.unlink()
                 raise
     except FileExistsError as error:
-        raise ConfigError(f"{error.filename2} exists: keys are never overwritten; take another name or DIR") from error
+        there = error.filename2 or error.filename  # a link's second path, or what stands where a folder is to be
+        raise ConfigError(f"{there} exists: keys are never overwritten; take another name or DIR") from error
     except OSError as error:
         raise ConfigError(f"{error.filename2 or error.filename}: {error.strerror}") from error
     return secret_path, public_path

@@ -330,6 +330,15 @@ def test_a_decision_is_explained_with_what_was_measured(tmp_path, capsys):
     assert "required_terms.py" in printed["error"]["hint"]
 
 
+@pytest.mark.parametrize(("link", "is_shown"), [("RUNNING", True), ("BACK_OFF", False), ("REFUSED", False)])
+def test_no_command_is_said_to_be_next_that_a_missing_device_would_refuse(status_with, link, is_shown):
+    report = status_with()["link"] | {"state": link, "cause": "there is no such port", "remedy": "plug the device in"}
+    known = status_with(next_commands=("home", "enable"), link=report)
+    shown = status_text(msgspec.convert(known, Status), Colour(sys.stdout))
+    assert ("next      home, enable" in shown) == is_shown
+    assert "next: plug the device in" in shown
+
+
 @pytest.fixture
 def states(status_with: Any) -> Any:
     """Makes answers to `status`, one (is_homed, is_busy) after the other, the last one for ever."""

@@ -31,6 +31,15 @@ def test_record_then_plot(fake_daemon, tmp_path, capsys):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_the_plot_of_a_cut_recording_says_so(fake_daemon, tmp_path, capsys):
+    file = tmp_path / "a.mcap"
+    assert main(["--endpoint", fake_daemon.control, "record", str(file), "--duration", "0.3"]) == 0
+    file.write_bytes(file.read_bytes()[:-40])
+    capsys.readouterr()
+    assert main(["plot", str(file), "-o", str(tmp_path / "a.png")]) == 0
+    assert "a.mcap was cut short" in capsys.readouterr().out
+
+
 def test_a_recording_says_what_it_is_of(fake_daemon, tmp_path):
     file = tmp_path / "a.mcap"
     assert main(["--endpoint", fake_daemon.control, "record", str(file), "--duration", "0.1"]) == 0

@@ -98,7 +98,7 @@ def test_a_second_daemon_is_refused_and_the_first_goes_on(rig):
     )
     assert ended.returncode == 1
     assert ended.stderr.splitlines()[-1].startswith("tormagd: endpoints.setpoint = 'ipc://")
-    assert ended.stderr.endswith(f": already running, pid {rig.daemon.pid}\n")
+    assert f": already running, pid {rig.daemon.pid}; end it, or name other" in ended.stderr
     rig.arm()
     rig.ask(0.7)
     rig.until(lambda: rig.telemetry().setpoint_cf == 0.7, "setpoints are heard")

@@ -143,6 +143,23 @@ def test_nobody_at_the_channel_and_no_channel_are_said(tmp_path: Path) -> None:
         assert str(path) in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("number", "said", "first"),
+    [(errno.ENODEV, "no such interface", "plug"), (errno.EAFNOSUPPORT, "knows no CAN", "sudo modprobe")],
+)
+def test_an_interface_that_is_not_there_says_how_it_comes(
+    monkeypatch: pytest.MonkeyPatch, number: int, said: str, first: str
+) -> None:
+    def absent(**_options: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(can, "Bus", absent)
+    with pytest.raises(BackendError, match=f"socketcan can7: cannot be opened: .*{said}") as caught:
+        opened(Device(backend="can", options={"interface": "socketcan"}, port="can7"))
+    assert caught.value.remedy.startswith(first)
+    assert "ip link set can7 up type can bitrate 1000000" in caught.value.remedy
+
+
 # -- behind an adapter on a serial line ----------------------------------------------------------------------------
 
 

@@ -31,4 +31,5 @@ def plot(source: Path, target: Path) -> Outcome:
         "limits": [band.name for band in bands(recording, "limits")],
         "faults": [band.name for band in bands(recording, "faults")],
     }
-    return Outcome(result, str(target))
+    cut = "" if recording.is_complete else f"; {source} was cut short: what was written before that is shown"
+    return Outcome(result, f"{target}{cut}")

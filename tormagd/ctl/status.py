@@ -42,7 +42,7 @@ def status_text(known: Status, colour: Colour) -> str:
     lines = [
         f"state     {paint(state)}, {', '.join(flags)}",
         *_codes(known.faults, known.fault_details, "fault", colour.red),
-        *([f"next      {', '.join(known.next_commands)}"] if known.next_commands else []),
+        *_next(known),
         *_codes(known.limits, known.limit_details, "held by", colour.yellow),
         f"force     asked {_number(known.setpoint_cf, 'N')}, governed {_number(known.governed_cf, 'N')}, "
         f"measured {_number(known.measured_cf, 'N')}",
@@ -69,6 +69,12 @@ def status_text(known: Status, colour: Colour) -> str:
     if known.setpoints.last_refusal:
         lines.append(f"refused   {colour.yellow(known.setpoints.last_refusal)}")
     return "\n".join(lines)
+
+
+def _next(known: Status) -> list[str]:
+    """The commands that lead to ENABLED. Without a device none of them is taken: then the link says what comes first."""
+    has_way = known.next_commands and known.link.state == "RUNNING"
+    return [f"next      {', '.join(known.next_commands)}"] if has_way else []
 
 
 def _peers(peers: PeersReport, colour: Colour) -> list[str]:

@@ -88,7 +88,9 @@ def _lock(path: Path, descriptor: int) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        raise OSError(f"already running, pid {content or 'not known'}") from error
+        raise OSError(
+            f"already running, pid {content or 'not known'}; end it, or name other addresses in [endpoints]"
+        ) from error
 
 
 def _listening(path: Path) -> socket.socket:

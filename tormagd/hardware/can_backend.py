@@ -33,6 +33,11 @@ MOST_LOAD = 0.7
 """What is left is for Status, commands and the bus's other nodes."""
 BUS_OFF = 0x40
 """Error class in the identifier of an error frame: linux/can/error.h, CAN_ERR_BUSOFF."""
+ABSENT = {
+    errno.ENODEV: ("there is no such interface", "plug the adapter in"),
+    errno.EAFNOSUPPORT: ("the kernel knows no CAN", "sudo modprobe can_raw"),
+}
+"""Why the kernel opens no `socketcan` interface, and what comes before bringing it up."""
 
 
 class CanOptions(Strict, frozen=True):
@@ -159,8 +164,7 @@ class CanBackend:
     def _gone(self, what: str, error: can.CanError | OSError) -> BackendError:
         number = _errno(error)
         if number == errno.ENETDOWN:
-            up = f"sudo ip link set {self._port} up type can bitrate {self._options.bitrate} restart-ms 100"
-            return BackendError(f"{self._name}: the interface is down", remedy=up)
+            return BackendError(f"{self._name}: the interface is down", remedy=_bring_up(self._port, self._options))
         return BackendError(f"{self._name}: {what}: {os.strerror(number) if number else error}")
 
 
@@ -207,8 +211,11 @@ def open_can(device: Device, options: CanOptions) -> CanBackend:
         if held is not None:
             os.close(held)
         number = _errno(error)
-        reason = os.strerror(number) if number else str(error)
-        raise BackendError(f"{name}: cannot be opened: {reason}") from error
+        reason, remedy = os.strerror(number) if number else str(error), ""
+        if options.interface == "socketcan" and number in ABSENT:
+            reason, first = ABSENT[number]
+            remedy = f"{first}, then {_bring_up(device.port, options)}"
+        raise BackendError(f"{name}: cannot be opened: {reason}", remedy) from error
     return CanBackend(device.port, options, bus, held)
 
 
@@ -226,6 +233,10 @@ def _of_the_interface(options: CanOptions) -> dict[str, Any]:
         case "udp_multicast":  # stays on this machine
             return {"hop_limit": 0, "fd": False}
     return {}
+
+
+def _bring_up(port: str, options: CanOptions) -> str:
+    return f"sudo ip link set {port} up type can bitrate {options.bitrate} restart-ms 100"
 
 
 def _hold(path: str) -> int:
