@@ -432,6 +432,13 @@ def test_status_text_shows_what_is_not_known_as_such(status_with):
     assert "late by" not in "\n".join(lines)
 
 
+@pytest.mark.parametrize("folder", ["", "/var/lib/tormag/profiles"])
+def test_status_text_says_why_a_profile_is_not_used_where_one_was_to_be(status_with, folder):
+    profile = {"is_used": False, "age_s": None, "refusal": "it is of another serial", "folder": folder}
+    shown = status_text(msgspec.convert(status_with(profile=profile), Status), Colour(sys.stdout))
+    assert ("it is of another serial\n          next: tormagctl calibrate --device" in shown) == bool(folder)
+
+
 def test_status_text_says_what_to_do_next(status_with):
     known = msgspec.convert(status_with(next_commands=("clear-fault", "home", "enable")), Status)
     assert "next      clear-fault, home, enable" in status_text(known, Colour(sys.stderr)).splitlines()

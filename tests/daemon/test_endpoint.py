@@ -560,7 +560,7 @@ def test_an_address_that_cannot_be_bound_is_named(tmp_path: Path) -> None:
 
 def test_a_second_daemon_takes_nothing_from_the_first_and_names_it(rig: Rig, tmp_path: Path) -> None:
     for _ in range(2):
-        with pytest.raises(OSError, match=f"^endpoints.setpoint = .*: already running, pid {os.getpid()}; end it, or name other addresses"):
+        with pytest.raises(OSError, match=f"^endpoints.setpoint = .*: already running, pid {os.getpid()}; end it, or "):
             Endpoint(Endpoints(**rig.addresses))
     client = rig.connect(zmq.DEALER, "control")
     client.send(encode(Request(v=VERSION, id=1, command="status")))

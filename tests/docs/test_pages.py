@@ -53,7 +53,7 @@ def spans(text):
 def commands(lines):
     """What of it is ours to check, as lists of words."""
     for line in lines:
-        for part in re.split(r" && | \| |; ", line.split(" #")[0].split(" < ")[0].strip()):
+        for part in re.split(r" && | \| |; ", line.split(" #")[0].split(" < ")[0].strip().removesuffix(" &")):
             found = COMMAND.fullmatch(part)
             if found and "..." not in part:
                 yield shlex.split(found[1])
@@ -122,8 +122,8 @@ def test_every_command_in_a_line_has_the_options_that_are_named(page):
             assert arguments[0] in subparsers.choices, words
 
 
-@pytest.mark.parametrize("page", sorted((ROOT / "docs/guides").glob("*.md")), ids=name_of)
-def test_every_table_of_a_configuration_in_a_guide_is_taken(page):
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted((ROOT / "docs/guides").glob("*.md"))], ids=name_of)
+def test_every_table_of_a_configuration_that_is_shown_is_taken(page):
     for _, language, body in FENCE.findall(page.read_text(encoding="utf-8")):
         if language == "toml":
             checked(toml_tables(body), Config)

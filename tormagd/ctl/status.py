@@ -52,7 +52,7 @@ def status_text(known: Status, colour: Colour) -> str:
         *(line for name, source in known.setpoints.by_source.items() for line in _source(name, source, colour)),
         *_way(known.way, colour),
         *_peers(known.peers, colour),
-        _device(known),
+        *_device(known, colour),
         f"link      {known.link.state}, {_counts(known.link, LINK_COUNTS)}",
         *_explained(known.link.cause, known.link.remedy, colour.yellow),
         *(_rate(name, group, colour) for name, group in known.rates.items()),
@@ -72,7 +72,7 @@ def status_text(known: Status, colour: Colour) -> str:
 
 
 def _next(known: Status) -> list[str]:
-    """The commands that lead to ENABLED. Without a device none of them is taken: then the link says what comes first."""
+    """The commands that lead to ENABLED. Without a device none of them is taken: the link says what comes first."""
     has_way = known.next_commands and known.link.state == "RUNNING"
     return [f"next      {', '.join(known.next_commands)}"] if has_way else []
 
@@ -91,14 +91,17 @@ def _peer(peer: PeerReport) -> str:
     return f"{peer.endpoint}: {peer.address}{f', key {peer.key}' if peer.key else ''}: {peer.reason} ({peer.count})"
 
 
-def _device(known: Status) -> str:
-    """What the device has shown of itself, and since when it is known."""
+def _device(known: Status, colour: Colour) -> list[str]:
+    """What the device has shown of itself, since when it is known, and why what was kept of it is not used."""
     shown, kept = known.device, known.profile
     age = "" if kept.age_s is None else f", kept {kept.age_s / 3600.0:.1f} h ago"
-    return (
+    lines = [
         f"device    {shown.scale:.2f} ± {shown.scale_sd:.2f} times the model {shown.offset_N:+.3f} N, sensor's zero "
         f"{shown.sensor_zero_N:+.3f} ± {shown.sensor_zero_sd_N:.3f} N{age}"
-    )
+    ]
+    if kept.folder and kept.refusal:  # without a folder nothing was to be kept
+        lines += _explained(kept.refusal, "tormagctl calibrate --device, which keeps a new profile", colour.yellow)
+    return lines
 
 
 def _core(build: str, colour: Colour) -> list[str]:
