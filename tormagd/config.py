@@ -384,7 +384,7 @@ def convert(path: Path, kind: type[T]) -> T:
         text = toml_text(path)
         try:
             return checked(toml_tables(text), kind)
-        except ConfigError as error:
+        except (TomlError, ConfigError) as error:
             raise ConfigError(f"{error}{_line(text, str(error))}") from error
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error

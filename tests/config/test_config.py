@@ -68,6 +68,7 @@ def test_a_mark_of_the_byte_order_is_passed_over(tmp_path: Path) -> None:
         ("[rates]\ncontrol_hz = 1000\ninference_hz = 2000\n", 3, None),
         ('[endpoints.curve]\nserver_secrets = ""\n', 2, "server_secret"),
         ("limits = { skew_fault_mm = 90.0 }\n", 1, None),
+        ("[trim]\nmost = 1.2\nleast = nan\n", 3, None),
     ],
 )
 def test_a_refusal_names_the_line_and_the_key_that_may_have_been_meant(write, text: str, line: int, meant: str) -> None:
@@ -83,6 +84,7 @@ def test_a_refusal_names_the_line_and_the_key_that_may_have_been_meant(write, te
         ('\nscene = "pulsee"\n', 2, "pulse"),
         ('[device]\nbackend = "cann"\n', 2, "can"),
         ("[device.options]\nbuad = 9600\n", 2, "baud"),
+        ('[device]\nbackend = "can"\noptions.interface = "sockcan"\n', 3, "socketcan"),
     ],
 )
 def test_so_does_a_refusal_that_takes_more_than_the_file(write, capsys, text: str, line: int, meant: str) -> None:

@@ -19,7 +19,7 @@ from can.interfaces.slcan import slcanBus
 from msgspec import Meta
 
 from firmware_protocol.codec import Message
-from tormagd.config import ConfigError, Device, Rates, Strict
+from tormagd.config import ConfigError, Device, Rates, Strict, did_you_mean
 from tormagd.hardware.backend import PLUGIN_ERRORS, BackendError, Driver, LinkStatistics
 from tormagd.hardware.can_stream import CanStream, SecondHostError
 
@@ -172,7 +172,10 @@ def check_can(device: Device, options: CanOptions, rates: Rates) -> None:
     """Raises ConfigError for an interface that is not installed or cannot be waited for, and for too slow a bus."""
     interface = options.interface
     if interface not in BACKENDS:
-        raise ConfigError(f"device.options.interface = {interface!r}: installed are {', '.join(sorted(BACKENDS))}")
+        raise ConfigError(
+            f"device.options.interface = {interface!r}: installed are {', '.join(sorted(BACKENDS))}"
+            f"{did_you_mean(interface, BACKENDS)}"
+        )
     module, name = BACKENDS[interface]
     try:
         bus = getattr(importlib.import_module(module), name)
