@@ -1,7 +1,10 @@
+import re
 import shlex
 
 import new_user
 import pytest
+from first_use.mistakes import ALONE, BESIDE, Mistake, judged, put
+from first_use.terminal import Terminal
 
 from tormagd.config import Config, checked
 from tormagd.ctl import main as ctl
@@ -11,20 +14,20 @@ from tormagd.toml_file import toml_tables
 COMMANDS = {"tormagctl": ctl.main, "tormagd": daemon.main}
 
 
-@pytest.mark.parametrize("mistake", new_user.ALONE, ids=lambda mistake: mistake.name.replace(" ", "_"))
+@pytest.mark.parametrize("mistake", ALONE, ids=lambda mistake: mistake.name.replace(" ", "_"))
 def test_a_mistake_that_needs_no_daemon_is_answered_in_a_sentence(mistake, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    new_user.put(mistake.files, tmp_path)
+    put(mistake.files, tmp_path)
     name, *arguments = shlex.split(mistake.command)
     try:
         code = COMMANDS[name](arguments)
     except SystemExit as ended:
         code = ended.code
-    assert new_user.judged(mistake, code, "".join(capsys.readouterr())).wrong == ""
+    assert judged(mistake, code, "".join(capsys.readouterr())).wrong == ""
 
 
 def test_the_twenty_mistakes_are_twenty():
-    assert len({mistake.name for mistake in new_user.ALONE + new_user.BESIDE}) == 20
+    assert len({mistake.name for mistake in ALONE + BESIDE}) == 20
 
 
 @pytest.mark.parametrize(
@@ -39,7 +42,7 @@ def test_the_twenty_mistakes_are_twenty():
     ],
 )
 def test_an_answer_is_judged_by_code_words_and_length(code, printed, wrong):
-    assert new_user.judged(new_user.Mistake("m", "c", 2, "no such thing"), code, printed).wrong == wrong
+    assert judged(Mistake("m", "c", 2, "no such thing"), code, printed).wrong == wrong
 
 
 def test_the_readme_has_a_configuration_and_lines_for_three_terminals(tmp_path):
@@ -53,9 +56,9 @@ def test_the_readme_has_a_configuration_and_lines_for_three_terminals(tmp_path):
 
 
 def test_a_terminal_tells_code_and_words_and_ctrl_c_ends_what_goes_on(tmp_path):
-    with new_user.Terminal(tmp_path, {"PATH": "/usr/bin:/bin"}) as terminal:
+    with Terminal(tmp_path, {"PATH": "/usr/bin:/bin"}) as terminal:
         assert terminal.run("echo one; false") == (1, "one\n")
-        said = terminal.start("(trap 'echo bye; exit 0' INT; echo ready; sleep 60)", new_user.re.compile("^rea.*$"))
+        said = terminal.start("(trap 'echo bye; exit 0' INT; echo ready; sleep 60)", re.compile("^rea.*$"))
         assert said == "ready"
         code, said = terminal.end()
         assert (code, said.split()) == (0, ["bye"])
