@@ -288,6 +288,7 @@ CLEAR_FIRST: Final = "tormagctl clear-fault"
 
 _OPENS = "the device is asked to open the gap"
 _CLEARED = "faults are cleared; nothing moves"
+_UNLATCHED = "no fault is latched here, and the device's own is cleared; nothing moves"
 ROWS: tuple[Transition | Refusal, ...] = (
     Transition(Event.ENABLE, DISABLED, ENABLED, "the force follows the setpoint from here", READY),
     Refusal(Event.ENABLE, ENABLED, "already_enabled", NOTHING_TO_DO),
@@ -318,8 +319,9 @@ ROWS: tuple[Transition | Refusal, ...] = (
     Refusal(Event.HOME, FAULTED, "fault", CLEAR_FIRST),
     # stop is never refused, and needs no device: whatever comes back finds a fault that somebody has to clear
     *[Transition(Event.STOP, source, FAULTED, _OPENS, (), RETRACT) for source in OperatingState],
-    Transition(Event.CLEAR_FAULT, DISABLED, DISABLED, _CLEARED, (CONNECTED, NOT_BUSY), DeviceRequest.CLEAR),
-    # nothing is latched here; what the device latches meanwhile is news, and must not be passed over
+    # nothing of ours is latched here; a device may hold what it latched while nobody was there to see it
+    Transition(Event.CLEAR_FAULT, DISABLED, DISABLED, _UNLATCHED, (CONNECTED, NOT_BUSY), DeviceRequest.CLEAR),
+    # what the device latches meanwhile is news, and must not be passed over
     Transition(Event.CLEAR_FAULT, ENABLED, ENABLED, "there is nothing to clear", (CONNECTED, NOT_BUSY)),
     Transition(Event.CLEAR_FAULT, PAUSED, PAUSED, "there is nothing to clear", (CONNECTED, NOT_BUSY)),
     Transition(Event.CLEAR_FAULT, FAULTED, DISABLED, _CLEARED, (CONNECTED, NOT_BUSY), DeviceRequest.CLEAR),
