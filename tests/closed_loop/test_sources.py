@@ -255,4 +255,5 @@ def test_the_whole_way_is_measured_part_by_part(armed: ClosedLoop) -> None:
     assert found.total_ms == pytest.approx(
         (found.to_duty_us.p99 + 400.0) * 1e-3 + max(found.carriages_ms, 0.0), abs=0.02
     )
+    assert found.total_ms is not None
     assert (found.total_ms < 400.0, found.budget_ms) == (True, 400.0)

@@ -53,7 +53,8 @@ class Followed(NamedTuple):
     def rms_N(self, start_s: float, end_s: float) -> tuple[float, float]:
         """Of the slope and of the mixture, in a part of the time."""
         inside = (self.time_s >= start_s) & (self.time_s < end_s)
-        return tuple(float(np.sqrt(np.mean(error[inside] ** 2))) for error in (self.slope_N, self.mixture_N))
+        slope_N, mixture_N = (float(np.sqrt(np.mean(each[inside] ** 2))) for each in (self.slope_N, self.mixture_N))
+        return slope_N, mixture_N
 
 
 def after(state: Periodicity, stamp_s: float, force_N: float, slope_N_s: float) -> Periodicity:

@@ -53,7 +53,7 @@ def record(plant="sample_1", hand=None, rates_N_s=(0.8, 1.0, 0.8), most_N=2.0):
         rows = []
         for sample in loop.run(
             waveform.duration_s,
-            lambda now_s, w=waveform, s=start_s: TimedSetpoint(w.at(now_s - s).force_N, now_s, 0.25),
+            lambda now_s, w=waveform, s=start_s: TimedSetpoint(w.at(now_s - s).force_N, now_s, 0.25),  # type: ignore[misc]
         ):
             seen = sample.state.estimate
             assert seen is not None
@@ -160,7 +160,7 @@ def test_a_force_that_has_little_to_do_with_the_field_is_refused_with_figures(ta
     code, text = refusal(loose)
     assert code == "poor_fit"
     r2, mae_mN, allowed_mN = (
-        float(re.search(pattern, text)[1])
+        float(re.findall(pattern, text)[0])
         for pattern in (r"R2 is (-?[\d.]+)", r"mean error ([\d.]+) mN", r"allowed: ([\d.]+) mN")
     )
     assert r2 < 0.97

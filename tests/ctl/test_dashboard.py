@@ -36,8 +36,8 @@ from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 START_NS = 1_790_000_000_000_000_000
 PORTRAIT = {"force_N": [0.5, 1.0, 3.0], "rate_N_s": [1.0, 2.0, 8.0]}
 SECONDS = 30.0
-COLUMNS = ("t_ns", "setpoint_cf", "governed_cf", "measured_cf", "left_mm", "right_mm", "reference_gap_mm", "field_mT")
-COLUMNS += ("operating_state", "limits", "faults", "lateness_us")
+COLUMNS: tuple[str, ...] = ("t_ns", "setpoint_cf", "governed_cf", "measured_cf", "left_mm", "right_mm")
+COLUMNS += ("reference_gap_mm", "field_mT", "operating_state", "limits", "faults", "lateness_us")
 Browser = TestClient[Any, Any]
 
 
@@ -125,8 +125,8 @@ def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
 
 
 def test_ten_browsers_are_one_subscriber(run_dir: Path, status_with, telemetry_with) -> None:
-    described = {"version": "0", "build": "", "configuration": {}, "scene": {}, "model": "", "firmware": None}
-    described |= {"profile": {"is_used": False, "age_s": None, "refusal": ""}, "serial_number": None}
+    described: dict[str, Any] = {"version": "0", "build": "", "configuration": {}, "scene": {}, "model": ""}
+    described |= {"firmware": None, "profile": {"is_used": False, "age_s": None, "refusal": ""}, "serial_number": None}
 
     async def look() -> None:
         context = zmq.Context()

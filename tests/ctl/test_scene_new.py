@@ -3,11 +3,11 @@
 import io
 import json
 import math
+import sys
 from pathlib import Path
 
 import pytest
 
-from tormagd.ctl import scene_new
 from tormagd.ctl.main import main
 from tormagd.scenes.scene import load_scene
 
@@ -80,7 +80,7 @@ class Terminal(io.StringIO):
 
 def test_without_a_recording_it_asks_and_enter_takes_what_is_proposed(tmp_path, capsys, monkeypatch):
     answers = "A vein is held open.\n\n1.5\nmuch\n0.06\n" + "\n" * 6
-    monkeypatch.setattr(scene_new.sys, "stdin", Terminal(answers))
+    monkeypatch.setattr(sys, "stdin", Terminal(answers))
     code, printed = new(capsys, str(tmp_path / "vein.toml"))
     assert code == 0
     scene = load_scene(printed["result"]["file"])
@@ -90,7 +90,7 @@ def test_without_a_recording_it_asks_and_enter_takes_what_is_proposed(tmp_path, 
 
 def test_where_nobody_can_be_asked_it_says_so(tmp_path, capsys, monkeypatch):
     for stdin, words in ((io.StringIO(), "nobody to ask"), (Terminal("one\n"), "the answers ended")):
-        monkeypatch.setattr(scene_new.sys, "stdin", stdin)
+        monkeypatch.setattr(sys, "stdin", stdin)
         code, printed = new(capsys, str(tmp_path / "mine.toml"))
         assert code == 2
         assert words in printed["error"]["message"]

@@ -165,7 +165,8 @@ def test_byte_order_mark_windows_lines_and_blank_lines_are_read(tmp_path):
     st.floats(-0.5, 1.5),
 )
 def test_between_rows_the_force_is_on_the_straight_line(tmp_path_factory, steps, share):
-    times, forces = [], []
+    times: list[float] = []
+    forces: list[float] = []
     for spacing, force in steps:
         times.append((times[-1] if times else 0.0) + spacing)
         forces.append(force)

@@ -5,6 +5,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -145,7 +146,7 @@ def test_an_operator_commands_and_an_observer_only_looks(rig: Rig) -> None:
         client = rig.peer(zmq.DEALER, "control", rig.pair(name))
         for command in commands:
             client.send(request(command))
-            rig.until(lambda client=client: client.poll(0))
+            rig.until(partial(client.poll, 0))
             reply = decode(client.recv_multipart()[-1], Reply)
             replies[name, command] = reply.error.code if reply.error else "ok"
     assert replies == {

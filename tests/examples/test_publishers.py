@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import msgpack
 import pytest
@@ -62,7 +63,9 @@ def played(publisher, tmp_path, refusals):
     """What it asked, what it published, and how it ended, where `enable` is answered with the refusals, one by one."""
     profile = tmp_path / "profile.csv"
     profile.write_text("t_s,force_N\n" + "".join(f"{t},{force}\n" for t, force in ROWS))
-    asked, heard, left = [], [], list(refusals)
+    asked: list[Any] = []
+    heard: list[Any] = []
+    left = list(refusals)
     context = zmq.Context()
     with tempfile.TemporaryDirectory() as folder:  # a short path, as sockets need
         control, setpoints = context.socket(zmq.ROUTER), context.socket(zmq.SUB)

@@ -18,7 +18,7 @@ import tty
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import can
 import numpy as np
@@ -194,7 +194,7 @@ CASES = {
 class FarEnd(ABC):
     """The device with its end of one transport, and what the daemon opens to come to it."""
 
-    device: VirtualDevice | CanDevice
+    device: Any  # VirtualDevice or CanDevice, by what the transport carries
     configured: Device
 
     @abstractmethod

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from typing import Any
 
 import pytest
 import uvloop
@@ -37,7 +38,8 @@ def test_what_the_kernel_refuses_is_said() -> None:
 
 def test_the_calls_are_those_of_the_closed_loop_and_can_be_made_again() -> None:
     core = build_core(Config())
-    steps, plans = core_cost.calls(Config(), core, 0.05)
+    made: Any = core_cost.calls(Config(), core, 0.05)
+    steps, plans = made
     assert (len(steps), len(plans)) == (50, 50)
     numbers = [plan().plan.number for plan in plans]
     assert numbers == list(range(numbers[0], numbers[0] + 50))

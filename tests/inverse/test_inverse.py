@@ -30,7 +30,10 @@ def linear(epsilon_N: float = 0.0) -> LinearFieldSearch:
     return LinearFieldSearch(field_range_mT=RANGE_MT, epsilon_N=epsilon_N)
 
 
-EXTREME_SOLVERS = (*(nearest(step_mT=10.0, dtype=dtype) for dtype in DTYPES), RisingSearch(RANGE_MT))
+EXTREME_SOLVERS: tuple[FieldSolver, ...] = (
+    *(nearest(step_mT=10.0, dtype=dtype) for dtype in DTYPES),
+    RisingSearch(RANGE_MT),
+)
 SOLVERS: tuple[Callable[[], FieldSolver], ...] = (nearest, linear)
 
 

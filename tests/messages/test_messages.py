@@ -134,7 +134,7 @@ def test_the_longest_preview_fits_the_size_limit() -> None:
 
 @pytest.mark.parametrize("kind", [Setpoint, Request])
 def test_unknown_fields_are_ignored(kind: type[Any]) -> None:
-    base = {Setpoint: SETPOINT, Request: REQUEST}[kind]
+    base = SETPOINT if kind is Setpoint else REQUEST
     newer = changed(base, colour="blue", nested={"v": 2, "list": [1, None]})
     assert decode(newer, kind) == decode(changed(base), kind)
 
@@ -201,7 +201,7 @@ def test_values_out_of_range_are_named(fields: dict[str, Any], name: str) -> Non
     ],
 )
 def test_a_refusal_is_short_whatever_was_sent(fields: dict[str, Any], kind: type[Any]) -> None:
-    base = {Setpoint: SETPOINT, Request: REQUEST}[kind]
+    base = SETPOINT if kind is Setpoint else REQUEST
     assert len(refusal(changed(base, **fields), kind)) < LONGEST_SHOWN + 60
 
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from safetensors import safe_open
 
 from tormagd.model import model_file
-from tormagd.model.features import FEATURES, LARGEST, UNITS, Element
+from tormagd.model.features import FEATURES, LARGEST, UNITS, Element, Scaling
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelFileError, ModelMetadata, load_model, save_model
 from tormagd.model.rising import not_rising_share
@@ -329,7 +329,7 @@ def test_not_rising_counts_where_the_force_falls_with_the_field(metadata: ModelM
 def _steep() -> ForceModel:
     rng = np.random.default_rng(4)
     ranges = dict.fromkeys(UNITS, (0.0, 1e-3))
-    scaling = model_file.Scaling((0.0,) * 4, (2e3,) * 4, 0.0, 2e3)
+    scaling = Scaling((0.0,) * 4, (2e3,) * 4, 0.0, 2e3)
     metadata = ModelMetadata(
         element=Element.TACTILE,
         insert="pad",

@@ -5,6 +5,7 @@ import math
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numerics
 import numpy as np
@@ -114,7 +115,7 @@ def test_no_load_in_the_domain_gives_anything_but_a_number(
 ) -> None:
     elastomer, geometry = built(device)
     most = max_radial_moment_Tm(elastomer, geometry)
-    moment = np.array([min(share, 0.999) * most], dtype=dtype)
+    moment: Any = np.array([min(share, 0.999) * most], dtype=dtype)
     force = brake_force_N(moment, elastomer, geometry)
     assert force.dtype == dtype
     assert np.isfinite(force).all()

@@ -1,6 +1,7 @@
 """Uniaxial laws: initial slopes, digits near no strain, refusals."""
 
 import math
+from typing import Any
 
 import mpmath as mp
 import numpy as np
@@ -24,7 +25,7 @@ def test_every_law_starts_with_three_times_its_shear_modulus(law: NeoHookean | O
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_stress_rises_and_keeps_type_and_shape(law: NeoHookean | Ogden | ThesisOgden, dtype: type) -> None:
-    stretch = np.linspace(0.1, 10.0, 60, dtype=dtype).reshape(6, 10)
+    stretch: Any = np.linspace(0.1, 10.0, 60, dtype=dtype).reshape(6, 10)
     stress = law.stress_Pa(stretch)
     assert stress.dtype == dtype
     assert stress.shape == stretch.shape

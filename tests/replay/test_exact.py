@@ -38,7 +38,7 @@ THINGS = st.recursive(
 
 
 def through_msgpack(thing: object) -> Any:
-    return restored(msgspec.msgpack.decode(packed(plain(thing))), KNOWN | kinds(Switches))
+    return restored(msgspec.msgpack.decode(packed(plain(thing))), {**KNOWN, **kinds(Switches)})
 
 
 def test_what_a_pad_remembers_comes_back() -> None:

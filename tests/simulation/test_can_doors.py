@@ -12,6 +12,7 @@ from pathlib import Path
 
 import can
 import pytest
+from can.interfaces.slcan import slcanBus
 
 from firmware_protocol.codec import (
     FUNCTION,
@@ -131,6 +132,7 @@ def test_pythons_own_slcan_finds_an_adapter(start: Start) -> None:
     path = channel(process)
     assert Path(path).is_char_device()
     with can.Bus(interface="slcan", channel=path, bitrate=1_000_000, sleep_after_open=0.0, ignore_config=True) as bus:
+        assert isinstance(bus, slcanBus)
         assert bus.get_version(LIMIT_S) == (10, 13)
         assert bus.get_serial_number(LIMIT_S) == "SIM1"
         meet(bus)

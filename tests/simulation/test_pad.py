@@ -7,13 +7,13 @@ from tormagd.physics.errors import DomainError
 from tormagd.simulation.pad import (
     FIELDS_MT,
     PADS,
-    TactilePad,
     cyclic_records,
     cycling_program,
     drawn_pad,
     holding_records,
     worked_pad,
 )
+from tormagd.simulation.tactile_pad import TactilePad
 
 AREA_M2 = np.pi / 4 * 0.030**2
 

@@ -36,7 +36,8 @@ def test_a_held_pad_relaxes_and_a_warm_one_is_softer() -> None:
     assert force_N("pad_1", 70.0, 2.0, seconds=3.0) < 0.98 * force_N("pad_1", 70.0, 2.0)
     plant = load_plant("pad_1")
     hot = msgspec.structs.replace(plant, thermal=msgspec.structs.replace(plant.thermal, drift_K_h=20.0))
-    cold_N, hot_N = [], []
+    cold_N: list[float] = []
+    hot_N: list[float] = []
     for made, forces in ((plant, cold_N), (hot, hot_N)):
         element = PressedPad(made, 70.0, STEP_S)
         element.advance(3600.0, 70.0, 2.0, 0.0)

@@ -8,10 +8,11 @@ import sys
 import time
 from pathlib import Path
 
-import bare_timer
 import pytest
 from machines import host
-from machines.host import Stall
+from machines.host import PERIOD_NS, Stall
+
+from tormagd.headroom.bare_timer import beat
 
 
 def test_a_stall_costs_the_beats_that_were_due_in_it():
@@ -64,7 +65,7 @@ def test_a_timer_that_is_held_up_says_for_how_long():
             if len(seen) == 6:
                 ended.set()
 
-        await bare_timer.beat(bare_timer.PERIOD_NS, on_beat, ended)
+        await beat(PERIOD_NS, on_beat, ended)
         return seen
 
     assert asyncio.run(beats())[3] >= 20

@@ -6,6 +6,7 @@ import identify_motor
 import numpy as np
 import pytest
 from motor import fit, identification, samples
+from motor.log import LogError, read_log
 
 from tormagd.config import Config, load_config
 from tormagd.ctl.calibrate_motors import motor_log
@@ -30,7 +31,7 @@ def write_log(path, noise_V=0.05, seed=0):
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_known_parameters_are_found(tmp_path, seed):
     write_log(tmp_path / "log.csv", seed=seed)
-    result = identify_motor.identify(identify_motor.read_log(tmp_path / "log.csv"), GAIN)
+    result = identification.identify(read_log(tmp_path / "log.csv"), GAIN)
     truth = {"mass_kg": MASS, "viscous_N_s_m": VISCOUS, "coulomb_N": COULOMB, "offset_N": OFFSET, "delay_s": DELAY_S}
     for name, value in truth.items():
         found = result["parameters"][name]
@@ -42,7 +43,7 @@ def test_known_parameters_are_found(tmp_path, seed):
 
 def test_without_a_gain_only_ratios(tmp_path):
     write_log(tmp_path / "log.csv")
-    result = identify_motor.identify(identify_motor.read_log(tmp_path / "log.csv"), None)
+    result = identification.identify(read_log(tmp_path / "log.csv"), None)
     assert result["parameters"]["mass_kg"] is None
     assert result["ratios_to_gain"]["mass_V_s2_m"]["value"] == pytest.approx(MASS / GAIN, rel=0.03)
 
@@ -79,7 +80,7 @@ def test_true_values_of_a_simulated_sample_are_inside_their_intervals(sample_log
 
 
 def test_the_identified_motor_is_a_configuration(sample_log, tmp_path):
-    result = identify_motor.identify(sample_log, None)
+    result = identification.identify(sample_log, None)
     assert result["parameters"]["backlash_um"] is None
     path = tmp_path / "motor.toml"
     identify_motor.write_config(path, result, Config())
@@ -89,9 +90,9 @@ def test_the_identified_motor_is_a_configuration(sample_log, tmp_path):
     assert written.inertia_kg_m2 == pytest.approx(true.motor.inertia_kg_m2, rel=0.05)
     assert written.gear_efficiency == pytest.approx(true.gear.efficiency, abs=0.05)
     assert written.supply_V == Config().motor.supply_V
-    with pytest.raises(identify_motor.LogError, match="exists"):
+    with pytest.raises(LogError, match="exists"):
         identify_motor.write_config(path, result, Config())
-    with pytest.raises(identify_motor.LogError, match="current_A"):
+    with pytest.raises(LogError, match="current_A"):
         identify_motor.write_config(tmp_path / "b.toml", result | {"motor": None}, Config())
 
 

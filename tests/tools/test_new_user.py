@@ -22,7 +22,7 @@ def test_a_mistake_that_needs_no_daemon_is_answered_in_a_sentence(mistake, tmp_p
     try:
         code = COMMANDS[name](arguments)
     except SystemExit as ended:
-        code = ended.code
+        code = int(str(ended.code))
     assert judged(mistake, code, "".join(capsys.readouterr())).wrong == ""
 
 

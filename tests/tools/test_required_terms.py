@@ -11,10 +11,10 @@ import required_terms
 from distributed import Client, LocalCluster
 from rendering import scene_runs
 from rendering.scene_runs import Case, key, run, run_all
-from required_terms import JUDGED, NO_COST, RATES_HZ, SHARE, is_good, measure
+from required_terms import NO_COST, RATES_HZ, SHARE, is_good, measure
 
 from tormagd.config import ConfigError
-from tormagd.scenes.measured import Cost, Judged, MeasuredScene, Without, is_met, measured, on_first, required
+from tormagd.scenes.measured import JUDGED, Cost, Judged, MeasuredScene, Without, is_met, measured, on_first, required
 from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_scene, shipped_scenes, terms_of
 
 STORED = measured()

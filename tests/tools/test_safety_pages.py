@@ -31,10 +31,10 @@ def test_the_page_of_states_has_every_code_and_every_event() -> None:
     for code, row in (*FAULTS.items(), *LIMITS.items()):
         assert f"| `{code}` | {row.cause} | {row.reaction} |" in page
     assert [code for code in (*Fault, *Limit) if f"`{code}`" not in page] == []
-    for row in ROWS:
-        if not isinstance(row, Refusal):
-            assert row.reason in page
-            assert f"    {row.source} --> {row.target}: " in page
+    for transition in ROWS:
+        if not isinstance(transition, Refusal):
+            assert transition.reason in page
+            assert f"    {transition.source} --> {transition.target}: " in page
 
 
 def test_the_evidence_is_of_the_matrix_that_there_is() -> None:
