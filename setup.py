@@ -5,12 +5,13 @@ to the bit and a fifth of the speed; `firmware_protocol/build.py` says which. TO
 not to compile, TORMAG_COMPILE=skip does not try.
 """
 
-import hashlib
 import json
 import os
 import shutil
 import sys
 import sysconfig
+import zlib
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 from setuptools import Extension, setup
@@ -119,9 +120,9 @@ class BuildCore(build_ext):
         return extensions
 
     def _record(self, lacking: str) -> None:
-        known = {"python": sysconfig.get_config_var("EXT_SUFFIX"), "interpreted": lacking, "sources": {}}
+        known = {"python": EXTENSION_SUFFIXES[0], "interpreted": lacking, "sources": {}}
         if not lacking:
-            known["sources"] = {source: hashlib.sha256(Path(source).read_bytes()).hexdigest() for source in SOURCES}
+            known["sources"] = {source: zlib.crc32(Path(source).read_bytes()) for source in SOURCES}
         places = [RECORD] if self.inplace or self.editable_mode else []
         if not self.editable_mode:
             places.append(Path(self.build_lib, RECORD))

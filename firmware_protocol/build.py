@@ -6,14 +6,13 @@ that was compiled makes all of the core interpreted, with a warning, because com
 TORMAG_COMPILED=0 does the same for one process. `tormagd --version`, `status` and `doctor` say which build runs.
 """
 
-import hashlib
 import importlib.machinery
 import importlib.util
 import json
 import os
 import sys
-import sysconfig
 import warnings
+import zlib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -61,29 +60,31 @@ def judged(root: Path, switch: str | None) -> tuple[Build, frozenset[str]]:
     """The build of the packages in `root`, and the modules that there are two of. `switch` is TORMAG_COMPILED."""
     try:
         record = json.loads((root / "firmware_protocol" / "core.json").read_bytes())
-        sources: dict[str, str] = record["sources"]
+        sources: dict[str, int] = record["sources"]
         suffix, lacking = record["python"], record["interpreted"]
     except (OSError, ValueError, KeyError, TypeError):
         return Build(False, "it was not compiled"), frozenset()
     modules = frozenset(source.removesuffix(".py").replace("/", ".") for source in sources)
-    if suffix != sysconfig.get_config_var("EXT_SUFFIX"):
+    if suffix != importlib.machinery.EXTENSION_SUFFIXES[0]:
         return Build(False, f"it was compiled for another Python ({suffix})"), modules
     if lacking:
         return Build(False, f"when it was installed, {lacking}"), modules
     if switch == "0":
         return Build(False, f"{SWITCH}=0"), modules
-    edited = [source for source, known in sources.items() if _digest(root / source) != known]
+    edited = [source for source, known in sources.items() if check_sum(root / source) != known]
     if edited:
         more = f" and {len(edited) - 1} more" if len(edited) > 1 else ""
         return Build(False, f"{edited[0]}{more} changed since the core was compiled"), modules
     return Build(True, ""), modules
 
 
-def _digest(path: Path) -> str:
+def check_sum(path: Path) -> int:
+    """CRC-32 of a source, -1 where it cannot be read. Edits are to be seen; what stands attacks takes as long to load
+    as all else here, and every command waits for it."""
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        return zlib.crc32(path.read_bytes())
     except OSError:
-        return ""
+        return -1
 
 
 @cache

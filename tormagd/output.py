@@ -5,7 +5,6 @@ they come in; whatever else is not printable is escaped where it goes out, all b
 """
 
 import json
-import logging
 import os
 import re
 from typing import TextIO
@@ -30,7 +29,7 @@ def write_line(text: str, stream: TextIO | None) -> OSError | None:
     if stream is None:
         return None
     try:
-        print(_escaped(text), file=stream, flush=True)
+        print(escaped(text), file=stream, flush=True)
     except OSError as error:
         # or the interpreter would try again at its end, complain, and change the exit code
         nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -40,19 +39,8 @@ def write_line(text: str, stream: TextIO | None) -> OSError | None:
     return None
 
 
-class LogFormatter(logging.Formatter):
-    """One line for each record, whatever stands in it; a traceback keeps its lines."""
-
-    def formatMessage(self, record: logging.LogRecord) -> str:
-        """The record's line."""
-        return printable(super().formatMessage(record))
-
-    def format(self, record: logging.LogRecord) -> str:
-        """The line and the traceback."""
-        return _escaped(super().format(record))
-
-
-def _escaped(text: str) -> str:
+def escaped(text: str) -> str:
+    """`text` with each character escaped that is not printable, but for line ends, tabulators and our own colours."""
     parts = _OURS.split(text)
     parts[::2] = [printable(part) for part in parts[::2]]
     return "".join(parts)

@@ -145,28 +145,36 @@ def _new_scene(options: argparse.Namespace) -> Outcome:
 
 def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
     from tormagd.client.blocking import Client
-    from tormagd.ctl.black_box import black_box
-    from tormagd.ctl.firmware import firmware
-    from tormagd.ctl.operate import home, operate, take
-    from tormagd.ctl.status import status
 
     with Client(endpoints, options.wait) as client:
         match options.command:
             case "status":
+                from tormagd.ctl.status import status
+
                 return status(client)
             case "top":
                 from tormagd.ctl.top import top
 
                 return top(client)
             case "firmware":
+                from tormagd.ctl.firmware import firmware
+
                 return firmware(client)
             case "blackbox":
+                from tormagd.ctl.black_box import black_box
+
                 return black_box(client, options.file)
             case "take":
+                from tormagd.ctl.operate import take
+
                 return take(client, options.source)
             case "home":
+                from tormagd.ctl.operate import home
+
                 return home(client, options.timeout, not options.no_wait)
             case _:
+                from tormagd.ctl.operate import operate
+
                 return operate(client, options.command)
 
 
@@ -295,7 +303,8 @@ def parser() -> argparse.ArgumentParser:
     _add_common(made)
     made.set_defaults(config=None, endpoint=None, key=None, server_key=None, json=False, wait=1.0)
     made.add_argument("--version", action="version", version=f"tormagctl {__version__}")
-    commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    # its own name is given, or argparse would lay a usage out to find it
+    commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND", prog=made.prog)
 
     def command(name: str, help_text: str) -> argparse.ArgumentParser:
         return commands.add_parser(name, help=help_text, description=help_text, parents=[shared], epilog=EXIT_TEXT)

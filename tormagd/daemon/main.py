@@ -1,7 +1,6 @@
 """`tormagd`: reads the configuration, builds the core, runs the daemon."""
 
 import argparse
-import logging
 import signal
 import sys
 from functools import partial
@@ -13,7 +12,8 @@ import msgspec
 from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import ENDPOINTS, Config, ConfigError, Endpoints, load_config, placed
-from tormagd.output import LogFormatter, printable, write_line
+from tormagd.daemon.log import log_to_stderr
+from tormagd.output import printable, write_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,7 +40,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Runs the daemon; returns the exit code: 0 ended on request, 1 could not run, 2 configuration refused."""
     options = parser().parse_args(arguments)
-    _log_to_stderr()
+    log_to_stderr()
     # nothing moves until the daemon runs and takes the signal over: before that, Ctrl-C may simply end the process
     interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
@@ -92,13 +92,6 @@ def _configured(options: argparse.Namespace) -> Config:
     if options.scene is not None:
         config = msgspec.structs.replace(config, scene=options.scene)
     return at_rates_of(load_scene(config.scene), config)
-
-
-def _log_to_stderr() -> None:
-    handler = logging.StreamHandler(sys.stderr)
-    time_first = "%(asctime)s " if sys.stderr is not None and sys.stderr.isatty() else ""  # the journal has its own
-    handler.setFormatter(LogFormatter(f"{time_first}%(levelname)s %(name)s: %(message)s"))
-    logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 
 def _keys(endpoints: Endpoints) -> "KeyRing | None":
