@@ -52,6 +52,7 @@ TOOL_ROOMS = {
     "thesis": set(),
     "motor": set(),
     "extremes": set(),
+    "first_use": set(),
     "rendering": {"machines"},
     "fault_matrix": {"wire"},
     "benchmarks": {"machines", "wire", "thesis", "rendering"},
