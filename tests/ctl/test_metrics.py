@@ -4,7 +4,9 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
+import subprocess
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +22,7 @@ from tormagd.ctl.main import main
 ROOT = Path(__file__).parents[2]
 BOARD = ROOT / "examples/grafana.json"
 BASE_UNITS = ("seconds", "newtons", "meters", "teslas", "hertz", "ratio")
+PROMTOOL = shutil.which("promtool")
 TIMES = {"p50": 41.0, "p99": 304.0, "p999": 500.0, "max": 900.0}
 
 
@@ -85,6 +88,15 @@ def test_names_and_types_keep_to_the_conventions(full: Any, capsys: pytest.Captu
             assert not name.endswith(unit)
         if re.search("force|gap|skew|field|age|delay|lateness|execution|round_trip|uptime", name):
             assert name.endswith(BASE_UNITS), name
+
+
+@pytest.mark.skipif(PROMTOOL is None, reason="no promtool here: it comes with Debian's package prometheus")
+def test_prometheus_s_own_parser_finds_no_fault(full: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    text = printed(capsys, full.control)
+    checked = subprocess.run(
+        [str(PROMTOOL), "check", "metrics"], input=text, text=True, capture_output=True, check=False
+    )
+    assert (checked.returncode, checked.stdout, checked.stderr) == (0, "", "")
 
 
 def test_what_is_not_known_has_no_sample(fake_daemon: Any, capsys: pytest.CaptureFixture[str]) -> None:
