@@ -5,6 +5,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= auto
+PYTHONS ?= 3.11 3.12 3.13
+GOAL ?= test
 SEARCHES ?= 5
 
 DESTDIR ?=
@@ -28,7 +30,7 @@ SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict --quiet
 
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
-.PHONY: install uninstall deb run test unhurried search check docs format compile core fetched model tactile-model reproduction evidence clean
+.PHONY: install uninstall deb run test unhurried search pythons check docs format compile core fetched model tactile-model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -49,6 +51,14 @@ search: $(VENV)/.dev
 	for round in $$(seq $(SEARCHES)); do \
 	    $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' \
 	        --hypothesis-profile=search || exit 1; \
+	done
+
+# what is committed, from nothing, with every supported Python; one that is not here is named
+pythons:
+	for version in $(PYTHONS); do \
+	    if ! python$$version -c '' 2>/dev/null; then echo "python$$version is not here: not tried"; continue; fi; \
+	    rm -rf build/python$$version && git clone --quiet . build/python$$version && \
+	    $(MAKE) --no-print-directory -C build/python$$version $(GOAL) PYTHON=python$$version || exit 1; \
 	done
 
 check: $(VENV)/.dev

@@ -18,6 +18,7 @@ BESIDE = (
     "README.md",
     "CONTRIBUTING.md",
     "CHANGELOG.md",
+    "RELEASING.md",
     "systemd/README.md",
     "firmware_protocol/README.md",
     "firmware_protocol/c/README.md",
