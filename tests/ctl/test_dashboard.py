@@ -18,7 +18,7 @@ from aiohttp import ClientResponse
 from aiohttp.test_utils import TestClient, TestServer
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from screenshots import CHROMIUM, Page, browser
+from machines.chromium import CHROMIUM, Page, browser
 
 from tormagd.client.aio import AsyncClient
 from tormagd.config import in_folder

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks import fast, latency, loop, virtual_time
+from benchmarks import browsers, fast, latency, loop, virtual_time
 from benchmarks.against import checkout
 from benchmarks.histograms import plot_histograms
 
@@ -41,6 +41,18 @@ def test_ratios_are_medians_over_the_pairs_and_not_of_the_sums() -> None:
     assert result["control_exec_us"]["mean"] == 50.0
     assert result["bare"]["merged_share"] == 0.0
     assert result["merged_share"] == pytest.approx(30 / 29_970)
+
+
+def test_browsers_are_judged_by_the_median_of_their_pairs(capsys: pytest.CaptureFixture[str]) -> None:
+    lateness = [(20.0, 30.0), (300.0, 300.0), (40.0, 44.0)]
+    pairs = [(block(without, 0), block(looked_at, 10)) for without, looked_at in lateness]
+    result = browsers.summary(pairs)
+    assert result["ratio"] == {"p50": 1.1, "p99": 1.1, "p999": 1.1}
+    assert result["without"]["lateness_us"]["p50"] == 40.0
+    assert result["looked_at"]["merged_share"] == pytest.approx(0.001, rel=0.01)
+    told = {"browsers": 10, "kind": "streams", "state": "ENABLED", "fifo_priority": 50}
+    browsers.print_table(result | told)
+    assert "10 streams" in capsys.readouterr().out
 
 
 def test_ratios_to_another_checkout_are_medians_over_the_pairs() -> None:
