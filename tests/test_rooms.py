@@ -48,13 +48,14 @@ MAY_IMPORT = {
 TOOLS = ROOT / "tools"
 TOOL_ROOMS = {
     "machines": set(),
+    "consoles": set(),
     "wire": set(),
     "thesis": set(),
     "motor": set(),
     "extremes": set(),
     "rendering": {"machines"},
     "fault_matrix": {"wire"},
-    "benchmarks": {"machines", "wire", "thesis", "rendering"},
+    "benchmarks": {"machines", "consoles", "wire", "thesis", "rendering"},
     "tactile": {"thesis", "rendering", "benchmarks"},
     "intrusion": {"machines", "rendering", "benchmarks"},
 }

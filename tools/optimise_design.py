@@ -7,12 +7,11 @@ import argparse
 import json
 import os
 import sys
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
 import numpy as np
+from machines import executors
 from thesis.values import USE_CASES
 from tqdm import tqdm
 
@@ -42,17 +41,15 @@ def main() -> int:
     parser.add_argument("--points", type=Path, help="CSV t_s,force_N: how much of this task the best design renders")
     parser.add_argument("--cutoff", type=float, help="low-pass of the CSV, Hz, before its rate is taken")
     parser.add_argument("--state", type=Path, help="JSON file that keeps finished runs")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes on this machine")
-    parser.add_argument("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster, instead of local processes")
+    executors.add_options(parser, os.cpu_count() or 1, needed="tormagd")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     try:
         recorded = None if options.points is None else read_task(options.points, options.cutoff)
         runs = _runs(options)
-        with ExitStack() as stack:
-            executor = _executor(options, stack)
-            with tqdm(total=len(runs), unit="run", disable=not sys.stderr.isatty()) as bar:
-                outcomes = sweep(runs, executor, options.state, lambda done, total: bar.update(done - bar.n))
+        bar = tqdm(total=len(runs), unit="run", disable=not sys.stderr.isatty())
+        with executors.chosen(options) as executor, bar:
+            outcomes = sweep(runs, executor, options.state, lambda done, total: bar.update(done - bar.n))
     except (DomainError, OSError) as error:
         print(f"optimise_design: {error}", file=sys.stderr)
         return 2
@@ -98,16 +95,6 @@ def _runs(options: argparse.Namespace) -> list[Run]:
     else:
         starts = [line.start for line in USE_CASES[options.use_case].starts]
     return [Run(problem, start, options.solver, options.seed) for start in starts]
-
-
-def _executor(options: argparse.Namespace, stack: ExitStack) -> Executor:
-    if options.dask is None:
-        return stack.enter_context(ProcessPoolExecutor(options.workers))
-    # only a cluster needs it installed
-    from distributed import Client
-
-    executor: Executor = stack.enter_context(stack.enter_context(Client(options.dask)).get_executor())
-    return executor
 
 
 def _merit(measure: str, outcome: Outcome) -> tuple[float, float]:

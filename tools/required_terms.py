@@ -15,12 +15,11 @@ devices are synthetic.
 import argparse
 import sys
 from collections.abc import Callable, Iterable
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
 from force_tracking import SAMPLES
+from machines import executors
 from rendering.scene_runs import ROOT, Case, costs, run_all
 from tqdm import tqdm
 
@@ -147,10 +146,7 @@ def main() -> int:
     parser.add_argument("--store", action="store_true", help="write the file that comes with the package")
     parser.add_argument("--costs", action="store_true", help="of stored scenes measure nothing but the costs anew")
     parser.add_argument("--kept", type=Path, default=KEPT, help="JSON file that keeps finished runs")
-    parser.add_argument("--workers", type=int, default=1, help="processes on this machine")
-    parser.add_argument(
-        "--dask", metavar="ADDRESS", help="scheduler of a Dask cluster; its workers need tools/ on their path"
-    )
+    executors.add_options(parser, 1, needed="tormagd, and tools/ on their path")
     options = parser.parse_args()
     known = {scene.name: scene for scene in measured().scenes}
     names = options.scenes or (list(known) if options.costs else list(shipped_scenes()))
@@ -159,9 +155,7 @@ def main() -> int:
     seconds, samples = (QUICK_S, SAMPLES[:1]) if options.quick else (SECONDS, SAMPLES)
     found = []
     try:
-        with ExitStack() as stack:
-            executor = _executor(options, stack)
-            bar = stack.enter_context(tqdm(unit="run", disable=not sys.stderr.isatty()))
+        with executors.chosen(options) as executor, tqdm(unit="run", disable=not sys.stderr.isatty()) as bar:
 
             def runs(cases: Iterable[Case]) -> dict[Case, float]:
                 bar.reset()
@@ -193,16 +187,6 @@ def _measured(scenes: list[MeasuredScene], seconds: float) -> Measured:
 
 def _text(result: Measured) -> str:
     return msgspec.json.format(msgspec.json.encode(result), indent=1).decode() + "\n"
-
-
-def _executor(options: argparse.Namespace, stack: ExitStack) -> Executor:
-    if options.dask is None:
-        return stack.enter_context(ProcessPoolExecutor(options.workers))
-    # only a cluster needs it installed
-    from distributed import Client
-
-    executor: Executor = stack.enter_context(stack.enter_context(Client(options.dask)).get_executor())
-    return executor
 
 
 def table(result: Measured) -> str:

@@ -17,7 +17,7 @@ from tormagd.simulation import __main__ as simulation
 from tormagd.toml_file import toml_tables
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "RELEASING.md"]
 PAGES += sorted(page for folder in ("docs", "systemd", "firmware_protocol") for page in (ROOT / folder).rglob("*.md"))
 PARSERS = {
     "tormagd": daemon.parser,
@@ -29,6 +29,7 @@ MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 COMMAND = re.compile(r"(?:sudo (?:-u \w+ )?)?((?:tormagctl|tormagd|make|python (?:-m |tools/)[\w./]+)(?: [ -~]*)?)")
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^(?: {4}| {8})(\S.*)$", re.MULTILINE)
+IMPORTED = re.compile(r"^from (\w+) import (\w+)$", re.MULTILINE)
 DECISION = ["Question", "Decision", "Why", "Given up"]
 
 
@@ -88,8 +89,11 @@ def require_there(words):
         assert importlib.util.find_spec(words[2]), words
     else:
         tool = ROOT / words[1]
-        parts = tool.parent.glob(f"*/{words[2].replace('-', '_')}.py") if words[2:] else ()
-        source = "".join(file.read_text(encoding="utf-8") for file in (tool, *parts))
+        source = tool.read_text(encoding="utf-8")
+        parts = [*tool.parent.glob(f"*/{words[2].replace('-', '_')}.py")] if words[2:] else []
+        # options that several tools have in common stand in a module that they import
+        parts += [tool.parent / room / f"{name}.py" for room, name in IMPORTED.findall(source)]
+        source += "".join(file.read_text(encoding="utf-8") for file in parts if file.exists())
         assert all(f'"{word}"' in source for word in words[2:] if word.startswith("--")), words
 
 

@@ -1,1 +1,1 @@
-"""What stands for another machine, and what this one took from a measurement."""
+"""What stands for another machine or is one, and what this one took from a measurement."""

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from tormagd.dashboard.frame import SHOWN_S, Explanation, Frame, Held, late_counts
@@ -34,7 +33,7 @@ class Recorded:
         self._recording, self._name = recording, name
         self._start_ns = start_ns(recording)
         self._curves = {ours: series(recording, theirs) for ours, theirs in CURVES.items()}
-        self._late = series(recording, "lateness_us") or series(recording, "tick.lateness_us")
+        self._late = series(recording, "lateness_us")
         self._states = bands(recording, "operating_state")
         self._limits, self._faults = bands(recording, "limits"), bands(recording, "faults")
         # the curves are the ticks' where there are any, and end with them
@@ -53,8 +52,8 @@ class Recorded:
             "is_complete": self._recording.is_complete,
             "tracking_rms_N": tracking_rms_N(self._recording),
             "version": metadata.get("version", ""),
-            "scene": (_decoded(metadata.get("scene"), dict[str, Any]) or {}).get("name", ""),
-            "portrait": _decoded(metadata.get("portrait"), PortraitReport),
+            "scene": (self._recording.described("scene", dict[str, Any]) or {}).get("name", ""),
+            "portrait": self._recording.described("portrait", PortraitReport),
             "overview": self._overview(),
             "explained": {code: Explanation(known.cause, known.remedy) for code, known in (LIMITS | FAULTS).items()},
         }
@@ -118,11 +117,3 @@ def _is_at(band: Band, at_s: float) -> bool:
 def _share(band: Band, from_s: float, to_s: float) -> float:
     inside_s = sum(max(min(end, to_s) - max(start, from_s), 0.0) for start, end in band.spans_s)
     return inside_s / max(to_s - from_s, STEP_S)
-
-
-def _decoded(text: str | None, kind: Any) -> Any:
-    """A value of a recording's metadata; None where there is none, or it is of another making."""
-    try:
-        return None if text is None else msgspec.json.decode(text, type=kind)
-    except msgspec.MsgspecError:
-        return None

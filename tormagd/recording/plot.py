@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tormagd.recording.reader import Recording
-from tormagd.recording.series import BREAK_S, Band, Series, bands, series, start_ns, tracking_rms_N
+from tormagd.recording.series import BREAK_S, Band, Series, bands, end_ns, series, start_ns, tracking_rms_N
 
 FORMATS = (".png", ".svg", ".pdf")
 
@@ -54,8 +54,7 @@ def figure(recording: Recording, title: str) -> Figure:
     when = datetime.fromtimestamp(begin / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     lane.set_xlabel(f"seconds since {when}")
     fig.suptitle(_headline(recording, title, faults), x=0.01, ha="left", fontsize=13, fontweight="bold")
-    last = max(int(c.t_ns.max()) for c in (recording.ticks, recording.telemetry) if c.t_ns.size)
-    lane.set_xlim(0.0, max((last - begin) / 1e9, 1e-3))
+    lane.set_xlim(0.0, max((end_ns(recording) - begin) / 1e9, 1e-3))
     return fig
 
 

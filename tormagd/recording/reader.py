@@ -2,10 +2,10 @@
 
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import msgspec
 import numpy as np
@@ -54,42 +54,57 @@ class Recording:
     metadata: dict[str, str] = field(default_factory=dict)
     is_complete: bool = True
 
+    def described(self, name: str, kind: Any) -> Any:
+        """What its metadata say of `name`, a value of this type; None where they do not, or say something else."""
+        try:
+            return msgspec.json.decode(self.metadata[name], type=kind)
+        except (KeyError, msgspec.MsgspecError):
+            return None
+
 
 def read_recording(path: Path) -> Recording:
     """The recording in `path`. Raises RecordingError: not readable, not MCAP, damaged, or not written by tormagd."""
-    builders = {TELEMETRY_TOPIC: _Builder(), TICKS_TOPIC: _Builder()}
+    try:
+        require_regular(path, MAX_FILE_BYTES)
+        with path.open("rb") as file:
+            return read_open_recording(file, str(path))
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror}") from error
+
+
+def read_open_recording(file: BinaryIO, name: str, only: Collection[str] | None = None) -> Recording:
+    """The recording in `file`, wherever that is, which errors call `name`; where `only` some fields of its messages are
+    wanted, no others are kept. Raises RecordingError: not MCAP, damaged, or not written by tormagd; and OSError.
+    """
+    builders = {TELEMETRY_TOPIC: _Builder(only), TICKS_TOPIC: _Builder(only)}
     metadata: dict[str, str] = {}
     topics: dict[int, str] = {}
     schemas: dict[int, bytes] = {}
     is_complete = True
     try:
-        require_regular(path, MAX_FILE_BYTES)
-        with path.open("rb") as file:
-            try:
-                for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:
-                    if isinstance(record, Schema):
-                        schemas[record.id] = record.data
-                    elif isinstance(record, Channel):
-                        topics[record.id] = record.topic
-                        if record.topic in builders and record.schema_id in schemas:
-                            builders[record.topic].expect(msgspec.json.decode(schemas[record.schema_id]))
-                    elif isinstance(record, Metadata) and record.name == ABOUT:
-                        metadata.update(record.metadata)
-                    elif isinstance(record, Message) and topics.get(record.channel_id) in builders:
-                        builders[topics[record.channel_id]].add(record.log_time, msgspec.json.decode(record.data))
-            except UNREADABLE:
-                # a record that runs into the end of the file was being written when the recorder died
-                if file.read(1):
-                    raise
-                is_complete = False
+        try:
+            for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:
+                if isinstance(record, Schema):
+                    schemas[record.id] = record.data
+                elif isinstance(record, Channel):
+                    topics[record.id] = record.topic
+                    if record.topic in builders and record.schema_id in schemas:
+                        builders[record.topic].expect(msgspec.json.decode(schemas[record.schema_id]))
+                elif isinstance(record, Metadata) and record.name == ABOUT:
+                    metadata.update(record.metadata)
+                elif isinstance(record, Message) and topics.get(record.channel_id) in builders:
+                    builders[topics[record.channel_id]].add(record.log_time, msgspec.json.decode(record.data))
+        except UNREADABLE:
+            # a record that runs into the end of the file was being written when the recorder died
+            if file.read(1):
+                raise
+            is_complete = False
         telemetry, ticks = builders[TELEMETRY_TOPIC].columns(), builders[TICKS_TOPIC].columns()
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}") from error
     except UNREADABLE as error:
-        raise RecordingError(f"{path}: not an intact MCAP recording ({error})") from error
+        raise RecordingError(f"{name}: not an intact MCAP recording ({error})") from error
     if not set(topics.values()) & set(builders):
         raise RecordingError(
-            f"{path}: no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
+            f"{name}: no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
         )
     return Recording(telemetry, ticks, metadata, is_complete and CUT not in metadata)
 
@@ -97,7 +112,8 @@ def read_recording(path: Path) -> Recording:
 class _Builder:
     """Rows of one topic on their way to columns; a column that first shows in a later row is filled up before it."""
 
-    def __init__(self) -> None:
+    def __init__(self, only: Collection[str] | None) -> None:
+        self._only = only
         self._t_ns: list[int] = []
         self._numbers: dict[str, list[float]] = {}
         self._words: dict[str, list[tuple[str, ...]]] = {}
@@ -105,6 +121,8 @@ class _Builder:
     def add(self, t_ns: int, message: object) -> None:
         if not isinstance(message, dict):
             raise ValueError(f"message of {t_ns} ns is {type(message).__name__}: allowed is an object")
+        if self._only is not None:
+            message = {name: message[name] for name in self._only if name in message}
         row = len(self._t_ns)
         self._t_ns.append(t_ns)
         for name, value in _flat("", message, MAX_NESTING):
@@ -120,6 +138,8 @@ class _Builder:
     def expect(self, schema: object) -> None:
         """The columns that the schema names are there, whether anything is ever known of them or not."""
         for name, kind in _columns("", schema, MAX_NESTING):
+            if self._only is not None and name.partition(".")[0] not in self._only:
+                continue
             if kind in ("number", "integer", "boolean"):
                 self._numbers.setdefault(name, [])
             elif kind in ("string", "array"):

@@ -20,6 +20,7 @@ SPELLINGS: dict[str, tuple[tuple[str, ...], ...]] = {
     "gap_setpoint_mm": (("gap_setpoint_mm",), ("reference_gap_mm",)),
     "left_duty": (("left_duty",), ("duty.0",)),
     "right_duty": (("right_duty",), ("duty.1",)),
+    "lateness_us": (("lateness_us",), ("tick.lateness_us",)),
 }
 "The columns whose sum is the quantity, in the order they are looked for."
 
@@ -46,6 +47,11 @@ def start_ns(recording: Recording) -> int:
     if not times:
         raise ValueError("the recording has no messages: was the daemon running?")
     return min(times)
+
+
+def end_ns(recording: Recording) -> int:
+    """The last message's time, of a recording with messages."""
+    return max(int(columns.t_ns.max()) for columns in (recording.ticks, recording.telemetry) if columns.t_ns.size)
 
 
 def series(recording: Recording, name: str) -> Series | None:
@@ -91,13 +97,16 @@ def tracking_rms_N(recording: Recording) -> float | None:
     if asked is None or measured is None:
         return None
     wanted = np.interp(measured.t_s, asked.t_s, asked.values)
-    states = {band.name: band.spans_s for band in bands(recording, "operating_state")}
-    used = np.isfinite(wanted) & np.isfinite(measured.values)
-    if states:
-        enabled = np.zeros(used.shape, dtype=bool)
-        for start, end in states.get("ENABLED", ()):
-            enabled |= (measured.t_s >= start) & (measured.t_s < end)
-        used &= enabled
+    used = np.isfinite(wanted) & np.isfinite(measured.values) & is_enabled(recording, measured.t_s)
     if not used.any():
         return None
     return float(np.sqrt(np.mean(np.square(measured.values[used] - wanted[used]))))
+
+
+def is_enabled(recording: Recording, t_s: Floats) -> NDArray[np.bool_]:
+    """Whether the device was ENABLED at each of these times; at all of them where no state is recorded."""
+    states = {band.name: band.spans_s for band in bands(recording, "operating_state")}
+    enabled = np.full(t_s.shape, not states)
+    for start, end in states.get("ENABLED", ()):
+        enabled |= (t_s >= start) & (t_s < end)
+    return enabled

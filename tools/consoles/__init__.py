@@ -1,0 +1,1 @@
+"""What the recordings of many consoles say of each, and of its device."""

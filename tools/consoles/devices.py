@@ -1,0 +1,87 @@
+"""Devices over many recordings: how well each followed, what held it back, and how it drifts."""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+
+import msgspec
+import numpy as np
+
+from tormagd.recording.summary import Summary
+
+DAY_S = 86_400.0
+LEAST_DAYS, LEAST_RECORDINGS = 1.0, 3
+"No drift for each day is told of less."
+
+
+class Drift(msgspec.Struct, frozen=True):
+    """A quantity of a device in the first and the newest recording that has it, and its change by a straight line
+    through all of them; null where they are too few, or of one day."""
+
+    first: float
+    newest: float
+    per_day: float | None
+
+
+class Console(msgspec.Struct, frozen=True, kw_only=True):
+    """All recordings of one device with one insert. Errors are of all the time ENABLED, and of the worst recording."""
+
+    serial_number: int | None
+    insert: str
+    recordings: int
+    enabled_s: float
+    tracking_rms_N: float | None
+    worst_rms_N: float | None
+    limits: dict[str, float]
+    "Each limit's share of the time ENABLED."
+    faults: dict[str, int]
+    "In how many recordings each fault came."
+    trim: Drift | None
+    current_A: Drift | None
+    clock_drift_ppm: Drift | None
+
+
+def consoles(summaries: Iterable[Summary]) -> list[Console]:
+    """One for each device and insert, in the order of both."""
+    groups: dict[tuple[int, str], list[Summary]] = defaultdict(list)
+    for each in summaries:
+        groups[-1 if each.serial_number is None else each.serial_number, each.insert].append(each)
+    return [_console(sorted(group, key=lambda each: each.start_s)) for _, group in sorted(groups.items())]
+
+
+def _console(group: list[Summary]) -> Console:
+    enabled_s = sum(each.enabled_s for each in group)
+    errors = [(each.enabled_s, each.tracking_rms_N) for each in group if each.tracking_rms_N is not None]
+    limits_s: Counter[str] = Counter()
+    for each in group:
+        limits_s.update(each.limits_s)
+    return Console(
+        serial_number=group[0].serial_number,
+        insert=group[0].insert,
+        recordings=len(group),
+        enabled_s=enabled_s,
+        tracking_rms_N=_pooled(errors),
+        worst_rms_N=max((rms_N for _, rms_N in errors), default=None),
+        limits={code: of_s / enabled_s for code, of_s in limits_s.most_common()} if enabled_s > 0.0 else {},
+        faults=dict(Counter(code for each in group for code in each.faults_at_s)),
+        trim=_drift([(each.start_s, each.trim) for each in group]),
+        current_A=_drift([(each.start_s, each.current_A) for each in group]),
+        clock_drift_ppm=_drift([(each.start_s, each.clock_drift_ppm) for each in group]),
+    )
+
+
+def _pooled(errors: list[tuple[float, float]]) -> float | None:
+    """The RMS over all of the time, from that of each part of it."""
+    if not errors:
+        return None
+    weights, rms_N = np.array(errors).T
+    return float(np.sqrt(np.average(rms_N**2, weights=weights if weights.any() else None)))
+
+
+def _drift(values: list[tuple[float, float | None]]) -> Drift | None:
+    known = [(start_s, value) for start_s, value in values if value is not None]
+    if not known:
+        return None
+    at_s, shown = np.array(known).T
+    days = (at_s - at_s[0]) / DAY_S
+    is_told = len(known) >= LEAST_RECORDINGS and days[-1] >= LEAST_DAYS
+    return Drift(known[0][1], known[-1][1], float(np.polyfit(days, shown, 1)[0]) if is_told else None)

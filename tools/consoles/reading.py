@@ -1,0 +1,65 @@
+"""Where recordings are, in a folder or a bucket, and what each of them says: read by workers, wherever those are."""
+
+from collections.abc import Callable
+from concurrent.futures import Executor, as_completed
+from typing import NamedTuple
+
+import fsspec
+
+from tormagd.recording.reader import read_open_recording
+from tormagd.recording.summary import FIELDS, Summary, summarise
+
+SUFFIX = ".mcap"
+
+
+class Fleet(NamedTuple):
+    """What was read, by file, and why something was not."""
+
+    summaries: dict[str, Summary]
+    left_out: dict[str, str]
+
+
+def files(url: str) -> dict[str, str]:
+    """The full address of every recording in a folder or under a URL, by its name there; or of one file.
+
+    Raises OSError where it cannot be looked into, ValueError for a kind of URL that nobody knows, and ImportError for
+    one that a package is missing for.
+    """
+    system, root = fsspec.core.url_to_fs(url)
+    if not system.exists(root):
+        raise FileNotFoundError(f"{url}: no such folder or file")
+    folder = root if system.isdir(root) else root.rpartition("/")[0]
+    found = sorted(path for path in system.find(root) if path.lower().endswith(SUFFIX))
+    return {path.removeprefix(folder).lstrip("/"): system.unstrip_protocol(path) for path in found}
+
+
+def read(url: str) -> Summary | str:
+    """One recording's summary, or why there is none."""
+    name = url.rpartition("/")[2]
+    try:
+        system, path = fsspec.core.url_to_fs(url)
+        if not system.isfile(path):
+            return "it is no regular file"
+        with system.open(path, "rb") as file:
+            return summarise(read_open_recording(file, name, FIELDS))
+    except (OSError, ValueError) as error:
+        return str(error).removeprefix(f"{name}: ")
+
+
+def read_all(
+    urls: dict[str, str],
+    executor: Executor,
+    progress: Callable[[int, int], object] = lambda finished, total: None,
+) -> Fleet:
+    """Every file's summary, in their order."""
+    found: dict[str, Summary | str] = {}
+    pending = {executor.submit(read, url): name for name, url in urls.items()}
+    for future in as_completed(pending):
+        error = future.exception()
+        found[pending[future]] = future.result() if error is None else f"the worker that read it failed: {error}"
+        progress(len(found), len(urls))
+    ordered = [(name, found[name]) for name in urls]
+    return Fleet(
+        {name: each for name, each in ordered if isinstance(each, Summary)},
+        {name: each for name, each in ordered if isinstance(each, str)},
+    )
