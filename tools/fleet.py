@@ -88,7 +88,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("recordings", metavar="FOLDER|URL", help="where they are, in folders of their own or not")
     parser.add_argument("--out", metavar="FILE|URL", help="Parquet: one row of a recording")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    executors.add_options(parser, os.cpu_count() or 1, needed="tormagd[fleet], tools/ on their path, and to reach the recordings")
+    executors.add_options(
+        parser, os.cpu_count() or 1, needed="tormagd[fleet], tools/ on their path, and to reach the recordings"
+    )
     options = parser.parse_args(arguments)
     try:
         urls = files(options.recordings)

@@ -113,8 +113,9 @@ def looking(config: Path, count: int, chromium: bool) -> Iterator[None]:
         viewers = multiprocessing.Process(target=look, args=(address, count, chromium, shown, over))
         viewers.start()
         try:
-            if not shown.wait(OPEN_S):
-                raise TimeoutError(f"{count} browsers do not show the daemon within {OPEN_S:g} s")
+            while not shown.wait(LOOK_S):
+                if not viewers.is_alive():  # it has said why
+                    raise TimeoutError(f"{count} browsers do not show the daemon within {OPEN_S:g} s")
             yield
         finally:
             over.set()
@@ -130,8 +131,9 @@ def look(address: str, count: int, chromium: bool, shown: Event, over: Event) ->
 
 async def _look(address: str, count: int, chromium: bool, shown: Event, over: Event) -> None:
     async with AsyncExitStack() as stack:
-        for _ in range(count):
-            await stack.enter_async_context(_chromium(address) if chromium else _stream(address))
+        async with asyncio.timeout(OPEN_S):
+            for _ in range(count):
+                await stack.enter_async_context(_chromium(address) if chromium else _stream(address))
         shown.set()
         while not over.is_set():
             await asyncio.sleep(LOOK_S)
@@ -156,7 +158,7 @@ async def _chromium(address: str) -> AsyncIterator[None]:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         async with browser(Path(profile)) as page:
             await page.open(address, *WINDOW)
-            await page.until("document.querySelector('#late td') !== null && portrait !== null")
+            await page.until("document.querySelector('#late td') !== null")
             yield
 
 
