@@ -1,4 +1,4 @@
-"""The wire of a pty: workers of the kernel's carry its bytes, at ordinary priority, as they carry those of a USB adapter.
+"""The wire of a pty: workers of the kernel's carry its bytes, at ordinary priority, as they carry a USB adapter's.
 
 With all processors busy they came up to 90 ms late while daemon and device kept every beat (Linux 6.18): the device's
 states are stale then, whatever the daemon does. Where it is the daemon that is measured, and the kernel grants it, the
