@@ -31,8 +31,8 @@ MAY_IMPORT = {
     "inverse": {"firmware_protocol", "physics", "model", "training"},
     "scenes": {"bounded_file", "config"},
     "safety": {"firmware_protocol"},
-    "hardware": LOWEST | {"safety"},
-    "control": LOWEST | {"exact", "physics", "model", "inverse", "scenes", "safety", "hardware"},
+    "hardware": LOWEST | {"exact", "safety"},
+    "control": LOWEST | {"exact", "keeping", "physics", "model", "inverse", "scenes", "safety", "hardware"},
     "daemon": LOWEST | FILES | {"output", "keys", "keeping", "scenes", "safety", "hardware", "control"},
     "recording": FILES | {"messages", "output", "keeping"},
     "client": {"config", "keys", "messages", "output"},
@@ -41,8 +41,8 @@ MAY_IMPORT = {
     "simulation": FILES | {"physics", "firmware_protocol", "output"},
     "headroom": {"config", "output", "daemon", "control", "simulation", "closed_loop"},
     "replay": LOWEST
-    | {"exact", "output", "recording", "model", "scenes", "safety", "hardware", "control", "daemon", "simulation"}
-    | {"closed_loop"},
+    | {"exact", "keeping", "output", "recording", "model", "scenes", "safety", "hardware", "control", "daemon"}
+    | {"simulation", "closed_loop"},
     "closed_loop": LOWEST | {"control", "hardware", "safety", "simulation"},
 }
 TOOLS = ROOT / "tools"

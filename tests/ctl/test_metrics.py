@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -116,7 +117,7 @@ def test_a_scrape_asks_anew_and_says_when_the_daemon_has_gone(full: Any, capsys:
     def scrape() -> None:
         try:
             while "tormagctl metrics: " not in (said := capsys.readouterr().err):
-                pass
+                time.sleep(0.01)
             address = said.split()[2]
             for _ in range(2):
                 with urlopen(address, timeout=30.0) as answer:

@@ -30,7 +30,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--fault", dest="faults", action="append", default=[])
     parser.add_argument("--config", type=Path)
     options = parser.parse_args(arguments)
-    logging.disable()  # a connection that is run again has no news
     try:
         configured = None if options.config is None else load_config(options.config)
         box = read_black_box(options.file)
@@ -80,4 +79,5 @@ def _rehearsed(known: Recorded, box: BlackBoxFile, options: argparse.Namespace) 
 
 
 if __name__ == "__main__":
+    logging.disable()  # a connection that is run again has no news
     sys.exit(main())
