@@ -30,16 +30,22 @@ SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict --quiet
 
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
-.PHONY: install uninstall deb run test unhurried search pythons check docs format compile core fetched model tactile-model reproduction evidence clean
+.PHONY: install uninstall deb run test unhurried live yielding-check search pythons check docs format compile core fetched model tactile-model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
 
-# mypy has one processor at most, and the tests leave some of two. The live tests keep time, so they have the machine for
-# themselves
 test: $(VENV)/.dev
-	$(MAKE) --no-print-directory --jobs=2 check unhurried
+	$(MAKE) --no-print-directory unhurried
+	$(MAKE) --no-print-directory --jobs=2 live yielding-check
+
+# real processes in real time, one test after the other: they wait more than they work, and what is checked beside them
+# gives way
+live: $(VENV)/.dev
 	$(BIN)/python -P -m pytest -q -m live $$(grep -rlE 'mark\.live' tests --include='test_*.py')
+
+yielding-check: $(VENV)/.dev
+	nice -n 19 $(MAKE) --no-print-directory check
 
 # -P: what its owner keeps in this folder is not imported in place of a module. The core's tests run on both builds
 unhurried: $(VENV)/.dev
