@@ -33,7 +33,8 @@ MOST_WAITED = 0.1
 waits for 3 to 8% of it, 30 to 80 us a wake-up; without, beside four busy loops, for a third."""
 MOST_BLOCKED = 0.02
 """Share of the time above which waiting for disk or memory is taken for a hold-up. Once a device that writes its truth
-to a disk stood still for 38 ms while every bare timer kept its beats; that the disk was why is likely, not shown."""
+to a disk stood still for 38 ms while every bare timer kept its beats: the disk was why, or what carries a pty's bytes
+(`wire.py`), which was not known then; neither is shown."""
 
 
 class Stall(NamedTuple):

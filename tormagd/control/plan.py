@@ -21,7 +21,7 @@ from tormagd.control.slow_friction import NOTHING_SLOW, SLOWEST_MM_S, SlowFricti
 from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
 from tormagd.model.displacement import MOVING_MM_S
 from tormagd.model.features import FEATURES
-from tormagd.model.force_curve import ForceCurve
+from tormagd.model.force_curve import ForceCurve, within
 from tormagd.model.model_file import ForceModel
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Scene, terms_of
@@ -250,7 +250,7 @@ class Planner:
         self._fits = terms.learning and (terms.scale or terms.offset)
         self._learns_scale, self._learns_offset = terms.scale, terms.offset
         self._only_curve = model.curve(
-            _within(contact.displacement_mm, displacements_mm), _within(contact.rate_mm_s, rates_mm_s), cip_percent
+            within(contact.displacement_mm, displacements_mm), within(contact.rate_mm_s, rates_mm_s), cip_percent
         )
 
     def start(self, now_s: float) -> PlanState:
@@ -290,8 +290,8 @@ class Planner:
         known_mm, known_mm_s = displacement_mm, rate_mm_s
         if self._has_rate:
             displacement_mm, rate_mm_s = self._contact.planned(setpoint if is_meant else None, estimate)
-            known_mm = _within(displacement_mm, self._displacements_mm)
-            known_mm_s = _within(rate_mm_s, self._rates_mm_s)
+            known_mm = within(displacement_mm, self._displacements_mm)
+            known_mm_s = within(rate_mm_s, self._rates_mm_s)
             curve = self._model.curve(known_mm, known_mm_s, self._cip_percent)
         wanted_N = device.model_N(governed.path_N[0])
         solution = self._search.solve(curve, wanted_N, state.plan.field_mT - state.remembered.lag_mT)
@@ -354,7 +354,7 @@ class Planner:
         """What the model says of the force of now, at the measured gap; None without a gap."""
         if estimate is None or not estimate.is_homed:
             return None
-        element_mT = _within(remembered.field_mT - remembered.lag_mT, self._fields_mT)
+        element_mT = within(remembered.field_mT - remembered.lag_mT, self._fields_mT)
         return self._present_curve(estimate).force_N(element_mT) - remembered.relaxed_N
 
     def _present_curve(self, estimate: Estimate) -> ForceCurve:
@@ -362,7 +362,7 @@ class Planner:
             return self._only_curve
         displacement_mm, rate_mm_s = self._contact.present(estimate)
         return self._model.curve(
-            _within(displacement_mm, self._displacements_mm), _within(rate_mm_s, self._rates_mm_s), self._cip_percent
+            within(displacement_mm, self._displacements_mm), within(rate_mm_s, self._rates_mm_s), self._cip_percent
         )
 
     def _remember(self, remembered: Remembered, now_s: float, estimate: Estimate | None) -> Remembered:
@@ -514,7 +514,3 @@ class Planner:
         if estimate is None or model_N is None or not self._contact.is_known(estimate):
             return None
         return shown.device.force_N(model_N) * shown.slow.factor_at(abs(estimate.handle.rate_mm_s))
-
-
-def _within(value: float, ends: tuple[float, float]) -> float:
-    return min(max(value, ends[0]), ends[1])

@@ -11,7 +11,7 @@ import math
 from typing import Final, final
 
 from firmware_protocol.value import Value
-from tormagd.model.force_curve import ForceCurve
+from tormagd.model.force_curve import ForceCurve, within
 from tormagd.model.memory import Memory
 from tormagd.physics.relaxation import PronyState
 
@@ -101,6 +101,5 @@ class Remembering:
 
     def _parts_N(self, curve: ForceCurve, field_mT: float) -> tuple[float, float]:
         """The force without field, and what the field adds."""
-        least_mT, most_mT = self._fields_mT
-        free_N = curve.force_N(min(max(0.0, least_mT), most_mT))
-        return free_N, curve.force_N(min(max(field_mT, least_mT), most_mT)) - free_N
+        free_N = curve.force_N(within(0.0, self._fields_mT))
+        return free_N, curve.force_N(within(field_mT, self._fields_mT)) - free_N

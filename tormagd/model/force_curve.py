@@ -55,6 +55,11 @@ class ForceCurve(Protocol):
         """Trust, 0..1, in a field that misses the force asked by `error_N` N."""
 
 
+def within(value: float, ends: tuple[float, float]) -> float:
+    """`value`, or the end that it lies beyond: a model is not asked where nothing was shown to it."""
+    return min(max(value, ends[0]), ends[1])
+
+
 @final
 class Known:
     """What a model has been shown: the least and the greatest of each feature, and the span of forces, N."""
