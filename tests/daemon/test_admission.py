@@ -307,6 +307,19 @@ def test_lists_that_are_no_good_leave_the_old_ones(rig: Rig, caplog: pytest.LogC
     rig.until(lambda: publisher.poll(0))
 
 
+def test_a_stranger_that_leaves_before_it_was_asked_about_is_counted_once(tcp_rig: Rig) -> None:
+    tcp_rig.endpoint.admission.pause_s = lambda: 0.05
+    for _ in range(5):
+        stranger = tcp_rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
+        time.sleep(0.03)
+        stranger.close(linger=0)
+    tcp_rig.until(lambda: tcp_rig.endpoint.report().connections["setpoint"] == 0, "closed")
+    tcp_rig.endpoint.admission.pause_s = lambda: 0.0
+    tcp_rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
+    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused >= 6, "refused")
+    assert tcp_rig.endpoint.report().refused == 6
+
+
 # -- how many ------------------------------------------------------------------------------------------------------
 
 

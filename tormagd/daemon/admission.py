@@ -256,6 +256,7 @@ class Admission:
             if kind == zmq.EVENT_ACCEPTED:
                 self._accepted(known, value)
             elif kind == zmq.EVENT_DISCONNECTED:
+                self._admit()  # it may have been asked about before it left, and is counted once
                 self._disconnected(known, value)
             elif kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
                 known.failed = REASONS.get(value, BROKEN_HANDSHAKE) if known.is_guarded else UNASKED_KEY
@@ -290,10 +291,12 @@ class Admission:
                 del known.of_address[address]
         if descriptor in known.cut:
             known.cut.discard(descriptor)
-        elif failed is not None:
+        elif failed not in (None, PLAIN):
             self._refuse(known.name, address, "", failed)
         elif known.was_turned_away(address):
             pass  # counted when it was asked about
+        elif failed is not None:
+            self._refuse(known.name, address, "", failed)
         elif not known.is_guarded:
             self._moved(known.name, address, has_left=True)
         elif known.admitted[address]:
