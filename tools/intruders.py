@@ -2,7 +2,8 @@
 
 Each part starts a daemon on a simulated device and counts what becomes of it; one that judges control's time measures
 the same without the trouble, or a bare timer beside it, in the same run. What else runs on the machine spoils that all
-the same, so each line says what bare timers on every processor missed meanwhile. Exit status 0 if all held. The whole
+the same, so each line says what bare timers on every processor missed meanwhile, and a fault is held against the
+machine where they stood still so long that the device or the daemon had to latch. Exit status 0 if all held. The whole
 takes about 20 minutes.
 """
 
@@ -14,9 +15,11 @@ from collections.abc import Callable
 from typing import Any
 
 from intrusion import floods, messages, pulse_from_afar, stop_lane, strangers
-from intrusion.besieged import FIFO_PRIORITY, Line
-from machines.host import Host, HostWatch
+from intrusion.besieged import FAULT, FIFO_PRIORITY, Line
+from machines.host import HOST_SHARE, Host, HostWatch
 from machines.wire import carried
+
+from tormagd.config import Device
 
 PARTS: dict[str, Callable[[float], Line]] = {
     "strangers": strangers.measure,
@@ -56,7 +59,17 @@ def watched(part: Callable[[float], Line], share: float) -> tuple[Line, Host]:
         start_s = time.monotonic()
         line = part(share)
         end_s = time.monotonic()
-    return line, watch.between(start_s, end_s)
+    host = watch.between(start_s, end_s)
+    return attributed(line, host), host
+
+
+def attributed(line: Line, host: Host) -> Line:
+    """With the faults held against the machine, where it stood still for long enough."""
+    if host.bare_worst_ms < HOST_SHARE * Device().command_timeout_ms:
+        return line
+    latched = [failure for failure in line.failures if failure.startswith(FAULT)]
+    others = [failure for failure in line.failures if failure not in latched]
+    return line._replace(failures=others, held_against_machine=latched)
 
 
 def as_json(lines: dict[str, tuple[Line, Host]]) -> dict[str, Any]:
@@ -74,6 +87,8 @@ def print_line(line: Line, host: Host) -> None:
     print(f"{line.says}; {host}", flush=True)
     for failure in line.failures:
         print(f"  FAILED: {failure}", flush=True)
+    for fault in line.held_against_machine:
+        print(f"  held against the machine: {fault}", flush=True)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from typing import Any
 
 import msgspec
 from benchmarks.loop import Stand, end, wait_for, write_config
-from machines.host import HostWatch
+from machines.host import HOST_SHARE, HostWatch
 from machines.own import own_machine
 from machines.wire import carried
 from mcap.exceptions import EndOfFile
@@ -47,8 +47,6 @@ MEAN_N, SWING_N, SWING_HZ = 1.5, 0.3, 1.2
 SETTLING_TICKS = 5_000
 SAMPLE_S = 0.5
 SETTLED_S = 120.0
-HOST_SHARE = 0.5
-"Of the time that a device waits for a command: a processor that stood still for less is not why something was late."
 WITNESS_S = 3.0
 MISSING_ALLOWED_MS = 1_000.0
 GROWTH_ALLOWED_KB = 2_048

@@ -193,3 +193,14 @@ def test_a_wrong_command_line_is_refused(wrong: list[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         intruders.main(wrong)
     assert caught.value.code == 2
+
+
+# -- what the machine has to answer for ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("stood_still_ms", "failures"), [(24.0, ["fault OLD", "too slow"]), (26.0, ["too slow"])])
+def test_a_fault_is_the_machines_where_it_stood_still(stood_still_ms: float, failures: list[str]) -> None:
+    host = Host(steal=0.0, bare_kept=0.99, bare_worst_ms=stood_still_ms, waited={})
+    line = intruders.attributed(Line("said", ["fault OLD", "too slow"], {}), host)
+    assert line.failures == failures
+    assert [*line.held_against_machine, *line.failures] == ["fault OLD", "too slow"]

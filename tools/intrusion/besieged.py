@@ -3,7 +3,7 @@
 import contextlib
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +20,8 @@ THROTTLE = Path("/proc/sys/kernel/sched_rt_runtime_us")
 UNTHROTTLED = "-1"
 ANSWER_S = 10.0
 "A client waits for its turn among those that trouble the daemon."
+FAULT = "fault "
+"What a failure begins with that the machine may have to answer for."
 UNHANDLED = ("Traceback", "CRITICAL", "Exception ignored")
 
 
@@ -29,6 +31,8 @@ class Line(NamedTuple):
     says: str
     failures: list[str]
     figures: dict[str, Any]
+    held_against_machine: Sequence[str] = ()
+    "Faults of a time in which it stood still."
 
 
 class Besieged(NamedTuple):
@@ -55,7 +59,7 @@ class Besieged(NamedTuple):
     def troubles(self) -> list[str]:
         """What must not have become of it: faults, and what nobody has handled."""
         log = (self.folder / LOG).read_text(encoding="utf-8", errors="replace")
-        found = [f"fault {fault}" for fault in self.status()["faults"]]
+        found = [f"{FAULT}{fault}" for fault in self.status()["faults"]]
         return found + [line for line in log.splitlines() if any(sign in line for sign in UNHANDLED)]
 
 

@@ -26,6 +26,8 @@ LOOK_S = 0.2
 "How often the kernel's counters are read."
 STALL_MS = 10.0
 "A bare timer that stood still so long has found a stall: a fifth of the time after which a device opens by itself."
+HOST_SHARE = 0.5
+"Of the time that a device waits for a command: a processor that stood still for less is not why something was late."
 LEAST_KEPT = 0.99
 "Share of its beats below which a bare timer says that the host does not leave enough."
 MOST_WAITED = 0.1

@@ -56,6 +56,8 @@ REASONS: dict[int, str] = {
 UNLISTED, WRONG_ROLE = "key not listed", "role not allowed"
 TOO_MANY = "too many connections"
 UNASKED_KEY = "no handshake that an open endpoint knows: a key is not to be shown here"
+MAYBE_ASKED = (None, PLAIN, TOO_MANY)
+"What is known of a peer that has gone, where libzmq may have asked about its key before."
 BROKEN_HANDSHAKE, LEFT = "broken handshake", "left in the handshake"
 
 log = logging.getLogger(__name__)
@@ -278,7 +280,6 @@ class Admission:
                 known.cut.add(descriptor)
                 with contextlib.suppress(OSError):
                     connection.shutdown(socket.SHUT_RDWR)
-                self._refuse(known.name, address, "", TOO_MANY)
             elif not known.is_guarded:
                 self._moved(known.name, address, has_left=False)
 
@@ -291,9 +292,8 @@ class Admission:
                 del known.of_address[address]
         if descriptor in known.cut:
             known.cut.discard(descriptor)
-        elif failed not in (None, PLAIN):
-            self._refuse(known.name, address, "", failed)
-        elif known.was_turned_away(address):
+            failed = TOO_MANY
+        if failed in MAYBE_ASKED and known.was_turned_away(address):
             pass  # counted when it was asked about
         elif failed is not None:
             self._refuse(known.name, address, "", failed)
