@@ -242,7 +242,7 @@ PARTS = {
     "stop": Part("tools/intruders.py stop --json", _says_intruders),
     "floods": Part("tools/intruders.py floods --json", _says_intruders),
     "messages": Part("tools/intruders.py messages --json", _says_intruders),
-    "inverse": Part("tools/benchmark.py inverse --json", _says_inverse, judges=False),
+    "inverse": Part("tools/benchmark.py inverse --json --write", _says_inverse, judges=False),
     "wrong_model": Part("tools/wrong_model.py --json", _says_wrong_model),
     "unmet": Part("tools/unmet_scene.py --json", _says_unmet, judges=False),
     "envelope": Part("tools/envelope.py --json --picture docs/images/envelope.png", _says_envelope),

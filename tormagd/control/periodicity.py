@@ -230,7 +230,17 @@ def foreseen(state: Periodicity, slope_N_s: float) -> Periodicity:
         since_s = state.stamp_s - state.time_s
         forecast = state.force_N + changes[JUDGED] - changes[1] * since_s / GRID_S
         said = Guess(forecast, state.force_N + slope_N_s * (JUDGED * GRID_S - since_s))
-    return state.replaced(from_s=state.time_s, changes_N=changes, awaited=(*state.awaited[:-1], said))
+    return Periodicity(
+        state.stamp_s,
+        state.force_N,
+        state.time_s,
+        state.history,
+        state.time_s,
+        changes,
+        (*state.awaited[:-1], said),
+        state.long,
+        state.short,
+    )
 
 
 def forecast_N(state: Periodicity, begins_s: float, after_s: list[float]) -> list[float]:
