@@ -102,8 +102,9 @@ def _head(share: float) -> str:
         f"adds more than {share:.0%} of the tolerance to the RMS error of the force on sample 1, with the device "
         "learned before and frozen, or while it is learned: learning hides what a term does. What is out is left out "
         f"together, and judged on samples 1, 2 and 3: within {JUDGED:g} of the tolerance, or no more than {share:.0%} "
-        "of it worse than with all terms; otherwise the term that counts most is put back. `tormagctl scene explain "
-        "NAME` prints a decision, and what changes at half and at twice the tolerance."
+        "of it worse than with all terms; otherwise the term that counts most is put back, until it is, and those put "
+        "back before the last are tried again. `tormagctl scene explain NAME` prints a decision, and what changes at "
+        "half and at twice the tolerance."
     )
 
 
