@@ -33,6 +33,7 @@ from scipy import sparse
 from tqdm import tqdm
 
 from tormagd.design.recorded_task import read_task
+from tormagd.force_file import ForceFileError
 from tormagd.physics.errors import DomainError, require
 from tormagd.simulation.parameters import PlantError, PlantParameters, load_plant
 
@@ -316,7 +317,7 @@ def main() -> int:
             step_s=options.step_ms * 1e-3,
             shows=True,
         )
-    except (DomainError, PlantError, OSError) as error:
+    except (DomainError, ForceFileError, PlantError) as error:
         print(f"bound: {error}", file=sys.stderr)
         return 2
     except RuntimeError as error:

@@ -218,6 +218,27 @@ def _says_unmet(figures: Figures) -> str:
     return f"`{figures['scene']}`, tolerance {1e3 * figures['tolerance_N']:g} mN, RMS on samples 1 to 3, mN: {rows}"
 
 
+def _says_recordings(figures: Figures) -> str:
+    scenes = []
+    for scene in figures["scenes"]:
+        inside = ", ".join(item["term"] for item in scene["terms"] if item["term"] not in scene["left_out"])
+        within = max(item["chosen_N"] for item in scene["judged"]) / scene["tolerance_N"]
+        scenes.append(f"`{scene['name']}` requires {inside}: {within:.2f} of its tolerance at the worst")
+    return "; ".join(scenes)
+
+
+def _says_spare(figures: Figures) -> str:
+    rows = [terms for samples in figures["added_N"].values() for terms in samples.values()]
+    most = ", ".join(f"{name} {1e3 * max(terms[name] for terms in rows):.1f}" for name in rows[0])
+    return f"most that the absence of each adds on samples 2 and 3, mN: {most}"
+
+
+def _says_rates(figures: Figures) -> str:
+    worst_N = max(max(row) for row in figures["error_N"].values())
+    rows = "; ".join(f"{swings} {1e3 * missed['nothing']:.1f}" for swings, missed in figures["frozen_N"].items())
+    return f"the model says up to {1e3 * worst_N:.0f} mN too much; `{figures['scene']}` frozen misses, mN: {rows}"
+
+
 def _says_inverse(figures: Figures) -> str:
     beaten = ", ".join(figures["beaten"]) or "nowhere"
     return (
@@ -245,6 +266,9 @@ PARTS = {
     "inverse": Part("tools/benchmark.py inverse --json --write", _says_inverse, judges=False),
     "wrong_model": Part("tools/wrong_model.py --json", _says_wrong_model),
     "unmet": Part("tools/unmet_scene.py --json", _says_unmet, judges=False),
+    "recordings": Part("tools/recorded_scenes.py --json", _says_recordings, judges=False),
+    "spare": Part("tools/spare_terms.py --json", _says_spare, judges=False),
+    "rates": Part("tools/rate_error.py --json", _says_rates, judges=False),
     "envelope": Part("tools/envelope.py --json --picture docs/images/envelope.png", _says_envelope),
 }
 

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from benchmarks.step import drive, settled_loop
 from bound import Bound, bound
 from rendering.human_pulse import pulse_profile, with_approach
-from rendering.publisher import PREVIEW_S, RATE_HZ, publisher
+from rendering.publisher import FILE_PREVIEW_S, PREVIEW_S, RATE_HZ, publisher
 from rendering.signals import Kind, Signal, data_folder, palpation, recorded_signals
 from rendering.tracking import Tracking, tracking
 from thesis.values import USE_CASES
@@ -53,8 +53,6 @@ TRIM_S = 10.0
 "The time the trim is given before the figures of other devices than sample 1 begin."
 PULSE_S = 20.0
 DRAWN_PULSE_S = 15.0
-FILE_PREVIEW_S = 0.4
-"Of recorded signals."
 PALPATION_SEEDS = 1, 2
 OVER_IDEAL = 1.3
 "A signal may be missed by so many times what the ideal carriages miss, beside ALLOWED_N."

@@ -20,6 +20,7 @@ from tormagd.design.optimisation import Design, Outcome, Problem, Run, coverage_
 from tormagd.design.phase_portrait import Region
 from tormagd.design.recorded_task import read_task
 from tormagd.design.sweep import sweep
+from tormagd.force_file import ForceFileError
 from tormagd.physics.errors import DomainError
 
 
@@ -50,7 +51,7 @@ def main() -> int:
         bar = tqdm(total=len(runs), unit="run", disable=not sys.stderr.isatty())
         with executors.chosen(options) as executor, bar:
             outcomes = sweep(runs, executor, options.state, lambda done, total: bar.update(done - bar.n))
-    except (DomainError, OSError) as error:
+    except (DomainError, ForceFileError, OSError) as error:
         print(f"optimise_design: {error}", file=sys.stderr)
         return 2
     ranked = sorted(outcomes.items(), key=lambda item: _merit(options.measure, item[1]))

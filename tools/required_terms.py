@@ -6,10 +6,10 @@ First the rates: the lowest at which all terms do what they do at the usual. At 
 absence adds more than SHARE of the scene's tolerance to the RMS error of the force, with the device learned beforehand
 and frozen or while it is learned, is in. All others are left out together. What rates and terms do is judged on samples
 1 (frozen, too), 2 and 3: it stays within JUDGED of the tolerance, or adds no more than SHARE of it; otherwise the rates
-are none, and the term that counts most is put back. A scene that the full model does not meet decides nothing. With the
-choice every search is tried. Costs are of this machine. Finished runs are kept, by what they depend on, in
-build/required_terms.json. `--store` puts every scene, as it is done, into the file that comes with the package. All
-devices are synthetic.
+are none, and the term that counts most is put back, until the rest may go; what was put back before that is tried
+again. A scene that the full model does not meet decides nothing. With the choice every search is tried. Costs are of
+this machine. Finished runs are kept, by what they depend on, in build/required_terms.json. `--store` puts every scene,
+as it is done, into the file that comes with the package. All devices are synthetic.
 """
 
 import argparse
@@ -84,15 +84,10 @@ def measure(name: str, runs: Runs, samples: tuple[str, ...] = SAMPLES, seconds: 
     rates = tuple(AtRates(*hz, judge((), hz), NO_COST) for hz in RATES_HZ)
     hz = cheapest(rates, tolerance_N)
     terms = _alone(lambda out, mode: case(out, hz, samples[0], mode), scene.signal.is_known_ahead, runs)
-    needed = set(required(terms, tolerance_N, SHARE))
-    if not is_met(rates[0].judged, tolerance_N):
-        needed = set(TERMS)  # nothing can be told from a scene that the full model does not meet
-    while True:
-        left_out = tuple(term for term in TERMS if term not in needed)
-        judged = judge(left_out, hz)
-        if not left_out or all(is_good(item, tolerance_N) for item in judged):
-            break
-        needed.add(max((item for item in terms if item.term in left_out), key=lambda item: item.added_N).term)
+    left_out: tuple[str, ...] = ()  # nothing can be told from a scene that the full model does not meet
+    if is_met(rates[0].judged, tolerance_N):
+        left_out = spared(terms, tolerance_N, lambda out: all(is_good(item, tolerance_N) for item in judge(out, hz)))
+    judged = judge(left_out, hz)
     searched = {search: case(left_out, hz, samples[0], True, search) for search in RUNTIME_SOLVERS}
     found = runs(searched.values())
     searches = tuple(WithSearch(search, found[each], NO_COST) for search, each in searched.items())
@@ -113,6 +108,23 @@ def _alone(case: Callable[[Iterable[str], bool], Case], is_known_ahead: bool, ru
         )
         terms.append(Without(term, frozen_N, learning_N, NO_COST))
     return tuple(terms)
+
+
+def spared(terms: tuple[Without, ...], tolerance_N: float, does: Callable[[Iterable[str]], bool]) -> tuple[str, ...]:
+    """The terms to leave out. `does` says whether a scene does without some.
+
+    Of those that are not required the one that counts most is put back, until the rest may go together. Beside what
+    followed it one may not be needed any more: those put back are tried again, the one that counts least first.
+    """
+    needed = required(terms, tolerance_N, SHARE)
+    out = [item.term for item in sorted(terms, key=lambda item: item.added_N) if item.term not in needed]
+    back: list[str] = []
+    while out and not does(out):
+        back.append(out.pop())
+    for term in reversed(back[:-1]):
+        if does([*out, term]):
+            out.append(term)
+    return tuple(term for term in TERMS if term in out)
 
 
 def cheapest(rates: tuple[AtRates, ...], tolerance_N: float) -> tuple[int, int]:
@@ -150,7 +162,7 @@ def is_good(item: Judged, tolerance_N: float) -> bool:
     return item.chosen_N <= max(JUDGED * tolerance_N, item.full_N + SHARE * tolerance_N)
 
 
-def main() -> int:
+def main(arguments: list[str] | None = None) -> int:
     """Measures the scenes that are named, or all that are shipped; 0, or 2 for one that cannot be measured."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="name or file; default: every shipped one")
@@ -160,7 +172,7 @@ def main() -> int:
     parser.add_argument("--costs", action="store_true", help="of stored scenes measure nothing but the costs anew")
     parser.add_argument("--kept", type=Path, default=KEPT, help="JSON file that keeps finished runs")
     executors.add_options(parser, 1, needed="tormagd, and tools/ on their path")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     known = {scene.name: scene for scene in measured().scenes}
     names = options.scenes or (list(known) if options.costs else list(shipped_scenes()))
     if options.costs and not set(names) <= set(known):

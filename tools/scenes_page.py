@@ -1,5 +1,5 @@
-"""docs/scenes.md and its pictures, from what `required_terms.py --store` measured, and from the parts `wrong_model` and
-`unmet` of docs/evidence; nothing is measured here.
+"""docs/scenes.md and its pictures, from what `required_terms.py --store` measured, and from the parts `recordings`,
+`spare`, `rates`, `wrong_model` and `unmet` of docs/evidence; nothing is measured here.
 
 scenes_page.py [--out docs]
 """
@@ -10,18 +10,26 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from benchmarks.scenes import core_without, draw, figures
 from matplotlib.figure import Figure
+from recorded_scenes import RECORDED
 from rendering.scene_runs import ROOT
 
 from tormagd.ctl.scene import TOLERANCES
-from tormagd.scenes.measured import JUDGED, MeasuredScene, is_met, measured, on_first, required
+from tormagd.scenes.measured import JUDGED, Measured, MeasuredScene, is_met, measured, on_first, required
 from tormagd.scenes.scene import TERMS, Scene, load_scene, scene_path, shipped_scenes, terms_of
 from tormagd.scenes.signal import asked
 
 PICTURE, TRADE = Path("images") / "scenes.png", Path("images") / "scene_trade.png"
 EVIDENCE = ROOT / "docs" / "evidence"
 DRAWN_S, DRAWN_HZ = 12.0, 100
+SAYS = {recorded.scene: recorded.says for recorded in RECORDED}
+_RECORDINGS = (
+    "## Recordings\n\nThe public recordings are no part of the package. `tools/recorded_scenes.py` makes scenes of "
+    "them, as the [guide](guides/scene.md#step-by-step) says and `tormagctl scene new` proposes, and measures them "
+    "like the others."
+)
 
 
 def main() -> int:
@@ -40,7 +48,8 @@ def page() -> str:
     """The whole page."""
     file = measured()
     known = {scene.name: scene for scene in file.scenes}
-    met = tuple(scene for scene in file.scenes if is_met(scene.judged, scene.tolerance_N))
+    recordings = msgspec.convert(_evidence("recordings"), Measured).scenes
+    met = _met(file.scenes)
     parts = [
         _head(file.share),
         "| scene | asked | tolerance | device gives | out | search | RMS all terms / chosen | cost all / chosen | "
@@ -51,12 +60,18 @@ def page() -> str:
         "500 plans a second, and with what was chosen at the rates chosen.",
         f"![what the scenes ask for over time](<{PICTURE.as_posix()}>)",
         _trade(met),
-        _counts(met),
+        _counts(met + _met(recordings)),
         _rates(file.scenes),
         _solver(file.scenes),
-        *(_scene(scene, file.share) for scene in file.scenes),
+        *(_scene(scene, load_scene(scene.name).description, file.share) for scene in file.scenes),
+        _RECORDINGS,
+        *(_scene(scene, SAYS[scene.name], file.share) for scene in recordings),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _met(scenes: tuple[MeasuredScene, ...]) -> tuple[MeasuredScene, ...]:
+    return tuple(scene for scene in scenes if is_met(scene.judged, scene.tolerance_N))
 
 
 def _head(share: float) -> str:
@@ -87,8 +102,9 @@ def _head(share: float) -> str:
         f"adds more than {share:.0%} of the tolerance to the RMS error of the force on sample 1, with the device "
         "learned before and frozen, or while it is learned: learning hides what a term does. What is out is left out "
         f"together, and judged on samples 1, 2 and 3: within {JUDGED:g} of the tolerance, or no more than {share:.0%} "
-        "of it worse than with all terms; otherwise the term that counts most is put back. `tormagctl scene explain "
-        "NAME` prints a decision, and what changes at half and at twice the tolerance."
+        "of it worse than with all terms; otherwise the term that counts most is put back, until it is, and those put "
+        "back before the last are tried again. `tormagctl scene explain NAME` prints a decision, and what changes at "
+        "half and at twice the tolerance."
     )
 
 
@@ -128,15 +144,84 @@ def _counts(scenes: tuple[MeasuredScene, ...]) -> str:
             f"| `{term}` | {', '.join(inside) or 'none'} | {1e3 * _added(worst, term):.1f} mN, "
             f"{_added(worst, term) / worst.tolerance_N:.0%} of the tolerance of `{worst.name}` |"
         )
-    never = [f"`{term}`" for term in TERMS if all(term in scene.left_out for scene in scenes)]
-    said = (
-        f"No measured scene requires {', '.join(never)}: on sample 1, whose motors are those that the loop is tuned "
-        "for, and at these tolerances. They are in by default because other devices and setpoints are not these."
-        if never
-        else "Each is required by some scene."
-    )
     table = "| term | required by | most that its absence adds |\n| --- | --- | --- |\n" + "\n".join(rows)
-    return f"## Which terms count\n\nOf the scenes that are met.\n\n{table}\n\n{said}"
+    never = [f"`{term}`" for term in TERMS if all(term in scene.left_out for scene in scenes)]
+    parts = [
+        "## Which terms count",
+        "Of the scenes and [recordings](#recordings) that are met.",
+        table,
+        f"No scene requires {', '.join(never)}. {_spare(scenes)}" if never else "Each is required by some scene.",
+        _relaxation(scenes),
+        _rate_error(),
+    ]
+    return "\n\n".join(parts)
+
+
+def _spare(scenes: tuple[MeasuredScene, ...]) -> str:
+    """Of the terms that no scene requires, what they do elsewhere."""
+    found = _evidence("spare")
+    added_N = {
+        f"`{scene}`, {sample.replace('_', ' ')}": terms
+        for scene, samples in found["added_N"].items()
+        for sample, terms in samples.items()
+    }
+    terms = list(next(iter(added_N.values())))
+    forces = [[name, *(f"{1e3 * more_N:.1f}" for more_N in row.values())] for name, row in added_N.items()]
+    motion = [
+        [
+            without,
+            *(
+                f"{row['overshoot']:.1%}, {1e3 * row['settling_s']:.0f} ms, {1e3 * row['stroke_s']:.0f} ms"
+                for row in samples.values()
+            ),
+        ]
+        for without, samples in found["motion"].items()
+    ]
+    return (
+        f"None of them takes more than {_most_saved(scenes, terms):.2f} % of a core. Sample 1 chooses, whose motors "
+        "are those that the loop is tuned for. On the others (`tools/spare_terms.py`, while the device is learned) "
+        f"each adds, left out alone, mN:\n\n{_table(['scene', *terms], forces)}\n\n"
+        "`friction` and `pull` are there for the gap's motion. Steps of 1 mm overshoot by, settle within 5 % in, and "
+        "the stroke takes, on samples 1 to 3:\n\n"
+        f"{_table(['without', '1', '2', '3'], motion)}"
+    )
+
+
+def _relaxation(scenes: tuple[MeasuredScene, ...]) -> str:
+    return (
+        "`relaxation` is one term, and not one for each of its times: all of them together take no more than "
+        f"{_most_saved(scenes, ['relaxation']):.2f} % of a core, so that one of them has hardly anything to save."
+    )
+
+
+def _most_saved(scenes: tuple[MeasuredScene, ...], terms: list[str]) -> float:
+    """What leaving one of the terms out saves at most, % of a core."""
+    return max(scene.saved_us_s(item) for scene in scenes for item in scene.terms if item.term in terms) / 1e4
+
+
+def _rate_error() -> str:
+    found = _evidence("rates")
+    worst_N, force_N, rate_mm_s = max(
+        (error_N, force_N, rate_mm_s)
+        for force_N, row in found["error_N"].items()
+        for error_N, rate_mm_s in zip(row, found["rates_mm_s"], strict=True)
+    )
+    frozen_N = found["frozen_N"]
+    rows = [[swings, *(f"{1e3 * missed_N:.1f}" for missed_N in missed.values())] for swings, missed in frozen_N.items()]
+    return (
+        f"**Where leaving a term out lowers the error.** `{found['scene']}`, learned and frozen, is followed better "
+        "without `rate`, `offset` or `relaxation`. There the model is wrong on the very device that it was learned "
+        f"from: right at 42 mm/s, at {rate_mm_s:g} mm/s and {force_N} N it says {1e3 * worst_N:.0f} mN too much "
+        "(`tools/rate_error.py`), for the device's friction falls within a few mm/s, and the network's later. As the "
+        "handle swings the offset follows that error to and fro, and frozen it keeps what it was in one moment. A "
+        "handle that swings where the model is right shows what the terms do. RMS frozen on sample 1, mN, without\n\n"
+        f"{_table(['handle', *next(iter(frozen_N.values()))], rows)}"
+    )
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def _added(scene: MeasuredScene, term: str) -> float:
@@ -187,7 +272,7 @@ def _rates(scenes: tuple[MeasuredScene, ...]) -> str:
     for scene in scenes:
         cells = [f"{1e3 * on_first(at.judged).chosen_N:.1f}" for at in scene.rates]
         rows.append(f"| `{scene.name}` | {1e3 * scene.tolerance_N:g} | " + " | ".join(cells) + " |")
-    met = [scene for scene in scenes if is_met(scene.judged, scene.tolerance_N)]
+    met = _met(scenes)
     chosen = sorted({scene.hz for scene in met})
     twice = max(_gain(scene) for scene in met)
     said = ", ".join(f"{control} / {inference}" for control, inference in chosen)
@@ -229,8 +314,7 @@ def _solver(scenes: tuple[MeasuredScene, ...]) -> str:
     )
 
 
-def _scene(scene: MeasuredScene, share: float) -> str:
-    stated = load_scene(scene.name)
+def _scene(scene: MeasuredScene, description: str, share: float) -> str:
     needed = {factor: required(scene.terms, factor * scene.tolerance_N, share) for factor in TOLERANCES}
     rows = [
         f"| `{item.term}` | {'out' if item.term in scene.left_out else 'in'} | {1e3 * item.frozen_added_N:.1f} | "
@@ -252,7 +336,7 @@ def _scene(scene: MeasuredScene, share: float) -> str:
         else f" **Not met**: with all terms {1e3 * missed_N:.0f} mN.{_why_not(scene.name)}"
     )
     return (
-        f"## `{scene.name}`\n\n{stated.description} Tolerance {1e3 * scene.tolerance_N:g} mN.{not_met}\n\n"
+        f"## `{scene.name}`\n\n{description} Tolerance {1e3 * scene.tolerance_N:g} mN.{not_met}\n\n"
         "| term | required | added, frozen, mN | added, learning, mN | saves | at half the tolerance | at twice |\n"
         "| --- | --- | --- | --- | --- | --- | --- |\n" + "\n".join(rows) + "\n\n"
         f"All terms at 1000 / 500 Hz / the required ones at {scene.control_hz} / {scene.inference_hz} Hz, mN: "

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tormagd.ctl.main import main
-from tormagd.ctl.waveform import SHAPES, WaveformError, beat, read_csv, shape
+from tormagd.ctl.waveform import SHAPES, beat, read_csv, shape
+from tormagd.force_file import ForceFileError
 from tormagd.messages import Setpoint
 
 
@@ -136,17 +137,17 @@ def test_what_is_no_regular_file_is_refused_rather_than_waited_for(tmp_path, cap
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(WaveformError, match="No such file"):
+    with pytest.raises(ForceFileError, match="No such file"):
         read_csv(tmp_path / "none.csv")
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes_are_a_waveform_or_a_waveform_error(tmp_path_factory, data):
+def test_any_bytes_are_a_waveform_or_refused(tmp_path_factory, data):
     file = Path(tmp_path_factory.getbasetemp()) / "any.csv"
     file.write_bytes(b"t_s,force_N\n" + data)
     try:
         waveform = read_csv(file)
-    except WaveformError:
+    except ForceFileError:
         return
     assert 0.0 <= waveform.at(waveform.duration_s / 2).force_N <= 1_000.0
 

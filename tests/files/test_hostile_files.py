@@ -12,8 +12,9 @@ from hostile_files import HOSTILE, KINDS, make
 from tormagd.bounded_file import read_bounded, require_regular
 from tormagd.config import ConfigError, load_config
 from tormagd.control.profile import ProfileError
-from tormagd.ctl.waveform import WaveformError, read_csv
+from tormagd.ctl.waveform import read_csv
 from tormagd.daemon.profiles import ProfileFolder
+from tormagd.force_file import ForceFileError
 from tormagd.keys import load_pair
 from tormagd.model.model_file import ModelFileError, load_model
 from tormagd.output import printable
@@ -46,7 +47,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "key": read_key,
     "profile": read_profile,
 }
-REFUSALS = (ConfigError, PlantError, ModelFileError, WaveformError, ProfileError)
+REFUSALS = (ConfigError, PlantError, ModelFileError, ForceFileError, ProfileError)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -47,14 +47,14 @@ def test_a_recording_is_smooth_between_its_rows_and_keeps_to_the_range(tmp_path:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", ("first line is ''", "t_s,force_N")),
+        ("", ("no column t_s", "t_s,force_N")),
         ("time,force\n0,1\n", ("'time,force'",)),
-        ("t_s,force_N\n0,1\n", ("(1, 2) values",)),
-        ("t_s,force_N\n0,1\n1,one\n", ("one",)),
-        ("t_s,force_N\n0,1\n0,2\n", ("times that rise",)),
+        ("t_s,force_N\n0,1\n", ("1 rows",)),
+        ("t_s,force_N\n0,1\n1,one\n", ("row 3, force_N = 'one'",)),
+        ("t_s,force_N\n0,1\n0,2\n", ("row 3, t_s = 0", "above the row before")),
         ("t_s,force_N\n0,1\n1,nan\n", ("finite",)),
-        ("t_s,force_N\n0,-1\n1,1\n", ("-1..1 N", "0..1000")),
-        ("t_s,force_N\n0,1,2\n1,1,2\n", ("(2, 3) values",)),
+        ("t_s,force_N\n0,-1\n1,1\n", ("row 2, force_N = -1", "0..1000")),
+        ("t_s,force_N\n0,1,2\n1,1,2\n", ("row 2 has 3 values",)),
     ],
 )
 def test_a_file_that_is_no_recording_is_refused(tmp_path: Path, text: str, words: tuple[str, ...]) -> None:

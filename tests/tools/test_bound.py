@@ -296,8 +296,8 @@ def test_the_command_prints_the_three_figures(monkeypatch, capsys, tmp_path) -> 
 @pytest.mark.parametrize(
     ("text", "arguments", "said"),
     [
-        ("t_s,force_N\n0,1\n1,nan\n2,1\n", [], "force_N = nan"),
-        ("t_s,force_N\n0,1\n1,1\n1,1\n", [], "t_s = 1.0"),
+        ("t_s,force_N\n0,1\n1,nan\n2,1\n", [], "row 3, force_N = 'nan'"),
+        ("t_s,force_N\n0,1\n1,1\n1,1\n", [], "row 4, t_s = 1"),
         ("t_s,force_N\n0,1\n1,1\n1e4,1\n", [], "t_s = 0.0 .. 10000.0"),
         ("t_s,force_N\n0,1\n1,1\n2,1\n", ["--step-ms", "2"], "step_s = 0.002"),
         ("t_s,force_N\n0,1\n1,1\n2,1\n", ["--hand-mm-s", "0"], "hand_mm_s = 0.0"),

@@ -21,7 +21,7 @@ from tormagd.config import Config, Motor
 from tormagd.control.motor import margins, zero_order_hold
 from tormagd.control.plan import Plan
 from tormagd.control.step import Stepper
-from tormagd.scenes.scene import load_scene
+from tormagd.scenes.scene import EVERY_TERM, load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand, SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
@@ -109,11 +109,12 @@ def run(plant_name: str = "sample_1", config: Config | None = None) -> dict[str,
     }
 
 
-def settled_loop(config: Config, parameters: PlantParameters) -> ClosedLoop:
-    """A loop that is homed, enabled, and at rest at START_MM."""
+def settled_loop(config: Config, parameters: PlantParameters, left_out: tuple[str, ...] = ()) -> ClosedLoop:
+    """A loop without these terms that is homed, enabled, and at rest at START_MM."""
     # a handle in motion would feel forces over the scene's at the closed end, which is a fault
     device = VirtualDevice(parameters, RecordedHand((0.0,), (0.0,)), seed=1)
-    loop = ClosedLoop(config, Stepper(config, load_scene("coronary")), None, device)
+    scene = msgspec.structs.replace(load_scene("coronary"), terms=EVERY_TERM.without(*left_out))
+    loop = ClosedLoop(config, Stepper(config, scene), None, device)
     loop.arm(hold(95.0, 0.0))
     drive(loop, START_MM, 3.0)
     return loop

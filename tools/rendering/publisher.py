@@ -13,6 +13,8 @@ Array = npt.NDArray[np.float64]
 RATE_HZ = 500
 PREVIEW_S = 0.07
 "How far a preview tells what follows."
+FILE_PREVIEW_S = 0.4
+"How far one does that plays a recording."
 
 
 def publisher(

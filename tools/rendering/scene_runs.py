@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from rendering.publisher import PREVIEW_S, publisher
+from rendering.publisher import FILE_PREVIEW_S, publisher
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, Rates
 from tormagd.control.core import Core, build_core
@@ -190,7 +190,7 @@ class _Play:
         forces = np.concatenate([np.full(len(before_s), self.force_N[0]), self.force_N])
         is_known = scene.signal is not None and scene.signal.is_known_ahead
         self.publish: Callable[[float], TimedSetpoint | None] = publisher(
-            times, forces, PREVIEW_S if is_known else 0.0, VALID_S
+            times, forces, FILE_PREVIEW_S if is_known else 0.0, VALID_S
         )
 
     def ticks(self, seconds: float) -> Iterable[tuple[float, ClosedLoop]]:

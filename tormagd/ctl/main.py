@@ -181,6 +181,7 @@ def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
 def _send(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
     from tormagd.ctl.send import Stream, send
     from tormagd.ctl.waveform import WaveformError, read_csv, shape
+    from tormagd.force_file import ForceFileError
     from tormagd.messages import MAX_PREVIEW_SAMPLES
 
     # a CSV file lasts as long as it is unless it is to be cut; a computed shape lasts ten seconds
@@ -191,7 +192,7 @@ def _send(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
         else:
             duration_s = options.duration or 10.0
             waveform = shape(options.what, options.from_N, options.to_N, options.frequency, duration_s)
-    except WaveformError as error:
+    except (WaveformError, ForceFileError) as error:
         raise usage_error(str(error), "correct it and send again; tormagctl send --help shows the choices") from error
     if options.valid_for_ms < 1e3 / options.rate:
         raise usage_error(

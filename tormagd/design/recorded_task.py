@@ -1,6 +1,5 @@
-"""A recorded task as points of the phase plane: a setpoint CSV in, forces and force rates out."""
+"""A recorded task as points of the phase plane: a file of forces in, forces and force rates out."""
 
-import csv
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,12 +7,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import butter, sosfiltfilt
 
-from tormagd.bounded_file import MOST_TABLE_BYTES, require_regular
+from tormagd.force_file import read_forces
 from tormagd.physics.errors import DomainError, require
 
 Array = npt.NDArray[np.float64]
 
-COLUMNS = ("t_s", "force_N")
 MIN_ROWS = 3
 MAX_TIME_S = 1e9
 MAX_FORCE_N = 1e6
@@ -29,24 +27,9 @@ class RecordedTask(NamedTuple):
 
 
 def read_task(path: Path, cutoff_Hz: float | None = None) -> RecordedTask:
-    """The task in a CSV with the columns `t_s,force_N` (others are ignored), at any spacing in time; see `task_of`.
-
-    Raises `DomainError` naming file, line and value for a file that is not that, and `OSError`.
-    """
-    times, forces = [], []
-    require_regular(path, MOST_TABLE_BYTES)
-    with path.open(newline="", encoding="utf-8") as file:
-        try:
-            rows = csv.DictReader(file, strict=True)
-            missing = [name for name in COLUMNS if name not in (rows.fieldnames or ())]
-            if missing:
-                raise DomainError(str(path), rows.fieldnames, f"a header with {', '.join(COLUMNS)}")
-            for row in rows:
-                times.append(_number(row["t_s"], f"{path}:{rows.line_num} t_s"))
-                forces.append(_number(row["force_N"], f"{path}:{rows.line_num} force_N"))
-        except (csv.Error, UnicodeDecodeError) as error:
-            raise DomainError(str(path), error, "a CSV file in UTF-8") from error
-    return task_of(np.array(times), np.array(forces), cutoff_Hz)
+    """The task in a file of forces; see `task_of`. Raises `ForceFileError` and `DomainError`."""
+    table = read_forces(path)
+    return task_of(np.array(table["t_s"]), np.array(table["force_N"]), cutoff_Hz)
 
 
 def task_of(time_s: Array, force_N: Array, cutoff_Hz: float | None = None) -> RecordedTask:
@@ -80,10 +63,3 @@ def _low_pass(time_s: Array, force_N: Array, cutoff_Hz: float, spacing_s: float)
     padding = min(len(even_N) - 1, 3 * (2 * _ORDER + 1))
     smooth: Array = sosfiltfilt(butter(_ORDER, cutoff_Hz, fs=rate_Hz, output="sos"), even_N, padlen=padding)
     return even_s, smooth
-
-
-def _number(text: str | None, where: str) -> float:
-    try:
-        return float(text or "")
-    except ValueError:
-        raise DomainError(where, repr(text), "a number") from None

@@ -1,6 +1,5 @@
 """The force that a scene asks for over time, as numbers."""
 
-import io
 import math
 from pathlib import Path
 
@@ -8,43 +7,21 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET
 
-from tormagd.bounded_file import read_bounded
 from tormagd.config import ConfigError
+from tormagd.force_file import ForceFileError, read_forces
 from tormagd.scenes.scene import Signal
 
 Array = npt.NDArray[np.float64]
 
-COLUMNS = "t_s,force_N"
-MOST_ROWS = 1_000_000
-MOST_BYTES = 64_000_000
-MOST_N = 1_000.0
-
 
 def recorded(path: Path) -> tuple[Array, Array]:
-    """Times, s, and forces, N (n each), of a CSV with the columns t_s,force_N. Raises ConfigError: file and value."""
+    """Times from the first row on, s, and forces, N (n each), of a file of forces. Raises ConfigError."""
     try:
-        file = io.StringIO(read_bounded(path, MOST_BYTES).decode())
-    except OSError as error:
-        raise ConfigError(f"signal.file = {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"signal.file = {path}: {error}: allowed is UTF-8") from error
-    header = file.readline(200).strip()
-    if header != COLUMNS:
-        raise ConfigError(f"signal.file = {path}: its first line is {header!r}: allowed is {COLUMNS}")
-    try:
-        rows = np.loadtxt(file, delimiter=",", ndmin=2, max_rows=MOST_ROWS + 1)
-    except ValueError as error:
-        raise ConfigError(f"signal.file = {path}: {error}") from error
-    if not 2 <= len(rows) <= MOST_ROWS or rows.shape[1] != 2:
-        raise ConfigError(f"signal.file = {path}: {rows.shape} values: allowed are 2 columns of 2..{MOST_ROWS} rows")
-    time_s, force_N = rows.T
-    if not (np.all(np.isfinite(rows)) and np.all(np.diff(time_s) > 0.0)):
-        raise ConfigError(f"signal.file = {path}: allowed are finite numbers, and times that rise from row to row")
-    if not (force_N.min() >= 0.0 and force_N.max() <= MOST_N):
-        raise ConfigError(
-            f"signal.file = {path}: forces of {force_N.min():g}..{force_N.max():g} N: allowed is 0..{MOST_N:g}"
-        )
-    return time_s - time_s[0], force_N
+        table = read_forces(path)
+    except ForceFileError as error:
+        raise ConfigError(f"signal.file = {error}") from error
+    time_s = np.array(table["t_s"])
+    return time_s - time_s[0], np.array(table["force_N"])
 
 
 def asked(

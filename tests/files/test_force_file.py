@@ -1,0 +1,49 @@
+"""A force over time has one reader, whoever it is for: all read the same files, and refuse others in the same words."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tormagd.ctl.waveform import read_csv
+from tormagd.design.recorded_task import read_task
+from tormagd.scenes.signal import recorded
+
+READERS: tuple[Callable[[Path], object], ...] = (read_csv, recorded, read_task)
+
+
+@pytest.mark.parametrize("text", ["t_s,force_N\n0,1\n1,2\n3,1\n", "rate_mm_s,force_N,t_s\n5,1,7\n5,2,8\n-5,0,9.5\n"])
+def test_all_read_the_same_files(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "task.csv"
+    path.write_text(text)
+    sent, (time_s, force_N), task = read_csv(path), recorded(path), read_task(path)
+    assert [sent.at(at_s).force_N for at_s in time_s] == force_N.tolist() == task.force_N.tolist()
+    assert (task.time_s - task.time_s[0]).tolist() == time_s.tolist()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "t_s,force_N\n0,1\n",
+        "t_s,force_N\n0,1\n1,-0.5\n2,1\n",
+        "t_s,force_N\n0,1\n1,1001\n2,1\n",
+        "t_s,force_N\n0,1\n1,nan\n2,1\n",
+        "t_s,force_N\n0,1\n1,1_5\n2,1\n",
+        "t_s,force_N\n0,1\n0,2\n2,1\n",
+        "t_s,force_N\n0,1\n1\n2,1\n",
+        "t_s,force_N,mood\n0,1,2\n1,1,2\n2,1,2\n",
+        't_s,force_N\n0,"1\n',
+        None,
+    ],
+)
+def test_the_same_mistake_is_told_in_the_same_words(tmp_path: Path, text: str | None) -> None:
+    path = tmp_path / "task.csv"
+    if text is not None:
+        path.write_text(text)
+    said = set()
+    for read in READERS:
+        with pytest.raises(ValueError, match=str(path)) as refused:
+            read(path)
+        said.add(str(refused.value).removeprefix("signal.file = "))
+    assert len(said) == 1

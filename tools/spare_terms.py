@@ -1,0 +1,69 @@
+"""What the terms do that no scene requires of sample 1: left out on other devices, and in the motion of the gap.
+
+    spare_terms.py [--json]
+
+The force is that of SCENES at the rates chosen for them, while the device is learned; the motion is that of steps of
+1 mm, both ways over the stroke, and of the stroke itself. All devices are synthetic.
+"""
+
+import argparse
+import json
+import sys
+
+from benchmarks.step import START_MM, STEP_MM, overshoot_over_stroke, settled_loop, step, stroke
+from force_tracking import SAMPLES
+from rendering.scene_runs import Case, run
+
+from tormagd.config import Config
+from tormagd.scenes.measured import measured
+from tormagd.simulation.parameters import load_plant
+
+SCENES = "pulse", "coronary"
+SPARE = "slope", "lag", "friction", "pull"
+MOVING = "", "friction", "pull"
+
+
+def main() -> int:
+    """Prints both tables; 0."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    options = parser.parse_args()
+    rates = {scene.name: scene.hz for scene in measured().scenes}
+    added_N = {name: {sample: added(name, sample, rates[name]) for sample in SAMPLES[1:]} for name in SCENES}
+    motion = {without or "nothing": {sample: moved(sample, without) for sample in SAMPLES} for without in MOVING}
+    if options.json:
+        print(json.dumps({"added_N": added_N, "motion": motion}))
+        return 0
+    for name, samples in added_N.items():
+        for sample, terms in samples.items():
+            rows = ", ".join(f"{term} {1e3 * more_N:.1f}" for term, more_N in terms.items())
+            print(f"{name:10s}{sample}  added, mN, without {rows}")
+    for without, found in motion.items():
+        for sample, row in found.items():
+            print(
+                f"without {without:10s}{sample}  overshoot {row['overshoot']:.1%}, settling "
+                f"{1e3 * row['settling_s']:.0f} ms, stroke {1e3 * row['stroke_s']:.0f} ms"
+            )
+    return 0
+
+
+def added(scene: str, sample: str, hz: tuple[int, int]) -> dict[str, float]:
+    """What each term's absence adds to the RMS error of the force, N, at rates of control and of inference."""
+    full_N = run(Case(scene, sample, (), "", True, *hz))
+    return {term: run(Case(scene, sample, (term,), "", True, *hz)) - full_N for term in SPARE}
+
+
+def moved(sample: str, without: str) -> dict[str, float]:
+    """The greatest overshoot, the longer settling of both ways at START_MM, and the time of the stroke."""
+    loop = settled_loop(Config(), load_plant(sample), (without,) if without else ())
+    steps = step(loop, START_MM + STEP_MM), step(loop, START_MM)
+    stroke_s = stroke(loop)
+    return {
+        "overshoot": overshoot_over_stroke(loop),
+        "settling_s": max(each.settling_5pct_s for each in steps),
+        "stroke_s": stroke_s,
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())
