@@ -52,7 +52,8 @@ set -e
 if [ "$1" = remove ] && [ -d /run/systemd/system ]; then
     systemctl stop 'tormag-record*.service' 'tormagd*.service' tormag.target || true
     # a template's name stands for all its instances
-    systemctl disable --quiet tormag.target tormagd.service tormagd@.service tormag-record.service tormag-record@.service 2>/dev/null || true
+    systemctl disable --quiet tormag.target tormagd.service tormagd@.service tormag-record.service tormag-record@.service \
+        2>/dev/null || true
 fi
 find /usr/lib/tormagd -name __pycache__ -prune -exec rm -rf {} +
 END

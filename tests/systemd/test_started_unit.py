@@ -66,7 +66,7 @@ def files(machine) -> set[str]:
 def shown(section: str) -> str:
     """The configuration that a section of the guide shows."""
     text = GUIDE.read_text(encoding="utf-8").split(f"\n## {section}\n")[1]
-    return textwrap.dedent(re.search(r"(?:^    [\[\w].*\n)+", text, re.MULTILINE)[0])
+    return textwrap.dedent(re.findall(r"(?:^    [\[\w].*\n)+", text, re.MULTILINE)[0])
 
 
 def test_the_service_from_its_installation_to_its_removal(package, machine, imports):
