@@ -8,8 +8,8 @@ KEY = "Figures"
 
 
 def stamp(figures: object) -> dict[str, str | None]:
-    """The metadata of a PNG drawn from `figures`, which are plain data: their digest, and nothing that changes with time
-    or version, so that the same figures make the same file."""
+    """The metadata of a PNG drawn from `figures`, which are plain data: their digest, and nothing that changes with
+    time or version, so that the same figures make the same file."""
     return {KEY: hashlib.sha256(msgspec.json.encode(figures, order="sorted")).hexdigest(), "Software": None}
 
 
