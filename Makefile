@@ -30,7 +30,7 @@ SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict --quiet
 
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
-.PHONY: install uninstall deb run test unhurried live yielding-check search pythons check docs format compile core fetched model tactile-model reproduction evidence clean
+.PHONY: install uninstall deb run test unhurried live yielding-check coverage search pythons check docs format compile core fetched model tactile-model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -51,6 +51,14 @@ yielding-check: $(VENV)/.dev
 unhurried: $(VENV)/.dev
 	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live and not interpreted'
 	TORMAG_COMPILED=0 $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' $(CORE_TESTS)
+
+# which lines of the two packages the tests without real time run; nothing compiled is seen, so the rooms that are compiled in
+# part are asked again, interpreted. pyproject.toml has the least share
+coverage: $(VENV)/.dev
+	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live and not interpreted' \
+	    --cov --cov-report= --cov-fail-under=0
+	TORMAG_COMPILED=0 $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' --cov --cov-append \
+	    $(CORE_TESTS) tests/physics tests/inverse tests/hardware tests/simulation tests/daemon
 
 # other cases of every property than those of `make test`, until one fails or SEARCHES rounds are done
 search: $(VENV)/.dev
@@ -141,7 +149,7 @@ deb: $(VENV)/.man
 	BUILD_PYTHON=$(BIN)/python BUILD_LIBRARY='$(CURDIR)/build/library' systemd/deb.sh build/library build
 
 clean:
-	rm -rf $(VENV) build run .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build run .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage*
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)

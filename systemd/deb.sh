@@ -50,8 +50,10 @@ cat > "$root/DEBIAN/prerm" <<'END'
 #!/bin/sh
 set -e
 if [ "$1" = remove ] && [ -d /run/systemd/system ]; then
-    systemctl stop 'tormag-record*.service' 'tormagd*.service' || true
-    systemctl disable --quiet --now tormag.target tormagd.service tormag-record.service 2>/dev/null || true
+    systemctl stop 'tormag-record*.service' 'tormagd*.service' tormag.target || true
+    # a template's name stands for all its instances
+    systemctl disable --quiet tormag.target tormagd.service tormagd@.service tormag-record.service tormag-record@.service \
+        2>/dev/null || true
 fi
 find /usr/lib/tormagd -name __pycache__ -prune -exec rm -rf {} +
 END

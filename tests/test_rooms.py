@@ -51,14 +51,15 @@ TOOL_ROOMS = {
     "machines": set(),
     "consoles": set(),
     "wire": set(),
-    "thesis": set(),
+    "pictures": set(),
+    "thesis": {"pictures"},
     "motor": set(),
     "extremes": set(),
     "first_use": set(),
     "rendering": {"machines"},
     "fault_matrix": {"wire"},
-    "benchmarks": {"machines", "consoles", "wire", "thesis", "rendering"},
-    "tactile": {"thesis", "rendering", "benchmarks"},
+    "benchmarks": {"machines", "consoles", "wire", "pictures", "thesis", "rendering"},
+    "tactile": {"pictures", "thesis", "rendering", "benchmarks"},
     "intrusion": {"machines", "rendering", "benchmarks"},
 }
 """Of the tools; beside them stand the scripts, which no room imports. What is the product's is open to all."""

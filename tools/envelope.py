@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from pictures.stamp import stamp
 from rendering.device_draws import drawn_device
 from rendering.ideal_carriage import brake_of
 from tqdm import tqdm
@@ -478,7 +479,7 @@ def print_table(result: Json) -> None:
         print(f"  {shown['over_N'] * 1e3:4.0f} mN over: {shown['device']}, {shown['hand']}, {shown['forces']}{said}")
 
 
-def picture(path: Path, found: list[tuple[Case, Figures]]) -> None:
+def picture(path: Path, result: Json, found: list[tuple[Case, Figures]]) -> None:
     """Error over handle speed and asked force, once for the own sample and once for all the others."""
     from matplotlib.figure import Figure
 
@@ -500,7 +501,7 @@ def picture(path: Path, found: list[tuple[Case, Figures]]) -> None:
         axes.grid(alpha=0.3)
     own.set_ylabel("force asked, N")
     figure.colorbar(shown, ax=[own, others], label=f"rendered less asked after {SETTLED_S:g} s of sliding, mN")
-    figure.savefig(path, dpi=130)
+    figure.savefig(path, dpi=130, metadata=stamp(result))
 
 
 def main() -> int:
@@ -518,7 +519,7 @@ def main() -> int:
     result, found = measure(options)
     print(json.dumps(result)) if options.json else print_table(result)
     if options.picture is not None:
-        picture(options.picture, found)
+        picture(options.picture, result, found)
     wrong = missed(result)
     for text in wrong:
         print(f"missed: {text}", file=sys.stderr)

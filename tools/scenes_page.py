@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 from benchmarks.scenes import core_without, draw, figures
 from matplotlib.figure import Figure
+from pictures.stamp import stamp
 from recorded_scenes import RECORDED
 from rendering.scene_runs import ROOT
 
@@ -376,8 +377,8 @@ def draw_asked(path: Path) -> None:
         range_N = max(stated.force.least_N, core_without(name, ()).planner.portrait.least_N), stated.force.most_N
         axes.plot(*asked(stated.signal, Path(scene_path(name)).parent, range_N, DRAWN_S, DRAWN_HZ), label=name)
     axes.set(xlabel="time, s", ylabel="force asked, N")
-    axes.legend(fontsize=8, ncols=2)
-    figure.savefig(path, dpi=90)
+    figure.legend(fontsize=8, loc="outside right center")
+    figure.savefig(path, dpi=90, metadata=stamp(measured().scenes))
 
 
 if __name__ == "__main__":

@@ -25,8 +25,8 @@ ENDPOINTS = ("setpoint", "telemetry", "control", "recording")
 ROLES = ("publish", "operate", "observe")
 
 T = TypeVar("T")
-_OURS = re.compile(r"([a-z_A-Z.]+) = ")
-"The key that a refusal of ours begins with."
+_OURS = re.compile(r"([a-z_A-Z.]+)(?: =|:) ")
+"The key, or the table, that a refusal of ours begins with."
 _PLACE = re.compile(r"`\$([^`]*)`")
 "The place that one of msgspec's ends with."
 _UNKNOWN = re.compile(r"unknown field `(\w+)`")
@@ -435,9 +435,10 @@ def _known_key(kind: Any, message: str) -> str:
 
 
 def _line(text: str, message: str) -> str:
-    """` (line N)` of the key that the message is about; nothing where it is none of the text's."""
-    line = line_of(text, _key_in(message))
-    return "" if line is None else f" (line {line})"
+    """` (line N)` of the key that the message is about, or of the table it is missing in; nothing without either."""
+    key = _key_in(message)
+    lines = (line_of(text, key[:size]) for size in range(len(key), 0, -1))
+    return next((f" (line {line})" for line in lines if line is not None), "")
 
 
 def _key_in(message: str) -> list[str]:

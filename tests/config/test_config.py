@@ -96,6 +96,24 @@ def test_so_does_a_refusal_that_takes_more_than_the_file(write, capsys, text: st
     assert told.endswith(f"did you mean `{meant}`? (line {line})\n")
 
 
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ('[device]\nport = "can0"\nbackend = "can"\n', 1),
+        ('[device]\nbackend = "can"\n[device.options]\nnode = 2\n', 3),
+        ("[rates]\ncontrol_hz = 1000\n[position]\nproportional_per_mm = 500.0\n", 3),
+    ],
+)
+def test_what_is_missing_or_does_not_fit_together_is_told_with_the_line_of_its_table(
+    write, capsys, text: str, line: int
+) -> None:
+    path = write(text)
+    assert main(["--config", str(path), "--check"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"tormagd: {path}: ")
+    assert told.endswith(f" (line {line})\n")
+
+
 def test_a_resolved_configuration_is_a_configuration(write) -> None:
     tables = msgspec.to_builtins(load_config(write("[motor]\nsupply_V = 24.0\n")))
     assert msgspec.convert(tables, Config).motor.supply_V == 24.0

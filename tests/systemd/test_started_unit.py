@@ -1,27 +1,73 @@
-"""The package on a machine: the unit without a device, with one, when one of both hangs; and what a removal leaves."""
+"""The package on a machine, from its installation to its removal: the unit without a device, with one, and when one of
+both hangs; what the kernel grants it; a second console beside it, with a recorder and a drop-in.
 
+One machine for all of that: to boot one, and to install on it, takes longer than most of what is shown.
+"""
+
+import re
 import textwrap
+from pathlib import Path
 
 import pytest
 
 pytestmark = pytest.mark.live
 
+GUIDE = Path(__file__).parents[2] / "systemd/README.md"
 SIMULATOR = """
 [Service]
 Environment=PYTHONPATH={library}
-ExecStart=/bin/sh -c '{python} -P -m tormagd.simulation --pty --seed 1 --truth /tmp/truth.csv | \
-    {{ read port; chgrp tormag $port; chmod 660 $port; ln -sfn $port /dev/tormag; exec cat; }}'
+ExecStart=/bin/sh -c '{python} -P -m tormagd.simulation --pty --seed 1 --truth /tmp/%i.csv | \
+    {{ read port; chgrp tormag $port; chmod 660 $port; ln -sfn $port /dev/%i; exec cat; }}'
 """
 LOG = "/tmp/tormagd.log"
+# what goes to the journal elsewhere; and the wait before a restart shows nothing
+SEEN = f"""
+[Service]
+StandardOutput=append:{LOG}
+StandardError=append:{LOG}
+RestartSec=100ms
+"""
+RAISES = "prlimit --rtprio=90:90 true && echo yes || true"
+IN_ITS_PLACE = """
+AmbientCapabilities=CAP_SYS_NICE
+CapabilityBoundingSet=CAP_SYS_NICE
+PrivateUsers=no
+"""
+"What gives the daemon real time where nobody may raise LimitRTPRIO, as in a container without CAP_SYS_RESOURCE."
+DROP_INS = "/etc/systemd/system/{unit}.service.d"
+OTHERS = ("/var/lib/dpkg", "/run/systemd")
+"What the package manager and systemd write for themselves."
+FIFO = re.compile(r"pid (\d+)'s .* policy: SCHED_FIFO.*\npid \d+'s .* priority: (\d+)")
+
+
+class Console:
+    """A console's service on a machine."""
+
+    def __init__(self, machine, unit: str) -> None:
+        self.machine, self.unit = machine, unit
+
+    def stands(self, state: str, *words: str) -> bool:
+        """Whether it is in this state, and its status says all of that."""
+        active, status = self.machine.shows(self.unit, "ActiveState", "StatusText")
+        return active == state and all(word in status for word in words)
+
+    def is_ready(self) -> bool:
+        """Whether its device is identified, and nothing else has happened."""
+        return self.stands("active", "DISABLED", "next: tormagctl home")
+
+    def restarts(self) -> int:
+        """How often systemd has started it again."""
+        (count,) = self.machine.shows(self.unit, "NRestarts")
+        return int(count)
+
+    def log(self) -> str:
+        """What it has said."""
+        return self.machine.run("cat", LOG)
 
 
 def put(machine, path: str, text: str) -> None:
     """Writes a file on the machine."""
     machine.run("sh", "-c", f"mkdir -p $(dirname {path}); cat > {path} <<'END'\n{textwrap.dedent(text)}\nEND")
-
-
-OTHERS = ("/var/lib/dpkg", "/etc/systemd/system", "/run/systemd")
-"What the package manager, this test and systemd write for themselves."
 
 
 def files(machine) -> set[str]:
@@ -31,66 +77,123 @@ def files(machine) -> set[str]:
     return {path for path in paths if not path.startswith(OTHERS)}
 
 
-def test_the_unit_is_up_with_a_device_only_and_a_hang_of_either_starts_it_again(package, machine, imports):
+def shown(section: str) -> str:
+    """The configuration that a section of the guide shows."""
+    text = GUIDE.read_text(encoding="utf-8").split(f"\n## {section}\n")[1]
+    return textwrap.dedent(re.findall(r"(?:^    [\[\w].*\n)+", text, re.MULTILINE)[0])
+
+
+def test_the_service_from_its_installation_to_its_removal(package, machine, imports):
+    console, left = Console(machine, "tormagd"), Console(machine, "tormagd@left")
     assert files(machine) == set()
+    installed(machine, package, imports)
+    it_is_up_with_a_device_only(console)
+    real_time_is_granted_to_the_daemon_alone(console)
+    what_can_change_does_and_what_cannot_is_named(console)
+    a_hang_of_either_starts_it_again(console)
+    another_console_stands_beside_it(console, left)
+    a_stop_opens_the_gap(console)
+    nothing_is_left(machine)
+
+
+def installed(machine, package, imports) -> None:
     machine.run("dpkg", "--no-triggers", "--force-unsafe-io", "--install", f"/opt/shared/package/{package.name}")
     assert {"/usr/bin/tormagd", "/usr/lib/systemd/system/tormagd@.service", "/etc/tormag"} < files(machine)
-    put(machine, "/etc/systemd/system/simulator.service", SIMULATOR.format(**imports))
-    # what goes to the journal elsewhere; and the wait before a restart shows nothing
-    put(
-        machine,
-        "/etc/systemd/system/tormagd.service.d/test.conf",
-        f"[Service]\nStandardOutput=append:{LOG}\nStandardError=append:{LOG}\nRestartSec=100ms",
-    )
+    put(machine, "/etc/systemd/system/simulator@.service", SIMULATOR.format(**imports))
+    seen = SEEN if machine.run("sh", "-c", RAISES) else SEEN + IN_ITS_PLACE
+    put(machine, f"{DROP_INS.format(unit='tormagd')}/test.conf", seen)
+    machine.run("systemctl", "enable", "tormag.target", "tormagd", "tormagd@left", "tormag-record@left")
     machine.run("systemctl", "daemon-reload")
 
-    def stands(state: str, *words: str) -> bool:
-        active, status = machine.shows("tormagd", "ActiveState", "StatusText")
-        return active == state and all(word in status for word in words)
 
-    def is_ready() -> bool:
-        return stands("active", "DISABLED", "next: tormagctl home")
-
-    def log() -> str:
-        return machine.run("cat", LOG)
-
-    # without a device it is not up, and says what it waits for
+def it_is_up_with_a_device_only(console) -> None:
+    machine = console.machine
     machine.run("systemctl", "start", "--no-block", "tormagd")
-    machine.until(lambda: stands("activating", "waiting for the device (BACK_OFF): /dev/tormag"), "it waits")
-    machine.run("systemctl", "start", "simulator")
-    machine.until(is_ready, "the device is identified")
-    assert "ready: the device is identified; next: home" in log()
+    machine.until(lambda: console.stands("activating", "waiting for the device (BACK_OFF): /dev/tormag"), "it waits")
+    machine.run("systemctl", "start", "simulator@tormag")
+    machine.until(console.is_ready, "the device is identified")
+    assert "ready: the device is identified; next: home" in console.log()
     assert machine.shows("tormagd", "NRestarts", "WatchdogUSec") == ["0", "2s"]
 
-    # what can change does, what cannot is named
+
+def real_time_is_granted_to_the_daemon_alone(console) -> None:
+    """To its control thread, and one below that to ZeroMQ's; not to the process that keeps its black box."""
+    machine = console.machine
+    main, group = machine.shows("tormagd", "MainPID", "ControlGroup")
+    processes = machine.run("cat", f"/sys/fs/cgroup{group}/cgroup.procs").split()
+    found = {each: dict(FIFO.findall(machine.run("chrt", "--all-tasks", "--pid", each))) for each in processes}
+    control = found.pop(main)
+    assert control.pop(main) == "50"
+    assert set(control.values()) == {"49"}
+    assert found
+    assert not any(found.values())
+
+
+def what_can_change_does_and_what_cannot_is_named(console) -> None:
+    machine = console.machine
     put(machine, "/tmp/change.sh", "cd /etc/tormag; echo '[sources]\npriority = [\"robot\"]' >> tormagd.toml")
     machine.run("sh", "/tmp/change.sh")
     machine.run("sed", "-i", "s/^inference_hz = 1000/inference_hz = 500/", "/etc/tormag/tormagd.toml")
     machine.run("systemctl", "reload", "tormagd")
-    machine.until(lambda: "now in force: sources.priority" in log(), "reloaded")
-    assert "not before a restart (systemctl restart tormagd): rates.inference_hz" in log()
-    assert "no list of keys" in log()
+    machine.until(lambda: "now in force: sources.priority" in console.log(), "reloaded")
+    assert "not before a restart (systemctl restart tormagd): rates.inference_hz" in console.log()
+    assert "no list of keys" in console.log()
 
+
+def a_hang_of_either_starts_it_again(console) -> None:
+    machine = console.machine
     # a device that says nothing any more while its port is open: the watchdog is not fed
-    machine.run("systemctl", "kill", "--signal=STOP", "simulator")
-    machine.until(lambda: machine.shows("tormagd", "NRestarts") == ["1"], "the watchdog has killed it")
-    machine.until(lambda: stands("activating", "waiting for the device"), "it waits again, not armed")
-    machine.run("systemctl", "kill", "--signal=CONT", "simulator")
-    machine.until(is_ready, "the device answers again")
-
+    machine.run("systemctl", "kill", "--signal=STOP", "simulator@tormag")
+    machine.until(lambda: console.restarts() == 1, "the watchdog has killed it")
+    machine.until(lambda: console.stands("activating", "waiting for the device"), "it waits again, not armed")
+    machine.run("systemctl", "kill", "--signal=CONT", "simulator@tormag")
+    machine.until(console.is_ready, "the device answers again")
     # a daemon that is not run does not feed it either
     machine.run("systemctl", "kill", "--kill-whom=main", "--signal=STOP", "tormagd")
-    machine.until(lambda: machine.shows("tormagd", "NRestarts") == ["2"] and is_ready(), "it is started again")
+    machine.until(lambda: console.restarts() == 2 and console.is_ready(), "it is started again")
 
-    # the carriages of a device that was never homed stand anywhere; the service has ended when they are apart
+
+def another_console_stands_beside_it(console, left) -> None:
+    """As the guide has it, with a publisher's address that takes a drop-in, and a recorder."""
+    machine = console.machine
+    text = re.sub(r'port = ".*"', 'port = "/dev/left"', shown("Several consoles"))
+    put(machine, "/etc/tormag/left.toml", re.sub('setpoint = ".*"', 'setpoint = "tcp://127.0.0.1:5555"', text))
+    drop_in = "/usr/share/tormagd/drop-ins/tcp.conf"
+    machine.run("install", "-D", "-m", "644", "-t", DROP_INS.format(unit=left.unit), drop_in)
+    machine.run("systemctl", "daemon-reload")
+    machine.run("systemctl", "start", "simulator@left", "tormagd@left", "tormag-record@left")
+    machine.until(left.is_ready, "the other device is identified")
+    machine.run("bash", "-c", ": < /dev/tcp/127.0.0.1/5555")
+    recording = "/var/lib/tormag/left/recordings/*.mcap"
+    machine.until(lambda: machine.run("sh", "-c", f"ls {recording}", check=False), "its recorder writes")
+
+    machine.run("tormagctl", "--endpoint", "ipc:///run/tormag-left/control", "stop")
+    machine.until(lambda: left.stands("active", "FAULT: STOPPED"), "it is stopped")
+    assert console.is_ready()
+    assert console.restarts() == 2
+
+    # the recorder ends before its daemon, with a whole file that no tick is missing in
+    machine.run("systemctl", "stop", "tormagd@left")
+    for unit in ("tormagd@left", "tormag-record@left"):
+        assert machine.shows(unit, "ActiveState", "Result") == ["inactive", "success"]
+    assert machine.run("sh", "-c", f"tail -c 8 {recording} | grep -c MCAP0") == "1"
+    assert console.is_ready()
+
+
+def a_stop_opens_the_gap(console) -> None:
+    """The carriages of a device that was never homed stand anywhere; the service has ended when they are apart."""
+    machine = console.machine
     machine.run("systemctl", "stop", "tormagd")
     assert machine.shows("tormagd", "ActiveState", "Result") == ["inactive", "success"]
-    header, *rows = machine.run("sh", "-c", "systemctl stop simulator; cat /tmp/truth.csv").splitlines()
+    header, *rows = machine.run("sh", "-c", "systemctl stop simulator@tormag; cat /tmp/tormag.csv").splitlines()
     gap = header.split(",").index("gap_mm")
     assert float(rows[0].split(",")[gap]) < 90.0
     assert float(rows[-1].split(",")[gap]) > 94.0
 
-    # nothing is left of it, whatever it has made
+
+def nothing_is_left(machine) -> None:
+    """Whatever package and service have made; what was put beside them is whose it is."""
+    machine.run("rm", "-r", *(DROP_INS.format(unit=unit) for unit in ("tormagd", "tormagd@left")))
     machine.run("dpkg", "--no-triggers", "--purge", "tormagd")
     assert files(machine) == set()
     assert "tormag" not in machine.run("cat", "/etc/passwd", "/etc/group")

@@ -6,6 +6,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+from pictures.stamp import stamp, tables
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "inverse_trade.md"
@@ -48,8 +49,9 @@ MARKERS = {
 
 def write(result: dict[str, Any]) -> None:
     """Rewrites page and plot."""
-    plot(result, PLOT)
-    PAGE.write_text(page(result))
+    text = page(result)
+    plot(result, PLOT, tables(text))
+    PAGE.write_text(text)
 
 
 def lines(result: dict[str, Any], separator: str = "  ") -> list[str]:
@@ -134,7 +136,7 @@ without memory. How good the *shipped* model is over its box is measured by `too
 [control.md](control.md#the-envelope)."""
 
 
-def plot(result: dict[str, Any], path: Path) -> None:
+def plot(result: dict[str, Any], path: Path, figures: list[str]) -> None:
     """Two panels over p50: the solver's error at one network, and the plant's error for every network."""
     figure = Figure(figsize=(11, 5), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -164,7 +166,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=8)
     figure.colorbar(colours, ax=right, label="hidden units")
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    figure.savefig(path, dpi=130, metadata=stamp(figures))
 
 
 def _scatter(axes: Axes, rows: list[dict[str, Any]], error: str) -> Any:

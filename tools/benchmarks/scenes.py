@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import msgspec
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from pictures.stamp import stamp
 from thesis.values import PULSE_MAE_MT
 
 from tormagd.config import Config
@@ -115,7 +116,7 @@ def draw(scenes: tuple[MeasuredScene, ...], path: Path) -> None:
     figure.supxlabel("processor time of steps and plans, % of one core")
     figure.supylabel("RMS error of the true force on sample 1, mN")
     figure.legend(*panels.flat[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
-    figure.savefig(path, dpi=100)
+    figure.savefig(path, dpi=100, metadata=stamp(scenes))
 
 
 def _panel(panel: Axes, scene: MeasuredScene) -> None:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from pictures.stamp import stamp
 
 from tactile.models import SCORED_SLOPE_N_MT
 from tormagd.simulation.pad import PadRecord
@@ -30,8 +31,8 @@ class Material(NamedTuple):
     hold: dict[str, Array]
 
 
-def draw_all(images: Path, material: Material, comparison: list[dict[str, Any]]) -> None:
-    """Writes all pictures as PNG into `images`."""
+def draw_all(images: Path, material: Material, comparison: list[dict[str, Any]], figures: list[str]) -> None:
+    """Writes all pictures as PNG into `images`, stamped with the page's figures."""
     for name, figure in {
         "tactile_fit": _fit(material),
         "tactile_training": _training(material),
@@ -39,8 +40,7 @@ def draw_all(images: Path, material: Material, comparison: list[dict[str, Any]])
         "tactile_hold": _hold(material.hold),
         "tactile_models": _models(comparison),
     }.items():
-        # no creation date: the same figures make the same file
-        figure.savefig(images / f"{name}.png", dpi=DPI, metadata={"Software": None})
+        figure.savefig(images / f"{name}.png", dpi=DPI, metadata=stamp(figures))
 
 
 def _last_cycles(material: Material, cip_percent: float) -> list[tuple[float, NDArray[np.int64]]]:

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from pictures.stamp import tables
 from thesis.values import PULSE_MAE_MT, PULSE_MAX_MT, PULSE_SD_MT, TABLE_4_1
 
 from tactile.plots import Material, draw_all
@@ -21,9 +22,6 @@ WAYS = {
 
 def write_report(folder: Path, figures: Json, material: Material) -> None:
     """Write learned_inverse.md into `folder`, and its pictures into `folder`/images."""
-    images = folder / "images"
-    images.mkdir(exist_ok=True)
-    draw_all(images, material, figures["comparison"])
     pulse = figures["pulse"]
     parts = [
         _head(),
@@ -35,6 +33,9 @@ def write_report(folder: Path, figures: Json, material: Material) -> None:
         _times(figures["solve_times"]),
     ]
     page = "\n".join(part.rstrip() + "\n" for part in parts)
+    images = folder / "images"
+    images.mkdir(exist_ok=True)
+    draw_all(images, material, figures["comparison"], tables(page))
     (folder / "learned_inverse.md").write_text(page, encoding="utf-8")
 
 

@@ -4,6 +4,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from pictures.stamp import tables
+
 from thesis.plots import draw_all
 from thesis.step_test import StepTest
 from thesis.table_2_5 import COLUMNS, readings
@@ -16,7 +18,6 @@ OBJECTIVES = ("trapezoid", "true", "true_thesis_speed")
 def write_page(path: Path, result: Json, tests: list[StepTest]) -> None:
     """Writes the page, and its pictures into the folder of its name beside it."""
     folder = path.with_suffix("")
-    draw_all(folder, result, tests)
     parts = [
         _head(),
         _table_2_3(result["table_2_3"]),
@@ -30,8 +31,9 @@ def write_page(path: Path, result: Json, tests: list[StepTest]) -> None:
         pulse_experiment(result["pulse"]),
         _errata(result["errata"]),
     ]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join(parts), encoding="utf-8")
+    page = "\n".join(parts)
+    draw_all(folder, result, tests, tables(page))
+    path.write_text(page, encoding="utf-8")
 
 
 def print_summary(result: Json) -> None:

@@ -11,6 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from pictures.stamp import stamp
 
 from thesis.step_test import StepTest
 from thesis.values import AS_BUILT, USE_CASES
@@ -23,14 +24,18 @@ MEASURED, THESIS, OURS, FREE, QUIET = "#222222", "#8d99ae", "#d1495b", "#2a7f9e"
 DPI = 90
 
 
-def draw_all(folder: Path, result: Json, tests: list[StepTest]) -> None:
-    """Writes all pictures as PNG into `folder`, which is made if it is not there."""
+def draw_all(folder: Path, result: Json, tests: list[StepTest], figures: list[str]) -> None:
+    """Writes all pictures as PNG into `folder`, which is made if it is not there, stamped with the page's figures."""
     folder.mkdir(parents=True, exist_ok=True)
-    _save(_table_2_4(result["table_2_4"]), folder / "table_2_4.png")
-    _save(_figure_2_5(result["figure_2_5"]), folder / "figure_2_5.png")
-    _save(_figure_2_7(result["figure_2_7"], tests), folder / "figure_2_7.png")
-    _save(_figure_3_2(result["table_3_2"]), folder / "figure_3_2.png")
-    _save(_figure_3_4(result["table_3_2"]), folder / "figure_3_4.png")
+    for name, figure in {
+        "table_2_4": _table_2_4(result["table_2_4"]),
+        "figure_2_5": _figure_2_5(result["figure_2_5"]),
+        "figure_2_7": _figure_2_7(result["figure_2_7"], tests),
+        "figure_3_2": _figure_3_2(result["table_3_2"]),
+        "figure_3_4": _figure_3_4(result["table_3_2"]),
+    }.items():
+        figure.savefig(folder / f"{name}.png", dpi=DPI, metadata=stamp(figures))
+        plt.close(figure)
 
 
 def _table_2_4(table: Json) -> Figure:
@@ -132,9 +137,3 @@ def _frame(axis: Axes, region: Region, title: str) -> None:
     axis.set(xlabel="force, N", ylabel="force rate, N/s", xlim=(-0.1, 1.35 * region.most_N))
     axis.set_ylim(-2.0 * region.most_rate_N_s, 2.0 * region.most_rate_N_s)
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, fontsize=8, frameon=False)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    # no creation date: the same figures make the same file
-    figure.savefig(path, dpi=DPI, metadata={"Software": None})
-    plt.close(figure)

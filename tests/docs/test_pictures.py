@@ -1,0 +1,39 @@
+"""Committed pictures are of the figures that are committed beside them."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from pictures.stamp import KEY, stamp, tables
+from PIL import Image
+
+from tormagd.scenes.measured import measured
+
+DOCS = Path(__file__).parents[2] / "docs"
+GENERATED = ("inverse_trade.md", "learned_inverse.md", "reproduction.md")
+SHOWN = re.compile(r"\]\(([\w/]+\.png)\)")
+
+
+def drawn():
+    """Every picture that is drawn from committed figures, and these."""
+    scenes = measured().scenes
+    yield "images/scenes.png", scenes
+    yield "images/scene_trade.png", scenes
+    envelope = json.loads((DOCS / "evidence/envelope.json").read_text(encoding="utf-8"))
+    yield "images/envelope.png", envelope["figures"]
+    for name in GENERATED:
+        page = (DOCS / name).read_text(encoding="utf-8")
+        for picture in SHOWN.findall(page):
+            yield picture, tables(page)
+
+
+@pytest.mark.parametrize(("picture", "figures"), [pytest.param(*each, id=each[0]) for each in drawn()])
+def test_a_picture_is_no_older_than_its_figures(picture, figures):
+    with Image.open(DOCS / picture) as opened:
+        assert opened.info[KEY] == stamp(figures)[KEY], "what writes the figures draws it anew"
+
+
+def test_other_figures_have_another_stamp_and_other_words_the_same():
+    page = "# A\n\n| mN |\n| --- |\n| 3 |\n"
+    assert stamp(tables(page)) == stamp(tables(page + "\nMore words.\n")) != stamp(tables(page.replace("3", "4")))

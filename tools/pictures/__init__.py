@@ -1,0 +1,1 @@
+"""What a committed picture says of itself."""
