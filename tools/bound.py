@@ -52,6 +52,9 @@ EXACT_N = 1e-6
 SECANT_MM_S = 5.0
 "Over which a limit is taken to be straight: turning round, it has a kink, and the carriages turn elsewhere next round."
 LEAST_BRAKING_MM_S2 = 50.0
+MOST_ITERATIONS = 1_000
+"""Of one programme: near the end, where the rounds go a little way only, the limits leave little room about the last
+round's way, and the solver takes ten times as many as at first."""
 SOLVED = ("Solved", "AlmostSolved")
 
 
@@ -279,6 +282,7 @@ def _least_squares(
     bounds = np.concatenate([bound for _, bound in limits])
     settings = clarabel.DefaultSettings()
     settings.verbose = False
+    settings.max_iter = MOST_ITERATIONS
     solver = clarabel.DefaultSolver(
         sparse.triu(matrix.T @ matrix / unit**2, format="csc"),
         matrix.T @ error / unit**2,

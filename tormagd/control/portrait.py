@@ -1,6 +1,7 @@
 """The device's phase portrait: which forces a gap gives, and how fast a gap speed changes them."""
 
 import math
+from bisect import bisect_right
 from typing import Final, final
 
 import numpy as np
@@ -79,6 +80,18 @@ class Portrait:
     def slope_at_N_mm(self, force_N: float) -> float:
         """|dF/dgap| where the gap gives this force."""
         return interpolated(force_N, self.force_N, self.slope_N_mm)
+
+    def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
+        """The gap that gives this force, as `gap_mm_at` has it, and |dF/dgap| at the point next to it."""
+        forces_N, gaps_mm = self.force_N, self.gap_mm
+        after = bisect_right(forces_N, force_N)
+        if after == 0:
+            return gaps_mm[0], self.slope_N_mm[0]
+        if after == len(forces_N):
+            return gaps_mm[-1], self.slope_N_mm[-1]
+        low_N, low_mm = forces_N[after - 1], gaps_mm[after - 1]
+        gap_mm = (gaps_mm[after] - low_mm) / (forces_N[after] - low_N) * (force_N - low_N) + low_mm
+        return gap_mm, self.slope_N_mm[after]
 
     def gap_mm_at(self, force_N: float) -> float:
         """The gap that gives this force; the nearest end of the range where none does."""
