@@ -36,14 +36,15 @@ ALLOWED = 1.5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """How long is played."""
+    """What is played, and how long."""
+    parser.add_argument("--scene", default="radial_pulse", help="whose plans (radial_pulse: among the cheapest without)")
     parser.add_argument("--seconds", type=float, default=5.0, help=f"of the pulse, behind {LEARNS_S:g} (5)")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """`{live, preview_70_ms, preview_400_ms: {mean_us, p99_us, max_us}, ratio: {NAME: {mean, p99}}, allowed}`: ratios
     over `live`."""
-    taken = least_us({name: plans(ahead_s, options.seconds) for name, ahead_s in AHEAD_S.items()})
+    taken = least_us({name: plans(options.scene, ahead_s, options.seconds) for name, ahead_s in AHEAD_S.items()})
     found: dict[str, dict[str, float]] = {
         name: {"mean_us": float(us.mean()), "p99_us": float(np.percentile(us, 99.0)), "max_us": float(us.max())}
         for name, us in taken.items()
@@ -58,9 +59,9 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     return rounded | {"ratio": ratio, "allowed": ALLOWED}
 
 
-def plans(ahead_s: float, seconds: float) -> list[Call]:
+def plans(scene: str, ahead_s: float, seconds: float) -> list[Call]:
     """Each plan of the pulse on sample 1 after LEARNS_S, to be made again."""
-    config = Config(scene="pulse")
+    config = Config(scene=scene)
     core = build_core(config)
     loop = ClosedLoop(config, core.stepper, core.planner, VirtualDevice(load_plant("sample_1"), SteadyHand()))
     loop.arm()

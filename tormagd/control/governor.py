@@ -279,11 +279,11 @@ class Governor:
         sent_mm, gap_mm = portrait.gap_mm_at(device.model_N(sent_N)), portrait.gap_mm_at(device.model_N(asks_N))
         way_mm = nearest_way_mm(sent_mm, elapsed_s, WAY_S, wanted_mm, weights, self._gap_speed_mm_s, len(PATH_S))
         forces_N: list[float] = []
-        left = math.exp(-elapsed_s / late_s)
+        left, left_in_a_step = math.exp(-elapsed_s / late_s), math.exp(-PATH_STEP_S / late_s)
         for drive_mm in way_mm:
             gap_mm = drive_mm + (gap_mm - drive_mm) * left
             forces_N.append(device.force_N(portrait.force_N_at(gap_mm)))
-            left = math.exp(-PATH_STEP_S / late_s)
+            left = left_in_a_step
         return forces_N, device.force_N(portrait.force_N_at(way_mm[0]))
 
     def foresee(self, state: GovernorState) -> GovernorState:

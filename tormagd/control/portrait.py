@@ -55,17 +55,17 @@ class FieldOfGap:
 
 @final
 class Portrait:
-    """Force over gap for one contact, without memory, and its slope |dF/dgap|, N per mm, at n points: forces rise and
-    gaps fall along the lists."""
+    """Force over gap for one contact, without memory, and its slope |dF/dgap|, N per mm, at n points: along the
+    lists forces rise, and gaps fall evenly."""
 
-    __slots__ = ("_falling_N", "_rising_mm", "force_N", "gap_mm", "slope_N_mm")
+    __slots__ = ("_open_mm", "_step_mm", "force_N", "gap_mm", "slope_N_mm")
 
     def __init__(self, gap_mm: list[float], force_N: list[float], slope_N_mm: list[float]) -> None:
         self.gap_mm: Final = gap_mm
         self.force_N: Final = force_N
         self.slope_N_mm: Final = slope_N_mm
-        self._rising_mm: Final[list[float]] = gap_mm[::-1]
-        self._falling_N: Final[list[float]] = force_N[::-1]
+        self._open_mm: Final = gap_mm[0]
+        self._step_mm: Final = (gap_mm[0] - gap_mm[-1]) / (len(gap_mm) - 1)
 
     @property
     def least_N(self) -> float:
@@ -99,7 +99,12 @@ class Portrait:
 
     def force_N_at(self, gap_mm: float) -> float:
         """What this gap gives; of the nearest end of the range outside of it."""
-        return interpolated(gap_mm, self._rising_mm, self._falling_N)
+        steps = max((self._open_mm - gap_mm) / self._step_mm, 0.0)
+        whole = int(steps)
+        if whole >= len(self.force_N) - 1:
+            return self.force_N[-1]
+        before_N = self.force_N[whole]
+        return (self.force_N[whole + 1] - before_N) * (steps - whole) + before_N
 
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
         """The fastest change of force that a gap speed renders at this force."""
