@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-
 from rendering.human_pulse import pulse_profile
 from rendering.publisher import PREVIEW_S, RATE_HZ, publisher
+
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
 from tormagd.control.core import build_core
@@ -37,7 +37,9 @@ ALLOWED = 1.5
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What is played, and how long."""
-    parser.add_argument("--scene", default="radial_pulse", help="whose plans (radial_pulse: among the cheapest without)")
+    parser.add_argument(
+        "--scene", default="radial_pulse", help="whose plans (radial_pulse: among the cheapest without)"
+    )
     parser.add_argument("--seconds", type=float, default=5.0, help=f"of the pulse, behind {LEARNS_S:g} (5)")
 
 

@@ -23,8 +23,7 @@ moves. By the last the gap crosses a third of its stroke, and what comes later c
 LEAST_WAY: Final = 9
 "So many of them are looked at even where a preview ends before."
 WAY_LASTS_S: Final = [
-    0.5 * (after_s - before_s)
-    for before_s, after_s in zip([0.0, *WAY_S[:-1]], [*WAY_S[1:], WAY_S[-1]], strict=True)
+    0.5 * (after_s - before_s) for before_s, after_s in zip([0.0, *WAY_S[:-1]], [*WAY_S[1:], WAY_S[-1]], strict=True)
 ]
 "The time that each of them stands for: from half way to the one before to half way to the next."
 STARTING_S: Final = 0.01

@@ -19,8 +19,8 @@ def nearest_way_mm(
     speed_mm_s: float,
     count: int,
 ) -> list[float]:
-    """The first `count` gaps of the best way along wanted gaps (n) with weights (n) > 0, at the first n of rising times.
-    The first of them is `elapsed_s` after the gap was at `start_mm`."""
+    """The first `count` gaps of the best way along wanted gaps (n) with weights (n) > 0, at the first n of rising
+    times. The first of them is `elapsed_s` after the gap was at `start_mm`."""
     best_mm = wanted_mm[:]
     # the kinks beside the flat piece, nearest last, each less the way that its side is shifted from its point back to
     # time 0; and by how much the slope of the derivative grows where one is passed on the way out
