@@ -47,12 +47,15 @@ HAND_MM_S = 42.0
 "The roller's surface at the thesis's 20 rpm."
 MOST_STEPS = 300_000
 ROUNDS = 30
-SETTLED = 5e-4
+SETTLED = 1e-3
 "Relative change of the RMS error from round to round, below which nothing is left to be found."
 EXACT_N = 1e-6
 SECANT_MM_S = 5.0
 "Over which a limit is taken to be straight: turning round, it has a kink, and the carriages turn elsewhere next round."
 LEAST_BRAKING_MM_S2 = 50.0
+MOST_ITERATIONS = 1_000
+"""Of one programme: where the rounds go a little way only, the limits leave little room about the last round's way, and
+the solver takes ten times as many as at first."""
 SOLVED = ("Solved", "AlmostSolved")
 
 
@@ -280,6 +283,7 @@ def _least_squares(
     bounds = np.concatenate([bound for _, bound in limits])
     settings = clarabel.DefaultSettings()
     settings.verbose = False
+    settings.max_iter = MOST_ITERATIONS
     solver = clarabel.DefaultSolver(
         sparse.triu(matrix.T @ matrix / unit**2, format="csc"),
         matrix.T @ error / unit**2,

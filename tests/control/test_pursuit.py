@@ -15,8 +15,9 @@ MOST_MM = SPEED_MM_S * STEP_S
 
 
 def way_mm(start_mm: float, wanted_mm: list[float], weights: list[float], elapsed_s: float = STEP_S) -> list[float]:
-    """All of the way."""
-    return nearest_way_mm(start_mm, elapsed_s, wanted_mm, weights, STEP_S, SPEED_MM_S, len(wanted_mm))
+    """All of the way, in even steps."""
+    times_s = [STEP_S * place for place in range(len(wanted_mm))]
+    return nearest_way_mm(start_mm, elapsed_s, times_s, wanted_mm, weights, SPEED_MM_S, len(wanted_mm))
 
 
 def cost(way: tuple[float, ...] | list[float], wanted_mm: list[float], weights: list[float]) -> float:
@@ -53,7 +54,8 @@ def test_the_first_gap_is_within_reach_of_the_last() -> None:
 
 
 def test_no_more_of_it_is_told_than_is_asked_for() -> None:
-    assert len(nearest_way_mm(60.0, 0.0, [60.0] * 10, [1.0] * 10, STEP_S, SPEED_MM_S, 3)) == 3
+    times_s = [STEP_S * place for place in range(12)]
+    assert len(nearest_way_mm(60.0, 0.0, times_s, [60.0] * 10, [1.0] * 10, SPEED_MM_S, 3)) == 3
 
 
 GRID = 4
@@ -62,21 +64,24 @@ GRID = 4
 
 @settings(max_examples=100, deadline=None)
 @given(
-    st.lists(st.tuples(st.floats(-2.0, 2.0), st.floats(0.01, 1.0)), min_size=1, max_size=12),
+    st.lists(st.tuples(st.floats(-2.0, 2.0), st.floats(0.01, 1.0), st.integers(1, 3)), min_size=1, max_size=12),
     st.integers(-10, 10),
 )
-def test_no_way_within_the_speed_misses_less(points: list[tuple[float, float]], start: int) -> None:
-    wanted, weights = [60.0 + at for at, _ in points], [weight for _, weight in points]
+def test_no_way_within_the_speed_misses_less(points: list[tuple[float, float, int]], start: int) -> None:
+    """Nor where the points are unevenly far apart."""
+    wanted, weights = [60.0 + at for at, _, _ in points], [weight for _, weight, _ in points]
+    steps = [step for _, _, step in points]
     grid_mm = MOST_MM / GRID
     start_mm = 60.0 + start * grid_mm
-    way = way_mm(start_mm, wanted, weights)
-    for before, after in itertools.pairwise([start_mm, *way]):
-        assert abs(after - before) <= MOST_MM + 1e-9
+    times_s = [STEP_S * (passed - steps[0]) for passed in itertools.accumulate(steps)]
+    way = nearest_way_mm(start_mm, STEP_S * steps[0], times_s, wanted, weights, SPEED_MM_S, len(wanted))
+    for (before, after), step in zip(itertools.pairwise([start_mm, *way]), steps, strict=True):
+        assert abs(after - before) <= step * MOST_MM + 1e-9
     reached = {start: 0.0}
-    for want, weight in zip(wanted, weights, strict=True):
+    for want, weight, step in zip(wanted, weights, steps, strict=True):
         following: dict[int, float] = {}
         for place, spent in reached.items():
-            for there in range(place - GRID, place + GRID + 1):
+            for there in range(place - step * GRID, place + step * GRID + 1):
                 total = spent + weight * (60.0 + there * grid_mm - want) ** 2
                 following[there] = min(total, following.get(there, math.inf))
         reached = following

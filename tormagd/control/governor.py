@@ -5,7 +5,6 @@ from typing import Final, final
 
 from firmware_protocol.value import Value
 from tormagd.control.device_fit import DeviceFit
-from tormagd.control.interpolation import interpolated
 from tormagd.control.periodicity import LONGEST_STEP_S, NOTHING_LEARNED, Periodicity, forecast_N, foreseen, observe
 from tormagd.control.portrait import Portrait
 from tormagd.control.pursuit import nearest_way_mm
@@ -17,13 +16,16 @@ AHEAD_S: Final = 0.05
 "Setpoints are carried forward along their slope, or past the end of their preview, by no more than this."
 PATH_S: Final = [0.0, 0.005, 0.01, 0.015, 0.02, 0.025, 0.03]
 "The times, from the moment that is planned for, at which a plan looks at the force to come."
-STEP_S: Final = 0.01
-WAY_S: Final = [0.0, 0.01, 0.02, 0.03, 0.04]
-"Steps of a preview, and the first of them, which reach as far as PATH_S."
-LEAST_STEPS: Final = 6
-MOST_STEPS: Final = 40
-"""Of a preview that is planned through, as far as it goes: in the most of them the gap crosses a third of its stroke,
-and what comes later can wait."""
+PATH_STEP_S: Final = 0.005
+WAY_S: Final = [*PATH_S, 0.04, 0.06, 0.09, 0.13, 0.18, 0.25, 0.33, 0.4]
+"""The times at which a preview is looked at, as far as it goes: the sparser, the less they matter to the gap's next
+moves. By the last the gap crosses a third of its stroke, and what comes later can wait."""
+LEAST_WAY: Final = 9
+"So many of them are looked at even where a preview ends before."
+WAY_LASTS_S: Final = [
+    0.5 * (after_s - before_s) for before_s, after_s in zip([0.0, *WAY_S[:-1]], [*WAY_S[1:], WAY_S[-1]], strict=True)
+]
+"The time that each of them stands for: from half way to the one before to half way to the next."
 STARTING_S: Final = 0.01
 """Time constant with which the gap comes to another speed where its carriages are not late. Chosen on sample 1: a pulse
 of 1.1 to 1.7 N, which is too steep, is missed by 54 and 51 mN with 5 and 15 ms, 1.4 to 1.7 N by 2.4 and 3.5."""
@@ -259,8 +261,8 @@ class Governor:
     def _pursued_N(
         self, asks_N: float, sent_N: float, elapsed_s: float, wanted_N: list[float], device: DeviceFit, late_s: float
     ) -> tuple[list[float], float]:
-        """The forces at PATH_S on the way of the gap that misses least of those wanted (n) from `late_s` on, STEP_S
-        apart, and the one that the carriages are sent to. `elapsed_s` ago those were `asks_N` and `sent_N`.
+        """The forces at PATH_S on the way of the gap that misses least of those wanted (n), at WAY_S from `late_s`
+        on, and the one that the carriages are sent to. `elapsed_s` ago those were `asks_N` and `sent_N`.
 
         A gap comes to another speed only gradually. So its carriages are sent along the way that a gap without inertia
         would go `late_s` later, and the gap is taken to follow them with that time constant.
@@ -268,21 +270,19 @@ class Governor:
         portrait = self._portrait
         wanted_mm: list[float] = []
         weights: list[float] = []
-        for force_N in wanted_N:
-            model_N = device.model_N(force_N)
-            slope_N_mm = max(portrait.slope_at_N_mm(model_N), FLATTEST_N_MM)
-            wanted_mm.append(portrait.gap_mm_at(model_N))
-            weights.append(slope_N_mm * slope_N_mm)
+        for place, force_N in enumerate(wanted_N):
+            gap_mm, slope_N_mm = portrait.gap_and_slope_at(device.model_N(force_N))
+            slope_N_mm = max(slope_N_mm, FLATTEST_N_MM)
+            wanted_mm.append(gap_mm)
+            weights.append(WAY_LASTS_S[place] * slope_N_mm * slope_N_mm)
         sent_mm, gap_mm = portrait.gap_mm_at(device.model_N(sent_N)), portrait.gap_mm_at(device.model_N(asks_N))
-        speed_mm_s = self._gap_speed_mm_s
-        way_mm = nearest_way_mm(sent_mm, elapsed_s, wanted_mm, weights, STEP_S, speed_mm_s, len(WAY_S))
+        way_mm = nearest_way_mm(sent_mm, elapsed_s, WAY_S, wanted_mm, weights, self._gap_speed_mm_s, len(PATH_S))
         forces_N: list[float] = []
-        before_s = -elapsed_s
-        for after_s in PATH_S:
-            drive_mm = interpolated(after_s, WAY_S, way_mm)
-            gap_mm = drive_mm + (gap_mm - drive_mm) * math.exp((before_s - after_s) / late_s)
+        left, left_in_a_step = math.exp(-elapsed_s / late_s), math.exp(-PATH_STEP_S / late_s)
+        for drive_mm in way_mm:
+            gap_mm = drive_mm + (gap_mm - drive_mm) * left
             forces_N.append(device.force_N(portrait.force_N_at(gap_mm)))
-            before_s = after_s
+            left = left_in_a_step
         return forces_N, device.force_N(portrait.force_N_at(way_mm[0]))
 
     def foresee(self, state: GovernorState) -> GovernorState:
@@ -325,16 +325,18 @@ class Governor:
 
 
 def _previewed_N(setpoint: TimedSetpoint, begins_s: float, least_N: float, most_N: float) -> list[float]:
-    """The forces from `begins_s`, 0 or more, after the setpoint's stamp on, STEP_S apart, within what is allowed."""
+    """The forces at WAY_S from `begins_s`, 0 or more, after the setpoint's stamp on, within what is allowed: as many as
+    the preview knows of, and at least LEAST_WAY."""
     forces_N, spacing_s = setpoint.preview_N, setpoint.preview_dt_s
     last, last_N = len(forces_N), forces_N[-1]
     ends_s = spacing_s * last
     mean_N_s = (last_N - setpoint.force_N) / ends_s
-    steps = min(max((ends_s - begins_s) / STEP_S, LEAST_STEPS), MOST_STEPS)
     wanted_N: list[float] = []
-    for step in range(int(steps) + 1):
-        at_s = begins_s + STEP_S * step
+    for after_s in WAY_S:
+        at_s = begins_s + after_s
         if at_s >= ends_s:
+            if len(wanted_N) >= LEAST_WAY:
+                break
             # past its end a short preview goes on as it has run so far; a long one has no end in sight
             force_N = last_N + mean_N_s * min(at_s - ends_s, AHEAD_S, ends_s)
         else:

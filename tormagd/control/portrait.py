@@ -1,6 +1,7 @@
 """The device's phase portrait: which forces a gap gives, and how fast a gap speed changes them."""
 
 import math
+from bisect import bisect_right
 from typing import Final, final
 
 import numpy as np
@@ -54,17 +55,17 @@ class FieldOfGap:
 
 @final
 class Portrait:
-    """Force over gap for one contact, without memory, and its slope |dF/dgap|, N per mm, at n points: forces rise and
-    gaps fall along the lists."""
+    """Force over gap for one contact, without memory, and its slope |dF/dgap|, N per mm, at n points: along the
+    lists forces rise, and gaps fall evenly."""
 
-    __slots__ = ("_falling_N", "_rising_mm", "force_N", "gap_mm", "slope_N_mm")
+    __slots__ = ("_open_mm", "_step_mm", "force_N", "gap_mm", "slope_N_mm")
 
     def __init__(self, gap_mm: list[float], force_N: list[float], slope_N_mm: list[float]) -> None:
         self.gap_mm: Final = gap_mm
         self.force_N: Final = force_N
         self.slope_N_mm: Final = slope_N_mm
-        self._rising_mm: Final[list[float]] = gap_mm[::-1]
-        self._falling_N: Final[list[float]] = force_N[::-1]
+        self._open_mm: Final = gap_mm[0]
+        self._step_mm: Final = (gap_mm[0] - gap_mm[-1]) / (len(gap_mm) - 1)
 
     @property
     def least_N(self) -> float:
@@ -80,13 +81,30 @@ class Portrait:
         """|dF/dgap| where the gap gives this force."""
         return interpolated(force_N, self.force_N, self.slope_N_mm)
 
+    def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
+        """The gap that gives this force, as `gap_mm_at` has it, and |dF/dgap| at the point next to it."""
+        forces_N, gaps_mm = self.force_N, self.gap_mm
+        after = bisect_right(forces_N, force_N)
+        if after == 0:
+            return gaps_mm[0], self.slope_N_mm[0]
+        if after == len(forces_N):
+            return gaps_mm[-1], self.slope_N_mm[-1]
+        low_N, low_mm = forces_N[after - 1], gaps_mm[after - 1]
+        gap_mm = (gaps_mm[after] - low_mm) / (forces_N[after] - low_N) * (force_N - low_N) + low_mm
+        return gap_mm, self.slope_N_mm[after]
+
     def gap_mm_at(self, force_N: float) -> float:
         """The gap that gives this force; the nearest end of the range where none does."""
         return interpolated(force_N, self.force_N, self.gap_mm)
 
     def force_N_at(self, gap_mm: float) -> float:
         """What this gap gives; of the nearest end of the range outside of it."""
-        return interpolated(gap_mm, self._rising_mm, self._falling_N)
+        steps = max((self._open_mm - gap_mm) / self._step_mm, 0.0)
+        whole = int(steps)
+        if whole >= len(self.force_N) - 1:
+            return self.force_N[-1]
+        before_N = self.force_N[whole]
+        return (self.force_N[whole + 1] - before_N) * (steps - whole) + before_N
 
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
         """The fastest change of force that a gap speed renders at this force."""

@@ -13,53 +13,51 @@ lasso, whose dual this is).
 def nearest_way_mm(
     start_mm: float,
     elapsed_s: float,
+    times_s: list[float],
     wanted_mm: list[float],
     weights: list[float],
-    step_s: float,
     speed_mm_s: float,
     count: int,
 ) -> list[float]:
-    """The first `count` gaps of the best way along wanted gaps (n), `step_s` apart, with weights (n) > 0. The first of
-    them is `elapsed_s` after the gap was at `start_mm`."""
+    """The first `count` gaps of the best way along wanted gaps (n) with weights (n) > 0, at the first n of rising
+    times. The first of them is `elapsed_s` after the gap was at `start_mm`."""
     best_mm = wanted_mm[:]
-    # the kinks beside the flat piece, nearest last, less how far their side has been shifted; and by how much the
-    # slope of the derivative grows where one is passed on the way out
+    # the kinks beside the flat piece, nearest last, each less the way that its side is shifted from its point back to
+    # time 0; and by how much the slope of the derivative grows where one is passed on the way out
     below_mm: list[float] = []
     below: list[float] = []
     above_mm: list[float] = []
     above: list[float] = []
-    below_shift_mm, above_shift_mm = 0.0, 0.0
-    shift_mm = speed_mm_s * step_s
     place = len(wanted_mm)
     while place:
         place -= 1
+        shift_mm = speed_mm_s * times_s[place]
         least_mm, slope = wanted_mm[place], weights[place]
         offset = -slope * least_mm
-        while above and least_mm > above_mm[-1] + above_shift_mm:
-            kink_mm, change = above_mm.pop() + above_shift_mm, above.pop()
+        while above and least_mm > above_mm[-1] - shift_mm:
+            kink_mm, change = above_mm.pop() - shift_mm, above.pop()
             slope += change
             offset -= change * kink_mm
-            below_mm.append(kink_mm - below_shift_mm)
+            below_mm.append(kink_mm - shift_mm)
             below.append(-change)
             least_mm = -offset / slope
-        while below and least_mm < below_mm[-1] + below_shift_mm:
-            kink_mm, change = below_mm.pop() + below_shift_mm, below.pop()
+        while below and least_mm < below_mm[-1] + shift_mm:
+            kink_mm, change = below_mm.pop() + shift_mm, below.pop()
             slope += change
             offset -= change * kink_mm
-            above_mm.append(kink_mm - above_shift_mm)
+            above_mm.append(kink_mm + shift_mm)
             above.append(-change)
             least_mm = -offset / slope
         best_mm[place] = least_mm
-        below_mm.append(least_mm - below_shift_mm)
+        below_mm.append(least_mm - shift_mm)
         below.append(slope)
-        above_mm.append(least_mm - above_shift_mm)
+        above_mm.append(least_mm + shift_mm)
         above.append(slope)
-        below_shift_mm -= shift_mm
-        above_shift_mm += shift_mm
     way_mm: list[float] = []
-    gap_mm, moved_mm = start_mm, speed_mm_s * elapsed_s
+    gap_mm, before_s = start_mm, times_s[0] - elapsed_s
     for place in range(count):
+        moved_mm = speed_mm_s * (times_s[place] - before_s)
         gap_mm = min(max(best_mm[place], gap_mm - moved_mm), gap_mm + moved_mm)
         way_mm.append(gap_mm)
-        moved_mm = shift_mm
+        before_s = times_s[place]
     return way_mm
