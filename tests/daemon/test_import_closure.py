@@ -17,6 +17,7 @@ ROOMS = {
     "control",
     "daemon",
     "exact",
+    "force_file",
     "hardware",
     "inverse",
     "keeping",

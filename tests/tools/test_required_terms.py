@@ -207,7 +207,7 @@ def test_dask_workers_give_what_this_process_gives(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(scene_runs, "run", key)
     cases = [Case("brain"), Case("coronary", "sample_3", ("pull", "rate"), "nearest", False)]
     with (
-        LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0") as cluster,
         Client(cluster) as client,
         client.get_executor() as executor,
     ):
