@@ -9,6 +9,7 @@ takes about 20 minutes.
 
 import argparse
 import json
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -42,6 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"{', '.join(unknown)}: allowed are {', '.join(PARTS)}")
     if not 0.0 < options.share <= 1.0:
         parser.error(f"--share {options.share:g}: allowed is above 0, to 1")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # what was changed of the machine is put back
     lines = {}
     for name in options.part or PARTS:
         lines[name] = watched(PARTS[name], options.share)

@@ -137,10 +137,10 @@ class Relay:
 
     async def _join(self, near: _Half) -> None:
         far = _Half()
-        self._ends.append(far)
         far.other = near
         await asyncio.get_running_loop().create_connection(lambda: far, self._host, self._port)
         assert far.transport is not None
+        self._ends.append(far)  # one that did not get through has not been at the daemon
         far.transport.write(near.heard)  # what came meanwhile
         near.other = far
         if near.transport is not None and near.transport.is_closing():
