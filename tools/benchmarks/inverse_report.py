@@ -95,7 +95,8 @@ def page(result: dict[str, Any]) -> str:
 
 TEXT = """# Speed against accuracy of the inverse
 
-Written by `python tools/evidence.py inverse` with [its figures](evidence/inverse.json); do not edit. Synthetic data throughout: {workload}.
+Written by `python tools/evidence.py inverse` with [its figures](evidence/inverse.json); do not edit. Synthetic data
+throughout: {workload}.
 One process, one thread unless a row says otherwise, garbage collector frozen as in the daemon ({environment}).
 
 A solve gets a state of the handle, a force and the last field, and answers with a field, its confidence and its reach.
