@@ -304,7 +304,7 @@ def _solver(scenes: tuple[MeasuredScene, ...]) -> str:
         "## The search\n\nWhere the handle's rate is not required there is nothing to search: the force over the gap "
         "is one table, read by straight lines (`portrait`), and the network is asked once, at the start. Where a "
         "search runs it is `newton`: in every scene the cheapest of the searches, with an error that no other "
-        "one beats by more than the tolerance's hundredth part, and for networks of 10 to 200 units [the most exact]"
+        "one beats by more than the tolerance's hundredth part, and for networks of 10 to 200 units [exact to 2 uN]"
         "(inverse_trade.md). So nothing picks among them: a brake's model rises with the field everywhere, and one "
         "neighbour is enough, as it is not on [the pad](tactile.md). float32 saves nothing on one root. `nearest` and "
         "`coarse-to-fine` run only where a brake's scene names them: `pulse` does, to show the k-nearest search in "

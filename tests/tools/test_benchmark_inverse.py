@@ -8,7 +8,8 @@ import benchmark
 import msgspec
 import numpy as np
 import pytest
-from benchmarks import inverse_workload
+from benchmarks import inverse_report, inverse_workload
+from benchmarks.inverse_report import ROOT
 
 from tormagd.simulation.element import Element
 from tormagd.simulation.parameters import load_plant
@@ -103,3 +104,10 @@ def test_the_plant_of_the_workload_is_the_plant():
     field = inverse_workload.NOMINAL.field_mT(gap)
     (expected,) = inverse_workload.plant_force_N(plant, np.array([travel]), np.array([speed]), np.array([field]))
     assert element.force_N == pytest.approx(expected, abs=2e-3)
+
+
+def test_the_committed_page_is_of_the_committed_figures() -> None:
+    figures = json.loads((ROOT / "docs/evidence/inverse.json").read_text(encoding="utf-8"))["figures"]
+    assert inverse_report.PAGE.read_text(encoding="utf-8") == inverse_report.page(figures), (
+        "python tools/evidence.py inverse writes both anew"
+    )

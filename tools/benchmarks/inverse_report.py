@@ -199,24 +199,28 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 
 def _choices(result: dict[str, Any]) -> list[str]:
-    beaten = ", ".join(result["beaten"]) or "nowhere"
+    beaten = "; ".join(result["beaten"]) or "nowhere"
     said = [
-        f"where `newton` is slower than another search of the daemon's by more than a tenth, or less exact: {beaten}"
+        "where `newton`, as the daemon runs it, is slower than another search of the daemon's by more than a tenth, or "
+        f"less exact by more than 1 uN: {beaten}"
     ]
+    alike: dict[str, list[str]] = {}
     for scene, row in result["chosen"].items():
-        others = ", ".join(
-            f"{name} {errors['plant_mae_mT']:.1f} mT, {1e3 * errors['force_mae_N']:.0f} mN"
-            for name, errors in row["mismatched"].items()
-        )
-        said.append(
-            f"scene {scene} (tolerance {1e3 * row['tolerance_rms_N']:g} mN rms): {row['name']}, {row['dtype']}. "
-            f"Over {row['solves']} solves ({'FIFO' if row['fifo'] else 'no FIFO'}) "
-            f"p50 {row['p50_us']:.1f} us, p99 {row['p99_us']:.1f} us, "
-            f"p99.9 {row['p999_us']:.1f} us; plant error {row['plant_mae_mT']:.2f} mT mean, "
-            f"{row['plant_max_mT']:.2f} mT max, {1e3 * row['force_mae_N']:.1f} mN. "
-            f"On plants it was not trained on (no trim): {others}."
-        )
-    return said
+        alike.setdefault(_choice(row), []).append(f"{scene} ({1e3 * row['tolerance_rms_N']:g} mN)")
+    return [*said, *(f"{', '.join(scenes)}: {choice}" for choice, scenes in alike.items())]
+
+
+def _choice(row: dict[str, Any]) -> str:
+    others = ", ".join(
+        f"{name} {errors['plant_mae_mT']:.1f} mT, {1e3 * errors['force_mae_N']:.0f} mN"
+        for name, errors in row["mismatched"].items()
+    )
+    return (
+        f"{row['name']}, {row['dtype']}. Over {row['solves']} solves ({'FIFO' if row['fifo'] else 'no FIFO'}) "
+        f"p50 {row['p50_us']:.1f} us, p99 {row['p99_us']:.1f} us, p99.9 {row['p999_us']:.1f} us; plant error "
+        f"{row['plant_mae_mT']:.2f} mT mean, {row['plant_max_mT']:.2f} mT max, {1e3 * row['force_mae_N']:.1f} mN. "
+        f"On plants it was not trained on (no trim): {others}."
+    )
 
 
 def _comparisons(result: dict[str, Any]) -> list[str]:
