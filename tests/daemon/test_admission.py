@@ -320,6 +320,21 @@ def test_a_stranger_that_leaves_before_it_was_asked_about_is_counted_once(tcp_ri
     assert tcp_rig.endpoint.report().refused == 6
 
 
+def test_one_that_leaves_in_the_handshake_is_not_taken_for_one_that_was_asked_about(tcp_rig: Rig) -> None:
+    publisher = tcp_rig.peer(zmq.XPUB, "setpoint", tcp_rig.pair("robot"))
+    tcp_rig.until(lambda: publisher.poll(0))
+    tcp_rig.endpoint.admission.pause_s = lambda: 0.05
+    tcp_rig.peer(zmq.XPUB, "setpoint", STRANGER)
+    port = int(tcp_rig.addresses["setpoint"].rsplit(":", 1)[1])
+    socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S).close()
+    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused, "refused")
+    tcp_rig.endpoint.admission.pause_s = lambda: 0.0
+    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused >= 2, "counted")
+    tcp_rig.until(lambda: tcp_rig.endpoint.report().connections["setpoint"] == 1, "closed")
+    assert tcp_rig.endpoint.report().refused == 2
+    assert not any(has_left for _, has_left in tcp_rig.endpoint.admission.moves)
+
+
 # -- how many ------------------------------------------------------------------------------------------------------
 
 

@@ -30,7 +30,7 @@ from tormagd.config import ENDPOINTS
 from tormagd.keys import PUBLIC, SECRET, SERVER, KeyPair, load_pair, load_public
 
 TRIES = 10_000
-LEAST_PER_S, PER_S = 500.0, 600.0
+LEAST_PER_S, PER_S = 500.0, 540.0
 ROUNDS = 10
 UNDISTURBED_S = 2.0
 "Before each round."

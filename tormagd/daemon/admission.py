@@ -56,8 +56,6 @@ REASONS: dict[int, str] = {
 UNLISTED, WRONG_ROLE = "key not listed", "role not allowed"
 TOO_MANY = "too many connections"
 UNASKED_KEY = "no handshake that an open endpoint knows: a key is not to be shown here"
-MAYBE_ASKED = (None, PLAIN, TOO_MANY)
-"What is known of a peer that has gone, where libzmq may have asked about its key before."
 BROKEN_HANDSHAKE, LEFT = "broken handshake", "left in the handshake"
 
 log = logging.getLogger(__name__)
@@ -73,19 +71,48 @@ class _Connections:
         self.admitted: Counter[str] = Counter()
         self.turned_away: deque[str] = deque(maxlen=CONNECTIONS)
         "Addresses whose keys were refused, and whose connections are not closed yet."
+        self.untold = 0
+        "So many of these libzmq has not turned away yet: whoever leaves in the handshake may be one of them."
+        self.taken_for_one: deque[tuple[str, str]] = deque(maxlen=CONNECTIONS)
+        "Addresses of those that did, and of those that they were taken for."
         self.failed: str | None = None
         "Why the handshake failed of the connection that is closed next: libzmq closes it at once."
         self.cut: set[int] = set()
 
-    def was_turned_away(self, address: str) -> bool:
-        """Whether a connection that is closed is one whose key was refused."""
-        if not address and self.turned_away:  # it had gone before it was seen
-            self.turned_away.popleft()
-            return True
-        if address not in self.turned_away:
+    def turn_away(self, address: str) -> None:
+        """Its key is refused, which libzmq will be told."""
+        self.turned_away.append(address)
+        self.untold += 1
+
+    def told(self) -> str | None:
+        """libzmq turns one away. The address of another that had left in the handshake and was taken for this one."""
+        if self.untold:
+            self.untold -= 1
+            return None
+        other, address = self.taken_for_one.pop() if self.taken_for_one else ("", "")
+        self.turned_away.append(address)
+        return other
+
+    def left_untold(self, address: str) -> bool:
+        """Whether a connection that was closed in the handshake is one whose key was refused."""
+        taken = self._turned_away(address) if self.untold else None
+        if taken is None:
             return False
-        self.turned_away.remove(address)
+        self.untold -= 1
+        self.taken_for_one.append((address, taken))
         return True
+
+    def was_turned_away(self, address: str) -> bool:
+        """Whether a connection that is closed after its handshake is one whose key was refused."""
+        return self._turned_away(address) is not None
+
+    def _turned_away(self, address: str) -> str | None:
+        if not address and self.turned_away:  # it had gone before it was seen
+            return self.turned_away.popleft()
+        if address not in self.turned_away:
+            return None
+        self.turned_away.remove(address)
+        return address
 
 
 class Admission:
@@ -137,6 +164,7 @@ class Admission:
             endpoint.setsockopt(zmq.TCP_KEEPALIVE_CNT, 4)
         events = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
         events |= zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+        events |= zmq.EVENT_HANDSHAKE_FAILED_AUTH
         self._endpoints[endpoint.get_monitor_socket(events)] = _Connections(name, is_guarded)
         self._watched.append(endpoint)
 
@@ -237,7 +265,7 @@ class Admission:
             self._moved(name, address, has_left=False)
             known.admitted[address] += 1
             return True
-        known.turned_away.append(address)
+        known.turn_away(address)
         listed = self.allowed.get(public)
         reason = UNLISTED if listed is None else f"{WRONG_ROLE}: {', '.join(sorted(listed.roles))}"
         self._refuse(name, address, self.name(public) if public else "", reason)
@@ -260,6 +288,10 @@ class Admission:
             elif kind == zmq.EVENT_DISCONNECTED:
                 self._admit()  # it may have been asked about before it left, and is counted once
                 self._disconnected(known, value)
+            elif kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+                other = known.told()
+                if other is not None:
+                    self._refuse(known.name, other, "", PLAIN)
             elif kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
                 known.failed = REASONS.get(value, BROKEN_HANDSHAKE) if known.is_guarded else UNASKED_KEY
             elif kind == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL:
@@ -290,11 +322,12 @@ class Admission:
             known.of_address[address] -= 1
             if not known.of_address[address]:
                 del known.of_address[address]
+        was_asked = known.was_turned_away(address) if failed is None else failed == PLAIN and known.left_untold(address)
         if descriptor in known.cut:
             known.cut.discard(descriptor)
             failed = TOO_MANY
-        if failed in MAYBE_ASKED and known.was_turned_away(address):
-            pass  # counted when it was asked about
+        if was_asked:
+            pass  # counted then
         elif failed is not None:
             self._refuse(known.name, address, "", failed)
         elif not known.is_guarded:
