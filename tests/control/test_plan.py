@@ -245,6 +245,19 @@ def test_what_teaches_nothing_leaves_the_device_as_it_is(core, estimate: Estimat
     assert state.device == known
 
 
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_handle_that_has_stopped_teaches_nothing(core, goes_on: bool) -> None:
+    """Its rate is filtered and is known for slower only later, when the gap may have moved on already."""
+    state, devices = learned(core, 2.0, moving(sensed_s=0.0)), []
+    for number in range(10):
+        now_s = state.plan.time_s + PERIOD_S
+        at_mm = 100.0 + 5.0 * PERIOD_S * number * goes_on
+        slower = Handle(MOBILISED_MM, 5.0, Turn(1.0, 0.0, at_mm), 42.0)
+        state = planned(core, 1.0, moving(force_N=0.8, sensed_s=now_s, handle_mm=at_mm, handle=slower), state)
+        devices.append(state.device)
+    assert (devices[2] == devices[-1]) is not goes_on
+
+
 def test_one_reading_teaches_once(core) -> None:
     state = planned(core, 1.0, moving(force_N=1.4))
     again = core.planner.plan(state, state.plan.time_s + PERIOD_S, None, moving(force_N=1.4, number=state.shown.read))
@@ -314,30 +327,25 @@ def test_positions_before_homing_predict_nothing(core) -> None:
     assert planned(core, 1.0, moving()).plan.predicted_N is not None
 
 
-def test_a_publishers_own_motion_is_used_instead_of_the_measured(core) -> None:
-    state = core.planner.start(0.0)
+TURNING = moving(is_homed=False, handle=Handle(MOBILISED_MM / 2.0, 42.0, TURN, 42.0))
 
-    def gap(estimate: Estimate | None, rate_mm_s: float | None) -> float:
-        return core.planner.plan(
-            state, PERIOD_S, TimedSetpoint(1.0, PERIOD_S, 0.1, rate_mm_s=rate_mm_s), estimate
-        ).plan.gap_mm
 
+def gap_mm(core: Core, estimate: Estimate | None, rate_mm_s: float | None, now_s: float = PERIOD_S) -> float:
+    """The plan's, where the setpoint states this rate."""
+    setpoint = TimedSetpoint(1.0, PERIOD_S, 0.1, rate_mm_s=rate_mm_s)
+    return core.planner.plan(core.planner.start(0.0), now_s, setpoint, estimate).plan.gap_mm
+
+
+def test_a_publishers_own_motion_is_used_until_the_handle_slides(core) -> None:
     slow = moving(force_N=0.0, is_homed=False, handle=Handle(MOBILISED_MM, 8.0, TURN, 8.0))
-    assert gap(None, 8.0) == gap(slow, None) == gap(moving(is_homed=False), -8.0)
-    assert gap(moving(is_homed=False), None) != gap(slow, None)
+    assert gap_mm(core, None, 8.0) == gap_mm(core, slow, None) == gap_mm(core, TURNING, -8.0)
+    sliding = moving(is_homed=False)
+    assert gap_mm(core, sliding, 8.0) == gap_mm(core, sliding, None) != gap_mm(core, slow, None)
 
 
 def test_a_stale_setpoints_motion_is_not_used_any_more(core) -> None:
-    state = core.planner.start(0.0)
-    measured = moving(is_homed=False)
-
-    def gap(now_s: float, rate_mm_s: float | None) -> float:
-        return core.planner.plan(
-            state, now_s, TimedSetpoint(1.0, PERIOD_S, 0.1, rate_mm_s=rate_mm_s), measured
-        ).plan.gap_mm
-
-    assert gap(0.09, 8.0) != gap(0.09, None)
-    assert gap(0.2, 8.0) == gap(0.2, None)
+    assert gap_mm(core, TURNING, 8.0, now_s=0.09) != gap_mm(core, TURNING, None, now_s=0.09)
+    assert gap_mm(core, TURNING, 8.0, now_s=0.2) == gap_mm(core, TURNING, None, now_s=0.2)
 
 
 estimates = st.none() | st.builds(

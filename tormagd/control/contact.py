@@ -26,7 +26,8 @@ class Contact:
         self.slides: Final = slides
 
     def planned(self, setpoint: TimedSetpoint | None, estimate: Estimate | None) -> tuple[float, float]:
-        """Displacement, mm, and rate, mm/s, that the force is planned for: the setpoint's own where it states them."""
+        """Displacement, mm, and rate, mm/s, that the force is planned for: the setpoint's own where it states them, but
+        of a handle that slides the measured rate."""
         raise NotImplementedError
 
     def present(self, estimate: Estimate) -> tuple[float, float]:
@@ -53,7 +54,8 @@ class Sliding(Contact):
         if setpoint is not None:
             if setpoint.displacement_mm is not None:
                 displacement_mm = setpoint.displacement_mm
-            if setpoint.rate_mm_s is not None:
+            # learned of the measured rate, a device would be taken for another at the stated one
+            if setpoint.rate_mm_s is not None and (estimate is None or not self.is_known(estimate)):
                 rate_mm_s = abs(setpoint.rate_mm_s)
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
 

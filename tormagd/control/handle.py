@@ -12,6 +12,8 @@ from firmware_protocol.value import Value
 
 STANDS_MM: Final = 0.01
 "Just over a count of the encoder: a handle within it stands."
+STOPPED_S: Final = 0.01
+"One that has stood for so long slides no more, whatever its rate's filter still says: friction keeps what it is."
 SETTLES_S: Final = 0.3
 "What the rate's filter leaves of a motion, and what the force sensor still has to tell of it, has gone by then."
 RISES_N: Final = 0.15
@@ -50,6 +52,11 @@ class HandleWatch(Value):
         self.least_N: Final = least_N
         self.least_model_N: Final = least_model_N
         self.is_lost: Final = is_lost
+
+    @property
+    def has_stopped(self) -> bool:
+        """Whether it slides no more."""
+        return self.still_s > STOPPED_S
 
     def heard(self, sensed_s: float, handle_mm: float, reading_N: float, model_N: float) -> "HandleWatch":
         """The same after one more reading of handle and force, where the model gives `model_N` at the measured gap."""

@@ -35,6 +35,8 @@ NEWS_S = 10.0
 "At most one log line in this time."
 AT_ONCE = 8
 "Events taken from one socket before the next one's turn."
+RESTS_S = 1e-3
+"Between two looks for events: each look, too, takes the interpreter's lock, when events come and not when it is spared."
 _CREDENTIALS = struct.Struct("3i")
 _ZAP = "inproc://zeromq.zap.01"
 _KEY_BYTES = 32
@@ -242,6 +244,8 @@ class Admission:
                 else:
                     self._watch(ready, self._endpoints[ready])
             self._tell()
+            time.sleep(RESTS_S)
+            time.sleep(self.pause_s())
 
     def _admit(self) -> None:
         for _ in range(AT_ONCE):
