@@ -40,8 +40,8 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A force to render, from one publisher. `stamp_ns` is CLOCK_REALTIME at the publisher.
 
     `displacement_mm` (since the handle turned) and `rate_mm_s` say at which handle motion the force is meant; without
-    them, and of a brake's handle that slides, the daemon uses the motion it measures. `preview_N` holds the forces that follow this one, `preview_dt_ms`
-    apart. A publisher that is started again raises its `session` and starts `seq` anew.
+    them, and of a brake's handle that slides, the daemon uses the motion it measures. `preview_N` holds the forces that
+    follow, `preview_dt_ms` apart. A publisher that is started again raises its `session` and starts `seq` anew.
     """
 
     v: int

@@ -36,7 +36,7 @@ NEWS_S = 10.0
 AT_ONCE = 8
 "Events taken from one socket before the next one's turn."
 RESTS_S = 1e-3
-"Between two looks for events: each look, too, takes the interpreter's lock, when events come and not when it is spared."
+"Between two looks for events: a look, too, takes the interpreter's lock, when they come and not when it is to spare."
 _CREDENTIALS = struct.Struct("3i")
 _ZAP = "inproc://zeromq.zap.01"
 _KEY_BYTES = 32
