@@ -38,7 +38,7 @@ def test_what_only_those_hear_who_were_let_in(more: bytes) -> None:
 
 def knocked(**changed: Any) -> Line:
     found = {"tries": 10_000, "most_bytes": 246, "beyond": 0, "per_s": 530.0, "counted": 10_000}
-    late = {"without_p99_us": 40.0, "late_p99_us": 71.0}
+    late = {"without_p99_us": 40.0, "next_door_p99_us": 90.0, "late_p99_us": 71.0}
     return strangers.judged({"plain": found | late | changed}, [])
 
 
