@@ -61,7 +61,7 @@ def page() -> str:
         "500 plans a second, and with what was chosen at the rates chosen.",
         f"![what the scenes ask for over time](<{PICTURE.as_posix()}>)",
         _trade(met),
-        _counts(met + _met(recordings)),
+        _counts(met + _met(recordings), file.share),
         _rates(file.scenes),
         _solver(file.scenes),
         *(_scene(scene, load_scene(scene.name).description, file.share) for scene in file.scenes),
@@ -136,7 +136,7 @@ def _row(stated: Scene, found: MeasuredScene | None) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _counts(scenes: tuple[MeasuredScene, ...]) -> str:
+def _counts(scenes: tuple[MeasuredScene, ...], share: float) -> str:
     rows = []
     for term in TERMS:
         inside = [f"`{scene.name}`" for scene in scenes if term not in scene.left_out]
@@ -146,20 +146,24 @@ def _counts(scenes: tuple[MeasuredScene, ...]) -> str:
             f"{_added(worst, term) / worst.tolerance_N:.0%} of the tolerance of `{worst.name}` |"
         )
     table = "| term | required by | most that its absence adds |\n| --- | --- | --- |\n" + "\n".join(rows)
-    never = [f"`{term}`" for term in TERMS if all(term in scene.left_out for scene in scenes)]
+    never = [term for term in TERMS if all(term in scene.left_out for scene in scenes)]
     parts = [
         "## Which terms count",
         "Of the scenes and [recordings](#recordings) that are met.",
         table,
-        f"No scene requires {', '.join(never)}. {_spare(scenes)}" if never else "Each is required by some scene.",
+        _never(scenes, never, share) if never else "Each is required by some scene.",
         _relaxation(scenes),
         _rate_error(),
     ]
     return "\n\n".join(parts)
 
 
-def _spare(scenes: tuple[MeasuredScene, ...]) -> str:
-    """Of the terms that no scene requires, what they do elsewhere."""
+def _never(scenes: tuple[MeasuredScene, ...], never: list[str], share: float) -> str:
+    """Of the terms that no scene requires, at what tolerance one would, and what they do elsewhere."""
+    would = []
+    for term in never:
+        worst = max(scenes, key=lambda scene: _added(scene, term))
+        would.append(f"`{term}` under {1e3 * _added(worst, term) / share:.1f} mN (`{worst.name}`)")
     found = _evidence("spare")
     added_N = {
         f"`{scene}`, {sample.replace('_', ' ')}": terms
@@ -179,8 +183,10 @@ def _spare(scenes: tuple[MeasuredScene, ...]) -> str:
         for without, samples in found["motion"].items()
     ]
     return (
-        f"None of them takes more than {_most_saved(scenes, terms):.2f} % of a core. Sample 1 chooses, whose motors "
-        "are those that the loop is tuned for. On the others (`tools/spare_terms.py`, while the device is learned) "
+        f"No scene requires {', '.join(f'`{term}`' for term in never)}. The tolerance at which one would: "
+        f"{', '.join(would)}; the force sensor's step is 1 mN. None of them takes more than "
+        f"{_most_saved(scenes, never):.2f} % of a core. Sample 1 chooses, whose motors are those that the loop is "
+        "tuned for. On the others (`tools/spare_terms.py`, while the device is learned) "
         f"each adds, left out alone, mN:\n\n{_table(['scene', *terms], forces)}\n\n"
         "`friction` and `pull` are there for the gap's motion. Steps of 1 mm overshoot by, settle within 5 % in, and "
         "the stroke takes, on samples 1 to 3:\n\n"
