@@ -7,7 +7,7 @@ CRC8_INITIAL: Final = 0xFF
 CRC8_FINAL_XOR: Final = 0xFF
 
 
-def _crc8_table() -> tuple[int, ...]:
+def _crc8_table() -> bytes:
     table = []
     for byte in range(256):
         register = byte
@@ -15,7 +15,7 @@ def _crc8_table() -> tuple[int, ...]:
             register = register << 1 ^ (CRC8_POLYNOMIAL if register & 0x80 else 0)
             register &= 0xFF
         table.append(register)
-    return tuple(table)
+    return bytes(table)
 
 
 CRC8_TABLE: Final = _crc8_table()

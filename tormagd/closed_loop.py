@@ -6,12 +6,13 @@ port are replaced. It stands beside the rooms because it joins control with simu
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterable
-from typing import NamedTuple, Self
+from typing import Final, Self, final
 
 import numpy as np
 import numpy.typing as npt
 
 from firmware_protocol.codec import Message
+from firmware_protocol.value import Value
 from tormagd.config import Config
 from tormagd.control.conditions import conditions
 from tormagd.control.governor import TimedSetpoint
@@ -29,25 +30,39 @@ from tormagd.simulation.device import MessageDevice, SerialDevice
 from tormagd.simulation.plant import Truth
 
 Array = npt.NDArray[np.float64]
-HOMING_S = 10.0
+HOMING_S: Final = 10.0
 "Longer than the slowest homing from a closed gap."
-MAX_UNREAD_BYTES = 4096
+MAX_UNREAD_BYTES: Final = 4096
 "What a serial port keeps for a program that does not read."
-MAX_UNREAD_FRAMES = 512
+MAX_UNREAD_FRAMES: Final = 512
 "What a CAN socket keeps, about."
 
 
-class Sample(NamedTuple):
-    """One control tick: what was asked, what the controller knew, and what really was."""
+@final
+class Sample(Value):
+    """One control tick: what was asked, what the controller knew, and what really was. The step was given the
+    `measurement`; what it drove may have changed the connection's by now."""
 
-    time_s: float
-    state: StepState
-    output: StepOutput
-    plan: Plan
-    trim: float
-    truth: Truth
-    measurement: Measurement | None
-    "What the step was given; what it drove may have changed the connection's by now."
+    __match_args__ = ("time_s", "state", "output", "plan", "trim", "truth", "measurement")
+    __slots__ = __match_args__
+
+    def __init__(
+        self,
+        time_s: float,
+        state: StepState,
+        output: StepOutput,
+        plan: Plan,
+        trim: float,
+        truth: Truth,
+        measurement: Measurement | None,
+    ) -> None:
+        self.time_s: Final = time_s
+        self.state: Final = state
+        self.output: Final = output
+        self.plan: Final = plan
+        self.trim: Final = trim
+        self.truth: Final = truth
+        self.measurement: Final = measurement
 
 
 class VirtualWire:

@@ -10,11 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tormagd.control.periodicity import (
+    DELAYS,
     GRID_S,
     HISTORY,
+    HORIZON,
     LEAST_HISTORY,
     LONGEST_STEP_S,
     NOTHING_LEARNED,
+    RIDGE,
+    SAME_N,
+    STRIDE,
+    TAPS,
     Periodicity,
     Skill,
     forecast_N,
@@ -206,6 +212,22 @@ def test_a_forecast_is_looked_for_once_for_each_point_of_the_grid() -> None:
     passed = observe(state, state.time_s + GRID_S, 1.5)
     assert passed.changes_N == state.changes_N
     assert foreseen(passed, 0.0).from_s == passed.time_s
+
+
+@pytest.mark.parametrize("seconds", [1.3, 4.0, 12.0])
+def test_a_forecast_is_the_constant_of_a_weighted_ridge_regression(seconds: float) -> None:
+    state = learned(seconds)
+    history, delays = np.frombuffer(state.history), np.array(DELAYS)
+    newest = len(history) - 1
+    ends = np.arange(newest - HORIZON, DELAYS[-1] - 1, -STRIDE)[:, None]
+    apart = history[ends - delays] - history[ends] - (history[newest - delays] - history[newest])
+    followed = history[ends + np.arange(HORIZON + 1)] - history[ends]
+    weight = (np.sum(apart**2, axis=1) + TAPS * SAME_N**2) ** -2
+    ridge = RIDGE / TAPS * np.sum(weight[:, None] * apart**2) + SAME_N**2 * np.sum(weight)
+    rows = np.sqrt(weight)[:, None] * np.column_stack([np.ones(len(ends)), apart])
+    rows = np.vstack([rows, np.sqrt(ridge) * np.eye(TAPS + 1)[1:]])
+    wanted = np.vstack([np.sqrt(weight)[:, None] * followed, np.zeros((TAPS, HORIZON + 1))])
+    assert state.changes_N == pytest.approx(np.linalg.lstsq(rows, wanted)[0][0], abs=1e-9)
 
 
 def test_the_forecast_starts_at_the_newest_setpoint_between_two_points_of_the_grid() -> None:

@@ -5,7 +5,7 @@ Continuous model, from duty u to carriage position x (mm), friction and load lef
 """
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +14,9 @@ from tormagd.config import Motor, Position
 
 Array = npt.NDArray[np.float64]
 
-PULL_STATED_MM = 45.0
+PULL_STATED_MM: Final = 45.0
 "The gap for which `motor.pull_V` is stated."
-PULL_DEPTH_MM = 32.0
+PULL_DEPTH_MM: Final = 32.0
 "Two blocks of 40 x 40 x 20 mm attract each other like dipoles this much further apart than their faces."
 
 

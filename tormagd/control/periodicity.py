@@ -55,14 +55,12 @@ TAPS: Final = 5
 _LEAST_BYTES: Final = LEAST_HISTORY * array("d").itemsize
 _MOST_BYTES: Final = HISTORY * array("d").itemsize
 _SHORTEST: Final = DELAYS[-1] + 1 + HORIZON
-_ROWS: Final = np.array([0, *[-delay for delay in DELAYS], *range(1, HORIZON + 1)])[:, None]
+_ROWS: Final = np.array([*[-delay for delay in DELAYS], *range(HORIZON + 1)])[:, None]
 _ENDS: Final = np.arange(-1 - HORIZON, _SHORTEST - HORIZON - HISTORY - 2, -STRIDE)
 _AROUND: Final = np.concatenate([np.minimum(_ROWS - 1, -1), _ROWS + _ENDS], axis=1)
-"""Places from the end of a full history, a column for each stretch: its end, what is compared of it, what followed. The
+"""Places from the end of a full history, a column for each stretch: what is compared of it, its end, what followed. The
 first column is the newest stretch, which nothing has followed yet."""
 _AHEAD_S: Final[list[float]] = [GRID_S * point for point in range(HORIZON + 1)]
-_CONSTANT: Final = np.eye(TAPS + 1)[0]
-_RIDGE: Final = np.diag(1.0 - _CONSTANT)
 
 
 @final
@@ -262,20 +260,31 @@ def _search(history: Array) -> list[float]:
     from itself, so that the regression's constant is its forecast.
     """
     changes = history[_AROUND[:, : (len(history) - _SHORTEST) // STRIDE + 2]]
-    changes[1:] -= changes[0]
-    before = changes[1 : TAPS + 1]
-    before -= before[:, :1]
-    squared = np.einsum("ij,ij->j", before, before)
-    weight = (squared + TAPS * SAME_N**2) ** -2
+    changes -= changes[TAPS]
+    before = changes[:TAPS]
+    before -= before[:, :1].copy()
+    weight = (np.add.reduce(before * before) + TAPS * SAME_N**2) ** -2
     weight[0] = 0.0
-    changes[0] = 1.0
-    regressors = changes[: TAPS + 1]
-    weighted = regressors * weight
-    normal = weighted @ regressors.T
-    total = normal[0, 0]
-    normal += (RIDGE / TAPS * (weight @ squared) + SAME_N**2 * total) * _RIDGE
-    solution = np.linalg.solve(normal, _CONSTANT)
-    if solution[0] * total > MOST_LEVERAGE:
+    changes[TAPS] = 1.0
+    return _constants((changes[: TAPS + 1] * weight @ changes.T).tolist())
+
+
+def _constants(rows: list[list[float]]) -> list[float]:
+    """The regression's constants, the first 0, by elimination of all else from its normal equations: weighted sums of
+    products, a row for each regressor, that of 1 the last; a column for each, and behind them for what followed."""
+    total = rows[TAPS][TAPS]
+    variance = 0.0
+    for place in range(TAPS):
+        variance += rows[place][place]
+    ridge = RIDGE / TAPS * variance + SAME_N**2 * total
+    for _ in range(TAPS):
+        pivot = rows[0]
+        left: list[list[float]] = []
+        for row in rows[1:]:
+            share = row[0] / (pivot[0] + ridge)
+            left.append([value - share * above for value, above in zip(row[1:], pivot[1:])])  # noqa: B905
+        rows = left
+    constant = rows[0]
+    if total > MOST_LEVERAGE * constant[0]:
         return []
-    ahead: list[float] = (changes[TAPS + 1 :] @ (solution @ weighted)).tolist()
-    return [0.0, *ahead]
+    return [0.0, *[each / constant[0] for each in constant[1:]]]

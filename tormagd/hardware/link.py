@@ -31,28 +31,28 @@ from tormagd.hardware.link_statistics import DeviceClock, RoundTrip
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import DeviceRequest
 
-REPEAT_S = 0.05
+REPEAT_S: Final = 0.05
 "A Hello or a command without its acknowledgement is sent again after this time."
-GIVE_UP_S = 1.0
+GIVE_UP_S: Final = 1.0
 "A Home or Clear that the device has not taken by then, it would take as a surprise."
-HELLO_S = 1.0
+HELLO_S: Final = 1.0
 "A device that was reset takes no Drive before a Hello; it hears one this often."
-SILENT_S = 0.08
+SILENT_S: Final = 0.08
 "Without any message for this long the link is lost; by then the firmware's own 50 ms have passed."
-UNANSWERED_S = 1.0
+UNANSWERED_S: Final = 1.0
 "A device that has not said who it is for this long is asked only every HELLO_S: it may be another make's."
-FIRST_NONCE = 255
+FIRST_NONCE: Final = 255
 """A Hello's until a command has been acknowledged. Commands count from 1 to 254, so that theirs is always another, and
 0 is what a device shows after a reset."""
-OVERTAKEN = 16
+OVERTAKEN: Final = 16
 "A State whose counter is behind by less than this repeats an earlier one, or was overtaken; it is no measurement."
 
-POSITION_SPAN_MM = period(State, "left_position_mm")
-DEVICE_TIME_SPAN_S = period(State, "device_time_s")
-HANDLE_SPAN_MM = period(Sense, "handle_position_mm")
+POSITION_SPAN_MM: Final = period(State, "left_position_mm")
+DEVICE_TIME_SPAN_S: Final = period(State, "device_time_s")
+HANDLE_SPAN_MM: Final = period(Sense, "handle_position_mm")
 
 _HOMED: Final = int(Switches.HOMED)
-_COMMANDS: dict[DeviceRequest, type[Home] | type[Retract] | type[Clear]] = {
+_COMMANDS: Final[dict[DeviceRequest, type[Home] | type[Retract] | type[Clear]]] = {
     DeviceRequest.HOME: Home,
     DeviceRequest.RETRACT: Retract,
     DeviceRequest.CLEAR: Clear,
