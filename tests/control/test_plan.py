@@ -186,7 +186,7 @@ def swung(core: Core, late_s: float, *, is_known: bool, seconds: float = 10.0) -
 
 @pytest.mark.parametrize(("late_s", "learned_s"), [(0.015, 0.015), (0.0, 0.0), (-0.01, 0.0), (0.06, MOST_LAG_S)])
 def test_a_lag_is_learned_where_what_comes_is_known(core, late_s: float, learned_s: float) -> None:
-    assert swung(core, late_s, is_known=True).shown.lag_s == pytest.approx(learned_s, abs=3e-3)
+    assert swung(core, late_s, is_known=True).shown.lag_s == pytest.approx(learned_s, abs=1e-3)
 
 
 def test_a_gap_on_its_way_after_a_jump_is_not_late(core) -> None:
