@@ -262,7 +262,7 @@ def swing_N(time_s: float) -> float:
 def test_a_preview_is_what_comes(seconds: float, ahead_s: float) -> None:
     """A swing that no slope foresees; the path goes along it."""
     _, governed = told(swing_N, seconds, ahead_s=ahead_s)
-    assert path_N(governed) == pytest.approx([swing_N(seconds + after_s) for after_s in PATH_S], abs=5e-4)
+    assert path_N(governed) == pytest.approx([swing_N(seconds + after_s) for after_s in PATH_S], abs=2e-3)
     assert governed.force_N == governed.path_N[0]
     assert (governed.limits, governed.foresight) == ((), 1.0)
 

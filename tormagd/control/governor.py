@@ -278,13 +278,11 @@ class Governor:
         sent_mm, gap_mm = portrait.gap_mm_at(device.model_N(sent_N)), portrait.gap_mm_at(device.model_N(asks_N))
         way_mm = nearest_way_mm(sent_mm, elapsed_s, WAY_S, wanted_mm, weights, self._gap_speed_mm_s, len(PATH_S))
         forces_N: list[float] = []
-        left, behind = _following(elapsed_s, late_s)
-        in_a_step = _following(PATH_STEP_S, late_s)
+        left, left_in_a_step = math.exp(-elapsed_s / late_s), math.exp(-PATH_STEP_S / late_s)
         for drive_mm in way_mm:
-            gap_mm = drive_mm + left * (gap_mm - sent_mm) - behind * (drive_mm - sent_mm)
+            gap_mm = drive_mm + (gap_mm - drive_mm) * left
             forces_N.append(device.force_N(portrait.force_N_at(gap_mm)))
-            sent_mm = drive_mm
-            left, behind = in_a_step
+            left = left_in_a_step
         return forces_N, device.force_N(portrait.force_N_at(way_mm[0]))
 
     def foresee(self, state: GovernorState) -> GovernorState:
@@ -324,13 +322,6 @@ class Governor:
         if allowed_N > highest_N:
             return highest_N, (*reasons, Limit.F_MAX)
         return allowed_N, reasons
-
-
-def _following(step_s: float, late_s: float) -> tuple[float, float]:
-    """How a gap follows, with the time constant `late_s`, what moves evenly for `step_s`: the share that is left of its
-    distance before, and the share of the move by which it is behind besides."""
-    left = math.exp(-step_s / late_s)
-    return left, (1.0 - left) * late_s / step_s if step_s > 0.0 else 1.0
 
 
 def _previewed_N(setpoint: TimedSetpoint, begins_s: float, least_N: float, most_N: float) -> list[float]:
