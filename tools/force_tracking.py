@@ -86,7 +86,6 @@ class Track(NamedTuple):
     rendered_N: Array
     limits: dict[str, float]
     trim: float
-    lag_s: float
     shown: Shown = NOTHING_SHOWN
 
     def since(self, start_s: float) -> Tracking:
@@ -139,7 +138,7 @@ def track(
     if not signal.is_known_ahead:  # what comes as an event holds until the next
         asked = signal.force_N[np.searchsorted(signal.time_s, axis, side="right") - 1]
     shares = {str(limit): count / len(axis) for limit, count in sorted(held.items())}
-    return Track(axis, asked, rendered, shares, sample.trim, loop.plan_state.lag_s, loop.plan_state.shown)
+    return Track(axis, asked, rendered, shares, sample.trim, loop.plan_state.shown)
 
 
 def pulse(duration_s: float) -> Signal:
@@ -185,7 +184,7 @@ def samples(pool: concurrent.futures.Executor) -> tuple[Json, dict[str, Track]]:
                 "whole": compared(found, best[name].result(), 0.0),
                 "after_trim": compared(found, best[name].result(), TRIM_S),
                 "trim": found.trim,
-                "lag_ms": found.lag_s * 1e3,
+                "lag_ms": found.shown.lag_s * 1e3,
                 "limits": found.limits,
             }
         )

@@ -256,8 +256,8 @@ class RateReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class DeviceReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The device as far as it has shown itself: its force is `scale` times the model's plus `offset_N`; and what its
-    force sensor reads without one."""
+    """The device as far as it has shown itself: its force is `scale` times the model's plus `offset_N`; what its force
+    sensor reads without one; and how late its carriages are, as far as that is learned."""
 
     scale: float
     scale_sd: float
@@ -265,6 +265,7 @@ class DeviceReport(msgspec.Struct, frozen=True, kw_only=True):
     offset_sd_N: float
     sensor_zero_N: float
     sensor_zero_sd_N: float
+    lag_ms: float | None = None
 
 
 class ProfileReport(msgspec.Struct, frozen=True, kw_only=True):

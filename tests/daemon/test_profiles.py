@@ -15,7 +15,7 @@ from tormagd.control.sensor import Sensor
 from tormagd.daemon.profiles import ProfileFolder, Profiles
 
 MODEL = "ab" * 32
-STRONG = Shown(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4))
+STRONG = Shown(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4), lag_s=0.02)
 
 
 class Rig:
@@ -63,7 +63,7 @@ def test_what_is_learned_while_driven_is_there_after_a_restart(tmp_path: Path) -
         again = Rig(tmp_path / "profiles")
         again.profiles.look(7, is_driven=False)
         await again.settled()
-        assert again.shown.device.scale == 1.3
+        assert (again.shown.device.scale, again.shown.lag_s) == (1.3, 0.02)
         report = again.profiles.report()
         assert report.is_used
         assert report.age_s is not None
@@ -72,7 +72,13 @@ def test_what_is_learned_while_driven_is_there_after_a_restart(tmp_path: Path) -
     run(scene)
 
 
-def test_a_profile_that_nothing_was_added_to_does_not_get_younger(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("added", "is_kept"),
+    [({"device": DeviceFit(1.31, 0.02, 1e-4, 0.0, 1e-4)}, b'"scale": 1.31'), ({"lag_s": 0.025}, b'"lag_s": 0.025')],
+)
+def test_a_profile_that_nothing_was_added_to_does_not_get_younger(
+    tmp_path: Path, added: dict[str, object], is_kept: bytes
+) -> None:
     keep(tmp_path, 7)
     path = tmp_path / "00000007-MRE-50-40.json"
     before = path.read_bytes()
@@ -86,10 +92,10 @@ def test_a_profile_that_nothing_was_added_to_does_not_get_younger(tmp_path: Path
         await rig.settled()
         assert path.read_bytes() == before
         rig.profiles.look(7, is_driven=True)
-        rig.shown = rig.shown.replaced(device=DeviceFit(1.31, 0.02, 1e-4, 0.0, 1e-4))
+        rig.shown = rig.shown.replaced(**added)
         rig.profiles.look(7, is_driven=False)
         await rig.settled()
-        assert b"1.31" in path.read_bytes()
+        assert is_kept in path.read_bytes()
 
     run(scene)
 

@@ -65,7 +65,7 @@ V1: dict[type[msgspec.Struct], str] = {
     LatenessReport: "p50 p99 p999 max worst",
     ExecReport: "p50 p99 p999 max",
     ProfileReport: "is_used age_s refusal folder",
-    DeviceReport: "scale scale_sd offset_N offset_sd_N sensor_zero_N sensor_zero_sd_N",
+    DeviceReport: "scale scale_sd offset_N offset_sd_N sensor_zero_N sensor_zero_sd_N lag_ms",
     Explained: "code cause remedy",
     StallReport: "ms culprit",
     BlackBoxReport: "folder newest refusal dropped",

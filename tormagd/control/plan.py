@@ -52,6 +52,9 @@ LAG_TIME_S: Final = 0.4
 MOST_LAG_S: Final = 0.045
 """Chosen on sample 1 with its inertia, 1.7 and 2.5 times of it: with 400 ms of preview the first finger pressure is
 missed least, over 16 s from a lag of none, by 9.5, 12.6 and 15.9 mN. A second and 30 ms leave 10.3, 14.4 and 19.2."""
+MEASURED_S: Final = 0.0015
+"""So long before a plan its carriages were measured. Taken for lateness, that was learned without end: 20 ms by sample
+1 in 16 s of the first finger pressure; now 9, and 11 in 16 more. Chosen there: with 1 ms it goes on growing."""
 LEAST_FORESIGHT: Final = 0.5
 "With less the lag is hardly made up for, and teaching it would have no end."
 LEAST_TRAVEL_MM_S: Final = 10.0
@@ -142,10 +145,10 @@ class Plan(Value):
 @final
 class Shown(Value):
     """What the device has shown of itself by its readings up to number `read`, taken at `read_s`, at speed and at a
-    creep, whether its sensor is believed, what it reads without a force, and the limits that come of it. `surprise_N`
-    is by how much the newest readings were more than expected."""
+    creep, whether its sensor is believed, what it reads without a force, and the limits that come of it. `lag_s`, 0 to
+    MOST_LAG_S, is how late its carriages are; `surprise_N` by how much the newest readings were more than expected."""
 
-    __match_args__ = ("device", "sensor", "read", "read_s", "limits", "slow", "zero", "surprise_N")
+    __match_args__ = ("device", "sensor", "read", "read_s", "limits", "slow", "zero", "lag_s", "surprise_N")
     __slots__ = __match_args__
 
     def __init__(
@@ -157,9 +160,11 @@ class Shown(Value):
         limits: tuple[Limit, ...] = (),
         slow: SlowFriction = NOTHING_SLOW,
         zero: SensorZero = TARED,
+        lag_s: float = 0.0,
         surprise_N: float = 0.0,
     ) -> None:
         self.device: Final = device
+        self.lag_s: Final = lag_s
         self.surprise_N: Final = surprise_N
         self.slow: Final = slow
         self.zero: Final = zero
@@ -174,9 +179,9 @@ NOTHING_SHOWN: Final = Shown()
 
 @final
 class PlanState(Value):
-    """What planning remembers, and what the element does. `lag_s` is how late the device's carriages are."""
+    """What planning remembers, and what the element does."""
 
-    __match_args__ = ("governor", "plan", "shown", "lag_s", "handle", "remembered")
+    __match_args__ = ("governor", "plan", "shown", "handle", "remembered")
     __slots__ = __match_args__
 
     def __init__(
@@ -184,14 +189,12 @@ class PlanState(Value):
         governor: GovernorState,
         plan: Plan,
         shown: Shown = NOTHING_SHOWN,
-        lag_s: float = 0.0,
         handle: HandleWatch = UNHEARD,
         remembered: Remembered = NOTHING_REMEMBERED,
     ) -> None:
         self.governor: Final = governor
         self.plan: Final = plan
         self.shown: Final = shown
-        self.lag_s: Final = lag_s
         self.handle: Final = handle
         self.remembered: Final = remembered
 
@@ -246,7 +249,8 @@ class Planner:
         self._adapts_in_s, self._scales = trim.time_s, (trim.least, trim.most)
         self._low_confidence = config.limits.low_confidence
         self._unsensed_s = unsensed_s(1.0 / config.rates.control_hz)
-        self._has_rate, self._has_lag = terms.rate, terms.lag and terms.learning
+        self._has_rate, self._has_lag = terms.rate, terms.lag
+        self._learns_lag = terms.learning and terms.lag
         self._has_creep = terms.creep and contact.slides
         self._learns_creep = terms.learning and self._has_creep
         self._fits = terms.learning and (terms.scale or terms.offset)
@@ -284,8 +288,9 @@ class Planner:
         if self._has_creep:
             sliding_mm_s = MOVING_MM_S if estimate is None else estimate.handle.sliding_mm_s
             device = device.times(shown.slow.factor_at(sliding_mm_s))
-        governor, governed = self._governor.govern(state.governor, now_s, setpoint, device, state.lag_s)
-        lag_s = self._learn_lag(state, now_s, estimate, remembered, governed, device)
+        lag_s = shown.lag_s if self._has_lag else 0.0
+        governor, governed = self._governor.govern(state.governor, now_s, setpoint, device, lag_s)
+        shown = self._learn_lag(shown, now_s - state.plan.time_s, estimate, remembered, governed, device)
         is_meant = setpoint is not None and Limit.STALE not in governed.limits
         curve = self._only_curve
         displacement_mm, rate_mm_s = curve.displacement_mm, curve.rate_mm_s
@@ -343,7 +348,7 @@ class Planner:
             outside=outside,
             sensor_doubted_s=shown.sensor.doubted_s,
         )
-        return PlanState(governor, plan, shown, lag_s, handle, remembered)
+        return PlanState(governor, plan, shown, handle, remembered)
 
     def foresee(self, state: PlanState) -> PlanState:
         """What can be prepared for the next plans once one is made: to be called after each, when nothing waits."""
@@ -403,7 +408,7 @@ class Planner:
             return shown
         if now_s - estimate.sensed_s > self._unsensed_s:
             return shown  # its force is an old one
-        slow, zero = shown.slow, shown.zero
+        slow, zero, lag_s = shown.slow, shown.zero, shown.lag_s
         if self._has_creep:
             slow = slow.followed(model_N, estimate.handle_mm)
         direction, rate_mm_s = estimate.handle.turn.direction, abs(estimate.handle.rate_mm_s)
@@ -425,7 +430,7 @@ class Planner:
                 is_lesson = is_zero_known and (is_mobilised or reading_N > expected_N)
                 if expected_N > LEAST_EXPECTED_N and is_lesson:
                     slow = slow.observed(shown.device, rate_mm_s, reading_N, elapsed_s)
-            return Shown(shown.device, shown.sensor, estimate.number, now_s, shown.limits, slow, zero)
+            return Shown(shown.device, shown.sensor, estimate.number, now_s, shown.limits, slow, zero, lag_s)
         # the sensor is judged by all that an elastomer may do, whatever this one is thought to remember
         sensor = judge(
             shown.sensor,
@@ -451,13 +456,12 @@ class Planner:
         )
         limits: tuple[Limit, ...] = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
         if sensor.is_doubted:
-            return Shown(UNSEEN, sensor, estimate.number, now_s, (Limit.SENSOR, *limits), NOTHING_SLOW, zero)
+            return Shown(UNSEEN, sensor, estimate.number, now_s, (Limit.SENSOR, *limits), NOTHING_SLOW, zero, lag_s)
         if not is_zero_known:
-            return Shown(
-                shown.device, sensor, estimate.number, now_s, (Limit.OFFSET_UNKNOWN, *limits), shown.slow, zero
-            )
+            limits = (Limit.OFFSET_UNKNOWN, *limits)
+            return Shown(shown.device, sensor, estimate.number, now_s, limits, shown.slow, zero, lag_s)
         if not self._fits:
-            return Shown(shown.device, sensor, estimate.number, now_s, limits, slow, zero)
+            return Shown(shown.device, sensor, estimate.number, now_s, limits, slow, zero, lag_s)
         error_N = reading_N - shown.device.force_N(model_N)
         surprise_N = shown.surprise_N + elapsed_s / (SURPRISE_S + elapsed_s) * (error_N - shown.surprise_N)
         adapts_in_s = self._adapts_in_s / (1.0 + (surprise_N / SURPRISE_N) ** 2)
@@ -475,7 +479,7 @@ class Planner:
         slow = slow.beside(shown.device.force_N(model_N), device.force_N(model_N))
         if is_held:
             limits = (Limit.TRIM, *limits)
-        return Shown(device, sensor, estimate.number, now_s, limits, slow, zero, surprise_N)
+        return Shown(device, sensor, estimate.number, now_s, limits, slow, zero, lag_s, surprise_N)
 
     def _lawful_mT(self, solution: FieldSolution, wanted_N: float) -> float:
         """The search's field, no further than LAW_SHARE from the force law's."""
@@ -486,25 +490,37 @@ class Planner:
 
     def _learn_lag(
         self,
-        state: PlanState,
-        now_s: float,
+        shown: Shown,
+        elapsed_s: float,
         estimate: Estimate | None,
         remembered: Remembered,
         governed: Governed,
         device: DeviceFit,
-    ) -> float:
+    ) -> Shown:
         """How far the gap is behind over how fast it moves: a motor weaker than it is believed to be comes late."""
-        if not self._has_lag or estimate is None or not estimate.is_homed or governed.foresight < LEAST_FORESIGHT:
-            return state.lag_s
+        if not self._learns_lag or estimate is None or not estimate.is_homed or governed.foresight < LEAST_FORESIGHT:
+            return shown
         # the gap that would do the same without the field's lag
         gap_mm = self._field.gap_mm(remembered.field_mT - remembered.lag_mT)
         behind_mm = self.portrait.gap_mm_at(device.model_N(governed.force_N)) - gap_mm
         if abs(behind_mm) > MOST_LAG_S * self._fastest_mm_s:
-            return state.lag_s  # on its way after a jump
+            return shown  # on its way after a jump
         travel_mm_s = estimate.left_mm_s + estimate.right_mm_s
+        behind_mm -= travel_mm_s * MEASURED_S
         late_s = behind_mm * travel_mm_s / (travel_mm_s * travel_mm_s + LEAST_TRAVEL_MM_S * LEAST_TRAVEL_MM_S)
-        elapsed = max(0.0, now_s - state.plan.time_s)
-        return min(max(state.lag_s + elapsed / (LAG_TIME_S + elapsed) * late_s, 0.0), MOST_LAG_S)
+        elapsed_s = max(0.0, elapsed_s)
+        lag_s = min(max(shown.lag_s + elapsed_s / (LAG_TIME_S + elapsed_s) * late_s, 0.0), MOST_LAG_S)
+        return Shown(
+            shown.device,
+            shown.sensor,
+            shown.read,
+            shown.read_s,
+            shown.limits,
+            shown.slow,
+            shown.zero,
+            lag_s,
+            shown.surprise_N,
+        )
 
     def _motion_ahead(self, governed: Governed, device: DeviceFit) -> tuple[float, float]:
         # along the portrait, not from one solution to the next: a difference would amplify the solver's grain

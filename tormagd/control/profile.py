@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Meta
 
 from tormagd.control.device_fit import OFFSET_SD_N, SCALE_SD, DeviceFit
-from tormagd.control.plan import Shown
+from tormagd.control.plan import MOST_LAG_S, Shown
 from tormagd.control.sensor_zero import MOST_ZERO_N, TARED, SensorZero
 from tormagd.control.slow_friction import LEAST, MOST, SlowFriction
 
@@ -33,7 +33,8 @@ class ProfileError(ValueError):
 
 class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A device, by its serial number, with an insert, as a model sees it. `saved_ns` is CLOCK_REALTIME; the others are
-    those of `DeviceFit`, `SlowFriction` and `SensorZero`, with standard deviations for variances."""
+    those of `DeviceFit`, `SlowFriction`, `SensorZero` and `Shown`, with standard deviations for variances. Profiles
+    from before lateness was kept have no `lag_s`: none is known of the device."""
 
     v: Annotated[int, Meta(ge=VERSION, le=VERSION)]
     serial_number: Annotated[int, Meta(ge=0, lt=2**32)]
@@ -46,6 +47,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     slow_factor: Annotated[float, Meta(ge=LEAST, le=MOST)]
     slow_learned: Annotated[float, Meta(ge=0.0, le=1.0)]
     sensor_zero_N: Annotated[float, Meta(ge=-MOST_ZERO_N, le=MOST_ZERO_N)]
+    lag_s: Annotated[float, Meta(ge=0.0, le=MOST_LAG_S)] = 0.0
 
     def shown(self, now_ns: int) -> Shown:
         """What the device counts as having shown of itself, at CLOCK_REALTIME `now_ns`."""
@@ -53,7 +55,8 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         device = DeviceFit(self.scale, self.offset_N, scale_sd**2, 0.0, min(RELAXED_SD_N, OFFSET_SD_N) ** 2)
         slow = SlowFriction(self.slow_factor, self.slow_learned)
         is_recent = abs(now_ns - self.saved_ns) * 1e-9 < ZERO_LASTS_S
-        return Shown(device, slow=slow, zero=SensorZero(self.sensor_zero_N) if is_recent else TARED)
+        zero = SensorZero(self.sensor_zero_N) if is_recent else TARED
+        return Shown(device, slow=slow, zero=zero, lag_s=self.lag_s)
 
 
 def profile_of(shown: Shown, *, serial_number: int, insert: str, model: str, saved_ns: int) -> Profile:
@@ -70,6 +73,7 @@ def profile_of(shown: Shown, *, serial_number: int, insert: str, model: str, sav
         slow_factor=shown.slow.factor,
         slow_learned=shown.slow.learned,
         sensor_zero_N=shown.zero.zero_N,
+        lag_s=shown.lag_s,
     )
 
 

@@ -89,7 +89,7 @@ class Profiles:
         self._was_driven = False
         self._writing: asyncio.Future[None] | None = None
         self._saved_ns: int | None = None
-        self._on_disk: tuple[DeviceFit, SlowFriction, float] | None = None
+        self._on_disk: tuple[DeviceFit, SlowFriction, float, float] | None = None
         self._is_used = False
         self.digest = ""
         "SHA-256 of the profile that was read; empty without one."
@@ -173,6 +173,6 @@ class Profiles:
             self._refusal = ""
 
 
-def _kept(shown: Shown) -> tuple[DeviceFit, SlowFriction, float]:
+def _kept(shown: Shown) -> tuple[DeviceFit, SlowFriction, float, float]:
     """What of it a profile holds."""
-    return shown.device, shown.slow, shown.zero.zero_N
+    return shown.device, shown.slow, shown.zero.zero_N, shown.lag_s
