@@ -84,7 +84,7 @@ def _reversals(axes: Axes, rehearsals: list[Rehearsal]) -> None:
     second = axes.twinx()
     second.fill_between(time_s, moving.handle_mm_s[part], color=QUIET, alpha=0.25, linewidth=0)
     second.set_ylabel("handle speed, mm/s (grey)", color=QUIET)
-    _dress(axes, "Handle stops and reverses: a brake never pushes", "force at the roller, N")
+    _dress(axes, "A handle that stops and reverses", "force at the roller, N")
 
 
 def _name_above(axes: Axes) -> None:

@@ -49,7 +49,7 @@ def picture(path: Path, pulses: dict[str, Any], stairs: dict[str, Any], figures:
         axes[1, 1].legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(0.0, 0.9))
         _dress(axes[1, 1], title, "RMS error, mN", "draws, each row sorted")
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(path, dpi=110, metadata=stamp(figures))
     plt.close(figure)
 
