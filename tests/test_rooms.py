@@ -56,7 +56,7 @@ TOOL_ROOMS = {
     "motor": set(),
     "extremes": set(),
     "first_use": set(),
-    "rendering": {"machines"},
+    "rendering": {"machines", "pictures"},
     "fault_matrix": {"wire"},
     "benchmarks": {"machines", "consoles", "wire", "pictures", "thesis", "rendering"},
     "tactile": {"pictures", "thesis", "rendering", "benchmarks"},

@@ -19,7 +19,7 @@ import msgspec
 from machines.host import Host
 from rendering.human_pulse import Array
 from rendering.rehearsal import Case, Rehearsal, rehearse
-from rendering.show import HOLD_S, LEAST_N, MOST_N, RAMP_S, RECORDING, RUN_DIR, Aborted, Shown, profile, scored, show
+from rendering.show import LEAST_N, MOST_N, RECORDING, RUN_DIR, Aborted, Shown, profile, scored, show
 from rendering.show_figure import draw
 from rendering.tracking import Tracking
 
@@ -172,7 +172,7 @@ def conclude(
         print_timing(shown)
         met = checks(scene, shown) | in_virtual_time
         picture = RUN_DIR / "pulse.png"
-        draw(picture, scene, shown.time_s, shown.asked_N, shown.rendered_N, shown.gap_mm, rehearsals, RAMP_S + HOLD_S)
+        draw(picture, scene, shown, rehearsals, force_table(shown, rehearsals))
         written = [f"recording {RECORDING}", f"picture {picture}", *written]
         summary |= {
             "tracking": scored(shown.time_s, shown.asked_N, shown.rendered_N)._asdict(),
@@ -211,21 +211,25 @@ def virtual_time_checks(scene: Scene, rehearsals: list[Rehearsal]) -> dict[str, 
 
 
 def print_forces(shown: Shown | Aborted, rehearsals: list[Rehearsal]) -> None:
-    """The forces, as a table."""
+    """What was asked, and the forces as a table."""
+    results = [scored(rehearsal.time_s, rehearsal.asked_N, rehearsal.rendered_N) for rehearsal in rehearsals]
+    deviation = f" (sd {results[-1].reference_sd_N * 1e3:.0f} mN)" if results else ""
+    print(f"\nforce asked {LEAST_N}..{MOST_N} N{deviation}, rendered by the plant:")
+    print("\n".join(force_table(shown, rehearsals)))
+
+
+def force_table(shown: Shown | Aborted, rehearsals: list[Rehearsal]) -> list[str]:
+    """How well the forces were rendered: a heading, and a line for each case."""
     rows = {}
     if isinstance(shown, Shown):
         rows["real time, plant sample 1"] = numbers(scored(shown.time_s, shown.asked_N, shown.rendered_N))
-    deviation = ""
     for rehearsal in rehearsals:
         result = scored(rehearsal.time_s, rehearsal.asked_N, rehearsal.rendered_N)
-        deviation = f" (sd {result.reference_sd_N * 1e3:.0f} mN)"
         is_steady = rehearsal.case.hand == "steady"
         rows[f"virtual time, {rehearsal.case.label}"] = numbers(result) if is_steady else "  (a brake: see the picture)"
-    print(f"\nforce asked {LEAST_N}..{MOST_N} N{deviation}, rendered by the plant:")
     width = max(map(len, rows), default=0)
-    print(f"  {'':{width}s} {'RMS':>8s} {'worst':>8s}  variance accounted for")
-    for label, line in rows.items():
-        print(f"  {label:{width}s} {line}")
+    heading = f"  {'':{width}s} {'RMS':>8s} {'worst':>8s}  variance accounted for"
+    return [heading, *(f"  {label:{width}s} {line}" for label, line in rows.items())]
 
 
 def print_timing(shown: Shown) -> None:

@@ -247,6 +247,36 @@ def _says_inverse(figures: Figures) -> str:
     )
 
 
+def _says_tracking(figures: Figures) -> str:
+    pulses: dict[bool, list[str]] = {False: [], True: []}
+    for row in figures["samples"]["rows"]:
+        pulses[row["preview"]].append(f"{1e3 * row['after_trim']['rms_N']:.1f}")
+    draws = ", ".join(f"{1e3 * found['worst_rms_N']:.1f}" for found in figures["draws"])
+    return (
+        f"the pulse after 10 s on samples 1 to 3, RMS in mN: {', '.join(pulses[False])} live, "
+        f"{', '.join(pulses[True])} with preview; worst of {figures['draws'][0]['count']} draws with preview and "
+        f"live: {draws}; staircase off by {1e3 * max(row['worst_N'] for row in figures['staircase']['rows']):.0f} mN "
+        "at most"
+    )
+
+
+def _says_step(figures: Figures) -> str:
+    return (
+        f"1 mm: rise {figures['rise_s'] * 1e3:.0f} ms, {figures['rise_over_time_optimal']:.2f} times the fastest, "
+        f"overshoot {figures['overshoot']:.1%}, settled after {figures['settling_5pct_s'] * 1e3:.0f} ms; H(z) off by "
+        f"{figures['model_nrmse']:.1%} NRMSE"
+    )
+
+
+def _says_pad_hold(figures: Figures) -> str:
+    worst = (
+        f"{held['plant']} {'with' if held['relaxation'] else 'without'} relaxation {held['force_error']:.2%}"
+        for held in figures["holds"]
+        if not held["is_learning"]
+    )
+    return f"an hour at {figures['force_N']:g} N, frozen, greatest error of the force: {', '.join(worst)}"
+
+
 PARTS = {
     "fuzz": Part("tools/fuzz_protocol.py --json", _says_fuzz),
     "bus": Part("tools/benchmark.py bus --json", _says_bus),
@@ -270,6 +300,17 @@ PARTS = {
     "spare": Part("tools/spare_terms.py --json", _says_spare, judges=False),
     "rates": Part("tools/rate_error.py --json", _says_rates, judges=False),
     "envelope": Part("tools/envelope.py --json --picture docs/images/envelope.png", _says_envelope),
+    "step": Part("tools/benchmark.py step --json --plot docs/images/step.png", _says_step, judges=False),
+    "tracking": Part(
+        "tools/force_tracking.py samples draws staircase --json --picture docs/images/force_tracking.png",
+        _says_tracking,
+        judges=False,
+    ),
+    "pad_hold": Part(
+        "tools/tactile_hold.py --coarse --json --picture docs/images/tactile_hold_1h.png",
+        _says_pad_hold,
+        judges=False,
+    ),
 }
 
 

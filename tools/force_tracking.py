@@ -426,7 +426,7 @@ def main() -> int:
     if options.picture is not None:
         from rendering.tracking_figure import picture
 
-        picture(options.picture, pulses, stairs, result.get("draws", []))
+        picture(options.picture, pulses, stairs, result)
     return 0
 
 

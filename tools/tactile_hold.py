@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+from pictures.stamp import stamp
 
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, Rates
@@ -157,10 +158,11 @@ def _coarse(case: Case) -> Iterator[Moment]:
             yield Moment(element.force_N, gap_mm, state, str(Fault.SENSOR) if is_doubted else "")
 
 
-def draw(path: Path, holds: list[dict[str, Any]]) -> None:
-    """The error over time of every hold, a panel for each pad."""
+def draw(path: Path, figures: dict[str, Any]) -> None:
+    """The error over time of every hold, a panel for each pad, stamped with its figures."""
     from matplotlib.figure import Figure
 
+    holds = figures["holds"]
     plants = list(dict.fromkeys(held["plant"] for held in holds))
     figure = Figure(figsize=(4.2 * len(plants), 3.8), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(plants), sharey=True))
@@ -186,7 +188,7 @@ def draw(path: Path, holds: list[dict[str, Any]]) -> None:
         axes.set(title=plant.replace("_", " "), xlabel="held for, min")
     panels[0].set(ylabel="error of the true force, %")
     panels[0].legend(fontsize=8, loc="lower left")
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, metadata=stamp(figures))
 
 
 def main() -> int:
@@ -213,10 +215,11 @@ def main() -> int:
                 f"{held['fault'] and ': ' + held['fault']}",
                 sys.stdout,
             )
+    figures = {"synthetic": True, "force_N": FORCE_N, "holds": holds}
     if options.json:
-        write_line(json.dumps({"synthetic": True, "force_N": FORCE_N, "holds": holds}), sys.stdout)
+        write_line(json.dumps(figures), sys.stdout)
     if options.picture is not None:
-        draw(options.picture, holds)
+        draw(options.picture, figures)
     return 0
 
 

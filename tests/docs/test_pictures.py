@@ -10,9 +10,11 @@ from PIL import Image
 
 from tormagd.scenes.measured import measured
 
-DOCS = Path(__file__).parents[2] / "docs"
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
 GENERATED = ("inverse_trade.md", "learned_inverse.md", "reproduction.md")
 SHOWN = re.compile(r"\]\(([\w/]+\.png)\)")
+DRAWN = re.compile(r"--(?:picture|plot) docs/(\S+)")
 
 
 def drawn():
@@ -20,8 +22,13 @@ def drawn():
     scenes = measured().scenes
     yield "images/scenes.png", scenes
     yield "images/scene_trade.png", scenes
-    envelope = json.loads((DOCS / "evidence/envelope.json").read_text(encoding="utf-8"))
-    yield "images/envelope.png", envelope["figures"]
+    for path in sorted(DOCS.glob("evidence/*.json")):
+        evidence = json.loads(path.read_text(encoding="utf-8"))
+        for picture in DRAWN.findall(evidence["command"]):
+            evidence["figures"].pop("machine_us", None)  # of the machine, not of what was measured
+            yield picture, evidence["figures"]
+    summary = (ROOT / "README.md").read_text(encoding="utf-8").partition("\nforce asked")[2].partition("```")[0]
+    yield "images/pulse.png", [line for line in summary.splitlines() if line.startswith("  ")]
     for name in GENERATED:
         page = (DOCS / name).read_text(encoding="utf-8")
         for picture in SHOWN.findall(page):

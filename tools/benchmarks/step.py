@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from pictures.stamp import stamp
 
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config, Motor
@@ -189,8 +190,8 @@ def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> Modell
     return Modelled(TICK_S * np.arange(count + 1, dtype=np.float64), measured, modelled)
 
 
-def draw(path: Path, plant_name: str, config: Config) -> None:
-    """Writes a PNG: H(z) beside the plant's duty steps, and the gap's 1 mm steps."""
+def draw(path: Path, plant_name: str, config: Config, figures: dict[str, Any]) -> None:
+    """Writes a PNG, stamped with these figures: H(z) beside the plant's duty steps, and the gap's 1 mm steps."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -220,7 +221,7 @@ def draw(path: Path, plant_name: str, config: Config) -> None:
         axes.set_xlabel("time, s")
         axes.legend(frameon=False)
         axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, metadata=stamp(figures))
     plt.close(figure)
 
 
@@ -288,9 +289,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The object for these options."""
+    result = run(options.plant)
     if options.plot is not None:
-        draw(options.plot, options.plant, Config())
-    return run(options.plant)
+        draw(options.plot, options.plant, Config(), result)
+    return result
 
 
 def print_table(result: dict[str, Any]) -> None:

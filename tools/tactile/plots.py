@@ -18,6 +18,7 @@ CLASSES = {25.0: "MRE-A, 25 %", 35.0: "MRE-B, 35 %", 45.0: "MRE-C, 45 %"}
 SHOWN_FIELDS = (0, 3, 6, 10)
 SHOWN_RATE_MM_S = 1.0
 DPI = 80
+LABEL_SIDES: tuple[dict[str, Any], ...] = ({"xytext": (7, 4)}, {"xytext": (-7, -4), "ha": "right", "va": "top"})
 
 
 class Material(NamedTuple):
@@ -152,10 +153,14 @@ def _hold(traces: dict[str, Array]) -> Figure:
 def _models(comparison: list[dict[str, Any]]) -> Figure:
     figure = Figure(figsize=(7.5, 4.2), layout="constrained")
     axis = figure.subplots()
-    for row in comparison:
+    # neighbours' labels stand on either side of their points
+    for number, row in enumerate(sorted(comparison, key=lambda row: row["predict_us_per_row"])):
         place = row["predict_us_per_row"], row["random_mae_N"]
         axis.loglog(*place, "o" if row["pareto"] else "x", color="C3" if row["pareto"] else "C7")
-        axis.annotate(row["model"], place, xytext=(6, 4), textcoords="offset points", fontsize=8)
+        axis.annotate(row["model"], place, textcoords="offset points", fontsize=9, **LABEL_SIDES[number % 2])
+    for scale in (axis.xaxis, axis.yaxis):
+        scale.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter("{x:g}")
     axis.set(
         xlabel="prediction, µs a row",
         ylabel="MAE on the random split, N",
