@@ -259,16 +259,17 @@ def test_what_teaches_nothing_leaves_the_device_as_it_is(core, estimate: Estimat
 
 
 @pytest.mark.parametrize("goes_on", [False, True])
-def test_a_handle_that_has_stopped_teaches_nothing(core, goes_on: bool) -> None:
-    """Its rate is filtered and is known for slower only later, when the gap may have moved on already."""
+def test_a_handle_that_has_stopped_teaches_nothing_of_a_gap_that_goes_on(core, goes_on: bool) -> None:
+    """Its rate is filtered, and known for slower only later."""
     state, devices = learned(core, 2.0, moving(sensed_s=0.0)), []
-    for number in range(10):
+    for number in range(20):
         now_s = state.plan.time_s + PERIOD_S
-        at_mm = 100.0 + 5.0 * PERIOD_S * number * goes_on
+        at_mm, gap_mm = 100.0 + 5.0 * PERIOD_S * number * goes_on, 78.1 - 0.3 * number
         slower = Handle(MOBILISED_MM, 5.0, Turn(1.0, 0.0, at_mm), 42.0)
-        state = planned(core, 1.0, moving(force_N=0.8, sensed_s=now_s, handle_mm=at_mm, handle=slower), state)
+        estimate = moving(gap_mm, sensed_s=now_s, handle_mm=at_mm, handle=slower)
+        state = planned(core, 1.0, estimate, state)
         devices.append(state.device)
-    assert (devices[2] == devices[-1]) is not goes_on
+    assert (devices[10] == devices[-1]) is not goes_on
 
 
 def test_one_reading_teaches_once(core) -> None:

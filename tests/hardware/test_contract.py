@@ -555,7 +555,7 @@ def check_limits(samples: list[Sample]) -> None:
         assert max(abs(output.left_duty), abs(output.right_duty)) <= CONFIG.position.duty_limit
         assert CLOSED_MM < truth.gap_mm < OPEN_MM
     for sample in samples[::20]:
-        found = list(numbers(tuple(sample)))
+        found = list(numbers(sample))
         assert len(found) > LEAST_NUMBERS
         assert not any(map(math.isnan, found))
 

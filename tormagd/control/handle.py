@@ -12,14 +12,12 @@ from firmware_protocol.value import Value
 
 STANDS_MM: Final = 0.01
 "Just over a count of the encoder: a handle within it stands."
-STOPPED_S: Final = 0.01
-"One that has stood for so long slides no more, whatever its rate's filter still says: friction keeps what it is."
 SETTLES_S: Final = 0.3
 "What the rate's filter leaves of a motion, and what the force sensor still has to tell of it, has gone by then."
 RISES_N: Final = 0.15
 "More than STANDS_MM bends of the stiffest elastomer, 12 N/mm, and noise."
 MODEL_RISES_N: Final = 0.1
-"By so much the gap has to have closed, in the model's force: the strongest believable device makes 1.53 times as much."
+"By so much the gap has to have moved, in the model's force: the strongest believable device makes 1.53 times as much."
 FILTER_S: Final = 0.01
 UNHEARD_S: Final = 0.1
 "After so long without a reading it is watched anew."
@@ -30,9 +28,10 @@ FORGETS_S: Final = 5.0
 @final
 class HandleWatch(Value):
     """A handle that has stood at `at_mm` for `still_s`, as heard at `heard_s`; the mean of the force's size over
-    FILTER_S, the least of it since, and what the model gave then. `is_lost`: it is not believed until it moves."""
+    FILTER_S, the least of it since, and what the model gave then. `rested_N` is what the model gave when it came to
+    stand. `is_lost`: it is not believed until it moves."""
 
-    __match_args__ = ("at_mm", "heard_s", "still_s", "force_N", "least_N", "least_model_N", "is_lost")
+    __match_args__ = ("at_mm", "heard_s", "still_s", "force_N", "least_N", "least_model_N", "rested_N", "is_lost")
     __slots__ = __match_args__
 
     def __init__(
@@ -43,6 +42,7 @@ class HandleWatch(Value):
         force_N: float = 0.0,
         least_N: float = 0.0,
         least_model_N: float = 0.0,
+        rested_N: float = 0.0,
         is_lost: bool = False,
     ) -> None:
         self.at_mm: Final = at_mm
@@ -51,12 +51,13 @@ class HandleWatch(Value):
         self.force_N: Final = force_N
         self.least_N: Final = least_N
         self.least_model_N: Final = least_model_N
+        self.rested_N: Final = rested_N
         self.is_lost: Final = is_lost
 
-    @property
-    def has_stopped(self) -> bool:
-        """Whether it slides no more."""
-        return self.still_s > STOPPED_S
+    def outlasts(self, model_N: float) -> bool:
+        """Whether it has stood since before the gap moved to where the model gives `model_N`, though its filtered rate
+        says more: friction at rest does not follow."""
+        return abs(model_N - self.rested_N) > MODEL_RISES_N
 
     def heard(self, sensed_s: float, handle_mm: float, reading_N: float, model_N: float) -> "HandleWatch":
         """The same after one more reading of handle and force, where the model gives `model_N` at the measured gap."""
@@ -65,16 +66,17 @@ class HandleWatch(Value):
             return self
         size_N = abs(reading_N)
         if elapsed_s > UNHEARD_S or abs(handle_mm - self.at_mm) > STANDS_MM:
-            return HandleWatch(handle_mm, sensed_s, 0.0, size_N, size_N, model_N)
+            return HandleWatch(handle_mm, sensed_s, 0.0, size_N, size_N, model_N, model_N)
         still_s = self.still_s + elapsed_s
         force_N = self.force_N + elapsed_s / (FILTER_S + elapsed_s) * (size_N - self.force_N)
         if still_s < SETTLES_S or force_N <= self.least_N:
-            return HandleWatch(self.at_mm, sensed_s, still_s, force_N, force_N, model_N, self.is_lost)
+            return HandleWatch(self.at_mm, sensed_s, still_s, force_N, force_N, model_N, self.rested_N, self.is_lost)
         share = elapsed_s / (FORGETS_S + elapsed_s)
         least_N = self.least_N + share * (force_N - self.least_N)
         least_model_N = self.least_model_N + share * (model_N - self.least_model_N)
         has_risen = force_N - least_N > RISES_N and model_N - least_model_N > MODEL_RISES_N
-        return HandleWatch(self.at_mm, sensed_s, still_s, force_N, least_N, least_model_N, self.is_lost or has_risen)
+        is_lost = self.is_lost or has_risen
+        return HandleWatch(self.at_mm, sensed_s, still_s, force_N, least_N, least_model_N, self.rested_N, is_lost)
 
 
 UNHEARD: Final = HandleWatch()

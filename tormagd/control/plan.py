@@ -282,7 +282,7 @@ class Planner:
         handle = state.handle
         if self._contact.slides and estimate is not None and model_N is not None:
             handle = handle.heard(estimate.sensed_s, estimate.handle_mm, estimate.force_N, model_N)
-        shown = self._learn(state.shown, now_s, estimate, model_N, remembered.relaxed_N, handle.has_stopped)
+        shown = self._learn(state.shown, now_s, estimate, model_N, remembered.relaxed_N, handle)
         # from here on over the model's force without memory, which searches and portrait know
         device = shown.device.relaxed(remembered.relaxed_N)
         if self._has_creep:
@@ -400,7 +400,7 @@ class Planner:
         estimate: Estimate | None,
         model_N: float | None,
         relaxed_N: float,
-        has_stopped: bool,
+        handle: HandleWatch,
     ) -> Shown:
         """From the force at the *measured* gap: the model's error is learned, not the tracking error, so it cannot
         fight the position loop. A sensor that is not believed teaches nothing, and what it has taught is forgotten."""
@@ -417,7 +417,7 @@ class Planner:
         is_zero_known = zero_sd_N <= UNKNOWN_SD_N
         elapsed_s = min(now_s - shown.read_s, LONGEST_LESSON_S)
         is_mobilised = self._contact.is_known(estimate)
-        if not is_mobilised or has_stopped or (self._contact.slides and rate_mm_s < MOVING_MM_S):
+        if not is_mobilised or handle.outlasts(model_N) or (self._contact.slides and rate_mm_s < MOVING_MM_S):
             if shown.sensor.is_doubted:
                 slow = NOTHING_SLOW
             elif (
