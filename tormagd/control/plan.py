@@ -417,7 +417,8 @@ class Planner:
         is_zero_known = zero_sd_N <= UNKNOWN_SD_N
         elapsed_s = min(now_s - shown.read_s, LONGEST_LESSON_S)
         is_mobilised = self._contact.is_known(estimate)
-        if not is_mobilised or handle.outlasts(model_N) or (self._contact.slides and rate_mm_s < MOVING_MM_S):
+        is_slow = rate_mm_s < MOVING_MM_S or handle.outlasts(model_N)
+        if not is_mobilised or (self._contact.slides and is_slow):
             if shown.sensor.is_doubted:
                 slow = NOTHING_SLOW
             elif (
