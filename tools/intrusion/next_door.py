@@ -17,6 +17,8 @@ from tormagd.daemon.endpoint import Endpoint
 from tormagd.keys import KeyRing
 
 LOOKS_S = 0.005
+PATIENCE_S = 20.0
+"Until it stands open."
 
 
 def _stand_open(endpoints: Endpoints, opened: Event, ended: Event) -> None:
@@ -29,7 +31,7 @@ def _stand_open(endpoints: Endpoints, opened: Event, ended: Event) -> None:
 
 @contextlib.contextmanager
 def next_door(endpoints: Endpoints) -> Iterator[dict[str, str]]:
-    """The addresses of such a door, a process of its own with the keys of these `endpoints`."""
+    """The addresses of such a door, a process of its own with the keys of these `endpoints`. Raises TimeoutError."""
     addresses = {name: f"tcp://127.0.0.1:{free_port()}" for name in ENDPOINTS}
     spawn = get_context("spawn")
     opened, ended = spawn.Event(), spawn.Event()
@@ -37,7 +39,8 @@ def next_door(endpoints: Endpoints) -> Iterator[dict[str, str]]:
     process = spawn.Process(target=_stand_open, args=(beside, opened, ended))
     process.start()
     try:
-        opened.wait()
+        if not opened.wait(PATIENCE_S):
+            raise TimeoutError(f"the door next to the daemon's did not open within {PATIENCE_S:g} s")
         yield addresses
     finally:
         ended.set()

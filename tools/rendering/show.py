@@ -54,6 +54,7 @@ CTL = ("-m", "tormagd.ctl.main", "--config", str(RUN_DIR / "tormagd.toml"), "--j
 LEAST_N, MOST_N = 1.4, 1.7
 PULSE_S = 20.0
 RAMP_S, HOLD_S = 1.0, 3.0
+PULSE_START_S = RAMP_S + HOLD_S
 "Approach to the pulse's first force, and a hold there in which the trim learns this device."
 START_N = 0.6
 RATE_HZ = 500
@@ -139,7 +140,7 @@ def profile(duration_s: float = PULSE_S) -> tuple[Array, Array]:
 
 def scored(time_s: Array, asked_N: Array, rendered_N: Array) -> Tracking:
     """Tracking over the pulse, without the approach."""
-    pulse = time_s >= RAMP_S + HOLD_S
+    pulse = time_s >= PULSE_START_S
     return tracking(asked_N[pulse], rendered_N[pulse])
 
 

@@ -12,12 +12,11 @@ from pictures.stamp import stamp
 
 from rendering.human_pulse import Array
 from rendering.rehearsal import Rehearsal
-from rendering.show import HOLD_S, RAMP_S, Shown
+from rendering.show import PULSE_START_S, Shown
 from rendering.tracking import tracking
 from tormagd.scenes.scene import Scene
 
 ASKED, RENDERED, QUIET = "#222222", "#d1495b", "#8d99ae"
-PULSE_START_S = RAMP_S + HOLD_S
 CLOSE_UP_S = 4.0
 
 

@@ -282,6 +282,7 @@ def _constants(rows: list[list[float]]) -> list[float]:
         left: list[list[float]] = []
         for row in rows[1:]:
             share = row[0] / (pivot[0] + ridge)
+            # rows are equally long, and only an unchecked zip is compiled to a plain loop
             left.append([value - share * above for value, above in zip(row[1:], pivot[1:])])  # noqa: B905
         rows = left
     constant = rows[0]
