@@ -17,14 +17,14 @@ from tormagd.control.contact import ROLLER_RATE_MM_S
 from tormagd.model.model_file import ForceModel, load_model
 from tormagd.model.shipped import model_path
 from tormagd.physics.friction import Friction
-from tormagd.scenes.scene import Handle, load_scene, scene_path
+from tormagd.scenes.scene import RELAXATION_S, Handle, load_scene, scene_path
 from tormagd.simulation.parameters import load_plant
 
 SCENE, SAMPLE = "aorta_1", "sample_1"
 FORCES_N = 1.0, 1.5, 2.0, 2.5
 RATES_MM_S = 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 40.0
 FASTER_MM_S = 20.0
-LEFT_OUT: tuple[tuple[str, ...], ...] = (), ("rate",), ("offset",), ("relaxation",)
+LEFT_OUT = {"nothing": (), "rate": ("rate",), "offset": ("offset",), "relaxation": tuple(RELAXATION_S)}
 
 
 def main() -> int:
@@ -82,8 +82,8 @@ def frozen_error_N(handle: Handle) -> dict[str, float]:
     scene = load_scene(SCENE)
     hz = scene.bandwidth.control_hz, scene.bandwidth.inference_hz
     return {
-        ", ".join(left_out) or "nothing": run(Case(SCENE, SAMPLE, left_out, "", False, *hz), hand=turning(handle))
-        for left_out in LEFT_OUT
+        name: run(Case(SCENE, SAMPLE, left_out, "", False, *hz), hand=turning(handle))
+        for name, left_out in LEFT_OUT.items()
     }
 
 

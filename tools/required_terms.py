@@ -48,7 +48,7 @@ from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_task, shipped_sce
 SHARE = 0.2
 KEPT = ROOT / "build" / "required_terms.json"
 STORED = ROOT / "tormagd" / "scenes" / FILE
-SECONDS, QUICK_S = 5.0, 2.0
+SECONDS, QUICK_S, LONGEST_S = 5.0, 2.0, 120.0
 RATES_HZ = (
     *((1_000, 500), (2_000, 1_000), (1_000, 1_000), (1_000, 83)),
     *((500, 500), (500, 83), (250, 250), (250, 83)),
@@ -68,6 +68,8 @@ def measure(name: str, runs: Runs, samples: tuple[str, ...] = SAMPLES, seconds: 
     if scene.signal is None:
         raise ConfigError(f"scene {scene.name}: signal is missing: without one nothing is known of what it asks for")
     tolerance_N = scene.force.tolerance_rms_N
+    if scene.signal.hold_s is not msgspec.UNSET:  # what a hold does is seen by its end
+        seconds = max(seconds, min(scene.signal.hold_s, LONGEST_S))
     on = [(samples[0], False), *((plant, True) for plant in samples)]
 
     def case(left_out: Iterable[str], hz: tuple[int, int], plant: str, is_learning: bool, search: str = "") -> Case:
@@ -221,12 +223,12 @@ def table(result: Measured) -> str:
         lines += [
             f"{scene.name}: tolerance {1e3 * scene.tolerance_N:.0f} mN, {scene.cost_full_us_s:.0f} us/s full, "
             f"{scene.cost_us_s:.0f} chosen, at {scene.control_hz} / {scene.inference_hz} Hz",
-            "  term      added, frozen  learning     saved",
+            f"  {'term':18s}added, frozen  learning     saved",
         ]
         for item in scene.terms:
             stays = "out" if item.term in scene.left_out else "in"
             lines.append(
-                f"  {item.term:9s} {1e3 * item.frozen_added_N:12.1f}  {1e3 * item.learning_added_N:8.1f}  "
+                f"  {item.term:18s}{1e3 * item.frozen_added_N:12.1f}  {1e3 * item.learning_added_N:8.1f}  "
                 f"{scene.saved_us_s(item):8.0f}  {stays}"
             )
         for judged in scene.judged:

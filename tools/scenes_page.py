@@ -152,7 +152,6 @@ def _counts(scenes: tuple[MeasuredScene, ...], share: float) -> str:
         "Of the scenes and [recordings](#recordings) that are met.",
         table,
         _never(scenes, never, share) if never else "Each is required by some scene.",
-        _relaxation(scenes),
         _rate_error(),
     ]
     return "\n\n".join(parts)
@@ -191,13 +190,6 @@ def _never(scenes: tuple[MeasuredScene, ...], never: list[str], share: float) ->
         "`friction` and `pull` are there for the gap's motion. Steps of 1 mm overshoot by, settle within 5 % in, and "
         "the stroke takes, on samples 1 to 3:\n\n"
         f"{_table(['without', '1', '2', '3'], motion)}"
-    )
-
-
-def _relaxation(scenes: tuple[MeasuredScene, ...]) -> str:
-    return (
-        "`relaxation` is one term, and not one for each of its times: all of them together take no more than "
-        f"{_most_saved(scenes, ['relaxation']):.2f} % of a core, so that one of them has hardly anything to save."
     )
 
 

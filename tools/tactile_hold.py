@@ -33,7 +33,7 @@ from tormagd.control.step import SENSOR_FAULT_S
 from tormagd.model.displacement import Turn
 from tormagd.output import write_line
 from tormagd.safety.codes import Fault
-from tormagd.scenes.scene import load_scene, terms_of
+from tormagd.scenes.scene import RELAXATION_S, load_scene, terms_of
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, PressingHand
 from tormagd.simulation.parameters import load_plant
@@ -105,7 +105,7 @@ class _Prepared:
         assert stated.finger is not msgspec.UNSET, "a tactile scene has a finger"
         self.inference_hz = stated.bandwidth.inference_hz
         self.config = Config(scene=SCENE, rates=Rates(control_hz=CONTROL_HZ, inference_hz=self.inference_hz))
-        terms = terms_of(stated) if case.relaxation else terms_of(stated).without("relaxation")
+        terms = terms_of(stated) if case.relaxation else terms_of(stated).without(*RELAXATION_S)
         frozen = msgspec.structs.replace(terms, learning=False)
         self.core = build_core(self.config, msgspec.structs.replace(stated, terms=terms))
         self.later = (

@@ -13,7 +13,7 @@ from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import PlanState
 from tormagd.model.displacement import Turn
 from tormagd.safety.codes import Limit
-from tormagd.scenes.scene import EVERY_TERM, load_scene, scene_path
+from tormagd.scenes.scene import EVERY_TERM, RELAXATION_S, load_scene, scene_path
 
 CONFIG = Config(scene="radial_pulse")
 SCENE = load_scene("radial_pulse")
@@ -79,7 +79,7 @@ def test_a_pad_that_is_held_is_pressed_harder_as_it_relaxes(pad_core: Core) -> N
 
 
 def test_without_the_term_nothing_is_remembered(pad_core: Core) -> None:
-    without = build_core(CONFIG, msgspec.structs.replace(SCENE, terms=EVERY_TERM.without("relaxation")))
+    without = build_core(CONFIG, msgspec.structs.replace(SCENE, terms=EVERY_TERM.without(*RELAXATION_S)))
     forgetful = held(without, 60.0)
     assert forgetful.remembered.relaxed_N == 0.0
     assert forgetful.plan.field_mT == pytest.approx(held(without, PERIOD_S).plan.field_mT, abs=0.01)

@@ -19,7 +19,7 @@ from tormagd.physics.relaxation import PronySeries
 
 MEMORY = Memory(fractions=(0.05, 0.04, 0.04), times_s=(8.0, 90.0, 900.0), lag_mT=8.0, turn_mT=80.0)
 FIELDS_MT = (50.0, 900.0)
-STEADY = MEMORY.of(relaxation=True, hysteresis=False)
+STEADY = MEMORY.of(relaxes=lambda _: True, hysteresis=False)
 REMEMBERING = Remembering(MEMORY, FIELDS_MT)
 CURVE = load_model(model_path("torque_mre_50_40", Path()), element="torque").curve(1.5, 42.0, 40.0)
 
@@ -85,10 +85,16 @@ def test_before_anything_is_known_nothing_is_expected() -> None:
     assert NOTHING_REMEMBERED.relaxed_N == 0.0
 
 
-def test_either_can_be_left_out() -> None:
-    assert MEMORY.of(relaxation=True, hysteresis=True) == MEMORY
-    assert MEMORY.of(relaxation=True, hysteresis=False) == STEADY
-    assert MEMORY.of(relaxation=False, hysteresis=True) == Memory(lag_mT=8.0, turn_mT=80.0)
+def test_each_can_be_left_out() -> None:
+    assert MEMORY.of(relaxes=lambda _: True, hysteresis=True) == MEMORY
+    assert MEMORY.of(relaxes=lambda _: True, hysteresis=False) == STEADY
+    assert MEMORY.of(relaxes=lambda _: False, hysteresis=True) == Memory(lag_mT=8.0, turn_mT=80.0)
+    short = MEMORY.of(relaxes=lambda time_s: time_s < 100.0, hysteresis=False)
+    assert short == Memory(fractions=(0.05, 0.04), times_s=(8.0, 90.0), turn_mT=80.0)
+    pads = Memory(fractions=(0.01, 0.04), times_s=(1.0, 10.0), field_fractions=(0.03, 0.05))
+    assert pads.of(relaxes=lambda time_s: time_s > 5.0, hysteresis=True) == Memory(
+        fractions=(0.04,), times_s=(10.0,), field_fractions=(0.05,)
+    )
 
 
 RELAXED = 0.13

@@ -46,7 +46,9 @@ def refusal(name_or_path: str) -> str:
 
 def test_the_thesiss_tasks_are_shipped() -> None:
     table_2_5 = {"cardiovascular", "brain", "bronchoscopy", "vitreoretinal", "laparoscopy"}
-    assert set(shipped_scenes()) == {"aorta_1", "aorta_2", "coronary", "pulse", "radial_pulse"} | table_2_5
+    assert (
+        set(shipped_scenes()) == {"aorta_1", "aorta_2", "coronary", "pulse", "radial_hold", "radial_pulse"} | table_2_5
+    )
     assert all(load_scene(name).signal is not None for name in shipped_scenes())
 
 
@@ -225,6 +227,12 @@ def test_terms_are_named_in_the_scene(write) -> None:
     assert named.left_out == ("rate", "pull")
     with pytest.raises(ValueError, match="term 'gravity': allowed is one of rate, creep"):
         EVERY_TERM.without("gravity")
+
+
+def test_a_time_constant_belongs_to_the_nearest_of_its_terms() -> None:
+    alone = EVERY_TERM.without("relaxation_1_s", "relaxation_100_s", "relaxation_1000_s")
+    assert [time_s for time_s in (0.01, 3.0, 3.3, 10.0, 31.0, 32.0, 1e5) if alone.relaxes(time_s)] == [3.3, 10.0, 31.0]
+    assert all(EVERY_TERM.relaxes(time_s) for time_s in (1e-3, 1.0, 1e5))
 
 
 def test_terms_that_nobody_measured_are_not_known_to_be_required(write) -> None:

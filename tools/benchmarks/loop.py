@@ -5,7 +5,7 @@ neighbour. Both have the same heartbeat, event loop and scheduling, publish a ro
 eight clients, each of which asks for status again as soon as it is answered; the stub has no controller and no device.
 
 Processor time is that of the daemon with its threads and children; recording is on: a subscriber reads every tick. With
-`--against` the daemon of another checkout takes its turn, on the same simulated device, this checkout's.
+`--against` the daemon of another checkout takes its turn, on its own simulated device: the protocol changes, too.
 """
 
 import argparse
@@ -92,8 +92,8 @@ class Pair(NamedTuple):
 
 
 class Stand(NamedTuple):
-    """What is measured: scheduling, rates, the serial line, how often setpoints come, and of which checkout the daemon
-    is. The device is always this checkout's. `device_fifo` is its own priority; it stands for a machine of its own.
+    """What is measured: scheduling, rates, the serial line, how often setpoints come, and of which checkout daemon
+    and device are. `device_fifo` is the device's own priority; it stands for a machine of its own.
     `within` runs the daemon on another machine (`ip netns exec NAME`), which is reached at `host`."""
 
     realtime: RealTime
@@ -378,11 +378,11 @@ def daemon_process(folder: Path, realtime: RealTime, setpoint_hz: int = SETPOINT
 def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
     """The same for any stand."""
     with contextlib.ExitStack() as stack:
-        ours, theirs = environment(None), environment(stand.root)
+        theirs = environment(stand.root)
         if stand.device_fifo:
             stack.enter_context(carried(stand.device_fifo))
         device = own_machine(stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud), *stand.device)
-        simulator = subprocess.Popen([sys.executable, *device], stdout=subprocess.PIPE, env=ours, text=True)
+        simulator = subprocess.Popen([sys.executable, *device], stdout=subprocess.PIPE, env=theirs, text=True)
         stack.callback(end, simulator)
         assert simulator.stdout is not None
         path = write_config(folder, simulator.stdout.readline().strip(), stand)

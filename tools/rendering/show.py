@@ -70,7 +70,11 @@ OF_TIME = frozenset(
     {
         Fault.HOST_STALL,
         Fault.LINK_LOST,
+        Fault.LINK_DEGRADED,
         Fault.MEASUREMENT_STALE,
+        Fault.SENSE_STALE,
+        Fault.STATUS_STALE,
+        Fault.CLOCK,
         Fault.FOLLOWING_ERROR,
         Fault.DEVICE_COMMAND_TIMEOUT,
         Fault.DEVICE_NOT_RUNNING,

@@ -243,7 +243,7 @@ class Planner:
         self._ceiling_N = CEILING * scene.force.most_N
         displacements_mm, rates_mm_s, fields_mT, _ = model.feature_ranges
         self._displacements_mm, self._rates_mm_s, self._fields_mT = displacements_mm, rates_mm_s, fields_mT
-        memory = model.metadata.memory.of(relaxation=terms.relaxation, hysteresis=terms.hysteresis)
+        memory = model.metadata.memory.of(relaxes=terms.relaxes, hysteresis=terms.hysteresis)
         self._memory = Remembering(memory, fields_mT)
         self._fastest_mm_s, self._hardest_mm_s2 = position.gap_speed_mm_s, position.gap_acceleration_mm_s2
         self._adapts_in_s, self._scales = trim.time_s, (trim.least, trim.most)
@@ -527,10 +527,10 @@ class Planner:
         # along the portrait, not from one solution to the next: a difference would amplify the solver's grain
         start_mm = self.portrait.gap_mm_at(device.model_N(governed.path_N[0]))
         speed, acceleration = 0.0, 0.0
-        for force_N, to_speed, to_acceleration in zip(governed.path_N, _TO_SPEED, _TO_ACCELERATION, strict=True):
+        for place, force_N in enumerate(governed.path_N):
             away_mm = self.portrait.gap_mm_at(device.model_N(force_N)) - start_mm
-            speed += to_speed * away_mm
-            acceleration += to_acceleration * away_mm
+            speed += _TO_SPEED[place] * away_mm
+            acceleration += _TO_ACCELERATION[place] * away_mm
         fastest, hardest = self._fastest_mm_s, self._hardest_mm_s2
         return min(max(speed, -fastest), fastest), min(max(acceleration, -hardest), hardest)
 

@@ -95,8 +95,9 @@ class Remembering:
             return Remembered(field_mT, lag_mT, before.free, before.added, 0.0, now_s)
         elapsed_s = max(now_s - before.time_s, 0.0)
         free_N, added_N = self._parts_N(curve, field_mT - lag_mT)
-        left_N, free = self._free.discretise(elapsed_s).advance(before.free, free_N)
-        left_of_added_N, added = self._added.discretise(elapsed_s).advance(before.added, added_N)
+        step = self._free.discretise(elapsed_s)
+        left_N, free = step.advance(before.free, free_N)
+        left_of_added_N, added = step.of(self._added.fractions).advance(before.added, added_N)
         return Remembered(field_mT, lag_mT, free, added, free_N + added_N - left_N - left_of_added_N, now_s)
 
     def _parts_N(self, curve: ForceCurve, field_mT: float) -> tuple[float, float]:

@@ -57,6 +57,10 @@ class PronyStep(Value):
             following.append(branch_N)
         return force_N, tuple(following)
 
+    def of(self, fractions: tuple[float, ...]) -> "PronyStep":
+        """The same step of a series of the same times with other fractions."""
+        return PronyStep(1.0 - sum(fractions, 0.0), fractions, self.decays, self.gains)
+
 
 @final
 class PronySeries(Value):
@@ -88,7 +92,7 @@ class PronySeries(Value):
             require("dt_s", dt_s, 0.0, MAX_STEP_S)
         ratios = [dt_s / time_s for time_s in self.times_s]
         return PronyStep(
-            equilibrium_fraction=1.0 - sum(self.fractions),
+            equilibrium_fraction=1.0 - sum(self.fractions, 0.0),
             fractions=self.fractions,
             decays=tuple([math.exp(-ratio) for ratio in ratios]),
             # mean of the decay over the step: what is left of a ramp that rose by one over it

@@ -4,6 +4,7 @@ The daemon runs one scene. Nothing that a scene does not ask for is modelled or 
 """
 
 import hashlib
+import math
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -103,7 +104,9 @@ class Terms(Strict, frozen=True):
     `scale`       the device's force over the model's is learned: friction, modulus, field
     `offset`      the device's offset is learned: what the elastomer relaxes, and what the field's hysteresis holds
                   back, beyond what its model expects
-    `relaxation`  what the elastomer has relaxed away of the force is told by the model, from what it was put to
+    `relaxation_1_s`, `_10_s`, `_100_s`, `_1000_s`
+                  what the elastomer has relaxed away of the force is told by the model, from what it was put to: each
+                  the part whose time constants are the nearest to its own
     `hysteresis`  how far the field lags behind that of its gap is told by the model, from where the gap has been
     `slope`       setpoints are carried along their slope to now and ahead
     `forecast`    a force that repeats itself is foreseen
@@ -121,7 +124,10 @@ class Terms(Strict, frozen=True):
     creep: bool = True
     scale: bool = True
     offset: bool = True
-    relaxation: bool = True
+    relaxation_1_s: bool = True
+    relaxation_10_s: bool = True
+    relaxation_100_s: bool = True
+    relaxation_1000_s: bool = True
     hysteresis: bool = True
     slope: bool = True
     forecast: bool = True
@@ -138,6 +144,11 @@ class Terms(Strict, frozen=True):
         """The names of the terms that are out."""
         return tuple(name for name in TERMS if not getattr(self, name))
 
+    def relaxes(self, time_s: float) -> bool:
+        """Whether what relaxes with this time constant is told."""
+        nearest = min(RELAXATION_S, key=lambda name: abs(math.log(time_s / RELAXATION_S[name])))
+        return bool(getattr(self, nearest))
+
     def without(self, *names: str) -> "Terms":
         """These terms with some more left out. Raises ValueError for a name that is none."""
         for name in names:
@@ -148,6 +159,8 @@ class Terms(Strict, frozen=True):
 
 TERMS = tuple(name for name in Terms.__struct_fields__ if name != "learning")
 EVERY_TERM = Terms()
+RELAXATION_S = {"relaxation_1_s": 1.0, "relaxation_10_s": 10.0, "relaxation_100_s": 100.0, "relaxation_1000_s": 1e3}
+"The time constant of each of these terms."
 
 
 class Insert(Strict, frozen=True):
