@@ -34,7 +34,7 @@ from machines.host import processor_s
 from machines.own import own_machine
 from machines.wire import carried
 
-from benchmarks.against import add_against_argument, environment
+from benchmarks.against import add_against_argument, entry_points, environment
 from benchmarks.histograms import plot_histograms
 from benchmarks.keys import curve_table, free_port
 from tormagd.client import Client, ClientError
@@ -56,6 +56,8 @@ LOG = "tormagd.log"
 "What the daemon says, in its folder."
 CLIENTS = 8
 SETPOINT_HZ = 500
+STARTS_S = 20.0
+"Until the first tick, at most."
 WARM_UP_S = 1.0
 ALONE_S = 4.0
 "For how long a block goes on without its clients."
@@ -221,6 +223,7 @@ def block(started: Started, seconds: float) -> Block:
             load = multiprocessing.Process(target=hammer, args=(running.config.endpoints.control, stop), daemon=True)
             load.start()
             try:
+                recorder.poll(STARTS_S * 1e3)
                 collect(recorder, WARM_UP_S)
                 ticks, share = collect_and_weigh(recorder, running.pid, seconds)
                 plan_us = planned(running.config.endpoints.control)
@@ -378,7 +381,9 @@ def daemon_process(folder: Path, realtime: RealTime, setpoint_hz: int = SETPOINT
 def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
     """The same for any stand."""
     with contextlib.ExitStack() as stack:
-        theirs = environment(stand.root)
+        theirs = environment(stand.root, folder)
+        if stand.root is not None:
+            entry_points(stand.root, folder)
         if stand.device_fifo:
             stack.enter_context(carried(stand.device_fifo))
         device = own_machine(stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud), *stand.device)
