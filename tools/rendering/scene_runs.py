@@ -24,6 +24,7 @@ from tormagd.control.core import Core, build_core
 from tormagd.control.estimate import Estimate
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import Planner, PlanState
+from tormagd.control.remembered import Remembered
 from tormagd.control.step import StepState
 from tormagd.hardware.measurement import Measurement
 from tormagd.scenes.measured import Cost
@@ -99,10 +100,13 @@ def costs(cases: Sequence[Case]) -> list[Cost]:
         planner, stepper = core.planner, core.stepper
         steps: list[Call] = []
         plans: list[Call] = []
+        first = given[0]
+        own = planner.plan(planner.start(first.now_s), first.now_s, first.setpoint, first.estimate).remembered
         for each in given:
             steps.append(partial(stepper.step, each.step_state, each.now_s, each.measurement, each.plan_state.plan))
             if each.is_planned:
-                plans.append(partial(_planned, planner, each.plan_state, each.now_s, each.setpoint, each.estimate))
+                state = _remembering_as(own, each.plan_state)
+                plans.append(partial(_planned, planner, state, each.now_s, each.setpoint, each.estimate))
         made.append((steps, plans))
     rounds = [[(_each_us(steps), _each_us(plans)) for steps, plans in made] for _ in range(ROUNDS)]
     # a setpoint that comes a little late makes a plan more: what all have cost is shared by those that were asked for
@@ -112,6 +116,13 @@ def costs(cases: Sequence[Case]) -> list[Cost]:
         for index in range(len(cases))
     ]
     return [Cost(round(steps_us / len(given), 3), round(plans_us / asked, 3)) for steps_us, plans_us in totals_us]
+
+
+def _remembering_as(own: Remembered, state: PlanState) -> PlanState:
+    """The state with no more of the elastomer's branches than a model of its own remembers."""
+    remembered = state.remembered
+    free, added = remembered.free[: len(own.free)], remembered.added[: len(own.added)]
+    return state.replaced(remembered=remembered.replaced(free=free, added=added))
 
 
 def _modelled(scene: Scene, case: Case) -> Scene:
