@@ -56,7 +56,7 @@ LOG = "tormagd.log"
 "What the daemon says, in its folder."
 CLIENTS = 8
 SETPOINT_HZ = 500
-STARTS_S = 20.0
+STARTS_MS = 20_000
 "Until the first tick, at most."
 WARM_UP_S = 1.0
 ALONE_S = 4.0
@@ -223,7 +223,7 @@ def block(started: Started, seconds: float) -> Block:
             load = multiprocessing.Process(target=hammer, args=(running.config.endpoints.control, stop), daemon=True)
             load.start()
             try:
-                recorder.poll(STARTS_S * 1e3)
+                recorder.poll(STARTS_MS)
                 collect(recorder, WARM_UP_S)
                 ticks, share = collect_and_weigh(recorder, running.pid, seconds)
                 plan_us = planned(running.config.endpoints.control)

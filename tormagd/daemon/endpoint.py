@@ -126,11 +126,11 @@ class Endpoint:
         """Reads what has arrived, at most DRAIN messages; True if there is a newer setpoint."""
         is_newer = False
         for _ in range(DRAIN):
-            try:
-                frame = self._setpoints.recv(zmq.NOBLOCK, copy=False)
-            except zmq.Again:
+            # asking first takes a third of what an exception does, and most calls find nothing
+            if not int(self._setpoints.get(zmq.EVENTS)) & zmq.POLLIN:
                 self.is_flooded = False
                 return is_newer
+            frame = self._setpoints.recv(zmq.NOBLOCK, copy=False)
             is_rest, self._is_in_parts = self._is_in_parts, frame.more
             if is_rest:
                 continue  # of a message that was refused by its first part
