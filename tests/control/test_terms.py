@@ -166,7 +166,7 @@ def test_without_the_preview_what_follows_is_not_looked_at() -> None:
     def speed_mm_s(core: Core, **setpoint: object) -> float:
         return told(core, after(core, 20), 1.0, **setpoint).plan.gap_speed_mm_s
 
-    assert speed_mm_s(core_without(), **ahead) < -20.0
+    assert speed_mm_s(core_without(), **ahead) < -8.0  # from rest, it gains speed with a time constant of 25 ms
     assert speed_mm_s(core_without("preview"), **ahead) == speed_mm_s(core_without("preview"))
 
 

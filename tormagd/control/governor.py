@@ -1,6 +1,7 @@
 """From the publisher's setpoint to the force that will be asked of the device, with the reason for every difference."""
 
 import math
+from itertools import pairwise
 from typing import Final, final
 
 from firmware_protocol.value import Value
@@ -26,9 +27,12 @@ WAY_LASTS_S: Final = [
     0.5 * (after_s - before_s) for before_s, after_s in zip([0.0, *WAY_S[:-1]], [*WAY_S[1:], WAY_S[-1]], strict=True)
 ]
 "The time that each of them stands for: from half way to the one before to half way to the next."
-STARTING_S: Final = 0.01
-"""Time constant with which the gap comes to another speed where its carriages are not late. Chosen on sample 1: a pulse
-of 1.1 to 1.7 N, which is too steep, is missed by 54 and 51 mN with 5 and 15 ms, 1.4 to 1.7 N by 2.4 and 3.5."""
+STARTING_S: Final = 0.025
+"""Time constant with which the gap comes to another speed where its carriages are not late. Chosen on sample 1 with its
+inertia, 1.7 and 2.5 times of it: a finger's pulse, which is too steep (AAC249), is missed by 10.5, 10.1 and 10.0 mN
+with 20, 25 and 30 ms, palpation by 318 each."""
+_LEADS: Final = [STARTING_S / (after_s - before_s) for before_s, after_s in pairwise(WAY_S)]
+"Of how much the gap wanted changes to the next point, so much is what its speed takes of the carriages."
 FLATTEST_N_MM: Final = 1e-3
 "A force that hardly depends on the gap counts as if it did by this much."
 OUTRUN_N: Final = 0.02
@@ -215,7 +219,7 @@ class Governor:
         if setpoint.preview_N and self._has_preview:
             periodicity, foresight = NOTHING_LEARNED, 1.0
             late_s = STARTING_S + lag_s
-            wanted_N = _previewed_N(setpoint, soon_s + late_s, least, most)
+            wanted_N = _previewed_N(setpoint, soon_s + lag_s, least, most)
             # what it passes to is what is asked, not what the gap can make of it
             asks_N = force if is_passing else state.asked_N
             sent_N = asks_N if is_passing or state.drive_N is None else state.drive_N
@@ -261,11 +265,12 @@ class Governor:
     def _pursued_N(
         self, asks_N: float, sent_N: float, elapsed_s: float, wanted_N: list[float], device: DeviceFit, late_s: float
     ) -> tuple[list[float], float]:
-        """The forces at PATH_S on the way of the gap that misses least of those wanted (n), at WAY_S from `late_s`
-        on, and the one that the carriages are sent to. `elapsed_s` ago those were `asks_N` and `sent_N`.
+        """The forces at PATH_S on the way of the gap that misses least of those wanted (n), at WAY_S, and the one that
+        the carriages are sent to. `elapsed_s` ago those were `asks_N` and `sent_N`.
 
-        A gap comes to another speed only gradually. So its carriages are sent along the way that a gap without inertia
-        would go `late_s` later, and the gap is taken to follow them with that time constant.
+        A gap comes to another speed only gradually: it is taken to follow its carriages with the time constant
+        `late_s`. So those are wanted ahead of it by what its speed takes in that time. On a healthy device that is all;
+        of one that is later, what is wanted is looked up so much later, because a slope does not reach that far.
         """
         portrait = self._portrait
         wanted_mm: list[float] = []
@@ -273,6 +278,8 @@ class Governor:
         for place, force_N in enumerate(wanted_N):
             gap_mm, slope_N_mm = portrait.gap_and_slope_at(device.model_N(force_N))
             slope_N_mm = max(slope_N_mm, FLATTEST_N_MM)
+            if place:
+                wanted_mm[place - 1] += _LEADS[place - 1] * (gap_mm - wanted_mm[place - 1])
             wanted_mm.append(gap_mm)
             weights.append(WAY_LASTS_S[place] * slope_N_mm * slope_N_mm)
         sent_mm, gap_mm = portrait.gap_mm_at(device.model_N(sent_N)), portrait.gap_mm_at(device.model_N(asks_N))
