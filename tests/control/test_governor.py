@@ -341,13 +341,21 @@ def beats_N(time_s: float) -> float:
     return 1.4 + 0.15 * math.sin(phase) + 0.08 * math.sin(2.0 * phase + 1.0) + 0.04 * math.sin(3.0 * phase)
 
 
-def beaten(seconds: float) -> GovernorState:
+SWIFT = Governor(PORTRAIT, SCENE, 3.0 * GAP_SPEED_MM_S)
+"Its gap is fast enough for this pulse."
+
+
+def beaten(seconds: float, governor: Governor = GOVERNOR) -> GovernorState:
     """The state after so much of the pulse, 500 times a second, without a preview."""
     state = GovernorState(0.0, 0.4)
     for tick in range(1, round(500 * seconds) + 1):
-        state, _ = decide(state, tick / 500, TimedSetpoint(beats_N(tick / 500), tick / 500, VALID_S))
-        state = GOVERNOR.foresee(state)
+        state, _ = governor.govern(state, tick / 500, beat(tick / 500), DeviceFit(), 0.0)
+        state = governor.foresee(state)
     return state
+
+
+def beat(time_s: float) -> TimedSetpoint:
+    return TimedSetpoint(beats_N(time_s), time_s, VALID_S)
 
 
 @pytest.fixture(scope="module")
@@ -355,22 +363,36 @@ def learned() -> GovernorState:
     return beaten(10.0)
 
 
-def test_a_force_that_repeats_itself_is_foreseen(learned: GovernorState) -> None:
+def test_a_force_that_repeats_itself_is_foreseen() -> None:
     worst_N = extrapolated_N = 0.0
-    state = learned
+    state = beaten(10.0, SWIFT)
     for tick in range(5_001, 5_501):
         now_s = tick / 500
-        setpoint = TimedSetpoint(beats_N(now_s), now_s, VALID_S)
-        state, governed = decide(GOVERNOR.foresee(state), now_s, setpoint, lag_s=0.01)
-        _, blind = decide(state.replaced(periodicity=NOTHING_LEARNED), now_s, setpoint)
+        state, governed = SWIFT.govern(SWIFT.foresee(state), now_s, beat(now_s), DeviceFit(), 0.0)
+        _, blind = SWIFT.govern(state.replaced(periodicity=NOTHING_LEARNED), now_s, beat(now_s), DeviceFit(), 0.0)
         assert governed.foresight > 0.9
         assert governed.limits == ()
-        expected = [beats_N(now_s + 0.01 * governed.foresight + ahead_s) for ahead_s in PATH_S]
+        expected = [beats_N(now_s + ahead_s) for ahead_s in PATH_S]
         worst_N = max(worst_N, float(np.abs(path_N(governed) - expected).max()))
-        extrapolated_N = max(
-            extrapolated_N, float(np.abs(path_N(blind) - [beats_N(now_s + ahead_s) for ahead_s in PATH_S]).max())
-        )
+        extrapolated_N = max(extrapolated_N, float(np.abs(path_N(blind) - expected).max()))
     assert worst_N < 0.3 * extrapolated_N
+
+
+def test_of_what_is_foreseen_a_slow_gap_makes_the_best(learned: GovernorState) -> None:
+    """It turns before the force does, and is asked for no more than it can do."""
+    fastest_N_s = GAP_SPEED_MM_S * (PORTRAIT.force_N[-1] - PORTRAIT.force_N[0]) / (95.0 - 45.0)
+    state, follower_N = learned, learned.asked_N
+    missed_N, followed_N = [], []
+    for tick in range(5_001, 5_956):
+        now_s = tick / 500
+        state, governed = decide(GOVERNOR.foresee(state), now_s, beat(now_s))
+        assert np.all(np.abs(np.diff(path_N(governed))) <= fastest_N_s * np.diff(PATH_S) + 0.01)
+        assert governed.force_N == pytest.approx(beats_N(now_s))
+        step_N = fastest_N_s / 500
+        follower_N += min(max(beats_N(now_s) - follower_N, -step_N), step_N)
+        missed_N.append(governed.path_N[0] - beats_N(now_s))
+        followed_N.append(follower_N - beats_N(now_s))
+    assert np.std(missed_N) < 0.8 * np.std(followed_N)
 
 
 def test_a_lag_is_made_up_for_as_far_as_it_is_known_what_comes() -> None:
