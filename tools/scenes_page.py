@@ -25,6 +25,7 @@ from tormagd.scenes.signal import asked
 PICTURE, TRADE = Path("images") / "scenes.png", Path("images") / "scene_trade.png"
 EVIDENCE = ROOT / "docs" / "evidence"
 DRAWN_S, DRAWN_HZ = 12.0, 100
+COLOURS = 10
 SAYS = {recorded.scene: recorded.says for recorded in RECORDED}
 _RECORDINGS = (
     "## Recordings\n\nThe public recordings are no part of the package. `tools/recorded_scenes.py` makes scenes of "
@@ -368,12 +369,13 @@ def draw_asked(path: Path) -> None:
     """What the scenes ask for over time."""
     figure = Figure(figsize=(9.0, 4.5), layout="constrained")
     axes = figure.subplots()
-    for name in shipped_scenes():
+    for number, name in enumerate(shipped_scenes()):
         stated = load_scene(name)
         if stated.signal is None:
             continue
         range_N = max(stated.force.least_N, core_without(name, ()).planner.portrait.least_N), stated.force.most_N
-        axes.plot(*asked(stated.signal, Path(scene_path(name)).parent, range_N, DRAWN_S, DRAWN_HZ), label=name)
+        curve = asked(stated.signal, Path(scene_path(name)).parent, range_N, DRAWN_S, DRAWN_HZ)
+        axes.plot(*curve, ":" if number >= COLOURS else "-", label=name)  # from there on they come again
     axes.set(xlabel="time, s", ylabel="force asked, N")
     figure.legend(fontsize=8, loc="outside right center")
     figure.savefig(path, dpi=90, metadata=stamp(measured().scenes))
