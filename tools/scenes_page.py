@@ -210,7 +210,7 @@ def _rate_error() -> str:
     rows = [[swings, *(f"{1e3 * missed_N:.1f}" for missed_N in missed.values())] for swings, missed in frozen_N.items()]
     return (
         f"**Where leaving a term out lowers the error.** `{found['scene']}`, learned and frozen, is followed better "
-        "without `rate`, `offset` or `relaxation`. There the model is wrong on the very device that it was learned "
+        "without `rate`, `offset` or any relaxation. There the model is wrong on the very device that it was learned "
         f"from: right at 42 mm/s, at {rate_mm_s:g} mm/s and {force_N} N it says {1e3 * worst_N:.0f} mN too much "
         "(`tools/rate_error.py`), for the device's friction falls within a few mm/s, and the network's later. As the "
         "handle swings the offset follows that error to and fro, and frozen it keeps what it was in one moment. A "
