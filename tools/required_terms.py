@@ -48,7 +48,9 @@ from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_task, shipped_sce
 SHARE = 0.2
 KEPT = ROOT / "build" / "required_terms.json"
 STORED = ROOT / "tormagd" / "scenes" / FILE
-SECONDS, QUICK_S, LONGEST_S = 5.0, 2.0, 120.0
+SECONDS, QUICK_S = 5.0, 2.0
+LONGEST_S = 120.0
+"Of a hold that is measured to its end; `--quick` leaves out all after QUICK_S."
 RATES_HZ = (
     *((1_000, 500), (2_000, 1_000), (1_000, 1_000), (1_000, 83)),
     *((500, 500), (500, 83), (250, 250), (250, 83)),
@@ -62,14 +64,21 @@ NO_COST = Cost(0.0, 0.0)
 Runs = Callable[[Iterable[Case]], dict[Case, float]]
 
 
-def measure(name: str, runs: Runs, samples: tuple[str, ...] = SAMPLES, seconds: float = SECONDS) -> MeasuredScene:
-    """One scene, whole; `runs` gives the outcomes of cases. Raises ConfigError for a scene that has no signal."""
+def measure(
+    name: str,
+    runs: Runs,
+    samples: tuple[str, ...] = SAMPLES,
+    seconds: float = SECONDS,
+    longest_s: float = LONGEST_S,
+) -> MeasuredScene:
+    """One scene, whole, for these seconds, or for as long as it holds a force, `longest_s` at most; `runs` gives the
+    outcomes of cases. Raises ConfigError for a scene that has no signal."""
     scene = load_task(name)
     if scene.signal is None:
         raise ConfigError(f"scene {scene.name}: signal is missing: without one nothing is known of what it asks for")
     tolerance_N = scene.force.tolerance_rms_N
     if scene.signal.hold_s is not msgspec.UNSET:  # what a hold does is seen by its end
-        seconds = max(seconds, min(scene.signal.hold_s, LONGEST_S))
+        seconds = max(seconds, min(scene.signal.hold_s, longest_s))
     on = [(samples[0], False), *((plant, True) for plant in samples)]
 
     def case(left_out: Iterable[str], hz: tuple[int, int], plant: str, is_learning: bool, search: str = "") -> Case:
@@ -179,7 +188,7 @@ def main(arguments: list[str] | None = None) -> int:
     names = options.scenes or (list(known) if options.costs else list(shipped_scenes()))
     if options.costs and not set(names) <= set(known):
         parser.error(f"--costs: allowed are the scenes that are stored, {', '.join(known)}")
-    seconds, samples = (QUICK_S, SAMPLES[:1]) if options.quick else (SECONDS, SAMPLES)
+    seconds, longest_s, samples = (QUICK_S, QUICK_S, SAMPLES[:1]) if options.quick else (SECONDS, LONGEST_S, SAMPLES)
     found = []
     try:
         with executors.chosen(options) as executor, tqdm(unit="run", disable=not sys.stderr.isatty()) as bar:
@@ -195,7 +204,10 @@ def main(arguments: list[str] | None = None) -> int:
 
             for name in names:
                 bar.set_description(name)
-                found.append(with_costs(known[name], name) if options.costs else measure(name, runs, samples, seconds))
+                if options.costs:
+                    found.append(with_costs(known[name], name))
+                else:
+                    found.append(measure(name, runs, samples, seconds, longest_s))
                 if options.store:
                     others = [scene for scene in measured().scenes if scene.name != found[-1].name]
                     every = sorted([*others, found[-1]], key=lambda scene: scene.name)

@@ -26,6 +26,7 @@ PICTURE, TRADE = Path("images") / "scenes.png", Path("images") / "scene_trade.pn
 EVIDENCE = ROOT / "docs" / "evidence"
 DRAWN_S, DRAWN_HZ = 12.0, 100
 COLOURS = 10
+"Of Matplotlib, which then begins with them anew."
 SAYS = {recorded.scene: recorded.says for recorded in RECORDED}
 _RECORDINGS = (
     "## Recordings\n\nThe public recordings are no part of the package. `tools/recorded_scenes.py` makes scenes of "
@@ -375,7 +376,7 @@ def draw_asked(path: Path) -> None:
             continue
         range_N = max(stated.force.least_N, core_without(name, ()).planner.portrait.least_N), stated.force.most_N
         curve = asked(stated.signal, Path(scene_path(name)).parent, range_N, DRAWN_S, DRAWN_HZ)
-        axes.plot(*curve, ":" if number >= COLOURS else "-", label=name)  # from there on they come again
+        axes.plot(*curve, ":" if number >= COLOURS else "-", label=name)
     axes.set(xlabel="time, s", ylabel="force asked, N")
     figure.legend(fontsize=8, loc="outside right center")
     figure.savefig(path, dpi=90, metadata=stamp(measured().scenes))

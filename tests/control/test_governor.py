@@ -363,19 +363,20 @@ def learned() -> GovernorState:
     return beaten(10.0)
 
 
-def test_a_force_that_repeats_itself_is_foreseen() -> None:
+@pytest.mark.parametrize(("lag_s", "share"), [(0.0, 0.3), (0.01, 0.75)])
+def test_a_force_that_repeats_itself_is_foreseen(lag_s: float, share: float) -> None:
     worst_N = extrapolated_N = 0.0
     state = beaten(10.0, SWIFT)
     for tick in range(5_001, 5_501):
         now_s = tick / 500
-        state, governed = SWIFT.govern(SWIFT.foresee(state), now_s, beat(now_s), DeviceFit(), 0.0)
+        state, governed = SWIFT.govern(SWIFT.foresee(state), now_s, beat(now_s), DeviceFit(), lag_s)
         _, blind = SWIFT.govern(state.replaced(periodicity=NOTHING_LEARNED), now_s, beat(now_s), DeviceFit(), 0.0)
         assert governed.foresight > 0.9
         assert governed.limits == ()
         expected = [beats_N(now_s + ahead_s) for ahead_s in PATH_S]
         worst_N = max(worst_N, float(np.abs(path_N(governed) - expected).max()))
         extrapolated_N = max(extrapolated_N, float(np.abs(path_N(blind) - expected).max()))
-    assert worst_N < 0.3 * extrapolated_N
+    assert worst_N < share * extrapolated_N
 
 
 def test_of_what_is_foreseen_a_slow_gap_makes_the_best(learned: GovernorState) -> None:

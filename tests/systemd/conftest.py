@@ -17,7 +17,8 @@ import pytest
 CHECKOUT = Path(__file__).parents[2]
 BOOT = Path(__file__).with_name("boot.sh")
 NAMESPACES = ("--pid", "--fork", "--mount", "--mount-proc", "--cgroup", "--uts", "--ipc", "--net", "--kill-child")
-PYTHON = f"env LD_LIBRARY_PATH=/opt/base/lib /opt/base/bin/python{sys.version_info[0]}.{sys.version_info[1]}"
+VERSION = f"{sys.version_info[0]}.{sys.version_info[1]}"
+PYTHON = f"env LD_LIBRARY_PATH=/opt/base/lib /opt/base/bin/python{VERSION}"
 LIBRARY = "/opt/checkout:/opt/packages"
 "Where the machine finds this interpreter, and what it imports."
 TRIAL = """mount -t tmpfs tmpfs /mnt && mkdir /mnt/upper /mnt/work /mnt/root /mnt/group
@@ -151,9 +152,8 @@ def package(tmp_path: Path) -> Path:
         pytest.skip("dpkg-deb is not installed")
     asked = ["dpkg-query", "--show", "--showformat", "${Version}", "python3"]
     debians = subprocess.run(asked, capture_output=True, text=True, check=False).stdout
-    own = "{}.{}".format(*sys.version_info)
-    if debians and not debians.startswith(f"{own}."):
-        pytest.skip(f"the package of Python {own} is for a Debian that has it; this one's is {debians}")
+    if debians and not debians.startswith(f"{VERSION}."):
+        pytest.skip(f"the package of Python {VERSION} is for a Debian that has it; this one's is {debians}")
     library, out = tmp_path / "library", tmp_path / "package"
     library.mkdir()
     for name in ("tormagd", "firmware_protocol"):

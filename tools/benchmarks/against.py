@@ -24,19 +24,20 @@ def checkout(text: str) -> Path:
     return root
 
 
-def entry_points(root: Path, folder: Path) -> None:
-    """Puts what that checkout's package says of itself into the folder: its backends are found by it. Raises
-    CalledProcessError."""
-    setup = [sys.executable, "-c", "from setuptools import setup; setup()", "--quiet"]
-    subprocess.run([*setup, "egg_info", "--egg-base", str(folder)], cwd=root, check=True, capture_output=True)
-
-
-def environment(root: Path | None, *more: Path) -> dict[str, str]:
-    """For a process that runs package and tools of that checkout; None for what runs here, which may be installed.
-    `more` folders are looked into besides."""
+def environment(root: Path | None) -> dict[str, str]:
+    """For a process that runs package and tools of that checkout; None for what runs here, which may be installed."""
     if root is None:
         inherited = os.environ.get("PYTHONPATH")
         folders = [str(TOOLS)] + ([inherited] if inherited else [])
     else:
-        folders = [str(root), str(root / "tools"), *map(str, more)]
+        folders = [str(root), str(root / "tools")]
     return os.environ | {"PYTHONPATH": os.pathsep.join(folders), "OMP_NUM_THREADS": "1"}
+
+
+def as_installed(root: Path, folder: Path) -> dict[str, str]:
+    """The same, where backends are found, too: by what that checkout's package says of itself, which is written into
+    the folder. Raises CalledProcessError."""
+    setup = [sys.executable, "-c", "from setuptools import setup; setup()", "--quiet"]
+    subprocess.run([*setup, "egg_info", "--egg-base", str(folder)], cwd=root, check=True, capture_output=True)
+    found = environment(root)
+    return found | {"PYTHONPATH": os.pathsep.join([found["PYTHONPATH"], str(folder)])}

@@ -34,7 +34,7 @@ from machines.host import processor_s
 from machines.own import own_machine
 from machines.wire import carried
 
-from benchmarks.against import add_against_argument, entry_points, environment
+from benchmarks.against import add_against_argument, as_installed, environment
 from benchmarks.histograms import plot_histograms
 from benchmarks.keys import curve_table, free_port
 from tormagd.client import Client, ClientError
@@ -381,9 +381,7 @@ def daemon_process(folder: Path, realtime: RealTime, setpoint_hz: int = SETPOINT
 def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
     """The same for any stand."""
     with contextlib.ExitStack() as stack:
-        theirs = environment(stand.root, folder)
-        if stand.root is not None:
-            entry_points(stand.root, folder)
+        theirs = environment(None) if stand.root is None else as_installed(stand.root, folder)
         if stand.device_fifo:
             stack.enter_context(carried(stand.device_fifo))
         device = own_machine(stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud), *stand.device)

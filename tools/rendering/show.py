@@ -54,8 +54,8 @@ CTL = ("-m", "tormagd.ctl.main", "--config", str(RUN_DIR / "tormagd.toml"), "--j
 LEAST_N, MOST_N = 1.4, 1.7
 PULSE_S = 20.0
 RAMP_S, HOLD_S = 1.0, 3.0
-PULSE_START_S = RAMP_S + HOLD_S
 "Approach to the pulse's first force, and a hold there in which the trim learns this device."
+PULSE_START_S = RAMP_S + HOLD_S
 START_N = 0.6
 RATE_HZ = 500
 "Setpoints a second."

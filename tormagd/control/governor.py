@@ -90,9 +90,9 @@ class TimedSetpoint(Value):
 @final
 class GovernorState(Value):
     """What the governor remembers between plans: `asked_N` is the force that the last one asked of the device, and
-    `above_N` how far that was above the least that the device then seemed to make; with a preview its carriages were
-    sent to that of `drive_N`; `holder` whose setpoints it followed; while `is_passing` the force is on its way to those
-    of a new holder."""
+    `above_N` how far that was above the least that the device then seemed to make; where it was known or foreseen what
+    comes the carriages were sent to that of `drive_N`; `holder` whose setpoints it followed; while `is_passing` the
+    force is on its way to those of a new holder."""
 
     __match_args__ = (
         "time_s",
@@ -225,28 +225,28 @@ class Governor:
         asks_N = force if is_passing else state.asked_N
         sent_N = asks_N if is_passing or state.drive_N is None else state.drive_N
         elapsed_s = max(now_s - state.time_s, 0.0)
-        governed = force
         if setpoint.preview_N and self._has_preview:
             periodicity, foresight = NOTHING_LEARNED, 1.0
             wanted_N = _previewed_N(setpoint, soon_s + lag_s, least, most)
             path, drive_N = self._pursued_N(asks_N, sent_N, elapsed_s, wanted_N, device, lag_s)
-            within = [min(max(force_N, least), most) for force_N in path]
-            governed = within[0]
-            if abs(governed - force) > OUTRUN_N:
-                reasons = (*reasons, Limit.RATE)
         else:
             periodicity = observe(learned, setpoint.stamp_s, asked_N) if self._has_forecast else NOTHING_LEARNED
             # one that has fallen silent for longer than a stream may is not believed to go on as it did
             foresight = periodicity.trust if age <= LONGEST_STEP_S else 0.0
             path = _expected_N(asked_N, slope, periodicity, foresight, soon_s + foresight * lag_s)
-            within = [min(max(force_N, least), most) for force_N in path]
-            if foresight > 0.0 and not is_passing and self._is_near(sent_N, within[-1], device):
-                pursued, drive_N = self._pursued_N(asks_N, sent_N, elapsed_s, within, device, lag_s)
-                for place, force_N in enumerate(pursued):
-                    within[place] += foresight * (min(max(force_N, least), most) - within[place])
-            within = within[: len(PATH_S)]
+        within = [min(max(force_N, least), most) for force_N in path]
+        governed = force
+        if drive_N is not None:
+            governed = within[0]
+            if abs(governed - force) > OUTRUN_N:
+                reasons = (*reasons, Limit.RATE)
+        elif foresight > 0.0 and not is_passing and self._is_near(sent_N, within[-1], device):
+            pursued, drive_N = self._pursued_N(asks_N, sent_N, elapsed_s, within, device, lag_s)
+            for place, force_N in enumerate(pursued):
+                within[place] += foresight * (min(max(force_N, least), most) - within[place])
+        within = within[: len(PATH_S)]
         if is_passing:
-            step_N = self._release_N_s * max(0.0, now_s - state.time_s)
+            step_N = self._release_N_s * elapsed_s
             left_N = within[0] - state.asked_N
             is_passing = abs(left_N) > step_N
             if is_passing:
@@ -346,8 +346,8 @@ class Governor:
 def _expected_N(
     asked_N: float, slope_N_s: float, periodicity: Periodicity, foresight: float, begins_s: float
 ) -> list[float]:
-    """The forces at PATH_S from `begins_s` after the newest setpoint on, at _FORESEEN_S where some of what comes is
-    foreseen: those along its slope, with so large a share of the forecast."""
+    """The forces at PATH_S, or at _FORESEEN_S where some of what comes is foreseen, from `begins_s` after the newest
+    setpoint on: those along its slope, with so large a share of the forecast."""
     times_s = _FORESEEN_S if foresight > 0.0 else PATH_S
     forces_N = [asked_N + slope_N_s * min(begins_s + after_s, AHEAD_S) for after_s in times_s]
     if foresight > 0.0:

@@ -24,17 +24,11 @@ MAX_STEP_S: Final = 1e9
 class PronyStep(Value):
     """The exact update of a `PronySeries` over one step length, for a driving force linear over the step."""
 
-    __match_args__ = ("equilibrium_fraction", "fractions", "decays", "gains")
-    __slots__ = __match_args__
+    __match_args__ = ("fractions", "decays", "gains")
+    __slots__ = ("decays", "equilibrium_fraction", "fractions", "gains")
 
-    def __init__(
-        self,
-        equilibrium_fraction: float,
-        fractions: tuple[float, ...],
-        decays: tuple[float, ...],
-        gains: tuple[float, ...],
-    ) -> None:
-        self.equilibrium_fraction: Final = equilibrium_fraction
+    def __init__(self, fractions: tuple[float, ...], decays: tuple[float, ...], gains: tuple[float, ...]) -> None:
+        self.equilibrium_fraction: Final = 1.0 - sum(fractions, 0.0)
         self.fractions: Final = fractions
         self.decays: Final = decays
         self.gains: Final = gains
@@ -59,7 +53,7 @@ class PronyStep(Value):
 
     def of(self, fractions: tuple[float, ...]) -> "PronyStep":
         """The same step of a series of the same times with other fractions."""
-        return PronyStep(1.0 - sum(fractions, 0.0), fractions, self.decays, self.gains)
+        return PronyStep(fractions, self.decays, self.gains)
 
 
 @final
@@ -92,7 +86,6 @@ class PronySeries(Value):
             require("dt_s", dt_s, 0.0, MAX_STEP_S)
         ratios = [dt_s / time_s for time_s in self.times_s]
         return PronyStep(
-            equilibrium_fraction=1.0 - sum(self.fractions, 0.0),
             fractions=self.fractions,
             decays=tuple([math.exp(-ratio) for ratio in ratios]),
             # mean of the decay over the step: what is left of a ramp that rose by one over it

@@ -117,7 +117,7 @@ class Measured(Struct, frozen=True):
     share: float
     "Of a scene's tolerance: a term that adds more when it is left out is required."
     seconds: float
-    "Of each run, at the least: a hold is measured to its end."
+    "Of each run, at the least: a hold is measured to its end, two minutes of it at most."
     build: str
     machine_us: float
     "Of the machine that the costs are of: see `tormagd.headroom.machine_loop`."
