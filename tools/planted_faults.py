@@ -205,8 +205,8 @@ PLANTED = (
     Planted(STEP, "if sight.is_blind or leap is not None:", "if leap is not None:", "driven blindly"),
     Planted(
         STEP,
-        "output = StepOutput(DriveMode.RUN, 0.0, 0.0, safety",
-        "output = StepOutput(DriveMode.RUN, *state.duties, safety",
+        "output = StepOutput(_RUN, 0.0, 0.0, safety",
+        "output = StepOutput(_RUN, *state.duties, safety",
         "the last duty is held blindly",
     ),
     Planted(STEP, "if now_s >= state.safety.clearing_until_s:", "if False:", "the device's own faults are passed over"),
@@ -216,18 +216,18 @@ PLANTED = (
     Planted(
         STEP,
         "return StepOutput(DriveMode.OFF, 0.0, 0.0, safety.request",
-        "return StepOutput(DriveMode.RUN, 0.0, 0.0, safety.request",
+        "return StepOutput(_RUN, 0.0, 0.0, safety.request",
         "RUN while disabled",
     ),
     Planted(
         STEP,
-        "within_mm = min(max(gap_mm, self._closed_mm, plan.least_gap_mm), self._open_mm)",
+        "within_mm = min(max(max(gap_mm, self._closed_mm), plan.least_gap_mm), self._open_mm)",
         "within_mm = min(max(gap_mm, self._closed_mm), self._open_mm)",
         "closer than this device may",
     ),
     Planted(
         STEP,
-        "within_mm = min(max(gap_mm, self._closed_mm, plan.least_gap_mm), self._open_mm)",
+        "within_mm = min(max(max(gap_mm, self._closed_mm), plan.least_gap_mm), self._open_mm)",
         "within_mm = gap_mm",
         "beyond the scene's gaps",
     ),

@@ -27,6 +27,8 @@ ERROR_N2_S: Final = 3e-4
 second. Chosen on sample 1 and draws 0 to 11, for their steps; with seven times as much these took two seconds."""
 SCALE_LASTS_S: Final = 600.0
 "In which what was learned of the scale is forgotten: the device has warmed, by a kelvin or less."
+SCALE_VARIANCE: Final = SCALE_SD * SCALE_SD
+OFFSET_VARIANCE_N2: Final = OFFSET_SD_N * OFFSET_SD_N
 SURE: Final = 2.0
 "Standard deviations within which a force is taken to lie."
 
@@ -42,9 +44,9 @@ class DeviceFit(Value):
         self,
         scale: float = 1.0,
         offset_N: float = 0.0,
-        scale_variance: float = SCALE_SD**2,
+        scale_variance: float = SCALE_VARIANCE,
         covariance_N: float = 0.0,
-        offset_variance_N2: float = OFFSET_SD_N**2,
+        offset_variance_N2: float = OFFSET_VARIANCE_N2,
     ) -> None:
         self.scale: Final = scale
         self.offset_N: Final = offset_N
@@ -139,9 +141,9 @@ def observe(
         return fit, False
     # both are forgotten towards their spread, which keeps the variances those of a believable device
     keeps_scale = math.exp(-elapsed_s / SCALE_LASTS_S)
-    keeps_offset = math.exp(-elapsed_s * error_N2_s / (2.0 * OFFSET_SD_N**2 * adapts_in_s**2))
-    scale_variance = SCALE_SD**2 + keeps_scale**2 * (fit.scale_variance - SCALE_SD**2)
-    offset_variance = OFFSET_SD_N**2 + keeps_offset**2 * (fit.offset_variance_N2 - OFFSET_SD_N**2)
+    keeps_offset = math.exp(-elapsed_s * error_N2_s / (2.0 * OFFSET_VARIANCE_N2 * (adapts_in_s * adapts_in_s)))
+    scale_variance = SCALE_VARIANCE + keeps_scale * keeps_scale * (fit.scale_variance - SCALE_VARIANCE)
+    offset_variance = OFFSET_VARIANCE_N2 + keeps_offset * keeps_offset * (fit.offset_variance_N2 - OFFSET_VARIANCE_N2)
     covariance = keeps_scale * keeps_offset * fit.covariance_N
     by_scale = model_N * scale_variance + covariance
     by_offset = model_N * covariance + offset_variance

@@ -311,7 +311,18 @@ class Governor:
         periodicity = foreseen(state.periodicity, state.slope_N_s)
         if periodicity is state.periodicity:
             return state
-        return state.replaced(periodicity=periodicity)
+        return GovernorState(
+            state.time_s,
+            state.asked_N,
+            state.stamp_s,
+            state.slope_N_s,
+            state.last_N,
+            periodicity,
+            state.holder,
+            state.is_passing,
+            state.above_N,
+            state.drive_N,
+        )
 
     def _ramp(
         self,

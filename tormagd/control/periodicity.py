@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from firmware_protocol.value import Value
-from tormagd.control.interpolation import interpolated
 
 Array = npt.NDArray[np.float64]
 
@@ -60,7 +59,6 @@ _ENDS: Final = np.arange(-1 - HORIZON, _SHORTEST - HORIZON - HISTORY - 2, -STRID
 _AROUND: Final = np.concatenate([np.minimum(_ROWS - 1, -1), _ROWS + _ENDS], axis=1)
 """Places from the end of a full history, a column for each stretch: what is compared of it, its end, what followed. The
 first column is the newest stretch, which nothing has followed yet."""
-_AHEAD_S: Final[list[float]] = [GRID_S * point for point in range(HORIZON + 1)]
 
 
 @final
@@ -245,12 +243,20 @@ def forecast_N(state: Periodicity, begins_s: float, after_s: list[float]) -> lis
     """The forces at these times (n) after `begins_s`, 0 or more, from the newest setpoint on; they stay where the
     forecast ends. Only where `trust` is above 0."""
     changes = state.changes_N
-    since_s = state.stamp_s - state.from_s
-    start = int(since_s / GRID_S)
-    part = since_s / GRID_S - start
     # the forecast starts at the newest setpoint, which may have come some steps after the point it is from
-    base_N = state.force_N - changes[start] - part * (changes[start + 1] - changes[start])
-    return [interpolated(begins_s + later_s + since_s, _AHEAD_S, changes) + base_N for later_s in after_s]
+    since_s = state.stamp_s - state.from_s
+    base_N = state.force_N - _change_N(changes, since_s)
+    return [base_N + _change_N(changes, since_s + begins_s + later_s) for later_s in after_s]
+
+
+def _change_N(changes_N: list[float], after_s: float) -> float:
+    """Of changes on the grid, that after so much time, linear between the points; beyond the end the last."""
+    steps = after_s / GRID_S
+    whole = int(steps)
+    if whole >= len(changes_N) - 1:
+        return changes_N[-1]
+    before_N = changes_N[whole]
+    return (changes_N[whole + 1] - before_N) * (steps - whole) + before_N
 
 
 def _search(history: Array) -> list[float]:

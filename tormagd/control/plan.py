@@ -356,7 +356,7 @@ class Planner:
         governor = self._governor.foresee(state.governor)
         if governor is state.governor:
             return state
-        return state.replaced(governor=governor)
+        return PlanState(governor, state.plan, state.shown, state.handle, state.remembered)
 
     def _model_N(self, estimate: Estimate | None, remembered: Remembered) -> float | None:
         """What the model says of the force of now, at the measured gap; None without a gap."""

@@ -1,7 +1,7 @@
 """The device's phase portrait: which forces a gap gives, and how fast a gap speed changes them."""
 
 import math
-from bisect import bisect_right
+from itertools import accumulate
 from typing import Final, final
 
 import numpy as np
@@ -16,6 +16,10 @@ from tormagd.physics.force import Elastomer, Geometry, brake_force_N
 
 Array = npt.NDArray[np.float64]
 GRID: Final = 201
+STRETCHES: Final = 1024
+"So many equal ones a portrait's forces are divided into, to find a force among its points: few points share one."
+LEAST_RISE_N: Final = 1e-9
+"A portrait of a model that does not rise has its points in the outermost of them."
 
 
 @final
@@ -58,7 +62,7 @@ class Portrait:
     """Force over gap for one contact, without memory, and its slope |dF/dgap|, N per mm, at n points: along the
     lists forces rise, and gaps fall evenly."""
 
-    __slots__ = ("_open_mm", "_step_mm", "force_N", "gap_mm", "slope_N_mm")
+    __slots__ = ("_open_mm", "_points_before", "_step_mm", "_stretches_per_N", "force_N", "gap_mm", "slope_N_mm")
 
     def __init__(self, gap_mm: list[float], force_N: list[float], slope_N_mm: list[float]) -> None:
         self.gap_mm: Final = gap_mm
@@ -66,6 +70,11 @@ class Portrait:
         self.slope_N_mm: Final = slope_N_mm
         self._open_mm: Final = gap_mm[0]
         self._step_mm: Final = (gap_mm[0] - gap_mm[-1]) / (len(gap_mm) - 1)
+        self._stretches_per_N: Final = (STRETCHES - 1) / max(force_N[-1] - force_N[0], LEAST_RISE_N)
+        points = [0] * STRETCHES
+        for force in force_N:
+            points[self._stretch(force)] += 1
+        self._points_before: Final = list(accumulate(points, initial=0))
 
     @property
     def least_N(self) -> float:
@@ -79,23 +88,38 @@ class Portrait:
 
     def slope_at_N_mm(self, force_N: float) -> float:
         """|dF/dgap| where the gap gives this force."""
-        return interpolated(force_N, self.force_N, self.slope_N_mm)
+        return self._between(force_N, self._points_to(force_N), self.slope_N_mm)
 
     def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
         """The gap that gives this force, as `gap_mm_at` has it, and |dF/dgap| at the point next to it."""
-        forces_N, gaps_mm = self.force_N, self.gap_mm
-        after = bisect_right(forces_N, force_N)
-        if after == 0:
-            return gaps_mm[0], self.slope_N_mm[0]
-        if after == len(forces_N):
-            return gaps_mm[-1], self.slope_N_mm[-1]
-        low_N, low_mm = forces_N[after - 1], gaps_mm[after - 1]
-        gap_mm = (gaps_mm[after] - low_mm) / (forces_N[after] - low_N) * (force_N - low_N) + low_mm
-        return gap_mm, self.slope_N_mm[after]
+        after = self._points_to(force_N)
+        return self._between(force_N, after, self.gap_mm), self.slope_N_mm[min(after, len(self.slope_N_mm) - 1)]
 
     def gap_mm_at(self, force_N: float) -> float:
         """The gap that gives this force; the nearest end of the range where none does."""
-        return interpolated(force_N, self.force_N, self.gap_mm)
+        return self._between(force_N, self._points_to(force_N), self.gap_mm)
+
+    def _stretch(self, force_N: float) -> int:
+        """Which of the stretches a force is in; those beyond the ends are in the outermost ones."""
+        return int(min(max((force_N - self.force_N[0]) * self._stretches_per_N, 0.0), STRETCHES - 1.0))
+
+    def _points_to(self, force_N: float) -> int:
+        """How many points give no more than this force, as `bisect_right` counts them: a plan asks up to thirty times,
+        and takes a tenth of its time less so."""
+        forces_N = self.force_N
+        points = self._points_before[self._stretch(force_N)]
+        while points < len(forces_N) and forces_N[points] <= force_N:
+            points += 1
+        return points
+
+    def _between(self, force_N: float, after: int, ys: list[float]) -> float:
+        """Linear between the point `after` and the one before it; beyond the ends what the outermost has."""
+        if after == 0:
+            return ys[0]
+        if after == len(ys):
+            return ys[-1]
+        low_N = self.force_N[after - 1]
+        return (ys[after] - ys[after - 1]) / (self.force_N[after] - low_N) * (force_N - low_N) + ys[after - 1]
 
     def force_N_at(self, gap_mm: float) -> float:
         """What this gap gives; of the nearest end of the range outside of it."""

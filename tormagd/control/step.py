@@ -58,6 +58,11 @@ OPPOSED_S: Final = 0.1
 "A carriage that moves against its duty for so long does not brake: it brakes from full speed within 0.06 s."
 WENT_AGAINST_S: Final = 0.015
 "Carriages that come apart, or to a stop, after one of them has gone against its duty for so long do so for that."
+# looking a member up takes longer than comparing it
+_DRIVEN: Final = OperatingState.ENABLED, OperatingState.PAUSED
+_PAUSED: Final = OperatingState.PAUSED
+_RUN: Final = DriveMode.RUN
+_RUNS: Final = DeviceMode.RUN
 SLOW_SHARE: Final = 0.4
 TOO_SLOW_SHARE: Final = 0.8
 """Of the delay that the position loop bears besides its own period: from the first on a round trip is a limit, from the
@@ -267,7 +272,7 @@ class Stepper:
     def lose_link(self, state: StepState) -> StepState:
         """The state after the link broke: a fault where the device was driven, otherwise only a forgotten estimate."""
         safety = state.safety
-        if safety.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED):
+        if safety.operating_state in _DRIVEN:
             safety = latch(safety, (Fault.LINK_LOST,))
         return state.replaced(safety=safety, estimate=None)
 
@@ -293,7 +298,7 @@ class Stepper:
         safety = latch(state.safety, self._watch(state, estimate, now_s, measurement, plan, sight, leap, homing))
         if safety.needs_homing:
             safety, estimate = homed_again(safety, measurement.is_homed), estimate.replaced(is_homed=False)
-        if safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
+        if safety.operating_state not in _DRIVEN:
             if measurement.is_busy:  # homing moves the origin: what was learned about motion before it is void
                 estimate = first_estimate(measurement, self._home_mm)
             state = state.replaced(
@@ -319,7 +324,7 @@ class Stepper:
         if state.leap is not None:
             limit = Limit.ENCODER
         safety = state.safety
-        output = StepOutput(DriveMode.RUN, 0.0, 0.0, safety.request, safety.request_number, (limit,))
+        output = StepOutput(_RUN, 0.0, 0.0, safety.request, safety.request_number, (limit,))
         return state.replaced(duties=(0.0, 0.0)), output
 
     def _from_where_it_is(self, state: StepState, estimate: Estimate) -> StepState:
@@ -351,7 +356,7 @@ class Stepper:
             pull = pull_V(self._pull_V, max(reference.gap_mm, self._closed_mm)) / self._supply_V
         speeds = self._speeds(pull, expected, estimate)
         limits: list[Limit] = []
-        if safety.operating_state is OperatingState.PAUSED:
+        if safety.operating_state is _PAUSED:
             target = Reference(reference.gap_mm)
             reference, is_limited, is_slewed = follow(self._gap_acceleration_mm_s2, reference, target, dt_s, speeds)
         else:
@@ -417,7 +422,7 @@ class Stepper:
             acted=acted,
         )
         output = StepOutput(
-            DriveMode.RUN,
+            _RUN,
             min(max(left_duty, -most), most),
             min(max(right_duty, -most), most),
             safety.request,
@@ -431,7 +436,7 @@ class Stepper:
         age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + self._lag_s
         gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
         speed_mm_s = plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2
-        within_mm = min(max(gap_mm, self._closed_mm, plan.least_gap_mm), self._open_mm)
+        within_mm = min(max(max(gap_mm, self._closed_mm), plan.least_gap_mm), self._open_mm)
         return Reference(within_mm, speed_mm_s, plan.gap_acceleration_mm_s2)
 
     def _speeds(self, pull: float, expected: Expected, estimate: Estimate) -> Speeds:
@@ -499,7 +504,7 @@ class Stepper:
             is_right_open = not sight.is_blind and measurement.is_right_open
             if is_outside(estimate, self._closed_mm, self._open_mm, is_left_open, is_right_open):
                 faults.append(Fault.OUT_OF_STROKE)
-        if state.safety.operating_state not in (OperatingState.ENABLED, OperatingState.PAUSED):
+        if state.safety.operating_state not in _DRIVEN:
             return tuple(faults)
         # the tick that is nearest to a time's end judges it: the next one would be a period late
         at_s = now_s + self._nominal_dt_s / 2.0
@@ -532,7 +537,7 @@ class Stepper:
             faults.append(Fault.SENSOR)
         if is_still:
             faults.append(Fault.NO_MOTION)
-        if measurement.mode is not DeviceMode.RUN and not faults and now_s - state.enabled_s > STARTING_S:
+        if measurement.mode is not _RUNS and not faults and now_s - state.enabled_s > STARTING_S:
             faults.append(Fault.DEVICE_NOT_RUNNING)
         return tuple(faults)
 
