@@ -209,7 +209,12 @@ PLANTED = (
         "output = StepOutput(_RUN, *state.duties, safety",
         "the last duty is held blindly",
     ),
-    Planted(STEP, "if now_s >= state.safety.clearing_until_s:", "if False:", "the device's own faults are passed over"),
+    Planted(
+        STEP,
+        "if shown and now_s >= state.safety.clearing_until_s:",
+        "if False:",
+        "the device's own faults are passed over",
+    ),
     Planted(
         STEP, "            safety = latch(safety, (Fault.LINK_LOST,))", "            pass", "a lost link is no fault"
     ),

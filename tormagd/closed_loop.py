@@ -4,7 +4,6 @@ The same `plan` and `step`, the same connection, the same protocol bytes as in t
 port are replaced. It stands beside the rooms because it joins control with simulation, which no room may.
 """
 
-from bisect import bisect_right
 from collections.abc import Callable, Iterable
 from typing import Final, Self, final
 
@@ -301,10 +300,16 @@ class ClosedLoop:
 
 def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:
     """A publisher in virtual time: each force is sent at its time, and nothing before the first."""
-    sent_s, sent_N = times_s.tolist(), forces_N.tolist()
+    sent_s: list[float] = times_s.tolist()
+    sent_N: list[float] = forces_N.tolist()
+    sent = 0
 
     def newest(now_s: float) -> TimedSetpoint | None:
-        index = bisect_right(sent_s, now_s) - 1
-        return None if index < 0 else TimedSetpoint(sent_N[index], sent_s[index], valid_for_s)
+        nonlocal sent
+        if sent and sent_s[sent - 1] > now_s:
+            sent = 0  # asked about an earlier time
+        while sent < len(sent_s) and sent_s[sent] <= now_s:
+            sent += 1
+        return TimedSetpoint(sent_N[sent - 1], sent_s[sent - 1], valid_for_s) if sent else None
 
     return newest

@@ -204,7 +204,7 @@ def _advanced(state: Periodicity, stamp_s: float, force_N: float, count: int) ->
     came_N = [state.force_N + share * (force_N - state.force_N) for share in shares]
     history = (state.history + array("d", came_N).tobytes())[-_MOST_BYTES:]
     long, short = state.long, state.short
-    for came, guess in zip(came_N, state.awaited, strict=False):
+    for came, guess in zip(came_N, state.awaited):  # noqa: B905 as below
         if guess is not None:
             forecast_error_N, slope_error_N = guess.forecast_N - came, guess.slope_N - came
             long = long.after(forecast_error_N, slope_error_N, LONG_S)

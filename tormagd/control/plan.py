@@ -61,6 +61,10 @@ LEAST_FORESIGHT: Final = 0.5
 LEAST_TRAVEL_MM_S: Final = 10.0
 "Slower carriages teach the lag less."
 
+# looking a member up takes longer than comparing it
+_INSIDE: Final = Reach.INSIDE
+_STALE: Final = Limit.STALE
+
 _PARABOLA: Final = np.linalg.pinv(np.stack([np.array(PATH_S), np.array(PATH_S) ** 2 / 2.0], axis=1))
 _TO_SPEED: Final[list[float]] = _PARABOLA[0].tolist()
 _TO_ACCELERATION: Final[list[float]] = _PARABOLA[1].tolist()
@@ -292,7 +296,7 @@ class Planner:
         lag_s = shown.lag_s if self._has_lag else 0.0
         governor, governed = self._governor.govern(state.governor, now_s, setpoint, device, lag_s)
         shown = self._learn_lag(shown, now_s - state.plan.time_s, estimate, remembered, governed, device)
-        is_meant = setpoint is not None and Limit.STALE not in governed.limits
+        is_meant = setpoint is not None and _STALE not in governed.limits
         curve = self._only_curve
         displacement_mm, rate_mm_s = curve.displacement_mm, curve.rate_mm_s
         known_mm, known_mm_s = displacement_mm, rate_mm_s
@@ -325,7 +329,7 @@ class Planner:
             limits = (*limits, Limit.CEILING)
         if solution.confidence < self._low_confidence:
             limits = (*limits, Limit.LOW_CONFIDENCE)
-        if solution.reach is not Reach.INSIDE:
+        if solution.reach is not _INSIDE:
             reached = Limit.F_MIN if solution.reach is Reach.BELOW else Limit.F_MAX
             # where nobody asks for a force, none is held back for being too low
             if reached not in limits and (is_meant or reached is Limit.F_MAX):

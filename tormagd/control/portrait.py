@@ -70,11 +70,12 @@ class Portrait:
         self.slope_N_mm: Final = slope_N_mm
         self._open_mm: Final = gap_mm[0]
         self._step_mm: Final = (gap_mm[0] - gap_mm[-1]) / (len(gap_mm) - 1)
-        self._stretches_per_N: Final = (STRETCHES - 1) / max(force_N[-1] - force_N[0], LEAST_RISE_N)
-        points = [0] * STRETCHES
+        self._stretches_per_N: Final = STRETCHES / max(force_N[-1] - force_N[0], LEAST_RISE_N)
+        # the points before each stretch, as `_points_to` finds it, and before what is beyond the last of them
+        points_in = [0] * (STRETCHES + 1)
         for force in force_N:
-            points[self._stretch(force)] += 1
-        self._points_before: Final = list(accumulate(points, initial=0))
+            points_in[min(max(int((force - force_N[0]) * self._stretches_per_N), 0), STRETCHES)] += 1
+        self._points_before: Final = list(accumulate(points_in[:-1], initial=0))
 
     @property
     def least_N(self) -> float:
@@ -88,38 +89,36 @@ class Portrait:
 
     def slope_at_N_mm(self, force_N: float) -> float:
         """|dF/dgap| where the gap gives this force."""
-        return self._between(force_N, self._points_to(force_N), self.slope_N_mm)
+        return interpolated(force_N, self.force_N, self.slope_N_mm)
 
     def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
         """The gap that gives this force, as `gap_mm_at` has it, and |dF/dgap| at the point next to it."""
+        forces_N, gaps_mm = self.force_N, self.gap_mm
         after = self._points_to(force_N)
-        return self._between(force_N, after, self.gap_mm), self.slope_N_mm[min(after, len(self.slope_N_mm) - 1)]
+        if after == 0:
+            return gaps_mm[0], self.slope_N_mm[0]
+        if after == len(forces_N):
+            return gaps_mm[-1], self.slope_N_mm[-1]
+        low_N, low_mm = forces_N[after - 1], gaps_mm[after - 1]
+        gap_mm = (gaps_mm[after] - low_mm) / (forces_N[after] - low_N) * (force_N - low_N) + low_mm
+        return gap_mm, self.slope_N_mm[after]
 
     def gap_mm_at(self, force_N: float) -> float:
         """The gap that gives this force; the nearest end of the range where none does."""
-        return self._between(force_N, self._points_to(force_N), self.gap_mm)
-
-    def _stretch(self, force_N: float) -> int:
-        """Which of the stretches a force is in; those beyond the ends are in the outermost ones."""
-        return int(min(max((force_N - self.force_N[0]) * self._stretches_per_N, 0.0), STRETCHES - 1.0))
+        gap_mm, _ = self.gap_and_slope_at(force_N)
+        return gap_mm
 
     def _points_to(self, force_N: float) -> int:
         """How many points give no more than this force, as `bisect_right` counts them: a plan asks up to thirty times,
         and takes a tenth of its time less so."""
         forces_N = self.force_N
-        points = self._points_before[self._stretch(force_N)]
+        stretch = (force_N - forces_N[0]) * self._stretches_per_N
+        if stretch < 0.0:
+            return 0
+        points = self._points_before[int(stretch) if stretch < STRETCHES else STRETCHES]
         while points < len(forces_N) and forces_N[points] <= force_N:
             points += 1
         return points
-
-    def _between(self, force_N: float, after: int, ys: list[float]) -> float:
-        """Linear between the point `after` and the one before it; beyond the ends what the outermost has."""
-        if after == 0:
-            return ys[0]
-        if after == len(ys):
-            return ys[-1]
-        low_N = self.force_N[after - 1]
-        return (ys[after] - ys[after - 1]) / (self.force_N[after] - low_N) * (force_N - low_N) + ys[after - 1]
 
     def force_N_at(self, gap_mm: float) -> float:
         """What this gap gives; of the nearest end of the range outside of it."""

@@ -490,7 +490,8 @@ class Stepper:
         faults: list[Fault] = []
         if homing is not None and homing.faults:
             faults.extend(homing.faults)
-        if now_s >= state.safety.clearing_until_s:
+        shown: int = measurement.faults
+        if shown and now_s >= state.safety.clearing_until_s:
             is_ours = Fault.HOST_STALL in state.safety.faults or (
                 sight.has_stalled(now_s) and sight.stall_s > self._longest_own_stall_s
             )

@@ -6,10 +6,10 @@ from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from firmware_protocol.value import Value
 from tormagd.hardware.link_quality import UNKNOWN_QUALITY, LinkQuality
 
-# operations on flags make new ones, at a microsecond each; the core asks a thousand times a second
-_HOMED: Final = int(Switches.HOMED)
-_LEFT_OPEN: Final = int(Switches.LEFT_OPEN)
-_RIGHT_OPEN: Final = int(Switches.RIGHT_OPEN)
+# operations on flags make new ones, at a microsecond each, but for shifts; the core asks a thousand times a second
+_HOMED: Final = Switches.HOMED.bit_length() - 1
+_LEFT_OPEN: Final = Switches.LEFT_OPEN.bit_length() - 1
+_RIGHT_OPEN: Final = Switches.RIGHT_OPEN.bit_length() - 1
 _LATCHED: Final = DeviceMode.LATCHED
 _BUSY: Final = (DeviceMode.HOMING, DeviceMode.RETRACTING)
 
@@ -76,17 +76,20 @@ class Measurement(Value):
     @property
     def is_homed(self) -> bool:
         """The device knows where its carriages are."""
-        return int(self.switches) & _HOMED != 0
+        switches: int = self.switches
+        return switches >> _HOMED & 1 != 0
 
     @property
     def is_left_open(self) -> bool:
         """The left carriage is at its open switch."""
-        return int(self.switches) & _LEFT_OPEN != 0
+        switches: int = self.switches
+        return switches >> _LEFT_OPEN & 1 != 0
 
     @property
     def is_right_open(self) -> bool:
         """The right carriage is at its open switch."""
-        return int(self.switches) & _RIGHT_OPEN != 0
+        switches: int = self.switches
+        return switches >> _RIGHT_OPEN & 1 != 0
 
     @property
     def is_busy(self) -> bool:
@@ -96,4 +99,5 @@ class Measurement(Value):
     @property
     def is_latched(self) -> bool:
         """The device holds a fault that only a Clear takes away."""
-        return self.mode is _LATCHED or int(self.faults) != 0
+        faults: int = self.faults
+        return self.mode is _LATCHED or faults != 0

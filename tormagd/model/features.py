@@ -59,20 +59,6 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return scaled
 
 
-def require_inputs(displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> None:
-    """Raise `DomainError` naming the first feature that is NaN, infinite or beyond `LARGEST`."""
-    # written out because it stands before every prediction of the control loop
-    if (
-        -LARGEST <= displacement_mm <= LARGEST
-        and -LARGEST <= rate_mm_s <= LARGEST
-        and -LARGEST <= field_mT <= LARGEST
-        and -LARGEST <= cip_percent <= LARGEST
-    ):
-        return
-    for name, value in zip(FEATURES, (displacement_mm, rate_mm_s, field_mT, cip_percent), strict=True):
-        require_number(name, value)
-
-
 def require_number(name: str, value: float) -> None:
     """Raise `DomainError` when `value` is NaN, infinite or beyond `LARGEST`."""
     if not -LARGEST <= value <= LARGEST:

@@ -9,7 +9,7 @@ from typing import Final, Protocol, TypeAlias, final
 import numpy as np
 from numpy.typing import NDArray
 
-from tormagd.model.features import FEATURES, FIELD, require_inputs
+from tormagd.model.features import FEATURES, FIELD, LARGEST, require_number
 
 EXTRAPOLATION_RATE: Final = 4.0
 """Confidence falls to 1/e when the inputs lie a quarter of their training range outside it, features summed."""
@@ -20,6 +20,7 @@ RESIDUAL_RATE: Final = 20.0
 LARGEST_EXPONENT: Final = 700.0
 "exp() of a little more has no float. A unit that far from its step is shut to the last digit of every force."
 
+_LARGEST: Final[float] = LARGEST
 Floats: TypeAlias = NDArray[np.floating]
 
 
@@ -53,6 +54,20 @@ class ForceCurve(Protocol):
 
     def confidence(self, field_mT: float, error_N: float) -> float:
         """Trust, 0..1, in a field that misses the force asked by `error_N` N."""
+
+
+def require_inputs(displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> None:
+    """Raise `DomainError` naming the first feature that is NaN, infinite or beyond `LARGEST`."""
+    # written out because it stands before every prediction of the control loop
+    if (
+        -_LARGEST <= displacement_mm <= _LARGEST
+        and -_LARGEST <= rate_mm_s <= _LARGEST
+        and -_LARGEST <= field_mT <= _LARGEST
+        and -_LARGEST <= cip_percent <= _LARGEST
+    ):
+        return
+    for name, value in zip(FEATURES, (displacement_mm, rate_mm_s, field_mT, cip_percent), strict=True):
+        require_number(name, value)
 
 
 def within(value: float, ends: tuple[float, float]) -> float:

@@ -30,10 +30,9 @@ from tormagd.model.features import (
     Element,
     Scaling,
     require_features,
-    require_inputs,
     require_number,
 )
-from tormagd.model.force_curve import ForceCurve, Known, Network
+from tormagd.model.force_curve import ForceCurve, Known, Network, require_inputs
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.physics.errors import DomainError
 

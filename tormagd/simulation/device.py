@@ -273,7 +273,7 @@ class MessageDevice:
             self.plant.drive(None, None)
 
     def _volts(self, duty: float) -> float:
-        return round(duty * self._pwm_steps) / self._pwm_steps * self._supply_V
+        return float(math.floor(duty * self._pwm_steps + 0.5)) / self._pwm_steps * self._supply_V
 
     def _device_time_s(self, time_s: float) -> float:
         return (time_s - self._boot_s) * self._rate
@@ -575,7 +575,7 @@ class VirtualDevice:
             frame = encode_frame(packet.function, self._sequence, packet.payload)
             self._sequence = (self._sequence + 1) % 256
             start_s = max(packet.time_s, self._sender_free_s)
-            self._sender_free_s = start_s + len(frame) * self._byte_s
+            self._sender_free_s = start_s + float(len(frame)) * self._byte_s
             self._line.append(Outgoing(start_s, frame))
 
     def transmit(self, now_s: float) -> bytes:

@@ -50,6 +50,7 @@ SERIAL_NUMBER: Final = 1
 # An operation on flags makes new ones, and a member of an enumeration is looked up in its class by Python code, at a
 # microsecond and a fifth of one: what is needed in every tick is made and named here
 NO_SWITCH: Final = Switches(0)
+HOMED_SWITCHES: Final = [Switches(bits) | Switches.HOMED for bits in range(16)]
 CLOSED_SWITCHES: Final = Switches.LEFT_CLOSED | Switches.RIGHT_CLOSED
 NO_FAULT: Final = DeviceFault(0)
 
@@ -432,9 +433,10 @@ class Firmware:
 
     def status(self, sensors: Sensors) -> Status:
         """Mode, switches, faults, and what was last accepted (0 before anything was)."""
+        ends: int = sensors.switches
         return Status(
             mode=self.mode,
-            switches=sensors.switches | Switches.HOMED if self.homed else sensors.switches,
+            switches=HOMED_SWITCHES[ends] if self.homed else sensors.switches,
             faults=self.faults,
             temperature_C=sensors.temperature_C,
             supply_V=sensors.supply_V,

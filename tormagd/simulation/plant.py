@@ -259,11 +259,13 @@ class ForceSensor:
     __slots__ = (
         "_delay_s",
         "_drift_N_s",
+        "_has_spare",
         "_in_flight",
         "_noise",
         "_period_s",
         "_range_N",
         "_samples",
+        "_spare",
         "_spread_N",
         "reading_N",
     )
@@ -276,6 +278,8 @@ class ForceSensor:
         self._spread_N = sensor.noise_mN * 1e-3
         self._drift_N_s = noise.choice((-1.0, 1.0)) * sensor.drift_mN_min * 1e-3 / 60.0
         self._range_N = plant.assumed.force_range_N
+        self._has_spare = False
+        self._spare = 0.0
         self._samples = 0
         self._in_flight: deque[tuple[float, float]] = deque()
         self.reading_N = 0.0
@@ -285,8 +289,20 @@ class ForceSensor:
         # half an element step of tolerance: a sample falls on the nearest step
         if time_s + 0.5 * ELEMENT_STEP_S >= self._samples * self._period_s:
             self._samples += 1
-            sample_N = force_N + self._drift_N_s * time_s + self._noise.gauss(0.0, self._spread_N)
+            sample_N = force_N + self._drift_N_s * time_s + self._spread_N * self._normal()
             sample_N = min(max(sample_N, -self._range_N), self._range_N)
             self._in_flight.append((time_s + self._delay_s, sample_N))
         while self._in_flight and self._in_flight[0][0] <= time_s + 0.5 * ELEMENT_STEP_S:
             self.reading_N = self._in_flight.popleft()[1]
+
+    def _normal(self) -> float:
+        """The next standard normal number, of two at a time (Box and Muller, 1958). It is `random.Random.gauss`, whose
+        numbers may be others in another Python: only those of `random` are promised to stay, and figures with them."""
+        if self._has_spare:
+            self._has_spare = False
+            return self._spare
+        angle = self._noise.random() * math.tau
+        radius = math.sqrt(-2.0 * math.log(1.0 - self._noise.random()))
+        self._spare = math.sin(angle) * radius
+        self._has_spare = True
+        return math.cos(angle) * radius
