@@ -30,12 +30,36 @@ def test_a_stall_costs_the_beats_that_were_due_in_it():
         ({"bare_worst_ms": 10.0}, True),
         ({"bare_kept": 0.98}, True),
         ({"waited": {"daemon": 0.02, "simulated device": 0.2}}, True),
+        ({"waited_worst_ms": 24.0}, False),
+        ({"waited_worst_ms": 60.0}, True),
         ({"steal": 0.5}, False),  # what was stolen while nobody wanted it did no harm; a timer would have seen it
     ],
 )
 def test_what_was_taken_is_judged_by_what_a_program_would_have_missed(changes, took_much):
     calm = host.Host(steal=0.0, bare_kept=1.0, bare_worst_ms=1.2, waited={})
     assert calm._replace(**changes).took_much is took_much
+
+
+def looked(time_s: float, **waited_s: float) -> host.Counters:
+    """What the kernel's counters say of processes that have waited so long by then."""
+    return host.Counters(time_s, stolen=0, ticks=round(100 * time_s), waited_s=waited_s, blocked_s=0.0)
+
+
+def test_a_wait_that_led_to_a_fault_is_seen_by_the_look_after_it(tmp_path: Path):
+    with (tmp_path / "log").open("w") as log, host.HostWatch(0, log) as watched:
+        watched.end()
+        watched._looks = [
+            looked(1.0),
+            looked(1.2, device=0.010),
+            looked(1.4, device=0.014),
+            looked(1.6, device=0.134),  # 110 ms until 1.55: the fault is of 1.54, and the device was ended at 1.58
+            looked(1.8),
+        ]
+        found = watched.between(1.1, 1.54)
+    assert found.waited == {"device": pytest.approx(0.134 / 0.6)}
+    assert found.waited_worst_ms == pytest.approx(100.0)
+    assert found.took_much
+    assert "device waited" in str(found)
 
 
 def test_a_timer_on_every_processor_and_a_process_that_waits(tmp_path: Path):
