@@ -71,6 +71,12 @@ def test_without_a_reversal_nothing_is_told_and_less_and_less_is_known() -> None
     assert zero.sd_N(1e9) == MOST_SD_N
 
 
+@pytest.mark.parametrize("minutes", [10, 20, 40, 60])
+def test_a_sensor_that_drifts_one_way_stays_within_what_is_believed(minutes: int) -> None:
+    zero, now_s = strokes(TARED, 0.0, number=1)
+    assert zero.sd_N(now_s + 60.0 * minutes) >= 0.005 * minutes
+
+
 def test_before_anything_is_heard_no_time_counts() -> None:
     assert TARED.sd_N(1e9) == TARED_SD_N
 

@@ -12,8 +12,10 @@ from firmware_protocol.value import Value
 
 TARED_SD_N: Final = 0.02
 "Of a sensor that begins: it is taken for tared."
-DRIFT_N2_S: Final = 0.05**2 / 600.0
-"A sensor that drifts by 5 mN a minute is off by 50 mN after ten (plant card)."
+WANDERS_S: Final = 600.0
+DRIFT_N2_S: Final = 0.05**2 / WANDERS_S
+"""A sensor that drifts by 5 mN a minute is off by 50 mN after ten (plant card). For so long it may wander to and fro;
+in an hour it may have gone one way."""
 MOST_SD_N: Final = 0.3
 "An hour of that. However long nothing was heard, no more is believed possible."
 UNKNOWN_SD_N: Final = 0.05
@@ -86,7 +88,9 @@ class SensorZero(Value):
 
     def sd_N(self, now_s: float) -> float:
         """Standard deviation of the zero by now; before the first reading no time counts."""
-        return math.sqrt(min(self.variance_N2 + DRIFT_N2_S * max(now_s - self.told_s, 0.0), MOST_SD_N * MOST_SD_N))
+        since_s = max(now_s - self.told_s, 0.0)
+        drifted_N2 = DRIFT_N2_S * since_s * max(since_s / WANDERS_S, 1.0)
+        return math.sqrt(min(self.variance_N2 + drifted_N2, MOST_SD_N * MOST_SD_N))
 
     def doubted(self) -> "SensorZero":
         """The same of a sensor that is not believed to have been tared."""
