@@ -176,9 +176,11 @@ def _heard(past: Past | None, model_N: float, reading_N: float, elapsed_s: float
 def _is_strange(past: Past, model_N: float, rate_mm_s: float, direction: float, zero_sd_N: float) -> bool:
     if past.still_s > FROZEN_S:
         return True
+    # where nothing has told the zero for long, it may explain what no device does
+    unknown_N = SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
     most_loaded_N, least_loaded_N = max(model_N, past.loaded_N), min(model_N, past.loaded_N)
-    weakest_N = LEAST_SCALE * (model_N - RELAXES_MOST * most_loaded_N) - NOISE_N
-    strongest_N = MOST_SCALE * (model_N - RELAXES_LEAST * least_loaded_N) + NOISE_N
+    weakest_N = LEAST_SCALE * (model_N - RELAXES_MOST * most_loaded_N) - NOISE_N - unknown_N
+    strongest_N = MOST_SCALE * (model_N - RELAXES_LEAST * least_loaded_N) + NOISE_N + unknown_N
     if not weakest_N <= past.measured_N <= strongest_N:
         return True
     (before_N, before_mm_s, before_way), (kept_N, kept_mm_s, _) = past.before_at, past.kept_at
@@ -195,6 +197,6 @@ def _is_strange(past: Past, model_N: float, rate_mm_s: float, direction: float, 
     if abs(past.measured_N - past.before.force_N(model_N)) > jump_N:
         return True
     slow = past.slow
-    unsure_N = SURE * math.sqrt(slow.offset_variance_N2) + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
+    unsure_N = SURE * math.sqrt(slow.offset_variance_N2) + unknown_N
     least_N = LEAST_OFFSET_N - RELAXES_MOST * slow.scale * most_loaded_N
     return slow.offset_N + unsure_N < least_N or slow.offset_N - unsure_N > MOST_OFFSET_N
