@@ -71,7 +71,7 @@ class Portrait:
         self._open_mm: Final = gap_mm[0]
         self._step_mm: Final = (gap_mm[0] - gap_mm[-1]) / (len(gap_mm) - 1)
         self._stretches_per_N: Final = STRETCHES / max(force_N[-1] - force_N[0], LEAST_RISE_N)
-        # the points before each stretch, as `_points_to` finds it, and before what is beyond the last of them
+        # the points before each stretch, as a force finds its own, and before what is beyond the last of them
         points_in = [0] * (STRETCHES + 1)
         for force in force_N:
             points_in[min(max(int((force - force_N[0]) * self._stretches_per_N), 0), STRETCHES)] += 1
@@ -94,9 +94,13 @@ class Portrait:
     def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
         """The gap that gives this force, as `gap_mm_at` has it, and |dF/dgap| at the point next to it."""
         forces_N, gaps_mm = self.force_N, self.gap_mm
-        after = self._points_to(force_N)
-        if after == 0:
+        stretch = (force_N - forces_N[0]) * self._stretches_per_N
+        if stretch < 0.0:
             return gaps_mm[0], self.slope_N_mm[0]
+        # as `bisect_right` finds it: a plan asks up to thirty times, and takes a tenth of its time less so
+        after = self._points_before[int(stretch) if stretch < STRETCHES else STRETCHES]
+        while after < len(forces_N) and forces_N[after] <= force_N:
+            after += 1
         if after == len(forces_N):
             return gaps_mm[-1], self.slope_N_mm[-1]
         low_N, low_mm = forces_N[after - 1], gaps_mm[after - 1]
@@ -107,18 +111,6 @@ class Portrait:
         """The gap that gives this force; the nearest end of the range where none does."""
         gap_mm, _ = self.gap_and_slope_at(force_N)
         return gap_mm
-
-    def _points_to(self, force_N: float) -> int:
-        """How many points give no more than this force, as `bisect_right` counts them: a plan asks up to thirty times,
-        and takes a tenth of its time less so."""
-        forces_N = self.force_N
-        stretch = (force_N - forces_N[0]) * self._stretches_per_N
-        if stretch < 0.0:
-            return 0
-        points = self._points_before[int(stretch) if stretch < STRETCHES else STRETCHES]
-        while points < len(forces_N) and forces_N[points] <= force_N:
-            points += 1
-        return points
 
     def force_N_at(self, gap_mm: float) -> float:
         """What this gap gives; of the nearest end of the range outside of it."""
