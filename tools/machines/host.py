@@ -153,11 +153,15 @@ class HostWatch:
         if len(looks) < 2:
             looks = self._looks
         first, last = looks[0], looks[-1]
+        newest = {name: look for look in looks for name in look.waited_s}
         return Host(
             steal=(last.stolen - first.stolen) / max(last.ticks - first.ticks, 1),
             bare_kept=min((kept(stalls, start_s, end_s) for stalls in self._stalls), default=1.0),
             bare_worst_ms=max((stall.length_ms for stall in self._within(start_s, end_s)), default=0.0),
-            waited={name: waited_share(name, looks) for look in looks for name in look.waited_s},
+            waited={
+                name: (look.waited_s[name] - first.waited_s.get(name, 0.0)) / max(look.time_s - first.time_s, 1e-9)
+                for name, look in newest.items()
+            },
             blocked=(last.blocked_s - first.blocked_s) / max(last.time_s - first.time_s, 1e-9),
             waited_worst_ms=1e3 * max((waited_over_s(*pair) for pair in pairwise(looks)), default=0.0),
         )
@@ -169,13 +173,6 @@ class HostWatch:
     def _look(self) -> None:
         while not self._ended.wait(LOOK_S):
             self._looks.append(counters(self._pids))
-
-
-def waited_share(name: str, looks: list[Counters]) -> float:
-    """Of the time from the first of the looks to the last that saw this process."""
-    last = next(look for look in reversed(looks) if name in look.waited_s)
-    waited_s = last.waited_s[name] - looks[0].waited_s.get(name, 0.0)
-    return waited_s / max(last.time_s - looks[0].time_s, 1e-9)
 
 
 def waited_over_s(before: Counters, after: Counters) -> float:

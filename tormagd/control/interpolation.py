@@ -12,3 +12,12 @@ def interpolated(x: float, xs: list[float], ys: list[float]) -> float:
         return ys[-1]
     low = xs[after - 1]
     return (ys[after] - ys[after - 1]) / (xs[after] - low) * (x - low) + ys[after - 1]
+
+
+def at_step(steps: float, ys: list[float]) -> float:
+    """The same of evenly spaced points: so many steps, 0 or more, behind the first of `ys` (n)."""
+    whole = int(steps)
+    if whole >= len(ys) - 1:
+        return ys[-1]
+    before = ys[whole]
+    return (ys[whole + 1] - before) * (steps - whole) + before

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from firmware_protocol.value import Value
+from tormagd.control.interpolation import at_step
 
 Array = npt.NDArray[np.float64]
 
@@ -245,18 +246,8 @@ def forecast_N(state: Periodicity, begins_s: float, after_s: list[float]) -> lis
     changes = state.changes_N
     # the forecast starts at the newest setpoint, which may have come some steps after the point it is from
     since_s = state.stamp_s - state.from_s
-    base_N = state.force_N - _change_N(changes, since_s)
-    return [base_N + _change_N(changes, since_s + begins_s + later_s) for later_s in after_s]
-
-
-def _change_N(changes_N: list[float], after_s: float) -> float:
-    """Of changes on the grid, that after so much time, linear between the points; beyond the end the last."""
-    steps = after_s / GRID_S
-    whole = int(steps)
-    if whole >= len(changes_N) - 1:
-        return changes_N[-1]
-    before_N = changes_N[whole]
-    return (changes_N[whole + 1] - before_N) * (steps - whole) + before_N
+    base_N = state.force_N - at_step(since_s / GRID_S, changes)
+    return [base_N + at_step((since_s + begins_s + later_s) / GRID_S, changes) for later_s in after_s]
 
 
 def _search(history: Array) -> list[float]:

@@ -7,7 +7,7 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
-from tormagd.control.interpolation import interpolated
+from tormagd.control.interpolation import at_step, interpolated
 from tormagd.inverse.solution import FieldSolution, Reach, checked_near_mT
 from tormagd.model.force_curve import ForceCurve
 from tormagd.physics.errors import DomainError
@@ -114,12 +114,7 @@ class Portrait:
 
     def force_N_at(self, gap_mm: float) -> float:
         """What this gap gives; of the nearest end of the range outside of it."""
-        steps = max((self._open_mm - gap_mm) / self._step_mm, 0.0)
-        whole = int(steps)
-        if whole >= len(self.force_N) - 1:
-            return self.force_N[-1]
-        before_N = self.force_N[whole]
-        return (self.force_N[whole + 1] - before_N) * (steps - whole) + before_N
+        return at_step(max((self._open_mm - gap_mm) / self._step_mm, 0.0), self.force_N)
 
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
         """The fastest change of force that a gap speed renders at this force."""

@@ -62,7 +62,7 @@ WENT_AGAINST_S: Final = 0.015
 _DRIVEN: Final = OperatingState.ENABLED, OperatingState.PAUSED
 _PAUSED: Final = OperatingState.PAUSED
 _RUN: Final = DriveMode.RUN
-_RUNS: Final = DeviceMode.RUN
+_DEVICE_RUN: Final = DeviceMode.RUN
 SLOW_SHARE: Final = 0.4
 TOO_SLOW_SHARE: Final = 0.8
 """Of the delay that the position loop bears besides its own period: from the first on a round trip is a limit, from the
@@ -538,7 +538,7 @@ class Stepper:
             faults.append(Fault.SENSOR)
         if is_still:
             faults.append(Fault.NO_MOTION)
-        if measurement.mode is not _RUNS and not faults and now_s - state.enabled_s > STARTING_S:
+        if measurement.mode is not _DEVICE_RUN and not faults and now_s - state.enabled_s > STARTING_S:
             faults.append(Fault.DEVICE_NOT_RUNNING)
         return tuple(faults)
 

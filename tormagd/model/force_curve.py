@@ -20,6 +20,7 @@ RESIDUAL_RATE: Final = 20.0
 LARGEST_EXPONENT: Final = 700.0
 "exp() of a little more has no float. A unit that far from its step is shut to the last digit of every force."
 
+# compiled, a constant of this module is a plain float
 _LARGEST: Final[float] = LARGEST
 Floats: TypeAlias = NDArray[np.floating]
 

@@ -530,8 +530,6 @@ _BY_DEVICE_FAULT: dict[DeviceFault, Fault] = {bit: Fault(f"DEVICE_{bit.name}") f
 
 def device_faults(bits: DeviceFault, *, is_host_stall: bool = False) -> tuple[Fault, ...]:
     """The faults that the firmware's bits stand for. With `is_host_stall` it was this process that gave no command."""
-    if not bits:  # as nearly always, a thousand times a second
-        return ()
     found = tuple(fault for bit, fault in _BY_DEVICE_FAULT.items() if bit in bits)
     if not is_host_stall:
         return found
