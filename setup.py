@@ -23,7 +23,9 @@ COMPILED = {
     "tormagd/physics": ("friction", "relaxation"),
     "tormagd/model": ("displacement", "force_curve"),
     "tormagd/inverse": ("solution", "newton"),
-    "tormagd/hardware": ("frame_stream", "link", "link_quality", "link_statistics", "measurement", "connection"),
+    "tormagd/hardware": (
+        *("serial_port", "frame_stream", "link", "link_quality", "link_statistics", "measurement", "connection"),
+    ),
     "tormagd/safety": ("operating_state",),
     "tormagd/control": (
         *(
@@ -120,9 +122,9 @@ class BuildCore(build_ext):
         return extensions
 
     def _record(self, lacking: str) -> None:
-        known = {"python": EXTENSION_SUFFIXES[0], "interpreted": lacking, "sources": {}}
-        if not lacking:
-            known["sources"] = {source: zlib.crc32(Path(source).read_bytes()) for source in SOURCES}
+        # without a build, too: what an earlier one left beside the sources is not to be imported
+        sources = {source: zlib.crc32(Path(source).read_bytes()) for source in SOURCES}
+        known = {"python": EXTENSION_SUFFIXES[0], "interpreted": lacking, "sources": sources}
         places = [RECORD] if self.inplace or self.editable_mode else []
         if not self.editable_mode:
             places.append(Path(self.build_lib, RECORD))

@@ -22,17 +22,18 @@ FIELDS_MT = (50.0, 900.0)
 STEADY = MEMORY.of(relaxes=lambda _: True, hysteresis=False)
 REMEMBERING = Remembering(MEMORY, FIELDS_MT)
 CURVE = load_model(model_path("torque_mre_50_40", Path()), element="torque").curve(1.5, 42.0, 40.0)
+FREE_N = REMEMBERING.free_N(CURVE)
 
 
 def test_it_relaxes_as_its_series_does() -> None:
     series = PronySeries(MEMORY.fractions, MEMORY.times_s)
     before_N, after_N = CURVE.force_N(300.0), CURVE.force_N(700.0)
     step, state = series.discretise(0.5), series.relaxed(before_N)
-    remembered = Remembering(STEADY, FIELDS_MT).rested(CURVE, 300.0, 0.0)
+    remembered = Remembering(STEADY, FIELDS_MT).rested(CURVE, FREE_N, 300.0, 0.0)
     assert remembered.relaxed_N == pytest.approx(before_N * 0.13)
     for place in range(1, 41):
         true_N, state = step.advance(state, after_N)
-        remembered = Remembering(STEADY, FIELDS_MT).followed(remembered, CURVE, 700.0, 0.5 * place)
+        remembered = Remembering(STEADY, FIELDS_MT).followed(remembered, CURVE, FREE_N, 700.0, 0.5 * place)
         assert after_N - remembered.relaxed_N == pytest.approx(true_N, abs=1e-12)
 
 
@@ -41,17 +42,17 @@ def test_what_the_field_adds_relaxes_by_fractions_of_its_own() -> None:
     remembering = Remembering(memory, FIELDS_MT)
     remembered = remembering.unloaded(700.0, 5.0)
     assert remembered.relaxed_N == 0.0
-    remembered = remembering.followed(remembered, CURVE, 700.0, 5.0)
+    remembered = remembering.followed(remembered, CURVE, FREE_N, 700.0, 5.0)
     assert remembered.relaxed_N == pytest.approx(0.0)
-    remembered = remembering.followed(remembered, CURVE, 700.0, 1e4)
+    remembered = remembering.followed(remembered, CURVE, FREE_N, 700.0, 1e4)
     free_N = CURVE.force_N(FIELDS_MT[0])
     assert remembered.relaxed_N == pytest.approx(0.09 * free_N + 0.12 * (CURVE.force_N(700.0) - free_N))
 
 
 def test_time_that_goes_back_ages_nothing() -> None:
-    remembered = REMEMBERING.rested(CURVE, 300.0, 10.0)
-    remembered = REMEMBERING.followed(remembered, CURVE, 700.0, 11.0)
-    earlier = REMEMBERING.followed(remembered, CURVE, 700.0, 10.0)
+    remembered = REMEMBERING.rested(CURVE, FREE_N, 300.0, 10.0)
+    remembered = REMEMBERING.followed(remembered, CURVE, FREE_N, 700.0, 11.0)
+    earlier = REMEMBERING.followed(remembered, CURVE, FREE_N, 700.0, 10.0)
     assert earlier.relaxed_N == pytest.approx(remembered.relaxed_N)
 
 
@@ -65,17 +66,17 @@ def test_the_field_lags_along_its_way_and_not_in_time() -> None:
 
 
 def test_what_relaxes_is_the_force_of_the_element_s_own_field() -> None:
-    remembered = REMEMBERING.followed(REMEMBERING.rested(CURVE, 300.0, 0.0), CURVE, 500.0, 0.0)
+    remembered = REMEMBERING.followed(REMEMBERING.rested(CURVE, FREE_N, 300.0, 0.0), CURVE, FREE_N, 500.0, 0.0)
     lag_mT = REMEMBERING.lag_at_mT(Remembered(300.0, time_s=0.0), 500.0)
     assert remembered.lag_mT == lag_mT
     steady = Remembering(STEADY, FIELDS_MT)
-    without_lag = steady.followed(steady.rested(CURVE, 300.0, 0.0), CURVE, 500.0 - lag_mT, 0.0)
+    without_lag = steady.followed(steady.rested(CURVE, FREE_N, 300.0, 0.0), CURVE, FREE_N, 500.0 - lag_mT, 0.0)
     assert remembered.relaxed_N == pytest.approx(without_lag.relaxed_N, abs=1e-12)
 
 
 def test_an_element_without_memory_is_as_its_gap() -> None:
     forgetful = Remembering(NO_MEMORY, FIELDS_MT)
-    remembered = forgetful.followed(forgetful.rested(CURVE, 300.0, 0.0), CURVE, 500.0, 1.0)
+    remembered = forgetful.followed(forgetful.rested(CURVE, FREE_N, 300.0, 0.0), CURVE, FREE_N, 500.0, 1.0)
     assert (remembered.lag_mT, remembered.relaxed_N) == (0.0, 0.0)
 
 
@@ -138,9 +139,9 @@ def test_a_gap_that_no_device_has_is_not_believed_to_have_been_one() -> None:
 
 @given(steps=st.lists(st.tuples(st.floats(100.0, 900.0), st.floats(0.0, 1e6)), min_size=1, max_size=30))
 def test_it_never_remembers_more_than_there_was(steps: list[tuple[float, float]]) -> None:
-    remembered, most_N = REMEMBERING.rested(CURVE, 300.0, 0.0), CURVE.force_N(300.0)
+    remembered, most_N = REMEMBERING.rested(CURVE, FREE_N, 300.0, 0.0), CURVE.force_N(300.0)
     for field_mT, time_s in steps:
-        remembered = REMEMBERING.followed(remembered, CURVE, field_mT, time_s)
+        remembered = REMEMBERING.followed(remembered, CURVE, FREE_N, field_mT, time_s)
         most_N = max(most_N, CURVE.force_N(min(field_mT - remembered.lag_mT, FIELDS_MT[1])))
         assert abs(remembered.lag_mT) <= MEMORY.lag_mT
         assert remembered.relaxed_N <= sum(MEMORY.fractions) * most_N * (1.0 + 1e-12)

@@ -2,8 +2,10 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from typing import Any
 
@@ -41,3 +43,24 @@ def test_both_builds_give_the_same_results_to_the_bit() -> None:
     assert compiled["digests"] == interpreted["digests"]
     assert compiled["things"] == interpreted["things"]
     assert min(compiled["things"].values()) > LEAST_THINGS
+
+
+def test_what_an_earlier_build_left_does_not_run_where_none_was_made(tmp_path: Path) -> None:
+    pytest.importorskip("setuptools")
+    for folder in ("firmware_protocol", "tormagd"):
+        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    for name in ("setup.py", "pyproject.toml", "README.md"):
+        shutil.copy(ROOT / name, tmp_path)
+    left = tmp_path / "firmware_protocol" / f"checksum{EXTENSION_SUFFIXES[0]}"
+    left.write_bytes(b"of another day")
+    build = [sys.executable, "setup.py", "-q", "build_ext", "--inplace"]
+    subprocess.run(build, cwd=tmp_path, env={**os.environ, "TORMAG_COMPILE": "skip"}, check=True)
+    shown = "from firmware_protocol import build, checksum; print(build.settle(), checksum.__file__)"
+    environment = {**os.environ, SWITCH: "1", "PYTHONPATH": str(tmp_path)}
+    ran = subprocess.run(
+        [sys.executable, "-P", "-c", shown], env=environment, capture_output=True, text=True, check=True
+    )
+    assert (
+        ran.stdout
+        == f"interpreted: when it was installed, TORMAG_COMPILE=skip {tmp_path}/firmware_protocol/checksum.py\n"
+    )

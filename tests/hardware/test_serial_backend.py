@@ -18,7 +18,8 @@ from tormagd.config import ConfigError, Device, Rates
 from tormagd.hardware import backend as backends
 from tormagd.hardware.backend import BackendError, choose
 from tormagd.hardware.frame_stream import FrameStream
-from tormagd.hardware.serial_backend import SerialBackend, SerialOptions, open_serial
+from tormagd.hardware.serial_backend import SerialOptions, open_serial
+from tormagd.hardware.serial_port import SerialPort
 
 STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
 
@@ -50,17 +51,17 @@ def line() -> Iterator[Line]:
 
 
 @pytest.fixture
-def port(line: Line) -> Iterator[SerialBackend]:
+def port(line: Line) -> Iterator[SerialPort]:
     opened = open_serial(line.device, SerialOptions())
     yield opened
     opened.close()
 
 
-def wait_readable(port: SerialBackend) -> None:
+def wait_readable(port: SerialPort) -> None:
     assert select.select([port.fileno()], [], [], 5.0)[0]
 
 
-def test_messages_pass_both_ways(line: Line, port: SerialBackend) -> None:
+def test_messages_pass_both_ways(line: Line, port: SerialPort) -> None:
     far = FrameStream()
     assert port.receive() == []
     os.write(line.far, far.pack(STATUS) + far.pack(STATUS.replaced(drive_counter=9)))
@@ -72,7 +73,7 @@ def test_messages_pass_both_ways(line: Line, port: SerialBackend) -> None:
     assert (port.statistics.frames, port.statistics.corrupt) == (2, 0)
 
 
-def test_a_frame_may_arrive_in_pieces(line: Line, port: SerialBackend) -> None:
+def test_a_frame_may_arrive_in_pieces(line: Line, port: SerialPort) -> None:
     frame = FrameStream().pack(STATUS)
     for piece in (frame[:5], frame[5:]):
         os.write(line.far, piece)
@@ -101,7 +102,7 @@ def test_a_second_opening_is_refused_until_the_first_has_closed(line: Line) -> N
     open_serial(line.device, SerialOptions()).close()
 
 
-def test_a_device_that_goes_away_is_said_by_reading_and_writing(line: Line, port: SerialBackend) -> None:
+def test_a_device_that_goes_away_is_said_by_reading_and_writing(line: Line, port: SerialPort) -> None:
     os.close(line.far)
     with pytest.raises(BackendError, match=line.device.port):
         port.receive()
@@ -109,14 +110,14 @@ def test_a_device_that_goes_away_is_said_by_reading_and_writing(line: Line, port
         port.send(Home(1))
 
 
-def test_end_of_file_is_a_device_that_was_unplugged(port: SerialBackend, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_end_of_file_is_a_device_that_was_unplugged(port: SerialPort, monkeypatch: pytest.MonkeyPatch) -> None:
     """A real USB port reads nothing, for ever, once its device is gone."""
     monkeypatch.setattr(os, "read", lambda descriptor, count: b"")
     with pytest.raises(BackendError, match="unplugged"):
         port.receive()
 
 
-def test_a_far_end_that_does_not_read_is_noticed(port: SerialBackend) -> None:
+def test_a_far_end_that_does_not_read_is_noticed(port: SerialPort) -> None:
     def send_for_long() -> None:
         for counter in range(20_000):
             port.send(Drive(0.0, 0.0, DriveMode.OFF, counter % 256))
@@ -126,7 +127,7 @@ def test_a_far_end_that_does_not_read_is_noticed(port: SerialBackend) -> None:
 
 
 def test_what_the_driver_did_not_take_is_sent_before_the_next_frame(
-    line: Line, port: SerialBackend, monkeypatch: pytest.MonkeyPatch
+    line: Line, port: SerialPort, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken = b""
     room = iter([3, 0, 7, 0, 0, 100, 100])

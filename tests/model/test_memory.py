@@ -27,7 +27,7 @@ def test_the_daemon_remembers_what_the_grey_box_does() -> None:
         place = min(0.01 * step, 2.0), 0.3, float(draw.uniform(140.0, 360.0))
         expected_N = lab.advance(*place, 45.0)
         curve = model.curve(*place[:2], 45.0)
-        remembered = remembering.followed(remembered, curve, place[2], 0.01 * step)
+        remembered = remembering.followed(remembered, curve, remembering.free_N(curve), place[2], 0.01 * step)
         assert curve.force_N(place[2]) - remembered.relaxed_N == pytest.approx(expected_N, abs=1e-6)
 
 

@@ -11,16 +11,15 @@ import time
 from array import array
 from pathlib import Path
 
-write = os.write
-times = array("q")
+write, now_ns = os.write, time.monotonic_ns
+begun_ended: list[tuple[int, int]] = []
 
 
 def timed(fd: int, data: bytes) -> int:
     """As os.write."""
-    start_ns = time.monotonic_ns()
+    begun_ns = now_ns()
     written = write(fd, data)
-    times.append(start_ns)
-    times.append(time.monotonic_ns() - start_ns)
+    begun_ended.append((begun_ns, now_ns()))
     return written
 
 
@@ -32,6 +31,7 @@ def main() -> int:
     try:
         return daemon(sys.argv[2:])
     finally:
+        times = array("q", [value for begun_ns, ended_ns in begun_ended for value in (begun_ns, ended_ns - begun_ns)])
         Path(sys.argv[1]).write_bytes(times.tobytes())
 
 

@@ -239,7 +239,7 @@ class Planner:
         """`portrait` and `law` are of the gaps whose fields `search` may answer with; of a pad no law is known."""
         position, trim = config.position, config.trim
         self.portrait: Final = portrait
-        self._model, self._search, self._field, self._law = model, search, field, law
+        self._network, self._search, self._field, self._law = model.network, search, field, law
         self._contact = contact
         terms = terms_of(scene)
         self._governor = Governor(portrait, scene.force, position.gap_speed_mm_s, terms)
@@ -260,9 +260,10 @@ class Planner:
         self._learns_creep = terms.learning and self._has_creep
         self._fits = terms.learning and (terms.scale or terms.offset)
         self._learns_scale, self._learns_offset = terms.scale, terms.offset
-        self._only_curve = model.curve(
+        self._only_curve: ForceCurve = self._network.curve(
             within(contact.displacement_mm, displacements_mm), within(contact.rate_mm_s, rates_mm_s), cip_percent
         )
+        self._only_free_N = self._memory.free_N(self._only_curve)
 
     def start(self, now_s: float) -> PlanState:
         """The state before the first plan: gap open."""
@@ -304,7 +305,7 @@ class Planner:
             displacement_mm, rate_mm_s = self._contact.planned(setpoint if is_meant else None, estimate)
             known_mm = within(displacement_mm, self._displacements_mm)
             known_mm_s = within(rate_mm_s, self._rates_mm_s)
-            curve = self._model.curve(known_mm, known_mm_s, self._cip_percent)
+            curve = self._network.curve(known_mm, known_mm_s, self._cip_percent)
         wanted_N = device.model_N(governed.path_N[0])
         solution = self._search.solve(curve, wanted_N, state.plan.field_mT - state.remembered.lag_mT)
         lawful_mT = self._lawful_mT(solution, wanted_N)
@@ -373,7 +374,7 @@ class Planner:
         if not self._has_rate:
             return self._only_curve
         displacement_mm, rate_mm_s = self._contact.present(estimate)
-        return self._model.curve(
+        return self._network.curve(
             within(displacement_mm, self._displacements_mm), within(rate_mm_s, self._rates_mm_s), self._cip_percent
         )
 
@@ -388,15 +389,19 @@ class Planner:
             return Remembered(opened_mm=opened_mm) if remembered.is_empty else remembered
         gap_mm = max(estimate.gap_mm, self._closed_mm - BEYOND_MM) if estimate.is_homed else self._open_mm
         field_mT = self._field.field_mT(gap_mm)
-        curve = self._only_curve if self._contact.slides else self._present_curve(estimate)
+        curve: ForceCurve = self._only_curve
+        free_N = self._only_free_N
+        if not self._contact.slides:
+            curve = self._present_curve(estimate)
+            free_N = self._memory.free_N(curve)
         if remembered.is_empty and self._contact.slides:
             found_mm = gap_mm - remembered.opened_mm
             is_known = self._closed_mm - BEYOND_MM <= found_mm <= self._open_mm + BEYOND_MM
             rested_mT = self._field.field_mT(found_mm if is_known else gap_mm)
-            remembered = self._memory.rested(curve, rested_mT, now_s)
+            remembered = self._memory.rested(curve, free_N, rested_mT, now_s)
         elif remembered.is_empty:
             remembered = self._memory.unloaded(field_mT, now_s)
-        return self._memory.followed(remembered, curve, field_mT, now_s)
+        return self._memory.followed(remembered, curve, free_N, field_mT, now_s)
 
     def _learn(
         self,

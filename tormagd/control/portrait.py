@@ -1,13 +1,12 @@
 """The device's phase portrait: which forces a gap gives, and how fast a gap speed changes them."""
 
 import math
-from itertools import accumulate
 from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
 
-from tormagd.control.interpolation import at_step, interpolated
+from tormagd.control.interpolation import Rising, at_step, interpolated
 from tormagd.inverse.solution import FieldSolution, Reach, checked_near_mT
 from tormagd.model.force_curve import ForceCurve
 from tormagd.physics.errors import DomainError
@@ -16,10 +15,6 @@ from tormagd.physics.force import Elastomer, Geometry, brake_force_N
 
 Array = npt.NDArray[np.float64]
 GRID: Final = 201
-STRETCHES: Final = 1024
-"So many equal ones a portrait's forces are divided into, to find a force among its points: few points share one."
-LEAST_RISE_N: Final = 1e-9
-"A portrait of a model that does not rise has its points in the outermost of them."
 
 
 @final
@@ -62,7 +57,7 @@ class Portrait:
     """Force over gap for one contact, without memory, and its slope |dF/dgap|, N per mm, at n points: along the
     lists forces rise, and gaps fall evenly."""
 
-    __slots__ = ("_open_mm", "_points_before", "_step_mm", "_stretches_per_N", "force_N", "gap_mm", "slope_N_mm")
+    __slots__ = ("_open_mm", "_rising_N", "_step_mm", "force_N", "gap_mm", "slope_N_mm")
 
     def __init__(self, gap_mm: list[float], force_N: list[float], slope_N_mm: list[float]) -> None:
         self.gap_mm: Final = gap_mm
@@ -70,12 +65,7 @@ class Portrait:
         self.slope_N_mm: Final = slope_N_mm
         self._open_mm: Final = gap_mm[0]
         self._step_mm: Final = (gap_mm[0] - gap_mm[-1]) / (len(gap_mm) - 1)
-        self._stretches_per_N: Final = STRETCHES / max(force_N[-1] - force_N[0], LEAST_RISE_N)
-        # the points before each stretch, as a force finds its own, and before what is beyond the last of them
-        points_in = [0] * (STRETCHES + 1)
-        for force in force_N:
-            points_in[min(max(int((force - force_N[0]) * self._stretches_per_N), 0), STRETCHES)] += 1
-        self._points_before: Final = list(accumulate(points_in[:-1], initial=0))
+        self._rising_N: Final = Rising(force_N)
 
     @property
     def least_N(self) -> float:
@@ -89,18 +79,14 @@ class Portrait:
 
     def slope_at_N_mm(self, force_N: float) -> float:
         """|dF/dgap| where the gap gives this force."""
-        return interpolated(force_N, self.force_N, self.slope_N_mm)
+        return interpolated(force_N, self._rising_N, self.slope_N_mm)
 
     def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
         """The gap that gives this force, as `gap_mm_at` has it, and |dF/dgap| at the point next to it."""
+        after = self._rising_N.after(force_N)
+        if after == 0:
+            return self.gap_mm[0], self.slope_N_mm[0]
         forces_N, gaps_mm = self.force_N, self.gap_mm
-        stretch = (force_N - forces_N[0]) * self._stretches_per_N
-        if stretch < 0.0:
-            return gaps_mm[0], self.slope_N_mm[0]
-        # as `bisect_right` finds it: a plan asks up to thirty times, and takes a tenth of its time less so
-        after = self._points_before[int(stretch) if stretch < STRETCHES else STRETCHES]
-        while after < len(forces_N) and forces_N[after] <= force_N:
-            after += 1
         if after == len(forces_N):
             return gaps_mm[-1], self.slope_N_mm[-1]
         low_N, low_mm = forces_N[after - 1], gaps_mm[after - 1]
@@ -109,8 +95,7 @@ class Portrait:
 
     def gap_mm_at(self, force_N: float) -> float:
         """The gap that gives this force; the nearest end of the range where none does."""
-        gap_mm, _ = self.gap_and_slope_at(force_N)
-        return gap_mm
+        return interpolated(force_N, self._rising_N, self.gap_mm)
 
     def force_N_at(self, gap_mm: float) -> float:
         """What this gap gives; of the nearest end of the range outside of it."""
@@ -148,15 +133,16 @@ class LawOfField:
     """The magnetoelastic law of the insert (Eq. 29 to 34) over the gaps of a portrait, scaled to its force: what the
     learned model is held against. Force and field rise along the lists."""
 
-    __slots__ = ("fields_mT", "force_N")
+    __slots__ = ("_rising_N", "fields_mT", "force_N")
 
     def __init__(self, force_N: list[float], fields_mT: list[float]) -> None:
         self.force_N: Final = force_N
+        self._rising_N: Final = Rising(force_N)
         self.fields_mT: Final = fields_mT
 
     def field_mT(self, force_N: float) -> float:
         """The field for a force; that of the nearer end where none gives it."""
-        return interpolated(force_N, self.force_N, self.fields_mT)
+        return interpolated(force_N, self._rising_N, self.fields_mT)
 
 
 def law_beside(

@@ -55,7 +55,7 @@ NOTHING_REMEMBERED: Final = Remembered()
 @final
 class Remembering:
     """The constants of an element's memory. Its methods change nothing. A `curve` is the force without memory of the
-    element as it is touched now, which is asked for fields within `fields_mT`."""
+    element as it is touched now, which is asked for fields within `fields_mT`; `free_N` is its force without field."""
 
     __slots__ = ("_added", "_fields_mT", "_free", "_lag_mT", "_relaxes", "_turn_mT")
 
@@ -71,11 +71,15 @@ class Remembering:
         """At that field, after a long rest without load."""
         return Remembered(field_mT, 0.0, self._free.relaxed(0.0), self._added.relaxed(0.0), 0.0, now_s)
 
-    def rested(self, curve: ForceCurve, field_mT: float, now_s: float) -> Remembered:
+    def free_N(self, curve: ForceCurve) -> float:
+        """The force without field."""
+        return curve.force_N(within(0.0, self._fields_mT))
+
+    def rested(self, curve: ForceCurve, free_N: float, field_mT: float, now_s: float) -> Remembered:
         """After a long rest at that field."""
-        free_N, added_N = self._parts_N(curve, field_mT)
+        added_N = curve.force_N(within(field_mT, self._fields_mT)) - free_N
         rest = Remembered(field_mT, 0.0, self._free.relaxed(free_N), self._added.relaxed(added_N), 0.0, now_s)
-        return self.followed(rest, curve, field_mT, now_s)
+        return self.followed(rest, curve, free_N, field_mT, now_s)
 
     def lag_at_mT(self, before: Remembered, field_mT: float) -> float:
         """How far the element's field is behind the gap's once that is `field_mT`, on a straight way from `before`; 0
@@ -88,19 +92,16 @@ class Remembering:
         side_mT = math.copysign(self._lag_mT, change_mT)
         return side_mT + (before.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._turn_mT)
 
-    def followed(self, before: Remembered, curve: ForceCurve, field_mT: float, now_s: float) -> Remembered:
+    def followed(
+        self, before: Remembered, curve: ForceCurve, free_N: float, field_mT: float, now_s: float
+    ) -> Remembered:
         """After `before`, at the field of a measured gap."""
         lag_mT = self.lag_at_mT(before, field_mT)
         if not self._relaxes:
             return Remembered(field_mT, lag_mT, before.free, before.added, 0.0, now_s)
         elapsed_s = max(now_s - before.time_s, 0.0)
-        free_N, added_N = self._parts_N(curve, field_mT - lag_mT)
+        added_N = curve.force_N(within(field_mT - lag_mT, self._fields_mT)) - free_N
         step = self._free.discretise(elapsed_s)
         left_N, free = step.advance(before.free, free_N)
         left_of_added_N, added = step.of(self._added.fractions).advance(before.added, added_N)
         return Remembered(field_mT, lag_mT, free, added, free_N + added_N - left_N - left_of_added_N, now_s)
-
-    def _parts_N(self, curve: ForceCurve, field_mT: float) -> tuple[float, float]:
-        """The force without field, and what the field adds."""
-        free_N = curve.force_N(within(0.0, self._fields_mT))
-        return free_N, curve.force_N(within(field_mT, self._fields_mT)) - free_N

@@ -1,6 +1,5 @@
 """The serial backend: pyserial opens and configures the port, the event loop watches its descriptor."""
 
-import contextlib
 import errno
 import os
 import termios
@@ -9,14 +8,10 @@ from typing import Annotated
 import serial
 from msgspec import Meta
 
-from firmware_protocol.codec import Message
 from tormagd.config import Device, Strict
-from tormagd.hardware.backend import BackendError, Driver, LinkStatistics
-from tormagd.hardware.frame_stream import FrameStream
+from tormagd.hardware.backend import BackendError, Driver
+from tormagd.hardware.serial_port import SerialPort
 from tormagd.hardware.usb_latency import make_prompt
-
-READ_BYTES = 4_096
-UNSENT_BYTES = 512  # half a frame may wait for the driver; more means that nobody reads at the other end
 
 # why a port does not open, where the kernel's own words leave open what to do
 _HELD = ("another process holds it", "tormagctl ports says who; end it, and it is tried again")
@@ -28,60 +23,6 @@ _REFUSALS = {
 }
 
 
-class SerialBackend:
-    """An open, exclusively held serial port."""
-
-    def __init__(self, port: serial.Serial) -> None:
-        self._port = port
-        self._fd: int = port.fileno()
-        self.stream = FrameStream()
-        self._unsent = b""
-
-    @property
-    def statistics(self) -> LinkStatistics:
-        """Counters since the port was opened."""
-        return self.stream.statistics
-
-    def fileno(self) -> int:
-        """The port's descriptor."""
-        return self._fd
-
-    def receive(self) -> list[Message]:
-        """All valid messages that have arrived. Raises BackendError at end-of-file or a read error."""
-        try:
-            data = os.read(self._fd, READ_BYTES)
-        except BlockingIOError:
-            return self.stream.unpack(b"")
-        except OSError as error:
-            raise BackendError(f"{self._port.port}: reading failed: {error.strerror}") from error
-        if not data:
-            raise BackendError(f"{self._port.port}: the device was unplugged")
-        return self.stream.unpack(data)
-
-    def send(self, message: Message) -> None:
-        """Writes one frame. Raises BackendError when the port is gone or its far end has stopped reading."""
-        data = self._unsent + self.stream.pack(message)
-        try:
-            written = os.write(self._fd, data)
-        except BlockingIOError:
-            written = 0
-        except OSError as error:
-            raise BackendError(f"{self._port.port}: writing failed: {error.strerror}") from error
-        self._unsent = data[written:]
-        if self._unsent:
-            self.stream.statistics.unsent += 1
-        if len(self._unsent) > UNSENT_BYTES:
-            raise BackendError(f"{self._port.port}: nobody reads at the other end")
-
-    def close(self) -> None:
-        """Closes the port and drops its lock."""
-        # what was not sent is void, and closing would wait for it, up to half a minute; a device that is gone refuses
-        with contextlib.suppress(OSError, termios.error):
-            self._port.reset_output_buffer()
-        with contextlib.suppress(OSError):
-            self._port.close()
-
-
 class SerialOptions(Strict, frozen=True):
     """`[device.options]` of a serial port."""
 
@@ -89,7 +30,7 @@ class SerialOptions(Strict, frozen=True):
     "Carries control at 1 kHz with room to spare; a USB device of its own takes no notice of it."
 
 
-def open_serial(device: Device, options: SerialOptions) -> SerialBackend:
+def open_serial(device: Device, options: SerialOptions) -> SerialPort:
     """Opens `device.port` exclusively. Raises BackendError saying why not."""
     try:
         port = serial.Serial(device.port, options.baud, timeout=0, write_timeout=0, exclusive=True)
@@ -102,7 +43,7 @@ def open_serial(device: Device, options: SerialOptions) -> SerialBackend:
         raise BackendError(f"{device.port}: cannot be opened: {reason}", remedy) from error
     except termios.error as error:  # no OSError; unplugged while it was set up
         raise BackendError(f"{device.port}: cannot be opened: {error.args[-1]}") from error
-    return SerialBackend(port)
+    return SerialPort(port)
 
 
 def _tell_nothing_from_gone(fd: int) -> None:

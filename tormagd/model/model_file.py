@@ -127,7 +127,8 @@ class ForceModel:
     output_bias: float
     physical: PhysicalLayers = field(init=False, repr=False)
     _tanh: PhysicalLayers = field(init=False, repr=False)
-    _network: Network = field(init=False, repr=False)
+    network: Network = field(init=False, repr=False)
+    "The same again, on floats alone: its curves are what plans ask."
 
     def __post_init__(self) -> None:
         hidden = self.metadata.hidden
@@ -140,7 +141,7 @@ class ForceModel:
         halved = PhysicalLayers(weight / 2, bias / 2, output / 2, constant + float(output.sum()) / 2)
         object.__setattr__(self, "_tanh", halved)
         known = Known(self.feature_ranges, self.force_span_N)
-        object.__setattr__(self, "_network", Network(weight, bias, output, constant, known))
+        object.__setattr__(self, "network", Network(weight, bias, output, constant, known))
 
     def _fold(self) -> PhysicalLayers:
         scaling = self.metadata.scaling
@@ -178,7 +179,7 @@ class ForceModel:
 
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> ForceCurve:
         """The force over the field for one state of the handle. Raises `DomainError` on a non-finite input."""
-        return self._network.curve(displacement_mm, rate_mm_s, cip_percent)
+        return self.network.curve(displacement_mm, rate_mm_s, cip_percent)
 
     def predict(self, features: ArrayLike) -> Array:
         """Force in N (n) for `features` (n x 4, order of `FEATURES`). Raises `DomainError` on a wrong shape or NaN."""

@@ -28,7 +28,10 @@ class PronyStep(Value):
     __slots__ = ("decays", "equilibrium_fraction", "fractions", "gains")
 
     def __init__(self, fractions: tuple[float, ...], decays: tuple[float, ...], gains: tuple[float, ...]) -> None:
-        self.equilibrium_fraction: Final = 1.0 - sum(fractions, 0.0)
+        relaxing = 0.0  # summed here: `sum` is a call, and a plan makes two of these
+        for fraction in fractions:
+            relaxing += fraction
+        self.equilibrium_fraction: Final = 1.0 - relaxing
         self.fractions: Final = fractions
         self.decays: Final = decays
         self.gains: Final = gains
