@@ -111,10 +111,21 @@ def _subparsers(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse
 def _options(parser: argparse.ArgumentParser) -> list[tuple[str, ...]]:
     formatter = parser._get_formatter()
     return [
-        (f"`{formatter._format_action_invocation(action)}`".replace("|", "\\|"), _says(action))
+        (f"`{_called(action, formatter)}`".replace("|", "\\|"), _says(action))
         for action in parser._actions
         if not isinstance(action, argparse._SubParsersAction | argparse._HelpAction)
     ]
+
+
+def _called(action: argparse.Action, formatter: argparse.HelpFormatter) -> str:
+    """A positional argument's name, or an option with what it takes: alike for every Python, as the formatter's own
+    line is not."""
+    if not action.option_strings:
+        return formatter._format_args(action, formatter._get_default_metavar_for_positional(action))
+    if action.nargs == 0:
+        return ", ".join(action.option_strings)
+    taken = formatter._format_args(action, formatter._get_default_metavar_for_optional(action))
+    return ", ".join(f"{name} {taken}" for name in action.option_strings)
 
 
 def _says(action: argparse.Action) -> str:
