@@ -3,24 +3,32 @@
     spare_terms.py [--json]
 
 The force is that of SCENES at the rates chosen for them, while the device is learned; the motion is that of steps of
-1 mm, both ways over the stroke, and of the stroke itself. All devices are synthetic.
+1 mm, both ways over the stroke, and of the stroke itself: of the samples, of DRAWS, and of one that nobody greased. All
+devices are synthetic.
 """
 
 import argparse
 import json
 import sys
 
+import msgspec
 from benchmarks.step import START_MM, STEP_MM, overshoot_over_stroke, settled_loop, step, stroke
 from force_tracking import SAMPLES
+from rendering.device_draws import drawn_device
 from rendering.scene_runs import Case, run
 
 from tormagd.config import Config
 from tormagd.scenes.measured import measured
-from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.parameters import PlantParameters, load_plant
 
 SCENES = "pulse", "coronary"
 SPARE = "slope", "lag", "friction", "pull"
-MOVING = "", "friction", "pull"
+MOVING = "", "motor", "friction", "pull"
+"Left out of the motion; that of `motor` shows what a term does that counts there."
+DRAWS = range(40, 50)
+"Devices that chose nothing."
+DRY_DRAG_N, DRY_EFFICIENCY, DRY_FRICTION = 20.0, 0.55, 0.3
+"Of sample 1 with over three times its drag, a gearbox that loses half as much again, and a nut that rubs so much more."
 
 
 def main() -> int:
@@ -30,7 +38,9 @@ def main() -> int:
     options = parser.parse_args()
     rates = {scene.name: scene.hz for scene in measured().scenes}
     added_N = {name: {sample: added(name, sample, rates[name]) for sample in SAMPLES[1:]} for name in SCENES}
-    motion = {without or "nothing": {sample: moved(sample, without) for sample in SAMPLES} for without in MOVING}
+    devices = {name: [load_plant(name)] for name in SAMPLES}
+    devices |= {"draws": [drawn_device(number) for number in DRAWS], "dry": [dry_device()]}
+    motion = {without or "nothing": {name: worst(of, without) for name, of in devices.items()} for without in MOVING}
     if options.json:
         print(json.dumps({"added_N": added_N, "motion": motion}))
         return 0
@@ -53,9 +63,26 @@ def added(scene: str, sample: str, hz: tuple[int, int]) -> dict[str, float]:
     return {term: run(Case(scene, sample, (term,), "", True, *hz)) - full_N for term in SPARE}
 
 
-def moved(sample: str, without: str) -> dict[str, float]:
+def dry_device() -> PlantParameters:
+    """Sample 1 as nobody greased it."""
+    plant = load_plant(SAMPLES[0])
+    screw = msgspec.structs.replace(
+        plant.screw, drag_left_N=DRY_DRAG_N, drag_right_N=DRY_DRAG_N, friction_coefficient=DRY_FRICTION
+    )
+    return msgspec.structs.replace(
+        plant, screw=screw, gear=msgspec.structs.replace(plant.gear, efficiency=DRY_EFFICIENCY)
+    )
+
+
+def worst(devices: list[PlantParameters], without: str) -> dict[str, float]:
+    """The worst of each figure of these devices."""
+    found = [moved(device, without) for device in devices]
+    return {name: max(row[name] for row in found) for name in found[0]}
+
+
+def moved(device: PlantParameters, without: str) -> dict[str, float]:
     """The greatest overshoot, the longer settling of both ways at START_MM, and the time of the stroke."""
-    loop = settled_loop(Config(), load_plant(sample), (without,) if without else ())
+    loop = settled_loop(Config(), device, (without,) if without else ())
     steps = step(loop, START_MM + STEP_MM), step(loop, START_MM)
     stroke_s = stroke(loop)
     return {

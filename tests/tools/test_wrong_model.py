@@ -11,6 +11,7 @@ from wrong_model import ALLOWED
 
 from tormagd.scenes.measured import is_met, measured
 from tormagd.scenes.scene import load_scene
+from tormagd.simulation.parameters import load_plant
 
 SCENES = {scene.name: scene for scene in measured().scenes}
 
@@ -37,6 +38,8 @@ def test_the_figures_of_the_spare_terms_and_of_the_rates_are_of_today() -> None:
     spare, rates = (
         json.loads((FOLDER / f"{part}.json").read_text(encoding="utf-8"))["figures"] for part in ("spare", "rates")
     )
-    assert moved("sample_3", "friction") == pytest.approx(spare["motion"]["friction"]["sample_3"], rel=0.2, abs=0.005)
+    assert moved(load_plant("sample_3"), "friction") == pytest.approx(
+        spare["motion"]["friction"]["sample_3"], rel=0.2, abs=0.005
+    )
     model, friction = model_and_friction()
     assert error_N(model, friction, 2.5) == pytest.approx(rates["error_N"]["2.5"], abs=1e-4)
