@@ -25,7 +25,8 @@ class Rising:
         self._points_before: Final = list(accumulate(points_in[:-1], initial=0))
 
     def after(self, value: float) -> int:
-        """How many are not above `value`: what `bisect_right` finds, in a tenth of its time."""
+        """How many are not above `value`, as `bisect_right` says: a plan asks up to thirty times, and takes a tenth of
+        its time less so where it is compiled."""
         values = self.values
         stretch = (value - values[0]) * self._per_unit
         if stretch < 0.0:
