@@ -196,7 +196,7 @@ def _never(scenes: tuple[MeasuredScene, ...], never: list[str], share: float) ->
         "40 to 49, and on a sample 1 that nobody greased (over three times the drag, gearbox and nut half as bad "
         "again):\n\n"
         f"{_table(['without', '1', '2', '3', 'draws', 'dry'], motion)}\n\n"
-        'With `terms = "required"` no scene computes either.'
+        f'With `terms = "required"` no scene that is met computes any of {", ".join(f"`{term}`" for term in never)}.'
     )
 
 

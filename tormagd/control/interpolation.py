@@ -39,7 +39,11 @@ class Rising:
 
 def interpolated(x: float, xs: Rising, ys: list[float]) -> float:
     """Linear between the points (n, n), and the outermost `ys` beyond them."""
-    after = xs.after(x)
+    return interpolated_before(xs.after(x), x, xs, ys)
+
+
+def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> float:
+    """The same where it is known that so many of `xs` are not above `x`."""
     if after == 0:
         return ys[0]
     if after == len(ys):

@@ -6,7 +6,7 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
-from tormagd.control.interpolation import Rising, at_step, interpolated
+from tormagd.control.interpolation import Rising, at_step, interpolated, interpolated_before
 from tormagd.inverse.solution import FieldSolution, Reach, checked_near_mT
 from tormagd.model.force_curve import ForceCurve
 from tormagd.physics.errors import DomainError
@@ -84,14 +84,8 @@ class Portrait:
     def gap_and_slope_at(self, force_N: float) -> tuple[float, float]:
         """The gap that gives this force, as `gap_mm_at` has it, and |dF/dgap| at the point next to it."""
         after = self._rising_N.after(force_N)
-        if after == 0:
-            return self.gap_mm[0], self.slope_N_mm[0]
-        forces_N, gaps_mm = self.force_N, self.gap_mm
-        if after == len(forces_N):
-            return gaps_mm[-1], self.slope_N_mm[-1]
-        low_N, low_mm = forces_N[after - 1], gaps_mm[after - 1]
-        gap_mm = (gaps_mm[after] - low_mm) / (forces_N[after] - low_N) * (force_N - low_N) + low_mm
-        return gap_mm, self.slope_N_mm[after]
+        gap_mm = interpolated_before(after, force_N, self._rising_N, self.gap_mm)
+        return gap_mm, self.slope_N_mm[min(after, len(self.slope_N_mm) - 1)]
 
     def gap_mm_at(self, force_N: float) -> float:
         """The gap that gives this force; the nearest end of the range where none does."""
@@ -133,10 +127,9 @@ class LawOfField:
     """The magnetoelastic law of the insert (Eq. 29 to 34) over the gaps of a portrait, scaled to its force: what the
     learned model is held against. Force and field rise along the lists."""
 
-    __slots__ = ("_rising_N", "fields_mT", "force_N")
+    __slots__ = ("_rising_N", "fields_mT")
 
     def __init__(self, force_N: list[float], fields_mT: list[float]) -> None:
-        self.force_N: Final = force_N
         self._rising_N: Final = Rising(force_N)
         self.fields_mT: Final = fields_mT
 
