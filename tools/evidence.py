@@ -227,10 +227,10 @@ def _says_recordings(figures: Figures) -> str:
     return "; ".join(scenes)
 
 
-def _says_spare(figures: Figures) -> str:
-    rows = [terms for samples in figures["added_N"].values() for terms in samples.values()]
-    most = ", ".join(f"{name} {1e3 * max(terms[name] for terms in rows):.1f}" for name in rows[0])
-    return f"most that the absence of each adds on samples 2 and 3, mN: {most}"
+def _says_motor(figures: Figures) -> str:
+    rows = [found for samples in figures["added_N"].values() for found in samples.values()]
+    most = ", ".join(f"{name} {1e3 * max(found[name] for found in rows):.1f}" for name in rows[0])
+    return f"most that the absence of each adds on samples 1 to 3, mN: {most}"
 
 
 def _says_rates(figures: Figures) -> str:
@@ -297,7 +297,7 @@ PARTS = {
     "wrong_model": Part("tools/wrong_model.py --json", _says_wrong_model),
     "unmet": Part("tools/unmet_scene.py --json", _says_unmet, judges=False),
     "recordings": Part("tools/recorded_scenes.py --json", _says_recordings, judges=False),
-    "spare": Part("tools/spare_terms.py --json", _says_spare, judges=False),
+    "motor": Part("tools/motor_parts.py --json", _says_motor, judges=False),
     "rates": Part("tools/rate_error.py --json", _says_rates, judges=False),
     "envelope": Part("tools/envelope.py --json --picture docs/images/envelope.png", _says_envelope),
     "step": Part("tools/benchmark.py step --json --plot docs/images/step.png", _says_step, judges=False),

@@ -1,5 +1,5 @@
 """docs/scenes.md and its pictures, from what `required_terms.py --store` measured, and from the parts `recordings`,
-`spare`, `rates`, `wrong_model` and `unmet` of docs/evidence; nothing is measured here.
+`motor`, `rates`, `wrong_model` and `unmet` of docs/evidence; nothing is measured here.
 
 scenes_page.py [--out docs]
 """
@@ -92,7 +92,8 @@ def _head(share: float) -> str:
         "| `force.tolerance_rms_N` | what terms, search and rates are chosen by; what the sensor is needed for |\n"
         "| `[signal]` | `file`, or `bandwidth_hz`, `step_N`, `hold_s`: what is asked over time. Refused, with the "
         "points that fail, where the gap's speed alone leaves more than the tolerance; played when terms are measured "
-        "|\n | `signal.is_known_ahead` | whether it is played with a preview |\n"
+        "|\n| `signal.is_known_ahead` | whether it is played with a preview |\n"
+        "| `signal.setpoint_hz` | how often the publisher sends, where plans are made more often; played so |\n"
         "| `[handle]` | the rates at the roller; refused where the model was not trained on them |\n"
         "| `[finger]` | of a pad, in place of the handle: how deep it is pressed, and how fast; refused alike |\n"
         "| `insert.gap_speed_mm_s` | the fastest that the gap may move, where that is less than the configuration's |\n"
@@ -148,30 +149,34 @@ def _counts(scenes: tuple[MeasuredScene, ...], share: float) -> str:
             f"{_added(worst, term) / worst.tolerance_N:.0%} of the tolerance of `{worst.name}` |"
         )
     table = "| term | required by | most that its absence adds |\n| --- | --- | --- |\n" + "\n".join(rows)
-    never = [term for term in TERMS if all(term in scene.left_out for scene in scenes)]
+    spared = [term for term in TERMS if all(term in scene.left_out for scene in scenes)]
+    said = "Each is required by some scene." if not spared else f"No scene requires {', '.join(spared)}."
+    back = [f"`{term}`" for term in TERMS if all(_added(scene, term) <= share * scene.tolerance_N for scene in scenes)]
+    if back:
+        said += (
+            f" Alone {' and '.join(back)} would add no more than {share:.0%} of any tolerance: put back, because "
+            f"without them and all else that is out a scene would be beyond {JUDGED:g} of its own."
+        )
     parts = [
         "## Which terms count",
         "Of the scenes and [recordings](#recordings) that are met.",
         table,
-        _never(scenes, never, share) if never else "Each is required by some scene.",
+        f"{said} What a term takes is at most {_most_saved(scenes):.2f} % of a core, `forecast` and `rate` left aside.",
+        _motor(),
         _rate_error(),
     ]
     return "\n\n".join(parts)
 
 
-def _never(scenes: tuple[MeasuredScene, ...], never: list[str], share: float) -> str:
-    """Of the terms that no scene requires, at what tolerance one would, and what they do elsewhere."""
-    would = []
-    for term in never:
-        worst = max(scenes, key=lambda scene: _added(scene, term))
-        would.append(f"`{term}` under {1e3 * _added(worst, term) / share:.1f} mN (`{worst.name}`)")
-    found = _evidence("spare")
+def _motor() -> str:
+    """What the parts of the motor's term do, and that term and `lag` on the samples that do not choose."""
+    found = _evidence("motor")
     added_N = {
         f"`{scene}`, {sample.replace('_', ' ')}": terms
         for scene, samples in found["added_N"].items()
         for sample, terms in samples.items()
     }
-    terms = list(next(iter(added_N.values())))
+    names = list(next(iter(added_N.values())))
     forces = [[name, *(f"{1e3 * more_N:.1f}" for more_N in row.values())] for name, row in added_N.items()]
     motion = [
         [
@@ -183,35 +188,40 @@ def _never(scenes: tuple[MeasuredScene, ...], never: list[str], share: float) ->
         ]
         for without, samples in found["motion"].items()
     ]
+    most_mN = {name: 1e3 * max(row[name] for row in added_N.values()) for name in ("friction", "pull")}
     return (
-        f"No scene requires {', '.join(f'`{term}`' for term in never)}. The tolerance at which one would: "
-        f"{', '.join(would)}; the force sensor's step is 1 mN. None of them takes more than "
-        f"{_most_saved(scenes, never):.2f} % of a core. Sample 1 chooses, whose motors are those that the loop is "
-        "tuned for. On the others (`tools/spare_terms.py`, while the device is learned) "
-        f"each adds, left out alone, mN:\n\n{_table(['scene', *terms], forces)}\n\n"
-        "`friction` and `pull` act on the gap's motion, as `motor` does. Without them steps settle later by at most "
-        f"{_later_ms(found, 'friction')} and {_later_ms(found, 'pull')} ms, without that by "
-        f"{_later_ms(found, 'motor')}. "
+        "`motor` is one term: the duty that the motor's equation asks for, with the dry friction of gearbox and screw "
+        "and the magnets' pull in it. No scene would require these two by themselves: with a motor that is configured "
+        f"without one (`tools/motor_parts.py`) the force is off by {most_mN['friction']:.1f} and "
+        f"{most_mN['pull']:.1f} mN more at most, where the sensor's step is 1 mN. They belong to how the gap moves: "
+        "without the pull an opening gap runs 0.5 mm behind "
+        "([control](control.md#reference-expectation-feed-forward)). Sample 1 chooses, whose motors are those that the "
+        "loop is tuned for. What each adds, left out alone, while the device is learned, mN:"
+        f"\n\n{_table(['scene', *names], forces)}\n\n"
+        f"Steps settle later by at most {_later_ms(found, 'friction')} ms without friction, "
+        f"{_later_ms(found, 'pull')} without the pull, {_later_ms(found, 'motor')} without `motor`. "
         "Steps of 1 mm overshoot by, settle within 5 % in, and the stroke takes, on samples 1 to 3, at worst on draws "
         "40 to 49, and on a sample 1 that nobody greased (over three times the drag, gearbox and nut half as bad "
         "again):\n\n"
-        f"{_table(['without', '1', '2', '3', 'draws', 'dry'], motion)}\n\n"
-        f'With `terms = "required"` no scene that is met computes any of {", ".join(f"`{term}`" for term in never)}.'
+        f"{_table(['without', '1', '2', '3', 'draws', 'dry'], motion)}"
     )
 
 
-def _later_ms(spare: dict[str, Any], without: str) -> int:
-    """By how much steps settle later at most without a term, ms."""
-    motion = spare["motion"]
+def _later_ms(found: dict[str, Any], without: str) -> int:
+    """By how much steps settle later at most without a term or a part of one, ms."""
+    motion = found["motion"]
     later_s: list[float] = [
         motion[without][name]["settling_s"] - row["settling_s"] for name, row in motion["nothing"].items()
     ]
     return round(1e3 * max(later_s))
 
 
-def _most_saved(scenes: tuple[MeasuredScene, ...], terms: list[str]) -> float:
-    """What leaving one of the terms out saves at most, % of a core."""
-    return max(scene.saved_us_s(item) for scene in scenes for item in scene.terms if item.term in terms) / 1e4
+def _most_saved(scenes: tuple[MeasuredScene, ...]) -> float:
+    """What leaving one of the others out saves at most, % of a core."""
+    return (
+        max(scene.saved_us_s(item) for scene in scenes for item in scene.terms if item.term not in ("forecast", "rate"))
+        / 1e4
+    )
 
 
 def _rate_error() -> str:
@@ -293,10 +303,11 @@ def _rates(scenes: tuple[MeasuredScene, ...]) -> str:
     said = ", ".join(f"{control} / {inference}" for control, inference in chosen)
     return (
         "## Rates\n\nRMS on sample 1, mN, with all terms, over control / inference rate, Hz; setpoints come as often "
-        "as plans are made. 83 Hz is the thesis's own rate, 1 / (4 + 8 ms). At 250 Hz of control the position loop "
-        "keeps 4.5 dB; the daemon never watches less often than 500 Hz where the rates are the scene's, so that no "
-        "scene gets 250 Hz. Of the others each scene that is met gets the lowest that does what the usual, 1000 / 500, "
-        f"does: {said} Hz. Twice the usual take no more than {twice:.0%} of a tolerance off the error.\n\n"
+        "as plans are made, or as the scene says. 83 Hz is the thesis's own rate, 1 / (4 + 8 ms). At 250 Hz of control "
+        "the position loop keeps 4.5 dB; the daemon never watches less often than 500 Hz where the rates are the "
+        "scene's, so that no scene gets 250 Hz. Of the others each scene that is met gets the lowest that does what "
+        f"the usual, 1000 / 500, does: {said} Hz. Twice the usual take no more than {twice:.0%} of a tolerance off the "
+        "error.\n\n"
         f"| scene | tolerance | {head} |\n| --- | --- |{' --- |' * len(scenes[0].rates)}\n" + "\n".join(rows)
     )
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
-from tormagd.config import Config
+from tormagd.config import Config, Motor
 from tormagd.control.core import Core, build_core
 from tormagd.control.device_fit import UNSEEN, DeviceFit, observe
 from tormagd.control.estimate import Estimate, Handle
@@ -29,8 +29,8 @@ READY = Conditions(
 )
 
 
-def core_with(terms: Terms) -> Core:
-    return build_core(CONFIG, msgspec.structs.replace(load_scene("coronary"), terms=terms))
+def core_with(terms: Terms, config: Config = CONFIG) -> Core:
+    return build_core(config, msgspec.structs.replace(load_scene("coronary"), terms=terms))
 
 
 def core_without(*names: str) -> Core:
@@ -219,21 +219,21 @@ def duties(core: Core, measure: Callable[..., Measurement], target_mm: float) ->
     return found
 
 
-def test_each_part_of_the_feed_forward_can_be_left_out(measure) -> None:
+def test_without_the_motor_nothing_is_fed_forward(measure) -> None:
     for target_mm in (90.0, 60.0):
-        full = duties(core_without(), measure, target_mm)
-        none = duties(core_without("motor", "friction", "pull"), measure, target_mm)
-        assert abs(none[0]) < 0.1 * abs(full[0])
-        for name in ("motor", "friction"):
-            left = duties(core_without(name), measure, target_mm)
-            assert all(abs(none[0]) <= abs(duty) < abs(whole) for duty, whole in zip(left, full, strict=True)), name
+        full, left = (duties(core_without(*names), measure, target_mm) for names in ((), ("motor",)))
+        assert abs(left[0]) < 0.1 * abs(full[0])
+        assert all(abs(duty) < abs(whole) for duty, whole in zip(left, full, strict=True))
 
 
-def test_the_magnets_pull_counts_where_it_opens(measure) -> None:
+def test_dry_friction_counts_both_ways_and_the_magnets_pull_where_it_opens(measure) -> None:
     for target_mm, is_opening in ((90.0, True), (60.0, False)):
-        full, left = (duties(core_without(*names), measure, target_mm) for names in ((), ("pull",)))
-        assert all((whole > duty) is is_opening for duty, whole in zip(left, full, strict=True))
-        assert is_opening or left == full
+        full = duties(core_without(), measure, target_mm)
+        smooth = duties(core_with(EVERY_TERM, Config(motor=Motor(coulomb_V=0.0))), measure, target_mm)
+        assert all(abs(duty) < abs(whole) for duty, whole in zip(smooth, full, strict=True))
+        free = duties(core_with(EVERY_TERM, Config(motor=Motor(pull_V=0.0))), measure, target_mm)
+        assert all((whole > duty) is is_opening for duty, whole in zip(free, full, strict=True))
+        assert is_opening or free == full
 
 
 def test_learning_can_be_stopped_for_a_measurement() -> None:

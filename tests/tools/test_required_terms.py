@@ -86,6 +86,17 @@ def test_the_core_alone_does_what_it_did_in_the_loop() -> None:
     assert again() == again() == (loop.step_state, loop.plan_state)
 
 
+@pytest.mark.parametrize(("scene", "sent_hz"), [("fluoroscopy", 15.0), ("coronary", 83.0)])
+def test_a_publisher_sends_as_often_as_its_scene_says(scene: str, sent_hz: float) -> None:
+    played = _Play(Case(scene, control_hz=500, inference_hz=83))
+    sent = {setpoint for now_ms in range(2_000, 4_000) if (setpoint := played.publish(1e-3 * now_ms)) is not None}
+    stamps_s = np.array(sorted(setpoint.stamp_s for setpoint in sent))
+    assert np.diff(stamps_s) == pytest.approx(1.0 / sent_hz, rel=1e-6)
+    at_s = stamps_s - played.begins_s
+    forces_N = [setpoint.force_N for setpoint in sorted(sent, key=lambda setpoint: setpoint.stamp_s)]
+    assert forces_N == pytest.approx(np.interp(at_s, played.time_s, played.force_N))
+
+
 def table(added_N: dict[str, float]) -> tuple[Without, ...]:
     return tuple(Without(term, added_N.get(term, 0.0), 0.0, NO_COST) for term in TERMS)
 
@@ -94,10 +105,10 @@ def test_a_term_is_required_that_costs_more_than_its_share_learning_or_not() -> 
     terms = (
         Without("rate", 0.011, 0.0, NO_COST),
         Without("creep", 0.0, 0.011, NO_COST),
-        Without("pull", 0.0099, -0.5, NO_COST),
+        Without("motor", 0.0099, -0.5, NO_COST),
     )
     assert required(terms, 0.05, 0.2) == ("rate", "creep")
-    assert required(terms, 0.025, 0.2) == ("rate", "creep", "pull")
+    assert required(terms, 0.025, 0.2) == ("rate", "creep", "motor")
 
 
 def test_a_choice_is_good_within_the_tolerance_or_beside_the_full_model() -> None:
@@ -205,7 +216,7 @@ def test_every_part_of_a_case_is_in_its_key() -> None:
 def test_dask_workers_give_what_this_process_gives(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cases and outcomes go there and back; what a case takes on its way is the same everywhere, so it is not run."""
     monkeypatch.setattr(scene_runs, "run", key)
-    cases = [Case("brain"), Case("coronary", "sample_3", ("pull", "rate"), "nearest", False)]
+    cases = [Case("brain"), Case("coronary", "sample_3", ("motor", "rate"), "nearest", False)]
     with (
         LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0") as cluster,
         Client(cluster) as client,

@@ -4,8 +4,8 @@ import json
 
 import pytest
 from evidence import FOLDER
+from motor_parts import moved
 from rate_error import error_N, model_and_friction
-from spare_terms import moved
 from unmet_scene import OTHERS, SCENE, missed_N
 from wrong_model import ALLOWED
 
@@ -33,13 +33,13 @@ def test_a_handle_that_teaches_what_the_device_is_meets_what_is_not_met() -> Non
     assert known < tolerance_N < as_it_is
 
 
-def test_the_figures_of_the_spare_terms_and_of_the_rates_are_of_today() -> None:
-    """`python tools/evidence.py spare rates` measures them again."""
-    spare, rates = (
-        json.loads((FOLDER / f"{part}.json").read_text(encoding="utf-8"))["figures"] for part in ("spare", "rates")
+def test_the_figures_of_the_motors_parts_and_of_the_rates_are_of_today() -> None:
+    """`python tools/evidence.py motor rates` measures them again."""
+    motor, rates = (
+        json.loads((FOLDER / f"{part}.json").read_text(encoding="utf-8"))["figures"] for part in ("motor", "rates")
     )
     assert moved(load_plant("sample_3"), "friction") == pytest.approx(
-        spare["motion"]["friction"]["sample_3"], rel=0.2, abs=0.005
+        motor["motion"]["friction"]["sample_3"], rel=0.2, abs=0.005
     )
     model, friction = model_and_friction()
     assert error_N(model, friction, 2.5) == pytest.approx(rates["error_N"]["2.5"], abs=1e-4)

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from rendering.publisher import FILE_PREVIEW_S, publisher
 from tormagd.closed_loop import ClosedLoop
-from tormagd.config import Config, Rates
+from tormagd.config import Config, Motor, Rates
 from tormagd.control.core import Core, build_core
 from tormagd.control.estimate import Estimate
 from tormagd.control.governor import TimedSetpoint
@@ -59,7 +59,7 @@ DEPENDS_ON = (
 
 class Case(msgspec.Struct, frozen=True):
     """One run. `left_out` are names of terms, `search` takes the place of the scene's own where it is given; setpoints
-    come `inference_hz` times a second."""
+    come `inference_hz` times a second, or as often as the scene says where that is less."""
 
     scene: str
     plant: str = "sample_1"
@@ -71,10 +71,12 @@ class Case(msgspec.Struct, frozen=True):
     seconds: float = 5.0
 
 
-def run(case: Case, plant: PlantParameters | None = None, hand: Hand | None = None) -> float:
+def run(
+    case: Case, plant: PlantParameters | None = None, hand: Hand | None = None, motor: Motor | None = None
+) -> float:
     """RMS of the true force less the force asked, N; a run that ends in a fault counts as no force at all. `plant` and
-    `hand` take the place of those that case and scene name."""
-    played = _Play(case, plant, hand)
+    `hand` take the place of those that case and scene name, `motor` that of the one the controller believes in."""
+    played = _Play(case, plant, hand, motor)
     rows = []
     for time_s, loop in played.ticks(case.seconds):
         truth = loop.device.truth
@@ -180,9 +182,15 @@ class _Moment(NamedTuple):
 class _Play:
     """A case's loop, armed, and its signal behind an approach."""
 
-    def __init__(self, case: Case, plant: PlantParameters | None = None, hand: Hand | None = None) -> None:
+    def __init__(
+        self,
+        case: Case,
+        plant: PlantParameters | None = None,
+        hand: Hand | None = None,
+        motor: Motor | None = None,
+    ) -> None:
         rates = Rates(control_hz=case.control_hz, inference_hz=min(case.inference_hz, case.control_hz))
-        self.config = config = Config(scene=case.scene, rates=rates)
+        self.config = config = Config(scene=case.scene, rates=rates, motor=motor or Motor())
         stated = load_task(case.scene)
         free = Bandwidth(control_hz=case.control_hz, inference_hz=rates.inference_hz)
         scene = _modelled(msgspec.structs.replace(stated, bandwidth=free), case)
@@ -199,9 +207,13 @@ class _Play:
         self.begins_s = self._loop.now_s + approach_s
         times = np.concatenate([self._loop.now_s + before_s, self.begins_s + self.time_s])
         forces = np.concatenate([np.full(len(before_s), self.force_N[0]), self.force_N])
-        is_known = scene.signal is not None and scene.signal.is_known_ahead
+        signal = scene.signal
+        assert signal is not None, "its forces are asked for"
+        if signal.setpoint_hz is not msgspec.UNSET and signal.setpoint_hz < case.inference_hz:
+            sent_s = np.arange(times[0], times[-1], 1.0 / signal.setpoint_hz)
+            times, forces = sent_s, np.interp(sent_s, times, forces)
         self.publish: Callable[[float], TimedSetpoint | None] = publisher(
-            times, forces, FILE_PREVIEW_S if is_known else 0.0, VALID_S
+            times, forces, FILE_PREVIEW_S if signal.is_known_ahead else 0.0, VALID_S
         )
 
     def ticks(self, seconds: float) -> Iterable[tuple[float, ClosedLoop]]:

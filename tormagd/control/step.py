@@ -232,10 +232,7 @@ class Stepper:
         self._lag_s = electrical_time_s(motor) + EXCHANGE_S
         self._gear_loss = 1.0 - motor.gear_efficiency
         self._coulomb = motor.coulomb_V / motor.supply_V
-        terms = terms_of(scene)
-        self._has_pull, self._has_motor = terms.pull, terms.motor
-        self._coulomb_ahead = self._coulomb if terms.friction else 0.0
-        self._goes_ahead = terms.pull or terms.motor or terms.friction
+        self._has_motor = terms_of(scene).motor
 
     def start(self, now_s: float) -> StepState:
         """The state before the first step: disabled."""
@@ -352,7 +349,7 @@ class Stepper:
         expected = expect(expected, reference, dt_s, self._lag_s, self._derivative_filter_s)
         # a homed carriage that is found beyond the closed end has to come back from there
         pull = 0.0
-        if self._has_pull:
+        if self._has_motor:
             pull = pull_V(self._pull_V, max(reference.gap_mm, self._closed_mm)) / self._supply_V
         speeds = self._speeds(pull, expected, estimate)
         limits: list[Limit] = []
@@ -462,14 +459,12 @@ class Stepper:
         )
 
     def _feed_forward(self, reference: Reference, pull: float) -> float:
-        if not self._goes_ahead:
+        if not self._has_motor:
             return 0.0
         speed, acceleration = reference.speed_mm_s / 2.0, reference.acceleration_mm_s2 / 2.0
         moving = min(max(speed / COULOMB_SPEED_MM_S, -1.0), 1.0)
         # to close, the pull helps a fifth as much: the screw's friction eats the rest
-        resisting = self._coulomb_ahead + (pull if moving > 0.0 else 0.0)
-        if not self._has_motor:
-            return resisting * moving
+        resisting = self._coulomb + (pull if moving > 0.0 else 0.0)
         # what the gears lose has to be added to speed up, and helps to brake
         loss = math.copysign(self._gear_loss, acceleration * speed)
         inertia = acceleration * self._mechanical_time_s / (1.0 - loss)

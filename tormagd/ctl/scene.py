@@ -75,6 +75,8 @@ def check_scene(name: str, config: Path | None) -> Outcome:
             f"signal     the gap's speed alone misses {1e3 * derived['missed_rms_N']:.1f} mN of a tolerance of "
             f"{1e3 * scene.force.tolerance_rms_N:g}, {derived['missed_share']:.1%} of the time is faster"
         )
+    if scene.signal is not None and scene.signal.setpoint_hz is not msgspec.UNSET:
+        lines.append(f"           its publisher sends {scene.signal.setpoint_hz:g} times a second")
     if share is None:
         lines.append("cost       not measured: tools/required_terms.py does")
     else:

@@ -16,6 +16,8 @@ from tormagd.config import LEAST_INFERENCE_HZ, ConfigError, Strict, convert, did
 from tormagd.scenes.measured import measured
 
 AUTO = "auto"
+LEAST_SETPOINT_HZ = 12.0
+"Setpoints a tenth of a second apart are no stream any more."
 LEAST_CONTROL_HZ = 500
 "What is watched for safety is watched in every control tick: slower than this is none that a scene is run at."
 LONGEST_SHOWN = 200  # characters of a refused name
@@ -59,6 +61,8 @@ class Signal(Strict, frozen=True):
     "After each rise and each fall; 0 where it is not given."
     is_known_ahead: bool = False
     "Whether the publisher knows what comes, and sends it as a preview."
+    setpoint_hz: Annotated[float, Meta(ge=LEAST_SETPOINT_HZ, le=1_000.0)] | UnsetType = UNSET
+    "How often the publisher sends; as often as plans are made where it is not given."
 
     def __post_init__(self) -> None:
         shaped = {key: getattr(self, key) for key in ("bandwidth_hz", "step_N", "hold_s")}
@@ -112,9 +116,8 @@ class Terms(Strict, frozen=True):
     `forecast`    a force that repeats itself is foreseen
     `preview`     what a publisher says will follow is used
     `lag`         how late the carriages are is learned, and made up for
-    `motor`       the duty for the reference's speed and acceleration is fed forward
-    `friction`    the duty that overcomes the dry friction of gearbox and screw is fed forward
-    `pull`        the duty against the magnets' pull is fed forward, and limits the opening speed
+    `motor`       the duty that the reference takes of the motors is fed forward: for its speed and acceleration, the
+                  dry friction of gearbox and screw, and the magnets' pull, which limits the opening speed as well
 
     A pad has no `creep`. What safety rests on is no term: the ceiling, the judgement of the sensor, the force law
     beside the search.
@@ -134,8 +137,6 @@ class Terms(Strict, frozen=True):
     preview: bool = True
     lag: bool = True
     motor: bool = True
-    friction: bool = True
-    pull: bool = True
     learning: bool = True
     "No part of the model, but whether `creep`, `scale`, `offset` and `lag` go on learning, or stay what they are."
 

@@ -1,6 +1,7 @@
-"""What the terms do that no scene requires of sample 1: left out on other devices, and in the motion of the gap.
+"""What two parts of the term `motor` do by themselves, dry friction and the magnets' pull, beside the whole term and
+`lag`, the other one that is there for the gap's motion.
 
-    spare_terms.py [--json]
+    motor_parts.py [--json]
 
 The force is that of SCENES at the rates chosen for them, while the device is learned; the motion is that of steps of
 1 mm, both ways over the stroke, and of the stroke itself: of the samples, of DRAWS, and of one that nobody greased. All
@@ -17,14 +18,16 @@ from force_tracking import SAMPLES
 from rendering.device_draws import drawn_device
 from rendering.scene_runs import Case, run
 
-from tormagd.config import Config
+from tormagd.config import Config, Motor
 from tormagd.scenes.measured import measured
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
-SCENES = "pulse", "coronary"
-SPARE = "slope", "lag", "friction", "pull"
-MOVING = "", "motor", "friction", "pull"
-"Left out of the motion; that of `motor` shows what a term does that counts there."
+SCENES = "pulse", "radial_pulse", "coronary"
+NOTHING = "nothing"
+TERMS = "lag", "motor"
+PARTS = {"friction": Motor(coulomb_V=0.0), "pull": Motor(pull_V=0.0)}
+"A motor that is configured without one has none of it fed forward."
+MOVING = NOTHING, "motor", *PARTS
 DRAWS = range(40, 50)
 "Devices that chose nothing."
 DRY_DRAG_N, DRY_EFFICIENCY, DRY_FRICTION = 20.0, 0.55, 0.3
@@ -37,19 +40,19 @@ def main() -> int:
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args()
     rates = {scene.name: scene.hz for scene in measured().scenes}
-    added_N = {name: {sample: added(name, sample, rates[name]) for sample in SAMPLES[1:]} for name in SCENES}
+    added_N = {name: {sample: added(name, sample, rates[name]) for sample in SAMPLES} for name in SCENES}
     devices = {name: [load_plant(name)] for name in SAMPLES}
     devices |= {"draws": [drawn_device(number) for number in DRAWS], "dry": [dry_device()]}
-    motion = {without or "nothing": {name: worst(of, without) for name, of in devices.items()} for without in MOVING}
+    motion = {without: {name: worst(of, without) for name, of in devices.items()} for without in MOVING}
     if options.json:
         print(json.dumps({"added_N": added_N, "motion": motion}))
         return 0
     for name, samples in added_N.items():
-        for sample, terms in samples.items():
-            rows = ", ".join(f"{term} {1e3 * more_N:.1f}" for term, more_N in terms.items())
-            print(f"{name:10s}{sample}  added, mN, without {rows}")
-    for without, found in motion.items():
-        for sample, row in found.items():
+        for sample, found in samples.items():
+            rows = ", ".join(f"{without} {1e3 * more_N:.1f}" for without, more_N in found.items())
+            print(f"{name:13s}{sample}  added, mN, without {rows}")
+    for without, moves in motion.items():
+        for sample, row in moves.items():
             print(
                 f"without {without:10s}{sample}  overshoot {row['overshoot']:.1%}, settling "
                 f"{1e3 * row['settling_s']:.0f} ms, stroke {1e3 * row['stroke_s']:.0f} ms"
@@ -58,9 +61,10 @@ def main() -> int:
 
 
 def added(scene: str, sample: str, hz: tuple[int, int]) -> dict[str, float]:
-    """What each term's absence adds to the RMS error of the force, N, at rates of control and of inference."""
+    """What each one's absence adds to the RMS error of the force, N, at rates of control and of inference."""
     full_N = run(Case(scene, sample, (), "", True, *hz))
-    return {term: run(Case(scene, sample, (term,), "", True, *hz)) - full_N for term in SPARE}
+    terms = {term: run(Case(scene, sample, (term,), "", True, *hz)) - full_N for term in TERMS}
+    return terms | {part: run(Case(scene, sample, (), "", True, *hz), motor=PARTS[part]) - full_N for part in PARTS}
 
 
 def dry_device() -> PlantParameters:
@@ -82,7 +86,8 @@ def worst(devices: list[PlantParameters], without: str) -> dict[str, float]:
 
 def moved(device: PlantParameters, without: str) -> dict[str, float]:
     """The greatest overshoot, the longer settling of both ways at START_MM, and the time of the stroke."""
-    loop = settled_loop(Config(), device, (without,) if without else ())
+    config = Config(motor=PARTS[without]) if without in PARTS else Config()
+    loop = settled_loop(config, device, (without,) if without in TERMS else ())
     steps = step(loop, START_MM + STEP_MM), step(loop, START_MM)
     stroke_s = stroke(loop)
     return {
