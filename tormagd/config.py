@@ -196,7 +196,8 @@ class Position(Strict, frozen=True):
     gap_speed_mm_s: Annotated[float, Meta(gt=0.0, le=500.0)] = 38.0
     "How fast the gap may change: both carriages together, less than motors on a full supply reach."
     gap_acceleration_mm_s2: Annotated[float, Meta(gt=0.0, le=100_000.0)] = 1_600.0
-    "From rest; with speed it falls along the motors' torque-speed line."
+    """From rest; with speed it falls along the motors' torque-speed line. Carriages that show more are asked for up to
+    twice as much."""
     duty_limit: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0
     "The most that a motor is given; less spares it, and makes the gap slower."
 

@@ -72,6 +72,11 @@ CLOCK_FAULT: Final = 0.1
 "A clock that is off by a greater share is a limit, and a fault."
 STALL_SHARE: Final = 0.8
 "Of the device's timeout: a shorter stall of ours did not make it run out."
+LIVELIEST: Final = 2.0
+"No more is asked of lively motors, times what is asked of all; the liveliest of the plant card do 2.4 times as much."
+LIVELIER_BY_MM: Final = 100.0
+"""For each mm that carriages are ahead of what is expected while they gain speed as fast as they are let, so much more
+is asked of them in a second of it: two or three beats of a pulse show what a device can."""
 LAGGING_MM: Final = 0.1
 "The speed limit is reported as RATE only where it leaves the reference this far behind its target."
 
@@ -124,6 +129,7 @@ class StepState(Value):
         "leap",
         "homing",
         "acted",
+        "liveliness",
     )
     __slots__ = __match_args__
 
@@ -146,6 +152,7 @@ class StepState(Value):
         leap: Leap | None = None,
         homing: Homing | None = None,
         acted: Acted = NEVER,
+        liveliness: float = 1.0,
     ) -> None:
         self.time_s: Final = time_s
         self.safety: Final = safety
@@ -171,6 +178,8 @@ class StepState(Value):
         self.homing: Final = homing
         "The newest."
         self.acted: Final = acted
+        self.liveliness: Final = liveliness
+        "How fast the carriages have shown to gain speed, times `position.gap_acceleration_mm_s2`: 1 to LIVELIEST."
 
 
 @final
@@ -267,11 +276,11 @@ class Stepper:
         return state.replaced(safety=safety)
 
     def lose_link(self, state: StepState) -> StepState:
-        """The state after the link broke: a fault where the device was driven, otherwise only a forgotten estimate."""
+        """The state after the link broke: a fault where the device was driven, otherwise only a forgotten device."""
         safety = state.safety
         if safety.operating_state in _DRIVEN:
             safety = latch(safety, (Fault.LINK_LOST,))
-        return state.replaced(safety=safety, estimate=None)
+        return state.replaced(safety=safety, estimate=None, liveliness=1.0)  # another device may come
 
     def step(
         self, state: StepState, now_s: float, measurement: Measurement | None, plan: Plan
@@ -352,19 +361,23 @@ class Stepper:
         if self._has_motor:
             pull = pull_V(self._pull_V, max(reference.gap_mm, self._closed_mm)) / self._supply_V
         speeds = self._speeds(pull, expected, estimate)
+        most_mm_s2 = state.liveliness * self._gap_acceleration_mm_s2
         limits: list[Limit] = []
         if safety.operating_state is _PAUSED:
             target = Reference(reference.gap_mm)
-            reference, is_limited, is_slewed = follow(self._gap_acceleration_mm_s2, reference, target, dt_s, speeds)
+            reference, is_limited, is_slewed = follow(most_mm_s2, reference, target, dt_s, speeds)
         else:
             target = self._target(plan, now_s)
             if state.over_s > OVER_HELD_S:
                 target = Reference(self._open_mm)
                 limits.append(Limit.OVER_FORCE)
-            reference, is_limited, is_slewed = follow(self._gap_acceleration_mm_s2, reference, target, dt_s, speeds)
+            reference, is_limited, is_slewed = follow(most_mm_s2, reference, target, dt_s, speeds)
             if is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
                 limits.append(Limit.RATE)
         left_error, right_error = self._errors(expected, estimate)
+        liveliness = state.liveliness
+        if is_slewed:
+            liveliness = self._liveliness(liveliness, reference, left_error, right_error, dt_s)
         ahead = self._feed_forward(reference, pull)
         left_state, right_state = state.left, state.right
         if abs(reference.speed_mm_s) < RESTING_MM_S:
@@ -417,6 +430,7 @@ class Stepper:
             opposed_s=self._opposed_s(state, estimate, left.duty, right.duty, dt_s),
             homing=state.homing,
             acted=acted,
+            liveliness=liveliness,
         )
         output = StepOutput(
             _RUN,
@@ -448,6 +462,18 @@ class Stepper:
         # the magnets' pull helps to close, but a reserve is worth more there than a little speed
         opening_mm_s = self._no_load_mm_s * (self._gains.duty_limit - self._coulomb - pull)
         return Speeds(motors_mm_s, min(closing_mm_s, opening_mm_s), closing_mm_s)
+
+    def _liveliness(self, shown: float, reference: Reference, left: Error, right: Error, dt_s: float) -> float:
+        """After a period in which the limit of its acceleration held the reference back: carriages whose motors are
+        livelier than believed get ahead of what is expected then, and the feedback holds them back. Of weaker ones no
+        less is asked: they turn too late where they are spared."""
+        if reference.acceleration_mm_s2 * reference.speed_mm_s <= 0.0:
+            return shown
+        # a carriage that did not get as far as it should is not ahead because it need not come back as far
+        lead_s = self._gains.derivative_time_s
+        behind_mm = left.position_mm + right.position_mm + lead_s * (left.speed_mm_s + right.speed_mm_s)
+        ahead_mm = -math.copysign(1.0, reference.speed_mm_s) * behind_mm
+        return min(max(shown + LIVELIER_BY_MM * ahead_mm * dt_s, 1.0), LIVELIEST)
 
     def _errors(self, expected: Expected, estimate: Estimate) -> tuple[Error, Error]:
         """Both carriages' errors; either also takes half of the skew, so that the faster waits for the slower."""

@@ -110,6 +110,7 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
     needed = {factor: required(found.terms, factor * tolerance_N, file.share) for factor in TOLERANCES}
     out, usual = set(derived["terms_out"]), found.rates[0]
     solver = derived["solver"]
+    width = max(len(item.term) for item in found.terms)
     lines = [
         f"{scene.name}: {scene.description}",
         f"tolerance  {1e3 * tolerance_N:g} mN rms; a term is required that adds more than {file.share:.0%} of it",
@@ -119,13 +120,14 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
         f"{found.cost_us_s / 1e4:.2f}% with those that are required at {found.control_hz} / {found.inference_hz} Hz "
         f"({file.build}, machine_us {file.machine_us:g})",
         "",
-        "term       runs   required  added, frozen  added, learning      saved    at half  at twice the tolerance",
+        f"{'term':{width}} runs   required  added, frozen  added, learning      saved    at half  at twice the "
+        "tolerance",
     ]
     for item in found.terms:
         is_required = item.term not in found.left_out
         at_half, at_twice = ("in" if item.term in needed[factor] else "out" for factor in (0.5, 2.0))
         lines.append(
-            f"{item.term:10s} {'out' if item.term in out else 'in':6s} {'in' if is_required else 'out':8s} "
+            f"{item.term:{width}} {'out' if item.term in out else 'in':6s} {'in' if is_required else 'out':8s} "
             f"{1e3 * item.frozen_added_N:11.1f} mN {1e3 * item.learning_added_N:13.1f} mN "
             f"{found.saved_us_s(item) / 1e4:8.2f}% {at_half:>10s} {at_twice:>9s}"
         )
