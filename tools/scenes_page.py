@@ -192,7 +192,7 @@ def _motor() -> str:
     return (
         "`motor` is one term: the duty that the motor's equation asks for, with the dry friction of gearbox and screw "
         "and the magnets' pull in it. No scene would require these two by themselves: with a motor that is configured "
-        f"without one (`tools/motor_parts.py`) the force is off by {most_mN['friction']:.1f} and "
+        f"without one (`tools/motor_parts.py`) the scenes below are missed by {most_mN['friction']:.1f} and "
         f"{most_mN['pull']:.1f} mN more at most, where the sensor's step is 1 mN. They belong to how the gap moves: "
         "without the pull an opening gap runs 0.5 mm behind "
         "([control](control.md#reference-expectation-feed-forward)). Sample 1 chooses, whose motors are those that the "
