@@ -62,9 +62,10 @@ def main() -> int:
 
 def added(scene: str, sample: str, hz: tuple[int, int]) -> dict[str, float]:
     """What each one's absence adds to the RMS error of the force, N, at rates of control and of inference."""
-    full_N = run(Case(scene, sample, (), "", True, *hz))
-    terms = {term: run(Case(scene, sample, (term,), "", True, *hz)) - full_N for term in TERMS}
-    return terms | {part: run(Case(scene, sample, (), "", True, *hz), motor=PARTS[part]) - full_N for part in PARTS}
+    case = Case(scene, sample, (), "", True, *hz)
+    full_N = run(case)
+    terms = {term: run(msgspec.structs.replace(case, left_out=(term,))) - full_N for term in TERMS}
+    return terms | {part: run(case, motor=motor) - full_N for part, motor in PARTS.items()}
 
 
 def dry_device() -> PlantParameters:

@@ -151,7 +151,8 @@ def _counts(scenes: tuple[MeasuredScene, ...], share: float) -> str:
     table = "| term | required by | most that its absence adds |\n| --- | --- | --- |\n" + "\n".join(rows)
     spared = [term for term in TERMS if all(term in scene.left_out for scene in scenes)]
     said = "Each is required by some scene." if not spared else f"No scene requires {', '.join(spared)}."
-    back = [f"`{term}`" for term in TERMS if all(_added(scene, term) <= share * scene.tolerance_N for scene in scenes)]
+    little = [term for term in TERMS if all(_added(scene, term) <= share * scene.tolerance_N for scene in scenes)]
+    back = [f"`{term}`" for term in little if term not in spared]
     if back:
         said += (
             f" Alone {' and '.join(back)} would add no more than {share:.0%} of any tolerance: put back, because "

@@ -90,11 +90,9 @@ def test_the_core_alone_does_what_it_did_in_the_loop() -> None:
 def test_a_publisher_sends_as_often_as_its_scene_says(scene: str, sent_hz: float) -> None:
     played = _Play(Case(scene, control_hz=500, inference_hz=83))
     sent = {setpoint for now_ms in range(2_000, 4_000) if (setpoint := played.publish(1e-3 * now_ms)) is not None}
-    stamps_s = np.array(sorted(setpoint.stamp_s for setpoint in sent))
+    stamps_s, forces_N = np.array(sorted((setpoint.stamp_s, setpoint.force_N) for setpoint in sent)).T
     assert np.diff(stamps_s) == pytest.approx(1.0 / sent_hz, rel=1e-6)
-    at_s = stamps_s - played.begins_s
-    forces_N = [setpoint.force_N for setpoint in sorted(sent, key=lambda setpoint: setpoint.stamp_s)]
-    assert forces_N == pytest.approx(np.interp(at_s, played.time_s, played.force_N))
+    assert forces_N == pytest.approx(np.interp(stamps_s - played.begins_s, played.time_s, played.force_N))
 
 
 def table(added_N: dict[str, float]) -> tuple[Without, ...]:
