@@ -95,7 +95,6 @@ class Daemon:
             refused,
         )
         self._box.begin(self._control.state, self._inference.state, self._connection)
-        self._ticks_per_snapshot = rates.control_hz // rates.telemetry_hz
         self._ended = asyncio.Event()
 
     async def run(self) -> None:
@@ -159,12 +158,9 @@ class Daemon:
         try:
             self._inference.after_tick(control.state.estimate)
         finally:  # whatever becomes of planning, the daemon can be seen and stopped
-            planned_ns = time.monotonic_ns()
-            callbacks.ran(InferenceLoop.after_tick.__qualname__, driven_ns, planned_ns)
+            callbacks.ran(InferenceLoop.after_tick.__qualname__, driven_ns, time.monotonic_ns())
             self._telemetry.record(used)
-            if timing.runs % self._ticks_per_snapshot == 0:
-                self._telemetry.publish(heartbeat.due_ns)
-                callbacks.ran(TelemetryLoop.publish.__qualname__, planned_ns, time.monotonic_ns())
+            self._telemetry.after_tick(heartbeat.due_ns)
 
     def _receive_setpoints(self) -> None:
         self._inference.receive(self._control.state.estimate, self._control.next_tick_ns)
