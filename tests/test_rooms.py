@@ -22,6 +22,7 @@ MAY_IMPORT = {
     "output": set(),
     "exact": set(),
     "keeping": set(),
+    "slices": set(),
     "keys": FILES | {"config"},
     "entry": set(),  # it loads the daemon or tormagctl by name, never both
     "physics": FILES,
@@ -34,12 +35,12 @@ MAY_IMPORT = {
     "safety": {"firmware_protocol"},
     "hardware": LOWEST | {"exact", "safety"},
     "control": LOWEST | {"exact", "keeping", "physics", "model", "inverse", "scenes", "safety", "hardware"},
-    "daemon": LOWEST | FILES | {"output", "keys", "keeping", "scenes", "safety", "hardware", "control"},
+    "daemon": LOWEST | FILES | {"output", "keys", "keeping", "slices", "scenes", "safety", "hardware", "control"},
     "recording": FILES | {"messages", "output", "keeping"},
     "client": {"config", "keys", "messages", "output"},
     "dashboard": {"client", "messages", "output", "recording", "safety"},
     "ctl": FILES | {"dashboard", "force_file", "client", "config", "messages", "output", "keys", "scenes", "recording"},
-    "simulation": FILES | {"physics", "firmware_protocol", "output"},
+    "simulation": FILES | {"physics", "firmware_protocol", "output", "slices"},
     "headroom": {"config", "output", "daemon", "control", "simulation", "closed_loop"},
     "replay": LOWEST
     | {"exact", "keeping", "output", "recording", "model", "scenes", "safety", "hardware", "control", "daemon"}

@@ -28,6 +28,7 @@ ROOMS = {
     "physics",
     "safety",
     "scenes",
+    "slices",
     "toml_file",
 }
 LIBRARIES = (

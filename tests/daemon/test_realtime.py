@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,14 @@ import pytest
 
 from tormagd.config import RealTime
 from tormagd.daemon import realtime
+from tormagd.slices import ask_for_slices
+
+
+@pytest.fixture(autouse=True)
+def usual_slices() -> Iterator[None]:
+    """What a test has prepared, the next one does not run with."""
+    yield
+    ask_for_slices(0)
 
 
 def refuse(*_arguments: Any) -> None:
@@ -23,7 +32,9 @@ def test_nothing_asked_for_is_nothing_refused() -> None:
 def test_each_refusal_names_its_setting_and_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     monkeypatch.setattr(os, "sched_setaffinity", refuse)
-    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(mlockall=lambda flags: -1))
+    monkeypatch.setattr(
+        ctypes, "CDLL", lambda *_, **__: SimpleNamespace(mlockall=lambda flags: -1, syscall=lambda *_: -1)
+    )
     monkeypatch.setattr(realtime, "_LATENCY", Path("/proc/version/none"))
     refused = realtime.prepare(RealTime(fifo_priority=40, cpus=(0,), lock_memory=True, keep_awake=True))
     assert [line.split(":")[0] for line in refused] == [

@@ -13,7 +13,7 @@ import zmq
 import zmq.asyncio
 
 from firmware_protocol.build import settle
-from tormagd.config import Config, Endpoints, RealTime
+from tormagd.config import Config, Endpoints, Rates, RealTime
 from tormagd.control.core import Core, build_core
 from tormagd.control.plan import PlanState
 from tormagd.control.sight import Sight
@@ -62,11 +62,16 @@ def no_device() -> Backend:
     raise BackendError("no such port", "plug it in")
 
 
-def run(core: Core, folder: Path, operate: Callable[[Command, FailingPlanner], Awaitable[None]]) -> None:
+def run(
+    core: Core,
+    folder: Path,
+    operate: Callable[[Command, FailingPlanner], Awaitable[None]],
+    rates: Rates = Rates(),  # noqa: B008 it is immutable
+) -> None:
     """A daemon that has no device, for as long as `operate` takes."""
     planner = FailingPlanner(core)
     addresses = {name: f"ipc://{folder}/{name}" for name in ("setpoint", "telemetry", "control", "recording")}
-    config = Config(endpoints=Endpoints(**addresses), realtime=RealTime(watchdog_ms=WATCHDOG_MS))
+    config = Config(endpoints=Endpoints(**addresses), rates=rates, realtime=RealTime(watchdog_ms=WATCHDOG_MS))
 
     async def both() -> None:
         made: Any = core._replace(planner=planner)  # type: ignore[arg-type]
@@ -98,6 +103,18 @@ def test_stop_without_a_device_says_that_there_is_none(core: Core, tmp_path: Pat
         assert status["build"] == str(settle())
 
     run(core, tmp_path, operate)
+
+
+@pytest.mark.parametrize("ticks_per_snapshot", [1, 2, 50])
+def test_requests_are_answered_with_the_newest_snapshot_however_few_ticks_it_stands_for(
+    core: Core, tmp_path: Path, ticks_per_snapshot: int
+) -> None:
+    async def operate(command: Command, _planner: FailingPlanner) -> None:
+        numbers = [(await command("status"))["seq"] for _ in range(4)]
+        assert numbers == sorted(set(numbers))  # one answer in a period
+
+    rates = Rates(control_hz=100, inference_hz=100, telemetry_hz=100 // ticks_per_snapshot)
+    run(core, tmp_path, operate, rates)
 
 
 def test_a_daemon_describes_what_it_runs(core: Core, tmp_path: Path) -> None:

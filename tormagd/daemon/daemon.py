@@ -37,6 +37,9 @@ SWITCH_S = 1e-4
 "For so long another thread may keep the interpreter's lock while this one waits for it; Python's own is 5 ms."
 TAKEN_BEFORE_NS = 200_000
 "Requests are taken no later than this before the next control tick."
+SERVED_AFTER = 1
+"""Requests are answered so many ticks after a snapshot: both after the same one made the next tick late where this
+thread has no real-time priority."""
 LONGEST_RETRACT_S = 10.0
 "A full stroke takes the firmware 3 s at its own retract speed; longer means that it cannot, and it says so itself."
 
@@ -95,6 +98,7 @@ class Daemon:
             refused,
         )
         self._box.begin(self._control.state, self._inference.state, self._connection)
+        self._ticks_per_snapshot = rates.control_hz // rates.telemetry_hz
         self._ended = asyncio.Event()
 
     async def run(self) -> None:
@@ -158,9 +162,16 @@ class Daemon:
         try:
             self._inference.after_tick(control.state.estimate)
         finally:  # whatever becomes of planning, the daemon can be seen and stopped
-            callbacks.ran(InferenceLoop.after_tick.__qualname__, driven_ns, time.monotonic_ns())
+            planned_ns = time.monotonic_ns()
+            callbacks.ran(InferenceLoop.after_tick.__qualname__, driven_ns, planned_ns)
             self._telemetry.record(used)
-            self._telemetry.after_tick(heartbeat.due_ns)
+            if (timing.runs + SERVED_AFTER) % self._ticks_per_snapshot == 0:
+                self._telemetry.publish(heartbeat.due_ns)
+                callbacks.ran(TelemetryLoop.publish.__qualname__, planned_ns, time.monotonic_ns())
+            if timing.runs % self._ticks_per_snapshot == 0:
+                begun_ns = time.monotonic_ns()
+                self._telemetry.serve()
+                callbacks.ran(TelemetryLoop.serve.__qualname__, begun_ns, time.monotonic_ns())
 
     def _receive_setpoints(self) -> None:
         self._inference.receive(self._control.state.estimate, self._control.next_tick_ns)

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from tormagd.config import RealTime
+from tormagd.slices import ask_for_slices
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _LATENCY = Path("/dev/cpu_dma_latency")
@@ -22,7 +23,8 @@ log = logging.getLogger(__name__)
 def prepare(settings: RealTime) -> list[str]:
     """Applies the settings to this thread and process; returns what was refused, in plain words.
 
-    FIFO is set on this thread only and reset on fork, so that child processes and threads stay ordinary.
+    FIFO is set on this thread only and reset on fork, so that child processes and threads stay ordinary. Without it the
+    thread has short slices, and so have those that it begins.
     """
     refused = []
     if settings.cpus:
@@ -36,6 +38,7 @@ def prepare(settings: RealTime) -> list[str]:
             os.sched_setscheduler(0, policy, os.sched_param(settings.fifo_priority))
         except OSError as error:
             refused.append(f"realtime.fifo_priority = {settings.fifo_priority}: {error.strerror}; see LimitRTPRIO")
+    ask_for_slices()
     if settings.lock_memory and ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
         refused.append(f"realtime.lock_memory: {os.strerror(ctypes.get_errno())}; see LimitMEMLOCK")
     if settings.keep_awake:

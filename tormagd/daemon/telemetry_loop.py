@@ -1,11 +1,9 @@
 """The telemetry loop: at 50 Hz publish the snapshot and the ticks, answer commands and `status`, feed the watchdog."""
 
 import logging
-import math
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import msgspec
 
@@ -49,17 +47,13 @@ SERVED_BEFORE_NS = 200_000
 PORTRAIT_STEP = 5
 "Every fifth point of the portrait is told: it is smooth."
 
-Part: TypeAlias = Callable[[float], None]
-"Some of a telemetry period's work, given the time (monotonic), s."
-
 log = logging.getLogger(__name__)
 
 
 class TelemetryLoop:
     """Tells everybody else what the control and inference loops do. It runs in their slack, after a control tick.
 
-    A period's work is done in parts, one after each of its first control ticks: all at once takes longer than a tick's
-    slack where this thread has no real-time priority. `not_granted` is what the kernel refused at the start.
+    `not_granted` is what the kernel refused at the start.
     """
 
     def __init__(
@@ -82,9 +76,6 @@ class TelemetryLoop:
         self._callbacks, self._causes, self._box = callbacks, causes, box
         self.timing = RateGroup("telemetry", NS // config.rates.telemetry_hz)
         self._groups = (control.timing, inference.timing, self.timing)
-        parts = self._publish, self._publish_ticks, self._look, self._tell, self._serve
-        self._turns = spread(parts, config.rates.control_hz // config.rates.telemetry_hz)
-        self._turn = self._due_ns = self._begun_ns = self._spent_ns = 0
         self._newest: Telemetry
         self._started_s = time.monotonic()
         self._ticks: list[TickRecord] = []
@@ -113,22 +104,31 @@ class TelemetryLoop:
         self._ticks.append(record)
         self._box.ticked(record, control.state, self._inference.state)
 
-    def after_tick(self, due_ns: int) -> None:
-        """A control tick that was due at `due_ns` is done: what of this period's work has its turn now."""
-        turn, self._turn = self._turn, (self._turn + 1) % len(self._turns)
-        if turn == 0:
-            self._due_ns, self._begun_ns, self._spent_ns = due_ns, time.monotonic_ns(), 0
-        for part in self._turns[turn]:
-            start_ns = time.monotonic_ns()
-            part(start_ns * 1e-9)
-            end_ns = time.monotonic_ns()
-            self._callbacks.ran(part.__qualname__, start_ns, end_ns)
-            self._spent_ns += end_ns - start_ns
-        if self._turn == 0:
-            self.timing.record(self._due_ns, self._begun_ns, self._begun_ns + self._spent_ns)
+    def publish(self, due_ns: int) -> None:
+        """One telemetry period, which was due at `due_ns`."""
+        start_ns = time.monotonic_ns()
+        self._newest = self._snapshot(start_ns * 1e-9)
+        self._endpoint.publish(self._newest)
+        link = self._connection.link
+        identity = None if link is None else link.identity
+        self._profiles.look(None if identity is None else identity.serial_number, is_driven(self._control.state))
+        self._endpoint.publish_ticks(self._ticks[-MOST_TICKS:])
+        self._ticks.clear()
+        self._refresh(start_ns * 1e-9)
+        self._box.look()
+        self._status = None
+        self._tell_service(start_ns * 1e-9, self._newest.is_homed)
+        self._report_late_ticks()
+        self._report_sources(start_ns * 1e-9)
+        self.timing.record(due_ns, start_ns, time.monotonic_ns())
+
+    def serve(self) -> None:
+        """Answers the requests that wait, with what was published last."""
+        until_ns = self._control.next_tick_ns - SERVED_BEFORE_NS
+        self._endpoint.serve(time.monotonic(), self._answer, until_ns)
 
     def take_requests(self) -> None:
-        """Takes the requests that have arrived: `stop` and `disable` are carried out, the rest waits for its turn."""
+        """Takes the requests that have arrived: `stop` and `disable` are carried out, the rest waits for `serve`."""
         self._endpoint.take_requests(self._command)
 
     def keep(self, reason: str, after_s: float) -> Path:
@@ -159,32 +159,11 @@ class TelemetryLoop:
         connection, control = self._connection, self._control
         return is_busy(connection.measurement, connection.pending, control.state, control.output)
 
-    def _publish(self, now_s: float) -> None:
+    def _snapshot(self, now_s: float) -> Telemetry:
         stamp = self._endpoint.inbox.newest
         homed = is_homed(self._connection.measurement, self._control.state.estimate)
         age_s = None if stamp is None else now_s - stamp.stamp_s
-        self._newest = snapshot(self._ticks[-1], self.timing.runs, homed, self.is_busy(), age_s)
-        self._endpoint.publish(self._newest)
-        self._status = None
-
-    def _publish_ticks(self, now_s: float) -> None:
-        self._endpoint.publish_ticks(self._ticks[-MOST_TICKS:])
-        self._ticks.clear()
-
-    def _look(self, now_s: float) -> None:
-        link = self._connection.link
-        identity = None if link is None else link.identity
-        self._profiles.look(None if identity is None else identity.serial_number, is_driven(self._control.state))
-        self._box.look()
-        self._refresh(now_s)
-
-    def _serve(self, now_s: float) -> None:
-        self._endpoint.serve(now_s, self._answer, self._control.next_tick_ns - SERVED_BEFORE_NS)
-
-    def _tell(self, now_s: float) -> None:
-        self._tell_service(now_s, self._newest.is_homed)
-        self._report_late_ticks()
-        self._report_sources(now_s)
+        return snapshot(self._ticks[-1], self.timing.runs, homed, self.is_busy(), age_s)
 
     def take_over(self, config: Config) -> None:
         """Goes on with another configuration, of which only what a loop looks at each time may differ."""
@@ -345,9 +324,3 @@ class TelemetryLoop:
             output=OutputReport(rate=acted.rate, slew=acted.slew, not_finite=acted.not_finite, range=acted.range),
             next_commands=tuple(map(str, next_commands(safety, newest.is_homed))),
         )
-
-
-def spread(parts: tuple[Part, ...], turns: int) -> list[tuple[Part, ...]]:
-    """What is done at each of a period's turns: one part at a time where there are turns enough."""
-    at_once = math.ceil(len(parts) / turns)
-    return [parts[turn * at_once : (turn + 1) * at_once] for turn in range(turns)]

@@ -29,6 +29,7 @@ from tormagd.simulation.parameters import PlantError, load_plant, plant_names
 from tormagd.simulation.pty_door import PtyDoor
 from tormagd.simulation.real_time import Door, PacedDevice, serve
 from tormagd.simulation.slcan_door import SlcanDoor
+from tormagd.slices import ask_for_slices
 
 # The C sources are what a microcontroller would run; the Python twin, held equal to them by tests, needs no compiler.
 FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware}
@@ -38,6 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the device until SIGTERM or SIGINT; the first line on stdout says where. Usage errors exit with 2."""
     command = parser()
     options = command.parse_args(arguments)
+    ask_for_slices()  # a device waits for nobody's processor
     stopping = False
 
     def stop(_signal: int, _frame: object) -> None:
