@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import demo
 import numpy as np
@@ -10,6 +11,7 @@ from machines.host import Host
 from rendering import show
 from rendering.rehearsal import Rehearsal
 
+from tormagd.ctl.outcome import CommandError, Exit
 from tormagd.messages import VERSION, Telemetry, Tick
 from tormagd.safety.codes import FAULTS, Fault, Limit
 from tormagd.scenes.scene import load_scene
@@ -112,6 +114,26 @@ def test_a_fault_is_one_sentence_with_cause_and_remedy(fault):
         assert FAULTS[fault].cause in sentence
         assert is_hosts or FAULTS[fault].remedy in sentence
         assert not re.search(r"[\n{}]", sentence)
+
+
+@pytest.mark.parametrize(
+    ("code", "host", "verdict"),
+    [
+        ("not_homed", STALLED, demo.Verdict.HOST),
+        ("not_homed", QUIET, demo.Verdict.MISSED),
+        ("not_allowed", STALLED, demo.Verdict.MISSED),
+    ],
+)
+def test_a_homing_that_came_to_nothing_is_the_hosts_only_where_it_stood_still(code, host, verdict, monkeypatch):
+    def home(*_arguments):
+        raise CommandError(Exit.REFUSED, code, "homing ended, but the device is not homed", "tormagctl status")
+
+    monkeypatch.setattr(show, "home", home)
+    with pytest.raises(show.ShowError) as caught:
+        show.arm(SimpleNamespace(request=lambda _command: {"faults": []}))
+    found, sentence = demo.judge(SCENE, show.Aborted(caught.value, host, 1e-3))
+    assert found is verdict
+    assert "homing ended" in sentence
 
 
 def test_the_host_line_names_steal_and_both_worst_stalls():

@@ -84,6 +84,11 @@ OF_TIME = frozenset(
 else."""
 
 
+OUT_OF_TIME = frozenset({"not_fresh", "timeout", "not_begun", "not_homed"})
+"""Why a device could not be homed and enabled where somebody came too late. A homing, too, ends with an open gap when
+the device hears nothing for its 50 ms."""
+
+
 class ShowError(Exception):
     """A show that did not get to its end: one sentence with cause and remedy.
 
@@ -335,7 +340,7 @@ def arm(client: Client) -> None:
                 time.sleep(0.05)
     except ClientError as error:
         raise_fault(status(client))
-        is_late = isinstance(error, UnreachableError) or error.code in ("not_fresh", "timeout", "not_begun")
+        is_late = isinstance(error, UnreachableError) or error.code in OUT_OF_TIME
         raise ShowError(error.message, error.hint, is_of_time=is_late) from error
 
 
