@@ -8,12 +8,12 @@ privilege.
 
 import ctypes
 import os
-import platform
+import sys
 
 SHORTEST_NS = 100_000
 "The kernel gives none shorter."
 _SYSTEM_CALL = {"x86_64": 314, "aarch64": 274}
-"The number of sched_setattr(2), for which the C library has a function from glibc 2.41 on."
+"The number of sched_setattr(2), for which the C library has a function from glibc 2.41 on; of 64-bit programs."
 
 
 class _Attributes(ctypes.Structure):
@@ -34,8 +34,8 @@ def ask_for_slices(slice_ns: int = SHORTEST_NS) -> None:
 
     An older kernel takes no notice, and nothing is asked for a thread that is not an ordinary one.
     """
-    number = _SYSTEM_CALL.get(platform.machine())
-    if number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
+    number = _SYSTEM_CALL.get(os.uname().machine)
+    if number is None or sys.maxsize < 2**32 or os.sched_getscheduler(0) != os.SCHED_OTHER:
         return
     asked = _Attributes(
         size=ctypes.sizeof(_Attributes),

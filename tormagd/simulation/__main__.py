@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the device until SIGTERM or SIGINT; the first line on stdout says where. Usage errors exit with 2."""
     command = parser()
     options = command.parse_args(arguments)
-    ask_for_slices()  # a device waits for nobody's processor
+    ask_for_slices()  # a real device has a processor of its own
     stopping = False
 
     def stop(_signal: int, _frame: object) -> None:
