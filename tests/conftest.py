@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ from hypothesis import HealthCheck, settings
 from machines.host import HostWatch
 
 from firmware_protocol.build import SWITCH, settle
+from tormagd.slices import ask_for_slices
 
 # No test asserts a wall-clock duration, so none fails because the machine is slow. One commit has one verdict: a
 # property's cases are drawn from its source, and `make search` draws others; what it finds becomes an `@example`
@@ -37,6 +39,13 @@ ATTEMPTS = 3
 WATCHED_ABOVE = 51
 "FIFO priority of the bare timers, where it is allowed: one above the daemon's in the tests."
 WATCHED = pytest.StashKey[HostWatch]()
+
+
+@pytest.fixture
+def usual_slices() -> Iterator[None]:
+    """What a test has asked the kernel for, the next one does not run with."""
+    yield
+    ask_for_slices(0)
 
 
 class HostWarning(UserWarning):

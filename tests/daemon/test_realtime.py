@@ -2,7 +2,6 @@
 
 import ctypes
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,14 +10,8 @@ import pytest
 
 from tormagd.config import RealTime
 from tormagd.daemon import realtime
-from tormagd.slices import ask_for_slices
 
-
-@pytest.fixture(autouse=True)
-def usual_slices() -> Iterator[None]:
-    """What a test has prepared, the next one does not run with."""
-    yield
-    ask_for_slices(0)
+pytestmark = pytest.mark.usefixtures("usual_slices")
 
 
 def refuse(*_arguments: Any) -> None:

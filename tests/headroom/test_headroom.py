@@ -14,6 +14,8 @@ from tormagd.headroom import __main__ as program
 from tormagd.headroom import core_cost, machine_loop
 from tormagd.headroom.bare_timer import beat, lateness
 
+pytestmark = pytest.mark.usefixtures("usual_slices")
+
 
 def test_the_reference_loop_is_what_it_was() -> None:
     """Changed, it would make every figure that stands beside it incomparable."""
