@@ -10,23 +10,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tormagd.control.periodicity import (
-    DELAYS,
+    BEAT_DELAYS,
     GRID_S,
     HISTORY,
     HORIZON,
+    JUDGED,
     LEAST_HISTORY,
+    LONG_S,
     LONGEST_STEP_S,
+    LOST,
     NOTHING_LEARNED,
     RIDGE,
+    RISE_DELAYS,
     SAME_N,
     STRIDE,
     TAPS,
     Periodicity,
-    Skill,
     forecast_N,
     foreseen,
     observe,
 )
+from tormagd.control.skill import Skill
 
 Array = npt.NDArray[np.float64]
 
@@ -214,20 +218,79 @@ def test_a_forecast_is_looked_for_once_for_each_point_of_the_grid() -> None:
     assert foreseen(passed, 0.0).from_s == passed.time_s
 
 
-@pytest.mark.parametrize("seconds", [1.3, 4.0, 12.0])
-def test_a_forecast_is_the_constant_of_a_weighted_ridge_regression(seconds: float) -> None:
-    state = learned(seconds)
-    history, delays = np.frombuffer(state.history), np.array(DELAYS)
+def by_regression(history: Array, of: tuple[int, ...]) -> tuple[Array, float]:
+    """The constants of a weighted ridge regression, by NumPy's least squares, and the least mean square apart."""
+    delays = np.array(of)
     newest = len(history) - 1
-    ends = np.arange(newest - HORIZON, DELAYS[-1] - 1, -STRIDE)[:, None]
+    ends = np.arange(newest - HORIZON, of[-1] - 1, -STRIDE)[:, None]
     apart = history[ends - delays] - history[ends] - (history[newest - delays] - history[newest])
     followed = history[ends + np.arange(HORIZON + 1)] - history[ends]
-    weight = (np.sum(apart**2, axis=1) + TAPS * SAME_N**2) ** -2
+    distance = np.sum(apart**2, axis=1) + TAPS * SAME_N**2
+    weight = distance**-2
     ridge = RIDGE / TAPS * np.sum(weight[:, None] * apart**2) + SAME_N**2 * np.sum(weight)
     rows = np.sqrt(weight)[:, None] * np.column_stack([np.ones(len(ends)), apart])
     rows = np.vstack([rows, np.sqrt(ridge) * np.eye(TAPS + 1)[1:]])
     wanted = np.vstack([np.sqrt(weight)[:, None] * followed, np.zeros((TAPS, HORIZON + 1))])
-    assert state.changes_N == pytest.approx(np.linalg.lstsq(rows, wanted)[0][0], abs=1e-9)
+    constants: Array = np.linalg.lstsq(rows, wanted)[0][0]
+    return constants, float(distance.min()) / TAPS
+
+
+@pytest.mark.parametrize(("rise_missed", "beat_missed"), [(4e-4, 4e-4), (1e-4, 4e-4), (3e-4, 1e-5), (0.0, 0.0)])
+@pytest.mark.parametrize("seconds", [1.6, 4.0, 12.0])
+def test_a_forecast_is_a_mixture_of_weighted_ridge_regressions(
+    seconds: float, rise_missed: float, beat_missed: float
+) -> None:
+    """By the inverse squares of the mean squares that both missed lately, and are from what they know now."""
+    before = learned(seconds)
+    before = observe(before, before.stamp_s + GRID_S, before.force_N + 0.002)
+    state = foreseen(before.replaced(rise_missed=rise_missed, beat_missed=beat_missed), 0.0)
+    history = np.frombuffer(state.history)
+    (rise, rise_apart), (beat, beat_apart) = (by_regression(history, of) for of in (RISE_DELAYS, BEAT_DELAYS))
+    rise_weight, beat_weight = (rise_missed + rise_apart) ** -2, (beat_missed + beat_apart) ** -2
+    mixed = (rise_weight * rise + beat_weight * beat) / (rise_weight + beat_weight)
+    assert state.changes_N == pytest.approx(mixed, abs=1e-9)
+
+
+def test_what_both_embeddings_missed_is_remembered() -> None:
+    """Setpoints come as the grid's points do: what was said four before is compared with what came."""
+    times_s = np.arange(600) * GRID_S * (1.0 + 1e-6)
+    forces_N = pulse_N(times_s)
+    state = NOTHING_LEARNED
+    said: list[tuple[float, float] | None] = []
+    missed: tuple[list[float], list[float]] = ([], [])
+    for time_s, force_N in zip(times_s.tolist(), forces_N.tolist(), strict=True):
+        state = after(state, time_s, force_N, 0.0)
+        guess = state.awaited[-1]
+        said.append(None if guess is None else (guess.rise_N, guess.beat_N))
+        if len(said) > JUDGED and (then := said[-1 - JUDGED]) is not None:
+            for errors, forecast in zip(missed, then, strict=True):
+                errors.append(forecast - force_N)
+    for errors, found in zip(missed, (state.rise_missed, state.beat_missed), strict=True):
+        mean = NOTHING_LEARNED.rise_missed
+        for error in errors:
+            mean += GRID_S / (LONG_S + GRID_S) * (error**2 - mean)
+        assert len(errors) > 400
+        assert found == pytest.approx(mean, rel=0.01)
+
+
+def test_where_one_finds_nothing_alike_the_other_speaks_for_both() -> None:
+    """After a jump to a force that is held: before long the short embedding has left it behind, the long one not."""
+    state, spoken = learned(), 0
+    for tick in range(1, BEAT_DELAYS[-1] + 2):
+        state = after(state, 4.0 + tick * GRID_S, 0.8 + 1e-4 * math.sin(tick), 0.0)
+        guess = state.awaited[-1]
+        if guess is not None and guess.rise_N == guess.beat_N:
+            spoken += 1
+            constants, _ = by_regression(np.frombuffer(state.history), RISE_DELAYS)
+            assert state.changes_N == pytest.approx(constants, abs=1e-9)
+    assert spoken > 10
+
+
+def test_where_nothing_is_alike_trust_has_to_be_earned_again() -> None:
+    state = learned()
+    jumped = after(state, state.stamp_s + GRID_S, 0.8, 0.0)
+    assert (jumped.changes_N, jumped.short) == ([], LOST)
+    assert jumped.replaced(changes_N=state.changes_N).trust < 0.03 < state.trust
 
 
 def test_the_forecast_starts_at_the_newest_setpoint_between_two_points_of_the_grid() -> None:

@@ -9,6 +9,7 @@ from tormagd.control.device_fit import DeviceFit
 from tormagd.control.periodicity import LONGEST_STEP_S, NOTHING_LEARNED, Periodicity, forecast_N, foreseen, observe
 from tormagd.control.portrait import Portrait
 from tormagd.control.pursuit import nearest_way_mm
+from tormagd.control.restraint import Restraint, restrain
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 
@@ -92,7 +93,7 @@ class GovernorState(Value):
     """What the governor remembers between plans: `asked_N` is the force that the last one asked of the device, and
     `above_N` how far that was above the least that the device then seemed to make; where it was known or foreseen what
     comes the carriages were sent to that of `drive_N`; `holder` whose setpoints it followed; while `is_passing` the
-    force is on its way to those of a new holder."""
+    force is on its way to those of a new holder; `restraint` begins with each stream that nothing announces."""
 
     __match_args__ = (
         "time_s",
@@ -105,6 +106,7 @@ class GovernorState(Value):
         "is_passing",
         "above_N",
         "drive_N",
+        "restraint",
     )
     __slots__ = __match_args__
 
@@ -120,10 +122,12 @@ class GovernorState(Value):
         is_passing: bool = False,
         above_N: float = math.inf,
         drive_N: float | None = None,
+        restraint: Restraint | None = None,
     ) -> None:
         self.time_s: Final = time_s
         self.above_N: Final = above_N
         self.drive_N: Final = drive_N
+        self.restraint: Final = restraint
         self.asked_N: Final = asked_N
         self.stamp_s: Final = stamp_s
         self.slope_N_s: Final = slope_N_s
@@ -189,9 +193,9 @@ class Governor:
     ) -> tuple[GovernorState, Governed]:
         """One decision, for now and, where what comes is known, for up to `lag_s` later: an extrapolation that far is a
         guess. The force is within what the scene allows and `device`, as far as it has shown itself, gives; with a
-        preview it is what the gap can best make of it. A missing or stale setpoint decays to F_min along the scene's
-        `release_N_s`, and from one holder's force to the next one's it goes as fast: never a jump, never a force held
-        for ever.
+        preview it is what the gap can best make of it, and without one no further from the mean than is worth the way.
+        A missing or stale setpoint decays to F_min along the scene's `release_N_s`, and from one holder's force to the
+        next one's it goes as fast: never a jump, never a force held for ever.
         """
         portrait = self._portrait
         lowest = max(device.force_N(portrait.least_N), 0.0)
@@ -225,6 +229,8 @@ class Governor:
         asks_N = force if is_passing else state.asked_N
         sent_N = asks_N if is_passing or state.drive_N is None else state.drive_N
         elapsed_s = max(now_s - state.time_s, 0.0)
+        held_back_N = 0.0
+        restraint: Restraint | None = None
         if setpoint.preview_N and self._has_preview:
             periodicity, foresight = NOTHING_LEARNED, 1.0
             wanted_N = _previewed_N(setpoint, soon_s + lag_s, least, most)
@@ -233,18 +239,26 @@ class Governor:
             periodicity = observe(learned, setpoint.stamp_s, asked_N) if self._has_forecast else NOTHING_LEARNED
             # one that has fallen silent for longer than a stream may is not believed to go on as it did
             foresight = periodicity.trust if age <= LONGEST_STEP_S else 0.0
+            if self._has_forecast:
+                restraint, for_N = restrain(
+                    None if is_new_holder else state.restraint, elapsed_s, force, device, portrait, self._gap_speed_mm_s
+                )
+                held_back_N = for_N - force
             path = _expected_N(asked_N, slope, periodicity, foresight, soon_s + foresight * lag_s)
+            path = [force_N + held_back_N for force_N in path]
         within = [min(max(force_N, least), most) for force_N in path]
-        governed = force
+        governed = min(max(force + held_back_N, least), most)
         if drive_N is not None:
             governed = within[0]
-            if abs(governed - force) > OUTRUN_N:
-                reasons = (*reasons, Limit.RATE)
         elif foresight > 0.0 and not is_passing and self._is_near(sent_N, within[-1], device):
             pursued, drive_N = self._pursued_N(asks_N, sent_N, elapsed_s, within, device, lag_s)
             for place, force_N in enumerate(pursued):
                 within[place] += foresight * (min(max(force_N, least), most) - within[place])
         within = within[: len(PATH_S)]
+        if abs(governed - force) > OUTRUN_N:
+            reasons = (*reasons, Limit.RATE)
+        if abs(held_back_N) > OUTRUN_N:
+            foresight = 0.0  # what comes is not known far enough ahead, and how late the carriages are does not show
         if is_passing:
             step_N = self._release_N_s * elapsed_s
             left_N = within[0] - state.asked_N
@@ -264,6 +278,7 @@ class Governor:
             is_passing,
             max(within[0] - lowest, 0.0),
             drive_N,
+            restraint,
         )
         return rendered, Governed(governed, within, age, reasons, foresight)
 
@@ -322,6 +337,7 @@ class Governor:
             state.is_passing,
             state.above_N,
             state.drive_N,
+            state.restraint,
         )
 
     def _ramp(

@@ -2,8 +2,9 @@
 
 No period is assumed, for heart beats vary: the newest stretch of force, as a delay embedding, is compared with those
 remembered, and what followed them tells what will follow it (analogue forecasting, Lorenz, J. Atmos. Sci. 26, 1969;
-locally weighted linear regression, Cleveland and Devlin, J. Am. Stat. Assoc. 83, 1988). How far that is believed has to
-be earned: by its skill over the slope that is extrapolated otherwise, judged by what came.
+locally weighted linear regression, Cleveland and Devlin, J. Am. Stat. Assoc. 83, 1988). Two embeddings do that, one as
+long as the rise of a pulse and one as half its beat; the one that missed less lately counts more. How far both are
+believed has to be earned: by their skill over the slope that is extrapolated otherwise, judged by what came.
 """
 
 import math
@@ -15,6 +16,7 @@ import numpy.typing as npt
 
 from firmware_protocol.value import Value
 from tormagd.control.interpolation import at_step
+from tormagd.control.skill import DOUBT_N, UNJUDGED, Skill
 
 Array = npt.NDArray[np.float64]
 
@@ -24,9 +26,13 @@ HISTORY: Final = 1_000
 "Ten seconds: a dozen heart beats at rest, and twice a breath, which modulates them."
 LEAST_HISTORY: Final = 100
 "With less, which is less than a heart beat, nothing is forecast."
-DELAYS: Final = (1, 2, 4, 7, 11)
-"""Of the embedding: a stretch is compared at these points before its end, as changes from there. Close together where
-the slope and its change show, and back to the rise of a pulse, which takes a tenth of a second."""
+RISE_DELAYS: Final = (1, 2, 4, 7, 11)
+BEAT_DELAYS: Final = (1, 3, 8, 18, 38)
+"""Of the embeddings: a stretch is compared at these points before its end, as changes from there. Close together where
+the slope and its change show, and back to the rise of a pulse, which takes a tenth of a second, or to what came before
+it: a rise is foreseen from there, but fewer stretches are alike for so long. The second were chosen on sample 1."""
+TAPS: Final = 5
+"As many as there are delays in each."
 STRIDE: Final = 3
 "Every third stretch is looked at: the regression makes up for most of what lies between them."
 HORIZON: Final = 8
@@ -37,6 +43,9 @@ LONGEST_STEP_S: Final = 0.1
 "Setpoints further apart than this are no stream: nothing that was learned outlives the gap."
 SAME_N: Final = 1e-4
 "Stretches that differ by no more are the same: a tenth of what the force sensor resolves."
+UNLIKE_N: Final = 0.05
+"""Where every stretch differs by more, none is like the newest. Pulses on sample 1 are missed by as much with 30 and by
+1 % more with 80 mN."""
 RIDGE: Final = 0.01
 "Share by which the regression's variances are raised: from stretches that hardly differ no dependence is learned."
 MOST_LEVERAGE: Final = 100.0
@@ -45,65 +54,53 @@ those most like it, in their standard deviations."""
 LONG_S: Final = 2.0
 SHORT_S: Final = 0.2
 "Skill is earned over the long time, a few beats, and lost over the short: a rhythm that breaks breaks at once."
-DOUBT_N: Final = 0.02
-"Before the first is judged, forecasts count as this far from the slope and no better."
-FORGIVEN_N: Final = 0.003
-"Differences as small as this neither earn trust nor lose it."
-
-TAPS: Final = 5
-"Of the embedding: as many as DELAYS."
+_LONG_SHARE: Final = GRID_S / (LONG_S + GRID_S)
+_SHORT_SHARE: Final = GRID_S / (SHORT_S + GRID_S)
 _LEAST_BYTES: Final = LEAST_HISTORY * array("d").itemsize
 _MOST_BYTES: Final = HISTORY * array("d").itemsize
-_SHORTEST: Final = DELAYS[-1] + 1 + HORIZON
-_ROWS: Final = np.array([*[-delay for delay in DELAYS], *range(HORIZON + 1)])[:, None]
-_ENDS: Final = np.arange(-1 - HORIZON, _SHORTEST - HORIZON - HISTORY - 2, -STRIDE)
-_AROUND: Final = np.concatenate([np.minimum(_ROWS - 1, -1), _ROWS + _ENDS], axis=1)
-"""Places from the end of a full history, a column for each stretch: what is compared of it, its end, what followed. The
-first column is the newest stretch, which nothing has followed yet."""
 
 
 @final
-class Skill(Value):
-    """Means of squares, N², with the newest counting most: what forecasts gained on the slope, and how far they were
-    from it."""
+class Embedding(Value):
+    """Where stretches and what followed them are in a full history.
 
-    __match_args__ = ("gained", "apart")
+    shortest  the points that a stretch takes with what followed it
+    around    (TAPS + 1 + HORIZON, n) places from the history's end, a column for each stretch: what is compared of it,
+              its end, what followed; the first is the newest stretch, which nothing has followed yet
+    """
+
+    __match_args__ = ("shortest", "around")
     __slots__ = __match_args__
 
-    def __init__(self, gained: float, apart: float) -> None:
-        self.gained: Final = gained
-        self.apart: Final = apart
+    def __init__(self, delays: tuple[int, ...]) -> None:
+        self.shortest: Final = delays[-1] + 1 + HORIZON
+        rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
+        ends = np.arange(-1 - HORIZON, self.shortest - HORIZON - HISTORY - 2, -STRIDE)
+        self.around: Final[Array] = np.concatenate([np.minimum(rows - 1, -1), rows + ends], axis=1)
 
-    def after(self, forecast_error_N: float, slope_error_N: float, time_s: float) -> "Skill":
-        """With the errors of one forecast more; `time_s` is the time constant of forgetting."""
-        share = GRID_S / (time_s + GRID_S)
-        gained = slope_error_N * slope_error_N - forecast_error_N * forecast_error_N
-        difference_N = slope_error_N - forecast_error_N
-        apart = difference_N * difference_N
-        return Skill(self.gained + share * (gained - self.gained), self.apart + share * (apart - self.apart))
 
-    @property
-    def score(self) -> float:
-        """Gained over apart. Of all mixtures, what was judged would have been met best by one with the share
-        (1 + score) / 2 of the forecast."""
-        return self.gained / (self.apart + FORGIVEN_N * FORGIVEN_N)
+RISE: Final = Embedding(RISE_DELAYS)
+BEAT: Final = Embedding(BEAT_DELAYS)
 
 
 @final
 class Guess(Value):
-    """What forecast and slope said that a point of the grid would be, N."""
+    """What both embeddings, their mixture and the slope said that a point of the grid would be, N."""
 
-    __match_args__ = ("forecast_N", "slope_N")
+    __match_args__ = ("rise_N", "beat_N", "forecast_N", "slope_N")
     __slots__ = __match_args__
 
-    def __init__(self, forecast_N: float, slope_N: float) -> None:
+    def __init__(self, rise_N: float, beat_N: float, forecast_N: float, slope_N: float) -> None:
+        self.rise_N: Final = rise_N
+        self.beat_N: Final = beat_N
         self.forecast_N: Final = forecast_N
         self.slope_N: Final = slope_N
 
 
 NOTHING_SAID: Final[tuple[Guess | None, ...]] = (None,) * JUDGED
-UNJUDGED_LONG: Final = Skill(0.0, DOUBT_N * DOUBT_N)
 UNJUDGED_SHORT: Final = Skill(0.0, 0.0)
+LOST: Final = Skill(-DOUBT_N * DOUBT_N, DOUBT_N * DOUBT_N)
+"The skill of late where nothing is like the newest stretch: what is forecast after that has to earn it again."
 
 
 @final
@@ -116,7 +113,9 @@ class Periodicity(Value):
     from_s            the point of the grid that `changes_N` are from
     changes_N         from there to itself and the points ahead; empty while nothing is forecast
     awaited           what was said of the next points of the grid, to be judged by what comes
-    long, short       the skill so far
+    long, short       the skill so far, over the slope
+    rise_missed, beat_missed
+                      means of the squares of what each embedding's forecast missed so far, N²
     """
 
     __match_args__ = (
@@ -129,6 +128,8 @@ class Periodicity(Value):
         "awaited",
         "long",
         "short",
+        "rise_missed",
+        "beat_missed",
     )
     __slots__ = __match_args__
 
@@ -141,8 +142,10 @@ class Periodicity(Value):
         from_s: float = -math.inf,
         changes_N: list[float] | None = None,
         awaited: tuple[Guess | None, ...] = NOTHING_SAID,
-        long: Skill = UNJUDGED_LONG,
+        long: Skill = UNJUDGED,
         short: Skill = UNJUDGED_SHORT,
+        rise_missed: float = DOUBT_N * DOUBT_N,
+        beat_missed: float = DOUBT_N * DOUBT_N,
     ) -> None:
         self.stamp_s: Final = stamp_s
         self.force_N: Final = force_N
@@ -153,6 +156,8 @@ class Periodicity(Value):
         self.awaited: Final = awaited
         self.long: Final = long
         self.short: Final = short
+        self.rise_missed: Final = rise_missed
+        self.beat_missed: Final = beat_missed
 
     @property
     def trust(self) -> float:
@@ -193,6 +198,8 @@ def observe(state: Periodicity, stamp_s: float, force_N: float) -> Periodicity:
             state.awaited,
             state.long,
             state.short,
+            state.rise_missed,
+            state.beat_missed,
         )
     return _advanced(state, stamp_s, force_N, count)
 
@@ -205,15 +212,31 @@ def _advanced(state: Periodicity, stamp_s: float, force_N: float, count: int) ->
     came_N = [state.force_N + share * (force_N - state.force_N) for share in shares]
     history = (state.history + array("d", came_N).tobytes())[-_MOST_BYTES:]
     long, short = state.long, state.short
+    rise_missed, beat_missed = state.rise_missed, state.beat_missed
     for came, guess in zip(came_N, state.awaited):  # noqa: B905 as below
         if guess is not None:
             forecast_error_N, slope_error_N = guess.forecast_N - came, guess.slope_N - came
-            long = long.after(forecast_error_N, slope_error_N, LONG_S)
-            short = short.after(forecast_error_N, slope_error_N, SHORT_S)
+            long = long.after(forecast_error_N, slope_error_N, _LONG_SHARE)
+            short = short.after(forecast_error_N, slope_error_N, _SHORT_SHARE)
+            rise_error_N, beat_error_N = guess.rise_N - came, guess.beat_N - came
+            rise_missed += _LONG_SHARE * (rise_error_N * rise_error_N - rise_missed)
+            beat_missed += _LONG_SHARE * (beat_error_N * beat_error_N - beat_missed)
     awaited = (*state.awaited, *NOTHING_SAID)[min(count, JUDGED) :][:JUDGED]
     # until the next forecast the last one serves, as far as it reaches
     changes = state.changes_N if stamp_s - state.from_s < (HORIZON - 1) * GRID_S else None
-    return Periodicity(stamp_s, force_N, times_s[-1], history, state.from_s, changes, awaited, long, short)
+    return Periodicity(
+        stamp_s,
+        force_N,
+        times_s[-1],
+        history,
+        state.from_s,
+        changes,
+        awaited,
+        long,
+        short,
+        rise_missed,
+        beat_missed,
+    )
 
 
 def foreseen(state: Periodicity, slope_N_s: float) -> Periodicity:
@@ -221,12 +244,26 @@ def foreseen(state: Periodicity, slope_N_s: float) -> Periodicity:
     which is extrapolated otherwise, say, to be judged by. Takes several times as long as a plan."""
     if state.from_s >= state.time_s or len(state.history) < _LEAST_BYTES:
         return state
-    changes = _search(np.frombuffer(state.history))
+    history = np.frombuffer(state.history)
+    rise, rise_unlike = _search(history, RISE)
+    beat, beat_unlike = _search(history, BEAT)
+    changes: list[float] = []
     said: Guess | None = None
-    if changes:
+    short = LOST
+    if rise or beat:
+        short = state.short
+        # for one that finds nothing alike the other speaks
+        rise, beat = rise or beat, beat or rise
+        rise_weight = (state.rise_missed + rise_unlike) ** -2
+        share = rise_weight / (rise_weight + (state.beat_missed + beat_unlike) ** -2)
+        changes = [beat[place] + share * (rise[place] - beat[place]) for place in range(len(rise))]
         since_s = state.stamp_s - state.time_s
-        forecast = state.force_N + changes[JUDGED] - changes[1] * since_s / GRID_S
-        said = Guess(forecast, state.force_N + slope_N_s * (JUDGED * GRID_S - since_s))
+        said = Guess(
+            _ahead_N(state.force_N, rise, since_s),
+            _ahead_N(state.force_N, beat, since_s),
+            _ahead_N(state.force_N, changes, since_s),
+            state.force_N + slope_N_s * (JUDGED * GRID_S - since_s),
+        )
     return Periodicity(
         state.stamp_s,
         state.force_N,
@@ -236,7 +273,9 @@ def foreseen(state: Periodicity, slope_N_s: float) -> Periodicity:
         changes,
         (*state.awaited[:-1], said),
         state.long,
-        state.short,
+        short,
+        state.rise_missed,
+        state.beat_missed,
     )
 
 
@@ -250,20 +289,30 @@ def forecast_N(state: Periodicity, begins_s: float, after_s: list[float]) -> lis
     return [base_N + at_step((since_s + begins_s + later_s) / GRID_S, changes) for later_s in after_s]
 
 
-def _search(history: Array) -> list[float]:
-    """The changes from the newest point of the grid to itself and the next HORIZON; empty where nothing is like it.
+def _ahead_N(force_N: float, changes_N: list[float], since_s: float) -> float:
+    """JUDGED points ahead, along changes from a point `since_s` before the newest force."""
+    return force_N + changes_N[JUDGED] - changes_N[1] * since_s / GRID_S
+
+
+def _search(history: Array, embedding: Embedding) -> tuple[list[float], float]:
+    """The changes from the newest point of the grid to itself and the next HORIZON, empty where nothing is like it; and
+    how far the stretch most like the newest is from it: the mean square of a point, N², SAME_N's at least.
 
     What followed a stretch is regressed on 1 and on how the stretch differs from the newest. The newest does not differ
     from itself, so that the regression's constant is its forecast.
     """
-    changes = history[_AROUND[:, : (len(history) - _SHORTEST) // STRIDE + 2]]
+    changes = history[embedding.around[:, : (len(history) - embedding.shortest) // STRIDE + 2]]
     changes -= changes[TAPS]
     before = changes[:TAPS]
     before -= before[:, :1].copy()
-    weight = (np.add.reduce(before * before) + TAPS * SAME_N**2) ** -2
-    weight[0] = 0.0
+    apart = np.add.reduce(before * before) + TAPS * SAME_N**2
+    apart[0] = math.inf
+    weight = apart**-2
     changes[TAPS] = 1.0
-    return _constants((changes[: TAPS + 1] * weight @ changes.T).tolist())
+    unlike = float(apart.min()) / TAPS
+    if unlike > UNLIKE_N * UNLIKE_N:
+        return [], unlike
+    return _constants((changes[: TAPS + 1] * weight @ changes.T).tolist()), unlike
 
 
 def _constants(rows: list[list[float]]) -> list[float]:

@@ -14,14 +14,16 @@ from tormagd.control.estimate import Estimate, Handle
 from tormagd.control.governor import GovernorState, TimedSetpoint
 from tormagd.control.handle import HandleWatch
 from tormagd.control.homing import Homing
-from tormagd.control.periodicity import Guess, Periodicity, Skill
+from tormagd.control.periodicity import Guess, Periodicity
 from tormagd.control.pid import PidState
 from tormagd.control.plan import Outside, Plan, PlanState, Shown
 from tormagd.control.plausible import Leap
 from tormagd.control.remembered import Remembered
+from tormagd.control.restraint import Restraint
 from tormagd.control.sensor import Past, Sensor
 from tormagd.control.sensor_zero import Level, SensorZero
 from tormagd.control.sight import Sight
+from tormagd.control.skill import Skill
 from tormagd.control.slow_friction import SlowFriction
 from tormagd.control.step import Acted, StepOutput, StepState
 from tormagd.control.trajectory import Expected, Reference
@@ -60,8 +62,8 @@ KNOWN = kinds(
         Reference,
         Expected,
     ),
-    *(PidState, Sight, Leap, Homing, PlanState, GovernorState, Periodicity, Skill, Guess, Plan, Outside, Shown),
-    *(DeviceFit, Sensor, Past, SlowFriction, SensorZero, Level, HandleWatch, Remembered),
+    *(PidState, Sight, Leap, Homing, PlanState, GovernorState, Periodicity, Skill, Guess, Restraint, Plan),
+    *(Outside, Shown, DeviceFit, Sensor, Past, SlowFriction, SensorZero, Level, HandleWatch, Remembered),
     *(Conditions, DeviceMode, Switches),
 )
 "All that the core's states consist of."

@@ -1,0 +1,39 @@
+"""How much better one of two guesses at a force was than the other, lately."""
+
+from typing import Final, final
+
+from firmware_protocol.value import Value
+
+DOUBT_N: Final = 0.02
+"Before the first is judged, the two count as this far apart and equally good."
+FORGIVEN_N: Final = 0.003
+"Differences as small as this neither earn trust nor lose it."
+
+
+@final
+class Skill(Value):
+    """Means of squares, N², with the newest counting most: what one guess gained on the other, and how far apart they
+    were."""
+
+    __match_args__ = ("gained", "apart")
+    __slots__ = __match_args__
+
+    def __init__(self, gained: float, apart: float) -> None:
+        self.gained: Final = gained
+        self.apart: Final = apart
+
+    def after(self, error_N: float, other_error_N: float, share: float) -> "Skill":
+        """With the errors of one guess and of the other once more, which count for so large a share of all."""
+        gained = other_error_N * other_error_N - error_N * error_N
+        difference_N = other_error_N - error_N
+        apart = difference_N * difference_N
+        return Skill(self.gained + share * (gained - self.gained), self.apart + share * (apart - self.apart))
+
+    @property
+    def score(self) -> float:
+        """Gained over apart. Of all mixtures, what was judged would have been met best by one with the share
+        (1 + score) / 2 of the first guess."""
+        return self.gained / (self.apart + FORGIVEN_N * FORGIVEN_N)
+
+
+UNJUDGED: Final = Skill(0.0, DOUBT_N * DOUBT_N)
