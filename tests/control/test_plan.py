@@ -14,7 +14,8 @@ from tormagd.control.core import Core
 from tormagd.control.device_fit import DeviceFit
 from tormagd.control.estimate import Estimate, Handle
 from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import LAW_SHARE, MEASURED_S, MOST_LAG_S, NOTHING_SHOWN, Outside, Plan, PlanState, Shown
+from tormagd.control.lateness import MEASURED_S, MOST_LAG_S, Lateness
+from tormagd.control.plan import LAW_SHARE, NOTHING_SHOWN, Outside, Plan, PlanState, Shown
 from tormagd.inverse.solution import FieldSolution, Reach
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
 from tormagd.safety.codes import Limit
@@ -175,7 +176,7 @@ def swung(core: Core, late_s: float, *, is_known: bool, seconds: float = 10.0) -
     for tick in range(1, round(seconds / PERIOD_S)):
         now_s = tick * PERIOD_S
         # it starts as much sooner as has been learned, and is measured before the plan
-        come_s = now_s - MEASURED_S - late_s + state.shown.lag_s
+        come_s = now_s - MEASURED_S - late_s + state.shown.lateness.lag_s
         side_mm_s = (gap_mm(come_s) - gap_mm(come_s - 1e-3)) / 2e-3
         # the handle rests: the trim learns nothing
         estimate = moving(gap_mm(come_s), left_mm_s=side_mm_s, right_mm_s=side_mm_s, handle=RESTING.handle)
@@ -188,7 +189,7 @@ def swung(core: Core, late_s: float, *, is_known: bool, seconds: float = 10.0) -
 @pytest.mark.parametrize(("late_s", "learned_s"), [(0.015, 0.017), (0.0, 0.002), (-0.01, 0.0), (0.06, MOST_LAG_S)])
 def test_a_lag_is_learned_where_what_comes_is_known(core, late_s: float, learned_s: float) -> None:
     """And half a plan's period besides: by so much the governor's gap goes before what is previewed."""
-    assert swung(core, late_s, is_known=True).shown.lag_s == pytest.approx(learned_s, abs=1e-3)
+    assert swung(core, late_s, is_known=True).shown.lateness.lag_s == pytest.approx(learned_s, abs=1e-3)
 
 
 def test_a_gap_on_its_way_after_a_jump_is_not_late(core) -> None:
@@ -199,15 +200,15 @@ def test_a_gap_on_its_way_after_a_jump_is_not_late(core) -> None:
         setpoint = TimedSetpoint(1.5, now_s, 0.1, preview_N=(1.5,) * 40, preview_dt_s=2e-3)
         travelling = moving(85.0, left_mm_s=-15.0, right_mm_s=-15.0, handle=RESTING.handle)
         state = core.planner.plan(state, now_s, setpoint, travelling)
-    assert state.shown.lag_s == 0.0
+    assert state.shown.lateness.lag_s == 0.0
 
 
 def test_without_a_preview_a_lag_is_learned_once_the_swing_is_foreseen(core) -> None:
     early = swung(core, 0.015, is_known=False, seconds=1.0)
-    assert (early.plan.foresight, early.shown.lag_s) == (0.0, 0.0)
+    assert (early.plan.foresight, early.shown.lateness.lag_s) == (0.0, 0.0)
     late = swung(core, 0.015, is_known=False, seconds=20.0)
     assert late.plan.foresight > 0.9
-    assert late.shown.lag_s == pytest.approx(0.015, abs=2e-3)
+    assert late.shown.lateness.lag_s == pytest.approx(0.015, abs=2e-3)
 
 
 def learned(core: Core, seconds: float, estimate: Estimate, shown: Shown = NOTHING_SHOWN) -> PlanState:
@@ -225,9 +226,9 @@ def learned(core: Core, seconds: float, estimate: Estimate, shown: Shown = NOTHI
     ids=["at rest", "sliding", "a sensor that is not believed"],
 )
 def test_what_is_known_of_the_lag_outlasts_what_the_sensor_teaches(core, estimate: Estimate, is_doubted: bool) -> None:
-    shown = learned(core, 1.2, estimate, Shown(lag_s=0.02)).shown
+    shown = learned(core, 1.2, estimate, Shown(lateness=Lateness(0.02))).shown
     assert shown.sensor.is_doubted == is_doubted
-    assert (shown.read, shown.lag_s) == (299, 0.02)
+    assert (shown.read, shown.lateness.lag_s) == (299, 0.02)
 
 
 def test_the_device_is_learned_from_measured_over_predicted_force(core) -> None:
@@ -397,14 +398,16 @@ def test_nan_never_travels(core, history: list[tuple[float, TimedSetpoint | None
         last, state = state, core.planner.plan(state, now_s, setpoint, heard)
         plan = state.plan
         numbers = (plan.governed_N, plan.field_mT, plan.gap_mm, plan.gap_speed_mm_s, plan.confidence, state.trim)
-        assert all(math.isfinite(value) for value in (*numbers, plan.gap_acceleration_mm_s2, state.shown.lag_s))
+        assert all(
+            math.isfinite(value) for value in (*numbers, plan.gap_acceleration_mm_s2, state.shown.lateness.lag_s)
+        )
         assert plan.predicted_N is None or math.isfinite(plan.predicted_N)
         assert 45.0 <= plan.gap_mm <= 95.0
         assert CONFIG.trim.least <= state.device.scale <= CONFIG.trim.most
         assert all(math.isfinite(getattr(state.device, name)) for name in DeviceFit.__match_args__)
         assert plan.governed_N <= max(core.scene.force.most_N, state.device.force_N(core.planner.portrait.least_N))
         assert plan.gap_mm >= plan.least_gap_mm
-        assert 0.0 <= state.shown.lag_s <= MOST_LAG_S
+        assert 0.0 <= state.shown.lateness.lag_s <= MOST_LAG_S
         assert plan.number == last.plan.number + 1
 
 

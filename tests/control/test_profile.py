@@ -9,13 +9,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tormagd.control.device_fit import OFFSET_SD_N, SCALE_SD, DeviceFit
-from tormagd.control.plan import MOST_LAG_S, Shown
+from tormagd.control.lateness import MOST_LAG_S, Lateness
+from tormagd.control.plan import Shown
 from tormagd.control.profile import MAX_BYTES, ZERO_LASTS_S, Profile, ProfileError, profile_of, read_profile
 from tormagd.control.sensor_zero import TARED, SensorZero
 from tormagd.control.slow_friction import SlowFriction
 
 OF = {"serial_number": 7, "insert": "MRE-50-40", "model": "ab" * 32}
-KNOWN = Shown(DeviceFit(1.2, -0.05, 1e-4, -1e-4, 4e-4), slow=SlowFriction(1.1, 0.6), zero=SensorZero(0.07), lag_s=0.012)
+KNOWN = Shown(
+    DeviceFit(1.2, -0.05, 1e-4, -1e-4, 4e-4),
+    slow=SlowFriction(1.1, 0.6),
+    zero=SensorZero(0.07),
+    lateness=Lateness(0.012),
+)
 KEPT = profile_of(KNOWN, saved_ns=10**18, **OF)  # type: ignore[arg-type]
 
 
@@ -28,7 +34,7 @@ def test_what_was_learned_is_there_again_and_less_sure() -> None:
     assert shown.device.force_N(1.5) == KNOWN.device.force_N(1.5)
     assert shown.slow.factor_at(0.0) == KNOWN.slow.factor_at(0.0)
     assert shown.zero.zero_N == 0.07
-    assert shown.lag_s == 0.012
+    assert shown.lateness.lag_s == 0.012
     assert KNOWN.device.deviation_N(2.0) < shown.device.deviation_N(2.0) < 0.6 * DeviceFit().deviation_N(2.0)
 
 
@@ -69,7 +75,7 @@ def test_of_a_profile_from_before_lateness_was_kept_none_is_known() -> None:
     fields = json.loads(msgspec.json.encode(KEPT))
     del fields["lag_s"]
     shown = read_profile(json.dumps(fields).encode(), **OF).shown(10**18)  # type: ignore[arg-type]
-    assert shown == again(KEPT).shown(10**18).replaced(lag_s=0.0)
+    assert shown == again(KEPT).shown(10**18).replaced(lateness=Lateness())
 
 
 @given(data=st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
@@ -98,8 +104,8 @@ def test_every_fit_can_be_kept(
     scale: float, scale_variance: float, offset_N: float, offset_variance: float, zero_N: float, lag_s: float
 ) -> None:
     fit = DeviceFit(scale, offset_N, scale_variance, 0.0, offset_variance)
-    kept = profile_of(Shown(fit, zero=SensorZero(zero_N), lag_s=lag_s), saved_ns=0, **OF)  # type: ignore[arg-type]
+    kept = profile_of(Shown(fit, zero=SensorZero(zero_N), lateness=Lateness(lag_s)), saved_ns=0, **OF)  # type: ignore[arg-type]
     shown = again(kept).shown(0)
     assert shown.device.force_N(1.0) == pytest.approx(fit.force_N(1.0))
-    assert shown.lag_s == lag_s
+    assert shown.lateness.lag_s == lag_s
     assert math.isfinite(shown.device.surely_within_N(2.5))

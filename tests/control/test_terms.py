@@ -11,6 +11,7 @@ from tormagd.control.core import Core, build_core
 from tormagd.control.device_fit import UNSEEN, DeviceFit, observe
 from tormagd.control.estimate import Estimate, Handle
 from tormagd.control.governor import TimedSetpoint
+from tormagd.control.lateness import Lateness
 from tormagd.control.periodicity import NOTHING_LEARNED
 from tormagd.control.plan import Plan, PlanState, Shown
 from tormagd.control.slow_friction import NOTHING_SLOW
@@ -186,7 +187,7 @@ def late_s(core: Core) -> float:
         preview = tuple(force_N + 0.5 * 0.002 * step for step in range(1, 35))
         setpoint = TimedSetpoint(force_N, now_s, 0.1, preview_N=preview, preview_dt_s=0.002)
         state = core.planner.plan(state, now_s, setpoint, estimate)
-    return state.shown.lag_s
+    return state.shown.lateness.lag_s
 
 
 def test_without_the_lag_late_carriages_stay_late() -> None:
@@ -198,7 +199,7 @@ def test_without_the_lag_what_is_known_of_it_is_not_looked_at() -> None:
     ahead = {"preview_N": tuple(1.0 + 0.1 * (step > 15) for step in range(35)), "preview_dt_s": 0.002}
 
     def gap_mm(core: Core, lag_s: float) -> float:
-        state = core.planner.start(0.0).replaced(shown=Shown(lag_s=lag_s))
+        state = core.planner.start(0.0).replaced(shown=Shown(lateness=Lateness(lag_s)))
         return told(core, state, 1.0, **ahead).plan.gap_mm
 
     assert gap_mm(core_without(), 0.02) != gap_mm(core_without(), 0.0)
@@ -243,5 +244,5 @@ def test_learning_can_be_stopped_for_a_measurement() -> None:
     for _ in range(50):
         kept = told(frozen, kept, 1.4)
     assert (kept.device, kept.shown.slow.factor) == (state.device, state.shown.slow.factor)
-    assert kept.shown.lag_s == state.shown.lag_s
+    assert kept.shown.lateness.lag_s == state.shown.lateness.lag_s
     assert kept.shown.read == state.shown.read + 50

@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 
 from tormagd.control.device_fit import DeviceFit
+from tormagd.control.lateness import Lateness
 from tormagd.control.plan import NOTHING_SHOWN, Shown
 from tormagd.control.profile import ProfileError, profile_of
 from tormagd.control.sensor import Sensor
 from tormagd.daemon.profiles import ProfileFolder, Profiles
 
 MODEL = "ab" * 32
-STRONG = Shown(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4), lag_s=0.02)
+STRONG = Shown(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4), lateness=Lateness(0.02))
 
 
 class Rig:
@@ -63,7 +64,7 @@ def test_what_is_learned_while_driven_is_there_after_a_restart(tmp_path: Path) -
         again = Rig(tmp_path / "profiles")
         again.profiles.look(7, is_driven=False)
         await again.settled()
-        assert (again.shown.device.scale, again.shown.lag_s) == (1.3, 0.02)
+        assert (again.shown.device.scale, again.shown.lateness.lag_s) == (1.3, 0.02)
         report = again.profiles.report()
         assert report.is_used
         assert report.age_s is not None
@@ -74,7 +75,10 @@ def test_what_is_learned_while_driven_is_there_after_a_restart(tmp_path: Path) -
 
 @pytest.mark.parametrize(
     ("added", "is_kept"),
-    [({"device": DeviceFit(1.31, 0.02, 1e-4, 0.0, 1e-4)}, b'"scale": 1.31'), ({"lag_s": 0.025}, b'"lag_s": 0.025')],
+    [
+        ({"device": DeviceFit(1.31, 0.02, 1e-4, 0.0, 1e-4)}, b'"scale": 1.31'),
+        ({"lateness": Lateness(0.025)}, b'"lag_s": 0.025'),
+    ],
 )
 def test_a_profile_that_nothing_was_added_to_does_not_get_younger(
     tmp_path: Path, added: dict[str, object], is_kept: bytes

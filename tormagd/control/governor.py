@@ -37,8 +37,8 @@ STARTING_S: Final = 0.025
 """Time constant with which the gap comes to another speed where its carriages are not late. Chosen on sample 1 with its
 inertia, 1.7 and 2.5 times of it: a finger's pulse, which is too steep (AAC249), is missed by 10.5, 10.1 and 10.0 mN
 with 20, 25 and 30 ms, palpation by 318 each."""
-_LEADS: Final = [STARTING_S / (after_s - before_s) for before_s, after_s in pairwise(WAY_S)]
-"Of how much the gap wanted changes to the next point, so much is what its speed takes of the carriages."
+_CHANGES_PER_S: Final = [1.0 / (after_s - before_s) for before_s, after_s in pairwise(WAY_S)]
+"From how much the gap wanted changes to the next point to its speed."
 FLATTEST_N_MM: Final = 1e-3
 "A force that hardly depends on the gap counts as if it did by this much."
 OUTRUN_N: Final = 0.02
@@ -92,8 +92,9 @@ class TimedSetpoint(Value):
 class GovernorState(Value):
     """What the governor remembers between plans: `asked_N` is the force that the last one asked of the device, and
     `above_N` how far that was above the least that the device then seemed to make; where it was known or foreseen what
-    comes the carriages were sent to that of `drive_N`; `holder` whose setpoints it followed; while `is_passing` the
-    force is on its way to those of a new holder; `restraint` begins with each stream that nothing announces."""
+    comes the carriages were sent to that of `drive_N`; `expected_N` is the force by now on the way of a preview;
+    `holder` whose setpoints it followed; while `is_passing` the force is on its way to those of a new holder;
+    `restraint` begins with each stream that nothing announces."""
 
     __match_args__ = (
         "time_s",
@@ -107,6 +108,7 @@ class GovernorState(Value):
         "above_N",
         "drive_N",
         "restraint",
+        "expected_N",
     )
     __slots__ = __match_args__
 
@@ -123,10 +125,12 @@ class GovernorState(Value):
         above_N: float = math.inf,
         drive_N: float | None = None,
         restraint: Restraint | None = None,
+        expected_N: float | None = None,
     ) -> None:
         self.time_s: Final = time_s
         self.above_N: Final = above_N
         self.drive_N: Final = drive_N
+        self.expected_N: Final = expected_N
         self.restraint: Final = restraint
         self.asked_N: Final = asked_N
         self.stamp_s: Final = stamp_s
@@ -225,6 +229,7 @@ class Governor:
         soon_s = max(age, 0.0)
         is_passing = is_new_holder or state.is_passing
         drive_N: float | None = None
+        expected_N: float | None = None
         # what it passes to is what is asked, not what the gap can make of it
         asks_N = force if is_passing else state.asked_N
         sent_N = asks_N if is_passing or state.drive_N is None else state.drive_N
@@ -235,6 +240,10 @@ class Governor:
             periodicity, foresight = NOTHING_LEARNED, 1.0
             wanted_N = _previewed_N(setpoint, soon_s + lag_s, least, most)
             path, drive_N = self._pursued_N(asks_N, sent_N, elapsed_s, wanted_N, device, lag_s)
+            # the path sets out sooner by as much as the carriages come later
+            expected_N = asks_N if is_passing or state.expected_N is None else state.expected_N
+            if elapsed_s > 0.0:
+                expected_N += elapsed_s / (lag_s + elapsed_s) * (path[0] - expected_N)
         else:
             periodicity = observe(learned, setpoint.stamp_s, asked_N) if self._has_forecast else NOTHING_LEARNED
             # one that has fallen silent for longer than a stream may is not believed to go on as it did
@@ -248,8 +257,8 @@ class Governor:
             path = [force_N + held_back_N for force_N in path]
         within = [min(max(force_N, least), most) for force_N in path]
         governed = min(max(force + held_back_N, least), most)
-        if drive_N is not None:
-            governed = within[0]
+        if expected_N is not None:
+            governed = min(max(expected_N, least), most)
         elif foresight > 0.0 and not is_passing and self._is_near(sent_N, within[-1], device):
             pursued, drive_N = self._pursued_N(asks_N, sent_N, elapsed_s, within, device, lag_s)
             for place, force_N in enumerate(pursued):
@@ -265,7 +274,7 @@ class Governor:
             is_passing = abs(left_N) > step_N
             if is_passing:
                 governed = state.asked_N + math.copysign(step_N, left_N)
-                within, drive_N = [governed] * len(PATH_S), None
+                within, drive_N, expected_N = [governed] * len(PATH_S), None, None
                 reasons, foresight = (*reasons, Limit.TAKEOVER), 0.0
         rendered = GovernorState(
             now_s,
@@ -279,6 +288,7 @@ class Governor:
             max(within[0] - lowest, 0.0),
             drive_N,
             restraint,
+            expected_N,
         )
         return rendered, Governed(governed, within, age, reasons, foresight)
 
@@ -294,24 +304,24 @@ class Governor:
         """The forces at PATH_S on the way of the gap that misses least of those wanted (n), at WAY_S, and the one that
         the carriages are sent to. `elapsed_s` ago those were `asks_N` and `sent_N`.
 
-        A gap comes to another speed only gradually: it is taken to follow its carriages with a time constant. So those
-        are wanted ahead of it by what its speed takes in STARTING_S; for what a device is later than that, `lag_s`, the
-        forces wanted are later ones, because a slope does not reach so far.
+        A gap comes to another speed only gradually: it is taken to follow its carriages with a time constant, which is
+        STARTING_S and by how much a device is later, `lag_s`. So those are wanted ahead of it by what its speed takes
+        in that time. As a slope does not reach so far, the forces wanted of a late device are later ones, too.
         """
         portrait = self._portrait
+        late_s = STARTING_S + lag_s
         wanted_mm: list[float] = []
         weights: list[float] = []
         for place, force_N in enumerate(wanted_N):
             gap_mm, slope_N_mm = portrait.gap_and_slope_at(device.model_N(force_N))
             slope_N_mm = max(slope_N_mm, FLATTEST_N_MM)
             if place:
-                wanted_mm[place - 1] += _LEADS[place - 1] * (gap_mm - wanted_mm[place - 1])
+                wanted_mm[place - 1] += late_s * _CHANGES_PER_S[place - 1] * (gap_mm - wanted_mm[place - 1])
             wanted_mm.append(gap_mm)
             weights.append(WAY_LASTS_S[place] * slope_N_mm * slope_N_mm)
         sent_mm, gap_mm = portrait.gap_mm_at(device.model_N(sent_N)), portrait.gap_mm_at(device.model_N(asks_N))
         way_mm = nearest_way_mm(sent_mm, elapsed_s, WAY_S, wanted_mm, weights, self._gap_speed_mm_s, len(PATH_S))
         forces_N: list[float] = []
-        late_s = STARTING_S + lag_s
         left, left_in_a_step = math.exp(-elapsed_s / late_s), math.exp(-PATH_STEP_S / late_s)
         for drive_mm in way_mm:
             gap_mm = drive_mm + (gap_mm - drive_mm) * left
@@ -338,6 +348,7 @@ class Governor:
             state.above_N,
             state.drive_N,
             state.restraint,
+            state.expected_N,
         )
 
     def _ramp(

@@ -12,6 +12,7 @@ from tormagd.control.device_fit import UNSEEN, DeviceFit, observe
 from tormagd.control.estimate import Estimate
 from tormagd.control.governor import PATH_S, Governed, Governor, GovernorState, TimedSetpoint
 from tormagd.control.handle import UNHEARD, HandleWatch
+from tormagd.control.lateness import ON_TIME, Lateness, found, surprised
 from tormagd.control.portrait import FieldOfGap, LawOfField, Portrait
 from tormagd.control.remembered import NOTHING_REMEMBERED, Remembered, Remembering
 from tormagd.control.sensor import UNJUDGED, Sensor, judge
@@ -48,18 +49,8 @@ learned sooner, in a fifth of its time at twice as much. So noise alone hardly m
 LEAST_ADAPTS_IN_S: Final = 0.04
 BEYOND_MM: Final = 2.0
 "Beyond the closed end, where a carriage may overrun, the model is asked no further."
-LAG_TIME_S: Final = 0.4
-MOST_LAG_S: Final = 0.03
-"""The most with which nothing was missed more than before a gap's start was planned for, on sample 1 with its inertia
-1.7 and 2.5 times of it: a finger's pulse (AAC249, 400 ms of preview, from a lag of none) by 13.2 and 16.3 mN, that of
-`make run` by 4.0 and 8.3. 45 ms leave 12.9 and 16.3, 3.7 and 9.6; on sample 2, too, the second is worse."""
-MEASURED_S: Final = 0.0015
-"""So long before a plan its carriages were measured. Taken for lateness, that was learned without end: 20 ms by sample
-1 in 16 s of the first finger pressure. Chosen there: with 1 ms it went on growing."""
 LEAST_FORESIGHT: Final = 0.5
-"With less the lag is hardly made up for, and teaching it would have no end."
-LEAST_TRAVEL_MM_S: Final = 10.0
-"Slower carriages teach the lag less."
+"With less what is planned leaps, and no carriages are on time."
 
 # looking a member up takes longer than comparing it
 _INSIDE: Final = Reach.INSIDE
@@ -150,10 +141,10 @@ class Plan(Value):
 @final
 class Shown(Value):
     """What the device has shown of itself by its readings up to number `read`, taken at `read_s`, at speed and at a
-    creep, whether its sensor is believed, what it reads without a force, and the limits that come of it. `lag_s`, 0 to
-    MOST_LAG_S, is how late its carriages are; `surprise_N` by how much the newest readings were more than expected."""
+    creep, whether its sensor is believed, what it reads without a force, and the limits that come of it; how late its
+    carriages are; and by how much the newest readings were more than expected, `surprise_N`."""
 
-    __match_args__ = ("device", "sensor", "read", "read_s", "limits", "slow", "zero", "lag_s", "surprise_N")
+    __match_args__ = ("device", "sensor", "read", "read_s", "limits", "slow", "zero", "lateness", "surprise_N")
     __slots__ = __match_args__
 
     def __init__(
@@ -165,11 +156,11 @@ class Shown(Value):
         limits: tuple[Limit, ...] = (),
         slow: SlowFriction = NOTHING_SLOW,
         zero: SensorZero = TARED,
-        lag_s: float = 0.0,
+        lateness: Lateness = ON_TIME,
         surprise_N: float = 0.0,
     ) -> None:
         self.device: Final = device
-        self.lag_s: Final = lag_s
+        self.lateness: Final = lateness
         self.surprise_N: Final = surprise_N
         self.slow: Final = slow
         self.zero: Final = zero
@@ -294,9 +285,8 @@ class Planner:
         if self._has_creep:
             sliding_mm_s = MOVING_MM_S if estimate is None else estimate.handle.sliding_mm_s
             device = device.times(shown.slow.factor_at(sliding_mm_s))
-        lag_s = shown.lag_s if self._has_lag else 0.0
+        lag_s = shown.lateness.lag_s if self._has_lag else 0.0
         governor, governed = self._governor.govern(state.governor, now_s, setpoint, device, lag_s)
-        shown = self._learn_lag(shown, now_s - state.plan.time_s, estimate, remembered, governed, device)
         is_meant = setpoint is not None and _STALE not in governed.limits
         curve = self._only_curve
         displacement_mm, rate_mm_s = curve.displacement_mm, curve.rate_mm_s
@@ -335,6 +325,7 @@ class Planner:
             # where nobody asks for a force, none is held back for being too low
             if reached not in limits and (is_meant or reached is Limit.F_MAX):
                 limits = (*limits, reached)
+        shown = self._timed(shown, now_s - state.plan.time_s, estimate, governed.foresight, gap_mm)
         speed_mm_s, acceleration_mm_s2 = self._motion_ahead(governed, device)
         plan = Plan(
             number=state.plan.number + 1,
@@ -418,7 +409,7 @@ class Planner:
             return shown
         if now_s - estimate.sensed_s > self._unsensed_s:
             return shown  # its force is an old one
-        slow, zero, lag_s = shown.slow, shown.zero, shown.lag_s
+        slow, zero, lateness = shown.slow, shown.zero, shown.lateness
         if self._has_creep:
             slow = slow.followed(model_N, estimate.handle_mm)
         direction, rate_mm_s = estimate.handle.turn.direction, abs(estimate.handle.rate_mm_s)
@@ -441,7 +432,7 @@ class Planner:
                 is_lesson = is_zero_known and (is_mobilised or reading_N > expected_N)
                 if expected_N > LEAST_EXPECTED_N and is_lesson:
                     slow = slow.observed(shown.device, rate_mm_s, reading_N, elapsed_s)
-            return Shown(shown.device, shown.sensor, estimate.number, now_s, shown.limits, slow, zero, lag_s)
+            return Shown(shown.device, shown.sensor, estimate.number, now_s, shown.limits, slow, zero, lateness)
         # the sensor is judged by all that an elastomer may do, whatever this one is thought to remember
         sensor = judge(
             shown.sensor,
@@ -467,12 +458,12 @@ class Planner:
         )
         limits: tuple[Limit, ...] = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
         if sensor.is_doubted:
-            return Shown(UNSEEN, sensor, estimate.number, now_s, (Limit.SENSOR, *limits), NOTHING_SLOW, zero, lag_s)
+            return Shown(UNSEEN, sensor, estimate.number, now_s, (Limit.SENSOR, *limits), NOTHING_SLOW, zero, lateness)
         if not is_zero_known:
             limits = (Limit.OFFSET_UNKNOWN, *limits)
-            return Shown(shown.device, sensor, estimate.number, now_s, limits, shown.slow, zero, lag_s)
+            return Shown(shown.device, sensor, estimate.number, now_s, limits, shown.slow, zero, lateness)
         if not self._fits:
-            return Shown(shown.device, sensor, estimate.number, now_s, limits, slow, zero, lag_s)
+            return Shown(shown.device, sensor, estimate.number, now_s, limits, slow, zero, lateness)
         error_N = reading_N - shown.device.force_N(model_N)
         surprise_N = shown.surprise_N + elapsed_s / (SURPRISE_S + elapsed_s) * (error_N - shown.surprise_N)
         adapts_in_s = self._adapts_in_s / (1.0 + (surprise_N / SURPRISE_N) ** 2)
@@ -490,7 +481,7 @@ class Planner:
         slow = slow.beside(shown.device.force_N(model_N), device.force_N(model_N))
         if is_held:
             limits = (Limit.TRIM, *limits)
-        return Shown(device, sensor, estimate.number, now_s, limits, slow, zero, lag_s, surprise_N)
+        return Shown(device, sensor, estimate.number, now_s, limits, slow, zero, lateness, surprise_N)
 
     def _lawful_mT(self, solution: FieldSolution, wanted_N: float) -> float:
         """The search's field, no further than LAW_SHARE from the force law's."""
@@ -499,28 +490,19 @@ class Planner:
         law_mT = self._law.field_mT(wanted_N)
         return min(max(solution.field_mT, (1.0 - LAW_SHARE) * law_mT), (1.0 + LAW_SHARE) * law_mT)
 
-    def _learn_lag(
-        self,
-        shown: Shown,
-        elapsed_s: float,
-        estimate: Estimate | None,
-        remembered: Remembered,
-        governed: Governed,
-        device: DeviceFit,
+    def _timed(
+        self, shown: Shown, elapsed_s: float, estimate: Estimate | None, foresight: float, planned_mm: float
     ) -> Shown:
-        """How far the gap is behind over how fast it moves: a motor weaker than it is believed to be comes late."""
-        if not self._learns_lag or estimate is None or not estimate.is_homed or governed.foresight < LEAST_FORESIGHT:
+        """What the device has shown, and of how late its carriages are behind this gap."""
+        if not self._learns_lag:
             return shown
-        # the gap that would do the same without the field's lag
-        gap_mm = self._field.gap_mm(remembered.field_mT - remembered.lag_mT)
-        behind_mm = self.portrait.gap_mm_at(device.model_N(governed.force_N)) - gap_mm
-        if abs(behind_mm) > MOST_LAG_S * self._fastest_mm_s:
-            return shown  # on its way after a jump
-        travel_mm_s = estimate.left_mm_s + estimate.right_mm_s
-        behind_mm -= travel_mm_s * MEASURED_S
-        late_s = behind_mm * travel_mm_s / (travel_mm_s * travel_mm_s + LEAST_TRAVEL_MM_S * LEAST_TRAVEL_MM_S)
-        elapsed_s = max(0.0, elapsed_s)
-        lag_s = min(max(shown.lag_s + elapsed_s / (LAG_TIME_S + elapsed_s) * late_s, 0.0), MOST_LAG_S)
+        if estimate is None or not estimate.is_homed or foresight < LEAST_FORESIGHT:
+            lateness = surprised(shown.lateness)
+        else:
+            speed_mm_s = estimate.left_mm_s + estimate.right_mm_s
+            lateness = found(shown.lateness, elapsed_s, planned_mm, estimate.gap_mm, speed_mm_s, self._fastest_mm_s)
+        if lateness is shown.lateness:
+            return shown
         return Shown(
             shown.device,
             shown.sensor,
@@ -529,7 +511,7 @@ class Planner:
             shown.limits,
             shown.slow,
             shown.zero,
-            lag_s,
+            lateness,
             shown.surprise_N,
         )
 

@@ -11,7 +11,8 @@ import msgspec
 from msgspec import Meta
 
 from tormagd.control.device_fit import OFFSET_SD_N, SCALE_SD, DeviceFit
-from tormagd.control.plan import MOST_LAG_S, Shown
+from tormagd.control.lateness import MOST_LAG_S, Lateness
+from tormagd.control.plan import Shown
 from tormagd.control.sensor_zero import MOST_ZERO_N, TARED, SensorZero
 from tormagd.control.slow_friction import LEAST, MOST, SlowFriction
 
@@ -33,7 +34,7 @@ class ProfileError(ValueError):
 
 class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A device, by its serial number, with an insert, as a model sees it. `saved_ns` is CLOCK_REALTIME; the others are
-    those of `DeviceFit`, `SlowFriction`, `SensorZero` and `Shown`, with standard deviations for variances. Profiles
+    those of `DeviceFit`, `SlowFriction`, `SensorZero` and `Lateness`, with standard deviations for variances. Profiles
     from before lateness was kept have no `lag_s`: none is known of the device."""
 
     v: Annotated[int, Meta(ge=VERSION, le=VERSION)]
@@ -56,7 +57,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         slow = SlowFriction(self.slow_factor, self.slow_learned)
         is_recent = abs(now_ns - self.saved_ns) * 1e-9 < ZERO_LASTS_S
         zero = SensorZero(self.sensor_zero_N) if is_recent else TARED
-        return Shown(device, slow=slow, zero=zero, lag_s=self.lag_s)
+        return Shown(device, slow=slow, zero=zero, lateness=Lateness(self.lag_s))
 
 
 def profile_of(shown: Shown, *, serial_number: int, insert: str, model: str, saved_ns: int) -> Profile:
@@ -73,7 +74,7 @@ def profile_of(shown: Shown, *, serial_number: int, insert: str, model: str, sav
         slow_factor=shown.slow.factor,
         slow_learned=shown.slow.learned,
         sensor_zero_N=shown.zero.zero_N,
-        lag_s=shown.lag_s,
+        lag_s=shown.lateness.lag_s,
     )
 
 

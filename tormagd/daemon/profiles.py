@@ -175,4 +175,4 @@ class Profiles:
 
 def _kept(shown: Shown) -> tuple[DeviceFit, SlowFriction, float, float]:
     """What of it a profile holds."""
-    return shown.device, shown.slow, shown.zero.zero_N, shown.lag_s
+    return shown.device, shown.slow, shown.zero.zero_N, shown.lateness.lag_s

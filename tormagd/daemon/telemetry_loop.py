@@ -306,7 +306,7 @@ class TelemetryLoop:
                 offset_sd_N=round(shown.offset_sd_N, 4),
                 sensor_zero_N=round(planned.shown.zero.zero_N, 4),
                 sensor_zero_sd_N=round(planned.shown.zero.sd_N(time.monotonic()), 4),
-                lag_ms=round(planned.shown.lag_s * 1e3, 1),
+                lag_ms=round(planned.shown.lateness.lag_s * 1e3, 1),
             ),
             profile=self._profiles.report(),
             least_gap_mm=round(plan.least_gap_mm, 2),
