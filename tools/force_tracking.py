@@ -184,7 +184,7 @@ def samples(pool: concurrent.futures.Executor) -> tuple[Json, dict[str, Track]]:
                 "whole": compared(found, best[name].result(), 0.0),
                 "after_trim": compared(found, best[name].result(), TRIM_S),
                 "trim": found.trim,
-                "lag_ms": found.shown.lag_s * 1e3,
+                "lag_ms": found.shown.lateness.lag_s * 1e3,
                 "limits": found.limits,
             }
         )

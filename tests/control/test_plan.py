@@ -398,16 +398,15 @@ def test_nan_never_travels(core, history: list[tuple[float, TimedSetpoint | None
         last, state = state, core.planner.plan(state, now_s, setpoint, heard)
         plan = state.plan
         numbers = (plan.governed_N, plan.field_mT, plan.gap_mm, plan.gap_speed_mm_s, plan.confidence, state.trim)
-        assert all(
-            math.isfinite(value) for value in (*numbers, plan.gap_acceleration_mm_s2, state.shown.lateness.lag_s)
-        )
+        lag_s = state.shown.lateness.lag_s
+        assert all(math.isfinite(value) for value in (*numbers, plan.gap_acceleration_mm_s2, lag_s))
         assert plan.predicted_N is None or math.isfinite(plan.predicted_N)
         assert 45.0 <= plan.gap_mm <= 95.0
         assert CONFIG.trim.least <= state.device.scale <= CONFIG.trim.most
         assert all(math.isfinite(getattr(state.device, name)) for name in DeviceFit.__match_args__)
         assert plan.governed_N <= max(core.scene.force.most_N, state.device.force_N(core.planner.portrait.least_N))
         assert plan.gap_mm >= plan.least_gap_mm
-        assert 0.0 <= state.shown.lateness.lag_s <= MOST_LAG_S
+        assert 0.0 <= lag_s <= MOST_LAG_S
         assert plan.number == last.plan.number + 1
 
 
