@@ -52,7 +52,11 @@ def test_no_figure_is_better_than_that_of_the_ideal_carriages(swung: Track) -> N
     least = ideal(load_plant("sample_1"), fast).figures()
     assert 0.01 <= least["foresight_rms_N"] < least["no_delay_rms_N"]
     rushed = track(load_plant("sample_1"), fast, "pulse", 0.0)
-    assert rushed.since(0.0).rms_N >= least["no_delay_rms_N"]
+    assert rushed.since(0.0).rms_N >= least["foresight_rms_N"]
+    # as long as nothing is foreseen, which three swings are too few for
+    begun = fast._replace(time_s=fast.time_s[:250], force_N=fast.force_N[:250])
+    at_first = ideal(load_plant("sample_1"), begun).figures()
+    assert track(load_plant("sample_1"), begun, "pulse", 0.0).since(0.0).rms_N >= at_first["no_delay_rms_N"]
 
 
 def test_weak_motors_render_a_live_pulse_once_it_is_foreseen() -> None:

@@ -14,6 +14,7 @@ from tormagd.control.estimate import Estimate, Handle
 from tormagd.control.governor import GovernorState, TimedSetpoint
 from tormagd.control.handle import HandleWatch
 from tormagd.control.homing import Homing
+from tormagd.control.lateness import Lateness
 from tormagd.control.periodicity import Guess, Periodicity
 from tormagd.control.pid import PidState
 from tormagd.control.plan import Outside, Plan, PlanState, Shown
@@ -62,7 +63,7 @@ KNOWN = kinds(
         Reference,
         Expected,
     ),
-    *(PidState, Sight, Leap, Homing, PlanState, GovernorState, Periodicity, Skill, Guess, Restraint, Plan),
+    *(PidState, Sight, Leap, Homing, PlanState, GovernorState, Periodicity, Skill, Guess, Restraint, Lateness, Plan),
     *(Outside, Shown, DeviceFit, Sensor, Past, SlowFriction, SensorZero, Level, HandleWatch, Remembered),
     *(Conditions, DeviceMode, Switches),
 )
