@@ -254,7 +254,8 @@ class Governor:
                 )
                 held_back_N = for_N - force
             path = _expected_N(asked_N, slope, periodicity, foresight, soon_s + foresight * lag_s)
-            path = [force_N + held_back_N for force_N in path]
+            if held_back_N:
+                path = [force_N + held_back_N for force_N in path]
         within = [min(max(force_N, least), most) for force_N in path]
         governed = min(max(force + held_back_N, least), most)
         if expected_N is not None:

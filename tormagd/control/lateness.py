@@ -1,4 +1,4 @@
-"""How late a device's carriages are behind the gap that is planned: motors weaker than believed are.
+"""How late a device's carriages are behind the gap that is planned: weaker motors than were believed come late.
 
 Expected is the planned gap behind a lag of first order, and the lag is the one with which the carriages are found
 nearest to that: least squares, in which what is known fades. So the plan may set out sooner by it without the lag
@@ -51,7 +51,8 @@ ON_TIME: Final = Lateness()
 
 
 def surprised(before: Lateness) -> Lateness:
-    """What is known after a plan that did not know what comes: the same. Where the gap is expected begins anew."""
+    """What is known after a plan that did not know what comes: the same lag. Where the gap is expected begins anew, and
+    so does whether it is on its way."""
     return before if before.expected_mm is None else Lateness(before.lag_s, before.motion_mm2_s)
 
 
@@ -69,8 +70,7 @@ def found(
     elif elapsed_s > 0.0:
         expected_mm += elapsed_s / (lag_s + elapsed_s) * (planned_mm - expected_mm)
     behind_mm = expected_mm - gap_mm - speed_mm_s * MEASURED_S
-    away_mm = abs(behind_mm)
-    if away_mm > (CAUGHT_UP_MM if before.is_on_its_way else MOST_LAG_S * fastest_mm_s):
+    if abs(behind_mm) > (CAUGHT_UP_MM if before.is_on_its_way else MOST_LAG_S * fastest_mm_s):
         return Lateness(lag_s, motion_mm2_s, expected_mm, True)
     motion_mm2_s += elapsed_s * (speed_mm_s * speed_mm_s - motion_mm2_s / FADES_S)
     lag_s += elapsed_s * behind_mm * speed_mm_s / (DOUBTED_MM2_S + motion_mm2_s)
