@@ -30,7 +30,7 @@ SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict --quiet
 
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
-.PHONY: install uninstall deb run test unhurried live yielding-check coverage search pythons check docs format compile core fetched model tactile-model reproduction evidence clean
+.PHONY: install uninstall deb wheels run test unhurried live yielding-check coverage search pythons check docs format compile core fetched model tactile-model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -124,7 +124,7 @@ evidence: $(VENV)/.dev
 # commands find it there. It is built for, and run by, the interpreter that PYTHON names.
 install: $(VENV)/.man
 	rm -rf '$(DESTDIR)$(LIBRARY)'
-	$(PIP_TO) '$(DESTDIR)$(LIBRARY)' '.[$(SERVICE_EXTRAS)]'
+	$(PIP_TO) '$(DESTDIR)$(LIBRARY)' ./client '.[$(SERVICE_EXTRAS)]'
 	rm -rf '$(DESTDIR)$(LIBRARY)/bin'
 	BUILD_PYTHON=$(BIN)/python BUILD_LIBRARY='$(DESTDIR)$(LIBRARY)' \
 	    systemd/install.sh '$(DESTDIR)' '$(PREFIX)' "$$(command -v $(PYTHON))" '$(LIBRARY)'
@@ -137,13 +137,17 @@ uninstall:
 	    '$(DESTDIR)$(PREFIX)'/share/bash-completion/completions/tormagctl \
 	    '$(DESTDIR)$(PREFIX)'/share/zsh/site-functions/_tormagctl
 
+# both distributions in build/wheels, to be installed together: pip install build/wheels/*.whl
+wheels: | $(BIN)/python
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheels ./client .
+
 # a Debian package in build/, for the Python of this Debian: without torch, which only `tormagctl calibrate` needs
 deb: $(VENV)/.man
 	$(BIN)/python -c 'import sys, subprocess as s; v = "%d.%d" % sys.version_info[:2]; a = s.check_output(["/usr/bin/python3", \
 	    "-c", "import sys; print(\"%d.%d\" % sys.version_info[:2], end=\"\")"], text=True); \
 	    sys.exit(None if a == v else f"the package runs with Python {a}, but .venv has {v}: make clean, make deb PYTHON=/usr/bin/python3")'
 	rm -rf build/library
-	$(PIP_TO) build/library --no-deps .
+	$(PIP_TO) build/library --no-deps ./client .
 	$(BIN)/python tools/dependencies.py record plot top dashboard metrics | grep -v '^torch=' > build/requirements.txt
 	$(PIP_TO) build/library --requirement build/requirements.txt
 	rm -rf build/library/bin
@@ -155,23 +159,23 @@ clean:
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.demo: pyproject.toml setup.py | $(BIN)/python
+$(VENV)/.demo: pyproject.toml client/pyproject.toml setup.py | $(BIN)/python
 	$(MAKE) --no-print-directory --jobs=2 core fetched EXTRAS=demo
 	@$(SAY_BUILD)
 	touch $@
 
-$(VENV)/.man: pyproject.toml setup.py | $(BIN)/python
+$(VENV)/.man: pyproject.toml client/pyproject.toml setup.py | $(BIN)/python
 	$(BIN)/python -m pip install --quiet 'argparse-manpage>=4.6'
 	touch $@
 
-$(VENV)/.dev: pyproject.toml setup.py | $(BIN)/python
+$(VENV)/.dev: pyproject.toml client/pyproject.toml setup.py | $(BIN)/python
 	$(MAKE) --no-print-directory --jobs=2 core fetched EXTRAS=dev
 	@$(SAY_BUILD)
 	touch $@ $(VENV)/.demo
 
 # the core is compiled while what it needs is fetched: each takes a minute, and a processor
 core: | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --no-deps --editable .
+	$(BIN)/python -m pip install --quiet --no-deps --editable client --editable .
 
 fetched: | $(BIN)/python
 	$(BIN)/python tools/dependencies.py $(EXTRAS) > $(VENV)/$(EXTRAS).txt

@@ -110,6 +110,8 @@ class BuildCore(build_ext):
     def _translated(self) -> list[Extension]:
         from mypyc.build import mypycify
 
+        # what the core takes from the client is typed there, wherever the client is or will be installed
+        os.environ["MYPYPATH"] = str(Path("client/src").resolve())
         Path(self.build_temp).mkdir(parents=True, exist_ok=True)
         options = ["--config-file=", "--ignore-missing-imports", f"--cache-dir={self.build_temp}/mypy"]
         extensions = mypycify(

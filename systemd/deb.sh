@@ -1,20 +1,20 @@
 #!/bin/sh
 # Packs a Debian package:  deb.sh LIBRARY OUT
-# LIBRARY is a folder with tormagd and all that it imports, for PYTHON (/usr/bin/python3), which the package runs with. All
+# LIBRARY is a folder with both distributions and all that they import, for PYTHON (/usr/bin/python3), which the package runs with. All
 # of it is in the package, but for torch, which only `tormagctl calibrate` needs: a console need not reach a registry.
 set -eu
 library=$1 out=$2
 python=${PYTHON:-/usr/bin/python3}
 here=$(cd "$(dirname "$0")" && pwd)
 checkout=$(dirname "$here")
-version=$(sed -n 's/^__version__ = "\(.*\)"/\1/p' "$checkout/tormagd/__init__.py")
+version=$(sed -n 's/^__version__ = "\(.*\)"/\1/p' "$checkout/client/src/tormagd_client/__init__.py")
 abi=$("$python" -c 'import sys; print(*sys.version_info[:2], sep=".")')
 next=${abi%.*}.$((${abi#*.} + 1))
 root=$(mktemp -d)
 trap 'rm -rf "$root"' EXIT
 chmod 755 "$root"
 
-BUILD_PYTHON=${BUILD_PYTHON:-$python} BUILD_LIBRARY=${BUILD_LIBRARY:-$checkout} \
+BUILD_PYTHON=${BUILD_PYTHON:-$python} BUILD_LIBRARY=${BUILD_LIBRARY:-$checkout:$checkout/client/src} \
     "$here/install.sh" "$root" /usr "${RUN_PYTHON:-$python}" /usr/lib/tormagd
 cp -a "$library/." "$root/usr/lib/tormagd"
 mkdir "$root/DEBIAN"

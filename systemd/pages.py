@@ -9,8 +9,7 @@ from argparse_manpage.manpage import Manpage
 
 from tormagd import __version__
 from tormagd.ctl.completion import completion
-from tormagd.ctl.main import SHELLS
-from tormagd.ctl.main import parser as ctl
+from tormagd.ctl.main import SHELLS, parser as ctl
 from tormagd.daemon.main import parser as daemon
 
 

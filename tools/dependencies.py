@@ -10,10 +10,11 @@ PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
 
 
 def requirements(extras: list[str]) -> list[str]:
-    """What `pip install '.[extras]'` would fetch, but for the project. Raises KeyError for an extra that is none."""
+    """What `pip install ./client '.[extras]'` would fetch, but for the project and its client, which no registry has to
+    give. Raises KeyError for an extra that is none."""
     project = tomllib.loads(PYPROJECT.read_text(encoding="utf-8"))["project"]
     ours = re.compile(rf"{project['name']}\[(.*)\]")
-    found: list[str] = list(project["dependencies"])
+    found = [requirement for requirement in project["dependencies"] if not requirement.startswith("tormagd-client==")]
     waiting = list(extras)
     while waiting:
         for requirement in project["optional-dependencies"][waiting.pop(0)]:

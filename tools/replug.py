@@ -27,9 +27,9 @@ from tqdm import tqdm
 from wire.cable import Cable
 
 from firmware_protocol.codec import DeviceMode
-from tormagd.client import Client, ClientError
-from tormagd.messages import VERSION, Setpoint, encode
 from tormagd.recording.ticks import decode_ticks
+from tormagd_client import Client, ClientError
+from tormagd_client.messages import VERSION, Setpoint, encode
 
 DOORS = {"serial": "--pty", "can": "--can"}
 BACKENDS = {"serial": 'backend = "serial"', "can": 'backend = "can"\noptions.interface = "tormagsim"'}

@@ -15,10 +15,10 @@ from pathlib import Path
 from machines.chromium import Page, browser
 from rich.console import Console
 
-from tormagd.client.blocking import Client
 from tormagd.config import load_config
 from tormagd.ctl.top import REDRAW_S, Watcher
 from tormagd.ctl.top_screen import Seen, screen
+from tormagd_client.blocking import Client
 
 TERMINALS = ((80, 24), (160, 50))
 PAGES = {"wide": (1440, 900), "phone": (390, 844)}

@@ -33,7 +33,6 @@ from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from tqdm import tqdm
 
-from tormagd.client import Client
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, RealTime, load_config
 from tormagd.control.core import build_core
@@ -42,6 +41,7 @@ from tormagd.recording.writer import TELEMETRY_TOPIC, TICKS_TOPIC
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
+from tormagd_client import Client
 
 MEAN_N, SWING_N, SWING_HZ = 1.5, 0.3, 1.2
 SETTLING_TICKS = 5_000

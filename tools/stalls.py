@@ -26,8 +26,8 @@ from machines.own import own_machine
 from machines.wire import carried
 from tqdm import tqdm
 
-from tormagd.client import Client, ClientError
-from tormagd.messages import VERSION, Setpoint, Telemetry, decode, encode
+from tormagd_client import Client, ClientError
+from tormagd_client.messages import VERSION, Setpoint, Telemetry, decode, encode
 
 FORCE_N, NEUTRAL_N = 1.5, 0.3
 ALLOWED_N = 0.1

@@ -2,31 +2,12 @@
 
 import errno
 import os
-import stat
 from pathlib import Path
+
+from tormagd_client.regular_file import require_regular as require_regular
 
 MOST_TABLE_BYTES = 1 << 30
 "A table of measurements, which is read row by row: a day of a testing machine."
-_KINDS = {
-    stat.S_IFDIR: "a directory",
-    stat.S_IFIFO: "a pipe",
-    stat.S_IFCHR: "a character device",
-    stat.S_IFBLK: "a block device",
-    stat.S_IFSOCK: "a socket",
-}
-
-
-def require_regular(path: Path, most_bytes: int) -> os.stat_result:
-    """What is known of a regular file of at most `most_bytes`. Raises OSError; its `strerror` says what is allowed."""
-    try:
-        found = path.stat()
-    except ValueError as error:  # a name with a zero in it
-        raise OSError(errno.EINVAL, "no file can have this name", str(path)) from error
-    kind = stat.S_IFMT(found.st_mode)
-    if kind == stat.S_IFREG and found.st_size <= most_bytes:
-        return found
-    what = f"this has {found.st_size}" if kind == stat.S_IFREG else f"this is {_KINDS.get(kind, 'something else')}"
-    raise OSError(errno.EINVAL, f"allowed is a regular file of at most {most_bytes} bytes; {what}", str(path))
 
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:

@@ -4,8 +4,6 @@ A TOML file, or the defaults. Unknown keys, wrong types, NaN and infinities, val
 orderings are refused with the key's path, the value and what is allowed.
 """
 
-import ipaddress
-import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,15 +12,22 @@ from typing import Annotated, Any, TypeVar, get_args
 import msgspec
 from msgspec import Meta
 
-from tormagd.toml_file import TomlError, in_short, line_of, toml_tables, toml_text
+from tormagd.toml_file import TomlError, line_of, toml_tables, toml_text
+from tormagd_client.endpoints import (
+    ENDPOINTS as ENDPOINTS,
+    ROLES as ROLES,
+    ConfigError as ConfigError,
+    Curve as Curve,
+    Endpoints as Endpoints,
+    Strict as Strict,
+    in_folder as in_folder,
+    require_usable,
+)
+from tormagd_client.printable import in_short, require
 
 LEAST_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
-DEFAULT_RUN_DIR = "/run/tormag"
 MOST_LISTED = 8
 "Sources in the order of priority: fewer than are kept apart, so that one that is not listed is heard, too."
-LONGEST_IPC_PATH = 107  # bytes that the kernel takes of a socket's path
-ENDPOINTS = ("setpoint", "telemetry", "control", "recording")
-ROLES = ("publish", "operate", "observe")
 
 T = TypeVar("T")
 _OURS = re.compile(r"([a-z_A-Z.]+)(?: =|:) ")
@@ -30,15 +35,6 @@ _OURS = re.compile(r"([a-z_A-Z.]+)(?: =|:) ")
 _PLACE = re.compile(r"`\$([^`]*)`")
 "The place that one of msgspec's ends with."
 _UNKNOWN = re.compile(r"unknown field `(\w+)`")
-_TCP = re.compile(r"tcp://(localhost|[0-9.]+):([0-9]{1,5})")
-
-
-class ConfigError(ValueError):
-    """A configuration that was refused: the text names the key, the value and what is allowed."""
-
-
-class Strict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of the configuration."""
 
 
 class Device(Strict, frozen=True):
@@ -61,48 +57,7 @@ class Device(Strict, frozen=True):
     "What the firmware does without us: how fast a carriage opens, stated here for scenes to be checked against."
 
     def __post_init__(self) -> None:
-        _order(self.port.isprintable(), "device.port", self.port, "printable characters")
-
-
-class Curve(Strict, frozen=True):
-    """Key files. The daemon has `server_secret` and a folder of public keys for each role, a client the last two keys.
-
-    A folder that is not named is the one of its role's name beside `server_secret`.
-    """
-
-    server_secret: str = ""
-    "The daemon's own pair, `server.key_secret`, which `tormagctl keys generate` makes."
-    publish: str = ""
-    "Who may send setpoints, and nothing else."
-    operate: str = ""
-    "Who may give commands, and look."
-    observe: str = ""
-    "Who may look: telemetry, recording, `status`."
-    also_local: bool = False
-    "Whether `ipc://` and loopback demand keys, too."
-    client_secret: str = ""
-    "What `tormagctl` shows."
-    server_public: str = ""
-    "The daemon that `tormagctl` believes; by default the `.key` beside `server_secret`."
-
-
-class Endpoints(Strict, frozen=True):
-    """ZeroMQ addresses. Only `ipc://` and loopback are open; any other address is refused without CURVE keys."""
-
-    setpoint: str = f"ipc://{DEFAULT_RUN_DIR}/setpoint"
-    "Where publishers connect; in the service's own folder, as all four are."
-    telemetry: str = f"ipc://{DEFAULT_RUN_DIR}/telemetry"
-    "Where whoever looks subscribes."
-    control: str = f"ipc://{DEFAULT_RUN_DIR}/control"
-    "Where commands are given."
-    recording: str = f"ipc://{DEFAULT_RUN_DIR}/recording"
-    "Where the recorder hears every control tick."
-    curve: Curve | None = None
-    "Keys, for who connects from elsewhere."
-
-    def is_guarded(self, name: str) -> bool:
-        """Whether the daemon lets in only whom it has the key of."""
-        return not _is_local(getattr(self, name)) or (self.curve is not None and self.curve.also_local)
+        require(self.port.isprintable(), "device.port", self.port, "printable characters")
 
 
 class Sources(Strict, frozen=True):
@@ -113,7 +68,7 @@ class Sources(Strict, frozen=True):
 
     def __post_init__(self) -> None:
         names = self.priority
-        _order(
+        require(
             len(set(names)) == len(names) <= MOST_LISTED and all(name.isprintable() for name in names),
             "sources.priority",
             names,
@@ -260,116 +215,37 @@ class Config(Strict, frozen=True):
 
     def __post_init__(self) -> None:
         rates, device, limits = self.rates, self.device, self.limits
-        _order(
+        require(
             rates.inference_hz <= rates.control_hz,
             "rates.inference_hz",
             rates.inference_hz,
             f"at most rates.control_hz = {rates.control_hz}",
         )
-        _order(
+        require(
             rates.control_hz % rates.telemetry_hz == 0,
             "rates.telemetry_hz",
             rates.telemetry_hz,
             f"a divisor of rates.control_hz = {rates.control_hz}",
         )
-        _order(
+        require(
             device.command_timeout_ms < self.realtime.watchdog_ms,
             "device.command_timeout_ms",
             device.command_timeout_ms,
             f"under realtime.watchdog_ms = {self.realtime.watchdog_ms:g}: the device must act before systemd does",
         )
-        _order(
+        require(
             device.measurement_timeout_ms <= device.command_timeout_ms,
             "device.measurement_timeout_ms",
             device.measurement_timeout_ms,
             f"at most device.command_timeout_ms = {device.command_timeout_ms:g}",
         )
-        _order(
+        require(
             limits.skew_warning_mm <= limits.skew_fault_mm,
             "limits.skew_warning_mm",
             limits.skew_warning_mm,
             f"at most limits.skew_fault_mm = {limits.skew_fault_mm:g}",
         )
-        taken: dict[str, str] = {}
-        curve = self.endpoints.curve
-        has_keys = curve is not None and bool(curve.server_secret or curve.client_secret)
-        _order(
-            has_keys or curve is None or not curve.also_local,
-            "endpoints.curve.also_local",
-            True,
-            "false without keys, which are server_secret or client_secret",
-        )
-        for name in ENDPOINTS:
-            address = getattr(self.endpoints, name)
-            place = _ipc_place(name, address) if address.startswith("ipc://") else _tcp_place(name, address, has_keys)
-            _order(
-                place not in taken,
-                f"endpoints.{name}",
-                address,
-                f"an address other than that of endpoints.{taken.get(place)}",
-            )
-            taken[place] = name
-
-
-def _ipc_place(name: str, address: str) -> str:
-    """What an `ipc://` address comes to, however it is spelt."""
-    path = address.removeprefix("ipc://")
-    _order(
-        path not in ("", "@", "*")
-        and path.isprintable()
-        and not path.endswith("/")
-        and len(path.encode()) <= LONGEST_IPC_PATH,
-        f"endpoints.{name}",
-        address,
-        f"after ipc:// the path of a socket, or @ and a name, of at most {LONGEST_IPC_PATH} bytes",
-    )
-    return path if path.startswith("@") else os.path.realpath(path)
-
-
-def _tcp_place(name: str, address: str, has_keys: bool) -> str:
-    """The same of a `tcp://` address. IPv4 only: a ZeroMQ socket speaks no IPv6 unless it is told to, at both ends."""
-    matched = _TCP.fullmatch(address)
-    host, port = matched.groups() if matched else ("", "0")
-    _order(
-        (_is_loopback(host) or (has_keys and _is_ipv4(host))) and 0 < int(port) < 65_536,
-        f"endpoints.{name}",
-        address,
-        "ipc:// or tcp:// with an IPv4 address and a port of 1..65535"
-        if has_keys
-        else "ipc:// or a loopback tcp:// address with a port of 1..65535; others need CURVE keys in [endpoints.curve]",
-    )
-    return f"{'127.0.0.1' if host == 'localhost' else host}:{int(port)}"
-
-
-def _is_local(address: str) -> bool:
-    matched = _TCP.fullmatch(address)
-    return matched is None or _is_loopback(matched[1])
-
-
-def _is_loopback(host: str) -> bool:
-    return host == "localhost" or (_is_ipv4(host) and ipaddress.IPv4Address(host).is_loopback)
-
-
-def _is_ipv4(host: str) -> bool:
-    try:
-        ipaddress.IPv4Address(host)
-    except ValueError:
-        return False
-    return True
-
-
-def _order(condition: bool, key: str, value: object, allowed: str) -> None:
-    if not condition:
-        raise ValueError(f"{key} = {in_short(value)}: allowed is {allowed}")
-
-
-def in_folder(folder: str) -> Endpoints:
-    """The endpoints of a daemon whose sockets are in `folder`. Raises ConfigError: the path is too long, or none."""
-    try:
-        placed = msgspec.convert({name: f"ipc://{folder}/{name}" for name in ENDPOINTS}, Endpoints)
-        return Config(endpoints=placed).endpoints
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
+        require_usable(self.endpoints)
 
 
 def load_config(path: Path | None) -> Config:

@@ -7,7 +7,7 @@ from array import array
 from pathlib import Path
 
 from tormagd.bounded_file import read_bounded
-from tormagd.messages import MAX_DISPLACEMENT_MM, MAX_FORCE_N, MAX_RATE_MM_S
+from tormagd_client.messages import MAX_DISPLACEMENT_MM, MAX_FORCE_N, MAX_RATE_MM_S
 
 REQUIRED_COLUMNS = ("t_s", "force_N")
 OPTIONAL_COLUMNS = ("displacement_mm", "rate_mm_s")

@@ -4,20 +4,14 @@ A terminal obeys what is printed to it. Words of a file, a device or somebody el
 they come in; whatever else is not printable is escaped where it goes out, all but line ends and our own colours.
 """
 
-import json
 import os
 import re
 from typing import TextIO
 
+from tormagd_client.printable import printable as printable
+
 _OURS = re.compile("(\n|\t|\x1b\\[(?:0|1|31|32|33)m)")
 "What a line may hold besides printable characters: its end, a tabulator, and the colours of `ctl.outcome.Colour`."
-
-
-def printable(text: str) -> str:
-    """`text` on one line, with each character that is not printable as JSON escapes it: `\\n`, `\\u001b`."""
-    if text.isprintable():
-        return text
-    return "".join(each if each.isprintable() else json.dumps(each)[1:-1] for each in text)
 
 
 def write_line(text: str, stream: TextIO | None) -> OSError | None:

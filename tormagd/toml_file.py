@@ -17,8 +17,6 @@ MOST_GUESSES = 16
 "Lines that may give a key, of those that have its name in them: a file may be full of them."
 MOST_LINES = 8
 "Of one value, to be told where it stands."
-LONGEST_SHOWN = 80
-"Characters of a value that a refusal shows."
 
 # a string that does not end goes on to the end of the line or the text: the parser stops there, too
 _TOKEN = re.compile(
@@ -88,12 +86,6 @@ def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
             table = table[name]
         return True
     return False
-
-
-def in_short(value: object) -> str:
-    """A value as a refusal shows it."""
-    shown = repr(value)
-    return shown if len(shown) <= LONGEST_SHOWN else f"{shown[: LONGEST_SHOWN - 3]}..."
 
 
 def _require_shallow(text: str) -> None:

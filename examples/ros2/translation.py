@@ -3,7 +3,7 @@ lies along z."""
 
 from typing import Any
 
-from tormagd.messages import Telemetry
+from tormagd_client.messages import Telemetry
 
 COMMANDS = ("home", "enable", "disable", "pause", "resume")
 "What of CRTK's `state_command` this device can: it homes anew, and cannot be unhomed."

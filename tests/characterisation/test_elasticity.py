@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
 from tormagd.characterisation.elasticity import fit_neo_hookean, fit_ogden, fit_thesis_ogden
 from tormagd.characterisation.record import RecordError, read_columns

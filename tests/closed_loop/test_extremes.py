@@ -8,8 +8,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from firmware_protocol.value import Value
 from tormagd.closed_loop import Array, ClosedLoop, Sample

@@ -16,11 +16,11 @@ from tormagd.control.plan import PlanState
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.source_clock import SETTLED_S
 from tormagd.daemon.way import Way
-from tormagd.messages import SourceReport
 from tormagd.safety.codes import Limit
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
+from tormagd_client.messages import SourceReport
 
 START_NS = 1_800_000_000_000_000_000
 PERIOD_S = 0.002

@@ -7,15 +7,14 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import LEAST_INFERENCE_HZ, Config, ConfigError, load_config
 from tormagd.daemon.main import main
 from tormagd.hardware.backend import ENTRY_POINTS, choose
-from tormagd.keys import generate
+from tormagd_client.keys import generate
 
 Write = Callable[[str], Path]
 

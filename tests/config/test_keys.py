@@ -9,15 +9,8 @@ import pytest
 import zmq
 
 from tormagd.config import ENDPOINTS, Config, ConfigError, Curve, Endpoints
-from tormagd.keys import (
-    MAX_KEY_FILE_BYTES,
-    KeyRing,
-    fingerprint,
-    generate,
-    load_folder,
-    load_pair,
-    load_public,
-)
+from tormagd.keys import KeyRing, load_folder
+from tormagd_client.keys import MAX_KEY_FILE_BYTES, fingerprint, generate, load_pair, load_public
 
 FAR = {name: f"tcp://192.0.2.1:{5_555 + number}" for number, name in enumerate(ENDPOINTS)}
 

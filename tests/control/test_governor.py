@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tormagd.control.device_fit import DeviceFit
 from tormagd.control.governor import AHEAD_S, OUTRUN_N, PATH_S, Governed, Governor, GovernorState, TimedSetpoint

@@ -5,8 +5,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 from scipy.optimize import brentq
 from scipy.signal import StateSpace, cont2discrete, dlsim, lfilter
 

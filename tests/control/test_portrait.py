@@ -5,8 +5,7 @@ from bisect import bisect_right
 from itertools import accumulate
 
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from tormagd.control.portrait import Portrait
 

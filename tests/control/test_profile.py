@@ -5,8 +5,7 @@ import math
 
 import msgspec
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from tormagd.control.device_fit import OFFSET_SD_N, SCALE_SD, DeviceFit
 from tormagd.control.lateness import MOST_LAG_S, Lateness

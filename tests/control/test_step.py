@@ -4,8 +4,7 @@ import math
 
 import msgspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.config import Config

@@ -3,8 +3,7 @@
 import math
 
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from tormagd.config import Config, Position
 from tormagd.control.motor import full_speed_mm_s

@@ -14,7 +14,7 @@ import msgspec
 import pytest
 import zmq
 
-from tormagd.messages import VERSION, Setpoint, Telemetry, Tick, decode, encode
+from tormagd_client.messages import VERSION, Setpoint, Telemetry, Tick, decode, encode
 
 COLUMNS = ("t_ns", "setpoint_cf", "governed_cf", "measured_cf", "left_mm", "right_mm", "left_duty", "right_duty")
 

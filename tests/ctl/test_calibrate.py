@@ -16,12 +16,9 @@ from tormagd.config import Config
 from tormagd.control import estimate
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
-from tormagd.ctl import calibrate as ctl_calibrate
-from tormagd.ctl import calibrate_motors as ctl_calibrate_motors
-from tormagd.ctl import calibrate_run
+from tormagd.ctl import calibrate as ctl_calibrate, calibrate_motors as ctl_calibrate_motors, calibrate_run
 from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, up_and_down, write_sweeps
-from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS
-from tormagd.ctl.calibrate_motors import excitation, motor_log
+from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, excitation, motor_log
 from tormagd.ctl.calibrate_run import Range
 from tormagd.ctl.main import main
 from tormagd.ctl.outcome import CommandError

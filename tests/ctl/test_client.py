@@ -1,4 +1,4 @@
-"""`tormagd.client`, blocking and for asyncio, at a daemon made of sockets."""
+"""`tormagd_client`, blocking and for asyncio, at a daemon made of sockets."""
 
 import asyncio
 import time
@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from tormagd.client import Client, ClientError, InFaultError, RefusedError, SettingError, UnreachableError
-from tormagd.client.aio import AsyncClient
-from tormagd.config import ConfigError, Curve, Endpoints, in_folder
+from tormagd_client import Client, ClientError, InFaultError, RefusedError, SettingError, UnreachableError
+from tormagd_client.aio import AsyncClient
+from tormagd_client.endpoints import ConfigError, Curve, Endpoints, in_folder
 
 PATIENCE_S = 20.0
 

@@ -13,8 +13,8 @@ from tormagd.ctl.main import main
 from tormagd.ctl.operate import DONE_STATES
 from tormagd.ctl.outcome import Colour
 from tormagd.ctl.status import status_text
-from tormagd.messages import Status
 from tormagd.scenes.scene import TERMS, scene_path
+from tormagd_client.messages import Status
 
 
 def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:

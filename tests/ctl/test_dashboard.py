@@ -16,22 +16,21 @@ import pytest
 import zmq
 from aiohttp import ClientResponse
 from aiohttp.test_utils import TestClient, TestServer
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from machines.chromium import CHROMIUM, Page, browser
 
-from tormagd.client.aio import AsyncClient
 from tormagd.config import in_folder
 from tormagd.ctl.main import main
 from tormagd.dashboard.frame import LATE_US, SHOWN_S, Frame, late_counts
 from tormagd.dashboard.live import WAITING, Live
 from tormagd.dashboard.recorded import Recorded
 from tormagd.dashboard.server import application
-from tormagd.messages import Description, Status, encode
 from tormagd.recording.reader import read_recording
 from tormagd.recording.ticks import TickBatch
 from tormagd.recording.writer import RecordingWriter
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
+from tormagd_client.aio import AsyncClient
+from tormagd_client.messages import Description, Status, encode
 
 START_NS = 1_790_000_000_000_000_000
 PORTRAIT = {"force_N": [0.5, 1.0, 3.0], "rate_N_s": [1.0, 2.0, 8.0]}

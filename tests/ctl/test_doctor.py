@@ -7,8 +7,7 @@ import pytest
 
 from firmware_protocol.build import COST, REMEDY, Build
 from tormagd.config import Config, Device, Endpoints, RealTime
-from tormagd.ctl import doctor as checks
-from tormagd.ctl import headroom
+from tormagd.ctl import doctor as checks, headroom
 from tormagd.ctl.doctor import Verdict, doctor, examine
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.main import main

@@ -10,7 +10,7 @@ import pytest
 from tormagd.ctl.firmware import firmware_text
 from tormagd.ctl.main import main
 from tormagd.ctl.outcome import Colour
-from tormagd.messages import LinkReport
+from tormagd_client.messages import LinkReport
 
 
 @pytest.fixture

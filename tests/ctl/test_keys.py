@@ -14,7 +14,7 @@ from zmq.auth import load_certificate
 from zmq.utils import z85
 
 from tormagd.ctl.main import KEY, SERVER_KEY, main
-from tormagd.messages import VERSION
+from tormagd_client.messages import VERSION
 
 
 def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, dict[str, Any]]:

@@ -5,13 +5,12 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from tormagd.ctl.main import main
 from tormagd.ctl.waveform import SHAPES, beat, read_csv, shape
 from tormagd.force_file import ForceFileError
-from tormagd.messages import Setpoint
+from tormagd_client.messages import Setpoint
 
 
 def send(daemon, capsys, *arguments: str) -> dict:

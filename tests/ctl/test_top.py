@@ -10,14 +10,13 @@ from typing import Any
 
 import msgspec
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from rich.console import Console
 
 from tormagd.ctl.main import main
 from tormagd.ctl.sparkline import EIGHTHS, columns, span, sparkline
 from tormagd.ctl.top_screen import CURVES, Seen, screen
-from tormagd.messages import Explained, Status
+from tormagd_client.messages import Explained, Status
 
 SIZES = ((80, 24), (160, 50))
 RATE = Explained("RATE", "the force was asked to change faster than the carriages travel", "ask for slower changes")

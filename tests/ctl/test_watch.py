@@ -9,7 +9,7 @@ import pytest
 
 from tormagd.ctl.main import main
 from tormagd.ctl.watch import held_back
-from tormagd.messages import Status
+from tormagd_client.messages import Status
 
 EXPLAINED = {
     "STALE": "setpoints of 'me' come 300 ms late",

@@ -17,8 +17,9 @@ from tormagd.config import Config, Curve, Endpoints
 from tormagd.daemon import admission
 from tormagd.daemon.admission import CONNECTIONS_PER_PEER, PLAIN
 from tormagd.daemon.endpoint import Endpoint
-from tormagd.keys import KeyPair, KeyRing, fingerprint, generate, load_pair
-from tormagd.messages import VERSION, PeerReport, Reply, Request, decode, encode
+from tormagd.keys import KeyRing
+from tormagd_client.keys import KeyPair, fingerprint, generate, load_pair
+from tormagd_client.messages import VERSION, PeerReport, Reply, Request, decode, encode
 
 PATIENCE_S = 8.0
 NAMES = ("setpoint", "telemetry", "control", "recording")

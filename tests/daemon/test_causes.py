@@ -1,8 +1,8 @@
 """Causes: each code with what a person needs to know about it."""
 
 from tormagd.daemon.causes import explanations
-from tormagd.messages import Explained
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
+from tormagd_client.messages import Explained
 
 
 def test_codes_are_explained_by_their_table() -> None:

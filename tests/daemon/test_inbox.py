@@ -6,14 +6,13 @@ from typing import Any
 import msgpack
 import msgspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tormagd.daemon.inbox import REPORTED, SILENT_S, SOURCES, SetpointInbox
 from tormagd.daemon.source_clock import AHEAD_S, SETTLED_S
-from tormagd.messages import MAX_MESSAGE_BYTES, VERSION, Reply, SetpointReport, decode, encode
 from tormagd.safety.codes import Limit
 from tormagd.safety.operating_state import RefusedError
+from tormagd_client.messages import MAX_MESSAGE_BYTES, VERSION, Reply, SetpointReport, decode, encode
 
 START_NS = 1_800_000_000_000_000_000
 "Some day on CLOCK_REALTIME that is second 0 of the control clock here."

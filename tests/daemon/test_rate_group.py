@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from msgspec.structs import astuple
 
 from tormagd.daemon.rate_group import ERROR_PERIODS, HORIZON_NS, SHARES, Grade, Histogram, RateGroup

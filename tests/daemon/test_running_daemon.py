@@ -21,9 +21,9 @@ from tormagd.daemon import notify
 from tormagd.daemon.callbacks import KERNEL, Delay
 from tormagd.daemon.daemon import Daemon
 from tormagd.hardware.backend import Backend, BackendError
-from tormagd.messages import VERSION, Description, Reply, Request, decode, encode
 from tormagd.physics.errors import DomainError
 from tormagd.safety.codes import FAULTS, Fault
+from tormagd_client.messages import VERSION, Description, Reply, Request, decode, encode
 
 pytestmark = pytest.mark.live
 

@@ -10,8 +10,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from tormagd.daemon.source_clock import (
     AHEAD_S,

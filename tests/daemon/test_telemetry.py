@@ -15,13 +15,13 @@ from tormagd.control.trajectory import Reference
 from tormagd.daemon.telemetry import limits_held, snapshot, tick_record
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
-from tormagd.messages import Telemetry, TickRecord, decode, encode, encode_ticks
 from tormagd.recording.plot import save_plot
 from tormagd.recording.reader import read_recording
 from tormagd.recording.ticks import decode_ticks
 from tormagd.recording.writer import RecordingWriter
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import DeviceRequest, OperatingState, SafetyState
+from tormagd_client.messages import Telemetry, TickRecord, decode, encode, encode_ticks
 
 PLAN = Plan(7, 1.0, 1.5, 0.01, 1.4, 1.38, 500.0, 64.0, -1.0, 0.9, (Limit.RANGE, Limit.SKEW))
 OUTPUT = StepOutput(DriveMode.RUN, 0.1, -0.2, DeviceRequest.NONE, 0, (Limit.SKEW, Limit.RATE))

@@ -2,8 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tormagd.design.brake import Brake
 from tormagd.design.phase_portrait import PhasePortrait, Region

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import zmq
 
-from tormagd.messages import VERSION, Reply, Request, Setpoint, Telemetry, decode, encode
+from tormagd_client.messages import VERSION, Reply, Request, Setpoint, Telemetry, decode, encode
 
 PATIENCE_S = 60.0
 "Longer than anything takes on a busy machine; only a failure waits for it."

@@ -12,7 +12,7 @@ import msgpack
 import pytest
 import zmq
 
-from tormagd.messages import VERSION, Setpoint, encode
+from tormagd_client.messages import VERSION, Setpoint, encode
 
 pytestmark = pytest.mark.live
 

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from tormagd.client.wire import Numbering
-from tormagd.messages import Setpoint, Telemetry, Tick, decode
+from tormagd_client.messages import Setpoint, Telemetry, Tick, decode
+from tormagd_client.wire import Numbering
 
 PATH = Path(__file__).parents[2] / "examples" / "ros2" / "translation.py"
 spec = importlib.util.spec_from_file_location("translation", PATH)

@@ -8,8 +8,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from tormagd.messages import Telemetry
 from tormagd.recording.writer import TELEMETRY_TOPIC, TICK_KINDS, TICKS_TOPIC, plain_schema, tick_schema
+from tormagd_client.messages import Telemetry
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SCHEMAS = {TELEMETRY_TOPIC: plain_schema(Telemetry), TICKS_TOPIC: tick_schema(TICK_KINDS)}

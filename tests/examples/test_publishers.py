@@ -13,7 +13,7 @@ import msgpack
 import pytest
 import zmq
 
-from tormagd.messages import Setpoint, decode
+from tormagd_client.messages import Setpoint, decode
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"

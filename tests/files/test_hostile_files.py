@@ -15,12 +15,12 @@ from tormagd.control.profile import ProfileError
 from tormagd.ctl.waveform import read_csv
 from tormagd.daemon.profiles import ProfileFolder
 from tormagd.force_file import ForceFileError
-from tormagd.keys import load_pair
 from tormagd.model.model_file import ModelFileError, load_model
 from tormagd.output import printable
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.parameters import PlantError, load_plant
 from tormagd.toml_file import MOST_DEPTH, TomlError, toml_tables
+from tormagd_client.keys import load_pair
 
 
 def read_profile(path: Path) -> object:

@@ -8,8 +8,7 @@ from typing import Any
 import cantools
 import numpy as np
 import pytest
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 
 from firmware_protocol import codec
 from firmware_protocol.codec import (

@@ -7,8 +7,7 @@ from itertools import pairwise
 
 import pytest
 from cobs import cobs  # type: ignore[import-untyped]
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
 from firmware_protocol.codec import EncodeError
 from firmware_protocol.framing import (

@@ -1,8 +1,7 @@
 """Messages to CAN frames and back: identifiers, counters, and whatever a bus may carry besides."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from firmware_protocol.codec import (
     FUNCTION,

@@ -8,8 +8,7 @@ from types import SimpleNamespace
 
 import msgspec
 import pytest
-from hypothesis import HealthCheck, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from firmware_protocol.codec import (
@@ -35,8 +34,8 @@ from tormagd.control.journal import Journal
 from tormagd.hardware.backend import BackendError
 from tormagd.hardware.connection import FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S, Connection
 from tormagd.hardware.link import SILENT_S, LinkState
-from tormagd.messages import LinkReport
 from tormagd.safety.operating_state import DeviceRequest
+from tormagd_client.messages import LinkReport
 
 TICK_S = 1e-3
 COMMANDS = {Home: DeviceRequest.HOME, Retract: DeviceRequest.RETRACT, Clear: DeviceRequest.CLEAR}

@@ -1,8 +1,7 @@
 """Messages to serial bytes and back: what is damaged is counted, what is whole arrives."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from firmware_protocol.codec import Clear, Drive, DriveMode, EncodeError, Home, Message, Retract
 from firmware_protocol.framing import encode_frame

@@ -5,8 +5,7 @@ from collections.abc import Iterable
 
 import msgspec
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from firmware_protocol.codec import Drive, DriveMode, Message
 from tormagd.hardware.frame_stream import FrameStream

@@ -10,8 +10,7 @@ import uvloop
 from firmware_protocol.build import Build
 from tormagd.config import Config, RealTime
 from tormagd.control.core import build_core
-from tormagd.headroom import __main__ as program
-from tormagd.headroom import core_cost, machine_loop
+from tormagd.headroom import __main__ as program, core_cost, machine_loop
 from tormagd.headroom.bare_timer import beat, lateness
 
 pytestmark = pytest.mark.usefixtures("usual_slices")

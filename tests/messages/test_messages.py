@@ -6,10 +6,9 @@ from typing import Any
 import msgpack
 import msgspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from tormagd.messages import (
+from tormagd_client.messages import (
     LONGEST_SHOWN,
     MAX_DISPLACEMENT_MM,
     MAX_MESSAGE_BYTES,

@@ -8,8 +8,8 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import msgspec
 import pytest
 
-from tormagd import messages
-from tormagd.messages import (
+from tormagd_client import messages
+from tormagd_client.messages import (
     BlackBoxReport,
     ClockReport,
     Description,

@@ -7,8 +7,7 @@ import mpmath
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from tormagd.model.features import LARGEST
 from tormagd.model.force_curve import LARGEST_EXPONENT, Known, Network

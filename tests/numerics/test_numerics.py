@@ -11,8 +11,7 @@ import numerics
 import numpy as np
 import pytest
 from extremes import steps
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from tormagd.physics.brake_curve import BrakeCurve
 from tormagd.physics.errors import DomainError

@@ -6,8 +6,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from tormagd.physics.constitutive import (
     Field,

@@ -6,8 +6,7 @@ from typing import Any
 import mpmath as mp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from tormagd.physics.errors import DomainError
 from tormagd.physics.hyperelastic import NeoHookean, Ogden, ThesisOgden

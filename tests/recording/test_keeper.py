@@ -9,8 +9,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
 from tormagd.recording.black_box import read_black_box

@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
 
-from tormagd.messages import MessageError, Telemetry, Tick, encode
 from tormagd.recording.closing import close_cut
 from tormagd.recording.plot import figure, save_plot
 from tormagd.recording.reader import Recording, RecordingError, read_recording
 from tormagd.recording.series import bands, series, tracking_rms_N
 from tormagd.recording.ticks import TickBatch, decode_ticks
 from tormagd.recording.writer import RecordingWriter, plain_schema
+from tormagd_client.messages import MessageError, Telemetry, Tick, encode
 
 START_NS = 1_790_000_000_000_000_000
 COLUMNS = ("t_ns", "setpoint_cf", "measured_cf", "left_mm", "right_mm", "left_duty")

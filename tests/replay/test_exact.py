@@ -6,8 +6,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from firmware_protocol.codec import SCHEMA_HASH, Identity, Switches
 from tormagd.control.device_fit import UNSEEN

@@ -14,11 +14,11 @@ from firmware_protocol.codec import FUNCTION, Drive, Home, State, can_identifier
 from firmware_protocol.framing import FrameDecoder
 from tormagd.control.core import Core
 from tormagd.keeping import Part
-from tormagd.messages import TickRecord
 from tormagd.recording.black_box import BlackBoxFile, read_black_box, write_black_box
 from tormagd.replay.rebuild import rebuilt, recorded
 from tormagd.replay.rerun import Rerun, rerun, ticks_of
 from tormagd.safety.codes import Fault
+from tormagd_client.messages import TickRecord
 
 COLUMNS = TickRecord.__struct_fields__
 DAMAGED_TICK, SNAPSHOT_S = 2_710, 2.5

@@ -20,12 +20,12 @@ from tormagd.config import Config
 from tormagd.control.core import Core
 from tormagd.control.journal import MISSING
 from tormagd.keeping import Part
-from tormagd.messages import TickRecord
 from tormagd.recording.black_box import BlackBoxFile, read_black_box, write_black_box
 from tormagd.recording.reader import RecordingError, read_recording
 from tormagd.replay.rebuild import ReplayError, differences, rebuilt, recorded
 from tormagd.replay.rerun import Rerun, rerun, ticks_of
 from tormagd.safety.codes import Fault
+from tormagd_client.messages import TickRecord
 
 COLUMNS = TickRecord.__struct_fields__
 CHANGED_TICK = 3_210

@@ -1,8 +1,7 @@
 """The operating state: armed on purpose, opened on every fault, never re-armed by itself."""
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from tormagd.safety.codes import FAULTS, Fault, Position

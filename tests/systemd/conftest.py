@@ -19,7 +19,7 @@ BOOT = Path(__file__).with_name("boot.sh")
 NAMESPACES = ("--pid", "--fork", "--mount", "--mount-proc", "--cgroup", "--uts", "--ipc", "--net", "--kill-child")
 VERSION = f"{sys.version_info[0]}.{sys.version_info[1]}"
 PYTHON = f"env LD_LIBRARY_PATH=/opt/base/lib /opt/base/bin/python{VERSION}"
-LIBRARY = "/opt/checkout:/opt/packages"
+LIBRARY = "/opt/checkout:/opt/checkout/client/src:/opt/packages"
 "Where the machine finds this interpreter, and what it imports."
 TRIAL = """mount -t tmpfs tmpfs /mnt && mkdir /mnt/upper /mnt/work /mnt/root /mnt/group
 mount -t overlay overlay -o lowerdir=/,upperdir=/mnt/upper,workdir=/mnt/work /mnt/root
@@ -156,8 +156,8 @@ def package(tmp_path: Path) -> Path:
         pytest.skip(f"the package of Python {VERSION} is for a Debian that has it; this one's is {debians}")
     library, out = tmp_path / "library", tmp_path / "package"
     library.mkdir()
-    for name in ("tormagd", "firmware_protocol"):
-        shutil.copytree(CHECKOUT / name, library / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("tormagd", "firmware_protocol", "client/src/tormagd_client"):
+        shutil.copytree(CHECKOUT / name, library / Path(name).name, ignore=shutil.ignore_patterns("__pycache__"))
     for imported in Path(sysconfig.get_path("purelib")).iterdir():
         if not (library / imported.name).exists():
             (library / imported.name).symlink_to(f"/opt/packages/{imported.name}")

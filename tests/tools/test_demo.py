@@ -12,9 +12,9 @@ from rendering import show
 from rendering.rehearsal import Rehearsal
 
 from tormagd.ctl.outcome import CommandError, Exit
-from tormagd.messages import VERSION, Telemetry, Tick
 from tormagd.safety.codes import FAULTS, Fault, Limit
 from tormagd.scenes.scene import load_scene
+from tormagd_client.messages import VERSION, Telemetry, Tick
 
 README = Path(__file__).parents[2] / "README.md"
 SCENE = load_scene("pulse")

@@ -14,8 +14,8 @@ from intrusion.besieged import Line
 from machines.host import Host
 
 from tormagd.daemon.inbox import SetpointInbox
-from tormagd.messages import MessageError, Request, decode
 from tormagd.safety.operating_state import COMMANDS
+from tormagd_client.messages import MessageError, Request, decode
 
 GREETING = bytes(64)
 WELCOME = b"\x04\xa8" + b"\x07WELCOME" + bytes(160)

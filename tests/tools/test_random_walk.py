@@ -1,8 +1,7 @@
 """The core walks at random, and keeps its rules; a rule that is broken is seen."""
 
 import pytest
-from hypothesis import settings
-from hypothesis import strategies as st
+from hypothesis import settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
 from random_walk import ALLOWED, DRIVEN, BrokenRuleError, Walk
 

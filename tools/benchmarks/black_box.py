@@ -25,11 +25,11 @@ from tormagd.daemon.black_box import PART_TICKS, BlackBox, header
 from tormagd.daemon.telemetry import tick_record
 from tormagd.hardware.connection import Connection
 from tormagd.keeping import READ
-from tormagd.messages import TickRecord
 from tormagd.recording.keeper import KEPT_S
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
+from tormagd_client.messages import TickRecord
 
 PULSE_S = 3.0
 PLANNED_EVERY, FORESEEN_EVERY = 2, 4

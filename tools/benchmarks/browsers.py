@@ -39,7 +39,7 @@ from benchmarks.loop import (
     realtime_settings,
     recording,
 )
-from tormagd.client import Client
+from tormagd_client import Client
 
 CTL = ("-P", "-m", "tormagd.ctl.main")
 OPEN_S = 120.0

@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from tormagd.client import Client, ClientError
 from tormagd.config import ENDPOINTS
+from tormagd_client import Client, ClientError
 
 ALLOWED_MS = 150.0
 PATIENCE_S = 60.0

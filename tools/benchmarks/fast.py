@@ -35,7 +35,7 @@ from benchmarks.loop import (
     without_writes,
     writes,
 )
-from tormagd.client import ClientError
+from tormagd_client import ClientError
 
 LINES = ((2_000, 3_000_000), (4_000, 4_000_000))
 "Control rate, Hz, and baud."

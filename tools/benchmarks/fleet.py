@@ -24,11 +24,11 @@ from tormagd.config import Config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
 from tormagd.daemon.telemetry import snapshot, tick_record
-from tormagd.messages import Telemetry, TickRecord, decode, encode, encode_ticks
 from tormagd.recording.ticks import decode_ticks
 from tormagd.recording.writer import RecordingWriter
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
+from tormagd_client.messages import Telemetry, TickRecord, decode, encode, encode_ticks
 
 DAILY = 10
 "Recordings of one console."

@@ -4,7 +4,7 @@ import shutil
 import socket
 from pathlib import Path
 
-from tormagd.keys import PUBLIC, SECRET, SERVER, generate
+from tormagd_client.keys import PUBLIC, SECRET, SERVER, generate
 
 CLIENT = "client"
 "Publishes and operates."

@@ -28,8 +28,8 @@ from benchmarks.loop import Stand, add_realtime_arguments, asked_for, daemon_pro
 from tormagd.config import Config, RealTime
 from tormagd.daemon.endpoint import context
 from tormagd.daemon.realtime import prepare, priority_of_threads
-from tormagd.messages import VERSION, Setpoint, encode
 from tormagd.recording.ticks import decode_ticks
+from tormagd_client.messages import VERSION, Setpoint, encode
 
 Array = npt.NDArray[np.float64]
 

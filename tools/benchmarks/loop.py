@@ -37,17 +37,17 @@ from machines.wire import carried
 from benchmarks.against import add_against_argument, as_installed, environment
 from benchmarks.histograms import plot_histograms
 from benchmarks.keys import curve_table, free_port
-from tormagd.client import Client, ClientError
-from tormagd.client.wire import keys_of, opened
 from tormagd.config import ENDPOINTS, Config, Endpoints, RealTime, load_config
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
 from tormagd.daemon.telemetry_loop import SERVED_BEFORE_NS
 from tormagd.headroom.bare_timer import beat
-from tormagd.messages import Request
 from tormagd.recording.ticks import decode_ticks
 from tormagd.simulation.device import DEFAULT_BAUD
+from tormagd_client import Client, ClientError
+from tormagd_client.messages import Request
+from tormagd_client.wire import keys_of, opened
 
 Array = npt.NDArray[np.float64]
 NOTHING: Array = np.array([])

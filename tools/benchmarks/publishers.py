@@ -33,7 +33,7 @@ from rendering.show import (
 )
 from rendering.tracking import tracking
 
-from tormagd.client import Client
+from tormagd_client import Client
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FOLDER = ADDRESS.removeprefix("ipc://").removesuffix("/{}")

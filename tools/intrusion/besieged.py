@@ -11,8 +11,8 @@ import numpy as np
 import zmq
 from benchmarks.loop import LOG, Array, Running, Stand, collect, daemon, recording
 
-from tormagd.client import Client
 from tormagd.config import Config, RealTime
+from tormagd_client import Client
 
 FIFO_PRIORITY = 50
 DEVICE_PRIORITY, OTHERS_PRIORITY = FIFO_PRIORITY - 10, FIFO_PRIORITY - 20

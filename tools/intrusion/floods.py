@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from intrusion.besieged import Line, besieged, elsewhere, stand
 from tormagd.config import ENDPOINTS, Endpoints
-from tormagd.messages import VERSION, Request, Setpoint, encode
+from tormagd_client.messages import VERSION, Request, Setpoint, encode
 
 PER_S = 100_000
 LEAST_PER_S = 99_000

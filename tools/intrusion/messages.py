@@ -20,7 +20,7 @@ from tqdm import tqdm
 from intrusion.besieged import FAULT, Besieged, Line, besieged, stand
 from tormagd.config import Endpoints
 from tormagd.daemon.endpoint import SETPOINTS_PER_S
-from tormagd.messages import MAX_MESSAGE_BYTES, Reply, decode
+from tormagd_client.messages import MAX_MESSAGE_BYTES, Reply, decode
 
 SETPOINTS, REQUESTS, SUBSCRIPTIONS = 800_000, 100_000, 50_000
 "On `setpoint`, on `control`, on each of `telemetry` and `recording`."

@@ -20,11 +20,11 @@ from benchmarks.loop import QUANTILES, Array
 from tqdm import tqdm
 
 from intrusion.besieged import Besieged, Line, besieged, stand
-from tormagd.client import RefusedError
 from tormagd.config import Endpoints
-from tormagd.messages import VERSION, Request, encode
 from tormagd.recording.ticks import decode_ticks
 from tormagd.safety.operating_state import DeviceRequest
+from tormagd_client import RefusedError
+from tormagd_client.messages import VERSION, Request, encode
 
 CLIENTS = 100
 STOPS, CLOSING_STOPS = 1_000, 20

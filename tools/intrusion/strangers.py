@@ -29,7 +29,7 @@ from tqdm import trange
 from intrusion.besieged import Besieged, Line, besieged, p99_us, stand
 from intrusion.next_door import next_door
 from tormagd.config import ENDPOINTS
-from tormagd.keys import PUBLIC, SECRET, SERVER, KeyPair, load_pair, load_public
+from tormagd_client.keys import PUBLIC, SECRET, SERVER, KeyPair, load_pair, load_public
 
 TRIES = 10_000
 LEAST_PER_S, PER_S = 500.0, 600.0

@@ -24,11 +24,11 @@ from machines.wire import carried
 
 from rendering.human_pulse import Array, pulse_profile, with_approach
 from rendering.tracking import Tracking, tracking
-from tormagd.client import Client, ClientError, UnreachableError
 from tormagd.ctl.operate import home, operate
-from tormagd.messages import MessageError, Telemetry, decode
 from tormagd.recording.reader import RecordingError, read_recording
 from tormagd.safety.codes import FAULTS, Fault
+from tormagd_client import Client, ClientError, UnreachableError
+from tormagd_client.messages import MessageError, Telemetry, decode
 
 RUN_DIR = Path("run/demo")
 RECORDING = RUN_DIR / "pulse.mcap"

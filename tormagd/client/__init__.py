@@ -1,6 +1,6 @@
-"""What a program of your own speaks to the daemon with; `tormagctl` does, too. For asyncio: `tormagd.client.aio`."""
+"""The client of the distribution `tormagd-client` by its older name. For asyncio: `tormagd.client.aio`."""
 
-from tormagd.client.blocking import Client
-from tormagd.client.errors import ClientError, InFaultError, RefusedError, SettingError, UnreachableError
+from tormagd_client.blocking import Client
+from tormagd_client.errors import ClientError, InFaultError, RefusedError, SettingError, UnreachableError
 
 __all__ = ["Client", "ClientError", "InFaultError", "RefusedError", "SettingError", "UnreachableError"]

@@ -16,9 +16,9 @@ from tormagd.control.step import StepState
 from tormagd.exact import plain
 from tormagd.hardware.backend import Received, Sent
 from tormagd.keeping import READ, WROTE
-from tormagd.messages import TickRecord
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions
+from tormagd_client.messages import TickRecord
 
 FORMAT = 2
 "Of the entries: raised when one comes, is removed or changes its meaning."

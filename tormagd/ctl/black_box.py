@@ -4,8 +4,8 @@ import shutil
 import time
 from pathlib import Path
 
-from tormagd.client.blocking import Client
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+from tormagd_client.blocking import Client
 
 POLL_S = 0.1
 LONGEST_S = 30.0

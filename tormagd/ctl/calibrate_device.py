@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from tormagd.client.blocking import Client
 from tormagd.config import Endpoints
 from tormagd.ctl.calibrate_run import MOVING_MM_S, Columns, Range, armed, reach, seconds_bar
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ctl.waveform import Sample, Waveform
-from tormagd.messages import ProfileReport, Status
+from tormagd_client.blocking import Client
+from tormagd_client.messages import ProfileReport, Status
 
 COLUMNS = ("monotonic_s", "measured_cf", "handle_rate_mm_s")
 "Of the control ticks, what the steps are judged by."

@@ -11,11 +11,11 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from tormagd.client.blocking import Client
 from tormagd.config import Endpoints
 from tormagd.ctl.calibrate_run import Columns, Range, armed, reach, seconds_bar
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ctl.waveform import Sample, Waveform
+from tormagd_client.blocking import Client
 
 Side: TypeAlias = Literal["left", "right"]
 

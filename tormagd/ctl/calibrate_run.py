@@ -12,16 +12,16 @@ import numpy.typing as npt
 import zmq
 from tqdm import tqdm
 
-from tormagd.client.blocking import Client
-from tormagd.client.errors import ClientError, unreachable
-from tormagd.client.wire import Numbering, connect, keys_of
 from tormagd.config import Endpoints
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.operate import home
 from tormagd.ctl.outcome import CommandError, Exit, is_terminal
 from tormagd.ctl.waveform import Waveform
-from tormagd.messages import MessageError
 from tormagd.recording.ticks import MAX_BATCH_BYTES, TickBatch, Value, decode_ticks
+from tormagd_client.blocking import Client
+from tormagd_client.errors import ClientError, unreachable
+from tormagd_client.messages import MessageError
+from tormagd_client.wire import Numbering, connect, keys_of
 
 Columns = dict[str, npt.NDArray[np.float64]]
 

@@ -2,10 +2,10 @@
 
 import sys
 
-from tormagd.client.blocking import Client
-from tormagd.client.wire import understood
 from tormagd.ctl.outcome import Colour, Outcome
-from tormagd.messages import ClockReport, LinkReport, RoundTripReport
+from tormagd_client.blocking import Client
+from tormagd_client.messages import ClockReport, LinkReport, RoundTripReport
+from tormagd_client.wire import understood
 
 UNKNOWN = "-"
 COUNTERS = ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronisations")

@@ -6,7 +6,8 @@ from typing import Any
 
 from tormagd.config import ConfigError
 from tormagd.ctl.outcome import Outcome, usage_error
-from tormagd.keys import PUBLIC, SERVER, fingerprint, generate, load_folder, load_public
+from tormagd.keys import load_folder
+from tormagd_client.keys import PUBLIC, SERVER, fingerprint, generate, load_public
 
 HINT = "tormagctl keys generate --help; the guide has the whole exchange"
 

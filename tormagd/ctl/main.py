@@ -13,10 +13,10 @@ from pathlib import Path
 import msgspec
 
 from tormagd import __version__
-from tormagd.client.errors import ClientError
 from tormagd.config import ENDPOINTS, ROLES, Config, ConfigError, Curve, Endpoints, load_config
 from tormagd.ctl.outcome import Outcome, exit_code, print_error, print_outcome, usage_error
 from tormagd.output import write_line
+from tormagd_client.errors import ClientError
 
 STATE_COMMANDS = {
     "enable": "start rendering force (homed, fresh measurements and a neutral setpoint needed)",
@@ -144,7 +144,7 @@ def _new_scene(options: argparse.Namespace) -> Outcome:
 
 
 def _ask(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
-    from tormagd.client.blocking import Client
+    from tormagd_client.blocking import Client
 
     with Client(endpoints, options.wait) as client:
         match options.command:
@@ -182,7 +182,7 @@ def _send(options: argparse.Namespace, endpoints: Endpoints) -> Outcome:
     from tormagd.ctl.send import Stream, send
     from tormagd.ctl.waveform import WaveformError, read_csv, shape
     from tormagd.force_file import ForceFileError
-    from tormagd.messages import MAX_PREVIEW_SAMPLES
+    from tormagd_client.messages import MAX_PREVIEW_SAMPLES
 
     # a CSV file lasts as long as it is unless it is to be cut; a computed shape lasts ten seconds
     try:

@@ -15,13 +15,13 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
-from tormagd.client.blocking import Client
-from tormagd.client.errors import ClientError
 from tormagd.config import Endpoints
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import Outcome, usage_error
-from tormagd.messages import ExecReport, Status
 from tormagd.output import write_line
+from tormagd_client.blocking import Client
+from tormagd_client.errors import ClientError
+from tormagd_client.messages import ExecReport, Status
 
 LOOPBACK = "127.0.0.1"
 POLL_S = 0.1

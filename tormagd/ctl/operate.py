@@ -3,9 +3,9 @@
 import sys
 import time
 
-from tormagd.client.blocking import Client
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal
-from tormagd.messages import Explained, Status
+from tormagd_client.blocking import Client
+from tormagd_client.messages import Explained, Status
 
 POLL_S = 0.05
 BEGIN_S = 2.0

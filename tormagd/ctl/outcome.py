@@ -7,8 +7,8 @@ from typing import Any, TextIO
 
 import msgspec
 
-from tormagd.client.errors import ClientError, InFaultError, SettingError, UnreachableError
 from tormagd.output import printable, write_line
+from tormagd_client.errors import ClientError, InFaultError, SettingError, UnreachableError
 
 
 class Exit(IntEnum):

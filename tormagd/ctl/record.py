@@ -11,16 +11,16 @@ from pathlib import Path
 import msgspec
 import zmq
 
-from tormagd.client.blocking import Client
-from tormagd.client.errors import ClientError, unreachable
-from tormagd.client.wire import Keys, connect, keys_of
 from tormagd.config import Endpoints
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
-from tormagd.messages import MessageError, Telemetry, decode
 from tormagd.output import printable, write_line
 from tormagd.recording.ticks import MAX_BATCH_BYTES, decode_ticks
 from tormagd.recording.writer import RecordingWriter
+from tormagd_client.blocking import Client
+from tormagd_client.errors import ClientError, unreachable
+from tormagd_client.messages import MessageError, Telemetry, decode
+from tormagd_client.wire import Keys, connect, keys_of
 
 POLL_MS = 100
 QUEUE = 10_000

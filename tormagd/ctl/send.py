@@ -9,14 +9,14 @@ from typing import NamedTuple
 import msgspec
 import zmq
 
-from tormagd.client.blocking import Client
-from tormagd.client.errors import UnreachableError, unreachable
-from tormagd.client.wire import Numbering, connect, keys_of
 from tormagd.config import Endpoints
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ctl.watch import Watch, require_range
 from tormagd.ctl.waveform import Waveform
+from tormagd_client.blocking import Client
+from tormagd_client.errors import UnreachableError, unreachable
+from tormagd_client.wire import Numbering, connect, keys_of
 
 
 class Stream(NamedTuple):

@@ -4,10 +4,9 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 
 from firmware_protocol.build import COST, REMEDY
-from tormagd.client.blocking import Client
-from tormagd.client.wire import understood
 from tormagd.ctl.outcome import Colour, Exit, Outcome
-from tormagd.messages import (
+from tormagd_client.blocking import Client
+from tormagd_client.messages import (
     Explained,
     LinkReport,
     PeerReport,
@@ -18,6 +17,7 @@ from tormagd.messages import (
     Status,
     WayReport,
 )
+from tormagd_client.wire import understood
 
 UNKNOWN = "-"
 SURE_WINDOWS = 20

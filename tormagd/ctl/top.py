@@ -13,13 +13,13 @@ from collections.abc import Iterator
 from rich.console import Console
 from rich.live import Live
 
-from tormagd.client.blocking import Client
-from tormagd.client.errors import not_understood
-from tormagd.client.wire import Pending, understood
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import Outcome, is_terminal, usage_error
 from tormagd.ctl.top_screen import Seen, screen
-from tormagd.messages import Explained, MessageError, Telemetry
+from tormagd_client.blocking import Client
+from tormagd_client.errors import not_understood
+from tormagd_client.messages import Explained, MessageError, Telemetry
+from tormagd_client.wire import Pending, understood
 
 REDRAW_S = 0.2
 ASK_S = 1.0

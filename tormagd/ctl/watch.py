@@ -5,12 +5,12 @@ import time
 
 import msgspec
 
-from tormagd.client.blocking import Client
-from tormagd.client.wire import Pending, understood
 from tormagd.ctl.operate import in_fault
 from tormagd.ctl.outcome import CommandError, Exit
-from tormagd.messages import Description, Explained, Status
 from tormagd.output import write_line
+from tormagd_client.blocking import Client
+from tormagd_client.messages import Description, Explained, Status
+from tormagd_client.wire import Pending, understood
 
 LOOK_S = 0.1
 "Between two looks at the daemon's status. It is a new one every 20 ms, and reading it takes a quarter of one."

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tormagd.force_file import OPTIONAL_COLUMNS, read_forces
-from tormagd.messages import MAX_FORCE_N
+from tormagd_client.messages import MAX_FORCE_N
 
 
 class WaveformError(ValueError):

@@ -21,8 +21,9 @@ import zmq.utils.monitor
 from zmq.utils import z85
 
 from tormagd.config import ROLES, ConfigError
-from tormagd.keys import Allowed, KeyRing, fingerprint
-from tormagd.messages import PeerReport
+from tormagd.keys import Allowed, KeyRing
+from tormagd_client.keys import fingerprint
+from tormagd_client.messages import PeerReport
 
 CONNECTIONS = 200
 CONNECTIONS_PER_PEER = 160

@@ -30,8 +30,8 @@ from tormagd.control.step import StepState
 from tormagd.daemon.profiles import state_folder
 from tormagd.hardware.connection import Connection
 from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
-from tormagd.messages import BlackBoxReport, TickRecord
 from tormagd.safety.operating_state import RefusedError
+from tormagd_client.messages import BlackBoxReport, TickRecord
 
 PART_TICKS = 20
 "Control periods that are handed over at once; between two telemetry messages, where telemetry has as many."

@@ -9,8 +9,8 @@ from tormagd.config import Device
 from tormagd.control.step import StepState
 from tormagd.daemon.callbacks import Delay
 from tormagd.hardware.measurement import Measurement
-from tormagd.messages import Explained, StallReport
 from tormagd.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
+from tormagd_client.messages import Explained, StallReport
 
 log = logging.getLogger(__name__)
 

@@ -21,7 +21,8 @@ from tormagd.daemon.inbox import SOURCES, SetpointInbox
 from tormagd.daemon.requests import FIRST, Requests, Waiting, may_go_first
 from tormagd.daemon.socket_file import SocketFile, ipc_path
 from tormagd.keys import KeyRing
-from tormagd.messages import (
+from tormagd.safety.operating_state import RefusedError
+from tormagd_client.messages import (
     MAX_MESSAGE_BYTES,
     VERSION,
     ErrorReply,
@@ -36,7 +37,6 @@ from tormagd.messages import (
     encode,
     encode_ticks,
 )
-from tormagd.safety.operating_state import RefusedError
 
 DRAIN = 32
 "Setpoints read at once at most; more wait for the next tick, so that a flood cannot stall control."

@@ -14,9 +14,9 @@ from tormagd.daemon.rate_group import RecentHistogram
 from tormagd.daemon.sequence import Order, Sequence
 from tormagd.daemon.source_clock import AHEAD_S, SourceClock
 from tormagd.hardware.link_statistics import WINDOW_S, ClockFit
-from tormagd.messages import ClockReport, MessageError, Setpoint, SetpointReport, SourceReport, decode
 from tormagd.safety.codes import Explanation, Limit
 from tormagd.safety.operating_state import RefusedError
+from tormagd_client.messages import ClockReport, MessageError, Setpoint, SetpointReport, SourceReport, decode
 
 SOURCES = 16
 "Publishers that are kept apart; another one is refused until an old one has been silent."

@@ -17,7 +17,7 @@ from tormagd.control.device_fit import UNSEEN, DeviceFit
 from tormagd.control.plan import NOTHING_SHOWN, Shown
 from tormagd.control.profile import MAX_BYTES, Profile, ProfileError, profile_of, read_profile
 from tormagd.control.slow_friction import SlowFriction
-from tormagd.messages import ProfileReport
+from tormagd_client.messages import ProfileReport
 
 log = logging.getLogger(__name__)
 

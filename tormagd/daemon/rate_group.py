@@ -6,7 +6,7 @@ from typing import Final, NamedTuple, final
 
 from msgspec.structs import asdict
 
-from tormagd.messages import ExecReport, LatenessReport, RateReport
+from tormagd_client.messages import ExecReport, LatenessReport, RateReport
 
 WARNING_PERIODS: Final = 1.0
 "A run that is done later than this after it was due has overrun: the next one was due already."

@@ -7,8 +7,8 @@ from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.control.plan import Plan
 from tormagd.control.step import StepOutput, StepState
 from tormagd.hardware.measurement import Measurement
-from tormagd.messages import VERSION, Telemetry, Tick, TickRecord
 from tormagd.safety.operating_state import OperatingState
+from tormagd_client.messages import VERSION, Telemetry, Tick, TickRecord
 
 
 def tick_record(

@@ -26,7 +26,9 @@ from tormagd.daemon.service import READY, Service, status_line
 from tormagd.daemon.telemetry import is_driven, snapshot, tick_record
 from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
-from tormagd.messages import (
+from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
+from tormagd.scenes.scene import terms_of
+from tormagd_client.messages import (
     Description,
     DeviceReport,
     OutputReport,
@@ -36,8 +38,6 @@ from tormagd.messages import (
     Telemetry,
     TickRecord,
 )
-from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
-from tormagd.scenes.scene import terms_of
 
 NS = 1_000_000_000
 MOST_TICKS = 100

@@ -10,7 +10,7 @@ import math
 from tormagd.control.plan import PlanState
 from tormagd.control.step import StepState
 from tormagd.daemon.rate_group import RecentHistogram
-from tormagd.messages import ExecReport, WayReport
+from tormagd_client.messages import ExecReport, WayReport
 
 BUDGET_MS = 400.0
 "Over this, a delayed force makes a task slower and its contacts harder."

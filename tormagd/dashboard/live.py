@@ -9,11 +9,11 @@ from typing import Any
 
 import msgspec
 
-from tormagd.client.aio import AsyncClient
-from tormagd.client.errors import ClientError
 from tormagd.dashboard.frame import Explanation, Frame, Held, late_counts
-from tormagd.messages import Description, MessageError, Status, Telemetry
 from tormagd.output import printable
+from tormagd_client.aio import AsyncClient
+from tormagd_client.errors import ClientError
+from tormagd_client.messages import Description, MessageError, Status, Telemetry
 
 FRAME_S = 0.1
 STATUS_S = 1.0

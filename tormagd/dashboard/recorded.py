@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 
 from tormagd.dashboard.frame import SHOWN_S, Explanation, Frame, Held, late_counts
-from tormagd.messages import PortraitReport
 from tormagd.recording.reader import Recording
 from tormagd.recording.series import BREAK_S, Band, Series, bands, series, start_ns, tracking_rms_N
 from tormagd.safety.codes import FAULTS, LIMITS
+from tormagd_client.messages import PortraitReport
 
 STEP_S = 0.02
 "Between two points of a curve, as live."

@@ -20,8 +20,8 @@ from tormagd.hardware.can_stream import CanStream
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import DeviceLink, LinkState
 from tormagd.hardware.measurement import Measurement
-from tormagd.messages import ClockReport, LinkReport, RoundTripReport
 from tormagd.safety.operating_state import DeviceRequest
+from tormagd_client.messages import ClockReport, LinkReport, RoundTripReport
 
 FIRST_BACK_OFF_S = 0.05
 LONGEST_BACK_OFF_S = 1.0

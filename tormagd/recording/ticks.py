@@ -4,7 +4,7 @@ from typing import TypeAlias
 
 import msgspec
 
-from tormagd.messages import VERSION, MessageError
+from tormagd_client.messages import VERSION, MessageError
 
 TIME_COLUMN = "t_ns"
 MAX_BATCH_BYTES = 4_000_000  # 20 ms at 4 kHz with 100 columns is under 1 MB

@@ -17,9 +17,9 @@ from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
 from tormagd import __version__
-from tormagd.messages import Telemetry, TickRecord
 from tormagd.recording.closing import ABOUT, CUT, close_cut
 from tormagd.recording.ticks import TickBatch, Value
+from tormagd_client.messages import Telemetry, TickRecord
 
 TELEMETRY_TOPIC = "/telemetry"
 TICKS_TOPIC = "/ticks"

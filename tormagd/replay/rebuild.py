@@ -11,9 +11,9 @@ from tormagd import __version__
 from tormagd.config import Config, ConfigError, checked
 from tormagd.control.core import Core, build_core, platform_name, sources_hash
 from tormagd.control.journal import FORMATS
-from tormagd.messages import TickRecord
 from tormagd.recording.black_box import BlackBoxFile
 from tormagd.scenes.scene import Scene, load_scene
+from tormagd_client.messages import TickRecord
 
 NEEDED = (
     "format", "version", "sources_sha256", "platform", "config", "config_sha256", "scene", "scene_sha256",

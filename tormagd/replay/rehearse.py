@@ -15,7 +15,6 @@ from tormagd.config import Config, ConfigError, checked
 from tormagd.control import journal
 from tormagd.control.core import Core
 from tormagd.control.governor import TimedSetpoint
-from tormagd.messages import TickRecord
 from tormagd.replay.rebuild import ReplayError
 from tormagd.replay.rerun import SETPOINT, ticks_of
 from tormagd.safety.operating_state import OperatingState, RefusedError
@@ -23,6 +22,7 @@ from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import FaultError, parse_fault
 from tormagd.simulation.hand import RecordedHand
 from tormagd.simulation.parameters import PlantError, load_plant
+from tormagd_client.messages import TickRecord
 
 HOMED_S, CONNECTED_S = 8.0, 0.5
 """In virtual time: by then the device is homed, and renders the first setpoint where the recorded one did at the file's

@@ -33,7 +33,6 @@ from tormagd.daemon.telemetry import tick_record
 from tormagd.exact import first_difference, kinds, packed, plain, restored
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
-from tormagd.messages import TickRecord
 from tormagd.model.displacement import Turn
 from tormagd.recording.black_box import frames_in, is_tick
 from tormagd.replay.conversation import Conversation, Damage, Found
@@ -47,6 +46,7 @@ from tormagd.safety.operating_state import (
     SafetyState,
     latch,
 )
+from tormagd_client.messages import TickRecord
 
 KNOWN = kinds(
     *(

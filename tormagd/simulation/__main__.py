@@ -20,11 +20,9 @@ from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevi
 from tormagd.simulation.can_door import FOLDER_PREFIX, CanDoor
 from tormagd.simulation.compiled_firmware import CompiledFirmware
 from tormagd.simulation.device import DEFAULT_BAUD, FirmwareKind, MessageDevice, VirtualDevice
-from tormagd.simulation.faults import FORMS as KNOWN_FAULTS
-from tormagd.simulation.faults import FaultError, parse_fault
+from tormagd.simulation.faults import FORMS as KNOWN_FAULTS, FaultError, parse_fault
 from tormagd.simulation.firmware import Firmware
-from tormagd.simulation.hand import KNOWN as KNOWN_HANDS
-from tormagd.simulation.hand import HandError, parse_hand
+from tormagd.simulation.hand import KNOWN as KNOWN_HANDS, HandError, parse_hand
 from tormagd.simulation.parameters import PlantError, load_plant, plant_names
 from tormagd.simulation.pty_door import PtyDoor
 from tormagd.simulation.real_time import Door, PacedDevice, serve

@@ -8,8 +8,10 @@ from typing import Any, Self
 
 import zmq
 
-from tormagd.client.errors import RefusedError, unreachable
-from tormagd.client.wire import (
+from tormagd_client.endpoints import Endpoints, in_folder
+from tormagd_client.errors import RefusedError, unreachable
+from tormagd_client.messages import Description, Status, Telemetry, decode
+from tormagd_client.wire import (
     NOT_YET,
     SUBSCRIBED,
     Keys,
@@ -22,8 +24,6 @@ from tormagd.client.wire import (
     opened,
     understood,
 )
-from tormagd.config import Endpoints, in_folder
-from tormagd.messages import Description, Status, Telemetry, decode
 
 RETRY_S = 0.1
 

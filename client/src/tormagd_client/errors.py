@@ -3,8 +3,8 @@
 import os
 from pathlib import Path
 
-from tormagd import __version__
-from tormagd.output import printable
+from tormagd_client import __version__
+from tormagd_client.printable import printable
 
 
 class ClientError(Exception):

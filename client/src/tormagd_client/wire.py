@@ -7,10 +7,10 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 import zmq
 
-from tormagd import __version__
-from tormagd.client.errors import InFaultError, RefusedError, SettingError, UnreachableError
-from tormagd.config import ConfigError, Curve
-from tormagd.messages import (
+from tormagd_client import __version__
+from tormagd_client.endpoints import ConfigError, Curve
+from tormagd_client.errors import InFaultError, RefusedError, SettingError, UnreachableError
+from tormagd_client.messages import (
     MAX_MESSAGE_BYTES,
     VERSION,
     Description,
@@ -22,7 +22,7 @@ from tormagd.messages import (
     decode,
     encode,
 )
-from tormagd.output import printable
+from tormagd_client.printable import printable
 
 T = TypeVar("T", Status, Description)
 SocketT = TypeVar("SocketT", bound="zmq.Socket[Any]")
@@ -56,7 +56,7 @@ def keys_of(curve: Curve | None) -> Keys | None:
     """The client's keys in a configuration; None where it has none. Raises SettingError: a file is no good."""
     if curve is None or not curve.client_secret:
         return None
-    from tormagd.keys import PUBLIC, SECRET, load_pair, load_public  # takes a moment, and most have no keys
+    from tormagd_client.keys import PUBLIC, SECRET, load_pair, load_public  # takes a moment, and most have no keys
 
     server_public = curve.server_public or curve.server_secret.removesuffix(SECRET) + PUBLIC
     if server_public == PUBLIC:

@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 import msgpack
 import msgspec
 
+from tormagd_client.printable import require
+
 VERSION = 1
 MAX_MESSAGE_BYTES = 16_384  # a setpoint with the longest preview is under 3 kB; libzmq drops what is larger
 MAX_SOURCE_CHARACTERS = 64
@@ -21,19 +23,10 @@ MAX_FORCE_N = 1_000.0  # a value no brake of this size can mean; the scene's own
 MAX_VALIDITY_MS = 60_000.0
 MAX_DISPLACEMENT_MM = 2.0  # since the handle last turned: friction is mobilised there, and more means nothing
 MAX_RATE_MM_S = 300.0  # no hand moves a handle faster
-LONGEST_SHOWN = 80  # characters of a refused value: an answer with the refusal in it has to stay readable itself
 
 
 class MessageError(ValueError):
     """A message that was refused: the text says which field, its value and what is allowed."""
-
-
-def _require(condition: bool, name: str, value: object, allowed: str) -> None:
-    if not condition:
-        shown = repr(value)
-        if len(shown) > LONGEST_SHOWN:
-            shown = f"{shown[: LONGEST_SHOWN - 3]}..."
-        raise ValueError(f"{name} = {shown}: allowed is {allowed}")
 
 
 class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -57,28 +50,28 @@ class Setpoint(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     session: int | None = None
 
     def __post_init__(self) -> None:
-        _require(self.v == VERSION, "v", self.v, f"{VERSION}")
+        require(self.v == VERSION, "v", self.v, f"{VERSION}")
         is_named = 0 < len(self.source) <= MAX_SOURCE_CHARACTERS and self.source.isprintable()
-        _require(is_named, "source", self.source, "1..64 printable characters")
-        _require(0 <= self.seq < 2**63, "seq", self.seq, "0..2^63-1")
-        _require(self.session is None or 0 <= self.session < 2**63, "session", self.session, "0..2^63-1")
-        _require(0 <= self.stamp_ns < 2**63, "stamp_ns", self.stamp_ns, "0..2^63-1 ns since 1970")
-        _require(0.0 <= self.servo_cf <= MAX_FORCE_N, "servo_cf", self.servo_cf, f"0..{MAX_FORCE_N:g} N")
-        _require(0.0 < self.valid_for_ms <= MAX_VALIDITY_MS, "valid_for_ms", self.valid_for_ms, "above 0, to 60000 ms")
+        require(is_named, "source", self.source, "1..64 printable characters")
+        require(0 <= self.seq < 2**63, "seq", self.seq, "0..2^63-1")
+        require(self.session is None or 0 <= self.session < 2**63, "session", self.session, "0..2^63-1")
+        require(0 <= self.stamp_ns < 2**63, "stamp_ns", self.stamp_ns, "0..2^63-1 ns since 1970")
+        require(0.0 <= self.servo_cf <= MAX_FORCE_N, "servo_cf", self.servo_cf, f"0..{MAX_FORCE_N:g} N")
+        require(0.0 < self.valid_for_ms <= MAX_VALIDITY_MS, "valid_for_ms", self.valid_for_ms, "above 0, to 60000 ms")
         for name, least, most in (
             ("displacement_mm", 0.0, MAX_DISPLACEMENT_MM),
             ("rate_mm_s", -MAX_RATE_MM_S, MAX_RATE_MM_S),
         ):
             value = getattr(self, name)
-            _require(value is None or least <= value <= most, name, value, f"{least:g}..{most:g}")
+            require(value is None or least <= value <= most, name, value, f"{least:g}..{most:g}")
         if self.preview_N is not None:
             allowed = f"at most {MAX_PREVIEW_SAMPLES} forces of 0..{MAX_FORCE_N:g} N"
-            _require(len(self.preview_N) <= MAX_PREVIEW_SAMPLES, "preview_N", f"{len(self.preview_N)} values", allowed)
+            require(len(self.preview_N) <= MAX_PREVIEW_SAMPLES, "preview_N", f"{len(self.preview_N)} values", allowed)
             for index, force_N in enumerate(self.preview_N):
                 if not 0.0 <= force_N <= MAX_FORCE_N:
                     raise ValueError(f"preview_N[{index}] = {force_N!r}: allowed is 0..{MAX_FORCE_N:g} N")
             spacing = self.preview_dt_ms
-            _require(spacing is not None and 0.0 < spacing <= 1_000.0, "preview_dt_ms", spacing, "above 0, to 1000 ms")
+            require(spacing is not None and 0.0 < spacing <= 1_000.0, "preview_dt_ms", spacing, "above 0, to 1000 ms")
 
 
 class Tick(msgspec.Struct, frozen=True):
@@ -470,8 +463,8 @@ class Request(msgspec.Struct, frozen=True, kw_only=True):
     args: dict[str, Any] = msgspec.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _require(self.v == VERSION, "v", self.v, f"{VERSION}")
-        _require(0 < len(self.command) <= 64, "command", self.command, "1..64 characters")
+        require(self.v == VERSION, "v", self.v, f"{VERSION}")
+        require(0 < len(self.command) <= 64, "command", self.command, "1..64 characters")
 
 
 class ErrorReply(msgspec.Struct, frozen=True):

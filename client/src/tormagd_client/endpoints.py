@@ -1,0 +1,145 @@
+"""Where a daemon is: ZeroMQ addresses, and the key files of who connects from elsewhere."""
+
+import ipaddress
+import os
+import re
+
+import msgspec
+
+from tormagd_client.printable import require
+
+DEFAULT_RUN_DIR = "/run/tormag"
+LONGEST_IPC_PATH = 107  # bytes that the kernel takes of a socket's path
+ENDPOINTS = ("setpoint", "telemetry", "control", "recording")
+ROLES = ("publish", "operate", "observe")
+
+_TCP = re.compile(r"tcp://(localhost|[0-9.]+):([0-9]{1,5})")
+
+
+class ConfigError(ValueError):
+    """A configuration that was refused: the text names the key, the value and what is allowed."""
+
+
+class Strict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A table of the configuration."""
+
+
+class Curve(Strict, frozen=True):
+    """Key files. The daemon has `server_secret` and a folder of public keys for each role, a client the last two keys.
+
+    A folder that is not named is the one of its role's name beside `server_secret`.
+    """
+
+    server_secret: str = ""
+    "The daemon's own pair, `server.key_secret`, which `tormagctl keys generate` makes."
+    publish: str = ""
+    "Who may send setpoints, and nothing else."
+    operate: str = ""
+    "Who may give commands, and look."
+    observe: str = ""
+    "Who may look: telemetry, recording, `status`."
+    also_local: bool = False
+    "Whether `ipc://` and loopback demand keys, too."
+    client_secret: str = ""
+    "What `tormagctl` shows."
+    server_public: str = ""
+    "The daemon that `tormagctl` believes; by default the `.key` beside `server_secret`."
+
+
+class Endpoints(Strict, frozen=True):
+    """ZeroMQ addresses. Only `ipc://` and loopback are open; any other address is refused without CURVE keys."""
+
+    setpoint: str = f"ipc://{DEFAULT_RUN_DIR}/setpoint"
+    "Where publishers connect; in the service's own folder, as all four are."
+    telemetry: str = f"ipc://{DEFAULT_RUN_DIR}/telemetry"
+    "Where whoever looks subscribes."
+    control: str = f"ipc://{DEFAULT_RUN_DIR}/control"
+    "Where commands are given."
+    recording: str = f"ipc://{DEFAULT_RUN_DIR}/recording"
+    "Where the recorder hears every control tick."
+    curve: Curve | None = None
+    "Keys, for who connects from elsewhere."
+
+    def is_guarded(self, name: str) -> bool:
+        """Whether the daemon lets in only whom it has the key of."""
+        return not _is_local(getattr(self, name)) or (self.curve is not None and self.curve.also_local)
+
+
+def require_usable(endpoints: Endpoints) -> None:
+    """Raises ValueError naming an address that cannot be used, is another's, or demands keys that are not there."""
+    taken: dict[str, str] = {}
+    curve = endpoints.curve
+    has_keys = curve is not None and bool(curve.server_secret or curve.client_secret)
+    require(
+        has_keys or curve is None or not curve.also_local,
+        "endpoints.curve.also_local",
+        True,
+        "false without keys, which are server_secret or client_secret",
+    )
+    for name in ENDPOINTS:
+        address = getattr(endpoints, name)
+        place = _ipc_place(name, address) if address.startswith("ipc://") else _tcp_place(name, address, has_keys)
+        require(
+            place not in taken,
+            f"endpoints.{name}",
+            address,
+            f"an address other than that of endpoints.{taken.get(place)}",
+        )
+        taken[place] = name
+
+
+def in_folder(folder: str) -> Endpoints:
+    """The endpoints of a daemon whose sockets are in `folder`. Raises ConfigError: the path is too long, or none."""
+    try:
+        placed = msgspec.convert({name: f"ipc://{folder}/{name}" for name in ENDPOINTS}, Endpoints)
+        require_usable(placed)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    return placed
+
+
+def _ipc_place(name: str, address: str) -> str:
+    """What an `ipc://` address comes to, however it is spelt."""
+    path = address.removeprefix("ipc://")
+    require(
+        path not in ("", "@", "*")
+        and path.isprintable()
+        and not path.endswith("/")
+        and len(path.encode()) <= LONGEST_IPC_PATH,
+        f"endpoints.{name}",
+        address,
+        f"after ipc:// the path of a socket, or @ and a name, of at most {LONGEST_IPC_PATH} bytes",
+    )
+    return path if path.startswith("@") else os.path.realpath(path)
+
+
+def _tcp_place(name: str, address: str, has_keys: bool) -> str:
+    """The same of a `tcp://` address. IPv4 only: a ZeroMQ socket speaks no IPv6 unless it is told to, at both ends."""
+    matched = _TCP.fullmatch(address)
+    host, port = matched.groups() if matched else ("", "0")
+    require(
+        (_is_loopback(host) or (has_keys and _is_ipv4(host))) and 0 < int(port) < 65_536,
+        f"endpoints.{name}",
+        address,
+        "ipc:// or tcp:// with an IPv4 address and a port of 1..65535"
+        if has_keys
+        else "ipc:// or a loopback tcp:// address with a port of 1..65535; others need CURVE keys in [endpoints.curve]",
+    )
+    return f"{'127.0.0.1' if host == 'localhost' else host}:{int(port)}"
+
+
+def _is_local(address: str) -> bool:
+    matched = _TCP.fullmatch(address)
+    return matched is None or _is_loopback(matched[1])
+
+
+def _is_loopback(host: str) -> bool:
+    return host == "localhost" or (_is_ipv4(host) and ipaddress.IPv4Address(host).is_loopback)
+
+
+def _is_ipv4(host: str) -> bool:
+    try:
+        ipaddress.IPv4Address(host)
+    except ValueError:
+        return False
+    return True
