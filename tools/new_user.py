@@ -169,10 +169,10 @@ def install(folder: Path, has_compiler: bool) -> tuple[dict[str, str], dict[str,
 
     pip = (venv / "bin/python", "-m", "pip", "--quiet", "--disable-pip-version-check")
     timed("environment", sys.executable, "-m", "venv", venv)
-    timed("wheel", *pip, "wheel", "--no-deps", "--wheel-dir", dist, source, **without)
+    timed("wheel", *pip, "wheel", "--no-deps", "--wheel-dir", dist, source / "client", source, **without)
     shutil.rmtree(source)
-    (wheel,) = dist.glob("*.whl")
-    timed("install", *pip, "install", f"{wheel}[{EXTRAS}]")
+    (client,), (wheel,) = dist.glob("tormagd_client-*.whl"), dist.glob("tormagd-*.whl")
+    timed("install", *pip, "install", client, f"{wheel}[{EXTRAS}]")
     return {"PATH": f"{venv}/bin:/usr/bin:/bin", "HOME": str(folder), "LANG": "C.UTF-8"}, took_s
 
 

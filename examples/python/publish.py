@@ -1,5 +1,5 @@
 import csv, sys, time
-from tormagd.client import Client, ClientError
+from tormagd_client import Client, ClientError
 
 if len(sys.argv) != 3:
     sys.exit("usage: python publish.py FOLDER PROFILE.csv")

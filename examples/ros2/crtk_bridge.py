@@ -12,7 +12,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from translation import command_of, fill_force, fill_header, fill_joints, fill_operating_state, setpoint_of
 
-from tormagd.client import Client, ClientError
+from tormagd_client import Client, ClientError
 
 LOOK_S = 0.02
 "As often as the daemon tells what it does."

@@ -47,7 +47,7 @@ def test_both_builds_give_the_same_results_to_the_bit() -> None:
 
 def test_what_an_earlier_build_left_does_not_run_where_none_was_made(tmp_path: Path) -> None:
     pytest.importorskip("setuptools")
-    for folder in ("firmware_protocol", "tormagd"):
+    for folder in ("firmware_protocol", "tormagd", "client"):
         shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
     for name in ("setup.py", "pyproject.toml", "README.md"):
         shutil.copy(ROOT / name, tmp_path)

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from tormagd_client.messages import (
-    LONGEST_SHOWN,
     MAX_DISPLACEMENT_MM,
     MAX_MESSAGE_BYTES,
     MAX_PREVIEW_SAMPLES,
@@ -24,6 +23,7 @@ from tormagd_client.messages import (
     decode,
     encode,
 )
+from tormagd_client.printable import LONGEST_SHOWN
 
 SETPOINT: dict[str, Any] = {"v": 1, "source": "a", "seq": 7, "stamp_ns": 10**18, "servo_cf": 1.5, "valid_for_ms": 50.0}
 REQUEST: dict[str, Any] = {"v": 1, "id": 3, "command": "status"}

@@ -30,7 +30,7 @@ def environment(root: Path | None) -> dict[str, str]:
         inherited = os.environ.get("PYTHONPATH")
         folders = [str(TOOLS)] + ([inherited] if inherited else [])
     else:
-        folders = [str(root), str(root / "tools")]
+        folders = [str(root), str(root / "client" / "src"), str(root / "tools")]
     return os.environ | {"PYTHONPATH": os.pathsep.join(folders), "OMP_NUM_THREADS": "1"}
 
 

@@ -8,6 +8,7 @@ import os
 import re
 import stat
 import struct
+import sys
 import tempfile
 from pathlib import Path
 from typing import NamedTuple
@@ -121,3 +122,19 @@ def _is_key(text: bytes) -> bool:
         return len(text) == _KEY_CHARACTERS and len(z85.decode(text)) == 32
     except (ValueError, KeyError, struct.error):
         return False
+
+
+def main(arguments: list[str]) -> str:
+    """Makes the pair of a client: NAME and FOLDER. What became of it, a sentence; ends the process where none was made."""
+    try:
+        name, folder = arguments
+        secret, public = generate(name, Path(folder), Path(folder))
+        return f"{secret} stays here; {public} goes to the daemon: {fingerprint(load_public(public))}"
+    except ConfigError as error:
+        raise SystemExit(str(error)) from error
+    except ValueError as error:
+        raise SystemExit("usage: python -m tormagd_client.keys NAME FOLDER") from error
+
+
+if __name__ == "__main__":
+    print(main(sys.argv[1:]))

@@ -1,0 +1,88 @@
+"""The client is a distribution of its own: what it needs, what it brings, and its version."""
+
+import ast
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import tormagd
+import tormagd.client.aio
+import tormagd_client.aio
+from tormagd_client import __version__
+
+ROOT = Path(__file__).parents[2]
+SOURCES = sorted((ROOT / "client/src/tormagd_client").glob("*.py"))
+NEEDED = {"zmq", "msgpack", "msgspec"}
+
+BLOCKED = """
+import sys
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] not in {"tormagd_client", "zmq", "msgpack", "msgspec", *sys.stdlib_module_names}:
+            raise ModuleNotFoundError(f"{name} is blocked")
+sys.meta_path.insert(0, Blocked())
+import tormagd_client, tormagd_client.aio, tormagd_client.keys, tormagd_client.messages
+for name in tormagd_client.__all__:
+    getattr(tormagd_client, name)
+"""
+
+
+def imported(source: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
+        match node:
+            case ast.Import(names=names):
+                found |= {each.name.partition(".")[0] for each in names}
+            case ast.ImportFrom(module=str(module)):
+                found.add(module.partition(".")[0])
+    return found
+
+
+def project(folder: Path) -> dict:
+    return tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=lambda it: it.name)
+def test_it_imports_its_libraries_and_nothing_of_the_daemon(source: Path) -> None:
+    assert imported(source) <= NEEDED | {"tormagd_client"} | sys.stdlib_module_names
+
+
+def test_it_runs_where_nothing_else_can_be_imported() -> None:
+    ran = subprocess.run([sys.executable, "-P", "-c", BLOCKED], capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stderr) == (0, "")
+
+
+def test_who_reads_messages_does_not_wait_for_sockets() -> None:
+    script = "import sys, tormagd_client.messages; sys.exit('zmq' in sys.modules)"
+    subprocess.run([sys.executable, "-P", "-c", script], check=True)
+
+
+def test_both_distributions_are_of_one_version() -> None:
+    assert f"tormagd-client=={__version__}" in project(ROOT)["dependencies"]
+    assert tormagd.__version__ == __version__
+    assert {each.partition(">")[0] for each in project(ROOT / "client")["dependencies"]} == {
+        "pyzmq",
+        "msgpack",
+        "msgspec",
+    }
+
+
+def test_its_older_name_goes_on_working() -> None:
+    assert tormagd.client.aio.AsyncClient is tormagd_client.aio.AsyncClient
+    assert {name: getattr(tormagd.client, name) for name in tormagd.client.__all__} == {
+        name: getattr(tormagd_client, name) for name in tormagd_client.__all__
+    }
+
+
+def test_a_machine_with_the_client_alone_makes_its_keys(tmp_path: Path) -> None:
+    command = [sys.executable, "-P", "-m", "tormagd_client.keys"]
+    made = subprocess.run([*command, "robot", str(tmp_path)], capture_output=True, text=True, check=True)
+    assert made.stdout.startswith(f"{tmp_path}/robot.key_secret stays here; {tmp_path}/robot.key goes to the daemon: ")
+    again = subprocess.run([*command, "robot", str(tmp_path)], capture_output=True, text=True, check=False)
+    assert again.returncode == 1
+    assert "keys are never overwritten" in again.stderr
+    wrong = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert wrong.stderr == "usage: python -m tormagd_client.keys NAME FOLDER\n"
