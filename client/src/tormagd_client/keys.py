@@ -125,7 +125,7 @@ def _is_key(text: bytes) -> bool:
 
 
 def main(arguments: list[str]) -> str:
-    """Makes a client's pair, from NAME and FOLDER: what became of it. Ends the process with a sentence where none was made."""
+    """Makes a client's pair, from NAME and FOLDER: what became of it. Ends the process where none was made."""
     try:
         name, folder = arguments
         secret, public = generate(name, Path(folder), Path(folder))
