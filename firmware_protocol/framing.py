@@ -34,9 +34,6 @@ _DISTANCES: Final = _BYTES[1:-1]
 class Frame(Value):
     """One frame that arrived whole. Whether its payload is a message is for `codec.decode` to say."""
 
-    __match_args__ = ("function", "sequence", "payload")
-    __slots__ = __match_args__
-
     def __init__(self, function: int, sequence: int, payload: bytes) -> None:
         self.function: Final = function
         self.sequence: Final = sequence
@@ -48,7 +45,6 @@ class FramingStatistics(Value):
     """What a FrameDecoder has seen since it was made. It counts on; a copy does not."""
 
     __match_args__ = ("bytes", "frames", "corrupt", "lost", "repeated", "resynchronisations")
-    __slots__ = ("bytes", "corrupt", "frames", "lost", "refused", "repeated", "resynchronisations", "unsent")
 
     def __init__(
         self,

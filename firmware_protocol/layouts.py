@@ -16,9 +16,6 @@ class Retract(Value):
     until Status carries its nonce.
     """
 
-    __match_args__ = ("nonce",)
-    __slots__ = __match_args__
-
     def __init__(self, nonce: int) -> None:
         # New for every command, equal in its repetitions: the device acts on a nonce once.
         self.nonce: Final = nonce
@@ -29,9 +26,6 @@ class Drive(Value):
     """Host -> Device. Motor duties. Every 1 ms; each accepted one is answered by State and Sense. In RUN, 50 ms
     without a valid one makes the device open the gap and latch COMMAND_TIMEOUT.
     """
-
-    __match_args__ = ("left_duty", "right_duty", "mode", "counter")
-    __slots__ = __match_args__
 
     def __init__(self, left_duty: float, right_duty: float, mode: DriveMode, counter: int) -> None:
         # Share of the supply voltage at the left motor; positive opens.
@@ -48,9 +42,6 @@ class Drive(Value):
 @final
 class State(Value):
     """Device -> Host. Where the carriages are. Sent at once for each accepted Drive, so every 1 ms."""
-
-    __match_args__ = ("left_position_mm", "right_position_mm", "device_time_s", "counter")
-    __slots__ = __match_args__
 
     def __init__(self, left_position_mm: float, right_position_mm: float, device_time_s: float, counter: int) -> None:
         # Left screw relative to home (8 mm lead, 4480 counts a turn): 0 at the open end, negative towards closed.
@@ -69,9 +60,6 @@ class Sense(Value):
     """Device -> Host. Currents, force and handle, sampled with the State it follows. Sent at once for each accepted
     Drive, so every 1 ms.
     """
-
-    __match_args__ = ("left_current_A", "right_current_A", "force_N", "handle_position_mm")
-    __slots__ = __match_args__
 
     def __init__(
         self, left_current_A: float, right_current_A: float, force_N: float, handle_position_mm: float
@@ -93,9 +81,6 @@ class Clear(Value):
     nonce.
     """
 
-    __match_args__ = ("nonce",)
-    __slots__ = __match_args__
-
     def __init__(self, nonce: int) -> None:
         # As in Retract.
         self.nonce: Final = nonce
@@ -107,9 +92,6 @@ class Home(Value):
     its nonce.
     """
 
-    __match_args__ = ("nonce",)
-    __slots__ = __match_args__
-
     def __init__(self, nonce: int) -> None:
         # As in Retract.
         self.nonce: Final = nonce
@@ -120,9 +102,6 @@ class Status(Value):
     """Device -> Host. What the device is doing and what is wrong. Every 20 ms on the device's own clock, host or no
     host.
     """
-
-    __match_args__ = ("mode", "switches", "faults", "temperature_C", "supply_V", "drive_counter", "command_nonce")
-    __slots__ = __match_args__
 
     def __init__(
         self,
@@ -156,9 +135,6 @@ class Hello(Value):
     after that.
     """
 
-    __match_args__ = ("schema_hash", "protocol_version", "nonce")
-    __slots__ = __match_args__
-
     def __init__(self, schema_hash: int, protocol_version: int, nonce: int) -> None:
         # First four bytes of the SHA-256 of this file's canonical layout, read as a big-endian number, as the host
         # knows it; on the wire little-endian, as every number.
@@ -174,9 +150,6 @@ class Identity(Value):
     """Device -> Host. Answer to Hello. A device that was compiled from another schema latches SCHEMA_MISMATCH and
     refuses Drive RUN.
     """
-
-    __match_args__ = ("schema_hash", "firmware_major", "firmware_minor", "serial_number")
-    __slots__ = __match_args__
 
     def __init__(self, schema_hash: int, firmware_major: int, firmware_minor: int, serial_number: int) -> None:
         # As in Hello, as the device knows it.

@@ -90,7 +90,6 @@ def _layouts_module(schema: Schema) -> str:
 
 
 def _message(message: MessageSource) -> str:
-    names = ", ".join(f'"{signal.name}"' for signal in message.fields)
     fields = []
     for signal in message.fields:
         fields += [f"        # {line}\n" for line in textwrap.wrap(signal.comment, TEXT_WIDTH - 4)]
@@ -99,8 +98,6 @@ def _message(message: MessageSource) -> str:
     heading = f"{message.sender} -> {message.receiver}. {message.comment}"
     return (
         f"@final\nclass {message.name}(Value):\n{_docstring(heading)}\n"
-        f"    __match_args__ = ({names}{',' if len(message.fields) == 1 else ''})\n"
-        "    __slots__ = __match_args__\n\n"
         f"    {_call('def __init__', parameters, ' -> None:')}\n{''.join(fields)}"
     )
 

@@ -2,7 +2,8 @@
 
 A value is a final class with a plain `__init__`, whose attributes are `Final`. Compiled, making one and reading it are
 a few machine instructions, and no assignment gets past it; interpreted, it is faster than a named tuple. The fields are
-named once, in `__match_args__`, in the order of `__init__`; `__slots__` is the same.
+named once, by `__init__`, which assigns them in the order of its parameters. A value that holds more than it is made of
+names its fields itself, in `__match_args__`.
 """
 
 from typing import Any, ClassVar, Self
@@ -11,8 +12,16 @@ from typing import Any, ClassVar, Self
 class Value:
     """Base of the values: equality, hash, text, copies and pickles by `__match_args__`."""
 
-    __slots__ = ()
     __match_args__: ClassVar[tuple[str, ...]] = ()
+
+    def __init_subclass__(cls) -> None:
+        """Reads the names of the fields: a compiled class says its attributes, any other its parameters."""
+        code = getattr(cls.__init__, "__code__", None)
+        if code is None:
+            names = getattr(cls, "__mypyc_attrs__", ())
+        else:
+            names = code.co_varnames[1 : code.co_argcount + code.co_kwonlyargcount]
+        type.__setattr__(cls, "__match_args__", names)
 
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):

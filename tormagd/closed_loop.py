@@ -42,9 +42,6 @@ class Sample(Value):
     """One control tick: what was asked, what the controller knew, and what really was. The step was given the
     `measurement`; what it drove may have changed the connection's by now."""
 
-    __match_args__ = ("time_s", "state", "output", "plan", "trim", "truth", "measurement")
-    __slots__ = __match_args__
-
     def __init__(
         self,
         time_s: float,

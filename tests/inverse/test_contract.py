@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 
 from tormagd.inverse.bracketed import BracketedSearch, Refinement, brent, finer_grid, newton
-from tormagd.inverse.closed_form import ClosedForm
-from tormagd.inverse.direct import DirectInverse
-from tormagd.inverse.kd_tree import KdTreeSearch
 from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
 from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.newton import ACCURACY_MT, RisingSearch
@@ -18,13 +15,9 @@ from tormagd.inverse.solution import FieldSolver, Reach
 from tormagd.model.features import LARGEST
 from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
-from tormagd.physics.field import radial_moment_from_flux_density_Tm
-from tormagd.physics.force import TORMAG, brake_force_N
-from tormagd.physics.inserts import insert
 
 RANGE_MT = (100.0, 750.0)
 CIP = 40.0
-ELASTOMER = insert("MRE-50-40").elastomer
 Make = Callable[[ForceModel], FieldSolver]
 
 
@@ -35,15 +28,10 @@ class Subject(NamedTuple):
     accuracy_mT: float
     is_continuous: bool = True
     needs_rising: bool = False
-    uses_network: bool = True
 
 
 def bracketed(refine: Refinement, dtype: type[np.floating] = np.float64) -> Make:
     return lambda model: BracketedSearch(field_range_mT=RANGE_MT, refine=refine, dtype=dtype)
-
-
-def linear(epsilon_N: float) -> Make:
-    return lambda model: LinearFieldSearch(field_range_mT=RANGE_MT, epsilon_N=epsilon_N, predict_one=torch_row(model))
 
 
 SUBJECTS = {
@@ -57,34 +45,24 @@ SUBJECTS = {
     "newton float32": Subject(bracketed(newton, np.float32), 1e-2),
     "rising": Subject(lambda model: RisingSearch(RANGE_MT), ACCURACY_MT, needs_rising=True),
     "brent": Subject(bracketed(brent), 1e-3),
-    "k-d tree": Subject(lambda model: KdTreeSearch(model, field_range_mT=RANGE_MT), 25.0),
-    "direct": Subject(lambda model: DirectInverse(model, field_range_mT=RANGE_MT), 10.0, True, True),
-    "thesis-linear": Subject(linear(0.01), 5.0, False),
-    "linear-argmin": Subject(linear(0.0), 0.51, False),
-    "vectorised-argmin": Subject(lambda model: GridArgmin(model, field_range_mT=RANGE_MT), 0.51, False),
-    "closed form": Subject(
-        lambda model: ClosedForm(model, ELASTOMER, TORMAG, field_range_mT=RANGE_MT), 1e-6, uses_network=False
+    "thesis-linear": Subject(
+        lambda model: LinearFieldSearch(field_range_mT=RANGE_MT, epsilon_N=0.01, predict_one=torch_row(model)),
+        *(5.0, False),
     ),
+    "linear-argmin": Subject(lambda model: LinearFieldSearch(field_range_mT=RANGE_MT, epsilon_N=0.0), 0.51, False),
+    "vectorised-argmin": Subject(lambda model: GridArgmin(model, field_range_mT=RANGE_MT), 0.51, False),
 }
-NETWORK = [name for name, subject in SUBJECTS.items() if subject.uses_network]
-CONTINUOUS = [name for name in NETWORK if SUBJECTS[name].is_continuous and not SUBJECTS[name].needs_rising]
-FORGETFUL = [name for name in NETWORK if not SUBJECTS[name].is_continuous]
+ANY_SHAPE = [name for name, subject in SUBJECTS.items() if not subject.needs_rising]
+CONTINUOUS = [name for name in ANY_SHAPE if SUBJECTS[name].is_continuous]
+FORGETFUL = [name for name in ANY_SHAPE if not SUBJECTS[name].is_continuous]
 _MADE: dict[tuple[str, int], FieldSolver] = {}
 
 
 def solver(name: str, model: ForceModel) -> FieldSolver:
-    """The search on that model, made once: some take a training."""
+    """The search on that model, made once."""
     if (name, id(model)) not in _MADE:
         _MADE[name, id(model)] = SUBJECTS[name].make(model)
     return _MADE[name, id(model)]
-
-
-def force_N(name: str, model: ForceModel, displacement_mm: float, rate_mm_s: float, field_mT: float) -> float:
-    """The force that the search inverts: the network's, or the closed form's."""
-    if SUBJECTS[name].uses_network:
-        return model.predict_one(displacement_mm, rate_mm_s, field_mT, CIP)
-    moment = radial_moment_from_flux_density_Tm(1e-3 * field_mT, ELASTOMER.relative_permeability, TORMAG.inner_radius_m)
-    return float(brake_force_N(moment, ELASTOMER, TORMAG))
 
 
 @pytest.mark.parametrize("name", SUBJECTS)
@@ -93,14 +71,14 @@ def test_on_a_rising_model_the_root_is_found(rising: ForceModel, name: str) -> N
     rng = np.random.default_rng(3)
     last: float | None = None
     for displacement, rate, field in rng.uniform((0.05, 3, 110), (0.95, 57, 740), (60, 3)).tolist():
-        force = force_N(name, rising, displacement, rate, field)
+        force = rising.predict_one(displacement, rate, field, CIP)
         solution = searcher.solve(rising.curve(displacement, rate, CIP), force, last)
         assert solution.field_mT == pytest.approx(field, abs=accuracy)
         assert solution.reach is Reach.INSIDE
         assert solution.predicted_force_N == pytest.approx(
             rising.predict_one(displacement, rate, solution.field_mT, CIP), abs=1e-12
         )
-        assert 0 < solution.confidence <= 1
+        assert (0.999 if SUBJECTS[name].is_continuous else 0.0) < solution.confidence <= 1
         assert isinstance(solution.field_mT, float)
         last = solution.field_mT
 
@@ -116,6 +94,7 @@ def test_on_a_model_that_falls_again_the_branch_is_kept(bump: ForceModel, name: 
             assert solution.reach is Reach.INSIDE
             assert (solution.field_mT - 450) * side > 0
             assert abs(solution.field_mT - last) < 60
+            assert solution.predicted_force_N == pytest.approx(peak - depth, abs=1e-3)
             last = solution.field_mT
 
 
@@ -136,39 +115,38 @@ def test_a_search_without_memory_answers_with_one_of_the_roots(bump: ForceModel,
     assert solution.reach is Reach.INSIDE
 
 
-@pytest.mark.parametrize("fixture", ["bump", "plateau"])
-def test_a_direct_inverse_refuses_a_model_that_has_none(request: pytest.FixtureRequest, fixture: str) -> None:
-    with pytest.raises(DomainError, match="rises with the field everywhere"):
-        SUBJECTS["direct"].make(request.getfixturevalue(fixture))
+@pytest.mark.parametrize("name", SUBJECTS)
+@pytest.mark.parametrize("end", RANGE_MT)
+def test_the_ends_themselves_are_inside(rising: ForceModel, name: str, end: float) -> None:
+    curve = rising.curve(0.5, 10, CIP)
+    solution = solver(name, rising).solve(curve, curve.force_N(end), None)
+    assert solution.reach is Reach.INSIDE
+    assert solution.field_mT == pytest.approx(end, abs=0.01 if SUBJECTS[name].is_continuous else 5.0)
 
 
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_out_of_reach_is_the_nearest_end_and_never_silent(rising: ForceModel, name: str) -> None:
     searcher = solver(name, rising)
-    least, most = (force_N(name, rising, 0.5, 10, field) for field in RANGE_MT)
+    least, most = (rising.predict_one(0.5, 10, field, CIP) for field in RANGE_MT)
     below = searcher.solve(rising.curve(0.5, 10, CIP), least - 0.5, 500.0)
     above = searcher.solve(rising.curve(0.5, 10, CIP), most + 0.5, 500.0)
     assert (below.field_mT, below.reach) == (RANGE_MT[0], Reach.BELOW)
     assert (above.field_mT, above.reach) == (RANGE_MT[1], Reach.ABOVE)
-    if SUBJECTS[name].uses_network:
-        assert max(below.confidence, above.confidence) <= math.exp(-20 * 0.49 / 6)
+    for solution in (below, above):
+        assert solution.confidence == pytest.approx(math.exp(-20 * 0.5 / 6), rel=1e-4)
 
 
-@pytest.mark.parametrize("name", NETWORK)
+@pytest.mark.parametrize("name", ANY_SHAPE)
 def test_above_the_peak_of_a_bump_is_above(bump: ForceModel, name: str) -> None:
-    if SUBJECTS[name].needs_rising:
-        pytest.skip("for rising forces only")
     peak = bump.predict_one(0.5, 10, 450.0, CIP)
     solution = solver(name, bump).solve(bump.curve(0.5, 10, CIP), peak + 0.1, 200.0)
     assert solution.reach is Reach.ABOVE
     assert solution.field_mT == pytest.approx(450, abs=2)
 
 
-@pytest.mark.parametrize("name", NETWORK)
+@pytest.mark.parametrize("name", ANY_SHAPE)
 def test_a_tie_is_resolved_by_continuity(plateau: ForceModel, name: str) -> None:
     """Hundreds of fields give the same force to the last bit: the last field among them stays."""
-    if SUBJECTS[name].needs_rising:
-        pytest.skip("for rising forces only")
     top = plateau.predict_one(0.5, 10, 740.0, CIP)
     for last in (600.0, 633.3):
         solution = solver(name, plateau).solve(plateau.curve(0.5, 10, CIP), top, last)
@@ -209,7 +187,12 @@ def test_extreme_inputs_have_a_defined_answer(rising: ForceModel, name: str) -> 
         curve = rising.curve(displacement, rate, cip)
         solution = searcher.solve(curve, force, last)
         assert RANGE_MT[0] <= solution.field_mT <= RANGE_MT[1]
-        assert math.isfinite(solution.predicted_force_N)
+        assert solution.predicted_force_N == pytest.approx(curve.force_N(solution.field_mT), rel=1e-12, abs=1e-12)
+        least, most = (curve.force_N(field) for field in RANGE_MT)
+        if not least - 0.01 <= force <= most + 0.01:
+            assert solution.reach is (Reach.BELOW if force < least else Reach.ABOVE)
+        elif least + 0.01 < force < most - 0.01:
+            assert solution.reach is Reach.INSIDE
         assert 0 <= solution.confidence <= 1
         assert solution == searcher.solve(curve, force, last)
 

@@ -1,18 +1,14 @@
 """The searches: they find the network's own root, keep their branch, and say when there is none."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
 from scipy.optimize import brentq
 
 from tormagd.inverse.linear import THESIS_EPSILON_N, LinearFieldSearch
 from tormagd.inverse.nearest import NearestFieldSearch, field_grid
-from tormagd.inverse.newton import RisingSearch
-from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
-from tormagd.model.features import LARGEST
+from tormagd.inverse.solution import FieldSolution, Reach
 from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 
@@ -29,13 +25,6 @@ def linear(epsilon_N: float = 0.0) -> LinearFieldSearch:
     return LinearFieldSearch(field_range_mT=RANGE_MT, epsilon_N=epsilon_N)
 
 
-EXTREME_SOLVERS: tuple[FieldSolver, ...] = (
-    *(nearest(step_mT=10.0, dtype=dtype) for dtype in DTYPES),
-    RisingSearch(RANGE_MT),
-)
-SOLVERS: tuple[Callable[[], FieldSolver], ...] = (nearest, linear)
-
-
 def attainable(model: ForceModel, displacement_mm: float, rate_mm_s: float, share: float) -> float:
     """Return the force at `share` of the way from the least to the greatest at that point."""
     low, high = (model.predict_one(displacement_mm, rate_mm_s, field, CIP) for field in RANGE_MT)
@@ -49,20 +38,6 @@ def network_root(model: ForceModel, displacement_mm: float, rate_mm_s: float, fo
     )
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_nearest_finds_the_root_of_the_network(rising: ForceModel, dtype: type[np.floating]) -> None:
-    solver = nearest(dtype=dtype)
-    rng = np.random.default_rng(0)
-    for displacement, rate, share in rng.uniform((0, 0, 0.001), (1, 60, 0.999), (300, 3)).tolist():
-        force = attainable(rising, displacement, rate, share)
-        solution = solver.solve(rising.curve(displacement, rate, CIP), force, None)
-        root = network_root(rising, displacement, rate, force)
-        assert solution.field_mT == pytest.approx(root, abs=0.01)
-        assert solution.reach is Reach.INSIDE
-        assert solution.predicted_force_N == pytest.approx(force, abs=1e-4)
-        assert solution.confidence > 0.999
-
-
 def test_interpolation_beats_the_grid(rising: ForceModel) -> None:
     """With a grid of 25 mT the answers stay within a hundredth of a step."""
     solver = nearest(step_mT=25.0, dtype=np.float64)
@@ -70,33 +45,6 @@ def test_interpolation_beats_the_grid(rising: ForceModel) -> None:
         force = attainable(rising, 0.5, 20, share)
         root = network_root(rising, 0.5, 20, force)
         assert solver.solve(rising.curve(0.5, 20, CIP), force, None).field_mT == pytest.approx(root, abs=0.25)
-
-
-def test_single_and_double_precision_agree(rising: ForceModel) -> None:
-    single, double = (nearest(dtype=dtype) for dtype in DTYPES)
-    rng = np.random.default_rng(1)
-    for displacement, rate, share in rng.uniform((0, 0, 0.01), (1, 60, 0.99), (200, 3)).tolist():
-        force = attainable(rising, displacement, rate, share)
-        ends = [
-            solver.solve(rising.curve(displacement, rate, CIP), force, 400.0).field_mT for solver in (single, double)
-        ]
-        assert ends[0] == pytest.approx(ends[1], abs=0.01)
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_the_branch_of_the_last_field_is_kept(bump: ForceModel, dtype: type[np.floating]) -> None:
-    """Follow a force down and up again on either side of the peak: the field never jumps across."""
-    solver = nearest(dtype=dtype)
-    peak = bump.predict_one(0.5, 10, 450.0, CIP)
-    for start, side in ((440.0, -1), (460.0, 1)):
-        last = start
-        for force in peak - 0.05 - np.concatenate((np.linspace(0, 2, 60), np.linspace(2, 0, 60))):
-            solution = solver.solve(bump.curve(0.5, 10, CIP), float(force), last)
-            assert solution.reach is Reach.INSIDE
-            assert (solution.field_mT - 450) * side > 0
-            assert abs(solution.field_mT - last) < 60
-            assert solution.predicted_force_N == pytest.approx(force, abs=1e-3)
-            last = solution.field_mT
 
 
 @pytest.mark.parametrize(("neighbours", "keeps"), [(1, False), (2, False), (16, True)])
@@ -122,11 +70,6 @@ def test_one_neighbour_is_enough_where_the_force_rises(rising: ForceModel) -> No
         last = solution.field_mT
 
 
-def test_without_a_last_field_the_least_of_the_roots_is_taken(bump: ForceModel) -> None:
-    force = bump.predict_one(0.5, 10, 300.0, CIP)
-    assert nearest().solve(bump.curve(0.5, 10, CIP), force, None).field_mT == pytest.approx(300, abs=0.05)
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_on_a_plateau_the_field_moves_as_little_as_possible(plateau: ForceModel, dtype: type[np.floating]) -> None:
     """Where hundreds of fields give the same force, the answer is one of the nearest in force, not a far one."""
@@ -145,33 +88,6 @@ def test_a_slope_below_rounding_does_not_move_the_field(creeping: ForceModel) ->
     solution = nearest(neighbours=701).solve(creeping.curve(0.5, 10, CIP), grid[2] + 1, 600.0)
     assert solution.reach is Reach.ABOVE
     assert solution.field_mT == pytest.approx(600, abs=0.5)
-
-
-@pytest.mark.parametrize("make", SOLVERS)
-def test_out_of_reach_is_the_nearest_end_and_says_so(rising: ForceModel, make: Callable[..., FieldSolver]) -> None:
-    solver = make()
-    least, greatest = (rising.predict_one(0.5, 10, field, CIP) for field in RANGE_MT)
-    below = solver.solve(rising.curve(0.5, 10, CIP), least - 0.3, 500.0)
-    above = solver.solve(rising.curve(0.5, 10, CIP), greatest + 0.3, 500.0)
-    assert (below.field_mT, below.reach) == (100.0, Reach.BELOW)
-    assert (above.field_mT, above.reach) == (800.0, Reach.ABOVE)
-    for solution in (below, above):
-        assert solution.confidence == pytest.approx(math.exp(-20 * 0.3 / 6))
-
-
-@pytest.mark.parametrize("make", SOLVERS)
-@pytest.mark.parametrize("end", RANGE_MT)
-def test_the_ends_themselves_are_inside(rising: ForceModel, make: Callable[..., FieldSolver], end: float) -> None:
-    solution = make().solve(rising.curve(0.5, 10, CIP), rising.predict_one(0.5, 10, end, CIP), None)
-    assert solution.reach is Reach.INSIDE
-    assert solution.field_mT == pytest.approx(end, abs=0.01)
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_a_force_over_the_peak_of_a_bump_is_above(bump: ForceModel, dtype: type[np.floating]) -> None:
-    solution = nearest(dtype=dtype).solve(bump.curve(0.5, 10, CIP), bump.predict_one(0.5, 10, 450.0, CIP) + 0.1, 200.0)
-    assert solution.reach is Reach.ABOVE
-    assert solution.field_mT == pytest.approx(450, abs=1)
 
 
 def test_linear_stops_at_the_first_row_within_epsilon(rising: ForceModel) -> None:
@@ -197,48 +113,6 @@ def test_linear_has_the_radius_of_the_thesis_by_default(rising: ForceModel) -> N
     assert THESIS_EPSILON_N == 1.26
     assert solver.solve(rising.curve(0.5, 10, CIP), force - 1.25, None).reach is Reach.INSIDE
     assert solver.solve(rising.curve(0.5, 10, CIP), force - 1.27, None).reach is Reach.BELOW
-
-
-@given(
-    displacement=st.one_of(st.floats(-100, 100), st.sampled_from((0.0, 5e-324, -5e-324, LARGEST))),
-    rate=st.one_of(st.floats(-6000, 6000), st.sampled_from((0.0, 5e-324, -LARGEST))),
-    force=st.one_of(st.floats(-600, 600), st.sampled_from((0.0, 5e-324, LARGEST))),
-    cip=st.one_of(st.floats(-4000, 4000), st.sampled_from((0.0, 5e-324))),
-    last=st.one_of(st.none(), st.floats(-80_000, 80_000)),
-)
-def test_extreme_inputs_give_a_defined_answer(
-    rising: ForceModel, displacement: float, rate: float, force: float, cip: float, last: float | None
-) -> None:
-    for solver in EXTREME_SOLVERS:
-        curve = rising.curve(displacement, rate, cip)
-        solution = solver.solve(curve, force, last)
-        assert 100 <= solution.field_mT <= 800
-        assert solution.predicted_force_N == curve.force_N(solution.field_mT)
-        assert 0 <= solution.confidence <= 1
-        least = rising.predict_one(displacement, rate, 100.0, cip)
-        greatest = rising.predict_one(displacement, rate, 800.0, cip)
-        if least + 0.01 < force < greatest - 0.01:
-            assert solution.reach is Reach.INSIDE
-        elif force < least - 0.01:
-            assert solution.reach is Reach.BELOW
-        elif force > greatest + 0.01:
-            assert solution.reach is Reach.ABOVE
-
-
-@pytest.mark.parametrize("make", SOLVERS)
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
-@pytest.mark.parametrize(
-    ("position", "name"),
-    [(0, "displacement_mm"), (1, "rate_mm_s"), (2, "force_N"), (3, "cip_percent"), (4, "last_field_mT")],
-)
-def test_inputs_that_are_no_numbers_are_refused(
-    rising: ForceModel, make: Callable[..., FieldSolver], value: float, position: int, name: str
-) -> None:
-    point = [0.5, 10.0, 2.0, CIP, 400.0]
-    point[position] = value
-    displacement, rate, force, cip, last = point
-    with pytest.raises(DomainError, match=name):
-        make().solve(rising.curve(displacement, rate, cip), force, last)
 
 
 def test_a_solve_leaves_no_trace_in_the_next(rising: ForceModel) -> None:

@@ -37,9 +37,6 @@ SURE: Final = 2.0
 class DeviceFit(Value):
     """Scale and offset of one device, their variances and covariance."""
 
-    __match_args__ = ("scale", "offset_N", "scale_variance", "covariance_N", "offset_variance_N2")
-    __slots__ = __match_args__
-
     def __init__(
         self,
         scale: float = 1.0,

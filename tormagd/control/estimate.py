@@ -24,9 +24,6 @@ class Handle(Value):
     that a handle that stops keeps it. `rate_mm_s` is positive the way the handle went last.
     """
 
-    __match_args__ = ("displacement_mm", "rate_mm_s", "turn", "sliding_mm_s")
-    __slots__ = __match_args__
-
     def __init__(self, displacement_mm: float, rate_mm_s: float, turn: Turn, sliding_mm_s: float = MOVING_MM_S) -> None:
         self.displacement_mm: Final = displacement_mm
         self.rate_mm_s: Final = rate_mm_s
@@ -41,22 +38,6 @@ class Estimate(Value):
     Where they are not homed, positions mean nothing: they count from wherever the carriages were, or counts were lost.
     Force and handle are of a Sense that came at `sensed_s` on the host's clock, `handle_time_s` on the device's.
     """
-
-    __match_args__ = (
-        "number",
-        "is_homed",
-        "device_time_s",
-        "left_mm",
-        "right_mm",
-        "left_mm_s",
-        "right_mm_s",
-        "force_N",
-        "handle",
-        "handle_mm",
-        "sensed_s",
-        "handle_time_s",
-    )
-    __slots__ = __match_args__
 
     def __init__(
         self,

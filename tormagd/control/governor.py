@@ -52,19 +52,6 @@ class TimedSetpoint(Value):
     other; with `is_contested` somebody else sends setpoints too.
     """
 
-    __match_args__ = (
-        "force_N",
-        "stamp_s",
-        "valid_for_s",
-        "displacement_mm",
-        "rate_mm_s",
-        "preview_N",
-        "preview_dt_s",
-        "holder",
-        "is_contested",
-    )
-    __slots__ = __match_args__
-
     def __init__(
         self,
         force_N: float,
@@ -96,22 +83,6 @@ class GovernorState(Value):
     `holder` whose setpoints it followed; while `is_passing` the force is on its way to those of a new holder;
     `restraint` begins with each stream that nothing announces."""
 
-    __match_args__ = (
-        "time_s",
-        "asked_N",
-        "stamp_s",
-        "slope_N_s",
-        "last_N",
-        "periodicity",
-        "holder",
-        "is_passing",
-        "above_N",
-        "drive_N",
-        "restraint",
-        "expected_N",
-    )
-    __slots__ = __match_args__
-
     def __init__(
         self,
         time_s: float,
@@ -128,10 +99,6 @@ class GovernorState(Value):
         expected_N: float | None = None,
     ) -> None:
         self.time_s: Final = time_s
-        self.above_N: Final = above_N
-        self.drive_N: Final = drive_N
-        self.expected_N: Final = expected_N
-        self.restraint: Final = restraint
         self.asked_N: Final = asked_N
         self.stamp_s: Final = stamp_s
         self.slope_N_s: Final = slope_N_s
@@ -139,6 +106,10 @@ class GovernorState(Value):
         self.periodicity: Final = periodicity
         self.holder: Final = holder
         self.is_passing: Final = is_passing
+        self.above_N: Final = above_N
+        self.drive_N: Final = drive_N
+        self.restraint: Final = restraint
+        self.expected_N: Final = expected_N
 
 
 @final
@@ -148,9 +119,6 @@ class Governed(Value):
     `foresight`, 0..1, is how well what comes is known: 1 from a preview, less where the force repeats itself, 0 where
     it is extrapolated.
     """
-
-    __match_args__ = ("force_N", "path_N", "age_s", "limits", "foresight")
-    __slots__ = __match_args__
 
     def __init__(
         self,
@@ -170,17 +138,6 @@ class Governed(Value):
 @final
 class Governor:
     """The constants of governing: what the scene allows, and the fastest that the gap may be driven."""
-
-    __slots__ = (
-        "_gap_speed_mm_s",
-        "_has_forecast",
-        "_has_preview",
-        "_has_slope",
-        "_least_N",
-        "_most_N",
-        "_portrait",
-        "_release_N_s",
-    )
 
     def __init__(self, portrait: Portrait, scene: Force, gap_speed_mm_s: float, terms: Terms = EVERY_TERM) -> None:
         self._has_slope: Final = terms.slope

@@ -31,9 +31,6 @@ class HandleWatch(Value):
     FILTER_S, the least of it since, and what the model gave then. `rested_N` is what the model gave when it came to
     stand. `is_lost`: it is not believed until it moves."""
 
-    __match_args__ = ("at_mm", "heard_s", "still_s", "force_N", "least_N", "least_model_N", "rested_N", "is_lost")
-    __slots__ = __match_args__
-
     def __init__(
         self,
         at_mm: float = math.inf,

@@ -36,12 +36,6 @@ class Homing(Value):
     what was wrong with it.
     """
 
-    __match_args__ = (
-        "began_s", "time_s", "left_mm", "right_mm", "left_at_mm", "right_at_mm", "switches", "most_N", "over_s",
-        "has_ended", "faults",
-    )  # fmt: skip
-    __slots__ = __match_args__
-
     def __init__(
         self,
         began_s: float,

@@ -13,8 +13,6 @@ LEAST_SPAN: Final = 1e-9
 class Rising:
     """A list (n) that rises, and the places in it."""
 
-    __slots__ = ("_per_unit", "_points_before", "values")
-
     def __init__(self, values: list[float]) -> None:
         self.values: Final = values
         self._per_unit: Final = STRETCHES / max(values[-1] - values[0], LEAST_SPAN)

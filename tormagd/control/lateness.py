@@ -31,9 +31,6 @@ class Lateness(Value):
     """`lag_s`, 0 to MOST_LAG_S; `motion_mm2_s`, how much motion taught it; `expected_mm`, where the gap is expected,
     None where it was not known what comes; `is_on_its_way` after a jump."""
 
-    __match_args__ = ("lag_s", "motion_mm2_s", "expected_mm", "is_on_its_way")
-    __slots__ = __match_args__
-
     def __init__(
         self,
         lag_s: float = 0.0,

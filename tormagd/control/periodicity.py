@@ -70,7 +70,6 @@ class Embedding(Value):
     """
 
     __match_args__ = ("shortest", "around")
-    __slots__ = __match_args__
 
     def __init__(self, delays: tuple[int, ...]) -> None:
         self.shortest: Final = delays[-1] + 1 + HORIZON
@@ -86,9 +85,6 @@ BEAT: Final = Embedding(BEAT_DELAYS)
 @final
 class Guess(Value):
     """What both embeddings, their mixture and the slope said that a point of the grid would be, N."""
-
-    __match_args__ = ("rise_N", "beat_N", "forecast_N", "slope_N")
-    __slots__ = __match_args__
 
     def __init__(self, rise_N: float, beat_N: float, forecast_N: float, slope_N: float) -> None:
         self.rise_N: Final = rise_N
@@ -117,21 +113,6 @@ class Periodicity(Value):
     rise_missed, beat_missed
                       means of the squares of what each embedding's forecast missed so far, N²
     """
-
-    __match_args__ = (
-        "stamp_s",
-        "force_N",
-        "time_s",
-        "history",
-        "from_s",
-        "changes_N",
-        "awaited",
-        "long",
-        "short",
-        "rise_missed",
-        "beat_missed",
-    )
-    __slots__ = __match_args__
 
     def __init__(
         self,

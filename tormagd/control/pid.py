@@ -15,15 +15,6 @@ ON_TARGET_MM: Final = 0.001
 class Gains(Value):
     """What of `config.Position` the PID needs; gains per mm, times in s, the duty's limit."""
 
-    __match_args__ = (
-        "proportional_per_mm",
-        "integral_time_s",
-        "derivative_time_s",
-        "back_calculation_s",
-        "duty_limit",
-    )
-    __slots__ = __match_args__
-
     def __init__(
         self,
         proportional_per_mm: float,
@@ -54,9 +45,6 @@ class Gains(Value):
 class Error(Value):
     """How far a carriage is from where it is expected, mm and mm/s."""
 
-    __match_args__ = ("position_mm", "speed_mm_s")
-    __slots__ = __match_args__
-
     def __init__(self, position_mm: float, speed_mm_s: float) -> None:
         self.position_mm: Final = position_mm
         self.speed_mm_s: Final = speed_mm_s
@@ -66,9 +54,6 @@ class Error(Value):
 class PidState(Value):
     """The integral action, duty. Starting it at 0 is bumpless: holding takes no duty, because friction holds."""
 
-    __match_args__ = ("integral",)
-    __slots__ = __match_args__
-
     def __init__(self, integral: float = 0.0) -> None:
         self.integral: Final = integral
 
@@ -76,9 +61,6 @@ class PidState(Value):
 @final
 class PidOutput(Value):
     """Duty in -limit..limit, and whether the limit held it back."""
-
-    __match_args__ = ("duty", "is_saturated")
-    __slots__ = __match_args__
 
     def __init__(self, duty: float, is_saturated: bool) -> None:
         self.duty: Final = duty

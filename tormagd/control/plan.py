@@ -66,9 +66,6 @@ _TO_ACCELERATION: Final[list[float]] = _PARABOLA[1].tolist()
 class Outside(Value):
     """A quantity that something was not asked about as it was, because that lies outside what is known of it."""
 
-    __match_args__ = ("quantity", "asked", "used")
-    __slots__ = __match_args__
-
     def __init__(self, quantity: str, asked: float, used: float) -> None:
         self.quantity: Final = quantity
         self.asked: Final = asked
@@ -80,26 +77,6 @@ class Plan(Value):
     """Where the gap should go, and why. `number` lets a recording say which plan a tick used; `foresight` is the
     governor's. The gap is never to be closer than `least_gap_mm`. `outside` says what MODEL_RANGE is about;
     `sensor_doubted_s` is for how long the force sensor has not been believed while the handle slid."""
-
-    __match_args__ = (
-        "number",
-        "time_s",
-        "setpoint_N",
-        "setpoint_age_s",
-        "governed_N",
-        "predicted_N",
-        "field_mT",
-        "gap_mm",
-        "gap_speed_mm_s",
-        "confidence",
-        "limits",
-        "gap_acceleration_mm_s2",
-        "foresight",
-        "least_gap_mm",
-        "outside",
-        "sensor_doubted_s",
-    )
-    __slots__ = __match_args__
 
     def __init__(
         self,
@@ -144,9 +121,6 @@ class Shown(Value):
     creep, whether its sensor is believed, what it reads without a force, and the limits that come of it; how late its
     carriages are; and by how much the newest readings were more than expected, `surprise_N`."""
 
-    __match_args__ = ("device", "sensor", "read", "read_s", "limits", "slow", "zero", "lateness", "surprise_N")
-    __slots__ = __match_args__
-
     def __init__(
         self,
         device: DeviceFit = UNSEEN,
@@ -160,14 +134,14 @@ class Shown(Value):
         surprise_N: float = 0.0,
     ) -> None:
         self.device: Final = device
-        self.lateness: Final = lateness
-        self.surprise_N: Final = surprise_N
-        self.slow: Final = slow
-        self.zero: Final = zero
         self.sensor: Final = sensor
         self.read: Final = read
         self.read_s: Final = read_s
         self.limits: Final = limits
+        self.slow: Final = slow
+        self.zero: Final = zero
+        self.lateness: Final = lateness
+        self.surprise_N: Final = surprise_N
 
 
 NOTHING_SHOWN: Final = Shown()
@@ -176,9 +150,6 @@ NOTHING_SHOWN: Final = Shown()
 @final
 class PlanState(Value):
     """What planning remembers, and what the element does."""
-
-    __match_args__ = ("governor", "plan", "shown", "handle", "remembered")
-    __slots__ = __match_args__
 
     def __init__(
         self,

@@ -20,9 +20,6 @@ class Leap(Value):
     """A step of the encoders that no carriage takes: seen at `seen_s`, by so much either side, within `within_s`, away
     from `left_from_mm` and `right_from_mm`."""
 
-    __match_args__ = ("seen_s", "left_mm", "right_mm", "within_s", "left_from_mm", "right_from_mm")
-    __slots__ = __match_args__
-
     def __init__(
         self,
         seen_s: float,

@@ -25,8 +25,6 @@ class FieldOfGap:
     `DomainError` outside the law's range of gaps.
     """
 
-    __slots__ = ("_coefficient", "_exponent", "_inverse", "_per_moment_T", "_range_mm", "_strongest_mT", "_weakest_mT")
-
     def __init__(self, law: PowerFieldLaw, relative_permeability: float, inner_radius_m: float) -> None:
         self._coefficient: Final = law.coefficient
         self._exponent: Final = law.exponent
@@ -56,8 +54,6 @@ class FieldOfGap:
 class Portrait:
     """Force over gap for one contact, without memory, and its slope |dF/dgap|, N per mm, at n points: along the
     lists forces rise, and gaps fall evenly."""
-
-    __slots__ = ("_open_mm", "_rising_N", "_step_mm", "force_N", "gap_mm", "slope_N_mm")
 
     def __init__(self, gap_mm: list[float], force_N: list[float], slope_N_mm: list[float]) -> None:
         self.gap_mm: Final = gap_mm
@@ -104,8 +100,6 @@ class Portrait:
 class PortraitSearch:
     """The search where the handle's rate is no input: the portrait itself, by straight lines, and no network."""
 
-    __slots__ = ("_field", "_portrait")
-
     def __init__(self, shown: Portrait, field: FieldOfGap) -> None:
         self._portrait: Final = shown
         self._field: Final = field
@@ -126,8 +120,6 @@ class PortraitSearch:
 class LawOfField:
     """The magnetoelastic law of the insert (Eq. 29 to 34) over the gaps of a portrait, scaled to its force: what the
     learned model is held against. Force and field rise along the lists."""
-
-    __slots__ = ("_rising_N", "fields_mT")
 
     def __init__(self, force_N: list[float], fields_mT: list[float]) -> None:
         self._rising_N: Final = Rising(force_N)

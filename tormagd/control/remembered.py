@@ -22,9 +22,6 @@ class Remembered(Value):
     field and of what the field adds, N; how much of the force has relaxed, N; all at `time_s`, before which nothing is
     known but by how much the gap had been opened, mm, since the device was switched on."""
 
-    __match_args__ = ("field_mT", "lag_mT", "free", "added", "relaxed_N", "time_s", "opened_mm")
-    __slots__ = __match_args__
-
     def __init__(
         self,
         field_mT: float = 0.0,
@@ -56,8 +53,6 @@ NOTHING_REMEMBERED: Final = Remembered()
 class Remembering:
     """The constants of an element's memory. Its methods change nothing. A `curve` is the force without memory of the
     element as it is touched now, which is asked for fields within `fields_mT`; `free_N` is its force without field."""
-
-    __slots__ = ("_added", "_fields_mT", "_free", "_lag_mT", "_relaxes", "_turn_mT")
 
     def __init__(self, memory: Memory, fields_mT: tuple[float, float]) -> None:
         self._free: Final = memory.free

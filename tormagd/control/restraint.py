@@ -27,9 +27,6 @@ back, with longer ones a touch that stays where those before it did not."""
 class Restraint(Value):
     """The mean of the forces asked, where the eager and the restrained gap are, and what restraint gained."""
 
-    __match_args__ = ("mean_N", "eager_mm", "restrained_mm", "skill")
-    __slots__ = __match_args__
-
     def __init__(self, mean_N: float, eager_mm: float, restrained_mm: float, skill: Skill = UNJUDGED) -> None:
         self.mean_N: Final = mean_N
         self.eager_mm: Final = eager_mm

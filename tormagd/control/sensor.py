@@ -55,20 +55,6 @@ class Past(Value):
     model's force over MEMORY_S, and the slow fit. `before` and `kept` are the device's own fit of up to twice and once
     KEPT_S ago, and `before_at` and `kept_at` the model's force and the handle's rate then, N and mm/s, and its way."""
 
-    __match_args__ = (
-        "reading_N",
-        "still_s",
-        "measured_N",
-        "loaded_N",
-        "slow",
-        "before",
-        "before_at",
-        "kept",
-        "kept_at",
-        "kept_s",
-    )
-    __slots__ = __match_args__
-
     def __init__(
         self,
         reading_N: float,
@@ -97,9 +83,6 @@ class Past(Value):
 @final
 class Sensor(Value):
     """The judgement: whether it is doubted, for how long of sliding, and since when there is, or is no, evidence."""
-
-    __match_args__ = ("is_doubted", "doubted_s", "evidence_s", "past")
-    __slots__ = __match_args__
 
     def __init__(
         self, is_doubted: bool = False, doubted_s: float = 0.0, evidence_s: float = 0.0, past: Past | None = None

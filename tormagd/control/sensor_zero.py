@@ -39,9 +39,6 @@ class Level(Value):
     """Means over the newest sliding one way: of the readings along the motion, of the model's force there, N, and of
     the handle's rate, mm/s, over `heard_s`, the last of it at `until_s`."""
 
-    __match_args__ = ("reading_N", "model_N", "rate_mm_s", "heard_s", "until_s")
-    __slots__ = __match_args__
-
     def __init__(self, reading_N: float, model_N: float, rate_mm_s: float, heard_s: float, until_s: float) -> None:
         self.reading_N: Final = reading_N
         self.model_N: Final = model_N
@@ -66,9 +63,6 @@ class Level(Value):
 class SensorZero(Value):
     """The zero, N, and its variance as of `told_s`; the way the handle goes, 1 or -1, with its level, and the level of
     the way before until the two have been compared."""
-
-    __match_args__ = ("zero_N", "variance_N2", "told_s", "direction", "level", "before")
-    __slots__ = __match_args__
 
     def __init__(
         self,

@@ -23,9 +23,6 @@ SHOWN_S: Final = 0.1
 class Sight(Value):
     """What is remembered of it. `seen_s` is when a new state was last found, `stalled_s` when a stall last ended."""
 
-    __match_args__ = ("seen_s", "stalled_s", "stall_s", "is_blind")
-    __slots__ = __match_args__
-
     def __init__(
         self, seen_s: float = math.inf, stalled_s: float = -math.inf, stall_s: float = 0.0, is_blind: bool = False
     ) -> None:

@@ -15,9 +15,6 @@ class Skill(Value):
     """Means of squares, N², with the newest counting most: what one guess gained on the other, and how far apart they
     were."""
 
-    __match_args__ = ("gained", "apart")
-    __slots__ = __match_args__
-
     def __init__(self, gained: float, apart: float) -> None:
         self.gained: Final = gained
         self.apart: Final = apart

@@ -39,9 +39,6 @@ class SlowFriction(Value):
     """The device's force at a creep over what its fit says, and the share of that which was learned at a creep; the
     model's force as far as the bristles have followed it, N; and where the handle was then, mm."""
 
-    __match_args__ = ("factor", "learned", "followed_N", "handle_mm")
-    __slots__ = __match_args__
-
     def __init__(
         self, factor: float = 1.0, learned: float = 0.0, followed_N: float = 0.0, handle_mm: float = 0.0
     ) -> None:

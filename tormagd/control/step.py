@@ -94,9 +94,6 @@ class Acted(Value):
     the rest within `motor.inductance`, and a limit in between would only take phase away from the position loop.
     """
 
-    __match_args__ = ("rate", "slew", "not_finite", "range")
-    __slots__ = __match_args__
-
     def __init__(self, rate: int = 0, slew: int = 0, not_finite: int = 0, range: int = 0) -> None:
         self.rate: Final = rate
         self.slew: Final = slew
@@ -110,28 +107,6 @@ NEVER: Final = Acted()
 @final
 class StepState(Value):
     """What a step remembers."""
-
-    __match_args__ = (
-        "time_s",
-        "safety",
-        "estimate",
-        "reference",
-        "expected",
-        "left",
-        "right",
-        "duties",
-        "enabled_s",
-        "straying_s",
-        "still_s",
-        "over_s",
-        "sight",
-        "opposed_s",
-        "leap",
-        "homing",
-        "acted",
-        "liveliness",
-    )
-    __slots__ = __match_args__
 
     def __init__(
         self,
@@ -185,9 +160,6 @@ class StepState(Value):
 @final
 class StepOutput(Value):
     """What goes to the device, and what holds it back."""
-
-    __match_args__ = ("mode", "left_duty", "right_duty", "request", "request_number", "limits")
-    __slots__ = __match_args__
 
     def __init__(
         self,

@@ -15,9 +15,6 @@ LEAST_BRAKING: Final = 0.2
 class Reference(Value):
     """Where the gap is driven, mm, and how fast it is driven there, mm/s and mm/s^2."""
 
-    __match_args__ = ("gap_mm", "speed_mm_s", "acceleration_mm_s2")
-    __slots__ = __match_args__
-
     def __init__(self, gap_mm: float, speed_mm_s: float = 0.0, acceleration_mm_s2: float = 0.0) -> None:
         self.gap_mm: Final = gap_mm
         self.speed_mm_s: Final = speed_mm_s
@@ -27,9 +24,6 @@ class Reference(Value):
 @final
 class Speeds(Value):
     """Of the gap, mm/s, > 0: where the motors have no torque left, and the fastest that the reference may be."""
-
-    __match_args__ = ("no_load_mm_s", "opening_mm_s", "closing_mm_s")
-    __slots__ = __match_args__
 
     def __init__(self, no_load_mm_s: float, opening_mm_s: float, closing_mm_s: float) -> None:
         self.no_load_mm_s: Final = no_load_mm_s
@@ -44,9 +38,6 @@ class Expected(Value):
     The windings take the acceleration with a lag and the exchange brings it in and back a little later, so this is the
     reference with its jerk limited to what the drive can do. A lag has a positive kernel: it adds no overshoot.
     """
-
-    __match_args__ = ("gap_mm", "speed_mm_s", "filtered_mm_s")
-    __slots__ = __match_args__
 
     def __init__(self, gap_mm: float, speed_mm_s: float = 0.0, filtered_mm_s: float = 0.0) -> None:
         self.gap_mm: Final = gap_mm

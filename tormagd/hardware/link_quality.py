@@ -26,9 +26,6 @@ class LinkQuality(Value):
     that stands.
     """
 
-    __match_args__ = ("unanswered", "damaged", "unsent", "round_trip_s", "clock_drift")
-    __slots__ = __match_args__
-
     def __init__(
         self,
         unanswered: float = 0.0,
@@ -61,9 +58,6 @@ UNKNOWN_QUALITY: Final = LinkQuality()
 @final
 class Counts(Value):
     """Counters that only grow: Drives, States that were news, frames received and damaged, messages not taken."""
-
-    __match_args__ = ("drives", "states", "frames", "damaged", "unsent")
-    __slots__ = __match_args__
 
     def __init__(self, drives: int = 0, states: int = 0, frames: int = 0, damaged: int = 0, unsent: int = 0) -> None:
         self.drives: Final = drives

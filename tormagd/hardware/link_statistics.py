@@ -147,9 +147,6 @@ class ClockFit(Value):
     is positive where the device's clock runs fast. `residual_us` is the standard deviation around the line.
     """
 
-    __match_args__ = ("offset_s", "drift_ppm", "residual_us", "windows", "outliers")
-    __slots__ = __match_args__
-
     def __init__(self, offset_s: float, drift_ppm: float, residual_us: float, windows: int, outliers: int) -> None:
         self.offset_s: Final = offset_s
         self.drift_ppm: Final = drift_ppm

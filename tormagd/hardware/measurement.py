@@ -26,13 +26,6 @@ class Measurement(Value):
     there and back. `link` is how well the wire carried it.
     """
 
-    __match_args__ = (
-        "number", "received_s", "device_time_s", "left_mm", "right_mm", "left_current_A", "right_current_A", "force_N",
-        "handle_mm", "mode", "switches", "faults", "temperature_C", "supply_V", "sensed_s", "reported_s", "delay_s",
-        "link",
-    )  # fmt: skip
-    __slots__ = __match_args__
-
     def __init__(
         self,
         number: int,

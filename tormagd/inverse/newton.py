@@ -29,8 +29,6 @@ class RisingSearch:
     The answer is the root to `ACCURACY_MT`; out of reach it is the end. Raises `DomainError` on a range that is none.
     """
 
-    __slots__ = ("_high_mT", "_low_mT")
-
     def __init__(self, field_range_mT: tuple[float, float]) -> None:
         low_mT, high_mT = field_range_mT
         require_number("field_range_mT", low_mT)

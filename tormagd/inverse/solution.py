@@ -24,9 +24,6 @@ class FieldSolution(Value):
     other (a pass over a whole grid of fields is one).
     """
 
-    __match_args__ = ("field_mT", "predicted_force_N", "confidence", "iterations", "reach")
-    __slots__ = __match_args__
-
     def __init__(
         self, field_mT: float, predicted_force_N: float, confidence: float, iterations: int, reach: Reach
     ) -> None:

@@ -19,9 +19,6 @@ MOVING_MM_S: Final = 5.0
 class Turn(Value):
     """The way the handle goes, 1 or -1, where it last turned, mm, and the furthest it has been since, mm."""
 
-    __match_args__ = ("direction", "turned_mm", "furthest_mm")
-    __slots__ = __match_args__
-
     def __init__(self, direction: float, turned_mm: float, furthest_mm: float) -> None:
         self.direction: Final = direction
         self.turned_mm: Final = turned_mm

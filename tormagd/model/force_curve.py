@@ -80,8 +80,6 @@ def within(value: float, ends: tuple[float, float]) -> float:
 class Known:
     """What a model has been shown: the least and the greatest of each feature, and the span of forces, N."""
 
-    __slots__ = ("highs", "lows", "scales", "span_N")
-
     def __init__(self, ranges: tuple[tuple[float, float], ...], span_N: float) -> None:
         self.lows: Final = [low for low, _ in ranges]
         self.highs: Final = [high for _, high in ranges]
@@ -101,11 +99,6 @@ class Network:
 
     `weight` (h x 4, columns in the order of `FEATURES`), `bias` (h) and `output` (h) are finite.
     """
-
-    __slots__ = (
-        "bias", "cip", "constant_N", "displacement", "field", "field_half", "known", "magnitude_N", "middle_N",
-        "output", "output_half", "rate",
-    )  # fmt: skip
 
     def __init__(
         self,
@@ -146,8 +139,6 @@ class Network:
 @final
 class NetworkCurve:
     """See `ForceCurve`. Made by `Network.curve`."""
-
-    __slots__ = ("_network", "_shift", "cip_percent", "displacement_mm", "rate_mm_s")
 
     def __init__(
         self, network: Network, shift: list[float], displacement_mm: float, rate_mm_s: float, cip_percent: float

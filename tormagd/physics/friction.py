@@ -30,9 +30,6 @@ class Friction(Value):
     stribeck_speed_mm_s        v_s: speed at which the level has fallen most of the way to kinetic, > 0
     """
 
-    __match_args__ = ("presliding_stiffness_N_mm", "viscous_N_s_mm", "static_ratio", "stribeck_speed_mm_s")
-    __slots__ = __match_args__
-
     def __init__(
         self,
         presliding_stiffness_N_mm: float,

@@ -25,7 +25,6 @@ class PronyStep(Value):
     """The exact update of a `PronySeries` over one step length, for a driving force linear over the step."""
 
     __match_args__ = ("fractions", "decays", "gains")
-    __slots__ = ("decays", "equilibrium_fraction", "fractions", "gains")
 
     def __init__(self, fractions: tuple[float, ...], decays: tuple[float, ...], gains: tuple[float, ...]) -> None:
         relaxing = 0.0  # summed here: `sum` is a call, and a plan makes two of these
@@ -62,9 +61,6 @@ class PronyStep(Value):
 @final
 class PronySeries(Value):
     """Relaxing fractions g_i (each >= 0, sum < 1) and their time constants tau_i, s; raises `DomainError` otherwise."""
-
-    __match_args__ = ("fractions", "times_s")
-    __slots__ = __match_args__
 
     def __init__(self, fractions: tuple[float, ...], times_s: tuple[float, ...]) -> None:
         if len(fractions) != len(times_s):

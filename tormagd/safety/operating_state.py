@@ -67,12 +67,6 @@ class RefusedError(Exception):
 class Conditions(Value):
     """What the decisions depend on."""
 
-    __match_args__ = (
-        "connected", "fresh", "homed", "busy", "device_latched", "requested_N", "neutral_N", "sensor_doubted", "cause",
-        "remedy", "round_trip_s", "clock_drift", "apart_mm", "most_apart_mm", "most_round_trip_s", "most_clock_drift",
-    )  # fmt: skip
-    __slots__ = __match_args__
-
     def __init__(
         self,
         connected: bool,
@@ -117,9 +111,6 @@ class SafetyState(Value):
 
     `needs_homing`: the device's word that it is homed does not count, until it has begun homing and so taken it back.
     """
-
-    __match_args__ = ("operating_state", "faults", "request", "request_number", "clearing_until_s", "needs_homing")
-    __slots__ = __match_args__
 
     def __init__(
         self,

@@ -60,9 +60,6 @@ END_SWITCHES: Final = [Switches(bits) for bits in range(16)]
 class Packet(Value):
     """One message's payload and when it is handed to, or came from, the link."""
 
-    __match_args__ = ("time_s", "function", "payload")
-    __slots__ = __match_args__
-
     def __init__(self, time_s: float, function: int, payload: bytes) -> None:
         self.time_s: Final = time_s
         self.function: Final = function
@@ -73,9 +70,6 @@ class Packet(Value):
 class Reply(Value):
     """What a received message called for, and when it is given."""
 
-    __match_args__ = ("time_s", "answer")
-    __slots__ = __match_args__
-
     def __init__(self, time_s: float, answer: Answer) -> None:
         self.time_s: Final = time_s
         self.answer: Final = answer
@@ -84,9 +78,6 @@ class Reply(Value):
 @final
 class Outgoing(Value):
     """The part of a frame that is still to leave, and when its first bit does."""
-
-    __match_args__ = ("start_s", "data")
-    __slots__ = __match_args__
 
     def __init__(self, start_s: float, data: bytes) -> None:
         self.start_s: Final = start_s

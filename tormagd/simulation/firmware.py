@@ -66,19 +66,6 @@ DRIVES_OFF: Final = DriveMode.OFF
 class Sensors(Value):
     """What the electronics measure; encoder counts since power-on, positive opening."""
 
-    __match_args__ = (
-        "left_counts",
-        "right_counts",
-        "left_current_A",
-        "right_current_A",
-        "force_N",
-        "handle_counts",
-        "switches",
-        "supply_V",
-        "temperature_C",
-    )
-    __slots__ = __match_args__
-
     def __init__(
         self,
         left_counts: int,
@@ -105,9 +92,6 @@ class Sensors(Value):
 @final
 class Output(Value):
     """What the bridges do: duties in [-1, 1], or open."""
-
-    __match_args__ = ("left_duty", "right_duty", "enabled")
-    __slots__ = __match_args__
 
     def __init__(self, left_duty: float, right_duty: float, enabled: bool) -> None:
         self.left_duty: Final = left_duty

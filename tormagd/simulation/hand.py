@@ -34,9 +34,6 @@ class Hand(Protocol):
 class SteadyHand(Value):
     """Turns at a constant speed, 42 mm/s at the 20 rpm of the thesis's measurements."""
 
-    __match_args__ = ("rpm",)
-    __slots__ = __match_args__
-
     def __init__(self, rpm: float = DEFAULT_RPM) -> None:
         self.rpm: Final = rpm
 
@@ -47,9 +44,6 @@ class SteadyHand(Value):
 @final
 class ReversingHand(Value):
     """Forth, rest, back, rest: smooth strokes of 30 mm (0.35 of the period each) with full stops (0.15 each)."""
-
-    __match_args__ = ("period_s",)
-    __slots__ = __match_args__
 
     def __init__(self, period_s: float = DEFAULT_PERIOD_S) -> None:
         self.period_s: Final = period_s
@@ -67,9 +61,6 @@ class PressingHand(Value):
     """The dummy finger of the thesis's pulse experiment: it touches the pad after 10 s, when the device is homed,
     presses in at 1 mm/s, and stays."""
 
-    __match_args__ = ("depth_mm",)
-    __slots__ = __match_args__
-
     def __init__(self, depth_mm: float = DEFAULT_DEPTH_MM) -> None:
         self.depth_mm: Final = depth_mm
 
@@ -80,9 +71,6 @@ class PressingHand(Value):
 @final
 class RecordedHand(Value):
     """A recording, linear between its points and standing before the first and after the last."""
-
-    __match_args__ = ("times_s", "positions_mm")
-    __slots__ = __match_args__
 
     def __init__(self, times_s: tuple[float, ...], positions_mm: tuple[float, ...]) -> None:
         self.times_s: Final = times_s

@@ -30,9 +30,6 @@ TIME_LIMIT_S: Final = 8.0  # the whole stroke at homing speed takes under 4 s
 class Carriage(Value):
     """What the firmware knows of one carriage: encoder position, its open switch, its motor's current."""
 
-    __match_args__ = ("position_mm", "at_open_end", "current_A")
-    __slots__ = __match_args__
-
     def __init__(self, position_mm: float, at_open_end: bool, current_A: float) -> None:
         self.position_mm: Final = position_mm
         self.at_open_end: Final = at_open_end

@@ -28,21 +28,6 @@ class Truth(Value):
     """What really is, as no sensor sees it; `force_N` has the sign of the motion it resists. Of a pad the handle is the
     finger's depth in it, and force pushes the finger out."""
 
-    __match_args__ = (
-        "time_s",
-        "force_N",
-        "gap_mm",
-        "left_mm",
-        "right_mm",
-        "left_A",
-        "right_A",
-        "temperature_C",
-        "handle_mm",
-        "handle_mm_s",
-        "kinetic_N",
-    )
-    __slots__ = __match_args__
-
     def __init__(
         self,
         time_s: float,
