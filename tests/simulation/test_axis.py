@@ -31,6 +31,11 @@ def steps(duration_s: float) -> int:
     return round(duration_s / SUBSTEP_S)
 
 
+def turn(axis: Axis, duration_s: float, volts: float | None, attraction_N: float = 0.0) -> None:
+    for _ in range(steps(duration_s)):
+        axis.step(volts, attraction_N)
+
+
 def at_gap(plant: PlantParameters, gap_mm: float) -> PlantParameters:
     assumed = msgspec.structs.replace(plant.assumed, start_left_mm=gap_mm / 2.0, start_right_mm=gap_mm / 2.0)
     return msgspec.structs.replace(plant, assumed=assumed)
@@ -38,8 +43,7 @@ def at_gap(plant: PlantParameters, gap_mm: float) -> PlantParameters:
 
 def test_no_load_speed_and_current_are_those_of_the_data_sheet() -> None:
     axis = an_axis()
-    for _ in range(steps(0.2)):
-        axis.step(12.0, 0.0)
+    turn(axis, 0.2, 12.0)
     assert axis.speed_rad_s * 60.0 / math.tau == pytest.approx(150.0, rel=0.05)
     assert axis.current_A == pytest.approx(0.2, abs=0.03)
 
@@ -79,22 +83,18 @@ def test_current_is_limited() -> None:
 def test_under_break_away_voltage_the_screw_truly_stands() -> None:
     axis = an_axis()
     break_away_V = SAMPLE_1.gear.output_friction_Nm / (70.0 * 0.011) * 2.2
-    for _ in range(steps(0.5)):
-        axis.step(0.98 * break_away_V, 0.0)
+    turn(axis, 0.5, 0.98 * break_away_V)
     assert axis.speed_rad_s == 0.0
     assert axis.angle_rad == 0.0
-    for _ in range(steps(0.5)):
-        axis.step(1.05 * break_away_V, 0.0)
+    turn(axis, 0.5, 1.05 * break_away_V)
     assert axis.angle_rad > 0.0
 
 
 def test_lost_motion_on_reversal_is_backlash_and_twice_the_drag() -> None:
     drag_N = 6.0
     axis = an_axis(drag_N=drag_N)
-    for _ in range(steps(0.1)):
-        axis.step(3.0, 0.0)
-    for _ in range(steps(0.1)):
-        axis.step(None, 0.0)
+    turn(axis, 0.1, 3.0)
+    turn(axis, 0.1, None)
     turned_at, stood_at = axis.angle_rad, axis.position_m
     lost_m = 0.0
     while axis.position_m == stood_at:
@@ -116,8 +116,7 @@ def test_magnets_stronger_than_drag_keep_the_nut_on_one_flank() -> None:
 def test_the_stops_hold_against_full_drive() -> None:
     for volts, stop_mm in ((12.0, 48.0), (-12.0, 22.0)):
         axis = an_axis(start_mm=35.0)
-        for _ in range(steps(2.0)):
-            axis.step(volts, 30.0)
+        turn(axis, 2.0, volts, 30.0)
         assert axis.position_m * 1e3 == pytest.approx(stop_mm, abs=1e-9)
         assert axis.speed_rad_s == pytest.approx(0.0, abs=0.05)
         assert abs(axis.contact_N) < 2500.0
@@ -235,8 +234,7 @@ def test_no_energy_comes_from_nowhere(volts: list[float | None], wear: float) ->
 
 def test_friction_takes_a_turning_screw_to_rest_and_never_back() -> None:
     axis = an_axis()
-    for _ in range(steps(0.05)):
-        axis.step(12.0, 0.0)
+    turn(axis, 0.05, 12.0)
     speeds = []
     while axis.speed_rad_s != 0.0:
         axis.step(None, 0.0)
@@ -244,6 +242,5 @@ def test_friction_takes_a_turning_screw_to_rest_and_never_back() -> None:
     assert all(after < before for before, after in itertools.pairwise(speeds))
     assert min(speeds) == 0.0
     resting_at = axis.angle_rad
-    for _ in range(steps(0.1)):
-        axis.step(None, 0.0)
+    turn(axis, 0.1, None)
     assert axis.angle_rad == resting_at

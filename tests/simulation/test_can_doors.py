@@ -138,23 +138,6 @@ def test_pythons_own_slcan_finds_an_adapter(start: Start) -> None:
         meet(bus)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("--can", "--bitrate", "7"), "10000"),
-        (("--can", "--node", "16"), "16"),
-        (("--can", "/nonexistent/can"), "/nonexistent"),
-        (("--bus", "telepathy:0"), "telepathy"),
-        (("--can", "--pty"), "not allowed"),
-    ],
-)
-def test_a_wrong_call_says_what_is_right_and_exits_with_2(start: Start, arguments: tuple[str, ...], said: str) -> None:
-    process = start(*arguments)
-    output, errors = process.communicate(timeout=LIMIT_S)
-    assert (process.returncode, output) == (2, "")
-    assert said in errors
-
-
 @pytest.mark.parametrize("address", ["udp_multicast:239.74.163.88", "socketcan:vcan0"])
 def test_the_device_is_a_node_of_a_bus_that_is_there(start: Start, address: str) -> None:
     interface, _, name = address.partition(":")
