@@ -12,7 +12,6 @@ from pathlib import Path
 
 import can
 import pytest
-from can.interfaces.slcan import slcanBus
 
 from firmware_protocol.codec import (
     FUNCTION,
@@ -124,17 +123,6 @@ def test_what_a_killed_simulator_left_is_replaced_and_what_somebody_serves_is_no
     third = start("--can", path)
     assert channel(third) == path
     with can.Bus(interface="tormagsim", channel=path, ignore_config=True) as bus:
-        meet(bus)
-
-
-def test_pythons_own_slcan_finds_an_adapter(start: Start) -> None:
-    process = start("--slcan")
-    path = channel(process)
-    assert Path(path).is_char_device()
-    with can.Bus(interface="slcan", channel=path, bitrate=1_000_000, sleep_after_open=0.0, ignore_config=True) as bus:
-        assert isinstance(bus, slcanBus)
-        assert bus.get_version(LIMIT_S) == (10, 13)
-        assert bus.get_serial_number(LIMIT_S) == "SIM1"
         meet(bus)
 
 
