@@ -114,22 +114,6 @@ def test_a_publisher_that_says_so_is_restarted_without_a_gap(publishing: Publish
     assert publishing.inbox.report(publishing.now_s).by_source["a"].restarts == 1
 
 
-@pytest.mark.parametrize("numbers", [{"seq": 2**63 - 1}, {"session": 2**63 - 1, "seq": 7}])
-def test_no_number_locks_a_source_out(publishing: Publishing, numbers: dict[str, int]) -> None:
-    """Somebody sends one such message in its name, valid for a minute; two messages later it is heard again."""
-    for tick in range(100):
-        publishing.now_s = tick * 0.002
-        assert publishing.send(tick)
-    publishing.send(0, 9.0, valid_for_ms=60_000.0, **numbers)
-    heard = []
-    for tick in range(100, 110):
-        publishing.now_s = tick * 0.002
-        heard.append(publishing.send(tick))
-    assert heard.count(False) <= 2
-    assert all(heard[2:])
-    assert publishing.force_N == 1.0
-
-
 # -- who holds the brake -------------------------------------------------------------------------------------------
 
 
