@@ -16,6 +16,7 @@ from firmware_protocol.conformance.host import (
     is_open,
     positions,
     shown,
+    unless,
 )
 
 PAGE: Final = "Homing"
@@ -144,9 +145,9 @@ def homing_takes_only_retract(host: Host) -> str:
     host.until(lambda: host.status.mode is DeviceMode.IDLE, OPENED_S)
     status = host.next_status(Beat.OFF)
     seen = f"Retract {'acknowledged' if was_acknowledged else 'not acknowledged'}, {shown(status)}"
-    if not was_acknowledged or status.mode is not DeviceMode.IDLE or is_homed(status) or not is_open(status):
-        raise Unmet(seen)
-    return seen
+    return unless(
+        not was_acknowledged or status.mode is not DeviceMode.IDLE or is_homed(status) or not is_open(status), seen
+    )
 
 
 CHECKS: Final = (

@@ -66,6 +66,13 @@ class Unmet(Exception):  # noqa: N818  (what a device leaves unmet; nothing has 
     """The device does not do what the page says; the text is what was seen."""
 
 
+def unless(is_wrong: object, seen: str) -> str:
+    """What was seen. Raises Unmet with it where that is wrong."""
+    if is_wrong:
+        raise Unmet(seen)
+    return seen
+
+
 class Beat(Enum):
     """What is sent every millisecond."""
 

@@ -4,7 +4,7 @@ from typing import Final
 
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, Clear, DeviceFault, DeviceMode, Identity
 from firmware_protocol.conformance.check import check
-from firmware_protocol.conformance.host import SEEN_S, Beat, Host, Unmet, is_homed, shown
+from firmware_protocol.conformance.host import SEEN_S, Beat, Host, Unmet, is_homed, shown, unless
 
 PAGE = "Who says what when, 1"
 CLEARING = "What each mode takes"
@@ -68,9 +68,7 @@ def _mismatch(host: Host, schema: int, version: int) -> str:
         and status.mode is DeviceMode.LATCHED
         and not is_homed(status)
     )
-    if not is_right:
-        raise Unmet(seen)
-    return seen
+    return unless(not is_right, seen)
 
 
 @check(PAGE, "Hello with another schema hash", "Identity; Status LATCHED with SCHEMA_MISMATCH, not HOMED")
@@ -111,9 +109,7 @@ def clear_clears(host: Host) -> str:
     was_acknowledged = host.command(Clear)
     status = host.next_status(Beat.OFF)
     seen = f"Clear {'acknowledged' if was_acknowledged else 'not acknowledged'}, {shown(status)}"
-    if not was_acknowledged or status.mode is not DeviceMode.IDLE or status.faults or is_homed(status):
-        raise Unmet(seen)
-    return seen
+    return unless(not was_acknowledged or status.mode is not DeviceMode.IDLE or status.faults or is_homed(status), seen)
 
 
 @check("Modes", "not homed, Drive OFF, then Drive RUN with a duty of 0", "stays IDLE")
@@ -124,9 +120,7 @@ def run_needs_homing(host: Host) -> str:
         raise Unmet(f"HOMED even after a mismatch and a Clear: {shown(host.status)}")
     host.pass_time(SEEN_S, Beat.RUN)
     status = host.next_status(Beat.RUN)
-    if status.mode is not DeviceMode.IDLE:
-        raise Unmet(shown(status))
-    return shown(status)
+    return unless(status.mode is not DeviceMode.IDLE, shown(status))
 
 
 CHECKS: Final = (

@@ -27,6 +27,7 @@ from firmware_protocol.conformance.host import (
     is_open,
     positions,
     shown,
+    unless,
 )
 
 PAGE: Final = "Modes"
@@ -109,9 +110,10 @@ def open_switch_stops(host: Host) -> str:
     left_mm = state.left_position_mm - start.left_position_mm
     right_mm = state.right_position_mm - start.right_position_mm
     seen = f"left by {left_mm:+.2f} mm, right by {right_mm:+.2f} mm, {most_A:.2f} A at most, {shown(host.status)}"
-    if most_A > AT_STOP_A or max(abs(left_mm), abs(right_mm)) > AT_STOP_MM or host.status.mode is not DeviceMode.RUN:
-        raise Unmet(seen)
-    return seen
+    return unless(
+        most_A > AT_STOP_A or max(abs(left_mm), abs(right_mm)) > AT_STOP_MM or host.status.mode is not DeviceMode.RUN,
+        seen,
+    )
 
 
 @check(PAGE, f"{RUNNING}Drive OFF", "RETRACTING, then IDLE at both open switches, HOMED, no fault", moves=True)
@@ -144,9 +146,7 @@ def _opens(host: Host, beat: Beat) -> str:
     status = host.next_status(beat)
     seen = f"from {before}: RETRACTING, then {shown(status)}, {positions(host.last(State))}"
     is_right = status.mode is DeviceMode.IDLE and is_open(status) and is_homed(status) and not status.faults
-    if not is_right:
-        raise Unmet(seen)
-    return seen
+    return unless(not is_right, seen)
 
 
 @check(
@@ -195,9 +195,7 @@ def _refused_in_run(host: Host, kind: type[Home] | type[Clear]) -> str:
     is_refused = host.is_refused(kind, Beat.RUN)
     status = host.next_status(Beat.RUN)
     seen = f"{'not acknowledged' if is_refused else 'acknowledged'}, {shown(status)}"
-    if not is_refused or status.mode is not DeviceMode.RUN or not is_homed(status):
-        raise Unmet(seen)
-    return seen
+    return unless(not is_refused or status.mode is not DeviceMode.RUN or not is_homed(status), seen)
 
 
 @check("Who says what when, 1", "the right Hello in RUN", "Identity; stays RUN and HOMED", moves=True)
@@ -209,9 +207,7 @@ def hello_in_run(host: Host) -> str:
         host.hello(nonce=nonce, beat=Beat.RUN)
     status = host.next_status(Beat.RUN)
     seen = f"{len(host.all_of(Identity))} Identity for 2 Hellos, {shown(status)}"
-    if status.mode is not DeviceMode.RUN or not is_homed(status) or len(host.all_of(Identity)) != 2:
-        raise Unmet(seen)
-    return seen
+    return unless(status.mode is not DeviceMode.RUN or not is_homed(status) or len(host.all_of(Identity)) != 2, seen)
 
 
 @check(
@@ -228,9 +224,12 @@ def mismatch_in_run(host: Host) -> str:
         raise Unmet(shown(status))
     host.until(lambda: host.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED), OPENED_S, Beat.RUN)
     status = host.next_status(Beat.RUN)
-    if status.mode is not DeviceMode.LATCHED or DeviceFault.SCHEMA_MISMATCH not in status.faults or not is_open(status):
-        raise Unmet(shown(status))
-    return shown(status)
+    return unless(
+        status.mode is not DeviceMode.LATCHED
+        or DeviceFault.SCHEMA_MISMATCH not in status.faults
+        or not is_open(status),
+        shown(status),
+    )
 
 
 @check(
@@ -251,9 +250,7 @@ def retracting_takes_only_retract(host: Host) -> str:
     home, retract = ("acknowledged" if one else "not acknowledged" for one in (not is_refused, was_acknowledged))
     seen = f"Home {home}, Retract {retract}, {shown(status)}"
     is_right = status.mode is DeviceMode.IDLE and is_homed(status) and is_open(status)
-    if not is_refused or not was_acknowledged or not is_right:
-        raise Unmet(seen)
-    return seen
+    return unless(not is_refused or not was_acknowledged or not is_right, seen)
 
 
 CHECKS: Final = (

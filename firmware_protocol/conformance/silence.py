@@ -30,6 +30,7 @@ from firmware_protocol.conformance.host import (
     is_open,
     positions,
     shown,
+    unless,
 )
 from firmware_protocol.conformance.running import has_to_let_go
 
@@ -62,9 +63,7 @@ def _judged(silence: Silence) -> str:
         raise Unmet("no Status after the last Drive")
     at_s, status = late[0]
     seen = f"{at_s * 1e3:.0f} ms after the last Drive: {shown(status)}"
-    if status.mode is DeviceMode.RUN or DeviceFault.COMMAND_TIMEOUT not in status.faults:
-        raise Unmet(seen)
-    return seen
+    return unless(status.mode is DeviceMode.RUN or DeviceFault.COMMAND_TIMEOUT not in status.faults, seen)
 
 
 @check(
@@ -87,9 +86,7 @@ def silence_opens(host: Host) -> str:
     silence = host.fall_silent()
     modes = {status.mode.name for _, status in silence.statuses}
     seen = f"from {before}: {shown(silence.status)} after {silence.seconds:.2f} s, by way of {', '.join(sorted(modes))}"
-    if not is_open(silence.status) or silence.status.mode is DeviceMode.RUN:
-        raise Unmet(seen)
-    return seen
+    return unless(not is_open(silence.status) or silence.status.mode is DeviceMode.RUN, seen)
 
 
 @check(
@@ -125,9 +122,10 @@ def silence_latches(host: Host) -> str:
     host.fall_silent()
     host.pass_time(0.3, Beat.OFF)
     status = host.next_status(Beat.OFF)
-    if status.mode is not DeviceMode.LATCHED or DeviceFault.COMMAND_TIMEOUT not in status.faults or is_homed(status):
-        raise Unmet(shown(status))
-    return shown(status)
+    return unless(
+        status.mode is not DeviceMode.LATCHED or DeviceFault.COMMAND_TIMEOUT not in status.faults or is_homed(status),
+        shown(status),
+    )
 
 
 @check(LATCHES, f"{LATCHED}Drive RUN with a duty of 0", "stays LATCHED; each Drive is answered", moves=True)
@@ -139,9 +137,7 @@ def latched_refuses_run(host: Host) -> str:
     status = host.next_status(Beat.RUN)
     states = len(host.all_of(State))
     seen = f"{shown(status)}, {states} State"
-    if status.mode is not DeviceMode.LATCHED or states < SEEN_S * 900:
-        raise Unmet(seen)
-    return seen
+    return unless(status.mode is not DeviceMode.LATCHED or states < SEEN_S * 900, seen)
 
 
 @check(LATCHES, f"{LATCHED}Home", "not acknowledged, stays LATCHED", moves=True)
@@ -161,9 +157,7 @@ def _refused(host: Host, kind: type[Home] | type[Retract]) -> str:
     is_refused = host.is_refused(kind)
     status = host.next_status(Beat.OFF)
     seen = f"{'not acknowledged' if is_refused else 'acknowledged'}, {shown(status)}"
-    if not is_refused or status.mode is not DeviceMode.LATCHED:
-        raise Unmet(seen)
-    return seen
+    return unless(not is_refused or status.mode is not DeviceMode.LATCHED, seen)
 
 
 @check(LATCHES, f"{LATCHED}Clear, then Drive RUN", "acknowledged, no fault, not HOMED; stays IDLE", moves=True)
@@ -174,9 +168,7 @@ def cleared_is_not_homed(host: Host) -> str:
     host.pass_time(SEEN_S, Beat.RUN)
     status = host.next_status(Beat.RUN)
     seen = f"{'acknowledged' if was_acknowledged else 'not acknowledged'}, {shown(status)}"
-    if not was_acknowledged or status.mode is not DeviceMode.IDLE or status.faults or is_homed(status):
-        raise Unmet(seen)
-    return seen
+    return unless(not was_acknowledged or status.mode is not DeviceMode.IDLE or status.faults or is_homed(status), seen)
 
 
 @check(

@@ -13,6 +13,7 @@ from firmware_protocol.conformance.host import (
     Host,
     Unmet,
     shown,
+    unless,
     usual,
 )
 
@@ -54,9 +55,7 @@ def _status_rate(host: Host, beat: Beat) -> str:
     widest_s = max(after - before for before, after in pairwise([start_s, *times, host.now_s]))
     seen = f"one every {period_s * 1e3:.1f} ms, {widest_s * 1e3:.0f} ms apart at most"
     # a lost one, or a late one of ours, makes one gap of two; a sender that lags makes more
-    if abs(period_s / STATUS_S - 1.0) > STATUS_TOLERANCE or widest_s > 2.5 * STATUS_S:
-        raise Unmet(seen)
-    return seen
+    return unless(abs(period_s / STATUS_S - 1.0) > STATUS_TOLERANCE or widest_s > 2.5 * STATUS_S, seen)
 
 
 @check(ANSWERS, f"{LISTENED_S * 1e3:.0f} Drive OFF, one every 1 ms", "a State for each, 99 % at least")
@@ -79,9 +78,7 @@ def _answered(host: Host, kind: type[State] | type[Sense]) -> str:
     refused = {what: count for what, count in host.refused.items() if what.startswith(kind.__name__)}
     if refused:
         seen += f"; refused since the start: {refused}"
-    if abs(came - sent) > MOST_LOST * sent:
-        raise Unmet(seen)
-    return seen
+    return unless(abs(came - sent) > MOST_LOST * sent, seen)
 
 
 @check(ANSWERS, f"{PAIRS} Drive OFF, each after the answer to the one before", "State, then Sense")
@@ -108,9 +105,7 @@ def no_answer_without_drive(host: Host) -> str:
     host.pass_time(0.2)
     states, senses = len(host.all_of(State)), len(host.all_of(Sense))
     seen = f"{states} State, {senses} Sense"
-    if states or senses:
-        raise Unmet(seen)
-    return seen
+    return unless(states or senses, seen)
 
 
 @check(ANSWERS, "Drive OFF every 1 ms", f"State within {MOST_ANSWER_S * 1e3:g} ms as a rule, at once on the device")
@@ -126,9 +121,7 @@ def answer_time(host: Host) -> str:
     if not delays_s:
         raise Unmet("no State ever came")
     seen = f"{usual(delays_s) * 1e3:.2f} ms as a rule, {max(delays_s) * 1e3:.1f} ms at most"
-    if usual(delays_s) > MOST_ANSWER_S:
-        raise Unmet(seen)
-    return seen
+    return unless(usual(delays_s) > MOST_ANSWER_S, seen)
 
 
 @check("State", "Drive OFF every 1 ms for 0.6 s", "State's counter is one more each time, modulo 256")
@@ -166,9 +159,7 @@ def device_clock(host: Host) -> str:
         raise Unmet(f"{len(states)} State in {CLOCKED_S:g} s")
     drift = usual(drifts)
     seen = f"{1.0 + drift:.4f} s in a second, {drift:+.2%}"
-    if abs(drift) > MOST_DRIFT:
-        raise Unmet(seen)
-    return seen
+    return unless(abs(drift) > MOST_DRIFT, seen)
 
 
 @check(STATUS, "Drive OFF, its counter going up, then none", "Status shows the counter of the last Drive")
@@ -207,9 +198,7 @@ def status_plausible(host: Host) -> str:
     status = host.next_status(Beat.OFF)
     seen = f"{status.supply_V:.1f} V, {status.temperature_C:.0f} degC, {shown(status)}"
     causes = [fault.name for fault in status.faults if fault.name in ("SUPPLY", "TEMPERATURE")]
-    if not (9.0 <= status.supply_V <= 15.0 and -20.0 <= status.temperature_C <= 60.0) or causes:
-        raise Unmet(seen)
-    return seen
+    return unless(not (9.0 <= status.supply_V <= 15.0 and -20.0 <= status.temperature_C <= 60.0) or causes, seen)
 
 
 @check("Sense", "Drive OFF, nothing moving", "currents under 0.2 A, a force under 5 N")
@@ -220,9 +209,7 @@ def sense_plausible(host: Host) -> str:
     sense = host.last(Sense)
     currents, force_N = (sense.left_current_A, sense.right_current_A), sense.force_N
     seen = f"{currents[0]:+.3f} A, {currents[1]:+.3f} A, {force_N:+.3f} N"
-    if max(map(abs, currents)) > 0.2 or abs(force_N) > 5.0:
-        raise Unmet(seen)
-    return seen
+    return unless(max(map(abs, currents)) > 0.2 or abs(force_N) > 5.0, seen)
 
 
 CHECKS: Final = (

@@ -132,15 +132,6 @@ def request(command: str) -> bytes:
 # -- who is let in -------------------------------------------------------------------------------------------------
 
 
-def test_a_listed_publisher_is_heard(rig: Rig) -> None:
-    publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair("robot"))
-    rig.until(lambda: publisher.poll(0))
-    publisher.send(setpoint(1))
-    rig.until(lambda: rig.endpoint.inbox.accepted == 1)
-    assert rig.endpoint.report().refused == rig.endpoint.report().dropped == 0
-    assert rig.endpoint.report().connections["setpoint"] == 1
-
-
 def test_an_operator_commands_and_an_observer_only_looks(rig: Rig) -> None:
     replies = {}
     for name, commands in (("console", ("enable", "stop", "status")), ("viewer", ("stop", "enable", "status"))):

@@ -14,7 +14,8 @@ from tormagd.config import Config
 from tormagd.control.core import Core, build_core
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.journal import MOST_ENTRIES, Journal
-from tormagd.daemon.black_box import PART_TICKS, BlackBox, black_box_folder
+from tormagd.daemon.black_box import PART_TICKS, BlackBox
+from tormagd.daemon.profiles import state_folder
 from tormagd.daemon.telemetry import tick_record
 from tormagd.exact import plain
 from tormagd.hardware.connection import Connection
@@ -169,7 +170,7 @@ def test_it_says_when_it_ends(rig: Rig) -> None:
 
 def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
-    assert black_box_folder("") is None
+    assert state_folder("", "blackbox") is None
     box = BlackBox(None, {}, 1_000)
     loop = closed_loop(core)
     box.begin(core.stepper.start(0.0), core.planner.start(0.0), loop.connection)
@@ -179,8 +180,8 @@ def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.Monkey
     with pytest.raises(RefusedError, match="no folder is named"):
         box.write("REQUEST", 0.0, {})
     monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/tormag:/more")
-    assert black_box_folder("") == Path("/var/lib/tormag/blackbox")
-    assert black_box_folder("/elsewhere") == Path("/elsewhere")
+    assert state_folder("", "blackbox") == Path("/var/lib/tormag/blackbox")
+    assert state_folder("/elsewhere", "blackbox") == Path("/elsewhere")
 
 
 def test_a_process_that_does_not_start_is_no_reason_not_to_run(core: Core) -> None:

@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from itertools import count
 
+import pytest
+
 from tormagd.daemon.callbacks import KERNEL, NEWS_NS, Callbacks, Delay
 
 MS = 1_000_000
@@ -28,9 +30,15 @@ class Loop:
         self.now_ns += duration_ns
 
 
-def busy() -> Callable[[], int]:
-    """A thread that had the processor all the time."""
-    return count(0, 1_000 * MS).__next__
+@pytest.fixture
+def loop() -> Loop:
+    return Loop()
+
+
+@pytest.fixture
+def callbacks(loop: Loop) -> Callbacks:
+    """Of a thread that had the processor all the time."""
+    return Callbacks(loop, loop.clock_ns, count(0, 1_000 * MS).__next__)
 
 
 class Slow:
@@ -43,9 +51,7 @@ class Slow:
         self._loop.run_for(self._takes_ns)
 
 
-def test_the_callback_that_ran_into_the_tick_is_named() -> None:
-    loop = Loop()
-    callbacks = Callbacks(loop, loop.clock_ns, busy())
+def test_the_callback_that_ran_into_the_tick_is_named(loop: Loop, callbacks: Callbacks) -> None:
     callbacks.add_reader(1, Slow(loop, 3 * MS).receive)
     loop.run_for(9 * MS)
     loop.readers[1]()
@@ -55,33 +61,26 @@ def test_the_callback_that_ran_into_the_tick_is_named() -> None:
     assert callbacks.blamed == {"Slow.receive": 1}
 
 
-def test_what_a_callback_took_before_the_tick_was_due_does_not_count() -> None:
-    loop = Loop()
-    callbacks = Callbacks(loop, loop.clock_ns, busy())
+def test_what_a_callback_took_before_the_tick_was_due_does_not_count(loop: Loop, callbacks: Callbacks) -> None:
     callbacks.ran("long, but before", 0, 9 * MS)
     callbacks.ran("short", 10 * MS, 11 * MS)
     callbacks.ran("tick", 11 * MS, 13 * MS)
     assert callbacks.blame(10 * MS, 13 * MS) == Delay(3 * MS, "tick", 2 * MS)
 
 
-def test_many_short_runs_of_one_callback_add_up() -> None:
-    loop = Loop()
-    callbacks = Callbacks(loop, loop.clock_ns, busy())
+def test_many_short_runs_of_one_callback_add_up(loop: Loop, callbacks: Callbacks) -> None:
     for start in range(10, 18, 2):
         callbacks.ran("often", start * MS, (start + 1) * MS)
     callbacks.ran("once", 18 * MS, 21 * MS)
     assert callbacks.blame(10 * MS, 21 * MS) == Delay(11 * MS, "often", 4 * MS)
 
 
-def test_where_nothing_of_ours_ran_it_was_the_kernel() -> None:
-    loop = Loop()
-    callbacks = Callbacks(loop, loop.clock_ns, busy())
+def test_where_nothing_of_ours_ran_it_was_the_kernel(loop: Loop, callbacks: Callbacks) -> None:
     callbacks.ran("tick", 14 * MS, 15 * MS)
     assert callbacks.blame(10 * MS, 15 * MS) == Delay(5 * MS, KERNEL, 4 * MS)
 
 
-def test_a_callback_in_whose_midst_the_thread_was_stopped_is_not_to_blame() -> None:
-    loop = Loop()
+def test_a_callback_in_whose_midst_the_thread_was_stopped_is_not_to_blame(loop: Loop) -> None:
     ran_ns = [0]
     callbacks = Callbacks(loop, loop.clock_ns, lambda: ran_ns[0])
     callbacks.ran("tick", 9 * MS, 50 * MS)
@@ -92,9 +91,7 @@ def test_a_callback_in_whose_midst_the_thread_was_stopped_is_not_to_blame() -> N
     assert callbacks.blame(50 * MS, 60 * MS) == Delay(10 * MS, "tick", 10 * MS)
 
 
-def test_a_tick_in_time_leaves_nothing_to_the_next_and_no_news() -> None:
-    loop = Loop()
-    callbacks = Callbacks(loop, loop.clock_ns, busy())
+def test_a_tick_in_time_leaves_nothing_to_the_next_and_no_news(loop: Loop, callbacks: Callbacks) -> None:
     callbacks.ran("earlier", 0, 20 * MS)
     callbacks.forget()
     assert callbacks.news() is None
@@ -104,9 +101,7 @@ def test_a_tick_in_time_leaves_nothing_to_the_next_and_no_news() -> None:
     assert callbacks.blame(10 * MS, 20 * MS) == Delay(10 * MS, KERNEL, 10 * MS)
 
 
-def test_one_log_line_in_a_while_with_the_worst_of_all() -> None:
-    loop = Loop()
-    callbacks = Callbacks(loop, loop.clock_ns, busy())
+def test_one_log_line_in_a_while_with_the_worst_of_all(loop: Loop, callbacks: Callbacks) -> None:
     callbacks.ran("tick", 0, 2 * MS)
     callbacks.blame(0, 2 * MS)
     first = callbacks.news()
@@ -130,9 +125,7 @@ def test_one_log_line_in_a_while_with_the_worst_of_all() -> None:
     assert callbacks.blamed.total() == 4
 
 
-def test_a_descriptor_that_is_no_longer_watched_is_taken_from_the_loop() -> None:
-    loop = Loop()
-    callbacks = Callbacks(loop, loop.clock_ns, busy())
+def test_a_descriptor_that_is_no_longer_watched_is_taken_from_the_loop(loop: Loop, callbacks: Callbacks) -> None:
     callbacks.add_reader(5, Slow(loop, 1).receive)
     callbacks.remove_reader(5)
     assert loop.readers == {}

@@ -22,11 +22,3 @@ def test_what_is_listed_goes_before_what_comes_later_or_is_not(holder: str, othe
     assert is_passed(Hold(holder), other, ORDER, is_stale=True)
     assert not is_passed(Hold(holder, is_given=True), other, ORDER, is_stale=False)
     assert not is_passed(Hold(holder), other, (), is_stale=False)
-
-
-def test_each_change_of_the_publisher_behind_it_has_a_number_but_the_first() -> None:
-    first = Hold().passed_to("a")
-    assert first == Hold("a", 0)
-    assert first.passed_to("b") == Hold("b", 1)
-    assert first.passed_to("b", is_given=True).is_given
-    assert first.passed_to("b").restarted() == Hold("b", 2)

@@ -2,8 +2,9 @@
 
 import asyncio
 import os
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -20,30 +21,40 @@ STRONG = Shown(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4), lateness=Lateness(0.02))
 
 
 class Rig:
-    """Profiles of a planner that is a variable."""
+    """Profiles of a planner that is a variable, on an event loop that runs while they are asked to look."""
 
-    def __init__(self, folder: Path | None) -> None:
+    def __init__(self, runner: asyncio.Runner, folder: Path | None) -> None:
         self.shown = NOTHING_SHOWN
-        self.folder = None if folder is None else ProfileFolder(folder, "MRE-50-40", MODEL)
-        self.profiles = Profiles(self.folder, lambda: self.shown, self.teach)
+        self._runner = runner
+        self.profiles = runner.run(self._begun(folder and ProfileFolder(folder, "MRE-50-40", MODEL)))
+
+    async def _begun(self, folder: ProfileFolder | None) -> Profiles:
+        return Profiles(folder, lambda: self.shown, self.teach)
 
     def teach(self, shown: Shown) -> None:
         self.shown = shown
 
-    async def settled(self) -> None:
-        """Until the other thread has read and written."""
+    def look(self, serial_number: int, *driven: bool, shown: Shown | None = None) -> None:
+        """Looks once for each of `driven`, and waits until the other thread has read and written. The planner has
+        learned `shown` before the last."""
+        self._runner.run(self._looked(serial_number, driven, shown))
+
+    async def _looked(self, serial_number: int, driven: tuple[bool, ...], shown: Shown | None) -> None:
+        for number, is_driven in enumerate(driven, 1):
+            if number == len(driven):
+                self.shown = shown or self.shown
+            self.profiles.look(serial_number, is_driven=is_driven)
         await self.profiles.finished()
         for _ in range(3):
             await asyncio.get_running_loop().run_in_executor(None, lambda: None)
 
 
-def run(scene: Callable[[], Awaitable[None]]) -> None:
-    async def with_one_thread() -> None:
-        # what is given to it is done in turn, so that what comes last says that all is done
-        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(1))
-        await scene()
-
-    asyncio.run(with_one_thread())
+@pytest.fixture
+def new_rig() -> Iterator[Callable[[Path | None], Rig]]:
+    with asyncio.Runner() as runner:
+        # what is given to one thread is done in turn, so that what comes last says that all is done
+        runner.get_loop().set_default_executor(ThreadPoolExecutor(1))
+        yield partial(Rig, runner)
 
 
 def keep(folder: Path, serial_number: int, shown: Shown = STRONG) -> None:
@@ -51,26 +62,19 @@ def keep(folder: Path, serial_number: int, shown: Shown = STRONG) -> None:
     ProfileFolder(folder, "MRE-50-40", MODEL).write(profile)
 
 
-def test_what_is_learned_while_driven_is_there_after_a_restart(tmp_path: Path) -> None:
-    async def scene() -> None:
-        rig = Rig(tmp_path / "profiles")
-        rig.profiles.look(7, is_driven=False)
-        await rig.settled()
-        assert (rig.shown, rig.profiles.report().is_used) == (NOTHING_SHOWN, False)
-        rig.profiles.look(7, is_driven=True)
-        rig.shown = STRONG
-        rig.profiles.look(7, is_driven=False)
-        await rig.settled()
-        again = Rig(tmp_path / "profiles")
-        again.profiles.look(7, is_driven=False)
-        await again.settled()
-        assert (again.shown.device.scale, again.shown.lateness.lag_s) == (1.3, 0.02)
-        report = again.profiles.report()
-        assert report.is_used
-        assert report.age_s is not None
-        assert report.refusal == ""
-
-    run(scene)
+def test_what_is_learned_while_driven_is_there_after_a_restart(
+    new_rig: Callable[[Path | None], Rig], tmp_path: Path
+) -> None:
+    rig = new_rig(tmp_path / "profiles")
+    rig.look(7, False)
+    assert (rig.shown, rig.profiles.report().is_used) == (NOTHING_SHOWN, False)
+    rig.look(7, True, False, shown=STRONG)
+    again = new_rig(tmp_path / "profiles")
+    again.look(7, False)
+    assert (again.shown.device.scale, again.shown.lateness.lag_s) == (1.3, 0.02)
+    report = again.profiles.report()
+    assert (report.is_used, report.refusal) == (True, "")
+    assert report.age_s is not None
 
 
 @pytest.mark.parametrize(
@@ -81,84 +85,49 @@ def test_what_is_learned_while_driven_is_there_after_a_restart(tmp_path: Path) -
     ],
 )
 def test_a_profile_that_nothing_was_added_to_does_not_get_younger(
-    tmp_path: Path, added: dict[str, object], is_kept: bytes
+    new_rig: Callable[[Path | None], Rig], tmp_path: Path, added: dict[str, object], is_kept: bytes
 ) -> None:
     keep(tmp_path, 7)
     path = tmp_path / "00000007-MRE-50-40.json"
     before = path.read_bytes()
-
-    async def scene() -> None:
-        rig = Rig(tmp_path)
-        rig.profiles.look(7, is_driven=False)
-        await rig.settled()
-        for is_driven in (True, False):
-            rig.profiles.look(7, is_driven=is_driven)
-        await rig.settled()
-        assert path.read_bytes() == before
-        rig.profiles.look(7, is_driven=True)
-        rig.shown = rig.shown.replaced(**added)
-        rig.profiles.look(7, is_driven=False)
-        await rig.settled()
-        assert is_kept in path.read_bytes()
-
-    run(scene)
+    rig = new_rig(tmp_path)
+    rig.look(7, False)
+    rig.look(7, True, False)
+    assert path.read_bytes() == before
+    rig.look(7, True, False, shown=rig.shown.replaced(**added))
+    assert is_kept in path.read_bytes()
 
 
-def test_a_refusal_is_over_when_a_profile_has_been_kept(tmp_path: Path) -> None:
+def test_a_refusal_is_over_when_a_profile_has_been_kept(new_rig: Callable[[Path | None], Rig], tmp_path: Path) -> None:
     (tmp_path / "00000007-MRE-50-40.json").write_bytes(b"nothing")
-
-    async def scene() -> None:
-        rig = Rig(tmp_path)
-        rig.profiles.look(7, is_driven=True)
-        await rig.settled()
-        assert "not a profile" in rig.profiles.report().refusal
-        rig.shown = STRONG
-        rig.profiles.look(7, is_driven=False)
-        await rig.settled()
-        assert rig.profiles.report().refusal == ""
-
-    run(scene)
+    rig = new_rig(tmp_path)
+    rig.look(7, True)
+    assert "not a profile" in rig.profiles.report().refusal
+    rig.look(7, False, shown=STRONG)
+    assert rig.profiles.report().refusal == ""
 
 
-def test_another_device_is_not_taken_for_the_one_before(tmp_path: Path) -> None:
+def test_another_device_is_not_taken_for_the_one_before(new_rig: Callable[[Path | None], Rig], tmp_path: Path) -> None:
     keep(tmp_path, 7)
-
-    async def scene() -> None:
-        rig = Rig(tmp_path)
-        rig.profiles.look(7, is_driven=False)
-        await rig.settled()
-        assert rig.shown.device.scale == 1.3
-        rig.profiles.look(8, is_driven=False)
-        await rig.settled()
-        assert rig.shown == NOTHING_SHOWN
-        assert not rig.profiles.report().is_used
-
-    run(scene)
+    rig = new_rig(tmp_path)
+    rig.look(7, False)
+    assert rig.shown.device.scale == 1.3
+    rig.look(8, False)
+    assert (rig.shown, rig.profiles.report().is_used) == (NOTHING_SHOWN, False)
 
 
-def test_a_device_that_has_shown_itself_meanwhile_is_believed(tmp_path: Path) -> None:
+def test_a_device_that_has_shown_itself_meanwhile_is_believed(
+    new_rig: Callable[[Path | None], Rig], tmp_path: Path
+) -> None:
     keep(tmp_path, 7)
-
-    async def scene() -> None:
-        rig = Rig(tmp_path)
-        rig.profiles.look(7, is_driven=False)
-        rig.shown = Shown(DeviceFit(0.8))
-        await rig.settled()
-        assert rig.shown.device.scale == 0.8
-
-    run(scene)
+    rig = new_rig(tmp_path)
+    rig.look(7, False, False, shown=Shown(DeviceFit(0.8)))
+    assert rig.shown.device.scale == 0.8
 
 
-def test_what_a_doubted_sensor_taught_is_not_kept(tmp_path: Path) -> None:
-    async def scene() -> None:
-        rig = Rig(tmp_path)
-        rig.profiles.look(7, is_driven=True)
-        rig.shown = STRONG.replaced(sensor=Sensor(is_doubted=True))
-        rig.profiles.look(7, is_driven=False)
-        await rig.settled()
-        assert list(tmp_path.iterdir()) == []
-
-    run(scene)
+def test_what_a_doubted_sensor_taught_is_not_kept(new_rig: Callable[[Path | None], Rig], tmp_path: Path) -> None:
+    new_rig(tmp_path).look(7, True, False, shown=STRONG.replaced(sensor=Sensor(is_doubted=True)))
+    assert list(tmp_path.iterdir()) == []
 
 
 def wrong_model(path: Path) -> None:
@@ -183,18 +152,13 @@ def another_device(path: Path) -> None:
     ],
 )
 def test_a_wrong_file_is_named_and_nothing_is_believed_of_it(
-    tmp_path: Path, spoil: Callable[[Path], object], says: str
+    new_rig: Callable[[Path | None], Rig], tmp_path: Path, spoil: Callable[[Path], object], says: str
 ) -> None:
-    async def scene() -> None:
-        rig = Rig(tmp_path)
-        assert rig.folder is not None
-        spoil(rig.folder.path(7))
-        rig.profiles.look(7, is_driven=False)
-        await rig.settled()
-        assert rig.shown == NOTHING_SHOWN
-        assert says in rig.profiles.report().refusal
-
-    run(scene)
+    rig = new_rig(tmp_path)
+    spoil(tmp_path / "00000007-MRE-50-40.json")
+    rig.look(7, False)
+    assert rig.shown == NOTHING_SHOWN
+    assert says in rig.profiles.report().refusal
 
 
 def test_a_folder_that_cannot_be_written_keeps_nothing_and_says_so(tmp_path: Path) -> None:
@@ -203,14 +167,8 @@ def test_a_folder_that_cannot_be_written_keeps_nothing_and_says_so(tmp_path: Pat
         keep(tmp_path / "file", 7)
 
 
-def test_without_a_folder_nothing_is_kept() -> None:
-    async def scene() -> None:
-        rig = Rig(None)
-        rig.profiles.look(7, is_driven=True)
-        rig.shown = STRONG
-        rig.profiles.look(7, is_driven=False)
-        await rig.settled()
-        assert rig.shown == STRONG
-        assert rig.profiles.report().refusal
-
-    run(scene)
+def test_without_a_folder_nothing_is_kept(new_rig: Callable[[Path | None], Rig]) -> None:
+    rig = new_rig(None)
+    rig.look(7, True, False, shown=STRONG)
+    assert rig.shown == STRONG
+    assert rig.profiles.report().refusal

@@ -43,14 +43,6 @@ def test_all_together_are_bounded() -> None:
     assert requests.put(waiting("late"))
 
 
-def test_what_came_before_the_gap_was_told_to_open_is_overtaken() -> None:
-    requests = Requests()
-    before = waiting("a", opens=requests.opens)
-    requests.opens += 1
-    assert requests.is_overtaken(before)
-    assert not requests.is_overtaken(waiting("a", opens=requests.opens))
-
-
 @pytest.mark.parametrize("command", FIRST)
 def test_no_packing_of_a_first_command_is_overlooked(command: str) -> None:
     """msgpack has four ways to write a string; a client of another language may choose any."""

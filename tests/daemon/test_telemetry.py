@@ -215,13 +215,8 @@ def test_a_tick_is_recorded_whole() -> None:
 
 
 @pytest.mark.parametrize("present", OperatingState)
-def test_nothing_holds_back_a_device_that_is_not_driven(present: OperatingState) -> None:
-    held = limits_held(StepState(1.0, SafetyState(present)), OUTPUT, PLAN)
-    assert bool(held) == (present in (OperatingState.ENABLED, OperatingState.PAUSED))
-
-
-@pytest.mark.parametrize("present", OperatingState)
-def test_no_force_is_governed_while_the_device_is_not_driven(present: OperatingState) -> None:
+def test_nothing_is_governed_or_holds_back_while_the_device_is_not_driven(present: OperatingState) -> None:
+    is_driven = present in (OperatingState.ENABLED, OperatingState.PAUSED)
     published = telemetry(MEASUREMENT, StepState(1.0, SafetyState(present), first_estimate(MEASUREMENT, 47.5)))
-    assert published.governed_cf == (1.4 if present in (OperatingState.ENABLED, OperatingState.PAUSED) else None)
-    assert published.setpoint_cf == 1.5
+    assert bool(limits_held(StepState(1.0, SafetyState(present)), OUTPUT, PLAN)) == is_driven
+    assert (published.governed_cf, published.setpoint_cf) == (1.4 if is_driven else None, 1.5)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import firmware_protocol
-from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, DecodeError, Message, decode, encode
+from firmware_protocol.codec import DecodeError, Message, decode, encode
 from firmware_protocol.framing import MAX_PAYLOAD, FrameDecoder, encode_frame
 from firmware_protocol.layouts import LAYOUTS
 from firmware_protocol.schema import Layout
@@ -91,17 +91,6 @@ def hexed(data: bytes) -> str:
     return data.hex() or "-"
 
 
-def test_the_header_is_of_this_schema() -> None:
-    header = (ROOM / "c" / "messages.h").read_text(encoding="utf-8")
-    assert f"#define TORMAG_SCHEMA_HASH 0x{SCHEMA_HASH:08X}u\n" in header
-    assert f"#define TORMAG_PROTOCOL_VERSION {PROTOCOL_VERSION}u\n" in header
-    for layout in LAYOUTS:
-        for signal in layout.signals:
-            if signal.type is float:
-                macro = f"TORMAG_{layout.message.__name__}_{signal.name}_SCALE".upper()
-                assert f"#define {macro} {float(signal.scale)!r}" in header
-
-
 # -- payloads ------------------------------------------------------------------------------------------------------
 
 
@@ -177,16 +166,6 @@ def test_under_sanitizers_every_payload_is_accepted_or_refused_as_by_python(exch
 
 
 # -- frames --------------------------------------------------------------------------------------------------------
-
-
-def test_the_crc_is_genibus(library: ctypes.CDLL) -> None:
-    library.tormag_crc16.restype = ctypes.c_uint16
-    assert library.tormag_crc16(b"123456789", ctypes.c_size_t(9)) == 0xD64E
-
-
-def test_under_sanitizers_valid_frames_are_written_as_the_vectors_say(exchange: Exchange) -> None:
-    requests = [f"frame {v['function']} {v['sequence']} {v['payload']}" for v in FRAMES["valid"]]
-    assert exchange(requests) == [vector["frame"] for vector in FRAMES["valid"]]
 
 
 def test_under_sanitizers_any_payload_is_framed_as_by_python(exchange: Exchange) -> None:

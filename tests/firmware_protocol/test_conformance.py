@@ -172,16 +172,37 @@ class Rogue(CompiledFirmware):
         return self.take(time_s, message, sensors)
 
     def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        return self.real.receive(time_s, message, sensors)
+        return self.answered(message, self.real.receive(time_s, self.heard(time_s, message), sensors))
+
+    def heard(self, time_s: float, message: Message) -> Message:
+        """What it takes a message for."""
+        return message
+
+    def answered(self, message: Message, answer: Answer) -> Answer:
+        """What it makes of the right answer."""
+        return answer
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        return self.real.tick(time_s, sensors)
+        status = self.real.tick(time_s, sensors)
+        self.ticked(time_s)
+        return status and self.shown(time_s, status)
+
+    def ticked(self, time_s: float) -> None:
+        """What it does after each tick."""
+
+    def shown(self, time_s: float, status: Status) -> Status | None:
+        """What it makes of a right Status."""
+        return status
 
     def status(self, sensors: Sensors) -> Status:
         return self.real.status(sensors)
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        return self.real.measurement(time_s, sensors)
+        return self.measured(time_s, *self.real.measurement(time_s, sensors))
+
+    def measured(self, time_s: float, state: State, sense: Sense) -> tuple[State, Sense]:
+        """What it makes of a right measurement."""
+        return state, sense
 
     def identity(self) -> Identity:
         return self.real.identity()
@@ -216,40 +237,41 @@ class HashBytesReversed(Rogue):
 class AnswersHelloOnce(Rogue):
     said = 0
 
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        answer = self.real.receive(time_s, message, sensors)
+    def answered(self, message: Message, answer: Answer) -> Answer:
         self.said += isinstance(message, Hello)
         return Answer.NONE if isinstance(message, Hello) and self.said > 1 else answer
 
 
 class HelloIsNoNonce(Rogue):
+    kind: type[Message] = Hello
+
     def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
         before = self.real._nonce
         answer = self.real.receive(time_s, message, sensors)
-        if isinstance(message, Hello):
+        if isinstance(message, self.kind):
             self.real._nonce = before
         return answer
 
 
+class NonceNotShown(HelloIsNoNonce):
+    kind = Retract
+
+
 class IgnoresSchema(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        if isinstance(message, Hello):
-            message = message.replaced(schema_hash=SCHEMA_HASH)
-        return self.real.receive(time_s, message, sensors)
+    def heard(self, time_s: float, message: Message) -> Message:
+        return message.replaced(schema_hash=SCHEMA_HASH) if isinstance(message, Hello) else message
 
 
 class IgnoresVersion(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        if isinstance(message, Hello):
-            message = message.replaced(protocol_version=1)
-        return self.real.receive(time_s, message, sensors)
+    def heard(self, time_s: float, message: Message) -> Message:
+        return message.replaced(protocol_version=1) if isinstance(message, Hello) else message
 
 
 class ClearsMismatch(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
+    def heard(self, time_s: float, message: Message) -> Message:
         if isinstance(message, Clear):
             self.real._compatible = True
-        return self.real.receive(time_s, message, sensors)
+        return message
 
 
 class ClearIgnored(Rogue):
@@ -268,36 +290,31 @@ class RunsUnhomed(Rogue):
 class SlowStatus(Rogue):
     count = 0
 
-    def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        status = self.real.tick(time_s, sensors)
-        self.count += status is not None
+    def shown(self, time_s: float, status: Status) -> Status | None:
+        self.count += 1
         return status if self.count % 2 else None
 
 
 class StatusOnlyBesideDrives(Rogue):
-    def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        status = self.real.tick(time_s, sensors)
+    def shown(self, time_s: float, status: Status) -> Status | None:
         return status if time_s - self.drive_s < 0.3 else None
 
 
 class StatusLagsBesideDrives(Rogue):
     count = 0
 
-    def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        status = self.real.tick(time_s, sensors)
-        self.count += status is not None
+    def shown(self, time_s: float, status: Status) -> Status | None:
+        self.count += 1
         return None if self.count % 4 == 0 and time_s - self.drive_s < 0.01 else status
 
 
 class StateCounterStuck(Rogue):
-    def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        state, sense = self.real.measurement(time_s, sensors)
+    def measured(self, time_s: float, state: State, sense: Sense) -> tuple[State, Sense]:
         return state.replaced(counter=5), sense
 
 
 class StateCounterRepeated(Rogue):
-    def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        state, sense = self.real.measurement(time_s, sensors)
+    def measured(self, time_s: float, state: State, sense: Sense) -> tuple[State, Sense]:
         return state.replaced(counter=state.counter // 2), sense
 
 
@@ -307,40 +324,43 @@ class ClockInMilliseconds(Rogue):
 
 
 class DriveCounterBehind(Rogue):
-    def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        status = self.real.tick(time_s, sensors)
-        return status and status.replaced(drive_counter=(status.drive_counter - 1) % 256)
+    def shown(self, time_s: float, status: Status) -> Status | None:
+        return status.replaced(drive_counter=(status.drive_counter - 1) % 256)
 
 
 class AnswersRepetitions(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        answer = self.real.receive(time_s, message, sensors)
+    def answered(self, message: Message, answer: Answer) -> Answer:
         return Answer.MEASUREMENT if isinstance(message, Drive) else answer
 
 
 class SupplyInTenths(Rogue):
-    def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        status = self.real.tick(time_s, sensors)
-        return status and status.replaced(supply_V=status.supply_V / 10.0)
+    def shown(self, time_s: float, status: Status) -> Status | None:
+        return status.replaced(supply_V=status.supply_V / 10.0)
 
 
 class CurrentOffset(Rogue):
-    def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        state, sense = self.real.measurement(time_s, sensors)
+    def measured(self, time_s: float, state: State, sense: Sense) -> tuple[State, Sense]:
         return state, sense.replaced(left_current_A=sense.left_current_A + 0.5)
 
 
 class HomeIgnored(Rogue):
+    """Acknowledged all the same."""
+
+    kind: type[Home] | type[Retract] = Home
+
     def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        if isinstance(message, Home):
+        if isinstance(message, self.kind):
             self.real._nonce = message.nonce
             return Answer.NONE
         return self.real.receive(time_s, message, sensors)
 
 
+class RetractIgnored(HomeIgnored):
+    kind = Retract
+
+
 class HomeKeepsOrigin(Rogue):
-    def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        state, sense = self.real.measurement(time_s, sensors)
+    def measured(self, time_s: float, state: State, sense: Sense) -> tuple[State, Sense]:
         left_mm = state.left_position_mm + self.real._left_zero_mm
         return state.replaced(left_position_mm=left_mm, right_position_mm=left_mm), sense
 
@@ -350,8 +370,7 @@ class HomedBeforeZero(Rogue):
 
     zeroed_s = -1.0
 
-    def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        state, sense = self.real.measurement(time_s, sensors)
+    def measured(self, time_s: float, state: State, sense: Sense) -> tuple[State, Sense]:
         if self.real.homed and self.zeroed_s < 0.0:
             self.zeroed_s = time_s + 0.04
         if time_s < self.zeroed_s:
@@ -360,27 +379,10 @@ class HomedBeforeZero(Rogue):
 
 
 class ObeysRepetitions(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
+    def heard(self, time_s: float, message: Message) -> Message:
         if isinstance(message, Home):
             self.real._nonce = None
-        return self.real.receive(time_s, message, sensors)
-
-
-class RetractIgnored(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        if isinstance(message, Retract):
-            self.real._nonce = message.nonce
-            return Answer.NONE
-        return self.real.receive(time_s, message, sensors)
-
-
-class NonceNotShown(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        before = self.real._nonce
-        answer = self.real.receive(time_s, message, sensors)
-        if isinstance(message, Retract):
-            self.real._nonce = before
-        return answer
+        return message
 
 
 class ClearEndsAnything(Rogue):
@@ -393,10 +395,10 @@ class ClearEndsAnything(Rogue):
 
 
 class HomesFromAnywhere(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
+    def heard(self, time_s: float, message: Message) -> Message:
         if isinstance(message, Home) and message.nonce != self.real._nonce:
             self.real.mode, self.real.faults = DeviceMode.IDLE, DeviceFault(0)
-        return self.real.receive(time_s, message, sensors)
+        return message
 
 
 class RetractsWhenLatched(Rogue):
@@ -408,17 +410,14 @@ class RetractsWhenLatched(Rogue):
 
 
 class NeverRuns(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        if isinstance(message, Drive):
-            message = message.replaced(mode=DriveMode.OFF)
-        return self.real.receive(time_s, message, sensors)
+    def heard(self, time_s: float, message: Message) -> Message:
+        return message.replaced(mode=DriveMode.OFF) if isinstance(message, Drive) else message
 
 
 class ModesMixedUp(Rogue):
-    def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        status = self.real.tick(time_s, sensors)
+    def shown(self, time_s: float, status: Status) -> Status | None:
         swap = {DeviceMode.RUN: DeviceMode.HOMING, DeviceMode.HOMING: DeviceMode.RUN}
-        return status and status.replaced(mode=swap.get(status.mode, status.mode))
+        return status.replaced(mode=swap.get(status.mode, status.mode))
 
 
 class MotorsSwapped(Rogue):
@@ -433,10 +432,10 @@ class MotorsSwapped(Rogue):
 class PushesIntoStop(Rogue):
     asked: Drive | None = None
 
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
+    def heard(self, time_s: float, message: Message) -> Message:
         if isinstance(message, Drive):
             self.asked = message
-        return self.real.receive(time_s, message, sensors)
+        return message
 
     @property
     def output(self) -> Output:
@@ -455,14 +454,13 @@ class OffOnlySwitchesOff(Rogue):
 
 
 class NeedsNoLettingGo(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
+    def heard(self, time_s: float, message: Message) -> Message:
         self.real._may_run = True
-        return self.real.receive(time_s, message, sensors)
+        return message
 
 
 class NeedsNoLettingGoAfterFault(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        answer = self.real.receive(time_s, message, sensors)
+    def answered(self, message: Message, answer: Answer) -> Answer:
         if isinstance(message, Clear):
             self.real._may_run = True
         return answer
@@ -481,11 +479,9 @@ class HelloResets(Rogue):
         return self.real.receive(time_s, message, sensors)
 
 
-class MismatchInRunPasses(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        if isinstance(message, Hello) and self.real.mode is DeviceMode.RUN:
-            message = message.replaced(schema_hash=SCHEMA_HASH)
-        return self.real.receive(time_s, message, sensors)
+class MismatchInRunPasses(IgnoresSchema):
+    def heard(self, time_s: float, message: Message) -> Message:
+        return super().heard(time_s, message) if self.real.mode is DeviceMode.RUN else message
 
 
 class NoTimeout(Rogue):
@@ -494,72 +490,60 @@ class NoTimeout(Rogue):
         return self.real.tick(time_s, sensors)
 
 
-class TimeoutOf(Rogue):
-    timeout_s = 0.0
+class TimeoutOf65ms(Rogue):
+    timeout_s = 0.065
 
     def tick(self, time_s: float, sensors: Sensors) -> Status | None:
         self.real._drive_s = time_s if time_s - self.drive_s <= self.timeout_s else time_s - 1.0
         return self.real.tick(time_s, sensors)
 
 
-class TimeoutOf65ms(TimeoutOf):
-    timeout_s = 0.065
-
-
-class TimeoutOf35ms(TimeoutOf):
+class TimeoutOf35ms(TimeoutOf65ms):
     timeout_s = 0.035
 
 
 class TimeoutWithoutOpening(Rogue):
-    def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        status = self.real.tick(time_s, sensors)
+    def ticked(self, time_s: float) -> None:
         if self.real.mode is DeviceMode.RETRACTING and DeviceFault.COMMAND_TIMEOUT in self.real.faults:
             self.real._rest(time_s, DeviceMode.LATCHED)
-        return status
 
 
 class AnyMessageExtends(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
+    def heard(self, time_s: float, message: Message) -> Message:
         self.real._drive_s = time_s
-        return self.real.receive(time_s, message, sensors)
+        return message
 
 
 class RepetitionExtends(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
+    def heard(self, time_s: float, message: Message) -> Message:
         if isinstance(message, Drive):
             self.real._drive_s = time_s
-        return self.real.receive(time_s, message, sensors)
+        return message
 
 
 class DoesNotLatch(Rogue):
-    def tick(self, time_s: float, sensors: Sensors) -> Status | None:
-        status = self.real.tick(time_s, sensors)
+    def ticked(self, time_s: float) -> None:
         if self.real.mode is DeviceMode.LATCHED:
             self.real.faults = DeviceFault(0)
             self.real._rest(time_s, DeviceMode.IDLE)
-        return status
 
 
 class LatchedKeepsHomed(Rogue):
     was_homed = False
 
-    def tick(self, time_s: float, sensors: Sensors) -> Status | None:
+    def ticked(self, time_s: float) -> None:
         self.was_homed = self.was_homed or self.real.homed
-        status = self.real.tick(time_s, sensors)
         if self.real.mode is DeviceMode.LATCHED:
             self.real.homed = self.was_homed
-        return status
 
 
 class LatchedDoesNotMeasure(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        answer = self.real.receive(time_s, message, sensors)
+    def answered(self, message: Message, answer: Answer) -> Answer:
         return Answer.NONE if self.real.mode is DeviceMode.LATCHED and isinstance(message, Drive) else answer
 
 
 class ClearHomes(Rogue):
-    def take(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
-        answer = self.real.receive(time_s, message, sensors)
+    def answered(self, message: Message, answer: Answer) -> Answer:
         if isinstance(message, Clear) and self.real.mode is DeviceMode.IDLE:
             self.real.homed = True
         return answer

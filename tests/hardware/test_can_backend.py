@@ -7,7 +7,6 @@ import select
 import socket
 import tty
 from collections.abc import Callable, Iterator
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,10 @@ import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Drive, DriveMode, Home, Message, Status, Switches
 from tormagd.config import ConfigError, Device, Rates
-from tormagd.hardware import backend as backends
 from tormagd.hardware.backend import BackendError, choose, installed
 from tormagd.hardware.can_backend import FRAMES_AT_ONCE, UNSENT_FRAMES, CanBackend, CanOptions
 from tormagd.hardware.can_stream import CanStream
-from tormagd.simulation.can_frame import ERROR_FLAG, CanFrame, from_socket, to_socket
+from tormagd.simulation.can_frame import ERROR_FLAG, CanFrame, to_socket
 
 STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
 BUS_OFF = CanFrame(ERROR_FLAG | 0x40, bytes(8))
@@ -29,11 +27,6 @@ PASSIVE = CanFrame(ERROR_FLAG | 0x04, bytes((0, 0x30, 0, 0, 0, 0, 0, 0)))
 
 def frame_of(message: Message) -> CanFrame:
     return CanFrame(*CanStream(1).pack(message))
-
-
-def descriptors() -> int:
-    """How many this process has open."""
-    return len(list(Path("/proc/self/fd").iterdir()))
 
 
 def opened(device: Device) -> CanBackend:
@@ -45,6 +38,13 @@ def opened(device: Device) -> CanBackend:
 
 def wait_readable(backend: CanBackend) -> None:
     assert select.select([backend.fileno()], [], [], 5.0)[0]
+
+
+def next_of(backend: CanBackend) -> list[Message]:
+    """What comes next, together."""
+    while not (received := backend.receive()):
+        wait_readable(backend)
+    return received
 
 
 # -- on the simulator's bus ----------------------------------------------------------------------------------------
@@ -79,15 +79,6 @@ def bus(tmp_path: Path) -> Iterator[Bus]:
         yield made
 
 
-def test_messages_pass_both_ways(bus: Bus) -> None:
-    assert bus.backend.receive() == []
-    bus.put(frame_of(STATUS), frame_of(STATUS.replaced(drive_counter=9)))
-    assert [message.drive_counter for message in bus.backend.receive()] == [0, 9]  # type: ignore[union-attr]
-    bus.backend.send(Home(7))
-    assert from_socket(bus.far.recv(64)) == frame_of(Home(7))
-    assert (bus.backend.statistics.frames, bus.backend.statistics.corrupt) == (2, 0)
-
-
 def test_bus_off_is_said_by_its_name(bus: Bus) -> None:
     bus.put(frame_of(STATUS), BUS_OFF)
     with pytest.raises(BackendError, match="bus-off") as caught:
@@ -107,14 +98,6 @@ def test_another_host_on_the_same_node_ends_the_connection(bus: Bus) -> None:
     with pytest.raises(BackendError, match="another host drives node 1") as caught:
         bus.backend.receive()
     assert "device.options.node" in caught.value.remedy
-
-
-def test_a_simulator_that_goes_away_is_said_by_reading_and_writing(bus: Bus) -> None:
-    bus.far.close()
-    with pytest.raises(BackendError, match=bus.device.port):
-        bus.backend.receive()
-    with pytest.raises(BackendError, match=bus.device.port):
-        bus.backend.send(Home(1))
 
 
 def test_a_bus_that_takes_no_frames_is_noticed(bus: Bus) -> None:
@@ -194,11 +177,7 @@ def test_lines_of_an_adapter_pass_both_ways(adapter: Adapter) -> None:
     assert said.startswith(b"C\rS8\r")
     status = frame_of(STATUS)
     os.write(adapter.far, b"\rz\r\at%03X8%s\r" % (status.identifier, status.data.hex().encode()))
-    received: list[Message] = []
-    while not received:
-        wait_readable(backend)
-        received += backend.receive()
-    assert received == [STATUS]
+    assert next_of(backend) == [STATUS]
     backend.close()
 
 
@@ -210,11 +189,7 @@ def test_a_damaged_line_is_counted_and_the_next_is_read(adapter: Adapter, damage
         wait_readable(backend)
         assert backend.receive() == []
     os.write(adapter.far, b"t0718%s\r" % frame_of(STATUS).data.hex().encode())
-    received: list[Message] = []
-    while not received:
-        wait_readable(backend)
-        received += backend.receive()
-    assert received == [STATUS]
+    assert next_of(backend) == [STATUS]
     assert backend.statistics.resynchronisations == 1
     backend.close()
 
@@ -227,21 +202,6 @@ def test_an_adapter_belongs_to_one(adapter: Adapter, other: str) -> None:
         choose(second, Rates()).open()
     first.close()
     choose(second, Rates()).open().close()
-
-
-def test_an_adapter_that_was_unplugged_leaves_no_descriptor_behind() -> None:
-    before = descriptors()
-    for _ in range(3):
-        adapter = Adapter()
-        backend = opened(adapter.device)
-        adapter.unplug()
-        with pytest.raises(BackendError, match="slcan"):
-            backend.receive()
-        with pytest.raises(BackendError, match="slcan"):
-            backend.send(Home(1))
-        backend.close()
-        backend.close()
-    assert descriptors() == before
 
 
 # -- a bus that fails as told --------------------------------------------------------------------------------------
@@ -377,27 +337,3 @@ def test_a_driver_that_does_not_load_is_refused(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(can.interfaces.BACKENDS, "broken", ("no_such_module_anywhere", "Bus"))
     with pytest.raises(ConfigError, match=r"device\.options\.interface = 'broken': its driver does not load"):
         choose(can_device("broken"), Rates())
-
-
-def test_a_broken_plugin_is_named_and_skipped(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
-) -> None:
-    (tmp_path / "half_a_plugin.py").write_text("def open(device:\n")
-    (tmp_path / "angry_plugin.py").write_text("raise RuntimeError('not on a Friday')\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    entries = {
-        "fine": "tormagd.hardware.can_backend:DRIVER",
-        "function": "os:getpid",
-        "absent": "no_such_module_anywhere:open",
-    }
-    entries |= {"half": "half_a_plugin:open", "angry": "angry_plugin:open"}
-    points = [metadata.EntryPoint(name, value, backends.ENTRY_POINTS) for name, value in entries.items()]
-    monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == backends.ENTRY_POINTS else [])
-    found = installed()
-    assert list(found) == ["absent", "angry", "fine", "function", "half"]
-    assert found["fine"] == ""
-    assert "not on a Friday" in found["angry"]
-    assert "SyntaxError" in found["half"]
-    assert "allowed is a tormagd.hardware.backend.Driver" in found["function"]
-    assert [record.levelname for record in caplog.records] == ["WARNING"] * 4
-    assert choose(Device(backend="fine", options={"interface": "socketcan"}), Rates()).options

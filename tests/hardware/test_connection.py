@@ -5,6 +5,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import pytest
@@ -38,6 +39,7 @@ from tormagd.safety.operating_state import DeviceRequest
 from tormagd_client.messages import LinkReport
 
 TICK_S = 1e-3
+US = Identity(SCHEMA_HASH, 1, 0, 7)
 COMMANDS = {Home: DeviceRequest.HOME, Retract: DeviceRequest.RETRACT, Clear: DeviceRequest.CLEAR}
 
 
@@ -45,17 +47,16 @@ class Firmware:
     """As much of a device as a connection can see: it answers, counts nonces and forgets them when it is reset."""
 
     def __init__(self) -> None:
-        self.identity = Identity(SCHEMA_HASH, 1, 0, 7)
         self.accepted: list[type[Message]] = []
         self.reset()
 
     def reset(self) -> None:
         self.nonce, self.counter, self.boot_ms, self.drive_counter = 0, 0, 0, 0
 
-    def answers(self, message: Message) -> list[Message]:
+    def answers(self, message: Message, identity: Identity) -> list[Message]:
         if isinstance(message, Hello):
             self.nonce = message.nonce
-            return [self.identity]
+            return [identity]
         if isinstance(message, Drive):
             self.counter = (self.counter + 1) % 256
             self.drive_counter = message.counter
@@ -106,7 +107,7 @@ class Port:
             raise BackendError("can0: bus-off", "look at the termination")
         self.bench.sent.append((self.bench.now_s, message))
         if not self.bench.is_mute:
-            self.waiting.extend(self.bench.firmware.answers(message))
+            self.waiting.extend(bench.firmware.answers(message, bench.identity))
 
     def close(self) -> None:
         assert not self.is_closed
@@ -124,6 +125,7 @@ class Bench:
         self.attempts_s: list[float] = []
         self.readers: dict[int, Callable[[], None]] = {}
         self.losses = 0
+        self.identity = US
         self.is_there = self.has_status = True
         self.is_held = self.is_mute = self.is_bus_off = self.is_babbling = False
         self.request, self.number = DeviceRequest.NONE, 0
@@ -217,64 +219,33 @@ def bench() -> Bench:
     return Bench()
 
 
-def unanswered(bench: Bench) -> None:
-    bench.is_mute = True
-    bench.connection.open(bench)
-
-
-def babbling(bench: Bench) -> None:
-    bench.is_mute = bench.is_babbling = True
-    bench.connection.open(bench)
-
-
-def absent(bench: Bench) -> None:
-    bench.is_there = False
-    bench.connection.open(bench)
-
-
-def held(bench: Bench) -> None:
-    bench.is_held = True
-    bench.connection.open(bench)
-
-
-def wrong(bench: Bench) -> None:
-    bench.firmware.identity = Identity(0xBAD, 3, 1, 7)
-    bench.connection.open(bench)
-
-
-def silent(bench: Bench) -> None:
-    bench.running().is_mute = True
-
-
-def bus_off(bench: Bench) -> None:
-    bench.running().is_bus_off = True
-
-
-def unplugged(bench: Bench) -> None:
-    bench.running().unplug()
-
-
 @pytest.mark.parametrize(
-    ("trouble", "after_ms", "state", "cause", "remedy"),
+    ("is_running", "trouble", "after_ms", "state", "cause", "remedy"),
     [
-        (absent, 1, LinkState.BACK_OFF, "no such port", "plug"),
-        (held, 1, LinkState.BACK_OFF, "another process", "tormagctl ports"),
-        (wrong, 60, LinkState.REFUSED, "00000bad", "same protocol schema"),
-        (unanswered, 1_010, LinkState.UNANSWERED, "it is silent", "rate"),
-        (babbling, 1_010, LinkState.UNANSWERED, "not this protocol", "rate"),
-        (unplugged, 1, LinkState.LOST, "unplugged", "cable"),
-        (silent, 82, LinkState.LOST, "no message for 80 ms", "cable"),
-        (bus_off, 1, LinkState.LOST, "bus-off", "termination"),
+        (False, {"is_there": False}, 1, LinkState.BACK_OFF, "no such port", "plug"),
+        (False, {"is_held": True}, 1, LinkState.BACK_OFF, "another process", "tormagctl ports"),
+        (False, {"identity": Identity(0xBAD, 3, 1, 7)}, 60, LinkState.REFUSED, "00000bad", "same protocol schema"),
+        (False, {"is_mute": True}, 1_010, LinkState.UNANSWERED, "it is silent", "rate"),
+        (False, {"is_mute": True, "is_babbling": True}, 1_010, LinkState.UNANSWERED, "not this protocol", "rate"),
+        (True, {"is_there": False}, 1, LinkState.LOST, "unplugged", "cable"),
+        (True, {"is_mute": True}, 82, LinkState.LOST, "no message for 80 ms", "cable"),
+        (True, {"is_bus_off": True}, 1, LinkState.LOST, "bus-off", "termination"),
     ],
 )
 def test_each_trouble_has_its_state_cause_and_remedy_and_goes_when_it_is_mended(
-    bench: Bench, trouble: Callable[[Bench], None], after_ms: int, state: LinkState, cause: str, remedy: str
+    bench: Bench, is_running: bool, trouble: dict[str, Any], after_ms: int, state: LinkState, cause: str, remedy: str
 ) -> None:
-    trouble(bench)
+    if is_running:
+        bench.running()
+    for name, value in trouble.items():
+        setattr(bench, name, value)
+    if not bench.is_there:
+        bench.unplug()
+    if not is_running:
+        bench.connection.open(bench)
     bench.pass_ms(after_ms)
-    assert bench.connection.state is state
     report = bench.connection.report()
-    assert (report.state, bench.connection.measurement) == (str(state), None)
+    assert (report.state, bench.connection.state, bench.connection.measurement) == (str(state), state, None)
     assert cause in report.cause
     assert remedy in report.remedy
     bench.pass_ms(3_000)  # it has given up asking often by now
@@ -288,7 +259,7 @@ def test_each_trouble_has_its_state_cause_and_remedy_and_goes_when_it_is_mended(
 def heal(bench: Bench) -> None:
     bench.is_there = True
     bench.is_held = bench.is_mute = bench.is_bus_off = bench.is_babbling = False
-    bench.firmware.identity = Identity(SCHEMA_HASH, 1, 0, 7)
+    bench.identity = US
 
 
 def test_a_device_that_was_reset_is_a_loss_without_closing_the_port(bench: Bench) -> None:
@@ -320,7 +291,8 @@ def test_a_host_that_was_not_run_does_not_take_its_own_sleep_for_the_devices(ben
 
 
 def test_a_device_whose_first_word_is_who_it_is_runs_at_once(bench: Bench) -> None:
-    unanswered(bench)
+    bench.is_mute = True
+    bench.connection.open(bench)
     bench.pass_ms(1_100)
     bench.is_mute = False
     bench.has_status = False
@@ -341,20 +313,6 @@ def test_waiting_grows_to_a_second_and_starts_anew_with_the_next_device(bench: B
     bench.unplug()
     bench.pass_ms(60)
     assert bench.attempts_s[-1] - lost_s == pytest.approx(FIRST_BACK_OFF_S, abs=2e-3)
-
-
-@pytest.mark.parametrize("request_", [DeviceRequest.HOME, DeviceRequest.CLEAR])
-def test_what_was_asked_of_a_device_that_then_went_is_not_done_by_the_one_that_comes(
-    bench: Bench, request_: DeviceRequest
-) -> None:
-    bench.running().unplug()
-    bench.is_armed = False
-    bench.ask(request_)
-    bench.pass_ms(200)
-    heal(bench)
-    bench.pass_ms(1_500)
-    assert bench.connection.state is LinkState.RUNNING
-    assert bench.firmware.accepted == []
 
 
 def test_opening_the_gap_waits_for_a_device_that_went_before_it_had_heard(bench: Bench) -> None:
@@ -438,7 +396,7 @@ class Cables(RuleBasedStateMachine):
 
     @rule(schema=st.sampled_from([SCHEMA_HASH, SCHEMA_HASH, 0xBAD]), serial_number=st.integers(7, 8))
     def another_device_takes_its_place(self, schema: int, serial_number: int) -> None:
-        self.bench.firmware.identity = Identity(schema, 1, 0, serial_number)
+        self.bench.identity = Identity(schema, 1, 0, serial_number)
 
     @rule()
     def the_device_is_reset(self) -> None:

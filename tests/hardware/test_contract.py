@@ -24,12 +24,12 @@ import can
 import numpy as np
 import pytest
 
-from firmware_protocol.codec import DriveMode, Message, State
+from firmware_protocol.codec import DriveMode, Home, Message, State
 from firmware_protocol.value import Value
 from tormagd.closed_loop import ClosedLoop, Sample, stream
 from tormagd.config import Config, Device
 from tormagd.control.core import Core, build_core
-from tormagd.hardware.backend import Backend, choose
+from tormagd.hardware.backend import Backend, BackendError, choose
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import DeviceLink, LinkState
@@ -644,3 +644,20 @@ def test_host_and_device_meet_on_any_line_that_is_not_cut(
             break
     assert link.state is LinkState.RUNNING
     assert link.identity is not None
+
+
+@pytest.mark.parametrize("transport", ["serial", "slcan", "tormagsim"])
+def test_a_device_that_goes_is_said_by_reading_and_writing_and_leaves_nothing_open(
+    transport: str, tmp_path: Path
+) -> None:
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    far = TRANSPORTS[transport](VirtualDevice(load_plant("sample_1"), parse_hand("steady"), (), 1), tmp_path)
+    backend = choose(far.configured, CONFIG.rates).open()
+    far.close()
+    with pytest.raises(BackendError, match=far.configured.port):
+        backend.receive()
+    with pytest.raises(BackendError, match=far.configured.port):
+        backend.send(Home(1))
+    backend.close()
+    backend.close()
+    assert len(list(Path("/proc/self/fd").iterdir())) == before

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from firmware_protocol.codec import (
+    FUNCTION,
     PROTOCOL_VERSION,
     SCHEMA_HASH,
     Clear,
@@ -26,7 +27,6 @@ from firmware_protocol.codec import (
     encode,
     period,
 )
-from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import (
     FIRST_NONCE,
     GIVE_UP_S,
@@ -40,9 +40,6 @@ from tormagd.hardware.link import (
 )
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import DeviceRequest
-from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import load_plant
 
 US = Identity(SCHEMA_HASH, 1, 2, 77)
 POSITION_SPAN_MM = period(State, "left_position_mm")
@@ -58,11 +55,21 @@ def status(nonce: int = 0, **changes: object) -> Status:
 def running(nonce: int = 0) -> DeviceLink:
     """A link that knows its device, at time 0."""
     link = DeviceLink(0.0)
-    for message in (*link.due(0.0), US, status(nonce), Sense(0.0, 0.0, 0.0, 0.0), State(0.0, 0.0, 0.0, 0)):
-        if not isinstance(message, Hello):
-            link.receive(0.0, message)
+    assert [type(message) for message in link.due(0.0)] == [Hello]
+    told(link, 0.0, US, status(nonce), Sense(0.0, 0.0, 0.0, 0.0), State(0.0, 0.0, 0.0, 0))
     assert link.state is LinkState.RUNNING
     return link
+
+
+def told(link: DeviceLink, now_s: float, *messages: Message) -> None:
+    for message in messages:
+        link.receive(now_s, message)
+
+
+def measured(link: DeviceLink) -> Measurement:
+    """What it has measured, which has to be something."""
+    assert link.measurement is not None
+    return link.measurement
 
 
 def due(link: DeviceLink, from_s: float, until_s: float, heard: bool = True) -> list[tuple[float, Message]]:
@@ -140,22 +147,17 @@ def test_a_device_that_turns_up_late_is_asked_at_its_first_word() -> None:
 def test_a_device_that_was_reset_has_to_say_again_who_it_is() -> None:
     """Its Status shows the nonce 0, which no host ever sends."""
     link = running(nonce=FIRST_NONCE)
-    before = link.measurement
     link.receive(0.02, status(0, switches=Switches(0)))
     assert link.state is LinkState.RUNNING, "the core sees first what the reset did"
-    assert link.measurement is not None
-    assert not link.measurement.is_homed
+    assert not measured(link).is_homed
     link.request(0.021, DeviceRequest.RETRACT)
     assert [type(message) for message in link.due(0.021)] == [Hello]
     assert link.state is LinkState.IDENTIFYING
     assert "reset" in link.cause
     assert link.measurement is None
-    for message in (US, status(FIRST_NONCE), Sense(0.0, 0.0, 0.0, 0.0), State(5.0, 5.0, 0.0, 1)):
-        link.receive(0.022, message)
+    told(link, 0.022, US, status(FIRST_NONCE), Sense(0.0, 0.0, 0.0, 0.0), State(5.0, 5.0, 0.0, 1))
     assert link.state is LinkState.RUNNING
-    assert link.measurement is not None
-    assert before is not None
-    assert link.measurement.left_mm == 5.0
+    assert measured(link).left_mm == 5.0
     assert [type(message) for message in link.due(0.022)] == [Retract], "opening is still wanted"
 
 
@@ -165,8 +167,7 @@ def test_a_reset_device_does_nothing_that_was_asked_of_it_before(request_: Devic
     link.request(0.01, request_)
     link.receive(0.02, status(0))
     link.due(0.02)
-    for message in (US, status(FIRST_NONCE)):
-        link.receive(0.03, message)
+    told(link, 0.03, US, status(FIRST_NONCE))
     assert link.pending is DeviceRequest.NONE
     assert {type(message) for _, message in due(link, 0.03, 2.0)} == {Hello}
 
@@ -189,14 +190,12 @@ def test_a_state_that_is_no_news_measures_nothing(behind: int) -> None:
     assert link.measurement is before
     assert link.repeated == 1
     link.receive(0.3, State(-1.5, -1.5, 0.3, 40 + 3))
-    assert link.measurement is not None
-    assert link.measurement.left_mm == pytest.approx(-1.5)
+    assert measured(link).left_mm == pytest.approx(-1.5)
 
 
 def test_a_repetition_is_none_the_less_one_before_the_device_is_known() -> None:
     link = DeviceLink(0.0)
-    for message in (US, State(0.0, 0.0, 0.0, 5), Sense(0.0, 0.0, 0.0, 0.0), status(), State(0.0, 0.0, 0.0, 5)):
-        link.receive(0.0, message)
+    told(link, 0.0, US, State(0.0, 0.0, 0.0, 5), Sense(0.0, 0.0, 0.0, 0.0), status(), State(0.0, 0.0, 0.0, 5))
     assert (link.measurement, link.repeated) == (None, 1)
     link.receive(0.001, State(0.0, 0.0, 0.0, 6))
     assert link.measurement is not None
@@ -301,8 +300,7 @@ def test_a_number_that_another_host_used_last_is_no_acknowledgement(left_by_anot
     if is_early:
         link.request(0.0, DeviceRequest.RETRACT)
         assert not any(isinstance(message, Retract) for message in link.due(0.0))
-    link.receive(0.0, US)
-    link.receive(0.0, status(left_by_another_host))
+    told(link, 0.0, US, status(left_by_another_host))
     if not is_early:
         link.request(0.0, DeviceRequest.RETRACT)
     link.receive(0.01, status(left_by_another_host))
@@ -310,43 +308,17 @@ def test_a_number_that_another_host_used_last_is_no_acknowledgement(left_by_anot
     assert retract.nonce not in (0, left_by_another_host)
 
 
-def test_a_second_host_homes_a_device_that_the_first_one_homed() -> None:
-    """A daemon that was started again talks to a device that has stayed on, and counts from the start."""
-    device = VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1)
-    ticks = 0
-    for _ in range(2):
-        link, stream = DeviceLink(ticks * 1e-3), FrameStream()
-        was_homing = False
-        for tick in range(200):
-            ticks += 1
-            now_s = ticks * 1e-3
-            for message in stream.unpack(device.transmit(now_s)):
-                link.receive(now_s, message)
-            if tick == 100:
-                link.request(now_s, DeviceRequest.HOME)
-            for message in (*link.due(now_s), link.drive(0.0, 0.0, DriveMode.OFF)):
-                device.receive(now_s, stream.pack(message))
-            was_homing |= link.measurement is not None and link.measurement.mode is DeviceMode.HOMING
-        assert was_homing
-        for _ in range(8_000):  # the rest of the homing, unattended
-            ticks += 1
-            device.transmit(ticks * 1e-3)
-
-
 def test_a_device_that_has_homed_is_homed_from_the_first_position_in_its_new_origin() -> None:
     """The Status that says so comes between two States; with the last one's position a carriage were out of stroke."""
     link = DeviceLink(0.0)
     homing = status(mode=DeviceMode.HOMING, switches=Switches(0))
-    for message in (US, homing, Sense(0.0, 0.0, 0.0, 0.0), State(7.5, 8.5, 0.0, 0)):
-        link.receive(0.0, message)
+    told(link, 0.0, US, homing, Sense(0.0, 0.0, 0.0, 0.0), State(7.5, 8.5, 0.0, 0))
     open_switches = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
     link.receive(0.001, status(switches=open_switches | Switches.HOMED))
-    before = link.measurement
-    assert before is not None
+    before = measured(link)
     assert (before.is_homed, before.is_busy, before.left_mm) == (False, True, 7.5)
     link.receive(0.001, State(0.1, 0.2, 0.001, 1))
-    after = link.measurement
-    assert after is not None
+    after = measured(link)
     assert (after.is_homed, after.is_busy) == (True, False)
     assert (after.left_mm, after.right_mm) == (pytest.approx(0.1), pytest.approx(0.2))
 
@@ -362,8 +334,7 @@ def test_a_measurement_takes_a_status_a_sense_and_a_state() -> None:
         assert link.measurement is None
     link.receive(0.0, status(supply_V=11.5))
     link.receive(0.7, State(-3.0, -4.0, 0.25, 2))
-    measurement = link.measurement
-    assert measurement is not None
+    measurement = measured(link)
     assert measurement == Measurement(
         0, 0.7, 0.25, -3.0, -4.0, 0.1, 0.2, 0.3, 0.0, DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 11.5,
         0.0, 0.0,
@@ -374,13 +345,11 @@ def test_a_measurement_takes_a_status_a_sense_and_a_state() -> None:
 
 def test_a_status_updates_what_it_knows_and_leaves_the_number() -> None:
     link = running()
-    before = link.measurement
-    assert before is not None
+    before = measured(link)
     link.receive(
         1.0, status(mode=DeviceMode.LATCHED, switches=Switches(0), faults=DeviceFault.SKEW, temperature_C=41.0)
     )
-    after = link.measurement
-    assert after is not None
+    after = measured(link)
     assert (after.mode, after.faults, after.temperature_C) == (DeviceMode.LATCHED, DeviceFault.SKEW, 41.0)
     assert (after.is_homed, after.is_latched, after.is_busy) == (False, True, False)
     assert (after.number, after.received_s) == (before.number, before.received_s)
@@ -398,15 +367,13 @@ def test_a_status_updates_what_it_knows_and_leaves_the_number() -> None:
 )
 def test_busy_and_latched(mode: DeviceMode, faults: DeviceFault, busy: bool, latched: bool) -> None:
     link = running()
-    link.receive(0.1, status(mode=mode, faults=faults))
-    assert link.measurement is not None
-    assert (link.measurement.is_busy, link.measurement.is_latched) == (busy, latched)
+    told(link, 0.1, status(mode=mode, faults=faults))
+    assert (measured(link).is_busy, measured(link).is_latched) == (busy, latched)
 
 
 def through_the_wire(message: Message) -> Message:
     """What arrives of a message: quantised and wrapped."""
-    function = {State: 3, Sense: 4}[type(message)]
-    return decode(function, encode(message))
+    return decode(FUNCTION[type(message)], encode(message))
 
 
 @settings(max_examples=60, deadline=None)
@@ -428,17 +395,13 @@ def test_wraps_are_taken_out(
     """Any motion of less than half a wrap per message comes out as it was, but for the wire's steps."""
     left, right, time_s, handle = start
     link = DeviceLink(0.0)
-    link.receive(0.0, status())
-    link.receive(0.0, through_the_wire(Sense(0.0, 0.0, 0.0, handle)))
-    link.receive(0.0, through_the_wire(State(left, right, time_s, 0)))
-    first = link.measurement
-    assert first is not None
+    told(link, 0.0, status(), *map(through_the_wire, (Sense(0.0, 0.0, 0.0, handle), State(left, right, time_s, 0))))
+    first = measured(link)
     for number, (left_mm, right_mm, elapsed_s, handle_mm) in enumerate(moves, 1):
         left, right, time_s, handle = left + left_mm, right + right_mm, time_s + elapsed_s, handle + handle_mm
-        link.receive(number * 1e-3, through_the_wire(State(left, right, time_s, number % 256)))
-        link.receive(number * 1e-3, through_the_wire(Sense(0.0, 0.0, 0.0, handle)))
-    last = link.measurement
-    assert last is not None
+        news = (State(left, right, time_s, number % 256), Sense(0.0, 0.0, 0.0, handle))
+        told(link, number * 1e-3, *map(through_the_wire, news))
+    last = measured(link)
     assert last.number == len(moves)
     assert last.left_mm - first.left_mm == pytest.approx(left - start[0], abs=2e-3)
     assert last.right_mm - first.right_mm == pytest.approx(right - start[1], abs=2e-3)
@@ -454,8 +417,7 @@ def test_each_stream_says_when_it_came_last() -> None:
     link.receive(0.5, State(-1.0, -1.0, 0.1, 1))
     link.receive(0.6, Sense(0.0, 0.0, 1.5, 2.0))
     link.receive(0.7, status(supply_V=11.0))
-    measurement = link.measurement
-    assert measurement is not None
+    measurement = measured(link)
     assert (measurement.received_s, measurement.sensed_s, measurement.reported_s) == (0.5, 0.6, 0.7)
 
 
@@ -472,9 +434,7 @@ def test_each_stream_says_when_it_came_last() -> None:
 def test_what_is_missing_for_a_measurement_is_said(heard, refused, missing: str) -> None:
     link = DeviceLink(0.0)
     assert not link.missing(refused), "it does not run yet"
-    link.receive(0.0, US)
-    for message in heard:
-        link.receive(0.01, message)
+    told(link, 0.01, US, *heard)
     assert link.missing(refused) == missing
     assert link.measurement is None
 
@@ -492,8 +452,6 @@ def test_the_quality_goes_with_the_measurement() -> None:
             link.receive(now_s, State(0.0, 0.0, 0.0, tick // 2 % 256))
         if link.is_judging(now_s):
             link.judge(now_s, frames=tick, damaged=tick, unsent=tick // 10)
-    measurement = link.measurement
-    assert measurement is not None
+    measurement = measured(link)
     assert measurement.link.unanswered == pytest.approx(0.5, abs=0.01)
-    assert measurement.link.damaged == pytest.approx(0.5)
-    assert measurement.link.unsent == pytest.approx(0.1, abs=0.001)
+    assert (measurement.link.damaged, measurement.link.unsent) == pytest.approx((0.5, 0.1), abs=0.001)

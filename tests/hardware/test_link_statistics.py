@@ -1,19 +1,20 @@
 """Round trip and device clock, against ways and clocks that are known."""
 
 import random
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
-import msgspec
 import pytest
 from hypothesis import example, given, settings, strategies as st
 
-from firmware_protocol.codec import Drive, DriveMode, Message
-from tormagd.hardware.frame_stream import FrameStream
-from tormagd.hardware.link import DeviceLink, LinkState
-from tormagd.hardware.link_statistics import LEAST_WINDOWS, ROUND_TRIPS, WINDOW_S, WINDOWS, DeviceClock, RoundTrip
-from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import load_plant
+from tormagd.hardware.link_statistics import (
+    LEAST_WINDOWS,
+    ROUND_TRIPS,
+    WINDOW_S,
+    WINDOWS,
+    ClockFit,
+    DeviceClock,
+    RoundTrip,
+)
 
 PERIOD_S = 1e-3
 
@@ -49,14 +50,20 @@ def exchange(
             answers.setdefault(answered, []).append("identity")
 
 
+def report_of(trip: RoundTrip) -> dict[str, float]:
+    """What it has to say, which has to be something."""
+    report = trip.report()
+    assert report is not None
+    return report
+
+
 @pytest.mark.parametrize("way_ticks", [1, 2, 16, 120])
 def test_a_round_trip_of_any_length_is_known_after_one_hello(way_ticks: int) -> None:
     """A USB adapter that keeps bytes back for 16 ms has 16 Drives under way at a time."""
     trip = RoundTrip()
     assert trip.report() is None
     exchange(trip, range(1, 1_400), way_ticks)
-    report = trip.report()
-    assert report is not None
+    report = report_of(trip)
     assert set(report.values()) == {way_ticks * 1e3}
     assert trip.least_s == pytest.approx(way_ticks * PERIOD_S)
 
@@ -78,6 +85,21 @@ def test_an_answer_to_what_has_not_been_sent_ends_the_count() -> None:
 
 
 # -- clock ---------------------------------------------------------------------------------------------------------
+
+
+def fit_of(clock: DeviceClock) -> ClockFit:
+    """What it claims, which has to be something."""
+    fit = clock.fit()
+    assert fit is not None
+    return fit
+
+
+def heard(device_s: Callable[[float], float], ticks: int) -> DeviceClock:
+    """A clock of which something is heard every millisecond."""
+    clock = DeviceClock()
+    for tick in range(ticks):
+        clock.add(tick * PERIOD_S, device_s(tick * PERIOD_S))
+    return clock
 
 
 @settings(max_examples=25, deadline=None)
@@ -102,8 +124,7 @@ def test_offset_and_drift_are_found_behind_jitter_and_outliers(
             late_s = noise.uniform(0.005, 0.05) if noise.random() < outlier_share else 0.0
         latched_s = now_s - noise.uniform(0.0002, 0.0004) - late_s
         clock.add(now_s, round((latched_s - offset_s) * (1.0 + drift_ppm * 1e-6), 5))
-    fit = clock.fit()
-    assert fit is not None
+    fit = fit_of(clock)
     assert fit.drift_ppm == pytest.approx(drift_ppm, abs=2.0)
     assert fit.residual_us < 20.0
     assert fit.windows == 39
@@ -119,8 +140,7 @@ def test_memory_is_bounded_and_the_fit_follows_the_last_half_minute() -> None:
     for tick in range(600 * 20):
         device_s += 0.05 * (1.0 + (100e-6 if tick < 300 * 20 else -50e-6))
         clock.add(tick * 0.05, device_s)
-    fit = clock.fit()
-    assert fit is not None
+    fit = fit_of(clock)
     assert fit.windows == WINDOWS
     assert fit.drift_ppm == pytest.approx(-50.0, abs=0.1)
     assert len(clock._windows) == WINDOWS
@@ -128,66 +148,19 @@ def test_memory_is_bounded_and_the_fit_follows_the_last_half_minute() -> None:
 
 
 def test_nothing_is_claimed_before_there_is_enough() -> None:
-    clock = DeviceClock()
-    for tick in range(round((LEAST_WINDOWS - 1) * WINDOW_S / PERIOD_S)):
-        clock.add(tick * PERIOD_S, tick * PERIOD_S)
-    assert clock.fit() is None
+    assert heard(lambda now_s: now_s, round((LEAST_WINDOWS - 1) * WINDOW_S / PERIOD_S)).fit() is None
 
 
 @pytest.mark.parametrize("step_s", [-5.0, -0.1, 0.1])
 @pytest.mark.parametrize("after_s", [5.0, 8.0, 15.0, 25.0])
 def test_a_clock_that_is_set_begins_a_new_line(step_s: float, after_s: float) -> None:
-    clock = DeviceClock()
-    for tick in range(30_000):
-        now_s = tick * PERIOD_S
-        clock.add(now_s, now_s * (1.0 + 30e-6) + (step_s if now_s > 30.0 - after_s else 0.0))
-    fit = clock.fit()
-    assert fit is not None
+    fit = fit_of(heard(lambda now_s: now_s * (1.0 + 30e-6) + step_s * (now_s > 30.0 - after_s), 30_000))
     assert fit.drift_ppm == pytest.approx(30.0, abs=1.0)
     assert fit.offset_s == pytest.approx(-30.0 * 30e-6 - step_s, abs=1e-4)
 
 
 def test_a_clock_that_stands_still_is_a_drift_like_any_other() -> None:
-    clock = DeviceClock()
-    for tick in range(10_000):
-        clock.add(tick * PERIOD_S, 1.0)
-    fit = clock.fit()
-    assert fit is not None
-    assert fit.drift_ppm == pytest.approx(-1e6, rel=1e-3)
-
-
-# -- both, in a conversation with the simulated device ---------------------------------------------------------------
-
-
-@pytest.mark.parametrize("clock_ppm", [-120.0, 40.0])
-def test_the_simulated_devices_line_and_clock(clock_ppm: float) -> None:
-    """Frames take their time on a line of 1 Mbaud, replies their jitter; the host looks every 50 us."""
-    plant = load_plant("sample_1")
-    firmware = msgspec.structs.replace(plant.firmware, clock_ppm=clock_ppm)
-    device = VirtualDevice(msgspec.structs.replace(plant, firmware=firmware), SteadyHand(), seed=1)
-    link, stream = DeviceLink(0.0), FrameStream()
-    wire_s = sum(len(stream.pack(message)) for message in probe()) * 10e-6
-    for step in range(20 * 4_000):
-        now_s = step * 5e-5
-        for message in stream.unpack(device.transmit(now_s)):
-            link.receive(now_s, message)
-        if step % 20 == 0:
-            sent: list[Message] = []
-            if link.state is LinkState.RUNNING:
-                sent.append(link.drive(0.0, 0.0, DriveMode.OFF))
-            for message in (*sent, *link.due(now_s)):
-                device.receive(now_s, stream.pack(message))
-    report, fit = link.round_trip.report(), link.clock.fit()
-    assert report is not None
-    assert fit is not None
-    assert report["least"] >= wire_s * 1e6
-    assert report["p99"] <= wire_s * 1e6 + firmware.reply_jitter_us + 100.0
-    assert fit.drift_ppm == pytest.approx(clock_ppm, abs=4.0)
-
-
-def probe() -> tuple[Message, Message]:
-    """A Drive, and a State, which is as long."""
-    return Drive(0.0, 0.0, DriveMode.OFF, 0), Drive(0.0, 0.0, DriveMode.OFF, 1)
+    assert fit_of(heard(lambda _now_s: 1.0, 10_000)).drift_ppm == pytest.approx(-1e6, rel=1e-3)
 
 
 # -- what a step is told of both -----------------------------------------------------------------------------------
@@ -200,8 +173,7 @@ def test_a_device_that_answers_every_other_drive_is_matched_by_number(way_ticks:
     trip = RoundTrip()
     unanswered = frozenset(tick for tick in range(1, 4_000) if tick % every)
     exchange(trip, range(1, 4_000), way_ticks, lost=unanswered)
-    report = trip.report()
-    assert report is not None
+    report = report_of(trip)
     assert report["p99"] <= way_ticks * 1e3 + 1.0
     assert trip.usual_s == pytest.approx(way_ticks * PERIOD_S, abs=1e-6)
 
@@ -212,8 +184,7 @@ def test_drives_that_are_lost_now_and_then_make_no_round_trip_long(way_ticks: in
     trip = RoundTrip()
     lost = frozenset(tick for tick in range(1, 20_000) if noise.random() < 0.05)
     exchange(trip, range(1, 20_000), way_ticks, lost=lost)
-    report = trip.report()
-    assert report is not None
+    report = report_of(trip)
     assert report["least"] >= (way_ticks - 1) * 1e3
     assert report["p99"] <= (way_ticks + 2) * 1e3, "one lost Drive alone looks like an answer that is on its way"
     assert trip.usual_s == pytest.approx(way_ticks * PERIOD_S, abs=1.5 * PERIOD_S)
@@ -229,9 +200,7 @@ def test_a_device_that_stood_still_for_its_timeout_has_the_round_trip_that_it_ha
 
 @pytest.mark.parametrize("drift", [-0.5, -0.02, 3e-5, 0.015, 0.3])
 def test_a_clock_that_runs_wrong_is_known_within_four_seconds(drift: float) -> None:
-    clock = DeviceClock()
-    for tick in range(4_100):
-        clock.add(tick * PERIOD_S, round(tick * PERIOD_S * (1.0 + drift), 5))
+    clock = heard(lambda now_s: round(now_s * (1.0 + drift), 5), 4_100)
     assert clock.drift == pytest.approx(drift, rel=0.02, abs=2e-5)
 
 
@@ -246,9 +215,7 @@ def test_a_delay_that_begins_is_no_drift(delay_s: float) -> None:
 
 
 def test_a_clock_that_stands_is_known_at_once_and_forgiven_when_it_goes() -> None:
-    clock = DeviceClock()
-    for tick in range(1_000):
-        clock.add(tick * PERIOD_S, tick * PERIOD_S)
+    clock = heard(lambda now_s: now_s, 1_000)
     for tick in range(30):
         clock.add((1_000 + tick) * PERIOD_S, 1.0)
     assert clock.drift == -1.0

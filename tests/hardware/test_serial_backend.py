@@ -16,7 +16,7 @@ import pytest
 from firmware_protocol.codec import DeviceFault, DeviceMode, Drive, DriveMode, Home, Status, Switches
 from tormagd.config import ConfigError, Device, Rates
 from tormagd.hardware import backend as backends
-from tormagd.hardware.backend import BackendError, choose
+from tormagd.hardware.backend import BackendError, choose, installed
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.serial_backend import SerialOptions, open_serial
 from tormagd.hardware.serial_port import SerialPort
@@ -30,13 +30,6 @@ class Line(NamedTuple):
     far: int
     near: int
     device: Device
-
-    def read(self) -> bytes:
-        """What has arrived at the far end."""
-        data = b""
-        while select.select([self.far], [], [], 0.2 if not data else 0.0)[0]:
-            data += os.read(self.far, 65_536)
-        return data
 
 
 @pytest.fixture
@@ -61,27 +54,6 @@ def wait_readable(port: SerialPort) -> None:
     assert select.select([port.fileno()], [], [], 5.0)[0]
 
 
-def test_messages_pass_both_ways(line: Line, port: SerialPort) -> None:
-    far = FrameStream()
-    assert port.receive() == []
-    os.write(line.far, far.pack(STATUS) + far.pack(STATUS.replaced(drive_counter=9)))
-    wait_readable(port)
-    assert [message.drive_counter for message in port.receive()] == [0, 9]  # type: ignore[union-attr]
-    port.send(Home(7))
-    port.send(Drive(0.5, -0.5, DriveMode.RUN, 1))
-    assert far.unpack(line.read()) == [Home(7), Drive(0.5, -0.5, DriveMode.RUN, 1)]
-    assert (port.statistics.frames, port.statistics.corrupt) == (2, 0)
-
-
-def test_a_frame_may_arrive_in_pieces(line: Line, port: SerialPort) -> None:
-    frame = FrameStream().pack(STATUS)
-    for piece in (frame[:5], frame[5:]):
-        os.write(line.far, piece)
-        wait_readable(port)
-        received = port.receive()
-    assert received == [STATUS]
-
-
 def test_bytes_from_before_the_opening_are_not_read(line: Line) -> None:
     os.write(line.far, b"half a frame of an earlier life")
     port = open_serial(line.device, SerialOptions())
@@ -100,14 +72,6 @@ def test_a_second_opening_is_refused_until_the_first_has_closed(line: Line) -> N
     assert "tormagctl ports" in caught.value.remedy
     first.close()
     open_serial(line.device, SerialOptions()).close()
-
-
-def test_a_device_that_goes_away_is_said_by_reading_and_writing(line: Line, port: SerialPort) -> None:
-    os.close(line.far)
-    with pytest.raises(BackendError, match=line.device.port):
-        port.receive()
-    with pytest.raises(BackendError, match=line.device.port):
-        port.send(Home(1))
 
 
 def test_end_of_file_is_a_device_that_was_unplugged(port: SerialPort, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,13 +113,6 @@ def test_what_the_driver_did_not_take_is_sent_before_the_next_frame(
     assert far.statistics.lost == 0
 
 
-def test_closing_twice_or_after_the_device_has_gone_is_silent(line: Line) -> None:
-    port = open_serial(line.device, SerialOptions())
-    os.close(line.far)
-    port.close()
-    port.close()
-
-
 def test_a_port_that_goes_while_it_is_set_up_is_not_opened(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     def gone(descriptor: int) -> None:
         raise termios.error(errno.EIO, "Input/output error")
@@ -181,7 +138,7 @@ def test_what_is_no_serial_port_is_not_opened(tmp_path: Path, kind: str) -> None
 FINE = "tormagd.hardware.serial_backend:DRIVER"
 
 
-def installed(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
+def install(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
     """Pretends that these plugins are installed."""
     points = [metadata.EntryPoint(name, value, backends.ENTRY_POINTS) for name, value in entries.items()]
     monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == backends.ENTRY_POINTS else [])
@@ -194,25 +151,35 @@ def test_the_serial_backend_is_installed() -> None:
         choose(Device(port="/nowhere/tty"), Rates()).open()
 
 
-def test_a_plugin_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    installed(monkeypatch, other=FINE, broken="no_such_module_anywhere:open")
-    assert choose(Device(backend="other"), Rates()).options == SerialOptions()
-
-
 def test_an_unknown_backend_names_the_installed_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    installed(monkeypatch, zeta=FINE, alpha=FINE)
+    install(monkeypatch, zeta=FINE, alpha=FINE)
     with pytest.raises(ConfigError, match=r"device\.backend = 'telepathy': installed are alpha, zeta"):
         choose(Device(backend="telepathy"), Rates())
-    installed(monkeypatch)
+    install(monkeypatch)
     with pytest.raises(ConfigError, match="installed are none"):
         choose(Device(backend="telepathy"), Rates())
 
 
-@pytest.mark.parametrize("value", ["no_such_module_anywhere:open", "os:no_such_attribute", "os:getpid"])
-def test_a_plugin_that_does_not_load_is_refused_and_stops_nobody_else(
-    monkeypatch: pytest.MonkeyPatch, value: str
+def test_a_broken_plugin_is_named_and_stops_nobody_else(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    installed(monkeypatch, broken=value, fine=FINE)
-    with pytest.raises(ConfigError, match=r"device\.backend = 'broken': the plugin does not load"):
-        choose(Device(backend="broken"), Rates())
+    (tmp_path / "half_a_plugin.py").write_text("def open(device:\n")
+    (tmp_path / "angry_plugin.py").write_text("raise RuntimeError('not on a Friday')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    broken = {
+        "function": ("os:getpid", "allowed is a tormagd.hardware.backend.Driver"),
+        "absent": ("no_such_module_anywhere:open", "ModuleNotFoundError"),
+        "nameless": ("os:no_such_attribute", "AttributeError"),
+        "half": ("half_a_plugin:open", "SyntaxError"),
+        "angry": ("angry_plugin:open", "not on a Friday"),
+    }
+    install(monkeypatch, fine=FINE, **{name: value for name, (value, _) in broken.items()})
+    found = installed()
+    assert list(found) == sorted([*broken, "fine"])
+    assert found["fine"] == ""
+    assert [record.levelname for record in caplog.records] == ["WARNING"] * len(broken)
+    for name, (_, said) in broken.items():
+        assert said in found[name]
+        with pytest.raises(ConfigError, match=rf"device\.backend = '{name}': the plugin does not load"):
+            choose(Device(backend=name), Rates())
     assert choose(Device(backend="fine"), Rates()).options == SerialOptions()

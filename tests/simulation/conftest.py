@@ -66,6 +66,15 @@ class Host:
         self.send(Drive(left, right, mode, self._counter))
         self.wait(PERIOD_S)
 
+    def drive_until(self, time_s: float, left: float = 0.0, right: float = 0.0) -> None:
+        while self.time_s < time_s:
+            self.drive(left, right)
+
+    def drive_while_running(self, left: float, right: float) -> None:
+        while self.status.mode is DeviceMode.RUN:
+            self.drive(left, right)
+            assert self.time_s < 20.0
+
     def heartbeat(self, seconds: float) -> None:
         for _ in range(round(seconds / PERIOD_S)):
             self.drive(0.0, 0.0, DriveMode.OFF)

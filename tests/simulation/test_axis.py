@@ -12,7 +12,7 @@ from tormagd.simulation.axis import Axis
 from tormagd.simulation.hand import ReversingHand, SteadyHand
 from tormagd.simulation.parameters import PlantError, PlantParameters, load_plant
 from tormagd.simulation.plant import SUBSTEP_S, Plant
-from tormagd.simulation.static_laws import holding_over_stroke
+from tormagd.simulation.static_laws import pull_of_magnets_N
 
 SAMPLES = ("sample_1", "sample_2", "sample_3")
 
@@ -30,15 +30,28 @@ def steps(duration_s: float) -> int:
     return round(duration_s / SUBSTEP_S)
 
 
+def turn(axis: Axis, duration_s: float, volts: float | None, attraction_N: float = 0.0) -> None:
+    for _ in range(steps(duration_s)):
+        axis.step(volts, attraction_N)
+
+
 def at_gap(plant: PlantParameters, gap_mm: float) -> PlantParameters:
     assumed = msgspec.structs.replace(plant.assumed, start_left_mm=gap_mm / 2.0, start_right_mm=gap_mm / 2.0)
     return msgspec.structs.replace(plant, assumed=assumed)
 
 
+def holding(plant: PlantParameters, gap_mm: float, wear: float = 1.0) -> tuple[float, float]:
+    """The magnets' attraction, N, and by how much friction at a screw holds more than that turns back, N m: power off,
+    without the guide's drag, and the friction divided by `wear`."""
+    pull_N = float(pull_of_magnets_N(gap_mm, plant))
+    friction_m = plant.screw.friction_coefficient * 0.5e-3 * plant.assumed.screw_mean_diameter_mm
+    friction_Nm = (plant.gear.output_friction_Nm + friction_m * pull_N) / wear
+    return pull_N, friction_Nm - pull_N * plant.screw.lead_mm * 1e-3 / math.tau
+
+
 def test_no_load_speed_and_current_are_those_of_the_data_sheet() -> None:
     axis = an_axis()
-    for _ in range(steps(0.2)):
-        axis.step(12.0, 0.0)
+    turn(axis, 0.2, 12.0)
     assert axis.speed_rad_s * 60.0 / math.tau == pytest.approx(150.0, rel=0.05)
     assert axis.current_A == pytest.approx(0.2, abs=0.03)
 
@@ -78,22 +91,18 @@ def test_current_is_limited() -> None:
 def test_under_break_away_voltage_the_screw_truly_stands() -> None:
     axis = an_axis()
     break_away_V = SAMPLE_1.gear.output_friction_Nm / (70.0 * 0.011) * 2.2
-    for _ in range(steps(0.5)):
-        axis.step(0.98 * break_away_V, 0.0)
+    turn(axis, 0.5, 0.98 * break_away_V)
     assert axis.speed_rad_s == 0.0
     assert axis.angle_rad == 0.0
-    for _ in range(steps(0.5)):
-        axis.step(1.05 * break_away_V, 0.0)
+    turn(axis, 0.5, 1.05 * break_away_V)
     assert axis.angle_rad > 0.0
 
 
 def test_lost_motion_on_reversal_is_backlash_and_twice_the_drag() -> None:
     drag_N = 6.0
     axis = an_axis(drag_N=drag_N)
-    for _ in range(steps(0.1)):
-        axis.step(3.0, 0.0)
-    for _ in range(steps(0.1)):
-        axis.step(None, 0.0)
+    turn(axis, 0.1, 3.0)
+    turn(axis, 0.1, None)
     turned_at, stood_at = axis.angle_rad, axis.position_m
     lost_m = 0.0
     while axis.position_m == stood_at:
@@ -115,8 +124,7 @@ def test_magnets_stronger_than_drag_keep_the_nut_on_one_flank() -> None:
 def test_the_stops_hold_against_full_drive() -> None:
     for volts, stop_mm in ((12.0, 48.0), (-12.0, 22.0)):
         axis = an_axis(start_mm=35.0)
-        for _ in range(steps(2.0)):
-            axis.step(volts, 30.0)
+        turn(axis, 2.0, volts, 30.0)
         assert axis.position_m * 1e3 == pytest.approx(stop_mm, abs=1e-9)
         assert axis.speed_rad_s == pytest.approx(0.0, abs=0.05)
         assert abs(axis.contact_N) < 2500.0
@@ -125,14 +133,12 @@ def test_the_stops_hold_against_full_drive() -> None:
 @pytest.mark.parametrize("name", SAMPLES)
 def test_attraction_and_holding_margin_over_the_stroke(name: str) -> None:
     plant = load_plant(name)
-    rows = holding_over_stroke(plant)
-    assert rows[0].gap_mm == 44.5
-    assert rows[-1].gap_mm == 95.0
-    assert 50.0 < rows[0].attraction_N < 80.0
-    assert all(before.attraction_N > after.attraction_N for before, after in itertools.pairwise(rows))
-    assert all(row.margin_Nm > 0.05 for row in rows)
-    worn = holding_over_stroke(plant, wear=4.0)
-    assert worn[0].margin_Nm < 0.0 < worn[-1].margin_Nm
+    gaps_mm = [44.5 + 50.5 * index / 50 for index in range(51)]
+    rows = [holding(plant, gap_mm) for gap_mm in gaps_mm]
+    assert 50.0 < rows[0][0] < 80.0
+    assert all(before > after for (before, _), (after, _) in itertools.pairwise(rows))
+    assert all(margin_Nm > 0.05 for _, margin_Nm in rows)
+    assert holding(plant, gaps_mm[0], wear=4.0)[1] < 0.0 < holding(plant, gaps_mm[-1], wear=4.0)[1]
 
 
 @pytest.mark.parametrize("name", SAMPLES)
@@ -152,7 +158,7 @@ def test_a_worn_gearbox_lets_the_magnets_close_the_gap_where_the_margin_is_negat
         plant = Plant(at_gap(parameters, gap_mm), SteadyHand())
         plant.wear(4.0)
         plant.advance(3.0)
-        closes = min(holding_over_stroke(parameters, wear=4.0), key=lambda row: abs(row.gap_mm - gap_mm)).margin_Nm < 0
+        closes = holding(parameters, gap_mm, wear=4.0)[1] < 0.0
         assert (plant.gap_mm < gap_mm - 1.0) is closes, plant.truth
     assert plant.gap_mm == pytest.approx(90.0, abs=1e-6)
 
@@ -234,8 +240,7 @@ def test_no_energy_comes_from_nowhere(volts: list[float | None], wear: float) ->
 
 def test_friction_takes_a_turning_screw_to_rest_and_never_back() -> None:
     axis = an_axis()
-    for _ in range(steps(0.05)):
-        axis.step(12.0, 0.0)
+    turn(axis, 0.05, 12.0)
     speeds = []
     while axis.speed_rad_s != 0.0:
         axis.step(None, 0.0)
@@ -243,6 +248,5 @@ def test_friction_takes_a_turning_screw_to_rest_and_never_back() -> None:
     assert all(after < before for before, after in itertools.pairwise(speeds))
     assert min(speeds) == 0.0
     resting_at = axis.angle_rad
-    for _ in range(steps(0.1)):
-        axis.step(None, 0.0)
+    turn(axis, 0.1, None)
     assert axis.angle_rad == resting_at

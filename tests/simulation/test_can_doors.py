@@ -12,7 +12,6 @@ from pathlib import Path
 
 import can
 import pytest
-from can.interfaces.slcan import slcanBus
 
 from firmware_protocol.codec import (
     FUNCTION,
@@ -125,34 +124,6 @@ def test_what_a_killed_simulator_left_is_replaced_and_what_somebody_serves_is_no
     assert channel(third) == path
     with can.Bus(interface="tormagsim", channel=path, ignore_config=True) as bus:
         meet(bus)
-
-
-def test_pythons_own_slcan_finds_an_adapter(start: Start) -> None:
-    process = start("--slcan")
-    path = channel(process)
-    assert Path(path).is_char_device()
-    with can.Bus(interface="slcan", channel=path, bitrate=1_000_000, sleep_after_open=0.0, ignore_config=True) as bus:
-        assert isinstance(bus, slcanBus)
-        assert bus.get_version(LIMIT_S) == (10, 13)
-        assert bus.get_serial_number(LIMIT_S) == "SIM1"
-        meet(bus)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("--can", "--bitrate", "7"), "10000"),
-        (("--can", "--node", "16"), "16"),
-        (("--can", "/nonexistent/can"), "/nonexistent"),
-        (("--bus", "telepathy:0"), "telepathy"),
-        (("--can", "--pty"), "not allowed"),
-    ],
-)
-def test_a_wrong_call_says_what_is_right_and_exits_with_2(start: Start, arguments: tuple[str, ...], said: str) -> None:
-    process = start(*arguments)
-    output, errors = process.communicate(timeout=LIMIT_S)
-    assert (process.returncode, output) == (2, "")
-    assert said in errors
 
 
 @pytest.mark.parametrize("address", ["udp_multicast:239.74.163.88", "socketcan:vcan0"])

@@ -6,7 +6,6 @@ from itertools import pairwise
 
 import msgspec
 import pytest
-from hypothesis import given, settings, strategies as st
 
 from firmware_protocol.codec import (
     FUNCTION,
@@ -130,18 +129,6 @@ def test_handle_and_force_are_those_of_the_plant_in_sensor_steps() -> None:
     assert turned_mm > span_mm
     assert sense.handle_position_mm == pytest.approx(turned_mm % span_mm, abs=0.05)
     assert sense.force_N == pytest.approx(device.truth.force_N, abs=0.05)
-
-
-@settings(max_examples=60, deadline=None)
-@given(junk=st.binary(max_size=300))
-def test_garbage_on_the_line_does_nothing(junk: bytes) -> None:
-    device = a_device()
-    device.receive(0.0, junk + b"\x00")
-    device.receive(0.004, HELLO)
-    frames = FrameDecoder().feed(device.transmit(0.05))
-    messages = [decode(frame.function, frame.payload) for frame in frames]
-    assert sum(isinstance(message, Identity) for message in messages) >= 1
-    assert all(isinstance(message, Identity | Status) for message in messages)
 
 
 def test_corrupt_and_foreign_payloads_are_counted_and_dropped() -> None:

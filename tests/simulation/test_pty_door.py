@@ -16,23 +16,16 @@ import serial
 
 from firmware_protocol.codec import FUNCTION, PROTOCOL_VERSION, SCHEMA_HASH, Hello, Identity, Status, encode
 from firmware_protocol.framing import FrameDecoder, encode_frame
+from tormagd.simulation.__main__ import main
 
 LIMIT_S = 20.0
-
-
-def start(*arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "tormagd.simulation", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
 
 
 @pytest.fixture
 def simulator(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str, Path]]:
     truth = tmp_path / "truth.csv"
-    process = start("--pty", "--seed", "3", "--truth", str(truth))
+    command = [sys.executable, "-m", "tormagd.simulation", "--pty", "--seed", "3", "--truth", str(truth)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
         yield process, process.stdout.readline().strip(), truth
@@ -90,11 +83,19 @@ def test_hello_is_answered_across_two_hosts_and_the_truth_is_kept(simulator) -> 
         (("--pty", "--hand", "third"), "reversing"),
         (("--pty", "--baud", "7"), "1200"),
         (("--pty", "--truth", "/nonexistent/truth.csv"), "/nonexistent"),
+        (("--can", "--bitrate", "7"), "10000"),
+        (("--can", "--node", "16"), "16"),
+        (("--can", "/nonexistent/can"), "/nonexistent"),
+        (("--bus", "telepathy:0"), "telepathy"),
+        (("--can", "--pty"), "not allowed"),
     ],
 )
-def test_a_wrong_call_says_what_is_right_and_exits_with_2(arguments: tuple[str, ...], said: str) -> None:
-    process = start(*arguments)
-    output, errors = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 2
+@pytest.mark.usefixtures("usual_slices")
+def test_a_wrong_call_says_what_is_right_and_exits_with_2(
+    arguments: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+    output, errors = capsys.readouterr()
     assert output == ""
     assert said in errors

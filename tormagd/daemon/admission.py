@@ -31,13 +31,29 @@ CONNECTIONS_PER_PEER = 160
 PEERS = 32
 "Refused peers that are told apart; the one that was refused longest ago joins the others."
 OTHERS = "others"
-HANDSHAKE_MS = 2_000
+GUARDED = {
+    zmq.ZAP_ENFORCE_DOMAIN: 1,
+    zmq.HANDSHAKE_IVL: 2_000,
+    # a machine that has gone without a word frees its connection after half a minute
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 10,
+    zmq.TCP_KEEPALIVE_INTVL: 5,
+    zmq.TCP_KEEPALIVE_CNT: 4,
+}
+"Options of a guarded socket; times are in ms and s."
 NEWS_S = 10.0
 "At most one log line in this time."
 AT_ONCE = 8
 "Events taken from one socket before the next one's turn."
 RESTS_S = 1e-3
 "Between two looks for events: a look, too, takes the interpreter's lock, when they come and not when it is to spare."
+WATCHED = (
+    zmq.EVENT_ACCEPTED
+    | zmq.EVENT_DISCONNECTED
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
+)
 _CREDENTIALS = struct.Struct("3i")
 _ZAP = "inproc://zeromq.zap.01"
 _KEY_BYTES = 32
@@ -159,16 +175,9 @@ class Admission:
             endpoint.curve_secretkey = self._keys.server.secret
             endpoint.curve_server = True
             endpoint.setsockopt(zmq.ZAP_DOMAIN, name.encode())
-            endpoint.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
-            endpoint.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
-            # a machine that has gone without a word frees its connection after half a minute
-            for option, value in ((zmq.TCP_KEEPALIVE, 1), (zmq.TCP_KEEPALIVE_IDLE, 10), (zmq.TCP_KEEPALIVE_INTVL, 5)):
+            for option, value in GUARDED.items():
                 endpoint.setsockopt(option, value)
-            endpoint.setsockopt(zmq.TCP_KEEPALIVE_CNT, 4)
-        events = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
-        events |= zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
-        events |= zmq.EVENT_HANDSHAKE_FAILED_AUTH
-        self._endpoints[endpoint.get_monitor_socket(events)] = _Connections(name, is_guarded)
+        self._endpoints[endpoint.get_monitor_socket(WATCHED)] = _Connections(name, is_guarded)
         self._watched.append(endpoint)
 
     def start(self) -> None:
@@ -324,9 +333,7 @@ class Admission:
         address = known.addresses.pop(descriptor, "")
         failed, known.failed = known.failed, None
         if address:
-            known.of_address[address] -= 1
-            if not known.of_address[address]:
-                del known.of_address[address]
+            _count_down(known.of_address, address)
         was_asked = known.was_turned_away(address) if failed is None else failed == PLAIN and known.left_untold(address)
         if descriptor in known.cut:
             known.cut.discard(descriptor)
@@ -338,9 +345,7 @@ class Admission:
         elif not known.is_guarded:
             self._moved(known.name, address, has_left=True)
         elif known.admitted[address]:
-            known.admitted[address] -= 1
-            if not known.admitted[address]:
-                del known.admitted[address]
+            _count_down(known.admitted, address)
             self._moved(known.name, address, has_left=True)
         else:
             # a peer of an old version is closed without an event of its own
@@ -402,6 +407,13 @@ def shown(address: str) -> str:
         return "gone before it was seen"
     parts = address.split(":")
     return f"process {parts[3]} of user {parts[1]}" if len(parts) == 4 else address
+
+
+def _count_down(counts: Counter[str], name: str) -> None:
+    """One less; what is not there any more is not kept."""
+    counts[name] -= 1
+    if not counts[name]:
+        del counts[name]
 
 
 def _counts(allowed: Allowed) -> str:

@@ -27,7 +27,6 @@ from tormagd.control.core import Core, platform_name, sources_hash
 from tormagd.control.journal import FORMAT, Journal, Packer
 from tormagd.control.plan import PlanState
 from tormagd.control.step import StepState
-from tormagd.daemon.profiles import state_folder
 from tormagd.hardware.connection import Connection
 from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
 from tormagd.safety.operating_state import RefusedError
@@ -48,11 +47,6 @@ ASKED = "REQUEST"
 
 log = logging.getLogger(__name__)
 Start = Callable[[socket.socket], "subprocess.Popen[bytes]"]
-
-
-def black_box_folder(configured: str) -> Path | None:
-    """The folder for black boxes: the one that is configured, or else the service's; None where there is neither."""
-    return Path(configured) if configured else state_folder("blackbox")
 
 
 def header(config: Config, core: Core) -> dict[str, str]:

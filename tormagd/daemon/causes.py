@@ -69,9 +69,8 @@ class Causes:
         }
         if state.leap is not None:
             figures[Fault.ENCODER] = str(state.leap)
-        homing = state.homing
-        if homing is not None:
-            figures.update({fault: str(homing) for fault in homing.faults})
+        if state.homing is not None:
+            figures |= dict.fromkeys(state.homing.faults, str(state.homing))
         for fault in faults:
             if fault in figures:
                 self._told[fault] = f"{FAULTS[fault].cause}: {figures[fault]}"
@@ -99,7 +98,7 @@ class Causes:
     def newest_stall(self) -> StallReport | None:
         """The newest stall, None while there was none."""
         stall = self._stall
-        return None if stall is None else StallReport(round(stall.took_s * 1e3, 1), stall.culprit)
+        return stall and StallReport(round(stall.took_s * 1e3, 1), stall.culprit)
 
 
 def explanations(

@@ -19,7 +19,7 @@ from tormagd.daemon.control_loop import ControlLoop
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.inference_loop import InferenceLoop
-from tormagd.daemon.profiles import ProfileFolder, Profiles, profile_folder
+from tormagd.daemon.profiles import ProfileFolder, Profiles, state_folder
 from tormagd.daemon.realtime import freeze_garbage, priority_of_threads
 from tormagd.daemon.reload import reread
 from tormagd.daemon.telemetry_loop import TelemetryLoop
@@ -78,7 +78,7 @@ class Daemon:
             journal=self._box.journal,
             on_failure=partial(self._control.latch, Fault.PLAN_FAILED),
         )
-        folder = profile_folder(config.device.profiles)
+        folder = state_folder(config.device.profiles, "profiles")
         self._profiles = Profiles(
             None if folder is None else ProfileFolder(folder, core.scene.insert.name, core.model),
             lambda: self._inference.state.shown,

@@ -94,12 +94,11 @@ class Endpoint:
             self._recording = self._bind(zmq.XPUB, "recording", endpoints.recording)
             self._control = self._bind(zmq.ROUTER, "control", endpoints.control)
         except OSError:
-            self._release()
+            self.close()
             raise
         self._setpoints.subscribe(b"")
         self.admission.start()
-        self._is_in_parts = False
-        self._is_in_parts_of_request = False
+        self._is_in_parts = self._is_in_parts_of_request = False
         self._requests = Requests()
         self.has_requests = False
         "Whether requests may be waiting in the socket that its descriptor says nothing of any more."
@@ -170,12 +169,9 @@ class Endpoint:
                 return
             if waiting is None:
                 continue
-            if may_go_first(waiting.data):
-                looked_at += 1
-                is_answered = self._is_answered_first(waiting, answer)
-            else:
-                is_answered = False
-            if not is_answered and not self._requests.put(waiting):
+            may_be_first = may_go_first(waiting.data)
+            looked_at += may_be_first
+            if not (may_be_first and self._is_answered_first(waiting, answer)) and not self._requests.put(waiting):
                 self._drop("control", waiting.peer, TOO_MUCH, 1)
             if looked_at == FIRST_AT_ONCE or time.monotonic_ns() >= until_ns:
                 return
@@ -212,9 +208,6 @@ class Endpoint:
 
     def close(self) -> None:
         """Closes the sockets without waiting for anybody."""
-        self._release()
-
-    def _release(self) -> None:
         self.admission.close()
         for file in self._files:
             file.close()
@@ -324,8 +317,7 @@ class Endpoint:
 
     def _require_permitted(self, request: Request, waiting: Waiting) -> None:
         is_observed = request.command in OBSERVED
-        roles = MAY["control"] if is_observed else OPERATOR
-        if waiting.public and not self.admission.has_role(waiting.public, roles):
+        if waiting.public and not self.admission.has_role(waiting.public, MAY["control"] if is_observed else OPERATOR):
             self._drop("control", waiting.peer, NOT_ALLOWED, 1)
             raise RefusedError(
                 "forbidden",

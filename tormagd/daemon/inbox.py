@@ -13,10 +13,11 @@ from tormagd.daemon.hold import Hold, is_passed
 from tormagd.daemon.rate_group import RecentHistogram
 from tormagd.daemon.sequence import Order, Sequence
 from tormagd.daemon.source_clock import AHEAD_S, SourceClock
+from tormagd.hardware.connection import clock_report
 from tormagd.hardware.link_statistics import WINDOW_S, ClockFit
 from tormagd.safety.codes import Explanation, Limit
 from tormagd.safety.operating_state import RefusedError
-from tormagd_client.messages import ClockReport, MessageError, Setpoint, SetpointReport, SourceReport, decode
+from tormagd_client.messages import MessageError, Setpoint, SetpointReport, SourceReport, decode
 
 SOURCES = 16
 "Publishers that are kept apart; another one is refused until an old one has been silent."
@@ -276,13 +277,9 @@ class SetpointInbox:
     def _source_report(self, name: str, now_s: float) -> SourceReport:
         source = self._sources[name]
         clock, sequence = source.clock, source.sequence
-        if name == self.hold.source:
-            state = "stale" if source.is_stale(now_s) else "holds"
-        else:
-            state = "stale" if source.is_stale(now_s) else "refused"
-        fit = source.fit
+        state = "holds" if name == self.hold.source else "refused"
         return SourceReport(
-            state=state,
+            state="stale" if source.is_stale(now_s) else state,
             silent_ms=round((now_s - source.heard_s) * 1e3, 1),
             session=sequence.session,
             seq=sequence.seq,
@@ -294,11 +291,7 @@ class SetpointInbox:
             jitter_us=round(clock.jitter_s * 1e6, 1),
             clock_behind_ms=round(clock.offset_s * 1e3, 3) if clock.is_settled else None,
             clock_steps=clock.steps,
-            clock=None
-            if fit is None
-            else ClockReport(
-                round(fit.offset_s, 6), round(fit.drift_ppm, 2), round(fit.residual_us, 1), fit.windows, fit.outliers
-            ),
+            clock=clock_report(source.fit),
             cause=source.cause,
             remedy=source.remedy,
         )

@@ -108,12 +108,13 @@ async def _run(
     keys: "KeyRing | None",
     read_again: "Callable[[], Config]",
 ) -> None:
-    from tormagd.daemon.black_box import BlackBox, black_box_folder, header
+    from tormagd.daemon.black_box import BlackBox, header
     from tormagd.daemon.daemon import Daemon
+    from tormagd.daemon.profiles import state_folder
     from tormagd.daemon.realtime import prepare
 
     # before this thread is a real-time one: the process that is started keeps off its processors
-    folder = black_box_folder(config.black_box.folder)
+    folder = state_folder(config.black_box.folder, "blackbox")
     box = BlackBox(folder, {} if folder is None else header(config, core), config.rates.control_hz)
     refused = prepare(config.realtime)
     await Daemon(config, core, open_backend, refused, keys, box, read_again).run()

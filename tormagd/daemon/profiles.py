@@ -22,15 +22,11 @@ from tormagd_client.messages import ProfileReport
 log = logging.getLogger(__name__)
 
 
-def profile_folder(configured: str) -> Path | None:
-    """The folder for profiles: the one that is configured, or else the service's; None where there is neither."""
-    return Path(configured) if configured else state_folder("profiles")
-
-
-def state_folder(name: str) -> Path | None:
-    """The folder of that name in which the service may keep things; None where it is no service."""
+def state_folder(configured: str, name: str) -> Path | None:
+    """The folder that is configured, or else the one of that name in which the service may keep things; None where
+    there is neither."""
     state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
-    return Path(state, name) if state else None
+    return Path(configured) if configured else Path(state, name) if state else None
 
 
 class ProfileFolder:
@@ -137,10 +133,10 @@ class Profiles:
 
     def report(self) -> ProfileReport:
         """Whether the device's profile is used, how old it is, and why not."""
-        age_s = None if self._saved_ns is None else max(0.0, (time.time_ns() - self._saved_ns) * 1e-9)
+        saved_ns = self._saved_ns
         return ProfileReport(
             is_used=self._is_used,
-            age_s=None if age_s is None else round(age_s, 1),
+            age_s=None if saved_ns is None else round(max(0.0, (time.time_ns() - saved_ns) * 1e-9), 1),
             refusal=self._refusal,
             folder="" if self._folder is None else str(self._folder.folder),
         )

@@ -1,7 +1,7 @@
 """What one control tick was: the record of all of it, and the snapshot that is published of the newest."""
 
 import time
-from functools import cache
+from functools import lru_cache
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.control.plan import Plan
@@ -63,8 +63,8 @@ def tick_record(
         None if measurement is None else measurement.handle_mm,
         None if measurement is None else measurement.force_N,
         None if measurement is None else _MODES[measurement.mode],
-        () if measurement is None else _switches(measurement.switches),
-        () if measurement is None else _device_faults(measurement.faults),
+        () if measurement is None else _names(measurement.switches),
+        () if measurement is None else _names(measurement.faults),
         None if measurement is None else measurement.temperature_C,
         None if measurement is None else measurement.left_current_A,
         None if measurement is None else measurement.right_current_A,
@@ -94,16 +94,8 @@ _MODES = {mode: mode.name for mode in DeviceMode}
 _DRIVE_MODES = {mode: mode.name for mode in DriveMode}
 
 
-@cache
-def _switches(bits: Switches) -> tuple[str, ...]:
-    return _names(bits)
-
-
-@cache
-def _device_faults(bits: DeviceFault) -> tuple[str, ...]:
-    return _names(bits)
-
-
+# a switch and a fault of the same bits are equal
+@lru_cache(maxsize=None, typed=True)
 def _names(bits: Switches | DeviceFault) -> tuple[str, ...]:
     return tuple(str(bit.name) for bit in type(bits) if bit in bits)
 

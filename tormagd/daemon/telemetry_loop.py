@@ -222,9 +222,7 @@ class TelemetryLoop:
             if self._status is None:
                 self._status = msgspec.to_builtins(self._build_status(self._newest))
             return self._status
-        if request.command == "describe":
-            return self._describe()
-        return self._command(request)
+        return self._describe() if request.command == "describe" else self._command(request)
 
     def _describe(self) -> dict[str, Any]:
         link = self._connection.report()

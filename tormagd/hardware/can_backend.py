@@ -229,14 +229,15 @@ DRIVER = Driver(CanOptions, open_can, check_can)
 
 def _of_the_interface(options: CanOptions) -> dict[str, Any]:
     """What makes an interface fit the loop. Interfaces not named here must not block in `recv(0)`."""
-    match options.interface:
-        case "socketcan":  # other nodes' frames need not wake us
-            return {"can_filters": [{"can_id": options.node, "can_mask": 0xF, "extended": False}]}
-        case "slcan":  # by default it sleeps for 2 s when it opens, and for 1 ms whenever it finds nothing to read
-            return {"tty_baudrate": options.baud, "sleep_after_open": 0.0, "timeout": 0.0}
-        case "udp_multicast":  # stays on this machine
-            return {"hop_limit": 0, "fd": False}
-    return {}
+    fitting = {
+        # other nodes' frames need not wake us
+        "socketcan": {"can_filters": [{"can_id": options.node, "can_mask": 0xF, "extended": False}]},
+        # by default it sleeps for 2 s when it opens, and for 1 ms whenever it finds nothing to read
+        "slcan": {"tty_baudrate": options.baud, "sleep_after_open": 0.0, "timeout": 0.0},
+        # stays on this machine
+        "udp_multicast": {"hop_limit": 0, "fd": False},
+    }
+    return fitting.get(options.interface, {})
 
 
 def _bring_up(port: str, options: CanOptions) -> str:

@@ -19,6 +19,7 @@ from tormagd.hardware.backend import Backend, BackendError, Received, Sent, Stre
 from tormagd.hardware.can_stream import CanStream
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.link import DeviceLink, LinkState
+from tormagd.hardware.link_statistics import ClockFit
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import DeviceRequest
 from tormagd_client.messages import ClockReport, LinkReport, RoundTripReport
@@ -220,6 +221,7 @@ class Connection:
         """State, cause and remedy, identity, counters of this opening of the port, round trip and clock."""
         link, backend = self._link, self._backend
         identity = None if link is None else link.identity
+        round_trip = None if link is None else link.round_trip.report()
         counted = {name: None if backend is None else getattr(backend.statistics, name) for name in COUNTERS}
         if link is not None and counted["repeated"] is not None:
             counted["repeated"] += link.repeated  # each repetition is counted by whoever drops it
@@ -237,8 +239,9 @@ class Connection:
             daemon_schema=f"{SCHEMA_HASH:08x}",
             protocol_version=PROTOCOL_VERSION,
             **counted,
-            round_trip_us=None if link is None else _round_trip(link),
-            clock=None if link is None else _clock(link),
+            round_trip_us=None if round_trip is None else RoundTripReport(**round_trip),
+            # a State has been on its way for about half of the shortest round trip
+            clock=None if link is None else clock_report(link.clock.fit(), link.round_trip.least_s / 2.0),
             unsent=None if backend is None else backend.statistics.unsent,
             refused={} if backend is None else dict(backend.statistics.refused),
             unanswered_share=None if link is None or link.measurement is None else round(link.quality.unanswered, 4),
@@ -342,18 +345,12 @@ def _refusals(refused: Mapping[str, str]) -> str:
     return ", ".join([f"{name}: {why}" for name, why in sorted(refused.items())])
 
 
-def _round_trip(link: DeviceLink) -> RoundTripReport | None:
-    known = link.round_trip.report()
-    return None if known is None else RoundTripReport(**known)
-
-
-def _clock(link: DeviceLink) -> ClockReport | None:
-    fit = link.clock.fit()
+def clock_report(fit: ClockFit | None, way_s: float = 0.0) -> ClockReport | None:
+    """The line through a clock for `status`; `way_s` is how long what was heard of it had been on its way."""
     if fit is None:
         return None
     return ClockReport(
-        # a State has been on its way for about half of the shortest round trip
-        offset_s=round(fit.offset_s - link.round_trip.least_s / 2.0, 6),
+        offset_s=round(fit.offset_s - way_s, 6),
         drift_ppm=round(fit.drift_ppm, 2),
         residual_us=round(fit.residual_us, 1),
         windows=fit.windows,

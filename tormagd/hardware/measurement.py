@@ -14,6 +14,10 @@ _LATCHED: Final = DeviceMode.LATCHED
 _BUSY: Final = (DeviceMode.HOMING, DeviceMode.RETRACTING)
 
 
+def _is_set(bits: int, place: int) -> bool:
+    return bits >> place & 1 != 0
+
+
 @final
 class Measurement(Value):
     """One device state. Carriage positions are mm from the home switches (closing is negative); times are in s.
@@ -69,20 +73,17 @@ class Measurement(Value):
     @property
     def is_homed(self) -> bool:
         """The device knows where its carriages are."""
-        switches: int = self.switches
-        return switches >> _HOMED & 1 != 0
+        return _is_set(self.switches, _HOMED)
 
     @property
     def is_left_open(self) -> bool:
         """The left carriage is at its open switch."""
-        switches: int = self.switches
-        return switches >> _LEFT_OPEN & 1 != 0
+        return _is_set(self.switches, _LEFT_OPEN)
 
     @property
     def is_right_open(self) -> bool:
         """The right carriage is at its open switch."""
-        switches: int = self.switches
-        return switches >> _RIGHT_OPEN & 1 != 0
+        return _is_set(self.switches, _RIGHT_OPEN)
 
     @property
     def is_busy(self) -> bool:

@@ -171,9 +171,7 @@ class Refusal(NamedTuple):
 
 
 def _not_connected(state: SafetyState, present: Conditions) -> str:
-    if present.connected:
-        return ""
-    return f"the device is not connected{_because(present)}"
+    return "" if present.connected else f"the device is not connected{_because(present)}"
 
 
 def _latched(state: SafetyState, present: Conditions) -> str:

@@ -3,7 +3,6 @@
 One bus: whoever has something to send waits until it is free, then the lowest identifier goes first.
 """
 
-from collections import deque
 from heapq import heappop, heappush
 from typing import NamedTuple, Protocol
 
@@ -64,7 +63,8 @@ class CanDevice:
             raise ValueError(f"bitrate = {bitrate}: allowed are numbers over 0")
         if not 0 <= node <= 15:
             raise ValueError(f"node = {node}: allowed are 0 to 15")
-        self._messages = messages
+        self.messages = messages
+        """The device itself."""
         self.lost = 0
         """Frames that found the queue full."""
         self.busy_s = 0.0
@@ -76,17 +76,12 @@ class CanDevice:
         self._flight: _Flight | None = None
         self._free_s = 0.0
         self._now_s = 0.0
-        self._delivered: deque[Delivery] = deque()
-
-    @property
-    def messages(self) -> MessageDevice:
-        """The device itself."""
-        return self._messages
+        self._delivered: list[Delivery] = []
 
     @property
     def truth(self) -> Truth:
         """What really is, at the time of the last call."""
-        return self._messages.truth
+        return self.messages.truth
 
     @property
     def next_event_s(self) -> float:
@@ -104,8 +99,7 @@ class CanDevice:
     def transmit(self, now_s: float) -> list[Delivery]:
         """The frames that have gone by since the last call, the hosts' own among them."""
         self.advance(now_s)
-        delivered = list(self._delivered)
-        self._delivered.clear()
+        delivered, self._delivered = self._delivered, []
         return delivered
 
     def advance(self, now_s: float) -> None:

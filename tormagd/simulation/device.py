@@ -48,6 +48,21 @@ JAMMED_N: Final = 1e5
 "More drag than any motor overcomes."
 MAX_BACKLOG_BYTES: Final = 65_536
 """What the serial buffers of both ends and the adapter between them hold; more is lost, as on a real port."""
+STANDING: Final = frozenset(
+    {
+        "worn_gearbox",
+        "motor_dead_left",
+        "overheated",
+        "end_stop_left",
+        "switch_stuck_left",
+        "other_schema",
+        "commands_vanish",
+        "state_crc",
+        "switch_dead_left",
+    }
+)
+"""Faults that are there or not, and are asked for where they show."""
+OF_BRIDGES: Final = frozenset({"motor_dead_left", "supply_loss", "motor_reversed_left", "duties_reversed"})
 LEFT_OPEN: Final = 1
 RIGHT_OPEN: Final = 2
 LEFT_CLOSED: Final = 4
@@ -100,23 +115,14 @@ class MessageDevice:
         "_boot_s",
         "_closed_m",
         "_counts_per_rad",
-        "_deaf",
         "_drives",
         "_duty_sign",
         "_faults",
         "_frozen_until_s",
         "_handle_counts_per_mm",
         "_has_bad_encoders",
-        "_has_hit_left",
-        "_has_other_schema",
         "_home_m",
         "_inbox",
-        "_is_hot",
-        "_is_left_motor_dead",
-        "_is_state_damaged",
-        "_is_switch_dead_left",
-        "_is_switch_stuck_left",
-        "_is_worn",
         "_jitter",
         "_jitter_s",
         "_left_boot_counts",
@@ -129,6 +135,7 @@ class MessageDevice:
         "_right_boot_counts",
         "_right_extra_counts",
         "_silent",
+        "_struck",
         "_stuck_handle",
         "_stuck_left",
         "_supply_V",
@@ -172,19 +179,12 @@ class MessageDevice:
         # when the first of each is due; infinite where there is none
         self._arrival_s = math.inf
         self._answer_s = math.inf
-        self._deaf = False
+        self._struck: set[str] = set()
+        """The faults by name that are there now, of those that nothing else shows."""
         self._output: Output = OFF
         self._stuck_left: int | None = None
         self._silent = 0
         """The functions that are not sent, a bit each."""
-        self._is_state_damaged = False
-        self._is_switch_dead_left = False
-        self._is_switch_stuck_left = False
-        self._has_hit_left = False
-        self._has_other_schema = False
-        self._is_left_motor_dead = False
-        self._is_hot = False
-        self._is_worn = False
         self._stuck_handle: int | None = None
         self._frozen_until_s = -math.inf
         self._answering_every = 1
@@ -259,7 +259,7 @@ class MessageDevice:
             left_V, right_V = self._volts(output.left_duty), self._volts(output.right_duty)
             if self._duty_sign < 0.0 and self.firmware.mode is DeviceMode.RUN:
                 left_V, right_V = -left_V, -right_V
-            self.plant.drive(None if self._is_left_motor_dead else self._left_motor_sign * left_V, right_V)
+            self.plant.drive(None if "motor_dead_left" in self._struck else self._left_motor_sign * left_V, right_V)
         else:
             self.plant.drive(None, None)
 
@@ -284,7 +284,7 @@ class MessageDevice:
             self._send(time_s, status)
 
     def _deliver(self, time_s: float, packet: Packet) -> None:
-        if self._deaf or time_s < self._frozen_until_s:
+        if "commands_vanish" in self._struck or time_s < self._frozen_until_s:
             return
         try:
             message = decode(packet.function, packet.payload)
@@ -308,7 +308,7 @@ class MessageDevice:
     def _send_answer(self, time_s: float, answer: Answer) -> None:
         if answer is IDENTITY:
             known = self.firmware.identity()
-            if self._has_other_schema:
+            if "other_schema" in self._struck:
                 known = Identity(known.schema_hash ^ 1, known.firmware_major, known.firmware_minor, known.serial_number)
             self._send(time_s, known)
             return
@@ -320,17 +320,17 @@ class MessageDevice:
         function, payload = FUNCTION[type(message)], encode(message)
         if self._silent and self._silent >> function & 1:
             return
-        if self._is_state_damaged and isinstance(message, State):
+        if "state_crc" in self._struck and isinstance(message, State):
             payload = payload[:-1] + bytes((payload[-1] ^ 0xFF,))
         self.outbox.append(Packet(time_s, function, payload))
 
     def _sensors(self) -> Sensors:
-        plant = self.plant
+        plant, struck = self.plant, self._struck
         left_m, right_m = plant.left.position_m, plant.right.position_m
         switches = 0
-        if (left_m >= self._home_m and not self._is_switch_dead_left) or self._is_switch_stuck_left:
+        if (left_m >= self._home_m and "switch_dead_left" not in struck) or "switch_stuck_left" in struck:
             switches = LEFT_OPEN
-        elif left_m <= self._closed_m or self._has_hit_left:
+        elif left_m <= self._closed_m or "end_stop_left" in struck:
             switches = LEFT_CLOSED
         if right_m >= self._home_m:
             switches += RIGHT_OPEN
@@ -347,7 +347,7 @@ class MessageDevice:
             self._handle_counts() if self._stuck_handle is None else self._stuck_handle,
             END_SWITCHES[switches],
             self._supply_V,
-            HOT_C if self._is_hot else plant.element.temperature_C,
+            HOT_C if "overheated" in struck else plant.element.temperature_C,
         )
 
     def _handle_counts(self) -> int:
@@ -388,16 +388,14 @@ class MessageDevice:
         What came of it stays: a firmware that was reset, counts that an encoder gained or missed, what was latched.
         """
         plant, parameters, time_s = self.plant, self.parameters, self._time_s
-        if self._is_worn:
-            self._is_worn = False
+        if "worn_gearbox" in self._struck:
             plant.wear(1.0 / WEAR)
         plant.left.drag_N, plant.right.drag_N = parameters.screw.drag_left_N, parameters.screw.drag_right_N
         for axis in (plant.left, plant.right):
             axis.backlash_m = 0.5e-6 * parameters.screw.backlash_um
         self._supply_V = parameters.electronics.supply_V
         self._silent = 0
-        self._deaf = self._is_hot = self._has_hit_left = self._has_other_schema = self._is_state_damaged = False
-        self._is_left_motor_dead = self._is_switch_dead_left = self._is_switch_stuck_left = False
+        self._struck.clear()
         self._stuck_handle = None
         self._answering_every = 1
         self._left_motor_sign = self._duty_sign = 1.0
@@ -407,9 +405,10 @@ class MessageDevice:
         self._switch()
 
     def _strike(self, time_s: float, fault: Fault) -> None:
+        if fault.name in STANDING:
+            self._struck.add(fault.name)
         match fault.name:
             case "worn_gearbox":
-                self._is_worn = True
                 self.plant.wear(WEAR)
             case "drag_left":
                 self.plant.left.drag_N *= 1.0 + fault.percent / 100.0
@@ -420,38 +419,22 @@ class MessageDevice:
             case "backlash":
                 self.plant.left.backlash_m *= 1.0 + fault.percent / 100.0
                 self.plant.right.backlash_m *= 1.0 + fault.percent / 100.0
-            case "motor_dead_left":
-                self._is_left_motor_dead = True
-                self._switch()
-            case "overheated":
-                self._is_hot = True
-            case "end_stop_left":
-                self._has_hit_left = True
-            case "switch_stuck_left":
-                self._is_switch_stuck_left = True
             case "no_handle":
                 self._stuck_handle = self._handle_counts()
             case "frozen":
                 self._frozen_until_s = time_s + WATCHDOG_S
                 self._answers.clear()
                 self._answer_s = math.inf
-            case "other_schema":
-                self._has_other_schema = True
             case "encoder_stuck_left":
                 (left_rad, _), (right_rad, _) = self.plant.shafts
                 self._stuck_left, _ = self._encoders(left_rad, right_rad)
             case "reset":
                 self._reset(time_s)
-            case "commands_vanish":
-                self._deaf = True
             case "supply_loss":
                 self._supply_V = 0.0
-                self._switch()
             case "no_state" | "no_sense" | "no_status":
                 kinds: dict[str, type[Message]] = {"no_state": State, "no_sense": Sense, "no_status": Status}
                 self._silent |= 1 << FUNCTION[kinds[fault.name]]
-            case "state_crc":
-                self._is_state_damaged = True
             case "answers_half":
                 self._answering_every = 2
             case "encoder_jump" | "encoder_jump_left":
@@ -465,17 +448,14 @@ class MessageDevice:
                 self._count_on(None, -self._left_count_sign)
             case "motor_reversed_left":
                 self._left_motor_sign = -1.0
-                self._switch()
             case "duties_reversed":
                 self._duty_sign = -1.0
-                self._switch()
-            case "switch_dead_left":
-                self._is_switch_dead_left = True
             case "clock":
-                rate = self._rate * (1.0 + fault.percent / 100.0)
-                self._run_clock_at(time_s, rate)
-            case _:
+                self._run_clock_at(time_s, self._rate * (1.0 + fault.percent / 100.0))
+            case _ if fault.name not in STANDING:
                 raise ValueError(f"fault {fault.name!r} has no effect defined")
+        if fault.name in OF_BRIDGES:
+            self._switch()
 
     def _run_clock_at(self, time_s: float, rate: float) -> None:
         """The clock goes on from where it is."""

@@ -3,6 +3,7 @@
 import bisect
 import csv
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Protocol, final
 
@@ -87,15 +88,20 @@ class RecordedHand(Value):
         return start_mm + (end_mm - start_mm) * (time_s - start_s) / (end_s - start_s)
 
 
+_SIZED: dict[str, tuple[Callable[..., Hand], float, float]] = {
+    "steady": (SteadyHand, -300.0, 300.0),
+    "reversing": (ReversingHand, 0.1, 1000.0),
+    "pressing": (PressingHand, 0.1, 6.0),
+}
+"By its name, a hand that has a size, and what that may be."
+
+
 def parse_hand(spec: str) -> Hand:
     """The hand that a command-line word stands for. Raises HandError naming what is allowed."""
     name, _, value = spec.partition("=")
-    if name == "steady":
-        return SteadyHand(_number(spec, value, -300.0, 300.0) if value else DEFAULT_RPM)
-    if name == "reversing":
-        return ReversingHand(_number(spec, value, 0.1, 1000.0) if value else DEFAULT_PERIOD_S)
-    if name == "pressing":
-        return PressingHand(_number(spec, value, 0.1, 6.0) if value else DEFAULT_DEPTH_MM)
+    if name in _SIZED:
+        hand, low, high = _SIZED[name]
+        return hand(_number(spec, value, low, high)) if value else hand()
     if spec.endswith(".csv"):
         return read_recording(Path(spec))
     raise HandError(f"hand {spec!r}: allowed are {KNOWN}")

@@ -113,7 +113,7 @@ class Retraction:
     With a valid zero the speed tapers towards the open end; without one the search for the switch is slow throughout.
     """
 
-    __slots__ = ("_deadline_s", "_left", "_right", "_speed_mm_s", "_tapered")
+    __slots__ = ("_deadline_s", "_openings", "_speed_mm_s", "_tapered")
 
     def __init__(
         self,
@@ -128,34 +128,31 @@ class Retraction:
         self._deadline_s = time_s + TIME_LIMIT_S
         self._speed_mm_s = speed_mm_s
         self._tapered = tapered
-        left, right = carriages
-        self._left = Opening(time_s, left, lead_mm_rev, stall_A)
-        self._right = Opening(time_s, right, lead_mm_rev, stall_A)
+        self._openings = [Opening(time_s, carriage, lead_mm_rev, stall_A) for carriage in carriages]
 
     @property
     def duties(self) -> tuple[float, float]:
         """Left and right duty."""
-        return self._left.duty, self._right.duty
+        left, right = self._openings
+        return left.duty, right.duty
 
     @property
     def blocked(self) -> bool:
         """Whether a carriage has been given up; its screw springs back from the stall."""
-        return self._left.outcome is Outcome.FAILED or self._right.outcome is Outcome.FAILED
+        return Outcome.FAILED in [opening.outcome for opening in self._openings]
 
     def is_reversed(self, carriages: tuple[Carriage, Carriage]) -> bool:
         """Whether a carriage has gone back towards closed."""
-        left, right = carriages
-        return self._left.went_back(left) or self._right.went_back(right)
+        return True in [opening.went_back(each) for opening, each in zip(self._openings, carriages, strict=True)]
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
         """One tick; FAILED when a carriage could not be brought to its switch and neither moves any more."""
-        left, right = carriages
-        self._left.step(time_s, dt_s, left, self._bounded_mm_s(left))
-        self._right.step(time_s, dt_s, right, self._bounded_mm_s(right))
-        outcomes = (self._left.outcome, self._right.outcome)
+        for opening, carriage in zip(self._openings, carriages, strict=True):
+            opening.step(time_s, dt_s, carriage, self._bounded_mm_s(carriage))
+        outcomes = [opening.outcome for opening in self._openings]
         if time_s < self._deadline_s and Outcome.MOVING in outcomes:
             return Outcome.MOVING
-        return Outcome.DONE if outcomes == (Outcome.DONE, Outcome.DONE) else Outcome.FAILED
+        return Outcome.DONE if outcomes == [Outcome.DONE, Outcome.DONE] else Outcome.FAILED
 
     def _bounded_mm_s(self, carriage: Carriage) -> float:
         if not self._tapered:
@@ -174,11 +171,10 @@ class Homing:
         "_back_off_since_s",
         "_backed_off",
         "_deadline_s",
+        "_edges_mm",
         "_lead_mm_rev",
-        "_left_edge_mm",
         "_ramps",
         "_reversed_s",
-        "_right_edge_mm",
         "_search",
         "_speed_mm_s",
         "_stall_A",
@@ -199,20 +195,18 @@ class Homing:
         self._lead_mm_rev = lead_mm_rev
         self._stall_A = stall_A
         self._speed_mm_s = speed_mm_s
-        self._ramps = _ramps(carriages, lead_mm_rev)
-        self._starts_mm = _positions_mm(carriages)
-        self._back_off_since_s = time_s
+        self._begin_back_off(time_s, carriages)
         self._backed_off = False
         self._reversed_s: float | None = None
-        self._left_edge_mm: float | None = None
-        self._right_edge_mm: float | None = None
+        self._edges_mm: list[float | None] = [None, None]
         self.duties = (0.0, 0.0)
         self._search: Retraction | None = self._outward(time_s, carriages, speed_mm_s)
 
     @property
     def zeros_mm(self) -> tuple[float, float]:
         """Encoder positions at which the open switches closed; 0 for one that was not found."""
-        return self._left_edge_mm or 0.0, self._right_edge_mm or 0.0
+        left_mm, right_mm = self._edges_mm
+        return left_mm or 0.0, right_mm or 0.0
 
     def step(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
         """One tick: outward, back off, creep outward. REVERSED when a carriage has gone back, and was braked."""
@@ -226,29 +220,27 @@ class Homing:
             self.duties = (0.0, 0.0)
             return Outcome.REVERSED if time_s - self._reversed_s >= SETTLE_S else Outcome.MOVING
         if self._backed_off:
-            left, right = carriages
-            if left.at_open_end and self._left_edge_mm is None:
-                self._left_edge_mm = left.position_mm
-            if right.at_open_end and self._right_edge_mm is None:
-                self._right_edge_mm = right.position_mm
+            for side, carriage in enumerate(carriages):
+                if carriage.at_open_end and self._edges_mm[side] is None:
+                    self._edges_mm[side] = carriage.position_mm
         outcome = self._search.step(time_s, dt_s, carriages)
         self.duties = self._search.duties
         if outcome is not Outcome.DONE or self._backed_off:
             return outcome
         self._search = None
-        self._back_off_since_s = time_s
-        self._starts_mm = _positions_mm(carriages)
-        self._ramps = _ramps(carriages, self._lead_mm_rev)
+        self._begin_back_off(time_s, carriages)
         return Outcome.MOVING
+
+    def _begin_back_off(self, time_s: float, carriages: tuple[Carriage, Carriage]) -> None:
+        self._back_off_since_s = time_s
+        self._starts_mm = [carriage.position_mm for carriage in carriages]
+        self._ramps = [Ramp(carriage.position_mm, self._lead_mm_rev) for carriage in carriages]
 
     def _back_off(self, time_s: float, dt_s: float, carriages: tuple[Carriage, Carriage]) -> Outcome:
         if time_s - self._back_off_since_s > BACK_OFF_LIMIT_S:
             return Outcome.FAILED
-        left, right = carriages
-        left_ramp, right_ramp = self._ramps
-        left_start_mm, right_start_mm = self._starts_mm
-        left_duty = self._inward_duty(left, left_ramp, left_start_mm, dt_s)
-        right_duty = self._inward_duty(right, right_ramp, right_start_mm, dt_s)
+        sides = zip(carriages, self._ramps, self._starts_mm, strict=True)
+        left_duty, right_duty = [self._inward_duty(carriage, ramp, mm, dt_s) for carriage, ramp, mm in sides]
         self.duties = left_duty, right_duty
         if left_duty == 0.0 and right_duty == 0.0:
             self._backed_off = True
@@ -268,13 +260,3 @@ class Homing:
             speed_mm_s=speed_mm_s,
             tapered=False,
         )
-
-
-def _positions_mm(carriages: tuple[Carriage, Carriage]) -> tuple[float, float]:
-    left, right = carriages
-    return left.position_mm, right.position_mm
-
-
-def _ramps(carriages: tuple[Carriage, Carriage], lead_mm_rev: float) -> tuple[Ramp, Ramp]:
-    left, right = carriages
-    return Ramp(left.position_mm, lead_mm_rev), Ramp(right.position_mm, lead_mm_rev)

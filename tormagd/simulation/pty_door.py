@@ -26,16 +26,16 @@ class Pty:
         self._ours, self._theirs = os.openpty()
         tty.setraw(self._theirs)
         os.set_blocking(self._ours, False)
-        self.path = os.ttyname(self._theirs)
+        self.address = os.ttyname(self._theirs)
 
     def close(self) -> None:
         """Take the line away."""
         os.close(self._ours)
         os.close(self._theirs)
 
-    def fileno(self) -> int:
+    def descriptors(self) -> Sequence[int]:
         """The device's end."""
-        return self._ours
+        return (self._ours,)
 
     def read(self) -> bytes:
         """What the host has written; call it when there is something."""
@@ -52,25 +52,16 @@ class Pty:
             termios.tcflush(self._theirs, termios.TCIFLUSH)
 
 
-class PtyDoor:
+class PtyDoor(Pty):
     """One device on a serial line."""
 
     def __init__(self, device: VirtualDevice) -> None:
+        super().__init__()
         self._device = device
-        self._pty = Pty()
-        self.address = self._pty.path
-
-    def descriptors(self) -> Sequence[int]:
-        """The line's device end."""
-        return (self._pty.fileno(),)
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
         """Bytes in, bytes out."""
         if readable:
-            self._device.receive(now_s, self._pty.read())
+            self._device.receive(now_s, self.read())
         if out := self._device.transmit(now_s):
-            self._pty.write(out)
-
-    def close(self) -> None:
-        """Take the line away."""
-        self._pty.close()
+            self.write(out)

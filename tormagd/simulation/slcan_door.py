@@ -17,9 +17,8 @@ REFUSED = b"\a"
 SENT = b"z\r"
 LONGEST_COMMAND = 32
 """The longest there is, a 29-bit frame of 8 bytes, has 26 characters."""
-VERSION = b"V1013\r"
-SERIAL_NUMBER = b"NSIM1\r"
-STATUS_FLAGS = b"F00\r"
+TOLD = {b"V": b"V1013\r", b"N": b"NSIM1\r", b"F": b"F00\r"}
+"""Version, serial number and status flags."""
 _FRAME = re.compile(rb"t([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 
 
@@ -38,13 +37,12 @@ class SlcanAdapter:
         self._pending = rest[: LONGEST_COMMAND + 1]
         answers, frames = b"", []
         for command in commands:
-            if command[:1] == b"t" and self.is_open:
-                frame = _frame(command)
-                answers += SENT if frame else REFUSED
-                if frame:
-                    frames.append(frame)
-            else:
+            frame = _frame(command) if self.is_open else None
+            if frame is None:
                 answers += self._answer(command)
+            else:
+                answers += SENT
+                frames.append(frame)
         return answers, frames
 
     def line(self, frame: CanFrame) -> bytes:
@@ -63,52 +61,34 @@ class SlcanAdapter:
                 return OK
             case b"S" if not self.is_open and command[1:] in {b"%d" % number for number in range(9)}:
                 return OK  # accepted and without effect: the simulated bus has its own bit rate
-            case b"V":
-                return VERSION
-            case b"N":
-                return SERIAL_NUMBER
-            case b"F":
-                return STATUS_FLAGS
-        return REFUSED
+        return TOLD.get(command[:1], REFUSED)
 
 
-class SlcanDoor:
+class SlcanDoor(Pty):
     """One device behind such an adapter."""
 
     def __init__(self, device: CanDevice) -> None:
+        super().__init__()
         self._device = device
         self._adapter = SlcanAdapter()
-        self._pty = Pty()
-        self.address = self._pty.path
-
-    def descriptors(self) -> Sequence[int]:
-        """The line's device end."""
-        return (self._pty.fileno(),)
 
     def exchange(self, now_s: float, readable: Sequence[int]) -> None:
         """Characters in, characters out."""
         out = b""
         if readable:
-            out, frames = self._adapter.feed(self._pty.read())
+            out, frames = self._adapter.feed(self.read())
             for frame in frames:
                 self._device.receive(now_s, frame)
         for sender, frame in self._device.transmit(now_s):
             if sender == DEVICE and self._adapter.is_open:
                 out += self._adapter.line(frame)
         if out:
-            self._pty.write(out)
-
-    def close(self) -> None:
-        """Take the line away."""
-        self._pty.close()
+            self.write(out)
 
 
 def _frame(command: bytes) -> CanFrame | None:
     """The frame in `tiiildd..`: identifier, length and data in hexadecimal."""
     match = _FRAME.fullmatch(command)
-    if match is None:
+    if match is None or len(match[3]) != 2 * int(match[2]):
         return None
-    identifier, length, data = (text.decode() for text in match.groups())
-    if len(data) != 2 * int(length):
-        return None
-    return CanFrame(int(identifier, 16), bytes.fromhex(data))
+    return CanFrame(int(match[1], 16), bytes.fromhex(match[3].decode()))

@@ -5,7 +5,6 @@ They are formulas over arrays, asked once, when a device is made; what a tick ne
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,20 +19,6 @@ GRID_MM = 2e-3
 MOMENT_POINTS = 20_000
 JOIN_MM = 10.0
 """Width over which Eq. 7 goes over into the power law beyond 95 mm."""
-
-
-class Holding(NamedTuple):
-    """Whether a carriage stays where it is with the power off; torques at the screw, the guide's drag not counted."""
-
-    gap_mm: float
-    attraction_N: float
-    back_driving_Nm: float
-    friction_Nm: float
-
-    @property
-    def margin_Nm(self) -> float:
-        """Friction left over, N m; below 0 the magnets close the gap."""
-        return self.friction_Nm - self.back_driving_Nm
 
 
 def radial_moment_Tm(gap_mm: FloatArray, plant: PlantParameters) -> FloatArray:
@@ -92,20 +77,3 @@ def _over_gap(law: Callable[[FloatArray], FloatArray], plant: PlantParameters) -
 def _tabulated(law: Callable[[FloatArray], FloatArray], start: float, end: float, points: int) -> Curve:
     values: list[float] = law(np.linspace(start, end, points)).tolist()
     return Curve(values, start, end)
-
-
-def holding_over_stroke(plant: PlantParameters, points: int = 51, wear: float = 1.0) -> list[Holding]:
-    """Attraction, back-driving torque and holding friction from the smallest to the largest gap of the stroke.
-
-    `wear` divides the friction of gearbox and screw, as the fault `worn_gearbox` does with 4.
-    """
-    start_mm, end_mm = 2.0 * plant.assumed.closed_mm, 2.0 * plant.assumed.home_mm
-    lead_m_rad = plant.screw.lead_mm * 1e-3 / math.tau
-    friction_m = plant.screw.friction_coefficient * 0.5e-3 * plant.assumed.screw_mean_diameter_mm
-    rows = []
-    for index in range(points):
-        gap_mm = start_mm + (end_mm - start_mm) * index / (points - 1)
-        pull_N = pull_of_magnets_N(gap_mm, plant)
-        friction_Nm = (plant.gear.output_friction_Nm + friction_m * pull_N) / wear
-        rows.append(Holding(gap_mm, pull_N, pull_N * lead_m_rad, friction_Nm))
-    return rows
