@@ -73,7 +73,7 @@ class Rate(msgspec.Struct, frozen=True):
     change: str
 
 
-def measure(path: Path | None, machine: Machine) -> Headroom:
+def measured(path: Path | None, machine: Machine) -> Headroom:
     """Measures for the configuration in `path`. Raises CommandError where that cannot be done."""
     command = [sys.executable, "-P", "-m", "tormagd.headroom", *(["--config", str(path)] if path else [])]
     before, started_s = machine.taken(), time.monotonic()

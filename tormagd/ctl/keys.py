@@ -11,6 +11,11 @@ from tormagd.keys import PUBLIC, SERVER, fingerprint, generate, load_folder, loa
 HINT = "tormagctl keys generate --help; the guide has the whole exchange"
 
 
+def keys(action: str, path: Path, client: str | None, **clients: Sequence[str]) -> Outcome:
+    """Makes them, of `clients` by role, or shows the fingerprints of those that are there."""
+    return show_keys(path) if action == "show" else generate_keys(path, clients, client)
+
+
 def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: str | None) -> Outcome:
     """Make the daemon's pair where there is none, and a pair for each of `clients`, by role; or one `client`'s alone.
 

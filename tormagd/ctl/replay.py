@@ -23,13 +23,13 @@ def replay(
     settings: Sequence[str],
     plant: str,
     faults: Sequence[str],
-    config: Path | None,
+    config_file: Path | None,
 ) -> Outcome:
     """Runs the file. An outcome that is not bit-exact has the exit code REFUSED. Raises CommandError (USAGE) where file
     or options cannot be used."""
     command = [sys.executable, "-P", "-m", "tormagd.replay", f"--from={from_s!r}", f"--plant={plant}"]
     command += [f"--set={setting}" for setting in settings] + [f"--fault={fault}" for fault in faults]
-    command += [f"--config={config}"] if config else []
+    command += [f"--config={config_file}"] if config_file else []
     try:
         done = subprocess.run(
             [*command, "--", str(path)], capture_output=True, text=True, timeout=LONGEST_S, check=False

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from tormagd.config import ConfigError
+from tormagd.config import Config, ConfigError
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.scenes.measured import Measured, MeasuredScene, is_met, measured, on_first, required
 from tormagd.scenes.scene import Scene, load_scene, shipped_scenes
@@ -16,6 +16,25 @@ LONGEST_S = 30.0
 "Of the daemon's own check, which takes half a second."
 TOLERANCES = (0.5, 1.0, 2.0)
 "Times the scene's own, for which the terms are stated."
+
+
+def scene(action: str, name: str | None, force: Path | None, config: Config, config_file: Path | None) -> Outcome:
+    """One of the five; without a name, of the configuration's scene."""
+    named = name or config.scene
+    match action:
+        case "list":
+            return list_scenes()
+        case "show":
+            return show_scene(named)
+        case "check":
+            return check_scene(named, config_file)
+        case "explain":
+            return explain_scene(named, config_file)
+    if name is None:
+        raise usage_error("scene new: the file to write is missing", "tormagctl scene new FILE.toml")
+    from tormagd.ctl.scene_new import new_scene
+
+    return new_scene(Path(name), force, config_file)
 
 
 def list_scenes() -> Outcome:
