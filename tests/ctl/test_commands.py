@@ -10,7 +10,7 @@ import pytest
 
 from firmware_protocol.build import COST, REMEDY
 from tormagd.ctl.main import main
-from tormagd.ctl.operate import DONE_STATES
+from tormagd.ctl.operate import DONE
 from tormagd.ctl.outcome import Colour
 from tormagd.ctl.status import status_text
 from tormagd.messages import Status
@@ -90,7 +90,7 @@ def test_status_in_fault_exits_4_and_names_cause_and_remedy(fake_daemon, capsys)
 
 @pytest.mark.parametrize("command", ["enable", "disable", "pause", "resume", "stop", "clear-fault"])
 def test_a_command_reaches_the_daemon_under_its_name(fake_daemon, capsys, command):
-    done = {"operating_state": DONE_STATES[command][0]}
+    done = {"operating_state": DONE[command][1][0]}
     fake_daemon.answers[command] = lambda: {"ok": True, "result": done}
     code, printed = run_json(capsys, "--endpoint", fake_daemon.control, command)
     assert (code, printed["command"], printed["result"]) == (0, command, done)
@@ -327,7 +327,7 @@ def test_a_decision_is_explained_with_what_was_measured(tmp_path, capsys):
     code, printed = run_json(capsys, "scene", "explain", str(other))
     assert code == 1
     assert printed["error"]["code"] == "not_measured"
-    assert "required_terms.py" in printed["error"]["hint"]
+    assert "docs/guides/scene.md" in printed["error"]["hint"]
 
 
 @pytest.mark.parametrize(("link", "is_shown"), [("RUNNING", True), ("BACK_OFF", False), ("REFUSED", False)])

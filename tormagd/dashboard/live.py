@@ -11,8 +11,8 @@ import msgspec
 
 from tormagd.client.aio import AsyncClient
 from tormagd.client.errors import ClientError
-from tormagd.dashboard.frame import Explanation, Frame, Held, late_counts
-from tormagd.messages import Description, MessageError, Status, Telemetry
+from tormagd.dashboard.frame import Frame, Held, late_counts
+from tormagd.messages import Description, Explained, MessageError, Status, Telemetry
 from tormagd.output import printable
 
 FRAME_S = 0.1
@@ -34,7 +34,7 @@ class Live:
         self._kept: deque[Telemetry] = deque(maxlen=KEPT)
         self._new: list[Telemetry] = []
         self.browsers: set[asyncio.Queue[bytes]] = set()
-        self._explained: dict[str, Explanation] = {}
+        self._explained: dict[str, Explained] = {}
         self._heard_s = time.monotonic()
         self._why_silent = ""
         self._portrait = _portrait(description)
@@ -116,7 +116,7 @@ class Live:
 
     def _learn(self, status: Status) -> None:
         for each in (*status.fault_details, *status.limit_details):
-            self._explained[each.code] = Explanation(each.cause, each.remedy)
+            self._explained[each.code] = each
 
     def _shown_status(self) -> dict[str, object]:
         return {"status": self._status, "explained": self._explained}
