@@ -102,7 +102,9 @@ class Endpoints(Strict, frozen=True):
 
     def is_guarded(self, name: str) -> bool:
         """Whether the daemon lets in only whom it has the key of."""
-        return not _is_local(getattr(self, name)) or (self.curve is not None and self.curve.also_local)
+        matched = _TCP.fullmatch(getattr(self, name))
+        is_remote = matched is not None and not _is_loopback(matched[1])
+        return is_remote or (self.curve is not None and self.curve.also_local)
 
 
 class Sources(Strict, frozen=True):
@@ -260,36 +262,39 @@ class Config(Strict, frozen=True):
 
     def __post_init__(self) -> None:
         rates, device, limits = self.rates, self.device, self.limits
-        _order(
-            rates.inference_hz <= rates.control_hz,
-            "rates.inference_hz",
-            rates.inference_hz,
-            f"at most rates.control_hz = {rates.control_hz}",
-        )
-        _order(
-            rates.control_hz % rates.telemetry_hz == 0,
-            "rates.telemetry_hz",
-            rates.telemetry_hz,
-            f"a divisor of rates.control_hz = {rates.control_hz}",
-        )
-        _order(
-            device.command_timeout_ms < self.realtime.watchdog_ms,
-            "device.command_timeout_ms",
-            device.command_timeout_ms,
-            f"under realtime.watchdog_ms = {self.realtime.watchdog_ms:g}: the device must act before systemd does",
-        )
-        _order(
-            device.measurement_timeout_ms <= device.command_timeout_ms,
-            "device.measurement_timeout_ms",
-            device.measurement_timeout_ms,
-            f"at most device.command_timeout_ms = {device.command_timeout_ms:g}",
-        )
-        _order(
-            limits.skew_warning_mm <= limits.skew_fault_mm,
-            "limits.skew_warning_mm",
-            limits.skew_warning_mm,
-            f"at most limits.skew_fault_mm = {limits.skew_fault_mm:g}",
-        )
+        for key, value, is_right, allowed in (
+            (
+                "rates.inference_hz",
+                rates.inference_hz,
+                rates.inference_hz <= rates.control_hz,
+                f"at most rates.control_hz = {rates.control_hz}",
+            ),
+            (
+                "rates.telemetry_hz",
+                rates.telemetry_hz,
+                rates.control_hz % rates.telemetry_hz == 0,
+                f"a divisor of rates.control_hz = {rates.control_hz}",
+            ),
+            (
+                "device.command_timeout_ms",
+                device.command_timeout_ms,
+                device.command_timeout_ms < self.realtime.watchdog_ms,
+                f"under realtime.watchdog_ms = {self.realtime.watchdog_ms:g}: the device must act before systemd does",
+            ),
+            (
+                "device.measurement_timeout_ms",
+                device.measurement_timeout_ms,
+                device.measurement_timeout_ms <= device.command_timeout_ms,
+                f"at most device.command_timeout_ms = {device.command_timeout_ms:g}",
+            ),
+            (
+                "limits.skew_warning_mm",
+                limits.skew_warning_mm,
+                limits.skew_warning_mm <= limits.skew_fault_mm,
+                f"at most limits.skew_fault_mm = {limits.skew_fault_mm:g}",
+            ),
+        ):
+            _order(is_right, key, value, allowed)
         taken: dict[str, str] = {}
         curve = self.endpoints.curve
         has_keys = curve is not None and bool(curve.server_secret or curve.client_secret)
@@ -339,11 +344,6 @@ def _tcp_place(name: str, address: str, has_keys: bool) -> str:
         else "ipc:// or a loopback tcp:// address with a port of 1..65535; others need CURVE keys in [endpoints.curve]",
     )
     return f"{'127.0.0.1' if host == 'localhost' else host}:{int(port)}"
-
-
-def _is_local(address: str) -> bool:
-    matched = _TCP.fullmatch(address)
-    return matched is None or _is_loopback(matched[1])
 
 
 def _is_loopback(host: str) -> bool:

@@ -238,7 +238,7 @@ def test_a_time_constant_belongs_to_the_nearest_of_its_terms() -> None:
 def test_terms_that_nobody_measured_are_not_known_to_be_required(write) -> None:
     refused = refusal(write(terms='"required"', force__most_N="1.9"))
     assert "was not measured as it is now" in refused
-    assert "required_terms.py" in refused
+    assert "docs/guides/scene.md" in refused
 
 
 def test_a_daemon_may_run_at_the_rates_of_its_scene(write) -> None:

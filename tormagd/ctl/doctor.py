@@ -302,7 +302,7 @@ def port_holder(config: Config, machine: Machine) -> Finding:
     """Whether another process has the port. tormagd itself is meant to."""
     name = config.device.port
     target = machine.resolved(name)
-    others = machine.holders(target) if name.startswith("/") else []
+    others = machine.holders([target])[0][target] if name.startswith("/") else []
     if target.startswith("/dev/pts/"):  # whoever made a pseudo-terminal has it open as well
         locking = machine.lock_owners(target)
         others = [(pid, comm) for pid, comm in others if pid in locking]

@@ -81,7 +81,7 @@ def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: It
     configured = machine.resolved(config.device.port) if _is_line(config) else ""
     if configured and machine.path(configured).exists():
         known.setdefault(configured, None)
-    holding, hidden = machine.all_holders(list(known))
+    holding, hidden = machine.holders(list(known))
     channels = [(str(entry["interface"]), str(entry["channel"])) for entry in detected]
     own = (str(config.device.options.get("interface")), config.device.port) if config.device.backend == "can" else None
     if own is not None and own not in channels:
