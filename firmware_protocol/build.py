@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 SWITCH = "TORMAG_COMPILED"
 _HERE = Path(__file__).parent
-REMEDY = "install it again (pip install, or make compile) where a C compiler and Python's headers are"
+REMEDY = "install it again with pip where a C compiler and Python's headers are"
 COST = "a tick takes about five times as long as compiled"
 "What an interpreted core costs: the results are the same."
 

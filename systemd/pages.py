@@ -8,8 +8,9 @@ from pathlib import Path
 from argparse_manpage.manpage import Manpage
 
 from tormagd import __version__
-from tormagd.ctl.completion import completion
-from tormagd.ctl.main import SHELLS, parser as ctl
+from tormagd.ctl.commands import SHELLS
+from tormagd.ctl.completion import script
+from tormagd.ctl.main import parser as ctl
 from tormagd.daemon.main import parser as daemon
 
 
@@ -26,7 +27,7 @@ def main(share: Path) -> None:
     for shell, path in zip(
         SHELLS, ("bash-completion/completions/tormagctl", "zsh/site-functions/_tormagctl"), strict=True
     ):
-        (share / path).write_text(completion(ctl(), shell), encoding="utf-8")
+        (share / path).write_text(script(ctl(), shell), encoding="utf-8")
     for parser in (daemon(), ctl()):
         (share / "man/man1" / f"{parser.prog}.1.gz").write_bytes(page(parser))
 

@@ -250,9 +250,7 @@ class Config(Strict, frozen=True):
 
 def load_config(path: Path | None) -> Config:
     """The configuration in `path`, or the defaults. Raises ConfigError."""
-    if path is None:
-        return Config()
-    return convert(path, Config)
+    return Config() if path is None else convert(path, Config)
 
 
 def convert(path: Path, kind: type[T]) -> T:

@@ -10,7 +10,7 @@ import pytest
 
 from firmware_protocol.build import COST, REMEDY
 from tormagd.ctl.main import main
-from tormagd.ctl.operate import DONE_STATES
+from tormagd.ctl.operate import DONE
 from tormagd.ctl.outcome import Colour
 from tormagd.ctl.status import status_text
 from tormagd.scenes.scene import TERMS, scene_path
@@ -25,18 +25,78 @@ def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, 
     return code, printed
 
 
+SUPPLY = {"code": "SUPPLY", "cause": "supply voltage low", "remedy": "check the power supply"}
+IN_FAULT = {"operating_state": "FAULT", "faults": ["SUPPLY"], "fault_details": [SUPPLY]}
+ANSWERS = {
+    # what is shown is the daemon's own
+    "status": [
+        ({"operating_state": "ENABLED"}, {}, 0, ["state     ENABLED, homed"]),
+        (IN_FAULT, {}, 4, ["fault     SUPPLY", "supply voltage low", "next: check the power supply"]),
+    ],
+    "--json status": [({"core_share": 0.1}, {}, 0, ['"core_share":0.1'])],  # a newer daemon's
+    # a command is done where the answer says so
+    "stop": [
+        ({}, {"operating_state": "FAULT", "is_connected": True}, 0, ["the gap opens"]),
+        ({}, {"operating_state": "FAULT", "is_connected": False}, 1, ["nothing could be sent"]),
+    ],
+    "take b": [
+        ({}, {"source": "b", "instead_of": "a"}, 0, ["'b' holds the brake instead of 'a'"]),
+        ({}, {"source": "b", "instead_of": "b"}, 0, ["'b' holds the brake already"]),
+    ],
+    "--json take b": [({}, {"source": "c", "instead_of": "a"}, 1, ['"code":"not_done"'])],
+    # a fault that is there still, or comes back, is no success
+    "clear-fault": [
+        ({}, {"operating_state": "DISABLED"}, 0, ["no fault is latched; it is DISABLED"]),
+        ({}, {"operating_state": "PAUSED"}, 0, ["no fault is latched; it is PAUSED"]),
+    ],
+    "--json clear-fault": [
+        (IN_FAULT, {"operating_state": "DISABLED"}, 4, ['"code":"fault"', "came back: SUPPLY: supply voltage low"])
+    ],
+    "--json home": [(IN_FAULT | {"is_busy": True}, {}, 4, ['"code":"fault"', '"hint":"check the power supply"'])],
+} | {
+    f"--json {command}": [
+        ({}, result, 1, ['"code":"not_done"'])
+        for result in ({}, {"operating_state": None}, {"operating_state": "ASLEEP"})
+    ]
+    for command in ("enable", "disable", "pause", "resume", "stop")
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "status", "result", "code", "words"),
+    [(command, *row) for command, rows in ANSWERS.items() for row in rows],
+)
+def test_what_a_daemon_answers_decides_the_exit_code_and_is_told(
+    fake_daemon, capsys, command, status, result, code, words
+):
+    fake_daemon.says(**status)
+    name = command.removeprefix("--json ").split()[0]
+    if name != "status":
+        fake_daemon.answers[name] = lambda: {"ok": True, "result": result}
+    assert main(["--endpoint", fake_daemon.control, *command.split()]) == code
+    printed = capsys.readouterr().out
+    assert [word for word in words if word not in printed] == []
+    assert command != "take b" or fake_daemon.requests[-1]["args"] == {"source": "b"}
+
+
+@pytest.mark.parametrize(("code", "expected"), [("not_homed", 1), ("fault", 4), ("device_latched", 4)])
+def test_a_refusal_tells_code_message_and_hint(fake_daemon, capsys, code, expected):
+    """As keys for a script; for a person on stderr, with the next step last."""
+    fake_daemon.refuse("enable", code)
+    exit_code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "enable")
+    assert exit_code == expected
+    assert printed["error"] == {"code": code, "message": "cannot enable", "hint": "do this first"}
+    assert main(["--endpoint", fake_daemon.control, "enable"]) == expected
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("", "tormagctl enable: cannot enable\n  next: do this first\n")
+
+
 def test_status_gives_the_daemons_own_keys(fake_daemon, capsys):
     code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "status")
     assert code == 0
     assert printed["result"]["operating_state"] == "ENABLED"
     assert printed["result"]["measured_jp"] == [35.0, 35.0]
     assert printed["result"]["link"]["frames"] == 55_096
-
-
-def test_what_a_newer_daemon_says_besides_is_shown_and_does_not_matter(fake_daemon, capsys):
-    fake_daemon.says(core_share=0.1)
-    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "status")
-    assert (code, printed["result"]["core_share"]) == (0, 0.1)
 
 
 @pytest.mark.parametrize("command", ["status", "firmware", "home"])
@@ -78,47 +138,13 @@ def test_status_says_which_build_runs_and_what_an_interpreted_one_costs(fake_dae
     assert sum(line.startswith("core") for line in shown) == bool(lines)
 
 
-def test_status_in_fault_exits_4_and_names_cause_and_remedy(fake_daemon, capsys):
-    details = [{"code": "SKEW", "cause": "carriages apart", "remedy": "clean the screw"}]
-    fake_daemon.says(operating_state="FAULT", faults=["SKEW"], fault_details=details)
-    assert main(["--endpoint", fake_daemon.control, "status"]) == 4
-    text = capsys.readouterr().out
-    assert "SKEW" in text
-    assert "carriages apart" in text
-    assert "next: clean the screw" in text
-
-
 @pytest.mark.parametrize("command", ["enable", "disable", "pause", "resume", "stop", "clear-fault"])
 def test_a_command_reaches_the_daemon_under_its_name(fake_daemon, capsys, command):
-    done = {"operating_state": DONE_STATES[command][0]}
+    done = {"operating_state": DONE[command][1][0]}
     fake_daemon.answers[command] = lambda: {"ok": True, "result": done}
     code, printed = run_json(capsys, "--endpoint", fake_daemon.control, command)
     assert (code, printed["command"], printed["result"]) == (0, command, done)
     assert fake_daemon.commands == (["status", command] if command == "clear-fault" else [command])
-
-
-@pytest.mark.parametrize("command", ["enable", "disable", "pause", "resume", "stop", "clear-fault"])
-@pytest.mark.parametrize("result", [{}, {"operating_state": None}, {"operating_state": "ASLEEP"}])
-def test_an_answer_that_does_not_say_it_was_done_is_no_success(fake_daemon, capsys, command, result):
-    fake_daemon.answers[command] = lambda: {"ok": True, "result": result}
-    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, command)
-    assert (code, printed["error"]["code"]) == (1, "not_done")
-
-
-def test_a_fault_that_comes_back_was_not_cleared(fake_daemon, capsys):
-    fake_daemon.answers["clear-fault"] = lambda: {"ok": True, "result": {"operating_state": "DISABLED"}}
-    details = [{"code": "DEVICE_SUPPLY", "cause": "the supply voltage is out of range", "remedy": "check it"}]
-    fake_daemon.says(operating_state="FAULT", faults=["DEVICE_SUPPLY"], fault_details=details)
-    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "clear-fault")
-    assert (code, printed["error"]["code"]) == (4, "fault")
-    assert "came back: DEVICE_SUPPLY: the supply voltage" in printed["error"]["message"]
-
-
-@pytest.mark.parametrize("state", ["DISABLED", "PAUSED"])
-def test_clearing_what_is_not_latched_says_so(fake_daemon, capsys, state):
-    fake_daemon.answers["clear-fault"] = lambda: {"ok": True, "result": {"operating_state": state}}
-    assert main(["--endpoint", fake_daemon.control, "clear-fault"]) == 0
-    assert f"no fault is latched; it is {state}" in capsys.readouterr().out
 
 
 def test_a_fault_that_is_cleared_is_watched_until_it_would_have_come_back(fake_daemon, capsys):
@@ -132,49 +158,6 @@ def test_a_fault_that_is_cleared_is_watched_until_it_would_have_come_back(fake_d
     assert "fault cleared. tormagctl home, then enable" in capsys.readouterr().out
     assert fake_daemon.commands[:2] == ["status", "clear-fault"]
     assert set(fake_daemon.commands[2:]) == {"status"}
-
-
-def test_take_that_gave_the_brake_to_somebody_else_is_no_success(fake_daemon, capsys):
-    fake_daemon.answers["take"] = lambda: {"ok": True, "result": {"source": "c", "instead_of": "a"}}
-    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "take", "b")
-    assert (code, printed["error"]["code"]) == (1, "not_done")
-
-
-@pytest.mark.parametrize(
-    ("before", "said"), [("a", "'b' holds the brake instead of 'a'"), ("b", "'b' holds the brake already")]
-)
-def test_take_names_the_source_and_the_one_before(fake_daemon, capsys, before, said):
-    fake_daemon.answers["take"] = lambda: {"ok": True, "result": {"source": "b", "instead_of": before}}
-    assert main(["--endpoint", fake_daemon.control, "take", "b"]) == 0
-    assert said in capsys.readouterr().out
-    assert fake_daemon.requests[-1]["args"] == {"source": "b"}
-
-
-@pytest.mark.parametrize(
-    ("is_connected", "code", "said"), [(True, 0, "the gap opens"), (False, 1, "nothing could be sent")]
-)
-def test_stop_says_whether_a_device_was_there_to_be_told(fake_daemon, capsys, is_connected, code, said):
-    answer = {"ok": True, "result": {"operating_state": "FAULT", "is_connected": is_connected}}
-    fake_daemon.answers["stop"] = lambda: answer
-    assert main(["--endpoint", fake_daemon.control, "stop"]) == code
-    assert said in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(("code", "expected"), [("not_homed", 1), ("fault", 4), ("device_latched", 4)])
-def test_a_refusal_tells_code_message_and_hint(fake_daemon, capsys, code, expected):
-    fake_daemon.refuse("enable", code)
-    exit_code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "enable")
-    assert exit_code == expected
-    assert printed["error"] == {"code": code, "message": "cannot enable", "hint": "do this first"}
-
-
-def test_diagnostics_go_to_stderr_with_the_next_step(fake_daemon, capsys):
-    fake_daemon.refuse("enable", "not_homed")
-    assert main(["--endpoint", fake_daemon.control, "enable"]) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert "cannot enable" in captured.err
-    assert captured.err.splitlines()[-1].strip() == "next: do this first"
 
 
 @pytest.mark.parametrize("arguments", [["status"], ["home"], ["send", "step"], ["record", "out.mcap"]])
@@ -327,7 +310,7 @@ def test_a_decision_is_explained_with_what_was_measured(tmp_path, capsys):
     code, printed = run_json(capsys, "scene", "explain", str(other))
     assert code == 1
     assert printed["error"]["code"] == "not_measured"
-    assert "required_terms.py" in printed["error"]["hint"]
+    assert "docs/guides/scene.md" in printed["error"]["hint"]
 
 
 @pytest.mark.parametrize(("link", "is_shown"), [("RUNNING", True), ("BACK_OFF", False), ("REFUSED", False)])
@@ -385,16 +368,6 @@ def test_home_that_does_not_succeed_says_how(fake_daemon, capsys, monkeypatch, s
     fake_daemon.answers["status"] = states(*sequence)
     code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "home", "--timeout", timeout)
     assert (code, printed["error"]["code"]) == (1, expected)
-
-
-def test_a_fault_while_homing_exits_4_with_its_remedy(fake_daemon, capsys, states):
-    details = [{"code": "SUPPLY", "cause": "supply voltage low", "remedy": "check the power supply"}]
-    fake_daemon.answers["status"] = states(
-        (False, True), operating_state="FAULT", faults=["SUPPLY"], fault_details=details
-    )
-    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, "home")
-    assert code == 4
-    assert printed["error"]["hint"] == "check the power supply"
 
 
 def test_home_no_wait_returns_at_once(fake_daemon, capsys, states):

@@ -104,7 +104,9 @@ def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
             assert stream.content_type == "text/event-stream"
             told = await event(stream, "status")
             assert told["status"]["link"]["state"] == "RUNNING"
-            assert told["explained"] == {"RATE": {"cause": "too fast", "remedy": "ask for slower changes"}}
+            assert told["explained"] == {
+                "RATE": {"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}
+            }
             assert await event(stream, "portrait") == {"portrait": PORTRAIT}
             first = msgspec.convert(await event(stream, "frame"), Frame)
             then = msgspec.convert(await event(stream, "frame"), Frame)

@@ -8,7 +8,7 @@ import pytest
 from firmware_protocol.build import COST, REMEDY, Build
 from tormagd.config import Config, Device, Endpoints, RealTime
 from tormagd.ctl import doctor as checks, headroom
-from tormagd.ctl.doctor import Verdict, doctor, examine
+from tormagd.ctl.doctor import Verdict, examine, judged
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.main import main
 
@@ -52,7 +52,7 @@ def test_a_good_machine_has_nothing_to_remedy(good):
     findings = examine(REALTIME, Machine(good))
     assert [(f.name, f.found) for f in findings if f.verdict is not Verdict.OK] == []
     assert len({f.name for f in findings}) == len(checks.CHECKS)
-    assert doctor(REALTIME, good).exit_code == 0
+    assert judged(REALTIME, Machine(good)).exit_code == 0
 
 
 CASES = [
@@ -174,7 +174,7 @@ def test_run_directory(good):
 def test_an_empty_root_is_examined_without_error(tmp_path):
     findings = examine(Config(), Machine(tmp_path))
     assert all(finding.found for finding in findings)
-    assert doctor(Config(), tmp_path).exit_code == 1
+    assert judged(Config(), Machine(tmp_path)).exit_code == 1
 
 
 def test_this_machine_agrees_with_the_kernels_own_answers():
@@ -212,7 +212,7 @@ def by_rate(found: headroom.Headroom, loop: str, config: Config = REALTIME) -> d
 
 
 def test_a_machine_with_headroom_holds_its_rates_and_says_up_to_which(good):
-    outcome = doctor(REALTIME, good, measured())
+    outcome = judged(REALTIME, Machine(good), measured())
     assert outcome.exit_code == 0
     assert (outcome.result["fail"], outcome.result["warn"]) == (0, 0)
     control = by_rate(measured(), "control")
@@ -259,7 +259,7 @@ def test_each_trouble_that_was_measured_is_a_finding(good, found, name, verdict)
     finding = {finding.name: finding for finding in checks.examine_headroom(REALTIME, found)}[name]
     assert finding.verdict == verdict
     assert bool(finding.remedy) == (verdict != "ok")
-    assert doctor(REALTIME, good, found).exit_code == (1 if verdict == "fail" else 0)
+    assert judged(REALTIME, Machine(good), found).exit_code == (1 if verdict == "fail" else 0)
 
 
 def test_what_others_took_is_the_difference_of_two_looks(good):

@@ -13,7 +13,8 @@ import zmq
 from zmq.auth import load_certificate
 from zmq.utils import z85
 
-from tormagd.ctl.main import KEY, SERVER_KEY, main
+from tormagd.ctl.commands import KEY, SERVER_KEY
+from tormagd.ctl.main import main
 from tormagd_client.messages import VERSION
 
 

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import pytest
 
 from tormagd.config import Config, Device
-from tormagd.ctl import ports as module
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.main import main
 from tormagd.ctl.ports import Holder, ports, survey
@@ -116,8 +115,10 @@ def test_the_text_says_what_it_cannot_see(root: Path, monkeypatch: pytest.Monkey
         return listing(path)
 
     monkeypatch.setattr(Path, "iterdir", guarded)
-    monkeypatch.setattr(module, "_listed_serial_ports", lambda: [FTDI])
-    monkeypatch.setattr(module, "_detected_channels", lambda: [{"interface": "socketcan", "channel": "can0"}])
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [FTDI])
+    monkeypatch.setattr(
+        "can.detect_available_configs", lambda asked, timeout: [{"interface": "socketcan", "channel": "can0"}]
+    )
     outcome = ports(Config(), root)
     assert outcome.result["hidden_processes"] == 1
     for words in ("/dev/ttyUSB0", "configured", "held by minicom (process 4242)", "can0", "1 processes of other users"):
@@ -125,8 +126,8 @@ def test_the_text_says_what_it_cannot_see(root: Path, monkeypatch: pytest.Monkey
 
 
 def test_a_configured_port_that_is_not_there_is_said(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_listed_serial_ports", lambda: [])
-    monkeypatch.setattr(module, "_detected_channels", lambda: [])
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [])
+    monkeypatch.setattr("can.detect_available_configs", lambda asked, timeout: [])
     (root / "dev/ttyUSB0").unlink()
     assert "/dev/tormag, configured, but not there" in ports(Config(), root).text
     assert "no serial port" in ports(Config(device=Device(port="can0")), root).text
@@ -144,7 +145,7 @@ def test_a_real_lock_of_a_real_process_is_found(
     )
     config = tmp_path / "tormagd.toml"
     config.write_text(f'[device]\nport = "{path}"\n')
-    monkeypatch.setattr(module, "_detected_channels", lambda: [])
+    monkeypatch.setattr("can.detect_available_configs", lambda asked, timeout: [])
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == b"held\n"
@@ -163,7 +164,7 @@ def test_a_real_lock_of_a_real_process_is_found(
 def test_the_ports_of_this_machine_are_listed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(module, "_detected_channels", lambda: [])
+    monkeypatch.setattr("can.detect_available_configs", lambda asked, timeout: [])
     assert main(["--json", "ports"]) == 0
     result = json.loads(capsys.readouterr().out)["result"]
     assert set(result) == {"serial", "can", "hidden_processes"}

@@ -1,6 +1,7 @@
 """The documentation says what is there: pages written from types are up to date, and what is shown can be typed."""
 
 import argparse
+import importlib
 import importlib.util
 import re
 import shlex
@@ -26,10 +27,13 @@ PARSERS = {
     "python -m firmware_protocol.conformance": conformance.parser,
 }
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
-COMMAND = re.compile(r"(?:sudo (?:-u \w+ )?)?((?:tormagctl|tormagd|make|python (?:-m |tools/)[\w./]+)(?: [ -~]*)?)")
+COMMAND = re.compile(
+    r"(?:sudo (?:-u \w+ )?)?((?:tormagctl|tormagd|tormag-lab|make|python (?:-m |tools/)[\w./]+)(?: [ -~]*)?)"
+)
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^(?: {4}| {8})(\S.*)$", re.MULTILINE)
 IMPORTED = re.compile(r"^from (\w+) import (\w+)$", re.MULTILINE)
+LAB = importlib.import_module("tormagd.lab.main") if importlib.util.find_spec("tormagd.lab") else None
 DECISION = ["Question", "Decision", "Why", "Given up"]
 
 
@@ -85,6 +89,8 @@ def require_there(words):
     if words[0] == "make":
         targets = [word for word in words[1:] if "=" not in word]
         assert all(re.search(rf"^{target}:", MAKEFILE, re.MULTILINE) for target in targets), words
+    elif words[0] == "tormag-lab":
+        assert LAB is None or len(words) == 1 or words[1] in ("NAME", *LAB.COMMANDS), words
     elif words[1] == "-m":
         assert importlib.util.find_spec(words[2]), words
     else:

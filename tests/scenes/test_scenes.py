@@ -131,7 +131,7 @@ def test_contradictions_are_refused(write, low: str, low_value: str, high: str, 
         ({"handle__least_mm_s": "0.1"}, ("$.handle.least_mm_s", ">= 0.5")),
         ({"budget__core_share": "0.0"}, ("$.budget.core_share", "> 0.0")),
         ({"terms": '"some"'}, ("$.terms", "'some'")),
-        ({"terms": '"required"', "force__most_N": "1.9"}, ("was not measured as it is now", "required_terms.py")),
+        ({"terms": '"required"', "force__most_N": "1.9"}, ("was not measured as it is now", "docs/guides/scene.md")),
         ({"terms__gravity": "false"}, ("gravity", "unknown field")),
     ],
 )

@@ -108,7 +108,7 @@ ALONE = (
 "These need no daemon."
 
 BEHIND = (
-    "import time; from tormagd.client import Client; client = Client.local('sockets', 5.0, 'behind'); "
+    "import time; from tormagd_client import Client; client = Client.local('sockets', 5.0, 'behind'); "
     "[(client.publish(0.5, stamp_ns=time.time_ns() - 10**10), time.sleep(0.01)) for _ in range(100)]"
 )
 AS_ANYBODY = "setpriv --bounding-set=-dac_override,-dac_read_search " if os.geteuid() == 0 else ""

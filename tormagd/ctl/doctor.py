@@ -16,7 +16,7 @@ import msgspec
 
 from firmware_protocol.build import COST, REMEDY, settle
 from tormagd.config import Config
-from tormagd.ctl.headroom import MOST_STOLEN, MOST_USED, MOST_WAITED, Headroom, Rate, rates
+from tormagd.ctl.headroom import MOST_STOLEN, MOST_USED, MOST_WAITED, Headroom, Rate, measured, rates
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import Colour, Exit, Outcome
 
@@ -30,6 +30,8 @@ LATE_SHARE = 0.25
 "Of a control period: a bare timer that is later than this at p99 leaves the daemon too little of it."
 MISSED_SHARE = 0.001
 "Of its beats that a bare timer may miss."
+STOP_OTHERS = "stop what else runs here; top shows it"
+BY_UNIT = "run tormagd by its systemd unit, or add "
 
 
 class Verdict(StrEnum):
@@ -49,9 +51,15 @@ class Finding(msgspec.Struct, frozen=True):
     remedy: str = ""
 
 
-def doctor(config: Config, root: Path = Path("/"), found: Headroom | None = None) -> Outcome:
-    """Run every check, those of what was measured too. The exit code is REFUSED where one failed."""
-    findings = examine(config, Machine(root))
+def doctor(config: Config, config_file: Path | None, measure: bool) -> Outcome:
+    """Run every check on this machine, those of what can be measured too. The exit code is REFUSED where one failed."""
+    machine = Machine(Path("/"))
+    return judged(config, machine, measured(config_file, machine) if measure else None)
+
+
+def judged(config: Config, machine: Machine, found: Headroom | None = None) -> Outcome:
+    """The same of any machine."""
+    findings = examine(config, machine)
     if found is not None:
         findings += examine_headroom(config, found)
     count = {verdict: sum(finding.verdict is verdict for finding in findings) for verdict in Verdict}
@@ -65,6 +73,11 @@ def doctor(config: Config, root: Path = Path("/"), found: Headroom | None = None
         result["measured"] = msgspec.to_builtins(found) | {"rates": [msgspec.to_builtins(row) for row in table]}
         text += "\n" + _table(table)
     return Outcome(result, text, Exit.REFUSED if count[Verdict.FAIL] else Exit.DONE)
+
+
+def _finding(name: str, is_good: bool, found: str, remedy: str, otherwise: Verdict = Verdict.WARN) -> Finding:
+    """Good, which needs no remedy; or `otherwise`."""
+    return Finding(name, Verdict.OK, found) if is_good else Finding(name, otherwise, found, remedy)
 
 
 def examine(config: Config, machine: Machine) -> tuple[Finding, ...]:
@@ -86,35 +99,36 @@ def examine_headroom(config: Config, found: Headroom) -> tuple[Finding, ...]:
 def bare_timer(found: Headroom) -> Finding:
     """How late a thread is woken that asks for nothing else."""
     late_us, rate_hz = found.bare.lateness_us, found.bare.rate_hz
-    text = (
+    return _finding(
+        "bare timer",
+        late_us.p99 <= LATE_SHARE * 1e6 / rate_hz and found.bare.missed_share <= MISSED_SHARE,
         f"late p50 {late_us.p50:.0f} p99 {late_us.p99:.0f} p99.9 {late_us.p999:.0f} us, "
-        f"{found.bare.missed_share:.2%} of the beats missed at {rate_hz} Hz"
+        f"{found.bare.missed_share:.2%} of the beats missed at {rate_hz} Hz",
+        "heed the lines above; on a virtual machine also realtime.keep_awake = true, and processors of its own",
     )
-    if late_us.p99 <= LATE_SHARE * 1e6 / rate_hz and found.bare.missed_share <= MISSED_SHARE:
-        return Finding("bare timer", Verdict.OK, text)
-    remedy = "heed the lines above; on a virtual machine also realtime.keep_awake = true, and processors of its own"
-    return Finding("bare timer", Verdict.WARN, text, remedy)
 
 
 def others(found: Headroom) -> Finding:
     """What a hypervisor and other programs took meanwhile, by the kernel's word."""
     waited = "not known to this kernel" if found.waited is None else f"{found.waited:.0%} of the time"
-    text = f"stolen {found.steal:.1%}; something waited for a processor: {waited}"
-    if found.steal > MOST_STOLEN:
-        return Finding("others", Verdict.WARN, text, "ask whoever runs the host for processors that are not shared")
-    if found.waited is not None and found.waited > MOST_WAITED:
-        return Finding("others", Verdict.WARN, text, "stop what else runs here; top shows it")
-    return Finding("others", Verdict.OK, text)
+    is_stolen = found.steal > MOST_STOLEN
+    return _finding(
+        "others",
+        not is_stolen and (found.waited or 0.0) <= MOST_WAITED,
+        f"stolen {found.steal:.1%}; something waited for a processor: {waited}",
+        "ask whoever runs the host for processors that are not shared" if is_stolen else STOP_OTHERS,
+    )
 
 
 def core(found: Headroom) -> Finding:
     """What the core itself takes of a processor."""
     step, plan = found.step_us, found.plan_us
-    text = (
+    return Finding(
+        "core",
+        Verdict.OK,
         f"{found.build}: a step p50 {step.p50:.0f} p99 {step.p99:.0f} us, a plan p50 {plan.p50:.0f} "
-        f"p99 {plan.p99:.0f} us; reference loop {found.machine_us:.0f} us"
+        f"p99 {plan.p99:.0f} us; reference loop {found.machine_us:.0f} us",
     )
-    return Finding("core", Verdict.OK, text)
 
 
 def configured_rate(row: Rate) -> Finding:
@@ -126,31 +140,32 @@ def configured_rate(row: Rate) -> Finding:
 
 def preemption(config: Config, machine: Machine) -> Finding:
     """How soon the kernel lets go of a processor."""
-    remedy = "install a PREEMPT_RT kernel (Debian: linux-image-rt-amd64), or boot with preempt=full"
     version = machine.text("/proc/version") or ""
-    if machine.text("/sys/kernel/realtime") == "1" or re.search(r"\bPREEMPT_RT\b", version):
-        return Finding("preemption", Verdict.OK, "PREEMPT_RT")
+    is_real_time = machine.text("/sys/kernel/realtime") == "1" or bool(re.search(r"\bPREEMPT_RT\b", version))
     # the model in force stands in brackets or parentheses; reading it takes root
     active = re.search(r"[\[(](\w+)[\])]", machine.text("/sys/kernel/debug/sched/preempt") or "")
-    if active:
-        return Finding("preemption", Verdict.WARN, f"dynamic, {active[1]} in force", remedy)
     asked = re.search(r"\bpreempt=(\w+)", machine.text("/proc/cmdline") or "")
-    if "PREEMPT_DYNAMIC" in version:
-        return Finding("preemption", Verdict.WARN, f"dynamic, {asked[1] if asked else 'default'} model", remedy)
-    found = "full, but not PREEMPT_RT" if re.search(r"\bPREEMPT\b", version) else "none or voluntary"
-    return Finding("preemption", Verdict.WARN, found, remedy)
+    if is_real_time:
+        found = "PREEMPT_RT"
+    elif active:
+        found = f"dynamic, {active[1]} in force"
+    elif "PREEMPT_DYNAMIC" in version:
+        found = f"dynamic, {asked[1] if asked else 'default'} model"
+    else:
+        found = "full, but not PREEMPT_RT" if re.search(r"\bPREEMPT\b", version) else "none or voluntary"
+    remedy = "install a PREEMPT_RT kernel (Debian: linux-image-rt-amd64), or boot with preempt=full"
+    return _finding("preemption", is_real_time, found, remedy)
 
 
 def governor(config: Config, machine: Machine) -> Finding:
     """Whether processors slow down between ticks."""
     files = machine.path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
-    governors = sorted({text for file in files if (text := machine.text(f"/{file.relative_to(machine.root)}"))})
-    if not governors:
-        return Finding("cpu governor", Verdict.OK, "the kernel does not scale frequencies here")
-    if governors == ["performance"]:
-        return Finding("cpu governor", Verdict.OK, "performance")
-    return Finding(
-        "cpu governor", Verdict.WARN, ", ".join(governors), "sudo cpupower frequency-set --governor performance"
+    governors = {text for file in files if (text := machine.text(f"/{file.relative_to(machine.root)}"))}
+    return _finding(
+        "cpu governor",
+        governors <= {"performance"},
+        ", ".join(sorted(governors)) or "the kernel does not scale frequencies here",
+        "sudo cpupower frequency-set --governor performance",
     )
 
 
@@ -158,28 +173,27 @@ def scheduling(config: Config, machine: Machine) -> Finding:
     """Whether this user's processes may use SCHED_FIFO, at the priority the configuration asks for."""
     wanted = config.realtime.fifo_priority
     allowed = 99 if machine.has_capability(CAP_SYS_NICE) else int(machine.limit("Max realtime priority"))
-    found = f"allowed up to priority {allowed}, configured {wanted}"
-    remedy = "run tormagd by its systemd unit, or add '@tormag - rtprio 90' to /etc/security/limits.d/tormag.conf"
-    if allowed < wanted:
-        return Finding("sched_fifo", Verdict.FAIL, found, remedy)
-    if allowed == 0:
-        return Finding("sched_fifo", Verdict.WARN, found, remedy)
-    if wanted == 0:
-        return Finding("sched_fifo", Verdict.WARN, found, "set realtime.fifo_priority = 50 in the configuration")
-    return Finding("sched_fifo", Verdict.OK, found)
+    return _finding(
+        "sched_fifo",
+        0 < wanted <= allowed,
+        f"allowed up to priority {allowed}, configured {wanted}",
+        f"{BY_UNIT}'@tormag - rtprio 90' to /etc/security/limits.d/tormag.conf"
+        if allowed < max(wanted, 1)
+        else "set realtime.fifo_priority = 50 in the configuration",
+        Verdict.FAIL if allowed < wanted else Verdict.WARN,
+    )
 
 
 def memory_lock(config: Config, machine: Machine) -> Finding:
     """Whether the daemon may keep its memory from being paged out."""
-    limit = machine.limit("Max locked memory")
-    unlimited = machine.has_capability(CAP_IPC_LOCK) or limit == float("inf")
-    found = "unlimited" if unlimited else f"{limit / 1e6:.0f} MB"
-    if unlimited or limit >= MEMORY_TO_LOCK_BYTES:
-        return Finding("memlock", Verdict.OK, found)
-    remedy = (
-        "run tormagd by its systemd unit, or add '@tormag - memlock unlimited' to /etc/security/limits.d/tormag.conf"
+    limit = float("inf") if machine.has_capability(CAP_IPC_LOCK) else machine.limit("Max locked memory")
+    return _finding(
+        "memlock",
+        limit >= MEMORY_TO_LOCK_BYTES,
+        "unlimited" if limit == float("inf") else f"{limit / 1e6:.0f} MB",
+        f"{BY_UNIT}'@tormag - memlock unlimited' to /etc/security/limits.d/tormag.conf",
+        Verdict.FAIL if config.realtime.lock_memory else Verdict.WARN,
     )
-    return Finding("memlock", Verdict.FAIL if config.realtime.lock_memory else Verdict.WARN, found, remedy)
 
 
 def cores(config: Config, machine: Machine) -> Finding:
@@ -187,12 +201,9 @@ def cores(config: Config, machine: Machine) -> Finding:
     count = machine.cores()
     impossible = [number for number in config.realtime.cpus if number >= count]
     if impossible:
-        return Finding(
-            "cores", Verdict.FAIL, f"{count} online, realtime.cpus asks for {impossible}", f"name cores 0..{count - 1}"
-        )
-    if count < 2:
-        return Finding("cores", Verdict.WARN, f"{count} online", "use a machine with at least 2 cores")
-    return Finding("cores", Verdict.OK, f"{count} online")
+        found = f"{count} online, realtime.cpus asks for {impossible}"
+        return Finding("cores", Verdict.FAIL, found, f"name cores 0..{count - 1}")
+    return _finding("cores", count >= 2, f"{count} online", "use a machine with at least 2 cores")
 
 
 def load(config: Config, machine: Machine) -> Finding:
@@ -201,34 +212,27 @@ def load(config: Config, machine: Machine) -> Finding:
     if not fields:
         return Finding("load", Verdict.WARN, "not known", "mount /proc")
     average, count = float(fields[0]), machine.cores()
-    found = f"{average:.2f} over one minute on {count} cores"
-    if average > 0.8 * count:
-        return Finding("load", Verdict.WARN, found, "stop what else runs here; top shows it")
-    return Finding("load", Verdict.OK, found)
+    return _finding("load", average <= 0.8 * count, f"{average:.2f} over one minute on {count} cores", STOP_OTHERS)
 
 
 def timer_slack(config: Config, machine: Machine) -> Finding:
     """By how much the kernel may delay this user's timers to bundle them; SCHED_FIFO threads have none."""
     slack_ns = machine.number("/proc/self/timerslack_ns")
-    if slack_ns is None:
-        return Finding("timer slack", Verdict.OK, "the kernel does not say")
-    found = f"{slack_ns / 1e3:g} us"
-    if slack_ns > DEFAULT_SLACK_NS:
-        return Finding("timer slack", Verdict.WARN, found, "remove TimerSlackNSec= from what starts this session")
-    return Finding("timer slack", Verdict.OK, found)
+    return _finding(
+        "timer slack",
+        slack_ns is None or slack_ns <= DEFAULT_SLACK_NS,
+        "the kernel does not say" if slack_ns is None else f"{slack_ns / 1e3:g} us",
+        "remove TimerSlackNSec= from what starts this session",
+    )
 
 
 def clock_source(config: Config, machine: Machine) -> Finding:
     """Whether reading the time is fast and even."""
     name = machine.text("/sys/devices/system/clocksource/clocksource0/current_clocksource")
-    if name is None:
-        return Finding("clock source", Verdict.OK, "the kernel does not say")
-    if name in GOOD_CLOCKS:
-        return Finding("clock source", Verdict.OK, name)
-    return Finding(
+    return _finding(
         "clock source",
-        Verdict.WARN,
-        name,
+        name is None or name in GOOD_CLOCKS,
+        "the kernel does not say" if name is None else name,
         "dmesg | grep -i clocksource tells why tsc was given up; update the firmware",
     )
 
@@ -238,20 +242,17 @@ def swap(config: Config, machine: Machine) -> Finding:
     lines = (machine.text("/proc/swaps") or "").splitlines()[1:]
     if not lines:
         return Finding("swap", Verdict.OK, "off")
-    if config.realtime.lock_memory:
-        return Finding("swap", Verdict.OK, f"on ({lines[0].split()[0]}), but realtime.lock_memory keeps the daemon in")
-    return Finding(
-        "swap", Verdict.WARN, f"on ({lines[0].split()[0]})", "set realtime.lock_memory = true, or sudo swapoff -a"
-    )
+    is_locked = config.realtime.lock_memory
+    found = f"on ({lines[0].split()[0]}){', but realtime.lock_memory keeps the daemon in' if is_locked else ''}"
+    return _finding("swap", is_locked, found, "set realtime.lock_memory = true, or sudo swapoff -a")
 
 
 def huge_pages(config: Config, machine: Machine) -> Finding:
     """Whether the kernel stops processes to make huge pages of their memory."""
     active = re.search(r"\[(\w+)\]", machine.text("/sys/kernel/mm/transparent_hugepage/enabled") or "")
-    if active is None or active[1] != "always":
-        return Finding("huge pages", Verdict.OK, active[1] if active else "not in this kernel")
+    found = active[1] if active else "not in this kernel"
     remedy = "echo madvise | sudo tee /sys/kernel/mm/transparent_hugepage/enabled"
-    return Finding("huge pages", Verdict.WARN, "always", remedy)
+    return _finding("huge pages", found != "always", found, remedy)
 
 
 def run_directory(config: Config, machine: Machine) -> Finding:
@@ -261,44 +262,47 @@ def run_directory(config: Config, machine: Machine) -> Finding:
         return Finding("run directory", Verdict.OK, f"none needed for {address}")
     directory = os.path.dirname(address.removeprefix("ipc://"))  # noqa: PTH120
     path = machine.path(directory)
-    remedy = "start tormagd by its systemd unit, which makes it; or name ipc sockets in a directory of your own"
     if not path.is_dir():
+        remedy = "start tormagd by its systemd unit, which makes it; or name ipc sockets in a directory of your own"
         return Finding("run directory", Verdict.FAIL, f"{directory} does not exist", remedy)
-    if not os.access(path, os.W_OK | os.X_OK):
-        remedy = "join the group tormag (sudo usermod -aG tormag $USER), log in again"
-        return Finding("run directory", Verdict.FAIL, f"{directory} is not writable for you", remedy)
-    return Finding("run directory", Verdict.OK, f"{directory} is writable")
+    is_open = os.access(path, os.W_OK | os.X_OK)
+    return _finding(
+        "run directory",
+        is_open,
+        f"{directory} is {'writable' if is_open else 'not writable for you'}",
+        "join the group tormag (sudo usermod -aG tormag $USER), log in again",
+        Verdict.FAIL,
+    )
 
 
 def port(config: Config, machine: Machine) -> Finding:
     """Whether the device's port is there and open to this user. A port that is no path is a CAN channel."""
     name = config.device.port
     if not name.startswith("/"):
-        if machine.path(f"/sys/class/net/{name}").exists():
-            return Finding("device port", Verdict.OK, f"network interface {name}")
-        return Finding(
-            "device port",
-            Verdict.WARN,
-            f"no network interface {name}",
-            f"sudo ip link set {name} up type can, if it is one",
-        )
+        is_there = machine.path(f"/sys/class/net/{name}").exists()
+        found = f"{'' if is_there else 'no '}network interface {name}"
+        return _finding("device port", is_there, found, f"sudo ip link set {name} up type can, if it is one")
     target = machine.resolved(name)
     shown = name if target == name else f"{name} ({target})"
     path = machine.path(target)
     if not path.exists():
         remedy = "plug the device in and switch it on; install systemd/udev/60-tormag.rules for the name /dev/tormag"
         return Finding("device port", Verdict.FAIL, f"{shown} does not exist", remedy)
-    if not os.access(path, os.R_OK | os.W_OK):
-        remedy = "join the group that owns it (ls -l shows it; dialout or tormag), log in again"
-        return Finding("device port", Verdict.FAIL, f"{shown} is not readable and writable for you", remedy)
-    return Finding("device port", Verdict.OK, shown)
+    is_open = os.access(path, os.R_OK | os.W_OK)
+    return _finding(
+        "device port",
+        is_open,
+        shown if is_open else f"{shown} is not readable and writable for you",
+        "join the group that owns it (ls -l shows it; dialout or tormag), log in again",
+        Verdict.FAIL,
+    )
 
 
 def port_holder(config: Config, machine: Machine) -> Finding:
     """Whether another process has the port. tormagd itself is meant to."""
     name = config.device.port
     target = machine.resolved(name)
-    others = machine.holders(target) if name.startswith("/") else []
+    others = machine.holders([target])[0][target] if name.startswith("/") else []
     if target.startswith("/dev/pts/"):  # whoever made a pseudo-terminal has it open as well
         locking = machine.lock_owners(target)
         others = [(pid, comm) for pid, comm in others if pid in locking]
@@ -314,23 +318,19 @@ def usb_latency(config: Config, machine: Machine) -> Finding:
     adapter = os.path.basename(machine.resolved(config.device.port))  # noqa: PTH119
     file = f"/sys/bus/usb-serial/devices/{adapter}/latency_timer"
     latency_ms = machine.number(file) if adapter else None
-    if latency_ms is None:
-        return Finding("usb latency", Verdict.OK, "this port has no latency timer")
-    if latency_ms <= FAST_LATENCY_MS:
-        return Finding("usb latency", Verdict.OK, f"{latency_ms} ms")
-    remedy = (
+    return _finding(
+        "usb latency",
+        latency_ms is None or latency_ms <= FAST_LATENCY_MS,
+        "this port has no latency timer" if latency_ms is None else f"{latency_ms} ms",
         f"tormagd asks the driver for {FAST_LATENCY_MS} ms when it opens the port; where that is refused: "
-        f"echo {FAST_LATENCY_MS} | sudo tee {file}; systemd/udev/60-tormag.rules does it at every plug"
+        f"echo {FAST_LATENCY_MS} | sudo tee {file}; systemd/udev/60-tormag.rules does it at every plug",
     )
-    return Finding("usb latency", Verdict.WARN, f"{latency_ms} ms", remedy)
 
 
 def build(config: Config, machine: Machine) -> Finding:
     """Which build of the core is installed; the daemon of the same installation runs the same one."""
     runs = settle()
-    if runs.is_compiled:
-        return Finding("build", Verdict.OK, str(runs))
-    return Finding("build", Verdict.WARN, f"{runs}; {COST}", REMEDY)
+    return _finding("build", runs.is_compiled, str(runs) if runs.is_compiled else f"{runs}; {COST}", REMEDY)
 
 
 CHECKS: tuple[Callable[[Config, Machine], Finding], ...] = (

@@ -22,21 +22,17 @@ def firmware_text(link: LinkReport, colour: Colour) -> str:
     """The report in half a dozen lines; what is not known shows as `-`."""
     paint = colour.green if link.state == "RUNNING" else colour.yellow
     lines = [f"link        {paint(link.state)} on {link.port} ({link.backend})"]
-    if link.cause:
-        lines.append(f"            {colour.yellow(link.cause)}")
-    if link.remedy:
-        lines.append(f"            next: {link.remedy}")
+    lines += [f"            {colour.yellow(link.cause)}"] if link.cause else []
+    lines += [f"            next: {link.remedy}"] if link.remedy else []
+    last = f", the last: {link.last_loss}" if link.last_loss else ""
     ours, theirs = link.daemon_schema, link.firmware_schema
     fits = (
         UNKNOWN if theirs is None else "the daemon's too" if theirs == ours else colour.red(f"the daemon's is {ours}")
     )
-    losses = f"{link.losses} since the daemon started"
-    if link.last_loss:
-        losses += f", the last: {link.last_loss}"
     lines += [
         f"firmware    {_shown(link.firmware)}, device {_shown(link.serial_number)}",
         f"schema      {_shown(theirs)} ({fits}), protocol {link.protocol_version}",
-        f"losses      {losses}",
+        f"losses      {link.losses} since the daemon started{last}",
         f"received    {', '.join(f'{_shown(getattr(link, name))} {name}' for name in COUNTERS)}",
         f"refused     {', '.join(f'{name}: {why}' for name, why in sorted(link.refused.items())) or 'nothing'}",
         f"round trip  {_round_trip(link.round_trip_us)}",

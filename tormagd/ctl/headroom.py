@@ -4,8 +4,6 @@ The measuring is `python -m tormagd.headroom`, a process of its own that needs n
 figures are judged. What the kernel says meanwhile of steal and of processes that waited stands beside them.
 """
 
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +14,8 @@ from firmware_protocol.build import REMEDY
 from tormagd.config import LEAST_INFERENCE_HZ, Config
 from tormagd.ctl.machine import Machine, Taken
 from tormagd.ctl.outcome import CommandError, Exit
+from tormagd.ctl.process import answer_of
+from tormagd_client.messages import ExecReport
 
 LONGEST_S = 120.0
 "It takes 6 s on an idle machine, half of them to load the libraries."
@@ -30,14 +30,10 @@ MOST_STOLEN, MOST_WAITED = 0.01, 0.1
 "Shares of the time above which what others take is worth a warning."
 
 
-class Quantiles(msgspec.Struct, frozen=True):
+class Quantiles(ExecReport, frozen=True, kw_only=True):
     """Of a duration, us."""
 
     mean: float
-    p50: float
-    p99: float
-    p999: float
-    max: float
 
 
 class Bare(msgspec.Struct, frozen=True):
@@ -73,19 +69,17 @@ class Rate(msgspec.Struct, frozen=True):
     change: str
 
 
-def measure(path: Path | None, machine: Machine) -> Headroom:
+def measured(path: Path | None, machine: Machine) -> Headroom:
     """Measures for the configuration in `path`. Raises CommandError where that cannot be done."""
-    command = [sys.executable, "-P", "-m", "tormagd.headroom", *(["--config", str(path)] if path else [])]
     before, started_s = machine.taken(), time.monotonic()
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S, check=False)
-    except subprocess.TimeoutExpired as error:
-        raise _failed(f"not done after {LONGEST_S:g} s") from error
-    took_s = time.monotonic() - started_s
-    if done.returncode:
-        raise _failed((done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1])
-    found = msgspec.json.decode(done.stdout, type=Headroom)
-    steal, waited = shares(before, machine.taken(), took_s)
+        printed = answer_of("tormagd.headroom", [f"--config={path}"] if path else [], LONGEST_S)
+    except (TimeoutError, ChildProcessError) as error:
+        raise CommandError(
+            Exit.REFUSED, "not_measured", f"this machine could not be measured: {error}", "try it again"
+        ) from error
+    found = msgspec.json.decode(printed, type=Headroom)
+    steal, waited = shares(before, machine.taken(), time.monotonic() - started_s)
     return msgspec.structs.replace(found, steal=steal, waited=waited)
 
 
@@ -117,16 +111,11 @@ def _judged(loop: str, hz: int, configured: bool, found: Headroom, control_hz: i
         in_time = (late_us.p50 + TICK_OVER_STEP * step.p50 + plan.p50) * period
     busy = PERIOD_OVER_STEP * step.mean * period + plan.mean * 1e-6 * inference_hz
     used = max(in_time, busy)
-    change = ""
-    if used > MOST_USED:
-        lateness_is_most = loop == "control" and late_us.p99 > TICK_OVER_STEP * step.p99 and in_time > busy
-        if lateness_is_most:
-            change = "the kernel wakes too late: the checks of real time above, fewer programs beside it"
-        else:
-            can_compile = found.build == "interpreted"
-            change = f"compile the core: {REMEDY}" if can_compile else f"a faster processor, or less than {hz} Hz"
+    if used <= MOST_USED:
+        change = ""
+    elif loop == "control" and late_us.p99 > TICK_OVER_STEP * step.p99 and in_time > busy:
+        change = "the kernel wakes too late: the checks of real time above, fewer programs beside it"
+    else:
+        can_compile = found.build == "interpreted"
+        change = f"compile the core: {REMEDY}" if can_compile else f"a faster processor, or less than {hz} Hz"
     return Rate(loop, hz, configured, round(used, 3), used <= MOST_USED, change)
-
-
-def _failed(reason: str) -> CommandError:
-    return CommandError(Exit.REFUSED, "not_measured", f"this machine could not be measured: {reason}", "try it again")

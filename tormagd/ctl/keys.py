@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from tormagd.config import ConfigError
 from tormagd.ctl.outcome import Outcome, usage_error
@@ -10,6 +9,11 @@ from tormagd.keys import load_folder
 from tormagd_client.keys import PUBLIC, SERVER, fingerprint, generate, load_public
 
 HINT = "tormagctl keys generate --help; the guide has the whole exchange"
+
+
+def keys(action: str, path: Path, client: str | None, **clients: Sequence[str]) -> Outcome:
+    """Makes them, of `clients` by role, or shows the fingerprints of those that are there."""
+    return show_keys(path) if action == "show" else generate_keys(path, clients, client)
 
 
 def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: str | None) -> Outcome:
@@ -21,20 +25,20 @@ def generate_keys(folder: Path, clients: Mapping[str, Sequence[str]], client: st
     names = [name for listed in clients.values() for name in listed]
     if client is not None and names:
         raise usage_error("--client stands alone: it makes a pair that no list of this machine has", HINT)
+    made = []
     try:
         if client is not None:
             return _outcome([_made(client, "client", folder, folder)])
-        made = []
         if not (folder / f"{SERVER}{PUBLIC}").exists() or not names:
             made.append(_made(SERVER, SERVER, folder, folder))
         for role, listed in clients.items():
             (folder / role).mkdir(mode=0o700, exist_ok=True)
             made += [_made(name, role, folder, folder / role) for name in listed]
-        return _outcome(made)
     except OSError as error:
         raise usage_error(f"{error.filename}: {error.strerror}", HINT) from error
     except ConfigError as error:
         raise usage_error(str(error), HINT) from error
+    return _outcome(made)
 
 
 def show_keys(path: Path) -> Outcome:
@@ -59,9 +63,8 @@ def _made(name: str, role: str, secret_in: Path, public_in: Path) -> dict[str, s
 
 
 def _outcome(made: list[dict[str, str]]) -> Outcome:
-    result: dict[str, Any] = {"made": made}
     lines = [
         f"{key['name']} ({key['role']}) {key['fingerprint']}\n  secret {key['secret']}\n  public {key['public']}"
         for key in made
     ]
-    return Outcome(result, "\n".join(lines))
+    return Outcome({"made": made}, "\n".join(lines))

@@ -80,13 +80,9 @@ class Machine:
             current = os.path.normpath(os.path.join(os.path.dirname(current), target))  # noqa: PTH118, PTH120
         return current
 
-    def holders(self, absolute: str) -> list[tuple[int, str]]:
-        """Process id and name of everybody who has `absolute` open, as far as we may see; not this process."""
-        holding, _ = self.all_holders([absolute])
-        return holding[absolute]
-
-    def all_holders(self, paths: Sequence[str]) -> tuple[dict[str, list[tuple[int, str]]], int]:
-        """`holders` of each path in one look, and the number of processes whose open files we may not see."""
+    def holders(self, paths: Sequence[str]) -> tuple[dict[str, list[tuple[int, str]]], int]:
+        """Process id and name of everybody who has one of these open, as far as we may see, not this process; and the
+        number of processes whose open files we may not see."""
         holding: dict[str, list[tuple[int, str]]] = {path: [] for path in paths}
         hidden = 0
         for process in sorted(self.path("/proc").glob("[0-9]*")):

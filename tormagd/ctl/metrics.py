@@ -3,7 +3,8 @@
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import TypeVar
 
 from prometheus_client import CollectorRegistry, generate_latest, start_http_server
 from prometheus_client.core import (
@@ -28,6 +29,7 @@ POLL_S = 0.1
 STATES = ("DISABLED", "ENABLED", "PAUSED", "FAULT")
 PERCENTILES = ("p50", "p99", "p999", "max")
 MILLI, MICRO = 1e-3, 1e-6
+Labelled = TypeVar("Labelled", CounterMetricFamily, GaugeMetricFamily)
 UP = "Whether the daemon answers"
 
 
@@ -77,24 +79,13 @@ class Scrape(Collector):
             yield GaugeMetricFamily("tormag_up", UP, 0.0)
             return
         yield GaugeMetricFamily("tormag_up", UP, 1.0)
-        yield from _device(status)
-        yield from _setpoints(status)
-        yield from _loops(status)
-        yield from _link(status)
+        for part in (_device, _setpoints, _loops, _link):
+            yield from part(status)
 
 
 def _device(status: Status) -> Iterator[Metric]:
-    yield InfoMetricFamily(
-        "tormag",
-        "What runs",
-        {
-            "version": status.version,
-            "build": status.build,
-            "scene": status.scene,
-            "solver": status.solver,
-            "firmware": status.link.firmware or "",
-        },
-    )
+    about = {name: getattr(status, name) for name in ("version", "build", "scene", "solver")}
+    yield InfoMetricFamily("tormag", "What runs", about | {"firmware": status.link.firmware or ""})
     states = {state: state == status.operating_state for state in STATES}
     yield StateSetMetricFamily("tormag_operating_state", "The operating state", states)
     yield GaugeMetricFamily("tormag_homed", "Whether the positions are known", float(status.is_homed))
@@ -102,24 +93,22 @@ def _device(status: Status) -> Iterator[Metric]:
         ("tormag_fault", status.faults, "Latched faults, 1 for each that is there"),
         ("tormag_limit", status.limits, "Limits, 1 for each that holds the force back now"),
     ):
-        present = GaugeMetricFamily(name, text, labels=["code"])
-        for code in codes:
-            present.add_metric([code], 1.0)
-        yield present
-    for name, text, value in (
-        ("tormag_uptime_seconds", "Since the daemon started", status.uptime_s),
-        ("tormag_force_asked_newtons", "Newest setpoint", status.setpoint_cf),
-        ("tormag_force_governed_newtons", "What the governor makes of it", status.governed_cf),
-        ("tormag_force_measured_newtons", "What the force sensor reads", status.measured_cf),
-        ("tormag_force_least_newtons", "Least force of this device", status.least_N),
-        ("tormag_force_most_newtons", "Greatest force of this device", status.most_N),
-        ("tormag_gap_meters", "Measured gap between the magnets", _scaled(status.gap_mm, MILLI)),
-        ("tormag_skew_meters", "Left minus right carriage", _scaled(status.skew_mm, MILLI)),
-        ("tormag_field_teslas", "Flux density that is planned for", _scaled(status.field_mT, MILLI)),
-        ("tormag_device_scale_ratio", "The device's force over the model's", status.device.scale),
+        yield _labelled(GaugeMetricFamily(name, text, labels=["code"]), dict.fromkeys(codes, 1.0))
+    for name, text, value, unit in (
+        ("uptime_seconds", "Since the daemon started", status.uptime_s, 1.0),
+        ("force_asked_newtons", "Newest setpoint", status.setpoint_cf, 1.0),
+        ("force_governed_newtons", "What the governor makes of it", status.governed_cf, 1.0),
+        ("force_measured_newtons", "What the force sensor reads", status.measured_cf, 1.0),
+        ("force_least_newtons", "Least force of this device", status.least_N, 1.0),
+        ("force_most_newtons", "Greatest force of this device", status.most_N, 1.0),
+        ("gap_meters", "Measured gap between the magnets", status.gap_mm, MILLI),
+        ("skew_meters", "Left minus right carriage", status.skew_mm, MILLI),
+        ("field_teslas", "Flux density that is planned for", status.field_mT, MILLI),
+        ("device_scale_ratio", "The device's force over the model's", status.device.scale, 1.0),
+        ("setpoint_age_seconds", "Of the newest setpoint", status.setpoint_age_ms, MILLI),
     ):
         if value is not None:  # what is not known has no sample
-            yield GaugeMetricFamily(name, text, value)
+            yield GaugeMetricFamily(f"tormag_{name}", text, value * unit)
 
 
 def _setpoints(status: Status) -> Iterator[Metric]:
@@ -130,49 +119,41 @@ def _setpoints(status: Status) -> Iterator[Metric]:
         ("oversize", "Setpoints that were too large"),
     ):
         yield CounterMetricFamily(f"tormag_setpoints_{fate}", text, getattr(status.setpoints, fate))
-    if status.setpoint_age_ms is not None:
-        yield GaugeMetricFamily("tormag_setpoint_age_seconds", "Of the newest setpoint", status.setpoint_age_ms * MILLI)
+    sources = status.setpoints.by_source
     lost = CounterMetricFamily("tormag_source_lost", "Setpoints missing in a source's count", labels=["source"])
-    delay = GaugeMetricFamily(
-        "tormag_source_delay_seconds", "From the stamp until it was read", labels=["source", "percentile"]
+    yield _labelled(lost, {name: source.lost for name, source in sources.items()})
+    yield _percentiles(
+        "tormag_source_delay_seconds",
+        "From the stamp until it was read",
+        "source",
+        {name: source.delay_us for name, source in sources.items()},
     )
-    for name, source in status.setpoints.by_source.items():
-        lost.add_metric([name], source.lost)
-        _add_percentiles(delay, name, source.delay_us)
-    yield from (lost, delay)
 
 
 def _loops(status: Status) -> Iterator[Metric]:
+    rates = status.rates
     rate = GaugeMetricFamily("tormag_loop_rate_hertz", "Runs per second", labels=["loop"])
-    counters = {
-        name: CounterMetricFamily(f"tormag_loop_{name}", text, labels=["loop"])
-        for name, text in (
-            ("runs", "Runs"),
-            ("merged", "Runs that were due together and became one"),
-            ("overruns", "Runs done after the next was due"),
-            ("stalls", "Runs done after ten were due"),
-        )
-    }
-    late = GaugeMetricFamily(
-        "tormag_loop_lateness_seconds", "How late runs began, of the last seconds", labels=["loop", "percentile"]
-    )
-    took = GaugeMetricFamily(
-        "tormag_loop_execution_seconds", "How long runs took, of the last seconds", labels=["loop", "percentile"]
-    )
-    for loop, group in status.rates.items():
-        rate.add_metric([loop], group.hz)
-        for name, counter in counters.items():
-            counter.add_metric([loop], getattr(group, name))
-        _add_percentiles(late, loop, group.lateness_us)
-        _add_percentiles(took, loop, group.exec_us)
+    yield _labelled(rate, {loop: group.hz for loop, group in rates.items()})
+    for name, text in (
+        ("runs", "Runs"),
+        ("merged", "Runs that were due together and became one"),
+        ("overruns", "Runs done after the next was due"),
+        ("stalls", "Runs done after ten were due"),
+    ):
+        counter = CounterMetricFamily(f"tormag_loop_{name}", text, labels=["loop"])
+        yield _labelled(counter, {loop: getattr(group, name) for loop, group in rates.items()})
+    for name, text, report in (
+        ("lateness", "How late runs began, of the last seconds", "lateness_us"),
+        ("execution", "How long runs took, of the last seconds", "exec_us"),
+    ):
+        reports = {loop: getattr(group, report) for loop, group in rates.items()}
+        yield _percentiles(f"tormag_loop_{name}_seconds", text, "loop", reports)
     blamed = CounterMetricFamily("tormag_late_ticks", "Late control ticks, by who is to blame", labels=["culprit"])
-    for culprit, count in status.late_ticks_by.items():
-        blamed.add_metric([culprit], count)
-    yield from (rate, *counters.values(), late, took, blamed)
+    yield _labelled(blamed, status.late_ticks_by)
 
 
 def _link(status: Status) -> Iterator[Metric]:
-    link = status.link
+    link, trip_us = status.link, status.link.round_trip_us
     yield GaugeMetricFamily("tormag_link_running", "Whether the device answers", float(link.state == "RUNNING"))
     for name, text, count in (
         ("losses", "Times the link was lost", link.losses),
@@ -183,18 +164,21 @@ def _link(status: Status) -> Iterator[Metric]:
     ):
         if count is not None:
             yield CounterMetricFamily(f"tormag_link_{name}", text, count)
-    if link.round_trip_us is not None:
+    if trip_us is not None:
         trip = GaugeMetricFamily("tormag_link_round_trip_seconds", "From a Drive to its State", labels=["percentile"])
-        for percentile in ("p50", "p99"):
-            trip.add_metric([percentile], getattr(link.round_trip_us, percentile) * MICRO)
-        yield trip
+        yield _labelled(trip, {"p50": trip_us.p50 * MICRO, "p99": trip_us.p99 * MICRO})
     yield CounterMetricFamily("tormag_peers_refused", "Connections that were not let in", status.peers.refused)
 
 
-def _scaled(value: float | None, unit: float) -> float | None:
-    return None if value is None else value * unit
+def _labelled(family: Labelled, values: Mapping[str, float]) -> Labelled:
+    for label, value in values.items():
+        family.add_metric([label], value)
+    return family
 
 
-def _add_percentiles(family: GaugeMetricFamily, label: str, report: ExecReport) -> None:
-    for percentile in PERCENTILES:
-        family.add_metric([label, percentile], getattr(report, percentile) * MICRO)
+def _percentiles(name: str, text: str, label: str, reports: Mapping[str, ExecReport]) -> Metric:
+    family = GaugeMetricFamily(name, text, labels=[label, "percentile"])
+    for labelled, report in reports.items():
+        for percentile in PERCENTILES:
+            family.add_metric([labelled, percentile], getattr(report, percentile) * MICRO)
+    return family

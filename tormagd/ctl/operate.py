@@ -11,24 +11,16 @@ POLL_S = 0.05
 BEGIN_S = 2.0
 "By then a device that took the command has said that it is busy, over the slowest link."
 
-DONE_TEXT = {
-    "enable": "enabled",
-    "disable": "disabled; the gap opens",
-    "pause": "paused; the gap is held",
-    "resume": "resumed",
-    "stop": "stopped and latched; the gap opens. tormagctl clear-fault when it is safe to go on",
-    "clear-fault": "fault cleared. tormagctl home, then enable",
-}
-DONE_STATES = {
-    "enable": ("ENABLED",),
-    "disable": ("DISABLED",),
-    "pause": ("PAUSED",),
-    "resume": ("ENABLED",),
-    "stop": ("FAULT",),
+DONE: dict[str, tuple[str, tuple[str, ...]]] = {
+    "enable": ("enabled", ("ENABLED",)),
+    "disable": ("disabled; the gap opens", ("DISABLED",)),
+    "pause": ("paused; the gap is held", ("PAUSED",)),
+    "resume": ("resumed", ("ENABLED",)),
+    "stop": ("stopped and latched; the gap opens. tormagctl clear-fault when it is safe to go on", ("FAULT",)),
     # while nothing is latched there is nothing to clear
-    "clear-fault": ("DISABLED", "ENABLED", "PAUSED"),
+    "clear-fault": ("fault cleared. tormagctl home, then enable", ("DISABLED", "ENABLED", "PAUSED")),
 }
-"The operating states after a command that was carried out."
+"What a command has done, and the operating states after it was."
 STOPPED_WITHOUT_DEVICE = (
     "latched, but no device is connected: nothing could be sent, and the gap does not open. The device is told to open "
     "it when it is back; tormagctl status shows the link"
@@ -46,45 +38,33 @@ def operate(client: Client, command: str) -> Outcome:
     is_needless = command == "clear-fault" and not client.status().faults
     result = client.request(command)
     state = result.get("operating_state")
-    if state not in DONE_STATES[command]:
-        raise CommandError(
-            Exit.REFUSED,
-            "not_done",
-            f"the daemon answers {command} with operating_state = {state!r}: it was not done",
-            "tormagctl status",
-        )
+    text, states = DONE[command]
+    if state not in states:
+        raise _not_done(f"the daemon answers {command} with operating_state = {state!r}: it was not done")
     if command == "stop" and result.get("is_connected") is False:
         return Outcome(result, STOPPED_WITHOUT_DEVICE, Exit.REFUSED)
     if is_needless:
         return Outcome(result, f"no fault is latched; it is {state}")
     if command == "clear-fault":
-        _watch_clearing(client)
-    return Outcome(result, DONE_TEXT[command])
-
-
-def _watch_clearing(client: Client) -> None:
-    """Raises CommandError (FAULT) where the device has not let go of its fault."""
-    until_s = time.monotonic() + COMES_BACK_S
-    while time.monotonic() < until_s:
-        _raise_fault(client.status(), "the fault came back")
-        time.sleep(POLL_S)
+        until_s = time.monotonic() + COMES_BACK_S
+        while time.monotonic() < until_s:
+            _raise_fault(client.status(), "the fault came back")
+            time.sleep(POLL_S)
+    return Outcome(result, text)
 
 
 def take(client: Client, source: str) -> Outcome:
     """Give the brake to `source`, whoever holds it."""
     result = client.request("take", source=source)
     if result.get("source") != source:
-        raise CommandError(
-            Exit.REFUSED,
-            "not_done",
-            f"the daemon answers that {result.get('source')!r} holds the brake, not {source!r}",
-            "tormagctl status",
-        )
+        raise _not_done(f"the daemon answers that {result.get('source')!r} holds the brake, not {source!r}")
     before = result.get("instead_of")
-    instead = (
-        f" instead of {before!r}; the force goes to its setpoints along a ramp" if before != source else " already"
-    )
-    return Outcome(result, f"{source!r} holds the brake{instead}")
+    instead = "already" if before == source else f"instead of {before!r}; the force goes to its setpoints along a ramp"
+    return Outcome(result, f"{source!r} holds the brake {instead}")
+
+
+def _not_done(what: str) -> CommandError:
+    return CommandError(Exit.REFUSED, "not_done", what, "tormagctl status")
 
 
 def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
@@ -120,7 +100,8 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
                     "look at the link in tormagctl status",
                 )
             if shows_progress:
-                print(f"\rhoming {elapsed_s:5.1f} s, gap {_gap(state)}   ", end="", file=sys.stderr, flush=True)
+                gap = "not known" if state.gap_mm is None else f"{state.gap_mm:.1f} mm"
+                print(f"\rhoming {elapsed_s:5.1f} s, gap {gap}   ", end="", file=sys.stderr, flush=True)
             time.sleep(POLL_S)
     finally:
         if shows_progress:
@@ -147,7 +128,3 @@ def in_fault(state: Status, what: str) -> CommandError:
         f"{what}: {', '.join(state.faults) or first.code}: {first.cause}",
         first.remedy or "tormagctl clear-fault, then home",
     )
-
-
-def _gap(state: Status) -> str:
-    return "not known" if state.gap_mm is None else f"{state.gap_mm:.1f} mm"

@@ -33,14 +33,8 @@ def exit_code(error: ClientError) -> Exit:
     """What `tormagctl` ends with after this error."""
     if isinstance(error, CommandError):
         return error.exit_code
-    for kind, code in (
-        (InFaultError, Exit.FAULT),
-        (UnreachableError, Exit.UNREACHABLE),
-        (SettingError, Exit.USAGE),
-    ):
-        if isinstance(error, kind):
-            return code
-    return Exit.REFUSED
+    codes = {InFaultError: Exit.FAULT, UnreachableError: Exit.UNREACHABLE, SettingError: Exit.USAGE}
+    return codes.get(type(error), Exit.REFUSED)
 
 
 def usage_error(message: str, hint: str) -> CommandError:

@@ -64,8 +64,14 @@ class Ports(msgspec.Struct, frozen=True):
 
 def ports(config: Config, root: Path = Path("/")) -> Outcome:
     """What is there now."""
-    machine = Machine(root)
-    found = survey(config, machine, _listed_serial_ports(), _detected_channels())
+    # it says at every start which makers' libraries are not installed
+    logging.getLogger("can").setLevel(logging.CRITICAL)
+    import can
+    from serial.tools.list_ports import comports
+
+    asked = sorted(set(can.VALID_INTERFACES) - set(NOT_ASKED))
+    channels = can.detect_available_configs(asked, timeout=DETECTION_S)
+    found = survey(config, Machine(root), comports(), channels)
     return Outcome(msgspec.to_builtins(found), _text(found, config, Colour(sys.stdout)))
 
 
@@ -75,7 +81,7 @@ def survey(config: Config, machine: Machine, listed: Iterable[Any], detected: It
     configured = machine.resolved(config.device.port) if _is_line(config) else ""
     if configured and machine.path(configured).exists():
         known.setdefault(configured, None)
-    holding, hidden = machine.all_holders(list(known))
+    holding, hidden = machine.holders(list(known))
     channels = [(str(entry["interface"]), str(entry["channel"])) for entry in detected]
     own = (str(config.device.options.get("interface")), config.device.port) if config.device.backend == "can" else None
     if own is not None and own not in channels:
@@ -117,20 +123,6 @@ def _is_up(machine: Machine, channel: str) -> bool | None:
         return machine.path(channel).exists()
     state = machine.text(f"/sys/class/net/{channel}/operstate")
     return None if state is None else state in ("up", "unknown")
-
-
-def _listed_serial_ports() -> list[Any]:
-    from serial.tools.list_ports import comports
-
-    return list(comports())
-
-
-def _detected_channels() -> Sequence[Mapping[str, Any]]:
-    # it says at every start which makers' libraries are not installed
-    logging.getLogger("can").setLevel(logging.CRITICAL)
-    import can
-
-    return can.detect_available_configs(sorted(set(can.VALID_INTERFACES) - set(NOT_ASKED)), timeout=DETECTION_S)
 
 
 def _text(found: Ports, config: Config, colour: Colour) -> str:

@@ -1,10 +1,8 @@
 """`tormagctl replay`: a black box run again, bit for bit, or with the simulator in place of the device.
 
-The running is `python -m tormagd.replay`, a process of its own: what operates a daemon does not load its core.
+The running is `python -m tormagd.replay`, a process of its own.
 """
 
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ from typing import Any
 import msgspec
 
 from tormagd.ctl.outcome import Exit, Outcome, usage_error
+from tormagd.ctl.process import answer_of
 
 LONGEST_S = 900.0
 "Half a minute takes some seconds, interpreted and simulated twice some minutes."
@@ -23,26 +22,28 @@ def replay(
     settings: Sequence[str],
     plant: str,
     faults: Sequence[str],
-    config: Path | None,
+    config_file: Path | None,
 ) -> Outcome:
     """Runs the file. An outcome that is not bit-exact has the exit code REFUSED. Raises CommandError (USAGE) where file
     or options cannot be used."""
-    command = [sys.executable, "-P", "-m", "tormagd.replay", f"--from={from_s!r}", f"--plant={plant}"]
-    command += [f"--set={setting}" for setting in settings] + [f"--fault={fault}" for fault in faults]
-    command += [f"--config={config}"] if config else []
+    arguments = [
+        f"--from={from_s!r}",
+        f"--plant={plant}",
+        *(f"--set={setting}" for setting in settings),
+        *(f"--fault={fault}" for fault in faults),
+        *([f"--config={config_file}"] if config_file else []),
+    ]
     try:
-        done = subprocess.run(
-            [*command, "--", str(path)], capture_output=True, text=True, timeout=LONGEST_S, check=False
+        result: dict[str, Any] = msgspec.json.decode(
+            answer_of("tormagd.replay", [*arguments, "--", str(path)], LONGEST_S)
         )
-    except subprocess.TimeoutExpired as error:
-        raise usage_error(f"{path}: not done after {LONGEST_S:g} s", "is it a black box?") from error
-    if done.returncode:
-        lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-        raise usage_error(lines[-1], "tormagctl blackbox makes one, and the daemon on a fault; tormagctl replay --help")
-    result: dict[str, Any] = msgspec.json.decode(done.stdout)
+    except TimeoutError as error:
+        raise usage_error(f"{path}: {error}", "is it a black box?") from error
+    except ChildProcessError as error:
+        hint = "tormagctl blackbox makes one, and the daemon on a fault; tormagctl replay --help"
+        raise usage_error(str(error), hint) from error
     notes = "".join(f"\nnot as it was: {each}" for each in result["differences"])
-    if not result["is_complete"]:
-        notes += "\nthe file is cut short"
+    notes += "" if result["is_complete"] else "\nthe file is cut short"
     if "rerun" not in result:
         return Outcome(result, _instead(result) + notes)
     text, is_exact = _rerun(result["rerun"])
@@ -50,9 +51,14 @@ def replay(
 
 
 def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
-    gaps = f"; {done['gaps']} gaps in it were passed over" if done["gaps"] else ""
+    notes = f"; {done['gaps']} gaps in it were passed over" if done["gaps"] else ""
+    first, difference = done["first_damage"], done["difference"]
+    if first is not None:
+        notes += (
+            f"; {done['damaged']:,} of them came damaged ({done['resynchronised']:,} resynchronisations), the first is "
+            f"frame {first['frame']:,} at {first['time_s']:.3f} s: {first['why']}"
+        )
     span = f"{done['ticks']:,} ticks from {done['from_s']:.3f} to {done['to_s']:.3f} s"
-    difference, notes = done["difference"], gaps + _damage(done)
     if difference is None:
         frames = f"{done['frames']:,} frames give the measurements again" if done["frames"] else "no frames are in it"
         return f"bit-exact, {span}; {done['snapshots']} snapshots of the state between them, too; {frames}{notes}", True
@@ -61,16 +67,6 @@ def _rerun(done: dict[str, Any]) -> tuple[str, bool]:
         f"tick {difference['tick']:,} at {difference['time_s']:.3f} s differs{frame}: {difference['field']} was "
         f"{difference['recorded']}, is {difference['replayed']}; before it bit-exact, {done['ticks']:,} ticks{notes}"
     ), False
-
-
-def _damage(done: dict[str, Any]) -> str:
-    first = done["first_damage"]
-    if first is None:
-        return ""
-    return (
-        f"; {done['damaged']:,} of them came damaged ({done['resynchronised']:,} resynchronisations), the first is "
-        f"frame {first['frame']:,} at {first['time_s']:.3f} s: {first['why']}"
-    )
 
 
 def _instead(result: dict[str, Any]) -> str:

@@ -1,14 +1,13 @@
 """`tormagctl scene`: which scenes there are, what one asks for, whether this configuration can give it, and how."""
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from tormagd.config import ConfigError
+from tormagd.config import Config, ConfigError
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+from tormagd.ctl.process import answer_of
 from tormagd.scenes.measured import Measured, MeasuredScene, is_met, measured, on_first, required
 from tormagd.scenes.scene import Scene, load_scene, shipped_scenes
 
@@ -16,6 +15,25 @@ LONGEST_S = 30.0
 "Of the daemon's own check, which takes half a second."
 TOLERANCES = (0.5, 1.0, 2.0)
 "Times the scene's own, for which the terms are stated."
+
+
+def scene(action: str, name: str | None, force: Path | None, config: Config, config_file: Path | None) -> Outcome:
+    """One of the five; without a name, of the configuration's scene."""
+    named = name or config.scene
+    match action:
+        case "list":
+            return list_scenes()
+        case "show":
+            return show_scene(named)
+        case "check":
+            return check_scene(named, config_file)
+        case "explain":
+            return explain_scene(named, config_file)
+    if name is None:
+        raise usage_error("scene new: the file to write is missing", "tormagctl scene new FILE.toml")
+    from tormagd.ctl.scene_new import new_scene
+
+    return new_scene(Path(name), force, config_file)
 
 
 def list_scenes() -> Outcome:
@@ -30,10 +48,7 @@ def list_scenes() -> Outcome:
 
 def show_scene(name: str) -> Outcome:
     """Everything one scene states, defaults included. Raises CommandError (USAGE) for an unknown or faulty one."""
-    try:
-        stated = msgspec.to_builtins(load_scene(name))
-    except ConfigError as error:
-        raise usage_error(str(error), "tormagctl scene list shows the shipped ones") from error
+    stated = msgspec.to_builtins(_loaded(name))
     tables = {key: value for key, value in stated.items() if value is not None}
     return Outcome(tables, as_toml(tables))
 
@@ -68,27 +83,27 @@ def check_scene(name: str, config: Path | None) -> Outcome:
     ]
     if scene.force.least_N < least_N:
         lines.append(f"           below {least_N:.2f} N it gets that: a passive device has a least force (limit F_MIN)")
-    if derived["missed_rms_N"] is None:
-        lines.append("signal     not stated: nothing is known of how fast the force changes")
-    else:
-        lines.append(
-            f"signal     the gap's speed alone misses {1e3 * derived['missed_rms_N']:.1f} mN of a tolerance of "
-            f"{1e3 * scene.force.tolerance_rms_N:g}, {derived['missed_share']:.1%} of the time is faster"
-        )
+    lines.append(
+        "signal     not stated: nothing is known of how fast the force changes"
+        if derived["missed_rms_N"] is None
+        else f"signal     the gap's speed alone misses {1e3 * derived['missed_rms_N']:.1f} mN of a tolerance of "
+        f"{1e3 * scene.force.tolerance_rms_N:g}, {derived['missed_share']:.1%} of the time is faster"
+    )
     if scene.signal is not None and scene.signal.setpoint_hz is not msgspec.UNSET:
         lines.append(f"           its publisher sends {scene.signal.setpoint_hz:g} times a second")
-    if share is None:
-        lines.append("cost       not measured: tools/required_terms.py does")
-    else:
-        lines.append(f"cost       {share:.1%} of a processor, {scene.budget.core_share:.0%} are allowed")
-        if share > scene.budget.core_share:
-            raise CommandError(
-                Exit.REFUSED,
-                "budget",
-                f"scene {scene.name}: its steps and plans take {share:.1%} of a processor: allowed is "
-                f"budget.core_share = {scene.budget.core_share:g}",
-                "leave terms out, or lower the rates: tormagctl scene explain says what that costs",
-            )
+    lines.append(
+        "cost       not measured: docs/guides/scene.md says how"
+        if share is None
+        else f"cost       {share:.1%} of a processor, {scene.budget.core_share:.0%} are allowed"
+    )
+    if share is not None and share > scene.budget.core_share:
+        raise CommandError(
+            Exit.REFUSED,
+            "budget",
+            f"scene {scene.name}: its steps and plans take {share:.1%} of a processor: allowed is "
+            f"budget.core_share = {scene.budget.core_share:g}",
+            "leave terms out, or lower the rates: tormagctl scene explain says what that costs",
+        )
     return Outcome(result, "\n".join(lines))
 
 
@@ -103,7 +118,7 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
             Exit.REFUSED,
             "not_measured",
             f"scene {scene.name} was not measured as it is now",
-            f"tools/required_terms.py {name} measures it, in some minutes",
+            "docs/guides/scene.md says how that is done, in some minutes",
         )
     file, found = known
     tolerance_N = found.tolerance_N
@@ -124,30 +139,38 @@ def explain_scene(name: str, config: Path | None) -> Outcome:
         "tolerance",
     ]
     for item in found.terms:
-        is_required = item.term not in found.left_out
         at_half, at_twice = ("in" if item.term in needed[factor] else "out" for factor in (0.5, 2.0))
         lines.append(
-            f"{item.term:{width}} {'out' if item.term in out else 'in':6s} {'in' if is_required else 'out':8s} "
+            f"{item.term:{width}} {'out' if item.term in out else 'in':6s} "
+            f"{'out' if item.term in found.left_out else 'in':8s} "
             f"{1e3 * item.frozen_added_N:11.1f} mN {1e3 * item.learning_added_N:13.1f} mN "
             f"{found.saved_us_s(item) / 1e4:8.2f}% {at_half:>10s} {at_twice:>9s}"
         )
     back = [item.term for item in found.terms if item.term not in needed[1.0] and item.term not in found.left_out]
-    if back:
-        lines.append(f"{', '.join(back)}: not required alone, but with the others out")
-    lines += ["", "true force, RMS    every term   required ones"]
-    for judged in found.judged:
-        how = "learning" if judged.is_learning else "frozen"
-        lines.append(f"{judged.plant} {how:9s} {1e3 * judged.full_N:7.1f} mN {1e3 * judged.chosen_N:10.1f} mN")
-    if not is_met(found.judged, tolerance_N):
-        lines.append("NOT MET: the full model itself is over the tolerance")
-    lines += ["", "every term  control  inference  RMS on sample 1"]
-    for at in found.rates:
-        mark = "  chosen" if at is found.at_chosen else ""
-        rms_mN = 1e3 * on_first(at.judged).chosen_N
-        lines.append(f"            {at.control_hz:4d} Hz  {at.inference_hz:6d} Hz  {rms_mN:7.1f} mN{mark}")
-    lines += ["", "search named     RMS on sample 1    core share"]
-    for named in found.searches:
-        lines.append(f"{named.search:15s} {1e3 * named.rms_N:12.1f} mN  {found.us_s(named.cost) / 1e4:10.2f}%")
+    lines += [
+        *([f"{', '.join(back)}: not required alone, but with the others out"] if back else []),
+        "",
+        "true force, RMS    every term   required ones",
+        *(
+            f"{it.plant} {'learning' if it.is_learning else 'frozen':9s} {1e3 * it.full_N:7.1f} mN "
+            f"{1e3 * it.chosen_N:10.1f} mN"
+            for it in found.judged
+        ),
+        *([] if is_met(found.judged, tolerance_N) else ["NOT MET: the full model itself is over the tolerance"]),
+        "",
+        "every term  control  inference  RMS on sample 1",
+        *(
+            f"            {at.control_hz:4d} Hz  {at.inference_hz:6d} Hz  {1e3 * on_first(at.judged).chosen_N:7.1f} mN"
+            f"{'  chosen' if at is found.at_chosen else ''}"
+            for at in found.rates
+        ),
+        "",
+        "search named     RMS on sample 1    core share",
+        *(
+            f"{named.search:15s} {1e3 * named.rms_N:12.1f} mN  {found.us_s(named.cost) / 1e4:10.2f}%"
+            for named in found.searches
+        ),
+    ]
     result = msgspec.to_builtins(found) | {
         "derived": derived,
         "required": {f"{factor:g}": names for factor, names in needed.items()},
@@ -180,14 +203,16 @@ def _loaded(name: str) -> Scene:
 
 def _derived(name: str, config: Path | None) -> dict[str, Any]:
     """What the daemon's own check says of the scene. It loads what no command of this tool does: model and solvers."""
-    command = [sys.executable, "-P", "-m", "tormagd.daemon.main", "--check", "--scene", name]
-    command += [] if config is None else ["--config", str(config)]
+    arguments = ["--check", "--scene", name, *([] if config is None else ["--config", str(config)])]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S, check=False)
-    except subprocess.TimeoutExpired as error:
-        raise CommandError(Exit.REFUSED, "not_checked", f"not done after {LONGEST_S:g} s", "try it again") from error
-    if done.returncode:
-        reason = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1].removeprefix("tormagd: ")
-        raise CommandError(Exit.REFUSED, "refused", reason, "docs/scenes.md says what each key asks of the device")
-    derived: dict[str, Any] = msgspec.json.decode(done.stdout)["derived"]
+        derived: dict[str, Any] = msgspec.json.decode(answer_of("tormagd.daemon.main", arguments, LONGEST_S))["derived"]
+    except TimeoutError as error:
+        raise CommandError(Exit.REFUSED, "not_checked", str(error), "try it again") from error
+    except ChildProcessError as error:
+        raise CommandError(
+            Exit.REFUSED,
+            "refused",
+            str(error).removeprefix("tormagd: "),
+            "docs/scenes.md says what each key asks of the device",
+        ) from error
     return derived

@@ -34,7 +34,7 @@ def new_scene(out: Path, force_file: Path | None, config: Path | None) -> Outcom
         raise usage_error(f"{out}: allowed is a new file in a folder that exists", "name another file")
     tables = _from_answers(out.stem) if force_file is None else _from_recording(out, force_file)
     try:
-        msgspec.convert(tables | {"insert": {"name": INSERTS[0], "model": _model(INSERTS[0])}}, Scene)
+        msgspec.convert(_with(tables, INSERTS[0]), Scene)
     except msgspec.ValidationError as error:
         raise usage_error(f"no scene can be made of this: {error}", "docs/scenes.md says what each key asks") from error
     insert, checked = _softest(out, tables, config)
@@ -73,17 +73,17 @@ def _softest(out: Path, tables: Tables, config: Path | None) -> tuple[str, Outco
     )
 
 
+def _with(tables: Tables, insert: str) -> Tables:
+    return tables | {"insert": {"name": insert, "model": "torque_" + insert.lower().replace("-", "_")}}
+
+
 def _write(out: Path, tables: Tables, insert: str) -> None:
-    out.write_text(as_toml(tables | {"insert": {"name": insert, "model": _model(insert)}}) + "\n", encoding="utf-8")
+    out.write_text(as_toml(_with(tables, insert)) + "\n", encoding="utf-8")
 
 
 def _has_reserve(tables: Tables, checked: Outcome) -> bool:
     most_N: float = checked.result["most_N"]
     return bool(tables["force"]["most_N"] <= RESERVED * most_N)
-
-
-def _model(insert: str) -> str:
-    return "torque_" + insert.lower().replace("-", "_")
 
 
 def _from_recording(out: Path, force_file: Path) -> Tables:
@@ -160,7 +160,5 @@ def _tables(
 
 def _rounded(value: float, direction: Callable[[float], int]) -> float:
     """To two digits."""
-    if value == 0.0:
-        return 0.0
-    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    unit = 10.0 ** (math.floor(math.log10(value or 1.0)) - 1)
     return float(f"{direction(round(value / unit, 6)) * unit:.3g}")

@@ -1,9 +1,11 @@
 """`tormagctl send`: publish setpoints at a steady rate."""
 
 import contextlib
+import math
 import signal
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
@@ -11,11 +13,13 @@ import zmq
 
 from tormagd.config import Endpoints
 from tormagd.ctl.interrupt import interrupted_by
-from tormagd.ctl.outcome import CommandError, Exit, Outcome
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.ctl.watch import Watch, require_range
-from tormagd.ctl.waveform import Waveform
+from tormagd.ctl.waveform import Waveform, WaveformError, read_csv, shape
+from tormagd.force_file import ForceFileError
 from tormagd_client.blocking import Client
 from tormagd_client.errors import UnreachableError, unreachable
+from tormagd_client.messages import MAX_PREVIEW_SAMPLES
 from tormagd_client.wire import Numbering, connect, keys_of
 
 
@@ -29,11 +33,51 @@ class Stream(NamedTuple):
 
 
 def send(
-    endpoints: Endpoints, waveform: Waveform, duration_s: float, stream: Stream, wait_s: float, *, is_blind: bool
+    endpoints: Endpoints,
+    wait_s: float,
+    what: str,
+    rate_hz: float,
+    duration_s: float | None,
+    from_N: float,
+    to_N: float,
+    frequency_hz: float,
+    source: str,
+    valid_for_ms: float,
+    preview_ms: float,
+    is_blind: bool,
 ) -> Outcome:
-    """Publish `waveform` for `duration_s` or until interrupted, and see what becomes of it, unless `is_blind`.
+    """Publish a shape or a CSV file for `duration_s` or until interrupted, and see what becomes of it, unless
+    `is_blind`. Without a duration a file lasts as long as it is, a computed shape ten seconds.
 
-    Each setpoint has its own deadline, counted from the start, so that lateness does not add up. A setpoint whose
+    Raises CommandError: USAGE for what is not to be sent, and as `_sent`.
+    """
+    try:
+        if what.lower().endswith(".csv"):
+            waveform = read_csv(Path(what))
+            lasts_s = min(waveform.duration_s, duration_s or math.inf)
+        else:
+            lasts_s = duration_s or 10.0
+            waveform = shape(what, from_N, to_N, frequency_hz, lasts_s)
+    except (WaveformError, ForceFileError) as error:
+        raise usage_error(str(error), "correct it and send again; tormagctl send --help shows the choices") from error
+    if valid_for_ms < 1e3 / rate_hz:
+        raise usage_error(
+            f"--valid-for-ms = {valid_for_ms:g}: allowed is at least one period, {1e3 / rate_hz:g} ms",
+            "raise --valid-for-ms or --rate, or every setpoint is stale before the next comes",
+        )
+    preview = round(preview_ms * rate_hz * 1e-3)
+    if preview > MAX_PREVIEW_SAMPLES:
+        raise usage_error(
+            f"--preview-ms = {preview_ms:g}: {preview} setpoints at {rate_hz:g} Hz; allowed are {MAX_PREVIEW_SAMPLES}",
+            "look less far ahead",
+        )
+    return _sent(endpoints, waveform, lasts_s, Stream(rate_hz, source, valid_for_ms, preview), wait_s, is_blind)
+
+
+def _sent(
+    endpoints: Endpoints, waveform: Waveform, duration_s: float, stream: Stream, wait_s: float, is_blind: bool
+) -> Outcome:
+    """Each setpoint has its own deadline, counted from the start, so that lateness does not add up. A setpoint whose
     successor is due already is left out: the newest one wins anyway. Raises CommandError: UNREACHABLE where no daemon
     answers or subscribes within `wait_s`, or where it leaves on the way; FAULT as soon as the device is in FAULT;
     REFUSED where the scene does not allow such forces (nothing is sent), or the setpoints were not rendered.

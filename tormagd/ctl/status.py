@@ -9,7 +9,6 @@ from tormagd_client.blocking import Client
 from tormagd_client.messages import (
     Explained,
     LinkReport,
-    PeerReport,
     PeersReport,
     RateReport,
     SetpointReport,
@@ -38,11 +37,13 @@ def status_text(known: Status, colour: Colour) -> str:
     """The snapshot in a dozen lines, most important first; what the daemon does not know shows as `-`."""
     state = known.operating_state
     paint = {"ENABLED": colour.green, "PAUSED": colour.yellow, "FAULT": colour.red}.get(state, colour.bold)
+    is_running = known.link.state == "RUNNING"
     flags = ["homed" if known.is_homed else colour.yellow("not homed"), *(["busy"] if known.is_busy else [])]
     lines = [
         f"state     {paint(state)}, {', '.join(flags)}",
         *_codes(known.faults, known.fault_details, "fault", colour.red),
-        *_next(known),
+        # without a device none of them is taken: the link says what comes first
+        *([f"next      {', '.join(known.next_commands)}"] if known.next_commands and is_running else []),
         *_codes(known.limits, known.limit_details, "held by", colour.yellow),
         f"force     asked {_number(known.setpoint_cf, 'N')}, governed {_number(known.governed_cf, 'N')}, "
         f"measured {_number(known.measured_cf, 'N')}",
@@ -60,35 +61,23 @@ def status_text(known: Status, colour: Colour) -> str:
         f"daemon    {known.version}, scene {known.scene}, up {_number(known.uptime_s, 's', 0)}",
         *([f"terms out {', '.join(known.terms_out)}"] if known.terms_out else []),
         *_core(known.build, colour),
+        *_said("black box ", known.black_box.newest, str),
+        *_said("black box ", known.black_box.folder and known.black_box.refusal, colour.yellow),
+        *_said("refused   ", known.setpoints.last_refusal, colour.yellow),
     ]
-    box = known.black_box
-    if box.newest:
-        lines.append(f"black box {box.newest}")
-    if box.folder and box.refusal:
-        lines.append(f"black box {colour.yellow(box.refusal)}")
-    if known.setpoints.last_refusal:
-        lines.append(f"refused   {colour.yellow(known.setpoints.last_refusal)}")
     return "\n".join(lines)
-
-
-def _next(known: Status) -> list[str]:
-    """The commands that lead to ENABLED. Without a device none of them is taken: the link says what comes first."""
-    has_way = known.next_commands and known.link.state == "RUNNING"
-    return [f"next      {', '.join(known.next_commands)}"] if has_way else []
 
 
 def _peers(peers: PeersReport, colour: Colour) -> list[str]:
     """Who was not let in or sent too much, with the newest and the worst of them; nothing while nobody was."""
-    lines = []
-    if peers.refused:
-        lines.append(f"peers     {colour.yellow(f'{peers.refused} refused')}")
-    if peers.dropped:
-        lines.append(f"peers     {colour.yellow(f'{peers.dropped} messages not read')}")
-    return [*lines, *(f"          {_peer(each)}" for each in (*peers.refusals[-1:], *peers.drops[:1]))]
-
-
-def _peer(peer: PeerReport) -> str:
-    return f"{peer.endpoint}: {peer.address}{f', key {peer.key}' if peer.key else ''}: {peer.reason} ({peer.count})"
+    return [
+        *_said("peers     ", peers.refused and f"{peers.refused} refused", colour.yellow),
+        *_said("peers     ", peers.dropped and f"{peers.dropped} messages not read", colour.yellow),
+        *(
+            f"          {it.endpoint}: {it.address}{f', key {it.key}' if it.key else ''}: {it.reason} ({it.count})"
+            for it in (*peers.refusals[-1:], *peers.drops[:1])
+        ),
+    ]
 
 
 def _device(known: Status, colour: Colour) -> list[str]:
@@ -106,8 +95,8 @@ def _device(known: Status, colour: Colour) -> list[str]:
 
 def _core(build: str, colour: Colour) -> list[str]:
     """Which build of the core runs, and what it costs; nothing where an older daemon does not say."""
-    if not build or build == "compiled":
-        return [f"core      {build}"] if build else []
+    if build in ("", "compiled"):
+        return _said("core      ", build, str)
     return [f"core      {colour.yellow(build)}", *_explained(COST, REMEDY, str)]
 
 
@@ -130,17 +119,15 @@ def _source(name: str, source: SourceReport, colour: Colour) -> list[str]:
         f"delay {delay.p50 * 1e-3:.1f} ms (p50) {delay.p99 * 1e-3:.1f} ms (p99)",
         f"jitter {source.jitter_us * 1e-3:.1f} ms",
         f"{source.lost} lost",
-        "clock not known yet" if behind is None else f"clock {_clock(behind)}",
+        "clock not known yet"
+        if behind is None
+        else f"clock {abs(behind):.1f} ms {'behind' if behind >= 0.0 else 'ahead'}",
     ]
     if source.clock is not None and source.clock.windows >= SURE_WINDOWS:
         parts[-1] += f", {source.clock.drift_ppm:+.0f} ppm"
     if source.restarts:
         parts.append(f"{source.restarts} restarts")
     return [f"source    {name!r}: {', '.join(parts)}", *_explained(source.cause, source.remedy, colour.yellow)]
-
-
-def _clock(behind_ms: float) -> str:
-    return f"{abs(behind_ms):.1f} ms {'behind' if behind_ms >= 0.0 else 'ahead'}"
 
 
 def _way(way: WayReport | None, colour: Colour) -> list[str]:
@@ -168,17 +155,20 @@ def _way(way: WayReport | None, colour: Colour) -> list[str]:
 
 def _codes(codes: Sequence[str], details: Sequence[Explained], label: str, paint: Callable[[str], str]) -> list[str]:
     known = {explained.code: explained for explained in details}
-    lines = []
-    for code in codes:
-        lines.append(f"{label:<9} {paint(code)}")
-        if code in known:
-            lines += _explained(known[code].cause, known[code].remedy, str)
-    return lines
+    unknown = Explained("", "", "")
+    told = ((code, known.get(code, unknown)) for code in codes)
+    return [
+        line for code, why in told for line in (f"{label:<9} {paint(code)}", *_explained(why.cause, why.remedy, str))
+    ]
 
 
 def _explained(cause: str, remedy: str, paint: Callable[[str], str]) -> list[str]:
-    lines = [f"          {paint(cause)}"] if cause else []
-    return [*lines, f"          next: {remedy}"] if remedy else lines
+    return [*_said(" " * 10, cause, paint), *_said(" " * 10, remedy and f"next: {remedy}", str)]
+
+
+def _said(label: str, text: str | int | None, paint: Callable[[str], str]) -> list[str]:
+    """A line of this text; none where there is nothing to say."""
+    return [f"{label}{paint(str(text))}"] if text else []
 
 
 def _rate(name: str, group: RateReport, colour: Colour) -> str:

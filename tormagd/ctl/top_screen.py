@@ -80,14 +80,17 @@ def _head(seen: Seen, width: int) -> Text:
     head.append(f"  {', '.join(flags)}", "" if newest.is_homed else "yellow")
     if seen.silent_s > SILENT_S:
         head.append(f"  nothing heard for {seen.silent_s:.0f} s", "bold red")
-    about = f"{status.scene} · up {_duration(status.uptime_s)} · tormagd {status.version} · q ends"
+    minutes = status.uptime_s / 60.0
+    up = (
+        f"{minutes / 60.0:.1f} h"
+        if minutes >= 60.0
+        else f"{minutes:.0f} min"
+        if minutes >= 1.0
+        else f"{60.0 * minutes:.0f} s"
+    )
+    about = f"{status.scene} · up {up} · tormagd {status.version} · q ends"
     head.append(about.rjust(width - head.cell_len), "dim")
     return head
-
-
-def _duration(seconds: float) -> str:
-    minutes, hours = seconds / 60.0, seconds / 3600.0
-    return f"{hours:.1f} h" if hours >= 1.0 else f"{minutes:.0f} min" if minutes >= 1.0 else f"{seconds:.0f} s"
 
 
 def _curves(seen: Seen, width: int, rows: int, *, is_apart: bool) -> Table:
@@ -159,16 +162,13 @@ def _codes(seen: Seen, width: int) -> Table:
     for code in newest.faults:
         table.add_row(Text("FAULT", "bold red"), _code(code, "", "bold red", seen.explained))
     for code, count in times.most_common():
-        share = f" {_percent(count / len(seen.telemetry))} of the time"
+        share = count / len(seen.telemetry)
+        how_long = f" {'under 1%' if share < 0.01 else f'{share:.0%}'} of the time"
         style = "yellow" if code in newest.limits else "dim yellow"
-        table.add_row(Text("held by", style), _code(code, share, style, seen.explained))
+        table.add_row(Text("held by", style), _code(code, how_long, style, seen.explained))
     if not table.row_count:
         table.add_row(Text("held by", "bold"), Text("nothing, and there is no fault", "green"))
     return table
-
-
-def _percent(share: float) -> str:
-    return "under 1%" if share < 0.01 else f"{share:.0%}"
 
 
 def _code(code: str, how_long: str, style: str, explained: Mapping[str, Explained]) -> Text:

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from typing import Any
 
 import msgspec
 
@@ -24,16 +25,6 @@ SPOILING = ("RANGE", "F_MAX")
 "Limits that say: another force than the one asked for. Below F_min a device gives F_min, which is what 0 N means."
 
 
-class _Force(msgspec.Struct):
-    least_N: float
-    most_N: float
-
-
-class _Scene(msgspec.Struct):
-    name: str
-    force: _Force
-
-
 class Fate(msgspec.Struct, frozen=True):
     """How many setpoints were taken, in which share of the looks they were rendered (None: there was none in so short a
     time), and what held the force at times."""
@@ -46,20 +37,21 @@ class Fate(msgspec.Struct, frozen=True):
 def require_range(known: Description, least_N: float, most_N: float) -> None:
     """Raises CommandError (REFUSED) where the daemon's scene does not allow forces of that range."""
     try:
-        scene = msgspec.convert(known.scene, _Scene)
-    except msgspec.ValidationError as error:
+        force = msgspec.convert(known.scene["force"], dict[str, Any])
+        allowed = msgspec.convert((force["least_N"], force["most_N"]), tuple[float, float])
+    except (KeyError, msgspec.ValidationError) as error:
         raise CommandError(
             Exit.UNREACHABLE,
             "unintelligible",
             f"the scene of tormagd {known.version} is not understood: {error}",
             "install tormagd and tormagctl of the same version, and start the daemon again",
         ) from error
-    if not scene.force.least_N <= least_N <= most_N <= scene.force.most_N:
+    if not allowed[0] <= least_N <= most_N <= allowed[1]:
         raise CommandError(
             Exit.REFUSED,
             "out_of_range",
-            f"{least_N:g}..{most_N:g} N is asked: allowed is {scene.force.least_N:g}..{scene.force.most_N:g} N "
-            f"in scene {scene.name}; nothing was sent",
+            f"{least_N:g}..{most_N:g} N is asked: allowed is {allowed[0]:g}..{allowed[1]:g} N "
+            f"in scene {known.scene.get('name', '-')}; nothing was sent",
             "ask within the range, or let the daemon run another scene",
         )
 
@@ -72,12 +64,12 @@ def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandE
     if status.operating_state == "FAULT":
         return in_fault(status, "the device is in FAULT")
     if status.operating_state != "ENABLED":
-        next_ = {"PAUSED": "tormagctl resume"}.get(status.operating_state)
+        enable = f"{'' if status.is_homed else 'tormagctl home, then '}tormagctl enable"
         return CommandError(
             Exit.REFUSED,
             status.operating_state.lower(),
             f"the device is {status.operating_state}",
-            next_ or f"{'' if status.is_homed else 'tormagctl home, then '}tormagctl enable",
+            "tormagctl resume" if status.operating_state == "PAUSED" else enable,
         )
     report = status.setpoints.by_source.get(source)
     why = {each.code: each for each in status.limit_details}
@@ -87,20 +79,20 @@ def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandE
             Exit.REFUSED, "not_heard", f"the daemon has taken nothing of {source!r}{heard}", "tormagctl status"
         )
     if report.state == "refused":
-        other = why.get("OTHER_SOURCE")
-        holder = status.setpoints.newest_source
-        return CommandError(
-            Exit.REFUSED,
-            "other_source",
-            other.cause if other else f"{holder!r} holds the brake, not {source!r}",
-            other.remedy if other else f"end the other one, or tormagctl take {source}",
+        other = why.get("OTHER_SOURCE") or Explained(
+            "OTHER_SOURCE",
+            f"{status.setpoints.newest_source!r} holds the brake, not {source!r}",
+            f"end the other one, or tormagctl take {source}",
         )
-    if report.state == "stale" and not is_over:
-        return _by_limit("STALE", why, f"the setpoints of {source!r} come too late, or not at all")
-    for code in SPOILING:
-        if code in status.limits and not is_over:
-            return _by_limit(code, why, f"the force is held by the limit {code}")
-    return None
+        return CommandError(Exit.REFUSED, "other_source", other.cause, other.remedy)
+    spoiling = {code: f"the force is held by the limit {code}" for code in SPOILING if code in status.limits}
+    if report.state == "stale":
+        spoiling = {"STALE": f"the setpoints of {source!r} come too late, or not at all"}
+    if is_over or not spoiling:
+        return None
+    code, otherwise = next(iter(spoiling.items()))
+    message = f"{code}: {why[code].cause}" if code in why else otherwise
+    return CommandError(Exit.REFUSED, code.lower(), message, why[code].remedy if code in why else "tormagctl status")
 
 
 class Watch:
@@ -121,16 +113,15 @@ class Watch:
     def look(self) -> None:
         """Between two setpoints. Raises CommandError (FAULT) where the device is in FAULT; tells a person on stderr
         of what else keeps the force from being rendered."""
+        now_s = time.monotonic()
         if self._look_s is None:  # an answer may overtake the first setpoint
-            self._look_s = time.monotonic() + LOOK_S
-        if self._asked is None:
-            if time.monotonic() >= self._look_s:
-                self._asked = self._client.ask("status")
-            return
-        result = self._client.answer(self._asked)
+            self._look_s = now_s + LOOK_S
+        result = None if self._asked is None else self._client.answer(self._asked)
+        if self._asked is None and now_s >= self._look_s:
+            self._asked = self._client.ask("status")
         if result is None:
             return
-        self._asked, self._look_s = None, time.monotonic() + LOOK_S
+        self._asked, self._look_s = None, now_s + LOOK_S
         status = understood(result)
         held = held_back(status, self._source)
         self._raise_fault(held)
@@ -179,13 +170,3 @@ class Watch:
 def _accepted(status: Status, source: str) -> int:
     report = status.setpoints.by_source.get(source)
     return 0 if report is None else report.accepted
-
-
-def _by_limit(code: str, why: dict[str, Explained], otherwise: str) -> CommandError:
-    known = why.get(code)
-    return CommandError(
-        Exit.REFUSED,
-        code.lower(),
-        f"{code}: {known.cause}" if known else otherwise,
-        known.remedy if known else "tormagctl status",
-    )

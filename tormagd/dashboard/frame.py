@@ -18,13 +18,6 @@ class Held(msgspec.Struct, frozen=True):
     is_now: bool
 
 
-class Explanation(msgspec.Struct, frozen=True):
-    """Why a fault or a limit is there, and what to do about it."""
-
-    cause: str
-    remedy: str
-
-
 class Frame(msgspec.Struct, frozen=True, kw_only=True):
     """Curves of the same length, the oldest first, `t_s` since 1970; what is not known is null.
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import msgspec
 
-from tormagd.dashboard.frame import Explanation, Frame, Held, late_counts
+from tormagd.dashboard.frame import Frame, Held, late_counts
 from tormagd.output import printable
 from tormagd_client.aio import AsyncClient
 from tormagd_client.errors import ClientError
-from tormagd_client.messages import Description, MessageError, Status, Telemetry
+from tormagd_client.messages import Description, Explained, MessageError, Status, Telemetry
 
 FRAME_S = 0.1
 STATUS_S = 1.0
@@ -34,7 +34,7 @@ class Live:
         self._kept: deque[Telemetry] = deque(maxlen=KEPT)
         self._new: list[Telemetry] = []
         self.browsers: set[asyncio.Queue[bytes]] = set()
-        self._explained: dict[str, Explanation] = {}
+        self._explained: dict[str, Explained] = {}
         self._heard_s = time.monotonic()
         self._why_silent = ""
         self._portrait = _portrait(description)
@@ -116,7 +116,7 @@ class Live:
 
     def _learn(self, status: Status) -> None:
         for each in (*status.fault_details, *status.limit_details):
-            self._explained[each.code] = Explanation(each.cause, each.remedy)
+            self._explained[each.code] = each
 
     def _shown_status(self) -> dict[str, object]:
         return {"status": self._status, "explained": self._explained}

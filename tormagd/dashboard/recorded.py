@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from tormagd.dashboard.frame import SHOWN_S, Explanation, Frame, Held, late_counts
+from tormagd.dashboard.frame import SHOWN_S, Frame, Held, late_counts
 from tormagd.recording.reader import Recording
 from tormagd.recording.series import BREAK_S, Band, Series, bands, series, start_ns, tracking_rms_N
 from tormagd.safety.codes import FAULTS, LIMITS
-from tormagd_client.messages import PortraitReport
+from tormagd_client.messages import Explained, PortraitReport
 
 STEP_S = 0.02
 "Between two points of a curve, as live."
@@ -55,7 +55,9 @@ class Recorded:
             "scene": (self._recording.described("scene", dict[str, Any]) or {}).get("name", ""),
             "portrait": self._recording.described("portrait", PortraitReport),
             "overview": self._overview(),
-            "explained": {code: Explanation(known.cause, known.remedy) for code, known in (LIMITS | FAULTS).items()},
+            "explained": {
+                code: Explained(code, known.cause, known.remedy) for code, known in (LIMITS | FAULTS).items()
+            },
         }
 
     def frame(self, at_s: float) -> Frame:

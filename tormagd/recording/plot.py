@@ -48,8 +48,8 @@ def figure(recording: Recording, title: str) -> Figure:
     duty.set_ylim(-1.08, 1.08)
     _lanes(lane, states, limits, faults)
     for axes in (force, gap, duty):
-        for band in faults:
-            _shade(axes, band.spans_s, RED)
+        for start, end in (span for band in faults for span in band.spans_s):
+            axes.axvspan(start, end, color=RED, alpha=0.12, linewidth=0, zorder=0)
 
     when = datetime.fromtimestamp(begin / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     lane.set_xlabel(f"seconds since {when}")
@@ -114,11 +114,6 @@ def _dress(axes: Axes, label: str, quantity: str) -> None:
         axes.text(0.5, 0.5, f"no {quantity} recorded", transform=axes.transAxes, ha="center", va="center", color=GREY)
 
 
-def _shade(axes: Axes, spans_s: Iterable[tuple[float, float]], colour: str) -> None:
-    for start, end in spans_s:
-        axes.axvspan(start, end, color=colour, alpha=0.12, linewidth=0, zorder=0)
-
-
 def _lanes(axes: Axes, states: tuple[Band, ...], limits: tuple[Band, ...], faults: tuple[Band, ...]) -> None:
     """One lane for the operating state, one for every limit and fault that occurred, each with its name and share."""
     rows: list[tuple[str, list[tuple[Band, str]]]] = []
@@ -146,13 +141,12 @@ def _lanes(axes: Axes, states: tuple[Band, ...], limits: tuple[Band, ...], fault
 def _name_spans(axes: Axes, band: Band, row: int) -> None:
     """The state's name inside its longest stretch; the clip keeps it from running over its neighbours' ends."""
     start, end = max(band.spans_s, key=lambda span: span[1] - span[0])
-    dark = band.name in ("ENABLED", "FAULT")
     axes.annotate(
         band.name,
         ((start + end) / 2, row),
         ha="center",
         va="center",
         fontsize=8,
-        color="white" if dark else BLACK,
+        color="white" if band.name in ("ENABLED", "FAULT") else BLACK,
         clip_on=True,
     )

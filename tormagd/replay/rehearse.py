@@ -94,7 +94,9 @@ def script(columns: tuple[str, ...], entries: list[Any]) -> Script:
         for entry in entries:
             if isinstance(entry, list) and entry and entry[0] == journal.PLAN:
                 now_s, fields = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
-                setpoints.append((now_s - first_s, None if fields is None else _moved(TimedSetpoint(*fields), first_s)))
+                setpoints.append(
+                    (now_s - first_s, None if fields is None else _later(TimedSetpoint(*fields), -first_s))
+                )
             elif isinstance(entry, list) and entry and entry[0] == journal.COMMAND:
                 name, now_s, was_refused = msgspec.convert(entry[1:4], tuple[str, float, bool])
                 if not was_refused:
@@ -120,7 +122,8 @@ def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Seque
     try:
         injected = [parse_fault(fault) for fault in faults]
         delayed = [fault._replace(at_s=fault.at_s + todo.begins_s) for fault in injected]
-        device = VirtualDevice(load_plant(plant), _later(todo.hand, todo.begins_s), delayed, SEED)
+        hand = RecordedHand(tuple(time_s + todo.begins_s for time_s in todo.hand.times_s), todo.hand.positions_mm)
+        device = VirtualDevice(load_plant(plant), hand, delayed, SEED)
     except (FaultError, PlantError) as error:
         raise ReplayError(str(error)) from error
     loop = ClosedLoop(config, core.stepper, core.planner, device)
@@ -156,7 +159,7 @@ def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
             commands.pop()
         while setpoints and setpoints[-1][0] <= time_s:
             _, setpoint = setpoints.pop()
-            newest = None if setpoint is None else setpoint.replaced(stamp_s=setpoint.stamp_s + todo.begins_s)
+            newest = None if setpoint is None else _later(setpoint, todo.begins_s)
         sample = loop.tick(newest)
         for fault in sample.state.safety.faults:
             happened.faults.setdefault(str(fault), round(time_s, 3))
@@ -181,8 +184,8 @@ def _add_limits(limits: dict[str, float], held: Sequence[str], time_s: float) ->
         limits[limit] = round(limits.get(limit, 0.0) + time_s, 6)
 
 
-def _moved(setpoint: TimedSetpoint, first_s: float) -> TimedSetpoint:
-    return setpoint.replaced(stamp_s=setpoint.stamp_s - first_s)
+def _later(setpoint: TimedSetpoint, by_s: float) -> TimedSetpoint:
+    return setpoint.replaced(stamp_s=setpoint.stamp_s + by_s)
 
 
 def _hand(ticks: list[TickRecord]) -> RecordedHand:
@@ -193,7 +196,3 @@ def _hand(ticks: list[TickRecord]) -> RecordedHand:
             places.setdefault(tick.sensed_s - ticks[0].monotonic_s, tick.device_handle_mm)
     times_s = sorted(places) or [0.0]
     return RecordedHand(tuple(times_s), tuple(places.get(time_s, 0.0) for time_s in times_s))
-
-
-def _later(hand: RecordedHand, by_s: float) -> RecordedHand:
-    return RecordedHand(tuple(time_s + by_s for time_s in hand.times_s), hand.positions_mm)

@@ -7,27 +7,29 @@ import msgspec
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd import keeping
-from tormagd.control import journal
+from tormagd.control import (
+    device_fit,
+    estimate,
+    handle,
+    homing,
+    journal,
+    lateness,
+    periodicity,
+    pid,
+    plausible,
+    remembered,
+    restraint,
+    sensor,
+    sensor_zero,
+    sight,
+    skill,
+    slow_friction,
+    trajectory,
+)
 from tormagd.control.core import Core
-from tormagd.control.device_fit import DeviceFit
-from tormagd.control.estimate import Estimate, Handle
 from tormagd.control.governor import GovernorState, TimedSetpoint
-from tormagd.control.handle import HandleWatch
-from tormagd.control.homing import Homing
-from tormagd.control.lateness import Lateness
-from tormagd.control.periodicity import Guess, Periodicity
-from tormagd.control.pid import PidState
 from tormagd.control.plan import Outside, Plan, PlanState, Shown
-from tormagd.control.plausible import Leap
-from tormagd.control.remembered import Remembered
-from tormagd.control.restraint import Restraint
-from tormagd.control.sensor import Past, Sensor
-from tormagd.control.sensor_zero import Level, SensorZero
-from tormagd.control.sight import Sight
-from tormagd.control.skill import Skill
-from tormagd.control.slow_friction import SlowFriction
 from tormagd.control.step import Acted, StepOutput, StepState
-from tormagd.control.trajectory import Expected, Reference
 from tormagd.daemon.inference_loop import PLAN_ERRORS
 from tormagd.daemon.telemetry import tick_record
 from tormagd.exact import first_difference, kinds, packed, plain, restored
@@ -49,23 +51,43 @@ from tormagd.safety.operating_state import (
 from tormagd_client.messages import TickRecord
 
 KNOWN = kinds(
-    *(
-        StepState,
-        Acted,
-        SafetyState,
-        OperatingState,
-        DeviceRequest,
-        Fault,
-        Limit,
-        Estimate,
-        Handle,
-        Turn,
-        Reference,
-        Expected,
-    ),
-    *(PidState, Sight, Leap, Homing, PlanState, GovernorState, Periodicity, Skill, Guess, Restraint, Lateness, Plan),
-    *(Outside, Shown, DeviceFit, Sensor, Past, SlowFriction, SensorZero, Level, HandleWatch, Remembered),
-    *(Conditions, DeviceMode, Switches),
+    StepState,
+    Acted,
+    SafetyState,
+    OperatingState,
+    DeviceRequest,
+    Fault,
+    Limit,
+    estimate.Estimate,
+    estimate.Handle,
+    Turn,
+    trajectory.Reference,
+    trajectory.Expected,
+    pid.PidState,
+    sight.Sight,
+    plausible.Leap,
+    homing.Homing,
+    PlanState,
+    GovernorState,
+    periodicity.Periodicity,
+    skill.Skill,
+    periodicity.Guess,
+    restraint.Restraint,
+    lateness.Lateness,
+    Plan,
+    Outside,
+    Shown,
+    device_fit.DeviceFit,
+    sensor.Sensor,
+    sensor.Past,
+    slow_friction.SlowFriction,
+    sensor_zero.SensorZero,
+    sensor_zero.Level,
+    handle.HandleWatch,
+    remembered.Remembered,
+    Conditions,
+    DeviceMode,
+    Switches,
 )
 "All that the core's states consist of."
 UNTAKEN = (

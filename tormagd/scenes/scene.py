@@ -307,6 +307,6 @@ def _required(scene: Scene, path: Path) -> Terms:
         if known.fingerprint == scene.fingerprint:
             return EVERY_TERM.without(*known.left_out)
     raise ConfigError(
-        f'{path}: terms = "required": this scene was not measured as it is now: allowed is a scene of '
-        "tools/required_terms.py, which also says what stands in its place in a table [terms]"
+        f'{path}: terms = "required": this scene was not measured as it is now: allowed is one that was: '
+        "docs/guides/scene.md says how, and what stands in its place in a table [terms]"
     )
