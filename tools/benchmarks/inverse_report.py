@@ -24,7 +24,7 @@ COLUMNS = {
     "Pareto": "{pareto}",
 }
 LEAST_SHOWN_MT = 1e-6
-"Newton comes to 1e-11 mT, which would squeeze what matters; the axis says so."
+"Newton comes to 1e-11 mT, which would squeeze what matters; the page says so."
 MARKERS = {
     "thesis-linear": "v",
     "linear-argmin": "^",
@@ -36,15 +36,15 @@ MARKERS = {
 }
 TEXT = """# Speed against accuracy of the inverse
 
-Written by `python tools/evidence.py inverse` with [its figures](evidence/inverse.json), which have every variant; do not
-edit. Synthetic throughout: {workload}. One process, one thread, garbage collector frozen as in the daemon
+Written by `python tools/evidence.py inverse` with [its figures](evidence/inverse.json), which have every variant; do
+not edit. Synthetic throughout: {workload}. One process, one thread, garbage collector frozen as in the daemon
 ({environment}).
 
 A solve gets a state of the handle, a force and the last field, and answers with a field, its confidence and its reach.
 The curve of force over field for that state is made in the time shown. Two errors are kept apart. The *solver error* is
 the distance to the network's own nearest root, found by bisection that shares no code with the searches. The *plant
-error* is the distance to the field at which the simulated element gives the force; it holds the network's error too, and
-no search can be better than its network. *Force* is the plant's force at the answer less the force asked. One force
+error* is the distance to the field at which the simulated element gives the force; it holds the network's error too,
+and no search can be better than its network. *Force* is the plant's force at the answer less the force asked. One force
 reading's noise alone makes {noise_bound_mae_mT:.2f} mT.
 
 ![p50 against the solver error and against the plant error](images/inverse_trade.png)
@@ -62,7 +62,7 @@ reading's noise alone makes {noise_bound_mae_mT:.2f} mT.
 
 Times are from several rounds over all variants, so that a disturbance of the machine meets all alike; p99 still holds
 whatever else ran. *Pareto* marks the variants that no faster one equals in plant error; differences under one encoder
-count of the gap (about 0.02 mT) do not count.
+count of the gap (about 0.02 mT) do not count. Solver errors under 1e-6 mT are drawn there.
 
 The plant has pre-sliding and Stribeck friction, and no hysteresis or relaxation: those are errors of the model whatever
 the search. The networks were trained for this page; how good the *shipped* model is over its box is measured by
@@ -113,10 +113,8 @@ def plot(result: dict[str, Any], figures: list[str]) -> None:
     front = sorted((row["p50_us"], row["plant_mae_mT"]) for row in rows if row["pareto"])
     right.step(*zip(*front, strict=True), where="post", color="0.5", linewidth=1, zorder=0)
     right.axhline(result["noise_bound_mae_mT"], color="0.7", linestyle=":")
-    left.set(
-        title=f"against the network's own root, {USUAL_HIDDEN} units", ylabel="mean field error, mT (1e-6: or less)"
-    )
-    right.set(title="against the plant, all sizes; dotted: noise of one force reading")
+    left.set(title=f"against the network's own root, {USUAL_HIDDEN} units", ylabel="mean field error, mT")
+    right.set(title="against the plant, all sizes; dotted: one reading's noise")
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=7, fontsize=8)
     figure.savefig(PLOT, dpi=130, metadata=stamp(figures))
 

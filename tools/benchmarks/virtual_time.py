@@ -3,8 +3,8 @@
 The full plant with its firmware and protocol bytes, once under the whole core that follows 500 setpoints a second, once
 under the position loop alone. Each build of the core, and with `--against` another checkout, is a process of its own,
 and they take turns in stretches of some milliseconds: what a shared machine gives at a time, it gives to all of them.
-Processor time of one thread; the median over stretches, and of their ratios. For where the time goes, `python -m cProfile`
-sees into the interpreted build (`TORMAG_COMPILED=0`).
+Processor time of one thread; the median over stretches, and of their ratios. `python -m cProfile` says where it goes,
+in the interpreted build (`TORMAG_COMPILED=0`).
 """
 
 import argparse
