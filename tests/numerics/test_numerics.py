@@ -38,14 +38,13 @@ def test_a_sampled_run_passes_and_has_the_agreed_keys() -> None:
     found = json.loads(done.stdout)
     assert found["cases"] >= 20_000
     assert found["reference_cases"] >= 400
-    assert found["nonfinite"] == found["untyped_refusals"] == found["misjudged_domain"] == 0
+    assert found["nonfinite"] == found["misjudged"] == 0
     assert found["refused"] > 0
     assert 0.0 < found["worst_rel_error"]["float64"] <= 1e-12
     assert 0.0 < found["worst_rel_error"]["float32"] <= 1e-5
     assert 0.0 < found["worst_rel_error"]["float32_soft"] <= 3e-4
     assert all(share <= 1.0 for share in found["worst_error_over_allowed"].values())
     assert all(share <= 1.0 for share in found["time_steps"].values())
-    assert found["force_evaluations_per_s"] > 0
 
 
 def test_an_error_in_the_physics_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -37,7 +37,6 @@ from machines.wire import carried
 
 from benchmarks.against import add_against_argument, as_installed, environment
 from benchmarks.histograms import plot_histograms
-from benchmarks.keys import curve_table, free_port
 from tormagd.client import Client, ClientError
 from tormagd.client.wire import keys_of, opened
 from tormagd.config import ENDPOINTS, Config, Endpoints, RealTime, load_config
@@ -94,8 +93,7 @@ class Pair(NamedTuple):
 
 class Stand(NamedTuple):
     """What is measured: scheduling, rates, the serial line, how often setpoints come, and of which checkout daemon
-    and device are. `device_fifo` is the device's own priority; it stands for a machine of its own.
-    `within` runs the daemon on another machine (`ip netns exec NAME`), which is reached at `host`."""
+    and device are. `device_fifo` is the device's own priority; it stands for a machine of its own."""
 
     realtime: RealTime
     control_hz: int = 1_000
@@ -104,13 +102,6 @@ class Stand(NamedTuple):
     setpoint_hz: int = SETPOINT_HZ
     root: Path | None = None
     device_fifo: int = 0
-    scene: str = "coronary"
-    device: tuple[str, ...] = ()
-    "More arguments of the simulated device."
-    guarded: tuple[str, ...] = ()
-    "Endpoints at tcp:// addresses of `host` that demand keys; the others are at ipc://."
-    host: str = "127.0.0.1"
-    within: tuple[str, ...] = ()
 
 
 class Running(NamedTuple):
@@ -279,19 +270,12 @@ def hammer(address: str, stop: Event) -> None:
 def write_config(folder: Path, port: str, stand: Stand) -> Path:
     """A configuration with its sockets in `folder`; planning in every period, as in examples/service.toml."""
     path = folder / "tormagd.toml"
-    sockets = "".join(
-        f'{name} = "tcp://{stand.host}:{free_port()}"\n'
-        if name in stand.guarded
-        else f'{name} = "ipc://{folder}/{name}"\n'
-        for name in ENDPOINTS
-    )
-    if stand.guarded:
-        sockets += curve_table(folder / "keys", also_local=len(stand.guarded) == len(ENDPOINTS))
+    sockets = "".join(f'{name} = "ipc://{folder}/{name}"\n' for name in ENDPOINTS)
     realtime = stand.realtime
     # an older checkout knows no options, and only the other line's rate needs one
     options = "" if stand.baud == DEFAULT_BAUD else f"[device.options]\nbaud = {stand.baud}\n"
     path.write_text(
-        f'scene = "{stand.scene}"\n[device]\nport = "{port}"\n{options}[endpoints]\n{sockets}'
+        f'[device]\nport = "{port}"\n{options}[endpoints]\n{sockets}'
         f"[rates]\ncontrol_hz = {stand.control_hz}\ninference_hz = {stand.inference_hz}\n"
         f"[realtime]\nfifo_priority = {realtime.fifo_priority}\nkeep_awake = {str(realtime.keep_awake).lower()}\n"
         f"lock_memory = {str(realtime.lock_memory).lower()}\n"
@@ -313,14 +297,13 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
 
         if stand.device_fifo:
             stack.enter_context(carried(stand.device_fifo))
-        device = own_machine(stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud), *stand.device)
+        device = own_machine(stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud))
         simulator = started(sys.executable, *device, stdout=subprocess.PIPE)
         assert simulator.stdout is not None
         path = write_config(folder, simulator.stdout.readline().strip(), stand)
         config = load_config(path)
         with (folder / LOG).open("w") as log:
-            command = [*stand.within, sys.executable, "-P", "-m", "tormagd.daemon.main", "--config", str(path)]
-            process = started(*command, stderr=log)
+            process = started(sys.executable, "-P", "-m", "tormagd.daemon.main", "--config", str(path), stderr=log)
         wait_for(config.endpoints)
         ctl = [sys.executable, "-P", "-m", "tormagd.ctl.main", "--config", str(path), "--wait", "20"]
         for word in ("home", "enable"):
