@@ -74,11 +74,11 @@ PARTS = {
     ),
     "envelope": Part(
         "tools/envelope.py --json --picture docs/images/envelope.png",
-        "{cases} runs on samples and {draws} draws: over what was asked by {over_N:.3f} N at most, at most {peak_N:.2f} "
-        "N at all, {settled_N:.3f} N off after 2 s of sliding, {low_hold_faults} faults below F_min",
+        "{cases} runs on samples and {draws} draws: over what was asked by {over_N:.3f} N at most, at most "
+        "{peak_N:.2f} N at all, {settled_N:.3f} N off after 2 s of sliding, {low_hold_faults} faults below F_min",
     ),
     "step": Part(
-        "tools/benchmark.py step --json --plot docs/images/step.png",
+        "tools/benchmark.py step --json",
         "1 mm: rise {rise_s:.3f} s, {rise_over_time_optimal:.2f} times the fastest, overshoot {overshoot:.1%}, settled "
         "after {settling_5pct_s:.3f} s; H(z) off by {model_nrmse:.1%} NRMSE",
         judges=False,

@@ -54,9 +54,8 @@ def test_ratios_to_another_checkout_are_medians_over_the_pairs() -> None:
 
 
 def test_a_tick_is_fresh_whose_state_came_since_the_one_before() -> None:
-    stamp_ns = np.array([0, 500, 1_000, 2_000, 2_500], dtype=np.int64) * 1_000
-    received_s = np.array([0.1, 0.2, 0.2, 0.3, 0.4])
-    made = loop.as_block(loop.Ticks(stamp_ns, np.zeros(5), np.full(5, 50.0), received_s), 2_000)
+    times = zip((0, 500, 1_000, 2_000, 2_500), (0.1, 0.2, 0.2, 0.3, 0.4), strict=True)
+    made = loop.as_block([[stamp_us * 1_000, 0.0, 50.0, received_s] for stamp_us, received_s in times], 2_000)
     assert (made.ticks, made.merged, made.fresh) == (5, 1, 3)
     result = loop.summary([loop.Pair(made, made._replace(lateness_us=np.ones(5)))], RealTime())
     assert result["fresh_share"] == 0.75
@@ -147,7 +146,7 @@ def test_only_a_checkout_is_measured_against(tmp_path: Path) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="allowed is the root of a checkout"):
         checkout(str(tmp_path))
     with pytest.raises(RuntimeError, match="ended with status"):
-        virtual_time.Build("no such plant")
+        virtual_time.build("no such plant").__enter__()
 
 
 def test_a_package_that_was_not_asked_for_is_not_measured(tmp_path: Path) -> None:
@@ -155,7 +154,7 @@ def test_a_package_that_was_not_asked_for_is_not_measured(tmp_path: Path) -> Non
     (tmp_path / "tormagd").mkdir()
     shutil.copytree(ROOT / "tools", tmp_path / "tools")
     with pytest.raises(RuntimeError):
-        virtual_time.Build("sample_1", tmp_path)
+        virtual_time.build("sample_1", tmp_path).__enter__()
 
 
 def test_a_result_is_told_by_lines_and_tables() -> None:

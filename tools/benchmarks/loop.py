@@ -111,16 +111,6 @@ class Running(NamedTuple):
     pid: int
 
 
-class Ticks(NamedTuple):
-    """Rows of a recording, an array each."""
-
-    stamp_ns: npt.NDArray[np.int64]
-    lateness_us: Array
-    exec_us: Array
-    received_s: Array
-    "When the newest state had come that the tick knew; NaN before the first."
-
-
 Started = Callable[[Path], contextlib.AbstractContextManager[Running]]
 """Begins what is measured, with its files in the folder."""
 
@@ -177,20 +167,21 @@ def block(started: Started, seconds: float) -> Block:
         started(Path(folder)) as running,
         recording(running.config.endpoints) as recorder,
     ):
+        rate_hz = running.config.rates.control_hz
         stop = multiprocessing.Event()
         load = multiprocessing.Process(target=hammer, args=(running.config.endpoints.control, stop), daemon=True)
         load.start()
         try:
             recorder.poll(STARTS_MS)
-            collect(recorder, WARM_UP_S)
+            collect(recorder, WARM_UP_S, rate_hz)
             started_s, before_s = time.monotonic(), processor_s(running.pid)
-            ticks = collect(recorder, seconds)
+            ticks = collect(recorder, seconds, rate_hz)
             share = (processor_s(running.pid) - before_s) / (time.monotonic() - started_s)
             plan_us = planned(running.config.endpoints.control)
         finally:
             stop.set()
             load.join(5.0)
-    return as_block(ticks, running.config.rates.control_hz)._replace(plan_us=plan_us, core_share=share)
+    return ticks._replace(plan_us=plan_us, core_share=share)
 
 
 @contextlib.contextmanager
@@ -200,7 +191,7 @@ def recording(endpoints: Endpoints) -> Iterator["zmq.Socket[bytes]"]:
         yield opened(socket, endpoints.recording, keys_of(endpoints.curve))
 
 
-def collect(socket: "zmq.Socket[bytes]", seconds: float) -> Ticks:
+def collect(socket: "zmq.Socket[bytes]", seconds: float, rate_hz: int) -> Block:
     """Reads tick rows for a while. Raises RuntimeError where there are none."""
     until_s = time.monotonic() + seconds
     rows: list[list[Any]] = []
@@ -211,17 +202,16 @@ def collect(socket: "zmq.Socket[bytes]", seconds: float) -> Ticks:
             rows.extend([None if column is None else row[column] for column in columns] for row in batch.rows)
     if len(rows) < 2:
         raise RuntimeError(f"no ticks within {seconds:g} s")
-    stamp, *others = zip(*rows, strict=True)
-    return Ticks(np.array(stamp, dtype=np.int64), *(np.array(column, dtype=np.float64) for column in others))
+    return as_block(rows, rate_hz)
 
 
-def as_block(ticks: Ticks, rate_hz: int) -> Block:
-    """The ticks, how many periods had none, and how many ticks knew of a new state."""
-    count = ticks.stamp_ns.size
-    spanned_s = float(ticks.stamp_ns[-1] - ticks.stamp_ns[0]) * 1e-9
-    merged = max(0, round(spanned_s * rate_hz) + 1 - count)
-    fresh = int(np.count_nonzero(np.diff(ticks.received_s) > 0.0))
-    return Block(ticks.lateness_us, ticks.exec_us, count, merged, spanned_s, fresh)
+def as_block(rows: list[list[Any]], rate_hz: int) -> Block:
+    """The ticks, rows of COLUMNS; how many periods had none, and how many ticks knew of a new state."""
+    lateness_us, exec_us, received_s = np.array([row[1:] for row in rows], dtype=np.float64).T
+    spanned_s = (rows[-1][0] - rows[0][0]) * 1e-9
+    merged = max(0, round(spanned_s * rate_hz) + 1 - len(rows))
+    fresh = int(np.count_nonzero(np.diff(received_s) > 0.0))
+    return Block(lateness_us, exec_us, len(rows), merged, spanned_s, fresh)
 
 
 def planned(address: str) -> dict[str, float] | None:

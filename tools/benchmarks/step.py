@@ -9,13 +9,11 @@ import gc
 import itertools
 import math
 import time
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from pictures.stamp import stamp
 
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config, Motor
@@ -54,8 +52,6 @@ class Step(NamedTuple):
     steady_error_um: float
     true_error_um: float
     skew_um: float
-    time_s: Array
-    gap_mm: Array
 
 
 FIGURES = ("rise_s", "overshoot", "settling_5pct_s", "steady_error_um", "true_error_um", "skew_um")
@@ -119,8 +115,6 @@ def step(loop: ClosedLoop, target_mm: float) -> Step:
         steady_error_um=abs(float(gap[-1]) - target_mm) * 1e3,
         true_error_um=abs(samples[-1].truth.gap_mm - target_mm) * 1e3,
         skew_um=max(abs(estimate.skew_mm) for estimate in estimates) * 1e3,
-        time_s=time_s,
-        gap_mm=gap,
     )
 
 
@@ -170,31 +164,6 @@ def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> tuple[
 def nrmse(measured: Array, modelled: Array) -> float:
     """|measured - modelled| / |measured - mean(measured)|, norms."""
     return float(np.linalg.norm(measured - modelled) / np.linalg.norm(measured - measured.mean()))
-
-
-def draw(path: Path, plant_name: str, figures: dict[str, Any]) -> None:
-    """Writes a PNG, stamped with these figures: H(z) beside the plant's duty steps, and the gap's 1 mm steps."""
-    from matplotlib.figure import Figure  # nor does it need this
-
-    parameters, config = load_plant(plant_name), Config()
-    loop = settled_loop(config, parameters)
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for sign, target_mm, colour in ((1.0, START_MM + STEP_MM, "#2a6f97"), (-1.0, START_MM, "#d1495b")):
-        measured, modelled = model_step(config.motor, parameters, sign * MODEL_DUTY)
-        time_s = TICK_S * np.arange(measured.size)
-        off = nrmse(measured, modelled)
-        left.plot(time_s, measured, color=colour, linewidth=2.5, alpha=0.4, label=f"plant, duty {sign * MODEL_DUTY:+g}")
-        left.plot(time_s, modelled, color="#222222", linewidth=1.0, label=f"H(z), NRMSE {off:.1%}")
-        found = step(loop, target_mm)
-        right.plot(found.time_s, found.gap_mm, color=colour, label=f"to {target_mm:g} mm")
-        right.axhline(target_mm, color="#8d99ae", linewidth=0.8, linestyle=":")
-    left.set(title=f"Duty step from rest at a gap of {MODEL_GAP_MM:g} mm", ylabel="carriage, mm")
-    right.set(title=f"Gap step, {plant_name} (synthetic)", ylabel="gap by the encoders, mm", xlim=(0.0, 0.15))
-    for axes in (left, right):
-        axes.set_xlabel("time, s")
-        axes.legend(frameon=False)
-    figure.savefig(path, dpi=110, metadata=stamp(figures))
 
 
 class Optimum(NamedTuple):
@@ -259,15 +228,11 @@ def corner_margins(config: Config) -> dict[str, float]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `benchmark step`."""
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
-    parser.add_argument("--plot", type=Path, help="PNG of H(z) beside the plant, and of the steps")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The object for these options."""
-    result = run(options.plant)
-    if options.plot is not None:
-        draw(options.plot, options.plant, result)
-    return result
+    return run(options.plant)
 
 
 def hold(gap_mm: float, now_s: float) -> Plan:

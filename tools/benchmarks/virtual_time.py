@@ -13,7 +13,7 @@ import json
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -71,57 +71,39 @@ def armed_loop(config: Config, plant: str) -> ClosedLoop:
     return loop
 
 
-class Build:
-    """One build of one checkout in a process of its own. A context manager.
+Build = tuple[bool, Callable[[str, int], float]]
+"""Whether a build is compiled, and how it is asked for the processor time of a tick of a loop over so many, us."""
+
+
+@contextlib.contextmanager
+def build(plant: str, root: Path | None = None, switch: str = "") -> Iterator[Build]:
+    """One build of one checkout in a process of its own; `switch` is TORMAG_COMPILED.
 
     `root` is a checkout, None for the one that runs here. Raises RuntimeError where the process does not start, or
     measures another package than it should.
     """
+    worker = [sys.executable, "-P", str(Path(__file__).with_name("virtual_time_worker.py")), plant]
+    theirs = environment(root) | ({"TORMAG_COMPILED": switch} if switch else {})
+    with subprocess.Popen(worker, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=theirs, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        asked, answers = process.stdin, process.stdout
 
-    def __init__(self, plant: str, root: Path | None = None, interpreted: bool = False) -> None:
+        def answer() -> Any:
+            line = answers.readline()
+            if not line:
+                raise RuntimeError(f"the loop in a process of its own ended with status {process.wait()}")
+            return json.loads(line)
+
+        def tick_us(loop: str, ticks: int) -> float:
+            print(loop, ticks, file=asked, flush=True)
+            return float(answer())
+
+        hello = answer()
         package = Path(tormagd.__path__[0]) if root is None else root / "tormagd"
-        child_environment = environment(root)
-        if interpreted:
-            child_environment["TORMAG_COMPILED"] = "0"
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", str(Path(__file__).with_name("virtual_time_worker.py")), plant],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=child_environment,
-            text=True,
-        )
-        try:
-            hello = json.loads(self._line())
-            if not Path(hello["package"]).samefile(package):
-                raise RuntimeError(f"{hello['package']} was measured in place of {package}")
-        except BaseException:
-            self._end()
-            raise
-        self.is_compiled = bool(hello["compiled"])
-
-    def __enter__(self) -> "Build":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end()
-
-    def tick_us(self, loop: str, ticks: int) -> float:
-        """Processor time of a tick in the next stretch of that loop."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(f"{loop} {ticks}\n")
-        self._process.stdin.flush()
-        return float(self._line())
-
-    def _line(self) -> str:
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            raise RuntimeError(f"the loop in a process of its own ended with status {self._process.wait()}")
-        return line
-
-    def _end(self) -> None:
-        with contextlib.suppress(BrokenPipeError):
-            self._process.communicate(timeout=30)
+        if not Path(hello["package"]).samefile(package):
+            raise RuntimeError(f"{hello['package']} was measured in place of {package}")
+        yield hello["compiled"], tick_us
 
 
 Stretches = dict[str, dict[str, list[float]]]
@@ -131,15 +113,15 @@ Stretches = dict[str, dict[str, list[float]]]
 def compared(plant: str, ticks: int, against: Path | None) -> Stretches:
     """Every build there is, `interpreted` always, `compiled` and `against` where there is one, taking turns."""
     with contextlib.ExitStack() as stack:
-        ours = stack.enter_context(Build(plant))
-        builds = {"interpreted": ours}
-        if ours.is_compiled:
-            builds = {"compiled": ours, "interpreted": stack.enter_context(Build(plant, interpreted=True))}
-            if builds["interpreted"].is_compiled:
-                raise RuntimeError("TORMAG_COMPILED=0 did not switch the compiled core off")
+        builds = {"interpreted": stack.enter_context(build(plant, switch="0"))}
+        if builds["interpreted"][0]:
+            raise RuntimeError("TORMAG_COMPILED=0 did not switch the compiled core off")
+        ours = stack.enter_context(build(plant))
+        if ours[0]:
+            builds["compiled"] = ours
         if against is not None:
-            builds["against"] = stack.enter_context(Build(plant, against))
-        return take_turns({name: build.tick_us for name, build in builds.items()}, ticks)
+            builds["against"] = stack.enter_context(build(plant, against))
+        return take_turns({name: tick_us for name, (_, tick_us) in builds.items()}, ticks)
 
 
 def take_turns(builds: Mapping[str, Callable[[str, int], float]], ticks: int) -> Stretches:
