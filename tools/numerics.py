@@ -19,7 +19,6 @@ import multiprocessing
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, field
 from typing import Any
 
 import mpmath as mp
@@ -27,6 +26,7 @@ import numpy as np
 from benchmarks.table import lines
 from extremes.cases import DIGITS, Batch, draw_batch, reference
 from extremes.steps import worst_step_errors
+from extremes.tally import COUNTS, Tally
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -43,8 +43,6 @@ from tormagd.physics.force import (
     stretch_minus_one,
 )
 
-Array = NDArray[np.float64]
-
 BATCH = 500
 """Inputs for each device."""
 CHUNK = 20
@@ -56,49 +54,6 @@ FLOAT32_ALLOWED = {"float32": 1e-5, "float32_soft": 3e-4}
 PRECISIONS = ("float64", *FLOAT32_ALLOWED)
 STIFF = 0.7
 """lambda1 from which on float32 is held to the narrower bound."""
-
-
-@dataclass
-class Worst:
-    """The largest error of one quantity in one precision where the plain bound holds, and the largest share of what is
-    allowed anywhere: 8 eps times the condition number, where that is more."""
-
-    error: float = 0.0
-    over_allowed: float = 0.0
-
-    def take(self, errors: Array, plain: float, eps: float, conditions: Array) -> None:
-        """Note the worst of some cases."""
-        allowed = np.maximum(plain, 8.0 * eps * conditions)
-        self.error = max(self.error, float(errors[allowed == plain].max(initial=0.0)))
-        self.over_allowed = max(self.over_allowed, float((errors / allowed).max(initial=0.0)))
-
-
-@dataclass
-class Tally:
-    """What one chunk, or all of them, came to; `worst` by precision and quantity."""
-
-    cases: int = 0
-    reference_cases: int = 0
-    nonfinite: int = 0
-    refused: int = 0
-    misjudged: int = 0
-    worst: dict[tuple[str, str], Worst] = field(default_factory=dict)
-
-    def of(self, precision: str, quantity: str) -> Worst:
-        """The worst case of that kind so far."""
-        return self.worst.setdefault((precision, quantity), Worst())
-
-    def add(self, other: "Tally") -> None:
-        """Merge another tally into this one."""
-        for name in COUNTS:
-            setattr(self, name, getattr(self, name) + getattr(other, name))
-        for kind, theirs in other.worst.items():
-            mine = self.of(*kind)
-            mine.error = max(mine.error, theirs.error)
-            mine.over_allowed = max(mine.over_allowed, theirs.over_allowed)
-
-
-COUNTS = ("cases", "reference_cases", "nonfinite", "refused", "misjudged")
 
 
 def evaluate(batch: Batch, x: FloatArray) -> tuple[NDArray[np.bool_], dict[str, FloatArray]]:
@@ -134,12 +89,17 @@ def check_chunk(seed: int, devices: int, references: int) -> Tally:
         single = batch.x.astype(np.float32)
         single = single[_inside(batch, single)]
         admissible, values = evaluate(batch, batch.x)
-        tally.cases += len(batch.x)
-        tally.refused += int((~admissible).sum())
-        tally.nonfinite += sum(int((~np.isfinite(value)).sum()) for value in values.values())
+        tally.counts["cases"] += len(batch.x)
+        tally.counts["refused"] += int((~admissible).sum())
+        tally.counts["nonfinite"] += nonfinite(values)
         _compare_with_float32(tally, batch, single)
         _compare_with_reference(tally, batch, admissible, values, rng, references)
     return tally
+
+
+def nonfinite(values: dict[str, FloatArray]) -> int:
+    """How many of all quantities are not."""
+    return sum(int((~np.isfinite(value)).sum()) for value in values.values())
 
 
 def _inside(batch: Batch, x: FloatArray) -> NDArray[np.bool_]:
@@ -154,7 +114,7 @@ def _compare_with_float32(tally: Tally, batch: Batch, single: NDArray[np.float32
     both = admissible & also
     _, low = evaluate(batch, single[both])
     _, high = evaluate(batch, exact[both])
-    tally.nonfinite += sum(int((~np.isfinite(value)).sum()) for value in low.values())
+    tally.counts["nonfinite"] += nonfinite(low)
     stretch = 1.0 + high["stretch"]
     x, force, slope = exact[both], high["force"], high["slope"]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -171,7 +131,7 @@ def _compare_with_float32(tally: Tally, batch: Batch, single: NDArray[np.float32
         for precision, allowed in FLOAT32_ALLOWED.items():
             chosen = (stretch >= STIFF) if precision == "float32" else (stretch < STIFF)
             chosen &= (x > 0.0) & np.isfinite(errors)
-            tally.of(precision, quantity).take(errors[chosen], allowed, FLOAT32_EPS, kappa[chosen])
+            tally.note(precision, quantity, errors[chosen], allowed, 8.0 * FLOAT32_EPS * kappa[chosen])
 
 
 def _compare_with_reference(
@@ -188,10 +148,10 @@ def _compare_with_reference(
         if not x > 0.0:
             continue
         truth = reference(batch, x)
-        tally.reference_cases += 1
+        tally.counts["reference_cases"] += 1
         # so close to the bound the last digits of x decide
         if truth.admissible != bool(admissible[index]):
-            tally.misjudged += abs(truth.stretch - 0.05) > 1e-11
+            tally.counts["misjudged"] += abs(truth.stretch - 0.05) > 1e-11
             continue
         if not truth.admissible:
             continue
@@ -200,9 +160,8 @@ def _compare_with_reference(
             for quantity, value in truth.values.items():
                 array_value = float(values[quantity][place_among_admissible[index]])
                 error = max(float(abs(mp.mpf(computed) / value - 1)) for computed in (array_value, plain[quantity]))
-                kappa = truth.conditions[quantity]
-                found = tally.of("float64", quantity)
-                found.take(np.array([error]), FLOAT64_ALLOWED, FLOAT64_EPS, np.array([kappa]))
+                well = np.array([8.0 * FLOAT64_EPS * truth.conditions[quantity]])
+                tally.note("float64", quantity, np.array([error]), FLOAT64_ALLOWED, well)
 
 
 def _plain(batch: Batch, x: float) -> dict[str, float]:
@@ -231,27 +190,16 @@ def run(cases: int, references: int, seed: int, workers: int) -> dict[str, Any]:
     # a fresh interpreter for each worker, so that the same seed gives the same cases everywhere
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        steps = pool.submit(worst_step_errors, seed, max(50, references // 10))
-        tasks = [pool.submit(check_chunk, seed + 1 + index, size, each) for index, size in enumerate(chunks)]
-        for task in tqdm(as_completed(tasks), total=len(tasks), desc="devices", disable=not sys.stderr.isatty()):
+        tasks = [pool.submit(worst_step_errors, seed, max(50, references // 10))]
+        tasks += [pool.submit(check_chunk, seed + 1 + index, size, each) for index, size in enumerate(chunks)]
+        for task in tqdm(as_completed(tasks), total=len(tasks), desc="chunks", disable=None):
             tally.add(task.result())
-        time_steps = steps.result()
-    tally.nonfinite += time_steps.nonfinite
-    worst = dict.fromkeys(PRECISIONS, 0.0)
-    shares = dict.fromkeys(PRECISIONS, 0.0)
-    for (precision, _), found in tally.worst.items():
-        worst[precision] = max(worst[precision], found.error)
-        shares[precision] = max(shares[precision], found.over_allowed)
-    most = max(*shares.values(), *time_steps.over_allowed.values())
-    return {name: getattr(tally, name) for name in COUNTS} | {
-        "worst_rel_error": worst,
-        "worst_error_over_allowed": shares,
-        "quantities": {
-            f"{precision}, {quantity}": {"worst_rel_error": found.error, "over_allowed": found.over_allowed}
-            for (precision, quantity), found in sorted(tally.worst.items())
-        },
-        "time_steps": time_steps.over_allowed,
-        "passed": most <= 1.0 and tally.nonfinite == tally.misjudged == 0,
+    worst = {name: [found for (kind, _), found in tally.worst.items() if kind == name] for name in PRECISIONS}
+    return {name: tally.counts[name] for name in COUNTS} | {
+        "worst_rel_error": {name: max((it.error for it in found), default=0.0) for name, found in worst.items()},
+        "over_allowed": {f"{precision}, {name}": it.over_allowed for (precision, name), it in tally.worst.items()},
+        "passed": max(it.over_allowed for it in tally.worst.values()) <= 1.0
+        and tally.counts["nonfinite"] == tally.counts["misjudged"] == 0,
         "seconds": round(time.perf_counter() - started, 1),
     }
 

@@ -8,12 +8,12 @@ is more. The relaxation is also followed through a whole sequence of unequal ste
 
 import math
 import sys
-from dataclasses import dataclass, field
 from typing import Any
 
 import mpmath as mp
 import numpy as np
 
+from extremes.tally import Tally, Worst
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 
@@ -24,38 +24,27 @@ NORMAL_FORCE_N, NORMAL_SPEED_MM_S, NORMAL_TRAVEL_MM = 5.0, 42.0, 2.0
 EXTREME = 100.0
 
 
-@dataclass
-class StepErrors:
-    """Sequences run, numbers that were not finite, and by model the worst error over what is allowed."""
-
-    cases: int = 0
-    nonfinite: int = 0
-    over_allowed: dict[str, float] = field(default_factory=dict)
-
-    def take(self, name: str, computed: float, exact: Any, terms: Any, scale: float = 0.0) -> None:
-        """Note one result beside its reference; `terms` is the sum of the sizes of what was added up."""
-        if not math.isfinite(computed):
-            self.nonfinite += 1
-            return
-        allowed = max(8.0 * EPS * float(terms), 1e-12 * max(scale, abs(float(exact))))
-        share = float(abs(mp.mpf(computed) - exact)) / allowed if allowed > 0.0 else float(computed != exact)
-        self.over_allowed[name] = max(self.over_allowed.get(name, 0.0), share)
-
-
-def worst_step_errors(seed: int, sequences: int) -> StepErrors:
+def worst_step_errors(seed: int, sequences: int) -> Tally:
     """Every model over that many sequences of `STEPS` unequal steps."""
     rng = np.random.default_rng(seed)
-    errors = StepErrors()
+    tally = Tally()
     with mp.workdps(DIGITS):
         for _ in range(sequences):
             steps_s = _log_uniform(rng, 1e-6, 10.0, STEPS)
-            _relaxation(errors, rng, steps_s)
-            _friction(errors, rng, steps_s)
-            errors.cases += STEPS
-    return errors
+            _relaxation(tally, rng, steps_s)
+            _friction(tally, rng, steps_s)
+    return tally
 
 
-def _relaxation(errors: StepErrors, rng: np.random.Generator, steps_s: list[float]) -> None:
+def _note(tally: Tally, name: str, computed: float, exact: Any, terms: Any) -> None:
+    """One result beside its reference; `terms` is the sum of the sizes of what was added up."""
+    tally.counts["nonfinite"] += not math.isfinite(computed)
+    allowed = max(8.0 * EPS * float(terms), 1e-12 * abs(float(exact)))
+    share = float(abs(mp.mpf(computed) - exact)) / allowed if allowed > 0.0 else float(computed != exact)
+    tally.raise_to(("steps", name), Worst(over_allowed=share))
+
+
+def _relaxation(tally: Tally, rng: np.random.Generator, steps_s: list[float]) -> None:
     branches = int(rng.integers(1, 5))
     fractions = (rng.dirichlet(np.ones(branches)) * rng.uniform(0.0, 0.99)).tolist()
     series = PronySeries(tuple(fractions), tuple(_log_uniform(rng, 1e-6, 1e6, branches)))
@@ -71,10 +60,10 @@ def _relaxation(errors: StepErrors, rng: np.random.Generator, steps_s: list[floa
             exact[index] = exact[index] * mp.exp(-ratio) + (driving - last) * -mp.expm1(-ratio) / ratio
         last = mp.mpf(driving)
         truth = (1 - sum(shares)) * driving + sum(g * h for g, h in zip(shares, exact, strict=True))
-        errors.take("relaxation", force, truth, (2 + branches) * largest)
+        _note(tally, "relaxation", force, truth, (2 + branches) * largest)
 
 
-def _friction(errors: StepErrors, rng: np.random.Generator, steps_s: list[float]) -> None:
+def _friction(tally: Tally, rng: np.random.Generator, steps_s: list[float]) -> None:
     friction = Friction(
         presliding_stiffness_N_mm=_log_uniform(rng, 1e-2, 1e3, 1)[0],
         viscous_N_s_mm=float(rng.uniform(0.0, 1e-2)),
@@ -93,8 +82,8 @@ def _friction(errors: StepErrors, rng: np.random.Generator, steps_s: list[float]
         steady = reach if speed >= 0.0 else -reach
         moved = start - (steady - start) * mp.expm1(-abs(mp.mpf(speed)) * dt_s / reach) if reach > 0 else mp.mpf(0)
         force, deflection = friction.advance(deflection, speed, kinetic, dt_s)
-        errors.take("friction force", force, sigma * moved + viscous, 2 * level + abs(viscous))
-        errors.take("friction deflection", deflection, moved, 2 * reach)
+        _note(tally, "friction force", force, sigma * moved + viscous, 2 * level + abs(viscous))
+        _note(tally, "friction deflection", deflection, moved, 2 * reach)
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float, count: int) -> list[float]:
