@@ -116,7 +116,7 @@ reproduction: $(VENV)/.dev
 	$(BIN)/python tools/reproduce_thesis.py
 	$(BIN)/python tools/tactile_experiment.py --out docs
 
-# docs/evidence: fuzz, fault matrix, planted faults, random walk, numerics, replug, soak and intruders in full (well over an hour); `make test` samples them
+# the table of docs/evidence: fuzz, faults, walk, numerics, replug, soak, stalls and siege in full (well over an hour); `make test` samples them
 evidence: $(VENV)/.dev
 	$(BIN)/python tools/evidence.py
 

@@ -56,10 +56,9 @@ TOOL_ROOMS = {
     "thesis": {"pictures"},
     "motor": set(),
     "extremes": set(),
-    "first_use": set(),
     "rendering": {"machines", "pictures"},
     "fault_matrix": {"wire"},
-    "benchmarks": {"machines", "consoles", "wire", "pictures", "thesis", "rendering"},
+    "benchmarks": {"machines", "pictures", "thesis"},
     "tactile": {"pictures", "thesis", "rendering", "benchmarks"},
     "intrusion": {"machines", "rendering", "benchmarks"},
 }

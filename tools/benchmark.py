@@ -1,8 +1,8 @@
 """Measurements of tormagd, one a subcommand. Each prints one JSON object with --json, a table otherwise.
 
 Each also says, as `machine_us`, what the interpreter and the processor were worth meanwhile: the time of a fixed loop
-of pure Python. A measurement is a module of `benchmarks` (`_` for `-`) with `add_arguments(parser)`, `measure(options)`
-that returns the object, and `print_table(object)`.
+of pure Python. A measurement is a module of `benchmarks` (`_` for `-`) with `add_arguments(parser)` and
+`measure(options)`, which returns the object.
 """
 
 import argparse
@@ -11,6 +11,8 @@ import json
 import sys
 from collections.abc import Sequence
 
+from benchmarks.table import lines
+
 from tormagd.headroom.machine_loop import machine_us
 
 MEASUREMENTS = {
@@ -18,16 +20,8 @@ MEASUREMENTS = {
     "scenes": "what each scene costs with all terms and with those it requires",
     "loop": "lateness of the control loop beside a bare timer",
     "latency": "from a setpoint to the first drive frame that reflects it",
-    "fast": "control at 2 and 4 kHz on fast serial lines",
-    "preview": "what a plan costs that knows what follows",
     "step": "how fast and how exactly the gap follows, in virtual time",
-    "virtual-time": "how much faster than real time that is, and what limits it",
-    "black-box": "what the black box costs a control tick",
-    "publishers": "the pulse as C++, JavaScript and Python publish it",
-    "browsers": "how late control is while ten browsers look at the dashboard",
-    "fleet": "recordings of many consoles summed up by a Dask cluster and one by one",
-    "command": "how long tormagctl status takes until it has answered",
-    "bus": "load of the bus at 1 kHz control, and what the codec costs",
+    "virtual-time": "how much faster than real time that is",
 }
 
 
@@ -49,8 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.json:
         print(json.dumps(result))
     else:
-        module.print_table(result)
-        print(f"reference loop {result['machine_us']:.0f} us")
+        print(*lines(result), sep="\n")
     return 0
 
 

@@ -25,19 +25,19 @@ def result():
     """The object, by way of the command line."""
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
-        assert benchmark.main(["inverse", "--quick", "--json", "--fifo", "0"]) == 0
+        assert benchmark.main(["inverse", "--quick", "--json"]) == 0
     return json.loads(printed.getvalue())
 
 
-def rows(result, name, dtype="float64", hidden=50):
-    return [row for row in result["variants"] if (row["solver"], row["dtype"], row["hidden"]) == (name, dtype, hidden)]
+def rows(result, name, hidden=50):
+    return [row for row in result["variants"] if (row["solver"], row["hidden"]) == (name, hidden)]
 
 
 def test_every_variant_has_the_keys_of_the_contract(result):
     for row in result["variants"]:
         assert row.keys() >= KEYS
         assert 0 < row["p50_us"] <= row["p99_us"] <= row["p999_us"]
-        assert row["memory_kB"] > 0 or row["solver"] in ("closed form", "newton-rising")
+        assert row["memory_kB"] > 0 or row["solver"] == "newton-rising"
     names = {row["name"] for row in result["variants"]}
     assert names >= {"thesis-linear", "linear-argmin", "vectorised-argmin"}
     assert any(row["pareto"] for row in result["variants"])
@@ -56,7 +56,7 @@ def test_the_solver_error_is_that_of_the_method(result):
 
 
 def test_no_search_is_better_than_its_network(result):
-    errors = [row["plant_mae_mT"] for row in rows(result, "newton") + rows(result, "brent")]
+    errors = [row["plant_mae_mT"] for row in rows(result, "newton") + rows(result, "coarse-to-fine")]
     assert np.ptp(errors) < 1e-3
     assert min(errors) > 0.01
 
@@ -65,12 +65,7 @@ def test_a_scene_gets_a_search_that_is_measured_and_exact_enough(result):
     assert set(result["chosen"]) >= {"coronary", "pulse"}
     for chosen in result["chosen"].values():
         assert chosen["solver_force_max_N"] <= 0.1 * chosen["tolerance_rms_N"]
-        assert any(row["name"] == chosen["name"] and row["dtype"] == chosen["dtype"] for row in result["variants"])
-        assert set(chosen["mismatched"]) == {"sample_2", "sample_3"}
-
-
-def test_precisions_agree(result):
-    assert all(found["max_mT"] < 0.05 for found in result["float32_against_float64"].values())
+        assert any(row["name"] == chosen["name"] for row in result["variants"])
 
 
 def test_the_roots_that_judge_are_roots():

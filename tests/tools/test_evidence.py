@@ -9,54 +9,36 @@ import pytest
 from evidence import Part
 
 
-def says(figures: dict[str, Any]) -> str:
-    return f"{figures['cases']} cases"
-
-
-def printing(figures: dict[str, Any], status: int = 0) -> Part:
+def printing(figures: dict[str, Any], status: int = 0, **fields: bool) -> Part:
     """A part whose command prints these figures."""
-    return Part(f"-c 'import sys; print({json.dumps(json.dumps(figures))}); sys.exit({status})'", says)
+    text = json.dumps(json.dumps(figures))
+    return Part(f"-c 'import sys; print({text}); sys.exit({status})'", "{cases} cases", **fields)
 
 
 def test_all_parts_run_and_the_status_tells_of_the_failed(tmp_path: Path) -> None:
+    page = tmp_path / evidence.README
+    page.write_text(
+        evidence.HEADER + "| good | `old` | 0.0.0 | yes | 7 cases |\n| other | `old` | 0.0.0 | yes | kept |\n"
+    )
     parts = {
-        "good": printing({"cases": 1, "passed": True}),
+        "good": printing({"cases": 1, "passed": True}, is_kept=True),
         "doubtful": printing({"cases": 2, "passed": False}),
         "failed": printing({"cases": 3, "passed": False}, status=1),
-        "crashed": Part("-c 'import sys; sys.exit(\"no device\")'", says),
-        "measured": printing({"cases": 5})._replace(judges=False),
+        "crashed": Part("-c 'import sys; sys.exit(\"no device\")'", "{cases} cases"),
+        "measured": printing({"cases": 5}, judges=False),
     }
     assert evidence.collect(parts, tmp_path) == 1
-    records = {name: json.loads((tmp_path / f"{name}.json").read_text(encoding="utf-8")) for name in parts}
-    assert {name: record["held"] for name, record in records.items()} == {
-        "good": True,
-        "doubtful": False,
-        "failed": False,
-        "crashed": False,
-        "measured": True,
-    }
-    assert records["crashed"]["figures"] is None
-    assert "exit status 1" in records["crashed"]["error"]
-    assert records["good"]["figures"]["cases"] == 1
-    page = (tmp_path / "README.md").read_text(encoding="utf-8")
-    rows = {line.split("]")[0].removeprefix("| ["): line for line in page.splitlines() if line.startswith("| [")}
-    assert set(rows) == set(parts)
-    assert "| yes | 1 cases |" in rows["good"]
-    assert "| **no** | 3 cases |" in rows["failed"]
-    assert "| **no** | no figures, exit status 1 |" in rows["crashed"]
-    assert "| measured | 5 cases |" in rows["measured"]
-
-
-def test_figures_of_an_earlier_form_are_told_and_hide_no_others(tmp_path: Path) -> None:
-    parts = {"old": printing({"rows": 1}), "good": printing({"cases": 1})}
-    assert evidence.collect(parts, tmp_path) == 0
-    page = (tmp_path / "README.md").read_text(encoding="utf-8")
-    assert "measured before this part had 'cases': run it again" in page
-    assert "1 cases" in page
-
-
-def test_nothing_failed(tmp_path: Path) -> None:
-    assert evidence.collect({"good": printing({"cases": 1})}, tmp_path) == 0
+    text = page.read_text(encoding="utf-8")
+    rows = {line.split(" | ")[0].removeprefix("| "): line for line in text.splitlines() if " | `" in line}
+    assert list(rows) == ["good", "other", "doubtful", "failed", "crashed", "measured"]
+    assert rows["good"].endswith("| yes | 1 cases |")
+    assert rows["other"].endswith("| yes | kept |")
+    assert rows["doubtful"].endswith("| **no** | 2 cases |")
+    assert rows["failed"].endswith("| **no** | 3 cases |")
+    assert rows["crashed"].endswith("| **no** | no figures, exit status 1 |")
+    assert rows["measured"].endswith("| measured | 5 cases |")
+    assert [path.name for path in tmp_path.glob("*.json")] == ["good.json"]
+    assert evidence.collect({"good": parts["good"]}, tmp_path) == 0
 
 
 def test_an_unknown_part_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
@@ -69,3 +51,8 @@ def test_an_unknown_part_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
 def test_every_tool_that_is_called_is_there() -> None:
     for part in evidence.PARTS.values():
         assert (evidence.ROOT / part.command.split()[0]).is_file()
+
+
+def test_only_what_a_page_is_made_of_is_kept() -> None:
+    kept = {name for name, part in evidence.PARTS.items() if part.is_kept}
+    assert {path.stem for path in evidence.FOLDER.glob("*.json")} == kept

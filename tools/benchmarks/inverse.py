@@ -4,26 +4,23 @@ One thread and the garbage collector frozen, as in the daemon. Synthetic data (`
 """
 
 import argparse
-import contextlib
 import gc
 import itertools
 import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from benchmarks import inverse_report as report
 from benchmarks.inverse_workload import (
     CIP_PERCENT,
     FIELDS_MT,
-    INSERT,
     Array,
     Course,
     course,
@@ -34,32 +31,25 @@ from benchmarks.inverse_workload import (
     training_data,
 )
 from tormagd.daemon.realtime import freeze_garbage
-from tormagd.inverse.bracketed import BracketedSearch, brent, finer_grid, newton
-from tormagd.inverse.choice import RUNTIME_SOLVERS, named
-from tormagd.inverse.closed_form import ClosedForm
-from tormagd.inverse.direct import DirectInverse
-from tormagd.inverse.kd_tree import KdTreeSearch
+from tormagd.inverse.choice import build, named
 from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
-from tormagd.inverse.nearest import NearestFieldSearch
-from tormagd.inverse.newton import RisingSearch
 from tormagd.inverse.scan import FieldScan
 from tormagd.inverse.solution import FieldSolver
 from tormagd.model.model_file import ForceModel
 from tormagd.model.rising import falling_at
-from tormagd.physics.errors import DomainError
-from tormagd.physics.force import TORMAG
 from tormagd.scenes.scene import AUTO, load_scene, shipped_scenes
-from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.parameters import load_plant
 
-OWN, MISMATCHED = "sample_1", ("sample_2", "sample_3")
+PLANT = "sample_1"
 USUAL_HIDDEN = 50
 QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9}
 NEWTON, RISING = "newton", "newton-rising"
 "The daemon refuses a model that does not rise: the first is what it runs by name, and the second how that is done."
-SAME_TIME, LEAST_FORCE_N = 1.1, 1e-6
-"Times within this ratio are no difference: the machine's own noise. Nor are forces so near each other."
 BASELINES = ("thesis-linear", "linear-argmin", "vectorised-argmin")
-NUMPY_DTYPE: dict[str, type[np.floating]] = {"float32": np.float32, "float64": np.float64}
+BASELINE_STEP_MT = 1.0
+STEPS_MT = {"nearest": (1.0, 2.0, 5.0, 10.0, 20.0), "coarse-to-fine": (10.0, 20.0, 40.0), NEWTON: (10.0, 20.0, 40.0)}
+ENDS_MT = {"nearest": (2.0, 20.0), "coarse-to-fine": (20.0,), NEWTON: (20.0,)}
+"Steps on the networks that are not of the usual size."
 ENCODER_FIELD_MT = 0.02
 "About what one encoder count changes (1/560 mm, 5 to 22 mT/mm): smaller differences of error decide nothing."
 
@@ -74,11 +64,10 @@ class Effort(NamedTuple):
     rounds: int
     solves: int
     slow_solves: int
-    chosen_solves: int
 
 
-FULL = Effort((10, 25, 50, 100, 200), 6000, 40, 2000, 4, 3000, 50, 100_000)
-QUICK = Effort((10, 50), 1500, 12, 200, 1, 200, 10, 1000)
+FULL = Effort((10, 25, 50, 100, 200), 6000, 40, 2000, 4, 3000, 50)
+QUICK = Effort((10, 50), 1500, 12, 200, 1, 200, 10)
 
 
 class Case(NamedTuple):
@@ -86,10 +75,8 @@ class Case(NamedTuple):
 
     solver: str
     hidden: int = USUAL_HIDDEN
-    dtype: str = "float64"
     step_mT: float = 0.0
     neighbours: int = 0
-    threads: int = 1
 
     @property
     def name(self) -> str:
@@ -98,125 +85,99 @@ class Case(NamedTuple):
         return self.solver + step + (f" k={self.neighbours}" if self.neighbours else "")
 
 
-def cases(effort: Effort) -> Iterator[Case]:
-    """Solver x hidden size x step x k x precision x threads: everything at the usual size, the best at every size."""
-    precisions = tuple(NUMPY_DTYPE)
-    for hidden in effort.hidden:
-        usual = hidden == USUAL_HIDDEN
-        for solver in ("thesis-linear", "linear-argmin", "vectorised-argmin"):
-            yield Case(solver, hidden, step_mT=1.0)
-        yield Case("linear-argmin curve", hidden, step_mT=1.0)
-        steps, counts = ((1.0, 2.0, 5.0, 10.0, 20.0), (1, 4, 16)) if usual else ((2.0, 20.0), (4,))
-        for dtype, step, count in itertools.product(precisions, steps, counts):
-            yield Case("nearest", hidden, dtype, step, count)
-        for solver, dtype, step in itertools.product(
-            ("coarse-to-fine", NEWTON, "brent"), precisions, (10.0, 20.0, 40.0) if usual else (20.0,)
-        ):
-            if solver != "brent" or dtype == "float64":
-                yield Case(solver, hidden, dtype, step)
-        yield Case(RISING, hidden)
-        for count in (1, 8, 32) if usual else (8,):
-            yield Case("k-d tree", hidden, step_mT=4.0, neighbours=count)
-        yield Case("direct", hidden)
-    yield Case("closed form")
-    yield Case("vectorised-argmin", dtype="float32", step_mT=1.0)
-    for threads in (2, 4):
-        yield Case("vectorised-argmin", step_mT=1.0, threads=threads)
+def cases(hidden: tuple[int, ...]) -> Iterator[Case]:
+    """Every search at every size, at the usual size with every step, and what the shipped scenes choose."""
+    for size in hidden:
+        for solver in BASELINES:
+            yield Case(solver, size, BASELINE_STEP_MT)
+        for solver, steps_mT in (STEPS_MT if size == USUAL_HIDDEN else ENDS_MT).items():
+            for step_mT in steps_mT:
+                yield Case(solver, size, step_mT, named(solver).neighbours if solver == "nearest" else 0)
+        yield Case(RISING, size)
+    yield from (of_scene(name) for name in shipped_scenes())
+
+
+def of_scene(name: str) -> Case:
+    """What the scene runs where it searches."""
+    solver = load_scene(name).solver
+    choice = named(NEWTON if solver.name == AUTO else solver.name, solver.step_mT or None, solver.neighbours or None)
+    if choice.solver == NEWTON:
+        return Case(RISING)
+    return Case(choice.solver, step_mT=choice.step_mT, neighbours=choice.neighbours)
 
 
 def make(case: Case, model: ForceModel) -> FieldSolver:
-    """The search. Raises `DomainError` where it refuses the model."""
-    span: dict[str, Any] = {"field_range_mT": FIELDS_MT}
-    stepped = span | {"step_mT": case.step_mT}
-    refinements = {"coarse-to-fine": finer_grid, NEWTON: newton, "brent": brent}
-    builders: dict[str, Callable[[], FieldSolver]] = {
-        # the thesis took its network's mean error for the radius; so does this, with its own network's
-        "thesis-linear": lambda: LinearFieldSearch(
-            epsilon_N=model.metadata.metrics["mae_N"], predict_one=torch_row(model), **stepped
-        ),
-        "linear-argmin": lambda: LinearFieldSearch(epsilon_N=0.0, predict_one=torch_row(model), **stepped),
-        "linear-argmin curve": lambda: LinearFieldSearch(epsilon_N=0.0, **stepped),
-        "vectorised-argmin": lambda: GridArgmin(model, dtype=getattr(torch, case.dtype), **stepped),
-        "nearest": lambda: NearestFieldSearch(neighbours=case.neighbours, dtype=NUMPY_DTYPE[case.dtype], **stepped),
-        "k-d tree": lambda: KdTreeSearch(model, neighbours=case.neighbours, **stepped),
-        RISING: lambda: rising(model),
-        "direct": lambda: DirectInverse(model, **span),
-        "closed form": lambda: ClosedForm(model, INSERT.elastomer, TORMAG, **span),
-    }
-    if case.solver in refinements:
-        return BracketedSearch(refine=refinements[case.solver], dtype=NUMPY_DTYPE[case.dtype], **stepped)
-    return builders[case.solver]()
-
-
-def rising(model: ForceModel) -> RisingSearch:
-    """Raises `DomainError` on a model that the daemon would refuse."""
-    if falling_at(model, FIELDS_MT, model.feature_ranges[0][1]) is not None:
-        raise DomainError("model", "not rising with the field", "a force that rises with the field everywhere")
-    return RisingSearch(FIELDS_MT)
+    """The search: one of the daemon's, or a baseline."""
+    if case.solver not in BASELINES:
+        solver = NEWTON if case.solver == RISING else case.solver
+        choice = named(solver, case.step_mT or None, case.neighbours or None)
+        return build(choice, FIELDS_MT, rises=case.solver == RISING)
+    if case.solver == "vectorised-argmin":
+        return GridArgmin(model, dtype=torch.float64, field_range_mT=FIELDS_MT, step_mT=case.step_mT)
+    # the thesis took its network's mean error for the radius; so does this, with its own network's
+    epsilon_N = model.metadata.metrics["mae_N"] if case.solver == "thesis-linear" else 0.0
+    row = torch_row(model)
+    return LinearFieldSearch(epsilon_N=epsilon_N, predict_one=row, field_range_mT=FIELDS_MT, step_mT=case.step_mT)
 
 
 class Bench:
-    """The workload with what the answers are held against, per network."""
+    """The workload with what the answers are held against, per network. It trains them."""
 
     def __init__(self, effort: Effort) -> None:
         self.effort = effort
-        self.plant = load_plant(OWN)
+        self.plant = load_plant(PLANT)
         self.course = course(self.plant, effort.course)
-        self.data = training_data(self.plant, effort.training_rows, seed=1)
-        self.models: dict[int, ForceModel] = {}
-        self.roots: dict[int, list[Array]] = {}
+        data = training_data(self.plant, effort.training_rows, seed=1)
+        hidden = tqdm(effort.hidden, desc="networks", disable=None)
+        self.models = {size: trained(data, size, effort.epochs) for size in hidden}
+        self.roots = {size: network_roots_mT(model, self.course) for size, model in self.models.items()}
 
-    def prepare(self) -> None:
-        """Trains the networks and finds their roots."""
-        for hidden in tqdm(self.effort.hidden, desc="networks", disable=not sys.stderr.isatty()):
-            self.models[hidden] = trained(self.data, hidden, self.effort.epochs)
-            self.roots[hidden] = network_roots_mT(self.models[hidden], self.course)
-
-    def sweep(self) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    def sweep(self) -> tuple[list[dict[str, Any]], list[str]]:
         """The rows of the table, and the searches that refused a network. In rounds: a disturbance meets all alike."""
-        runs, refused = [], {}
-        for case in tqdm(list(cases(self.effort)), desc="building", disable=not sys.stderr.isatty()):
-            try:
-                runs.append(Run(self, case))
-            except DomainError as error:
-                refused[f"{case.name}, {case.hidden} units"] = str(error)
+        wanted = list(dict.fromkeys(cases(self.effort.hidden)))
+        refused = [case for case in wanted if case.solver == RISING and self._falls(case.hidden)]
+        runs = [Run(self, case) for case in wanted if case not in refused]
         freeze_garbage()
-        for _ in tqdm(range(self.effort.rounds), desc="rounds", disable=not sys.stderr.isatty()):
+        for _ in tqdm(range(self.effort.rounds), desc="rounds", disable=None):
             for run in runs:
-                run.advance(self.effort.slow_solves if run.is_slow else self.effort.solves)
-        return [run.row() for run in runs], refused
+                run.advance()
+        gc.unfreeze()
+        return [run.row() for run in runs], [f"{case.name}, {case.hidden} units" for case in refused]
+
+    def _falls(self, hidden: int) -> bool:
+        """Whether the daemon would refuse the network."""
+        model = self.models[hidden]
+        return falling_at(model, FIELDS_MT, model.feature_ranges[0][1]) is not None
 
 
 class Run:
     """One search on its network: fields of its first time along the course, and the time of every solve."""
 
     def __init__(self, bench: Bench, case: Case) -> None:
-        """Raises `DomainError` where the search refuses the network."""
         self.case, self._bench, self._model = case, bench, bench.models[case.hidden]
         self._solver = make(case, self._model)
-        self.is_slow = "linear" in case.solver
+        effort, is_slow = bench.effort, "linear" in case.solver
         # a search of milliseconds takes every so many points; it does not use the last field
-        every = max(bench.effort.course // bench.effort.slow_solves, 1) if self.is_slow else 1
+        every = max(effort.course // effort.slow_solves, 1) if is_slow else 1
         self._course = Course(*(column[::every] for column in bench.course))
         self._roots = bench.roots[case.hidden][::every]
-        self._fields: Array | None = None
+        self._solves = max(effort.slow_solves if is_slow else effort.solves, len(self._course.field_mT))
+        self._fields_mT: list[Array] = []
         self._times_us: list[Array] = []
 
-    def advance(self, solves: int) -> None:
-        """That many solves more."""
-        torch.set_num_threads(self.case.threads)
-        fields, times_us = follow(self._solver, self._model, self._course, max(solves, len(self._course.field_mT)))
-        torch.set_num_threads(1)
+    def advance(self) -> None:
+        """One round more."""
+        fields_mT, times_us = follow(self._solver, self._model, self._course, self._solves)
         self._times_us.append(times_us)
-        if self._fields is None:
-            self._fields = fields[: len(self._course.field_mT)]
+        self._fields_mT.append(fields_mT)
 
     def row(self) -> dict[str, Any]:
         """The row of the table."""
         times_us = np.concatenate(self._times_us)
         return (
-            self.case._asdict()
-            | {"name": self.case.name, "solves": len(times_us)}
+            {"name": self.case.name, "dtype": "float64"}
+            | self.case._asdict()
+            | {"solves": len(times_us)}
             | {f"{name}_us": float(np.percentile(times_us, share)) for name, share in QUANTILES.items()}
             | self._errors()
             | {"memory_kB": held_bytes(self._solver) / 1024}
@@ -224,29 +185,22 @@ class Run:
 
     def _errors(self) -> dict[str, float]:
         """The solver's error (against the network's own nearest root) and the plant's, apart."""
-        along, fields = self._course, self._fields
-        assert fields is not None, "a row comes after the first round"
+        along = self._course
+        fields = self._fields_mT[0][: len(along.field_mT)]
         rooted = np.array([found.size > 0 for found in self._roots])
         to_root = [abs(found - field).min() for found, field in zip(self._roots, fields, strict=True) if found.size]
         features = np.column_stack((along.displacement_mm, along.rate_mm_s, fields, np.full(len(fields), CIP_PERCENT)))
         error_N = np.abs(self._model.predict(features) - along.force_N)
+        rendered_N = plant_force_N(self._bench.plant, along.displacement_mm, along.rate_mm_s, fields)
+        error_mT = np.abs(fields - along.field_mT)
         return {
             "solver_mae_mT": float(np.mean(to_root)),
             "solver_max_mT": float(np.max(to_root)),
             "solver_force_max_N": float(error_N[rooted].max()),
-            "network_reach": float(rooted.mean()),
-        } | plant_errors(self._bench.plant, along, fields)
-
-
-def plant_errors(plant: PlantParameters, along: Course, fields: Array) -> dict[str, float]:
-    """Field against the plant's true field, and the plant's force at the answer against the force asked."""
-    rendered_N = plant_force_N(plant, along.displacement_mm, along.rate_mm_s, fields)
-    error_mT = np.abs(fields - along.field_mT)
-    return {
-        "plant_mae_mT": float(error_mT.mean()),
-        "plant_max_mT": float(error_mT.max()),
-        "force_mae_N": float(np.abs(rendered_N - along.force_N).mean()),
-    }
+            "plant_mae_mT": float(error_mT.mean()),
+            "plant_max_mT": float(error_mT.max()),
+            "force_mae_N": float(np.abs(rendered_N - along.force_N).mean()),
+        }
 
 
 def follow(solver: FieldSolver, model: ForceModel, along: Course, solves: int) -> tuple[Array, Array]:
@@ -266,7 +220,7 @@ def follow(solver: FieldSolver, model: ForceModel, along: Course, solves: int) -
 
 
 def held_bytes(owner: object) -> int:
-    """Bytes of the arrays, tensors, lists and trees that a search owns, beside the network that all of them share."""
+    """Bytes of the arrays, tensors and lists that a search owns, beside the network that all of them share."""
     total = 0
     for value in getattr(owner, "__dict__", {}).values():
         if isinstance(value, np.ndarray):
@@ -277,164 +231,63 @@ def held_bytes(owner: object) -> int:
             total += sys.getsizeof(value) + sum(map(sys.getsizeof, value))
         elif isinstance(value, FieldScan):
             total += held_bytes(value)
-        elif isinstance(value, cKDTree):
-            total += value.data.nbytes + value.indices.nbytes
     return total
 
 
 def mark_pareto(rows: list[dict[str, Any]]) -> None:
-    """Sets `pareto` on the one-thread rows that no faster one equals in plant error, to an encoder count."""
+    """Sets `pareto` on the rows that no faster one equals in plant error, to an encoder count."""
     for row in rows:
-        better = (
+        row["pareto"] = not any(
             other["p50_us"] < row["p50_us"] and other["plant_mae_mT"] < row["plant_mae_mT"] + ENCODER_FIELD_MT
             for other in rows
-            if other["threads"] == 1
         )
-        row["pareto"] = row["threads"] == 1 and not any(better)
 
 
-def precision(bench: Bench) -> dict[str, dict[str, float]]:
-    """Greatest and mean difference in field between float32 and float64, per search, over the course."""
-    found = {}
-    for solver, step, neighbours in (
-        ("nearest", 2.0, 4),
-        ("nearest", 20.0, 4),
-        ("coarse-to-fine", 20.0, 0),
-        (NEWTON, 20.0, 0),
-    ):
-        fields = [
-            follow(
-                make(Case(solver, USUAL_HIDDEN, dtype, step, neighbours), bench.models[USUAL_HIDDEN]),
-                bench.models[USUAL_HIDDEN],
-                bench.course,
-                bench.effort.course,
-            )[0]
-            for dtype in NUMPY_DTYPE
-        ]
-        difference = np.abs(fields[0] - fields[1])
-        name = Case(solver, step_mT=step, neighbours=neighbours).name
-        found[name] = {"max_mT": float(difference.max()), "mean_mT": float(difference.mean())}
-    return found
-
-
-def chosen(bench: Bench, fifo_priority: int) -> dict[str, dict[str, Any]]:
-    """What each shipped scene runs where it searches, measured at length, on this plant and on others."""
-    measured: dict[Case, dict[str, Any]] = {}
-    result = {}
-    for name in shipped_scenes():
-        scene = load_scene(name)
-        wanted = NEWTON if scene.solver.name == AUTO else scene.solver.name
-        choice = named(wanted, scene.solver.step_mT or None, scene.solver.neighbours or None)
-        case = Case(choice.solver, step_mT=choice.step_mT, neighbours=choice.neighbours)
-        if choice.solver == NEWTON:
-            case = Case(RISING)
-        if case not in measured:
-            run = Run(bench, case)
-            with real_time(fifo_priority) as fifo:
-                run.advance(bench.effort.chosen_solves)
-            measured[case] = run.row() | {"fifo": fifo, "mismatched": mismatched(bench, case)}
-        result[name] = measured[case] | {"tolerance_rms_N": scene.force.tolerance_rms_N}
-    return result
-
-
-def dominated(rows: list[dict[str, Any]]) -> list[str]:
-    """Where Newton's method, as the daemon runs it, is not the cheapest of the searches that the daemon may run, to
-    SAME_TIME, or not the most exact: at which size of the network, and by what."""
-    found = []
-    for best in (row for row in rows if row["solver"] == RISING):
-        for row in rows:
-            if row["hidden"] == best["hidden"] and row["solver"] in RUNTIME_SOLVERS and row["threads"] == 1:
-                is_faster = SAME_TIME * row["p50_us"] < best["p50_us"]
-                is_nearer = row["solver_force_max_N"] + LEAST_FORCE_N < best["solver_force_max_N"]
-                if is_faster or is_nearer:
-                    found.append(f"{row['hidden']} units: {row['name']} {row['dtype']}")
-    return found
-
-
-def mismatched(bench: Bench, case: Case) -> dict[str, dict[str, float]]:
-    """The plant's errors where the forces come from another plant than the one the network learned."""
-    errors = {}
-    for name in MISMATCHED:
-        plant = load_plant(name)
-        along = course(plant, bench.effort.course)
-        model = bench.models[case.hidden]
-        fields, _ = follow(make(case, model), model, along, bench.effort.course)
-        errors[name] = plant_errors(plant, along, fields)
-    return errors
-
-
-@contextlib.contextmanager
-def real_time(priority: int) -> Iterator[bool]:
-    """This thread under FIFO, as the daemon's may be; whether it was asked for and granted."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except OSError:  # priority 0 is none
-        yield False
-        return
-    try:
-        yield True
-    finally:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `benchmark inverse`."""
+    parser.add_argument("--quick", action="store_true", help="two small networks and few solves, for a test")
+    parser.add_argument("--write", action="store_true", help="also write docs/inverse_trade.md and its plot")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The contract's object for `benchmark inverse`; with `--write`, also the page."""
     effort = QUICK if options.quick else FULL
-    started_s = time.monotonic()
     torch.set_num_threads(1)
     bench = Bench(effort)
-    bench.prepare()
     rows, refused = bench.sweep()
     mark_pareto(rows)
-    picked = chosen(bench, options.fifo)
-    gc.unfreeze()
-    slope = plant_slope_N_per_mT(bench.plant, bench.course)
+    usual = {row["name"]: row for row in rows if row["hidden"] == USUAL_HIDDEN}
+    # where a network refuses it, as a small one may, the scene would run the search that looks at a grid
+    fallback = usual[Case(NEWTON, step_mT=STEPS_MT[NEWTON][1]).name]
+    scenes = {name: load_scene(name).force.tolerance_rms_N for name in shipped_scenes()}
+    chosen = {
+        name: usual.get(of_scene(name).name, fallback) | {"tolerance_rms_N": tolerance_N}
+        for name, tolerance_N in scenes.items()
+    }
+    p50_us = next(iter(chosen.values()))["p50_us"]
+    speedup = {name: usual[name]["p50_us"] / p50_us for name in BASELINES}
     sigma_N = 1e-3 * bench.plant.force_sensor.noise_mN
-    first = next(iter(picked.values()))
-    # both from the rounds: the long run of the chosen search has a scheduling that the baselines had not
-    p50_us = {(row["name"], row["dtype"]): row["p50_us"] for row in rows if _is_usual(row)}
-    chosen_us = p50_us[first["name"], first["dtype"]]
-    speedups = {name: p50_us[name, "float64"] / chosen_us for name in BASELINES}
     result = {
-        "workload": f"synthetic torque element ({OWN}, no memory), {effort.course} points of a smooth course",
+        "workload": f"synthetic torque element ({PLANT}, no memory), {effort.course} points of a smooth course",
         "environment": environment(),
-        "noise_bound_mae_mT": float((0.8 * sigma_N / slope).mean()),
+        "noise_bound_mae_mT": float((0.8 * sigma_N / plant_slope_N_per_mT(bench.plant, bench.course)).mean()),
         "variants": rows,
         "refused": refused,
-        "beaten": dominated(rows),
-        "chosen": picked,
-        "speedup_vs_thesis_linear": speedups["thesis-linear"],
-        "speedup": speedups,
-        "float32_against_float64": precision(bench),
-        "seconds": time.monotonic() - started_s,
+        "chosen": chosen,
+        "speedup_vs_thesis_linear": speedup["thesis-linear"],
+        "speedup": speedup,
     }
     if options.write:
         report.write(result)
     return result
 
 
-def _is_usual(row: dict[str, Any]) -> bool:
-    return bool(row["hidden"] == USUAL_HIDDEN and row["threads"] == 1)
-
-
 def environment() -> dict[str, Any]:
-    """What the times depend on."""
+    """What the times depend on besides."""
     return {
         "processors": os.cpu_count(),
         "python": platform.python_version(),
         "numpy": np.__version__,
         "torch": torch.__version__,
-        "load average": round(os.getloadavg()[1], 1),
+        "load average": round(os.getloadavg()[0], 1),
     }
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of `benchmark inverse`."""
-    parser.add_argument("--quick", action="store_true", help="few solves, two networks: shows that it works, no more")
-    parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority for the chosen search; 0 for none")
-    parser.add_argument("--write", action="store_true", help="rewrite docs/inverse_trade.md and its plot")
-
-
-def print_table(result: dict[str, Any]) -> None:
-    """The object for a person."""
-    print("\n".join(report.lines(result)))

@@ -24,7 +24,7 @@ import numpy.typing as npt
 import zmq
 
 from benchmarks.histograms import plot_histograms
-from benchmarks.loop import Stand, add_realtime_arguments, asked_for, daemon_process, quantiles, realtime_settings
+from benchmarks.loop import Stand, add_realtime_arguments, asked_for, daemon, quantiles, realtime_settings
 from tormagd.config import Config, RealTime
 from tormagd.daemon.endpoint import context
 from tormagd.daemon.realtime import prepare, priority_of_threads
@@ -36,6 +36,7 @@ Array = npt.NDArray[np.float64]
 LEAST_N, GRAIN_N = 1.0, 1e-4
 SPACING_S = (0.0015, 0.0025)
 "500 a second, as in `make run`; random, so that they meet every phase of the control period."
+COLUMNS = ("t_ns", "exec_us", "plan_time_s", "monotonic_s")
 SETTLE_NS = 500_000_000
 ALLOWED_US = 250.0
 """From a setpoint to its frame p99 is to take no longer than the bare hop's of the same run, a control period, which it
@@ -61,17 +62,15 @@ class Course(NamedTuple):
 
 def run(count: int, realtime: RealTime) -> Course:
     """`count` setpoints through the daemon, then as many through the bare hop."""
-    with tempfile.TemporaryDirectory(prefix="tormag-") as name, daemon_process(Path(name), realtime, 0) as config:
+    stand = Stand(realtime, setpoint_hz=0)
+    with tempfile.TemporaryDirectory(prefix="tormag-") as name, daemon(stand, Path(name)) as running:
         prepare(RealTime(fifo_priority=max(realtime.fifo_priority - BELOW, 0), keep_awake=realtime.keep_awake))
-        sent, rows = exchange(config, count)
-    first = first_ticks(sent, rows)
-    ticks = [tick for _, tick in first]
-    stamp_ns = np.array([stamp for stamp, _ in first], dtype=np.int64)
-    written_ns = np.array([tick["t_ns"] for tick in ticks], dtype=np.int64)
-    tick_us = np.array([tick["exec_us"] for tick in ticks])
+        sent, rows = exchange(running.config, count)
+    stamp_ns, *columns = zip(*first_ticks(sent, rows), strict=True)
+    written_ns, tick_us, planned_s, began_s = (np.array(column) for column in columns)
     # plan and tick are stamped on the monotonic clock, the frame on that of the setpoint's stamp
-    plan_us = np.array([(tick["monotonic_s"] - tick["plan_time_s"]) * 1e6 for tick in ticks])
-    return Course((written_ns - stamp_ns) * 1e-3 - tick_us - plan_us, plan_us, tick_us, bare_hop(count))
+    plan_us = (began_s - planned_s) * 1e6
+    return Course((written_ns - np.array(stamp_ns)) * 1e-3 - tick_us - plan_us, plan_us, tick_us, bare_hop(count))
 
 
 def summary(course: Course, count: int, realtime: RealTime) -> dict[str, Any]:
@@ -95,29 +94,35 @@ def summary(course: Course, count: int, realtime: RealTime) -> dict[str, Any]:
 
 
 def exchange(config: Config, count: int) -> tuple[dict[float, int], list[dict[str, Any]]]:
-    """Publishes and records: when each force was sent, ns, and the ticks of that time."""
-    with context(priority_of_threads()) as ours, ours.socket(zmq.XPUB) as publisher, ours.socket(zmq.SUB) as recording:
-        for socket in (publisher, recording):
-            socket.setsockopt(zmq.LINGER, 0)
+    """Publishes and records: when each force was sent, ns, and the ticks of that time. Raises RuntimeError."""
+    with context(priority_of_threads()) as ours, ours.socket(zmq.SUB) as recording:
+        recording.setsockopt(zmq.LINGER, 0)
         recording.setsockopt(zmq.RCVHWM, 0)  # read when the last one has been sent: reading would set the pace
         recording.subscribe(b"")
         recording.connect(config.endpoints.recording)
-        publisher.connect(config.endpoints.setpoint)
-        if not publisher.poll(5_000):
-            raise RuntimeError("the daemon does not take setpoints")
+        sent = publish(config.endpoints.setpoint, count)
+        return sent, rows_until(recording, time.time_ns() + SETTLE_NS)
+
+
+def publish(address: str, count: int) -> dict[float, int]:
+    """So many setpoints, each of its own force, to who binds there: when each was sent, ns. Raises RuntimeError."""
+    with context(priority_of_threads()) as ours, ours.socket(zmq.XPUB) as publisher:
+        publisher.setsockopt(zmq.LINGER, 1_000)
+        publisher.connect(address)
+        if not publisher.poll(10_000):
+            raise RuntimeError(f"nobody takes setpoints at {address}")
         publisher.recv()
         sent: dict[float, int] = {}
         spacing = random.Random(1)
         for number in range(count):
-            force = round(LEAST_N + GRAIN_N * (number % 5_000), 6)
-            stamp = time.time_ns()
+            time.sleep(spacing.uniform(*SPACING_S))
+            force, stamp_ns = round(LEAST_N + GRAIN_N * (number % 5_000), 6), time.time_ns()
             setpoint = Setpoint(
-                v=VERSION, source="latency", seq=number, stamp_ns=stamp, servo_cf=force, valid_for_ms=500.0
+                v=VERSION, source="latency", seq=number, stamp_ns=stamp_ns, servo_cf=force, valid_for_ms=500.0
             )
             publisher.send(encode(setpoint))
-            sent[force] = stamp
-            time.sleep(spacing.uniform(*SPACING_S))
-        return sent, rows_until(recording, time.time_ns() + SETTLE_NS)
+            sent[force] = stamp_ns
+    return sent
 
 
 def rows_until(recording: "zmq.Socket[bytes]", until_ns: int) -> list[dict[str, Any]]:
@@ -131,14 +136,12 @@ def rows_until(recording: "zmq.Socket[bytes]", until_ns: int) -> list[dict[str, 
     return rows
 
 
-def first_ticks(sent: dict[float, int], rows: list[dict[str, Any]]) -> list[tuple[int, dict[str, Any]]]:
-    """For each setpoint the first tick whose plan used it."""
+def first_ticks(sent: dict[float, int], rows: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
+    """Of each setpoint when it was sent, ns, and of the first tick whose plan used it what COLUMNS names."""
     first: dict[float, dict[str, Any]] = {}
     for row in rows:
-        force = row["setpoint_cf"]
-        if force in sent and force not in first:
-            first[force] = row
-    return [(sent[force], row) for force, row in first.items()]
+        first.setdefault(row["setpoint_cf"], row)
+    return [(sent[force], *(row[name] for name in COLUMNS)) for force, row in first.items() if force in sent]
 
 
 def bare_hop(count: int) -> Array:
@@ -149,28 +152,12 @@ def bare_hop(count: int) -> Array:
         scheduling = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
         process = multiprocessing.Process(target=receive, args=(address, count, scheduling, theirs), daemon=True)
         process.start()
-        send(address, count)
+        publish(address, count)
         if not ours.poll(10):
             raise RuntimeError("the bare hop lost messages")
         found: Array = ours.recv()
         process.join(5.0)
     return found
-
-
-def send(address: str, count: int) -> None:
-    """The near end of the bare hop."""
-    with context(priority_of_threads()) as ours, ours.socket(zmq.XPUB) as publisher:
-        publisher.setsockopt(zmq.LINGER, 1_000)
-        publisher.connect(address)
-        publisher.poll(10_000)
-        publisher.recv()
-        spacing = random.Random(2)
-        for number in range(count):
-            time.sleep(spacing.uniform(*SPACING_S))
-            stamp = time.time_ns()
-            publisher.send(
-                encode(Setpoint(v=VERSION, source="hop", seq=number, stamp_ns=stamp, servo_cf=1.0, valid_for_ms=500.0))
-            )
 
 
 def receive(address: str, count: int, scheduling: tuple[int, int], result: Connection) -> None:
@@ -182,12 +169,8 @@ def receive(address: str, count: int, scheduling: tuple[int, int], result: Conne
         hops = np.zeros(count)
         for index in range(count):
             data = socket.recv()
-            hops[index] = (time.time_ns() - _stamp(data)) * 1e-3
+            hops[index] = (time.time_ns() - msgpack.unpackb(data)["stamp_ns"]) * 1e-3
         result.send(hops)
-
-
-def _stamp(data: bytes) -> int:
-    return int(msgpack.unpackb(data)["stamp_ns"])
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -210,14 +193,3 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         }
         plot_histograms(options.plot, f"From {course.whole_us.size} setpoints to their first drive frames", shown)
     return summary(course, options.count, realtime)
-
-
-def print_table(result: dict[str, Any]) -> None:
-    """The object for a person."""
-    print(f"{'':28s}{'p50':>9s}{'p99':>9s}{'p99.9':>9s}   us (fifo {result['fifo_priority']})")
-    rows = {"setpoint to wire": result["setpoint_to_wire_us"], "bare ZeroMQ hop": result["bare_zmq_us"]}
-    for name, found in (rows | result["stages_us"]).items():
-        print(f"{name:28s}" + "".join(f"{found[key]:9.0f}" for key in ("p50", "p99", "p999")))
-    verdict = "kept" if result["kept"] else "NOT KEPT"
-    print(f"p99 at most {result['bound_us']:.0f} us, the hop's and a period and {ALLOWED_US:.0f} us: {verdict}")
-    print(f"{result['seen']} of {result['setpoints']} setpoints seen on the wire")

@@ -4,8 +4,10 @@ Daemon and stub run in alternating blocks, because a shared machine drifts: what
 neighbour. Both have the same heartbeat, event loop and scheduling, publish a row for each tick, and answer the same
 eight clients, each of which asks for status again as soon as it is answered; the stub has no controller and no device.
 
-Processor time is that of the daemon with its threads and children; recording is on: a subscriber reads every tick. With
-`--against` the daemon of another checkout takes its turn, on its own simulated device: the protocol changes, too.
+Processor time is that of the daemon with its threads and children; recording is on: a subscriber reads every tick. A
+tick is fresh whose measurement came since the tick before it. With `--against` the daemon of another checkout takes its
+turn, on its own simulated device: the protocol changes, too. `--control-hz 4000 --baud 4000000` is the fastest that
+`tormagd` takes; the device then has a priority just below the daemon's, because it stands for a machine of its own.
 """
 
 import argparse
@@ -25,7 +27,6 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 import uvloop
@@ -36,7 +37,6 @@ from machines.wire import carried
 
 from benchmarks.against import add_against_argument, as_installed, environment
 from benchmarks.histograms import plot_histograms
-from benchmarks.keys import curve_table, free_port
 from tormagd.config import ENDPOINTS, Config, Endpoints, RealTime, load_config
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
@@ -50,7 +50,6 @@ from tormagd_client.messages import Request
 from tormagd_client.wire import keys_of, opened
 
 Array = npt.NDArray[np.float64]
-NOTHING: Array = np.array([])
 
 LOG = "tormagd.log"
 "What the daemon says, in its folder."
@@ -59,11 +58,11 @@ SETPOINT_HZ = 500
 STARTS_MS = 20_000
 "Until the first tick, at most."
 WARM_UP_S = 1.0
-ALONE_S = 4.0
-"For how long a block goes on without its clients."
+BELOW = 5
+"The device's priority on a faster line is this far below the daemon's."
 TELEMETRY_EVERY = 20
 PLAN_QUANTILES = ("p50", "p99")
-COLUMNS = ("t_ns", "monotonic_s", "lateness_us", "exec_us", "received_s")
+COLUMNS = ("t_ns", "lateness_us", "exec_us", "received_s")
 "What is read of a recorded tick; a stub has not all of them."
 QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9, "max": 100.0}
 
@@ -76,13 +75,12 @@ class Block(NamedTuple):
     ticks: int
     merged: int
     seconds: float
-    without_write_us: Array = NOTHING
-    "Of the same ticks, less what writing to the device took; empty where the writes were not seen."
+    fresh: int = 0
+    "Ticks whose measurement came since the tick before."
     plan_us: dict[str, float] | None = None
     "p50 and p99 of its plans over the last 5 to 10 s as the daemon's status has them, in bins of 3%."
     core_share: float = 0.0
     "Processor time of all its processes over wall time, while the clients ask."
-    core_share_without_clients: float = 0.0
 
 
 class Pair(NamedTuple):
@@ -95,8 +93,7 @@ class Pair(NamedTuple):
 
 class Stand(NamedTuple):
     """What is measured: scheduling, rates, the serial line, how often setpoints come, and of which checkout daemon
-    and device are. `device_fifo` is the device's own priority; it stands for a machine of its own.
-    `within` runs the daemon on another machine (`ip netns exec NAME`), which is reached at `host`."""
+    and device are. `device_fifo` is the device's own priority; it stands for a machine of its own."""
 
     realtime: RealTime
     control_hz: int = 1_000
@@ -105,51 +102,24 @@ class Stand(NamedTuple):
     setpoint_hz: int = SETPOINT_HZ
     root: Path | None = None
     device_fifo: int = 0
-    scene: str = "coronary"
-    device: tuple[str, ...] = ()
-    "More arguments of the simulated device."
-    guarded: tuple[str, ...] = ()
-    "Endpoints at tcp:// addresses of `host` that demand keys; the others are at ipc://."
-    host: str = "127.0.0.1"
-    within: tuple[str, ...] = ()
 
 
 class Running(NamedTuple):
-    """A process that keeps time: where its sockets are, its id, and the file that has its writes once it has ended."""
+    """A process that keeps time: where its sockets are, and its id."""
 
     config: Config
     pid: int
-    writes: Path | None = None
 
 
-class Ticks(NamedTuple):
-    """Rows of a recording, an array each. `start_ns` is CLOCK_MONOTONIC's; empty where it was not recorded."""
-
-    stamp_ns: npt.NDArray[np.int64]
-    start_ns: npt.NDArray[np.int64]
-    lateness_us: Array
-    exec_us: Array
-    received_s: Array
-    "When the newest state had come that the tick knew; NaN before the first."
-
-
-def run(seconds: float, pairs: int, realtime: RealTime, against: Path | None = None) -> list[Pair]:
-    """`pairs` blocks of each kind, `seconds` long."""
-    ours = Stand(realtime)
-    return [
-        Pair(
-            block(partial(daemon, ours), seconds),
-            block(partial(stub_process, realtime), seconds),
-            None if against is None else block(partial(daemon, ours._replace(root=against)), seconds),
-        )
-        for _ in range(pairs)
-    ]
+Started = Callable[[Path], contextlib.AbstractContextManager[Running]]
+"""Begins what is measured, with its files in the folder."""
 
 
 def summary(pairs: list[Pair], realtime: RealTime) -> dict[str, Any]:
     """The contract's object."""
     bare = merge([pair.bare for pair in pairs])
-    result = _daemon([pair.daemon for pair in pairs]) | {
+    both_us = [(quantiles(pair.daemon.lateness_us), quantiles(pair.bare.lateness_us)) for pair in pairs]
+    result = _told([pair.daemon for pair in pairs]) | {
         "bare": {
             "method": f"uvloop + timerfd, fifo {realtime.fifo_priority}, {CLIENTS} clients",
             "lateness_us": quantiles(bare.lateness_us),
@@ -157,88 +127,61 @@ def summary(pairs: list[Pair], realtime: RealTime) -> dict[str, Any]:
             "core_share": round(bare.core_share, 4),
         },
         "ratio": {
-            name: statistics.median(
-                quantiles(pair.daemon.lateness_us)[name] / quantiles(pair.bare.lateness_us)[name] for pair in pairs
-            )
+            name: statistics.median(ours_us[name] / bare_us[name] for ours_us, bare_us in both_us)
             for name in ("p50", "p99", "p999")
         },
         "pairs": len(pairs),
     }
-    against = [pair.against for pair in pairs if pair.against is not None]
+    against = [(pair.daemon, pair.against) for pair in pairs if pair.against is not None]
     if against:
-        ratios = [_ratios(pair.daemon, pair.against) for pair in pairs if pair.against is not None]
-        result["against"] = _daemon(against) | {
-            "ratio": {
-                name: round(statistics.median(ratio[name] for ratio in ratios), 3)
-                for name in ratios[0]
-                if all(name in ratio for ratio in ratios)
-            }
+        result["against"] = _told([theirs for _, theirs in against]) | {
+            "core_share_ratio": round(
+                statistics.median(one.core_share / other.core_share for one, other in against), 3
+            ),
+            "tick_mean_ratio": round(
+                statistics.median(float(one.exec_us.mean() / other.exec_us.mean()) for one, other in against), 3
+            ),
         }
     return result | asked_for(realtime)
 
 
-def _daemon(blocks: list[Block]) -> dict[str, Any]:
+def _told(blocks: list[Block]) -> dict[str, Any]:
     whole = merge(blocks)
-    without_us, plan_us = whole.without_write_us, whole.plan_us
     return {
         "rate_hz": whole.ticks / whole.seconds,
         "ticks": whole.ticks,
         "merged_ticks": whole.merged,
+        "merged_share": whole.merged / max(whole.ticks, 1),
+        "fresh_share": round(whole.fresh / max(whole.ticks - len(blocks), 1), 5),
         "lateness_us": quantiles(whole.lateness_us),
         "control_exec_us": {"mean": float(whole.exec_us.mean())} | quantiles(whole.exec_us),
-        "tick_without_write_us": {"mean": round(float(without_us.mean()), 1)} | quantiles(without_us)
-        if without_us.size
-        else None,
-        "plan_us": plan_us,
+        "plan_us": whole.plan_us,
         "core_share": round(whole.core_share, 4),
-        "core_share_without_clients": round(whole.core_share_without_clients, 4),
-        "merged_share": whole.merged / max(whole.ticks, 1),
-        "block_s": round(whole.seconds / len(blocks), 1),
     }
-
-
-def _ratios(ours: Block, theirs: Block) -> dict[str, float]:
-    """What ours takes over what theirs does, as far as both are known."""
-    taken = {
-        "tick_mean": (float(ours.exec_us.mean()), float(theirs.exec_us.mean())),
-        "core_share": (ours.core_share, theirs.core_share),
-        "core_share_without_clients": (ours.core_share_without_clients, theirs.core_share_without_clients),
-    }
-    if ours.without_write_us.size and theirs.without_write_us.size:
-        taken["tick_without_write_mean"] = float(ours.without_write_us.mean()), float(theirs.without_write_us.mean())
-    if ours.plan_us and theirs.plan_us:
-        taken |= {f"plan_{name}": (ours.plan_us[name], theirs.plan_us[name]) for name in PLAN_QUANTILES}
-    return {name: own / other for name, (own, other) in taken.items() if other > 0.0}
-
-
-Started = Callable[[Path], contextlib.AbstractContextManager[Running]]
-"""Begins what is measured, with its files in the folder."""
 
 
 def block(started: Started, seconds: float) -> Block:
-    """One block of one kind, under the load of the clients; for some seconds more without them."""
-    with tempfile.TemporaryDirectory(prefix="tormag-") as folder:
-        with started(Path(folder)) as running, recording(running.config.endpoints) as recorder:
-            stop = multiprocessing.Event()
-            load = multiprocessing.Process(target=hammer, args=(running.config.endpoints.control, stop), daemon=True)
-            load.start()
-            try:
-                recorder.poll(STARTS_MS)
-                collect(recorder, WARM_UP_S)
-                ticks, share = collect_and_weigh(recorder, running.pid, seconds)
-                plan_us = planned(running.config.endpoints.control)
-            finally:
-                stop.set()
-                load.join(5.0)
-            collect(recorder, WARM_UP_S)  # what came while nobody read
-            _, share_alone = collect_and_weigh(recorder, running.pid, min(seconds, ALONE_S))
-        written = None if running.writes is None else writes(running.writes)  # they are there when it has ended
-    return as_block(ticks, running.config.rates.control_hz)._replace(
-        without_write_us=NOTHING if written is None else without_writes(ticks, *written),
-        plan_us=plan_us,
-        core_share=share,
-        core_share_without_clients=share_alone,
-    )
+    """One block of one kind, under the load of the clients."""
+    with (
+        tempfile.TemporaryDirectory(prefix="tormag-") as folder,
+        started(Path(folder)) as running,
+        recording(running.config.endpoints) as recorder,
+    ):
+        rate_hz = running.config.rates.control_hz
+        stop = multiprocessing.Event()
+        load = multiprocessing.Process(target=hammer, args=(running.config.endpoints.control, stop), daemon=True)
+        load.start()
+        try:
+            recorder.poll(STARTS_MS)
+            collect(recorder, WARM_UP_S, rate_hz)
+            started_s, before_s = time.monotonic(), processor_s(running.pid)
+            ticks = collect(recorder, seconds, rate_hz)
+            share = (processor_s(running.pid) - before_s) / (time.monotonic() - started_s)
+            plan_us = planned(running.config.endpoints.control)
+        finally:
+            stop.set()
+            load.join(5.0)
+    return ticks._replace(plan_us=plan_us, core_share=share)
 
 
 @contextlib.contextmanager
@@ -248,14 +191,7 @@ def recording(endpoints: Endpoints) -> Iterator["zmq.Socket[bytes]"]:
         yield opened(socket, endpoints.recording, keys_of(endpoints.curve))
 
 
-def collect_and_weigh(socket: "zmq.Socket[bytes]", pid: int, seconds: float) -> tuple[Ticks, float]:
-    """The ticks of that time, and the share of a processor that the process and what it has begun had meanwhile."""
-    started_s, before_s = time.monotonic(), processor_s(pid)
-    ticks = collect(socket, seconds)
-    return ticks, (processor_s(pid) - before_s) / (time.monotonic() - started_s)
-
-
-def collect(socket: "zmq.Socket[bytes]", seconds: float) -> Ticks:
+def collect(socket: "zmq.Socket[bytes]", seconds: float, rate_hz: int) -> Block:
     """Reads tick rows for a while. Raises RuntimeError where there are none."""
     until_s = time.monotonic() + seconds
     rows: list[list[Any]] = []
@@ -266,39 +202,16 @@ def collect(socket: "zmq.Socket[bytes]", seconds: float) -> Ticks:
             rows.extend([None if column is None else row[column] for column in columns] for row in batch.rows)
     if len(rows) < 2:
         raise RuntimeError(f"no ticks within {seconds:g} s")
-    stamp, start, lateness, execution, received = zip(*rows, strict=True)
-    starts = [] if start[0] is None else [round(second * 1e9) for second in start]
-    return Ticks(
-        np.array(stamp, dtype=np.int64),
-        np.array(starts, dtype=np.int64),
-        np.array(lateness, dtype=np.float64),
-        np.array(execution, dtype=np.float64),
-        np.array(received, dtype=np.float64),
-    )
+    return as_block(rows, rate_hz)
 
 
-def as_block(ticks: Ticks, rate_hz: int) -> Block:
-    """The ticks, and how many periods had none."""
-    count = ticks.stamp_ns.size
-    spanned_s = float(ticks.stamp_ns[-1] - ticks.stamp_ns[0]) * 1e-9
-    merged = max(0, round(spanned_s * rate_hz) + 1 - count)
-    return Block(ticks.lateness_us, ticks.exec_us, count, merged, spanned_s)
-
-
-def writes(file: Path) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
-    """When each write began and how long it took, ns; None where the daemon wrote some other way."""
-    pairs = np.fromfile(file, dtype=np.int64) if file.exists() else np.array([], dtype=np.int64)
-    return (pairs[0::2], pairs[1::2]) if pairs.size else None
-
-
-def without_writes(ticks: Ticks, begun_ns: npt.NDArray[np.int64], took_ns: npt.NDArray[np.int64]) -> Array:
-    """Each tick's time less that of the writes within it, us; empty where no tick wrote."""
-    spent_us = np.concatenate([[0.0], np.cumsum(took_ns * 1e-3)])
-    end_ns = ticks.start_ns + np.round(ticks.exec_us[: ticks.start_ns.size] * 1e3).astype(np.int64)
-    first, last = np.searchsorted(begun_ns, ticks.start_ns), np.searchsorted(begun_ns, end_ns)
-    if not np.any(last > first):
-        return NOTHING
-    return np.asarray(ticks.exec_us - (spent_us[last] - spent_us[first]), dtype=np.float64)
+def as_block(rows: list[list[Any]], rate_hz: int) -> Block:
+    """The ticks, rows of COLUMNS; how many periods had none, and how many ticks knew of a new state."""
+    lateness_us, exec_us, received_s = np.array([row[1:] for row in rows], dtype=np.float64).T
+    spanned_s = (rows[-1][0] - rows[0][0]) * 1e-9
+    merged = max(0, round(spanned_s * rate_hz) + 1 - len(rows))
+    fresh = int(np.count_nonzero(np.diff(received_s) > 0.0))
+    return Block(lateness_us, exec_us, len(rows), merged, spanned_s, fresh)
 
 
 def planned(address: str) -> dict[str, float] | None:
@@ -317,10 +230,9 @@ def merge(blocks: list[Block]) -> Block:
         sum(block.ticks for block in blocks),
         sum(block.merged for block in blocks),
         sum(block.seconds for block in blocks),
-        np.concatenate([block.without_write_us for block in blocks]),
+        sum(block.fresh for block in blocks),
         {name: statistics.median(plan[name] for plan in plans) for name in PLAN_QUANTILES} if plans else None,
         statistics.median(block.core_share for block in blocks),
-        statistics.median(block.core_share_without_clients for block in blocks),
     )
 
 
@@ -333,11 +245,10 @@ def hammer(address: str, stop: Event) -> None:
     """Eight clients that each ask for status as fast as they are answered."""
 
     def ask() -> None:
-        client = Client(Endpoints(control=address), 2.0)
-        while not stop.is_set():
-            with contextlib.suppress(ClientError):
-                client.request("status")
-        client.close()
+        with contextlib.closing(Client(Endpoints(control=address), 2.0)) as client:
+            while not stop.is_set():
+                with contextlib.suppress(ClientError):
+                    client.request("status")
 
     clients = [threading.Thread(target=ask) for _ in range(CLIENTS)]
     for client in clients:
@@ -349,19 +260,12 @@ def hammer(address: str, stop: Event) -> None:
 def write_config(folder: Path, port: str, stand: Stand) -> Path:
     """A configuration with its sockets in `folder`; planning in every period, as in examples/service.toml."""
     path = folder / "tormagd.toml"
-    sockets = "".join(
-        f'{name} = "tcp://{stand.host}:{free_port()}"\n'
-        if name in stand.guarded
-        else f'{name} = "ipc://{folder}/{name}"\n'
-        for name in ENDPOINTS
-    )
-    if stand.guarded:
-        sockets += curve_table(folder / "keys", also_local=len(stand.guarded) == len(ENDPOINTS))
+    sockets = "".join(f'{name} = "ipc://{folder}/{name}"\n' for name in ENDPOINTS)
     realtime = stand.realtime
     # an older checkout knows no options, and only the other line's rate needs one
     options = "" if stand.baud == DEFAULT_BAUD else f"[device.options]\nbaud = {stand.baud}\n"
     path.write_text(
-        f'scene = "{stand.scene}"\n[device]\nport = "{port}"\n{options}[endpoints]\n{sockets}'
+        f'[device]\nport = "{port}"\n{options}[endpoints]\n{sockets}'
         f"[rates]\ncontrol_hz = {stand.control_hz}\ninference_hz = {stand.inference_hz}\n"
         f"[realtime]\nfifo_priority = {realtime.fifo_priority}\nkeep_awake = {str(realtime.keep_awake).lower()}\n"
         f"lock_memory = {str(realtime.lock_memory).lower()}\n"
@@ -371,42 +275,33 @@ def write_config(folder: Path, port: str, stand: Stand) -> Path:
 
 
 @contextlib.contextmanager
-def daemon_process(folder: Path, realtime: RealTime, setpoint_hz: int = SETPOINT_HZ) -> Iterator[Config]:
-    """The daemon on a simulated device, enabled, with setpoints arriving (none where `setpoint_hz` is 0)."""
-    with daemon(Stand(realtime, setpoint_hz=setpoint_hz), folder) as running:
-        yield running.config
-
-
-@contextlib.contextmanager
 def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
-    """The same for any stand."""
+    """The daemon on a simulated device, homed, enabled, with setpoints arriving (none where `setpoint_hz` is 0)."""
     with contextlib.ExitStack() as stack:
         theirs = environment(None) if stand.root is None else as_installed(stand.root, folder)
+
+        def started(*command: str, **streams: Any) -> "subprocess.Popen[str]":
+            process = subprocess.Popen(command, env=theirs, text=True, **streams)
+            stack.callback(end, process)
+            return process
+
         if stand.device_fifo:
             stack.enter_context(carried(stand.device_fifo))
-        device = own_machine(stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud), *stand.device)
-        simulator = subprocess.Popen([sys.executable, *device], stdout=subprocess.PIPE, env=theirs, text=True)
-        stack.callback(end, simulator)
+        device = own_machine(stand.device_fifo, "tormagd.simulation", "--pty", "--baud", str(stand.baud))
+        simulator = started(sys.executable, *device, stdout=subprocess.PIPE)
         assert simulator.stdout is not None
         path = write_config(folder, simulator.stdout.readline().strip(), stand)
         config = load_config(path)
-        times = folder / "writes"
-        written = [sys.executable, "-P", str(Path(__file__).with_name("written.py")), str(times), "--config", str(path)]
         with (folder / LOG).open("w") as log:
-            process = subprocess.Popen([*stand.within, *written], env=theirs, stderr=log)
-        stack.callback(end, process)
-        ctl = [sys.executable, "-P", "-m", "tormagd.ctl.main", "--config", str(path), "--wait", "20"]
+            process = started(sys.executable, "-P", "-m", "tormagd.daemon.main", "--config", str(path), stderr=log)
         wait_for(config.endpoints)
-        for command in ("home", "enable"):
-            subprocess.run([*ctl, command], check=True, capture_output=True, env=theirs)
+        ctl = [sys.executable, "-P", "-m", "tormagd.ctl.main", "--config", str(path), "--wait", "20"]
+        for word in ("home", "enable"):
+            subprocess.run([*ctl, word], check=True, capture_output=True, env=theirs)
         if stand.setpoint_hz:
-            publisher = subprocess.Popen(
-                [*ctl, "send", "pulse", "--rate", str(stand.setpoint_hz), "--duration", "3600"],
-                stdout=subprocess.DEVNULL,
-                env=theirs,
-            )
-            stack.callback(end, publisher)
-        yield Running(config, process.pid, times)
+            pulse = ["send", "pulse", "--rate", str(stand.setpoint_hz), "--duration", "3600"]
+            started(*ctl, *pulse, stdout=subprocess.DEVNULL)
+        yield Running(config, process.pid)
 
 
 def end(child: "subprocess.Popen[Any]") -> None:
@@ -416,9 +311,9 @@ def end(child: "subprocess.Popen[Any]") -> None:
 
 
 @contextlib.contextmanager
-def stub_process(realtime: RealTime, folder: Path) -> Iterator[Running]:
-    """The bare timer."""
-    config = load_config(write_config(folder, "/dev/null", Stand(realtime)))
+def stub_process(stand: Stand, folder: Path) -> Iterator[Running]:
+    """The bare timer, with the scheduling and the control rate of the stand."""
+    config = load_config(write_config(folder, "/dev/null", stand))
     stub = multiprocessing.Process(target=bare_loop, args=(config,), daemon=True)
     stub.start()
     assert stub.pid is not None
@@ -456,12 +351,11 @@ async def _bare(config: Config) -> None:
 def wait_for(endpoints: Endpoints) -> None:
     """Until the daemon answers and its device does."""
     until_s = time.monotonic() + 60.0
-    client = Client(endpoints, 1.0)
-    while time.monotonic() < until_s:
-        with contextlib.suppress(ClientError):
-            if client.request("status").get("link", {}).get("state") == "RUNNING":
-                client.close()
-                return
+    with contextlib.closing(Client(endpoints, 1.0)) as client:
+        while time.monotonic() < until_s:
+            with contextlib.suppress(ClientError):
+                if client.request("status").get("link", {}).get("state") == "RUNNING":
+                    return
     raise RuntimeError("the daemon did not reach its device")
 
 
@@ -505,59 +399,33 @@ def asked_for(realtime: RealTime) -> dict[str, Any]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `benchmark loop`."""
     add_realtime_arguments(parser)
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of a block")
-    parser.add_argument("--pairs", type=int, default=3, help="blocks of each kind")
-    parser.add_argument("--without-fifo", action="store_true", help="as many pairs without FIFO after those with it")
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of a block (%(default)s)")
+    parser.add_argument("--pairs", type=int, default=3, help="blocks of each kind (%(default)s)")
+    parser.add_argument("--control-hz", type=int, default=1_000, metavar="HZ", help="(%(default)s)")
+    parser.add_argument("--baud", type=int, default=DEFAULT_BAUD, help="of the device's line (%(default)s)")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="histograms of the lateness")
     add_against_argument(parser)
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """The object for these options; what was measured without FIFO under `without_fifo`."""
+    """The object for these options."""
     realtime = realtime_settings(options)
-    pairs = run(options.seconds, options.pairs, realtime, options.against)
-    result = summary(pairs, realtime)
-    shown = {
-        "daemon": merge([pair.daemon for pair in pairs]).lateness_us,
-        "bare stub": merge([pair.bare for pair in pairs]).lateness_us,
-    }
-    if options.without_fifo:
-        without = msgspec.structs.replace(realtime, fifo_priority=0)
-        ordinary = run(options.seconds, options.pairs, without, options.against)
-        result["without_fifo"] = summary(ordinary, without)
-        shown["daemon without FIFO"] = merge([pair.daemon for pair in ordinary]).lateness_us
-        shown["bare stub without FIFO"] = merge([pair.bare for pair in ordinary]).lateness_us
+    below = 0 if options.baud == DEFAULT_BAUD else max(realtime.fifo_priority - BELOW, 0)
+    ours = Stand(realtime, options.control_hz, baud=options.baud, device_fifo=below)
+    theirs = ours._replace(root=options.against)
+    pairs = [
+        Pair(
+            block(partial(daemon, ours), options.seconds),
+            block(partial(stub_process, ours), options.seconds),
+            None if options.against is None else block(partial(daemon, theirs), options.seconds),
+        )
+        for _ in range(options.pairs)
+    ]
+    result = summary(pairs, realtime) | {"control_hz": options.control_hz, "baud": options.baud}
     if options.plot:
+        shown = {
+            "daemon": np.concatenate([pair.daemon.lateness_us for pair in pairs]),
+            "bare stub": np.concatenate([pair.bare.lateness_us for pair in pairs]),
+        }
         plot_histograms(options.plot, f"Lateness of {result['ticks']} control ticks, {CLIENTS} clients", shown)
     return result
-
-
-def print_table(result: dict[str, Any]) -> None:
-    """The object for a person."""
-    _print_pairs(result)
-    if "without_fifo" in result:
-        print()
-        _print_pairs(result["without_fifo"])
-
-
-def _print_pairs(result: dict[str, Any]) -> None:
-    bare = result["bare"]
-    print(f"{'':8s}{'p50':>9s}{'p99':>9s}{'p99.9':>9s}{'max':>9s}   lateness, us (fifo {result['fifo_priority']})")
-    for name, found in (("daemon", result["lateness_us"]), ("bare", bare["lateness_us"])):
-        print(f"{name:8s}" + "".join(f"{found[key]:9.1f}" for key in QUANTILES))
-    print(f"{'ratio':8s}" + "".join(f"{result['ratio'][key]:9.2f}" for key in ("p50", "p99", "p999")))
-    print(f"merged {result['merged_share']:.3%} (bare {bare['merged_share']:.3%}), on {os.cpu_count()} processors")
-    print(_spent("this checkout", result))
-    if "against" in result:
-        print(_spent("against", result["against"]))
-        print("ratio: " + ", ".join(f"{name} {ratio:.2f}" for name, ratio in result["against"]["ratio"].items()))
-
-
-def _spent(name: str, result: dict[str, Any]) -> str:
-    tick, bare_tick, plan = result["control_exec_us"], result["tick_without_write_us"], result["plan_us"]
-    return (
-        f"{name}: {result['rate_hz']:.1f} Hz, a tick {tick['mean']:.0f} us mean, {tick['p99']:.0f} p99"
-        + (f" ({bare_tick['mean']:.0f} and {bare_tick['p99']:.0f} without the write)" if bare_tick else "")
-        + (f", a plan {plan['p50']:.0f} us p50, {plan['p99']:.0f} p99" if plan else "")
-        + f", {result['core_share']:.1%} of a core ({result['core_share_without_clients']:.1%} without the clients)"
-    )

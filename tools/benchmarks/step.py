@@ -9,13 +9,11 @@ import gc
 import itertools
 import math
 import time
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from pictures.stamp import stamp
 
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config, Motor
@@ -45,20 +43,6 @@ PERIOD_CORNERS = (0.8, 1.0, 1.2)
 TICK_S = 1e-3
 
 
-class Modelled(NamedTuple):
-    """Both carriages' mean position from the start of a duty step, mm, as the encoders count it and by H(z)."""
-
-    time_s: Array
-    measured_mm: Array
-    modelled_mm: Array
-
-    @property
-    def nrmse(self) -> float:
-        """|measured - modelled| / |measured - mean(measured)|, norms."""
-        deviation = self.measured_mm - self.measured_mm.mean()
-        return float(np.linalg.norm(self.measured_mm - self.modelled_mm) / np.linalg.norm(deviation))
-
-
 class Step(NamedTuple):
     """One step of the gap, seen by the encoders; the plant's true error beside it."""
 
@@ -68,44 +52,35 @@ class Step(NamedTuple):
     steady_error_um: float
     true_error_um: float
     skew_um: float
-    time_s: Array
-    gap_mm: Array
 
 
-def run(plant_name: str = "sample_1", config: Config | None = None) -> dict[str, Any]:
-    """The contract's keys, for steps that open and that close; `worst` of both is what counts."""
-    config = config or Config()
-    parameters = load_plant(plant_name)
+FIGURES = ("rise_s", "overshoot", "settling_5pct_s", "steady_error_um", "true_error_um", "skew_um")
+
+
+def run(plant_name: str = "sample_1") -> dict[str, Any]:
+    """The contract's keys, for steps that open and that close; the worse of both is what counts."""
+    config, parameters = Config(), load_plant(plant_name)
     gc.collect()
     gc.disable()  # what is kept here is no garbage, and need not be looked through again and again
     started_s = time.thread_time()
     loop = settled_loop(config, parameters)
-    opening = step(loop, START_MM + STEP_MM)
-    closing = step(loop, START_MM)
+    steps = [step(loop, START_MM + STEP_MM), step(loop, START_MM)]
     stroke_s = stroke(loop)
     over_stroke = overshoot_over_stroke(loop)
     factor = loop.now_s / (time.thread_time() - started_s)
     gc.enable()
-    limits = {+1: time_optimal(parameters, START_MM, STEP_MM), -1: time_optimal(parameters, START_MM, -STEP_MM)}
-    span = STROKE_MM[1] - STROKE_MM[0]
-    physical_s = time_optimal(parameters, STROKE_MM[0], span).total_s
+    fastest_s = [time_optimal(parameters, START_MM, length_mm).rise_s for length_mm in (STEP_MM, -STEP_MM)]
     nominal = margins(config.motor, config.position, TICK_S)
-    corners = corner_margins(config)
     return {
         "plant": plant_name,
-        "rise_s": max(opening.rise_s, closing.rise_s),
-        "overshoot": max(opening.overshoot, closing.overshoot),
-        "settling_5pct_s": max(opening.settling_5pct_s, closing.settling_5pct_s),
-        "steady_error_um": max(opening.steady_error_um, closing.steady_error_um),
-        "true_error_um": max(opening.true_error_um, closing.true_error_um),
+        **{name: max(getattr(found, name) for found in steps) for name in FIGURES},
         "overshoot_over_stroke": over_stroke,
-        "skew_um": max(opening.skew_um, closing.skew_um),
-        "rise_over_time_optimal": max(opening.rise_s / limits[1].rise_s, closing.rise_s / limits[-1].rise_s),
-        "stroke_ratio": stroke_s / physical_s,
+        "rise_over_time_optimal": max(found.rise_s / s for found, s in zip(steps, fastest_s, strict=True)),
+        "stroke_ratio": stroke_s / time_optimal(parameters, STROKE_MM[0], STROKE_MM[1] - STROKE_MM[0]).total_s,
         "gain_margin_dB": nominal.gain_margin_dB,
         "phase_margin_deg": nominal.phase_margin_deg,
-        "corners": corners,
-        "model_nrmse": max(model_step(config.motor, parameters, sign * MODEL_DUTY).nrmse for sign in (1.0, -1.0)),
+        "corners": corner_margins(config),
+        "model_nrmse": max(nrmse(*model_step(config.motor, parameters, sign * MODEL_DUTY)) for sign in (1.0, -1.0)),
         "virtual_time_factor": factor,
     }
 
@@ -140,8 +115,6 @@ def step(loop: ClosedLoop, target_mm: float) -> Step:
         steady_error_um=abs(float(gap[-1]) - target_mm) * 1e3,
         true_error_um=abs(samples[-1].truth.gap_mm - target_mm) * 1e3,
         skew_um=max(abs(estimate.skew_mm) for estimate in estimates) * 1e3,
-        time_s=time_s,
-        gap_mm=gap,
     )
 
 
@@ -165,13 +138,12 @@ def overshoot_over_stroke(loop: ClosedLoop) -> float:
     return worst
 
 
-def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> Modelled:
-    """The plant's answer to a duty step beside that of H(z): the step less the Coulomb duty, and the motor's inertia
-    over the gears' efficiency, because they take their share of the torque that speeds it up.
+def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> tuple[Array, Array]:
+    """Both carriages' mean position every tick from the start of a duty step, mm: as the encoders count it, and by
+    H(z). There it is the step less the Coulomb duty, and the motor's inertia over the gears' efficiency, because they
+    take their share of the torque that speeds it up.
     """
-    side_mm = MODEL_GAP_MM / 2.0
-    at_rest = msgspec.structs.replace(parameters.assumed, start_left_mm=side_mm, start_right_mm=side_mm)
-    plant = Plant(msgspec.structs.replace(parameters, assumed=at_rest), SteadyHand())
+    plant = Plant(_at_rest(parameters, MODEL_GAP_MM), SteadyHand())
     volts = duty * parameters.electronics.supply_V
     counts_per_rad = parameters.electronics.encoder_counts_per_rev / math.tau
     count = round(MODEL_S / TICK_S)
@@ -186,43 +158,12 @@ def model_step(motor: Motor, parameters: PlantParameters, duty: float) -> Modell
     driving = np.full(count + 1, duty - math.copysign(motor.coulomb_V / motor.supply_V, duty))
     from scipy.signal import lfilter  # takes 0.6 s to import, and who only runs a loop needs it not
 
-    modelled: Array = lfilter(transfer.numerator, transfer.denominator, driving)
-    return Modelled(TICK_S * np.arange(count + 1, dtype=np.float64), measured, modelled)
+    return measured, lfilter(transfer.numerator, transfer.denominator, driving)
 
 
-def draw(path: Path, plant_name: str, config: Config, figures: dict[str, Any]) -> None:
-    """Writes a PNG, stamped with these figures: H(z) beside the plant's duty steps, and the gap's 1 mm steps."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    parameters = load_plant(plant_name)
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), constrained_layout=True)
-    for duty, colour in ((MODEL_DUTY, "#2a6f97"), (-MODEL_DUTY, "#d1495b")):
-        found = model_step(config.motor, parameters, duty)
-        left.plot(
-            found.time_s, found.measured_mm, color=colour, linewidth=2.5, alpha=0.4, label=f"plant, duty {duty:+g}"
-        )
-        left.plot(
-            found.time_s, found.modelled_mm, color="#222222", linewidth=1.0, label=f"H(z), NRMSE {found.nrmse:.1%}"
-        )
-    left.set_title(f"Duty step from rest at a gap of {MODEL_GAP_MM:g} mm", loc="left")
-    left.set_ylabel("carriage, mm")
-    loop = settled_loop(config, parameters)
-    for target_mm, colour in ((START_MM + STEP_MM, "#2a6f97"), (START_MM, "#d1495b")):
-        found_step = step(loop, target_mm)
-        right.plot(found_step.time_s, found_step.gap_mm, color=colour, label=f"to {target_mm:g} mm")
-        right.axhline(target_mm, color="#8d99ae", linewidth=0.8, linestyle=":")
-    right.set_xlim(0.0, 0.15)
-    right.set_title(f"Gap step, {plant_name} (synthetic)", loc="left")
-    right.set_ylabel("gap by the encoders, mm")
-    for axes in (left, right):
-        axes.set_xlabel("time, s")
-        axes.legend(frameon=False)
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=110, metadata=stamp(figures))
-    plt.close(figure)
+def nrmse(measured: Array, modelled: Array) -> float:
+    """|measured - modelled| / |measured - mean(measured)|, norms."""
+    return float(np.linalg.norm(measured - modelled) / np.linalg.norm(measured - measured.mean()))
 
 
 class Optimum(NamedTuple):
@@ -249,21 +190,24 @@ def time_optimal(parameters: PlantParameters, start_mm: float, distance_mm: floa
 
 def bang_bang(parameters: PlantParameters, start_mm: float, distance_mm: float, switch_s: float) -> tuple[Array, float]:
     """True gap every 0.1 ms until rest, and the time of that, for full voltage that turns round at `switch_s`."""
-    at_rest = msgspec.structs.replace(parameters.assumed, start_left_mm=start_mm / 2, start_right_mm=start_mm / 2)
     gaps, time_s, tick = [], 0.0, TICK_S / 10.0
-    plant = Plant(msgspec.structs.replace(parameters, assumed=at_rest), SteadyHand(), substep_s=tick)
+    plant = Plant(_at_rest(parameters, start_mm), SteadyHand(), substep_s=tick)
     volts = np.sign(distance_mm) * parameters.electronics.supply_V
-    for count in itertools.count(1):
-        time_s = count * tick
+    is_turning = False
+    while not is_turning and time_s <= 6.0:
+        time_s = (len(gaps) + 1) * tick
         applied = volts if time_s <= switch_s else -volts
         before = plant.gap_mm
         plant.drive(applied, applied)
         plant.advance(tick)
         gaps.append(plant.gap_mm)
         is_turning = time_s > switch_s and (plant.gap_mm - before) * distance_mm <= 0.0
-        if is_turning or time_s > 6.0:
-            return np.array(gaps), time_s
-    raise AssertionError("count ends never")
+    return np.array(gaps), time_s
+
+
+def _at_rest(parameters: PlantParameters, gap_mm: float) -> PlantParameters:
+    begun = msgspec.structs.replace(parameters.assumed, start_left_mm=gap_mm / 2.0, start_right_mm=gap_mm / 2.0)
+    return msgspec.structs.replace(parameters, assumed=begun)
 
 
 def corner_margins(config: Config) -> dict[str, float]:
@@ -284,27 +228,11 @@ def corner_margins(config: Config) -> dict[str, float]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `benchmark step`."""
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
-    parser.add_argument("--plot", type=Path, help="PNG of H(z) beside the plant, and of the steps")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The object for these options."""
-    result = run(options.plant)
-    if options.plot is not None:
-        draw(options.plot, options.plant, Config(), result)
-    return result
-
-
-def print_table(result: dict[str, Any]) -> None:
-    """The object for a person."""
-    for name, value in result.items():
-        if name == "corners":
-            print(
-                f"{'smallest margins':24s}{value['gain_margin_dB']:.1f} dB, {value['phase_margin_deg']:.0f} degrees "
-                f"over {value['corners']:.0f} corners"
-            )
-        else:
-            print(f"{name:24s}{value if isinstance(value, str) else f'{value:.4g}'}")
+    return run(options.plant)
 
 
 def hold(gap_mm: float, now_s: float) -> Plan:

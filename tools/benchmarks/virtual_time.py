@@ -3,27 +3,22 @@
 The full plant with its firmware and protocol bytes, once under the whole core that follows 500 setpoints a second, once
 under the position loop alone. Each build of the core, and with `--against` another checkout, is a process of its own,
 and they take turns in stretches of some milliseconds: what a shared machine gives at a time, it gives to all of them.
-Processor time of one thread; the median over stretches, and of their ratios. Profiled shares charge each function with
-its own time, calls excluded; profiling makes short functions look longer than they are, and does not see into compiled
-ones: it is the interpreted build that is profiled.
+Processor time of one thread; the median over stretches, and of their ratios. `python -m cProfile` says where it goes,
+in the interpreted build (`TORMAG_COMPILED=0`).
 """
 
 import argparse
 import contextlib
-import cProfile
 import json
-import pstats
 import statistics
 import subprocess
 import sys
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import firmware_protocol
 import tormagd
 from benchmarks.against import add_against_argument, environment
 from benchmarks.step import START_MM, STEP_MM, hold
@@ -39,8 +34,6 @@ MEAN_N, SWING_N, PULSE_HZ = 1.2, 0.3, 1.2
 STRETCH_TICKS = 100
 BUILDS = ("compiled", "interpreted")
 LOOPS = ("whole_core", "position_loop")
-SHOWN = 12
-"Functions in the profile."
 
 Run = Callable[[int], None]
 
@@ -78,65 +71,39 @@ def armed_loop(config: Config, plant: str) -> ClosedLoop:
     return loop
 
 
-class Build:
-    """One build of one checkout in a process of its own. A context manager.
+Build = tuple[bool, Callable[[str, int], float]]
+"""Whether a build is compiled, and how it is asked for the processor time of a tick of a loop over so many, us."""
+
+
+@contextlib.contextmanager
+def build(plant: str, root: Path | None = None, switch: str = "") -> Iterator[Build]:
+    """One build of one checkout in a process of its own; `switch` is TORMAG_COMPILED.
 
     `root` is a checkout, None for the one that runs here. Raises RuntimeError where the process does not start, or
     measures another package than it should.
     """
+    worker = [sys.executable, "-P", str(Path(__file__).with_name("virtual_time_worker.py")), plant]
+    theirs = environment(root) | ({"TORMAG_COMPILED": switch} if switch else {})
+    with subprocess.Popen(worker, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=theirs, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        asked, answers = process.stdin, process.stdout
 
-    def __init__(self, plant: str, root: Path | None = None, interpreted: bool = False) -> None:
+        def answer() -> Any:
+            line = answers.readline()
+            if not line:
+                raise RuntimeError(f"the loop in a process of its own ended with status {process.wait()}")
+            return json.loads(line)
+
+        def tick_us(loop: str, ticks: int) -> float:
+            print(loop, ticks, file=asked, flush=True)
+            return float(answer())
+
+        hello = answer()
         package = Path(tormagd.__path__[0]) if root is None else root / "tormagd"
-        child_environment = environment(root)
-        if interpreted:
-            child_environment["TORMAG_COMPILED"] = "0"
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", str(Path(__file__).with_name("virtual_time_worker.py")), plant],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=child_environment,
-            text=True,
-        )
-        try:
-            hello = json.loads(self._line())
-            if not Path(hello["package"]).samefile(package):
-                raise RuntimeError(f"{hello['package']} was measured in place of {package}")
-        except BaseException:
-            self._end()
-            raise
-        self.is_compiled = bool(hello["compiled"])
-
-    def __enter__(self) -> "Build":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end()
-
-    def tick_us(self, loop: str, ticks: int) -> float:
-        """Processor time of a tick in the next stretch of that loop."""
-        return float(self._asked(f"{loop} {ticks}"))
-
-    def profile(self, ticks: int) -> dict[str, Any]:
-        """Where so many ticks of the whole core spend their time: see `profiled`."""
-        found: dict[str, Any] = json.loads(self._asked(f"profile {ticks}"))
-        return found
-
-    def _asked(self, question: str) -> str:
-        assert self._process.stdin is not None
-        self._process.stdin.write(f"{question}\n")
-        self._process.stdin.flush()
-        return self._line()
-
-    def _line(self) -> str:
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            raise RuntimeError(f"the loop in a process of its own ended with status {self._process.wait()}")
-        return line
-
-    def _end(self) -> None:
-        with contextlib.suppress(BrokenPipeError):
-            self._process.communicate(timeout=30)
+        if not Path(hello["package"]).samefile(package):
+            raise RuntimeError(f"{hello['package']} was measured in place of {package}")
+        yield hello["compiled"], tick_us
 
 
 Stretches = dict[str, dict[str, list[float]]]
@@ -146,15 +113,15 @@ Stretches = dict[str, dict[str, list[float]]]
 def compared(plant: str, ticks: int, against: Path | None) -> Stretches:
     """Every build there is, `interpreted` always, `compiled` and `against` where there is one, taking turns."""
     with contextlib.ExitStack() as stack:
-        ours = stack.enter_context(Build(plant))
-        builds = {"interpreted": ours}
-        if ours.is_compiled:
-            builds = {"compiled": ours, "interpreted": stack.enter_context(Build(plant, interpreted=True))}
-            if builds["interpreted"].is_compiled:
-                raise RuntimeError("TORMAG_COMPILED=0 did not switch the compiled core off")
+        builds = {"interpreted": stack.enter_context(build(plant, switch="0"))}
+        if builds["interpreted"][0]:
+            raise RuntimeError("TORMAG_COMPILED=0 did not switch the compiled core off")
+        ours = stack.enter_context(build(plant))
+        if ours[0]:
+            builds["compiled"] = ours
         if against is not None:
-            builds["against"] = stack.enter_context(Build(plant, against))
-        return take_turns({name: build.tick_us for name, build in builds.items()}, ticks)
+            builds["against"] = stack.enter_context(build(plant, against))
+        return take_turns({name: tick_us for name, (_, tick_us) in builds.items()}, ticks)
 
 
 def take_turns(builds: Mapping[str, Callable[[str, int], float]], ticks: int) -> Stretches:
@@ -173,31 +140,18 @@ def take_turns(builds: Mapping[str, Callable[[str, int], float]], ticks: int) ->
 
 
 def summary(found: Stretches, period_us: float) -> dict[str, Any]:
-    """The contract's object. `whole_core` and `position_loop` at the top are those of the build that runs by default;
-    each `ratio` is one build's factor over the other's, the median over stretches."""
-    shown: dict[str, Any] = {name: _build(found[name], period_us) if name in found else None for name in BUILDS}
-    default = "compiled" if "compiled" in found else "interpreted"
-    result = {loop: _loop(found[default][loop], period_us) for loop in LOOPS} | {"build": default} | shown
+    """The contract's object, null for a build that is not there; each `ratio` is one build's factor over the other's,
+    the median over stretches; `tick_us` is the median."""
+    result: dict[str, Any] = dict.fromkeys(BUILDS)
+    for name, loops in found.items():
+        tick_us = {loop: statistics.median(taken_us) for loop, taken_us in loops.items()}
+        result[name] = {loop: round(period_us / taken_us, 2) for loop, taken_us in tick_us.items()}
+        result[name]["tick_us"] = {loop: round(taken_us, 1) for loop, taken_us in tick_us.items()}
     if "compiled" in found:
         result["ratio"] = _ratios(found, "compiled", "interpreted")
     if "against" in found:
-        ratios = {name: _ratios(found, name, "against") for name in BUILDS if name in found}
-        result["against"] = _build(found["against"], period_us) | {"ratio": ratios}
+        result["against"]["ratio"] = {name: _ratios(found, name, "against") for name in BUILDS if name in found}
     return result
-
-
-def _build(loops: dict[str, list[float]], period_us: float) -> dict[str, Any]:
-    parts = {loop: _loop(taken_us, period_us) for loop, taken_us in loops.items()}
-    factors: dict[str, Any] = {loop: part["factor"] for loop, part in parts.items()}
-    return factors | {"tick_us": {loop: part["tick_us"] for loop, part in parts.items()}}
-
-
-def _loop(taken_us: list[float], period_us: float) -> dict[str, Any]:
-    typical_us, best_us = statistics.median(taken_us), float(np.percentile(taken_us, 10.0))
-    return {
-        "factor": round(period_us / typical_us, 2),
-        "tick_us": {"p50": round(typical_us, 1), "p10": round(best_us, 1)},
-    }
 
 
 def _ratios(found: Stretches, faster: str, slower: str) -> dict[str, float]:
@@ -207,80 +161,16 @@ def _ratios(found: Stretches, faster: str, slower: str) -> dict[str, float]:
     }
 
 
-def profiled(run: Run, ticks: int) -> dict[str, Any]:
-    """Share of each room in the time, those of the functions, and how many calls a tick all of them are."""
-    profile = cProfile.Profile()
-    profile.runcall(run, ticks)
-    rooms: Counter[str] = Counter()
-    functions: Counter[str] = Counter()
-    total_calls = 0
-    # the stubs do not know of `stats`: (file, line, name) to (calls, primitive calls, own time, cumulative time, ...)
-    for (file, _, name), (_, calls, own_s, _, _) in pstats.Stats(profile).stats.items():  # type: ignore[attr-defined]
-        rooms[_room(file)] += own_s
-        total_calls += calls
-        functions[f"{_room(file)}: {Path(file).stem}.{name}, {calls / ticks:.3g} a tick"] += own_s
-    total_s = rooms.total()
-    return {
-        "calls_per_tick": round(total_calls / ticks),
-        "rooms": {room: round(own_s / total_s, 3) for room, own_s in rooms.most_common()},
-        "functions": {name: round(own_s / total_s, 3) for name, own_s in functions.most_common()},
-    }
-
-
-def _room(file: str) -> str:
-    for package in (tormagd, firmware_protocol):
-        # by where the packages are, whatever the folders above them are called
-        folder = Path(package.__path__[0])
-        if Path(file).is_relative_to(folder):
-            inside = Path(file).relative_to(folder).parts[0].removesuffix(".py")
-            return inside if package is tormagd else package.__name__
-    return "Python and NumPy"
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `benchmark virtual-time`."""
     parser.add_argument("--seconds", type=float, default=10.0, help="virtual time of each loop")
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
-    parser.add_argument("--profile", action="store_true", help="also say where the time goes")
     add_against_argument(parser)
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """The contract's object; `factor` and `tick_us` (median, and the fastest tenth); `profile` of the whole core."""
+    """The contract's object."""
     config = Config()
-    ticks = round(options.seconds * config.rates.control_hz)
-    result: dict[str, Any] = {"plant": options.plant, "seconds": options.seconds}
-    result |= summary(compared(options.plant, ticks, options.against), 1e6 / config.rates.control_hz)
-    if options.profile:
-        with Build(options.plant, interpreted=True) as build:
-            profile = build.profile(ticks)
-        profile["functions"] = dict(list(profile["functions"].items())[:SHOWN])
-        result["profile"] = profile
-    return result
-
-
-def print_table(result: dict[str, Any]) -> None:
-    """The object for a person."""
-    for name in (*BUILDS, "against"):
-        found: dict[str, Any] = result.get(name) or {}
-        for loop in LOOPS if found else ():
-            tick_us = found["tick_us"][loop]
-            print(
-                f"{name:12s}{loop.replace('_', ' '):15s}{found[loop]:6.2f} times real time, a tick "
-                f"{tick_us['p50']:.0f} us (fastest tenth {tick_us['p10']:.0f})"
-            )
-    if result["compiled"] is None:
-        print("no compiled build")
-    else:
-        _print_ratio("compiled", "interpreted", result["ratio"])
-    for name, ratio in result.get("against", {}).get("ratio", {}).items():
-        _print_ratio(name, "against", ratio)
-    if "profile" in result:
-        print(f"the whole core calls {result['profile']['calls_per_tick']} functions a tick; its time goes into")
-        for part in ("rooms", "functions"):
-            for name, share in result["profile"][part].items():
-                print(f"{share:7.1%}  {name}")
-
-
-def _print_ratio(faster: str, slower: str, ratio: dict[str, float]) -> None:
-    print(f"{faster} over {slower}: " + ", ".join(f"{loop.replace('_', ' ')} {ratio[loop]:.2f}" for loop in LOOPS))
+    found = compared(options.plant, round(options.seconds * config.rates.control_hz), options.against)
+    about = {"plant": options.plant, "seconds": options.seconds}
+    return about | summary(found, 1e6 / config.rates.control_hz)

@@ -10,20 +10,14 @@ import sys
 import time
 from pathlib import Path
 
+from benchmarks import virtual_time
+from firmware_protocol.build import settle
 from tormagd import closed_loop
 from tormagd.config import Config
 
-try:
-    from benchmarks import virtual_time
-except ModuleNotFoundError:  # a checkout from before the tools had rooms
-    import benchmark_virtual_time as virtual_time  # type: ignore[import-not-found, no-redef]
-
-PROFILE = "profile"
-
 
 def main() -> int:
-    """Answers each name of a loop and number of ticks with the processor time of a tick, us, until the input ends; and
-    `profile` and a number of ticks with the whole core's profile."""
+    """Answers each name of a loop and number of ticks with the processor time of a tick, us, until the input ends."""
     plant = sys.argv[1]
     runs = {
         "whole_core": virtual_time.force_loop(Config(), plant),
@@ -33,25 +27,13 @@ def main() -> int:
     gc.freeze()  # what was imported is no garbage; a daemon does the same
     # by a module of it: an empty folder of the package's name would pass for the package itself
     package = Path(str(closed_loop.__file__)).parent
-    print(json.dumps({"compiled": compiled(), "package": str(package)}), flush=True)
+    print(json.dumps({"compiled": settle().is_compiled, "package": str(package)}), flush=True)
     for line in sys.stdin:
         name, ticks = line.split()
-        if name == PROFILE:
-            print(json.dumps(virtual_time.profiled(runs["whole_core"], int(ticks))), flush=True)
-            continue
         started_s = time.thread_time()
         runs[name](int(ticks))
         print((time.thread_time() - started_s) / int(ticks) * 1e6, flush=True)
     return 0
-
-
-def compiled() -> bool:
-    """Whether the core that was imported is a compiled one; checkouts from before there was any have no `build`."""
-    try:
-        from firmware_protocol.build import settle
-    except ModuleNotFoundError:
-        return False
-    return settle().is_compiled
 
 
 if __name__ == "__main__":

@@ -1,0 +1,35 @@
+"""The result of any measurement for a person: a line for a figure or a few that belong together, a table for rows."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+
+def lines(result: Mapping[str, Any], path: str = "") -> Iterator[str]:
+    """What `--json` prints, as text: `path` is the name of what holds these figures."""
+    for key, value in result.items():
+        name = f"{path} {key}".strip()
+        if isinstance(value, Mapping) and any(isinstance(inner, Mapping | list) for inner in value.values()):
+            yield from lines(value, name)
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            yield name
+            yield from table(value)
+        else:
+            yield f"{name:40s}{shown(value)}"
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Rows of the same keys under their names; a column that holds more than a figure is left out."""
+    names = [name for name, value in rows[0].items() if not isinstance(value, Mapping | list)]
+    cells = [names, *([shown(row[name]) for name in names] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for line in cells:
+        yield "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
+
+
+def shown(value: Any) -> str:
+    """A figure to four digits; a few of them with their names."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {shown(inner)}" for name, inner in value.items())
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
