@@ -19,7 +19,6 @@ MEASUREMENTS = {
     "loop": "lateness of the control loop beside a bare timer",
     "latency": "from a setpoint to the first drive frame that reflects it",
     "fast": "control at 2 and 4 kHz on fast serial lines",
-    "preview": "what a plan costs that knows what follows",
     "step": "how fast and how exactly the gap follows, in virtual time",
     "virtual-time": "how much faster than real time that is, and what limits it",
     "black-box": "what the black box costs a control tick",
