@@ -234,8 +234,8 @@ def written(scene: Path, signal: Signal, is_known_ahead: bool) -> Path:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measures the scenes that are named, or all that are shipped; 0, 1 where `--wrong` shows a prediction to be off by more
-    than ALLOWED, or 2 for a scene that cannot be measured."""
+    """Measures the scenes that are named, or all that are shipped; 0, 1 where `--wrong` shows a prediction to be off
+    by more than ALLOWED, or 2 for a scene that cannot be measured."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="name or file; default: every shipped one")
     parser.add_argument("--recordings", action="store_true", help="the scenes of recordings in TORMAG_DATA instead")

@@ -51,7 +51,7 @@ def evenly_drawn(count: int) -> list[tuple[PlantParameters, dict[str, float]]]:
 
 
 def drawn_device(number: int) -> PlantParameters:
-    """Draw `number` of the plant card. Every third has the thesis's field law (Eq. 7), which has no exponent to draw."""
+    """Draw `number` of the plant card. Every third has the thesis's field law (Eq. 7), which has no exponent."""
     random = np.random.default_rng((SEED, number))
     nominal = load_plant("sample_1")
 

@@ -39,8 +39,9 @@ TRIM = Config().trim
 
 class Followed(NamedTuple):
     """What a run showed, a row for each control tick: time since its beginning, s; the force asked and the one truly
-    rendered, signed as the handle moves, N; where the handle is, mm and mm/s; whether a learned value stood at its rail.
-    And the share of time that each limit was held, the faults that ended it, and what the device had shown by then."""
+    rendered, signed as the handle moves, N; where the handle is, mm and mm/s; whether a learned value stood at its
+    rail. And the share of time that each limit was held, the faults that ended it, what the device had shown by then.
+    """
 
     time_s: Array
     asked_N: Array
@@ -123,9 +124,9 @@ def follow(loop: ClosedLoop, publish: Publisher, lasts_s: float, begins_s: float
         faults = tuple(map(str, sample.state.safety.faults))
         if faults:
             break
-    table = np.array(rows).reshape(-1, 6)
     shares = {limit: count / len(rows) for limit, count in sorted(held.items())}
-    return Followed(*table.T, limits=shares, faults=faults, shown=shown_by(loop), trim=trim)
+    time_s, asked, rendered, handle, speed, railed = np.array(rows).reshape(-1, 6).T
+    return Followed(time_s, asked, rendered, handle, speed, railed, shares, faults, shown_by(loop), trim)
 
 
 def shown_by(loop: ClosedLoop) -> Shown:

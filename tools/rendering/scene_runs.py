@@ -168,15 +168,15 @@ class Play:
         scene = _modelled(msgspec.structs.replace(stated, bandwidth=free), case)
         self.core = build_core(config, scene)
         self.planner = (self.core if case.is_learning else _frozen(config, scene)).planner
-        is_pad = scene.finger is not msgspec.UNSET
-        hand = PressingHand(scene.finger.depth_mm) if is_pad else swinging(scene.handle)
+        finger = scene.finger
+        hand = swinging(scene.handle) if finger is msgspec.UNSET else PressingHand(finger.depth_mm)
         device = VirtualDevice(plant_of(scene, case.plant), hand, seed=1)
         self._loop = ClosedLoop(config, self.core.stepper, self.core.planner, device)
         self._loop.arm()
         self.time_s, self.force_N = signal_of(self.core, case.scene, LEARN_S + case.seconds, case.inference_hz)
         approach_s = APPROACH_S
-        if is_pad:
-            approach_s += PRESSES_AT_S + scene.finger.depth_mm / PRESSING_MM_S - self._loop.now_s
+        if finger is not msgspec.UNSET:
+            approach_s += PRESSES_AT_S + finger.depth_mm / PRESSING_MM_S - self._loop.now_s
         before_s = np.arange(round(approach_s * case.inference_hz)) / case.inference_hz
         self.begins_s = self._loop.now_s + approach_s
         times = np.concatenate([self._loop.now_s + before_s, self.begins_s + self.time_s])
