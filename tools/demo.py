@@ -17,10 +17,20 @@ from typing import Any
 
 import msgspec
 from machines.host import Host
-from rendering.human_pulse import Array
-from rendering.rehearsal import Case, Rehearsal, rehearse
-from rendering.show import LEAST_N, MOST_N, RECORDING, RUN_DIR, Aborted, Shown, profile, scored, show
-from rendering.show_figure import draw
+from rendering.following import Array
+from rendering.rehearsal import Case, Rehearsals, rehearse
+from rendering.show import (
+    LEAST_N,
+    MOST_N,
+    PULSE_START_S,
+    RECORDING,
+    RUN_DIR,
+    Aborted,
+    Shown,
+    profile,
+    scored,
+    show,
+)
 from rendering.tracking import Tracking
 
 from tormagd.config import Config, ConfigError
@@ -134,14 +144,14 @@ def lost_frames(link: dict[str, Any]) -> int:
     return int(link["lost"] + link["corrupt"] + link["repeated"])
 
 
-def rehearse_all(config: Config, times_s: Array, forces_N: Array) -> list[Rehearsal]:
+def rehearse_all(config: Config, times_s: Array, forces_N: Array) -> Rehearsals:
     """Every case, on two processors. One that fails is said, and left out."""
-    done = []
+    done: Rehearsals = {}
     with concurrent.futures.ProcessPoolExecutor(max_workers=2) as pool:
         waiting = [pool.submit(rehearse, config, case, times_s, forces_N) for case in CASES]
         for number, (case, future) in enumerate(zip(CASES, waiting, strict=True), start=1):
             try:
-                done.append(future.result())
+                done[case] = future.result()
                 print(f"  {number}/{len(CASES)} {case.label}", flush=True)
             except (ConfigError, RuntimeError) as error:
                 print(f"  {number}/{len(CASES)} {case.label} failed: {error}", flush=True)
@@ -151,17 +161,16 @@ def rehearse_all(config: Config, times_s: Array, forces_N: Array) -> list[Rehear
 def conclude(
     scene: Scene,
     shown: Shown | Aborted,
-    rehearsals: list[Rehearsal],
+    rehearsals: Rehearsals,
     verdict: Verdict,
     sentence: str,
     seconds: float,
 ) -> int:
     """Prints the summary, writes it and the picture; the exit code."""
-    in_virtual_time = virtual_time_checks(scene, rehearsals)
-    met = in_virtual_time
+    met = in_virtual_time = virtual_time_checks(scene, rehearsals)
     print_forces(shown, rehearsals)
     summary: dict[str, Any] = {
-        "virtual_time": {r.case.label: scored(r.time_s, r.asked_N, r.rendered_N)._asdict() for r in rehearsals},
+        "virtual_time": {case.label: found.since(PULSE_START_S)._asdict() for case, found in rehearsals.items()},
         "host": shown.host._asdict(),
         "verdict": verdict.name,
         "sentence": sentence,
@@ -171,8 +180,10 @@ def conclude(
     if isinstance(shown, Shown):
         print_timing(shown)
         met = checks(scene, shown) | in_virtual_time
+        from rendering.pictures import show_picture
+
         picture = RUN_DIR / "pulse.png"
-        draw(picture, scene, shown, rehearsals, force_table(shown, rehearsals))
+        show_picture(picture, scene, shown, rehearsals, force_table(shown, rehearsals))
         written = [f"recording {RECORDING}", f"picture {picture}", *written]
         summary |= {
             "tracking": scored(shown.time_s, shown.asked_N, shown.rendered_N)._asdict(),
@@ -198,35 +209,32 @@ def conclude(
     return int(verdict if all(in_virtual_time.values()) else Verdict.MISSED)
 
 
-def virtual_time_checks(scene: Scene, rehearsals: list[Rehearsal]) -> dict[str, bool]:
+def virtual_time_checks(scene: Scene, rehearsals: Rehearsals) -> dict[str, bool]:
     """What the software must keep whatever the host does."""
-    by_label = {rehearsal.case.label: rehearsal for rehearsal in rehearsals}
-    first = by_label.get(CASES[0].label)
-    text = f"RMS error <= {scene.force.tolerance_rms_N:g} N in virtual time"
-    is_met = first is not None and scored(first.time_s, first.asked_N, first.rendered_N).rms_N
+    first, most_N = rehearsals.get(CASES[0]), scene.force.tolerance_rms_N
     return {
         "every case in virtual time done": len(rehearsals) == len(CASES),
-        text: first is not None and is_met <= scene.force.tolerance_rms_N,
+        f"RMS error <= {most_N:g} N in virtual time": first is not None and first.since(PULSE_START_S).rms_N <= most_N,
     }
 
 
-def print_forces(shown: Shown | Aborted, rehearsals: list[Rehearsal]) -> None:
+def print_forces(shown: Shown | Aborted, rehearsals: Rehearsals) -> None:
     """What was asked, and the forces as a table."""
-    results = [scored(rehearsal.time_s, rehearsal.asked_N, rehearsal.rendered_N) for rehearsal in rehearsals]
-    deviation = f" (sd {results[-1].reference_sd_N * 1e3:.0f} mN)" if results else ""
+    deviations_mN = [found.since(PULSE_START_S).reference_sd_N * 1e3 for found in rehearsals.values()]
+    deviation = f" (sd {deviations_mN[-1]:.0f} mN)" if deviations_mN else ""
     print(f"\nforce asked {LEAST_N}..{MOST_N} N{deviation}, rendered by the plant:")
     print("\n".join(force_table(shown, rehearsals)))
 
 
-def force_table(shown: Shown | Aborted, rehearsals: list[Rehearsal]) -> list[str]:
+def force_table(shown: Shown | Aborted, rehearsals: Rehearsals) -> list[str]:
     """How well the forces were rendered: a heading, and a line for each case."""
     rows = {}
     if isinstance(shown, Shown):
         rows["real time, plant sample 1"] = numbers(scored(shown.time_s, shown.asked_N, shown.rendered_N))
-    for rehearsal in rehearsals:
-        result = scored(rehearsal.time_s, rehearsal.asked_N, rehearsal.rendered_N)
-        is_steady = rehearsal.case.hand == "steady"
-        rows[f"virtual time, {rehearsal.case.label}"] = numbers(result) if is_steady else "  (a brake: see the picture)"
+    for case, found in rehearsals.items():
+        is_steady = case.hand == "steady"
+        line = numbers(found.since(PULSE_START_S)) if is_steady else "  (a brake: see the picture)"
+        rows[f"virtual time, {case.label}"] = line
     width = max(map(len, rows), default=0)
     heading = f"  {'':{width}s} {'RMS':>8s} {'worst':>8s}  variance accounted for"
     return [heading, *(f"  {label:{width}s} {line}" for label, line in rows.items())]

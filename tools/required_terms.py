@@ -1,6 +1,6 @@
 """Which terms of the controller's model a scene requires: each is left out in turn, on the whole simulated device.
 
-    required_terms.py [SCENE ...] [--quick] [--costs] [--json] [--store] [--dask ADDRESS]
+    required_terms.py [SCENE ...] [--quick] [--recordings] [--wrong] [--json] [--store] [--dask ADDRESS]
 
 First the rates: the lowest at which all terms do what they do at the usual. At these, sample 1 chooses: a term whose
 absence adds more than SHARE of the scene's tolerance to the RMS error of the force, with the device learned beforehand
@@ -9,21 +9,28 @@ and frozen or while it is learned, is in. All others are left out together. What
 are none, and the term that counts most is put back, until the rest may go; what was put back before that is tried
 again. A scene that the full model does not meet decides nothing. With the choice every search is tried. Costs are of
 this machine. Finished runs are kept, by what they depend on, in build/required_terms.json. `--store` puts every scene,
-as it is done, into the file that comes with the package. All devices are synthetic.
+as it is done, into the file that comes with the package. `--recordings` makes scenes of the public recordings in the
+folder that TORMAG_DATA names and measures these; `--wrong` measures two models that are wrong on purpose against what
+the stored decisions predict of them. All devices are synthetic.
 """
 
 import argparse
+import shutil
 import sys
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 import msgspec
-from force_tracking import SAMPLES
+import numpy as np
 from machines import executors
-from rendering.scene_runs import ROOT, Case, costs, run_all
-from tqdm import tqdm
+from rendering.device_draws import SAMPLES
+from rendering.scene_runs import ROOT, Case, costs, run, run_all
+from rendering.signals import Signal, data_folder, recorded_signals
+from rendering.tables import Json, lines
 
 from tormagd.config import ConfigError
+from tormagd.ctl.scene_new import new_scene
 from tormagd.headroom.__main__ import build
 from tormagd.headroom.machine_loop import machine_us
 from tormagd.inverse.choice import RUNTIME_SOLVERS
@@ -40,7 +47,6 @@ from tormagd.scenes.measured import (
     WithSearch,
     is_met,
     measured,
-    on_first,
     required,
 )
 from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_task, shipped_scenes
@@ -48,6 +54,17 @@ from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_task, shipped_sce
 SHARE = 0.2
 KEPT = ROOT / "build" / "required_terms.json"
 STORED = ROOT / "tormagd" / "scenes" / FILE
+FOLDER = ROOT / "build" / "recorded_scenes"
+RECORDED = {
+    "tool_torque": ("tool torque", False),
+    "arterial_pressure": ("arterial pressure", True),
+    "cataract": ("haptic scaled", True),
+}
+"Scenes of recordings: how the name of the signal begins, and whether it is played, and so known ahead."
+HOLD = "brain"
+PULSE = "pulse"
+WRONG_S = 60.0
+ALLOWED = 0.2
 SECONDS, QUICK_S = 5.0, 2.0
 LONGEST_S = 120.0
 "Of a hold that is measured to its end; `--quick` leaves out all after QUICK_S."
@@ -157,15 +174,14 @@ def with_costs(found: MeasuredScene, name: str) -> MeasuredScene:
     priced = iter(rest)
     searches = tuple(msgspec.structs.replace(item, cost=next(priced)) for item in found.searches)
     terms = tuple(msgspec.structs.replace(item, cost=next(priced)) for item in found.terms)
+    others_at = [
+        msgspec.structs.replace(case, control_hz=at.control_hz, inference_hz=at.inference_hz) for at in found.rates
+    ]
+    at_hz = {each: full if each == case else costs([each])[0] for each in others_at}
     rates = tuple(
-        msgspec.structs.replace(at, cost=full if at is found.at_chosen else _cost_at(name, at.hz)) for at in found.rates
+        msgspec.structs.replace(at, cost=at_hz[each]) for at, each in zip(found.rates, others_at, strict=True)
     )
     return msgspec.structs.replace(found, terms=terms, searches=searches, rates=rates, chosen=cost)
-
-
-def _cost_at(name: str, hz: tuple[int, int]) -> Cost:
-    (cost,) = costs([Case(name, control_hz=hz[0], inference_hz=hz[1])])
-    return cost
 
 
 def is_good(item: Judged, tolerance_N: float) -> bool:
@@ -173,41 +189,71 @@ def is_good(item: Judged, tolerance_N: float) -> bool:
     return item.chosen_N <= max(JUDGED * tolerance_N, item.full_N + SHARE * tolerance_N)
 
 
+def wrong_models() -> Json:
+    """What a wrong model costs a scene, as the stored decisions predict it and as it is: HOLD without any term misses
+    more, predicted is the sum of what each term adds alone; PULSE with every term at the usual rates takes a multiple
+    of the chosen model's time."""
+    scenes = {scene.name: scene for scene in measured().scenes}
+    hold, pulse = scenes[HOLD], scenes[PULSE]
+    full_N, none_N = (run(Case(HOLD, SAMPLES[0], out, "", False, *hold.hz, WRONG_S)) for out in ((), TERMS))
+    added_N, predicted_N = none_N - full_N, sum(item.frozen_added_N for item in hold.terms)
+    priced = with_costs(pulse, PULSE)
+    times, predicted = (each.cost_full_us_s / each.cost_us_s - 1.0 for each in (priced, pulse))
+    return {
+        HOLD: {"predicted_N": predicted_N, "measured_N": added_N, "off": abs(predicted_N / added_N - 1.0)},
+        PULSE: {"predicted": predicted, "measured": times, "off": abs(predicted / times - 1.0)},
+    }
+
+
+def recorded(folder: Path) -> list[str]:
+    """The files of the scenes that `tormagctl scene new` proposes for public recordings. Raises ConfigError where
+    those are not there."""
+    data = data_folder()
+    signals = [] if data is None else recorded_signals(data)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    files = []
+    for scene, (begins, is_known_ahead) in RECORDED.items():
+        signal = next((each for each in signals if each.name.startswith(begins)), None)
+        if signal is None:
+            raise ConfigError("TORMAG_DATA: allowed is the folder of the recordings")
+        files.append(str(written(folder / f"{scene}.toml", signal, is_known_ahead)))
+    return files
+
+
+def written(scene: Path, signal: Signal, is_known_ahead: bool) -> Path:
+    """The scene file, as step 1 and 2 of docs/guides/scene.md make it. Raises CommandError where none is taken."""
+    forces = scene.with_suffix(".csv")
+    rows = np.column_stack([signal.time_s, signal.force_N])
+    np.savetxt(forces, rows, fmt="%.6f", delimiter=",", header="t_s,force_N", comments="")
+    new_scene(scene, forces, None)
+    if is_known_ahead:
+        text = scene.read_text(encoding="utf-8")
+        scene.write_text(text.replace("[signal]\n", "[signal]\nis_known_ahead = true\n"), encoding="utf-8")
+    return scene
+
+
 def main(arguments: list[str] | None = None) -> int:
-    """Measures the scenes that are named, or all that are shipped; 0, or 2 for one that cannot be measured."""
+    """Measures the scenes that are named, or all that are shipped; 0, 1 where `--wrong` shows a prediction to be off
+    by more than ALLOWED, or 2 for a scene that cannot be measured."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="name or file; default: every shipped one")
+    parser.add_argument("--recordings", action="store_true", help="the scenes of recordings in TORMAG_DATA instead")
+    parser.add_argument("--wrong", action="store_true", help="what wrong models cost, against what is predicted")
     parser.add_argument("--quick", action="store_true", help=f"sample 1 alone, and {QUICK_S:g} s: a look, no figure")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--store", action="store_true", help="write the file that comes with the package")
-    parser.add_argument("--costs", action="store_true", help="of stored scenes measure nothing but the costs anew")
     parser.add_argument("--kept", type=Path, default=KEPT, help="JSON file that keeps finished runs")
     executors.add_options(parser, 1, needed="tormagd, and tools/ on their path")
     options = parser.parse_args(arguments)
-    known = {scene.name: scene for scene in measured().scenes}
-    names = options.scenes or (list(known) if options.costs else list(shipped_scenes()))
-    if options.costs and not set(names) <= set(known):
-        parser.error(f"--costs: allowed are the scenes that are stored, {', '.join(known)}")
     seconds, longest_s, samples = (QUICK_S, QUICK_S, SAMPLES[:1]) if options.quick else (SECONDS, LONGEST_S, SAMPLES)
-    found = []
+    found: list[MeasuredScene] = []
     try:
-        with executors.chosen(options) as executor, tqdm(unit="run", disable=not sys.stderr.isatty()) as bar:
-
-            def runs(cases: Iterable[Case]) -> dict[Case, float]:
-                bar.reset()
-
-                def progress(finished: int, total: int) -> None:
-                    bar.total = total
-                    bar.update(finished - bar.n)
-
-                return run_all(cases, executor, options.kept, progress)
-
-            for name in names:
-                bar.set_description(name)
-                if options.costs:
-                    found.append(with_costs(known[name], name))
-                else:
-                    found.append(measure(name, runs, samples, seconds, longest_s))
+        names = recorded(FOLDER) if options.recordings else options.scenes or list(shipped_scenes())
+        with executors.chosen(options) as executor:
+            for name in [] if options.wrong else names:
+                runs = partial(run_all, executor=executor, kept=options.kept)
+                found.append(measure(name, runs, samples, seconds, longest_s))
                 if options.store:
                     others = [scene for scene in measured().scenes if scene.name != found[-1].name]
                     every = sorted([*others, found[-1]], key=lambda scene: scene.name)
@@ -215,47 +261,44 @@ def main(arguments: list[str] | None = None) -> int:
     except ConfigError as error:
         print(f"required_terms: {error}", file=sys.stderr)
         return 2
-    result = _measured(found, seconds)
-    write_line(_text(result) if options.json else table(result), sys.stdout)
+    if options.wrong:
+        wrong = wrong_models()
+        write_line(_text(wrong) if options.json else "\n".join(lines(wrong, "wrong")), sys.stdout)
+        return int(any(each["off"] > ALLOWED for each in wrong.values()))
+    write_line(_text(_measured(found, seconds)) if options.json else "\n".join(map(table, found)), sys.stdout)
     return 0
 
 
-def _measured(scenes: list[MeasuredScene], seconds: float) -> Measured:
-    return Measured("tools/required_terms.py --store", SHARE, seconds, build(), round(machine_us(), 1), tuple(scenes))
-
-
-def _text(result: Measured) -> str:
-    return msgspec.json.format(msgspec.json.encode(result), indent=1).decode() + "\n"
-
-
-def table(result: Measured) -> str:
-    """Every scene for a person; errors in mN, costs in us per s of control."""
-    lines = []
-    for scene in result.scenes:
-        lines += [
+def table(scene: MeasuredScene) -> str:
+    """A scene for a person: errors in mN, costs in us per s of control."""
+    return "\n".join(
+        [
             f"{scene.name}: tolerance {1e3 * scene.tolerance_N:.0f} mN, {scene.cost_full_us_s:.0f} us/s full, "
             f"{scene.cost_us_s:.0f} chosen, at {scene.control_hz} / {scene.inference_hz} Hz",
-            f"  {'term':18s}added, frozen  learning     saved",
+            *(
+                f"  without {item.term:18s}{1e3 * item.frozen_added_N:8.1f} mN more frozen, "
+                f"{1e3 * item.learning_added_N:6.1f} learning: {'out' if item.term in scene.left_out else 'in'}"
+                for item in scene.terms
+            ),
+            *(
+                f"  {item.plant}, {'learning' if item.is_learning else 'frozen'}: "
+                f"full {1e3 * item.full_N:.1f}, chosen {1e3 * item.chosen_N:.1f} mN"
+                for item in scene.judged
+            ),
+            "  to name its terms in a scene file:",
+            "    [terms]",
+            *(f"    {term} = false" for term in scene.left_out),
         ]
-        for item in scene.terms:
-            stays = "out" if item.term in scene.left_out else "in"
-            lines.append(
-                f"  {item.term:18s}{1e3 * item.frozen_added_N:12.1f}  {1e3 * item.learning_added_N:8.1f}  "
-                f"{scene.saved_us_s(item):8.0f}  {stays}"
-            )
-        for judged in scene.judged:
-            how = "learning" if judged.is_learning else "frozen"
-            lines.append(
-                f"  {judged.plant}, {how}: full {1e3 * judged.full_N:.1f}, chosen {1e3 * judged.chosen_N:.1f} mN"
-            )
-        for at in scene.rates:
-            rms_mN = 1e3 * on_first(at.judged).chosen_N
-            lines.append(f"  {at.control_hz} Hz control, {at.inference_hz} Hz inference: {rms_mN:.1f} mN")
-        for named in scene.searches:
-            lines.append(f"  {named.search}: {1e3 * named.rms_N:.1f} mN, {scene.us_s(named.cost):.0f} us/s")
-        lines += ["  to name its terms in a scene file:", "    [terms]"]
-        lines += [f"    {term} = false" for term in scene.left_out]
-    return "\n".join(lines)
+    )
+
+
+def _measured(scenes: Iterable[MeasuredScene], seconds: float) -> Measured:
+    every = tuple(scenes)
+    return Measured("tools/required_terms.py --store", SHARE, seconds, build(), round(machine_us(), 1), every)
+
+
+def _text(result: object) -> str:
+    return msgspec.json.format(msgspec.json.encode(result), indent=1).decode() + "\n"
 
 
 if __name__ == "__main__":

@@ -1,38 +1,25 @@
-"""docs/scenes.md and its pictures, from what `required_terms.py --store` measured, and from the parts `recordings`,
-`motor`, `rates`, `wrong_model` and `unmet` of docs/evidence; nothing is measured here.
+"""docs/scenes.md and its pictures, from what `required_terms.py --store` measured; nothing is measured here.
 
 scenes_page.py [--out docs]
 """
 
 import argparse
-import json
 import sys
 from pathlib import Path
-from typing import Any
 
-import msgspec
-from benchmarks.scenes import core_without, draw, figures
+from benchmarks.scenes import core_without, draw
 from matplotlib.figure import Figure
 from pictures.stamp import stamp
-from recorded_scenes import RECORDED
 from rendering.scene_runs import ROOT
 
-from tormagd.ctl.scene import TOLERANCES
-from tormagd.scenes.measured import JUDGED, Measured, MeasuredScene, is_met, measured, on_first, required
+from tormagd.scenes.measured import JUDGED, MeasuredScene, is_met, measured, on_first
 from tormagd.scenes.scene import TERMS, Scene, load_scene, scene_path, shipped_scenes, terms_of
 from tormagd.scenes.signal import asked
 
 PICTURE, TRADE = Path("images") / "scenes.png", Path("images") / "scene_trade.png"
-EVIDENCE = ROOT / "docs" / "evidence"
 DRAWN_S, DRAWN_HZ = 12.0, 100
 COLOURS = 10
 "Of Matplotlib, which then begins with them anew."
-SAYS = {recorded.scene: recorded.says for recorded in RECORDED}
-_RECORDINGS = (
-    "## Recordings\n\nThe public recordings are no part of the package. `tools/recorded_scenes.py` makes scenes of "
-    "them, as the [guide](guides/scene.md#step-by-step) says and `tormagctl scene new` proposes, and measures them "
-    "like the others."
-)
 
 
 def main() -> int:
@@ -51,30 +38,22 @@ def page() -> str:
     """The whole page."""
     file = measured()
     known = {scene.name: scene for scene in file.scenes}
-    recordings = msgspec.convert(_evidence("recordings"), Measured).scenes
-    met = _met(file.scenes)
     parts = [
         _head(file.share),
-        "| scene | asked | tolerance | device gives | out | search | RMS all terms / chosen | cost all / chosen | "
-        "rates |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- |\n"
-        + "\n".join(_row(load_scene(name), known.get(name)) for name in shipped_scenes()),
-        f"RMS of the true force on sample 1 while the device is learned, mN. Cost in processor time of steps and "
-        f"plans, {file.build} core, beside a `machine_us` of {file.machine_us:g}: with all terms at 1,000 ticks and "
-        "500 plans a second, and with what was chosen at the rates chosen.",
+        _table(
+            ["scene", "asked", "tolerance", "device gives", "RMS all / chosen", "cost all / chosen", "rates", "search"],
+            [_row(load_scene(name), known[name]) for name in shipped_scenes() if name in known],
+        ),
+        "*RMS* is of the true force on sample 1 while the device is learned, mN; **bold** where a scene is not met. "
+        f"*Cost* is processor time of steps and plans, {file.build} core, beside a `machine_us` of "
+        f"{file.machine_us:g}: with all terms at 1,000 ticks and 500 plans a second, and with what was chosen.",
         f"![what the scenes ask for over time](<{PICTURE.as_posix()}>)",
-        _trade(met),
-        _counts(met + _met(recordings), file.share),
+        _terms(file.scenes),
+        _trade(file.scenes),
         _rates(file.scenes),
-        _solver(file.scenes),
-        *(_scene(scene, load_scene(scene.name).description, file.share) for scene in file.scenes),
-        _RECORDINGS,
-        *(_scene(scene, SAYS[scene.name], file.share) for scene in recordings),
+        _search(file.scenes),
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def _met(scenes: tuple[MeasuredScene, ...]) -> tuple[MeasuredScene, ...]:
-    return tuple(scene for scene in scenes if is_met(scene.judged, scene.tolerance_N))
 
 
 def _head(share: float) -> str:
@@ -112,284 +91,106 @@ def _head(share: float) -> str:
     )
 
 
-def _row(stated: Scene, found: MeasuredScene | None) -> str:
+def _row(stated: Scene, found: MeasuredScene) -> list[str]:
     reach = core_without(stated.name, ()).planner.portrait
     force = stated.force
     low_N, high_N = max(force.least_N, reach.least_N), min(force.most_N, reach.most_N)
     share = (high_N - low_N) / (force.most_N - force.least_N)
-    cells = [
+    judged = on_first(found.judged)
+    rms_mN = f"{1e3 * judged.full_N:.1f} / {1e3 * judged.chosen_N:.1f}"
+    return [
         f"`{stated.name}`",
         f"{force.least_N:g} to {force.most_N:g} N",
         f"{1e3 * force.tolerance_rms_N:g} mN",
         f"{low_N:.2f} to {high_N:.2f} N ({share:.0%})",
-    ]
-    if found is None:
-        return "| " + " | ".join([*cells, "not measured yet", "", "", "", ""]) + " |"
-    data = figures(found)
-    runs = " (runs with all)" if found.left_out and not terms_of(stated).left_out else ""
-    if not is_met(found.judged, found.tolerance_N):
-        runs = ": **not met**"
-    cells += [
-        (", ".join(found.left_out) or "none") + runs,
-        data["solver"],
-        f"{1e3 * data['rms_full_N']:.1f} / {1e3 * data['rms_N']:.1f}",
+        rms_mN if is_met(found.judged, found.tolerance_N) else f"**{rms_mN}**",
         f"{found.cost_full_us_s / 1e4:.2f} / {found.cost_us_s / 1e4:.2f} %",
         f"{found.control_hz} / {found.inference_hz} Hz",
+        core_without(stated.name, found.left_out).solver.solver,
     ]
-    return "| " + " | ".join(cells) + " |"
 
 
-def _counts(scenes: tuple[MeasuredScene, ...], share: float) -> str:
+def _terms(scenes: tuple[MeasuredScene, ...]) -> str:
     rows = []
-    for term in TERMS:
-        inside = [f"`{scene.name}`" for scene in scenes if term not in scene.left_out]
-        worst = max(scenes, key=lambda scene: _added(scene, term) / scene.tolerance_N)
-        rows.append(
-            f"| `{term}` | {', '.join(inside) or 'none'} | {1e3 * _added(worst, term):.1f} mN, "
-            f"{_added(worst, term) / worst.tolerance_N:.0%} of the tolerance of `{worst.name}` |"
-        )
-    table = "| term | required by | most that its absence adds |\n| --- | --- | --- |\n" + "\n".join(rows)
-    spared = [term for term in TERMS if all(term in scene.left_out for scene in scenes)]
-    said = "Each is required by some scene." if not spared else f"No scene requires {', '.join(spared)}."
-    little = [term for term in TERMS if all(_added(scene, term) <= share * scene.tolerance_N for scene in scenes)]
-    back = [f"`{term}`" for term in little if term not in spared]
-    if back:
-        said += (
-            f" Alone {' and '.join(back)} would add no more than {share:.0%} of any tolerance: put back, because "
-            f"without them and all else that is out a scene would be beyond {JUDGED:g} of its own."
-        )
-    parts = [
-        "## Which terms count",
-        "Of the scenes and [recordings](#recordings) that are met.",
-        table,
-        f"{said} What a term takes is at most {_most_saved(scenes):.2f} % of a core, `forecast` and `rate` left aside.",
-        _motor(),
-        _rate_error(),
-    ]
-    return "\n\n".join(parts)
-
-
-def _motor() -> str:
-    """What the parts of the motor's term do, and that term and `lag` on the samples that do not choose."""
-    found = _evidence("motor")
-    added_N = {
-        f"`{scene}`, {sample.replace('_', ' ')}": terms
-        for scene, samples in found["added_N"].items()
-        for sample, terms in samples.items()
-    }
-    names = list(next(iter(added_N.values())))
-    forces = [[name, *(f"{1e3 * more_N:.1f}" for more_N in row.values())] for name, row in added_N.items()]
-    motion = [
-        [
-            without,
-            *(
-                f"{row['overshoot']:.1%}, {1e3 * row['settling_s']:.0f} ms, {1e3 * row['stroke_s']:.0f} ms"
-                for row in samples.values()
-            ),
-        ]
-        for without, samples in found["motion"].items()
-    ]
-    most_mN = {name: 1e3 * max(row[name] for row in added_N.values()) for name in ("friction", "pull")}
+    for scene in scenes:
+        added = {item.term: f"{1e3 * item.added_N:.1f}" for item in scene.terms}
+        cells = [added[term] if term in scene.left_out else f"**{added[term]}**" for term in TERMS]
+        rows.append([f"`{scene.name}`", *cells])
+    whole = [f"`{each.name}`" for each in scenes if each.left_out and not terms_of(load_scene(each.name)).left_out]
     return (
-        "`motor` is one term: the duty that the motor's equation asks for, with the dry friction of gearbox and screw "
-        "and the magnets' pull in it. No scene would require these two by themselves: with a motor that is configured "
-        f"without one (`tools/motor_parts.py`) the scenes below are missed by {most_mN['friction']:.1f} and "
-        f"{most_mN['pull']:.1f} mN more at most, where the sensor's step is 1 mN. They belong to how the gap moves: "
-        "without the pull an opening gap runs 0.5 mm behind "
-        "([control](control.md#reference-expectation-feed-forward)). Sample 1 chooses, whose motors are those that the "
-        "loop is tuned for. What each adds, left out alone, while the device is learned, mN:"
-        f"\n\n{_table(['scene', *names], forces)}\n\n"
-        f"Steps settle later by at most {_later_ms(found, 'friction')} ms without friction, "
-        f"{_later_ms(found, 'pull')} without the pull, {_later_ms(found, 'motor')} without `motor`. "
-        "Steps of 1 mm overshoot by, settle within 5 % in, and the stroke takes, on samples 1 to 3, at worst on draws "
-        "40 to 49, and on a sample 1 that nobody greased (over three times the drag, gearbox and nut half as bad "
-        "again):\n\n"
-        f"{_table(['without', '1', '2', '3', 'draws', 'dry'], motion)}"
+        "## What each term does\n\nWhat the absence of each adds to the RMS error on sample 1, mN: the greater of "
+        "frozen and learning. **Bold** is what the scene requires; beside a small figure it was put back. Nothing can "
+        "be told from a scene that is not met, so it requires all. `vitreoretinal` asks for forces that lie below the "
+        "device's least, from a handle that is too slow to teach what the device is. "
+        f"All terms run, whatever is required, in {', '.join(whole)}: they say so. What was asked once about single "
+        "terms is answered in [a decision](decisions/0012-what-a-scene-requires.md).\n\n"
+        + _table(["scene", *(f"`{term}`" for term in TERMS)], rows)
     )
-
-
-def _later_ms(found: dict[str, Any], without: str) -> int:
-    """By how much steps settle later at most without a term or a part of one, ms."""
-    motion = found["motion"]
-    later_s: list[float] = [
-        motion[without][name]["settling_s"] - row["settling_s"] for name, row in motion["nothing"].items()
-    ]
-    return round(1e3 * max(later_s))
-
-
-def _most_saved(scenes: tuple[MeasuredScene, ...]) -> float:
-    """What leaving one of the others out saves at most, % of a core."""
-    return (
-        max(scene.saved_us_s(item) for scene in scenes for item in scene.terms if item.term not in ("forecast", "rate"))
-        / 1e4
-    )
-
-
-def _rate_error() -> str:
-    found = _evidence("rates")
-    worst_N, force_N, rate_mm_s = max(
-        (error_N, force_N, rate_mm_s)
-        for force_N, row in found["error_N"].items()
-        for error_N, rate_mm_s in zip(row, found["rates_mm_s"], strict=True)
-    )
-    frozen_N = found["frozen_N"]
-    rows = [[swings, *(f"{1e3 * missed_N:.1f}" for missed_N in missed.values())] for swings, missed in frozen_N.items()]
-    return (
-        f"**Where leaving a term out lowers the error.** `{found['scene']}`, learned and frozen, is followed better "
-        "without `rate`, `offset` or any relaxation. There the model is wrong on the very device that it was learned "
-        f"from: right at 42 mm/s, at {rate_mm_s:g} mm/s and {force_N} N it says {1e3 * worst_N:.0f} mN too much "
-        "(`tools/rate_error.py`), for the device's friction falls within a few mm/s, and the network's later. As the "
-        "handle swings the offset follows that error to and fro, and frozen it keeps what it was in one moment. A "
-        "handle that swings where the model is right shows what the terms do. RMS frozen on sample 1, mN, without\n\n"
-        f"{_table(['handle', *next(iter(frozen_N.values()))], rows)}"
-    )
-
-
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
-
-
-def _added(scene: MeasuredScene, term: str) -> float:
-    return next(item.added_N for item in scene.terms if item.term == term)
 
 
 def _trade(scenes: tuple[MeasuredScene, ...]) -> str:
-    saved = {scene.name: scene.cost_full_us_s / scene.cost_us_s for scene in scenes}
+    saved = {scene.name: scene.cost_full_us_s / scene.cost_us_s for scene in scenes if scene.left_out}
     least = min(saved, key=lambda name: saved[name])
     return (
         "## The trade\n\n"
         f"![error over processor time, a panel for each scene](<{TRADE.as_posix()}>)\n\n"
-        "`tools/benchmark.py scenes [--json] [--plot FILE.png]` prints and draws it: every term left out alone, every "
-        "rate and every search, on sample 1 while the device is learned. The thesis's search of 4 ms, 83 times a "
-        "second, stands at 33 % of a core: with its network's 1.26 N on the tactile element, and with its field error "
-        "of 1.14 mT as force of the torque brake.\n\n"
-        f"In the scenes that are met the time falls {saved[least]:.1f} to {max(saved.values()):.1f} times, least for "
-        f"`{least}`. The chosen model is not everywhere the nearest to the corner: the time saved is that of the "
-        "rates, of `forecast` and of `rate`. The forecast works 100 times a second whatever the rates are, so that a "
-        "scene that requires it gains least from slow ones. What the other terms take is within the noise of a busy "
-        "machine; they are out because the scene does not require them, for an error within its tolerance. So the "
-        "time that a set of terms saves is measured, and not the sum of what each saves.\n\n"
-        f"{_wrong_model()}"
+        "A panel is a scene, a point one model of it: every term left out alone, every rate and every search, on "
+        "sample 1 while the device is learned. Left is cheaper, low is nearer to what was asked; the line joins the "
+        "models that no cheaper one equals, the green area is what rates and terms may be chosen within. The stars are "
+        "the thesis's search of 4 ms, 83 times a second, at 33 % of a core: with its network's 1.26 N on the tactile "
+        "element, and with its field error of 1.14 mT as force of the torque brake. `tools/benchmark.py scenes "
+        "[--json] [--plot FILE.png]` prints and draws it.\n\n"
+        f"The time falls {saved[least]:.1f} to {max(saved.values()):.1f} times, least for `{least}`: by slower rates, "
+        "and without `rate` and `forecast`, which works 100 times a second whatever the rates are. What the other "
+        "terms take is within the noise of a busy machine; they are out because the scene does not require them."
     )
-
-
-def _wrong_model() -> str:
-    found = _evidence("wrong_model")
-    hold, pulse = found["cheapest"], found["fullest"]
-    return (
-        "**Wrong on purpose** (`tools/wrong_model.py`, learning frozen, sample 1). Where a force is held errors do add "
-        f"up: `{hold['scene']}` without any term misses {1e3 * hold['measured_N']:.1f} mN more, and "
-        f"{1e3 * hold['predicted_N']:.1f} were predicted, {hold['off']:.0%} off. Where a force beats the fullest model "
-        f"costs time: `{pulse['scene']}` with every term at the usual rates takes {pulse['measured']:.2f} times the "
-        f"chosen model's time more, and {pulse['predicted']:.2f} were predicted, {pulse['off']:.0%} off; for that it "
-        f"misses {1e3 * pulse['full_N']:.1f} instead of {1e3 * pulse['chosen_N']:.1f} mN."
-    )
-
-
-def _evidence(part: str) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((EVIDENCE / f"{part}.json").read_text(encoding="utf-8"))["figures"]
-    return found
 
 
 def _rates(scenes: tuple[MeasuredScene, ...]) -> str:
-    head = " | ".join(f"{at.control_hz} / {at.inference_hz}" for at in scenes[0].rates)
-    rows = []
-    for scene in scenes:
-        cells = [f"{1e3 * on_first(at.judged).chosen_N:.1f}" for at in scene.rates]
-        rows.append(f"| `{scene.name}` | {1e3 * scene.tolerance_N:g} | " + " | ".join(cells) + " |")
-    met = _met(scenes)
-    chosen = sorted({scene.hz for scene in met})
-    twice = max(_gain(scene) for scene in met)
-    said = ", ".join(f"{control} / {inference}" for control, inference in chosen)
+    head = ["scene", "tolerance", *(f"{at.control_hz} / {at.inference_hz}" for at in scenes[0].rates)]
+    rows = [
+        [
+            f"`{scene.name}`",
+            f"{1e3 * scene.tolerance_N:g}",
+            *(f"{1e3 * on_first(at.judged).chosen_N:.1f}" for at in scene.rates),
+        ]
+        for scene in scenes
+    ]
     return (
         "## Rates\n\nRMS on sample 1, mN, with all terms, over control / inference rate, Hz; setpoints come as often "
         "as plans are made, or as the scene says. 83 Hz is the thesis's own rate, 1 / (4 + 8 ms). At 250 Hz of control "
-        "the position loop keeps 4.5 dB; the daemon never watches less often than 500 Hz where the rates are the "
-        "scene's, so that no scene gets 250 Hz. Of the others each scene that is met gets the lowest that does what "
-        f"the usual, 1000 / 500, does: {said} Hz. Twice the usual take no more than {twice:.0%} of a tolerance off the "
-        "error.\n\n"
-        f"| scene | tolerance | {head} |\n| --- | --- |{' --- |' * len(scenes[0].rates)}\n" + "\n".join(rows)
+        "the position loop keeps 4.5 dB; the daemon never watches less often than 500 Hz, so that no scene gets 250. "
+        "Of the others each scene that is met gets the lowest that does what the usual, 1000 / 500, does.\n\n"
+        f"{_table(head, rows)}"
     )
 
 
-def _gain(scene: MeasuredScene) -> float:
-    """What the highest rates take off the error of the usual, of the tolerance."""
-    usual, highest = scene.rates[0], max(scene.rates, key=lambda at: at.hz)
-    return (on_first(usual.judged).chosen_N - on_first(highest.judged).chosen_N) / scene.tolerance_N
-
-
-def _solver(scenes: tuple[MeasuredScene, ...]) -> str:
+def _search(scenes: tuple[MeasuredScene, ...]) -> str:
     names = [item.search for item in scenes[0].searches]
-    rows = []
-    for scene in scenes:
-        cells = [f"{1e3 * item.rms_N:.1f} / {scene.us_s(item.cost) / 1e4:.2f}" for item in scene.searches]
-        runs = core_without(scene.name, scene.left_out).solver.solver
-        rows.append(f"| `{scene.name}` | {runs}, {scene.cost_us_s / 1e4:.2f} | " + " | ".join(cells) + " |")
+    rows = [
+        [
+            f"`{scene.name}`",
+            f"{scene.cost_us_s / 1e4:.2f}",
+            *(f"{1e3 * item.rms_N:.1f} / {scene.us_s(item.cost) / 1e4:.2f}" for item in scene.searches),
+        ]
+        for scene in scenes
+    ]
     return (
         "## The search\n\nWhere the handle's rate is not required there is nothing to search: the force over the gap "
         "is one table, read by straight lines (`portrait`), and the network is asked once, at the start. Where a "
         "search runs it is `newton`: in every scene the cheapest of the searches, with an error that no other "
         "one beats by more than the tolerance's hundredth part, and for networks of 10 to 200 units [exact to 2 uN]"
         "(inverse_trade.md). So nothing picks among them: a brake's model rises with the field everywhere, and one "
-        "neighbour is enough, as it is not on [the pad](tactile.md). float32 saves nothing on one root. `nearest` and "
-        "`coarse-to-fine` run only where a brake's scene names them: `pulse` does, to show the k-nearest search in "
-        "`make run`, and pays for it.\n\n"
+        "neighbour is enough, as it is not on [the pad](tactile.md). `nearest` and `coarse-to-fine` run only where a "
+        "brake's scene names them: `pulse` does, to show the k-nearest search in `make run`.\n\n"
         "RMS on sample 1, mN / processor time, %, with the chosen terms and rates and a search that is named.\n\n"
-        f"| scene | runs, % | {' | '.join(f'`{name}`' for name in names)} |\n| --- | --- |{' --- |' * len(names)}\n"
-        + "\n".join(rows)
+        + _table(["scene", "runs, %", *(f"`{name}`" for name in names)], rows)
     )
 
 
-def _scene(scene: MeasuredScene, description: str, share: float) -> str:
-    needed = {factor: required(scene.terms, factor * scene.tolerance_N, share) for factor in TOLERANCES}
-    rows = [
-        f"| `{item.term}` | {'out' if item.term in scene.left_out else 'in'} | {1e3 * item.frozen_added_N:.1f} | "
-        f"{1e3 * item.learning_added_N:.1f} | {scene.saved_us_s(item) / 1e4:.2f} % | "
-        f"{'in' if item.term in needed[0.5] else 'out'} | {'in' if item.term in needed[2.0] else 'out'} |"
-        for item in scene.terms
-    ]
-    judged = ", ".join(
-        f"{item.plant.replace('_', ' ')}{'' if item.is_learning else ' frozen'} {1e3 * item.full_N:.1f} / "
-        f"{1e3 * item.chosen_N:.1f}"
-        for item in scene.judged
-    )
-    saved = scene.cost_full_us_s / scene.cost_us_s
-    within = max(item.chosen_N for item in scene.judged) / scene.tolerance_N
-    missed_N = max(item.full_N for item in scene.judged if item.is_learning)
-    not_met = (
-        ""
-        if is_met(scene.judged, scene.tolerance_N)
-        else f" **Not met**: with all terms {1e3 * missed_N:.0f} mN.{_why_not(scene.name)}"
-    )
-    return (
-        f"## `{scene.name}`\n\n{description} Tolerance {1e3 * scene.tolerance_N:g} mN.{not_met}\n\n"
-        "| term | required | added, frozen, mN | added, learning, mN | saves | at half the tolerance | at twice |\n"
-        "| --- | --- | --- | --- | --- | --- | --- |\n" + "\n".join(rows) + "\n\n"
-        f"All terms at 1000 / 500 Hz / the required ones at {scene.control_hz} / {scene.inference_hz} Hz, mN: "
-        f"{judged}. The chosen model takes {1.0 / saved:.0%} of the time ({saved:.1f} times less); the worst of its "
-        f"errors is {within:.2f} of the tolerance."
-    )
-
-
-def _why_not(name: str) -> str:
-    found = _evidence("unmet")
-    if found["scene"] != name:
-        return ""
-    rows = "\n".join(
-        f"| {other} | " + " | ".join(f"{1e3 * error_N:.1f}" for error_N in errors_N.values()) + " |"
-        for other, errors_N in found["rms_N"].items()
-    )
-    return (
-        " What the elastomer relaxes away is half of it, and no other term of the device counts. But it is not a term "
-        "that is wanting: a handle that never reaches 5 mm/s, where friction is not yet that of sliding, teaches "
-        "nothing of scale and offset, and the ceiling holds the gap of a device that is unknown. One that has been "
-        "turned faster before is known, and misses a quarter of that at most. Most of what the scene asks for lies "
-        "below the device's least force: a gap that opens to 196 mm would give it ([table 2.5]"
-        "(reproduction.md#table-25-inserts-for-tasks)).\n\n"
-        "All terms, 1000 / 500 Hz, RMS on samples 1, 2 and 3, mN (`tools/unmet_scene.py`):\n\n"
-        f"| what is other | 1 | 2 | 3 |\n| --- | --- | --- | --- |\n{rows}"
-    )
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def draw_asked(path: Path) -> None:

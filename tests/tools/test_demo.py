@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from machines.host import Host
 from rendering import show
-from rendering.rehearsal import Rehearsal
+from rendering.following import Followed
+from rendering.rehearsal import Case, rehearse
 
+from tormagd.config import Config
 from tormagd.ctl.outcome import CommandError, Exit
 from tormagd.safety.codes import FAULTS, Fault, Limit
 from tormagd.scenes.scene import load_scene
@@ -60,7 +62,8 @@ def with_lost_frame():
 def rehearsals():
     """Every case, well tracked."""
     asked = 1.5 + 0.1 * np.sin(5.0 * AXIS_S)
-    return [Rehearsal(case, AXIS_S, asked, asked + 0.01, AXIS_S, AXIS_S) for case in demo.CASES]
+    found = Followed(AXIS_S, asked, asked + 0.01, AXIS_S, AXIS_S, AXIS_S, {})
+    return dict.fromkeys(demo.CASES, found)
 
 
 @pytest.mark.parametrize("host", [QUIET, STALLED])
@@ -205,5 +208,13 @@ def test_the_virtual_time_cases_are_shown_in_every_case(show_, verdict, exit_cod
 def test_a_virtual_time_case_that_fails_is_missed_whatever_the_host_did(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
     for verdict in (demo.Verdict.MET, demo.Verdict.HOST):
-        assert demo.conclude(SCENE, shown(), rehearsals()[1:], verdict, "", 60.0) == 1
+        assert demo.conclude(SCENE, shown(), dict(list(rehearsals().items())[1:]), verdict, "", 60.0) == 1
     assert "MISSED every case in virtual time done" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("case", demo.CASES, ids=lambda case: case.label)
+def test_every_case_of_the_demo_is_played(case: Case) -> None:
+    times_s = np.arange(0.0, 1.0, 0.002)
+    done = rehearse(Config(scene="pulse"), case, times_s, 1.5 + 0.1 * np.sin(2.0 * np.pi * times_s))
+    assert np.isfinite(done.rendered_N).all()
+    assert len(done.rendered_N) > 500

@@ -5,21 +5,17 @@ import math
 import envelope
 import numpy as np
 import pytest
-from rendering import device_draws
+from rendering.following import Followed
 
 FLOOR_N = 0.6
 
 
-def table(asked_N: float, along_N: np.ndarray, speed_mm_s: float = 42.0) -> np.ndarray:
+def judged(asked_N: float, along_N: np.ndarray, speed_mm_s: float = 42.0) -> envelope.Figures:
     """A handle that turns steadily, a row a millisecond; the force asked is the same from the beginning."""
-    rows = len(along_N)
-    handle_mm = speed_mm_s * 1e-3 * np.arange(1, rows + 1)
-    signed_N = along_N * math.copysign(1.0, speed_mm_s)
-    return np.column_stack((signed_N, handle_mm, np.full(rows, speed_mm_s), np.full(rows, asked_N)))
-
-
-def judged(rows: np.ndarray):
-    return envelope.judged(rows, lambda speed_mm_s: FLOOR_N, {}, ())
+    time_s, same = 1e-3 * np.arange(1, len(along_N) + 1), np.ones_like(along_N)
+    signed_N, speeds = along_N * math.copysign(1.0, speed_mm_s), speed_mm_s * same
+    found = Followed(time_s, asked_N * same, signed_N, time_s * speed_mm_s, speeds, same, {})
+    return envelope.judged(found, lambda speed_mm_s: FLOOR_N)
 
 
 def forces(rows: int, excess_N: float, at: int, lasts: int) -> np.ndarray:
@@ -30,27 +26,27 @@ def forces(rows: int, excess_N: float, at: int, lasts: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("lasts", "over_N"), [(200, 0.3), (40, 0.0)])
 def test_an_excess_counts_where_it_lasts(lasts: int, over_N: float) -> None:
-    assert judged(table(1.0, forces(6_000, 0.3, 4_000, lasts))).over_N == pytest.approx(over_N, abs=1e-9)
+    assert judged(1.0, forces(6_000, 0.3, 4_000, lasts)).over_N == pytest.approx(over_N, abs=1e-9)
 
 
 def test_before_a_carriage_could_have_arrived_nothing_counts() -> None:
-    assert judged(table(1.0, forces(6_000, 0.3, 100, 400))).over_N == pytest.approx(0.0, abs=1e-9)
+    assert judged(1.0, forces(6_000, 0.3, 100, 400)).over_N == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_greatest_force_counts_whenever_it_was() -> None:
-    assert judged(table(1.0, forces(6_000, 1.7, 100, 5))).peak_N == pytest.approx(2.7)
+    assert judged(1.0, forces(6_000, 1.7, 100, 5)).peak_N == pytest.approx(2.7)
 
 
 def test_below_what_the_open_gap_brakes_there_is_nothing_to_fall_short_of() -> None:
-    found = judged(table(0.2, np.full(6_000, 0.55)))
+    found = judged(0.2, np.full(6_000, 0.55))
     assert found.under_N == -np.inf
     assert found.settled == ()
-    assert judged(table(1.0, np.full(6_000, 0.8))).under_N == pytest.approx(0.2)
+    assert judged(1.0, np.full(6_000, 0.8)).under_N == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize("speed_mm_s", [42.0, -42.0])
 def test_both_ways_are_sliding(speed_mm_s: float) -> None:
-    found = judged(table(1.0, np.full(6_000, 1.1), speed_mm_s))
+    found = judged(1.0, np.full(6_000, 1.1), speed_mm_s)
     assert [round(error, 6) for _, _, error in found.settled] == [0.1] * len(found.settled)
     assert found.settled
 
@@ -59,11 +55,6 @@ def test_a_missed_bound_is_named() -> None:
     kept = dict.fromkeys(envelope.BOUNDS, 0.0)
     assert envelope.missed(kept) == []
     assert envelope.missed(kept | {"peak_N": 5.1}) == ["peak_N = 5.100: allowed is 2.6"]
-
-
-def test_a_draw_is_the_same_every_time_and_another_than_the_next() -> None:
-    assert device_draws.drawn_device(4) == device_draws.drawn_device(4)
-    assert device_draws.drawn_device(4) != device_draws.drawn_device(5)
 
 
 @pytest.mark.parametrize(

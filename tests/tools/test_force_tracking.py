@@ -1,27 +1,51 @@
 """The force-tracking tool: its signals, its draws, and its figures on one short run. All devices are synthetic."""
 
+import itertools
 import math
 
-import force_tracking
 import numpy as np
 import pytest
-from force_tracking import (
-    DRAWN,
-    SPREAD,
-    STAIR_S,
-    TRIM_S,
-    Track,
+from rendering.cases import (
+    ARRIVES_S,
+    LATER_S,
+    SPEEDS_MM_S,
+    STEP_S,
     allowed_N,
     compared,
-    draw_plants,
     ideal,
     stair_levels,
+    step_figures,
+    tour,
     track,
 )
-from rendering.publisher import publisher
-from rendering.signals import SCALED_N, Kind, Signal, palpation, recorded_signals
+from rendering.device_draws import DRAWN, SPREAD, drawn_device, evenly_drawn
+from rendering.following import Followed, publisher
+from rendering.human_pulse import pulse_profile, with_approach
+from rendering.signals import (
+    SCALED_N,
+    TRIM_S,
+    Kind,
+    Signal,
+    palpation,
+    pulse_signal,
+    recorded_signals,
+    staircase_signal,
+)
+from rendering.tables import lines, worst_lines
+from rendering.tracking import tracking
 
 from tormagd.simulation.parameters import load_plant
+
+BEGINS_S, IDEAL_S = 4.0, 0.9
+
+
+def course(*errors: tuple[float, float, float]) -> Followed:
+    """Ten seconds of 1 N without an error, but for these: from, to, s, and how much, N."""
+    time_s = 1e-3 * np.arange(10_000)
+    asked_N, felt_N, still = np.ones_like(time_s), np.ones_like(time_s), np.zeros_like(time_s)
+    for from_s, to_s, much_N in errors:
+        felt_N[(time_s >= from_s) & (time_s < to_s)] += much_N
+    return Followed(time_s, asked_N, felt_N, still, still, still, {})
 
 
 def swing(seconds: float) -> Signal:
@@ -30,11 +54,11 @@ def swing(seconds: float) -> Signal:
 
 
 @pytest.fixture(scope="module")
-def swung() -> Track:
+def swung() -> Followed:
     return track(load_plant("sample_1"), swing(1.6), "pulse", 0.07)
 
 
-def test_a_swing_is_rendered_and_nothing_holds_it_back(swung: Track) -> None:
+def test_a_swing_is_rendered_and_nothing_holds_it_back(swung: Followed) -> None:
     found = swung.since(0.8)
     assert found.rms_N <= 0.015
     assert found.variance_accounted_for >= 0.95
@@ -44,32 +68,86 @@ def test_a_swing_is_rendered_and_nothing_holds_it_back(swung: Track) -> None:
     assert all(0.0 <= share <= 1.0 for share in swung.limits.values())
 
 
-def test_no_figure_is_better_than_that_of_the_ideal_carriages(swung: Track) -> None:
-    beside = compared(swung, ideal(load_plant("sample_1"), swing(1.6)), 0.8)
+def test_no_figure_is_better_than_that_of_the_ideal_carriages(swung: Followed) -> None:
+    beside = compared(swung, ideal("sample_1", swing(1.6)), 0.8)
     assert beside["rms_N"] == swung.since(0.8).rms_N
     assert max(beside["foresight_rms_N"], beside["no_delay_rms_N"]) <= 1e-6 <= beside["rms_N"]
     fast = swing(1.6)._replace(force_N=1.5 + 0.2 * np.sin(2.0 * np.pi * 6.0 * swing(1.6).time_s))
-    least = ideal(load_plant("sample_1"), fast).figures()
+    least = ideal("sample_1", fast).figures()
     assert 0.01 <= least["foresight_rms_N"] < least["no_delay_rms_N"]
     rushed = track(load_plant("sample_1"), fast, "pulse", 0.0)
     assert rushed.since(0.0).rms_N >= least["foresight_rms_N"]
     # as long as nothing is foreseen, which three swings are too few for
     begun = fast._replace(time_s=fast.time_s[:250], force_N=fast.force_N[:250])
-    at_first = ideal(load_plant("sample_1"), begun).figures()
+    at_first = ideal("sample_1", begun).figures()
     assert track(load_plant("sample_1"), begun, "pulse", 0.0).since(0.0).rms_N >= at_first["no_delay_rms_N"]
 
 
 def test_weak_motors_render_a_live_pulse_once_it_is_foreseen() -> None:
     """Sample 2 starts and turns too late for what it is not told before: with the slope alone it misses by 28 mN."""
-    found = track(load_plant("sample_2"), force_tracking.pulse(13.0), "pulse", 0.0)
+    found = track(load_plant("sample_2"), pulse_signal(13.0), "pulse", 0.0)
     assert found.since(5.0).rms_N <= 0.02
     assert found.shown.lateness.lag_s > 0.005
 
 
-def test_the_error_is_measured_where_it_is(swung: Track) -> None:
-    """A millinewton more everywhere is a millinewton more of mean error: nothing is removed."""
-    shifted = swung._replace(rendered_N=swung.rendered_N + 0.001)
-    assert shifted.since(0.8).mean_N - swung.since(0.8).mean_N == pytest.approx(0.001)
+def test_nothing_is_removed_from_the_error() -> None:
+    reference = np.sin(np.linspace(0.0, 20.0, 1_000))
+    result = tracking(reference, reference + 0.5)
+    assert (result.rms_N, result.mean_N) == pytest.approx((0.5, 0.5))
+    assert result.variance_accounted_for == pytest.approx(1.0 - 0.25 / reference.var())
+
+
+def test_the_pulse_spans_what_was_asked_and_has_no_images() -> None:
+    times_s, forces_N = pulse_profile(10.0, 1.4, 1.7, 500)
+    assert len(times_s) == 5_000
+    assert (forces_N.min(), forces_N.max()) == pytest.approx((1.4, 1.7))
+    spectrum = np.abs(np.fft.rfft((forces_N - forces_N.mean()) * np.hanning(len(forces_N))))
+    high = np.fft.rfftfreq(len(forces_N), 2e-3) > 30.0
+    assert spectrum[high].max() < 1e-3 * spectrum.max()
+    with pytest.raises(ValueError, match="allowed is up to"):
+        pulse_profile(60.0, 1.4, 1.7, 500)
+
+
+def test_the_approach_ends_where_the_pulse_begins() -> None:
+    times_s, forces_N = with_approach(*pulse_profile(2.0, 1.4, 1.7, 500), 0.6, 1.0, 0.5)
+    assert forces_N[0] == 0.6
+    assert np.abs(np.diff(forces_N)).max() < 0.01
+    assert times_s[-1] == pytest.approx(3.5, abs=0.01)
+
+
+def test_a_step_is_judged_once_it_arrived_a_second_later_and_by_its_greatest() -> None:
+    arrives_s = BEGINS_S + IDEAL_S + ARRIVES_S
+    found = course(
+        (BEGINS_S, BEGINS_S + IDEAL_S, -1.3),  # on its way
+        (arrives_s, arrives_s + 0.1, -0.05),
+        (arrives_s + LATER_S, arrives_s + LATER_S + 0.1, 0.02),
+        (arrives_s + 0.5, arrives_s + 0.6, 0.09),
+        (BEGINS_S + STEP_S, 10.0, 1.3),  # the next step
+    )
+    figures = step_figures(found, BEGINS_S, IDEAL_S, 1.0)
+    assert figures == pytest.approx({"arrived_N": -0.05, "later_N": 0.02, "overshoot_N": 0.09})
+    # downwards what falls short of the force asked is beyond it
+    assert step_figures(found, BEGINS_S, IDEAL_S, -1.0)["overshoot_N"] == pytest.approx(0.05)
+
+
+def test_the_worst_is_of_means_in_between() -> None:
+    found = course((3.0, 3.2, -0.4), (5.0, 5.001, 5.0), (8.0, 9.0, 1.0))
+    assert found.worst_N(2.0, 4.0) == pytest.approx(0.4)
+    assert found.worst_N(4.5, 6.0) == pytest.approx(0.1)  # one reading of fifty
+
+
+def test_every_speed_follows_every_other_once() -> None:
+    assert sorted(itertools.pairwise(tour())) == sorted(itertools.permutations(SPEEDS_MM_S, 2))
+
+
+def test_figures_are_printed_with_the_worst_device() -> None:
+    devices = {"draw 40": {"up_N": 0.01}, "sample_2": {"up_N": -0.03}, "draw 41": {"up_N": 0.02}}
+    assert list(worst_lines("steps", devices)) == ["steps, up_N: 30.0 mN (sample_2), median 20.0 mN"]
+    rows = {"plant": "sample_1", "rms_N": 0.0123, "limits": {"RATE": 0.5}}
+    assert list(lines({"rows": [rows]}, "pulse")) == [
+        "pulse, rows: plant sample_1, rms 12.3 mN",
+        "pulse, rows, limits: RATE 0.5",
+    ]
 
 
 def test_a_publisher_sends_what_follows() -> None:
@@ -87,7 +165,7 @@ def test_a_publisher_sends_what_follows() -> None:
 
 
 def test_draws_repeat_themselves_within_their_spread() -> None:
-    first, again = list(draw_plants(4)), list(draw_plants(4))
+    first, again = evenly_drawn(4), evenly_drawn(4)
     assert first == again
     assert len({plant.motor.resistance_Ohm for plant, _ in first}) == 4
     nominal = load_plant("sample_1")
@@ -98,19 +176,19 @@ def test_draws_repeat_themselves_within_their_spread() -> None:
             nominal.gear.output_friction_Nm * factors["gear.output_friction_Nm"]
         )
         assert plant.electronics == nominal.electronics
+    assert drawn_device(4) == drawn_device(4) != drawn_device(5)
 
 
 def test_levels_are_those_of_the_steps() -> None:
     """A record made by hand: each level half a step off only in its first moments."""
-    signal = force_tracking.staircase_signal(0.47)
+    signal = staircase_signal(0.47)
     assert signal.force_N[0] == 1.0
     assert signal.force_N[signal.time_s > TRIM_S][0] == 0.47
     assert signal.force_N[-1] == pytest.approx(2.0)
-    late = np.interp(signal.time_s - 0.1, signal.time_s, signal.force_N)
-    asked, levels = stair_levels(Track(signal.time_s, signal.force_N, late, {}, 1.0))
+    late, still = np.interp(signal.time_s - 0.1, signal.time_s, signal.force_N), np.zeros_like(signal.time_s)
+    asked, levels = stair_levels(Followed(signal.time_s, signal.force_N, late, still, still, still, {}))
     assert asked == pytest.approx([0.47, *np.arange(0.5, 2.01, 0.1)])
     assert levels == pytest.approx(asked)
-    assert STAIR_S > 1.0
 
 
 def test_recorded_signals_are_in_the_devices_range(recordings) -> None:

@@ -1,1 +1,1 @@
-"""How a force is rendered: profiles, devices, what would be ideal, the error; and the parts of `make run`."""
+"""How a force is followed: hands, devices, signals, what ideal carriages do, the error; the parts of `make run`."""

@@ -1,17 +1,57 @@
-"""Random devices around sample 1, as the plant card draws them: seeded, so that a draw is the same every time."""
+"""The samples, and random devices around sample 1: seeded, so that a draw is the same every time."""
 
 import msgspec
 import numpy as np
 
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
+SAMPLES = ("sample_1", "sample_2", "sample_3")
+FIRST_DRAW = 40
+"Of those of the plant card that only judge: on earlier ones constants were chosen."
 TURNING_GAP_MM = 67.0
 "The field is drawn at this gap; the drawn exponent turns the law about it."
 SEED = 2026
+EVEN_SEED = 2024
+SPREAD = 0.2
+DRAWN = (
+    ("elastomer", "kinetic_friction"),
+    ("elastomer", "shear_modulus_kPa"),
+    ("field", "coefficient"),
+    ("motor", "resistance_Ohm"),
+    ("motor", "back_emf_V_s_rad"),
+    ("motor", "inertia_kg_m2"),
+    ("gear", "output_friction_Nm"),
+    ("screw", "friction_coefficient"),
+)
+"What is drawn evenly within +-SPREAD."
+
+
+def device(name: str) -> PlantParameters:
+    """A sample by its name, or `draw N` of the plant card."""
+    return drawn_device(int(name.split()[1])) if name.startswith("draw") else load_plant(name)
+
+
+def judging(draws: int) -> list[str]:
+    """The samples, and the names of so many draws that only judge."""
+    return [*SAMPLES, *(f"draw {number}" for number in range(FIRST_DRAW, FIRST_DRAW + draws))]
+
+
+def evenly_drawn(count: int) -> list[tuple[PlantParameters, dict[str, float]]]:
+    """Sample 1 with each of DRAWN times a factor, and the factors."""
+    random = np.random.default_rng(EVEN_SEED)
+    found = []
+    for _ in range(count):
+        plant, factors = load_plant(SAMPLES[0]), random.uniform(1.0 - SPREAD, 1.0 + SPREAD, len(DRAWN)).tolist()
+        for (table, name), factor in zip(DRAWN, factors, strict=True):
+            part = getattr(plant, table)
+            other = msgspec.structs.replace(part, **{name: getattr(part, name) * factor})
+            plant = msgspec.structs.replace(plant, **{table: other})
+        found.append((plant, {".".join(each): factor for each, factor in zip(DRAWN, factors, strict=True)}))
+    return found
 
 
 def drawn_device(number: int) -> PlantParameters:
-    """Draw `number`. Every third has the thesis's field law (Eq. 7), which has no exponent to draw."""
+    """Draw `number` of the plant card. Every third has the thesis's field law (Eq. 7), which has no exponent."""
     random = np.random.default_rng((SEED, number))
     nominal = load_plant("sample_1")
 

@@ -101,6 +101,10 @@ class Brake(NamedTuple):
         """The force of the fresh insert at a moment and its lag."""
         return float(np.interp(moment_Tm + lag_Tm, self.strength_Tm, self.fresh_N))
 
+    def open_N(self, hand_mm_s: float) -> float:
+        """What the open gap brakes with its element fresh."""
+        return self.sliding_N(self.fresh_at_N(float(self.moment_Tm[-1])), hand_mm_s)
+
     def lag_after_Tm(self, lag_Tm: float, change_Tm: float) -> float:
         """The lag once the moment has changed by that much, one way."""
         branch_Tm = math.copysign(self.branch_Tm, -change_Tm)

@@ -6,6 +6,7 @@ Every outcome is kept under a hash of all that it depends on; runs are spread ov
 
 import hashlib
 import math
+import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, as_completed
@@ -15,41 +16,39 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
+from tqdm import tqdm
 
-from rendering.publisher import FILE_PREVIEW_S, publisher
+from rendering.following import FILE_PREVIEW_S, Array, publisher
+from rendering.hands import swinging
 from tormagd.closed_loop import ClosedLoop
-from tormagd.config import Config, Motor, Rates
+from tormagd.config import Config, Rates
 from tormagd.control.core import Core, build_core
 from tormagd.control.estimate import Estimate
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import Planner, PlanState
-from tormagd.control.remembered import Remembered
 from tormagd.control.step import StepState
 from tormagd.hardware.measurement import Measurement
 from tormagd.scenes.measured import Cost
-from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Handle, Scene, Solver, load_task, scene_path, terms_of
+from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Solver, load_task, scene_path, terms_of
 from tormagd.scenes.signal import asked
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, Hand, PressingHand, RecordedHand
+from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, PressingHand
 from tormagd.simulation.parameters import PlantParameters, load_plant, with_insert
 
-Array = npt.NDArray[np.float64]
 Call = Callable[[], object]
 
 ROOT = Path(__file__).parents[2]
 LEARN_S = 4.0
 APPROACH_S = 2.0
 "The signal's first force is held for so long before it."
-HAND_S, HAND_STEP_S, HAND_LASTS_S = 5.3, 0.02, 90.0
-"The handle's speed swings between the scene's in this time, evenly in its logarithm."
 OPEN_MM = 0.1
 "So near its open end a gap is open: too much force there is the device's, and no error of any model."
 TIMED_S, ROUNDS = 1.0, 7
 VALID_S = 0.1
 DEPENDS_ON = (
     "tools/rendering/scene_runs.py",
-    "tools/rendering/publisher.py",
+    "tools/rendering/following.py",
+    "tools/rendering/hands.py",
     "tormagd/closed_loop.py",
     *(f"tormagd/{room}" for room in ("control", "hardware", "inverse", "model", "physics", "safety", "simulation")),
     "firmware_protocol",
@@ -71,12 +70,9 @@ class Case(msgspec.Struct, frozen=True):
     seconds: float = 5.0
 
 
-def run(
-    case: Case, plant: PlantParameters | None = None, hand: Hand | None = None, motor: Motor | None = None
-) -> float:
-    """RMS of the true force less the force asked, N; a run that ends in a fault counts as no force at all. `plant` and
-    `hand` take the place of those that case and scene name, `motor` that of the one the controller believes in."""
-    played = _Play(case, plant, hand, motor)
+def run(case: Case) -> float:
+    """RMS of the true force less the force asked, N; a run that ends in a fault counts as no force at all."""
+    played = Play(case)
     rows = []
     for time_s, loop in played.ticks(case.seconds):
         truth = loop.device.truth
@@ -94,37 +90,37 @@ def costs(cases: Sequence[Case]) -> list[Cost]:
     """What steps and plans take in the models of cases at equal rates: all are given what the first was given in the
     loop, in rounds over all of them, so that a disturbance of the machine meets all alike. Of each step and plan the
     least of ROUNDS counts."""
-    played = _Play(cases[0])
+    played = Play(cases[0])
     given = [moment for moment in played.moments(TIMED_S) if moment.time_s >= LEARN_S]
-    cores = [build_core(played.config, _modelled(played.core.scene, case)) for case in cases]
-    made: list[tuple[list[Call], list[Call]]] = []
-    for core in cores:
-        planner, stepper = core.planner, core.stepper
-        steps: list[Call] = []
-        plans: list[Call] = []
-        first = given[0]
-        own = planner.plan(planner.start(first.now_s), first.now_s, first.setpoint, first.estimate).remembered
-        for each in given:
-            steps.append(partial(stepper.step, each.step_state, each.now_s, each.measurement, each.plan_state.plan))
-            if each.is_planned:
-                state = _remembering_as(own, each.plan_state)
-                plans.append(partial(_planned, planner, state, each.now_s, each.setpoint, each.estimate))
-        made.append((steps, plans))
-    rounds = [[(_each_us(steps), _each_us(plans)) for steps, plans in made] for _ in range(ROUNDS)]
+    made = [_calls(build_core(played.config, _modelled(played.core.scene, case)), given) for case in cases]
+    least_us = [[np.full(len(calls), np.inf) for calls in kinds] for kinds in made]
+    for _ in range(ROUNDS):
+        for least, kinds in zip(least_us, made, strict=True):
+            least[:] = [np.minimum(before, _spent_us(calls)) for before, calls in zip(least, kinds, strict=True)]
     # a setpoint that comes a little late makes a plan more: what all have cost is shared by those that were asked for
     asked = len(given) * cases[0].inference_hz / cases[0].control_hz
-    totals_us = [
-        [float(np.min([one[index][kind] for one in rounds], axis=0).sum()) for kind in range(2)]
-        for index in range(len(cases))
+    return [
+        Cost(round(float(steps_us.sum()) / len(given), 3), round(float(plans_us.sum()) / asked, 3))
+        for steps_us, plans_us in least_us
     ]
-    return [Cost(round(steps_us / len(given), 3), round(plans_us / asked, 3)) for steps_us, plans_us in totals_us]
 
 
-def _remembering_as(own: Remembered, state: PlanState) -> PlanState:
-    """The state with no more of the elastomer's branches than a model of its own remembers."""
-    remembered = state.remembered
-    free, added = remembered.free[: len(own.free)], remembered.added[: len(own.added)]
-    return state.replaced(remembered=remembered.replaced(free=free, added=added))
+def _calls(core: Core, given: list["Moment"]) -> tuple[list[Call], list[Call]]:
+    """Every step and every plan of a core that is given this."""
+    planner, first = core.planner, given[0]
+    own = planner.plan(planner.start(first.now_s), first.now_s, first.setpoint, first.estimate).remembered
+    steps: list[Call] = []
+    plans: list[Call] = []
+    for each in given:
+        state, now_s = each.plan_state, each.now_s
+        steps.append(partial(core.stepper.step, each.step_state, now_s, each.measurement, state.plan))
+        if each.is_planned:
+            # with no more of the elastomer's branches than a model of its own remembers
+            known = state.remembered
+            known = known.replaced(free=known.free[: len(own.free)], added=known.added[: len(own.added)])
+            own_state = state.replaced(remembered=known)
+            plans.append(partial(_planned, planner, own_state, now_s, each.setpoint, each.estimate))
+    return steps, plans
 
 
 def _modelled(scene: Scene, case: Case) -> Scene:
@@ -139,7 +135,7 @@ def _planned(
     return planner.foresee(planner.plan(state, now_s, setpoint, estimate))
 
 
-def _each_us(calls: list[Call]) -> list[float]:
+def _spent_us(calls: list[Call]) -> list[float]:
     spent = []
     for call in calls:
         start_ns = time.thread_time_ns()
@@ -148,25 +144,7 @@ def _each_us(calls: list[Call]) -> list[float]:
     return spent
 
 
-def core_run(case: Case) -> Callable[[], tuple[StepState, PlanState]]:
-    """What the core did in the case's seconds, to be done again without device and protocol: each step and each plan
-    from the state before it, with what it was given in the loop. Gives the states that it ends in."""
-    played = _Play(case)
-    given = [moment for moment in played.moments(case.seconds) if moment.time_s >= LEARN_S]
-    stepper, planner = played.core.stepper, played.planner
-
-    def again() -> tuple[StepState, PlanState]:
-        step_state, plan_state = given[0].step_state, given[0].plan_state
-        for each in given:
-            step_state, _ = stepper.step(step_state, each.now_s, each.measurement, plan_state.plan)
-            if each.is_planned:
-                plan_state = _planned(planner, plan_state, each.now_s, each.setpoint, step_state.estimate)
-        return step_state, plan_state
-
-    return again
-
-
-class _Moment(NamedTuple):
+class Moment(NamedTuple):
     """What the core was given in one tick, behind the states before it. `time_s` counts from the signal's beginning."""
 
     time_s: float
@@ -179,30 +157,26 @@ class _Moment(NamedTuple):
     is_planned: bool
 
 
-class _Play:
+class Play:
     """A case's loop, armed, and its signal behind an approach."""
 
-    def __init__(
-        self,
-        case: Case,
-        plant: PlantParameters | None = None,
-        hand: Hand | None = None,
-        motor: Motor | None = None,
-    ) -> None:
+    def __init__(self, case: Case) -> None:
         rates = Rates(control_hz=case.control_hz, inference_hz=min(case.inference_hz, case.control_hz))
-        self.config = config = Config(scene=case.scene, rates=rates, motor=motor or Motor())
+        self.config = config = Config(scene=case.scene, rates=rates)
         stated = load_task(case.scene)
         free = Bandwidth(control_hz=case.control_hz, inference_hz=rates.inference_hz)
         scene = _modelled(msgspec.structs.replace(stated, bandwidth=free), case)
         self.core = build_core(config, scene)
         self.planner = (self.core if case.is_learning else _frozen(config, scene)).planner
-        device = VirtualDevice(plant or plant_of(scene, case.plant), hand or _hand(scene), seed=1)
+        finger = scene.finger
+        hand = swinging(scene.handle) if finger is msgspec.UNSET else PressingHand(finger.depth_mm)
+        device = VirtualDevice(plant_of(scene, case.plant), hand, seed=1)
         self._loop = ClosedLoop(config, self.core.stepper, self.core.planner, device)
         self._loop.arm()
         self.time_s, self.force_N = signal_of(self.core, case.scene, LEARN_S + case.seconds, case.inference_hz)
         approach_s = APPROACH_S
-        if scene.finger is not msgspec.UNSET:
-            approach_s += PRESSES_AT_S + scene.finger.depth_mm / PRESSING_MM_S - self._loop.now_s
+        if finger is not msgspec.UNSET:
+            approach_s += PRESSES_AT_S + finger.depth_mm / PRESSING_MM_S - self._loop.now_s
         before_s = np.arange(round(approach_s * case.inference_hz)) / case.inference_hz
         self.begins_s = self._loop.now_s + approach_s
         times = np.concatenate([self._loop.now_s + before_s, self.begins_s + self.time_s])
@@ -212,9 +186,7 @@ class _Play:
         if signal.setpoint_hz is not msgspec.UNSET and signal.setpoint_hz < case.inference_hz:
             sent_s = np.arange(times[0], times[-1], 1.0 / signal.setpoint_hz)
             times, forces = sent_s, np.interp(sent_s, times, forces)
-        self.publish: Callable[[float], TimedSetpoint | None] = publisher(
-            times, forces, FILE_PREVIEW_S if signal.is_known_ahead else 0.0, VALID_S
-        )
+        self.publish = publisher(times, forces, FILE_PREVIEW_S if signal.is_known_ahead else 0.0, VALID_S)
 
     def ticks(self, seconds: float) -> Iterable[tuple[float, ClosedLoop]]:
         """The loop after each tick, with the time in the signal, from the approach to `seconds` after LEARN_S."""
@@ -227,13 +199,13 @@ class _Play:
             loop.tick(self.publish(loop.now_s))
             yield time_s, loop
 
-    def moments(self, seconds: float) -> Iterable[_Moment]:
+    def moments(self, seconds: float) -> Iterable[Moment]:
         """The same ticks as the core saw them."""
         loop = self._loop
         step_state, plan_state, before_s = loop.step_state, loop.plan_state, loop.now_s
         for time_s, _ in self.ticks(seconds):
             assert plan_state is not None, "a loop with a planner has a state of it"
-            yield _Moment(
+            yield Moment(
                 time_s,
                 step_state,
                 plan_state,
@@ -271,21 +243,6 @@ def plant_of(scene: Scene, sample: str) -> PlantParameters:
     return with_insert(load_plant(sample), scene.insert.name)
 
 
-def _hand(scene: Scene) -> Hand:
-    if scene.finger is not msgspec.UNSET:
-        return PressingHand(scene.finger.depth_mm)
-    return turning(scene.handle)
-
-
-def turning(handle: Handle, first_mm_s: float = 0.0, first_s: float = 0.0) -> Hand:
-    """A hand whose speed swings between a scene's, behind the first seconds at another speed."""
-    low, high = math.log(handle.least_mm_s), math.log(handle.most_mm_s)
-    time_s = np.arange(0.0, HAND_LASTS_S, HAND_STEP_S)
-    speed_mm_s = np.exp((low + high) / 2.0 + (high - low) / 2.0 * np.sin(2.0 * math.pi * time_s / HAND_S))
-    speed_mm_s[time_s < first_s] = first_mm_s
-    return RecordedHand(tuple(time_s.tolist()), tuple((np.cumsum(speed_mm_s) * HAND_STEP_S).tolist()))
-
-
 @cache
 def sources_hash() -> str:
     """Of everything but the case that an outcome depends on."""
@@ -309,31 +266,23 @@ def key(case: Case) -> str:
     return hashlib.sha256(sources_hash().encode() + msgspec.json.encode(named) + file).hexdigest()
 
 
-def run_all(
-    cases: Iterable[Case],
-    executor: Executor,
-    kept: Path | None = None,
-    progress: Callable[[int, int], object] = lambda finished, total: None,
-) -> dict[Case, float]:
+def run_all(cases: Iterable[Case], executor: Executor, kept: Path | None = None) -> dict[Case, float]:
     """The outcome of every case, in their order. With `kept`, a JSON file, those that are in it are taken from there,
     and new ones are added as they come: what was stopped goes on where it was."""
-    wanted = list(dict.fromkeys(cases))
+    keys = {case: key(case) for case in cases}
     known: dict[str, float] = {}
     if kept is not None and kept.exists():
         known = msgspec.json.decode(kept.read_bytes(), type=dict[str, float])
-    keys = {case: key(case) for case in wanted}
-    pending = {executor.submit(run, case): case for case in wanted if keys[case] not in known}
-    progress(len(wanted) - len(pending), len(wanted))
+    pending = {executor.submit(run, case): keys[case] for case in keys if keys[case] not in known}
     try:
-        for finished, future in enumerate(as_completed(pending), len(wanted) - len(pending) + 1):
-            known[keys[pending[future]]] = future.result()
+        for future in tqdm(as_completed(pending), total=len(pending), unit="run", disable=not sys.stderr.isatty()):
+            known[pending[future]] = future.result()
             if kept is not None:
                 partial_file = kept.with_name(kept.name + ".part")
                 partial_file.parent.mkdir(parents=True, exist_ok=True)
                 partial_file.write_bytes(msgspec.json.encode(known))
                 partial_file.replace(kept)
-            progress(finished, len(wanted))
     finally:
         for future in pending:
             future.cancel()
-    return {case: known[keys[case]] for case in wanted}
+    return {case: known[keys[case]] for case in keys}

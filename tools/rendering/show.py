@@ -12,23 +12,24 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import zmq
 from machines.host import Host, HostWatch
 from machines.own import own_machine
 from machines.wire import carried
 
-from rendering.human_pulse import Array, pulse_profile, with_approach
+from rendering.following import Array
+from rendering.human_pulse import pulse_profile, with_approach
 from rendering.tracking import Tracking, tracking
 from tormagd.ctl.operate import home, operate
-from tormagd.recording.reader import RecordingError, read_recording
+from tormagd.recording.reader import Columns, RecordingError, read_recording
 from tormagd.safety.codes import FAULTS, Fault
 from tormagd_client import Client, ClientError, UnreachableError
-from tormagd_client.messages import MessageError, Telemetry, decode
+from tormagd_client.messages import MessageError, Telemetry
 
 RUN_DIR = Path("run/demo")
 RECORDING = RUN_DIR / "pulse.mcap"
@@ -59,6 +60,8 @@ PULSE_START_S = RAMP_S + HOLD_S
 START_N = 0.6
 RATE_HZ = 500
 "Setpoints a second."
+LOOK_S = 0.2
+"The longest wait for telemetry."
 PATIENCE_S = 60.0
 "For a start on a busy machine; only a failure waits for it."
 ANSWER_S = 5.0
@@ -170,15 +173,15 @@ def show(times_s: Array, forces_N: Array) -> Shown | Aborted:
             return judged(course, watched.between(course.start_s, course.end_s), times_s, forces_N)
         except ShowError as error:
             watched.end()
-            until_s = fault_s(error.time_s)
+            until_s, spacing_s = early_end(began_s, error.time_s)
             host = watched.between(max(began_s, until_s - BEFORE_FAULT_S), until_s)
-            return Aborted(error, host, fastest_s(began_s, error.time_s))
+            return Aborted(error, host, spacing_s)
 
 
 def write_profile(path: Path, times_s: Array, forces_N: Array) -> None:
     """A setpoint CSV."""
-    rows = (f"{t:.4f},{f:.5f}" for t, f in zip(times_s, forces_N, strict=True))
-    path.write_text("t_s,force_N\n" + "\n".join(rows) + "\n")
+    rows = np.column_stack([times_s, forces_N])
+    np.savetxt(path, rows, ("%.4f", "%.5f"), delimiter=",", header="t_s,force_N", comments="")
 
 
 def play(watched: HostWatch, duration_s: float) -> Course:
@@ -224,7 +227,7 @@ def judged(course: Course, host: Host, times_s: Array, forces_N: Array) -> Shown
     """The show's figures, from the device's own truth and the daemon's recording. Raises ShowError."""
     try:
         truth = np.genfromtxt(RUN_DIR / "truth.csv", delimiter=",", names=True)
-        spacings_s = tick_spacings_s(course.start_s, course.end_s)
+        spacings_s = np.diff(ticks_s(read_recording(RECORDING).ticks, course.start_s, course.end_s))
     except (OSError, ValueError) as error:
         raise ShowError(f"what was recorded cannot be read: {error}", f"look at the logs in {RUN_DIR}") from error
     axis = (truth["t_ns"] - course.start_ns) * 1e-9
@@ -248,32 +251,24 @@ def judged(course: Course, host: Host, times_s: Array, forces_N: Array) -> Shown
     )
 
 
-def tick_spacings_s(start_s: float, end_s: float) -> Array:
-    """Times between the recorded ticks between two times of CLOCK_MONOTONIC. Raises RecordingError."""
-    moments_s = read_recording(RECORDING).ticks.numbers.get("monotonic_s", np.empty(0))
-    return np.diff(moments_s[(moments_s >= start_s) & (moments_s <= end_s)])
+def ticks_s(ticks: Columns, start_s: float, end_s: float) -> Array:
+    """The recorded ticks between two times of CLOCK_MONOTONIC."""
+    moments_s = ticks.numbers.get("monotonic_s", np.empty(0))
+    return moments_s[(moments_s >= start_s) & (moments_s <= end_s)]
 
 
-def fault_s(seen_s: float) -> float:
-    """When the first fault was latched, by the recording: whoever saw it at `seen_s` may have been late."""
+def early_end(start_s: float, seen_s: float) -> tuple[float, float]:
+    """Of a show that ended early, by its recording: when the first fault was latched, for whoever saw it at `seen_s`
+    may have been late, and the time between ticks that the fastest tenth of them keeps; 0 where none were recorded."""
     try:
         ticks = read_recording(RECORDING).ticks
     except RecordingError:
-        return seen_s
-    moments_s = ticks.numbers.get("monotonic_s", np.empty(0))
-    latched = (
-        float(moment_s) for moment_s, faults in zip(moments_s, ticks.words.get("faults", ()), strict=False) if faults
-    )
-    return next(latched, seen_s)
-
-
-def fastest_s(start_s: float, end_s: float) -> float:
-    """Time between ticks that the fastest tenth of them keeps; 0 where none were recorded."""
-    try:
-        spacings_s = tick_spacings_s(start_s, end_s)
-    except RecordingError:
-        return 0.0
-    return float(np.quantile(spacings_s, FASTEST)) if len(spacings_s) else 0.0
+        return seen_s, 0.0
+    moments_s = ticks.numbers.get("monotonic_s", np.empty(0)).tolist()
+    faults = ticks.words.get("faults", ())
+    latched_s = next((at_s for at_s, codes in zip(moments_s, faults, strict=False) if codes), seen_s)
+    spacings_s = np.diff(ticks_s(ticks, start_s, seen_s))
+    return latched_s, float(np.quantile(spacings_s, FASTEST)) if len(spacings_s) else 0.0
 
 
 @contextlib.contextmanager
@@ -367,36 +362,30 @@ def watch(
 ) -> dict[str, float]:
     """The live view; the share of telemetry messages in which each limit was held. Raises ShowError."""
     is_terminal = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
-    held: dict[str, int] = {}
+    held: Counter[str] = Counter()
     seen = 0
     start_s = shown_s = time.monotonic()
     until_s = start_s + duration_s + PATIENCE_S
-    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.subscribe(b"")
-        socket.connect(ADDRESS.format("telemetry"))
-        while publisher.poll() is None and time.monotonic() < until_s:
-            if daemon.poll() is not None:
-                raise ended("tormagd")
-            if not socket.poll(200):
-                continue
-            try:
-                telemetry = decode(socket.recv(), Telemetry)
-            except MessageError as error:
-                print(f"telemetry: {error}", file=sys.stderr)
-                continue
+    while publisher.poll() is None and time.monotonic() < until_s:
+        if daemon.poll() is not None:
+            raise ended("tormagd")
+        try:
+            arrived = client.telemetry(LOOK_S)
+        except MessageError as error:
+            print(f"telemetry: {error}", file=sys.stderr)
+            continue
+        for telemetry in arrived:
             if telemetry.faults:
                 if is_terminal:
                     print()
                 raise_fault(status(client))
             seen += 1
-            for limit in telemetry.limits:
-                held[limit] = held.get(limit, 0) + 1
-            now_s = time.monotonic()
-            if now_s - shown_s >= (0.1 if is_terminal else 1.0):
-                shown_s = now_s
-                line = live_line(telemetry, now_s - start_s, duration_s)
-                print(f"\r\x1b[K{line}" if is_terminal else line, end="" if is_terminal else "\n", flush=True)
+            held.update(telemetry.limits)
+        now_s = time.monotonic()
+        if arrived and now_s - shown_s >= (0.1 if is_terminal else 1.0):
+            shown_s = now_s
+            line = live_line(arrived[-1], now_s - start_s, duration_s)
+            print(f"\r\x1b[K{line}" if is_terminal else line, end="" if is_terminal else "\n", flush=True)
     if is_terminal:
         print()
     if publisher.poll() is None:

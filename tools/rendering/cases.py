@@ -1,0 +1,410 @@
+"""The cases of `force_tracking.py`: how soon a device is known, and how well pulses, stairs and recorded forces are
+followed. Each gives plain data.
+
+Nothing is removed from an error: no mean, no delay. A step has *arrived* ARRIVES_S after the device's ideal carriages
+would have brought the force.
+"""
+
+import itertools
+import math
+from concurrent.futures import Executor
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from rendering.device_draws import SAMPLES, device, evenly_drawn
+from rendering.following import (
+    FILE_PREVIEW_S,
+    PREVIEW_S,
+    RATE_HZ,
+    VALID_S,
+    Followed,
+    Levels,
+    armed,
+    armed_at_rest,
+    asked_at,
+    follow,
+    publisher,
+)
+from rendering.hands import TURNED_MM_S, Legs
+from rendering.human_pulse import with_approach
+from rendering.ideal_carriage import brake_of, drive_of
+from rendering.ideal_force import Bound, asked_of, bound, no_delay_mm
+from rendering.signals import (
+    STAIR_S,
+    TRIM_S,
+    Kind,
+    Signal,
+    data_folder,
+    palpation,
+    pulse_signal,
+    recorded_signals,
+    staircase_signal,
+)
+from rendering.tables import Json
+from rendering.tracking import Tracking
+from tormagd.config import Config
+from tormagd.control.core import build_core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.control.plan import NOTHING_SHOWN, Shown
+from tormagd.control.profile import profile_of
+from tormagd.safety.codes import Limit
+from tormagd.scenes.scene import load_scene, terms_of
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import PlantParameters
+
+Array = npt.NDArray[np.float64]
+Kept = dict[str, Followed]
+"Runs that the picture shows, by part and device."
+
+STAIR_SCENE = "coronary"
+HIGH_N, LOW_N, ABOVE_N = 2.0, 0.7, 0.1
+"Steps begin at LOW_N, or ABOVE_N over what the open gap brakes where that is more."
+ARRIVES_S, LATER_S = 0.25, 1.0
+IDEAL_N = 0.01
+"The ideal carriages have brought a force that is as close."
+STEPS = (("up", "down"), ("up again", "down again"), ("up known", "down known"))
+"Of a fresh device; the same after REST_S; and after it was started again with its profile."
+STEP_S, REST_S = 3.0, 30.0
+RUNS_ON_S = 90.0
+CREEP_MM_S, CREPT_MM = 1.0, 10.0
+CREEP_N = (1.0, 2.0, 0.8)
+SPEEDS_MM_S, SPEED_S, SLID_S = (1.0, 42.0, 100.0, 300.0), 4.0, 1.0
+SPEEDS_N = (1.0, 2.0)
+DRIFT_MN_MIN, DRIFT_S, DRIFT_N, TURN_S = 5.0, 3600.0, 1.0, 10.0
+START_N, RAMP_S, HOLD_S = 0.6, 1.0, 1.0
+"Of the approach to a signal."
+PULSE_S, DRAWN_PULSE_S = 20.0, 15.0
+PALPATION_SEEDS = 1, 2
+OVER_IDEAL = 1.3
+"A signal may be missed by so many times what the ideal carriages miss, beside ALLOWED_N."
+ALLOWED_N = {Kind.PULSE: 0.006, Kind.HAND: 0.010}
+ALLOWED_WEAK_N = 0.015
+"A pulse on sample 2, whose motors are weak."
+FOLLOWABLE, UNDER_FLAT, OVER_FLAT = 0.7, 0.9, 1.05
+"""A hand that nobody foresees may be missed by UNDER_FLAT of what the best flat line misses, where the ideal carriages
+miss under FOLLOWABLE of that; by OVER_FLAT otherwise."""
+WITHIN_N = 0.018
+LEVEL_S = 0.5
+
+
+# -- how soon and how well a device is known ------------------------------------------------------------------------
+
+
+def course(plant: PlantParameters, legs: Legs, levels: Levels, shown: Shown = NOTHING_SHOWN) -> Followed:
+    """One run: the hand along its legs, the force along its levels, with a device that counts as having `shown` so much
+    of itself."""
+    loop, force_N = armed_at_rest(plant, legs, shown), asked_at(levels)
+    begins_s = loop.now_s
+    found = follow(
+        loop,
+        lambda now_s: TimedSetpoint(force_N(now_s - begins_s), now_s, VALID_S),
+        sum(lasts_s for lasts_s, _ in levels),
+        begins_s,
+    )
+    return found._replace(asked_N=np.array([force_N(time_s) for time_s in found.time_s.tolist()]))
+
+
+def ideal_s(plant: PlantParameters, low_N: float) -> tuple[float, float]:
+    """After how long the ideal carriages have brought the force up to HIGH_N, and down again."""
+    brake, rest, hold = brake_of(plant), 0.3, 2.0
+    levels = asked_at([(rest, low_N), (hold, HIGH_N), (hold, low_N)])
+    time_s = 1e-3 * np.arange(round((rest + 2.0 * hold) * 1e3))
+    wanted_N = np.array([levels(at_s) for at_s in time_s.tolist()])
+    asked = asked_of(brake, wanted_N, most_N=HIGH_N, hand_mm_s=TURNED_MM_S, step_s=1e-3)
+    reached_N = asked.rendered_N(brake, no_delay_mm(drive_of(plant), brake, asked, 1e-3))
+    is_far = np.abs(reached_N - asked.force_N) > IDEAL_N
+    up, down = (
+        np.flatnonzero(is_far[(time_s >= begins_s) & (time_s < begins_s + hold)]) for begins_s in (rest, rest + hold)
+    )
+    return 1e-3 * float(up.max(initial=-1) + 1), 1e-3 * float(down.max(initial=-1) + 1)
+
+
+def step_figures(found: Followed, begins_s: float, ideal: float, direction: float) -> Json:
+    """Of one step."""
+    arrives_s = begins_s + ideal + ARRIVES_S
+    held = (found.time_s >= begins_s + ideal) & (found.time_s < begins_s + STEP_S)
+    return {
+        "arrived_N": found.mean_N(arrives_s),
+        "later_N": found.mean_N(arrives_s + LATER_S),
+        "overshoot_N": float((direction * found.error_N[held]).max()),
+    }
+
+
+def steps(name: str) -> Json:
+    """Up and down on a fresh device, the same after REST_S, and once it was started again with its profile."""
+    plant = device(name)
+    brake = brake_of(plant)
+    low_N = max(LOW_N, brake.open_N(TURNED_MM_S) + ABOVE_N)
+    up_s, down_s = ideal_s(plant, low_N)
+    legs, once = [(RUNS_ON_S, TURNED_MM_S)], [(1.0, 0.0), (STEP_S, low_N), (STEP_S, HIGH_N)]
+    fresh = course(plant, legs, [*once, (REST_S, low_N), (STEP_S, HIGH_N), (STEP_S, low_N)])
+    kept = profile_of(fresh.shown, serial_number=1, insert="MRE", model="0" * 64, saved_ns=0)
+    known = course(plant, legs, [*once, (STEP_S, low_N)], kept.shown(3_600_000_000_000))
+    first_s, again_s = 1.0 + STEP_S, 1.0 + 2.0 * STEP_S + REST_S
+    courses = (fresh, first_s), (fresh, again_s), (known, first_s)
+    result: Json = {"faults": [*fresh.faults, *known.faults]}
+    for (up, down), (found, begins_s) in zip(STEPS, courses, strict=True):
+        result[up] = step_figures(found, begins_s, up_s, 1.0)
+        result[down] = step_figures(found, begins_s + STEP_S, down_s, -1.0)
+    return result
+
+
+def creep(name: str) -> Json:
+    """A handle at CREEP_MM_S: of each force the error after CREPT_MM, from a handle that was faster before and from one
+    that never was."""
+    plant, result = device(name), {}
+    hold_s = CREPT_MM / CREEP_MM_S + 2.0
+    for key, lead in (("after speed", [(3.0, TURNED_MM_S)]), ("only", [])):
+        lead_s = sum(lasts_s for lasts_s, _ in lead)
+        levels = [(lead_s + hold_s, CREEP_N[0]), *((hold_s, force_N) for force_N in CREEP_N[1:])]
+        found = course(plant, [*lead, (RUNS_ON_S, CREEP_MM_S)], levels)
+        ends_s = [lead_s + hold_s * (1 + place) for place in range(len(CREEP_N))]
+        result[key] = with_rail(found, [found.worst_N(end_s - 2.0, end_s) for end_s in ends_s])
+    return result
+
+
+def tour() -> list[float]:
+    """Speeds in an order in which every one follows every other."""
+    found, left = [SPEEDS_MM_S[0]], set(itertools.permutations(SPEEDS_MM_S, 2))
+    while left:
+        # the fastest of those that have not followed it: so the slowest, the first, is always left to go on from
+        after = max(fast for slow, fast in left if slow == found[-1])
+        left.remove((found[-1], after))
+        found.append(after)
+    return found
+
+
+def speeds(name: str) -> Json:
+    """Every speed after every other: the worst error from SLID_S on."""
+    plant, result = device(name), {}
+    legs = [(SPEED_S, speed) for speed in tour()]
+    for force_N in SPEEDS_N:
+        found = course(plant, legs, [(SPEED_S * len(legs), force_N)])
+        worst = {
+            f"{before:g} to {after:g} mm/s": found.worst_N(SPEED_S * place + SLID_S, SPEED_S * (place + 1))
+            for place, (before, after) in enumerate(itertools.pairwise(tour()), 1)
+        }
+        result[f"{force_N:g} N"] = with_rail(found, worst)
+    return result
+
+
+def with_rail(found: Followed, worst_N: object) -> Json:
+    """Errors, beside the share of time that a learned value stood at its bound."""
+    return {"worst_N": worst_N, "railed": float(found.is_railed.mean()), "faults": found.faults}
+
+
+def drift(name: str, lasts_s: float = DRIFT_S) -> Json:
+    """A force sensor that drifts, with a handle that turns back every TURN_S, and one that never does: the worst error
+    of a second's mean, and how far the force went from when OFFSET_UNKNOWN was first shown."""
+    plant = device(name)
+    sensor = msgspec.structs.replace(plant.force_sensor, drift_mN_min=DRIFT_MN_MIN)
+    plant = msgspec.structs.replace(plant, force_sensor=sensor)
+    turns = [(TURN_S, TURNED_MM_S), (TURN_S, -TURNED_MM_S)] * round(lasts_s / TURN_S / 2.0)
+    result: Json = {}
+    for key, legs in (("turning", turns), ("one_way", [(lasts_s, TURNED_MM_S)])):
+        loop = armed_at_rest(plant, legs)
+        begins_s, unknown_s = loop.now_s, None
+        means_N, second = [], list[float]()
+        for sample in loop.run(lasts_s, lambda now_s: TimedSetpoint(DRIFT_N, now_s, VALID_S)):
+            if unknown_s is None and Limit.OFFSET_UNKNOWN in sample.plan.limits:
+                unknown_s = sample.time_s - begins_s
+            second.append(abs(sample.truth.force_N) - DRIFT_N)
+            if len(second) == 1_000:
+                means_N.append(sum(second, 0.0) / len(second))
+                second.clear()
+        errors_N, at = np.array(means_N), np.arange(len(means_N))
+        # the second in which the handle turned says nothing, and the first ones arrive
+        settled = (at >= 3) & (at % round(TURN_S) != 0) & (at % round(TURN_S) != round(TURN_S) - 1)
+        known_N = errors_N[: round(unknown_s)] if unknown_s is not None else errors_N
+        result[key] = {
+            "worst_N": float(np.abs(errors_N[settled]).max()),
+            "unknown_after_s": unknown_s,
+            "drifted_on_N": float(np.abs(errors_N[len(known_N) :] - known_N[-1]).max(initial=0.0)),
+        }
+    return result
+
+
+def pulse(name: str) -> Json:
+    """RMS error of the pulse of `make run`, N: by the model alone, with the device learned before and nothing more of
+    it, and while it is learned."""
+    plant, played = device(name), pulse_signal(PULSE_S)
+    learning = track(plant, played, "pulse", 0.0)
+    before = learning.shown.replaced(read=-1, read_s=0.0)
+    alone, learned = (
+        track(plant, played, "pulse", 0.0, is_learning=False, shown=shown) for shown in (NOTHING_SHOWN, before)
+    )
+    courses = {"model alone": alone, "learned before": learned, "while learned": learning}
+    return {key: found.since(0.0).rms_N for key, found in courses.items()}
+
+
+# -- how well signals are followed ----------------------------------------------------------------------------------
+
+
+def track(
+    plant: PlantParameters,
+    signal: Signal,
+    scene: str,
+    preview_s: float,
+    *,
+    is_learning: bool = True,
+    shown: Shown = NOTHING_SHOWN,
+) -> Followed:
+    """Plays a signal behind an approach; time counts from its first force. The device counts as having `shown` so much
+    of itself, and goes on doing so where `is_learning`. Raises RuntimeError for a fault."""
+    stated = load_scene(scene)
+    terms = msgspec.structs.replace(terms_of(stated), learning=is_learning)
+    loop = armed(Config(scene=scene), plant, SteadyHand(), msgspec.structs.replace(stated, terms=terms), shown)
+    flat = np.array([0.0, 1.0 / RATE_HZ]), np.full(2, signal.force_N[0])
+    approach_s, approach_N = with_approach(*flat, START_N, RAMP_S, HOLD_S)
+    lead_s, start_s = float(approach_s[-1]), loop.now_s
+    times = np.concatenate([approach_s[:-1], lead_s + signal.time_s])
+    forces = np.concatenate([approach_N[:-1], signal.force_N])
+    publish = publisher(times + start_s, forces, preview_s, signal.valid_for_s)
+    found = follow(loop, publish, float(times[-1]), start_s + lead_s)
+    if found.faults:
+        raise RuntimeError(f"{signal.name}: {', '.join(found.faults)} at {loop.now_s:.3f} s")
+    asked = np.interp(found.time_s, signal.time_s, signal.force_N)
+    if not signal.is_known_ahead:  # what comes as an event holds until the next
+        asked = signal.force_N[np.searchsorted(signal.time_s, found.time_s, side="right") - 1]
+    return found._replace(asked_N=asked)
+
+
+def figures(result: Tracking) -> Json:
+    """A tracking as numbers for a table."""
+    return {
+        "rms_N": result.rms_N,
+        "vaf": result.variance_accounted_for,
+        "worst_N": result.worst_N,
+        "sd_N": result.reference_sd_N,
+    }
+
+
+def ideal(name: str, signal: Signal) -> Bound:
+    """What a device's ideal carriages render of a signal."""
+    return bound(device(name), signal.time_s, signal.force_N, is_held=not signal.is_known_ahead)
+
+
+def compared(found: Followed, best: Bound, start_s: float) -> Json:
+    """The figures from a time on, and the RMS errors of the ideal carriages since then."""
+    least = best.figures(start_s)
+    return figures(found.since(start_s)) | {name: least[name] for name in ("no_delay_rms_N", "foresight_rms_N")}
+
+
+def samples(pool: Executor, kept: Kept) -> Json:
+    """The pulse on the three samples, with and without preview: the whole of it, and after TRIM_S."""
+    rows, played = [], pulse_signal(PULSE_S)
+    cases = [(name, preview_s) for name in SAMPLES for preview_s in (PREVIEW_S, 0.0)]
+    runs = [pool.submit(track, device(name), played, "pulse", preview_s) for name, preview_s in cases]
+    best = {name: pool.submit(ideal, name, played) for name in SAMPLES}
+    for (name, preview_s), run in zip(cases, runs, strict=True):
+        found, least = run.result(), best[name].result()
+        rows.append(
+            {
+                "plant": name,
+                "preview": preview_s > 0.0,
+                "whole": compared(found, least, 0.0),
+                "after_trim": compared(found, least, TRIM_S),
+                "trim": found.trim,
+                "lag_ms": found.shown.lateness.lag_s * 1e3,
+                "limits": found.limits,
+            }
+        )
+        if preview_s:
+            kept[f"samples {name}"] = found
+    return {"rows": rows}
+
+
+def draws(pool: Executor, count: int) -> list[Json]:
+    """The pulse on random devices, after TRIM_S: with preview, then live."""
+    drawn, played = evenly_drawn(count), pulse_signal(DRAWN_PULSE_S)
+    result = []
+    for preview_s in (PREVIEW_S, 0.0):
+        runs = [pool.submit(track, plant, played, "pulse", preview_s) for plant, _ in drawn]
+        rows = []
+        for (_, factors), run in zip(drawn, runs, strict=True):
+            found = run.result()
+            rows.append(figures(found.since(TRIM_S)) | {"trim": found.trim, "limits": found.limits, "factors": factors})
+        rms = np.array([row["rms_N"] for row in rows])
+        result.append(
+            {
+                "preview": preview_s > 0.0,
+                "count": count,
+                "worst_rms_N": float(rms.max()),
+                "median_rms_N": float(np.median(rms)),
+                "within_18_mN": int(np.sum(rms <= WITHIN_N)),
+                "rows": rows,
+            }
+        )
+    return result
+
+
+def staircase(pool: Executor, kept: Kept) -> Json:
+    """The coronary scene's staircase on the three samples: the level of each step over its last LEVEL_S."""
+    rows = []
+    signal = staircase_signal(build_core(Config(scene=STAIR_SCENE)).planner.portrait.least_N)
+    runs = [pool.submit(track, device(name), signal, STAIR_SCENE, 0.0) for name in SAMPLES]
+    for name, run in zip(SAMPLES, runs, strict=True):
+        kept[f"staircase {name}"] = run.result()
+        asked, levels = stair_levels(run.result())
+        rows.append(
+            {
+                "plant": name,
+                "steps": len(levels),
+                "is_monotone": bool(np.all(np.diff(levels) > 0.0)),
+                "worst_N": float(np.abs(levels - asked).max()),
+                "smallest_step_N": float(np.diff(levels).min()),
+                "asked_N": asked.tolist(),
+                "rendered_N": levels.tolist(),
+            }
+        )
+    return {"rows": rows}
+
+
+def stair_levels(found: Followed) -> tuple[Array, Array]:
+    """The force asked and rendered on every step after the first hold."""
+    asked, levels = [], []
+    for end_s in np.arange(TRIM_S + STAIR_S, found.time_s[-1] + 0.02, STAIR_S):
+        inside = (found.time_s > end_s - LEVEL_S) & (found.time_s <= end_s - 0.01)
+        asked.append(float(np.median(found.asked_N[inside])))
+        levels.append(float(found.rendered_N[inside].mean()))
+    return np.array(asked), np.array(levels)
+
+
+def signals(pool: Executor) -> Json:
+    """The recorded signals and palpation on the three samples: those known ahead with preview, and all of them live."""
+    folder = data_folder()
+    if folder is None:
+        return {"rows": [], "note": "no recorded signals: TORMAG_DATA names no folder"}
+    found = [*recorded_signals(folder), *(palpation(seed) for seed in PALPATION_SEEDS)]
+    cases = [
+        (name, signal, preview_s)
+        for signal in found
+        for preview_s in ((FILE_PREVIEW_S, 0.0) if signal.is_known_ahead else (0.0,))
+        for name in SAMPLES
+    ]
+    runs = [pool.submit(track, device(name), signal, STAIR_SCENE, preview_s) for name, signal, preview_s in cases]
+    best = {(name, signal.name): pool.submit(ideal, name, signal) for signal in found for name in SAMPLES}
+    rows = []
+    for (name, signal, preview_s), run in zip(cases, runs, strict=True):
+        rendered, is_known = run.result(), preview_s > 0.0
+        row = compared(rendered, best[name, signal.name].result(), 0.0)
+        rows.append(
+            {"plant": name, "signal": signal.name, "scaled": signal.scaled, "preview": is_known}
+            | row
+            | {"allowed_N": allowed_N(signal.kind, name, is_known, row), "limits": rendered.limits}
+        )
+    return {"rows": rows}
+
+
+def allowed_N(kind: Kind, plant: str, has_preview: bool, row: Json) -> float | None:
+    """The RMS error that a signal may have, by what the ideal carriages miss and its deviation; None of other kinds."""
+    if kind is Kind.OTHER:
+        return None
+    if kind is Kind.HAND and not has_preview:
+        is_followable = row["no_delay_rms_N"] < FOLLOWABLE * row["sd_N"]
+        return float((UNDER_FLAT if is_followable else OVER_FLAT) * row["sd_N"])
+    ideal_N = row["foresight_rms_N" if has_preview else "no_delay_rms_N"]
+    is_weak = kind is Kind.PULSE and plant == "sample_2"
+    return math.hypot(OVER_IDEAL * ideal_N, ALLOWED_WEAK_N if is_weak else ALLOWED_N[kind])

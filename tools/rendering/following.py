@@ -1,0 +1,171 @@
+"""A force followed in virtual time: who publishes it, and what the device truly rendered."""
+
+from collections import Counter
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from rendering.hands import Legs, WaitingHand
+from rendering.tracking import Tracking, tracking
+from tormagd.closed_loop import ClosedLoop, stream
+from tormagd.config import Config
+from tormagd.control.core import build_core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.control.plan import NOTHING_SHOWN, Shown
+from tormagd.control.slow_friction import believable
+from tormagd.scenes.scene import Scene
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import Hand
+from tormagd.simulation.parameters import PlantParameters
+
+Array = npt.NDArray[np.float64]
+Levels = list[tuple[float, float]]
+"How long, s, and how much, N."
+Publisher = Callable[[float], TimedSetpoint | None]
+
+RATE_HZ = 500
+"Setpoints a second."
+PREVIEW_S = 0.07
+"How far a preview tells what follows."
+FILE_PREVIEW_S = 0.4
+"How far one does that plays a recording."
+CORNER_SCENE = "coronary"
+VALID_S = 0.25
+MEAN_S = 0.05
+TRIM = Config().trim
+
+
+class Followed(NamedTuple):
+    """What a run showed, a row for each control tick: time since its beginning, s; the force asked and the one truly
+    rendered, signed as the handle moves, N; where the handle is, mm and mm/s; whether a learned value stood at its
+    rail. And the share of time that each limit was held, the faults that ended it, what the device had shown by then.
+    """
+
+    time_s: Array
+    asked_N: Array
+    rendered_N: Array
+    handle_mm: Array
+    handle_mm_s: Array
+    is_railed: Array
+    limits: dict[str, float]
+    faults: tuple[str, ...] = ()
+    shown: Shown = NOTHING_SHOWN
+    trim: float = 1.0
+
+    @property
+    def along_N(self) -> Array:
+        """The force against the motion: what is felt of a brake."""
+        return np.where(self.handle_mm_s >= 0.0, self.rendered_N, -self.rendered_N)
+
+    @property
+    def error_N(self) -> Array:
+        """What is felt less what was asked."""
+        return self.along_N - self.asked_N
+
+    def since(self, start_s: float) -> Tracking:
+        """The figures from a time on."""
+        inside = self.time_s >= start_s
+        return tracking(self.asked_N[inside], self.rendered_N[inside])
+
+    def mean_N(self, begins_s: float, lasts_s: float = MEAN_S) -> float:
+        """The mean error over a while."""
+        return float(self.error_N[(self.time_s >= begins_s) & (self.time_s < begins_s + lasts_s)].mean())
+
+    def worst_N(self, begins_s: float, ends_s: float) -> float:
+        """The greatest of the means over MEAN_S in between."""
+        return max(abs(self.mean_N(at_s)) for at_s in np.arange(begins_s, ends_s - MEAN_S, MEAN_S))
+
+
+def armed(
+    config: Config,
+    plant: PlantParameters,
+    hand: Hand,
+    scene: Scene | None = None,
+    shown: Shown = NOTHING_SHOWN,
+) -> ClosedLoop:
+    """A device that was homed and enabled, and counts as having `shown` so much of itself. A given `scene` takes the
+    place of the configured one. Raises RuntimeError where the device does not get that far."""
+    core = build_core(config, scene)
+    loop = ClosedLoop(config, core.stepper, core.planner, VirtualDevice(plant, hand, seed=1))
+    loop.plan_state = core.planner.start(loop.now_s).replaced(shown=shown)
+    loop.arm()
+    return loop
+
+
+def armed_at_rest(plant: PlantParameters, legs: Legs, shown: Shown = NOTHING_SHOWN) -> ClosedLoop:
+    """The same in CORNER_SCENE with a hand that stood meanwhile, and goes along its legs from now on."""
+    hand = WaitingHand()
+    loop = armed(Config(scene=CORNER_SCENE), plant, hand, shown=shown)
+    hand.begin(legs, loop.now_s)
+    return loop
+
+
+def follow(loop: ClosedLoop, publish: Publisher, lasts_s: float, begins_s: float) -> Followed:
+    """Plays what is published for so long, or until a fault; rows count from `begins_s` of the loop's time on."""
+    rows: list[tuple[float, ...]] = []
+    held: Counter[str] = Counter()
+    faults: tuple[str, ...] = ()
+    trim, asked_N = 1.0, 0.0
+
+    def newest(now_s: float) -> TimedSetpoint | None:
+        nonlocal asked_N
+        setpoint = publish(now_s)
+        asked_N = 0.0 if setpoint is None else setpoint.force_N
+        return setpoint
+
+    for sample in loop.run(lasts_s, newest):
+        truth, trim = sample.truth, sample.trim
+        since_s = truth.time_s - begins_s
+        if since_s >= 0.0:
+            rows.append((since_s, asked_N, truth.force_N, truth.handle_mm, truth.handle_mm_s, is_railed(loop)))
+            held.update({str(limit) for limit in (*sample.plan.limits, *sample.output.limits)})
+        faults = tuple(map(str, sample.state.safety.faults))
+        if faults:
+            break
+    shares = {limit: count / len(rows) for limit, count in sorted(held.items())}
+    time_s, asked, rendered, handle, speed, railed = np.array(rows).reshape(-1, 6).T
+    return Followed(time_s, asked, rendered, handle, speed, railed, shares, faults, shown_by(loop), trim)
+
+
+def shown_by(loop: ClosedLoop) -> Shown:
+    """What the device has shown so far."""
+    assert loop.plan_state is not None, "a loop with a planner has a state of it"
+    return loop.plan_state.shown
+
+
+def is_railed(loop: ClosedLoop) -> bool:
+    """Whether a learned value stands at its bound."""
+    shown = shown_by(loop)
+    return shown.device.scale in (TRIM.least, TRIM.most) or (
+        shown.slow.learned > 0.0 and shown.slow.factor in believable(shown.device, shown.slow.followed_N)
+    )
+
+
+def asked_at(levels: Levels) -> Callable[[float], float]:
+    """The force asked at a time."""
+    ends = np.cumsum([lasts_s for lasts_s, _ in levels]).tolist()
+
+    def force_N(time_s: float) -> float:
+        return next((level for end, (_, level) in zip(ends, levels, strict=True) if time_s < end), levels[-1][1])
+
+    return force_N
+
+
+def publisher(times_s: Array, forces_N: Array, preview_s: float, valid_for_s: float) -> Publisher:
+    """Each force at its time; with a preview, what follows it up to `preview_s` in even steps."""
+    live = stream(times_s, forces_N, valid_for_s)
+    period_s = 1.0 / RATE_HZ
+    ahead_s = period_s * np.arange(1, round(preview_s / period_s) + 1)
+    if not ahead_s.size:
+        return live
+
+    def newest(now_s: float) -> TimedSetpoint | None:
+        setpoint = live(now_s)
+        if setpoint is None:
+            return None
+        preview = np.interp(setpoint.stamp_s + ahead_s, times_s, forces_N)
+        return setpoint.replaced(preview_N=tuple(preview.tolist()), preview_dt_s=period_s)
+
+    return newest

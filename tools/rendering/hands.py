@@ -1,0 +1,85 @@
+"""Hands at the handle: legs of even speed, and speeds that swing."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from tormagd.scenes.scene import Handle
+from tormagd.simulation.hand import Hand, RecordedHand
+
+Legs = list[tuple[float, float]]
+"How long, s, and how fast, mm/s."
+
+TURNED_MM_S = 42.0
+"The roller's surface at the thesis's 20 rpm."
+SWING_S, SWING_STEP_S, SWINGS_FOR_S = 5.3, 0.02, 90.0
+"A handle's speed swings between a scene's in this time, evenly in its logarithm."
+
+
+class WaitingHand:
+    """Stands until it goes along legs, which begin at a time of the device's."""
+
+    def __init__(self) -> None:
+        self._goes: Hand | None = None
+
+    def begin(self, legs: Legs, start_s: float) -> None:
+        """Goes along them from `start_s` on, and stands after the last."""
+        times_s, places_mm = [start_s], [0.0]
+        for lasts_s, speed_mm_s in legs:
+            times_s.append(times_s[-1] + lasts_s)
+            places_mm.append(places_mm[-1] + lasts_s * speed_mm_s)
+        self._goes = RecordedHand(tuple(times_s), tuple(places_mm))
+
+    def position_mm(self, time_s: float) -> float:
+        """Of the roller's surface."""
+        return 0.0 if self._goes is None else self._goes.position_mm(time_s)
+
+
+def swinging(handle: Handle) -> Hand:
+    """A hand whose speed swings between a scene's."""
+    low, high = math.log(handle.least_mm_s), math.log(handle.most_mm_s)
+    time_s = np.arange(0.0, SWINGS_FOR_S, SWING_STEP_S)
+    speed_mm_s = np.exp((low + high) / 2.0 + (high - low) / 2.0 * np.sin(2.0 * math.pi * time_s / SWING_S))
+    return RecordedHand(tuple(time_s.tolist()), tuple((np.cumsum(speed_mm_s) * SWING_STEP_S).tolist()))
+
+
+def flicks() -> Legs:
+    """42 mm/s, and up to 200 mm/s and down again within half a second each, both ways."""
+    legs: Legs = []
+    for direction in (1.0, -1.0, 1.0, -1.0):
+        rise = [(0.02, direction * (42.0 + 158.0 * step / 25.0)) for step in range(26)]
+        legs += [(1.0, direction * 42.0), *rise, (0.3, direction * 200.0), *rise[::-1]]
+    return legs * 3
+
+
+def reversals(seed: int) -> Legs:
+    """Turns and stops every 1..4 s, at speeds from a creep to 300 mm/s."""
+    random = np.random.default_rng(seed)
+    legs, direction = [], 1.0
+    for _ in range(20):
+        legs.append((random.uniform(1.0, 4.0), direction * math.exp(random.uniform(math.log(0.5), math.log(300.0)))))
+        if random.random() < 0.4:
+            legs.append((random.uniform(0.1, 1.0), 0.0))
+        direction = -direction
+    return legs
+
+
+def ladder() -> Legs:
+    """From 5 to 300 mm/s and back again, three seconds each."""
+    speeds = (5.0, 8.0, 15.0, 42.0, 100.0, 200.0, 300.0)
+    return [(3.0, speed) for speed in (*speeds, *(-speed for speed in speeds[::-1]))]
+
+
+HANDS: dict[str, Callable[[], Legs]] = {
+    "creep": lambda: [(3.0, 42.0), (30.0, 0.5)],
+    "1 mm/s": lambda: [(3.0, 42.0), (30.0, 1.0)],
+    "5 mm/s": lambda: [(60.0, 5.0)],
+    "42 mm/s": lambda: [(60.0, 42.0)],
+    "100 mm/s": lambda: [(60.0, -100.0)],
+    "300 mm/s": lambda: [(60.0, 300.0)],
+    "ladder": ladder,
+    "flicks": flicks,
+    "reversals": lambda: reversals(1),
+    "other reversals": lambda: reversals(2),
+}

@@ -1,0 +1,126 @@
+"""The pictures of forces that were followed: that of `make run`, and that of `force_tracking.py`."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from pictures.stamp import stamp
+
+from rendering.following import Array, Followed
+from rendering.rehearsal import Rehearsals
+from rendering.show import PULSE_START_S, Shown
+from rendering.tracking import tracking
+from tormagd.scenes.scene import Scene
+
+ASKED, RENDERED, OTHER, THIRD, QUIET = "#222222", "#d1495b", "#2a6f97", "#6a994e", "#8d99ae"
+SAMPLE_COLOURS = {"sample_1": RENDERED, "sample_2": OTHER, "sample_3": THIRD}
+CLOSE_UP_S = 4.0
+SAMPLES_FROM_S = 12.0
+BAR_MN = 18.0
+
+
+def show_picture(path: Path, scene: Scene, shown: Shown, rehearsals: Rehearsals, figures: list[str]) -> None:
+    """Writes a PNG, stamped with these figures: the run, a close-up, the error, the samples, the hand that stops."""
+    time_s, asked_N, rendered_N = shown.time_s, shown.asked_N, shown.rendered_N
+    figure = Figure(figsize=(13, 10.5), layout="constrained")
+    axes = figure.subplots(3, 2)
+    figure.suptitle("A measured human pulse, rendered as friction force by the simulated device", fontsize=14)
+    _forces(axes[0, 0], time_s, asked_N, rendered_N, "Real time, plant sample 1")
+    axes[0, 0].axvspan(0.0, PULSE_START_S, color="#eef0f4", zorder=0)
+    axes[0, 0].text(PULSE_START_S / 2, axes[0, 0].get_ylim()[0] + 0.03, "approach", ha="center", color=QUIET)
+    middle = PULSE_START_S + 6.0
+    near = (time_s >= middle) & (time_s < middle + CLOSE_UP_S)
+    _forces(axes[0, 1], time_s[near], asked_N[near], rendered_N[near], "Close-up")
+    _error(axes[1, 0], scene, shown)
+    axes[1, 1].plot(time_s[near], shown.gap_mm[near], color=OTHER)
+    _dress(axes[1, 1], "Gap between the magnets (close-up)", "gap, mm")
+    _samples(axes[2, 0], rehearsals)
+    _reversals(axes[2, 1], next(found for case, found in rehearsals.items() if case.hand != "steady"))
+    figure.savefig(path, dpi=110, metadata=stamp(figures))
+
+
+def _forces(
+    axes: Axes, time_s: Array, asked_N: Array, rendered_N: Array, title: str, label: str = "rendered (the plant's)"
+) -> None:
+    axes.plot(time_s, asked_N, color=ASKED, linewidth=1.4, label="asked")
+    axes.plot(time_s, rendered_N, color=RENDERED, linewidth=1.2, label=label)
+    # where it covers nothing
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False, borderaxespad=0.0)
+    _dress(axes, title, "force at the roller, N")
+
+
+def _error(axes: Axes, scene: Scene, shown: Shown) -> None:
+    pulse = shown.time_s >= PULSE_START_S
+    result = tracking(shown.asked_N[pulse], shown.rendered_N[pulse])
+    axes.axhline(0.0, color=QUIET, linewidth=0.8)
+    error_mN = (shown.rendered_N - shown.asked_N)[pulse] * 1e3
+    axes.plot(shown.time_s[pulse], error_mN, color=RENDERED, linewidth=0.9)
+    title = (
+        f"Error: RMS {result.rms_N * 1e3:.1f} mN (the scene allows {scene.force.tolerance_rms_N * 1e3:g}), "
+        f"variance accounted for {result.variance_accounted_for:.3f}"
+    )
+    _dress(axes, title, "rendered - asked, mN")
+
+
+def _samples(axes: Axes, rehearsals: Rehearsals) -> None:
+    steady = {case: found.since(PULSE_START_S) for case, found in rehearsals.items() if case.hand == "steady"}
+    results = list(steady.values())
+    names = [case.label.replace(", ", ",\n") for case in steady]
+    bars = axes.bar(names, [result.rms_N * 1e3 for result in results], color=OTHER, width=0.6)
+    deviation_mN = results[0].reference_sd_N * 1e3
+    axes.axhline(deviation_mN, color=QUIET, linestyle="--")
+    axes.text(-0.4, deviation_mN, "the pulse's own standard deviation", color=QUIET, va="bottom", fontsize=9)
+    labels = [f"{result.rms_N * 1e3:.1f} mN\nVAF {result.variance_accounted_for:.2f}" for result in results]
+    axes.bar_label(bars, labels, padding=2, fontsize=9)
+    axes.margins(y=0.25)
+    _dress(axes, "RMS error in virtual time: other samples, and the thesis's gap speed", "RMS error, mN", "")
+
+
+def _reversals(axes: Axes, moving: Followed) -> None:
+    part = (moving.time_s >= PULSE_START_S + 4.0) & (moving.time_s < PULSE_START_S + 12.0)
+    time_s, title = moving.time_s[part], "A handle that stops and reverses"
+    _forces(axes, time_s, moving.asked_N[part], moving.rendered_N[part], title, "felt (signed)")
+    second = axes.twinx()
+    second.fill_between(time_s, moving.handle_mm_s[part], color=QUIET, alpha=0.25, linewidth=0)
+    second.set_ylabel("handle speed, mm/s (grey)", color=QUIET)
+
+
+def tracking_picture(path: Path, kept: dict[str, Followed], figures: dict[str, Any]) -> None:
+    """Writes a PNG of what was measured, stamped with its figures: the pulse on the samples, its error, the staircase,
+    the random devices; a part that was not measured is left empty."""
+    figure = Figure(figsize=(12, 7.5), layout="constrained")
+    axes = figure.subplots(2, 2)
+    figure.suptitle("Forces asked and truly rendered by simulated devices (synthetic)", fontsize=13)
+    for name, found in kept.items():
+        part, sample = name.split()
+        is_pulse, colour = part == "samples", SAMPLE_COLOURS[sample]
+        near = (found.time_s >= SAMPLES_FROM_S) & (found.time_s < SAMPLES_FROM_S + CLOSE_UP_S) | (not is_pulse)
+        forces = axes[0 if is_pulse else 1, 0]
+        if colour == RENDERED:
+            forces.plot(found.time_s[near], found.asked_N[near], color=ASKED, linewidth=2.2, label="asked")
+        forces.plot(found.time_s[near], found.rendered_N[near], color=colour, linewidth=1.0, label=sample)
+        if is_pulse:
+            axes[0, 1].plot(found.time_s[near], found.error_N[near] * 1e3, color=colour, linewidth=1.0)
+    _dress(axes[0, 0], "Measured human pulse, with preview, after 12 s of trim", "force at the roller, N")
+    _dress(axes[0, 1], "Its error", "rendered - asked, mN")
+    _dress(axes[1, 0], "Staircase of 0.1 N, coronary scene", "force at the roller, N")
+    for found in figures.get("draws", []):
+        rms_mN = np.sort([1e3 * row["rms_N"] for row in found["rows"]])
+        label = "with preview" if found["preview"] else "live"
+        axes[1, 1].plot(np.arange(1, len(rms_mN) + 1), rms_mN, "o", markersize=4, label=label)
+    axes[1, 1].axhline(BAR_MN, color=QUIET, linestyle=":", label=f"{BAR_MN:g} mN")
+    axes[1, 1].set_ylim(bottom=0.0)
+    axes[1, 1].legend(frameon=False, fontsize=8, loc="lower right")
+    _dress(axes[1, 1], "Random devices, after 10 s of trim", "RMS error, mN", "draws, each row sorted")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    figure.savefig(path, dpi=110, metadata=stamp(figures))
+
+
+def _dress(axes: Axes, title: str, quantity: str, horizontal: str = "time, s") -> None:
+    axes.set_title(title, loc="left", fontsize=10.5)
+    axes.set_ylabel(quantity)
+    axes.set_xlabel(horizontal)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y", alpha=0.25)
