@@ -25,7 +25,6 @@ MEASUREMENTS = {
     "black-box": "what the black box costs a control tick",
     "publishers": "the pulse as C++, JavaScript and Python publish it",
     "browsers": "how late control is while ten browsers look at the dashboard",
-    "fleet": "recordings of many consoles summed up by a Dask cluster and one by one",
     "command": "how long tormagctl status takes until it has answered",
     "bus": "load of the bus at 1 kHz control, and what the codec costs",
 }

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import msgspec
 from force_tracking import SAMPLES
-from machines import executors
+from tormagd.lab import executors
 from rendering.scene_runs import ROOT, Case, costs, run_all
 from tqdm import tqdm
 

@@ -32,8 +32,8 @@ from tormagd.physics.inserts import insert
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
-from tormagd.training import calibration
-from tormagd.training.calibration import CalibrationError, fit, require_usable, training_rows
+from tormagd.lab.training import calibration
+from tormagd.lab.training.calibration import CalibrationError, fit, require_usable, training_rows
 
 INSERT = "MRE-50-40"
 CREATED = datetime.date(2024, 2, 29)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tormagd.inverse.bracketed import BracketedSearch, Refinement, brent, finer_grid, newton
-from tormagd.inverse.closed_form import ClosedForm
-from tormagd.inverse.direct import DirectInverse
-from tormagd.inverse.kd_tree import KdTreeSearch
+from tormagd.lab.searches.closed_form import ClosedForm
+from tormagd.lab.searches.direct import DirectInverse
+from tormagd.lab.searches.kd_tree import KdTreeSearch
 from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
 from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.newton import ACCURACY_MT, RisingSearch

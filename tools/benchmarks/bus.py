@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import cantools.database.can
 import numpy as np
-from wire.session import virtual_session
+from tormagd.lab.session import virtual_session
 
 import firmware_protocol
 from firmware_protocol.codec import (

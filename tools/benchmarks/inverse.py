@@ -36,9 +36,9 @@ from benchmarks.inverse_workload import (
 from tormagd.daemon.realtime import freeze_garbage
 from tormagd.inverse.bracketed import BracketedSearch, brent, finer_grid, newton
 from tormagd.inverse.choice import RUNTIME_SOLVERS, named
-from tormagd.inverse.closed_form import ClosedForm
-from tormagd.inverse.direct import DirectInverse
-from tormagd.inverse.kd_tree import KdTreeSearch
+from tormagd.lab.searches.closed_form import ClosedForm
+from tormagd.lab.searches.direct import DirectInverse
+from tormagd.lab.searches.kd_tree import KdTreeSearch
 from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
 from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.newton import RisingSearch

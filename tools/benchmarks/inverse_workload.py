@@ -19,10 +19,10 @@ from tormagd.physics.friction import Friction
 from tormagd.physics.inserts import insert
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import radial_moment_Tm
-from tormagd.training.dataset import Dataset
-from tormagd.training.levenberg_marquardt import train
-from tormagd.training.metrics import fit_metrics
-from tormagd.training.mlp import ForceNetwork, to_model
+from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.levenberg_marquardt import train
+from tormagd.lab.training.metrics import fit_metrics
+from tormagd.model.network import ForceNetwork, to_model
 
 Array = npt.NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import msgspec
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from pictures.stamp import stamp
-from thesis.values import PULSE_MAE_MT
+from tormagd.lab.thesis.values import PULSE_MAE_MT
 
 from tormagd.config import Config
 from tormagd.control.core import Core, build_core
