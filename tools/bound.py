@@ -32,8 +32,8 @@ from rendering.ideal_carriage import Brake, Drive, brake_of, drive_of
 from scipy import sparse
 from tqdm import tqdm
 
-from tormagd.lab.design.recorded_task import read_task
 from tormagd.force_file import ForceFileError
+from tormagd.lab.design.recorded_task import read_task
 from tormagd.physics.errors import DomainError, require
 from tormagd.simulation.parameters import PlantError, PlantParameters, load_plant
 

@@ -27,7 +27,6 @@ from rendering.human_pulse import pulse_profile, with_approach
 from rendering.publisher import FILE_PREVIEW_S, PREVIEW_S, RATE_HZ, publisher
 from rendering.signals import Kind, Signal, data_folder, palpation, recorded_signals
 from rendering.tracking import Tracking, tracking
-from tormagd.lab.thesis.values import USE_CASES
 
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
@@ -35,6 +34,7 @@ from tormagd.control.core import build_core
 from tormagd.control.plan import NOTHING_SHOWN, Shown
 from tormagd.lab.design.brake import Brake
 from tormagd.lab.design.phase_portrait import PhasePortrait
+from tormagd.lab.thesis.values import USE_CASES
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import TORMAG
 from tormagd.physics.inserts import insert

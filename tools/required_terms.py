@@ -19,7 +19,6 @@ from pathlib import Path
 
 import msgspec
 from force_tracking import SAMPLES
-from tormagd.lab import executors
 from rendering.scene_runs import ROOT, Case, costs, run_all
 from tqdm import tqdm
 
@@ -27,6 +26,7 @@ from tormagd.config import ConfigError
 from tormagd.headroom.__main__ import build
 from tormagd.headroom.machine_loop import machine_us
 from tormagd.inverse.choice import RUNTIME_SOLVERS
+from tormagd.lab import executors
 from tormagd.output import write_line
 from tormagd.scenes.measured import (
     FILE,

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from tormagd.inverse.bracketed import BracketedSearch, Refinement, brent, finer_grid, newton
+from tormagd.inverse.newton import ACCURACY_MT
+from tormagd.inverse.solution import Reach
 from tormagd.lab.searches.closed_form import ClosedForm
 from tormagd.lab.searches.direct import DirectInverse
 from tormagd.lab.searches.kd_tree import KdTreeSearch
-from tormagd.inverse.newton import ACCURACY_MT
-from tormagd.inverse.solution import Reach
 from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.physics.force import TORMAG

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from tormagd.inverse.bracketed import BracketedSearch, Refinement, brent, finer_grid, newton
-from tormagd.lab.searches.closed_form import ClosedForm
-from tormagd.lab.searches.direct import DirectInverse
-from tormagd.lab.searches.kd_tree import KdTreeSearch
 from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
 from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.newton import ACCURACY_MT, RisingSearch
 from tormagd.inverse.solution import FieldSolver, Reach
+from tormagd.lab.searches.closed_form import ClosedForm
+from tormagd.lab.searches.direct import DirectInverse
+from tormagd.lab.searches.kd_tree import KdTreeSearch
 from tormagd.model.features import LARGEST
 from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError

@@ -14,10 +14,10 @@ from tormagd.lab.characterisation.compression import (
     read_compression,
 )
 from tormagd.lab.characterisation.elasticity import fit_ogden, fit_thesis_ogden
+from tormagd.lab.characterisation.hyperelastic import Ogden
 from tormagd.lab.errors import LabError
 from tormagd.lab.tables import read_columns
 from tormagd.physics.errors import DomainError
-from tormagd.lab.characterisation.hyperelastic import Ogden
 
 LAW = Ogden((120e3,), (3.0,))
 SAMPLE = Sample()
@@ -101,10 +101,13 @@ def test_files_are_read_past_a_preamble_and_checked(tmp_path: Path) -> None:
     record = read_compression(path)
     assert record.force_N.tolist() == [0.0, 20.0, 45.0]
     for text, said in (
-        ("a,b\n1,2\n", "no header line with the columns time_s, displacement_mm, force_N"),
-        ("time_s,displacement_mm,force_N\n", "no rows"),
-        ("time_s,displacement_mm,force_N\n0,0,0\n1,nan,0\n", "line 3: displacement_mm = 'nan'"),
-        ("time_s,displacement_mm,force_N\n0,0\n", "line 2: force_N = ''"),
+        ("a,b\n1,2\n", "header is .*needed is 'time_s,displacement_mm,force_N'"),
+        ("time_s,displacement_mm,force_N\n", "0 rows"),
+        (
+            "time_s,displacement_mm,force_N\n0,0,0\n1,nan,0\n",
+            "row 3, displacement_mm: 'nan' is not allowed, only finite numbers",
+        ),
+        ("time_s,displacement_mm,force_N\n0,0\n", "row 2, force_N: ''"),
         ("time_s,displacement_mm,force_N\n1,0,0\n1,1,1\n", "time_s does not rise"),
     ):
         path.write_text(text)

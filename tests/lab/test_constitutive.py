@@ -74,13 +74,6 @@ def test_invariants_are_those_of_the_tensors(radial: float, around: float, radia
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.trace(c) ** 2)
 
 
-@given(stretch_values, stretch_values)
-def test_the_volume_is_kept(radial: float, around: float) -> None:
-    stretch = stretches(radial, around)
-    assert np.linalg.det(stretch.deformation_gradient) == pytest.approx(1.0, rel=1e-14)
-    assert invariants(stretch, field(0.0)).i3 == pytest.approx(1.0, rel=1e-14)
-
-
 def test_without_strain_and_field_there_is_no_energy_and_no_stress() -> None:
     rest, none = stretches(1.0, 1.0), field(0.0)
     assert total_energy_J_m3(rest, none, MATERIAL) == 0.0
@@ -154,31 +147,25 @@ def test_arrays_broadcast() -> None:
     np.testing.assert_allclose(stress[0, 2], one, rtol=1e-12, atol=1e-6)
 
 
-@pytest.mark.parametrize("bad", [0.0, -1.0, 0.01, 21.0, math.nan, math.inf])
-def test_stretches_outside_the_range_are_refused(bad: float) -> None:
-    for values, name in (((bad, 1.0), "radial"), ((1.0, bad), "circumferential")):
-        with pytest.raises(DomainError, match=name):
-            stretches(*values)
-    with pytest.raises(DomainError, match="radial"):
-        stretches(np.array([1.0, bad]), 1.0)
-
-
-def test_the_axial_stretch_is_checked_too() -> None:
-    with pytest.raises(DomainError, match="axial"):
-        stretches(0.1, 0.1)
+@pytest.mark.parametrize("bad", [0.0, -1.0, 0.01, 21.0, math.nan, math.inf, np.array([1.0, math.nan]), "one"])
+@pytest.mark.parametrize(
+    ("made", "name"), [(stretches, "radial"), (lambda bad: stretches(1.0, bad), "circumferential")]
+)
+def test_stretches_outside_the_range_are_refused(made, name, bad):
+    with pytest.raises(DomainError, match=name):
+        made(bad)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 11.0, -11.0])
-def test_fields_are_checked(bad: float) -> None:
-    with pytest.raises(DomainError, match="radial_T"):
-        field(bad)
-    with pytest.raises(DomainError, match="axial_T"):
-        field(0.0, bad)
+@pytest.mark.parametrize(("made", "name"), [(field, "radial_T"), (lambda bad: field(0.0, bad), "axial_T")])
+def test_fields_are_checked(made, name, bad):
+    with pytest.raises(DomainError, match=name):
+        made(bad)
 
 
-def test_what_is_no_number_is_refused() -> None:
-    with pytest.raises(DomainError, match="radial = one"):
-        stretches("one", 1.0)  # type: ignore[arg-type]
+def test_the_axial_stretch_is_checked_too():
+    with pytest.raises(DomainError, match="axial"):
+        stretches(0.1, 0.1)
 
 
 @pytest.mark.parametrize(

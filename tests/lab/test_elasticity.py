@@ -9,10 +9,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from tormagd.lab.characterisation.elasticity import fit_neo_hookean, fit_ogden, fit_thesis_ogden
+from tormagd.lab.characterisation.hyperelastic import NeoHookean, Ogden, ThesisOgden
 from tormagd.lab.errors import LabError
 from tormagd.lab.tables import read_columns
 from tormagd.physics.errors import DomainError
-from tormagd.lab.characterisation.hyperelastic import NeoHookean, Ogden, ThesisOgden
 
 DATA = Path(os.environ.get("TORMAG_DATA", Path(__file__).parents[3] / "shared" / "data"))
 COMPRESSION = np.linspace(1.0, 0.75, 60)
@@ -23,7 +23,7 @@ def measured(name: str, columns: tuple[str, str], delimiter: str = ",") -> list[
     path = DATA / name
     if not path.exists():
         pytest.skip(f"no measured data: {name} is not under TORMAG_DATA")
-    return read_columns(path, columns, delimiter)
+    return list(read_columns(path, columns, delimiter=delimiter).values())
 
 
 @settings(max_examples=25, deadline=None)
@@ -104,8 +104,3 @@ def test_curves_that_cannot_be_fitted(fit: object) -> None:
         fit(np.array([1.0, 0.9, 0.0]), np.array([0.0, -1e3, -1e4]))
     with pytest.raises(DomainError, match="stress_Pa"):
         fit(np.array([1.0, 0.9, 0.8]), np.array([0.0, -1e3, np.nan]))
-
-
-def test_the_number_of_terms_is_checked() -> None:
-    with pytest.raises(LabError, match=r"terms = 4: allowed is 1\.\.3"):
-        fit_ogden(COMPRESSION, COMPRESSION, terms=4)

@@ -6,15 +6,15 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import fleet
 import fsspec
 import msgspec
 import pyarrow.parquet
 import pytest
-from tormagd.lab.consoles.devices import Console, Drift, consoles
-from tormagd.lab.consoles.reading import files, read, read_all
 from distributed import LocalCluster
 
+from tormagd.lab.consoles.devices import Console, Drift, consoles
+from tormagd.lab.consoles.reading import files, read, read_all
+from tormagd.lab.main import main
 from tormagd.recording.summary import Summary
 from tormagd.recording.ticks import TickBatch
 from tormagd.recording.writer import RecordingWriter
@@ -58,7 +58,7 @@ def scheduler() -> Iterator[str]:
 def test_dask_workers_find_what_is_found_one_by_one(folder, scheduler, capsys, tmp_path):
     said = []
     for name, where in (("one.parquet", ["--workers", "1"]), ("dask.parquet", ["--dask", scheduler])):
-        assert fleet.main([str(folder), "--json", "--out", str(tmp_path / name), *where]) == 1
+        assert main(["fleet", str(folder), "--json", "--out", str(tmp_path / name), *where]) == 1
         out, err = capsys.readouterr()
         assert "left out 2/torn.mcap: not an intact MCAP recording" in err
         assert "left out pipe.mcap: it is no regular file" in err
@@ -72,7 +72,7 @@ def test_dask_workers_find_what_is_found_one_by_one(folder, scheduler, capsys, t
 
 
 def test_a_console_is_summed_up_over_its_days(folder, scheduler, capsys):
-    assert fleet.main([str(folder / "2"), "--dask", scheduler, "--json"]) == 1
+    assert main(["fleet", str(folder / "2"), "--dask", scheduler, "--json"]) == 1
     found = msgspec.convert(json.loads(capsys.readouterr().out)["consoles"][0], Console)
     assert (found.serial_number, found.insert, found.recordings) == (2, "MRE-50-40", 3)
     assert found.tracking_rms_N == pytest.approx(0.02)
@@ -95,7 +95,7 @@ def test_the_error_of_a_console_is_that_of_all_its_time(tmp_path):
 
 
 def test_a_person_reads_a_line_for_each_console(folder, scheduler, capsys):
-    assert fleet.main([str(folder / "1"), "--dask", scheduler]) == 0
+    assert main(["fleet", str(folder / "1"), "--dask", scheduler]) == 0
     heading, line = capsys.readouterr().out.splitlines()
     assert heading.split()[:3] == ["device", "insert", "files"]
     shown = "00000001 MRE-50-40 3 0 s 10.0, 10.0 1.000..1.040 (+0.02/day) 0.50 unknown RATE 50.0%"
@@ -104,7 +104,7 @@ def test_a_person_reads_a_line_for_each_console(folder, scheduler, capsys):
 
 def test_what_cannot_be_kept_is_told_after_what_was_found(folder, scheduler, capsys, tmp_path):
     (tmp_path / "file").touch()
-    assert fleet.main([str(folder / "1"), "--dask", scheduler, "--out", str(tmp_path / "file" / "a.parquet")]) == 2
+    assert main(["fleet", str(folder / "1"), "--dask", scheduler, "--out", str(tmp_path / "file" / "a.parquet")]) == 2
     out, err = capsys.readouterr()
     assert "MRE-50-40" in out
     assert str(tmp_path / "file") in err
@@ -127,7 +127,7 @@ def test_a_bucket_is_read_like_a_folder(folder):
     ],
 )
 def test_what_cannot_be_looked_at_is_told(url, reason, tmp_path, capsys):
-    assert fleet.main([url.format(empty=tmp_path)]) == 2
+    assert main(["fleet", url.format(empty=tmp_path)]) == 2
     assert reason in capsys.readouterr().err
 
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tormagd.physics.errors import DomainError
 from tormagd.lab.characterisation.hyperelastic import NeoHookean, Ogden, ThesisOgden
+from tormagd.physics.errors import DomainError
 
 LAWS = (NeoHookean(15e3), Ogden((12e3, 30.0, 5e3), (1.3, 9.0, -2.0)), ThesisOgden(15e3, 2.7), ThesisOgden(40e3, 0.7))
 

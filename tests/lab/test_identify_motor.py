@@ -2,15 +2,15 @@
 
 import json
 
-import identify_motor
 import numpy as np
 import pytest
-from tormagd.lab.motor import fit, identification, samples
-from tormagd.lab.errors import LabError
-from tormagd.lab.motor.log import read_log
 
 from tormagd.config import Config, load_config
 from tormagd.ctl.calibrate_motors import motor_log
+from tormagd.lab.errors import LabError
+from tormagd.lab.main import main
+from tormagd.lab.motor import command, fit, identification, samples
+from tormagd.lab.motor.log import read_log
 from tormagd.simulation.parameters import load_plant
 
 MASS, VISCOUS, COULOMB, OFFSET, GAIN, DELAY_S = 80.0, 150.0, 12.0, -2.0, 30.0, 0.003
@@ -50,7 +50,7 @@ def test_without_a_gain_only_ratios(tmp_path):
 
 
 def test_emps_is_within_the_published_values(recordings, capsys):
-    assert run(["identify", str(recordings / "emps" / "DATA_EMPS.mat"), "--json"]) == 0
+    assert main(["identify-motor", str(recordings / "emps" / "DATA_EMPS.mat"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     values = {name: item["value"] for name, item in found["parameters"].items() if item is not None}
     assert values["mass_kg"] == pytest.approx(95.1089, rel=0.02)
@@ -84,7 +84,7 @@ def test_the_identified_motor_is_a_configuration(sample_log, tmp_path):
     result = identification.identify(sample_log, None)
     assert result["parameters"]["backlash_um"] is None
     path = tmp_path / "motor.toml"
-    identify_motor.write_config(path, result, Config())
+    command.write_config(path, result, Config())
     written, true = load_config(path).motor, load_plant("sample_3")
     assert written.resistance_ohm == pytest.approx(true.motor.resistance_Ohm, rel=0.03)
     assert written.back_emf_V_s == pytest.approx(true.motor.back_emf_V_s_rad, rel=0.01)
@@ -92,9 +92,9 @@ def test_the_identified_motor_is_a_configuration(sample_log, tmp_path):
     assert written.gear_efficiency == pytest.approx(true.gear.efficiency, abs=0.05)
     assert written.supply_V == Config().motor.supply_V
     with pytest.raises(LabError, match="exists"):
-        identify_motor.write_config(path, result, Config())
+        command.write_config(path, result, Config())
     with pytest.raises(LabError, match="current_A"):
-        identify_motor.write_config(tmp_path / "b.toml", result | {"motor": None}, Config())
+        command.write_config(tmp_path / "b.toml", result | {"motor": None}, Config())
 
 
 def test_intervals_cover_what_hangs_together():
@@ -114,7 +114,7 @@ def test_intervals_cover_what_hangs_together():
     ("text", "told"),
     [
         ("t_s,input_V\n0,1\n", "position_mm"),
-        ("t_s,input_V,position_mm\n0,1,x\n", "line 2"),
+        ("t_s,input_V,position_mm\n0,1,x\n", "row 2"),
         ("t_s,input_V,position_mm\n" + "".join(f"{k * 1e-3},0,nan\n" for k in range(200)), "finite"),
         ("t_s,input_V,position_mm\n" + "".join(f"{k * k * 1e-3},0,0\n" for k in range(200)), "steps by"),
         ("t_s,input_V,position_mm\n" + "".join(f"{k * 0.1},0,0\n" for k in range(200)), "Hz"),
@@ -125,12 +125,5 @@ def test_intervals_cover_what_hangs_together():
 def test_a_log_that_cannot_be_used_says_why(tmp_path, capsys, text, told):
     log = tmp_path / "log.csv"
     log.write_text(text)
-    assert run(["identify", str(log)]) == 2
+    assert main(["identify-motor", str(log)]) == 2
     assert told in capsys.readouterr().err
-
-
-def run(arguments):
-    """The tool's main, with these arguments."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", arguments)
-        return identify_motor.main()

@@ -65,10 +65,6 @@ def test_no_design_on_a_grid_is_better_or_as_good_and_smaller(problem: Problem) 
             assert problem.volume_mm3(design) >= 0.999 * best.volume_mm3
 
 
-def test_the_same_run_gives_the_same_design(problem: Problem) -> None:
-    assert solve(Run(problem, problem.lower, "global")).design == found(problem, problem.lower).design
-
-
 @pytest.mark.parametrize("solver", ["local", "global"])
 def test_no_solver_returns_less_than_its_start(use_case_1: Region, as_built: Design, solver: str) -> None:
     covering = Problem(use_case_1, "true", THESIS_SPEED_MM_S)

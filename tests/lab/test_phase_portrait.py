@@ -45,11 +45,6 @@ def test_true_coverage_is_good_to_five_digits(brake: Brake, use_case_2: Region) 
     assert portrait.true_coverage(use_case_2) == pytest.approx(exact, abs=1e-5)
 
 
-def test_the_trapezoid_flatters(brake: Brake, use_case_2: Region) -> None:
-    slow = PhasePortrait(brake, SPEEDS[0])
-    assert slow.true_coverage(use_case_2) < slow.trapezoid_coverage(use_case_2) - 0.02
-
-
 def test_outline_lies_inside_the_trapezoid_and_joins_its_corners(brake: Brake) -> None:
     portrait = PhasePortrait(brake, 40.0)
     force, rate = portrait.outline()
@@ -67,18 +62,11 @@ def test_boundary_rate_is_what_a_moving_gap_gives(brake: Brake) -> None:
         assert moved / (2.0 * step_s) == pytest.approx(limit, rel=1e-6)
 
 
-def test_a_region_out_of_reach_is_not_covered(brake: Brake) -> None:
+def test_a_region_out_of_reach_is_not_covered_and_one_inside_is_whole(brake: Brake) -> None:
     portrait = PhasePortrait(brake, 40.0)
-    above = Region(brake.most_N, 0.1, brake.most_N + 1.0, 0.1)
-    assert portrait.true_coverage(above) == 0.0
-    assert portrait.trapezoid_coverage(above) == 0.0
-
-
-def test_a_region_well_inside_is_covered_whole(brake: Brake) -> None:
-    portrait = PhasePortrait(brake, 40.0)
-    inside = Region(2.0, 0.1, 3.0, 0.1)
-    assert portrait.true_coverage(inside) == pytest.approx(1.0, abs=1e-12)
-    assert portrait.trapezoid_coverage(inside) == pytest.approx(1.0, abs=1e-12)
+    for region, share in ((Region(brake.most_N, 0.1, brake.most_N + 1.0, 0.1), 0.0), (Region(2.0, 0.1, 3.0, 0.1), 1.0)):
+        assert portrait.true_coverage(region) == pytest.approx(share, abs=1e-12)
+        assert portrait.trapezoid_coverage(region) == pytest.approx(share, abs=1e-12)
 
 
 @settings(max_examples=60, deadline=None)

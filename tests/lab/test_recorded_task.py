@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tormagd.lab.design.recorded_task import read_task, task_of
 from tormagd.force_file import ForceFileError
+from tormagd.lab.design.recorded_task import read_task, task_of
 from tormagd.physics.errors import DomainError
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tormagd.lab.errors import LabError
 from tormagd.lab.characterisation.relaxation import RelaxationRecord, fit_relaxation
+from tormagd.lab.errors import LabError
 from tormagd.physics.errors import DomainError
 from tormagd.physics.relaxation import PronySeries
 

@@ -4,7 +4,6 @@ from pathlib import Path
 
 from tormagd.lab.thesis import page, table_2_5
 from tormagd.lab.thesis.values import TABLE_2_5
-
 from tormagd.physics.inserts import INSERTS
 
 FOUND = table_2_5.table_2_5()
@@ -30,6 +29,6 @@ def test_of_what_the_thesis_names_one_is_not_wide_enough() -> None:
 
 
 def test_the_page_has_it() -> None:
-    """`python tools/reproduce_thesis.py` writes it."""
+    """`tormag-lab reproduce-thesis --out docs` writes it."""
     written = Path(__file__).parents[2] / "docs" / "reproduction.md"
     assert page.table_2_5(FOUND) in written.read_text(encoding="utf-8")

@@ -5,17 +5,17 @@ import math
 
 import numpy as np
 import pytest
-import tactile_experiment
-from tormagd.lab.tactile import models, report
+
+from tormagd.lab.main import main
+from tormagd.lab.tactile import experiment, models, report
 from tormagd.lab.tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_shape, recorded_shapes
 from tormagd.lab.thesis.page import pulse_experiment, table_4_1
-
 from tormagd.simulation.pad import PADS
 
 
 @pytest.fixture(scope="module")
 def run():
-    return tactile_experiment.run(models.QUICK)
+    return experiment.whole(models.QUICK)
 
 
 def test_the_contract_s_keys_are_there_and_finite(run):
@@ -56,7 +56,7 @@ def test_the_page_and_its_pictures_are_written(run, tmp_path):
     for line in page.splitlines():
         if line.startswith("!["):
             assert (tmp_path / line[line.index("(") + 1 : -1]).read_bytes().startswith(b"\x89PNG")
-    assert page.count("![") == 5
+    assert page.count("![") == 3
 
 
 def test_thesis_and_ours_stand_side_by_side(run):
@@ -70,33 +70,11 @@ def test_thesis_and_ours_stand_side_by_side(run):
     assert "ynthetic" in section
 
 
-def test_the_searches_are_timed_and_the_two_errors_kept_apart(run):
-    times = run[0]["solve_times"]
-    rows = {row["name"]: row for row in times["searches"]}
-    assert {"thesis-linear", "linear-argmin", "vectorised-argmin"} <= set(rows)
-    assert rows["newton 40 mT"]["solver_max_mT"] < 1e-2
-    assert rows["nearest 2 mT"]["solver_max_mT"] < 0.2
-    assert rows["vectorised-argmin"]["solver_max_mT"] == pytest.approx(0.5, abs=0.1)
-    for row in rows.values():
-        assert 0 < row["p50_us"] <= row["p99_us"] <= row["p999_us"]
-        assert row["plant_mae_mT"] > 0.1
-
-
-def test_every_model_is_compared_on_every_split(run):
-    rows = {row["model"]: row for row in run[0]["comparison"]}
-    assert len(rows) == 5 + len(models.QUICK.sizes)
-    for name in ("network, 50 units (thesis)", "support vectors", "forest", "GRU", "grey box, 50 units"):
-        assert {f"{split}_mae_N" for split in ("random", "field", "class", "cycles", "hold")} <= set(rows[name])
-    assert rows["network, 10 units"]["memory_kB"] < rows["network, 50 units (thesis)"]["memory_kB"]
-    assert rows["grey box, 50 units"]["hold_mae_N"] < 0.5 * rows["network, 50 units (thesis)"]["hold_mae_N"]
-    assert any(row["pareto"] for row in rows.values())
-
-
 def test_without_heartpy_the_pulse_is_synthetic_and_says_so(monkeypatch):
     def missing(*_):
-        raise FileNotFoundError
+        raise ModuleNotFoundError
 
-    monkeypatch.setattr("tactile.pulse.pulse_profile", missing)
+    monkeypatch.setattr("tormagd.lab.tactile.pulse.pulse_profile", missing)
     shape, source = pulse_shape(5.0, 100)
     assert "synthetic" in source
     assert (shape.min(), shape.max()) == (0.0, 1.0)
@@ -140,5 +118,5 @@ def test_field_errors_count_only_where_the_force_depends_on_the_field():
 
 
 def test_another_place_than_a_folder_is_refused(tmp_path, capsys):
-    assert tactile_experiment.main(["--out", str(tmp_path / "none")]) == 2
+    assert main(["tactile-experiment", "--out", str(tmp_path / "none")]) == 2
     assert "not a directory" in capsys.readouterr().err

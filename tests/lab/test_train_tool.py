@@ -1,28 +1,16 @@
 """The training tool, from a synthetic CSV to a model file that loads."""
 
-import importlib.util
 import json
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 
+from tormagd.lab.main import main
+from tormagd.lab.training import train_model
+from tormagd.lab.training.dataset import Dataset, write_csv
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import load_model
-from tormagd.lab.training.dataset import Dataset, write_csv
-
-TOOL = Path(__file__).parents[2] / "tools" / "train_model.py"
-
-
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("train_model", TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")
@@ -40,13 +28,13 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def command(data: Path, out: Path, *more: str) -> list[str]:
-    required = [str(data), "--element", "torque", "--insert", "MRE-50-40", "--out", str(out)]
+    required = ["train-model", str(data), "--element", "torque", "--insert", "MRE-50-40", "--out", str(out)]
     return [*required, "--hidden", "15", "--epochs", "40", "--created", "2024-01-01", *more]
 
 
-def test_from_csv_to_model(tool: ModuleType, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_csv_to_model(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, plot = tmp_path / "model.safetensors", tmp_path / "convergence.png"
-    assert tool.main(command(data, out, "--json", "--plot", str(plot))) == 0
+    assert main(command(data, out, "--json", "--plot", str(plot))) == 0
     report = json.loads(capsys.readouterr().out)
     model = load_model(out, element="torque", insert="MRE-50-40")
     assert report["validation_r2"] > 0.999
@@ -60,35 +48,33 @@ def test_from_csv_to_model(tool: ModuleType, data: Path, tmp_path: Path, capsys:
     assert plot.read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_same_command_gives_the_same_bytes(tool: ModuleType, data: Path, tmp_path: Path) -> None:
+def test_the_same_command_gives_the_same_bytes(data: Path, tmp_path: Path) -> None:
     files = [tmp_path / name for name in ("a.safetensors", "b.safetensors", "c.safetensors")]
     for file, seed in zip(files, ("1", "1", "2"), strict=True):
-        assert tool.main(command(data, file, "--epochs", "5", "--seed", seed)) == 0
+        assert main(command(data, file, "--epochs", "5", "--seed", seed)) == 0
     assert files[0].read_bytes() == files[1].read_bytes()
     assert files[0].read_bytes() != files[2].read_bytes()
 
 
 def test_what_was_taken_out_of_the_data_is_in_the_file(
-    tool: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     memory = Memory(fractions=(0.05,), times_s=(8.0,), lag_mT=7.0, turn_mT=70.0)
-    monkeypatch.setattr(tool, "identify", lambda rows: (memory, rows))
+    monkeypatch.setattr(train_model, "identify", lambda rows: (memory, rows))
     for name, more, expected in (("with", ["--without-memory"], memory), ("plain", [], NO_MEMORY)):
         out = tmp_path / f"{name}.safetensors"
-        assert tool.main(command(data, out, "--epochs", "2", *more)) == 0
+        assert main(command(data, out, "--epochs", "2", *more)) == 0
         assert load_model(out, element="torque").metadata.memory == expected
 
 
-def test_a_table_for_people(tool: ModuleType, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert tool.main(command(data, tmp_path / "m.safetensors", "--epochs", "3")) == 0
+def test_a_table_for_people(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command(data, tmp_path / "m.safetensors", "--epochs", "3")) == 0
     printed = capsys.readouterr().out
     assert "validation" in printed
     assert "dF/dB <= 0 on" in printed
 
 
-def test_what_cannot_work_is_told_with_exit_2(
-    tool: ModuleType, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_work_is_told_with_exit_2(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "m.safetensors"
     broken = tmp_path / "broken.csv"
     broken.write_text("displacement_mm,rate_mm_s,field_mT,cip_percent,force_N\n0,0,nan,40,1\n")
@@ -101,6 +87,6 @@ def test_what_cannot_work_is_told_with_exit_2(
         (command(data, out, "--insert", "two words"), "insert"),
         (command(data, out, "--validation-share", "1"), "validation_share"),
     ):
-        assert tool.main(arguments) == 2
+        assert main(arguments) == 2
         assert message in capsys.readouterr().err
     assert not out.exists()

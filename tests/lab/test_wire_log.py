@@ -3,8 +3,6 @@
 import contextlib
 import os
 import select
-import subprocess
-import sys
 import threading
 import tty
 from collections.abc import Iterator
@@ -15,7 +13,6 @@ import can.viewer
 import cantools.database.can
 import pytest
 import serial
-import wire_log
 
 import firmware_protocol
 from firmware_protocol.codec import (
@@ -36,6 +33,8 @@ from firmware_protocol.codec import (
 )
 from firmware_protocol.framing import encode_frame
 from firmware_protocol.layouts import LAYOUTS
+from tormagd.lab import wire_log
+from tormagd.lab.main import main
 from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.can_door import CanDoor
 from tormagd.simulation.device import MessageDevice
@@ -51,7 +50,7 @@ PATIENCE_S = 20.0
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The candump log of a session in virtual time."""
     path = tmp_path_factory.mktemp("session") / "session.log"
-    assert wire_log.main(["virtual", str(path), "--seconds", str(SECONDS)]) == 0
+    assert main(["wire-log", "virtual", str(path), "--seconds", str(SECONDS)]) == 0
     return path
 
 
@@ -101,28 +100,10 @@ def test_cantools_decodes_every_frame_with_names_and_units(
     assert (units["force_N"], units["left_position_mm"], units["supply_V"]) == ("N", "mm", "V")
 
 
-def test_the_cantools_command_reads_the_log(session: Path, frames: list[can.Message]) -> None:
-    with session.open(encoding="ascii") as log:
-        done = subprocess.run(
-            [sys.executable, "-m", "cantools", "decode", "--single-line", str(DBC)],
-            stdin=log,
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=60,
-        )
-    lines = done.stdout.splitlines()
-    assert len(lines) == len(frames)
-    assert all("::" in line and "(" in line.split("::")[1] for line in lines)
-    sense = next(line for line in lines if "Sense(" in line)
-    assert " N," in sense
-    assert " A," in sense
-
-
 def test_python_cans_viewer_reads_every_frame(
     frames: list[can.Message], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert wire_log.main(["viewer"]) == 0
+    assert main(["wire-log", "viewer"]) == 0
     formats = tmp_path / "viewer.txt"
     formats.write_text(capsys.readouterr().out, encoding="ascii")
     _, structs = can.viewer._parse_viewer_args(["-i", "virtual", "-c", "test", "-d", str(formats)])
@@ -132,18 +113,6 @@ def test_python_cans_viewer_reads_every_frame(
         message = ours(frame)
         ours_values = [float(getattr(message, name)) for name in message.__match_args__]
         assert values[: len(ours_values)] == pytest.approx(ours_values)
-
-
-@pytest.mark.parametrize("ending", ["asc", "blf", "csv"])
-def test_python_cans_logconvert_keeps_every_frame(
-    session: Path, frames: list[can.Message], tmp_path: Path, ending: str
-) -> None:
-    converted = tmp_path / f"session.{ending}"
-    command = [sys.executable, "-m", "can.logconvert", str(session), str(converted)]
-    subprocess.run(command, check=True, capture_output=True, timeout=60)
-    with can.LogReader(converted) as reader:
-        again = [(frame.arbitration_id, bytes(frame.data)) for frame in reader]
-    assert again == [(frame.arbitration_id, bytes(frame.data)) for frame in frames]
 
 
 @pytest.mark.parametrize("ending", ["log", "asc", "blf"])
@@ -200,7 +169,7 @@ def test_what_is_no_frame_is_counted_and_not_logged(tmp_path: Path) -> None:
 
 
 def test_a_file_type_that_is_not_known_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert wire_log.main(["virtual", str(tmp_path / "session.mp3")]) == 1
+    assert main(["wire-log", "virtual", str(tmp_path / "session.mp3")]) == 2
     assert ".mp3" in capsys.readouterr().err
 
 

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import cantools.database.can
 import numpy as np
-from tormagd.lab.session import virtual_session
 
 import firmware_protocol
 from firmware_protocol.codec import (
@@ -35,6 +34,7 @@ from firmware_protocol.codec import (
 )
 from firmware_protocol.framing import FrameDecoder, encode_frame
 from tormagd.hardware.link import HELLO_S, REPEAT_S
+from tormagd.lab.session import virtual_session
 
 DBC = Path(firmware_protocol.__file__).parent / "tormag.dbc"
 CAN_BITRATE, SERIAL_BAUD = 1_000_000, 1_000_000

@@ -36,14 +36,14 @@ from benchmarks.inverse_workload import (
 from tormagd.daemon.realtime import freeze_garbage
 from tormagd.inverse.bracketed import BracketedSearch, brent, finer_grid, newton
 from tormagd.inverse.choice import RUNTIME_SOLVERS, named
-from tormagd.lab.searches.closed_form import ClosedForm
-from tormagd.lab.searches.direct import DirectInverse
-from tormagd.lab.searches.kd_tree import KdTreeSearch
 from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
 from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.newton import RisingSearch
 from tormagd.inverse.scan import FieldScan
 from tormagd.inverse.solution import FieldSolver
+from tormagd.lab.searches.closed_form import ClosedForm
+from tormagd.lab.searches.direct import DirectInverse
+from tormagd.lab.searches.kd_tree import KdTreeSearch
 from tormagd.model.model_file import ForceModel
 from tormagd.model.rising import falling_at
 from tormagd.physics.errors import DomainError

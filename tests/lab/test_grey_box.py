@@ -1,17 +1,15 @@
-"""Forward models behind one interface, on a small synthetic element with a known memory."""
+"""The relaxation-aware model on a small synthetic element with a known memory."""
 
 import numpy as np
 import pytest
 
 from tormagd.inverse.nearest import NearestFieldSearch
+from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.fitting import fit_network
+from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory, fit_grey_box, fit_series
+from tormagd.lab.training.memory import relaxed_N
 from tormagd.physics.errors import DomainError
 from tormagd.physics.relaxation import PronySeries
-from tormagd.lab.training.baselines import ForestForward, SupportVectorForward
-from tormagd.lab.training.dataset import Dataset
-from tormagd.lab.training.forward import ForwardModel, NetworkForward
-from tormagd.lab.training.grey_box import GreyBox, GreyBoxForward, GreyBoxMemory, fit_series
-from tormagd.lab.training.memory import relaxed_N
-from tormagd.lab.training.recurrent import RecurrentForward
 
 SERIES = PronySeries((0.02, 0.06, 0.04, 0.03), (1.2, 9.0, 120.0, 900.0))
 FIELD_SERIES = PronySeries((0.03, 0.09, 0.05, 0.02), (1.2, 9.0, 120.0, 900.0))
@@ -55,8 +53,7 @@ def holds() -> Dataset:
 
 @pytest.fixture(scope="module")
 def grey(cycles: Dataset, holds: Dataset) -> GreyBox:
-    forward = GreyBoxForward(holds, 20, epochs=40, settling_epochs=20)
-    return forward.fit(cycles, np.ones(len(cycles), dtype=bool))
+    return fit_grey_box(cycles, np.ones(len(cycles), dtype=bool), holds, hidden=20, epochs=40, settling_epochs=20)
 
 
 def test_a_series_is_recovered_from_holds_even_when_the_level_is_wrong(holds: Dataset) -> None:
@@ -88,11 +85,10 @@ def test_records_are_independent() -> None:
 
 
 def test_the_grey_box_sees_through_the_memory(grey: GreyBox, cycles: Dataset, holds: Dataset) -> None:
-    alone = NetworkForward(20, epochs=40)
-    alone.fit(cycles, np.ones(len(cycles), dtype=bool))
+    alone, _ = fit_network(cycles, np.ones(len(cycles), dtype=bool), 20, epochs=40)
     error = np.abs(grey.predict(holds) - holds.force_N).mean()
     assert error < 3 * NOISE_N
-    assert np.abs(alone.predict(holds) - holds.force_N).mean() > 5 * error
+    assert np.abs(alone.predict(holds.features) - holds.force_N).mean() > 5 * error
 
 
 def test_the_memory_inverts_itself(grey: GreyBox) -> None:
@@ -119,40 +115,6 @@ def test_steps_and_records_agree(grey: GreyBox) -> None:
     assert grey.predict(data)[1:] == pytest.approx(stepped[1:], rel=5e-3)
 
 
-@pytest.mark.parametrize(
-    ("model", "worst_N"),
-    [
-        (NetworkForward(15, epochs=30), 0.3),
-        (SupportVectorForward(600), 0.6),
-        (ForestForward(10), 0.6),
-        (RecurrentForward(hidden=12, epochs=30), 1.2),
-    ],
-)
-def test_every_model_learns_what_it_was_not_shown(model: ForwardModel, worst_N: float, cycles: Dataset) -> None:
-    held = np.zeros(len(cycles), dtype=bool)
-    held[1::4] = True
-    model.fit(cycles, ~held)
-    error = np.abs(model.predict(cycles) - cycles.force_N)[held].mean()
-    assert error < worst_N
-
-
-def test_forces_held_out_are_not_looked_at(cycles: Dataset) -> None:
-    held = np.zeros(len(cycles), dtype=bool)
-    held[::3] = True
-    spoiled = np.where(held, 900.0, cycles.force_N)
-    for make in (lambda: NetworkForward(5, epochs=3), lambda: RecurrentForward(hidden=4, epochs=1)):
-        first, second = make(), make()
-        first.fit(cycles, ~held)
-        second.fit(Dataset(cycles.features, spoiled, cycles.cycle, cycles.time_s), ~held)
-        assert first.predict(cycles) == pytest.approx(second.predict(cycles))
-
-
-@pytest.mark.parametrize("model", [NetworkForward(), SupportVectorForward(), ForestForward(), RecurrentForward()])
-def test_prediction_before_fit_is_refused(model: ForwardModel, cycles: Dataset) -> None:
-    with pytest.raises(DomainError, match="model"):
-        model.predict(cycles)
-
-
 def test_a_memory_needs_times(grey: GreyBox, cycles: Dataset) -> None:
     with pytest.raises(DomainError, match="time_s"):
         grey.predict(Dataset(cycles.features, cycles.force_N))
@@ -164,25 +126,14 @@ def test_relaxation_tests_without_a_rest_are_refused(cycles: Dataset) -> None:
         fit_series(moving, parts(moving.features))
 
 
-def test_a_fit_forgets_the_one_before(cycles: Dataset) -> None:
-    half = np.arange(len(cycles)) % 2 == 0
-    used, new = NetworkForward(8, epochs=4), NetworkForward(8, epochs=4)
-    used.fit(cycles, ~half)
-    assert (used.fit(cycles, half).hidden_weight == new.fit(cycles, half).hidden_weight).all()
-
-
-def test_a_start_of_another_size_is_refused(cycles: Dataset) -> None:
-    start = NetworkForward(5, epochs=1).fit(cycles, np.ones(len(cycles), dtype=bool))
-    with pytest.raises(DomainError, match="start"):
-        NetworkForward(6, start=start)
-
-
 def test_a_fit_goes_on_from_its_start(cycles: Dataset) -> None:
-    everything = np.ones(len(cycles), dtype=bool)
-    network = NetworkForward(15, epochs=30)
-    model = network.fit(cycles, everything)
-    goes_on = NetworkForward(15, epochs=1, start=model)
-    goes_on.fit(cycles.subset(cycles.features[:, 2] < 250), everything[: int((cycles.features[:, 2] < 250).sum())])
-    assert goes_on.training is not None
-    assert network.training is not None
-    assert goes_on.training.history[0].train_rmse_N < 1.5 * network.training.best.train_rmse_N
+    model, training = fit_network(cycles, np.ones(len(cycles), dtype=bool), 15, epochs=30)
+    _, goes_on = fit_network(cycles, cycles.features[:, 2] < 250, 15, epochs=1, start=model)
+    assert goes_on.history[0].train_rmse_N < 1.5 * training.best.train_rmse_N
+
+
+def test_forces_held_out_are_not_looked_at(cycles: Dataset) -> None:
+    known = np.arange(len(cycles)) % 3 > 0
+    spoiled = Dataset(cycles.features, np.where(known, cycles.force_N, 900.0), cycles.cycle, cycles.time_s)
+    models = [fit_network(data, known, 5, epochs=3)[0].predict(cycles.features) for data in (cycles, spoiled)]
+    assert models[0] == pytest.approx(models[1])
