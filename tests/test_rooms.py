@@ -26,11 +26,8 @@ MAY_IMPORT = {
     "keys": FILES | {"config"},
     "entry": set(),  # it loads the daemon or tormagctl by name, never both
     "physics": FILES,
-    "characterisation": FILES | {"physics"},
-    "design": {"bounded_file", "force_file", "physics"},
     "model": FILES | {"physics"},
-    "training": FILES | {"physics", "model"},
-    "inverse": {"firmware_protocol", "physics", "model", "training"},
+    "inverse": {"firmware_protocol", "physics", "model"},
     "scenes": {"config", "force_file"},
     "safety": {"firmware_protocol"},
     "hardware": LOWEST | {"exact", "safety"},
@@ -47,19 +44,17 @@ MAY_IMPORT = {
     | {"simulation", "closed_loop"},
     "closed_loop": LOWEST | {"control", "hardware", "safety", "simulation"},
 }
+MAY_IMPORT["lab"] = set(MAY_IMPORT) - {"entry"}
+"""The laboratory may import every room, and nothing imports it."""
 TOOLS = ROOT / "tools"
 TOOL_ROOMS = {
     "machines": set(),
-    "consoles": set(),
     "wire": set(),
     "pictures": set(),
-    "thesis": {"pictures"},
-    "motor": set(),
     "extremes": set(),
     "rendering": {"machines", "pictures"},
     "fault_matrix": {"wire"},
-    "benchmarks": {"machines", "pictures", "thesis"},
-    "tactile": {"pictures", "thesis", "rendering", "benchmarks"},
+    "benchmarks": {"machines", "wire", "pictures", "rendering"},
     "intrusion": {"machines", "rendering", "benchmarks"},
 }
 """Of the tools; beside them stand the scripts, which no room imports. What is the product's is open to all."""

@@ -23,7 +23,6 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from machines import executors
 from rendering.device_draws import SAMPLES
 from rendering.scene_runs import ROOT, Case, costs, run, run_all
 from rendering.signals import Signal, data_folder, recorded_signals
@@ -34,6 +33,7 @@ from tormagd.ctl.scene_new import new_scene
 from tormagd.headroom.__main__ import build
 from tormagd.headroom.machine_loop import machine_us
 from tormagd.inverse.choice import RUNTIME_SOLVERS
+from tormagd.lab import executors
 from tormagd.output import write_line
 from tormagd.scenes.measured import (
     FILE,

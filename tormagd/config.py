@@ -133,7 +133,7 @@ class Motor(Strict, frozen=True):
 class Position(Strict, frozen=True):
     """The carriage position loop: PID with filtered derivative, back-calculation and feed-forward.
 
-    The gains come from `tools/tune_position.py`.
+    The gains come from `tormag-lab tune-position`.
     """
 
     proportional_per_mm: Annotated[float, Meta(gt=0.0, le=1_000.0)] = 3.6

@@ -18,6 +18,11 @@ def ctl() -> int:
     return _run("tormagd.ctl.main")
 
 
+def lab() -> int:
+    """`tormag-lab`."""
+    return _run("tormagd.lab.main")
+
+
 def _run(module: str) -> int:
     """The exit code of the module's `main`, which sees to SIGINT itself as soon as it runs."""
     interrupt = signal.getsignal(signal.SIGINT)

@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from tactile_hold import Case, hold
 
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, Rates
 from tormagd.control.core import Core, build_core
 from tormagd.control.governor import TimedSetpoint
+from tormagd.lab.tactile.held import Case, hold
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene, scene_path
 from tormagd.scenes.signal import asked
@@ -51,7 +51,7 @@ def test_a_pulse_is_felt_on_the_pad(core: Core, plant: str) -> None:
 
 
 def test_a_held_force_stays_with_the_memory_and_falls_without() -> None:
-    """The first minutes of `tools/tactile_hold.py --coarse`, frozen."""
+    """The first minutes of `tormag-lab tactile-hold --coarse`, frozen."""
     within, without = (hold(Case("pad_1", remembers, False, 200.0, coarse=True)) for remembers in (True, False))
     assert within["force_error"] < 0.01
     assert not within["fault"]

@@ -22,6 +22,8 @@ from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, excitation, m
 from tormagd.ctl.calibrate_run import Range
 from tormagd.ctl.main import main
 from tormagd.ctl.outcome import CommandError
+from tormagd.lab.training import calibration
+from tormagd.lab.training.calibration import CalibrationError, fit, require_usable, training_rows
 from tormagd.model.displacement import MOVING_MM_S, Turn, displacement
 from tormagd.model.model_file import load_model
 from tormagd.model.shipped import model_path
@@ -29,8 +31,6 @@ from tormagd.physics.inserts import insert
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
-from tormagd.training import calibration
-from tormagd.training.calibration import CalibrationError, fit, require_usable, training_rows
 
 INSERT = "MRE-50-40"
 CREATED = datetime.date(2024, 2, 29)

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
+from tormagd.lab.training.dataset import read_csv
 from tormagd.model.model_file import load_model
-from tormagd.training.dataset import read_csv
 
 pytestmark = pytest.mark.live
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tormagd.ctl.waveform import read_csv
-from tormagd.design.recorded_task import read_task
+from tormagd.lab.design.recorded_task import read_task
 from tormagd.scenes.signal import recorded
 
 READERS: tuple[Callable[[Path], object], ...] = (read_csv, recorded, read_task)

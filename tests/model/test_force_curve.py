@@ -12,9 +12,9 @@ from hypothesis import given, strategies as st
 from tormagd.model.features import LARGEST
 from tormagd.model.force_curve import LARGEST_EXPONENT, Known, Network
 from tormagd.model.model_file import ForceModel, load_model
+from tormagd.model.network import to_network
 from tormagd.model.shipped import model_path
 from tormagd.physics.errors import DomainError
-from tormagd.training.mlp import to_network
 
 BOX = ((0.0, 0.0, 100.0, 40.0), (1.0, 60.0, 800.0, 40.0))
 Array = np.ndarray

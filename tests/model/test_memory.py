@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from tormagd.control.remembered import Remembering
+from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ModelFileError, load_model, save_model
 from tormagd.model.shipped import model_path
 from tormagd.physics.errors import DomainError
-from tormagd.training.grey_box import GreyBox, GreyBoxMemory
 
 HERE = Path(__file__).parent
 

@@ -3,9 +3,9 @@
 import msgspec
 import pytest
 from benchmarks import step
-from tune_position import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG
 
 from tormagd.config import Config
+from tormagd.lab.tune_position import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG
 from tormagd.simulation.parameters import load_plant
 
 

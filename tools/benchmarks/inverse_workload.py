@@ -11,18 +11,18 @@ import numpy as np
 import numpy.typing as npt
 
 from tormagd.control.portrait import FieldOfGap
+from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.levenberg_marquardt import train
+from tormagd.lab.training.metrics import fit_metrics
 from tormagd.model.features import Element, Scaling
 from tormagd.model.model_file import ForceModel, ModelMetadata
+from tormagd.model.network import ForceNetwork, to_model
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.physics.friction import Friction
 from tormagd.physics.inserts import insert
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import radial_moment_Tm
-from tormagd.training.dataset import Dataset
-from tormagd.training.levenberg_marquardt import train
-from tormagd.training.metrics import fit_metrics
-from tormagd.training.mlp import ForceNetwork, to_model
 
 Array = npt.NDArray[np.float64]
 

@@ -12,10 +12,10 @@ import msgspec
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from pictures.stamp import stamp
-from thesis.values import PULSE_MAE_MT
 
 from tormagd.config import Config
 from tormagd.control.core import Core, build_core
+from tormagd.lab.thesis.values import PULSE_MAE_MT
 from tormagd.scenes.measured import JUDGED, MeasuredScene, measured, on_first
 from tormagd.scenes.scene import EVERY_TERM, TERMS, load_scene
 

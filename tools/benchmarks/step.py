@@ -6,7 +6,6 @@ switch timed so that it comes to rest at the target.
 
 import argparse
 import gc
-import itertools
 import math
 import time
 from typing import Any, NamedTuple
@@ -20,6 +19,7 @@ from tormagd.config import Config, Motor
 from tormagd.control.motor import margins, zero_order_hold
 from tormagd.control.plan import Plan
 from tormagd.control.step import Stepper
+from tormagd.lab.tune_position import corner_margins
 from tormagd.scenes.scene import EVERY_TERM, load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand, SteadyHand
@@ -37,9 +37,6 @@ MODEL_GAP_MM, MODEL_DUTY, MODEL_S = 70.0, 0.5, 0.15
 "A duty step from rest in the middle of the stroke, with which H(z) is compared."
 WATCHED_S = 0.6
 SETTLING_BAND = 0.05
-CORNER = 0.3
-CORNER_PARAMETERS = ("resistance_ohm", "back_emf_V_s", "inertia_kg_m2", "inductance_mH")
-PERIOD_CORNERS = (0.8, 1.0, 1.2)
 TICK_S = 1e-3
 
 
@@ -208,21 +205,6 @@ def bang_bang(parameters: PlantParameters, start_mm: float, distance_mm: float, 
 def _at_rest(parameters: PlantParameters, gap_mm: float) -> PlantParameters:
     begun = msgspec.structs.replace(parameters.assumed, start_left_mm=gap_mm / 2.0, start_right_mm=gap_mm / 2.0)
     return msgspec.structs.replace(parameters, assumed=begun)
-
-
-def corner_margins(config: Config) -> dict[str, float]:
-    """The smallest margins over every corner of +-30% in the named motor parameters and +-20% in the period."""
-    gain, phase = [], []
-    for signs in itertools.product((1.0 - CORNER, 1.0 + CORNER), repeat=len(CORNER_PARAMETERS)):
-        changed = {
-            name: getattr(config.motor, name) * factor for name, factor in zip(CORNER_PARAMETERS, signs, strict=True)
-        }
-        motor: Motor = msgspec.structs.replace(config.motor, **changed)
-        for period in PERIOD_CORNERS:
-            found = margins(motor, config.position, TICK_S * period)
-            gain.append(found.gain_margin_dB)
-            phase.append(found.phase_margin_deg)
-    return {"gain_margin_dB": min(gain), "phase_margin_deg": min(phase), "corners": float(len(gain))}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

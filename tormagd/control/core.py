@@ -186,7 +186,7 @@ def _known_fields_mT(scene: Scene, model: ForceModel, part: Part) -> tuple[tuple
         raise DomainError(
             "insert.model",
             f"force that falls with the field at {falling_mm_s:.3g} mm/s",
-            "a force that rises with the field: train it on more data, as tools/train_model.py --rising checks",
+            "a force that rises with the field: train it on more data, as `tormag-lab train-model --rising` checks",
         )
     if part.contact.slides:
         return (low_mT, high_mT), True

@@ -1,6 +1,6 @@
 """`tormagctl calibrate`: a guided sweep through the running daemon, and a model of the insert from it.
 
-The sweep asks for forces, so every limit of the daemon stays in force. A process of its own (`learning.calibration`)
+The sweep asks for forces, so every limit of the daemon stays in force. A process of its own (`FITTING`)
 turns it into training data, fits, judges and saves: neither the daemon nor this program carries a training.
 """
 
@@ -31,7 +31,7 @@ EVERY = 4
 "Every fourth tick is kept: neighbours say nearly the same."
 
 PACES = ("steadily, about 20 turns a minute", "slowly, about 10 turns a minute", "quickly, about 25 turns a minute")
-FITTING = "tormagd.training.calibration"
+FITTING = "tormagd.lab.training.calibration"
 POLL_S = 0.2
 
 
@@ -92,7 +92,7 @@ def up_and_down(forces: Range, rate_N_s: float) -> Waveform:
 
 
 def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:
-    """The file that `learning.calibration` reads: every fourth tick of each sweep that says everything."""
+    """The file that `FITTING` reads: every fourth tick of each sweep that says everything."""
     start_s = min((float(sweep["monotonic_s"][0]) for sweep in sweeps if sweep["monotonic_s"].size), default=0.0)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

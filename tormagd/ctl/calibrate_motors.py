@@ -1,4 +1,4 @@
-"""`tormagctl calibrate --motors`: a log of one motor's voltage, current and motion, for `tools/identify_motor.py`.
+"""`tormagctl calibrate --motors`: a log of one motor's voltage, current and motion, for `tormag-lab identify-motor`.
 
 Only forces are asked for, so every limit of the daemon stays in force. They are chosen for what they make the carriages
 do: slow ramps show friction, fast ones the speed term, jumps the inertia.
@@ -94,7 +94,7 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
             [f"{value:.6f}" for value in row] for row in zip(*(log[name] for name in LOG_COLUMNS), strict=True)
         )
     result = {"file": str(path), "side": side, "rows": rows, "seconds": round(float(log["t_s"][-1]), 3)}
-    text = f"{path}: {rows} rows of the {side} carriage. next: python tools/identify_motor.py {path}"
+    text = f"{path}: {rows} rows of the {side} carriage. next: tormag-lab identify-motor {path}"
     return Outcome(result, text)
 
 

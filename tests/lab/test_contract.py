@@ -1,0 +1,134 @@
+"""What `tormag-lab` promises: its commands, how they refuse, what they need, and who may import the laboratory."""
+
+import ast
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tormagd.lab import errors
+from tormagd.lab.main import COMMANDS, main
+
+ROOT = Path(__file__).parents[2]
+SOURCES = [path for folder in ("tormagd", "firmware_protocol") for path in sorted((ROOT / folder).rglob("*.py"))]
+PAGES = [
+    *ROOT.glob("*.md"),
+    ROOT / "Makefile",
+    *(ROOT / "docs").rglob("*.md"),
+    *(ROOT / "firmware_protocol").rglob("*.md"),
+]
+HEAVY = ("torch", "sklearn", "clarabel", "dask", "distributed", "pyarrow", "matplotlib")
+WITHOUT = """
+import sys
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {heavy!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Missing())
+from tormagd.lab.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+LIGHT = ("characterise", "identify-motor", "optimise-design", "tune-position", "wire-log")
+
+
+def without_heavy(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """The command in an interpreter that has none of the heavy packages, as the Debian package."""
+    line = [sys.executable, "-P", "-c", WITHOUT.format(heavy=HEAVY), *arguments]
+    return subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_says_what_it_does_and_takes_json(name, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main([name, "--help"])
+    told = capsys.readouterr().out
+    assert told.startswith(f"usage: tormag-lab {name} ")
+    assert "--json" in told
+
+
+@pytest.mark.parametrize(("arguments", "exit_code"), [([], 0), (["--help"], 0), (["train"], 2)])
+def test_the_commands_are_listed(arguments, exit_code, capsys):
+    assert main(arguments) == exit_code
+    told = capsys.readouterr()
+    assert all(f"  {name} " in (told.err if exit_code else told.out) for name in COMMANDS)
+    assert "'train'" in told.err or not exit_code
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (("characterise", "compression", "absent.csv"), "absent.csv: cannot be read: No such file"),
+        (("optimise-design", "--region", "1", "1", "1", "1"), "most_N = 1"),
+        (("tune-position", "--config", "absent.toml"), "absent.toml"),
+        (("bench-sweep", "--plant", "absent", "--out", "x.csv"), "absent"),
+        (("identify-motor",), "give either a log or --samples"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line_and_exit_2(arguments, reason, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    told = capsys.readouterr()
+    assert told.err.startswith(f"tormag-lab {arguments[0]}: ")
+    assert reason in told.err
+    assert (told.out, told.err.count("\n")) == ("", 1)
+
+
+@pytest.mark.parametrize("name", LIGHT)
+def test_a_console_without_torch_has_the_light_commands(name):
+    done = without_heavy(name, "--help")
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_law_and_a_fitted_grey_box_need_no_torch():
+    rooms = "characterisation.constitutive, tormagd.lab.training.grey_box, tormagd.lab.thesis.errata"
+    line = f"import sys, tormagd.lab.{rooms}; assert not set({HEAVY!r}) & set(sys.modules)"
+    subprocess.run([sys.executable, "-P", "-c", line], check=True, timeout=60)
+
+
+def test_a_missing_package_is_one_sentence_with_the_command_that_brings_it():
+    done = without_heavy("train-model", "data.csv", "--element", "torque", "--insert", "A", "--out", "m")
+    assert done.returncode == 2
+    assert done.stderr == "tormag-lab train-model: torch is not installed: pip install 'tormagd[lab]'\n"
+
+
+def test_where_tormagd_stands_in_a_folder_of_its_own_packages_are_brought_there(monkeypatch, tmp_path):
+    monkeypatch.setattr(errors, "__file__", str(tmp_path / "tormagd" / "tormagd" / "lab" / "errors.py"))
+    told = errors.not_installed("torch")
+    assert told.endswith(f"sudo python3 -m pip install --target {tmp_path}/tormagd 'torch==2.13.0'")
+
+
+def imported(path: Path) -> set[str]:
+    """The modules that a file imports, also inside functions."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return found
+
+
+def test_nothing_else_imports_the_laboratory():
+    outside = [path for path in SOURCES if ROOT / "tormagd" / "lab" not in path.parents]
+    assert not [path for path in outside if any(name.startswith("tormagd.lab") for name in imported(path))]
+
+
+def test_every_command_that_is_named_exists():
+    known = set(COMMANDS) | {"NAME"}
+    for path in (*SOURCES, *PAGES):
+        text = path.read_text(encoding="utf-8")
+        named = set(re.findall(r"tormag-lab ([a-zA-Z][\w-]*)", text))
+        assert named <= known, path
+        scripts = set(re.findall(r"\btools/(\w+)\.py", text)) if path in SOURCES else set()
+        assert all((ROOT / "tools" / f"{name}.py").exists() for name in scripts), path
+
+
+def test_the_table_2_5_command_prints_what_json_has(capsys):
+    assert main(["reproduce-thesis", "--table-2-5", "--json"]) == 0
+    tasks = json.loads(capsys.readouterr().out)["tasks"]
+    assert main(["reproduce-thesis", "--table-2-5"]) == 0
+    table = capsys.readouterr().out
+    assert all(task["task"] in table for task in tasks)

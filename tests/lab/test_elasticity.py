@@ -1,0 +1,105 @@
+"""Fits of the uniaxial laws: synthetic curves with a known answer, and measured rubber where the data are at hand."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings, strategies as st
+
+from tormagd.lab.characterisation.elasticity import fit_neo_hookean, fit_ogden, fit_thesis_ogden
+from tormagd.lab.characterisation.hyperelastic import NeoHookean, Ogden, ThesisOgden
+from tormagd.lab.errors import LabError
+from tormagd.lab.tables import read_columns
+from tormagd.physics.errors import DomainError
+
+DATA = Path(os.environ.get("TORMAG_DATA", Path(__file__).parents[3] / "shared" / "data"))
+COMPRESSION = np.linspace(1.0, 0.75, 60)
+TENSION = np.linspace(1.0, 4.0, 80)
+
+
+def measured(name: str, columns: tuple[str, str], delimiter: str = ",") -> list[np.ndarray]:
+    path = DATA / name
+    if not path.exists():
+        pytest.skip(f"no measured data: {name} is not under TORMAG_DATA")
+    return list(read_columns(path, columns, delimiter=delimiter).values())
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(3.0, 7.0), st.floats(0.4, 12.0), st.booleans())
+def test_one_ogden_term_is_found_again(decades: float, exponent: float, pulled: bool) -> None:
+    law = Ogden((10.0**decades,), (exponent,))
+    stretch = TENSION if pulled else COMPRESSION
+    stress_Pa = law.stress_Pa(stretch)
+    assume(np.abs(stress_Pa).max() <= 1e12)  # beyond, a record is refused
+    fit = fit_ogden(stretch, stress_Pa)
+    assert fit.law.shear_modulus_Pa == pytest.approx(law.shear_modulus_Pa, rel=1e-4)
+    assert fit.law.exponents[0] == pytest.approx(exponent, rel=1e-3)
+    assert fit.r2 > 1.0 - 1e-9
+
+
+@pytest.mark.parametrize("exponent", [0.7, 2.0, 9.0])
+def test_the_printed_law_is_found_again(exponent: float) -> None:
+    law = ThesisOgden(140e3, exponent)
+    fit = fit_thesis_ogden(COMPRESSION, law.stress_Pa(COMPRESSION))
+    assert fit.law.constant_Pa == pytest.approx(140e3, rel=1e-5)
+    assert fit.law.shear_modulus_Pa == pytest.approx(law.shear_modulus_Pa, rel=1e-6)
+
+
+def test_three_terms_follow_what_one_cannot() -> None:
+    law = Ogden((200e3, 2e3, 1e-3), (1.3, 5.0, 12.0))
+    stretch = np.linspace(1.0, 7.0, 120)
+    stress = law.stress_Pa(stretch)
+    assert fit_ogden(stretch, stress).r2 < 0.995
+    assert fit_ogden(stretch, stress, terms=3).r2 > 0.99999
+
+
+def test_a_needless_term_is_dropped() -> None:
+    fit = fit_ogden(TENSION, NeoHookean(20e3).stress_Pa(TENSION), terms=3)
+    assert fit.law.shear_modulus_Pa == pytest.approx(20e3, rel=1e-3)
+
+
+def test_noise_moves_the_modulus_little() -> None:
+    rng = np.random.default_rng(1)
+    stress = NeoHookean(100e3).stress_Pa(COMPRESSION) + rng.normal(0.0, 500.0, len(COMPRESSION))
+    fit = fit_neo_hookean(COMPRESSION, stress)
+    assert fit.law.shear_modulus_Pa == pytest.approx(100e3, rel=0.01)
+    assert fit.rms_Pa == pytest.approx(500.0, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("file", "published_kPa"), [("Ecoflex_00-10", 7.4), ("Ecoflex_00-30", 15.1), ("Ecoflex_00-50", 20.8)]
+)
+def test_measured_silicones(file: str, published_kPa: float) -> None:
+    """Neo-Hookean over 5..50 % strain, where the grips' slack is out; Ogden to four times the length."""
+    columns = ("Engineering Strain", "Engineering Stress (MPa)")
+    strain, stress_MPa = measured(f"srmd_silicone/{file}.csv", columns, ";")
+    chosen = (strain >= 0.05) & (strain <= 0.5)
+    fit = fit_neo_hookean(1.0 + strain[chosen], 1e6 * stress_MPa[chosen])
+    assert 1e-3 * fit.law.shear_modulus_Pa == pytest.approx(published_kPa, rel=0.01)
+    chosen = (strain >= 0.05) & (strain <= 3.0)
+    for terms, share in ((1, 0.997), (2, 0.9997)):
+        assert fit_ogden(1.0 + strain[chosen], 1e6 * stress_MPa[chosen], terms).r2 > share
+
+
+def test_treloars_rubber() -> None:
+    stretch, stress_MPa = measured("hyperelastics_jl/uniaxial.csv", ("Stretch", "Stress"))
+    assert fit_neo_hookean(stretch, 1e6 * stress_MPa).r2 < 0.9
+    fit = fit_ogden(stretch, 1e6 * stress_MPa, terms=3)
+    assert fit.r2 > 0.998
+    assert 0.25e6 < fit.law.shear_modulus_Pa < 0.45e6
+
+
+@pytest.mark.parametrize("fit", [fit_neo_hookean, fit_ogden, fit_thesis_ogden])
+def test_curves_that_cannot_be_fitted(fit: object) -> None:
+    assert callable(fit)
+    with pytest.raises(LabError, match="no positive modulus"):
+        fit(COMPRESSION, -NeoHookean(1e4).stress_Pa(COMPRESSION))
+    with pytest.raises(LabError, match="vary"):
+        fit(COMPRESSION, np.zeros_like(COMPRESSION))
+    with pytest.raises(LabError, match="pairs"):
+        fit(COMPRESSION[:1], COMPRESSION[:1])
+    with pytest.raises(DomainError, match="stretch"):
+        fit(np.array([1.0, 0.9, 0.0]), np.array([0.0, -1e3, -1e4]))
+    with pytest.raises(DomainError, match="stress_Pa"):
+        fit(np.array([1.0, 0.9, 0.8]), np.array([0.0, -1e3, np.nan]))

@@ -1,0 +1,137 @@
+"""Many consoles' recordings: one by one, on Dask workers and from a bucket the same; what cannot be read is named."""
+
+import json
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import fsspec
+import msgspec
+import pyarrow.parquet
+import pytest
+from distributed import LocalCluster
+
+from tormagd.lab.consoles.devices import Console, Drift, consoles
+from tormagd.lab.consoles.reading import files, read, read_all
+from tormagd.lab.main import main
+from tormagd.recording.summary import Summary
+from tormagd.recording.ticks import TickBatch
+from tormagd.recording.writer import RecordingWriter
+
+DAY_S = 86_400
+START_S = 1_790_000_000
+COLUMNS = ("t_ns", "setpoint_cf", "measured_cf", "operating_state", "limits", "faults", "trim", "left_current_A")
+SCENE = json.dumps({"insert": {"name": "MRE-50-40"}})
+
+
+def write(path: Path, serial_number: int, day: int, error_N: float, trim: float) -> None:
+    """100 ms: RATE for the first half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    begin_ns = (START_S + day * DAY_S) * 10**9
+    rows = tuple(
+        (begin_ns + k * 10**6, 1.5, 1.5 + error_N, "ENABLED", ("RATE",) if k < 50 else (), (), trim, 0.5)
+        for k in range(100)
+    )
+    with RecordingWriter(path, {"serial_number": str(serial_number), "scene": SCENE}) as writer:
+        writer.ticks(TickBatch(v=1, columns=COLUMNS, rows=rows))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two consoles, three days; one file is none, and another a pipe that nobody writes to."""
+    folder = tmp_path_factory.mktemp("fleet")
+    for console in 1, 2:
+        for day in range(3):
+            write(folder / f"{console}" / f"{day}.mcap", console, day, 0.01 * console, 1.0 + 0.02 * console * day)
+    (folder / "2" / "torn.mcap").write_bytes(b"no recording")
+    os.mkfifo(folder / "pipe.mcap")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    with LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0") as cluster:
+        yield cluster.scheduler_address
+
+
+def test_dask_workers_find_what_is_found_one_by_one(folder, scheduler, capsys, tmp_path):
+    said = []
+    for name, where in (("one.parquet", ["--workers", "1"]), ("dask.parquet", ["--dask", scheduler])):
+        assert main(["fleet", str(folder), "--json", "--out", str(tmp_path / name), *where]) == 1
+        out, err = capsys.readouterr()
+        assert "left out 2/torn.mcap: not an intact MCAP recording" in err
+        assert "left out pipe.mcap: it is no regular file" in err
+        said.append((json.loads(out), pyarrow.parquet.read_table(tmp_path / name)))
+    assert said[0] == said[1]
+    result, table = said[0]
+    assert list(result["recordings"]) == [f"{console}/{day}.mcap" for console in (1, 2) for day in range(3)]
+    assert table.column_names == ["file", *Summary.__struct_fields__]
+    rows = [{**row, **{name: dict(row[name]) for name in ("limits_s", "faults_at_s")}} for row in table.to_pylist()]
+    assert {row.pop("file"): row for row in rows} == result["recordings"]
+
+
+def test_a_console_is_summed_up_over_its_days(folder, scheduler, capsys):
+    assert main(["fleet", str(folder / "2"), "--dask", scheduler, "--json"]) == 1
+    found = msgspec.convert(json.loads(capsys.readouterr().out)["consoles"][0], Console)
+    assert (found.serial_number, found.insert, found.recordings) == (2, "MRE-50-40", 3)
+    assert found.tracking_rms_N == pytest.approx(0.02)
+    assert found.limits == {"RATE": pytest.approx(0.5)}
+    assert found.trim == Drift(1.0, pytest.approx(1.08), pytest.approx(0.04))
+    assert found.current_A == Drift(0.5, 0.5, pytest.approx(0.0))
+    assert found.clock_drift_ppm is None
+
+
+def test_the_error_of_a_console_is_that_of_all_its_time(tmp_path):
+    write(tmp_path / "a.mcap", 1, 0, 0.01, 1.0)
+    write(tmp_path / "b.mcap", 1, 0, 0.03, 1.0)
+    first, second = (read(str(tmp_path / name)) for name in ("a.mcap", "b.mcap"))
+    assert not isinstance(first, str)
+    assert not isinstance(second, str)
+    (console,) = consoles([msgspec.structs.replace(first, enabled_s=0.3), second])
+    assert console.tracking_rms_N == pytest.approx(((3 * 0.01**2 + 0.03**2) / 4) ** 0.5)
+    assert console.worst_rms_N == pytest.approx(0.03)
+    assert console.trim == Drift(1.0, 1.0, None)
+
+
+def test_a_person_reads_a_line_for_each_console(folder, scheduler, capsys):
+    assert main(["fleet", str(folder / "1"), "--dask", scheduler]) == 0
+    heading, line = capsys.readouterr().out.splitlines()
+    assert heading.split()[:3] == ["device", "insert", "files"]
+    shown = "00000001 MRE-50-40 3 0 s 10.0, 10.0 1.000..1.040 (+0.02/day) 0.50 unknown RATE 50.0%"
+    assert " ".join(line.split()) == shown
+
+
+def test_what_cannot_be_kept_is_told_after_what_was_found(folder, scheduler, capsys, tmp_path):
+    (tmp_path / "file").touch()
+    assert main(["fleet", str(folder / "1"), "--dask", scheduler, "--out", str(tmp_path / "file" / "a.parquet")]) == 2
+    out, err = capsys.readouterr()
+    assert "MRE-50-40" in out
+    assert str(tmp_path / "file") in err
+
+
+def test_a_bucket_is_read_like_a_folder(folder):
+    fsspec.filesystem("memory").put(f"{folder}/1/", "/fleet/1/", recursive=True)
+    in_bucket, here = files("memory://fleet"), files(str(folder))
+    assert list(in_bucket) == ["1/0.mcap", "1/1.mcap", "1/2.mcap"]
+    with ThreadPoolExecutor(1) as thread:
+        assert read_all(in_bucket, thread) == read_all({name: here[name] for name in in_bucket}, thread)
+
+
+@pytest.mark.parametrize(
+    ("url", "reason"),
+    [
+        ("/nowhere", "/nowhere: no such folder or file"),
+        ("nothing://there", "Protocol not known: nothing"),
+        ("{empty}", "no .mcap in it; `tormagctl record` makes them"),
+    ],
+)
+def test_what_cannot_be_looked_at_is_told(url, reason, tmp_path, capsys):
+    assert main(["fleet", url.format(empty=tmp_path)]) == 2
+    assert reason in capsys.readouterr().err
+
+
+def test_a_worker_that_dies_is_told_with_its_file(folder):
+    with ThreadPoolExecutor(1) as here:
+        found = read_all({"a.mcap": 3}, here)  # type: ignore[dict-item]
+    assert found.left_out["a.mcap"].startswith("the worker that read it failed: ")

@@ -1,0 +1,139 @@
+"""The relaxation-aware model on a small synthetic element with a known memory."""
+
+import numpy as np
+import pytest
+
+from tormagd.inverse.nearest import NearestFieldSearch
+from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.fitting import fit_network
+from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory, fit_grey_box, fit_series
+from tormagd.lab.training.memory import relaxed_N
+from tormagd.physics.errors import DomainError
+from tormagd.physics.relaxation import PronySeries
+
+SERIES = PronySeries((0.02, 0.06, 0.04, 0.03), (1.2, 9.0, 120.0, 900.0))
+FIELD_SERIES = PronySeries((0.03, 0.09, 0.05, 0.02), (1.2, 9.0, 120.0, 900.0))
+NOISE_N = 0.02
+
+
+def parts(features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    displacement, rate, field, _ = features.T
+    free = 4 * displacement * (1 + 0.1 * displacement) * (1 + 0.02 * rate)
+    return free, free * 0.5 * (field / 300) ** 2
+
+
+def element(features: np.ndarray, time_s: np.ndarray, cycle: np.ndarray) -> Dataset:
+    empty = Dataset(features, np.zeros(len(features)), cycle, time_s)
+    free, added = parts(features)
+    force = relaxed_N(SERIES, free, empty) + relaxed_N(FIELD_SERIES, added, empty)
+    return Dataset(features, force + np.random.default_rng(0).normal(0, NOISE_N, len(force)), cycle, time_s)
+
+
+def records(displacement: np.ndarray, time_s: np.ndarray, fields: tuple[float, ...]) -> Dataset:
+    rate = np.gradient(displacement, time_s)
+    blocks = [
+        np.column_stack((displacement, rate, np.full_like(rate, field), np.full_like(rate, 45))) for field in fields
+    ]
+    rows = len(time_s)
+    cycle = np.arange(rows * len(fields)) // (rows // 4)
+    return element(np.concatenate(blocks), np.tile(time_s, len(fields)), cycle)
+
+
+@pytest.fixture(scope="module")
+def cycles() -> Dataset:
+    time_s = np.arange(1, 401) * 0.1
+    return records(2 - 2 * np.cos(2 * np.pi * time_s / 10), time_s + 200, (0.0, 75.0, 150.0, 225.0, 300.0))
+
+
+@pytest.fixture(scope="module")
+def holds() -> Dataset:
+    time_s = np.concatenate((np.linspace(0, 4, 21), 4 + np.geomspace(0.1, 3600, 120)))
+    return records(np.minimum(time_s, 4.0), time_s, (0.0, 150.0, 300.0))
+
+
+@pytest.fixture(scope="module")
+def grey(cycles: Dataset, holds: Dataset) -> GreyBox:
+    return fit_grey_box(cycles, np.ones(len(cycles), dtype=bool), holds, hidden=20, epochs=40, settling_epochs=20)
+
+
+def test_a_series_is_recovered_from_holds_even_when_the_level_is_wrong(holds: Dataset) -> None:
+    free, added = parts(holds.features)
+    found, field_found = fit_series(holds, (1.05 * free, 1.05 * added))
+    assert found.times_s == pytest.approx(SERIES.times_s, rel=0.2)
+    assert found.fractions == pytest.approx(SERIES.fractions, abs=0.01)
+    assert sum(field_found.fractions) == pytest.approx(sum(FIELD_SERIES.fractions), abs=0.03)
+
+
+def test_records_that_begin_late_were_run_before() -> None:
+    # a constant force: after n passes of 10 s it has relaxed for n * 10 s
+    features = np.column_stack((np.ones(10), np.zeros(10), np.zeros(10), np.zeros(10)))
+    series = PronySeries((0.5,), (20.0,))
+    for passes in (0, 3):
+        data = Dataset(features, np.zeros(10), None, np.arange(1.0, 11.0) + 10 * passes)
+        force = relaxed_N(series, np.full(10, 8.0), data)
+        ramp = 20.0 * (1 - np.exp(-1 / 20.0))  # the first step is a ramp of 1 s
+        remembered = 4.0 * ramp * np.exp(-(9 + 10 * passes) / 20.0)
+        assert force[-1] == pytest.approx(4.0 + remembered, rel=1e-9)
+
+
+def test_records_are_independent() -> None:
+    features = np.column_stack((np.ones(8), np.zeros(8), np.zeros(8), np.zeros(8)))
+    data = Dataset(features, np.zeros(8), None, np.tile([0.0, 1.0, 2.0, 5.0], 2))
+    force = relaxed_N(SERIES, np.full(8, 3.0), data)
+    assert force[:4] == pytest.approx(force[4:])
+    assert force[0] == pytest.approx(3.0)
+
+
+def test_the_grey_box_sees_through_the_memory(grey: GreyBox, cycles: Dataset, holds: Dataset) -> None:
+    alone, _ = fit_network(cycles, np.ones(len(cycles), dtype=bool), 20, epochs=40)
+    error = np.abs(grey.predict(holds) - holds.force_N).mean()
+    assert error < 3 * NOISE_N
+    assert np.abs(alone.predict(holds.features) - holds.force_N).mean() > 5 * error
+
+
+def test_the_memory_inverts_itself(grey: GreyBox) -> None:
+    model = grey.model
+    memory, told = GreyBoxMemory(grey, 0.5), GreyBoxMemory(grey, 0.5)
+    solver = NearestFieldSearch(field_range_mT=(0.0, 300.0), step_mT=1.0)
+    last = None
+    for step in range(200):
+        field = 180 + 60 * np.sin(step / 9)
+        force = told.advance(3.5, 0.0, field, 45.0)
+        wanted = memory.elastic_N(3.5, 0.0, force, 45.0)
+        last = solver.solve(model.curve(3.5, 0.0, 45.0), wanted, last).field_mT
+        assert last == pytest.approx(field, abs=0.1)
+        memory.advance(3.5, 0.0, last, 45.0)
+
+
+def test_steps_and_records_agree(grey: GreyBox) -> None:
+    fields = 150 + 100 * np.sin(np.arange(1, 41) / 5)
+    features = np.column_stack((np.full(40, 3.0), np.zeros(40), fields, np.full(40, 45.0)))
+    data = Dataset(features, np.zeros(40), None, np.arange(1, 41) * 0.25 - 0.25)
+    memory = GreyBoxMemory(grey, 0.25)
+    stepped = [memory.advance(3.0, 0.0, field, 45.0) for field in fields.tolist()]
+    # the record begins with a jump, the steps with a ramp: what is left of the difference fades
+    assert grey.predict(data)[1:] == pytest.approx(stepped[1:], rel=5e-3)
+
+
+def test_a_memory_needs_times(grey: GreyBox, cycles: Dataset) -> None:
+    with pytest.raises(DomainError, match="time_s"):
+        grey.predict(Dataset(cycles.features, cycles.force_N))
+
+
+def test_relaxation_tests_without_a_rest_are_refused(cycles: Dataset) -> None:
+    moving = cycles.subset(cycles.features[:, 1] != 0)
+    with pytest.raises(DomainError, match="holds"):
+        fit_series(moving, parts(moving.features))
+
+
+def test_a_fit_goes_on_from_its_start(cycles: Dataset) -> None:
+    model, training = fit_network(cycles, np.ones(len(cycles), dtype=bool), 15, epochs=30)
+    _, goes_on = fit_network(cycles, cycles.features[:, 2] < 250, 15, epochs=1, start=model)
+    assert goes_on.history[0].train_rmse_N < 1.5 * training.best.train_rmse_N
+
+
+def test_forces_held_out_are_not_looked_at(cycles: Dataset) -> None:
+    known = np.arange(len(cycles)) % 3 > 0
+    spoiled = Dataset(cycles.features, np.where(known, cycles.force_N, 900.0), cycles.cycle, cycles.time_s)
+    models = [fit_network(data, known, 5, epochs=3)[0].predict(cycles.features) for data in (cycles, spoiled)]
+    assert models[0] == pytest.approx(models[1])

@@ -1,0 +1,141 @@
+import itertools
+import math
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+
+from tormagd.lab.design.optimisation import (
+    SLACK,
+    Design,
+    Outcome,
+    Problem,
+    Run,
+    corner_cost,
+    coverage,
+    coverage_as_made,
+    solve,
+)
+from tormagd.lab.design.phase_portrait import Region
+from tormagd.physics.errors import DomainError
+
+THESIS_SPEED_MM_S = 25.0 / 3.0
+
+
+@cache
+def found(problem: Problem, start: Design) -> Outcome:
+    """What the global search finds; several statements look at one."""
+    return solve(Run(problem, start, "global"))
+
+
+def grid(problem: Problem, side: int) -> list[Design]:
+    low, high = (msgspec.structs.astuple(bound) for bound in (problem.lower, problem.upper))
+    axes = [np.linspace(a, b, side) for a, b in zip(low, high, strict=True)]
+    return [Design(*(float(value) for value in point)) for point in itertools.product(*axes)]
+
+
+@pytest.mark.parametrize(
+    ("use_case", "measure", "speed", "bar"),
+    [
+        (1, "trapezoid", THESIS_SPEED_MM_S, 0.995),
+        (1, "true", 40.0, 0.99),
+        (1, "true", THESIS_SPEED_MM_S, 0.97),
+        (2, "trapezoid", THESIS_SPEED_MM_S, 0.999),
+        (2, "true", 40.0, 0.995),
+        (2, "true", THESIS_SPEED_MM_S, 0.974),
+    ],
+)
+def test_two_starts_end_together_and_above_the_bar(
+    use_case_1: Region, use_case_2: Region, use_case: int, measure: str, speed: float, bar: float
+) -> None:
+    problem = Problem((use_case_1, use_case_2)[use_case - 1], measure, speed)
+    first, second = (found(problem, start) for start in (problem.lower, Design(40.0, 50.0, 170.0)))
+    assert min(first.coverage, second.coverage) >= bar
+    assert first.coverage == pytest.approx(second.coverage, rel=0.01)
+    assert first.volume_mm3 == pytest.approx(second.volume_mm3, rel=0.05)
+
+
+def test_no_design_on_a_grid_is_better_or_as_good_and_smaller(problem: Problem) -> None:
+    best = found(problem, problem.lower)
+    for design in grid(problem, 11):
+        reached = coverage(problem, design)
+        assert reached <= best.coverage + 2 * SLACK
+        if reached >= best.coverage:
+            assert problem.volume_mm3(design) >= 0.999 * best.volume_mm3
+
+
+@pytest.mark.parametrize("solver", ["local", "global"])
+def test_no_solver_returns_less_than_its_start(use_case_1: Region, as_built: Design, solver: str) -> None:
+    covering = Problem(use_case_1, "true", THESIS_SPEED_MM_S)
+    assert solve(Run(covering, as_built, solver)).coverage >= coverage(covering, as_built) - SLACK
+    corners = Problem(use_case_1, "corners", THESIS_SPEED_MM_S)
+    assert solve(Run(corners, as_built, solver)).corner_cost <= corner_cost(corners, as_built)
+
+
+def test_the_thesis_cost_ends_below_the_grid_and_covers_less(use_case_2: Region, as_built: Design) -> None:
+    problem = Problem(use_case_2, "corners", THESIS_SPEED_MM_S)
+    thesis = found(problem, as_built)
+    assert thesis.corner_cost <= min(corner_cost(problem, design) for design in grid(problem, 10))
+    assert thesis.coverage < coverage(problem, as_built)
+
+
+def test_a_soft_elastomer_keeps_clear_of_collapse(use_case_2: Region) -> None:
+    soft = Problem(use_case_2, "true", 40.0, shear_modulus_Pa=20e3)
+    margins = [soft.load_margin(design) for design in grid(soft, 5)]
+    assert min(margins) < 0.0 < max(margins)
+    outcome = solve(Run(soft, Design(45.0, 50.0, 200.0), "global"))
+    assert soft.load_margin(outcome.design) >= 0.0
+    assert outcome.coverage > 0.9
+
+
+def test_an_elastomer_too_soft_for_any_design_is_refused(use_case_2: Region, as_built: Design) -> None:
+    jelly = Problem(use_case_2, "true", 40.0, shear_modulus_Pa=2e3, relative_permeability=6.0)
+    assert max(jelly.load_margin(design) for design in grid(jelly, 5)) < 0.0
+    for solver in ("local", "global"):
+        with pytest.raises(DomainError, match="shear_modulus_Pa"):
+            solve(Run(jelly, as_built, solver))
+
+
+def test_corner_cost_of_a_perfect_match_is_nothing(problem: Problem, as_built: Design) -> None:
+    own = msgspec.structs.replace(problem, region=problem.portrait(as_built).trapezoid(), measure="corners")
+    assert corner_cost(own, as_built) == 0.0
+    assert coverage(own, as_built) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "variable"),
+    [
+        ({"lower": Design(4.2, 0.5, 46.0)}, "lower.outer_radius_mm"),
+        ({"lower": Design(6.5, 0.5, 45.0)}, "lower.open_mm"),
+        ({"lower": Design(6.5, 60.0, 46.0)}, "upper.thickness_mm"),
+        ({"upper": Design(math.inf, 50.0, 200.0)}, "upper.outer_radius_mm"),
+    ],
+)
+def test_impossible_problems_are_refused(use_case_2: Region, changes: dict[str, Design], variable: str) -> None:
+    with pytest.raises(DomainError) as refused:
+        Problem(use_case_2, "true", 40.0, **changes)
+    assert refused.value.variable == variable
+
+
+def test_starts_outside_the_bounds_are_refused(problem: Problem) -> None:
+    with pytest.raises(DomainError, match=r"start\.outer_radius_mm"):
+        Run(problem, Design(5.0, 20.0, 95.0), "global")
+    with pytest.raises(DomainError, match=r"start\.open_mm"):
+        Run(problem, Design(11.0, 20.0, math.nan), "local")
+
+
+def test_what_a_design_covers_as_it_is_made_is_the_least_of_its_neighbours(use_case_1: Region) -> None:
+    """The thesis's printed optimum of use case 1: what rounding to its printed digits does, and a percent of each."""
+    problem, printed = Problem(use_case_1, "trapezoid", THESIS_SPEED_MM_S), Design(7.3, 12.5, 197.0)
+    assert coverage_as_made(problem, printed, 0.0) == coverage(problem, printed)
+    least = coverage_as_made(problem, printed, 0.01)
+    assert least < coverage_as_made(problem, printed, 0.001) < coverage(problem, printed)
+    off = msgspec.structs.replace(printed, thickness_mm=0.99 * printed.thickness_mm)
+    assert least <= coverage(problem, off)
+
+
+def test_a_design_that_cannot_bear_its_field_as_made_covers_nothing(use_case_1: Region) -> None:
+    soft = Problem(use_case_1, "true", 38.0, shear_modulus_Pa=10e3)
+    assert soft.load_margin(Design(6.5, 12.5, 197.0)) < 0.0
+    assert coverage_as_made(soft, Design(6.5, 12.5, 197.0), 0.01) == 0.0

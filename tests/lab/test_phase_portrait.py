@@ -1,0 +1,152 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from tormagd.lab.design.brake import Brake
+from tormagd.lab.design.phase_portrait import PhasePortrait, Region
+from tormagd.physics.errors import DomainError
+from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
+from tormagd.physics.force import TORMAG, Elastomer
+
+SPEEDS = (25.0 / 3.0, 40.0)
+
+
+def count_points(portrait: PhasePortrait, region: Region, *, true: bool, side: int = 500) -> float:
+    """Coverage by counting a grid of points in the region: slow, and without an integral."""
+    force, share = np.meshgrid((np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side)
+    force = region.least_N + force * (region.most_N - region.least_N)
+    # rows of equal share of the rate have unequal height: weigh each point with it
+    required = region.rate_N_s(force)
+    judge = portrait.true_cloud if true else portrait.trapezoid_cloud
+    covered = judge(force.ravel(), (share * required).ravel()).covered.reshape(force.shape)
+    return float(np.sum(covered * required) / np.sum(required))
+
+
+@pytest.mark.parametrize("speed", SPEEDS)
+def test_coverage_agrees_with_counted_points(
+    brake: Brake, use_case_1: Region, use_case_2: Region, speed: float
+) -> None:
+    portrait = PhasePortrait(brake, speed)
+    for region in (use_case_1, use_case_2):
+        assert portrait.true_coverage(region) == pytest.approx(count_points(portrait, region, true=True), abs=1e-3)
+        counted = count_points(portrait, region, true=False)
+        assert portrait.trapezoid_coverage(region) == pytest.approx(counted, abs=1e-3)
+
+
+def test_true_coverage_is_good_to_five_digits(brake: Brake, use_case_2: Region) -> None:
+    portrait = PhasePortrait(brake, SPEEDS[0])
+    gap = np.linspace(brake.gap_mm(use_case_2.most_N), brake.open_mm, 200_001)
+    force = brake.force_N(gap)
+    inside = np.minimum(use_case_2.rate_N_s(force), SPEEDS[0] * brake.slope_N_mm(gap))
+    exact = -np.trapezoid(inside, force) / use_case_2.half_area
+    assert portrait.true_coverage(use_case_2) == pytest.approx(exact, abs=1e-5)
+
+
+def test_outline_lies_inside_the_trapezoid_and_joins_its_corners(brake: Brake) -> None:
+    portrait = PhasePortrait(brake, 40.0)
+    force, rate = portrait.outline()
+    ends = portrait.trapezoid()
+    assert (force[0], force[-1]) == pytest.approx((ends.most_N, ends.least_N))
+    assert (rate[0], rate[-1]) == pytest.approx((ends.most_rate_N_s, ends.least_rate_N_s))
+    assert np.all(rate[1:-1] < ends.rate_N_s(force[1:-1]))
+
+
+def test_boundary_rate_is_what_a_moving_gap_gives(brake: Brake) -> None:
+    force, rate = PhasePortrait(brake, 40.0).outline(5)
+    step_s = 1e-5
+    for gap, limit in zip(brake.gap_mm(force)[1:-1], rate[1:-1], strict=True):
+        moved = brake.force_N(float(gap) - 40.0 * step_s) - brake.force_N(float(gap) + 40.0 * step_s)
+        assert moved / (2.0 * step_s) == pytest.approx(limit, rel=1e-6)
+
+
+def test_a_region_out_of_reach_is_not_covered_and_one_inside_is_whole(brake: Brake) -> None:
+    portrait = PhasePortrait(brake, 40.0)
+    for region, share in ((Region(brake.most_N, 0.1, brake.most_N + 1.0, 0.1), 0.0), (Region(2.0, 0.1, 3.0, 0.1), 1.0)):
+        assert portrait.true_coverage(region) == pytest.approx(share, abs=1e-12)
+        assert portrait.trapezoid_coverage(region) == pytest.approx(share, abs=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    least=st.floats(0.0, 5.0),
+    width=st.floats(0.01, 5.0),
+    rates=st.tuples(st.floats(0.0, 10.0), st.floats(0.01, 10.0)),
+    speed=st.floats(0.1, 100.0),
+)
+def test_coverage_is_a_share_that_grows_with_the_gap_speed(
+    brake: Brake, least: float, width: float, rates: tuple[float, float], speed: float
+) -> None:
+    region = Region(least, rates[0], least + width, rates[1])
+    slow, fast = PhasePortrait(brake, speed), PhasePortrait(brake, 2.0 * speed)
+    for name in ("true_coverage", "trapezoid_coverage"):
+        assert 0.0 <= getattr(slow, name)(region) <= getattr(fast, name)(region) + 1e-9 <= 1.0 + 1e-9
+
+
+def test_cloud_says_which_points_fail_and_why(brake: Brake) -> None:
+    portrait = PhasePortrait(brake, 40.0)
+    limit = 40.0 * brake.slope_N_mm(brake.gap_mm(2.0))
+    force = np.array([2.0, 2.0, 2.0, 0.5 * brake.least_N, brake.most_N + 0.1])
+    cloud = portrait.true_cloud(force, np.array([0.99 * limit, 1.01 * limit, -1.01 * limit, 0.0, 0.0]))
+    assert cloud.covered.tolist() == [True, False, False, False, False]
+    assert cloud.too_fast.tolist() == [False, True, True, False, False]
+    assert cloud.below_least_force.tolist() == [False, False, False, True, False]
+    assert cloud.above_most_force.tolist() == [False, False, False, False, True]
+    assert cloud.share == pytest.approx(0.2)
+
+
+def test_brake_comes_back_from_force_to_gap(brake: Brake) -> None:
+    gap = np.linspace(45.0, 95.0, 101)
+    assert brake.gap_mm(brake.force_N(gap)) == pytest.approx(gap, rel=1e-11)
+    assert brake.gap_mm(brake.most_N) == 45.0
+    assert brake.gap_mm(brake.least_N) == pytest.approx(95.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("g0_Pa", [20e3, 79.5e3, 185.5e3, 277.3e3])
+@pytest.mark.parametrize("law", [ThesisFieldLaw(), PowerFieldLaw()])
+def test_end_forces_come_back_as_end_gaps(law: FieldLaw, g0_Pa: float) -> None:
+    device = Brake(law, Elastomer(g0_Pa, 2.7, 0.2), TORMAG, 45.0, 95.0)
+    ends = [device.most_N, device.least_N]
+    # Eq. 7 is flat at 95 mm: its inverse has half of the digits there
+    assert [device.gap_mm(force) for force in ends] == pytest.approx([45.0, 95.0], abs=1e-4)
+    assert device.gap_mm(np.array(ends)) == pytest.approx([45.0, 95.0], abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "variable"),
+    [
+        ((0.5, 0.1, 0.5, 0.1), "most_N"),
+        ((-0.1, 0.1, 0.5, 0.1), "least_N"),
+        ((0.0, math.nan, 0.5, 0.1), "least_rate_N_s"),
+        ((0.0, 0.0, math.inf, 0.1), "most_N"),
+        ((0.0, 0.0, 0.5, 0.0), "most_rate_N_s"),
+    ],
+)
+def test_impossible_regions_are_refused(arguments: tuple[float, ...], variable: str) -> None:
+    with pytest.raises(DomainError) as refused:
+        Region(*arguments)
+    assert refused.value.variable == variable
+
+
+def test_impossible_brakes_and_speeds_are_refused(brake: Brake) -> None:
+    elastomer = Elastomer(300e3, 3.8, 0.2)
+    with pytest.raises(DomainError, match="open_mm"):
+        Brake(PowerFieldLaw(), elastomer, TORMAG, 95.0, 45.0)
+    with pytest.raises(DomainError, match="open_mm = 120"):
+        Brake(ThesisFieldLaw(), elastomer, TORMAG, 45.0, 120.0)
+    with pytest.raises(DomainError, match="radial_moment_Tm"):
+        Brake(PowerFieldLaw(), Elastomer(5e3, 3.8, 0.2), TORMAG, 5.0, 95.0)
+    with pytest.raises(DomainError, match="gap_speed_mm_s"):
+        PhasePortrait(brake, 0.0)
+    with pytest.raises(DomainError, match="force_N"):
+        brake.gap_mm(2.0 * brake.most_N)
+
+
+def test_clouds_that_are_not_points_are_refused(brake: Brake) -> None:
+    portrait = PhasePortrait(brake, 40.0)
+    for force, rate in (([1.0, math.nan], [0.0, 0.0]), ([1.0], [math.inf]), ([1.0, 2.0], [0.0]), ([], [])):
+        with pytest.raises(DomainError):
+            portrait.true_cloud(np.array(force), np.array(rate))
+        with pytest.raises(DomainError):
+            portrait.trapezoid_cloud(np.array(force), np.array(rate))

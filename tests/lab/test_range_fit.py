@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+
+from tormagd.lab.design.range_fit import (
+    fit_exponent,
+    fit_friction,
+    frictionless_range_N,
+    leave_one_out,
+    mean_relative_error,
+)
+from tormagd.physics.errors import DomainError
+from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
+from tormagd.physics.force import TORMAG, brake_force_N
+from tormagd.physics.inserts import INSERTS
+
+ALL = list(INSERTS.values())
+LAWS = (ThesisFieldLaw(), PowerFieldLaw())
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_table_2_4_within_the_thesis_error(law: FieldLaw) -> None:
+    assert mean_relative_error(fit_friction(ALL, law), ALL) <= 0.102
+    assert mean_relative_error(fit_exponent(ALL, law), ALL) <= 0.075
+
+
+def test_no_other_friction_has_a_smaller_mean_error() -> None:
+    law = ThesisFieldLaw()
+    fit = fit_friction(ALL, law)
+    for shore, best in fit.friction.items():
+        matrix = [item for item in ALL if item.shore_hardness == shore]
+        least = mean_relative_error(fit, matrix)
+        for friction in np.linspace(0.5 * best, 2.0 * best, 301):
+            assert mean_relative_error(fit._replace(friction={shore: float(friction)}), matrix) >= least - 1e-12
+
+
+def test_the_registrys_friction_is_the_least_squares_of_the_relative_errors() -> None:
+    """With the thesis's field; it is given there to three digits."""
+    for matrix in (ALL[:4], ALL[4:8], ALL[8:]):
+        ratios = np.array([frictionless_range_N(item, LAWS[0]) / item.force_range.measured_N for item in matrix])
+        least = ratios.sum() / (ratios**2).sum()
+        assert {item.elastomer.friction_coefficient for item in matrix} == {round(float(least), 3)}
+
+
+def test_no_other_exponent_has_a_smaller_mean_error() -> None:
+    law = ThesisFieldLaw()
+    least = mean_relative_error(fit_exponent(ALL, law), ALL)
+    for exponent in np.linspace(0.8, 1.6, 161):
+        assert mean_relative_error(fit_friction(ALL, law, float(exponent)), ALL) >= least - 1e-4
+
+
+def test_left_out_inserts_are_predicted_worse() -> None:
+    law = ThesisFieldLaw()
+    for free in (False, True):
+        errors = leave_one_out(ALL, law, free_exponent=free)
+        assert set(errors) == set(INSERTS)
+        fit = fit_exponent(ALL, law) if free else fit_friction(ALL, law)
+        assert np.mean(list(errors.values())) > mean_relative_error(fit, ALL)
+
+
+def test_the_left_out_insert_does_not_see_its_own_measurement() -> None:
+    law = PowerFieldLaw()
+    others = [item for item in ALL if item.name != "MRE-10-10"]
+    expected = fit_friction(others, law).relative_error(INSERTS["MRE-10-10"])
+    assert leave_one_out(ALL, law, free_exponent=False)["MRE-10-10"] == expected
+
+
+def test_exponent_one_is_the_force_law_itself() -> None:
+    item, law = INSERTS["MRE-50-20"], PowerFieldLaw()
+    forces = brake_force_N(law.radial_moment_Tm(np.array([45.0, 95.0])), item.elastomer, TORMAG)
+    friction = item.elastomer.friction_coefficient
+    assert friction * frictionless_range_N(item, law) == pytest.approx(forces[0] - forces[1], rel=1e-12)
+
+
+def test_what_cannot_be_fitted_is_refused() -> None:
+    law = PowerFieldLaw()
+    with pytest.raises(DomainError, match="inserts"):
+        fit_friction([], law)
+    with pytest.raises(DomainError, match="shore_hardness"):
+        leave_one_out(ALL[:1] + ALL[4:], law, free_exponent=False)
+    with pytest.raises(DomainError, match="exponent"):
+        fit_friction(ALL, law, float("nan"))

@@ -1,0 +1,73 @@
+"""Relaxation spectra from synthetic records with a known answer."""
+
+import numpy as np
+import pytest
+
+from tormagd.lab.characterisation.relaxation import RelaxationRecord, fit_relaxation
+from tormagd.lab.errors import LabError
+from tormagd.physics.errors import DomainError
+from tormagd.physics.relaxation import PronySeries
+
+SERIES = PronySeries((0.05, 0.04, 0.04), (8.0, 90.0, 900.0))
+HOLD_S = np.concatenate(([0.0, 1e-3], 1e-3 + np.geomspace(0.05, 4000.0, 400)))
+
+
+def record(time_s: np.ndarray, driving: np.ndarray, scale_N: float = 2.5, noise_N: float = 0.0) -> RelaxationRecord:
+    state, forces = SERIES.relaxed(float(driving[0])), [SERIES.discretise(0.0).equilibrium_fraction * driving[0]]
+    for dt_s, level in zip(np.diff(time_s), driving[1:], strict=True):
+        force, state = SERIES.discretise(float(dt_s)).advance(state, float(level))
+        forces.append(force)
+    noise = np.random.default_rng(2).normal(0.0, noise_N, len(forces)) if noise_N else 0.0
+    return RelaxationRecord(time_s, driving, scale_N * np.array(forces) + noise)
+
+
+def step() -> np.ndarray:
+    return np.where(HOLD_S > 0.0, 1.0, 0.0)
+
+
+def test_a_step_gives_the_spectrum_and_the_scale() -> None:
+    fit = fit_relaxation(record(HOLD_S, step()))
+    assert fit.scale_N == pytest.approx(2.5, rel=1e-6)
+    assert fit.series.fractions == pytest.approx(SERIES.fractions, rel=1e-4)
+    assert fit.series.times_s == pytest.approx(SERIES.times_s, rel=1e-4)
+
+
+def test_ramps_down_and_up_give_the_same_spectrum() -> None:
+    time_s = np.arange(0.0, 4000.0, 5.0)
+    driving = 2.0 + np.interp(time_s, [0, 20, 800, 900, 2000, 2010, 4000], [3, 0, 0, 2, 2, -1, -1])
+    fit = fit_relaxation(record(time_s, driving))
+    assert fit.series.fractions == pytest.approx(SERIES.fractions, rel=1e-3)
+    assert fit.series.times_s == pytest.approx(SERIES.times_s, rel=1e-3)
+
+
+def test_noise_is_left_over_and_not_fitted() -> None:
+    fit = fit_relaxation(record(HOLD_S, step(), noise_N=0.005))
+    assert fit.rms_N == pytest.approx(0.005, rel=0.15)
+    assert sum(fit.series.fractions) == pytest.approx(0.13, abs=0.01)
+    assert fit.r2 > 0.99
+
+
+def test_one_branch_cannot_follow_three() -> None:
+    assert fit_relaxation(record(HOLD_S, step()), branches=1).rms_N > 10.0 * 1e-3
+
+
+def test_more_branches_than_the_record_shows_do_no_harm() -> None:
+    fit = fit_relaxation(record(HOLD_S, step()), branches=4)
+    assert 3 <= len(fit.series.fractions) <= 4
+    assert sum(fit.series.fractions) == pytest.approx(0.13, rel=1e-3)
+
+
+def test_records_that_cannot_be_fitted() -> None:
+    good = record(HOLD_S, step())
+    with pytest.raises(LabError, match="14 rows"):
+        fit_relaxation(RelaxationRecord(*(column[:10] for column in good)))
+    with pytest.raises(LabError, match="rise strictly"):
+        fit_relaxation(good._replace(time_s=good.time_s[::-1].copy()))
+    with pytest.raises(LabError, match="both change"):
+        fit_relaxation(good._replace(driving=np.ones_like(good.driving)))
+    with pytest.raises(LabError, match="equilibrium"):
+        fit_relaxation(good._replace(force_N=-good.force_N))
+    with pytest.raises(LabError, match="branches = 7"):
+        fit_relaxation(good, branches=7)
+    with pytest.raises(DomainError, match="force_N"):
+        fit_relaxation(good._replace(force_N=np.where(good.time_s > 1.0, np.nan, good.force_N)))

@@ -1,0 +1,141 @@
+"""The network and its training: derivatives, noise floor, determinism, scaling."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.func import functional_call, jacrev
+
+from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.levenberg_marquardt import Epoch, jacobian, train
+from tormagd.model.features import Scaling
+from tormagd.model.network import ForceNetwork
+from tormagd.physics.errors import DomainError
+
+NOISE_N = 0.02
+
+
+def synthetic(rows: int, seed: int, noise_N: float = NOISE_N) -> Dataset:
+    """A smooth synthetic brake: saturating in displacement, rising with the field, falling a little with the rate."""
+    rng = np.random.default_rng(seed)
+    features = np.column_stack(
+        (rng.uniform(0, 1, rows), rng.uniform(0, 60, rows), rng.uniform(100, 800, rows), np.full(rows, 40.0))
+    )
+    displacement, rate, field, _ = features.T
+    force = (1 - np.exp(-displacement / 0.3)) * (0.3 + 4 * (field / 800) ** 2) * (1 + 0.2 * np.exp(-rate / 20))
+    return Dataset(features, force + noise_N * rng.normal(size=rows))
+
+
+def network_for(data: Dataset, hidden: int = 10, seed: int = 0) -> ForceNetwork:
+    return ForceNetwork(Scaling.fit(data.features, data.force_N), hidden, seed=seed)
+
+
+def test_the_jacobian_is_that_of_automatic_differentiation() -> None:
+    network = network_for(synthetic(50, 0), hidden=7)
+    inputs = torch.randn(20, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    output, derivatives = jacobian(network, inputs)
+    shadow = _Scaled(network)
+    parameters = {name: value.detach() for name, value in shadow.named_parameters()}
+    expected = jacrev(lambda weights: functional_call(shadow, weights, (inputs,)))(parameters)
+    columns = torch.cat([expected[name].reshape(20, -1) for name in parameters], dim=1)
+    torch.testing.assert_close(output, network.forward_scaled(inputs), rtol=1e-13, atol=1e-14)
+    torch.testing.assert_close(derivatives, columns, rtol=1e-12, atol=1e-14)
+
+
+def test_training_reaches_the_noise_floor() -> None:
+    training, validation, fresh = synthetic(4000, 1), synthetic(1500, 2), synthetic(1500, 3, noise_N=0.0)
+    network = network_for(training, hidden=12)
+    result = train(network, training, validation, epochs=150)
+    assert result.best.validation_rmse_N == pytest.approx(NOISE_N, rel=0.06)
+    with torch.no_grad():
+        error = network(torch.tensor(fresh.features)).numpy() - fresh.force_N
+    assert np.sqrt(np.mean(error**2)) < NOISE_N / 3
+
+
+def test_every_accepted_step_lowers_the_training_error() -> None:
+    training, validation = synthetic(500, 1), synthetic(200, 2)
+    seen: list[Epoch] = []
+    result = train(network_for(training), training, validation, epochs=30, progress=seen.append)
+    errors = [step.train_rmse_N for step in result.history]
+    assert tuple(seen) == result.history
+    assert errors == sorted(errors, reverse=True)
+    assert [step.epoch for step in seen] == list(range(1, len(seen) + 1))
+
+
+def test_the_weights_left_are_the_best_on_validation() -> None:
+    training, validation = synthetic(60, 1, noise_N=0.3), synthetic(400, 2, noise_N=0.3)  # few rows: it overfits
+    network = network_for(training, hidden=20)
+    result = train(network, training, validation, epochs=100, patience=5)
+    assert result.stopped_by == "validation"
+    assert result.best.epoch < len(result.history)
+    assert result.best.validation_rmse_N == min(step.validation_rmse_N for step in result.history)
+    with torch.no_grad():
+        error = network(torch.tensor(validation.features)) - torch.tensor(validation.force_N)
+    assert math.sqrt(float(error.square().mean())) == pytest.approx(result.best.validation_rmse_N, rel=1e-9)
+
+
+def test_training_ends_by_damping_when_nothing_is_left_to_gain() -> None:
+    data = synthetic(8, 1)
+    result = train(network_for(data, hidden=10), data, data, epochs=400, patience=400)
+    assert result.stopped_by in ("damping", "epochs")
+    assert result.best.train_rmse_N < 1e-6
+
+
+def test_training_is_deterministic() -> None:
+    training, validation = synthetic(400, 1), synthetic(200, 2)
+
+    def run(seed: int) -> tuple[tuple[Epoch, ...], bytes]:
+        network = network_for(training, seed=seed)
+        result = train(network, training, validation, epochs=15)
+        return result.history, torch.nn.utils.parameters_to_vector(network.parameters()).detach().numpy().tobytes()
+
+    assert run(4) == run(4)
+    assert run(4)[1] != run(5)[1]
+
+
+def test_a_constant_column_neither_divides_by_zero_nor_matters() -> None:
+    training, validation = synthetic(400, 1), synthetic(200, 2)
+    network = network_for(training)
+    train(network, training, validation, epochs=15)
+    row = torch.tensor([[0.5, 10.0, 400.0, 40.0], [0.5, 10.0, 400.0, 12.0]], dtype=torch.float64)
+    with torch.no_grad():
+        force = network(row)
+    assert torch.isfinite(force).all()
+    assert float(force[0]) == pytest.approx(float(force[1]), rel=1e-13)
+    assert (network.hidden_weight[:, 3] == 0).all()
+
+
+def test_scaling_maps_the_ranges_onto_minus_one_to_one() -> None:
+    data = synthetic(300, 1)
+    network = network_for(data)
+    scaled = network.scale_inputs(torch.tensor(data.features))
+    torch.testing.assert_close(scaled.min(dim=0).values, torch.tensor([-1.0, -1, -1, 0], dtype=torch.float64))
+    torch.testing.assert_close(scaled.max(dim=0).values, torch.tensor([1.0, 1, 1, 0], dtype=torch.float64))
+    forces = network.scale_output(torch.tensor(data.force_N))
+    assert float(forces.min()) == pytest.approx(-1)
+    assert float(forces.max()) == pytest.approx(1)
+
+
+def test_what_cannot_be_trained_is_refused() -> None:
+    data = synthetic(50, 1)
+    with pytest.raises(DomainError, match="force_N"):
+        Scaling.fit(data.features, np.ones(50))
+    with pytest.raises(DomainError, match="hidden"):
+        network_for(data, hidden=0)
+    with pytest.raises(DomainError, match="float64"):
+        train(network_for(data).to(torch.float32), data, data)
+    for wrong in ({"epochs": 0}, {"patience": 0}):
+        with pytest.raises(DomainError, match=next(iter(wrong))):
+            train(network_for(data), data, data, **wrong)
+
+
+class _Scaled(torch.nn.Module):
+    """The network on scaled inputs, for torch.func."""
+
+    def __init__(self, network: ForceNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+        return self.network.forward_scaled(inputs)

@@ -1,0 +1,107 @@
+"""Material constants from a laboratory's records: shear modulus from a compression or tension test, relaxation.
+
+    tormag-lab characterise compression FILE.csv [--diameter-mm 30 --height-mm 12.5 --cycle 4]
+    tormag-lab characterise tension FILE.csv [--strain COLUMN --stress-mpa COLUMN --delimiter ";" --to-strain 0.5]
+    tormag-lab characterise relaxation FILE.csv [--branches 3]
+
+Compression files hold time_s,displacement_mm,force_N; relaxation files time_s,driving,force_N, the first row at rest.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tormagd.lab.characterisation.compression import (
+    Sample,
+    StressStretch,
+    deviations,
+    evaluated_cycle,
+    read_compression,
+)
+from tormagd.lab.characterisation.elasticity import fit_neo_hookean, fit_ogden, fit_thesis_ogden
+from tormagd.lab.characterisation.relaxation import RelaxationRecord, fit_relaxation
+from tormagd.lab.main import Found
+from tormagd.lab.tables import read_columns
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of `tormag-lab characterise`."""
+    kinds = parser.add_subparsers(required=True)
+    for name, handle in (("compression", compression), ("tension", tension), ("relaxation", relaxation)):
+        kind = kinds.add_parser(name)
+        kind.add_argument("file", type=Path)
+        kind.set_defaults(handle=handle)
+        if name == "compression":
+            kind.add_argument("--diameter-mm", type=float, default=30.0)
+            kind.add_argument("--height-mm", type=float, default=12.5)
+            kind.add_argument("--cycle", type=int, default=4, help="the cycle evaluated, counted from 1")
+        elif name == "tension":
+            kind.add_argument("--strain", default="Engineering Strain", help="column of engineering strain")
+            kind.add_argument("--stress-mpa", default="Engineering Stress (MPa)", help="column of engineering stress")
+            kind.add_argument("--delimiter", default=",")
+            kind.add_argument("--from-strain", type=float, default=0.05, help="leaves out the slack of the grips")
+            kind.add_argument("--to-strain", type=float, default=0.5)
+        else:
+            kind.add_argument("--branches", type=int, default=3)
+        if name != "relaxation":
+            kind.add_argument("--terms", type=int, default=1, help="terms of the Ogden law")
+
+
+def run(options: argparse.Namespace) -> Found:
+    """The constants of one record."""
+    figures: dict[str, Any] = options.handle(options)
+    return Found(figures, (f"{key}: {value}" for key, value in figures.items()))
+
+
+def compression(options: argparse.Namespace) -> dict[str, Any]:
+    """Moduli from the evaluated cycle, and where the test differs from the standard."""
+    record, sample = read_compression(options.file), Sample(options.diameter_mm, options.height_mm)
+    curve = evaluated_cycle(record, sample, options.cycle)
+    return {"cycle": options.cycle, "deviations": deviations(record, sample), **moduli(curve, options.terms)}
+
+
+def tension(options: argparse.Namespace) -> dict[str, Any]:
+    """Moduli from the part of a tension test between two strains."""
+    names = (options.strain, options.stress_mpa)
+    columns = read_columns(options.file, names, delimiter=options.delimiter)
+    strain, stress_MPa = (columns[name] for name in names)
+    chosen = (strain >= options.from_strain) & (strain <= options.to_strain)
+    return moduli(StressStretch(1.0 + strain[chosen], 1e6 * stress_MPa[chosen]), options.terms)
+
+
+def moduli(curve: StressStretch, terms: int) -> dict[str, Any]:
+    """The three laws' shear moduli, kPa, and how well each fits."""
+    neo_hookean, ogden = fit_neo_hookean(*curve), fit_ogden(*curve, terms=terms)
+    thesis = fit_thesis_ogden(*curve)
+    return {
+        "points": len(curve.stretch),
+        "stretch": [float(np.min(curve.stretch)), float(np.max(curve.stretch))],
+        "neo_hookean": {"shear_modulus_kPa": 1e-3 * neo_hookean.law.shear_modulus_Pa, "r2": neo_hookean.r2},
+        "ogden": {
+            "shear_modulus_kPa": 1e-3 * ogden.law.shear_modulus_Pa,
+            "moduli_kPa": [1e-3 * modulus_Pa for modulus_Pa in ogden.law.moduli_Pa],
+            "exponents": list(ogden.law.exponents),
+            "r2": ogden.r2,
+        },
+        "thesis_eq_3": {
+            "shear_modulus_kPa": 1e-3 * thesis.law.shear_modulus_Pa,
+            "G_o_kPa": 1e-3 * thesis.law.constant_Pa,
+            "alpha": thesis.law.exponent,
+            "r2": thesis.r2,
+        },
+    }
+
+
+def relaxation(options: argparse.Namespace) -> dict[str, Any]:
+    """Fractions and time constants of a relaxation record."""
+    record = RelaxationRecord(**read_columns(options.file, RelaxationRecord._fields))
+    fit = fit_relaxation(record, options.branches)
+    return {
+        "fractions": list(fit.series.fractions),
+        "times_s": list(fit.series.times_s),
+        "scale_N": fit.scale_N,
+        "r2": fit.r2,
+        "rms_N": fit.rms_N,
+    }

@@ -1,0 +1,136 @@
+"""A relaxation spectrum from a record: the `PronySeries` that turns the driving force into the measured one.
+
+The record may hold steps, ramps or anything else; the driving force is what the elastomer would give without memory, in
+any unit, because its scale is fitted too. With branch responses h_i the model is linear,
+
+    F = c_0 F0 + sum c_i h_i          g_i = c_i / (c_0 + sum c_i)
+
+so only the time constants are searched; the c are the non-negative least-squares solution for each trial. That keeps
+every fraction at or above zero and their sum at or below one, whatever the noise.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares, nnls
+
+from tormagd.lab.errors import LabError
+from tormagd.physics.errors import require
+from tormagd.physics.relaxation import MAX_FORCE_N, PronySeries
+
+Array = NDArray[np.float64]
+
+MAX_BRANCHES = 6
+LEAST_FRACTION = 1e-6
+"""A branch under this share of the force is noise, and left out of the series."""
+
+_STARTS = 3
+
+
+class RelaxationRecord(NamedTuple):
+    """Time, s; driving force in any unit; measured force, N. The first row is the state before, at rest."""
+
+    time_s: Array
+    driving: Array
+    force_N: Array
+
+
+@dataclass(frozen=True, slots=True)
+class RelaxationFit:
+    """The series; `scale_N`, the force at once per unit of driving force; r2; RMS of what is left, N."""
+
+    series: PronySeries
+    scale_N: float
+    r2: float
+    rms_N: float
+
+
+def fit_relaxation(record: RelaxationRecord, branches: int = 3) -> RelaxationFit:
+    """The series of up to `branches` (1..6) time constants that fits best.
+
+    The element is taken as rested at the first row; between rows the driving force goes straight, so a step is two rows
+    close together. Time constants are sought from a third of the shortest time step to three times the record: what is
+    slower cannot be told from the equilibrium. Branches the record shows nothing of are dropped.
+    Raises `LabError` for a record that is too short, not in order, or without driving force, and if nothing is left
+    at equilibrium (the record is too short to show it).
+    """
+    _check(record, branches)
+    steps = np.diff(record.time_s)
+    span = float(record.time_s[-1] - record.time_s[0])
+    low, high = math.log(float(steps.min()) / 3.0), math.log(3.0 * span)
+    best_norm, best = math.inf, np.empty(0)
+    for start in range(_STARTS):
+        # spread over the record's decades, each start shifted by a share of the spacing
+        places = (np.arange(branches) + (start + 1.0) / (_STARTS + 1.0)) / branches
+        fastest = max(low, math.log(span) - 2.5 * branches)
+        found = least_squares(
+            lambda log_times: _residual(record, np.exp(log_times)),
+            np.clip(fastest + places * (math.log(span) - fastest), low, high),
+            bounds=(low, high),
+            x_scale=0.5,
+            xtol=1e-10,
+            ftol=1e-12,
+            max_nfev=60,
+        )
+        norm = float(found.cost)
+        if norm < best_norm:
+            best_norm, best = norm, np.exp(found.x)
+    times_s = np.sort(best)
+    coefficients = _coefficients(record, times_s)
+    scale = float(coefficients.sum())
+    if not coefficients[0] > 0.0:
+        raise LabError("nothing is left at equilibrium: the record is too short to tell the slowest time from it")
+    kept = coefficients[1:] / scale >= LEAST_FRACTION
+    series = PronySeries(
+        tuple((coefficients[1:][kept] / scale).tolist()), tuple(float(time_s) for time_s in times_s[kept])
+    )
+    left = float(np.sum((_columns(record, times_s) @ coefficients - record.force_N) ** 2))
+    whole = float(np.sum((record.force_N - record.force_N.mean()) ** 2))
+    return RelaxationFit(series, scale, 1.0 - left / whole, math.sqrt(left / len(record.force_N)))
+
+
+def _columns(record: RelaxationRecord, times_s: Array) -> Array:
+    """F0 and each branch's response to it, one column each; the exact update of a force that goes straight."""
+    ratios = np.diff(record.time_s)[:, None] / times_s
+    changes = np.diff(record.driving)[:, None] * -np.expm1(-ratios) / ratios
+    decays = np.exp(-ratios)
+    columns = np.zeros((len(record.time_s), len(times_s) + 1))
+    columns[:, 0] = record.driving
+    for branch in range(len(times_s)):
+        response = 0.0
+        responses = [response]
+        for decay, change in zip(decays[:, branch].tolist(), changes[:, branch].tolist(), strict=True):
+            response = response * decay + change
+            responses.append(response)
+        columns[:, branch + 1] = responses
+    return columns
+
+
+def _coefficients(record: RelaxationRecord, times_s: Array) -> Array:
+    coefficients: Array = nnls(_columns(record, times_s), record.force_N)[0]
+    return coefficients
+
+
+def _residual(record: RelaxationRecord, times_s: Array) -> Array:
+    columns = _columns(record, times_s)
+    difference: Array = columns @ nnls(columns, record.force_N)[0] - record.force_N
+    return difference / float(np.linalg.norm(record.force_N))
+
+
+def _check(record: RelaxationRecord, branches: int) -> None:
+    if not 1 <= branches <= MAX_BRANCHES:
+        raise LabError(f"branches = {branches}: allowed is 1..{MAX_BRANCHES}")
+    rows = len(record.time_s)
+    if record.time_s.ndim != 1 or any(column.shape != (rows,) for column in record) or rows < 4 * branches + 2:
+        shapes = ", ".join(str(column.shape) for column in record)
+        raise LabError(f"columns of shape {shapes}: wanted are {4 * branches + 2} rows or more in each")
+    require("time_s", record.time_s, -1e12, 1e12)
+    require("driving", record.driving, -MAX_FORCE_N, MAX_FORCE_N)
+    require("force_N", record.force_N, -MAX_FORCE_N, MAX_FORCE_N)
+    if not (np.diff(record.time_s) > 0.0).all():
+        raise LabError("time_s does not rise strictly")
+    if not (np.ptp(record.driving) > 0.0 and np.ptp(record.force_N) > 0.0):
+        raise LabError("driving and force_N must both change: there is no relaxation to see")

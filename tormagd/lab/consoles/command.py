@@ -1,0 +1,101 @@
+"""Recordings of many consoles at once: how well each followed, what held it back, and how its device drifts.
+
+Every `.mcap` in the folder, or under a URL that fsspec knows (`s3://bucket/recordings` takes the package s3fs), is read
+by one of the workers, and summed up as `tormagd/recording/summary.py` says; `--out` keeps one row of a recording. The
+table has one line for each device and insert. A file that cannot be read is named and left out.
+"""
+
+import argparse
+import os
+import sys
+
+import fsspec
+import msgspec
+import pyarrow
+import pyarrow.parquet
+from tqdm import tqdm
+
+from tormagd.lab import executors
+from tormagd.lab.consoles.devices import Console, Drift, consoles
+from tormagd.lab.consoles.reading import SUFFIX, files, read_all
+from tormagd.lab.errors import LabError
+from tormagd.lab.main import Found
+from tormagd.lab.pages import aligned
+from tormagd.output import printable, write_line
+from tormagd.recording.summary import Summary
+
+HEADINGS = ("device", "insert", "files", "enabled", "RMS, worst mN", "trim", "current A", "clock ppm", "held back by")
+LEAST_SHARE, MOST_LIMITS = 0.001, 3
+"A limit that was there for less of the time is not shown to a person, nor more of them."
+KINDS = {
+    str: pyarrow.string(),
+    bool: pyarrow.bool_(),
+    int | None: pyarrow.int64(),
+    float: pyarrow.float64(),
+    float | None: pyarrow.float64(),
+    dict[str, float]: pyarrow.map_(pyarrow.string(), pyarrow.float64()),
+}
+"By the type of a figure, that of its column."
+
+
+def write_parquet(summaries: dict[str, Summary], url: str) -> None:
+    """One row of a recording, `file` and the fields of `Summary`. Raises OSError."""
+    fields = msgspec.structs.fields(Summary)
+    columns = [("file", pyarrow.string()), *((field.name, KINDS[field.type]) for field in fields)]
+    rows = [{"file": name, **msgspec.structs.asdict(each)} for name, each in summaries.items()]
+    table = pyarrow.Table.from_pylist(rows, pyarrow.schema(columns))
+    with fsspec.open(url, "wb") as file:
+        pyarrow.parquet.write_table(table, file)
+
+
+def _cells(console: Console) -> tuple[str, ...]:
+    errors_N = (console.tracking_rms_N, console.worst_rms_N)
+    held = [f"{code} {share:.1%}" for code, share in console.limits.items() if share >= LEAST_SHARE][:MOST_LIMITS]
+    faults = [f"{code} in {count}" for code, count in console.faults.items()]
+    return (
+        "unknown" if console.serial_number is None else f"{console.serial_number:08x}",
+        printable(console.insert) or "unknown",
+        str(console.recordings),
+        f"{console.enabled_s:.0f} s",
+        ", ".join("unknown" if error_N is None else f"{1e3 * error_N:.1f}" for error_N in errors_N),
+        _shown(console.trim, ".3f"),
+        _shown(console.current_A, ".2f"),
+        _shown(console.clock_drift_ppm, ".0f"),
+        printable(", ".join([*held, *faults])) or "nothing",
+    )
+
+
+def _shown(drift: Drift | None, form: str) -> str:
+    if drift is None:
+        return "unknown"
+    first, newest = f"{drift.first:{form}}", f"{drift.newest:{form}}"
+    if first == newest:
+        return first
+    return f"{first}..{newest}" + ("" if drift.per_day is None else f" ({drift.per_day:+.1g}/day)")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of `tormag-lab fleet`."""
+    parser.add_argument("recordings", metavar="FOLDER|URL", help="where they are, in folders of their own or not")
+    parser.add_argument("--out", metavar="FILE|URL", help="Parquet: one row of a recording")
+    executors.add_options(parser, os.cpu_count() or 1, needed="tormagd[lab], and to reach the recordings")
+
+
+def run(options: argparse.Namespace) -> Found:
+    """The consoles; exit code 1 where a file was left out, which is told on stderr. Raises LabError, OSError."""
+    try:
+        urls = files(options.recordings)
+    except (ValueError, ImportError) as error:
+        raise LabError(str(error)) from error
+    if not urls:
+        raise LabError(f"{options.recordings}: no {SUFFIX} in it; `tormagctl record` makes them")
+    bar = tqdm(total=len(urls), unit="recording", disable=None)
+    with executors.chosen(options) as executor, bar:
+        fleet = read_all(urls, executor, lambda finished, total: bar.update(finished - bar.n))
+    for name, reason in fleet.left_out.items():
+        write_line(f"tormag-lab fleet: left out {printable(name)}: {printable(reason)}", sys.stderr)
+    if options.out is not None:
+        write_parquet(fleet.summaries, options.out)
+    found = consoles(fleet.summaries.values())
+    result = {"consoles": found, "recordings": fleet.summaries, "left_out": fleet.left_out}
+    return Found(msgspec.to_builtins(result), aligned([HEADINGS, *map(_cells, found)]), 1 if fleet.left_out else 0)

@@ -1,0 +1,275 @@
+"""Structural optimisation (Eq. 39-42, table 3.2): outer radius, thickness and open gap for the portrait of a task.
+
+Two questions can be asked of a design. The thesis's cost (Eq. 39) adds the squared distances of the portrait's four
+corners from those of the task; it mixes newtons with newtons per second, and a portrait larger than the task costs as
+much as a smaller one. Ours is coverage of the required region, and among designs that cover as much, the least volume
+of elastomer, then the smallest open gap: `SLACK` is the coverage that may be given up for it.
+
+Two solvers, both scipy's. "local" follows the slopes from the start (SLSQP), as the thesis's fmincon did, and ends in
+whatever minimum that start leads to. "global" is differential evolution, with the start as one member of its first
+generation, followed by a derivative-free local search (COBYQA).
+
+A constraint is told to the solvers as one: the elastomer must bear the field of the closed gap (lambda1 >= 0.05).
+"""
+
+import itertools
+import math
+import time
+from collections.abc import Callable
+from typing import Any, Literal, TypeAlias
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import Bounds, NonlinearConstraint, OptimizeResult, differential_evolution, minimize
+
+from tormagd.lab.design.brake import Brake
+from tormagd.lab.design.phase_portrait import PhasePortrait, Region
+from tormagd.physics.errors import DomainError, require
+from tormagd.physics.field import PowerFieldLaw
+from tormagd.physics.force import Elastomer, Geometry, max_radial_moment_Tm
+
+Array = npt.NDArray[np.float64]
+Measure: TypeAlias = Literal["trapezoid", "true", "corners"]
+"""Coverage by the thesis's trapezoid, coverage by the true boundary, or the thesis's cost of corner distances."""
+Solver: TypeAlias = Literal["local", "global"]
+
+SLACK = 1e-4
+"""Coverage that a smaller elastomer may cost: a hundredth of a percent."""
+_GAP_WEIGHT = 1e-4
+"""Of the open gap beside the volume: decides only between volumes that are as good as equal."""
+_POPULATION = 10
+_GENERATIONS = 50
+_TRUST_RADIUS = 0.05
+_EVALUATIONS = 100
+
+
+class Design(msgspec.Struct, frozen=True):
+    """What is sought, mm: outer radius R_o, thickness t and open gap s_max."""
+
+    outer_radius_mm: float
+    thickness_mm: float
+    open_mm: float
+
+
+class Problem(msgspec.Struct, frozen=True):
+    """A task's region, the measure of success, and all that is given; the defaults are the thesis's (appendix B).
+
+    Raises `DomainError` for a lower bound that is not below its upper one, for an outer radius that leaves a shell
+    thinner than 0.5 mm, and for an open gap within 1 mm of the closed one.
+    """
+
+    region: Region
+    measure: Measure
+    gap_speed_mm_s: float
+    lower: Design = Design(6.5, 0.5, 46.0)
+    upper: Design = Design(45.0, 50.0, 200.0)
+    inner_radius_mm: float = 4.0
+    roller_radius_mm: float = 20.0
+    closed_mm: float = 45.0
+    shear_modulus_Pa: float = 300e3
+    relative_permeability: float = 3.8
+    friction_coefficient: float = 0.2
+
+    def __post_init__(self) -> None:
+        for name, low, high in zip(Design.__struct_fields__, _tuple(self.lower), _tuple(self.upper), strict=True):
+            require(f"lower.{name}", low, 0.01, 1e4)
+            require(f"upper.{name}", high, 0.01, 1e4)
+            if not low < high:
+                raise DomainError(f"upper.{name}", high, f"above lower.{name}, {low:g}")
+        if not self.lower.outer_radius_mm >= self.inner_radius_mm + 0.5:
+            raise DomainError("lower.outer_radius_mm", self.lower.outer_radius_mm, "a shell of 0.5 mm or more")
+        if not self.lower.open_mm >= self.closed_mm + 1.0:
+            raise DomainError("lower.open_mm", self.lower.open_mm, f"1 mm or more above {self.closed_mm:g}")
+
+    def geometry(self, design: Design) -> Geometry:
+        """The design's geometry."""
+        return Geometry(
+            inner_radius_m=1e-3 * self.inner_radius_mm,
+            outer_radius_m=1e-3 * design.outer_radius_mm,
+            thickness_m=1e-3 * design.thickness_mm,
+            roller_radius_m=1e-3 * self.roller_radius_mm,
+        )
+
+    @property
+    def elastomer(self) -> Elastomer:
+        """The given elastomer."""
+        return Elastomer(self.shear_modulus_Pa, self.relative_permeability, self.friction_coefficient)
+
+    def portrait(self, design: Design) -> PhasePortrait:
+        """The design's phase portrait; `DomainError` for a design that no brake can have."""
+        brake = Brake(PowerFieldLaw(), self.elastomer, self.geometry(design), self.closed_mm, design.open_mm)
+        return PhasePortrait(brake, self.gap_speed_mm_s)
+
+    def load_margin(self, design: Design) -> float:
+        """1 - field of the closed gap over the largest the elastomer bears; admissible where not negative."""
+        moment_Tm = PowerFieldLaw().radial_moment_Tm(self.closed_mm)
+        return 1.0 - moment_Tm / max_radial_moment_Tm(self.elastomer, self.geometry(design))
+
+    def volume_mm3(self, design: Design) -> float:
+        """Elastomer in the design."""
+        return math.pi * (design.outer_radius_mm**2 - self.inner_radius_mm**2) * design.thickness_mm
+
+
+class Outcome(msgspec.Struct, frozen=True):
+    """What a solver found. `coverage` is by the true boundary where that was the measure, else by the trapezoid."""
+
+    design: Design
+    coverage: float
+    corner_cost: float
+    volume_mm3: float
+    evaluations: int
+    seconds: float
+    """Processor time of the solving thread."""
+
+
+class Run(msgspec.Struct, frozen=True):
+    """One start of one solver on one problem: all that its outcome depends on."""
+
+    problem: Problem
+    start: Design
+    solver: Solver
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        lower, upper = _tuple(self.problem.lower), _tuple(self.problem.upper)
+        for name, value, low, high in zip(Design.__struct_fields__, _tuple(self.start), lower, upper, strict=True):
+            require(f"start.{name}", float(value), low, high)
+        require("seed", float(self.seed), 0.0, 2.0**31)
+
+
+def coverage(problem: Problem, design: Design) -> float:
+    """Share of the problem's region that the design covers, 0..1; `DomainError` for an impossible design."""
+    portrait = problem.portrait(design)
+    if problem.measure == "true":
+        return portrait.true_coverage(problem.region)
+    return portrait.trapezoid_coverage(problem.region)
+
+
+def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
+    """The least coverage where every dimension may be off by `share`, down, not at all, or up; 0 where one of these
+    designs does not bear its field."""
+    factors = itertools.product((1.0 - share, 1.0, 1.0 + share), repeat=len(Design.__struct_fields__))
+    made = [Design(*(value * factor for value, factor in zip(_tuple(design), each, strict=True))) for each in factors]
+    return min(coverage(problem, each) if problem.load_margin(each) >= 0.0 else 0.0 for each in made)
+
+
+def corner_cost(problem: Problem, design: Design) -> float:
+    """The thesis's cost, Eq. 39: sum of the squared corner distances, N and N/s taken as equal."""
+    offered, wanted = problem.portrait(design).trapezoid(), problem.region
+    # the lower corners mirror the upper ones
+    return 2.0 * (
+        (offered.least_N - wanted.least_N) ** 2
+        + (offered.least_rate_N_s - wanted.least_rate_N_s) ** 2
+        + (offered.most_N - wanted.most_N) ** 2
+        + (offered.most_rate_N_s - wanted.most_rate_N_s) ** 2
+    )
+
+
+def solve(run: Run) -> Outcome:
+    """The design that the run's solver finds from its start; the same run gives the same design anywhere.
+
+    Raises `DomainError` where the solver finds no design whose elastomer bears the field.
+    """
+    began_s = time.thread_time()
+    search = _Search(run.problem)
+    cost = search.corner_cost if run.problem.measure == "corners" else search.miss
+    first = search.scaled(run.start)
+    best = search.global_minimum(cost, first, run.seed) if run.solver == "global" else search.local_minimum(cost, first)
+    if run.problem.measure != "corners" and run.solver == "global":
+        best = search.smallest(best, run.seed)
+    design = search.design(best)
+    if run.problem.load_margin(design) < 0.0:
+        raise DomainError("shear_modulus_Pa", run.problem.shear_modulus_Pa, "an elastomer that bears the closed gap")
+    return Outcome(
+        design=design,
+        coverage=coverage(run.problem, design),
+        corner_cost=corner_cost(run.problem, design),
+        volume_mm3=run.problem.volume_mm3(design),
+        evaluations=search.evaluations,
+        seconds=time.thread_time() - began_s,
+    )
+
+
+class _Search:
+    """A problem in coordinates that run from 0 to 1 between the bounds, as the solvers want it."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.evaluations = 0
+        self._low = np.array(_tuple(problem.lower))
+        self._span = np.array(_tuple(problem.upper)) - self._low
+        self._bounds = Bounds(np.zeros(3), np.ones(3), keep_feasible=True)
+        self._margin = NonlinearConstraint(lambda x: problem.load_margin(self.design(x)), 0.0, np.inf)
+
+    def scaled(self, design: Design) -> Array:
+        return np.asarray((np.array(_tuple(design)) - self._low) / self._span)
+
+    def design(self, x: Array) -> Design:
+        # a solver may step a rounding outside its bounds
+        return Design(*(float(value) for value in self._low + self._span * np.clip(x, 0.0, 1.0)))
+
+    def miss(self, x: Array) -> float:
+        """Share of the region not covered; all of it where the elastomer would not bear the field."""
+        return 1.0 - self._at(coverage, x, 0.0)
+
+    def corner_cost(self, x: Array) -> float:
+        return self._at(corner_cost, x, math.inf)
+
+    def size(self, x: Array) -> float:
+        """Elastomer over the most that the bounds allow, and a trace of the open gap."""
+        volume = self.problem.volume_mm3(self.design(x)) / self.problem.volume_mm3(self.problem.upper)
+        return volume + _GAP_WEIGHT * float(x[2])
+
+    def global_minimum(self, cost: Callable[[Array], float], start: Array, seed: int) -> Array:
+        found = self._evolve(cost, start, seed, [self._margin])
+        return self._refine(cost, found, [self._margin])
+
+    def local_minimum(self, cost: Callable[[Array], float], start: Array) -> Array:
+        margin = {"type": "ineq", "fun": self._margin.fun}
+        result = minimize(cost, start, method="SLSQP", bounds=self._bounds, constraints=[margin])
+        return _better(cost, start, result)
+
+    def smallest(self, best: Array, seed: int) -> Array:
+        """The smallest among the designs that cover as much as `best`, less the slack."""
+        allowed = self.miss(best) + SLACK
+        limits = [NonlinearConstraint(self.miss, -np.inf, allowed), self._margin]
+        found = self._refine(self.size, self._evolve(self.size, best, seed, limits), limits)
+        return found if self.miss(found) <= allowed else best
+
+    def _evolve(self, cost: Callable[[Array], float], start: Array, seed: int, limits: list[Any]) -> Array:
+        result = differential_evolution(
+            cost,
+            self._bounds,
+            constraints=limits,
+            x0=start,
+            rng=np.random.default_rng(seed),
+            popsize=_POPULATION,
+            maxiter=_GENERATIONS,
+            tol=1e-6,
+            atol=1e-9,
+            polish=False,
+        )
+        return np.asarray(result.x)
+
+    def _refine(self, cost: Callable[[Array], float], start: Array, limits: list[Any]) -> Array:
+        options = {"initial_tr_radius": _TRUST_RADIUS, "final_tr_radius": 1e-5, "maxfev": _EVALUATIONS}
+        result = minimize(cost, start, method="COBYQA", bounds=self._bounds, constraints=limits, options=options)
+        return _better(cost, start, result) if _keeps(limits, result.x) else start
+
+    def _at(self, function: Callable[[Problem, Design], float], x: Array, impossible: float) -> float:
+        self.evaluations += 1
+        design = self.design(x)
+        return function(self.problem, design) if self.problem.load_margin(design) >= 0.0 else impossible
+
+
+def _better(cost: Callable[[Array], float], start: Array, result: OptimizeResult) -> Array:
+    return np.asarray(result.x) if cost(result.x) < cost(start) else start
+
+
+def _keeps(limits: list[Any], x: Array) -> bool:
+    return all(limit.lb <= limit.fun(x) <= limit.ub for limit in limits)
+
+
+def _tuple(design: Design) -> tuple[float, float, float]:
+    return design.outer_radius_mm, design.thickness_mm, design.open_mm

@@ -1,0 +1,162 @@
+"""The phase portrait: which (force, force rate) points a brake renders at a gap speed, and how much of a task that is.
+
+At the gap g the brake gives F(g) and |dF/dt| <= |dF/dg| * gap speed (Eq. 36). That is the *true* boundary. The thesis
+joins the two end points by straight lines, a *trapezoid*; F falls about as gap^-2.6, so the true boundary lies below
+that line in between. Both are kept: the trapezoid to compare with the thesis, the true one to decide with.
+
+Coverage of a region is a ratio of areas, exact for the trapezoid and a one-dimensional integral over the gap for the
+true boundary. Coverage of a point cloud is a share of its points.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from tormagd.lab.design.brake import Brake
+from tormagd.physics.errors import DomainError, FloatArray, require
+
+Mask = npt.NDArray[np.bool_]
+
+MAX_FORCE_N = 1e6
+MAX_RATE_N_S = 1e9
+MAX_GAP_SPEED_MM_S = 1e4
+_PANELS = 256
+"""Of the integral: the area of a region's coverage is then good to 1e-5 (see the tests)."""
+
+
+class Region(msgspec.Struct, frozen=True):
+    """What a task requires: |dF/dt| up to a rate that rises or falls linearly from the least to the most force.
+
+    Raises `DomainError` unless 0 <= least_N < most_N, both rates are finite and not negative, and not both are zero.
+    """
+
+    least_N: float
+    least_rate_N_s: float
+    most_N: float
+    most_rate_N_s: float
+
+    def __post_init__(self) -> None:
+        for name in ("least_N", "most_N"):
+            require(name, float(getattr(self, name)), 0.0, MAX_FORCE_N)
+        for name in ("least_rate_N_s", "most_rate_N_s"):
+            require(name, float(getattr(self, name)), 0.0, MAX_RATE_N_S)
+        if not self.least_N < self.most_N:
+            raise DomainError("most_N", self.most_N, f"above least_N, {self.least_N:g}")
+        if not self.least_rate_N_s + self.most_rate_N_s > 0.0:
+            raise DomainError("most_rate_N_s", self.most_rate_N_s, "above 0 where least_rate_N_s is 0")
+
+    @property
+    def half_area(self) -> float:
+        """Area of the half with rising force, N^2/s; the other half is its mirror image."""
+        return 0.5 * (self.least_rate_N_s + self.most_rate_N_s) * (self.most_N - self.least_N)
+
+    def rate_N_s(self, force_N: FloatArray) -> FloatArray:
+        """The rate required at a force inside the region."""
+        share = (force_N - self.least_N) / (self.most_N - self.least_N)
+        return self.least_rate_N_s + share * (self.most_rate_N_s - self.least_rate_N_s)
+
+
+class CloudCoverage(NamedTuple):
+    """Which points of a recorded task a brake renders, and why not the others; masks in the order of the points."""
+
+    covered: Mask
+    below_least_force: Mask
+    above_most_force: Mask
+    too_fast: Mask
+    """Within the forces, but beyond the rate."""
+
+    @property
+    def share(self) -> float:
+        """Covered points over all points."""
+        return float(np.mean(self.covered))
+
+
+@dataclass(frozen=True, slots=True)
+class PhasePortrait:
+    """A brake whose gap moves at up to `gap_speed_mm_s`; `DomainError` unless that is above 0 and up to 10 m/s."""
+
+    brake: Brake
+    gap_speed_mm_s: float
+
+    def __post_init__(self) -> None:
+        require("gap_speed_mm_s", self.gap_speed_mm_s, 1e-6, MAX_GAP_SPEED_MM_S)
+
+    def outline(self, points: int = 201) -> tuple[FloatArray, FloatArray]:
+        """The true boundary's upper half: (force_N, rate_N_s), both of `points` elements, force falling."""
+        gap_mm = np.geomspace(self.brake.closed_mm, self.brake.open_mm, points)
+        # a geometric series may end a rounding beyond its ends
+        gap_mm = np.clip(gap_mm, self.brake.closed_mm, self.brake.open_mm)
+        return self.brake.force_N(gap_mm), self.gap_speed_mm_s * self.brake.slope_N_mm(gap_mm)
+
+    def trapezoid(self) -> Region:
+        """The thesis's portrait: the end points of the true boundary, joined by a straight line."""
+        speed, brake = self.gap_speed_mm_s, self.brake
+        return Region(
+            brake.least_N,
+            speed * brake.slope_N_mm(brake.open_mm),
+            brake.most_N,
+            speed * brake.slope_N_mm(brake.closed_mm),
+        )
+
+    def true_coverage(self, region: Region) -> float:
+        """Share of the region's area inside the true boundary, 0..1."""
+        brake = self.brake
+        least, most = brake.least_N, brake.most_N
+        low, high = max(region.least_N, least), min(region.most_N, most)
+        if low >= high:
+            return 0.0
+        nearest_mm = brake.closed_mm if high == most else brake.gap_mm(high)
+        farthest_mm = brake.open_mm if low == least else brake.gap_mm(low)
+        # over ln(gap) the curves are nearly straight, and dF = |dF/dgap| gap d(ln gap)
+        log_gap = np.linspace(np.log(nearest_mm), np.log(farthest_mm), _PANELS + 1)
+        gap_mm = np.clip(np.exp(log_gap), brake.closed_mm, brake.open_mm)
+        slope = brake.slope_N_mm(gap_mm)
+        force = np.clip(brake.force_N(gap_mm), low, high)
+        rendered = np.minimum(region.rate_N_s(force), self.gap_speed_mm_s * slope)
+        # over the force, whose differences sum to the overlap exactly: full coverage is 1, not 1 give or take
+        area = -float(np.trapezoid(rendered, force))
+        return min(area / region.half_area, 1.0)
+
+    def trapezoid_coverage(self, region: Region) -> float:
+        """Share of the region's area inside the thesis's trapezoid, 0..1; exact."""
+        offered = self.trapezoid()
+        low, high = max(region.least_N, offered.least_N), min(region.most_N, offered.most_N)
+        if low >= high:
+            return 0.0
+        ends = np.array([low, high])
+        required, rendered = region.rate_N_s(ends), offered.rate_N_s(ends)
+        first, last = rendered - required
+        forces = ends
+        if first * last < 0.0:
+            crossing = low + (high - low) * first / (first - last)
+            forces = np.array([low, crossing, high])
+        smaller = np.minimum(region.rate_N_s(forces), offered.rate_N_s(forces))
+        return min(float(np.trapezoid(smaller, forces)) / region.half_area, 1.0)
+
+    def true_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
+        """The points of a task against the true boundary. Raises `DomainError` for points that are not finite."""
+        inside = self._within_forces(force_N, rate_N_s)
+        limit = np.zeros_like(force_N)
+        limit[inside] = self.gap_speed_mm_s * self.brake.slope_N_mm(self.brake.gap_mm(force_N[inside]))
+        return self._judge(force_N, rate_N_s, limit)
+
+    def trapezoid_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
+        """The points of a task against the thesis's trapezoid. Raises `DomainError` for points that are not finite."""
+        self._within_forces(force_N, rate_N_s)
+        return self._judge(force_N, rate_N_s, self.trapezoid().rate_N_s(force_N))
+
+    def _within_forces(self, force_N: FloatArray, rate_N_s: FloatArray) -> Mask:
+        if force_N.ndim != 1 or force_N.shape != rate_N_s.shape or not force_N.size:
+            raise DomainError("rate_N_s", rate_N_s.shape, f"one rate for each of one or more forces, {force_N.shape}")
+        require("force_N", force_N, -MAX_FORCE_N, MAX_FORCE_N)
+        require("rate_N_s", rate_N_s, -MAX_RATE_N_S, MAX_RATE_N_S)
+        inside: Mask = (force_N >= self.brake.least_N) & (force_N <= self.brake.most_N)
+        return inside
+
+    def _judge(self, force_N: FloatArray, rate_N_s: FloatArray, limit_N_s: FloatArray) -> CloudCoverage:
+        below, above = force_N < self.brake.least_N, force_N > self.brake.most_N
+        fast = ~below & ~above & (np.abs(rate_N_s) > limit_N_s)
+        return CloudCoverage(~(below | above | fast), below, above, fast)

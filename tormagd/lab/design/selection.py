@@ -1,0 +1,95 @@
+"""Table 2.5 as a method: which inserts serve a task's force range and resolution, and why the others do not."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from tormagd.lab.design.brake import Brake
+from tormagd.physics.errors import DomainError, require
+from tormagd.physics.force import radial_moment_for_force_Tm
+
+_POINTS = 201
+
+
+@dataclass(frozen=True, slots=True)
+class ForceTask:
+    """What a task asks of a brake. `DomainError` unless 0 <= least_N < most_N and 0 < resolution_N."""
+
+    name: str
+    least_N: float
+    most_N: float
+    resolution_N: float
+
+    def __post_init__(self) -> None:
+        for name in ("least_N", "most_N"):
+            require(name, getattr(self, name), 0.0, 1e6)
+        require("resolution_N", self.resolution_N, 1e-9, 1e6)
+        if not self.least_N < self.most_N:
+            raise DomainError("most_N", self.most_N, f"above least_N, {self.least_N:g}")
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One insert before one task. `reasons` says why it is out; empty means that it serves."""
+
+    insert: str
+    least_N: float
+    most_N: float
+    resolution_N: float
+    """Largest force change that one gap step makes within the part of the task's range that the insert reaches."""
+    served_share: float
+    """Share of the task's force range between the insert's least and most force."""
+    sufficient_gap_mm: float
+    """Gap at which the least force is low enough; NaN where the field law says nothing of such a gap."""
+    reasons: tuple[str, ...]
+
+    @property
+    def serves(self) -> bool:
+        """Whether the insert does all that the task asks."""
+        return not self.reasons
+
+
+def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) -> Verdict:
+    """One insert before a task, where the gap is placed in steps of `gap_resolution_mm` (0 < step <= 10 mm).
+
+    A passive brake never reaches 0 N. It serves a least force that it misses by no more than the task's resolution:
+    the task could not tell the difference.
+    """
+    require("gap_resolution_mm", gap_resolution_mm, 1e-9, 10.0)
+    least, most = brake.least_N, brake.most_N
+    low, high = max(least, task.least_N), min(most, task.most_N)
+    reasons = []
+    if least > task.least_N + task.resolution_N:
+        reasons.append(f"least force {least:.2f} N is above {task.least_N:g} N by more than {task.resolution_N:g} N")
+    if most < task.most_N:
+        reasons.append(f"most force {most:.2f} N is below {task.most_N:g} N")
+    if low >= high:
+        # no gap gives any force of the task; the finest step the insert has is the fairest figure left
+        resolution = gap_resolution_mm * brake.slope_N_mm(brake.open_mm)
+        share = 0.0
+    else:
+        gaps = np.clip(np.linspace(brake.gap_mm(high), brake.gap_mm(low), _POINTS), brake.closed_mm, brake.open_mm)
+        resolution = gap_resolution_mm * float(np.max(brake.slope_N_mm(gaps)))
+        share = (high - low) / (task.most_N - task.least_N)
+    if resolution > task.resolution_N:
+        reasons.append(f"one gap step changes {1e3 * resolution:.1f} mN, more than {1e3 * task.resolution_N:g} mN")
+    return Verdict(insert, least, most, resolution, share, _sufficient_gap_mm(brake, task), tuple(reasons))
+
+
+def rank(inserts: Mapping[str, Brake], task: ForceTask, gap_resolution_mm: float) -> list[Verdict]:
+    """All inserts, best first: those that serve by the finest resolution, then the others by the share they serve."""
+    verdicts = [judge(name, brake, task, gap_resolution_mm) for name, brake in inserts.items()]
+    return sorted(verdicts, key=lambda v: (not v.serves, -v.served_share if v.reasons else 0.0, v.resolution_N))
+
+
+def _sufficient_gap_mm(brake: Brake, task: ForceTask) -> float:
+    tolerated_N = task.least_N + task.resolution_N
+    if tolerated_N >= brake.least_N:
+        return brake.open_mm
+    moment_Tm = radial_moment_for_force_Tm(tolerated_N, brake.elastomer, brake.geometry)
+    farthest_mm = brake.field.gap_range_mm[1]
+    if moment_Tm < brake.field.radial_moment_Tm(farthest_mm):
+        return math.nan
+    return brake.field.gap_mm(moment_Tm)

@@ -1,0 +1,98 @@
+"""`tormag-lab NAME`: the laboratory's commands. Each is a module, which is loaded when it is asked for.
+
+A module has `add_options(parser)` and `run(options)`, which returns what was found. It is printed as one JSON object
+with --json, and in `lines` for a person otherwise.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from importlib import import_module
+from typing import NamedTuple
+
+from tormagd.config import ConfigError
+from tormagd.force_file import ForceFileError
+from tormagd.lab.errors import LabError, not_installed
+from tormagd.output import printable, write_line
+from tormagd.physics.errors import DomainError
+from tormagd.simulation.parameters import PlantError
+
+USAGE = 2
+REFUSALS = (LabError, ConfigError, ForceFileError, DomainError, PlantError)
+"What the rooms that are used here refuse input with."
+
+
+class Found(NamedTuple):
+    """What a command found: plain data, the same for a person, and the exit code."""
+
+    figures: object
+    lines: Iterable[str]
+    exit_code: int = 0
+
+
+class Command(NamedTuple):
+    """The module of `tormagd.lab`, and what it does."""
+
+    module: str
+    summary: str
+
+
+COMMANDS = {
+    "reproduce-thesis": Command("thesis.reproduction", "the thesis's tables and figures beside ours"),
+    "tactile-experiment": Command("tactile.experiment", "chapter 4 on a simulated pad: models, the pulse, holds"),
+    "tactile-hold": Command("tactile.held", "a force held on the pad for an hour, in virtual time"),
+    "characterise": Command("characterisation.command", "shear modulus and relaxation from a record"),
+    "optimise-design": Command("design.command", "the brake's geometry for a task"),
+    "bench-sweep": Command("training.bench_sweep", "training data from the simulated device on a bench"),
+    "train-model": Command("training.train_model", "a model file from training data"),
+    "tactile-model": Command("tactile.shipped", "a model file of a simulated pad"),
+    "identify-motor": Command("motor.command", "a motor and its screw from a log"),
+    "tune-position": Command("tune_position", "the gains of the position loop for a motor"),
+    "wire-log": Command("wire_log", "a session between host and device as a CAN log"),
+    "fleet": Command("consoles.command", "what the recordings of many consoles say of each"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command that is named first; returns its exit code, 2 for what cannot be."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    name = given[0] if given else "--help"
+    if name in COMMANDS:
+        return run(name, given[1:])
+    wanted = name in ("-h", "--help")
+    lines = ["usage: tormag-lab NAME [--help] ...", ""] if wanted else [f"tormag-lab: no command {name!r}. There are:"]
+    lines += [f"  {each:20}{command.summary}" for each, command in COMMANDS.items()]
+    write_line("\n".join(lines), sys.stdout if wanted else sys.stderr)
+    return 0 if wanted else USAGE
+
+
+def run(name: str, arguments: Sequence[str]) -> int:
+    """Runs one command and prints what it found."""
+    try:
+        module = import_module(f"tormagd.lab.{COMMANDS[name].module}")
+        parser = argparse.ArgumentParser(
+            prog=f"tormag-lab {name}", description=module.__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        )
+        parser.add_argument("--json", action="store_true", help="print one JSON object")
+        module.add_options(parser)
+        options = parser.parse_args(arguments)
+        command: Callable[[argparse.Namespace], Found] = module.run
+        found = command(options)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("tormagd"):
+            raise
+        return _refuse(name, not_installed(error.name.partition(".")[0]))
+    except OSError as error:
+        return _refuse(name, f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except ValueError as error:
+        if not isinstance(error, REFUSALS):
+            raise
+        return _refuse(name, str(error))
+    write_line(json.dumps(found.figures) if options.json else "\n".join(found.lines), sys.stdout)
+    return found.exit_code
+
+
+def _refuse(name: str, reason: str) -> int:
+    write_line(printable(f"tormag-lab {name}: {reason}"), sys.stderr)
+    return USAGE

@@ -1,0 +1,119 @@
+"""Identifies a motor and its screw from a log: mass, friction, offset, delay, with 95% confidence.
+
+Reads the motor log CSV (`t_s,input_V,position_mm`, optionally `current_A`) that `tormagctl calibrate --motors` writes,
+or the EMPS benchmark's .mat file, which states its own gain. `motor.fit` says with which models, and what the intervals
+cover. Volts and position alone fix only ratios to the gain: without `--gain-N-V` or a current the physical values are
+null. Everything is referred to the carriage; `viscous_N_s_m` is the slope of gain times voltage over speed, the
+back-EMF's part included.
+
+The first half of the log is fitted and the second half judged; the parameters come from all of it. `--samples` makes
+such logs of the simulated device in virtual time and prints what was identified beside what is true.
+"""
+
+import argparse
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from tormagd.config import Config, Motor, load_config
+from tormagd.lab.errors import LabError
+from tormagd.lab.main import Found
+from tormagd.lab.motor.fit import THINNED_HZ, fit_volts
+from tormagd.lab.motor.identification import identify
+from tormagd.lab.motor.log import Log, read_log
+
+VAGUE_SHARE = 0.5
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of `tormag-lab identify-motor`."""
+    parser.add_argument("log", type=Path, nargs="?", help="motor log CSV, or DATA_EMPS.mat")
+    parser.add_argument("--gain-N-V", type=float, dest="gain", help="force per volt, N/V; replaces a current")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="measured against simulated voltage")
+    parser.add_argument("--config", type=Path, help="whose gear ratio and screw lead hold; the defaults otherwise")
+    parser.add_argument("--write-config", type=Path, metavar="FILE.toml", help="new file with the identified [motor]")
+    parser.add_argument("--samples", action="store_true", help="identify the simulated samples, beside the truth")
+
+
+def run(options: argparse.Namespace) -> Found:
+    """The parameters. Raises LabError and ConfigError where the log or the configuration cannot be used."""
+    if options.samples == (options.log is not None):
+        raise LabError("give either a log or --samples")
+    if options.samples:
+        from tormagd.lab.motor import samples  # with the simulator behind it, which a log does not need
+
+        return samples.judged()
+    log = read_log(options.log)
+    result = identify(log, options.gain if options.gain is not None else log.gain_N_V)
+    if options.write_config:
+        write_config(options.write_config, result, load_config(options.config))
+    if options.plot:
+        draw(options.plot, log, result)
+    return Found(result, lines(result))
+
+
+def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
+    """A configuration file with the identified motor, for the gear ratio and lead of `config`.
+
+    Raises LabError where the log cannot fill it, the file exists, or a value is one that `tormagd` would refuse.
+    """
+    found = result["motor"]
+    if found is None:
+        raise LabError("--write-config: needs a log with current_A, and no --gain-N-V")
+    advance_m_rad = config.motor.screw_lead_mm * 1e-3 / (math.tau * config.motor.gear_ratio)
+    identified = {
+        "resistance_ohm": found["resistance_ohm"]["value"],
+        "back_emf_V_s": found["back_emf_V_s_m"]["value"] * advance_m_rad,
+        "inertia_kg_m2": found["mass_kg"]["value"] * advance_m_rad**2,
+        "gear_efficiency": found["gear_efficiency"]["value"],
+        "coulomb_V": found["coulomb_N"]["value"] / found["gain_N_V"]["value"],
+    }
+    inductance = found["inductance_mH"]
+    if inductance["ci95"] < VAGUE_SHARE * inductance["value"]:  # a log at 1 kHz hardly shows it
+        identified["inductance_mH"] = inductance["value"]
+    kept = msgspec.to_builtins(config.motor)
+    table = kept | {name: float(f"{value:.4g}") for name, value in identified.items()}
+    try:
+        msgspec.convert(table, Motor)
+        with path.open("x", encoding="utf-8") as file:
+            file.write(f"# identified by tormag-lab identify-motor: {', '.join(identified)}; the rest as configured\n")
+            file.write("[motor]\n")
+            file.writelines(f"{name} = {value!r}\n" for name, value in table.items())
+    except msgspec.ValidationError as error:
+        raise LabError(f"--write-config: {table}: {error}") from error
+    except OSError as error:
+        raise LabError(f"{path}: {error.strerror}") from error
+
+
+def lines(result: dict[str, Any]) -> Iterator[str]:
+    """The parameters for a person."""
+    shown = (result["motor"] or {}) | result["ratios_to_gain"] | result["parameters"]
+    for name, found in (shown | {"time_constant_s": result["time_constant_s"]}).items():
+        value = "not shown by this log" if found is None else f"{found['value']:12.5g} +- {found['ci95']:.2g}"
+        yield f"{name:24s}{value}"
+    yield f"residual {result['relative_residual']:.1%} of the voltage; held out {result['holdout_voltage_nrmse']:.1%}"
+    yield from result["notes"]
+
+
+def draw(path: Path, log: Log, result: dict[str, Any]) -> None:
+    """Measured against simulated voltage on the half that was not fitted."""
+    from matplotlib.figure import Figure
+
+    half = len(log.t_s) // 2
+    fitted = fit_volts(log.part(slice(None, half)))
+    time_s, measured, predicted = fitted.over_time(log.part(slice(half, None)))
+    figure = Figure(figsize=(11, 6), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    above.plot(time_s, measured, color="#222222", label="measured")
+    above.plot(time_s, predicted, color="#d1495b", linewidth=1.0, label="from the fit of the other half")
+    above.legend(frameon=False, ncols=2)
+    above.set_ylabel("input, V")
+    error = result["holdout_voltage_nrmse"]
+    above.set_title(f"Held-out half, {THINNED_HZ:.0f} Hz: relative error {error:.1%}; gaps where it stands", loc="left")
+    below.plot(time_s, measured - predicted, color="#2a6f97", linewidth=0.8)
+    below.set_ylabel("difference, V")
+    below.set_xlabel("time, s")
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,354 @@
+"""What a motor log says of motor and screw, with 95% intervals that own up to what the model leaves out.
+
+Three models, each linear, in the units of the carriage (m, N):
+
+    volts      gain V(t - delay) = mass a + viscous v + coulomb sign(v) + offset        (Gautier and Khalil)
+    windings   V(t - delay) = R i + L di/dt + K v
+    gearbox    K i = mass a + viscous v + p(x) + sign(v) (q(x) + (1 - efficiency) |K i|)
+
+`volts` needs nothing but voltage and position. A current in the log gives the other two, and with them the gain, K / R,
+because the force for each ampere and the voltage for each m/s are one number. p and q are polynomials of the position:
+the magnets pull, and load what rubs, more where the gap is small. The gears lose a share of what they transmit.
+
+Position is low-passed without lag and differentiated centrally; both sides of an equation are filtered alike.
+Where the carriage stands, friction is whatever it has to be, so such rows are left out.
+
+Intervals. The covariance is the sandwich over blocks of a second (Liang and Zeger 1986): residuals inside a block may
+hang together as they like. That covers noise, not a wrong model. So each model is fitted again in ways that should make
+no difference: with terms that it leaves out, with the rows about turns, with the current taken half a period earlier or
+later, with every second current only, in a wider band. Every parameter's interval grows by how far these move it, and
+by how much new terms let it vary within the log.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import butter, decimate, sosfiltfilt
+from scipy.stats import t as student
+
+from tormagd.lab.errors import LabError
+from tormagd.lab.motor.log import Array, Log
+
+CUTOFF_HZ = 100.0
+THINNED_HZ = 40.0
+SLOW_M_S = 1e-3
+"Slower than this the sign of the speed is noise, and friction may be static."
+MOSTLY, THROUGHOUT = 0.5, 0.98
+"Turns tell friction from drag where there is no current to tell them apart; where there is, they only blur it."
+BLOCK_S = 1.0
+LEAST_BLOCKS = 8
+EDGE = 4
+"Rows at both ends that carry the filters' guesses."
+SPREAD = 2.0
+"Of a parameter over the log, in standard deviations: 95%."
+LONGEST_DELAY_S = 0.02
+DELAY_TURNS = 4
+WIDER_HZ = 100.0
+"The other band of the comparison; 40 Hz is the first."
+SETTLING_TURNS = 60
+
+
+class Estimate(NamedTuple):
+    """A value and the half width of its 95% interval."""
+
+    value: float
+    ci95: float
+
+    def scaled(self, factor: float) -> "Estimate":
+        """Both in another unit."""
+        return Estimate(self.value * factor, self.ci95 * abs(factor))
+
+
+class Motion(NamedTuple):
+    """A log's motion at its own rate: position from its mean, m; speed; acceleration; sign of the speed, 0 at rest."""
+
+    x: Array
+    v: Array
+    a: Array
+    sign: Array
+    factor: int
+
+    def thin(self, column: Array) -> Array:
+        """The column as the equations see it: low-passed, thinned, without the ends."""
+        thinned = decimate(column, self.factor, ftype="fir", zero_phase=True) if self.factor > 1 else column
+        return np.asarray(thinned[EDGE:-EDGE])
+
+
+class Fit(NamedTuple):
+    """A least-squares fit: values, their covariance, how many deviations make 95%, and the relative residual."""
+
+    values: Array
+    covariance: Array
+    deviations: float
+    relative_residual: float
+
+    @property
+    def half_widths(self) -> Array:
+        """Of the values' 95% intervals."""
+        return np.asarray(self.deviations * np.sqrt(np.diag(self.covariance)))
+
+    def half_width_of(self, function: Callable[[Array], float]) -> float:
+        """Of the 95% interval of a function of the values, by its slopes."""
+        steps = 1e-3 * np.sqrt(np.diag(self.covariance))
+        slopes = np.array(
+            [
+                (function(self.values + shift) - function(self.values - shift)) / (2.0 * step) if step > 0.0 else 0.0
+                for step, shift in zip(steps, np.diag(steps), strict=True)
+            ]
+        )
+        return self.deviations * float(np.sqrt(slopes @ self.covariance @ slopes))
+
+
+def motion(log: Log, thinned_Hz: float = THINNED_HZ) -> Motion:
+    """Speed and acceleration of the log. Raises LabError where it moves too little to show anything."""
+    smooth = _low_pass(log)
+    position = smooth(log.position_m)
+    speed = np.gradient(position, log.period_s)
+    sign = np.sign(speed) * (np.abs(speed) > SLOW_M_S)
+    factor = max(1, round(1.0 / log.period_s / thinned_Hz))
+    found = Motion(position - position.mean(), speed, np.gradient(speed, log.period_s), sign, factor)
+    if len(found.thin(speed)) < LEAST_BLOCKS * BLOCK_S * thinned_Hz or not (sign > 0).any() or not (sign < 0).any():
+        raise LabError("the log moves too little: mass, friction and offset cannot be told apart")
+    return found
+
+
+def moving(seen: Motion, share: float) -> Array:
+    """Of the thinned rows, those that stand for motion by more than `share`."""
+    return np.asarray(seen.thin(np.abs(seen.sign)) > share)
+
+
+def _low_pass(log: Log) -> Callable[[Array], Array]:
+    sections = butter(4, CUTOFF_HZ, fs=1.0 / log.period_s, output="sos")
+    return lambda column: np.asarray(sosfiltfilt(sections, column))
+
+
+def block_numbers(seen: Motion, period_s: float) -> Array:
+    """The block of each thinned row."""
+    rows = len(seen.thin(seen.v))
+    return (np.arange(rows) * seen.factor * period_s / BLOCK_S).astype(np.int64)
+
+
+def linear(rows: Array, target: Array, blocks: Array) -> Fit:
+    """Least squares; `blocks` (n) numbers rows that may hang together. Raises LabError on too few, or a rank lost."""
+    scale = np.linalg.norm(rows, axis=0)
+    if (
+        len(np.unique(blocks)) < LEAST_BLOCKS
+        or not (scale > 0.0).all()
+        or np.linalg.matrix_rank(rows / scale) < rows.shape[1]
+    ):
+        raise LabError("the log moves too little: mass, friction and offset cannot be told apart")
+    scaled = rows / scale
+    values, *_ = np.linalg.lstsq(scaled, target, rcond=None)
+    residual = target - scaled @ values
+    covariance = _sandwich(scaled, residual, blocks) / np.outer(scale, scale)
+    return Fit(values / scale, covariance, _factor(blocks, len(values)), _share(residual, target))
+
+
+def _sandwich(jacobian: Array, residual: Array, blocks: Array) -> Array:
+    labels, index = np.unique(blocks, return_inverse=True)
+    scores = np.zeros((len(labels), jacobian.shape[1]))
+    np.add.at(scores, index, jacobian * residual[:, None])
+    bread = np.linalg.inv(jacobian.T @ jacobian)
+    count = len(labels) / max(len(labels) - jacobian.shape[1], 1)
+    return np.asarray(bread @ (scores.T @ scores) @ bread * count)
+
+
+def _factor(blocks: Array, parameters: int) -> float:
+    return float(student.ppf(0.975, max(len(np.unique(blocks)) - parameters, 1)))
+
+
+def _share(residual: Array, target: Array) -> float:
+    return float(np.linalg.norm(residual) / np.linalg.norm(target))
+
+
+class Volts(NamedTuple):
+    """The model `volts`: coefficients in V for m/s2, m/s and as they are, delay in s, and the relative residual."""
+
+    mass: Estimate
+    viscous: Estimate
+    coulomb: Estimate
+    offset: Estimate
+    delay: Estimate
+    relative_residual: float
+
+    def voltage(self, log: Log) -> tuple[Array, Array]:
+        """The voltage that was applied and the one this model says the log's motion took; rows in motion only."""
+        _, measured, predicted = self.over_time(log)
+        known = np.isfinite(measured)
+        return measured[known], predicted[known]
+
+    def over_time(self, log: Log) -> tuple[Array, Array, Array]:
+        """Thinned times, s, measured and predicted voltage; NaN where the carriage stands."""
+        seen = motion(log)
+        values = np.array([self.mass.value, self.viscous.value, self.coulomb.value, self.offset.value])
+        measured, _ = _voltage(log, seen, self.delay.value)
+        stands = np.where(moving(seen, MOSTLY), 0.0, np.nan)
+        time_s = log.t_s[0] + (np.arange(len(measured)) + EDGE) * seen.factor * log.period_s
+        return time_s, measured + stands, _volts_rows(seen) @ values + stands
+
+
+def _volts_rows(seen: Motion) -> Array:
+    return np.column_stack([seen.thin(column) for column in (seen.a, seen.v, seen.sign, np.ones_like(seen.v))])
+
+
+def _voltage(log: Log, seen: Motion, delay_s: float) -> tuple[Array, Array]:
+    """The delayed voltage and its slope, thinned."""
+    volts = _low_pass(log)(np.interp(log.t_s - delay_s, log.t_s, log.input_V))
+    return seen.thin(volts), seen.thin(np.gradient(volts, log.period_s))
+
+
+def fit_volts(log: Log) -> Volts:
+    """Gain, friction and delay from voltage and position alone. Raises LabError."""
+    seen = motion(log)
+    kept = moving(seen, MOSTLY)
+    blocks = block_numbers(seen, log.period_s)[kept]
+    rows = _volts_rows(seen)[kept]
+    # gears pass less on than they take in, so that mass shows otherwise when speeding up than when braking; friction
+    # and offset vary along the stroke
+    left_out = (seen.a * np.sign(seen.a * seen.v), seen.sign * seen.x, seen.x)
+    largest = (1.0, SPREAD * float(seen.x.std()), SPREAD * float(seen.x.std()))
+    more = np.column_stack([rows, *(seen.thin(column)[kept] for column in left_out)])
+    plain, delay_s = _with_delay(log, seen, rows, kept, blocks)
+    full, full_delay_s = _with_delay(log, seen, more, kept, blocks)
+    varied = [size * abs(float(value)) for size, value in zip(largest, full.values[4:7], strict=True)]
+    spreads = (varied[0], 0.0, varied[1], varied[2])
+    widths = plain.half_widths
+    mass, viscous, coulomb, offset = (
+        Estimate(float(value), float(width + abs(value - other) + spread))
+        for value, width, other, spread in zip(plain.values, widths, full.values, spreads, strict=False)
+    )
+    delay = Estimate(delay_s, float(widths[4]) + abs(full_delay_s - delay_s))
+    return Volts(mass, viscous, coulomb, offset, delay, plain.relative_residual)
+
+
+def _with_delay(log: Log, seen: Motion, rows: Array, kept: Array, blocks: Array) -> tuple[Fit, float]:
+    """A linear fit to the delayed voltage, and the delay: the slope's coefficient is what it is off (Gauss-Newton).
+
+    The slope stays in the rows, as the last column, so that the others' intervals know of the delay's.
+    """
+    delay_s = 0.0
+    for _ in range(DELAY_TURNS):
+        target, slope = _voltage(log, seen, delay_s)
+        fitted = linear(np.column_stack([rows, slope[kept]]), target[kept], blocks)
+        delay_s += float(fitted.values[-1])
+        if not abs(delay_s) <= LONGEST_DELAY_S:
+            raise LabError(f"the voltage fits the motion best {delay_s:g} s later: allowed are {LONGEST_DELAY_S:g} s")
+    return fitted, delay_s
+
+
+class Way(NamedTuple):
+    """One way to fit: with terms usually left out, with other rows, other currents, in another band."""
+
+    is_full: bool = False
+    moving_share: float = THROUGHOUT
+    current_shift: float = 0.0
+    currents: slice = slice(None)
+    thinned_Hz: float = THINNED_HZ
+
+
+OTHER_WAYS = (
+    (Way(is_full=True), Way(is_full=True, moving_share=MOSTLY)),
+    (Way(current_shift=-0.5), Way(current_shift=0.5)),
+    # a current known once a millisecond is not its mean, and half as many show by how much that matters
+    (Way(currents=slice(0, None, 2)), Way(currents=slice(1, None, 2))),
+    (Way(thinned_Hz=WIDER_HZ),),
+)
+"Groups of ways; of each group the one that differs most counts."
+
+
+def _estimates(fit_in: Callable[[Way], tuple[Array, Array]]) -> list[Estimate]:
+    """`fit_in` gives values and half widths. The values of the plain way, and intervals that cover the other ways."""
+    values, widths = fit_in(Way())
+    widths = widths.copy()
+    for group in OTHER_WAYS:
+        widths += np.max([np.abs(fit_in(way)[0] - values) for way in group], axis=0)
+    return [Estimate(float(value), float(width)) for value, width in zip(values, widths, strict=True)]
+
+
+class Windings(NamedTuple):
+    """The model `windings`: ohm, henry, V s/m, s."""
+
+    resistance: Estimate
+    inductance: Estimate
+    back_emf: Estimate
+    delay: Estimate
+
+
+def fit_windings(log: Log) -> Windings:
+    """Resistance, inductance, back-EMF and delay from voltage, current and position. Raises LabError."""
+
+    def fit_in(way: Way) -> tuple[Array, Array]:
+        seen = motion(log, way.thinned_Hz)
+        kept = moving(seen, way.moving_share)
+        current = _low_pass(log)(_current(log, way))
+        terms = [current, np.gradient(current, log.period_s), seen.v]
+        if way.is_full:  # brushes that take a voltage of their own, and a meter with an offset
+            terms += [seen.sign, np.ones_like(seen.v)]
+        rows = np.column_stack([seen.thin(term)[kept] for term in terms])
+        fitted, delay_s = _with_delay(log, seen, rows, kept, block_numbers(seen, log.period_s)[kept])
+        return np.append(fitted.values[:3], delay_s), fitted.half_widths[[0, 1, 2, -1]]
+
+    return Windings(*_estimates(fit_in))
+
+
+class Gearbox(NamedTuple):
+    """The model `gearbox`: kg, N s/m, the gears' efficiency, and in N, as means over where the log moved, half the
+    difference and half the sum of what slow opening and slow closing take."""
+
+    mass: Estimate
+    viscous: Estimate
+    efficiency: Estimate
+    coulomb: Estimate
+    offset: Estimate
+
+
+def fit_gearbox(log: Log, force_N_A: float) -> Gearbox:
+    """Inertia, friction and gear losses from current and position. Raises LabError."""
+
+    def fit_in(way: Way) -> tuple[Array, Array]:
+        seen = motion(log, way.thinned_Hz)
+        kept = moving(seen, way.moving_share)
+        blocks = block_numbers(seen, log.period_s)[kept]
+        force = force_N_A * _current(log, way)
+        x = seen.x / seen.x.std()
+        terms = [seen.a, seen.v, seen.sign * np.abs(force), np.ones_like(x), x, x**2, seen.sign, seen.sign * x]
+        target = seen.thin(force)[kept]
+        fitted = linear(np.column_stack([seen.thin(term)[kept] for term in terms]), target, blocks)
+        idle_N = 0.0
+        if way.is_full:
+            # what the gears take idling is not transmitted, and no share of it is lost; and see `fit_volts` on mass
+            idle_N = abs(float(fitted.values[6]))
+            terms += [seen.sign * np.minimum(np.abs(force), idle_N), seen.a * np.sign(seen.a * seen.v)]
+            fitted = linear(np.column_stack([seen.thin(term)[kept] for term in terms]), target, blocks)
+        at = x[seen.sign != 0][:: seen.factor]
+
+        def means(values: Array) -> Array:
+            opening, closing = (_slow(values, at, direction, idle_N) for direction in (1.0, -1.0))
+            return np.array([(opening - closing).mean() / 2.0, (opening + closing).mean() / 2.0])
+
+        values = np.array([fitted.values[0], fitted.values[1], 1.0 - fitted.values[2], *means(fitted.values)])
+        coulomb = fitted.half_width_of(lambda values: float(means(values)[0]))
+        offset = fitted.half_width_of(lambda values: float(means(values)[1]))
+        return values, np.array([*fitted.half_widths[:3], coulomb, offset])
+
+    return Gearbox(*_estimates(fit_in))
+
+
+def _current(log: Log, way: Way) -> Array:
+    if log.current_A is None:
+        raise LabError("current_A: needed to tell the motor's windings from its load")
+    times = log.t_s + way.current_shift * log.period_s
+    return np.asarray(np.interp(times, log.t_s[way.currents], log.current_A[way.currents]))
+
+
+def _slow(values: Array, x: Array, direction: float, idle_N: float) -> Array:
+    """The motor's force that moves the carriage slowly in `direction` at positions `x`."""
+    lost = float(values[2])
+    idling = float(values[8]) if len(values) > 8 else 0.0
+    load: Array = values[3] + values[4] * x + values[5] * x**2 + direction * (values[6] + values[7] * x)
+    force = load
+    # the loss depends on the force itself; each turn leaves less than the lost share of the error
+    for _ in range(SETTLING_TURNS):
+        force = load + direction * (lost * np.abs(force) + idling * np.minimum(np.abs(force), idle_N))
+    return force

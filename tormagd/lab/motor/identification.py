@@ -1,0 +1,95 @@
+"""What a motor log says about its motor: the contract's object of `identify_motor`."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from tormagd.lab.errors import LabError
+from tormagd.lab.motor.fit import Estimate, Gearbox, Volts, Windings, fit_gearbox, fit_volts, fit_windings
+from tormagd.lab.motor.log import Log
+
+PARAMETERS = ("mass_kg", "viscous_N_s_m", "coulomb_N", "offset_N")
+RATIOS = ("mass_V_s2_m", "viscous_V_s_m", "coulomb_V", "offset_V")
+BACKLASH = "backlash: an encoder on the motor's side of the play cannot show it"
+
+
+def identify(log: Log, gain_N_V: float | None) -> dict[str, Any]:
+    """The contract's object. Raises LabError where the log does not move enough to show anything."""
+    if gain_N_V is not None and not (math.isfinite(gain_N_V) and gain_N_V > 0.0):
+        raise LabError(f"gain_N_V = {gain_N_V}: allowed is a finite number above 0")
+    half = len(log.t_s) // 2
+    measured, predicted = fit_volts(log.part(slice(None, half))).voltage(log.part(slice(half, None)))
+    volts = fit_volts(log)
+    ratios = (volts.mass, volts.viscous, volts.coulomb, volts.offset)
+    has_current = log.current_A is not None and gain_N_V is None
+    notes = [BACKLASH]
+    delay, motor = volts.delay, None
+    found: tuple[Estimate | None, ...]
+    if has_current:
+        windings = fit_windings(log)
+        gearbox = fit_gearbox(log, windings.back_emf.value)
+        found, delay = physical(windings, gearbox), windings.delay
+        motor = motor_parameters(windings, gearbox)
+        gain_N_V = motor["gain_N_V"].value
+    elif gain_N_V is not None:
+        found = tuple(ratio.scaled(gain_N_V) for ratio in ratios)
+        notes.append("gain: taken as given, without an interval of its own")
+    else:
+        found = (None,) * len(PARAMETERS)
+        notes.append("no gain and no current: only ratios to the gain show")
+    return {
+        "parameters": {
+            **{name: _plain(estimate) for name, estimate in zip(PARAMETERS, found, strict=True)},
+            "delay_s": _plain(delay),
+            "backlash_um": None,
+        },
+        "ratios_to_gain": {name: _plain(ratio) for name, ratio in zip(RATIOS, ratios, strict=True)},
+        "motor": None if motor is None else {name: _plain(estimate) for name, estimate in motor.items()},
+        "time_constant_s": _plain(_time_constant(volts, motor)),
+        "gain_N_V": gain_N_V,
+        "relative_residual": volts.relative_residual,
+        "holdout_voltage_nrmse": float(np.linalg.norm(measured - predicted) / np.linalg.norm(measured)),
+        "notes": notes,
+    }
+
+
+def physical(windings: Windings, gearbox: Gearbox) -> tuple[Estimate, ...]:
+    """The contract's four parameters: the back-EMF brakes the carriage as drag of K^2 / R does."""
+    k, resistance = windings.back_emf, windings.resistance
+    braking = k.value**2 / resistance.value
+    width = braking * math.hypot(2.0 * k.ci95 / k.value, resistance.ci95 / resistance.value)
+    viscous = Estimate(braking + gearbox.viscous.value, width + gearbox.viscous.ci95)
+    return gearbox.mass, viscous, gearbox.coulomb, gearbox.offset
+
+
+def motor_parameters(windings: Windings, gearbox: Gearbox) -> dict[str, Estimate]:
+    """What a current shows besides: the motor as the carriage feels it, gain in N/V."""
+    k, resistance = windings.back_emf, windings.resistance
+    gain = k.value / resistance.value
+    width = gain * math.hypot(k.ci95 / k.value, resistance.ci95 / resistance.value)
+    return {
+        "gain_N_V": Estimate(gain, width),
+        "resistance_ohm": resistance,
+        "inductance_mH": windings.inductance.scaled(1e3),
+        "back_emf_V_s_m": k,
+        "friction_viscous_N_s_m": gearbox.viscous,
+        "gear_efficiency": gearbox.efficiency,
+        "mass_kg": gearbox.mass,
+        "coulomb_N": gearbox.coulomb,
+    }
+
+
+def _time_constant(volts: Volts, motor: dict[str, Estimate] | None) -> Estimate:
+    """Of the speed after a voltage step: mass R / K^2, or mass over drag where only ratios are known."""
+    if motor is None:
+        factors = [(volts.mass, 1.0), (volts.viscous, -1.0)]
+    else:
+        factors = [(motor["mass_kg"], 1.0), (motor["resistance_ohm"], 1.0), (motor["back_emf_V_s_m"], -2.0)]
+    value = math.prod(estimate.value**power for estimate, power in factors)
+    width = math.hypot(*(power * estimate.ci95 / estimate.value for estimate, power in factors))
+    return Estimate(value, abs(value) * width)
+
+
+def _plain(estimate: Estimate | None) -> dict[str, float] | None:
+    return None if estimate is None else estimate._asdict()

@@ -1,0 +1,49 @@
+"""Generated pages and their pictures: tables in Markdown, and pictures that say which figures they were drawn from."""
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+KEY = "Figures"
+DPI = 90
+
+
+def stamp(figures: object) -> dict[str, str | None]:
+    """The metadata of a PNG drawn from `figures`, which are plain data: their digest, and nothing that changes with
+    time or version, so that the same figures make the same file."""
+    return {KEY: hashlib.sha256(msgspec.json.encode(figures, order="sorted")).hexdigest(), "Software": None}
+
+
+def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapping[str, "Figure"]) -> None:
+    """Writes a page, and its pictures as PNG into `folder`, stamped with the rows of the page's tables."""
+    page = "\n".join(section.rstrip() + "\n" for section in sections)
+    figures = [line for line in page.splitlines() if line.startswith("|")]
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in pictures.items():
+        figure.savefig(folder / f"{name}.png", dpi=DPI, metadata=stamp(figures))
+    path.write_text(page, encoding="utf-8")
+
+
+def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table in Markdown."""
+    head = list(columns)
+    lines = [head, ["---"] * len(head), *(list(row) for row in rows)]
+    return "".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |\n" for line in lines)
+
+
+def aligned(rows: Iterable[Iterable[str]]) -> list[str]:
+    """The same for a terminal: columns side by side."""
+    lines = [list(row) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
+
+
+def percent(share: float) -> str:
+    """To a tenth."""
+    return f"{100 * share:.1f}%"

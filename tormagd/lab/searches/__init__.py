@@ -1,0 +1,1 @@
+"""Searches for the field that no scene chooses: measured beside those that run."""

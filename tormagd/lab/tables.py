@@ -1,0 +1,91 @@
+"""Columns of numbers from a CSV file, checked."""
+
+import csv
+import math
+from array import array
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tormagd.bounded_file import MOST_TABLE_BYTES, require_regular
+from tormagd.lab.errors import LabError
+
+MAX_ROWS = 5_000_000
+
+
+def read_columns(
+    path: Path,
+    names: tuple[str, ...],
+    optional: tuple[str, ...] = (),
+    *,
+    delimiter: str = ",",
+    allowed: Mapping[str, tuple[float, float]] | None = None,
+    is_exact: bool = False,
+) -> dict[str, NDArray[np.float64]]:
+    """The named columns of a CSV file, the optional ones where they are there; `allowed` has bounds of some.
+
+    The header is the first row with all the names. Rows before it are skipped (many testing machines write a preamble),
+    and so are other columns and empty rows; where `is_exact`, none of these may be. Raises `LabError`: unreadable, no
+    such header, a cell that is no finite number within its bounds (with its row), too many rows or none.
+    """
+    try:
+        require_regular(path, MOST_TABLE_BYTES)
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file, delimiter=delimiter, strict=is_exact)
+            try:
+                rows = ((reader.line_num, [cell.strip() for cell in row]) for row in reader)
+                return _columns(path, rows, names, optional, allowed or {}, is_exact)
+            except csv.Error as error:
+                raise LabError(f"{path}: row {reader.line_num}: not CSV ({error})") from error
+    except OSError as error:
+        raise LabError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise LabError(f"{path}: not a text file in UTF-8 ({error.reason} at byte {error.start})") from error
+
+
+def _columns(
+    path: Path,
+    rows: Iterator[tuple[int, list[str]]],
+    names: tuple[str, ...],
+    optional: tuple[str, ...],
+    allowed: Mapping[str, tuple[float, float]],
+    is_exact: bool,
+) -> dict[str, NDArray[np.float64]]:
+    header: list[str] = []
+    for _, header in rows:
+        if is_exact or set(names) <= set(header):
+            break
+    known = [name for name in header if name in (*names, *optional)]
+    is_other = is_exact and (tuple(header[: len(names)]) != names or known != header)
+    if is_other or not set(names) <= set(header) or len(set(known)) < len(known):
+        told = f"; then optionally {' and '.join(optional)}" if optional else ""
+        raise LabError(f"{path}: row 1: header is {','.join(header)[:200]!r}; needed is {','.join(names)!r}{told}")
+    places = [(name, header.index(name), allowed.get(name)) for name in known]
+    columns = {name: array("d") for name in known}
+    for line, row in rows:
+        if is_exact and len(row) != len(header):
+            raise LabError(f"{path}: row {line}: {len(row)} values; needed are {len(header)}")
+        if len(columns[names[0]]) >= MAX_ROWS:
+            raise LabError(f"{path}: row {line}: at most {MAX_ROWS} rows are allowed")
+        if any(row):
+            for name, place, bounds in places:
+                text = row[place] if place < len(row) else ""
+                columns[name].append(_number(f"{path}: row {line}, {name}", text, bounds))
+    if not columns[names[0]]:
+        raise LabError(f"{path}: 0 rows under the header")
+    return {name: np.array(column) for name, column in columns.items()}
+
+
+def _number(where: str, text: str, bounds: tuple[float, float] | None) -> float:
+    try:
+        # digits grouped as 1_000 are Python's idea, not CSV's
+        number = math.nan if "_" in text else float(text)
+    except ValueError:
+        number = math.nan
+    low, high = bounds or (-math.inf, math.inf)
+    if not (math.isfinite(number) and low <= number <= high):
+        wanted = "finite numbers" if bounds is None else f"numbers {low:g} to {high:g}"
+        raise LabError(f"{where}: {text[:40]!r} is not allowed, only {wanted}")
+    return number

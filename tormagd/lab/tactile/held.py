@@ -1,0 +1,217 @@
+"""A force held on the tactile pad for an hour, in virtual time: with relaxation and without.
+
+A constant force is asked for; the finger presses, and the device is learned for some seconds. From then on the error of
+the pad's true force counts, as a share of the force asked, and frozen runs learn no more. It is the daemon's own loop
+with the whole device, at the scene's own rates. With --coarse the plans alone run, fifty a second, and the gap is where
+they lead, which takes a tenth of the time; the two differ by less than 0.1 % of the force, as a
+test holds. A hold that latches a fault ends there. All pads are synthetic.
+"""
+
+import argparse
+import math
+import random
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from tqdm import tqdm
+
+from tormagd.closed_loop import ClosedLoop
+from tormagd.config import Config, Rates
+from tormagd.control.core import build_core
+from tormagd.control.estimate import Estimate, Handle
+from tormagd.control.governor import TimedSetpoint
+from tormagd.control.plan import PlanState
+from tormagd.control.step import SENSOR_FAULT_S
+from tormagd.lab.main import Found
+from tormagd.lab.pages import stamp
+from tormagd.model.displacement import Turn
+from tormagd.safety.codes import Fault
+from tormagd.scenes.scene import RELAXATION_S, load_scene, terms_of
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, PressingHand
+from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.plant import ForceSensor
+from tormagd.simulation.pressed_pad import PressedPad
+
+SCENE = "radial_pulse"
+PLANTS = ("pad_1", "pad_2", "pad_3")
+FORCE_N = 3.55
+LEARN_S = 4.0
+CONTROL_HZ = 500
+COARSE_S = 0.02
+VALID_S = 0.1
+SHOWN_S = 10.0
+FAULT_NOTE: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "color": "#d32f2f"}
+MODES = ((True, False), (False, False), (True, True), (False, True))
+
+
+class Case(NamedTuple):
+    """One hold."""
+
+    plant: str
+    relaxation: bool
+    is_learning: bool
+    seconds: float = 3600.0
+    coarse: bool = False
+
+
+class Moment(NamedTuple):
+    """Once a second: the pad's true force, the gap, what was planned, and the fault that ends the hold."""
+
+    force_N: float
+    gap_mm: float
+    state: PlanState
+    fault: str
+
+
+def hold(case: Case) -> dict[str, Any]:
+    """The greatest, the mean and the last error of the true force, as shares of the force asked, the share of time that
+    each limit was there, and the fault that ended it, if any."""
+    shares, limits, gap_mm, fault = [], dict[str, int](), math.nan, ""
+    for moment in (_coarse if case.coarse else _whole)(case):
+        fault = moment.fault
+        if fault:
+            break
+        shares.append(moment.force_N / FORCE_N - 1.0)
+        gap_mm = moment.gap_mm
+        for limit in moment.state.plan.limits:
+            limits[str(limit)] = limits.get(str(limit), 0) + 1
+    absolute = np.abs(shares)
+    return case._asdict() | {
+        "force_error": float(absolute.max()),
+        "mean_force_error": float(absolute.mean()),
+        "last_force_error": shares[-1],
+        "last_gap_mm": gap_mm,
+        "held_s": len(shares),
+        "fault": fault,
+        "limits": {name: count / len(shares) for name, count in limits.items()},
+        "every_s": SHOWN_S,
+        "shares": shares[:: round(SHOWN_S)],
+    }
+
+
+class _Prepared:
+    """What both ways need: cores that learn and that do not, the finger, the pad."""
+
+    def __init__(self, case: Case) -> None:
+        stated = load_scene(SCENE)
+        assert stated.finger is not msgspec.UNSET, "a tactile scene has a finger"
+        self.inference_hz = stated.bandwidth.inference_hz
+        self.config = Config(scene=SCENE, rates=Rates(control_hz=CONTROL_HZ, inference_hz=self.inference_hz))
+        terms = terms_of(stated) if case.relaxation else terms_of(stated).without(*RELAXATION_S)
+        frozen = msgspec.structs.replace(terms, learning=False)
+        self.core = build_core(self.config, msgspec.structs.replace(stated, terms=terms))
+        self.later = (
+            self.core if case.is_learning else build_core(self.config, msgspec.structs.replace(stated, terms=frozen))
+        )
+        self.hand, self.plant = PressingHand(stated.finger.depth_mm), load_plant(case.plant)
+        self.begins_s = PRESSES_AT_S + stated.finger.depth_mm / PRESSING_MM_S + LEARN_S
+
+
+def _whole(case: Case) -> Iterator[Moment]:
+    made = _Prepared(case)
+    loop = ClosedLoop(made.config, made.core.stepper, made.core.planner, VirtualDevice(made.plant, made.hand, seed=1))
+    loop.arm()
+
+    def asked(now_s: float) -> TimedSetpoint:
+        return TimedSetpoint(FORCE_N, math.floor(now_s * made.inference_hz) / made.inference_hz, VALID_S)
+
+    for _ in loop.run(made.begins_s - loop.now_s, asked):
+        pass
+    loop.plan_with(made.later.planner)
+    for _ in range(round(case.seconds)):
+        for _ in loop.run(1.0, asked):
+            pass
+        truth, state = loop.device.truth, loop.plan_state
+        assert state is not None, "this loop plans"
+        yield Moment(truth.force_N, truth.gap_mm, state, ", ".join(map(str, loop.step_state.safety.faults)))
+
+
+def _coarse(case: Case) -> Iterator[Moment]:
+    made = _Prepared(case)
+    planner, state = made.core.planner, made.core.planner.start(0.0)
+    element = PressedPad(made.plant, state.plan.gap_mm, COARSE_S)
+    sensor, depth_mm, each_s = ForceSensor(made.plant, random.Random(1)), 0.0, round(1.0 / COARSE_S)
+    begins, ends = round(made.begins_s / COARSE_S), round((made.begins_s + case.seconds) / COARSE_S)
+    for tick in range(1, ends + 1):
+        now_s, before_mm, gap_mm = tick * COARSE_S, depth_mm, state.plan.gap_mm
+        depth_mm = made.hand.position_mm(now_s)
+        rate_mm_s = (depth_mm - before_mm) / COARSE_S
+        element.advance(now_s, gap_mm, depth_mm, rate_mm_s)
+        sensor.advance(now_s, element.force_N)
+        handle, half_mm = Handle(depth_mm, rate_mm_s, Turn(1.0, 0.0, depth_mm)), gap_mm / 2.0
+        estimate = Estimate(
+            tick, True, now_s, half_mm, half_mm, 0.0, 0.0, sensor.reading_N, handle, depth_mm, now_s, now_s
+        )
+        state = planner.plan(state, now_s, TimedSetpoint(FORCE_N, now_s, VALID_S), estimate)
+        if tick == begins:
+            planner = made.later.planner
+        elif tick > begins and tick % each_s == 0:
+            is_doubted = state.plan.sensor_doubted_s > SENSOR_FAULT_S
+            yield Moment(element.force_N, gap_mm, state, str(Fault.SENSOR) if is_doubted else "")
+
+
+def draw(path: Path, figures: dict[str, Any]) -> None:
+    """The error over time of every hold, a panel for each pad, stamped with its figures."""
+    from matplotlib.figure import Figure
+
+    holds = figures["holds"]
+    plants = list(dict.fromkeys(held["plant"] for held in holds))
+    figure = Figure(figsize=(4.2 * len(plants), 3.8), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(1, len(plants), sharey=True))
+    for axes, plant in zip(panels, plants, strict=True):
+        axes.axhspan(-3.0, 3.0, color="#009e73", alpha=0.12, linewidth=0.0)
+        for held in holds:
+            if held["plant"] != plant:
+                continue
+            minutes = np.arange(len(held["shares"])) * held["every_s"] / 60.0
+            axes.plot(
+                minutes,
+                100.0 * np.array(held["shares"]),
+                "--" if held["is_learning"] else "-",
+                color="#0072b2" if held["relaxation"] else "#e69f00",
+                label=f"{'with' if held['relaxation'] else 'without'} relaxation, "
+                f"{'learning' if held['is_learning'] else 'frozen'}",
+            )
+            if held["fault"]:
+                axes.plot(minutes[-1], 100.0 * held["shares"][-1], "x", color="#d32f2f", markersize=9)
+                axes.annotate(
+                    f"fault {held['fault']}", (minutes[-1], 100.0 * held["shares"][-1]), (8, -3), **FAULT_NOTE
+                )
+        axes.set(title=plant.replace("_", " "), xlabel="held for, min")
+    panels[0].set(ylabel="error of the true force, %")
+    panels[0].legend(fontsize=8, loc="lower left")
+    figure.savefig(path, dpi=110, metadata=stamp(figures))
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of `tormag-lab tactile-hold`."""
+    parser.add_argument("--seconds", type=float, default=3600.0, help="of each hold, virtual (default: 3600)")
+    parser.add_argument("--plant", nargs="+", default=PLANTS, metavar="PLANT", help="default: pad_1 pad_2 pad_3")
+    parser.add_argument("--coarse", action="store_true", help="the plans alone, fifty a second")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the errors over time")
+
+
+def run(options: argparse.Namespace) -> Found:
+    """Every hold, with relaxation and without, learning and frozen."""
+    cases = [Case(plant, *mode, options.seconds, options.coarse) for plant in options.plant for mode in MODES]
+    with ProcessPoolExecutor(options.workers) as pool:
+        holds = list(tqdm(pool.map(hold, cases), total=len(cases), desc="holds", disable=None))
+    figures = {"synthetic": True, "force_N": FORCE_N, "holds": holds}
+    if options.picture is not None:
+        draw(options.picture, figures)
+    return Found(figures, map(_line, holds))
+
+
+def _line(held: dict[str, Any]) -> str:
+    return (
+        f"{held['plant']}  {'with' if held['relaxation'] else 'without':8}relaxation, "
+        f"{'learning' if held['is_learning'] else 'frozen':9} worst {held['force_error']:6.2%}, "
+        f"mean {held['mean_force_error']:6.2%}, last {held['last_force_error']:+6.2%} after {held['held_s']} s"
+        f"{held['fault'] and ': ' + held['fault']}"
+    )

@@ -1,0 +1,181 @@
+"""Forward models on the synthetic tactile pad: table 4.1, splits by whole groups, monotonicity."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from tormagd.lab.training.dataset import Array, Dataset
+from tormagd.lab.training.fitting import fit_network
+from tormagd.lab.training.grey_box import GreyBox, fit_grey_box
+from tormagd.lab.training.levenberg_marquardt import Training
+from tormagd.lab.training.metrics import force_metrics
+from tormagd.lab.training.splits import Mask, leave_cycles_out, leave_one_out, random_split
+from tormagd.model.features import FEATURES
+from tormagd.model.model_file import ForceModel
+from tormagd.model.rising import not_rising_share
+from tormagd.simulation.pad import (
+    PADS,
+    RATES_MM_S,
+    TOUCHING_MM,
+    PadRecord,
+    cyclic_records,
+    holding_records,
+    worked_pad,
+)
+from tormagd.simulation.parameters import PadParameters
+from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM
+
+CIP = FEATURES.index("cip_percent")
+SCORED_SLOPE_N_MT = 0.03
+"""Where the force depends less on the field than this, a field says nothing: the force error counts there."""
+SPLIT_SEED = 1
+CYCLE_FOLDS = 4
+PAD_IN_USE = "MRE-C"
+"""The class of the pulse experiment."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much of everything. `thin`: every how many rows the grouped splits use."""
+
+    samples_per_cycle: int
+    hold_samples: int
+    epochs: int
+    pad_epochs: int
+    settling_epochs: int
+    thin: int
+    group_epochs: int
+    hold_s: float
+    pulse_every: int
+
+
+FULL = Effort(175, 1500, 100, 100, 30, 3, 40, 3600.0, 1)
+QUICK = Effort(24, 280, 15, 12, 4, 4, 5, 60.0, 24)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What was trained on cycles with sensor noise `noise_N`: the thesis's network, and a model of the pad in use.
+
+    `model` learned from the three classes, and `training` says how that went. `grey`, the relaxation-aware model,
+    learned from the cycles of one class and from relaxation tests of it, as a laboratory would do with its pad.
+    """
+
+    noise_N: float
+    cycles: PadRecord
+    model: ForceModel
+    training: Training
+    grey: GreyBox
+
+
+def dataset(record: PadRecord, thin: int = 1) -> Dataset:
+    """A record as a laboratory would have it: without the true force."""
+    return Dataset(record.features[::thin], record.force_N[::thin], record.cycle[::thin], record.time_s[::thin])
+
+
+def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
+    """Train both models on the training part of the random split."""
+    cycles = cyclic_records(noise_N, seed, samples_per_cycle=effort.samples_per_cycle)
+    data = dataset(cycles)
+    known = ~random_split(len(data), SPLIT_SEED)
+    model, training = fit_network(data, known, epochs=effort.epochs)
+    pad = PADS[PAD_IN_USE]
+    own = data.features[:, CIP] == pad.cip_percent
+    grey = fit_grey_box(
+        data.subset(own),
+        known[own],
+        dataset(holding_records(pad, noise_N, int(pad.cip_percent), samples=effort.hold_samples)),
+        epochs=effort.pad_epochs,
+        settling_epochs=effort.settling_epochs,
+    )
+    return Trained(noise_N, cycles, model, training, grey)
+
+
+def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:
+    """Table 4.1 per class on the random split, the noise floor, and what whole groups left out do to it."""
+    data = dataset(trained.cycles)
+    held = random_split(len(data), SPLIT_SEED)
+    predicted = trained.model.predict(data.features)
+    rows = []
+    for name, pad in (*PADS.items(), ("All", None)):
+        of_class = np.ones(len(data), dtype=np.bool_) if pad is None else data.features[:, CIP] == pad.cip_percent
+        span_N = float(np.ptp(data.force_N[of_class]))
+        row: dict[str, Any] = {"class": name}
+        for part, mask in (("train", of_class & ~held), ("test", of_class & held)):
+            scores = force_metrics(predicted[mask], data.force_N[mask], span_N)
+            deviation = float(np.abs(predicted - data.force_N)[mask].std())
+            row[part] = {"mae_N": scores["mae_N"], "sd_N": deviation, "mae_percent": scores["mae_percent"]}
+            row[part]["r2"] = scores["r2"]
+        rows.append(row)
+    noise_N = float(np.abs(trained.cycles.force_N - trained.cycles.true_force_N)[held].mean())
+    thinned = dataset(trained.cycles, effort.thin)
+    epochs = effort.group_epochs
+    fields = tqdm(list(leave_one_out(thinned, "field_mT")), desc="fields left out", disable=None, leave=False)
+    test = rows[-1]["test"]
+    return {
+        "synthetic": True,
+        "sensor_noise_N": trained.noise_N,
+        "random": {"r2": test["r2"], "mae_N": test["mae_N"], "noise_mae_N": noise_N},
+        "leave_one_field_out": left_out(epochs, thinned, fields),
+        "leave_one_class_out": left_out(epochs, thinned, leave_one_out(thinned, "cip_percent")),
+        "leave_cycles_out": left_out(epochs, thinned, leave_cycles_out(thinned, CYCLE_FOLDS, SPLIT_SEED)),
+        "monotonicity": {
+            "network": monotonicity(trained.model, PADS.values()),
+            "relaxation_aware": monotonicity(trained.grey.model, [PADS[PAD_IN_USE]]),
+        },
+        "rows": rows,
+    }
+
+
+def left_out(epochs: int, data: Dataset, folds: Iterable[tuple[float, Mask]]) -> dict[str, Any]:
+    """Fit without each fold and judge on it: errors over all folds together, and each fold's own."""
+    predicted = np.empty(len(data))
+    judged = np.zeros(len(data), dtype=np.bool_)
+    each = []
+    for label, held in folds:
+        model, _ = fit_network(data, ~held, epochs=epochs)
+        predicted[held] = model.predict(data.features)[held]
+        judged |= held
+        each.append({"left_out": label, "mae_N": float(np.abs(predicted[held] - data.force_N[held]).mean())})
+    scores = force_metrics(predicted[judged], data.force_N[judged], float(np.ptp(data.force_N)))
+    return {"r2": scores["r2"], "mae_N": scores["mae_N"], "folds": each}
+
+
+def monotonicity(model: ForceModel, pads: Iterable[PadParameters]) -> dict[str, float]:
+    """Where dF/dB <= 0: share of the model's training box, and of the places where the pads' own slope counts.
+
+    The box spans from class to class, where there are no data; the second share is over a grid of displacement, rate
+    and field at the classes themselves, as far as the pad rises by `SCORED_SLOPE_N_MT` or more.
+    """
+    places = np.meshgrid(
+        np.linspace(TOUCHING_MM, FULL_INDENTATION_MM, 18),
+        np.sort([*RATES_MM_S, *(-rate for rate in RATES_MM_S)]),
+        np.linspace(0.0, FULL_FIELD_MT, 25),
+        indexing="ij",
+    )
+    grid = np.column_stack([axis.ravel() for axis in places])
+    falling = counted = 0
+    for pad in pads:
+        scored = slope_N_per_mT(pad, grid) >= SCORED_SLOPE_N_MT
+        rows = np.column_stack((grid, np.full(len(grid), pad.cip_percent)))[scored]
+        falling += int((model.field_slope_N_per_mT(rows) <= 0).sum())
+        counted += len(rows)
+    return {"not_rising_share_of_box": not_rising_share(model), "not_rising_share_where_scored": falling / counted}
+
+
+def slope_N_per_mT(parameters: PadParameters, places: Array) -> Array:
+    """dF/dB (n) of a worked pad at (displacement, rate, field) (n x 3), without what it remembers."""
+    pad = worked_pad(parameters)
+    displacement, rate, field = places.T
+    low, high = np.maximum(field - 0.5, 0.0), field + 0.5
+    at_low, at_high = (plant_force_N(pad, np.column_stack((displacement, rate, end))) for end in (low, high))
+    slope: Array = (at_high - at_low) / (high - low)
+    return slope
+
+
+def plant_force_N(pad: Any, places: Array) -> Array:
+    """Force (n) of a `TactilePad` without what it remembers at (displacement, rate, field) (n x 3)."""
+    return np.array([sum(pad.elastic_parts_N(*place)) for place in places.tolist()])

@@ -1,0 +1,238 @@
+"""The pulse experiment of section 4.3 on the synthetic pad, and pulses rendered on a pad held for an hour."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tormagd.inverse.linear import LinearFieldSearch
+from tormagd.inverse.nearest import NearestFieldSearch
+from tormagd.inverse.solution import FieldSolver, Reach
+from tormagd.lab.human_pulse import pulse_profile
+from tormagd.lab.tactile.models import PAD_IN_USE, SCORED_SLOPE_N_MT, Effort, Trained, plant_force_N, slope_N_per_mT
+from tormagd.lab.training.dataset import Array
+from tormagd.lab.training.grey_box import GreyBoxMemory
+from tormagd.model.model_file import ForceModel
+from tormagd.simulation.pad import PADS, drawn_pad, worked_pad
+from tormagd.simulation.parameters import PadParameters
+from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM
+
+SAMPLES = 4322
+RATE_HZ = 160
+"""As many samples as the thesis, so dense that the 25 s of measured pulse suffice."""
+REFERENCE_FIELDS_MT = (100.0, 200.0)
+FIELDS_MT = (0.0, FULL_FIELD_MT)
+OTHER_PADS = (1, 2)
+SENSOR_SEED = 7
+
+HOLD_RATE_HZ = 10
+HOLD_FORCES_N = (148.0, 154.0)
+"""Within reach of the field at the beginning and after an hour of relaxation."""
+HELD_PULSE_S = 20.0
+TEN_MINUTES_S = 600.0
+
+
+class Program(NamedTuple):
+    """What is done to the pad, sample by sample: time, displacement, rate by the two-point difference, field."""
+
+    time_s: Array
+    displacement_mm: Array
+    rate_mm_s: Array
+    field_mT: Array
+
+    def features(self, cip_percent: float) -> Array:
+        """The network's features (n x 4)."""
+        cip = np.full_like(self.field_mT, cip_percent)
+        return np.column_stack((self.displacement_mm, self.rate_mm_s, self.field_mT, cip))
+
+
+def pulse_shape(duration_s: float, rate_hz: int) -> tuple[Array, str]:
+    """A pulse between 0 and 1, and what it is: measured where heartpy is installed, else synthetic beats."""
+    try:
+        return pulse_profile(duration_s, 0.0, 1.0, rate_hz)[1], "measured photoplethysmogram (heartpy)"
+    except ModuleNotFoundError:
+        phase = (np.arange(round(duration_s * rate_hz)) / rate_hz * 1.2) % 1.0
+        beats = np.exp(-(((phase - 0.2) / 0.08) ** 2)) + 0.4 * np.exp(-(((phase - 0.5) / 0.12) ** 2))
+        return (beats - beats.min()) / np.ptp(beats), "synthetic beats (heartpy is not installed)"
+
+
+def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
+    """Measured arterial pulses between 0 and 1, by their file's name; none unless TORMAG_DATA names their folder."""
+    folder = os.environ.get("TORMAG_DATA")
+    shapes = {}
+    for path in sorted(Path(folder, "aac_nibp_pulse").glob("*.csv")) if folder else ():
+        time_s, pressure = np.loadtxt(path, delimiter=",", skiprows=1, unpack=True)
+        # six beats that end as they began
+        looped = np.interp(np.arange(round(duration_s * rate_hz)) / rate_hz, time_s, pressure, period=time_s[-1])
+        shapes[path.stem] = (looped - looped.min()) / np.ptp(looped)
+    return shapes
+
+
+def program(shape: Array) -> Program:
+    """Indentation to 4.5 mm at 1 mm/s, then held while the field follows `shape`, which fills the other samples."""
+    time_s = np.arange(1, SAMPLES + 1) / RATE_HZ
+    displacement_mm = np.minimum(time_s, FULL_INDENTATION_MM)
+    rate_mm_s = np.diff(displacement_mm, prepend=0.0) * RATE_HZ
+    low, high = REFERENCE_FIELDS_MT
+    pulse_mT = low + (high - low) * shape
+    return Program(
+        time_s, displacement_mm, rate_mm_s, np.concatenate((np.full(SAMPLES - len(shape), pulse_mT[0]), pulse_mT))
+    )
+
+
+HELD_S = (SAMPLES - FULL_INDENTATION_MM * RATE_HZ) / RATE_HZ
+
+
+def solve_all(
+    solver: FieldSolver, model: ForceModel, features: Array, force_N: Array, memory: GreyBoxMemory | None
+) -> tuple[Array, Array]:
+    """The field for each row in turn, and the force that the solver was asked for.
+
+    With `memory` that is the force asked, freed of what the pad remembers.
+    """
+    fields, wanted, last = np.empty(len(force_N)), force_N.copy(), None
+    for index, (row, asked_N) in enumerate(zip(features.tolist(), force_N.tolist(), strict=True)):
+        displacement_mm, rate_mm_s, _, cip_percent = row
+        if memory is not None:
+            wanted[index] = memory.elastic_N(displacement_mm, rate_mm_s, asked_N, cip_percent)
+        curve = model.curve(displacement_mm, rate_mm_s, cip_percent)
+        last = solver.solve(curve, float(wanted[index]), last).field_mT
+        if memory is not None:
+            # what the field found can give, not what was wished
+            memory.advance(displacement_mm, rate_mm_s, last, cip_percent)
+        fields[index] = last
+    return fields, wanted
+
+
+class Course(NamedTuple):
+    """The pulse experiment on one pad: the rows that are solved, and which of them a field error is scored on."""
+
+    pad: PadParameters
+    time_s: Array
+    features: Array
+    force_N: Array
+    slope_N_mT: Array
+    dt_s: float
+
+    @property
+    def scored(self) -> NDArray[np.bool_]:
+        """Rows (n, bool) where the force says something about the field."""
+        return self.slope_N_mT >= SCORED_SLOPE_N_MT
+
+    def scores(self, fields_mT: Array) -> dict[str, float]:
+        """Field error where it is scored, and elsewhere the force that the wrong field would cost."""
+        absolute = np.abs(fields_mT - self.features[:, 2])[self.scored]
+        pad, places = worked_pad(self.pad), self.features[~self.scored, :3].copy()
+        right_N = plant_force_N(pad, places)
+        places[:, 2] = fields_mT[~self.scored]
+        return {
+            "mae_mT": float(absolute.mean()),
+            "sd_mT": float(absolute.std()),
+            "max_mT": float(absolute.max()),
+            "elsewhere_force_mae_N": float(np.abs(plant_force_N(pad, places) - right_N).mean()),
+        }
+
+
+def course(pad: PadParameters, shape: Array, every: int = 1) -> Course:
+    """Do the experiment on that pad; every how many samples are solved is `every`."""
+    done = program(shape)
+    force_N = worked_pad(pad).run(*done)
+    features = done.features(pad.cip_percent)[::every]
+    return Course(
+        pad, done.time_s[::every], features, force_N[::every], slope_N_per_mT(pad, features[:, :3]), every / RATE_HZ
+    )
+
+
+def nearest() -> NearestFieldSearch:
+    """The search of the experiment."""
+    return NearestFieldSearch(field_range_mT=FIELDS_MT)
+
+
+def aware_fields(trained: Trained, along: Course, force_N: Array) -> Array:
+    """The fields that the relaxation-aware model finds for the forces."""
+    memory = GreyBoxMemory(trained.grey, along.dt_s)
+    return solve_all(nearest(), trained.grey.model, along.features, force_N, memory)[0]
+
+
+def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Scores of each way to the field, and the traces."""
+    noise_N = trained.noise_N
+    noisy_N = along.force_N + np.random.default_rng(SENSOR_SEED).normal(0.0, noise_N, len(along.force_N))
+    linear = LinearFieldSearch(field_range_mT=FIELDS_MT)
+    ways = {
+        "mlp": solve_all(nearest(), trained.model, along.features, along.force_N, None)[0],
+        "mlp_thesis_search": solve_all(linear, trained.model, along.features, along.force_N, None)[0],
+        "relaxation_aware": aware_fields(trained, along, along.force_N),
+        "relaxation_aware_noisy": aware_fields(trained, along, noisy_N),
+    }
+    bound_mT = np.sqrt(2.0 / np.pi) * noise_N / along.slope_N_mT[along.scored]
+    scores: dict[str, Any] = {name: along.scores(fields) for name, fields in ways.items()}
+    scores["noise_bound_mae_mT"] = float(bound_mT.mean())
+    scores["scored_share"] = float(along.scored.mean())
+    traces = {"time_s": along.time_s, "displacement_mm": along.features[:, 0], "force_N": along.force_N}
+    return scores, traces | {"reference": along.features[:, 2], "slope_N_mT": along.slope_N_mT} | ways
+
+
+def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any], dict[str, Array]]:
+    """The contract's `pulse`: the quieter sensor on top, each sensor below; other pads and other pulses beside."""
+    shape, source = pulse_shape(HELD_S, RATE_HZ)
+    pad, every = PADS[PAD_IN_USE], effort.pulse_every
+    own = course(pad, shape, every)
+    strangers = [course(drawn_pad(pad, seed), shape, every) for seed in OTHER_PADS]
+    recorded = {name: course(pad, other, every) for name, other in recorded_shapes(HELD_S, RATE_HZ).items()}
+    by_noise, all_traces = {}, []
+    for trained in trainings:
+        scores, traces = pulse_on(own, trained)
+        scores["other_pads"] = [along.scores(aware_fields(trained, along, along.force_N)) for along in strangers]
+        scores["other_pulses"] = {
+            name: along.scores(aware_fields(trained, along, along.force_N)) for name, along in recorded.items()
+        }
+        by_noise[str(trained.noise_N)] = scores
+        all_traces.append(traces)
+    top = by_noise[str(trainings[0].noise_N)]
+    kept = ("mlp", "mlp_thesis_search", "relaxation_aware", "noise_bound_mae_mT", "scored_share")
+    figures = {"synthetic": True, "shape": source, **{name: top[name] for name in kept}, "by_noise": by_noise}
+    return figures, all_traces[0]
+
+
+def hold(trained: Trained, duration_s: float) -> dict[str, Any]:
+    """Pulses rendered on a held pad, feed-forward alone, for `duration_s` of virtual time: with and without memory."""
+    dt_s = 1.0 / HOLD_RATE_HZ
+    rising = round(FULL_INDENTATION_MM * HOLD_RATE_HZ)
+    count = rising + round(duration_s * HOLD_RATE_HZ)
+    displacement_mm = np.minimum(np.arange(1, count + 1) * dt_s, FULL_INDENTATION_MM)
+    rate_mm_s = np.where(np.arange(count) < rising, 1.0, 0.0)
+    low, high = HOLD_FORCES_N
+    beats_N = low + (high - low) * pulse_shape(HELD_PULSE_S, HOLD_RATE_HZ)[0]
+    # there and back again, so that the repetition has no jump
+    asked_N = np.resize(np.concatenate((beats_N, beats_N[::-1])), count - rising)
+    pad = PADS[PAD_IN_USE]
+    scores = {}
+    for name, model, memory in (
+        ("without", trained.model, None),
+        ("with", trained.grey.model, GreyBoxMemory(trained.grey, dt_s)),
+    ):
+        plant = worked_pad(pad)
+        solver = nearest()
+        rendered, last, outside = np.empty(count), 0.0, 0
+        for index, place in enumerate(zip(displacement_mm.tolist(), rate_mm_s.tolist(), strict=True)):
+            if index >= rising:
+                wanted_N = float(asked_N[index - rising])
+                if memory is not None:
+                    wanted_N = memory.elastic_N(*place, wanted_N, pad.cip_percent)
+                answer = solver.solve(model.curve(*place, pad.cip_percent), wanted_N, last)
+                last, outside = answer.field_mT, outside + (answer.reach is not Reach.INSIDE)
+            if memory is not None:
+                memory.advance(*place, last, pad.cip_percent)
+            rendered[index] = plant.advance(dt_s, *place, last)
+        error = np.abs(rendered[rising:] - asked_N) / asked_N
+        scores[name] = {
+            "force_error_10min": float(error[: round(TEN_MINUTES_S * HOLD_RATE_HZ)].max()),
+            "force_error_1h": float(error.max()),
+            "mean_force_error": float(error.mean()),
+            "out_of_reach_share": outside / len(asked_N),
+        }
+    return {"duration_s": duration_s, **scores}

@@ -1,0 +1,94 @@
+"""Train the shipped tactile model: a pad is cycled and held on the bench, its relaxation-aware model becomes a file.
+
+The bench gives the plant's pad eleven fields, twelve cycles each at four rates, and an hour's hold at each of five
+fields; its force sensor has the noise of the plant's. Synthetic.
+"""
+
+import argparse
+import dataclasses
+import datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import torch
+
+from tormagd.lab.main import Found
+from tormagd.lab.tactile.models import dataset
+from tormagd.lab.training.grey_box import fit_grey_box
+from tormagd.lab.training.metrics import force_metrics
+from tormagd.lab.training.splits import random_split
+from tormagd.model.memory import Memory
+from tormagd.model.model_file import ForceModel, save_model
+from tormagd.model.rising import not_rising_share
+from tormagd.simulation.pad import cyclic_records, holding_records
+from tormagd.simulation.parameters import PlantError, load_plant
+
+INSERT = "MRE-C"
+HIDDEN = 30
+SEED = 1
+UNSEEN_FIELDS_MT = (130.0, 230.0)
+
+
+class Effort(NamedTuple):
+    """How much is recorded and learned."""
+
+    samples_per_cycle: int
+    hold_samples: int
+    epochs: int
+    settling_epochs: int
+
+
+FULL, QUICK = Effort(175, 1500, 100, 30), Effort(24, 200, 12, 4)
+
+
+def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceModel:
+    """The model of a plant's pad, judged on rows of the cycles and on two holds that it has not seen. PlantError."""
+    plant = load_plant(plant_name)
+    if plant.pad is None:
+        raise PlantError(f"plant {plant_name}: allowed is one with a [pad]")
+    noise_N = 1e-3 * plant.force_sensor.noise_mN
+    cycles = dataset(cyclic_records(noise_N, SEED, samples_per_cycle=effort.samples_per_cycle, pads=[plant.pad]))
+    holds = dataset(holding_records(plant.pad, noise_N, SEED, samples=effort.hold_samples))
+    held_out = random_split(len(cycles), SEED)
+    epochs, settling_epochs = effort.epochs, effort.settling_epochs
+    grey = fit_grey_box(cycles, ~held_out, holds, hidden=HIDDEN, epochs=epochs, settling_epochs=settling_epochs)
+    unseen = dataset(holding_records(plant.pad, 0.0, SEED, fields_mT=UNSEEN_FIELDS_MT, samples=effort.hold_samples))
+    is_pressed = unseen.features[:, 0] > 1.0
+    predicted_N = grey.predict(cycles)[held_out]
+    scores = force_metrics(predicted_N, cycles.force_N[held_out], grey.model.force_span_N)
+    metrics = {f"validation_{name}": value for name, value in scores.items()} | {
+        "noise_N": noise_N,
+        "unseen_holds_share": float(np.abs(grey.predict(unseen)[is_pressed] / unseen.force_N[is_pressed] - 1.0).max()),
+        "not_rising_share": not_rising_share(grey.model),
+    }
+    metadata = msgspec.structs.replace(
+        grey.model.metadata,
+        insert=INSERT,
+        metrics=metrics,
+        created=created,
+        training_data_sha256=cycles.sha256(),
+        memory=Memory(
+            fractions=grey.series.fractions, times_s=grey.series.times_s, field_fractions=grey.field_series.fractions
+        ),
+    )
+    return dataclasses.replace(grey.model, metadata=metadata)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of `tormag-lab tactile-model`."""
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.safetensors")
+    parser.add_argument("--plant", default="pad_1", help="whose pad is on the bench (default: pad_1)")
+    parser.add_argument("--quick", action="store_true", help="few rows and epochs: shows that it runs, not how well")
+    parser.add_argument("--created", type=datetime.date.fromisoformat, help="date in the file (default: today)")
+
+
+def run(options: argparse.Namespace) -> Found:
+    """Trains and writes; the metrics."""
+    torch.set_num_threads(1)
+    model = trained(options.plant, QUICK if options.quick else FULL, options.created or datetime.date.today())
+    save_model(options.out, model)
+    metrics = model.metadata.metrics
+    lines = [f"{name:24}{value:.5g}" for name, value in metrics.items()]
+    return Found({"out": str(options.out), **metrics}, [*lines, str(options.out)])

@@ -1,0 +1,312 @@
+"""From a bench sweep to a model file: training rows, a fit on some sweeps, a judgement on the others, or a refusal.
+
+    python -m tormagd.lab.training.calibration SWEEP.csv --insert NAME --out MODEL.safetensors [--csv TRAINING.csv]
+    python -m tormagd.lab.training.calibration --insert NAME     only says whether a fit can be made of that insert
+
+A process of its own, so that neither the daemon nor `tormagctl`, which starts it, carries a training. Prints one JSON
+object: `{"result": {...}}`, or `{"error": {"code", "message", "hint"}}` with exit code 1 and no model file.
+"""
+
+import argparse
+import datetime
+import importlib.util
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from tormagd.lab.errors import LabError, not_installed
+from tormagd.lab.tables import read_columns
+from tormagd.lab.training.dataset import Array, Dataset, write_csv
+from tormagd.lab.training.metrics import fit_metrics
+from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, displacement
+from tormagd.model.features import FEATURES, FIELD, Element
+from tormagd.model.model_file import ForceModel, save_model
+from tormagd.physics.errors import DomainError
+from tormagd.physics.field import PowerFieldLaw, flux_density_T
+from tormagd.physics.inserts import Insert, insert
+
+if TYPE_CHECKING:
+    from tormagd.lab.training.levenberg_marquardt import Epoch
+
+COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
+"""Of a sweep file: times of one device, the number of the sweep, the measured gap, the handle's travel at the roller,
+its rate and the measured force, both positive in the direction of motion."""
+
+LEAST_MOVING_SHARE = 0.3
+"Of every sweep. Turning to and fro with rests keeps over half of it."
+LEAST_FIELD_SPAN = 0.2
+"Of the greatest field."
+LEAST_SWEEPS = 3
+JUDGING = (3, 1)
+"Every third sweep, from the second on, is kept from the fit to judge it."
+VALIDATION_SHARE = 0.3
+STEADY_MM_S = 10.0
+"A handle whose rate stays within this (5th to 95th percentile) teaches nothing about the rate."
+RARE_SHARE = 0.01
+
+NEEDED = ("torch", "tqdm")
+"What a fit takes that not every installation has: asked for before anybody turns a handle."
+
+LEAST_R2 = 0.97
+"The thesis's own network, table 4.1."
+MOST_MAE_SHARE = 0.02
+"Of the greatest force: relaxation and temperature, which the model does not have, take one to two percent."
+MOST_MAE_OVER_NOISE = 3.0
+MEAN_OVER_SIGMA = math.sqrt(2.0 / math.pi)
+"Mean absolute value of Gaussian noise over its standard deviation."
+
+
+class CalibrationError(ValueError):
+    """A sweep that gives no model: a stable code, what was found beside what is needed, and what to do."""
+
+    def __init__(self, code: str, message: str, hint: str) -> None:
+        super().__init__(message)
+        self.code, self.message, self.hint = code, message, hint
+
+
+class Judgement(NamedTuple):
+    """Error on the sweeps kept from the fit, beside the force sensor's own noise and the bar."""
+
+    r2: float
+    mae_N: float
+    noise_mae_N: float
+    most_mae_N: float
+
+
+def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Dataset:
+    """The rows of sweeps (n x 6, order of COLUMNS, sweep by sweep) with the handle in motion; `cycle` is the sweep.
+
+    `field_mT` is the field law's at the measured gap, in this insert. A rate or a displacement that hardly varied is
+    made constant, so that the network cannot learn from its noise. Raises CalibrationError, LabError.
+    """
+    _, sweep, _, handle_mm, rate_mm_s, _ = table.T
+    rate_mm_s = np.abs(rate_mm_s)
+    is_moving = rate_mm_s >= MOVING_MM_S
+    for number in np.unique(sweep):
+        share = float(is_moving[sweep == number].mean())
+        if share < LEAST_MOVING_SHARE:
+            raise CalibrationError(
+                "handle_still",
+                f"the handle moved for {share:.0%} of sweep {number + 1:.0f}: needed are {LEAST_MOVING_SHARE:.0%} at "
+                f"{MOVING_MM_S:g} mm/s or more at the roller",
+                "turn the handle steadily for as long as the sweep runs",
+            )
+    displacement_mm = np.concatenate([displacement(handle_mm[sweep == number]) for number in np.unique(sweep)])
+    kept = is_moving & np.isfinite(displacement_mm)
+    displacement_mm, rate_mm_s, table = displacement_mm[kept], rate_mm_s[kept], table[kept]
+    low, high = np.percentile(rate_mm_s, (5.0, 95.0))
+    if high - low < STEADY_MM_S:
+        rate_mm_s = np.full_like(rate_mm_s, np.median(rate_mm_s))
+    if (displacement_mm < MOBILISED_MM).mean() < RARE_SHARE:
+        displacement_mm = np.full_like(displacement_mm, MOBILISED_MM)
+    time_s, sweep, gap_mm, _, _, force_N = table.T
+    moment_Tm = np.asarray(PowerFieldLaw().radial_moment_Tm(gap_mm))
+    field_mT = 1e3 * flux_density_T(moment_Tm, fitted.elastomer.relative_permeability, 1e-3 * inner_radius_mm)
+    cip_percent = np.full_like(rate_mm_s, 100.0 * fitted.cip_fraction)
+    features = np.column_stack((displacement_mm, rate_mm_s, field_mT, cip_percent))
+    return Dataset(features, force_N, sweep.astype(np.int64), time_s)
+
+
+def require_usable(data: Dataset) -> None:
+    """Refuse data that no fit can make a model of. Raises CalibrationError: few_sweeps, field_range, force_dead."""
+    assert data.cycle is not None  # training_rows sets it
+    sweeps = len(np.unique(data.cycle))
+    if sweeps < LEAST_SWEEPS:
+        raise CalibrationError(
+            "few_sweeps", f"{sweeps} sweeps: needed are {LEAST_SWEEPS}, one of them to judge by", "record more sweeps"
+        )
+    field_mT = data.features[:, FIELD]
+    low, high = float(field_mT.min()), float(field_mT.max())
+    if high - low < LEAST_FIELD_SPAN * high:
+        raise CalibrationError(
+            "field_range",
+            f"the field ran from {low:.0f} to {high:.0f} mT, {(high - low) / high:.0%} of the greatest: needed are "
+            f"{LEAST_FIELD_SPAN:.0%}",
+            "sweep a wider range of force, with a scene that allows it",
+        )
+    ends = np.percentile(field_mT, (10.0, 90.0))
+    weak, strong = data.force_N[field_mT <= ends[0]], data.force_N[field_mT >= ends[1]]
+    rise, noise = float(np.median(strong) - np.median(weak)), noise_sd_N(data)
+    if np.ptp(data.force_N) == 0.0 or rise < 3.0 * noise:
+        raise CalibrationError(
+            "force_dead",
+            f"the measured force rose by {rise:.3f} N from the weakest field to the strongest: needed are three times "
+            f"its noise, {3.0 * noise:.3f} N",
+            "check the force sensor and its cable, and that the insert is fitted",
+        )
+
+
+def noise_sd_N(data: Dataset) -> float:
+    """The force sensor's noise: the third differences of neighbouring rows, which hold hardly anything else."""
+    if data.time_s is None:
+        raise LabError("time_s: needed to know which rows are neighbours, and the data have none")
+    steps = np.diff(data.time_s)
+    third = np.diff(data.force_N, 3)
+    together = np.convolve(steps < 2.0 * np.median(steps), np.ones(3), "valid") == 3.0
+    # 1.4826 turns a Gaussian's median deviation into its standard deviation, sqrt(20) a third difference's into a row's
+    return float(1.4826 * np.median(np.abs(third[together])) / math.sqrt(20.0)) if together.any() else 0.0
+
+
+def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int = 50, epochs: int = 200) -> ForceModel:
+    """A model from all sweeps but the judging ones, with the judgement in its metrics. Raises CalibrationError
+    (poor_fit, not_rising) where it is not good enough to be used."""
+    from tqdm import tqdm
+
+    from tormagd.lab.training.fitting import (
+        fit_model,  # with torch, two seconds: whatever is refused is told without it
+    )
+
+    assert data.cycle is not None  # training_rows sets it
+    numbers = np.unique(data.cycle)
+    is_judging = np.isin(data.cycle, numbers[JUDGING[1] :: JUDGING[0]])
+    training, validation = data.subset(~is_judging).split(VALIDATION_SHARE, seed=0)
+    with tqdm(total=epochs, desc="fit", unit="epoch", disable=not sys.stderr.isatty(), leave=False) as bar:
+
+        def show(epoch: "Epoch") -> None:
+            bar.set_postfix_str(f"{epoch.validation_rmse_N:.4f} N rms")
+            bar.update()
+
+        model, _ = fit_model(
+            training,
+            validation,
+            element=Element.TORQUE,
+            insert=insert_name,
+            data_sha256=data.sha256(),
+            created=created,
+            hidden=hidden,
+            epochs=epochs,
+            progress=show,
+        )
+    judging = data.subset(is_judging)
+    found = fit_metrics(model, judging)
+    noise_mae_N = MEAN_OVER_SIGMA * noise_sd_N(data)
+    most_mae_N = max(MOST_MAE_OVER_NOISE * noise_mae_N, MOST_MAE_SHARE * float(np.percentile(data.force_N, 99.0)))
+    judgement = Judgement(found.get("r2", -math.inf), found["mae_N"], noise_mae_N, most_mae_N)
+    require_good(judgement)
+    require_rising(model)
+    metrics = model.metadata.metrics | {f"judged_{name}": value for name, value in found.items()}
+    metrics |= {
+        "noise_mae_N": noise_mae_N,
+        "most_mae_N": most_mae_N,
+        "judged_rows": float(len(judging)),
+        "sweeps": float(len(numbers)),
+    }
+    return replace(model, metadata=msgspec.structs.replace(model.metadata, metrics=metrics))
+
+
+def require_good(judgement: Judgement) -> None:
+    """Raise CalibrationError (poor_fit) with the figures and the bars."""
+    r2, mae_N, noise_mae_N, most_mae_N = judgement
+    if r2 >= LEAST_R2 and mae_N <= most_mae_N:
+        return
+    raise CalibrationError(
+        "poor_fit",
+        f"on sweeps kept from the fit R2 is {r2:.4f} (needed: {LEAST_R2:g}) and the mean error {mae_N * 1e3:.1f} mN "
+        f"(allowed: {most_mae_N * 1e3:.1f} mN; the sensor's noise alone makes {noise_mae_N * 1e3:.1f} mN)",
+        "nothing was saved; turn the handle more steadily, look for a loose sensor or insert, and sweep again",
+    )
+
+
+def require_rising(model: ForceModel, points: int = 64) -> None:
+    """Raise CalibrationError (not_rising) where the fully mobilised force does not rise with the field: there a force
+    has no one field."""
+    ranges = dict(zip(FEATURES, model.feature_ranges, strict=True))
+    rate_mm_s = sum(ranges["rate_mm_s"]) / 2.0
+    rows = np.array(
+        [
+            (ranges["displacement_mm"][1], rate_mm_s, field_mT, ranges["cip_percent"][0])
+            for field_mT in np.linspace(*ranges["field_mT"], points)
+        ]
+    )
+    force_N = model.predict(rows)
+    largest_fall_N = float((np.maximum.accumulate(force_N) - force_N).max())
+    if largest_fall_N > 0.01 * float(np.ptp(force_N)):
+        raise CalibrationError(
+            "not_rising",
+            f"the fitted force falls by {largest_fall_N * 1e3:.1f} mN from the weakest field to the strongest: "
+            "allowed is 1% of its span",
+            "nothing was saved; sweep again, slower",
+        )
+
+
+def calibrate(
+    sweep: Path, insert_name: str, inner_radius_mm: float, out: Path, training_csv: Path | None, created: datetime.date
+) -> dict[str, Any]:
+    """The whole of it; returns what was saved. Raises CalibrationError, LabError, DomainError, OSError."""
+    data = training_rows(read_sweep(sweep), insert(insert_name), inner_radius_mm)
+    if training_csv is not None:
+        write_csv(training_csv, data)
+    require_usable(data)
+    model = fit(data, insert_name, created)
+    save_model(out, model)
+    return {
+        "model": str(out),
+        "csv": None if training_csv is None else str(training_csv),
+        "insert": insert_name,
+        "created": created.isoformat(),
+        "rows": len(data),
+        "ranges": data.ranges(),
+        "metrics": model.metadata.metrics,
+    }
+
+
+def read_sweep(path: Path) -> Array:
+    """The table of a sweep file (n x 6). Raises LabError naming the file and what is wrong."""
+    return np.column_stack(list(read_columns(path, COLUMNS, is_exact=True).values()))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Prints the JSON object; 1 where there is no model."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument(
+        "sweep", type=Path, nargs="?", metavar="SWEEP.csv", help=f"columns {','.join(COLUMNS)}; none: check the insert"
+    )
+    parser.add_argument("--insert", required=True)
+    parser.add_argument("--inner-radius-mm", type=float, default=4.0, help="where the field is stated (4)")
+    parser.add_argument("--out", type=Path, metavar="MODEL.safetensors", help="with a sweep")
+    parser.add_argument("--csv", type=Path, metavar="TRAINING.csv", help="write the training data too")
+    options = parser.parse_args(arguments)
+    if (options.sweep is None) != (options.out is None):
+        parser.error("SWEEP.csv and --out go together")
+    try:
+        if options.sweep is None:
+            result: dict[str, Any] = {"insert": insert(options.insert).name}
+            for module in NEEDED:
+                if importlib.util.find_spec(module) is None:
+                    raise ModuleNotFoundError(name=module)
+        else:
+            result = calibrate(
+                options.sweep,
+                options.insert,
+                options.inner_radius_mm,
+                options.out,
+                options.csv,
+                datetime.datetime.now(datetime.UTC).date(),
+            )
+    except CalibrationError as error:
+        return _refuse(error.code, error.message, error.hint)
+    except (LabError, DomainError) as error:
+        return _refuse("data", str(error), "correct what is named and calibrate again")
+    except ModuleNotFoundError as error:
+        told, _, command = not_installed(error.name or "").partition(": ")
+        return _refuse("not_installed", told, command)
+    except OSError as error:
+        return _refuse("file", f"{error.filename}: {error.strerror}", "give files in a directory you may write to")
+    print(json.dumps({"result": result}))
+    return 0
+
+
+def _refuse(code: str, message: str, hint: str) -> int:
+    print(json.dumps({"error": {"code": code, "message": message, "hint": hint}}))
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

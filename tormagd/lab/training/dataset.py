@@ -1,0 +1,148 @@
+"""Training data: what was measured, as arrays, and the CSV file that carries it."""
+
+import csv
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tormagd.lab.errors import LabError
+from tormagd.lab.tables import read_columns
+from tormagd.model.features import FEATURES
+
+Array: TypeAlias = NDArray[np.float64]
+
+COLUMNS = (*FEATURES, "force_N")
+OPTIONAL_COLUMNS = ("cycle", "time_s")
+
+ALLOWED = {
+    "displacement_mm": (-100.0, 100.0),
+    "rate_mm_s": (-1000.0, 1000.0),
+    "field_mT": (0.0, 2000.0),
+    "cip_percent": (0.0, 100.0),
+    "force_N": (-1000.0, 1000.0),
+    "cycle": (0.0, 1e9),
+    "time_s": (0.0, 1e9),
+}
+"""Wider than any device this program drives, and narrow enough to catch a wrong unit or a shifted column.
+
+Force and displacement may be negative by noise; rate is negative when the element is unloaded."""
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Measured rows: features (n x 4, order of `FEATURES`), force_N (n), and optionally cycle (n) and time_s (n).
+
+    `cycle` labels rows that belong together (one loading cycle, one run), so that a split can keep them together.
+    Arrays are copied and unwritable. Raises `LabError` on shapes that do not fit, fewer than two rows, or a value
+    outside `ALLOWED`; NaN never is inside. Rows are counted from 0 here.
+    """
+
+    features: Array
+    force_N: Array
+    cycle: NDArray[np.int64] | None = None
+    time_s: Array | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("features", "force_N", "time_s"):
+            self._freeze(name, np.float64)
+        self._freeze("cycle", np.int64)
+        rows = len(self.force_N)
+        if rows < 2:
+            raise LabError(f"{rows} rows; at least 2 are needed")
+        expected = {"features": (rows, len(FEATURES)), "force_N": (rows,), "cycle": (rows,), "time_s": (rows,)}
+        for name, shape in expected.items():
+            array = getattr(self, name)
+            if array is not None and array.shape != shape:
+                raise LabError(f"{name} has shape {array.shape}; needed is {shape}")
+        for name, column in self.columns().items():
+            low, high = ALLOWED[name]
+            refused = np.flatnonzero(~((column >= low) & (column <= high)))
+            if refused.size:
+                row = int(refused[0])
+                raise LabError(f"row {row}, {name}: {column[row]} is not allowed, only {low:g} to {high:g}")
+
+    def _freeze(self, name: str, dtype: type[np.generic]) -> None:
+        given = getattr(self, name)
+        if given is not None:
+            array = np.array(given, dtype=dtype)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def columns(self) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]:
+        """Return each column by its name, as in the file; the optional ones only where they exist."""
+        columns: dict[str, NDArray[np.float64] | NDArray[np.int64]] = dict(zip(FEATURES, self.features.T, strict=True))
+        columns["force_N"] = self.force_N
+        if self.cycle is not None:
+            columns["cycle"] = self.cycle
+        if self.time_s is not None:
+            columns["time_s"] = self.time_s
+        return columns
+
+    def __len__(self) -> int:
+        return len(self.force_N)
+
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Return the least and the greatest value of each feature and of force_N."""
+        columns = self.columns()
+        return {name: (float(columns[name].min()), float(columns[name].max())) for name in COLUMNS}
+
+    def sha256(self) -> str:
+        """Return the digest of names and values: the same whatever the file's number format or line ends."""
+        digest = hashlib.sha256()
+        for name, column in self.columns().items():
+            digest.update(f"{name} {len(column)} ".encode())
+            digest.update(column.astype(column.dtype.newbyteorder("<")).tobytes())
+        return digest.hexdigest()
+
+    def subset(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> "Dataset":
+        """Return the chosen rows (indices or a mask)."""
+        cycle = None if self.cycle is None else self.cycle[rows]
+        time_s = None if self.time_s is None else self.time_s[rows]
+        return Dataset(self.features[rows], self.force_N[rows], cycle, time_s)
+
+    def split(self, validation_share: float, seed: int) -> tuple["Dataset", "Dataset"]:
+        """Split at random into (training, validation), the same way for the same seed.
+
+        With cycle labels whole cycles go to one side, because neighbours in a time series are nearly copies of each
+        other and a validation that holds copies of the training rows proves nothing.
+        Raises `LabError` when the share leaves fewer than two rows on a side.
+        """
+        if not 0 < validation_share < 1:
+            raise LabError(f"validation_share = {validation_share} is not allowed, only between 0 and 1")
+        groups = np.arange(len(self)) if self.cycle is None else self.cycle
+        labels = np.unique(groups)
+        held_out = round(validation_share * len(labels))
+        chosen = np.random.default_rng(seed).permutation(labels)[:held_out]
+        validation = np.isin(groups, chosen)
+        if not 2 <= validation.sum() <= len(self) - 2:
+            raise LabError(
+                f"{len(self)} rows in {len(labels)} groups leave fewer than 2 rows on one side "
+                f"at validation_share = {validation_share:g}"
+            )
+        return self.subset(~validation), self.subset(validation)
+
+
+def read_csv(path: Path) -> Dataset:
+    """Read training data: header `displacement_mm,rate_mm_s,field_mT,cip_percent,force_N` (+ `cycle`, `time_s`).
+
+    Raises `LabError` naming the row of the file, the column, the value and what is allowed.
+    """
+    named = read_columns(path, COLUMNS, OPTIONAL_COLUMNS, allowed=ALLOWED, is_exact=True)
+    cycle = named.get("cycle")
+    if cycle is not None and (cycle % 1.0).any():
+        row = int(np.flatnonzero(cycle % 1.0)[0])
+        raise LabError(f"{path}: row {row + 2}, cycle: '{cycle[row]:g}' is not allowed, only whole numbers")
+    return Dataset(np.column_stack([named[name] for name in FEATURES]), named["force_N"], cycle, named.get("time_s"))
+
+
+def write_csv(path: Path | str, dataset: Dataset) -> None:
+    """Write `dataset` so that `read_csv` gives back the same numbers to the last bit."""
+    columns = dataset.columns()
+    with Path(path).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))

@@ -1,0 +1,105 @@
+"""Training one force model: network, scaling, Levenberg-Marquardt, and what is written down about it."""
+
+import datetime
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import torch
+
+from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.levenberg_marquardt import Epoch, Training, train
+from tormagd.lab.training.metrics import fit_metrics
+from tormagd.lab.training.splits import Mask, random_split
+from tormagd.model.features import Element, Scaling
+from tormagd.model.memory import NO_MEMORY, Memory
+from tormagd.model.model_file import ForceModel, ModelMetadata
+from tormagd.model.network import ForceNetwork, to_model
+from tormagd.model.rising import not_rising_share
+
+VALIDATION_SHARE = 0.1
+"""Of the training rows, to say when the training stops; the test rows have no part in that."""
+
+
+def fit_model(
+    training: Dataset,
+    validation: Dataset,
+    *,
+    element: Element,
+    insert: str,
+    data_sha256: str,
+    created: datetime.date,
+    memory: Memory = NO_MEMORY,
+    hidden: int = 50,
+    epochs: int = 200,
+    seed: int = 0,
+    scaled_by: Dataset | None = None,
+    start: ForceModel | None = None,
+    progress: Callable[[Epoch], None] | None = None,
+) -> tuple[ForceModel, Training]:
+    """Train on `training`, stop by `validation`, and return the model with its metrics on both, and how it went. What
+    was taken out of the data before is their `memory`.
+
+    The network is scaled by the ranges of `scaled_by`, of `training` by default, and begins with the weights of
+    `start`, if given. Deterministic for given data and seed. Raises `DomainError` on a name or a count that a model
+    file may not have.
+    """
+    ranging = scaled_by or training
+    scaling = Scaling.fit(ranging.features, ranging.force_N)
+    network = ForceNetwork(scaling, hidden, seed=seed)
+    if start is not None:
+        _begin_with(network, scaling, start)
+    metadata = ModelMetadata(  # before the training, which a wrong name should not have to wait for
+        element=element,
+        insert=insert,
+        hidden=hidden,
+        ranges=ranging.ranges(),
+        scaling=scaling,
+        training_data_sha256=data_sha256,
+        metrics={},
+        created=created,
+        memory=memory,
+    )
+    result = train(network, training, validation, epochs=epochs, progress=progress)
+    model = to_model(network, metadata)
+    metrics = {
+        **{f"train_{name}": value for name, value in fit_metrics(model, training).items()},
+        **{f"validation_{name}": value for name, value in fit_metrics(model, validation).items()},
+        "not_rising_share": not_rising_share(model),
+        "train_rows": float(len(training)),
+        "validation_rows": float(len(validation)),
+        "epochs": float(len(result.history)),
+        "best_epoch": float(result.best.epoch),
+    }
+    return to_model(network, msgspec.structs.replace(metadata, metrics=metrics)), result
+
+
+def fit_network(
+    data: Dataset, known: Mask, hidden: int = 50, epochs: int = 162, start: ForceModel | None = None
+) -> tuple[ForceModel, Training]:
+    """The thesis's network (section 4.2.5) for the tactile element, from the rows of `data` (n) in `known` (n)."""
+    rows = data.subset(known)
+    stop = random_split(len(rows), 0, VALIDATION_SHARE)
+    return fit_model(
+        rows.subset(~stop),
+        rows.subset(stop),
+        element=Element.TACTILE,
+        insert="MRE-ABC",
+        data_sha256=rows.sha256(),
+        created=datetime.date.today(),
+        hidden=hidden,
+        epochs=epochs,
+        scaled_by=rows,
+        start=start,
+    )
+
+
+@torch.no_grad()
+def _begin_with(network: ForceNetwork, scaling: Scaling, start: ForceModel) -> None:
+    """Give the network the weights of `start`, folded into the scaling of these data."""
+    weight, bias, output, constant = start.physical
+    gain = np.array(scaling.input_gain)
+    network.hidden_weight.copy_(torch.tensor(np.divide(weight, gain, out=np.zeros_like(weight), where=gain != 0)))
+    network.hidden_bias.copy_(torch.tensor(bias + weight @ np.array(scaling.input_offset)))
+    network.output_weight.copy_(torch.tensor(output * scaling.output_gain))
+    network.output_bias.fill_((constant - scaling.output_offset) * scaling.output_gain)

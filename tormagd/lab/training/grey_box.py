@@ -1,0 +1,152 @@
+"""The relaxation-aware model: a network for the force without memory, and Prony series for what the stress remembers.
+
+F0 = NN(displacement, rate, field, CIP) is the force without memory. What of it is there without field, NN(.., 0, ..),
+and what the field adds relax each by fractions of their own, with the same times (see `tormagd.physics.relaxation`).
+The memory enters an inverse as a shift: `GreyBoxMemory.elastic_N` says which F0 gives the force that is asked now, and
+any search through the network finds the field for that F0.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.memory import records, relaxed_N
+from tormagd.lab.training.splits import Mask
+from tormagd.model.features import FEATURES, FIELD
+from tormagd.model.model_file import ForceModel
+from tormagd.physics.errors import DomainError
+from tormagd.physics.relaxation import PronySeries
+
+Array = NDArray[np.float64]
+
+RATE = FEATURES.index("rate_mm_s")
+START_TIMES_S = (1.0, 10.0, 100.0, 1000.0)
+START_FRACTION = 0.03
+TIME_SPREAD = 3.0
+"""The fitted times stay within this factor of the ones they start from, so that they cannot change places."""
+ROUNDS = 4
+"""The network is fitted to forces freed of memory, which the network itself predicts: that has to settle."""
+
+
+@dataclass(frozen=True)
+class GreyBox:
+    """A network for the force without memory; relaxation of its field-free part, and of what the field adds."""
+
+    model: ForceModel
+    series: PronySeries
+    field_series: PronySeries
+
+    def predict(self, data: Dataset) -> Array:
+        """Force (n), N, along the records of `data`. Raises `DomainError` without `time_s`."""
+        return _with_memory((self.series, self.field_series), elastic_parts_N(self.model, data), data)
+
+
+class GreyBoxMemory:
+    """What a pad remembers while it is driven, in steps of `dt_s`, beginning at rest."""
+
+    def __init__(self, grey: GreyBox, dt_s: float) -> None:
+        self._model = grey.model
+        self._step, self._field_step = grey.series.discretise(dt_s), grey.field_series.discretise(dt_s)
+        self._state, self._field_state = grey.series.relaxed(0.0), grey.field_series.relaxed(0.0)
+
+    def elastic_N(self, displacement_mm: float, rate_mm_s: float, force_N: float, cip_percent: float) -> float:
+        """The network's force, N, with which the pad gives `force_N` at the end of the step that begins now."""
+        free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
+        rest_N, _ = self._step.advance(self._state, free_N)
+        # the force is affine in the driving one: its value at 0 and its slope
+        step, state = self._field_step, self._field_state
+        past_N, _ = step.advance(state, 0.0)
+        gain = step.equilibrium_fraction + sum(g * k for g, k in zip(step.fractions, step.gains, strict=True))
+        return free_N + (force_N - rest_N - past_N) / gain
+
+    def advance(self, displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
+        """Take the step at that field; returns the force, N, that the model expects at its end."""
+        free_N = self._model.predict_one(displacement_mm, rate_mm_s, 0.0, cip_percent)
+        whole_N = self._model.predict_one(displacement_mm, rate_mm_s, field_mT, cip_percent)
+        rest_N, self._state = self._step.advance(self._state, free_N)
+        added_N, self._field_state = self._field_step.advance(self._field_state, whole_N - free_N)
+        return rest_N + added_N
+
+
+def elastic_parts_N(model: ForceModel, data: Dataset) -> tuple[Array, Array]:
+    """Force without memory (n), N: without field, and what the field adds."""
+    fieldless = data.features.copy()
+    fieldless[:, FIELD] = 0.0
+    free_N = model.predict(fieldless)
+    return free_N, model.predict(data.features) - free_N
+
+
+def _with_memory(series: tuple[PronySeries, PronySeries], parts: tuple[Array, Array], data: Dataset) -> Array:
+    return relaxed_N(series[0], parts[0], data) + relaxed_N(series[1], parts[1], data)
+
+
+def fit_series(holds: Dataset, parts: tuple[Array, Array]) -> tuple[PronySeries, PronySeries]:
+    """The two series that best make the forces of `holds` from the elastic `parts` (n each), each record scaled to fit.
+
+    The scales are free because a network that has never seen a hold is off by some percent there, which must not pass
+    for relaxation. For the same reason only rows at rest count; the others make the state that they begin in.
+    Raises `DomainError` where no record has two rows at rest, or without `time_s`.
+    """
+    at_rest = holds.features[:, RATE] == 0.0
+    still_rows = [np.flatnonzero(at_rest[rows]) + rows.start for rows in records(holds)]
+    still_rows = [rows for rows in still_rows if len(rows) > 1]
+    if not still_rows:
+        raise DomainError("holds", "no record with two rows at rate 0", "relaxation tests: to a depth, then held")
+    terms = len(START_TIMES_S)
+
+    def series(parameters: Array) -> tuple[PronySeries, PronySeries]:
+        fractions, added, times = (tuple(part.tolist()) for part in np.split(parameters, 3))
+        times_s = tuple(np.exp(times).tolist())
+        return PronySeries(fractions, times_s), PronySeries(added, times_s)
+
+    @functools.cache
+    def branches(time_s: float) -> tuple[Array, Array]:
+        # the force of one branch: the fractions enter linearly, so only a changed time costs a run along the records
+        single = PronySeries((0.5,), (time_s,))
+        return 2 * relaxed_N(single, parts[0], holds) - parts[0], 2 * relaxed_N(single, parts[1], holds) - parts[1]
+
+    def residual(parameters: Array) -> Array:
+        shape = parts[0] + parts[1]
+        for first, second, time_s in zip(*np.split(parameters, 3), strict=True):
+            free_N, added_N = branches(float(np.exp(time_s)))
+            shape = shape + first * (free_N - parts[0]) + second * (added_N - parts[1])
+        errors = []
+        for rows in still_rows:
+            measured, made = holds.force_N[rows], shape[rows]
+            errors.append(made * (made @ measured) / (made @ made) - measured)
+        return np.concatenate(errors)
+
+    times, spread = np.log(START_TIMES_S), np.log(TIME_SPREAD)
+    start = np.concatenate((np.full(2 * terms, START_FRACTION), times))
+    low = np.concatenate((np.zeros(2 * terms), times - spread))
+    high = np.concatenate((np.full(2 * terms, 0.3), times + spread))
+    scale = np.repeat((0.01, 0.01, 0.3), terms)
+    return series(least_squares(residual, start, bounds=(low, high), x_scale=scale, ftol=1e-6).x)
+
+
+def fit_grey_box(
+    data: Dataset, known: Mask, holds: Dataset, *, hidden: int = 30, epochs: int = 100, settling_epochs: int = 30
+) -> GreyBox:
+    """The model from the rows of cycles (n) in `known` (n), and from relaxation tests, `holds`.
+
+    The network learns for `epochs` as if there were no memory, then for `settling_epochs` in each of `ROUNDS` rounds.
+    """
+    from tormagd.lab.training.fitting import fit_network  # with torch, which a fitted model does without
+
+    model, _ = fit_network(data, known, hidden, epochs)
+    for _ in range(ROUNDS):
+        parts, parts_holds = elastic_parts_N(model, data), elastic_parts_N(model, holds)
+        series = fit_series(holds, parts_holds)
+        lost = sum(parts) - _with_memory(series, parts, data)
+        lost_holds = sum(parts_holds) - _with_memory(series, parts_holds, holds)
+        joined = Dataset(
+            np.concatenate((data.features, holds.features)),
+            np.concatenate((data.force_N + lost, holds.force_N + lost_holds)),
+        )
+        all_known = np.concatenate((known, np.ones(len(holds), dtype=np.bool_)))
+        model, _ = fit_network(joined, all_known, hidden, settling_epochs, start=model)
+    return GreyBox(model, *series)
