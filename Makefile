@@ -20,10 +20,10 @@ export OMP_NUM_THREADS ?= 1
 # which build of the core runs; where it is interpreted, why
 SAY_BUILD = $(BIN)/python -P -c 'from firmware_protocol.build import settle; print("the core runs", settle())'
 
-# what the core promises, asked of the interpreted build as well, and what puts faults into its sources. Closed loops are
+# what the core promises, asked of the interpreted build as well. Closed loops are
 # not run twice: `tests/core` holds the two builds against each other to the bit
 CORE_TESTS := tests/control tests/safety tests/model tests/firmware_protocol/test_codec.py tests/firmware_protocol/test_framing.py \
-    tests/hardware/test_link.py tests/hardware/test_link_statistics.py tests/tools/test_fuzz_protocol.py
+    tests/hardware/test_link.py tests/hardware/test_link_statistics.py
 
 # the variable: mkdocs-material's notice of its own end of life, 2027, is no warning of ours
 SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict --quiet
@@ -49,13 +49,13 @@ yielding-check: $(VENV)/.dev
 
 # -P: what its owner keeps in this folder is not imported in place of a module. The core's tests run on both builds
 unhurried: $(VENV)/.dev
-	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live and not interpreted'
+	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live'
 	TORMAG_COMPILED=0 $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' $(CORE_TESTS)
 
 # which lines of the two packages the tests without real time run; nothing compiled is seen, so the rooms that are compiled in
 # part are asked again, interpreted. pyproject.toml has the least share
 coverage: $(VENV)/.dev
-	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live and not interpreted' \
+	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' \
 	    --cov --cov-report= --cov-fail-under=0
 	TORMAG_COMPILED=0 $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' --cov --cov-append \
 	    $(CORE_TESTS) tests/physics tests/inverse tests/hardware tests/simulation \

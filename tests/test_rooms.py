@@ -58,10 +58,10 @@ TOOL_ROOMS = {
     "extremes": set(),
     "first_use": set(),
     "rendering": {"machines", "pictures"},
-    "fault_matrix": {"wire"},
+    "fault_matrix": set(),
+    "endurance": {"machines"},
     "benchmarks": {"machines", "consoles", "wire", "pictures", "thesis", "rendering"},
     "tactile": {"pictures", "thesis", "rendering", "benchmarks"},
-    "intrusion": {"machines", "rendering", "benchmarks"},
 }
 """Of the tools; beside them stand the scripts, which no room imports. What is the product's is open to all."""
 
