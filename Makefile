@@ -8,6 +8,8 @@ WORKERS ?= auto
 PYTHONS ?= 3.11 3.12 3.13
 GOAL ?= test
 SEARCHES ?= 5
+MUTANTS ?= 60
+SEED ?= 1
 
 DESTDIR ?=
 PREFIX ?= /usr/local
@@ -30,7 +32,7 @@ SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict --quiet
 
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
-.PHONY: install uninstall deb run test unhurried live yielding-check coverage search pythons check docs format compile core fetched model tactile-model reproduction evidence clean
+.PHONY: install uninstall deb run test unhurried live yielding-check coverage search mutation pythons check docs format compile core fetched model tactile-model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -67,6 +69,16 @@ search: $(VENV)/.dev
 	    $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' \
 	        --hypothesis-profile=search || exit 1; \
 	done
+
+# faults put one at a time into a clone of what is committed; the core is interpreted there, and survivors are listed
+mutation: $(VENV)/.dev
+	$(MAKE) --no-print-directory fetched EXTRAS=mutation
+	rm -rf build/mutation && git clone --quiet . build/mutation
+	cd build/mutation && export PATH='$(CURDIR)/$(BIN)':"$$PATH" PYTHONPATH=. TORMAG_COMPILED=0 && \
+	    cosmic-ray init tools/mutation.toml mutants.sqlite && \
+	    python tools/mutation_sample.py mutants.sqlite $(MUTANTS) $(SEED) && \
+	    cosmic-ray exec tools/mutation.toml mutants.sqlite && \
+	    cr-report --surviving-only --show-diff mutants.sqlite
 
 # what is committed, from nothing, with every supported Python; one that is not here is named
 pythons:
@@ -116,7 +128,7 @@ reproduction: $(VENV)/.dev
 	$(BIN)/python tools/reproduce_thesis.py
 	$(BIN)/python tools/tactile_experiment.py --out docs
 
-# docs/evidence: fuzz, fault matrix, planted faults, random walk, numerics, replug, soak and intruders in full (well over an hour); `make test` samples them
+# docs/evidence: the fault matrix and the cases of tools/endure.py in full (well over an hour); `make test` samples them
 evidence: $(VENV)/.dev
 	$(BIN)/python tools/evidence.py
 
