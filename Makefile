@@ -8,6 +8,8 @@ WORKERS ?= auto
 PYTHONS ?= 3.11 3.12 3.13
 GOAL ?= test
 SEARCHES ?= 5
+MUTANTS ?= 60
+SEED ?= 1
 
 DESTDIR ?=
 PREFIX ?= /usr/local
@@ -20,17 +22,17 @@ export OMP_NUM_THREADS ?= 1
 # which build of the core runs; where it is interpreted, why
 SAY_BUILD = $(BIN)/python -P -c 'from firmware_protocol.build import settle; print("the core runs", settle())'
 
-# what the core promises, asked of the interpreted build as well, and what puts faults into its sources. Closed loops are
+# what the core promises, asked of the interpreted build as well. Closed loops are
 # not run twice: `tests/core` holds the two builds against each other to the bit
 CORE_TESTS := tests/control tests/safety tests/model tests/firmware_protocol/test_codec.py tests/firmware_protocol/test_framing.py \
-    tests/hardware/test_link.py tests/hardware/test_link_statistics.py tests/tools/test_fuzz_protocol.py
+    tests/hardware/test_link.py tests/hardware/test_link_statistics.py
 
 # the variable: mkdocs-material's notice of its own end of life, 2027, is no warning of ours
 SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict --quiet
 
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
-.PHONY: install uninstall deb wheels run test unhurried live yielding-check coverage search pythons check docs format compile core fetched model tactile-model reproduction evidence clean
+.PHONY: install uninstall deb wheels run test unhurried live yielding-check coverage search mutation pythons check docs format compile core fetched model tactile-model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
@@ -49,13 +51,13 @@ yielding-check: $(VENV)/.dev
 
 # -P: what its owner keeps in this folder is not imported in place of a module. The core's tests run on both builds
 unhurried: $(VENV)/.dev
-	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live and not interpreted'
+	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live'
 	TORMAG_COMPILED=0 $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' $(CORE_TESTS)
 
 # which lines of the two packages the tests without real time run; nothing compiled is seen, so the rooms that are compiled in
 # part are asked again, interpreted. pyproject.toml has the least share
 coverage: $(VENV)/.dev
-	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live and not interpreted' \
+	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' \
 	    --cov --cov-report= --cov-fail-under=0
 	TORMAG_COMPILED=0 $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' --cov --cov-append \
 	    $(CORE_TESTS) tests/physics tests/inverse tests/hardware tests/simulation \
@@ -67,6 +69,16 @@ search: $(VENV)/.dev
 	    $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' \
 	        --hypothesis-profile=search || exit 1; \
 	done
+
+# faults put one at a time into a clone of what is committed; the core is interpreted there, and survivors are listed
+mutation: $(VENV)/.dev
+	$(MAKE) --no-print-directory fetched EXTRAS=mutation
+	rm -rf build/mutation && git clone --quiet . build/mutation
+	cd build/mutation && export PATH='$(CURDIR)/$(BIN)':"$$PATH" PYTHONPATH=. TORMAG_COMPILED=0 && \
+	    cosmic-ray init tools/mutation.toml mutants.sqlite && \
+	    python tools/mutation_sample.py mutants.sqlite $(MUTANTS) $(SEED) && \
+	    cosmic-ray exec tools/mutation.toml mutants.sqlite && \
+	    cr-report --surviving-only --show-diff mutants.sqlite
 
 # what is committed, from nothing, with every supported Python; one that is not here is named
 pythons:
@@ -116,7 +128,7 @@ reproduction: $(VENV)/.dev
 	$(BIN)/python tools/reproduce_thesis.py
 	$(BIN)/python tools/tactile_experiment.py --out docs
 
-# the table of docs/evidence: fuzz, faults, walk, numerics, replug, soak, stalls and siege in full (well over an hour); `make test` samples them
+# docs/evidence: the fault matrix and the cases of tools/endure.py in full (well over an hour); `make test` samples them
 evidence: $(VENV)/.dev
 	$(BIN)/python tools/evidence.py
 

@@ -1,5 +1,4 @@
-"""What every test shares: a live test that the host spoiled is started again, twice at most, and a test that puts a
-fault into the core's sources runs where these are interpreted.
+"""What every test shares: a live test that the host spoiled is started again, twice at most.
 
 A live test joins processes and sockets in real time. Where the host takes the processor for longer than the device may
 be silent, device and daemon protect themselves, as they must, and the scenario is over. That is never told from the
@@ -10,8 +9,6 @@ failure.
 import contextlib
 import os
 import signal
-import subprocess
-import sys
 import time
 import warnings
 from collections.abc import Iterator
@@ -21,7 +18,6 @@ import pytest
 from hypothesis import HealthCheck, settings
 from machines.host import HostWatch
 
-from firmware_protocol.build import SWITCH, settle
 from tormagd.slices import ask_for_slices
 
 # No test asserts a wall-clock duration, so none fails because the machine is slow. One commit has one verdict: a
@@ -34,7 +30,6 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # pytest-xdist's workers ignore Ctrl-C, as what runs in the background does, and what a test starts would inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-INTERPRETED_LIMIT_S = 300
 ATTEMPTS = 3
 WATCHED_ABOVE = 51
 "FIFO priority of the bare timers, where it is allowed: one above the daemon's in the tests."
@@ -54,29 +49,6 @@ class HostWarning(UserWarning):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Runs a test that its marker says is not run as any other."""
-    if pyfuncitem.get_closest_marker("interpreted") is not None and settle().is_compiled:
-        return run_interpreted(pyfuncitem)
-    return run_live(pyfuncitem)
-
-
-def run_interpreted(pyfuncitem: pytest.Function) -> bool:
-    """Runs a test in a process of its own, where the core is interpreted; its failure is this one's."""
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "pytest", "-q", "-p", "no:cacheprovider", pyfuncitem.nodeid],
-        env=os.environ | {SWITCH: "0"},
-        cwd=pyfuncitem.config.rootpath,
-        check=False,
-        capture_output=True,
-        text=True,
-        timeout=INTERPRETED_LIMIT_S,
-    )
-    if done.returncode or "1 passed" not in done.stdout:
-        pytest.fail(f"{done.stdout}{done.stderr}", pytrace=False)
-    return True
-
-
-def run_live(pyfuncitem: pytest.Function) -> bool | None:
     """Runs a live test, again after a failure that the host explains. What it asserts stays the same."""
     if pyfuncitem.get_closest_marker("live") is None:
         return None

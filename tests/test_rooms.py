@@ -53,9 +53,9 @@ TOOL_ROOMS = {
     "pictures": set(),
     "extremes": set(),
     "rendering": {"machines", "pictures"},
-    "fault_matrix": {"wire"},
+    "fault_matrix": set(),
+    "endurance": {"machines"},
     "benchmarks": {"machines", "wire", "pictures", "rendering"},
-    "intrusion": {"machines", "rendering", "benchmarks"},
 }
 """Of the tools; beside them stand the scripts, which no room imports. What is the product's is open to all."""
 

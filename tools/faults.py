@@ -106,32 +106,15 @@ def _is_taken(rig: Rig, watch: Watch, command: str) -> bool:
     return True
 
 
-WIDTH = 62
-
-
 def print_table(cells: list[Cell]) -> None:
     """The matrix for a person."""
-    times_heads = "".join(f"{head:>9s}" for head in ("noticed", "< 1 N", "open"))
-    times_heads += f"{'reacted':>10s}{'stated':>10s}"
-    print(f"{'injected':{WIDTH}s}{'bus':7s}{times_heads}{'loss':>10s}  {'must be':14s}noticed as; end state; recovery")
     for cell in cells:
-        times = (cell.noticed_ms, cell.below_1N_ms, cell.open_ms)
-        columns = "".join(f"{'-' if time is None else f'{time:.0f} ms':>9s}" for time in times)
-        for time in (cell.reacted_ms, cell.stated_ms):
-            columns += f"{'-' if time is None else f'{time:.0f} ms':>10s}"
-        columns += f"{cell.loss_N_s:6.1f} N/s"
-        named = [*cell.host_faults, *(f"device:{fault}" for fault in cell.device_faults), *cell.limits]
-        failed = {
-            "UNNAMED": not cell.named,
-            "UNSAFE": not cell.safe,
-            "LATE": not cell.in_time,
-            "NOT RECOVERED": not cell.recovered,
-        }
-        verdict = "".join(f" {word}" for word, is_so in failed.items() if is_so)
-        print(
-            f"{cell.fault:{WIDTH}s}{cell.bus:7s}{columns}  {cell.expected:14s}{', '.join(named) or 'nothing'}; "
-            f"{cell.reaction}; {', '.join(cell.recovery) or 'by itself'}{verdict}"
-        )
+        told = [*cell.host_faults, *(f"device:{fault}" for fault in cell.device_faults), *cell.limits]
+        verdicts = {"UNNAMED": cell.named, "UNSAFE": cell.safe, "LATE": cell.in_time, "NOT RECOVERED": cell.recovered}
+        failed = "".join(f" {word}" for word, is_so in verdicts.items() if not is_so)
+        times = f"reacted {cell.reacted_ms} ms, stated {cell.stated_ms}, open {cell.open_ms}; {cell.loss_N_s} N/s"
+        print(f"{cell.fault}, {cell.bus}: {cell.expected}; {', '.join(told) or 'nothing'}; {cell.reaction}{failed}")
+        print(f"    {times}; {', '.join(cell.recovery) or 'by itself'}")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ Two tests hold the pages to what they are made from. `python tools/safety_pages.
 
 import json
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,29 +19,26 @@ DOCS = Path(__file__).parents[1] / "docs"
 STATES, MATRIX = DOCS / "states.md", DOCS / "fault-matrix.md"
 EVIDENCE = DOCS / "evidence" / "faults.json"
 
-FAILED = {"named": "unnamed", "safe": "unsafe", "in_time": "late", "recovered": "not recovered"}
-"What a cell is called that is not what it should be."
+HELD = {"named": "named", "safe": "ended safe", "in_time": "reacted in their stated time", "recovered": "recovered"}
+"What a cell is called that is what it should be."
 
 _STATES_HEAD = """# Operating states, faults and limits
 
 Written by `python tools/safety_pages.py` from the tables that the daemon itself runs on, `operating_state.py` and
-`codes.py` in `tormagd/safety`. What happens beyond this process is told in [safety](safety.md), and in the
-[fault matrix](fault-matrix.md) what each fault comes to on a serial line and on a CAN bus.
+`codes.py` in `tormagd/safety`. What happens beyond this process is told in [safety](safety.md), and what each fault
+comes to on either bus in the [fault matrix](fault-matrix.md).
 
 """
 _MATRIX_HEAD = """# Fault matrix
 
-Written by `python tools/safety_pages.py` from [evidence/faults.json](evidence/faults.json), a run of `tools/faults.py`
-(`python tools/evidence.py faults`). All of it is virtual time and simulated devices.
+Written by `python tools/safety_pages.py` from [evidence/faults.json](evidence/faults.json), a run of `tools/faults.py
+--json`, which also has all times, what is stated, and what was tried before the cause had gone. All of it is virtual
+time and simulated devices.
 
-*Stated* is by when the reaction has to be on its way: the device begins to open or lets go, the limit is told, the
-command is refused. It is what [the table of codes](states.md#faults) says of the code that is to be named, or the
-injection's own time, and `-` where nothing has to be named. *Reacted* is what was measured, *open* when the gap was.
-
-*Recovery* is [what the daemon names](messages.md#status) as the way to ENABLED (`next_commands`), tried twice. *Before*
-is what it came to while the cause lasted: a command is refused, a fault shows again, or a limit is told all the while;
-`-` where the cause had gone by itself, or the daemon was dead. Then the cause is ended, and the commands of the last
-column are given: afterwards the force is followed again within 0.15 N, and nothing of the fault is told any more.
+Faults are put in while 1.8 ± 0.1 N are rendered at a turning handle; those of homing and of the start are there from
+the beginning. A row is of both buses, where they agree. *Safe after* is when the end that is stated began: the gap was
+open or at rest, or the limit was told. *Leads out* are the commands that the daemon [names itself](messages.md#status),
+once the cause has gone; afterwards the force is followed again within 0.15 N, and before that they came to nothing.
 
 """
 
@@ -60,30 +58,28 @@ def states_page() -> str:
 def matrix_page(record: dict[str, Any]) -> str:
     """The page of a run of the matrix."""
     cells = record["figures"]["cells"]
-    faults = dict.fromkeys(cell["fault"] for cell in cells)
-    kept = [sum(cell[name] for cell in cells) for name in ("named", "safe", "in_time", "recovered")]
-    says = (
-        f"{len(faults)} faults, {len(cells)} cells on `{record['figures']['plant']}`, version {record['version']}: "
-        f"{kept[0]} named, {kept[1]} ended safe, {kept[2]} reacted in their stated time, {kept[3]} recovered as "
-        "documented.\n\n"
-    )
-    head = ("fault", "bus", "named as", "reaction", "excitation", "stated", "reacted", "open", "before", "recovery")
+    kept = ", ".join(f"{sum(cell[name] for cell in cells)} {word}" for name, word in HELD.items())
+    says = f"{len(cells)} cells on `{record['figures']['plant']}`, version {record['version']}: {kept}.\n\n"
+    lines: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for cell in cells:
+        lines.setdefault((cell["fault"], *_outcome(cell)), []).append(cell)
+    buses = Counter(fault for fault, *_ in lines)
+    rows = []
+    for (fault, named, reaction, leads_out), alike in lines.items():
+        name = fault if buses[fault] == 1 else f"{fault} ({alike[0]['bus']})"
+        safe_s = [cell["seconds"] for cell in alike if cell["seconds"] is not None]
+        rows.append((name, named, reaction, f"{max(safe_s):.3f} s" if safe_s else "-", leads_out))
     never = "\n## What is no row, and why\n\n" + _table(("fault", "why"), [*LEFT_OUT.items()])
-    return _MATRIX_HEAD + says + _table(head, [_cell(cell) for cell in cells]) + never
+    return _MATRIX_HEAD + says + _table(("fault", "named as", "reaction", "safe after", "leads out"), rows) + never
 
 
-def _cell(cell: dict[str, Any]) -> tuple[str, ...]:
+def _outcome(cell: dict[str, Any]) -> tuple[str, ...]:
     told = [*cell["host_faults"], *(f"device:{name}" for name in cell["device_faults"]), *cell["limits"]]
-    failed = [word for name, word in FAILED.items() if not cell[name]]
+    # what the device has latched is told by the daemon, too, unless that is dead
+    told = [name for name in told if name.replace("device:", "DEVICE_") not in told or not name.startswith("device:")]
+    failed = [f"not {word}" for name, word in HELD.items() if not cell[name]]
     reaction = cell["expected"] + (f" (**{', '.join(failed)}**)" if failed else "")
-    named = ", ".join(dict.fromkeys(told)) or "-"
-    times = [_ms(cell[name]) for name in ("stated_ms", "reacted_ms", "open_ms")]
-    recovery = ", ".join(cell["recovery"]) or "by itself"
-    return cell["fault"], cell["bus"], named, reaction, cell["excitation"], *times, cell["tried"] or "-", recovery
-
-
-def _ms(time_ms: float | None) -> str:
-    return "-" if time_ms is None else f"{time_ms:,.0f} ms"
+    return ", ".join(dict.fromkeys(told)) or "-", reaction, ", ".join(cell["recovery"]) or "-"
 
 
 def _diagram() -> str:
@@ -96,29 +92,24 @@ def _diagram() -> str:
 
 
 def _transitions() -> str:
-    rows = [_transition(row) if isinstance(row, Transition) else _refusal(row) for row in ROWS]
+    known = {(row.event, row.source): row for row in ROWS}
+    rows = []
+    for event in Event:
+        row = next(row for row in ROWS if row.event is event and isinstance(row, Transition))
+        guards = ", ".join(dict.fromkeys(f"`{guard.code}`" for guard in row.guards)) or "-"
+        leads = [_lead(known[event, state]) for state in OperatingState]
+        asked = "-" if row.request is DeviceRequest.NONE else str(row.request)
+        rows.append((f"*{event}*" if event is Event.FAULT else f"`{event}`", *leads, guards, asked))
     return (
-        "## Events\n\nEvery event in every state. Without a device a command is refused with `not_connected`, whatever "
-        "else is in its way, except `stop`.\n\n"
-        + _table(("event", "in", "leads to", "logged as", "guards, in their order", "the device is asked"), rows)
+        "## Events\n\nWhere every event leads from every state, or what it is refused with. Without a device every "
+        "command but `stop` is refused with `not_connected`, whatever else is in its way.\n\n"
+        + _table(("event", *OperatingState, "guards, in their order", "device is asked"), rows)
         + "\n"
     )
 
 
-def _transition(row: Transition) -> tuple[str, ...]:
-    asked = "-" if row.request is DeviceRequest.NONE else str(row.request)
-    if row.request is DeviceRequest.CLEAR:
-        asked += ", where it has latched"
-    guards = ", ".join(f"`{guard.code}`" for guard in row.guards) or "-"
-    return _event(row.event), row.source, row.target, row.reason, guards, asked
-
-
-def _refusal(row: Refusal) -> tuple[str, ...]:
-    return _event(row.event), row.source, f"refused: `{row.code}`", f"do: {row.remedy}", "-", "-"
-
-
-def _event(event: Event) -> str:
-    return f"*{event}*" if event is Event.FAULT else f"`{event}`"
+def _lead(row: Transition | Refusal) -> str:
+    return str(row.target) if isinstance(row, Transition) else f"`{row.code}`"
 
 
 def _guards() -> str:
@@ -136,34 +127,28 @@ def _guards() -> str:
 
 
 def _faults() -> str:
-    rows = []
-    for fault in Fault:
-        row = FAULTS[fault]
-        rows.append(
-            (f"`{fault}`", row.cause, row.reaction, f"{row.safe_ms:,.0f} ms, {row.shows}", row.clears, row.remedy)
-        )
+    rows = [
+        (f"`{fault}`", row.cause, row.reaction, f"{row.safe_ms:,.0f}", row.remedy)
+        for fault, row in ((fault, FAULTS[fault]) for fault in Fault)
+    ]
+    stay = ", ".join(f"`{fault}`" for fault in Fault if "home" not in FAULTS[fault].clears)
     return (
-        "## Faults\n\nLatched until `clear-fault`. Several that show at once are named in this order: causes before "
-        "what follows of them. The reaction is on its way by the time that is stated, from when the fault is there and "
-        "shows; 50 ms are the device's own timeout, a tick is 1 ms.\n\n"
-        + _table(("fault", "means", "reaction", "by", "is cleared by", "remedy"), rows)
+        "## Faults\n\nLatched until `clear-fault`, and then `home`; no homing is wanted after "
+        f"{stay}. Several that show at once are named in this order: causes before what follows of them. The reaction "
+        "is on its way by so many ms from when the fault is there and shows; 50 are the device's own timeout.\n\n"
+        + _table(("fault", "means", "reaction", "by, ms", "remedy"), rows)
         + "\n"
     )
 
 
 def _limits() -> str:
-    rows = []
-    for limit in Limit:
-        row = LIMITS[limit]
-        rows.append((f"`{limit}`", row.cause, row.reaction, f"{row.safe_ms:,.0f} ms, {row.shows}", row.remedy))
-    return "## Limits\n\nThey come and go by themselves.\n\n" + _table(
-        ("limit", "means", "reaction", "told by", "remedy"), rows
-    )
+    rows = [(f"`{limit}`", LIMITS[limit].cause, LIMITS[limit].reaction, LIMITS[limit].remedy) for limit in Limit]
+    return "## Limits\n\nThey come and go by themselves.\n\n" + _table(("limit", "means", "reaction", "remedy"), rows)
 
 
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     lines = [head, tuple("---" for _ in head), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return "".join(f"| {' | '.join(line)}\n" for line in lines)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """The patient unit on another machine: the daemon in one network namespace, everybody else in another.
 
-Where namespaces are not permitted, it is skipped. How well a pulse from there is rendered beside one from here:
-`tools/intruders.py pulse`.
+Where namespaces are not permitted, it is skipped.
 """
 
 import contextlib

@@ -1,13 +1,13 @@
 """Twenty hostile files of each kind are refused by size, kind or shape, in one sentence, by whoever reads that kind.
 
-Nothing here takes time or memory: `tools/hostile_files.py` measures both, in processes of their own.
+Nothing here takes time or memory: `tools/endure.py files` measures both, in processes of their own.
 """
 
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hostile_files import HOSTILE, KINDS, make
+from endurance.files import HOSTILE, KINDS, make
 
 from tormagd.bounded_file import read_bounded, require_regular
 from tormagd.config import ConfigError, load_config

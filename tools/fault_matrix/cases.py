@@ -3,7 +3,7 @@
 from functools import partial
 from typing import NamedTuple
 
-from wire.bad_lines import Damaging, Delaying, Doubling, Losing, MakeWay, Reordering
+from fault_matrix.bad_lines import MakeWay, damaging, delaying, doubling, losing, reordering
 
 OPENS = "opens"
 "The gap is open and the force below 1 N."
@@ -22,8 +22,6 @@ DRIVEN = "1.8 ± 0.1 N at 1 Hz, handle at 42 mm/s"
 HOMING = "homing"
 ARMING = "homing for 14 s, then enable"
 CONNECTING = "the command home"
-REFUSED_MS = 100.0
-"A command is refused by then: at once."
 
 
 class Injection(NamedTuple):
@@ -85,22 +83,22 @@ MATRIX = (
     Injection("device clock 2% fast", ("CLOCK",), HELD, device="clock=+2%"),
     Injection("device clock 30% slow", ("CLOCK",), device="clock=-30%"),
     # the line
-    Injection("5% of the frames lost", ("LINK_DEGRADED",), HELD, way=partial(Losing, 0.05)),
+    Injection("5% of the frames lost", ("LINK_DEGRADED",), HELD, way=partial(losing, 0.05)),
     Injection(
         "5% of the frames damaged",
         ("LINK_DEGRADED", "LINK_LOST"),
         HELD_OR_OPENS,
-        way=partial(Damaging, 0.05),
+        way=partial(damaging, 0.05),
         within_ms=1_000.0,
         excitation=f"{DRIVEN}; a Hello that is hit opens the device at once, States have to be counted",
     ),
-    Injection("every frame twice", (), HELD, way=Doubling),
-    Injection("20% of the frames overtaken", (), HELD, way=partial(Reordering, 0.2)),
-    Injection("round trip of 7 ms", ("LINK_DEGRADED",), HELD, way=partial(Delaying, 0.003)),
-    Injection("round trip of 15 ms", ("LINK_DEGRADED",), way=partial(Delaying, 0.007)),
+    Injection("every frame twice", (), HELD, way=doubling),
+    Injection("20% of the frames overtaken", (), HELD, way=partial(reordering, 0.2)),
+    Injection("round trip of 7 ms", ("LINK_DEGRADED",), HELD, way=partial(delaying, 0.003)),
+    Injection("round trip of 15 ms", ("LINK_DEGRADED",), way=partial(delaying, 0.007)),
     Injection("every other Drive answered", ("LINK_DEGRADED",), HELD, device="answers_half"),
     Injection("bus full", ("LINK_DEGRADED", "STATUS_STALE"), HELD_OR_OPENS, fill_frames_ms=6.5, buses=(CAN,)),
-    Injection("cable pulled: nothing goes either way", ("LINK_LOST", "MEASUREMENT_STALE"), way=partial(Losing, 1.0)),
+    Injection("cable pulled: nothing goes either way", ("LINK_LOST", "MEASUREMENT_STALE"), way=partial(losing, 1.0)),
     Injection("daemon stalls for 12 ms, ten times a second", ("HOST_STALL",), HELD, host="hogged"),
     Injection(
         "firmware hangs, its watchdog resets it",
@@ -203,7 +201,7 @@ MATRIX = (
         "from the start: round trip of 15 ms",
         ("link_degraded",),
         STAYS,
-        way=partial(Delaying, 0.007),
+        way=partial(delaying, 0.007),
         within_ms=14_100.0,
         excitation=ARMING,
         is_driven=False,
@@ -247,9 +245,9 @@ LEFT_OUT = {
     "NaN from a sensor": "the wire carries integers, and has none; that step takes none is held by tests/control",
     "position that wraps": "it does every 117 mm, modulo 2^16 counts, and carriages travel 25; held by tests/hardware",
     "sensor's zero that drifts slowly": "it takes minutes and reversals; held by tests/closed_loop",
-    "flood of setpoints or requests": "what is not read is decided by sockets; tools/wire/traffic.py and tests/daemon",
+    "flood of setpoints or requests": "what is not read is decided by sockets; tools/endure.py siege and tests/daemon",
     "SIGKILL, SIGSTOP, SIGTERM, CPU hogs": "as far as a device can see they are silence, stalls and `disable`; with "
-    "real processes in tools/stalls.py, tools/soak.py and tests/end_to_end",
+    "real processes in tools/endure.py stalls and tests/end_to_end",
     "disk full or slow": "nothing that controls writes to one; held by tests/recording",
     "clock of the host set": "the daemon's own clock is monotonic; of a publisher's there is a row",
 }

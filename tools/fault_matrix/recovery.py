@@ -5,8 +5,6 @@ with the publisher silent, and lets it publish once the brake is enabled. Before
 nothing, or the fault be named all the while; afterwards the force has to be followed again.
 """
 
-from typing import NamedTuple
-
 from fault_matrix.cases import Injection
 from fault_matrix.rig import Rig
 from fault_matrix.watch import MOST_OFF_N, MOST_OVER_N, Cell
@@ -37,13 +35,13 @@ def recover(rig: Rig, injection: Injection, cell: Cell) -> Cell:
     commands = next_commands(rig.safety, rig.is_homed)
     trouble = _obeyed(rig, commands, PATIENCE_S)
     back_s = rig.loop.now_s - mended_s
-    followed = _follow(rig)
+    is_held, told = _follow(rig)
     done = list(map(str, commands))
-    if Limit.OFFSET_UNKNOWN in followed.told:
+    if Limit.OFFSET_UNKNOWN in told:
         rig.hand.turn_back(rig.loop.now_s)
         done.append("turn the handle back and forth")
-        followed = _follow(rig)
-    is_back = not trouble and not rig.safety.faults and followed.is_held and not _named(injection, followed.told)
+        is_held, told = _follow(rig)
+    is_back = not trouble and not rig.safety.faults and is_held and not _named(injection, told)
     return cell._replace(
         tried=tried,
         recovery=tuple(done),
@@ -58,7 +56,7 @@ def _before(rig: Rig, injection: Injection) -> tuple[str, bool]:
     trouble = _obeyed(rig, commands, 0.0)
     if trouble:
         return trouble, True
-    told = _follow(rig).told
+    _, told = _follow(rig)
     if rig.safety.faults:
         return ", ".join((*commands, f"{rig.safety.faults[0]} again")), True
     if not injection.names:
@@ -67,26 +65,20 @@ def _before(rig: Rig, injection: Injection) -> tuple[str, bool]:
     return (f"{named} still told", True) if named else ("goes on, unnamed", False)
 
 
-class Followed(NamedTuple):
-    """Whether the force was as asked at the end, and which limits were told then."""
-
-    is_held: bool
-    told: frozenset[str]
-
-
-def _follow(rig: Rig) -> Followed:
-    """The force over the next seconds, until a fault shows; then, and where nothing is enabled, it is not followed."""
+def _follow(rig: Rig) -> tuple[bool, set[str]]:
+    """Whether the force is as asked at the end of the next seconds, and which limits are told then. It is not where a
+    fault shows, or nothing is enabled."""
     off_N: list[float] = []
     told: set[str] = set()
     for _ in rig.run(FOLLOWED_S - JUDGED_S):
         if rig.safety.faults:
-            return Followed(False, frozenset())
+            return False, told
     for sample in rig.run(JUDGED_S):
         off_N.append(rig.off_N)
         if sample is not None:
             told.update(map(str, (*sample.plan.limits, *sample.output.limits)))
     is_held = abs(sum(off_N) / len(off_N)) < MOST_OFF_N and max(off_N) < MOST_OVER_N
-    return Followed(_is_enabled(rig) and is_held, frozenset(told))
+    return rig.safety.operating_state is OperatingState.ENABLED and is_held, told
 
 
 def _obeyed(rig: Rig, commands: tuple[Event, ...], patience_s: float) -> str:
@@ -136,10 +128,6 @@ def _rest(rig: Rig, duration_s: float) -> None:
         pass
 
 
-def _named(injection: Injection, told: frozenset[str]) -> str:
+def _named(injection: Injection, told: set[str]) -> str:
     """The code of the injection that is told."""
     return next((name for name in injection.names if name in told), "")
-
-
-def _is_enabled(rig: Rig) -> bool:
-    return rig.safety.operating_state is OperatingState.ENABLED

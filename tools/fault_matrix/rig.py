@@ -7,8 +7,8 @@ from functools import cache
 
 import msgpack
 import msgspec
-from wire.bad_lines import BadBus, BadSerialLine, Way
 
+from fault_matrix.bad_lines import BadBus, BadSerialLine, whole
 from fault_matrix.cases import SERIAL, Injection
 from tormagd.closed_loop import ClosedLoop, Sample, VirtualBus
 from tormagd.config import Config, load_config
@@ -112,7 +112,7 @@ class Rig:
 
     def mend(self) -> None:
         """All that is wrong is put right now; what came of it stays."""
-        self.line.spoil(Way)
+        self.line.spoil(whole)
         if isinstance(self.line, BadBus):
             self.line.fill(0.0)
         plant = self.loop.simulated.plant
@@ -158,17 +158,12 @@ class BadSensor:
     """A force sensor that is broken from now on, one way or another."""
 
     def __init__(self, sensor: Sensor, how: str) -> None:
-        self._sensor, self._how, self._last_N = sensor, how, sensor.reading_N
-
-    @property
-    def mended(self) -> Sensor:
-        """The sensor itself."""
-        return self._sensor
+        self.mended, self._how, self._last_N = sensor, how, sensor.reading_N
 
     @property
     def reading_N(self) -> float:
         """What is shown now; the handle turns forwards, and so readings are positive."""
-        true_N = self._sensor.reading_N
+        true_N = self.mended.reading_N
         shown = {
             "stuck": self._last_N,
             "high": true_N + OFFSET_N,
@@ -180,7 +175,7 @@ class BadSensor:
 
     def advance(self, time_s: float, force_N: float) -> None:
         """As the sensor itself."""
-        self._sensor.advance(time_s, force_N)
+        self.mended.advance(time_s, force_N)
 
 
 class Publisher:
@@ -242,31 +237,21 @@ class DaemonsBorder:
         self._seq += 1
         force_N = {"nan": math.nan, "negative": -1.0, "huge": 1e3}.get(wrong, asked_N(now_s))
         stamp_ns = realtime_ns + (CLOCK_STEP_S * 10**9 if wrong == "clock" else 0)
-        data = self._message("robot", force_N, stamp_ns, self._seq, self._session)
+        data = self._message("robot", force_N, stamp_ns)
         self._earlier.append(data)
         if wrong == "disordered":
-            if self._kept is None:
-                self._kept = data
-                return []
-            data, self._kept = self._kept, None
-            return [self._earlier[-1], data]
+            kept, self._kept = self._kept, None
+            if kept is not None:
+                return [data, kept]
+            self._kept = data
+            return []
         if wrong == "replayed":
             return [data, self._earlier[0]]
         if wrong == "second":
-            return [data, self._message("bystander", OTHER_N, realtime_ns, self._seq, 1)]
+            return [data, self._message("bystander", OTHER_N, realtime_ns)]
         return [data]
 
-    @staticmethod
-    def _message(source: str, force_N: float, stamp_ns: int, seq: int, session: int) -> bytes:
-        packed: bytes = msgpack.packb(
-            {
-                "v": 1,
-                "source": source,
-                "seq": seq,
-                "session": session,
-                "stamp_ns": stamp_ns,
-                "servo_cf": force_N,
-                "valid_for_ms": 100.0,
-            }
-        )
+    def _message(self, source: str, force_N: float, stamp_ns: int) -> bytes:
+        numbered = {"v": 1, "source": source, "seq": self._seq, "session": self._session}
+        packed: bytes = msgpack.packb(numbered | {"stamp_ns": stamp_ns, "servo_cf": force_N, "valid_for_ms": 100.0})
         return packed

@@ -1,7 +1,5 @@
 """What a fault brought about, tick by tick, and whether that is what had to come of it."""
 
-from collections import deque
-from collections.abc import Callable
 from typing import NamedTuple
 
 from fault_matrix.cases import FOLLOWED, HELD, HELD_OR_OPENS, LIMITED, OPENS, STAYS, Injection
@@ -70,75 +68,66 @@ class Watch:
     def __init__(self, rig: Rig, usual: dict[str, None], *, is_driven: bool) -> None:
         """Watches `rig` from now on. `usual` are the limits that were held before, too: they notice nothing."""
         loop = rig.loop
-        gap_mm = loop.simulated.truth.gap_mm
         self._rig, self._loop = rig, loop
-        self._most_N = 0.0
         self._has_run = is_driven
-        self._opening_s: float | None = None
-        self._let_go_s: float | None = None
-        self._usual, self._from_s, self._from_mm = usual, loop.now_s, gap_mm
+        self._usual, self._from_s = usual, loop.now_s
         self._host: dict[str, None] = {}
         self._device: dict[str, None] = {}
         self._limits: dict[str, None] = {}
         self._refusal = ""
-        self._forces_N: deque[float] = deque(maxlen=LOSS_MS + 1)
-        self._loss_N_s = 0.0
-        self._noticed_s: float | None = None
-        self._below_s: float | None = None
-        self._open_s: float | None = None
-        self._resting_s: float | None = None
-        self._least_mm = gap_mm
-        self._over_N = 0.0
+        self._since_s: dict[str, float] = {}
+        self._forces_N: list[float] = []
+        self._gaps_mm = [loop.simulated.truth.gap_mm]
         self._off_N: list[float] = []
 
     def see(self, sample: Sample | None) -> None:
         """Takes one tick; `sample` is None while the daemon is dead."""
-        loop = self._loop
-        truth, firmware = loop.simulated.truth, loop.simulated.firmware
+        truth, firmware = self._loop.simulated.truth, self._loop.simulated.firmware
         if sample is not None:
             self._host |= dict.fromkeys(map(str, sample.state.safety.faults))
             if sample.state.safety.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED):
                 held = map(str, (*sample.plan.limits, *sample.output.limits))
                 self._limits |= dict.fromkeys(limit for limit in held if limit not in self._usual)
         self._device |= dict.fromkeys(fault.name or "" for fault in firmware.faults)
-        self._forces_N.append(truth.force_N)
-        if len(self._forces_N) > LOSS_MS:
-            self._loss_N_s = max(self._loss_N_s, (self._forces_N[0] - truth.force_N) / (LOSS_MS * 1e-3))
-        first = _first(loop.now_s)
-        if self._host or self._device or self._limits:
-            self._noticed_s = first(self._noticed_s)
+        has_let_go = self._has_run and firmware.mode is not DeviceMode.RUN
+        self._has_run = self._has_run or firmware.mode is DeviceMode.RUN
+        self._note("noticed", bool(self._host or self._device or self._limits))
+        self._note("let go", has_let_go)
+        self._note("opening", has_let_go and firmware.mode is DeviceMode.RETRACTING)
         # a force that is let go and comes back was not safe
-        self._below_s = first(self._below_s) if truth.force_N < SAFE_N else None
-        self._open_s = first(self._open_s) if truth.gap_mm > OPEN_MM else None
-        self._resting_s = None if firmware.output.enabled else first(self._resting_s)
-        if firmware.mode is DeviceMode.RUN:
-            self._has_run = True
-        elif self._has_run:
-            self._let_go_s = first(self._let_go_s)
-            if firmware.mode is DeviceMode.RETRACTING:
-                self._opening_s = first(self._opening_s)
-        self._most_N = max(self._most_N, truth.force_N)
-        self._least_mm = min(self._least_mm, truth.gap_mm)
-        off_N = self._rig.off_N
-        self._over_N = max(self._over_N, off_N)
-        self._off_N.append(off_N)
+        for what, is_so in (
+            ("below", truth.force_N < SAFE_N),
+            ("open", truth.gap_mm > OPEN_MM),
+            ("resting", not firmware.output.enabled),
+        ):
+            self._note(what, is_so)
+            if not is_so:
+                self._since_s.pop(what, None)
+        self._forces_N.append(truth.force_N)
+        self._gaps_mm.append(truth.gap_mm)
+        self._off_N.append(self._rig.off_N)
+
+    def _note(self, what: str, is_so: bool) -> None:
+        """Keeps when it first was so."""
+        if is_so:
+            self._since_s.setdefault(what, self._loop.now_s)
 
     @property
     def is_open(self) -> bool:
         """Whether the gap is open, and no force left that could be lost."""
-        return self._open_s is not None
+        return "open" in self._since_s
 
     def refuse(self, error: RefusedError) -> None:
         """A command was refused."""
         self._refusal = f"{error.code}: {error.message.partition(': ')[2]}"
-        self._noticed_s = _first(self._loop.now_s)(self._noticed_s)
+        self._note("noticed", True)
 
     def cell(self, injection: Injection, bus: str) -> Cell:
         """The row."""
         loop = self._loop
         state = loop.step_state.safety.operating_state
         mode = loop.simulated.firmware.mode.name
-        noticed_ms = self._since(self._noticed_s)
+        noticed_ms = self._since("noticed")
         is_safe, safe_ms = self._ended(injection.safe, noticed_ms)
         stated_ms, reacted_ms = self._stated_ms(injection), self._reacted_ms(injection)
         return Cell(
@@ -150,9 +139,9 @@ class Watch:
             (*self._limits, *([self._refusal] if self._refusal else [])),
             f"daemon {state}, device {mode}",
             noticed_ms,
-            self._since(self._below_s),
-            self._since(self._open_s),
-            round(self._loss_N_s, 2),
+            self._since("below"),
+            self._since("open"),
+            round(max(self._loss_N_s(), 0.0), 2),
             injection.safe,
             self._is_named(injection.names),
             is_safe,
@@ -182,11 +171,11 @@ class Watch:
     def _reacted_ms(self, injection: Injection) -> float | None:
         """When the device began to open, where it does, or let go; when it was told otherwise."""
         if self._refusal:
-            return self._since(self._noticed_s)
+            return self._since("noticed")
         if not self._has_run:
-            return self._since(self._resting_s)
-        began_s = self._let_go_s if injection.safe == STAYS else self._opening_s
-        return self._since(self._noticed_s if began_s is None else began_s)
+            return self._since("resting")
+        began = "let go" if injection.safe == STAYS else "opening"
+        return self._since(began if began in self._since_s else "noticed")
 
     def _is_named(self, names: tuple[str, ...]) -> bool:
         if not names:
@@ -199,24 +188,27 @@ class Watch:
 
     def _ended(self, safe: str, noticed_ms: float | None) -> tuple[bool, float | None]:
         """Whether it ended as stated, and since when."""
-        has_opened = self._open_s is not None and self._below_s is not None
-        last_second = self._off_N[-1000:]
-        is_held = abs(sum(last_second) / len(last_second)) < MOST_OFF_N and self._over_N < MOST_OVER_N
+        has_opened = {"open", "below"} <= set(self._since_s)
+        last_second, is_not_over = self._off_N[-1000:], max(self._off_N) < MOST_OVER_N
+        is_held = abs(sum(last_second) / len(last_second)) < MOST_OFF_N and is_not_over
         if safe == STAYS:
-            is_still = self._resting_s is not None and self._least_mm > self._from_mm - MOST_CLOSED_MM
-            return is_still, self._since(self._resting_s)
+            is_still = "resting" in self._since_s and min(self._gaps_mm) > self._gaps_mm[0] - MOST_CLOSED_MM
+            return is_still, self._since("resting")
         if safe == LIMITED:
-            return not self._host and self._most_N < self._rig.most_N + MOST_OVER_N, noticed_ms
+            return not self._host and max(self._forces_N) < self._rig.most_N + MOST_OVER_N, noticed_ms
         if safe == FOLLOWED:
-            is_there = abs(self._forces_N[-1] - OTHER_N) < MOST_OFF_N and self._over_N < MOST_OVER_N
-            return is_there and not self._host, self._since(self._below_s)
+            is_there = abs(self._forces_N[-1] - OTHER_N) < MOST_OFF_N and is_not_over
+            return is_there and not self._host, self._since("below")
         if has_opened and safe in (OPENS, HELD_OR_OPENS):
-            return True, self._since(self._open_s)
+            return True, self._since("open")
         return safe in (HELD, HELD_OR_OPENS) and is_held and not self._host, noticed_ms
 
-    def _since(self, time_s: float | None) -> float | None:
-        return None if time_s is None else round((time_s - self._from_s) * 1e3, 1)
+    def _loss_N_s(self) -> float:
+        """The fastest that force was lost over LOSS_MS."""
+        over = zip(self._forces_N, self._forces_N[LOSS_MS:], strict=False)
+        return max((before - after) / (LOSS_MS * 1e-3) for before, after in over)
 
-
-def _first(now_s: float) -> Callable[[float | None], float]:
-    return lambda known: now_s if known is None else known
+    def _since(self, what: str) -> float | None:
+        if what not in self._since_s:
+            return None
+        return round((self._since_s[what] - self._from_s) * 1e3, 1)

@@ -44,7 +44,7 @@ SETPOINTS_PER_S, SETPOINT_BURST = 4_000.0, 1_000.0
 "What one publisher may send; the rest is dropped unread. The burst is what comes at once after a network's pause."
 SUBSCRIPTIONS = 16
 """What waits of one subscriber's subscriptions: libzmq works off all that there are in the thread that publishes. A
-thousand, as of all else, would make a tick late (`tools/intruders.py floods`)."""
+thousand, as of all else, would make a tick late (`tools/endure.py siege`)."""
 SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
 "What one subscriber may say. Who says more is cut off, and comes back as anybody."
 TAKEN, TAKEN_NS = 64, 80_000

@@ -13,82 +13,69 @@ FOREIGN_HOST = 2
 FOREIGN = CanFrame(0x00F, bytes(8))
 """Another node's, which wins every arbitration."""
 DELIMITER = b"\x00"
+SEED = 7
 
 
-class Way:
-    """One direction of a line. A unit is a frame, as bytes."""
-
-    def __init__(self) -> None:
-        self._random = random.Random(7)
-
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
-        """What comes out now, of these units and earlier ones."""
-        return units
+Way = Callable[[float, list[bytes]], list[bytes]]
+"""One direction of a line: what comes out of it now, of these units, frames as bytes, and earlier ones."""
+MakeWay = Callable[[], Way]
 
 
-class Losing(Way):
+def whole() -> Way:
+    """Brings every unit at once."""
+    return lambda _now_s, units: units
+
+
+def losing(share: float) -> Way:
     """Loses a share of the units."""
-
-    def __init__(self, share: float) -> None:
-        super().__init__()
-        self._share = share
-
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
-        return [unit for unit in units if self._random.random() >= self._share]
+    draw = random.Random(SEED)
+    return lambda _now_s, units: [unit for unit in units if draw.random() >= share]
 
 
-class Damaging(Losing):
+def damaging(share: float) -> Way:
     """Flips a bit in a share of the units."""
+    draw = random.Random(SEED)
 
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
-        return [self._flipped(unit) if self._random.random() < self._share else unit for unit in units]
-
-    def _flipped(self, unit: bytes) -> bytes:
-        at, bit = self._random.randrange(len(unit)), self._random.randrange(8)
+    def flipped(unit: bytes) -> bytes:
+        at, bit = draw.randrange(len(unit)), draw.randrange(8)
         return unit[:at] + bytes((unit[at] ^ 1 << bit,)) + unit[at + 1 :]
 
+    return lambda _now_s, units: [flipped(unit) if draw.random() < share else unit for unit in units]
 
-class Doubling(Way):
+
+def doubling() -> Way:
     """Every unit comes twice."""
-
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
-        return [unit for unit in units for _ in range(2)]
+    return lambda _now_s, units: [unit for unit in units for _ in range(2)]
 
 
-class Reordering(Losing):
+def reordering(share: float) -> Way:
     """A share of the units is overtaken by the next."""
+    draw, waiting = random.Random(SEED), list[bytes]()
 
-    def __init__(self, share: float) -> None:
-        super().__init__(share)
-        self._waiting: list[bytes] = []
-
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
+    def carry(_now_s: float, units: list[bytes]) -> list[bytes]:
         out: list[bytes] = []
         for unit in units:
-            if not self._waiting and self._random.random() < self._share:
-                self._waiting.append(unit)
+            if not waiting and draw.random() < share:
+                waiting.append(unit)
             else:
-                out += [unit, *self._waiting]
-                self._waiting.clear()
+                out += [unit, *waiting]
+                waiting.clear()
         return out
 
+    return carry
 
-class Delaying(Way):
+
+def delaying(delay_s: float) -> Way:
     """Every unit comes so much later."""
+    waiting: list[tuple[float, bytes]] = []
 
-    def __init__(self, delay_s: float) -> None:
-        super().__init__()
-        self._delay_s = delay_s
-        self._waiting: list[tuple[float, bytes]] = []
-
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
-        self._waiting += [(now_s + self._delay_s, unit) for unit in units]
-        out = [unit for due_s, unit in self._waiting if due_s <= now_s]
-        self._waiting = [(due_s, unit) for due_s, unit in self._waiting if due_s > now_s]
+    def carry(now_s: float, units: list[bytes]) -> list[bytes]:
+        waiting.extend((now_s + delay_s, unit) for unit in units)
+        out = [unit for due_s, unit in waiting if due_s <= now_s]
+        waiting[:] = [(due_s, unit) for due_s, unit in waiting if due_s > now_s]
         return out
 
-
-MakeWay = Callable[[], Way]
+    return carry
 
 
 DeviceT = TypeVar("DeviceT", bound=SerialDevice | CanDevice)
@@ -99,7 +86,7 @@ class _Spoilt(Generic[DeviceT]):
 
     def __init__(self, device: DeviceT) -> None:
         self._device = device
-        self._up, self._down = Way(), Way()
+        self._up, self._down = whole(), whole()
 
     @property
     def messages(self) -> MessageDevice:
@@ -122,14 +109,14 @@ class BadSerialLine(_Spoilt[SerialDevice]):
         self._unfinished = b""
 
     def receive(self, now_s: float, data: bytes) -> None:
-        for unit in self._down.carry(now_s, [data]):
+        for unit in self._down(now_s, [data]):
             self._device.receive(now_s, unit)
 
     def transmit(self, now_s: float) -> bytes:
-        for unit in self._down.carry(now_s, []):
+        for unit in self._down(now_s, []):
             self._device.receive(now_s, unit)
         *units, self._unfinished = (self._unfinished + self._device.transmit(now_s)).split(DELIMITER)
-        return b"".join(self._up.carry(now_s, [unit + DELIMITER for unit in units]))
+        return b"".join(self._up(now_s, [unit + DELIMITER for unit in units]))
 
 
 class BadBus(_Spoilt[CanDevice]):
@@ -145,11 +132,11 @@ class BadBus(_Spoilt[CanDevice]):
         self._foreign_frames_ms = frames_ms
 
     def receive(self, now_s: float, frame: CanFrame) -> None:
-        for unit in self._down.carry(now_s, [_unit(frame)]):
+        for unit in self._down(now_s, [_unit(frame)]):
             self._device.receive(now_s, _frame(unit))
 
     def transmit(self, now_s: float) -> list[Delivery]:
-        for unit in self._down.carry(now_s, []):
+        for unit in self._down(now_s, []):
             self._device.receive(now_s, _frame(unit))
         delivered = self._device.transmit(now_s)
         self._owed += self._foreign_frames_ms  # called once a millisecond
@@ -157,7 +144,7 @@ class BadBus(_Spoilt[CanDevice]):
             self._owed -= 1.0
             self._device.receive(now_s, FOREIGN, FOREIGN_HOST)
         ours = [_unit(delivery.frame) for delivery in delivered if delivery.sender == 0]
-        return [Delivery(0, _frame(unit)) for unit in self._up.carry(now_s, ours)]
+        return [Delivery(0, _frame(unit)) for unit in self._up(now_s, ours)]
 
 
 def _unit(frame: CanFrame) -> bytes:

@@ -1,17 +1,13 @@
 """A random walk of the core: hostile measurements, plans and commands, and what must hold in every step.
 
 Three things, whatever comes in: duties are within the limit and finite, nothing is driven while not ENABLED or PAUSED,
-and the operating state changes only along a row of the table. Ten million steps are
-`python tools/random_walk.py --steps 10_000_000`; the suite walks a hundred thousand.
+and the operating state changes only along a row of the table.
 """
 
-import argparse
-import json
 import math
 import random
-import sys
-import time
 from collections import Counter
+from typing import Any
 
 from tqdm import tqdm
 
@@ -173,45 +169,23 @@ class Walk:
         )
 
 
-def main() -> int:
-    """Walks, and says how far and what was met; returns 1 where a rule was broken."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--steps", type=int, default=10_000_000)
-    parser.add_argument("--seed", type=int, default=15)
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    if options.steps < 1:
-        parser.error(f"--steps {options.steps}: allowed is at least 1")
+def run(count: int, seed: int) -> dict[str, Any]:
+    """Walks `count` steps; the figures, and `failures`."""
     config = Config()
-    walk = Walk(build_core(config).stepper, config.position.duty_limit, options.seed)
-    broken, start_s = "", time.monotonic()
-    with tqdm(total=options.steps, desc="random walk", unit="step", disable=not sys.stderr.isatty()) as progress:
-        while walk.steps < options.steps and not broken:
+    walk = Walk(build_core(config).stepper, config.position.duty_limit, seed)
+    failures: list[str] = []
+    with tqdm(total=count, desc="random walk", unit="step", disable=None) as progress:
+        while walk.steps < count and not failures:
             before = walk.steps
             try:
-                walk.go(min(EPISODE, options.steps - before))
+                walk.go(min(EPISODE, count - before))
             except BrokenRuleError as error:
-                broken = f"step {walk.steps} of seed {options.seed}: {error}"
+                failures.append(f"step {walk.steps} of seed {seed}: {error}")
             progress.update(walk.steps - before)
-    figures = {
+    return {
         "steps": walk.steps,
-        "seed": options.seed,
         "driven": walk.driven,
-        "faults": {str(fault): count for fault, count in sorted(walk.faults.items())},
-        "ways": {f"{source} to {target} by {event}": count for (event, source, target), count in walk.ways.items()},
-        "broken": broken,
-        "minutes": round((time.monotonic() - start_s) / 60.0, 1),
-        "passed": not broken,
+        "faults": {str(fault): met for fault, met in sorted(walk.faults.items())},
+        "ways": {f"{source} to {target} by {event}": taken for (event, source, target), taken in walk.ways.items()},
+        "failures": failures,
     }
-    if options.json:
-        print(json.dumps(figures))
-    else:
-        print(f"{walk.steps:,} steps, {walk.driven:,} of them driven, {len(walk.faults)} kinds of faults latched")
-        for way, count in figures["ways"].items():
-            print(f"{count:9,d}  {way}")
-        print(broken or "no rule was broken")
-    return 1 if broken else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,248 @@
+"""Who troubles the daemon gets nowhere, and `stop` is heard beside it.
+
+One attack after the other runs as a process of its own: a hundred clients that ask without pause; hostile messages, each
+a valid one with one thing done to it that has to be refused; strangers that show no key, a wrong one, one that is not
+listed or one for something else; 10^5 messages a second to one endpoint. Meanwhile force is held and stopped, over and
+over: nothing but the stop may latch, nothing hostile be taken, and what was refused or dropped is counted.
+"""
+
+import contextlib
+import math
+import os
+import random
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from multiprocessing import get_context
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import zmq
+from tqdm import tqdm
+
+from endurance.stand import Figures, Stand
+from tormagd.config import Endpoints
+from tormagd.daemon.endpoint import SETPOINTS_PER_S
+from tormagd.keys import PUBLIC, SECRET, SERVER, load_pair, load_public
+from tormagd.safety.operating_state import DeviceRequest
+from tormagd_client.messages import VERSION, Reply, Request, decode, encode
+
+CLIENTS = 100
+FLOOD_PER_S, STRANGERS_PER_S = 100_000.0, 600.0
+PACE = 0.95
+"Of what a publisher may send: what goes beyond is dropped unread, and would show nothing here."
+PER_BURST = 20
+LIVES_S = 0.5
+"A stranger gives up after this time."
+FORCE_N, HELD_S = 1.5, (0.2, 0.8)
+WITHIN_MS = 5.0
+"From when a stop is handed to ZeroMQ until the tick that writes RETRACT has ended, beside the clients."
+PATIENCE_S = 20.0
+SETPOINT: dict[str, Any] = {
+    "v": 1,
+    "source": "hostile",
+    "seq": 7,
+    "stamp_ns": 1_800_000_000_000_000_000,
+    "servo_cf": 1.0,
+    "valid_for_ms": 50.0,
+}
+REQUEST: dict[str, Any] = {"v": 1, "id": 1, "command": "stop", "args": {}}
+NO_NUMBERS = (math.nan, math.inf, -math.inf)
+NO_SETPOINT: dict[str, tuple[Any, ...]] = {
+    "v": (0, 2, -1, 2**63),
+    "source": ("", "x" * 65, "\x1b[2J", "a\nb", "\u202e"),
+    "seq": (-1, 2**63, 2**64 - 1, 1.5),
+    "stamp_ns": (-1, 2**63, 2**64 - 1),
+    "servo_cf": (*NO_NUMBERS, -1e-9, -1.0, 1_001.0, 1e308),
+    "valid_for_ms": (*NO_NUMBERS, 0.0, -1.0, 60_001.0),
+    "displacement_mm": (*NO_NUMBERS, -0.1, 2.1),
+    "rate_mm_s": (*NO_NUMBERS, -301.0, 301.0),
+    "preview_N": ([1.0], [math.nan], [-1.0], [1.0] * 300, "x"),
+    "session": (-1, 2**63),
+}
+NO_REQUEST: dict[str, tuple[Any, ...]] = {
+    "v": (0, 2, -1),
+    "id": (1.5, [1], {}),
+    "command": ("", "stop ", "STOP", "x" * 65, "enable\x00", "\x1b[2Jstop"),
+    "args": ([], "stop", 1),
+}
+MISTYPED: tuple[Any, ...] = (None, [], [[]], {"v": 1}, True)
+HEADS = (b"\xdf\xff\xff\xff\xff", b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff", b"\xc1")
+"A map, an array, bytes and a text of 2^32-1, and what msgpack never means."
+
+Attack = Callable[[Endpoints, Path, Event, Any], None]
+"Goes on until the event, at a daemon whose keys are in this folder; the shared number says how often."
+
+
+def hostile(draw: random.Random, valid: dict[str, Any], not_allowed: dict[str, tuple[Any, ...]]) -> list[bytes]:
+    """The parts of one message that must not be taken, made of a valid one."""
+    packed: bytes = msgpack.packb(valid)
+    name, lacking = draw.choice(list(not_allowed)), draw.choice([field for field in valid if field != "args"])
+    match draw.randrange(9):
+        case 0:
+            return [b"\xc1" + draw.randbytes(draw.randrange(200))]
+        case 1:
+            return [packed[: draw.randrange(len(packed))]]
+        case 2:
+            return [packed + draw.randbytes(draw.randrange(1, 9))]
+        case 3:
+            return [msgpack.packb({field: value for field, value in valid.items() if field != lacking})]
+        case 4:
+            return [msgpack.packb(valid | {lacking: draw.choice(MISTYPED)})]
+        case 5:
+            return [msgpack.packb(valid | {name: draw.choice(not_allowed[name])})]
+        case 6:
+            return [draw.choice((b"\x91", b"\x81\xa1v")) * draw.choice((32, 1_000, 5_000))]
+        case 7:
+            return [draw.choice(HEADS) + packed]
+    return [packed] * draw.randrange(2, 6)
+
+
+def paced(per_s: float, stop: Event) -> Iterator[int]:
+    """Numbers, so many a second on average, until the event."""
+    start_s, number = time.monotonic(), 0
+    while not stop.is_set():
+        yield number
+        number += 1
+        if number % PER_BURST == 0:
+            time.sleep(max(0.0, start_s + number / per_s - time.monotonic()))
+
+
+def busy_clients(endpoints: Endpoints, _keys: Path, stop: Event, times: Any) -> None:
+    """Clients that ask for status again as soon as they are answered."""
+    request = encode(Request(v=VERSION, id=0, command="status"))
+    with zmq.Context() as context:
+        poller = zmq.Poller()
+        for _ in range(CLIENTS):
+            client = _peer(context, zmq.DEALER, endpoints.control)
+            client.send(request)
+            poller.register(client, zmq.POLLIN)
+        while not stop.is_set():
+            for client, _ in poller.poll(100):
+                client.recv()
+                client.send(request)
+                times.value += 1
+        context.destroy(linger=0)
+
+
+def flood(name: str, endpoints: Endpoints, _keys: Path, stop: Event, times: Any) -> None:
+    """Messages to one endpoint, valid ones and garbage; subscriptions where it takes nothing else."""
+    kind, data = {
+        "setpoint": (zmq.PUB, [msgpack.packb(SETPOINT), os.urandom(100)]),
+        "control": (zmq.DEALER, [encode(Request(v=VERSION, id=0, command="status"))]),
+        "recording": (zmq.XSUB, [sign + os.urandom(16) for sign in (b"\x01", b"\x00")]),
+    }[name]
+    with zmq.Context() as context:
+        peer = _peer(context, kind, getattr(endpoints, name))
+        for number in paced(FLOOD_PER_S, stop):
+            with contextlib.suppress(zmq.Again):
+                peer.send(data[number % len(data)], zmq.NOBLOCK)
+            times.value = number + 1
+        context.destroy(linger=0)
+
+
+def messages(endpoints: Endpoints, _keys: Path, stop: Event, times: Any) -> None:
+    """Hostile setpoints, and hostile requests one after the other. A request that is carried out ends it."""
+    draw = random.Random(1)
+    with zmq.Context() as context:
+        publisher = _peer(context, zmq.XPUB, endpoints.setpoint)
+        publisher.recv()  # the daemon listens
+        client = _peer(context, zmq.DEALER, endpoints.control)
+        for number in paced(PACE * SETPOINTS_PER_S, stop):
+            publisher.send_multipart(hostile(draw, SETPOINT, NO_SETPOINT))
+            if number % PER_BURST == 0:
+                client.send_multipart(hostile(draw, REQUEST, NO_REQUEST))
+                if not client.poll(round(PATIENCE_S * 1e3)) or decode(client.recv(), Reply).ok:
+                    raise RuntimeError("a hostile request was carried out, or not answered")
+            times.value = number + 1
+        context.destroy(linger=0)
+
+
+def strangers(endpoints: Endpoints, keys: Path, stop: Event, times: Any) -> None:
+    """Peers that are not let in to telemetry, each a try of its own."""
+    server, publisher = load_public(keys / f"{SERVER}{PUBLIC}"), load_pair(keys / f"publish{SECRET}")
+    with zmq.Context() as context:
+        alive: list[tuple[float, zmq.Socket[bytes]]] = []
+        for number in paced(STRANGERS_PER_S, stop):
+            peer: zmq.Socket[bytes] = context.socket(zmq.SUB)
+            peer.linger, peer.reconnect_ivl = 0, -1
+            kind = number % 4
+            if kind:  # the others show nothing
+                peer.curve_publickey, peer.curve_secretkey = publisher if kind == 3 else zmq.curve_keypair()
+                peer.curve_serverkey = zmq.curve_keypair()[0] if kind == 1 else server
+            peer.connect(endpoints.telemetry)
+            alive.append((time.monotonic(), peer))
+            while alive[0][0] < time.monotonic() - LIVES_S:
+                alive.pop(0)[1].close()
+            times.value = number + 1
+        context.destroy(linger=0)
+
+
+def _peer(context: "zmq.Context[Any]", kind: int, address: str) -> "zmq.Socket[bytes]":
+    peer: zmq.Socket[bytes] = context.socket(kind)
+    peer.linger = 0
+    peer.connect(address)
+    return peer
+
+
+ATTACKS: dict[str, Attack] = {
+    "clients": busy_clients,
+    "messages": messages,
+    "strangers": strangers,
+    "flood of setpoint": partial(flood, "setpoint"),
+    "flood of control": partial(flood, "control"),
+    "flood of recording": partial(flood, "recording"),
+}
+
+
+def run(stand: Stand, count: int, seed: int) -> Figures:
+    """`count` stops beside each attack; the figures, and `failures`."""
+    draw, spawn = random.Random(seed), get_context("spawn")
+    failures: list[str] = []
+    figures: Figures = {}
+    for name, attack in ATTACKS.items():
+        stop, times = spawn.Event(), spawn.Value("Q", 0)
+        attacker = spawn.Process(target=attack, args=(stand.endpoints, stand.keys, stop, times), daemon=True)
+        attacker.start()
+        stand.until(lambda _status, times=times: times.value > 0, f"{name} has begun")  # type: ignore[misc]
+        took_ms = sorted(_stop(stand, draw) for _ in tqdm(range(count), desc=name, unit="stop", disable=None))
+        status = stand.status()
+        stop.set()
+        attacker.join(PATIENCE_S)
+        figures[name] = {"times": times.value, "retract_ms": [round(took_ms[i], 2) for i in (count // 2, -1)]}
+        failures += [f"{name}: {what}" for what in judged(name, times.value, took_ms, status, attacker.exitcode)]
+    return figures | {"failures": failures}
+
+
+def judged(name: str, times: int, took_ms: Sequence[float], status: dict[str, Any], code: int | None) -> list[str]:
+    """What did not hold beside an attack that went on so often and ended with that code."""
+    drops = {drop["endpoint"] for drop in status["peers"]["drops"]}
+    refused = {"messages": status["setpoints"]["refused"], "strangers": status["peers"]["refused"]}.get(name, 1)
+    slow_ms = took_ms[math.ceil(0.99 * len(took_ms)) - 1]
+    checks = {
+        f"ended with {code} after {times} times": code == 0 and times > 0,
+        f"RETRACT {slow_ms:.1f} ms after stop (p99), allowed {WITHIN_MS:g}": slow_ms <= WITHIN_MS or name != "clients",
+        "taken for a source": SETPOINT["source"] not in status["setpoints"]["sources"] or name.startswith("flood"),
+        "not counted as refused": refused > 0,
+        "its source is not named": not name.startswith("flood") or name.removeprefix("flood of ") in drops,
+    }
+    return [what for what, is_so in checks.items() if not is_so]
+
+
+def _stop(stand: Stand, draw: random.Random) -> float:
+    """Holds force for a while and stops; how long it took until the device was told, ms."""
+    stand.arm()
+    since_s = time.monotonic()
+    stand.ask(FORCE_N)
+    time.sleep(draw.uniform(*HELD_S))
+    stand.see_faults(since_s)
+    with stand.ticks() as read:
+        sent_s = time.monotonic()
+        stand.client.request("stop")
+        told: list[float] = []
+        while not told and time.monotonic() < sent_s + PATIENCE_S:
+            asked = [tick for tick in read() if tick["request"] == DeviceRequest.RETRACT]
+            told = [tick["monotonic_s"] + tick["exec_us"] * 1e-6 for tick in asked if tick["monotonic_s"] > sent_s]
+    return 1e3 * (min(told, default=math.inf) - sent_s)

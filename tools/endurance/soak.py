@@ -1,0 +1,88 @@
+"""The same thing for a long time: does memory grow, do descriptors leak, is every tick recorded?
+
+A daemon renders force, is recorded, and a new client asks for its status every half second. Growth counts after two minutes, or a quarter of a shorter time, when what is made once has been made.
+"""
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from mcap.reader import make_reader
+from tqdm import tqdm
+
+from endurance.stand import PATIENCE_S, Figures, Stand, end
+from tormagd.recording.writer import TICKS_TOPIC
+from tormagd_client import Client
+
+MEAN_N, SWING_N, SWING_HZ = 1.5, 0.3, 0.2
+SAMPLE_S, SETTLED_S = 0.5, 120.0
+ALLOWED_KB = {"daemon": 2_048, "recorder": 16_384}
+"The recorder keeps the index, which is written last: two entries a second."
+
+
+def run(stand: Stand, count: int, seed: int) -> Figures:
+    """`count` samples, two a second; the figures, and `failures`. Nothing is drawn."""
+    path = stand.folder / "soak.mcap"
+    ctl = ("-m", "tormagd.ctl.main", "--config", str(stand.folder / "tormagd.toml"))
+    processes = {"daemon": stand.daemon, "recorder": stand.begin(*ctl, "record", str(path))}
+    stand.until(lambda _status: path.exists(), "recorded")
+    stand.arm()
+    memory_kB: dict[str, list[int]] = {name: [] for name in processes}
+    descriptors: dict[str, list[int]] = {name: [] for name in processes}
+    for _ in tqdm(range(count), desc="soak", unit="sample", disable=None):
+        since_s = time.monotonic()
+        stand.ask(MEAN_N + SWING_N * math.sin(math.tau * SWING_HZ * since_s))
+        time.sleep(SAMPLE_S)
+        with Client(stand.endpoints, PATIENCE_S) as client:
+            client.request("status")
+        if stand.see_faults(since_s):
+            stand.arm()
+        for name, process in processes.items():
+            memory_kB[name].append(process.resident_kB())
+            descriptors[name].append(process.descriptors())
+    end(processes["recorder"].child)
+    grown_kB = {name: growth(values) for name, values in memory_kB.items()}
+    stayed = {name: staying(values) for name, values in descriptors.items()}
+    ticks = recorded(path)
+    return {
+        "minutes": round(count * SAMPLE_S / 60.0, 2),
+        "growth_kB": grown_kB,
+        "memory_kB": {name: values[-1] for name, values in memory_kB.items()},
+        "descriptor_growth": stayed,
+        "ticks": len(ticks),
+        "failures": failures(grown_kB, stayed, ticks),
+    }
+
+
+def failures(grown_kB: dict[str, int], stayed: dict[str, int], ticks: list[int]) -> list[str]:
+    """What did not hold, in words; `ticks` are the numbers of those that were recorded."""
+    found = [
+        f"{name}: memory grew by {grown} kB, allowed {ALLOWED_KB[name]}"
+        for name, grown in grown_kB.items()
+        if grown > ALLOWED_KB[name]
+    ]
+    found += [f"{name}: {more} more descriptors" for name, more in stayed.items() if more > 0]
+    if not ticks or ticks[-1] - ticks[0] + 1 != len(ticks):
+        found.append(f"recording: {len(ticks)} ticks, not all of {ticks[:1]} to {ticks[-1:]}")
+    return found
+
+
+def recorded(path: Path) -> list[int]:
+    """The numbers of the ticks in a recording."""
+    with path.open("rb") as file:
+        messages: Any = make_reader(file).iter_messages(topics=[TICKS_TOPIC])
+        return [int(msgspec.json.decode(message.data)["tick"]) for _, _, message in messages]
+
+
+def staying(values: list[int]) -> int:
+    """By how many more there are in the last quarter than in the second, whatever comes and goes."""
+    quarter = len(values) // 4
+    return min(values[-quarter:]) - min(values[quarter : 2 * quarter])
+
+
+def growth(values: list[int]) -> int:
+    """By how much the largest is above the first, once what is made once has been made."""
+    settled = min(len(values) // 4, round(SETTLED_S / SAMPLE_S))
+    return max(values[settled:]) - values[settled]

@@ -1,0 +1,192 @@
+"""A daemon on a simulated device, as processes, and who operates it: what every case in real time runs on."""
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import zmq
+from machines.own import own_machine
+from machines.wire import carried
+
+from tormagd.config import load_config
+from tormagd.keys import SECRET, SERVER, generate
+from tormagd.recording.ticks import decode_ticks
+from tormagd_client import Client, ClientError
+
+FIFO_PRIORITY, DEVICE_PRIORITY = 50, 55
+"Of the daemon, and of the device, which stands for a machine of its own. Only where they are granted."
+BACKENDS = {"serial": 'backend = "serial"', "can": 'backend = "can"\noptions.interface = "tormagsim"'}
+DOORS = {"serial": "--pty", "can": "--can"}
+NEUTRAL_N, LASTS_MS = 0.3, 60_000.0
+PATIENCE_S = 60.0
+LOOK_S = 0.02
+UNHANDLED = ("Traceback", "CRITICAL", "Exception ignored")
+
+Figures = dict[str, Any]
+"What a case comes to: JSON, with the list `failures` of what did not hold."
+
+
+class Latched(NamedTuple):
+    """A fault that no case has asked for, and the time in which it came, CLOCK_MONOTONIC."""
+
+    fault: str
+    start_s: float
+    end_s: float
+
+
+class Process(NamedTuple):
+    """One of ours, and what /proc says of it."""
+
+    child: "subprocess.Popen[str]"
+
+    def descriptors(self) -> int:
+        """Files open now."""
+        return len(list(Path(f"/proc/{self.child.pid}/fd").iterdir()))
+
+    def resident_kB(self) -> int:
+        """Memory in use."""
+        pages = int(Path(f"/proc/{self.child.pid}/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") // 1024
+
+
+class Stand:
+    """Daemon, device and an operator's client. All of it ends with `stack`."""
+
+    def __init__(self, stack: ExitStack, transport: str = "serial") -> None:
+        """Raises TimeoutError. Telemetry demands keys, which lie in `keys`; the other endpoints are open."""
+        self._stack = stack
+        self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tormag-")))
+        self.latched: list[Latched] = []
+        stack.enter_context(carried(DEVICE_PRIORITY))
+        self.plug_in(transport)
+        self.keys = self.folder / "keys"
+        generate(SERVER, self.keys, self.keys)
+        for role in ("publish", "operate", "observe"):
+            generate(role, self.keys, self.keys / role)
+        with socket.socket() as probe:
+            probe.bind(("", 0))
+            addresses = {"telemetry": f"tcp://0.0.0.0:{probe.getsockname()[1]}"}
+        addresses |= {name: f"ipc://{self.folder}/{name}" for name in ("setpoint", "control", "recording")}
+        config = self.folder / "tormagd.toml"
+        config.write_text(
+            f'scene = "coronary"\n[realtime]\nfifo_priority = {FIFO_PRIORITY}\nlock_memory = true\n'
+            f'[device]\nport = "{self.folder}/device"\n{BACKENDS[transport]}\nmeasurement_timeout_ms = 50.0\n'
+            + "[endpoints]\n"
+            + "".join(f'{name} = "{address}"\n' for name, address in addresses.items())
+            + f'[endpoints.curve]\nserver_secret = "{self.keys}/{SERVER}{SECRET}"\n'
+        )
+        self.daemon = self.begin("-m", "tormagd.daemon.main", "--config", str(config))
+        self.endpoints = load_config(config).endpoints
+        self.client = stack.enter_context(Client(self.endpoints, 2.0))
+        self.until(lambda status: status["link"]["state"] == "RUNNING", "the link runs")
+
+    def begin(self, *arguments: str) -> Process:
+        """A Python of ours, what it says kept in the folder."""
+        log = self._stack.enter_context((self.folder / "log").open("a"))
+        environment = os.environ | {"OMP_NUM_THREADS": "1"}
+        child = subprocess.Popen(
+            [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=log, text=True, env=environment
+        )
+        self._stack.callback(end, child)
+        return Process(child)
+
+    def plug_in(self, transport: str) -> None:
+        """Begins a device; a symbolic link to its line stands for the stable name that udev gives a real one."""
+        simulated = ("--seed", "1", "--truth", str(self.folder / "truth.csv"))
+        self.device = self.begin(*own_machine(DEVICE_PRIORITY, "tormagd.simulation", DOORS[transport], *simulated))
+        assert self.device.child.stdout is not None
+        line, port = self.device.child.stdout.readline().strip(), self.folder / "device"
+        port.unlink(missing_ok=True)
+        port.symlink_to(line)
+
+    def status(self) -> dict[str, Any]:
+        """The daemon's status. Raises ClientError."""
+        return self.client.request("status")
+
+    def is_done(self, command: str) -> bool:
+        """Gives a command; whether it was carried out."""
+        with contextlib.suppress(ClientError):
+            self.client.request(command)
+            return True
+        return False
+
+    def until(self, reached: Callable[[dict[str, Any]], bool], what: str) -> dict[str, Any]:
+        """The status in which that is so. Raises TimeoutError saying what was waited for, and the last words."""
+        until_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until_s and self.daemon.child.poll() is None:
+            with contextlib.suppress(ClientError):
+                if reached(status := self.status()):
+                    return status
+            time.sleep(LOOK_S)
+        raise TimeoutError(f"not within {PATIENCE_S:g} s: {what}\n{(self.folder / 'log').read_text()[-2_000:]}")
+
+    def ask(self, force_N: float) -> None:
+        """Publishes a force that stays valid for long."""
+        self.client.publish(force_N, LASTS_MS)
+
+    def arm(self) -> None:
+        """Clears, homes and enables, whatever was before, at a neutral force. Raises TimeoutError."""
+
+        def is_armed(status: dict[str, Any]) -> bool:
+            if status["operating_state"] == "ENABLED":
+                return True
+            command = "clear-fault" if status["faults"] else "enable" if status["is_homed"] else "home"
+            if is_at_rest(status):
+                self.is_done(command)
+            return False
+
+        self.ask(NEUTRAL_N)
+        self.until(is_armed, "enabled")
+
+    def see_faults(self, since_s: float) -> bool:
+        """Keeps the faults that have latched since; whether there are any."""
+        faults = self.status()["faults"]
+        self.latched += [Latched(fault, since_s, time.monotonic()) for fault in faults]
+        return bool(faults)
+
+    @contextlib.contextmanager
+    def ticks(self) -> Iterator[Callable[[], list[dict[str, Any]]]]:
+        """Gives a function that gives the control ticks since it was last called, by their columns."""
+        with zmq.Context() as context, context.socket(zmq.SUB) as recorder:
+            recorder.subscribe(b"")
+            recorder.connect(self.endpoints.recording)
+
+            def read() -> list[dict[str, Any]]:
+                rows: list[dict[str, Any]] = []
+                while recorder.poll(0):
+                    batch = decode_ticks(recorder.recv())
+                    rows += [dict(zip(batch.columns, row, strict=True)) for row in batch.rows]
+                return rows
+
+            yield read
+
+    def truth(self) -> npt.NDArray[np.float64]:
+        """Ends the device; what no sensor has seen, columns t_ns, force_N and gap_mm."""
+        end(self.device.child)
+        return np.loadtxt(self.folder / "truth.csv", delimiter=",", skiprows=1, usecols=(0, 1, 2), ndmin=2)
+
+    def unhandled(self) -> list[str]:
+        """What the processes said of what nobody has handled."""
+        lines = (self.folder / "log").read_text(encoding="utf-8", errors="replace").splitlines()
+        return [line for line in lines if any(sign in line for sign in UNHANDLED)]
+
+
+def is_at_rest(status: dict[str, Any]) -> bool:
+    """Whether the link runs, and the device neither homes nor opens."""
+    return status["link"]["state"] == "RUNNING" and not status["is_busy"]
+
+
+def end(child: "subprocess.Popen[str]") -> None:
+    """Ends what we began."""
+    child.terminate()
+    child.wait(PATIENCE_S)

@@ -1,1 +1,0 @@
-"""Who troubles the daemon in `intruders.py`: strangers, floods, hostile messages."""
