@@ -71,8 +71,8 @@ def test_the_fastest_wires_are_configurations_that_tormagd_takes(tmp_path: Path)
 
 def test_the_bound_is_the_hops_and_a_period_and_a_quarter_of_a_millisecond() -> None:
     for whole_us, kept in ((1_350.0, True), (1_351.0, False)):
-        course = latency.Course(np.array([whole_us]), np.zeros(1), np.zeros(1), np.array([100.0]))
-        result = latency.summary(course, 1, RealTime())
+        found_us = {latency.WHOLE: np.array([whole_us]), latency.HOP: np.array([100.0])}
+        result = latency.summary(found_us, 1, RealTime())
         assert (result["bound_us"], result["kept"]) == (1_350.0, kept)
 
 
@@ -83,18 +83,19 @@ def test_the_first_tick_that_used_a_setpoint_counts() -> None:
 
 
 def test_stages_add_up_to_the_whole() -> None:
-    course = latency.Course(
-        sent_to_plan_us=np.array([200.0, 400.0]),
-        plan_to_tick_us=np.array([700.0, 100.0]),
-        tick_to_wire_us=np.array([60.0, 70.0]),
-        hop_us=np.array([100.0, 120.0]),
-    )
-    result = latency.summary(course, 3, RealTime())
+    # sent, written by the wall clock; the tick's time; planned, begun by the monotonic clock
+    ticks = [(1_000_000, 1_960_000, 60.0, 5.0, 5.0007), (3_000_000, 3_570_000, 70.0, 7.0, 7.0001)]
+    found_us = latency.stages(ticks) | {latency.HOP: np.array([100.0, 120.0])}
+    assert list(found_us)[1:4] == ["sent, until planning begins", "then until the tick begins", "tick, until written"]
+    for name, expected_us in zip(
+        found_us, ([960.0, 570.0], [200.0, 400.0], [700.0, 100.0], [60.0, 70.0]), strict=False
+    ):
+        assert found_us[name] == pytest.approx(expected_us)
+    result = latency.summary(found_us, 3, RealTime())
     assert result["setpoint_to_wire_us"]["p50"] == pytest.approx(765.0)
     assert result["setpoint_to_wire_us"]["max"] == pytest.approx(960.0)
     assert result["ratio"] == pytest.approx(765.0 / 110.0, abs=0.01)
-    assert (result["setpoints"], result["seen"]) == (3, 2)
-    assert len(result["stages_us"]) == 3
+    assert (result["setpoints"], result["seen"], len(result["stages_us"])) == (3, 2, 3)
 
 
 def test_histograms_are_drawn_of_any_positive_or_zero_durations(tmp_path: Path) -> None:

@@ -26,7 +26,6 @@ from benchmarks.inverse_workload import (
     course,
     network_roots_mT,
     plant_force_N,
-    plant_slope_N_per_mT,
     trained,
     training_data,
 )
@@ -266,11 +265,9 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     }
     p50_us = next(iter(chosen.values()))["p50_us"]
     speedup = {name: usual[name]["p50_us"] / p50_us for name in BASELINES}
-    sigma_N = 1e-3 * bench.plant.force_sensor.noise_mN
     result = {
         "workload": f"synthetic torque element ({PLANT}, no memory), {effort.course} points of a smooth course",
         "environment": environment(),
-        "noise_bound_mae_mT": float((0.8 * sigma_N / plant_slope_N_per_mT(bench.plant, bench.course)).mean()),
         "variants": rows,
         "refused": refused,
         "chosen": chosen,

@@ -44,8 +44,7 @@ A solve gets a state of the handle, a force and the last field, and answers with
 The curve of force over field for that state is made in the time shown. Two errors are kept apart. The *solver error* is
 the distance to the network's own nearest root, found by bisection that shares no code with the searches. The *plant
 error* is the distance to the field at which the simulated element gives the force; it holds the network's error too,
-and no search can be better than its network. *Force* is the plant's force at the answer less the force asked. One force
-reading's noise alone makes {noise_bound_mae_mT:.2f} mT.
+and no search can be better than its network. *Force* is the plant's force at the answer less the force asked.
 
 ![p50 against the solver error and against the plant error](images/inverse_trade.png)
 
@@ -112,9 +111,8 @@ def plot(result: dict[str, Any], figures: list[str]) -> None:
     _scatter(right, rows, "plant_mae_mT")
     front = sorted((row["p50_us"], row["plant_mae_mT"]) for row in rows if row["pareto"])
     right.step(*zip(*front, strict=True), where="post", color="0.5", linewidth=1, zorder=0)
-    right.axhline(result["noise_bound_mae_mT"], color="0.7", linestyle=":")
     left.set(title=f"against the network's own root, {USUAL_HIDDEN} units", ylabel="mean field error, mT")
-    right.set(title="against the plant, all sizes; dotted: one reading's noise")
+    right.set(title="against the plant, all sizes")
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=7, fontsize=8)
     figure.savefig(PLOT, dpi=130, metadata=stamp(figures))
 

@@ -37,10 +37,8 @@ DISPLACEMENTS_MM = (1.4, 2.1)
 RATES_MM_S = (2.0, 55.0)
 "Near full mobilisation and in motion: before break-away the force is the hand's choice, and the inverse is ill-posed."
 
-SOLVES = 2000
 COVERED = (0.04, 0.96)
 ROOT_STEP_MT = 0.5
-SLOPE_STEP_MT = 0.5
 
 
 class Course(NamedTuple):
@@ -85,16 +83,6 @@ def course(plant: PlantParameters, solves: int) -> Course:
     rate = 25.0 + 20.0 * np.sin(5 * phase)
     displacement = 1.75 + 0.25 * np.sin(7 * phase)
     return Course(displacement, rate, field, plant_force_N(plant, displacement, rate, field))
-
-
-def plant_slope_N_per_mT(plant: PlantParameters, along: Course) -> Array:
-    """dF/dB of the plant along the course, by central differences."""
-    either = [
-        plant_force_N(plant, along.displacement_mm, along.rate_mm_s, along.field_mT + side * SLOPE_STEP_MT)
-        for side in (1, -1)
-    ]
-    slope: Array = (either[0] - either[1]) / (2 * SLOPE_STEP_MT)
-    return slope
 
 
 def training_data(plant: PlantParameters, rows: int, seed: int) -> Dataset:

@@ -9,14 +9,13 @@ At worst a setpoint just misses the slack: it waits for a plan's time, then for 
 """
 
 import argparse
-import multiprocessing
 import os
 import random
 import tempfile
 import time
-from multiprocessing.connection import Connection
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -38,6 +37,8 @@ SPACING_S = (0.0015, 0.0025)
 "500 a second, as in `make run`; random, so that they meet every phase of the control period."
 COLUMNS = ("t_ns", "exec_us", "plan_time_s", "monotonic_s")
 SETTLE_NS = 500_000_000
+LOST_S = 10.0
+"For a message of the bare hop."
 ALLOWED_US = 250.0
 """From a setpoint to its frame p99 is to take no longer than the bare hop's of the same run, a control period, which it
 may just have missed, and this: the plan, the tick and the write."""
@@ -46,50 +47,48 @@ BELOW = 10
 "The measurement's own processes are this far below the daemon's real-time priority."
 
 
-class Course(NamedTuple):
-    """One array over the setpoints that were seen on the wire, us each, and one over the bare hops."""
-
-    sent_to_plan_us: Array
-    plan_to_tick_us: Array
-    tick_to_wire_us: Array
-    hop_us: Array
-
-    @property
-    def whole_us(self) -> Array:
-        """From the setpoint's stamp to its drive frame."""
-        return self.sent_to_plan_us + self.plan_to_tick_us + self.tick_to_wire_us
+Stages = dict[str, Array]
+"""Durations by name, us: of the whole way, of the bare hop, and of the parts of the way."""
+WHOLE, HOP = "setpoint to wire", "bare ZeroMQ hop"
 
 
-def run(count: int, realtime: RealTime) -> Course:
+def run(count: int, realtime: RealTime) -> Stages:
     """`count` setpoints through the daemon, then as many through the bare hop."""
     stand = Stand(realtime, setpoint_hz=0)
-    with tempfile.TemporaryDirectory(prefix="tormag-") as name, daemon(stand, Path(name)) as running:
+    with tempfile.TemporaryDirectory(prefix="tormag-") as name, daemon(stand, Path(name)) as (config, _):
         prepare(RealTime(fifo_priority=max(realtime.fifo_priority - BELOW, 0), keep_awake=realtime.keep_awake))
-        sent, rows = exchange(running.config, count)
-    stamp_ns, *columns = zip(*first_ticks(sent, rows), strict=True)
-    written_ns, tick_us, planned_s, began_s = (np.array(column) for column in columns)
+        ticks = first_ticks(*exchange(config, count))
+    return stages(ticks) | {HOP: bare_hop(count)}
+
+
+def stages(ticks: list[tuple[Any, ...]]) -> Stages:
+    """The whole way and its parts, of what `first_ticks` found."""
+    stamp_ns, written_ns, tick_us, planned_s, began_s = (np.array(column) for column in zip(*ticks, strict=True))
+    whole_us = (written_ns - stamp_ns) * 1e-3
     # plan and tick are stamped on the monotonic clock, the frame on that of the setpoint's stamp
     plan_us = (began_s - planned_s) * 1e6
-    return Course((written_ns - np.array(stamp_ns)) * 1e-3 - tick_us - plan_us, plan_us, tick_us, bare_hop(count))
+    return {
+        WHOLE: whole_us,
+        "sent, until planning begins": whole_us - tick_us - plan_us,
+        "then until the tick begins": plan_us,
+        "tick, until written": tick_us,
+    }
 
 
-def summary(course: Course, count: int, realtime: RealTime) -> dict[str, Any]:
+def summary(found_us: Stages, count: int, realtime: RealTime) -> dict[str, Any]:
     """The contract's object. `bound_us` is what p99 may come to, and `kept` whether it does."""
-    whole_us, hop_us = quantiles(course.whole_us), quantiles(course.hop_us)
+    told = {name: quantiles(durations_us) for name, durations_us in found_us.items()}
+    whole_us, hop_us = told.pop(WHOLE), told.pop(HOP)
     bound_us = round(hop_us["p99"] + PERIOD_US + ALLOWED_US, 1)
     return {
         "setpoint_to_wire_us": whole_us,
         "bare_zmq_us": hop_us,
         "bound_us": bound_us,
         "kept": whole_us["p99"] <= bound_us,
-        "ratio": round(float(np.median(course.whole_us) / np.median(course.hop_us)), 2),
-        "stages_us": {
-            "sent, until planning begins": quantiles(course.sent_to_plan_us),
-            "then until the tick begins": quantiles(course.plan_to_tick_us),
-            "tick, until written": quantiles(course.tick_to_wire_us),
-        },
+        "ratio": round(float(np.median(found_us[WHOLE]) / np.median(found_us[HOP])), 2),
+        "stages_us": told,
         "setpoints": count,
-        "seen": course.whole_us.size,
+        "seen": found_us[WHOLE].size,
     } | asked_for(realtime)
 
 
@@ -145,32 +144,27 @@ def first_ticks(sent: dict[float, int], rows: list[dict[str, Any]]) -> list[tupl
 
 
 def bare_hop(count: int) -> Array:
-    """The same message from PUB to SUB between two processes, us."""
-    with tempfile.TemporaryDirectory(prefix="tormag-") as folder:
+    """The same message from PUB to SUB between two processes, us. Raises zmq.Again where messages are lost."""
+    scheduling = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
+    with tempfile.TemporaryDirectory(prefix="tormag-") as folder, ProcessPoolExecutor(1) as pool:
         address = f"ipc://{folder}/hop"
-        ours, theirs = multiprocessing.Pipe()
-        scheduling = os.sched_getscheduler(0), os.sched_getparam(0).sched_priority
-        process = multiprocessing.Process(target=receive, args=(address, count, scheduling, theirs), daemon=True)
-        process.start()
+        received = pool.submit(receive, address, count, scheduling)
         publish(address, count)
-        if not ours.poll(10):
-            raise RuntimeError("the bare hop lost messages")
-        found: Array = ours.recv()
-        process.join(5.0)
-    return found
+        return received.result()
 
 
-def receive(address: str, count: int, scheduling: tuple[int, int], result: Connection) -> None:
-    """The far end of the bare hop, scheduled like the near one."""
+def receive(address: str, count: int, scheduling: tuple[int, int]) -> Array:
+    """The far end of the bare hop, scheduled like the near one. Raises zmq.Again where messages are lost."""
     os.sched_setscheduler(0, scheduling[0], os.sched_param(scheduling[1]))
     with context(priority_of_threads()) as ours, ours.socket(zmq.SUB) as socket:
+        socket.setsockopt(zmq.RCVTIMEO, round(LOST_S * 1e3))
         socket.subscribe(b"")
         socket.bind(address)
         hops = np.zeros(count)
         for index in range(count):
             data = socket.recv()
             hops[index] = (time.time_ns() - msgpack.unpackb(data)["stamp_ns"]) * 1e-3
-        result.send(hops)
+    return hops
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -183,13 +177,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The object for these options."""
     realtime = realtime_settings(options)
-    course = run(options.count, realtime)
+    found_us = run(options.count, realtime)
     if options.plot:
-        shown = {
-            "setpoint to wire": course.whole_us,
-            "bare ZeroMQ hop": course.hop_us,
-            "sent, until planning begins": course.sent_to_plan_us,
-            "tick, until written": course.tick_to_wire_us,
-        }
-        plot_histograms(options.plot, f"From {course.whole_us.size} setpoints to their first drive frames", shown)
-    return summary(course, options.count, realtime)
+        plot_histograms(options.plot, "From setpoints to their first drive frames", found_us)
+    return summary(found_us, options.count, realtime)

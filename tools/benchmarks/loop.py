@@ -19,9 +19,9 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -104,13 +104,8 @@ class Stand(NamedTuple):
     device_fifo: int = 0
 
 
-class Running(NamedTuple):
-    """A process that keeps time: where its sockets are, and its id."""
-
-    config: Config
-    pid: int
-
-
+Running = tuple[Config, int]
+"""The configuration and the id of a process that keeps time."""
 Started = Callable[[Path], contextlib.AbstractContextManager[Running]]
 """Begins what is measured, with its files in the folder."""
 
@@ -164,20 +159,20 @@ def block(started: Started, seconds: float) -> Block:
     """One block of one kind, under the load of the clients."""
     with (
         tempfile.TemporaryDirectory(prefix="tormag-") as folder,
-        started(Path(folder)) as running,
-        recording(running.config.endpoints) as recorder,
+        started(Path(folder)) as (config, pid),
+        recording(config.endpoints) as recorder,
     ):
-        rate_hz = running.config.rates.control_hz
+        rate_hz = config.rates.control_hz
         stop = multiprocessing.Event()
-        load = multiprocessing.Process(target=hammer, args=(running.config.endpoints.control, stop), daemon=True)
+        load = multiprocessing.Process(target=hammer, args=(config.endpoints.control, stop), daemon=True)
         load.start()
         try:
             recorder.poll(STARTS_MS)
             collect(recorder, WARM_UP_S, rate_hz)
-            started_s, before_s = time.monotonic(), processor_s(running.pid)
+            started_s, before_s = time.monotonic(), processor_s(pid)
             ticks = collect(recorder, seconds, rate_hz)
-            share = (processor_s(running.pid) - before_s) / (time.monotonic() - started_s)
-            plan_us = planned(running.config.endpoints.control)
+            share = (processor_s(pid) - before_s) / (time.monotonic() - started_s)
+            plan_us = planned(config.endpoints.control)
         finally:
             stop.set()
             load.join(5.0)
@@ -250,11 +245,9 @@ def hammer(address: str, stop: Event) -> None:
                 with contextlib.suppress(ClientError):
                     client.request("status")
 
-    clients = [threading.Thread(target=ask) for _ in range(CLIENTS)]
-    for client in clients:
-        client.start()
-    for client in clients:
-        client.join()
+    with ThreadPoolExecutor(CLIENTS) as clients:
+        for _ in range(CLIENTS):
+            clients.submit(ask)
 
 
 def write_config(folder: Path, port: str, stand: Stand) -> Path:
@@ -301,7 +294,7 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
         if stand.setpoint_hz:
             pulse = ["send", "pulse", "--rate", str(stand.setpoint_hz), "--duration", "3600"]
             started(*ctl, *pulse, stdout=subprocess.DEVNULL)
-        yield Running(config, process.pid)
+        yield config, process.pid
 
 
 def end(child: "subprocess.Popen[Any]") -> None:
@@ -318,7 +311,7 @@ def stub_process(stand: Stand, folder: Path) -> Iterator[Running]:
     stub.start()
     assert stub.pid is not None
     try:
-        yield Running(config, stub.pid)
+        yield config, stub.pid
     finally:
         stub.terminate()
         stub.join(5.0)

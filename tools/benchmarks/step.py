@@ -187,7 +187,8 @@ def time_optimal(parameters: PlantParameters, start_mm: float, distance_mm: floa
 
 def bang_bang(parameters: PlantParameters, start_mm: float, distance_mm: float, switch_s: float) -> tuple[Array, float]:
     """True gap every 0.1 ms until rest, and the time of that, for full voltage that turns round at `switch_s`."""
-    gaps, time_s, tick = [], 0.0, TICK_S / 10.0
+    gaps: list[float] = []
+    time_s, tick = 0.0, TICK_S / 10.0
     plant = Plant(_at_rest(parameters, start_mm), SteadyHand(), substep_s=tick)
     volts = np.sign(distance_mm) * parameters.electronics.supply_V
     is_turning = False
