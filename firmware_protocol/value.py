@@ -17,11 +17,9 @@ class Value:
     def __init_subclass__(cls) -> None:
         """Reads the names of the fields: a compiled class says its attributes, any other its parameters."""
         code = getattr(cls.__init__, "__code__", None)
-        if code is None:
-            names = getattr(cls, "__mypyc_attrs__", ())
-        else:
-            names = code.co_varnames[1 : code.co_argcount + code.co_kwonlyargcount]
-        type.__setattr__(cls, "__match_args__", names)
+        names = code.co_varnames[1 : code.co_argcount] if code else getattr(cls, "__mypyc_attrs__", ())
+        if "__match_args__" not in vars(cls):
+            type.__setattr__(cls, "__match_args__", names)
 
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):

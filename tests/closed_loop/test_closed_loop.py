@@ -4,7 +4,7 @@ All data here are synthetic: the device is the simulator's, the pulse is a formu
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -13,14 +13,11 @@ import pytest
 from firmware_protocol.codec import DeviceMode, DriveMode
 from tormagd.closed_loop import ClosedLoop, Sample, stream
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
-from tormagd.control.plan import Plan
+from tormagd.control.core import Core
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState, RefusedError
-from tormagd.simulation.device import SerialDevice, VirtualDevice
-from tormagd.simulation.faults import parse_fault
-from tormagd.simulation.hand import parse_hand
-from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.device import SerialDevice
+from tormagd.simulation.hand import ReversingHand
 
 CONFIG = Config()
 OPEN_MM = 95.0
@@ -31,42 +28,6 @@ STRIKE_S = 3.4
 Maker = Callable[..., ClosedLoop]
 
 
-@pytest.fixture(scope="module")
-def core() -> Core:
-    return build_core(CONFIG)
-
-
-@pytest.fixture(scope="module")
-def make(core: Core) -> Maker:
-    """A loop on a simulated device that has just been switched on."""
-
-    def build(
-        plant: str = "sample_1",
-        faults: Iterable[str] = (),
-        hand: str = "steady",
-        seed: int = 1,
-        *,
-        planned: bool = True,
-    ) -> ClosedLoop:
-        device = VirtualDevice(load_plant(plant), parse_hand(hand), [parse_fault(fault) for fault in faults], seed)
-        return ClosedLoop(CONFIG, core.stepper, core.planner if planned else None, device)
-
-    return build
-
-
-@pytest.fixture
-def armed(make: Maker) -> ClosedLoop:
-    """A loop that is armed: homing is the same every time."""
-    loop = make()
-    loop.arm()
-    return loop
-
-
-def gap_plan(gap_mm: float) -> Plan:
-    """A plan for a gap instead of a force."""
-    return Plan(1, 0.0, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
-
-
 def pulse_N(time_s: float) -> float:
     """A synthetic pulse of 1.2 Hz between 1.4 and 1.7 N, steep to rise and slow to fall, behind a ramp and a hold."""
     if time_s < LEAD_IN_S:
@@ -75,7 +36,7 @@ def pulse_N(time_s: float) -> float:
     return 1.4 + 0.15 * (1.0 - math.cos(phase + 0.4 * math.sin(phase)))
 
 
-def render(loop: ClosedLoop, force_N: Callable[[float], float], duration_s: float, rate_hz: int = 250) -> list[Sample]:
+def publish(loop: ClosedLoop, force_N: Callable[[float], float], duration_s: float, rate_hz: int = 250) -> list[Sample]:
     """The ticks while a publisher sends this force."""
     times = np.arange(round(duration_s * rate_hz)) / rate_hz
     forces = np.array([force_N(time) for time in times])
@@ -93,11 +54,6 @@ def rms_N(samples: list[Sample], force_N: Callable[[float], float], from_s: floa
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
-def hold_gap(loop: ClosedLoop, gap_mm: float, duration_s: float) -> list[Sample]:
-    """The ticks while a gap is asked for."""
-    return [loop.tick(plan=gap_plan(gap_mm)) for _ in range(round(duration_s * 1e3))]
-
-
 def faults_of(samples: list[Sample]) -> tuple[Fault, ...]:
     return samples[-1].state.safety.faults
 
@@ -106,7 +62,7 @@ def faults_of(samples: list[Sample]) -> tuple[Fault, ...]:
 
 
 def test_a_pulse_is_rendered(armed: ClosedLoop) -> None:
-    samples = render(armed, pulse_N, LEAD_IN_S + 2.5)
+    samples = publish(armed, pulse_N, LEAD_IN_S + 2.5)
     assert faults_of(samples) == ()
     assert rms_N(samples, pulse_N, LEAD_IN_S) <= 0.03
     assert samples[-1].trim == pytest.approx(1.0, abs=0.15)
@@ -115,11 +71,10 @@ def test_a_pulse_is_rendered(armed: ClosedLoop) -> None:
 
 
 @pytest.mark.parametrize("plant", ["sample_2", "sample_3"])
-def test_other_devices_of_the_kind_render_it_too(make: Maker, plant: str) -> None:
+def test_other_devices_of_the_kind_render_it_too(arm, plant: str) -> None:
     """The model was learned on sample 1; the trim makes up for what differs, given a second or two."""
-    loop = make(plant)
-    loop.arm()
-    samples = render(loop, pulse_N, LEAD_IN_S + 2.5)
+    loop = arm(plant)
+    samples = publish(loop, pulse_N, LEAD_IN_S + 2.5)
     assert faults_of(samples) == ()
     assert rms_N(samples, pulse_N, LEAD_IN_S + 1.5) <= 0.05
 
@@ -130,7 +85,7 @@ def test_a_staircase_rises_at_every_step(armed: ClosedLoop, core: Core) -> None:
     steps = [least, *np.arange(math.ceil(10.0 * least) / 10.0, 2.05, 0.1)]
     rendered, gaps = [], []
     for force in steps:
-        samples = render(armed, lambda time_s, force=force: float(force), 0.4, rate_hz=100)  # type: ignore[misc]
+        samples = publish(armed, lambda time_s, force=force: float(force), 0.4, rate_hz=100)  # type: ignore[misc]
         assert faults_of(samples) == ()
         rendered.append(float(np.mean([sample.truth.force_N for sample in samples[-100:]])))
         gaps.append(samples[-1].truth.gap_mm)
@@ -139,12 +94,11 @@ def test_a_staircase_rises_at_every_step(armed: ClosedLoop, core: Core) -> None:
     assert rendered == pytest.approx(steps, abs=0.06)
 
 
-def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(make: Maker) -> None:
+def test_a_hand_that_stops_and_turns_meets_no_more_than_was_asked(arm) -> None:
     """A constant force: the friction that waits for the hand stays what was asked while the hand rests. Of it the
     kinetic part is less the slower the hand is: Stribeck's comes on top."""
-    loop = make(hand="reversing")
-    loop.arm()
-    samples = render(loop, lambda time_s: 1.0, 4.0, rate_hz=100)[1_500:]
+    loop = arm(hand=ReversingHand())
+    samples = publish(loop, lambda time_s: 1.0, 4.0, rate_hz=100)[1_500:]
     assert min(abs(sample.truth.handle_mm_s) for sample in samples) < 0.1
     assert all(-0.1 < sample.truth.kinetic_N - 1.0 < 0.08 for sample in samples)
     assert all(abs(sample.truth.force_N) < 1.08 for sample in samples)
@@ -159,7 +113,7 @@ def test_without_a_publisher_the_gap_stays_open(armed: ClosedLoop) -> None:
 
 
 def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Core) -> None:
-    render(armed, lambda time_s: 1.4, 1.0)
+    publish(armed, lambda time_s: 1.4, 1.0)
     at_s = armed.now_s
     silent = stream(np.array([at_s]), np.array([1.4]))
     samples = list(armed.run(1.2, silent))
@@ -183,9 +137,8 @@ def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Co
 
 @pytest.mark.parametrize("direction", [-1.0, 1.0], ids=["closing", "opening"])
 @pytest.mark.parametrize("start_mm", [85.0, 60.0])
-def test_a_millimetre_of_gap(make: Maker, direction: float, start_mm: float) -> None:
-    loop = make(planned=False)
-    loop.arm(gap_plan(OPEN_MM))
+def test_a_millimetre_of_gap(arm, hold_gap, direction: float, start_mm: float) -> None:
+    loop = arm(planned=False)
     hold_gap(loop, start_mm, 1.8)
     from_mm = loop.device.truth.gap_mm
     assert from_mm == pytest.approx(start_mm, abs=0.02)
@@ -206,13 +159,13 @@ def test_a_millimetre_of_gap(make: Maker, direction: float, start_mm: float) -> 
 
 
 def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None:
-    render(armed, lambda time_s: 1.2, 1.2)
+    publish(armed, lambda time_s: 1.2, 1.2)
     armed.command("pause")
     held_mm = armed.device.truth.gap_mm
-    paused = render(armed, lambda time_s: 1.8, 0.4)
+    paused = publish(armed, lambda time_s: 1.8, 0.4)
     assert all(sample.truth.gap_mm == pytest.approx(held_mm, abs=0.3) for sample in paused)
     armed.command("resume")
-    resumed = render(armed, lambda time_s: 1.8, 0.8)
+    resumed = publish(armed, lambda time_s: 1.8, 0.8)
     assert resumed[-1].truth.force_N == pytest.approx(1.8, abs=0.06)
     armed.command("disable")
     opened = list(armed.run(2.2))
@@ -221,12 +174,12 @@ def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop) -> None
     assert all(sample.output.mode is DriveMode.OFF for sample in opened)
     # disabled is not a fault: it can be armed again without homing
     armed.command("enable")
-    again = render(armed, lambda time_s: 1.2, 1.2)
+    again = publish(armed, lambda time_s: 1.2, 1.2)
     assert again[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
 
 
 def test_stop_opens_and_has_to_be_cleared(armed: ClosedLoop) -> None:
-    render(armed, lambda time_s: 1.2, 0.8)
+    publish(armed, lambda time_s: 1.2, 0.8)
     armed.command("stop")
     samples = list(armed.run(2.2))
     assert faults_of(samples) == (Fault.STOPPED,)
@@ -235,30 +188,20 @@ def test_stop_opens_and_has_to_be_cleared(armed: ClosedLoop) -> None:
         armed.command("enable")
     armed.command("clear-fault")
     armed.command("enable")
-    assert render(armed, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
-
-
-def test_enabling_before_homing_is_refused(make: Maker) -> None:
-    loop = make()
-    for _ in range(200):
-        loop.tick()
-    with pytest.raises(RefusedError) as caught:
-        loop.command("enable")
-    assert caught.value.code == "not_homed"
+    assert publish(armed, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
 
 
 # -- faults --------------------------------------------------------------------------------------------------------
 
 
-def struck(make: Maker, spec: str, seconds: float = 2.6) -> tuple[ClosedLoop, list[Sample]]:
+def struck(arm: Maker, spec: str, seconds: float = 2.6) -> tuple[ClosedLoop, list[Sample]]:
     """The ticks from a fault on that is injected into a running pulse, and the loop after them."""
-    loop = make(faults=[f"{spec}@{STRIKE_S:g}"])
-    loop.arm()
-    before = render(loop, pulse_N, STRIKE_S - loop.now_s, rate_hz=100)
+    loop = arm(faults=[f"{spec}@{STRIKE_S:g}"])
+    before = publish(loop, pulse_N, STRIKE_S - loop.now_s, rate_hz=100)
     assert faults_of(before) == ()
     assert before[-1].truth.force_N == pytest.approx(pulse_N(before[-1].time_s - before[0].time_s), abs=0.1)
     phase_s = before[-1].time_s - before[0].time_s
-    samples = render(loop, lambda time_s: pulse_N(phase_s + time_s), seconds, rate_hz=100)
+    samples = publish(loop, lambda time_s: pulse_N(phase_s + time_s), seconds, rate_hz=100)
     assert (OperatingState.FAULT is samples[-1].state.safety.operating_state) == bool(faults_of(samples))
     return loop, samples
 
@@ -285,8 +228,8 @@ def opened_after_s(samples: list[Sample]) -> float:
         ("reset", Fault.DEVICE_NOT_RUNNING, 0.05),
     ],
 )
-def test_a_fault_is_named_and_the_gap_opens(make: Maker, spec: str, fault: Fault, within_s: float) -> None:
-    _, samples = struck(make, spec)
+def test_a_fault_is_named_and_the_gap_opens(arm, spec: str, fault: Fault, within_s: float) -> None:
+    _, samples = struck(arm, spec)
     found, after_s = first_fault(samples)
     assert found is fault
     assert after_s <= within_s
@@ -296,8 +239,8 @@ def test_a_fault_is_named_and_the_gap_opens(make: Maker, spec: str, fault: Fault
     assert not any(sample.output.mode is DriveMode.RUN for sample in samples if sample.state.safety.faults)
 
 
-def test_after_a_lost_encoder_enabling_wants_homing_though_the_device_calls_itself_homed(make: Maker) -> None:
-    loop, samples = struck(make, "encoder_stuck_left")
+def test_after_a_lost_encoder_enabling_wants_homing_though_the_device_calls_itself_homed(arm) -> None:
+    loop, samples = struck(arm, "encoder_stuck_left")
     assert faults_of(samples) == (Fault.NO_MOTION,)
     assert loop.measurement is not None
     assert loop.measurement.is_homed
@@ -312,12 +255,12 @@ def test_after_a_lost_encoder_enabling_wants_homing_though_the_device_calls_itse
     loop.command("clear-fault")
     list(loop.run(0.1))
     loop.arm()
-    assert render(loop, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
+    assert publish(loop, lambda time_s: 1.2, 1.2)[-1].truth.force_N == pytest.approx(1.2, abs=0.06)
 
 
-def test_a_device_that_hears_nothing_opens_by_itself(make: Maker) -> None:
+def test_a_device_that_hears_nothing_opens_by_itself(arm) -> None:
     """Nothing that the host sends arrives: the opening is the device's own, 50 ms after the last Drive."""
-    _, samples = struck(make, "commands_vanish")
+    _, samples = struck(arm, "commands_vanish")
     found, after_s = first_fault(samples)
     assert found is Fault.MEASUREMENT_STALE
     assert after_s <= 0.06
@@ -328,8 +271,8 @@ def test_a_device_that_hears_nothing_opens_by_itself(make: Maker) -> None:
     assert opened_after_s(samples) < 0.05 + 0.15 + (OPEN_MM - still_mm) / 15.0
 
 
-def test_without_supply_the_gap_is_held_by_friction_and_both_facts_are_named(make: Maker) -> None:
-    loop, samples = struck(make, "supply_loss", seconds=6.5)
+def test_without_supply_the_gap_is_held_by_friction_and_both_facts_are_named(arm) -> None:
+    loop, samples = struck(arm, "supply_loss", seconds=6.5)
     found, after_s = first_fault(samples)
     assert found is Fault.DEVICE_SUPPLY
     assert after_s < 0.05
@@ -346,21 +289,19 @@ def test_without_supply_the_gap_is_held_by_friction_and_both_facts_are_named(mak
 
 
 @pytest.mark.parametrize("spec", ["drag_left=+50%", "worn_gearbox"])
-def test_wear_is_made_up_for(make: Maker, spec: str) -> None:
+def test_wear_is_made_up_for(arm, spec: str) -> None:
     """Half as much drag again on one side, or a quarter of the friction: synchronised, and still on the pulse."""
-    loop = make(faults=[f"{spec}@2.5"])
-    loop.arm()
-    samples = render(loop, pulse_N, LEAD_IN_S + 1.7)
+    loop = arm(faults=[f"{spec}@2.5"])
+    samples = publish(loop, pulse_N, LEAD_IN_S + 1.7)
     assert faults_of(samples) == ()
     assert rms_N(samples, pulse_N, LEAD_IN_S) <= 0.03
     assert max(abs(sample.truth.left_mm - sample.truth.right_mm) for sample in samples) < CONFIG.limits.skew_fault_mm
 
 
-def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(make: Maker) -> None:
+def test_a_worn_gearbox_that_lets_go_is_noticed_while_the_drives_are_off(arm) -> None:
     """Killed with the gap closed: the device opens by itself, and nothing shuts on the way."""
-    loop = make(faults=["worn_gearbox@2.5"])
-    loop.arm()
-    render(loop, lambda time_s: 1.6, 1.5)
+    loop = arm(faults=["worn_gearbox@2.5"])
+    publish(loop, lambda time_s: 1.6, 1.5)
     closed_mm = loop.device.truth.gap_mm
     for _ in range(2_500):
         loop.skip()
@@ -384,12 +325,12 @@ class Unheard:
 
 def test_a_lost_link_is_a_fault_that_does_not_go_by_itself(armed: ClosedLoop) -> None:
     """The device falls silent for the host: its bytes are lost for a quarter of a second."""
-    render(armed, lambda time_s: 1.4, 0.8)
+    publish(armed, lambda time_s: 1.4, 0.8)
     device = armed.device
     armed.device = Unheard(device)  # type: ignore[assignment]
-    silent = render(armed, lambda time_s: 1.4, 0.25)
+    silent = publish(armed, lambda time_s: 1.4, 0.25)
     armed.device = device
-    back = render(armed, lambda time_s: 1.4, 2.6)
+    back = publish(armed, lambda time_s: 1.4, 2.6)
     assert faults_of(silent)[0] is Fault.MEASUREMENT_STALE
     assert Fault.LINK_LOST in faults_of(silent) or silent[-1].state.safety.operating_state is OperatingState.FAULT
     assert back[-1].state.safety.operating_state is OperatingState.FAULT
@@ -402,20 +343,16 @@ def test_a_lost_link_is_a_fault_that_does_not_go_by_itself(armed: ClosedLoop) ->
 def trace(loop: ClosedLoop, seconds: float) -> list[tuple[object, ...]]:
     return [
         (sample.state, sample.output, sample.plan, sample.truth)
-        for sample in render(loop, pulse_N, seconds, rate_hz=100)
+        for sample in publish(loop, pulse_N, seconds, rate_hz=100)
     ]
 
 
-def test_a_run_repeats_itself_and_another_seed_does_not(make: Maker) -> None:
-    runs = []
-    for seed in (1, 1, 2):
-        loop = make(seed=seed)
-        loop.arm()
-        runs.append(trace(loop, 0.8))
+def test_a_run_repeats_itself_and_another_seed_does_not(arm) -> None:
+    runs = [trace(arm(seed=seed), 0.8) for seed in (1, 1, 2)]
     assert runs[0] == runs[1]
     assert runs[0] != runs[2]
 
 
-def test_a_loop_without_a_planner_wants_plans(make: Maker) -> None:
+def test_a_loop_without_a_planner_wants_plans(make) -> None:
     with pytest.raises(ValueError, match="allowed is a plan"):
         make(planned=False).tick()

@@ -7,18 +7,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.closed_loop import Sample
 from tormagd.config import Config
 from tormagd.control.core import Core, build_core
-from tormagd.control.governor import Governor, TimedSetpoint
-from tormagd.control.plan import Plan
+from tormagd.control.governor import Governor
 from tormagd.control.portrait import Portrait
 from tormagd.control.sensor_zero import UNKNOWN_SD_N
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import ReversingHand, SteadyHand
-from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.hand import ReversingHand
 
 
 class LyingSensor:
@@ -53,23 +51,7 @@ def frozen() -> Callable[[float], float]:
 
 CONFIG = Config(scene="coronary")
 ASKED_N, F_MIN_N, MOST_N = 1.5, 0.65, 2.0
-VALID_S = 0.2
 CEILING_N = 1.25 * MOST_N + 0.1
-
-
-@pytest.fixture(scope="module")
-def core() -> Core:
-    """A core keeps nothing of what it is stepped through."""
-    return build_core(CONFIG)
-
-
-def joined(core: Core, sample: str = "sample_1", hand: object = None) -> ClosedLoop:
-    device = VirtualDevice(load_plant(sample), hand or SteadyHand(), seed=1)  # type: ignore[arg-type]
-    return ClosedLoop(CONFIG, core.stepper, core.planner, device)
-
-
-def render(loop: ClosedLoop, asked_N: float, seconds: float) -> list[Sample]:
-    return list(loop.run(seconds, lambda now_s: TimedSetpoint(asked_N, now_s, VALID_S)))
 
 
 def worst_N(samples: list[Sample]) -> float:
@@ -99,9 +81,8 @@ LIES: dict[str, Callable[[], Callable[[float], float]]] = {
 
 
 @pytest.mark.parametrize("lie", LIES)
-def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(core: Core, lie: str) -> None:
-    loop = joined(core)
-    loop.arm()
+def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(arm, render, lie: str) -> None:
+    loop = arm()
     render(loop, ASKED_N, 2.0)
     LyingSensor(loop.device, LIES[lie](), loop.now_s)
     samples = render(loop, ASKED_N, 3.0)
@@ -110,8 +91,8 @@ def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(core: Core, lie
 
 
 @pytest.mark.parametrize("lie", ["-0.5 N", "+1 N", "-1 N", "frozen", "tenfold", "inverted"])
-def test_a_sensor_that_lies_from_the_beginning_keeps_the_device_disabled(core: Core, lie: str) -> None:
-    loop = joined(core)
+def test_a_sensor_that_lies_from_the_beginning_keeps_the_device_disabled(make, lie: str) -> None:
+    loop = make()
     LyingSensor(loop.device, LIES[lie]())
     loop.arm()
     loop.command("disable")
@@ -123,8 +104,8 @@ def test_a_sensor_that_lies_from_the_beginning_keeps_the_device_disabled(core: C
 
 
 @pytest.mark.parametrize("lie", ["-0.3 N", "+0.5 N"])
-def test_an_offset_from_the_beginning_is_told_from_a_scale(core: Core, lie: str) -> None:
-    loop = joined(core)
+def test_an_offset_from_the_beginning_is_told_from_a_scale(make, render, lie: str) -> None:
+    loop = make()
     LyingSensor(loop.device, LIES[lie]())
     loop.arm()
     samples = render(loop, ASKED_N, 3.0)
@@ -132,18 +113,18 @@ def test_an_offset_from_the_beginning_is_told_from_a_scale(core: Core, lie: str)
     assert worst_N(samples) < ASKED_N + 0.3
 
 
-def test_a_sensor_that_reads_a_little_too_much_from_the_beginning_presses_less(core: Core) -> None:
+def test_a_sensor_that_reads_a_little_too_much_from_the_beginning_presses_less(make, render) -> None:
     """As long as the handle goes one way it cannot be told from a stronger device with another field law; what it does
     is on the safe side."""
-    loop = joined(core)
+    loop = make()
     LyingSensor(loop.device, LIES["+0.3 N"]())
     loop.arm()
     assert worst_N(render(loop, ASKED_N, 3.0)) < ASKED_N
 
 
 @pytest.mark.parametrize("lie", ["+0.3 N", "-0.3 N"])
-def test_a_reversal_names_a_zero_that_was_wrong_from_the_beginning(core: Core, lie: str) -> None:
-    loop = joined(core, hand=ReversingHand(4.0))
+def test_a_reversal_names_a_zero_that_was_wrong_from_the_beginning(make, render, lie: str) -> None:
+    loop = make(hand=ReversingHand(4.0))
     LyingSensor(loop.device, LIES[lie]())
     loop.arm()
     samples = render(loop, ASKED_N, 6.0)
@@ -153,10 +134,9 @@ def test_a_reversal_names_a_zero_that_was_wrong_from_the_beginning(core: Core, l
 
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_3"])
-def test_a_zero_that_drifts_is_taken_off_where_the_handle_turns(core: Core, sample: str) -> None:
+def test_a_zero_that_drifts_is_taken_off_where_the_handle_turns(arm, render, sample: str) -> None:
     """By 0.2 N a minute, forty times what the plant card has, and turning every second."""
-    loop = joined(core, sample, ReversingHand(2.0))
-    loop.arm()
+    loop = arm(sample, ReversingHand(2.0))
     render(loop, ASKED_N, 2.0)
     start_s = loop.device.truth.time_s
     LyingSensor(loop.device, lambda reading_N: reading_N + 0.2 / 60.0 * (loop.device.truth.time_s - start_s))
@@ -173,9 +153,8 @@ def slides(sample: Sample) -> bool:
     return estimate is not None and estimate.handle.rate_mm_s > 20.0 and estimate.handle.displacement_mm >= 2.0
 
 
-def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_off(core: Core) -> None:
-    loop = joined(core)
-    loop.arm()
+def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_off(arm, render) -> None:
+    loop = arm()
     render(loop, ASKED_N, 2.0)
     assert loop.plan_state is not None
     before = loop.plan_state.shown.device
@@ -189,9 +168,8 @@ def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_of
     assert abs(samples[-1].truth.force_N) == pytest.approx(ASKED_N, abs=0.05)
 
 
-def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(core: Core) -> None:
-    loop = joined(core)
-    loop.arm()
+def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(arm, render) -> None:
+    loop = arm()
     render(loop, ASKED_N, 2.0)
     LyingSensor(loop.device, LIES["-1 N"](), loop.now_s)
     samples = render(loop, ASKED_N, 3.0)
@@ -201,9 +179,8 @@ def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(core: C
 
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
-def test_an_honest_sensor_is_believed(core: Core, sample: str) -> None:
-    loop = joined(core, sample, ReversingHand(3.0))
-    loop.arm()
+def test_an_honest_sensor_is_believed(arm, render, sample: str) -> None:
+    loop = arm(sample, ReversingHand(3.0))
     for asked_N in (0.7, 2.0, 0.7, 1.4):
         samples = render(loop, asked_N, 3.0)
         assert not any(Limit.SENSOR in sample.plan.limits for sample in samples)
@@ -212,13 +189,12 @@ def test_an_honest_sensor_is_believed(core: Core, sample: str) -> None:
 # -- layer a: the governed force -----------------------------------------------------------------------------------
 
 
-def test_the_governed_force_holds_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_governed_force_holds_alone(arm, render, monkeypatch: pytest.MonkeyPatch) -> None:
     """With no ceiling over gap and measured force, 1000 N asked give the scene's greatest."""
     core = build_core(CONFIG)
     monkeypatch.setattr(core.planner, "_ceiling_N", 100.0 * MOST_N)
     monkeypatch.setattr(core.stepper, "_ceiling_N", math.inf)
-    loop = joined(core)
-    loop.arm()
+    loop = arm(core=core)
     samples = render(loop, 1_000.0, 2.5)
     assert worst_N(samples) < MOST_N + 0.15
     assert Limit.RANGE in samples[-1].plan.limits
@@ -236,12 +212,11 @@ def ask_for_six_newtons(core: Core, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
-def test_the_gap_holds_alone(monkeypatch: pytest.MonkeyPatch, sample: str) -> None:
+def test_the_gap_holds_alone(arm, render, monkeypatch: pytest.MonkeyPatch, sample: str) -> None:
     core = build_core(CONFIG)
     ask_for_six_newtons(core, monkeypatch)
     monkeypatch.setattr(core.stepper, "_ceiling_N", math.inf)
-    loop = joined(core, sample)
-    loop.arm()
+    loop = arm(sample, core=core)
     samples = render(loop, 1.0, 4.0)
     assert samples[-1].plan.governed_N == 6.0
     assert MOST_N < worst_N(samples) < CEILING_N
@@ -253,12 +228,11 @@ def test_the_gap_holds_alone(monkeypatch: pytest.MonkeyPatch, sample: str) -> No
 
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
-def test_the_measured_force_holds_alone(sample: str) -> None:
+def test_the_measured_force_holds_alone(arm, hold_gap, sample: str) -> None:
     """A plan that closes the gap without any word of forces: the force over the ceiling opens it, at a bounded rate."""
     core = build_core(CONFIG)
-    loop = joined(core, sample)
-    loop.arm()
-    shut = [loop.tick(plan=gap_plan(47.0, loop.now_s)) for _ in range(4_000)]
+    loop = arm(sample, core=core)
+    shut = hold_gap(loop, 47.0, 4.0)
     assert shut[-1].state.safety.faults == (Fault.OVER_FORCE,)
     assert any(Limit.OVER_FORCE in sample.output.limits for sample in shut)
     forces_N = np.array([sample.truth.force_N for sample in shut])
@@ -271,16 +245,10 @@ def test_the_measured_force_holds_alone(sample: str) -> None:
     assert shut[-1].truth.gap_mm > 90.0
 
 
-def gap_plan(gap_mm: float, now_s: float) -> Plan:
-    """A plan for a gap instead of a force."""
-    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
-
-
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
-def test_a_start_from_rest_is_not_over_force(core: Core, sample: str) -> None:
+def test_a_start_from_rest_is_not_over_force(arm, render, sample: str) -> None:
     """Static friction is up to 1.25 times the kinetic one."""
-    loop = joined(core, sample, ReversingHand(2.0))
-    loop.arm()
+    loop = arm(sample, ReversingHand(2.0))
     samples = render(loop, MOST_N, 6.0)
     assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
     assert worst_N(samples) < CEILING_N

@@ -4,39 +4,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
+from tormagd.control.core import build_core
 from tormagd.control.device_fit import UNSEEN
 from tormagd.control.governor import TimedSetpoint
 from tormagd.scenes.scene import Terms, load_scene
-from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import load_plant
 
-CONFIG = Config(scene="coronary")
 VALID_S = 0.2
 SAMPLES = ("sample_1", "sample_2", "sample_3")
 
 
-@pytest.fixture(scope="module")
-def core() -> Core:
-    return build_core(CONFIG)
-
-
-def armed(core: Core, sample: str) -> ClosedLoop:
-    loop = ClosedLoop(CONFIG, core.stepper, core.planner, VirtualDevice(load_plant(sample), SteadyHand(), seed=1))
-    loop.arm()
-    return loop
-
-
-def render(loop: ClosedLoop, asked_N: float, seconds: float) -> list[Sample]:
-    return list(loop.run(seconds, lambda now_s: TimedSetpoint(asked_N, now_s, VALID_S)))
-
-
 @pytest.mark.parametrize("sample", SAMPLES)
-def test_a_step_of_a_new_device_settles_soon_after_its_carriages_have(core: Core, sample: str) -> None:
-    loop = armed(core, sample)
+def test_a_step_of_a_new_device_settles_soon_after_its_carriages_have(arm, render, sample: str) -> None:
+    loop = arm(sample)
     render(loop, 0.7, 2.0)
     for overshoots_N, settles_N in ((0.1, 0.02), (0.08, 0.02)):
         forces_N = [abs(each.truth.force_N) for each in render(loop, 2.0, 3.0)]
@@ -46,21 +26,21 @@ def test_a_step_of_a_new_device_settles_soon_after_its_carriages_have(core: Core
 
 
 @pytest.mark.parametrize("sample", SAMPLES)
-def test_noise_alone_hardly_moves_the_gap(core: Core, sample: str) -> None:
-    loop = armed(core, sample)
+def test_noise_alone_hardly_moves_the_gap(arm, render, sample: str) -> None:
+    loop = arm(sample)
     render(loop, 1.2, 5.0)
     gaps_mm = np.array([each.plan.gap_mm for each in render(loop, 1.2, 3.0)])
     assert np.std(gaps_mm - np.linspace(gaps_mm[0], gaps_mm[-1], len(gaps_mm))) < 0.1
 
 
-def test_a_device_that_was_known_before_is_right_at_once(core: Core) -> None:
+def test_a_device_that_was_known_before_is_right_at_once(arm, render) -> None:
     """What a profile brings: sample 2 is a quarter weaker than the model."""
-    loop = armed(core, "sample_2")
+    loop = arm("sample_2")
     render(loop, 0.7, 1.0)
     render(loop, 2.0, 2.0)
     assert loop.plan_state is not None
     shown = loop.plan_state.shown
-    again = armed(core, "sample_2")
+    again = arm("sample_2")
     assert again.plan_state is not None
     again.plan_state = again.plan_state.replaced(shown=shown.replaced(read=-1, read_s=-1.0))
     forces_N = [abs(each.truth.force_N) for each in render(again, 2.0, 2.5)]
@@ -68,12 +48,11 @@ def test_a_device_that_was_known_before_is_right_at_once(core: Core) -> None:
     assert np.mean(forces_N[1_200:1_300]) == pytest.approx(2.0, abs=0.04)
 
 
-def test_the_model_alone_renders_the_forces_of_the_device_that_it_was_trained_on() -> None:
+def test_the_model_alone_renders_the_forces_of_the_device_that_it_was_trained_on(arm, render) -> None:
     """It knows what the elastomer has relaxed and how its field lags; nothing is learned."""
     config, scene = Config(scene="pulse"), load_scene("pulse")
     alone = build_core(config, msgspec.structs.replace(scene, terms=Terms(learning=False)))
-    loop = ClosedLoop(config, alone.stepper, alone.planner, VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1))
-    loop.arm()
+    loop = arm(core=alone, config=config)
     begins_s = loop.now_s
     render(loop, 1.55, 2.0)
     errors_N = [

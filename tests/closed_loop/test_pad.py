@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, Rates
 from tormagd.control.core import Core, build_core
 from tormagd.control.governor import TimedSetpoint
@@ -13,9 +12,7 @@ from tormagd.lab.tactile.held import Case, hold
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene, scene_path
 from tormagd.scenes.signal import asked
-from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import PressingHand, RecordedHand
-from tormagd.simulation.parameters import load_plant
 
 SCENE = load_scene("radial_pulse")
 CONFIG = Config(scene="radial_pulse", rates=Rates(control_hz=500, inference_hz=83))
@@ -28,11 +25,10 @@ def core() -> Core:
 
 
 @pytest.mark.parametrize("plant", ["pad_1", "pad_2"])
-def test_a_pulse_is_felt_on_the_pad(core: Core, plant: str) -> None:
+def test_a_pulse_is_felt_on_the_pad(arm, core: Core, plant: str) -> None:
     """On the pad of the model, and on a weaker one that relaxes more."""
     time_s, force_N = asked(SCENE.signal, scene_path("radial_pulse").parent, (3.2, 3.9), PULSE_S, 100)
-    loop = ClosedLoop(CONFIG, core.stepper, core.planner, VirtualDevice(load_plant(plant), PressingHand(2.0), seed=1))
-    loop.arm()
+    loop = arm(plant, PressingHand(2.0), core=core, config=CONFIG)
 
     def publish(now_s: float) -> TimedSetpoint:
         stamp_s = math.floor(100.0 * now_s) / 100.0
@@ -63,11 +59,10 @@ def test_a_hold_of_plans_alone_is_that_of_the_whole_device() -> None:
     assert whole["last_force_error"] == pytest.approx(coarse["last_force_error"], abs=1e-3)
 
 
-def test_a_finger_that_presses_too_hard_opens_the_gap_and_is_no_fault(core: Core) -> None:
+def test_a_finger_that_presses_too_hard_opens_the_gap_and_is_no_fault(arm, core: Core) -> None:
     """Its force is the finger's own: more than the scene's greatest by far, at any gap."""
     hand = RecordedHand((0.0, 3.0, 4.0), (0.0, 0.0, 4.0))
-    loop = ClosedLoop(CONFIG, core.stepper, core.planner, VirtualDevice(load_plant("pad_1"), hand, seed=1))
-    loop.arm()
+    loop = arm("pad_1", hand, core=core, config=CONFIG)
     last = list(loop.run(4.5, lambda now_s: TimedSetpoint(3.6, now_s, 0.1)))[-1]
     assert last.truth.force_N > 1.5 * SCENE.force.most_N
     assert Limit.OVER_FORCE in last.output.limits

@@ -1,16 +1,15 @@
 """A great step of the force, held: what the elastomer relaxes before the trim gives it back. All data are synthetic."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config, Trim
-from tormagd.control.core import build_core
-from tormagd.control.plan import Plan
-from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import load_plant
+from tormagd.control.core import Core, build_core
 
+Maker = Callable[..., ClosedLoop]
 LOW_N, HIGH_N = 0.7, 2.0
 REST_S, HOLD_S = 12.0, 12.0
 "The trim knows the device before the step; the elastomer's shortest time constant is 8 s."
@@ -19,12 +18,10 @@ TRIMMED_S = 3.0
 PERIOD_S = 0.01
 
 
-def errors_after_step(plant: str, trim_s: float) -> tuple[np.ndarray, np.ndarray]:
+def errors_after_step(arm: Maker, plant: str, trim_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Times after the step and the true force less the asked one, with a trim of that time constant."""
     config = Config(scene="coronary", trim=Trim(time_s=trim_s))
-    core = build_core(config)
-    loop = ClosedLoop(config, core.stepper, core.planner, VirtualDevice(load_plant(plant), SteadyHand(), seed=1))
-    loop.arm()
+    loop = arm(plant, core=build_core(config), config=config)
     times_s = loop.now_s + PERIOD_S * np.arange(round((REST_S + HOLD_S) / PERIOD_S))
     step_s = loop.now_s + REST_S
     forces_N = np.where(times_s < step_s, LOW_N, HIGH_N)
@@ -37,35 +34,26 @@ def errors_after_step(plant: str, trim_s: float) -> tuple[np.ndarray, np.ndarray
     return time_s, error_N
 
 
-def drift_N(plant: str, trim_s: float) -> float:
+def drift_N(arm: Maker, plant: str, trim_s: float) -> float:
     """The greatest mean error of any second from TRIMMED_S on."""
-    time_s, error_N = errors_after_step(plant, trim_s)
+    time_s, error_N = errors_after_step(arm, plant, trim_s)
     held_N = error_N[time_s > TRIMMED_S]
     return float(max(abs(second.mean()) for second in np.array_split(held_N, round(HOLD_S - TRIMMED_S))))
 
 
 @pytest.fixture(scope="module")
-def allowed_N() -> float:
+def allowed_N(core: Core) -> float:
     """A fifth of what the scene tolerates."""
-    return 0.2 * build_core(Config(scene="coronary")).scene.force.tolerance_rms_N
+    return 0.2 * core.scene.force.tolerance_rms_N
 
 
 @pytest.mark.parametrize("plant", ["sample_1", "sample_2"])
-def test_the_trim_takes_up_what_the_elastomer_relaxes(plant: str, allowed_N: float) -> None:
+def test_the_trim_takes_up_what_the_elastomer_relaxes(arm, plant: str, allowed_N: float) -> None:
     """So nothing needs to be fed forward."""
-    assert drift_N(plant, Trim().time_s) < allowed_N
+    assert drift_N(arm, plant, Trim().time_s) < allowed_N
 
 
-def test_without_a_trim_the_relaxation_is_seen(allowed_N: float) -> None:
+def test_without_a_trim_the_relaxation_is_seen(arm, hold_gap, allowed_N: float) -> None:
     """At a gap that is held, the force falls by more than the trim leaves of it."""
-    config = Config(scene="coronary")
-    core = build_core(config)
-    loop = ClosedLoop(config, core.stepper, None, VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1))
-    loop.arm(held(95.0, 0.0))
-    forces_N = [loop.tick(plan=held(65.0, loop.now_s)).truth.force_N for _ in range(round(HOLD_S * 1e3))]
+    forces_N = [sample.truth.force_N for sample in hold_gap(arm(planned=False), 65.0, HOLD_S)]
     assert forces_N[round(TRIMMED_S * 1e3)] - forces_N[-1] > 2.0 * allowed_N
-
-
-def held(gap_mm: float, now_s: float) -> Plan:
-    """A plan of nothing but a gap."""
-    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())

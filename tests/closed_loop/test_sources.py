@@ -10,16 +10,12 @@ import msgpack
 import pytest
 
 from tormagd.closed_loop import ClosedLoop, Sample
-from tormagd.config import Config
-from tormagd.control.core import Core, build_core
+from tormagd.control.core import Core
 from tormagd.control.plan import PlanState
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.source_clock import SETTLED_S
 from tormagd.daemon.way import Way
 from tormagd.safety.codes import Limit
-from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import load_plant
 from tormagd_client.messages import SourceReport
 
 START_NS = 1_800_000_000_000_000_000
@@ -88,18 +84,6 @@ class Run(NamedTuple):
     def fastest_loss_N_s(self, over_s: float = 0.05) -> float:
         forces, over = [each.truth.force_N for each in self.samples], round(over_s * 1e3)
         return max((a - b) / over_s for a, b in zip(forces, forces[over:], strict=False))
-
-
-@pytest.fixture(scope="module")
-def core() -> Core:
-    return build_core(Config())
-
-
-@pytest.fixture
-def armed(core: Core) -> ClosedLoop:
-    loop = ClosedLoop(Config(), core.stepper, core.planner, VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1))
-    loop.arm()
-    return loop
 
 
 def run(

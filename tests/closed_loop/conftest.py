@@ -1,0 +1,89 @@
+"""What the closed loops share: one core, devices behind it, and what is asked of them. All of it is synthetic."""
+
+from collections.abc import Callable, Iterable
+
+import pytest
+
+from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.config import Config
+from tormagd.control.core import Core, build_core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.control.plan import Plan
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.faults import parse_fault
+from tormagd.simulation.hand import Hand, SteadyHand
+from tormagd.simulation.parameters import PlantParameters, load_plant
+
+OPEN_MM = 95.0
+VALID_S = 0.2
+Maker = Callable[..., ClosedLoop]
+
+
+@pytest.fixture(scope="session")
+def core() -> Core:
+    """Of the shipped coronary scene. It keeps nothing of what it is stepped through."""
+    return build_core(Config())
+
+
+@pytest.fixture(scope="session")
+def make(core: Core) -> Maker:
+    """A loop on a simulated device that has just been switched on."""
+
+    def build(
+        plant: str | PlantParameters = "sample_1",
+        hand: Hand | None = None,
+        faults: Iterable[str] = (),
+        seed: int = 1,
+        *,
+        planned: bool = True,
+        config: Config | None = None,
+        core: Core = core,
+    ) -> ClosedLoop:
+        parameters = load_plant(plant) if isinstance(plant, str) else plant
+        device = VirtualDevice(parameters, hand or SteadyHand(), [parse_fault(fault) for fault in faults], seed)
+        return ClosedLoop(config or Config(), core.stepper, core.planner if planned else None, device)
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def arm(make: Maker) -> Maker:
+    """A loop that is armed, at the open gap."""
+
+    def armed(*plant_and_hand: object, planned: bool = True, **options: object) -> ClosedLoop:
+        loop = make(*plant_and_hand, planned=planned, **options)
+        loop.arm(None if planned else gap_plan(OPEN_MM))
+        return loop
+
+    return armed
+
+
+@pytest.fixture
+def armed(arm: Maker) -> ClosedLoop:
+    """A loop that is armed: homing is the same every time."""
+    return arm()
+
+
+def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan:
+    """A plan for a gap instead of a force."""
+    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())
+
+
+@pytest.fixture(scope="session")
+def hold_gap() -> Callable[[ClosedLoop, float, float], list[Sample]]:
+    """The ticks while a gap is asked for, for so many seconds."""
+
+    def hold(loop: ClosedLoop, gap_mm: float, seconds: float) -> list[Sample]:
+        return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(round(1e3 * seconds))]
+
+    return hold
+
+
+@pytest.fixture(scope="session")
+def render() -> Callable[[ClosedLoop, float, float], list[Sample]]:
+    """The ticks while a publisher asks for a force, for so many seconds."""
+
+    def rendered(loop: ClosedLoop, asked_N: float, seconds: float) -> list[Sample]:
+        return list(loop.run(seconds, lambda now_s: TimedSetpoint(asked_N, now_s, VALID_S)))
+
+    return rendered
