@@ -303,9 +303,13 @@ def test_commands_are_answered_in_bounded_portions_and_in_their_order(
         client.send(command("status", number))
     answered: list[object] = []
 
+    def answer(request: Request) -> dict[str, Any]:
+        answered.append(request.id)
+        return {}
+
     def serve() -> None:
         before = len(answered)
-        rig.endpoint.serve(0.0, lambda request: answered.append(request.id) or {}, until_ns)
+        rig.endpoint.serve(0.0, answer, until_ns)
         assert len(answered) - before <= most
 
     rig.until(lambda: len(answered) == count, serve)

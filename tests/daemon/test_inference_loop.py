@@ -1,6 +1,7 @@
 """When plans are made: at once where the slack allows, right after the tick where not, and at the latest when due."""
 
 import random
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,20 +22,23 @@ DUE_NS = 4 * TICK_NS
 class Rig:
     """An inference loop whose plans take as long as the test says, on a clock that moves with them."""
 
-    def __init__(self) -> None:
+    def __init__(self, planner: Any = None) -> None:
         self.now_ns = 1_000 * TICK_NS
         self.plan_ns = 60 * US
         self.has_arrived = False
         self.planned_ns: list[int] = []
         self.foreseen_ns: list[int] = []
-        planner: Any = SimpleNamespace(start=lambda now_s: None, plan=self.plan, foresee=self.foresee)
-        endpoint: Any = SimpleNamespace(
-            drain_setpoints=self.drain, is_flooded=False, inbox=SimpleNamespace(newest=None)
-        )
+        self.failures = 0
+        planner = planner or SimpleNamespace(start=lambda now_s: None, plan=self.plan, foresee=self.foresee)
+        self.inbox = SetpointInbox()
+        endpoint: Any = SimpleNamespace(drain_setpoints=self.drain, is_flooded=False, inbox=self.inbox)
         self.journal = Journal()
         self.loop = InferenceLoop(
-            planner, endpoint, DUE_NS, 0.0, lambda: self.now_ns, journal=self.journal, on_failure=pytest.fail
+            planner, endpoint, DUE_NS, 0.0, lambda: self.now_ns, journal=self.journal, on_failure=self.fail
         )
+
+    def fail(self) -> None:
+        self.failures += 1
 
     def plan(self, *_arguments: Any) -> None:
         self.planned_ns.append(self.now_ns)
@@ -60,8 +64,10 @@ class Rig:
 
 
 @pytest.fixture
-def rig() -> Rig:
-    return Rig()
+def rig() -> Iterator[Rig]:
+    made = Rig()
+    yield made
+    assert made.failures == 0
 
 
 def test_a_setpoint_is_planned_at_once_where_the_slack_allows(rig: Rig) -> None:
@@ -158,10 +164,8 @@ def test_what_the_next_plans_need_is_prepared_after_a_tick_and_not_while_a_setpo
 
 
 @pytest.mark.parametrize("error", [DomainError("displacement_mm", 1e10, "less"), ZeroDivisionError(), RuntimeError()])
-def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on(rig: Rig, error: Exception) -> None:
+def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on(error: Exception) -> None:
     """The one that makes planning fail would make it fail again and again."""
-    inbox = SetpointInbox()
-    failures: list[None] = []
 
     def plan(state: PlanState, now_s: float, setpoint: TimedSetpoint | None, _estimate: object) -> PlanState:
         if setpoint is not None:
@@ -178,25 +182,16 @@ def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on
         foresee=lambda state: state,
         afresh=afresh,
     )
-    endpoint: Any = SimpleNamespace(drain_setpoints=rig.drain, is_flooded=False, inbox=inbox)
-    journal = Journal()
-    loop = InferenceLoop(
-        planner,
-        endpoint,
-        DUE_NS,
-        0.0,
-        lambda: rig.now_ns,
-        journal=journal,
-        on_failure=lambda: failures.append(None),
-    )
+    rig = Rig(planner)
+    inbox, loop = rig.inbox, rig.loop
     inbox.newest = TimedSetpoint(1.0, 0.0, 0.1)
     rig.has_arrived = True
     loop.after_tick(None)
-    assert (len(failures), inbox.newest, inbox.refused, loop.state.plan.number) == (1, None, 1, 1)
+    assert (rig.failures, inbox.newest, inbox.refused, loop.state.plan.number) == (1, None, 1, 1)
     assert "no gap could be planned" in str(inbox.last_refusal)
     rig.has_arrived = True
     loop.after_tick(None)
-    assert (len(failures), inbox.refused, loop.state.plan.number) == (1, 1, 2)
+    assert (rig.failures, inbox.refused, loop.state.plan.number) == (1, 1, 2)
     # and it is written down in that order: what a replay has to do
     first_s = rig.now_ns * 1e-9
-    assert journal.take() == [("afresh", first_s), ("plan", first_s, None)]
+    assert rig.journal.take() == [("afresh", first_s), ("plan", first_s, None)]

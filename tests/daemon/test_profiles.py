@@ -26,7 +26,7 @@ class Rig:
     def __init__(self, runner: asyncio.Runner, folder: Path | None) -> None:
         self.shown = NOTHING_SHOWN
         self._runner = runner
-        self.profiles = runner.run(self._begun(folder and ProfileFolder(folder, "MRE-50-40", MODEL)))
+        self.profiles = runner.run(self._begun(None if folder is None else ProfileFolder(folder, "MRE-50-40", MODEL)))
 
     async def _begun(self, folder: ProfileFolder | None) -> Profiles:
         return Profiles(folder, lambda: self.shown, self.teach)

@@ -1,8 +1,8 @@
 """The simulator as a process, over a real pseudo-terminal."""
 
+import contextlib
 import csv
 import itertools
-import os
 import select
 import signal
 import subprocess
@@ -12,10 +12,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import serial
 
-from firmware_protocol.codec import FUNCTION, PROTOCOL_VERSION, SCHEMA_HASH, Hello, Identity, Status, encode
-from firmware_protocol.framing import FrameDecoder, encode_frame
+from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, Hello, Identity, Message, Status
+from tormagd.config import Device
+from tormagd.hardware.serial_backend import SerialOptions, open_serial
 from tormagd.simulation.__main__ import main
 
 LIMIT_S = 20.0
@@ -34,30 +34,23 @@ def simulator(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str, Path
         process.communicate()
 
 
-def say_hello_until_identity(path: str, nonce: int) -> set[int]:
-    """Open the line, repeat Hello until Identity comes, close it; the functions seen."""
-    decoder = FrameDecoder()
-    seen: set[int] = set()
+def meet(path: str, nonce: int) -> None:
+    """Opens the line as the daemon does, repeats Hello until both Identity and Status have come, and closes it."""
+    seen: set[type[Message]] = set()
     deadline_s = time.monotonic() + LIMIT_S
-    with serial.Serial(path, 1_000_000, exclusive=True, timeout=0) as port:
-        port.reset_input_buffer()
-        sequence = 0
-        while not {FUNCTION[Identity], FUNCTION[Status]} <= seen:
+    with contextlib.closing(open_serial(Device(port=path), SerialOptions())) as port:
+        while not {Identity, Status} <= seen:
             assert time.monotonic() < deadline_s, f"only {seen} in {LIMIT_S} s"
-            hello = encode(Hello(SCHEMA_HASH, PROTOCOL_VERSION, nonce))
-            port.write(encode_frame(FUNCTION[Hello], sequence % 256, hello))
-            sequence += 1
-            readable, _, _ = select.select([port.fd], [], [], 0.1)
-            if readable:
-                seen.update(frame.function for frame in decoder.feed(os.read(port.fd, 4096)))
-    return seen
+            port.send(Hello(SCHEMA_HASH, PROTOCOL_VERSION, nonce))
+            select.select([port.fileno()], [], [], 0.1)
+            seen |= {type(message) for message in port.receive()}
 
 
 def test_hello_is_answered_across_two_hosts_and_the_truth_is_kept(simulator) -> None:
     process, path, truth = simulator
     assert Path(path).is_char_device()
     for nonce in (1, 2):
-        say_hello_until_identity(path, nonce)
+        meet(path, nonce)
     assert process.poll() is None
     process.send_signal(signal.SIGTERM)
     output, errors = process.communicate(timeout=LIMIT_S)

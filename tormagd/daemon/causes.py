@@ -98,7 +98,7 @@ class Causes:
     def newest_stall(self) -> StallReport | None:
         """The newest stall, None while there was none."""
         stall = self._stall
-        return stall and StallReport(round(stall.took_s * 1e3, 1), stall.culprit)
+        return None if stall is None else StallReport(round(stall.took_s * 1e3, 1), stall.culprit)
 
 
 def explanations(

@@ -229,7 +229,7 @@ DRIVER = Driver(CanOptions, open_can, check_can)
 
 def _of_the_interface(options: CanOptions) -> dict[str, Any]:
     """What makes an interface fit the loop. Interfaces not named here must not block in `recv(0)`."""
-    fitting = {
+    fitting: dict[str, dict[str, Any]] = {
         # other nodes' frames need not wake us
         "socketcan": {"can_filters": [{"can_id": options.node, "can_mask": 0xF, "extended": False}]},
         # by default it sleeps for 2 s when it opens, and for 1 ms whenever it finds nothing to read
