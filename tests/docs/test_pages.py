@@ -27,7 +27,9 @@ PARSERS = {
     "python -m firmware_protocol.conformance": conformance.parser,
 }
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
-COMMAND = re.compile(r"(?:sudo (?:-u \w+ )?)?((?:tormagctl|tormagd|tormag-lab|make|python (?:-m |tools/)[\w./]+)(?: [ -~]*)?)")
+COMMAND = re.compile(
+    r"(?:sudo (?:-u \w+ )?)?((?:tormagctl|tormagd|tormag-lab|make|python (?:-m |tools/)[\w./]+)(?: [ -~]*)?)"
+)
 FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^(?: {4}| {8})(\S.*)$", re.MULTILINE)
 IMPORTED = re.compile(r"^from (\w+) import (\w+)$", re.MULTILINE)
