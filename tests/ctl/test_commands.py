@@ -27,7 +27,15 @@ def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, 
 
 SUPPLY = {"code": "SUPPLY", "cause": "supply voltage low", "remedy": "check the power supply"}
 IN_FAULT = {"operating_state": "FAULT", "faults": ["SUPPLY"], "fault_details": [SUPPLY]}
-ANSWERS: dict[str, list[tuple[dict[str, Any], dict[str, Any], int, list[str]]]] = {
+Row = tuple[dict[str, Any], dict[str, Any], int, list[str]]
+NOT_DONE: dict[str, list[Row]] = {
+    f"--json {command}": [
+        ({}, result, 1, ['"code":"not_done"'])
+        for result in ({}, {"operating_state": None}, {"operating_state": "ASLEEP"})
+    ]
+    for command in ("enable", "disable", "pause", "resume", "stop")
+}
+ANSWERS: dict[str, list[Row]] = {
     # what is shown is the daemon's own
     "status": [
         ({"operating_state": "ENABLED"}, {}, 0, ["state     ENABLED, homed"]),
@@ -58,12 +66,7 @@ ANSWERS: dict[str, list[tuple[dict[str, Any], dict[str, Any], int, list[str]]]] 
         (IN_FAULT, {"operating_state": "DISABLED"}, 4, ['"code":"fault"', "came back: SUPPLY: supply voltage low"])
     ],
     "--json home": [(IN_FAULT | {"is_busy": True}, {}, 4, ['"code":"fault"', '"hint":"check the power supply"'])],
-} | {
-    f"--json {command}": [
-        ({}, result, 1, ['"code":"not_done"'])
-        for result in ({}, {"operating_state": None}, {"operating_state": "ASLEEP"})
-    ]
-    for command in ("enable", "disable", "pause", "resume", "stop")
+    **NOT_DONE,
 }
 
 
