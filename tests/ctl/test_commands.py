@@ -28,13 +28,9 @@ def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, 
 SUPPLY = {"code": "SUPPLY", "cause": "supply voltage low", "remedy": "check the power supply"}
 IN_FAULT = {"operating_state": "FAULT", "faults": ["SUPPLY"], "fault_details": [SUPPLY]}
 Row = tuple[dict[str, Any], dict[str, Any], int, list[str]]
-NOT_DONE: dict[str, list[Row]] = {
-    f"--json {command}": [
-        ({}, result, 1, ['"code":"not_done"'])
-        for result in ({}, {"operating_state": None}, {"operating_state": "ASLEEP"})
-    ]
-    for command in ("enable", "disable", "pause", "resume", "stop")
-}
+UNDONE: list[Row] = [
+    ({}, result, 1, ['"code":"not_done"']) for result in ({}, {"operating_state": None}, {"operating_state": "ASLEEP"})
+]
 ANSWERS: dict[str, list[Row]] = {
     # what is shown is the daemon's own
     "status": [
@@ -63,10 +59,11 @@ ANSWERS: dict[str, list[Row]] = {
         ({}, {"operating_state": "PAUSED"}, 0, ["no fault is latched; it is PAUSED"]),
     ],
     "--json clear-fault": [
-        (IN_FAULT, {"operating_state": "DISABLED"}, 4, ['"code":"fault"', "came back: SUPPLY: supply voltage low"])
+        (IN_FAULT, {"operating_state": "DISABLED"}, 4, ['"code":"fault"', "came back: SUPPLY: supply voltage low"]),
+        *UNDONE,
     ],
     "--json home": [(IN_FAULT | {"is_busy": True}, {}, 4, ['"code":"fault"', '"hint":"check the power supply"'])],
-    **NOT_DONE,
+    **{f"--json {command}": UNDONE for command in ("enable", "disable", "pause", "resume", "stop")},
 }
 
 
