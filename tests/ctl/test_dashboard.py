@@ -20,7 +20,6 @@ from hypothesis import given, settings, strategies as st
 from machines.chromium import CHROMIUM, Page, browser
 
 from tormagd.config import in_folder
-from tormagd.ctl.main import main
 from tormagd.dashboard.frame import LATE_US, SHOWN_S, Frame, late_counts
 from tormagd.dashboard.live import WAITING, Live
 from tormagd.dashboard.recorded import Recorded
@@ -257,17 +256,6 @@ def test_the_command_says_where_it_serves_and_ends_in_order(fake_daemon: Any) ->
             process.kill()
     assert process.returncode == 0
     assert json.loads(said)["ok"]
-
-
-@pytest.mark.parametrize(("what", "code"), [([], 3), (["/nowhere.mcap"], 2), (["--port", "70000"], 2)])
-def test_what_cannot_be_shown_is_refused(run_dir: Path, capsys: pytest.CaptureFixture[str], what: list[str], code: int):
-    command = ["--endpoint", f"ipc://{run_dir}/control", "--wait", "0.01", "dashboard", *what]
-    if "--port" in what:
-        with pytest.raises(SystemExit, match="2"):
-            main(command)
-    else:
-        assert main(command) == code
-    assert capsys.readouterr().err
 
 
 def in_chromium(shown: Callable[[], Any], tmp_path: Path, act: Callable[[Page, str], Awaitable[None]]) -> None:

@@ -55,35 +55,79 @@ def test_a_good_machine_has_nothing_to_remedy(good):
     assert judged(REALTIME, Machine(good)).exit_code == 0
 
 
+PINNED = Config(realtime=RealTime(cpus=(1, 9)))
+DYNAMIC = "Linux version 6.1 #1 SMP PREEMPT_DYNAMIC Debian"
+CAN = Config(device=Device(port="can0"))
+BY_TCP = Config(endpoints=Endpoints(control="tcp://127.0.0.1:5555"))
+ELSEWHERE = Config(endpoints=Endpoints(control="ipc:///run/elsewhere/control"))
+NOTHING = {"proc/self/limits": LIMITS.format(memlock="0", rtprio="0")}
+CAPABLE = NOTHING | {"proc/self/status": f"Name:\tx\nCapEff:\t{1 << 23 | 1 << 14:016x}\n"}
+SWAPPING = {"proc/swaps": "Filename Type\n/dev/sda2 partition 1 0 -2\n"}
+CLOCK = "sys/devices/system/clocksource/clocksource0/current_clocksource"
+FORCED = {"proc/version": DYNAMIC, "sys/kernel/debug/sched/preempt": "none voluntary (full)"}
+
+
+def limited(memlock, rtprio):
+    """What the kernel says of this process's limits."""
+    return {"proc/self/limits": LIMITS.format(memlock=memlock, rtprio=rtprio)}
+
+
 CASES = [
-    (checks.preemption, "proc/version", "Linux version 6.1 #1 SMP PREEMPT_DYNAMIC Debian", "warn", "dynamic, default"),
-    (checks.preemption, "proc/version", "Linux version 6.1 #1 SMP", "warn", "none or voluntary"),
-    (checks.preemption, "proc/version", "Linux version 6.1 #1 SMP PREEMPT x", "warn", "full, but not"),
-    (checks.governor, "sys/devices/system/cpu/cpu1/cpufreq/scaling_governor", "powersave", "warn", "powersave"),
+    (checks.preemption, REALTIME, {"proc/version": DYNAMIC}, "warn", "dynamic, default"),
+    (checks.preemption, REALTIME, {"proc/version": "Linux version 6.1 #1 SMP"}, "warn", "none or voluntary"),
+    (checks.preemption, REALTIME, {"proc/version": "Linux version 6.1 #1 SMP PREEMPT x"}, "warn", "full, but not"),
+    (checks.preemption, REALTIME, FORCED, "warn", "full in force"),
+    (checks.preemption, REALTIME, FORCED | {"sys/kernel/realtime": "1"}, "ok", "PREEMPT_RT"),
     (
-        checks.scheduling,
-        "proc/self/limits",
-        LIMITS.format(memlock="1", rtprio="0"),
-        "fail",
-        "priority 0, configured 50",
+        checks.governor,
+        REALTIME,
+        {"sys/devices/system/cpu/cpu1/cpufreq/scaling_governor": "powersave"},
+        "warn",
+        "powersave",
     ),
-    (checks.scheduling, "proc/self/limits", LIMITS.format(memlock="1", rtprio="49"), "fail", "49, configured 50"),
-    (checks.scheduling, "proc/self/limits", LIMITS.format(memlock="1", rtprio="50"), "ok", "50, configured 50"),
-    (checks.memory_lock, "proc/self/limits", LIMITS.format(memlock="8388608", rtprio="90"), "fail", "8 MB"),
-    (checks.cores, "sys/devices/system/cpu/online", "0", "warn", "1 online"),
-    (checks.cores, "sys/devices/system/cpu/online", "0,2-5", "ok", "5 online"),
-    (checks.load, "proc/loadavg", "3.90 1 1 1/2 3", "warn", "3.90"),
-    (checks.timer_slack, "proc/self/timerslack_ns", "1000000", "warn", "1000 us"),
-    (checks.clock_source, "sys/devices/system/clocksource/clocksource0/current_clocksource", "hpet", "warn", "hpet"),
-    (checks.huge_pages, "sys/kernel/mm/transparent_hugepage/enabled", "[always] madvise never", "warn", "always"),
-    (checks.usb_latency, "sys/bus/usb-serial/devices/ttyUSB0/latency_timer", "16", "warn", "16 ms"),
+    (checks.scheduling, REALTIME, limited("1", "0"), "fail", "priority 0, configured 50"),
+    (checks.scheduling, REALTIME, limited("1", "49"), "fail", "49, configured 50"),
+    (checks.scheduling, REALTIME, limited("1", "50"), "ok", "50, configured 50"),
+    (checks.scheduling, REALTIME, CAPABLE, "ok", "99, configured 50"),
+    (checks.scheduling, Config(), NOTHING, "warn", "0, configured 0"),
+    (checks.memory_lock, REALTIME, limited("8388608", "90"), "fail", "8 MB"),
+    (checks.memory_lock, REALTIME, CAPABLE, "ok", "unlimited"),
+    (checks.memory_lock, Config(), limited("8388608", "0"), "warn", "8 MB"),
+    (checks.cores, REALTIME, {"sys/devices/system/cpu/online": "0"}, "warn", "1 online"),
+    (checks.cores, REALTIME, {"sys/devices/system/cpu/online": "0,2-5"}, "ok", "5 online"),
+    (checks.cores, PINNED, {}, "fail", "[9]"),
+    (checks.load, REALTIME, {"proc/loadavg": "3.90 1 1 1/2 3"}, "warn", "3.90"),
+    (checks.timer_slack, REALTIME, {"proc/self/timerslack_ns": "1000000"}, "warn", "1000 us"),
+    (checks.clock_source, REALTIME, {CLOCK: "hpet"}, "warn", "hpet"),
+    (checks.swap, Config(), SWAPPING, "warn", "on (/dev/sda2)"),
+    (checks.swap, REALTIME, SWAPPING, "ok", "on (/dev/sda2), but"),
+    (
+        checks.huge_pages,
+        REALTIME,
+        {"sys/kernel/mm/transparent_hugepage/enabled": "[always] madvise never"},
+        "warn",
+        "always",
+    ),
+    (
+        checks.usb_latency,
+        REALTIME,
+        {"sys/bus/usb-serial/devices/ttyUSB0/latency_timer": "16"},
+        "warn",
+        "16 ms",
+    ),
+    (checks.port, CAN, {}, "warn", "no network interface can0"),
+    (checks.port, CAN, {"sys/class/net/can0/operstate": "up"}, "ok", "network interface can0"),
+    (checks.run_directory, ELSEWHERE, {}, "fail", "/run/elsewhere does not exist"),
+    (checks.run_directory, BY_TCP, {}, "ok", "none needed"),
 ]
 
 
-@pytest.mark.parametrize(("check", "path", "text", "verdict", "found"), CASES)
-def test_each_trouble_is_found_and_has_a_remedy(good, check, path, text, verdict, found):
-    write(good, path, text)
-    finding = check(REALTIME, Machine(good))
+@pytest.mark.parametrize(("check", "config", "files", "verdict", "found"), CASES)
+def test_each_trouble_is_found_and_has_a_remedy(good, check, config, files, verdict, found):
+    """What the configuration does not ask for only warns, and capabilities stand for limits."""
+    for path, text in files.items():
+        write(good, path, text)
+    finding = check(config, Machine(good))
     assert finding.verdict == verdict
     assert found in finding.found
     assert bool(finding.remedy) == (verdict != "ok")
@@ -95,37 +139,6 @@ def test_an_interpreted_core_is_a_warning_that_says_why_what_it_costs_and_what_t
     finding = checks.build(REALTIME, Machine(good))
     assert finding.found == f"interpreted: no C compiler (cc) when it was installed; {COST}"
     assert (finding.verdict, finding.remedy) == (Verdict.WARN, REMEDY)
-
-
-def test_the_preemption_model_in_force_is_read_where_root_may(good):
-    write(good, "proc/version", "Linux version 6.1 #1 SMP PREEMPT_DYNAMIC")
-    write(good, "sys/kernel/debug/sched/preempt", "none voluntary (full)")
-    assert "full in force" in checks.preemption(REALTIME, Machine(good)).found
-    write(good, "sys/kernel/realtime", "1")
-    assert checks.preemption(REALTIME, Machine(good)).verdict is Verdict.OK
-
-
-def test_what_the_configuration_does_not_ask_for_only_warns(good):
-    write(good, "proc/self/limits", LIMITS.format(memlock="8388608", rtprio="0"))
-    assert checks.scheduling(Config(), Machine(good)).verdict is Verdict.WARN
-    assert checks.memory_lock(Config(), Machine(good)).verdict is Verdict.WARN
-    write(good, "proc/swaps", "Filename Type\n/dev/sda2 partition 1 0 -2\n")
-    assert checks.swap(Config(), Machine(good)).verdict is Verdict.WARN
-    assert checks.swap(REALTIME, Machine(good)).verdict is Verdict.OK
-
-
-def test_capabilities_stand_for_limits(good):
-    write(good, "proc/self/limits", LIMITS.format(memlock="0", rtprio="0"))
-    write(good, "proc/self/status", f"Name:\tx\nCapEff:\t{1 << 23 | 1 << 14:016x}\n")
-    assert checks.scheduling(REALTIME, Machine(good)).verdict is Verdict.OK
-    assert checks.memory_lock(REALTIME, Machine(good)).verdict is Verdict.OK
-
-
-def test_a_core_that_is_not_there_is_a_failure(good):
-    config = Config(realtime=RealTime(cpus=(1, 9)))
-    finding = checks.cores(config, Machine(good))
-    assert finding.verdict is Verdict.FAIL
-    assert "[9]" in finding.found
 
 
 def test_port_missing_taken_or_not_ours(good):
@@ -155,20 +168,6 @@ def test_who_made_a_pseudo_terminal_is_not_its_holder(good):
     inode = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
     write(good, "proc/locks", f"1: FLOCK  ADVISORY  WRITE 4242 {inode} 0 EOF\n")
     assert checks.port_holder(config, Machine(good)).found == "python (process 4242)"
-
-
-def test_a_can_channel_is_a_network_interface(good):
-    config = Config(device=Device(port="can0"))
-    assert checks.port(config, Machine(good)).verdict is Verdict.WARN
-    (good / "sys/class/net/can0").mkdir(parents=True)
-    assert checks.port(config, Machine(good)).verdict is Verdict.OK
-
-
-def test_run_directory(good):
-    (good / "run/tormag").rmdir()
-    assert checks.run_directory(Config(), Machine(good)).verdict is Verdict.FAIL
-    local = Config(endpoints=Endpoints(control="tcp://127.0.0.1:5555"))
-    assert checks.run_directory(local, Machine(good)).verdict is Verdict.OK
 
 
 def test_an_empty_root_is_examined_without_error(tmp_path):

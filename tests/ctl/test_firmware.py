@@ -56,8 +56,3 @@ def test_the_keys_of_json_are_the_links(fake_daemon: Any, status_with: Any, caps
     assert json.loads(capsys.readouterr().out)["result"] == known
     assert main(["--endpoint", fake_daemon.control, "firmware"]) == 0
     assert "RUNNING" in capsys.readouterr().out
-
-
-def test_without_a_daemon_it_says_so(run_dir: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--endpoint", f"ipc://{run_dir}/control", "--wait", "0.05", "firmware"]) == 3
-    assert "not reachable" in capsys.readouterr().err

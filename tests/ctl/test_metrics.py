@@ -138,10 +138,6 @@ def test_a_scrape_asks_anew_and_says_when_the_daemon_has_gone(full: Any, capsys:
     assert full.commands == ["status"] * 3
 
 
-def test_without_a_daemon_it_does_not_begin(run_dir: Path) -> None:
-    assert main(["--endpoint", f"ipc://{run_dir}/control", "--wait", "0.01", "metrics"]) == 3
-
-
 def test_the_board_asks_for_what_there_is(full: Any, capsys: pytest.CaptureFixture[str]) -> None:
     known = {sample.name for family in read(printed(capsys, full.control)).values() for sample in family.samples}
     board = json.loads(BOARD.read_text(encoding="utf-8"))

@@ -147,7 +147,6 @@ def test_a_real_lock_of_a_real_process_is_found(
     config.write_text(f'[device]\nport = "{path}"\n')
     monkeypatch.setattr("can.detect_available_configs", lambda asked, timeout: [])
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
-        assert holder.stdout is not None
         assert holder.stdout.readline() == b"held\n"
         with pytest.raises(BlockingIOError):
             fcntl.flock(near, fcntl.LOCK_EX | fcntl.LOCK_NB)

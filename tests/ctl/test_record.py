@@ -100,11 +100,6 @@ def test_in_a_folder_a_recording_has_a_name_of_its_own(fake_daemon, tmp_path, ca
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.mcap", file.name)
 
 
-def test_a_file_that_cannot_be_made_is_a_usage_error(fake_daemon, tmp_path, capsys):
-    assert main(["--endpoint", fake_daemon.control, "record", str(tmp_path / "none" / "a.mcap")]) == 2
-    assert "No such file" in capsys.readouterr().err
-
-
 def test_rubbish_is_counted_and_left_out(fake_daemon, tmp_path, capsys):
     good = {"v": 1, "columns": ["t_ns", "x"], "rows": [[2**60, 1.0]]}
     fake_daemon.rubbish += [
@@ -149,8 +144,6 @@ def test_a_full_disk_ends_a_recording_that_can_still_be_read(fake_daemon, tmp_pa
     with file.open("rb") as opened:
         reader = make_reader(opened)
         summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
         messages = [message for _, _, message in reader.iter_messages()]
         assert len(messages) == summary.statistics.message_count
         assert len(messages) == recording.ticks.t_ns.size + recording.telemetry.t_ns.size

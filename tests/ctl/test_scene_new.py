@@ -35,7 +35,6 @@ def test_a_recorded_force_becomes_a_scene_with_the_softest_insert_that_renders_i
     scene = load_scene(str(out))
     assert (scene.name, scene.force.least_N, scene.force.most_N) == ("mine", 0.31, 0.62)
     assert scene.force.tolerance_rms_N == pytest.approx(0.016)
-    assert scene.signal is not None
     assert scene.signal.file == "../forces.csv"
     assert main(["scene", "check", str(out)]) == 0
 
@@ -67,14 +66,6 @@ def test_a_force_that_no_insert_renders_is_refused_and_leaves_no_file(
     assert not out.exists()
 
 
-def test_a_file_is_never_written_over(tmp_path, capsys):
-    out = tmp_path / "mine.toml"
-    out.write_text("keep")
-    code, _ = new(capsys, str(out), "--force", str(recording(tmp_path / "f.csv", 0.8, 1.5, 0.1)))
-    assert code == 2
-    assert out.read_text() == "keep"
-
-
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
@@ -88,11 +79,3 @@ def test_without_a_recording_it_asks_and_enter_takes_what_is_proposed(tmp_path, 
     scene = load_scene(printed["result"]["file"])
     assert (scene.description, scene.force.most_N, scene.force.tolerance_rms_N) == ("A vein is held open.", 1.5, 0.06)
     assert (scene.force.resolution_N, scene.signal.bandwidth_hz) == (0.12, 0.2)
-
-
-def test_where_nobody_can_be_asked_it_says_so(tmp_path, capsys, monkeypatch):
-    for stdin, words in ((io.StringIO(), "nobody to ask"), (Terminal("one\n"), "the answers ended")):
-        monkeypatch.setattr(sys, "stdin", stdin)
-        code, printed = new(capsys, str(tmp_path / "mine.toml"))
-        assert code == 2
-        assert words in printed["error"]["message"]

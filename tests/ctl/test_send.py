@@ -135,11 +135,6 @@ def test_what_is_no_regular_file_is_refused_rather_than_waited_for(tmp_path, cap
         assert f"{name}: allowed is a regular file" in json.loads(capsys.readouterr().out)["error"]["message"]
 
 
-def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(ForceFileError, match="No such file"):
-        read_csv(tmp_path / "none.csv")
-
-
 @given(st.binary(max_size=300))
 def test_any_bytes_are_a_waveform_or_refused(tmp_path_factory, data):
     file = Path(tmp_path_factory.getbasetemp()) / "any.csv"

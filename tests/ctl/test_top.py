@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, strategies as st
 from rich.console import Console
 
-from tormagd.ctl.main import main
 from tormagd.ctl.sparkline import EIGHTHS, columns, span, sparkline
 from tormagd.ctl.top_screen import CURVES, Seen, screen
 from tormagd_client.messages import Explained, Status
@@ -167,8 +166,3 @@ def test_it_is_ended_by_a_key_or_a_signal_and_only_looks(fake_daemon: Any, end: 
     assert "ENABLED" in text
     assert set(fake_daemon.commands) == {"status"}
     assert not fake_daemon.setpoints
-
-
-def test_without_a_terminal_it_is_refused(fake_daemon: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--endpoint", fake_daemon.control, "top"]) == 2
-    assert "tormagctl status" in capsys.readouterr().err

@@ -140,19 +140,18 @@ def test_setpoints_that_nobody_took_are_no_success(fake_daemon, capsys):
     assert (code, printed["error"]["code"]) == (1, "not_taken")
 
 
-@pytest.mark.parametrize("arguments", [("--to-N", "5.5"), ("--from-N", "0.4", "--to-N", "6")])
-def test_what_the_scene_does_not_allow_is_not_sent(fake_daemon, capsys, arguments):
-    code, printed, _ = send(fake_daemon, capsys, *arguments)
-    assert (code, printed["error"]["code"]) == (1, "out_of_range")
-    assert "allowed is 0..5 N in scene pulse; nothing was sent" in printed["error"]["message"]
-    assert fake_daemon.setpoints == []
-
-
-def test_a_file_that_leaves_the_range_is_not_sent(fake_daemon, capsys, tmp_path):
+@pytest.mark.parametrize(
+    "arguments", [("step", "--to-N", "5.5"), ("step", "--from-N", "0.4", "--to-N", "6"), ("FILE",)]
+)
+def test_what_the_scene_does_not_allow_is_not_sent(fake_daemon, capsys, tmp_path, arguments):
     file = tmp_path / "task.csv"
     file.write_text("t_s,force_N\n0,1\n1,7\n")
-    assert main(["--endpoint", fake_daemon.control, "send", str(file)]) == 1
-    assert "1..7 N is asked" in capsys.readouterr().err
+    told = [str(file) if each == "FILE" else each for each in arguments]
+    assert main(["--endpoint", fake_daemon.control, "--json", "send", *told]) == 1
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert error["code"] == "out_of_range"
+    assert "allowed is 0..5 N in scene pulse; nothing was sent" in error["message"]
+    assert fake_daemon.setpoints == []
 
 
 def test_blind_it_asks_nothing_and_says_that_it_does_not_know(fake_daemon, capsys):

@@ -78,8 +78,6 @@ class Rig:
 
     def _plug_in(self) -> None:
         """A symbolic link to the simulator's line stands for the stable name that udev gives a real one."""
-        assert self.simulator is not None
-        assert self.simulator.stdout is not None
         path = self.simulator.stdout.readline().strip()
         assert path.startswith("/")
         self.port.unlink(missing_ok=True)

@@ -65,7 +65,6 @@ class Machines:
         with contextlib.suppress(OSError):  # a device does not wait for the host's processors
             policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
             os.sched_setscheduler(simulator.pid, policy, os.sched_param(40))
-        assert simulator.stdout is not None
         port = simulator.stdout.readline().strip()
         self.config = folder / "tormagd.toml"
         self.config.write_text(

@@ -35,12 +35,10 @@ class Flight:
     def tick(self, setpoint: TimedSetpoint | None = None) -> Sample:
         """One control period."""
         before = self.loop.plan_state
-        assert before is not None
         self._is_stepped = False
         sample = self.loop.tick(setpoint)
         self._stepped()
         planned = self.loop.plan_state
-        assert planned is not None
         if planned.plan is not before.plan:
             self._journal.planned(sample.time_s, setpoint)
             self._journal.foresaw()

@@ -89,7 +89,6 @@ def test_frames_are_messages_that_anybody_can_read(path: Path, can_path: Path) -
     assert identifiers[can_identifier(FUNCTION[Drive])] == pytest.approx(3_300, abs=30)
     with path.open("rb") as file:
         schema, _, message = next(iter(make_reader(file).iter_messages(topics="/frames")))
-    assert schema is not None
     assert set(json.loads(schema.data)["properties"]) == {"monotonic_s", "direction", "data", "identifier"}
     assert message.log_time > 1_700_000_000_000_000_000
 
@@ -108,7 +107,6 @@ def test_what_came_damaged_is_counted_and_measured_alike(core: Core, on_can: Fli
     done = again(core, entries)
     assert done.difference is None
     assert done.damaged == pytest.approx(300, abs=2)
-    assert done.first_damage is not None
     assert done.first_damage.time_s == pytest.approx(DAMAGED_FROM_S, abs=0.003)
     assert done.first_damage.why == "State: CRC-8"
     assert frames(can_path)[done.first_damage.frame - 1]["identifier"] == can_identifier(FUNCTION[State])
@@ -118,10 +116,8 @@ def test_a_damaged_frame_is_found_in_its_place(core: Core, box: BlackBoxFile) ->
     place = place_of(box.entries, "read", DAMAGED_TICK)
     done = again(core, changed(box.entries, place, damaged(box.entries[place][2])), SNAPSHOT_S)
     assert (done.damaged, done.ticks) == (1, DAMAGED_TICK - 1 - round(1e3 * SNAPSHOT_S))
-    assert done.first_damage is not None
     assert done.first_damage.frame == number_of(box.entries, place - 1) + 1
     found = done.difference
-    assert found is not None
     assert (found.tick, found.field) == (DAMAGED_TICK, "measurement.number")
     assert found.frame == number_of(box.entries, place)
 
@@ -129,14 +125,12 @@ def test_a_damaged_frame_is_found_in_its_place(core: Core, box: BlackBoxFile) ->
 def test_a_frame_that_is_missing_is_found_in_its_place(core: Core, box: BlackBoxFile) -> None:
     place = place_of(box.entries, "read", DAMAGED_TICK)
     found = again(core, [*box.entries[:place], *box.entries[place + 1 :]], SNAPSHOT_S).difference
-    assert found is not None
     assert (found.tick, found.field) == (DAMAGED_TICK, "measurement.number")
 
 
 def test_another_frame_that_was_written_is_found(core: Core, box: BlackBoxFile) -> None:
     place = place_of(box.entries, "wrote", DAMAGED_TICK)
     found = again(core, changed(box.entries, place, []), SNAPSHOT_S).difference
-    assert found is not None
     assert (found.tick, found.field, found.recorded) == (DAMAGED_TICK, "written", "nothing")
     assert found.frame == number_of(box.entries, place - 1) + 1
 
@@ -148,7 +142,6 @@ def test_a_memory_that_differs_is_found_where_no_tick_shows_it(core: Core, box: 
     altered = {**connection, "link": {"DeviceLink": link | {"_least_delay_s": link["_least_delay_s"] + 1e-9}}}
     entries = [*box.entries[:place], ["state", step, plan, altered], *box.entries[place + 1 :]]
     found = again(core, entries, SNAPSHOT_S - 0.5).difference
-    assert found is not None
     assert found.field == "state.connection.link._least_delay_s"
 
 

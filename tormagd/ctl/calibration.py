@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from tormagd.config import Config, ConfigError, Endpoints
 from tormagd.ctl.calibrate import calibrate, require_new
@@ -22,7 +23,7 @@ def calibration(
     out: Path | None,
     csv: Path | None,
     rates_N_s: Sequence[float],
-    side: str,
+    side: Literal["left", "right"],
     is_agreed: bool,
 ) -> Outcome:
     """Of a device, an insert, or the motors. Raises CommandError: USAGE for options that do not fit each other and for

@@ -52,10 +52,8 @@ class Outcome(msgspec.Struct, frozen=True):
 
 def print_outcome(command: str, outcome: Outcome, as_json: bool) -> None:
     """On stdout: one JSON object `{command, ok, result, error}`, or the text."""
-    if as_json:
-        _print_json(command, outcome.exit_code is Exit.DONE, outcome.result, None)
-    else:
-        _print(command, outcome.text)
+    is_done = outcome.exit_code is Exit.DONE
+    _print(command, _object(command, is_done, outcome.result, None) if as_json else outcome.text)
 
 
 def print_error(command: str, error: ClientError, as_json: bool) -> None:
@@ -64,12 +62,12 @@ def print_error(command: str, error: ClientError, as_json: bool) -> None:
     said, hint = colour.red(printable(error.message)), printable(error.hint)
     write_line(f"tormagctl {command}: {said}\n  next: {hint}", sys.stderr)
     if as_json:
-        _print_json(command, False, None, {"code": error.code, "message": error.message, "hint": error.hint})
+        told = {"code": error.code, "message": error.message, "hint": error.hint}
+        _print(command, _object(command, False, None, told))
 
 
-def _print_json(command: str, ok: bool, result: dict[str, Any] | None, error: dict[str, str] | None) -> None:
-    answer = {"command": command, "ok": ok, "result": result, "error": error}
-    _print(command, msgspec.json.encode(answer).decode())
+def _object(command: str, ok: bool, result: dict[str, Any] | None, error: dict[str, str] | None) -> str:
+    return msgspec.json.encode({"command": command, "ok": ok, "result": result, "error": error}).decode()
 
 
 def _print(command: str, text: str) -> None:

@@ -21,7 +21,15 @@ from tormagd.bounded_file import require_regular
 from tormagd.keeping import READ, WROTE, Part
 from tormagd.recording.closing import ABOUT
 from tormagd.recording.reader import MAX_FILE_BYTES, MAX_RECORD_BYTES, UNREADABLE, RecordingError
-from tormagd.recording.writer import CHUNK_BYTES, TICK_KINDS, TICKS_TOPIC, known_values, plain_schema, tick_schema
+from tormagd.recording.writer import (
+    CHUNK_BYTES,
+    TICK_KINDS,
+    TICKS_TOPIC,
+    known_values,
+    plain_schema,
+    registered,
+    tick_schema,
+)
 
 CORE_TOPIC, FRAMES_TOPIC = "/core", "/frames"
 HEADER = "black_box"
@@ -86,30 +94,25 @@ def _write(path: Path, header: dict[str, str], parts: Sequence[Part]) -> int:
         mcap.add_metadata(ABOUT, {"version": __version__, "kind": HEADER})
         core = mcap.register_channel(topic=CORE_TOPIC, message_encoding="msgpack", schema_id=0)
         kinds = {name: TICK_KINDS[name] for name in columns if name in TICK_KINDS}
-        tick_channel = _channel(mcap, TICKS_TOPIC, tick_schema(kinds))
-        frame_channel = _channel(mcap, FRAMES_TOPIC, plain_schema(Frame))
+        _, tick_channel = registered(mcap, TICKS_TOPIC, tick_schema(kinds))
+        _, frame_channel = registered(mcap, FRAMES_TOPIC, plain_schema(Frame))
         began = parts[0]
         for number, part in enumerate(parts):
             mcap.add_message(core, log_time=part.t_ns, data=part.entries, publish_time=part.t_ns, sequence=number)
             for entry in msgspec.msgpack.decode(part.entries):
                 if is_tick(entry):
                     data = msgspec.json.encode(known_values(columns, entry))
-                    mcap.add_message(tick_channel, log_time=entry[0], data=data, publish_time=entry[0], sequence=ticks)
+                    mcap.add_message(
+                        tick_channel.id, log_time=entry[0], data=data, publish_time=entry[0], sequence=ticks
+                    )
                     ticks += 1
                 for frame in frames_in(entry):
                     frames += 1
                     t_ns = began.t_ns + round((frame.monotonic_s - began.time_s) * 1e9)  # so they stay in their order
                     data = msgspec.json.encode(frame)
-                    mcap.add_message(frame_channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=frames)
+                    mcap.add_message(frame_channel.id, log_time=t_ns, data=data, publish_time=t_ns, sequence=frames)
         mcap.finish()  # type: ignore[no-untyped-call]
     return ticks
-
-
-def _channel(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:
-    data = msgspec.json.encode(schema)
-    schema_id = mcap.register_schema(name=schema["title"], encoding="jsonschema", data=data)
-    channel: int = mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
-    return channel
 
 
 def is_tick(entry: Any) -> bool:

@@ -89,7 +89,18 @@ def _read(file: BinaryIO) -> tuple[int, list[MetadataIndex], list[_Whole]]:
                 metadata.append(MetadataIndex(before, here - before, record.name))
             elif isinstance(record, Chunk):
                 newest = record
-                whole.append(_Whole(here, _chunk_index(record, before, here - before), Counter()))
+                entry = ChunkIndex(
+                    chunk_length=here - before,
+                    chunk_start_offset=before,
+                    compression=record.compression,
+                    compressed_size=len(record.data),
+                    message_end_time=record.message_end_time,
+                    message_index_length=0,
+                    message_index_offsets={},
+                    message_start_time=record.message_start_time,
+                    uncompressed_size=record.uncompressed_size,
+                )
+                whole.append(_Whole(here, entry, Counter()))
             elif isinstance(record, MessageIndex) and whole:
                 last = whole.pop()
                 last.entry.message_index_offsets[record.channel_id] = before
@@ -109,20 +120,6 @@ def _read(file: BinaryIO) -> tuple[int, list[MetadataIndex], list[_Whole]]:
     ):
         whole.pop()
     return start, metadata, whole
-
-
-def _chunk_index(chunk: Chunk, offset: int, length: int) -> ChunkIndex:
-    return ChunkIndex(
-        chunk_length=length,
-        chunk_start_offset=offset,
-        compression=chunk.compression,
-        compressed_size=len(chunk.data),
-        message_end_time=chunk.message_end_time,
-        message_index_length=0,
-        message_index_offsets={},
-        message_start_time=chunk.message_start_time,
-        uncompressed_size=chunk.uncompressed_size,
-    )
 
 
 def _ending(

@@ -48,7 +48,7 @@ class RecordingWriter:
         self._channels: list[Channel] = []
         self._mcap.start(profile="", library=f"tormagd {__version__}")
         self.describe({"version": __version__, **(metadata or {})})
-        self._telemetry_channel = self._channel(TELEMETRY_TOPIC, "tormagd.Telemetry", plain_schema(Telemetry))
+        self._telemetry_channel = self._channel(TELEMETRY_TOPIC, plain_schema(Telemetry))
         self._tick_channels: dict[tuple[tuple[str, str], ...], int] = {}
         self._columns: tuple[str, ...] = ()
         self._kinds: dict[str, str] = {}
@@ -161,23 +161,29 @@ class RecordingWriter:
         self._kinds |= {name: _KINDS[type(value)] for name, value in message.items()}
         key = tuple(self._kinds.items())
         if key not in self._tick_channels:
-            self._tick_channels[key] = self._channel(TICKS_TOPIC, "tormagd.Tick", tick_schema(self._kinds))
+            self._tick_channels[key] = self._channel(TICKS_TOPIC, tick_schema(self._kinds))
         self._tick_channel = self._tick_channels[key]
         return self._tick_channel
 
-    def _channel(self, topic: str, name: str, schema: dict[str, Any]) -> int:
-        data = msgspec.json.encode(schema)
-        schema_id = self._mcap.register_schema(name=name, encoding="jsonschema", data=data)
-        channel: int = self._mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
-        self._schemas.append(Schema(schema_id, data, "jsonschema", name))
-        self._channels.append(Channel(channel, topic, "json", {}, schema_id))
-        return channel
+    def _channel(self, topic: str, schema: dict[str, Any]) -> int:
+        of, channel = registered(self._mcap, topic, schema)
+        self._schemas.append(of)
+        self._channels.append(channel)
+        return channel.id
 
     def _add(self, channel: int, t_ns: int, data: bytes, sequence: int) -> None:
         if self._chunk_ns is None or abs(t_ns - self._chunk_ns) > CHUNK_NS:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             self._chunk_ns = t_ns
         self._mcap.add_message(channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=sequence % 2**32)
+
+
+def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> tuple[Schema, Channel]:
+    """A channel of JSON messages that obey this schema, in the file that `mcap` writes."""
+    data = msgspec.json.encode(schema)
+    schema_id = mcap.register_schema(name=schema["title"], encoding="jsonschema", data=data)
+    channel = mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
+    return Schema(schema_id, data, "jsonschema", schema["title"]), Channel(channel, topic, "json", {}, schema_id)
 
 
 def plain_schema(message: type[msgspec.Struct]) -> dict[str, Any]:
