@@ -17,8 +17,7 @@ from typing import Any
 
 import msgspec
 from machines.host import Host
-from rendering.following import Array
-from rendering.rehearsal import Case, Rehearsals, rehearse
+from rendering.following import Array, Case, Rehearsals, rehearse
 from rendering.show import (
     LEAST_N,
     MOST_N,

@@ -13,9 +13,8 @@ import msgspec
 import numpy as np
 import pytest
 from rendering.human_pulse import pulse_profile
-from rendering.ideal_carriage import Brake, Drive, brake_of, drive_of
-from rendering.ideal_force import Asked, asked_of, foresight_mm, no_delay_mm, rms
-from rendering.ideal_force import bound as best
+from rendering.ideal_carriage import Asked, Brake, Drive, asked_of, brake_of, drive_of, foresight_mm, no_delay_mm, rms
+from rendering.ideal_carriage import bound as best
 
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries

@@ -8,8 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from pictures.stamp import stamp
 
-from rendering.following import Array, Followed
-from rendering.rehearsal import Rehearsals
+from rendering.following import Array, Followed, Rehearsals
 from rendering.show import PULSE_START_S, Shown
 from rendering.tracking import tracking
 from tormagd.scenes.scene import Scene
