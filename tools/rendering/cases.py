@@ -21,6 +21,7 @@ from rendering.following import (
     VALID_S,
     Followed,
     Levels,
+    Tracking,
     armed,
     armed_at_rest,
     asked_at,
@@ -28,7 +29,6 @@ from rendering.following import (
     publisher,
 )
 from rendering.hands import TURNED_MM_S, Legs
-from rendering.human_pulse import with_approach
 from rendering.ideal_carriage import Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
 from rendering.signals import (
     STAIR_S,
@@ -40,9 +40,9 @@ from rendering.signals import (
     pulse_signal,
     recorded_signals,
     staircase_signal,
+    with_approach,
 )
 from rendering.tables import Json
-from rendering.tracking import Tracking
 from tormagd.config import Config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint

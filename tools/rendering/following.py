@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from rendering.device_draws import device
 from rendering.hands import Legs, WaitingHand
-from rendering.tracking import Tracking, tracking
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
 from tormagd.control.core import build_core
@@ -40,6 +39,29 @@ LEAD_IN_S = 0.2
 "Time between enabling and the first setpoint of a rehearsal."
 REHEARSED_VALID_S = 0.1
 TRIM = Config().trim
+
+
+class Tracking(NamedTuple):
+    """Tracking of one signal. `variance_accounted_for` is 1 - sum(e^2) / sum((ref - mean(ref))^2)."""
+
+    rms_N: float
+    variance_accounted_for: float
+    worst_N: float
+    mean_N: float
+    reference_sd_N: float
+
+
+def tracking(reference_N: Array, rendered_N: Array) -> Tracking:
+    """Compares two signals of one length, sample by sample: nothing is removed from the error, no mean and no delay."""
+    error = rendered_N - reference_N
+    deviation = reference_N - reference_N.mean()
+    return Tracking(
+        rms_N=float(np.sqrt(np.mean(error**2))),
+        variance_accounted_for=float(1.0 - np.sum(error**2) / np.sum(deviation**2)),
+        worst_N=float(np.abs(error).max()),
+        mean_N=float(error.mean()),
+        reference_sd_N=float(deviation.std()),
+    )
 
 
 class Followed(NamedTuple):
