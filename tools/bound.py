@@ -3,7 +3,7 @@
     bound.py FORCE.csv [--plant sample_1] [--held] [--json]
 
 The CSV has the columns `t_s,force_N`. *Without delay* the carriages know the force asked now and how fast it changes;
-*with foresight* all of it (`tools/rendering/ideal_force.py`).
+*with foresight* all of it (`tools/rendering/ideal_carriage.py`).
 """
 
 import argparse
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from rendering.hands import TURNED_MM_S
-from rendering.ideal_force import MOST_N, STEP_S, bound
+from rendering.ideal_carriage import MOST_N, STEP_S, bound
 from rendering.tables import lines
 
 from tormagd.force_file import ForceFileError, read_forces
@@ -42,7 +42,6 @@ def main() -> int:
             most_N=options.most_N,
             hand_mm_s=options.hand_mm_s,
             step_s=options.step_ms * 1e-3,
-            shows=True,
         )
     except (DomainError, ForceFileError, PlantError, RuntimeError) as error:
         print(f"bound: {error}", file=sys.stderr)

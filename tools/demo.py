@@ -17,8 +17,7 @@ from typing import Any
 
 import msgspec
 from machines.host import Host
-from rendering.following import Array
-from rendering.rehearsal import Case, Rehearsals, rehearse
+from rendering.following import Array, Case, Rehearsals, Tracking, rehearse
 from rendering.show import (
     LEAST_N,
     MOST_N,
@@ -31,7 +30,6 @@ from rendering.show import (
     scored,
     show,
 )
-from rendering.tracking import Tracking
 
 from tormagd.config import Config, ConfigError
 from tormagd.scenes.scene import Scene, load_scene

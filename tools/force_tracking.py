@@ -14,6 +14,7 @@ import argparse
 import json
 import os
 import sys
+from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -25,21 +26,20 @@ from rendering.tables import Json, lines, worst_lines
 from tqdm import tqdm
 
 DRAWS = 40
-EVEN_DRAWS = 32
 OF_DEVICES = {"steps": cases.steps, "creep": cases.creep, "speeds": cases.speeds, "pulse": cases.pulse}
-CASES = (*OF_DEVICES, "drift", "samples", "draws", "staircase", "signals")
+OF_SIGNALS: dict[str, Callable[[Executor, cases.Kept], Any]] = {
+    "samples": cases.samples,
+    "draws": cases.draws,
+    "staircase": cases.staircase,
+    "signals": cases.signals,
+}
+CASES = (*OF_DEVICES, "drift", *OF_SIGNALS)
 
 
 def measure(case: str, options: argparse.Namespace, pool: Executor, kept: cases.Kept) -> Any:
     """One case; runs for the picture are added to `kept`."""
-    if case == "samples":
-        return cases.samples(pool, kept)
-    if case == "staircase":
-        return cases.staircase(pool, kept)
-    if case == "draws":
-        return cases.draws(pool, EVEN_DRAWS)
-    if case == "signals":
-        return cases.signals(pool)
+    if case in OF_SIGNALS:
+        return OF_SIGNALS[case](pool, kept)
     names = judging(options.draws)
     if options.tuning:
         names = [SAMPLES[0], *(f"draw {number}" for number in range(min(options.draws, FIRST_DRAW)))]
@@ -72,8 +72,7 @@ def main() -> int:
     if options.json:
         print(json.dumps(result))
     for case, found in {} if options.json else result.items():
-        is_of_devices = case in OF_DEVICES or case == "drift"
-        print("\n".join(worst_lines(case, found) if is_of_devices else lines({case: found}, "RMS")))
+        print("\n".join(lines({case: found}, "RMS") if case in OF_SIGNALS else worst_lines(case, found)))
     if options.picture is not None:
         from rendering.pictures import tracking_picture
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from machines.host import Host
 from rendering import show
-from rendering.following import Followed
-from rendering.rehearsal import Case, rehearse
+from rendering.following import Case, Followed, rehearse
 
 from tormagd.config import Config
 from tormagd.ctl.outcome import CommandError, Exit

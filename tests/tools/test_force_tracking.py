@@ -19,8 +19,8 @@ from rendering.cases import (
     track,
 )
 from rendering.device_draws import DRAWN, SPREAD, drawn_device, evenly_drawn
-from rendering.following import Followed, publisher
-from rendering.human_pulse import pulse_profile, with_approach
+from rendering.following import Followed, publisher, tracking
+from rendering.human_pulse import pulse_profile
 from rendering.signals import (
     SCALED_N,
     TRIM_S,
@@ -30,9 +30,9 @@ from rendering.signals import (
     pulse_signal,
     recorded_signals,
     staircase_signal,
+    with_approach,
 )
 from rendering.tables import lines, worst_lines
-from rendering.tracking import tracking
 
 from tormagd.simulation.parameters import load_plant
 

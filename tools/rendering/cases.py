@@ -21,6 +21,7 @@ from rendering.following import (
     VALID_S,
     Followed,
     Levels,
+    Tracking,
     armed,
     armed_at_rest,
     asked_at,
@@ -28,9 +29,7 @@ from rendering.following import (
     publisher,
 )
 from rendering.hands import TURNED_MM_S, Legs
-from rendering.human_pulse import with_approach
-from rendering.ideal_carriage import brake_of, drive_of
-from rendering.ideal_force import Bound, asked_of, bound, no_delay_mm
+from rendering.ideal_carriage import Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
 from rendering.signals import (
     STAIR_S,
     TRIM_S,
@@ -41,9 +40,9 @@ from rendering.signals import (
     pulse_signal,
     recorded_signals,
     staircase_signal,
+    with_approach,
 )
 from rendering.tables import Json
-from rendering.tracking import Tracking
 from tormagd.config import Config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
@@ -85,6 +84,7 @@ ALLOWED_WEAK_N = 0.015
 FOLLOWABLE, UNDER_FLAT, OVER_FLAT = 0.7, 0.9, 1.05
 """A hand that nobody foresees may be missed by UNDER_FLAT of what the best flat line misses, where the ideal carriages
 miss under FOLLOWABLE of that; by OVER_FLAT otherwise."""
+EVEN_DRAWS = 32
 WITHIN_N = 0.018
 LEVEL_S = 0.5
 
@@ -262,7 +262,7 @@ def track(
     times = np.concatenate([approach_s[:-1], lead_s + signal.time_s])
     forces = np.concatenate([approach_N[:-1], signal.force_N])
     publish = publisher(times + start_s, forces, preview_s, signal.valid_for_s)
-    found = follow(loop, publish, float(times[-1]), start_s + lead_s)
+    found = follow(loop, publish, float(times[-1]), start_s, lead_s)
     if found.faults:
         raise RuntimeError(f"{signal.name}: {', '.join(found.faults)} at {loop.now_s:.3f} s")
     asked = np.interp(found.time_s, signal.time_s, signal.force_N)
@@ -316,7 +316,7 @@ def samples(pool: Executor, kept: Kept) -> Json:
     return {"rows": rows}
 
 
-def draws(pool: Executor, count: int) -> list[Json]:
+def draws(pool: Executor, _kept: Kept, count: int = EVEN_DRAWS) -> list[Json]:
     """The pulse on random devices, after TRIM_S: with preview, then live."""
     drawn, played = evenly_drawn(count), pulse_signal(DRAWN_PULSE_S)
     result = []
@@ -372,7 +372,7 @@ def stair_levels(found: Followed) -> tuple[Array, Array]:
     return np.array(asked), np.array(levels)
 
 
-def signals(pool: Executor) -> Json:
+def signals(pool: Executor, _kept: Kept) -> Json:
     """The recorded signals and palpation on the three samples: those known ahead with preview, and all of them live."""
     folder = data_folder()
     if folder is None:

@@ -4,20 +4,21 @@ from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from rendering.device_draws import device
 from rendering.hands import Legs, WaitingHand
-from rendering.tracking import Tracking, tracking
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import NOTHING_SHOWN, Shown
 from tormagd.control.slow_friction import believable
-from tormagd.scenes.scene import Scene
+from tormagd.scenes.scene import Scene, load_scene
 from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import Hand
+from tormagd.simulation.hand import Hand, parse_hand
 from tormagd.simulation.parameters import PlantParameters
 
 Array = npt.NDArray[np.float64]
@@ -34,7 +35,33 @@ FILE_PREVIEW_S = 0.4
 CORNER_SCENE = "coronary"
 VALID_S = 0.25
 MEAN_S = 0.05
+LEAD_IN_S = 0.2
+"Time between enabling and the first setpoint of a rehearsal."
+REHEARSED_VALID_S = 0.1
 TRIM = Config().trim
+
+
+class Tracking(NamedTuple):
+    """Tracking of one signal. `variance_accounted_for` is 1 - sum(e^2) / sum((ref - mean(ref))^2)."""
+
+    rms_N: float
+    variance_accounted_for: float
+    worst_N: float
+    mean_N: float
+    reference_sd_N: float
+
+
+def tracking(reference_N: Array, rendered_N: Array) -> Tracking:
+    """Compares two signals of one length, sample by sample: nothing is removed from the error, no mean and no delay."""
+    error = rendered_N - reference_N
+    deviation = reference_N - reference_N.mean()
+    return Tracking(
+        rms_N=float(np.sqrt(np.mean(error**2))),
+        variance_accounted_for=float(1.0 - np.sum(error**2) / np.sum(deviation**2)),
+        worst_N=float(np.abs(error).max()),
+        mean_N=float(error.mean()),
+        reference_sd_N=float(deviation.std()),
+    )
 
 
 class Followed(NamedTuple):
@@ -102,8 +129,9 @@ def armed_at_rest(plant: PlantParameters, legs: Legs, shown: Shown = NOTHING_SHO
     return loop
 
 
-def follow(loop: ClosedLoop, publish: Publisher, lasts_s: float, begins_s: float) -> Followed:
-    """Plays what is published for so long, or until a fault; rows count from `begins_s` of the loop's time on."""
+def follow(loop: ClosedLoop, publish: Publisher, lasts_s: float, start_s: float, lead_s: float = 0.0) -> Followed:
+    """Plays what is published for so long, or until a fault; rows count from `lead_s` after `start_s`, a time of the
+    loop's."""
     rows: list[tuple[float, ...]] = []
     held: Counter[str] = Counter()
     faults: tuple[str, ...] = ()
@@ -117,7 +145,7 @@ def follow(loop: ClosedLoop, publish: Publisher, lasts_s: float, begins_s: float
 
     for sample in loop.run(lasts_s, newest):
         truth, trim = sample.truth, sample.trim
-        since_s = truth.time_s - begins_s
+        since_s = truth.time_s - start_s - lead_s
         if since_s >= 0.0:
             rows.append((since_s, asked_N, truth.force_N, truth.handle_mm, truth.handle_mm_s, is_railed(loop)))
             held.update({str(limit) for limit in (*sample.plan.limits, *sample.output.limits)})
@@ -169,3 +197,32 @@ def publisher(times_s: Array, forces_N: Array, preview_s: float, valid_for_s: fl
         return setpoint.replaced(preview_N=tuple(preview.tolist()), preview_dt_s=period_s)
 
     return newest
+
+
+class Case(NamedTuple):
+    """What `make run` rehearses beside its real-time figures: a plant, a hand, and the gap speed the controller may use
+    (None: the configured one)."""
+
+    label: str
+    plant: str = "sample_1"
+    hand: str = "steady"
+    gap_speed_mm_s: float | None = None
+
+
+Rehearsals = dict[Case, Followed]
+
+
+def rehearse(config: Config, case: Case, times_s: Array, forces_N: Array) -> Followed:
+    """Homes, enables, plays the profile. Raises RuntimeError where the device does not get that far or faults."""
+    if case.gap_speed_mm_s is not None:
+        slow = msgspec.structs.replace(config.position, gap_speed_mm_s=case.gap_speed_mm_s)
+        config = msgspec.structs.replace(config, position=slow)
+    # what is played is not the scene's own signal, which the daemon refuses where the gap is too slow for it
+    scene = msgspec.structs.replace(load_scene(config.scene), signal=None)
+    loop = armed(config, device(case.plant), parse_hand(case.hand), scene)
+    start_s = loop.now_s + LEAD_IN_S
+    publish = publisher(times_s + start_s, forces_N, 0.0, REHEARSED_VALID_S)
+    found = follow(loop, publish, LEAD_IN_S + float(times_s[-1]), start_s)
+    if found.faults:
+        raise RuntimeError(f"{case.label}: {', '.join(found.faults)} at {loop.now_s:.3f} s")
+    return found._replace(asked_N=np.interp(found.time_s, times_s, forces_N))

@@ -46,12 +46,3 @@ def pulse_profile(duration_s: float, least_N: float, most_N: float, rate_hz: int
     part = CubicSpline(np.arange(len(raw)) / SOURCE_HZ, smooth)(EDGE_S + times_s)
     scaled = least_N + (part - part.min()) / (part.max() - part.min()) * (most_N - least_N)
     return times_s, scaled
-
-
-def with_approach(times_s: Array, forces_N: Array, start_N: float, ramp_s: float, hold_s: float) -> tuple[Array, Array]:
-    """The profile behind a ramp from `start_N` to its first force and a hold there, so that nothing jumps."""
-    period_s = float(times_s[1] - times_s[0])
-    ramp = np.linspace(start_N, forces_N[0], round(ramp_s / period_s), endpoint=False)
-    hold = np.full(round(hold_s / period_s), forces_N[0])
-    forces = np.concatenate([ramp, hold, forces_N])
-    return np.arange(len(forces), dtype=np.float64) * period_s, forces

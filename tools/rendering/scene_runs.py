@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, as_completed
 from functools import cache, partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -26,8 +26,6 @@ from tormagd.control.core import Core, build_core
 from tormagd.control.estimate import Estimate
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import Planner, PlanState
-from tormagd.control.step import StepState
-from tormagd.hardware.measurement import Measurement
 from tormagd.scenes.measured import Cost
 from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Solver, load_task, scene_path, terms_of
 from tormagd.scenes.signal import asked
@@ -36,6 +34,7 @@ from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, PressingHand
 from tormagd.simulation.parameters import PlantParameters, load_plant, with_insert
 
 Call = Callable[[], object]
+Given = tuple[Any, ...]
 
 ROOT = Path(__file__).parents[2]
 LEARN_S = 4.0
@@ -91,36 +90,31 @@ def costs(cases: Sequence[Case]) -> list[Cost]:
     loop, in rounds over all of them, so that a disturbance of the machine meets all alike. Of each step and plan the
     least of ROUNDS counts."""
     played = Play(cases[0])
-    given = [moment for moment in played.moments(TIMED_S) if moment.time_s >= LEARN_S]
-    made = [_calls(build_core(played.config, _modelled(played.core.scene, case)), given) for case in cases]
+    steps, plans = played.given(TIMED_S)
+    made = [_calls(build_core(played.config, _modelled(played.core.scene, case)), steps, plans) for case in cases]
     least_us = [[np.full(len(calls), np.inf) for calls in kinds] for kinds in made]
     for _ in range(ROUNDS):
         for least, kinds in zip(least_us, made, strict=True):
             least[:] = [np.minimum(before, _spent_us(calls)) for before, calls in zip(least, kinds, strict=True)]
     # a setpoint that comes a little late makes a plan more: what all have cost is shared by those that were asked for
-    asked = len(given) * cases[0].inference_hz / cases[0].control_hz
+    asked = len(steps) * cases[0].inference_hz / cases[0].control_hz
     return [
-        Cost(round(float(steps_us.sum()) / len(given), 3), round(float(plans_us.sum()) / asked, 3))
+        Cost(round(float(steps_us.sum()) / len(steps), 3), round(float(plans_us.sum()) / asked, 3))
         for steps_us, plans_us in least_us
     ]
 
 
-def _calls(core: Core, given: list["Moment"]) -> tuple[list[Call], list[Call]]:
+def _calls(core: Core, steps: list[Given], plans: list[Given]) -> tuple[list[Call], list[Call]]:
     """Every step and every plan of a core that is given this."""
-    planner, first = core.planner, given[0]
-    own = planner.plan(planner.start(first.now_s), first.now_s, first.setpoint, first.estimate).remembered
-    steps: list[Call] = []
-    plans: list[Call] = []
-    for each in given:
-        state, now_s = each.plan_state, each.now_s
-        steps.append(partial(core.stepper.step, each.step_state, now_s, each.measurement, state.plan))
-        if each.is_planned:
-            # with no more of the elastomer's branches than a model of its own remembers
-            known = state.remembered
-            known = known.replaced(free=known.free[: len(own.free)], added=known.added[: len(own.added)])
-            own_state = state.replaced(remembered=known)
-            plans.append(partial(_planned, planner, own_state, now_s, each.setpoint, each.estimate))
-    return steps, plans
+    planner, (_, now_s, setpoint, estimate) = core.planner, plans[0]
+    own = planner.plan(planner.start(now_s), now_s, setpoint, estimate).remembered
+    made: list[Call] = []
+    for state, *given in plans:
+        # with no more of the elastomer's branches than a model of its own remembers
+        known = state.remembered
+        known = known.replaced(free=known.free[: len(own.free)], added=known.added[: len(own.added)])
+        made.append(partial(_planned, planner, state.replaced(remembered=known), *given))
+    return [partial(core.stepper.step, *given) for given in steps], made
 
 
 def _modelled(scene: Scene, case: Case) -> Scene:
@@ -142,19 +136,6 @@ def _spent_us(calls: list[Call]) -> list[float]:
         call()
         spent.append((time.thread_time_ns() - start_ns) * 1e-3)
     return spent
-
-
-class Moment(NamedTuple):
-    """What the core was given in one tick, behind the states before it. `time_s` counts from the signal's beginning."""
-
-    time_s: float
-    step_state: StepState
-    plan_state: PlanState
-    now_s: float
-    setpoint: TimedSetpoint | None
-    measurement: Measurement | None
-    estimate: Estimate | None
-    is_planned: bool
 
 
 class Play:
@@ -199,23 +180,19 @@ class Play:
             loop.tick(self.publish(loop.now_s))
             yield time_s, loop
 
-    def moments(self, seconds: float) -> Iterable[Moment]:
-        """The same ticks as the core saw them."""
-        loop = self._loop
+    def given(self, seconds: float) -> tuple[list[Given], list[Given]]:
+        """What the core's steps and plans were given in these seconds after LEARN_S: their arguments."""
+        loop, steps, plans = self._loop, list[Given](), list[Given]()
         step_state, plan_state, before_s = loop.step_state, loop.plan_state, loop.now_s
         for time_s, _ in self.ticks(seconds):
             assert plan_state is not None, "a loop with a planner has a state of it"
-            yield Moment(
-                time_s,
-                step_state,
-                plan_state,
-                loop.now_s,
-                self.publish(before_s),
-                loop.measurement,
-                loop.step_state.estimate,
-                loop.plan_state is not plan_state,
-            )
+            if time_s >= LEARN_S:
+                steps.append((step_state, loop.now_s, loop.measurement, plan_state.plan))
+                if loop.plan_state is not plan_state:
+                    setpoint, estimate = self.publish(before_s), loop.step_state.estimate
+                    plans.append((plan_state, loop.now_s, setpoint, estimate))
             step_state, plan_state, before_s = loop.step_state, loop.plan_state, loop.now_s
+        return steps, plans
 
 
 def _frozen(config: Config, scene: Scene) -> Core:

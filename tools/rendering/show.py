@@ -22,9 +22,9 @@ from machines.host import Host, HostWatch
 from machines.own import own_machine
 from machines.wire import carried
 
-from rendering.following import Array
-from rendering.human_pulse import pulse_profile, with_approach
-from rendering.tracking import Tracking, tracking
+from rendering.following import Array, Tracking, tracking
+from rendering.human_pulse import pulse_profile
+from rendering.signals import with_approach
 from tormagd.ctl.operate import home, operate
 from tormagd.recording.reader import Columns, RecordingError, read_recording
 from tormagd.safety.codes import FAULTS, Fault
@@ -160,7 +160,8 @@ def show(times_s: Array, forces_N: Array) -> Shown | Aborted:
     """Starts the processes, plays the profile with a live view, ends them in order."""
     shutil.rmtree(RUN_DIR, ignore_errors=True)
     RUN_DIR.mkdir(parents=True)
-    write_profile(RUN_DIR / "pulse.csv", times_s, forces_N)
+    rows, formats = np.column_stack([times_s, forces_N]), ("%.4f", "%.5f")
+    np.savetxt(RUN_DIR / "pulse.csv", rows, formats, delimiter=",", header="t_s,force_N", comments="")
     with (
         (RUN_DIR / "bare_timer.log").open("w") as log,
         HostWatch(DAEMON_FIFO + 1, log) as watched,
@@ -176,12 +177,6 @@ def show(times_s: Array, forces_N: Array) -> Shown | Aborted:
             until_s, spacing_s = early_end(began_s, error.time_s)
             host = watched.between(max(began_s, until_s - BEFORE_FAULT_S), until_s)
             return Aborted(error, host, spacing_s)
-
-
-def write_profile(path: Path, times_s: Array, forces_N: Array) -> None:
-    """A setpoint CSV."""
-    rows = np.column_stack([times_s, forces_N])
-    np.savetxt(path, rows, ("%.4f", "%.5f"), delimiter=",", header="t_s,force_N", comments="")
 
 
 def play(watched: HostWatch, duration_s: float) -> Course:

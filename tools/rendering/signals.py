@@ -61,6 +61,15 @@ class Signal(NamedTuple):
     kind: Kind = Kind.OTHER
 
 
+def with_approach(times_s: Array, forces_N: Array, start_N: float, ramp_s: float, hold_s: float) -> tuple[Array, Array]:
+    """The profile behind a ramp from `start_N` to its first force and a hold there, so that nothing jumps."""
+    period_s = float(times_s[1] - times_s[0])
+    ramp = np.linspace(start_N, forces_N[0], round(ramp_s / period_s), endpoint=False)
+    hold = np.full(round(hold_s / period_s), forces_N[0])
+    forces = np.concatenate([ramp, hold, forces_N])
+    return np.arange(len(forces), dtype=np.float64) * period_s, forces
+
+
 def pulse_signal(duration_s: float) -> Signal:
     """The demonstration's pulse."""
     low_N, high_N = PULSE_N
