@@ -18,7 +18,7 @@ PAGES = [
     *ROOT.glob("*.md"),
     ROOT / "Makefile",
     *(ROOT / "docs").rglob("*.md"),
-    *(ROOT / "firmware_protocol").rglob("*.md"),
+    *(ROOT / "systemd").rglob("*.md"),
 ]
 HEAVY = ("torch", "sklearn", "clarabel", "dask", "distributed", "pyarrow", "matplotlib")
 WITHOUT = """
