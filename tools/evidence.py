@@ -307,7 +307,7 @@ PARTS = {
         judges=False,
     ),
     "pad_hold": Part(
-        "tools/tactile_hold.py --coarse --json --picture docs/images/tactile_hold_1h.png",
+        "-m tormagd.lab tactile-hold --coarse --json --picture docs/images/tactile_hold_1h.png",
         _says_pad_hold,
         judges=False,
     ),

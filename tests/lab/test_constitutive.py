@@ -149,7 +149,8 @@ def test_arrays_broadcast() -> None:
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, 0.01, 21.0, math.nan, math.inf, np.array([1.0, math.nan]), "one"])
 @pytest.mark.parametrize(
-    ("made", "name"), [(lambda bad: stretches(bad, 1.0), "radial"), (lambda bad: stretches(1.0, bad), "circumferential")]
+    ("made", "name"),
+    [(lambda bad: stretches(bad, 1.0), "radial"), (lambda bad: stretches(1.0, bad), "circumferential")],
 )
 def test_stretches_outside_the_range_are_refused(made, name, bad):
     with pytest.raises(DomainError, match=name):
