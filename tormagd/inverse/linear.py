@@ -9,8 +9,8 @@ from tormagd.inverse.solution import FieldSolution, Reach, answer, checked_near_
 from tormagd.model.features import FEATURES, FIELD, require_number
 from tormagd.model.force_curve import ForceCurve
 from tormagd.model.model_file import ForceModel
-from tormagd.physics.errors import DomainError
 from tormagd.model.network import to_network
+from tormagd.physics.errors import DomainError
 
 THESIS_EPSILON_N = 1.26
 """Radius of the neighbourhood in the thesis: the mean error of its network."""
