@@ -15,7 +15,6 @@ from tormagd.lab.characterisation.constitutive import (
     cauchy_stress_Pa,
     field,
     invariants,
-    magnetic_energy_J_m3,
     nominal_stress_Pa,
     pressure_for_free_ends_Pa,
     strain_energy_J_m3,
@@ -80,14 +79,6 @@ def test_without_strain_and_field_there_is_no_energy_and_no_stress() -> None:
     pressure = pressure_for_free_ends_Pa(rest, none, MATERIAL)
     assert pressure == 2.0 * MATERIAL.c10_Pa + 4.0 * MATERIAL.c01_Pa
     assert (cauchy_stress_Pa(rest, none, MATERIAL, pressure) == 0.0).all()
-
-
-def test_without_strain_only_the_maxwell_stress_is_left() -> None:
-    rest, b = stretches(1.0, 1.0), field(0.5, 0.2)
-    stress = cauchy_stress_Pa(rest, b, MATERIAL, 2.0 * MATERIAL.c10_Pa + 4.0 * MATERIAL.c01_Pa)
-    vector = np.array([0.5, 0.0, 0.2])
-    np.testing.assert_allclose(stress, np.outer(vector, vector) / MATERIAL.permeability_H_m, atol=1e-9)
-    assert magnetic_energy_J_m3(rest, b, MATERIAL) == pytest.approx(0.29 / (2.0 * MU0_H_M * 4.0))
 
 
 def test_the_shear_modulus_is_the_slope_of_a_small_shear() -> None:
