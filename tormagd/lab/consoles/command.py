@@ -82,7 +82,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """The consoles; exit code 1 where a file was left out, 2 where --out failed: told on stderr. Raises LabError, OSError."""
+    """The consoles; exit code 1 where a file was left out, 2 where --out failed. Raises LabError, OSError."""
     try:
         urls = files(options.recordings)
     except (ValueError, ImportError) as error:
