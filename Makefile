@@ -15,7 +15,7 @@ DESTDIR ?=
 PREFIX ?= /usr/local
 LIBRARY := $(PREFIX)/lib/tormagd
 # what the service's users have besides: recordings, their pictures, calibration, and what they look at it with
-SERVICE_EXTRAS ?= record,plot,lab,top,dashboard,metrics
+SERVICE_EXTRAS ?= record,plot,identify,top,dashboard,metrics
 
 export OMP_NUM_THREADS ?= 1
 
@@ -108,25 +108,25 @@ compile: core
 
 # the shipped models: bench sweeps recorded from the simulated device (sample 1, with each insert), then training
 model: $(VENV)/.dev
-	$(BIN)/python tools/bench_sweep.py --plant sample_1 --out build/bench_sweep.csv
-	$(BIN)/python tools/train_model.py build/bench_sweep.csv --element torque --insert MRE-50-40 --without-memory \
+	$(BIN)/tormag-lab bench-sweep --plant sample_1 --out build/bench_sweep.csv
+	$(BIN)/tormag-lab train-model build/bench_sweep.csv --element torque --insert MRE-50-40 --without-memory \
 	    --rising --hidden 40 --epochs 120 --validation-share 0.2 \
 	    --out tormagd/model/models/torque_mre_50_40.safetensors --plot build/training.png
 	for pair in brain:10-10 cardiovascular:10-20; do \
-	    $(BIN)/python tools/bench_sweep.py --plant sample_1 --scene $${pair%:*} --out build/$${pair%:*}.csv && \
-	    $(BIN)/python tools/train_model.py build/$${pair%:*}.csv --element torque --insert MRE-$${pair#*:} \
+	    $(BIN)/tormag-lab bench-sweep --plant sample_1 --scene $${pair%:*} --out build/$${pair%:*}.csv && \
+	    $(BIN)/tormag-lab train-model build/$${pair%:*}.csv --element torque --insert MRE-$${pair#*:} \
 	        --without-memory --rising --hidden 40 --epochs 120 --validation-share 0.2 \
 	        --out tormagd/model/models/torque_mre_$$(echo $${pair#*:} | tr - _).safetensors || exit 1; \
 	done
 
 # the shipped model of the tactile pad: cycles and holds of the simulated pad 1 on the bench, then training
 tactile-model: $(VENV)/.dev
-	$(BIN)/python tools/tactile_model.py --out tormagd/model/models/tactile_mre_c.safetensors
+	$(BIN)/tormag-lab tactile-model --out tormagd/model/models/tactile_mre_c.safetensors
 
 # docs/reproduction.md and docs/learned_inverse.md with their plots: the thesis's tables and figures beside ours
 reproduction: $(VENV)/.dev
-	$(BIN)/python tools/reproduce_thesis.py
-	$(BIN)/python tools/tactile_experiment.py --out docs
+	$(BIN)/tormag-lab reproduce-thesis --out docs
+	$(BIN)/tormag-lab tactile-experiment --out docs
 
 # docs/evidence: the fault matrix and the cases of tools/endure.py in full (well over an hour); `make test` samples them
 evidence: $(VENV)/.dev
@@ -143,7 +143,7 @@ install: $(VENV)/.man
 
 # leaves the configuration and what was recorded
 uninstall:
-	rm -rf $(addprefix '$(DESTDIR)$(PREFIX)'/,lib/tormagd share/tormagd share/doc/tormagd bin/tormagd bin/tormagctl) \
+	rm -rf $(addprefix '$(DESTDIR)$(PREFIX)'/,lib/tormagd share/tormagd share/doc/tormagd bin/tormagd bin/tormagctl bin/tormag-lab) \
 	    '$(DESTDIR)$(PREFIX)'/lib/systemd/system/tormag* '$(DESTDIR)$(PREFIX)'/lib/*/tormag.conf \
 	    '$(DESTDIR)$(PREFIX)'/lib/udev/rules.d/60-tormag.rules '$(DESTDIR)$(PREFIX)'/share/man/man1/tormag* \
 	    '$(DESTDIR)$(PREFIX)'/share/bash-completion/completions/tormagctl \
@@ -160,7 +160,7 @@ deb: $(VENV)/.man
 	    sys.exit(None if a == v else f"the package runs with Python {a}, but .venv has {v}: make clean, make deb PYTHON=/usr/bin/python3")'
 	rm -rf build/library
 	$(PIP_TO) build/library --no-deps ./client .
-	$(BIN)/python tools/dependencies.py record plot top dashboard metrics | grep -v '^torch=' > build/requirements.txt
+	$(BIN)/python tools/dependencies.py record plot identify top dashboard metrics | grep -v '^torch=' > build/requirements.txt
 	$(PIP_TO) build/library --requirement build/requirements.txt
 	rm -rf build/library/bin
 	BUILD_PYTHON=$(BIN)/python BUILD_LIBRARY='$(CURDIR)/build/library' systemd/deb.sh build/library build

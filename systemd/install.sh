@@ -14,7 +14,7 @@ lib=$root$prefix/lib share=$root$prefix/share
 
 put() { install -D -m 644 "$1" "$2"; }
 
-for program in daemon:tormagd ctl:tormagctl; do
+for program in daemon:tormagd ctl:tormagctl lab:tormag-lab; do
     install -d "$root$prefix/bin"
     # children, such as the fitting of a calibration, find the library by the same variable
     cat > "$root$prefix/bin/${program#*:}" <<END

@@ -125,6 +125,16 @@ def test_the_whole_process_writes_model_and_training_data(sweeps, tmp_path, caps
     assert "MRE-99-99" in json.loads(capsys.readouterr().out)["error"]["message"]
 
 
+def test_a_missing_package_is_told_before_anybody_turns_the_handle(monkeypatch, capsys):
+    assert calibration.main(["--insert", INSERT]) == 0
+    assert json.loads(capsys.readouterr().out) == {"result": {"insert": INSERT}}
+    monkeypatch.setattr(calibration, "NEEDED", ("a_package_that_is_not",))
+    assert calibration.main(["--insert", INSERT]) == 1
+    told = json.loads(capsys.readouterr().out)["error"]
+    assert (told["code"], told["message"]) == ("not_installed", "a_package_that_is_not is not installed")
+    assert "pip install" in told["hint"]
+
+
 def test_a_handle_that_stands_still_is_refused(table):
     still = table.copy()
     still[still[:, column("sweep")] == 2.0, column("rate_mm_s")] = 0.3

@@ -14,7 +14,6 @@ from tormagd.lab.characterisation.constitutive import (
     cauchy_stress_Pa,
     field,
     invariants,
-    magnetic_energy_J_m3,
     nominal_stress_Pa,
     pressure_for_free_ends_Pa,
     strain_energy_J_m3,
@@ -81,14 +80,6 @@ def test_without_strain_and_field_there_is_no_energy_and_no_stress() -> None:
     assert (cauchy_stress_Pa(rest, none, MATERIAL, pressure) == 0.0).all()
 
 
-def test_without_strain_only_the_maxwell_stress_is_left() -> None:
-    rest, b = stretches(1.0, 1.0), field(0.5, 0.2)
-    stress = cauchy_stress_Pa(rest, b, MATERIAL, 2.0 * MATERIAL.c10_Pa + 4.0 * MATERIAL.c01_Pa)
-    vector = np.array([0.5, 0.0, 0.2])
-    np.testing.assert_allclose(stress, np.outer(vector, vector) / MATERIAL.permeability_H_m, atol=1e-9)
-    assert magnetic_energy_J_m3(rest, b, MATERIAL) == pytest.approx(0.29 / (2.0 * MU0_H_M * 4.0))
-
-
 def test_the_shear_modulus_is_the_slope_of_a_small_shear() -> None:
     """Plane-strain compression by e gives T_rr - T_zz = 4 G0 e: pure shear at 45 degrees."""
     for share in (0.0, 0.3, 1.0):
@@ -148,7 +139,8 @@ def test_arrays_broadcast() -> None:
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, 0.01, 21.0, math.nan, math.inf, np.array([1.0, math.nan]), "one"])
 @pytest.mark.parametrize(
-    ("made", "name"), [(stretches, "radial"), (lambda bad: stretches(1.0, bad), "circumferential")]
+    ("made", "name"),
+    [(lambda bad: stretches(bad, 1.0), "radial"), (lambda bad: stretches(1.0, bad), "circumferential")],
 )
 def test_stretches_outside_the_range_are_refused(made, name, bad):
     with pytest.raises(DomainError, match=name):

@@ -18,7 +18,7 @@ PAGES = [
     *ROOT.glob("*.md"),
     ROOT / "Makefile",
     *(ROOT / "docs").rglob("*.md"),
-    *(ROOT / "firmware_protocol").rglob("*.md"),
+    *(ROOT / "systemd").rglob("*.md"),
 ]
 HEAVY = ("torch", "sklearn", "clarabel", "dask", "distributed", "pyarrow", "matplotlib")
 WITHOUT = """
@@ -64,7 +64,7 @@ def test_the_commands_are_listed(arguments, exit_code, capsys):
         (("optimise-design", "--region", "1", "1", "1", "1"), "most_N = 1"),
         (("tune-position", "--config", "absent.toml"), "absent.toml"),
         (("bench-sweep", "--plant", "absent", "--out", "x.csv"), "absent"),
-        (("identify-motor",), "give either a log or --samples"),
+        (("identify-motor", "absent.csv"), "absent.csv: cannot be read"),
     ],
 )
 def test_what_cannot_be_used_is_one_line_and_exit_2(arguments, reason, capsys, tmp_path, monkeypatch):

@@ -1,17 +1,25 @@
 """Identification on a log with a known answer: a computed one, and the EMPS benchmark."""
 
 import json
+import math
 
 import numpy as np
 import pytest
 
+from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, load_config
-from tormagd.ctl.calibrate_motors import motor_log
+from tormagd.control.core import build_core
+from tormagd.control.governor import TimedSetpoint
+from tormagd.ctl.calibrate_motors import COLUMNS, excitation, motor_log
+from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS, Columns, Range
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import main
-from tormagd.lab.motor import command, fit, identification, samples
-from tormagd.lab.motor.log import read_log
-from tormagd.simulation.parameters import load_plant
+from tormagd.lab.motor import command, fit, identification
+from tormagd.lab.motor.log import Log, read_log
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.static_laws import pull_of_magnets_N
 
 MASS, VISCOUS, COULOMB, OFFSET, GAIN, DELAY_S = 80.0, 150.0, 12.0, -2.0, 30.0, 0.003
 
@@ -60,22 +68,117 @@ def test_emps_is_within_the_published_values(recordings, capsys):
     assert found["holdout_voltage_nrmse"] <= 0.06
 
 
+def compare(log: Log, plant: PlantParameters, side: str) -> dict:
+    """Identified and true, by parameter. Without a current in the log the true gain is given."""
+    true = truth(plant, side, 2e3 * log.position_m[fit.motion(log).sign != 0.0])
+    result = identification.identify(log, None if log.current_A is not None else true["gain_N_V"])
+    identified = {**(result["motor"] or {}), **result["parameters"], "time_constant_s": result["time_constant_s"]}
+    return {
+        name: {**found, "true": true[name], "inside": abs(found["value"] - true[name]) <= found["ci95"]}
+        for name, found in identified.items()
+        if found is not None
+    }
+
+
+def record(sample: str, seed: int = 1, rounds: int = 2) -> Columns:
+    """The control ticks of `tormagctl calibrate --motors` on a simulated device, in virtual time."""
+    config = Config()
+    core = build_core(config)
+    device = VirtualDevice(load_plant(sample), SteadyHand(), seed=seed)
+    loop = ClosedLoop(config, core.stepper, core.planner, device)
+    loop.arm()
+    for _ in loop.run(1.0):
+        pass
+    # the status of a daemon says the same: what this device gives with its gap open, as far as it has shown itself
+    least_N = loop.plan_state.device.force_N(core.planner.portrait.least_N)
+    waveform = excitation(Range(least_N, min(core.planner.portrait.most_N, core.scene.force.most_N)), rounds)
+    start_s = loop.now_s
+
+    def newest(now_s: float) -> TimedSetpoint:
+        sent_s = math.floor((now_s - start_s) * RATE_HZ + 1e-9) / RATE_HZ
+        return TimedSetpoint(waveform.at(sent_s).force_N, start_s + sent_s, VALID_FOR_MS * 1e-3)
+
+    rows = []
+    for sample_ in loop.run(waveform.duration_s, newest):
+        measured, estimate, reference = loop.measurement, sample_.state.estimate, sample_.state.reference
+        rows.append(
+            (
+                measured.device_time_s,
+                sample_.output.left_duty,
+                sample_.output.right_duty,
+                measured.supply_V,
+                estimate.left_mm,
+                estimate.right_mm,
+                measured.left_current_A,
+                measured.right_current_A,
+                estimate.force_N,
+                reference.gap_mm,
+            )
+        )
+    return dict(zip(COLUMNS, np.array(rows).T, strict=True))
+
+
+def to_log(columns: Columns) -> Log:
+    """What `read_log` makes of the file."""
+    return Log(columns["t_s"], columns["input_V"], columns["position_mm"] * 1e-3, None, columns["current_A"])
+
+
+def truth(plant: PlantParameters, side: str, gap_mm: np.ndarray) -> dict[str, float]:
+    """What the plant file says, in the identified quantities; friction and offset as means over the gaps of the log.
+
+    The delay runs from a row's positions to the middle of the millisecond in which its voltage acts: the Drive that
+    carries it arrives when the next positions are taken, but for the device's reply jitter, half of it in the mean.
+    """
+    motor, gear, screw = plant.motor, plant.gear, plant.screw
+    lead_m_rad = screw.lead_mm * 1e-3 / math.tau
+    k = gear.ratio * motor.back_emf_V_s_rad / lead_m_rad
+    mass = motor.inertia_kg_m2 * gear.ratio**2 / lead_m_rad**2
+    idle_N = gear.output_friction_Nm / lead_m_rad
+    drag_N = screw.drag_left_N if side == "left" else screw.drag_right_N
+    pull_N = np.asarray(pull_of_magnets_N(gap_mm, plant))
+    rub = screw.friction_coefficient * 0.5e-3 * plant.assumed.screw_mean_diameter_mm / lead_m_rad
+
+    def slow(direction: float) -> np.ndarray:
+        contact_N = pull_N + direction * drag_N
+        load_N = direction * contact_N + rub * np.abs(contact_N)
+        driving = idle_N + load_N / gear.efficiency
+        braking = np.maximum(idle_N + load_N, (load_N + gear.efficiency * idle_N) / (2.0 - gear.efficiency))
+        force_N: np.ndarray = np.where(load_N > 0.0, driving, braking) * direction
+        return force_N
+
+    opening, closing = slow(1.0), slow(-1.0)
+    return {
+        "gain_N_V": k / motor.resistance_Ohm,
+        "resistance_ohm": motor.resistance_Ohm,
+        "inductance_mH": motor.inductance_mH,
+        "back_emf_V_s_m": k,
+        "friction_viscous_N_s_m": 0.0,
+        "gear_efficiency": gear.efficiency,
+        "mass_kg": mass,
+        "viscous_N_s_m": k**2 / motor.resistance_Ohm,
+        "coulomb_N": float((opening - closing).mean()) / 2.0,
+        "offset_N": float((opening + closing).mean()) / 2.0,
+        "delay_s": 1.5 * 1e-3 - 0.5e-6 * plant.firmware.reply_jitter_us,
+        "time_constant_s": mass * motor.resistance_Ohm / k**2,
+    }
+
+
 @pytest.fixture(scope="module")
 def sample_log():
     """Half of what `tormagctl calibrate --motors` records, on simulated sample 3, in virtual time."""
-    return samples.to_log(motor_log(samples.record("sample_3", rounds=1), "left"))
+    return to_log(motor_log(record("sample_3", rounds=1), "left"))
 
 
 def test_true_values_of_a_simulated_sample_are_inside_their_intervals(sample_log):
     """The plant is richer than the models: backlash, a springy screw, losses in the gears, friction under load."""
     plant = load_plant("sample_3")
-    found = samples.compare(sample_log, plant, "left")
+    found = compare(sample_log, plant, "left")
     assert {name for name, row in found.items() if not row["inside"]} == set()
     # intervals that say something
     assert found["back_emf_V_s_m"]["ci95"] < 0.01 * found["back_emf_V_s_m"]["true"]
     for name, share in (("mass_kg", 0.15), ("gear_efficiency", 0.15), ("coulomb_N", 0.3), ("gain_N_V", 0.15)):
         assert found[name]["ci95"] < share * found[name]["true"]
-    without_current = samples.compare(sample_log._replace(current_A=None), plant, "left")
+    without_current = compare(sample_log._replace(current_A=None), plant, "left")
     assert {name for name, row in without_current.items() if not row["inside"]} == set()
     assert set(without_current) == {*identification.PARAMETERS, "delay_s", "time_constant_s"}
 

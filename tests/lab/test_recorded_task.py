@@ -3,7 +3,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tormagd.force_file import ForceFileError
 from tormagd.lab.design.recorded_task import read_task, task_of
 from tormagd.physics.errors import DomainError
 
@@ -35,23 +34,6 @@ def test_a_short_record_can_be_filtered() -> None:
     assert len(task_of(np.arange(5) * 0.01, np.ones(5), cutoff_Hz=10.0).force_N) == 5
 
 
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("t_s,force\n0,1\n", "no column force_N"),
-        ("", "no column t_s"),
-        ("t_s,force_N\n0,1\n0,1\n1,1\n", "row 3, t_s = 0: allowed is above the row before"),
-        ("t_s,force_N\n0,1\n1,one\n2,1\n", "row 3, force_N = 'one'"),
-        ("t_s,force_N\n0,1\n1\n2,1\n", "row 3 has 1 values"),
-        ("t_s,force_N\n0,1\n1,nan\n2,1\n", "force_N = 'nan'"),
-        ("t_s,force_N\n0,1\n1,inf\n2,1\n", "force_N = 'inf'"),
-    ],
-)
-def test_other_files_are_refused(tmp_path: Path, text: str, complaint: str) -> None:
-    with pytest.raises(ForceFileError, match=complaint):
-        read_task(write(tmp_path / "task.csv", text))
-
-
 def test_two_rows_are_no_task(tmp_path: Path) -> None:
     with pytest.raises(DomainError, match="3 times or more"):
         read_task(write(tmp_path / "task.csv", "t_s,force_N\n0,1\n1,1\n"))
@@ -61,10 +43,3 @@ def test_two_rows_are_no_task(tmp_path: Path) -> None:
 def test_impossible_cutoffs_are_refused(cutoff: float) -> None:
     with pytest.raises(DomainError, match="cutoff_Hz"):
         task_of(np.arange(50) * 0.01, np.ones(50), cutoff_Hz=cutoff)
-
-
-def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "task.csv"
-    path.write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(ForceFileError, match="UTF-8"):
-        read_task(path)

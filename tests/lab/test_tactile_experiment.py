@@ -56,7 +56,7 @@ def test_the_page_and_its_pictures_are_written(run, tmp_path):
     for line in page.splitlines():
         if line.startswith("!["):
             assert (tmp_path / line[line.index("(") + 1 : -1]).read_bytes().startswith(b"\x89PNG")
-    assert page.count("![") == 3
+    assert page.count("![") == 2
 
 
 def test_thesis_and_ours_stand_side_by_side(run):

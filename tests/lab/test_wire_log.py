@@ -1,6 +1,5 @@
 """A recorded session is read by stock CAN tools: cantools with the DBC, and python-can's own."""
 
-import contextlib
 import os
 import select
 import threading
@@ -17,17 +16,12 @@ import serial
 import firmware_protocol
 from firmware_protocol.codec import (
     FUNCTION,
-    PROTOCOL_VERSION,
-    SCHEMA_HASH,
     Drive,
     DriveMode,
-    Hello,
-    Home,
     Message,
     Sense,
     State,
     Status,
-    can_identifier,
     decode,
     encode,
 )
@@ -35,11 +29,6 @@ from firmware_protocol.framing import encode_frame
 from firmware_protocol.layouts import LAYOUTS
 from tormagd.lab import wire_log
 from tormagd.lab.main import main
-from tormagd.simulation.can_device import CanDevice
-from tormagd.simulation.can_door import CanDoor
-from tormagd.simulation.device import MessageDevice
-from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import load_plant
 
 DBC = Path(firmware_protocol.__file__).parent / "tormag.dbc"
 SECONDS = 0.2
@@ -113,45 +102,6 @@ def test_python_cans_viewer_reads_every_frame(
         message = ours(frame)
         ours_values = [float(getattr(message, name)) for name in message.__match_args__]
         assert values[: len(ours_values)] == pytest.approx(ours_values)
-
-
-@pytest.mark.parametrize("ending", ["log", "asc", "blf"])
-def test_a_log_written_through_tormagsim_is_read_by_stock_tools(
-    tmp_path: Path, database: cantools.database.can.Database, ending: str
-) -> None:
-    """A host and a stock logger are on the simulated bus; its time is virtual, its sockets are real."""
-    log = tmp_path / f"session.{ending}"
-    door = CanDoor(CanDevice(MessageDevice(load_plant("sample_1"), SteadyHand())), tmp_path / "can 1")
-    bus = {"interface": "tormagsim", "channel": door.address, "ignore_config": True}
-    sent: list[Message] = []
-    with contextlib.closing(door), can.Bus(**bus) as host, can.Bus(**bus) as listener, can.Logger(log) as logger:
-        for tick in range(60):
-            messages: list[Message] = [Drive(0.0, 0.0, DriveMode.OFF, tick)]
-            messages += [Hello(SCHEMA_HASH, PROTOCOL_VERSION, 255)] if tick == 0 else []
-            messages += [Home(1)] if tick == 30 else []
-            for message in messages:
-                identifier = can_identifier(FUNCTION[type(message)])
-                host.send(can.Message(arbitration_id=identifier, data=encode(message), is_extended_id=False))
-            sent += messages
-            for part in range(10):  # 0.1 ms each
-                readable, _, _ = select.select(door.descriptors(), [], [], 0.0)
-                door.exchange((tick + part / 10) * 1e-3, readable)
-            while (frame := listener.recv(0)) is not None:
-                frame.timestamp = tick * 1e-3
-                logger.on_message_received(frame)
-    with can.LogReader(log) as reader:
-        frames = list(reader)
-    names = [database.get_message_by_frame_id(frame.arbitration_id).name for frame in frames]
-    assert [ours(frame) for frame in frames if ours(frame) in sent] == sent
-    # one Drive may still be on its way back; Status comes every 20 ms
-    assert names.count("State") >= 59
-    assert (names.count("Identity"), names.count("Status")) == (1, 2)
-    for frame in frames:
-        signals = database.decode_message(frame.arbitration_id, frame.data, decode_choices=False)
-        assert isinstance(signals, dict)
-        message = ours(frame)
-        for name in message.__match_args__:
-            assert signals[name] == pytest.approx(float(getattr(message, name)))
 
 
 def test_what_is_no_frame_is_counted_and_not_logged(tmp_path: Path) -> None:

@@ -82,7 +82,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """The consoles; exit code 1 where a file was left out, which is told on stderr. Raises LabError, OSError."""
+    """The consoles; exit code 1 where a file was left out, 2 where --out failed. Raises LabError, OSError."""
     try:
         urls = files(options.recordings)
     except (ValueError, ImportError) as error:
@@ -94,8 +94,13 @@ def run(options: argparse.Namespace) -> Found:
         fleet = read_all(urls, executor, lambda finished, total: bar.update(finished - bar.n))
     for name, reason in fleet.left_out.items():
         write_line(f"tormag-lab fleet: left out {printable(name)}: {printable(reason)}", sys.stderr)
-    if options.out is not None:
-        write_parquet(fleet.summaries, options.out)
+    exit_code = 1 if fleet.left_out else 0
+    try:
+        if options.out is not None:
+            write_parquet(fleet.summaries, options.out)
+    except OSError as error:  # what was found is told all the same
+        write_line(f"tormag-lab fleet: {printable(str(error))}", sys.stderr)
+        exit_code = 2
     found = consoles(fleet.summaries.values())
     result = {"consoles": found, "recordings": fleet.summaries, "left_out": fleet.left_out}
-    return Found(msgspec.to_builtins(result), aligned([HEADINGS, *map(_cells, found)]), 1 if fleet.left_out else 0)
+    return Found(msgspec.to_builtins(result), aligned([HEADINGS, *map(_cells, found)]), exit_code)

@@ -6,8 +6,7 @@ cover. Volts and position alone fix only ratios to the gain: without `--gain-N-V
 null. Everything is referred to the carriage; `viscous_N_s_m` is the slope of gain times voltage over speed, the
 back-EMF's part included.
 
-The first half of the log is fitted and the second half judged; the parameters come from all of it. `--samples` makes
-such logs of the simulated device in virtual time and prints what was identified beside what is true.
+The first half of the log is fitted and the second half judged; the parameters come from all of it.
 """
 
 import argparse
@@ -30,22 +29,15 @@ VAGUE_SHARE = 0.5
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of `tormag-lab identify-motor`."""
-    parser.add_argument("log", type=Path, nargs="?", help="motor log CSV, or DATA_EMPS.mat")
+    parser.add_argument("log", type=Path, help="motor log CSV, or DATA_EMPS.mat")
     parser.add_argument("--gain-N-V", type=float, dest="gain", help="force per volt, N/V; replaces a current")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="measured against simulated voltage")
     parser.add_argument("--config", type=Path, help="whose gear ratio and screw lead hold; the defaults otherwise")
     parser.add_argument("--write-config", type=Path, metavar="FILE.toml", help="new file with the identified [motor]")
-    parser.add_argument("--samples", action="store_true", help="identify the simulated samples, beside the truth")
 
 
 def run(options: argparse.Namespace) -> Found:
     """The parameters. Raises LabError and ConfigError where the log or the configuration cannot be used."""
-    if options.samples == (options.log is not None):
-        raise LabError("give either a log or --samples")
-    if options.samples:
-        from tormagd.lab.motor import samples  # with the simulator behind it, which a log does not need
-
-        return samples.judged()
     log = read_log(options.log)
     result = identify(log, options.gain if options.gain is not None else log.gain_N_V)
     if options.write_config:

@@ -15,13 +15,12 @@ from tqdm import tqdm
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.lab.tactile import branches
-from tormagd.lab.tactile.models import FULL, QUICK, SPLIT_SEED, Effort, Trained, table_4_1, train
+from tormagd.lab.tactile.models import FULL, QUICK, Effort, Trained, table_4_1, train
 from tormagd.lab.tactile.plots import Material
 from tormagd.lab.tactile.pulse import hold, pulse
 from tormagd.lab.tactile.report import write_report
 from tormagd.lab.thesis.page import WAYS
 from tormagd.lab.training.dataset import Array
-from tormagd.lab.training.splits import random_split
 
 NOISES_N = (0.05, 0.5)
 TABLE_NOISE_N = 0.5
@@ -60,8 +59,7 @@ def whole(effort: Effort) -> tuple[dict[str, Any], Material]:
         },
     }
     predicted_N = tabled.model.predict(tabled.cycles.features)
-    held_out = random_split(len(predicted_N), SPLIT_SEED)
-    return figures, Material(tabled.cycles, predicted_N, held_out, tabled.training, traces)
+    return figures, Material(tabled.cycles, predicted_N, traces)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

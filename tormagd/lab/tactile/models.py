@@ -10,7 +10,6 @@ from tqdm import tqdm
 from tormagd.lab.training.dataset import Array, Dataset
 from tormagd.lab.training.fitting import fit_network
 from tormagd.lab.training.grey_box import GreyBox, fit_grey_box
-from tormagd.lab.training.levenberg_marquardt import Training
 from tormagd.lab.training.metrics import force_metrics
 from tormagd.lab.training.splits import Mask, leave_cycles_out, leave_one_out, random_split
 from tormagd.model.features import FEATURES
@@ -60,14 +59,13 @@ QUICK = Effort(24, 280, 15, 12, 4, 4, 5, 60.0, 24)
 class Trained:
     """What was trained on cycles with sensor noise `noise_N`: the thesis's network, and a model of the pad in use.
 
-    `model` learned from the three classes, and `training` says how that went. `grey`, the relaxation-aware model,
+    `model` learned from the three classes. `grey`, the relaxation-aware model,
     learned from the cycles of one class and from relaxation tests of it, as a laboratory would do with its pad.
     """
 
     noise_N: float
     cycles: PadRecord
     model: ForceModel
-    training: Training
     grey: GreyBox
 
 
@@ -81,7 +79,7 @@ def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
     cycles = cyclic_records(noise_N, seed, samples_per_cycle=effort.samples_per_cycle)
     data = dataset(cycles)
     known = ~random_split(len(data), SPLIT_SEED)
-    model, training = fit_network(data, known, epochs=effort.epochs)
+    model, _ = fit_network(data, known, epochs=effort.epochs)
     pad = PADS[PAD_IN_USE]
     own = data.features[:, CIP] == pad.cip_percent
     grey = fit_grey_box(
@@ -91,7 +89,7 @@ def train(noise_N: float, effort: Effort, seed: int = 0) -> Trained:
         epochs=effort.pad_epochs,
         settling_epochs=effort.settling_epochs,
     )
-    return Trained(noise_N, cycles, model, training, grey)
+    return Trained(noise_N, cycles, model, grey)
 
 
 def table_4_1(trained: Trained, effort: Effort) -> dict[str, Any]:

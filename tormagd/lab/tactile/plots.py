@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from tormagd.lab.tactile.models import SCORED_SLOPE_N_MT
 from tormagd.lab.training.dataset import Array
-from tormagd.lab.training.levenberg_marquardt import Training
-from tormagd.lab.training.splits import Mask
 from tormagd.simulation.pad import PadRecord
 
 CLASSES = {25.0: "MRE-A, 25 %", 35.0: "MRE-B, 35 %", 45.0: "MRE-C, 45 %"}
@@ -22,8 +20,6 @@ class Material(NamedTuple):
 
     cycles: PadRecord
     predicted_N: Array
-    held_out: Mask
-    training: Training
     pulses: dict[str, Array]
 
 
@@ -31,7 +27,6 @@ def pictures(material: Material) -> dict[str, Figure]:
     """Every picture by the name of its file."""
     return {
         "tactile_fit": _fit(material),
-        "tactile_training": _training(material),
         "tactile_pulse": _pulse(material.pulses),
     }
 
@@ -71,29 +66,6 @@ def _fit(material: Material) -> Figure:
             axis.plot(displacement_mm, material.predicted_N[rows], lw=1, color="black")
     axes[0].plot([], [], color="black", label="network")
     axes[0].legend()
-    return figure
-
-
-def _training(material: Material) -> Figure:
-    figure = Figure(figsize=(11, 3.8), layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
-    epochs = [epoch.epoch for epoch in material.training.history]
-    left.semilogy(epochs, [epoch.train_rmse_N for epoch in material.training.history], label="training")
-    left.semilogy(epochs, [epoch.validation_rmse_N for epoch in material.training.history], "--", label="validation")
-    left.set(xlabel="epoch", ylabel="force error, N rms", title="Levenberg-Marquardt (figure 4.5a)")
-    left.legend()
-    held = np.flatnonzero(material.held_out)[::7]
-    measured, predicted = material.cycles.force_N[held], material.predicted_N[held]
-    middle.plot(measured, predicted, ".", ms=2, alpha=0.4)
-    middle.plot([0, measured.max()], [0, measured.max()], color="black", lw=0.8)
-    middle.set(xlabel="force of the test rows, N", ylabel="predicted, N", title="Test rows (figure 4.5b)")
-    right.hist((predicted - measured), bins=80, density=True, label="network - data")
-    noise = (material.cycles.true_force_N - material.cycles.force_N)[held]
-    right.hist(noise, bins=80, density=True, histtype="step", color="black", label="the sensor's noise")
-    right.set(xlabel="force error of the test rows, N", title="Against the noise floor")
-    right.margins(y=0.3)
-    right.legend(loc="upper left")
-    figure.suptitle("Training of the 4-50-1 network (synthetic data)")
     return figure
 
 

@@ -89,7 +89,7 @@ def _table_4_1(data: Json) -> str:
         "An inverse needs a force that rises with the field. dF/dB <= 0 on this share of the training box, contents "
         "between the classes included, and of the places where the pad itself rises by 0.03 N/mT or more: network "
         f"{network}, relaxation-aware model {aware}. There the searches answer by continuity.\n\n"
-        "![data and network](images/tactile_fit.png)\n![training](images/tactile_training.png)\n"
+        "![data and network](images/tactile_fit.png)\n"
     )
 
 

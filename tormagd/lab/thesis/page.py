@@ -66,14 +66,11 @@ def summary(result: Json) -> Iterator[str]:
     for row in readings(result["table_2_5"]):
         yield f"table 2.5   {row[0]}: {row[1]}, {row[3]} of the width; strictly {row[7]}"
     yield f"figure 2.5  {result['figure_2_5']['eq_7']['working_point_N']} N (thesis {list(FIGURE_2_5_N)})"
-    for row in result["figure_2_7"]["rows"]:
-        yield f"figure 2.7  {row['insert']}: {', '.join(f'{force:.2f}' for force in row['simulated_N'])} N"
     for row in optima["best"]:
         yield (
             f"table 3.2   use case {row['use_case']}, {row['objective']}: {row['coverage']:.2%}, "
             f"starts within {row['spread']:.3%}"
         )
-    yield f"            slowest start {optima['max_seconds']:.2f} s of one core"
     learned, pulse = result["table_4_1"], result["pulse"]
     yield (
         f"table 4.1   synthetic: R2 {learned['random']['r2']:.4f}, MAE {learned['random']['mae_N']:.3f} N (noise alone "

@@ -132,10 +132,12 @@ def read_csv(path: Path) -> Dataset:
     Raises `LabError` naming the row of the file, the column, the value and what is allowed.
     """
     named = read_columns(path, COLUMNS, OPTIONAL_COLUMNS, allowed=ALLOWED, is_exact=True)
-    cycle = named.get("cycle")
-    if cycle is not None and (cycle % 1.0).any():
-        row = int(np.flatnonzero(cycle % 1.0)[0])
-        raise LabError(f"{path}: row {row + 2}, cycle: '{cycle[row]:g}' is not allowed, only whole numbers")
+    cycle = None
+    if "cycle" in named:
+        cycle = named["cycle"].astype(np.int64)
+        for row in np.flatnonzero(cycle != named["cycle"])[:1].tolist():
+            found = named["cycle"][row]
+            raise LabError(f"{path}: row {row + 2}, cycle: '{found:g}' is not allowed, only whole numbers")
     return Dataset(np.column_stack([named[name] for name in FEATURES]), named["force_N"], cycle, named.get("time_s"))
 
 
