@@ -7,6 +7,7 @@ Exit status 0 if all held.
 
 import argparse
 import json
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -21,11 +22,11 @@ DEVICE_WAITS_MS = 50.0
 
 
 class Case(NamedTuple):
-    """A module of `endurance`, how much of what it takes in full, and what else its `run` wants. One `on_stand` wants a
+    """A module of `endurance`, how much is taken `in_full`, and what else its `run` wants. One `on_stand` wants a
     daemon and a device before all else."""
 
     module: str
-    count: int
+    in_full: int
     of: str
     more: tuple[str, ...] = ()
     on_stand: bool = False
@@ -46,15 +47,16 @@ CASES = {
 def main(arguments: list[str] | None = None) -> int:
     """Runs a case and prints its figures; 0 if it held, 1 if not."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    counts = ", ".join(f"{name} {case.count:,} {case.of}" for name, case in CASES.items())
+    counts = ", ".join(f"{name} {case.in_full:,} {case.of}" for name, case in CASES.items())
     parser.add_argument("case", choices=CASES)
     parser.add_argument("--count", type=int, help=f"default: {counts}")
     parser.add_argument("--seed", type=int, default=1, help="of what is drawn (1)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(arguments)
-    count = CASES[options.case].count if options.count is None else options.count
+    count = CASES[options.case].in_full if options.count is None else options.count
     if count < 1:
         parser.error(f"--count {count}: allowed is at least 1")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # what was begun is ended
     result = measured(options.case, count, options.seed)
     print(json.dumps(result, indent=None if options.json else 1))
     return 0 if result["passed"] else 1

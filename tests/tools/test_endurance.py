@@ -12,7 +12,7 @@ from endurance.stand import Stand
 from endurance.walk import ALLOWED, DRIVEN, BrokenRuleError, Walk
 
 from firmware_protocol.codec import decode as decoded, encode
-from firmware_protocol.framing import Frame, FrameDecoder, FramingStatistics
+from firmware_protocol.framing import Frame, FrameDecoder, FramingStatistics, encode_frame
 from tormagd.config import Config
 from tormagd.control.core import build_core
 from tormagd.daemon.inbox import SetpointInbox
@@ -121,7 +121,7 @@ def test_traffic_is_valid_and_damage_damages(receiver: str) -> None:
     for _ in range(300):
         function, payload = fuzz.drawn(draw, receiver)
         assert encode(decoded(function, payload)) == payload
-        frame = fuzz.encode_frame(function, 1, payload)
+        frame = encode_frame(function, 1, payload)
         assert all(fuzz.damaged(kind, draw, frame, frame + b"\1") != frame for kind in fuzz.WIRE_DAMAGE[:3])
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from endurance.stand import Figures, Stand
+from endurance.stand import Figures, Stand, used
 
 CLOSING_MM = 85.0
 "The gap when the device is unplugged, on its way from 95."
@@ -49,7 +49,7 @@ def _cycle(stand: Stand, transport: str, draw: random.Random) -> dict[str, Any]:
         stand.ask(draw.uniform(1.4, 1.8))
         stand.until(lambda _status: any(_gap_mm(tick) < CLOSING_MM for tick in read()), "the gap closes")
         pulled_s = time.monotonic()
-        stand.device.child.kill()
+        stand.device.kill()
         time.sleep(draw.uniform(*DOWN_S))
         stand.plug_in(transport)
         status = stand.until(lambda status: status["link"]["state"] == "RUNNING", "the device is back")
@@ -58,10 +58,11 @@ def _cycle(stand: Stand, transport: str, draw: random.Random) -> dict[str, Any]:
     failures = [] if status["operating_state"] == "FAULT" else [f"{status['operating_state']} after a loss"]
     if any(tick["operating_state"] == "ENABLED" for tick in ticks if tick["monotonic_s"] > lost_s):
         failures.append("armed again by itself")
+    descriptors, resident_kB = used(stand.daemon)
     return {
         "lost_after_ms": round(1e3 * (lost_s - pulled_s), 1),
-        "descriptors": stand.daemon.descriptors(),
-        "resident_kB": stand.daemon.resident_kB(),
+        "descriptors": descriptors,
+        "resident_kB": resident_kB,
         "failures": failures,
     }
 

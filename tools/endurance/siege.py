@@ -1,9 +1,9 @@
 """Who troubles the daemon gets nowhere, and `stop` is heard beside it.
 
-One attack after the other runs as a process of its own: a hundred clients that ask without pause; hostile messages, each
-a valid one with one thing done to it that has to be refused; strangers that show no key, a wrong one, one that is not
-listed or one for something else; 10^5 messages a second to one endpoint. Meanwhile force is held and stopped, over and
-over: nothing but the stop may latch, nothing hostile be taken, and what was refused or dropped is counted.
+One attack after the other runs as a process of its own: a hundred clients that ask without pause; hostile messages,
+each a valid one with one thing done to it that has to be refused; strangers that show no key, a wrong one, one that is
+not listed or one for something else; 10^5 messages a second to one endpoint. Meanwhile force is held and stopped, over
+and over: nothing but the stop may latch, nothing hostile be taken, and what was refused or dropped is counted.
 """
 
 import contextlib
@@ -80,24 +80,18 @@ def hostile(draw: random.Random, valid: dict[str, Any], not_allowed: dict[str, t
     """The parts of one message that must not be taken, made of a valid one."""
     packed: bytes = msgpack.packb(valid)
     name, lacking = draw.choice(list(not_allowed)), draw.choice([field for field in valid if field != "args"])
-    match draw.randrange(9):
-        case 0:
-            return [b"\xc1" + draw.randbytes(draw.randrange(200))]
-        case 1:
-            return [packed[: draw.randrange(len(packed))]]
-        case 2:
-            return [packed + draw.randbytes(draw.randrange(1, 9))]
-        case 3:
-            return [msgpack.packb({field: value for field, value in valid.items() if field != lacking})]
-        case 4:
-            return [msgpack.packb(valid | {lacking: draw.choice(MISTYPED)})]
-        case 5:
-            return [msgpack.packb(valid | {name: draw.choice(not_allowed[name])})]
-        case 6:
-            return [draw.choice((b"\x91", b"\x81\xa1v")) * draw.choice((32, 1_000, 5_000))]
-        case 7:
-            return [draw.choice(HEADS) + packed]
-    return [packed] * draw.randrange(2, 6)
+    ways = (
+        [b"\xc1" + draw.randbytes(draw.randrange(200))],
+        [packed[: draw.randrange(len(packed))]],
+        [packed + draw.randbytes(draw.randrange(1, 9))],
+        [msgpack.packb({field: value for field, value in valid.items() if field != lacking})],
+        [msgpack.packb(valid | {lacking: draw.choice(MISTYPED)})],
+        [msgpack.packb(valid | {name: draw.choice(not_allowed[name])})],
+        [draw.choice((b"\x91", b"\x81\xa1v")) * draw.choice((32, 1_000, 5_000))],
+        [draw.choice(HEADS) + packed],
+        [packed] * draw.randrange(2, 6),
+    )
+    return draw.choice(ways)
 
 
 def paced(per_s: float, stop: Event) -> Iterator[int]:
@@ -114,13 +108,11 @@ def busy_clients(endpoints: Endpoints, _keys: Path, stop: Event, times: Any) -> 
     """Clients that ask for status again as soon as they are answered."""
     request = encode(Request(v=VERSION, id=0, command="status"))
     with zmq.Context() as context:
-        poller = zmq.Poller()
-        for _ in range(CLIENTS):
-            client = _peer(context, zmq.DEALER, endpoints.control)
+        clients = [_peer(context, zmq.DEALER, endpoints.control) for _ in range(CLIENTS)]
+        for client in clients:
             client.send(request)
-            poller.register(client, zmq.POLLIN)
         while not stop.is_set():
-            for client, _ in poller.poll(100):
+            for client in clients:
                 client.recv()
                 client.send(request)
                 times.value += 1
@@ -166,13 +158,10 @@ def strangers(endpoints: Endpoints, keys: Path, stop: Event, times: Any) -> None
     with zmq.Context() as context:
         alive: list[tuple[float, zmq.Socket[bytes]]] = []
         for number in paced(STRANGERS_PER_S, stop):
-            peer: zmq.Socket[bytes] = context.socket(zmq.SUB)
-            peer.linger, peer.reconnect_ivl = 0, -1
             kind = number % 4
-            if kind:  # the others show nothing
-                peer.curve_publickey, peer.curve_secretkey = publisher if kind == 3 else zmq.curve_keypair()
-                peer.curve_serverkey = zmq.curve_keypair()[0] if kind == 1 else server
-            peer.connect(endpoints.telemetry)
+            pair = publisher if kind == 3 else zmq.curve_keypair()
+            shown = (*pair, zmq.curve_keypair()[0] if kind == 1 else server) if kind else ()
+            peer = _peer(context, zmq.SUB, endpoints.telemetry, shown)
             alive.append((time.monotonic(), peer))
             while alive[0][0] < time.monotonic() - LIVES_S:
                 alive.pop(0)[1].close()
@@ -180,9 +169,11 @@ def strangers(endpoints: Endpoints, keys: Path, stop: Event, times: Any) -> None
         context.destroy(linger=0)
 
 
-def _peer(context: "zmq.Context[Any]", kind: int, address: str) -> "zmq.Socket[bytes]":
+def _peer(context: "zmq.Context[Any]", kind: int, address: str, keys: tuple[bytes, ...] = ()) -> "zmq.Socket[bytes]":
     peer: zmq.Socket[bytes] = context.socket(kind)
     peer.linger = 0
+    if keys:
+        peer.curve_publickey, peer.curve_secretkey, peer.curve_serverkey = keys
     peer.connect(address)
     return peer
 

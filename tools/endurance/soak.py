@@ -1,6 +1,7 @@
 """The same thing for a long time: does memory grow, do descriptors leak, is every tick recorded?
 
-A daemon renders force, is recorded, and a new client asks for its status every half second. Growth counts after two minutes, or a quarter of a shorter time, when what is made once has been made.
+A daemon renders force, is recorded, and a new client asks for its status every half second. Growth counts after two
+minutes, or a quarter of a shorter time, when what is made once has been made.
 """
 
 import math
@@ -12,7 +13,7 @@ import msgspec
 from mcap.reader import make_reader
 from tqdm import tqdm
 
-from endurance.stand import PATIENCE_S, Figures, Stand, end
+from endurance.stand import PATIENCE_S, Figures, Stand, end, used
 from tormagd.recording.writer import TICKS_TOPIC
 from tormagd_client import Client
 
@@ -40,9 +41,10 @@ def run(stand: Stand, count: int, seed: int) -> Figures:
         if stand.see_faults(since_s):
             stand.arm()
         for name, process in processes.items():
-            memory_kB[name].append(process.resident_kB())
-            descriptors[name].append(process.descriptors())
-    end(processes["recorder"].child)
+            now = used(process)
+            descriptors[name].append(now[0])
+            memory_kB[name].append(now[1])
+    end(processes["recorder"])
     grown_kB = {name: growth(values) for name, values in memory_kB.items()}
     stayed = {name: staying(values) for name, values in descriptors.items()}
     ticks = recorded(path)

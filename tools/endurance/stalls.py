@@ -84,7 +84,7 @@ def _hold(stand: Stand) -> None:
 
 
 def _stop(stand: Stand, process: str, pause_ms: float) -> Stop:
-    child = (stand.daemon if process == "daemon" else stand.device).child
+    child = stand.daemon if process == "daemon" else stand.device
     began_ns = time.time_ns()
     child.send_signal(signal.SIGSTOP)
     # a sleep may end late, which a stop must not: the last stretch is waited for awake

@@ -44,21 +44,6 @@ class Latched(NamedTuple):
     end_s: float
 
 
-class Process(NamedTuple):
-    """One of ours, and what /proc says of it."""
-
-    child: "subprocess.Popen[str]"
-
-    def descriptors(self) -> int:
-        """Files open now."""
-        return len(list(Path(f"/proc/{self.child.pid}/fd").iterdir()))
-
-    def resident_kB(self) -> int:
-        """Memory in use."""
-        pages = int(Path(f"/proc/{self.child.pid}/statm").read_text().split()[1])
-        return pages * os.sysconf("SC_PAGE_SIZE") // 1024
-
-
 class Stand:
     """Daemon, device and an operator's client. All of it ends with `stack`."""
 
@@ -90,7 +75,7 @@ class Stand:
         self.client = stack.enter_context(Client(self.endpoints, 2.0))
         self.until(lambda status: status["link"]["state"] == "RUNNING", "the link runs")
 
-    def begin(self, *arguments: str) -> Process:
+    def begin(self, *arguments: str) -> "subprocess.Popen[str]":
         """A Python of ours, what it says kept in the folder."""
         log = self._stack.enter_context((self.folder / "log").open("a"))
         environment = os.environ | {"OMP_NUM_THREADS": "1"}
@@ -98,14 +83,14 @@ class Stand:
             [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=log, text=True, env=environment
         )
         self._stack.callback(end, child)
-        return Process(child)
+        return child
 
     def plug_in(self, transport: str) -> None:
         """Begins a device; a symbolic link to its line stands for the stable name that udev gives a real one."""
         simulated = ("--seed", "1", "--truth", str(self.folder / "truth.csv"))
         self.device = self.begin(*own_machine(DEVICE_PRIORITY, "tormagd.simulation", DOORS[transport], *simulated))
-        assert self.device.child.stdout is not None
-        line, port = self.device.child.stdout.readline().strip(), self.folder / "device"
+        assert self.device.stdout is not None
+        line, port = self.device.stdout.readline().strip(), self.folder / "device"
         port.unlink(missing_ok=True)
         port.symlink_to(line)
 
@@ -123,7 +108,7 @@ class Stand:
     def until(self, reached: Callable[[dict[str, Any]], bool], what: str) -> dict[str, Any]:
         """The status in which that is so. Raises TimeoutError saying what was waited for, and the last words."""
         until_s = time.monotonic() + PATIENCE_S
-        while time.monotonic() < until_s and self.daemon.child.poll() is None:
+        while time.monotonic() < until_s and self.daemon.poll() is None:
             with contextlib.suppress(ClientError):
                 if reached(status := self.status()):
                     return status
@@ -172,13 +157,20 @@ class Stand:
 
     def truth(self) -> npt.NDArray[np.float64]:
         """Ends the device; what no sensor has seen, columns t_ns, force_N and gap_mm."""
-        end(self.device.child)
+        end(self.device)
         return np.loadtxt(self.folder / "truth.csv", delimiter=",", skiprows=1, usecols=(0, 1, 2), ndmin=2)
 
     def unhandled(self) -> list[str]:
         """What the processes said of what nobody has handled."""
         lines = (self.folder / "log").read_text(encoding="utf-8", errors="replace").splitlines()
         return [line for line in lines if any(sign in line for sign in UNHANDLED)]
+
+
+def used(child: "subprocess.Popen[str]") -> tuple[int, int]:
+    """Descriptors and memory in kB that a process has now."""
+    folder = Path(f"/proc/{child.pid}")
+    pages = int((folder / "statm").read_text().split()[1])
+    return len(list((folder / "fd").iterdir())), pages * os.sysconf("SC_PAGE_SIZE") // 1024
 
 
 def is_at_rest(status: dict[str, Any]) -> bool:

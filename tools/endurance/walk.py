@@ -49,8 +49,7 @@ class Walk:
     def __init__(self, stepper: Stepper, duty_limit: float, seed: int) -> None:
         self._stepper, self._limit, self._random = stepper, duty_limit, random.Random(seed)
         self.steps = self.driven = 0
-        self.faults: Counter[Fault] = Counter()
-        self.ways: Counter[tuple[str, OperatingState, OperatingState]] = Counter()
+        self.ways: Counter[str] = Counter()
         self.begin()
 
     def begin(self) -> None:
@@ -115,9 +114,7 @@ class Walk:
             return
         if target is not ALLOWED[event, source] and not (event is Event.STOP and Fault.STOPPED in before.faults):
             raise BrokenRuleError(f"{event} in {source} led to {target}: allowed is {ALLOWED[event, source]}")
-        self.faults.update(new)
-        if source is not target:
-            self.ways[str(event), source, target] += 1
+        self.ways[f"{source} to {target} by {event}"] += source is not target
 
     def _some(self, low: float, high: float) -> float:
         draw = self._random
@@ -185,7 +182,6 @@ def run(count: int, seed: int) -> dict[str, Any]:
     return {
         "steps": walk.steps,
         "driven": walk.driven,
-        "faults": {str(fault): met for fault, met in sorted(walk.faults.items())},
-        "ways": {f"{source} to {target} by {event}": taken for (event, source, target), taken in walk.ways.items()},
+        "ways": +walk.ways,
         "failures": failures,
     }
