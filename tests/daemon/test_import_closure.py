@@ -8,7 +8,7 @@ import sys
 import tormagd.daemon.daemon, tormagd.daemon.main, tormagd.control.core
 import tormagd.hardware.serial_backend, tormagd.hardware.can_backend
 names = sorted(sys.modules)
-print(*[name for name in names if name.startswith(("tormagd.", "firmware_protocol.")) and "__mypyc" not in name])
+print(*[name for name in names if name.startswith(("tormagd.", "tormagd_client.", "firmware_protocol.")) and "__mypyc" not in name])
 print(*sorted({name.partition(".")[0] for name in names} & set(sys.argv[1:])))
 """
 ROOMS = {
@@ -22,7 +22,6 @@ ROOMS = {
     "inverse",
     "keeping",
     "keys",
-    "messages",
     "model",
     "output",
     "physics",
@@ -54,6 +53,13 @@ def test_the_daemon_loads_the_model_and_nothing_of_its_training() -> None:
     ours, libraries = done.stdout.splitlines()
     rooms = {name.split(".")[1] for name in ours.split() if name.startswith("tormagd.")}
     assert rooms == ROOMS
+    assert {name for name in ours.split() if name.startswith("tormagd_client.")} == {
+        "tormagd_client.endpoints",
+        "tormagd_client.keys",
+        "tormagd_client.messages",
+        "tormagd_client.printable",
+        "tormagd_client.regular_file",
+    }
     assert {name for name in ours.split() if name.startswith("tormagd.model.")} == {
         "tormagd.model.displacement",
         "tormagd.model.features",

@@ -40,9 +40,7 @@ class Client:
         self._numbering = Numbering(source)
         self._context = zmq.Context()
         self._ids = itertools.count(1)
-        self._control: zmq.Socket[bytes] | None = None
-        self._setpoints: zmq.Socket[bytes] | None = None
-        self._telemetry: zmq.Socket[bytes] | None = None
+        self._sockets: dict[int, zmq.Socket[bytes]] = {}
         self._is_taken = False
 
     @classmethod
@@ -56,18 +54,17 @@ class Client:
 
     def ask(self, command: str, **args: Any) -> Pending:
         """Give `command` and do not wait: what `answer` is asked with."""
-        if self._control is None:
-            self._control = self._opened(zmq.DEALER, self._endpoints.control)
         pending = Pending(next(self._ids), command)
-        self._control.send(asked(pending, args))
+        self._socket(zmq.DEALER, self._endpoints.control).send(asked(pending, args))
         return pending
 
     def answer(self, pending: Pending, wait_s: float = 0.0) -> dict[str, Any] | None:
         """The result of what was asked; None where it does not come within `wait_s`. Raises as `request`."""
         deadline_s = time.monotonic() + wait_s
         left_s = wait_s
-        while self._control is not None and left_s >= 0.0 and self._control.poll(round(left_s * 1e3)):
-            result = answered(self._control.recv_multipart()[-1], pending)
+        control = self._socket(zmq.DEALER, self._endpoints.control)
+        while left_s >= 0.0 and control.poll(round(left_s * 1e3)):
+            result = answered(control.recv_multipart()[-1], pending)
             if result is not None:
                 return result
             left_s = deadline_s - time.monotonic()  # it was the late answer to a request that was given up
@@ -101,30 +98,27 @@ class Client:
         Waits until the daemon takes setpoints: the first time, and where it has gone since. Raises ValueError naming
         what is not allowed, and UnreachableError where nobody takes setpoints within `wait_s`.
         """
-        if self._setpoints is None:
-            # XPUB speaks to SUB as PUB does, and is told of the subscription: without that the first would be lost
-            self._setpoints = self._opened(zmq.XPUB, self._endpoints.setpoint)
-        while self._setpoints.poll(0 if self._is_taken else round(self._wait_s * 1e3)):
-            self._is_taken = self._setpoints.recv().startswith(SUBSCRIBED)
+        # XPUB speaks to SUB as PUB does, and is told of the subscription: without that the first would be lost
+        setpoints = self._socket(zmq.XPUB, self._endpoints.setpoint)
+        while setpoints.poll(0 if self._is_taken else round(self._wait_s * 1e3)):
+            self._is_taken = setpoints.recv().startswith(SUBSCRIBED)
         if not self._is_taken:
             raise unreachable(self._endpoints.setpoint, f"nobody takes setpoints there within {self._wait_s:g} s")
-        self._setpoints.send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
+        setpoints.send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
 
     def telemetry(self, wait_s: float = 0.0) -> list[Telemetry]:
         """What has arrived since the last call, the oldest first; waits up to `wait_s` for the first. Listens from the
         first call on. Raises MessageError for what is none."""
-        if self._telemetry is None:
-            self._telemetry = self._opened(zmq.SUB, self._endpoints.telemetry)
+        socket = self._socket(zmq.SUB, self._endpoints.telemetry)
         arrived: list[Telemetry] = []
-        while self._telemetry.poll(0 if arrived else round(wait_s * 1e3)):
-            arrived.append(decode(self._telemetry.recv_multipart()[-1], Telemetry))
+        while socket.poll(0 if arrived else round(wait_s * 1e3)):
+            arrived.append(decode(socket.recv_multipart()[-1], Telemetry))
         return arrived
 
     def close(self) -> None:
         """Close the connections; setpoints that are on their way get a moment."""
-        for socket in (self._control, self._setpoints, self._telemetry):
-            if socket is not None:
-                socket.close()
+        for socket in self._sockets.values():
+            socket.close()
         self._context.term()
 
     def __enter__(self) -> Self:
@@ -141,5 +135,7 @@ class Client:
             raise unreachable(self._endpoints.control, f"no answer within {wait_s:g} s")
         return result
 
-    def _opened(self, kind: int, address: str) -> "zmq.Socket[bytes]":
-        return opened(self._context.socket(kind), address, self._keys)
+    def _socket(self, kind: int, address: str) -> "zmq.Socket[bytes]":
+        if kind not in self._sockets:
+            self._sockets[kind] = opened(self._context.socket(kind), address, self._keys)
+        return self._sockets[kind]
