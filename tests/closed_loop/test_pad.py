@@ -20,15 +20,15 @@ PRESSED_S, PULSE_S = 14.0, 5.0
 
 
 @pytest.fixture(scope="module")
-def core() -> Core:
+def pad_core() -> Core:
     return build_core(CONFIG)
 
 
 @pytest.mark.parametrize("plant", ["pad_1", "pad_2"])
-def test_a_pulse_is_felt_on_the_pad(arm, core: Core, plant: str) -> None:
+def test_a_pulse_is_felt_on_the_pad(arm, pad_core: Core, plant: str) -> None:
     """On the pad of the model, and on a weaker one that relaxes more."""
     time_s, force_N = asked(SCENE.signal, scene_path("radial_pulse").parent, (3.2, 3.9), PULSE_S, 100)
-    loop = arm(plant, PressingHand(2.0), core=core, config=CONFIG)
+    loop = arm(plant, PressingHand(2.0), core=pad_core, config=CONFIG)
 
     def publish(now_s: float) -> TimedSetpoint:
         stamp_s = math.floor(100.0 * now_s) / 100.0
@@ -59,10 +59,10 @@ def test_a_hold_of_plans_alone_is_that_of_the_whole_device() -> None:
     assert whole["last_force_error"] == pytest.approx(coarse["last_force_error"], abs=1e-3)
 
 
-def test_a_finger_that_presses_too_hard_opens_the_gap_and_is_no_fault(arm, core: Core) -> None:
+def test_a_finger_that_presses_too_hard_opens_the_gap_and_is_no_fault(arm, pad_core: Core) -> None:
     """Its force is the finger's own: more than the scene's greatest by far, at any gap."""
     hand = RecordedHand((0.0, 3.0, 4.0), (0.0, 0.0, 4.0))
-    loop = arm("pad_1", hand, core=core, config=CONFIG)
+    loop = arm("pad_1", hand, core=pad_core, config=CONFIG)
     last = list(loop.run(4.5, lambda now_s: TimedSetpoint(3.6, now_s, 0.1)))[-1]
     assert last.truth.force_N > 1.5 * SCENE.force.most_N
     assert Limit.OVER_FORCE in last.output.limits

@@ -8,7 +8,8 @@ import sys
 import tormagd.daemon.daemon, tormagd.daemon.main, tormagd.control.core
 import tormagd.hardware.serial_backend, tormagd.hardware.can_backend
 names = sorted(sys.modules)
-print(*[name for name in names if name.startswith(("tormagd.", "tormagd_client.", "firmware_protocol.")) and "__mypyc" not in name])
+ours = [name for name in names if name.startswith(("tormagd.", "tormagd_client.", "firmware_protocol."))]
+print(*[name for name in ours if "__mypyc" not in name])
 print(*sorted({name.partition(".")[0] for name in names} & set(sys.argv[1:])))
 """
 ROOMS = {

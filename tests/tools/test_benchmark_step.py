@@ -5,7 +5,7 @@ import pytest
 from benchmarks import step
 
 from tormagd.config import Config
-from tormagd.lab.tune_position import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG
+from tormagd.lab.tune_position import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG, corner_margins
 from tormagd.simulation.parameters import load_plant
 
 
@@ -40,6 +40,6 @@ def test_a_wrong_motor_is_noticed_in_the_comparison():
 
 
 def test_the_shipped_gains_are_robust():
-    corners = step.corner_margins(Config())
+    corners = corner_margins(Config())
     assert corners["gain_margin_dB"] >= LEAST_GAIN_MARGIN_DB
     assert corners["phase_margin_deg"] >= LEAST_PHASE_MARGIN_DEG

@@ -21,11 +21,11 @@ from tormagd.control.profile import ProfileError
 from tormagd.ctl.waveform import read_csv
 from tormagd.daemon.profiles import ProfileFolder
 from tormagd.force_file import ForceFileError
-from tormagd.keys import load_pair
 from tormagd.model.model_file import ModelFileError, load_model
 from tormagd.output import printable
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.parameters import PlantError, load_plant
+from tormagd_client.keys import load_pair
 
 TERABYTE = 1 << 40
 WITHIN_S, MEMORY_MB = 1.0, 100.0

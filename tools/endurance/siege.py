@@ -25,8 +25,8 @@ from tqdm import tqdm
 from endurance.stand import Figures, Stand
 from tormagd.config import Endpoints
 from tormagd.daemon.endpoint import SETPOINTS_PER_S
-from tormagd.keys import PUBLIC, SECRET, SERVER, load_pair, load_public
 from tormagd.safety.operating_state import DeviceRequest
+from tormagd_client.keys import PUBLIC, SECRET, SERVER, load_pair, load_public
 from tormagd_client.messages import VERSION, Reply, Request, decode, encode
 
 CLIENTS = 100

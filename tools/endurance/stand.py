@@ -19,9 +19,9 @@ from machines.own import own_machine
 from machines.wire import carried
 
 from tormagd.config import load_config
-from tormagd.keys import SECRET, SERVER, generate
 from tormagd.recording.ticks import decode_ticks
 from tormagd_client import Client, ClientError
+from tormagd_client.keys import SECRET, SERVER, generate
 
 FIFO_PRIORITY, DEVICE_PRIORITY = 50, 55
 "Of the daemon, and of the device, which stands for a machine of its own. Only where they are granted."

@@ -53,7 +53,7 @@ def sections(figures: Json) -> Iterator[str]:
         "## Held for ten minutes and for an hour\n\n"
         "Pulses between 148 and 154 N rendered by feed-forward alone at 10 Hz, virtual time; greatest force error.\n\n"
         + table(("model", "10 min", "1 h"), held)
-        + "\nHow long a search takes is measured by `tools/benchmark.py inverse`."
+        + "\nHow long a search takes stands in the [inverse trade](inverse_trade.md)."
     )
 
 
