@@ -123,7 +123,7 @@ def _terms(scenes: tuple[MeasuredScene, ...]) -> str:
         "be told from a scene that is not met, so it requires all. `vitreoretinal` asks for forces that lie below the "
         "device's least, from a handle that is too slow to teach what the device is. "
         f"All terms run, whatever is required, in {', '.join(whole)}: they say so. What was asked once about single "
-        "terms is answered in [a decision](decisions/0012-what-a-scene-requires.md).\n\n"
+        "terms is answered in [a decision](decisions/0009-what-a-scene-requires.md).\n\n"
         + _table(["scene", *(f"`{term}`" for term in TERMS)], rows)
     )
 
