@@ -14,15 +14,17 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from benchmarks.table import lines
 from rendering import cases
 from rendering.device_draws import FIRST_DRAW, SAMPLES, judging
-from rendering.tables import Json, lines, worst_lines
+from rendering.ideal_carriage import Json
 from tqdm import tqdm
 
 DRAWS = 40
@@ -50,6 +52,27 @@ def measure(case: str, options: argparse.Namespace, pool: Executor, kept: cases.
     return dict(zip(names, found, strict=True))
 
 
+def worst(devices: dict[str, Json]) -> list[Json]:
+    """A row for each figure that devices have in common: the greatest without its sign, whose it is, and the median."""
+    sizes = {device: dict(_sizes(found)) for device, found in devices.items()}
+    rows = []
+    for figure in next(iter(sizes.values())):
+        of_devices = {device: found[figure] for device, found in sizes.items() if figure in found}
+        device = max(of_devices, key=lambda device: of_devices[device])
+        median = float(np.median(list(of_devices.values())))
+        rows.append({"figure": figure, "worst": of_devices[device], "device": device, "median": median})
+    return rows
+
+
+def _sizes(found: object, name: str = "") -> Iterator[tuple[str, float]]:
+    """Every number in plain data, without its sign."""
+    if isinstance(found, dict | list | tuple):
+        for key, value in found.items() if isinstance(found, dict) else enumerate(found, 1):
+            yield from _sizes(value, f"{name}, {key}".removeprefix(", "))
+    elif isinstance(found, int | float):
+        yield name, abs(found)
+
+
 def main() -> int:
     """Measures and prints; 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -71,8 +94,8 @@ def main() -> int:
             result[case] = measure(case, options, pool, kept)
     if options.json:
         print(json.dumps(result))
-    for case, found in {} if options.json else result.items():
-        print("\n".join(lines({case: found}, "RMS") if case in OF_SIGNALS else worst_lines(case, found)))
+    else:
+        print(*lines({case: found if case in OF_SIGNALS else worst(found) for case, found in result.items()}), sep="\n")
     if options.picture is not None:
         from rendering.pictures import tracking_picture
 
