@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from benchmarks import latency, loop, virtual_time
 from benchmarks.against import checkout
-from benchmarks.histograms import plot_histograms
 from benchmarks.table import lines
 
 from tormagd.config import RealTime, load_config
@@ -17,7 +16,6 @@ from tormagd.control.core import build_core
 from tormagd.hardware.backend import choose
 from tormagd.hardware.serial_backend import SerialOptions
 
-PNG = b"\x89PNG"
 ROOT = Path(__file__).parents[2]
 
 
@@ -96,12 +94,6 @@ def test_stages_add_up_to_the_whole() -> None:
     assert result["setpoint_to_wire_us"]["max"] == pytest.approx(960.0)
     assert result["ratio"] == pytest.approx(765.0 / 110.0, abs=0.01)
     assert (result["setpoints"], result["seen"], len(result["stages_us"])) == (3, 2, 3)
-
-
-def test_histograms_are_drawn_of_any_positive_or_zero_durations(tmp_path: Path) -> None:
-    path = tmp_path / "lateness.png"
-    plot_histograms(path, "two sets", {"one": np.array([0.0, 3.0, 5_000.0]), "other": np.full(10, 40.0)})
-    assert path.read_bytes().startswith(PNG)
 
 
 def test_virtual_time_is_measured_beside_another_checkout() -> None:
