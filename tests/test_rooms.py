@@ -49,13 +49,11 @@ MAY_IMPORT["lab"] = set(MAY_IMPORT) - {"entry"}
 TOOLS = ROOT / "tools"
 TOOL_ROOMS = {
     "machines": set(),
-    "wire": set(),
-    "pictures": set(),
     "extremes": set(),
-    "rendering": {"machines", "pictures"},
+    "rendering": {"machines"},
     "fault_matrix": set(),
     "endurance": {"machines"},
-    "benchmarks": {"machines", "wire", "pictures", "rendering"},
+    "benchmarks": {"machines", "rendering"},
 }
 """Of the tools; beside them stand the scripts, which no room imports. What is the product's is open to all."""
 

@@ -12,9 +12,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from benchmarks.table import lines
 from rendering.hands import TURNED_MM_S
 from rendering.ideal_carriage import MOST_N, STEP_S, bound
-from rendering.tables import lines
 
 from tormagd.force_file import ForceFileError, read_forces
 from tormagd.physics.errors import DomainError
@@ -47,7 +47,7 @@ def main() -> int:
         print(f"bound: {error}", file=sys.stderr)
         return 1 if isinstance(error, RuntimeError) else 2
     result = found.figures()
-    print(json.dumps(result) if options.json else "\n".join(lines(result, f"{options.plant} (synthetic)")))
+    print(json.dumps(result) if options.json else "\n".join(lines(result)))
     return 0
 
 

@@ -21,15 +21,15 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from pictures.stamp import stamp
+from benchmarks.table import lines
 from rendering.device_draws import SAMPLES, device, judging
 from rendering.following import CORNER_SCENE, VALID_S, Array, Followed, Levels, armed_at_rest, asked_at, follow
 from rendering.hands import HANDS, TURNED_MM_S
-from rendering.ideal_carriage import brake_of
-from rendering.tables import Json, lines
+from rendering.ideal_carriage import Json, brake_of
 from tqdm import tqdm
 
 from tormagd.control.governor import TimedSetpoint
+from tormagd.lab.pages import stamp
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.model_file import load_model
 from tormagd.model.shipped import model_path
@@ -335,7 +335,7 @@ def main() -> int:
         print(json.dumps(result))
     else:
         worst = sorted(result["rows"], key=lambda shown: -shown["over_N"])[:6]
-        print("\n".join(lines(result | {"rows": worst}, "envelope")))
+        print("\n".join(lines(result | {"rows": worst})))
     if options.picture is not None:
         picture(options.picture, result, found)
     wrong = missed(result)

@@ -1,28 +1,30 @@
 """How well a force is followed: the true force of simulated devices less what was asked, in virtual time.
 
-    force_tracking.py [CASE ...] [--draws N] [--drift-s S] [--tuning] [--json] [--picture FILE.png]
+    force_tracking.py [CASE ...] [--draws N] [--drift-s S] [--json] [--picture FILE.png]
 
 How soon a device is known: `steps`, `creep` and `speeds`, of the three samples and of draws of the plant card; `drift`
 of the force sensor, and the `pulse` of `make run` as more is known, of the samples. How well signals are followed:
 that pulse on the `samples` and on random `draws`, 500 setpoints a second, with a preview of 70 ms and without; a
 `staircase`; recorded `signals` from the folder that TORMAG_DATA names, with 400 ms, as a publisher can that plays a
 file, and live. Beside them stands what ideal carriages miss (`bound.py`). Draws 40 to 79 and samples 2 and 3 only
-judge; `--tuning` takes what constants may be chosen on. All devices are synthetic.
+judge. All devices are synthetic.
 """
 
 import argparse
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from benchmarks.table import lines
 from rendering import cases
-from rendering.device_draws import FIRST_DRAW, SAMPLES, judging
-from rendering.tables import Json, lines, worst_lines
+from rendering.device_draws import SAMPLES, judging
+from rendering.ideal_carriage import Json
 from tqdm import tqdm
 
 DRAWS = 40
@@ -41,8 +43,6 @@ def measure(case: str, options: argparse.Namespace, pool: Executor, kept: cases.
     if case in OF_SIGNALS:
         return OF_SIGNALS[case](pool, kept)
     names = judging(options.draws)
-    if options.tuning:
-        names = [SAMPLES[0], *(f"draw {number}" for number in range(min(options.draws, FIRST_DRAW)))]
     if case in ("drift", "pulse"):
         names = [name for name in names if name in SAMPLES]
     run = partial(cases.drift, lasts_s=options.drift_s) if case == "drift" else OF_DEVICES[case]
@@ -50,12 +50,32 @@ def measure(case: str, options: argparse.Namespace, pool: Executor, kept: cases.
     return dict(zip(names, found, strict=True))
 
 
+def worst(devices: dict[str, Json]) -> list[Json]:
+    """A row for each figure that devices have in common: the greatest without its sign, whose it is, and the median."""
+    sizes = {device: dict(_sizes(found)) for device, found in devices.items()}
+    rows = []
+    for figure in next(iter(sizes.values())):
+        of_devices = {device: found[figure] for device, found in sizes.items() if figure in found}
+        device = max(of_devices, key=lambda device: of_devices[device])
+        median = float(np.median(list(of_devices.values())))
+        rows.append({"figure": figure, "worst": of_devices[device], "device": device, "median": median})
+    return rows
+
+
+def _sizes(found: object, name: str = "") -> Iterator[tuple[str, float]]:
+    """Every number in plain data, without its sign."""
+    if isinstance(found, dict | list | tuple):
+        for key, value in found.items() if isinstance(found, dict) else enumerate(found, 1):
+            yield from _sizes(value, f"{name}, {key}".removeprefix(", "))
+    elif isinstance(found, int | float):
+        yield name, abs(found)
+
+
 def main() -> int:
     """Measures and prints; 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"any of {', '.join(CASES)}; default: all")
     parser.add_argument("--draws", type=int, default=DRAWS, help=f"devices of the plant card ({DRAWS})")
-    parser.add_argument("--tuning", action="store_true", help="the devices that constants may be chosen on")
     parser.add_argument("--drift-s", type=float, default=cases.DRIFT_S, help="how long a sensor drifts (%(default)g)")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--picture", type=Path, help="PNG of samples, staircase and draws")
@@ -71,8 +91,8 @@ def main() -> int:
             result[case] = measure(case, options, pool, kept)
     if options.json:
         print(json.dumps(result))
-    for case, found in {} if options.json else result.items():
-        print("\n".join(lines({case: found}, "RMS") if case in OF_SIGNALS else worst_lines(case, found)))
+    else:
+        print(*lines({case: found if case in OF_SIGNALS else worst(found) for case, found in result.items()}), sep="\n")
     if options.picture is not None:
         from rendering.pictures import tracking_picture
 

@@ -23,10 +23,11 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from benchmarks.table import lines
 from rendering.device_draws import SAMPLES
+from rendering.ideal_carriage import Json
 from rendering.scene_runs import ROOT, Case, costs, run, run_all
 from rendering.signals import Signal, data_folder, recorded_signals
-from rendering.tables import Json, lines
 
 from tormagd.config import ConfigError
 from tormagd.ctl.scene_new import new_scene
@@ -263,7 +264,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     if options.wrong:
         wrong = wrong_models()
-        write_line(_text(wrong) if options.json else "\n".join(lines(wrong, "wrong")), sys.stdout)
+        write_line(_text(wrong) if options.json else "\n".join(lines(wrong)), sys.stdout)
         return int(any(each["off"] > ALLOWED for each in wrong.values()))
     write_line(_text(_measured(found, seconds)) if options.json else "\n".join(map(table, found)), sys.stdout)
     return 0

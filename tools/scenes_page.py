@@ -9,9 +9,9 @@ from pathlib import Path
 
 from benchmarks.scenes import core_without, draw
 from matplotlib.figure import Figure
-from pictures.stamp import stamp
 from rendering.scene_runs import ROOT
 
+from tormagd.lab.pages import stamp
 from tormagd.scenes.measured import JUDGED, MeasuredScene, is_met, measured, on_first
 from tormagd.scenes.scene import TERMS, Scene, load_scene, scene_path, shipped_scenes, terms_of
 from tormagd.scenes.signal import asked

@@ -5,9 +5,9 @@ import re
 from pathlib import Path
 
 import pytest
-from pictures.stamp import KEY, stamp, tables
 from PIL import Image
 
+from tormagd.lab.pages import KEY, figures_of, stamp
 from tormagd.scenes.measured import measured
 
 ROOT = Path(__file__).parents[2]
@@ -32,7 +32,7 @@ def drawn():
     for name in GENERATED:
         page = (DOCS / name).read_text(encoding="utf-8")
         for picture in SHOWN.findall(page):
-            yield picture, tables(page)
+            yield picture, figures_of(page)
 
 
 @pytest.mark.parametrize(("picture", "figures"), [pytest.param(*each, id=each[0]) for each in drawn()])
@@ -43,4 +43,8 @@ def test_a_picture_is_no_older_than_its_figures(picture, figures):
 
 def test_other_figures_have_another_stamp_and_other_words_the_same():
     page = "# A\n\n| mN |\n| --- |\n| 3 |\n"
-    assert stamp(tables(page)) == stamp(tables(page + "\nMore words.\n")) != stamp(tables(page.replace("3", "4")))
+    assert (
+        stamp(figures_of(page))
+        == stamp(figures_of(page + "\nMore words.\n"))
+        != stamp(figures_of(page.replace("3", "4")))
+    )

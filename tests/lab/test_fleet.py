@@ -14,8 +14,8 @@ from distributed import LocalCluster
 
 from tormagd.lab.consoles.devices import Console, Drift, consoles
 from tormagd.lab.consoles.reading import files, read, read_all
+from tormagd.lab.consoles.summary import Summary
 from tormagd.lab.main import main
-from tormagd.recording.summary import Summary
 from tormagd.recording.ticks import TickBatch
 from tormagd.recording.writer import RecordingWriter
 

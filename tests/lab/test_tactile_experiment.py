@@ -8,9 +8,9 @@ import pytest
 
 from tormagd.lab.main import main
 from tormagd.lab.tactile import experiment, models, report
+from tormagd.lab.tactile.pads import PADS
 from tormagd.lab.tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_shape, recorded_shapes
 from tormagd.lab.thesis.page import pulse_experiment, table_4_1
-from tormagd.simulation.pad import PADS
 
 
 @pytest.fixture(scope="module")

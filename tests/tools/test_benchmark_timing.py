@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from benchmarks import latency, loop, virtual_time
 from benchmarks.against import checkout
-from benchmarks.histograms import plot_histograms
 from benchmarks.table import lines
 
 from tormagd.config import RealTime, load_config
@@ -17,7 +16,6 @@ from tormagd.control.core import build_core
 from tormagd.hardware.backend import choose
 from tormagd.hardware.serial_backend import SerialOptions
 
-PNG = b"\x89PNG"
 ROOT = Path(__file__).parents[2]
 
 
@@ -98,12 +96,6 @@ def test_stages_add_up_to_the_whole() -> None:
     assert (result["setpoints"], result["seen"], len(result["stages_us"])) == (3, 2, 3)
 
 
-def test_histograms_are_drawn_of_any_positive_or_zero_durations(tmp_path: Path) -> None:
-    path = tmp_path / "lateness.png"
-    plot_histograms(path, "two sets", {"one": np.array([0.0, 3.0, 5_000.0]), "other": np.full(10, 40.0)})
-    assert path.read_bytes().startswith(PNG)
-
-
 def test_virtual_time_is_measured_beside_another_checkout() -> None:
     result = virtual_time.measure(argparse.Namespace(seconds=0.2, plant="sample_1", against=ROOT))
     for build in ("interpreted", "against"):
@@ -160,9 +152,9 @@ def test_a_package_that_was_not_asked_for_is_not_measured(tmp_path: Path) -> Non
 
 def test_a_result_is_told_by_lines_and_tables() -> None:
     result = {"rate_hz": 999.26, "lateness_us": {"p50": 44.0, "p99": 900.0}, "against": {"ratio": {"p50": 1.5}}}
-    rows = [{"name": "a", "p50_us": 1.25, "more": {}}, {"name": "long", "p50_us": 10.0, "more": {}}]
+    rows = [{"name": "a", "p50_us": 1.25, "more": {}}, {"name": "long", "p50_us": 10.0, "more": {"RATE": 0.5}}]
     told = [" ".join(line.split()) for line in lines(result | {"variants": rows, "cpus": [0, 1]})]
     assert told == [
         "rate_hz 999.3", "lateness_us p50 44, p99 900", "against ratio p50 1.5",
-        "variants", "name p50_us", "a 1.25", "long 10", "cpus 0, 1",
+        "variants", "name p50_us more RATE", "a 1.25", "long 10 0.5", "cpus 0, 1",
     ]  # fmt: skip

@@ -12,7 +12,6 @@ import bound
 import msgspec
 import numpy as np
 import pytest
-from rendering.human_pulse import pulse_profile
 from rendering.ideal_carriage import (
     Asked,
     Brake,
@@ -26,6 +25,7 @@ from rendering.ideal_carriage import (
     rms,
 )
 
+from tormagd.lab.human_pulse import pulse_profile
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.element import Element

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from force_tracking import worst
 from rendering.cases import (
     ARRIVES_S,
     LATER_S,
@@ -20,7 +21,6 @@ from rendering.cases import (
 )
 from rendering.device_draws import DRAWN, SPREAD, drawn_device, evenly_drawn
 from rendering.following import Followed, publisher, tracking
-from rendering.human_pulse import pulse_profile
 from rendering.signals import (
     SCALED_N,
     TRIM_S,
@@ -32,8 +32,8 @@ from rendering.signals import (
     staircase_signal,
     with_approach,
 )
-from rendering.tables import lines, worst_lines
 
+from tormagd.lab.human_pulse import pulse_profile
 from tormagd.simulation.parameters import load_plant
 
 BEGINS_S, IDEAL_S = 4.0, 0.9
@@ -142,12 +142,7 @@ def test_every_speed_follows_every_other_once() -> None:
 
 def test_figures_are_printed_with_the_worst_device() -> None:
     devices = {"draw 40": {"up_N": 0.01}, "sample_2": {"up_N": -0.03}, "draw 41": {"up_N": 0.02}}
-    assert list(worst_lines("steps", devices)) == ["steps, up_N: 30.0 mN (sample_2), median 20.0 mN"]
-    rows = {"plant": "sample_1", "rms_N": 0.0123, "limits": {"RATE": 0.5}}
-    assert list(lines({"rows": [rows]}, "pulse")) == [
-        "pulse, rows: plant sample_1, rms 12.3 mN",
-        "pulse, rows, limits: RATE 0.5",
-    ]
+    assert worst(devices) == [{"figure": "up_N", "worst": 0.03, "device": "sample_2", "median": 0.02}]
 
 
 def test_a_publisher_sends_what_follows() -> None:

@@ -5,7 +5,8 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from pictures.stamp import stamp, tables
+
+from tormagd.lab.pages import figures_of, stamp, table
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "inverse_trade.md"
@@ -79,24 +80,21 @@ the search. The networks were trained for this page; how good the *shipped* mode
 def write(result: dict[str, Any]) -> None:
     """Rewrites page and plot."""
     text = page(result)
-    plot(result, tables(text))
+    plot(result, figures_of(text))
     PAGE.write_text(text, encoding="utf-8")
 
 
 def page(result: dict[str, Any]) -> str:
     """docs/inverse_trade.md."""
     shown = [row for row in result["variants"] if row["pareto"] or row["hidden"] == USUAL_HIDDEN]
-    lines = [list(COLUMNS), ["---"] * len(COLUMNS)]
-    for row in shown:
-        star = {"pareto": "*" if row["pareto"] else ""}
-        lines.append([form.format(**(row | star)) for form in COLUMNS.values()])
+    stars = [row | {"pareto": "*" if row["pareto"] else ""} for row in shown]
     alike: dict[str, list[str]] = {}
     for scene, row in result["chosen"].items():
         alike.setdefault(row["name"], []).append(scene)
     texts = {
         "environment": ", ".join(f"{name} {value}" for name, value in result["environment"].items()),
         "usual": USUAL_HIDDEN,
-        "table": "".join(f"| {' | '.join(line)} |\n" for line in lines),
+        "table": table(COLUMNS, [[form.format(**row) for form in COLUMNS.values()] for row in stars]),
         "scenes": "\n".join(f"- `{name}`: {', '.join(scenes)}" for name, scenes in alike.items()),
     }
     return TEXT.format(**(result | texts))

@@ -22,7 +22,6 @@ import numpy as np
 import numpy.typing as npt
 import zmq
 
-from benchmarks.histograms import plot_histograms
 from benchmarks.loop import Stand, add_realtime_arguments, asked_for, daemon, quantiles, realtime_settings
 from tormagd.config import Config, RealTime
 from tormagd.daemon.endpoint import context
@@ -171,13 +170,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `benchmark latency`."""
     add_realtime_arguments(parser)
     parser.add_argument("--count", type=int, default=1_000, help="setpoints")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="histograms of the whole, its stages and the hop")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The object for these options."""
     realtime = realtime_settings(options)
-    found_us = run(options.count, realtime)
-    if options.plot:
-        plot_histograms(options.plot, "From setpoints to their first drive frames", found_us)
-    return summary(found_us, options.count, realtime)
+    return summary(run(options.count, realtime), options.count, realtime)

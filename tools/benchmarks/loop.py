@@ -14,7 +14,6 @@ import argparse
 import asyncio
 import contextlib
 import multiprocessing
-import os
 import statistics
 import subprocess
 import sys
@@ -36,7 +35,6 @@ from machines.own import own_machine
 from machines.wire import carried
 
 from benchmarks.against import add_against_argument, as_installed, environment
-from benchmarks.histograms import plot_histograms
 from tormagd.config import ENDPOINTS, Config, Endpoints, RealTime, load_config
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
@@ -356,28 +354,11 @@ def add_realtime_arguments(parser: argparse.ArgumentParser) -> None:
     """What the kernel is asked for."""
     parser.add_argument("--fifo", type=int, default=50, help="SCHED_FIFO priority of what is measured; 0 for none")
     parser.add_argument("--keep-awake", action="store_true", help="idle processors do not sleep")
-    parser.add_argument(
-        "--cpus",
-        type=int,
-        nargs="+",
-        default=[],
-        metavar="N",
-        help="processors for what is measured; what measures it keeps to the others",
-    )
 
 
 def realtime_settings(options: argparse.Namespace) -> RealTime:
-    """The settings for these options. What measures and makes the load leaves the named processors from now on.
-
-    Raises SystemExit where that leaves it none.
-    """
-    if options.cpus:
-        usable = os.sched_getaffinity(0)
-        others = usable - set(options.cpus)
-        if not set(options.cpus) <= usable or not others:
-            raise SystemExit(f"--cpus {options.cpus}: allowed are some, not all, of {sorted(usable)}")
-        os.sched_setaffinity(0, others)
-    return RealTime(options.fifo, lock_memory=True, cpus=tuple(options.cpus), keep_awake=options.keep_awake)
+    """The settings for these options."""
+    return RealTime(options.fifo, lock_memory=True, keep_awake=options.keep_awake)
 
 
 def asked_for(realtime: RealTime) -> dict[str, Any]:
@@ -396,7 +377,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pairs", type=int, default=3, help="blocks of each kind (%(default)s)")
     parser.add_argument("--control-hz", type=int, default=1_000, metavar="HZ", help="(%(default)s)")
     parser.add_argument("--baud", type=int, default=DEFAULT_BAUD, help="of the device's line (%(default)s)")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="histograms of the lateness")
     add_against_argument(parser)
 
 
@@ -414,11 +394,4 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         )
         for _ in range(options.pairs)
     ]
-    result = summary(pairs, realtime) | {"control_hz": options.control_hz, "baud": options.baud}
-    if options.plot:
-        shown = {
-            "daemon": np.concatenate([pair.daemon.lateness_us for pair in pairs]),
-            "bare stub": np.concatenate([pair.bare.lateness_us for pair in pairs]),
-        }
-        plot_histograms(options.plot, f"Lateness of {result['ticks']} control ticks, {CLIENTS} clients", shown)
-    return result
+    return summary(pairs, realtime) | {"control_hz": options.control_hz, "baud": options.baud}

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import msgspec
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from pictures.stamp import stamp
 
 from tormagd.config import Config
 from tormagd.control.core import Core, build_core
+from tormagd.lab.pages import stamp
 from tormagd.lab.thesis.values import PULSE_MAE_MT
 from tormagd.scenes.measured import JUDGED, MeasuredScene, measured, on_first
 from tormagd.scenes.scene import EVERY_TERM, TERMS, load_scene
@@ -138,15 +138,3 @@ def _panel(panel: Axes, scene: MeasuredScene) -> None:
 
 def _axes(every: list[Variant]) -> tuple[list[float], list[float]]:
     return [each.cost_us_s / 1e4 for each in every], [1e3 * each.rms_N for each in every]
-
-
-def print_table(result: Json) -> None:
-    """What was chosen, for a person."""
-    print("scene           search      rates, Hz   RMS all / chosen, mN  tolerance  core all / chosen  out")
-    for row in result["scenes"]:
-        print(
-            f"{row['name']:15s} {row['solver']:10s} {row['control_hz']:5d} / {row['inference_hz']:<3d} "
-            f"{1e3 * row['rms_full_N']:9.1f} / {1e3 * row['rms_N']:<8.1f} {1e3 * row['tolerance_N']:8.0f}  "
-            f"{row['cost_full_us_per_s'] / 1e4:7.2f} / {row['cost_us_per_s'] / 1e4:.2f} %    "
-            f"{', '.join(row['terms_out']) or 'none'}"
-        )

@@ -51,9 +51,6 @@ class Step(NamedTuple):
     skew_um: float
 
 
-FIGURES = ("rise_s", "overshoot", "settling_5pct_s", "steady_error_um", "true_error_um", "skew_um")
-
-
 def run(plant_name: str = "sample_1") -> dict[str, Any]:
     """The contract's keys, for steps that open and that close; the worse of both is what counts."""
     config, parameters = Config(), load_plant(plant_name)
@@ -70,7 +67,7 @@ def run(plant_name: str = "sample_1") -> dict[str, Any]:
     nominal = margins(config.motor, config.position, TICK_S)
     return {
         "plant": plant_name,
-        **{name: max(getattr(found, name) for found in steps) for name in FIGURES},
+        **{name: max(getattr(found, name) for found in steps) for name in Step._fields},
         "overshoot_over_stroke": over_stroke,
         "rise_over_time_optimal": max(found.rise_s / s for found, s in zip(steps, fastest_s, strict=True)),
         "stroke_ratio": stroke_s / time_optimal(parameters, STROKE_MM[0], STROKE_MM[1] - STROKE_MM[0]).total_s,

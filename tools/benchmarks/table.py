@@ -18,12 +18,21 @@ def lines(result: Mapping[str, Any], path: str = "") -> Iterator[str]:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Rows of the same keys under their names; a column that holds more than a figure is left out."""
-    names = [name for name, value in rows[0].items() if not isinstance(value, Mapping | list)]
-    cells = [names, *([shown(row[name]) for name in names] for row in rows)]
+    """Rows under the names of their figures, those of a part behind the part's name; what holds more is left out."""
+    flat = [dict(_figures(row)) for row in rows]
+    names = list(dict.fromkeys(name for row in flat for name in row))
+    cells = [names, *([shown(row.get(name, "")) for name in names] for row in flat)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     for line in cells:
         yield "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
+
+
+def _figures(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    for key, value in row.items():
+        if isinstance(value, Mapping):
+            yield from ((f"{key} {name}", inner) for name, inner in _figures(value))
+        elif not isinstance(value, list):
+            yield key, value
 
 
 def shown(value: Any) -> str:

@@ -29,7 +29,7 @@ from rendering.following import (
     publisher,
 )
 from rendering.hands import TURNED_MM_S, Legs
-from rendering.ideal_carriage import Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
+from rendering.ideal_carriage import Bound, Json, asked_of, bound, brake_of, drive_of, no_delay_mm
 from rendering.signals import (
     STAIR_S,
     TRIM_S,
@@ -42,7 +42,6 @@ from rendering.signals import (
     staircase_signal,
     with_approach,
 )
-from rendering.tables import Json
 from tormagd.config import Config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from pictures.stamp import stamp
 
 from rendering.following import Array, Followed, Rehearsals, tracking
 from rendering.show import PULSE_START_S, Shown
+from tormagd.lab.pages import stamp
 from tormagd.scenes.scene import Scene
 
 ASKED, RENDERED, OTHER, THIRD, QUIET = "#222222", "#d1495b", "#2a6f97", "#6a994e", "#8d99ae"

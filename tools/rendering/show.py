@@ -23,9 +23,9 @@ from machines.own import own_machine
 from machines.wire import carried
 
 from rendering.following import Array, Tracking, tracking
-from rendering.human_pulse import pulse_profile
 from rendering.signals import with_approach
 from tormagd.ctl.operate import home, operate
+from tormagd.lab.human_pulse import pulse_profile
 from tormagd.recording.reader import Columns, RecordingError, read_recording
 from tormagd.safety.codes import FAULTS, Fault
 from tormagd_client import Client, ClientError, UnreachableError

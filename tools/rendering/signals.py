@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import butter, sosfiltfilt
 
-from rendering.human_pulse import pulse_profile
+from tormagd.lab.human_pulse import pulse_profile
 
 Array = npt.NDArray[np.float64]
 

@@ -25,7 +25,7 @@ def measured_pulse() -> Array:
     # found, not imported: heartpy's import fails beside a current setuptools
     package = importlib.util.find_spec("heartpy")
     if package is None or package.origin is None:
-        raise ModuleNotFoundError("heartpy is not installed", name="heartpy")
+        raise ModuleNotFoundError("heartpy is not installed: pip install 'tormagd[demo]'", name="heartpy")
     return np.loadtxt(Path(package.origin).parent / "data" / "data.csv", delimiter=",", ndmin=1)
 
 

@@ -20,13 +20,17 @@ def stamp(figures: object) -> dict[str, str | None]:
     return {KEY: hashlib.sha256(msgspec.json.encode(figures, order="sorted")).hexdigest(), "Software": None}
 
 
+def figures_of(page: str) -> list[str]:
+    """The figures of a generated page: the rows of its tables, whatever else it says."""
+    return [line for line in page.splitlines() if line.startswith("|")]
+
+
 def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapping[str, "Figure"]) -> None:
     """Writes a page, and its pictures as PNG into `folder`, stamped with the rows of the page's tables."""
     page = "\n".join(section.rstrip() + "\n" for section in sections)
-    figures = [line for line in page.splitlines() if line.startswith("|")]
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in pictures.items():
-        figure.savefig(folder / f"{name}.png", dpi=DPI, metadata=stamp(figures))
+        figure.savefig(folder / f"{name}.png", dpi=DPI, metadata=stamp(figures_of(page)))
     path.write_text(page, encoding="utf-8")
 
 

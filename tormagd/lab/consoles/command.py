@@ -1,8 +1,8 @@
 """Recordings of many consoles at once: how well each followed, what held it back, and how its device drifts.
 
 Every `.mcap` in the folder, or under a URL that fsspec knows (`s3://bucket/recordings` takes the package s3fs), is read
-by one of the workers, and summed up as `tormagd/recording/summary.py` says; `--out` keeps one row of a recording. The
-table has one line for each device and insert. A file that cannot be read is named and left out.
+by one of the workers, and summed up as `summary.py` says; `--out` keeps one row of a recording. The table has one line
+for each device and insert. A file that cannot be read is named and left out.
 """
 
 import argparse
@@ -18,11 +18,11 @@ from tqdm import tqdm
 from tormagd.lab import executors
 from tormagd.lab.consoles.devices import Console, Drift, consoles
 from tormagd.lab.consoles.reading import SUFFIX, files, read_all
+from tormagd.lab.consoles.summary import Summary
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.lab.pages import aligned
 from tormagd.output import printable, write_line
-from tormagd.recording.summary import Summary
 
 HEADINGS = ("device", "insert", "files", "enabled", "RMS, worst mN", "trim", "current A", "clock ppm", "held back by")
 LEAST_SHARE, MOST_LIMITS = 0.001, 3

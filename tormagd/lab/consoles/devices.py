@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import msgspec
 import numpy as np
 
-from tormagd.recording.summary import Summary
+from tormagd.lab.consoles.summary import Summary
 
 DAY_S = 86_400.0
 LEAST_DAYS, LEAST_RECORDINGS = 1.0, 3

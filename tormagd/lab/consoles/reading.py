@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import fsspec
 
+from tormagd.lab.consoles.summary import FIELDS, Summary, summarise
 from tormagd.recording.reader import read_open_recording
-from tormagd.recording.summary import FIELDS, Summary, summarise
 
 SUFFIX = ".mcap"
 

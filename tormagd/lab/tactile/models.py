@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from tormagd.lab.tactile.pads import PADS, PadRecord, cyclic_records, holding_records
 from tormagd.lab.training.dataset import Array, Dataset
 from tormagd.lab.training.fitting import fit_network
 from tormagd.lab.training.grey_box import GreyBox, fit_grey_box
@@ -15,15 +16,7 @@ from tormagd.lab.training.splits import Mask, leave_cycles_out, leave_one_out, r
 from tormagd.model.features import FEATURES
 from tormagd.model.model_file import ForceModel
 from tormagd.model.rising import not_rising_share
-from tormagd.simulation.pad import (
-    PADS,
-    RATES_MM_S,
-    TOUCHING_MM,
-    PadRecord,
-    cyclic_records,
-    holding_records,
-    worked_pad,
-)
+from tormagd.simulation.pad import RATES_MM_S, TOUCHING_MM, worked_pad
 from tormagd.simulation.parameters import PadParameters
 from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM
 

@@ -13,10 +13,11 @@ from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.solution import FieldSolver, Reach
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.lab.tactile.models import PAD_IN_USE, SCORED_SLOPE_N_MT, Effort, Trained, plant_force_N, slope_N_per_mT
+from tormagd.lab.tactile.pads import PADS, drawn_pad
 from tormagd.lab.training.dataset import Array
 from tormagd.lab.training.grey_box import GreyBoxMemory
 from tormagd.model.model_file import ForceModel
-from tormagd.simulation.pad import PADS, drawn_pad, worked_pad
+from tormagd.simulation.pad import worked_pad
 from tormagd.simulation.parameters import PadParameters
 from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from tormagd.lab.consoles.summary import FIELDS, summarise
 from tormagd.recording.reader import RecordingError, read_open_recording, read_recording
-from tormagd.recording.summary import FIELDS, summarise
 from tormagd.recording.ticks import TickBatch
 from tormagd.recording.writer import RecordingWriter
 

@@ -1,1 +1,0 @@
-"""What a committed picture says of itself."""
