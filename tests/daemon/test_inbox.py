@@ -279,6 +279,19 @@ def test_a_line_through_a_few_noisy_stamps_is_no_drift(publishing: Publishing) -
     assert max(drifts_ppm) > 200.0
 
 
+@pytest.mark.parametrize("drift_ppm", [200.0, -200.0])
+def test_a_drifting_clock_is_told(publishing: Publishing, drift_ppm: float) -> None:
+    noise = random.Random(1)
+    for tick in range(1_500):
+        publishing.now_s = tick * 0.01
+        publishing.send(tick, 1.0, "a", noise.uniform(0.0, 0.001) - drift_ppm * 1e-6 * publishing.now_s)
+    found = publishing.of("a")
+    assert found.clock is not None
+    assert found.clock.windows > 8
+    assert found.clock.drift_ppm == pytest.approx(drift_ppm, abs=60.0)
+    assert f"ppm {'fast' if drift_ppm > 0.0 else 'slow'}" in found.cause
+
+
 def test_nothing_is_given_to_a_source_whose_stamps_were_refused(publishing: Publishing) -> None:
     publishing.send(1, 1.0, "a", -3.0)
     with pytest.raises(RefusedError, match="nothing that is still valid"):

@@ -212,7 +212,7 @@ class Rig:
         return socket
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def shared_rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
     """A device and a daemon that has found it, which outlive a test."""
     with contextlib.closing(Rig(tmp_path_factory.mktemp("rig"))) as made:

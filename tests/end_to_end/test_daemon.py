@@ -60,20 +60,17 @@ def test_stale_setpoint_decays_to_the_least_force(rig):
     assert rig.telemetry().operating_state == "ENABLED"
 
 
-def test_enable_is_refused_until_everything_is_right(new_rig):
-    reply = new_rig.command("enable")
-    assert not reply.ok
-    assert reply.error.code == "not_homed"
-    new_rig.done("home")
-    new_rig.until(lambda: new_rig.status()["is_homed"] and not new_rig.status()["is_busy"], "homed")
-    new_rig.ask(1.5)
-    new_rig.until(lambda: new_rig.telemetry().setpoint_cf == 1.5, "setpoint seen")
-    reply = new_rig.command("enable")
+def test_enable_is_refused_until_the_setpoint_is_neutral(rig):
+    rig.arm()
+    rig.done("disable")
+    rig.ask(1.5)
+    rig.until(lambda: rig.telemetry().setpoint_cf == 1.5 and not rig.status()["is_busy"], "setpoint seen")
+    reply = rig.command("enable")
     assert not reply.ok
     assert reply.error.code == "not_neutral"
-    new_rig.ask(0.5)
-    new_rig.until(lambda: new_rig.telemetry().setpoint_cf == 0.5, "setpoint seen")
-    new_rig.until(lambda: new_rig.command("enable").ok, "enabled")
+    rig.ask(0.5)
+    rig.until(lambda: rig.telemetry().setpoint_cf == 0.5, "setpoint seen")
+    rig.until(lambda: rig.command("enable").ok, "enabled")
 
 
 def test_home_is_seen_as_busy_at_once_and_nothing_is_enabled_on_top_of_it(rig):

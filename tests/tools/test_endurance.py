@@ -32,9 +32,8 @@ def test_a_case_in_virtual_time_holds_and_repeats_itself(name: str, count: int) 
 
 
 @pytest.mark.live
-@pytest.mark.parametrize("transport", ["serial", "can"])
-def test_a_device_is_unplugged_in_motion_and_plugged_in_again(transport: str) -> None:
-    result = replug.run(transport, 2, seed=3)
+def test_a_device_is_unplugged_in_motion_and_plugged_in_again() -> None:
+    result = replug.run("can", 1, seed=3)
     assert result["failures"] == []
     assert result["lost_after_ms"] > 0.0
 
