@@ -93,11 +93,10 @@ def test_frames_are_messages_that_anybody_can_read(path: Path, can_path: Path) -
     assert message.log_time > 1_700_000_000_000_000_000
 
 
-@pytest.mark.parametrize(("from_s", "begins_s"), [(1.6, 1.5), (2.9, 2.5)])
-def test_the_link_measures_and_writes_the_same_again(core: Core, box: BlackBoxFile, from_s, begins_s) -> None:
+def test_the_link_measures_and_writes_the_same_again(core: Core, box: BlackBoxFile) -> None:
     """From the middle of the run too: a snapshot has what the link and the decoder remembered."""
-    done = again(core, box.entries, from_s)
-    assert (done.difference, done.from_s) == (None, pytest.approx(begins_s, abs=1e-9))
+    done = again(core, box.entries, 1.6)
+    assert (done.difference, done.from_s) == (None, pytest.approx(1.5, abs=1e-9))
     assert done.frames > 2 * done.ticks
 
 
