@@ -47,8 +47,7 @@ def test_no_file_and_an_empty_file_are_the_defaults(write) -> None:
 def test_what_a_file_says_is_taken_and_the_rest_stays(write) -> None:
     config = load_config(write('scene = "pulse"\n[device]\nport = "/dev/ttyACM3"\n[realtime]\ncpus = [1, 3]\n'))
     assert (config.scene, config.device.port, config.realtime.cpus) == ("pulse", "/dev/ttyACM3", (1, 3))
-    assert config.rates == Config().rates
-    assert config.device.options == {}
+    assert (config.rates, config.device.options) == (Config().rates, {})
 
 
 def test_a_mark_of_the_byte_order_is_passed_over(tmp_path: Path) -> None:
@@ -299,8 +298,7 @@ def test_check_prints_the_resolved_configuration(write, capsys) -> None:
     captured = capsys.readouterr()
     resolved = json.loads(captured.out)
     assert msgspec.convert(resolved["config"], Config).scene == "pulse"
-    assert resolved["config"]["device"]["options"] == {"baud": 1_000_000}
-    assert resolved["scene"]["name"] == "pulse"
+    assert (resolved["config"]["device"]["options"], resolved["scene"]["name"]) == ({"baud": 1_000_000}, "pulse")
     assert 0.0 < resolved["derived"]["least_N"] < resolved["derived"]["most_N"]
     assert resolved["derived"]["phase_margin_deg"] >= 30.0
 

@@ -118,8 +118,7 @@ def test_one_log_line_in_a_while_with_the_worst_of_all(loop: Loop, callbacks: Ca
     loop.run_for(1)
     second = callbacks.news()
     assert second is not None
-    assert second.ticks == 3
-    assert second.worst == Delay(7 * MS, "reader 7", 7 * MS)
+    assert (second.ticks, second.worst) == (3, Delay(7 * MS, "reader 7", 7 * MS))
     loop.run_for(NEWS_NS)
     assert callbacks.news() is None
     assert callbacks.blamed.total() == 4

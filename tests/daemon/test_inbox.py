@@ -87,8 +87,7 @@ def test_a_setpoint_is_put_on_the_control_clock(publishing: Publishing) -> None:
 def test_an_older_or_repeated_number_is_dropped(publishing: Publishing, seq: int) -> None:
     publishing.send(5, 1.0)
     assert not publishing.send(seq, 2.0)
-    assert publishing.force_N == 1.0
-    assert publishing.counters() == (1, 0, 1)
+    assert (publishing.force_N, publishing.counters()) == (1.0, (1, 0, 1))
     assert publishing.send(6, 2.0)
 
 
@@ -120,8 +119,7 @@ def test_one_source_holds_the_brake_and_another_is_refused_and_named_until_it_is
     assert publishing.send(1, 1.0, "a")
     publishing.now_s = 0.04
     assert not publishing.send(1, 2.0, "b")
-    assert publishing.counters() == (1, 1, 0)
-    assert publishing.force_N == 1.0
+    assert (publishing.counters(), publishing.force_N) == ((1, 1, 0), 1.0)
     assert publishing.send(2, 1.0, "a")
     assert publishing.newest.is_contested
     report = publishing.inbox.report(publishing.now_s)
@@ -219,8 +217,7 @@ def test_setting_the_time_of_this_machine_keeps_no_setpoint_out(publishing: Publ
     for tick in range(2, 5):
         publishing.now_s += 0.002
         assert publishing.send(tick, float(tick), "a", 0.001)
-        assert publishing.force_N == tick
-        assert publishing.age_s == pytest.approx(0.001, abs=1e-5)
+        assert (publishing.force_N, publishing.age_s) == (tick, pytest.approx(0.001, abs=1e-5))
 
 
 @pytest.mark.parametrize("age_s", [1.0, -1.0])
@@ -389,8 +386,7 @@ def test_the_report_fits_into_an_answer_whatever_the_sources_call_themselves(pub
 @pytest.mark.parametrize("data", [b"", b"\xc1", b"\x00" * 20_000, msgpack.packb("setpoint")])
 def test_garbage_is_counted(publishing: Publishing, data: bytes) -> None:
     assert not publishing.take(data)
-    assert publishing.counters() == (0, 1, 0)
-    assert publishing.inbox.newest is None
+    assert (publishing.counters(), publishing.inbox.newest) == ((0, 1, 0), None)
 
 
 @settings(max_examples=60, deadline=None)

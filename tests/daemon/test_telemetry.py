@@ -64,8 +64,7 @@ def test_a_driven_device() -> None:
         1.38,
         1.39,
     )
-    assert published.duty == (0.1, -0.2)
-    assert published.setpoint_age_ms == pytest.approx(12.0)
+    assert (published.duty, published.setpoint_age_ms) == ((0.1, -0.2), pytest.approx(12.0))
     assert (published.is_homed, published.is_busy, published.operating_state) == (True, False, "ENABLED")
     assert (published.tick.lateness_us, published.tick.exec_us) == (20.0, 150.0)
     # each limit once, those of the plan first
@@ -76,8 +75,7 @@ def test_positions_before_homing_are_not_known() -> None:
     lost = MEASUREMENT.replaced(switches=Switches(0), mode=DeviceMode.HOMING)
     published = telemetry(lost, StepState(1.0, SafetyState(), first_estimate(lost, 47.5)), is_busy=True)
     assert (published.gap_mm, published.measured_jp, published.skew_mm, published.gap_setpoint_mm) == (None,) * 4
-    assert (published.is_homed, published.is_busy) == (False, True)
-    assert published.measured_cf == 1.39
+    assert (published.is_homed, published.is_busy, published.measured_cf) == (False, True, 1.39)
 
 
 def test_without_a_device_nothing_measured_is_known() -> None:

@@ -40,8 +40,7 @@ def test_what_is_packed_comes_out_however_it_is_cut(sent: list[Message], cuts: l
     received += receiver.unpack(line)
     assert len(received) == len(sent)
     assert all(is_same(*pair) for pair in zip(received, sent, strict=True))
-    assert receiver.statistics.frames == len(sent)
-    assert (receiver.statistics.corrupt, receiver.statistics.lost) == (0, 0)
+    assert (receiver.statistics.frames, receiver.statistics.corrupt, receiver.statistics.lost) == (len(sent), 0, 0)
 
 
 @given(noise=st.binary(max_size=300))

@@ -141,8 +141,7 @@ def test_memory_is_bounded_and_the_fit_follows_the_last_half_minute() -> None:
         device_s += 0.05 * (1.0 + (100e-6 if tick < 300 * 20 else -50e-6))
         clock.add(tick * 0.05, device_s)
     fit = fit_of(clock)
-    assert fit.windows == WINDOWS
-    assert fit.drift_ppm == pytest.approx(-50.0, abs=0.1)
+    assert (fit.windows, fit.drift_ppm) == (WINDOWS, pytest.approx(-50.0, abs=0.1))
     assert len(clock._windows) == WINDOWS
     assert len(trip._recent) == ROUND_TRIPS
 

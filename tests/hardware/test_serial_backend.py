@@ -175,8 +175,7 @@ def test_a_broken_plugin_is_named_and_stops_nobody_else(
     }
     install(monkeypatch, fine=FINE, **{name: value for name, (value, _) in broken.items()})
     found = installed()
-    assert list(found) == sorted([*broken, "fine"])
-    assert found["fine"] == ""
+    assert (list(found), found["fine"]) == (sorted([*broken, "fine"]), "")
     assert [record.levelname for record in caplog.records] == ["WARNING"] * len(broken)
     for name, (_, said) in broken.items():
         assert said in found[name]
