@@ -28,7 +28,7 @@ CORE_TESTS := tests/control tests/safety tests/model tests/firmware_protocol/tes
     tests/hardware/test_link.py tests/hardware/test_link_statistics.py
 
 # the variable: mkdocs-material's notice of its own end of life, 2027, is no warning of ours
-SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict --quiet
+SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict
 
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
