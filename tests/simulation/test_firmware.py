@@ -3,6 +3,8 @@
 The rules of the page are the conformance kit's, which it passes (tests/firmware_protocol).
 """
 
+import itertools
+
 import pytest
 
 from firmware_protocol.codec import (
@@ -10,7 +12,9 @@ from firmware_protocol.codec import (
     DeviceFault,
     DeviceMode,
     Home,
+    Sense,
     State,
+    Status,
     Switches,
 )
 from tormagd.simulation.parameters import load_plant
@@ -19,6 +23,31 @@ SAMPLES = ("sample_1", "sample_2", "sample_3")
 
 COMMAND_TIMEOUT_S = 0.05
 STATUS_PERIOD_S = 0.02
+
+
+def count(host, kind) -> int:
+    return sum(isinstance(message, kind) for _, message in host.received)
+
+
+# -- status, and answers to Drives: exactly, where the kit allows for a wire ------------------------------------------
+
+
+def test_status_comes_fifty_times_a_second_unasked_and_nothing_else_does(make_host) -> None:
+    host = make_host()
+    host.wait(2.0)
+    assert 99 <= count(host, Status) <= 101
+    assert len(host.received) == count(host, Status)
+
+
+def test_each_accepted_drive_is_answered_once_by_state_and_sense(make_host) -> None:
+    host = make_host()
+    host.heartbeat(0.5)
+    host.wait(0.005)
+    states = [message for _, message in host.received if isinstance(message, State)]
+    assert len(states) == count(host, Sense) == 500
+    assert all((after.counter - before.counter) % 256 == 1 for before, after in itertools.pairwise(states))
+    host.wait(STATUS_PERIOD_S)
+    assert host.status.drive_counter == 500 % 256
 
 
 # -- what must come before a run -----------------------------------------------------------------------------------
