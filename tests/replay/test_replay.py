@@ -238,7 +238,7 @@ def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Pa
         writer.finish()
     assert "allowed is msgpack" in refusal(other)
     changes = {
-        "format": ("3", "format = '3'"),
+        "format": ("2", "format = '2'"),
         "config": ('{"scene": "pulse"}', "config: its hash"),
         "model_sha256": ("f" * 64, "the model with the hash 'ffffffffffff'"),
         "columns": (json.dumps(["t_ns"]), "no column 'monotonic_s'"),

@@ -80,9 +80,6 @@ OVER_IDEAL = 1.3
 ALLOWED_N = {Kind.PULSE: 0.006, Kind.HAND: 0.010}
 ALLOWED_WEAK_N = 0.015
 "A pulse on sample 2, whose motors are weak."
-FOLLOWABLE, UNDER_FLAT, OVER_FLAT = 0.7, 0.9, 1.05
-"""A hand that nobody foresees may be missed by UNDER_FLAT of what the best flat line misses, where the ideal carriages
-miss under FOLLOWABLE of that; by OVER_FLAT otherwise."""
 EVEN_DRAWS = 32
 WITHIN_N = 0.018
 LEVEL_S = 0.5
@@ -398,12 +395,10 @@ def signals(pool: Executor, _kept: Kept) -> Json:
 
 
 def allowed_N(kind: Kind, plant: str, has_preview: bool, row: Json) -> float | None:
-    """The RMS error that a signal may have, by what the ideal carriages miss and its deviation; None of other kinds."""
-    if kind is Kind.OTHER:
+    """The RMS error that a signal may have, by what the ideal carriages miss; None of other kinds, and of a hand that
+    nobody foresees."""
+    if kind is Kind.OTHER or (kind is Kind.HAND and not has_preview):
         return None
-    if kind is Kind.HAND and not has_preview:
-        is_followable = row["no_delay_rms_N"] < FOLLOWABLE * row["sd_N"]
-        return float((UNDER_FLAT if is_followable else OVER_FLAT) * row["sd_N"])
     ideal_N = row["foresight_rms_N" if has_preview else "no_delay_rms_N"]
     is_weak = kind is Kind.PULSE and plant == "sample_2"
     return math.hypot(OVER_IDEAL * ideal_N, ALLOWED_WEAK_N if is_weak else ALLOWED_N[kind])
