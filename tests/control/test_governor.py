@@ -12,16 +12,19 @@ from hypothesis import given, settings, strategies as st
 from tormagd.control.device_fit import DeviceFit
 from tormagd.control.governor import (
     AHEAD_S,
+    LEAST_WAY,
     PATH_S,
+    WAY_S,
     Governed,
     Governor,
     GovernorState,
     TimedSetpoint,
+    _previewed_N,
 )
 from tormagd.control.periodicity import NOTHING_LEARNED
 from tormagd.control.portrait import Portrait
 from tormagd.safety.codes import Limit
-from tormagd.scenes.scene import Force
+from tormagd.scenes.scene import Force, Terms
 
 PORTRAIT = Portrait(
     np.linspace(95.0, 45.0, 19).tolist(), np.linspace(0.4, 2.2, 19).tolist(), np.linspace(0.01, 0.1, 19).tolist()
@@ -437,9 +440,26 @@ def test_a_silent_stream_is_not_believed_to_go_on(learned: GovernorState) -> Non
     assert np.all(path_N(late) == path_N(blind))
 
 
-def test_what_comes_with_a_preview_is_not_learned(learned: GovernorState) -> None:
-    state, _ = decide(learned, 10.002, TimedSetpoint(1.4, 10.002, VALID_S, preview_N=(1.4, 1.4), preview_dt_s=2e-3))
+def test_what_a_long_preview_says_is_not_foreseen(learned: GovernorState) -> None:
+    state, _ = decide(learned, 10.002, TimedSetpoint(1.4, 10.002, VALID_S, preview_N=(1.4,) * 200, preview_dt_s=2e-3))
     assert state.periodicity == NOTHING_LEARNED
+
+
+def test_past_its_end_a_short_preview_of_what_repeats_itself_is_foreseen() -> None:
+    """With 40 ms of a pulse known, the gap is sent to what comes in 90."""
+    missed: dict[bool, list[float]] = {True: [], False: []}
+    for is_foreseen, found in missed.items():
+        governor = Governor(PORTRAIT, SCENE, GAP_SPEED_MM_S, Terms(forecast=is_foreseen))
+        state = GovernorState(0.0, beats_N(0.0))
+        for tick in range(1, 5_000):
+            now_s = tick * 2e-3
+            ahead_N = tuple(beats_N(now_s + 2e-3 * step) for step in range(1, 21))
+            setpoint = TimedSetpoint(beats_N(now_s), now_s, VALID_S, preview_N=ahead_N, preview_dt_s=2e-3)
+            state, _ = governor.govern(governor.foresee(state), now_s, setpoint, DeviceFit(), 0.0)
+            if now_s > 6.0:
+                wanted_N = _previewed_N(setpoint, 0.0, 0.0, 10.0, state.periodicity)
+                found.append(wanted_N[LEAST_WAY - 1] - beats_N(now_s + WAY_S[LEAST_WAY - 1]))
+    assert np.std(missed[True]) < 0.5 * np.std(missed[False])
 
 
 def test_touches_that_nobody_foresees_are_gone_for() -> None:

@@ -6,7 +6,15 @@ from typing import Final, final
 
 from firmware_protocol.value import Value
 from tormagd.control.device_fit import DeviceFit
-from tormagd.control.periodicity import LONGEST_STEP_S, NOTHING_LEARNED, Periodicity, forecast_N, foreseen, observe
+from tormagd.control.periodicity import (
+    HORIZON_S,
+    LONGEST_STEP_S,
+    NOTHING_LEARNED,
+    Periodicity,
+    forecast_N,
+    foreseen,
+    observe,
+)
 from tormagd.control.portrait import Portrait
 from tormagd.control.pursuit import nearest_way_mm
 from tormagd.safety.codes import Limit
@@ -189,7 +197,13 @@ class Governor:
         elapsed_s = max(now_s - state.time_s, 0.0)
         if setpoint.preview_N and self._has_preview:
             periodicity, foresight = NOTHING_LEARNED, 1.0
-            wanted_N = _previewed_N(setpoint, soon_s + lag_s, least, most)
+            ends_s, last_N = setpoint.preview_dt_s * len(setpoint.preview_N), setpoint.preview_N[-1]
+            if self._has_forecast and ends_s < WAY_S[-1]:
+                # what comes after its end is foreseen from there
+                slope = (last_N - setpoint.force_N) / ends_s
+                last_N = min(max(last_N, self._least_N), self._most_N)
+                periodicity = observe(learned, setpoint.stamp_s + ends_s, last_N)
+            wanted_N = _previewed_N(setpoint, soon_s + lag_s, least, most, periodicity)
             path, drive_N = self._pursued_N(asks_N, sent_N, elapsed_s, wanted_N, device, lag_s)
             # the path sets out sooner by as much as the carriages come later
             expected_N = asks_N if is_passing or state.expected_N is None else state.expected_N
@@ -335,21 +349,27 @@ def _expected_N(
     return forces_N
 
 
-def _previewed_N(setpoint: TimedSetpoint, begins_s: float, least_N: float, most_N: float) -> list[float]:
+def _previewed_N(
+    setpoint: TimedSetpoint, begins_s: float, least_N: float, most_N: float, periodicity: Periodicity
+) -> list[float]:
     """The forces at WAY_S from `begins_s`, 0 or more, after the setpoint's stamp on, within what is allowed: as many as
-    the preview knows of, and at least LEAST_WAY."""
+    the preview knows of, and at least LEAST_WAY. Past its end a short preview goes on as `periodicity` foresees it, as
+    far as that is trusted, or else as it has run so far; a long one has no end in sight."""
     forces_N, spacing_s = setpoint.preview_N, setpoint.preview_dt_s
     last, last_N = len(forces_N), forces_N[-1]
     ends_s = spacing_s * last
     mean_N_s = (last_N - setpoint.force_N) / ends_s
+    trust = periodicity.trust
+    known_s = ends_s + HORIZON_S if trust > 0.0 else ends_s
     wanted_N: list[float] = []
     for after_s in WAY_S:
         at_s = begins_s + after_s
         if at_s >= ends_s:
-            if len(wanted_N) >= LEAST_WAY:
+            if len(wanted_N) >= LEAST_WAY and at_s >= known_s:
                 break
-            # past its end a short preview goes on as it has run so far; a long one has no end in sight
             force_N = last_N + mean_N_s * min(at_s - ends_s, AHEAD_S, ends_s)
+            if trust > 0.0:
+                force_N += trust * (forecast_N(periodicity, at_s - ends_s, [0.0])[0] - force_N)
         else:
             place = min(int(at_s / spacing_s), last - 1)
             before_N = forces_N[place - 1] if place else setpoint.force_N
