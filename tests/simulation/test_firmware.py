@@ -14,7 +14,6 @@ from firmware_protocol.codec import (
     Home,
     Sense,
     State,
-    Status,
     Switches,
 )
 from tormagd.simulation.parameters import load_plant
@@ -29,14 +28,7 @@ def count(host, kind) -> int:
     return sum(isinstance(message, kind) for _, message in host.received)
 
 
-# -- status, and answers to Drives: exactly, where the kit allows for a wire ------------------------------------------
-
-
-def test_status_comes_fifty_times_a_second_unasked_and_nothing_else_does(make_host) -> None:
-    host = make_host()
-    host.wait(2.0)
-    assert 99 <= count(host, Status) <= 101
-    assert len(host.received) == count(host, Status)
+# -- answers to Drives: exactly, where the kit allows for a wire -----------------------------------------------------
 
 
 def test_each_accepted_drive_is_answered_once_by_state_and_sense(make_host) -> None:
@@ -184,14 +176,6 @@ def test_a_blocked_carriage_is_an_overcurrent_and_a_failed_retract(running) -> N
 
 
 # -- injected faults -----------------------------------------------------------------------------------------------
-
-
-def test_commands_that_vanish_are_silence(running) -> None:
-    host = running(["commands_vanish@3.5"])
-    while host.status.mode is not DeviceMode.LATCHED:
-        host.drive(0.0, 0.0)
-        assert host.time_s < 20.0
-    assert host.status.faults == DeviceFault.COMMAND_TIMEOUT
 
 
 def test_reset_forgets_zero_handshake_and_mode_but_holds_the_gap(running) -> None:
