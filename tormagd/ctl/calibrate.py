@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from tormagd.config import Endpoints
-from tormagd.ctl.calibrate_run import Columns, InterruptedRunError, Range, Run, armed, reach, seconds_bar
+from tormagd.ctl.calibrate_run import SOURCE, Columns, InterruptedRunError, Range, Run, armed, reach, seconds_bar
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.ctl.waveform import Sample, Waveform
@@ -50,7 +50,7 @@ def calibrate(
     enough, and then there is no model file), FAULT, UNREACHABLE, `InterruptedRunError`.
     """
     _ask_fitter("--insert", insert)  # an unknown insert is told now, not after the sweeps
-    with Client(endpoints, wait_s) as client:
+    with Client(endpoints, wait_s, SOURCE) as client:
         forces = reach(client, scene.force.most_N)
         if not forces.most_N > forces.least_N:
             raise CommandError(

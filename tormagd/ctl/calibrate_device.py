@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tormagd.config import Endpoints
-from tormagd.ctl.calibrate_run import MOVING_MM_S, Columns, Range, armed, reach, seconds_bar
+from tormagd.ctl.calibrate_run import MOVING_MM_S, SOURCE, Columns, Range, armed, reach, seconds_bar
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ctl.waveform import Sample, Waveform
 from tormagd_client.blocking import Client
@@ -65,7 +65,7 @@ def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -
     Raises CommandError: REFUSED (also where no profile is kept, the handle hardly moves, or the force sensor is not
     believed), FAULT, UNREACHABLE, `InterruptedRunError`.
     """
-    with Client(endpoints, wait_s) as client:
+    with Client(endpoints, wait_s, SOURCE) as client:
         profile = client.status().profile
         if not profile.folder:
             raise _not_kept(profile)

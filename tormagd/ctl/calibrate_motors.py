@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from tormagd.config import Endpoints
-from tormagd.ctl.calibrate_run import Columns, Range, armed, reach, seconds_bar
+from tormagd.ctl.calibrate_run import SOURCE, Columns, Range, armed, reach, seconds_bar
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ctl.waveform import Sample, Waveform
 from tormagd_client.blocking import Client
@@ -78,7 +78,7 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
 
     Raises CommandError: USAGE where the file exists or cannot be made, REFUSED, FAULT, UNREACHABLE.
     """
-    with Client(endpoints, wait_s) as client:
+    with Client(endpoints, wait_s, SOURCE) as client:
         waveform = excitation(reach(client, scene_most_N))
         with (
             armed(endpoints, client, COLUMNS, wait_s) as run,

@@ -40,22 +40,6 @@ STEP_NAMED_S = 60.0
 class _Source:
     """What is known of one publisher."""
 
-    __slots__ = (
-        "accepted",
-        "cause",
-        "clock",
-        "delays",
-        "fit",
-        "heard_s",
-        "is_named",
-        "refused",
-        "remedy",
-        "sequence",
-        "setpoint",
-        "stamp_s",
-        "summary",
-    )
-
     def __init__(self, setpoint: Setpoint, now_s: float) -> None:
         self.setpoint, self.heard_s = setpoint, now_s
         self.stamp_s = -math.inf  # nothing of it has been taken yet

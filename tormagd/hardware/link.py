@@ -89,7 +89,6 @@ class DeviceLink:
         "_state", "_states", "_status", "_told", "cause", "clock", "identity", "quality", "repeated", "round_trip",
         "state",
     )  # fmt: skip
-    __slots__ = (*__match_args__, "_measurement")
 
     def __init__(self, now_s: float) -> None:
         self.repeated = 0

@@ -106,49 +106,6 @@ class MessageDevice:
     `receive` queues a payload for its time of arrival; `advance` lets time pass and fills `outbox`.
     """
 
-    __slots__ = (
-        "_answer_s",
-        "_answering_every",
-        "_answers",
-        "_arrival_s",
-        "_boot",
-        "_boot_s",
-        "_closed_m",
-        "_counts_per_rad",
-        "_drives",
-        "_duty_sign",
-        "_faults",
-        "_frozen_until_s",
-        "_handle_counts_per_mm",
-        "_has_bad_encoders",
-        "_home_m",
-        "_inbox",
-        "_jitter",
-        "_jitter_s",
-        "_left_boot_counts",
-        "_left_count_sign",
-        "_left_extra_counts",
-        "_left_motor_sign",
-        "_output",
-        "_pwm_steps",
-        "_rate",
-        "_right_boot_counts",
-        "_right_extra_counts",
-        "_silent",
-        "_struck",
-        "_stuck_handle",
-        "_stuck_left",
-        "_supply_V",
-        "_tick_due_s",
-        "_ticks",
-        "_time_s",
-        "firmware",
-        "outbox",
-        "parameters",
-        "plant",
-        "undecodable",
-    )
-
     def __init__(
         self,
         parameters: PlantParameters,
@@ -492,8 +449,6 @@ class VirtualDevice:
 
     Times are the host's, seconds from power-on, and must not fall over all three (ValueError).
     """
-
-    __slots__ = ("_byte_s", "_decoder", "_line", "_receiver_free_s", "_sender_free_s", "_sequence", "messages")
 
     def __init__(
         self,

@@ -119,33 +119,6 @@ MEASUREMENT: Final = Answer.MEASUREMENT
 class Firmware:
     """One device's firmware from its boot on. All times are device time, in seconds since the boot, never falling."""
 
-    __slots__ = (
-        "_compatible",
-        "_drive_counter",
-        "_drive_s",
-        "_handle_mm_per_count",
-        "_homing_mm_s",
-        "_lead_mm_rev",
-        "_left_calm_s",
-        "_left_zero_mm",
-        "_may_run",
-        "_mm_per_count",
-        "_motion",
-        "_nonce",
-        "_overcurrent_A",
-        "_retract_mm_s",
-        "_right_calm_s",
-        "_right_zero_mm",
-        "_state_counter",
-        "_ticks",
-        "_watch_counts",
-        "_watch_since_s",
-        "faults",
-        "homed",
-        "mode",
-        "output",
-    )
-
     def __init__(self, plant: PlantParameters) -> None:
         self._lead_mm_rev = plant.screw.lead_mm
         self._mm_per_count = plant.screw.lead_mm / plant.electronics.encoder_counts_per_rev

@@ -76,26 +76,6 @@ class Plant:
     state is that at its beginning. At power-on both bridges are open.
     """
 
-    __slots__ = (
-        "_attraction",
-        "_hand",
-        "_left_V",
-        "_left_early_V",
-        "_right_V",
-        "_right_early_V",
-        "_substep_s",
-        "_substeps",
-        "_substeps_per_element",
-        "_target_s",
-        "element",
-        "force_sensor",
-        "handle_mm",
-        "handle_mm_s",
-        "left",
-        "parameters",
-        "right",
-    )
-
     def __init__(self, parameters: PlantParameters, hand: Hand, seed: int = 0, *, substep_s: float = SUBSTEP_S) -> None:
         assumed = parameters.assumed
         self.parameters = parameters
@@ -240,20 +220,6 @@ def _mean_V(axis: Axis, voltage_V: float | None, early_V: float) -> float | None
 @final
 class ForceSensor:
     """Samples at its own rate, adds noise and a drifting offset, saturates, and shows each sample after a delay."""
-
-    __slots__ = (
-        "_delay_s",
-        "_drift_N_s",
-        "_has_spare",
-        "_in_flight",
-        "_noise",
-        "_period_s",
-        "_range_N",
-        "_samples",
-        "_spare",
-        "_spread_N",
-        "reading_N",
-    )
 
     def __init__(self, plant: PlantParameters, noise: random.Random) -> None:
         sensor = plant.force_sensor
