@@ -84,8 +84,6 @@ class BlackBox:
     ) -> None:
         self._folder = folder
         self._refusal, self._newest, self._dropped = "", "", 0
-        self.handed_over = 0
-        "Bytes of entries."
         self._socket: socket.socket | None = None
         self._process: subprocess.Popen[bytes] | None = None
         if folder is None:
@@ -124,7 +122,6 @@ class BlackBox:
         if self._ticks % PART_TICKS:
             return
         entries = self._packer.take()
-        self.handed_over += len(entries)
         is_taken = self._say(Part(record.monotonic_s, record.t_ns, self._has_state, entries))
         self._has_state = False
         if not is_taken:

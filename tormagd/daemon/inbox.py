@@ -10,7 +10,7 @@ from collections import deque
 
 from tormagd.control.governor import TimedSetpoint
 from tormagd.daemon.hold import Hold, is_passed
-from tormagd.daemon.rate_group import RecentHistogram
+from tormagd.daemon.rate_group import Histogram
 from tormagd.daemon.sequence import Order, Sequence
 from tormagd.daemon.source_clock import AHEAD_S, SourceClock
 from tormagd.hardware.connection import clock_report
@@ -45,7 +45,7 @@ class _Source:
         self.stamp_s = -math.inf  # nothing of it has been taken yet
         self.sequence = Sequence(setpoint.session, setpoint.seq)
         self.clock = SourceClock()
-        self.delays = RecentHistogram()
+        self.delays = Histogram()
         self.accepted = self.refused = 0
         self.is_named = False
         self.refresh(now_s)
@@ -62,7 +62,7 @@ class _Source:
 
     def keep(self, setpoint: Setpoint, now_s: float, delay_s: float) -> None:
         if self.clock.is_settled:
-            self.delays.add(now_s, delay_s * 1e6)
+            self.delays.add_at(now_s, delay_s * 1e6)
         # the worse of arrival and corrected stamp: a stamp of the time to come is of now
         self.setpoint, self.heard_s, self.stamp_s = setpoint, now_s, now_s - max(delay_s, 0.0)
 

@@ -49,7 +49,6 @@ SERIAL_NUMBER: Final = 1
 
 # An operation on flags makes new ones, and a member of an enumeration is looked up in its class by Python code, at a
 # microsecond and a fifth of one: what is needed in every tick is made and named here
-NO_SWITCH: Final = Switches(0)
 HOMED_SWITCHES: Final = [Switches(bits) | Switches.HOMED for bits in range(16)]
 CLOSED_SWITCHES: Final = Switches.LEFT_CLOSED | Switches.RIGHT_CLOSED
 NO_FAULT: Final = DeviceFault(0)
