@@ -160,7 +160,7 @@ def test_one_from_before_frames_were_kept_is_replayed_without(path: Path, tmp_pa
     before = tmp_path / "before.mcap"
     box = read_black_box(path)
     entries = [entry[:3] if entry[0] == "state" else entry for entry in box.entries if not _passed(entry)]
-    write_black_box(before, box.header | {"format": "1"}, [Part(1.0, 1, True, msgspec.msgpack.encode(entries))])
+    write_black_box(before, box.header | {"format": "1"}, [Part(1.0, 1, msgspec.msgpack.encode(entries))])
     box = read_black_box(before)
     known = recorded(box, tmp_path)
     done = rerun(rebuilt(known), known.columns, box.entries)
