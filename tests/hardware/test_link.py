@@ -315,7 +315,6 @@ def test_a_measurement_takes_a_status_a_sense_and_a_state() -> None:
         0.1, 0.2,
     )  # fmt: skip
     assert link.measurement is measurement
-    assert link.age_s(0.8) == pytest.approx(0.1)
 
 
 def test_a_status_updates_what_it_knows_and_leaves_the_number() -> None:

@@ -136,14 +136,11 @@ def test_what_the_controllers_cannot_hold_is_lost_and_counted(make: Callable[...
     assert device.messages.undecodable == 0
 
 
-def test_time_does_not_run_backwards_and_impossible_buses_are_refused(make: Callable[..., CanDevice]) -> None:
+def test_time_does_not_run_backwards(make: Callable[..., CanDevice]) -> None:
     device = make()
     device.advance(0.01)
     with pytest.raises(ValueError, match="now_s"):
         device.advance(0.009)
-    for bitrate, node in ((0, 1), (1_000_000, 16), (1_000_000, -1)):
-        with pytest.raises(ValueError, match="allowed are"):
-            make(bitrate, node)
 
 
 def test_control_at_a_kilohertz_leaves_thirty_percent_of_the_bus(make: Callable[..., CanDevice]) -> None:
