@@ -170,7 +170,7 @@ class Ending(NamedTuple):
     left_mm: float
     right_mm: float
     "Where the carriages are then."
-    within_mm: float = 0.51
+    within_mm: float = 0.3
 
 
 OPEN_MM = 47.5
