@@ -120,22 +120,21 @@ def _publish(
         overdue = min(int(late_s * rate_hz), last - index)
         skipped += overdue
         index += overdue
+        sample = waveform.at(index / rate_hz)
+        ahead = range(index + 1, index + 1 + stream.preview)
         try:
-            client.require_taken()
+            client.publish(
+                sample.force_N,
+                stream.valid_for_ms,
+                start_ns + round(index / rate_hz * 1e9),  # when the force is meant, whenever it gets sent
+                displacement_mm=sample.displacement_mm,
+                rate_mm_s=sample.rate_mm_s,
+                preview_N=tuple(waveform.at(min(later / rate_hz, duration_s)).force_N for later in ahead) or None,
+                preview_dt_ms=1e3 / rate_hz if ahead else None,
+            )
         except UnreachableError as error:
             message = f"the daemon at {address} went away after {sent} setpoints"
             raise CommandError(Exit.UNREACHABLE, "gone", message, error.hint) from error
-        sample = waveform.at(index / rate_hz)
-        ahead = range(index + 1, index + 1 + stream.preview)
-        client.publish(
-            sample.force_N,
-            stream.valid_for_ms,
-            start_ns + round(index / rate_hz * 1e9),  # when the force is meant, whenever it gets sent
-            displacement_mm=sample.displacement_mm,
-            rate_mm_s=sample.rate_mm_s,
-            preview_N=tuple(waveform.at(min(later / rate_hz, duration_s)).force_N for later in ahead) or None,
-            preview_dt_ms=1e3 / rate_hz if ahead else None,
-        )
         sent, index = sent + 1, index + 1
         if watch is not None:
             watch.look()
