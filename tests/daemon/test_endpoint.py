@@ -14,10 +14,10 @@ import msgpack
 import pytest
 import zmq
 
-from tormagd.config import Endpoints
 from tormagd.daemon.endpoint import DRAIN, REQUESTS, SETPOINT_BURST, Endpoint
 from tormagd.daemon.requests import WAITING_PER_CLIENT
 from tormagd.safety.operating_state import RefusedError
+from tormagd_client.endpoints import Endpoints
 from tormagd_client.messages import VERSION, Reply, Request, Telemetry, Tick, decode, encode
 
 PATIENCE_MS = 10_000

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from machines.two import HERE, THERE, NotPermittedError, two_machines
 
-from tormagd.config import ENDPOINTS
+from tormagd_client.endpoints import ENDPOINTS
 
 pytestmark = pytest.mark.live
 
