@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import msgspec
 
-from tormagd.config import Endpoints
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.ctl.watch import Watch, require_range
 from tormagd.ctl.waveform import Waveform, WaveformError, read_csv, shape
 from tormagd.force_file import ForceFileError
 from tormagd_client.blocking import Client
+from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import UnreachableError
 from tormagd_client.messages import MAX_PREVIEW_SAMPLES
 
