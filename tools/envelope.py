@@ -28,7 +28,7 @@ from rendering.hands import HANDS, TURNED_MM_S
 from rendering.ideal_carriage import Json, brake_of
 from tqdm import tqdm
 
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.lab.pages import stamp
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.model_file import load_model
@@ -206,8 +206,8 @@ def low_hold(name: str, asked_N: float, lasts_s: float) -> tuple[str, ...]:
     is_shown = False
     for sample in loop.run(lasts_s, lambda now_s: TimedSetpoint(asked_N, now_s, VALID_S)):
         is_shown = is_shown or Limit.F_MIN in sample.plan.limits
-        if sample.state.safety.faults:
-            return tuple(map(str, sample.state.safety.faults))
+        if sample.safety.faults:
+            return tuple(map(str, sample.safety.faults))
     return () if is_shown else ("F_MIN was not shown",)
 
 

@@ -92,7 +92,7 @@ def _head(share: float) -> str:
 
 
 def _row(stated: Scene, found: MeasuredScene) -> list[str]:
-    reach = core_without(stated.name, ()).planner.portrait
+    reach = core_without(stated.name, ()).portrait
     force = stated.force
     low_N, high_N = max(force.least_N, reach.least_N), min(force.most_N, reach.most_N)
     share = (high_N - low_N) / (force.most_N - force.least_N)
@@ -201,7 +201,7 @@ def draw_asked(path: Path) -> None:
         stated = load_scene(name)
         if stated.signal is None:
             continue
-        range_N = max(stated.force.least_N, core_without(name, ()).planner.portrait.least_N), stated.force.most_N
+        range_N = max(stated.force.least_N, core_without(name, ()).portrait.min_N), stated.force.most_N
         curve = asked(stated.signal, Path(scene_path(name)).parent, range_N, DRAWN_S, DRAWN_HZ)
         axes.plot(*curve, ":" if number >= COLOURS else "-", label=name)
     axes.set(xlabel="time, s", ylabel="force asked, N")

@@ -12,17 +12,17 @@ import numpy.typing as npt
 
 from firmware_protocol.codec import Message
 from firmware_protocol.value import Value
+from tormagd.assembly.conditions import conditions
 from tormagd.config import Config
-from tormagd.control.conditions import conditions
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import Plan, Planner, PlanState
-from tormagd.control.step import StepOutput, Stepper, StepState
+from tormagd.control.core import Planner, Stepper
+from tormagd.control.move.reference import Reference
+from tormagd.control.records import Duty, Measured, Plan, TimedSetpoint
 from tormagd.hardware.backend import LinkStatistics
 from tormagd.hardware.can_stream import CanStream
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.measurement import Measurement
-from tormagd.safety.operating_state import Conditions, OperatingState
+from tormagd.safety.operating_state import Conditions, OperatingState, SafetyState
 from tormagd.simulation.can_device import DEFAULT_NODE, DEVICE, CanLine
 from tormagd.simulation.can_frame import CanFrame
 from tormagd.simulation.device import MessageDevice, SerialDevice
@@ -45,18 +45,20 @@ class Sample(Value):
     def __init__(
         self,
         time_s: float,
-        state: StepState,
-        output: StepOutput,
+        measured: Measured | None,
+        safety: SafetyState,
+        reference: Reference | None,
+        output: Duty,
         plan: Plan,
-        trim: float,
         truth: Truth,
         measurement: Measurement | None,
     ) -> None:
         self.time_s: Final = time_s
-        self.state: Final = state
+        self.measured: Final = measured
+        self.safety: Final = safety
+        self.reference: Final = reference
         self.output: Final = output
         self.plan: Final = plan
-        self.trim: Final = trim
         self.truth: Final = truth
         self.measurement: Final = measurement
 
@@ -168,13 +170,11 @@ class ClosedLoop:
     ) -> None:
         """`planner` may be missing where every tick is given its plan. The device is behind a serial line, or it comes
         with its bus."""
-        self._config, self._stepper, self._planner = config, stepper, planner
+        self._config, self.stepper, self.planner = config, stepper, planner
         self._period_s = 1.0 / config.rates.control_hz
         self._inference_s = 1.0 / config.rates.inference_hz
         self._ticks = 0
-        self.step_state = stepper.start(0.0)
-        self.plan_state: PlanState | None = None if planner is None else planner.start(0.0)
-        self._output: StepOutput | None = None
+        self._output: Duty | None = None
         self._setpoint: TimedSetpoint | None = None
         self._port: VirtualPort | VirtualBus = device if isinstance(device, VirtualBus) else VirtualPort(device)
         self.connection = Connection(config.device, self._port.open, self._lose_link, self._port.clock)
@@ -215,20 +215,16 @@ class ClosedLoop:
         self._port.advance(now_s)
         self.connection.receive()
         used = self._newest_plan() if plan is None else plan
-        measurement = self.connection.measurement
-        self.step_state, output = self._stepper.step(self.step_state, now_s, measurement, used)
+        measurement, stepper = self.connection.measurement, self.stepper
+        output = stepper.step(now_s, measurement, used)
         self.connection.exchange(
             output.left_duty, output.right_duty, output.mode, output.request, output.request_number
         )
         self._output, self._setpoint = output, setpoint
+        measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
         if plan is None:
             self._infer(now_s, setpoint)
-        trim = 1.0 if self.plan_state is None else self.plan_state.trim
-        return Sample(now_s, self.step_state, output, used, trim, self._port.device.truth, measurement)
-
-    def plan_with(self, planner: Planner) -> None:
-        """Plans from now on are another planner's, which goes on from the state as it is."""
-        self._planner = planner
+        return Sample(now_s, measured, safety, reference, output, used, self._port.device.truth, measurement)
 
     def skip(self) -> None:
         """One control period in which the daemon does nothing: it was stopped, or killed. What comes waits for it."""
@@ -237,20 +233,20 @@ class ClosedLoop:
 
     def command(self, name: str) -> None:
         """An operator's command. Raises RefusedError."""
-        self.step_state = self._stepper.command(self.step_state, name, self.now_s, self.conditions())
+        self.stepper.command(name, self.now_s, self.conditions())
 
     def conditions(self) -> Conditions:
         """What commands are decided on."""
-        planner, planned = self._planner, self.plan_state
+        believe = None if self.planner is None else self.planner.believe
         return conditions(
             self.now_s,
             self._config,
             self.connection,
-            self.step_state,
+            self.stepper,
             self._output,
             self._setpoint,
-            planned.device.force_N(planner.portrait.least_N) if planner is not None and planned is not None else 0.0,
-            sensor_doubted=planned is not None and planned.sensor.is_doubted,
+            0.0 if believe is None else believe.min_N,
+            sensor_doubted=believe is not None and believe.sensor.is_doubted,
         )
 
     def run(
@@ -267,21 +263,22 @@ class ClosedLoop:
         self._until(lambda m: m.is_busy, "start homing", plan)
         self._until(lambda m: not m.is_busy and m.is_homed, "home", plan)
         self.command("enable")
-        if self.step_state.safety.operating_state is not OperatingState.ENABLED:
-            raise RuntimeError(f"not enabled: {self.step_state.safety}")
+        if self.stepper.safety.operating_state is not OperatingState.ENABLED:
+            raise RuntimeError(f"not enabled: {self.stepper.safety}")
 
     def _newest_plan(self) -> Plan:
-        if self.plan_state is None:
+        if self.planner is None:
             raise ValueError("plan = None: allowed is a plan for every tick of a loop without a planner")
-        return self.plan_state.plan
+        return self.planner.planned
 
     def _infer(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
-        if self._planner is None or self.plan_state is None:
+        planner = self.planner
+        if planner is None:
             return
-        is_new = setpoint is not None and setpoint.stamp_s > self.plan_state.governor.stamp_s
-        if is_new or now_s - self.plan_state.plan.time_s >= self._inference_s - 1e-9:
-            planned = self._planner.plan(self.plan_state, now_s, setpoint, self.step_state.estimate)
-            self.plan_state = self._planner.foresee(planned)
+        is_new = setpoint is not None and setpoint.stamp_s > planner.planned.stamp_s
+        if is_new or now_s - planner.planned.time_s >= self._inference_s - 1e-9:
+            planner.plan(now_s, setpoint, self.stepper.measured)
+            planner.foresee()
 
     def _until(self, reached: Callable[[Measurement], bool], what: str, plan: Plan | None) -> None:
         for _ in range(round(HOMING_S / self._period_s)):
@@ -292,7 +289,7 @@ class ClosedLoop:
         raise RuntimeError(f"the device did not {what} within {HOMING_S:g} s: {link}")
 
     def _lose_link(self) -> None:
-        self.step_state = self._stepper.lose_link(self.step_state)
+        self.stepper.lose_link()
 
 
 def stream(times_s: Array, forces_N: Array, valid_for_s: float = 0.1) -> Callable[[float], TimedSetpoint | None]:

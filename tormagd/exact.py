@@ -7,7 +7,9 @@ Plain data are what msgpack holds. What it does not know is a map with one key, 
     a list         {"list": [...]}, as a bare one is a tuple; a deque, too
 
 Two equal values come back as two: nothing in the core asks whether a value is the very one that it made before. What
-changes in place, such as the device's link, is written like a value, and read into one that is there already.
+changes in place, such as a stage of the core or the device's link, is written like a value, and read into one that is
+there already. Its fields are those that its class names in `__match_args__` or annotates; one that begins with an
+underscore is a constant.
 """
 
 from collections import deque
@@ -39,12 +41,12 @@ def kinds(*types: type[Value] | type[Enum]) -> Kinds:
 
 
 def plain(thing: object) -> Any:
-    """`thing` as plain data. Raises TypeError for what names no fields in `__match_args__`, and is neither plain, an
-    enumerator, a tuple, a list nor a deque."""
+    """`thing` as plain data. Raises TypeError for what has no fields, and is neither plain, an enumerator, a tuple, a
+    list nor a deque."""
     if type(thing) in _AS_THEY_ARE:
         return thing
-    names = getattr(type(thing), "__match_args__", None)
-    if names is not None:
+    names = _fields(type(thing))
+    if names:
         return {type(thing).__name__: {name: plain(getattr(thing, name)) for name in names}}
     if isinstance(thing, Enum):
         return {type(thing).__name__: thing.value}
@@ -57,8 +59,16 @@ def plain(thing: object) -> Any:
     raise TypeError(f"{thing!r}: allowed are values, enumerators, tuples, lists and what msgpack knows")
 
 
+def _fields(kind: type) -> tuple[str, ...]:
+    # a compiled class has no annotations, but says its attributes
+    for told in ("__match_args__", "__mypyc_attrs__", "__annotations__"):
+        if hasattr(kind, told) and not issubclass(kind, Enum):
+            return tuple(name for name in getattr(kind, told) if told == "__match_args__" or not name.startswith("_"))
+    return ()
+
+
 def _changes(thing: object) -> bool:
-    return hasattr(type(thing), "__match_args__") and not isinstance(thing, Value)
+    return not isinstance(thing, Value) and bool(_fields(type(thing)))
 
 
 def restored(data: Any, known: Kinds) -> Any:
@@ -93,7 +103,7 @@ def restore(thing: Any, data: Any, known: Kinds) -> None:
     """Gives `thing`, which changes in place, the fields that `data` stand for. Raises InexactError."""
     name = type(thing).__name__
     fields = data.get(name) if isinstance(data, dict) else None
-    if not isinstance(fields, dict) or set(fields) != set(thing.__match_args__):
+    if not isinstance(fields, dict) or set(fields) != set(_fields(type(thing))):
         raise InexactError(f"{str(data)[:60]}: allowed are the fields of {name}")
     for field, told in fields.items():
         own = getattr(thing, field)

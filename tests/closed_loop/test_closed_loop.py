@@ -126,7 +126,7 @@ def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Co
     assert max(before - after for before, after in pairwise(governed)) <= 2.0 * 0.0061
     # down to what this device, as far as it has shown itself, gives at its open gap
     assert armed.plan_state is not None
-    least_N = armed.plan_state.device.force_N(core.planner.portrait.least_N)
+    least_N = armed.planner.believe.device.force_N(core.planner.portrait.least_N)
     assert governed[-1] == pytest.approx(least_N, abs=0.01)
     assert samples[-1].truth.gap_mm > OPEN_MM - 3.0
     assert samples[-1].truth.force_N == pytest.approx(least_N, abs=0.05)
@@ -144,7 +144,7 @@ def test_a_millimetre_of_gap(arm, hold_gap, direction: float, start_mm: float) -
     assert from_mm == pytest.approx(start_mm, abs=0.02)
     samples = hold_gap(loop, start_mm + direction, 0.5)
     travelled = np.array([direction * (sample.truth.gap_mm - from_mm) for sample in samples])
-    reference = [direction * (sample.state.reference.gap_mm - start_mm) for sample in samples if sample.state.reference]
+    reference = [direction * (sample.reference.gap_mm - start_mm) for sample in samples if sample.reference]
     rise_s = (int(np.argmax(travelled >= 0.9)) - int(np.argmax(travelled >= 0.1))) * 1e-3
     assert 0.0 < rise_s <= 0.06
     assert travelled.max() <= 1.02
@@ -209,8 +209,8 @@ def struck(arm: Maker, spec: str, seconds: float = 2.6) -> tuple[ClosedLoop, lis
 def first_fault(samples: list[Sample]) -> tuple[Fault, float]:
     """The first fault and how long after the strike it was latched."""
     for sample in samples:
-        if sample.state.safety.faults:
-            return sample.state.safety.faults[0], sample.time_s - STRIKE_S
+        if sample.safety.faults:
+            return sample.safety.faults[0], sample.time_s - STRIKE_S
     pytest.fail("no fault")
 
 
@@ -236,7 +236,7 @@ def test_a_fault_is_named_and_the_gap_opens(arm, spec: str, fault: Fault, within
     assert opened_after_s(samples) < 2.5
     # what was said once is never taken back
     assert samples[-1].output.mode is DriveMode.OFF
-    assert not any(sample.output.mode is DriveMode.RUN for sample in samples if sample.state.safety.faults)
+    assert not any(sample.output.mode is DriveMode.RUN for sample in samples if sample.safety.faults)
 
 
 def test_after_a_lost_encoder_enabling_wants_homing_though_the_device_calls_itself_homed(arm) -> None:

@@ -79,7 +79,7 @@ def skews_um(synchronisation: float) -> Array:
     assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
     assert_sane(samples, config)
     assert samples[-1].truth.gap_mm == pytest.approx(94.0, abs=0.1)
-    return np.array([sample.state.estimate.skew_mm for sample in samples if sample.state.estimate is not None]) * 1e3
+    return np.array([sample.measured.skew_mm for sample in samples if sample.measured is not None]) * 1e3
 
 
 def test_uneven_screws_stay_together_and_cross_coupling_is_why() -> None:

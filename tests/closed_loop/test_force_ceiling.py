@@ -149,7 +149,7 @@ def test_a_zero_that_drifts_is_taken_off_where_the_handle_turns(arm, render, sam
 
 
 def slides(sample: Sample) -> bool:
-    estimate = sample.state.estimate
+    estimate = sample.measured
     return estimate is not None and estimate.handle.rate_mm_s > 20.0 and estimate.handle.displacement_mm >= 2.0
 
 
@@ -174,7 +174,7 @@ def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(arm, re
     LyingSensor(loop.device, LIES["-1 N"](), loop.now_s)
     samples = render(loop, ASKED_N, 3.0)
     assert samples[-1].state.safety.faults == (Fault.SENSOR,)
-    first = next(sample.time_s for sample in samples if sample.state.safety.faults)
+    first = next(sample.time_s for sample in samples if sample.safety.faults)
     assert first - samples[0].time_s == pytest.approx(2.06, abs=0.1)
 
 

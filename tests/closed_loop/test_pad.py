@@ -40,7 +40,7 @@ def test_a_pulse_is_felt_on_the_pad(arm, pad_core: Core, plant: str) -> None:
         sample.truth.force_N - float(np.interp(sample.time_s - PRESSED_S, time_s, force_N))
         for sample in loop.run(PULSE_S, publish)
     ]
-    assert not loop.step_state.safety.faults
+    assert not loop.stepper.safety.faults
     assert float(np.sqrt(np.mean(np.square(errors_N)))) < 0.8 * SCENE.force.tolerance_rms_N
     assert loop.plan_state is not None
     assert loop.plan_state.remembered.relaxed_N > 0.1

@@ -158,7 +158,7 @@ def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLo
     samples = run(holding, FORCE_N, 3.0)
     assert samples[-1].state.safety.faults[0] is Fault.MEASUREMENT_STALE
     assert Fault.HOST_STALL not in samples[-1].state.safety.faults
-    assert not any(sample.output.mode.name == "RUN" for sample in samples if sample.state.safety.faults)
+    assert not any(sample.output.mode.name == "RUN" for sample in samples if sample.safety.faults)
 
 
 # -- the open end --------------------------------------------------------------------------------------------------

@@ -251,7 +251,7 @@ def loop(core: Core, seen: Digest, plant: str, hand: Hand, fault: str, flips: fl
             )
             if planned is not running.plan_state:
                 planned = running.plan_state
-                seen.see((planned, sample.trim))
+                seen.see((planned, sample.plan.trim))
 
     for stalled_ms, then_s in ((0, 1.5), (12, 0.5), (40, 0.5), (83, 2.4)):
         for _ in range(stalled_ms):

@@ -52,7 +52,7 @@ def record(plant="sample_1", hand=None, rates_N_s=(0.8, 1.0, 0.8), most_N=2.0):
             waveform.duration_s,
             lambda now_s, w=waveform, s=start_s: TimedSetpoint(w.at(now_s - s).force_N, now_s, 0.25),  # type: ignore[misc]
         ):
-            seen = sample.state.estimate
+            seen = sample.measured
             assert seen is not None
             rows.append(
                 (sample.time_s, seen.left_mm, seen.right_mm, seen.handle_mm, seen.handle.rate_mm_s, seen.force_N)

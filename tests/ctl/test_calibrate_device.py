@@ -29,7 +29,7 @@ def played(loop, waveform):
     for sample in loop.run(
         waveform.duration_s, lambda now_s: TimedSetpoint(waveform.at(now_s - start_s).force_N, now_s, 0.25)
     ):
-        seen = sample.state.estimate
+        seen = sample.measured
         rows.append((sample.time_s, seen.force_N, seen.handle.rate_mm_s))
     return dict(zip(COLUMNS, np.array(rows).T, strict=True))
 

@@ -545,7 +545,7 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     samples = []
     for sample in loop.run(case.bad_s, publisher(loop.now_s)):
         samples.append(sample)
-        if sample.state.safety.faults:
+        if sample.safety.faults:
             break
     check_limits(samples)
     last = samples[-1]
@@ -559,7 +559,7 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     if case.named:
         settled = samples[-SETTLED_TICKS:]
         assert case.named & {
-            name for sample in settled for name in (*sample.state.safety.faults, *sample.output.limits)
+            name for sample in settled for name in (*sample.safety.faults, *sample.output.limits)
         }
     for name in case.counted:
         assert getattr(line.backend.statistics, name) > 0, name
@@ -576,7 +576,7 @@ def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
             break
     check_limits(samples)
     assert all(sample.output.mode is DriveMode.OFF for sample in (faulted, *samples))
-    assert all(sample.state.safety.operating_state is OperatingState.FAULT for sample in samples)
+    assert all(sample.safety.operating_state is OperatingState.FAULT for sample in samples)
     assert samples[-1].truth.gap_mm > OPEN_MM - 2.0
     assert min(sample.truth.gap_mm for sample in samples) > faulted.truth.gap_mm - COASTING_MM
 

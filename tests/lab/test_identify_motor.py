@@ -90,7 +90,7 @@ def record(sample: str, seed: int = 1, rounds: int = 2) -> Columns:
     for _ in loop.run(1.0):
         pass
     # the status of a daemon says the same: what this device gives with its gap open, as far as it has shown itself
-    least_N = loop.plan_state.device.force_N(core.planner.portrait.least_N)
+    least_N = loop.planner.believe.device.force_N(core.planner.portrait.least_N)
     waveform = excitation(Range(least_N, min(core.planner.portrait.most_N, core.scene.force.most_N)), rounds)
     start_s = loop.now_s
 

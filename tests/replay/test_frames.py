@@ -99,7 +99,7 @@ def test_the_link_measures_and_writes_the_same_again(core: Core, box: BlackBoxFi
 
 def test_what_came_damaged_is_counted_and_measured_alike(core: Core, on_can: Flight, can_path: Path) -> None:
     entries = read_black_box(can_path).entries
-    assert on_can.loop.step_state.safety.faults[0] is Fault.MEASUREMENT_STALE
+    assert on_can.loop.stepper.safety.faults[0] is Fault.MEASUREMENT_STALE
     done = again(core, entries)
     assert done.difference is None
     assert done.damaged == pytest.approx(300, abs=2)

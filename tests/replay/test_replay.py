@@ -47,7 +47,7 @@ def again(core: Core, box: BlackBoxFile, from_s: float = 0.0) -> Rerun:
 
 
 def test_a_fault_is_replayed_bit_for_bit_from_the_file_alone(ended: Flight, box: BlackBoxFile, path: Path) -> None:
-    assert ended.loop.step_state.safety.faults == (Fault.ENCODER,)
+    assert ended.loop.stepper.safety.faults == (Fault.ENCODER,)
     known = recorded(box, path.parent)
     assert known.config == ended.config
     done = rerun(rebuilt(known), known.columns, box.entries)
@@ -76,7 +76,7 @@ def test_it_is_from_the_middle_of_the_run(core: Core, box: BlackBoxFile, from_s:
 def test_black_boxes_of_planted_faults_replay(fly: Any, core: Core, tmp_path: Path, fault, silent_s, told) -> None:
     """The force sensor falls silent, the device does, and the daemon stands still."""
     flight = fly(*([fault] if fault else []), until_s=3.3, silent_s=silent_s)
-    assert str(flight.loop.step_state.safety.faults[0]) == told
+    assert str(flight.loop.stepper.safety.faults[0]) == told
     box = read_black_box(flight.write(tmp_path / "planted.mcap"))
     done = again(core, box)
     assert done.difference is None

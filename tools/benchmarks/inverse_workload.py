@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from tormagd.control.portrait import FieldOfGap
+from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.levenberg_marquardt import train
 from tormagd.lab.training.metrics import fit_metrics

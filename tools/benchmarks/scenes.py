@@ -12,8 +12,8 @@ import msgspec
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
 from tormagd.lab.pages import stamp
 from tormagd.lab.thesis.values import PULSE_MAE_MT
 from tormagd.scenes.measured import JUDGED, MeasuredScene, measured, on_first

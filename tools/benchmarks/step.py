@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config, Motor
-from tormagd.control.motor import margins, zero_order_hold
-from tormagd.control.plan import Plan
-from tormagd.control.step import Stepper
+from tormagd.control.core import Stepper
+from tormagd.control.move.motor import margins, zero_order_hold
+from tormagd.control.records import Plan
 from tormagd.lab.tune_position import corner_margins
 from tormagd.scenes.scene import EVERY_TERM, load_scene
 from tormagd.simulation.device import VirtualDevice
@@ -92,13 +92,13 @@ def settled_loop(config: Config, parameters: PlantParameters, left_out: tuple[st
 
 def step(loop: ClosedLoop, target_mm: float) -> Step:
     """One step to a gap, from rest."""
-    before = loop.step_state.estimate
+    before = loop.stepper.measured
     if before is None:
         raise RuntimeError("the loop has no measurement")
     start_mm, start_s = before.gap_mm, loop.now_s
     samples = drive(loop, target_mm, WATCHED_S)
     time_s = np.array([sample.time_s - start_s for sample in samples])
-    estimates = [sample.state.estimate for sample in samples if sample.state.estimate is not None]
+    estimates = [sample.measured for sample in samples if sample.measured is not None]
     gap = np.array([estimate.gap_mm for estimate in estimates])
     share = (gap - start_mm) / (target_mm - start_mm)
     outside = np.flatnonzero(np.abs(share - 1.0) > SETTLING_BAND)

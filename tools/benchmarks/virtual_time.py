@@ -22,9 +22,9 @@ import numpy as np
 import tormagd
 from benchmarks.against import add_against_argument, environment
 from benchmarks.step import START_MM, STEP_MM, hold
+from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
-from tormagd.control.core import build_core
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
@@ -66,7 +66,7 @@ def gap_loop(config: Config, plant: str) -> Run:
 def armed_loop(config: Config, plant: str) -> ClosedLoop:
     """Homed and enabled."""
     core = build_core(config)
-    loop = ClosedLoop(config, core.stepper, core.planner, VirtualDevice(load_plant(plant), SteadyHand(), seed=1))
+    loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(plant), SteadyHand(), seed=1))
     loop.arm()
     return loop
 

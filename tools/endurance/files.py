@@ -16,8 +16,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from tormagd.assembly.profile import ProfileError
 from tormagd.config import load_config
-from tormagd.control.profile import ProfileError
 from tormagd.ctl.waveform import read_csv
 from tormagd.daemon.profiles import ProfileFolder
 from tormagd.force_file import ForceFileError

@@ -12,10 +12,10 @@ from typing import Any
 from tqdm import tqdm
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
+from tormagd.assembly.build import build_core
 from tormagd.config import Config
-from tormagd.control.core import build_core
-from tormagd.control.plan import Plan
-from tormagd.control.step import Stepper
+from tormagd.control.core import Stepper
+from tormagd.control.records import Plan
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault

@@ -10,11 +10,11 @@ import msgspec
 
 from fault_matrix.bad_lines import BadBus, BadSerialLine, whole
 from fault_matrix.cases import SERIAL, Injection
+from tormagd.assembly.build import Core, build_core
+from tormagd.assembly.conditions import is_homed
 from tormagd.closed_loop import ClosedLoop, Sample, VirtualBus
 from tormagd.config import Config, load_config
-from tormagd.control.conditions import is_homed
-from tormagd.control.core import Core, build_core
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.safety.operating_state import SafetyState
 from tormagd.simulation.can_device import CanDevice
@@ -54,10 +54,10 @@ class Rig:
         self.line: BadSerialLine | BadBus
         if bus == SERIAL:
             self.line = serial = BadSerialLine(device)
-            self.loop = ClosedLoop(self.config, core.stepper, core.planner, serial)
+            self.loop = ClosedLoop(self.config, core.stepper(), core.planner(), serial)
         else:
             self.line = can = BadBus(CanDevice(device.messages))
-            self.loop = ClosedLoop(self.config, core.stepper, core.planner, VirtualBus(can))
+            self.loop = ClosedLoop(self.config, core.stepper(), core.planner(), VirtualBus(can))
         self.publisher = Publisher() if injection.publisher is None else DaemonsBorder()
         self.is_dead = False
         self._stalled_ms = 0
@@ -66,12 +66,12 @@ class Rig:
     @property
     def safety(self) -> SafetyState:
         """Operating state and faults."""
-        return self.loop.step_state.safety
+        return self.loop.stepper.safety
 
     @property
     def is_homed(self) -> bool:
         """As telemetry says it."""
-        return is_homed(self.loop.measurement, self.loop.step_state.estimate)
+        return is_homed(self.loop.measurement, self.loop.stepper.measured)
 
     @property
     def off_N(self) -> float:

@@ -84,8 +84,8 @@ class Watch:
         """Takes one tick; `sample` is None while the daemon is dead."""
         truth, firmware = self._loop.simulated.truth, self._loop.simulated.firmware
         if sample is not None:
-            self._host |= dict.fromkeys(map(str, sample.state.safety.faults))
-            if sample.state.safety.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED):
+            self._host |= dict.fromkeys(map(str, sample.safety.faults))
+            if sample.safety.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED):
                 held = map(str, (*sample.plan.limits, *sample.output.limits))
                 self._limits |= dict.fromkeys(limit for limit in held if limit not in self._usual)
         self._device |= dict.fromkeys(fault.name or "" for fault in firmware.faults)
@@ -125,7 +125,7 @@ class Watch:
     def cell(self, injection: Injection, bus: str) -> Cell:
         """The row."""
         loop = self._loop
-        state = loop.step_state.safety.operating_state
+        state = loop.stepper.safety.operating_state
         mode = loop.simulated.firmware.mode.name
         noticed_ms = self._since("noticed")
         is_safe, safe_ms = self._ended(injection.safe, noticed_ms)

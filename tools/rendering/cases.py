@@ -42,11 +42,11 @@ from rendering.signals import (
     staircase_signal,
     with_approach,
 )
+from tormagd.assembly.build import build_core
+from tormagd.assembly.profile import profile_of
 from tormagd.config import Config
-from tormagd.control.core import build_core
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import NOTHING_SHOWN, Shown
-from tormagd.control.profile import profile_of
+from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
+from tormagd.control.records import TimedSetpoint
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene, terms_of
 from tormagd.simulation.hand import SteadyHand
@@ -88,7 +88,7 @@ LEVEL_S = 0.5
 # -- how soon and how well a device is known ------------------------------------------------------------------------
 
 
-def course(plant: PlantParameters, legs: Legs, levels: Levels, shown: Shown = NOTHING_SHOWN) -> Followed:
+def course(plant: PlantParameters, legs: Legs, levels: Levels, shown: Learned = NOTHING_LEARNED) -> Followed:
     """One run: the hand along its legs, the force along its levels, with a device that counts as having `shown` so much
     of itself."""
     loop, force_N = armed_at_rest(plant, legs, shown), asked_at(levels)
@@ -229,7 +229,7 @@ def pulse(name: str) -> Json:
     learning = track(plant, played, "pulse", 0.0)
     before = learning.shown.replaced(read=-1, read_s=0.0)
     alone, learned = (
-        track(plant, played, "pulse", 0.0, is_learning=False, shown=shown) for shown in (NOTHING_SHOWN, before)
+        track(plant, played, "pulse", 0.0, is_learning=False, shown=shown) for shown in (NOTHING_LEARNED, before)
     )
     courses = {"model alone": alone, "learned before": learned, "while learned": learning}
     return {key: found.since(0.0).rms_N for key, found in courses.items()}
@@ -245,7 +245,7 @@ def track(
     preview_s: float,
     *,
     is_learning: bool = True,
-    shown: Shown = NOTHING_SHOWN,
+    shown: Learned = NOTHING_LEARNED,
 ) -> Followed:
     """Plays a signal behind an approach; time counts from its first force. The device counts as having `shown` so much
     of itself, and goes on doing so where `is_learning`. Raises RuntimeError for a fault."""
@@ -339,7 +339,7 @@ def draws(pool: Executor, _kept: Kept, count: int = EVEN_DRAWS) -> list[Json]:
 def staircase(pool: Executor, kept: Kept) -> Json:
     """The coronary scene's staircase on the three samples: the level of each step over its last LEVEL_S."""
     rows = []
-    signal = staircase_signal(build_core(Config(scene=STAIR_SCENE)).planner.portrait.least_N)
+    signal = staircase_signal(build_core(Config(scene=STAIR_SCENE)).portrait.min_N)
     runs = [pool.submit(track, device(name), signal, STAIR_SCENE, 0.0) for name in SAMPLES]
     for name, run in zip(SAMPLES, runs, strict=True):
         kept[f"staircase {name}"] = run.result()

@@ -10,12 +10,12 @@ import numpy.typing as npt
 
 from rendering.device_draws import device
 from rendering.hands import Legs, WaitingHand
+from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
-from tormagd.control.core import build_core
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import NOTHING_SHOWN, Shown
-from tormagd.control.slow_friction import believable
+from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
+from tormagd.control.believe.slow_friction import believable
+from tormagd.control.records import TimedSetpoint
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import Hand, parse_hand
@@ -78,7 +78,7 @@ class Followed(NamedTuple):
     is_railed: Array
     limits: dict[str, float]
     faults: tuple[str, ...] = ()
-    shown: Shown = NOTHING_SHOWN
+    shown: Learned = NOTHING_LEARNED
     trim: float = 1.0
 
     @property
@@ -110,18 +110,18 @@ def armed(
     plant: PlantParameters,
     hand: Hand,
     scene: Scene | None = None,
-    shown: Shown = NOTHING_SHOWN,
+    shown: Learned = NOTHING_LEARNED,
 ) -> ClosedLoop:
     """A device that was homed and enabled, and counts as having `shown` so much of itself. A given `scene` takes the
     place of the configured one. Raises RuntimeError where the device does not get that far."""
     core = build_core(config, scene)
-    loop = ClosedLoop(config, core.stepper, core.planner, VirtualDevice(plant, hand, seed=1))
+    loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(plant, hand, seed=1))
     loop.plan_state = core.planner.start(loop.now_s).replaced(shown=shown)
     loop.arm()
     return loop
 
 
-def armed_at_rest(plant: PlantParameters, legs: Legs, shown: Shown = NOTHING_SHOWN) -> ClosedLoop:
+def armed_at_rest(plant: PlantParameters, legs: Legs, shown: Learned = NOTHING_LEARNED) -> ClosedLoop:
     """The same in CORNER_SCENE with a hand that stood meanwhile, and goes along its legs from now on."""
     hand = WaitingHand()
     loop = armed(Config(scene=CORNER_SCENE), plant, hand, shown=shown)
@@ -144,12 +144,12 @@ def follow(loop: ClosedLoop, publish: Publisher, lasts_s: float, start_s: float,
         return setpoint
 
     for sample in loop.run(lasts_s, newest):
-        truth, trim = sample.truth, sample.trim
+        truth, trim = sample.truth, sample.plan.trim
         since_s = truth.time_s - start_s - lead_s
         if since_s >= 0.0:
             rows.append((since_s, asked_N, truth.force_N, truth.handle_mm, truth.handle_mm_s, is_railed(loop)))
             held.update({str(limit) for limit in (*sample.plan.limits, *sample.output.limits)})
-        faults = tuple(map(str, sample.state.safety.faults))
+        faults = tuple(map(str, sample.safety.faults))
         if faults:
             break
     shares = {limit: count / len(rows) for limit, count in sorted(held.items())}
@@ -157,7 +157,7 @@ def follow(loop: ClosedLoop, publish: Publisher, lasts_s: float, start_s: float,
     return Followed(time_s, asked, rendered, handle, speed, railed, shares, faults, shown_by(loop), trim)
 
 
-def shown_by(loop: ClosedLoop) -> Shown:
+def shown_by(loop: ClosedLoop) -> Learned:
     """What the device has shown so far."""
     assert loop.plan_state is not None, "a loop with a planner has a state of it"
     return loop.plan_state.shown

@@ -16,16 +16,16 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from tormagd.control.plan import PlanState
 from tqdm import tqdm
 
 from rendering.following import FILE_PREVIEW_S, Array, publisher
 from rendering.hands import swinging
+from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, Rates
-from tormagd.control.core import Core, build_core
-from tormagd.control.estimate import Estimate
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import Planner, PlanState
+from tormagd.control.core import Planner
+from tormagd.control.records import Measured, TimedSetpoint
 from tormagd.scenes.measured import Cost
 from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Solver, load_task, scene_path, terms_of
 from tormagd.scenes.signal import asked
@@ -75,7 +75,7 @@ def run(case: Case) -> float:
     rows = []
     for time_s, loop in played.ticks(case.seconds):
         truth = loop.device.truth
-        if loop.step_state.safety.faults:
+        if loop.stepper.safety.faults:
             return float(np.sqrt(np.mean(played.force_N**2)))
         if time_s >= LEARN_S:
             rows.append((truth.time_s - played.begins_s, truth.force_N, truth.gap_mm))
@@ -124,7 +124,7 @@ def _modelled(scene: Scene, case: Case) -> Scene:
 
 
 def _planned(
-    planner: Planner, state: PlanState, now_s: float, setpoint: TimedSetpoint | None, estimate: Estimate | None
+    planner: Planner, state: PlanState, now_s: float, setpoint: TimedSetpoint | None, estimate: Measured | None
 ) -> PlanState:
     return planner.foresee(planner.plan(state, now_s, setpoint, estimate))
 
@@ -152,7 +152,7 @@ class Play:
         finger = scene.finger
         hand = swinging(scene.handle) if finger is msgspec.UNSET else PressingHand(finger.depth_mm)
         device = VirtualDevice(plant_of(scene, case.plant), hand, seed=1)
-        self._loop = ClosedLoop(config, self.core.stepper, self.core.planner, device)
+        self._loop = ClosedLoop(config, self.core.stepper(), self.core.planner(), device)
         self._loop.arm()
         self.time_s, self.force_N = signal_of(self.core, case.scene, LEARN_S + case.seconds, case.inference_hz)
         approach_s = APPROACH_S
@@ -189,7 +189,7 @@ class Play:
             if time_s >= LEARN_S:
                 steps.append((step_state, loop.now_s, loop.measurement, plan_state.plan))
                 if loop.plan_state is not plan_state:
-                    setpoint, estimate = self.publish(before_s), loop.step_state.estimate
+                    setpoint, estimate = self.publish(before_s), loop.stepper.measured
                     plans.append((plan_state, loop.now_s, setpoint, estimate))
             step_state, plan_state, before_s = loop.step_state, loop.plan_state, loop.now_s
         return steps, plans
@@ -205,7 +205,7 @@ def signal_of(core: Core, scene_name: str, longest_s: float, rate_hz: int) -> tu
     scene = core.scene
     if scene.signal is None:
         raise ValueError(f"scene {scene.name}: it has no [signal]: nothing is known of what it asks for")
-    range_N = max(scene.force.least_N, core.planner.portrait.least_N), scene.force.most_N
+    range_N = max(scene.force.least_N, core.portrait.min_N), scene.force.most_N
     time_s, force_N = asked(scene.signal, Path(scene_path(scene_name)).parent, range_N, longest_s, rate_hz)
     if not scene.signal.file and time_s[-1] < longest_s:
         force_N = np.tile(force_N, math.ceil(longest_s * rate_hz / len(force_N)))[: round(longest_s * rate_hz)]

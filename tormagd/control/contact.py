@@ -2,8 +2,7 @@
 
 from typing import Final, final
 
-from tormagd.control.estimate import Estimate
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import Measured, TimedSetpoint
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S
 
 ROLLER_RATE_MM_S: Final = 42.0
@@ -25,16 +24,16 @@ class Contact:
         self.rate_mm_s: Final = rate_mm_s
         self.slides: Final = slides
 
-    def planned(self, setpoint: TimedSetpoint | None, estimate: Estimate | None) -> tuple[float, float]:
+    def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
         """Displacement, mm, and rate, mm/s, that the force is planned for: the setpoint's own where it states them, but
         of a handle that slides the measured rate."""
         raise NotImplementedError
 
-    def present(self, estimate: Estimate) -> tuple[float, float]:
+    def present(self, measured: Measured) -> tuple[float, float]:
         """Displacement, mm, and rate, mm/s, at which the model gives the force of now."""
         raise NotImplementedError
 
-    def is_known(self, estimate: Estimate) -> bool:
+    def is_known(self, measured: Measured) -> bool:
         """Whether the model knows the force of now."""
         raise NotImplementedError
 
@@ -47,26 +46,26 @@ class Sliding(Contact):
     def __init__(self) -> None:
         super().__init__(MOBILISED_MM, ROLLER_RATE_MM_S, slides=True)
 
-    def planned(self, setpoint: TimedSetpoint | None, estimate: Estimate | None) -> tuple[float, float]:
+    def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
         """See `Contact.planned`."""
         displacement_mm = MOBILISED_MM
-        rate_mm_s = MOVING_MM_S if estimate is None else estimate.handle.sliding_mm_s
+        rate_mm_s = MOVING_MM_S if measured is None else measured.handle.sliding_mm_s
         if setpoint is not None:
             if setpoint.displacement_mm is not None:
                 displacement_mm = setpoint.displacement_mm
             # learned of the measured rate, a device would be taken for another at the stated one
-            if setpoint.rate_mm_s is not None and (estimate is None or not self.is_known(estimate)):
+            if setpoint.rate_mm_s is not None and (measured is None or not self.is_known(measured)):
                 rate_mm_s = abs(setpoint.rate_mm_s)
         return displacement_mm, max(rate_mm_s, CREEP_MM_S)
 
-    def present(self, estimate: Estimate) -> tuple[float, float]:
+    def present(self, measured: Measured) -> tuple[float, float]:
         """See `Contact.present`."""
-        return MOBILISED_MM, abs(estimate.handle.rate_mm_s)
+        return MOBILISED_MM, abs(measured.handle.rate_mm_s)
 
-    def is_known(self, estimate: Estimate) -> bool:
+    def is_known(self, measured: Measured) -> bool:
         """Whether the handle has gone far enough one way, and not begun to come back: its friction is mobilised."""
-        handle = estimate.handle
-        gone_back_mm = abs(estimate.handle_mm - handle.turn.furthest_mm)
+        handle = measured.handle
+        gone_back_mm = abs(measured.handle_mm - handle.turn.furthest_mm)
         return handle.displacement_mm >= MOBILISED_MM and gone_back_mm <= GONE_BACK_MM
 
 
@@ -78,11 +77,11 @@ class Pressing(Contact):
     def __init__(self, depth_mm: float) -> None:
         super().__init__(depth_mm, 0.0, slides=False)
 
-    def planned(self, setpoint: TimedSetpoint | None, estimate: Estimate | None) -> tuple[float, float]:
+    def planned(self, setpoint: TimedSetpoint | None, measured: Measured | None) -> tuple[float, float]:
         """See `Contact.planned`."""
         depth_mm, rate_mm_s = self.displacement_mm, 0.0
-        if estimate is not None and self.is_known(estimate):
-            depth_mm, rate_mm_s = self.present(estimate)
+        if measured is not None and self.is_known(measured):
+            depth_mm, rate_mm_s = self.present(measured)
         if setpoint is not None:
             if setpoint.displacement_mm is not None:
                 depth_mm = setpoint.displacement_mm
@@ -90,10 +89,10 @@ class Pressing(Contact):
                 rate_mm_s = setpoint.rate_mm_s
         return depth_mm, rate_mm_s
 
-    def present(self, estimate: Estimate) -> tuple[float, float]:
+    def present(self, measured: Measured) -> tuple[float, float]:
         """See `Contact.present`."""
-        return estimate.handle.displacement_mm, estimate.handle.rate_mm_s
+        return measured.handle.displacement_mm, measured.handle.rate_mm_s
 
-    def is_known(self, estimate: Estimate) -> bool:
+    def is_known(self, measured: Measured) -> bool:
         """Whether the finger is about as deep as the scene says, or deeper."""
-        return estimate.handle.displacement_mm >= PRESSED * self.displacement_mm
+        return measured.handle.displacement_mm >= PRESSED * self.displacement_mm

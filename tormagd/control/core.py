@@ -1,312 +1,201 @@
-"""The functional core put together for one scene: `plan` and `step` with their constants.
+"""The core: `plan` and `step`, which call the stages in the order in which data flows.
 
-The daemon, the virtual-time simulation and the tests build it here, so that all of them run the same one.
+    step   every tick    measure -> watch -> move
+    plan   when due      believe -> ask -> aim
+
+Deterministic: no clock, no I/O, no globals. The same stages and inputs give the same bits, compiled and interpreted, in
+the daemon, in virtual time and in a replay. All state is in the stages' fields; what passes between them is a record.
 """
 
-import hashlib
 import math
-import platform
-from pathlib import Path
-from typing import NamedTuple
+from typing import Final, final
 
-import msgspec
-import numpy as np
-from msgspec import UNSET
-
+from firmware_protocol.codec import DriveMode
 from tormagd.config import Config
-from tormagd.control.contact import PRESSED, Contact, Pressing, Sliding
-from tormagd.control.device_fit import LEAST_SCALE
-from tormagd.control.motor import Margins, margins, pull_V
-from tormagd.control.plan import CEILING, Planner
-from tormagd.control.portrait import FieldOfGap, LawOfField, Portrait, PortraitSearch, law_beside, portrait
-from tormagd.control.renderable import Missed, missed
-from tormagd.control.step import Stepper
-from tormagd.inverse.choice import Choice, build, named
-from tormagd.model.force_curve import ForceCurve
-from tormagd.model.model_file import ForceModel, ModelFileError, load_model
-from tormagd.model.rising import falling_at
-from tormagd.model.shipped import model_path
-from tormagd.physics.errors import DomainError
-from tormagd.physics.field import PAD_RADIUS_M, REFERENCE_PERMEABILITY, PowerFieldLaw
-from tormagd.physics.force import Geometry
-from tormagd.physics.inserts import insert
-from tormagd.scenes.scene import AUTO, LEAST_CONTROL_HZ, Finger, Scene, load_scene, scene_path, terms_of
-from tormagd.scenes.signal import asked
-from tormagd_client.endpoints import ConfigError
+from tormagd.control.aim.aim import Aim, Element
+from tormagd.control.ask.governor import Governor
+from tormagd.control.believe.believe import Believe, Learned
+from tormagd.control.believe.memory import ElementMemory
+from tormagd.control.measure import Measure
+from tormagd.control.move.carriages import Carriages
+from tormagd.control.move.homing import Homing
+from tormagd.control.move.motor import full_speed_mm_s
+from tormagd.control.move.watch import Watch, ceiling_N
+from tormagd.control.records import Duty, Measured, Plan, TimedSetpoint
+from tormagd.hardware.measurement import Measurement
+from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.operating_state import Conditions, OperatingState, SafetyState, command, homed_again, latch
+from tormagd.scenes.scene import Scene, terms_of
 
-LEAST_PHASE_MARGIN_DEG = 30.0
-LEAST_GAIN_MARGIN_DB = 4.0
-SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("physics", "model", "inverse", "safety", "scenes")))
-SOURCES += ("tormagd/hardware", "tormagd/control")
-SENSED_N = 0.001
-"A step of the force sensor's message."
-SETTLES_MM = 4.0 * 8.0 / 4480.0
-"To within four counts of the encoders the gap comes to rest, wherever in its stroke: friction holds it there."
-DEPTHS = 9
-"Between the scene's depth and the model's greatest, at which a pad's force is looked at whether it rises."
-LOOKED_AT_S, LOOKED_AT_HZ, LOOKS = 30.0, 100, 20
-"So much of a scene's signal is held against the device's speed, as often as this, and so often in a period."
-SEVERAL_BRANCHES = named("nearest", neighbours=16, reason="the force falls with the field somewhere")
-"With fewer neighbours answers jump between branches, more gain little: docs/tactile.md."
-IN_PORTRAIT = Choice("portrait", 0.0, 0, "the scene requires no rate: force over gap is one table")
-BY_NEWTON = named("newton", reason="of the searches the cheapest, and the most exact")
-"At every tolerance and for every size of network: docs/inverse_trade.md, and docs/scenes.md on the device."
+_PAUSED: Final = OperatingState.PAUSED
 
 
-class Core(NamedTuple):
-    """What one scene's control needs; nothing in it changes."""
+@final
+class Planner:
+    """From setpoints to gaps, for one device."""
 
-    scene: Scene
-    planner: Planner
-    stepper: Stepper
-    margins: Margins
-    solver: Choice
-    model: str
-    "The model's fingerprint."
-    models: Path
-    "Where the scene's model was looked for, where it is no shipped one."
-    gap_speed_mm_s: float
-    "The fastest that the gap is moved."
-    missed: Missed | None = None
-    "What the gap's speed alone leaves of the scene's signal; None where it states none."
+    planned: Plan
+    "The newest."
+    believe: Believe
+    governor: Governor
+    aim: Aim
+
+    def __init__(self, config: Config, scene: Scene, element: Element, now_s: float = 0.0) -> None:
+        """Begins with the gap open at `now_s`."""
+        terms, insert = terms_of(scene), scene.insert
+        gap_range_mm, memory = (insert.gap_closed_mm, insert.gap_open_mm), element.memory
+        followed = ElementMemory(memory, element.nominal, element.field, gap_range_mm)
+        self.believe = Believe(config, terms, element.nominal, followed, element.portrait.min_N)
+        gap_speed_mm_s = config.position.gap_speed_mm_s
+        self.governor = Governor(now_s, element.portrait, scene.force, gap_speed_mm_s, terms)
+        self.aim = Aim(config, scene, element)
+        self.planned = self.aim.begin(now_s, 0, 0.0)
+
+    def plan(self, now_s: float, setpoint: TimedSetpoint | None, measured: Measured | None) -> Plan:
+        """The next plan. `measured` is None while the device has said nothing: nothing is learned of it then. Raises
+        what its searches raise: call `afresh` then."""
+        belief = self.believe.update(now_s, measured)
+        ask = self.governor.update(now_s, setpoint, belief.device, belief.lag_s)
+        plan = self.aim.update(now_s, setpoint, ask, belief, measured)
+        # how late the carriages are is learned from this plan's gap, and acts in the next one
+        self.believe.expect(now_s - self.planned.time_s, measured, plan.foresight, plan.gap_mm)
+        self.planned = plan
+        return plan
+
+    def foresee(self) -> bool:
+        """Prepares what the next plans need of what comes, and says whether there was something to do: to be called
+        after each plan, when nothing waits."""
+        return self.governor.foresee()
+
+    def teach(self, learned: Learned) -> None:
+        """Takes that for what is known of the device. The element's memory stays."""
+        self.believe.teach(learned)
+
+    def afresh(self, now_s: float) -> None:
+        """Begins anew after a plan that could not be made. Plans go on being numbered, and the element has not
+        forgotten."""
+        self.believe.forget()
+        self.governor.begin(now_s)
+        self.planned = self.aim.begin(now_s, self.planned.number + 1, self.believe.memory.lag_mT)
 
 
-def build_core(config: Config, scene: Scene | None = None, models: Path | None = None) -> Core:
-    """The core for `config.scene`. Raises ConfigError where scene, model and configuration do not fit each other.
+@final
+class Stepper:
+    """From measurements and plans to duties, for one device."""
 
-    A given `scene` takes the place of the one in the file; its files are beside that one, or its model in the folder
-    `models`: then it has been checked, and its signal is not looked for.
-    """
-    beside = scene_path(config.scene).parent.absolute() if models is None else models
-    scene = load_scene(config.scene) if scene is None else scene
-    config = _slowed(config, scene)
-    for name in ("control_hz", "inference_hz"):
-        offered, needed = getattr(config.rates, name), getattr(scene.bandwidth, name)
-        if offered < needed:
-            raise ConfigError(f"rates.{name} = {offered}: allowed is at least {needed}, which scene {scene.name} needs")
-    stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
-    if stability.phase_margin_deg < LEAST_PHASE_MARGIN_DEG or stability.gain_margin_dB < LEAST_GAIN_MARGIN_DB:
-        raise ConfigError(
-            f"position: these gains leave a phase margin of {stability.phase_margin_deg:.0f} degrees and a gain margin "
-            f"of {stability.gain_margin_dB:.1f} dB: allowed is at least {LEAST_PHASE_MARGIN_DEG:g} and "
-            f"{LEAST_GAIN_MARGIN_DB:g}"
+    time_s: float
+    "Of the newest step."
+    safety: SafetyState
+    measure: Measure
+    homing: Homing
+    watch: Watch
+    move: Carriages
+
+    def __init__(self, config: Config, scene: Scene, now_s: float = 0.0) -> None:
+        """Begins disabled at `now_s`."""
+        position, period_s = config.position, 1.0 / config.rates.control_hz
+        self.time_s, self.safety = now_s, SafetyState()
+        slides = scene.element == "torque"
+        home_mm, full_mm_s = scene.insert.gap_open_mm / 2.0, full_speed_mm_s(config.motor)
+        self.measure = Measure(home_mm, position.derivative_filter_s, slides, full_mm_s, period_s)
+        self._ceiling_N: Final = ceiling_N(scene)
+        self.homing = Homing(self._ceiling_N)
+        self.watch = Watch(config, scene)
+        self.move = Carriages(config, scene)
+        self._period_s: Final = period_s
+
+    @property
+    def measured(self) -> Measured | None:
+        """What was measured at the newest step; None while the device has said nothing."""
+        return self.measure.measured
+
+    def step(self, now_s: float, measurement: Measurement | None, plan: Plan) -> Duty:
+        """One control period. With no measurement the link is lost, and the device is told nothing but OFF."""
+        last_s = self.time_s
+        self.time_s = now_s
+        if measurement is None:
+            self.lose_link()
+            return self._duty(DriveMode.OFF, 0.0, 0.0, ())
+        measured = self.measure.update(last_s, now_s, measurement, self.safety.needs_homing)
+        measured = self._judge(now_s, measurement, measured, plan)
+        if not self.safety.is_driven:
+            if measurement.is_busy:  # homing moves the origin
+                self.measure.begin(measurement)
+            self.move.stop()
+            return self._duty(DriveMode.OFF, 0.0, 0.0, ())
+        sight = self.measure.sight
+        if sight.is_blind or self.measure.leap is not None:
+            return self._hold(now_s)
+        if sight.was_blind:
+            self.move.resume(measured)
+        dt_s = now_s - last_s
+        if not 0.0 < dt_s < 10.0 * self._period_s:
+            dt_s = self._period_s  # a clock that stood still gives no period
+        return self._drive(now_s, dt_s, measurement, measured, plan)
+
+    def command(self, name: str, now_s: float, conditions: Conditions) -> None:
+        """Takes an operator's command. Raises RefusedError, and nothing has changed then."""
+        measured, before = self.measured, self.safety
+        self.safety = command(before, name, now_s, self.watch.known(conditions, measured))
+        is_enabled = self.safety.operating_state is OperatingState.ENABLED
+        if is_enabled and before.operating_state is OperatingState.DISABLED:
+            assert measured is not None, "nothing is fresh without one"
+            self.move.begin(measured.gap_mm)
+            self.watch.begin(now_s)
+
+    def latch(self, fault: Fault) -> None:
+        """Latches a fault that was found elsewhere."""
+        self.safety = latch(self.safety, (fault,))
+
+    def lose_link(self) -> None:
+        """The link broke: a fault where the device was driven, otherwise only a forgotten device."""
+        if self.safety.is_driven:
+            self.latch(Fault.LINK_LOST)
+        self.measure.lose_device()
+        self.move.lose_device()
+
+    def _judge(self, now_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Measured:
+        """Latches the faults that show. What is measured of a device that has lost its position is not homed."""
+        measure = self.measure
+        shown = self.watch.faults(
+            now_s, self.safety, measurement, measured, measure.sight, measure.leap, plan.sensor_doubted_s
         )
-    _refuse_too_weak(config, scene)
-    try:
-        model = load_model(
-            model_path(scene.insert.model, beside=beside),
-            element=scene.element,
-            insert=scene.insert.name,
-        )
-        part = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
-        field = part.field
-        fields_mT, rises = _known_fields_mT(scene, model, part)
-        reach = portrait(_curve(model, part), field, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
-        choice = choose_solver(scene, rises=rises)
-        search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, rises=rises)
-        law = _law(scene, reach, field) if part.contact.slides else None
-    except (DomainError, ModelFileError) as error:
-        raise ConfigError(f"scene {scene.name}: {error}") from error
-    _refuse_unknown_hand(scene, model)
-    _refuse_out_of_reach(scene, reach)
-    _refuse_too_fine(scene, reach)
-    too_fast = _refuse_too_fast(config, scene, reach, beside) if models is None else None
-    _refuse_too_sudden(config, scene, reach)
-    planner = Planner(config, scene, model, search, field, reach, law, part.cip_percent, part.contact)
-    stepper, speed_mm_s = Stepper(config, scene), config.position.gap_speed_mm_s
-    return Core(scene, planner, stepper, stability, choice, model.fingerprint, beside, speed_mm_s, too_fast)
+        if not self.safety.is_driven:
+            self.homing.update(now_s, measurement)
+            shown = self.homing.faults + shown
+        self.safety = latch(self.safety, shown)
+        if not self.safety.needs_homing:
+            return measured
+        self.safety = homed_again(self.safety, measurement.is_homed)
+        return measure.lose_position(measured)
 
+    def _hold(self, now_s: float) -> Duty:
+        """Asks the device for an answer without moving anything: friction holds the gap. Nothing is learned from it."""
+        limit = Limit.HOST_STALL if self.measure.sight.has_stalled(now_s) else Limit.DEVICE_SILENT
+        if self.measure.leap is not None:
+            limit = Limit.ENCODER
+        self.watch.rest()
+        return self._duty(DriveMode.RUN, 0.0, 0.0, (limit,))
 
-def sources_hash() -> str:
-    """SHA-256 of the sources that decide: all that `plan` and `step` run. Both builds of them have the same."""
-    root, digest = Path(__file__).parents[2], hashlib.sha256()
-    for room in SOURCES:
-        for path in sorted((root / room).glob("**/*.py")):
-            digest.update(f"{path.relative_to(root).as_posix()} {path.stat().st_size}\n".encode())
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
+    def _drive(self, now_s: float, dt_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Duty:
+        followed = None if self.safety.operating_state is _PAUSED else plan
+        drive = self.move.update(now_s, dt_s, followed, measurement, measured, self.watch.is_over)
+        total = drive.left_motor + drive.right_motor + measurement.supply_V
+        if not -math.inf < total < math.inf:  # a sum is finite only if all of it is
+            self._begin_anew()
+            return self._duty(DriveMode.OFF, 0.0, 0.0, ())
+        self.watch.update(dt_s, measured, self.move.reference_mm, drive.left_motor, drive.right_motor)
+        limits = (*drive.limits, *self.watch.limits(now_s, measurement, measured, self.measure.sight))
+        return self._duty(DriveMode.RUN, drive.left_duty, drive.right_duty, limits)
 
+    def _begin_anew(self) -> None:
+        """A number is not finite: nothing that it may have come into is kept."""
+        self.latch(Fault.NOT_FINITE)
+        self.measure.forget()
+        self.homing = Homing(self._ceiling_N)
+        self.watch.begin(math.inf)
+        self.watch.rest()
+        self.move.forget()
 
-def platform_name() -> str:
-    """What else the bits of a result depend on: the processor's kind, Python and NumPy."""
-    return f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}"
-
-
-class Part(NamedTuple):
-    """What the scene's element is to the core: how it is touched, the field in it over the gap, and its iron."""
-
-    contact: Contact
-    field: FieldOfGap
-    cip_percent: float
-
-
-def _brake(scene: Scene) -> Part:
-    fitted = insert(scene.insert.name)
-    permeability, radius_mm = fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm
-    return Part(Sliding(), FieldOfGap(PowerFieldLaw(), permeability, radius_mm * 1e-3), 100.0 * fitted.cip_fraction)
-
-
-def _pad(finger: Finger, model: ForceModel) -> Part:
-    *_, (cip_percent, _) = model.feature_ranges
-    return Part(
-        Pressing(finger.depth_mm), FieldOfGap(PowerFieldLaw(), REFERENCE_PERMEABILITY, PAD_RADIUS_M), cip_percent
-    )
-
-
-def _curve(model: ForceModel, part: Part) -> ForceCurve:
-    """Of the contact that the portrait is drawn for, or the nearest that the model knows."""
-    (_, most_mm), (slowest_mm_s, fastest_mm_s), _, _ = model.feature_ranges
-    contact = part.contact
-    rate_mm_s = min(max(contact.rate_mm_s, slowest_mm_s), fastest_mm_s)
-    return model.curve(min(contact.displacement_mm, most_mm), rate_mm_s, part.cip_percent)
-
-
-def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
-    """The force law beside the brake's model; of a pad none is printed that could judge one."""
-    fitted, metres = scene.insert, 1e-3
-    geometry = Geometry(
-        fitted.inner_radius_mm * metres,
-        fitted.outer_radius_mm * metres,
-        fitted.thickness_mm * metres,
-        fitted.roller_radius_mm * metres,
-    )
-    return law_beside(reach, PowerFieldLaw(), field, insert(fitted.name).elastomer, geometry)
-
-
-def _known_fields_mT(scene: Scene, model: ForceModel, part: Part) -> tuple[tuple[float, float], bool]:
-    """The fields of the scene's gaps, as far as the model knows them; and whether it knows that they give more force
-    however the element is touched. Where it is touched as the portrait is, they have to."""
-    low_mT, high_mT = model.field_range_mT
-    low_mT = max(low_mT, part.field.field_mT(scene.insert.gap_open_mm))
-    high_mT = min(high_mT, part.field.field_mT(scene.insert.gap_closed_mm))
-    if not low_mT < high_mT:
-        raise DomainError("insert.model", f"trained on {model.field_range_mT} mT", "fields that the scene's gaps give")
-    (_, most_mm), *_ = model.feature_ranges
-    falling_mm_s = falling_at(model, (low_mT, high_mT), min(part.contact.displacement_mm, most_mm))
-    if falling_mm_s is not None:
-        raise DomainError(
-            "insert.model",
-            f"force that falls with the field at {falling_mm_s:.3g} mm/s",
-            "a force that rises with the field: train it on more data, as `tormag-lab train-model --rising` checks",
-        )
-    if part.contact.slides:
-        return (low_mT, high_mT), True
-    depths_mm = np.linspace(PRESSED * part.contact.displacement_mm, most_mm, DEPTHS).tolist()
-    return (low_mT, high_mT), all(falling_at(model, (low_mT, high_mT), depth) is None for depth in depths_mm)
-
-
-def _refuse_too_weak(config: Config, scene: Scene) -> None:
-    motor, closed_mm = config.motor, scene.insert.gap_closed_mm
-    needed_V = motor.coulomb_V + pull_V(motor.pull_V, closed_mm)
-    most_V = config.position.duty_limit * motor.supply_V / 2.0
-    if needed_V > most_V:
-        raise ConfigError(
-            f"motor: coulomb_V = {motor.coulomb_V:g} and pull_V = {motor.pull_V:g} take {needed_V:.2f} V to open the "
-            f"gap from {closed_mm:g} mm: allowed is {most_V:g} V, half of position.duty_limit times motor.supply_V"
-        )
-
-
-def _refuse_out_of_reach(scene: Scene, reach: Portrait) -> None:
-    # a lowest force below what the open gap gives is no error: no passive brake gives 0, and the limit F_MIN says so
-    between = f"allowed is {reach.least_N:.2f}..{reach.most_N:.2f}, what model {scene.insert.model} gives in these gaps"
-    if not reach.least_N < scene.force.most_N <= reach.most_N:
-        raise ConfigError(f"scene {scene.name}: force.most_N = {scene.force.most_N:g}: {between}")
-
-
-def at_rates_of(scene: Scene, config: Config) -> Config:
-    """The configuration with the rates that the scene needs, where `rates.of_scene` says so. Raises ConfigError."""
-    if not config.rates.of_scene:
-        return config
-    needed = scene.bandwidth
-    control_hz = max(needed.control_hz, LEAST_CONTROL_HZ)
-    rates = msgspec.structs.replace(config.rates, control_hz=control_hz, inference_hz=needed.inference_hz)
-    try:
-        return msgspec.structs.replace(config, rates=rates)
-    except ValueError as error:
-        raise ConfigError(f"scene {scene.name}: rates.of_scene: {error}") from error
-
-
-def _slowed(config: Config, scene: Scene) -> Config:
-    """The configuration with the scene's gap speed, where that is the lower one."""
-    position, asked_mm_s = config.position, scene.insert.gap_speed_mm_s
-    if asked_mm_s is UNSET or asked_mm_s >= position.gap_speed_mm_s:
-        return config
-    return msgspec.structs.replace(config, position=msgspec.structs.replace(position, gap_speed_mm_s=asked_mm_s))
-
-
-def least_resolution_N(reach: Portrait, most_N: float) -> float:
-    """The smallest difference of force that the device makes and measures, up to this force."""
-    return max(SENSED_N, SETTLES_MM * reach.slope_at_N_mm(most_N))
-
-
-def _refuse_too_fine(scene: Scene, reach: Portrait) -> None:
-    least_N = least_resolution_N(reach, scene.force.most_N)
-    if scene.force.resolution_N < least_N:
-        raise ConfigError(
-            f"scene {scene.name}: force.resolution_N = {scene.force.resolution_N:g}: allowed is at least {least_N:.2g}"
-            f": the force sensor has steps of {SENSED_N:g} N, and the gap settles to {1e3 * SETTLES_MM:.0f} um"
-        )
-
-
-def _refuse_unknown_hand(scene: Scene, model: ForceModel) -> None:
-    depths_mm, rates_mm_s, *_ = model.feature_ranges
-    handle, finger = scene.handle, scene.finger
-    stated = [("handle.least_mm_s", handle.least_mm_s, rates_mm_s), ("handle.most_mm_s", handle.most_mm_s, rates_mm_s)]
-    if finger is not UNSET:
-        stated = [("finger.depth_mm", finger.depth_mm, depths_mm), ("finger.most_mm_s", finger.most_mm_s, rates_mm_s)]
-    for key, value, (least, most) in stated:
-        if not least <= value <= most:
-            raise ConfigError(
-                f"scene {scene.name}: {key} = {value:g}: allowed is {least:.2g}..{most:.3g}, what model "
-                f"{scene.insert.model} was trained on"
-            )
-
-
-def _refuse_too_fast(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Missed | None:
-    if scene.signal is None:
-        return None
-    force, speed_mm_s = scene.force, config.position.gap_speed_mm_s
-    range_N = max(force.least_N, reach.least_N), force.most_N
-    bandwidth_hz = 0.0 if scene.signal.bandwidth_hz is UNSET else scene.signal.bandwidth_hz
-    rate_hz = max(LOOKED_AT_HZ, math.ceil(LOOKS * bandwidth_hz))
-    times_s, forces_N = asked(scene.signal, beside, range_N, LOOKED_AT_S, rate_hz)
-    miss = missed(reach, times_s.tolist(), forces_N.tolist(), speed_mm_s)
-    if miss.rms_N > force.tolerance_rms_N:
-        worst = ", ".join(
-            f"{point.asked_N_s:.2g} N/s at {point.force_N:.2f} N (the device: {point.given_N_s:.2g})"
-            for point in miss.worst
-        )
-        raise ConfigError(
-            f"scene {scene.name}: signal: allowed is what gaps of {speed_mm_s:g} mm/s follow within "
-            f"force.tolerance_rms_N = {force.tolerance_rms_N:g}: they miss it by {miss.rms_N:.3f}, {miss.share:.0%} of "
-            f"the time is faster: {worst}"
-        )
-    return miss
-
-
-def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
-    # the weakest believable device makes a force with the least gap, where a gap's speed is the most force; and the
-    # ceiling lets no gap make more than CEILING times the scene's greatest
-    opening_mm_s, key = max(
-        (2.0 * config.device.retract_mm_s, "device.retract_mm_s"),
-        (config.position.gap_speed_mm_s, "position.gap_speed_mm_s"),
-    )
-    model_N = min(CEILING * scene.force.most_N / LEAST_SCALE, reach.most_N)
-    lost_N_s = LEAST_SCALE * reach.force_rate_N_s(model_N, opening_mm_s)
-    if lost_N_s > scene.force.most_release_N_s:
-        raise ConfigError(
-            f"scene {scene.name}: force.most_release_N_s = {scene.force.most_release_N_s:g}: allowed is at least "
-            f"{lost_N_s:.2f}: {key} opens the gap by {opening_mm_s:g} mm/s, which at {LEAST_SCALE * model_N:.2g} N "
-            "loses so much"
-        )
-
-
-def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:
-    """The search that `scene` names; else the portrait where the rate is no term, the k-nearest where the force is not
-    known to rise, or Newton's method. Raises DomainError."""
-    wanted = scene.solver
-    if wanted.name == AUTO:
-        if not terms_of(scene).rate:
-            return IN_PORTRAIT
-        return BY_NEWTON if rises else SEVERAL_BRANCHES
-    return named(wanted.name, wanted.step_mT or None, wanted.neighbours or None)
+    def _duty(self, mode: DriveMode, left: float, right: float, limits: tuple[Limit, ...]) -> Duty:
+        return Duty(mode, left, right, self.safety.request, self.safety.request_number, limits)

@@ -3,7 +3,7 @@
 from typing import Final, final
 
 from firmware_protocol.value import Value
-from tormagd.control.estimate import Estimate
+from tormagd.control.records import Measured
 
 LEAP_SPEEDS: Final = 3.0
 "No motor, and no pull of the magnets, moves a carriage faster than so many times the motor's own full speed,"
@@ -36,12 +36,12 @@ class Leap(Value):
         self.left_from_mm: Final = left_from_mm
         self.right_from_mm: Final = right_from_mm
 
-    def has_come_back(self, estimate: Estimate, full_speed_mm_s: float, now_s: float) -> bool:
+    def has_come_back(self, measured: Measured, full_speed_mm_s: float, now_s: float) -> bool:
         """Whether the counts are where carriages can have come to since before the leap: it was a burst on a line."""
-        most_mm = LEAP_SPEEDS * full_speed_mm_s * (self.within_s + now_s - self.seen_s) + LEAP_MM
+        max_mm = LEAP_SPEEDS * full_speed_mm_s * (self.within_s + now_s - self.seen_s) + LEAP_MM
         return (
-            abs(estimate.left_mm - self.left_from_mm) <= most_mm
-            and abs(estimate.right_mm - self.right_from_mm) <= most_mm
+            abs(measured.left_mm - self.left_from_mm) <= max_mm
+            and abs(measured.right_mm - self.right_from_mm) <= max_mm
         )
 
     def __str__(self) -> str:
@@ -49,25 +49,25 @@ class Leap(Value):
 
 
 def leap_between(
-    last: Estimate, estimate: Estimate, full_speed_mm_s: float, now_s: float, seen_s: float
+    last: Measured, measured: Measured, full_speed_mm_s: float, now_s: float, seen_s: float
 ) -> Leap | None:
-    """The leap from `last` to `estimate`, the first that was seen since `seen_s`; None for what a carriage can do.
+    """The leap from `last` to `measured`, the first that was seen since `seen_s`; None for what a carriage can do.
 
     The device's clock says how long it took, unless there was nothing to see for longer, and the clock ran over.
     """
-    left_mm, right_mm = estimate.left_mm - last.left_mm, estimate.right_mm - last.right_mm
-    within_s = max(estimate.device_time_s - last.device_time_s, now_s - seen_s)
-    most_mm = LEAP_SPEEDS * full_speed_mm_s * within_s + LEAP_MM
-    if -most_mm <= left_mm <= most_mm and -most_mm <= right_mm <= most_mm:
+    left_mm, right_mm = measured.left_mm - last.left_mm, measured.right_mm - last.right_mm
+    within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)
+    max_mm = LEAP_SPEEDS * full_speed_mm_s * within_s + LEAP_MM
+    if -max_mm <= left_mm <= max_mm and -max_mm <= right_mm <= max_mm:
         return None
     return Leap(now_s, left_mm, right_mm, within_s, last.left_mm, last.right_mm)
 
 
-def is_outside(estimate: Estimate, closed_mm: float, open_mm: float, is_left_open: bool, is_right_open: bool) -> bool:
+def is_outside(measured: Measured, closed_mm: float, open_mm: float, is_left_open: bool, is_right_open: bool) -> bool:
     """Whether a carriage of a homed device reads a place where none can be, for gaps from `closed_mm` to `open_mm`, or
     where it cannot be because its open switch is closed: there it was homed."""
-    least_mm, most_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
+    min_mm, max_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
     home_mm = open_mm / 2.0 - OVERRUN_MM
-    left_least_mm = home_mm if is_left_open else least_mm
-    right_least_mm = home_mm if is_right_open else least_mm
-    return not (left_least_mm <= estimate.left_mm <= most_mm and right_least_mm <= estimate.right_mm <= most_mm)
+    left_min_mm = home_mm if is_left_open else min_mm
+    right_min_mm = home_mm if is_right_open else min_mm
+    return not (left_min_mm <= measured.left_mm <= max_mm and right_min_mm <= measured.right_mm <= max_mm)

@@ -22,11 +22,10 @@ import msgspec
 
 from firmware_protocol.build import settle
 from tormagd import __version__
+from tormagd.assembly.build import Core, platform_name, sources_hash
+from tormagd.assembly.journal import FORMAT, Journal, Packer
 from tormagd.config import Config
-from tormagd.control.core import Core, platform_name, sources_hash
-from tormagd.control.journal import FORMAT, Journal, Packer
-from tormagd.control.plan import PlanState
-from tormagd.control.step import StepState
+from tormagd.control.core import Planner, Stepper
 from tormagd.hardware.connection import Connection
 from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
 from tormagd.safety.operating_state import RefusedError
@@ -101,13 +100,13 @@ class BlackBox:
         self._connection: Connection | None = None
         self._asked: deque[Write] = deque(maxlen=MOST_ASKED)
 
-    def begin(self, step: StepState, plan: PlanState, connection: Connection) -> None:
+    def begin(self, stepper: Stepper, planner: Planner, connection: Connection) -> None:
         """With these states the first tick is run, and with what comes through this connection."""
         if self._socket is not None:
             self._connection, connection.traffic = connection, self.journal
-        self._snapshot(step, plan)
+        self._snapshot(stepper, planner)
 
-    def ticked(self, record: TickRecord, step: StepState, plan: PlanState) -> None:
+    def ticked(self, record: TickRecord, stepper: Stepper, planner: Planner) -> None:
         """A control period is over, with these states."""
         if self._socket is None:
             return
@@ -126,7 +125,7 @@ class BlackBox:
             self._dropped += 1
             self.journal.missed()
         if not is_taken or self._ticks % self._ticks_per_snapshot == 0:
-            self._snapshot(step, plan)
+            self._snapshot(stepper, planner)
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
         """Asks for a black box, and says where it will be. Raises RefusedError."""
@@ -205,8 +204,8 @@ class BlackBox:
         while self._asked and self._say(self._asked[0]):
             self._asked.popleft()
 
-    def _snapshot(self, step: StepState, plan: PlanState) -> None:
-        self.journal.snapshot(step, plan, None if self._connection is None else self._connection.memory())
+    def _snapshot(self, stepper: Stepper, planner: Planner) -> None:
+        self.journal.snapshot(stepper, planner, None if self._connection is None else self._connection.memory())
 
     def _say(self, what: Said) -> bool:
         """Whether the socket took it."""

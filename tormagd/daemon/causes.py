@@ -6,7 +6,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from tormagd.config import Device
-from tormagd.control.step import StepState
+from tormagd.control.core import Stepper
 from tormagd.daemon.callbacks import Delay
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import FAULTS, LIMITS, Explanation, Fault, Limit
@@ -33,13 +33,13 @@ class Causes:
         self._stall: Stall | None = None
         self._told: dict[str, str] = {}
 
-    def note_stall(self, state: StepState, delay: Delay) -> None:
+    def note_stall(self, stepper: Stepper, delay: Delay) -> None:
         """A tick was late. Only what the step took for a stall, too, is one; of two close together the longer stays."""
-        sight, known = state.sight, self._stall
-        if sight.stalled_s == state.time_s and (known is None or known.took_s != sight.stall_s):
+        sight, known = stepper.measure.sight, self._stall
+        if sight.stalled_s == stepper.time_s and (known is None or known.took_s != sight.stall_s):
             self._stall = Stall(sight.stall_s, delay.culprit)
 
-    def tell(self, faults: tuple[Fault, ...], state: StepState, measurement: Measurement | None) -> None:
+    def tell(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement | None) -> None:
         """Says which faults are new, and remembers what is known of their causes now."""
         for fault in faults:
             self._told.pop(fault, None)
@@ -47,30 +47,29 @@ class Causes:
             opened = f"the device opened the gap by itself after {self._device.command_timeout_ms:g} ms"
             self._told[Fault.HOST_STALL] = f"{self._stall}; {opened}"
         if Fault.MEASUREMENT_STALE in faults and measurement is not None:
-            silent_ms = (state.time_s - measurement.received_s) * 1e3
+            silent_ms = (stepper.time_s - measurement.received_s) * 1e3
             self._told[Fault.MEASUREMENT_STALE] = (
                 f"the device had sent no new state for {silent_ms:.0f} ms"
                 if silent_ms > measurement.delay_s * 1e3
                 else f"the device was {measurement.delay_s * 1e3:.0f} ms behind with the commands that it obeyed"
             )
         if measurement is not None:
-            self._tell_what_was_measured(faults, state, measurement)
+            self._tell_what_was_measured(faults, stepper, measurement)
         for explained in self.of_faults(faults):
             log.error("fault: %s: %s; next: %s", explained.code, explained.cause, explained.remedy)
 
-    def _tell_what_was_measured(self, faults: tuple[Fault, ...], state: StepState, measurement: Measurement) -> None:
+    def _tell_what_was_measured(self, faults: tuple[Fault, ...], stepper: Stepper, measurement: Measurement) -> None:
         """The causes whose figures are the measurement's, or what the step has remembered of it."""
         figures: dict[Fault, str] = {
-            Fault.SENSE_STALE: f"for {(state.time_s - measurement.sensed_s) * 1e3:.0f} ms",
-            Fault.STATUS_STALE: f"for {(state.time_s - measurement.reported_s) * 1e3:.0f} ms",
+            Fault.SENSE_STALE: f"for {(stepper.time_s - measurement.sensed_s) * 1e3:.0f} ms",
+            Fault.STATUS_STALE: f"for {(stepper.time_s - measurement.reported_s) * 1e3:.0f} ms",
             Fault.LINK_DEGRADED: str(measurement.link),
             Fault.CLOCK: f"by {measurement.link.clock_drift:+.1%}",
             Fault.OUT_OF_STROKE: f"left {measurement.left_mm:.1f} mm, right {measurement.right_mm:.1f} mm from home",
         }
-        if state.leap is not None:
-            figures[Fault.ENCODER] = str(state.leap)
-        if state.homing is not None:
-            figures |= dict.fromkeys(state.homing.faults, str(state.homing))
+        if stepper.measure.leap is not None:
+            figures[Fault.ENCODER] = str(stepper.measure.leap)
+        figures |= dict.fromkeys(stepper.homing.faults, str(stepper.homing))
         for fault in faults:
             if fault in figures:
                 self._told[fault] = f"{FAULTS[fault].cause}: {figures[fault]}"

@@ -3,14 +3,14 @@
 import logging
 import time
 
-from tormagd.control.journal import Journal
-from tormagd.control.plan import Plan
-from tormagd.control.step import StepOutput, Stepper, StepState
+from tormagd.assembly.journal import Journal
+from tormagd.control.core import Stepper
+from tormagd.control.records import Duty, Plan
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import Conditions, RefusedError, latch, reason
+from tormagd.safety.operating_state import Conditions, RefusedError, reason
 
 TICK_SHARE, BEFORE_SHARE = 0.3, 0.1
 "Of the period: what a tick is given, and what is kept clear before it."
@@ -22,9 +22,8 @@ class ControlLoop:
     """Carries the newest measurement through `step` to the device, once a period."""
 
     def __init__(self, stepper: Stepper, connection: Connection, period_ns: int, journal: Journal) -> None:
-        self._stepper, self._connection, self._journal = stepper, connection, journal
-        self.state: StepState = stepper.start(time.monotonic())
-        self.output: StepOutput | None = None
+        self.stepper, self._connection, self._journal = stepper, connection, journal
+        self.output: Duty | None = None
         self.measurement: Measurement | None = None
         "What the last step was given; the connection may have a newer one by now."
         self.timing = RateGroup("control", period_ns)
@@ -40,7 +39,7 @@ class ControlLoop:
             self._connection.receive()  # what came before or during the pause is not to be taken for an answer after it
         self.measurement = self._connection.measurement
         self._journal.stepped()
-        self.state, output = self._stepper.step(self.state, now_s, self.measurement, plan)
+        output = self.stepper.step(now_s, self.measurement, plan)
         self._connection.exchange(
             output.left_duty, output.right_duty, output.mode, output.request, output.request_number
         )
@@ -50,9 +49,9 @@ class ControlLoop:
 
     def command(self, name: str, conditions: Conditions) -> None:
         """An operator's command. Raises RefusedError."""
-        now_s, source = time.monotonic(), self.state.safety.operating_state
+        now_s, source = time.monotonic(), self.stepper.safety.operating_state
         try:
-            self.state = self._stepper.command(self.state, name, now_s, conditions)
+            self.stepper.command(name, now_s, conditions)
         except RefusedError:
             self._journal.commanded(name, now_s, conditions, is_refused=True)
             raise
@@ -71,16 +70,16 @@ class ControlLoop:
     def latch(self, fault: Fault) -> None:
         """Latches a fault that was found outside the step."""
         self._journal.latched(fault)
-        self.state = self.state.replaced(safety=latch(self.state.safety, (fault,)))
+        self.stepper.latch(fault)
 
     def lose_link(self) -> None:
         """Tells the core that the device is gone."""
         self._journal.lost_link()
-        self.state = self._stepper.lose_link(self.state)
+        self.stepper.lose_link()
 
     def new_faults(self) -> tuple[Fault, ...]:
         """The faults that were latched since this was last asked."""
-        faults, known = self.state.safety.faults, self._known_faults
+        faults, known = self.stepper.safety.faults, self._known_faults
         if faults == known:
             return ()
         self._known_faults = faults

@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable
 from functools import partial
 
+from tormagd.assembly.build import Core
 from tormagd.config import Config
-from tormagd.control.core import Core
 from tormagd.daemon import notify
 from tormagd.daemon.black_box import AFTER_FAULT_S, BlackBox
 from tormagd.daemon.callbacks import Callbacks
@@ -69,20 +69,21 @@ class Daemon:
         self._endpoint = Endpoint(config.endpoints, priority_of_threads(), config.sources.priority, keys)
         rates = config.rates
         self._box = box or BlackBox(None, {}, rates.control_hz)
-        self._control = ControlLoop(core.stepper, self._connection, NS // rates.control_hz, self._box.journal)
+        self._control = ControlLoop(
+            core.stepper(time.monotonic()), self._connection, NS // rates.control_hz, self._box.journal
+        )
         self._endpoint.admission.pause_s = self._control.until_slack_s
         self._inference = InferenceLoop(
-            core.planner,
+            core.planner(time.monotonic()),
             self._endpoint,
             NS // rates.inference_hz,
-            time.monotonic(),
             journal=self._box.journal,
             on_failure=partial(self._control.latch, Fault.PLAN_FAILED),
         )
         folder = state_folder(config.device.profiles, "profiles")
         self._profiles = Profiles(
             None if folder is None else ProfileFolder(folder, core.scene.insert.name, core.model),
-            lambda: self._inference.state.shown,
+            self._inference.planner.believe,
             self._inference.teach,
         )
         self._telemetry = TelemetryLoop(
@@ -98,7 +99,7 @@ class Daemon:
             self._box,
             refused,
         )
-        self._box.begin(self._control.state, self._inference.state, self._connection)
+        self._box.begin(self._control.stepper, self._inference.planner, self._connection)
         self._ticks_per_snapshot = rates.control_hz // rates.telemetry_hz
         self._ended = asyncio.Event()
 
@@ -145,23 +146,23 @@ class Daemon:
             return  # a spurious wake-up
         callbacks, control, timing = self._callbacks, self._control, self._control.timing
         start_ns = time.monotonic_ns()
-        used = self._inference.state
-        control.tick(heartbeat.due_ns, beats - 1, used.plan)
+        used = self._inference.planner.planned
+        control.tick(heartbeat.due_ns, beats - 1, used)
         driven_ns = time.monotonic_ns()
         callbacks.ran(ControlLoop.tick.__qualname__, start_ns, driven_ns)
         if timing.delay_ns > timing.period_ns:
-            self._causes.note_stall(control.state, callbacks.blame(driven_ns - timing.delay_ns, driven_ns))
+            self._causes.note_stall(control.stepper, callbacks.blame(driven_ns - timing.delay_ns, driven_ns))
         else:
             callbacks.forget()
         if self._endpoint.has_requests:
             self._telemetry.take_requests()
             callbacks.ran(TelemetryLoop.take_requests.__qualname__, driven_ns, time.monotonic_ns())
         if faults := control.new_faults():
-            self._causes.tell(faults, control.state, control.measurement)
+            self._causes.tell(faults, control.stepper, control.measurement)
             with contextlib.suppress(RefusedError):  # where none is kept
                 self._telemetry.keep(str(faults[0]), AFTER_FAULT_S)
         try:
-            self._inference.after_tick(control.state.estimate)
+            self._inference.after_tick(control.stepper.measured)
         finally:  # whatever becomes of planning, the daemon can be seen and stopped
             planned_ns = time.monotonic_ns()
             callbacks.ran(InferenceLoop.after_tick.__qualname__, driven_ns, planned_ns)
@@ -175,7 +176,7 @@ class Daemon:
                 callbacks.ran(TelemetryLoop.serve.__qualname__, begun_ns, time.monotonic_ns())
 
     def _receive_setpoints(self) -> None:
-        self._inference.receive(self._control.state.estimate, self._control.next_tick_ns)
+        self._inference.receive(self._control.stepper.measured, self._control.next_tick_ns)
 
     def _receive_requests(self) -> None:
         # shortly before a tick they wait for it, as setpoints do: it goes first, and sends what they ask for. A flood
@@ -214,7 +215,7 @@ class Daemon:
 
     async def _open_gap(self) -> None:
         """Asks the device to open and waits until it has; what it cannot do in time it goes on doing without us."""
-        if self._control.state.safety.operating_state is not OperatingState.FAULT and self._connection.measurement:
+        if self._control.stepper.safety.operating_state is not OperatingState.FAULT and self._connection.measurement:
             self._control.command("disable", self._telemetry.conditions())
         until_s = time.monotonic() + LONGEST_RETRACT_S
         while self._telemetry.is_busy() and time.monotonic() < until_s:

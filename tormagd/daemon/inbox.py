@@ -8,7 +8,7 @@ import math
 import shlex
 from collections import deque
 
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.hold import Hold, is_passed
 from tormagd.daemon.rate_group import Histogram
 from tormagd.daemon.sequence import Order, Sequence

@@ -4,9 +4,10 @@ import logging
 import time
 from collections.abc import Callable
 
-from tormagd.control.estimate import Estimate
-from tormagd.control.journal import Journal
-from tormagd.control.plan import Planner, PlanState, Shown
+from tormagd.assembly.journal import Journal
+from tormagd.control.believe.believe import Learned
+from tormagd.control.core import Planner
+from tormagd.control.records import Measured
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.rate_group import RateGroup
 
@@ -29,26 +30,24 @@ class InferenceLoop:
         planner: Planner,
         endpoint: Endpoint,
         period_ns: int,
-        now_s: float,
         clock_ns: Callable[[], int] = time.monotonic_ns,
         *,
         journal: Journal,
         on_failure: Callable[[], None],
     ) -> None:
-        self._planner, self._endpoint, self._clock_ns, self._journal = planner, endpoint, clock_ns, journal
+        self.planner, self._endpoint, self._clock_ns, self._journal = planner, endpoint, clock_ns, journal
         self._on_failure, self._failure = on_failure, ""
-        self.state: PlanState = planner.start(now_s)
         self.timing = RateGroup("inference", period_ns)
         self._due_ns = 0  # the first is due with the first tick: what the daemon does before that is no stall
         self._waiting_ns = 0
         self._slack_ns = 200_000.0
 
-    def teach(self, shown: Shown) -> None:
-        """Plans from now on for a device that has shown this of itself."""
-        self._journal.taught(shown)
-        self.state = self.state.replaced(shown=shown)
+    def teach(self, learned: Learned) -> None:
+        """Plans from now on for a device of which this is known."""
+        self._journal.taught(learned)
+        self.planner.teach(learned)
 
-    def receive(self, estimate: Estimate | None, next_tick_ns: int) -> None:
+    def receive(self, measured: Measured | None, next_tick_ns: int) -> None:
         """Something has arrived: reads it, and plans on a new setpoint, if the next control tick leaves the time."""
         start_ns = self._clock_ns()
         if start_ns + self._slack_ns >= next_tick_ns:
@@ -58,25 +57,25 @@ class InferenceLoop:
         elif self._endpoint.is_flooded:
             pass  # it goes on once a tick: between ticks a flood would leave the processor nothing else
         elif self._endpoint.drain_setpoints():
-            self._plan(estimate, start_ns)
+            self._plan(measured, start_ns)
             self._learn_slack(start_ns)
 
-    def after_tick(self, estimate: Estimate | None) -> None:
+    def after_tick(self, measured: Measured | None) -> None:
         """Plans if a setpoint is waiting or a plan is due; called in the slack after a control tick."""
         now_ns = self._clock_ns()
         # reading here too makes the edge-triggered descriptor harmless: nothing waits longer than a tick
         if self._endpoint.drain_setpoints():
-            self._plan(estimate, self._waiting_ns or now_ns)
+            self._plan(measured, self._waiting_ns or now_ns)
             self._learn_slack(now_ns)
         elif now_ns >= self._due_ns:
-            self._plan(estimate, self._due_ns or now_ns)
+            self._plan(measured, self._due_ns or now_ns)
         self._waiting_ns = 0
         # here the next tick is farthest: a plan for a setpoint that comes just before it has not that time
         self._foresee(now_ns * 1e-9)
 
-    def _plan(self, estimate: Estimate | None, due_ns: int) -> None:
+    def _plan(self, measured: Measured | None, due_ns: int) -> None:
         start_ns = self._clock_ns()
-        self.state = self._planned(start_ns * 1e-9, estimate)
+        self._make_plan(start_ns * 1e-9, measured)
         self.timing.record(due_ns, start_ns, self._clock_ns())
         # a period after this one was due, or the rate would fall by what each waits for its tick; but what was missed
         # is not made up for
@@ -91,27 +90,23 @@ class InferenceLoop:
         moved_ns = self._slack_ns * (1.0 + (LEARNT_SHARE if took_ns > self._slack_ns else -LEARNT_SHARE))
         self._slack_ns = min(moved_ns, MOST_SLACK_NS)
 
-    def _planned(self, now_s: float, estimate: Estimate | None) -> PlanState:
+    def _make_plan(self, now_s: float, measured: Measured | None) -> None:
         setpoint = self._endpoint.inbox.newest
-        try:
-            planned = self._planner.plan(self.state, now_s, setpoint, estimate)
-        except PLAN_ERRORS as error:
-            return self._afresh(now_s, error)
         self._journal.planned(now_s, setpoint)
-        return planned
+        try:
+            self.planner.plan(now_s, setpoint, measured)
+        except PLAN_ERRORS as error:
+            self._begin_afresh(now_s, error)
 
     def _foresee(self, now_s: float) -> None:
         try:
-            foreseen = self._planner.foresee(self.state)
-        except PLAN_ERRORS as error:
-            foreseen = self._afresh(now_s, error)
-        else:
-            if foreseen is not self.state:
+            if self.planner.foresee():
                 self._journal.foresaw()
-        self.state = foreseen
+        except PLAN_ERRORS as error:
+            self._begin_afresh(now_s, error)
 
-    def _afresh(self, now_s: float, error: Exception) -> PlanState:
-        """The state without what could not be planned for."""
+    def _begin_afresh(self, now_s: float, error: Exception) -> None:
+        """Goes on without what could not be planned for."""
         inbox = self._endpoint.inbox
         if str(error) != self._failure:  # the first failure is news, the same one again is not
             self._failure = str(error)
@@ -119,4 +114,4 @@ class InferenceLoop:
         inbox.withdraw(f"no gap could be planned: {error}")
         self._on_failure()
         self._journal.began_afresh(now_s)
-        return self._planner.afresh(self.state, now_s)
+        self.planner.afresh(now_s)

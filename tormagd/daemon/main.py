@@ -20,7 +20,7 @@ from tormagd_client.printable import printable
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tormagd.control.core import Core
+    from tormagd.assembly.build import Core
     from tormagd.hardware.backend import Backend
     from tormagd.keys import KeyRing
 
@@ -59,7 +59,7 @@ def _start(options: argparse.Namespace) -> int:
     # here, not above: the signal has to be seen to first
     import uvloop
 
-    from tormagd.control.core import build_core
+    from tormagd.assembly.build import build_core
     from tormagd.hardware.backend import choose
 
     try:
@@ -87,7 +87,7 @@ def _refused(why: str) -> int:
 
 def _configured(options: argparse.Namespace) -> Config:
     """What the file says, and the command line beside it. Raises ConfigError."""
-    from tormagd.control.core import at_rates_of
+    from tormagd.assembly.build import at_rates_of
     from tormagd.scenes.scene import load_scene
 
     config = load_config(options.config)
@@ -123,7 +123,7 @@ async def _run(
 
 
 def _print_resolved(config: Config, core: "Core", options: msgspec.Struct) -> None:
-    from tormagd.control.core import least_resolution_N
+    from tormagd.assembly.build import least_resolution_N
     from tormagd.hardware.backend import installed
     from tormagd.scenes.scene import terms_of
 
@@ -132,8 +132,8 @@ def _print_resolved(config: Config, core: "Core", options: msgspec.Struct) -> No
         "config": msgspec.to_builtins(msgspec.structs.replace(config, device=device)),
         "scene": msgspec.to_builtins(core.scene),
         "derived": {
-            "least_N": core.planner.portrait.least_N,
-            "most_N": core.planner.portrait.most_N,
+            "least_N": core.portrait.min_N,
+            "most_N": core.portrait.max_N,
             "phase_margin_deg": core.margins.phase_margin_deg,
             "gain_margin_dB": core.margins.gain_margin_dB,
             "solver": core.solver._asdict(),
@@ -141,7 +141,7 @@ def _print_resolved(config: Config, core: "Core", options: msgspec.Struct) -> No
             "inference_hz": config.rates.inference_hz,
             "fingerprint": core.scene.fingerprint,
             "terms_out": terms_of(core.scene).left_out,
-            "least_resolution_N": least_resolution_N(core.planner.portrait, core.scene.force.most_N),
+            "least_resolution_N": least_resolution_N(core.portrait, core.scene.force.most_N),
             "missed_rms_N": None if core.missed is None else core.missed.rms_N,
             "missed_share": None if core.missed is None else core.missed.share,
         },

@@ -11,11 +11,10 @@ from pathlib import Path
 
 import msgspec
 
+from tormagd.assembly.profile import MAX_BYTES, Profile, ProfileError, profile_of, read_profile
 from tormagd.bounded_file import in_place_of, read_bounded
-from tormagd.control.device_fit import UNSEEN, DeviceFit
-from tormagd.control.plan import NOTHING_SHOWN, Shown
-from tormagd.control.profile import MAX_BYTES, Profile, ProfileError, profile_of, read_profile
-from tormagd.control.slow_friction import SlowFriction
+from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
+from tormagd.control.believe.strength import UNSEEN
 from tormagd_client.messages import ProfileReport
 
 log = logging.getLogger(__name__)
@@ -68,19 +67,18 @@ class ProfileFolder:
 class Profiles:
     """Takes care that what a device shows of itself is known the next time, and of no other device.
 
-    `learned` gives what has been shown, `teach` puts something else in its place. Without a folder nothing is kept.
+    `believe` is what learns, `teach` puts something else in the place of what it has learned. Without a folder nothing
+    is kept.
     """
 
-    def __init__(
-        self, folder: ProfileFolder | None, learned: Callable[[], Shown], teach: Callable[[Shown], None]
-    ) -> None:
-        self._folder, self._learned, self._teach = folder, learned, teach
+    def __init__(self, folder: ProfileFolder | None, believe: Believe, teach: Callable[[Learned], None]) -> None:
+        self._folder, self._believe, self._teach = folder, believe, teach
         self._loop = asyncio.get_running_loop()
         self._serial_number: int | None = None
         self._was_driven = False
         self._writing: asyncio.Future[None] | None = None
         self._saved_ns: int | None = None
-        self._on_disk: tuple[DeviceFit, SlowFriction, float, float] | None = None
+        self._on_disk: Learned | None = None
         self._is_used = False
         self.digest = ""
         "SHA-256 of the profile that was read; empty without one."
@@ -90,7 +88,7 @@ class Profiles:
         """Once a telemetry period: which device there is, and whether it is driven."""
         if serial_number is not None and serial_number != self._serial_number:
             if self._serial_number is not None:
-                self._teach(NOTHING_SHOWN)  # that was another device
+                self._teach(NOTHING_LEARNED)  # that was another device
             self._serial_number, self._saved_ns, self._is_used = serial_number, None, False
             self._on_disk, self.digest = None, ""
             if self._folder is not None:
@@ -104,20 +102,20 @@ class Profiles:
         """Keeps what has been learned, where anything has been and the sensor is believed.
 
         A profile that nothing was added to stays as it is: it does not get younger by being used."""
-        shown = self._learned()
-        if self._folder is None or self._serial_number is None or shown.device is UNSEEN or shown.sensor.is_doubted:
+        learned, is_doubted = self._believe.learned(), self._believe.sensor.is_doubted
+        if self._folder is None or self._serial_number is None or learned.device is UNSEEN or is_doubted:
             return
-        if _kept(shown) == self._on_disk:
+        if learned == self._on_disk:
             return
         now_ns = time.time_ns()
         profile = profile_of(
-            shown,
+            learned,
             serial_number=self._serial_number,
             insert=self._folder.insert,
             model=self._folder.model,
             saved_ns=now_ns,
         )
-        self._saved_ns, self._on_disk = now_ns, _kept(shown)
+        self._saved_ns, self._on_disk = now_ns, learned
         self._writing = self._loop.run_in_executor(None, self._folder.write, profile)
         self._writing.add_done_callback(self._note)
 
@@ -144,13 +142,13 @@ class Profiles:
             log.warning("the profile is not used: %s", error)
             return
         # another device by now, or one that has shown itself meanwhile, is not told what it is
-        if profile is None or profile.serial_number != self._serial_number or self._learned().device is not UNSEEN:
+        if profile is None or profile.serial_number != self._serial_number or self._believe.strength.fit is not UNSEEN:
             return
         now_ns = time.time_ns()
-        shown = profile.shown(now_ns)
-        self._teach(shown)
+        learned = profile.learned(now_ns)
+        self._teach(learned)
         self.digest = hashlib.sha256(msgspec.json.encode(profile)).hexdigest()
-        self._saved_ns, self._on_disk, self._is_used = profile.saved_ns, _kept(shown), True
+        self._saved_ns, self._on_disk, self._is_used = profile.saved_ns, learned, True
         hours = (now_ns - profile.saved_ns) / 3.6e12
         log.info("the device's profile of %.1f hours ago is used: scale %.3f", hours, profile.scale)
 
@@ -162,8 +160,3 @@ class Profiles:
             log.warning("%s", error)
         else:
             self._refusal = ""
-
-
-def _kept(shown: Shown) -> tuple[DeviceFit, SlowFriction, float, float]:
-    """What of it a profile holds."""
-    return shown.device, shown.slow, shown.zero.zero_N, shown.lateness.lag_s

@@ -4,49 +4,47 @@ import time
 from functools import lru_cache
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
-from tormagd.control.plan import Plan
-from tormagd.control.step import StepOutput, StepState
+from tormagd.control.core import Stepper
+from tormagd.control.records import Duty, Plan
 from tormagd.hardware.measurement import Measurement
-from tormagd.safety.operating_state import OperatingState
+from tormagd.safety.operating_state import SafetyState
 from tormagd_client.messages import VERSION, Telemetry, Tick, TickRecord
 
 
 def tick_record(
-    now_s: float,
-    state: StepState,
-    output: StepOutput,
+    stepper: Stepper,
+    output: Duty,
     plan: Plan,
-    trim: float,
     measurement: Measurement | None,
     lateness_us: float,
     exec_us: float,
     number: int = 0,
 ) -> TickRecord:
     """The record of one tick. By position, as by name it would take ten times as long: in the order of its fields."""
-    estimate, safety = state.estimate, state.safety
-    is_placed = estimate is not None and estimate.is_homed
+    measured, safety, reference = stepper.measured, stepper.safety, stepper.move.reference
+    is_placed = measured is not None and measured.is_homed
     link = None if measurement is None else measurement.link
     return TickRecord(
         time.time_ns(),
-        now_s,
+        stepper.time_s,
         plan.number,
         plan.setpoint_N,
         plan.setpoint_age_s,
-        plan.governed_N if is_driven(state) else None,
+        plan.governed_N if safety.is_driven else None,
         plan.governed_N,
         plan.predicted_N,
         plan.field_mT,
         plan.gap_mm,
         plan.gap_speed_mm_s,
         plan.gap_acceleration_mm_s2,
-        plan.least_gap_mm,
+        plan.min_gap_mm,
         plan.limits,
         tuple(f"{each.quantity} {each.asked!r} {each.used!r}" for each in plan.outside) if plan.outside else (),
         plan.sensor_doubted_s,
         plan.foresight,
         plan.time_s,
         plan.confidence,
-        trim,
+        plan.trim,
         None if measurement is None else measurement.number,
         None if measurement is None else measurement.received_s,
         None if measurement is None else measurement.delay_s,
@@ -69,14 +67,14 @@ def tick_record(
         None if measurement is None else measurement.left_current_A,
         None if measurement is None else measurement.right_current_A,
         None if measurement is None else measurement.supply_V,
-        None if state.reference is None else state.reference.gap_mm,
-        None if estimate is None else estimate.force_N,
-        estimate.left_mm if estimate is not None and is_placed else None,
-        estimate.right_mm if estimate is not None and is_placed else None,
-        None if estimate is None else estimate.handle_mm,
-        None if estimate is None else estimate.handle.rate_mm_s,
+        None if reference is None else reference.gap_mm,
+        None if measured is None else measured.force_N,
+        measured.left_mm if measured is not None and is_placed else None,
+        measured.right_mm if measured is not None and is_placed else None,
+        None if measured is None else measured.handle_mm,
+        None if measured is None else measured.handle.rate_mm_s,
         safety.operating_state,
-        limits_held(state, output, plan),
+        limits_held(safety, output, plan),
         output.limits,
         safety.faults,
         _DRIVE_MODES[output.mode],
@@ -100,14 +98,9 @@ def _names(bits: Switches | DeviceFault) -> tuple[str, ...]:
     return tuple(str(bit.name) for bit in type(bits) if bit in bits)
 
 
-def is_driven(state: StepState) -> bool:
-    """Whether the device follows the plan, or holds what it followed last."""
-    return state.safety.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED)
-
-
-def limits_held(state: StepState, output: StepOutput, plan: Plan) -> tuple[str, ...]:
+def limits_held(safety: SafetyState, output: Duty, plan: Plan) -> tuple[str, ...]:
     """What holds the force back now; nothing does while the device is not driven."""
-    if not is_driven(state):
+    if not safety.is_driven:
         return ()
     return tuple(dict.fromkeys((*plan.limits, *output.limits)))
 

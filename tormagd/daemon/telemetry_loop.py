@@ -9,11 +9,11 @@ import msgspec
 
 from firmware_protocol.build import settle
 from tormagd import __version__
+from tormagd.assembly.belief import beliefs
+from tormagd.assembly.build import Core
+from tormagd.assembly.conditions import conditions, is_busy, is_homed
 from tormagd.config import Config
-from tormagd.control.belief import beliefs
-from tormagd.control.conditions import conditions, is_busy, is_homed
-from tormagd.control.core import Core
-from tormagd.control.plan import PlanState
+from tormagd.control.records import Plan
 from tormagd.daemon import notify
 from tormagd.daemon.black_box import ASKED, BlackBox
 from tormagd.daemon.callbacks import Callbacks
@@ -24,7 +24,7 @@ from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import Profiles
 from tormagd.daemon.rate_group import ERROR_PERIODS, RateGroup
 from tormagd.daemon.service import READY, Service, status_line
-from tormagd.daemon.telemetry import is_driven, snapshot, tick_record
+from tormagd.daemon.telemetry import snapshot, tick_record
 from tormagd.daemon.way import Way
 from tormagd.hardware.connection import Connection
 from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
@@ -85,26 +85,24 @@ class TelemetryLoop:
         self._service = Service()
         self._status: dict[str, Any] | None = None
 
-    def record(self, used: PlanState) -> None:
+    def record(self, used: Plan) -> None:
         """Keeps the control tick that just ran, with what had been planned when it did."""
         control = self._control
         if control.output is None:
             return
-        self._way.ticked(control.state, used)
+        self._way.ticked(control.stepper, used)
         timing = control.timing
         record = tick_record(
-            control.state.time_s,
-            control.state,
+            control.stepper,
             control.output,
-            used.plan,
-            used.trim,
+            used,
             control.measurement,
             timing.lateness_us,
             timing.exec_us,
             timing.runs,
         )
         self._ticks.append(record)
-        self._box.ticked(record, control.state, self._inference.state)
+        self._box.ticked(record, control.stepper, self._inference.planner)
 
     def publish(self, due_ns: int) -> None:
         """One telemetry period, which was due at `due_ns`."""
@@ -113,7 +111,9 @@ class TelemetryLoop:
         self._endpoint.publish(self._newest)
         link = self._connection.link
         identity = None if link is None else link.identity
-        self._profiles.look(None if identity is None else identity.serial_number, is_driven(self._control.state))
+        self._profiles.look(
+            None if identity is None else identity.serial_number, self._control.stepper.safety.is_driven
+        )
         self._endpoint.publish_ticks(self._ticks[-MOST_TICKS:])
         self._ticks.clear()
         self._refresh(start_ns * 1e-9)
@@ -149,21 +149,21 @@ class TelemetryLoop:
             time.monotonic(),
             self._config,
             self._connection,
-            self._control.state,
+            self._control.stepper,
             self._control.output,
             self._endpoint.inbox.newest,
-            self._least_N(),
-            sensor_doubted=self._inference.state.sensor.is_doubted,
+            self._inference.planner.believe.min_N,
+            sensor_doubted=self._inference.planner.believe.sensor.is_doubted,
         )
 
     def is_busy(self) -> bool:
         """Whether the device homes or opens, or is about to."""
         connection, control = self._connection, self._control
-        return is_busy(connection.measurement, connection.pending, control.state, control.output)
+        return is_busy(connection.measurement, connection.pending, control.stepper, control.output)
 
     def _snapshot(self, now_s: float) -> Telemetry:
         stamp = self._endpoint.inbox.newest
-        homed = is_homed(self._connection.measurement, self._control.state.estimate)
+        homed = is_homed(self._connection.measurement, self._control.stepper.measured)
         age_s = None if stamp is None else now_s - stamp.stamp_s
         return snapshot(self._ticks[-1], self.timing.runs, homed, self.is_busy(), age_s)
 
@@ -174,8 +174,8 @@ class TelemetryLoop:
 
     def _tell_service(self, now_s: float, is_homed_: bool) -> None:
         """Says to systemd how it stands, and feeds its watchdog while plans and device states are fresh."""
-        connection, safety, service = self._connection, self._control.state.safety, self._service
-        plan, measurement, link = self._inference.state.plan, connection.measurement, connection.state
+        connection, safety, service = self._connection, self._control.stepper.safety, self._service
+        plan, measurement, link = self._inference.planner.planned, connection.measurement, connection.state
         is_alive = service.is_alive(
             now_s,
             self._config.realtime.watchdog_ms * 1e-3,
@@ -243,7 +243,7 @@ class TelemetryLoop:
         return described
 
     def _portrait(self) -> PortraitReport:
-        portrait, device = self._core.planner.portrait, self._inference.state.device
+        portrait, device = self._core.portrait, self._inference.planner.believe.device
         scaled_mm_s = device.scale * self._core.gap_speed_mm_s
         return PortraitReport(
             force_N=tuple(round(device.force_N(force_N), 4) for force_N in portrait.force_N[::PORTRAIT_STEP]),
@@ -258,7 +258,7 @@ class TelemetryLoop:
             return {"file": str(self.keep(ASKED, 0.0))}
         self._control.command(request.command, self.conditions())
         return {
-            "operating_state": str(self._control.state.safety.operating_state),
+            "operating_state": str(self._control.stepper.safety.operating_state),
             # without a device nothing moves yet: a request to open is kept for it, and no other is taken
             "is_connected": self._connection.measurement is not None,
         }
@@ -272,13 +272,10 @@ class TelemetryLoop:
         log.info("take: %r", source)
         return {"source": source, "instead_of": before}
 
-    def _least_N(self) -> float:
-        """F_min of this device, as far as it has shown itself."""
-        return self._inference.state.device.force_N(self._core.planner.portrait.least_N)
-
     def _build_status(self, newest: Telemetry) -> Status:
-        safety, planned = self._control.state.safety, self._inference.state
-        plan, shown, acted = planned.plan, planned.device, self._control.state.acted
+        stepper, planner = self._control.stepper, self._inference.planner
+        safety, plan, believe, acted = stepper.safety, planner.planned, planner.believe, stepper.move.acted
+        device = believe.device
         # a command of this very period has changed the state since the snapshot, and whoever gave it asks now
         known = msgspec.structs.asdict(newest) | {
             "operating_state": str(safety.operating_state),
@@ -296,24 +293,24 @@ class TelemetryLoop:
             terms_out=terms_of(self._core.scene).left_out,
             solver=self._core.solver.solver,
             uptime_s=round(time.monotonic() - self._started_s, 1),
-            least_N=round(self._least_N(), 3),
-            most_N=round(shown.force_N(self._core.planner.portrait.most_N), 3),
-            trim=round(planned.trim, 4),
+            least_N=round(believe.min_N, 3),
+            most_N=round(device.force_N(self._core.portrait.max_N), 3),
+            trim=round(plan.trim, 4),
             device=DeviceReport(
-                scale=round(shown.scale, 4),
-                scale_sd=round(shown.scale_sd, 4),
-                offset_N=round(shown.offset_N, 4),
-                offset_sd_N=round(shown.offset_sd_N, 4),
-                sensor_zero_N=round(planned.shown.zero.zero_N, 4),
-                sensor_zero_sd_N=round(planned.shown.zero.sd_N(now_s), 4),
-                lag_ms=round(planned.shown.lateness.lag_s * 1e3, 1),
+                scale=round(device.scale, 4),
+                scale_sd=round(device.scale_sd, 4),
+                offset_N=round(device.offset_N, 4),
+                offset_sd_N=round(device.offset_sd_N, 4),
+                sensor_zero_N=round(believe.zero.zero_N, 4),
+                sensor_zero_sd_N=round(believe.zero.sd_N(now_s), 4),
+                lag_ms=round(believe.carriages.lag_s * 1e3, 1),
             ),
             belief={
                 name: BeliefReport(value=round(it.value, 5), sd=it.sd and round(it.sd, 5), unit=it.unit, acts=it.acts)
-                for name, it in beliefs(planned, self._control.state, now_s, terms_of(self._core.scene)).items()
+                for name, it in beliefs(planner, stepper, now_s, terms_of(self._core.scene)).items()
             },
             profile=self._profiles.report(),
-            least_gap_mm=round(plan.least_gap_mm, 2),
+            least_gap_mm=round(plan.min_gap_mm, 2),
             link=link,
             setpoints=inbox.report(now_s),
             peers=self._endpoint.report(),

@@ -7,8 +7,8 @@ leave out, nobody here can see.
 
 import math
 
-from tormagd.control.plan import PlanState
-from tormagd.control.step import StepState
+from tormagd.control.core import Stepper
+from tormagd.control.records import Plan
 from tormagd.daemon.rate_group import Histogram
 from tormagd_client.messages import ExecReport, WayReport
 
@@ -32,19 +32,19 @@ class Way:
         self._behind = self._moved = 0.0
         self._summary = self._to_duty.summary()
 
-    def ticked(self, state: StepState, used: PlanState) -> None:
+    def ticked(self, stepper: Stepper, used: Plan) -> None:
         """One control tick, and what had been planned when it ran."""
-        now_s, stamp_s = state.time_s, used.governor.stamp_s
+        now_s, stamp_s = stepper.time_s, used.stamp_s
         if stamp_s != self._stamp_s:
             self._stamp_s = stamp_s
             if stamp_s > -math.inf:  # a duty that follows no setpoint ends no way
                 self._to_duty.add_at(now_s, (now_s - stamp_s) * 1e6)
         elapsed_s, self._tick_s = now_s - self._tick_s, now_s
-        reference, estimate = state.reference, state.estimate
-        if reference is None or estimate is None or not 0.0 < elapsed_s < MEMORY_S:
+        reference, measured = stepper.move.reference, stepper.measured
+        if reference is None or measured is None or not 0.0 < elapsed_s < MEMORY_S:
             return
         speed_mm_s = reference.speed_mm_s
-        behind_mm = used.plan.gap_mm - estimate.gap_mm
+        behind_mm = used.gap_mm - measured.gap_mm
         if -MOST_BEHIND_MM < behind_mm < MOST_BEHIND_MM:
             kept = 1.0 - elapsed_s / MEMORY_S
             self._behind = kept * self._behind + elapsed_s * behind_mm * speed_mm_s

@@ -14,8 +14,8 @@ import numpy as np
 import uvloop
 
 from firmware_protocol.build import settle
+from tormagd.assembly.build import build_core
 from tormagd.config import Config, load_config
-from tormagd.control.core import build_core
 from tormagd.headroom.bare_timer import Lateness, lateness
 from tormagd.headroom.core_cost import Call, CoreCost, calls, core_cost
 from tormagd.headroom.machine_loop import machine_us

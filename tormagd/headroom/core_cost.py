@@ -1,22 +1,23 @@
 """What `plan` and `step` cost on this machine: the scene in virtual time, then both once more, each call timed.
 
-Both are pure, so that what they were given in the closed loop can be given to them again without plant and protocol,
-and in the control period's own pace: a processor that sleeps between two ticks finds its caches colder than one that
-does not, and the same step takes two or three times as long. Processor time: what others take of the machine is the
-bare timer's to say.
+Both are deterministic, so that what they were given in the closed loop can be given to them again without plant and
+protocol, and in the control period's own pace: a processor that sleeps between two ticks finds its caches colder than
+one that does not, and the same step takes two or three times as long. Processor time: what others take of the machine
+is the bare timer's to say.
 """
 
 import asyncio
 import math
 import time
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from functools import partial
 from typing import NamedTuple
 
+from tormagd.assembly.build import Core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
-from tormagd.control.core import Core
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.headroom.bare_timer import NS, beat
 from tormagd.simulation.device import VirtualDevice
@@ -38,11 +39,13 @@ class CoreCost(NamedTuple):
 
 
 def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[Call]]:
-    """Each step and each plan of an armed device that renders a pulse, to be called again."""
-    planner, stepper = core.planner, core.stepper
+    """Each step and each plan of an armed device that renders a pulse, to be called again in turn."""
     period_s = 1.0 / config.rates.control_hz
-    loop = ClosedLoop(config, stepper, planner, VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
+    loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
     loop.arm()
+    # stages change in place, so what is called again are others, which begin where these do
+    stepper, planner = deepcopy(loop.stepper), deepcopy(loop.planner)
+    assert planner is not None, "this loop plans"
     force = core.scene.force
     middle_N = 0.5 * (force.least_N + force.most_N)
     steps: list[Call] = []
@@ -51,11 +54,9 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
         now_s = loop.now_s + period_s
         force_N = middle_N * (1.0 + SWING_SHARE * math.sin(math.tau * PULSE_HZ * now_s))
         setpoint = TimedSetpoint(force_N, now_s, 0.1)  # a new one for every tick, so that every tick plans
-        before, planned = loop.step_state, loop.plan_state
         sample = loop.tick(setpoint)
-        assert planned is not None, "a loop with a planner has planned"
-        steps.append(partial(stepper.step, before, now_s, loop.measurement, sample.plan))
-        plans.append(partial(planner.plan, planned, now_s, setpoint, loop.step_state.estimate))
+        steps.append(partial(stepper.step, now_s, sample.measurement, sample.plan))
+        plans.append(partial(planner.plan, now_s, setpoint, sample.measured))
     return steps, plans
 
 

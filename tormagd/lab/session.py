@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 from tqdm import tqdm
 
+from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import load_config
-from tormagd.control.core import build_core
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.simulation.device import DEFAULT_BAUD, VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
@@ -49,7 +49,7 @@ def virtual_session(seconds: float, to_device: Listener, to_host: Listener, baud
     core = build_core(config)
     device = VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1, baud=baud)
     tapped = TappedDevice(device, to_device, to_host)
-    loop = ClosedLoop(config, core.stepper, core.planner, tapped)
+    loop = ClosedLoop(config, core.stepper(), core.planner(), tapped)
     loop.arm()
     ticks = round(seconds * config.rates.control_hz)
     for _ in tqdm(range(ticks), desc="virtual session", unit="tick", disable=None):

@@ -15,7 +15,7 @@ import msgspec
 from tqdm import tqdm
 
 from tormagd.config import Config, load_config
-from tormagd.control.motor import margins
+from tormagd.control.move.motor import margins
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 

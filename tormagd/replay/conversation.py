@@ -9,7 +9,7 @@ import msgspec
 from firmware_protocol.codec import DeviceFault, DeviceMode, Identity, Message, Sense, State, Status, Switches
 from firmware_protocol.framing import Frame, FramingStatistics
 from tormagd.config import Device
-from tormagd.control.step import StepOutput
+from tormagd.control.records import Duty
 from tormagd.exact import first_difference, kinds, packed, plain
 from tormagd.hardware.backend import BackendError, LinkStatistics, Sent, Stream
 from tormagd.hardware.can_stream import CanStream, SecondHostError
@@ -150,7 +150,7 @@ class Conversation:
             why = ", ".join(f"{name}: {each}" for name, each in seen.refused.items()) or "unreadable"
             self.first_damage = Damage(self.frame - len(pieces) + 1 + wire.damaged[0], wire.now_s, why)
 
-    def wrote(self, entry: Any, output: StepOutput) -> Found | None:
+    def wrote(self, entry: Any, output: Duty) -> Found | None:
         """A step's output went to the device: what was written otherwise."""
         wire = self._wire
         if wire is None:

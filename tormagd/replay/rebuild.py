@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import msgspec
 
 from tormagd import __version__
+from tormagd.assembly.build import Core, build_core, platform_name, sources_hash
+from tormagd.assembly.journal import FORMAT
 from tormagd.config import Config, checked
-from tormagd.control.core import Core, build_core, platform_name, sources_hash
-from tormagd.control.journal import FORMAT
 from tormagd.recording.black_box import BlackBoxFile
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.endpoints import ConfigError

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from tormagd.assembly import journal
+from tormagd.assembly.build import Core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, checked
-from tormagd.control import journal
-from tormagd.control.core import Core
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.replay.rebuild import ReplayError
 from tormagd.replay.rerun import SETPOINT, ticks_of
 from tormagd.safety.operating_state import OperatingState, RefusedError
@@ -127,7 +127,7 @@ def rehearse(core: Core, config: Config, todo: Script, plant: str, faults: Seque
         device = VirtualDevice(load_plant(plant), hand, delayed, SEED)
     except (FaultError, PlantError) as error:
         raise ReplayError(str(error)) from error
-    loop = ClosedLoop(config, core.stepper, core.planner, device)
+    loop = ClosedLoop(config, core.stepper(), core.planner(), device)
     try:
         if todo.is_homed:
             loop.arm()
@@ -162,9 +162,9 @@ def _run(loop: ClosedLoop, todo: Script, period_s: float) -> Happened:
             _, setpoint = setpoints.pop()
             newest = None if setpoint is None else _later(setpoint, todo.begins_s)
         sample = loop.tick(newest)
-        for fault in sample.state.safety.faults:
+        for fault in sample.safety.faults:
             happened.faults.setdefault(str(fault), round(time_s, 3))
-        if sample.state.safety.operating_state in DRIVEN:
+        if sample.safety.operating_state in DRIVEN:
             _add_limits(happened.limits, (*sample.plan.limits, *sample.output.limits), period_s)
     return happened
 

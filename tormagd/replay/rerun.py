@@ -7,31 +7,19 @@ import msgspec
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd import keeping
-from tormagd.control import (
-    device_fit,
-    estimate,
-    handle,
-    homing,
-    journal,
-    lateness,
-    periodicity,
-    pid,
-    plausible,
-    remembered,
-    sensor,
-    sensor_zero,
-    sight,
-    skill,
-    slow_friction,
-    trajectory,
-)
-from tormagd.control.core import Core
-from tormagd.control.governor import GovernorState, TimedSetpoint
-from tormagd.control.plan import Outside, Plan, PlanState, Shown
-from tormagd.control.step import Acted, StepOutput, StepState
+from tormagd.assembly import journal
+from tormagd.assembly.build import Core
+from tormagd.control.ask.forecast import Guess
+from tormagd.control.ask.skill import Skill
+from tormagd.control.believe.believe import Learned
+from tormagd.control.believe.sensor_zero import Level
+from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.move.reference import Reference
+from tormagd.control.plausible import Leap
+from tormagd.control.records import Duty, Handle, Measured, Outside, Plan, TimedSetpoint
 from tormagd.daemon.inference_loop import PLAN_ERRORS
 from tormagd.daemon.telemetry import tick_record
-from tormagd.exact import first_difference, kinds, packed, plain, restored
+from tormagd.exact import first_difference, kinds, packed, plain, restore, restored
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.model.displacement import Turn
@@ -39,55 +27,15 @@ from tormagd.recording.black_box import frames_in, is_tick
 from tormagd.replay.conversation import Conversation, Damage, Found
 from tormagd.replay.rebuild import ReplayError
 from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import (
-    Conditions,
-    DeviceRequest,
-    OperatingState,
-    RefusedError,
-    SafetyState,
-    latch,
-)
+from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState, RefusedError, SafetyState
 from tormagd_client.messages import TickRecord
 
 KNOWN = kinds(
-    StepState,
-    Acted,
-    SafetyState,
-    OperatingState,
-    DeviceRequest,
-    Fault,
-    Limit,
-    estimate.Estimate,
-    estimate.Handle,
-    Turn,
-    trajectory.Reference,
-    trajectory.Expected,
-    pid.PidState,
-    sight.Sight,
-    plausible.Leap,
-    homing.Homing,
-    PlanState,
-    GovernorState,
-    periodicity.Periodicity,
-    skill.Skill,
-    periodicity.Guess,
-    lateness.Lateness,
-    Plan,
-    Outside,
-    Shown,
-    device_fit.DeviceFit,
-    sensor.Sensor,
-    sensor.Past,
-    slow_friction.SlowFriction,
-    sensor_zero.SensorZero,
-    sensor_zero.Level,
-    handle.HandleWatch,
-    remembered.Remembered,
-    Conditions,
-    DeviceMode,
-    Switches,
+    *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
+    *(Measured, Handle, Turn, Leap, Reference, Plan, Outside),
+    *(DeviceFit, Level, Learned, Skill, Guess),
 )
-"All that the core's states consist of."
+"All records that stages keep, or that were given to them."
 UNTAKEN = (
     TypeError, AttributeError, ValueError, ArithmeticError, LookupError, AssertionError, RuntimeError, RecursionError,
 )  # fmt: skip
@@ -202,17 +150,17 @@ def _start(entries: list[Any], records: dict[int, TickRecord], until_s: float) -
 
 
 class _Running:
-    """The core's states between two entries, and the conversation's."""
+    """The core between two entries, and the conversation."""
 
     def __init__(self, core: Core, frame: int) -> None:
         self.conversation = Conversation(frame)
         self._of_frames: Found | None = None
         "What frames show to differ: told with the tick, behind what its record shows."
-        self._stepper, self._planner = core.stepper, core.planner
-        self._step: StepState = core.stepper.start(0.0)
-        self._plan: PlanState = core.planner.start(0.0)
-        self._used = self._plan
-        self._output: StepOutput | None = None
+        self._stepper, self._planner = core.stepper(), core.planner()
+        self._used = self._planner.planned
+        self._failure: Exception | None = None
+        "Of the newest plan, until the core is known to have failed there, too."
+        self._output: Duty | None = None
         self._measurement: Measurement | None = None
         self.is_known = False
         "Whether the states are the recorded core's."
@@ -241,10 +189,8 @@ class _Running:
             case journal.STEP:
                 self._measurement = measurement_of(record)
                 self._of_frames = self.conversation.compare(self._measurement)
-                self._used = self._plan
-                self._step, self._output = self._stepper.step(
-                    self._step, record.monotonic_s, self._measurement, self._used.plan
-                )
+                self._used = self._planner.planned
+                self._output = self._stepper.step(record.monotonic_s, self._measurement, self._used)
             case keeping.WROTE:
                 if self._output is None:
                     raise ValueError("something written without a step")
@@ -253,27 +199,31 @@ class _Running:
                 now_s, setpoint = msgspec.convert(entry[1:], tuple[float, SETPOINT | None])
                 timed = None if setpoint is None else TimedSetpoint(*setpoint)
                 try:
-                    self._plan = self._planner.plan(self._plan, now_s, timed, self._step.estimate)
+                    self._planner.plan(now_s, timed, self._stepper.measured)
                 except PLAN_ERRORS as error:
-                    return Found("plan", "made", f"failed: {error}")
+                    self._failure = error
             case journal.FORESEE:
-                self._plan = self._planner.foresee(self._plan)
+                self._planner.foresee()
             case journal.AFRESH:
-                self._plan = self._planner.afresh(self._plan, msgspec.convert(entry[1], float))
+                self._failure = None
+                self._planner.afresh(msgspec.convert(entry[1], float))
             case journal.TEACH:
-                self._plan = self._plan.replaced(shown=restored(entry[1], KNOWN))
+                learned = restored(entry[1], KNOWN)
+                if not isinstance(learned, Learned):
+                    raise ValueError(f"{learned!r}: allowed is what is learned of a device")
+                self._planner.teach(learned)
             case journal.COMMAND:
                 command, now_s, was_refused, given = msgspec.convert(entry[1:], tuple[str, float, bool, dict[str, Any]])
                 try:
-                    self._step = self._stepper.command(self._step, command, now_s, restored(given, KNOWN))
+                    self._stepper.command(command, now_s, restored(given, KNOWN))
                 except RefusedError as error:
                     return None if was_refused else Found(command, "taken", f"refused: {error.message}")
                 if was_refused:
                     return Found(command, "refused", "taken")
             case journal.LATCH:
-                self._step = self._step.replaced(safety=latch(self._step.safety, (Fault(entry[1]),)))
+                self._stepper.latch(Fault(entry[1]))
             case journal.LOSE_LINK:
-                self._step = self._stepper.lose_link(self._step)
+                self._stepper.lose_link()
             case _:
                 raise ValueError(f"{name[:40]!r}: no entry of a black box")
         return None
@@ -285,8 +235,9 @@ class _Running:
         if self._output is None:
             raise ValueError("a tick without a step")
         timing = record.lateness_us, record.exec_us, record.tick
-        plan, trim = self._used.plan, self._used.trim
-        given = tick_record(self._step.time_s, self._step, self._output, plan, trim, self._measurement, *timing)
+        if self._failure is not None:
+            return Found("plan", "made", f"failed: {self._failure}")
+        given = tick_record(self._stepper, self._output, self._used, self._measurement, *timing)
         left, right = msgspec.structs.astuple(record)[NOT_THE_CORES:], msgspec.structs.astuple(given)[NOT_THE_CORES:]
         if packed(left) == packed(right):
             return self._of_frames
@@ -298,16 +249,15 @@ class _Running:
         differs, connection = None, entry[3]
         if self.is_known:
             self.snapshots += 1
-            for what, recorded, own in (("step", entry[1], self._step), ("plan", entry[2], self._plan)):
+            for what, recorded, own in (("step", entry[1], self._stepper), ("plan", entry[2], self._planner)):
                 found = first_difference(recorded, plain(own))
                 if found is not None and differs is None:
                     differs = Found(f"state.{what}.{found[0]}", *found[1:])
             differs = differs or self.conversation.compare_memory(connection)
         self.conversation.begin(connection)
-        step, plan = restored(entry[1], KNOWN), restored(entry[2], KNOWN)
-        if not isinstance(step, StepState) or not isinstance(plan, PlanState):
-            raise ValueError("a snapshot: allowed are a StepState and a PlanState")
-        self._step, self._plan, self.is_known = step, plan, True
+        restore(self._stepper, entry[1], KNOWN)
+        restore(self._planner, entry[2], KNOWN)
+        self._failure, self.is_known = None, True
         return differs
 
 

@@ -128,6 +128,11 @@ class SafetyState(Value):
         self.clearing_until_s: Final = clearing_until_s
         self.needs_homing: Final = needs_homing
 
+    @property
+    def is_driven(self) -> bool:
+        """Whether the device follows the plan, or holds what it followed last."""
+        return self.operating_state is OperatingState.ENABLED or self.operating_state is OperatingState.PAUSED
+
     def ask(self, request: DeviceRequest) -> "SafetyState":
         """The same state with a new request to the device."""
         return self.replaced(request=request, request_number=self.request_number + 1)

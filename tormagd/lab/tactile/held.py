@@ -19,13 +19,11 @@ import msgspec
 import numpy as np
 from tqdm import tqdm
 
+from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, Rates
-from tormagd.control.core import build_core
-from tormagd.control.estimate import Estimate, Handle
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import PlanState
-from tormagd.control.step import SENSOR_FAULT_S
+from tormagd.control.move.watch import SENSOR_FAULT_S
+from tormagd.control.records import Handle, Measured, Plan, TimedSetpoint
 from tormagd.lab.main import Found
 from tormagd.lab.pages import stamp
 from tormagd.model.displacement import Turn
@@ -64,7 +62,7 @@ class Moment(NamedTuple):
 
     force_N: float
     gap_mm: float
-    state: PlanState
+    plan: Plan
     fault: str
 
 
@@ -78,7 +76,7 @@ def hold(case: Case) -> dict[str, Any]:
             break
         shares.append(moment.force_N / FORCE_N - 1.0)
         gap_mm = moment.gap_mm
-        for limit in moment.state.plan.limits:
+        for limit in moment.plan.limits:
             limits[str(limit)] = limits.get(str(limit), 0) + 1
     absolute = np.abs(shares)
     return case._asdict() | {
@@ -95,7 +93,7 @@ def hold(case: Case) -> dict[str, Any]:
 
 
 class _Prepared:
-    """What both ways need: cores that learn and that do not, the finger, the pad."""
+    """What both ways need: the core, the finger, the pad."""
 
     def __init__(self, case: Case) -> None:
         stated = load_scene(SCENE)
@@ -103,18 +101,16 @@ class _Prepared:
         self.inference_hz = stated.bandwidth.inference_hz
         self.config = Config(scene=SCENE, rates=Rates(control_hz=CONTROL_HZ, inference_hz=self.inference_hz))
         terms = terms_of(stated) if case.relaxation else terms_of(stated).without(*RELAXATION_S)
-        frozen = msgspec.structs.replace(terms, learning=False)
         self.core = build_core(self.config, msgspec.structs.replace(stated, terms=terms))
-        self.later = (
-            self.core if case.is_learning else build_core(self.config, msgspec.structs.replace(stated, terms=frozen))
-        )
         self.hand, self.plant = PressingHand(stated.finger.depth_mm), load_plant(case.plant)
         self.begins_s = PRESSES_AT_S + stated.finger.depth_mm / PRESSING_MM_S + LEARN_S
 
 
 def _whole(case: Case) -> Iterator[Moment]:
     made = _Prepared(case)
-    loop = ClosedLoop(made.config, made.core.stepper, made.core.planner, VirtualDevice(made.plant, made.hand, seed=1))
+    loop = ClosedLoop(
+        made.config, made.core.stepper(), made.core.planner(), VirtualDevice(made.plant, made.hand, seed=1)
+    )
     loop.arm()
 
     def asked(now_s: float) -> TimedSetpoint:
@@ -122,37 +118,38 @@ def _whole(case: Case) -> Iterator[Moment]:
 
     for _ in loop.run(made.begins_s - loop.now_s, asked):
         pass
-    loop.plan_with(made.later.planner)
+    planner = loop.planner
+    assert planner is not None, "this loop plans"
+    planner.believe.learns = case.is_learning
     for _ in range(round(case.seconds)):
         for _ in loop.run(1.0, asked):
             pass
-        truth, state = loop.device.truth, loop.plan_state
-        assert state is not None, "this loop plans"
-        yield Moment(truth.force_N, truth.gap_mm, state, ", ".join(map(str, loop.step_state.safety.faults)))
+        truth = loop.device.truth
+        yield Moment(truth.force_N, truth.gap_mm, planner.planned, ", ".join(map(str, loop.stepper.safety.faults)))
 
 
 def _coarse(case: Case) -> Iterator[Moment]:
     made = _Prepared(case)
-    planner, state = made.core.planner, made.core.planner.start(0.0)
-    element = PressedPad(made.plant, state.plan.gap_mm, COARSE_S)
+    planner = made.core.planner()
+    element = PressedPad(made.plant, planner.planned.gap_mm, COARSE_S)
     sensor, depth_mm, each_s = ForceSensor(made.plant, random.Random(1)), 0.0, round(1.0 / COARSE_S)
     begins, ends = round(made.begins_s / COARSE_S), round((made.begins_s + case.seconds) / COARSE_S)
     for tick in range(1, ends + 1):
-        now_s, before_mm, gap_mm = tick * COARSE_S, depth_mm, state.plan.gap_mm
+        now_s, before_mm, gap_mm = tick * COARSE_S, depth_mm, planner.planned.gap_mm
         depth_mm = made.hand.position_mm(now_s)
         rate_mm_s = (depth_mm - before_mm) / COARSE_S
         element.advance(now_s, gap_mm, depth_mm, rate_mm_s)
         sensor.advance(now_s, element.force_N)
         handle, half_mm = Handle(depth_mm, rate_mm_s, Turn(1.0, 0.0, depth_mm)), gap_mm / 2.0
-        estimate = Estimate(
+        measured = Measured(
             tick, True, now_s, half_mm, half_mm, 0.0, 0.0, sensor.reading_N, handle, depth_mm, now_s, now_s
         )
-        state = planner.plan(state, now_s, TimedSetpoint(FORCE_N, now_s, VALID_S), estimate)
+        plan = planner.plan(now_s, TimedSetpoint(FORCE_N, now_s, VALID_S), measured)
         if tick == begins:
-            planner = made.later.planner
+            planner.believe.learns = case.is_learning
         elif tick > begins and tick % each_s == 0:
-            is_doubted = state.plan.sensor_doubted_s > SENSOR_FAULT_S
-            yield Moment(element.force_N, gap_mm, state, str(Fault.SENSOR) if is_doubted else "")
+            is_doubted = plan.sensor_doubted_s > SENSOR_FAULT_S
+            yield Moment(element.force_N, gap_mm, plan, str(Fault.SENSOR) if is_doubted else "")
 
 
 def draw(path: Path, figures: dict[str, Any]) -> None:

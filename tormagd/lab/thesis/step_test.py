@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import load_config
-from tormagd.control.plan import Plan
-from tormagd.control.step import Stepper
+from tormagd.control.core import Stepper
+from tormagd.control.records import Plan
 from tormagd.physics.inserts import Insert
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
@@ -64,9 +64,9 @@ def step_test(fitted: Insert, seed: int) -> StepTest:
     for gap_mm in GAPS_MM:
         for _ in range(round(HOLD_S / 1e-3)):
             sample = loop.tick(plan=_plan(gap_mm, loop.now_s))
-            estimate = sample.state.estimate
-            if estimate is None or sample.state.safety.faults:
-                raise RuntimeError(f"{fitted.name}: the test ended at {gap_mm:g} mm: {sample.state.safety}")
+            estimate = sample.measured
+            if estimate is None or sample.safety.faults:
+                raise RuntimeError(f"{fitted.name}: the test ended at {gap_mm:g} mm: {sample.safety}")
             rows.append((sample.time_s - began_s, estimate.gap_mm, estimate.force_N))
     record = np.array(rows)
     settled = record.reshape(len(GAPS_MM), -1, 3)[:, -round(SETTLED_S / 1e-3) :].mean(axis=1)

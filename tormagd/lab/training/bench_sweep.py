@@ -22,9 +22,9 @@ from tqdm import tqdm
 
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import load_config
-from tormagd.control.plan import Plan
-from tormagd.control.portrait import FieldOfGap
-from tormagd.control.step import Stepper
+from tormagd.control.core import Stepper
+from tormagd.control.field_of_gap import FieldOfGap
+from tormagd.control.records import Plan
 from tormagd.lab.main import Found
 from tormagd.lab.training.dataset import Array, Dataset, write_csv
 from tormagd.model.displacement import MOBILISED_MM
@@ -125,9 +125,9 @@ def swept(plant: str, scene_name: str, course: Course) -> Array:
     for gap_mm, end_s in zip(course.gaps_mm, ends_s, strict=True):
         while loop.now_s < end_s:
             sample = loop.tick(plan=_plan(gap_mm, loop.now_s))
-            estimate = sample.state.estimate
-            if estimate is None or sample.state.safety.faults:
-                raise RuntimeError(f"the sweep ended at {gap_mm:.1f} mm: {sample.state.safety}")
+            estimate = sample.measured
+            if estimate is None or sample.safety.faults:
+                raise RuntimeError(f"the sweep ended at {gap_mm:.1f} mm: {sample.safety}")
             signed_N = estimate.force_N * estimate.handle.turn.direction
             rows.append((loop.now_s, estimate.handle_mm, estimate.gap_mm, signed_N))
     time_s, handle_mm, gap_mm, signed_N = np.array(rows).T

@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from tormagd.control.portrait import Portrait
+from tormagd.control.aim.portrait import Portrait
 
 SHOWN = 3
 

@@ -1,7 +1,8 @@
-"""What the core was given, in the order it was given: with it and a state to begin with, all that it did can be rerun.
+"""What the core was given, in the order in which it was given that: with it and a beginning, all can be run again.
 
-`plan` and `step` are pure, so nothing that they gave has to be kept: it stands in the tick's record, to compare with.
-So is the conversation with the device, once it is known what was read and when: what was written is kept to compare.
+`plan` and `step` are deterministic, so nothing that they gave has to be kept: it stands in the tick's record, to
+compare with. So is the conversation with the device, once it is known what was read and when: what was written is kept
+to compare.
 """
 
 import struct
@@ -10,9 +11,9 @@ from typing import Any
 
 import msgspec
 
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import PlanState, Shown
-from tormagd.control.step import StepState
+from tormagd.control.believe.believe import Learned
+from tormagd.control.core import Planner, Stepper
+from tormagd.control.records import TimedSetpoint
 from tormagd.exact import plain
 from tormagd.hardware.backend import Received, Sent
 from tormagd.keeping import READ, WROTE
@@ -20,7 +21,7 @@ from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions
 from tormagd_client.messages import TickRecord
 
-FORMAT = 3
+FORMAT = 4
 "Of the entries and of the states in them: raised when one comes, is removed or changes its meaning. No other is rerun."
 STEP = "step"
 "The step ran here; what it was given stands in the next record."
@@ -40,8 +41,8 @@ Entry = str | TickRecord | tuple[Any, ...]
 
 
 class Journal:
-    """Entries that wait to be taken. Writing one is a reference in a list: values do not change. One that is not kept
-    takes no note of anything."""
+    """Entries that wait to be taken. Writing one is a reference in a list: records do not change, and stages are
+    written out at once. A journal that is not kept takes no note of anything."""
 
     def __init__(self, *, is_kept: bool = True) -> None:
         self.is_kept = is_kept
@@ -56,7 +57,7 @@ class Journal:
         self._add(record)
 
     def planned(self, now_s: float, setpoint: TimedSetpoint | None) -> None:
-        """A plan was made, with the newest estimate."""
+        """A plan begins, with what was measured last. Whether it can be made is found out again."""
         self._add((PLAN, now_s, setpoint))
 
     def foresaw(self) -> None:
@@ -64,12 +65,12 @@ class Journal:
         self._add((FORESEE,))
 
     def began_afresh(self, now_s: float) -> None:
-        """No plan could be made: planning began anew."""
+        """The plan could not be made: planning began anew."""
         self._add((AFRESH, now_s))
 
-    def taught(self, shown: Shown) -> None:
-        """What the device has shown was put in the place of what was known of it."""
-        self._add((TEACH, shown))
+    def taught(self, learned: Learned) -> None:
+        """What is known of the device from another day was put in the place of what was believed."""
+        self._add((TEACH, learned))
 
     def commanded(self, name: str, now_s: float, conditions: Conditions, *, is_refused: bool) -> None:
         """An operator's command was given, and taken or refused."""
@@ -95,9 +96,10 @@ class Journal:
         """A conversation with the device begins, which remembers this; None: it has ended."""
         self._add((CONNECTED, memory))
 
-    def snapshot(self, step: StepState, plan: PlanState, connection: Any) -> None:
+    def snapshot(self, stepper: Stepper, planner: Planner, connection: Any) -> None:
         """All that the core and the conversation remember now: a replay may begin here."""
-        self._add((STATE, step, plan, connection))
+        if self.is_kept:
+            self._add((STATE, plain(stepper), plain(planner), connection))
 
     def missed(self) -> None:
         """Entries before this were lost."""

@@ -4,10 +4,11 @@ import math
 from typing import Final, final
 
 from firmware_protocol.value import Value
+from tormagd.control.filter import low_pass
 
 APPROACH_S: Final = 0.01
 "Time constant of the last stretch: below it the reference would chase every quantum of its target."
-LEAST_BRAKING: Final = 0.2
+MIN_BRAKING: Final = 0.2
 "Share of the acceleration that is left to brake with, however hard the target itself turns."
 
 
@@ -31,20 +32,6 @@ class Speeds(Value):
         self.closing_mm_s: Final = closing_mm_s
 
 
-@final
-class Expected(Value):
-    """Where the gap must be by now if it follows its reference: mm, mm/s, and the speed as the estimate filters it.
-
-    The windings take the acceleration with a lag and the exchange brings it in and back a little later, so this is the
-    reference with its jerk limited to what the drive can do. A lag has a positive kernel: it adds no overshoot.
-    """
-
-    def __init__(self, gap_mm: float, speed_mm_s: float = 0.0, filtered_mm_s: float = 0.0) -> None:
-        self.gap_mm: Final = gap_mm
-        self.speed_mm_s: Final = speed_mm_s
-        self.filtered_mm_s: Final = filtered_mm_s
-
-
 def follow(
     acceleration_mm_s2: float,
     reference: Reference,
@@ -64,7 +51,7 @@ def follow(
     """
     distance = target.gap_mm - reference.gap_mm
     relative = acceleration_mm_s2 + math.copysign(1.0, distance) * target.acceleration_mm_s2
-    relative = max(relative, LEAST_BRAKING * acceleration_mm_s2)
+    relative = max(relative, MIN_BRAKING * acceleration_mm_s2)
     closing = math.copysign(_stopping_mm_s(abs(distance), relative, dt_s), distance)
     wanted = target.speed_mm_s + closing
     wanted = max(wanted, -_stopping_mm_s(max(reference.gap_mm - floor_mm, 0.0), acceleration_mm_s2, dt_s))
@@ -89,12 +76,25 @@ def _stopping_mm_s(distance_mm: float, braking_mm_s2: float, dt_s: float) -> flo
     return min(fastest, distance_mm / max(APPROACH_S, dt_s))
 
 
-def expect(expected: Expected, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> Expected:
-    """What is expected `dt_s` later, `lag_s` behind the reference; `filter_s` is that of the estimated speeds."""
-    share = dt_s / (lag_s + dt_s)
-    speed = expected.speed_mm_s + share * (reference.speed_mm_s - expected.speed_mm_s)
-    return Expected(
-        expected.gap_mm + share * (reference.gap_mm - expected.gap_mm),
-        speed,
-        expected.filtered_mm_s + dt_s / (filter_s + dt_s) * (speed - expected.filtered_mm_s),
-    )
+@final
+class Expected:
+    """Where the gap must be by now if it follows its reference: the reference with its jerk limited.
+
+    The windings take the acceleration with a lag, and the exchange brings it in and back a little later. A lag has a
+    positive kernel: it adds no overshoot.
+    """
+
+    gap_mm: float = 0.0
+    speed_mm_s: float = 0.0
+    filtered_mm_s: float = 0.0
+    "The speed as the measured one is filtered."
+
+    def begin(self, gap_mm: float, speed_mm_s: float = 0.0) -> None:
+        """The gap is there, and moves so fast."""
+        self.gap_mm, self.speed_mm_s, self.filtered_mm_s = gap_mm, speed_mm_s, speed_mm_s
+
+    def update(self, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> None:
+        """`dt_s` later, `lag_s` behind the reference; `filter_s` is that of the measured speeds."""
+        self.speed_mm_s = low_pass(self.speed_mm_s, reference.speed_mm_s, dt_s, lag_s)
+        self.gap_mm = low_pass(self.gap_mm, reference.gap_mm, dt_s, lag_s)
+        self.filtered_mm_s = low_pass(self.filtered_mm_s, self.speed_mm_s, dt_s, filter_s)

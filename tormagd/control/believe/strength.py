@@ -1,24 +1,26 @@
-"""What this device has shown of itself: the force it makes, over the model's, as a scale and an offset with variances.
+"""How strong this device is: the force it makes over the model's, as a scale and an offset with their variances.
 
-    F = scale F_model + offset
+    model    F = s m + o + v           m model's force, N; F measured force, N; s scale; o offset, N
+    predict  s, o forget towards their spread with time constants SCALE_LASTS_S and one that gives `adapts_in_s`
+    update   Kalman filter of (s, o), with v of density ERROR_N2_S; what is not learned keeps its value (Schmidt)
 
-Friction, field and elastomer differ from device to device by a factor; what the elastomer has relaxed, and what the
-field's hysteresis holds back, shift the force. A Kalman filter tells the two apart as far as the forces rendered so far
-allow, and no further: what a low force does not show of a high one is left to the device's spread, and known as such.
+Friction, field and elastomer differ from device to device by a factor. What the elastomer has relaxed shifts the
+force. A low force shows little of a high one: the variances say how little.
 """
 
 import math
 from typing import Final, final
 
 from firmware_protocol.value import Value
+from tormagd.control.filter import low_pass
 
 SCALE_SD: Final = 0.17
 "Spread of the scale of devices not yet seen: friction, shear modulus and field each differ evenly within 12%."
-LEAST_SCALE: Final = 0.64
-MOST_SCALE: Final = 1.53
+MIN_SCALE: Final = 0.64
+MAX_SCALE: Final = 1.53
 "All three at their ends, and the field's exponent at its own, -1.34 and -1.26: no believable device is beyond."
-RELAXES_LEAST: Final = 0.1
-RELAXES_MOST: Final = 0.21
+MIN_RELAXED: Final = 0.1
+MAX_RELAXED: Final = 0.21
 "The least and the greatest share of its force that an elastomer loses in the course of hours."
 OFFSET_SD_N: Final = 0.1
 "Of the offset: what relaxation and hysteresis do around 0.5 N."
@@ -31,6 +33,11 @@ SCALE_VARIANCE: Final = SCALE_SD * SCALE_SD
 OFFSET_VARIANCE_N2: Final = OFFSET_SD_N * OFFSET_SD_N
 SURE: Final = 2.0
 "Standard deviations within which a force is taken to lie."
+SURPRISE_S: Final = 0.03
+SURPRISE_N: Final = 0.01
+"""A mean over that time, in which noise leaves 2 to 5 mN, of more than this is the device's own: then its offset is
+learned sooner, in a fifth of its time at twice as much. So noise alone hardly moves the gap, and a step settles."""
+MIN_ADAPTS_IN_S: Final = 0.04
 
 
 @final
@@ -100,51 +107,57 @@ class DeviceFit(Value):
             self.offset_variance_N2 + relaxed_N * (by_scale_N - 2.0 * self.covariance_N),
         )
 
-    def surely_within_N(self, most_N: float) -> float:
-        """The most to ask of the model for the device to give no more than `most_N`: as far as it has shown itself,
-        but no believable device is weaker than LEAST_SCALE or stronger than MOST_SCALE."""
-        # scale m + offset + SURE sqrt(variance of that) = most, a quadratic: the smaller root is where the sum is meant
-        room_N, sure = most_N - self.offset_N, SURE * SURE
+    def surely_within_N(self, max_N: float) -> float:
+        """The model's force at which a device that is SURE deviations stronger gives `max_N`. No device is taken for
+        weaker than MIN_SCALE or stronger than MAX_SCALE."""
+        # scale m + offset + SURE sqrt(variance of that) = max, a quadratic: the smaller root is where the sum is meant
+        room_N, sure = max_N - self.offset_N, SURE * SURE
         square = self.scale * self.scale - sure * self.scale_variance
         half = self.scale * room_N + sure * self.covariance_N
         rest = room_N * room_N - sure * self.offset_variance_N2
         if square <= 0.0:  # so uncertain beside its scale that no force is surely within
-            return most_N / MOST_SCALE
+            return max_N / MAX_SCALE
         root_N = (half - math.sqrt(max(half * half - square * rest, 0.0))) / square
-        return min(max(root_N, most_N / MOST_SCALE), most_N / LEAST_SCALE)
+        return min(max(root_N, max_N / MAX_SCALE), max_N / MIN_SCALE)
 
 
 UNSEEN: Final = DeviceFit()
 "A device that has shown nothing of itself."
 
 
+def forgotten(fit: DeviceFit, dt_s: float, adapts_in_s: float) -> DeviceFit:
+    """The fit after `dt_s` without a reading: its variances go to those of a believable device."""
+    keeps_scale = math.exp(-dt_s / SCALE_LASTS_S)
+    keeps_offset = math.exp(-dt_s * ERROR_N2_S / (2.0 * OFFSET_VARIANCE_N2 * (adapts_in_s * adapts_in_s)))
+    return DeviceFit(
+        fit.scale,
+        fit.offset_N,
+        SCALE_VARIANCE + keeps_scale * keeps_scale * (fit.scale_variance - SCALE_VARIANCE),
+        keeps_scale * keeps_offset * fit.covariance_N,
+        OFFSET_VARIANCE_N2 + keeps_offset * keeps_offset * (fit.offset_variance_N2 - OFFSET_VARIANCE_N2),
+    )
+
+
 def observe(
     fit: DeviceFit,
     model_N: float,
     measured_N: float,
-    elapsed_s: float,
+    dt_s: float,
     *,
     adapts_in_s: float,
     bounds: tuple[float, float],
-    error_N2_s: float = ERROR_N2_S,
     learns_scale: bool = True,
     learns_offset: bool = True,
 ) -> tuple[DeviceFit, bool]:
-    """The fit after `measured_N` where the model says `model_N`, `elapsed_s` after the last, and whether the scale is
-    held at one of its `bounds`. In the long run the offset is learned in about `adapts_in_s`; `error_N2_s` is the
-    density of what the model does not follow. All are finite. What is not learned keeps its value and stays as
-    uncertain as it is, and the other's gain counts with that (Schmidt's filter)."""
-    if elapsed_s <= 0.0:
+    """The fit after `measured_N` where the model says `model_N`, `dt_s` after the last, and whether its scale is held
+    at one of the `bounds`. The offset adapts in about `adapts_in_s`. All are finite."""
+    if dt_s <= 0.0:
         return fit, False
-    # both are forgotten towards their spread, which keeps the variances those of a believable device
-    keeps_scale = math.exp(-elapsed_s / SCALE_LASTS_S)
-    keeps_offset = math.exp(-elapsed_s * error_N2_s / (2.0 * OFFSET_VARIANCE_N2 * (adapts_in_s * adapts_in_s)))
-    scale_variance = SCALE_VARIANCE + keeps_scale * keeps_scale * (fit.scale_variance - SCALE_VARIANCE)
-    offset_variance = OFFSET_VARIANCE_N2 + keeps_offset * keeps_offset * (fit.offset_variance_N2 - OFFSET_VARIANCE_N2)
-    covariance = keeps_scale * keeps_offset * fit.covariance_N
-    by_scale = model_N * scale_variance + covariance
-    by_offset = model_N * covariance + offset_variance
-    innovation_variance = model_N * by_scale + by_offset + error_N2_s / elapsed_s
+    prior = forgotten(fit, dt_s, adapts_in_s)
+    noise_N2 = ERROR_N2_S / dt_s
+    by_scale = model_N * prior.scale_variance + prior.covariance_N
+    by_offset = model_N * prior.covariance_N + prior.offset_variance_N2
+    innovation_variance = model_N * by_scale + by_offset + noise_N2
     gain_scale = by_scale / innovation_variance if learns_scale else 0.0
     gain_offset = by_offset / innovation_variance if learns_offset else 0.0
     error_N = measured_N - fit.force_N(model_N)
@@ -153,13 +166,55 @@ def observe(
     offset_N = fit.offset_N + gain_offset * error_N
     if scale != wanted and learns_offset:
         # a scale that is held is known: what is left of the error is the offset's alone
-        by_itself = offset_variance / (offset_variance + error_N2_s / elapsed_s)
+        by_itself = prior.offset_variance_N2 / (prior.offset_variance_N2 + noise_N2)
         offset_N = fit.offset_N + by_itself * (measured_N - scale * model_N - fit.offset_N)
     learned = DeviceFit(
         scale,
         offset_N,
-        scale_variance - gain_scale * by_scale,
-        covariance - (gain_scale * by_offset if learns_scale else gain_offset * by_scale),
-        offset_variance - gain_offset * by_offset,
+        prior.scale_variance - gain_scale * by_scale,
+        prior.covariance_N - (gain_scale * by_offset if learns_scale else gain_offset * by_scale),
+        prior.offset_variance_N2 - gain_offset * by_offset,
     )
     return learned, scale != wanted
+
+
+@final
+class Strength:
+    """Learns how strong one device is, sooner where its readings surprise."""
+
+    fit: DeviceFit = UNSEEN
+    surprise_N: float = 0.0
+    "By how much the readings of the last SURPRISE_S were more than expected."
+    is_held: bool = False
+    "The scale is at one of its bounds."
+
+    def __init__(self, adapts_in_s: float, bounds: tuple[float, float], learns: tuple[bool, bool]) -> None:
+        """`adapts_in_s`: the offset's time without surprise; `bounds` of the scale; what `learns`, scale and offset."""
+        self._adapts_in_s: Final = adapts_in_s
+        self._bounds: Final = bounds
+        self._learns: Final = learns
+
+    def update(self, model_N: float, reading_N: float, dt_s: float) -> None:
+        """Takes a reading that stands for `dt_s` > 0, where the model says `model_N`."""
+        error_N = reading_N - self.fit.force_N(model_N)
+        self.surprise_N = low_pass(self.surprise_N, error_N, dt_s, SURPRISE_S)
+        adapts_in_s = self._adapts_in_s / (1.0 + (self.surprise_N / SURPRISE_N) ** 2)
+        self.fit, self.is_held = observe(
+            self.fit,
+            model_N,
+            reading_N,
+            dt_s,
+            adapts_in_s=max(adapts_in_s, MIN_ADAPTS_IN_S),
+            bounds=self._bounds,
+            learns_scale=self._learns[0],
+            learns_offset=self._learns[1],
+        )
+
+    def settle(self) -> None:
+        """Nothing can be learned now: what comes then is no surprise yet."""
+        self.surprise_N, self.is_held = 0.0, False
+
+    def forget(self, fit: DeviceFit = UNSEEN) -> None:
+        """Takes `fit` for what is known."""
+        self.fit = fit
+        self.settle()

@@ -1,29 +1,27 @@
 """What an operator's command is decided on: what the device says, what was asked of it, and what is asked of us."""
 
 from tormagd.config import Config
-from tormagd.control.estimate import Estimate
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.step import SENSE_FAULT_S, STATUS_FAULT_S, StepOutput, StepState
+from tormagd.control.core import Stepper
+from tormagd.control.move.watch import SENSE_FAULT_S, STATUS_FAULT_S
+from tormagd.control.records import Duty, Measured, TimedSetpoint
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import Conditions, DeviceRequest
 
 
-def is_homed(measurement: Measurement | None, estimate: Estimate | None) -> bool:
+def is_homed(measurement: Measurement | None, measured: Measured | None) -> bool:
     """Whether the carriages' positions are known; the device's word alone is not enough."""
-    return measurement is not None and estimate is not None and estimate.is_homed
+    return measurement is not None and measured is not None and measured.is_homed
 
 
-def is_busy(
-    measurement: Measurement | None, pending: DeviceRequest, state: StepState, output: StepOutput | None
-) -> bool:
+def is_busy(measurement: Measurement | None, pending: DeviceRequest, stepper: Stepper, output: Duty | None) -> bool:
     """Whether the device homes or opens, or was asked to and has not said yet that it does.
 
     `output` is the newest step's, `pending` the request that the device has not acknowledged.
     """
     if measurement is None:
         return False
-    is_asked = output is not None and output.request_number != state.safety.request_number
+    is_asked = output is not None and output.request_number != stepper.safety.request_number
     return is_asked or pending is not DeviceRequest.NONE or measurement.is_busy
 
 
@@ -31,8 +29,8 @@ def conditions(
     now_s: float,
     config: Config,
     connection: Connection,
-    state: StepState,
-    output: StepOutput | None,
+    stepper: Stepper,
+    output: Duty | None,
     setpoint: TimedSetpoint | None,
     least_N: float,
     *,
@@ -45,8 +43,8 @@ def conditions(
     return Conditions(
         connected=measurement is not None,
         fresh=measurement is not None and not old,
-        homed=is_homed(measurement, state.estimate),
-        busy=is_busy(measurement, connection.pending, state, output),
+        homed=is_homed(measurement, stepper.measured),
+        busy=is_busy(measurement, connection.pending, stepper, output),
         device_latched=measurement is not None and measurement.is_latched,
         requested_N=setpoint.force_N if setpoint is not None and is_current else None,
         neutral_N=least_N + config.limits.neutral_margin_N,

@@ -10,11 +10,11 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from tormagd.control.device_fit import OFFSET_SD_N, SCALE_SD, DeviceFit
-from tormagd.control.lateness import MOST_LAG_S, Lateness
-from tormagd.control.plan import Shown
-from tormagd.control.sensor_zero import MOST_ZERO_N, TARED, SensorZero
-from tormagd.control.slow_friction import LEAST, MOST, SlowFriction
+from tormagd.control.believe.believe import Learned
+from tormagd.control.believe.carriage_lag import MAX_LAG_S
+from tormagd.control.believe.sensor_zero import MAX_ZERO_N
+from tormagd.control.believe.slow_friction import MAX_FACTOR, MIN_FACTOR
+from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceFit
 
 VERSION = 1
 MAX_BYTES = 4_096
@@ -34,8 +34,8 @@ class ProfileError(ValueError):
 
 class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A device, by its serial number, with an insert, as a model sees it. `saved_ns` is CLOCK_REALTIME; the others are
-    those of `DeviceFit`, `SlowFriction`, `SensorZero` and `Lateness`, with standard deviations for variances. Profiles
-    from before lateness was kept have no `lag_s`: none is known of the device."""
+    those of `Learned`, with standard deviations for variances. Profiles from before the carriages' lag was kept have no
+    `lag_s`: none is known of the device."""
 
     v: Annotated[int, Meta(ge=VERSION, le=VERSION)]
     serial_number: Annotated[int, Meta(ge=0, lt=2**32)]
@@ -45,36 +45,35 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     scale: Annotated[float, Meta(gt=0.1, lt=10.0)]
     scale_sd: Annotated[float, Meta(ge=0.0, le=2.0 * SCALE_SD)]
     offset_N: Annotated[float, Meta(ge=-5.0, le=5.0)]
-    slow_factor: Annotated[float, Meta(ge=LEAST, le=MOST)]
+    slow_factor: Annotated[float, Meta(ge=MIN_FACTOR, le=MAX_FACTOR)]
     slow_learned: Annotated[float, Meta(ge=0.0, le=1.0)]
-    sensor_zero_N: Annotated[float, Meta(ge=-MOST_ZERO_N, le=MOST_ZERO_N)]
-    lag_s: Annotated[float, Meta(ge=0.0, le=MOST_LAG_S)] = 0.0
+    sensor_zero_N: Annotated[float, Meta(ge=-MAX_ZERO_N, le=MAX_ZERO_N)]
+    lag_s: Annotated[float, Meta(ge=0.0, le=MAX_LAG_S)] = 0.0
 
-    def shown(self, now_ns: int) -> Shown:
-        """What the device counts as having shown of itself, at CLOCK_REALTIME `now_ns`."""
+    def learned(self, now_ns: int) -> Learned:
+        """What is known of the device at CLOCK_REALTIME `now_ns`."""
         scale_sd = min(math.hypot(self.scale_sd, WARMTH_SD), SCALE_SD)
         device = DeviceFit(self.scale, self.offset_N, scale_sd**2, 0.0, min(RELAXED_SD_N, OFFSET_SD_N) ** 2)
-        slow = SlowFriction(self.slow_factor, self.slow_learned)
         is_recent = abs(now_ns - self.saved_ns) * 1e-9 < ZERO_LASTS_S
-        zero = SensorZero(self.sensor_zero_N) if is_recent else TARED
-        return Shown(device, slow=slow, zero=zero, lateness=Lateness(self.lag_s))
+        zero_N = self.sensor_zero_N if is_recent else 0.0
+        return Learned(device, self.slow_factor, self.slow_learned, zero_N, self.lag_s)
 
 
-def profile_of(shown: Shown, *, serial_number: int, insert: str, model: str, saved_ns: int) -> Profile:
-    """The profile to keep of a device that has shown this of itself."""
+def profile_of(learned: Learned, *, serial_number: int, insert: str, model: str, saved_ns: int) -> Profile:
+    """The profile to keep of a device of which this is known."""
     return Profile(
         v=VERSION,
         serial_number=serial_number,
         insert=insert,
         model=model,
         saved_ns=saved_ns,
-        scale=shown.device.scale,
-        scale_sd=min(shown.device.scale_sd, SCALE_SD),
-        offset_N=shown.device.offset_N,
-        slow_factor=shown.slow.factor,
-        slow_learned=shown.slow.learned,
-        sensor_zero_N=shown.zero.zero_N,
-        lag_s=shown.lateness.lag_s,
+        scale=learned.device.scale,
+        scale_sd=min(learned.device.scale_sd, SCALE_SD),
+        offset_N=learned.device.offset_N,
+        slow_factor=learned.slow_factor,
+        slow_learned=learned.slow_learned,
+        sensor_zero_N=learned.sensor_zero_N,
+        lag_s=learned.lag_s,
     )
 
 

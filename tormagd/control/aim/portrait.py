@@ -1,53 +1,19 @@
 """The device's phase portrait: which forces a gap gives, and how fast a gap speed changes them."""
 
-import math
 from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
 
+from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.interpolation import Rising, at_step, interpolated, interpolated_before
 from tormagd.inverse.solution import FieldSolution, Reach, checked_near_mT
 from tormagd.model.force_curve import ForceCurve
-from tormagd.physics.errors import DomainError
-from tormagd.physics.field import PowerFieldLaw, flux_density_T
+from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import Elastomer, Geometry, brake_force_N
 
 Array = npt.NDArray[np.float64]
 GRID: Final = 201
-
-
-@final
-class FieldOfGap:
-    """The flux density at the shaft's surface, mT, over the gap, mm, in one insert: Eq. 6 with the power law's a.
-
-    What `PowerFieldLaw` and `flux_density_T` compute, on floats alone: it stands in every plan. Both directions raise
-    `DomainError` outside the law's range of gaps.
-    """
-
-    def __init__(self, law: PowerFieldLaw, relative_permeability: float, inner_radius_m: float) -> None:
-        self._coefficient: Final = law.coefficient
-        self._exponent: Final = law.exponent
-        self._inverse: Final = 1.0 / law.exponent
-        self._per_moment_T: Final = flux_density_T(1.0, relative_permeability, inner_radius_m)
-        self._range_mm: Final = law.gap_range_mm
-        nearest_mm, farthest_mm = law.gap_range_mm
-        self._strongest_mT: Final = self.field_mT(nearest_mm)
-        self._weakest_mT: Final = self.field_mT(farthest_mm)
-
-    def field_mT(self, gap_mm: float) -> float:
-        """Flux density |b| at R_i."""
-        if not self._range_mm[0] <= gap_mm <= self._range_mm[1]:
-            raise DomainError("gap_mm", gap_mm, f"a number from {self._range_mm[0]:g} to {self._range_mm[1]:g}")
-        return 1e3 * (self._coefficient * math.pow(gap_mm, self._exponent) * self._per_moment_T)
-
-    def gap_mm(self, field_mT: float) -> float:
-        """The gap that gives `field_mT`."""
-        if not self._weakest_mT <= field_mT <= self._strongest_mT:
-            raise DomainError(
-                "field_mT", field_mT, f"a number from {self._weakest_mT:g} to {self._strongest_mT:g}, which gaps give"
-            )
-        return math.pow(1e-3 * field_mT / self._per_moment_T / self._coefficient, self._inverse)
 
 
 @final
@@ -64,12 +30,12 @@ class Portrait:
         self._rising_N: Final = Rising(force_N)
 
     @property
-    def least_N(self) -> float:
+    def min_N(self) -> float:
         """F_min: what the open gap gives. A passive device gives no less."""
         return self.force_N[0]
 
     @property
-    def most_N(self) -> float:
+    def max_N(self) -> float:
         """F_max: what the closed gap gives."""
         return self.force_N[-1]
 
@@ -109,10 +75,10 @@ class PortraitSearch:
         checked_near_mT(force_N, last_field_mT, 0.0)
         shown = self._portrait
         field_mT = self._field.field_mT(shown.gap_mm_at(force_N))
-        least_N, most_N = shown.least_N, shown.most_N
-        if least_N <= force_N <= most_N:
+        min_N, max_N = shown.min_N, shown.max_N
+        if min_N <= force_N <= max_N:
             return FieldSolution(field_mT, force_N, 1.0, 1, Reach.INSIDE)
-        nearest_N, reach = (least_N, Reach.BELOW) if force_N < least_N else (most_N, Reach.ABOVE)
+        nearest_N, reach = (min_N, Reach.BELOW) if force_N < min_N else (max_N, Reach.ABOVE)
         return FieldSolution(field_mT, nearest_N, curve.confidence(field_mT, force_N - nearest_N), 1, reach)
 
 

@@ -1,0 +1,331 @@
+"""The core put together for one scene, and the refusals where scene, model and configuration do not fit each other.
+
+The daemon, the virtual-time simulation and the tests build it here, so that all of them run the same one.
+"""
+
+import hashlib
+import math
+import platform
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec import UNSET
+
+from tormagd.assembly.renderable import Missed, missed
+from tormagd.config import Config
+from tormagd.control.aim.aim import Element
+from tormagd.control.aim.floors import CEILING
+from tormagd.control.aim.portrait import LawOfField, Portrait, PortraitSearch, law_beside, portrait
+from tormagd.control.believe.strength import MIN_SCALE
+from tormagd.control.contact import PRESSED, Contact, Pressing, Sliding
+from tormagd.control.core import Planner, Stepper
+from tormagd.control.field_of_gap import FieldOfGap
+from tormagd.control.move.motor import Margins, margins, pull_V
+from tormagd.control.nominal import Nominal
+from tormagd.inverse.choice import Choice, build, named
+from tormagd.model.force_curve import ForceCurve
+from tormagd.model.model_file import ForceModel, ModelFileError, load_model
+from tormagd.model.rising import falling_at
+from tormagd.model.shipped import model_path
+from tormagd.physics.errors import DomainError
+from tormagd.physics.field import PAD_RADIUS_M, REFERENCE_PERMEABILITY, PowerFieldLaw
+from tormagd.physics.force import Geometry
+from tormagd.physics.inserts import insert
+from tormagd.scenes.scene import AUTO, LEAST_CONTROL_HZ, Finger, Scene, load_scene, scene_path, terms_of
+from tormagd.scenes.signal import asked
+from tormagd_client.endpoints import ConfigError
+
+LEAST_PHASE_MARGIN_DEG = 30.0
+LEAST_GAIN_MARGIN_DB = 4.0
+SOURCES = ("firmware_protocol", *(f"tormagd/{it}" for it in ("physics", "model", "inverse", "safety", "scenes")))
+SOURCES += ("tormagd/hardware", "tormagd/control", "tormagd/assembly")
+SENSED_N = 0.001
+"A step of the force sensor's message."
+SETTLES_MM = 4.0 * 8.0 / 4480.0
+"To within four counts of the encoders the gap comes to rest, wherever in its stroke: friction holds it there."
+DEPTHS = 9
+"Between the scene's depth and the model's greatest, at which a pad's force is looked at whether it rises."
+LOOKED_AT_S, LOOKED_AT_HZ, LOOKS = 30.0, 100, 20
+"So much of a scene's signal is held against the device's speed, as often as this, and so often in a period."
+SEVERAL_BRANCHES = named("nearest", neighbours=16, reason="the force falls with the field somewhere")
+"With fewer neighbours answers jump between branches, more gain little: docs/tactile.md."
+IN_PORTRAIT = Choice("portrait", 0.0, 0, "the scene requires no rate: force over gap is one table")
+BY_NEWTON = named("newton", reason="of the searches the cheapest, and the most exact")
+"At every tolerance and for every size of network: docs/inverse_trade.md, and docs/scenes.md on the device."
+
+
+class Core(NamedTuple):
+    """What one scene's control needs; nothing in it changes. `planner` and `stepper` begin with it."""
+
+    config: Config
+    "With the scene's own gap speed."
+    scene: Scene
+    element: Element
+    margins: Margins
+    solver: Choice
+    model: str
+    "The model's fingerprint."
+    models: Path
+    "Where the scene's model was looked for, where it is no shipped one."
+    gap_speed_mm_s: float
+    "The fastest that the gap is moved."
+    missed: Missed | None = None
+    "What the gap's speed alone leaves of the scene's signal; None where it states none."
+
+    @property
+    def portrait(self) -> Portrait:
+        """Force over gap, of the nominal device without memory."""
+        return self.element.portrait
+
+    def planner(self, now_s: float = 0.0) -> Planner:
+        """Planning that begins at `now_s`: gap open, nothing known of the device."""
+        return Planner(self.config, self.scene, self.element, now_s)
+
+    def stepper(self, now_s: float = 0.0) -> Stepper:
+        """Steps that begin at `now_s`: disabled."""
+        return Stepper(self.config, self.scene, now_s)
+
+
+def build_core(config: Config, scene: Scene | None = None, models: Path | None = None) -> Core:
+    """The core for `config.scene`. Raises ConfigError where scene, model and configuration do not fit each other.
+
+    A given `scene` takes the place of the one in the file; its files are beside that one, or its model in the folder
+    `models`: then it has been checked, and its signal is not looked for.
+    """
+    beside = scene_path(config.scene).parent.absolute() if models is None else models
+    scene = load_scene(config.scene) if scene is None else scene
+    config = _slowed(config, scene)
+    for name in ("control_hz", "inference_hz"):
+        offered, needed = getattr(config.rates, name), getattr(scene.bandwidth, name)
+        if offered < needed:
+            raise ConfigError(f"rates.{name} = {offered}: allowed is at least {needed}, which scene {scene.name} needs")
+    stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
+    if stability.phase_margin_deg < LEAST_PHASE_MARGIN_DEG or stability.gain_margin_dB < LEAST_GAIN_MARGIN_DB:
+        raise ConfigError(
+            f"position: these gains leave a phase margin of {stability.phase_margin_deg:.0f} degrees and a gain margin "
+            f"of {stability.gain_margin_dB:.1f} dB: allowed is at least {LEAST_PHASE_MARGIN_DEG:g} and "
+            f"{LEAST_GAIN_MARGIN_DB:g}"
+        )
+    _refuse_too_weak(config, scene)
+    try:
+        model = load_model(
+            model_path(scene.insert.model, beside=beside),
+            element=scene.element,
+            insert=scene.insert.name,
+        )
+        part = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
+        field = part.field
+        fields_mT, rises = _known_fields_mT(scene, model, part)
+        reach = portrait(_curve(model, part), field, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
+        choice = choose_solver(scene, rises=rises)
+        search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, rises=rises)
+        law = _law(scene, reach, field) if part.contact.slides else None
+    except (DomainError, ModelFileError) as error:
+        raise ConfigError(f"scene {scene.name}: {error}") from error
+    _refuse_unknown_hand(scene, model)
+    _refuse_out_of_reach(scene, reach)
+    _refuse_too_fine(scene, reach)
+    too_fast = _refuse_too_fast(config, scene, reach, beside) if models is None else None
+    _refuse_too_sudden(config, scene, reach)
+    terms = terms_of(scene)
+    nominal = Nominal(model, part.contact, part.cip_percent, terms.rate)
+    memory = model.metadata.memory.of(relaxes=terms.relaxes, hysteresis=terms.hysteresis)
+    element, speed_mm_s = Element(nominal, memory, field, reach, search, law), config.position.gap_speed_mm_s
+    return Core(config, scene, element, stability, choice, model.fingerprint, beside, speed_mm_s, too_fast)
+
+
+def sources_hash() -> str:
+    """SHA-256 of the sources that decide: all that `plan` and `step` run. Both builds of them have the same."""
+    root, digest = Path(__file__).parents[2], hashlib.sha256()
+    for room in SOURCES:
+        for path in sorted((root / room).glob("**/*.py")):
+            digest.update(f"{path.relative_to(root).as_posix()} {path.stat().st_size}\n".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def platform_name() -> str:
+    """What else the bits of a result depend on: the processor's kind, Python and NumPy."""
+    return f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}"
+
+
+class Part(NamedTuple):
+    """What the scene's element is to the core: how it is touched, the field in it over the gap, and its iron."""
+
+    contact: Contact
+    field: FieldOfGap
+    cip_percent: float
+
+
+def _brake(scene: Scene) -> Part:
+    fitted = insert(scene.insert.name)
+    permeability, radius_mm = fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm
+    return Part(Sliding(), FieldOfGap(PowerFieldLaw(), permeability, radius_mm * 1e-3), 100.0 * fitted.cip_fraction)
+
+
+def _pad(finger: Finger, model: ForceModel) -> Part:
+    *_, (cip_percent, _) = model.feature_ranges
+    return Part(
+        Pressing(finger.depth_mm), FieldOfGap(PowerFieldLaw(), REFERENCE_PERMEABILITY, PAD_RADIUS_M), cip_percent
+    )
+
+
+def _curve(model: ForceModel, part: Part) -> ForceCurve:
+    """Of the contact that the portrait is drawn for, or the nearest that the model knows."""
+    (_, most_mm), (slowest_mm_s, fastest_mm_s), _, _ = model.feature_ranges
+    contact = part.contact
+    rate_mm_s = min(max(contact.rate_mm_s, slowest_mm_s), fastest_mm_s)
+    return model.curve(min(contact.displacement_mm, most_mm), rate_mm_s, part.cip_percent)
+
+
+def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
+    """The force law beside the brake's model; of a pad none is printed that could judge one."""
+    fitted, metres = scene.insert, 1e-3
+    geometry = Geometry(
+        fitted.inner_radius_mm * metres,
+        fitted.outer_radius_mm * metres,
+        fitted.thickness_mm * metres,
+        fitted.roller_radius_mm * metres,
+    )
+    return law_beside(reach, PowerFieldLaw(), field, insert(fitted.name).elastomer, geometry)
+
+
+def _known_fields_mT(scene: Scene, model: ForceModel, part: Part) -> tuple[tuple[float, float], bool]:
+    """The fields of the scene's gaps, as far as the model knows them; and whether it knows that they give more force
+    however the element is touched. Where it is touched as the portrait is, they have to."""
+    low_mT, high_mT = model.field_range_mT
+    low_mT = max(low_mT, part.field.field_mT(scene.insert.gap_open_mm))
+    high_mT = min(high_mT, part.field.field_mT(scene.insert.gap_closed_mm))
+    if not low_mT < high_mT:
+        raise DomainError("insert.model", f"trained on {model.field_range_mT} mT", "fields that the scene's gaps give")
+    (_, most_mm), *_ = model.feature_ranges
+    falling_mm_s = falling_at(model, (low_mT, high_mT), min(part.contact.displacement_mm, most_mm))
+    if falling_mm_s is not None:
+        raise DomainError(
+            "insert.model",
+            f"force that falls with the field at {falling_mm_s:.3g} mm/s",
+            "a force that rises with the field: train it on more data, as `tormag-lab train-model --rising` checks",
+        )
+    if part.contact.slides:
+        return (low_mT, high_mT), True
+    depths_mm = np.linspace(PRESSED * part.contact.displacement_mm, most_mm, DEPTHS).tolist()
+    return (low_mT, high_mT), all(falling_at(model, (low_mT, high_mT), depth) is None for depth in depths_mm)
+
+
+def _refuse_too_weak(config: Config, scene: Scene) -> None:
+    motor, closed_mm = config.motor, scene.insert.gap_closed_mm
+    needed_V = motor.coulomb_V + pull_V(motor.pull_V, closed_mm)
+    most_V = config.position.duty_limit * motor.supply_V / 2.0
+    if needed_V > most_V:
+        raise ConfigError(
+            f"motor: coulomb_V = {motor.coulomb_V:g} and pull_V = {motor.pull_V:g} take {needed_V:.2f} V to open the "
+            f"gap from {closed_mm:g} mm: allowed is {most_V:g} V, half of position.duty_limit times motor.supply_V"
+        )
+
+
+def _refuse_out_of_reach(scene: Scene, reach: Portrait) -> None:
+    # a lowest force below what the open gap gives is no error: no passive brake gives 0, and the limit F_MIN says so
+    between = f"allowed is {reach.min_N:.2f}..{reach.max_N:.2f}, what model {scene.insert.model} gives in these gaps"
+    if not reach.min_N < scene.force.most_N <= reach.max_N:
+        raise ConfigError(f"scene {scene.name}: force.most_N = {scene.force.most_N:g}: {between}")
+
+
+def at_rates_of(scene: Scene, config: Config) -> Config:
+    """The configuration with the rates that the scene needs, where `rates.of_scene` says so. Raises ConfigError."""
+    if not config.rates.of_scene:
+        return config
+    needed = scene.bandwidth
+    control_hz = max(needed.control_hz, LEAST_CONTROL_HZ)
+    rates = msgspec.structs.replace(config.rates, control_hz=control_hz, inference_hz=needed.inference_hz)
+    try:
+        return msgspec.structs.replace(config, rates=rates)
+    except ValueError as error:
+        raise ConfigError(f"scene {scene.name}: rates.of_scene: {error}") from error
+
+
+def _slowed(config: Config, scene: Scene) -> Config:
+    """The configuration with the scene's gap speed, where that is the lower one."""
+    position, asked_mm_s = config.position, scene.insert.gap_speed_mm_s
+    if asked_mm_s is UNSET or asked_mm_s >= position.gap_speed_mm_s:
+        return config
+    return msgspec.structs.replace(config, position=msgspec.structs.replace(position, gap_speed_mm_s=asked_mm_s))
+
+
+def least_resolution_N(reach: Portrait, most_N: float) -> float:
+    """The smallest difference of force that the device makes and measures, up to this force."""
+    return max(SENSED_N, SETTLES_MM * reach.slope_at_N_mm(most_N))
+
+
+def _refuse_too_fine(scene: Scene, reach: Portrait) -> None:
+    least_N = least_resolution_N(reach, scene.force.most_N)
+    if scene.force.resolution_N < least_N:
+        raise ConfigError(
+            f"scene {scene.name}: force.resolution_N = {scene.force.resolution_N:g}: allowed is at least {least_N:.2g}"
+            f": the force sensor has steps of {SENSED_N:g} N, and the gap settles to {1e3 * SETTLES_MM:.0f} um"
+        )
+
+
+def _refuse_unknown_hand(scene: Scene, model: ForceModel) -> None:
+    depths_mm, rates_mm_s, *_ = model.feature_ranges
+    handle, finger = scene.handle, scene.finger
+    stated = [("handle.least_mm_s", handle.least_mm_s, rates_mm_s), ("handle.most_mm_s", handle.most_mm_s, rates_mm_s)]
+    if finger is not UNSET:
+        stated = [("finger.depth_mm", finger.depth_mm, depths_mm), ("finger.most_mm_s", finger.most_mm_s, rates_mm_s)]
+    for key, value, (least, most) in stated:
+        if not least <= value <= most:
+            raise ConfigError(
+                f"scene {scene.name}: {key} = {value:g}: allowed is {least:.2g}..{most:.3g}, what model "
+                f"{scene.insert.model} was trained on"
+            )
+
+
+def _refuse_too_fast(config: Config, scene: Scene, reach: Portrait, beside: Path) -> Missed | None:
+    if scene.signal is None:
+        return None
+    force, speed_mm_s = scene.force, config.position.gap_speed_mm_s
+    range_N = max(force.least_N, reach.min_N), force.most_N
+    bandwidth_hz = 0.0 if scene.signal.bandwidth_hz is UNSET else scene.signal.bandwidth_hz
+    rate_hz = max(LOOKED_AT_HZ, math.ceil(LOOKS * bandwidth_hz))
+    times_s, forces_N = asked(scene.signal, beside, range_N, LOOKED_AT_S, rate_hz)
+    miss = missed(reach, times_s.tolist(), forces_N.tolist(), speed_mm_s)
+    if miss.rms_N > force.tolerance_rms_N:
+        worst = ", ".join(
+            f"{point.asked_N_s:.2g} N/s at {point.force_N:.2f} N (the device: {point.given_N_s:.2g})"
+            for point in miss.worst
+        )
+        raise ConfigError(
+            f"scene {scene.name}: signal: allowed is what gaps of {speed_mm_s:g} mm/s follow within "
+            f"force.tolerance_rms_N = {force.tolerance_rms_N:g}: they miss it by {miss.rms_N:.3f}, {miss.share:.0%} of "
+            f"the time is faster: {worst}"
+        )
+    return miss
+
+
+def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
+    # the weakest believable device makes a force with the least gap, where a gap's speed is the most force; and the
+    # ceiling lets no gap make more than CEILING times the scene's greatest
+    opening_mm_s, key = max(
+        (2.0 * config.device.retract_mm_s, "device.retract_mm_s"),
+        (config.position.gap_speed_mm_s, "position.gap_speed_mm_s"),
+    )
+    model_N = min(CEILING * scene.force.most_N / MIN_SCALE, reach.max_N)
+    lost_N_s = MIN_SCALE * reach.force_rate_N_s(model_N, opening_mm_s)
+    if lost_N_s > scene.force.most_release_N_s:
+        raise ConfigError(
+            f"scene {scene.name}: force.most_release_N_s = {scene.force.most_release_N_s:g}: allowed is at least "
+            f"{lost_N_s:.2f}: {key} opens the gap by {opening_mm_s:g} mm/s, which at {MIN_SCALE * model_N:.2g} N "
+            "loses so much"
+        )
+
+
+def choose_solver(scene: Scene, *, rises: bool = True) -> Choice:
+    """The search that `scene` names; else the portrait where the rate is no term, the k-nearest where the force is not
+    known to rise, or Newton's method. Raises DomainError."""
+    wanted = scene.solver
+    if wanted.name == AUTO:
+        if not terms_of(scene).rate:
+            return IN_PORTRAIT
+        return BY_NEWTON if rises else SEVERAL_BRANCHES
+    return named(wanted.name, wanted.step_mT or None, wanted.neighbours or None)

@@ -1,0 +1,153 @@
+"""From the force that is asked to the gap that gives it: force -> field -> gap, and what holds the gap back.
+
+force  m = (F - o) / s                   of the model, without memory, for the device that is believed in
+field  B: m(B) = m                       the search, held near the force law
+gap    of B + l                          l the lag of the element's field; no closer than the ceiling's floor
+ahead  the same along the portrait for the forces to come, as the speed and acceleration of a parabola
+"""
+
+import math
+from typing import Final, NamedTuple, final
+
+import numpy as np
+
+from tormagd.config import Config
+from tormagd.control.aim.floors import CEILING, ceiling_mm, lawful_mT
+from tormagd.control.aim.portrait import LawOfField, Portrait
+from tormagd.control.ask.path import PATH_S
+from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.field_of_gap import FieldOfGap
+from tormagd.control.nominal import Nominal
+from tormagd.control.records import Ask, Belief, Measured, Outside, Plan, TimedSetpoint
+from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
+from tormagd.model.features import FEATURES
+from tormagd.model.memory import Memory
+from tormagd.safety.codes import Limit
+from tormagd.scenes.scene import Scene
+
+# looking a member up takes longer than comparing it
+_INSIDE: Final = Reach.INSIDE
+
+_PARABOLA: Final = np.linalg.pinv(np.stack([np.array(PATH_S), np.array(PATH_S) ** 2 / 2.0], axis=1))
+_TO_SPEED: Final[list[float]] = _PARABOLA[0].tolist()
+_TO_ACCELERATION: Final[list[float]] = _PARABOLA[1].tolist()
+"From the path's distances from its beginning to the speed and acceleration there of the nearest parabola."
+
+
+class Element(NamedTuple):
+    """How the nominal device makes force: the model and its memory, the field over the gap, the force over the gap
+    (without memory), the search for a field, and the force law beside the model; of a pad no law is known."""
+
+    nominal: Nominal
+    memory: Memory
+    field: FieldOfGap
+    portrait: Portrait
+    search: FieldSolver
+    law: LawOfField | None
+
+
+@final
+class Aim:
+    """Plans one gap after another."""
+
+    number: int = 0
+    "Of the newest plan."
+    element_mT: float = 0.0
+    "The element's field at it: where several fields give a force, the one nearest to this is taken."
+
+    def __init__(self, config: Config, scene: Scene, element: Element) -> None:
+        self._nominal: Final = element.nominal
+        self._field: Final = element.field
+        self._portrait: Final = element.portrait
+        self._search: Final = element.search
+        self._law: Final = element.law
+        self._closed_mm: Final = scene.insert.gap_closed_mm
+        self._open_mm: Final = scene.insert.gap_open_mm
+        self._ceiling_N: Final = CEILING * scene.force.most_N
+        self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
+        self._max_mm_s2: Final = config.position.gap_acceleration_mm_s2
+        self._low_confidence: Final = config.limits.low_confidence
+
+    def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
+        """The plan before the first, numbered `number`: gap open. The element's field lags by `lag_mT`."""
+        field_mT = self._field.field_mT(self._open_mm)
+        self.number, self.element_mT = number, field_mT - lag_mT
+        min_N = self._portrait.min_N
+        return Plan(number, now_s, None, None, min_N, None, field_mT, self._open_mm, 0.0, 1.0, (Limit.NO_SETPOINT,))
+
+    def update(
+        self, now_s: float, setpoint: TimedSetpoint | None, ask: Ask, belief: Belief, measured: Measured | None
+    ) -> Plan:
+        """The plan for what is asked of the device that is believed in. `setpoint` is what `ask` was made of. Raises
+        DomainError where no field or gap can be found."""
+        device, lag = belief.device, belief.field_lag
+        curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
+        wanted_N = device.model_N(ask.path_N[0])
+        solution = self._search.solve(curve, wanted_N, self.element_mT)
+        element_mT = lawful_mT(self._law, wanted_N, solution.field_mT)
+        if element_mT != solution.field_mT:
+            outside = (*outside, Outside(FEATURES[2], solution.field_mT, element_mT))
+        field_mT = element_mT + lag.lag_at_mT(element_mT + lag.lag_mT)
+        # the field grid ends where the gap range ends, up to rounding
+        wanted_mm = min(max(self._field.gap_mm(field_mT), self._closed_mm), self._open_mm)
+        min_mm = ceiling_mm(self._portrait, device, self._ceiling_N)
+        gap_mm = max(wanted_mm, min_mm)
+        speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, device)
+        model_N = belief.at_speed.model_N(ask.force_N)
+        self.number += 1
+        self.element_mT = field_mT - lag.lag_mT
+        return Plan(
+            number=self.number,
+            time_s=now_s,
+            setpoint_N=None if setpoint is None else setpoint.force_N,
+            setpoint_age_s=ask.age_s,
+            governed_N=ask.force_N,
+            predicted_N=belief.predicted_N,
+            field_mT=field_mT,
+            gap_mm=gap_mm,
+            gap_speed_mm_s=speed_mm_s,
+            confidence=solution.confidence,
+            limits=self._limits(ask, belief.limits, outside, gap_mm > wanted_mm, solution),
+            gap_acceleration_mm_s2=acceleration_mm_s2,
+            foresight=ask.foresight,
+            min_gap_mm=min_mm,
+            outside=outside,
+            sensor_doubted_s=belief.sensor_doubted_s,
+            trim=ask.force_N / model_N if model_N > 0.0 else belief.at_speed.scale,
+            stamp_s=setpoint.stamp_s if setpoint is not None and ask.is_meant else -math.inf,
+        )
+
+    def _limits(
+        self,
+        ask: Ask,
+        believed: tuple[Limit, ...],
+        outside: tuple[Outside, ...],
+        is_held: bool,
+        solution: FieldSolution,
+    ) -> tuple[Limit, ...]:
+        """What holds the force back, in the order in which it does; `is_held`: the ceiling holds the gap."""
+        limits = (*ask.limits, *believed)
+        if outside:
+            limits = (*limits, Limit.MODEL_RANGE)
+        if is_held:
+            limits = (*limits, Limit.CEILING)
+        if solution.confidence < self._low_confidence:
+            limits = (*limits, Limit.LOW_CONFIDENCE)
+        if solution.reach is not _INSIDE:
+            reached = Limit.F_MIN if solution.reach is Reach.BELOW else Limit.F_MAX
+            # where nobody asks for a force, none is held back for being too low
+            if reached not in limits and (ask.is_meant or reached is Limit.F_MAX):
+                limits = (*limits, reached)
+        return limits
+
+    def _motion_ahead(self, path_N: list[float], device: DeviceFit) -> tuple[float, float]:
+        """Speed and acceleration of the gap along these forces at PATH_S (7), within what the carriages do."""
+        # along the portrait, not from one solution to the next: a difference would amplify the solver's grain
+        start_mm = self._portrait.gap_mm_at(device.model_N(path_N[0]))
+        speed, acceleration = 0.0, 0.0
+        for place, force_N in enumerate(path_N):
+            away_mm = self._portrait.gap_mm_at(device.model_N(force_N)) - start_mm
+            speed += _TO_SPEED[place] * away_mm
+            acceleration += _TO_ACCELERATION[place] * away_mm
+        top, hardest = self._top_speed_mm_s, self._max_mm_s2
+        return min(max(speed, -top), top), min(max(acceleration, -hardest), hardest)

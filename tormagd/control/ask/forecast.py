@@ -1,0 +1,280 @@
+"""What comes next in a force that repeats itself, as a pulse does, where the setpoints bring no preview.
+
+No period is assumed, for heart beats vary: the newest stretch of force, as a delay embedding, is compared with those
+remembered, and what followed them tells what will follow it (analogue forecasting, Lorenz, J. Atmos. Sci. 26, 1969;
+locally weighted linear regression, Cleveland and Devlin, J. Am. Stat. Assoc. 83, 1988). Two embeddings do that, one as
+long as the rise of a pulse and one as half its beat; the one that missed less lately counts more. How far both are
+believed has to be earned: by their skill over the slope that is extrapolated otherwise, judged by what came.
+"""
+
+import math
+from array import array
+from typing import Final, final
+
+import numpy as np
+import numpy.typing as npt
+
+from firmware_protocol.value import Value
+from tormagd.control.ask.skill import DOUBT_N, UNJUDGED, Skill
+from tormagd.control.interpolation import at_step
+
+Array = npt.NDArray[np.float64]
+
+GRID_S: Final = 0.01
+"Forces are remembered on a grid of time, whose points everything below counts; a pulse rises in ten of them."
+HISTORY: Final = 1_000
+"Ten seconds: a dozen heart beats at rest, and twice a breath, which modulates them."
+MIN_HISTORY: Final = 100
+"With less, which is less than a heart beat, nothing is forecast."
+RISE_DELAYS: Final = (1, 2, 4, 7, 11)
+BEAT_DELAYS: Final = (1, 3, 8, 18, 38)
+"""Of the embeddings: a stretch is compared at these points before its end, as changes from there. Close together where
+the slope and its change show, and back to the rise of a pulse, which takes a tenth of a second, or to what came before
+it: a rise is foreseen from there, but fewer stretches are alike for so long. The second were chosen on sample 1."""
+TAPS: Final = 5
+"As many as there are delays in each."
+STRIDE: Final = 3
+"Every third stretch is looked at: the regression makes up for most of what lies between them."
+HORIZON: Final = 8
+"Points that are forecast; a plan looks 30 ms ahead, from as far ahead as the carriages are late."
+HORIZON_S: Final = HORIZON * GRID_S
+JUDGED: Final = 4
+"The point ahead that forecasts are judged at: as far as the middle of what a plan looks at, with usual carriages."
+MAX_STEP_S: Final = 0.1
+"Setpoints further apart than this are no stream: nothing that was learned outlives the gap."
+SAME_N: Final = 1e-4
+"Stretches that differ by no more are the same: a tenth of what the force sensor resolves."
+UNLIKE_N: Final = 0.05
+"""Where every stretch differs by more, none is like the newest. Pulses on sample 1 are missed by as much with 30 and by
+1 % more with 80 mN."""
+RIDGE: Final = 0.01
+"Share by which the regression's variances are raised: from stretches that hardly differ no dependence is learned."
+MAX_LEVERAGE: Final = 100.0
+"""Nothing is forecast from a stretch of more leverage, as after a jump: 1 and its squared distance from the mean of
+those most like it, in their standard deviations."""
+LONG_S: Final = 2.0
+SHORT_S: Final = 0.2
+"Skill is earned over the long time, a few beats, and lost over the short: a rhythm that breaks breaks at once."
+_LONG_SHARE: Final = GRID_S / (LONG_S + GRID_S)
+_SHORT_SHARE: Final = GRID_S / (SHORT_S + GRID_S)
+_MIN_BYTES: Final = MIN_HISTORY * array("d").itemsize
+_MAX_BYTES: Final = HISTORY * array("d").itemsize
+
+
+@final
+class Embedding(Value):
+    """Where stretches and what followed them are in a full history.
+
+    shortest  the points that a stretch takes with what followed it
+    around    (TAPS + 1 + HORIZON, n) places from the history's end, a column for each stretch: what is compared of it,
+              its end, what followed; the first is the newest stretch, which nothing has followed yet
+    """
+
+    __match_args__ = ("shortest", "around")
+
+    def __init__(self, delays: tuple[int, ...]) -> None:
+        self.shortest: Final = delays[-1] + 1 + HORIZON
+        rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
+        ends = np.arange(-1 - HORIZON, self.shortest - HORIZON - HISTORY - 2, -STRIDE)
+        self.around: Final[Array] = np.concatenate([np.minimum(rows - 1, -1), rows + ends], axis=1)
+
+
+RISE: Final = Embedding(RISE_DELAYS)
+BEAT: Final = Embedding(BEAT_DELAYS)
+
+
+@final
+class Guess(Value):
+    """What both embeddings, their mixture and the slope said that a point of the grid would be, N."""
+
+    def __init__(self, rise_N: float, beat_N: float, forecast_N: float, slope_N: float) -> None:
+        self.rise_N: Final = rise_N
+        self.beat_N: Final = beat_N
+        self.forecast_N: Final = forecast_N
+        self.slope_N: Final = slope_N
+
+
+NOTHING_SAID: Final[tuple[Guess | None, ...]] = (None,) * JUDGED
+UNJUDGED_SHORT: Final = Skill(0.0, 0.0)
+LOST: Final = Skill(-DOUBT_N * DOUBT_N, DOUBT_N * DOUBT_N)
+"The skill of late where nothing is like the newest stretch: what is forecast after that has to earn it again."
+
+
+@final
+class Forecast:
+    """Learns one stream of setpoints, and says how it goes on."""
+
+    stamp_s: float
+    "Of the newest setpoint."
+    force_N: float
+    time_s: float
+    "Of the newest point of the grid, not after the newest setpoint."
+    history: bytes
+    "The forces on the grid, float64: bytes do not change, and NumPy reads them where they are."
+    from_s: float
+    "The point of the grid that `changes_N` are from,"
+    changes_N: list[float]
+    "from there to itself and the points ahead; empty while nothing is forecast."
+    awaited: tuple[Guess | None, ...]
+    "What was said of the next points of the grid, to be judged by what comes."
+    long: Skill
+    "Skill over the slope, of LONG_S"
+    short: Skill
+    "and of SHORT_S."
+    rise_missed: float
+    "Mean square of what each embedding's forecast missed, N²."
+    beat_missed: float
+
+    def __init__(self) -> None:
+        self._begin(-math.inf, 0.0, -math.inf, b"")
+
+    @property
+    def trust(self) -> float:
+        """0..1: how far the forecast takes the place of the slope; half of what would have been best, and nothing where
+        nothing was gained."""
+        if not self.changes_N:
+            return 0.0
+        earned, lost = self.long.score, -self.short.score
+        return min(max(earned, 0.0), 1.0) * min(max(1.0 - lost, 0.0), 1.0)
+
+    def forget(self) -> None:
+        """Begins anew, with nothing learned."""
+        self._begin(-math.inf, 0.0, -math.inf, b"")
+
+    def update(self, stamp_s: float, force_N: float) -> None:
+        """Takes one setpoint more. What comes next is not looked for here, as something waits for this setpoint:
+        `foresee` does that afterwards.
+
+        Another force with the same stamp, or one from up to GRID_S before, takes the place of the first; a stamp from
+        longer before, or after MAX_STEP_S, begins anew.
+        """
+        if -GRID_S < stamp_s - self.stamp_s < 0.0:
+            stamp_s = self.stamp_s  # the clocks of publisher and daemon are read at slightly different times
+        spacing_s = stamp_s - self.stamp_s
+        if not 0.0 <= spacing_s <= MAX_STEP_S:
+            self._begin(stamp_s, force_N, stamp_s, array("d", [force_N]).tobytes())
+            return
+        count = int((stamp_s - self.time_s) / GRID_S)
+        if count > 0 and spacing_s > 0.0:
+            self._advance(stamp_s, force_N, count)
+        self.stamp_s, self.force_N = stamp_s, force_N
+
+    def foresee(self, slope_N_s: float) -> bool:
+        """Forecasts from the newest point of the grid, once for each, and notes what forecast and `slope_N_s`, which is
+        extrapolated otherwise, say, to be judged by. Whether there was something to do: it takes several times as long
+        as a plan."""
+        if self.from_s >= self.time_s or len(self.history) < _MIN_BYTES:
+            return False
+        history = np.frombuffer(self.history)
+        rise, rise_unlike = _search(history, RISE)
+        beat, beat_unlike = _search(history, BEAT)
+        changes: list[float] = []
+        said: Guess | None = None
+        if rise or beat:
+            # for one that finds nothing alike the other speaks
+            rise, beat = rise or beat, beat or rise
+            rise_weight = (self.rise_missed + rise_unlike) ** -2
+            share = rise_weight / (rise_weight + (self.beat_missed + beat_unlike) ** -2)
+            changes = [beat[place] + share * (rise[place] - beat[place]) for place in range(len(rise))]
+            said = self._guess(rise, beat, changes, slope_N_s)
+        else:
+            self.short = LOST
+        self.from_s, self.changes_N = self.time_s, changes
+        self.awaited = (*self.awaited[:-1], said)
+        return True
+
+    def forces_N(self, begins_s: float, after_s: list[float]) -> list[float]:
+        """The forces at these times (n) after `begins_s`, 0 or more, from the newest setpoint on; they stay where the
+        forecast ends. Only where `trust` is above 0."""
+        changes = self.changes_N
+        # the forecast starts at the newest setpoint, which may have come some steps after the point it is from
+        since_s = self.stamp_s - self.from_s
+        base_N = self.force_N - at_step(since_s / GRID_S, changes)
+        return [base_N + at_step((since_s + begins_s + later_s) / GRID_S, changes) for later_s in after_s]
+
+    def _begin(self, stamp_s: float, force_N: float, time_s: float, history: bytes) -> None:
+        self.stamp_s, self.force_N, self.time_s, self.history = stamp_s, force_N, time_s, history
+        self.from_s, self.changes_N, self.awaited = -math.inf, [], NOTHING_SAID
+        self.long, self.short = UNJUDGED, UNJUDGED_SHORT
+        self.rise_missed = self.beat_missed = DOUBT_N * DOUBT_N
+
+    def _advance(self, stamp_s: float, force_N: float, count: int) -> None:
+        """Goes `count` points of the grid on: what was said of them is judged by what came."""
+        spacing_s = stamp_s - self.stamp_s
+        times_s = [self.time_s + GRID_S * step for step in range(1, count + 1)]
+        shares = [(time_s - self.stamp_s) / spacing_s for time_s in times_s]
+        came_N = [self.force_N + share * (force_N - self.force_N) for share in shares]
+        self.history = (self.history + array("d", came_N).tobytes())[-_MAX_BYTES:]
+        self.time_s = times_s[-1]
+        for came, guess in zip(came_N, self.awaited):  # noqa: B905 as below
+            if guess is not None:
+                self._judge(guess, came)
+        self.awaited = (*self.awaited, *NOTHING_SAID)[min(count, JUDGED) :][:JUDGED]
+        # until the next forecast the last one serves, as far as it reaches
+        if stamp_s - self.from_s >= (HORIZON - 1) * GRID_S:
+            self.changes_N = []
+
+    def _judge(self, guess: Guess, came_N: float) -> None:
+        error_N, slope_error_N = guess.forecast_N - came_N, guess.slope_N - came_N
+        self.long = self.long.after(error_N, slope_error_N, _LONG_SHARE)
+        self.short = self.short.after(error_N, slope_error_N, _SHORT_SHARE)
+        rise_error_N, beat_error_N = guess.rise_N - came_N, guess.beat_N - came_N
+        self.rise_missed += _LONG_SHARE * (rise_error_N * rise_error_N - self.rise_missed)
+        self.beat_missed += _LONG_SHARE * (beat_error_N * beat_error_N - self.beat_missed)
+
+    def _guess(self, rise: list[float], beat: list[float], changes: list[float], slope_N_s: float) -> Guess:
+        since_s = self.stamp_s - self.time_s
+        return Guess(
+            _ahead_N(self.force_N, rise, since_s),
+            _ahead_N(self.force_N, beat, since_s),
+            _ahead_N(self.force_N, changes, since_s),
+            self.force_N + slope_N_s * (JUDGED * GRID_S - since_s),
+        )
+
+
+def _ahead_N(force_N: float, changes_N: list[float], since_s: float) -> float:
+    """JUDGED points ahead, along changes from a point `since_s` before the newest force."""
+    return force_N + changes_N[JUDGED] - changes_N[1] * since_s / GRID_S
+
+
+def _search(history: Array, embedding: Embedding) -> tuple[list[float], float]:
+    """The changes from the newest point of the grid to itself and the next HORIZON, empty where nothing is like it; and
+    how far the stretch most like the newest is from it: the mean square of a point, N², SAME_N's at least.
+
+    What followed a stretch is regressed on 1 and on how the stretch differs from the newest. The newest does not differ
+    from itself, so that the regression's constant is its forecast.
+    """
+    changes = history[embedding.around[:, : (len(history) - embedding.shortest) // STRIDE + 2]]
+    changes -= changes[TAPS]
+    before = changes[:TAPS]
+    before -= before[:, :1].copy()
+    apart = np.add.reduce(before * before) + TAPS * SAME_N**2
+    apart[0] = math.inf
+    weight = apart**-2
+    changes[TAPS] = 1.0
+    unlike = float(apart.min()) / TAPS
+    if unlike > UNLIKE_N * UNLIKE_N:
+        return [], unlike
+    return _constants((changes[: TAPS + 1] * weight @ changes.T).tolist()), unlike
+
+
+def _constants(rows: list[list[float]]) -> list[float]:
+    """The regression's constants, the first 0, by elimination of all else from its normal equations: weighted sums of
+    products, a row for each regressor, that of 1 the last; a column for each, and behind them for what followed."""
+    total = rows[TAPS][TAPS]
+    variance = 0.0
+    for place in range(TAPS):
+        variance += rows[place][place]
+    ridge = RIDGE / TAPS * variance + SAME_N**2 * total
+    for _ in range(TAPS):
+        pivot = rows[0]
+        left: list[list[float]] = []
+        for row in rows[1:]:
+            share = row[0] / (pivot[0] + ridge)
+            # rows are equally long, and only an unchecked zip is compiled to a plain loop
+            left.append([value - share * above for value, above in zip(row[1:], pivot[1:])])  # noqa: B905
+        rows = left
+    constant = rows[0]
+    if total > MAX_LEVERAGE * constant[0]:
+        return []
+    return [0.0, *[each / constant[0] for each in constant[1:]]]

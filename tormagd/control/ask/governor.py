@@ -1,0 +1,261 @@
+"""From the publisher's setpoint to the force that is asked of the device, now and ahead, with the reason for every
+difference.
+
+    now       the setpoint, within what the scene allows and the device gives
+    ahead     its preview; without one its slope, and the forecast as far as that is trusted
+    path      where what comes is known: the forces along the gap's path that misses least of them
+    decay     without a setpoint, or with one that is too old: to F_min at the scene's release rate
+    takeover  from one publisher's force to the next one's, at the same rate
+"""
+
+import math
+from typing import Final, final
+
+from tormagd.control.aim.portrait import Portrait
+from tormagd.control.ask.forecast import HORIZON_S, MAX_STEP_S, Forecast
+from tormagd.control.ask.path import PATH_S, TIMES_S, Path
+from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.filter import low_pass
+from tormagd.control.records import Ask, TimedSetpoint
+from tormagd.safety.codes import Limit
+from tormagd.scenes.scene import EVERY_TERM, Force, Terms
+
+SLOPE_FILTER_S: Final = 0.003
+AHEAD_S: Final = 0.05
+"Setpoints are carried forward along their slope, or past the end of their preview, by no more than this."
+MIN_TIMES: Final = 9
+"So many of TIMES_S are looked at even where a preview ends before, and of a forecast."
+_FORECAST_S: Final = TIMES_S[:MIN_TIMES]
+OUTRUN_N: Final = 0.02
+"Of what is known ahead no more is missed without a word: further from it, the carriages are too slow, which is RATE."
+
+Bounds = tuple[float, float]
+"The least and the greatest force that the scene allows and the device gives."
+
+
+@final
+class Governor:
+    """Follows the setpoints of one publisher after another."""
+
+    time_s: float
+    "Of the newest plan."
+    asked_N: float
+    "What it asked of the device,"
+    above_N: float
+    "and by how much that was above the least that the device then seemed to make."
+    stamp_s: float
+    "Of the setpoint that the force follows; -inf where it follows none."
+    slope_N_s: float
+    "Of the setpoints, filtered."
+    last_N: float
+    "The newest setpoint's force, within what the scene allows."
+    holder: int
+    "Whose setpoints it followed last."
+    is_passing: bool
+    "The force is on its way to those of a new holder."
+    sent_N: float | None
+    "Where the carriages were sent, as a force; None where it is not known what comes."
+    expected_N: float | None
+    "The force by now along the path of a preview, behind the carriages' lag."
+    forecast: Forecast
+
+    def __init__(
+        self, now_s: float, portrait: Portrait, force: Force, gap_speed_mm_s: float, terms: Terms = EVERY_TERM
+    ) -> None:
+        """`force` is the scene's."""
+        self._has_slope: Final = terms.slope
+        self._has_forecast: Final = terms.forecast
+        self._has_preview: Final = terms.preview
+        self._portrait: Final = portrait
+        self._path: Final = Path(portrait, gap_speed_mm_s)
+        self._gap_speed_mm_s: Final = gap_speed_mm_s
+        self._min_N: Final = force.least_N
+        self._max_N: Final = force.most_N
+        self._release_N_s: Final = force.release_N_s
+        self.forecast = Forecast()
+        self.begin(now_s)
+
+    def begin(self, now_s: float) -> None:
+        """Begins at `now_s` with the gap open and no publisher."""
+        self.time_s, self.asked_N, self.above_N = now_s, self._portrait.min_N, 0.0
+        self.holder, self.is_passing = 0, False
+        self._forget()
+
+    def update(self, now_s: float, setpoint: TimedSetpoint | None, device: DeviceFit, lag_s: float) -> Ask:
+        """What is asked at `now_s`. Of what is known ahead it looks up to `lag_s` further. The force is within what the
+        scene allows and `device` gives. It never jumps, and is never held for ever: see `decay` and `takeover`."""
+        lowest_N = max(device.force_N(self._portrait.min_N), 0.0)
+        dt_s = max(now_s - self.time_s, 0.0)
+        self.time_s = now_s
+        if setpoint is None:
+            return self._decay(dt_s, lowest_N, None, (Limit.NO_SETPOINT,))
+        age_s = now_s - setpoint.stamp_s
+        if age_s > setpoint.valid_for_s:
+            stale = (Limit.STALE, Limit.OTHER_SOURCE) if setpoint.is_contested else (Limit.STALE,)
+            return self._decay(dt_s, lowest_N, age_s, stale)
+        highest_N = max(device.force_N(self._portrait.max_N), 0.0)
+        # what comes is told from what is asked: the least that the device makes is learned, and so it varies
+        allowed_N = min(max(setpoint.force_N, self._min_N), self._max_N)
+        force_N, limits = _within_reach(setpoint.force_N, allowed_N, lowest_N, highest_N)
+        if setpoint.is_contested:
+            limits = (*limits, Limit.OTHER_SOURCE)
+        self._hear(setpoint, allowed_N, force_N, device)
+        bounds = min(max(self._min_N, lowest_N), highest_N), min(max(self._max_N, lowest_N), highest_N)
+        governed_N, foresight = force_N, 1.0
+        if setpoint.preview_N and self._has_preview:
+            path_N = self._previewed(setpoint, max(age_s, 0.0), dt_s, force_N, bounds, device, lag_s)
+            governed_N = min(max(self.expected_N, bounds[0]), bounds[1]) if self.expected_N is not None else force_N
+        else:
+            foresight = self._foreseen(setpoint.stamp_s, allowed_N, age_s)
+            path_N = self._continued(max(age_s, 0.0), dt_s, force_N, foresight, bounds, device, lag_s)
+        if abs(governed_N - force_N) > OUTRUN_N:
+            limits = (*limits, Limit.RATE)
+        if self.is_passing and self._passes(path_N[0], dt_s):
+            governed_N = self.asked_N + math.copysign(self._release_N_s * dt_s, path_N[0] - self.asked_N)
+            path_N, self.sent_N, self.expected_N = [governed_N] * len(PATH_S), None, None
+            limits, foresight = (*limits, Limit.TAKEOVER), 0.0
+        self.asked_N, self.above_N = path_N[0], max(path_N[0] - lowest_N, 0.0)
+        return Ask(governed_N, path_N, age_s, limits, foresight, is_meant=True)
+
+    def foresee(self) -> bool:
+        """Prepares a forecast for the next plans, where one is due, and tells whether: for the time between plans."""
+        return self._has_forecast and self.forecast.foresee(self.slope_N_s)
+
+    def _hear(self, setpoint: TimedSetpoint, allowed_N: float, force_N: float, device: DeviceFit) -> None:
+        """Takes the setpoint's slope, and whose it is."""
+        spacing_s = setpoint.stamp_s - self.stamp_s
+        if setpoint.holder != self.holder:  # another publisher's forces say nothing of this one's
+            self.holder, self.is_passing, self.slope_N_s = setpoint.holder, True, 0.0
+            self.forecast.forget()
+        elif spacing_s > MAX_STEP_S or not self._has_slope:
+            self.slope_N_s = 0.0
+        elif spacing_s > 0.0:
+            rate_N_s = device.scale * self._portrait.force_rate_N_s(device.model_N(force_N), self._gap_speed_mm_s)
+            slope_N_s = min(max((allowed_N - self.last_N) / spacing_s, -rate_N_s), rate_N_s)
+            self.slope_N_s = low_pass(self.slope_N_s, slope_N_s, spacing_s, SLOPE_FILTER_S)
+        self.stamp_s, self.last_N = setpoint.stamp_s, allowed_N
+
+    def _foreseen(self, stamp_s: float, allowed_N: float, age_s: float) -> float:
+        """How far the forecast is trusted after this setpoint."""
+        if not self._has_forecast:
+            return 0.0
+        self.forecast.update(stamp_s, allowed_N)
+        # one that has fallen silent for longer than a stream may is not believed to go on as it did
+        return self.forecast.trust if age_s <= MAX_STEP_S else 0.0
+
+    def _previewed(
+        self,
+        setpoint: TimedSetpoint,
+        soon_s: float,
+        dt_s: float,
+        force_N: float,
+        bounds: Bounds,
+        device: DeviceFit,
+        lag_s: float,
+    ) -> list[float]:
+        """The forces at PATH_S on the best path for a preview, from `soon_s` after its stamp on."""
+        if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
+            # what comes after its end is foreseen from there
+            self.slope_N_s = setpoint.preview_slope_N_s
+            last_N = min(max(setpoint.preview_N[-1], self._min_N), self._max_N)
+            self.forecast.update(setpoint.stamp_s + setpoint.preview_s, last_N)
+        else:
+            self.forecast.forget()
+        wanted_N = _wanted_N(setpoint, soon_s + lag_s, bounds, self.forecast)
+        from_N, sent_N = self._left_from(force_N)
+        path_N, self.sent_N = self._path.pursue(from_N, sent_N, dt_s, wanted_N, device, lag_s)
+        # the path sets out sooner by as much as the carriages come later
+        expected_N = from_N if self.is_passing or self.expected_N is None else self.expected_N
+        if dt_s > 0.0:
+            expected_N += dt_s / (lag_s + dt_s) * (path_N[0] - expected_N)
+        self.expected_N = expected_N
+        return [min(max(each_N, bounds[0]), bounds[1]) for each_N in path_N]
+
+    def _continued(
+        self,
+        soon_s: float,
+        dt_s: float,
+        force_N: float,
+        foresight: float,
+        bounds: Bounds,
+        device: DeviceFit,
+        lag_s: float,
+    ) -> list[float]:
+        """The forces at PATH_S along the slope of the setpoints, and so far as `foresight` goes as forecast."""
+        begins_s = soon_s + foresight * lag_s
+        times_s = _FORECAST_S if foresight > 0.0 else PATH_S
+        slope_N_s = self.slope_N_s
+        path_N = [self.last_N + slope_N_s * min(begins_s + after_s, AHEAD_S) for after_s in times_s]
+        if foresight > 0.0:
+            for place, forecast_N in enumerate(self.forecast.forces_N(begins_s, times_s)):
+                path_N[place] += foresight * (forecast_N - path_N[place])
+        path_N = [min(max(each_N, bounds[0]), bounds[1]) for each_N in path_N]
+        from_N, sent_N = self._left_from(force_N)
+        self.sent_N, self.expected_N = None, None
+        if foresight > 0.0 and not self.is_passing and self._path.is_near(sent_N, path_N[-1], device):
+            pursued_N, self.sent_N = self._path.pursue(from_N, sent_N, dt_s, path_N, device, lag_s)
+            for place, each_N in enumerate(pursued_N):
+                path_N[place] += foresight * (min(max(each_N, bounds[0]), bounds[1]) - path_N[place])
+        return path_N[: len(PATH_S)]
+
+    def _left_from(self, force_N: float) -> tuple[float, float]:
+        """The force at the last plan, and the one that the carriages were sent to then."""
+        # what a takeover passes to is what is asked, not what the gap can make of it
+        from_N = force_N if self.is_passing else self.asked_N
+        return from_N, from_N if self.is_passing or self.sent_N is None else self.sent_N
+
+    def _passes(self, to_N: float, dt_s: float) -> bool:
+        """Whether the force of a new holder is still further away than a takeover goes in `dt_s`."""
+        self.is_passing = abs(to_N - self.asked_N) > self._release_N_s * dt_s
+        return self.is_passing
+
+    def _decay(self, dt_s: float, lowest_N: float, age_s: float | None, limits: tuple[Limit, ...]) -> Ask:
+        # a device that is found to make less than was believed is not asked for more above its least than it was
+        above_N = max(min(self.above_N, self.asked_N - lowest_N) - self._release_N_s * dt_s, 0.0)
+        self.asked_N, self.above_N = lowest_N + above_N, above_N
+        self._forget()
+        return Ask(self.asked_N, [self.asked_N] * len(PATH_S), age_s, limits)
+
+    def _forget(self) -> None:
+        """No setpoint is followed."""
+        self.stamp_s, self.slope_N_s, self.last_N = -math.inf, 0.0, 0.0
+        self.sent_N, self.expected_N = None, None
+        self.forecast.forget()
+
+
+def _within_reach(
+    setpoint_N: float, allowed_N: float, lowest_N: float, highest_N: float
+) -> tuple[float, tuple[Limit, ...]]:
+    """Of the setpoint, what the scene allows of it and the device gives: never over the scene's greatest, unless the
+    open gap itself makes more."""
+    limits: tuple[Limit, ...] = () if allowed_N == setpoint_N else (Limit.RANGE,)
+    if allowed_N < lowest_N:
+        return lowest_N, (*limits, Limit.F_MIN)
+    if allowed_N > highest_N:
+        return highest_N, (*limits, Limit.F_MAX)
+    return allowed_N, limits
+
+
+def _wanted_N(setpoint: TimedSetpoint, begins_s: float, bounds: Bounds, forecast: Forecast) -> list[float]:
+    """The forces at TIMES_S from `begins_s`, 0 or more, after the stamp of a preview on: as many as it knows of, and at
+    least MIN_TIMES. Past its end a short preview goes on as it is forecast, as far as that is trusted, or else as it
+    has run so far; a long one has no end in sight."""
+    forces_N, spacing_s = setpoint.preview_N, setpoint.preview_dt_s
+    last, last_N = len(forces_N), forces_N[-1]
+    ends_s, mean_N_s, trust = setpoint.preview_s, setpoint.preview_slope_N_s, forecast.trust
+    known_s = ends_s + HORIZON_S if trust > 0.0 else ends_s
+    wanted_N: list[float] = []
+    for after_s in TIMES_S:
+        at_s = begins_s + after_s
+        if at_s >= ends_s:
+            if len(wanted_N) >= MIN_TIMES and at_s >= known_s:
+                break
+            force_N = last_N + mean_N_s * min(at_s - ends_s, AHEAD_S, ends_s)
+            if trust > 0.0:
+                force_N += trust * (forecast.forces_N(at_s - ends_s, [0.0])[0] - force_N)
+        else:
+            place = min(int(at_s / spacing_s), last - 1)
+            before_N = forces_N[place - 1] if place else setpoint.force_N
+            force_N = (forces_N[place] - before_N) / spacing_s * (at_s - spacing_s * place) + before_N
+        wanted_N.append(min(max(force_N, bounds[0]), bounds[1]))
+    return wanted_N

@@ -1,0 +1,233 @@
+"""From what is measured to what is believed of the device: the estimators of one device, and what each may learn from.
+
+A reading of the force teaches where the model knows the force: while friction is mobilised and the handle slides. It is
+compared with the model at the *measured* gap, so the model's error is learned and not the tracking error, and learning
+cannot fight the position loop. A sensor that is not believed teaches nothing, and what it has taught is forgotten.
+"""
+
+import math
+from typing import Final, final
+
+from firmware_protocol.value import Value
+from tormagd.config import Config
+from tormagd.control.believe.carriage_lag import CarriageLag
+from tormagd.control.believe.handle import HandleWatch
+from tormagd.control.believe.memory import ElementMemory
+from tormagd.control.believe.sensor import SensorTrust
+from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N, SensorZero
+from tormagd.control.believe.slow_friction import SLOWEST_MM_S, SlowFriction
+from tormagd.control.believe.strength import UNSEEN, DeviceFit, Strength
+from tormagd.control.nominal import Nominal
+from tormagd.control.records import Belief, Measured
+from tormagd.control.sight import unsensed_s
+from tormagd.model.displacement import MOVING_MM_S
+from tormagd.safety.codes import Limit
+from tormagd.scenes.scene import Terms
+
+MIN_DT_S: Final = 0.003
+MAX_DT_S: Final = 0.02
+"Readings teach at most this often; a gap in the readings counts as the second at most."
+CREEPING_MM_S: Final = 1.2 * MOVING_MM_S
+COMES_TO_REST: Final = 3.0
+"A handle that has slid no faster for some travel creeps; one that has slid so many times faster only comes to rest."
+MIN_EXPECTED_N: Final = 0.1
+"Of less force no share is told."
+UNTARED_N: Final = 0.15
+"A sensor that is off by more is worth a word: it is half an hour's drift."
+MIN_FORESIGHT: Final = 0.5
+"With less what is planned leaps, and no carriages are on time."
+
+
+@final
+class Learned(Value):
+    """What is known of a device from another day. `slow_factor` was learned at a creep by the share `slow_learned`."""
+
+    def __init__(
+        self,
+        device: DeviceFit = UNSEEN,
+        slow_factor: float = 1.0,
+        slow_learned: float = 0.0,
+        sensor_zero_N: float = 0.0,
+        lag_s: float = 0.0,
+    ) -> None:
+        self.device: Final = device
+        self.slow_factor: Final = slow_factor
+        self.slow_learned: Final = slow_learned
+        self.sensor_zero_N: Final = sensor_zero_N
+        self.lag_s: Final = lag_s
+
+
+NOTHING_LEARNED: Final = Learned()
+
+
+@final
+class Believe:
+    """The estimators of one device."""
+
+    memory: ElementMemory
+    handle: HandleWatch
+    strength: Strength
+    slow: SlowFriction
+    zero: SensorZero
+    sensor: SensorTrust
+    carriages: CarriageLag
+    learns: bool
+    "Whether anything is learned of device, creep and carriages."
+    read: int = -1
+    "Number of the newest measurement that taught,"
+    read_s: float
+    "and when."
+    limits: tuple[Limit, ...] = ()
+    "What is wrong with what the sensor shows."
+
+    def __init__(
+        self, config: Config, terms: Terms, nominal: Nominal, memory: ElementMemory, min_model_N: float
+    ) -> None:
+        """`min_model_N`: the model's force with the gap open."""
+        trim = config.trim
+        self._min_model_N: Final = min_model_N
+        self.memory, self.handle = memory, HandleWatch()
+        self.strength = Strength(trim.time_s, (trim.least, trim.most), (terms.scale, terms.offset))
+        self.slow, self.zero = SlowFriction(), SensorZero()
+        self.sensor, self.carriages = SensorTrust(), CarriageLag()
+        self._nominal: Final = nominal
+        self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)
+        self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
+        self.learns, self.read_s = terms.learning, -math.inf
+        self._has_lag: Final = terms.lag
+        self._has_creep: Final = terms.creep and nominal.slides
+        self._fits: Final = terms.scale or terms.offset
+
+    @property
+    def device(self) -> DeviceFit:
+        """The device's force over the model's without memory, as its element is relaxed now, at speed."""
+        return self.strength.fit.relaxed(self.memory.relaxed_N)
+
+    @property
+    def min_N(self) -> float:
+        """F_min of this device: what its open gap gives at speed."""
+        return self.device.force_N(self._min_model_N)
+
+    def learned(self) -> Learned:
+        """What is worth keeping of this device."""
+        slow = self.slow
+        return Learned(self.strength.fit, slow.factor, slow.learned, self.zero.zero_N, self.carriages.lag_s)
+
+    def teach(self, learned: Learned) -> None:
+        """Takes that for what is known of the device. The element's memory and the handle's watch stay."""
+        self.strength.forget(learned.device)
+        self.slow, self.zero = SlowFriction(), SensorZero()
+        self.sensor, self.carriages = SensorTrust(), CarriageLag()
+        self.slow.factor, self.slow.learned = learned.slow_factor, learned.slow_learned
+        self.zero.zero_N, self.carriages.lag_s = learned.sensor_zero_N, learned.lag_s
+        self.read, self.read_s, self.limits = -1, -math.inf, ()
+
+    def forget(self) -> None:
+        """Forgets the device, but not what its element has been through."""
+        self.teach(NOTHING_LEARNED)
+        self.handle = HandleWatch()
+
+    def update(self, now_s: float, measured: Measured | None) -> Belief:
+        """What is believed at `now_s`. `measured` is None while the device has said nothing."""
+        model_N: float | None = None
+        if measured is not None:
+            self.memory.update(now_s, measured)
+            if measured.is_homed:
+                model_N = self.memory.force_N(self._nominal.now(measured))
+                self._hear(now_s, measured, model_N)
+        return self._belief(measured, model_N)
+
+    def expect(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
+        """Learns how late the carriages are, once a plan is made `dt_s` after the last."""
+        if not (self.learns and self._has_lag):
+            return
+        if measured is None or not measured.is_homed or foresight < MIN_FORESIGHT:
+            self.carriages.update(dt_s, None, 0.0, 0.0, self._top_speed_mm_s)
+        else:
+            gap_mm, speed_mm_s = measured.gap_mm, measured.gap_speed_mm_s
+            self.carriages.update(dt_s, planned_mm, gap_mm, speed_mm_s, self._top_speed_mm_s)
+
+    def _belief(self, measured: Measured | None, model_N: float | None) -> Belief:
+        device = at_speed = self.device
+        if self._has_creep:
+            sliding_mm_s = MOVING_MM_S if measured is None else measured.handle.sliding_mm_s
+            device = at_speed.times(self.slow.factor_at(sliding_mm_s))
+        predicted_N: float | None = None
+        if measured is not None and model_N is not None and self._nominal.contact.is_known(measured):
+            slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
+            predicted_N = self.strength.fit.force_N(model_N) * slow
+        lag_s = self.carriages.lag_s if self._has_lag else 0.0
+        limits = (*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits
+        return Belief(device, at_speed, lag_s, self.memory.field_lag, predicted_N, limits, self.sensor.doubted_s)
+
+    def _hear(self, now_s: float, measured: Measured, model_N: float) -> None:
+        """Learns from the newest reading, where the model says `model_N`."""
+        if self._nominal.slides:
+            self.handle.update(measured.sensed_s, measured.handle_mm, measured.force_N, model_N)
+        if measured.number == self.read or now_s - self.read_s < MIN_DT_S:
+            return
+        if now_s - measured.sensed_s > self._unsensed_s:
+            return  # its force is an old one
+        dt_s = min(now_s - self.read_s, MAX_DT_S)
+        self.read, self.read_s = measured.number, now_s
+        rate_mm_s = abs(measured.handle.rate_mm_s)
+        is_mobilised = self._nominal.contact.is_known(measured)
+        is_slow = self._nominal.slides and (rate_mm_s < MOVING_MM_S or self.handle.moved_gap_at_rest(model_N))
+        if is_mobilised and not is_slow:
+            self._hear_at_speed(now_s, measured, model_N, dt_s)
+        else:
+            self._hear_at_creep(now_s, measured, model_N, dt_s, is_mobilised)
+
+    def _hear_at_creep(self, now_s: float, measured: Measured, model_N: float, dt_s: float, is_mobilised: bool) -> None:
+        self.strength.settle()
+        if not self._has_creep:
+            return
+        if self.sensor.is_doubted:
+            self.slow = SlowFriction()
+            return
+        self.slow.follow(model_N, measured.handle_mm)
+        handle = measured.handle
+        rate_mm_s = abs(handle.rate_mm_s)
+        is_creep = handle.sliding_mm_s < min(CREEPING_MM_S, COMES_TO_REST * rate_mm_s)
+        if not self.learns or not is_creep or not SLOWEST_MM_S < rate_mm_s < CREEPING_MM_S:
+            return
+        expected_N = self.strength.fit.force_N(self.slow.followed_N)
+        reading_N = measured.force_N - handle.turn.direction * self.zero.zero_N
+        # before it is mobilised friction is less than the model's; more is more all the same
+        is_lesson = self.zero.sd_N(now_s) <= UNKNOWN_SD_N and (is_mobilised or reading_N > expected_N)
+        if expected_N > MIN_EXPECTED_N and is_lesson:
+            self.slow.update(self.strength.fit, rate_mm_s, reading_N, dt_s)
+
+    def _hear_at_speed(self, now_s: float, measured: Measured, model_N: float, dt_s: float) -> None:
+        direction, rate_mm_s = measured.handle.turn.direction, abs(measured.handle.rate_mm_s)
+        zero, fit = self.zero, self.strength.fit
+        reading_N, zero_sd_N = measured.force_N - direction * zero.zero_N, zero.sd_N(now_s)
+        was_doubted, relaxed_N = self.sensor.is_doubted, self.memory.relaxed_N
+        # the sensor is judged by all that an elastomer may do, whatever this one is thought to remember
+        free_N, free_fit = model_N + relaxed_N, fit.relaxed(relaxed_N)
+        self.sensor.update(free_fit, free_N, rate_mm_s, reading_N, dt_s, direction, zero_sd_N)
+        if self.sensor.is_doubted and not was_doubted:
+            zero.doubt()
+        zero.update(now_s, direction, measured.force_N, model_N, rate_mm_s, dt_s, fit.scale, fit.scale_sd)
+        self.limits = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
+        if self.sensor.is_doubted:
+            self.strength.forget()
+            self.slow = SlowFriction()
+            self.limits = (Limit.SENSOR, *self.limits)
+        elif not zero_sd_N <= UNKNOWN_SD_N:
+            self.strength.settle()
+            self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)
+        else:
+            self._fit(measured, model_N, reading_N, dt_s)
+
+    def _fit(self, measured: Measured, model_N: float, reading_N: float, dt_s: float) -> None:
+        if self._has_creep:
+            self.slow.follow(model_N, measured.handle_mm)
+        if not (self.learns and self._fits):
+            return
+        before_N = self.strength.fit.force_N(model_N)
+        self.strength.update(model_N, reading_N, dt_s)
+        # what is known of a creep stays what it is while the rest is learned
+        self.slow.rescale(before_N, self.strength.fit.force_N(model_N))
+        if self.strength.is_held:
+            self.limits = (Limit.TRIM, *self.limits)

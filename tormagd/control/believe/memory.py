@@ -1,0 +1,112 @@
+"""What the element remembers: how much of its force has relaxed, and how far its field lags behind the gap's.
+
+    force    F = m(B - l) - r          m the model's force without memory, B the gap's field, l its lag, r what relaxed
+    lag      l goes to +-width over a change of field `turn` (FieldLag)
+    relaxed  r is what Prony series of two parts leave: of the force without field, and of what the field adds
+
+Both are followed from the measured gaps and expected of every device, so neither is learned. What has relaxed is the
+same for every field: a shift, and any search still finds the field.
+"""
+
+import math
+from typing import Final, final
+
+from tormagd.control.field_of_gap import FieldOfGap
+from tormagd.control.nominal import Nominal
+from tormagd.control.records import FieldLag, Measured
+from tormagd.model.force_curve import ForceCurve, within
+from tormagd.model.memory import Memory
+from tormagd.physics.relaxation import PronyState
+
+BEYOND_MM: Final = 2.0
+"Beyond the closed end, where a carriage may overrun, the model is asked no further."
+
+
+@final
+class ElementMemory:
+    """Follows one element. A brake has rested where its device was switched on, and relaxes of what a handle at the
+    roller's speed would feel; a pad was not touched, and relaxes of what presses it."""
+
+    field_mT: float = 0.0
+    "Of the newest gap."
+    lag_mT: float = 0.0
+    "How far the element's own is behind it."
+    free: PronyState = ()
+    "Branches of the force without field, N,"
+    added: PronyState = ()
+    "and of what the field adds."
+    relaxed_N: float = 0.0
+    time_s: float
+    "Before the first gap that means something: -inf."
+    opened_mm: float = 0.0
+    "Until then: by how much the gap has opened since the device was switched on."
+
+    def __init__(self, memory: Memory, nominal: Nominal, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> None:
+        """`gap_range_mm`: closed and open."""
+        self.time_s = -math.inf
+        self._free: Final = memory.free
+        self._added: Final = memory.added
+        self._width_mT: Final = memory.lag_mT
+        self._turn_mT: Final = memory.turn_mT
+        self._relaxes: Final = len(memory.fractions) > 0
+        self._nominal: Final = nominal
+        self._field: Final = field
+        self._closed_mm: Final = gap_range_mm[0]
+        self._open_mm: Final = gap_range_mm[1]
+        self._only_free_N: Final = self._free_N(nominal.only)
+
+    @property
+    def field_lag(self) -> FieldLag:
+        """How far the element's field is behind the gap's, now and at another gap."""
+        return FieldLag(self.field_mT, self.lag_mT, self._width_mT, self._turn_mT, self.time_s == -math.inf)
+
+    def force_N(self, curve: ForceCurve) -> float:
+        """What the model gives now, if the force without memory over the field is `curve`."""
+        return curve.force_N(within(self.field_mT - self.lag_mT, self._nominal.fields_mT)) - self.relaxed_N
+
+    def update(self, now_s: float, measured: Measured) -> None:
+        """Takes the newest gap."""
+        slides = self._nominal.slides
+        is_empty = self.time_s == -math.inf
+        if slides and not measured.is_homed:
+            # until both switches are found, positions count from where the carriages were, as if they were open
+            if is_empty:
+                self.opened_mm = max(measured.gap_mm - self._open_mm, self.opened_mm)
+            return
+        gap_mm = max(measured.gap_mm, self._closed_mm - BEYOND_MM) if measured.is_homed else self._open_mm
+        field_mT = self._field.field_mT(gap_mm)
+        curve = self._nominal.only if slides else self._nominal.now(measured)
+        free_N = self._only_free_N if slides else self._free_N(curve)
+        if is_empty and slides:
+            found_mm = gap_mm - self.opened_mm
+            is_known = self._closed_mm - BEYOND_MM <= found_mm <= self._open_mm + BEYOND_MM
+            rested_mT = self._field.field_mT(found_mm if is_known else gap_mm)
+            self._begin(rested_mT, free_N, self._added_N(curve, rested_mT, free_N), now_s)
+            self._follow(curve, free_N, rested_mT, now_s)
+        elif is_empty:
+            self._begin(field_mT, 0.0, 0.0, now_s)
+        self._follow(curve, free_N, field_mT, now_s)
+
+    def _begin(self, field_mT: float, free_N: float, added_N: float, now_s: float) -> None:
+        """After a long rest at that field and load."""
+        self.field_mT, self.lag_mT, self.relaxed_N, self.opened_mm, self.time_s = field_mT, 0.0, 0.0, 0.0, now_s
+        self.free, self.added = self._free.relaxed(free_N), self._added.relaxed(added_N)
+
+    def _follow(self, curve: ForceCurve, free_N: float, field_mT: float, now_s: float) -> None:
+        """The gap went straight to that field; `curve` is the force there without memory, `free_N` without field."""
+        self.lag_mT = self.field_lag.lag_at_mT(field_mT)
+        dt_s = max(now_s - self.time_s, 0.0)
+        self.field_mT, self.time_s = field_mT, now_s
+        if not self._relaxes:
+            return
+        added_N = self._added_N(curve, field_mT - self.lag_mT, free_N)
+        step = self._free.discretise(dt_s)
+        left_N, self.free = step.advance(self.free, free_N)
+        left_of_added_N, self.added = step.of(self._added.fractions).advance(self.added, added_N)
+        self.relaxed_N = free_N + added_N - left_N - left_of_added_N
+
+    def _free_N(self, curve: ForceCurve) -> float:
+        return curve.force_N(within(0.0, self._nominal.fields_mT))
+
+    def _added_N(self, curve: ForceCurve, field_mT: float, free_N: float) -> float:
+        return curve.force_N(within(field_mT, self._nominal.fields_mT)) - free_N

@@ -1,0 +1,92 @@
+"""How much more force a creeping handle meets than one at speed: static friction differs from device to device.
+
+    model    F = f(v) (s m + o)            f(v) = 1 + e(v) (k - 1),  e(v) = exp(-(v / STRIBECK_MM_S)^2)
+    error    1 + (F / (s m + o) - 1) / e(v) - k
+    update   k by that times e(v) dt / (LEARNED_S + dt)
+
+The factor k is learned while the handle slides slowly, and acts there only. It stays within what static friction
+differs from device to device and how uncertain the fit (s, o) is: of a device that was never seen at speed a creep
+shows nearly all.
+"""
+
+import math
+from typing import Final, final
+
+from tormagd.control.believe.strength import MAX_RELAXED, MAX_SCALE, MIN_SCALE, DeviceFit
+
+STRIBECK_MM_S: Final = 5.0
+"Handles of this speed have left most of static friction behind (plant card)."
+SLOWEST_MM_S: Final = 0.3
+"A slower handle may stand."
+REACH_MM: Final = 0.35
+"Over this travel friction follows a field that rises: 2.5 N bend the bristles so far before they slide."
+LEARNED_S: Final = 0.3
+MIN_STATIC: Final = 0.9
+MAX_STATIC: Final = 1.15
+"""Static over kinetic friction is 1.08 to 1.25, and 1.15 on the device of the model; and the speeds at which it fades
+differ."""
+MIN_FACTOR: Final = MIN_SCALE * MIN_STATIC
+MAX_FACTOR: Final = MAX_SCALE * MAX_STATIC
+"Of any device."
+BELIEVED_SD: Final = 3.0
+"""Standard deviations of the fit within which a creep is believed. Chosen on draws 0 to 39: with two, seven of them are
+held at this bound, for up to a hundredth of the time in which they creep at first."""
+MIN_SHARE: Final = MIN_SCALE * (1.0 - MAX_RELAXED)
+NOISE_N: Final = 0.03
+"A sensor that reads less than this share of the model's force, and its noise, teaches nothing: no device is so weak."
+
+
+@final
+class SlowFriction:
+    """Learns the factor k of one device."""
+
+    factor: float = 1.0
+    "k."
+    learned: float = 0.0
+    "Which share of the factor was learned at a creep, 0..1."
+    followed_N: float = 0.0
+    "The model's force as far as the bristles of the contact have followed it."
+    handle_mm: float = 0.0
+    "Where the handle was then."
+
+    def factor_at(self, rate_mm_s: float) -> float:
+        """The factor for a handle that slides at this rate, 0 or more: 1 at speed."""
+        return 1.0 + _slowness(rate_mm_s) * (self.factor - 1.0)
+
+    def follow(self, model_N: float, handle_mm: float) -> None:
+        """The handle went to `handle_mm`, where the model says `model_N`: bristles follow less force at once, and more
+        over REACH_MM of travel."""
+        rise_N = model_N - self.followed_N
+        if rise_N > 0.0:
+            rise_N *= 1.0 - math.exp(-abs(handle_mm - self.handle_mm) / REACH_MM)
+        self.followed_N += rise_N
+        self.handle_mm = handle_mm
+
+    def rescale(self, before_N: float, after_N: float) -> None:
+        """The fit now expects `after_N` where it expected `before_N`: the force at a creep stays what it was, as far as
+        that was learned at a creep."""
+        if before_N == after_N or self.learned == 0.0 or not (before_N > 0.0 and after_N > 0.0):
+            return
+        self.factor = min(max(self.factor * math.pow(before_N / after_N, self.learned), MIN_FACTOR), MAX_FACTOR)
+
+    def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
+        """Takes a reading along a motion at `rate_mm_s`. The fit gives more than nothing of what was followed."""
+        if reading_N < MIN_SHARE * self.followed_N - NOISE_N:
+            return
+        slowness = _slowness(rate_mm_s)
+        share = slowness * dt_s / (LEARNED_S + dt_s)
+        shown = 1.0 + (reading_N / fit.force_N(self.followed_N) - 1.0) / slowness
+        least, most = believable(fit, self.followed_N)
+        self.factor = min(max(self.factor + share * (shown - self.factor), least), most)
+        self.learned += share * (1.0 - self.learned)
+
+
+def believable(fit: DeviceFit, model_N: float) -> tuple[float, float]:
+    """The least and the greatest factor of a device with that fit, where the model says `model_N`."""
+    unsure = BELIEVED_SD * fit.deviation_N(model_N) / fit.force_N(model_N)
+    return max(MIN_STATIC - unsure, MIN_FACTOR), min(MAX_STATIC + unsure, MAX_FACTOR)
+
+
+def _slowness(rate_mm_s: float) -> float:
+    ratio = rate_mm_s / STRIBECK_MM_S
+    return math.exp(-ratio * ratio)

@@ -1,0 +1,6 @@
+"""A low-pass filter of first order."""
+
+
+def low_pass(value: float, towards: float, dt_s: float, time_s: float) -> float:
+    """`value` after `dt_s` >= 0 on its way to `towards`, with the time constant `time_s` > 0."""
+    return value + dt_s / (time_s + dt_s) * (towards - value)

@@ -1,0 +1,132 @@
+"""From a measurement to positions, speeds and the handle's motion; what of it is plausible, and how old it is."""
+
+from typing import Final, final
+
+from tormagd.control.filter import low_pass
+from tormagd.control.plausible import Leap, leap_between
+from tormagd.control.records import Handle, Measured
+from tormagd.control.sight import Sight
+from tormagd.hardware.measurement import Measurement
+from tormagd.model.displacement import MOVING_MM_S, Turn
+
+RATE_FILTER_S: Final = 0.05
+SLIDING_MM: Final = 0.3
+"Friction takes on the level of another rate over some such travel; without travel it does not change."
+FAST_MM_S: Final = 2.0 * MOVING_MM_S
+"From here on friction hardly depends on the rate: what Stribeck's part there is has faded."
+MIN_DT_S: Final = 5e-6
+"Half a step of the device's clock; positions over less time than that would give speeds without bound."
+
+
+@final
+class Measure:
+    """Follows one device's measurements."""
+
+    measured: Measured | None = None
+    "The newest; None while the device has said nothing."
+    sight: Sight
+    leap: Leap | None = None
+    "Of the encoders, until the device has said whether it was reset."
+
+    def __init__(
+        self, home_mm: float, derivative_filter_s: float, turns: bool, full_speed_mm_s: float, period_s: float
+    ) -> None:
+        """`home_mm`: a carriage's distance from the centre plane on its home switch. `turns` tells a handle from a
+        finger, whose force always pushes the same way. `full_speed_mm_s` is a carriage's, `period_s` a tick's."""
+        self.sight = Sight(period_s)
+        self._home_mm: Final = home_mm
+        self._derivative_filter_s: Final = derivative_filter_s
+        self._turns: Final = turns
+        self._full_speed_mm_s: Final = full_speed_mm_s
+
+    def update(self, last_s: float, now_s: float, measurement: Measurement, needs_homing: bool) -> Measured:
+        """Takes what is known at `now_s`, a tick after `last_s`: the newest measurement, or the last one again.
+        `needs_homing`: the device's word that it is homed does not count."""
+        last, seen_s = self.measured, self.sight.seen_s
+        is_new = last is None or measurement.number != last.number
+        self.sight.update(last_s, now_s, is_new)
+        measured = self.measured = self._measured(last, measurement)
+        if self.leap is not None:
+            # it was reset, which it says itself; or it was a burst on a line, and the counts are right again
+            is_over = needs_homing or not measurement.is_homed
+            if is_over or self.leap.has_come_back(measured, self._full_speed_mm_s, now_s):
+                self.leap = None
+        elif is_new and last is not None and last.is_homed and measurement.is_homed:
+            self.leap = leap_between(last, measured, self._full_speed_mm_s, now_s, seen_s)
+        return measured
+
+    def lose_position(self, measured: Measured) -> Measured:
+        """The same of a device whose carriages are nowhere known until it is homed again."""
+        self.measured = measured.replaced(is_homed=False) if measured.is_homed else measured
+        return self.measured
+
+    def lose_device(self) -> None:
+        """The device has gone."""
+        self.measured = None
+
+    def forget(self) -> None:
+        """Nothing has been measured."""
+        self.measured, self.leap = None, None
+        self.sight.forget()
+
+    def begin(self, measurement: Measurement) -> None:
+        """Begins with one measurement: everything at rest. What was learned about motion before it is void."""
+        self.measured = self._first(measurement)
+
+    def _first(self, measurement: Measurement) -> Measured:
+        return Measured(
+            number=measurement.number,
+            is_homed=measurement.is_homed,
+            device_time_s=measurement.device_time_s,
+            left_mm=self._home_mm + measurement.left_mm,
+            right_mm=self._home_mm + measurement.right_mm,
+            left_mm_s=0.0,
+            right_mm_s=0.0,
+            force_N=measurement.force_N,
+            handle=Handle(0.0, 0.0, Turn(1.0, measurement.handle_mm, measurement.handle_mm)),
+            handle_mm=measurement.handle_mm,
+            sensed_s=measurement.sensed_s,
+            handle_time_s=measurement.device_time_s,
+        )
+
+    def _measured(self, last: Measured | None, measurement: Measurement) -> Measured:
+        """The same one again where the device has said nothing new. Speeds are filtered derivatives over the *device's*
+        clock, so that late delivery is not mistaken for slow motion."""
+        if last is None:
+            return self._first(measurement)
+        dt_s = measurement.device_time_s - last.device_time_s
+        if measurement.number == last.number or dt_s < MIN_DT_S:
+            return last
+        left_mm, right_mm = self._home_mm + measurement.left_mm, self._home_mm + measurement.right_mm
+        # without news of the handle it has not stopped: its motion is judged over all the time since the last
+        handle, handle_time_s = last.handle, last.handle_time_s
+        if measurement.sensed_s != last.sensed_s:
+            handle = self._handle(last, measurement.handle_mm, measurement.device_time_s - handle_time_s)
+            handle_time_s = measurement.device_time_s
+        return Measured(
+            number=measurement.number,
+            is_homed=measurement.is_homed,
+            device_time_s=measurement.device_time_s,
+            left_mm=left_mm,
+            right_mm=right_mm,
+            left_mm_s=low_pass(last.left_mm_s, (left_mm - last.left_mm) / dt_s, dt_s, self._derivative_filter_s),
+            right_mm_s=low_pass(last.right_mm_s, (right_mm - last.right_mm) / dt_s, dt_s, self._derivative_filter_s),
+            force_N=measurement.force_N * handle.turn.direction,
+            handle=handle,
+            handle_mm=measurement.handle_mm,
+            sensed_s=measurement.sensed_s,
+            handle_time_s=handle_time_s,
+        )
+
+    def _handle(self, last: Measured, position_mm: float, dt_s: float) -> Handle:
+        before = last.handle
+        travel_mm = position_mm - last.handle_mm
+        rate_mm_s = low_pass(before.turn.direction * before.rate_mm_s, travel_mm / dt_s, dt_s, RATE_FILTER_S)
+        slid = abs(travel_mm) / (SLIDING_MM + abs(travel_mm))
+        # friction's level is one of 300 and 42 mm/s, and another of 4: how much faster it has been does not count
+        from_mm_s = min(before.sliding_mm_s, max(abs(rate_mm_s), FAST_MM_S))
+        sliding_mm_s = from_mm_s + slid * (abs(rate_mm_s) - from_mm_s)
+        if not self._turns:
+            return Handle(max(position_mm, 0.0), rate_mm_s, before.turn, sliding_mm_s)
+        turn = before.turn.moved_to(position_mm)
+        return Handle(turn.displacement_mm(position_mm), turn.direction * rate_mm_s, turn, sliding_mm_s)

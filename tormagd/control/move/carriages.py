@@ -1,0 +1,260 @@
+"""The carriages: a gap with its speed and acceleration in, two duties out. This is the seam to the actuator.
+
+target     where the plan leads by when a duty of now shows; a floor that acts ends the motion towards it
+reference  follows the target at the speed and acceleration of the motors
+expected   the reference behind the windings' lag
+duty       of each carriage: PID on expected minus measured, plus what speed, acceleration, friction and pull take
+"""
+
+import math
+from typing import Final, final
+
+from firmware_protocol.value import Value
+from tormagd.config import Config
+from tormagd.control.move.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s, pull_V
+from tormagd.control.move.pid import Pid
+from tormagd.control.move.reference import Expected, Reference, Speeds, follow
+from tormagd.control.records import Measured, Plan
+from tormagd.hardware.measurement import Measurement
+from tormagd.safety.codes import Limit
+from tormagd.scenes.scene import Scene, terms_of
+
+CARRY_S: Final = 0.012
+"A plan's gap is carried forward along its speed by no more than three inference periods."
+WEAK_MM: Final = 1.0
+"Carriages further behind than this have reached the top speed of motors that are weaker than they are believed to be."
+EXCHANGE_S: Final = 0.0015
+"From a duty to its effect as the encoders report it: a period in the exchange, half a period that it is held."
+COULOMB_SPEED_MM_S: Final = 0.5
+"Below this reference speed the friction feed-forward fades, so that a resting carriage is not pushed to and fro."
+RESTING_MM_S: Final = 0.02
+"A slower reference has arrived: it comes in exponentially, and what a second of it moves is a few encoder counts."
+MAX_ACCELERATION_SCALE: Final = 2.0
+"No more is asked of lively motors; the liveliest of the plant card do 2.4 times as much."
+SCALE_PER_MM_S: Final = 100.0
+"""For each mm that carriages are ahead of what is expected while they gain speed as fast as they are let, so much more
+is asked of them in a second of it: two or three beats of a pulse show what a device can."""
+LAGGING_MM: Final = 0.1
+"The speed limit is reported as RATE only where it leaves the reference this far behind its target."
+
+
+@final
+class Acted:
+    """In how many ticks each limit of the output has acted, in the order in which they stand.
+
+    Duties have no slew limit: the reference's acceleration bounds what is asked of the motors, their windings smooth
+    the rest within `motor.inductance`, and a limit in between would only take phase away from the position loop.
+    """
+
+    rate: int = 0
+    "The speed of the gap's reference,"
+    slew: int = 0
+    "its acceleration,"
+    not_finite: int = 0
+    "a number that was not finite,"
+    range: int = 0
+    "a duty out of its range."
+
+
+@final
+class Drive(Value):
+    """Duties as the device takes them, each within its limit; what limits them; and the motors' part of them, before
+    the device's own supply is allowed for."""
+
+    def __init__(
+        self, left_duty: float, right_duty: float, left_motor: float, right_motor: float, limits: list[Limit]
+    ) -> None:
+        self.left_duty: Final = left_duty
+        self.right_duty: Final = right_duty
+        self.left_motor: Final = left_motor
+        self.right_motor: Final = right_motor
+        self.limits: Final = limits
+
+
+@final
+class Carriages:
+    """Drives the two carriages of one device."""
+
+    reference: Reference | None = None
+    "Where the gap is driven; None while nothing is driven: it begins where the gap is."
+    expected: Expected
+    left: Pid
+    right: Pid
+    acceleration_scale: float = 1.0
+    """1..MAX_ACCELERATION_SCALE, of `position.gap_acceleration_mm_s2`: how fast the carriages have shown to gain speed.
+    Those whose motors are livelier than believed get ahead of what is expected. Of weaker ones no less is asked: they
+    would turn too late."""
+    acted: Acted
+
+    def __init__(self, config: Config, scene: Scene) -> None:
+        position, motor = config.position, config.motor
+        self.expected, self.acted = Expected(), Acted()
+        self.left, self.right = Pid(position), Pid(position)
+        self._duty_limit: Final = position.duty_limit
+        self._derivative_time_s: Final = position.derivative_time_s
+        self._derivative_filter_s: Final = position.derivative_filter_s
+        self._synchronisation: Final = position.synchronisation
+        self._gap_acceleration_mm_s2: Final = position.gap_acceleration_mm_s2
+        self._gap_speed_mm_s: Final = position.gap_speed_mm_s
+        self._closed_mm: Final = scene.insert.gap_closed_mm
+        self._open_mm: Final = scene.insert.gap_open_mm
+        self._pull_V: Final = motor.pull_V
+        self._supply_V: Final = motor.supply_V
+        self._full_speed_mm_s: Final = full_speed_mm_s(motor)
+        self._no_load_mm_s: Final = 2.0 * self._full_speed_mm_s
+        self._mechanical_time_s: Final = mechanical_time_s(motor)
+        self._lag_s: Final = electrical_time_s(motor) + EXCHANGE_S
+        self._gear_loss: Final = 1.0 - motor.gear_efficiency
+        self._coulomb: Final = motor.coulomb_V / motor.supply_V
+        self._has_motor: Final = terms_of(scene).motor
+
+    @property
+    def reference_mm(self) -> float:
+        """Where the gap is driven; nowhere while nothing is."""
+        return math.nan if self.reference is None else self.reference.gap_mm
+
+    def begin(self, gap_mm: float) -> None:
+        """Begins bumpless: from where the gap is, at rest, with empty integrators."""
+        self.reference = Reference(gap_mm)
+        self.expected.begin(gap_mm)
+        self.left.begin()
+        self.right.begin()
+
+    def resume(self, measured: Measured) -> None:
+        """The device went on with its last duty, unseen: the reference goes on from what came of it, without a leap."""
+        speed_mm_s = min(max(measured.gap_speed_mm_s, -self._no_load_mm_s), self._no_load_mm_s)
+        self.reference = Reference(measured.gap_mm, speed_mm_s)
+        self.expected.begin(measured.gap_mm, speed_mm_s)
+
+    def stop(self) -> None:
+        """Nothing is driven."""
+        self.reference = None
+
+    def lose_device(self) -> None:
+        """Another device may come."""
+        self.acceleration_scale = 1.0
+
+    def forget(self) -> None:
+        """Nothing is driven, or known of the motors."""
+        self.begin(0.0)
+        self.stop()
+        self.lose_device()
+        self.acted.not_finite += 1
+
+    def update(
+        self,
+        now_s: float,
+        dt_s: float,
+        plan: Plan | None,
+        measurement: Measurement,
+        measured: Measured,
+        is_over: bool,
+    ) -> Drive:
+        """One tick, `dt_s` > 0 after the last. Without a `plan` the gap is held; it opens while the force `is_over`
+        what it may be."""
+        if self.reference is None:
+            self.reference = Reference(measured.gap_mm)
+            self.expected.begin(measured.gap_mm)
+        self.expected.update(self.reference, dt_s, self._lag_s, self._derivative_filter_s)
+        # a homed carriage that is found beyond the closed end has to come back from there
+        pull = 0.0
+        if self._has_motor:
+            pull = pull_V(self._pull_V, max(self.reference.gap_mm, self._closed_mm)) / self._supply_V
+        limits: list[Limit] = []
+        is_slewed = self._follow(now_s, dt_s, plan, self._speeds(pull, measured), is_over, limits)
+        reference = self.reference
+        # either also takes half of the skew, so that the faster waits for the slower
+        skew_mm = self._synchronisation * measured.skew_mm / 2.0
+        half_mm, half_mm_s = self.expected.gap_mm / 2.0, self.expected.filtered_mm_s / 2.0
+        left_mm, right_mm = half_mm - measured.left_mm - skew_mm, half_mm - measured.right_mm + skew_mm
+        left_mm_s, right_mm_s = half_mm_s - measured.left_mm_s, half_mm_s - measured.right_mm_s
+        if is_slewed:
+            self._learn_acceleration(reference, left_mm + right_mm, left_mm_s + right_mm_s, dt_s)
+        ahead = self._feed_forward(reference, pull)
+        if abs(reference.speed_mm_s) < RESTING_MM_S:
+            self.left.rest(left_mm, dt_s)
+            self.right.rest(right_mm, dt_s)
+        # the firmware gives a carriage at its open switch no opening duty: nothing may be learned or concluded there
+        left = self.left.update(left_mm, left_mm_s, ahead, dt_s, measurement.is_left_open)
+        right = self.right.update(right_mm, right_mm_s, ahead, dt_s, measurement.is_right_open)
+        return self._drive(left, right, measurement.supply_V, limits)
+
+    def _follow(
+        self, now_s: float, dt_s: float, plan: Plan | None, speeds: Speeds, is_over: bool, limits: list[Limit]
+    ) -> bool:
+        """Moves the reference on, and says whether the limit of its acceleration held it back."""
+        reference = self.reference
+        assert reference is not None, "it begins with the first tick"
+        floor_mm, target = self._closed_mm, Reference(reference.gap_mm)
+        if plan is not None:
+            floor_mm = max(floor_mm, plan.min_gap_mm)
+            target = self._target(plan, now_s, floor_mm)
+            if is_over:
+                target = Reference(self._open_mm)
+                limits.append(Limit.OVER_FORCE)
+        max_mm_s2 = self.acceleration_scale * self._gap_acceleration_mm_s2
+        reference, is_limited, is_slewed = follow(max_mm_s2, reference, target, dt_s, speeds, floor_mm)
+        if plan is not None and is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
+            limits.append(Limit.RATE)
+        self.reference = reference
+        self.acted.rate += is_limited
+        self.acted.slew += is_slewed
+        return is_slewed
+
+    def _target(self, plan: Plan, now_s: float, floor_mm: float) -> Reference:
+        """Where the plan leads by when a duty of now shows. The least gap, `floor_mm`, or the greatest, where it acts,
+        also ends the motion towards it."""
+        age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + self._lag_s
+        gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
+        speed_mm_s = plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2
+        acceleration_mm_s2 = plan.gap_acceleration_mm_s2
+        if gap_mm < floor_mm:
+            gap_mm, speed_mm_s, acceleration_mm_s2 = floor_mm, max(speed_mm_s, 0.0), max(acceleration_mm_s2, 0.0)
+        if gap_mm > self._open_mm:
+            gap_mm, speed_mm_s, acceleration_mm_s2 = self._open_mm, min(speed_mm_s, 0.0), min(acceleration_mm_s2, 0.0)
+        return Reference(gap_mm, speed_mm_s, acceleration_mm_s2)
+
+    def _speeds(self, pull: float, measured: Measured) -> Speeds:
+        """The motors' and the configured one, or what the carriages show where they fall behind; not below half, so
+        that carriages that are held still are found out by their following error."""
+        motors_mm_s = self._no_load_mm_s
+        if abs(self.expected.gap_mm - measured.gap_mm) > WEAK_MM:
+            motors_mm_s = min(max(abs(measured.gap_speed_mm_s), motors_mm_s / 2.0), motors_mm_s)
+        closing_mm_s = min(motors_mm_s, self._gap_speed_mm_s)
+        # the magnets' pull helps to close, but a reserve is worth more there than a little speed
+        opening_mm_s = self._no_load_mm_s * (self._duty_limit - self._coulomb - pull)
+        return Speeds(motors_mm_s, min(closing_mm_s, opening_mm_s), closing_mm_s)
+
+    def _learn_acceleration(self, reference: Reference, error_mm: float, error_mm_s: float, dt_s: float) -> None:
+        """After a period in which the limit of its acceleration held the reference back; the errors are the gap's."""
+        if reference.acceleration_mm_s2 * reference.speed_mm_s <= 0.0:
+            return
+        # a carriage that did not get as far as it should is not ahead because it need not come back as far
+        behind_mm = error_mm + self._derivative_time_s * error_mm_s
+        ahead_mm = -math.copysign(1.0, reference.speed_mm_s) * behind_mm
+        scale = self.acceleration_scale + SCALE_PER_MM_S * ahead_mm * dt_s
+        self.acceleration_scale = min(max(scale, 1.0), MAX_ACCELERATION_SCALE)
+
+    def _feed_forward(self, reference: Reference, pull: float) -> float:
+        """The duty that the reference's speed and acceleration take, with friction and the magnets' `pull`, a duty."""
+        if not self._has_motor:
+            return 0.0
+        speed, acceleration = reference.speed_mm_s / 2.0, reference.acceleration_mm_s2 / 2.0
+        moving = min(max(speed / COULOMB_SPEED_MM_S, -1.0), 1.0)
+        # to close, the pull helps a fifth as much: the screw's friction eats the rest
+        resisting = self._coulomb + (pull if moving > 0.0 else 0.0)
+        # what the gears lose has to be added to speed up, and helps to brake
+        loss = math.copysign(self._gear_loss, acceleration * speed)
+        inertia = acceleration * self._mechanical_time_s / (1.0 - loss)
+        return (speed + inertia) / self._full_speed_mm_s + resisting * moving
+
+    def _drive(self, left: float, right: float, supply_V: float, limits: list[Limit]) -> Drive:
+        """The bridges switch the device's real supply: the same volts take less duty of a higher one."""
+        is_saturated = self.left.is_saturated or self.right.is_saturated
+        if is_saturated:
+            limits.append(Limit.SATURATED)
+        scale, limit = self._supply_V / max(supply_V, 0.5 * self._supply_V), self._duty_limit
+        left_duty, right_duty = left * scale, right * scale
+        self.acted.range += is_saturated or max(abs(left_duty), abs(right_duty)) > limit
+        left_duty, right_duty = min(max(left_duty, -limit), limit), min(max(right_duty, -limit), limit)
+        return Drive(left_duty, right_duty, left, right, limits)

@@ -1,0 +1,119 @@
+"""The device's homing, watched from here: it opens, it finds both switches, it ends, and the force stays what it was.
+
+Homing is the firmware's own routine, and a motor that is wired the wrong way presses shut while it believes to open.
+"""
+
+from typing import Final, final
+
+from firmware_protocol.codec import DeviceMode, Switches
+from tormagd.hardware.measurement import Measurement
+from tormagd.safety.codes import Fault
+
+LONGEST_S: Final = 12.0
+"The slowest homing from a closed gap takes under 10 s."
+BACKS_OFF_MM: Final = 3.0
+"A carriage that goes further towards closed than a firmware backs off from a switch goes the wrong way,"
+WENT_BACK_MM: Final = 0.5
+"and one whose homing failed has gone there by this."
+ZEROED_MM: Final = 1.0
+"No carriage moves so far between two looks: the device has set its zero."
+STATUS_S: Final = 0.1
+"Status says that the device homes still; it comes every 20 ms."
+OVER_S: Final = 0.04
+RISES: Final = 1.25
+"An opening gap brakes less and less; what the sensor shows may be this many times what it showed when homing began."
+
+_HOMING: Final = DeviceMode.HOMING
+_BOTH_OPEN: Final = int(Switches.LEFT_OPEN) | int(Switches.RIGHT_OPEN)
+_NOTHING: Final[tuple[Fault, ...]] = ()
+
+
+@final
+class Homing:
+    """Watches one homing after another."""
+
+    is_running: bool = False
+    began_s: float = 0.0
+    time_s: float = 0.0
+    "Of the newest look."
+    left_mm: float = 0.0
+    "How far open the carriages have been,"
+    right_mm: float = 0.0
+    left_at_mm: float = 0.0
+    "and where they are."
+    right_at_mm: float = 0.0
+    switches: int = 0
+    "Which open switches were seen closed."
+    max_N: float = 0.0
+    "What the force sensor may show,"
+    over_s: float = 0.0
+    "and for how long it has shown more."
+    faults: tuple[Fault, ...] = _NOTHING
+    "What was wrong at the newest look; told once."
+
+    def __init__(self, ceiling_N: float) -> None:
+        """`ceiling_N` is what the force sensor may show at any time."""
+        self._ceiling_N: Final = ceiling_N
+
+    @property
+    def went_back_mm(self) -> tuple[float, float]:
+        """How far left and right carriage have come back towards closed from where they were most open."""
+        return self.left_mm - self.left_at_mm, self.right_mm - self.right_at_mm
+
+    def __str__(self) -> str:
+        left_mm, right_mm = self.went_back_mm
+        missing = Switches(_BOTH_OPEN & ~self.switches)
+        names = " and ".join([str(bit.name) for bit in Switches if bit in missing])
+        never = f", never closed: {names}" if names else ""
+        return (
+            f"after {self.time_s - self.began_s:.1f} s of homing, left {left_mm:.1f} mm and right {right_mm:.1f} mm "
+            f"back towards closed{never}"
+        )
+
+    def update(self, now_s: float, measurement: Measurement) -> None:
+        """Takes one more look at the device."""
+        self.faults = _NOTHING
+        if measurement.mode is not _HOMING:
+            if self.is_running:
+                self._end(now_s, measurement)
+        elif not self.is_running:
+            self._begin(now_s, measurement)
+        else:
+            self._follow(now_s, measurement)
+
+    def _begin(self, now_s: float, measurement: Measurement) -> None:
+        self.is_running, self.began_s, self.time_s, self.over_s = True, now_s, now_s, 0.0
+        self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
+        self.left_at_mm, self.right_at_mm = measurement.left_mm, measurement.right_mm
+        self.switches = int(measurement.switches) & _BOTH_OPEN
+        self.max_N = max(self._ceiling_N, RISES * abs(measurement.force_N))
+
+    def _follow(self, now_s: float, measurement: Measurement) -> None:
+        self.left_mm = _outermost_mm(self.left_mm, self.left_at_mm, measurement.left_mm)
+        self.right_mm = _outermost_mm(self.right_mm, self.right_at_mm, measurement.right_mm)
+        self.left_at_mm, self.right_at_mm = measurement.left_mm, measurement.right_mm
+        self.switches |= int(measurement.switches) & _BOTH_OPEN
+        self.over_s = self.over_s + (now_s - self.time_s) if abs(measurement.force_N) > self.max_N else 0.0
+        self.time_s = now_s
+        if max(self.went_back_mm) > BACKS_OFF_MM:
+            self.faults = (Fault.WRONG_DIRECTION,)
+        elif now_s - self.began_s > LONGEST_S:
+            self.faults = (Fault.HOMING,)
+        elif self.over_s > OVER_S:
+            self.faults = (Fault.OVER_FORCE,)
+        elif now_s - measurement.reported_s > STATUS_S:
+            self.faults = (Fault.STATUS_STALE,)
+
+    def _end(self, now_s: float, measurement: Measurement) -> None:
+        """Homed, or given up by the device, or ended by a request to open."""
+        self.is_running, self.time_s = False, now_s
+        self.switches |= int(measurement.switches) & _BOTH_OPEN
+        if measurement.is_homed:
+            if self.switches != _BOTH_OPEN:
+                self.faults = (Fault.HOMING,)
+        elif measurement.is_latched and max(self.went_back_mm) > WENT_BACK_MM:
+            self.faults = (Fault.WRONG_DIRECTION,)
+
+
+def _outermost_mm(outermost_mm: float, last_mm: float, now_mm: float) -> float:
+    return now_mm if abs(now_mm - last_mm) > ZEROED_MM else max(outermost_mm, now_mm)

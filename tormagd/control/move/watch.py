@@ -1,0 +1,239 @@
+"""What shows that something is wrong: with the device, the positions, the link, the force or the motion."""
+
+import math
+from typing import Final, final
+
+from firmware_protocol.codec import DeviceMode
+from tormagd.config import Config
+from tormagd.control.believe.strength import SCALE_SD
+from tormagd.control.move.motor import delay_margin_s
+from tormagd.control.plausible import Leap, is_outside
+from tormagd.control.records import Measured
+from tormagd.control.sight import Sight, unsensed_s
+from tormagd.hardware.measurement import Measurement
+from tormagd.safety.codes import Fault, Limit, device_faults
+from tormagd.safety.operating_state import Conditions, SafetyState
+from tormagd.scenes.scene import Scene
+
+STARTING_S: Final = 0.15
+"After enabling, the device may take this long to report that it runs."
+STILL_MM_S: Final = 0.5
+"Slower than this a carriage does not move: half an encoder count a millisecond and filtered."
+STARTS_OVER: Final = 1.25
+"Static over kinetic friction at most: a start from rest may take so many times the greatest force."
+OVER_N: Final = 0.1
+"What the sensor may be off besides."
+OVER_HELD_S: Final = 0.01
+OVER_FAULT_S: Final = 0.04
+"A force over the ceiling opens the gap after the first, and is a fault after the second."
+SENSOR_FAULT_S: Final = 2.0
+"A sensor that has not been believed for so long of sliding is a fault: forces are then only as good as the model."
+SENSE_FAULT_S: Final = 0.1
+STATUS_FAULT_S: Final = 0.1
+"Without a Sense, and without a Status, for so long: Status comes every 20 ms, Sense with every State."
+OPPOSED_S: Final = 0.1
+"A carriage that moves against its duty for so long does not brake: it brakes from full speed within 0.06 s."
+WENT_AGAINST_S: Final = 0.015
+"Carriages that come apart, or to a stop, after one of them has gone against its duty for so long do so for that."
+SLOW_SHARE: Final = 0.4
+TOO_SLOW_SHARE: Final = 0.8
+"""Of the delay that the position loop bears besides its own period: from the first on a round trip is a limit, from the
+second on a fault, and no enabling: carriages swing from about the whole on."""
+CLOCK_OFF: Final = 0.01
+CLOCK_FAULT: Final = 0.1
+"A clock that is off by a greater share is a limit, and a fault."
+STALL_SHARE: Final = 0.8
+"Of the device's timeout: a shorter stall of ours did not make it run out."
+
+_DEVICE_RUN: Final = DeviceMode.RUN
+
+
+def ceiling_N(scene: Scene) -> float:
+    """What the force sensor may show in a scene."""
+    return STARTS_OVER * scene.force.most_N + OVER_N
+
+
+@final
+class Watch:
+    """Watches one device. Times are counted in periods: a process that stood still saw nothing."""
+
+    enabled_s: float = math.inf
+    straying_s: float = 0.0
+    "For how long the gap has been too far from its reference."
+    still_s: float = 0.0
+    "For how long a carriage has been driven without moving."
+    opposed_s: float = 0.0
+    "For how long a carriage has moved against its duty."
+    over_s: float = 0.0
+    "For how long the measured force has been over the ceiling while the handle moved."
+    left_duty: float = 0.0
+    right_duty: float = 0.0
+    "Of the step before."
+
+    def __init__(self, config: Config, scene: Scene) -> None:
+        limits, device, period_s = config.limits, config.device, 1.0 / config.rates.control_hz
+        bears_s = delay_margin_s(config.motor, config.position, period_s)
+        self._max_apart_mm: Final = limits.skew_fault_mm
+        self._max_round_trip_s: Final = period_s + TOO_SLOW_SHARE * bears_s
+        self._slow_s: Final = period_s + SLOW_SHARE * bears_s
+        self._period_s: Final = period_s
+        self._unsensed_s: Final = unsensed_s(period_s)
+        self._skew_warning_mm: Final = limits.skew_warning_mm
+        self._following_error_mm: Final = limits.following_error_mm
+        self._following_time_s: Final = limits.following_time_s
+        self._no_motion_duty: Final = limits.no_motion_duty
+        self._no_motion_time_s: Final = limits.no_motion_time_s
+        self._measurement_timeout_s: Final = device.measurement_timeout_ms * 1e-3
+        self._longest_own_stall_s: Final = STALL_SHARE * device.command_timeout_ms * 1e-3
+        self._closed_mm: Final = scene.insert.gap_closed_mm
+        self._open_mm: Final = scene.insert.gap_open_mm
+        self._slides: Final = scene.element == "torque"
+        # devices not yet seen differ by SCALE_SD: a scene that tolerates that does without the sensor
+        self._needs_sensor: Final = scene.force.tolerance_rms_N < SCALE_SD * scene.force.most_N
+        self._ceiling_N: Final = ceiling_N(scene)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the force has been over the ceiling for so long that the gap opens."""
+        return self.over_s > OVER_HELD_S
+
+    def known(self, conditions: Conditions, measured: Measured | None) -> Conditions:
+        """The conditions of a command, with what is watched here."""
+        return conditions.replaced(
+            fresh=conditions.fresh and measured is not None,
+            apart_mm=math.inf if measured is None else abs(measured.skew_mm),
+            most_apart_mm=self._max_apart_mm,
+            most_round_trip_s=self._max_round_trip_s,
+            most_clock_drift=CLOCK_FAULT,
+        )
+
+    def begin(self, enabled_s: float) -> None:
+        """Nothing has been seen since `enabled_s`."""
+        self.enabled_s = enabled_s
+        self.straying_s = self.still_s = self.opposed_s = self.over_s = 0.0
+
+    def faults(
+        self,
+        now_s: float,
+        safety: SafetyState,
+        measurement: Measurement,
+        measured: Measured,
+        sight: Sight,
+        leap: Leap | None,
+        sensor_doubted_s: float,
+    ) -> tuple[Fault, ...]:
+        """All that show now; `latch` names them in the order of their table."""
+        faults = self._of_device(now_s, safety, measurement, sight)
+        if leap is not None:
+            if measurement.reported_s > leap.seen_s:  # so it was not reset in between
+                faults.append(Fault.ENCODER)
+        elif measured.is_homed and not safety.needs_homing:
+            # switches come with Status: without a State, positions are older than they are
+            is_left_open = not sight.is_blind and measurement.is_left_open
+            is_right_open = not sight.is_blind and measurement.is_right_open
+            if is_outside(measured, self._closed_mm, self._open_mm, is_left_open, is_right_open):
+                faults.append(Fault.OUT_OF_STROKE)
+        if safety.is_driven:
+            faults += self._of_link(now_s, measurement, sight)
+            if leap is None:  # what follows from positions says nothing then
+                faults += self._of_motion(measured, sensor_doubted_s)
+                if measurement.mode is not _DEVICE_RUN and not faults and now_s - self.enabled_s > STARTING_S:
+                    faults.append(Fault.DEVICE_NOT_RUNNING)
+        return tuple(faults)
+
+    def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> list[Limit]:
+        """What is not as it should be, and no fault."""
+        limits: list[Limit] = []
+        if abs(measured.skew_mm) > self._skew_warning_mm:
+            limits.append(Limit.SKEW)
+        if sight.has_stalled(now_s):
+            limits.append(Limit.HOST_STALL)
+        if now_s - measurement.sensed_s > self._unsensed_s:
+            limits.append(Limit.SENSE_STALE)
+        link = measurement.link
+        if link.is_lossy or link.round_trip_s > self._slow_s:
+            limits.append(Limit.LINK_DEGRADED)
+        if abs(link.clock_drift) > CLOCK_OFF:
+            limits.append(Limit.CLOCK)
+        return limits
+
+    def update(self, dt_s: float, measured: Measured, reference_mm: float, left_duty: float, right_duty: float) -> None:
+        """Takes a tick in which the carriages were driven with these duties, towards the gap `reference_mm`."""
+        is_astray = abs(reference_mm - measured.gap_mm) > self._following_error_mm
+        self.straying_s = self.straying_s + dt_s if is_astray else 0.0
+        is_felt = not self._slides or abs(measured.handle.rate_mm_s) > STILL_MM_S
+        self.over_s = self.over_s + dt_s if measured.force_N > self._ceiling_N and is_felt else 0.0
+        self.still_s = self.still_s + dt_s if self._is_still(measured, left_duty, right_duty) else 0.0
+        self._judge_direction(dt_s, measured, left_duty, right_duty)
+        self.left_duty, self.right_duty = left_duty, right_duty
+
+    def rest(self) -> None:
+        """Takes a tick without duties."""
+        self.left_duty = self.right_duty = 0.0
+
+    def _of_device(self, now_s: float, safety: SafetyState, measurement: Measurement, sight: Sight) -> list[Fault]:
+        shown: int = measurement.faults
+        if not shown or now_s < safety.clearing_until_s:
+            return []
+        is_ours = Fault.HOST_STALL in safety.faults or (
+            sight.has_stalled(now_s) and sight.stall_s > self._longest_own_stall_s
+        )
+        return list(device_faults(measurement.faults, is_host_stall=is_ours))
+
+    def _of_link(self, now_s: float, measurement: Measurement, sight: Sight) -> list[Fault]:
+        faults: list[Fault] = []
+        # the tick that is nearest to a time's end judges it: the next one would be a period late
+        at_s = now_s + self._period_s / 2.0
+        if not sight.is_waiting(now_s):
+            # what has just come over a slow line is old too, and a loop around it would swing
+            if at_s - measurement.received_s + measurement.delay_s > self._measurement_timeout_s:
+                faults.append(Fault.MEASUREMENT_STALE)
+            if self._needs_sensor and at_s - measurement.sensed_s > SENSE_FAULT_S:
+                faults.append(Fault.SENSE_STALE)
+            if at_s - measurement.reported_s > STATUS_FAULT_S:
+                faults.append(Fault.STATUS_STALE)
+        if measurement.link.round_trip_s > self._max_round_trip_s:
+            faults.append(Fault.LINK_DEGRADED)
+        if abs(measurement.link.clock_drift) > CLOCK_FAULT:
+            faults.append(Fault.CLOCK)
+        return faults
+
+    def _of_motion(self, measured: Measured, sensor_doubted_s: float) -> list[Fault]:
+        faults: list[Fault] = []
+        is_skewed = abs(measured.skew_mm) > self._max_apart_mm
+        is_still = self.still_s > self._no_motion_time_s
+        if self.opposed_s > (WENT_AGAINST_S if is_skewed or is_still else OPPOSED_S):
+            faults.append(Fault.WRONG_DIRECTION)
+        if is_skewed:
+            faults.append(Fault.SKEW)
+        if self.straying_s > self._following_time_s:
+            faults.append(Fault.FOLLOWING_ERROR)
+        if self.over_s > OVER_FAULT_S and self._slides:  # of a pad it is the finger that presses so hard
+            faults.append(Fault.OVER_FORCE)
+        if self._needs_sensor and sensor_doubted_s > SENSOR_FAULT_S:
+            faults.append(Fault.SENSOR)
+        if is_still:
+            faults.append(Fault.NO_MOTION)
+        return faults
+
+    def _is_still(self, measured: Measured, left_duty: float, right_duty: float) -> bool:
+        """Whether a carriage that is driven stands."""
+        # a duty that turns round before the carriage could move drives it nowhere
+        is_left_driven = left_duty * math.copysign(1.0, self.left_duty) > self._no_motion_duty
+        is_right_driven = right_duty * math.copysign(1.0, self.right_duty) > self._no_motion_duty
+        is_left_still = is_left_driven and abs(measured.left_mm_s) < STILL_MM_S
+        is_right_still = is_right_driven and abs(measured.right_mm_s) < STILL_MM_S
+        return is_left_still or is_right_still
+
+    def _judge_direction(self, dt_s: float, measured: Measured, left_duty: float, right_duty: float) -> None:
+        """A carriage that is driven well moves the other way; one that comes to a stop there, did."""
+        left_mm_s = right_mm_s = 0.0
+        is_left_driven, is_right_driven = abs(left_duty) > self._no_motion_duty, abs(right_duty) > self._no_motion_duty
+        if is_left_driven:
+            left_mm_s = measured.left_mm_s * math.copysign(1.0, left_duty)
+        if is_right_driven:
+            right_mm_s = measured.right_mm_s * math.copysign(1.0, right_duty)
+        if left_mm_s < -STILL_MM_S or right_mm_s < -STILL_MM_S:
+            self.opposed_s += dt_s
+        elif left_mm_s > STILL_MM_S or right_mm_s > STILL_MM_S or not (is_left_driven or is_right_driven):
+            self.opposed_s = 0.0

@@ -1,0 +1,285 @@
+"""What passes between the stages, in the order in which it flows. Every record is immutable.
+
+Forces are in N against the motion of the handle, gaps and positions in mm, and opening is positive.
+"""
+
+import math
+from typing import Final, final
+
+from firmware_protocol.codec import DriveMode
+from firmware_protocol.value import Value
+from tormagd.control.believe.strength import DeviceFit
+from tormagd.model.displacement import MOVING_MM_S, Turn
+from tormagd.safety.codes import Limit
+from tormagd.safety.operating_state import DeviceRequest
+
+
+@final
+class TimedSetpoint(Value):
+    """The newest valid setpoint. `stamp_s` is when the publisher meant it, on the clock of `now_s`; `preview_N` are the
+    forces that follow it, `preview_dt_s` apart. `holder` numbers the publishers that have held the brake, one after the
+    other; with `is_contested` somebody else sends setpoints too.
+    """
+
+    def __init__(
+        self,
+        force_N: float,
+        stamp_s: float,
+        valid_for_s: float,
+        displacement_mm: float | None = None,
+        rate_mm_s: float | None = None,
+        preview_N: tuple[float, ...] = (),
+        preview_dt_s: float = 0.0,
+        holder: int = 0,
+        is_contested: bool = False,
+    ) -> None:
+        self.force_N: Final = force_N
+        self.stamp_s: Final = stamp_s
+        self.valid_for_s: Final = valid_for_s
+        self.displacement_mm: Final = displacement_mm
+        self.rate_mm_s: Final = rate_mm_s
+        self.preview_N: Final = preview_N
+        self.preview_dt_s: Final = preview_dt_s
+        self.holder: Final = holder
+        self.is_contested: Final = is_contested
+
+    @property
+    def preview_s(self) -> float:
+        """How long after its stamp the preview ends."""
+        return self.preview_dt_s * len(self.preview_N)
+
+    @property
+    def preview_slope_N_s(self) -> float:
+        """The mean slope of a preview that is there."""
+        return (self.preview_N[-1] - self.force_N) / self.preview_s
+
+
+@final
+class Handle(Value):
+    """The handle's motion. `displacement_mm` is its travel since `turn`, or how deep a finger is in a pad. `rate_mm_s`
+    is positive the way the handle went last, or inwards. `sliding_mm_s` >= 0 is the rate at which friction slides: the
+    rate over the last travel, so that a handle that stops keeps it.
+    """
+
+    def __init__(self, displacement_mm: float, rate_mm_s: float, turn: Turn, sliding_mm_s: float = MOVING_MM_S) -> None:
+        self.displacement_mm: Final = displacement_mm
+        self.rate_mm_s: Final = rate_mm_s
+        self.turn: Final = turn
+        self.sliding_mm_s: Final = sliding_mm_s
+
+
+@final
+class Measured(Value):
+    """Carriages in mm from the centre plane and in mm/s, and the force that the sensor reads.
+
+    Where the device is not homed, positions mean nothing. Force and handle came at `sensed_s` on the host's clock, and
+    at `handle_time_s` on the device's. `number` is the measurement's.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        is_homed: bool,
+        device_time_s: float,
+        left_mm: float,
+        right_mm: float,
+        left_mm_s: float,
+        right_mm_s: float,
+        force_N: float,
+        handle: Handle,
+        handle_mm: float,
+        sensed_s: float,
+        handle_time_s: float,
+    ) -> None:
+        self.number: Final = number
+        self.is_homed: Final = is_homed
+        self.device_time_s: Final = device_time_s
+        self.left_mm: Final = left_mm
+        self.right_mm: Final = right_mm
+        self.left_mm_s: Final = left_mm_s
+        self.right_mm_s: Final = right_mm_s
+        self.force_N: Final = force_N
+        self.handle: Final = handle
+        self.handle_mm: Final = handle_mm
+        self.sensed_s: Final = sensed_s
+        self.handle_time_s: Final = handle_time_s
+
+    @property
+    def gap_mm(self) -> float:
+        """Distance between the magnets."""
+        return self.left_mm + self.right_mm
+
+    @property
+    def gap_speed_mm_s(self) -> float:
+        """How fast it opens."""
+        return self.left_mm_s + self.right_mm_s
+
+    @property
+    def skew_mm(self) -> float:
+        """Left carriage minus right carriage."""
+        return self.left_mm - self.right_mm
+
+
+@final
+class FieldLag(Value):
+    """The field of the newest gap and how far the element's own is behind it. Along a rising or falling field the lag
+    comes to `width_mT`, and turns round over `turn_mT`. Nothing has been measured yet where `is_empty`."""
+
+    def __init__(self, field_mT: float, lag_mT: float, width_mT: float, turn_mT: float, is_empty: bool) -> None:
+        self.field_mT: Final = field_mT
+        self.lag_mT: Final = lag_mT
+        self.width_mT: Final = width_mT
+        self.turn_mT: Final = turn_mT
+        self.is_empty: Final = is_empty
+
+    def lag_at_mT(self, field_mT: float) -> float:
+        """The lag once the gap's field is `field_mT`, on a straight way from here; 0 before anything was measured."""
+        change_mT = field_mT - self.field_mT
+        if self.is_empty:
+            return 0.0
+        if change_mT == 0.0:
+            return self.lag_mT
+        side_mT = math.copysign(self.width_mT, change_mT)
+        return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self.turn_mT)
+
+
+@final
+class Belief(Value):
+    """What is believed of the device at a plan.
+
+    device            its force over the model's without memory, for the rate at which the handle slides
+    at_speed          the same at the speed of a handle in motion
+    lag_s             how late its carriages come
+    field_lag         how far the element's field is behind the gap's
+    predicted_N       the force that it is expected to show now; None where nothing is known, as before break-away
+    limits            what is wrong with what it shows
+    sensor_doubted_s  for how long of sliding its force sensor has not been believed
+    """
+
+    def __init__(
+        self,
+        device: DeviceFit,
+        at_speed: DeviceFit,
+        lag_s: float,
+        field_lag: FieldLag,
+        predicted_N: float | None,
+        limits: tuple[Limit, ...],
+        sensor_doubted_s: float,
+    ) -> None:
+        self.device: Final = device
+        self.at_speed: Final = at_speed
+        self.lag_s: Final = lag_s
+        self.field_lag: Final = field_lag
+        self.predicted_N: Final = predicted_N
+        self.limits: Final = limits
+        self.sensor_doubted_s: Final = sensor_doubted_s
+
+
+@final
+class Ask(Value):
+    """The force to render now, the forces (7) at `path.PATH_S` after the moment that is planned for, the setpoint's
+    age, and what holds the force back. `foresight`, 0..1, is how well what comes is known: 1 from a preview, less where
+    the force repeats itself, 0 where it is extrapolated. `is_meant`: a publisher wants it, nothing decays."""
+
+    def __init__(
+        self,
+        force_N: float,
+        path_N: list[float],
+        age_s: float | None,
+        limits: tuple[Limit, ...],
+        foresight: float = 0.0,
+        is_meant: bool = False,
+    ) -> None:
+        self.force_N: Final = force_N
+        self.path_N: Final = path_N
+        self.age_s: Final = age_s
+        self.limits: Final = limits
+        self.foresight: Final = foresight
+        self.is_meant: Final = is_meant
+
+
+@final
+class Outside(Value):
+    """A quantity that the model was not asked about as it was, because that lies outside what the model knows."""
+
+    def __init__(self, quantity: str, asked: float, used: float) -> None:
+        self.quantity: Final = quantity
+        self.asked: Final = asked
+        self.used: Final = used
+
+
+@final
+class Plan(Value):
+    """Where the gap should go, and why.
+
+    number            lets a recording say which plan a tick used
+    setpoint_N        the publisher's force, None without a setpoint, and its age `setpoint_age_s`
+    stamp_s           of the setpoint that the force follows; -inf where it follows none
+    governed_N        the force to render now
+    predicted_N       the force that the device is expected to show now
+    gap_mm            with its speed and acceleration; never closer than `min_gap_mm`
+    confidence        0..1, of the model's in `field_mT`
+    trim              the device's force over the model's, where the plan leads
+    outside           what the limit MODEL_RANGE is about
+    """
+
+    def __init__(
+        self,
+        number: int,
+        time_s: float,
+        setpoint_N: float | None,
+        setpoint_age_s: float | None,
+        governed_N: float,
+        predicted_N: float | None,
+        field_mT: float,
+        gap_mm: float,
+        gap_speed_mm_s: float,
+        confidence: float,
+        limits: tuple[Limit, ...],
+        gap_acceleration_mm_s2: float = 0.0,
+        foresight: float = 0.0,
+        min_gap_mm: float = 0.0,
+        outside: tuple[Outside, ...] = (),
+        sensor_doubted_s: float = 0.0,
+        trim: float = 1.0,
+        stamp_s: float = -math.inf,
+    ) -> None:
+        self.number: Final = number
+        self.time_s: Final = time_s
+        self.setpoint_N: Final = setpoint_N
+        self.setpoint_age_s: Final = setpoint_age_s
+        self.governed_N: Final = governed_N
+        self.predicted_N: Final = predicted_N
+        self.field_mT: Final = field_mT
+        self.gap_mm: Final = gap_mm
+        self.gap_speed_mm_s: Final = gap_speed_mm_s
+        self.confidence: Final = confidence
+        self.limits: Final = limits
+        self.gap_acceleration_mm_s2: Final = gap_acceleration_mm_s2
+        self.foresight: Final = foresight
+        self.min_gap_mm: Final = min_gap_mm
+        self.outside: Final = outside
+        self.sensor_doubted_s: Final = sensor_doubted_s
+        self.trim: Final = trim
+        self.stamp_s: Final = stamp_s
+
+
+@final
+class Duty(Value):
+    """What goes to the device: duties in -limit..limit, its mode and the newest request; and what holds it back."""
+
+    def __init__(
+        self,
+        mode: DriveMode,
+        left_duty: float,
+        right_duty: float,
+        request: DeviceRequest,
+        request_number: int,
+        limits: tuple[Limit, ...],
+    ) -> None:
+        self.mode: Final = mode
+        self.left_duty: Final = left_duty
+        self.right_duty: Final = right_duty
+        self.request: Final = request
+        self.request_number: Final = request_number
+        self.limits: Final = limits
