@@ -56,7 +56,7 @@ class Planner:
         what its searches raise: call `afresh` then."""
         belief = self.believe.update(now_s, measured)
         ask = self.governor.update(now_s, setpoint, belief.device, belief.lag_s)
-        plan = self.aim.update(now_s, setpoint, ask, belief, measured)
+        plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured)
         # how late the carriages are is learned from this plan's gap, and acts in the next one
         self.believe.expect(now_s - self.planned.time_s, measured, plan.foresight, plan.gap_mm)
         self.planned = plan

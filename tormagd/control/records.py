@@ -121,36 +121,12 @@ class Measured(Value):
 
 
 @final
-class FieldLag(Value):
-    """The field of the newest gap and how far the element's own is behind it. Along a rising or falling field the lag
-    comes to `width_mT`, and turns round over `turn_mT`. Nothing has been measured yet where `is_empty`."""
-
-    def __init__(self, field_mT: float, lag_mT: float, width_mT: float, turn_mT: float, is_empty: bool) -> None:
-        self.field_mT: Final = field_mT
-        self.lag_mT: Final = lag_mT
-        self.width_mT: Final = width_mT
-        self.turn_mT: Final = turn_mT
-        self.is_empty: Final = is_empty
-
-    def lag_at_mT(self, field_mT: float) -> float:
-        """The lag once the gap's field is `field_mT`, on a straight way from here; 0 before anything was measured."""
-        change_mT = field_mT - self.field_mT
-        if self.is_empty:
-            return 0.0
-        if change_mT == 0.0:
-            return self.lag_mT
-        side_mT = math.copysign(self.width_mT, change_mT)
-        return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self.turn_mT)
-
-
-@final
 class Belief(Value):
     """What is believed of the device at a plan.
 
     device            its force over the model's without memory, for the rate at which the handle slides
     at_speed          the same at the speed of a handle in motion
     lag_s             how late its carriages come
-    field_lag         how far the element's field is behind the gap's
     predicted_N       the force that it is expected to show now; None where nothing is known, as before break-away
     limits            what is wrong with what it shows
     sensor_doubted_s  for how long of sliding its force sensor has not been believed
@@ -161,7 +137,6 @@ class Belief(Value):
         device: DeviceFit,
         at_speed: DeviceFit,
         lag_s: float,
-        field_lag: FieldLag,
         predicted_N: float | None,
         limits: tuple[Limit, ...],
         sensor_doubted_s: float,
@@ -169,7 +144,6 @@ class Belief(Value):
         self.device: Final = device
         self.at_speed: Final = at_speed
         self.lag_s: Final = lag_s
-        self.field_lag: Final = field_lag
         self.predicted_N: Final = predicted_N
         self.limits: Final = limits
         self.sensor_doubted_s: Final = sensor_doubted_s

@@ -15,6 +15,7 @@ from tormagd.config import Config
 from tormagd.control.aim.floors import CEILING, ceiling_mm, lawful_mT
 from tormagd.control.aim.portrait import LawOfField, Portrait
 from tormagd.control.ask.path import PATH_S
+from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.nominal import Nominal
@@ -76,18 +77,24 @@ class Aim:
         return Plan(number, now_s, None, None, min_N, None, field_mT, self._open_mm, 0.0, 1.0, (Limit.NO_SETPOINT,))
 
     def update(
-        self, now_s: float, setpoint: TimedSetpoint | None, ask: Ask, belief: Belief, measured: Measured | None
+        self,
+        now_s: float,
+        setpoint: TimedSetpoint | None,
+        ask: Ask,
+        belief: Belief,
+        memory: ElementMemory,
+        measured: Measured | None,
     ) -> Plan:
-        """The plan for what is asked of the device that is believed in. `setpoint` is what `ask` was made of. Raises
-        DomainError where no field or gap can be found."""
-        device, lag = belief.device, belief.field_lag
+        """The plan for what is asked of the device that is believed in, whose element has this `memory`. `setpoint` is
+        what `ask` was made of. Raises DomainError where no field or gap can be found."""
+        device = belief.device
         curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
         wanted_N = device.model_N(ask.path_N[0])
         solution = self._search.solve(curve, wanted_N, self.element_mT)
         element_mT = lawful_mT(self._law, wanted_N, solution.field_mT)
         if element_mT != solution.field_mT:
             outside = (*outside, Outside(FEATURES[2], solution.field_mT, element_mT))
-        field_mT = element_mT + lag.lag_at_mT(element_mT + lag.lag_mT)
+        field_mT = element_mT + memory.lag_at_mT(element_mT + memory.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
         wanted_mm = min(max(self._field.gap_mm(field_mT), self._closed_mm), self._open_mm)
         min_mm = ceiling_mm(self._portrait, device, self._ceiling_N)
@@ -95,7 +102,7 @@ class Aim:
         speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, device)
         model_N = belief.at_speed.model_N(ask.force_N)
         self.number += 1
-        self.element_mT = field_mT - lag.lag_mT
+        self.element_mT = field_mT - memory.lag_mT
         return Plan(
             number=self.number,
             time_s=now_s,

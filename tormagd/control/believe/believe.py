@@ -158,7 +158,7 @@ class Believe:
             predicted_N = self.strength.fit.force_N(model_N) * slow
         lag_s = self.carriages.lag_s if self._has_lag else 0.0
         limits = (*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits
-        return Belief(device, at_speed, lag_s, self.memory.field_lag, predicted_N, limits, self.sensor.doubted_s)
+        return Belief(device, at_speed, lag_s, predicted_N, limits, self.sensor.doubted_s)
 
     def _hear(self, now_s: float, measured: Measured, model_N: float) -> None:
         """Learns from the newest reading, where the model says `model_N`."""

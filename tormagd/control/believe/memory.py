@@ -1,7 +1,7 @@
 """What the element remembers: how much of its force has relaxed, and how far its field lags behind the gap's.
 
     force    F = m(B - l) - r          m the model's force without memory, B the gap's field, l its lag, r what relaxed
-    lag      l goes to +-width over a change of field `turn` (FieldLag)
+    lag      l goes to +-width along a rising or falling field, over a change by `turn`
     relaxed  r is what Prony series of two parts leave: of the force without field, and of what the field adds
 
 Both are followed from the measured gaps and expected of every device, so neither is learned. What has relaxed is the
@@ -13,7 +13,7 @@ from typing import Final, final
 
 from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.nominal import Nominal
-from tormagd.control.records import FieldLag, Measured
+from tormagd.control.records import Measured
 from tormagd.model.force_curve import ForceCurve, within
 from tormagd.model.memory import Memory
 from tormagd.physics.relaxation import PronyState
@@ -55,10 +55,16 @@ class ElementMemory:
         self._open_mm: Final = gap_range_mm[1]
         self._only_free_N: Final = self._free_N(nominal.only)
 
-    @property
-    def field_lag(self) -> FieldLag:
-        """How far the element's field is behind the gap's, now and at another gap."""
-        return FieldLag(self.field_mT, self.lag_mT, self._width_mT, self._turn_mT, self.time_s == -math.inf)
+    def lag_at_mT(self, field_mT: float) -> float:
+        """How far the element's field is behind the gap's once that is `field_mT`, on a straight way from here; 0 before
+        anything was measured."""
+        change_mT = field_mT - self.field_mT
+        if self.time_s == -math.inf:
+            return 0.0
+        if change_mT == 0.0:
+            return self.lag_mT
+        side_mT = math.copysign(self._width_mT, change_mT)
+        return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._turn_mT)
 
     def force_N(self, curve: ForceCurve) -> float:
         """What the model gives now, if the force without memory over the field is `curve`."""
@@ -94,7 +100,7 @@ class ElementMemory:
 
     def _follow(self, curve: ForceCurve, free_N: float, field_mT: float, now_s: float) -> None:
         """The gap went straight to that field; `curve` is the force there without memory, `free_N` without field."""
-        self.lag_mT = self.field_lag.lag_at_mT(field_mT)
+        self.lag_mT = self.lag_at_mT(field_mT)
         dt_s = max(now_s - self.time_s, 0.0)
         self.field_mT, self.time_s = field_mT, now_s
         if not self._relaxes:
