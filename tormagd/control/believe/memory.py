@@ -56,8 +56,8 @@ class ElementMemory:
         self._only_free_N: Final = self._free_N(nominal.only)
 
     def lag_at_mT(self, field_mT: float) -> float:
-        """How far the element's field is behind the gap's once that is `field_mT`, on a straight way from here; 0 before
-        anything was measured."""
+        """How far the element's field is behind the gap's once that is `field_mT`, on a straight way from here. It is 0
+        before anything was measured."""
         change_mT = field_mT - self.field_mT
         if self.time_s == -math.inf:
             return 0.0
