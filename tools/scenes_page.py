@@ -94,13 +94,13 @@ def _head(share: float) -> str:
 def _row(stated: Scene, found: MeasuredScene) -> list[str]:
     reach = core_without(stated.name, ()).portrait
     force = stated.force
-    low_N, high_N = max(force.least_N, reach.least_N), min(force.most_N, reach.most_N)
+    low_N, high_N = max(force.least_N, reach.min_N), min(force.most_N, reach.max_N)
     share = (high_N - low_N) / (force.most_N - force.least_N)
     judged = on_first(found.judged)
     rms_mN = f"{1e3 * judged.full_N:.1f} / {1e3 * judged.chosen_N:.1f}"
     return [
         f"`{stated.name}`",
-        f"{force.least_N:g} to {force.most_N:g} N",
+        f"{force.min_N:g} to {force.most_N:g} N",
         f"{1e3 * force.tolerance_rms_N:g} mN",
         f"{low_N:.2f} to {high_N:.2f} N ({share:.0%})",
         rms_mN if is_met(found.judged, found.tolerance_N) else f"**{rms_mN}**",

@@ -7,6 +7,7 @@ and the operating state changes only along a row of the table.
 import math
 import random
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 from tqdm import tqdm
@@ -46,8 +47,9 @@ class BrokenRuleError(Exception):
 class Walk:
     """One walk. `seed` draws all of it; the same seed walks the same way."""
 
-    def __init__(self, stepper: Stepper, duty_limit: float, seed: int) -> None:
-        self._stepper, self._limit, self._random = stepper, duty_limit, random.Random(seed)
+    def __init__(self, begun: Callable[[float], Stepper], duty_limit: float, seed: int) -> None:
+        """`begun` gives steps that begin at a time."""
+        self._begun, self._limit, self._random = begun, duty_limit, random.Random(seed)
         self.steps = self.driven = 0
         self.ways: Counter[str] = Counter()
         self.begin()
@@ -58,7 +60,7 @@ class Walk:
         self.now_s, self._number, self._at_mm = draw.uniform(0.0, 1e5), 0, draw.uniform(-25.0, 0.0)
         self._strangeness = draw.choice((0.0, 0.0, 0.0, 0.003, 0.1))
         self._gap_mm = draw.uniform(40.0, 100.0)
-        self.state = self._stepper.start(self.now_s)
+        self.stepper = self._begun(self.now_s)
 
     def go(self, steps: int) -> None:
         """Walks on. Raises BrokenRuleError."""
@@ -72,9 +74,9 @@ class Walk:
             if draw.random() < 0.02:
                 self._gap_mm = draw.choice(STRANGE) if draw.random() < self._strangeness else draw.uniform(40.0, 100.0)
             plan = Plan(1, self.now_s, None, None, 0.0, None, 0.0, self._gap_mm, draw.uniform(-40.0, 40.0), 1.0, ())
-            before = self.state.safety
-            self.state, output = self._stepper.step(self.state, self.now_s, measured, plan)
-            after = self.state.safety
+            before = self.stepper.safety
+            output = self.stepper.step(self.now_s, measured, plan)
+            after = self.stepper.safety
             is_driven = after.operating_state in DRIVEN
             duties = (output.left_duty, output.right_duty)
             if not (abs(duties[0]) <= self._limit and abs(duties[1]) <= self._limit):  # NaN is no duty either
@@ -88,19 +90,19 @@ class Walk:
 
     def _command(self) -> None:
         draw = self._random
-        likely = NEXT.get(self.state.safety.operating_state, "resume")
+        likely = NEXT.get(self.stepper.safety.operating_state, "resume")
         self.operate(draw.choice(COMMANDS) if draw.random() < 0.1 else likely)
 
     def operate(self, name: str) -> None:
         """An operator's command, under conditions that are drawn. Raises BrokenRuleError."""
-        before = self.state.safety
+        before = self.stepper.safety
         try:
-            self.state = self._stepper.command(self.state, name, self.now_s, self._conditions())
+            self.stepper.command(name, self.now_s, self._conditions())
         except RefusedError:
             return
         if (Event(name), before.operating_state) not in ALLOWED:
             raise BrokenRuleError(f"{name} was taken in {before.operating_state}: no row of the table")
-        self._check(Event(name), before, self.state.safety)
+        self._check(Event(name), before, self.stepper.safety)
 
     def _check(self, event: Event, before: SafetyState, after: SafetyState) -> None:
         """What a step or a command did to the operating state is a row of the table."""
@@ -125,7 +127,7 @@ class Walk:
         draw, some, number = self._random, self._some, self._number
         is_odd = draw.random() < 0.002
         self._number = number = number + (draw.random() < 0.97)
-        reference = self.state.reference
+        reference = self.stepper.move.reference
         if reference is not None and abs(reference.gap_mm) < 200.0:  # carriages follow, more or less
             self._at_mm += 0.3 * (reference.gap_mm / 2.0 - 47.5 - self._at_mm)
         leap_mm = 4.0 if draw.random() < 1e-4 else 0.0

@@ -137,7 +137,7 @@ def steps(name: str) -> Json:
     legs, once = [(RUNS_ON_S, TURNED_MM_S)], [(1.0, 0.0), (STEP_S, low_N), (STEP_S, HIGH_N)]
     fresh = course(plant, legs, [*once, (REST_S, low_N), (STEP_S, HIGH_N), (STEP_S, low_N)])
     kept = profile_of(fresh.shown, serial_number=1, insert="MRE", model="0" * 64, saved_ns=0)
-    known = course(plant, legs, [*once, (STEP_S, low_N)], kept.shown(3_600_000_000_000))
+    known = course(plant, legs, [*once, (STEP_S, low_N)], kept.learned(3_600_000_000_000))
     first_s, again_s = 1.0 + STEP_S, 1.0 + 2.0 * STEP_S + REST_S
     courses = (fresh, first_s), (fresh, again_s), (known, first_s)
     result: Json = {"faults": [*fresh.faults, *known.faults]}
@@ -227,9 +227,9 @@ def pulse(name: str) -> Json:
     it, and while it is learned."""
     plant, played = device(name), pulse_signal(PULSE_S)
     learning = track(plant, played, "pulse", 0.0)
-    before = learning.shown.replaced(read=-1, read_s=0.0)
     alone, learned = (
-        track(plant, played, "pulse", 0.0, is_learning=False, shown=shown) for shown in (NOTHING_LEARNED, before)
+        track(plant, played, "pulse", 0.0, is_learning=False, shown=shown)
+        for shown in (NOTHING_LEARNED, learning.shown)
     )
     courses = {"model alone": alone, "learned before": learned, "while learned": learning}
     return {key: found.since(0.0).rms_N for key, found in courses.items()}
@@ -303,7 +303,7 @@ def samples(pool: Executor, kept: Kept) -> Json:
                 "whole": compared(found, least, 0.0),
                 "after_trim": compared(found, least, TRIM_S),
                 "trim": found.trim,
-                "lag_ms": found.shown.lateness.lag_s * 1e3,
+                "lag_ms": found.shown.lag_s * 1e3,
                 "limits": found.limits,
             }
         )

@@ -13,7 +13,7 @@ from rendering.hands import Legs, WaitingHand
 from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
-from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
+from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
 from tormagd.control.believe.slow_friction import believable
 from tormagd.control.records import TimedSetpoint
 from tormagd.scenes.scene import Scene, load_scene
@@ -116,7 +116,7 @@ def armed(
     place of the configured one. Raises RuntimeError where the device does not get that far."""
     core = build_core(config, scene)
     loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(plant, hand, seed=1))
-    loop.plan_state = core.planner.start(loop.now_s).replaced(shown=shown)
+    taught(loop).teach(shown)
     loop.arm()
     return loop
 
@@ -154,21 +154,20 @@ def follow(loop: ClosedLoop, publish: Publisher, lasts_s: float, start_s: float,
             break
     shares = {limit: count / len(rows) for limit, count in sorted(held.items())}
     time_s, asked, rendered, handle, speed, railed = np.array(rows).reshape(-1, 6).T
-    return Followed(time_s, asked, rendered, handle, speed, railed, shares, faults, shown_by(loop), trim)
+    return Followed(time_s, asked, rendered, handle, speed, railed, shares, faults, taught(loop).learned(), trim)
 
 
-def shown_by(loop: ClosedLoop) -> Learned:
-    """What the device has shown so far."""
-    assert loop.plan_state is not None, "a loop with a planner has a state of it"
-    return loop.plan_state.shown
+def taught(loop: ClosedLoop) -> Believe:
+    """What is believed of the loop's device."""
+    assert loop.planner is not None, "this loop plans"
+    return loop.planner.believe
 
 
 def is_railed(loop: ClosedLoop) -> bool:
     """Whether a learned value stands at its bound."""
-    shown = shown_by(loop)
-    return shown.device.scale in (TRIM.least, TRIM.most) or (
-        shown.slow.learned > 0.0 and shown.slow.factor in believable(shown.device, shown.slow.followed_N)
-    )
+    fit, slow = taught(loop).strength.fit, taught(loop).slow
+    is_creep_railed = slow.learned > 0.0 and slow.factor in believable(fit, slow.followed_N)
+    return fit.scale in (TRIM.least, TRIM.most) or is_creep_railed
 
 
 def asked_at(levels: Levels) -> Callable[[float], float]:

@@ -8,33 +8,31 @@ import hashlib
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor, as_completed
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from tormagd.control.plan import PlanState
 from tqdm import tqdm
 
-from rendering.following import FILE_PREVIEW_S, Array, publisher
+from rendering.following import FILE_PREVIEW_S, Array, publisher, taught
 from rendering.hands import swinging
 from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, Rates
-from tormagd.control.core import Planner
-from tormagd.control.records import Measured, TimedSetpoint
+from tormagd.control.records import Measured, Plan, TimedSetpoint
+from tormagd.exact import plain, restore
+from tormagd.hardware.measurement import Measurement
+from tormagd.replay.rerun import KNOWN
 from tormagd.scenes.measured import Cost
-from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Solver, load_task, scene_path, terms_of
+from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Solver, load_task, scene_path
 from tormagd.scenes.signal import asked
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import PRESSES_AT_S, PRESSING_MM_S, PressingHand
 from tormagd.simulation.parameters import PlantParameters, load_plant, with_insert
-
-Call = Callable[[], object]
-Given = tuple[Any, ...]
 
 ROOT = Path(__file__).parents[2]
 LEARN_S = 4.0
@@ -49,10 +47,31 @@ DEPENDS_ON = (
     "tools/rendering/following.py",
     "tools/rendering/hands.py",
     "tormagd/closed_loop.py",
-    *(f"tormagd/{room}" for room in ("control", "hardware", "inverse", "model", "physics", "safety", "simulation")),
+    *(
+        f"tormagd/{room}"
+        for room in ("control", "assembly", "hardware", "inverse", "model", "physics", "safety", "simulation")
+    ),
     "firmware_protocol",
     "tormagd/scenes/signal.py",
 )
+
+
+class Begun(NamedTuple):
+    """A core, as plain data."""
+
+    stepper: Any
+    planner: Any
+
+
+class Tick(NamedTuple):
+    """What a core's step and plan were given in one tick."""
+
+    now_s: float
+    measurement: Measurement | None
+    plan: Plan
+    setpoint: TimedSetpoint | None
+    measured: Measured | None
+    is_planned: bool
 
 
 class Case(msgspec.Struct, frozen=True):
@@ -90,52 +109,48 @@ def costs(cases: Sequence[Case]) -> list[Cost]:
     loop, in rounds over all of them, so that a disturbance of the machine meets all alike. Of each step and plan the
     least of ROUNDS counts."""
     played = Play(cases[0])
-    steps, plans = played.given(TIMED_S)
-    made = [_calls(build_core(played.config, _modelled(played.core.scene, case)), steps, plans) for case in cases]
-    least_us = [[np.full(len(calls), np.inf) for calls in kinds] for kinds in made]
-    for _ in range(ROUNDS):
-        for least, kinds in zip(least_us, made, strict=True):
-            least[:] = [np.minimum(before, _spent_us(calls)) for before, calls in zip(least, kinds, strict=True)]
+    begun, ticks = played.given(TIMED_S)
+    cores = [build_core(played.config, _modelled(played.core.scene, case)) for case in cases]
+    least_us = [_spent_us(core, begun, ticks) for core in cores]
+    for _ in range(ROUNDS - 1):
+        for place, core in enumerate(cores):
+            spent_us = zip(least_us[place], _spent_us(core, begun, ticks), strict=True)
+            least_us[place] = tuple(np.minimum(before, now) for before, now in spent_us)
     # a setpoint that comes a little late makes a plan more: what all have cost is shared by those that were asked for
-    asked = len(steps) * cases[0].inference_hz / cases[0].control_hz
+    asked = len(ticks) * cases[0].inference_hz / cases[0].control_hz
     return [
-        Cost(round(float(steps_us.sum()) / len(steps), 3), round(float(plans_us.sum()) / asked, 3))
+        Cost(round(float(steps_us.sum()) / len(ticks), 3), round(float(plans_us.sum()) / asked, 3))
         for steps_us, plans_us in least_us
     ]
 
 
-def _calls(core: Core, steps: list[Given], plans: list[Given]) -> tuple[list[Call], list[Call]]:
-    """Every step and every plan of a core that is given this."""
-    planner, (_, now_s, setpoint, estimate) = core.planner, plans[0]
-    own = planner.plan(planner.start(now_s), now_s, setpoint, estimate).remembered
-    made: list[Call] = []
-    for state, *given in plans:
-        # with no more of the elastomer's branches than a model of its own remembers
-        known = state.remembered
-        known = known.replaced(free=known.free[: len(own.free)], added=known.added[: len(own.added)])
-        made.append(partial(_planned, planner, state.replaced(remembered=known), *given))
-    return [partial(core.stepper.step, *given) for given in steps], made
+def _spent_us(core: Core, begun: Begun, ticks: list[Tick]) -> tuple[Array, ...]:
+    """The time of every step and of every plan of a core that begins there and is given this."""
+    stepper, planner = core.stepper(), core.planner()
+    restore(stepper, begun.stepper, KNOWN)
+    own = planner.believe.memory
+    planner.plan(ticks[0].now_s, None, ticks[0].measured)
+    branches = len(own.free), len(own.added)
+    restore(planner, begun.planner, KNOWN)
+    # with no more of the elastomer's branches than a model of its own remembers
+    own.free, own.added = own.free[: branches[0]], own.added[: branches[1]]
+    steps_us, plans_us = [], []
+    for tick in ticks:
+        start_ns = time.thread_time_ns()
+        stepper.step(tick.now_s, tick.measurement, tick.plan)
+        stepped_ns = time.thread_time_ns()
+        steps_us.append((stepped_ns - start_ns) * 1e-3)
+        if tick.is_planned:
+            planner.plan(tick.now_s, tick.setpoint, tick.measured)
+            planner.foresee()
+            plans_us.append((time.thread_time_ns() - stepped_ns) * 1e-3)
+    return np.array(steps_us), np.array(plans_us)
 
 
 def _modelled(scene: Scene, case: Case) -> Scene:
     """The scene with the case's terms and search."""
     solver = Solver(name=case.search) if case.search else scene.solver
     return msgspec.structs.replace(scene, terms=EVERY_TERM.without(*case.left_out), solver=solver)
-
-
-def _planned(
-    planner: Planner, state: PlanState, now_s: float, setpoint: TimedSetpoint | None, estimate: Measured | None
-) -> PlanState:
-    return planner.foresee(planner.plan(state, now_s, setpoint, estimate))
-
-
-def _spent_us(calls: list[Call]) -> list[float]:
-    spent = []
-    for call in calls:
-        start_ns = time.thread_time_ns()
-        call()
-        spent.append((time.thread_time_ns() - start_ns) * 1e-3)
-    return spent
 
 
 class Play:
@@ -148,7 +163,7 @@ class Play:
         free = Bandwidth(control_hz=case.control_hz, inference_hz=rates.inference_hz)
         scene = _modelled(msgspec.structs.replace(stated, bandwidth=free), case)
         self.core = build_core(config, scene)
-        self.planner = (self.core if case.is_learning else _frozen(config, scene)).planner
+        self._learns = case.is_learning
         finger = scene.finger
         hand = swinging(scene.handle) if finger is msgspec.UNSET else PressingHand(finger.depth_mm)
         device = VirtualDevice(plant_of(scene, case.plant), hand, seed=1)
@@ -176,28 +191,26 @@ class Play:
         while loop.now_s < ends_s:
             time_s = loop.now_s - self.begins_s
             if time_s >= LEARN_S:
-                loop.plan_with(self.planner)
+                taught(loop).learns = self._learns
             loop.tick(self.publish(loop.now_s))
             yield time_s, loop
 
-    def given(self, seconds: float) -> tuple[list[Given], list[Given]]:
-        """What the core's steps and plans were given in these seconds after LEARN_S: their arguments."""
-        loop, steps, plans = self._loop, list[Given](), list[Given]()
-        step_state, plan_state, before_s = loop.step_state, loop.plan_state, loop.now_s
+    def given(self, seconds: float) -> tuple[Begun, list[Tick]]:
+        """What the core was LEARN_S into the signal, and what it was given in these seconds after that."""
+        ticks: list[Tick] = []
+        begun: Begun | None = None
+        loop, planner = self._loop, self._loop.planner
+        assert planner is not None, "this loop plans"
+        before_s, plan = loop.now_s, planner.planned
         for time_s, _ in self.ticks(seconds):
-            assert plan_state is not None, "a loop with a planner has a state of it"
-            if time_s >= LEARN_S:
-                steps.append((step_state, loop.now_s, loop.measurement, plan_state.plan))
-                if loop.plan_state is not plan_state:
-                    setpoint, estimate = self.publish(before_s), loop.stepper.measured
-                    plans.append((plan_state, loop.now_s, setpoint, estimate))
-            step_state, plan_state, before_s = loop.step_state, loop.plan_state, loop.now_s
-        return steps, plans
-
-
-def _frozen(config: Config, scene: Scene) -> Core:
-    terms = msgspec.structs.replace(terms_of(scene), learning=False)
-    return build_core(config, msgspec.structs.replace(scene, terms=terms))
+            if begun is not None:
+                setpoint, is_planned = self.publish(before_s), planner.planned is not plan
+                ticks.append(Tick(loop.now_s, loop.measurement, plan, setpoint, loop.stepper.measured, is_planned))
+            elif time_s >= LEARN_S:
+                begun = Begun(plain(loop.stepper), plain(planner))
+            before_s, plan = loop.now_s, planner.planned
+        assert begun is not None, "the signal lasts longer than LEARN_S"
+        return begun, ticks
 
 
 def signal_of(core: Core, scene_name: str, longest_s: float, rate_hz: int) -> tuple[Array, Array]:
