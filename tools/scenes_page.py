@@ -100,7 +100,7 @@ def _row(stated: Scene, found: MeasuredScene) -> list[str]:
     rms_mN = f"{1e3 * judged.full_N:.1f} / {1e3 * judged.chosen_N:.1f}"
     return [
         f"`{stated.name}`",
-        f"{force.min_N:g} to {force.most_N:g} N",
+        f"{force.least_N:g} to {force.most_N:g} N",
         f"{1e3 * force.tolerance_rms_N:g} mN",
         f"{low_N:.2f} to {high_N:.2f} N ({share:.0%})",
         rms_mN if is_met(found.judged, found.tolerance_N) else f"**{rms_mN}**",
