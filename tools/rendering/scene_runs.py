@@ -21,12 +21,12 @@ from tqdm import tqdm
 from rendering.following import FILE_PREVIEW_S, Array, publisher, taught
 from rendering.hands import swinging
 from tormagd.assembly.build import Core, build_core
+from tormagd.assembly.journal import KNOWN
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, Rates
 from tormagd.control.records import Measured, Plan, TimedSetpoint
 from tormagd.exact import plain, restore
 from tormagd.hardware.measurement import Measurement
-from tormagd.replay.rerun import KNOWN
 from tormagd.scenes.measured import Cost
 from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Solver, load_task, scene_path
 from tormagd.scenes.signal import asked

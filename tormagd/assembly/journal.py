@@ -11,18 +11,32 @@ from typing import Any
 
 import msgspec
 
+from firmware_protocol.codec import DeviceMode, Switches
+from tormagd.control.ask.forecast import Guess
+from tormagd.control.ask.skill import Skill
 from tormagd.control.believe.believe import Learned
+from tormagd.control.believe.sensor_zero import Level
+from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.core import Planner, Stepper
-from tormagd.control.records import TimedSetpoint
-from tormagd.exact import plain
+from tormagd.control.move.reference import Reference
+from tormagd.control.plausible import Leap
+from tormagd.control.records import Handle, Measured, Outside, Plan, TimedSetpoint
+from tormagd.exact import kinds, plain
 from tormagd.hardware.backend import Received, Sent
 from tormagd.keeping import READ, WROTE
-from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import Conditions
+from tormagd.model.displacement import Turn
+from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState, SafetyState
 from tormagd_client.messages import TickRecord
 
 FORMAT = 4
 "Of the entries and of the states in them: raised when one comes, is removed or changes its meaning. No other is rerun."
+KNOWN = kinds(
+    *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
+    *(Measured, Handle, Turn, Leap, Reference, Plan, Outside),
+    *(DeviceFit, Level, Learned, Skill, Guess),
+)
+"All records that stages keep, or that were given to them: what `exact` reads back."
 STEP = "step"
 "The step ran here; what it was given stands in the next record."
 PLAN, FORESEE, AFRESH, TEACH = "plan", "foresee", "afresh", "teach"

@@ -10,15 +10,16 @@ import asyncio
 import math
 import time
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from functools import partial
 from typing import NamedTuple
 
 from tormagd.assembly.build import Core
+from tormagd.assembly.journal import KNOWN
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.heartbeat import Heartbeat
+from tormagd.exact import plain, restore
 from tormagd.headroom.bare_timer import NS, beat
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
@@ -44,8 +45,9 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
     loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
     loop.arm()
     # stages change in place, so what is called again are others, which begin where these do
-    stepper, planner = deepcopy(loop.stepper), deepcopy(loop.planner)
-    assert planner is not None, "this loop plans"
+    stepper, planner = core.stepper(), core.planner()
+    restore(stepper, plain(loop.stepper), KNOWN)
+    restore(planner, plain(loop.planner), KNOWN)
     force = core.scene.force
     middle_N = 0.5 * (force.least_N + force.most_N)
     steps: list[Call] = []

@@ -9,33 +9,21 @@ from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd import keeping
 from tormagd.assembly import journal
 from tormagd.assembly.build import Core
-from tormagd.control.ask.forecast import Guess
-from tormagd.control.ask.skill import Skill
+from tormagd.assembly.journal import KNOWN
 from tormagd.control.believe.believe import Learned
-from tormagd.control.believe.sensor_zero import Level
-from tormagd.control.believe.strength import DeviceFit
-from tormagd.control.move.reference import Reference
-from tormagd.control.plausible import Leap
-from tormagd.control.records import Duty, Handle, Measured, Outside, Plan, TimedSetpoint
+from tormagd.control.records import Duty, TimedSetpoint
 from tormagd.daemon.inference_loop import PLAN_ERRORS
 from tormagd.daemon.telemetry import tick_record
-from tormagd.exact import first_difference, kinds, packed, plain, restore, restored
+from tormagd.exact import first_difference, packed, plain, restore, restored
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
-from tormagd.model.displacement import Turn
 from tormagd.recording.black_box import frames_in, is_tick
 from tormagd.replay.conversation import Conversation, Damage, Found
 from tormagd.replay.rebuild import ReplayError
-from tormagd.safety.codes import Fault, Limit
-from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState, RefusedError, SafetyState
+from tormagd.safety.codes import Fault
+from tormagd.safety.operating_state import RefusedError
 from tormagd_client.messages import TickRecord
 
-KNOWN = kinds(
-    *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
-    *(Measured, Handle, Turn, Leap, Reference, Plan, Outside),
-    *(DeviceFit, Level, Learned, Skill, Guess),
-)
-"All records that stages keep, or that were given to them."
 UNTAKEN = (
     TypeError, AttributeError, ValueError, ArithmeticError, LookupError, AssertionError, RuntimeError, RecursionError,
 )  # fmt: skip
