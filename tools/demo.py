@@ -31,8 +31,9 @@ from rendering.show import (
     show,
 )
 
-from tormagd.config import Config, ConfigError
+from tormagd.config import Config
 from tormagd.scenes.scene import Scene, load_scene
+from tormagd_client.endpoints import ConfigError
 
 SHOWS = 3
 "The first, and two more where the host spoils one."

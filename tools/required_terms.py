@@ -29,7 +29,6 @@ from rendering.ideal_carriage import Json
 from rendering.scene_runs import ROOT, Case, costs, run, run_all
 from rendering.signals import Signal, data_folder, recorded_signals
 
-from tormagd.config import ConfigError
 from tormagd.ctl.scene_new import new_scene
 from tormagd.headroom.__main__ import build
 from tormagd.headroom.machine_loop import machine_us
@@ -51,6 +50,7 @@ from tormagd.scenes.measured import (
     required,
 )
 from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_task, shipped_scenes
+from tormagd_client.endpoints import ConfigError
 
 SHARE = 0.2
 KEPT = ROOT / "build" / "required_terms.json"

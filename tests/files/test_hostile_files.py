@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from endurance.files import HOSTILE, READERS, make, refusal
 
-from tormagd.bounded_file import read_bounded, require_regular
+from tormagd.bounded_file import read_bounded
 from tormagd.toml_file import MOST_DEPTH, TomlError, toml_tables
+from tormagd_client.regular_file import require_regular
 
 
 @pytest.mark.parametrize("kind", READERS)

@@ -14,11 +14,12 @@ import can
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Drive, DriveMode, Home, Message, Status, Switches
-from tormagd.config import ConfigError, Device, Rates
+from tormagd.config import Device, Rates
 from tormagd.hardware.backend import BackendError, choose, installed
 from tormagd.hardware.can_backend import FRAMES_AT_ONCE, UNSENT_FRAMES, CanBackend, CanOptions
 from tormagd.hardware.can_stream import CanStream
 from tormagd.simulation.can_frame import ERROR_FLAG, CanFrame, to_socket
+from tormagd_client.endpoints import ConfigError
 
 STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
 BUS_OFF = CanFrame(ERROR_FLAG | 0x40, bytes(8))
@@ -100,16 +101,6 @@ def test_another_host_on_the_same_node_ends_the_connection(bus: Bus) -> None:
     assert "device.options.node" in caught.value.remedy
 
 
-def test_a_bus_that_takes_no_frames_is_noticed(bus: Bus) -> None:
-    def send_for_long() -> None:
-        for counter in range(10_000):
-            bus.backend.send(Drive(0.0, 0.0, DriveMode.OFF, counter % 256))
-
-    with pytest.raises(BackendError, match="nobody acknowledges") as caught:
-        send_for_long()
-    assert "bit rate" in caught.value.remedy
-
-
 def test_no_more_frames_are_taken_at_once_than_the_loop_can_bear(bus: Bus) -> None:
     bus.far.setblocking(False)
     queued = 0
@@ -117,13 +108,6 @@ def test_no_more_frames_are_taken_at_once_than_the_loop_can_bear(bus: Bus) -> No
         for queued in range(2 * FRAMES_AT_ONCE):  # noqa: B007 - counts what the kernel takes
             bus.put(frame_of(STATUS))
     assert len(bus.backend.receive()) == min(queued, FRAMES_AT_ONCE)
-
-
-def test_nobody_at_the_channel_and_no_channel_are_said(tmp_path: Path) -> None:
-    for path in (tmp_path / "absent", tmp_path):
-        with pytest.raises(BackendError, match="cannot be opened") as caught:
-            opened(Device(backend="can", options={"interface": "tormagsim"}, port=str(path)))
-        assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -192,16 +176,6 @@ def test_a_damaged_line_is_counted_and_the_next_is_read(adapter: Adapter, damage
     assert next_of(backend) == [STATUS]
     assert backend.statistics.resynchronisations == 1
     backend.close()
-
-
-@pytest.mark.parametrize("other", ["slcan", "serial"])
-def test_an_adapter_belongs_to_one(adapter: Adapter, other: str) -> None:
-    first = opened(adapter.device)
-    second = adapter.device if other == "slcan" else Device(port=adapter.device.port)
-    with pytest.raises(BackendError):
-        choose(second, Rates()).open()
-    first.close()
-    choose(second, Rates()).open().close()
 
 
 # -- a bus that fails as told --------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ COLUMNS = TickRecord.__struct_fields__
 CHANGED_TICK = 3_210
 TICKS = 4_000
 ROOT = Path(__file__).parents[2]
-NO_TICKS = [Part(0.0, 1, True, msgspec.msgpack.encode(["step"]))]
+NO_TICKS = [Part(0.0, 1, msgspec.msgpack.encode(["step"]))]
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,6 @@ from tormagd.simulation.device import MessageDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters
 
-BIT_S = 1e-6
 EXCHANGE_BITS = 395
 "Drive, State and Sense with the most stuffing, as firmware_protocol/README.md says."
 
@@ -110,23 +109,16 @@ def run(device: CanDevice, from_s: float, until_s: float, step_s: float = 1e-5) 
     return seen
 
 
-def test_a_frame_takes_its_bits_and_is_answered(make: Callable[..., CanDevice]) -> None:
-    device = make()
+@pytest.mark.parametrize("bitrate", [1_000_000, 500_000, 125_000])
+def test_a_frame_takes_its_bits_and_is_answered(make: Callable[..., CanDevice], bitrate: int) -> None:
+    device = make(bitrate)
     device.receive(0.0001, HELLO)
-    seen = run(device, 0.0001, 0.002)
+    seen = run(device, 0.0001, 0.005)
     (heard_s, hello), (answered_s, identity) = [item for item in seen if item[1].frame.identifier != STATUS]
     assert hello == Delivery(1, HELLO)
-    assert heard_s == pytest.approx(0.0001 + frame_bits(HELLO) * BIT_S, abs=1.1e-5)
+    assert heard_s == pytest.approx(0.0001 + frame_bits(HELLO) / bitrate, abs=1.1e-5)
     assert (identity.sender, identity.frame.identifier) == (DEVICE, IDENTITY)
-    assert answered_s >= heard_s + frame_bits(identity.frame) * BIT_S - 1e-9
-
-
-def test_half_the_bit_rate_takes_twice_as_long(make: Callable[..., CanDevice]) -> None:
-    for bitrate in (1_000_000, 500_000, 125_000):
-        device = make(bitrate)
-        device.receive(0.0, HELLO)
-        heard_s = run(device, 0.0, 0.002)[0][0]
-        assert heard_s == pytest.approx(frame_bits(HELLO) / bitrate, abs=1.1e-5)
+    assert answered_s >= heard_s + frame_bits(identity.frame) / bitrate - 1e-9
 
 
 def test_the_lowest_identifier_goes_first_once_the_bus_is_free(make: Callable[..., CanDevice]) -> None:
@@ -159,14 +151,11 @@ def test_what_the_controllers_cannot_hold_is_lost_and_counted(make: Callable[...
     assert device.messages.undecodable == 0
 
 
-def test_time_does_not_run_backwards_and_impossible_buses_are_refused(make: Callable[..., CanDevice]) -> None:
+def test_time_does_not_run_backwards(make: Callable[..., CanDevice]) -> None:
     device = make()
     device.advance(0.01)
     with pytest.raises(ValueError, match="now_s"):
         device.advance(0.009)
-    for bitrate, node in ((0, 1), (1_000_000, 16), (1_000_000, -1)):
-        with pytest.raises(ValueError, match="allowed are"):
-            make(bitrate, node)
 
 
 def test_control_at_a_kilohertz_leaves_thirty_percent_of_the_bus(make: Callable[..., CanDevice]) -> None:

@@ -15,7 +15,6 @@ from rendering.scene_runs import Case, Play, key, run, run_all
 from rendering.signals import Signal
 from required_terms import HOLD, NO_COST, PULSE, RATES_HZ, SHARE, is_good, measure, spared, written, wrong_models
 
-from tormagd.config import ConfigError
 from tormagd.scenes.measured import (
     JUDGED,
     Cost,
@@ -28,6 +27,7 @@ from tormagd.scenes.measured import (
     required,
 )
 from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_scene, load_task, shipped_scenes, terms_of
+from tormagd_client.endpoints import ConfigError
 
 STORED = measured()
 

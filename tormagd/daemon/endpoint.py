@@ -14,7 +14,6 @@ from typing import Any
 
 import zmq
 
-from tormagd.config import ENDPOINTS, Endpoints
 from tormagd.daemon.admission import MAY, OTHERS, Admission, shown
 from tormagd.daemon.allowance import Allowance
 from tormagd.daemon.inbox import SOURCES, SetpointInbox
@@ -22,6 +21,7 @@ from tormagd.daemon.requests import FIRST, Requests, Waiting, may_go_first
 from tormagd.daemon.socket_file import SocketFile, ipc_path
 from tormagd.keys import KeyRing
 from tormagd.safety.operating_state import RefusedError
+from tormagd_client.endpoints import ENDPOINTS, Endpoints
 from tormagd_client.messages import (
     MAX_MESSAGE_BYTES,
     VERSION,
@@ -183,7 +183,7 @@ class Endpoint:
         """
         self._count_oversize(now_s)
         self._tell_drops(now_s)
-        if not self._requests.any_waiting:
+        if not self._requests.count:
             self.take_requests(answer)
         for number in range(REQUESTS):
             if number and time.monotonic_ns() >= until_ns:
@@ -324,7 +324,8 @@ class Endpoint:
                 f"{request.command!r} is not for the key {self.admission.name(waiting.public)}",
                 "its .key belongs in the daemon's folder of operators (operate), which SIGHUP reads again",
             )
-        if self._requests.is_overtaken(waiting) and not is_observed:
+        # the gap has been told to open since this came: whatever it asks, it was meant for before that
+        if waiting.opens < self._requests.opens and not is_observed:
             raise RefusedError(
                 "overtaken",
                 f"stop or disable came after {request.command!r} and went first",

@@ -15,9 +15,9 @@ from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 from zstandard import ZstdError
 
-from tormagd.bounded_file import require_regular
 from tormagd.recording.closing import ABOUT, CUT
 from tormagd.recording.writer import TELEMETRY_TOPIC, TICKS_TOPIC
+from tormagd_client.regular_file import require_regular
 
 MAX_FILE_BYTES = 1 << 40
 MAX_RECORD_BYTES = 64_000_000

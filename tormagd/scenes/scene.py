@@ -12,8 +12,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from tormagd.config import LEAST_INFERENCE_HZ, ConfigError, Strict, convert, did_you_mean
+from tormagd.config import LEAST_INFERENCE_HZ, convert, did_you_mean
 from tormagd.scenes.measured import measured
+from tormagd_client.endpoints import ConfigError, Strict
 
 AUTO = "auto"
 LEAST_SETPOINT_HZ = 12.0
@@ -113,8 +114,7 @@ class Terms(Strict, frozen=True):
                   the part whose time constants are the nearest to its own
     `hysteresis`  how far the field lags behind that of its gap is told by the model, from where the gap has been
     `slope`       setpoints are carried along their slope to now and ahead
-    `forecast`    a force that repeats itself is foreseen, and of one that is over before the gap gets there no more is
-                  gone for than is worth the way
+    `forecast`    a force that repeats itself is foreseen
     `preview`     what a publisher says will follow is used
     `lag`         how late the carriages are is learned, and made up for
     `motor`       the duty that the reference takes of the motors is fed forward: for its speed and acceleration, the
