@@ -106,7 +106,9 @@ class Carriages:
         self._lag_s: Final = electrical_time_s(motor) + EXCHANGE_S
         self._gear_loss: Final = 1.0 - motor.gear_efficiency
         self._coulomb: Final = motor.coulomb_V / motor.supply_V
-        self._has_motor: Final = terms_of(scene).motor
+        terms = terms_of(scene)
+        self._has_motor: Final = terms.motor
+        self._learns: Final = terms.learning
 
     @property
     def reference_mm(self) -> float:
@@ -168,7 +170,7 @@ class Carriages:
         half_mm, half_mm_s = self.expected.gap_mm / 2.0, self.expected.filtered_mm_s / 2.0
         left_mm, right_mm = half_mm - measured.left_mm - skew_mm, half_mm - measured.right_mm + skew_mm
         left_mm_s, right_mm_s = half_mm_s - measured.left_mm_s, half_mm_s - measured.right_mm_s
-        if is_slewed:
+        if is_slewed and self._learns:
             self._learn_acceleration(reference, left_mm + right_mm, left_mm_s + right_mm_s, dt_s)
         ahead = self._feed_forward(reference, pull)
         if abs(reference.speed_mm_s) < RESTING_MM_S:
