@@ -110,7 +110,7 @@ def nearest_path_mm(
 
 
 def _best_mm(times_s: list[float], wanted_mm: list[float], weights: list[float], speed_mm_s: float) -> list[float]:
-    """The gap that each point (n) would be met best from, were it reached in time: all that comes after it allowed for."""
+    """The gap that is best at each point (n) for it and all that comes after, if it can be reached in time."""
     best_mm = wanted_mm[:]
     # the kinks beside the flat piece, nearest last, each less the distance that its side is shifted from its point back
     # to time 0; and by how much the slope of the derivative grows where one is passed on the way out
