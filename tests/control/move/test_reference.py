@@ -6,8 +6,8 @@ import pytest
 from hypothesis import example, given, settings, strategies as st
 
 from tormagd.config import Config, Position
-from tormagd.control.motor import full_speed_mm_s
-from tormagd.control.trajectory import Expected, Reference, Speeds, expect, follow
+from tormagd.control.move.motor import full_speed_mm_s
+from tormagd.control.move.reference import Expected, Reference, Speeds, expect, follow
 
 DT_S = 1e-3
 LIMITS = Config().position

@@ -7,7 +7,7 @@ from itertools import accumulate
 import numpy as np
 from hypothesis import given, strategies as st
 
-from tormagd.control.portrait import Portrait
+from tormagd.control.aim.portrait import Portrait
 
 GAINS_N = st.lists(st.floats(1e-9, 1.0), min_size=1, max_size=60)
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies as st
 from simple_pid import PID
 
 from tormagd.config import Config, Position
-from tormagd.control.pid import ON_TARGET_MM, Error, Gains, PidOutput, PidState, pid, rested
+from tormagd.control.move.pid import Error, Gains, ON_TARGET_MM, PidOutput, PidState, pid, rested
 
 DT_S = 1e-3
 GAINS = Gains.of(Config().position)

@@ -8,26 +8,18 @@ from hypothesis import given, settings, strategies as st
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.config import Config
-from tormagd.control.core import Core
-from tormagd.control.estimate import Estimate
-from tormagd.control.motor import delay_margin_s, electrical_time_s
-from tormagd.control.plan import Plan
+from tormagd.assembly.build import Core
+from tormagd.control.records import Measured
+from tormagd.control.move.motor import delay_margin_s, electrical_time_s
+from tormagd.control.records import Plan
 from tormagd.control.plausible import LEAP_MM
 from tormagd.control.sight import BLIND_S, UNSENSED_S
-from tormagd.control.step import (
-    CARRY_S,
-    EXCHANGE_S,
-    NEVER,
-    SENSE_FAULT_S,
-    SENSOR_FAULT_S,
-    STARTING_S,
-    STATUS_FAULT_S,
-    Acted,
-    StepOutput,
-    Stepper,
-    StepState,
-)
-from tormagd.control.trajectory import APPROACH_S, Reference
+from tormagd.control.move.carriages import CARRY_S, EXCHANGE_S
+from tormagd.control.step import Acted, NEVER, StepState
+from tormagd.control.move.watch import SENSE_FAULT_S, SENSOR_FAULT_S, STARTING_S, STATUS_FAULT_S
+from tormagd.control.records import Duty
+from tormagd.control.core import Stepper
+from tormagd.control.move.reference import APPROACH_S, Reference
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault, Limit
@@ -53,7 +45,7 @@ class Bench:
         self._stepper, self._measure = stepper, measure
         self.state = stepper.start(0.0)
         self.ticks = 0
-        self.output = StepOutput(*OFF, DeviceRequest.NONE, 0, ())
+        self.output = Duty(*OFF, DeviceRequest.NONE, 0, ())
 
     @property
     def now_s(self) -> float:
@@ -66,7 +58,7 @@ class Bench:
         return self.state.reference
 
     @property
-    def estimate(self) -> Estimate:
+    def estimate(self) -> Measured:
         """What is believed of the device."""
         assert self.state.estimate is not None
         return self.state.estimate
@@ -75,7 +67,7 @@ class Bench:
     def faults(self) -> tuple[Fault, ...]:
         return self.state.safety.faults
 
-    def step(self, plan: Plan | None = None, count: int = 1, **changes: object) -> StepOutput:
+    def step(self, plan: Plan | None = None, count: int = 1, **changes: object) -> Duty:
         """Some control periods with the same kind of measurement."""
         for _ in range(count):
             self.ticks += 1
@@ -85,7 +77,7 @@ class Bench:
             )
         return self.output
 
-    def silent(self, measurement: Measurement | None, count: int = 1) -> StepOutput:
+    def silent(self, measurement: Measurement | None, count: int = 1) -> Duty:
         """Some control periods in which this same measurement is the newest."""
         for _ in range(count):
             self.ticks += 1
@@ -127,7 +119,7 @@ def running(bench: Bench) -> Bench:
     return bench
 
 
-def driven(output: StepOutput) -> tuple[DriveMode, float, float]:
+def driven(output: Duty) -> tuple[DriveMode, float, float]:
     """What the bridges are told."""
     return output.mode, output.left_duty, output.right_duty
 
@@ -507,7 +499,7 @@ def test_a_link_without_measurements_is_a_lost_one(running: Bench, name: str | N
 
 def test_a_lost_link_is_no_fault_while_disabled(bench: Bench, core: Core) -> None:
     bench.step()
-    assert bench.silent(None, count=5) == StepOutput(DriveMode.OFF, 0.0, 0.0, DeviceRequest.NONE, 0, ())
+    assert bench.silent(None, count=5) == Duty(DriveMode.OFF, 0.0, 0.0, DeviceRequest.NONE, 0, ())
     assert bench.faults == ()
     assert core.stepper.lose_link(bench.state).safety.faults == ()
     assert bench.state.estimate is None

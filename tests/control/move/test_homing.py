@@ -3,7 +3,7 @@
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
-from tormagd.control.homing import BACKS_OFF_MM, LONGEST_S, Homing, watch
+from tormagd.control.move.homing import BACKS_OFF_MM, Homing, LONGEST_S, watch
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault
 

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from firmware_protocol.codec import Switches
-from tormagd.control.estimate import Estimate, first_estimate, update
+from tormagd.control.records import Measured
+from tormagd.control.measure import first_estimate, update
 from tormagd.model.displacement import MOBILISED_MM, TURN_MM
 
 HOME_MM = 47.5
@@ -19,8 +20,8 @@ HANDLE_COUNT_MM = 2.0 * math.pi * 20.0 / 16384.0
 def follow_handle(measure):
     """The estimate after the handle has been at each of these places, a millisecond apart."""
 
-    def follow(positions: list[float], force_N: float = 0.6) -> Estimate:
-        estimate: Estimate | None = None
+    def follow(positions: list[float], force_N: float = 0.6) -> Measured:
+        estimate: Measured | None = None
         for number, position in enumerate(positions):
             estimate = update(estimate, measure(number, handle_mm=position, force_N=force_N), HOME_MM, FILTER_S)
         assert estimate is not None
