@@ -17,7 +17,8 @@ class Home:
 
     def __init__(self, measure) -> None:
         self._measure, self.ticks = measure, 0
-        self.homing, self.faults = Homing(CEILING_N), []
+        self.homing = Homing(CEILING_N)
+        self.faults: list[Fault] = []
 
     def look(self, count: int = 1, **changes: object) -> None:
         seen = {"mode": DeviceMode.HOMING, "switches": Switches(0), "force_N": 0.3, **changes}
