@@ -10,7 +10,6 @@ import asyncio
 import math
 import time
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from functools import partial
 from typing import NamedTuple
 
@@ -41,10 +40,9 @@ class CoreCost(NamedTuple):
 def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[Call]]:
     """Each step and each plan of an armed device that renders a pulse, to be called again in turn."""
     period_s = 1.0 / config.rates.control_hz
-    loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
-    loop.arm()
-    # stages change in place, so what is called again are others, which begin where these do
-    stepper, planner = deepcopy(loop.stepper), deepcopy(loop.planner)
+    # stages change in place, so what is called again are others, armed alike: they begin where the loop's do
+    loop, other = _armed(config, core), _armed(config, core)
+    stepper, planner = other.stepper, other.planner
     assert planner is not None, "this loop plans"
     force = core.scene.force
     middle_N = 0.5 * (force.least_N + force.most_N)
@@ -58,6 +56,13 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
         steps.append(partial(stepper.step, now_s, sample.measurement, sample.plan))
         plans.append(partial(planner.plan, now_s, setpoint, sample.measured))
     return steps, plans
+
+
+def _armed(config: Config, core: Core) -> ClosedLoop:
+    device = VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1)
+    loop = ClosedLoop(config, core.stepper(), core.planner(), device)
+    loop.arm()
+    return loop
 
 
 async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> CoreCost:
