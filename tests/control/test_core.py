@@ -152,26 +152,23 @@ def test_a_homing_that_presses_shut_is_ended_and_named(bench) -> None:
 
 
 @pytest.mark.parametrize("names", [[], ["pause"]])
-def test_a_lost_link_is_a_fault_while_driven(running, names: list[str]) -> None:
+@pytest.mark.parametrize("is_between", [False, True], ids=["nothing measured", "between two steps"])
+def test_a_lost_link_is_a_fault_while_driven(running, names: list[str], is_between: bool) -> None:
     """However it went: nothing that was armed is still armed when measurements come back."""
     for name in names:
         running.command(name)
-    running.silent(None)
-    assert running.is_opened
-    assert running.faults == (Fault.LINK_LOST,)
-    assert running.stepper.measured is None
+    if is_between:
+        running.stepper.lose_link()
+    else:
+        running.silent(None)
+        assert running.is_opened
     safety = running.stepper.safety
+    assert (safety.faults, safety.request) == ((Fault.LINK_LOST,), DeviceRequest.RETRACT)
+    assert running.stepper.measured is None
     running.stepper.lose_link()
     assert running.stepper.safety == safety
     running.step(count=5)
     assert running.is_opened
-
-
-def test_a_link_that_is_lost_between_two_steps(running) -> None:
-    running.stepper.lose_link()
-    assert running.faults == (Fault.LINK_LOST,)
-    assert running.stepper.safety.request is DeviceRequest.RETRACT
-    assert running.stepper.measured is None
 
 
 def test_a_lost_link_is_no_fault_while_disabled(bench) -> None:

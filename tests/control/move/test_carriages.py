@@ -6,7 +6,7 @@ import pytest
 
 from firmware_protocol.codec import DriveMode, Switches
 from tormagd.config import Config
-from tormagd.control.move.carriages import CARRY_S, EXCHANGE_S
+from tormagd.control.move.carriages import CARRY_S, EXCHANGE_S, MAX_ACCELERATION_SCALE
 from tormagd.control.move.motor import electrical_time_s
 from tormagd.control.move.reference import APPROACH_S
 from tormagd.safety.codes import Limit
@@ -65,12 +65,6 @@ def test_a_least_gap_ends_a_motion_towards_it(running) -> None:
     assert 76.0 - 1e-3 < lowest_mm < 76.01
 
 
-@pytest.mark.parametrize("min_gap_mm", [0.0, 79.8])
-def test_the_gap_is_closed_no_further_than_this_device_allows(running, min_gap_mm: float) -> None:
-    running.step(running.plan(50.0, min_gap_mm=min_gap_mm), count=40)
-    assert (running.move.reference.gap_mm >= 79.7) == (min_gap_mm > 0.0)
-
-
 @pytest.mark.parametrize("gap_mm", [40.5, 42.0, 44.9])
 def test_carriages_beyond_the_closed_end_are_driven_back(bench, gap_mm: float) -> None:
     bench.enabled(**bench.gap(gap_mm))
@@ -116,6 +110,20 @@ def test_limits_name_what_holds_back(running) -> None:
     assert Limit.SATURATED in far[-1]
     assert Limit.SKEW not in far[-1]
     assert not running.faults
+
+
+def test_only_carriages_that_gain_speed_sooner_than_expected_are_asked_for_more(make_bench) -> None:
+    lively, weak = make_bench().enabled(), make_bench().enabled()
+    for _ in range(400):
+        lively.step(79.0, **lively.there)
+        weak.step(79.0, **weak.gap(80.0))
+    scale = lively.move.acceleration_scale
+    assert 1.01 < scale < MAX_ACCELERATION_SCALE
+    assert weak.move.acceleration_scale == 1.0
+    lively.step(79.0, count=400, **lively.there)
+    assert lively.move.acceleration_scale == scale, "what rests shows nothing"
+    lively.stepper.lose_link()
+    assert lively.move.acceleration_scale == 1.0, "another device may come"
 
 
 def acted(bench) -> tuple[int, int, int, int]:
