@@ -9,7 +9,7 @@ import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
+from tormagd.assembly.build import Core, build_core
 from tormagd.hardware.measurement import Measurement
 from tormagd.model.memory import NO_MEMORY
 from tormagd.model.model_file import ForceModel, load_model
@@ -22,7 +22,7 @@ def config() -> Config:
     return Config()
 
 
-LOADED = "tormagd.control.core.load_model"
+LOADED = "tormagd.assembly.build.load_model"
 
 
 def load_forgetful(path: Path, **meant: str) -> ForceModel:

@@ -7,9 +7,10 @@ import pytest
 
 from tormagd.config import Config
 from tormagd.control.contact import PRESSED, Pressing
-from tormagd.control.core import SEVERAL_BRANCHES, Core, build_core, choose_solver
-from tormagd.control.estimate import Estimate, Handle, update
-from tormagd.control.governor import TimedSetpoint
+from tormagd.assembly.build import Core, SEVERAL_BRANCHES, build_core, choose_solver
+from tormagd.control.records import Handle, Measured
+from tormagd.control.measure import update
+from tormagd.control.records import TimedSetpoint
 from tormagd.control.plan import PlanState
 from tormagd.model.displacement import Turn
 from tormagd.safety.codes import Limit
@@ -27,11 +28,11 @@ def pad_core() -> Core:
     return build_core(CONFIG)
 
 
-def pressed(depth_mm: float, rate_mm_s: float = 0.0, *, gap_mm: float = 78.0, number: int = 1) -> Estimate:
+def pressed(depth_mm: float, rate_mm_s: float = 0.0, *, gap_mm: float = 78.0, number: int = 1) -> Measured:
     """A homed device with a finger that deep in its pad."""
     handle = Handle(depth_mm, rate_mm_s, Turn(1.0, 0.0, 0.0))
     half_mm = gap_mm / 2.0
-    return Estimate(number, True, 0.0, half_mm, half_mm, 0.0, 0.0, 3.5, handle, depth_mm, 0.0, 0.0)
+    return Measured(number, True, 0.0, half_mm, half_mm, 0.0, 0.0, 3.5, handle, depth_mm, 0.0, 0.0)
 
 
 def held(core: Core, seconds: float, force_N: float = 3.5, *, depth_mm: float = DEPTH_MM) -> PlanState:

@@ -7,14 +7,16 @@ import msgspec
 import pytest
 
 from tormagd.config import Config, Motor
-from tormagd.control.core import Core, build_core
-from tormagd.control.device_fit import UNSEEN, DeviceFit, observe
-from tormagd.control.estimate import Estimate, Handle
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.lateness import Lateness
-from tormagd.control.periodicity import NOTHING_LEARNED
-from tormagd.control.plan import Plan, PlanState, Shown
-from tormagd.control.slow_friction import NOTHING_SLOW
+from tormagd.assembly.build import Core, build_core
+from tormagd.control.believe.strength import DeviceFit, UNSEEN, observe
+from tormagd.control.records import Handle, Measured
+from tormagd.control.records import TimedSetpoint
+from tormagd.control.believe.carriage_lag import CarriageLag
+from tormagd.control.ask.forecast import NOTHING_LEARNED
+from tormagd.control.records import Plan
+from tormagd.control.plan import PlanState
+from tormagd.control.believe.believe import Learned
+from tormagd.control.believe.slow_friction import NOTHING_SLOW
 from tormagd.hardware.measurement import Measurement
 from tormagd.model.displacement import MOBILISED_MM, Turn
 from tormagd.safety.codes import Limit
@@ -45,7 +47,7 @@ def told(core: Core, state: PlanState, asked_N: float, rate_mm_s: float = 42.0, 
     handle = Handle(MOBILISED_MM, rate_mm_s, Turn(1.0, 0.0, at_mm), rate_mm_s)
     number = state.shown.read + 1
     force_N = 1.2 + 0.002 * (number % 2)  # a sensor that stands still is not believed
-    estimate = Estimate(number, True, 0.0, 39.0, 39.0, 0.0, 0.0, force_N, handle, at_mm, math.inf, 0.0)
+    estimate = Measured(number, True, 0.0, 39.0, 39.0, 0.0, 0.0, force_N, handle, at_mm, math.inf, 0.0)
     asked = TimedSetpoint(asked_N, now_s, 0.1).replaced(**setpoint)
     return core.planner.foresee(core.planner.plan(state, now_s, asked, estimate))
 
@@ -183,7 +185,7 @@ def late_s(core: Core) -> float:
         force_N = 1.0 + 0.5 * now_s
         gap_mm = core.planner.portrait.gap_mm_at(force_N) + 0.3
         handle = Handle(MOBILISED_MM, 42.0, Turn(1.0, 0.0, 100.0), 42.0)
-        estimate = Estimate(number, True, 0.0, gap_mm / 2, gap_mm / 2, -7.0, -7.0, 1.0, handle, 100.0, -math.inf, 0.0)
+        estimate = Measured(number, True, 0.0, gap_mm / 2, gap_mm / 2, -7.0, -7.0, 1.0, handle, 100.0, -math.inf, 0.0)
         preview = tuple(force_N + 0.5 * 0.002 * step for step in range(1, 35))
         setpoint = TimedSetpoint(force_N, now_s, 0.1, preview_N=preview, preview_dt_s=0.002)
         state = core.planner.plan(state, now_s, setpoint, estimate)
@@ -199,7 +201,7 @@ def test_without_the_lag_what_is_known_of_it_is_not_looked_at() -> None:
     ahead = {"preview_N": tuple(1.0 + 0.1 * (step > 15) for step in range(35)), "preview_dt_s": 0.002}
 
     def gap_mm(core: Core, lag_s: float) -> float:
-        state = core.planner.start(0.0).replaced(shown=Shown(lateness=Lateness(lag_s)))
+        state = core.planner.start(0.0).replaced(shown=Learned(lateness=CarriageLag(lag_s)))
         return told(core, state, 1.0, **ahead).plan.gap_mm
 
     assert gap_mm(core_without(), 0.02) != gap_mm(core_without(), 0.0)

@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
-from tormagd.control.device_fit import DeviceFit
-from tormagd.control.sensor import UNJUDGED, judge
-from tormagd.control.sensor_zero import TARED_SD_N, SensorZero
+from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.believe.sensor import UNJUDGED, judge
+from tormagd.control.believe.sensor_zero import SensorZero, TARED_SD_N
 
 DRIFT_N_S = 0.005 / 60.0
 STEP_S = 0.1

@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from tormagd.control.sensor_zero import (
-    LEVEL_S,
-    LONGEST_TURN_S,
-    MOST_SD_N,
-    MOST_ZERO_N,
-    TARED,
-    TARED_SD_N,
-    UNKNOWN_SD_N,
-    SensorZero,
-)
+from tormagd.control.believe.sensor_zero import LEVEL_S, LONGEST_TURN_S, MAX_ZERO_N, MOST_SD_N, SensorZero, TARED, TARED_SD_N, UNKNOWN_SD_N
 
 PERIOD_S = 0.004
 
@@ -81,7 +72,7 @@ def test_before_anything_is_heard_no_time_counts() -> None:
 
 
 @pytest.mark.parametrize(
-    "turn", [{"rest_s": LONGEST_TURN_S + 0.1}, {"stroke_s": 0.5 * LEVEL_S}, {"off_N": MOST_ZERO_N + 0.1}]
+    "turn", [{"rest_s": LONGEST_TURN_S + 0.1}, {"stroke_s": 0.5 * LEVEL_S}, {"off_N": MAX_ZERO_N + 0.1}]
 )
 def test_levels_that_say_nothing_are_not_compared(turn: dict[str, float]) -> None:
     """Too far apart, too short, or of a sensor that is broken rather than off its zero."""
@@ -108,6 +99,6 @@ def test_no_history_makes_it_impossible(history: list[tuple[float, float, float,
     for gone_s, direction, reading_N, model_N, rate_mm_s in history:
         now_s += gone_s + PERIOD_S
         zero = zero.heard(now_s, direction, reading_N, model_N, rate_mm_s, min(gone_s + PERIOD_S, 0.02), 1.0, 0.17)
-        assert abs(zero.zero_N) <= MOST_ZERO_N
+        assert abs(zero.zero_N) <= MAX_ZERO_N
         assert 0.0 < zero.variance_N2 <= MOST_SD_N**2
         assert math.isfinite(zero.sd_N(now_s + 1.0))

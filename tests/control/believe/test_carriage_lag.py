@@ -4,15 +4,7 @@ import math
 
 import pytest
 
-from tormagd.control.lateness import (
-    CAUGHT_UP_MM,
-    MEASURED_S,
-    MOST_LAG_S,
-    ON_TIME,
-    Lateness,
-    found,
-    surprised,
-)
+from tormagd.control.believe.carriage_lag import AGE_S, CAUGHT_UP_MM, CarriageLag, MAX_LAG_S, ON_TIME, found, surprised
 
 FASTEST_MM_S, PERIOD_S = 38.0, 0.01
 
@@ -21,12 +13,12 @@ def swing_mm(time_s: float) -> float:
     return 70.0 + 2.0 * math.sin(2.0 * math.pi * time_s)
 
 
-def swung(late_s: float, seconds: float, *, off_mm: float = 0.0, before: Lateness = ON_TIME) -> Lateness:
+def swung(late_s: float, seconds: float, *, off_mm: float = 0.0, before: CarriageLag = ON_TIME) -> CarriageLag:
     """Of carriages that follow a planned swing as much later, measured off by so much."""
     known = before
     for tick in range(round(seconds / PERIOD_S)):
         now_s = tick * PERIOD_S
-        measured_s = now_s - MEASURED_S - late_s
+        measured_s = now_s - AGE_S - late_s
         gap_mm = swing_mm(measured_s) + off_mm
         speed_mm_s = (swing_mm(measured_s + 1e-4) - swing_mm(measured_s - 1e-4)) / 2e-4
         known = found(known, PERIOD_S, swing_mm(now_s), gap_mm, speed_mm_s, FASTEST_MM_S)
@@ -49,13 +41,13 @@ def test_a_gap_that_is_off_is_not_late() -> None:
     assert swung(0.01, 10.0, off_mm=0.2).lag_s == pytest.approx(swung(0.01, 10.0).lag_s, abs=2e-3)
 
 
-@pytest.mark.parametrize(("late_s", "learned_s"), [(-0.01, 0.0), (0.058, 0.058), (0.2, MOST_LAG_S)])
+@pytest.mark.parametrize(("late_s", "learned_s"), [(-0.01, 0.0), (0.058, 0.058), (0.2, MAX_LAG_S)])
 def test_it_has_bounds(late_s: float, learned_s: float) -> None:
     assert swung(late_s, 20.0).lag_s == pytest.approx(learned_s, abs=2e-3)
 
 
 def test_a_jump_teaches_nothing_until_it_is_caught_up_with() -> None:
-    known, gap_mm = Lateness(0.01), 80.0
+    known, gap_mm = CarriageLag(0.01), 80.0
     for _ in range(100):
         known = found(known, PERIOD_S, 60.0, gap_mm, -FASTEST_MM_S if gap_mm > 60.0 else 0.0, FASTEST_MM_S)
         if gap_mm > 60.0 + CAUGHT_UP_MM + 0.06:
@@ -75,9 +67,9 @@ def test_what_comes_as_a_surprise_teaches_nothing_and_forgets_nothing() -> None:
 @pytest.mark.parametrize("elapsed_s", [0.0, -1.0, 1e-9, 1e9])
 @pytest.mark.parametrize("speed_mm_s", [0.0, 1e6, -1e6])
 def test_no_clock_and_no_speed_upsets_it(elapsed_s: float, speed_mm_s: float) -> None:
-    known = Lateness(0.01, expected_mm=70.0)
+    known = CarriageLag(0.01, expected_mm=70.0)
     for _ in range(100):
         known = found(known, elapsed_s, 70.0, 70.0, speed_mm_s, FASTEST_MM_S)
-        assert 0.0 <= known.lag_s <= MOST_LAG_S
+        assert 0.0 <= known.lag_s <= MAX_LAG_S
         assert math.isfinite(known.motion_mm2_s)
         assert known.motion_mm2_s >= 0.0

@@ -7,19 +7,19 @@ import msgspec
 import pytest
 from hypothesis import given, strategies as st
 
-from tormagd.control.device_fit import OFFSET_SD_N, SCALE_SD, DeviceFit
-from tormagd.control.lateness import MOST_LAG_S, Lateness
-from tormagd.control.plan import Shown
-from tormagd.control.profile import MAX_BYTES, ZERO_LASTS_S, Profile, ProfileError, profile_of, read_profile
-from tormagd.control.sensor_zero import TARED, SensorZero
-from tormagd.control.slow_friction import SlowFriction
+from tormagd.control.believe.strength import DeviceFit, OFFSET_SD_N, SCALE_SD
+from tormagd.control.believe.carriage_lag import CarriageLag, MAX_LAG_S
+from tormagd.control.believe.believe import Learned
+from tormagd.assembly.profile import MAX_BYTES, Profile, ProfileError, ZERO_LASTS_S, profile_of, read_profile
+from tormagd.control.believe.sensor_zero import SensorZero, TARED
+from tormagd.control.believe.slow_friction import SlowFriction
 
 OF = {"serial_number": 7, "insert": "MRE-50-40", "model": "ab" * 32}
-KNOWN = Shown(
+KNOWN = Learned(
     DeviceFit(1.2, -0.05, 1e-4, -1e-4, 4e-4),
     slow=SlowFriction(1.1, 0.6),
     zero=SensorZero(0.07),
-    lateness=Lateness(0.012),
+    lateness=CarriageLag(0.012),
 )
 KEPT = profile_of(KNOWN, saved_ns=10**18, **OF)  # type: ignore[arg-type]
 
@@ -58,7 +58,7 @@ def test_that_of_another_is_refused(name: str, present: object) -> None:
         {"offset_N": "much"},
         {"slow_factor": 9.0},
         {"lag_s": -1e-3},
-        {"lag_s": 1.01 * MOST_LAG_S},
+        {"lag_s": 1.01 * MAX_LAG_S},
         {"lag_s": None},
         {"v": 2},
         {"more": 1},
@@ -74,7 +74,7 @@ def test_of_a_profile_from_before_lateness_was_kept_none_is_known() -> None:
     fields = json.loads(msgspec.json.encode(KEPT))
     del fields["lag_s"]
     shown = read_profile(json.dumps(fields).encode(), **OF).shown(10**18)  # type: ignore[arg-type]
-    assert shown == again(KEPT).shown(10**18).replaced(lateness=Lateness())
+    assert shown == again(KEPT).shown(10**18).replaced(lateness=CarriageLag())
 
 
 @given(data=st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
@@ -97,13 +97,13 @@ def test_large_and_deep_rubbish_is_refused(data: bytes) -> None:
     offset_N=st.floats(-0.5, 0.5),
     offset_variance=st.floats(0.0, OFFSET_SD_N**2),
     zero_N=st.floats(-0.4, 0.4),
-    lag_s=st.floats(0.0, MOST_LAG_S),
+    lag_s=st.floats(0.0, MAX_LAG_S),
 )
 def test_every_fit_can_be_kept(
     scale: float, scale_variance: float, offset_N: float, offset_variance: float, zero_N: float, lag_s: float
 ) -> None:
     fit = DeviceFit(scale, offset_N, scale_variance, 0.0, offset_variance)
-    kept = profile_of(Shown(fit, zero=SensorZero(zero_N), lateness=Lateness(lag_s)), saved_ns=0, **OF)  # type: ignore[arg-type]
+    kept = profile_of(Learned(fit, zero=SensorZero(zero_N), lateness=CarriageLag(lag_s)), saved_ns=0, **OF)  # type: ignore[arg-type]
     shown = again(kept).shown(0)
     assert shown.device.force_N(1.0) == pytest.approx(fit.force_N(1.0))
     assert shown.lateness.lag_s == lag_s

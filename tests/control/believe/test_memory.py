@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, strategies as st
 
 from tormagd.config import Config
-from tormagd.control.core import build_core
-from tormagd.control.estimate import Estimate, Handle
+from tormagd.assembly.build import build_core
+from tormagd.control.records import Handle, Measured
 from tormagd.control.plan import PlanState
-from tormagd.control.remembered import NOTHING_REMEMBERED, Remembered, Remembering
+from tormagd.control.believe.memory import NOTHING_REMEMBERED, Remembered, Remembering
 from tormagd.model.displacement import Turn
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import load_model
@@ -101,7 +101,7 @@ RELAXED = 0.13
 "Of what the shipped model's element has relaxed after a long rest, about."
 
 
-def remembering(*estimates: Estimate) -> PlanState:
+def remembering(*estimates: Measured) -> PlanState:
     """The state after plans that found the device as in these estimates, half a second apart."""
     core = build_core(Config())
     state = core.planner.start(0.0)
@@ -110,10 +110,10 @@ def remembering(*estimates: Estimate) -> PlanState:
     return state
 
 
-def found(gap_mm: float, *, is_homed: bool = True) -> Estimate:
+def found(gap_mm: float, *, is_homed: bool = True) -> Measured:
     """A device at that gap, whose handle has not moved."""
     handle = Handle(0.0, 0.0, Turn(1.0, 0.0, 0.0))
-    return Estimate(1, is_homed, 0.0, gap_mm / 2.0, gap_mm / 2.0, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
+    return Measured(1, is_homed, 0.0, gap_mm / 2.0, gap_mm / 2.0, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
 
 
 def test_a_device_that_is_found_homed_has_rested_there() -> None:

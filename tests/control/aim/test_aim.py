@@ -9,12 +9,15 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from tormagd.config import Config
-from tormagd.control.core import Core
-from tormagd.control.device_fit import DeviceFit
-from tormagd.control.estimate import Estimate, Handle
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.lateness import MEASURED_S, MOST_LAG_S, Lateness
-from tormagd.control.plan import LAW_SHARE, NOTHING_SHOWN, Outside, Plan, PlanState, Shown
+from tormagd.assembly.build import Core
+from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.records import Handle, Measured
+from tormagd.control.records import TimedSetpoint
+from tormagd.control.believe.carriage_lag import AGE_S, CarriageLag, MAX_LAG_S
+from tormagd.control.aim.floors import LAW_SHARE
+from tormagd.control.believe.believe import Learned, NOTHING_LEARNED
+from tormagd.control.records import Outside, Plan
+from tormagd.control.plan import PlanState
 from tormagd.inverse.solution import FieldSolution, Reach
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
 from tormagd.safety.codes import Limit
@@ -24,14 +27,14 @@ CONFIG = Config()
 TURN = Turn(1.0, 0.0, 100.0)
 
 
-def moving(gap_mm: float = 78.1, force_N: float = 1.0871, **changes: object) -> Estimate:
+def moving(gap_mm: float = 78.1, force_N: float = 1.0871, **changes: object) -> Measured:
     """A homed device whose handle has long moved, which gives what the shipped model says. Its Sense never ages."""
     handle = Handle(MOBILISED_MM, 42.0, TURN, 42.0)
-    estimate = Estimate(1, True, 0.0, gap_mm / 2.0, gap_mm / 2.0, 0.0, 0.0, force_N, handle, 100.0, math.inf, 0.0)
+    estimate = Measured(1, True, 0.0, gap_mm / 2.0, gap_mm / 2.0, 0.0, 0.0, force_N, handle, 100.0, math.inf, 0.0)
     return estimate.replaced(**changes)
 
 
-def planned(core: Core, force_N: float, estimate: Estimate | None = None, state: PlanState | None = None) -> PlanState:
+def planned(core: Core, force_N: float, estimate: Measured | None = None, state: PlanState | None = None) -> PlanState:
     """The state after a fresh setpoint."""
     state = state or core.planner.start(0.0)
     now_s = state.plan.time_s + PERIOD_S
@@ -51,7 +54,7 @@ RESTING = moving(handle=Handle(MOBILISED_MM, 0.0, TURN, 42.0))
 
 
 @pytest.mark.parametrize("estimate", [None, RESTING], ids=["no device", "at rest"])
-def test_without_a_setpoint_the_gap_stays_open(core, estimate: Estimate | None) -> None:
+def test_without_a_setpoint_the_gap_stays_open(core, estimate: Measured | None) -> None:
     state = core.planner.start(0.0)
     for tick in range(1, 20):
         state = core.planner.plan(state, tick * PERIOD_S, None, estimate)
@@ -113,7 +116,7 @@ def test_what_cannot_be_given_is_said_once(core, force_N: float, limit: Limit) -
 
 def test_a_device_that_gives_more_than_was_asked_at_its_open_gap_is_said(core) -> None:
     """Where the element gives 1.6 times the model's force, 0.7 N are less than the open gap gives."""
-    state = core.planner.start(0.0).replaced(shown=Shown(DeviceFit(scale=1.6)))
+    state = core.planner.start(0.0).replaced(shown=Learned(DeviceFit(scale=1.6)))
     plan = planned(core, 0.7, None, state).plan
     assert Limit.F_MIN in plan.limits
     assert plan.gap_mm == pytest.approx(95.0, abs=0.1)
@@ -175,7 +178,7 @@ def swung(core: Core, late_s: float, *, is_known: bool, seconds: float = 10.0) -
     for tick in range(1, round(seconds / PERIOD_S)):
         now_s = tick * PERIOD_S
         # it starts as much sooner as has been learned, and is measured before the plan
-        come_s = now_s - MEASURED_S - late_s + state.shown.lateness.lag_s
+        come_s = now_s - AGE_S - late_s + state.shown.lateness.lag_s
         side_mm_s = (gap_mm(come_s) - gap_mm(come_s - 1e-3)) / 2e-3
         # the handle rests: the trim learns nothing
         estimate = moving(gap_mm(come_s), left_mm_s=side_mm_s, right_mm_s=side_mm_s, handle=RESTING.handle)
@@ -185,7 +188,7 @@ def swung(core: Core, late_s: float, *, is_known: bool, seconds: float = 10.0) -
     return state
 
 
-@pytest.mark.parametrize(("late_s", "learned_s"), [(0.015, 0.017), (0.0, 0.002), (-0.01, 0.0), (0.06, MOST_LAG_S)])
+@pytest.mark.parametrize(("late_s", "learned_s"), [(0.015, 0.017), (0.0, 0.002), (-0.01, 0.0), (0.06, MAX_LAG_S)])
 def test_a_lag_is_learned_where_what_comes_is_known(core, late_s: float, learned_s: float) -> None:
     """And half a plan's period besides: by so much the governor's gap goes before what is previewed."""
     assert swung(core, late_s, is_known=True).shown.lateness.lag_s == pytest.approx(learned_s, abs=1e-3)
@@ -210,7 +213,7 @@ def test_without_a_preview_a_lag_is_learned_once_the_swing_is_foreseen(core) -> 
     assert late.shown.lateness.lag_s == pytest.approx(0.015, abs=2e-3)
 
 
-def learned(core: Core, seconds: float, estimate: Estimate, shown: Shown = NOTHING_SHOWN) -> PlanState:
+def learned(core: Core, seconds: float, estimate: Measured, shown: Learned = NOTHING_LEARNED) -> PlanState:
     """The state after the same estimate for a while, but for the noise that a live sensor has."""
     state = core.planner.start(0.0).replaced(shown=shown)
     for number in range(round(seconds / PERIOD_S)):
@@ -224,8 +227,8 @@ def learned(core: Core, seconds: float, estimate: Estimate, shown: Shown = NOTHI
     [(RESTING, False), (moving(), False), (moving(force_N=20.0), True)],
     ids=["at rest", "sliding", "a sensor that is not believed"],
 )
-def test_what_is_known_of_the_lag_outlasts_what_the_sensor_teaches(core, estimate: Estimate, is_doubted: bool) -> None:
-    shown = learned(core, 1.2, estimate, Shown(lateness=Lateness(0.02))).shown
+def test_what_is_known_of_the_lag_outlasts_what_the_sensor_teaches(core, estimate: Measured, is_doubted: bool) -> None:
+    shown = learned(core, 1.2, estimate, Learned(lateness=CarriageLag(0.02))).shown
     assert shown.sensor.is_doubted == is_doubted
     assert (shown.read, shown.lateness.lag_s) == (299, 0.02)
 
@@ -250,9 +253,9 @@ def test_the_device_is_learned_from_measured_over_predicted_force(core) -> None:
     ],
     ids=["no measurement", "not homed", "not mobilised", "too slow", "at rest"],
 )
-def test_what_teaches_nothing_leaves_the_device_as_it_is(core, estimate: Estimate | None) -> None:
+def test_what_teaches_nothing_leaves_the_device_as_it_is(core, estimate: Measured | None) -> None:
     known = DeviceFit(scale=1.1, scale_variance=1e-4)
-    state = core.planner.start(0.0).replaced(shown=Shown(known))
+    state = core.planner.start(0.0).replaced(shown=Learned(known))
     for _ in range(20):
         state = planned(core, 1.0, estimate, state)
     assert state.device == known
@@ -344,7 +347,7 @@ def test_positions_before_homing_predict_nothing(core) -> None:
 TURNING = moving(is_homed=False, handle=Handle(MOBILISED_MM / 2.0, 42.0, TURN, 42.0))
 
 
-def gap_mm(core: Core, estimate: Estimate | None, rate_mm_s: float | None, now_s: float = PERIOD_S) -> float:
+def gap_mm(core: Core, estimate: Measured | None, rate_mm_s: float | None, now_s: float = PERIOD_S) -> float:
     """The plan's, where the setpoint states this rate."""
     setpoint = TimedSetpoint(1.0, PERIOD_S, 0.1, rate_mm_s=rate_mm_s)
     return core.planner.plan(core.planner.start(0.0), now_s, setpoint, estimate).plan.gap_mm
@@ -389,7 +392,7 @@ setpoints = st.none() | st.builds(
 
 @settings(max_examples=80, deadline=None)
 @given(history=st.lists(st.tuples(st.floats(0.0, 20.0), setpoints, estimates), min_size=1, max_size=8))
-def test_nan_never_travels(core, history: list[tuple[float, TimedSetpoint | None, Estimate | None]]) -> None:
+def test_nan_never_travels(core, history: list[tuple[float, TimedSetpoint | None, Measured | None]]) -> None:
     state, now_s = core.planner.start(0.0), 0.0
     for elapsed_s, setpoint, estimate in history:
         now_s += elapsed_s
@@ -405,7 +408,7 @@ def test_nan_never_travels(core, history: list[tuple[float, TimedSetpoint | None
         assert all(math.isfinite(getattr(state.device, name)) for name in DeviceFit.__match_args__)
         assert plan.governed_N <= max(core.scene.force.most_N, state.device.force_N(core.planner.portrait.least_N))
         assert plan.gap_mm >= plan.least_gap_mm
-        assert 0.0 <= lag_s <= MOST_LAG_S
+        assert 0.0 <= lag_s <= MAX_LAG_S
         assert plan.number == last.plan.number + 1
 
 

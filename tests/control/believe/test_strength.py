@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.control.device_fit import (
-    LEAST_SCALE,
-    MOST_SCALE,
-    OFFSET_SD_N,
-    SCALE_SD,
-    SURE,
-    DeviceFit,
-    observe,
-)
+from tormagd.control.believe.strength import DeviceFit, MAX_SCALE, MIN_SCALE, OFFSET_SD_N, SCALE_SD, SURE, observe
 
 PERIOD_S = 0.004
 BOUNDS = (0.6, 1.6)
@@ -68,14 +60,14 @@ def test_force_and_model_are_each_others_inverse() -> None:
 
 
 @pytest.mark.parametrize("levels", [[], [(0.2, 0.7)], [(2.0, 0.7)], [(2.0, 0.7), (2.0, 1.6)]])
-@pytest.mark.parametrize("scale", [LEAST_SCALE, 0.8, 1.0, 1.2, MOST_SCALE])
+@pytest.mark.parametrize("scale", [MIN_SCALE, 0.8, 1.0, 1.2, MAX_SCALE])
 def test_what_is_surely_within_is_within(levels: list[tuple[float, float]], scale: float) -> None:
     """However little has been shown, and whatever the device: never over, but for the two in a hundred of `SURE`."""
     most_N = 2.5
     model_N = shown(levels, scale, 0.0).surely_within_N(most_N)
-    allowed_N = most_N if levels else most_N * MOST_SCALE / (1.0 + SURE * SCALE_SD)
+    allowed_N = most_N if levels else most_N * MAX_SCALE / (1.0 + SURE * SCALE_SD)
     assert scale * model_N <= 1.03 * allowed_N
-    assert most_N / MOST_SCALE <= model_N <= most_N / LEAST_SCALE
+    assert most_N / MAX_SCALE <= model_N <= most_N / MIN_SCALE
 
 
 def test_the_ceiling_moves_once_a_weak_device_has_shown_itself() -> None:
@@ -84,7 +76,7 @@ def test_the_ceiling_moves_once_a_weak_device_has_shown_itself() -> None:
 
 
 def test_a_device_of_which_nothing_is_sure_is_taken_for_the_strongest() -> None:
-    assert DeviceFit(scale=2.0 * SCALE_SD).surely_within_N(2.5) == 2.5 / MOST_SCALE
+    assert DeviceFit(scale=2.0 * SCALE_SD).surely_within_N(2.5) == 2.5 / MAX_SCALE
 
 
 readings = st.tuples(st.floats(0.3, 8.0), st.floats(-33.0, 33.0), st.floats(0.0, 0.02))

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from tormagd.control.handle import FORGETS_S, MODEL_RISES_N, RISES_N, SETTLES_S, STANDS_MM, UNHEARD, HandleWatch
+from tormagd.control.believe.handle import FORGETS_S, HandleWatch, MODEL_RISES_N, RISES_N, SETTLES_S, STANDS_MM, UNHEARD
 
 PERIOD_S = 0.002
 STIFFEST_N_MM = 12.0

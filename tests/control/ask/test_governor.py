@@ -9,20 +9,12 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.control.device_fit import DeviceFit
-from tormagd.control.governor import (
-    AHEAD_S,
-    LEAST_WAY,
-    PATH_S,
-    WAY_S,
-    Governed,
-    Governor,
-    GovernorState,
-    TimedSetpoint,
-    _previewed_N,
-)
-from tormagd.control.periodicity import NOTHING_LEARNED
-from tormagd.control.portrait import Portrait
+from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.ask.governor import AHEAD_S, Governor, GovernorState, LEAST_WAY, WAY_S, _previewed_N
+from tormagd.control.ask.path import PATH_S
+from tormagd.control.records import Ask, TimedSetpoint
+from tormagd.control.ask.forecast import NOTHING_LEARNED
+from tormagd.control.aim.portrait import Portrait
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Force, Terms
 
@@ -46,18 +38,18 @@ def decide(
     scene: Force = SCENE,
     lag_s: float = 0.0,
     portrait: Portrait = PORTRAIT,
-) -> tuple[GovernorState, Governed]:
+) -> tuple[GovernorState, Ask]:
     """One decision on the device of these tests."""
     governor = Governor(portrait, scene, GAP_SPEED_MM_S)
     return governor.govern(state, now_s, setpoint, DeviceFit(), lag_s)
 
 
-def path_N(governed: Governed) -> npt.NDArray[np.float64]:
+def path_N(governed: Ask) -> npt.NDArray[np.float64]:
     """The force to come."""
     return np.array(governed.path_N)
 
 
-def stream_of(forces: list[float], period_s: float = 0.01, **keywords: Any) -> tuple[GovernorState, Governed]:
+def stream_of(forces: list[float], period_s: float = 0.01, **keywords: Any) -> tuple[GovernorState, Ask]:
     """The last decision on setpoints that came one per period."""
     state = GovernorState(0.0, 0.4)
     for number, force in enumerate(forces, 1):
@@ -249,7 +241,7 @@ def test_a_clock_that_stands_still_or_goes_back_lets_nothing_jump() -> None:
 
 def told(
     force_N: Callable[[float], float], seconds: float, *, ahead_s: float = 0.4, lag_s: float = 0.0
-) -> tuple[GovernorState, Governed]:
+) -> tuple[GovernorState, Ask]:
     """The last decision on setpoints that carry what follows, 500 times a second from 0 s on."""
     state, governed = decide(GovernorState(0.0, force_N(0.0)), 0.0, None)
     state = state.replaced(asked_N=force_N(0.0))

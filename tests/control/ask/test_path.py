@@ -6,7 +6,7 @@ import math
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.control.pursuit import nearest_way_mm
+from tormagd.control.ask.path import nearest_path_mm
 
 STEP_S = 0.01
 SPEED_MM_S = 40.0
@@ -16,7 +16,7 @@ MOST_MM = SPEED_MM_S * STEP_S
 def way_mm(start_mm: float, wanted_mm: list[float], weights: list[float], elapsed_s: float = STEP_S) -> list[float]:
     """All of the way, in even steps."""
     times_s = [STEP_S * place for place in range(len(wanted_mm))]
-    return nearest_way_mm(start_mm, elapsed_s, times_s, wanted_mm, weights, SPEED_MM_S, len(wanted_mm))
+    return nearest_path_mm(start_mm, elapsed_s, times_s, wanted_mm, weights, SPEED_MM_S, len(wanted_mm))
 
 
 def cost(way: tuple[float, ...] | list[float], wanted_mm: list[float], weights: list[float]) -> float:
@@ -54,7 +54,7 @@ def test_the_first_gap_is_within_reach_of_the_last() -> None:
 
 def test_no_more_of_it_is_told_than_is_asked_for() -> None:
     times_s = [STEP_S * place for place in range(12)]
-    assert len(nearest_way_mm(60.0, 0.0, times_s, [60.0] * 10, [1.0] * 10, SPEED_MM_S, 3)) == 3
+    assert len(nearest_path_mm(60.0, 0.0, times_s, [60.0] * 10, [1.0] * 10, SPEED_MM_S, 3)) == 3
 
 
 GRID = 4
@@ -73,7 +73,7 @@ def test_no_way_within_the_speed_misses_less(points: list[tuple[float, float, in
     grid_mm = MOST_MM / GRID
     start_mm = 60.0 + start * grid_mm
     times_s = [STEP_S * (passed - steps[0]) for passed in itertools.accumulate(steps)]
-    way = nearest_way_mm(start_mm, STEP_S * steps[0], times_s, wanted, weights, SPEED_MM_S, len(wanted))
+    way = nearest_path_mm(start_mm, STEP_S * steps[0], times_s, wanted, weights, SPEED_MM_S, len(wanted))
     for (before, after), step in zip(itertools.pairwise([start_mm, *way]), steps, strict=True):
         assert abs(after - before) <= step * MOST_MM + 1e-9
     reached = {start: 0.0}

@@ -5,18 +5,8 @@ import math
 import pytest
 from hypothesis import given, strategies as st
 
-from tormagd.control.device_fit import UNSEEN, DeviceFit
-from tormagd.control.slow_friction import (
-    LEAST,
-    LEAST_SHARE,
-    MOST,
-    NOTHING_SLOW,
-    REACH_MM,
-    STATIC_LEAST,
-    STATIC_MOST,
-    STRIBECK_MM_S,
-    SlowFriction,
-)
+from tormagd.control.believe.strength import DeviceFit, UNSEEN
+from tormagd.control.believe.slow_friction import LEAST_SHARE, MAX_FACTOR, MIN_FACTOR, NOTHING_SLOW, REACH_MM, STATIC_LEAST, STATIC_MOST, STRIBECK_MM_S, SlowFriction
 
 PERIOD_S = 0.003
 KNOWN = DeviceFit(scale_variance=0.0, offset_variance_N2=0.0)
@@ -51,8 +41,8 @@ def test_of_a_known_device_a_creep_shows_its_static_friction_and_no_more() -> No
 def test_of_a_device_that_was_never_seen_a_creep_shows_nearly_all() -> None:
     assert crept(0.75, 10.0).factor_at(1.0) == pytest.approx(0.75, abs=0.01)
     assert crept(1.35, 10.0).factor_at(1.0) == pytest.approx(1.35, abs=0.01)
-    assert crept(0.55, 10.0).factor == LEAST
-    assert crept(5.0, 10.0).factor <= MOST
+    assert crept(0.55, 10.0).factor == MIN_FACTOR
+    assert crept(5.0, 10.0).factor <= MAX_FACTOR
 
 
 def test_a_sensor_that_reads_less_than_any_device_makes_teaches_nothing() -> None:
@@ -76,13 +66,13 @@ def test_beside_a_fit_that_learned_the_force_at_a_creep_stays() -> None:
     assert slow.beside(1.0, 1.05).factor * 1.05 == pytest.approx(slow.factor, rel=1e-4)
     assert slow.beside(1.0, 1.0) is slow
     assert slow.beside(1.0, -0.1) is slow
-    assert crept(1.0, 9.0).beside(1.0, 0.5).factor == MOST  # of twice the force
+    assert crept(1.0, 9.0).beside(1.0, 0.5).factor == MAX_FACTOR  # of twice the force
     # of a creep that was never seen nothing is known but what the fit says
     assert NOTHING_SLOW.beside(1.0, 0.8) == NOTHING_SLOW
 
 
 @given(
-    start=st.floats(LEAST, MOST),
+    start=st.floats(MIN_FACTOR, MAX_FACTOR),
     events=st.lists(
         st.tuples(
             st.floats(0.1, 5.0), st.floats(0.0, 5.0), st.floats(-33.0, 33.0), st.floats(0.0, 0.02), st.floats(-9, 9)
@@ -95,6 +85,6 @@ def test_nothing_leaves_its_bounds(start: float, events: list[tuple[float, float
     for expected_N, rate_mm_s, reading_N, elapsed_s, handle_mm in events:
         slow = slow.followed(expected_N, handle_mm).observed(fit, rate_mm_s, reading_N, elapsed_s)
         slow = slow.beside(expected_N, abs(reading_N))
-        assert LEAST <= slow.factor <= MOST
+        assert MIN_FACTOR <= slow.factor <= MAX_FACTOR
         assert 0.0 <= slow.followed_N <= 5.0
-        assert LEAST <= slow.factor_at(rate_mm_s) <= MOST
+        assert MIN_FACTOR <= slow.factor_at(rate_mm_s) <= MAX_FACTOR
