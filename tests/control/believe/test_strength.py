@@ -6,14 +6,24 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.control.believe.strength import DeviceFit, MAX_SCALE, MIN_SCALE, OFFSET_SD_N, SCALE_SD, SURE, observe
+from tormagd.control.believe.strength import (
+    ERROR_N2_S,
+    MAX_SCALE,
+    MIN_SCALE,
+    OFFSET_SD_N,
+    SCALE_SD,
+    SURE,
+    UNSEEN,
+    DeviceFit,
+    Strength,
+    observe,
+)
 
 PERIOD_S = 0.004
 BOUNDS = (0.6, 1.6)
-NEW = DeviceFit()
 
 
-def shown(levels: list[tuple[float, float]], scale: float, offset_N: float, fit: DeviceFit = NEW) -> DeviceFit:
+def shown(levels: list[tuple[float, float]], scale: float, offset_N: float, fit: DeviceFit = UNSEEN) -> DeviceFit:
     """The fit after a device of that scale and offset has been held at model forces for some time each, with noise."""
     random = np.random.default_rng(1)
     for seconds, model_N in levels:
@@ -102,3 +112,55 @@ def test_over_the_force_without_memory_it_says_the_same(relaxed_N: float) -> Non
     for model_N in (0.5, 1.0, 2.0):
         assert over.force_N(model_N) == pytest.approx(fit.force_N(model_N - relaxed_N))
         assert over.deviation_N(model_N) == pytest.approx(fit.deviation_N(model_N - relaxed_N))
+
+
+@pytest.mark.parametrize(("learns_scale", "learns_offset"), [(True, False), (False, True)])
+def test_what_is_left_out_keeps_its_uncertainty_and_is_counted_with(learns_scale: bool, learns_offset: bool) -> None:
+    """Schmidt's filter against the covariance of any gain, in Joseph's form."""
+    fit, terms = DeviceFit(1.1, 0.02, 0.02, 0.001, 0.008), {"adapts_in_s": 0.5, "bounds": BOUNDS}
+    found, _ = observe(fit, 1.5, 1.7, 0.01, learns_scale=learns_scale, learns_offset=learns_offset, **terms)
+    aged, _ = observe(fit, 1.5, 1.7, 0.01, learns_scale=False, learns_offset=False, **terms)
+    before = np.array([[aged.scale_variance, aged.covariance_N], [aged.covariance_N, aged.offset_variance_N2]])
+    seen = np.array([1.5, 1.0])
+    noise_N2 = ERROR_N2_S / 0.01
+    gains = before @ seen / (seen @ before @ seen + noise_N2) * [learns_scale, learns_offset]
+    kept = np.eye(2) - np.outer(gains, seen)
+    joseph = kept @ before @ kept.T + noise_N2 * np.outer(gains, gains)
+    assert (found.scale_variance, found.covariance_N) == pytest.approx(joseph[0])
+    assert found.offset_variance_N2 == pytest.approx(joseph[1, 1])
+    assert (found.scale == fit.scale) is not learns_scale
+    assert (found.offset_N == fit.offset_N) is not learns_offset
+
+
+KNOWN = DeviceFit(scale_variance=1e-6, offset_variance_N2=1e-4)
+
+
+def heard(off_N: float, seconds: float, learns: tuple[bool, bool] = (True, True)) -> Strength:
+    """A known device after so long of readings with noise, that are off by so much from the model's 1.5 N."""
+    strength = Strength(0.5, BOUNDS, learns)
+    strength.forget(KNOWN)
+    for noise_N in np.random.default_rng(2).normal(0.0, 0.01, round(seconds / PERIOD_S)).tolist():
+        strength.update(1.5, 1.5 + off_N + noise_N, PERIOD_S)
+    return strength
+
+
+def test_a_surprise_is_learned_sooner_and_noise_is_none() -> None:
+    assert heard(0.1, 0.15).fit.force_N(1.5) > 1.58
+    assert shown([(0.15, 1.5)], 1.0, 0.1, KNOWN).force_N(1.5) < 1.52
+    assert heard(0.0, 10.0).fit.force_N(1.5) == pytest.approx(1.5, abs=5e-4)
+
+
+@pytest.mark.parametrize("learns", [(False, True), (True, False), (False, False)])
+def test_what_it_may_not_learn_it_leaves_as_it_was(learns: tuple[bool, bool]) -> None:
+    fit = heard(0.1, 10.0, learns).fit
+    assert (fit.scale != KNOWN.scale, fit.offset_N != KNOWN.offset_N) == learns
+
+
+def test_a_pause_ends_a_surprise_and_what_was_held_and_leaves_the_fit() -> None:
+    strength = heard(2.0, 0.05)
+    known, surprise_N = strength.fit, strength.surprise_N
+    assert (surprise_N > 0.1, strength.is_held) == (True, True)
+    strength.settle()
+    assert (strength.fit, strength.surprise_N, strength.is_held) == (known, 0.0, False)
+    strength.forget()
+    assert strength.fit == UNSEEN
