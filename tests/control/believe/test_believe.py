@@ -1,18 +1,18 @@
 """What may teach which estimator, and what of it the next plans are made with."""
 
-import copy
 import math
 
 import pytest
 
 from tormagd.assembly.build import Core
+from tormagd.assembly.journal import KNOWN
 from tormagd.control.believe.believe import NOTHING_LEARNED, UNTARED_N, Learned
 from tormagd.control.believe.carriage_lag import AGE_S, MAX_LAG_S
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.core import Planner
 from tormagd.control.records import Handle, Measured, TimedSetpoint
-from tormagd.exact import plain
+from tormagd.exact import plain, restore
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
 from tormagd.safety.codes import Limit
 
@@ -71,11 +71,12 @@ def test_what_teaches_nothing_leaves_the_device_as_it_is(planner, planned, movin
 
 
 def test_without_learning_no_reading_teaches_and_the_sensor_is_judged_all_the_same(planner, hear, moving) -> None:
-    learned = Learned(DeviceFit(1.1, 0.02, 1e-4), 1.05, 0.5, 0.0, 0.02)
+    learned = Learned(DeviceFit(1.1, 0.02, 1e-4), 1.05, 0.5, 0.01, 0.02)
     planner.teach(learned)
     planner.believe.learns = False
-    for measured in (moving(force_N=1.4), moving(force_N=1.4, **CREEPING)):
-        hear(planner, 0.4, measured)
+    back = Handle(MOBILISED_MM, -42.0, Turn(-1.0, 0.0, 100.0), 42.0)
+    for changes in ({}, {"handle": back}, CREEPING):
+        hear(planner, 0.4, moving(force_N=1.4, **changes))
     assert planner.believe.learned() == learned
     assert Limit.SENSOR in hear(planner, 0.4, moving(force_N=9.0)).planned.limits
 
@@ -225,10 +226,11 @@ def test_what_is_forgotten_and_what_is_taught(planner, hear, moving) -> None:
     assert planner.believe.learned() == learned
 
 
-def test_a_replay_and_a_copy_plan_the_same(swing, planned, moving) -> None:
+def test_a_replay_and_what_is_read_back_plan_the_same(core, swing, planned, moving) -> None:
     first, again = (swing(0.015, is_known=False, seconds=3.0) for _ in range(2))
     assert first.planned.foresight > 0.0
     assert plain(first) == plain(again)
-    copied = copy.deepcopy(first)
-    assert planned(copied, 1.3, moving()) == planned(first, 1.3, moving())
-    assert plain(copied) == plain(first) != plain(again)
+    read = core.planner()
+    restore(read, plain(first), KNOWN)
+    assert planned(read, 1.3, moving()) == planned(first, 1.3, moving())
+    assert plain(read) == plain(first) != plain(again)

@@ -1,4 +1,4 @@
-"""The judgement of the sensor: what no believable device gives, and what one may, for an hour in one direction as well."""
+"""The judgement of the sensor: what no believable device gives, and what one may, for an hour one way as well."""
 
 from collections.abc import Callable
 
@@ -31,7 +31,7 @@ def doubted_after_s(zero_sd_N: Callable[[float], float]) -> float | None:
 
 def test_a_drift_that_nothing_could_tell_is_no_reason_to_doubt() -> None:
     zero = SensorZero()
-    zero.told_s = 0.0
+    zero.begin(0.0)
     assert doubted_after_s(zero.sd_N) is None
 
 

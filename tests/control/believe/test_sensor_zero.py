@@ -52,6 +52,7 @@ def strokes(
         for noise_N in random.normal(0.0, 0.01, round(stroke_s / PERIOD_S)).tolist():
             now_s += PERIOD_S
             reading_N = scale * force_N + direction * off_N + noise_N
+            zero.begin(now_s)
             zero.update(now_s, direction, reading_N, force_N, 42.0, PERIOD_S, scale, 0.02)
         now_s += rest_s
     return now_s
@@ -120,6 +121,7 @@ def test_no_history_makes_it_impossible(history: list[tuple[float, float, float,
     zero, now_s = SensorZero(), 0.0
     for gone_s, direction, reading_N, model_N, rate_mm_s in history:
         now_s += gone_s + PERIOD_S
+        zero.begin(now_s)
         zero.update(now_s, direction, reading_N, model_N, rate_mm_s, min(gone_s + PERIOD_S, 0.02), 1.0, 0.17)
         assert abs(zero.zero_N) <= MAX_ZERO_N
         assert 0.0 < zero.variance_N2 <= MAX_SD_N**2

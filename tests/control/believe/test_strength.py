@@ -157,9 +157,10 @@ def test_what_it_may_not_learn_it_leaves_as_it_was(learns: tuple[bool, bool]) ->
 
 
 def test_a_pause_ends_a_surprise_and_what_was_held_and_leaves_the_fit() -> None:
-    strength = heard(2.0, 0.05)
-    known, surprise_N = strength.fit, strength.surprise_N
-    assert (surprise_N > 0.1, strength.is_held) == (True, True)
+    strength = Strength(0.5, BOUNDS, (True, True))
+    strength.update(1.5, 4.5, 1.0)
+    known = strength.fit
+    assert (known.scale, strength.is_held, strength.surprise_N > 1.0) == (BOUNDS[1], True, True)
     strength.settle()
     assert (strength.fit, strength.surprise_N, strength.is_held) == (known, 0.0, False)
     strength.forget()
