@@ -8,7 +8,27 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.control.ask.forecast import BEAT_DELAYS, GRID_S, HISTORY, HORIZON, JUDGED, LEAST_HISTORY, LONGEST_STEP_S, LONG_S, LOST, NOTHING_LEARNED, Periodicity, RIDGE, RISE_DELAYS, SAME_N, STRIDE, TAPS, forecast_N, foreseen, observe
+from tormagd.control.ask.forecast import (
+    BEAT_DELAYS,
+    GRID_S,
+    HISTORY,
+    HORIZON,
+    JUDGED,
+    LEAST_HISTORY,
+    LONGEST_STEP_S,
+    LONG_S,
+    LOST,
+    NOTHING_LEARNED,
+    Periodicity,
+    RIDGE,
+    RISE_DELAYS,
+    SAME_N,
+    STRIDE,
+    TAPS,
+    forecast_N,
+    foreseen,
+    observe,
+)
 from tormagd.control.ask.skill import Skill
 
 Array = npt.NDArray[np.float64]
