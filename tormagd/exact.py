@@ -60,6 +60,8 @@ def plain(thing: object) -> Any:
 
 
 def _fields(kind: type) -> tuple[str, ...]:
+    if issubclass(kind, Enum):
+        return ()
     if hasattr(kind, "__match_args__"):
         return tuple(kind.__match_args__)
     # a compiled class has no annotations, but says its attributes
