@@ -12,11 +12,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from benchmarks.table import lines
 from rendering.hands import TURNED_MM_S
 from rendering.ideal_carriage import MOST_N, STEP_S, bound
 
 from tormagd.force_file import ForceFileError, read_forces
+from tormagd.lab.told import lines
 from tormagd.physics.errors import DomainError
 from tormagd.simulation.parameters import PlantError, load_plant
 

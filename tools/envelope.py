@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from benchmarks.table import lines
 from rendering.device_draws import SAMPLES, device, judging
 from rendering.following import CORNER_SCENE, VALID_S, Array, Followed, Levels, armed_at_rest, asked_at, follow
 from rendering.hands import HANDS, TURNED_MM_S
@@ -30,6 +29,7 @@ from tqdm import tqdm
 
 from tormagd.control.governor import TimedSetpoint
 from tormagd.lab.pages import stamp
+from tormagd.lab.told import lines
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.model_file import load_model
 from tormagd.model.shipped import model_path

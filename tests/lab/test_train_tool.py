@@ -71,7 +71,7 @@ def test_a_table_for_people(data: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert main(command(data, tmp_path / "m.safetensors", "--epochs", "3")) == 0
     printed = capsys.readouterr().out
     assert "validation" in printed
-    assert "dF/dB <= 0 on" in printed
+    assert "not_rising_share" in printed
 
 
 def test_what_cannot_work_is_told_with_exit_2(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

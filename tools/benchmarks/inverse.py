@@ -114,7 +114,7 @@ def make(case: Case, model: ForceModel) -> FieldSolver:
     if case.solver == "vectorised-argmin":
         return GridArgmin(model, dtype=torch.float64, field_range_mT=FIELDS_MT, step_mT=case.step_mT)
     # the thesis took its network's mean error for the radius; so does this, with its own network's
-    epsilon_N = model.metadata.metrics["mae_N"] if case.solver == "thesis-linear" else 0.0
+    epsilon_N = model.metadata.metrics["validation_mae_N"] if case.solver == "thesis-linear" else 0.0
     row = torch_row(model)
     return LinearFieldSearch(epsilon_N=epsilon_N, predict_one=row, field_range_mT=FIELDS_MT, step_mT=case.step_mT)
 
@@ -245,7 +245,7 @@ def mark_pareto(rows: list[dict[str, Any]]) -> None:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `benchmark inverse`."""
     parser.add_argument("--quick", action="store_true", help="two small networks and few solves, for a test")
-    parser.add_argument("--write", action="store_true", help="also write docs/inverse_trade.md and its plot")
+    parser.add_argument("--write", action="store_true", help="also write docs/inverse_trade.md")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:

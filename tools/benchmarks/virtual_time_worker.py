@@ -1,18 +1,15 @@
-"""The closed loop of one build of one checkout, run in stretches as they are asked for on the standard input.
+"""The closed loop of one build, run in stretches as they are asked for on the standard input.
 
-`benchmark virtual-time` starts one for everything that it compares, and lets them take turns. The tools and the package
-are those of PYTHONPATH, maybe of an older checkout: of these nothing is used but how it makes its two loops.
+`benchmark virtual-time` starts one for each build, and lets them take turns.
 """
 
 import gc
 import json
 import sys
 import time
-from pathlib import Path
 
 from benchmarks import virtual_time
 from firmware_protocol.build import settle
-from tormagd import closed_loop
 from tormagd.config import Config
 
 
@@ -25,9 +22,7 @@ def main() -> int:
     }
     gc.collect()
     gc.freeze()  # what was imported is no garbage; a daemon does the same
-    # by a module of it: an empty folder of the package's name would pass for the package itself
-    package = Path(str(closed_loop.__file__)).parent
-    print(json.dumps({"compiled": settle().is_compiled, "package": str(package)}), flush=True)
+    print(json.dumps(settle().is_compiled), flush=True)
     for line in sys.stdin:
         name, ticks = line.split()
         started_s = time.thread_time()

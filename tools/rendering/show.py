@@ -22,8 +22,7 @@ from machines.host import Host, HostWatch
 from machines.own import own_machine
 from machines.wire import carried
 
-from rendering.following import Array, Tracking, tracking
-from rendering.signals import with_approach
+from rendering.following import Array, Tracking, tracking, with_approach
 from tormagd.ctl.operate import home, operate
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.recording.reader import Columns, RecordingError, read_recording

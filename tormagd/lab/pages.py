@@ -41,13 +41,6 @@ def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     return "".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |\n" for line in lines)
 
 
-def aligned(rows: Iterable[Iterable[str]]) -> list[str]:
-    """The same for a terminal: columns side by side."""
-    lines = [list(row) for row in rows]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
-
-
 def percent(share: float) -> str:
     """To a tenth."""
     return f"{100 * share:.1f}%"

@@ -160,8 +160,7 @@ def run(options: argparse.Namespace) -> Found:
             virtual_session(options.seconds, log.to_device, log.to_host)
         else:
             _tap_until_stopped(options.port, options.baud, log)
-    told = {"file": str(options.file), "frames": log.frames, "damaged": log.damaged}
-    return Found(told, [f"{options.file}: {log.frames} frames, {log.damaged} damaged stretches"])
+    return Found({"file": str(options.file), "frames": log.frames, "damaged": log.damaged})
 
 
 def _tap_until_stopped(path: str, baud: int, log: WireLog) -> None:

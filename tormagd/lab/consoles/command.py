@@ -21,7 +21,7 @@ from tormagd.lab.consoles.reading import SUFFIX, files, read_all
 from tormagd.lab.consoles.summary import Summary
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
-from tormagd.lab.pages import aligned
+from tormagd.lab.told import table
 from tormagd.output import printable, write_line
 
 HEADINGS = ("device", "insert", "files", "enabled", "RMS, worst mN", "trim", "current A", "clock ppm", "held back by")
@@ -103,4 +103,5 @@ def run(options: argparse.Namespace) -> Found:
         exit_code = 2
     found = consoles(fleet.summaries.values())
     result = {"consoles": found, "recordings": fleet.summaries, "left_out": fleet.left_out}
-    return Found(msgspec.to_builtins(result), aligned([HEADINGS, *map(_cells, found)]), exit_code)
+    rows = (dict(zip(HEADINGS, _cells(console), strict=True)) for console in found)
+    return Found(msgspec.to_builtins(result), table(rows), exit_code)

@@ -5,7 +5,6 @@ k-nearest search decide, on the shipped models.
 """
 
 import argparse
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,7 @@ from tormagd.lab.tactile import branches
 from tormagd.lab.tactile.models import FULL, QUICK, Effort, Trained, table_4_1, train
 from tormagd.lab.tactile.plots import Material
 from tormagd.lab.tactile.pulse import hold, pulse
-from tormagd.lab.tactile.report import write_report
-from tormagd.lab.thesis.page import WAYS
+from tormagd.lab.tactile.report import sections, write_report
 from tormagd.lab.training.dataset import Array
 
 NOISES_N = (0.05, 0.5)
@@ -70,29 +68,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """The figures; with --out also the page. Raises LabError where that has no folder."""
+    """The figures, for a person as the page; with --out it is written. Raises LabError where that has no folder."""
     if options.branches:
-        found = branches.measured()
-        return Found(found, branches.lines(found))
+        return Found(branches.measured())
     if options.out is not None and not options.out.is_dir():
         raise LabError(f"cannot write to {options.out}: not a directory")
     figures, material = whole(QUICK if options.quick else FULL)
     if options.out is not None:
         write_report(options.out, figures, material)
-    return Found(figures, summary(figures))
-
-
-def summary(figures: dict[str, Any]) -> Iterator[str]:
-    """The figures for a person."""
-    table, scores = figures["table_4_1"], figures["pulse"]
-    yield "synthetic data"
-    yield "random split: R2 {r2:.4f}, MAE {mae_N:.3f} N, noise alone {noise_mae_N:.3f} N".format(**table["random"])
-    for name in ("leave_one_field_out", "leave_one_class_out", "leave_cycles_out"):
-        yield f"{name}: R2 {table[name]['r2']:.4f}, MAE {table[name]['mae_N']:.3f} N"
-    for noise, part in scores["by_noise"].items():
-        for name in WAYS:
-            yield f"pulse, noise {noise} N, {name}: {part[name]['mae_mT']:.2f} mT mean, {part[name]['max_mT']:.2f} max"
-        yield f"pulse, noise {noise} N, the noise alone: {part['noise_bound_mae_mT']:.2f} mT mean"
-    for name in ("without", "with"):
-        held = scores["hold"][name]
-        yield f"hold {name} relaxation: {held['force_error_10min']:.2%} in 10 min, {held['force_error_1h']:.2%} in all"
+    return Found(figures, sections(figures))

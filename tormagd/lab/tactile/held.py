@@ -205,13 +205,4 @@ def run(options: argparse.Namespace) -> Found:
     figures = {"synthetic": True, "force_N": FORCE_N, "holds": holds}
     if options.picture is not None:
         draw(options.picture, figures)
-    return Found(figures, map(_line, holds))
-
-
-def _line(held: dict[str, Any]) -> str:
-    return (
-        f"{held['plant']}  {'with' if held['relaxation'] else 'without':8}relaxation, "
-        f"{'learning' if held['is_learning'] else 'frozen':9} worst {held['force_error']:6.2%}, "
-        f"mean {held['mean_force_error']:6.2%}, last {held['last_force_error']:+6.2%} after {held['held_s']} s"
-        f"{held['fault'] and ': ' + held['fault']}"
-    )
+    return Found(figures)

@@ -89,6 +89,4 @@ def run(options: argparse.Namespace) -> Found:
     torch.set_num_threads(1)
     model = trained(options.plant, QUICK if options.quick else FULL, options.created or datetime.date.today())
     save_model(options.out, model)
-    metrics = model.metadata.metrics
-    lines = [f"{name:24}{value:.5g}" for name, value in metrics.items()]
-    return Found({"out": str(options.out), **metrics}, [*lines, str(options.out)])
+    return Found({"out": str(options.out), **model.metadata.metrics})

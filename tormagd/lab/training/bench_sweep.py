@@ -81,8 +81,7 @@ def run(options: argparse.Namespace) -> Found:
     data = record(options.plant, options.scene, options.seed)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     write_csv(options.out, data)
-    told = f"{len(data)} rows in {options.out} (synthetic: plant {options.plant}, seed {options.seed})"
-    return Found({"out": str(options.out), "rows": len(data), "synthetic": True}, [told])
+    return Found({"out": str(options.out), "rows": len(data), "synthetic": True})
 
 
 def record(plant: str, scene_name: str, seed: int) -> Dataset:

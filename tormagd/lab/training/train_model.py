@@ -6,7 +6,6 @@ tormag-lab train-model DATA.csv --element torque --insert MRE-50-40 --out FILE.s
 import argparse
 import datetime
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 from tqdm import tqdm
@@ -56,7 +55,7 @@ def run(options: argparse.Namespace) -> Found:
     if options.plot is not None:
         plot_convergence(options.plot, training)
     report = {"out": str(options.out), "data_sha256": model.metadata.training_data_sha256, **model.metadata.metrics}
-    return Found({**report, "stopped_by": training.stopped_by}, [*lines(model, training), str(options.out)])
+    return Found({**report, "stopped_by": training.stopped_by})
 
 
 def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Training]:
@@ -96,20 +95,6 @@ def memory_line(memory: Memory) -> str:
     terms = zip(memory.fractions, memory.times_s, strict=True)
     relaxing = ", ".join(f"{fraction:.1%} in {time_s:.0f} s" for fraction, time_s in terms)
     return f"taken out: relaxation of {relaxing}; a field {memory.lag_mT:.1f} mT behind"
-
-
-def lines(model: ForceModel, training: Training) -> Iterator[str]:
-    """The metrics for a person."""
-    metrics = model.metadata.metrics
-    yield f"{'':12}{'R2':>9}{'MAE N':>9}{'MAE %':>8}{'RMSE N':>9}{'max N':>8}{'rows':>8}"
-    for part in ("train", "validation"):
-        values = {name.removeprefix(f"{part}_"): value for name, value in metrics.items()}
-        yield (
-            f"{part:12}{values.get('r2', float('nan')):9.5f}{values['mae_N']:9.4f}{values['mae_percent']:8.2f}"
-            f"{values['rmse_N']:9.4f}{values['max_N']:8.3f}{values['rows']:8.0f}"
-        )
-    yield f"kept epoch {training.best.epoch} of {len(training.history)}, stopped by {training.stopped_by}"
-    yield f"dF/dB <= 0 on {100 * metrics['not_rising_share']:.2f}% of the training box"
 
 
 def plot_convergence(path: Path, training: Training) -> None:
