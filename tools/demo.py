@@ -17,7 +17,7 @@ from typing import Any
 
 import msgspec
 from machines.host import Host
-from rendering.following import Array, Case, Rehearsals, Tracking, rehearse
+from rendering.following import Case, Rehearsals, Tracking, rehearse
 from rendering.show import (
     LEAST_N,
     MOST_N,
@@ -32,6 +32,7 @@ from rendering.show import (
 )
 
 from tormagd.config import Config, ConfigError
+from tormagd.lab.arrays import Array
 from tormagd.scenes.scene import Scene, load_scene
 
 SHOWS = 3

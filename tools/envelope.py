@@ -20,14 +20,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from rendering.device_draws import SAMPLES, device, judging
-from rendering.following import CORNER_SCENE, VALID_S, Array, Followed, Levels, armed_at_rest, asked_at, follow
+from rendering.following import CORNER_SCENE, VALID_S, Followed, Levels, armed_at_rest, asked_at, follow
 from rendering.hands import HANDS, TURNED_MM_S
-from rendering.ideal_carriage import Json, brake_of
+from rendering.ideal_carriage import brake_of
 from tqdm import tqdm
 
 from tormagd.control.governor import TimedSetpoint
+from tormagd.lab.arrays import Array, Json, Mask
 from tormagd.lab.pages import stamp
 from tormagd.lab.told import lines
 from tormagd.model.displacement import MOBILISED_MM
@@ -190,7 +190,7 @@ def lasted_s(is_same: Iterable[bool]) -> Array:
     return np.array(lasted)
 
 
-def sliding(handle_mm: Array, speed_mm_s: Array) -> npt.NDArray[np.bool_]:
+def sliding(handle_mm: Array, speed_mm_s: Array) -> Mask:
     """Where the handle has gone SLIDING_MM since it turned, and moves."""
     found, turned_mm, direction = np.zeros(len(handle_mm), dtype=np.bool_), float(handle_mm[0]), 0.0
     for index, (position, speed) in enumerate(zip(handle_mm.tolist(), speed_mm_s.tolist(), strict=True)):

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 from rendering import cases
 from rendering.device_draws import SAMPLES, judging
-from rendering.ideal_carriage import Json
 from tqdm import tqdm
 
+from tormagd.lab.arrays import Json
 from tormagd.lab.told import lines
 
 DRAWS = 40

@@ -21,7 +21,6 @@ from benchmarks import inverse_report as report
 from benchmarks.inverse_workload import (
     CIP_PERCENT,
     FIELDS_MT,
-    Array,
     Course,
     course,
     network_roots_mT,
@@ -34,6 +33,7 @@ from tormagd.inverse.choice import build, named
 from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
 from tormagd.inverse.scan import FieldScan
 from tormagd.inverse.solution import FieldSolver
+from tormagd.lab.arrays import Array
 from tormagd.model.model_file import ForceModel
 from tormagd.model.rising import falling_at
 from tormagd.scenes.scene import AUTO, load_scene, shipped_scenes

@@ -8,9 +8,9 @@ import datetime
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from tormagd.control.portrait import FieldOfGap
+from tormagd.lab.arrays import Array
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.fitting import fit_model
 from tormagd.model.features import Element
@@ -21,8 +21,6 @@ from tormagd.physics.friction import Friction
 from tormagd.physics.inserts import insert
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import radial_moment_Tm
-
-Array = npt.NDArray[np.float64]
 
 INSERT = insert("MRE-50-40")
 CIP_PERCENT = 100.0 * INSERT.cip_fraction

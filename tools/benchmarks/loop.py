@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import uvloop
 import zmq
 from machines.host import processor_s
@@ -41,13 +40,12 @@ from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
 from tormagd.daemon.telemetry_loop import SERVED_BEFORE_NS
 from tormagd.headroom.bare_timer import beat
+from tormagd.lab.arrays import Array
 from tormagd.recording.ticks import decode_ticks
 from tormagd.simulation.device import DEFAULT_BAUD
 from tormagd_client import Client, ClientError
 from tormagd_client.messages import Request
 from tormagd_client.wire import keys_of, opened
-
-Array = npt.NDArray[np.float64]
 
 LOG = "tormagd.log"
 "What the daemon says, in its folder."

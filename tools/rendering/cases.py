@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from rendering.device_draws import SAMPLES, device
 from rendering.following import (
@@ -31,19 +30,19 @@ from rendering.following import (
     with_approach,
 )
 from rendering.hands import TURNED_MM_S, Legs
-from rendering.ideal_carriage import Bound, Json, asked_of, bound, brake_of, drive_of, no_delay_mm
+from rendering.ideal_carriage import Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
 from tormagd.config import Config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import NOTHING_SHOWN, Shown
 from tormagd.control.profile import profile_of
+from tormagd.lab.arrays import Array, Json
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene, terms_of
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters
 
-Array = npt.NDArray[np.float64]
 Kept = dict[str, Followed]
 "Runs that the picture shows, by part and device."
 

@@ -19,14 +19,14 @@ agrees to 0.4 % (`tests/tools/test_bound.py`).
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import clarabel
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
 from rendering.hands import TURNED_MM_S
+from tormagd.lab.arrays import Array, Json
 from tormagd.physics.errors import DomainError, require
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
@@ -34,9 +34,6 @@ from tormagd.simulation.curve import Curve
 from tormagd.simulation.gap_field import SMALLEST_GAP_MM
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import MOMENT_POINTS, force_over_moment, pull_over_gap, radial_moment_Tm
-
-Array = npt.NDArray[np.float64]
-Json = dict[str, Any]
 
 STEP_S = 1e-3
 MOST_N = 2.0

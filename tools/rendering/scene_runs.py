@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from tqdm import tqdm
 
-from rendering.following import FILE_PREVIEW_S, Array, publisher
+from rendering.following import FILE_PREVIEW_S, publisher
 from rendering.hands import swinging
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, Rates
@@ -26,6 +26,7 @@ from tormagd.control.core import Core, build_core
 from tormagd.control.estimate import Estimate
 from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import Planner, PlanState
+from tormagd.lab.arrays import Array
 from tormagd.scenes.measured import Cost
 from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Solver, load_task, scene_path, terms_of
 from tormagd.scenes.signal import asked

@@ -22,8 +22,9 @@ from machines.host import Host, HostWatch
 from machines.own import own_machine
 from machines.wire import carried
 
-from rendering.following import Array, Tracking, tracking, with_approach
+from rendering.following import Tracking, tracking, with_approach
 from tormagd.ctl.operate import home, operate
+from tormagd.lab.arrays import Array
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.recording.reader import Columns, RecordingError, read_recording
 from tormagd.safety.codes import FAULTS, Fault

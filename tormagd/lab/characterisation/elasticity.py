@@ -10,9 +10,9 @@ from itertools import combinations
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 
+from tormagd.lab.arrays import Array
 from tormagd.lab.characterisation.hyperelastic import (
     MAX_EXPONENT,
     MAX_STRETCH,
@@ -26,7 +26,6 @@ from tormagd.lab.characterisation.hyperelastic import (
 from tormagd.lab.errors import LabError
 from tormagd.physics.errors import FloatArray, require
 
-Array = NDArray[np.float64]
 Law = TypeVar("Law", NeoHookean, Ogden, ThesisOgden)
 Shape = Callable[[FloatArray, float], FloatArray]
 

@@ -20,16 +20,15 @@ from typing import Any, Literal, TypeAlias
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import Bounds, NonlinearConstraint, OptimizeResult, differential_evolution, minimize
 
+from tormagd.lab.arrays import Array
 from tormagd.lab.design.brake import Brake
 from tormagd.lab.design.phase_portrait import PhasePortrait, Region
 from tormagd.physics.errors import DomainError, require
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import Elastomer, Geometry, max_radial_moment_Tm
 
-Array = npt.NDArray[np.float64]
 Measure: TypeAlias = Literal["trapezoid", "true", "corners"]
 """Coverage by the thesis's trapezoid, coverage by the true boundary, or the thesis's cost of corner distances."""
 Solver: TypeAlias = Literal["local", "global"]

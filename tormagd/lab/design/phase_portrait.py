@@ -13,12 +13,10 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
+from tormagd.lab.arrays import Mask
 from tormagd.lab.design.brake import Brake
 from tormagd.physics.errors import DomainError, FloatArray, require
-
-Mask = npt.NDArray[np.bool_]
 
 MAX_FORCE_N = 1e6
 MAX_RATE_N_S = 1e9

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.lab.tactile import branches
@@ -18,7 +19,6 @@ from tormagd.lab.tactile.models import FULL, QUICK, Effort, Trained, table_4_1, 
 from tormagd.lab.tactile.plots import Material
 from tormagd.lab.tactile.pulse import hold, pulse
 from tormagd.lab.tactile.report import sections, write_report
-from tormagd.lab.training.dataset import Array
 
 NOISES_N = (0.05, 0.5)
 TABLE_NOISE_N = 0.5

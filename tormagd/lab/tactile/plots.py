@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from tormagd.lab.arrays import Array
 from tormagd.lab.tactile.models import SCORED_SLOPE_N_MT
 from tormagd.lab.tactile.pads import PadRecord
-from tormagd.lab.training.dataset import Array
 
 CLASSES = {25.0: "MRE-A, 25 %", 35.0: "MRE-B, 35 %", 45.0: "MRE-C, 45 %"}
 SHOWN_FIELDS = (0, 3, 6, 10)

@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tormagd.inverse.linear import LinearFieldSearch
 from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.solution import FieldSolver, Reach
+from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.lab.tactile.models import PAD_IN_USE, SCORED_SLOPE_N_MT, Effort, Trained, plant_force_N, slope_N_per_mT
 from tormagd.lab.tactile.pads import PADS, drawn_pad
-from tormagd.lab.training.dataset import Array
 from tormagd.lab.training.grey_box import GreyBoxMemory
 from tormagd.model.model_file import ForceModel
 from tormagd.simulation.pad import worked_pad
@@ -119,7 +118,7 @@ class Course(NamedTuple):
     dt_s: float
 
     @property
-    def scored(self) -> NDArray[np.bool_]:
+    def scored(self) -> Mask:
         """Rows (n, bool) where the force says something about the field."""
         return self.slope_N_mT >= SCORED_SLOPE_N_MT
 

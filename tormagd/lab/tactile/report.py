@@ -2,14 +2,12 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
+from tormagd.lab.arrays import Json
 from tormagd.lab.pages import table, write_page
 from tormagd.lab.tactile.plots import Material, pictures
 from tormagd.lab.thesis.page import WAYS
 from tormagd.lab.thesis.values import PULSE_MAE_MT, PULSE_MAX_MT, PULSE_SD_MT
-
-Json = dict[str, Any]
 
 
 def write_report(folder: Path, figures: Json, material: Material) -> None:

@@ -2,14 +2,13 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
+from tormagd.lab.arrays import Json
 from tormagd.lab.pages import percent, table, write_page
 from tormagd.lab.thesis.step_test import StepTest
 from tormagd.lab.thesis.table_2_5 import COLUMNS, readings
 from tormagd.lab.thesis.values import PULSE_MAE_MT, PULSE_MAX_MT, PULSE_SD_MT, TABLE_4_1
 
-Json = dict[str, Any]
 OBJECTIVES = ("trapezoid", "true", "true_thesis_speed")
 WAYS = {
     "mlp": "network alone",

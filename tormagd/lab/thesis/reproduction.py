@@ -8,11 +8,11 @@ import argparse
 import os
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
+from tormagd.lab.arrays import Json
 from tormagd.lab.design.brake import Brake
 from tormagd.lab.design.optimisation import Design, Outcome, Problem, Run, coverage
 from tormagd.lab.design.phase_portrait import PhasePortrait
@@ -38,8 +38,6 @@ from tormagd.lab.told import table
 from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
 from tormagd.physics.force import TORMAG, Elastomer
 from tormagd.physics.inserts import INSERTS, Insert, insert
-
-Json = dict[str, Any]
 
 CONTROLLER_SPEED_MM_S = 40.0
 "Gap speed of two carriages at 150 rpm on 8 mm screws; the controller's own, once measured, goes in with --gap-speed."

@@ -8,19 +8,17 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import load_config
 from tormagd.control.plan import Plan
 from tormagd.control.step import Stepper
+from tormagd.lab.arrays import Array
 from tormagd.physics.inserts import Insert
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
-
-Array = npt.NDArray[np.float64]
 
 GAPS_MM = (94.5, 85.0, 75.0, 65.0, 55.0, 45.5)
 "The thesis's steps; the first and the last stay half a millimetre clear of the end stops."

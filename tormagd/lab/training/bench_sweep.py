@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from tqdm import tqdm
 
 from tormagd.closed_loop import ClosedLoop
@@ -25,8 +24,9 @@ from tormagd.config import load_config
 from tormagd.control.plan import Plan
 from tormagd.control.portrait import FieldOfGap
 from tormagd.control.step import Stepper
+from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.main import Found
-from tormagd.lab.training.dataset import Array, Dataset, write_csv
+from tormagd.lab.training.dataset import Dataset, write_csv
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.inserts import insert
@@ -137,7 +137,7 @@ def swept(plant: str, scene_name: str, course: Course) -> Array:
     return np.column_stack((time_s[kept], np.abs(rate_mm_s[kept]), field_mT, along_N))
 
 
-def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
     """The handle's rate, mm/s, at each tick, and where it has slid steadily, at a steady gap, for long enough."""
     rate_mm_s, is_even = _even(handle_mm)
     _, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
@@ -156,7 +156,7 @@ def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, npt.NDArray[np.bool
     return rate_mm_s, slides
 
 
-def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array, npt.NDArray[np.bool_]]:
+def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array, Mask]:
     """Rate over a window around each tick, mm/s, and whether it is the same in both halves of the window."""
     gone = (position_mm[RATE_TICKS:] - position_mm[:-RATE_TICKS]) / RATE_TICKS * 1e3
     edge = np.zeros(RATE_TICKS)

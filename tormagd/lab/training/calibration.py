@@ -21,9 +21,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 import numpy as np
 
+from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError, not_installed
 from tormagd.lab.tables import read_columns
-from tormagd.lab.training.dataset import Array, Dataset, write_csv
+from tormagd.lab.training.dataset import Dataset, write_csv
 from tormagd.lab.training.metrics import fit_metrics
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, displacement
 from tormagd.model.features import FEATURES, FIELD, Element

@@ -4,16 +4,14 @@ import csv
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.errors import LabError
 from tormagd.lab.tables import read_columns
 from tormagd.model.features import FEATURES
-
-Array: TypeAlias = NDArray[np.float64]
 
 COLUMNS = (*FEATURES, "force_N")
 OPTIONAL_COLUMNS = ("cycle", "time_s")
@@ -72,9 +70,9 @@ class Dataset:
             array.setflags(write=False)
             object.__setattr__(self, name, array)
 
-    def columns(self) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]:
+    def columns(self) -> dict[str, Array | NDArray[np.int64]]:
         """Return each column by its name, as in the file; the optional ones only where they exist."""
-        columns: dict[str, NDArray[np.float64] | NDArray[np.int64]] = dict(zip(FEATURES, self.features.T, strict=True))
+        columns: dict[str, Array | NDArray[np.int64]] = dict(zip(FEATURES, self.features.T, strict=True))
         columns["force_N"] = self.force_N
         if self.cycle is not None:
             columns["cycle"] = self.cycle
@@ -98,7 +96,7 @@ class Dataset:
             digest.update(column.astype(column.dtype.newbyteorder("<")).tobytes())
         return digest.hexdigest()
 
-    def subset(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> "Dataset":
+    def subset(self, rows: NDArray[np.integer] | Mask) -> "Dataset":
         """Return the chosen rows (indices or a mask)."""
         cycle = None if self.cycle is None else self.cycle[rows]
         time_s = None if self.time_s is None else self.time_s[rows]

@@ -7,10 +7,11 @@ import msgspec
 import numpy as np
 import torch
 
+from tormagd.lab.arrays import Mask
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.levenberg_marquardt import Epoch, Training, train
 from tormagd.lab.training.metrics import fit_metrics
-from tormagd.lab.training.splits import Mask, random_split
+from tormagd.lab.training.splits import random_split
 from tormagd.model.features import Element, Scaling
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelMetadata

@@ -10,18 +10,15 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.memory import records, relaxed_N
-from tormagd.lab.training.splits import Mask
 from tormagd.model.features import FEATURES, FIELD
 from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.physics.relaxation import PronySeries
-
-Array = NDArray[np.float64]
 
 RATE = FEATURES.index("rate_mm_s")
 START_TIMES_S = (1.0, 10.0, 100.0, 1000.0)

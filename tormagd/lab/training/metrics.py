@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from tormagd.lab.training.dataset import Array, Dataset
+from tormagd.lab.arrays import Array
+from tormagd.lab.training.dataset import Dataset
 from tormagd.model.model_file import ForceModel
 
 

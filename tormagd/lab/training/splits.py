@@ -3,13 +3,11 @@
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tormagd.lab.arrays import Mask
 from tormagd.lab.errors import LabError
 from tormagd.lab.training.dataset import Dataset
 from tormagd.model.features import FEATURES
-
-Mask = NDArray[np.bool_]
 
 TEST_SHARE = 0.3
 """Of the thesis: 70 : 30."""
