@@ -9,7 +9,7 @@ import pytest
 from tormagd.lab.main import main
 from tormagd.lab.tactile import experiment, models, report
 from tormagd.lab.tactile.pads import PADS
-from tormagd.lab.tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_shape, recorded_shapes
+from tormagd.lab.tactile.pulse import HELD_S, RATE_HZ, course, program, pulse_shape
 from tormagd.lab.thesis.page import pulse_experiment, table_4_1
 
 
@@ -80,18 +80,6 @@ def test_without_heartpy_the_pulse_is_synthetic_and_says_so(monkeypatch):
     assert (shape.min(), shape.max()) == (0.0, 1.0)
     spectrum = np.abs(np.fft.rfft(shape - shape.mean()))
     assert np.fft.rfftfreq(len(shape), 0.01)[spectrum.argmax()] == pytest.approx(1.2)
-
-
-def test_arterial_pulses_are_read_where_the_recordings_are(recordings, monkeypatch):
-    monkeypatch.setenv("TORMAG_DATA", str(recordings))
-    shapes = recorded_shapes(10.0, 160)
-    assert shapes
-    for shape in shapes.values():
-        assert len(shape) == 1600
-        assert (shape.min(), shape.max()) == (0.0, 1.0)
-        assert np.abs(np.diff(shape)).max() < 0.25
-    monkeypatch.delenv("TORMAG_DATA")
-    assert recorded_shapes(10.0, 160) == {}
 
 
 def test_the_program_is_the_thesis_s():

@@ -13,7 +13,6 @@ import fsspec
 import msgspec
 import pyarrow
 import pyarrow.parquet
-from tqdm import tqdm
 
 from tormagd.lab import executors
 from tormagd.lab.consoles.devices import Console, Drift, consoles
@@ -89,9 +88,8 @@ def run(options: argparse.Namespace) -> Found:
         raise LabError(str(error)) from error
     if not urls:
         raise LabError(f"{options.recordings}: no {SUFFIX} in it; `tormagctl record` makes them")
-    bar = tqdm(total=len(urls), unit="recording", disable=None)
-    with executors.chosen(options) as executor, bar:
-        fleet = read_all(urls, executor, lambda finished, total: bar.update(finished - bar.n))
+    with executors.chosen(options) as executor:
+        fleet = read_all(urls, executor)
     for name, reason in fleet.left_out.items():
         write_line(f"tormag-lab fleet: left out {printable(name)}: {printable(reason)}", sys.stderr)
     exit_code = 1 if fleet.left_out else 0

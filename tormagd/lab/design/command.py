@@ -9,7 +9,6 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from tqdm import tqdm
 
 from tormagd.config import Position
 from tormagd.lab import executors
@@ -40,10 +39,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> Found:
     """The optima, best first. Raises DomainError, OSError."""
-    runs = _runs(options)
-    bar = tqdm(total=len(runs), unit="run", disable=None)
-    with executors.chosen(options) as executor, bar:
-        outcomes = sweep(runs, executor, options.state, lambda done, total: bar.update(done - bar.n))
+    with executors.chosen(options) as executor:
+        outcomes = sweep(_runs(options), executor, options.state)
     ranked = sorted(outcomes.items(), key=lambda item: _merit(options.measure, item[1]))
     rows = [
         msgspec.to_builtins(each) | {"coverage_as_made": coverage_as_made(run.problem, each.design, 0.01 * options.off)}

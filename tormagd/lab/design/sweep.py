@@ -5,11 +5,12 @@ Each outcome is written as it comes, so that a sweep that was stopped goes on wh
 another region, bound or seed it is another run, and never takes an old outcome.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import Executor, as_completed
 from pathlib import Path
 
 import msgspec
+from tqdm import tqdm
 
 from tormagd.bounded_file import read_bounded
 from tormagd.lab.design.optimisation import Outcome, Run, solve
@@ -28,26 +29,23 @@ def sweep(
     runs: Iterable[Run],
     executor: Executor,
     state: Path | None = None,
-    progress: Callable[[int, int], object] = lambda finished, total: None,
 ) -> dict[Run, Outcome]:
     """The outcome of every run, in the order of the runs; a run that stands twice is solved once.
 
-    `progress(finished, total)` is called at the start and after each run. With `state`, outcomes found in that file are
-    taken from it and new ones are added. Raises `DomainError` for a state file that is not one (it is left as it is)
-    and whatever a run raised; runs that have not begun are then given up, finished ones stay in the file.
+    With `state`, outcomes found in that file are taken from it and new ones are added. Raises `DomainError` for a state
+    file that is not one (it is left as it is) and whatever a run raised; runs that have not begun are then given up,
+    finished ones stay in the file.
     """
     wanted = list(dict.fromkeys(runs))
     known = {} if state is None else read_state(state)
     outcomes = {run: known[run] for run in wanted if run in known}
-    progress(len(outcomes), len(wanted))
     pending = {executor.submit(solve, run): run for run in wanted if run not in outcomes}
     try:
-        for future in as_completed(pending):
+        for future in tqdm(as_completed(pending), total=len(pending), desc="optimisation", unit="run", disable=None):
             outcome = future.result()
             outcomes[pending[future]] = known[pending[future]] = outcome
             if state is not None:
                 _write_state(state, known)
-            progress(len(outcomes), len(wanted))
     finally:
         for future in pending:
             future.cancel()

@@ -1,8 +1,6 @@
 """The pulse experiment of section 4.3 on the synthetic pad, and pulses rendered on a pad held for an hour."""
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,18 +55,6 @@ def pulse_shape(duration_s: float, rate_hz: int) -> tuple[Array, str]:
         phase = (np.arange(round(duration_s * rate_hz)) / rate_hz * 1.2) % 1.0
         beats = np.exp(-(((phase - 0.2) / 0.08) ** 2)) + 0.4 * np.exp(-(((phase - 0.5) / 0.12) ** 2))
         return (beats - beats.min()) / np.ptp(beats), "synthetic beats (heartpy is not installed)"
-
-
-def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
-    """Measured arterial pulses between 0 and 1, by their file's name; none unless TORMAG_DATA names their folder."""
-    folder = os.environ.get("TORMAG_DATA")
-    shapes = {}
-    for path in sorted(Path(folder, "aac_nibp_pulse").glob("*.csv")) if folder else ():
-        time_s, pressure = np.loadtxt(path, delimiter=",", skiprows=1, unpack=True)
-        # six beats that end as they began
-        looped = np.interp(np.arange(round(duration_s * rate_hz)) / rate_hz, time_s, pressure, period=time_s[-1])
-        shapes[path.stem] = (looped - looped.min()) / np.ptp(looped)
-    return shapes
 
 
 def program(shape: Array) -> Program:
@@ -177,19 +163,15 @@ def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str,
 
 
 def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any], dict[str, Array]]:
-    """The contract's `pulse`: the quieter sensor on top, each sensor below; other pads and other pulses beside."""
+    """The contract's `pulse`: the quieter sensor on top, each sensor below; other pads beside."""
     shape, source = pulse_shape(HELD_S, RATE_HZ)
     pad, every = PADS[PAD_IN_USE], effort.pulse_every
     own = course(pad, shape, every)
     strangers = [course(drawn_pad(pad, seed), shape, every) for seed in OTHER_PADS]
-    recorded = {name: course(pad, other, every) for name, other in recorded_shapes(HELD_S, RATE_HZ).items()}
     by_noise, all_traces = {}, []
     for trained in trainings:
         scores, traces = pulse_on(own, trained)
         scores["other_pads"] = [along.scores(aware_fields(trained, along, along.force_N)) for along in strangers]
-        scores["other_pulses"] = {
-            name: along.scores(aware_fields(trained, along, along.force_N)) for name, along in recorded.items()
-        }
         by_noise[str(trained.noise_N)] = scores
         all_traces.append(traces)
     top = by_noise[str(trainings[0].noise_N)]

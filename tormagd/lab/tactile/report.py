@@ -98,7 +98,6 @@ def _pulse(pulse: Json) -> str:
         named += [
             (f"with relaxation, other pad {index}", part) for index, part in enumerate(scores["other_pads"], start=1)
         ]
-        named += [(f"with relaxation, arterial pressure {name}", part) for name, part in scores["other_pulses"].items()]
         rows += [
             (
                 noise,

@@ -40,7 +40,7 @@ class Effort(NamedTuple):
     settling_epochs: int
 
 
-FULL, QUICK = Effort(175, 1500, 100, 30), Effort(24, 200, 12, 4)
+FULL = Effort(175, 1500, 100, 30)
 
 
 def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceModel:
@@ -80,13 +80,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of `tormag-lab tactile-model`."""
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.safetensors")
     parser.add_argument("--plant", default="pad_1", help="whose pad is on the bench (default: pad_1)")
-    parser.add_argument("--quick", action="store_true", help="few rows and epochs: shows that it runs, not how well")
     parser.add_argument("--created", type=datetime.date.fromisoformat, help="date in the file (default: today)")
 
 
 def run(options: argparse.Namespace) -> Found:
     """Trains and writes; the metrics."""
     torch.set_num_threads(1)
-    model = trained(options.plant, QUICK if options.quick else FULL, options.created or datetime.date.today())
+    model = trained(options.plant, FULL, options.created or datetime.date.today())
     save_model(options.out, model)
     return Found({"out": str(options.out), **model.metadata.metrics})

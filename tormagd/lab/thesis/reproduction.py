@@ -10,7 +10,6 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from tormagd.lab.arrays import Json
 from tormagd.lab.design.brake import Brake
@@ -69,8 +68,7 @@ def run(options: argparse.Namespace) -> Found:
         learned = pool.submit(reproduced, QUICK if options.quick else FULL)
         steps = [pool.submit(step_test, insert(name), options.seed) for name in STEP_INSERTS]
         runs = table_3_2_runs(options.gap_speed, options.seed, starts=1 if options.quick else None)
-        with tqdm(total=len(runs), desc="optimisation", unit="run", disable=None) as bar:
-            outcomes = sweep(runs.values(), pool, options.state, lambda done, total: bar.update(done - bar.n))
+        outcomes = sweep(runs.values(), pool, options.state)
         tests = [step.result() for step in steps]
         chapter_4 = learned.result()
     result = {

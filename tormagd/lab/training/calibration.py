@@ -16,7 +16,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -32,9 +32,6 @@ from tormagd.model.model_file import ForceModel, save_model
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw, flux_density_T
 from tormagd.physics.inserts import Insert, insert
-
-if TYPE_CHECKING:
-    from tormagd.lab.training.levenberg_marquardt import Epoch
 
 COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 """Of a sweep file: times of one device, the number of the sweep, the measured gap, the handle's travel at the roller,
@@ -158,8 +155,6 @@ def noise_sd_N(data: Dataset) -> float:
 def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int = 50, epochs: int = 200) -> ForceModel:
     """A model from all sweeps but the judging ones, with the judgement in its metrics. Raises CalibrationError
     (poor_fit, not_rising) where it is not good enough to be used."""
-    from tqdm import tqdm
-
     from tormagd.lab.training.fitting import (
         fit_model,  # with torch, two seconds: whatever is refused is told without it
     )
@@ -168,23 +163,16 @@ def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int 
     numbers = np.unique(data.cycle)
     is_judging = np.isin(data.cycle, numbers[JUDGING[1] :: JUDGING[0]])
     training, validation = data.subset(~is_judging).split(VALIDATION_SHARE, seed=0)
-    with tqdm(total=epochs, desc="fit", unit="epoch", disable=not sys.stderr.isatty(), leave=False) as bar:
-
-        def show(epoch: "Epoch") -> None:
-            bar.set_postfix_str(f"{epoch.validation_rmse_N:.4f} N rms")
-            bar.update()
-
-        model, _ = fit_model(
-            training,
-            validation,
-            element=Element.TORQUE,
-            insert=insert_name,
-            data_sha256=data.sha256(),
-            created=created,
-            hidden=hidden,
-            epochs=epochs,
-            progress=show,
-        )
+    model, _ = fit_model(
+        training,
+        validation,
+        element=Element.TORQUE,
+        insert=insert_name,
+        data_sha256=data.sha256(),
+        created=created,
+        hidden=hidden,
+        epochs=epochs,
+    )
     judging = data.subset(is_judging)
     found = fit_metrics(model, judging)
     noise_mae_N = MEAN_OVER_SIGMA * noise_sd_N(data)

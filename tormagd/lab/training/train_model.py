@@ -8,13 +8,11 @@ import datetime
 import sys
 from pathlib import Path
 
-from tqdm import tqdm
-
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.lab.training.dataset import Dataset, read_csv
 from tormagd.lab.training.fitting import fit_model
-from tormagd.lab.training.levenberg_marquardt import Epoch, Training
+from tormagd.lab.training.levenberg_marquardt import Training
 from tormagd.lab.training.unremembered import identify
 from tormagd.model.features import Element
 from tormagd.model.memory import NO_MEMORY, Memory
@@ -64,26 +62,17 @@ def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Trainin
     if options.without_memory:
         memory, data = identify(data)
         write_line(memory_line(memory), sys.stderr)
-    training_data, validation_data = data.split(options.validation_share, options.seed)
-    with tqdm(total=options.epochs, unit="epoch", disable=None, leave=False) as bar:
-
-        def show(epoch: Epoch) -> None:
-            bar.set_postfix_str(f"train {epoch.train_rmse_N:.4f} N, validation {epoch.validation_rmse_N:.4f} N rms")
-            bar.update()
-
-        model, training = fit_model(
-            training_data,
-            validation_data,
-            element=options.element,
-            insert=options.insert,
-            data_sha256=data_sha256,
-            created=options.created or datetime.date.today(),
-            memory=memory,
-            hidden=options.hidden,
-            epochs=options.epochs,
-            seed=options.seed,
-            progress=show,
-        )
+    model, training = fit_model(
+        *data.split(options.validation_share, options.seed),
+        element=options.element,
+        insert=options.insert,
+        data_sha256=data_sha256,
+        created=options.created or datetime.date.today(),
+        memory=memory,
+        hidden=options.hidden,
+        epochs=options.epochs,
+        seed=options.seed,
+    )
     share = model.metadata.metrics["not_rising_share"]
     if options.rising and share > 0.0:
         raise DomainError("not_rising_share", share, "0: train with other hidden units, another seed or more data")
