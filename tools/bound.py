@@ -3,7 +3,7 @@
     bound.py FORCE.csv [--plant sample_1] [--held] [--json]
 
 The CSV has the columns `t_s,force_N`. *Without delay* the carriages know the force asked now and how fast it changes;
-*with foresight* all of it (`tools/rendering/ideal_carriage.py`).
+*with foresight* all of it (`tormagd/lab/ideal_carriage.py`).
 """
 
 import argparse
@@ -12,10 +12,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from rendering.hands import TURNED_MM_S
-from rendering.ideal_carriage import MOST_N, STEP_S, bound
 
 from tormagd.force_file import ForceFileError, read_forces
+from tormagd.lab.ideal_carriage import MOST_N, STEP_S, TURNED_MM_S, bound
 from tormagd.lab.told import lines
 from tormagd.physics.errors import DomainError
 from tormagd.simulation.parameters import PlantError, load_plant

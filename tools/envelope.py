@@ -22,12 +22,12 @@ from typing import NamedTuple
 import numpy as np
 from rendering.device_draws import SAMPLES, device, judging
 from rendering.following import CORNER_SCENE, VALID_S, Followed, Levels, armed_at_rest, asked_at, follow
-from rendering.hands import HANDS, TURNED_MM_S
-from rendering.ideal_carriage import brake_of
+from rendering.hands import HANDS
 from tqdm import tqdm
 
 from tormagd.control.governor import TimedSetpoint
 from tormagd.lab.arrays import Array, Json, Mask
+from tormagd.lab.ideal_carriage import TURNED_MM_S, brake_of
 from tormagd.lab.pages import stamp
 from tormagd.lab.told import lines
 from tormagd.model.displacement import MOBILISED_MM

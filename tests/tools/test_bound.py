@@ -13,7 +13,9 @@ import bound
 import msgspec
 import numpy as np
 import pytest
-from rendering.ideal_carriage import (
+
+from tormagd.lab.human_pulse import pulse_profile
+from tormagd.lab.ideal_carriage import (
     Asked,
     Brake,
     Drive,
@@ -25,8 +27,6 @@ from rendering.ideal_carriage import (
     no_delay_mm,
     rms,
 )
-
-from tormagd.lab.human_pulse import pulse_profile
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.element import Element

@@ -29,8 +29,7 @@ from rendering.following import (
     publisher,
     with_approach,
 )
-from rendering.hands import TURNED_MM_S, Legs
-from rendering.ideal_carriage import Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
+from rendering.hands import Legs
 from tormagd.config import Config
 from tormagd.control.core import build_core
 from tormagd.control.governor import TimedSetpoint
@@ -38,6 +37,7 @@ from tormagd.control.plan import NOTHING_SHOWN, Shown
 from tormagd.control.profile import profile_of
 from tormagd.lab.arrays import Array, Json
 from tormagd.lab.human_pulse import pulse_profile
+from tormagd.lab.ideal_carriage import TURNED_MM_S, Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene, terms_of
 from tormagd.simulation.hand import SteadyHand

@@ -12,7 +12,6 @@ import math
 import random
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
@@ -27,7 +26,6 @@ from tormagd.control.governor import TimedSetpoint
 from tormagd.control.plan import PlanState
 from tormagd.control.step import SENSOR_FAULT_S
 from tormagd.lab.main import Found
-from tormagd.lab.pages import stamp
 from tormagd.model.displacement import Turn
 from tormagd.safety.codes import Fault
 from tormagd.scenes.scene import RELAXATION_S, load_scene, terms_of
@@ -45,7 +43,6 @@ CONTROL_HZ = 500
 COARSE_S = 0.02
 VALID_S = 0.1
 SHOWN_S = 10.0
-FAULT_NOTE: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "color": "#d32f2f"}
 MODES = ((True, False), (False, False), (True, True), (False, True))
 
 
@@ -155,46 +152,12 @@ def _coarse(case: Case) -> Iterator[Moment]:
             yield Moment(element.force_N, gap_mm, state, str(Fault.SENSOR) if is_doubted else "")
 
 
-def draw(path: Path, figures: dict[str, Any]) -> None:
-    """The error over time of every hold, a panel for each pad, stamped with its figures."""
-    from matplotlib.figure import Figure
-
-    holds = figures["holds"]
-    plants = list(dict.fromkeys(held["plant"] for held in holds))
-    figure = Figure(figsize=(4.2 * len(plants), 3.8), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, len(plants), sharey=True))
-    for axes, plant in zip(panels, plants, strict=True):
-        axes.axhspan(-3.0, 3.0, color="#009e73", alpha=0.12, linewidth=0.0)
-        for held in holds:
-            if held["plant"] != plant:
-                continue
-            minutes = np.arange(len(held["shares"])) * held["every_s"] / 60.0
-            axes.plot(
-                minutes,
-                100.0 * np.array(held["shares"]),
-                "--" if held["is_learning"] else "-",
-                color="#0072b2" if held["relaxation"] else "#e69f00",
-                label=f"{'with' if held['relaxation'] else 'without'} relaxation, "
-                f"{'learning' if held['is_learning'] else 'frozen'}",
-            )
-            if held["fault"]:
-                axes.plot(minutes[-1], 100.0 * held["shares"][-1], "x", color="#d32f2f", markersize=9)
-                axes.annotate(
-                    f"fault {held['fault']}", (minutes[-1], 100.0 * held["shares"][-1]), (8, -3), **FAULT_NOTE
-                )
-        axes.set(title=plant.replace("_", " "), xlabel="held for, min")
-    panels[0].set(ylabel="error of the true force, %")
-    panels[0].legend(fontsize=8, loc="lower left")
-    figure.savefig(path, dpi=110, metadata=stamp(figures))
-
-
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of `tormag-lab tactile-hold`."""
     parser.add_argument("--seconds", type=float, default=3600.0, help="of each hold, virtual (default: 3600)")
     parser.add_argument("--plant", nargs="+", default=PLANTS, metavar="PLANT", help="default: pad_1 pad_2 pad_3")
     parser.add_argument("--coarse", action="store_true", help="the plans alone, fifty a second")
     parser.add_argument("--workers", type=int, default=1, help="processes")
-    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the errors over time")
 
 
 def run(options: argparse.Namespace) -> Found:
@@ -203,6 +166,4 @@ def run(options: argparse.Namespace) -> Found:
     with ProcessPoolExecutor(options.workers) as pool:
         holds = list(tqdm(pool.map(hold, cases), total=len(cases), desc="holds", disable=None))
     figures = {"synthetic": True, "force_N": FORCE_N, "holds": holds}
-    if options.picture is not None:
-        draw(options.picture, figures)
     return Found(figures)

@@ -25,7 +25,6 @@ import clarabel
 import numpy as np
 from scipy import sparse
 
-from rendering.hands import TURNED_MM_S
 from tormagd.lab.arrays import Array, Json
 from tormagd.physics.errors import DomainError, require
 from tormagd.physics.friction import Friction
@@ -35,6 +34,8 @@ from tormagd.simulation.gap_field import SMALLEST_GAP_MM
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import MOMENT_POINTS, force_over_moment, pull_over_gap, radial_moment_Tm
 
+TURNED_MM_S = 42.0
+"The roller's surface at the thesis's 20 rpm."
 STEP_S = 1e-3
 MOST_N = 2.0
 "The greatest force of the scenes."
