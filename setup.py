@@ -45,7 +45,7 @@ COMPILED = {
             "remembered",
             "pursuit",
         ),
-        *("skill", "periodicity", "restraint", "lateness", "governor", "handle", "plan", "motor", "step", "conditions"),
+        *("skill", "periodicity", "lateness", "governor", "handle", "plan", "motor", "step", "conditions"),
     ),
     "tormagd/simulation": (
         *("curve", "axis", "gap_field", "warmth", "element", "tactile_pad", "pressed_pad"),

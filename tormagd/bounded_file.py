@@ -1,7 +1,12 @@
-"""Files that anybody may have made: nothing but a regular file is read, and no more of it than it can mean to hold."""
+"""Files that anybody may have made: nothing but a regular file is read, and no more of it than it can mean to hold.
 
+What is written takes the place of what was there in one go.
+"""
+
+import contextlib
 import errno
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from tormagd_client.regular_file import require_regular as require_regular
@@ -22,3 +27,16 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
     if len(data) > most_bytes:  # it grows, or, as some of the kernel's, does not know its size
         raise OSError(errno.EFBIG, f"allowed is a regular file of at most {most_bytes} bytes; this has more", str(path))
     return data
+
+
+@contextlib.contextmanager
+def in_place_of(path: Path) -> Iterator[Path]:
+    """What to write to: in the end it takes the place of `path`, whole or, where there is an OSError, not at all."""
+    beside = path.with_name(f"{path.name}.part")
+    try:
+        yield beside
+        beside.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            beside.unlink()
+        raise

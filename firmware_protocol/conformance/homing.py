@@ -16,6 +16,7 @@ from firmware_protocol.conformance.host import (
     is_open,
     positions,
     shown,
+    told,
     unless,
 )
 
@@ -46,15 +47,11 @@ def home_homes(host: Host) -> str:
     """The device finds its open end by itself."""
     homing = _homings(host)[0]
     modes = " ".join(mode.name for mode in homing.modes)
-    seen = f"{modes} in {homing.seconds:.1f} s, {shown(homing.status)}"
-    if not homing.was_acknowledged:
-        raise Unmet(f"not acknowledged; {seen}")
-    is_right = homing.status.mode is DeviceMode.IDLE and is_homed(homing.status) and is_open(homing.status)
-    if not is_right or homing.status.faults or homing.seconds > HOMED_S:
-        raise Unmet(seen)
-    if DeviceMode.HOMING not in homing.modes:
-        raise Unmet(f"{seen}: never HOMING")
-    return seen
+    status = homing.status
+    is_right = status.mode is DeviceMode.IDLE and is_homed(status) and is_open(status) and not status.faults
+    went = homing.was_acknowledged and DeviceMode.HOMING in homing.modes and homing.seconds <= HOMED_S
+    seen = f"{told(homing.was_acknowledged)}; {modes} in {homing.seconds:.1f} s, {shown(status)}"
+    return unless(not is_right or not went, seen)
 
 
 @check(PAGE, "Home, Drive OFF every 1 ms", f"both positions within {ZERO_MM:g} mm of 0 afterwards", moves=True)
@@ -65,9 +62,7 @@ def home_zeroes(host: Host) -> str:
         state = homing.last
         if state is None or not is_homed(homing.status):
             raise Unmet("no State" if state is None else shown(homing.status))
-        seen = positions(state)
-        if max(abs(state.left_position_mm), abs(state.right_position_mm)) > ZERO_MM:
-            raise Unmet(seen)
+        seen = unless(max(abs(state.left_position_mm), abs(state.right_position_mm)) > ZERO_MM, positions(state))
     return seen
 
 
@@ -84,10 +79,9 @@ def homed_is_in_new_origin(host: Host) -> str:
         first, last = homing.first, homing.last
         if first is None or last is None:
             raise Unmet(f"no State after HOMED: {shown(homing.status)}")
-        seen = f"first {positions(first)}, then {positions(last)}"
         left_mm = abs(first.left_position_mm - last.left_position_mm)
-        if max(left_mm, abs(first.right_position_mm - last.right_position_mm)) > JUMP_MM:
-            raise Unmet(seen)
+        jump_mm = max(left_mm, abs(first.right_position_mm - last.right_position_mm))
+        seen = unless(jump_mm > JUMP_MM, f"first {positions(first)}, then {positions(last)}")
     return seen
 
 
@@ -95,16 +89,15 @@ def homed_is_in_new_origin(host: Host) -> str:
 def repeated_command(host: Host) -> str:
     """A device acts on a nonce once."""
     host.homed()
-    if not host.command(Home):
-        raise Unmet(f"Home not acknowledged: {shown(host.status)}")
+    host.obeyed(Home)
     nonce = host.status.command_nonce
+    seen = ""
     host.until(lambda: host.status.mode is not DeviceMode.HOMING, HOMED_S)
     for _ in range(3):
         host.send(Home(nonce))
         host.pass_time(SEEN_S, Beat.OFF)
-        if host.status.mode is not DeviceMode.IDLE or not is_homed(host.status):
-            raise Unmet(f"after the same nonce again: {shown(host.status)}")
-    return shown(host.status)
+        seen = host.shows(DeviceMode.IDLE, homed=True, besides="after the same nonce again")
+    return seen
 
 
 @check(
@@ -118,11 +111,8 @@ def retract_when_idle(host: Host) -> str:
     host.homed()
     was_acknowledged = host.command(Retract)
     host.until(lambda: host.status.mode is DeviceMode.IDLE, OPENED_S)
-    status = host.next_status(Beat.OFF)
-    seen = f"{'acknowledged' if was_acknowledged else 'not acknowledged'}, {shown(status)}"
-    if not (was_acknowledged and status.mode is DeviceMode.IDLE and is_open(status) and is_homed(status)):
-        raise Unmet(seen)
-    return f"{seen}, {positions(host.last(State))}"
+    besides = f"{told(was_acknowledged)}, {positions(host.last(State))}"
+    return host.shows(DeviceMode.IDLE, homed=True, opened=True, besides=besides, wrong=not was_acknowledged)
 
 
 @check(
@@ -134,20 +124,12 @@ def retract_when_idle(host: Host) -> str:
 def homing_takes_only_retract(host: Host) -> str:
     """A homing is ended by a Retract, and by nothing else that a host says."""
     host.homed()
-    if not host.command(Home):
-        raise Unmet(f"Home not acknowledged: {shown(host.status)}")
+    host.obeyed(Home)
     for kind in (Clear, Home):
-        if not host.is_refused(kind):
-            raise Unmet(f"{kind.__name__} acknowledged: {shown(host.status)}")
-        if host.status.mode is not DeviceMode.HOMING:
-            raise Unmet(f"after {kind.__name__}: {shown(host.status)}")
-    was_acknowledged = host.command(Retract)
+        host.refuses(kind, DeviceMode.HOMING)
+    host.obeyed(Retract)
     host.until(lambda: host.status.mode is DeviceMode.IDLE, OPENED_S)
-    status = host.next_status(Beat.OFF)
-    seen = f"Retract {'acknowledged' if was_acknowledged else 'not acknowledged'}, {shown(status)}"
-    return unless(
-        not was_acknowledged or status.mode is not DeviceMode.IDLE or is_homed(status) or not is_open(status), seen
-    )
+    return host.shows(DeviceMode.IDLE, homed=False, opened=True)
 
 
 CHECKS: Final = (

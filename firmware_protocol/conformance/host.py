@@ -7,6 +7,7 @@ than INSIDE_MM.
 import math
 from collections.abc import Callable
 from enum import Enum, auto
+from itertools import dropwhile, groupby
 from typing import Final, NamedTuple, TypeVar
 
 from firmware_protocol.codec import (
@@ -64,6 +65,11 @@ Command = type[Retract] | type[Clear] | type[Home]
 
 class Unmet(Exception):  # noqa: N818  (what a device leaves unmet; nothing has gone wrong here)
     """The device does not do what the page says; the text is what was seen."""
+
+
+def told(was_acknowledged: bool) -> str:
+    """How a command went, in words."""
+    return "acknowledged" if was_acknowledged else "not acknowledged"
 
 
 def unless(is_wrong: object, seen: str) -> str:
@@ -166,10 +172,8 @@ class Host:
 
     def new_nonce(self) -> int:
         """One that the device has not accepted."""
-        shown = self.newest.get(Status)
-        taken = shown.message.command_nonce if shown and isinstance(shown.message, Status) else 0
         self._nonce = self._nonce % MOST_NONCE + 1
-        if self._nonce == taken:
+        if self._nonce == self._shown_nonce():
             self._nonce = self._nonce % MOST_NONCE + 1
         return self._nonce
 
@@ -186,9 +190,20 @@ class Host:
             self.beat(beat)
         return True
 
+    def obeyed(self, kind: Command, beat: Beat = Beat.OFF) -> None:
+        """The same of one that has to be. Raises Unmet."""
+        if not self.command(kind, beat):
+            raise Unmet(f"{kind.__name__} not acknowledged: {shown(self.status)}")
+
     def is_refused(self, kind: Command, beat: Beat = Beat.OFF) -> bool:
         """Whether a command is not acknowledged."""
         return not self.command(kind, beat, SEEN_S)
+
+    def refuses(self, kind: Command, mode: DeviceMode, beat: Beat = Beat.OFF, *, homed: bool | None = None) -> str:
+        """A command that must not be acknowledged, and leaves the device as it is; as `shows`."""
+        is_refused = self.is_refused(kind, beat)
+        besides = f"{kind.__name__} {told(not is_refused)}"
+        return self.shows(mode, beat, homed=homed, besides=besides, wrong=not is_refused)
 
     def beat(self, beat: Beat, left: float = 0.0, right: float = 0.0) -> None:
         """One millisecond: a Drive, where one is wanted, and whatever comes."""
@@ -247,6 +262,35 @@ class Host:
             raise Unmet(f"no Status for {5 * STATUS_S * 1e3:.0f} ms")
         return self.last(Status)
 
+    def shows(
+        self,
+        mode: DeviceMode,
+        beat: Beat = Beat.OFF,
+        *,
+        homed: bool | None = None,
+        opened: bool | None = None,
+        fault: DeviceFault | None = None,
+        besides: str = "",
+        wrong: object = False,
+    ) -> str:
+        """What the next Status shows, behind what was seen `besides`.
+
+        Raises Unmet with it unless that is this mode and what else is given (`fault`: among others; NO_FAULT: none at
+        all), and where something else was `wrong`.
+        """
+        status = self.next_status(beat)
+        is_right = (
+            status.mode is mode
+            and homed in (None, is_homed(status))
+            and opened in (None, is_open(status))
+            and (fault is None or (fault in status.faults if fault else not status.faults))
+        )
+        return unless(wrong or not is_right, f"{besides}, {shown(status)}" if besides else shown(status))
+
+    def _shown_nonce(self) -> int:
+        """Of the newest Status; 0 before there was one."""
+        return self.last(Status).command_nonce if Status in self.newest else 0
+
     def _listen(self) -> None:
         self._next_s += PERIOD_S
         for arrival in self.line.receive(self._next_s):
@@ -270,9 +314,7 @@ class Host:
     def _take(self, heard: Heard) -> None:
         message = heard.message
         if isinstance(message, Status):
-            before = self.newest.get(Status)
-            was = before.message.command_nonce if before and isinstance(before.message, Status) else 0
-            self.resets += was != 0 and message.command_nonce == 0
+            self.resets += self._shown_nonce() != 0 and message.command_nonce == 0
             for what in contradictions(message):
                 self.contradictions[what] = self.contradictions.get(what, 0) + 1
         self.heard.append(heard)
@@ -317,22 +359,12 @@ class Host:
             self.until(lambda: self.status.mode is not DeviceMode.HOMING, HOMED_S, beat)
         seconds = self._next_s - start_s
         self.pass_time(SEEN_S, beat)
-        heard = self.heard[first_heard:]
-        modes: list[DeviceMode] = []
-        first: State | None = None
-        last: State | None = None
-        homed = False
-        for one in heard:
-            message = one.message
-            if isinstance(message, Status):
-                homed = homed or is_homed(message)
-                if not modes or modes[-1] is not message.mode:
-                    modes.append(message.mode)
-            elif isinstance(message, State):
-                last = message
-                if homed and first is None:
-                    first = message
-        homing = Homing(was_acknowledged, seconds, self.status, tuple(modes), first, last)
+        heard = [one.message for one in self.heard[first_heard:]]
+        modes = tuple(mode for mode, _ in groupby(message.mode for message in heard if isinstance(message, Status)))
+        states = [message for message in heard if isinstance(message, State)]
+        since_homed = dropwhile(lambda message: not (isinstance(message, Status) and is_homed(message)), heard)
+        first = next((message for message in since_homed if isinstance(message, State)), None)
+        homing = Homing(was_acknowledged, seconds, self.status, modes, first, states[-1] if states else None)
         self.homings.append(homing)
         return homing
 

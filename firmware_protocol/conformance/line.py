@@ -1,7 +1,7 @@
 """What carries messages between this host and a device, with its clock; and what can be damaged on it."""
 
 from collections.abc import Mapping
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from firmware_protocol.codec import can_identifier
 from firmware_protocol.framing import DELIMITER, MAX_ENCODED, FrameDecoder, cobs_decode, cobs_encode, encode_frame
@@ -51,34 +51,11 @@ class FramePort(Protocol):
         """Gives the bus back."""
 
 
-class Line(Protocol):
-    """One conversation with one device."""
-
-    @property
-    def frame_errors(self) -> dict[str, int]:
-        """What was wrong with the device's frames, and how often."""
-
-    def now_s(self) -> float:
-        """The time, from any start; it never falls."""
-
-    def send(self, function: int, payload: bytes) -> None:
-        """One whole frame. Raises OSError when the line is gone."""
-
-    def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
-        """What this carrier can do to a frame, by name, as what `send_damaged` takes, each to be ignored."""
-
-    def send_damaged(self, unit: bytes) -> None:
-        """Puts one of those on the line. Raises OSError when the line is gone."""
-
-    def receive(self, until_s: float) -> list[Arrival]:
-        """Waits until then; the device's whole frames that came. Raises OSError when the line is gone."""
-
-    def close(self) -> None:
-        """Gives the line back."""
-
-
 class SerialLine:
-    """Frames of COBS and CRC-16 on a serial port."""
+    """One conversation with one device, in frames of COBS and CRC-16 on a serial port.
+
+    Whatever uses the port raises OSError when it is gone.
+    """
 
     def __init__(self, port: BytePort) -> None:
         self._port = port
@@ -96,7 +73,9 @@ class SerialLine:
         self._port.write(self._frame(function, payload))
 
     def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
-        """Each ends with a delimiter, so that the frame after it is whole."""
+        """What this carrier can do to a frame, by name, as what `send_damaged` takes, each to be ignored.
+
+        Each ends with a delimiter, so that the frame after it is whole."""
         frame = self._frame(function, payload)
         body = frame[:-1]
         middle = len(body) // 2
@@ -153,7 +132,7 @@ class SerialLine:
 
 
 class CanLine:
-    """Payloads as data of CAN frames of one node."""
+    """The same conversation, its payloads the data of CAN frames of one node."""
 
     def __init__(self, port: FramePort, node: int) -> None:
         """Raises EncodeError for a node outside 0..15."""
@@ -197,3 +176,6 @@ class CanLine:
     def close(self) -> None:
         """Gives the bus back."""
         self._port.close()
+
+
+Line: TypeAlias = SerialLine | CanLine

@@ -4,7 +4,7 @@ from typing import Final
 
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, Clear, DeviceFault, DeviceMode, Identity
 from firmware_protocol.conformance.check import check
-from firmware_protocol.conformance.host import SEEN_S, Beat, Host, Unmet, is_homed, shown, unless
+from firmware_protocol.conformance.host import NO_FAULT, SEEN_S, Beat, Host, Unmet, is_homed, shown, unless
 
 PAGE = "Who says what when, 1"
 CLEARING = "What each mode takes"
@@ -17,12 +17,8 @@ def identity_answers_hello(host: Host) -> str:
     for _ in range(HELLOS):
         host.hello()
     count = len(host.all_of(Identity))
-    seen = f"{count} Identity for {HELLOS} Hellos"
-    if count != HELLOS:
-        if host.refused:
-            seen += f"; refused: {', '.join(host.refused)}"
-        raise Unmet(seen)
-    return seen
+    refused = f"; refused: {', '.join(host.refused)}" if host.refused else ""
+    return unless(count != HELLOS, f"{count} Identity for {HELLOS} Hellos{refused}")
 
 
 @check(
@@ -38,9 +34,8 @@ def schema_hash(host: Host) -> str:
     seen = f"schema {theirs:08X}, bytes {theirs.to_bytes(4, 'little').hex(' ')}"
     if theirs == int.from_bytes(SCHEMA_HASH.to_bytes(4, "little"), "big"):
         raise Unmet(f"{seen}: its bytes are the wrong way round")
-    if theirs != SCHEMA_HASH:
-        raise Unmet(f"{seen}: firmware and this program are built from different tormag.dbc")
-    return seen
+    different = ": firmware and this program are built from different tormag.dbc" if theirs != SCHEMA_HASH else ""
+    return unless(different, seen + different)
 
 
 @check("Who says what when, 5", "Hello with nonce 255, 77, 77, 255", "the next Status shows each")
@@ -60,15 +55,13 @@ def _mismatch(host: Host, schema: int, version: int) -> str:
     host.forget()
     host.hello(schema, version)
     answers = len(host.all_of(Identity))
-    status = host.next_status(Beat.OFF)
-    seen = f"{answers} Identity, {shown(status)}"
-    is_right = (
-        answers == 1
-        and DeviceFault.SCHEMA_MISMATCH in status.faults
-        and status.mode is DeviceMode.LATCHED
-        and not is_homed(status)
+    return host.shows(
+        DeviceMode.LATCHED,
+        homed=False,
+        fault=DeviceFault.SCHEMA_MISMATCH,
+        besides=f"{answers} Identity",
+        wrong=answers != 1,
     )
-    return unless(not is_right, seen)
 
 
 @check(PAGE, "Hello with another schema hash", "Identity; Status LATCHED with SCHEMA_MISMATCH, not HOMED")
@@ -87,11 +80,8 @@ def version_mismatch(host: Host) -> str:
 def mismatch_holds(host: Host) -> str:
     """The cause is not gone."""
     schema_mismatch.perform(host)
-    is_refused = host.is_refused(Clear)
-    status = host.next_status(Beat.OFF)
-    if not is_refused or DeviceFault.SCHEMA_MISMATCH not in status.faults:
-        raise Unmet(f"Clear {'refused' if is_refused else 'acknowledged'}, {shown(status)}")
-    return shown(status)
+    host.refuses(Clear, DeviceMode.LATCHED)
+    return host.shows(DeviceMode.LATCHED, fault=DeviceFault.SCHEMA_MISMATCH)
 
 
 @check(
@@ -103,13 +93,9 @@ def clear_clears(host: Host) -> str:
     """Clear takes away a fault whose cause is gone, and brings back no zero."""
     schema_mismatch.perform(host)
     host.hello()
-    status = host.next_status(Beat.OFF)
-    if DeviceFault.SCHEMA_MISMATCH not in status.faults:
-        raise Unmet(f"after the right Hello, before Clear: {shown(status)}")
-    was_acknowledged = host.command(Clear)
-    status = host.next_status(Beat.OFF)
-    seen = f"Clear {'acknowledged' if was_acknowledged else 'not acknowledged'}, {shown(status)}"
-    return unless(not was_acknowledged or status.mode is not DeviceMode.IDLE or status.faults or is_homed(status), seen)
+    host.shows(DeviceMode.LATCHED, fault=DeviceFault.SCHEMA_MISMATCH, besides="after the right Hello, before Clear")
+    host.obeyed(Clear)
+    return host.shows(DeviceMode.IDLE, homed=False, fault=NO_FAULT)
 
 
 @check("Modes", "not homed, Drive OFF, then Drive RUN with a duty of 0", "stays IDLE")
@@ -119,8 +105,7 @@ def run_needs_homing(host: Host) -> str:
     if is_homed(host.status):
         raise Unmet(f"HOMED even after a mismatch and a Clear: {shown(host.status)}")
     host.pass_time(SEEN_S, Beat.RUN)
-    status = host.next_status(Beat.RUN)
-    return unless(status.mode is not DeviceMode.IDLE, shown(status))
+    return host.shows(DeviceMode.IDLE, Beat.RUN)
 
 
 CHECKS: Final = (

@@ -17,17 +17,17 @@ from firmware_protocol.conformance.check import check
 from firmware_protocol.conformance.host import (
     INSIDE_MM,
     MOST_DUTY,
+    NO_FAULT,
     OPENED_S,
     PERIOD_S,
     SEEN_S,
     Beat,
     Host,
     Unmet,
-    is_homed,
     is_open,
     positions,
     shown,
-    unless,
+    told,
 )
 
 PAGE: Final = "Modes"
@@ -77,9 +77,7 @@ def _duty_moves(host: Host, *, is_left: bool) -> str:
     for step in range(round(MOST_DUTY / RAMP_PER_S / PERIOD_S)):
         duty = -RAMP_PER_S * PERIOD_S * step
         host.beat(Beat.RUN, duty if is_left else 0.0, 0.0 if is_left else duty)
-        state = host.last(State)
-        left_mm = state.left_position_mm - start.left_position_mm
-        right_mm = state.right_position_mm - start.right_position_mm
+        left_mm, right_mm = _moved_mm(host, start)
         moved_mm, other_mm = (left_mm, right_mm) if is_left else (right_mm, left_mm)
         seen = f"left by {left_mm:+.2f} mm, right by {right_mm:+.2f} mm at a duty of {duty:.2f}"
         if moved_mm <= -MOVED_MM and abs(other_mm) < MOVED_MM / 2:
@@ -104,16 +102,21 @@ def open_switch_stops(host: Host) -> str:
     host.forget()
     for _ in range(200):
         host.beat(Beat.RUN, AT_STOP_DUTY, AT_STOP_DUTY)
-    senses = [sense for _, sense in host.all_of(Sense)]
-    state = host.last(State)
-    most_A = max((max(abs(sense.left_current_A), abs(sense.right_current_A)) for sense in senses), default=0.0)
-    left_mm = state.left_position_mm - start.left_position_mm
-    right_mm = state.right_position_mm - start.right_position_mm
-    seen = f"left by {left_mm:+.2f} mm, right by {right_mm:+.2f} mm, {most_A:.2f} A at most, {shown(host.status)}"
-    return unless(
-        most_A > AT_STOP_A or max(abs(left_mm), abs(right_mm)) > AT_STOP_MM or host.status.mode is not DeviceMode.RUN,
-        seen,
+    currents_A = [abs(A) for _, sense in host.all_of(Sense) for A in (sense.left_current_A, sense.right_current_A)]
+    most_A = max(currents_A, default=0.0)
+    left_mm, right_mm = _moved_mm(host, start)
+    return host.shows(
+        DeviceMode.RUN,
+        Beat.RUN,
+        besides=f"left by {left_mm:+.2f} mm, right by {right_mm:+.2f} mm, {most_A:.2f} A at most",
+        wrong=most_A > AT_STOP_A or max(abs(left_mm), abs(right_mm)) > AT_STOP_MM,
     )
+
+
+def _moved_mm(host: Host, start: State) -> tuple[float, float]:
+    """How far left and right are from where they were."""
+    state = host.last(State)
+    return state.left_position_mm - start.left_position_mm, state.right_position_mm - start.right_position_mm
 
 
 @check(PAGE, f"{RUNNING}Drive OFF", "RETRACTING, then IDLE at both open switches, HOMED, no fault", moves=True)
@@ -132,21 +135,16 @@ def off_opens(host: Host) -> str:
 def retract_opens(host: Host) -> str:
     """A Retract is stronger than a Drive."""
     host.running(INSIDE_MM)
-    if not host.command(Retract, Beat.RUN):
-        raise Unmet(f"not acknowledged: {shown(host.status)}")
+    host.obeyed(Retract, Beat.RUN)
     return _opens(host, Beat.RUN)
 
 
 def _opens(host: Host, beat: Beat) -> str:
     before = positions(host.last(State))
-    first = host.next_status(beat)
-    if first.mode is not DeviceMode.RETRACTING:
-        raise Unmet(f"from {before}: {shown(first)}")
+    host.shows(DeviceMode.RETRACTING, beat, besides=f"from {before}")
     host.until(lambda: host.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED), OPENED_S, beat)
-    status = host.next_status(beat)
-    seen = f"from {before}: RETRACTING, then {shown(status)}, {positions(host.last(State))}"
-    is_right = status.mode is DeviceMode.IDLE and is_open(status) and is_homed(status) and not status.faults
-    return unless(not is_right, seen)
+    besides = f"from {before} to {positions(host.last(State))}: RETRACTING, then"
+    return host.shows(DeviceMode.IDLE, beat, homed=True, opened=True, fault=NO_FAULT, besides=besides)
 
 
 @check(
@@ -158,8 +156,7 @@ def _opens(host: Host, beat: Beat) -> str:
 def let_go_after_retract(host: Host) -> str:
     """Who was put off RUN has to let go once before it gets there again."""
     host.running()
-    if not host.command(Retract, Beat.RUN):
-        raise Unmet(f"Retract not acknowledged: {shown(host.status)}")
+    host.obeyed(Retract, Beat.RUN)
     host.until(lambda: host.status.mode is not DeviceMode.RETRACTING, OPENED_S, Beat.RUN)
     return has_to_let_go(host)
 
@@ -167,35 +164,24 @@ def let_go_after_retract(host: Host) -> str:
 def has_to_let_go(host: Host) -> str:
     """From IDLE, Drive RUN going on. Raises Unmet where RUN comes before a Drive OFF, or not after it."""
     host.pass_time(SEEN_S, Beat.RUN)
-    status = host.next_status(Beat.RUN)
-    if status.mode is not DeviceMode.IDLE:
-        raise Unmet(f"before a Drive OFF: {shown(status)}")
+    host.shows(DeviceMode.IDLE, Beat.RUN, besides="before a Drive OFF")
     host.beat(Beat.OFF)
     host.pass_time(SEEN_S, Beat.RUN)
-    status = host.next_status(Beat.RUN)
-    if status.mode is not DeviceMode.RUN:
-        raise Unmet(f"after a Drive OFF and Drive RUN again: {shown(status)}")
-    return "IDLE, then RUN"
+    return host.shows(DeviceMode.RUN, Beat.RUN, besides="IDLE, and after a Drive OFF and Drive RUN again")
 
 
 @check("What each mode takes", "Home in RUN", "not acknowledged, stays RUN and HOMED", moves=True)
 def home_refused_in_run(host: Host) -> str:
     """A homing would take the brake out of the host's hands."""
-    return _refused_in_run(host, Home)
+    host.running()
+    return host.refuses(Home, DeviceMode.RUN, Beat.RUN, homed=True)
 
 
 @check("What each mode takes", "Clear in RUN", "not acknowledged, stays RUN and HOMED", moves=True)
 def clear_refused_in_run(host: Host) -> str:
     """Clear is for drives that are off."""
-    return _refused_in_run(host, Clear)
-
-
-def _refused_in_run(host: Host, kind: type[Home] | type[Clear]) -> str:
     host.running()
-    is_refused = host.is_refused(kind, Beat.RUN)
-    status = host.next_status(Beat.RUN)
-    seen = f"{'not acknowledged' if is_refused else 'acknowledged'}, {shown(status)}"
-    return unless(not is_refused or status.mode is not DeviceMode.RUN or not is_homed(status), seen)
+    return host.refuses(Clear, DeviceMode.RUN, Beat.RUN, homed=True)
 
 
 @check("Who says what when, 1", "the right Hello in RUN", "Identity; stays RUN and HOMED", moves=True)
@@ -205,9 +191,9 @@ def hello_in_run(host: Host) -> str:
     host.forget()
     for nonce in (host.status.command_nonce, 77):
         host.hello(nonce=nonce, beat=Beat.RUN)
-    status = host.next_status(Beat.RUN)
-    seen = f"{len(host.all_of(Identity))} Identity for 2 Hellos, {shown(status)}"
-    return unless(status.mode is not DeviceMode.RUN or not is_homed(status) or len(host.all_of(Identity)) != 2, seen)
+    count = len(host.all_of(Identity))
+    besides = f"{count} Identity for 2 Hellos"
+    return host.shows(DeviceMode.RUN, Beat.RUN, homed=True, besides=besides, wrong=count != 2)
 
 
 @check(
@@ -223,13 +209,7 @@ def mismatch_in_run(host: Host) -> str:
     if (status := host.next_status(Beat.RUN)).mode is DeviceMode.RUN:
         raise Unmet(shown(status))
     host.until(lambda: host.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED), OPENED_S, Beat.RUN)
-    status = host.next_status(Beat.RUN)
-    return unless(
-        status.mode is not DeviceMode.LATCHED
-        or DeviceFault.SCHEMA_MISMATCH not in status.faults
-        or not is_open(status),
-        shown(status),
-    )
+    return host.shows(DeviceMode.LATCHED, Beat.RUN, opened=True, fault=DeviceFault.SCHEMA_MISMATCH)
 
 
 @check(
@@ -241,16 +221,13 @@ def mismatch_in_run(host: Host) -> str:
 def retracting_takes_only_retract(host: Host) -> str:
     """What opens is not turned round."""
     host.running(INSIDE_MM)
-    if host.next_status(Beat.OFF).mode is not DeviceMode.RETRACTING:
-        raise Unmet(f"after Drive OFF: {shown(host.status)}")
+    host.shows(DeviceMode.RETRACTING, besides="after Drive OFF")
     is_refused = host.is_refused(Home)
     was_acknowledged = host.command(Retract)
     host.until(lambda: host.status.mode is DeviceMode.IDLE, OPENED_S)
-    status = host.next_status(Beat.OFF)
-    home, retract = ("acknowledged" if one else "not acknowledged" for one in (not is_refused, was_acknowledged))
-    seen = f"Home {home}, Retract {retract}, {shown(status)}"
-    is_right = status.mode is DeviceMode.IDLE and is_homed(status) and is_open(status)
-    return unless(not is_refused or not was_acknowledged or not is_right, seen)
+    besides = f"Home {told(not is_refused)}, Retract {told(was_acknowledged)}"
+    is_wrong = not is_refused or not was_acknowledged
+    return host.shows(DeviceMode.IDLE, homed=True, opened=True, besides=besides, wrong=is_wrong)
 
 
 CHECKS: Final = (

@@ -21,6 +21,7 @@ from firmware_protocol.conformance.check import check
 from firmware_protocol.conformance.host import (
     HELLO_NONCE,
     INSIDE_MM,
+    NO_FAULT,
     SEEN_S,
     Beat,
     Host,
@@ -48,12 +49,12 @@ LATCHED: Final = "LATCHED by silence, "
 def short_silence_is_borne(host: Host) -> str:
     """50 ms are the host's to use."""
     host.running()
+    seen = ""
     for _ in range(3):
         host.pass_time(SHORT_S)
         host.pass_time(SEEN_S, Beat.RUN)
-        if host.status.mode is not DeviceMode.RUN or host.status.faults:
-            raise Unmet(shown(host.status))
-    return shown(host.status)
+        seen = host.shows(DeviceMode.RUN, Beat.RUN, fault=NO_FAULT)
+    return seen
 
 
 def _judged(silence: Silence) -> str:
@@ -121,11 +122,7 @@ def silence_latches(host: Host) -> str:
     host.running(INSIDE_MM)
     host.fall_silent()
     host.pass_time(0.3, Beat.OFF)
-    status = host.next_status(Beat.OFF)
-    return unless(
-        status.mode is not DeviceMode.LATCHED or DeviceFault.COMMAND_TIMEOUT not in status.faults or is_homed(status),
-        shown(status),
-    )
+    return host.shows(DeviceMode.LATCHED, homed=False, fault=DeviceFault.COMMAND_TIMEOUT)
 
 
 @check(LATCHES, f"{LATCHED}Drive RUN with a duty of 0", "stays LATCHED; each Drive is answered", moves=True)
@@ -134,41 +131,31 @@ def latched_refuses_run(host: Host) -> str:
     host.latched()
     host.forget()
     host.pass_time(SEEN_S, Beat.RUN)
-    status = host.next_status(Beat.RUN)
     states = len(host.all_of(State))
-    seen = f"{shown(status)}, {states} State"
-    return unless(status.mode is not DeviceMode.LATCHED or states < SEEN_S * 900, seen)
+    return host.shows(DeviceMode.LATCHED, Beat.RUN, besides=f"{states} State", wrong=states < SEEN_S * 900)
 
 
 @check(LATCHES, f"{LATCHED}Home", "not acknowledged, stays LATCHED", moves=True)
 def latched_refuses_home(host: Host) -> str:
     """First the fault is cleared."""
-    return _refused(host, Home)
+    host.latched()
+    return host.refuses(Home, DeviceMode.LATCHED)
 
 
 @check(LATCHES, f"{LATCHED}Retract", "not acknowledged, stays LATCHED", moves=True)
 def latched_refuses_retract(host: Host) -> str:
     """It has opened already, or cannot."""
-    return _refused(host, Retract)
-
-
-def _refused(host: Host, kind: type[Home] | type[Retract]) -> str:
     host.latched()
-    is_refused = host.is_refused(kind)
-    status = host.next_status(Beat.OFF)
-    seen = f"{'not acknowledged' if is_refused else 'acknowledged'}, {shown(status)}"
-    return unless(not is_refused or status.mode is not DeviceMode.LATCHED, seen)
+    return host.refuses(Retract, DeviceMode.LATCHED)
 
 
 @check(LATCHES, f"{LATCHED}Clear, then Drive RUN", "acknowledged, no fault, not HOMED; stays IDLE", moves=True)
 def cleared_is_not_homed(host: Host) -> str:
     """After a fault the zero is found anew."""
     host.latched()
-    was_acknowledged = host.command(Clear)
+    host.obeyed(Clear)
     host.pass_time(SEEN_S, Beat.RUN)
-    status = host.next_status(Beat.RUN)
-    seen = f"{'acknowledged' if was_acknowledged else 'not acknowledged'}, {shown(status)}"
-    return unless(not was_acknowledged or status.mode is not DeviceMode.IDLE or status.faults or is_homed(status), seen)
+    return host.shows(DeviceMode.IDLE, Beat.RUN, homed=False, fault=NO_FAULT)
 
 
 @check(
@@ -181,8 +168,7 @@ def let_go_after_fault(host: Host) -> str:
     """A host that knows of no fault does not run on through it."""
     host.running(INSIDE_MM)
     host.fall_silent()
-    if not host.command(Clear, Beat.RUN):
-        raise Unmet(f"Clear not acknowledged: {shown(host.status)}")
+    host.obeyed(Clear, Beat.RUN)
     homing = host.home(Beat.RUN)
     if not is_homed(homing.status):
         raise Unmet(f"not homed: {shown(homing.status)}")

@@ -811,6 +811,17 @@ def test_carriages_where_none_can_be_are_a_fault_before_anything_is_driven(bench
     assert bench.state.safety.needs_homing
 
 
+def test_a_least_gap_ends_a_motion_towards_it(running: Bench) -> None:
+    """A path that closes at 38 mm/s, well beyond the gap that this device allows."""
+    lowest_mm = math.inf
+    for tick in range(1, 300):
+        closing = gap_plan(80.0 - 0.038 * tick, running.now_s, gap_speed_mm_s=-38.0)
+        followed_mm = (running.reference.gap_mm - 95.0) / 2.0
+        running.step(closing.replaced(least_gap_mm=76.0), left_mm=followed_mm, right_mm=followed_mm)
+        lowest_mm = min(lowest_mm, running.reference.gap_mm)
+    assert 76.0 - 1e-3 < lowest_mm < 76.01
+
+
 @pytest.mark.parametrize("least_gap_mm", [0.0, 79.8])
 def test_the_gap_is_closed_no_further_than_this_device_allows(running: Bench, least_gap_mm: float) -> None:
     running.step(gap_plan(50.0).replaced(least_gap_mm=least_gap_mm), count=40)

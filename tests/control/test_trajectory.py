@@ -182,3 +182,16 @@ def test_what_is_expected_of_a_ramp_is_late_by_the_lag() -> None:
         expected = expect(expected, Reference(60.0 + 20.0 * tick * DT_S, 20.0), DT_S, lag_s, 0.003)
     assert 60.0 + 20.0 * 199 * DT_S - expected.gap_mm == pytest.approx(20.0 * lag_s, rel=1e-6)
     assert expected.filtered_mm_s == pytest.approx(20.0, rel=1e-6)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    start=st.floats(70.0, 95.0),
+    path=st.lists(st.tuples(gaps, st.floats(-60.0, 60.0), st.floats(-1e3, 1e3)), min_size=1, max_size=300),
+)
+@example(start=75.0, path=[(75.0 - 0.038 * tick, -38.0, 0.0) for tick in range(400)])
+def test_no_target_leads_it_beyond_its_floor(start: float, path: list[tuple[float, float, float]]) -> None:
+    reference = Reference(start)
+    for gap_mm, speed_mm_s, turning in path:
+        reference, _, _ = follow(MOST_MM_S2, reference, Reference(gap_mm, speed_mm_s, turning), DT_S, SPEEDS, 70.0)
+        assert reference.gap_mm >= 70.0 - MOST_MM_S2 * DT_S**2 / 8.0  # 0.2 um: it brakes in whole periods

@@ -402,6 +402,18 @@ def test_status_text_shows_what_is_not_known_as_such(status_with):
     assert "late by" not in "\n".join(lines)
 
 
+def test_status_text_shows_what_is_believed_and_acts(status_with):
+    belief = {
+        "scale": {"value": 0.75, "sd": 0.01, "unit": "", "acts": True},
+        "low_speed_factor": {"value": 1.12, "sd": None, "unit": "", "acts": True},
+        "carriage_lag": {"value": 0.035, "sd": 0.002, "unit": "s", "acts": True},
+        "relaxed": {"value": 0.2, "sd": None, "unit": "N", "acts": False},
+    }
+    known = msgspec.convert(status_with(belief=belief), Status)
+    shown = status_text(known, Colour(sys.stderr)).splitlines()
+    assert "believed  low_speed_factor 1.12, carriage_lag 0.035 ± 0.002 s" in shown
+
+
 @pytest.mark.parametrize("folder", ["", "/var/lib/tormag/profiles"])
 def test_status_text_says_why_a_profile_is_not_used_where_one_was_to_be(status_with, folder):
     profile = {"is_used": False, "age_s": None, "refusal": "it is of another serial", "folder": folder}

@@ -125,20 +125,6 @@ def test_a_flipped_bit_in_a_frame_is_found(frame: Frame, data: st.DataObject) ->
     assert decoder.statistics.corrupt == 1
 
 
-def test_a_repeated_frame_is_counted_and_given_once() -> None:
-    decoder = FrameDecoder()
-    first, second = numbered(2)
-    assert decoder.feed(wire(first) * 3 + wire(second) * 2) == [first, second]
-    assert (decoder.statistics.frames, decoder.statistics.repeated, decoder.statistics.lost) == (2, 3, 0)
-
-
-def test_a_sender_that_starts_anew_is_heard() -> None:
-    decoder = FrameDecoder()
-    old, new = Frame(2, 0, b"old"), Frame(8, 0, b"new")
-    assert decoder.feed(wire(old) + wire(new)) == [old, new]
-    assert decoder.statistics.repeated == 1
-
-
 @pytest.mark.parametrize("start", [0, 100, 250])
 @pytest.mark.parametrize("missing", [1, 7, 239])  # with more, the next would look like one that was overtaken
 def test_gaps_in_the_sequence_are_counted_through_zero(start: int, missing: int) -> None:
@@ -188,29 +174,6 @@ def test_a_byte_more_or_less_at_the_end_is_found(frame: Frame, more: int) -> Non
     assert decoder.statistics.corrupt == 4
 
 
-def test_a_zero_less_at_the_end_is_found() -> None:
-    """In those frames whose CRC ends in one; about one in 256."""
-    decoder = FrameDecoder()
-    generator = random.Random(7)
-    found = 0
-    while found < 20:
-        encoded = encode_frame(3, 7, generator.randbytes(generator.randrange(9)))
-        if cobs.decode(encoded[:-1])[-1] == 0:
-            found += 1
-            assert decoder.feed(encoded[:-2] + b"\0") == []
-    assert decoder.statistics.corrupt == found
-
-
-def test_a_whole_frame_with_a_byte_more_before_the_delimiter_is_not_a_frame() -> None:
-    """Also when the byte comes alone: what is kept of a stretch must not look like a whole one."""
-    encoded = wire(Frame(1, 2, bytes(8)))
-    stretched = encoded[:-1] + b"\x01\0"
-    for size in (1, len(encoded) - 1, len(stretched)):
-        decoder = FrameDecoder()
-        assert [f for i in range(0, len(stretched), size) for f in decoder.feed(stretched[i : i + size])] == []
-        assert decoder.statistics.corrupt == 1
-
-
 @pytest.mark.parametrize("excess", [0, 1, 2, 100])
 def test_the_longest_frame_passes_and_a_longer_stretch_does_not(excess: int) -> None:
     """However it is cut: the byte that makes it too long must count also when it was not kept."""
@@ -241,7 +204,7 @@ def test_a_frame_that_comes_late_is_not_lost(start: int, late: int) -> None:
 def test_a_line_that_reorders_loses_what_it_lost(seed: int, lossy: bool) -> None:
     """Neighbours change places now and then, and some frames go missing: counted is what never came."""
     rng = random.Random(seed)
-    sent = numbered(2_000, rng.randrange(256))
+    sent = numbered(600, rng.randrange(256))
     kept = [
         frame for number, frame in enumerate(sent) if number in (0, len(sent) - 1) or not lossy or rng.random() > 0.03
     ]

@@ -100,16 +100,6 @@ def test_another_host_on_the_same_node_ends_the_connection(bus: Bus) -> None:
     assert "device.options.node" in caught.value.remedy
 
 
-def test_a_bus_that_takes_no_frames_is_noticed(bus: Bus) -> None:
-    def send_for_long() -> None:
-        for counter in range(10_000):
-            bus.backend.send(Drive(0.0, 0.0, DriveMode.OFF, counter % 256))
-
-    with pytest.raises(BackendError, match="nobody acknowledges") as caught:
-        send_for_long()
-    assert "bit rate" in caught.value.remedy
-
-
 def test_no_more_frames_are_taken_at_once_than_the_loop_can_bear(bus: Bus) -> None:
     bus.far.setblocking(False)
     queued = 0
@@ -117,13 +107,6 @@ def test_no_more_frames_are_taken_at_once_than_the_loop_can_bear(bus: Bus) -> No
         for queued in range(2 * FRAMES_AT_ONCE):  # noqa: B007 - counts what the kernel takes
             bus.put(frame_of(STATUS))
     assert len(bus.backend.receive()) == min(queued, FRAMES_AT_ONCE)
-
-
-def test_nobody_at_the_channel_and_no_channel_are_said(tmp_path: Path) -> None:
-    for path in (tmp_path / "absent", tmp_path):
-        with pytest.raises(BackendError, match="cannot be opened") as caught:
-            opened(Device(backend="can", options={"interface": "tormagsim"}, port=str(path)))
-        assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -192,16 +175,6 @@ def test_a_damaged_line_is_counted_and_the_next_is_read(adapter: Adapter, damage
     assert next_of(backend) == [STATUS]
     assert backend.statistics.resynchronisations == 1
     backend.close()
-
-
-@pytest.mark.parametrize("other", ["slcan", "serial"])
-def test_an_adapter_belongs_to_one(adapter: Adapter, other: str) -> None:
-    first = opened(adapter.device)
-    second = adapter.device if other == "slcan" else Device(port=adapter.device.port)
-    with pytest.raises(BackendError):
-        choose(second, Rates()).open()
-    first.close()
-    choose(second, Rates()).open().close()
 
 
 # -- a bus that fails as told --------------------------------------------------------------------------------------

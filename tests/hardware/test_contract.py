@@ -15,18 +15,18 @@ import socket
 import struct
 import termios
 import tty
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import can
+import msgspec
 import numpy as np
 import pytest
 
-from firmware_protocol.codec import DriveMode, Home, Message, State
+from firmware_protocol.codec import Drive, DriveMode, Home, Message, State
 from firmware_protocol.value import Value
-from tormagd.closed_loop import ClosedLoop, Sample, stream
+from tormagd.closed_loop import ClosedLoop, Sample, VirtualWire, stream
 from tormagd.config import Config, Device
 from tormagd.control.core import Core, build_core
 from tormagd.hardware.backend import Backend, BackendError, choose
@@ -188,37 +188,10 @@ CASES = {
 }
 
 
-# -- transports ----------------------------------------------------------------------------------------------------
+# -- transports: a device with its end of one, and what the daemon opens to come to it --------------------------------
 
 
-class FarEnd(ABC):
-    """The device with its end of one transport, and what the daemon opens to come to it."""
-
-    device: Any  # VirtualDevice or CanDevice, by what the transport carries
-    configured: Device
-
-    @abstractmethod
-    def units(self, now_s: float) -> list[bytes]:
-        """What the device has sent by now."""
-
-    @abstractmethod
-    def take(self, now_s: float, unit: bytes) -> None:
-        """What has come from the host goes to the device."""
-
-    @abstractmethod
-    def read(self) -> bytes:
-        """The unit that the backend has just sent."""
-
-    @abstractmethod
-    def write(self, unit: bytes, backend: Backend) -> None:
-        """Hands a unit to the kernel, and waits until the backend can read it."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Gives the kernel's things back."""
-
-
-class PtyEnd(FarEnd):
+class PtyEnd:
     """A far end at a pseudo-terminal."""
 
     end: bytes
@@ -231,6 +204,7 @@ class PtyEnd(FarEnd):
         self._pending = b""
 
     def read(self) -> bytes:
+        """The unit that the backend has just sent."""
         while self.end not in self._pending:
             assert select.select([self._far], [], [], PATIENCE_S)[0], "the backend sent nothing"
             self._pending += os.read(self._far, 4_096)
@@ -238,6 +212,7 @@ class PtyEnd(FarEnd):
         return unit + self.end
 
     def write(self, unit: bytes, backend: Backend) -> None:
+        """Hands a unit to the kernel, and waits until the backend can read it."""
         expected = _waiting(backend.fileno()) + len(unit)
         os.write(self._far, unit)
         while _waiting(backend.fileno()) < expected:
@@ -258,6 +233,7 @@ class SerialEnd(PtyEnd):
         self._sending = b""
 
     def units(self, now_s: float) -> list[bytes]:
+        """What the device has sent by now."""
         *units, self._sending = (self._sending + self.device.transmit(now_s)).split(self.end)
         return [unit + self.end for unit in units]
 
@@ -292,7 +268,7 @@ class SlcanEnd(PtyEnd):
             self._answers += self._adapter.feed(self.read())[0]
 
 
-class PacketEnd(FarEnd):
+class PacketEnd:
     """A far end where a frame is a packet."""
 
     def __init__(self, device: VirtualDevice) -> None:
@@ -362,6 +338,9 @@ class BusEnd(PacketEnd):
         self._bus.shutdown()
 
 
+FarEnd: TypeAlias = SerialEnd | SlcanEnd | TormagsimEnd | BusEnd
+
+
 def udp_end(device: VirtualDevice, folder: Path) -> FarEnd:
     group = "239.74.163.77"
     try:
@@ -376,10 +355,7 @@ def udp_end(device: VirtualDevice, folder: Path) -> FarEnd:
 
 
 def socketcan_end(device: VirtualDevice, folder: Path) -> FarEnd:
-    try:
-        bus = can.Bus(interface="socketcan", channel="vcan0", ignore_config=True)
-    except OSError as error:
-        pytest.skip(f"no vcan0 (sudo ip link add vcan0 type vcan; sudo ip link set vcan0 up): {error}")
+    bus = can.Bus(interface="socketcan", channel="vcan0", ignore_config=True)
     return BusEnd(device, "socketcan", "vcan0", bus)
 
 
@@ -392,11 +368,15 @@ TRANSPORTS: dict[str, Callable[[VirtualDevice, Path], FarEnd]] = {
 }
 
 
-EVERY_TRANSPORT = [
+MARKS = {
     # all who use this group on a machine hear each other: these tests do not run beside one another
-    pytest.param(name, marks=pytest.mark.live) if name == "udp_multicast" else name
-    for name in TRANSPORTS
-]
+    "udp_multicast": pytest.mark.live,
+    "socketcan": pytest.mark.skipif(
+        not Path("/sys/class/net/vcan0").exists(),
+        reason="no vcan0 (sudo ip link add vcan0 type vcan; sudo ip link set vcan0 up)",
+    ),
+}
+EVERY_TRANSPORT = [pytest.param(name, marks=MARKS.get(name, ())) for name in TRANSPORTS]
 
 
 def _waiting(fd: int) -> int:
@@ -476,12 +456,9 @@ class Tap:
 
     def __init__(self, line: Line) -> None:
         self._line = line
-        self.statistics = line.backend.statistics
+        self.statistics, self.fileno, self.close = line.backend.statistics, line.backend.fileno, line.backend.close
         self.now_s = 0.0
         self.heard: list[Message] = []
-
-    def fileno(self) -> int:
-        return self._line.backend.fileno()
 
     def receive(self) -> list[Message]:
         messages = self._line.exchange(self.now_s)
@@ -491,26 +468,23 @@ class Tap:
     def send(self, message: Message) -> None:
         self._line.send(self.now_s, message)
 
-    def close(self) -> None:
-        """The line is closed by whoever made it."""
-
-    def add_reader(self, fd: int, callback: Callable[[], None]) -> None:
-        self.wake = callback
-
-    def remove_reader(self, fd: int) -> None:
-        del self.wake
-
 
 @pytest.fixture(scope="module")
 def core() -> Core:
     return build_core(CONFIG)
 
 
+def a_device() -> VirtualDevice:
+    """One that has homed soon."""
+    plant = load_plant("sample_1")
+    near = msgspec.structs.replace(plant.assumed, start_left_mm=46.0, start_right_mm=45.5)
+    return VirtualDevice(msgspec.structs.replace(plant, assumed=near), parse_hand("steady"), (), 1)
+
+
 @pytest.fixture
 def moving(core: Core) -> ClosedLoop:
     """A loop that is armed and closing its gap, on a perfect line."""
-    device = VirtualDevice(load_plant("sample_1"), parse_hand("steady"), (), 1)
-    loop = ClosedLoop(CONFIG, core.stepper, core.planner, device)
+    loop = ClosedLoop(CONFIG, core.stepper, core.planner, a_device())
     loop.arm()
     asked = publisher(loop.now_s)
     for _ in loop.run(MOVING_S, asked):
@@ -609,14 +583,13 @@ def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
 
 @pytest.mark.parametrize("transport", EVERY_TRANSPORT)
 def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Callable[..., Line]) -> None:
-    device = VirtualDevice(load_plant("sample_1"), parse_hand("steady"), (), 1)
-    tap = Tap(lines(transport, device, Case(Twice)))
+    tap = Tap(lines(transport, a_device(), Case(Twice)))
     connection = Connection(CONFIG.device, lambda: tap, lambda: None, lambda: tap.now_s)
-    connection.open(tap)
+    connection.open(VirtualWire())
     for tick in range(1, 300):
         tap.now_s = tick * PERIOD_S
         connection.exchange(0.0, 0.0, DriveMode.OFF, DeviceRequest.NONE, 0)
-        tap.wake()
+        connection.receive()
     assert connection.state is LinkState.RUNNING
     states = sum(isinstance(message, State) for message in tap.heard)
     assert states > 100
@@ -630,8 +603,7 @@ def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Ca
 def test_host_and_device_meet_on_any_line_that_is_not_cut(
     transport: str, case: Case, lines: Callable[..., Line]
 ) -> None:
-    device = VirtualDevice(load_plant("sample_1"), parse_hand("steady"), (), 1)
-    line = lines(transport, device, case)
+    line = lines(transport, a_device(), case)
     link = DeviceLink(0.0)
     assert link.state is LinkState.IDENTIFYING
     for tick in range(1, 1_000):
@@ -651,7 +623,7 @@ def test_a_device_that_goes_is_said_by_reading_and_writing_and_leaves_nothing_op
     transport: str, tmp_path: Path
 ) -> None:
     before = len(list(Path("/proc/self/fd").iterdir()))
-    far = TRANSPORTS[transport](VirtualDevice(load_plant("sample_1"), parse_hand("steady"), (), 1), tmp_path)
+    far = TRANSPORTS[transport](a_device(), tmp_path)
     backend = choose(far.configured, CONFIG.rates).open()
     far.close()
     with pytest.raises(BackendError, match=far.configured.port):
@@ -661,3 +633,47 @@ def test_a_device_that_goes_is_said_by_reading_and_writing_and_leaves_nothing_op
     backend.close()
     backend.close()
     assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+@pytest.mark.parametrize(
+    ("transport", "said", "remedy"),
+    [("serial", "nobody reads", ""), ("tormagsim", "nobody acknowledges", "bit rate")],
+)
+def test_a_far_end_that_takes_nothing_is_noticed(
+    transport: str, said: str, remedy: str, lines: Callable[..., Line]
+) -> None:
+    backend = lines(transport, a_device(), CASES["clean"]).backend
+
+    def send_for_long() -> None:
+        for counter in range(20_000):
+            backend.send(Drive(0.0, 0.0, DriveMode.OFF, counter % 256))
+
+    with pytest.raises(BackendError, match=said) as caught:
+        send_for_long()
+    assert remedy in caught.value.remedy
+
+
+@pytest.mark.parametrize("second", ["serial", "slcan"])
+@pytest.mark.parametrize("first", ["serial", "slcan"])
+def test_a_port_belongs_to_one(first: str, second: str, lines: Callable[..., Line]) -> None:
+    line = lines(first, a_device(), CASES["clean"])
+    port = line.far.configured.port
+    wanted = (
+        Device(port=port) if second == "serial" else Device(backend="can", options={"interface": second}, port=port)
+    )
+    with pytest.raises(BackendError, match=f"{port}: .*another (process|program) holds it") as caught:
+        choose(wanted, CONFIG.rates).open()
+    assert "tormagctl ports" in caught.value.remedy
+    line.backend.close()
+    choose(wanted, CONFIG.rates).open().close()
+
+
+@pytest.mark.parametrize("name", ["absent", "folder", "file"])
+@pytest.mark.parametrize("configured", [{}, {"backend": "can", "options": {"interface": "tormagsim"}}])
+def test_what_is_no_port_and_no_channel_is_not_opened(configured: dict[str, Any], name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BackendError, match="cannot be opened") as caught:
+        choose(Device(**configured, port=str(path)), CONFIG.rates).open()
+    assert str(caught.value).count(str(path)) == 1

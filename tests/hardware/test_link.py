@@ -33,7 +33,6 @@ from tormagd.hardware.link import (
     HELLO_S,
     OVERTAKEN,
     REPEAT_S,
-    SILENT_S,
     UNANSWERED_S,
     DeviceLink,
     LinkState,
@@ -107,41 +106,20 @@ def test_another_schema_is_refused_with_both_hashes_and_the_firmwares_version() 
     assert all(word in link.cause for word in ("1f00c0de", f"{SCHEMA_HASH:08x}", "3.9"))
     link.request(0.0, DeviceRequest.HOME)
     assert all(isinstance(message, Hello) for _, message in due(link, 0.0, 2.0))
-
-
-def test_a_device_that_is_replaced_while_running_is_refused() -> None:
     link = running()
     link.receive(1.0, US.replaced(schema_hash=SCHEMA_HASH ^ 1))
-    assert link.state is LinkState.REFUSED
+    assert link.state is LinkState.REFUSED, "also where it took another one's place"
 
 
-def test_silence_loses_a_running_link() -> None:
-    link = running()
-    link.receive(0.5, Sense(0.0, 0.0, 0.0, 0.0))
-    link.due(0.5 + SILENT_S)
-    assert link.state is LinkState.RUNNING
-    link.due(0.5 + SILENT_S + 1e-3)
-    assert link.state is LinkState.LOST
-    assert "80 ms" in link.cause
-
-
-def test_waiting_for_the_first_answer_is_no_loss() -> None:
+def test_a_device_that_turns_up_late_is_no_loss_and_asked_at_its_first_word() -> None:
     link = DeviceLink(0.0)
     due(link, 0.0, UNANSWERED_S, heard=False)
     assert link.state is LinkState.IDENTIFYING
-    late = due(link, UNANSWERED_S, 10.0, heard=False)
-    assert link.state is LinkState.UNANSWERED
-    assert len(late) == pytest.approx(9.0 / HELLO_S, abs=1)
-
-
-def test_a_device_that_turns_up_late_is_asked_at_its_first_word() -> None:
-    link = DeviceLink(0.0)
-    due(link, 0.0, 3.3, heard=False)
-    link.receive(3.3, status())
+    late = due(link, UNANSWERED_S, 10.3, heard=False)
+    assert (link.state, len(late)) == (LinkState.UNANSWERED, pytest.approx(9.0 / HELLO_S, abs=1))
+    link.receive(10.3, status())
     assert link.state is LinkState.IDENTIFYING
-    assert [type(message) for message in link.due(3.3)] == [Hello]
-    link.receive(3.31, US)
-    assert link.state is LinkState.RUNNING
+    assert [type(message) for message in link.due(10.3)] == [Hello]
 
 
 def test_a_device_that_was_reset_has_to_say_again_who_it_is() -> None:
@@ -285,11 +263,8 @@ def test_a_newer_request_replaces_an_unfinished_one() -> None:
     link.request(0.01, DeviceRequest.HOME)
     (home,) = link.due(0.01)
     link.request(0.02, DeviceRequest.RETRACT)
-    (retract,) = link.due(0.02)
-    assert isinstance(home, Home)
-    assert isinstance(retract, Retract)
-    assert home.nonce != retract.nonce
-    link.receive(0.03, status(home.nonce))
+    assert [type(message) for message in link.due(0.02)] == [Retract]
+    link.receive(0.03, status(home.nonce))  # type: ignore[union-attr]
     assert any(isinstance(message, Retract) for _, message in due(link, 0.03, 0.1))
 
 
@@ -330,17 +305,16 @@ def test_a_measurement_takes_a_status_a_sense_and_a_state() -> None:
     link = DeviceLink(0.0)
     link.receive(0.0, US)
     for message in (State(0.0, 0.0, 0.0, 0), Sense(0.1, 0.2, 0.3, 0.0), State(0.0, 0.0, 0.0, 1)):
-        link.receive(0.0, message)
+        link.receive(0.1, message)
         assert link.measurement is None
-    link.receive(0.0, status(supply_V=11.5))
+    link.receive(0.2, status(supply_V=11.5))
     link.receive(0.7, State(-3.0, -4.0, 0.25, 2))
     measurement = measured(link)
     assert measurement == Measurement(
         0, 0.7, 0.25, -3.0, -4.0, 0.1, 0.2, 0.3, 0.0, DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 11.5,
-        0.0, 0.0,
+        0.1, 0.2,
     )  # fmt: skip
     assert link.measurement is measurement
-    assert link.age_s(0.8) == pytest.approx(0.1)
 
 
 def test_a_status_updates_what_it_knows_and_leaves_the_number() -> None:
@@ -410,15 +384,6 @@ def test_wraps_are_taken_out(
 
 
 # -- each of its streams -------------------------------------------------------------------------------------------
-
-
-def test_each_stream_says_when_it_came_last() -> None:
-    link = running()
-    link.receive(0.5, State(-1.0, -1.0, 0.1, 1))
-    link.receive(0.6, Sense(0.0, 0.0, 1.5, 2.0))
-    link.receive(0.7, status(supply_V=11.0))
-    measurement = measured(link)
-    assert (measurement.received_s, measurement.sensed_s, measurement.reported_s) == (0.5, 0.6, 0.7)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import pytest
 
-from firmware_protocol.codec import DeviceFault, DeviceMode, Drive, DriveMode, Home, Status, Switches
+from firmware_protocol.codec import DeviceFault, DeviceMode, Home, Status, Switches
 from tormagd.config import ConfigError, Device, Rates
 from tormagd.hardware import backend as backends
 from tormagd.hardware.backend import BackendError, choose, installed
@@ -64,30 +64,11 @@ def test_bytes_from_before_the_opening_are_not_read(line: Line) -> None:
     port.close()
 
 
-def test_a_second_opening_is_refused_until_the_first_has_closed(line: Line) -> None:
-    first = open_serial(line.device, SerialOptions())
-    with pytest.raises(BackendError, match=r"cannot be opened: another process holds it") as caught:
-        open_serial(line.device, SerialOptions())
-    assert line.device.port in str(caught.value)
-    assert "tormagctl ports" in caught.value.remedy
-    first.close()
-    open_serial(line.device, SerialOptions()).close()
-
-
 def test_end_of_file_is_a_device_that_was_unplugged(port: SerialPort, monkeypatch: pytest.MonkeyPatch) -> None:
     """A real USB port reads nothing, for ever, once its device is gone."""
     monkeypatch.setattr(os, "read", lambda descriptor, count: b"")
     with pytest.raises(BackendError, match="unplugged"):
         port.receive()
-
-
-def test_a_far_end_that_does_not_read_is_noticed(port: SerialPort) -> None:
-    def send_for_long() -> None:
-        for counter in range(20_000):
-            port.send(Drive(0.0, 0.0, DriveMode.OFF, counter % 256))
-
-    with pytest.raises(BackendError, match="nobody reads"):
-        send_for_long()
 
 
 def test_what_the_driver_did_not_take_is_sent_before_the_next_frame(
@@ -122,16 +103,6 @@ def test_a_port_that_goes_while_it_is_set_up_is_not_opened(line: Line, monkeypat
         open_serial(line.device, SerialOptions())
 
 
-@pytest.mark.parametrize("kind", ["absent", "a directory", "a file"])
-def test_what_is_no_serial_port_is_not_opened(tmp_path: Path, kind: str) -> None:
-    path = {"absent": tmp_path / "absent", "a directory": tmp_path, "a file": tmp_path / "file"}[kind]
-    if kind == "a file":
-        path.write_text("")
-    with pytest.raises(BackendError, match="cannot be opened") as caught:
-        open_serial(Device(port=str(path)), SerialOptions())
-    assert str(caught.value).count(str(path)) == 1
-
-
 # -- finding one ---------------------------------------------------------------------------------------------------
 
 
@@ -147,8 +118,6 @@ def install(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
 def test_the_serial_backend_is_installed() -> None:
     chosen = choose(Device(options={"baud": 115_200}), Rates())
     assert chosen.options == SerialOptions(baud=115_200)
-    with pytest.raises(BackendError, match="/nowhere/tty: cannot be opened"):
-        choose(Device(port="/nowhere/tty"), Rates()).open()
 
 
 def test_an_unknown_backend_names_the_installed_ones(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from tormagd.inverse.bracketed import BracketedSearch, Refinement, brent, finer_grid, newton
+from tormagd.inverse.bracketed import BracketedSearch, Refinement, finer_grid, newton
 from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
 from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.newton import ACCURACY_MT, RisingSearch
@@ -30,21 +30,15 @@ class Subject(NamedTuple):
     needs_rising: bool = False
 
 
-def bracketed(refine: Refinement, dtype: type[np.floating] = np.float64) -> Make:
-    return lambda model: BracketedSearch(field_range_mT=RANGE_MT, refine=refine, dtype=dtype)
+def bracketed(refine: Refinement) -> Make:
+    return lambda model: BracketedSearch(field_range_mT=RANGE_MT, refine=refine)
 
 
 SUBJECTS = {
     "nearest": Subject(lambda model: NearestFieldSearch(field_range_mT=RANGE_MT), 5e-3),
-    "nearest float32": Subject(
-        lambda model: NearestFieldSearch(field_range_mT=RANGE_MT, step_mT=1.0, dtype=np.float32), 1e-2
-    ),
     "coarse-to-fine": Subject(bracketed(finer_grid), 5e-3),
-    "coarse-to-fine float32": Subject(bracketed(finer_grid, np.float32), 2e-2),
     "newton": Subject(bracketed(newton), 1e-6),
-    "newton float32": Subject(bracketed(newton, np.float32), 1e-2),
     "rising": Subject(lambda model: RisingSearch(RANGE_MT), ACCURACY_MT, needs_rising=True),
-    "brent": Subject(bracketed(brent), 1e-3),
     "thesis-linear": Subject(
         lambda model: LinearFieldSearch(field_range_mT=RANGE_MT, epsilon_N=0.01, predict_one=torch_row(model)),
         *(5.0, False),
@@ -200,15 +194,3 @@ def test_extreme_inputs_have_a_defined_answer(rising: ForceModel, name: str) -> 
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_far_outside_the_training_range_the_answer_is_not_trusted(rising: ForceModel, name: str) -> None:
     assert solver(name, rising).solve(rising.curve(100.0, 10.0, CIP), 2.0, 400.0).confidence < 1e-6
-
-
-@pytest.mark.parametrize(("single", "double"), [("newton float32", "newton"), ("nearest float32", "nearest")])
-def test_single_precision_stays_near_double(rising: ForceModel, single: str, double: str) -> None:
-    rng = np.random.default_rng(5)
-    for displacement, rate, field in rng.uniform((0.05, 3, 110), (0.95, 57, 740), (100, 3)).tolist():
-        force = rising.predict_one(displacement, rate, field, CIP)
-        ends = [
-            solver(name, rising).solve(rising.curve(displacement, rate, CIP), force, 400.0).field_mT
-            for name in (single, double)
-        ]
-        assert ends[0] == pytest.approx(ends[1], abs=0.01)

@@ -10,6 +10,7 @@ import pytest
 
 from tormagd_client import messages
 from tormagd_client.messages import (
+    BeliefReport,
     BlackBoxReport,
     ClockReport,
     Description,
@@ -46,7 +47,7 @@ V1: dict[type[msgspec.Struct], str] = {
     Telemetry: TELEMETRY,
     Tick: "lateness_us exec_us",
     Status: f"{TELEMETRY} version build scene scene_fingerprint terms_out solver uptime_s least_N most_N trim "
-    "device profile least_gap_mm link setpoints peers "
+    "device belief profile least_gap_mm link setpoints peers "
     "rates late_ticks_by fault_details limit_details newest_stall not_granted way "
     "black_box output next_commands",
     OutputReport: "rate slew not_finite range",
@@ -66,6 +67,7 @@ V1: dict[type[msgspec.Struct], str] = {
     ExecReport: "p50 p99 p999 max",
     ProfileReport: "is_used age_s refusal folder",
     DeviceReport: "scale scale_sd offset_N offset_sd_N sensor_zero_N sensor_zero_sd_N lag_ms",
+    BeliefReport: "value sd unit acts",
     Explained: "code cause remedy",
     StallReport: "ms culprit",
     BlackBoxReport: "folder newest refusal dropped",

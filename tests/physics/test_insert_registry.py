@@ -47,7 +47,6 @@ def test_a_laboratorys_inserts_stand_beside_the_shipped_ones(tmp_path: Path) -> 
     assert soft.elastomer.friction_coefficient == 0.3
     assert soft.shear_modulus_Pa == 310e3
     assert soft.masses_g["slacker"] == 0.0
-    assert soft.density_g_cc == pytest.approx(0.4 * 1.07 + 0.5 * 7.87 + 0.1 * 0.97)
     assert more.elastomer.relative_permeability == pytest.approx(3.0)
     assert more.elastomer.friction_coefficient == 0.19
     assert more.force_range.measured_N == 3.1

@@ -20,7 +20,7 @@ HEADER = {"columns": json.dumps(["t_ns", "x"]), "config": "{}"}
 
 
 def part(time_s: float, size: int = 100) -> Part:
-    return Part(time_s, round(time_s * 1e9), True, bytes(size))
+    return Part(time_s, round(time_s * 1e9), bytes(size))
 
 
 def test_the_ring_keeps_half_a_minute_of_a_day() -> None:
@@ -86,7 +86,7 @@ def process() -> Iterator[Process]:
 
 def ticks(first: int, count: int) -> Part:
     entries = [item for number in range(first, first + count) for item in ("step", [number, 0.5])]
-    return Part(first * 1e-3, first, True, msgspec.msgpack.encode(entries))
+    return Part(first * 1e-3, first, msgspec.msgpack.encode(entries))
 
 
 def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process, tmp_path: Path) -> None:

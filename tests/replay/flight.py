@@ -48,8 +48,7 @@ class Flight:
         self._journal.ticked(record)
         self._ticks += 1
         if self._ticks % PART_TICKS == 0:
-            has_state = self._ticks % SNAPSHOT_TICKS == PART_TICKS
-            self.ring.put(Part(sample.time_s, record.t_ns, has_state, self._packed()))
+            self.ring.put(Part(sample.time_s, record.t_ns, self._packed()))
             if self._ticks % SNAPSHOT_TICKS == 0:
                 self._remember()
         return sample

@@ -5,7 +5,6 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 from flight import Flight, frames
 from mcap.reader import make_reader
@@ -13,9 +12,7 @@ from mcap.reader import make_reader
 from firmware_protocol.codec import FUNCTION, Drive, Home, State, can_identifier, decode
 from firmware_protocol.framing import FrameDecoder
 from tormagd.control.core import Core
-from tormagd.keeping import Part
-from tormagd.recording.black_box import BlackBoxFile, read_black_box, write_black_box
-from tormagd.replay.rebuild import rebuilt, recorded
+from tormagd.recording.black_box import BlackBoxFile, read_black_box
 from tormagd.replay.rerun import Rerun, rerun, ticks_of
 from tormagd.safety.codes import Fault
 from tormagd_client.messages import TickRecord
@@ -153,15 +150,3 @@ def test_a_link_that_was_lost_and_came_back_is_run_again(fly: Any, core: Core, t
     done = again(core, entries)
     assert (done.difference, done.ticks) == (None, 3_400)
     assert done.frames == number_of(entries, len(entries) - 1)
-
-
-def test_one_from_before_frames_were_kept_is_replayed_without(path: Path, tmp_path: Path) -> None:
-    """Format 1 had neither frames nor a conversation's memory."""
-    before = tmp_path / "before.mcap"
-    box = read_black_box(path)
-    entries = [entry[:3] if entry[0] == "state" else entry for entry in box.entries if not _passed(entry)]
-    write_black_box(before, box.header | {"format": "1"}, [Part(1.0, 1, True, msgspec.msgpack.encode(entries))])
-    box = read_black_box(before)
-    known = recorded(box, tmp_path)
-    done = rerun(rebuilt(known), known.columns, box.entries)
-    assert (done.difference, done.ticks, done.frames) == (None, 4_000, 0)

@@ -33,10 +33,6 @@ from tormagd.simulation.device import MessageDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters
 
-BIT_S = 1e-6
-EXCHANGE_BITS = 395
-"Drive, State and Sense with the most stuffing, as firmware_protocol/README.md says."
-
 
 def bits_by_hand(frame: CanFrame) -> int:
     """ISO 11898-1, bit by bit: an oracle without tables."""
@@ -60,18 +56,6 @@ def test_bits_are_those_of_the_standard() -> None:
     frames += [CanFrame(0x041, bytes([b]) * 8) for b in (0x0F, 0xF0, 0x78, 0x87, 0x1E)]
     for frame in frames:
         assert frame_bits(frame) == bits_by_hand(frame), frame
-
-
-def test_an_exchange_never_takes_more_bits_than_the_headroom_was_computed_from() -> None:
-    def most_bits(length: int) -> int:
-        stuffable = 34 + 8 * length
-        return stuffable + (stuffable - 1) // 4 + 13
-
-    assert most_bits(7) + 2 * most_bits(8) == EXCHANGE_BITS
-    noise = random.Random(2)
-    for _ in range(2_000):
-        assert frame_bits(CanFrame(0x021, noise.randbytes(7))) <= most_bits(7)
-        assert frame_bits(CanFrame(0x031, noise.randbytes(8))) <= most_bits(8)
 
 
 def test_a_frame_survives_the_socket_and_what_is_none_is_refused() -> None:
@@ -110,23 +94,16 @@ def run(device: CanDevice, from_s: float, until_s: float, step_s: float = 1e-5) 
     return seen
 
 
-def test_a_frame_takes_its_bits_and_is_answered(make: Callable[..., CanDevice]) -> None:
-    device = make()
+@pytest.mark.parametrize("bitrate", [1_000_000, 500_000, 125_000])
+def test_a_frame_takes_its_bits_and_is_answered(make: Callable[..., CanDevice], bitrate: int) -> None:
+    device = make(bitrate)
     device.receive(0.0001, HELLO)
-    seen = run(device, 0.0001, 0.002)
+    seen = run(device, 0.0001, 0.005)
     (heard_s, hello), (answered_s, identity) = [item for item in seen if item[1].frame.identifier != STATUS]
     assert hello == Delivery(1, HELLO)
-    assert heard_s == pytest.approx(0.0001 + frame_bits(HELLO) * BIT_S, abs=1.1e-5)
+    assert heard_s == pytest.approx(0.0001 + frame_bits(HELLO) / bitrate, abs=1.1e-5)
     assert (identity.sender, identity.frame.identifier) == (DEVICE, IDENTITY)
-    assert answered_s >= heard_s + frame_bits(identity.frame) * BIT_S - 1e-9
-
-
-def test_half_the_bit_rate_takes_twice_as_long(make: Callable[..., CanDevice]) -> None:
-    for bitrate in (1_000_000, 500_000, 125_000):
-        device = make(bitrate)
-        device.receive(0.0, HELLO)
-        heard_s = run(device, 0.0, 0.002)[0][0]
-        assert heard_s == pytest.approx(frame_bits(HELLO) / bitrate, abs=1.1e-5)
+    assert answered_s >= heard_s + frame_bits(identity.frame) / bitrate - 1e-9
 
 
 def test_the_lowest_identifier_goes_first_once_the_bus_is_free(make: Callable[..., CanDevice]) -> None:
@@ -159,14 +136,11 @@ def test_what_the_controllers_cannot_hold_is_lost_and_counted(make: Callable[...
     assert device.messages.undecodable == 0
 
 
-def test_time_does_not_run_backwards_and_impossible_buses_are_refused(make: Callable[..., CanDevice]) -> None:
+def test_time_does_not_run_backwards(make: Callable[..., CanDevice]) -> None:
     device = make()
     device.advance(0.01)
     with pytest.raises(ValueError, match="now_s"):
         device.advance(0.009)
-    for bitrate, node in ((0, 1), (1_000_000, 16), (1_000_000, -1)):
-        with pytest.raises(ValueError, match="allowed are"):
-            make(bitrate, node)
 
 
 def test_control_at_a_kilohertz_leaves_thirty_percent_of_the_bus(make: Callable[..., CanDevice]) -> None:

@@ -4,6 +4,7 @@ The rules of the page are the conformance kit's, which it passes (tests/firmware
 """
 
 import itertools
+from typing import NamedTuple
 
 import pytest
 
@@ -14,7 +15,6 @@ from firmware_protocol.codec import (
     Home,
     Sense,
     State,
-    Status,
     Switches,
 )
 from tormagd.simulation.parameters import load_plant
@@ -29,14 +29,7 @@ def count(host, kind) -> int:
     return sum(isinstance(message, kind) for _, message in host.received)
 
 
-# -- status, and answers to Drives: exactly, where the kit allows for a wire ------------------------------------------
-
-
-def test_status_comes_fifty_times_a_second_unasked_and_nothing_else_does(make_host) -> None:
-    host = make_host()
-    host.wait(2.0)
-    assert 99 <= count(host, Status) <= 101
-    assert len(host.received) == count(host, Status)
+# -- answers to Drives: exactly, where the kit allows for a wire -----------------------------------------------------
 
 
 def test_each_accepted_drive_is_answered_once_by_state_and_sense(make_host) -> None:
@@ -155,43 +148,114 @@ def test_silence_opens_the_gap_and_latches(running, name: str) -> None:
     assert host.device.truth.left_A == 0.0
 
 
-def test_a_closed_switch_ends_the_run(running) -> None:
-    host = running(gap_mm=50.0)
-    host.drive_while_running(-0.3, -0.3)
-    assert host.status.faults == DeviceFault.END_STOP
-    assert host.device.truth.gap_mm > 44.0 - 1e-6
-    host.wait_for(DeviceMode.LATCHED)
-    assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
+class Ending(NamedTuple):
+    """How a run from a gap of `gap_mm` ends, with these faults of the device, while the host drives so."""
+
+    faults: tuple[str, ...]
+    duties: tuple[float, float] | None
+    "None: it falls silent."
+    gap_mm: float
+    at_once: DeviceFault
+    "What is latched when it is out of RUN."
+    latched: DeviceFault
+    "And once the drives are off."
+    left_mm: float
+    right_mm: float
+    "Where the carriages are then."
+    within_mm: float = 0.51
 
 
-def test_skew_ends_the_run(running) -> None:
-    host = running()
-    host.drive_while_running(0.4, -0.4)
-    assert host.status.faults == DeviceFault.SKEW
-    assert abs(host.device.truth.left_mm - host.device.truth.right_mm) < 4.0
-
-
-def test_a_blocked_carriage_is_an_overcurrent_and_a_failed_retract(running) -> None:
-    host = running(["drag_left=+10000%@3.5", "drag_left=+1000%@3.5"], gap_mm=60.0)
-    host.drive_until(3.6)
-    host.drive_while_running(1.0, 0.0)
-    assert host.status.faults == DeviceFault.OVERCURRENT
-    host.wait_for(DeviceMode.LATCHED)
-    assert host.status.faults == DeviceFault.OVERCURRENT | DeviceFault.RETRACT_FAILED
+OPEN_MM = 47.5
+ENDINGS = {
+    "a closed switch": Ending((), (-0.3, -0.3), 50.0, DeviceFault.END_STOP, DeviceFault.END_STOP, OPEN_MM, OPEN_MM),
+    "skew": Ending((), (0.4, -0.4), 60.0, DeviceFault.SKEW, DeviceFault.SKEW, OPEN_MM, OPEN_MM),
     # the other carriage is opened all the same
-    assert host.device.truth.right_mm == pytest.approx(47.5, abs=0.3)
-    assert host.device.truth.left_A == 0.0
+    "a blocked carriage": Ending(
+        ("blocked_left@3.5",),
+        (1.0, 0.0),
+        60.0,
+        DeviceFault.OVERCURRENT,
+        DeviceFault.OVERCURRENT | DeviceFault.RETRACT_FAILED,
+        30.0,
+        OPEN_MM,
+    ),
+    "a stiff guide": Ending(
+        ("drag_left=+1000%@3.5",),
+        None,
+        60.0,
+        DeviceFault.COMMAND_TIMEOUT,
+        DeviceFault.COMMAND_TIMEOUT,
+        OPEN_MM,
+        OPEN_MM,
+    ),
+    # found by the skew, and opened blind
+    "a stuck encoder": Ending(
+        ("encoder_stuck_left@3.5",), (-0.3, -0.3), 60.0, DeviceFault.SKEW, DeviceFault.SKEW, OPEN_MM, OPEN_MM
+    ),
+    "no supply": Ending(
+        ("supply_loss@3.5",),
+        (0.0, 0.0),
+        60.0,
+        DeviceFault.SUPPLY,
+        DeviceFault.SUPPLY | DeviceFault.RETRACT_FAILED,
+        30.0,
+        30.0,
+        0.16,
+    ),
+    "a worn gearbox without supply": Ending(
+        ("worn_gearbox@3.5", "supply_loss@3.5"),
+        (0.0, 0.0),
+        48.0,
+        DeviceFault.SUPPLY,
+        DeviceFault.SUPPLY | DeviceFault.UNCOMMANDED_MOTION | DeviceFault.RETRACT_FAILED,
+        22.0,
+        22.0,
+        0.24,
+    ),
+    "a worn gearbox after a reset": Ending(
+        ("worn_gearbox@3.6", "reset@3.5"),
+        (0.0, 0.0),
+        48.0,
+        DeviceFault(0),
+        DeviceFault.UNCOMMANDED_MOTION,
+        OPEN_MM,
+        OPEN_MM,
+    ),
+}
+
+
+@pytest.mark.parametrize("ending", ENDINGS.values(), ids=ENDINGS)
+def test_how_a_run_ends(running, ending: Ending) -> None:
+    host = running(ending.faults, gap_mm=ending.gap_mm)
+    if ending.faults:
+        host.drive_until(3.5)
+    while host.status.mode is DeviceMode.RUN:
+        if ending.duties is None:
+            host.wait(1e-3)
+        else:
+            host.drive(*ending.duties)
+        assert host.time_s < 20.0
+    assert host.status.faults == ending.at_once
+    truth = host.device.truth
+    assert abs(truth.left_mm - truth.right_mm) < 4.0
+    assert truth.gap_mm > 44.0 - 1e-6
+    host.wait_for(DeviceMode.LATCHED)
+    host.wait(1.0)
+    truth = host.device.truth
+    assert (host.status.faults, truth.left_A, truth.right_A) == (ending.latched, 0.0, 0.0)
+    assert truth.left_mm == pytest.approx(ending.left_mm, abs=ending.within_mm)
+    assert truth.right_mm == pytest.approx(ending.right_mm, abs=ending.within_mm)
+
+
+def test_a_fault_is_not_cleared_while_its_cause_lasts(running) -> None:
+    host = running(["supply_loss@3.5"])
+    host.wait_for(DeviceMode.LATCHED)
+    assert host.status.supply_V == 0.0
+    host.command(Clear)
+    assert not host.acknowledged()
 
 
 # -- injected faults -----------------------------------------------------------------------------------------------
-
-
-def test_commands_that_vanish_are_silence(running) -> None:
-    host = running(["commands_vanish@3.5"])
-    while host.status.mode is not DeviceMode.LATCHED:
-        host.drive(0.0, 0.0)
-        assert host.time_s < 20.0
-    assert host.status.faults == DeviceFault.COMMAND_TIMEOUT
 
 
 def test_reset_forgets_zero_handshake_and_mode_but_holds_the_gap(running) -> None:
@@ -207,26 +271,6 @@ def test_reset_forgets_zero_handshake_and_mode_but_holds_the_gap(running) -> Non
     host.go_to(60.0)
 
 
-def test_supply_loss_holds_and_says_so_until_it_is_gone(running) -> None:
-    host = running(["supply_loss@3.5"])
-    host.drive_until(3.5)
-    stood_mm = host.device.truth.gap_mm
-    host.wait_for(DeviceMode.LATCHED)
-    assert host.status.faults == DeviceFault.SUPPLY | DeviceFault.RETRACT_FAILED
-    assert host.status.supply_V == 0.0
-    assert host.device.truth.gap_mm == pytest.approx(stood_mm, abs=0.02)
-    host.command(Clear)
-    assert not host.acknowledged()
-
-
-def test_a_worn_gearbox_without_supply_closes_and_is_noticed(running) -> None:
-    host = running(["worn_gearbox@3.5", "supply_loss@3.5"], gap_mm=48.0)
-    host.drive_until(3.5)
-    host.wait(1.0)
-    assert host.device.truth.gap_mm < 44.5
-    assert host.status.faults == DeviceFault.SUPPLY | DeviceFault.UNCOMMANDED_MOTION | DeviceFault.RETRACT_FAILED
-
-
 def test_a_gap_that_closes_fast_is_noticed_while_the_device_still_tries_to_open(running) -> None:
     host = running(["worn_gearbox@3.5", "supply_loss@3.5"], gap_mm=47.0, plant="sample_3")
     host.drive_until(3.5)
@@ -235,31 +279,6 @@ def test_a_gap_that_closes_fast_is_noticed_while_the_device_still_tries_to_open(
         assert host.time_s < 5.0
     assert host.status.mode is DeviceMode.RETRACTING
     assert DeviceFault.RETRACT_FAILED not in host.status.faults
-
-
-def test_a_worn_gearbox_with_supply_is_noticed_after_a_reset_and_opened(running) -> None:
-    host = running(["worn_gearbox@3.6", "reset@3.5"], gap_mm=48.0)
-    host.drive_until(3.5)
-    host.wait_for(DeviceMode.LATCHED)
-    assert host.status.faults == DeviceFault.UNCOMMANDED_MOTION
-    assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
-
-
-def test_a_stuck_encoder_is_found_by_the_skew_and_the_carriage_opened_blind(running) -> None:
-    host = running(["encoder_stuck_left@3.5"])
-    host.drive_until(3.5)
-    host.drive_while_running(-0.3, -0.3)
-    assert host.status.faults == DeviceFault.SKEW
-    host.wait_for(DeviceMode.LATCHED)
-    assert host.device.truth.left_mm == pytest.approx(47.5, abs=0.51)
-    assert host.device.truth.right_mm == pytest.approx(47.5, abs=0.3)
-
-
-def test_a_stiff_guide_still_opens(running) -> None:
-    host = running(["drag_left=+1000%@3.5"])
-    host.wait_for(DeviceMode.LATCHED)
-    assert host.status.faults == DeviceFault.COMMAND_TIMEOUT
-    assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
 
 
 @pytest.mark.parametrize("reversed_part", ["motor_reversed_left", "encoder_reversed_left"])

@@ -179,15 +179,3 @@ def test_time_may_be_cut_in_any_way() -> None:
         pieces.advance(0.3 / 3000 * 2 / 3)
     assert pieces.truth == whole.truth
     assert pieces.sensed_force_N == whole.sensed_force_N
-
-
-@pytest.mark.parametrize("dt_s", [-1e-3, float("nan"), float("inf")])
-def test_impossible_steps_are_refused(dt_s: float) -> None:
-    with pytest.raises(ValueError, match=r"dt_s .* finite"):
-        Plant(SAMPLE_1, SteadyHand()).advance(dt_s)
-
-
-@pytest.mark.parametrize("voltages", [(float("inf"), 0.0), (None, float("nan"))])
-def test_impossible_voltages_are_refused(voltages: tuple[float | None, float | None]) -> None:
-    with pytest.raises(ValueError, match=r"_V .* finite"):
-        Plant(SAMPLE_1, SteadyHand()).drive(*voltages)

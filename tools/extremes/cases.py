@@ -7,7 +7,7 @@ import mpmath as mp
 import numpy as np
 
 from tormagd.physics.errors import FloatArray
-from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw, radial_moment_from_flux_density_Tm
+from tormagd.physics.field import REFERENCE_PERMEABILITY, FieldLaw, PowerFieldLaw, ThesisFieldLaw
 from tormagd.physics.force import Elastomer, Geometry, max_radial_moment_Tm
 
 DIGITS = 65
@@ -55,7 +55,7 @@ def draw_batch(rng: np.random.Generator, size: int) -> Batch:
         return Batch(elastomer, geometry, ThesisFieldLaw(), np.where(share < 0.3, near_the_end, 45.0 + 50.0 * share))
     if kind == 2:
         field_T = np.where(share < 0.5, 3.0 * rng.uniform(0.0, 1.0, size), 3.0 * 10.0 ** rng.uniform(-9.0, 0.0, size))
-        return Batch(elastomer, geometry, None, radial_moment_from_flux_density_Tm(field_T, mu_r, inner_m))
+        return Batch(elastomer, geometry, None, field_T / (mu_r / (REFERENCE_PERMEABILITY * inner_m)))
     # up to the edge of the domain, where the force is steepest, and a little beyond
     most_Tm = max_radial_moment_Tm(elastomer, geometry)
     to_the_edge = 1.0 - 10.0 ** rng.uniform(-12.0, 0.0, size)
@@ -68,29 +68,27 @@ def reference(batch: Batch, x: float) -> Reference:
         # Eq. 7 bends at 95 mm, so that a step is measured from there
         scale = min(mp.mpf(x), 95 - mp.mpf(x)) if isinstance(batch.field, ThesisFieldLaw) else mp.mpf(x)
         step = scale * GRAIN
-        points = [_force(batch, mp.mpf(x) + place * step) for place in (-2, -1, 0, 1, 2)] if scale > 0 else []
-        centre = points[2] if points else _force(batch, mp.mpf(x))
+        points = [_force(batch, mp.mpf(x) + place * step) for place in (-1, 0, 1)] if scale > 0 else []
+        centre = points[1] if points else _force(batch, mp.mpf(x))
         if centre is None or None in points or not points:
             stretch = float(centre[0]) if centre is not None else -math.inf
             return Reference(False, stretch, {}, {})
         stretches, forces = zip(*points, strict=True)
-        slope, curvature, third = _differences(forces, step)
+        slope, curvature = _differences(forces, step)
         stretch_slope = _differences(stretches, step)[0]
-        compression = 1 - stretches[2]
-        values = {"stretch": stretches[2] - 1, "force": forces[2], "slope": slope, "round trip": mp.mpf(x)}
+        compression = 1 - stretches[1]
+        values = {"stretch": stretches[1] - 1, "force": forces[1], "slope": slope, "round trip": mp.mpf(x)}
         conditions = {
             "stretch": _ratio(x * stretch_slope, compression),
-            "force": _ratio(x * slope, forces[2]),
+            "force": _ratio(x * slope, forces[1]),
             "slope": _ratio(x * curvature, slope),
-            "round trip": _ratio(forces[2], x * slope),
+            "round trip": _ratio(forces[1], x * slope),
         }
         if batch.field is not None:
-            moments = [_moment(batch.field, mp.mpf(x) + place * step) for place in (-2, -1, 0, 1, 2)]
-            of_moment = _ratio(moments[2], x * _differences(moments, step)[0])
+            moments = [_moment(batch.field, mp.mpf(x) + place * step) for place in (-1, 0, 1)]
+            of_moment = _ratio(moments[1], x * _differences(moments, step)[0])
             conditions["round trip"] = max(conditions["round trip"], of_moment)
-            values["curvature"] = curvature
-            conditions["curvature"] = _ratio(x * third, curvature)
-        return Reference(bool(stretches[2] >= mp.mpf("0.05")), float(stretches[2]), values, conditions)
+        return Reference(bool(stretches[1] >= mp.mpf("0.05")), float(stretches[1]), values, conditions)
 
 
 def _moment(field: FieldLaw | None, x: Any) -> Any:
@@ -121,14 +119,10 @@ def _force(batch: Batch, x: Any) -> tuple[Any, Any] | None:
     return stretch, xi * (g0 * (stretch**-4 - 1) + a2 / (r_i**2 * mu * stretch**2))
 
 
-def _differences(values: Any, step: Any) -> tuple[Any, Any, Any]:
-    """First, second and third derivative from five equidistant values."""
-    far_below, below, centre, above, far_above = values
-    return (
-        (above - below) / (2 * step),
-        (above - 2 * centre + below) / step**2,
-        (far_above - 2 * above + 2 * below - far_below) / (2 * step**3),
-    )
+def _differences(values: Any, step: Any) -> tuple[Any, Any]:
+    """First and second derivative from three equidistant values."""
+    below, centre, above = values
+    return (above - below) / (2 * step), (above - 2 * centre + below) / step**2
 
 
 def _ratio(numerator: Any, denominator: Any) -> float:

@@ -6,10 +6,17 @@ from typing import Final, final
 
 from firmware_protocol.value import Value
 from tormagd.control.device_fit import DeviceFit
-from tormagd.control.periodicity import LONGEST_STEP_S, NOTHING_LEARNED, Periodicity, forecast_N, foreseen, observe
+from tormagd.control.periodicity import (
+    HORIZON_S,
+    LONGEST_STEP_S,
+    NOTHING_LEARNED,
+    Periodicity,
+    forecast_N,
+    foreseen,
+    observe,
+)
 from tormagd.control.portrait import Portrait
 from tormagd.control.pursuit import nearest_way_mm
-from tormagd.control.restraint import Restraint, restrain
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 
@@ -80,8 +87,7 @@ class GovernorState(Value):
     """What the governor remembers between plans: `asked_N` is the force that the last one asked of the device, and
     `above_N` how far that was above the least that the device then seemed to make; where it was known or foreseen what
     comes the carriages were sent to that of `drive_N`; `expected_N` is the force by now on the way of a preview;
-    `holder` whose setpoints it followed; while `is_passing` the force is on its way to those of a new holder;
-    `restraint` begins with each stream that nothing announces."""
+    `holder` whose setpoints it followed; while `is_passing` the force is on its way to those of a new holder."""
 
     def __init__(
         self,
@@ -95,7 +101,6 @@ class GovernorState(Value):
         is_passing: bool = False,
         above_N: float = math.inf,
         drive_N: float | None = None,
-        restraint: Restraint | None = None,
         expected_N: float | None = None,
     ) -> None:
         self.time_s: Final = time_s
@@ -108,7 +113,6 @@ class GovernorState(Value):
         self.is_passing: Final = is_passing
         self.above_N: Final = above_N
         self.drive_N: Final = drive_N
-        self.restraint: Final = restraint
         self.expected_N: Final = expected_N
 
 
@@ -154,9 +158,9 @@ class Governor:
     ) -> tuple[GovernorState, Governed]:
         """One decision, for now and, where what comes is known, for up to `lag_s` later: an extrapolation that far is a
         guess. The force is within what the scene allows and `device`, as far as it has shown itself, gives; with a
-        preview it is what the gap can best make of it, and without one no further from the mean than is worth the way.
-        A missing or stale setpoint decays to F_min along the scene's `release_N_s`, and from one holder's force to the
-        next one's it goes as fast: never a jump, never a force held for ever.
+        preview it is what the gap can best make of it. A missing or stale setpoint decays to F_min along the scene's
+        `release_N_s`, and from one holder's force to the next one's it goes as fast: never a jump, never a force held
+        for ever.
         """
         portrait = self._portrait
         lowest = max(device.force_N(portrait.least_N), 0.0)
@@ -191,11 +195,15 @@ class Governor:
         asks_N = force if is_passing else state.asked_N
         sent_N = asks_N if is_passing or state.drive_N is None else state.drive_N
         elapsed_s = max(now_s - state.time_s, 0.0)
-        held_back_N = 0.0
-        restraint: Restraint | None = None
         if setpoint.preview_N and self._has_preview:
             periodicity, foresight = NOTHING_LEARNED, 1.0
-            wanted_N = _previewed_N(setpoint, soon_s + lag_s, least, most)
+            ends_s, last_N = setpoint.preview_dt_s * len(setpoint.preview_N), setpoint.preview_N[-1]
+            if self._has_forecast and ends_s < WAY_S[-1]:
+                # what comes after its end is foreseen from there
+                slope = (last_N - setpoint.force_N) / ends_s
+                last_N = min(max(last_N, self._least_N), self._most_N)
+                periodicity = observe(learned, setpoint.stamp_s + ends_s, last_N)
+            wanted_N = _previewed_N(setpoint, soon_s + lag_s, least, most, periodicity)
             path, drive_N = self._pursued_N(asks_N, sent_N, elapsed_s, wanted_N, device, lag_s)
             # the path sets out sooner by as much as the carriages come later
             expected_N = asks_N if is_passing or state.expected_N is None else state.expected_N
@@ -205,16 +213,9 @@ class Governor:
             periodicity = observe(learned, setpoint.stamp_s, asked_N) if self._has_forecast else NOTHING_LEARNED
             # one that has fallen silent for longer than a stream may is not believed to go on as it did
             foresight = periodicity.trust if age <= LONGEST_STEP_S else 0.0
-            if self._has_forecast:
-                restraint, for_N = restrain(
-                    None if is_new_holder else state.restraint, elapsed_s, force, device, portrait, self._gap_speed_mm_s
-                )
-                held_back_N = for_N - force
             path = _expected_N(asked_N, slope, periodicity, foresight, soon_s + foresight * lag_s)
-            if held_back_N:
-                path = [force_N + held_back_N for force_N in path]
         within = [min(max(force_N, least), most) for force_N in path]
-        governed = min(max(force + held_back_N, least), most)
+        governed = min(max(force, least), most)
         if expected_N is not None:
             governed = min(max(expected_N, least), most)
         elif foresight > 0.0 and not is_passing and self._is_near(sent_N, within[-1], device):
@@ -224,8 +225,6 @@ class Governor:
         within = within[: len(PATH_S)]
         if abs(governed - force) > OUTRUN_N:
             reasons = (*reasons, Limit.RATE)
-        if abs(held_back_N) > OUTRUN_N:
-            foresight = 0.0  # what comes is not known far enough ahead, and how late the carriages are does not show
         if is_passing:
             step_N = self._release_N_s * elapsed_s
             left_N = within[0] - state.asked_N
@@ -245,7 +244,6 @@ class Governor:
             is_passing,
             max(within[0] - lowest, 0.0),
             drive_N,
-            restraint,
             expected_N,
         )
         return rendered, Governed(governed, within, age, reasons, foresight)
@@ -305,7 +303,6 @@ class Governor:
             state.is_passing,
             state.above_N,
             state.drive_N,
-            state.restraint,
             state.expected_N,
         )
 
@@ -352,21 +349,27 @@ def _expected_N(
     return forces_N
 
 
-def _previewed_N(setpoint: TimedSetpoint, begins_s: float, least_N: float, most_N: float) -> list[float]:
+def _previewed_N(
+    setpoint: TimedSetpoint, begins_s: float, least_N: float, most_N: float, periodicity: Periodicity
+) -> list[float]:
     """The forces at WAY_S from `begins_s`, 0 or more, after the setpoint's stamp on, within what is allowed: as many as
-    the preview knows of, and at least LEAST_WAY."""
+    the preview knows of, and at least LEAST_WAY. Past its end a short preview goes on as `periodicity` foresees it, as
+    far as that is trusted, or else as it has run so far; a long one has no end in sight."""
     forces_N, spacing_s = setpoint.preview_N, setpoint.preview_dt_s
     last, last_N = len(forces_N), forces_N[-1]
     ends_s = spacing_s * last
     mean_N_s = (last_N - setpoint.force_N) / ends_s
+    trust = periodicity.trust
+    known_s = ends_s + HORIZON_S if trust > 0.0 else ends_s
     wanted_N: list[float] = []
     for after_s in WAY_S:
         at_s = begins_s + after_s
         if at_s >= ends_s:
-            if len(wanted_N) >= LEAST_WAY:
+            if len(wanted_N) >= LEAST_WAY and at_s >= known_s:
                 break
-            # past its end a short preview goes on as it has run so far; a long one has no end in sight
             force_N = last_N + mean_N_s * min(at_s - ends_s, AHEAD_S, ends_s)
+            if trust > 0.0:
+                force_N += trust * (forecast_N(periodicity, at_s - ends_s, [0.0])[0] - force_N)
         else:
             place = min(int(at_s / spacing_s), last - 1)
             before_N = forces_N[place - 1] if place else setpoint.force_N

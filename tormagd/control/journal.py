@@ -20,10 +20,8 @@ from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions
 from tormagd_client.messages import TickRecord
 
-FORMAT = 2
-"Of the entries: raised when one comes, is removed or changes its meaning."
-FORMATS = (1, FORMAT)
-"Those that can be rerun: in the first there is nothing of the conversation."
+FORMAT = 3
+"Of the entries and of the states in them: raised when one comes, is removed or changes its meaning. No other is rerun."
 STEP = "step"
 "The step ran here; what it was given stands in the next record."
 PLAN, FORESEE, AFRESH, TEACH = "plan", "foresee", "afresh", "teach"

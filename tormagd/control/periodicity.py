@@ -37,6 +37,7 @@ STRIDE: Final = 3
 "Every third stretch is looked at: the regression makes up for most of what lies between them."
 HORIZON: Final = 8
 "Points that are forecast; a plan looks 30 ms ahead, from as far ahead as the carriages are late."
+HORIZON_S: Final = HORIZON * GRID_S
 JUDGED: Final = 4
 "The point ahead that forecasts are judged at: as far as the middle of what a plan looks at, with usual carriages."
 LONGEST_STEP_S: Final = 0.1

@@ -337,13 +337,14 @@ class Stepper:
         limits: list[Limit] = []
         if safety.operating_state is _PAUSED:
             target = Reference(reference.gap_mm)
-            reference, is_limited, is_slewed = follow(most_mm_s2, reference, target, dt_s, speeds)
+            reference, is_limited, is_slewed = follow(most_mm_s2, reference, target, dt_s, speeds, self._closed_mm)
         else:
             target = self._target(plan, now_s)
             if state.over_s > OVER_HELD_S:
                 target = Reference(self._open_mm)
                 limits.append(Limit.OVER_FORCE)
-            reference, is_limited, is_slewed = follow(most_mm_s2, reference, target, dt_s, speeds)
+            floor_mm = max(self._closed_mm, plan.least_gap_mm)
+            reference, is_limited, is_slewed = follow(most_mm_s2, reference, target, dt_s, speeds, floor_mm)
             if is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
                 limits.append(Limit.RATE)
         left_error, right_error = self._errors(expected, estimate)
@@ -415,12 +416,18 @@ class Stepper:
         return state, output
 
     def _target(self, plan: Plan, now_s: float) -> Reference:
-        """Where the plan leads by when a duty of now shows."""
+        """Where the plan leads by when a duty of now shows. A least or greatest gap that acts also ends the motion
+        towards it."""
         age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + self._lag_s
         gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
         speed_mm_s = plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2
-        within_mm = min(max(max(gap_mm, self._closed_mm), plan.least_gap_mm), self._open_mm)
-        return Reference(within_mm, speed_mm_s, plan.gap_acceleration_mm_s2)
+        acceleration_mm_s2 = plan.gap_acceleration_mm_s2
+        floor_mm = max(self._closed_mm, plan.least_gap_mm)
+        if gap_mm < floor_mm:
+            gap_mm, speed_mm_s, acceleration_mm_s2 = floor_mm, max(speed_mm_s, 0.0), max(acceleration_mm_s2, 0.0)
+        if gap_mm > self._open_mm:
+            gap_mm, speed_mm_s, acceleration_mm_s2 = self._open_mm, min(speed_mm_s, 0.0), min(acceleration_mm_s2, 0.0)
+        return Reference(gap_mm, speed_mm_s, acceleration_mm_s2)
 
     def _speeds(self, pull: float, expected: Expected, estimate: Estimate) -> Speeds:
         """The motors' and the configured one, or what the carriages show where they fall behind; not below half, so

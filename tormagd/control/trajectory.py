@@ -46,10 +46,15 @@ class Expected(Value):
 
 
 def follow(
-    acceleration_mm_s2: float, reference: Reference, target: Reference, dt_s: float, speeds: Speeds
+    acceleration_mm_s2: float,
+    reference: Reference,
+    target: Reference,
+    dt_s: float,
+    speeds: Speeds,
+    floor_mm: float = -math.inf,
 ) -> tuple[Reference, bool, bool]:
     """The reference `dt_s` later, whether the speed limit holds it back from the target, which moves, and whether the
-    limit of its acceleration does.
+    limit of its acceleration does. It closes no faster than it can still come to rest at `floor_mm`.
 
     The closing speed is the largest from which the distance left still suffices to brake with
     `acceleration_mm_s2`, so that a step is time-optimal under the limits and does not overshoot. The target's own
@@ -60,10 +65,9 @@ def follow(
     distance = target.gap_mm - reference.gap_mm
     relative = acceleration_mm_s2 + math.copysign(1.0, distance) * target.acceleration_mm_s2
     relative = max(relative, LEAST_BRAKING * acceleration_mm_s2)
-    change = relative * dt_s
-    braking = (math.sqrt(change * change + 8.0 * relative * abs(distance)) - change) / 2.0
-    closing = math.copysign(min(braking, abs(distance) / max(APPROACH_S, dt_s)), distance)
+    closing = math.copysign(_stopping_mm_s(abs(distance), relative, dt_s), distance)
     wanted = target.speed_mm_s + closing
+    wanted = max(wanted, -_stopping_mm_s(max(reference.gap_mm - floor_mm, 0.0), acceleration_mm_s2, dt_s))
     bounded = min(max(wanted, -speeds.closing_mm_s), speeds.opening_mm_s)
     torque = max(0.0, 1.0 - abs(reference.speed_mm_s) / speeds.no_load_mm_s)
     is_opening = reference.speed_mm_s > 0.0
@@ -76,6 +80,13 @@ def follow(
     chosen = min(max(asked, -down), up)
     speed = reference.speed_mm_s + chosen * dt_s
     return Reference(reference.gap_mm + speed * dt_s, speed, chosen), bounded != wanted, chosen != asked
+
+
+def _stopping_mm_s(distance_mm: float, braking_mm_s2: float, dt_s: float) -> float:
+    """The fastest from which that distance still suffices to come to rest, in steps of `dt_s`."""
+    change = braking_mm_s2 * dt_s
+    fastest = (math.sqrt(change * change + 8.0 * braking_mm_s2 * distance_mm) - change) / 2.0
+    return min(fastest, distance_mm / max(APPROACH_S, dt_s))
 
 
 def expect(expected: Expected, reference: Reference, dt_s: float, lag_s: float, filter_s: float) -> Expected:

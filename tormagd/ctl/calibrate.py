@@ -17,10 +17,10 @@ import msgspec
 import numpy as np
 
 from tormagd.config import Endpoints
-from tormagd.ctl.calibrate_run import Columns, InterruptedRunError, Range, Run, armed, reach, seconds_bar
+from tormagd.ctl.calibrate_run import SOURCE, Columns, InterruptedRunError, Range, Run, armed, reach, seconds_bar
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
-from tormagd.ctl.waveform import Sample, Waveform
+from tormagd.ctl.waveform import Waveform, through
 from tormagd.scenes.scene import Scene
 from tormagd_client.blocking import Client
 
@@ -50,7 +50,7 @@ def calibrate(
     enough, and then there is no model file), FAULT, UNREACHABLE, `InterruptedRunError`.
     """
     _ask_fitter("--insert", insert)  # an unknown insert is told now, not after the sweeps
-    with Client(endpoints, wait_s) as client:
+    with Client(endpoints, wait_s, SOURCE) as client:
         forces = reach(client, scene.force.most_N)
         if not forces.most_N > forces.least_N:
             raise CommandError(
@@ -82,13 +82,8 @@ def _sweep(run: Run, forces: Range, number: int, rates_N_s: Sequence[float]) -> 
 
 def up_and_down(forces: Range, rate_N_s: float) -> Waveform:
     """From the least force to the most and back at a steady rate."""
-    span_N = forces.most_N - forces.least_N
-    half_s = span_N / rate_N_s
-
-    def at(t_s: float) -> Sample:
-        return Sample(forces.least_N + span_N * (1.0 - min(1.0, abs(t_s / half_s - 1.0))))
-
-    return Waveform(2.0 * half_s, at, forces.least_N, forces.most_N)
+    half_s = (forces.most_N - forces.least_N) / rate_N_s
+    return through([(0.0, forces.least_N), (half_s, forces.most_N), (2.0 * half_s, forces.least_N)])
 
 
 def write_sweeps(path: Path, sweeps: Sequence[Columns]) -> None:

@@ -4,7 +4,6 @@ Nothing is fitted here. The daemon learns while it drives; what it lacks on its 
 the whole range, and a handle that turns back often enough for the sensor's zero. Then steps say how good that is.
 """
 
-import bisect
 import sys
 import time
 from typing import Any
@@ -12,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from tormagd.config import Endpoints
-from tormagd.ctl.calibrate_run import MOVING_MM_S, Columns, Range, armed, reach, seconds_bar
+from tormagd.ctl.calibrate_run import MOVING_MM_S, SOURCE, Columns, Range, armed, reach, seconds_bar
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
-from tormagd.ctl.waveform import Sample, Waveform
+from tormagd.ctl.waveform import Sample, Waveform, through
 from tormagd_client.blocking import Client
 from tormagd_client.messages import ProfileReport, Status
 
@@ -45,18 +44,10 @@ def lesson(forces: Range) -> tuple[Waveform, Waveform]:
             ramps.append((ramps[-1][0] + ramp_s, force_N))
     levels_N = [low_N + share * (forces.most_N - low_N) for share in STEP_SHARES]
 
-    def on_ramps(t_s: float) -> Sample:
-        right = min(max(bisect.bisect_right(ramps, (t_s, np.inf)), 1), len(ramps) - 1)
-        (before_s, before_N), (after_s, after_N) = ramps[right - 1], ramps[right]
-        return Sample(before_N + (after_N - before_N) * min((t_s - before_s) / (after_s - before_s), 1.0))
-
     def on_steps(t_s: float) -> Sample:
         return Sample(levels_N[min(int(t_s / STEP_S), len(levels_N) - 1)])
 
-    return (
-        Waveform(ramps[-1][0], on_ramps, low_N, forces.most_N),
-        Waveform(STEP_S * len(levels_N), on_steps, low_N, forces.most_N),
-    )
+    return through(ramps), Waveform(STEP_S * len(levels_N), on_steps, low_N, forces.most_N)
 
 
 def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -> Outcome:
@@ -65,7 +56,7 @@ def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -
     Raises CommandError: REFUSED (also where no profile is kept, the handle hardly moves, or the force sensor is not
     believed), FAULT, UNREACHABLE, `InterruptedRunError`.
     """
-    with Client(endpoints, wait_s) as client:
+    with Client(endpoints, wait_s, SOURCE) as client:
         profile = client.status().profile
         if not profile.folder:
             raise _not_kept(profile)

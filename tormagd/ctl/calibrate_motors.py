@@ -4,7 +4,6 @@ Only forces are asked for, so every limit of the daemon stays in force. They are
 do: slow ramps show friction, fast ones the speed term, jumps the inertia.
 """
 
-import bisect
 import csv
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -12,9 +11,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from tormagd.config import Endpoints
-from tormagd.ctl.calibrate_run import Columns, Range, armed, reach, seconds_bar
+from tormagd.ctl.calibrate_run import SOURCE, Columns, Range, armed, reach, seconds_bar
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
-from tormagd.ctl.waveform import Sample, Waveform
+from tormagd.ctl.waveform import Waveform, through
 from tormagd_client.blocking import Client
 
 Side: TypeAlias = Literal["left", "right"]
@@ -62,15 +61,7 @@ def excitation(forces: Range, rounds: int = ROUNDS) -> Waveform:
         for share in JUMP_SHARES:
             go(low + share * (high - low), 1e-3)
             go(points[-1][1], JUMP_S)
-    times = [time_s for time_s, _ in points]
-
-    def at(t_s: float) -> Sample:
-        right = min(max(bisect.bisect_right(times, t_s), 1), len(points) - 1)
-        (before_s, before_N), (after_s, after_N) = points[right - 1], points[right]
-        share = min(max((t_s - before_s) / (after_s - before_s), 0.0), 1.0)
-        return Sample(before_N + share * (after_N - before_N))
-
-    return Waveform(times[-1], at, low, high)
+    return through(points)
 
 
 def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side: Side, wait_s: float) -> Outcome:
@@ -78,7 +69,7 @@ def calibrate_motors(endpoints: Endpoints, scene_most_N: float, path: Path, side
 
     Raises CommandError: USAGE where the file exists or cannot be made, REFUSED, FAULT, UNREACHABLE.
     """
-    with Client(endpoints, wait_s) as client:
+    with Client(endpoints, wait_s, SOURCE) as client:
         waveform = excitation(reach(client, scene_most_N))
         with (
             armed(endpoints, client, COLUMNS, wait_s) as run,

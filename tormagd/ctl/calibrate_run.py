@@ -17,11 +17,11 @@ from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.operate import home
 from tormagd.ctl.outcome import CommandError, Exit, is_terminal
 from tormagd.ctl.waveform import Waveform
-from tormagd.recording.ticks import MAX_BATCH_BYTES, TickBatch, Value, decode_ticks
+from tormagd.recording.ticks import TickBatch, Value, decode_ticks, listening
 from tormagd_client.blocking import Client
 from tormagd_client.errors import ClientError, unreachable
 from tormagd_client.messages import MessageError
-from tormagd_client.wire import Numbering, connect, keys_of
+from tormagd_client.wire import keys_of
 
 Columns = dict[str, npt.NDArray[np.float64]]
 
@@ -32,7 +32,6 @@ VALID_FOR_MS = 250.0
 SILENT_S = 1.0
 "Ticks come every 20 ms; without any for this long the daemon has gone."
 RECENT_SETPOINT_MS = 1_000.0
-QUEUE = 10_000
 HOMING_S = 30.0
 MOVING_MM_S = 5.0
 HANDLE_PATIENCE_S = 30.0
@@ -74,14 +73,12 @@ class Run:
         self,
         endpoints: Endpoints,
         client: Client,
-        sockets: tuple["zmq.Socket[bytes]", "zmq.Socket[bytes]"],
+        ticks: "zmq.Socket[bytes]",
         columns: Sequence[str],
         is_interrupted: Callable[[], bool],
     ) -> None:
         self._endpoints, self._client, self._columns = endpoints, client, tuple(columns)
-        self._setpoints, self._ticks = sockets
-        self._is_interrupted = is_interrupted
-        self._numbering = Numbering(SOURCE)
+        self._ticks, self._is_interrupted = ticks, is_interrupted
         self._heard_s = time.monotonic()
 
     def play(self, waveform: Waveform, bar: "tqdm[Any] | None" = None) -> Columns:
@@ -104,7 +101,7 @@ class Run:
         if self._is_interrupted():
             raise InterruptedRunError
         due_s = time.monotonic() + 1.0 / RATE_HZ
-        self._setpoints.send(self._numbering.setpoint(force_N, VALID_FOR_MS))
+        self._client.publish(force_N, VALID_FOR_MS)
         rows: list[list[float]] = []
         while (left_s := due_s - time.monotonic()) > 0.0:
             if self._ticks.poll(max(1, round(left_s * 1e3))):
@@ -183,16 +180,8 @@ def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: 
     """
     context = zmq.Context()
     try:
-        # XPUB speaks to SUB as PUB does, and it is told of the subscription: without that the first would be lost
-        setpoints, ticks = context.socket(zmq.XPUB), context.socket(zmq.SUB)
-        for option, value in ((zmq.RCVHWM, QUEUE), (zmq.MAXMSGSIZE, MAX_BATCH_BYTES)):
-            ticks.setsockopt(option, value)
-        ticks.subscribe(b"")
-        keys = keys_of(endpoints.curve)
-        connect(setpoints, endpoints.setpoint, keys)
-        connect(ticks, endpoints.recording, keys)
-        if not setpoints.poll(round(wait_s * 1e3)):
-            raise unreachable(endpoints.setpoint, f"nobody takes setpoints there within {wait_s:g} s")
+        ticks = listening(context, endpoints.recording, keys_of(endpoints.curve))
+        client.require_taken()
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
             status = client.status()
             if not status.is_homed:
@@ -203,7 +192,7 @@ def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: 
                 _enable(client)
             try:
                 _drop_old(ticks, wait_s, endpoints.recording)
-                yield Run(endpoints, client, (setpoints, ticks), columns, is_interrupted)
+                yield Run(endpoints, client, ticks, columns, is_interrupted)
             except BaseException:
                 # in FAULT the gap opens already, and a daemon that has gone has opened it: the first error counts
                 with suppress(ClientError):

@@ -15,16 +15,14 @@ from tormagd.config import Endpoints
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.output import printable, write_line
-from tormagd.recording.ticks import MAX_BATCH_BYTES, decode_ticks
+from tormagd.recording.ticks import decode_ticks, listening
 from tormagd.recording.writer import RecordingWriter
 from tormagd_client.blocking import Client
 from tormagd_client.errors import ClientError, unreachable
 from tormagd_client.messages import MessageError, Telemetry, decode
-from tormagd_client.wire import Keys, connect, keys_of
+from tormagd_client.wire import keys_of
 
 POLL_MS = 100
-QUEUE = 10_000
-"Batches that may wait while the disk is slow: over three minutes."
 LONGEST_END_S = 60.0
 "What has arrived until the end is written down, but no longer than that."
 SILENT_S = 1.0
@@ -45,8 +43,8 @@ def record(endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -
     keys = keys_of(endpoints.curve)
     context = zmq.Context()
     try:
-        telemetry = _subscribe(context, endpoints.telemetry, keys)
-        ticks = _subscribe(context, endpoints.recording, keys)
+        telemetry = listening(context, endpoints.telemetry, keys)
+        ticks = listening(context, endpoints.recording, keys)
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
             if not _any_ready((telemetry, ticks), wait_s, is_interrupted):
                 raise unreachable(endpoints.telemetry, f"nothing is published there within {wait_s:g} s")
@@ -85,15 +83,6 @@ def _about(endpoints: Endpoints, wait_s: float) -> dict[str, str]:
         for name, value in known.items()
         if value is not None
     }
-
-
-def _subscribe(context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None) -> "zmq.Socket[bytes]":
-    socket = context.socket(zmq.SUB)
-    socket.setsockopt(zmq.RCVHWM, QUEUE)
-    socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
-    socket.subscribe(b"")
-    connect(socket, address, keys)
-    return socket
 
 
 def _any_ready(sockets: tuple["zmq.Socket[bytes]", ...], wait_s: float, is_interrupted: Callable[[], bool]) -> bool:

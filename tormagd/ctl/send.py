@@ -1,6 +1,5 @@
 """`tormagctl send`: publish setpoints at a steady rate."""
 
-import contextlib
 import math
 import signal
 import time
@@ -9,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
-import zmq
 
 from tormagd.config import Endpoints
 from tormagd.ctl.interrupt import interrupted_by
@@ -18,9 +16,8 @@ from tormagd.ctl.watch import Watch, require_range
 from tormagd.ctl.waveform import Waveform, WaveformError, read_csv, shape
 from tormagd.force_file import ForceFileError
 from tormagd_client.blocking import Client
-from tormagd_client.errors import UnreachableError, unreachable
+from tormagd_client.errors import UnreachableError
 from tormagd_client.messages import MAX_PREVIEW_SAMPLES
-from tormagd_client.wire import Numbering, connect, keys_of
 
 
 class Stream(NamedTuple):
@@ -82,34 +79,24 @@ def _sent(
     answers or subscribes within `wait_s`, or where it leaves on the way; FAULT as soon as the device is in FAULT;
     REFUSED where the scene does not allow such forces (nothing is sent), or the setpoints were not rendered.
     """
-    address, keys = endpoints.setpoint, keys_of(endpoints.curve)
-    context = zmq.Context()
-    # XPUB speaks to SUB as PUB does, and it is told of the subscription: without that the first setpoints would be lost
-    socket = context.socket(zmq.XPUB)
-    socket.setsockopt(zmq.LINGER, 200)
-    with contextlib.ExitStack() as stack:
-        stack.callback(context.destroy)
+    with Client(endpoints, wait_s, stream.source) as client:
         watch = None
         if not is_blind:
-            client = stack.enter_context(Client(endpoints, wait_s))
             try:
                 known = client.describe()
             except UnreachableError as error:
-                if keys is not None:
+                if endpoints.curve is not None and endpoints.curve.client_secret:
                     error.hint += "; with a key that may only publish: --blind"
                 raise
             require_range(known, waveform.least_N, waveform.most_N)
             watch = Watch(client, stream.source)
-        connect(socket, address, keys)
-        if not socket.poll(round(wait_s * 1e3)):
-            raise unreachable(address, f"nobody takes setpoints there within {wait_s:g} s")
-        socket.recv()
+        client.require_taken()
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
-            return _publish(socket, address, waveform, duration_s, stream, is_interrupted, watch)
+            return _publish(client, endpoints.setpoint, waveform, duration_s, stream, is_interrupted, watch)
 
 
 def _publish(
-    socket: "zmq.Socket[bytes]",
+    client: Client,
     address: str,
     waveform: Waveform,
     duration_s: float,
@@ -118,8 +105,7 @@ def _publish(
     watch: Watch | None,
 ) -> Outcome:
     rate_hz = stream.rate_hz
-    numbering = Numbering(stream.source)
-    skipped = index = 0
+    sent = skipped = index = 0
     worst_late_s = 0.0
     start_s, start_ns = time.monotonic(), time.time_ns()
     # the margin keeps the last one where the times of a file are off by a rounding error
@@ -134,16 +120,14 @@ def _publish(
         overdue = min(int(late_s * rate_hz), last - index)
         skipped += overdue
         index += overdue
-        if socket.poll(0) and socket.recv()[:1] == b"\x00":
-            raise CommandError(
-                Exit.UNREACHABLE,
-                "gone",
-                f"the daemon at {address} went away after {numbering.sent} setpoints",
-                unreachable(address, "").hint,
-            )
+        try:
+            client.require_taken()
+        except UnreachableError as error:
+            message = f"the daemon at {address} went away after {sent} setpoints"
+            raise CommandError(Exit.UNREACHABLE, "gone", message, error.hint) from error
         sample = waveform.at(index / rate_hz)
         ahead = range(index + 1, index + 1 + stream.preview)
-        setpoint = numbering.setpoint(
+        client.publish(
             sample.force_N,
             stream.valid_for_ms,
             start_ns + round(index / rate_hz * 1e9),  # when the force is meant, whenever it gets sent
@@ -152,14 +136,13 @@ def _publish(
             preview_N=tuple(waveform.at(min(later / rate_hz, duration_s)).force_N for later in ahead) or None,
             preview_dt_ms=1e3 / rate_hz if ahead else None,
         )
-        socket.send(setpoint)
-        index += 1
+        sent, index = sent + 1, index + 1
         if watch is not None:
             watch.look()
     seconds = time.monotonic() - start_s
     result = {
         "source": stream.source,
-        "sent": numbering.sent,
+        "sent": sent,
         "skipped": skipped,
         "start_ns": start_ns,
         "seconds": round(seconds, 3),
@@ -168,10 +151,10 @@ def _publish(
     }
     fate = "whether they were taken is not known"
     if watch is not None:
-        became = watch.finish(numbering.sent)
+        became = watch.finish(sent)
         result |= msgspec.structs.asdict(became)
         fate = f"{became.accepted} taken and rendered"
         if became.limits:
             fate += f", held by {', '.join(became.limits)} at times"
     left_out = f", {skipped} left out because this machine was late" if skipped else ""
-    return Outcome(result, f"sent {numbering.sent} setpoints as {stream.source!r} in {seconds:.1f} s{left_out}; {fate}")
+    return Outcome(result, f"sent {sent} setpoints as {stream.source!r} in {seconds:.1f} s{left_out}; {fate}")

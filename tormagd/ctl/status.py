@@ -81,13 +81,20 @@ def _peers(peers: PeersReport, colour: Colour) -> list[str]:
 
 
 def _device(known: Status, colour: Colour) -> list[str]:
-    """What the device has shown of itself, since when it is known, and why what was kept of it is not used."""
+    """What the device has shown of itself, what of it acts, since when it is known, and why what was kept is not
+    used."""
     shown, kept = known.device, known.profile
     age = "" if kept.age_s is None else f", kept {kept.age_s / 3600.0:.1f} h ago"
     lines = [
         f"device    {shown.scale:.2f} ± {shown.scale_sd:.2f} times the model {shown.offset_N:+.3f} N, sensor's zero "
         f"{shown.sensor_zero_N:+.3f} ± {shown.sensor_zero_sd_N:.3f} N{age}"
     ]
+    told = [
+        f"{name} {it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'}{it.unit and f' {it.unit}'}"
+        for name, it in known.belief.items()
+        if it.acts and name not in ("scale", "offset", "sensor_zero")
+    ]
+    lines += _said("believed  ", ", ".join(told), str)
     if kept.folder and kept.refusal:  # without a folder nothing was to be kept
         lines += _explained(kept.refusal, "tormagctl calibrate --device, which keeps a new profile", colour.yellow)
     return lines

@@ -3,7 +3,7 @@
 import math
 from array import array
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,6 +31,19 @@ class Waveform(NamedTuple):
     at: Callable[[float], Sample]
     least_N: float
     most_N: float
+
+
+def through(points: Sequence[tuple[float, float]]) -> Waveform:
+    """Straight lines through these times, from 0 on and rising, and forces."""
+    times_s, forces_N = zip(*points, strict=True)
+
+    def at(t_s: float) -> Sample:
+        right = min(max(bisect_right(times_s, t_s), 1), len(points) - 1)
+        (before_s, before_N), (after_s, after_N) = points[right - 1], points[right]
+        share = min(max((t_s - before_s) / (after_s - before_s), 0.0), 1.0)
+        return Sample(before_N + share * (after_N - before_N))
+
+    return Waveform(times_s[-1], at, min(forces_N), max(forces_N))
 
 
 SHAPES = ("step", "sine", "ramp", "pulse")

@@ -7,8 +7,6 @@ PEERS = 256
 
 
 class _Bucket:
-    __slots__ = ("filled_s", "left")
-
     def __init__(self, left: float, filled_s: float) -> None:
         self.left, self.filled_s = left, filled_s
 

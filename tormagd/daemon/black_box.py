@@ -84,8 +84,6 @@ class BlackBox:
     ) -> None:
         self._folder = folder
         self._refusal, self._newest, self._dropped = "", "", 0
-        self.handed_over = 0
-        "Bytes of entries."
         self._socket: socket.socket | None = None
         self._process: subprocess.Popen[bytes] | None = None
         if folder is None:
@@ -100,7 +98,6 @@ class BlackBox:
         self._ticks = PART_TICKS // 2
         self._ticks_per_snapshot = max(1, round(SNAPSHOT_S * control_hz / PART_TICKS)) * PART_TICKS
         self._encoder = msgspec.msgpack.Encoder()
-        self._has_state = False
         self._connection: Connection | None = None
         self._asked: deque[Write] = deque(maxlen=MOST_ASKED)
 
@@ -124,9 +121,7 @@ class BlackBox:
         if self._ticks % PART_TICKS:
             return
         entries = self._packer.take()
-        self.handed_over += len(entries)
-        is_taken = self._say(Part(record.monotonic_s, record.t_ns, self._has_state, entries))
-        self._has_state = False
+        is_taken = self._say(Part(record.monotonic_s, record.t_ns, entries))
         if not is_taken:
             self._dropped += 1
             self.journal.missed()
@@ -212,7 +207,6 @@ class BlackBox:
 
     def _snapshot(self, step: StepState, plan: PlanState) -> None:
         self.journal.snapshot(step, plan, None if self._connection is None else self._connection.memory())
-        self._has_state = True
 
     def _say(self, what: Said) -> bool:
         """Whether the socket took it."""

@@ -183,7 +183,7 @@ class Endpoint:
         """
         self._count_oversize(now_s)
         self._tell_drops(now_s)
-        if not self._requests.any_waiting:
+        if not self._requests.count:
             self.take_requests(answer)
         for number in range(REQUESTS):
             if number and time.monotonic_ns() >= until_ns:
@@ -324,7 +324,8 @@ class Endpoint:
                 f"{request.command!r} is not for the key {self.admission.name(waiting.public)}",
                 "its .key belongs in the daemon's folder of operators (operate), which SIGHUP reads again",
             )
-        if self._requests.is_overtaken(waiting) and not is_observed:
+        # the gap has been told to open since this came: whatever it asks, it was meant for before that
+        if waiting.opens < self._requests.opens and not is_observed:
             raise RefusedError(
                 "overtaken",
                 f"stop or disable came after {request.command!r} and went first",

@@ -10,7 +10,7 @@ from collections import deque
 
 from tormagd.control.governor import TimedSetpoint
 from tormagd.daemon.hold import Hold, is_passed
-from tormagd.daemon.rate_group import RecentHistogram
+from tormagd.daemon.rate_group import Histogram
 from tormagd.daemon.sequence import Order, Sequence
 from tormagd.daemon.source_clock import AHEAD_S, SourceClock
 from tormagd.hardware.connection import clock_report
@@ -40,28 +40,12 @@ STEP_NAMED_S = 60.0
 class _Source:
     """What is known of one publisher."""
 
-    __slots__ = (
-        "accepted",
-        "cause",
-        "clock",
-        "delays",
-        "fit",
-        "heard_s",
-        "is_named",
-        "refused",
-        "remedy",
-        "sequence",
-        "setpoint",
-        "stamp_s",
-        "summary",
-    )
-
     def __init__(self, setpoint: Setpoint, now_s: float) -> None:
         self.setpoint, self.heard_s = setpoint, now_s
         self.stamp_s = -math.inf  # nothing of it has been taken yet
         self.sequence = Sequence(setpoint.session, setpoint.seq)
         self.clock = SourceClock()
-        self.delays = RecentHistogram()
+        self.delays = Histogram()
         self.accepted = self.refused = 0
         self.is_named = False
         self.refresh(now_s)
@@ -78,7 +62,7 @@ class _Source:
 
     def keep(self, setpoint: Setpoint, now_s: float, delay_s: float) -> None:
         if self.clock.is_settled:
-            self.delays.add(now_s, delay_s * 1e6)
+            self.delays.add_at(now_s, delay_s * 1e6)
         # the worse of arrival and corrected stamp: a stamp of the time to come is of now
         self.setpoint, self.heard_s, self.stamp_s = setpoint, now_s, now_s - max(delay_s, 0.0)
 

@@ -2,7 +2,6 @@
 written by another thread; the control thread only looks, once a telemetry period."""
 
 import asyncio
-import contextlib
 import hashlib
 import logging
 import os
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from tormagd.bounded_file import read_bounded
+from tormagd.bounded_file import in_place_of, read_bounded
 from tormagd.control.device_fit import UNSEEN, DeviceFit
 from tormagd.control.plan import NOTHING_SHOWN, Shown
 from tormagd.control.profile import MAX_BYTES, Profile, ProfileError, profile_of, read_profile
@@ -56,17 +55,13 @@ class ProfileFolder:
     def write(self, profile: Profile) -> None:
         """Keeps it: the old one or the new one is there, whatever happens. Raises ProfileError."""
         path = self.path(profile.serial_number)
-        beside = path.with_suffix(".new")
         try:
             self.folder.mkdir(mode=0o750, parents=True, exist_ok=True)
-            with beside.open("wb") as file:
+            with in_place_of(path) as beside, beside.open("wb") as file:
                 file.write(msgspec.json.format(msgspec.json.encode(profile)) + b"\n")
                 file.flush()
                 os.fsync(file.fileno())
-            beside.replace(path)
         except OSError as error:
-            with contextlib.suppress(OSError):
-                beside.unlink()
             raise ProfileError(f"{path}: {error.strerror}: nothing was kept") from error
 
 

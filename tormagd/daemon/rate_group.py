@@ -28,12 +28,20 @@ class Histogram:
         self._now = [0] * _BINS
         self._before = [0] * _BINS
         self._most_now = self._most_before = 0.0
+        self._turned_s = -math.inf
 
     def add(self, value_us: float) -> None:
         """Counts one duration; a negative one (a clock's grain) counts as 0."""
         self._now[_bin(value_us)] += 1
         if value_us > self._most_now:
             self._most_now = value_us
+
+    def add_at(self, now_s: float, value_us: float) -> None:
+        """Counts one duration, at `now_s`: what there is then is of the time since one to two horizons ago."""
+        if now_s - self._turned_s > HORIZON_NS * 1e-9:
+            self.turn()
+            self._turned_s = now_s
+        self.add(value_us)
 
     def turn(self) -> None:
         """Begins a new horizon and forgets the one before the last."""
@@ -54,26 +62,6 @@ class Histogram:
             while waiting and seen >= waiting[0][1] * total:
                 found[waiting.pop(0)[0]] = min(float(_upper_edge(index)), round(most, 1))
         return ExecReport(**found, max=round(most, 1))
-
-
-@final
-class RecentHistogram:
-    """A histogram of the time since one to two horizons ago."""
-
-    def __init__(self) -> None:
-        self._histogram = Histogram()
-        self._turned_s = -math.inf
-
-    def add(self, now_s: float, value_us: float) -> None:
-        """Counts one duration, at `now_s`."""
-        if now_s - self._turned_s > HORIZON_NS * 1e-9:
-            self._histogram.turn()
-            self._turned_s = now_s
-        self._histogram.add(value_us)
-
-    def summary(self) -> ExecReport:
-        """See `Histogram.summary`."""
-        return self._histogram.summary()
 
 
 def _bin(value_us: float) -> int:

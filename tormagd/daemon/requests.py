@@ -29,25 +29,21 @@ class Requests:
 
     def __init__(self) -> None:
         self._waiting: dict[bytes, deque[Waiting]] = {}
-        self._count = 0
+        self.count = 0
+        "How many wait."
         self.opens = 0
         "How often the gap has been told to open."
-
-    @property
-    def any_waiting(self) -> bool:
-        """Whether there is one to answer."""
-        return self._count > 0
 
     def put(self, waiting: Waiting) -> bool:
         """Lets a request wait for its client's turn; False where too many wait."""
         client = waiting.envelope[0]
         of_client = self._waiting.get(client)
-        if self._count >= WAITING or (of_client is not None and len(of_client) >= WAITING_PER_CLIENT):
+        if self.count >= WAITING or (of_client is not None and len(of_client) >= WAITING_PER_CLIENT):
             return False
         if of_client is None:
             of_client = self._waiting[client] = deque()
         of_client.append(waiting)
-        self._count += 1
+        self.count += 1
         return True
 
     def next(self) -> Waiting | None:
@@ -57,13 +53,9 @@ class Requests:
             del self._waiting[client]
             if of_client:
                 self._waiting[client] = of_client
-            self._count -= 1
+            self.count -= 1
             return taken
         return None
-
-    def is_overtaken(self, waiting: Waiting) -> bool:
-        """Whether the gap has been told to open since this came: whatever it asks, it was meant for before that."""
-        return waiting.opens < self.opens
 
 
 def may_go_first(data: bytes) -> bool:

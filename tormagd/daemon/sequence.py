@@ -31,20 +31,6 @@ class Order(Enum):
 class Sequence:
     """The run of `seq` that is followed, in its `session`; None where the publisher has none."""
 
-    __slots__ = (
-        "_in_row",
-        "_latest_session",
-        "_step",
-        "_stray_seq",
-        "_stray_session",
-        "_strays",
-        "_strays_since_s",
-        "lost",
-        "restarts",
-        "seq",
-        "session",
-    )
-
     def __init__(self, session: int | None, seq: int) -> None:
         self.session, self.seq = session, seq
         self.lost = 0

@@ -35,20 +35,6 @@ JITTER_SHARE = 1.0 / 16.0
 class SourceClock:
     """The clock of one publisher, fed with each of its messages, in the order in which they were sent."""
 
-    __slots__ = (
-        "_heard_s",
-        "_lateness_s",
-        "_leaked_s",
-        "_line",
-        "_settles_s",
-        "jitter_s",
-        "offset_s",
-        "stepped_at_s",
-        "stepped_s",
-        "steps",
-        "way_s",
-    )
-
     def __init__(self) -> None:
         self.offset_s = 0.0
         "By how much the clock is behind ours, as far as it can be told."

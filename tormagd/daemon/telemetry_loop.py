@@ -10,6 +10,7 @@ import msgspec
 from firmware_protocol.build import settle
 from tormagd import __version__
 from tormagd.config import Config
+from tormagd.control.belief import beliefs
 from tormagd.control.conditions import conditions, is_busy, is_homed
 from tormagd.control.core import Core
 from tormagd.control.plan import PlanState
@@ -29,6 +30,7 @@ from tormagd.hardware.connection import Connection
 from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
 from tormagd.scenes.scene import terms_of
 from tormagd_client.messages import (
+    BeliefReport,
     Description,
     DeviceReport,
     OutputReport,
@@ -303,9 +305,13 @@ class TelemetryLoop:
                 offset_N=round(shown.offset_N, 4),
                 offset_sd_N=round(shown.offset_sd_N, 4),
                 sensor_zero_N=round(planned.shown.zero.zero_N, 4),
-                sensor_zero_sd_N=round(planned.shown.zero.sd_N(time.monotonic()), 4),
+                sensor_zero_sd_N=round(planned.shown.zero.sd_N(now_s), 4),
                 lag_ms=round(planned.shown.lateness.lag_s * 1e3, 1),
             ),
+            belief={
+                name: BeliefReport(value=round(it.value, 5), sd=it.sd and round(it.sd, 5), unit=it.unit, acts=it.acts)
+                for name, it in beliefs(planned, self._control.state, now_s, terms_of(self._core.scene)).items()
+            },
             profile=self._profiles.report(),
             least_gap_mm=round(plan.least_gap_mm, 2),
             link=link,

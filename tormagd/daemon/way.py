@@ -9,7 +9,7 @@ import math
 
 from tormagd.control.plan import PlanState
 from tormagd.control.step import StepState
-from tormagd.daemon.rate_group import RecentHistogram
+from tormagd.daemon.rate_group import Histogram
 from tormagd_client.messages import ExecReport, WayReport
 
 BUDGET_MS = 400.0
@@ -26,7 +26,7 @@ class Way:
     """Takes every control tick; remembers a bounded number of figures."""
 
     def __init__(self) -> None:
-        self._to_duty = RecentHistogram()
+        self._to_duty = Histogram()
         self._stamp_s = -math.inf
         self._tick_s = -math.inf
         self._behind = self._moved = 0.0
@@ -38,7 +38,7 @@ class Way:
         if stamp_s != self._stamp_s:
             self._stamp_s = stamp_s
             if stamp_s > -math.inf:  # a duty that follows no setpoint ends no way
-                self._to_duty.add(now_s, (now_s - stamp_s) * 1e6)
+                self._to_duty.add_at(now_s, (now_s - stamp_s) * 1e6)
         elapsed_s, self._tick_s = now_s - self._tick_s, now_s
         reference, estimate = state.reference, state.estimate
         if reference is None or estimate is None or not 0.0 < elapsed_s < MEMORY_S:

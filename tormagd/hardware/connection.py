@@ -9,8 +9,7 @@ CLOSED --> IDENTIFYING <--> UNANSWERED             the port is opened: --> IDENT
 import logging
 import time
 from collections.abc import Callable, Mapping
-from types import MappingProxyType
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, DriveMode, Message
 from tormagd.config import Device
@@ -27,23 +26,6 @@ from tormagd_client.messages import ClockReport, LinkReport, RoundTripReport
 FIRST_BACK_OFF_S = 0.05
 LONGEST_BACK_OFF_S = 1.0
 COUNTERS = ("frames", "bytes", "corrupt", "lost", "repeated", "resynchronisations")
-
-TRANSITIONS: Final[Mapping[LinkState, frozenset[LinkState]]] = MappingProxyType(
-    {
-        LinkState.CLOSED: frozenset({LinkState.IDENTIFYING, LinkState.BACK_OFF}),
-        LinkState.BACK_OFF: frozenset({LinkState.IDENTIFYING, LinkState.CLOSED}),
-        LinkState.IDENTIFYING: frozenset(
-            {LinkState.RUNNING, LinkState.REFUSED, LinkState.UNANSWERED, LinkState.LOST, LinkState.CLOSED}
-        ),
-        LinkState.UNANSWERED: frozenset(
-            {LinkState.IDENTIFYING, LinkState.RUNNING, LinkState.REFUSED, LinkState.LOST, LinkState.CLOSED}
-        ),
-        LinkState.REFUSED: frozenset({LinkState.RUNNING, LinkState.IDENTIFYING, LinkState.LOST, LinkState.CLOSED}),
-        LinkState.RUNNING: frozenset({LinkState.IDENTIFYING, LinkState.REFUSED, LinkState.LOST, LinkState.CLOSED}),
-        LinkState.LOST: frozenset({LinkState.IDENTIFYING, LinkState.BACK_OFF, LinkState.CLOSED}),
-    }
-)
-"""Where each state can lead. RUNNING is left only with a loss, and entered only by an Identity that fits."""
 
 _REMEDIES = {
     LinkState.BACK_OFF: "check cable, supply, device.port and who holds it (tormagctl ports); it is tried again",
@@ -327,7 +309,6 @@ class Connection:
         before, state = self._seen, self.state
         if state is before:
             return
-        assert state in TRANSITIONS[before], f"{before} does not lead to {state}"
         self._seen = state
         if state is LinkState.RUNNING:
             self._back_off_s = FIRST_BACK_OFF_S

@@ -11,7 +11,6 @@ class FrameStream:
     """Both directions of one serial conversation. A frame that does not decode is counted, never raised."""
 
     __match_args__: ClassVar = ("_decoder", "_sequence")
-    __slots__ = (*__match_args__, "received", "sent")
 
     def __init__(self) -> None:
         self._decoder = FrameDecoder()

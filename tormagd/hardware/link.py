@@ -3,7 +3,6 @@
 No I/O and no clock: the daemon and the virtual-time simulation carry the same messages to and from it.
 """
 
-import math
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import ClassVar, Final, final
@@ -89,7 +88,6 @@ class DeviceLink:
         "_state", "_states", "_status", "_told", "cause", "clock", "identity", "quality", "repeated", "round_trip",
         "state",
     )  # fmt: skip
-    __slots__ = (*__match_args__, "_measurement")
 
     def __init__(self, now_s: float) -> None:
         self.repeated = 0
@@ -227,10 +225,6 @@ class DeviceLink:
         """The port failed: the conversation is over."""
         self.state = LinkState.LOST
         self.cause = cause
-
-    def age_s(self, now_s: float) -> float:
-        """Time since the newest measurement, s; infinite without one."""
-        return now_s - self._received_s if self._is_measured else math.inf
 
     def _watch(self, now_s: float) -> None:
         # what broke was heard a tick ago: so the core has seen the measurement that shows it, and names it better

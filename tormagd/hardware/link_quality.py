@@ -72,7 +72,6 @@ class LinkWatch:
     """Makes the figures of one conversation. Asked whether it is time in every period, it looks ten times a second."""
 
     __match_args__: ClassVar = ("_counts", "_due_s", "_round_trip_s")
-    __slots__ = __match_args__
 
     def __init__(self, now_s: float) -> None:
         self._due_s = now_s + SETTLING_LOOKS * LOOKED_S

@@ -53,7 +53,6 @@ class RoundTrip:
     __match_args__: ClassVar = (
         "_before_hello", "_lead", "_newest", "_newest_s", "_recent", "_sent_s", "_state", "_unsure", "_usual",
     )  # fmt: skip
-    __slots__ = __match_args__
 
     def __init__(self) -> None:
         self._sent_s = [0.0] * 256
@@ -164,7 +163,6 @@ class DeviceClock:
     """
 
     __match_args__: ClassVar = ("_ends_s", "_least", "_newest_s", "_standing", "_windows", "drift")
-    __slots__ = (*__match_args__, "_fit", "_is_fitted")
 
     def __init__(self) -> None:
         self._windows: deque[tuple[float, float]] = deque(maxlen=WINDOWS)

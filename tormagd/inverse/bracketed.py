@@ -1,4 +1,4 @@
-"""Coarse look, then refinement of the bracket nearest the last field: by a finer grid, by Newton, by Brent."""
+"""Coarse look, then refinement of the bracket nearest the last field: by a finer grid, or by Newton."""
 
 from collections.abc import Callable
 from typing import TypeAlias
@@ -57,39 +57,17 @@ def finer_grid(curve: ForceCurve, bracket: Bracket, force_N: float) -> tuple[flo
     return bracket.crossing_mT, evaluations
 
 
-def brent(curve: ForceCurve, bracket: Bracket, force_N: float) -> tuple[float, int]:
-    """Brent's method as scipy has it. For the laboratory: scipy is no daemon dependency, and Newton needs less."""
-    from scipy.optimize import brentq
-
-    # the ends keep the signs that the look saw
-    known = {bracket.left_mT: bracket.left_N, bracket.right_mT: bracket.right_N}
-
-    def excess_N(field: float) -> float:
-        return known[field] if field in known else curve.force_N(field) - force_N
-
-    field, report = brentq(excess_N, bracket.left_mT, bracket.right_mT, xtol=ACCURACY_MT, full_output=True)
-    return float(field), int(report.function_calls) - len(known)
-
-
 class BracketedSearch:
     """A look at every `step_mT`, then `refine` on the bracket whose root lies nearest the last field.
 
     Without a last field the lowest root wins, which is the opener gap. The answer is the curve's own root to
     `ACCURACY_MT` (`finer_grid`: to a straight line over 2 mT). Where nothing crosses, the force is out of reach,
-    and the field that comes nearest is the answer. `dtype` (numpy.float32 or float64) is the type that the look
-    is computed in. Raises `DomainError` on parameters it cannot use.
+    and the field that comes nearest is the answer. Raises `DomainError` on parameters it cannot use.
     """
 
-    def __init__(
-        self,
-        *,
-        field_range_mT: tuple[float, float],
-        refine: Refinement,
-        step_mT: float = 20.0,
-        dtype: type[np.floating] = np.float64,
-    ) -> None:
+    def __init__(self, *, field_range_mT: tuple[float, float], refine: Refinement, step_mT: float = 20.0) -> None:
         self._refine = refine
-        self._scan = FieldScan(field_range_mT=field_range_mT, step_mT=step_mT, dtype=dtype)
+        self._scan = FieldScan(field_range_mT=field_range_mT, step_mT=step_mT)
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """See `FieldSolver.solve`."""

@@ -21,11 +21,7 @@ class Choice(NamedTuple):
 _REFINEMENTS: dict[str, Refinement] = {"coarse-to-fine": finer_grid, "newton": newton}
 
 RUNTIME_SOLVERS = ("nearest", *_REFINEMENTS)
-"""The searches that the daemon may run. They answer from the curve alone and keep the branch of the last field.
-
-The k-d tree and Brent's method want scipy, the direct inverse a training of its own; the closed form does not use the
-learned model, and the row-by-row searches are baselines.
-"""
+"""The searches that the daemon may run. They answer from the curve alone and keep the branch of the last field."""
 
 _USUAL_STEP_MT = {"nearest": 2.0, "coarse-to-fine": 20.0, "newton": 20.0}
 _USUAL_NEIGHBOURS = 4

@@ -27,54 +27,34 @@ def field_grid(field_range_mT: tuple[float, float], step_mT: float) -> NDArray[n
     return np.linspace(low, high, int(np.ceil((high - low) / step_mT)) + 1)
 
 
-def require_precision(dtype: type[np.floating]) -> None:
-    """Raise `DomainError` unless `dtype` is one that grids are computed in."""
-    if dtype not in (np.float32, np.float64):
-        raise DomainError("dtype", dtype, "numpy.float32 or numpy.float64")
-
-
 class NearestFieldSearch:
     """Nearest-neighbour search of the field (section 4.2.6 of the thesis), vectorised and continuous.
 
     It looks at the force at every field of a grid at once. Candidates are the `neighbours` points of the grid that are
     nearest in force. Where predicted and asked force cross beside one, the root takes its place, by linear
     interpolation, so that the answer is not bound to the grid. Where none do, those candidates count that are as near
-    as the best within the rounding of `dtype`, and the point nearest the last field if it is: plateaus, touching points
+    as the best within rounding, and the point nearest the last field if it is: plateaus, touching points
     and the ends of reach.
 
     The candidate nearest the last field wins; without a last field the lowest, which is the opener gap. Where the force
     rises with the field there is one root, and one neighbour finds it. Where it also falls there are several, each on
     a branch of its own: with too few neighbours all of them may lie on another branch than the last field's.
 
-    Parameters: `field_range_mT` and `step_mT` make the grid; `dtype` is numpy.float32 or numpy.float64. The default is
-    float64 every 2 mT, which is ten times nearer the curve's own root than float32 every 1 mT.
-    Raises `DomainError` on parameters it cannot use.
+    `field_range_mT` and `step_mT` make the grid. Raises `DomainError` on parameters it cannot use.
     """
 
-    def __init__(
-        self,
-        *,
-        field_range_mT: tuple[float, float],
-        step_mT: float = 2.0,
-        neighbours: int = 8,
-        dtype: type[np.floating] = np.float64,
-    ) -> None:
-        require_precision(dtype)
+    def __init__(self, *, field_range_mT: tuple[float, float], step_mT: float = 2.0, neighbours: int = 8) -> None:
         self._fields_mT = field_grid(field_range_mT, step_mT)
         points = len(self._fields_mT)
         if not 1 <= neighbours <= points:
             raise DomainError("neighbours", neighbours, f"1 to the number of grid points, {points}")
-        self._grid_mT: Floats = self._fields_mT.astype(dtype)
         self._neighbours = neighbours
         self._per_mT = 1 / float(self._fields_mT[1] - self._fields_mT[0])
-        self._eps = float(np.finfo(dtype).eps)
 
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """See `FieldSolver.solve`."""
         near = checked_near_mT(force_N, last_field_mT, float(self._fields_mT[0]))
-        excess_N = curve.forces_N(self._grid_mT)
-        excess_N -= excess_N.dtype.type(force_N)
-        candidates, reach = self._candidates(excess_N, near, tie_N(curve, self._eps))
+        candidates, reach = self._candidates(curve.forces_N(self._fields_mT) - force_N, near, tie_N(curve))
         field_mT = float(candidates[np.abs(candidates - near).argmin()])
         return answer(curve, field_mT, force_N, curve.force_N(field_mT), 2, reach)
 

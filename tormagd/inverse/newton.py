@@ -16,9 +16,6 @@ LOOKED_AT_MT: Final = 0.25 * ACCURACY_MT
 MOST_EVALUATIONS: Final = 60
 """Bisection alone needs 20 from 1000 mT to `ACCURACY_MT`; thrice that is for steps that alternate with it."""
 
-EPS: Final = 2.0**-52
-"The unit of rounding that the curve's forces are computed with."
-
 
 @final
 class RisingSearch:
@@ -44,7 +41,7 @@ class RisingSearch:
         span = high - low
         field = checked_near_mT(force_N, last_field_mT, low)
         field = low if field < low else high if field > high else field
-        same_N = tie_N(curve, EPS)
+        same_N = tie_N(curve)
         left, right, left_seen, right_seen = low, high, False, False
         # a step leaves its square times this: a parabola's over the range at first, then as the last two steps show
         bend_per_mT, before = 1.0 / span, 2.0 * span

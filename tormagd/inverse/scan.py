@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tormagd.inverse.nearest import field_grid, require_precision
+from tormagd.inverse.nearest import field_grid
 from tormagd.inverse.solution import Reach, checked_near_mT, tie_N
-from tormagd.model.force_curve import Floats, ForceCurve
+from tormagd.model.force_curve import ForceCurve
 
 FINEST_MT = 2.0
 """Grids are refined until their step is this small: around the nearest point where nothing crosses, too."""
@@ -36,13 +36,10 @@ class Bracket(NamedTuple):
 class Look(NamedTuple):
     """What a look shows: brackets to refine, nearest first, and `candidate_mT`, a field that fits or comes nearest.
 
-    `near_mT` is the field from which distance counts; `ends_N` is how far the force at the least and the greatest field
-    lies above the one asked. Out of reach there are no brackets, but a candidate.
+    `near_mT` is the field from which distance counts. Out of reach there are no brackets, but a candidate.
     """
 
-    curve: ForceCurve
     near_mT: float
-    ends_N: tuple[float, float]
     brackets: list[Bracket]
     candidate_mT: float | None
     reach: Reach
@@ -52,17 +49,13 @@ class Look(NamedTuple):
 class FieldScan:
     """Looks at the force on a coarse grid of fields (`step_mT`).
 
-    A dip or a bump narrower than the grid's step can go unseen, except where it decides over reach. `dtype`
-    (numpy.float32 or numpy.float64) is the type that the grid is computed in. Raises `DomainError` on parameters it
-    cannot use.
+    A dip or a bump narrower than the grid's step can go unseen, except where it decides over reach. Raises
+    `DomainError` on parameters it cannot use.
     """
 
-    def __init__(self, *, field_range_mT: tuple[float, float], step_mT: float, dtype: type[np.floating]) -> None:
-        require_precision(dtype)
-        fields_mT = field_grid(field_range_mT, step_mT)
-        self._list_mT: list[float] = fields_mT.tolist()
-        self._fields_mT: Floats = fields_mT.astype(dtype)
-        self._eps = float(np.finfo(dtype).eps)
+    def __init__(self, *, field_range_mT: tuple[float, float], step_mT: float) -> None:
+        self._fields_mT = field_grid(field_range_mT, step_mT)
+        self._list_mT: list[float] = self._fields_mT.tolist()
 
     def look(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> Look:
         """Where the force is met, seen from the last field, or else from the least. `DomainError` on NaN."""
@@ -84,26 +77,25 @@ class FieldScan:
     def _search(
         self, curve: ForceCurve, near: float, here_N: float, fields: list[float], excess: list[float], force_N: float
     ) -> Look:
-        ends_N, iterations = (excess[0], excess[-1]), 2
-        same_N = tie_N(curve, self._eps)
+        iterations, same_N = 2, tie_N(curve)
         while True:
             brackets = _brackets(fields, excess)
             best_N = min(map(abs, excess))
             if brackets and best_N > same_N:
                 brackets.sort(key=lambda bracket: bracket.distance_mT(near))
-                return Look(curve, near, ends_N, brackets, None, Reach.INSIDE, iterations)
+                return Look(near, brackets, None, Reach.INSIDE, iterations)
             tied = [field for field, error in zip(fields, excess, strict=True) if abs(error) <= best_N + same_N]
             nearest = min(tied, key=lambda field: abs(field - near))
             if best_N <= same_N:
                 brackets.sort(key=lambda bracket: bracket.distance_mT(near))
-                return Look(curve, near, ends_N, brackets, nearest, Reach.INSIDE, iterations)
+                return Look(near, brackets, nearest, Reach.INSIDE, iterations)
             at, last = fields.index(nearest), len(fields) - 1
             low, high = fields[max(at - 1, 0)], fields[min(at + 1, last)]
             if high - low <= 2 * FINEST_MT:
                 if abs(here_N) <= best_N + same_N:
                     nearest = near
                 reach = Reach.ABOVE if excess[at] < 0 else Reach.BELOW
-                return Look(curve, near, ends_N, [], nearest, reach, iterations)
+                return Look(near, [], nearest, reach, iterations)
             zoomed = np.linspace(low, high, ZOOM_POINTS)
             fields, iterations = zoomed.tolist(), iterations + 1
             excess = (curve.forces_N(zoomed) - force_N).tolist()

@@ -34,7 +34,7 @@ class FieldSolution(Value):
         self.reach: Final = reach
 
 
-ROUNDINGS: Final = 16.0
+TIE: Final = 16.0 * 2.0**-52
 "A sum of as many terms as a network has units is wrong by a few units of rounding: forces that near are the same."
 
 
@@ -61,9 +61,9 @@ def checked_near_mT(force_N: float, last_field_mT: float | None, least_mT: float
     return near_mT
 
 
-def tie_N(curve: ForceCurve, eps: float) -> float:
-    """Forces of `curve` that differ by less are the same, computed with a unit of rounding of `eps`."""
-    return ROUNDINGS * eps * curve.magnitude_N
+def tie_N(curve: ForceCurve) -> float:
+    """Forces of `curve` that differ by less are the same."""
+    return TIE * curve.magnitude_N
 
 
 def answer(

@@ -21,7 +21,7 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import ArrayLike, NDArray
 
-from tormagd.bounded_file import read_bounded
+from tormagd.bounded_file import in_place_of, read_bounded
 from tormagd.model.features import (
     FEATURES,
     FIELD,
@@ -206,13 +206,11 @@ class ForceModel:
 
 def save_model(path: Path | str, model: ForceModel) -> None:
     """Write `model` to `path`; the same model gives the same bytes. Readers see the old file or the whole new one."""
-    target = Path(path)
     tensors = _tensors(model)
     header = _header(model.metadata)
     header["checksum"] = _checksum(header, tensors)
-    temporary = target.with_name(target.name + ".part")
-    temporary.write_bytes(_canonical(safetensors.numpy.save(tensors, header)))
-    temporary.replace(target)
+    with in_place_of(Path(path)) as unfinished:
+        unfinished.write_bytes(_canonical(safetensors.numpy.save(tensors, header)))
 
 
 def load_model(path: Path | str, *, element: Element | str, insert: str | None = None) -> ForceModel:

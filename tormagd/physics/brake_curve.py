@@ -91,22 +91,10 @@ class BrakeCurve(NamedTuple):
 
     def force_slope(self, compression: Real, load: Real) -> Real:
         """d phi / d y; every term is positive."""
-        stretch = 1.0 - compression
-        elastic, magnetic = self._stretch_terms(stretch, load)
-        return (elastic + magnetic) * self._compression_slope(compression, load) + self._load_term(stretch)
-
-    def force_curvature(self, compression: Real, load: Real) -> Real:
-        """d2 phi / d y2."""
-        stretch = 1.0 - compression
-        slope = self._compression_slope(compression, load)
-        curvature = slope * (2.0 * self.a - slope) / self._root(compression, load)
-        elastic, magnetic = self._stretch_terms(stretch, load)
-        elastic_slope = 30.0 / stretch**7 - 2.0 / stretch**3
-        return (
-            (elastic + magnetic) * curvature
-            + (elastic_slope + 4.0 * magnetic / stretch) * slope * slope
-            + 6.0 * self._load_term(stretch) / stretch * slope
-        )
+        stretch, w = 1.0 - compression, self.wall
+        # d phi / d eps at constant load, then d phi / d y at constant stretch
+        elastic, magnetic = 5.0 / stretch**6 - 1.0 / stretch**2, 12.0 * (1.0 + w) * load / stretch**4
+        return (elastic + magnetic) * self._compression_slope(compression, load) + 4.0 * (1.0 + w) / stretch**3
 
     def compression_for_force(self, force: Real) -> Real:
         """eps at which phi(eps) is `force`, for 0 <= force <= phi(0.95): inverse of the curve along eps.
@@ -140,18 +128,6 @@ class BrakeCurve(NamedTuple):
         result: Real = fn.where(force > 0.0, compression, 0.0 * wanted)
         return result
 
-    def _root(self, compression: Real, load: Real) -> Real:
-        """r = p + eps."""
-        return 1.0 - self.a * load + compression
-
     def _compression_slope(self, compression: Real, load: Real) -> Real:
-        """d eps / d y = (B + A eps) / r."""
-        return (self.b + self.a * compression) / self._root(compression, load)
-
-    def _stretch_terms(self, stretch: Real, load: Real) -> tuple[Real, Real]:
-        """d phi / d eps at constant load: elastic and magnetic term."""
-        return 5.0 / stretch**6 - 1.0 / stretch**2, 12.0 * (1.0 + self.wall) * load / stretch**4
-
-    def _load_term(self, stretch: Real) -> Real:
-        """d phi / d y at constant stretch."""
-        return 4.0 * (1.0 + self.wall) / stretch**3
+        """d eps / d y = (B + A eps) / r, with r = p + eps."""
+        return (self.b + self.a * compression) / (1.0 - self.a * load + compression)

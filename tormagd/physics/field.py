@@ -21,11 +21,10 @@ states, at the least gap by the power law. How it falls over the gap is then the
 _TM_PER_MT_MM = 1e-6
 _EQ7_C1, _EQ7_C2, _EQ7_P = 1.206, 1256.0, 1.867
 _EQ7_MIN_MM, _EQ7_MAX_MM = 45.0, 95.0
-_EQ7_CURVED_MAX_MM = _EQ7_MAX_MM - 1e-9
 
 
 class FieldLaw(Protocol):
-    """A strictly falling map from gap (mm) to radial moment (T m), with its inverse and derivatives.
+    """A strictly falling map from gap (mm) to radial moment (T m), with its inverse and slope.
 
     Every method takes a float or an array, returns the same kind and shape, and raises `DomainError` for a gap outside
     `gap_range_mm`, or a radial moment that no gap in that range gives.
@@ -44,9 +43,6 @@ class FieldLaw(Protocol):
     def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
         """First derivative of the radial moment, T m per mm; never positive."""
 
-    def d2_radial_moment_d_gap2(self, gap_mm: Real) -> Real:
-        """Second derivative of the radial moment, T m per mm^2."""
-
 
 @dataclass(frozen=True, slots=True)
 class ThesisFieldLaw:
@@ -55,8 +51,7 @@ class ThesisFieldLaw:
     The printed equation carries no unit; mT mm is the one that gives the measured field ("up to 800 mT"). It must not
     be stretched beyond 95 mm: a larger s_max in Eq. 7 raises the field at *every* gap.
 
-    At 95 mm the slope is zero, so the inverse loses half of its digits there, and the second derivative has no bound:
-    asking for it at 95 mm raises `DomainError`.
+    At 95 mm the slope is zero, so the inverse loses half of its digits there.
     """
 
     @property
@@ -76,10 +71,6 @@ class ThesisFieldLaw:
     def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return -_TM_PER_MT_MM * _EQ7_C1 * _EQ7_P * _power(_EQ7_MAX_MM - gap_mm, _EQ7_P - 1.0)
-
-    def d2_radial_moment_d_gap2(self, gap_mm: Real) -> Real:
-        require("gap_mm", gap_mm, _EQ7_MIN_MM, _EQ7_CURVED_MAX_MM)
-        return _TM_PER_MT_MM * _EQ7_C1 * _EQ7_P * (_EQ7_P - 1.0) * _power(_EQ7_MAX_MM - gap_mm, _EQ7_P - 2.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,27 +105,13 @@ class PowerFieldLaw:
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return self.coefficient * self.exponent * _power(gap_mm, self.exponent - 1.0)
 
-    def d2_radial_moment_d_gap2(self, gap_mm: Real) -> Real:
-        require("gap_mm", gap_mm, *self.gap_range_mm)
-        return self.coefficient * self.exponent * (self.exponent - 1.0) * _power(gap_mm, self.exponent - 2.0)
-
 
 def flux_density_T(radial_moment_Tm: Real, relative_permeability: float, radius_m: float) -> Real:
     """Radial flux density b = (mu_r / 4) a / R in the elastomer, T (Eq. 6 with the permeability of Eq. 8)."""
     require("radial_moment_Tm", radial_moment_Tm, 0.0, 1e6)
-    return radial_moment_Tm * _flux_per_moment(relative_permeability, radius_m)
-
-
-def radial_moment_from_flux_density_Tm(flux_density_T: Real, relative_permeability: float, radius_m: float) -> Real:
-    """Radial moment a, T m, that gives the flux density b at radius R: inverse of `flux_density_T`."""
-    require("flux_density_T", flux_density_T, 0.0, 1e6)
-    return flux_density_T / _flux_per_moment(relative_permeability, radius_m)
-
-
-def _flux_per_moment(relative_permeability: float, radius_m: float) -> float:
     require("relative_permeability", relative_permeability, 1.0, 1e3)
     require("radius_m", radius_m, 1e-5, 1.0)
-    return relative_permeability / (REFERENCE_PERMEABILITY * radius_m)
+    return radial_moment_Tm * (relative_permeability / (REFERENCE_PERMEABILITY * radius_m))
 
 
 def _require_moment(radial_moment_Tm: Real, law: FieldLaw) -> None:

@@ -18,17 +18,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tormagd.physics.brake_curve import MAX_COMPRESSION, BrakeCurve
-from tormagd.physics.errors import DomainError, FloatArray, Real, require
+from tormagd.physics.errors import DomainError, Real, require
 from tormagd.physics.field import REFERENCE_PERMEABILITY, FieldLaw
 
 MU0_H_M = 4e-7 * math.pi
-
-_BLOCK = 4096
-"""Elements evaluated at a time: 32 kB in float64, so that a handful of temporaries fits into the second-level cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,19 +84,6 @@ def brake_force_N(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geomet
     return law.force(radial_moment_Tm)
 
 
-def brake_force_masked_N(
-    radial_moment_Tm: FloatArray, elastomer: Elastomer, geometry: Geometry
-) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """`brake_force_N` of an array that may leave the domain: (force, admissible).
-
-    Where `admissible` is False (lambda1 would be below 0.05) the force is that of the domain's edge, a lower bound.
-    Raises `DomainError` for NaN and for elements outside 0..1e30.
-    """
-    law = _reduce(elastomer, geometry)
-    require("radial_moment_Tm", radial_moment_Tm, 0.0, 1e30)
-    return law.force(np.minimum(radial_moment_Tm, law.max_moment_Tm)), radial_moment_Tm <= law.max_moment_Tm
-
-
 def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
     """Slope of the force over the radial moment, N / (T m), >= 0."""
     law = _reduce(elastomer, geometry)
@@ -115,21 +96,6 @@ def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geo
 def d_force_d_gap(gap_mm: Real, field: FieldLaw, elastomer: Elastomer, geometry: Geometry) -> Real:
     """Slope of the force over the gap, N/mm, <= 0 (the bracket of Eq. 36)."""
     return d_force_d_moment(field.radial_moment_Tm(gap_mm), elastomer, geometry) * field.d_radial_moment_d_gap(gap_mm)
-
-
-def d2_force_d_gap2(gap_mm: Real, field: FieldLaw, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Curvature of the force over the gap, N/mm^2."""
-    law = _reduce(elastomer, geometry)
-    moment_Tm = field.radial_moment_Tm(gap_mm)
-    require("radial_moment_Tm", moment_Tm, 0.0, law.max_moment_Tm)
-    load = law.load(moment_Tm)
-    compression = law.curve.compression(load)
-    slope, curvature = law.curve.force_slope(compression, load), law.curve.force_curvature(compression, load)
-    # chain rule twice: over y = (root a)^2, then over a(gap)
-    scale = 2.0 * law.force_scale_N * law.load_root_per_Tm**2
-    moment_slope = field.d_radial_moment_d_gap(gap_mm)
-    moment_curvature = field.d2_radial_moment_d_gap2(gap_mm)
-    return scale * ((slope + 2.0 * load * curvature) * moment_slope**2 + moment_Tm * slope * moment_curvature)
 
 
 def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
@@ -158,19 +124,8 @@ class _Reduced(NamedTuple):
         return root * root
 
     def force(self, moment_Tm: Real) -> Real:
-        if isinstance(moment_Tm, np.ndarray) and moment_Tm.size > _BLOCK:
-            return self._blocked_force(moment_Tm)
         load = self.load(moment_Tm)
         return self.force_scale_N * self.curve.force(self.curve.compression(load), load)
-
-    def _blocked_force(self, moment_Tm: FloatArray) -> FloatArray:
-        # twenty passes over one array: in blocks its temporaries stay in the cache, where a pass is twice as fast
-        force = np.empty(moment_Tm.shape, moment_Tm.dtype)
-        # reshape copies where the moments are not contiguous; the result is, so its flat view is itself
-        flat, result = moment_Tm.reshape(-1), force.reshape(-1)
-        for start in range(0, flat.size, _BLOCK):
-            result[start : start + _BLOCK] = self.force(flat[start : start + _BLOCK])
-        return force
 
 
 @lru_cache(maxsize=64)

@@ -99,11 +99,6 @@ class Insert:
             "thinner": 100.0 * self.thinner_fraction * THINNER_DENSITY_G_CC,
         }
 
-    @property
-    def density_g_cc(self) -> float:
-        """Density of the mixture, g/cc."""
-        return sum(self.masses_g.values()) / 100.0
-
 
 _Fraction = Annotated[float, Meta(ge=0.0, le=0.6)]
 _Density = Annotated[float, Meta(ge=0.1, le=25.0)]
@@ -197,11 +192,6 @@ def _insert(row: _Row, matrix: _Matrix) -> Insert:
 
 INSERTS = load_inserts()
 """The inserts that ship with this package."""
-
-FRICTION_COEFFICIENT = MappingProxyType(
-    {item.shore_hardness: item.elastomer.friction_coefficient for item in INSERTS.values()}
-)
-"""Kinetic friction coefficient on the shaft by the matrix's Shore 00 hardness, of the shipped inserts."""
 
 
 def insert(name: str, inserts: Mapping[str, Insert] = INSERTS) -> Insert:

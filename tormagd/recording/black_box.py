@@ -5,7 +5,6 @@
 the daemon handed over. The metadata `black_box` are its header. `tormagctl replay` runs it.
 """
 
-import contextlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from tormagd import __version__
-from tormagd.bounded_file import require_regular
+from tormagd.bounded_file import in_place_of, require_regular
 from tormagd.keeping import READ, WROTE, Part
 from tormagd.recording.closing import ABOUT
 from tormagd.recording.reader import MAX_FILE_BYTES, MAX_RECORD_BYTES, UNREADABLE, RecordingError
@@ -71,17 +70,10 @@ def frames_in(entry: Any) -> list[Frame]:
 def write_black_box(path: Path, header: dict[str, str], parts: Sequence[Part]) -> int:
     """Writes a new file of some parts, whole or not at all; returns how many ticks are in it. Raises FileExistsError,
     OSError."""
-    beside = path.with_name(f"{path.name}.part")
     if path.exists():
         raise FileExistsError(17, "exists", str(path))
-    try:
-        ticks = _write(beside, header, parts)
-        beside.replace(path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            beside.unlink()
-        raise
-    return ticks
+    with in_place_of(path) as beside:
+        return _write(beside, header, parts)
 
 
 def _write(path: Path, header: dict[str, str], parts: Sequence[Part]) -> int:

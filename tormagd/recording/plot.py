@@ -1,6 +1,5 @@
 """One picture of a recording: what was asked, what was rendered, and what held it back."""
 
-import contextlib
 import io
 from collections.abc import Iterable
 from datetime import UTC, datetime
@@ -10,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tormagd.bounded_file import in_place_of
 from tormagd.recording.reader import Recording
 from tormagd.recording.series import BREAK_S, Band, Series, bands, end_ns, series, start_ns, tracking_rms_N
 
@@ -64,15 +64,9 @@ def save_plot(recording: Recording, path: Path, title: str) -> None:
         raise ValueError(f"{path.name}: allowed are names ending in {', '.join(FORMATS)}")
     picture = io.BytesIO()
     figure(recording, title).savefig(picture, format=path.suffix[1:].lower(), dpi=110)
-    # beside it first: a full disk leaves neither half a picture nor takes the one that was there
-    unfinished = path.with_name(f"{path.name}.part")
-    try:
+    # a full disk leaves neither half a picture nor takes the one that was there
+    with in_place_of(path) as unfinished:
         unfinished.write_bytes(picture.getvalue())
-        unfinished.replace(path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            unfinished.unlink()
-        raise
 
 
 def _headline(recording: Recording, title: str, faults: Iterable[Band]) -> str:

@@ -3,13 +3,17 @@
 from typing import TypeAlias
 
 import msgspec
+import zmq
 
 from tormagd_client.messages import VERSION, MessageError
+from tormagd_client.wire import Keys, connect
 
 TIME_COLUMN = "t_ns"
 MAX_BATCH_BYTES = 4_000_000  # 20 ms at 4 kHz with 100 columns is under 1 MB
 MAX_COLUMNS = 256
 MAX_TIME_NS = 2**63
+QUEUE = 10_000
+"Batches that may wait while whoever listens is slow: over three minutes."
 
 Value: TypeAlias = int | float | bool | str | tuple[str, ...] | None
 
@@ -36,6 +40,16 @@ class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
             time_ns = row[0]
             if isinstance(time_ns, bool) or not isinstance(time_ns, int) or not 0 <= time_ns < MAX_TIME_NS:
                 raise ValueError(f"rows[{number}].{TIME_COLUMN} = {time_ns!r}: allowed is 0..2^63-1 ns since 1970")
+
+
+def listening(context: "zmq.Context[zmq.Socket[bytes]]", address: str, keys: Keys | None) -> "zmq.Socket[bytes]":
+    """Hears what is published at `address`, telemetry or ticks. Raises SettingError as `connect`."""
+    socket = context.socket(zmq.SUB)
+    socket.setsockopt(zmq.RCVHWM, QUEUE)
+    socket.setsockopt(zmq.MAXMSGSIZE, MAX_BATCH_BYTES)
+    socket.subscribe(b"")
+    connect(socket, address, keys)
+    return socket
 
 
 _DECODER = msgspec.msgpack.Decoder(TickBatch)

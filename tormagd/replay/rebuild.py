@@ -10,7 +10,7 @@ import msgspec
 from tormagd import __version__
 from tormagd.config import Config, ConfigError, checked
 from tormagd.control.core import Core, build_core, platform_name, sources_hash
-from tormagd.control.journal import FORMATS
+from tormagd.control.journal import FORMAT
 from tormagd.recording.black_box import BlackBoxFile
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.messages import TickRecord
@@ -44,10 +44,10 @@ def recorded(box: BlackBoxFile, beside: Path) -> Recorded:
     missing = [name for name in NEEDED if name not in header]
     if missing:
         raise ReplayError(f"its header has no {missing[0]!r}: it is no black box of this version")
-    if header["format"] not in map(str, FORMATS):
+    if header["format"] != str(FORMAT):
         raise ReplayError(
-            f"format = {header['format'][:20]!r}, written by tormagd {header['version'][:20]!r}: allowed are "
-            f"{' and '.join(map(str, FORMATS))}; tormagd {__version__} writes the last"
+            f"format = {header['format'][:20]!r}, written by tormagd {header['version'][:20]!r}: allowed is {FORMAT}, "
+            f"which tormagd {__version__} writes; replay it with the version that wrote it"
         )
     columns = _json(header, "columns")
     if not isinstance(columns, list) or not all(isinstance(name, str) for name in columns):

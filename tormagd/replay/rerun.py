@@ -18,7 +18,6 @@ from tormagd.control import (
     pid,
     plausible,
     remembered,
-    restraint,
     sensor,
     sensor_zero,
     sight,
@@ -72,7 +71,6 @@ KNOWN = kinds(
     periodicity.Periodicity,
     skill.Skill,
     periodicity.Guess,
-    restraint.Restraint,
     lateness.Lateness,
     Plan,
     Outside,
@@ -297,7 +295,7 @@ class _Running:
 
     def _begin(self, entry: Any) -> Found | None:
         """Compares the states with the recorded ones, and goes on from these."""
-        differs, connection = None, entry[3] if len(entry) > 3 else None
+        differs, connection = None, entry[3]
         if self.is_known:
             self.snapshots += 1
             for what, recorded, own in (("step", entry[1], self._step), ("plan", entry[2], self._plan)):

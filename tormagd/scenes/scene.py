@@ -113,8 +113,7 @@ class Terms(Strict, frozen=True):
                   the part whose time constants are the nearest to its own
     `hysteresis`  how far the field lags behind that of its gap is told by the model, from where the gap has been
     `slope`       setpoints are carried along their slope to now and ahead
-    `forecast`    a force that repeats itself is foreseen, and of one that is over before the gap gets there no more is
-                  gone for than is worth the way
+    `forecast`    a force that repeats itself is foreseen
     `preview`     what a publisher says will follow is used
     `lag`         how late the carriages are is learned, and made up for
     `motor`       the duty that the reference takes of the motors is fed forward: for its speed and acceleration, the

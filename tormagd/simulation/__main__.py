@@ -11,6 +11,7 @@ import contextlib
 import sys
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from firmware_protocol.c.build import BuildError
@@ -116,8 +117,16 @@ def parser() -> argparse.ArgumentParser:
         help=f"may be repeated; {KNOWN_FAULTS}".replace("%", "%%"),
     )
     made.add_argument("--seed", type=int, default=0, metavar="N", help="of noise and jitter")
-    made.add_argument("--baud", type=_baud, default=DEFAULT_BAUD, metavar="N", help=f"default {DEFAULT_BAUD}")
-    made.add_argument("--bitrate", type=_bitrate, default=DEFAULT_BITRATE, metavar="N", help="of the CAN bus")
+    made.add_argument(
+        "--baud",
+        type=partial(_rate, 1_200, 20_000_000),
+        default=DEFAULT_BAUD,
+        metavar="N",
+        help=f"default {DEFAULT_BAUD}",
+    )
+    made.add_argument(
+        "--bitrate", type=partial(_rate, 10_000, 1_000_000), default=DEFAULT_BITRATE, metavar="N", help="of the CAN bus"
+    )
     made.add_argument("--node", type=int, choices=range(16), default=DEFAULT_NODE, metavar="N", help="on the CAN bus")
     made.add_argument(
         "--firmware",
@@ -129,18 +138,11 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def _baud(text: str) -> int:
-    baud = int(text)
-    if not 1200 <= baud <= 20_000_000:
-        raise argparse.ArgumentTypeError(f"{baud}: allowed are 1200 to 20000000")
-    return baud
-
-
-def _bitrate(text: str) -> int:
-    bitrate = int(text)
-    if not 10_000 <= bitrate <= 1_000_000:
-        raise argparse.ArgumentTypeError(f"{bitrate}: allowed are 10000 to 1000000")
-    return bitrate
+def _rate(least: int, most: int, text: str) -> int:
+    rate = int(text)
+    if not least <= rate <= most:
+        raise argparse.ArgumentTypeError(f"{rate}: allowed are {least} to {most}")
+    return rate
 
 
 if __name__ == "__main__":

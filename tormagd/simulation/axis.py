@@ -28,33 +28,6 @@ class Axis:
     Raises PlantError for a plant that is too stiff or too light for the substep.
     """
 
-    __slots__ = (
-        "_closed_stop_m",
-        "_coupling_Nm_A",
-        "_current_limit_A",
-        "_decay",
-        "_driven_rad_s_Nm",
-        "_dt_s",
-        "_electrical_time_s",
-        "_impulse_rad_s_Nm",
-        "_lead_m_rad",
-        "_mesh_loss",
-        "_nut_zero_m",
-        "_open_stop_m",
-        "_remaining",
-        "_resistance_Ohm",
-        "_stiffness_N_m",
-        "angle_rad",
-        "backlash_m",
-        "contact_N",
-        "current_A",
-        "drag_N",
-        "gear_friction_Nm",
-        "position_m",
-        "screw_friction_m",
-        "speed_rad_s",
-    )
-
     def __init__(
         self, plant: PlantParameters, drag_N: float, start_mm: float, attraction_N: float, dt_s: float
     ) -> None:

@@ -59,10 +59,6 @@ class CanDevice:
     """
 
     def __init__(self, messages: MessageDevice, bitrate: int = DEFAULT_BITRATE, node: int = DEFAULT_NODE) -> None:
-        if bitrate <= 0:
-            raise ValueError(f"bitrate = {bitrate}: allowed are numbers over 0")
-        if not 0 <= node <= 15:
-            raise ValueError(f"node = {node}: allowed are 0 to 15")
         self.messages = messages
         """The device itself."""
         self.lost = 0

@@ -1,7 +1,7 @@
 """A classical CAN frame with an 11-bit identifier: its bits on the bus, and its bytes on the simulator's socket."""
 
+import re
 import struct
-from functools import cache
 from typing import NamedTuple
 
 MAX_IDENTIFIER = 0x7FF
@@ -11,11 +11,12 @@ ERROR_FLAG = 0x2000_0000
 SOCKET_FRAME = struct.Struct("=IB3x8s")
 """Linux's `struct can_frame`."""
 
-CRC_POLYNOMIAL = 0x4599
-CRC_MASK = 0x7FFF
 CRC_BITS = 15
-LONGEST_RUN = 5
-"""Equal bits in a row after which a sender stuffs one of the other kind: ISO 11898-1, 10.5."""
+CRC_MASK = 0x7FFF
+CRC_GENERATOR = 0xC599
+STUFFED = re.compile("0{5}(?:1{4}0{4})*(?:1{4})?|1{5}(?:0{4}1{4})*(?:0{4})?")
+"""After five equal bits a sender stuffs one of the other kind, with which the next run begins (ISO 11898-1, 10.5): a
+match has one for its first five, and one for each four more."""
 UNSTUFFED_BITS = 13
 """CRC delimiter, acknowledgement and its delimiter, end of frame (7), and the pause before the next frame (3)."""
 
@@ -27,29 +28,16 @@ class CanFrame(NamedTuple):
     data: bytes
 
 
-class _Progress(NamedTuple):
-    """How far a frame has been put on the bus: its CRC so far, the run of equal bits at its end, the bits so far."""
-
-    crc: int
-    last: int
-    run: int
-    bits: int
-
-
-_START = _Progress(crc=0, last=1, run=0, bits=0)
-
-
 def frame_bits(frame: CanFrame) -> int:
     """How many bit times the frame takes, with its stuff bits and the pause behind it."""
-    crc, last, run, bits = _header(frame.identifier, len(frame.data))
-    for byte in frame.data:
-        crc = _crc_table()[crc >> 7 ^ byte] ^ crc << 8 & CRC_MASK
-        last, run, count = _stuffing_table(8)[last, run, byte]
-        bits += count
-    last, run, count = _stuffing_table(8)[last, run, crc >> CRC_BITS - 8]
-    bits += count
-    _, _, count = _stuffing_table(CRC_BITS - 8)[last, run, crc & 0x7F]
-    return bits + count + UNSTUFFED_BITS
+    # start of frame, identifier, then RTR, IDE and r0, which are 0 in a classical data frame, and the length
+    head = (frame.identifier << 7 | len(frame.data)).to_bytes(3, "big")
+    crc = 0
+    for byte in head + frame.data:
+        crc = _CRC_TABLE[crc >> 7 ^ byte] ^ crc << 8 & CRC_MASK
+    count = 19 + 8 * len(frame.data) + CRC_BITS
+    bits = f"{int.from_bytes(head + frame.data, 'big') << CRC_BITS | crc:0{count}b}"
+    return count + sum((len(run) - 1) // 4 for run in STUFFED.findall(bits)) + UNSTUFFED_BITS
 
 
 def to_socket(frame: CanFrame) -> bytes:
@@ -67,51 +55,11 @@ def from_socket(packet: bytes) -> CanFrame | None:
     return CanFrame(identifier, data[:length])
 
 
-def _stuffed(last: int, run: int, bit: int) -> tuple[int, int, int]:
-    """One bit more: the last bit on the bus, the run that it ends, and the bits that were sent."""
-    run = run + 1 if bit == last else 1
-    return (bit, run, 1) if run < LONGEST_RUN else (1 - bit, 1, 2)
+def _crc_of(byte: int) -> int:
+    crc = byte << CRC_BITS - 8
+    for _ in range(8):
+        crc = crc << 1 ^ (CRC_GENERATOR if crc >> CRC_BITS - 1 else 0)
+    return crc
 
 
-def _crc_step(crc: int, bit: int) -> int:
-    feedback = crc >> CRC_BITS - 1 ^ bit
-    return (crc << 1 & CRC_MASK) ^ (CRC_POLYNOMIAL if feedback else 0)
-
-
-@cache
-def _header(identifier: int, length: int) -> _Progress:
-    # start of frame, identifier, then RTR, IDE and r0, which are 0 in a classical data frame, and the length
-    crc, last, run, bits = _START
-    value = identifier << 7 | length
-    for position in range(18, -1, -1):
-        bit = value >> position & 1
-        crc = _crc_step(crc, bit)
-        last, run, count = _stuffed(last, run, bit)
-        bits += count
-    return _Progress(crc, last, run, bits)
-
-
-@cache
-def _crc_table() -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        crc = 0
-        for position in range(7, -1, -1):
-            crc = _crc_step(crc, byte >> position & 1)
-        table.append(crc)
-    return tuple(table)
-
-
-@cache
-def _stuffing_table(width: int) -> dict[tuple[int, int, int], tuple[int, int, int]]:
-    """What the last bit and the run before so many bits become, and how many bits are sent."""
-    table = {}
-    for start in ((bit, run) for bit in (0, 1) for run in range(LONGEST_RUN)):
-        for value in range(1 << width):
-            last, run = start
-            sent = 0
-            for position in range(width - 1, -1, -1):
-                last, run, count = _stuffed(last, run, value >> position & 1)
-                sent += count
-            table[*start, value] = last, run, sent
-    return table
+_CRC_TABLE = [_crc_of(byte) for byte in range(256)]

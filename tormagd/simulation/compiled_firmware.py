@@ -119,7 +119,7 @@ class CompiledFirmware:
             serial_number=SERIAL_NUMBER,
         )
         library = _library()
-        # The C struct lives in an array of doubles, for their alignment. It points nowhere, so that it may be copied.
+        # The C struct lives in an array of doubles, for their alignment.
         self._device = (ctypes.c_double * math.ceil(_sizes(library)[0] / ctypes.sizeof(ctypes.c_double)))()
         library.tormag_device_init(self._device, ctypes.byref(parameters))
 

@@ -7,8 +7,6 @@ from typing import final
 class Curve:
     """A function by its values on a uniform grid from `start` to `end`, linear between the points (two at least)."""
 
-    __slots__ = ("_last", "_per_unit", "_start", "_values")
-
     def __init__(self, values: list[float], start: float, end: float) -> None:
         self._start = start
         self._per_unit = (len(values) - 1) / (end - start)

@@ -82,72 +82,11 @@ class Packet(Value):
 
 
 @final
-class Reply(Value):
-    """What a received message called for, and when it is given."""
-
-    def __init__(self, time_s: float, answer: Answer) -> None:
-        self.time_s: Final = time_s
-        self.answer: Final = answer
-
-
-@final
-class Outgoing(Value):
-    """The part of a frame that is still to leave, and when its first bit does."""
-
-    def __init__(self, start_s: float, data: bytes) -> None:
-        self.start_s: Final = start_s
-        self.data: Final = data
-
-
-@final
 class MessageDevice:
     """The device at the level of messages: payloads in, payloads out, whatever carries them.
 
     `receive` queues a payload for its time of arrival; `advance` lets time pass and fills `outbox`.
     """
-
-    __slots__ = (
-        "_answer_s",
-        "_answering_every",
-        "_answers",
-        "_arrival_s",
-        "_boot",
-        "_boot_s",
-        "_closed_m",
-        "_counts_per_rad",
-        "_drives",
-        "_duty_sign",
-        "_faults",
-        "_frozen_until_s",
-        "_handle_counts_per_mm",
-        "_has_bad_encoders",
-        "_home_m",
-        "_inbox",
-        "_jitter",
-        "_jitter_s",
-        "_left_boot_counts",
-        "_left_count_sign",
-        "_left_extra_counts",
-        "_left_motor_sign",
-        "_output",
-        "_pwm_steps",
-        "_rate",
-        "_right_boot_counts",
-        "_right_extra_counts",
-        "_silent",
-        "_struck",
-        "_stuck_handle",
-        "_stuck_left",
-        "_supply_V",
-        "_tick_due_s",
-        "_ticks",
-        "_time_s",
-        "firmware",
-        "outbox",
-        "parameters",
-        "plant",
-        "undecodable",
-    )
 
     def __init__(
         self,
@@ -175,7 +114,8 @@ class MessageDevice:
         self._home_m = parameters.assumed.home_mm * 1e-3
         self._closed_m = parameters.assumed.closed_mm * 1e-3
         self._inbox: deque[Packet] = deque()
-        self._answers: deque[Reply] = deque()
+        self._answers: deque[tuple[float, Answer]] = deque()
+        """What received messages called for, and when it is given."""
         # when the first of each is due; infinite where there is none
         self._arrival_s = math.inf
         self._answer_s = math.inf
@@ -228,9 +168,9 @@ class MessageDevice:
                 self._arrival_s = self._inbox[0].time_s if self._inbox else math.inf
                 self._deliver(event_s, packet)
             elif self._answer_s <= event_s:
-                reply = self._answers.popleft()
-                self._answer_s = self._answers[0].time_s if self._answers else math.inf
-                self._send_answer(event_s, reply.answer)
+                _, answer = self._answers.popleft()
+                self._answer_s = self._answers[0][0] if self._answers else math.inf
+                self._send_answer(event_s, answer)
             else:
                 self._tick(event_s)
             if self.firmware.output is not self._output:
@@ -302,8 +242,8 @@ class MessageDevice:
                 self._answer_s = answer_s
             else:
                 # none overtakes the one before it
-                answer_s = max(answer_s, self._answers[-1].time_s)
-            self._answers.append(Reply(answer_s, answer))
+                answer_s = max(answer_s, self._answers[-1][0])
+            self._answers.append((answer_s, answer))
 
     def _send_answer(self, time_s: float, answer: Answer) -> None:
         if answer is IDENTITY:
@@ -493,8 +433,6 @@ class VirtualDevice:
     Times are the host's, seconds from power-on, and must not fall over all three (ValueError).
     """
 
-    __slots__ = ("_byte_s", "_decoder", "_line", "_receiver_free_s", "_sender_free_s", "_sequence", "messages")
-
     def __init__(
         self,
         parameters: PlantParameters,
@@ -504,14 +442,13 @@ class VirtualDevice:
         baud: int = DEFAULT_BAUD,
         boot: FirmwareKind = Firmware,
     ) -> None:
-        if baud <= 0:
-            raise ValueError(f"baud = {baud}: allowed are numbers over 0")
         self.messages = MessageDevice(parameters, hand, faults, seed, boot)
         self._byte_s = BITS_PER_BYTE / baud
         self._decoder = FrameDecoder()
         self._receiver_free_s = 0.0
         self._sequence = 0
-        self._line: deque[Outgoing] = deque()
+        self._line: deque[tuple[float, bytes]] = deque()
+        """What is still to leave of each frame, and when its first bit does."""
         self._sender_free_s = 0.0
 
     @property
@@ -547,7 +484,7 @@ class VirtualDevice:
             self._sequence = (self._sequence + 1) % 256
             start_s = max(packet.time_s, self._sender_free_s)
             self._sender_free_s = start_s + float(len(frame)) * self._byte_s
-            self._line.append(Outgoing(start_s, frame))
+            self._line.append((start_s, frame))
 
     def transmit(self, now_s: float) -> bytes:
         """The bytes that have come out of the line since the last call."""
@@ -555,14 +492,13 @@ class VirtualDevice:
         out: list[bytes] = []
         line, byte_s = self._line, self._byte_s
         while line:
-            frame = line[0]
-            data = frame.data
+            start_s, data = line[0]
             # a millionth of a byte of tolerance: sums of times are not exact
-            done = int((now_s - frame.start_s) / byte_s + 1e-6)
+            done = int((now_s - start_s) / byte_s + 1e-6)
             if done < len(data):
                 if done > 0:
                     out.append(data[:done])
-                    line[0] = Outgoing(frame.start_s + done * byte_s, data[done:])
+                    line[0] = (start_s + done * byte_s, data[done:])
                 break
             out.append(data)
             line.popleft()
@@ -573,8 +509,8 @@ class VirtualDevice:
         """When there is next something to do: a frame that ends on the line, or an event inside the device."""
         event_s = self.messages.next_event_s
         if self._line:
-            frame = self._line[0]
-            event_s = min(event_s, frame.start_s + len(frame.data) * self._byte_s)
+            start_s, data = self._line[0]
+            event_s = min(event_s, start_s + len(data) * self._byte_s)
         return event_s
 
 

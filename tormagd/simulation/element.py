@@ -24,19 +24,6 @@ class Element:
     tormagd.physics.errors.DomainError when the parameters leave the force law's domain somewhere in the stroke.
     """
 
-    __slots__ = (
-        "_deflection_mm",
-        "_dt_s",
-        "_field",
-        "_force",
-        "_friction",
-        "_memory",
-        "_relax",
-        "_warmth",
-        "force_N",
-        "kinetic_N",
-    )
-
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
         self._dt_s = dt_s
         self._field = GapField(plant, gap_mm)

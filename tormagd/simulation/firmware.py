@@ -49,7 +49,6 @@ SERIAL_NUMBER: Final = 1
 
 # An operation on flags makes new ones, and a member of an enumeration is looked up in its class by Python code, at a
 # microsecond and a fifth of one: what is needed in every tick is made and named here
-NO_SWITCH: Final = Switches(0)
 HOMED_SWITCHES: Final = [Switches(bits) | Switches.HOMED for bits in range(16)]
 CLOSED_SWITCHES: Final = Switches.LEFT_CLOSED | Switches.RIGHT_CLOSED
 NO_FAULT: Final = DeviceFault(0)
@@ -118,33 +117,6 @@ MEASUREMENT: Final = Answer.MEASUREMENT
 @final
 class Firmware:
     """One device's firmware from its boot on. All times are device time, in seconds since the boot, never falling."""
-
-    __slots__ = (
-        "_compatible",
-        "_drive_counter",
-        "_drive_s",
-        "_handle_mm_per_count",
-        "_homing_mm_s",
-        "_lead_mm_rev",
-        "_left_calm_s",
-        "_left_zero_mm",
-        "_may_run",
-        "_mm_per_count",
-        "_motion",
-        "_nonce",
-        "_overcurrent_A",
-        "_retract_mm_s",
-        "_right_calm_s",
-        "_right_zero_mm",
-        "_state_counter",
-        "_ticks",
-        "_watch_counts",
-        "_watch_since_s",
-        "faults",
-        "homed",
-        "mode",
-        "output",
-    )
 
     def __init__(self, plant: PlantParameters) -> None:
         self._lead_mm_rev = plant.screw.lead_mm

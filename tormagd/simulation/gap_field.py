@@ -13,8 +13,6 @@ SMALLEST_GAP_MM: Final = 45.0
 class GapField:
     """The radial moment, T m, of a plant's magnets, off by at most `branch_Tm` either way for its hysteresis."""
 
-    __slots__ = ("_lag_Tm", "_moment", "_moment_Tm", "_turn_Tm", "branch_Tm")
-
     def __init__(self, plant: PlantParameters, gap_mm: float) -> None:
         self._moment = moment_over_gap(plant)
         largest_Tm = self._moment.at(SMALLEST_GAP_MM)

@@ -49,8 +49,6 @@ class Outcome(Enum):
 class Ramp:
     """Moves one carriage at a bounded speed, by way of a position that runs ahead of it."""
 
-    __slots__ = ("_full_speed_mm_s", "_reference_mm")
-
     def __init__(self, position_mm: float, lead_mm_rev: float) -> None:
         self._reference_mm = position_mm
         self._full_speed_mm_s = NO_LOAD_REV_S * lead_mm_rev
@@ -70,8 +68,6 @@ class Opening:
     A carriage that comes no further has failed when its current says why: a stall, or no current at all. Standing still
     at a travelling current is a dead encoder, and the motion goes on.
     """
-
-    __slots__ = ("_arrived_s", "_progress_mm", "_progress_s", "_ramp", "_stall_A", "duty", "outcome")
 
     def __init__(self, time_s: float, carriage: Carriage, lead_mm_rev: float, stall_A: float) -> None:
         self._ramp = Ramp(carriage.position_mm, lead_mm_rev)
@@ -112,8 +108,6 @@ class Retraction:
 
     With a valid zero the speed tapers towards the open end; without one the search for the switch is slow throughout.
     """
-
-    __slots__ = ("_deadline_s", "_openings", "_speed_mm_s", "_tapered")
 
     def __init__(
         self,
@@ -166,21 +160,6 @@ class Homing:
 
     `zeros_mm` holds the encoder positions of the two switches once the outcome is DONE.
     """
-
-    __slots__ = (
-        "_back_off_since_s",
-        "_backed_off",
-        "_deadline_s",
-        "_edges_mm",
-        "_lead_mm_rev",
-        "_ramps",
-        "_reversed_s",
-        "_search",
-        "_speed_mm_s",
-        "_stall_A",
-        "_starts_mm",
-        "duties",
-    )
 
     def __init__(
         self,

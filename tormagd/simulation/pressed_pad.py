@@ -25,8 +25,6 @@ class PressedPad:
     gives no more there.
     """
 
-    __slots__ = ("_dt_s", "_field", "_pad", "_warmth", "force_N")
-
     def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
         if plant.pad is None:
             raise ValueError("plant.pad = None: allowed is the plant of a pad")

@@ -29,32 +29,6 @@ STRONGEST_MT: Final = 500.0
 class TactilePad:
     """One pad with its past: what it has been worked, and what its stress remembers. New pads are unworked."""
 
-    __slots__ = (
-        "_area",
-        "_breakdown",
-        "_breakdown_strain",
-        "_damage",
-        "_deepest_mm",
-        "_displacement_mm",
-        "_dt_s",
-        "_field_memory",
-        "_field_modulus_kPa",
-        "_field_rate_gain",
-        "_field_series",
-        "_field_step",
-        "_gent_limit",
-        "_height_mm",
-        "_memory",
-        "_modulus_kPa",
-        "_mullins_share",
-        "_mullins_travel_mm",
-        "_rate_gain",
-        "_rate_scale_mm_s",
-        "_saturation",
-        "_series",
-        "_step",
-    )
-
     def __init__(self, parameters: PadParameters) -> None:
         # kPa mm^2 is 1e-3 N
         self._area: float = 1e-3 * math.pi / 4.0 * parameters.diameter_mm**2

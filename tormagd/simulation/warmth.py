@@ -10,8 +10,6 @@ from tormagd.simulation.parameters import PlantParameters
 class Warmth:
     """The elastomer's temperature: from that of the room towards the warmest, ever more slowly."""
 
-    __slots__ = ("_ambient_C", "_drift_K_s", "_force_per_K", "_warming_K", "temperature_C")
-
     def __init__(self, plant: PlantParameters) -> None:
         self._force_per_K: Final = plant.thermal.force_percent_K / 100.0
         self._ambient_C: Final = plant.assumed.ambient_C

@@ -1,7 +1,6 @@
 """The same client for asyncio: other tasks run while a call waits."""
 
 import asyncio
-import itertools
 import math
 from collections.abc import AsyncIterator
 from types import TracebackType
@@ -11,43 +10,31 @@ import zmq
 import zmq.asyncio
 
 from tormagd_client.blocking import RETRY_S
-from tormagd_client.endpoints import Endpoints, in_folder
-from tormagd_client.errors import RefusedError, unreachable
+from tormagd_client.endpoints import Endpoints
+from tormagd_client.errors import RefusedError
 from tormagd_client.messages import Description, Status, Telemetry, decode
 from tormagd_client.wire import (
     NOT_YET,
     SUBSCRIBED,
-    Numbering,
-    Pending,
+    Connections,
     answered,
     asked,
     described,
-    keys_of,
-    opened,
     understood,
 )
 
 
-class AsyncClient:
+class AsyncClient(Connections[zmq.asyncio.Socket]):
     """As `blocking.Client`, with the same arguments, results and errors; an asynchronous context manager.
 
     `ask` and `answer` are not needed here: a task may wait for a `request` while others run.
     """
 
-    def __init__(self, endpoints: Endpoints, wait_s: float = 1.0, source: str = "client") -> None:
-        self._endpoints, self._wait_s = endpoints, wait_s
-        self._keys = keys_of(endpoints.curve)
-        self._numbering = Numbering(source)
-        self._context = zmq.asyncio.Context()
-        self._ids = itertools.count(1)
-        self._sockets: dict[int, zmq.asyncio.Socket] = {}
-        self._turn = asyncio.Lock()
-        self._is_taken = False
+    _made = zmq.asyncio.Context
 
-    @classmethod
-    def local(cls, folder: str, wait_s: float = 1.0, source: str = "client") -> Self:
-        """The daemon of this machine whose sockets are in `folder`."""
-        return cls(in_folder(folder), wait_s, source)
+    def __init__(self, endpoints: Endpoints, wait_s: float = 1.0, source: str = "client") -> None:
+        super().__init__(endpoints, wait_s, source)
+        self._turn = asyncio.Lock()
 
     async def request(self, command: str, **args: Any) -> dict[str, Any]:
         """The result of `command`; one after the other where several tasks ask."""
@@ -82,7 +69,7 @@ class AsyncClient:
         while await setpoints.poll(0 if self._is_taken else round(self._wait_s * 1e3)):
             self._is_taken = (await setpoints.recv()).startswith(SUBSCRIBED)
         if not self._is_taken:
-            raise unreachable(self._endpoints.setpoint, f"nobody takes setpoints there within {self._wait_s:g} s")
+            raise self._untaken()
         await setpoints.send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
 
     async def telemetry(self) -> AsyncIterator[Telemetry]:
@@ -90,12 +77,6 @@ class AsyncClient:
         socket = self._socket(zmq.SUB, self._endpoints.telemetry)
         while True:
             yield decode((await socket.recv_multipart())[-1], Telemetry)
-
-    def close(self) -> None:
-        """Close the connections; setpoints that are on their way get a moment."""
-        for socket in self._sockets.values():
-            socket.close()
-        self._context.term()
 
     async def __aenter__(self) -> Self:
         return self
@@ -107,7 +88,7 @@ class AsyncClient:
 
     async def _result(self, command: str, args: dict[str, Any], wait_s: float) -> dict[str, Any]:
         async with self._turn:
-            control, pending = self._socket(zmq.DEALER, self._endpoints.control), Pending(next(self._ids), command)
+            control, pending = self._socket(zmq.DEALER, self._endpoints.control), self._pending(command)
             await control.send(asked(pending, args))
             try:
                 async with asyncio.timeout(wait_s):
@@ -116,9 +97,4 @@ class AsyncClient:
                         if result is not None:
                             return result
             except TimeoutError as error:
-                raise unreachable(self._endpoints.control, f"no answer within {wait_s:g} s") from error
-
-    def _socket(self, kind: int, address: str) -> zmq.asyncio.Socket:
-        if kind not in self._sockets:
-            self._sockets[kind] = opened(self._context.socket(kind), address, self._keys)
-        return self._sockets[kind]
+                raise self._unanswered(wait_s) from error

@@ -1,6 +1,5 @@
 """A client whose calls return when they are done."""
 
-import itertools
 import math
 import time
 from types import TracebackType
@@ -8,45 +7,29 @@ from typing import Any, Self
 
 import zmq
 
-from tormagd_client.endpoints import Endpoints, in_folder
-from tormagd_client.errors import RefusedError, unreachable
+from tormagd_client.errors import RefusedError
 from tormagd_client.messages import Description, Status, Telemetry, decode
 from tormagd_client.wire import (
     NOT_YET,
     SUBSCRIBED,
-    Keys,
-    Numbering,
+    Connections,
     Pending,
     answered,
     asked,
     described,
-    keys_of,
-    opened,
     understood,
 )
 
 RETRY_S = 0.1
 
 
-class Client:
+class Client(Connections["zmq.Socket[bytes]"]):
     """The daemon at `endpoints`: commands, setpoints, telemetry. A context manager; sockets open as they are needed.
 
     `wait_s` is the longest wait for the daemon. `source` names the publisher. Not to be shared between threads.
     """
 
-    def __init__(self, endpoints: Endpoints, wait_s: float = 1.0, source: str = "client") -> None:
-        self._endpoints, self._wait_s = endpoints, wait_s
-        self._keys: Keys | None = keys_of(endpoints.curve)
-        self._numbering = Numbering(source)
-        self._context = zmq.Context()
-        self._ids = itertools.count(1)
-        self._sockets: dict[int, zmq.Socket[bytes]] = {}
-        self._is_taken = False
-
-    @classmethod
-    def local(cls, folder: str, wait_s: float = 1.0, source: str = "client") -> Self:
-        """The daemon of this machine whose sockets are in `folder`."""
-        return cls(in_folder(folder), wait_s, source)
+    _made = zmq.Context
 
     def request(self, command: str, **args: Any) -> dict[str, Any]:
         """The result of `command`. Raises UnreachableError without an answer in time, RefusedError, InFaultError."""
@@ -54,7 +37,7 @@ class Client:
 
     def ask(self, command: str, **args: Any) -> Pending:
         """Give `command` and do not wait: what `answer` is asked with."""
-        pending = Pending(next(self._ids), command)
+        pending = self._pending(command)
         self._socket(zmq.DEALER, self._endpoints.control).send(asked(pending, args))
         return pending
 
@@ -98,13 +81,17 @@ class Client:
         Waits until the daemon takes setpoints: the first time, and where it has gone since. Raises ValueError naming
         what is not allowed, and UnreachableError where nobody takes setpoints within `wait_s`.
         """
+        self.require_taken().send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
+
+    def require_taken(self) -> "zmq.Socket[bytes]":
+        """Where setpoints go, once the daemon takes them. Raises UnreachableError as `publish`."""
         # XPUB speaks to SUB as PUB does, and is told of the subscription: without that the first would be lost
         setpoints = self._socket(zmq.XPUB, self._endpoints.setpoint)
         while setpoints.poll(0 if self._is_taken else round(self._wait_s * 1e3)):
             self._is_taken = setpoints.recv().startswith(SUBSCRIBED)
         if not self._is_taken:
-            raise unreachable(self._endpoints.setpoint, f"nobody takes setpoints there within {self._wait_s:g} s")
-        setpoints.send(self._numbering.setpoint(force_N, valid_for_ms, stamp_ns, **fields))
+            raise self._untaken()
+        return setpoints
 
     def telemetry(self, wait_s: float = 0.0) -> list[Telemetry]:
         """What has arrived since the last call, the oldest first; waits up to `wait_s` for the first. Listens from the
@@ -114,12 +101,6 @@ class Client:
         while socket.poll(0 if arrived else round(wait_s * 1e3)):
             arrived.append(decode(socket.recv_multipart()[-1], Telemetry))
         return arrived
-
-    def close(self) -> None:
-        """Close the connections; setpoints that are on their way get a moment."""
-        for socket in self._sockets.values():
-            socket.close()
-        self._context.term()
 
     def __enter__(self) -> Self:
         return self
@@ -132,10 +113,5 @@ class Client:
     def _result(self, pending: Pending, wait_s: float) -> dict[str, Any]:
         result = self.answer(pending, wait_s)
         if result is None:
-            raise unreachable(self._endpoints.control, f"no answer within {wait_s:g} s")
+            raise self._unanswered(wait_s)
         return result
-
-    def _socket(self, kind: int, address: str) -> "zmq.Socket[bytes]":
-        if kind not in self._sockets:
-            self._sockets[kind] = opened(self._context.socket(kind), address, self._keys)
-        return self._sockets[kind]

@@ -261,6 +261,15 @@ class DeviceReport(msgspec.Struct, frozen=True, kw_only=True):
     lag_ms: float | None = None
 
 
+class BeliefReport(msgspec.Struct, frozen=True, kw_only=True):
+    """One believed value in its unit, its standard deviation where one is known, and whether it acts now."""
+
+    value: float
+    sd: float | None
+    unit: str
+    acts: bool
+
+
 class ProfileReport(msgspec.Struct, frozen=True, kw_only=True):
     """What was kept of this device: whether it is in use, how old what is on the disk is, why there is nothing, and the
     folder of the profiles, empty where none are kept."""
@@ -339,6 +348,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     most_N: float
     trim: float
     device: DeviceReport
+    belief: dict[str, BeliefReport] = {}
     profile: ProfileReport
     least_gap_mm: float
     link: LinkReport

@@ -1,15 +1,17 @@
 """What goes over the sockets, whoever waits for it: addresses and keys, requests and their answers, setpoints."""
 
+import itertools
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
 import msgspec
 import zmq
 
 from tormagd_client import __version__
-from tormagd_client.endpoints import ConfigError, Curve
-from tormagd_client.errors import InFaultError, RefusedError, SettingError, UnreachableError
+from tormagd_client.endpoints import ConfigError, Curve, Endpoints, in_folder
+from tormagd_client.errors import InFaultError, RefusedError, SettingError, UnreachableError, unreachable
 from tormagd_client.messages import (
     MAX_MESSAGE_BYTES,
     VERSION,
@@ -190,3 +192,47 @@ class Numbering:
         )
         self.sent += 1
         return encode(made)
+
+
+class Connections(Generic[SocketT]):
+    """What a client is, however it waits: the daemon at `endpoints`, and the sockets to it, opened as they are needed.
+
+    `wait_s` is the longest wait for the daemon. `source` names the publisher.
+    """
+
+    _made: ClassVar[Callable[[], Any]]
+    "The context that the sockets are of."
+
+    def __init__(self, endpoints: Endpoints, wait_s: float = 1.0, source: str = "client") -> None:
+        self._endpoints, self._wait_s = endpoints, wait_s
+        self._keys = keys_of(endpoints.curve)
+        self._numbering = Numbering(source)
+        self._context = type(self)._made()
+        self._ids = itertools.count(1)
+        self._sockets: dict[int, SocketT] = {}
+        self._is_taken = False
+
+    @classmethod
+    def local(cls, folder: str, wait_s: float = 1.0, source: str = "client") -> Self:
+        """The daemon of this machine whose sockets are in `folder`."""
+        return cls(in_folder(folder), wait_s, source)
+
+    def close(self) -> None:
+        """Close the connections; setpoints that are on their way get a moment."""
+        for socket in self._sockets.values():
+            socket.close()
+        self._context.term()
+
+    def _socket(self, kind: int, address: str) -> SocketT:
+        if kind not in self._sockets:
+            self._sockets[kind] = opened(self._context.socket(kind), address, self._keys)
+        return self._sockets[kind]
+
+    def _pending(self, command: str) -> Pending:
+        return Pending(next(self._ids), command)
+
+    def _unanswered(self, wait_s: float) -> UnreachableError:
+        return unreachable(self._endpoints.control, f"no answer within {wait_s:g} s")
+
+    def _untaken(self) -> UnreachableError:
+        return unreachable(self._endpoints.setpoint, f"nobody takes setpoints there within {self._wait_s:g} s")
