@@ -14,7 +14,7 @@ that is no bound: a forecast that is right misses less, down to what foresight d
 *With foresight* the whole signal is known, and the RMS error is the least that the drive allows; at what gap and speed
 the carriages begin is free. The optimum is found by sequential quadratic programmes (Gauss-Newton, each solved by
 Clarabel), to 2 %: carried on, the rounds found nothing better than that. Without the field's lag a search of everything
-agrees to 0.4 % (`tests/tools/test_bound.py`).
+agrees to 0.4 % (`tests/lab/test_bound.py`).
 """
 
 import math
@@ -348,7 +348,7 @@ def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arr
     A round takes for straight, about the gap of the last round, what is not: the force over the gap, the field's lag,
     and the speeds that a step reaches over the speed before. It solves the quadratic programme that this makes, whose
     unknowns are the gaps and the lags. Nothing says that this is convex, so that it ends at the optimum is tested:
-    against a search of everything (`tests/tools/test_bound.py`).
+    against a search of everything (`tests/lab/test_bound.py`).
     Raises RuntimeError where the rounds come to no end.
     """
     steps = len(asked.force_N)
