@@ -8,6 +8,7 @@ prediction. A show that the host disturbed is told as that, and started again; t
 host.
 """
 
+import argparse
 import concurrent.futures
 import signal
 import sys
@@ -63,6 +64,7 @@ class Verdict(IntEnum):
 
 def main() -> int:
     """Runs the demonstration; 0: what the scene states was met, 1: missed, 3: the host left too little to say."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     started_s = time.monotonic()
     times_s, forces_N = profile()
     config = Config(scene="pulse")

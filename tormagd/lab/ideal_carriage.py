@@ -17,21 +17,26 @@ Clarabel), to 2 %: carried on, the rounds found nothing better than that. Withou
 agrees to 0.4 % (`tests/lab/test_bound.py`).
 """
 
+import argparse
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import clarabel
 import numpy as np
 from scipy import sparse
 
+from tormagd.force_file import read_forces
 from tormagd.lab.arrays import Array, Json
+from tormagd.lab.errors import LabError
+from tormagd.lab.main import Found
 from tormagd.physics.errors import DomainError, require
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.curve import Curve
 from tormagd.simulation.gap_field import SMALLEST_GAP_MM
-from tormagd.simulation.parameters import PlantParameters
+from tormagd.simulation.parameters import PlantParameters, load_plant
 from tormagd.simulation.static_laws import MOMENT_POINTS, force_over_moment, pull_over_gap, radial_moment_Tm
 
 TURNED_MM_S = 42.0
@@ -391,6 +396,24 @@ def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arr
             radius_mm = 0.5 * float(np.abs(moved_mm).max())
         last_N = now_N
     raise RuntimeError(f"foresight: no end after {ROUNDS} rounds, {last_N * 1e3:.2f} mN")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of `tormag-lab bound`."""
+    parser.add_argument("force", type=Path, metavar="FORCE.csv", help="columns t_s,force_N")
+    parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample (sample_1)")
+    parser.add_argument("--held", action="store_true", help="each force holds until the next (linear in between)")
+
+
+def run(options: argparse.Namespace) -> Found:
+    """The figures of a file of forces. Raises DomainError, ForceFileError, PlantError, and LabError where no optimum
+    was found."""
+    table = read_forces(options.force)
+    plant, time_s, force_N = load_plant(options.plant), np.array(table["t_s"]), np.array(table["force_N"])
+    try:
+        return Found(bound(plant, time_s, force_N, is_held=options.held).figures())
+    except RuntimeError as error:
+        raise LabError(str(error)) from error
 
 
 def rms(error_N: Array) -> float:

@@ -45,6 +45,7 @@ COMMANDS = {
     "tactile-hold": Command("tactile.held", "a force held on the pad for an hour, in virtual time"),
     "characterise": Command("characterisation.command", "shear modulus and relaxation from a record"),
     "optimise-design": Command("design.command", "the brake's geometry for a task"),
+    "bound": Command("ideal_carriage", "what a device's ideal carriages miss of a force"),
     "bench-sweep": Command("training.bench_sweep", "training data from the simulated device on a bench"),
     "train-model": Command("training.train_model", "a model file from training data"),
     "tactile-model": Command("tactile.shipped", "a model file of a simulated pad"),
