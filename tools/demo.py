@@ -32,9 +32,10 @@ from rendering.show import (
     show,
 )
 
-from tormagd.config import Config, ConfigError
+from tormagd.config import Config
 from tormagd.lab.arrays import Array
 from tormagd.scenes.scene import Scene, load_scene
+from tormagd_client.endpoints import ConfigError
 
 SHOWS = 3
 "The first, and two more where the host spoils one."

@@ -22,7 +22,6 @@ import msgspec
 from rendering.device_draws import SAMPLES
 from rendering.scene_runs import ROOT, Case, costs, run_all
 
-from tormagd.config import ConfigError
 from tormagd.headroom.__main__ import build
 from tormagd.headroom.machine_loop import machine_us
 from tormagd.inverse.choice import RUNTIME_SOLVERS
@@ -43,6 +42,7 @@ from tormagd.scenes.measured import (
     required,
 )
 from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_task, shipped_scenes
+from tormagd_client.endpoints import ConfigError
 
 SHARE = 0.2
 KEPT = ROOT / "build" / "required_terms.json"

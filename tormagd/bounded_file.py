@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from tormagd_client.regular_file import require_regular as require_regular
+from tormagd_client.regular_file import require_regular
 
 MOST_TABLE_BYTES = 1 << 30
 "A table of measurements, which is read row by row: a day of a testing machine."

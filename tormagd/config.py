@@ -13,16 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from tormagd.toml_file import TomlError, line_of, toml_tables, toml_text
-from tormagd_client.endpoints import (
-    ENDPOINTS as ENDPOINTS,
-    ROLES as ROLES,
-    ConfigError as ConfigError,
-    Curve as Curve,
-    Endpoints as Endpoints,
-    Strict as Strict,
-    in_folder as in_folder,
-    require_usable,
-)
+from tormagd_client.endpoints import ConfigError, Endpoints, Strict, require_usable
 from tormagd_client.printable import in_short, require
 
 LEAST_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from tormagd.config import ROLES, ConfigError, Endpoints
+from tormagd_client.endpoints import ROLES, ConfigError, Endpoints
 from tormagd_client.keys import PUBLIC, load_pair, load_public, regular
 
 MAX_KEYS = 256

@@ -8,7 +8,7 @@ import os
 import re
 from typing import TextIO
 
-from tormagd_client.printable import printable as printable
+from tormagd_client.printable import printable
 
 _OURS = re.compile("(\n|\t|\x1b\\[(?:0|1|31|32|33)m)")
 "What a line may hold besides printable characters: its end, a tabulator, and the colours of `ctl.outcome.Colour`."

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from tormagd.bounded_file import read_bounded
-from tormagd_client.printable import in_short as in_short
 
 MOST_BYTES = 65_536
 "Ten times the longest configuration with all its comments."

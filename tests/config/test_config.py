@@ -11,9 +11,10 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from firmware_protocol.build import settle
 from tormagd import __version__
-from tormagd.config import LEAST_INFERENCE_HZ, Config, ConfigError, load_config
+from tormagd.config import LEAST_INFERENCE_HZ, Config, load_config
 from tormagd.daemon.main import main
 from tormagd.hardware.backend import ENTRY_POINTS, choose
+from tormagd_client.endpoints import ConfigError
 from tormagd_client.keys import generate
 
 Write = Callable[[str], Path]

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 import zmq
 
-from tormagd.config import ENDPOINTS, Config, ConfigError, Curve, Endpoints
+from tormagd.config import Config
 from tormagd.keys import KeyRing, load_folder
+from tormagd_client.endpoints import ENDPOINTS, ConfigError, Curve, Endpoints
 from tormagd_client.keys import MAX_KEY_FILE_BYTES, fingerprint, generate, load_pair, load_public
 
 FAR = {name: f"tcp://192.0.2.1:{5_555 + number}" for number, name in enumerate(ENDPOINTS)}

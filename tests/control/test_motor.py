@@ -9,10 +9,11 @@ from hypothesis import example, given, settings, strategies as st
 from scipy.optimize import brentq
 from scipy.signal import StateSpace, cont2discrete, dlsim, lfilter
 
-from tormagd.config import Config, ConfigError, Motor, Position
+from tormagd.config import Config, Motor, Position
 from tormagd.control.core import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG, build_core
 from tormagd.control.motor import full_speed_mm_s, margins, mechanical_time_s, pull_V, zero_order_hold
 from tormagd.physics.magnets import CuboidMagnet, attraction_N
+from tormagd_client.endpoints import ConfigError
 
 PERIOD_S = 1e-3
 motors = st.builds(

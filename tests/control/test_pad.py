@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from tormagd.config import Config, ConfigError
+from tormagd.config import Config
 from tormagd.control.contact import PRESSED, Pressing
 from tormagd.control.core import SEVERAL_BRANCHES, Core, build_core, choose_solver
 from tormagd.control.estimate import Estimate, Handle, update
@@ -14,6 +14,7 @@ from tormagd.control.plan import PlanState
 from tormagd.model.displacement import Turn
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import EVERY_TERM, RELAXATION_S, load_scene, scene_path
+from tormagd_client.endpoints import ConfigError
 
 CONFIG = Config(scene="radial_pulse")
 SCENE = load_scene("radial_pulse")

@@ -19,7 +19,6 @@ from aiohttp.test_utils import TestClient, TestServer
 from hypothesis import given, settings, strategies as st
 from machines.chromium import CHROMIUM, Page, browser
 
-from tormagd.config import in_folder
 from tormagd.dashboard.frame import LATE_US, SHOWN_S, Frame, late_counts
 from tormagd.dashboard.live import WAITING, Live
 from tormagd.dashboard.recorded import Recorded
@@ -29,6 +28,7 @@ from tormagd.recording.ticks import TickBatch
 from tormagd.recording.writer import RecordingWriter
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd_client.aio import AsyncClient
+from tormagd_client.endpoints import in_folder
 from tormagd_client.messages import Description, Status, encode
 
 START_NS = 1_790_000_000_000_000_000

@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 
 from firmware_protocol.build import COST, REMEDY, Build
-from tormagd.config import Config, Device, Endpoints, RealTime
+from tormagd.config import Config, Device, RealTime
 from tormagd.ctl import doctor as checks, headroom
 from tormagd.ctl.doctor import Verdict, examine, judged
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.main import main
+from tormagd_client.endpoints import Endpoints
 
 LIMITS = """Limit                     Soft Limit           Hard Limit           Units
 Max locked memory         {memlock}            unlimited            bytes

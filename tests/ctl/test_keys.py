@@ -1,5 +1,6 @@
 """`tormagctl keys`, and clients that show a key: to a daemon made of guarded sockets only."""
 
+import asyncio
 import json
 import stat
 import threading
@@ -15,6 +16,10 @@ from zmq.utils import z85
 
 from tormagd.ctl.commands import KEY, SERVER_KEY
 from tormagd.ctl.main import main
+from tormagd_client.aio import AsyncClient
+from tormagd_client.blocking import Client
+from tormagd_client.endpoints import Endpoints
+from tormagd_client.errors import UnreachableError
 from tormagd_client.messages import VERSION
 
 
@@ -133,6 +138,23 @@ def test_another_key_or_none_is_not_answered_and_the_hint_says_where_to_look(
         code, printed = run_json(capsys, "--endpoint", guarded, "--wait", "0.3", *arguments, "disable")
         assert (code, printed["error"]["code"]) == (3, "unreachable")
         assert "--key and --server-key" in printed["error"]["hint"]
+
+
+def test_who_was_refused_and_asks_again_is_told_and_does_not_wait_for_ever(guarded: str) -> None:
+    """A refusal ends the connection for good, and there is nobody to send to."""
+    endpoints = Endpoints(control=guarded)
+    with Client(endpoints, wait_s=0.2) as client:
+        for _ in range(3):
+            with pytest.raises(UnreachableError):
+                client.request("disable")
+
+    async def ask() -> None:
+        async with AsyncClient(endpoints, wait_s=0.2) as client:
+            for _ in range(3):
+                with pytest.raises(UnreachableError):
+                    await client.request("disable")
+
+    asyncio.run(ask())
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import os
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
@@ -160,20 +161,13 @@ def test_byte_order_mark_windows_lines_and_blank_lines_are_read(tmp_path):
     st.floats(-0.5, 1.5),
 )
 def test_between_rows_the_force_is_on_the_straight_line(tmp_path_factory, steps, share):
-    times: list[float] = []
-    forces: list[float] = []
-    for spacing, force in steps:
-        times.append((times[-1] if times else 0.0) + spacing)
-        forces.append(force)
+    spacing, forces = zip(*steps, strict=True)
+    times = np.cumsum(spacing).tolist()
     file = Path(tmp_path_factory.getbasetemp()) / "line.csv"
     file.write_text("t_s,force_N\n" + "".join(f"{t!r},{f!r}\n" for t, f in zip(times, forces, strict=True)))
     waveform = read_csv(file)
     t_s = share * waveform.duration_s
-    inside = min(max(t_s, 0.0), waveform.duration_s) + times[0]
-    right = next(i for i in range(1, len(times)) if times[i] >= inside - 1e-12 or i == len(times) - 1)
-    slope = (forces[right] - forces[right - 1]) / (times[right] - times[right - 1])
-    expected = forces[right - 1] + slope * (inside - times[right - 1])
-    assert waveform.at(t_s).force_N == pytest.approx(expected, abs=1e-6)
+    assert waveform.at(t_s).force_N == pytest.approx(np.interp(times[0] + t_s, times, forces), abs=1e-6)
 
 
 @pytest.mark.parametrize("name", SHAPES)

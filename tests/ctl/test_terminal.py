@@ -12,7 +12,8 @@ from hypothesis import given, strategies as st
 from tormagd.ctl.main import main
 from tormagd.ctl.outcome import Colour
 from tormagd.daemon.log import LogFormatter
-from tormagd.output import printable, write_line
+from tormagd.output import write_line
+from tormagd_client.printable import printable
 
 EVIL = "\x1b[2J\x1b]0;owned\x07\r\n\x9b31m\u202eevil\x7f"
 HARMLESS = r"\u001b[2J\u001b]0;owned\u0007\r\n\u009b31m\u202eevil\u007f"

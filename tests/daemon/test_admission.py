@@ -13,11 +13,12 @@ import msgpack
 import pytest
 import zmq
 
-from tormagd.config import Config, Curve, Endpoints
+from tormagd.config import Config
 from tormagd.daemon import admission
 from tormagd.daemon.admission import CONNECTIONS_PER_PEER, PLAIN
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.keys import KeyRing
+from tormagd_client.endpoints import Curve, Endpoints
 from tormagd_client.keys import KeyPair, fingerprint, generate, load_pair
 from tormagd_client.messages import VERSION, PeerReport, Reply, Request, decode, encode
 

@@ -14,10 +14,10 @@ import msgpack
 import pytest
 import zmq
 
-from tormagd.config import Endpoints
 from tormagd.daemon.endpoint import DRAIN, REQUESTS, SETPOINT_BURST, Endpoint
 from tormagd.daemon.requests import WAITING_PER_CLIENT
 from tormagd.safety.operating_state import RefusedError
+from tormagd_client.endpoints import Endpoints
 from tormagd_client.messages import VERSION, Reply, Request, Telemetry, Tick, decode, encode
 
 PATIENCE_MS = 10_000
@@ -505,6 +505,13 @@ def test_a_second_daemon_takes_nothing_from_the_first_and_names_it(rig: Rig, tmp
     for _ in range(2):
         with pytest.raises(OSError, match=f"^endpoints.setpoint = .*: already running, pid {os.getpid()}; end it, or "):
             Endpoint(Endpoints(**rig.addresses))
+    config = tmp_path / "tormagd.toml"
+    config.write_text("[endpoints]\n" + "".join(f'{name} = "{address}"\n' for name, address in rig.addresses.items()))
+    second = [sys.executable, "-m", "tormagd.daemon.main", "--config", str(config)]
+    ended = subprocess.run(second, capture_output=True, text=True, check=False, timeout=60.0)
+    assert ended.returncode == 1
+    assert ended.stderr.splitlines()[-1].startswith("tormagd: endpoints.setpoint = 'ipc://")
+    assert f": already running, pid {os.getpid()}; end it, or name other" in ended.stderr
     assert rig.is_answered()
     assert sorted(path.name for path in tmp_path.iterdir() if path.is_socket()) == sorted(rig.addresses)
 

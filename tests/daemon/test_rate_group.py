@@ -40,15 +40,6 @@ def test_percentiles_are_exact_to_the_width_of_their_bin(values: list[float]) ->
         assert exact - 0.05 <= getattr(summary, name) <= exact * (1.0 + 1.0 / 32.0) + 1.0
 
 
-@pytest.mark.parametrize("value_us", [-5.0, 0.0, 63.99, 64.0, 65.0, 127.0, 128.0, 4_095.0, 4_096.0, 1e7])
-def test_one_value_is_its_own_percentile(value_us: float) -> None:
-    histogram = Histogram()
-    histogram.add(value_us)
-    summary = histogram.summary()
-    assert summary.p50 == summary.p99 == summary.p999
-    assert summary.p50 == pytest.approx(max(value_us, 0.0), rel=1.0 / 32.0, abs=1.0)
-
-
 def test_what_is_beyond_the_last_bin_is_still_the_largest() -> None:
     histogram = Histogram()
     histogram.add(1e12)

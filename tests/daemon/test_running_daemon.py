@@ -1,47 +1,111 @@
-"""The daemon's own event loop without a device: whatever becomes of planning, it can be seen and stopped."""
+"""The daemon's own loops in virtual time, at a simulated device or at none; it is spoken to over its sockets."""
 
 import asyncio
+import contextlib
 import gc
+import logging
+import os
 import signal
-from collections.abc import Awaitable, Callable, Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 import pytest
-import zmq
-import zmq.asyncio
 
 from firmware_protocol.build import settle
-from tormagd.config import Config, Endpoints, Rates, RealTime
+from tormagd.closed_loop import VirtualPort
+from tormagd.config import Config, Rates, RealTime
 from tormagd.control.core import Core, build_core
 from tormagd.control.plan import PlanState
 from tormagd.control.sight import Sight
-from tormagd.daemon import notify
+from tormagd.daemon import daemon as daemon_module, notify
 from tormagd.daemon.callbacks import KERNEL, Delay
 from tormagd.daemon.daemon import Daemon
-from tormagd.hardware.backend import Backend, BackendError
+from tormagd.hardware.backend import BackendError
 from tormagd.physics.errors import DomainError
-from tormagd.safety.codes import FAULTS, Fault
-from tormagd_client.messages import VERSION, Description, Reply, Request, decode, encode
+from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.hand import ReversingHand
+from tormagd.simulation.parameters import load_plant
+from tormagd_client import Client, RefusedError, UnreachableError
+from tormagd_client.endpoints import in_folder
+from tormagd_client.messages import Description
+from tormagd_client.wire import Pending
 
-pytestmark = pytest.mark.live
-
-PATIENCE_S = 20.0
+PATIENCE_TICKS = 20_000
+"Longer than anything takes; only a failure waits for it."
+LOOK_TICKS = 50
+"How often the status is looked at while something is waited for."
+SLOW_NS = 3_000_000_000
+START_NS = 1_800_000_000_000_000_000
+"The time of day at which CLOCK_MONOTONIC is 0."
 WATCHDOG_MS = 100.0
-Command = Callable[[str], Awaitable[dict[str, Any]]]
 
 
-@pytest.fixture(scope="module")
-def core() -> Core:
-    return build_core(Config())
+class Clock:
+    """All clocks, standing still but for what the test says."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+
+    def slow(self, _record: object = None) -> bool:
+        """Three seconds that something takes."""
+        self.now_ns += SLOW_NS
+        return True
 
 
-@pytest.fixture(autouse=True)
-def thawed() -> Iterator[None]:
-    """The daemon takes what lives out of the collector's reach, for good."""
-    yield
-    gc.unfreeze()
+class Heartbeat:
+    """Beats as the kernel's timer does, when they are asked for."""
+
+    made: ClassVar["list[Heartbeat]"] = []
+
+    def __init__(self, period_ns: int) -> None:
+        self.period_ns, self.due_ns = period_ns, time.monotonic_ns()
+        self._fd, self._is_over = os.eventfd(0), False
+        self.made.append(self)
+
+    def fileno(self) -> int:
+        return self._fd
+
+    def beats(self) -> int:
+        beats = 0 if self._is_over else (time.monotonic_ns() - self.due_ns) // self.period_ns
+        self.due_ns += beats * self.period_ns
+        return beats
+
+    def close(self) -> None:
+        self._is_over = True
+        os.close(self._fd)
+
+
+class Port:
+    """The line of a simulated device. Unplugged, it cannot be opened and fails."""
+
+    def __init__(self) -> None:
+        self.line = VirtualPort(VirtualDevice(load_plant("sample_1"), ReversingHand(2.0), seed=1))
+        self.is_plugged_in = True
+
+    def open(self) -> "Port":
+        if not self.is_plugged_in:
+            raise BackendError("no such port", "plug it in")
+        self.line.open()
+        self._fd = os.eventfd(0)
+        return self
+
+    def fileno(self) -> int:
+        return self._fd
+
+    def receive(self) -> Any:
+        if not self.is_plugged_in:
+            raise BackendError("the port is gone", "plug it in")
+        return self.line.receive()
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.line, name)
 
 
 class FailingPlanner:
@@ -49,7 +113,6 @@ class FailingPlanner:
 
     def __init__(self, core: Core) -> None:
         self._planner = core.planner
-        self.portrait, self.start, self.foresee = core.planner.portrait, core.planner.start, core.planner.foresee
         self.error: Exception | None = None
 
     def plan(self, *arguments: Any) -> PlanState:
@@ -57,148 +120,330 @@ class FailingPlanner:
             raise self.error.with_traceback(None)  # or it would grow by each time, and take long to log
         return self._planner.plan(*arguments)
 
-
-def no_device() -> Backend:
-    raise BackendError("no such port", "plug it in")
-
-
-def run(
-    core: Core,
-    folder: Path,
-    operate: Callable[[Command, FailingPlanner], Awaitable[None]],
-    rates: Rates = Rates(),  # noqa: B008 it is immutable
-) -> None:
-    """A daemon that has no device, for as long as `operate` takes."""
-    planner = FailingPlanner(core)
-    addresses = {name: f"ipc://{folder}/{name}" for name in ("setpoint", "telemetry", "control", "recording")}
-    config = Config(endpoints=Endpoints(**addresses), rates=rates, realtime=RealTime(watchdog_ms=WATCHDOG_MS))
-
-    async def both() -> None:
-        made: Any = core._replace(planner=planner)  # type: ignore[arg-type]
-        running = asyncio.create_task(Daemon(config, made, no_device, []).run())
-        with zmq.asyncio.Context() as context, context.socket(zmq.DEALER) as client:
-            client.linger = 0
-            client.connect(addresses["control"])
-
-            async def command(name: str) -> dict[str, Any]:
-                await client.send(encode(Request(v=VERSION, id=1, command=name)))
-                reply = decode(await asyncio.wait_for(client.recv(), PATIENCE_S), Reply)
-                assert reply.ok, reply.error
-                return reply.result or {}
-
-            try:
-                await operate(command, planner)
-            finally:
-                signal.raise_signal(signal.SIGTERM)
-                await running
-
-    asyncio.run(both())
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._planner, name)
 
 
-def test_stop_without_a_device_says_that_there_is_none(core: Core, tmp_path: Path) -> None:
-    async def operate(command: Command, _planner: FailingPlanner) -> None:
-        assert await command("stop") == {"operating_state": "FAULT", "is_connected": False}
-        status = await command("status")
-        assert (status["faults"], status["governed_cf"], status["is_busy"]) == (["STOPPED"], None, False)
-        assert status["build"] == str(settle())
+class Running:
+    """A daemon that beats when the test says so, and an operator's client, which publishes, too."""
 
-    run(core, tmp_path, operate)
+    def __init__(self, runner: asyncio.Runner, clock: Clock, core: Core, folder: Path) -> None:
+        self.clock, self.port, self.planner, self.core = clock, Port(), FailingPlanner(core), core
+        self._runner, self._folder = runner, str(folder)
+        self.clients: list[Client] = []
+        self.client = self.publisher("test")
+
+    def publisher(self, source: str) -> Client:
+        """A client with a name of its own."""
+        self.clients.append(Client.local(self._folder, 1e-3, source))
+        return self.clients[-1]
+
+    def start(self, rates: Rates = Rates(), *, is_plugged_in: bool = True) -> None:  # noqa: B008 it is immutable
+        """Begins to run; that takes some seconds."""
+        self.port.is_plugged_in = is_plugged_in
+        self._runner.run(self._begun(rates))
+
+    async def _begun(self, rates: Rates) -> None:
+        config = Config(endpoints=in_folder(self._folder), rates=rates, realtime=RealTime(watchdog_ms=WATCHDOG_MS))
+        made: Any = self.core._replace(planner=self.planner)  # type: ignore[arg-type]
+        self.daemon = Daemon(config, made, self.port.open, [])
+        # what was bound before the clock was made
+        self.daemon._inference._clock_ns = self.daemon._callbacks._clock_ns = time.monotonic_ns
+        self.daemon._connection._clock = time.monotonic
+        self.clock.slow()
+        self._run = asyncio.create_task(self.daemon.run())
+        while not Heartbeat.made:
+            await asyncio.sleep(0)
+        self._heartbeat = Heartbeat.made.pop()
+
+    def tick(self, times: int = 1) -> None:
+        """So many control periods."""
+        self._runner.run(self._ticked(times))
+
+    async def _ticked(self, times: int) -> None:
+        for _ in range(times):
+            self.clock.now_ns += self._heartbeat.period_ns
+            self.port.advance(time.monotonic())
+            self.daemon._connection.receive()
+            asyncio.get_running_loop().call_soon(self.daemon._beat, self._heartbeat)
+            await asyncio.sleep(0)
+
+    def answer(self, pending: Pending) -> dict[str, Any]:
+        """The result of what was asked. Raises RefusedError."""
+        for _ in range(PATIENCE_TICKS):
+            if (result := self.client.answer(pending, 1e-3)) is not None:
+                return result
+            self.tick()
+        pytest.fail(f"no answer to {pending}")
+
+    def command(self, name: str, **args: Any) -> dict[str, Any]:
+        """The result of a command. Raises RefusedError."""
+        return self.answer(self.client.ask(name, **args))
+
+    def refused(self, name: str, **args: Any) -> str:
+        """The code with which a command is refused."""
+        with pytest.raises(RefusedError) as refused:
+            self.command(name, **args)
+        return refused.value.code
+
+    def until(self, reached: Callable[[dict[str, Any]], bool], what: str) -> dict[str, Any]:
+        """The status in which that is so."""
+        for _ in range(PATIENCE_TICKS // LOOK_TICKS):
+            self.tick(LOOK_TICKS)
+            if reached(status := self.command("status")):
+                return status
+        pytest.fail(f"not reached: {what}")
+
+    def arm(self) -> None:
+        """Homes, where that is still to do, and enables."""
+        status = self.until(lambda status: status["link"]["state"] == "RUNNING", "the link runs")
+        if not status["is_homed"]:
+            self.command("home")
+        self.until(lambda status: status["is_homed"] and not status["is_busy"], "homed")
+        self.command("enable")
+
+    def ask(self, force_N: float, valid_for_ms: float = 30_000.0, by: Client | None = None) -> None:
+        """Publishes one setpoint, and waits until it is taken or refused."""
+        inbox = self.daemon._endpoint.inbox
+        before = inbox.accepted + inbox.refused
+        for _ in range(PATIENCE_TICKS):
+            with contextlib.suppress(UnreachableError):  # who does not beat tells nobody that it listens
+                (by or self.client).publish(force_N, valid_for_ms)
+                break
+            self.tick()
+        while inbox.accepted + inbox.refused == before:
+            self.tick()
+
+    def end(self) -> None:
+        """Ends it as SIGTERM does, and the clients."""
+        signal.raise_signal(signal.SIGTERM)
+        self._runner.run(self._ended())
+        for client in self.clients:
+            client.close()
+
+    async def _ended(self) -> None:
+        while not self._run.done():
+            await self._ticked(1)
+
+
+@pytest.fixture(scope="module")
+def core() -> Core:
+    return build_core(Config())
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
+    made = Clock()
+    monkeypatch.setattr(time, "monotonic_ns", lambda: made.now_ns)
+    monkeypatch.setattr(time, "monotonic", lambda: made.now_ns * 1e-9)
+    monkeypatch.setattr(time, "time_ns", lambda: START_NS + made.now_ns)
+    monkeypatch.setattr(daemon_module, "Heartbeat", Heartbeat)
+    yield made
+    Heartbeat.made.clear()
+    gc.unfreeze()  # the daemon takes what lives out of the collector's reach
+
+
+@pytest.fixture
+def running(clock: Clock, core: Core, tmp_path: Path) -> Iterator[Running]:
+    with asyncio.Runner() as runner:
+        made = Running(runner, clock, core, tmp_path)
+        yield made
+        made.end()
+
+
+# -- without a device ----------------------------------------------------------------------------------------------
+
+
+def test_stop_without_a_device_says_that_there_is_none(running: Running) -> None:
+    running.start(is_plugged_in=False)
+    assert running.command("stop") == {"operating_state": "FAULT", "is_connected": False}
+    status = running.command("status")
+    assert (status["faults"], status["governed_cf"], status["is_busy"]) == (["STOPPED"], None, False)
+    assert status["build"] == str(settle())
 
 
 @pytest.mark.parametrize("ticks_per_snapshot", [1, 2, 50])
 def test_requests_are_answered_with_the_newest_snapshot_however_few_ticks_it_stands_for(
-    core: Core, tmp_path: Path, ticks_per_snapshot: int
+    running: Running, ticks_per_snapshot: int
 ) -> None:
-    async def operate(command: Command, _planner: FailingPlanner) -> None:
-        numbers = [(await command("status"))["seq"] for _ in range(4)]
-        assert numbers == sorted(set(numbers))  # one answer in a period
-
-    rates = Rates(control_hz=100, inference_hz=100, telemetry_hz=100 // ticks_per_snapshot)
-    run(core, tmp_path, operate, rates)
+    running.start(Rates(control_hz=100, inference_hz=100, telemetry_hz=100 // ticks_per_snapshot), is_plugged_in=False)
+    numbers = [running.command("status")["seq"] for _ in range(4)]
+    assert numbers == sorted(set(numbers))  # one answer in a period
 
 
-def test_a_daemon_describes_what_it_runs(core: Core, tmp_path: Path) -> None:
-    async def operate(command: Command, _planner: FailingPlanner) -> None:
-        described = msgspec.convert(await command("describe"), Description)
-        assert described.scene["name"] == core.scene.name
-        assert described.configuration["realtime"]["watchdog_ms"] == WATCHDOG_MS
-        assert (described.model, described.build) == (core.model, str(settle()))
-        assert (described.firmware, described.serial_number) == (None, None)
-        # a device that has shown nothing yet is the model, at the gap speed of the configuration
-        shown, told = core.planner.portrait, described.portrait
-        assert told is not None
-        assert told.force_N == pytest.approx(shown.force_N[::5], abs=1e-4)
-        speed_mm_s = described.configuration["position"]["gap_speed_mm_s"]
-        assert told.rate_N_s == pytest.approx(
-            [shown.force_rate_N_s(f, speed_mm_s) for f in shown.force_N[::5]], abs=1e-4
-        )
-
-    run(core, tmp_path, operate)
+def test_a_daemon_describes_what_it_runs(running: Running) -> None:
+    running.start(is_plugged_in=False)
+    described = msgspec.convert(running.command("describe"), Description)
+    assert described.scene["name"] == running.core.scene.name
+    assert described.configuration["realtime"]["watchdog_ms"] == WATCHDOG_MS
+    assert (described.model, described.build) == (running.core.model, str(settle()))
+    assert (described.firmware, described.serial_number) == (None, None)
+    # a device that has shown nothing yet is the model, at the gap speed of the configuration
+    shown, told = running.core.planner.portrait, described.portrait
+    assert told is not None
+    assert told.force_N == pytest.approx(shown.force_N[::5], abs=1e-4)
+    speed_mm_s = described.configuration["position"]["gap_speed_mm_s"]
+    assert told.rate_N_s == pytest.approx([shown.force_rate_N_s(f, speed_mm_s) for f in shown.force_N[::5]], abs=1e-4)
 
 
 @pytest.mark.parametrize("error", [DomainError("displacement_mm", 1e10, "less"), TypeError("nobody expects this")])
-def test_a_daemon_that_cannot_plan_can_be_seen_and_stopped(core: Core, tmp_path: Path, error: Exception) -> None:
-    async def operate(command: Command, planner: FailingPlanner) -> None:
-        planner.error = error
-        first = await command("status")
-        while (status := await command("status"))["seq"] < first["seq"] + 3:
-            assert ("PLAN_FAILED" in status["faults"]) >= ("PLAN_FAILED" in first["faults"])
-        assert ("PLAN_FAILED" in status["faults"]) == isinstance(error, DomainError)
-        await command("stop")
-        assert "STOPPED" in (await command("status"))["faults"]
-
-    run(core, tmp_path, operate)
+def test_a_daemon_that_cannot_plan_can_be_seen_and_stopped(running: Running, error: Exception) -> None:
+    running.start(is_plugged_in=False)
+    running.tick()
+    running.planner.error = error
+    running.tick(100)
+    assert ("PLAN_FAILED" in running.command("status")["faults"]) == isinstance(error, DomainError)
+    running.command("stop")
+    assert "STOPPED" in running.command("status")["faults"]
 
 
-def test_the_watchdog_is_fed_while_plans_are_fresh(core: Core, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_watchdog_is_fed_while_plans_are_fresh(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     notified: list[str] = []
     monkeypatch.setattr(notify, "notify", notified.append)
+    running.start(is_plugged_in=False)
+    running.tick(100)
+    assert "WATCHDOG=1" in notified
+    running.planner.error = TypeError("nobody expects this")
+    running.tick(round(2 * WATCHDOG_MS))
+    notified.clear()
+    running.tick(100)
+    assert notified == []
 
-    async def operate(command: Command, planner: FailingPlanner) -> None:
-        while "WATCHDOG=1" not in notified:
-            await command("status")
-        planner.error = TypeError("nobody expects this")
-        broken_ns = (await command("status"))["t_ns"]
-        while (await command("status"))["t_ns"] < broken_ns + 2e6 * WATCHDOG_MS:
-            pass
-        notified.clear()
-        newest = (await command("status"))["seq"]
-        while (await command("status"))["seq"] < newest + 5:
-            pass
-        assert notified == []
 
-    run(core, tmp_path, operate)
+def test_a_slow_start_is_graded_as_a_fast_one(running: Running, caplog: pytest.LogCaptureFixture) -> None:
+    """The loops are graded from their first period on."""
+    said = logging.getLogger(daemon_module.__name__)
+    said.addFilter(running.clock.slow)
+    begun_ns = running.clock.now_ns
+    with caplog.at_level(logging.INFO):
+        running.start(is_plugged_in=False)
+        said.removeFilter(running.clock.slow)
+        assert running.clock.now_ns - begun_ns >= 2 * SLOW_NS
+        running.tick(200)
+    daemon = running.daemon
+    groups = (daemon._control.timing, daemon._inference.timing, daemon._telemetry.timing)
+    for group in groups:
+        group.refresh()
+    assert [group.report.grade for group in groups] == ["good"] * 3
+    assert (daemon._control.timing.runs, daemon._control.timing.merged) == (200, 0)
+    assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
 
 
 def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
-    core: Core, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    running: Running, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Length and culprit are those of the stall that did it, whatever stalls come after."""
-    addresses = {name: f"ipc://{tmp_path}/{name}" for name in ("setpoint", "telemetry", "control", "recording")}
+    running.start(is_plugged_in=False)
+    control, causes = running.daemon._control, running.daemon._causes
 
-    async def tell() -> None:
-        daemon = Daemon(Config(endpoints=Endpoints(**addresses)), core, no_device, [])
-        control, causes = daemon._control, daemon._causes
+    def stall(now_s: float, took_s: float, culprit: str) -> None:
+        control.state = control.state.replaced(time_s=now_s, sight=Sight(now_s, now_s, took_s, is_blind=True))
+        causes.note_stall(control.state, Delay(round(took_s * 1e9), culprit, 1))
 
-        def stall(now_s: float, took_s: float, culprit: str) -> None:
-            control.state = control.state.replaced(time_s=now_s, sight=Sight(now_s, now_s, took_s, is_blind=True))
-            causes.note_stall(control.state, Delay(round(took_s * 1e9), culprit, 1))
-
-        stall(10.0, 0.083, KERNEL)
-        # a late tick that is no stall is not taken for one
-        control.state = control.state.replaced(time_s=10.1)
-        causes.note_stall(control.state, Delay(2_000_000, "TelemetryLoop.publish", 1_500_000))
-        control.latch(Fault.HOST_STALL)
-        causes.tell(control.new_faults(), control.state, None)
-        stall(11.0, 0.006, "somebody else")
-        control.latch(Fault.PLAN_FAILED)
-        causes.tell(control.new_faults(), control.state, None)
-        assert control.new_faults() == ()
-        daemon._endpoint.close()
-
-    asyncio.run(tell())
+    stall(10.0, 0.083, KERNEL)
+    # a late tick that is no stall is not taken for one
+    control.state = control.state.replaced(time_s=10.1)
+    causes.note_stall(control.state, Delay(2_000_000, "TelemetryLoop.publish", 1_500_000))
+    control.latch(Fault.HOST_STALL)
+    causes.tell(control.new_faults(), control.state, None)
+    stall(11.0, 0.006, "somebody else")
+    control.latch(Fault.PLAN_FAILED)
+    causes.tell(control.new_faults(), control.state, None)
+    assert control.new_faults() == ()
     assert [record.getMessage() for record in caplog.records if record.getMessage().startswith("fault")] == [
         "fault: HOST_STALL: the control loop stood still for 83 ms (kernel); "
         f"the device opened the gap by itself after 50 ms; next: {FAULTS[Fault.HOST_STALL].remedy}",
         f"fault: PLAN_FAILED: {FAULTS[Fault.PLAN_FAILED].cause}; next: {FAULTS[Fault.PLAN_FAILED].remedy}",
     ]
+
+
+# -- with a device -------------------------------------------------------------------------------------------------
+
+
+def test_force_follows_the_setpoint_and_what_holds_it_back_is_said(running: Running) -> None:
+    running.start()
+    running.arm()
+    for force_N in (1.0, 1.6):
+        running.ask(force_N)
+        status = running.until(lambda status, asked=force_N: abs(status["measured_cf"] - asked) < 0.06, f"{force_N} N")  # type: ignore[misc]
+    assert (status["operating_state"], status["setpoint_cf"]) == ("ENABLED", 1.6)
+    assert abs(status["skew_mm"]) < 0.05
+    running.ask(0.1)
+    status = running.until(lambda status: abs(status["governed_cf"] - status["least_N"]) < 5e-3, "the least force")
+    assert "F_MIN" in status["limits"]
+    assert {"code": "F_MIN", "remedy": LIMITS[Limit.F_MIN].remedy}.items() <= status["limit_details"][0].items()
+    running.ask(1.5)
+    running.until(lambda status: status["governed_cf"] == 1.5, "governed")
+    running.ask(1.5, valid_for_ms=50.0)
+    running.until(lambda status: "STALE" in status["limits"], "STALE shown")
+    status = running.until(lambda status: status["governed_cf"] < status["least_N"] + 0.01, "decayed")
+    assert status["operating_state"] == "ENABLED"
+
+
+def test_what_may_not_be_done_yet_is_refused_and_stop_opens_and_latches(running: Running) -> None:
+    running.start()
+    running.arm()
+    running.command("disable")
+    running.until(lambda status: not status["is_busy"], "open")
+    home, enable, look = (running.client.ask(name) for name in ("home", "enable", "status"))
+    assert running.answer(home)
+    with pytest.raises(RefusedError, match="homing"):
+        running.answer(enable)
+    assert running.answer(look)["is_busy"]
+    status = running.until(lambda status: status["is_homed"] and not status["is_busy"], "homed")
+    assert status["faults"] == []
+    running.ask(1.5)
+    assert running.refused("enable") == "not_neutral"
+    running.ask(0.5)
+    running.command("enable")
+    running.ask(1.5)
+    running.until(lambda status: status["gap_mm"] < 72.0, "closing")
+    running.command("stop")
+    status = running.until(lambda status: status["gap_mm"] > 94.0 and not status["is_busy"], "open")
+    assert (status["operating_state"], status["fault_details"][0]["code"]) == ("FAULT", "STOPPED")
+    running.command("clear-fault")
+    assert running.command("status")["operating_state"] == "DISABLED"
+
+
+def test_a_second_publisher_is_refused_and_named_until_it_is_given_the_brake(running: Running) -> None:
+    running.start()
+    console = running.publisher("console")
+    running.arm()
+    running.ask(0.9)
+    running.until(lambda status: abs(status["measured_cf"] - 0.9) < 0.06, "0.9 N")
+    running.ask(1.6, by=console)
+    running.ask(0.9)
+    status = running.until(lambda status: "OTHER_SOURCE" in status["limits"], "the other one is named")
+    told = {each["code"]: each for each in status["limit_details"]}["OTHER_SOURCE"]
+    assert told["cause"] == "'console' sends setpoints too, and 'test' holds the brake"
+    assert told["remedy"].endswith("tormagctl take console")
+    assert status["setpoint_cf"] == 0.9
+    assert running.refused("take") == "bad_source"
+    assert running.refused("take", source="nobody") == "unknown_source"
+    assert running.command("take", source="console") == {"source": "console", "instead_of": "test"}
+    governed_N: list[float] = []
+    status = running.until(
+        lambda status: governed_N.append(status["governed_cf"]) or governed_N[-1] == 1.6,  # type: ignore[func-returns-value]
+        "the ramp ends at 1.6 N",
+    )
+    assert governed_N == sorted(governed_N)
+    assert sum(0.9 < force_N < 1.6 for force_N in governed_N) >= 5
+    assert status["setpoints"]["by_source"]["test"]["state"] == "refused"
+
+
+def test_a_device_that_is_unplugged_in_motion_comes_back_without_re_arming(running: Running) -> None:
+    running.start()
+    running.arm()
+    running.ask(1.5)
+    running.until(lambda status: status["gap_mm"] < 85.0, "closing")
+    running.port.is_plugged_in = False
+    status = running.until(lambda status: "LINK_LOST" in status["faults"], "the loss is named")
+    assert (status["link"]["cause"], status["link"]["remedy"]) == ("no such port", "plug it in")
+    running.tick(500)
+    running.port.is_plugged_in = True
+    status = running.until(lambda status: status["link"]["state"] == "RUNNING" and not status["is_busy"], "back, open")
+    assert status["operating_state"] == "FAULT"
+    running.command("clear-fault")
+    assert running.command("status")["operating_state"] == "DISABLED"
+    running.ask(0.5)
+    running.arm()

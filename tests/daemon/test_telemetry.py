@@ -1,10 +1,8 @@
 """Snapshots: what is not known is null, and nothing holds back a device that is not driven."""
 
 import time
-from pathlib import Path
 
 import msgspec
-import numpy as np
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
@@ -15,13 +13,9 @@ from tormagd.control.trajectory import Reference
 from tormagd.daemon.telemetry import limits_held, snapshot, tick_record
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
-from tormagd.recording.plot import save_plot
-from tormagd.recording.reader import read_recording
-from tormagd.recording.ticks import decode_ticks
-from tormagd.recording.writer import RecordingWriter
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import DeviceRequest, OperatingState, SafetyState
-from tormagd_client.messages import Telemetry, TickRecord, decode, encode, encode_ticks
+from tormagd_client.messages import Telemetry, decode, encode, encode_ticks
 
 PLAN = Plan(7, 1.0, 1.5, 0.01, 1.4, 1.38, 500.0, 64.0, -1.0, 0.9, (Limit.RANGE, Limit.SKEW))
 OUTPUT = StepOutput(DriveMode.RUN, 0.1, -0.2, DeviceRequest.NONE, 0, (Limit.SKEW, Limit.RATE))
@@ -43,7 +37,6 @@ MEASUREMENT = Measurement(
     sensed_s=1.0,
     reported_s=1.0,
 )
-LATE = MEASUREMENT.replaced(delay_s=0.031)
 
 
 def telemetry(measurement: Measurement | None, state: StepState, is_busy: bool = False) -> Telemetry:
@@ -82,23 +75,6 @@ def test_without_a_device_nothing_measured_is_known() -> None:
     published = telemetry(None, StepState(1.0))
     assert (published.gap_mm, published.measured_cf, published.measured_jp) == (None, None, None)
     assert (published.is_homed, published.is_busy) == (False, False)
-
-
-def test_a_recording_says_how_old_the_measurement_of_a_tick_was(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    every = TickRecord.__struct_fields__
-    old = tuple(name for name in every if name not in ("received_s", "delay_s"))
-    with RecordingWriter(path) as writer:
-        for columns, measurement in ((old, MEASUREMENT), (every, LATE), (every, None)):
-            tick = tick_record(1.012, StepState(1.012), OUTPUT, PLAN, 1.1, measurement, 20.0, 150.0)
-            writer.ticks(decode_ticks(encode_ticks([[getattr(tick, name) for name in columns]], columns)))
-    recording = read_recording(path)
-    ages_s = [recording.ticks.numbers[name] for name in ("monotonic_s", "received_s", "delay_s")]
-    assert np.array_equal(ages_s[0], [1.012] * 3)
-    # an older daemon's rows have neither, and without a device nothing is known of one
-    assert np.array_equal(ages_s[1], [np.nan, 1.0, np.nan], equal_nan=True)
-    assert np.array_equal(ages_s[2], [np.nan, 0.031, np.nan], equal_nan=True)
-    save_plot(recording, tmp_path / "a.png", "older and newer rows")
 
 
 def test_a_tick_is_recorded_whole() -> None:

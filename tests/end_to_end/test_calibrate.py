@@ -1,4 +1,4 @@
-"""`tormagctl calibrate` over real processes: a model of the (simulated) insert, and an interrupted run."""
+"""`tormagctl calibrate` over real processes: an interrupted run, and a model of the (simulated) insert."""
 
 import json
 import signal
@@ -13,19 +13,17 @@ from tormagd.model.model_file import load_model
 pytestmark = pytest.mark.live
 
 
-def command(rig, *arguments):
-    """tormagctl on this rig's daemon, patient because the machine may be busy."""
-    program = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(rig.config), "--wait", "20", "--json"]
-    return [*program, "calibrate", "--yes", *arguments]
-
-
-def test_a_sweep_becomes_a_model_that_says_what_it_is(new_rig, tmp_path):
+def test_an_interrupt_leaves_no_file_and_a_sweep_becomes_a_model_that_says_what_it_is(new_rig, tmp_path):
+    # patient because the machine may be busy
+    program = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(new_rig.config), "--wait", "20", "--json"]
+    command = [*program, "calibrate", "--yes"]
+    an_interrupt_opens_the_gap_and_leaves_no_file(new_rig, [*command, "--motors"], tmp_path / "log.csv")
+    new_rig.until(lambda: new_rig.status()["setpoint_age_ms"] > 1_000.0, "nobody else publishes")
     out, data = tmp_path / "model.safetensors", tmp_path / "training.csv"
     arguments = ("--insert", "MRE-50-40", "--out", str(out), "--csv", str(data), "--rates", "1.0,1.4,1.0")
     # the sweep begins at the least force that this device has shown, and a rested one gives less than its model says
-    new_rig.done("home")
     new_rig.until(lambda: new_rig.status()["least_N"] < 0.6, "the device has shown itself")
-    done = subprocess.run(command(new_rig, *arguments), capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     metrics = json.loads(done.stdout)["result"]["metrics"]
     assert done.stderr.count("turn the handle") == 3
@@ -37,15 +35,13 @@ def test_a_sweep_becomes_a_model_that_says_what_it_is(new_rig, tmp_path):
     low, high = model.field_range_mT
     assert low < 320.0
     assert high > 480.0
-    new_rig.until(lambda: (new_rig.status()["gap_mm"] or 0.0) > 94.0, "the gap is open")
-    assert new_rig.status()["operating_state"] == "DISABLED"
+    is_disabled_and_open(new_rig)
 
 
-def test_an_interrupt_opens_the_gap_and_leaves_no_file(new_rig, tmp_path):
-    out = tmp_path / "log.csv"
-    running = subprocess.Popen(command(new_rig, "--motors", "--out", str(out)), stdout=subprocess.PIPE, text=True)
+def an_interrupt_opens_the_gap_and_leaves_no_file(rig, command, out) -> None:
+    running = subprocess.Popen([*command, "--out", str(out)], stdout=subprocess.PIPE, text=True)
     try:
-        new_rig.until(lambda: (new_rig.telemetry().gap_mm or 95.0) < 90.0, "the carriages move")
+        rig.until(lambda: (rig.status()["gap_mm"] or 95.0) < 90.0, "the carriages move")
         running.send_signal(signal.SIGINT)
         printed, _ = running.communicate(timeout=120)
     finally:
@@ -53,5 +49,9 @@ def test_an_interrupt_opens_the_gap_and_leaves_no_file(new_rig, tmp_path):
     assert running.returncode == 1
     assert json.loads(printed)["error"]["code"] == "interrupted"
     assert not out.exists()
-    assert new_rig.status()["operating_state"] == "DISABLED"
-    new_rig.until(lambda: (new_rig.status()["gap_mm"] or 0.0) > 94.0, "the gap is open")
+    is_disabled_and_open(rig)
+
+
+def is_disabled_and_open(rig) -> None:
+    rig.until(lambda: (rig.status()["gap_mm"] or 0.0) > 94.0, "the gap is open")
+    assert rig.status()["operating_state"] == "DISABLED"

@@ -14,18 +14,20 @@ from pathlib import Path
 
 import pytest
 
-from tormagd.bounded_file import read_bounded, require_regular
-from tormagd.config import ConfigError, load_config
+from tormagd.bounded_file import read_bounded
+from tormagd.config import load_config
 from tormagd.control.profile import ProfileError
 from tormagd.ctl.waveform import read_csv
 from tormagd.daemon.profiles import ProfileFolder
 from tormagd.force_file import ForceFileError
 from tormagd.model.model_file import ModelFileError, load_model
-from tormagd.output import printable
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.parameters import PlantError, load_plant
 from tormagd.toml_file import MOST_DEPTH, TomlError, toml_tables
+from tormagd_client.endpoints import ConfigError
 from tormagd_client.keys import load_pair
+from tormagd_client.printable import printable
+from tormagd_client.regular_file import require_regular
 
 TERABYTE = 1 << 40
 WITHIN_S, MEMORY_MB = 1.0, 100.0

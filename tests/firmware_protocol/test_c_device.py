@@ -119,7 +119,6 @@ class Twins(CompiledFirmware):
         message = decode(FUNCTION[type(message)], payload)
         answer = self.python.receive(time_s, message, sensors)
         assert super().receive(time_s, message, sensors) is answer
-        assert encode(self.status(sensors)) == encode(self.python.status(sensors))
         self._compare(f"receive {time_s!r} {FUNCTION[type(message)]} {payload.hex()}", f"{ANSWERS[answer]}", sensors)
         return answer
 
@@ -142,6 +141,7 @@ class Twins(CompiledFirmware):
         python, output, view = self.python, self.python.output, self._view()
         assert (view.mode, view.faults, view.homed) == (python.mode, python.faults, python.homed)
         assert Output(view.left_duty, view.right_duty, view.enabled) == output
+        assert encode(self.status(sensors)) == encode(python.status(sensors))
         self.seen |= {python.mode, *python.faults}
         seen = [getattr(sensors, name) for name in Sensors.__match_args__]
         self.requests.append(" ".join([request, *(repr(+value) for value in seen)]))
@@ -192,8 +192,7 @@ class Bench:
         self.hello()
         self.command(Home)
         for _ in range(100):
-            self.drive(0.0, 0.0, DriveMode.OFF)
-            self.tick(49)
+            self.drive(0.0, 0.0, DriveMode.OFF, 50)
             if self.twins.mode is not DeviceMode.HOMING:
                 break
 
@@ -337,7 +336,7 @@ def told_life() -> Twins:
         bench.drive(-1.0, -1.0, count=50)
         carriages.held, carriages.current_A = True, current_A
         bench.command(Retract)
-        bench.tick(4150, 2.0 * TICK_S)
+        bench.tick(8300)
     bench.restart()
     bench.drive(-1.0, -1.0, count=50)
     carriages.held, carriages.current_A, carriages.drift_mm_s = True, 3.5, 0.18

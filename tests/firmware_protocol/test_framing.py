@@ -204,7 +204,7 @@ def test_a_frame_that_comes_late_is_not_lost(start: int, late: int) -> None:
 def test_a_line_that_reorders_loses_what_it_lost(seed: int, lossy: bool) -> None:
     """Neighbours change places now and then, and some frames go missing: counted is what never came."""
     rng = random.Random(seed)
-    sent = numbered(600, rng.randrange(256))
+    sent = numbered(2_000, rng.randrange(256))
     kept = [
         frame for number, frame in enumerate(sent) if number in (0, len(sent) - 1) or not lossy or rng.random() > 0.03
     ]

@@ -14,11 +14,12 @@ import can
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Drive, DriveMode, Home, Message, Status, Switches
-from tormagd.config import ConfigError, Device, Rates
+from tormagd.config import Device, Rates
 from tormagd.hardware.backend import BackendError, choose, installed
 from tormagd.hardware.can_backend import FRAMES_AT_ONCE, UNSENT_FRAMES, CanBackend, CanOptions
 from tormagd.hardware.can_stream import CanStream
 from tormagd.simulation.can_frame import ERROR_FLAG, CanFrame, to_socket
+from tormagd_client.endpoints import ConfigError
 
 STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
 BUS_OFF = CanFrame(ERROR_FLAG | 0x40, bytes(8))

@@ -14,12 +14,13 @@ from typing import NamedTuple
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Home, Status, Switches
-from tormagd.config import ConfigError, Device, Rates
+from tormagd.config import Device, Rates
 from tormagd.hardware import backend as backends
 from tormagd.hardware.backend import BackendError, choose, installed
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.serial_backend import SerialOptions, open_serial
 from tormagd.hardware.serial_port import SerialPort
+from tormagd_client.endpoints import ConfigError
 
 STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from tormagd.config import Config, ConfigError
+from tormagd.config import Config
 from tormagd.control.core import build_core, choose_solver
 from tormagd.inverse.bracketed import BracketedSearch
 from tormagd.inverse.choice import RUNTIME_SOLVERS, build, named
@@ -17,6 +17,7 @@ from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 from tormagd.scenes.measured import measured
 from tormagd.scenes.scene import Solver, load_scene, scene_path, shipped_scenes, terms_of
+from tormagd_client.endpoints import ConfigError
 
 
 @pytest.mark.parametrize("name", RUNTIME_SOLVERS)

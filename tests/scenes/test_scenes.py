@@ -7,9 +7,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from tormagd.config import Config, ConfigError, Rates
+from tormagd.config import Config, Rates
 from tormagd.control.core import at_rates_of, build_core
 from tormagd.scenes.scene import EVERY_TERM, Scene, Terms, load_scene, scene_path, shipped_scenes
+from tormagd_client.endpoints import ConfigError
 
 BASE = {
     "name": '"bench"',

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tormagd.config import ConfigError
 from tormagd.scenes.scene import Signal
 from tormagd.scenes.signal import asked, recorded
+from tormagd_client.endpoints import ConfigError
 
 RANGE_N = (0.5, 2.0)
 

@@ -15,6 +15,7 @@ from firmware_protocol.codec import (
     Home,
     Sense,
     State,
+    Status,
     Switches,
 )
 from tormagd.simulation.parameters import load_plant
@@ -29,7 +30,14 @@ def count(host, kind) -> int:
     return sum(isinstance(message, kind) for _, message in host.received)
 
 
-# -- answers to Drives: exactly, where the kit allows for a wire -----------------------------------------------------
+# -- status, and answers to Drives: exactly, where the kit allows for a wire ------------------------------------------
+
+
+def test_status_comes_fifty_times_a_second_unasked_and_nothing_else_does(make_host) -> None:
+    host = make_host()
+    host.wait(2.0)
+    assert 99 <= count(host, Status) <= 101
+    assert len(host.received) == count(host, Status)
 
 
 def test_each_accepted_drive_is_answered_once_by_state_and_sense(make_host) -> None:
@@ -162,7 +170,7 @@ class Ending(NamedTuple):
     left_mm: float
     right_mm: float
     "Where the carriages are then."
-    within_mm: float = 0.51
+    within_mm: float = 0.3
 
 
 OPEN_MM = 47.5
@@ -249,8 +257,11 @@ def test_how_a_run_ends(running, ending: Ending) -> None:
 
 def test_a_fault_is_not_cleared_while_its_cause_lasts(running) -> None:
     host = running(["supply_loss@3.5"])
+    host.drive_until(3.5)
+    stood_mm = host.device.truth.gap_mm
     host.wait_for(DeviceMode.LATCHED)
     assert host.status.supply_V == 0.0
+    assert host.device.truth.gap_mm == pytest.approx(stood_mm, abs=0.02)
     host.command(Clear)
     assert not host.acknowledged()
 

@@ -14,7 +14,6 @@ from rendering import scene_runs
 from rendering.scene_runs import Case, Play, key, run, run_all
 from required_terms import NO_COST, RATES_HZ, SHARE, is_good, measure, spared
 
-from tormagd.config import ConfigError
 from tormagd.scenes.measured import (
     JUDGED,
     Cost,
@@ -27,6 +26,7 @@ from tormagd.scenes.measured import (
     required,
 )
 from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_scene, shipped_scenes, terms_of
+from tormagd_client.endpoints import ConfigError
 
 STORED = measured()
 

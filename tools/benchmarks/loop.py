@@ -34,7 +34,7 @@ from machines.own import own_machine
 from machines.wire import carried
 
 from benchmarks.against import add_against_argument, as_installed, environment
-from tormagd.config import ENDPOINTS, Config, Endpoints, RealTime, load_config
+from tormagd.config import Config, RealTime, load_config
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
@@ -44,6 +44,7 @@ from tormagd.lab.arrays import Array
 from tormagd.recording.ticks import decode_ticks
 from tormagd.simulation.device import DEFAULT_BAUD
 from tormagd_client import Client, ClientError
+from tormagd_client.endpoints import ENDPOINTS, Endpoints
 from tormagd_client.messages import Request
 from tormagd_client.wire import keys_of, opened
 

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 
-from tormagd.config import Config, ConfigError
+from tormagd.config import Config
 from tormagd.control.contact import PRESSED, Contact, Pressing, Sliding
 from tormagd.control.device_fit import LEAST_SCALE
 from tormagd.control.motor import Margins, margins, pull_V
@@ -32,6 +32,7 @@ from tormagd.physics.force import Geometry
 from tormagd.physics.inserts import insert
 from tormagd.scenes.scene import AUTO, LEAST_CONTROL_HZ, Finger, Scene, load_scene, scene_path, terms_of
 from tormagd.scenes.signal import asked
+from tormagd_client.endpoints import ConfigError
 
 LEAST_PHASE_MARGIN_DEG = 30.0
 LEAST_GAIN_MARGIN_DB = 4.0

@@ -81,6 +81,16 @@ class TimedSetpoint(Value):
         self.holder: Final = holder
         self.is_contested: Final = is_contested
 
+    @property
+    def preview_s(self) -> float:
+        """How long after its stamp the preview ends."""
+        return self.preview_dt_s * len(self.preview_N)
+
+    @property
+    def preview_slope_N_s(self) -> float:
+        """The mean slope of a preview that is there."""
+        return (self.preview_N[-1] - self.force_N) / self.preview_s
+
 
 @final
 class GovernorState(Value):
@@ -197,12 +207,11 @@ class Governor:
         elapsed_s = max(now_s - state.time_s, 0.0)
         if setpoint.preview_N and self._has_preview:
             periodicity, foresight = NOTHING_LEARNED, 1.0
-            ends_s, last_N = setpoint.preview_dt_s * len(setpoint.preview_N), setpoint.preview_N[-1]
-            if self._has_forecast and ends_s < WAY_S[-1]:
+            if self._has_forecast and setpoint.preview_s < WAY_S[-1]:
                 # what comes after its end is foreseen from there
-                slope = (last_N - setpoint.force_N) / ends_s
-                last_N = min(max(last_N, self._least_N), self._most_N)
-                periodicity = observe(learned, setpoint.stamp_s + ends_s, last_N)
+                slope = setpoint.preview_slope_N_s
+                last_N = min(max(setpoint.preview_N[-1], self._least_N), self._most_N)
+                periodicity = observe(learned, setpoint.stamp_s + setpoint.preview_s, last_N)
             wanted_N = _previewed_N(setpoint, soon_s + lag_s, least, most, periodicity)
             path, drive_N = self._pursued_N(asks_N, sent_N, elapsed_s, wanted_N, device, lag_s)
             # the path sets out sooner by as much as the carriages come later
@@ -215,7 +224,7 @@ class Governor:
             foresight = periodicity.trust if age <= LONGEST_STEP_S else 0.0
             path = _expected_N(asked_N, slope, periodicity, foresight, soon_s + foresight * lag_s)
         within = [min(max(force_N, least), most) for force_N in path]
-        governed = min(max(force, least), most)
+        governed = force
         if expected_N is not None:
             governed = min(max(expected_N, least), most)
         elif foresight > 0.0 and not is_passing and self._is_near(sent_N, within[-1], device):
@@ -357,9 +366,7 @@ def _previewed_N(
     far as that is trusted, or else as it has run so far; a long one has no end in sight."""
     forces_N, spacing_s = setpoint.preview_N, setpoint.preview_dt_s
     last, last_N = len(forces_N), forces_N[-1]
-    ends_s = spacing_s * last
-    mean_N_s = (last_N - setpoint.force_N) / ends_s
-    trust = periodicity.trust
+    ends_s, mean_N_s, trust = setpoint.preview_s, setpoint.preview_slope_N_s, periodicity.trust
     known_s = ends_s + HORIZON_S if trust > 0.0 else ends_s
     wanted_N: list[float] = []
     for after_s in WAY_S:

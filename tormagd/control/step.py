@@ -339,11 +339,11 @@ class Stepper:
             target = Reference(reference.gap_mm)
             reference, is_limited, is_slewed = follow(most_mm_s2, reference, target, dt_s, speeds, self._closed_mm)
         else:
-            target = self._target(plan, now_s)
+            floor_mm = max(self._closed_mm, plan.least_gap_mm)
+            target = self._target(plan, now_s, floor_mm)
             if state.over_s > OVER_HELD_S:
                 target = Reference(self._open_mm)
                 limits.append(Limit.OVER_FORCE)
-            floor_mm = max(self._closed_mm, plan.least_gap_mm)
             reference, is_limited, is_slewed = follow(most_mm_s2, reference, target, dt_s, speeds, floor_mm)
             if is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
                 limits.append(Limit.RATE)
@@ -415,14 +415,13 @@ class Stepper:
         )
         return state, output
 
-    def _target(self, plan: Plan, now_s: float) -> Reference:
-        """Where the plan leads by when a duty of now shows. A least or greatest gap that acts also ends the motion
-        towards it."""
+    def _target(self, plan: Plan, now_s: float, floor_mm: float) -> Reference:
+        """Where the plan leads by when a duty of now shows. The least gap, `floor_mm`, or the greatest, where it acts,
+        also ends the motion towards it."""
         age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + self._lag_s
         gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
         speed_mm_s = plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2
         acceleration_mm_s2 = plan.gap_acceleration_mm_s2
-        floor_mm = max(self._closed_mm, plan.least_gap_mm)
         if gap_mm < floor_mm:
             gap_mm, speed_mm_s, acceleration_mm_s2 = floor_mm, max(speed_mm_s, 0.0), max(acceleration_mm_s2, 0.0)
         if gap_mm > self._open_mm:

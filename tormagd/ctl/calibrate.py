@@ -16,13 +16,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from tormagd.config import Endpoints
 from tormagd.ctl.calibrate_run import SOURCE, Columns, InterruptedRunError, Range, Run, armed, reach, seconds_bar
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.ctl.waveform import Waveform, through
 from tormagd.scenes.scene import Scene
 from tormagd_client.blocking import Client
+from tormagd_client.endpoints import Endpoints
 
 COLUMNS = ("monotonic_s", "left_mm", "right_mm", "handle_mm", "handle_rate_mm_s", "measured_cf")
 "Of the control ticks, what a sweep is made of."

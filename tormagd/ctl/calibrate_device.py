@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from tormagd.config import Endpoints
 from tormagd.ctl.calibrate_run import MOVING_MM_S, SOURCE, Columns, Range, armed, reach, seconds_bar
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ctl.waveform import Sample, Waveform, through
 from tormagd_client.blocking import Client
+from tormagd_client.endpoints import Endpoints
 from tormagd_client.messages import ProfileReport, Status
 
 COLUMNS = ("monotonic_s", "measured_cf", "handle_rate_mm_s")

@@ -10,11 +10,11 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from tormagd.config import Endpoints
 from tormagd.ctl.calibrate_run import SOURCE, Columns, Range, armed, reach, seconds_bar
 from tormagd.ctl.outcome import CommandError, Exit, Outcome
 from tormagd.ctl.waveform import Waveform, through
 from tormagd_client.blocking import Client
+from tormagd_client.endpoints import Endpoints
 
 Side: TypeAlias = Literal["left", "right"]
 

@@ -12,13 +12,13 @@ import numpy.typing as npt
 import zmq
 from tqdm import tqdm
 
-from tormagd.config import Endpoints
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.operate import home
 from tormagd.ctl.outcome import CommandError, Exit, is_terminal
 from tormagd.ctl.waveform import Waveform
 from tormagd.recording.ticks import TickBatch, Value, decode_ticks, listening
 from tormagd_client.blocking import Client
+from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, unreachable
 from tormagd_client.messages import MessageError
 from tormagd_client.wire import keys_of

@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from tormagd.config import Config, ConfigError, Endpoints
+from tormagd.config import Config
 from tormagd.ctl.calibrate import calibrate, require_new
 from tormagd.ctl.calibrate_device import calibrate_device
 from tormagd.ctl.calibrate_motors import calibrate_motors
 from tormagd.ctl.outcome import Outcome, is_terminal, usage_error
 from tormagd.scenes.scene import load_scene
+from tormagd_client.endpoints import ConfigError, Endpoints
 
 
 def calibration(

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tormagd.config import ROLES
+from tormagd_client.endpoints import ROLES
 
 SHELLS = ("bash", "zsh")
 KEY, SERVER_KEY = "TORMAG_KEY", "TORMAG_SERVER_KEY"

@@ -5,7 +5,6 @@ import sys
 import time
 from pathlib import Path
 
-from tormagd.config import Endpoints
 from tormagd.ctl.outcome import Outcome, usage_error
 from tormagd.dashboard.live import Live
 from tormagd.dashboard.recorded import Recorded
@@ -13,6 +12,7 @@ from tormagd.dashboard.server import LOOPBACK, serve
 from tormagd.output import write_line
 from tormagd.recording.reader import read_recording
 from tormagd_client.aio import AsyncClient
+from tormagd_client.endpoints import Endpoints
 
 
 def dashboard(endpoints: Endpoints, path: Path | None, port: int, wait_s: float) -> Outcome:

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from tormagd.config import ConfigError
 from tormagd.ctl.outcome import Outcome, usage_error
 from tormagd.keys import load_folder
+from tormagd_client.endpoints import ConfigError
 from tormagd_client.keys import PUBLIC, SERVER, fingerprint, generate, load_public
 
 HINT = "tormagctl keys generate --help; the guide has the whole exchange"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from tormagd.output import printable
+from tormagd_client.printable import printable
 
 
 class Taken(NamedTuple):

@@ -15,10 +15,11 @@ from typing import Any
 import msgspec
 
 from tormagd import __version__
-from tormagd.config import ENDPOINTS, Config, ConfigError, Curve, Endpoints, load_config
+from tormagd.config import Config, load_config
 from tormagd.ctl.commands import COMMANDS, KEY, SERVER_KEY, SHARED, USUAL, Option
 from tormagd.ctl.outcome import Outcome, exit_code, print_error, print_outcome, usage_error
 from tormagd.output import write_line
+from tormagd_client.endpoints import ENDPOINTS, ConfigError, Curve, Endpoints
 from tormagd_client.errors import ClientError
 
 EXTRAS = {

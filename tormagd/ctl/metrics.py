@@ -16,11 +16,11 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
-from tormagd.config import Endpoints
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import Outcome, usage_error
 from tormagd.output import write_line
 from tormagd_client.blocking import Client
+from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError
 from tormagd_client.messages import ExecReport, Status
 

@@ -7,8 +7,9 @@ from typing import Any, TextIO
 
 import msgspec
 
-from tormagd.output import printable, write_line
+from tormagd.output import write_line
 from tormagd_client.errors import ClientError, InFaultError, SettingError, UnreachableError
+from tormagd_client.printable import printable
 
 
 class Exit(IntEnum):

@@ -16,7 +16,7 @@ import msgspec
 from tormagd.config import Config
 from tormagd.ctl.machine import Machine
 from tormagd.ctl.outcome import Colour, Outcome
-from tormagd.output import printable
+from tormagd_client.printable import printable
 
 DETECTION_S = 2.0
 "python-can asks every interface at once; what has not answered by then is left out."

@@ -11,15 +11,16 @@ from pathlib import Path
 import msgspec
 import zmq
 
-from tormagd.config import Endpoints
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
-from tormagd.output import printable, write_line
+from tormagd.output import write_line
 from tormagd.recording.ticks import decode_ticks, listening
 from tormagd.recording.writer import RecordingWriter
 from tormagd_client.blocking import Client
+from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, unreachable
 from tormagd_client.messages import MessageError, Telemetry, decode
+from tormagd_client.printable import printable
 from tormagd_client.wire import keys_of
 
 POLL_MS = 100

@@ -5,11 +5,12 @@ from typing import Any
 
 import msgspec
 
-from tormagd.config import Config, ConfigError
+from tormagd.config import Config
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.ctl.process import answer_of
 from tormagd.scenes.measured import Measured, MeasuredScene, is_met, measured, on_first, required
 from tormagd.scenes.scene import Scene, load_scene, shipped_scenes
+from tormagd_client.endpoints import ConfigError
 
 LONGEST_S = 30.0
 "Of the daemon's own check, which takes half a second."

@@ -9,11 +9,11 @@ from typing import Any
 
 import msgspec
 
-from tormagd.config import ConfigError
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal, usage_error
 from tormagd.ctl.scene import as_toml, check_scene
 from tormagd.scenes.scene import Scene
 from tormagd.scenes.signal import recorded
+from tormagd_client.endpoints import ConfigError
 
 INSERTS = ("MRE-10-10", "MRE-10-20", "MRE-50-40")
 "Those with a shipped model, from the softest, whose least force is the lowest."

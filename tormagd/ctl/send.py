@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import msgspec
 
-from tormagd.config import Endpoints
 from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
 from tormagd.ctl.watch import Watch, require_range
 from tormagd.ctl.waveform import Waveform, WaveformError, read_csv, shape
 from tormagd.force_file import ForceFileError
 from tormagd_client.blocking import Client
+from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import UnreachableError
 from tormagd_client.messages import MAX_PREVIEW_SAMPLES
 
@@ -120,22 +120,21 @@ def _publish(
         overdue = min(int(late_s * rate_hz), last - index)
         skipped += overdue
         index += overdue
+        sample = waveform.at(index / rate_hz)
+        ahead = range(index + 1, index + 1 + stream.preview)
         try:
-            client.require_taken()
+            client.publish(
+                sample.force_N,
+                stream.valid_for_ms,
+                start_ns + round(index / rate_hz * 1e9),  # when the force is meant, whenever it gets sent
+                displacement_mm=sample.displacement_mm,
+                rate_mm_s=sample.rate_mm_s,
+                preview_N=tuple(waveform.at(min(later / rate_hz, duration_s)).force_N for later in ahead) or None,
+                preview_dt_ms=1e3 / rate_hz if ahead else None,
+            )
         except UnreachableError as error:
             message = f"the daemon at {address} went away after {sent} setpoints"
             raise CommandError(Exit.UNREACHABLE, "gone", message, error.hint) from error
-        sample = waveform.at(index / rate_hz)
-        ahead = range(index + 1, index + 1 + stream.preview)
-        client.publish(
-            sample.force_N,
-            stream.valid_for_ms,
-            start_ns + round(index / rate_hz * 1e9),  # when the force is meant, whenever it gets sent
-            displacement_mm=sample.displacement_mm,
-            rate_mm_s=sample.rate_mm_s,
-            preview_N=tuple(waveform.at(min(later / rate_hz, duration_s)).force_N for later in ahead) or None,
-            preview_dt_ms=1e3 / rate_hz if ahead else None,
-        )
         sent, index = sent + 1, index + 1
         if watch is not None:
             watch.look()

@@ -11,8 +11,8 @@ from rich.table import Table
 from rich.text import Text
 
 from tormagd.ctl.sparkline import columns, span, sparkline
-from tormagd.output import printable
 from tormagd_client.messages import Explained, Status, Telemetry
+from tormagd_client.printable import printable
 
 COLUMN_NS = 100_000_000
 "What one character of a sparkline stands for."

@@ -20,8 +20,8 @@ import zmq
 import zmq.utils.monitor
 from zmq.utils import z85
 
-from tormagd.config import ROLES, ConfigError
 from tormagd.keys import Allowed, KeyRing
+from tormagd_client.endpoints import ROLES, ConfigError
 from tormagd_client.keys import fingerprint
 from tormagd_client.messages import PeerReport
 

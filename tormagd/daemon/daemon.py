@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from tormagd.config import Config, ConfigError
+from tormagd.config import Config
 from tormagd.control.core import Core
 from tormagd.daemon import notify
 from tormagd.daemon.black_box import AFTER_FAULT_S, BlackBox
@@ -29,6 +29,7 @@ from tormagd.keys import KeyRing
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd.scenes.scene import terms_of
+from tormagd_client.endpoints import ConfigError
 
 NS = 1_000_000_000
 OPENING_LOOK_S = 0.02

@@ -14,7 +14,6 @@ from typing import Any
 
 import zmq
 
-from tormagd.config import ENDPOINTS, Endpoints
 from tormagd.daemon.admission import MAY, OTHERS, Admission, shown
 from tormagd.daemon.allowance import Allowance
 from tormagd.daemon.inbox import SOURCES, SetpointInbox
@@ -22,6 +21,7 @@ from tormagd.daemon.requests import FIRST, Requests, Waiting, may_go_first
 from tormagd.daemon.socket_file import SocketFile, ipc_path
 from tormagd.keys import KeyRing
 from tormagd.safety.operating_state import RefusedError
+from tormagd_client.endpoints import ENDPOINTS, Endpoints
 from tormagd_client.messages import (
     MAX_MESSAGE_BYTES,
     VERSION,

@@ -3,7 +3,8 @@
 import logging
 import sys
 
-from tormagd.output import escaped, printable
+from tormagd.output import escaped
+from tormagd_client.printable import printable
 
 
 def log_to_stderr() -> None:

@@ -10,10 +10,10 @@ from typing import Any
 import msgspec
 
 from tormagd.dashboard.frame import Frame, Held, late_counts
-from tormagd.output import printable
 from tormagd_client.aio import AsyncClient
 from tormagd_client.errors import ClientError
 from tormagd_client.messages import Description, Explained, MessageError, Status, Telemetry
+from tormagd_client.printable import printable
 
 FRAME_S = 0.1
 STATUS_S = 1.0

@@ -19,9 +19,10 @@ from can.interfaces.slcan import slcanBus
 from msgspec import Meta
 
 from firmware_protocol.codec import Message
-from tormagd.config import ConfigError, Device, Rates, Strict, did_you_mean
+from tormagd.config import Device, Rates, did_you_mean
 from tormagd.hardware.backend import PLUGIN_ERRORS, BackendError, Driver, LinkStatistics
 from tormagd.hardware.can_stream import CanStream, SecondHostError
+from tormagd_client.endpoints import ConfigError, Strict
 
 FRAMES_AT_ONCE = 256
 """Most frames taken in one `receive`: a bus that never falls silent must not keep the loop."""

@@ -8,10 +8,11 @@ from typing import Annotated
 import serial
 from msgspec import Meta
 
-from tormagd.config import Device, Strict
+from tormagd.config import Device
 from tormagd.hardware.backend import BackendError, Driver
 from tormagd.hardware.serial_port import SerialPort
 from tormagd.hardware.usb_latency import make_prompt
+from tormagd_client.endpoints import Strict
 
 # why a port does not open, where the kernel's own words leave open what to do
 _HELD = ("another process holds it", "tormagctl ports says who; end it, and it is tried again")

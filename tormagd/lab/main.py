@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from typing import Any, NamedTuple
 
-from tormagd.config import ConfigError
 from tormagd.force_file import ForceFileError
 from tormagd.lab.errors import LabError, not_installed
 from tormagd.lab.told import lines
-from tormagd.output import printable, write_line
+from tormagd.output import write_line
 from tormagd.physics.errors import DomainError
 from tormagd.simulation.parameters import PlantError
+from tormagd_client.endpoints import ConfigError
+from tormagd_client.printable import printable
 
 USAGE = 2
 REFUSALS = (LabError, ConfigError, ForceFileError, DomainError, PlantError)

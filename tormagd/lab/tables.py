@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tormagd.bounded_file import MOST_TABLE_BYTES, require_regular
+from tormagd.bounded_file import MOST_TABLE_BYTES
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
+from tormagd_client.regular_file import require_regular
 
 MAX_ROWS = 5_000_000
 

@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from tormagd import __version__
-from tormagd.bounded_file import in_place_of, require_regular
+from tormagd.bounded_file import in_place_of
 from tormagd.keeping import READ, WROTE, Part
 from tormagd.recording.closing import ABOUT
 from tormagd.recording.reader import MAX_FILE_BYTES, MAX_RECORD_BYTES, UNREADABLE, RecordingError
@@ -29,6 +29,7 @@ from tormagd.recording.writer import (
     registered,
     tick_schema,
 )
+from tormagd_client.regular_file import require_regular
 
 CORE_TOPIC, FRAMES_TOPIC = "/core", "/frames"
 HEADER = "black_box"

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from firmware_protocol.build import settle
-from tormagd.config import ConfigError, load_config
+from tormagd.config import load_config
 from tormagd.output import write_line
 from tormagd.recording.black_box import BlackBoxFile, read_black_box
 from tormagd.recording.reader import RecordingError
 from tormagd.replay.rebuild import Recorded, ReplayError, differences, rebuilt, recorded
 from tormagd.replay.rehearse import changed, rehearse, script
 from tormagd.replay.rerun import rerun
+from tormagd_client.endpoints import ConfigError
 
 NESTED = ("first_damage", "difference")
 "Of a rerun: tuples with names, or None."

@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 import msgspec
 
 from tormagd import __version__
-from tormagd.config import Config, ConfigError, checked
+from tormagd.config import Config, checked
 from tormagd.control.core import Core, build_core, platform_name, sources_hash
 from tormagd.control.journal import FORMAT
 from tormagd.recording.black_box import BlackBoxFile
 from tormagd.scenes.scene import Scene, load_scene
+from tormagd_client.endpoints import ConfigError
 from tormagd_client.messages import TickRecord
 
 NEEDED = (

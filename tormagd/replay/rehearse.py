@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from tormagd.closed_loop import ClosedLoop
-from tormagd.config import Config, ConfigError, checked
+from tormagd.config import Config, checked
 from tormagd.control import journal
 from tormagd.control.core import Core
 from tormagd.control.governor import TimedSetpoint
@@ -22,6 +22,7 @@ from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import FaultError, parse_fault
 from tormagd.simulation.hand import RecordedHand
 from tormagd.simulation.parameters import PlantError, load_plant
+from tormagd_client.endpoints import ConfigError
 from tormagd_client.messages import TickRecord
 
 HOMED_S, CONNECTED_S = 8.0, 0.5

@@ -12,8 +12,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from tormagd.config import LEAST_INFERENCE_HZ, ConfigError, Strict, convert, did_you_mean
+from tormagd.config import LEAST_INFERENCE_HZ, convert, did_you_mean
 from tormagd.scenes.measured import measured
+from tormagd_client.endpoints import ConfigError, Strict
 
 AUTO = "auto"
 LEAST_SETPOINT_HZ = 12.0

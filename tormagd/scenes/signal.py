@@ -7,9 +7,9 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET
 
-from tormagd.config import ConfigError
 from tormagd.force_file import ForceFileError, read_forces
 from tormagd.scenes.scene import Signal
+from tormagd_client.endpoints import ConfigError
 
 Array = npt.NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from firmware_protocol.c.build import BuildError
-from tormagd.output import printable, write_line
+from tormagd.output import write_line
 from tormagd.physics.errors import DomainError
 from tormagd.simulation.can_device import DEFAULT_BITRATE, DEFAULT_NODE, CanDevice
 from tormagd.simulation.can_door import FOLDER_PREFIX, CanDoor
@@ -29,6 +29,7 @@ from tormagd.simulation.pty_door import PtyDoor
 from tormagd.simulation.real_time import Door, PacedDevice, serve
 from tormagd.simulation.slcan_door import SlcanDoor
 from tormagd.slices import ask_for_slices
+from tormagd_client.printable import printable
 
 # The C sources are what a microcontroller would run; the Python twin, held equal to them by tests, needs no compiler.
 FIRMWARES: dict[str, FirmwareKind] = {"python": Firmware, "c": CompiledFirmware}

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Final, Protocol, final
 
 from firmware_protocol.value import Value
-from tormagd.bounded_file import MOST_TABLE_BYTES, require_regular
+from tormagd.bounded_file import MOST_TABLE_BYTES
+from tormagd_client.regular_file import require_regular
 
 ROLLER_RADIUS_MM: Final = 20.0
 DEFAULT_RPM: Final = 20.0

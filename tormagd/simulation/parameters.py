@@ -10,7 +10,8 @@ from msgspec import Meta, Struct
 
 from tormagd.bounded_file import read_bounded
 from tormagd.physics.inserts import insert
-from tormagd.toml_file import MOST_BYTES, TomlError, in_short, toml_tables
+from tormagd.toml_file import MOST_BYTES, TomlError, toml_tables
+from tormagd_client.printable import in_short
 
 PLANTS_INSERT = "MRE-50-40"
 "What the committed samples have in them."

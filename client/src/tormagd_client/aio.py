@@ -89,9 +89,9 @@ class AsyncClient(Connections[zmq.asyncio.Socket]):
     async def _result(self, command: str, args: dict[str, Any], wait_s: float) -> dict[str, Any]:
         async with self._turn:
             control, pending = self._socket(zmq.DEALER, self._endpoints.control), self._pending(command)
-            await control.send(asked(pending, args))
             try:
                 async with asyncio.timeout(wait_s):
+                    await control.send(asked(pending, args))
                     while True:
                         result = answered((await control.recv_multipart())[-1], pending)
                         if result is not None:

@@ -1,5 +1,6 @@
 """A client whose calls return when they are done."""
 
+import contextlib
 import math
 import time
 from types import TracebackType
@@ -38,7 +39,9 @@ class Client(Connections["zmq.Socket[bytes]"]):
     def ask(self, command: str, **args: Any) -> Pending:
         """Give `command` and do not wait: what `answer` is asked with."""
         pending = self._pending(command)
-        self._socket(zmq.DEALER, self._endpoints.control).send(asked(pending, args))
+        # a daemon that has refused the key is nobody to send to, for good: the answer is what does not come then
+        with contextlib.suppress(zmq.Again):
+            self._socket(zmq.DEALER, self._endpoints.control).send(asked(pending, args), zmq.NOBLOCK)
         return pending
 
     def answer(self, pending: Pending, wait_s: float = 0.0) -> dict[str, Any] | None:

@@ -21,7 +21,8 @@ from tormagd.lab.consoles.summary import Summary
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.lab.told import table
-from tormagd.output import printable, write_line
+from tormagd.output import write_line
+from tormagd_client.printable import printable
 
 HEADINGS = ("device", "insert", "files", "enabled", "RMS, worst mN", "trim", "current A", "clock ppm", "held back by")
 LEAST_SHARE, MOST_LIMITS = 0.001, 3
