@@ -83,8 +83,8 @@ PARTS = {
         judges=False,
     ),
     "tracking": Part(
-        "tools/force_tracking.py samples staircase --json --picture docs/images/force_tracking.png",
-        "[the pulse and staircase](../images/force_tracking.png)",
+        "tools/force_tracking.py samples draws staircase --json --picture docs/images/force_tracking.png",
+        "[the pulse, draws and staircase](../images/force_tracking.png)",
         judges=False,
     ),
 }

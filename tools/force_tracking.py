@@ -4,8 +4,10 @@
 
 How soon a device is known: `steps`, `creep` and `speeds`, of the three samples and of draws of the plant card; `drift`
 of the force sensor, and the `pulse` of `make run` as more is known, of the samples. How well signals are followed:
-that pulse on the `samples`, 500 setpoints a second, with a preview of 70 ms and without, beside what ideal carriages
-miss (`bound.py`); and a `staircase`. Draws 40 to 79 and samples 2 and 3 only judge. All devices are synthetic.
+that pulse on the `samples` and on random `draws`, 500 setpoints a second, with a preview of 70 ms and without; a
+`staircase`; recorded `signals` from the folder that TORMAG_DATA names, with 400 ms, as a publisher can that plays a
+file, and live. Beside them stands what ideal carriages miss (`bound.py`). Draws 40 to 79 and samples 2 and 3 only
+judge. All devices are synthetic.
 """
 
 import argparse
@@ -30,7 +32,9 @@ DRAWS = 40
 OF_DEVICES = {"steps": cases.steps, "creep": cases.creep, "speeds": cases.speeds, "pulse": cases.pulse}
 OF_SIGNALS: dict[str, Callable[[Executor, cases.Kept], Any]] = {
     "samples": cases.samples,
+    "draws": cases.draws,
     "staircase": cases.staircase,
+    "signals": cases.signals,
 }
 CASES = (*OF_DEVICES, "drift", *OF_SIGNALS)
 
@@ -75,7 +79,7 @@ def main() -> int:
     parser.add_argument("--draws", type=int, default=DRAWS, help=f"devices of the plant card ({DRAWS})")
     parser.add_argument("--drift-s", type=float, default=cases.DRIFT_S, help="how long a sensor drifts (%(default)g)")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--picture", type=Path, help="PNG of samples and staircase")
+    parser.add_argument("--picture", type=Path, help="PNG of samples, staircase and draws")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
     options = parser.parse_args()
     unknown = [case for case in options.cases if case not in CASES]

@@ -1,4 +1,4 @@
-"""How exact the physics is at its extremes: the force law against 50 digits, float32 against float64.
+"""How exact the physics is at its extremes: the force law against 50 digits, float32 against float64, long time steps.
 
 `--json` prints one object. `cases` inputs are evaluated as arrays in float64 and float32; `reference_cases` of them are
 computed in 50 digits from the formulas as printed, and compared with the arrays' float64 and with plain floats.
@@ -24,6 +24,7 @@ from typing import Any
 import mpmath as mp
 import numpy as np
 from extremes.cases import DIGITS, Batch, draw_batch, reference
+from extremes.steps import worst_step_errors
 from extremes.tally import COUNTS, Tally
 from numpy.typing import NDArray
 from tqdm import tqdm
@@ -188,7 +189,8 @@ def run(cases: int, references: int, seed: int, workers: int) -> dict[str, Any]:
     # a fresh interpreter for each worker, so that the same seed gives the same cases everywhere
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        tasks = [pool.submit(check_chunk, seed + 1 + index, size, each) for index, size in enumerate(chunks)]
+        tasks = [pool.submit(worst_step_errors, seed, max(50, references // 10))]
+        tasks += [pool.submit(check_chunk, seed + 1 + index, size, each) for index, size in enumerate(chunks)]
         for task in tqdm(as_completed(tasks), total=len(tasks), desc="chunks", disable=None):
             tally.add(task.result())
     worst = {name: [found for (kind, _), found in tally.worst.items() if kind == name] for name in PRECISIONS}

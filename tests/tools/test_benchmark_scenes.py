@@ -13,8 +13,9 @@ KEYS = {
 }  # fmt: skip
 
 
-def test_every_scene_has_the_keys_of_the_contract_and_its_variants(capsys):
-    assert benchmark.main(["scenes", "--json"]) == 0
+def test_every_scene_has_the_keys_of_the_contract_and_its_variants(capsys, tmp_path):
+    picture = tmp_path / "trade.png"
+    assert benchmark.main(["scenes", "--json", "--plot", str(picture)]) == 0
     result = json.loads(capsys.readouterr().out)
     assert {row["name"] for row in result["scenes"]} <= set(shipped_scenes())
     for row in result["scenes"]:
@@ -26,6 +27,7 @@ def test_every_scene_has_the_keys_of_the_contract_and_its_variants(capsys):
             # the forecast works by the time: a scene that requires it saves less by slow rates than one that does not
             least = 1.8 if "forecast" in row["terms_in"] else 2.0
             assert row["cost_us_per_s"] < row["cost_full_us_per_s"] / least
+    assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 def test_on_the_front_nothing_is_both_cheaper_and_nearer():

@@ -1,6 +1,7 @@
 """The force-tracking tool: its signals, its draws, and its figures on one short run. All devices are synthetic."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -10,19 +11,27 @@ from rendering.cases import (
     LATER_S,
     SPEEDS_MM_S,
     STEP_S,
-    TRIM_S,
-    Signal,
+    allowed_N,
     compared,
     ideal,
-    pulse_signal,
     stair_levels,
-    staircase_signal,
     step_figures,
     tour,
     track,
 )
-from rendering.device_draws import drawn_device
-from rendering.following import Followed, publisher, tracking, with_approach
+from rendering.device_draws import DRAWN, SPREAD, drawn_device, evenly_drawn
+from rendering.following import Followed, publisher, tracking
+from rendering.signals import (
+    SCALED_N,
+    TRIM_S,
+    Kind,
+    Signal,
+    palpation,
+    pulse_signal,
+    recorded_signals,
+    staircase_signal,
+    with_approach,
+)
 
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.simulation.parameters import load_plant
@@ -41,7 +50,7 @@ def course(*errors: tuple[float, float, float]) -> Followed:
 
 def swing(seconds: float) -> Signal:
     times = np.arange(round(seconds * 500)) / 500
-    return Signal("swing", times, 1.5 + 0.1 * np.sin(2.0 * np.pi * 1.5 * times))
+    return Signal("swing", "a formula", times, 1.5 + 0.1 * np.sin(2.0 * np.pi * 1.5 * times))
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +159,18 @@ def test_a_publisher_sends_what_follows() -> None:
     assert silent.preview_N == ()
 
 
-def test_draws_repeat_themselves() -> None:
+def test_draws_repeat_themselves_within_their_spread() -> None:
+    first, again = evenly_drawn(4), evenly_drawn(4)
+    assert first == again
+    assert len({plant.motor.resistance_Ohm for plant, _ in first}) == 4
+    nominal = load_plant("sample_1")
+    for plant, factors in first:
+        assert len(factors) == len(DRAWN)
+        assert all(1.0 - SPREAD <= factor <= 1.0 + SPREAD for factor in factors.values())
+        assert plant.gear.output_friction_Nm == pytest.approx(
+            nominal.gear.output_friction_Nm * factors["gear.output_friction_Nm"]
+        )
+        assert plant.electronics == nominal.electronics
     assert drawn_device(4) == drawn_device(4) != drawn_device(5)
 
 
@@ -164,3 +184,33 @@ def test_levels_are_those_of_the_steps() -> None:
     asked, levels = stair_levels(Followed(signal.time_s, signal.force_N, late, still, still, still, {}))
     assert asked == pytest.approx([0.47, *np.arange(0.5, 2.01, 0.1)])
     assert levels == pytest.approx(asked)
+
+
+def test_recorded_signals_are_in_the_devices_range(recordings) -> None:
+    found = recorded_signals(recordings)
+    assert {signal.name.split()[0] for signal in found} == {"finger", "arterial", "tool", "haptic"}
+    for signal in found:
+        assert np.all(np.diff(signal.time_s) > 0.0)
+        assert 0.55 <= signal.force_N.min() <= signal.force_N.max() <= (2.0 if signal.kind is Kind.HAND else 1.75)
+
+
+def test_a_palpation_touches_at_random_and_again_alike() -> None:
+    touched = palpation(1)
+    assert np.all(touched.force_N == palpation(1).force_N)
+    assert not np.all(touched.force_N == palpation(2).force_N)
+    assert SCALED_N[0] <= touched.force_N.min() <= touched.force_N.max() <= SCALED_N[1]
+    # a touch of a newton within a tenth of a second, smoothly
+    assert 10.0 < np.abs(np.gradient(touched.force_N, touched.time_s)).max() < 30.0
+
+
+def test_what_is_allowed_grows_with_what_the_ideal_carriages_miss() -> None:
+    row = {"sd_N": 0.3, "no_delay_rms_N": 0.2, "foresight_rms_N": 0.1}
+    assert allowed_N(Kind.OTHER, "sample_1", True, row) is None
+    assert allowed_N(Kind.PULSE, "sample_1", False, row) == pytest.approx(math.hypot(0.26, 0.006))
+    assert allowed_N(Kind.PULSE, "sample_2", True, row) == pytest.approx(math.hypot(0.13, 0.015))
+    assert allowed_N(Kind.HAND, "sample_2", True, row) == pytest.approx(math.hypot(0.13, 0.01))
+    assert allowed_N(Kind.HAND, "sample_1", False, row) is None
+
+
+def test_a_folder_without_data_gives_no_signals(tmp_path) -> None:
+    assert recorded_signals(tmp_path) == []

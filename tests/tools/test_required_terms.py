@@ -12,7 +12,8 @@ import required_terms
 from distributed import Client, LocalCluster
 from rendering import scene_runs
 from rendering.scene_runs import Case, Play, key, run, run_all
-from required_terms import NO_COST, RATES_HZ, SHARE, is_good, measure, spared
+from rendering.signals import Signal
+from required_terms import HOLD, NO_COST, PULSE, RATES_HZ, SHARE, is_good, measure, spared, written, wrong_models
 
 from tormagd.scenes.measured import (
     JUDGED,
@@ -25,7 +26,7 @@ from tormagd.scenes.measured import (
     on_first,
     required,
 )
-from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_scene, shipped_scenes, terms_of
+from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_scene, load_task, shipped_scenes, terms_of
 from tormagd_client.endpoints import ConfigError
 
 STORED = measured()
@@ -54,12 +55,31 @@ def test_what_is_stored_is_of_a_shipped_scene_as_it_is(scene: MeasuredScene) -> 
         assert terms_of(stated).left_out == scene.left_out
 
 
+def test_a_recording_becomes_a_scene_that_is_taken(tmp_path: Path) -> None:
+    time_s = np.arange(0.0, 8.0, 0.02)
+    played = Signal("", "", time_s, 1.2 + 0.3 * np.sin(time_s))
+    signal = load_task(str(written(tmp_path / "cataract.toml", played, is_known_ahead=True))).signal
+    assert signal is not None
+    assert signal.is_known_ahead
+
+
 def test_a_case_gives_what_was_stored() -> None:
     """The whole device again, for one scene with what it leaves out: the file belongs to this model and this plant."""
     brain = next(scene for scene in STORED.scenes if scene.name == "brain")
     hz = brain.control_hz, brain.inference_hz
     case = Case("brain", "sample_1", tuple(sorted(brain.left_out)), "", True, *hz, STORED.seconds)
     assert run(case) == pytest.approx(on_first(brain.judged).chosen_N, rel=0.05)
+
+
+def test_wrong_models_cost_what_the_decisions_predict(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of made-up outcomes: 65.9 mN more, where the stored terms add up to some 61, and costs as they are stored."""
+    monkeypatch.setattr(required_terms, "run", lambda case: 0.001 + 0.0659 * bool(case.left_out))
+    monkeypatch.setattr(required_terms, "with_costs", lambda scene, name: scene)
+    found = wrong_models()
+    scene = next(scene for scene in STORED.scenes if scene.name == HOLD)
+    assert found[HOLD]["predicted_N"] == pytest.approx(sum(item.frozen_added_N for item in scene.terms))
+    assert found[HOLD]["off"] == pytest.approx(1.0 - found[HOLD]["predicted_N"] / 0.0659)
+    assert found[PULSE]["off"] == 0.0 < found[PULSE]["predicted"]
 
 
 @pytest.mark.parametrize(("scene", "sent_hz"), [("fluoroscopy", 15.0), ("coronary", 83.0)])

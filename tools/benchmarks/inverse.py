@@ -245,7 +245,7 @@ def mark_pareto(rows: list[dict[str, Any]]) -> None:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `benchmark inverse`."""
     parser.add_argument("--quick", action="store_true", help="two small networks and few solves, for a test")
-    parser.add_argument("--write", action="store_true", help="also write docs/inverse_trade.md")
+    parser.add_argument("--write", action="store_true", help="also write docs/inverse_trade.md and its plot")
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:

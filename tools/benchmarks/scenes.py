@@ -35,13 +35,16 @@ class Variant(NamedTuple):
     rms_N: float
 
 
-def add_arguments(_parser: argparse.ArgumentParser) -> None:
-    """`benchmark scenes` has no options of its own."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `benchmark scenes`."""
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="also draw error over cost")
 
 
-def measure(_options: argparse.Namespace) -> Json:
+def measure(options: argparse.Namespace) -> Json:
     """`{scenes: [...], measured_machine_us}`: each scene's figures, and its variants."""
     file = measured()
+    if options.plot is not None:
+        draw(file.scenes, options.plot)
     scenes = [figures(scene) | {"variants": [each._asdict() for each in variants(scene)]} for scene in file.scenes]
     return {"scenes": scenes, "measured_machine_us": file.machine_us}
 

@@ -1,1 +1,1 @@
-"""The cases of `numerics.py`, and what they came to."""
+"""The cases of `numerics.py`, and their steps through time."""

@@ -36,7 +36,7 @@ VALID_S = 0.25
 MEAN_S = 0.05
 LEAD_IN_S = 0.2
 "Time between enabling and the first setpoint of a rehearsal."
-SIGNAL_VALID_S = 0.1
+REHEARSED_VALID_S = 0.1
 TRIM = Config().trim
 
 
@@ -198,15 +198,6 @@ def publisher(times_s: Array, forces_N: Array, preview_s: float, valid_for_s: fl
     return newest
 
 
-def with_approach(times_s: Array, forces_N: Array, start_N: float, ramp_s: float, hold_s: float) -> tuple[Array, Array]:
-    """The profile behind a ramp from `start_N` to its first force and a hold there, so that nothing jumps."""
-    period_s = float(times_s[1] - times_s[0])
-    ramp = np.linspace(start_N, forces_N[0], round(ramp_s / period_s), endpoint=False)
-    hold = np.full(round(hold_s / period_s), forces_N[0])
-    forces = np.concatenate([ramp, hold, forces_N])
-    return np.arange(len(forces), dtype=np.float64) * period_s, forces
-
-
 class Case(NamedTuple):
     """What `make run` rehearses beside its real-time figures: a plant, a hand, and the gap speed the controller may use
     (None: the configured one)."""
@@ -229,7 +220,7 @@ def rehearse(config: Config, case: Case, times_s: Array, forces_N: Array) -> Fol
     scene = msgspec.structs.replace(load_scene(config.scene), signal=None)
     loop = armed(config, device(case.plant), parse_hand(case.hand), scene)
     start_s = loop.now_s + LEAD_IN_S
-    publish = publisher(times_s + start_s, forces_N, 0.0, SIGNAL_VALID_S)
+    publish = publisher(times_s + start_s, forces_N, 0.0, REHEARSED_VALID_S)
     found = follow(loop, publish, LEAD_IN_S + float(times_s[-1]), start_s)
     if found.faults:
         raise RuntimeError(f"{case.label}: {', '.join(found.faults)} at {loop.now_s:.3f} s")

@@ -22,7 +22,8 @@ from machines.host import Host, HostWatch
 from machines.own import own_machine
 from machines.wire import carried
 
-from rendering.following import Tracking, tracking, with_approach
+from rendering.following import Tracking, tracking
+from rendering.signals import with_approach
 from tormagd.ctl.operate import home, operate
 from tormagd.lab.arrays import Array
 from tormagd.lab.human_pulse import pulse_profile

@@ -1,0 +1,173 @@
+"""Recorded signals as force profiles within the device's range, from the folder that TORMAG_DATA names.
+
+Shape and rhythm are measured; where a signal is not a force, the newtons are chosen, as `scaled` says.
+"""
+
+import math
+import os
+from enum import StrEnum
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from tormagd.lab.arrays import Array
+from tormagd.lab.human_pulse import pulse_profile
+
+PULSE_N = (1.4, 1.7)
+"The range of the demonstration's pulse."
+RATE_HZ = 500
+PULSE_S = 16.0
+"A recorded pulse is repeated up to this; the loops of `aac_nibp_pulse` end where they begin."
+LOW_PASS_HZ = 20.0
+ROLLER_M = 0.020
+TOOL_NM_PER_COUNT = 0.000039811
+HAPTIC_S = 40.0
+"Of the 98 s recorded."
+SHIFT_N = 0.6
+"Above the device's least force."
+SCALED_N = (0.62, 2.0)
+"From the shipped model's least force to the scenes' greatest."
+RISE_S = 0.1
+LASTS_S = (0.1, 0.6)
+"Of a touch of the palpation, and of the time between two."
+TOUCHES_N = (0.9, 2.0)
+TOUCHED_S = 16.0
+TRIM_S = 10.0
+"The time the trim is given before the figures of other devices than sample 1 begin."
+STAIR_N, STAIR_TOP_N, STAIR_S = 0.1, 2.0, 1.5
+
+
+class Kind(StrEnum):
+    """What a signal is judged as: a pulse, or the force of a hand that moves as it likes."""
+
+    PULSE = "pulse"
+    HAND = "hand"
+    OTHER = "other"
+
+
+class Signal(NamedTuple):
+    """A force profile. `is_known_ahead`: it comes from a file, so that a publisher can send a preview."""
+
+    name: str
+    scaled: str
+    time_s: Array
+    force_N: Array
+    is_known_ahead: bool = True
+    valid_for_s: float = 0.1
+    kind: Kind = Kind.OTHER
+
+
+def with_approach(times_s: Array, forces_N: Array, start_N: float, ramp_s: float, hold_s: float) -> tuple[Array, Array]:
+    """The profile behind a ramp from `start_N` to its first force and a hold there, so that nothing jumps."""
+    period_s = float(times_s[1] - times_s[0])
+    ramp = np.linspace(start_N, forces_N[0], round(ramp_s / period_s), endpoint=False)
+    hold = np.full(round(hold_s / period_s), forces_N[0])
+    forces = np.concatenate([ramp, hold, forces_N])
+    return np.arange(len(forces), dtype=np.float64) * period_s, forces
+
+
+def pulse_signal(duration_s: float) -> Signal:
+    """The demonstration's pulse."""
+    low_N, high_N = PULSE_N
+    return Signal("pulse", f"{low_N}..{high_N} N", *pulse_profile(duration_s, low_N, high_N, RATE_HZ))
+
+
+def staircase_signal(least_N: float) -> Signal:
+    """From the least force to STAIR_TOP_N in steps of STAIR_N, after TRIM_S at 1 N; nothing of it known ahead."""
+    first_N = math.ceil(least_N / STAIR_N) * STAIR_N
+    levels = np.concatenate([[1.0, least_N], np.arange(first_N, STAIR_TOP_N + 1e-9, STAIR_N)])
+    ends_s = np.cumsum([TRIM_S] + [STAIR_S] * (len(levels) - 1))
+    time_s = np.arange(round(float(ends_s[-1]) * 100)) / 100
+    return Signal("staircase", "as it is", time_s, levels[np.searchsorted(ends_s, time_s, side="right")], False)
+
+
+def recorded_signals(folder: Path) -> list[Signal]:
+    """Every signal found under a data folder; those that are not there are left out."""
+    return [
+        *(_pulse(path, "finger pressure") for path in sorted((folder / "aac_nibp_pulse").glob("*.csv"))),
+        *(_pulse(path, "arterial pressure") for path in sorted((folder / "wfdb_mimicdb").glob("*_ABP.csv"))),
+        *(_tool(path) for path in sorted((folder / "umn_mis_tool").glob("*.TXT"))),
+        *(_haptic(path) for path in sorted((folder / "kit_cataract_haptic").glob("*.csv"))),
+        *(_scaled_haptic(path) for path in sorted((folder / "kit_cataract_haptic").glob("*.csv"))),
+    ]
+
+
+def palpation(seed: int) -> Signal:
+    """A hand that feels its way: touches of random force, each within RISE_S, at random times (synthetic)."""
+    random = np.random.default_rng(seed)
+    time_s = np.arange(round(TOUCHED_S * RATE_HZ)) / RATE_HZ
+    force_N = np.full(len(time_s), SCALED_N[0])
+    begins_s = random.uniform(*LASTS_S)
+    while begins_s < TOUCHED_S:
+        ends_s = begins_s + RISE_S + random.uniform(*LASTS_S)
+        more_N = random.uniform(*TOUCHES_N) - SCALED_N[0]
+        force_N += more_N * (_rising(time_s - begins_s) - _rising(time_s - ends_s))
+        begins_s = ends_s + RISE_S + random.uniform(*LASTS_S)
+    return Signal(f"palpation {seed}", f"touches within {RISE_S:g} s", time_s, force_N, kind=Kind.HAND)
+
+
+def _rising(since_s: Array) -> Array:
+    rising: Array = 0.5 - 0.5 * np.cos(np.pi * np.clip(since_s / RISE_S, 0.0, 1.0))
+    return rising
+
+
+def data_folder() -> Path | None:
+    """The folder that TORMAG_DATA names, if it is there."""
+    name = os.environ.get("TORMAG_DATA")
+    return Path(name) if name and Path(name).is_dir() else None
+
+
+def _pulse(path: Path, what: str) -> Signal:
+    raw = np.loadtxt(path, delimiter=",", skiprows=1)
+    period_s = float(np.median(np.diff(raw[:, 0])))
+    # there and back where the ends do not meet: a jump is none of the pulse's own
+    values = raw[:, 1]
+    if abs(values[-1] - values[0]) > 0.02 * np.ptp(values):
+        values = np.concatenate([values, values[-2:0:-1]])
+    values = np.tile(values, int(np.ceil(PULSE_S / period_s / len(values))) + 1)
+    smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=1.0 / period_s, output="sos"), values)
+    time_s = np.arange(round(PULSE_S * RATE_HZ)) / RATE_HZ
+    part = np.interp(time_s, np.arange(len(smooth)) * period_s, smooth)
+    low, high = PULSE_N
+    force = low + (part - part.min()) / np.ptp(part) * (high - low)
+    return Signal(
+        f"{what} {path.stem}", f"least..most to {low}..{high} N, {LOW_PASS_HZ:g} Hz", time_s, force, kind=Kind.PULSE
+    )
+
+
+def _tool(path: Path) -> Signal:
+    raw = np.loadtxt(path, delimiter=",", comments="%", usecols=(0, 5))
+    count = len(raw)
+    force = np.abs(raw[:, 1]) * TOOL_NM_PER_COUNT / ROLLER_M
+    smooth = sosfiltfilt(butter(4, LOW_PASS_HZ, fs=1_000.0, output="sos"), force)
+    time_s = np.arange(0.0, count / 1_000.0 - 0.5, 1.0 / RATE_HZ)
+    forces = np.interp(time_s, np.arange(count) / 1_000.0, smooth)
+    return Signal(f"tool torque {path.stem}", f"over 20 mm, not scaled, {LOW_PASS_HZ:g} Hz", time_s, forces)
+
+
+def _haptic(path: Path) -> Signal:
+    time_s, forces = _commands(path)
+    # live: sent when it came, nothing of it known before; over the recording's pauses the last one goes stale
+    return Signal(
+        f"haptic commands {path.stem}", f"|F| + {SHIFT_N:g} N, at its own times", time_s, SHIFT_N + forces, False, 0.25
+    )
+
+
+def _scaled_haptic(path: Path) -> Signal:
+    """The same hand, as a force that somebody sends who plays the file: straight lines between the commands."""
+    sent_s, sent_N = _commands(path)
+    least_N, most_N = SCALED_N
+    scaled = least_N + (sent_N - sent_N.min()) / np.ptp(sent_N) * (most_N - least_N)
+    time_s = np.arange(0.0, sent_s[-1], 1.0 / RATE_HZ)
+    forces = np.interp(time_s, sent_s, scaled)
+    return Signal(f"haptic scaled {path.stem}", f"|F| to {least_N}..{most_N} N", time_s, forces, kind=Kind.HAND)
+
+
+def _commands(path: Path) -> tuple[Array, Array]:
+    """Times, s, and forces, N, of the commands of the first HAPTIC_S."""
+    raw = np.loadtxt(path, delimiter=",", skiprows=1)
+    time_s, first = np.unique(raw[:, 0], return_index=True)
+    inside = time_s <= HAPTIC_S
+    return time_s[inside], np.linalg.norm(raw[first, 1:4], axis=1)[inside]
