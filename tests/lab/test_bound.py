@@ -26,7 +26,6 @@ from tormagd.lab.ideal_carriage import (
     rms,
 )
 from tormagd.lab.main import main
-from tormagd.physics.errors import DomainError
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.element import Element
@@ -301,9 +300,3 @@ def test_what_cannot_be_used_is_named(capsys, tmp_path, text, arguments, said) -
     path.write_text(text)
     assert main(["bound", str(path), *arguments]) == 2
     assert said in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("name", "value"), [("step_s", 2e-3), ("hand_mm_s", 0.0), ("most_N", math.nan)])
-def test_settings_are_checked(name: str, value: float) -> None:
-    with pytest.raises(DomainError, match=name):
-        best(SAMPLES[0], np.arange(3.0), np.ones(3), **{name: value})

@@ -31,7 +31,7 @@ from tormagd.force_file import read_forces
 from tormagd.lab.arrays import Array, Json
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
-from tormagd.physics.errors import DomainError, require
+from tormagd.physics.errors import DomainError
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.curve import Curve
@@ -266,14 +266,9 @@ def bound(
     force_N: Array,
     *,
     is_held: bool = False,
-    most_N: float = MOST_N,
-    hand_mm_s: float = TURNED_MM_S,
     step_s: float = STEP_S,
 ) -> Bound:
     """The bound for forces at rising times, linear in between, or held until the next. Raises `DomainError`."""
-    require("step_s", step_s, 1e-5, STEP_S)
-    require("hand_mm_s", hand_mm_s, 0.5, 300.0)
-    require("most_N", most_N, 0.1, 10.0)
     steps = (time_s[-1] - time_s[0]) / step_s
     if not 2.0 <= steps <= MOST_STEPS:
         raise DomainError("t_s", f"{time_s[0]} .. {time_s[-1]}", f"2 to {MOST_STEPS} steps of {step_s:g} s")
@@ -282,7 +277,7 @@ def bound(
     if is_held:
         wanted_N = force_N[np.searchsorted(time_s, axis_s + 1e-9, side="right") - 1]
     brake, drive = brake_of(plant), drive_of(plant)
-    asked = asked_of(brake, wanted_N, most_N=most_N, hand_mm_s=hand_mm_s, step_s=step_s)
+    asked = asked_of(brake, wanted_N, most_N=MOST_N, hand_mm_s=TURNED_MM_S, step_s=step_s)
     greedy_mm = no_delay_mm(drive, brake, asked, step_s)
     best_mm = foresight_mm(drive, brake, asked, step_s)
     return Bound(axis_s, asked.force_N, asked.rendered_N(brake, greedy_mm), asked.rendered_N(brake, best_mm))

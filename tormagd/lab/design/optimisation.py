@@ -52,11 +52,7 @@ class Design(msgspec.Struct, frozen=True):
 
 
 class Problem(msgspec.Struct, frozen=True):
-    """A task's region, the measure of success, and all that is given; the defaults are the thesis's (appendix B).
-
-    Raises `DomainError` for a lower bound that is not below its upper one, for an outer radius that leaves a shell
-    thinner than 0.5 mm, and for an open gap within 1 mm of the closed one.
-    """
+    """A task's region, the measure of success, and all that is given; the defaults are the thesis's (appendix B)."""
 
     region: Region
     measure: Measure
@@ -69,17 +65,6 @@ class Problem(msgspec.Struct, frozen=True):
     shear_modulus_Pa: float = 300e3
     relative_permeability: float = 3.8
     friction_coefficient: float = 0.2
-
-    def __post_init__(self) -> None:
-        for name, low, high in zip(Design.__struct_fields__, _tuple(self.lower), _tuple(self.upper), strict=True):
-            require(f"lower.{name}", low, 0.01, 1e4)
-            require(f"upper.{name}", high, 0.01, 1e4)
-            if not low < high:
-                raise DomainError(f"upper.{name}", high, f"above lower.{name}, {low:g}")
-        if not self.lower.outer_radius_mm >= self.inner_radius_mm + 0.5:
-            raise DomainError("lower.outer_radius_mm", self.lower.outer_radius_mm, "a shell of 0.5 mm or more")
-        if not self.lower.open_mm >= self.closed_mm + 1.0:
-            raise DomainError("lower.open_mm", self.lower.open_mm, f"1 mm or more above {self.closed_mm:g}")
 
     def geometry(self, design: Design) -> Geometry:
         """The design's geometry."""
@@ -131,9 +116,6 @@ class Run(msgspec.Struct, frozen=True):
     seed: int = 1
 
     def __post_init__(self) -> None:
-        lower, upper = _tuple(self.problem.lower), _tuple(self.problem.upper)
-        for name, value, low, high in zip(Design.__struct_fields__, _tuple(self.start), lower, upper, strict=True):
-            require(f"start.{name}", float(value), low, high)
         require("seed", float(self.seed), 0.0, 2.0**31)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError, not_installed
 from tormagd.lab.tables import read_columns
-from tormagd.lab.training.dataset import Dataset, write_csv
+from tormagd.lab.training.dataset import ALLOWED, Dataset, write_csv
 from tormagd.lab.training.metrics import fit_metrics
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, displacement
 from tormagd.model.features import FEATURES, FIELD, Element
@@ -143,8 +143,7 @@ def require_usable(data: Dataset) -> None:
 
 def noise_sd_N(data: Dataset) -> float:
     """The force sensor's noise: the third differences of neighbouring rows, which hold hardly anything else."""
-    if data.time_s is None:
-        raise LabError("time_s: needed to know which rows are neighbours, and the data have none")
+    assert data.time_s is not None  # training_rows sets it
     steps = np.diff(data.time_s)
     third = np.diff(data.force_N, 3)
     together = np.convolve(steps < 2.0 * np.median(steps), np.ones(3), "valid") == 3.0
@@ -248,7 +247,7 @@ def calibrate(
 
 def read_sweep(path: Path) -> Array:
     """The table of a sweep file (n x 6). Raises LabError naming the file and what is wrong."""
-    return np.column_stack(list(read_columns(path, COLUMNS, is_exact=True).values()))
+    return np.column_stack(list(read_columns(path, COLUMNS, allowed=ALLOWED, is_exact=True).values()))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -70,15 +70,14 @@ def train(
     patience: int = 10,
     least_improvement: float = 1e-4,
 ) -> Training:
-    """Fit `network` (float64) to `training` in place and leave it with the weights that did best on `validation`.
+    """Fit `network` to `training` in place and leave it with the weights that did best on `validation`. It is of
+    float64, because the normal equations square the rounding.
 
     Stops after `epochs` accepted steps; when `patience` steps in a row have not lowered the validation error by the
     share `least_improvement`; or when no damping lowers the training error any more (`stopped_by`: "epochs",
     "validation", "damping"). Deterministic for a given network and data.
-    Raises `DomainError` on a network that is not float64 or a count below 1.
+    Raises `DomainError` on a count below 1.
     """
-    if network.hidden_weight.dtype != torch.float64:
-        raise DomainError("network", network.hidden_weight.dtype, "float64: the normal equations square the rounding")
     for name, count in (("epochs", epochs), ("patience", patience)):
         if count < 1:
             raise DomainError(name, count, "1 or more")
