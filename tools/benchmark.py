@@ -39,10 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     before_us = machine_us()
     result = module.measure(options)
     result["machine_us"] = round((before_us + machine_us()) / 2.0, 1)
-    if options.json:
-        print(json.dumps(result))
-    else:
-        print(*lines(result), sep="\n")
+    print(json.dumps(result) if options.json else "\n".join(lines(result)))
     return 0
 
 

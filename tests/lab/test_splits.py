@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tormagd.lab.training.dataset import Dataset
-from tormagd.lab.training.splits import leave_cycles_out, leave_one_out, random_split
+from tormagd.lab.training.metrics import leave_cycles_out, leave_one_out, random_split
 
 
 @pytest.fixture

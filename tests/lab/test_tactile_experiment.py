@@ -70,20 +70,8 @@ def test_thesis_and_ours_stand_side_by_side(run):
     assert "ynthetic" in section
 
 
-def test_without_heartpy_the_pulse_is_synthetic_and_says_so(monkeypatch):
-    def missing(*_):
-        raise ModuleNotFoundError
-
-    monkeypatch.setattr("tormagd.lab.tactile.pulse.pulse_profile", missing)
-    shape, source = pulse_shape(5.0, 100)
-    assert "synthetic" in source
-    assert (shape.min(), shape.max()) == (0.0, 1.0)
-    spectrum = np.abs(np.fft.rfft(shape - shape.mean()))
-    assert np.fft.rfftfreq(len(shape), 0.01)[spectrum.argmax()] == pytest.approx(1.2)
-
-
 def test_the_program_is_the_thesis_s():
-    shape, _ = pulse_shape(HELD_S, RATE_HZ)
+    shape = pulse_shape(HELD_S, RATE_HZ)
     done = program(shape)
     assert len(done.time_s) == 4322
     held = done.displacement_mm == 4.5
@@ -94,7 +82,7 @@ def test_the_program_is_the_thesis_s():
 
 
 def test_field_errors_count_only_where_the_force_depends_on_the_field():
-    shape, _ = pulse_shape(HELD_S, RATE_HZ)
+    shape = pulse_shape(HELD_S, RATE_HZ)
     along = course(PADS["MRE-C"], shape, 20)
     reference = along.features[:, 2]
     scores = along.scores(np.where(along.scored, reference + 2.0, 300.0))

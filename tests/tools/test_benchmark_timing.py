@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks import latency, loop, virtual_time
-from benchmarks.against import checkout
 
 from tormagd.config import RealTime, load_config
 from tormagd.control.core import build_core
@@ -132,9 +131,9 @@ def test_without_a_compiled_build_there_is_none() -> None:
 
 
 def test_only_a_checkout_is_measured_against(tmp_path: Path) -> None:
-    assert checkout(str(ROOT)) == ROOT
+    assert loop.checkout(str(ROOT)) == ROOT
     with pytest.raises(argparse.ArgumentTypeError, match="allowed is the root of a checkout"):
-        checkout(str(tmp_path))
+        loop.checkout(str(tmp_path))
 
 
 def test_a_build_whose_loops_cannot_be_made_is_not_measured() -> None:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import zmq
-from machines.own import own_machine
+from machines.own import end, own_machine
 from machines.wire import carried
 
 from tormagd.config import load_config
@@ -176,9 +176,3 @@ def used(child: "subprocess.Popen[str]") -> tuple[int, int]:
 def is_at_rest(status: dict[str, Any]) -> bool:
     """Whether the link runs, and the device neither homes nor opens."""
     return status["link"]["state"] == "RUNNING" and not status["is_busy"]
-
-
-def end(child: "subprocess.Popen[str]") -> None:
-    """Ends what we began."""
-    child.terminate()
-    child.wait(PATIENCE_S)

@@ -204,8 +204,7 @@ def _frozen(config: Config, scene: Scene) -> Core:
 def signal_of(core: Core, scene_name: str, longest_s: float, rate_hz: int) -> tuple[Array, Array]:
     """The scene's signal, up and down again until the time is over; a recording is played once."""
     scene = core.scene
-    if scene.signal is None:
-        raise ValueError(f"scene {scene.name}: it has no [signal]: nothing is known of what it asks for")
+    assert scene.signal is not None, "its forces are asked for"
     range_N = max(scene.force.least_N, core.planner.portrait.least_N), scene.force.most_N
     time_s, force_N = asked(scene.signal, Path(scene_path(scene_name)).parent, range_N, longest_s, rate_hz)
     if not scene.signal.file and time_s[-1] < longest_s:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from machines.host import Host, HostWatch
-from machines.own import own_machine
+from machines.own import end, own_machine
 from machines.wire import carried
 
 from rendering.following import Tracking, tracking
@@ -211,8 +211,8 @@ def play(watched: HostWatch, duration_s: float) -> Course:
         raise_fault(after)
         codes["publisher"] = publisher.returncode
         codes["recorder"] = end(recorder, signal.SIGINT)
-        codes["tormagd"] = end(daemon, signal.SIGTERM)
-        codes["simulator"] = end(simulator, signal.SIGTERM)
+        codes["tormagd"] = end(daemon)
+        codes["simulator"] = end(simulator)
     answer = json.loads(printed)
     if not answer["ok"]:
         raise ShowError(f"the publisher: {answer['error']['message']}", answer["error"]["hint"], is_of_time=True)
@@ -278,17 +278,7 @@ def process(name: str, *arguments: str, is_read: bool = False) -> Iterator["subp
             yield child
         finally:
             if child.poll() is None:
-                end(child, signal.SIGTERM)
-
-
-def end(child: "subprocess.Popen[str]", number: signal.Signals) -> int:
-    """Sends a signal and waits for the orderly end it asks for."""
-    child.send_signal(number)
-    try:
-        return child.wait(timeout=15)
-    except subprocess.TimeoutExpired:
-        child.kill()
-        return child.wait()
+                end(child)
 
 
 def ended(name: str) -> ShowError:

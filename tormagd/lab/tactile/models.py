@@ -12,8 +12,7 @@ from tormagd.lab.tactile.pads import PADS, PadRecord, cyclic_records, holding_re
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.fitting import fit_network
 from tormagd.lab.training.grey_box import GreyBox, fit_grey_box
-from tormagd.lab.training.metrics import force_metrics
-from tormagd.lab.training.splits import leave_cycles_out, leave_one_out, random_split
+from tormagd.lab.training.metrics import force_metrics, leave_cycles_out, leave_one_out, random_split
 from tormagd.model.features import FEATURES
 from tormagd.model.model_file import ForceModel
 from tormagd.model.rising import not_rising_share

@@ -41,6 +41,7 @@ BEYOND_MM = 2.0
 STOPS_MM = 2.5
 "The bench's switches stand so far beyond the scene's gaps."
 BENCH_MOST_N = 20.0
+"On a bench no force that the closed gap gives is a fault."
 GAP_STEP_MM = 3.0
 HOLD_GAP_MM, HOLD_STROKES = 46.0, 150
 BEGIN_S = 8.0
@@ -117,13 +118,13 @@ def swept(plant: str, scene_name: str, course: Course) -> Array:
     hand, ends_s = strokes(len(course.gaps_mm), course.seed)
     device = VirtualDevice(bench(with_insert(load_plant(plant), scene.insert.name), scene), hand, seed=course.seed)
     loop = ClosedLoop(config, Stepper(config, scene), None, device)
-    loop.arm(_plan(scene.insert.gap_open_mm, 0.0))
+    loop.arm(gap_plan(scene.insert.gap_open_mm, 0.0))
     while loop.now_s < BEGIN_S:
-        loop.tick(plan=_plan(scene.insert.gap_open_mm, loop.now_s))
+        loop.tick(plan=gap_plan(scene.insert.gap_open_mm, loop.now_s))
     rows = []
     for gap_mm, end_s in zip(course.gaps_mm, ends_s, strict=True):
         while loop.now_s < end_s:
-            sample = loop.tick(plan=_plan(gap_mm, loop.now_s))
+            sample = loop.tick(plan=gap_plan(gap_mm, loop.now_s))
             estimate = sample.state.estimate
             if estimate is None or sample.state.safety.faults:
                 raise RuntimeError(f"the sweep ended at {gap_mm:.1f} mm: {sample.state.safety}")
@@ -191,7 +192,8 @@ def bench(plant: PlantParameters, scene: Scene) -> PlantParameters:
     return msgspec.structs.replace(plant, assumed=stops)
 
 
-def _plan(gap_mm: float, now_s: float) -> Plan:
+def gap_plan(gap_mm: float, now_s: float) -> Plan:
+    """A plan that asks for a gap and nothing else."""
     return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
 
 

@@ -9,8 +9,7 @@ import torch
 from tormagd.lab.arrays import Mask
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.levenberg_marquardt import Training, train
-from tormagd.lab.training.metrics import fit_metrics
-from tormagd.lab.training.splits import random_split
+from tormagd.lab.training.metrics import fit_metrics, random_split
 from tormagd.model.features import Element, Scaling
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelMetadata

@@ -40,18 +40,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--rising", action="store_true", help="refuse a model whose force does not rise with the field everywhere"
     )
     parser.add_argument("--created", type=datetime.date.fromisoformat, help="date in the file (default: today)")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the convergence")
 
 
 def run(options: argparse.Namespace) -> Found:
     """Trains and writes; the metrics. Raises LabError, DomainError, OSError."""
-    for path in (options.out, options.plot):
-        if path is not None and not path.parent.is_dir():
-            raise LabError(f"cannot write {path}: {path.parent} is not a directory")
+    if not options.out.parent.is_dir():
+        raise LabError(f"cannot write {options.out}: {options.out.parent} is not a directory")
     model, training = fit(options, read_csv(options.data))
     save_model(options.out, model)
-    if options.plot is not None:
-        plot_convergence(options.plot, training)
     report = {"out": str(options.out), "data_sha256": model.metadata.training_data_sha256, **model.metadata.metrics}
     return Found({**report, "stopped_by": training.stopped_by})
 
@@ -84,20 +80,3 @@ def memory_line(memory: Memory) -> str:
     terms = zip(memory.fractions, memory.times_s, strict=True)
     relaxing = ", ".join(f"{fraction:.1%} in {time_s:.0f} s" for fraction, time_s in terms)
     return f"taken out: relaxation of {relaxing}; a field {memory.lag_mT:.1f} mT behind"
-
-
-def plot_convergence(path: Path, training: Training) -> None:
-    """Draw the errors over the epochs."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    axes = figure.subplots()
-    epochs = [step.epoch for step in training.history]
-    axes.semilogy(epochs, [step.train_rmse_N for step in training.history], label="training")
-    axes.semilogy(epochs, [step.validation_rmse_N for step in training.history], label="validation")
-    axes.axvline(training.best.epoch, color="grey", linestyle=":", label=f"kept: epoch {training.best.epoch}")
-    axes.set(
-        xlabel="epoch", ylabel="force error, N rms", title=f"Levenberg-Marquardt, stopped by {training.stopped_by}"
-    )
-    axes.legend()
-    figure.savefig(path, dpi=150)
