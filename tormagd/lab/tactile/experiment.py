@@ -16,7 +16,6 @@ from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.lab.tactile import branches
 from tormagd.lab.tactile.models import FULL, QUICK, Effort, Trained, table_4_1, train
-from tormagd.lab.tactile.plots import Material
 from tormagd.lab.tactile.pulse import hold, pulse
 from tormagd.lab.tactile.report import sections, write_report
 
@@ -25,7 +24,8 @@ TABLE_NOISE_N = 0.5
 
 
 def contract(effort: Effort) -> tuple[dict[str, Any], Trained, dict[str, Array]]:
-    """`table_4_1` and `pulse` of the contract, with keys added; what the table was made with; the pulse's traces.
+    """`table_4_1` and `pulse` of the contract, with keys added, and what relaxes; what they were made with; the pulse's
+    traces.
 
     A quick effort takes fewer rows and epochs and holds for a minute: it shows that all runs, not how well.
     """
@@ -37,6 +37,11 @@ def contract(effort: Effort) -> tuple[dict[str, Any], Trained, dict[str, Array]]
     found = {
         "table_4_1": table_4_1(tabled, effort),
         "pulse": figures | {"hold": held, "hold_1h_force_error": held["with"]["force_error_1h"]},
+        "relaxation": {
+            "fractions": tabled.grey.series.fractions,
+            "field_fractions": tabled.grey.field_series.fractions,
+            "times_s": tabled.grey.series.times_s,
+        },
     }
     return found, tabled, traces
 
@@ -44,20 +49,6 @@ def contract(effort: Effort) -> tuple[dict[str, Any], Trained, dict[str, Array]]
 def reproduced(effort: Effort) -> dict[str, Any]:
     """The contract's figures alone."""
     return contract(effort)[0]
-
-
-def whole(effort: Effort) -> tuple[dict[str, Any], Material]:
-    """Do everything; returns the figures and what the pictures are drawn from."""
-    figures, tabled, traces = contract(effort)
-    figures |= {
-        "relaxation": {
-            "fractions": tabled.grey.series.fractions,
-            "field_fractions": tabled.grey.field_series.fractions,
-            "times_s": tabled.grey.series.times_s,
-        },
-    }
-    predicted_N = tabled.model.predict(tabled.cycles.features)
-    return figures, Material(tabled.cycles, predicted_N, traces)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -73,7 +64,7 @@ def run(options: argparse.Namespace) -> Found:
         return Found(branches.measured())
     if options.out is not None and not options.out.is_dir():
         raise LabError(f"cannot write to {options.out}: not a directory")
-    figures, material = whole(QUICK if options.quick else FULL)
+    figures, trained, traces = contract(QUICK if options.quick else FULL)
     if options.out is not None:
-        write_report(options.out, figures, material)
+        write_report(options.out, figures, trained, traces)
     return Found(figures, sections(figures))

@@ -1,6 +1,8 @@
 """The pulse experiment of section 4.3 on the synthetic pad, and pulses rendered on a pad held for an hour."""
 
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,6 +53,18 @@ class Program(NamedTuple):
 def pulse_shape(duration_s: float, rate_hz: int) -> Array:
     """A measured pulse between 0 and 1. Raises ModuleNotFoundError where heartpy is not installed."""
     return pulse_profile(duration_s, 0.0, 1.0, rate_hz)[1]
+
+
+def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
+    """Measured arterial pulses between 0 and 1, by their file's name; none unless TORMAG_DATA names their folder."""
+    folder = os.environ.get("TORMAG_DATA")
+    shapes = {}
+    for path in sorted(Path(folder, "aac_nibp_pulse").glob("*.csv")) if folder else ():
+        time_s, pressure = np.loadtxt(path, delimiter=",", skiprows=1, unpack=True)
+        # six beats that end as they began
+        looped = np.interp(np.arange(round(duration_s * rate_hz)) / rate_hz, time_s, pressure, period=time_s[-1])
+        shapes[path.stem] = (looped - looped.min()) / np.ptp(looped)
+    return shapes
 
 
 def program(shape: Array) -> Program:
@@ -159,15 +173,19 @@ def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str,
 
 
 def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any], dict[str, Array]]:
-    """The contract's `pulse`: the quieter sensor on top, each sensor below; other pads beside."""
+    """The contract's `pulse`: the quieter sensor on top, each sensor below; other pads and other pulses beside."""
     shape = pulse_shape(HELD_S, RATE_HZ)
     pad, every = PADS[PAD_IN_USE], effort.pulse_every
     own = course(pad, shape, every)
     strangers = [course(drawn_pad(pad, seed), shape, every) for seed in OTHER_PADS]
+    recorded = {name: course(pad, other, every) for name, other in recorded_shapes(HELD_S, RATE_HZ).items()}
     by_noise, all_traces = {}, []
     for trained in trainings:
         scores, traces = pulse_on(own, trained)
         scores["other_pads"] = [along.scores(aware_fields(trained, along, along.force_N)) for along in strangers]
+        scores["other_pulses"] = {
+            name: along.scores(aware_fields(trained, along, along.force_N)) for name, along in recorded.items()
+        }
         by_noise[str(trained.noise_N)] = scores
         all_traces.append(traces)
     top = by_noise[str(trainings[0].noise_N)]

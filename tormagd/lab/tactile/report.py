@@ -3,17 +3,17 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from tormagd.lab.arrays import Json
+from tormagd.lab.arrays import Array, Json
 from tormagd.lab.pages import table, write_page
-from tormagd.lab.tactile.plots import Material, pictures
+from tormagd.lab.tactile.models import Trained
+from tormagd.lab.tactile.plots import pictures
 from tormagd.lab.thesis.page import WAYS
 from tormagd.lab.thesis.values import PULSE_MAE_MT, PULSE_MAX_MT, PULSE_SD_MT
 
 
-def write_report(folder: Path, figures: Json, material: Material) -> None:
+def write_report(folder: Path, figures: Json, trained: Trained, traces: dict[str, Array]) -> None:
     """Write learned_inverse.md into `folder`, and its pictures into `folder`/images."""
-    drawn = pictures(material)
-    write_page(folder / "learned_inverse.md", sections(figures), folder / "images", drawn)
+    write_page(folder / "learned_inverse.md", sections(figures), folder / "images", pictures(trained, traces))
 
 
 def sections(figures: Json) -> Iterator[str]:
@@ -98,6 +98,7 @@ def _pulse(pulse: Json) -> str:
         named += [
             (f"with relaxation, other pad {index}", part) for index, part in enumerate(scores["other_pads"], start=1)
         ]
+        named += [(f"with relaxation, arterial pressure {name}", part) for name, part in scores["other_pulses"].items()]
         rows += [
             (
                 noise,

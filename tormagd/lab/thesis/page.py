@@ -19,13 +19,11 @@ WAYS = {
 "The ways from a force to a field."
 
 
-def write(folder: Path, result: Json, tests: list[StepTest]) -> Path:
-    """Writes reproduction.md into `folder`, its pictures into a folder of that name, and returns the page's path."""
+def write(folder: Path, result: Json, tests: list[StepTest]) -> None:
+    """Writes reproduction.md into `folder`, and its pictures into a folder of that name."""
     from tormagd.lab.thesis.plots import pictures
 
-    path = folder / "reproduction.md"
-    write_page(path, sections(result), path.with_suffix(""), pictures(result, tests))
-    return path
+    write_page(folder / "reproduction.md", sections(result), folder / "reproduction", pictures(result, tests))
 
 
 def sections(result: Json) -> Iterator[str]:
