@@ -22,7 +22,7 @@ from machines.host import Host, HostWatch
 from machines.own import end, own_machine
 from machines.wire import carried
 
-from rendering.following import Tracking, tracking
+from rendering.following import RATE_HZ, Tracking, tracking
 from rendering.signals import with_approach
 from tormagd.ctl.operate import home, operate
 from tormagd.lab.arrays import Array
@@ -59,8 +59,6 @@ RAMP_S, HOLD_S = 1.0, 3.0
 "Approach to the pulse's first force, and a hold there in which the trim learns this device."
 PULSE_START_S = RAMP_S + HOLD_S
 START_N = 0.6
-RATE_HZ = 500
-"Setpoints a second."
 LOOK_S = 0.2
 "The longest wait for telemetry."
 PATIENCE_S = 60.0

@@ -131,7 +131,10 @@ def coverage_as_made(problem: Problem, design: Design, share: float) -> float:
     """The least coverage where every dimension may be off by `share`, down, not at all, or up; 0 where one of these
     designs does not bear its field."""
     factors = itertools.product((1.0 - share, 1.0, 1.0 + share), repeat=len(Design.__struct_fields__))
-    made = [Design(*(value * factor for value, factor in zip(_tuple(design), each, strict=True))) for each in factors]
+    made = [
+        Design(*(value * factor for value, factor in zip(msgspec.structs.astuple(design), each, strict=True)))
+        for each in factors
+    ]
     return min(coverage(problem, each) if problem.load_margin(each) >= 0.0 else 0.0 for each in made)
 
 
@@ -178,13 +181,13 @@ class _Search:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.evaluations = 0
-        self._low = np.array(_tuple(problem.lower))
-        self._span = np.array(_tuple(problem.upper)) - self._low
+        self._low = np.array(msgspec.structs.astuple(problem.lower))
+        self._span = np.array(msgspec.structs.astuple(problem.upper)) - self._low
         self._bounds = Bounds(np.zeros(3), np.ones(3), keep_feasible=True)
         self._margin = NonlinearConstraint(lambda x: problem.load_margin(self.design(x)), 0.0, np.inf)
 
     def scaled(self, design: Design) -> Array:
-        return np.asarray((np.array(_tuple(design)) - self._low) / self._span)
+        return np.asarray((np.array(msgspec.structs.astuple(design)) - self._low) / self._span)
 
     def design(self, x: Array) -> Design:
         # a solver may step a rounding outside its bounds
@@ -250,7 +253,3 @@ def _better(cost: Callable[[Array], float], start: Array, result: OptimizeResult
 
 def _keeps(limits: list[Any], x: Array) -> bool:
     return all(limit.lb <= limit.fun(x) <= limit.ub for limit in limits)
-
-
-def _tuple(design: Design) -> tuple[float, float, float]:
-    return design.outer_radius_mm, design.thickness_mm, design.open_mm

@@ -8,6 +8,7 @@ another region, bound or seed it is another run, and never takes an old outcome.
 from collections.abc import Iterable
 from concurrent.futures import Executor, as_completed
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 from tqdm import tqdm
@@ -16,12 +17,11 @@ from tormagd.bounded_file import read_bounded
 from tormagd.lab.design.optimisation import Outcome, Run, solve
 from tormagd.physics.errors import DomainError
 
-STATE_VERSION = 1
 MAX_STATE_BYTES = 64_000_000
 
 
 class _State(msgspec.Struct, forbid_unknown_fields=True):
-    version: int
+    version: Literal[1]
     finished: list[tuple[Run, Outcome]]
 
 
@@ -60,13 +60,11 @@ def read_state(path: Path) -> dict[Run, Outcome]:
         state = msgspec.json.decode(read_bounded(path, MAX_STATE_BYTES), type=_State)
     except msgspec.DecodeError as error:
         raise DomainError(str(path), error, "the state file of a sweep") from error
-    if state.version != STATE_VERSION:
-        raise DomainError(f"{path} version", state.version, str(STATE_VERSION))
     return dict(state.finished)
 
 
 def _write_state(path: Path, finished: dict[Run, Outcome]) -> None:
     # replaced whole: a stop in the middle leaves the last good state
     partial = path.with_name(path.name + ".part")
-    partial.write_bytes(msgspec.json.encode(_State(STATE_VERSION, list(finished.items()))))
+    partial.write_bytes(msgspec.json.encode(_State(1, list(finished.items()))))
     partial.replace(path)

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -67,15 +67,6 @@ class CalibrationError(ValueError):
     def __init__(self, code: str, message: str, hint: str) -> None:
         super().__init__(message)
         self.code, self.message, self.hint = code, message, hint
-
-
-class Judgement(NamedTuple):
-    """Error on the sweeps kept from the fit, beside the force sensor's own noise and the bar."""
-
-    r2: float
-    mae_N: float
-    noise_mae_N: float
-    most_mae_N: float
 
 
 def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Dataset:
@@ -176,8 +167,7 @@ def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int 
     found = fit_metrics(model, judging)
     noise_mae_N = MEAN_OVER_SIGMA * noise_sd_N(data)
     most_mae_N = max(MOST_MAE_OVER_NOISE * noise_mae_N, MOST_MAE_SHARE * float(np.percentile(data.force_N, 99.0)))
-    judgement = Judgement(found.get("r2", -math.inf), found["mae_N"], noise_mae_N, most_mae_N)
-    require_good(judgement)
+    require_good(found.get("r2", -math.inf), found["mae_N"], noise_mae_N, most_mae_N)
     require_rising(model)
     metrics = model.metadata.metrics | {f"judged_{name}": value for name, value in found.items()}
     metrics |= {
@@ -189,9 +179,9 @@ def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int 
     return replace(model, metadata=msgspec.structs.replace(model.metadata, metrics=metrics))
 
 
-def require_good(judgement: Judgement) -> None:
-    """Raise CalibrationError (poor_fit) with the figures and the bars."""
-    r2, mae_N, noise_mae_N, most_mae_N = judgement
+def require_good(r2: float, mae_N: float, noise_mae_N: float, most_mae_N: float) -> None:
+    """Raise CalibrationError (poor_fit) for an error on the sweeps kept from the fit that is over the bar; the figures
+    stand beside the force sensor's own noise."""
     if r2 >= LEAST_R2 and mae_N <= most_mae_N:
         return
     raise CalibrationError(
