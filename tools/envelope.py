@@ -331,11 +331,8 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
     options = parser.parse_args()
     result, found = measure(options)
-    if options.json:
-        print(json.dumps(result))
-    else:
-        worst = sorted(result["rows"], key=lambda shown: -shown["over_N"])[:6]
-        print("\n".join(lines(result | {"rows": worst})))
+    worst = sorted(result["rows"], key=lambda shown: -shown["over_N"])[:6]
+    print(json.dumps(result) if options.json else "\n".join(lines(result | {"rows": worst})))
     if options.picture is not None:
         picture(options.picture, result, found)
     wrong = missed(result)

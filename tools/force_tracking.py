@@ -90,10 +90,8 @@ def main() -> int:
     with ProcessPoolExecutor(max_workers=options.jobs) as pool:
         for case in options.cases or CASES:
             result[case] = measure(case, options, pool, kept)
-    if options.json:
-        print(json.dumps(result))
-    else:
-        print(*lines({case: found if case in OF_SIGNALS else worst(found) for case, found in result.items()}), sep="\n")
+    told = {case: found if case in OF_SIGNALS else worst(found) for case, found in result.items()}
+    print(json.dumps(result) if options.json else "\n".join(lines(told)))
     if options.picture is not None:
         from rendering.pictures import tracking_picture
 

@@ -27,58 +27,19 @@ from firmware_protocol.codec import (
 )
 from firmware_protocol.framing import encode_frame
 from firmware_protocol.layouts import LAYOUTS
-from tormagd.closed_loop import ClosedLoop
-from tormagd.config import Config
-from tormagd.control.core import build_core
-from tormagd.control.governor import TimedSetpoint
 from tormagd.lab import wire_log
 from tormagd.lab.main import main
-from tormagd.simulation.device import VirtualDevice
-from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import load_plant
-from tormagd.simulation.plant import Truth
 
 DBC = Path(firmware_protocol.__file__).parent / "tormag.dbc"
 SECONDS = 0.2
 PATIENCE_S = 20.0
 
 
-class TappedDevice:
-    """A simulated device whose line is logged: a `SerialDevice`."""
-
-    def __init__(self, device: VirtualDevice, log: wire_log.WireLog) -> None:
-        self._device, self._log = device, log
-        self.messages = device.messages
-
-    @property
-    def truth(self) -> Truth:
-        """As the device's own."""
-        return self._device.truth
-
-    def receive(self, now_s: float, data: bytes) -> None:
-        """As the device's own."""
-        self._log.to_device(now_s, data)
-        self._device.receive(now_s, data)
-
-    def transmit(self, now_s: float) -> bytes:
-        """As the device's own."""
-        data = self._device.transmit(now_s)
-        self._log.to_host(now_s, data)
-        return data
-
-
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The candump log of a session in virtual time."""
     path = tmp_path_factory.mktemp("session") / "session.log"
-    config = Config()
-    core = build_core(config)
-    with wire_log.WireLog(path) as log:
-        device = TappedDevice(VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1), log)
-        loop = ClosedLoop(config, core.stepper, core.planner, device)
-        loop.arm()
-        for _ in loop.run(SECONDS, lambda now_s: TimedSetpoint(1.5, now_s, 0.1)):
-            pass
+    assert main(["wire-log", "virtual", str(path), "--seconds", str(SECONDS)]) == 0
     return path
 
 
@@ -158,7 +119,7 @@ def test_what_is_no_frame_is_counted_and_not_logged(tmp_path: Path) -> None:
 
 
 def test_a_file_type_that_is_not_known_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["wire-log", "tap", str(tmp_path / "session.mp3")]) == 2
+    assert main(["wire-log", "virtual", str(tmp_path / "session.mp3")]) == 2
     assert ".mp3" in capsys.readouterr().err
 
 

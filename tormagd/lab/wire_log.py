@@ -2,14 +2,17 @@
 
 On CAN, `python -m can.logger` records the bus and nothing of ours is needed. A serial line has one owner, so `tap` goes
 between: it holds the device's port, offers the daemon a pseudo-terminal instead, passes every byte on and logs the
-frames. `viewer` prints what python-can's viewer needs to know of the messages.
+frames. `virtual` logs a session in virtual time, synthetic from end to end. `viewer` prints what python-can's viewer
+needs to know of the messages.
 """
 
 import argparse
 import contextlib
+import math
 import os
 import select
 import signal
+import threading
 import time
 import tty
 from collections.abc import Callable
@@ -23,13 +26,21 @@ import serial
 from firmware_protocol.codec import FUNCTION, can_identifier
 from firmware_protocol.framing import Frame, FrameDecoder
 from firmware_protocol.layouts import LAYOUTS
+from tormagd.closed_loop import ClosedLoop
+from tormagd.config import load_config
+from tormagd.control.core import build_core
+from tormagd.control.governor import TimedSetpoint
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
-from tormagd.simulation.device import DEFAULT_BAUD
+from tormagd.simulation.device import DEFAULT_BAUD, VirtualDevice
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.plant import Truth
 
 NODE = 1
 READ_BYTES = 4096
 POLL_MS = 100
+MEAN_N, SWING_N, SWING_HZ = 1.5, 0.3, 1.2
 
 
 class WireLog:
@@ -87,6 +98,45 @@ class WireLog:
         )
 
 
+class TappedDevice:
+    """A simulated device whose line is logged: a `SerialDevice`."""
+
+    def __init__(self, device: VirtualDevice, log: WireLog) -> None:
+        self._device, self._log = device, log
+        self.messages = device.messages
+
+    @property
+    def truth(self) -> Truth:
+        """As the device's own."""
+        return self._device.truth
+
+    def receive(self, now_s: float, data: bytes) -> None:
+        """As the device's own."""
+        self._log.to_device(now_s, data)
+        self._device.receive(now_s, data)
+
+    def transmit(self, now_s: float) -> bytes:
+        """As the device's own."""
+        data = self._device.transmit(now_s)
+        self._log.to_host(now_s, data)
+        return data
+
+
+def virtual_session(seconds: float, log: WireLog) -> None:
+    """Connects, homes, enables and follows a swinging force for that long, in virtual time."""
+    config = load_config(None)
+    core = build_core(config)
+    device = TappedDevice(VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1), log)
+    loop = ClosedLoop(config, core.stepper, core.planner, device)
+    loop.arm()
+
+    def asked(now_s: float) -> TimedSetpoint:
+        return TimedSetpoint(MEAN_N + SWING_N * math.sin(math.tau * SWING_HZ * now_s), now_s, 0.1)
+
+    for _ in loop.run(seconds, asked):
+        pass
+
+
 def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stopped: Callable[[], bool]) -> None:
     """Passes bytes between `port` and a pseudo-terminal, whose path is announced, until `stopped()`.
 
@@ -134,15 +184,18 @@ def viewer_formats(node: int = NODE) -> list[str]:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of `tormag-lab wire-log`."""
     ways = parser.add_subparsers(dest="way", required=True)
+    virtual = ways.add_parser("virtual", help="log a session in virtual time")
     tapped = ways.add_parser("tap", help="log what passes between the daemon and a serial device")
     ways.add_parser("viewer", help="print the messages' formats for python-can's viewer")
-    tapped.add_argument("file", type=Path, help="its ending says which format: .log, .asc, .blf, ...")
+    for way in (virtual, tapped):
+        way.add_argument("file", type=Path, help="its ending says which format: .log, .asc, .blf, ...")
+    virtual.add_argument("--seconds", type=float, default=5.0, help="after homing and enabling")
     tapped.add_argument("--port", default="/dev/tormag", help="the device's port")
     tapped.add_argument("--baud", type=int, default=DEFAULT_BAUD)
 
 
 def run(options: argparse.Namespace) -> Found:
-    """Logs until a signal ends it. Raises LabError, OSError for a file or port that cannot be used."""
+    """Logs until the session or a signal ends it. Raises LabError, OSError for a file or port that cannot be used."""
     if options.way == "viewer":
         formats = viewer_formats()
         return Found(formats, formats)
@@ -151,23 +204,21 @@ def run(options: argparse.Namespace) -> Found:
     except ValueError as error:
         raise LabError(str(error)) from error
     with log:
-        _tap_until_stopped(options.port, options.baud, log)
+        if options.way == "virtual":
+            virtual_session(options.seconds, log)
+        else:
+            _tap_until_stopped(options.port, options.baud, log)
     return Found({"file": str(options.file), "frames": log.frames, "damaged": log.damaged})
 
 
 def _tap_until_stopped(path: str, baud: int, log: WireLog) -> None:
-    stopping = False
-
-    def stop(_signal: int, _frame: object) -> None:
-        nonlocal stopping
-        stopping = True
-
-    signal.signal(signal.SIGINT, stop)
-    signal.signal(signal.SIGTERM, stop)
+    stopping = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopping.set())
     with serial.Serial(path, baud, timeout=0, exclusive=True) as port:
         tap(
             port,
             log,
             lambda pty: print(f"{pty}  # give this to the daemon as device.port", flush=True),
-            lambda: stopping,
+            stopping.is_set,
         )

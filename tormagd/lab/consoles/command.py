@@ -90,17 +90,17 @@ def run(options: argparse.Namespace) -> Found:
     if not urls:
         raise LabError(f"{options.recordings}: no {SUFFIX} in it; `tormagctl record` makes them")
     with executors.chosen(options) as executor:
-        fleet = read_all(urls, executor)
-    for name, reason in fleet.left_out.items():
+        summaries, left_out = read_all(urls, executor)
+    for name, reason in left_out.items():
         write_line(f"tormag-lab fleet: left out {printable(name)}: {printable(reason)}", sys.stderr)
-    exit_code = 1 if fleet.left_out else 0
+    exit_code = 1 if left_out else 0
     try:
         if options.out is not None:
-            write_parquet(fleet.summaries, options.out)
+            write_parquet(summaries, options.out)
     except OSError as error:  # what was found is told all the same
         write_line(f"tormag-lab fleet: {printable(str(error))}", sys.stderr)
         exit_code = 2
-    found = consoles(fleet.summaries.values())
-    result = {"consoles": found, "recordings": fleet.summaries, "left_out": fleet.left_out}
+    found = consoles(summaries.values())
+    result = {"consoles": found, "recordings": summaries, "left_out": left_out}
     rows = (dict(zip(HEADINGS, _cells(console), strict=True)) for console in found)
     return Found(msgspec.to_builtins(result), table(rows), exit_code)

@@ -46,11 +46,6 @@ def contract(effort: Effort) -> tuple[dict[str, Any], Trained, dict[str, Array]]
     return found, tabled, traces
 
 
-def reproduced(effort: Effort) -> dict[str, Any]:
-    """The contract's figures alone."""
-    return contract(effort)[0]
-
-
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of `tormag-lab tactile-experiment`."""
     parser.add_argument("--quick", action="store_true", help="few rows and epochs: shows that it runs, not how well")

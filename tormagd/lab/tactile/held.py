@@ -56,33 +56,27 @@ class Case(NamedTuple):
     coarse: bool = False
 
 
-class Moment(NamedTuple):
-    """Once a second: the pad's true force, the gap, what was planned, and the fault that ends the hold."""
-
-    force_N: float
-    gap_mm: float
-    state: PlanState
-    fault: str
+Moment = tuple[float, float, PlanState, str]
+"Once a second: the pad's true force, N, the gap, mm, what was planned, and the fault that ends the hold."
 
 
 def hold(case: Case) -> dict[str, Any]:
     """The greatest, the mean and the last error of the true force, as shares of the force asked, the share of time that
     each limit was there, and the fault that ended it, if any."""
-    shares, limits, gap_mm, fault = [], dict[str, int](), math.nan, ""
-    for moment in (_coarse if case.coarse else _whole)(case):
-        fault = moment.fault
+    shares, limits, last_mm, fault = [], dict[str, int](), math.nan, ""
+    for force_N, gap_mm, state, fault in (_coarse if case.coarse else _whole)(case):
         if fault:
             break
-        shares.append(moment.force_N / FORCE_N - 1.0)
-        gap_mm = moment.gap_mm
-        for limit in moment.state.plan.limits:
+        shares.append(force_N / FORCE_N - 1.0)
+        last_mm = gap_mm
+        for limit in state.plan.limits:
             limits[str(limit)] = limits.get(str(limit), 0) + 1
     absolute = np.abs(shares)
     return case._asdict() | {
         "force_error": float(absolute.max()),
         "mean_force_error": float(absolute.mean()),
         "last_force_error": shares[-1],
-        "last_gap_mm": gap_mm,
+        "last_gap_mm": last_mm,
         "held_s": len(shares),
         "fault": fault,
         "limits": {name: count / len(shares) for name, count in limits.items()},
@@ -125,7 +119,7 @@ def _whole(case: Case) -> Iterator[Moment]:
             pass
         truth, state = loop.device.truth, loop.plan_state
         assert state is not None, "this loop plans"
-        yield Moment(truth.force_N, truth.gap_mm, state, ", ".join(map(str, loop.step_state.safety.faults)))
+        yield truth.force_N, truth.gap_mm, state, ", ".join(map(str, loop.step_state.safety.faults))
 
 
 def _coarse(case: Case) -> Iterator[Moment]:
@@ -149,7 +143,7 @@ def _coarse(case: Case) -> Iterator[Moment]:
             planner = made.later.planner
         elif tick > begins and tick % each_s == 0:
             is_doubted = state.plan.sensor_doubted_s > SENSOR_FAULT_S
-            yield Moment(element.force_N, gap_mm, state, str(Fault.SENSOR) if is_doubted else "")
+            yield element.force_N, gap_mm, state, str(Fault.SENSOR) if is_doubted else ""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -165,5 +159,4 @@ def run(options: argparse.Namespace) -> Found:
     cases = [Case(plant, *mode, options.seconds, options.coarse) for plant in options.plant for mode in MODES]
     with ProcessPoolExecutor(options.workers) as pool:
         holds = list(tqdm(pool.map(hold, cases), total=len(cases), desc="holds", disable=None))
-    figures = {"synthetic": True, "force_N": FORCE_N, "holds": holds}
-    return Found(figures)
+    return Found({"synthetic": True, "force_N": FORCE_N, "holds": holds})

@@ -237,7 +237,7 @@ def table_4_1(data: Json) -> str:
     """The section on table 4.1, thesis and ours side by side."""
     rows = []
     for row in data["rows"]:
-        for name, printed in TABLE_4_1[row["class"]]._asdict().items():
+        for name, printed in TABLE_4_1[row["class"]].items():
             ours = row[name]
             rows.append(
                 (

@@ -33,7 +33,6 @@ class StepTest(NamedTuple):
 
     insert: str
     time_s: Array
-    gap_mm: Array
     force_N: Array
     level_gap_mm: Array
     level_force_N: Array
@@ -64,5 +63,5 @@ def step_test(fitted: Insert, seed: int) -> StepTest:
             rows.append((sample.time_s - began_s, estimate.gap_mm, estimate.force_N))
     record = np.array(rows)
     settled = record.reshape(len(GAPS_MM), -1, 3)[:, -round(SETTLED_S / 1e-3) :].mean(axis=1)
-    time_s, gap_mm, force_N = record[::EVERY].T
-    return StepTest(fitted.name, time_s, gap_mm, force_N, settled[:, 1], settled[:, 2])
+    time_s, _, force_N = record[::EVERY].T
+    return StepTest(fitted.name, time_s, force_N, settled[:, 1], settled[:, 2])
