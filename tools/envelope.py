@@ -242,8 +242,7 @@ def model_on_plant() -> Json:
 
 def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures]]]:
     """Everything; the keys are those of the public contract, and `model`, `peak_N`, `settled_N`, `rows`."""
-    draws = QUICK_DRAWS if options.quick else options.draws
-    lasts_s = QUICK_LOW_HOLD_S if options.quick else options.hold_s
+    draws, lasts_s = (QUICK_DRAWS, QUICK_LOW_HOLD_S) if options.quick else (DRAWS, LOW_HOLD_S)
     asked = list(cases(draws))
     holds = [(name, force_N, lasts_s) for name in judging(min(draws, HELD_DRAWS)) for force_N in LOW_N]
     with ProcessPoolExecutor(max_workers=options.jobs) as pool:
@@ -322,10 +321,6 @@ def main() -> int:
     """Measures, prints, and draws; 0 only if the bounds were kept and nothing faulted."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a sample of it: two draws, short holds")
-    parser.add_argument("--draws", type=int, default=DRAWS, help=f"random devices ({DRAWS})")
-    parser.add_argument(
-        "--hold-s", type=float, default=LOW_HOLD_S, help=f"a force under F_min is held ({LOW_HOLD_S:g})"
-    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--picture", type=Path, help="PNG of the force error over handle speed and asked force")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")

@@ -244,7 +244,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help=f"sample 1 alone, and {QUICK_S:g} s: a look, no figure")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--store", action="store_true", help="write the file that comes with the package")
-    parser.add_argument("--kept", type=Path, default=KEPT, help="JSON file that keeps finished runs")
     executors.add_options(parser, 1, needed="tormagd, and tools/ on their path")
     options = parser.parse_args(arguments)
     seconds, longest_s, samples = (QUICK_S, QUICK_S, SAMPLES[:1]) if options.quick else (SECONDS, LONGEST_S, SAMPLES)
@@ -253,7 +252,7 @@ def main(arguments: list[str] | None = None) -> int:
         names = recorded(FOLDER) if options.recordings else options.scenes or list(shipped_scenes())
         with executors.chosen(options) as executor:
             for name in [] if options.wrong else names:
-                runs = partial(run_all, executor=executor, kept=options.kept)
+                runs = partial(run_all, executor=executor, kept=KEPT)
                 found.append(measure(name, runs, samples, seconds, longest_s))
                 if options.store:
                     others = [scene for scene in measured().scenes if scene.name != found[-1].name]
