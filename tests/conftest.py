@@ -37,6 +37,15 @@ WATCHED = pytest.StashKey[HostWatch]()
 
 
 @pytest.fixture
+def recordings() -> Path:
+    """The folder of measured data, which is not part of the repository."""
+    folder = Path(os.environ.get("TORMAG_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip("no measured data: set TORMAG_DATA to its folder")
+    return folder
+
+
+@pytest.fixture
 def usual_slices() -> Iterator[None]:
     """What a test has asked the kernel for, the next one does not run with."""
     yield

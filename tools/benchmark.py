@@ -11,9 +11,8 @@ import json
 import sys
 from collections.abc import Sequence
 
-from benchmarks.table import lines
-
 from tormagd.headroom.machine_loop import machine_us
+from tormagd.lab.told import lines
 
 MEASUREMENTS = {
     "inverse": "speed against accuracy of the searches for the field",
@@ -40,10 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     before_us = machine_us()
     result = module.measure(options)
     result["machine_us"] = round((before_us + machine_us()) / 2.0, 1)
-    if options.json:
-        print(json.dumps(result))
-    else:
-        print(*lines(result), sep="\n")
+    print(json.dumps(result) if options.json else "\n".join(lines(result)))
     return 0
 
 

@@ -8,6 +8,7 @@ prediction. A show that the host disturbed is told as that, and started again; t
 host.
 """
 
+import argparse
 import concurrent.futures
 import signal
 import sys
@@ -17,7 +18,7 @@ from typing import Any
 
 import msgspec
 from machines.host import Host
-from rendering.following import Array, Case, Rehearsals, Tracking, rehearse
+from rendering.following import Case, Rehearsals, Tracking, rehearse
 from rendering.show import (
     LEAST_N,
     MOST_N,
@@ -32,6 +33,7 @@ from rendering.show import (
 )
 
 from tormagd.config import Config
+from tormagd.lab.arrays import Array
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.endpoints import ConfigError
 
@@ -63,6 +65,7 @@ class Verdict(IntEnum):
 
 def main() -> int:
     """Runs the demonstration; 0: what the scene states was met, 1: missed, 3: the host left too little to say."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     started_s = time.monotonic()
     times_s, forces_N = profile()
     config = Config(scene="pulse")

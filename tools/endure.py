@@ -35,7 +35,6 @@ class Case(NamedTuple):
 CASES = {
     "fuzz": Case("fuzz", 11_000_000, "damaged frames"),
     "walk": Case("walk", 10_000_000, "steps"),
-    "files": Case("files", 26, "files"),
     "replug-serial": Case("replug", 200, "cycles", ("serial",)),
     "replug-can": Case("replug", 200, "cycles", ("can",)),
     "stalls": Case("stalls", 400, "stops", on_stand=True),

@@ -20,16 +20,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
-from benchmarks.table import lines
 from rendering.device_draws import SAMPLES, device, judging
-from rendering.following import CORNER_SCENE, VALID_S, Array, Followed, Levels, armed_at_rest, asked_at, follow
-from rendering.hands import HANDS, TURNED_MM_S
-from rendering.ideal_carriage import Json, brake_of
+from rendering.following import CORNER_SCENE, VALID_S, Followed, Levels, armed_at_rest, asked_at, follow
+from rendering.hands import HANDS
 from tqdm import tqdm
 
 from tormagd.control.records import TimedSetpoint
+from tormagd.lab.arrays import Array, Json, Mask
+from tormagd.lab.ideal_carriage import TURNED_MM_S, brake_of
 from tormagd.lab.pages import stamp
+from tormagd.lab.told import lines
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.model_file import load_model
 from tormagd.model.shipped import model_path
@@ -190,7 +190,7 @@ def lasted_s(is_same: Iterable[bool]) -> Array:
     return np.array(lasted)
 
 
-def sliding(handle_mm: Array, speed_mm_s: Array) -> npt.NDArray[np.bool_]:
+def sliding(handle_mm: Array, speed_mm_s: Array) -> Mask:
     """Where the handle has gone SLIDING_MM since it turned, and moves."""
     found, turned_mm, direction = np.zeros(len(handle_mm), dtype=np.bool_), float(handle_mm[0]), 0.0
     for index, (position, speed) in enumerate(zip(handle_mm.tolist(), speed_mm_s.tolist(), strict=True)):
@@ -242,8 +242,7 @@ def model_on_plant() -> Json:
 
 def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures]]]:
     """Everything; the keys are those of the public contract, and `model`, `peak_N`, `settled_N`, `rows`."""
-    draws = QUICK_DRAWS if options.quick else options.draws
-    lasts_s = QUICK_LOW_HOLD_S if options.quick else options.hold_s
+    draws, lasts_s = (QUICK_DRAWS, QUICK_LOW_HOLD_S) if options.quick else (DRAWS, LOW_HOLD_S)
     asked = list(cases(draws))
     holds = [(name, force_N, lasts_s) for name in judging(min(draws, HELD_DRAWS)) for force_N in LOW_N]
     with ProcessPoolExecutor(max_workers=options.jobs) as pool:
@@ -322,20 +321,13 @@ def main() -> int:
     """Measures, prints, and draws; 0 only if the bounds were kept and nothing faulted."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a sample of it: two draws, short holds")
-    parser.add_argument("--draws", type=int, default=DRAWS, help=f"random devices ({DRAWS})")
-    parser.add_argument(
-        "--hold-s", type=float, default=LOW_HOLD_S, help=f"a force under F_min is held ({LOW_HOLD_S:g})"
-    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--picture", type=Path, help="PNG of the force error over handle speed and asked force")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
     options = parser.parse_args()
     result, found = measure(options)
-    if options.json:
-        print(json.dumps(result))
-    else:
-        worst = sorted(result["rows"], key=lambda shown: -shown["over_N"])[:6]
-        print("\n".join(lines(result | {"rows": worst})))
+    worst = sorted(result["rows"], key=lambda shown: -shown["over_N"])[:6]
+    print(json.dumps(result) if options.json else "\n".join(lines(result | {"rows": worst})))
     if options.picture is not None:
         picture(options.picture, result, found)
     wrong = missed(result)

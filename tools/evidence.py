@@ -49,7 +49,6 @@ PARTS = {
         "not over after two frames; C and Python differ {languages_differ} times",
     ),
     "walk": Part("tools/endure.py walk --json", "{steps:,} steps, {driven:,} of them driven"),
-    "files": Part("tools/endure.py files --json", "{count} files, {memory_MB} MB at most"),
     "replug-serial": Part(
         "tools/endure.py replug-serial --json", "{cycles} cycles; lost after {lost_after_ms} ms at most"
     ),

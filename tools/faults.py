@@ -17,6 +17,7 @@ from fault_matrix.rig import Rig
 from fault_matrix.watch import Cell, Watch
 from tqdm import tqdm
 
+from tormagd.lab.told import table
 from tormagd.safety.operating_state import RefusedError
 
 INJECTED_S = 5.0
@@ -25,6 +26,11 @@ USUAL_S = 2.0
 WATCHED_S = 6.0
 CONNECTED_S = 0.5
 ARMING_S = 14.0
+SHOWN = (
+    *("fault", "bus", "host_faults", "device_faults", "limits", "reaction", "named", "safe", "in_time", "recovered"),
+    *("noticed_ms", "reacted_ms", "stated_ms", "open_ms", "loss_N_s", "tried", "recovery"),
+)
+"Of a cell, for a person."
 
 
 def main() -> int:
@@ -46,7 +52,7 @@ def main() -> int:
     if options.json:
         print(json.dumps({"plant": options.plant, "cells": [cell._asdict() for cell in cells]}))
     else:
-        print_table(cells)
+        print(*table({name: getattr(cell, name) for name in SHOWN} for cell in cells), sep="\n")
     return 0 if all(cell.named and cell.safe and cell.in_time and cell.recovered for cell in cells) else 1
 
 
@@ -104,17 +110,6 @@ def _is_taken(rig: Rig, watch: Watch, command: str) -> bool:
         watch.refuse(error)
         return False
     return True
-
-
-def print_table(cells: list[Cell]) -> None:
-    """The matrix for a person."""
-    for cell in cells:
-        told = [*cell.host_faults, *(f"device:{fault}" for fault in cell.device_faults), *cell.limits]
-        verdicts = {"UNNAMED": cell.named, "UNSAFE": cell.safe, "LATE": cell.in_time, "NOT RECOVERED": cell.recovered}
-        failed = "".join(f" {word}" for word, is_so in verdicts.items() if not is_so)
-        times = f"reacted {cell.reacted_ms} ms, stated {cell.stated_ms}, open {cell.open_ms}; {cell.loss_N_s} N/s"
-        print(f"{cell.fault}, {cell.bus}: {cell.expected}; {', '.join(told) or 'nothing'}; {cell.reaction}{failed}")
-        print(f"    {times}; {', '.join(cell.recovery) or 'by itself'}")
 
 
 if __name__ == "__main__":

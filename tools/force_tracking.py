@@ -21,11 +21,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmarks.table import lines
 from rendering import cases
 from rendering.device_draws import SAMPLES, judging
-from rendering.ideal_carriage import Json
 from tqdm import tqdm
+
+from tormagd.lab.arrays import Json
+from tormagd.lab.told import lines
 
 DRAWS = 40
 OF_DEVICES = {"steps": cases.steps, "creep": cases.creep, "speeds": cases.speeds, "pulse": cases.pulse}
@@ -89,10 +90,8 @@ def main() -> int:
     with ProcessPoolExecutor(max_workers=options.jobs) as pool:
         for case in options.cases or CASES:
             result[case] = measure(case, options, pool, kept)
-    if options.json:
-        print(json.dumps(result))
-    else:
-        print(*lines({case: found if case in OF_SIGNALS else worst(found) for case, found in result.items()}), sep="\n")
+    told = {case: found if case in OF_SIGNALS else worst(found) for case, found in result.items()}
+    print(json.dumps(result) if options.json else "\n".join(lines(told)))
     if options.picture is not None:
         from rendering.pictures import tracking_picture
 

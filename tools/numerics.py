@@ -23,13 +23,14 @@ from typing import Any
 
 import mpmath as mp
 import numpy as np
-from benchmarks.table import lines
 from extremes.cases import DIGITS, Batch, draw_batch, reference
 from extremes.steps import worst_step_errors
 from extremes.tally import COUNTS, Tally
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from tormagd.lab.arrays import Mask
+from tormagd.lab.told import lines
 from tormagd.physics.errors import FloatArray
 from tormagd.physics.field import ThesisFieldLaw
 from tormagd.physics.force import (
@@ -54,7 +55,7 @@ STIFF = 0.7
 """lambda1 from which on float32 is held to the narrower bound."""
 
 
-def evaluate(batch: Batch, x: FloatArray) -> tuple[NDArray[np.bool_], dict[str, FloatArray]]:
+def evaluate(batch: Batch, x: FloatArray) -> tuple[Mask, dict[str, FloatArray]]:
     """(admissible, every quantity at the admissible x), in the precision of x."""
     law, elastomer, geometry = batch.field, batch.elastomer, batch.geometry
     moment_Tm = x if law is None else law.radial_moment_Tm(x)
@@ -98,7 +99,7 @@ def nonfinite(values: dict[str, FloatArray]) -> int:
     return sum(int((~np.isfinite(value)).sum()) for value in values.values())
 
 
-def _inside(batch: Batch, x: FloatArray) -> NDArray[np.bool_]:
+def _inside(batch: Batch, x: FloatArray) -> Mask:
     """Rounding to float32 may carry a gap to 95 mm, where the slope of Eq. 7 is zero."""
     return x < np.float32(95.0) if isinstance(batch.field, ThesisFieldLaw) else np.isfinite(x)
 
@@ -136,7 +137,7 @@ def _compare_with_float32(tally: Tally, batch: Batch, single: NDArray[np.float32
 def _compare_with_reference(
     tally: Tally,
     batch: Batch,
-    admissible: NDArray[np.bool_],
+    admissible: Mask,
     values: dict[str, FloatArray],
     rng: np.random.Generator,
     references: int,

@@ -8,7 +8,7 @@ import ast
 import inspect
 import itertools
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -19,6 +19,7 @@ from tormagd import config
 from tormagd.ctl import main as ctl
 from tormagd.daemon import main as daemon
 from tormagd.hardware import can_backend, serial_backend
+from tormagd.lab.pages import table
 from tormagd.simulation import __main__ as simulation
 
 FOLDER = Path(__file__).parents[1] / "docs" / "reference"
@@ -59,11 +60,11 @@ def main() -> int:
 def configuration_page() -> str:
     """Every key with its default, what is allowed, and why."""
     parts = [_CONFIGURATION_HEAD]
-    for table, kind in (*tables(config.Config, ""), *BACKENDS.items()):
+    for heading, kind in (*tables(config.Config, ""), *BACKENDS.items()):
         says = " ".join(inspect.cleandoc(kind.__doc__ or "").split())
-        parts.append(f"## {table or 'At the top'}\n\n{says}\n")
+        parts.append(f"## {heading or 'At the top'}\n\n{says}\n")
         rows = [(f"`{key.name}`", key.default, key.allowed, key.why) for key in keys(kind)]
-        parts.append(_table(("key", "default", "allowed", "what and why"), rows))
+        parts.append(table(("key", "default", "allowed", "what and why"), rows))
     return "\n".join(parts)
 
 
@@ -93,12 +94,12 @@ def commands_page() -> str:
     for parser in (daemon.parser(), ctl.parser(), simulation.parser(), conformance.parser()):
         parts.append(f"## {parser.prog}\n\n{parser.description}\n")
         shared = _options(parser)
-        parts.append(_table(("option", "what"), shared))
+        parts.append(table(("option", "what"), shared))
         for name, command in _subparsers(parser):
             own = [row for row in _options(command) if row not in shared]
             parts.append(f"### {parser.prog} {name}\n\n{command.description}\n")
             if own:
-                parts.append(_table(("option", "what"), own))
+                parts.append(table(("option", "what"), own))
     return "\n".join(parts)
 
 
@@ -131,11 +132,6 @@ def _called(action: argparse.Action, formatter: argparse.HelpFormatter) -> str:
 def _says(action: argparse.Action) -> str:
     says = (action.help or "").replace("%(default)s", str(action.default)).replace("%%", "%")
     return says.replace("|", "\\|") or "-"
-
-
-def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
-    lines = [head, ("---",) * len(head), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def _default(field: msgspec.structs.FieldInfo) -> str:

@@ -23,9 +23,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from benchmarks.table import lines
 from rendering.device_draws import SAMPLES
-from rendering.ideal_carriage import Json
 from rendering.scene_runs import ROOT, Case, costs, run, run_all
 from rendering.signals import Signal, data_folder, recorded_signals
 
@@ -34,6 +32,8 @@ from tormagd.headroom.__main__ import build
 from tormagd.headroom.machine_loop import machine_us
 from tormagd.inverse.choice import RUNTIME_SOLVERS
 from tormagd.lab import executors
+from tormagd.lab.arrays import Json
+from tormagd.lab.told import lines
 from tormagd.output import write_line
 from tormagd.scenes.measured import (
     FILE,
@@ -244,7 +244,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help=f"sample 1 alone, and {QUICK_S:g} s: a look, no figure")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--store", action="store_true", help="write the file that comes with the package")
-    parser.add_argument("--kept", type=Path, default=KEPT, help="JSON file that keeps finished runs")
     executors.add_options(parser, 1, needed="tormagd, and tools/ on their path")
     options = parser.parse_args(arguments)
     seconds, longest_s, samples = (QUICK_S, QUICK_S, SAMPLES[:1]) if options.quick else (SECONDS, LONGEST_S, SAMPLES)
@@ -253,7 +252,7 @@ def main(arguments: list[str] | None = None) -> int:
         names = recorded(FOLDER) if options.recordings else options.scenes or list(shipped_scenes())
         with executors.chosen(options) as executor:
             for name in [] if options.wrong else names:
-                runs = partial(run_all, executor=executor, kept=options.kept)
+                runs = partial(run_all, executor=executor, kept=KEPT)
                 found.append(measure(name, runs, samples, seconds, longest_s))
                 if options.store:
                     others = [scene for scene in measured().scenes if scene.name != found[-1].name]

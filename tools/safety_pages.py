@@ -6,12 +6,12 @@ Two tests hold the pages to what they are made from. `python tools/safety_pages.
 import json
 import sys
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from fault_matrix.cases import LEFT_OUT
 
+from tormagd.lab.pages import table
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd.safety.operating_state import ROWS, DeviceRequest, Event, Guard, OperatingState, Refusal, Transition
 
@@ -69,8 +69,8 @@ def matrix_page(record: dict[str, Any]) -> str:
         name = fault if buses[fault] == 1 else f"{fault} ({alike[0]['bus']})"
         safe_s = [cell["seconds"] for cell in alike if cell["seconds"] is not None]
         rows.append((name, named, reaction, f"{max(safe_s):.3f} s" if safe_s else "-", leads_out))
-    never = "\n## What is no row, and why\n\n" + _table(("fault", "why"), [*LEFT_OUT.items()])
-    return _MATRIX_HEAD + says + _table(("fault", "named as", "reaction", "safe after", "leads out"), rows) + never
+    never = "\n## What is no row, and why\n\n" + table(("fault", "why"), [*LEFT_OUT.items()])
+    return _MATRIX_HEAD + says + table(("fault", "named as", "reaction", "safe after", "leads out"), rows) + never
 
 
 def _outcome(cell: dict[str, Any]) -> tuple[str, ...]:
@@ -103,7 +103,7 @@ def _transitions() -> str:
     return (
         "## Events\n\nWhere every event leads from every state, or what it is refused with. Without a device every "
         "command but `stop` is refused with `not_connected`, whatever else is in its way.\n\n"
-        + _table(("event", *OperatingState, "guards, in their order", "device is asked"), rows)
+        + table(("event", *OperatingState, "guards, in their order", "device is asked"), rows)
         + "\n"
     )
 
@@ -121,7 +121,7 @@ def _guards() -> str:
     rows = [(f"`{guard.code}`", guard.wants, guard.remedy) for guard in known.values()]
     return (
         "## Guards\n\nA command is refused with the first that does not hold.\n\n"
-        + _table(("refused as", "wants that", "otherwise"), rows)
+        + table(("refused as", "wants that", "otherwise"), rows)
         + "\n"
     )
 
@@ -136,19 +136,14 @@ def _faults() -> str:
         "## Faults\n\nLatched until `clear-fault`, and then `home`; no homing is wanted after "
         f"{stay}. Several that show at once are named in this order: causes before what follows of them. The reaction "
         "is on its way by so many ms from when the fault is there and shows; 50 are the device's own timeout.\n\n"
-        + _table(("fault", "means", "reaction", "by, ms", "remedy"), rows)
+        + table(("fault", "means", "reaction", "by, ms", "remedy"), rows)
         + "\n"
     )
 
 
 def _limits() -> str:
     rows = [(f"`{limit}`", LIMITS[limit].cause, LIMITS[limit].reaction, LIMITS[limit].remedy) for limit in Limit]
-    return "## Limits\n\nThey come and go by themselves.\n\n" + _table(("limit", "means", "reaction", "remedy"), rows)
-
-
-def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
-    lines = [head, tuple("---" for _ in head), *rows]
-    return "".join(f"| {' | '.join(line)}\n" for line in lines)
+    return "## Limits\n\nThey come and go by themselves.\n\n" + table(("limit", "means", "reaction", "remedy"), rows)
 
 
 if __name__ == "__main__":

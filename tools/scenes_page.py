@@ -11,7 +11,7 @@ from benchmarks.scenes import core_without, draw
 from matplotlib.figure import Figure
 from rendering.scene_runs import ROOT
 
-from tormagd.lab.pages import stamp
+from tormagd.lab.pages import stamp, table
 from tormagd.scenes.measured import JUDGED, MeasuredScene, is_met, measured, on_first
 from tormagd.scenes.scene import TERMS, Scene, load_scene, scene_path, shipped_scenes, terms_of
 from tormagd.scenes.signal import asked
@@ -40,7 +40,7 @@ def page() -> str:
     known = {scene.name: scene for scene in file.scenes}
     parts = [
         _head(file.share),
-        _table(
+        table(
             ["scene", "asked", "tolerance", "device gives", "RMS all / chosen", "cost all / chosen", "rates", "search"],
             [_row(load_scene(name), known[name]) for name in shipped_scenes() if name in known],
         ),
@@ -53,7 +53,7 @@ def page() -> str:
         _rates(file.scenes),
         _search(file.scenes),
     ]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(part.rstrip() for part in parts) + "\n"
 
 
 def _head(share: float) -> str:
@@ -124,7 +124,7 @@ def _terms(scenes: tuple[MeasuredScene, ...]) -> str:
         "device's least, from a handle that is too slow to teach what the device is. "
         f"All terms run, whatever is required, in {', '.join(whole)}: they say so. What was asked once about single "
         "terms is answered in [a decision](decisions/0009-what-a-scene-requires.md).\n\n"
-        + _table(["scene", *(f"`{term}`" for term in TERMS)], rows)
+        + table(["scene", *(f"`{term}`" for term in TERMS)], rows)
     )
 
 
@@ -161,7 +161,7 @@ def _rates(scenes: tuple[MeasuredScene, ...]) -> str:
         "as plans are made, or as the scene says. 83 Hz is the thesis's own rate, 1 / (4 + 8 ms). At 250 Hz of control "
         "the position loop keeps 4.5 dB; the daemon never watches less often than 500 Hz, so that no scene gets 250. "
         "Of the others each scene that is met gets the lowest that does what the usual, 1000 / 500, does.\n\n"
-        f"{_table(head, rows)}"
+        f"{table(head, rows)}"
     )
 
 
@@ -184,13 +184,8 @@ def _search(scenes: tuple[MeasuredScene, ...]) -> str:
         "neighbour is enough, as it is not on [the pad](tactile.md). `nearest` and `coarse-to-fine` run only where a "
         "brake's scene names them: `pulse` does, to show the k-nearest search in `make run`.\n\n"
         "RMS on sample 1, mN / processor time, %, with the chosen terms and rates and a search that is named.\n\n"
-        + _table(["scene", "runs, %", *(f"`{name}`" for name in names)], rows)
+        + table(["scene", "runs, %", *(f"`{name}`" for name in names)], rows)
     )
-
-
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def draw_asked(path: Path) -> None:

@@ -222,7 +222,7 @@ def test_a_sweep_file_that_is_none_says_why(tmp_path):
     for text, told in (
         ("a,b\n1,2\n", "header"),
         (",".join(FILE_COLUMNS) + "\n1,2,3,4,5,x\n", "x"),
-        (",".join(FILE_COLUMNS) + "\n1,2,3,4,5,nan\n1,2,3,4,5,6\n", "finite"),
+        (",".join(FILE_COLUMNS) + "\n1,2,3,4,5,nan\n1,2,3,4,5,6\n", "only numbers -1000 to 1000"),
     ):
         path = tmp_path / "sweep.csv"
         path.write_text(text)

@@ -4,6 +4,7 @@ Where namespaces are not permitted, it is skipped.
 """
 
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -15,14 +16,43 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from machines.two import HERE, THERE, NotPermittedError, two_machines
 
 from tormagd_client.endpoints import ENDPOINTS
 
 pytestmark = pytest.mark.live
 
+HERE, THERE = "192.0.2.1", "192.0.2.2"
+"Made for documentation (RFC 5737)."
+_NUMBERS = itertools.count(1)
 PATIENCE_S = 60.0
 CTL = [sys.executable, "-m", "tormagd.ctl.main"]
+
+
+@contextlib.contextmanager
+def two_machines() -> Iterator[list[tuple[str, ...]]]:
+    """Network namespaces with a cable between them: what a command begins with to run at HERE, and at THERE. What runs
+    there has to have ended before they are taken away."""
+    number = f"{os.getpid() % 10_000}{next(_NUMBERS)}"
+    here, there = (f"tormag{number}{end}" for end in "ab")
+    with contextlib.ExitStack() as stack:
+        for line in (
+            f"netns add {here}",
+            f"netns add {there}",
+            f"link add t{number}a netns {here} type veth peer name t{number}b netns {there}",
+            f"-n {here} addr add {HERE}/30 dev t{number}a",
+            f"-n {there} addr add {THERE}/30 dev t{number}b",
+            f"-n {here} link set t{number}a up",
+            f"-n {there} link set t{number}b up",
+        ):
+            try:
+                subprocess.run(["ip", *line.split()], check=True, capture_output=True, text=True)
+            except (OSError, subprocess.CalledProcessError) as error:
+                reason = getattr(error, "stderr", "") or str(error)
+                pytest.skip(f"no network namespaces here: ip {line}: {reason.strip()}")
+            if line.startswith("netns"):
+                name = line.split()[-1]
+                stack.callback(subprocess.run, ["ip", "netns", "del", name], check=False, capture_output=True)
+        yield [("ip", "netns", "exec", name) for name in (here, there)]
 
 
 class Machines:
@@ -37,10 +67,7 @@ class Machines:
         """Everything anew in another folder."""
         self.close()
         self.folder, self.keys = folder, folder / "keys"
-        try:
-            self._within = self._stack.enter_context(two_machines())
-        except NotPermittedError as error:
-            pytest.skip(str(error))
+        self._within = self._stack.enter_context(two_machines())
         clients = ("--publish", "robot", "--operate", "console", "--observe", "screen")
         subprocess.run([*CTL, "keys", "generate", str(self.keys), *clients], check=True, capture_output=True)
         addresses = "".join(f'{name} = "tcp://{HERE}:{5_555 + n}"\n' for n, name in enumerate(ENDPOINTS))

@@ -6,19 +6,19 @@ from pathlib import Path
 import pytest
 
 from tormagd.ctl.waveform import read_csv
-from tormagd.lab.design.recorded_task import read_task
+from tormagd.force_file import read_forces
 from tormagd.scenes.signal import recorded
 
-READERS: tuple[Callable[[Path], object], ...] = (read_csv, recorded, read_task)
+READERS: tuple[Callable[[Path], object], ...] = (read_csv, recorded, read_forces)
 
 
 @pytest.mark.parametrize("text", ["t_s,force_N\n0,1\n1,2\n3,1\n", "rate_mm_s,force_N,t_s\n5,1,7\n5,2,8\n-5,0,9.5\n"])
 def test_all_read_the_same_files(tmp_path: Path, text: str) -> None:
     path = tmp_path / "task.csv"
     path.write_text(text)
-    sent, (time_s, force_N), task = read_csv(path), recorded(path), read_task(path)
-    assert [sent.at(at_s).force_N for at_s in time_s] == force_N.tolist() == task.force_N.tolist()
-    assert (task.time_s - task.time_s[0]).tolist() == time_s.tolist()
+    sent, (time_s, force_N), table = read_csv(path), recorded(path), read_forces(path)
+    assert [sent.at(at_s).force_N for at_s in time_s] == force_N.tolist() == list(table["force_N"])
+    assert [at_s - table["t_s"][0] for at_s in table["t_s"]] == time_s.tolist()
 
 
 @pytest.mark.parametrize(

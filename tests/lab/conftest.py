@@ -1,8 +1,5 @@
 """The thesis's device and use cases, as the design tests want them."""
 
-import os
-from pathlib import Path
-
 import pytest
 
 from tormagd.lab.design.brake import Brake
@@ -37,12 +34,3 @@ def problem(use_case_2: Region) -> Problem:
 @pytest.fixture(scope="session")
 def as_built() -> Design:
     return Design(11.0, 20.0, 95.0)
-
-
-@pytest.fixture
-def recordings() -> Path:
-    """The folder of measured data, which is not part of the repository."""
-    folder = Path(os.environ.get("TORMAG_DATA", Path(__file__).parents[3] / "shared" / "data"))
-    if not folder.is_dir():
-        pytest.skip("no measured data: set TORMAG_DATA to its folder")
-    return folder

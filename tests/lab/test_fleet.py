@@ -133,5 +133,5 @@ def test_what_cannot_be_looked_at_is_told(url, reason, tmp_path, capsys):
 
 def test_a_worker_that_dies_is_told_with_its_file(folder):
     with ThreadPoolExecutor(1) as here:
-        found = read_all({"a.mcap": 3}, here)  # type: ignore[dict-item]
-    assert found.left_out["a.mcap"].startswith("the worker that read it failed: ")
+        _, left_out = read_all({"a.mcap": 3}, here)  # type: ignore[dict-item]
+    assert left_out["a.mcap"].startswith("the worker that read it failed: ")

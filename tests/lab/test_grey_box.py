@@ -120,12 +120,6 @@ def test_a_memory_needs_times(grey: GreyBox, cycles: Dataset) -> None:
         grey.predict(Dataset(cycles.features, cycles.force_N))
 
 
-def test_relaxation_tests_without_a_rest_are_refused(cycles: Dataset) -> None:
-    moving = cycles.subset(cycles.features[:, 1] != 0)
-    with pytest.raises(DomainError, match="holds"):
-        fit_series(moving, parts(moving.features))
-
-
 def test_a_fit_goes_on_from_its_start(cycles: Dataset) -> None:
     model, training = fit_network(cycles, np.ones(len(cycles), dtype=bool), 15, epochs=30)
     _, goes_on = fit_network(cycles, cycles.features[:, 2] < 250, 15, epochs=1, start=model)

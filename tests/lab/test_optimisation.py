@@ -1,5 +1,4 @@
 import itertools
-import math
 from functools import cache
 
 import msgspec
@@ -101,28 +100,6 @@ def test_corner_cost_of_a_perfect_match_is_nothing(problem: Problem, as_built: D
     own = msgspec.structs.replace(problem, region=problem.portrait(as_built).trapezoid(), measure="corners")
     assert corner_cost(own, as_built) == 0.0
     assert coverage(own, as_built) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize(
-    ("changes", "variable"),
-    [
-        ({"lower": Design(4.2, 0.5, 46.0)}, "lower.outer_radius_mm"),
-        ({"lower": Design(6.5, 0.5, 45.0)}, "lower.open_mm"),
-        ({"lower": Design(6.5, 60.0, 46.0)}, "upper.thickness_mm"),
-        ({"upper": Design(math.inf, 50.0, 200.0)}, "upper.outer_radius_mm"),
-    ],
-)
-def test_impossible_problems_are_refused(use_case_2: Region, changes: dict[str, Design], variable: str) -> None:
-    with pytest.raises(DomainError) as refused:
-        Problem(use_case_2, "true", 40.0, **changes)
-    assert refused.value.variable == variable
-
-
-def test_starts_outside_the_bounds_are_refused(problem: Problem) -> None:
-    with pytest.raises(DomainError, match=r"start\.outer_radius_mm"):
-        Run(problem, Design(5.0, 20.0, 95.0), "global")
-    with pytest.raises(DomainError, match=r"start\.open_mm"):
-        Run(problem, Design(11.0, 20.0, math.nan), "local")
 
 
 def test_what_a_design_covers_as_it_is_made_is_the_least_of_its_neighbours(use_case_1: Region) -> None:

@@ -102,8 +102,3 @@ def test_drawn_pads_differ_and_are_repeatable() -> None:
 def test_impossible_places_are_refused(place: tuple[float, float, float], name: str) -> None:
     with pytest.raises(DomainError, match=name):
         TactilePad(PADS["MRE-A"]).advance(0.1, *place)
-
-
-def test_a_relaxation_test_needs_samples_of_the_hold() -> None:
-    with pytest.raises(DomainError, match="samples"):
-        holding_records(PADS["MRE-A"], 0.0, 0, samples=46)

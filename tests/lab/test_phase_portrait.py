@@ -141,12 +141,3 @@ def test_impossible_brakes_and_speeds_are_refused(brake: Brake) -> None:
         PhasePortrait(brake, 0.0)
     with pytest.raises(DomainError, match="force_N"):
         brake.gap_mm(2.0 * brake.most_N)
-
-
-def test_clouds_that_are_not_points_are_refused(brake: Brake) -> None:
-    portrait = PhasePortrait(brake, 40.0)
-    for force, rate in (([1.0, math.nan], [0.0, 0.0]), ([1.0], [math.inf]), ([1.0, 2.0], [0.0]), ([], [])):
-        with pytest.raises(DomainError):
-            portrait.true_cloud(np.array(force), np.array(rate))
-        with pytest.raises(DomainError):
-            portrait.trapezoid_cloud(np.array(force), np.array(rate))

@@ -8,7 +8,6 @@ from tormagd.lab.design.range_fit import (
     leave_one_out,
     mean_relative_error,
 )
-from tormagd.physics.errors import DomainError
 from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
 from tormagd.physics.force import TORMAG, brake_force_N
 from tormagd.physics.inserts import INSERTS
@@ -69,13 +68,3 @@ def test_exponent_one_is_the_force_law_itself() -> None:
     forces = brake_force_N(law.radial_moment_Tm(np.array([45.0, 95.0])), item.elastomer, TORMAG)
     friction = item.elastomer.friction_coefficient
     assert friction * frictionless_range_N(item, law) == pytest.approx(forces[0] - forces[1], rel=1e-12)
-
-
-def test_what_cannot_be_fitted_is_refused() -> None:
-    law = PowerFieldLaw()
-    with pytest.raises(DomainError, match="inserts"):
-        fit_friction([], law)
-    with pytest.raises(DomainError, match="shore_hardness"):
-        leave_one_out(ALL[:1] + ALL[4:], law, free_exponent=False)
-    with pytest.raises(DomainError, match="exponent"):
-        fit_friction(ALL, law, float("nan"))

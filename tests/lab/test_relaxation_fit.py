@@ -57,17 +57,20 @@ def test_more_branches_than_the_record_shows_do_no_harm() -> None:
     assert sum(fit.series.fractions) == pytest.approx(0.13, rel=1e-3)
 
 
-def test_records_that_cannot_be_fitted() -> None:
-    good = record(HOLD_S, step())
-    with pytest.raises(LabError, match="14 rows"):
-        fit_relaxation(RelaxationRecord(*(column[:10] for column in good)))
-    with pytest.raises(LabError, match="rise strictly"):
-        fit_relaxation(good._replace(time_s=good.time_s[::-1].copy()))
-    with pytest.raises(LabError, match="both change"):
-        fit_relaxation(good._replace(driving=np.ones_like(good.driving)))
-    with pytest.raises(LabError, match="equilibrium"):
-        fit_relaxation(good._replace(force_N=-good.force_N))
-    with pytest.raises(LabError, match="branches = 7"):
-        fit_relaxation(good, branches=7)
-    with pytest.raises(DomainError, match="force_N"):
-        fit_relaxation(good._replace(force_N=np.where(good.time_s > 1.0, np.nan, good.force_N)))
+GOOD = record(HOLD_S, step())
+
+
+@pytest.mark.parametrize(
+    ("record_", "branches", "error", "said"),
+    [
+        (RelaxationRecord(*(column[:10] for column in GOOD)), 3, LabError, "14 rows"),
+        (GOOD._replace(time_s=GOOD.time_s[::-1].copy()), 3, LabError, "rise strictly"),
+        (GOOD._replace(driving=np.ones_like(GOOD.driving)), 3, LabError, "both change"),
+        (GOOD._replace(force_N=-GOOD.force_N), 3, LabError, "equilibrium"),
+        (GOOD, 7, LabError, "branches = 7"),
+        (GOOD._replace(force_N=np.where(GOOD.time_s > 1.0, np.nan, GOOD.force_N)), 3, DomainError, "force_N"),
+    ],
+)
+def test_records_that_cannot_be_fitted(record_, branches, error, said) -> None:
+    with pytest.raises(error, match=said):
+        fit_relaxation(record_, branches)

@@ -5,7 +5,6 @@ import pytest
 
 from tormagd.lab.design.brake import Brake
 from tormagd.lab.design.selection import ForceTask, judge, rank
-from tormagd.physics.errors import DomainError
 from tormagd.physics.field import ThesisFieldLaw
 
 STEP_MM = 0.1
@@ -67,14 +66,3 @@ def test_ranking_puts_the_finest_that_serves_first(brake: Brake) -> None:
     assert [verdict.insert for verdict in ranked][-1] == "short"
     assert len(serving) == 3
     assert [v.resolution_N for v in serving] == sorted(v.resolution_N for v in serving)
-
-
-@pytest.mark.parametrize("values", [(1.0, 1.0, 0.1), (-1.0, 1.0, 0.1), (0.0, 1.0, 0.0), (0.0, math.nan, 0.1)])
-def test_impossible_tasks_are_refused(values: tuple[float, float, float]) -> None:
-    with pytest.raises(DomainError):
-        ForceTask("task", *values)
-
-
-def test_impossible_steps_are_refused(brake: Brake) -> None:
-    with pytest.raises(DomainError, match="gap_resolution_mm"):
-        judge("it", brake, ForceTask("task", 1.0, 2.0, 0.1), 0.0)

@@ -55,12 +55,10 @@ def test_training_reaches_the_noise_floor() -> None:
 
 def test_every_accepted_step_lowers_the_training_error() -> None:
     training, validation = synthetic(500, 1), synthetic(200, 2)
-    seen: list[Epoch] = []
-    result = train(network_for(training), training, validation, epochs=30, progress=seen.append)
+    result = train(network_for(training), training, validation, epochs=30)
     errors = [step.train_rmse_N for step in result.history]
-    assert tuple(seen) == result.history
     assert errors == sorted(errors, reverse=True)
-    assert [step.epoch for step in seen] == list(range(1, len(seen) + 1))
+    assert [step.epoch for step in result.history] == list(range(1, len(errors) + 1))
 
 
 def test_the_weights_left_are_the_best_on_validation() -> None:
@@ -123,8 +121,6 @@ def test_what_cannot_be_trained_is_refused() -> None:
         Scaling.fit(data.features, np.ones(50))
     with pytest.raises(DomainError, match="hidden"):
         network_for(data, hidden=0)
-    with pytest.raises(DomainError, match="float64"):
-        train(network_for(data).to(torch.float32), data, data)
     for wrong in ({"epochs": 0}, {"patience": 0}):
         with pytest.raises(DomainError, match=next(iter(wrong))):
             train(network_for(data), data, data, **wrong)

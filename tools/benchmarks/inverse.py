@@ -21,7 +21,6 @@ from benchmarks import inverse_report as report
 from benchmarks.inverse_workload import (
     CIP_PERCENT,
     FIELDS_MT,
-    Array,
     Course,
     course,
     network_roots_mT,
@@ -34,6 +33,7 @@ from tormagd.inverse.choice import build, named
 from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
 from tormagd.inverse.scan import FieldScan
 from tormagd.inverse.solution import FieldSolver
+from tormagd.lab.arrays import Array
 from tormagd.model.model_file import ForceModel
 from tormagd.model.rising import falling_at
 from tormagd.scenes.scene import AUTO, load_scene, shipped_scenes
@@ -114,7 +114,7 @@ def make(case: Case, model: ForceModel) -> FieldSolver:
     if case.solver == "vectorised-argmin":
         return GridArgmin(model, dtype=torch.float64, field_range_mT=FIELDS_MT, step_mT=case.step_mT)
     # the thesis took its network's mean error for the radius; so does this, with its own network's
-    epsilon_N = model.metadata.metrics["mae_N"] if case.solver == "thesis-linear" else 0.0
+    epsilon_N = model.metadata.metrics["validation_mae_N"] if case.solver == "thesis-linear" else 0.0
     row = torch_row(model)
     return LinearFieldSearch(epsilon_N=epsilon_N, predict_one=row, field_range_mT=FIELDS_MT, step_mT=case.step_mT)
 

@@ -8,23 +8,19 @@ import datetime
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from tormagd.control.field_of_gap import FieldOfGap
+from tormagd.lab.arrays import Array
 from tormagd.lab.training.dataset import Dataset
-from tormagd.lab.training.levenberg_marquardt import train
-from tormagd.lab.training.metrics import fit_metrics
-from tormagd.model.features import Element, Scaling
-from tormagd.model.model_file import ForceModel, ModelMetadata
-from tormagd.model.network import ForceNetwork, to_model
+from tormagd.lab.training.fitting import fit_model
+from tormagd.model.features import Element
+from tormagd.model.model_file import ForceModel
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.physics.friction import Friction
 from tormagd.physics.inserts import insert
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.static_laws import radial_moment_Tm
-
-Array = npt.NDArray[np.float64]
 
 INSERT = insert("MRE-50-40")
 CIP_PERCENT = 100.0 * INSERT.cip_fraction
@@ -96,23 +92,18 @@ def training_data(plant: PlantParameters, rows: int, seed: int) -> Dataset:
 
 
 def trained(data: Dataset, hidden: int, epochs: int, seed: int = 0) -> ForceModel:
-    """A network with that many units, trained by Levenberg-Marquardt; its metrics hold `mae_N` of the held-out rows."""
-    training, validation = data.split(0.3, seed)
-    scaling = Scaling.fit(training.features, training.force_N)
-    network = ForceNetwork(scaling, hidden, seed=seed)
-    train(network, training, validation, epochs=epochs)
-    metadata = ModelMetadata(
+    """A network with that many units, trained by Levenberg-Marquardt; its metrics hold `validation_mae_N`."""
+    model, _ = fit_model(
+        *data.split(0.3, seed),
         element=Element.TORQUE,
         insert=INSERT.name,
-        hidden=hidden,
-        ranges=training.ranges(),
-        scaling=scaling,
-        training_data_sha256=data.sha256(),
-        metrics={},
+        data_sha256=data.sha256(),
         created=datetime.date(2024, 1, 1),
+        hidden=hidden,
+        epochs=epochs,
+        seed=seed,
     )
-    metadata.metrics.update(fit_metrics(to_model(network, metadata), validation))
-    return to_model(network, metadata)
+    return model
 
 
 def network_roots_mT(model: ForceModel, along: Course) -> list[Array]:

@@ -19,17 +19,15 @@ from typing import Any
 
 import msgpack
 import numpy as np
-import numpy.typing as npt
 import zmq
 
 from benchmarks.loop import Stand, add_realtime_arguments, asked_for, daemon, quantiles, realtime_settings
 from tormagd.config import Config, RealTime
 from tormagd.daemon.endpoint import context
 from tormagd.daemon.realtime import prepare, priority_of_threads
+from tormagd.lab.arrays import Array
 from tormagd.recording.ticks import decode_ticks
 from tormagd_client.messages import VERSION, Setpoint, encode
-
-Array = npt.NDArray[np.float64]
 
 LEAST_N, GRAIN_N = 1.0, 1e-4
 SPACING_S = (0.0015, 0.0025)

@@ -14,6 +14,7 @@ import argparse
 import asyncio
 import contextlib
 import multiprocessing
+import os
 import statistics
 import subprocess
 import sys
@@ -27,20 +28,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import uvloop
 import zmq
 from machines.host import processor_s
-from machines.own import own_machine
+from machines.own import end, own_machine
 from machines.wire import carried
 
-from benchmarks.against import add_against_argument, as_installed, environment
 from tormagd.config import Config, RealTime, load_config
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.heartbeat import Heartbeat
 from tormagd.daemon.realtime import prepare, priority_of_threads
 from tormagd.daemon.telemetry_loop import SERVED_BEFORE_NS
 from tormagd.headroom.bare_timer import beat
+from tormagd.lab.arrays import Array
 from tormagd.recording.ticks import decode_ticks
 from tormagd.simulation.device import DEFAULT_BAUD
 from tormagd_client import Client, ClientError
@@ -48,8 +48,7 @@ from tormagd_client.endpoints import ENDPOINTS, Endpoints
 from tormagd_client.messages import Request
 from tormagd_client.wire import keys_of, opened
 
-Array = npt.NDArray[np.float64]
-
+TOOLS = Path(__file__).parents[1]
 LOG = "tormagd.log"
 "What the daemon says, in its folder."
 CLIENTS = 8
@@ -270,7 +269,7 @@ def write_config(folder: Path, port: str, stand: Stand) -> Path:
 def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
     """The daemon on a simulated device, homed, enabled, with setpoints arriving (none where `setpoint_hz` is 0)."""
     with contextlib.ExitStack() as stack:
-        theirs = environment(None) if stand.root is None else as_installed(stand.root, folder)
+        theirs = environment(stand.root, folder)
 
         def started(*command: str, **streams: Any) -> "subprocess.Popen[str]":
             process = subprocess.Popen(command, env=theirs, text=True, **streams)
@@ -296,10 +295,27 @@ def daemon(stand: Stand, folder: Path) -> Iterator[Running]:
         yield config, process.pid
 
 
-def end(child: "subprocess.Popen[Any]") -> None:
-    """Ends what we began."""
-    child.terminate()
-    child.wait(20)
+def checkout(text: str) -> Path:
+    """The root of a checkout. Raises ArgumentTypeError for any other folder."""
+    root = Path(text).resolve()
+    if not (root / "tormagd" / "closed_loop.py").is_file() or not (root / "tools" / "benchmark.py").is_file():
+        raise argparse.ArgumentTypeError(f"{text}: allowed is the root of a checkout, with tormagd/ and tools/ in it")
+    return root
+
+
+def environment(root: Path | None, folder: Path) -> dict[str, str]:
+    """For a process that runs package and tools of that checkout; None for what runs here, which may be installed.
+
+    A checkout's backends are found by what its package says of itself, which is written into the folder. Raises
+    CalledProcessError.
+    """
+    if root is None:
+        folders = [str(TOOLS), *filter(None, [os.environ.get("PYTHONPATH")])]
+    else:
+        setup = [sys.executable, "-c", "from setuptools import setup; setup()", "--quiet"]
+        subprocess.run([*setup, "egg_info", "--egg-base", str(folder)], cwd=root, check=True, capture_output=True)
+        folders = [str(root), str(root / "client" / "src"), str(root / "tools"), str(folder)]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(folders), "OMP_NUM_THREADS": "1"}
 
 
 @contextlib.contextmanager
@@ -378,7 +394,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pairs", type=int, default=3, help="blocks of each kind (%(default)s)")
     parser.add_argument("--control-hz", type=int, default=1_000, metavar="HZ", help="(%(default)s)")
     parser.add_argument("--baud", type=int, default=DEFAULT_BAUD, help="of the device's line (%(default)s)")
-    add_against_argument(parser)
+    parser.add_argument(
+        "--against", type=checkout, metavar="FOLDER", help="root of another checkout, measured in turns with this one"
+    )
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:

@@ -6,7 +6,7 @@ those that `required_terms.py --store` measured.
 
 import argparse
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 from matplotlib.axes import Axes
@@ -14,12 +14,11 @@ from matplotlib.figure import Figure
 
 from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config
+from tormagd.lab.arrays import Json
 from tormagd.lab.pages import stamp
 from tormagd.lab.thesis.values import PULSE_MAE_MT
 from tormagd.scenes.measured import JUDGED, MeasuredScene, measured, on_first
 from tormagd.scenes.scene import EVERY_TERM, TERMS, load_scene
-
-Json = dict[str, Any]
 
 THESIS_HZ, THESIS_SOLVE_MS, THESIS_ERROR_N = 83, 4.0, 1.26
 "Its controller's rate, the time of its search, and its network's mean error of the force, on its tactile element."

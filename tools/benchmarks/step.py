@@ -12,21 +12,19 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config, Motor
 from tormagd.control.core import Stepper
 from tormagd.control.move.motor import margins, zero_order_hold
 from tormagd.control.records import Plan
+from tormagd.lab.arrays import Array
 from tormagd.lab.tune_position import corner_margins
 from tormagd.scenes.scene import EVERY_TERM, load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import RecordedHand, SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 from tormagd.simulation.plant import Plant
-
-Array = npt.NDArray[np.float64]
 
 START_MM, STEP_MM = 60.0, 1.0
 STROKE_MM = (46.0, 94.0)

@@ -1,27 +1,28 @@
 """`benchmark virtual-time`: how many times faster than real time the closed loop runs, and what limits it.
 
 The full plant with its firmware and protocol bytes, once under the whole core that follows 500 setpoints a second, once
-under the position loop alone. Each build of the core, and with `--against` another checkout, is a process of its own,
-and they take turns in stretches of some milliseconds: what a shared machine gives at a time, it gives to all of them.
+under the position loop alone. Each build of the core is a process of its own, and they take turns in stretches of some
+milliseconds: what a shared machine gives at a time, it gives to both.
 Processor time of one thread; the median over stretches, and of their ratios. `python -m cProfile` says where it goes,
 in the interpreted build (`TORMAG_COMPILED=0`).
 """
 
 import argparse
 import contextlib
-import json
+import gc
+import os
 import statistics
-import subprocess
-import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
-import tormagd
-from benchmarks.against import add_against_argument, environment
 from benchmarks.step import START_MM, STEP_MM, hold
+from firmware_protocol.build import SWITCH, settle
 from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
@@ -71,47 +72,43 @@ def armed_loop(config: Config, plant: str) -> ClosedLoop:
     return loop
 
 
+RUNS: dict[str, Run] = {}
+"Of a process that is measured: its loops."
 Build = tuple[bool, Callable[[str, int], float]]
 """Whether a build is compiled, and how it is asked for the processor time of a tick of a loop over so many, us."""
 
 
+def make_loops(plant: str) -> None:
+    """In a process that is measured, before all else."""
+    RUNS.update(whole_core=force_loop(Config(), plant), position_loop=gap_loop(Config(), plant))
+    gc.collect()
+    gc.freeze()  # what was imported is no garbage; a daemon does the same
+
+
+def tick_us(loop: str, ticks: int) -> float:
+    """In a process that is measured: the processor time of a tick of a loop over so many, us."""
+    started_s = time.thread_time()
+    RUNS[loop](ticks)
+    return (time.thread_time() - started_s) / ticks * 1e6
+
+
 @contextlib.contextmanager
-def build(plant: str, root: Path | None = None, switch: str = "") -> Iterator[Build]:
-    """One build of one checkout in a process of its own; `switch` is TORMAG_COMPILED.
-
-    `root` is a checkout, None for the one that runs here. Raises RuntimeError where the process does not start, or
-    measures another package than it should.
-    """
-    worker = [sys.executable, "-P", str(Path(__file__).with_name("virtual_time_worker.py")), plant]
-    theirs = environment(root) | ({"TORMAG_COMPILED": switch} if switch else {})
-    with subprocess.Popen(worker, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=theirs, text=True) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        asked, answers = process.stdin, process.stdout
-
-        def answer() -> Any:
-            line = answers.readline()
-            if not line:
-                raise RuntimeError(f"the loop in a process of its own ended with status {process.wait()}")
-            return json.loads(line)
-
-        def tick_us(loop: str, ticks: int) -> float:
-            print(loop, ticks, file=asked, flush=True)
-            return float(answer())
-
-        hello = answer()
-        package = Path(tormagd.__path__[0]) if root is None else root / "tormagd"
-        if not Path(hello["package"]).samefile(package):
-            raise RuntimeError(f"{hello['package']} was measured in place of {package}")
-        yield hello["compiled"], tick_us
+def build(plant: str, switch: str | None = None) -> Iterator[Build]:
+    """One build in a process of its own; `switch` is TORMAG_COMPILED. Raises BrokenProcessPool where its loops cannot
+    be made."""
+    switched = {} if switch is None else {SWITCH: switch}
+    with ProcessPoolExecutor(1, get_context("spawn"), make_loops, (plant,)) as process:
+        with mock.patch.dict(os.environ, switched):  # what the process begins with
+            is_compiled = process.submit(settle).result().is_compiled
+        yield is_compiled, lambda loop, ticks: process.submit(tick_us, loop, ticks).result()
 
 
 Stretches = dict[str, dict[str, list[float]]]
 """Processor times of a tick, us: a list for each build and loop; stretches of one number were run side by side."""
 
 
-def compared(plant: str, ticks: int, against: Path | None) -> Stretches:
-    """Every build there is, `interpreted` always, `compiled` and `against` where there is one, taking turns."""
+def compared(plant: str, ticks: int) -> Stretches:
+    """Every build there is, `interpreted` always, `compiled` where there is one, taking turns."""
     with contextlib.ExitStack() as stack:
         builds = {"interpreted": stack.enter_context(build(plant, switch="0"))}
         if builds["interpreted"][0]:
@@ -119,9 +116,7 @@ def compared(plant: str, ticks: int, against: Path | None) -> Stretches:
         ours = stack.enter_context(build(plant))
         if ours[0]:
             builds["compiled"] = ours
-        if against is not None:
-            builds["against"] = stack.enter_context(build(plant, against))
-        return take_turns({name: tick_us for name, (_, tick_us) in builds.items()}, ticks)
+        return take_turns({name: tick for name, (_, tick) in builds.items()}, ticks)
 
 
 def take_turns(builds: Mapping[str, Callable[[str, int], float]], ticks: int) -> Stretches:
@@ -140,37 +135,30 @@ def take_turns(builds: Mapping[str, Callable[[str, int], float]], ticks: int) ->
 
 
 def summary(found: Stretches, period_us: float) -> dict[str, Any]:
-    """The contract's object, null for a build that is not there; each `ratio` is one build's factor over the other's,
-    the median over stretches; `tick_us` is the median."""
+    """The contract's object, null for a build that is not there; `ratio` is one build's factor over the other's, the
+    median over stretches; `tick_us` is the median."""
     result: dict[str, Any] = dict.fromkeys(BUILDS)
     for name, loops in found.items():
         tick_us = {loop: statistics.median(taken_us) for loop, taken_us in loops.items()}
         result[name] = {loop: round(period_us / taken_us, 2) for loop, taken_us in tick_us.items()}
         result[name]["tick_us"] = {loop: round(taken_us, 1) for loop, taken_us in tick_us.items()}
     if "compiled" in found:
-        result["ratio"] = _ratios(found, "compiled", "interpreted")
-    if "against" in found:
-        result["against"]["ratio"] = {name: _ratios(found, name, "against") for name in BUILDS if name in found}
+        result["ratio"] = {
+            loop: round(statistics.median(np.divide(slow_us, found["compiled"][loop]).tolist()), 3)
+            for loop, slow_us in found["interpreted"].items()
+        }
     return result
-
-
-def _ratios(found: Stretches, faster: str, slower: str) -> dict[str, float]:
-    return {
-        loop: round(statistics.median(np.divide(found[slower][loop], found[faster][loop]).tolist()), 3)
-        for loop in LOOPS
-    }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of `benchmark virtual-time`."""
     parser.add_argument("--seconds", type=float, default=10.0, help="virtual time of each loop")
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
-    add_against_argument(parser)
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """The contract's object."""
     config = Config()
-    found = compared(options.plant, round(options.seconds * config.rates.control_hz), options.against)
+    found = compared(options.plant, round(options.seconds * config.rates.control_hz))
     about = {"plant": options.plant, "seconds": options.seconds}
     return about | summary(found, 1e6 / config.rates.control_hz)

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from machines.own import end
 from mcap.reader import make_reader
 from tqdm import tqdm
 
-from endurance.stand import PATIENCE_S, Figures, Stand, end, used
+from endurance.stand import PATIENCE_S, Figures, Stand, used
 from tormagd.recording.writer import TICKS_TOPIC
 from tormagd_client import Client
 

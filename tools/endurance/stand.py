@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import zmq
-from machines.own import own_machine
+from machines.own import end, own_machine
 from machines.wire import carried
 
 from tormagd.config import load_config
+from tormagd.lab.arrays import Array
 from tormagd.recording.ticks import decode_ticks
 from tormagd_client import Client, ClientError
 from tormagd_client.keys import SECRET, SERVER, generate
@@ -155,7 +155,7 @@ class Stand:
 
             yield read
 
-    def truth(self) -> npt.NDArray[np.float64]:
+    def truth(self) -> Array:
         """Ends the device; what no sensor has seen, columns t_ns, force_N and gap_mm."""
         end(self.device)
         return np.loadtxt(self.folder / "truth.csv", delimiter=",", skiprows=1, usecols=(0, 1, 2), ndmin=2)
@@ -176,9 +176,3 @@ def used(child: "subprocess.Popen[str]") -> tuple[int, int]:
 def is_at_rest(status: dict[str, Any]) -> bool:
     """Whether the link runs, and the device neither homes nor opens."""
     return status["link"]["state"] == "RUNNING" and not status["is_busy"]
-
-
-def end(child: "subprocess.Popen[str]") -> None:
-    """Ends what we began."""
-    child.terminate()
-    child.wait(PATIENCE_S)

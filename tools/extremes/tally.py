@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from tormagd.lab.arrays import Array
+
 COUNTS = ("cases", "reference_cases", "nonfinite", "refused", "misjudged")
 
 

@@ -226,18 +226,6 @@ MATRIX = (
 )
 
 
-UNLIKE_LOSSES = (
-    "frozen",
-    "no_handle",
-    "blocked_left",
-    "blocked_left blocked_right",
-    "motor_dead_left",
-    "backlash=+900%",
-    "overheated",
-    "end_stop_left",
-    "switch_stuck_left",
-)
-"""Devices that lose the force as others do that are tried on all samples: of these the evidence on one is enough."""
 LEFT_OUT = {
     "motor that turns round in the middle of a run": "it is named (WRONG_DIRECTION after 31 ms), but is not safe: the "
     "device opens by its own routine, which then presses that side shut. Only the wiring can see to that",

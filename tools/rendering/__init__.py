@@ -1,1 +1,1 @@
-"""How a force is followed: hands, devices, signals, what ideal carriages do, the error; the parts of `make run`."""
+"""How a force is followed: hands, devices, signals, the error; the parts of `make run`."""

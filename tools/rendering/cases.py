@@ -11,7 +11,6 @@ from concurrent.futures import Executor
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from rendering.device_draws import SAMPLES, device, evenly_drawn
 from rendering.following import (
@@ -28,8 +27,7 @@ from rendering.following import (
     follow,
     publisher,
 )
-from rendering.hands import TURNED_MM_S, Legs
-from rendering.ideal_carriage import Bound, Json, asked_of, bound, brake_of, drive_of, no_delay_mm
+from rendering.hands import Legs
 from rendering.signals import (
     STAIR_S,
     TRIM_S,
@@ -47,12 +45,13 @@ from tormagd.assembly.profile import profile_of
 from tormagd.config import Config
 from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
 from tormagd.control.records import TimedSetpoint
+from tormagd.lab.arrays import Array, Json
+from tormagd.lab.ideal_carriage import TURNED_MM_S, Bound, asked_of, bound, brake_of, drive_of, no_delay_mm
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene, terms_of
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters
 
-Array = npt.NDArray[np.float64]
 Kept = dict[str, Followed]
 "Runs that the picture shows, by part and device."
 

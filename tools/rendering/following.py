@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from rendering.device_draws import device
 from rendering.hands import Legs, WaitingHand
@@ -16,12 +15,12 @@ from tormagd.config import Config
 from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
 from tormagd.control.believe.slow_friction import believable
 from tormagd.control.records import TimedSetpoint
+from tormagd.lab.arrays import Array
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import Hand, parse_hand
 from tormagd.simulation.parameters import PlantParameters
 
-Array = npt.NDArray[np.float64]
 Levels = list[tuple[float, float]]
 "How long, s, and how much, N."
 Publisher = Callable[[float], TimedSetpoint | None]

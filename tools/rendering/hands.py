@@ -11,8 +11,6 @@ from tormagd.simulation.hand import Hand, RecordedHand
 Legs = list[tuple[float, float]]
 "How long, s, and how fast, mm/s."
 
-TURNED_MM_S = 42.0
-"The roller's surface at the thesis's 20 rpm."
 SWING_S, SWING_STEP_S, SWINGS_FOR_S = 5.3, 0.02, 90.0
 "A handle's speed swings between a scene's in this time, evenly in its logarithm."
 

@@ -7,8 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rendering.following import Array, Followed, Rehearsals, tracking
+from rendering.following import Followed, Rehearsals, tracking
 from rendering.show import PULSE_START_S, Shown
+from tormagd.lab.arrays import Array
 from tormagd.lab.pages import stamp
 from tormagd.scenes.scene import Scene
 

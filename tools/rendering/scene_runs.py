@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from tqdm import tqdm
 
-from rendering.following import FILE_PREVIEW_S, Array, publisher, taught
+from rendering.following import FILE_PREVIEW_S, publisher, taught
 from rendering.hands import swinging
 from tormagd.assembly.build import Core, build_core
 from tormagd.assembly.journal import KNOWN
@@ -27,6 +27,7 @@ from tormagd.config import Config, Rates
 from tormagd.control.records import Measured, Plan, TimedSetpoint
 from tormagd.exact import plain, restore
 from tormagd.hardware.measurement import Measurement
+from tormagd.lab.arrays import Array
 from tormagd.scenes.measured import Cost
 from tormagd.scenes.scene import EVERY_TERM, Bandwidth, Scene, Solver, load_task, scene_path
 from tormagd.scenes.signal import asked
@@ -216,8 +217,7 @@ class Play:
 def signal_of(core: Core, scene_name: str, longest_s: float, rate_hz: int) -> tuple[Array, Array]:
     """The scene's signal, up and down again until the time is over; a recording is played once."""
     scene = core.scene
-    if scene.signal is None:
-        raise ValueError(f"scene {scene.name}: it has no [signal]: nothing is known of what it asks for")
+    assert scene.signal is not None, "its forces are asked for"
     range_N = max(scene.force.least_N, core.portrait.min_N), scene.force.most_N
     time_s, force_N = asked(scene.signal, Path(scene_path(scene_name)).parent, range_N, longest_s, rate_hz)
     if not scene.signal.file and time_s[-1] < longest_s:

@@ -19,12 +19,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from machines.host import Host, HostWatch
-from machines.own import own_machine
+from machines.own import end, own_machine
 from machines.wire import carried
 
-from rendering.following import Array, Tracking, tracking
+from rendering.following import RATE_HZ, Tracking, tracking
 from rendering.signals import with_approach
 from tormagd.ctl.operate import home, operate
+from tormagd.lab.arrays import Array
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.recording.reader import Columns, RecordingError, read_recording
 from tormagd.safety.codes import FAULTS, Fault
@@ -58,8 +59,6 @@ RAMP_S, HOLD_S = 1.0, 3.0
 "Approach to the pulse's first force, and a hold there in which the trim learns this device."
 PULSE_START_S = RAMP_S + HOLD_S
 START_N = 0.6
-RATE_HZ = 500
-"Setpoints a second."
 LOOK_S = 0.2
 "The longest wait for telemetry."
 PATIENCE_S = 60.0
@@ -210,8 +209,8 @@ def play(watched: HostWatch, duration_s: float) -> Course:
         raise_fault(after)
         codes["publisher"] = publisher.returncode
         codes["recorder"] = end(recorder, signal.SIGINT)
-        codes["tormagd"] = end(daemon, signal.SIGTERM)
-        codes["simulator"] = end(simulator, signal.SIGTERM)
+        codes["tormagd"] = end(daemon)
+        codes["simulator"] = end(simulator)
     answer = json.loads(printed)
     if not answer["ok"]:
         raise ShowError(f"the publisher: {answer['error']['message']}", answer["error"]["hint"], is_of_time=True)
@@ -277,17 +276,7 @@ def process(name: str, *arguments: str, is_read: bool = False) -> Iterator["subp
             yield child
         finally:
             if child.poll() is None:
-                end(child, signal.SIGTERM)
-
-
-def end(child: "subprocess.Popen[str]", number: signal.Signals) -> int:
-    """Sends a signal and waits for the orderly end it asks for."""
-    child.send_signal(number)
-    try:
-        return child.wait(timeout=15)
-    except subprocess.TimeoutExpired:
-        child.kill()
-        return child.wait()
+                end(child)
 
 
 def ended(name: str) -> ShowError:

@@ -10,12 +10,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import butter, sosfiltfilt
 
+from tormagd.lab.arrays import Array
 from tormagd.lab.human_pulse import pulse_profile
-
-Array = npt.NDArray[np.float64]
 
 PULSE_N = (1.4, 1.7)
 "The range of the demonstration's pulse."

@@ -19,7 +19,8 @@ def add_options(parser: argparse.ArgumentParser, workers: int, needed: str) -> N
 def chosen(options: argparse.Namespace) -> Iterator[Executor]:
     """What was asked for. Raises OSError where no scheduler answers at the address, ValueError for no worker at all."""
     if options.dask is None:
-        with processes(options.workers) as here:
+        # no forks of this one: of threads that libraries have begun they would have the locks and not the threads
+        with ProcessPoolExecutor(options.workers, get_context("forkserver")) as here:
             yield here
         return
     # only a cluster needs it installed
@@ -27,9 +28,3 @@ def chosen(options: argparse.Namespace) -> Iterator[Executor]:
 
     with Client(options.dask) as client, client.get_executor() as cluster:
         yield cluster
-
-
-def processes(workers: int) -> Executor:
-    """So many of this machine, none of them a fork of this one: of threads that libraries have begun it would have the
-    locks and not the threads."""
-    return ProcessPoolExecutor(workers, get_context("forkserver"))

@@ -8,11 +8,10 @@ import importlib.util
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 
-Array = npt.NDArray[np.float64]
+from tormagd.lab.arrays import Array
 
 SOURCE_HZ = 100
 LOW_PASS_HZ = 8.0

@@ -1,7 +1,7 @@
 """`tormag-lab NAME`: the laboratory's commands. Each is a module, which is loaded when it is asked for.
 
 A module has `add_options(parser)` and `run(options)`, which returns what was found. It is printed as one JSON object
-with --json, and in `lines` for a person otherwise.
+with --json, and for a person otherwise.
 """
 
 import argparse
@@ -9,10 +9,11 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from tormagd.force_file import ForceFileError
 from tormagd.lab.errors import LabError, not_installed
+from tormagd.lab.told import lines
 from tormagd.output import write_line
 from tormagd.physics.errors import DomainError
 from tormagd.simulation.parameters import PlantError
@@ -25,10 +26,10 @@ REFUSALS = (LabError, ConfigError, ForceFileError, DomainError, PlantError)
 
 
 class Found(NamedTuple):
-    """What a command found: plain data, the same for a person, and the exit code."""
+    """What a command found: plain data, the exit code, and the same for a person where tables do not tell it best."""
 
-    figures: object
-    lines: Iterable[str]
+    figures: Any
+    lines: Iterable[str] | None = None
     exit_code: int = 0
 
 
@@ -45,6 +46,7 @@ COMMANDS = {
     "tactile-hold": Command("tactile.held", "a force held on the pad for an hour, in virtual time"),
     "characterise": Command("characterisation.command", "shear modulus and relaxation from a record"),
     "optimise-design": Command("design.command", "the brake's geometry for a task"),
+    "bound": Command("ideal_carriage", "what a device's ideal carriages miss of a force"),
     "bench-sweep": Command("training.bench_sweep", "training data from the simulated device on a bench"),
     "train-model": Command("training.train_model", "a model file from training data"),
     "tactile-model": Command("tactile.shipped", "a model file of a simulated pad"),
@@ -62,9 +64,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name in COMMANDS:
         return run(name, given[1:])
     wanted = name in ("-h", "--help")
-    lines = ["usage: tormag-lab NAME [--help] ...", ""] if wanted else [f"tormag-lab: no command {name!r}. There are:"]
-    lines += [f"  {each:20}{command.summary}" for each, command in COMMANDS.items()]
-    write_line("\n".join(lines), sys.stdout if wanted else sys.stderr)
+    head = ["usage: tormag-lab NAME [--help] ...", ""] if wanted else [f"tormag-lab: no command {name!r}. There are:"]
+    commands = (f"  {each:20}{command.summary}" for each, command in COMMANDS.items())
+    write_line("\n".join([*head, *commands]), sys.stdout if wanted else sys.stderr)
     return 0 if wanted else USAGE
 
 
@@ -90,7 +92,8 @@ def run(name: str, arguments: Sequence[str]) -> int:
         if not isinstance(error, REFUSALS):
             raise
         return _refuse(name, str(error))
-    write_line(json.dumps(found.figures) if options.json else "\n".join(found.lines), sys.stdout)
+    told = lines(found.figures) if found.lines is None else found.lines
+    write_line(json.dumps(found.figures) if options.json else "\n".join(told), sys.stdout)
     return found.exit_code
 
 

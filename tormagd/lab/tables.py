@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tormagd.bounded_file import MOST_TABLE_BYTES
+from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
 from tormagd_client.regular_file import require_regular
 
@@ -24,7 +24,7 @@ def read_columns(
     delimiter: str = ",",
     allowed: Mapping[str, tuple[float, float]] | None = None,
     is_exact: bool = False,
-) -> dict[str, NDArray[np.float64]]:
+) -> dict[str, Array]:
     """The named columns of a CSV file, the optional ones where they are there; `allowed` has bounds of some.
 
     The header is the first row with all the names. Rows before it are skipped (many testing machines write a preamble),
@@ -53,7 +53,7 @@ def _columns(
     optional: tuple[str, ...],
     allowed: Mapping[str, tuple[float, float]],
     is_exact: bool,
-) -> dict[str, NDArray[np.float64]]:
+) -> dict[str, Array]:
     header: list[str] = []
     for _, header in rows:
         if is_exact or set(names) <= set(header):

@@ -8,9 +8,11 @@ needs to know of the messages.
 
 import argparse
 import contextlib
+import math
 import os
 import select
 import signal
+import threading
 import time
 import tty
 from collections.abc import Callable
@@ -24,14 +26,21 @@ import serial
 from firmware_protocol.codec import FUNCTION, can_identifier
 from firmware_protocol.framing import Frame, FrameDecoder
 from firmware_protocol.layouts import LAYOUTS
+from tormagd.assembly.build import build_core
+from tormagd.closed_loop import ClosedLoop
+from tormagd.config import load_config
+from tormagd.control.records import TimedSetpoint
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
-from tormagd.lab.session import virtual_session
-from tormagd.simulation.device import DEFAULT_BAUD
+from tormagd.simulation.device import DEFAULT_BAUD, VirtualDevice
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import load_plant
+from tormagd.simulation.plant import Truth
 
 NODE = 1
 READ_BYTES = 4096
 POLL_MS = 100
+MEAN_N, SWING_N, SWING_HZ = 1.5, 0.3, 1.2
 
 
 class WireLog:
@@ -87,6 +96,45 @@ class WireLog:
             is_rx=is_rx,
             channel="can0",
         )
+
+
+class TappedDevice:
+    """A simulated device whose line is logged: a `SerialDevice`."""
+
+    def __init__(self, device: VirtualDevice, log: WireLog) -> None:
+        self._device, self._log = device, log
+        self.messages = device.messages
+
+    @property
+    def truth(self) -> Truth:
+        """As the device's own."""
+        return self._device.truth
+
+    def receive(self, now_s: float, data: bytes) -> None:
+        """As the device's own."""
+        self._log.to_device(now_s, data)
+        self._device.receive(now_s, data)
+
+    def transmit(self, now_s: float) -> bytes:
+        """As the device's own."""
+        data = self._device.transmit(now_s)
+        self._log.to_host(now_s, data)
+        return data
+
+
+def virtual_session(seconds: float, log: WireLog) -> None:
+    """Connects, homes, enables and follows a swinging force for that long, in virtual time."""
+    config = load_config(None)
+    core = build_core(config)
+    device = TappedDevice(VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1), log)
+    loop = ClosedLoop(config, core.stepper(), core.planner(), device)
+    loop.arm()
+
+    def asked(now_s: float) -> TimedSetpoint:
+        return TimedSetpoint(MEAN_N + SWING_N * math.sin(math.tau * SWING_HZ * now_s), now_s, 0.1)
+
+    for _ in loop.run(seconds, asked):
+        pass
 
 
 def tap(port: serial.Serial, log: WireLog, announce: Callable[[str], None], stopped: Callable[[], bool]) -> None:
@@ -157,26 +205,20 @@ def run(options: argparse.Namespace) -> Found:
         raise LabError(str(error)) from error
     with log:
         if options.way == "virtual":
-            virtual_session(options.seconds, log.to_device, log.to_host)
+            virtual_session(options.seconds, log)
         else:
             _tap_until_stopped(options.port, options.baud, log)
-    told = {"file": str(options.file), "frames": log.frames, "damaged": log.damaged}
-    return Found(told, [f"{options.file}: {log.frames} frames, {log.damaged} damaged stretches"])
+    return Found({"file": str(options.file), "frames": log.frames, "damaged": log.damaged})
 
 
 def _tap_until_stopped(path: str, baud: int, log: WireLog) -> None:
-    stopping = False
-
-    def stop(_signal: int, _frame: object) -> None:
-        nonlocal stopping
-        stopping = True
-
-    signal.signal(signal.SIGINT, stop)
-    signal.signal(signal.SIGTERM, stop)
+    stopping = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopping.set())
     with serial.Serial(path, baud, timeout=0, exclusive=True) as port:
         tap(
             port,
             log,
             lambda pty: print(f"{pty}  # give this to the daemon as device.port", flush=True),
-            lambda: stopping,
+            stopping.is_set,
         )

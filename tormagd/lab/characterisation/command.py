@@ -51,8 +51,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> Found:
     """The constants of one record."""
-    figures: dict[str, Any] = options.handle(options)
-    return Found(figures, (f"{key}: {value}" for key, value in figures.items()))
+    return Found(options.handle(options))
 
 
 def compression(options: argparse.Namespace) -> dict[str, Any]:

@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.errors import LabError
 from tormagd.lab.tables import read_columns
 from tormagd.physics.errors import require
-
-Array = NDArray[np.float64]
 
 CYCLES = 4
 """Three conditioning cycles and the one that counts."""
@@ -133,7 +131,7 @@ def deviations(record: CompressionRecord, sample: Sample) -> list[str]:
     return found
 
 
-def _latched(values: Array, low: float, high: float) -> NDArray[np.bool_]:
+def _latched(values: Array, low: float, high: float) -> Mask:
     """True from where the values pass `high` until they pass `low`; at first, whether they start above `high`."""
     decided = np.where(values >= high, 1, np.where(values <= low, 0, -1))
     known = np.maximum.accumulate(np.where(decided >= 0, np.arange(len(values)), -1))

@@ -20,12 +20,11 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tormagd.lab.arrays import Array
 from tormagd.physics.errors import DomainError, require
 from tormagd.physics.force import MU0_H_M
 
-Array: TypeAlias = NDArray[np.float64]
 Scalars: TypeAlias = float | Array
 
 MIN_STRETCH, MAX_STRETCH = 0.05, 20.0

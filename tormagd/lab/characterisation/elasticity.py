@@ -10,14 +10,13 @@ from itertools import combinations
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 
+from tormagd.lab.arrays import Array
 from tormagd.lab.characterisation.hyperelastic import (
     MAX_EXPONENT,
     MAX_STRETCH,
     MIN_STRETCH,
-    NeoHookean,
     Ogden,
     ThesisOgden,
     ogden_shape,
@@ -26,8 +25,7 @@ from tormagd.lab.characterisation.hyperelastic import (
 from tormagd.lab.errors import LabError
 from tormagd.physics.errors import FloatArray, require
 
-Array = NDArray[np.float64]
-Law = TypeVar("Law", NeoHookean, Ogden, ThesisOgden)
+Law = TypeVar("Law", Ogden, ThesisOgden)
 Shape = Callable[[FloatArray, float], FloatArray]
 
 MAX_TERMS = 3
@@ -45,11 +43,11 @@ class Fit(Generic[Law]):
     rms_Pa: float
 
 
-def fit_neo_hookean(stretch: Array, stress_Pa: Array) -> Fit[NeoHookean]:
+def fit_neo_hookean(stretch: Array, stress_Pa: Array) -> Fit[Ogden]:
     """The shear modulus that fits best. Raises `LabError` for a curve no positive modulus fits."""
     _check(stretch, stress_Pa, 2)
     moduli, _ = _moduli(ogden_shape, stretch, stress_Pa, (2.0,))
-    return _fit(NeoHookean(_positive(moduli)[0]), stretch, stress_Pa)
+    return _fit(Ogden(_positive(moduli), (2.0,)), stretch, stress_Pa)
 
 
 def fit_ogden(stretch: Array, stress_Pa: Array, terms: int = 1) -> Fit[Ogden]:

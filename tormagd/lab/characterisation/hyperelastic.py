@@ -59,21 +59,6 @@ class Ogden:
 
 
 @dataclass(frozen=True, slots=True)
-class NeoHookean:
-    """The law of one constant, the shear modulus (Pa); `DomainError` unless it is 1e-3 Pa..1 TPa."""
-
-    shear_modulus_Pa: float
-
-    def __post_init__(self) -> None:
-        require("shear_modulus_Pa", self.shear_modulus_Pa, 1e-3, 1e12)
-
-    def stress_Pa(self, stretch: Real) -> Real:
-        """Engineering stress, Pa, at a stretch of 0.05..20."""
-        require("stretch", stretch, MIN_STRETCH, MAX_STRETCH)
-        return self.shear_modulus_Pa * ogden_shape(stretch, 2.0)
-
-
-@dataclass(frozen=True, slots=True)
 class ThesisOgden:
     """Eq. 3 as printed: its constant G_o (Pa) and exponent alpha > 0; `DomainError` outside the bounds of `Ogden`."""
 

@@ -14,14 +14,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, nnls
 
+from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
 from tormagd.physics.errors import require
 from tormagd.physics.relaxation import MAX_FORCE_N, PronySeries
-
-Array = NDArray[np.float64]
 
 MAX_BRANCHES = 6
 LEAST_FRACTION = 1e-6

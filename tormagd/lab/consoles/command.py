@@ -13,7 +13,6 @@ import fsspec
 import msgspec
 import pyarrow
 import pyarrow.parquet
-from tqdm import tqdm
 
 from tormagd.lab import executors
 from tormagd.lab.consoles.devices import Console, Drift, consoles
@@ -21,7 +20,7 @@ from tormagd.lab.consoles.reading import SUFFIX, files, read_all
 from tormagd.lab.consoles.summary import Summary
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
-from tormagd.lab.pages import aligned
+from tormagd.lab.told import table
 from tormagd.output import write_line
 from tormagd_client.printable import printable
 
@@ -90,18 +89,18 @@ def run(options: argparse.Namespace) -> Found:
         raise LabError(str(error)) from error
     if not urls:
         raise LabError(f"{options.recordings}: no {SUFFIX} in it; `tormagctl record` makes them")
-    bar = tqdm(total=len(urls), unit="recording", disable=None)
-    with executors.chosen(options) as executor, bar:
-        fleet = read_all(urls, executor, lambda finished, total: bar.update(finished - bar.n))
-    for name, reason in fleet.left_out.items():
+    with executors.chosen(options) as executor:
+        summaries, left_out = read_all(urls, executor)
+    for name, reason in left_out.items():
         write_line(f"tormag-lab fleet: left out {printable(name)}: {printable(reason)}", sys.stderr)
-    exit_code = 1 if fleet.left_out else 0
+    exit_code = 1 if left_out else 0
     try:
         if options.out is not None:
-            write_parquet(fleet.summaries, options.out)
+            write_parquet(summaries, options.out)
     except OSError as error:  # what was found is told all the same
         write_line(f"tormag-lab fleet: {printable(str(error))}", sys.stderr)
         exit_code = 2
-    found = consoles(fleet.summaries.values())
-    result = {"consoles": found, "recordings": fleet.summaries, "left_out": fleet.left_out}
-    return Found(msgspec.to_builtins(result), aligned([HEADINGS, *map(_cells, found)]), exit_code)
+    found = consoles(summaries.values())
+    result = {"consoles": found, "recordings": summaries, "left_out": left_out}
+    rows = (dict(zip(HEADINGS, _cells(console), strict=True)) for console in found)
+    return Found(msgspec.to_builtins(result), table(rows), exit_code)

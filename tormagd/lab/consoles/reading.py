@@ -1,22 +1,14 @@
 """Where recordings are, in a folder or a bucket, and what each of them says: read by workers, wherever those are."""
 
-from collections.abc import Callable
 from concurrent.futures import Executor, as_completed
-from typing import NamedTuple
 
 import fsspec
+from tqdm import tqdm
 
 from tormagd.lab.consoles.summary import FIELDS, Summary, summarise
 from tormagd.recording.reader import read_open_recording
 
 SUFFIX = ".mcap"
-
-
-class Fleet(NamedTuple):
-    """What was read, by file, and why something was not."""
-
-    summaries: dict[str, Summary]
-    left_out: dict[str, str]
 
 
 def files(url: str) -> dict[str, str]:
@@ -46,20 +38,15 @@ def read(url: str) -> Summary | str:
         return str(error).removeprefix(f"{name}: ")
 
 
-def read_all(
-    urls: dict[str, str],
-    executor: Executor,
-    progress: Callable[[int, int], object] = lambda finished, total: None,
-) -> Fleet:
-    """Every file's summary, in their order."""
+def read_all(urls: dict[str, str], executor: Executor) -> tuple[dict[str, Summary], dict[str, str]]:
+    """Every file's summary, in their order, and why a file has none."""
     found: dict[str, Summary | str] = {}
     pending = {executor.submit(read, url): name for name, url in urls.items()}
-    for future in as_completed(pending):
+    for future in tqdm(as_completed(pending), total=len(urls), unit="recording", disable=None):
         error = future.exception()
         found[pending[future]] = future.result() if error is None else f"the worker that read it failed: {error}"
-        progress(len(found), len(urls))
     ordered = [(name, found[name]) for name in urls]
-    return Fleet(
+    return (
         {name: each for name, each in ordered if isinstance(each, Summary)},
         {name: each for name, each in ordered if isinstance(each, str)},
     )

@@ -5,19 +5,15 @@ Runs on this machine's cores or, with --dask, on a cluster. With --state a stopp
 
 import argparse
 import os
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
-from tqdm import tqdm
 
 from tormagd.config import Position
 from tormagd.lab import executors
 from tormagd.lab.design.optimisation import Design, Outcome, Problem, Run, coverage_as_made
 from tormagd.lab.design.phase_portrait import Region
-from tormagd.lab.design.recorded_task import read_task
 from tormagd.lab.design.sweep import sweep
 from tormagd.lab.main import Found
 from tormagd.lab.thesis.values import USE_CASES
@@ -37,47 +33,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--off", type=float, default=1.0, help="how far off a dimension may be made, percent (1)")
     parser.add_argument("--starts", type=int, default=5, help="random starts of a region")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--points", type=Path, help="CSV t_s,force_N: how much of this task the best design renders")
-    parser.add_argument("--cutoff", type=float, help="low-pass of the CSV, Hz, before its rate is taken")
     parser.add_argument("--state", type=Path, help="JSON file that keeps finished runs")
     executors.add_options(parser, os.cpu_count() or 1, needed="tormagd[lab]")
 
 
 def run(options: argparse.Namespace) -> Found:
-    """The optima, best first. Raises DomainError, ForceFileError, OSError."""
-    recorded = None if options.points is None else read_task(options.points, options.cutoff)
-    runs = _runs(options)
-    bar = tqdm(total=len(runs), unit="run", disable=None)
-    with executors.chosen(options) as executor, bar:
-        outcomes = sweep(runs, executor, options.state, lambda done, total: bar.update(done - bar.n))
+    """The optima, best first. Raises DomainError, OSError."""
+    with executors.chosen(options) as executor:
+        outcomes = sweep(_runs(options), executor, options.state)
     ranked = sorted(outcomes.items(), key=lambda item: _merit(options.measure, item[1]))
     rows = [
         msgspec.to_builtins(each) | {"coverage_as_made": coverage_as_made(run.problem, each.design, 0.01 * options.off)}
         for run, each in ranked
     ]
-    result: dict[str, Any] = {"outcomes": rows}
-    if recorded is not None:
-        best, outcome = ranked[0]
-        cloud = best.problem.portrait(outcome.design).true_cloud(recorded.force_N, recorded.rate_N_s)
-        failing = np.flatnonzero(~cloud.covered)
-        result["points"] = {
-            "share": cloud.share,
-            "failing": [[float(column[index]) for column in recorded] for index in failing],
-        }
-    return Found(result, _lines(result, options.off))
-
-
-def _lines(result: dict[str, Any], off: float) -> Iterator[str]:
-    yield f"  R_o mm    t mm  s_max mm  coverage  +-{off:g}%  elastomer cm3  corner cost"
-    for row in result["outcomes"]:
-        outer_mm, thickness_mm, open_mm = row["design"].values()
-        yield (
-            f"{outer_mm:8.2f}{thickness_mm:8.2f}{open_mm:10.1f}{row['coverage']:10.2%}{row['coverage_as_made']:8.2%}"
-            f"{1e-3 * row['volume_mm3']:15.2f}{row['corner_cost']:13.4g}"
-        )
-    if "points" in result:
-        points = result["points"]
-        yield f"recorded task: {points['share']:.2%} of its points; {len(points['failing'])} fail (--json lists them)"
+    return Found({"outcomes": rows})
 
 
 def _runs(options: argparse.Namespace) -> list[Run]:

@@ -13,12 +13,10 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
+from tormagd.lab.arrays import Mask
 from tormagd.lab.design.brake import Brake
 from tormagd.physics.errors import DomainError, FloatArray, require
-
-Mask = npt.NDArray[np.bool_]
 
 MAX_FORCE_N = 1e6
 MAX_RATE_N_S = 1e9
@@ -137,24 +135,15 @@ class PhasePortrait:
         return min(float(np.trapezoid(smaller, forces)) / region.half_area, 1.0)
 
     def true_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
-        """The points of a task against the true boundary. Raises `DomainError` for points that are not finite."""
-        inside = self._within_forces(force_N, rate_N_s)
+        """The points of a task against the true boundary."""
+        inside = (force_N >= self.brake.least_N) & (force_N <= self.brake.most_N)
         limit = np.zeros_like(force_N)
         limit[inside] = self.gap_speed_mm_s * self.brake.slope_N_mm(self.brake.gap_mm(force_N[inside]))
         return self._judge(force_N, rate_N_s, limit)
 
     def trapezoid_cloud(self, force_N: FloatArray, rate_N_s: FloatArray) -> CloudCoverage:
-        """The points of a task against the thesis's trapezoid. Raises `DomainError` for points that are not finite."""
-        self._within_forces(force_N, rate_N_s)
+        """The points of a task against the thesis's trapezoid."""
         return self._judge(force_N, rate_N_s, self.trapezoid().rate_N_s(force_N))
-
-    def _within_forces(self, force_N: FloatArray, rate_N_s: FloatArray) -> Mask:
-        if force_N.ndim != 1 or force_N.shape != rate_N_s.shape or not force_N.size:
-            raise DomainError("rate_N_s", rate_N_s.shape, f"one rate for each of one or more forces, {force_N.shape}")
-        require("force_N", force_N, -MAX_FORCE_N, MAX_FORCE_N)
-        require("rate_N_s", rate_N_s, -MAX_RATE_N_S, MAX_RATE_N_S)
-        inside: Mask = (force_N >= self.brake.least_N) & (force_N <= self.brake.most_N)
-        return inside
 
     def _judge(self, force_N: FloatArray, rate_N_s: FloatArray, limit_N_s: FloatArray) -> CloudCoverage:
         below, above = force_N < self.brake.least_N, force_N > self.brake.most_N

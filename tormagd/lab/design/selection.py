@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from tormagd.lab.design.brake import Brake
-from tormagd.physics.errors import DomainError, require
 from tormagd.physics.force import radial_moment_for_force_Tm
 
 _POINTS = 201
@@ -15,19 +14,12 @@ _POINTS = 201
 
 @dataclass(frozen=True, slots=True)
 class ForceTask:
-    """What a task asks of a brake. `DomainError` unless 0 <= least_N < most_N and 0 < resolution_N."""
+    """What a task asks of a brake: forces from `least_N` to `most_N`, in steps of `resolution_N`."""
 
     name: str
     least_N: float
     most_N: float
     resolution_N: float
-
-    def __post_init__(self) -> None:
-        for name in ("least_N", "most_N"):
-            require(name, getattr(self, name), 0.0, 1e6)
-        require("resolution_N", self.resolution_N, 1e-9, 1e6)
-        if not self.least_N < self.most_N:
-            raise DomainError("most_N", self.most_N, f"above least_N, {self.least_N:g}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +44,11 @@ class Verdict:
 
 
 def judge(insert: str, brake: Brake, task: ForceTask, gap_resolution_mm: float) -> Verdict:
-    """One insert before a task, where the gap is placed in steps of `gap_resolution_mm` (0 < step <= 10 mm).
+    """One insert before a task, where the gap is placed in steps of `gap_resolution_mm`.
 
     A passive brake never reaches 0 N. It serves a least force that it misses by no more than the task's resolution:
     the task could not tell the difference.
     """
-    require("gap_resolution_mm", gap_resolution_mm, 1e-9, 10.0)
     least, most = brake.least_N, brake.most_N
     low, high = max(least, task.least_N), min(most, task.most_N)
     reasons = []

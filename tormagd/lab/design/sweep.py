@@ -5,22 +5,23 @@ Each outcome is written as it comes, so that a sweep that was stopped goes on wh
 another region, bound or seed it is another run, and never takes an old outcome.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import Executor, as_completed
 from pathlib import Path
+from typing import Literal
 
 import msgspec
+from tqdm import tqdm
 
 from tormagd.bounded_file import read_bounded
 from tormagd.lab.design.optimisation import Outcome, Run, solve
 from tormagd.physics.errors import DomainError
 
-STATE_VERSION = 1
 MAX_STATE_BYTES = 64_000_000
 
 
 class _State(msgspec.Struct, forbid_unknown_fields=True):
-    version: int
+    version: Literal[1]
     finished: list[tuple[Run, Outcome]]
 
 
@@ -28,26 +29,23 @@ def sweep(
     runs: Iterable[Run],
     executor: Executor,
     state: Path | None = None,
-    progress: Callable[[int, int], object] = lambda finished, total: None,
 ) -> dict[Run, Outcome]:
     """The outcome of every run, in the order of the runs; a run that stands twice is solved once.
 
-    `progress(finished, total)` is called at the start and after each run. With `state`, outcomes found in that file are
-    taken from it and new ones are added. Raises `DomainError` for a state file that is not one (it is left as it is)
-    and whatever a run raised; runs that have not begun are then given up, finished ones stay in the file.
+    With `state`, outcomes found in that file are taken from it and new ones are added. Raises `DomainError` for a state
+    file that is not one (it is left as it is) and whatever a run raised; runs that have not begun are then given up,
+    finished ones stay in the file.
     """
     wanted = list(dict.fromkeys(runs))
     known = {} if state is None else read_state(state)
     outcomes = {run: known[run] for run in wanted if run in known}
-    progress(len(outcomes), len(wanted))
     pending = {executor.submit(solve, run): run for run in wanted if run not in outcomes}
     try:
-        for future in as_completed(pending):
+        for future in tqdm(as_completed(pending), total=len(pending), desc="optimisation", unit="run", disable=None):
             outcome = future.result()
             outcomes[pending[future]] = known[pending[future]] = outcome
             if state is not None:
                 _write_state(state, known)
-            progress(len(outcomes), len(wanted))
     finally:
         for future in pending:
             future.cancel()
@@ -62,13 +60,11 @@ def read_state(path: Path) -> dict[Run, Outcome]:
         state = msgspec.json.decode(read_bounded(path, MAX_STATE_BYTES), type=_State)
     except msgspec.DecodeError as error:
         raise DomainError(str(path), error, "the state file of a sweep") from error
-    if state.version != STATE_VERSION:
-        raise DomainError(f"{path} version", state.version, str(STATE_VERSION))
     return dict(state.finished)
 
 
 def _write_state(path: Path, finished: dict[Run, Outcome]) -> None:
     # replaced whole: a stop in the middle leaves the last good state
     partial = path.with_name(path.name + ".part")
-    partial.write_bytes(msgspec.json.encode(_State(STATE_VERSION, list(finished.items()))))
+    partial.write_bytes(msgspec.json.encode(_State(1, list(finished.items()))))
     partial.replace(path)

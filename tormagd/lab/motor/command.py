@@ -11,7 +11,6 @@ The first half of the log is fitted and the second half judged; the parameters c
 
 import argparse
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +43,7 @@ def run(options: argparse.Namespace) -> Found:
         write_config(options.write_config, result, load_config(options.config))
     if options.plot:
         draw(options.plot, log, result)
-    return Found(result, lines(result))
+    return Found(result)
 
 
 def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
@@ -78,16 +77,6 @@ def write_config(path: Path, result: dict[str, Any], config: Config) -> None:
         raise LabError(f"--write-config: {table}: {error}") from error
     except OSError as error:
         raise LabError(f"{path}: {error.strerror}") from error
-
-
-def lines(result: dict[str, Any]) -> Iterator[str]:
-    """The parameters for a person."""
-    shown = (result["motor"] or {}) | result["ratios_to_gain"] | result["parameters"]
-    for name, found in (shown | {"time_constant_s": result["time_constant_s"]}).items():
-        value = "not shown by this log" if found is None else f"{found['value']:12.5g} +- {found['ci95']:.2g}"
-        yield f"{name:24s}{value}"
-    yield f"residual {result['relative_residual']:.1%} of the voltage; held out {result['holdout_voltage_nrmse']:.1%}"
-    yield from result["notes"]
 
 
 def draw(path: Path, log: Log, result: dict[str, Any]) -> None:

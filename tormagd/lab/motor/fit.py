@@ -27,8 +27,9 @@ import numpy as np
 from scipy.signal import butter, decimate, sosfiltfilt
 from scipy.stats import t as student
 
+from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
-from tormagd.lab.motor.log import Array, Log
+from tormagd.lab.motor.log import Log
 
 CUTOFF_HZ = 100.0
 THINNED_HZ = 40.0

@@ -4,16 +4,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
 from tormagd.bounded_file import MOST_TABLE_BYTES
+from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
 from tormagd.lab.tables import read_columns
 from tormagd_client.regular_file import require_regular
-
-Array = npt.NDArray[np.float64]
 
 COLUMNS = ("t_s", "input_V", "position_mm")
 CURRENT_COLUMN = "current_A"

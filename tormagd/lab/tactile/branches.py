@@ -6,7 +6,6 @@ is an answer further than JUMP_MT from the last; *travel* is the answers' way ov
 rises everywhere there are none, however few neighbours.
 """
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -83,14 +82,3 @@ def measured_on(model_name: str, element: str, range_mT: tuple[float, float]) ->
     for row in rows:
         row["other_answers"] = float(np.mean(np.abs(np.array(row.pop("answers")) - most) > 1e-6))
     return {"model": model_name, "not_rising_share_of_box": not_rising_share(model), "rows": rows}
-
-
-def lines(found: dict[str, Any]) -> Iterator[str]:
-    """The same for a person."""
-    for name in MODELS:
-        yield f"{name}: dF/dB <= 0 on {found[name]['not_rising_share_of_box']:.1%} of the model's box"
-        for row in found[name]["rows"]:
-            yield (
-                f"  {row['neighbours']:2} neighbours: jumps {row['jump_share']:7.3%}, travel {row['travel']:5.2f}, "
-                f"other answers than {NEIGHBOURS[-1]} neighbours {row['other_answers']:6.2%}"
-            )

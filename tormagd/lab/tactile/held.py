@@ -12,7 +12,6 @@ import math
 import random
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
@@ -25,7 +24,6 @@ from tormagd.config import Config, Rates
 from tormagd.control.move.watch import SENSOR_FAULT_S
 from tormagd.control.records import Handle, Measured, Plan, TimedSetpoint
 from tormagd.lab.main import Found
-from tormagd.lab.pages import stamp
 from tormagd.model.displacement import Turn
 from tormagd.safety.codes import Fault
 from tormagd.scenes.scene import RELAXATION_S, load_scene, terms_of
@@ -43,7 +41,6 @@ CONTROL_HZ = 500
 COARSE_S = 0.02
 VALID_S = 0.1
 SHOWN_S = 10.0
-FAULT_NOTE: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "color": "#d32f2f"}
 MODES = ((True, False), (False, False), (True, True), (False, True))
 
 
@@ -57,33 +54,27 @@ class Case(NamedTuple):
     coarse: bool = False
 
 
-class Moment(NamedTuple):
-    """Once a second: the pad's true force, the gap, what was planned, and the fault that ends the hold."""
-
-    force_N: float
-    gap_mm: float
-    plan: Plan
-    fault: str
+Moment = tuple[float, float, Plan, str]
+"Once a second: the pad's true force, N, the gap, mm, what was planned, and the fault that ends the hold."
 
 
 def hold(case: Case) -> dict[str, Any]:
     """The greatest, the mean and the last error of the true force, as shares of the force asked, the share of time that
     each limit was there, and the fault that ended it, if any."""
-    shares, limits, gap_mm, fault = [], dict[str, int](), math.nan, ""
-    for moment in (_coarse if case.coarse else _whole)(case):
-        fault = moment.fault
+    shares, limits, last_mm, fault = [], dict[str, int](), math.nan, ""
+    for force_N, gap_mm, plan, fault in (_coarse if case.coarse else _whole)(case):
         if fault:
             break
-        shares.append(moment.force_N / FORCE_N - 1.0)
-        gap_mm = moment.gap_mm
-        for limit in moment.plan.limits:
+        shares.append(force_N / FORCE_N - 1.0)
+        last_mm = gap_mm
+        for limit in plan.limits:
             limits[str(limit)] = limits.get(str(limit), 0) + 1
     absolute = np.abs(shares)
     return case._asdict() | {
         "force_error": float(absolute.max()),
         "mean_force_error": float(absolute.mean()),
         "last_force_error": shares[-1],
-        "last_gap_mm": gap_mm,
+        "last_gap_mm": last_mm,
         "held_s": len(shares),
         "fault": fault,
         "limits": {name: count / len(shares) for name, count in limits.items()},
@@ -108,9 +99,8 @@ class _Prepared:
 
 def _whole(case: Case) -> Iterator[Moment]:
     made = _Prepared(case)
-    loop = ClosedLoop(
-        made.config, made.core.stepper(), made.core.planner(), VirtualDevice(made.plant, made.hand, seed=1)
-    )
+    planner, device = made.core.planner(), VirtualDevice(made.plant, made.hand, seed=1)
+    loop = ClosedLoop(made.config, made.core.stepper(), planner, device)
     loop.arm()
 
     def asked(now_s: float) -> TimedSetpoint:
@@ -118,14 +108,12 @@ def _whole(case: Case) -> Iterator[Moment]:
 
     for _ in loop.run(made.begins_s - loop.now_s, asked):
         pass
-    planner = loop.planner
-    assert planner is not None, "this loop plans"
     planner.believe.learns = case.is_learning
     for _ in range(round(case.seconds)):
         for _ in loop.run(1.0, asked):
             pass
         truth = loop.device.truth
-        yield Moment(truth.force_N, truth.gap_mm, planner.planned, ", ".join(map(str, loop.stepper.safety.faults)))
+        yield truth.force_N, truth.gap_mm, planner.planned, ", ".join(map(str, loop.stepper.safety.faults))
 
 
 def _coarse(case: Case) -> Iterator[Moment]:
@@ -149,40 +137,7 @@ def _coarse(case: Case) -> Iterator[Moment]:
             planner.believe.learns = case.is_learning
         elif tick > begins and tick % each_s == 0:
             is_doubted = plan.sensor_doubted_s > SENSOR_FAULT_S
-            yield Moment(element.force_N, gap_mm, plan, str(Fault.SENSOR) if is_doubted else "")
-
-
-def draw(path: Path, figures: dict[str, Any]) -> None:
-    """The error over time of every hold, a panel for each pad, stamped with its figures."""
-    from matplotlib.figure import Figure
-
-    holds = figures["holds"]
-    plants = list(dict.fromkeys(held["plant"] for held in holds))
-    figure = Figure(figsize=(4.2 * len(plants), 3.8), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, len(plants), sharey=True))
-    for axes, plant in zip(panels, plants, strict=True):
-        axes.axhspan(-3.0, 3.0, color="#009e73", alpha=0.12, linewidth=0.0)
-        for held in holds:
-            if held["plant"] != plant:
-                continue
-            minutes = np.arange(len(held["shares"])) * held["every_s"] / 60.0
-            axes.plot(
-                minutes,
-                100.0 * np.array(held["shares"]),
-                "--" if held["is_learning"] else "-",
-                color="#0072b2" if held["relaxation"] else "#e69f00",
-                label=f"{'with' if held['relaxation'] else 'without'} relaxation, "
-                f"{'learning' if held['is_learning'] else 'frozen'}",
-            )
-            if held["fault"]:
-                axes.plot(minutes[-1], 100.0 * held["shares"][-1], "x", color="#d32f2f", markersize=9)
-                axes.annotate(
-                    f"fault {held['fault']}", (minutes[-1], 100.0 * held["shares"][-1]), (8, -3), **FAULT_NOTE
-                )
-        axes.set(title=plant.replace("_", " "), xlabel="held for, min")
-    panels[0].set(ylabel="error of the true force, %")
-    panels[0].legend(fontsize=8, loc="lower left")
-    figure.savefig(path, dpi=110, metadata=stamp(figures))
+            yield element.force_N, gap_mm, plan, str(Fault.SENSOR) if is_doubted else ""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -191,7 +146,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plant", nargs="+", default=PLANTS, metavar="PLANT", help="default: pad_1 pad_2 pad_3")
     parser.add_argument("--coarse", action="store_true", help="the plans alone, fifty a second")
     parser.add_argument("--workers", type=int, default=1, help="processes")
-    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the errors over time")
 
 
 def run(options: argparse.Namespace) -> Found:
@@ -199,16 +153,4 @@ def run(options: argparse.Namespace) -> Found:
     cases = [Case(plant, *mode, options.seconds, options.coarse) for plant in options.plant for mode in MODES]
     with ProcessPoolExecutor(options.workers) as pool:
         holds = list(tqdm(pool.map(hold, cases), total=len(cases), desc="holds", disable=None))
-    figures = {"synthetic": True, "force_N": FORCE_N, "holds": holds}
-    if options.picture is not None:
-        draw(options.picture, figures)
-    return Found(figures, map(_line, holds))
-
-
-def _line(held: dict[str, Any]) -> str:
-    return (
-        f"{held['plant']}  {'with' if held['relaxation'] else 'without':8}relaxation, "
-        f"{'learning' if held['is_learning'] else 'frozen':9} worst {held['force_error']:6.2%}, "
-        f"mean {held['mean_force_error']:6.2%}, last {held['last_force_error']:+6.2%} after {held['held_s']} s"
-        f"{held['fault'] and ': ' + held['fault']}"
-    )
+    return Found({"synthetic": True, "force_N": FORCE_N, "holds": holds})

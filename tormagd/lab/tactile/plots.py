@@ -1,39 +1,28 @@
 """The pictures of docs/learned_inverse.md."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tormagd.lab.tactile.models import SCORED_SLOPE_N_MT
+from tormagd.lab.arrays import Array
+from tormagd.lab.tactile.models import SCORED_SLOPE_N_MT, Trained
 from tormagd.lab.tactile.pads import PadRecord
-from tormagd.lab.training.dataset import Array
 
 CLASSES = {25.0: "MRE-A, 25 %", 35.0: "MRE-B, 35 %", 45.0: "MRE-C, 45 %"}
 SHOWN_FIELDS = (0, 3, 6, 10)
 SHOWN_RATE_MM_S = 1.0
 
 
-class Material(NamedTuple):
-    """What the pictures are drawn from: the data of table 4.1 with what the network says, and the traces."""
-
-    cycles: PadRecord
-    predicted_N: Array
-    pulses: dict[str, Array]
+def pictures(trained: Trained, traces: dict[str, Array]) -> dict[str, Figure]:
+    """Every picture by the name of its file: the data of table 4.1 with what the network says, and the pulse."""
+    return {"tactile_fit": _fit(trained), "tactile_pulse": _pulse(traces)}
 
 
-def pictures(material: Material) -> dict[str, Figure]:
-    """Every picture by the name of its file."""
-    return {
-        "tactile_fit": _fit(material),
-        "tactile_pulse": _pulse(material.pulses),
-    }
-
-
-def _last_cycles(material: Material, cip_percent: float) -> list[tuple[float, NDArray[np.int64]]]:
+def _last_cycles(cycles: PadRecord, cip_percent: float) -> list[tuple[float, NDArray[np.int64]]]:
     """(field, rows) of the last cycle at 1 mm/s, at some of the fields."""
-    features = material.cycles.features
+    features = cycles.features
     chosen = []
     for field_mT in np.unique(features[:, 2])[list(SHOWN_FIELDS)]:
         rows = np.flatnonzero(
@@ -41,7 +30,7 @@ def _last_cycles(material: Material, cip_percent: float) -> list[tuple[float, ND
             & (features[:, 2] == field_mT)
             & np.isclose(np.abs(features[:, 1]), SHOWN_RATE_MM_S)
         )
-        cycle = material.cycles.cycle[rows]
+        cycle = cycles.cycle[rows]
         chosen.append((float(field_mT), rows[cycle == cycle.max()]))
     return chosen
 
@@ -56,14 +45,14 @@ def _panels(title: str, width: float = 11.0) -> tuple[Figure, Any]:
     return figure, axes
 
 
-def _fit(material: Material) -> Figure:
+def _fit(trained: Trained) -> Figure:
     figure, axes = _panels("Data and network at 1 mm/s (synthetic; like figures 4.3 and 4.4)")
     for axis, cip_percent in zip(axes, CLASSES, strict=True):
-        for index, (field_mT, rows) in enumerate(_last_cycles(material, cip_percent)):
-            displacement_mm = material.cycles.features[rows, 0]
+        for index, (field_mT, rows) in enumerate(_last_cycles(trained.cycles, cip_percent)):
+            features = trained.cycles.features[rows]
             label = f"data, {field_mT:.0f} mT"
-            axis.plot(displacement_mm, material.cycles.force_N[rows], ".", ms=4, color=f"C{index}", label=label)
-            axis.plot(displacement_mm, material.predicted_N[rows], lw=1, color="black")
+            axis.plot(features[:, 0], trained.cycles.force_N[rows], ".", ms=4, color=f"C{index}", label=label)
+            axis.plot(features[:, 0], trained.model.predict(features), lw=1, color="black")
     axes[0].plot([], [], color="black", label="network")
     axes[0].legend()
     return figure

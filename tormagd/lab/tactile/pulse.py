@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tormagd.inverse.linear import LinearFieldSearch
 from tormagd.inverse.nearest import NearestFieldSearch
 from tormagd.inverse.solution import FieldSolver, Reach
+from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.lab.tactile.models import PAD_IN_USE, SCORED_SLOPE_N_MT, Effort, Trained, plant_force_N, slope_N_per_mT
 from tormagd.lab.tactile.pads import PADS, drawn_pad
-from tormagd.lab.training.dataset import Array
 from tormagd.lab.training.grey_box import GreyBoxMemory
 from tormagd.model.model_file import ForceModel
 from tormagd.simulation.pad import worked_pad
@@ -28,6 +27,7 @@ REFERENCE_FIELDS_MT = (100.0, 200.0)
 FIELDS_MT = (0.0, FULL_FIELD_MT)
 OTHER_PADS = (1, 2)
 SENSOR_SEED = 7
+SHAPE = "measured photoplethysmogram (heartpy)"
 
 HOLD_RATE_HZ = 10
 HOLD_FORCES_N = (148.0, 154.0)
@@ -50,14 +50,9 @@ class Program(NamedTuple):
         return np.column_stack((self.displacement_mm, self.rate_mm_s, self.field_mT, cip))
 
 
-def pulse_shape(duration_s: float, rate_hz: int) -> tuple[Array, str]:
-    """A pulse between 0 and 1, and what it is: measured where heartpy is installed, else synthetic beats."""
-    try:
-        return pulse_profile(duration_s, 0.0, 1.0, rate_hz)[1], "measured photoplethysmogram (heartpy)"
-    except ModuleNotFoundError:
-        phase = (np.arange(round(duration_s * rate_hz)) / rate_hz * 1.2) % 1.0
-        beats = np.exp(-(((phase - 0.2) / 0.08) ** 2)) + 0.4 * np.exp(-(((phase - 0.5) / 0.12) ** 2))
-        return (beats - beats.min()) / np.ptp(beats), "synthetic beats (heartpy is not installed)"
+def pulse_shape(duration_s: float, rate_hz: int) -> Array:
+    """A measured pulse between 0 and 1. Raises ModuleNotFoundError where heartpy is not installed."""
+    return pulse_profile(duration_s, 0.0, 1.0, rate_hz)[1]
 
 
 def recorded_shapes(duration_s: float, rate_hz: int) -> dict[str, Array]:
@@ -119,7 +114,7 @@ class Course(NamedTuple):
     dt_s: float
 
     @property
-    def scored(self) -> NDArray[np.bool_]:
+    def scored(self) -> Mask:
         """Rows (n, bool) where the force says something about the field."""
         return self.slope_N_mT >= SCORED_SLOPE_N_MT
 
@@ -179,7 +174,7 @@ def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str,
 
 def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any], dict[str, Array]]:
     """The contract's `pulse`: the quieter sensor on top, each sensor below; other pads and other pulses beside."""
-    shape, source = pulse_shape(HELD_S, RATE_HZ)
+    shape = pulse_shape(HELD_S, RATE_HZ)
     pad, every = PADS[PAD_IN_USE], effort.pulse_every
     own = course(pad, shape, every)
     strangers = [course(drawn_pad(pad, seed), shape, every) for seed in OTHER_PADS]
@@ -195,7 +190,7 @@ def pulse(trainings: Sequence[Trained], effort: Effort) -> tuple[dict[str, Any],
         all_traces.append(traces)
     top = by_noise[str(trainings[0].noise_N)]
     kept = ("mlp", "mlp_thesis_search", "relaxation_aware", "noise_bound_mae_mT", "scored_share")
-    figures = {"synthetic": True, "shape": source, **{name: top[name] for name in kept}, "by_noise": by_noise}
+    figures = {"synthetic": True, "shape": SHAPE, **{name: top[name] for name in kept}, "by_noise": by_noise}
     return figures, all_traces[0]
 
 
@@ -207,7 +202,7 @@ def hold(trained: Trained, duration_s: float) -> dict[str, Any]:
     displacement_mm = np.minimum(np.arange(1, count + 1) * dt_s, FULL_INDENTATION_MM)
     rate_mm_s = np.where(np.arange(count) < rising, 1.0, 0.0)
     low, high = HOLD_FORCES_N
-    beats_N = low + (high - low) * pulse_shape(HELD_PULSE_S, HOLD_RATE_HZ)[0]
+    beats_N = low + (high - low) * pulse_shape(HELD_PULSE_S, HOLD_RATE_HZ)
     # there and back again, so that the repetition has no jump
     asked_N = np.resize(np.concatenate((beats_N, beats_N[::-1])), count - rising)
     pad = PADS[PAD_IN_USE]

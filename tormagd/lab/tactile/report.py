@@ -2,20 +2,18 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
+from tormagd.lab.arrays import Array, Json
 from tormagd.lab.pages import table, write_page
-from tormagd.lab.tactile.plots import Material, pictures
+from tormagd.lab.tactile.models import Trained
+from tormagd.lab.tactile.plots import pictures
 from tormagd.lab.thesis.page import WAYS
 from tormagd.lab.thesis.values import PULSE_MAE_MT, PULSE_MAX_MT, PULSE_SD_MT
 
-Json = dict[str, Any]
 
-
-def write_report(folder: Path, figures: Json, material: Material) -> None:
+def write_report(folder: Path, figures: Json, trained: Trained, traces: dict[str, Array]) -> None:
     """Write learned_inverse.md into `folder`, and its pictures into `folder`/images."""
-    drawn = pictures(material)
-    write_page(folder / "learned_inverse.md", sections(figures), folder / "images", drawn)
+    write_page(folder / "learned_inverse.md", sections(figures), folder / "images", pictures(trained, traces))
 
 
 def sections(figures: Json) -> Iterator[str]:

@@ -8,18 +8,16 @@ import argparse
 import dataclasses
 import datetime
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
 import torch
 
 from tormagd.lab.main import Found
-from tormagd.lab.tactile.models import dataset
+from tormagd.lab.tactile.models import FULL, Effort, dataset
 from tormagd.lab.tactile.pads import cyclic_records, holding_records
 from tormagd.lab.training.grey_box import fit_grey_box
-from tormagd.lab.training.metrics import force_metrics
-from tormagd.lab.training.splits import random_split
+from tormagd.lab.training.metrics import force_metrics, random_split
 from tormagd.model.memory import Memory
 from tormagd.model.model_file import ForceModel, save_model
 from tormagd.model.rising import not_rising_share
@@ -31,18 +29,6 @@ SEED = 1
 UNSEEN_FIELDS_MT = (130.0, 230.0)
 
 
-class Effort(NamedTuple):
-    """How much is recorded and learned."""
-
-    samples_per_cycle: int
-    hold_samples: int
-    epochs: int
-    settling_epochs: int
-
-
-FULL, QUICK = Effort(175, 1500, 100, 30), Effort(24, 200, 12, 4)
-
-
 def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceModel:
     """The model of a plant's pad, judged on rows of the cycles and on two holds that it has not seen. PlantError."""
     plant = load_plant(plant_name)
@@ -52,7 +38,7 @@ def trained(plant_name: str, effort: Effort, created: datetime.date) -> ForceMod
     cycles = dataset(cyclic_records(noise_N, SEED, samples_per_cycle=effort.samples_per_cycle, pads=[plant.pad]))
     holds = dataset(holding_records(plant.pad, noise_N, SEED, samples=effort.hold_samples))
     held_out = random_split(len(cycles), SEED)
-    epochs, settling_epochs = effort.epochs, effort.settling_epochs
+    epochs, settling_epochs = effort.pad_epochs, effort.settling_epochs
     grey = fit_grey_box(cycles, ~held_out, holds, hidden=HIDDEN, epochs=epochs, settling_epochs=settling_epochs)
     unseen = dataset(holding_records(plant.pad, 0.0, SEED, fields_mT=UNSEEN_FIELDS_MT, samples=effort.hold_samples))
     is_pressed = unseen.features[:, 0] > 1.0
@@ -80,15 +66,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of `tormag-lab tactile-model`."""
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.safetensors")
     parser.add_argument("--plant", default="pad_1", help="whose pad is on the bench (default: pad_1)")
-    parser.add_argument("--quick", action="store_true", help="few rows and epochs: shows that it runs, not how well")
     parser.add_argument("--created", type=datetime.date.fromisoformat, help="date in the file (default: today)")
 
 
 def run(options: argparse.Namespace) -> Found:
     """Trains and writes; the metrics."""
     torch.set_num_threads(1)
-    model = trained(options.plant, QUICK if options.quick else FULL, options.created or datetime.date.today())
+    model = trained(options.plant, FULL, options.created or datetime.date.today())
     save_model(options.out, model)
-    metrics = model.metadata.metrics
-    lines = [f"{name:24}{value:.5g}" for name, value in metrics.items()]
-    return Found({"out": str(options.out), **metrics}, [*lines, str(options.out)])
+    return Found({"out": str(options.out), **model.metadata.metrics})

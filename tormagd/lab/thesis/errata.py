@@ -1,7 +1,6 @@
 """Where the thesis contradicts itself or its own tables. Every figure is computed here from what the thesis prints."""
 
 import math
-from typing import TypedDict
 
 import numpy as np
 
@@ -24,19 +23,14 @@ SAMPLE = Elastomer(shear_modulus_Pa=277.3e3, relative_permeability=4.0, friction
 APPENDIX_MU_R = 3.8
 
 
-class Erratum(TypedDict):
-    """Where it is, what is printed, what was found, and the reading used here."""
-
-    place: str
-    printed: str
-    found: str
-    used: str
+KEYS = ("place", "printed", "found", "used")
+"Where it is, what is printed, what was found, and the reading used here."
 
 
-def errata() -> list[Erratum]:
-    """All of them, in the order of the thesis."""
+def errata() -> list[dict[str, str]]:
+    """All of them by KEYS, in the order of the thesis."""
     found = (*_chapter_2(), _eq_25(), *_chapter_3(), *_appendices(), *_chapter_4())
-    return [Erratum(place=place, printed=printed, found=what, used=used) for place, printed, what, used in found]
+    return [dict(zip(KEYS, row, strict=True)) for row in found]
 
 
 def table_2_4_errors() -> list[dict[str, object]]:

@@ -1,15 +1,14 @@
-"""docs/reproduction.md, and a summary to print, from the figures of `reproduction`."""
+"""docs/reproduction.md, from the figures of `reproduction`."""
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
+from tormagd.lab.arrays import Json
 from tormagd.lab.pages import percent, table, write_page
 from tormagd.lab.thesis.step_test import StepTest
 from tormagd.lab.thesis.table_2_5 import COLUMNS, readings
-from tormagd.lab.thesis.values import FIGURE_2_5_N, PULSE_MAE_MT, PULSE_MAX_MT, PULSE_SD_MT, TABLE_4_1
+from tormagd.lab.thesis.values import PULSE_MAE_MT, PULSE_MAX_MT, PULSE_SD_MT, TABLE_4_1
 
-Json = dict[str, Any]
 OBJECTIVES = ("trapezoid", "true", "true_thesis_speed")
 WAYS = {
     "mlp": "network alone",
@@ -20,13 +19,11 @@ WAYS = {
 "The ways from a force to a field."
 
 
-def write(folder: Path, result: Json, tests: list[StepTest]) -> Path:
-    """Writes reproduction.md into `folder`, its pictures into a folder of that name, and returns the page's path."""
+def write(folder: Path, result: Json, tests: list[StepTest]) -> None:
+    """Writes reproduction.md into `folder`, and its pictures into a folder of that name."""
     from tormagd.lab.thesis.plots import pictures
 
-    path = folder / "reproduction.md"
-    write_page(path, sections(result), path.with_suffix(""), pictures(result, tests))
-    return path
+    write_page(folder / "reproduction.md", sections(result), folder / "reproduction", pictures(result, tests))
 
 
 def sections(result: Json) -> Iterator[str]:
@@ -52,36 +49,6 @@ def sections(result: Json) -> Iterator[str]:
     yield "## Errata\n\n" + table(
         ("where", "printed", "found", "used here"), (each.values() for each in result["errata"])
     )
-
-
-def summary(result: Json) -> Iterator[str]:
-    """The figures that answer "does it reproduce?", one a line."""
-    ranges, optima = result["table_2_4"], result["table_3_2"]
-    yield f"table 2.3   largest mass difference {result['table_2_3']['max_error_g']:.3f} g"
-    yield (
-        f"table 2.4   mean error {ranges['mean_rel_error']:.1%} (thesis {ranges['thesis']['mean_rel_error']:.1%}), "
-        f"free exponent {ranges['mean_rel_error_free_exponent']:.1%}; leave one out "
-        f"{ranges['leave_one_out_mean_rel_error']:.1%}, {ranges['leave_one_out_mean_rel_error_free_exponent']:.1%}"
-    )
-    for row in readings(result["table_2_5"]):
-        yield f"table 2.5   {row[0]}: {row[1]}, {row[3]} of the width; strictly {row[7]}"
-    yield f"figure 2.5  {result['figure_2_5']['eq_7']['working_point_N']} N (thesis {list(FIGURE_2_5_N)})"
-    for row in optima["best"]:
-        yield (
-            f"table 3.2   use case {row['use_case']}, {row['objective']}: {row['coverage']:.2%}, "
-            f"starts within {row['spread']:.3%}"
-        )
-    learned, pulse = result["table_4_1"], result["pulse"]
-    yield (
-        f"table 4.1   synthetic: R2 {learned['random']['r2']:.4f}, MAE {learned['random']['mae_N']:.3f} N (noise alone "
-        f"{learned['random']['noise_mae_N']:.3f}); one field left out R2 {learned['leave_one_field_out']['r2']:.4f}"
-    )
-    yield (
-        f"pulse       synthetic: network {pulse['mlp']['mae_mT']:.2f} mT, with relaxation "
-        f"{pulse['relaxation_aware']['mae_mT']:.2f}, at most {pulse['relaxation_aware']['max_mT']:.2f}; "
-        f"held 1 h {pulse['hold_1h_force_error']:.2%} (thesis {PULSE_MAE_MT} mT, at most {PULSE_MAX_MT})"
-    )
-    yield f"errata      {len(result['errata'])}"
 
 
 def _table_2_4(data: Json) -> str:
@@ -270,7 +237,7 @@ def table_4_1(data: Json) -> str:
     """The section on table 4.1, thesis and ours side by side."""
     rows = []
     for row in data["rows"]:
-        for name, printed in TABLE_4_1[row["class"]]._asdict().items():
+        for name, printed in TABLE_4_1[row["class"]].items():
             ours = row[name]
             rows.append(
                 (

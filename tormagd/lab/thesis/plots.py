@@ -6,12 +6,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from tormagd.lab.arrays import Json
 from tormagd.lab.design.optimisation import Design, Problem
 from tormagd.lab.design.phase_portrait import Region
 from tormagd.lab.thesis.step_test import StepTest
 from tormagd.lab.thesis.values import AS_BUILT, USE_CASES
-
-Json = dict[str, Any]
 
 MEASURED, THESIS, OURS, FREE, QUIET = "#222222", "#8d99ae", "#d1495b", "#2a7f9e", "#e9ecf2"
 

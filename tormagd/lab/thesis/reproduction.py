@@ -8,20 +8,17 @@ import argparse
 import os
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
+from tormagd.lab.arrays import Json
 from tormagd.lab.design.brake import Brake
 from tormagd.lab.design.optimisation import Design, Outcome, Problem, Run, coverage
 from tormagd.lab.design.phase_portrait import PhasePortrait
 from tormagd.lab.design.range_fit import RangeFit, fit_exponent, fit_friction, leave_one_out, mean_relative_error
-from tormagd.lab.design.recorded_task import task_of
 from tormagd.lab.design.sweep import sweep
 from tormagd.lab.human_pulse import pulse_profile
 from tormagd.lab.main import Found
-from tormagd.lab.pages import aligned
 from tormagd.lab.thesis import page
 from tormagd.lab.thesis.errata import errata, table_2_4_errors
 from tormagd.lab.thesis.step_test import StepTest, step_test
@@ -36,11 +33,10 @@ from tormagd.lab.thesis.values import (
     TABLE_2_4_MEAN_PERCENT,
     USE_CASES,
 )
+from tormagd.lab.told import table
 from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
 from tormagd.physics.force import TORMAG, Elastomer
 from tormagd.physics.inserts import INSERTS, Insert, insert
-
-Json = dict[str, Any]
 
 CONTROLLER_SPEED_MM_S = 40.0
 "Gap speed of two carriages at 150 rpm on 8 mm screws; the controller's own, once measured, goes in with --gap-speed."
@@ -61,21 +57,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Found:
-    """The contract's object; with --out also the page."""
+    """The contract's object, for a person as the page; with --out it is written."""
     if options.table_2_5:
         found = table_2_5()
-        return Found(found, aligned([COLUMNS, *readings(found)]))
-    from tormagd.lab.tactile.experiment import reproduced
+        return Found(found, table(dict(zip(COLUMNS, row, strict=True)) for row in readings(found)))
+    from tormagd.lab.tactile.experiment import contract
     from tormagd.lab.tactile.models import FULL, QUICK
 
     with ProcessPoolExecutor(options.workers) as pool:
-        learned = pool.submit(reproduced, QUICK if options.quick else FULL)
+        learned = pool.submit(contract, QUICK if options.quick else FULL)
         steps = [pool.submit(step_test, insert(name), options.seed) for name in STEP_INSERTS]
         runs = table_3_2_runs(options.gap_speed, options.seed, starts=1 if options.quick else None)
-        with tqdm(total=len(runs), desc="optimisation", unit="run", disable=None) as bar:
-            outcomes = sweep(runs.values(), pool, options.state, lambda done, total: bar.update(done - bar.n))
+        outcomes = sweep(runs.values(), pool, options.state)
         tests = [step.result() for step in steps]
-        chapter_4 = learned.result()
+        chapter_4, *_ = learned.result()
     result = {
         "table_2_3": table_2_3(),
         "table_2_4": table_2_4(),
@@ -90,7 +85,7 @@ def run(options: argparse.Namespace) -> Found:
     }
     if options.out is not None:
         page.write(options.out, result, tests)
-    return Found(result, page.summary(result))
+    return Found(result, page.sections(result))
 
 
 def table_2_3() -> Json:
@@ -256,28 +251,26 @@ def phase_portrait(gap_speed_mm_s: float) -> Json:
 
 def _pulse_cloud(gap_speed_mm_s: float) -> Json:
     times_s, forces_N = pulse_profile(PULSE_S, *PULSE_N, PULSE_HZ)
-    task = task_of(times_s, forces_N)
+    rates_N_s = np.gradient(forces_N, times_s)
     brake = Brake(PowerFieldLaw(), insert("MRE-50-40").elastomer, TORMAG, CLOSED_MM, OPEN_MM)
     rows = []
     for speed in (GAP_SPEED_MM_S, gap_speed_mm_s):
         portrait = PhasePortrait(brake, speed)
-        true, trapezoid = (
-            judge(task.force_N, task.rate_N_s) for judge in (portrait.true_cloud, portrait.trapezoid_cloud)
-        )
+        true, trapezoid = (judge(forces_N, rates_N_s) for judge in (portrait.true_cloud, portrait.trapezoid_cloud))
         failing = np.flatnonzero(~true.covered)
-        worst = failing[np.argsort(-np.abs(task.rate_N_s[failing]))][:5]
+        worst = failing[np.argsort(-np.abs(rates_N_s[failing]))][:5]
         rows.append(
             {
                 "gap_speed_mm_s": speed,
                 "true": true.share,
                 "trapezoid": trapezoid.share,
-                "points": len(task.force_N),
+                "points": len(forces_N),
                 "too_fast": int(true.too_fast.sum()),
                 "below_least_force": int(true.below_least_force.sum()),
                 "above_most_force": int(true.above_most_force.sum()),
                 "worst": [
                     {"t_s": float(t), "force_N": float(f), "rate_N_s": float(r)}
-                    for t, f, r in zip(*(column[worst] for column in task), strict=True)
+                    for t, f, r in zip(times_s[worst], forces_N[worst], rates_N_s[worst], strict=True)
                 ],
             }
         )

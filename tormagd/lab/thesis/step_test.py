@@ -8,19 +8,17 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import load_config
 from tormagd.control.core import Stepper
-from tormagd.control.records import Plan
+from tormagd.lab.arrays import Array
+from tormagd.lab.training.bench_sweep import BENCH_MOST_N, gap_plan
 from tormagd.physics.inserts import Insert
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import load_plant
-
-Array = npt.NDArray[np.float64]
 
 GAPS_MM = (94.5, 85.0, 75.0, 65.0, 55.0, 45.5)
 "The thesis's steps; the first and the last stay half a millimetre clear of the end stops."
@@ -35,20 +33,15 @@ class StepTest(NamedTuple):
 
     insert: str
     time_s: Array
-    gap_mm: Array
     force_N: Array
     level_gap_mm: Array
     level_force_N: Array
 
 
-MOST_N = 20.0
-"On a bench no force that the closed gap gives is a fault."
-
-
 def step_test(fitted: Insert, seed: int) -> StepTest:
     """One insert through all gaps. Raises RuntimeError where the device faults."""
     config, scene = load_config(None), load_scene("coronary")
-    scene = msgspec.structs.replace(scene, force=msgspec.structs.replace(scene.force, most_N=MOST_N))
+    scene = msgspec.structs.replace(scene, force=msgspec.structs.replace(scene.force, most_N=BENCH_MOST_N))
     plant = load_plant("sample_1")
     elastomer = msgspec.structs.replace(
         plant.elastomer,
@@ -58,21 +51,17 @@ def step_test(fitted: Insert, seed: int) -> StepTest:
     )
     device = VirtualDevice(msgspec.structs.replace(plant, elastomer=elastomer), SteadyHand(), seed=seed)
     loop = ClosedLoop(config, Stepper(config, scene), None, device)
-    loop.arm(_plan(GAPS_MM[0], 0.0))
+    loop.arm(gap_plan(GAPS_MM[0], 0.0))
     began_s = loop.now_s
     rows = []
     for gap_mm in GAPS_MM:
         for _ in range(round(HOLD_S / 1e-3)):
-            sample = loop.tick(plan=_plan(gap_mm, loop.now_s))
+            sample = loop.tick(plan=gap_plan(gap_mm, loop.now_s))
             estimate = sample.measured
             if estimate is None or sample.safety.faults:
                 raise RuntimeError(f"{fitted.name}: the test ended at {gap_mm:g} mm: {sample.safety}")
             rows.append((sample.time_s - began_s, estimate.gap_mm, estimate.force_N))
     record = np.array(rows)
     settled = record.reshape(len(GAPS_MM), -1, 3)[:, -round(SETTLED_S / 1e-3) :].mean(axis=1)
-    time_s, gap_mm, force_N = record[::EVERY].T
-    return StepTest(fitted.name, time_s, gap_mm, force_N, settled[:, 1], settled[:, 2])
-
-
-def _plan(gap_mm: float, now_s: float) -> Plan:
-    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
+    time_s, _, force_N = record[::EVERY].T
+    return StepTest(fitted.name, time_s, force_N, settled[:, 1], settled[:, 2])

@@ -5,16 +5,14 @@ a task is served from its own least force on, and a passive brake does not reach
 """
 
 import math
-from typing import Any
 
+from tormagd.lab.arrays import Json
 from tormagd.lab.design.brake import Brake
 from tormagd.lab.design.selection import ForceTask, Verdict, rank
 from tormagd.lab.thesis.values import TABLE_2_5
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.force import TORMAG
 from tormagd.physics.inserts import INSERTS
-
-Json = dict[str, Any]
 
 CLOSED_MM, OPEN_MM = 45.0, 95.0
 GAP_RESOLUTION_MM = 0.1

@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from tqdm import tqdm
 
 from tormagd.closed_loop import ClosedLoop
@@ -25,8 +24,9 @@ from tormagd.config import load_config
 from tormagd.control.core import Stepper
 from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.records import Plan
+from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.main import Found
-from tormagd.lab.training.dataset import Array, Dataset, write_csv
+from tormagd.lab.training.dataset import Dataset, write_csv
 from tormagd.model.displacement import MOBILISED_MM
 from tormagd.physics.field import PowerFieldLaw
 from tormagd.physics.inserts import insert
@@ -41,6 +41,7 @@ BEYOND_MM = 2.0
 STOPS_MM = 2.5
 "The bench's switches stand so far beyond the scene's gaps."
 BENCH_MOST_N = 20.0
+"On a bench no force that the closed gap gives is a fault."
 GAP_STEP_MM = 3.0
 HOLD_GAP_MM, HOLD_STROKES = 46.0, 150
 BEGIN_S = 8.0
@@ -81,8 +82,7 @@ def run(options: argparse.Namespace) -> Found:
     data = record(options.plant, options.scene, options.seed)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     write_csv(options.out, data)
-    told = f"{len(data)} rows in {options.out} (synthetic: plant {options.plant}, seed {options.seed})"
-    return Found({"out": str(options.out), "rows": len(data), "synthetic": True}, [told])
+    return Found({"out": str(options.out), "rows": len(data), "synthetic": True})
 
 
 def record(plant: str, scene_name: str, seed: int) -> Dataset:
@@ -118,13 +118,13 @@ def swept(plant: str, scene_name: str, course: Course) -> Array:
     hand, ends_s = strokes(len(course.gaps_mm), course.seed)
     device = VirtualDevice(bench(with_insert(load_plant(plant), scene.insert.name), scene), hand, seed=course.seed)
     loop = ClosedLoop(config, Stepper(config, scene), None, device)
-    loop.arm(_plan(scene.insert.gap_open_mm, 0.0))
+    loop.arm(gap_plan(scene.insert.gap_open_mm, 0.0))
     while loop.now_s < BEGIN_S:
-        loop.tick(plan=_plan(scene.insert.gap_open_mm, loop.now_s))
+        loop.tick(plan=gap_plan(scene.insert.gap_open_mm, loop.now_s))
     rows = []
     for gap_mm, end_s in zip(course.gaps_mm, ends_s, strict=True):
         while loop.now_s < end_s:
-            sample = loop.tick(plan=_plan(gap_mm, loop.now_s))
+            sample = loop.tick(plan=gap_plan(gap_mm, loop.now_s))
             estimate = sample.measured
             if estimate is None or sample.safety.faults:
                 raise RuntimeError(f"the sweep ended at {gap_mm:.1f} mm: {sample.safety}")
@@ -138,7 +138,7 @@ def swept(plant: str, scene_name: str, course: Course) -> Array:
     return np.column_stack((time_s[kept], np.abs(rate_mm_s[kept]), field_mT, along_N))
 
 
-def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
     """The handle's rate, mm/s, at each tick, and where it has slid steadily, at a steady gap, for long enough."""
     rate_mm_s, is_even = _even(handle_mm)
     _, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
@@ -157,7 +157,7 @@ def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, npt.NDArray[np.bool
     return rate_mm_s, slides
 
 
-def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array, npt.NDArray[np.bool_]]:
+def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array, Mask]:
     """Rate over a window around each tick, mm/s, and whether it is the same in both halves of the window."""
     gone = (position_mm[RATE_TICKS:] - position_mm[:-RATE_TICKS]) / RATE_TICKS * 1e3
     edge = np.zeros(RATE_TICKS)
@@ -192,7 +192,8 @@ def bench(plant: PlantParameters, scene: Scene) -> PlantParameters:
     return msgspec.structs.replace(plant, assumed=stops)
 
 
-def _plan(gap_mm: float, now_s: float) -> Plan:
+def gap_plan(gap_mm: float, now_s: float) -> Plan:
+    """A plan that asks for a gap and nothing else."""
     return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
 
 

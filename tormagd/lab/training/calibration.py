@@ -16,14 +16,15 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
 
+from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError, not_installed
 from tormagd.lab.tables import read_columns
-from tormagd.lab.training.dataset import Array, Dataset, write_csv
+from tormagd.lab.training.dataset import ALLOWED, Dataset, write_csv
 from tormagd.lab.training.metrics import fit_metrics
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, displacement
 from tormagd.model.features import FEATURES, FIELD, Element
@@ -31,9 +32,6 @@ from tormagd.model.model_file import ForceModel, save_model
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw, flux_density_T
 from tormagd.physics.inserts import Insert, insert
-
-if TYPE_CHECKING:
-    from tormagd.lab.training.levenberg_marquardt import Epoch
 
 COLUMNS = ("time_s", "sweep", "gap_mm", "handle_mm", "rate_mm_s", "force_N")
 """Of a sweep file: times of one device, the number of the sweep, the measured gap, the handle's travel at the roller,
@@ -69,15 +67,6 @@ class CalibrationError(ValueError):
     def __init__(self, code: str, message: str, hint: str) -> None:
         super().__init__(message)
         self.code, self.message, self.hint = code, message, hint
-
-
-class Judgement(NamedTuple):
-    """Error on the sweeps kept from the fit, beside the force sensor's own noise and the bar."""
-
-    r2: float
-    mae_N: float
-    noise_mae_N: float
-    most_mae_N: float
 
 
 def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Dataset:
@@ -145,8 +134,7 @@ def require_usable(data: Dataset) -> None:
 
 def noise_sd_N(data: Dataset) -> float:
     """The force sensor's noise: the third differences of neighbouring rows, which hold hardly anything else."""
-    if data.time_s is None:
-        raise LabError("time_s: needed to know which rows are neighbours, and the data have none")
+    assert data.time_s is not None  # training_rows sets it
     steps = np.diff(data.time_s)
     third = np.diff(data.force_N, 3)
     together = np.convolve(steps < 2.0 * np.median(steps), np.ones(3), "valid") == 3.0
@@ -157,8 +145,6 @@ def noise_sd_N(data: Dataset) -> float:
 def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int = 50, epochs: int = 200) -> ForceModel:
     """A model from all sweeps but the judging ones, with the judgement in its metrics. Raises CalibrationError
     (poor_fit, not_rising) where it is not good enough to be used."""
-    from tqdm import tqdm
-
     from tormagd.lab.training.fitting import (
         fit_model,  # with torch, two seconds: whatever is refused is told without it
     )
@@ -167,29 +153,21 @@ def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int 
     numbers = np.unique(data.cycle)
     is_judging = np.isin(data.cycle, numbers[JUDGING[1] :: JUDGING[0]])
     training, validation = data.subset(~is_judging).split(VALIDATION_SHARE, seed=0)
-    with tqdm(total=epochs, desc="fit", unit="epoch", disable=not sys.stderr.isatty(), leave=False) as bar:
-
-        def show(epoch: "Epoch") -> None:
-            bar.set_postfix_str(f"{epoch.validation_rmse_N:.4f} N rms")
-            bar.update()
-
-        model, _ = fit_model(
-            training,
-            validation,
-            element=Element.TORQUE,
-            insert=insert_name,
-            data_sha256=data.sha256(),
-            created=created,
-            hidden=hidden,
-            epochs=epochs,
-            progress=show,
-        )
+    model, _ = fit_model(
+        training,
+        validation,
+        element=Element.TORQUE,
+        insert=insert_name,
+        data_sha256=data.sha256(),
+        created=created,
+        hidden=hidden,
+        epochs=epochs,
+    )
     judging = data.subset(is_judging)
     found = fit_metrics(model, judging)
     noise_mae_N = MEAN_OVER_SIGMA * noise_sd_N(data)
     most_mae_N = max(MOST_MAE_OVER_NOISE * noise_mae_N, MOST_MAE_SHARE * float(np.percentile(data.force_N, 99.0)))
-    judgement = Judgement(found.get("r2", -math.inf), found["mae_N"], noise_mae_N, most_mae_N)
-    require_good(judgement)
+    require_good(found.get("r2", -math.inf), found["mae_N"], noise_mae_N, most_mae_N)
     require_rising(model)
     metrics = model.metadata.metrics | {f"judged_{name}": value for name, value in found.items()}
     metrics |= {
@@ -201,9 +179,9 @@ def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int 
     return replace(model, metadata=msgspec.structs.replace(model.metadata, metrics=metrics))
 
 
-def require_good(judgement: Judgement) -> None:
-    """Raise CalibrationError (poor_fit) with the figures and the bars."""
-    r2, mae_N, noise_mae_N, most_mae_N = judgement
+def require_good(r2: float, mae_N: float, noise_mae_N: float, most_mae_N: float) -> None:
+    """Raise CalibrationError (poor_fit) for an error on the sweeps kept from the fit that is over the bar; the figures
+    stand beside the force sensor's own noise."""
     if r2 >= LEAST_R2 and mae_N <= most_mae_N:
         return
     raise CalibrationError(
@@ -259,7 +237,7 @@ def calibrate(
 
 def read_sweep(path: Path) -> Array:
     """The table of a sweep file (n x 6). Raises LabError naming the file and what is wrong."""
-    return np.column_stack(list(read_columns(path, COLUMNS, is_exact=True).values()))
+    return np.column_stack(list(read_columns(path, COLUMNS, allowed=ALLOWED, is_exact=True).values()))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -4,16 +4,14 @@ import csv
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.errors import LabError
 from tormagd.lab.tables import read_columns
 from tormagd.model.features import FEATURES
-
-Array: TypeAlias = NDArray[np.float64]
 
 COLUMNS = (*FEATURES, "force_N")
 OPTIONAL_COLUMNS = ("cycle", "time_s")
@@ -37,8 +35,7 @@ class Dataset:
     """Measured rows: features (n x 4, order of `FEATURES`), force_N (n), and optionally cycle (n) and time_s (n).
 
     `cycle` labels rows that belong together (one loading cycle, one run), so that a split can keep them together.
-    Arrays are copied and unwritable. Raises `LabError` on shapes that do not fit, fewer than two rows, or a value
-    outside `ALLOWED`; NaN never is inside. Rows are counted from 0 here.
+    Raises `LabError` on fewer than two rows.
     """
 
     features: Array
@@ -47,34 +44,12 @@ class Dataset:
     time_s: Array | None = None
 
     def __post_init__(self) -> None:
-        for name in ("features", "force_N", "time_s"):
-            self._freeze(name, np.float64)
-        self._freeze("cycle", np.int64)
-        rows = len(self.force_N)
-        if rows < 2:
-            raise LabError(f"{rows} rows; at least 2 are needed")
-        expected = {"features": (rows, len(FEATURES)), "force_N": (rows,), "cycle": (rows,), "time_s": (rows,)}
-        for name, shape in expected.items():
-            array = getattr(self, name)
-            if array is not None and array.shape != shape:
-                raise LabError(f"{name} has shape {array.shape}; needed is {shape}")
-        for name, column in self.columns().items():
-            low, high = ALLOWED[name]
-            refused = np.flatnonzero(~((column >= low) & (column <= high)))
-            if refused.size:
-                row = int(refused[0])
-                raise LabError(f"row {row}, {name}: {column[row]} is not allowed, only {low:g} to {high:g}")
+        if len(self.force_N) < 2:
+            raise LabError(f"{len(self.force_N)} rows; at least 2 are needed")
 
-    def _freeze(self, name: str, dtype: type[np.generic]) -> None:
-        given = getattr(self, name)
-        if given is not None:
-            array = np.array(given, dtype=dtype)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
-
-    def columns(self) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]:
+    def columns(self) -> dict[str, Array | NDArray[np.int64]]:
         """Return each column by its name, as in the file; the optional ones only where they exist."""
-        columns: dict[str, NDArray[np.float64] | NDArray[np.int64]] = dict(zip(FEATURES, self.features.T, strict=True))
+        columns: dict[str, Array | NDArray[np.int64]] = dict(zip(FEATURES, self.features.T, strict=True))
         columns["force_N"] = self.force_N
         if self.cycle is not None:
             columns["cycle"] = self.cycle
@@ -98,7 +73,7 @@ class Dataset:
             digest.update(column.astype(column.dtype.newbyteorder("<")).tobytes())
         return digest.hexdigest()
 
-    def subset(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> "Dataset":
+    def subset(self, rows: NDArray[np.integer] | Mask) -> "Dataset":
         """Return the chosen rows (indices or a mask)."""
         cycle = None if self.cycle is None else self.cycle[rows]
         time_s = None if self.time_s is None else self.time_s[rows]

@@ -1,16 +1,15 @@
 """Training one force model: network, scaling, Levenberg-Marquardt, and what is written down about it."""
 
 import datetime
-from collections.abc import Callable
 
 import msgspec
 import numpy as np
 import torch
 
+from tormagd.lab.arrays import Mask
 from tormagd.lab.training.dataset import Dataset
-from tormagd.lab.training.levenberg_marquardt import Epoch, Training, train
-from tormagd.lab.training.metrics import fit_metrics
-from tormagd.lab.training.splits import Mask, random_split
+from tormagd.lab.training.levenberg_marquardt import Training, train
+from tormagd.lab.training.metrics import fit_metrics, random_split
 from tormagd.model.features import Element, Scaling
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelMetadata
@@ -35,7 +34,6 @@ def fit_model(
     seed: int = 0,
     scaled_by: Dataset | None = None,
     start: ForceModel | None = None,
-    progress: Callable[[Epoch], None] | None = None,
 ) -> tuple[ForceModel, Training]:
     """Train on `training`, stop by `validation`, and return the model with its metrics on both, and how it went. What
     was taken out of the data before is their `memory`.
@@ -60,7 +58,7 @@ def fit_model(
         created=created,
         memory=memory,
     )
-    result = train(network, training, validation, epochs=epochs, progress=progress)
+    result = train(network, training, validation, epochs=epochs)
     model = to_model(network, metadata)
     metrics = {
         **{f"train_{name}": value for name, value in fit_metrics(model, training).items()},

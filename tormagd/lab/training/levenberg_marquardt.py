@@ -7,12 +7,12 @@ readable in one place. Without them and the Jacobian nothing would remain of the
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from tormagd.lab.training.dataset import Dataset
 from tormagd.model.network import ForceNetwork
@@ -69,17 +69,15 @@ def train(
     epochs: int = 200,
     patience: int = 10,
     least_improvement: float = 1e-4,
-    progress: Callable[[Epoch], None] | None = None,
 ) -> Training:
-    """Fit `network` (float64) to `training` in place and leave it with the weights that did best on `validation`.
+    """Fit `network` to `training` in place and leave it with the weights that did best on `validation`. It is of
+    float64, because the normal equations square the rounding.
 
     Stops after `epochs` accepted steps; when `patience` steps in a row have not lowered the validation error by the
     share `least_improvement`; or when no damping lowers the training error any more (`stopped_by`: "epochs",
-    "validation", "damping"). `progress` is called after every step. Deterministic for a given network and data.
-    Raises `DomainError` on a network that is not float64 or a count below 1.
+    "validation", "damping"). Deterministic for a given network and data.
+    Raises `DomainError` on a count below 1.
     """
-    if network.hidden_weight.dtype != torch.float64:
-        raise DomainError("network", network.hidden_weight.dtype, "float64: the normal equations square the rounding")
     for name, count in (("epochs", epochs), ("patience", patience)):
         if count < 1:
             raise DomainError(name, count, "1 or more")
@@ -97,7 +95,7 @@ def train(
     waited = 0
     damping = INITIAL_DAMPING
     stopped_by = "epochs"
-    for epoch in range(1, epochs + 1):
+    for epoch in tqdm(range(1, epochs + 1), desc="training", unit="epoch", disable=None, leave=False):
         normal, gradient = _normal_equations(network, inputs, targets)
         while damping <= GREATEST_DAMPING:
             change = _step(normal, gradient, damping)
@@ -118,8 +116,6 @@ def train(
         history.append(step)
         if step.validation_rmse_N < best.validation_rmse_N:
             best, best_weights = step, weights
-        if progress is not None:
-            progress(step)
         if step.validation_rmse_N < reference * (1 - least_improvement):
             reference, waited = step.validation_rmse_N, 0
         else:

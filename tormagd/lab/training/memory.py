@@ -4,13 +4,11 @@ import itertools
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tormagd.lab.arrays import Array
 from tormagd.lab.training.dataset import Dataset
 from tormagd.physics.errors import DomainError
 from tormagd.physics.relaxation import PronySeries
-
-Array = NDArray[np.float64]
 
 
 def records(data: Dataset) -> Iterator[slice]:

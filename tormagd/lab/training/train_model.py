@@ -6,16 +6,13 @@ tormag-lab train-model DATA.csv --element torque --insert MRE-50-40 --out FILE.s
 import argparse
 import datetime
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-
-from tqdm import tqdm
 
 from tormagd.lab.errors import LabError
 from tormagd.lab.main import Found
 from tormagd.lab.training.dataset import Dataset, read_csv
 from tormagd.lab.training.fitting import fit_model
-from tormagd.lab.training.levenberg_marquardt import Epoch, Training
+from tormagd.lab.training.levenberg_marquardt import Training
 from tormagd.lab.training.unremembered import identify
 from tormagd.model.features import Element
 from tormagd.model.memory import NO_MEMORY, Memory
@@ -43,20 +40,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--rising", action="store_true", help="refuse a model whose force does not rise with the field everywhere"
     )
     parser.add_argument("--created", type=datetime.date.fromisoformat, help="date in the file (default: today)")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the convergence")
 
 
 def run(options: argparse.Namespace) -> Found:
     """Trains and writes; the metrics. Raises LabError, DomainError, OSError."""
-    for path in (options.out, options.plot):
-        if path is not None and not path.parent.is_dir():
-            raise LabError(f"cannot write {path}: {path.parent} is not a directory")
+    if not options.out.parent.is_dir():
+        raise LabError(f"cannot write {options.out}: {options.out.parent} is not a directory")
     model, training = fit(options, read_csv(options.data))
     save_model(options.out, model)
-    if options.plot is not None:
-        plot_convergence(options.plot, training)
     report = {"out": str(options.out), "data_sha256": model.metadata.training_data_sha256, **model.metadata.metrics}
-    return Found({**report, "stopped_by": training.stopped_by}, [*lines(model, training), str(options.out)])
+    return Found({**report, "stopped_by": training.stopped_by})
 
 
 def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Training]:
@@ -65,26 +58,17 @@ def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Trainin
     if options.without_memory:
         memory, data = identify(data)
         write_line(memory_line(memory), sys.stderr)
-    training_data, validation_data = data.split(options.validation_share, options.seed)
-    with tqdm(total=options.epochs, unit="epoch", disable=None, leave=False) as bar:
-
-        def show(epoch: Epoch) -> None:
-            bar.set_postfix_str(f"train {epoch.train_rmse_N:.4f} N, validation {epoch.validation_rmse_N:.4f} N rms")
-            bar.update()
-
-        model, training = fit_model(
-            training_data,
-            validation_data,
-            element=options.element,
-            insert=options.insert,
-            data_sha256=data_sha256,
-            created=options.created or datetime.date.today(),
-            memory=memory,
-            hidden=options.hidden,
-            epochs=options.epochs,
-            seed=options.seed,
-            progress=show,
-        )
+    model, training = fit_model(
+        *data.split(options.validation_share, options.seed),
+        element=options.element,
+        insert=options.insert,
+        data_sha256=data_sha256,
+        created=options.created or datetime.date.today(),
+        memory=memory,
+        hidden=options.hidden,
+        epochs=options.epochs,
+        seed=options.seed,
+    )
     share = model.metadata.metrics["not_rising_share"]
     if options.rising and share > 0.0:
         raise DomainError("not_rising_share", share, "0: train with other hidden units, another seed or more data")
@@ -96,34 +80,3 @@ def memory_line(memory: Memory) -> str:
     terms = zip(memory.fractions, memory.times_s, strict=True)
     relaxing = ", ".join(f"{fraction:.1%} in {time_s:.0f} s" for fraction, time_s in terms)
     return f"taken out: relaxation of {relaxing}; a field {memory.lag_mT:.1f} mT behind"
-
-
-def lines(model: ForceModel, training: Training) -> Iterator[str]:
-    """The metrics for a person."""
-    metrics = model.metadata.metrics
-    yield f"{'':12}{'R2':>9}{'MAE N':>9}{'MAE %':>8}{'RMSE N':>9}{'max N':>8}{'rows':>8}"
-    for part in ("train", "validation"):
-        values = {name.removeprefix(f"{part}_"): value for name, value in metrics.items()}
-        yield (
-            f"{part:12}{values.get('r2', float('nan')):9.5f}{values['mae_N']:9.4f}{values['mae_percent']:8.2f}"
-            f"{values['rmse_N']:9.4f}{values['max_N']:8.3f}{values['rows']:8.0f}"
-        )
-    yield f"kept epoch {training.best.epoch} of {len(training.history)}, stopped by {training.stopped_by}"
-    yield f"dF/dB <= 0 on {100 * metrics['not_rising_share']:.2f}% of the training box"
-
-
-def plot_convergence(path: Path, training: Training) -> None:
-    """Draw the errors over the epochs."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    axes = figure.subplots()
-    epochs = [step.epoch for step in training.history]
-    axes.semilogy(epochs, [step.train_rmse_N for step in training.history], label="training")
-    axes.semilogy(epochs, [step.validation_rmse_N for step in training.history], label="validation")
-    axes.axvline(training.best.epoch, color="grey", linestyle=":", label=f"kept: epoch {training.best.epoch}")
-    axes.set(
-        xlabel="epoch", ylabel="force error, N rms", title=f"Levenberg-Marquardt, stopped by {training.stopped_by}"
-    )
-    axes.legend()
-    figure.savefig(path, dpi=150)

@@ -10,15 +10,13 @@ h follows the field's changes towards +-h_max. A record begins after a long rest
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from tormagd.lab.arrays import Array
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.memory import records, times_of
 from tormagd.model.features import FEATURES, FIELD
 from tormagd.model.memory import Memory
-
-Array = NDArray[np.float64]
 
 RATE = FEATURES.index("rate_mm_s")
 START_TIMES_S = (10.0, 100.0, 1000.0)

@@ -7,13 +7,13 @@ forms are those of a speed that is reached at once.
 import json
 import math
 import re
-import sys
 
-import bound
 import msgspec
 import numpy as np
 import pytest
-from rendering.ideal_carriage import (
+
+from tormagd.lab.human_pulse import pulse_profile
+from tormagd.lab.ideal_carriage import (
     Asked,
     Brake,
     Drive,
@@ -25,8 +25,7 @@ from rendering.ideal_carriage import (
     no_delay_mm,
     rms,
 )
-
-from tormagd.lab.human_pulse import pulse_profile
+from tormagd.lab.main import main
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.element import Element
@@ -276,19 +275,14 @@ def test_a_force_may_be_held_until_the_next() -> None:
     assert held.figures(0.9)["no_delay_rms_N"] <= 1e-3
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["bound.py", *arguments])
-    return bound.main()
-
-
-def test_the_command_prints_the_three_figures(monkeypatch, capsys, tmp_path) -> None:
+def test_the_command_prints_the_three_figures(capsys, tmp_path) -> None:
     path = tmp_path / "force.csv"
     path.write_text("t_s,force_N\n0,1.0\n0.2,1.0\n0.21,1.4\n0.5,1.4\n")
-    assert run(monkeypatch, str(path), "--plant", "sample_3", "--json") == 0
+    assert main(["bound", str(path), "--plant", "sample_3", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert set(result) == {"sd_N", "no_delay_rms_N", "foresight_rms_N"}
     assert 0.0 < result["foresight_rms_N"] < result["no_delay_rms_N"]
-    assert run(monkeypatch, str(path)) == 0
+    assert main(["bound", str(path)]) == 0
     assert re.search(r"^no_delay_rms_N +0\.1713$", capsys.readouterr().out, re.MULTILINE)
 
 
@@ -298,14 +292,11 @@ def test_the_command_prints_the_three_figures(monkeypatch, capsys, tmp_path) -> 
         ("t_s,force_N\n0,1\n1,nan\n2,1\n", [], "row 3, force_N = 'nan'"),
         ("t_s,force_N\n0,1\n1,1\n1,1\n", [], "row 4, t_s = 1"),
         ("t_s,force_N\n0,1\n1,1\n1e4,1\n", [], "t_s = 0.0 .. 10000.0"),
-        ("t_s,force_N\n0,1\n1,1\n2,1\n", ["--step-ms", "2"], "step_s = 0.002"),
-        ("t_s,force_N\n0,1\n1,1\n2,1\n", ["--hand-mm-s", "0"], "hand_mm_s = 0.0"),
-        ("t_s,force_N\n0,1\n1,1\n2,1\n", ["--most-N", "nan"], "most_N = nan"),
         ("t_s,force_N\n0,1\n1,1\n2,1\n", ["--plant", "sample_9"], "sample_9"),
     ],
 )
-def test_what_cannot_be_used_is_named(monkeypatch, capsys, tmp_path, text, arguments, said) -> None:
+def test_what_cannot_be_used_is_named(capsys, tmp_path, text, arguments, said) -> None:
     path = tmp_path / "force.csv"
     path.write_text(text)
-    assert run(monkeypatch, str(path), *arguments) == 2
+    assert main(["bound", str(path), *arguments]) == 2
     assert said in capsys.readouterr().err

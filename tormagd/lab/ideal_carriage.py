@@ -14,30 +14,33 @@ that is no bound: a forecast that is right misses less, down to what foresight d
 *With foresight* the whole signal is known, and the RMS error is the least that the drive allows; at what gap and speed
 the carriages begin is free. The optimum is found by sequential quadratic programmes (Gauss-Newton, each solved by
 Clarabel), to 2 %: carried on, the rounds found nothing better than that. Without the field's lag a search of everything
-agrees to 0.4 % (`tests/tools/test_bound.py`).
+agrees to 0.4 % (`tests/lab/test_bound.py`).
 """
 
+import argparse
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import clarabel
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 
-from rendering.hands import TURNED_MM_S
-from tormagd.physics.errors import DomainError, require
+from tormagd.force_file import read_forces
+from tormagd.lab.arrays import Array, Json
+from tormagd.lab.errors import LabError
+from tormagd.lab.main import Found
+from tormagd.physics.errors import DomainError
 from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.curve import Curve
 from tormagd.simulation.gap_field import SMALLEST_GAP_MM
-from tormagd.simulation.parameters import PlantParameters
+from tormagd.simulation.parameters import PlantParameters, load_plant
 from tormagd.simulation.static_laws import MOMENT_POINTS, force_over_moment, pull_over_gap, radial_moment_Tm
 
-Array = npt.NDArray[np.float64]
-Json = dict[str, Any]
-
+TURNED_MM_S = 42.0
+"The roller's surface at the thesis's 20 rpm."
 STEP_S = 1e-3
 MOST_N = 2.0
 "The greatest force of the scenes."
@@ -263,14 +266,9 @@ def bound(
     force_N: Array,
     *,
     is_held: bool = False,
-    most_N: float = MOST_N,
-    hand_mm_s: float = TURNED_MM_S,
     step_s: float = STEP_S,
 ) -> Bound:
     """The bound for forces at rising times, linear in between, or held until the next. Raises `DomainError`."""
-    require("step_s", step_s, 1e-5, STEP_S)
-    require("hand_mm_s", hand_mm_s, 0.5, 300.0)
-    require("most_N", most_N, 0.1, 10.0)
     steps = (time_s[-1] - time_s[0]) / step_s
     if not 2.0 <= steps <= MOST_STEPS:
         raise DomainError("t_s", f"{time_s[0]} .. {time_s[-1]}", f"2 to {MOST_STEPS} steps of {step_s:g} s")
@@ -279,7 +277,7 @@ def bound(
     if is_held:
         wanted_N = force_N[np.searchsorted(time_s, axis_s + 1e-9, side="right") - 1]
     brake, drive = brake_of(plant), drive_of(plant)
-    asked = asked_of(brake, wanted_N, most_N=most_N, hand_mm_s=hand_mm_s, step_s=step_s)
+    asked = asked_of(brake, wanted_N, most_N=MOST_N, hand_mm_s=TURNED_MM_S, step_s=step_s)
     greedy_mm = no_delay_mm(drive, brake, asked, step_s)
     best_mm = foresight_mm(drive, brake, asked, step_s)
     return Bound(axis_s, asked.force_N, asked.rendered_N(brake, greedy_mm), asked.rendered_N(brake, best_mm))
@@ -350,7 +348,7 @@ def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arr
     A round takes for straight, about the gap of the last round, what is not: the force over the gap, the field's lag,
     and the speeds that a step reaches over the speed before. It solves the quadratic programme that this makes, whose
     unknowns are the gaps and the lags. Nothing says that this is convex, so that it ends at the optimum is tested:
-    against a search of everything (`tests/tools/test_bound.py`).
+    against a search of everything (`tests/lab/test_bound.py`).
     Raises RuntimeError where the rounds come to no end.
     """
     steps = len(asked.force_N)
@@ -393,6 +391,24 @@ def foresight_mm(drive: Drive, brake: Brake, asked: Asked, step_s: float) -> Arr
             radius_mm = 0.5 * float(np.abs(moved_mm).max())
         last_N = now_N
     raise RuntimeError(f"foresight: no end after {ROUNDS} rounds, {last_N * 1e3:.2f} mN")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of `tormag-lab bound`."""
+    parser.add_argument("force", type=Path, metavar="FORCE.csv", help="columns t_s,force_N")
+    parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample (sample_1)")
+    parser.add_argument("--held", action="store_true", help="each force holds until the next (linear in between)")
+
+
+def run(options: argparse.Namespace) -> Found:
+    """The figures of a file of forces. Raises DomainError, ForceFileError, PlantError, and LabError where no optimum
+    was found."""
+    table = read_forces(options.force)
+    plant, time_s, force_N = load_plant(options.plant), np.array(table["t_s"]), np.array(table["force_N"])
+    try:
+        return Found(bound(plant, time_s, force_N, is_held=options.held).figures())
+    except RuntimeError as error:
+        raise LabError(str(error)) from error
 
 
 def rms(error_N: Array) -> float:

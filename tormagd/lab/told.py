@@ -1,6 +1,6 @@
 """The result of any measurement for a person: a line for a figure or a few that belong together, a table for rows."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 
@@ -17,7 +17,7 @@ def lines(result: Mapping[str, Any], path: str = "") -> Iterator[str]:
             yield f"{name:40s}{shown(value)}"
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+def table(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
     """Rows under the names of their figures, those of a part behind the part's name; what holds more is left out."""
     flat = [dict(_figures(row)) for row in rows]
     names = list(dict.fromkeys(name for row in flat for name in row))
@@ -41,4 +41,4 @@ def shown(value: Any) -> str:
         return ", ".join(f"{name} {shown(inner)}" for name, inner in value.items())
     if isinstance(value, float):
         return f"{value:.4g}"
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
