@@ -4,11 +4,10 @@ from collections.abc import Callable, Iterable
 
 import pytest
 
+from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import Plan
+from tormagd.control.records import Plan, TimedSetpoint
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import Hand, SteadyHand
@@ -41,7 +40,7 @@ def make(core: Core) -> Maker:
     ) -> ClosedLoop:
         parameters = load_plant(plant) if isinstance(plant, str) else plant
         device = VirtualDevice(parameters, hand or SteadyHand(), [parse_fault(fault) for fault in faults], seed)
-        return ClosedLoop(config or Config(), core.stepper, core.planner if planned else None, device)
+        return ClosedLoop(config or Config(), core.stepper(), core.planner() if planned else None, device)
 
     return build
 

@@ -2,10 +2,10 @@
 
 import msgspec
 
+from tormagd.assembly.belief import beliefs
+from tormagd.assembly.build import build_core
 from tormagd.config import Config
-from tormagd.control.belief import beliefs
-from tormagd.control.core import build_core
-from tormagd.control.sensor_zero import UNKNOWN_SD_N
+from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.scenes.scene import EVERY_TERM, Terms, load_scene
 
 

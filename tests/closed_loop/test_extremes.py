@@ -13,8 +13,8 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from firmware_protocol.value import Value
 from tormagd.closed_loop import Array, ClosedLoop, Sample
 from tormagd.config import Config
-from tormagd.control.plan import Plan
-from tormagd.control.step import Stepper
+from tormagd.control.core import Stepper
+from tormagd.control.records import Plan
 from tormagd.safety.operating_state import OperatingState
 from tormagd.scenes.scene import load_scene
 from tormagd.simulation.device import VirtualDevice
@@ -76,7 +76,7 @@ def skews_um(synchronisation: float) -> Array:
     for tick in range(1_600):
         gap_mm, speed_mm_s = (94.0 - 15e-3 * tick, -15.0) if tick < 800 else (82.0 + 15e-3 * (tick - 800), 15.0)
         samples.append(loop.tick(plan=gap_plan(gap_mm, loop.now_s).replaced(gap_speed_mm_s=speed_mm_s)))
-    assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
+    assert samples[-1].safety.operating_state is OperatingState.ENABLED
     assert_sane(samples, config)
     assert samples[-1].truth.gap_mm == pytest.approx(94.0, abs=0.1)
     return np.array([sample.measured.skew_mm for sample in samples if sample.measured is not None]) * 1e3
@@ -96,7 +96,7 @@ def test_motors_that_cannot_keep_the_speed_are_waited_for() -> None:
     loop.arm(gap_plan(OPEN_MM))
     samples = on_the_way(loop, 47.0, 2_000) + on_the_way(loop, 93.0, 2_000)
     assert_sane(samples)
-    assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
+    assert samples[-1].safety.operating_state is OperatingState.ENABLED
     assert samples[-1].truth.gap_mm == pytest.approx(93.0, abs=0.1)
 
 
@@ -125,7 +125,7 @@ def unevenly(loop: ClosedLoop, gap_mm: float, periods_s: list[float]) -> list[Sa
 def test_jitter_of_a_few_periods_is_ridden_out(periods_s: list[float]) -> None:
     samples = unevenly(armed(), 92.0, periods_s)
     assert_sane(samples)
-    assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
+    assert samples[-1].safety.operating_state is OperatingState.ENABLED
     assert min(sample.truth.gap_mm for sample in samples) > 92.0 - 0.2
 
 
@@ -135,7 +135,7 @@ def test_jitter_beyond_the_timeout_ends_in_a_fault_and_not_in_motion(periods_s: 
     samples = unevenly(armed(), 90.0, periods_s)
     assert_sane(samples)
     if max(periods_s) > 0.05:
-        assert samples[-1].state.safety.operating_state is OperatingState.FAULT
+        assert samples[-1].safety.operating_state is OperatingState.FAULT
     assert min(sample.truth.gap_mm for sample in samples) > 90.0 - 2.0
 
 
@@ -150,5 +150,5 @@ def test_a_target_that_flips_every_tick_is_averaged_and_left_behind_cleanly() ->
     assert all(79.9 < sample.truth.gap_mm < 90.1 for sample in flipping)
     after = on_the_way(loop, 85.0, 600)
     assert_sane(after)
-    assert after[-1].state.safety.operating_state is OperatingState.ENABLED
+    assert after[-1].safety.operating_state is OperatingState.ENABLED
     assert after[-1].truth.gap_mm == pytest.approx(85.0, abs=0.03)

@@ -7,12 +7,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import Sample
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
-from tormagd.control.governor import Governor
-from tormagd.control.portrait import Portrait
-from tormagd.control.sensor_zero import UNKNOWN_SD_N
+from tormagd.control.aim.portrait import Portrait
+from tormagd.control.ask.governor import Governor
+from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd.simulation.device import VirtualDevice
@@ -173,7 +173,7 @@ def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(arm, re
     render(loop, ASKED_N, 2.0)
     LyingSensor(loop.device, LIES["-1 N"](), loop.now_s)
     samples = render(loop, ASKED_N, 3.0)
-    assert samples[-1].state.safety.faults == (Fault.SENSOR,)
+    assert samples[-1].safety.faults == (Fault.SENSOR,)
     first = next(sample.time_s for sample in samples if sample.safety.faults)
     assert first - samples[0].time_s == pytest.approx(2.06, abs=0.1)
 
@@ -221,7 +221,7 @@ def test_the_gap_holds_alone(arm, render, monkeypatch: pytest.MonkeyPatch, sampl
     assert samples[-1].plan.governed_N == 6.0
     assert MOST_N < worst_N(samples) < CEILING_N
     assert Limit.CEILING in samples[-1].plan.limits
-    assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
+    assert samples[-1].safety.operating_state is OperatingState.ENABLED
 
 
 # -- layer c: the measured force -----------------------------------------------------------------------------------
@@ -233,7 +233,7 @@ def test_the_measured_force_holds_alone(arm, hold_gap, sample: str) -> None:
     core = build_core(CONFIG)
     loop = arm(sample, core=core)
     shut = hold_gap(loop, 47.0, 4.0)
-    assert shut[-1].state.safety.faults == (Fault.OVER_FORCE,)
+    assert shut[-1].safety.faults == (Fault.OVER_FORCE,)
     assert any(Limit.OVER_FORCE in sample.output.limits for sample in shut)
     forces_N = np.array([sample.truth.force_N for sample in shut])
     over_s = 1e-3 * np.count_nonzero(forces_N > CEILING_N)
@@ -250,5 +250,5 @@ def test_a_start_from_rest_is_not_over_force(arm, render, sample: str) -> None:
     """Static friction is up to 1.25 times the kinetic one."""
     loop = arm(sample, ReversingHand(2.0))
     samples = render(loop, MOST_N, 6.0)
-    assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
+    assert samples[-1].safety.operating_state is OperatingState.ENABLED
     assert worst_N(samples) < CEILING_N

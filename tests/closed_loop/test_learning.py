@@ -4,10 +4,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from tormagd.assembly.build import build_core
 from tormagd.config import Config
-from tormagd.control.core import build_core
-from tormagd.control.device_fit import UNSEEN
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.believe.strength import UNSEEN
+from tormagd.control.records import TimedSetpoint
 from tormagd.scenes.scene import Terms, load_scene
 
 VALID_S = 0.2

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config, Rates
-from tormagd.control.core import Core, build_core
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.lab.tactile.held import Case, hold
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene, scene_path
@@ -67,4 +67,4 @@ def test_a_finger_that_presses_too_hard_opens_the_gap_and_is_no_fault(arm, pad_c
     assert last.truth.force_N > 1.5 * SCENE.force.most_N
     assert Limit.OVER_FORCE in last.output.limits
     assert last.truth.gap_mm > 94.0
-    assert not last.state.safety.faults
+    assert not last.safety.faults

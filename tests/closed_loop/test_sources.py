@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import msgpack
 import pytest
-
-from tormagd.closed_loop import ClosedLoop, Sample
-from tormagd.control.core import Core
 from tormagd.control.plan import PlanState
+
+from tormagd.assembly.build import Core
+from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.source_clock import SETTLED_S
 from tormagd.daemon.way import Way

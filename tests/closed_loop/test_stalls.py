@@ -3,10 +3,10 @@
 import pytest
 
 from firmware_protocol.codec import DeviceMode
+from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState
 from tormagd.simulation.device import VirtualDevice
@@ -27,7 +27,7 @@ def core() -> Core:
 
 def armed(core: Core, plant: str = "sample_1") -> ClosedLoop:
     device = VirtualDevice(load_plant(plant), SteadyHand(), seed=1)
-    loop = ClosedLoop(Config(), core.stepper, core.planner, device)
+    loop = ClosedLoop(Config(), core.stepper(), core.planner(), device)
     loop.arm()
     return loop
 
@@ -95,7 +95,7 @@ def test_a_daemon_that_stalls_for_less_than_the_timeout_goes_on(holding: ClosedL
     before = holding.step_state
     forces_N = stall(holding, stall_ms)
     samples = run(holding, FORCE_N, 0.6)
-    assert samples[-1].state.safety.faults == ()
+    assert samples[-1].safety.faults == ()
     assert Limit.HOST_STALL in limits_of(samples)
     assert not samples[-1].output.limits
     forces_N += [sample.truth.force_N for sample in samples]
@@ -111,7 +111,7 @@ def test_a_stall_on_the_way_leaves_no_kick(holding: ClosedLoop, stall_ms: int) -
     run(holding, 1.7, 0.08)
     stall(holding, stall_ms)
     samples = run(holding, 1.7, 1.2)
-    assert samples[-1].state.safety.faults == ()
+    assert samples[-1].safety.faults == ()
     assert max(sample.truth.force_N for sample in samples) < 1.7 + ALLOWED_N
     assert all(sample.truth.force_N == pytest.approx(1.7, abs=ALLOWED_N) for sample in samples[400:])
 
@@ -120,7 +120,7 @@ def test_stalls_one_after_the_other(holding: ClosedLoop) -> None:
     for stall_ms in (45, 6, 30, 47, 10, 20):
         stall(holding, stall_ms)
         samples = run(holding, FORCE_N, 0.05)
-        assert samples[-1].state.safety.faults == ()
+        assert samples[-1].safety.faults == ()
         assert samples[-1].truth.force_N == pytest.approx(FORCE_N, abs=ALLOWED_N)
 
 
@@ -130,8 +130,8 @@ def test_a_daemon_that_stalls_for_longer_finds_the_device_opening_and_says_why(
 ) -> None:
     stall(holding, stall_ms)
     samples = run(holding, FORCE_N, 3.0)
-    assert samples[25].state.safety.operating_state is OperatingState.FAULT
-    assert samples[-1].state.safety.faults == (Fault.HOST_STALL,)
+    assert samples[25].safety.operating_state is OperatingState.FAULT
+    assert samples[-1].safety.faults == (Fault.HOST_STALL,)
     assert samples[-1].truth.gap_mm > OPEN_MM - 1.0
     assert holding.measurement is not None
     assert holding.measurement.mode is DeviceMode.LATCHED
@@ -144,7 +144,7 @@ def test_a_device_that_stands_still_for_less_than_the_timeout_is_waited_for(hold
     holding.device = device  # type: ignore[assignment]
     device.stop(holding.now_s, stop_ms)
     samples = run(holding, FORCE_N, 0.6)
-    assert samples[-1].state.safety.faults == ()
+    assert samples[-1].safety.faults == ()
     assert (Limit.DEVICE_SILENT in limits_of(samples)) == (stop_ms > 5)
     assert Limit.HOST_STALL not in limits_of(samples)
     assert max(abs(sample.truth.force_N - FORCE_N) for sample in samples) < ALLOWED_N
@@ -156,8 +156,8 @@ def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLo
     holding.device = device  # type: ignore[assignment]
     device.stop(holding.now_s, stop_ms)
     samples = run(holding, FORCE_N, 3.0)
-    assert samples[-1].state.safety.faults[0] is Fault.MEASUREMENT_STALE
-    assert Fault.HOST_STALL not in samples[-1].state.safety.faults
+    assert samples[-1].safety.faults[0] is Fault.MEASUREMENT_STALE
+    assert Fault.HOST_STALL not in samples[-1].safety.faults
     assert not any(sample.output.mode.name == "RUN" for sample in samples if sample.safety.faults)
 
 
@@ -171,7 +171,7 @@ def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(core: Core
     run(loop, 1.2, 0.8)
     loop.device.messages._home_m -= 2e-4
     samples = run(loop, force_N, 3.0)
-    assert samples[-1].state.safety.faults == ()
+    assert samples[-1].safety.faults == ()
     assert Limit.F_MIN in samples[-1].plan.limits
     assert OPEN_MM - 0.5 < samples[-1].truth.gap_mm < OPEN_MM - 0.02
     held = samples[1_500:]

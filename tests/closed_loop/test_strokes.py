@@ -3,10 +3,10 @@
 import msgspec
 import pytest
 
+from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import Sample
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
-from tormagd.control.step import LIVELIEST
+from tormagd.control.move.carriages import MAX_ACCELERATION_SCALE
 from tormagd.simulation.hand import RecordedHand
 
 CONFIG = Config()
@@ -51,7 +51,8 @@ def test_a_step_knows_nothing_of_the_stroke_before_it(arm, hold_gap) -> None:
 
 
 @pytest.mark.parametrize(
-    ("sample", "least", "most"), [("sample_1", 1.0, 1.4), ("sample_2", 1.0, 1.0), ("sample_3", 1.6, LIVELIEST)]
+    ("sample", "least", "most"),
+    [("sample_1", 1.0, 1.4), ("sample_2", 1.0, 1.0), ("sample_3", 1.6, MAX_ACCELERATION_SCALE)],
 )
 def test_lively_motors_are_asked_for_more_and_weak_ones_for_no_less(
     arm, hold_gap, sample: str, least: float, most: float

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
 from tormagd.control import estimate
-from tormagd.control.core import build_core
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.ctl import calibrate as ctl_calibrate, calibrate_motors as ctl_calibrate_motors, calibrate_run
 from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, up_and_down, write_sweeps
 from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, excitation, motor_log
@@ -41,11 +41,11 @@ def record(plant="sample_1", hand=None, rates_N_s=(0.8, 1.0, 0.8), most_N=2.0):
     config = Config()
     core = build_core(config)
     device = VirtualDevice(load_plant(plant), hand or ReversingHand(2.0), seed=3)
-    loop = ClosedLoop(config, core.stepper, core.planner, device)
+    loop = ClosedLoop(config, core.stepper(), core.planner(), device)
     loop.arm()
     sweeps = []
     for rate in rates_N_s:
-        waveform = up_and_down(Range(core.planner.portrait.least_N, most_N), rate)
+        waveform = up_and_down(Range(core.portrait.min_N, most_N), rate)
         start_s = loop.now_s
         rows = []
         for sample in loop.run(

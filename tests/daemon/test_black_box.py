@@ -9,11 +9,11 @@ import msgspec
 import pytest
 
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, Hello
+from tormagd.assembly.build import Core, build_core
+from tormagd.assembly.journal import MOST_ENTRIES, Journal
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.journal import MOST_ENTRIES, Journal
+from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.black_box import PART_TICKS, BlackBox
 from tormagd.daemon.profiles import state_folder
 from tormagd.daemon.telemetry import tick_record
@@ -34,7 +34,7 @@ def core() -> Core:
 
 def closed_loop(core: Core) -> ClosedLoop:
     device = VirtualDevice(load_plant("sample_1"), ReversingHand(2.0))
-    return ClosedLoop(Config(), core.stepper, core.planner, device)
+    return ClosedLoop(Config(), core.stepper(), core.planner(), device)
 
 
 class Rig:

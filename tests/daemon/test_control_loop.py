@@ -5,10 +5,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from tormagd.control.step import StepState
 
 from firmware_protocol.codec import DriveMode
-from tormagd.control.journal import Journal
-from tormagd.control.step import StepOutput, StepState
+from tormagd.assembly.journal import Journal
+from tormagd.control.records import Duty
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.safety.operating_state import DeviceRequest
 
@@ -20,9 +21,9 @@ def test_the_measurement_that_a_step_was_given_is_kept_though_the_exchange_bring
     def exchange(*_arguments: Any) -> None:
         connection.measurement = "new"
 
-    def step(state: StepState, now_s: float, measurement: Any, _plan: Any) -> tuple[StepState, StepOutput]:
+    def step(state: StepState, now_s: float, measurement: Any, _plan: Any) -> tuple[StepState, Duty]:
         given.append(measurement)
-        return state.replaced(time_s=now_s), StepOutput(DriveMode.OFF, 0.0, 0.0, DeviceRequest.NONE, 0, ())
+        return state.replaced(time_s=now_s), Duty(DriveMode.OFF, 0.0, 0.0, DeviceRequest.NONE, 0, ())
 
     connection.exchange = exchange
     connection.receive = lambda: given.append("received")

@@ -6,10 +6,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from tormagd.control.plan import PlanState
 
-from tormagd.control.governor import GovernorState, TimedSetpoint
-from tormagd.control.journal import Journal
-from tormagd.control.plan import Plan, PlanState
+from tormagd.assembly.journal import Journal
+from tormagd.control.ask.governor import GovernorState
+from tormagd.control.records import Plan, TimedSetpoint
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.physics.errors import DomainError

@@ -9,37 +9,37 @@ from pathlib import Path
 
 import pytest
 
-from tormagd.control.device_fit import DeviceFit
-from tormagd.control.lateness import Lateness
-from tormagd.control.plan import NOTHING_SHOWN, Shown
-from tormagd.control.profile import ProfileError, profile_of
-from tormagd.control.sensor import Sensor
+from tormagd.assembly.profile import ProfileError, profile_of
+from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
+from tormagd.control.believe.carriage_lag import CarriageLag
+from tormagd.control.believe.sensor import Sensor
+from tormagd.control.believe.strength import DeviceFit
 from tormagd.daemon.profiles import ProfileFolder, Profiles
 
 MODEL = "ab" * 32
-STRONG = Shown(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4), lateness=Lateness(0.02))
+STRONG = Learned(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4), lateness=CarriageLag(0.02))
 
 
 class Rig:
     """Profiles of a planner that is a variable, on an event loop that runs while they are asked to look."""
 
     def __init__(self, runner: asyncio.Runner, folder: Path | None) -> None:
-        self.shown = NOTHING_SHOWN
+        self.shown = NOTHING_LEARNED
         self._runner = runner
         self.profiles = runner.run(self._begun(None if folder is None else ProfileFolder(folder, "MRE-50-40", MODEL)))
 
     async def _begun(self, folder: ProfileFolder | None) -> Profiles:
         return Profiles(folder, lambda: self.shown, self.teach)
 
-    def teach(self, shown: Shown) -> None:
+    def teach(self, shown: Learned) -> None:
         self.shown = shown
 
-    def look(self, serial_number: int, *driven: bool, shown: Shown | None = None) -> None:
+    def look(self, serial_number: int, *driven: bool, shown: Learned | None = None) -> None:
         """Looks once for each of `driven`, and waits until the other thread has read and written. The planner has
         learned `shown` before the last."""
         self._runner.run(self._looked(serial_number, driven, shown))
 
-    async def _looked(self, serial_number: int, driven: tuple[bool, ...], shown: Shown | None) -> None:
+    async def _looked(self, serial_number: int, driven: tuple[bool, ...], shown: Learned | None) -> None:
         for number, is_driven in enumerate(driven, 1):
             if number == len(driven):
                 self.shown = shown or self.shown
@@ -57,7 +57,7 @@ def new_rig() -> Iterator[Callable[[Path | None], Rig]]:
         yield partial(Rig, runner)
 
 
-def keep(folder: Path, serial_number: int, shown: Shown = STRONG) -> None:
+def keep(folder: Path, serial_number: int, shown: Learned = STRONG) -> None:
     profile = profile_of(shown, serial_number=serial_number, insert="MRE-50-40", model=MODEL, saved_ns=0)
     ProfileFolder(folder, "MRE-50-40", MODEL).write(profile)
 
@@ -67,7 +67,7 @@ def test_what_is_learned_while_driven_is_there_after_a_restart(
 ) -> None:
     rig = new_rig(tmp_path / "profiles")
     rig.look(7, False)
-    assert (rig.shown, rig.profiles.report().is_used) == (NOTHING_SHOWN, False)
+    assert (rig.shown, rig.profiles.report().is_used) == (NOTHING_LEARNED, False)
     rig.look(7, True, False, shown=STRONG)
     again = new_rig(tmp_path / "profiles")
     again.look(7, False)
@@ -81,7 +81,7 @@ def test_what_is_learned_while_driven_is_there_after_a_restart(
     ("added", "is_kept"),
     [
         ({"device": DeviceFit(1.31, 0.02, 1e-4, 0.0, 1e-4)}, b'"scale": 1.31'),
-        ({"lateness": Lateness(0.025)}, b'"lag_s": 0.025'),
+        ({"lateness": CarriageLag(0.025)}, b'"lag_s": 0.025'),
     ],
 )
 def test_a_profile_that_nothing_was_added_to_does_not_get_younger(
@@ -113,7 +113,7 @@ def test_another_device_is_not_taken_for_the_one_before(new_rig: Callable[[Path 
     rig.look(7, False)
     assert rig.shown.device.scale == 1.3
     rig.look(8, False)
-    assert (rig.shown, rig.profiles.report().is_used) == (NOTHING_SHOWN, False)
+    assert (rig.shown, rig.profiles.report().is_used) == (NOTHING_LEARNED, False)
 
 
 def test_a_device_that_has_shown_itself_meanwhile_is_believed(
@@ -121,7 +121,7 @@ def test_a_device_that_has_shown_itself_meanwhile_is_believed(
 ) -> None:
     keep(tmp_path, 7)
     rig = new_rig(tmp_path)
-    rig.look(7, False, False, shown=Shown(DeviceFit(0.8)))
+    rig.look(7, False, False, shown=Learned(DeviceFit(0.8)))
     assert rig.shown.device.scale == 0.8
 
 
@@ -157,7 +157,7 @@ def test_a_wrong_file_is_named_and_nothing_is_believed_of_it(
     rig = new_rig(tmp_path)
     spoil(tmp_path / "00000007-MRE-50-40.json")
     rig.look(7, False)
-    assert rig.shown == NOTHING_SHOWN
+    assert rig.shown == NOTHING_LEARNED
     assert says in rig.profiles.report().refusal
 
 

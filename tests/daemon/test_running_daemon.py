@@ -13,12 +13,12 @@ from typing import Any, ClassVar
 
 import msgspec
 import pytest
+from tormagd.control.plan import PlanState
 
 from firmware_protocol.build import settle
+from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import VirtualPort
 from tormagd.config import Config, Rates, RealTime
-from tormagd.control.core import Core, build_core
-from tormagd.control.plan import PlanState
 from tormagd.control.sight import Sight
 from tormagd.daemon import daemon as daemon_module, notify
 from tormagd.daemon.callbacks import KERNEL, Delay
@@ -279,7 +279,7 @@ def test_a_daemon_describes_what_it_runs(running: Running) -> None:
     assert (described.model, described.build) == (running.core.model, str(settle()))
     assert (described.firmware, described.serial_number) == (None, None)
     # a device that has shown nothing yet is the model, at the gap speed of the configuration
-    shown, told = running.core.planner.portrait, described.portrait
+    shown, told = running.core.portrait, described.portrait
     assert told is not None
     assert told.force_N == pytest.approx(shown.force_N[::5], abs=1e-4)
     speed_mm_s = described.configuration["position"]["gap_speed_mm_s"]

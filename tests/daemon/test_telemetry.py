@@ -4,12 +4,12 @@ import time
 
 import msgspec
 import pytest
+from tormagd.control.step import StepState
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
-from tormagd.control.estimate import first_estimate
-from tormagd.control.plan import Outside, Plan
-from tormagd.control.step import StepOutput, StepState
-from tormagd.control.trajectory import Reference
+from tormagd.control.measure import first_estimate
+from tormagd.control.move.reference import Reference
+from tormagd.control.records import Duty, Outside, Plan
 from tormagd.daemon.telemetry import limits_held, snapshot, tick_record
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
@@ -18,7 +18,7 @@ from tormagd.safety.operating_state import DeviceRequest, OperatingState, Safety
 from tormagd_client.messages import Telemetry, decode, encode, encode_ticks
 
 PLAN = Plan(7, 1.0, 1.5, 0.01, 1.4, 1.38, 500.0, 64.0, -1.0, 0.9, (Limit.RANGE, Limit.SKEW))
-OUTPUT = StepOutput(DriveMode.RUN, 0.1, -0.2, DeviceRequest.NONE, 0, (Limit.SKEW, Limit.RATE))
+OUTPUT = Duty(DriveMode.RUN, 0.1, -0.2, DeviceRequest.NONE, 0, (Limit.SKEW, Limit.RATE))
 MEASUREMENT = Measurement(
     number=1,
     received_s=1.0,
@@ -120,7 +120,7 @@ def test_a_tick_is_recorded_whole() -> None:
     estimate = first_estimate(measurement, 47.5)
     safety = SafetyState(OperatingState.PAUSED, (Fault.SKEW, Fault.SENSOR), DeviceRequest.CLEAR, 99)
     state = StepState(1.5, safety, estimate, Reference(64.2))
-    output = StepOutput(DriveMode.RUN, 0.1, -0.2, DeviceRequest.HOME, 5, (Limit.RATE,))
+    output = Duty(DriveMode.RUN, 0.1, -0.2, DeviceRequest.HOME, 5, (Limit.RATE,))
     tick = tick_record(1.5, state, output, plan, 1.1, measurement, 20.0, 150.0, 9)
     sent = msgspec.msgpack.decode(encode_ticks([tick]))
     row = dict(zip(sent["columns"], sent["rows"][0], strict=True))

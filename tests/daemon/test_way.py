@@ -3,13 +3,13 @@
 import math
 
 import pytest
-
-from tormagd.config import Config
-from tormagd.control.core import build_core
-from tormagd.control.estimate import Estimate, Handle
 from tormagd.control.plan import PlanState
 from tormagd.control.step import StepState
-from tormagd.control.trajectory import Reference
+
+from tormagd.assembly.build import build_core
+from tormagd.config import Config
+from tormagd.control.move.reference import Reference
+from tormagd.control.records import Handle, Measured
 from tormagd.daemon.way import MOST_BEHIND_MM, Way
 from tormagd.model.displacement import Turn
 
@@ -20,8 +20,8 @@ def resting() -> PlanState:
 
 
 @pytest.fixture
-def estimate() -> Estimate:
-    return Estimate(1, True, 0.0, 35.0, 35.0, 0.0, 0.0, 1.0, Handle(0.0, 0.0, Turn(1.0, 0.0, 0.0)), 0.0, 0.0, 0.0)
+def estimate() -> Measured:
+    return Measured(1, True, 0.0, 35.0, 35.0, 0.0, 0.0, 1.0, Handle(0.0, 0.0, Turn(1.0, 0.0, 0.0)), 0.0, 0.0, 0.0)
 
 
 def planned(resting: PlanState, stamp_s: float, gap_mm: float = 70.0) -> PlanState:
@@ -49,7 +49,7 @@ def test_each_setpoint_ends_its_way_once_with_the_first_duty_that_follows_it(res
     assert way.report(None).to_duty_us.max == pytest.approx(20_000.0, abs=1.0)
 
 
-def swings(way: Way, resting: PlanState, estimate: Estimate, lag_s: float, jump_mm: float = 0.0) -> None:
+def swings(way: Way, resting: PlanState, estimate: Measured, lag_s: float, jump_mm: float = 0.0) -> None:
     """A gap that swings, and is so late."""
     for tick in range(4_000):
         now_s = 1.0 + tick * 1e-3
@@ -63,7 +63,7 @@ def swings(way: Way, resting: PlanState, estimate: Estimate, lag_s: float, jump_
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.013, 0.05])
 def test_the_carriages_delay_is_how_far_they_are_behind_over_how_fast(
-    resting: PlanState, estimate: Estimate, lag_s: float
+    resting: PlanState, estimate: Measured, lag_s: float
 ) -> None:
     way = Way()
     swings(way, resting, estimate, lag_s)
@@ -73,7 +73,7 @@ def test_the_carriages_delay_is_how_far_they_are_behind_over_how_fast(
     assert found.total_ms == pytest.approx(10.0 + 0.4 + 1e3 * lag_s, abs=0.2)
 
 
-def test_a_gap_that_is_on_its_way_after_a_jump_is_not_late(resting: PlanState, estimate: Estimate) -> None:
+def test_a_gap_that_is_on_its_way_after_a_jump_is_not_late(resting: PlanState, estimate: Measured) -> None:
     way = Way()
     swings(way, resting, estimate, 0.0, 2.0 * MOST_BEHIND_MM)
     assert way.report(400.0).carriages_ms is None

@@ -26,9 +26,9 @@ import pytest
 
 from firmware_protocol.codec import Drive, DriveMode, Home, Message, State
 from firmware_protocol.value import Value
+from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, Sample, VirtualWire, stream
 from tormagd.config import Config, Device
-from tormagd.control.core import Core, build_core
 from tormagd.hardware.backend import Backend, BackendError, choose
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
@@ -484,7 +484,7 @@ def a_device() -> VirtualDevice:
 @pytest.fixture
 def moving(core: Core) -> ClosedLoop:
     """A loop that is armed and closing its gap, on a perfect line."""
-    loop = ClosedLoop(CONFIG, core.stepper, core.planner, a_device())
+    loop = ClosedLoop(CONFIG, core.stepper(), core.planner(), a_device())
     loop.arm()
     asked = publisher(loop.now_s)
     for _ in loop.run(MOVING_S, asked):
@@ -549,8 +549,8 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
             break
     check_limits(samples)
     last = samples[-1]
-    if last.state.safety.faults:
-        assert last.state.safety.faults[0] in case.faults
+    if last.safety.faults:
+        assert last.safety.faults[0] in case.faults
         check_safe(loop, last)
     else:
         assert last.truth.force_N == pytest.approx(FORCE_N, abs=case.tolerance_N)
@@ -558,9 +558,7 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     assert (loop.connection.state, loop.connection.losses) == (case.link, case.losses)
     if case.named:
         settled = samples[-SETTLED_TICKS:]
-        assert case.named & {
-            name for sample in settled for name in (*sample.safety.faults, *sample.output.limits)
-        }
+        assert case.named & {name for sample in settled for name in (*sample.safety.faults, *sample.output.limits)}
     for name in case.counted:
         assert getattr(line.backend.statistics, name) > 0, name
     for name in case.uncounted:

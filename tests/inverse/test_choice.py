@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from tormagd.assembly.build import build_core, choose_solver
 from tormagd.config import Config
-from tormagd.control.core import build_core, choose_solver
 from tormagd.inverse.bracketed import BracketedSearch
 from tormagd.inverse.choice import RUNTIME_SOLVERS, build, named
 from tormagd.inverse.nearest import NearestFieldSearch

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from tormagd.assembly.build import build_core
 from tormagd.config import Config
-from tormagd.control.core import build_core
 from tormagd.lab.tactile import branches, shipped
 from tormagd.model.model_file import save_model
 from tormagd.scenes.scene import scene_path

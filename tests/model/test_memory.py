@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from tormagd.control.remembered import Remembering
+from tormagd.control.believe.memory import Remembering
 from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ModelFileError, load_model, save_model

@@ -11,10 +11,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from flight import Flight
 
+from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, VirtualBus
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
@@ -48,7 +48,7 @@ def fly(core: Core) -> Fly:
         config = config or Config()
         device = VirtualDevice(load_plant("sample_1"), ReversingHand(2.0), [parse_fault(it) for it in faults], 1)
         line = VirtualBus(CanDevice(device.messages)) if bus else device
-        flight = Flight(config, core, ClosedLoop(config, core.stepper, core.planner, line))
+        flight = Flight(config, core, ClosedLoop(config, core.stepper(), core.planner(), line))
         flight.arm()
         while flight.loop.now_s < until_s:
             flight.tick(asked(flight.loop.now_s))

@@ -7,11 +7,11 @@ from typing import Any
 
 from mcap.reader import make_reader
 
+from tormagd.assembly.build import Core
+from tormagd.assembly.journal import Journal, Packer
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
-from tormagd.control.core import Core
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.journal import Journal, Packer
+from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.black_box import header
 from tormagd.daemon.telemetry import tick_record
 from tormagd.keeping import Part

@@ -7,13 +7,15 @@ from typing import Any
 import msgspec
 import pytest
 from hypothesis import given, settings, strategies as st
+from tormagd.control.plan import PlanState
+from tormagd.control.step import StepState
 
 from firmware_protocol.codec import SCHEMA_HASH, Identity, Switches
-from tormagd.control.device_fit import UNSEEN
-from tormagd.control.governor import GovernorState
-from tormagd.control.plan import NOTHING_SHOWN, Outside, Plan, PlanState
-from tormagd.control.remembered import Remembered
-from tormagd.control.step import StepState
+from tormagd.control.ask.governor import GovernorState
+from tormagd.control.believe.believe import NOTHING_LEARNED
+from tormagd.control.believe.memory import Remembered
+from tormagd.control.believe.strength import UNSEEN
+from tormagd.control.records import Outside, Plan
 from tormagd.exact import InexactError, first_difference, kinds, packed, plain, restore, restored
 from tormagd.hardware.link import DeviceLink
 from tormagd.hardware.link_statistics import RoundTrip
@@ -66,7 +68,7 @@ def test_floats_keep_their_bits() -> None:
 
 def test_sentinels_come_back_equal() -> None:
     """Nothing in the core asks which of two equal ones it is; replays from snapshots show it."""
-    assert through_msgpack(NOTHING_SHOWN) == NOTHING_SHOWN
+    assert through_msgpack(NOTHING_LEARNED) == NOTHING_LEARNED
     assert through_msgpack(UNSEEN) == UNSEEN
 
 

@@ -16,9 +16,9 @@ from flight import Flight, frames, planted
 from mcap.writer import Writer
 
 from firmware_protocol.build import SWITCH, settle
+from tormagd.assembly.build import Core
+from tormagd.assembly.journal import MISSING
 from tormagd.config import Config
-from tormagd.control.core import Core
-from tormagd.control.journal import MISSING
 from tormagd.keeping import Part
 from tormagd.recording.black_box import BlackBoxFile, read_black_box, write_black_box
 from tormagd.recording.reader import RecordingError, read_recording

@@ -11,8 +11,8 @@ from benchmarks import latency, loop, virtual_time
 from benchmarks.against import checkout
 from benchmarks.table import lines
 
+from tormagd.assembly.build import build_core
 from tormagd.config import RealTime, load_config
-from tormagd.control.core import build_core
 from tormagd.hardware.backend import choose
 from tormagd.hardware.serial_backend import SerialOptions
 
