@@ -1,6 +1,6 @@
 """What the closed loops share: one core, devices behind it, and what is asked of them. All of it is synthetic."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 import pytest
 
@@ -20,7 +20,7 @@ Maker = Callable[..., ClosedLoop]
 
 @pytest.fixture(scope="session")
 def core() -> Core:
-    """Of the shipped coronary scene. It keeps nothing of what it is stepped through."""
+    """Of the shipped coronary scene. Nothing in it changes."""
     return build_core(Config())
 
 
@@ -69,13 +69,20 @@ def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan
 
 
 @pytest.fixture(scope="session")
-def hold_gap() -> Callable[[ClosedLoop, float, float], list[Sample]]:
-    """The ticks while a gap is asked for, for so many seconds."""
+def gap_ticks() -> Callable[[ClosedLoop, float, float], Iterator[Sample]]:
+    """The ticks while a gap is asked for, for so many seconds, one by one: between them the stages can be looked at."""
 
-    def hold(loop: ClosedLoop, gap_mm: float, seconds: float) -> list[Sample]:
-        return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(round(1e3 * seconds))]
+    def ticks(loop: ClosedLoop, gap_mm: float, seconds: float) -> Iterator[Sample]:
+        for _ in range(round(1e3 * seconds)):
+            yield loop.tick(plan=gap_plan(gap_mm, loop.now_s))
 
-    return hold
+    return ticks
+
+
+@pytest.fixture(scope="session")
+def hold_gap(gap_ticks: Callable[..., Iterator[Sample]]) -> Callable[[ClosedLoop, float, float], list[Sample]]:
+    """All of them."""
+    return lambda *asked: list(gap_ticks(*asked))
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ All data here are synthetic: the device is the simulator's, the pulse is a formu
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 
 import numpy as np
@@ -14,6 +14,7 @@ from firmware_protocol.codec import DeviceMode, DriveMode
 from tormagd.assembly.build import Core
 from tormagd.closed_loop import ClosedLoop, Sample, stream
 from tormagd.config import Config
+from tormagd.exact import packed, plain
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd.simulation.device import SerialDevice
@@ -38,9 +39,14 @@ def pulse_N(time_s: float) -> float:
 
 def publish(loop: ClosedLoop, force_N: Callable[[float], float], duration_s: float, rate_hz: int = 250) -> list[Sample]:
     """The ticks while a publisher sends this force."""
+    return list(published(loop, force_N, duration_s, rate_hz))
+
+
+def published(loop: ClosedLoop, force_N: Callable[[float], float], duration_s: float, rate_hz: int) -> Iterable[Sample]:
+    """The same one by one."""
     times = np.arange(round(duration_s * rate_hz)) / rate_hz
     forces = np.array([force_N(time) for time in times])
-    return list(loop.run(duration_s, stream(times + loop.now_s, forces)))
+    return loop.run(duration_s, stream(times + loop.now_s, forces))
 
 
 def rms_N(samples: list[Sample], force_N: Callable[[float], float], from_s: float) -> float:
@@ -65,7 +71,7 @@ def test_a_pulse_is_rendered(armed: ClosedLoop) -> None:
     samples = publish(armed, pulse_N, LEAD_IN_S + 2.5)
     assert faults_of(samples) == ()
     assert rms_N(samples, pulse_N, LEAD_IN_S) <= 0.03
-    assert samples[-1].trim == pytest.approx(1.0, abs=0.15)
+    assert samples[-1].plan.trim == pytest.approx(1.0, abs=0.15)
     # what is said of it: once it has arrived, nothing holds it back
     assert not any(sample.plan.limits for sample in samples[-1_000:])
 
@@ -125,8 +131,7 @@ def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Co
     governed = [sample.plan.governed_N for sample in stale]
     assert max(before - after for before, after in pairwise(governed)) <= 2.0 * 0.0061
     # down to what this device, as far as it has shown itself, gives at its open gap
-    assert armed.plan_state is not None
-    least_N = armed.planner.believe.device.force_N(core.portrait.min_N)
+    least_N = armed.planner.believe.min_N
     assert governed[-1] == pytest.approx(least_N, abs=0.01)
     assert samples[-1].truth.gap_mm > OPEN_MM - 3.0
     assert samples[-1].truth.force_N == pytest.approx(least_N, abs=0.05)
@@ -340,10 +345,9 @@ def test_a_lost_link_is_a_fault_that_does_not_go_by_itself(armed: ClosedLoop) ->
 # -- repetition ----------------------------------------------------------------------------------------------------
 
 
-def trace(loop: ClosedLoop, seconds: float) -> list[tuple[object, ...]]:
+def trace(loop: ClosedLoop, seconds: float) -> list[bytes]:
     return [
-        (sample.state, sample.output, sample.plan, sample.truth)
-        for sample in publish(loop, pulse_N, seconds, rate_hz=100)
+        packed(plain([sample, loop.stepper, loop.planner])) for sample in published(loop, pulse_N, seconds, rate_hz=100)
     ]
 
 

@@ -42,8 +42,7 @@ def test_a_pulse_is_felt_on_the_pad(arm, pad_core: Core, plant: str) -> None:
     ]
     assert not loop.stepper.safety.faults
     assert float(np.sqrt(np.mean(np.square(errors_N)))) < 0.8 * SCENE.force.tolerance_rms_N
-    assert loop.plan_state is not None
-    assert loop.plan_state.remembered.relaxed_N > 0.1
+    assert loop.planner.believe.memory.relaxed_N > 0.1
 
 
 def test_a_held_force_stays_with_the_memory_and_falls_without() -> None:
