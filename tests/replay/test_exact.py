@@ -6,16 +6,14 @@ from typing import Any
 
 import msgspec
 import pytest
+from flight import asked
 from hypothesis import given, settings, strategies as st
-from tormagd.control.plan import PlanState
-from tormagd.control.step import StepState
 
 from firmware_protocol.codec import SCHEMA_HASH, Identity, Switches
-from tormagd.control.ask.governor import GovernorState
+from tormagd.assembly.build import Core
 from tormagd.control.believe.believe import NOTHING_LEARNED
-from tormagd.control.believe.memory import Remembered
 from tormagd.control.believe.strength import UNSEEN
-from tormagd.control.records import Outside, Plan
+from tormagd.control.records import Outside
 from tormagd.exact import InexactError, first_difference, kinds, packed, plain, restore, restored
 from tormagd.hardware.link import DeviceLink
 from tormagd.hardware.link_statistics import RoundTrip
@@ -25,7 +23,6 @@ from tormagd.replay.rerun import KNOWN
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import SafetyState
 
-PLAN = Plan(1, 0.5, 3.5, 0.001, 3.5, None, 180.0, 78.0, 0.0, 1.0, (Limit.F_MIN,))
 FLOATS = st.one_of(st.floats(), st.sampled_from([-0.0, math.nan, -math.inf, 5e-324]))
 LEAVES = st.one_of(FLOATS, st.integers(-(2**63), 2**64 - 1), st.booleans(), st.none(), st.text(), st.binary())
 LEAVES |= st.sampled_from([Limit.RATE, Fault.SKEW, Switches.HOMED | Switches.LEFT_OPEN])
@@ -43,12 +40,6 @@ THINGS = st.recursive(
 
 def through_msgpack(thing: object) -> Any:
     return restored(msgspec.msgpack.decode(packed(plain(thing))), {**KNOWN, **kinds(Switches)})
-
-
-def test_what_an_element_remembers_comes_back() -> None:
-    remembered = Remembered(400.0, 1.5, (3.5, 0.25), (0.5, 0.125), 0.0625, 1.0)
-    state = PlanState(GovernorState(1.0, 2.0), PLAN, remembered=remembered)
-    assert through_msgpack(state) == state
 
 
 @settings(max_examples=25)
@@ -72,9 +63,10 @@ def test_sentinels_come_back_equal() -> None:
     assert through_msgpack(UNSEEN) == UNSEEN
 
 
-def test_differences_have_a_name() -> None:
-    one = StepState(1.0, SafetyState(faults=(Fault.SKEW,)))
-    other = one.replaced(safety=one.safety.replaced(request_number=7))
+def test_differences_have_a_name(core: Core) -> None:
+    one, other = core.stepper(), core.stepper()
+    one.safety = SafetyState(faults=(Fault.SKEW,))
+    other.safety = one.safety.replaced(request_number=7)
     assert first_difference(plain(one), plain(other)) == ("safety.request_number", 0, 7)
     assert first_difference(plain((1.0, 2.0)), plain((1.0, 2.0, 3.0))) == ("length", 2, 3)
     assert first_difference(plain(0.0), plain(-0.0)) == ("", 0.0, -0.0)
@@ -115,6 +107,35 @@ def test_what_changes_in_place_is_given_what_another_remembered() -> None:
     assert (other.state, other.identity) == (one.state, one.identity)
     other.round_trip.drive(4, 2.5)
     assert first_difference(plain(one), plain(other)) == ("round_trip._newest", 3, 4)
+
+
+def test_stages_in_the_middle_of_a_run_go_on_in_others_to_the_bit(fly: Any, core: Core) -> None:
+    """What was written down of them is all that they are, and neither has anything in common with the other."""
+    flight = fly(until_s=6.0)
+    loop, planner = flight.loop, flight.planner
+    stepper_again, planner_again = core.stepper(), core.planner()
+    for own, new in ((loop.stepper, stepper_again), (planner, planner_again)):
+        restore(new, msgspec.msgpack.decode(packed(plain(own))), KNOWN)
+        assert first_difference(plain(own), plain(new)) is None
+    assert planner.governor.forecast.trust > 0.0
+    for tick in range(400):
+        planned, setpoint = planner.planned, asked(loop.now_s)
+        sample = loop.tick(setpoint)
+        assert stepper_again.step(sample.time_s, sample.measurement, planner_again.planned) == sample.output
+        if planner.planned is not planned:
+            assert planner_again.plan(sample.time_s, setpoint, stepper_again.measured) == planner.planned
+            planner_again.foresee()
+        if tick % 50 == 0:
+            assert first_difference(plain(loop.stepper), plain(stepper_again)) is None
+            assert first_difference(plain(planner), plain(planner_again)) is None
+
+
+@pytest.mark.parametrize("change", [{"time_s": None}, {"unheard": 1.0}, {"safety": {"Unheard": {}}}, {"homing": 1.0}])
+def test_a_stage_takes_its_own_fields_and_no_others(core: Core, change: dict[str, Any]) -> None:
+    fields = plain(core.stepper())["Stepper"] | change
+    told = {name: field for name, field in fields.items() if field is not None or name not in change}
+    with pytest.raises(InexactError):
+        restore(core.stepper(), {"Stepper": told}, KNOWN)
 
 
 @pytest.mark.parametrize(
