@@ -14,8 +14,8 @@ import pytest
 from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
-from tormagd.control import estimate
-from tormagd.control.records import TimedSetpoint
+from tormagd.control.measure import Measure
+from tormagd.control.records import Handle, Measured, TimedSetpoint
 from tormagd.ctl import calibrate as ctl_calibrate, calibrate_motors as ctl_calibrate_motors, calibrate_run
 from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, up_and_down, write_sweeps
 from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, excitation, motor_log
@@ -201,11 +201,11 @@ def test_displacement_is_what_the_daemon_calls_it():
     """Of a whole sweep or position by position: one law."""
     rng = np.random.default_rng(1)
     path = np.cumsum(rng.normal(0.0, 0.06, 4000)) + 3.0 * np.sin(np.arange(4000) / 90.0)
-    handle = estimate.Handle(0.0, 0.0, Turn(1.0, path[0], path[0]))
+    measure, handle = Measure(47.5, 0.01, True, 20.0, 1e-3), Handle(0.0, 0.0, Turn(1.0, path[0], path[0]))
     expected = []
     for position in path:
-        fake = estimate.Estimate(0, True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
-        handle = estimate._handle(fake, float(position), 1e-3, True)
+        fake = Measured(0, True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
+        handle = measure._handle(fake, float(position), 1e-3)
         expected.append(handle.displacement_mm)
     found = displacement(path)
     known = np.isfinite(found)

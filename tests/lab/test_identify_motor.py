@@ -90,7 +90,7 @@ def record(sample: str, seed: int = 1, rounds: int = 2) -> Columns:
     for _ in loop.run(1.0):
         pass
     # the status of a daemon says the same: what this device gives with its gap open, as far as it has shown itself
-    least_N = loop.planner.believe.device.force_N(core.portrait.min_N)
+    least_N = loop.planner.believe.min_N
     waveform = excitation(Range(least_N, min(core.portrait.max_N, core.scene.force.most_N)), rounds)
     start_s = loop.now_s
 

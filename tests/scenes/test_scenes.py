@@ -59,9 +59,9 @@ def test_a_shipped_scene_gives_a_core_that_can_render_it(name: str) -> None:
     assert core.scene.name == name
     assert core.scene.description.endswith(".")
     portrait = core.portrait
-    assert portrait.least_N < core.scene.force.most_N
+    assert portrait.min_N < core.scene.force.most_N
     # a scene may like less than the device's least force, but nothing above its greatest
-    assert portrait.most_N >= core.scene.force.most_N
+    assert portrait.max_N >= core.scene.force.most_N
     assert core.margins.phase_margin_deg >= 45.0
     assert core.margins.gain_margin_dB >= 6.0
 
