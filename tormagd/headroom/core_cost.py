@@ -10,7 +10,6 @@ import asyncio
 import math
 import time
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from functools import partial
 from typing import NamedTuple
 
@@ -41,10 +40,9 @@ class CoreCost(NamedTuple):
 def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[Call]]:
     """Each step and each plan of an armed device that renders a pulse, to be called again in turn."""
     period_s = 1.0 / config.rates.control_hz
-    loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
-    loop.arm()
-    # stages change in place, so what is called again are others, which begin where these do
-    stepper, planner = deepcopy(loop.stepper), deepcopy(loop.planner)
+    # stages change in place, so what is called again are those of another loop that has come as far
+    loop, again = _armed(config, core), _armed(config, core)
+    stepper, planner = again.stepper, again.planner
     assert planner is not None, "this loop plans"
     force = core.scene.force
     middle_N = 0.5 * (force.least_N + force.most_N)
@@ -55,9 +53,15 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
         force_N = middle_N * (1.0 + SWING_SHARE * math.sin(math.tau * PULSE_HZ * now_s))
         setpoint = TimedSetpoint(force_N, now_s, 0.1)  # a new one for every tick, so that every tick plans
         sample = loop.tick(setpoint)
-        steps.append(partial(stepper.step, now_s, sample.measurement, sample.plan))
-        plans.append(partial(planner.plan, now_s, setpoint, sample.measured))
+        steps.append(partial(stepper.step, sample.time_s, sample.measurement, sample.plan))
+        plans.append(partial(planner.plan, sample.time_s, setpoint, sample.measured))
     return steps, plans
+
+
+def _armed(config: Config, core: Core) -> ClosedLoop:
+    loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
+    loop.arm()
+    return loop
 
 
 async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> CoreCost:
