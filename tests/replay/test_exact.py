@@ -1,7 +1,9 @@
 """Values as plain data: back as they were, to the bit, in both builds; anything else is refused."""
 
+import ast
 import math
 import struct
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -23,6 +25,7 @@ from tormagd.replay.rerun import KNOWN
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import SafetyState
 
+ROOT = Path(__file__).parents[2]
 FLOATS = st.one_of(st.floats(), st.sampled_from([-0.0, math.nan, -math.inf, 5e-324]))
 LEAVES = st.one_of(FLOATS, st.integers(-(2**63), 2**64 - 1), st.booleans(), st.none(), st.text(), st.binary())
 LEAVES |= st.sampled_from([Limit.RATE, Fault.SKEW, Switches.HOMED | Switches.LEFT_OPEN])
@@ -128,6 +131,20 @@ def test_stages_in_the_middle_of_a_run_go_on_in_others_to_the_bit(fly: Any, core
         if tick % 50 == 0:
             assert first_difference(plain(loop.stepper), plain(stepper_again)) is None
             assert first_difference(plain(planner), plain(planner_again)) is None
+
+
+def test_what_changes_in_a_stage_is_a_field_of_its_class() -> None:
+    """So it is written down; whatever else there is, is final."""
+    for path in (ROOT / "tormagd" / "control").rglob("*.py"):
+        for kind in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(kind, ast.ClassDef):
+                named = [ast.unparse(it.target) for it in kind.body if isinstance(it, ast.AnnAssign)]
+                inside = [it for method in kind.body if isinstance(method, ast.FunctionDef) for it in ast.walk(method)]
+                final = [ast.unparse(it.target) for it in inside if isinstance(it, ast.AnnAssign)]
+                attributes = [it for it in inside if isinstance(it, ast.Attribute) and isinstance(it.ctx, ast.Store)]
+                own = {ast.unparse(it) for it in attributes if isinstance(it.value, ast.Name) and it.value.id == "self"}
+                public = {f"self.{name}" for name in named if not name.startswith("_")}
+                assert own - {*final} <= public, f"{path}: {kind.name}"
 
 
 @pytest.mark.parametrize("change", [{"time_s": None}, {"unheard": 1.0}, {"safety": {"Unheard": {}}}, {"homing": 1.0}])
