@@ -10,6 +10,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LOWEST = {"firmware_protocol", "config", "messages"}
 FILES = {"bounded_file", "toml_file"}
+DECIDES = {"firmware_protocol", "config", "physics", "model", "inverse", "scenes", "safety", "hardware"}
+"""What the core is made of."""
 NO_ROOM = {"firmware_protocol.value", "firmware_protocol.build"}
 """What all values are made of, and which build runs: they know nothing of any room, the protocol's included."""
 MAY_IMPORT = {
@@ -31,18 +33,21 @@ MAY_IMPORT = {
     "scenes": {"config", "force_file"},
     "safety": {"firmware_protocol"},
     "hardware": LOWEST | {"exact", "safety"},
-    "control": LOWEST | {"exact", "keeping", "physics", "model", "inverse", "scenes", "safety", "hardware"},
-    "daemon": LOWEST | FILES | {"output", "keys", "keeping", "slices", "scenes", "safety", "hardware", "control"},
+    "control": DECIDES,
+    "assembly": DECIDES | {"messages", "exact", "keeping", "control"},
+    "daemon": LOWEST
+    | FILES
+    | {"output", "keys", "keeping", "slices", "scenes", "safety", "hardware", "control", "assembly"},
     "recording": FILES | {"messages", "output", "keeping"},
     "client": {"config", "keys", "messages", "output"},
     "dashboard": {"client", "messages", "output", "recording", "safety"},
     "ctl": FILES | {"dashboard", "force_file", "client", "config", "messages", "output", "keys", "scenes", "recording"},
     "simulation": FILES | {"physics", "firmware_protocol", "output", "slices"},
-    "headroom": {"config", "output", "daemon", "control", "simulation", "closed_loop"},
+    "headroom": {"config", "output", "daemon", "control", "assembly", "simulation", "closed_loop"},
     "replay": LOWEST
     | {"exact", "keeping", "output", "recording", "model", "scenes", "safety", "hardware", "control", "daemon"}
-    | {"simulation", "closed_loop"},
-    "closed_loop": LOWEST | {"control", "hardware", "safety", "simulation"},
+    | {"assembly", "simulation", "closed_loop"},
+    "closed_loop": LOWEST | {"control", "assembly", "hardware", "safety", "simulation"},
 }
 MAY_IMPORT["lab"] = set(MAY_IMPORT) - {"entry"}
 """The laboratory may import every room, and nothing imports it."""

@@ -1,14 +1,13 @@
 """What the closed loops share: one core, devices behind it, and what is asked of them. All of it is synthetic."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 import pytest
 
+from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import Plan
+from tormagd.control.records import Plan, TimedSetpoint
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
 from tormagd.simulation.hand import Hand, SteadyHand
@@ -21,7 +20,7 @@ Maker = Callable[..., ClosedLoop]
 
 @pytest.fixture(scope="session")
 def core() -> Core:
-    """Of the shipped coronary scene. It keeps nothing of what it is stepped through."""
+    """Of the shipped coronary scene. Nothing in it changes."""
     return build_core(Config())
 
 
@@ -41,7 +40,7 @@ def make(core: Core) -> Maker:
     ) -> ClosedLoop:
         parameters = load_plant(plant) if isinstance(plant, str) else plant
         device = VirtualDevice(parameters, hand or SteadyHand(), [parse_fault(fault) for fault in faults], seed)
-        return ClosedLoop(config or Config(), core.stepper, core.planner if planned else None, device)
+        return ClosedLoop(config or Config(), core.stepper(), core.planner() if planned else None, device)
 
     return build
 
@@ -70,13 +69,20 @@ def gap_plan(gap_mm: float, now_s: float = 0.0, speed_mm_s: float = 0.0) -> Plan
 
 
 @pytest.fixture(scope="session")
-def hold_gap() -> Callable[[ClosedLoop, float, float], list[Sample]]:
-    """The ticks while a gap is asked for, for so many seconds."""
+def gap_ticks() -> Callable[[ClosedLoop, float, float], Iterator[Sample]]:
+    """The ticks while a gap is asked for, for so many seconds, one by one: between them the stages can be looked at."""
 
-    def hold(loop: ClosedLoop, gap_mm: float, seconds: float) -> list[Sample]:
-        return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(round(1e3 * seconds))]
+    def ticks(loop: ClosedLoop, gap_mm: float, seconds: float) -> Iterator[Sample]:
+        for _ in range(round(1e3 * seconds)):
+            yield loop.tick(plan=gap_plan(gap_mm, loop.now_s))
 
-    return hold
+    return ticks
+
+
+@pytest.fixture(scope="session")
+def hold_gap(gap_ticks: Callable[..., Iterator[Sample]]) -> Callable[[ClosedLoop, float, float], list[Sample]]:
+    """All of them."""
+    return lambda *asked: list(gap_ticks(*asked))
 
 
 @pytest.fixture(scope="session")

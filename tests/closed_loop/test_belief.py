@@ -2,10 +2,10 @@
 
 import msgspec
 
+from tormagd.assembly.belief import beliefs
+from tormagd.assembly.build import build_core
 from tormagd.config import Config
-from tormagd.control.belief import beliefs
-from tormagd.control.core import build_core
-from tormagd.control.sensor_zero import UNKNOWN_SD_N
+from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.scenes.scene import EVERY_TERM, Terms, load_scene
 
 
@@ -13,9 +13,8 @@ def test_a_weak_device_that_was_slid_at_speed_is_known_as_such(arm, render) -> N
     loop = arm("sample_2")
     render(loop, 0.7, 1.0)
     render(loop, 2.0, 2.0)
-    assert loop.plan_state is not None
-    told = beliefs(loop.plan_state, loop.step_state, loop.now_s, EVERY_TERM)
-    assert told["scale"].value == loop.plan_state.shown.device.scale < 0.95
+    told = beliefs(loop.planner, loop.stepper, loop.now_s, EVERY_TERM)
+    assert told["scale"].value == loop.planner.believe.strength.fit.scale < 0.95
     assert told["scale"].sd is not None
     assert 0.0 < told["scale"].sd < 0.1
     assert told["relaxed"].value > 0.0
@@ -23,7 +22,7 @@ def test_a_weak_device_that_was_slid_at_speed_is_known_as_such(arm, render) -> N
     # nothing came that was known ahead, or repeated itself
     assert not told["carriage_lag"].acts
     assert not told["forecast_trust"].acts
-    later = beliefs(loop.plan_state, loop.step_state, loop.now_s + 3600.0, EVERY_TERM)["sensor_zero"]
+    later = beliefs(loop.planner, loop.stepper, loop.now_s + 3600.0, EVERY_TERM)["sensor_zero"]
     assert later.sd is not None
     assert (later.sd > UNKNOWN_SD_N, later.acts) == (True, False)
 
@@ -32,8 +31,7 @@ def test_a_term_that_is_left_out_does_not_act(arm, render) -> None:
     config, left_out = Config(scene="pulse"), Terms(creep=False, scale=False, hysteresis=False)
     loop = arm(core=build_core(config, msgspec.structs.replace(load_scene("pulse"), terms=left_out)), config=config)
     render(loop, 1.5, 1.0)
-    assert loop.plan_state is not None
-    told = beliefs(loop.plan_state, loop.step_state, loop.now_s, left_out)
+    told = beliefs(loop.planner, loop.stepper, loop.now_s, left_out)
     assert {name for name, it in told.items() if it.acts} == {
         "offset", "sensor_zero", "acceleration_scale", "relaxed"
     }  # fmt: skip

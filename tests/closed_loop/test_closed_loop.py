@@ -4,16 +4,17 @@ All data here are synthetic: the device is the simulator's, the pulse is a formu
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from firmware_protocol.codec import DeviceMode, DriveMode
+from tormagd.assembly.build import Core
 from tormagd.closed_loop import ClosedLoop, Sample, stream
 from tormagd.config import Config
-from tormagd.control.core import Core
+from tormagd.exact import packed, plain
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd.simulation.device import SerialDevice
@@ -38,9 +39,14 @@ def pulse_N(time_s: float) -> float:
 
 def publish(loop: ClosedLoop, force_N: Callable[[float], float], duration_s: float, rate_hz: int = 250) -> list[Sample]:
     """The ticks while a publisher sends this force."""
+    return list(published(loop, force_N, duration_s, rate_hz))
+
+
+def published(loop: ClosedLoop, force_N: Callable[[float], float], duration_s: float, rate_hz: int) -> Iterable[Sample]:
+    """The same one by one."""
     times = np.arange(round(duration_s * rate_hz)) / rate_hz
     forces = np.array([force_N(time) for time in times])
-    return list(loop.run(duration_s, stream(times + loop.now_s, forces)))
+    return loop.run(duration_s, stream(times + loop.now_s, forces))
 
 
 def rms_N(samples: list[Sample], force_N: Callable[[float], float], from_s: float) -> float:
@@ -55,7 +61,7 @@ def rms_N(samples: list[Sample], force_N: Callable[[float], float], from_s: floa
 
 
 def faults_of(samples: list[Sample]) -> tuple[Fault, ...]:
-    return samples[-1].state.safety.faults
+    return samples[-1].safety.faults
 
 
 # -- rendering -----------------------------------------------------------------------------------------------------
@@ -65,7 +71,7 @@ def test_a_pulse_is_rendered(armed: ClosedLoop) -> None:
     samples = publish(armed, pulse_N, LEAD_IN_S + 2.5)
     assert faults_of(samples) == ()
     assert rms_N(samples, pulse_N, LEAD_IN_S) <= 0.03
-    assert samples[-1].trim == pytest.approx(1.0, abs=0.15)
+    assert samples[-1].plan.trim == pytest.approx(1.0, abs=0.15)
     # what is said of it: once it has arrived, nothing holds it back
     assert not any(sample.plan.limits for sample in samples[-1_000:])
 
@@ -81,7 +87,7 @@ def test_other_devices_of_the_kind_render_it_too(arm, plant: str) -> None:
 
 def test_a_staircase_rises_at_every_step(armed: ClosedLoop, core: Core) -> None:
     """The coronary scene: from the least force to 2 N, a tenth of a newton apart."""
-    least = core.planner.portrait.least_N
+    least = core.portrait.min_N
     steps = [least, *np.arange(math.ceil(10.0 * least) / 10.0, 2.05, 0.1)]
     rendered, gaps = [], []
     for force in steps:
@@ -125,8 +131,7 @@ def test_a_publisher_that_stops_lets_the_force_decay(armed: ClosedLoop, core: Co
     governed = [sample.plan.governed_N for sample in stale]
     assert max(before - after for before, after in pairwise(governed)) <= 2.0 * 0.0061
     # down to what this device, as far as it has shown itself, gives at its open gap
-    assert armed.plan_state is not None
-    least_N = armed.planner.believe.device.force_N(core.planner.portrait.least_N)
+    least_N = armed.planner.believe.min_N
     assert governed[-1] == pytest.approx(least_N, abs=0.01)
     assert samples[-1].truth.gap_mm > OPEN_MM - 3.0
     assert samples[-1].truth.force_N == pytest.approx(least_N, abs=0.05)
@@ -202,7 +207,7 @@ def struck(arm: Maker, spec: str, seconds: float = 2.6) -> tuple[ClosedLoop, lis
     assert before[-1].truth.force_N == pytest.approx(pulse_N(before[-1].time_s - before[0].time_s), abs=0.1)
     phase_s = before[-1].time_s - before[0].time_s
     samples = publish(loop, lambda time_s: pulse_N(phase_s + time_s), seconds, rate_hz=100)
-    assert (OperatingState.FAULT is samples[-1].state.safety.operating_state) == bool(faults_of(samples))
+    assert (OperatingState.FAULT is samples[-1].safety.operating_state) == bool(faults_of(samples))
     return loop, samples
 
 
@@ -244,7 +249,7 @@ def test_after_a_lost_encoder_enabling_wants_homing_though_the_device_calls_itse
     assert faults_of(samples) == (Fault.NO_MOTION,)
     assert loop.measurement is not None
     assert loop.measurement.is_homed
-    assert not samples[-1].state.estimate.is_homed  # type: ignore[union-attr]
+    assert not samples[-1].measured.is_homed  # type: ignore[union-attr]
     loop.command("clear-fault")
     list(loop.run(0.1))
     with pytest.raises(RefusedError) as caught:
@@ -332,18 +337,17 @@ def test_a_lost_link_is_a_fault_that_does_not_go_by_itself(armed: ClosedLoop) ->
     armed.device = device
     back = publish(armed, lambda time_s: 1.4, 2.6)
     assert faults_of(silent)[0] is Fault.MEASUREMENT_STALE
-    assert Fault.LINK_LOST in faults_of(silent) or silent[-1].state.safety.operating_state is OperatingState.FAULT
-    assert back[-1].state.safety.operating_state is OperatingState.FAULT
+    assert Fault.LINK_LOST in faults_of(silent) or silent[-1].safety.operating_state is OperatingState.FAULT
+    assert back[-1].safety.operating_state is OperatingState.FAULT
     assert back[-1].truth.gap_mm > OPEN_MM - 2.0
 
 
 # -- repetition ----------------------------------------------------------------------------------------------------
 
 
-def trace(loop: ClosedLoop, seconds: float) -> list[tuple[object, ...]]:
+def trace(loop: ClosedLoop, seconds: float) -> list[bytes]:
     return [
-        (sample.state, sample.output, sample.plan, sample.truth)
-        for sample in publish(loop, pulse_N, seconds, rate_hz=100)
+        packed(plain([sample, loop.stepper, loop.planner])) for sample in published(loop, pulse_N, seconds, rate_hz=100)
     ]
 
 

@@ -1,18 +1,17 @@
 """The brake is not closed by mistake: three layers that each hold alone, and a sensor that is judged (synthetic)."""
 
-import math
 from collections.abc import Callable
 
 import msgspec
 import numpy as np
 import pytest
 
+from tormagd.assembly.build import Core
 from tormagd.closed_loop import Sample
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
-from tormagd.control.governor import Governor
-from tormagd.control.portrait import Portrait
-from tormagd.control.sensor_zero import UNKNOWN_SD_N
+from tormagd.control.aim.portrait import Portrait
+from tormagd.control.ask.governor import Governor
+from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState, RefusedError
 from tormagd.simulation.device import VirtualDevice
@@ -141,8 +140,7 @@ def test_a_zero_that_drifts_is_taken_off_where_the_handle_turns(arm, render, sam
     start_s = loop.device.truth.time_s
     LyingSensor(loop.device, lambda reading_N: reading_N + 0.2 / 60.0 * (loop.device.truth.time_s - start_s))
     samples = render(loop, ASKED_N, 24.0)
-    assert loop.plan_state is not None
-    assert loop.plan_state.shown.zero.zero_N == pytest.approx(0.08, abs=0.04)
+    assert loop.planner.believe.zero.zero_N == pytest.approx(0.08, abs=0.04)
     sliding = [abs(each.truth.force_N) for each in samples[-4_000:] if slides(each)]
     assert np.mean(sliding) == pytest.approx(ASKED_N, abs=0.02)
     assert Limit.SENSOR not in samples[-1].plan.limits
@@ -156,15 +154,13 @@ def slides(sample: Sample) -> bool:
 def test_without_reversals_a_drifting_zero_teaches_no_more_once_it_may_be_far_off(arm, render) -> None:
     loop = arm()
     render(loop, ASKED_N, 2.0)
-    assert loop.plan_state is not None
-    before = loop.plan_state.shown.device
+    before = loop.planner.believe.strength.fit
     # as after ten minutes of turning the one way
-    aged = loop.plan_state.shown.zero.replaced(variance_N2=1.01 * UNKNOWN_SD_N**2)
-    loop.plan_state = loop.plan_state.replaced(shown=loop.plan_state.shown.replaced(zero=aged))
+    loop.planner.believe.zero.variance_N2 = 1.01 * UNKNOWN_SD_N**2
     LyingSensor(loop.device, lambda reading_N: reading_N + 0.1)
     samples = render(loop, ASKED_N, 3.0)
     assert samples[-1].plan.limits == (Limit.OFFSET_UNKNOWN,)
-    assert loop.plan_state.shown.device == before
+    assert loop.planner.believe.strength.fit == before
     assert abs(samples[-1].truth.force_N) == pytest.approx(ASKED_N, abs=0.05)
 
 
@@ -173,7 +169,7 @@ def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(arm, re
     render(loop, ASKED_N, 2.0)
     LyingSensor(loop.device, LIES["-1 N"](), loop.now_s)
     samples = render(loop, ASKED_N, 3.0)
-    assert samples[-1].state.safety.faults == (Fault.SENSOR,)
+    assert samples[-1].safety.faults == (Fault.SENSOR,)
     first = next(sample.time_s for sample in samples if sample.safety.faults)
     assert first - samples[0].time_s == pytest.approx(2.06, abs=0.1)
 
@@ -189,12 +185,18 @@ def test_an_honest_sensor_is_believed(arm, render, sample: str) -> None:
 # -- layer a: the governed force -----------------------------------------------------------------------------------
 
 
-def test_the_governed_force_holds_alone(arm, render, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="session")
+def open_core(core: Core) -> Core:
+    """Of a scene in which a hundred times the force is none too great: no ceiling acts."""
+    force = msgspec.structs.replace(core.scene.force, most_N=100.0 * MOST_N)
+    return core._replace(scene=msgspec.structs.replace(core.scene, force=force))
+
+
+def test_the_governed_force_holds_alone(make, render, core: Core, open_core: Core) -> None:
     """With no ceiling over gap and measured force, 1000 N asked give the scene's greatest."""
-    core = build_core(CONFIG)
-    monkeypatch.setattr(core.planner, "_ceiling_N", 100.0 * MOST_N)
-    monkeypatch.setattr(core.stepper, "_ceiling_N", math.inf)
-    loop = arm(core=core)
+    loop = make(core=open_core)
+    loop.planner.governor = core.planner().governor
+    loop.arm()
     samples = render(loop, 1_000.0, 2.5)
     assert worst_N(samples) < MOST_N + 0.15
     assert Limit.RANGE in samples[-1].plan.limits
@@ -203,37 +205,34 @@ def test_the_governed_force_holds_alone(arm, render, monkeypatch: pytest.MonkeyP
 # -- layer b: the gap ----------------------------------------------------------------------------------------------
 
 
-def ask_for_six_newtons(core: Core, monkeypatch: pytest.MonkeyPatch) -> None:
+def ask_for_six_newtons(core: Core) -> Governor:
     """A governor that has gone mad: it takes the device for a giant, and the scene for one that wants nothing else."""
     giant = Portrait([95.0, 45.0], [0.0, 100.0], [2.0, 2.0])
     force = msgspec.structs.replace(core.scene.force, least_N=6.0, most_N=6.0)
-    mad = Governor(giant, force, CONFIG.position.gap_speed_mm_s)
-    monkeypatch.setattr(core.planner, "_governor", mad)
+    return Governor(0.0, giant, force, CONFIG.position.gap_speed_mm_s)
 
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
-def test_the_gap_holds_alone(arm, render, monkeypatch: pytest.MonkeyPatch, sample: str) -> None:
-    core = build_core(CONFIG)
-    ask_for_six_newtons(core, monkeypatch)
-    monkeypatch.setattr(core.stepper, "_ceiling_N", math.inf)
-    loop = arm(sample, core=core)
+def test_the_gap_holds_alone(make, render, core: Core, open_core: Core, sample: str) -> None:
+    loop = make(sample)
+    loop.stepper, loop.planner.governor = open_core.stepper(), ask_for_six_newtons(core)
+    loop.arm()
     samples = render(loop, 1.0, 4.0)
     assert samples[-1].plan.governed_N == 6.0
     assert MOST_N < worst_N(samples) < CEILING_N
     assert Limit.CEILING in samples[-1].plan.limits
-    assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
+    assert samples[-1].safety.operating_state is OperatingState.ENABLED
 
 
 # -- layer c: the measured force -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
-def test_the_measured_force_holds_alone(arm, hold_gap, sample: str) -> None:
+def test_the_measured_force_holds_alone(arm, hold_gap, core: Core, sample: str) -> None:
     """A plan that closes the gap without any word of forces: the force over the ceiling opens it, at a bounded rate."""
-    core = build_core(CONFIG)
-    loop = arm(sample, core=core)
+    loop = arm(sample)
     shut = hold_gap(loop, 47.0, 4.0)
-    assert shut[-1].state.safety.faults == (Fault.OVER_FORCE,)
+    assert shut[-1].safety.faults == (Fault.OVER_FORCE,)
     assert any(Limit.OVER_FORCE in sample.output.limits for sample in shut)
     forces_N = np.array([sample.truth.force_N for sample in shut])
     over_s = 1e-3 * np.count_nonzero(forces_N > CEILING_N)
@@ -250,5 +249,5 @@ def test_a_start_from_rest_is_not_over_force(arm, render, sample: str) -> None:
     """Static friction is up to 1.25 times the kinetic one."""
     loop = arm(sample, ReversingHand(2.0))
     samples = render(loop, MOST_N, 6.0)
-    assert samples[-1].state.safety.operating_state is OperatingState.ENABLED
+    assert samples[-1].safety.operating_state is OperatingState.ENABLED
     assert worst_N(samples) < CEILING_N

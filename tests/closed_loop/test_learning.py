@@ -4,10 +4,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from tormagd.assembly.build import build_core
 from tormagd.config import Config
-from tormagd.control.core import build_core
-from tormagd.control.device_fit import UNSEEN
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.believe.strength import UNSEEN
+from tormagd.control.records import TimedSetpoint
 from tormagd.scenes.scene import Terms, load_scene
 
 VALID_S = 0.2
@@ -38,11 +38,8 @@ def test_a_device_that_was_known_before_is_right_at_once(arm, render) -> None:
     loop = arm("sample_2")
     render(loop, 0.7, 1.0)
     render(loop, 2.0, 2.0)
-    assert loop.plan_state is not None
-    shown = loop.plan_state.shown
     again = arm("sample_2")
-    assert again.plan_state is not None
-    again.plan_state = again.plan_state.replaced(shown=shown.replaced(read=-1, read_s=-1.0))
+    again.planner.teach(loop.planner.believe.learned())
     forces_N = [abs(each.truth.force_N) for each in render(again, 2.0, 2.5)]
     assert max(forces_N) < 2.0 + 0.06
     assert np.mean(forces_N[1_200:1_300]) == pytest.approx(2.0, abs=0.04)
@@ -62,5 +59,4 @@ def test_the_model_alone_renders_the_forces_of_the_device_that_it_was_trained_on
         )
     ]
     assert np.sqrt(np.mean(np.square(errors_N))) < 0.02
-    assert loop.plan_state is not None
-    assert loop.plan_state.shown.device == UNSEEN
+    assert loop.planner.believe.strength.fit == UNSEEN

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config, Rates
-from tormagd.control.core import Core, build_core
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.lab.tactile.held import Case, hold
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene, scene_path
@@ -42,8 +42,7 @@ def test_a_pulse_is_felt_on_the_pad(arm, pad_core: Core, plant: str) -> None:
     ]
     assert not loop.stepper.safety.faults
     assert float(np.sqrt(np.mean(np.square(errors_N)))) < 0.8 * SCENE.force.tolerance_rms_N
-    assert loop.plan_state is not None
-    assert loop.plan_state.remembered.relaxed_N > 0.1
+    assert loop.planner.believe.memory.relaxed_N > 0.1
 
 
 def test_a_held_force_stays_with_the_memory_and_falls_without() -> None:
@@ -67,4 +66,4 @@ def test_a_finger_that_presses_too_hard_opens_the_gap_and_is_no_fault(arm, pad_c
     assert last.truth.force_N > 1.5 * SCENE.force.most_N
     assert Limit.OVER_FORCE in last.output.limits
     assert last.truth.gap_mm > 94.0
-    assert not last.state.safety.faults
+    assert not last.safety.faults

@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config, Trim
-from tormagd.control.core import Core, build_core
 
 Maker = Callable[..., ClosedLoop]
 LOW_N, HIGH_N = 0.7, 2.0

@@ -9,9 +9,8 @@ from typing import NamedTuple
 import msgpack
 import pytest
 
+from tormagd.assembly.build import Core
 from tormagd.closed_loop import ClosedLoop, Sample
-from tormagd.control.core import Core
-from tormagd.control.plan import PlanState
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.source_clock import SETTLED_S
 from tormagd.daemon.way import Way
@@ -103,10 +102,9 @@ def run(
             inbox.take(following[1], now_s, START_NS + round(now_s * 1e9))
             following = next(coming, None)
         at(inbox, now_s - start_s)
-        used = loop.plan_state
-        assert isinstance(used, PlanState)
+        used = loop.planner.planned
         samples.append(loop.tick(inbox.newest))
-        way.ticked(samples[-1].state, used)
+        way.ticked(loop.stepper, used)
     for _ in range(8):
         inbox.refresh(loop.now_s)
     way.refresh()

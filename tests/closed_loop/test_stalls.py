@@ -1,12 +1,14 @@
 """Stalls of daemon and device against the simulated device, and a force below the least one, in virtual time."""
 
+from collections.abc import Iterable
+
 import pytest
 
 from firmware_protocol.codec import DeviceMode
+from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState
 from tormagd.simulation.device import VirtualDevice
@@ -27,7 +29,7 @@ def core() -> Core:
 
 def armed(core: Core, plant: str = "sample_1") -> ClosedLoop:
     device = VirtualDevice(load_plant(plant), SteadyHand(), seed=1)
-    loop = ClosedLoop(Config(), core.stepper, core.planner, device)
+    loop = ClosedLoop(Config(), core.stepper(), core.planner(), device)
     loop.arm()
     return loop
 
@@ -41,9 +43,14 @@ def holding(core: Core) -> ClosedLoop:
     return loop
 
 
+def ticks(loop: ClosedLoop, force_N: float, duration_s: float) -> Iterable[Sample]:
+    """While a publisher sends this force, a new setpoint every period."""
+    return loop.run(duration_s, lambda now_s: TimedSetpoint(force_N, now_s, 0.2))
+
+
 def run(loop: ClosedLoop, force_N: float, duration_s: float) -> list[Sample]:
-    """The ticks while a publisher sends this force, a new setpoint every period."""
-    return [loop.tick(TimedSetpoint(force_N, loop.now_s, 0.2)) for _ in range(round(duration_s * 1e3))]
+    """All of them."""
+    return list(ticks(loop, force_N, duration_s))
 
 
 def stall(loop: ClosedLoop, stall_ms: int) -> list[float]:
@@ -86,23 +93,27 @@ class Stopped:
             self._device.receive(now_s - self._behind_s, data)
 
 
-def limits_of(samples: list[Sample]) -> set[Limit]:
+def limits_of(samples: Iterable[Sample]) -> set[Limit]:
     return {limit for sample in samples for limit in sample.output.limits}
 
 
 @pytest.mark.parametrize("stall_ms", SHORT_MS)
 def test_a_daemon_that_stalls_for_less_than_the_timeout_goes_on(holding: ClosedLoop, stall_ms: int) -> None:
-    before = holding.step_state
+    before = holding.stepper.move.left.integral
     forces_N = stall(holding, stall_ms)
-    samples = run(holding, FORCE_N, 0.6)
-    assert samples[-1].state.safety.faults == ()
+    seen = [
+        (sample, holding.stepper.measure.sight.is_blind, holding.stepper.move.left.integral)
+        for sample in ticks(holding, FORCE_N, 0.6)
+    ]
+    samples, are_blind, integrals = zip(*seen, strict=True)
+    assert samples[-1].safety.faults == ()
     assert Limit.HOST_STALL in limits_of(samples)
     assert not samples[-1].output.limits
     forces_N += [sample.truth.force_N for sample in samples]
     assert max(abs(force_N - FORCE_N) for force_N in forces_N) < ALLOWED_N
     # judged within two periods, and the integral has not moved by more than holding moves it
-    assert sum(sample.state.sight.is_blind for sample in samples) <= 2
-    assert samples[2].state.left.integral == pytest.approx(before.left.integral, abs=0.02)
+    assert sum(are_blind) <= 2
+    assert integrals[2] == pytest.approx(before, abs=0.02)
 
 
 @pytest.mark.parametrize("stall_ms", SHORT_MS)
@@ -111,7 +122,7 @@ def test_a_stall_on_the_way_leaves_no_kick(holding: ClosedLoop, stall_ms: int) -
     run(holding, 1.7, 0.08)
     stall(holding, stall_ms)
     samples = run(holding, 1.7, 1.2)
-    assert samples[-1].state.safety.faults == ()
+    assert samples[-1].safety.faults == ()
     assert max(sample.truth.force_N for sample in samples) < 1.7 + ALLOWED_N
     assert all(sample.truth.force_N == pytest.approx(1.7, abs=ALLOWED_N) for sample in samples[400:])
 
@@ -120,7 +131,7 @@ def test_stalls_one_after_the_other(holding: ClosedLoop) -> None:
     for stall_ms in (45, 6, 30, 47, 10, 20):
         stall(holding, stall_ms)
         samples = run(holding, FORCE_N, 0.05)
-        assert samples[-1].state.safety.faults == ()
+        assert samples[-1].safety.faults == ()
         assert samples[-1].truth.force_N == pytest.approx(FORCE_N, abs=ALLOWED_N)
 
 
@@ -130,12 +141,12 @@ def test_a_daemon_that_stalls_for_longer_finds_the_device_opening_and_says_why(
 ) -> None:
     stall(holding, stall_ms)
     samples = run(holding, FORCE_N, 3.0)
-    assert samples[25].state.safety.operating_state is OperatingState.FAULT
-    assert samples[-1].state.safety.faults == (Fault.HOST_STALL,)
+    assert samples[25].safety.operating_state is OperatingState.FAULT
+    assert samples[-1].safety.faults == (Fault.HOST_STALL,)
     assert samples[-1].truth.gap_mm > OPEN_MM - 1.0
     assert holding.measurement is not None
     assert holding.measurement.mode is DeviceMode.LATCHED
-    assert samples[-1].state.sight.stall_s == pytest.approx(stall_ms * 1e-3 + 1e-3)
+    assert holding.stepper.measure.sight.stall_s == pytest.approx(stall_ms * 1e-3 + 1e-3)
 
 
 @pytest.mark.parametrize("stop_ms", SHORT_MS)
@@ -144,7 +155,7 @@ def test_a_device_that_stands_still_for_less_than_the_timeout_is_waited_for(hold
     holding.device = device  # type: ignore[assignment]
     device.stop(holding.now_s, stop_ms)
     samples = run(holding, FORCE_N, 0.6)
-    assert samples[-1].state.safety.faults == ()
+    assert samples[-1].safety.faults == ()
     assert (Limit.DEVICE_SILENT in limits_of(samples)) == (stop_ms > 5)
     assert Limit.HOST_STALL not in limits_of(samples)
     assert max(abs(sample.truth.force_N - FORCE_N) for sample in samples) < ALLOWED_N
@@ -156,8 +167,8 @@ def test_a_device_that_stands_still_for_longer_is_a_silent_one(holding: ClosedLo
     holding.device = device  # type: ignore[assignment]
     device.stop(holding.now_s, stop_ms)
     samples = run(holding, FORCE_N, 3.0)
-    assert samples[-1].state.safety.faults[0] is Fault.MEASUREMENT_STALE
-    assert Fault.HOST_STALL not in samples[-1].state.safety.faults
+    assert samples[-1].safety.faults[0] is Fault.MEASUREMENT_STALE
+    assert Fault.HOST_STALL not in samples[-1].safety.faults
     assert not any(sample.output.mode.name == "RUN" for sample in samples if sample.safety.faults)
 
 
@@ -170,13 +181,15 @@ def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(core: Core
     loop = armed(core)
     run(loop, 1.2, 0.8)
     loop.device.messages._home_m -= 2e-4
-    samples = run(loop, force_N, 3.0)
-    assert samples[-1].state.safety.faults == ()
+    move = loop.stepper.move
+    seen = [(sample, move.left.integral, move.right.integral) for sample in ticks(loop, force_N, 3.0)]
+    samples, left, right = zip(*seen, strict=True)
+    assert samples[-1].safety.faults == ()
     assert Limit.F_MIN in samples[-1].plan.limits
     assert OPEN_MM - 0.5 < samples[-1].truth.gap_mm < OPEN_MM - 0.02
     held = samples[1_500:]
     assert Limit.SATURATED not in limits_of(held)
-    assert max(max(sample.state.left.integral, sample.state.right.integral) for sample in held) < 0.1
+    assert max(*left[1_500:], *right[1_500:]) < 0.1
     # and it comes off again as ever
     forces_N = [sample.truth.force_N for sample in run(loop, 1.2, 1.5)]
     assert max(forces_N) < 1.2 + ALLOWED_N

@@ -10,25 +10,23 @@ import json
 import math
 import random
 from collections.abc import Callable
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import firmware_protocol
 from firmware_protocol.build import settle
 from firmware_protocol.codec import DecodeError, DeviceFault, DeviceMode, DriveMode, EncodeError, Switches
-from firmware_protocol.value import Value
 
 BUILD = settle()  # before anything of the core is imported
 
 from firmware_protocol.codec import decode, encode  # noqa: E402
 from firmware_protocol.framing import FrameDecoder, encode_frame  # noqa: E402
 from firmware_protocol.layouts import LAYOUTS  # noqa: E402
+from tormagd.assembly.build import Core, build_core  # noqa: E402
 from tormagd.closed_loop import ClosedLoop  # noqa: E402
 from tormagd.config import Config  # noqa: E402
-from tormagd.control.core import Core, build_core  # noqa: E402
-from tormagd.control.governor import TimedSetpoint  # noqa: E402
-from tormagd.control.plan import Plan  # noqa: E402
+from tormagd.control.records import Plan, TimedSetpoint  # noqa: E402
+from tormagd.exact import plain  # noqa: E402
 from tormagd.hardware.frame_stream import FrameStream  # noqa: E402
 from tormagd.hardware.link import DeviceLink  # noqa: E402
 from tormagd.hardware.link_quality import LinkQuality  # noqa: E402
@@ -57,9 +55,9 @@ class Digest:
         self.things = 0
 
     def see(self, thing: object) -> None:
-        """Takes a value with everything in it."""
+        """Takes a value, a stage of the core or an error, with everything in it."""
         texts: list[str] = []
-        _write(thing, texts)
+        _write(f"{type(thing).__name__}: {thing}" if isinstance(thing, Exception) else plain(thing), texts)
         self.things += len(texts)
         self._hash.update("\n".join([*texts, ""]).encode())
 
@@ -69,25 +67,17 @@ class Digest:
         return self._hash.hexdigest()
 
 
-def _write(thing: object, texts: list[str]) -> None:
-    if isinstance(thing, float | bytes):
-        texts.append(thing.hex())
-    elif isinstance(thing, Enum):
-        texts.append(f"{type(thing).__name__} {thing._value_!r}")
-    elif thing is None or isinstance(thing, int | str):
-        texts.append(repr(thing))
-    elif isinstance(thing, Value):
-        texts.append(type(thing).__name__)
-        for name in thing.__match_args__:
-            _write(getattr(thing, name), texts)
-    elif isinstance(thing, tuple | list):
-        texts.append(f"{len(thing)}:")
-        for inner in thing:
+def _write(data: Any, texts: list[str]) -> None:
+    if isinstance(data, float | bytes):
+        texts.append(data.hex())
+    elif isinstance(data, dict):
+        _write(list(data.items()), texts)
+    elif isinstance(data, list | tuple):
+        texts.append(f"{len(data)}:")
+        for inner in data:
             _write(inner, texts)
-    elif isinstance(thing, Exception):
-        texts.append(f"{type(thing).__name__}: {thing}")
     else:
-        raise TypeError(f"{thing!r}: allowed is what has a text of its own, the same in both builds")
+        texts.append(repr(data))
 
 
 # -- step and plan, whatever is measured ---------------------------------------------------------------------------
@@ -99,7 +89,7 @@ def hostile(core: Core, seen: Digest) -> None:
     for _ in range(EPISODES):
         strangeness = rng.choice([0.0, 0.0, 0.01, 0.1])
         now_s, number, at_mm = rng.uniform(0.0, 1e5), 0, rng.uniform(-25.0, 0.0)
-        state, planned = core.stepper.start(now_s), core.planner.start(now_s)
+        stepper, planner = core.stepper(now_s), core.planner(now_s)
         measured: Measurement | None = None
         for _ in range(TICKS):
             now_s += rng.choice([0.0, 2e-3, 0.02, -1e-3]) if rng.random() < 0.05 else 1e-3
@@ -109,31 +99,31 @@ def hostile(core: Core, seen: Digest) -> None:
                 measured = measurement(rng, number, now_s, at_mm, strangeness)
             elif rng.random() < 0.02:
                 measured = None
-            plan = planned.plan
+            plan = planner.planned
             if rng.random() < 0.5:
                 gap_mm, speed_mm_s = rng.uniform(40.0, 100.0), rng.uniform(-40.0, 40.0)
                 plan = Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, speed_mm_s, 1.0, ())
-            state, output = core.stepper.step(state, now_s, measured, plan)
-            seen.see((state, output))
+            seen.see([stepper.step(now_s, measured, plan), stepper])
             if rng.random() < 0.3:
                 setpoint = None if rng.random() < 0.1 else setpoint_at(rng, now_s)
                 try:
-                    planned = core.planner.plan(planned, now_s, setpoint, state.estimate)
-                    seen.see((planned, planned.trim))
-                    planned = core.planner.foresee(planned)
+                    planner.plan(now_s, setpoint, stepper.measured)
+                    seen.see(planner)
+                    planner.foresee()
                 except (ValueError, OverflowError) as error:  # of what is not finite, and no wire brings
                     seen.see(error)
-                    planned = core.planner.start(now_s)
+                    seen.see(planner)
+                    planner = core.planner(now_s)
             if rng.random() < 0.1:
-                name = NEXT.get(state.safety.operating_state, "resume")
+                name = NEXT.get(stepper.safety.operating_state, "resume")
                 if rng.random() < 0.2:
                     name = rng.choice(COMMANDS)
                 try:
-                    state = core.stepper.command(state, name, now_s, conditions(rng))
+                    stepper.command(name, now_s, conditions(rng))
                 except RefusedError as error:
                     seen.see(error)
             if rng.random() < 0.003:
-                state = core.stepper.lose_link(state)
+                stepper.lose_link()
 
 
 def measurement(rng: random.Random, number: int, now_s: float, at_mm: float, strangeness: float) -> Measurement:
@@ -233,7 +223,7 @@ def loop(core: Core, seen: Digest, plant: str, hand: Hand, fault: str, flips: fl
     """Armed, a pulse with steps between, two stalls that are survived and one that is not; then cleared and on."""
     faults = [parse_fault(fault)] if fault else []
     line = BadLine(VirtualDevice(load_plant(plant), hand, faults, seed=3), seen, 0.0)
-    running = ClosedLoop(CONFIG, core.stepper, core.planner, line)
+    running = ClosedLoop(CONFIG, core.stepper(), core.planner(), line)
     running.arm()
     line.flips = flips
 
@@ -246,12 +236,10 @@ def loop(core: Core, seen: Digest, plant: str, hand: Hand, fault: str, flips: fl
     def on(seconds: float) -> None:
         planned = None
         for sample in running.run(seconds, asked):
-            seen.see(
-                (sample.time_s, sample.state, sample.output, sample.plan.number, sample.truth, running.measurement)
-            )
-            if planned is not running.plan_state:
-                planned = running.plan_state
-                seen.see((planned, sample.plan.trim))
+            seen.see([sample, running.stepper, running.measurement])
+            if planned is not running.planner.planned:
+                planned = running.planner.planned
+                seen.see(running.planner)
 
     for stalled_ms, then_s in ((0, 1.5), (12, 0.5), (40, 0.5), (83, 2.4)):
         for _ in range(stalled_ms):

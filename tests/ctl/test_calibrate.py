@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
-from tormagd.control import estimate
-from tormagd.control.core import build_core
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.measure import Measure
+from tormagd.control.records import Handle, Measured, TimedSetpoint
 from tormagd.ctl import calibrate as ctl_calibrate, calibrate_motors as ctl_calibrate_motors, calibrate_run
 from tormagd.ctl.calibrate import COLUMNS, FILE_COLUMNS, up_and_down, write_sweeps
 from tormagd.ctl.calibrate_motors import COLUMNS as MOTOR_COLUMNS, excitation, motor_log
@@ -41,11 +41,11 @@ def record(plant="sample_1", hand=None, rates_N_s=(0.8, 1.0, 0.8), most_N=2.0):
     config = Config()
     core = build_core(config)
     device = VirtualDevice(load_plant(plant), hand or ReversingHand(2.0), seed=3)
-    loop = ClosedLoop(config, core.stepper, core.planner, device)
+    loop = ClosedLoop(config, core.stepper(), core.planner(), device)
     loop.arm()
     sweeps = []
     for rate in rates_N_s:
-        waveform = up_and_down(Range(core.planner.portrait.least_N, most_N), rate)
+        waveform = up_and_down(Range(core.portrait.min_N, most_N), rate)
         start_s = loop.now_s
         rows = []
         for sample in loop.run(
@@ -201,11 +201,11 @@ def test_displacement_is_what_the_daemon_calls_it():
     """Of a whole sweep or position by position: one law."""
     rng = np.random.default_rng(1)
     path = np.cumsum(rng.normal(0.0, 0.06, 4000)) + 3.0 * np.sin(np.arange(4000) / 90.0)
-    handle = estimate.Handle(0.0, 0.0, Turn(1.0, path[0], path[0]))
+    measure, handle = Measure(47.5, 0.01, True, 20.0, 1e-3), Handle(0.0, 0.0, Turn(1.0, path[0], path[0]))
     expected = []
     for position in path:
-        fake = estimate.Estimate(0, True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
-        handle = estimate._handle(fake, float(position), 1e-3, True)
+        fake = Measured(0, True, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
+        handle = measure._handle(fake, float(position), 1e-3)
         expected.append(handle.displacement_mm)
     found = displacement(path)
     known = np.isfinite(found)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from rendering.device_draws import drawn_device
 
+from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
-from tormagd.control.core import build_core
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.ctl import calibrate_device
 from tormagd.ctl.calibrate_device import ARRIVED_S, COLUMNS, STEP_S, judged, lesson
 from tormagd.ctl.calibrate_run import Range
@@ -44,9 +44,9 @@ def test_what_is_asked_teaches_the_device(plant, mean_N: float, worst_N: float) 
     """Synthetic devices, none of which chose a constant of the learning."""
     config = Config()
     core = build_core(config)
-    loop = ClosedLoop(config, core.stepper, core.planner, VirtualDevice(plant, ReversingHand(2.0), seed=5))
+    loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(plant, ReversingHand(2.0), seed=5))
     loop.arm()
-    learning, judging = lesson(Range(core.planner.portrait.least_N, 2.0))
+    learning, judging = lesson(Range(core.portrait.min_N, 2.0))
     assert learning.duration_s + judging.duration_s < 60.0
     played(loop, learning)
     found = judged(played(loop, judging), judging, 0.0)

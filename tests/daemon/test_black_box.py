@@ -9,11 +9,11 @@ import msgspec
 import pytest
 
 from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, Hello
+from tormagd.assembly.build import Core
+from tormagd.assembly.journal import MOST_ENTRIES, Journal
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.journal import MOST_ENTRIES, Journal
+from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.black_box import PART_TICKS, BlackBox
 from tormagd.daemon.profiles import state_folder
 from tormagd.daemon.telemetry import tick_record
@@ -27,14 +27,9 @@ from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
 
 
-@pytest.fixture(scope="module")
-def core() -> Core:
-    return build_core(Config())
-
-
 def closed_loop(core: Core) -> ClosedLoop:
     device = VirtualDevice(load_plant("sample_1"), ReversingHand(2.0))
-    return ClosedLoop(Config(), core.stepper, core.planner, device)
+    return ClosedLoop(Config(), core.stepper(), core.planner(), device)
 
 
 class Rig:
@@ -42,11 +37,11 @@ class Rig:
 
     def __init__(self, core: Core, connection: Connection | None = None) -> None:
         self.waited = 0
-        self.step, self.plan = core.stepper.start(0.0), core.planner.start(0.0)
-        self.step, self.output = core.stepper.step(self.step, 1.0, None, self.plan.plan)
+        self.stepper, self.planner = core.stepper(), core.planner()
+        self.output = self.stepper.step(1.0, None, self.planner.planned)
         self.box = BlackBox(Path("/boxes"), {"format": "1"}, 1_000, self.start)
         connection = connection or Connection(Config().device, lambda: pytest.fail("nobody opens it"), lambda: None)
-        self.box.begin(self.step, self.plan, connection)
+        self.box.begin(self.stepper, self.planner, connection)
 
     def start(self, its: socket.socket) -> Any:
         self.its = its.dup()
@@ -59,8 +54,8 @@ class Rig:
     def tick(self, times: int = 1) -> None:
         for _ in range(times):
             self.box.journal.stepped()
-            record = tick_record(1.0, self.step, self.output, self.plan.plan, 1.0, None, 0.0, 0.0)
-            self.box.ticked(record, self.step, self.plan)
+            record = tick_record(self.stepper, self.output, self.planner.planned, None, 0.0, 0.0)
+            self.box.ticked(record, self.stepper, self.planner)
 
     def heard(self) -> list[Said]:
         said: list[Said] = []
@@ -171,7 +166,7 @@ def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.Monkey
     assert state_folder("", "blackbox") is None
     box = BlackBox(None, {}, 1_000)
     loop = closed_loop(core)
-    box.begin(core.stepper.start(0.0), core.planner.start(0.0), loop.connection)
+    box.begin(core.stepper(), core.planner(), loop.connection)
     loop.tick()
     box.journal.stepped()
     assert box.journal.take() == []

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from firmware_protocol.codec import DriveMode
-from tormagd.control.journal import Journal
-from tormagd.control.step import StepOutput, StepState
+from tormagd.assembly.journal import Journal
+from tormagd.control.records import Duty
 from tormagd.daemon.control_loop import ControlLoop
 from tormagd.safety.operating_state import DeviceRequest
 
@@ -20,13 +20,13 @@ def test_the_measurement_that_a_step_was_given_is_kept_though_the_exchange_bring
     def exchange(*_arguments: Any) -> None:
         connection.measurement = "new"
 
-    def step(state: StepState, now_s: float, measurement: Any, _plan: Any) -> tuple[StepState, StepOutput]:
+    def step(_now_s: float, measurement: Any, _plan: Any) -> Duty:
         given.append(measurement)
-        return state.replaced(time_s=now_s), StepOutput(DriveMode.OFF, 0.0, 0.0, DeviceRequest.NONE, 0, ())
+        return Duty(DriveMode.OFF, 0.0, 0.0, DeviceRequest.NONE, 0, ())
 
     connection.exchange = exchange
     connection.receive = lambda: given.append("received")
-    stepper: Any = SimpleNamespace(start=StepState, step=step)
+    stepper: Any = SimpleNamespace(step=step)
     loop = ControlLoop(stepper, connection, 1_000_000, Journal())
     plan: Any = None
     for seen in ("old", "new"):
@@ -54,7 +54,7 @@ def test_the_measurement_that_a_step_was_given_is_kept_though_the_exchange_bring
 def test_another_thread_keeps_clear_of_a_tick(
     monkeypatch: pytest.MonkeyPatch, since_due_us: float, wait_us: float
 ) -> None:
-    loop = ControlLoop(SimpleNamespace(start=StepState), SimpleNamespace(), 1_000_000, Journal())  # type: ignore[arg-type]
+    loop = ControlLoop(SimpleNamespace(), SimpleNamespace(), 1_000_000, Journal())  # type: ignore[arg-type]
     loop.next_tick_ns = 50_000_000_000
     monkeypatch.setattr(time, "monotonic_ns", lambda: loop.next_tick_ns + round(since_due_us * 1e3))
     assert loop.until_slack_s() * 1e6 == pytest.approx(wait_us)

@@ -5,7 +5,7 @@ import sys
 
 LOADED = """
 import sys
-import tormagd.daemon.daemon, tormagd.daemon.main, tormagd.control.core
+import tormagd.daemon.daemon, tormagd.daemon.main, tormagd.assembly.build
 import tormagd.hardware.serial_backend, tormagd.hardware.can_backend
 names = sorted(sys.modules)
 ours = [name for name in names if name.startswith(("tormagd.", "tormagd_client.", "firmware_protocol."))]
@@ -13,6 +13,7 @@ print(*[name for name in ours if "__mypyc" not in name])
 print(*sorted({name.partition(".")[0] for name in names} & set(sys.argv[1:])))
 """
 ROOMS = {
+    "assembly",
     "bounded_file",
     "config",
     "control",

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.inbox import REPORTED, SILENT_S, SOURCES, SetpointInbox
 from tormagd.daemon.source_clock import AHEAD_S, SETTLED_S
 from tormagd.safety.codes import Limit

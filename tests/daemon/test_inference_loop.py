@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from tormagd.control.governor import GovernorState, TimedSetpoint
-from tormagd.control.journal import Journal
-from tormagd.control.plan import Plan, PlanState
+from tormagd.assembly.journal import Journal
+from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.physics.errors import DomainError
@@ -29,12 +28,12 @@ class Rig:
         self.planned_ns: list[int] = []
         self.foreseen_ns: list[int] = []
         self.failures = 0
-        planner = planner or SimpleNamespace(start=lambda now_s: None, plan=self.plan, foresee=self.foresee)
+        planner = planner or SimpleNamespace(plan=self.plan, foresee=self.foresee)
         self.inbox = SetpointInbox()
         endpoint: Any = SimpleNamespace(drain_setpoints=self.drain, is_flooded=False, inbox=self.inbox)
         self.journal = Journal()
         self.loop = InferenceLoop(
-            planner, endpoint, DUE_NS, 0.0, lambda: self.now_ns, journal=self.journal, on_failure=self.fail
+            planner, endpoint, DUE_NS, lambda: self.now_ns, journal=self.journal, on_failure=self.fail
         )
 
     def fail(self) -> None:
@@ -44,7 +43,7 @@ class Rig:
         self.planned_ns.append(self.now_ns)
         self.now_ns += self.plan_ns
 
-    def foresee(self, state: None) -> None:
+    def foresee(self) -> None:
         self.foreseen_ns.append(self.now_ns)
 
     def drain(self) -> bool:
@@ -166,32 +165,26 @@ def test_what_the_next_plans_need_is_prepared_after_a_tick_and_not_while_a_setpo
 @pytest.mark.parametrize("error", [DomainError("displacement_mm", 1e10, "less"), ZeroDivisionError(), RuntimeError()])
 def test_a_setpoint_that_cannot_be_planned_for_is_withdrawn_and_planning_goes_on(error: Exception) -> None:
     """The one that makes planning fail would make it fail again and again."""
+    called: list[str] = []
 
-    def plan(state: PlanState, now_s: float, setpoint: TimedSetpoint | None, _estimate: object) -> PlanState:
+    def plan(_now_s: float, setpoint: TimedSetpoint | None, _measured: object) -> None:
+        called.append("plan")
         if setpoint is not None:
             raise error
-        return state.replaced(plan=state.plan.replaced(number=state.plan.number + 1))
 
-    def afresh(state: PlanState, now_s: float) -> PlanState:
-        return PlanState(GovernorState(now_s, 0.5), resting.replaced(number=state.plan.number + 1))
-
-    resting = Plan(0, 0.0, None, None, 0.5, None, 50.0, 95.0, 0.0, 1.0, ())
     planner: Any = SimpleNamespace(
-        start=lambda now_s: PlanState(GovernorState(now_s, 0.5), resting),
-        plan=plan,
-        foresee=lambda state: state,
-        afresh=afresh,
+        plan=plan, foresee=lambda: called.append("foresee"), afresh=lambda _now_s: called.append("afresh")
     )
     rig = Rig(planner)
     inbox, loop = rig.inbox, rig.loop
-    inbox.newest = TimedSetpoint(1.0, 0.0, 0.1)
+    rejected = inbox.newest = TimedSetpoint(1.0, 0.0, 0.1)
     rig.has_arrived = True
     loop.after_tick(None)
-    assert (rig.failures, inbox.newest, inbox.refused, loop.state.plan.number) == (1, None, 1, 1)
+    assert (rig.failures, inbox.newest, inbox.refused, called) == (1, None, 1, ["plan", "afresh", "foresee"])
     assert "no gap could be planned" in str(inbox.last_refusal)
     rig.has_arrived = True
     loop.after_tick(None)
-    assert (rig.failures, inbox.refused, loop.state.plan.number) == (1, 1, 2)
+    assert (rig.failures, inbox.refused, called[3:]) == (1, 1, ["plan", "foresee"])
     # and it is written down in that order: what a replay has to do
     first_s = rig.now_ns * 1e-9
-    assert rig.journal.take() == [("afresh", first_s), ("plan", first_s, None)]
+    assert rig.journal.take() == [("plan", first_s, rejected), ("afresh", first_s), ("plan", first_s, None)]

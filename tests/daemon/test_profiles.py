@@ -9,40 +9,40 @@ from pathlib import Path
 
 import pytest
 
-from tormagd.control.device_fit import DeviceFit
-from tormagd.control.lateness import Lateness
-from tormagd.control.plan import NOTHING_SHOWN, Shown
-from tormagd.control.profile import ProfileError, profile_of
-from tormagd.control.sensor import Sensor
+from tormagd.assembly.build import Core
+from tormagd.assembly.profile import ProfileError, profile_of
+from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
+from tormagd.control.believe.strength import DeviceFit
 from tormagd.daemon.profiles import ProfileFolder, Profiles
 
 MODEL = "ab" * 32
-STRONG = Shown(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4), lateness=Lateness(0.02))
+STRONG = Learned(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4), lag_s=0.02)
 
 
 class Rig:
-    """Profiles of a planner that is a variable, on an event loop that runs while they are asked to look."""
+    """Profiles of what is believed, on an event loop that runs while they are asked to look."""
 
-    def __init__(self, runner: asyncio.Runner, folder: Path | None) -> None:
-        self.shown = NOTHING_SHOWN
+    def __init__(self, core: Core, runner: asyncio.Runner, folder: Path | None) -> None:
+        self.believe = core.planner().believe
         self._runner = runner
         self.profiles = runner.run(self._begun(None if folder is None else ProfileFolder(folder, "MRE-50-40", MODEL)))
 
     async def _begun(self, folder: ProfileFolder | None) -> Profiles:
-        return Profiles(folder, lambda: self.shown, self.teach)
+        return Profiles(folder, self.believe, self.believe.teach)
 
-    def teach(self, shown: Shown) -> None:
-        self.shown = shown
+    @property
+    def learned(self) -> Learned:
+        return self.believe.learned()
 
-    def look(self, serial_number: int, *driven: bool, shown: Shown | None = None) -> None:
-        """Looks once for each of `driven`, and waits until the other thread has read and written. The planner has
-        learned `shown` before the last."""
-        self._runner.run(self._looked(serial_number, driven, shown))
+    def look(self, serial_number: int, *driven: bool, learned: Learned | None = None) -> None:
+        """Looks once for each of `driven`, and waits until the other thread has read and written. Before the last,
+        `learned` has been."""
+        self._runner.run(self._looked(serial_number, driven, learned))
 
-    async def _looked(self, serial_number: int, driven: tuple[bool, ...], shown: Shown | None) -> None:
+    async def _looked(self, serial_number: int, driven: tuple[bool, ...], learned: Learned | None) -> None:
         for number, is_driven in enumerate(driven, 1):
-            if number == len(driven):
-                self.shown = shown or self.shown
+            if number == len(driven) and learned is not None:
+                self.believe.teach(learned)
             self.profiles.look(serial_number, is_driven=is_driven)
         await self.profiles.finished()
         for _ in range(3):
@@ -50,15 +50,15 @@ class Rig:
 
 
 @pytest.fixture
-def new_rig() -> Iterator[Callable[[Path | None], Rig]]:
+def new_rig(core: Core) -> Iterator[Callable[[Path | None], Rig]]:
     with asyncio.Runner() as runner:
         # what is given to one thread is done in turn, so that what comes last says that all is done
         runner.get_loop().set_default_executor(ThreadPoolExecutor(1))
-        yield partial(Rig, runner)
+        yield partial(Rig, core, runner)
 
 
-def keep(folder: Path, serial_number: int, shown: Shown = STRONG) -> None:
-    profile = profile_of(shown, serial_number=serial_number, insert="MRE-50-40", model=MODEL, saved_ns=0)
+def keep(folder: Path, serial_number: int) -> None:
+    profile = profile_of(STRONG, serial_number=serial_number, insert="MRE-50-40", model=MODEL, saved_ns=0)
     ProfileFolder(folder, "MRE-50-40", MODEL).write(profile)
 
 
@@ -67,11 +67,11 @@ def test_what_is_learned_while_driven_is_there_after_a_restart(
 ) -> None:
     rig = new_rig(tmp_path / "profiles")
     rig.look(7, False)
-    assert (rig.shown, rig.profiles.report().is_used) == (NOTHING_SHOWN, False)
-    rig.look(7, True, False, shown=STRONG)
+    assert (rig.learned, rig.profiles.report().is_used) == (NOTHING_LEARNED, False)
+    rig.look(7, True, False, learned=STRONG)
     again = new_rig(tmp_path / "profiles")
     again.look(7, False)
-    assert (again.shown.device.scale, again.shown.lateness.lag_s) == (1.3, 0.02)
+    assert (again.learned.device.scale, again.learned.lag_s) == (1.3, 0.02)
     report = again.profiles.report()
     assert (report.is_used, report.refusal) == (True, "")
     assert report.age_s is not None
@@ -81,7 +81,7 @@ def test_what_is_learned_while_driven_is_there_after_a_restart(
     ("added", "is_kept"),
     [
         ({"device": DeviceFit(1.31, 0.02, 1e-4, 0.0, 1e-4)}, b'"scale": 1.31'),
-        ({"lateness": Lateness(0.025)}, b'"lag_s": 0.025'),
+        ({"lag_s": 0.025}, b'"lag_s": 0.025'),
     ],
 )
 def test_a_profile_that_nothing_was_added_to_does_not_get_younger(
@@ -94,7 +94,7 @@ def test_a_profile_that_nothing_was_added_to_does_not_get_younger(
     rig.look(7, False)
     rig.look(7, True, False)
     assert path.read_bytes() == before
-    rig.look(7, True, False, shown=rig.shown.replaced(**added))
+    rig.look(7, True, False, learned=rig.learned.replaced(**added))
     assert is_kept in path.read_bytes()
 
 
@@ -103,7 +103,7 @@ def test_a_refusal_is_over_when_a_profile_has_been_kept(new_rig: Callable[[Path 
     rig = new_rig(tmp_path)
     rig.look(7, True)
     assert "not a profile" in rig.profiles.report().refusal
-    rig.look(7, False, shown=STRONG)
+    rig.look(7, False, learned=STRONG)
     assert rig.profiles.report().refusal == ""
 
 
@@ -111,9 +111,9 @@ def test_another_device_is_not_taken_for_the_one_before(new_rig: Callable[[Path 
     keep(tmp_path, 7)
     rig = new_rig(tmp_path)
     rig.look(7, False)
-    assert rig.shown.device.scale == 1.3
+    assert rig.learned.device.scale == 1.3
     rig.look(8, False)
-    assert (rig.shown, rig.profiles.report().is_used) == (NOTHING_SHOWN, False)
+    assert (rig.learned, rig.profiles.report().is_used) == (NOTHING_LEARNED, False)
 
 
 def test_a_device_that_has_shown_itself_meanwhile_is_believed(
@@ -121,12 +121,16 @@ def test_a_device_that_has_shown_itself_meanwhile_is_believed(
 ) -> None:
     keep(tmp_path, 7)
     rig = new_rig(tmp_path)
-    rig.look(7, False, False, shown=Shown(DeviceFit(0.8)))
-    assert rig.shown.device.scale == 0.8
+    rig.look(7, False, False, learned=Learned(DeviceFit(0.8)))
+    assert rig.learned.device.scale == 0.8
 
 
 def test_what_a_doubted_sensor_taught_is_not_kept(new_rig: Callable[[Path | None], Rig], tmp_path: Path) -> None:
-    new_rig(tmp_path).look(7, True, False, shown=STRONG.replaced(sensor=Sensor(is_doubted=True)))
+    rig = new_rig(tmp_path)
+    rig.look(7, False, True, learned=STRONG)
+    rig.believe.sensor.is_doubted = True
+    rig.look(7, False)
+    assert rig.learned == STRONG
     assert list(tmp_path.iterdir()) == []
 
 
@@ -157,7 +161,7 @@ def test_a_wrong_file_is_named_and_nothing_is_believed_of_it(
     rig = new_rig(tmp_path)
     spoil(tmp_path / "00000007-MRE-50-40.json")
     rig.look(7, False)
-    assert rig.shown == NOTHING_SHOWN
+    assert rig.learned == NOTHING_LEARNED
     assert says in rig.profiles.report().refusal
 
 
@@ -169,6 +173,6 @@ def test_a_folder_that_cannot_be_written_keeps_nothing_and_says_so(tmp_path: Pat
 
 def test_without_a_folder_nothing_is_kept(new_rig: Callable[[Path | None], Rig]) -> None:
     rig = new_rig(None)
-    rig.look(7, True, False, shown=STRONG)
-    assert rig.shown == STRONG
+    rig.look(7, True, False, learned=STRONG)
+    assert rig.learned == STRONG
     assert rig.profiles.report().refusal

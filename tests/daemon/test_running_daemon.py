@@ -15,11 +15,11 @@ import msgspec
 import pytest
 
 from firmware_protocol.build import settle
+from tormagd.assembly.build import Core
 from tormagd.closed_loop import VirtualPort
 from tormagd.config import Config, Rates, RealTime
-from tormagd.control.core import Core, build_core
-from tormagd.control.plan import PlanState
-from tormagd.control.sight import Sight
+from tormagd.control.core import Planner
+from tormagd.control.records import Plan
 from tormagd.daemon import daemon as daemon_module, notify
 from tormagd.daemon.callbacks import KERNEL, Delay
 from tormagd.daemon.daemon import Daemon
@@ -111,11 +111,11 @@ class Port:
 class FailingPlanner:
     """Plans as the core's does, until its error is set."""
 
-    def __init__(self, core: Core) -> None:
-        self._planner = core.planner
+    def __init__(self, planner: Planner) -> None:
+        self._planner = planner
         self.error: Exception | None = None
 
-    def plan(self, *arguments: Any) -> PlanState:
+    def plan(self, *arguments: Any) -> Plan:
         if self.error is not None:
             raise self.error.with_traceback(None)  # or it would grow by each time, and take long to log
         return self._planner.plan(*arguments)
@@ -128,7 +128,7 @@ class Running:
     """A daemon that beats when the test says so, and an operator's client, which publishes, too."""
 
     def __init__(self, runner: asyncio.Runner, clock: Clock, core: Core, folder: Path) -> None:
-        self.clock, self.port, self.planner, self.core = clock, Port(), FailingPlanner(core), core
+        self.clock, self.port, self.core = clock, Port(), core
         self._runner, self._folder = runner, str(folder)
         self.clients: list[Client] = []
         self.client = self.publisher("test")
@@ -145,8 +145,9 @@ class Running:
 
     async def _begun(self, rates: Rates) -> None:
         config = Config(endpoints=in_folder(self._folder), rates=rates, realtime=RealTime(watchdog_ms=WATCHDOG_MS))
-        made: Any = self.core._replace(planner=self.planner)  # type: ignore[arg-type]
-        self.daemon = Daemon(config, made, self.port.open, [])
+        self.daemon = Daemon(config, self.core, self.port.open, [])
+        self.planner = FailingPlanner(self.daemon._inference.planner)
+        self.daemon._inference.planner = self.planner  # type: ignore[assignment]
         # what was bound before the clock was made
         self.daemon._inference._clock_ns = self.daemon._callbacks._clock_ns = time.monotonic_ns
         self.daemon._connection._clock = time.monotonic
@@ -226,11 +227,6 @@ class Running:
             await self._ticked(1)
 
 
-@pytest.fixture(scope="module")
-def core() -> Core:
-    return build_core(Config())
-
-
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
     made = Clock()
@@ -279,7 +275,7 @@ def test_a_daemon_describes_what_it_runs(running: Running) -> None:
     assert (described.model, described.build) == (running.core.model, str(settle()))
     assert (described.firmware, described.serial_number) == (None, None)
     # a device that has shown nothing yet is the model, at the gap speed of the configuration
-    shown, told = running.core.planner.portrait, described.portrait
+    shown, told = running.core.portrait, described.portrait
     assert told is not None
     assert told.force_N == pytest.approx(shown.force_N[::5], abs=1e-4)
     speed_mm_s = described.configuration["position"]["gap_speed_mm_s"]
@@ -337,18 +333,20 @@ def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
     control, causes = running.daemon._control, running.daemon._causes
 
     def stall(now_s: float, took_s: float, culprit: str) -> None:
-        control.state = control.state.replaced(time_s=now_s, sight=Sight(now_s, now_s, took_s, is_blind=True))
-        causes.note_stall(control.state, Delay(round(took_s * 1e9), culprit, 1))
+        stepper, sight = control.stepper, control.stepper.measure.sight
+        stepper.time_s = sight.stalled_s = now_s
+        sight.stall_s = took_s
+        causes.note_stall(stepper, Delay(round(took_s * 1e9), culprit, 1))
 
     stall(10.0, 0.083, KERNEL)
     # a late tick that is no stall is not taken for one
-    control.state = control.state.replaced(time_s=10.1)
-    causes.note_stall(control.state, Delay(2_000_000, "TelemetryLoop.publish", 1_500_000))
+    control.stepper.time_s = 10.1
+    causes.note_stall(control.stepper, Delay(2_000_000, "TelemetryLoop.publish", 1_500_000))
     control.latch(Fault.HOST_STALL)
-    causes.tell(control.new_faults(), control.state, None)
+    causes.tell(control.new_faults(), control.stepper, None)
     stall(11.0, 0.006, "somebody else")
     control.latch(Fault.PLAN_FAILED)
-    causes.tell(control.new_faults(), control.state, None)
+    causes.tell(control.new_faults(), control.stepper, None)
     assert control.new_faults() == ()
     assert [record.getMessage() for record in caplog.records if record.getMessage().startswith("fault")] == [
         "fault: HOST_STALL: the control loop stood still for 83 ms (kernel); "

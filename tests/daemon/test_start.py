@@ -53,7 +53,7 @@ def test_what_is_slow_to_load_is_not_loaded_before_that():
     [
         ("tormagd", "tormagd.daemon.main"),
         ("tormagd", "uvloop"),
-        ("tormagd", "tormagd.control.core"),
+        ("tormagd", "tormagd.assembly.build"),
         ("tormagctl", "tormagd.ctl.main"),
         ("tormagctl", "tormagd.config"),
         ("simulation", "numpy"),

@@ -6,19 +6,20 @@ import msgspec
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
-from tormagd.control.estimate import first_estimate
-from tormagd.control.plan import Outside, Plan
-from tormagd.control.step import StepOutput, StepState
-from tormagd.control.trajectory import Reference
+from tormagd.config import Config
+from tormagd.control.core import Stepper
+from tormagd.control.move.reference import Reference
+from tormagd.control.records import Duty, Outside, Plan
 from tormagd.daemon.telemetry import limits_held, snapshot, tick_record
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import DeviceRequest, OperatingState, SafetyState
+from tormagd.scenes.scene import load_scene
 from tormagd_client.messages import Telemetry, decode, encode, encode_ticks
 
 PLAN = Plan(7, 1.0, 1.5, 0.01, 1.4, 1.38, 500.0, 64.0, -1.0, 0.9, (Limit.RANGE, Limit.SKEW))
-OUTPUT = StepOutput(DriveMode.RUN, 0.1, -0.2, DeviceRequest.NONE, 0, (Limit.SKEW, Limit.RATE))
+OUTPUT = Duty(DriveMode.RUN, 0.1, -0.2, DeviceRequest.NONE, 0, (Limit.SKEW, Limit.RATE))
 MEASUREMENT = Measurement(
     number=1,
     received_s=1.0,
@@ -39,16 +40,28 @@ MEASUREMENT = Measurement(
 )
 
 
-def telemetry(measurement: Measurement | None, state: StepState, is_busy: bool = False) -> Telemetry:
+def stepped(safety: SafetyState, measurement: Measurement | None, now_s: float = 1.0) -> Stepper:
+    """A stepper in this state, whose first measurement this is."""
+    stepper = Stepper(Config(), load_scene("coronary"), now_s)
+    stepper.safety = safety
+    if measurement is not None:
+        stepper.measure.begin(measurement)
+    return stepper
+
+
+def telemetry(
+    measurement: Measurement | None, safety: SafetyState, reference: Reference | None = None, is_busy: bool = False
+) -> Telemetry:
     """What is published, as a client decodes it."""
-    tick = tick_record(1.0, state, OUTPUT, PLAN, 1.1, measurement, 20.0, 150.0)
-    is_homed = state.estimate is not None and state.estimate.is_homed
+    stepper = stepped(safety, measurement)
+    stepper.move.reference = reference
+    tick = tick_record(stepper, OUTPUT, PLAN, measurement, 20.0, 150.0)
+    is_homed = stepper.measured is not None and stepper.measured.is_homed
     return decode(encode(snapshot(tick, 3, is_homed, is_busy, 0.012)), Telemetry)
 
 
 def test_a_driven_device() -> None:
-    state = StepState(1.0, SafetyState(OperatingState.ENABLED), first_estimate(MEASUREMENT, 47.5), Reference(64.2))
-    published = telemetry(MEASUREMENT, state)
+    published = telemetry(MEASUREMENT, SafetyState(OperatingState.ENABLED), Reference(64.2))
     assert published.measured_jp == (32.5, 32.0)
     assert (published.gap_mm, published.skew_mm, published.gap_setpoint_mm) == (64.5, 0.5, 64.2)
     assert (published.setpoint_cf, published.governed_cf, published.predicted_cf, published.measured_cf) == (
@@ -66,13 +79,13 @@ def test_a_driven_device() -> None:
 
 def test_positions_before_homing_are_not_known() -> None:
     lost = MEASUREMENT.replaced(switches=Switches(0), mode=DeviceMode.HOMING)
-    published = telemetry(lost, StepState(1.0, SafetyState(), first_estimate(lost, 47.5)), is_busy=True)
+    published = telemetry(lost, SafetyState(), is_busy=True)
     assert (published.gap_mm, published.measured_jp, published.skew_mm, published.gap_setpoint_mm) == (None,) * 4
     assert (published.is_homed, published.is_busy, published.measured_cf) == (False, True, 1.39)
 
 
 def test_without_a_device_nothing_measured_is_known() -> None:
-    published = telemetry(None, StepState(1.0))
+    published = telemetry(None, SafetyState())
     assert (published.gap_mm, published.measured_cf, published.measured_jp) == (None, None, None)
     assert (published.is_homed, published.is_busy) == (False, False)
 
@@ -113,15 +126,18 @@ def test_a_tick_is_recorded_whole() -> None:
         limits=(Limit.RANGE,),
         gap_acceleration_mm_s2=-7.5,
         foresight=0.75,
-        least_gap_mm=31.0,
+        min_gap_mm=31.0,
         outside=(Outside("rate_mm_s", 1 / 3, 300.0),),
         sensor_doubted_s=0.0625,
+        trim=1.1,
     )
-    estimate = first_estimate(measurement, 47.5)
     safety = SafetyState(OperatingState.PAUSED, (Fault.SKEW, Fault.SENSOR), DeviceRequest.CLEAR, 99)
-    state = StepState(1.5, safety, estimate, Reference(64.2))
-    output = StepOutput(DriveMode.RUN, 0.1, -0.2, DeviceRequest.HOME, 5, (Limit.RATE,))
-    tick = tick_record(1.5, state, output, plan, 1.1, measurement, 20.0, 150.0, 9)
+    stepper = stepped(safety, measurement, 1.5)
+    stepper.move.reference = Reference(64.2)
+    measured = stepper.measured
+    assert measured is not None
+    output = Duty(DriveMode.RUN, 0.1, -0.2, DeviceRequest.HOME, 5, (Limit.RATE,))
+    tick = tick_record(stepper, output, plan, measurement, 20.0, 150.0, 9)
     sent = msgspec.msgpack.decode(encode_ticks([tick]))
     row = dict(zip(sent["columns"], sent["rows"][0], strict=True))
     assert abs(row.pop("t_ns") - time.time_ns()) < 60_000_000_000
@@ -168,11 +184,11 @@ def test_a_tick_is_recorded_whole() -> None:
         "right_current_A": 0.4,
         "supply_V": 12.1,
         "reference_gap_mm": 64.2,
-        "measured_cf": estimate.force_N,
+        "measured_cf": measured.force_N,
         "left_mm": 32.5,
         "right_mm": 32.0,
-        "handle_mm": estimate.handle_mm,
-        "handle_rate_mm_s": estimate.handle.rate_mm_s,
+        "handle_mm": measured.handle_mm,
+        "handle_rate_mm_s": measured.handle.rate_mm_s,
         "operating_state": "PAUSED",
         "limits": ["RANGE", "RATE"],
         "step_limits": ["RATE"],
@@ -191,6 +207,6 @@ def test_a_tick_is_recorded_whole() -> None:
 @pytest.mark.parametrize("present", OperatingState)
 def test_nothing_is_governed_or_holds_back_while_the_device_is_not_driven(present: OperatingState) -> None:
     is_driven = present in (OperatingState.ENABLED, OperatingState.PAUSED)
-    published = telemetry(MEASUREMENT, StepState(1.0, SafetyState(present), first_estimate(MEASUREMENT, 47.5)))
-    assert bool(limits_held(StepState(1.0, SafetyState(present)), OUTPUT, PLAN)) == is_driven
+    published = telemetry(MEASUREMENT, SafetyState(present))
+    assert bool(limits_held(SafetyState(present), OUTPUT, PLAN)) == is_driven
     assert (published.governed_cf, published.setpoint_cf) == (1.4 if is_driven else None, 1.5)

@@ -30,8 +30,8 @@ from firmware_protocol.codec import (
     Switches,
     period,
 )
+from tormagd.assembly.journal import Journal
 from tormagd.config import Device
-from tormagd.control.journal import Journal
 from tormagd.hardware.backend import BackendError
 from tormagd.hardware.connection import FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S, Connection
 from tormagd.hardware.link import SILENT_S, LinkState

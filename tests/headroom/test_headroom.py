@@ -8,8 +8,8 @@ import pytest
 import uvloop
 
 from firmware_protocol.build import Build
+from tormagd.assembly.build import build_core
 from tormagd.config import Config, RealTime
-from tormagd.control.core import build_core
 from tormagd.headroom import __main__ as program, core_cost, machine_loop
 from tormagd.headroom.bare_timer import beat, lateness
 
@@ -42,10 +42,14 @@ def test_the_calls_are_those_of_the_closed_loop_and_can_be_made_again() -> None:
     made: Any = core_cost.calls(Config(), core, 0.05)
     steps, plans = made
     assert (len(steps), len(plans)) == (50, 50)
-    numbers = [plan().plan.number for plan in plans]
+    # each of these plans is the one that the next step was given in the loop
+    planned = [plan() for plan in plans]
+    assert planned[:-1] == [step.args[2] for step in steps[1:]]
+    numbers = [plan.number for plan in planned]
     assert numbers == list(range(numbers[0], numbers[0] + 50))
-    outputs = [step()[1] for step in steps]
-    assert outputs == [step()[1] for step in steps]
+    again, _ = core_cost.calls(Config(), core, 0.05)
+    outputs = [step() for step in steps]
+    assert outputs == [step() for step in again]
     assert any(output.left_duty != 0.0 for output in outputs)
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from tormagd.assembly.build import build_core, choose_solver
 from tormagd.config import Config
-from tormagd.control.core import build_core, choose_solver
 from tormagd.inverse.bracketed import BracketedSearch
 from tormagd.inverse.choice import RUNTIME_SOLVERS, build, named
 from tormagd.inverse.nearest import NearestFieldSearch
@@ -84,7 +84,7 @@ def test_a_scene_whose_search_cannot_be_is_refused(tmp_path: Path, table: str, w
 
 def test_what_trains_and_what_is_for_the_laboratory_stays_out_of_the_daemon() -> None:
     """torch takes seconds to load, and the searches that the daemon may run know nothing but a curve."""
-    loaded = "import sys, tormagd.control.core, tormagd.inverse.choice; print(*sys.modules)"
+    loaded = "import sys, tormagd.assembly.build, tormagd.inverse.choice; print(*sys.modules)"
     found = subprocess.run([sys.executable, "-c", loaded], check=True, capture_output=True, text=True).stdout.split()
     assert "tormagd.inverse.newton" in found
     assert not {"torch", "scipy", "sklearn", "matplotlib"} & set(found)

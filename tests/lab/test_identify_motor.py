@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
+from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config, load_config
-from tormagd.control.core import build_core
-from tormagd.control.governor import TimedSetpoint
+from tormagd.control.records import TimedSetpoint
 from tormagd.ctl.calibrate_motors import COLUMNS, excitation, motor_log
 from tormagd.ctl.calibrate_run import RATE_HZ, VALID_FOR_MS, Columns, Range
 from tormagd.lab.errors import LabError
@@ -85,13 +85,13 @@ def record(sample: str, seed: int = 1, rounds: int = 2) -> Columns:
     config = Config()
     core = build_core(config)
     device = VirtualDevice(load_plant(sample), SteadyHand(), seed=seed)
-    loop = ClosedLoop(config, core.stepper, core.planner, device)
+    loop = ClosedLoop(config, core.stepper(), core.planner(), device)
     loop.arm()
     for _ in loop.run(1.0):
         pass
     # the status of a daemon says the same: what this device gives with its gap open, as far as it has shown itself
-    least_N = loop.planner.believe.device.force_N(core.planner.portrait.least_N)
-    waveform = excitation(Range(least_N, min(core.planner.portrait.most_N, core.scene.force.most_N)), rounds)
+    least_N = loop.planner.believe.min_N
+    waveform = excitation(Range(least_N, min(core.portrait.max_N, core.scene.force.most_N)), rounds)
     start_s = loop.now_s
 
     def newest(now_s: float) -> TimedSetpoint:
@@ -100,7 +100,7 @@ def record(sample: str, seed: int = 1, rounds: int = 2) -> Columns:
 
     rows = []
     for sample_ in loop.run(waveform.duration_s, newest):
-        measured, estimate, reference = loop.measurement, sample_.state.estimate, sample_.state.reference
+        measured, estimate, reference = loop.measurement, sample_.measured, sample_.reference
         rows.append(
             (
                 measured.device_time_s,

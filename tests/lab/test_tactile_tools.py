@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from tormagd.assembly.build import build_core
 from tormagd.config import Config
-from tormagd.control.core import build_core
 from tormagd.lab.tactile import branches, shipped
 from tormagd.lab.tactile.models import QUICK
 from tormagd.model.model_file import save_model

@@ -1,6 +1,5 @@
 """What the replay's tests share: one core, and one flight that ended with a fault."""
 
-import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -9,12 +8,11 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from flight import Flight
+from flight import Flight, asked
 
-from tormagd.closed_loop import ClosedLoop, VirtualBus
+from tormagd.assembly.build import Core, build_core
+from tormagd.closed_loop import VirtualBus
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
-from tormagd.control.governor import TimedSetpoint
 from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.faults import parse_fault
@@ -22,12 +20,6 @@ from tormagd.simulation.hand import ReversingHand
 from tormagd.simulation.parameters import load_plant
 
 Fly = Callable[..., Flight]
-
-
-def asked(now_s: float) -> TimedSetpoint:
-    """A pulse at 250 Hz."""
-    stamp_s = math.floor(now_s * 250.0) / 250.0
-    return TimedSetpoint(1.3 + 0.3 * math.sin(math.tau * 1.2 * stamp_s), stamp_s, 0.1)
 
 
 @pytest.fixture(scope="session")
@@ -48,7 +40,7 @@ def fly(core: Core) -> Fly:
         config = config or Config()
         device = VirtualDevice(load_plant("sample_1"), ReversingHand(2.0), [parse_fault(it) for it in faults], 1)
         line = VirtualBus(CanDevice(device.messages)) if bus else device
-        flight = Flight(config, core, ClosedLoop(config, core.stepper, core.planner, line))
+        flight = Flight(config, core, line)
         flight.arm()
         while flight.loop.now_s < until_s:
             flight.tick(asked(flight.loop.now_s))

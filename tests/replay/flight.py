@@ -1,50 +1,66 @@
 """A run in virtual time with its black box: what the daemon does with its journal, done around the closed loop."""
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from mcap.reader import make_reader
 
-from tormagd.closed_loop import ClosedLoop, Sample
+from tormagd.assembly.build import Core
+from tormagd.assembly.journal import Journal, Packer
+from tormagd.closed_loop import ClosedLoop, Sample, VirtualBus
 from tormagd.config import Config
-from tormagd.control.core import Core
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.journal import Journal, Packer
+from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.black_box import header
+from tormagd.daemon.inbox import SetpointInbox
+from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.telemetry import tick_record
 from tormagd.keeping import Part
 from tormagd.recording.black_box import write_black_box
 from tormagd.recording.keeper import Ring
+from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import RefusedError
+from tormagd.simulation.device import VirtualDevice
 
 PART_TICKS, SNAPSHOT_TICKS = 20, 500
+NS = 1_000_000_000
+
+
+def asked(now_s: float) -> TimedSetpoint:
+    """A pulse at 250 Hz."""
+    stamp_s = math.floor(now_s * 250.0) / 250.0
+    return TimedSetpoint(1.3 + 0.3 * math.sin(math.tau * 1.2 * stamp_s), stamp_s, 0.1)
 
 
 class Flight:
-    """A closed loop that is written down."""
+    """A closed loop that is written down, and plans in the daemon's own loop."""
 
-    def __init__(self, config: Config, core: Core, loop: ClosedLoop) -> None:
-        self.config, self.core, self.loop = config, core, loop
+    def __init__(self, config: Config, core: Core, device: VirtualDevice | VirtualBus) -> None:
+        self.config, self.core, self.planner = config, core, core.planner()
         self.ring, self._journal, self._ticks = Ring(), Journal(), 0
         self._is_stepped = False
-        loop.connection.traffic = self
+        self.loop = ClosedLoop(config, core.stepper(), self.planner, device)
+        self.loop.connection.traffic = self
+        self._asked: TimedSetpoint | None = None
+        self._inbox = SetpointInbox()
+        endpoint: Any = SimpleNamespace(inbox=self._inbox, drain_setpoints=self._drain)
+        period_ns = NS // config.rates.inference_hz
+        self._inference = InferenceLoop(
+            self.planner, endpoint, period_ns, self._clock_ns, journal=self._journal, on_failure=self._fail
+        )
         self._remember()
 
     def tick(self, setpoint: TimedSetpoint | None = None) -> Sample:
         """One control period."""
-        before = self.loop.plan_state
         self._is_stepped = False
-        sample = self.loop.tick(setpoint)
+        sample = self.loop.tick(setpoint, self.planner.planned)
         self._stepped()
-        planned = self.loop.plan_state
-        if planned.plan is not before.plan:
-            self._journal.planned(sample.time_s, setpoint)
-            self._journal.foresaw()
-        record = tick_record(
-            sample.time_s, self.loop.step_state, sample.output, sample.plan, before.trim, sample.measurement, 0.0, 0.0
-        )
+        self._asked = setpoint
+        self._inference.after_tick(self.loop.stepper.measured)
+        record = tick_record(self.loop.stepper, sample.output, sample.plan, sample.measurement, 0.0, 0.0)
         self._journal.ticked(record)
         self._ticks += 1
         if self._ticks % PART_TICKS == 0:
@@ -74,8 +90,19 @@ class Flight:
         self._is_stepped = True
 
     def _remember(self) -> None:
-        assert self.loop.plan_state is not None
-        self._journal.snapshot(self.loop.step_state, self.loop.plan_state, self.loop.connection.memory())
+        self._journal.snapshot(self.loop.stepper, self.planner, self.loop.connection.memory())
+
+    def _drain(self) -> bool:
+        """Whether a setpoint has come."""
+        before, self._inbox.newest = self._inbox.newest, self._asked
+        return self._asked is not None and (before is None or self._asked.stamp_s > before.stamp_s)
+
+    def _clock_ns(self) -> int:
+        return round(self.loop.now_s * NS)
+
+    def _fail(self) -> None:
+        self._journal.latched(Fault.PLAN_FAILED)
+        self.loop.stepper.latch(Fault.PLAN_FAILED)
 
     def _packed(self) -> bytes:
         packer = Packer()

@@ -1,19 +1,21 @@
 """Values as plain data: back as they were, to the bit, in both builds; anything else is refused."""
 
+import ast
 import math
 import struct
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
+from flight import asked
 from hypothesis import given, settings, strategies as st
 
 from firmware_protocol.codec import SCHEMA_HASH, Identity, Switches
-from tormagd.control.device_fit import UNSEEN
-from tormagd.control.governor import GovernorState
-from tormagd.control.plan import NOTHING_SHOWN, Outside, Plan, PlanState
-from tormagd.control.remembered import Remembered
-from tormagd.control.step import StepState
+from tormagd.assembly.build import Core
+from tormagd.control.believe.believe import NOTHING_LEARNED
+from tormagd.control.believe.strength import UNSEEN
+from tormagd.control.records import Outside
 from tormagd.exact import InexactError, first_difference, kinds, packed, plain, restore, restored
 from tormagd.hardware.link import DeviceLink
 from tormagd.hardware.link_statistics import RoundTrip
@@ -23,7 +25,7 @@ from tormagd.replay.rerun import KNOWN
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import SafetyState
 
-PLAN = Plan(1, 0.5, 3.5, 0.001, 3.5, None, 180.0, 78.0, 0.0, 1.0, (Limit.F_MIN,))
+ROOT = Path(__file__).parents[2]
 FLOATS = st.one_of(st.floats(), st.sampled_from([-0.0, math.nan, -math.inf, 5e-324]))
 LEAVES = st.one_of(FLOATS, st.integers(-(2**63), 2**64 - 1), st.booleans(), st.none(), st.text(), st.binary())
 LEAVES |= st.sampled_from([Limit.RATE, Fault.SKEW, Switches.HOMED | Switches.LEFT_OPEN])
@@ -43,12 +45,6 @@ def through_msgpack(thing: object) -> Any:
     return restored(msgspec.msgpack.decode(packed(plain(thing))), {**KNOWN, **kinds(Switches)})
 
 
-def test_what_an_element_remembers_comes_back() -> None:
-    remembered = Remembered(400.0, 1.5, (3.5, 0.25), (0.5, 0.125), 0.0625, 1.0)
-    state = PlanState(GovernorState(1.0, 2.0), PLAN, remembered=remembered)
-    assert through_msgpack(state) == state
-
-
 @settings(max_examples=25)
 @given(THINGS)
 def test_what_comes_back_is_what_went(thing: object) -> None:
@@ -66,13 +62,14 @@ def test_floats_keep_their_bits() -> None:
 
 def test_sentinels_come_back_equal() -> None:
     """Nothing in the core asks which of two equal ones it is; replays from snapshots show it."""
-    assert through_msgpack(NOTHING_SHOWN) == NOTHING_SHOWN
+    assert through_msgpack(NOTHING_LEARNED) == NOTHING_LEARNED
     assert through_msgpack(UNSEEN) == UNSEEN
 
 
-def test_differences_have_a_name() -> None:
-    one = StepState(1.0, SafetyState(faults=(Fault.SKEW,)))
-    other = one.replaced(safety=one.safety.replaced(request_number=7))
+def test_differences_have_a_name(core: Core) -> None:
+    one, other = core.stepper(), core.stepper()
+    one.safety = SafetyState(faults=(Fault.SKEW,))
+    other.safety = one.safety.replaced(request_number=7)
     assert first_difference(plain(one), plain(other)) == ("safety.request_number", 0, 7)
     assert first_difference(plain((1.0, 2.0)), plain((1.0, 2.0, 3.0))) == ("length", 2, 3)
     assert first_difference(plain(0.0), plain(-0.0)) == ("", 0.0, -0.0)
@@ -113,6 +110,49 @@ def test_what_changes_in_place_is_given_what_another_remembered() -> None:
     assert (other.state, other.identity) == (one.state, one.identity)
     other.round_trip.drive(4, 2.5)
     assert first_difference(plain(one), plain(other)) == ("round_trip._newest", 3, 4)
+
+
+def test_stages_in_the_middle_of_a_run_go_on_in_others_to_the_bit(fly: Any, core: Core) -> None:
+    """What was written down of them is all that they are, and neither has anything in common with the other."""
+    flight = fly(until_s=6.0)
+    loop, planner = flight.loop, flight.planner
+    stepper_again, planner_again = core.stepper(), core.planner()
+    for own, new in ((loop.stepper, stepper_again), (planner, planner_again)):
+        restore(new, msgspec.msgpack.decode(packed(plain(own))), KNOWN)
+        assert first_difference(plain(own), plain(new)) is None
+    assert planner.governor.forecast.trust > 0.0
+    for tick in range(400):
+        planned, setpoint = planner.planned, asked(loop.now_s)
+        sample = loop.tick(setpoint)
+        assert stepper_again.step(sample.time_s, sample.measurement, planner_again.planned) == sample.output
+        if planner.planned is not planned:
+            assert planner_again.plan(sample.time_s, setpoint, stepper_again.measured) == planner.planned
+            planner_again.foresee()
+        if tick % 50 == 0:
+            assert first_difference(plain(loop.stepper), plain(stepper_again)) is None
+            assert first_difference(plain(planner), plain(planner_again)) is None
+
+
+def test_what_changes_in_a_stage_is_a_field_of_its_class() -> None:
+    """So it is written down; whatever else there is, is final."""
+    for path in (ROOT / "tormagd" / "control").rglob("*.py"):
+        for kind in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(kind, ast.ClassDef):
+                named = [ast.unparse(it.target) for it in kind.body if isinstance(it, ast.AnnAssign)]
+                inside = [it for method in kind.body if isinstance(method, ast.FunctionDef) for it in ast.walk(method)]
+                final = [ast.unparse(it.target) for it in inside if isinstance(it, ast.AnnAssign)]
+                attributes = [it for it in inside if isinstance(it, ast.Attribute) and isinstance(it.ctx, ast.Store)]
+                own = {ast.unparse(it) for it in attributes if isinstance(it.value, ast.Name) and it.value.id == "self"}
+                public = {f"self.{name}" for name in named if not name.startswith("_")}
+                assert own - {*final} <= public, f"{path}: {kind.name}"
+
+
+@pytest.mark.parametrize("change", [{"time_s": None}, {"unheard": 1.0}, {"safety": {"Unheard": {}}}, {"homing": 1.0}])
+def test_a_stage_takes_its_own_fields_and_no_others(core: Core, change: dict[str, Any]) -> None:
+    fields = plain(core.stepper())["Stepper"] | change
+    told = {name: field for name, field in fields.items() if field is not None or name not in change}
+    with pytest.raises(InexactError):
+        restore(core.stepper(), {"Stepper": told}, KNOWN)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 
 from firmware_protocol.codec import FUNCTION, Drive, Home, State, can_identifier, decode
 from firmware_protocol.framing import FrameDecoder
-from tormagd.control.core import Core
+from tormagd.assembly.build import Core
 from tormagd.recording.black_box import BlackBoxFile, read_black_box
 from tormagd.replay.rerun import Rerun, rerun, ticks_of
 from tormagd.safety.codes import Fault

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 import random
 import struct
@@ -12,13 +13,14 @@ from typing import Any
 
 import msgspec
 import pytest
-from flight import Flight, frames, planted
+from flight import Flight, asked, frames, planted
 from mcap.writer import Writer
 
 from firmware_protocol.build import SWITCH, settle
+from tormagd import __version__
+from tormagd.assembly.build import Core
+from tormagd.assembly.journal import MISSING
 from tormagd.config import Config
-from tormagd.control.core import Core
-from tormagd.control.journal import MISSING
 from tormagd.keeping import Part
 from tormagd.recording.black_box import BlackBoxFile, read_black_box, write_black_box
 from tormagd.recording.reader import RecordingError, read_recording
@@ -31,6 +33,10 @@ COLUMNS = TickRecord.__struct_fields__
 CHANGED_TICK = 3_210
 TICKS = 4_000
 ROOT = Path(__file__).parents[2]
+FORMER = (
+    f"format = '3', written by tormagd {__version__!r}: allowed is 4, which tormagd {__version__} writes; "
+    "replay it with the version that wrote it"
+)
 NO_TICKS = [Part(0.0, 1, msgspec.msgpack.encode(["step"]))]
 
 
@@ -86,7 +92,7 @@ def test_black_boxes_of_planted_faults_replay(fly: Any, core: Core, tmp_path: Pa
 
 
 def test_the_other_build_replays_it_to_the_bit(path: Path) -> None:
-    """This process wrote it."""
+    """This process wrote it. The other names the same fields of every stage, or it would refuse the snapshots."""
     switch = "0" if settle().is_compiled else "1"
     command = [sys.executable, "-P", "-m", "tormagd.replay", str(path), "--from", "3"]
     environment = os.environ | {SWITCH: switch, "PYTHONPATH": str(ROOT)}
@@ -103,6 +109,29 @@ def test_a_black_box_is_drawn_like_a_recording(path: Path) -> None:
     assert recording.ticks.t_ns.size == TICKS
     assert recording.ticks.words["faults"][-1] == ("ENCODER",)
     assert set(recording.ticks.numbers) | set(recording.ticks.words) == set(COLUMNS)
+
+
+def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, core: Core, tmp_path: Path) -> None:
+    """It may have failed half way: that it was tried comes first, and then that planning began afresh."""
+    flight = fly(until_s=3.1)
+    number = flight.planner.planned.number
+    flight.tick(asked(flight.loop.now_s).replaced(force_N=math.nan))
+    assert flight.loop.stepper.safety.faults == (Fault.PLAN_FAILED,)
+    assert flight.planner.planned.number == number + 1
+    for _ in range(499):
+        flight.tick(asked(flight.loop.now_s))
+    box = read_black_box(flight.write(tmp_path / "failed.mcap"))
+    (place,) = [place for place, entry in enumerate(box.entries) if entry[0] == "afresh"]
+    tried, latched, afresh = box.entries[place - 2 : place + 1]
+    assert (tried[0], tried[1], latched) == ("plan", afresh[1], ["latch", "PLAN_FAILED"])
+    assert math.isnan(tried[2][0])
+    done = again(core, box)
+    assert (done.difference, done.ticks, done.snapshots) == (None, 3_600, 7)
+    # a plan that fails here alone is no such plan
+    entries = [*box.entries[: place - 1], *box.entries[place + 1 :]]
+    found = again(core, msgspec.structs.replace(box, entries=entries), 3.0).difference
+    assert (found.tick, found.field, found.recorded) == (3_101, "plan", "made")
+    assert found.replayed == "failed: force_N = nan is not allowed: a finite number within +-1e+09"
 
 
 def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxFile) -> None:
@@ -157,10 +186,10 @@ def test_a_state_that_differs_is_found_where_no_tick_shows_it(core: Core, box: B
     entries = [*box.entries]
     place = [p for p, it in enumerate(entries) if it[0] == "state"][4]
     state = msgspec.msgpack.decode(msgspec.msgpack.encode(entries[place]))
-    state[1]["StepState"]["estimate"]["Estimate"]["handle"]["Handle"]["sliding_mm_s"] += 1e-12
+    state[1]["Stepper"]["measure"]["Measure"]["measured"]["Measured"]["handle"]["Handle"]["sliding_mm_s"] += 1e-12
     entries[place] = state
     found = rerun(core, COLUMNS, entries, 1.5).difference
-    assert found.field == "state.step.estimate.handle.sliding_mm_s"
+    assert found.field == "state.step.measure.measured.handle.sliding_mm_s"
 
 
 def test_another_limit_gives_another_first_tick(box: BlackBoxFile, path: Path) -> None:
@@ -238,7 +267,7 @@ def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Pa
         writer.finish()
     assert "allowed is msgpack" in refusal(other)
     changes = {
-        "format": ("2", "format = '2'"),
+        "format": ("3", FORMER),
         "config": ('{"scene": "pulse"}', "config: its hash"),
         "model_sha256": ("f" * 64, "the model with the hash 'ffffffffffff'"),
         "columns": (json.dumps(["t_ns"]), "no column 'monotonic_s'"),
@@ -258,19 +287,9 @@ def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Pa
 def test_no_entries_break_it(core: Core, box: BlackBoxFile) -> None:
     """Anything at all in the place of an entry, or of a value in one, is found, passed over or refused."""
     rng = random.Random(5)
-    rubbish: list[Any] = [
-        None,
-        -1,
-        2**63,
-        "x",
-        [],
-        {},
-        [[]],
-        ["plan"],
-        ["state", 1, 2],
-        ["command", "stop", 1.0, False],
-    ]
-    rubbish += [["latch", "SKEWED"], ["teach", {"Shown": {}}], ["afresh", "now"], ["unheard"], float("nan"), [1], b"\0"]
+    rubbish: list[Any] = [None, -1, 2**63, "x", float("nan"), b"\0", {}, [], [[]], [1], ["plan"], ["unheard"]]
+    rubbish += [["state", 1, 2], ["command", "stop", 1.0, False], ["latch", "SKEWED"], ["afresh", "now"]]
+    rubbish += [["teach", {"Learned": {}}], ["teach", {"Limit": "RATE"}]]
     first = list(ticks_of(COLUMNS, box.entries))[60]
     head = box.entries[: first + 1]
     for _ in range(100):

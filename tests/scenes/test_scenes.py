@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from tormagd.assembly.build import at_rates_of, build_core
 from tormagd.config import Config, Rates
-from tormagd.control.core import at_rates_of, build_core
 from tormagd.scenes.scene import EVERY_TERM, Scene, Terms, load_scene, scene_path, shipped_scenes
 from tormagd_client.endpoints import ConfigError
 
@@ -58,10 +58,10 @@ def test_a_shipped_scene_gives_a_core_that_can_render_it(name: str) -> None:
     assert core.scene == load_scene(name)
     assert core.scene.name == name
     assert core.scene.description.endswith(".")
-    portrait = core.planner.portrait
-    assert portrait.least_N < core.scene.force.most_N
+    portrait = core.portrait
+    assert portrait.min_N < core.scene.force.most_N
     # a scene may like less than the device's least force, but nothing above its greatest
-    assert portrait.most_N >= core.scene.force.most_N
+    assert portrait.max_N >= core.scene.force.most_N
     assert core.margins.phase_margin_deg >= 45.0
     assert core.margins.gain_margin_dB >= 6.0
 

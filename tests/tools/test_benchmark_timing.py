@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from benchmarks import latency, loop, virtual_time
 
+from tormagd.assembly.build import build_core
 from tormagd.config import RealTime, load_config
-from tormagd.control.core import build_core
 from tormagd.hardware.backend import choose
 from tormagd.hardware.serial_backend import SerialOptions
 from tormagd.lab.told import lines

@@ -13,8 +13,8 @@ from endurance.walk import ALLOWED, DRIVEN, BrokenRuleError, Walk
 
 from firmware_protocol.codec import decode as decoded, encode
 from firmware_protocol.framing import Frame, FrameDecoder, FramingStatistics, encode_frame
+from tormagd.assembly.build import build_core
 from tormagd.config import Config
-from tormagd.control.core import build_core
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.safety.operating_state import COMMANDS, Event, OperatingState
 from tormagd_client.messages import MessageError, Request, decode

@@ -1,0 +1,12 @@
+"""What the daemon's tests share: one core."""
+
+import pytest
+
+from tormagd.assembly.build import Core, build_core
+from tormagd.config import Config
+
+
+@pytest.fixture(scope="session")
+def core() -> Core:
+    """Of the shipped coronary scene. Nothing in it changes."""
+    return build_core(Config())
