@@ -22,12 +22,10 @@ from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingS
 from tormagd.scenes.scene import Scene
 
 MeasurementMaker = Callable[..., Measurement]
-PERIOD_S = 1e-3
+PERIOD_S, PLAN_PERIOD_S = 1e-3, 4e-3
 READY = Conditions(
     connected=True, fresh=True, homed=True, busy=False, device_latched=False, requested_N=None, neutral_N=0.5
 )
-PLAN_PERIOD_S = 0.004
-"Between plans."
 
 
 @pytest.fixture(scope="session")
@@ -52,21 +50,11 @@ def forgetful(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
-def make_core(config: Config) -> Callable[[], Core]:
-    """Makes cores of the shipped coronary scene, with such a model."""
-
-    def make() -> Core:
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(LOADED, load_forgetful)
-            return build_core(config)
-
-    return make
-
-
-@pytest.fixture(scope="session")
-def core(make_core: Callable[[], Core]) -> Core:
-    """Such a core, in which nothing changes."""
-    return make_core()
+def core(config: Config) -> Core:
+    """Of the shipped coronary scene, with such a model."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(LOADED, load_forgetful)
+        return build_core(config)
 
 
 @pytest.fixture(scope="session")
@@ -198,18 +186,6 @@ def make_bench(core: Core, measure: MeasurementMaker) -> Callable[..., Bench]:
     return make
 
 
-@pytest.fixture(scope="session")
-def moving() -> Callable[..., Measured]:
-    """A homed device whose handle has long moved, which gives what the shipped model says. Its Sense never ages."""
-
-    def make(gap_mm: float = 78.1, force_N: float = 1.0871, **changes: object) -> Measured:
-        half_mm, handle = gap_mm / 2.0, Handle(MOBILISED_MM, 42.0, Turn(1.0, 0.0, 100.0), 42.0)
-        measured = Measured(1, True, 0.0, half_mm, half_mm, 0.0, 0.0, force_N, handle, 100.0, math.inf, 0.0)
-        return measured.replaced(**changes)
-
-    return make
-
-
 @pytest.fixture
 def bench(make_bench: Callable[..., Bench]) -> Bench:
     return make_bench()
@@ -221,6 +197,18 @@ def running(bench: Bench) -> Bench:
     bench.enabled().step(count=3)
     assert bench.stepper.safety.operating_state is OperatingState.ENABLED
     return bench
+
+
+@pytest.fixture(scope="session")
+def moving() -> Callable[..., Measured]:
+    """A homed device whose handle has long moved, which gives what the shipped model says. Its Sense never ages."""
+
+    def make(gap_mm: float = 78.1, force_N: float = 1.0871, **changes: object) -> Measured:
+        half_mm, handle = gap_mm / 2.0, Handle(MOBILISED_MM, 42.0, Turn(1.0, 0.0, 100.0), 42.0)
+        measured = Measured(1, True, 0.0, half_mm, half_mm, 0.0, 0.0, force_N, handle, 100.0, math.inf, 0.0)
+        return measured.replaced(**changes)
+
+    return make
 
 
 @pytest.fixture(scope="session")

@@ -1,13 +1,12 @@
 """Every term can be left out, which is decided at construction, and then it is not there: not learned, not used."""
 
 import math
-from collections.abc import Callable
 
 import msgspec
 import pytest
 
 from tormagd.assembly.build import Core, build_core
-from tormagd.config import Config, Motor
+from tormagd.config import Config
 from tormagd.control.ask.forecast import Forecast
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.slow_friction import SlowFriction
@@ -15,27 +14,22 @@ from tormagd.control.believe.strength import UNSEEN
 from tormagd.control.core import Planner
 from tormagd.control.records import Handle, Plan, TimedSetpoint
 from tormagd.exact import plain
-from tormagd.hardware.measurement import Measurement
 from tormagd.model.displacement import MOBILISED_MM, Turn
 from tormagd.safety.codes import Limit
-from tormagd.safety.operating_state import Conditions
-from tormagd.scenes.scene import EVERY_TERM, TERMS, Terms, load_scene
+from tormagd.scenes.scene import EVERY_TERM, TERMS, Scene, Terms, load_scene
 
 pytestmark = pytest.mark.usefixtures("forgetful")
 
-CONFIG = Config()
 PERIOD_S = 0.004
-READY = Conditions(
-    connected=True, fresh=True, homed=True, busy=False, device_latched=False, requested_N=None, neutral_N=0.5
-)
 
 
-def core_with(terms: Terms, config: Config = CONFIG) -> Core:
-    return build_core(config, msgspec.structs.replace(load_scene("coronary"), terms=terms))
+def scene_without(*names: str, learning: bool = True) -> Scene:
+    terms = msgspec.structs.replace(EVERY_TERM.without(*names), learning=learning)
+    return msgspec.structs.replace(load_scene("coronary"), terms=terms)
 
 
-def core_without(*names: str) -> Core:
-    return core_with(EVERY_TERM.without(*names))
+def core_without(*names: str, learning: bool = True) -> Core:
+    return build_core(Config(), scene_without(*names, learning=learning))
 
 
 @pytest.fixture(scope="session")
@@ -170,41 +164,32 @@ def test_without_the_lag_what_is_known_of_it_is_not_looked_at(told) -> None:
     assert gap_mm(core_without("lag"), 0.02) == gap_mm(core_without("lag"), 0.0)
 
 
-def duties(core: Core, measure: Callable[..., Measurement], target_mm: float) -> list[float]:
+@pytest.fixture
+def duties(make_bench):
     """The first duties of an armed device on its way from 80 mm; it has not moved yet, so nearly all is fed forward."""
-    stepper, found = core.stepper(), []
-    for tick in range(1, 7):
-        plan = Plan(1, tick * 1e-3, None, None, 0.0, None, 0.0, target_mm, 0.0, 1.0, ())
-        duty = stepper.step(tick * 1e-3, measure(tick), plan)
-        if tick == 2:
-            stepper.command("enable", tick * 1e-3, READY)
-        if tick > 3:
-            found.append(duty.left_duty)
-    return found
+
+    def first(target_mm: float, *left_out: str, **motor: float) -> list[float]:
+        bench = make_bench(scene_without(*left_out), motor=motor).enabled()
+        return [bench.step(target_mm).left_duty for _ in range(3)]
+
+    return first
 
 
-def test_without_the_motor_nothing_is_fed_forward(measure) -> None:
+def test_without_the_motor_nothing_is_fed_forward(duties) -> None:
     for target_mm in (90.0, 60.0):
-        full, left = (duties(core_without(*names), measure, target_mm) for names in ((), ("motor",)))
+        full, left = duties(target_mm), duties(target_mm, "motor")
         assert abs(left[0]) < 0.1 * abs(full[0])
         assert all(abs(duty) < abs(whole) for duty, whole in zip(left, full, strict=True))
 
 
-def test_dry_friction_counts_both_ways_and_the_magnets_pull_where_it_opens(measure) -> None:
+def test_dry_friction_counts_both_ways_and_the_magnets_pull_where_it_opens(duties) -> None:
     for target_mm, is_opening in ((90.0, True), (60.0, False)):
-        full = duties(core_without(), measure, target_mm)
-        smooth = duties(core_with(EVERY_TERM, Config(motor=Motor(coulomb_V=0.0))), measure, target_mm)
+        full, smooth, free = duties(target_mm), duties(target_mm, coulomb_V=0.0), duties(target_mm, pull_V=0.0)
         assert all(abs(duty) < abs(whole) for duty, whole in zip(smooth, full, strict=True))
-        free = duties(core_with(EVERY_TERM, Config(motor=Motor(pull_V=0.0))), measure, target_mm)
         assert all((whole > duty) is is_opening for duty, whole in zip(free, full, strict=True))
         assert is_opening or free == full
 
 
-def test_learning_can_be_stopped_for_a_measurement(after, told) -> None:
-    learned = after(core_without(), 100).believe.learned()
-    frozen = core_with(Terms(learning=False)).planner()
-    frozen.teach(learned)
-    for _ in range(50):
-        told(frozen, 1.4)
-    assert frozen.believe.learned() == learned
-    assert frozen.believe.read == 49
+def test_learning_can_be_stopped_for_a_measurement() -> None:
+    assert core_without().planner().believe.learns
+    assert not core_without(learning=False).planner().believe.learns

@@ -197,14 +197,17 @@ def test_a_publisher_that_comes_back_is_followed_again_without_a_slope_from_befo
     assert np.all(path_N(ask) == 1.5)
 
 
-def test_a_slope_is_learned_and_carried_ahead() -> None:
+@pytest.mark.parametrize("lag_s", [0.0, 0.02])
+def test_a_slope_is_learned_and_carried_ahead(lag_s: float) -> None:
+    """However late the carriages are: a lag is made up for as far as it is known what comes."""
     following, ask = stream_of(RAMP_N)
     assert following.slope_N_s == pytest.approx(1.0, rel=1e-3)
     assert path_N(ask) == pytest.approx(1.39 + AFTER_S, abs=1e-3)
     for waited_s, ahead_N in ((0.0, 1.39), (0.01, 1.40), (AHEAD_S, 1.44), (0.09, 1.44)):
-        later = decide(following, 0.4 + waited_s, TimedSetpoint(1.39, 0.4, VALID_S))
+        later = decide(following, 0.4 + waited_s, TimedSetpoint(1.39, 0.4, VALID_S), lag_s)
         assert path_N(later)[0] == pytest.approx(ahead_N, abs=1e-3)
         assert later.force_N == pytest.approx(1.39)
+        assert later.foresight == 0.0
 
 
 @settings(max_examples=100, deadline=None)
@@ -246,14 +249,17 @@ def test_a_clock_that_stands_still_or_goes_back_lets_nothing_jump(now_s: float) 
     assert decide(governor(1.0, 1.5), now_s, None).force_N == 1.5
 
 
+def at(force_N: Callable[[float], float], now_s: float, ahead_s: float = 0.0) -> TimedSetpoint:
+    """The setpoint of a force, which carries what follows for so long."""
+    ahead_N = tuple(force_N(now_s + 0.002 * place) for place in range(1, round(500 * ahead_s) + 1))
+    return TimedSetpoint(force_N(now_s), now_s, VALID_S, preview_N=ahead_N, preview_dt_s=0.002)
+
+
 def told(force_N: Callable[[float], float], seconds: float, *, ahead_s: float = 0.4, lag_s: float = 0.0) -> Ask:
     """The last decision on setpoints that carry what follows, 500 times a second from 0 s on."""
     following = governor(0.0, force_N(0.0))
     for tick in range(1, round(500 * seconds) + 1):
-        now_s = tick / 500
-        ahead_N = tuple(force_N(now_s + 0.002 * place) for place in range(1, round(500 * ahead_s) + 1))
-        setpoint = TimedSetpoint(force_N(now_s), now_s, VALID_S, preview_N=ahead_N, preview_dt_s=0.002)
-        ask = decide(following, now_s, setpoint, lag_s)
+        ask = decide(following, tick / 500, at(force_N, tick / 500, ahead_s), lag_s)
     return ask
 
 
@@ -341,15 +347,11 @@ def beats_N(time_s: float) -> float:
     return 1.4 + 0.15 * math.sin(phase) + 0.08 * math.sin(2.0 * phase + 1.0) + 0.04 * math.sin(3.0 * phase)
 
 
-def beat(time_s: float) -> TimedSetpoint:
-    return TimedSetpoint(beats_N(time_s), time_s, VALID_S)
-
-
 def beaten(seconds: float, **keywords: Any) -> Governor:
     """A governor after so much of the pulse, 500 times a second, without a preview."""
     following = governor(**keywords)
     for tick in range(1, round(500 * seconds) + 1):
-        decide(following, tick / 500, beat(tick / 500))
+        decide(following, tick / 500, at(beats_N, tick / 500))
         following.foresee()
     return following
 
@@ -375,7 +377,10 @@ def test_a_force_that_repeats_itself_is_foreseen(lag_s: float, share: float) -> 
     blind = beaten(10.0, gap_speed_mm_s=swift_mm_s, terms=EVERY_TERM.without("forecast"))
     for tick in range(5_001, 5_501):
         now_s = tick / 500
-        ask, extrapolated = decide(following, now_s, beat(now_s), lag_s), decide(blind, now_s, beat(now_s))
+        ask, extrapolated = (
+            decide(following, now_s, at(beats_N, now_s), lag_s),
+            decide(blind, now_s, at(beats_N, now_s)),
+        )
         following.foresee()
         assert ask.foresight > 0.9
         assert ask.limits == ()
@@ -394,7 +399,7 @@ def test_of_what_is_foreseen_a_slow_gap_makes_the_best(learned: Governor) -> Non
     for tick in range(5_001, 5_956):
         now_s = tick / 500
         learned.foresee()
-        ask = decide(learned, now_s, beat(now_s))
+        ask = decide(learned, now_s, at(beats_N, now_s))
         assert np.all(np.abs(np.diff(path_N(ask))) <= fastest_N_s * np.diff(PATH_S) + 0.01)
         assert ask.force_N == pytest.approx(beats_N(now_s))
         step_N = fastest_N_s / 500
@@ -404,17 +409,10 @@ def test_of_what_is_foreseen_a_slow_gap_makes_the_best(learned: Governor) -> Non
     assert np.std(missed_N) < 0.8 * np.std(followed_N)
 
 
-def test_a_lag_is_made_up_for_as_far_as_it_is_known_what_comes() -> None:
-    following, _ = stream_of(RAMP_N)
-    extrapolated = decide(following, 0.4, TimedSetpoint(1.39, 0.4, VALID_S), 0.02)
-    assert extrapolated.foresight == 0.0
-    assert path_N(extrapolated)[0] == pytest.approx(1.39)
-
-
 def test_no_forecast_holds_a_force_of_a_stale_setpoint(learned: Governor) -> None:
     for tick in range(1, 1_000):
         now_s = 10.0 + tick * 1e-3
-        ask = decide(learned, now_s, beat(10.0))
+        ask = decide(learned, now_s, at(beats_N, 10.0))
         if now_s - 10.0 <= VALID_S:
             continue
         assert ask.limits == (Limit.STALE,)
@@ -446,8 +444,7 @@ def test_past_its_end_a_short_preview_of_what_repeats_itself_is_foreseen() -> No
         following = governor(0.0, beats_N(0.0), terms=Terms(forecast=is_foreseen))
         for tick in range(1, 5_000):
             now_s = tick * 2e-3
-            ahead_N = tuple(beats_N(now_s + 2e-3 * step) for step in range(1, 21))
-            setpoint = TimedSetpoint(beats_N(now_s), now_s, VALID_S, preview_N=ahead_N, preview_dt_s=2e-3)
+            setpoint = at(beats_N, now_s, 0.04)
             following.foresee()
             decide(following, now_s, setpoint)
             if now_s > 6.0:

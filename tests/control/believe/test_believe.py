@@ -168,9 +168,10 @@ def swing(core, moving):
     """A planner after a swing that the gap follows that much too late, and a handle that rests: it teaches nothing."""
     gap_mm_at = core.portrait.gap_mm_at
 
-    def swung(late_s: float, *, is_known: bool, seconds: float = 10.0) -> Planner:
+    def swung(late_s: float, *, is_known: bool, seconds: float = 10.0, learns: bool = True) -> Planner:
         # late carriages are only sent along swings that they can follow
         planner, swings_Hz = core.planner(), 1.0 if is_known else 2.0
+        planner.believe.learns = learns
 
         def force_N(time_s: float) -> float:
             return 1.5 + 0.1 * math.sin(2.0 * math.pi * swings_Hz * time_s)
@@ -194,6 +195,7 @@ def swing(core, moving):
 def test_a_lag_is_learned_where_what_comes_is_known(swing, late_s: float, learned_s: float) -> None:
     """And half a plan's period besides: by so much the governor's gap goes before what is previewed."""
     assert swing(late_s, is_known=True).believe.carriages.lag_s == pytest.approx(learned_s, abs=1e-3)
+    assert swing(late_s, is_known=True, seconds=1.0, learns=False).believe.carriages.lag_s == 0.0
 
 
 def test_without_a_preview_a_lag_is_learned_once_the_swing_is_foreseen(swing) -> None:
@@ -204,26 +206,13 @@ def test_without_a_preview_a_lag_is_learned_once_the_swing_is_foreseen(swing) ->
     assert late.believe.carriages.lag_s == pytest.approx(0.015, abs=2e-3)
 
 
-def test_a_gap_on_its_way_after_a_jump_is_not_late(planner, moving) -> None:
-    planner.governor.asked_N = 1.5
-    travelling = moving(85.0, left_mm_s=-15.0, right_mm_s=-15.0, **RESTING)
-    for tick in range(1, 500):
-        now_s = tick * PERIOD_S
-        planner.plan(now_s, TimedSetpoint(1.5, now_s, 0.1, preview_N=(1.5,) * 40, preview_dt_s=2e-3), travelling)
-    assert planner.believe.carriages.lag_s == 0.0
-
-
-def test_what_is_forgotten_and_what_is_taught(planner, hear, moving) -> None:
-    """The element has been through what it has been through, whatever is known of the device."""
-    hear(planner, 1.0, moving(force_N=1.2))
-    memory, learned = plain(planner.believe.memory), planner.believe.learned()
-    number = planner.planned.number
-    planner.afresh(3.0)
-    assert planner.believe.learned() == NOTHING_LEARNED != learned
-    assert plain(planner.believe.memory) == memory
-    assert (planner.planned.number, planner.planned.gap_mm, planner.planned.time_s) == (number + 1, 95.0, 3.0)
+def test_what_is_taught_is_known_until_it_begins_afresh(planner) -> None:
+    learned = Learned(DeviceFit(1.1, 0.02, 1e-4), 1.05, 0.5, 0.01, 0.02)
     planner.teach(learned)
     assert planner.believe.learned() == learned
+    planner.afresh(3.0)
+    assert planner.believe.learned() == NOTHING_LEARNED
+    assert (planner.planned.number, planner.planned.gap_mm, planner.planned.time_s) == (1, 95.0, 3.0)
 
 
 def test_a_replay_and_what_is_read_back_plan_the_same(core, swing, planned, moving) -> None:

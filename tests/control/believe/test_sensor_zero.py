@@ -19,32 +19,23 @@ from tormagd.control.believe.sensor_zero import (
 PERIOD_S = 0.004
 
 
-@pytest.fixture
-def zero() -> SensorZero:
-    """Of a sensor that is taken for tared."""
-    return SensorZero()
-
-
-@pytest.fixture
-def doubted() -> SensorZero:
-    """Of one that is not."""
-    zero = SensorZero()
-    zero.doubt()
-    return zero
-
-
 def strokes(
-    zero: SensorZero,
     off_N: float,
+    zero: SensorZero | None = None,
     *,
+    is_tared: bool = True,
     number: int = 6,
     stroke_s: float = 0.5,
     rest_s: float = 0.2,
     scale: float = 1.0,
     from_s: float = 0.0,
     model_N: tuple[float, float] = (1.5, 1.5),
-) -> float:
-    """Strokes to and fro of a handle on a device whose sensor is off by that, with noise; until when."""
+) -> tuple[SensorZero, float]:
+    """After strokes to and fro of a handle on a device whose sensor is off by that, with noise; and when. Without
+    `is_tared` the sensor is not taken for tared."""
+    zero = zero or SensorZero()
+    if not is_tared:
+        zero.doubt()
     random, now_s = np.random.default_rng(2), from_s
     for stroke in range(number):
         direction = -1.0 if stroke % 2 else 1.0
@@ -55,59 +46,59 @@ def strokes(
             zero.begin(now_s)
             zero.update(now_s, direction, reading_N, force_N, 42.0, PERIOD_S, scale, 0.02)
         now_s += rest_s
-    return now_s
+    return zero, now_s
 
 
 @pytest.mark.parametrize("off_N", [0.0, 0.05, -0.1, 0.3])
 @pytest.mark.parametrize("scale", [0.7, 1.0, 1.4])
-def test_a_few_reversals_tell_the_zero_whatever_the_device(zero: SensorZero, off_N: float, scale: float) -> None:
-    now_s = strokes(zero, off_N, number=20, scale=scale)
+def test_a_few_reversals_tell_the_zero_whatever_the_device(off_N: float, scale: float) -> None:
+    zero, now_s = strokes(off_N, number=20, scale=scale)
     assert zero.zero_N == pytest.approx(off_N, abs=0.015 + 0.1 * abs(off_N))
     assert zero.sd_N(now_s) < TARED_SD_N
 
 
-def test_one_reversal_is_enough_where_the_sensor_is_not_taken_for_tared(doubted: SensorZero) -> None:
-    now_s = strokes(doubted, 0.3, number=2)
-    assert doubted.zero_N == pytest.approx(0.3, abs=0.01)
-    assert doubted.sd_N(now_s) < 0.03
+def test_one_reversal_is_enough_where_the_sensor_is_not_taken_for_tared() -> None:
+    zero, now_s = strokes(0.3, is_tared=False, number=2)
+    assert zero.zero_N == pytest.approx(0.3, abs=0.01)
+    assert zero.sd_N(now_s) < 0.03
 
 
-def test_the_force_may_be_another_after_the_reversal(doubted: SensorZero) -> None:
-    strokes(doubted, 0.1, number=2, scale=1.2, model_N=(0.8, 1.9))
-    assert doubted.zero_N == pytest.approx(0.1, abs=0.01)
+def test_the_force_may_be_another_after_the_reversal() -> None:
+    zero, _ = strokes(0.1, is_tared=False, number=2, scale=1.2, model_N=(0.8, 1.9))
+    assert zero.zero_N == pytest.approx(0.1, abs=0.01)
 
 
-def test_without_a_reversal_nothing_is_told_and_less_and_less_is_known(zero: SensorZero) -> None:
-    now_s = strokes(zero, 0.1, number=1)
+def test_without_a_reversal_nothing_is_told_and_less_and_less_is_known() -> None:
+    zero, now_s = strokes(0.1, number=1)
     assert zero.zero_N == 0.0
     assert zero.sd_N(now_s + 300.0) < UNKNOWN_SD_N < zero.sd_N(now_s + 700.0)
     assert zero.sd_N(1e9) == MAX_SD_N
 
 
 @pytest.mark.parametrize("minutes", [10, 20, 40, 60])
-def test_a_sensor_that_drifts_one_way_stays_within_what_is_believed(zero: SensorZero, minutes: int) -> None:
-    now_s = strokes(zero, 0.0, number=1)
+def test_a_sensor_that_drifts_one_way_stays_within_what_is_believed(minutes: int) -> None:
+    zero, now_s = strokes(0.0, number=1)
     assert zero.sd_N(now_s + 60.0 * minutes) >= 0.005 * minutes
 
 
-def test_before_anything_is_heard_no_time_counts(zero: SensorZero) -> None:
-    assert zero.sd_N(1e9) == TARED_SD_N
+def test_before_anything_is_heard_no_time_counts() -> None:
+    assert SensorZero().sd_N(1e9) == TARED_SD_N
 
 
 @pytest.mark.parametrize(
     "turn", [{"rest_s": LONGEST_TURN_S + 0.1}, {"stroke_s": 0.5 * LEVEL_S}, {"off_N": MAX_ZERO_N + 0.1}]
 )
-def test_levels_that_say_nothing_are_not_compared(doubted: SensorZero, turn: dict[str, float]) -> None:
+def test_levels_that_say_nothing_are_not_compared(turn: dict[str, float]) -> None:
     """Too far apart, too short, or of a sensor that is broken rather than off its zero."""
-    strokes(doubted, **({"off_N": 0.2, "number": 2} | turn))  # type: ignore[arg-type]
-    assert doubted.zero_N == 0.0
+    zero, _ = strokes(**({"off_N": 0.2, "number": 2, "is_tared": False} | turn))  # type: ignore[arg-type]
+    assert zero.zero_N == 0.0
 
 
-def test_a_drift_is_followed(zero: SensorZero) -> None:
+def test_a_drift_is_followed() -> None:
     """5 mN a minute for an hour, turning every 10 s."""
-    now_s = 0.0
+    zero, now_s = SensorZero(), 0.0
     for _ in range(180):
-        now_s = strokes(zero, 0.005 / 60.0 * now_s, number=2, stroke_s=1.0, rest_s=9.0, from_s=now_s)
+        _, now_s = strokes(0.005 / 60.0 * now_s, zero, number=2, stroke_s=1.0, rest_s=9.0, from_s=now_s)
     assert zero.zero_N == pytest.approx(0.3, abs=0.02)
 
 
