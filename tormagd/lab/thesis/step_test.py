@@ -64,10 +64,10 @@ def step_test(fitted: Insert, seed: int) -> StepTest:
     for gap_mm in GAPS_MM:
         for _ in range(round(HOLD_S / 1e-3)):
             sample = loop.tick(plan=_plan(gap_mm, loop.now_s))
-            estimate = sample.measured
-            if estimate is None or sample.safety.faults:
+            measured = sample.measured
+            if measured is None or sample.safety.faults:
                 raise RuntimeError(f"{fitted.name}: the test ended at {gap_mm:g} mm: {sample.safety}")
-            rows.append((sample.time_s - began_s, estimate.gap_mm, estimate.force_N))
+            rows.append((sample.time_s - began_s, measured.gap_mm, measured.force_N))
     record = np.array(rows)
     settled = record.reshape(len(GAPS_MM), -1, 3)[:, -round(SETTLED_S / 1e-3) :].mean(axis=1)
     time_s, gap_mm, force_N = record[::EVERY].T

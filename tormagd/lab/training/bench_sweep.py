@@ -125,11 +125,11 @@ def swept(plant: str, scene_name: str, course: Course) -> Array:
     for gap_mm, end_s in zip(course.gaps_mm, ends_s, strict=True):
         while loop.now_s < end_s:
             sample = loop.tick(plan=_plan(gap_mm, loop.now_s))
-            estimate = sample.measured
-            if estimate is None or sample.safety.faults:
+            measured = sample.measured
+            if measured is None or sample.safety.faults:
                 raise RuntimeError(f"the sweep ended at {gap_mm:.1f} mm: {sample.safety}")
-            signed_N = estimate.force_N * estimate.handle.turn.direction
-            rows.append((loop.now_s, estimate.handle_mm, estimate.gap_mm, signed_N))
+            signed_N = measured.force_N * measured.handle.turn.direction
+            rows.append((loop.now_s, measured.handle_mm, measured.gap_mm, signed_N))
     time_s, handle_mm, gap_mm, signed_N = np.array(rows).T
     rate_mm_s, slides = sliding(handle_mm, gap_mm)
     kept = np.flatnonzero(slides)[::EVERY]
