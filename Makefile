@@ -24,8 +24,8 @@ SAY_BUILD = $(BIN)/python -P -c 'from firmware_protocol.build import settle; pri
 
 # what the core promises, asked of the interpreted build as well. Closed loops are
 # not run twice: `tests/core` holds the two builds against each other to the bit
-CORE_TESTS := tests/control tests/safety tests/model tests/firmware_protocol/test_codec.py tests/firmware_protocol/test_framing.py \
-    tests/hardware/test_link.py tests/hardware/test_link_statistics.py
+CORE_TESTS := tests/control tests/assembly tests/safety tests/model tests/firmware_protocol/test_codec.py \
+    tests/firmware_protocol/test_framing.py tests/hardware/test_link.py tests/hardware/test_link_statistics.py
 
 # the variable: mkdocs-material's notice of its own end of life, 2027, is no warning of ours
 SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict

@@ -36,7 +36,7 @@ COMPILED = {
     ),
     "tormagd/control/ask": ("skill", "forecast", "path", "governor"),
     "tormagd/control/aim": ("portrait", "floors", "aim"),
-    "tormagd/control/move": ("motor", "pid", "reference", "homing", "watch", "carriages"),
+    "tormagd/control/move": ("motor", "pid", "reference", "homing", "watch", "actuator", "carriages"),
     "tormagd/assembly": ("conditions",),
     "tormagd/simulation": (
         *("curve", "axis", "gap_field", "warmth", "element", "tactile_pad", "pressed_pad"),

@@ -60,11 +60,11 @@ def plain(thing: object) -> Any:
 
 
 def _fields(kind: type) -> tuple[str, ...]:
+    if hasattr(kind, "__match_args__"):
+        return tuple(kind.__match_args__)
     # a compiled class has no annotations, but says its attributes
-    for told in ("__match_args__", "__mypyc_attrs__", "__annotations__"):
-        if hasattr(kind, told) and not issubclass(kind, Enum):
-            return tuple(name for name in getattr(kind, told) if told == "__match_args__" or not name.startswith("_"))
-    return ()
+    told = [vars(each).get("__mypyc_attrs__") or vars(each).get("__annotations__", ()) for each in kind.__mro__]
+    return tuple(sorted({name for names in told for name in names if name[0] != "_"}))
 
 
 def _changes(thing: object) -> bool:

@@ -7,14 +7,23 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
+from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
+from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config
-from tormagd.control.core import Core, build_core
+from tormagd.control.core import Stepper
+from tormagd.control.records import Duty, Plan
 from tormagd.hardware.measurement import Measurement
 from tormagd.model.memory import NO_MEMORY
 from tormagd.model.model_file import ForceModel, load_model
+from tormagd.safety.codes import Fault
+from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState
+from tormagd.scenes.scene import Scene
 
 MeasurementMaker = Callable[..., Measurement]
+PERIOD_S = 1e-3
+READY = Conditions(
+    connected=True, fresh=True, homed=True, busy=False, device_latched=False, requested_N=None, neutral_N=0.5
+)
 
 
 @pytest.fixture(scope="session")
@@ -22,7 +31,7 @@ def config() -> Config:
     return Config()
 
 
-LOADED = "tormagd.control.core.load_model"
+LOADED = "tormagd.assembly.build.load_model"
 
 
 def load_forgetful(path: Path, **meant: str) -> ForceModel:
@@ -83,3 +92,116 @@ def measure() -> MeasurementMaker:
         return healthy.replaced(**{**came, **changes})  # type: ignore[arg-type]
 
     return make
+
+
+class Bench:
+    """A Stepper fed with described measurements, a millisecond apart."""
+
+    def __init__(self, stepper: Stepper, measure: MeasurementMaker) -> None:
+        self.stepper, self.move, self.watch, self.measure = stepper, stepper.move, stepper.watch, measure
+        self.now_s, self.ticks = 0.0, 0
+        self.output: Duty
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        return self.stepper.safety.faults
+
+    @property
+    def driven(self) -> tuple[DriveMode, float, float]:
+        """What the bridges are told."""
+        return self.output.mode, self.output.left_duty, self.output.right_duty
+
+    @property
+    def is_off(self) -> bool:
+        return self.driven == (DriveMode.OFF, 0.0, 0.0)
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the device is asked for an answer, and nothing is moved."""
+        return self.driven == (DriveMode.RUN, 0.0, 0.0)
+
+    @property
+    def is_opened(self) -> bool:
+        """Whether the drives are off for a fault, and the device has been asked to open."""
+        is_faulty = self.stepper.safety.operating_state is OperatingState.FAULT
+        return is_faulty and self.is_off and self.output.request is DeviceRequest.RETRACT
+
+    @property
+    def there(self) -> dict[str, float]:
+        """Of a measurement: carriages where they are wanted."""
+        return self.gap(self.move.reference.gap_mm)  # type: ignore[union-attr]
+
+    @staticmethod
+    def gap(gap_mm: float) -> dict[str, float]:
+        """Of a measurement: carriages this far apart."""
+        return dict.fromkeys(("left_mm", "right_mm"), gap_mm / 2.0 - 47.5)
+
+    def plan(self, gap_mm: float, **fields: object) -> Plan:
+        """A plan of now for a gap."""
+        at_rest = Plan(1, self.now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
+        return at_rest.replaced(**fields)  # type: ignore[arg-type]
+
+    def at(self, now_s: float, measurement: Measurement | None, aim: Plan | float = 80.0) -> Duty:
+        """One step, whenever that is. What a plan says besides the gap is said by the plan."""
+        self.now_s = now_s
+        self.output = self.stepper.step(now_s, measurement, aim if isinstance(aim, Plan) else self.plan(aim))
+        return self.output
+
+    def step(self, aim: Plan | float = 80.0, count: int = 1, **changes: object) -> Duty:
+        """Some control periods with the same kind of measurement."""
+        for _ in range(count):
+            self.ticks += 1
+            self.at(self.ticks * PERIOD_S, self.measure(self.ticks, **changes), aim)
+        return self.output
+
+    def silent(self, measurement: Measurement | None, count: int = 1) -> Duty:
+        """Some control periods in which this same measurement is the newest."""
+        for _ in range(count):
+            self.ticks += 1
+            self.at(self.ticks * PERIOD_S, measurement)
+        return self.output
+
+    def command(self, name: str, **conditions: object) -> None:
+        self.stepper.command(name, self.now_s, READY.replaced(**conditions))  # type: ignore[arg-type]
+
+    def enabled(self, **changes: object) -> "Bench":
+        """Enabled after three periods of this kind."""
+        self.step(count=3, **changes)
+        self.command("enable")
+        return self
+
+    def run_into(self, fault: Fault, aim: Plan | float = 80.0, **changes: object) -> int:
+        """Periods until exactly this fault is latched, and so the drives off and the device asked to open."""
+        start = self.ticks
+        while not self.faults:
+            self.step(aim, **changes)
+            assert self.ticks - start < 1_000, f"no {fault}"
+        assert self.faults == (fault,)
+        assert self.is_opened
+        return self.ticks - start
+
+
+@pytest.fixture(scope="session")
+def make_bench(core: Core, measure: MeasurementMaker) -> Callable[..., Bench]:
+    """Makes benches, of a configuration with other values in the sections that are named."""
+
+    def make(scene: Scene = core.scene, **sections: dict[str, object]) -> Bench:
+        changed = {
+            name: msgspec.structs.replace(getattr(core.config, name), **values) for name, values in sections.items()
+        }
+        return Bench(Stepper(msgspec.structs.replace(core.config, **changed), scene), measure)
+
+    return make
+
+
+@pytest.fixture
+def bench(make_bench: Callable[..., Bench]) -> Bench:
+    return make_bench()
+
+
+@pytest.fixture
+def running(bench: Bench) -> Bench:
+    """Enabled at a gap of 80 mm, and at rest there."""
+    bench.enabled().step(count=3)
+    assert bench.stepper.safety.operating_state is OperatingState.ENABLED
+    return bench

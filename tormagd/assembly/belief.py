@@ -1,37 +1,30 @@
 """All that is believed of the device, as one table for whoever looks: status, `top`, the page."""
 
-from typing import NamedTuple
-
 from tormagd.control.believe.believe import MIN_FORESIGHT
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.control.core import Planner, Stepper
 from tormagd.scenes.scene import Terms
+from tormagd_client.messages import BeliefReport
 
 
-class Believed(NamedTuple):
-    """A value in a `unit`, empty where it has none, its standard deviation where its estimator knows one, and whether
-    plan or reference follow it now."""
-
-    value: float
-    sd: float | None
-    unit: str
-    acts: bool
-
-
-def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> dict[str, Believed]:
+def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> dict[str, BeliefReport]:
     """What is believed at `now_s`, by name: the device's force is `scale` times the model's plus `offset`, at a creep
     times `low_speed_factor`; docs/messages.md says what each is."""
     believe, plan = planner.believe, planner.planned
     fit, memory, zero_sd_N = believe.strength.fit, believe.memory, believe.zero.sd_N(now_s)
     is_ahead = plan.foresight >= MIN_FORESIGHT
     return {
-        "scale": Believed(fit.scale, fit.scale_sd, "", terms.scale),
-        "offset": Believed(fit.offset_N, fit.offset_sd_N, "N", terms.offset),
-        "low_speed_factor": Believed(believe.slow.factor, None, "", terms.creep),
-        "sensor_zero": Believed(believe.zero.zero_N, zero_sd_N, "N", zero_sd_N <= UNKNOWN_SD_N),
-        "carriage_lag": Believed(believe.carriages.lag_s, None, "s", terms.lag and is_ahead),
-        "acceleration_scale": Believed(stepper.move.acceleration_scale, None, "", stepper.move.reference is not None),
-        "forecast_trust": Believed(planner.governor.forecast.trust, None, "", plan.foresight > 0.0),
-        "relaxed": Believed(memory.relaxed_N, None, "N", memory.relaxed_N != 0.0),
-        "field_lag": Believed(memory.lag_mT, None, "mT", memory.lag_mT != 0.0),
+        "scale": _told(fit.scale, fit.scale_sd, "", terms.scale),
+        "offset": _told(fit.offset_N, fit.offset_sd_N, "N", terms.offset),
+        "low_speed_factor": _told(believe.slow.factor, None, "", terms.creep),
+        "sensor_zero": _told(believe.zero.zero_N, zero_sd_N, "N", zero_sd_N <= UNKNOWN_SD_N),
+        "carriage_lag": _told(believe.carriages.lag_s, None, "s", terms.lag and is_ahead),
+        "acceleration_scale": _told(stepper.move.acceleration_scale, None, "", stepper.move.reference is not None),
+        "forecast_trust": _told(planner.governor.forecast.trust, None, "", plan.foresight > 0.0),
+        "relaxed": _told(memory.relaxed_N, None, "N", memory.relaxed_N != 0.0),
+        "field_lag": _told(memory.lag_mT, None, "mT", memory.lag_mT != 0.0),
     }
+
+
+def _told(value: float, sd: float | None, unit: str, acts: bool) -> BeliefReport:
+    return BeliefReport(value=value, sd=sd, unit=unit, acts=acts)

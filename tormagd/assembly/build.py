@@ -69,10 +69,13 @@ class Core(NamedTuple):
     "The model's fingerprint."
     models: Path
     "Where the scene's model was looked for, where it is no shipped one."
-    gap_speed_mm_s: float
-    "The fastest that the gap is moved."
     missed: Missed | None = None
     "What the gap's speed alone leaves of the scene's signal; None where it states none."
+
+    @property
+    def gap_speed_mm_s(self) -> float:
+        """The fastest that the gap is moved."""
+        return self.config.position.gap_speed_mm_s
 
     @property
     def portrait(self) -> Portrait:
@@ -101,39 +104,36 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
         offered, needed = getattr(config.rates, name), getattr(scene.bandwidth, name)
         if offered < needed:
             raise ConfigError(f"rates.{name} = {offered}: allowed is at least {needed}, which scene {scene.name} needs")
-    stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
-    if stability.phase_margin_deg < LEAST_PHASE_MARGIN_DEG or stability.gain_margin_dB < LEAST_GAIN_MARGIN_DB:
-        raise ConfigError(
-            f"position: these gains leave a phase margin of {stability.phase_margin_deg:.0f} degrees and a gain margin "
-            f"of {stability.gain_margin_dB:.1f} dB: allowed is at least {LEAST_PHASE_MARGIN_DEG:g} and "
-            f"{LEAST_GAIN_MARGIN_DB:g}"
-        )
+    stability = _refuse_unstable(config)
     _refuse_too_weak(config, scene)
     try:
         model = load_model(
-            model_path(scene.insert.model, beside=beside),
-            element=scene.element,
-            insert=scene.insert.name,
+            model_path(scene.insert.model, beside=beside), element=scene.element, insert=scene.insert.name
         )
-        part = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
-        field = part.field
-        fields_mT, rises = _known_fields_mT(scene, model, part)
-        reach = portrait(_curve(model, part), field, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
-        choice = choose_solver(scene, rises=rises)
-        search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, rises=rises)
-        law = _law(scene, reach, field) if part.contact.slides else None
+        element, choice = _element(scene, model)
     except (DomainError, ModelFileError) as error:
         raise ConfigError(f"scene {scene.name}: {error}") from error
     _refuse_unknown_hand(scene, model)
-    _refuse_out_of_reach(scene, reach)
-    _refuse_too_fine(scene, reach)
-    too_fast = _refuse_too_fast(config, scene, reach, beside) if models is None else None
-    _refuse_too_sudden(config, scene, reach)
+    _refuse_out_of_reach(scene, element.portrait)
+    _refuse_too_fine(scene, element.portrait)
+    too_fast = _refuse_too_fast(config, scene, element.portrait, beside) if models is None else None
+    _refuse_too_sudden(config, scene, element.portrait)
+    return Core(config, scene, element, stability, choice, model.fingerprint, beside, too_fast)
+
+
+def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
+    """The scene's element as the model has it, and how its field is searched for."""
     terms = terms_of(scene)
+    part = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
+    field = part.field
+    fields_mT, rises = _known_fields_mT(scene, model, part)
+    reach = portrait(_curve(model, part), field, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
+    choice = choose_solver(scene, rises=rises)
+    search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, rises=rises)
+    law = _law(scene, reach, field) if part.contact.slides else None
     nominal = Nominal(model, part.contact, part.cip_percent, terms.rate)
     memory = model.metadata.memory.of(relaxes=terms.relaxes, hysteresis=terms.hysteresis)
-    element, speed_mm_s = Element(nominal, memory, field, reach, search, law), config.position.gap_speed_mm_s
-    return Core(config, scene, element, stability, choice, model.fingerprint, beside, speed_mm_s, too_fast)
+    return Element(nominal, memory, field, reach, search, law), choice
 
 
 def sources_hash() -> str:
@@ -212,6 +212,17 @@ def _known_fields_mT(scene: Scene, model: ForceModel, part: Part) -> tuple[tuple
         return (low_mT, high_mT), True
     depths_mm = np.linspace(PRESSED * part.contact.displacement_mm, most_mm, DEPTHS).tolist()
     return (low_mT, high_mT), all(falling_at(model, (low_mT, high_mT), depth) is None for depth in depths_mm)
+
+
+def _refuse_unstable(config: Config) -> Margins:
+    stability = margins(config.motor, config.position, 1.0 / config.rates.control_hz)
+    if stability.phase_margin_deg < LEAST_PHASE_MARGIN_DEG or stability.gain_margin_dB < LEAST_GAIN_MARGIN_DB:
+        raise ConfigError(
+            f"position: these gains leave a phase margin of {stability.phase_margin_deg:.0f} degrees and a gain margin "
+            f"of {stability.gain_margin_dB:.1f} dB: allowed is at least {LEAST_PHASE_MARGIN_DEG:g} and "
+            f"{LEAST_GAIN_MARGIN_DB:g}"
+        )
+    return stability
 
 
 def _refuse_too_weak(config: Config, scene: Scene) -> None:

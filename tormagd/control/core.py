@@ -17,6 +17,7 @@ from tormagd.control.ask.governor import Governor
 from tormagd.control.believe.believe import Believe, Learned
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.measure import Measure
+from tormagd.control.move.actuator import Actuator
 from tormagd.control.move.carriages import Carriages
 from tormagd.control.move.homing import Homing
 from tormagd.control.move.motor import full_speed_mm_s
@@ -89,10 +90,10 @@ class Stepper:
     measure: Measure
     homing: Homing
     watch: Watch
-    move: Carriages
+    move: Actuator
 
-    def __init__(self, config: Config, scene: Scene, now_s: float = 0.0) -> None:
-        """Begins disabled at `now_s`."""
+    def __init__(self, config: Config, scene: Scene, now_s: float = 0.0, move: Actuator | None = None) -> None:
+        """Begins disabled at `now_s`. Without `move` the carriages are what moves the gap."""
         position, period_s = config.position, 1.0 / config.rates.control_hz
         self.time_s, self.safety = now_s, SafetyState()
         slides = scene.element == "torque"
@@ -101,7 +102,7 @@ class Stepper:
         self._ceiling_N: Final = ceiling_N(scene)
         self.homing = Homing(self._ceiling_N)
         self.watch = Watch(config, scene)
-        self.move = Carriages(config, scene)
+        self.move = Carriages(config, scene) if move is None else move
         self._period_s: Final = period_s
 
     @property

@@ -8,7 +8,7 @@ from tormagd.control.core import Stepper
 from tormagd.control.records import Duty, Plan
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.operating_state import SafetyState
-from tormagd_client.messages import VERSION, Telemetry, Tick, TickRecord
+from tormagd_client.messages import VERSION, BeliefReport, Telemetry, Tick, TickRecord
 
 
 def tick_record(
@@ -105,7 +105,14 @@ def limits_held(safety: SafetyState, output: Duty, plan: Plan) -> tuple[str, ...
     return tuple(dict.fromkeys((*plan.limits, *output.limits)))
 
 
-def snapshot(tick: TickRecord, sequence: int, is_homed: bool, is_busy: bool, age_s: float | None) -> Telemetry:
+def snapshot(
+    tick: TickRecord,
+    sequence: int,
+    is_homed: bool,
+    is_busy: bool,
+    age_s: float | None,
+    belief: dict[str, BeliefReport],
+) -> Telemetry:
     """The telemetry of the newest tick."""
     known = tick.left_mm is not None and tick.right_mm is not None
     left, right = tick.left_mm or 0.0, tick.right_mm or 0.0
@@ -131,4 +138,5 @@ def snapshot(tick: TickRecord, sequence: int, is_homed: bool, is_busy: bool, age
         setpoint_age_ms=None if age_s is None else age_s * 1e3,
         confidence=tick.confidence,
         tick=Tick(lateness_us=tick.lateness_us, exec_us=tick.exec_us),
+        belief=belief,
     )

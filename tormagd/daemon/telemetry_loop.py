@@ -30,7 +30,6 @@ from tormagd.hardware.connection import Connection
 from tormagd.safety.operating_state import Conditions, RefusedError, next_commands
 from tormagd.scenes.scene import terms_of
 from tormagd_client.messages import (
-    BeliefReport,
     Description,
     DeviceReport,
     OutputReport,
@@ -165,7 +164,9 @@ class TelemetryLoop:
         stamp = self._endpoint.inbox.newest
         homed = is_homed(self._connection.measurement, self._control.stepper.measured)
         age_s = None if stamp is None else now_s - stamp.stamp_s
-        return snapshot(self._ticks[-1], self.timing.runs, homed, self.is_busy(), age_s)
+        planner, stepper = self._inference.planner, self._control.stepper
+        believed = beliefs(planner, stepper, now_s, terms_of(self._core.scene))
+        return snapshot(self._ticks[-1], self.timing.runs, homed, self.is_busy(), age_s, believed)
 
     def take_over(self, config: Config) -> None:
         """Goes on with another configuration, of which only what a loop looks at each time may differ."""
@@ -305,10 +306,6 @@ class TelemetryLoop:
                 sensor_zero_sd_N=round(believe.zero.sd_N(now_s), 4),
                 lag_ms=round(believe.carriages.lag_s * 1e3, 1),
             ),
-            belief={
-                name: BeliefReport(value=round(it.value, 5), sd=it.sd and round(it.sd, 5), unit=it.unit, acts=it.acts)
-                for name, it in beliefs(planner, stepper, now_s, terms_of(self._core.scene)).items()
-            },
             profile=self._profiles.report(),
             least_gap_mm=round(plan.min_gap_mm, 2),
             link=link,

@@ -81,11 +81,20 @@ class Tick(msgspec.Struct, frozen=True):
     exec_us: float
 
 
+class BeliefReport(msgspec.Struct, frozen=True, kw_only=True):
+    """One believed value in its unit, its standard deviation where one is known, and whether it acts now."""
+
+    value: float
+    sd: float | None
+    unit: str
+    acts: bool
+
+
 class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     """What the daemon is doing, 50 times a second. Forces in N, lengths in mm, `t_ns` CLOCK_REALTIME.
 
-    `measured_cf` is the force sensor's, `predicted_cf` the model's at the measured gap and motion. A value that is not
-    known (no device, no setpoint) is null.
+    `measured_cf` is the force sensor's, `predicted_cf` the model's at the measured gap and motion; `belief` is what is
+    believed of the device, by name. A value that is not known (no device, no setpoint) is null.
     """
 
     v: int
@@ -109,6 +118,7 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     setpoint_age_ms: float | None
     confidence: float | None
     tick: Tick
+    belief: dict[str, BeliefReport] = {}
 
 
 class Explained(msgspec.Struct, frozen=True):
@@ -261,15 +271,6 @@ class DeviceReport(msgspec.Struct, frozen=True, kw_only=True):
     lag_ms: float | None = None
 
 
-class BeliefReport(msgspec.Struct, frozen=True, kw_only=True):
-    """One believed value in its unit, its standard deviation where one is known, and whether it acts now."""
-
-    value: float
-    sd: float | None
-    unit: str
-    acts: bool
-
-
 class ProfileReport(msgspec.Struct, frozen=True, kw_only=True):
     """What was kept of this device: whether it is in use, how old what is on the disk is, why there is nothing, and the
     folder of the profiles, empty where none are kept."""
@@ -348,7 +349,6 @@ class Status(Telemetry, frozen=True, kw_only=True):
     most_N: float
     trim: float
     device: DeviceReport
-    belief: dict[str, BeliefReport] = {}
     profile: ProfileReport
     least_gap_mm: float
     link: LinkReport

@@ -98,11 +98,27 @@ class Aim:
         # the field grid ends where the gap range ends, up to rounding
         wanted_mm = min(max(self._field.gap_mm(field_mT), self._closed_mm), self._open_mm)
         min_mm = ceiling_mm(self._portrait, device, self._ceiling_N)
-        gap_mm = max(wanted_mm, min_mm)
-        speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, device)
-        model_N = belief.at_speed.model_N(ask.force_N)
         self.number += 1
         self.element_mT = field_mT - memory.lag_mT
+        limits = self._limits(ask, belief.limits, outside, min_mm > wanted_mm, solution)
+        gap_mm, confidence = max(wanted_mm, min_mm), solution.confidence
+        return self._plan(now_s, setpoint, ask, belief, field_mT, gap_mm, min_mm, confidence, limits, outside)
+
+    def _plan(
+        self,
+        now_s: float,
+        setpoint: TimedSetpoint | None,
+        ask: Ask,
+        belief: Belief,
+        field_mT: float,
+        gap_mm: float,
+        min_mm: float,
+        confidence: float,
+        limits: tuple[Limit, ...],
+        outside: tuple[Outside, ...],
+    ) -> Plan:
+        speed_mm_s, acceleration_mm_s2 = self._motion_ahead(ask.path_N, belief.device)
+        model_N = belief.at_speed.model_N(ask.force_N)
         return Plan(
             number=self.number,
             time_s=now_s,
@@ -113,8 +129,8 @@ class Aim:
             field_mT=field_mT,
             gap_mm=gap_mm,
             gap_speed_mm_s=speed_mm_s,
-            confidence=solution.confidence,
-            limits=self._limits(ask, belief.limits, outside, gap_mm > wanted_mm, solution),
+            confidence=confidence,
+            limits=limits,
             gap_acceleration_mm_s2=acceleration_mm_s2,
             foresight=ask.foresight,
             min_gap_mm=min_mm,

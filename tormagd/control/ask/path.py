@@ -98,6 +98,19 @@ def nearest_path_mm(
 ) -> list[float]:
     """The first `count` gaps of the best path along wanted gaps (n) with weights (n) > 0, at the first n of rising
     times. The first of them is `elapsed_s` after the gap was at `start_mm`."""
+    best_mm = _best_mm(times_s, wanted_mm, weights, speed_mm_s)
+    path_mm: list[float] = []
+    gap_mm, before_s = start_mm, times_s[0] - elapsed_s
+    for place in range(count):
+        moved_mm = speed_mm_s * (times_s[place] - before_s)
+        gap_mm = min(max(best_mm[place], gap_mm - moved_mm), gap_mm + moved_mm)
+        path_mm.append(gap_mm)
+        before_s = times_s[place]
+    return path_mm
+
+
+def _best_mm(times_s: list[float], wanted_mm: list[float], weights: list[float], speed_mm_s: float) -> list[float]:
+    """The gap that is best at each point (n) for it and all that comes after, if it can be reached in time."""
     best_mm = wanted_mm[:]
     # the kinks beside the flat piece, nearest last, each less the distance that its side is shifted from its point back
     # to time 0; and by how much the slope of the derivative grows where one is passed on the way out
@@ -130,11 +143,4 @@ def nearest_path_mm(
         below.append(slope)
         above_mm.append(least_mm + shift_mm)
         above.append(slope)
-    path_mm: list[float] = []
-    gap_mm, before_s = start_mm, times_s[0] - elapsed_s
-    for place in range(count):
-        moved_mm = speed_mm_s * (times_s[place] - before_s)
-        gap_mm = min(max(best_mm[place], gap_mm - moved_mm), gap_mm + moved_mm)
-        path_mm.append(gap_mm)
-        before_s = times_s[place]
-    return path_mm
+    return best_mm

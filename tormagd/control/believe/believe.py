@@ -72,7 +72,7 @@ class Believe:
     sensor: SensorTrust
     carriages: CarriageLag
     learns: bool
-    "Whether anything is learned of device, creep and carriages."
+    "Whether anything is learned. What protects goes on without: the sensor is judged, and a lie makes it forgotten."
     read: int = -1
     "Number of the newest measurement that taught,"
     read_s: float
@@ -208,7 +208,9 @@ class Believe:
         self.sensor.update(free_fit, free_N, rate_mm_s, reading_N, dt_s, direction, zero_sd_N)
         if self.sensor.is_doubted and not was_doubted:
             zero.doubt()
-        zero.update(now_s, direction, measured.force_N, model_N, rate_mm_s, dt_s, fit.scale, fit.scale_sd)
+        zero.begin(now_s)
+        if self.learns:
+            zero.update(now_s, direction, measured.force_N, model_N, rate_mm_s, dt_s, fit.scale, fit.scale_sd)
         self.limits = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
         if self.sensor.is_doubted:
             self.strength.forget()

@@ -84,6 +84,10 @@ class SensorZero:
         drifted_N2 = DRIFT_N2_S * since_s * max(since_s / WANDERS_S, 1.0)
         return math.sqrt(min(self.variance_N2 + drifted_N2, MAX_SD_N * MAX_SD_N))
 
+    def begin(self, now_s: float) -> None:
+        """There is a reading: from the first on the zero drifts."""
+        self.told_s = min(self.told_s, now_s)
+
     def doubt(self) -> None:
         """The sensor is not believed to have been tared."""
         self.variance_N2 = MAX_SD_N * MAX_SD_N
@@ -101,7 +105,6 @@ class SensorZero:
     ) -> None:
         """Takes a reading along `direction` of a handle that slides at `rate_mm_s`, where the model says `model_N`. It
         stands for `dt_s` > 0; the device's scale is known to within `scale_sd`. All are finite."""
-        self.told_s = min(self.told_s, now_s)
         level = self.level
         if level is None or direction != self.direction:
             # what was heard for too short a time is no level

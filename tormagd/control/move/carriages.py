@@ -9,8 +9,8 @@ duty       of each carriage: PID on expected minus measured, plus what speed, ac
 import math
 from typing import Final, final
 
-from firmware_protocol.value import Value
 from tormagd.config import Config
+from tormagd.control.move.actuator import Actuator, Drive
 from tormagd.control.move.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s, pull_V
 from tormagd.control.move.pid import Pid
 from tormagd.control.move.reference import Expected, Reference, Speeds, follow
@@ -39,56 +39,18 @@ LAGGING_MM: Final = 0.1
 
 
 @final
-class Acted:
-    """In how many ticks each limit of the output has acted, in the order in which they stand.
+class Carriages(Actuator):
+    """Drives the two carriages of one device. Those whose motors are livelier than believed get ahead of what is
+    expected, and `acceleration_scale` grows. Of weaker ones no less is asked: they would turn too late."""
 
-    Duties have no slew limit: the reference's acceleration bounds what is asked of the motors, their windings smooth
-    the rest within `motor.inductance`, and a limit in between would only take phase away from the position loop.
-    """
-
-    rate: int = 0
-    "The speed of the gap's reference,"
-    slew: int = 0
-    "its acceleration,"
-    not_finite: int = 0
-    "a number that was not finite,"
-    range: int = 0
-    "a duty out of its range."
-
-
-@final
-class Drive(Value):
-    """Duties as the device takes them, each within its limit; what limits them; and the motors' part of them, before
-    the device's own supply is allowed for."""
-
-    def __init__(
-        self, left_duty: float, right_duty: float, left_motor: float, right_motor: float, limits: list[Limit]
-    ) -> None:
-        self.left_duty: Final = left_duty
-        self.right_duty: Final = right_duty
-        self.left_motor: Final = left_motor
-        self.right_motor: Final = right_motor
-        self.limits: Final = limits
-
-
-@final
-class Carriages:
-    """Drives the two carriages of one device."""
-
-    reference: Reference | None = None
-    "Where the gap is driven; None while nothing is driven: it begins where the gap is."
     expected: Expected
     left: Pid
     right: Pid
-    acceleration_scale: float = 1.0
-    """1..MAX_ACCELERATION_SCALE, of `position.gap_acceleration_mm_s2`: how fast the carriages have shown to gain speed.
-    Those whose motors are livelier than believed get ahead of what is expected. Of weaker ones no less is asked: they
-    would turn too late."""
-    acted: Acted
 
     def __init__(self, config: Config, scene: Scene) -> None:
+        super().__init__()
         position, motor = config.position, config.motor
-        self.expected, self.acted = Expected(), Acted()
+        self.expected = Expected()
         self.left, self.right = Pid(position), Pid(position)
         self._duty_limit: Final = position.duty_limit
         self._derivative_time_s: Final = position.derivative_time_s
@@ -106,40 +68,27 @@ class Carriages:
         self._lag_s: Final = electrical_time_s(motor) + EXCHANGE_S
         self._gear_loss: Final = 1.0 - motor.gear_efficiency
         self._coulomb: Final = motor.coulomb_V / motor.supply_V
-        self._has_motor: Final = terms_of(scene).motor
-
-    @property
-    def reference_mm(self) -> float:
-        """Where the gap is driven; nowhere while nothing is."""
-        return math.nan if self.reference is None else self.reference.gap_mm
+        terms = terms_of(scene)
+        self._has_motor: Final = terms.motor
+        self._learns: Final = terms.learning
 
     def begin(self, gap_mm: float) -> None:
-        """Begins bumpless: from where the gap is, at rest, with empty integrators."""
+        """Begins bumpless, with empty integrators."""
         self.reference = Reference(gap_mm)
         self.expected.begin(gap_mm)
         self.left.begin()
         self.right.begin()
 
     def resume(self, measured: Measured) -> None:
-        """The device went on with its last duty, unseen: the reference goes on from what came of it, without a leap."""
+        """See `Actuator.resume`: the device went on with its last duty."""
         speed_mm_s = min(max(measured.gap_speed_mm_s, -self._no_load_mm_s), self._no_load_mm_s)
         self.reference = Reference(measured.gap_mm, speed_mm_s)
         self.expected.begin(measured.gap_mm, speed_mm_s)
 
-    def stop(self) -> None:
-        """Nothing is driven."""
-        self.reference = None
-
-    def lose_device(self) -> None:
-        """Another device may come."""
-        self.acceleration_scale = 1.0
-
     def forget(self) -> None:
-        """Nothing is driven, or known of the motors."""
+        """See `Actuator.forget`."""
         self.begin(0.0)
-        self.stop()
-        self.lose_device()
-        self.acted.not_finite += 1
+        super().forget()
 
     def update(
         self,
@@ -150,8 +99,7 @@ class Carriages:
         measured: Measured,
         is_over: bool,
     ) -> Drive:
-        """One tick, `dt_s` > 0 after the last. Without a `plan` the gap is held; it opens while the force `is_over`
-        what it may be."""
+        """See `Actuator.update`."""
         if self.reference is None:
             self.reference = Reference(measured.gap_mm)
             self.expected.begin(measured.gap_mm)
@@ -168,7 +116,7 @@ class Carriages:
         half_mm, half_mm_s = self.expected.gap_mm / 2.0, self.expected.filtered_mm_s / 2.0
         left_mm, right_mm = half_mm - measured.left_mm - skew_mm, half_mm - measured.right_mm + skew_mm
         left_mm_s, right_mm_s = half_mm_s - measured.left_mm_s, half_mm_s - measured.right_mm_s
-        if is_slewed:
+        if is_slewed and self._learns:
             self._learn_acceleration(reference, left_mm + right_mm, left_mm_s + right_mm_s, dt_s)
         ahead = self._feed_forward(reference, pull)
         if abs(reference.speed_mm_s) < RESTING_MM_S:

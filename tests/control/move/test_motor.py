@@ -9,9 +9,16 @@ from hypothesis import example, given, settings, strategies as st
 from scipy.optimize import brentq
 from scipy.signal import StateSpace, cont2discrete, dlsim, lfilter
 
+from tormagd.assembly.build import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG, build_core
 from tormagd.config import Config, Motor, Position
-from tormagd.control.core import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG, build_core
-from tormagd.control.motor import full_speed_mm_s, margins, mechanical_time_s, pull_V, zero_order_hold
+from tormagd.control.move.motor import (
+    delay_margin_s,
+    full_speed_mm_s,
+    margins,
+    mechanical_time_s,
+    pull_V,
+    zero_order_hold,
+)
 from tormagd.physics.magnets import CuboidMagnet, attraction_N
 from tormagd_client.endpoints import ConfigError
 
@@ -182,6 +189,12 @@ def test_gains_at_their_bounds_are_unstable_only_where_the_margins_say_so(positi
     found = margins(motor, position, PERIOD_S)
     if found.phase_margin_deg >= LEAST_PHASE_MARGIN_DEG and found.gain_margin_dB >= LEAST_GAIN_MARGIN_DB:
         assert closed_loop_radius(motor, position) < 1.0
+
+
+def test_the_round_trip_that_is_refused_is_within_what_the_loop_bears(core) -> None:
+    bears_s = delay_margin_s(core.config.motor, core.config.position, PERIOD_S)
+    assert 0.005 < bears_s < 0.05
+    assert bears_s == pytest.approx(core.margins.phase_margin_deg / 360.0 / core.margins.crossover_Hz)
 
 
 def test_a_slower_loop_has_less_phase_left() -> None:

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import example, given, settings, strategies as st
 
 from tormagd.config import Config, Position
-from tormagd.control.motor import full_speed_mm_s
-from tormagd.control.trajectory import Expected, Reference, Speeds, expect, follow
+from tormagd.control.move.motor import full_speed_mm_s
+from tormagd.control.move.reference import Expected, Reference, Speeds, follow
 
 DT_S = 1e-3
 LIMITS = Config().position
@@ -166,9 +166,10 @@ def test_what_is_expected_never_leaves_what_was_asked(
     references: list[tuple[float, float, float]], lag_s: float, filter_s: float
 ) -> None:
     """A lag with a positive kernel: no overshoot of its own, whatever the periods."""
-    expected = Expected(references[0][0])
+    expected = Expected()
+    expected.begin(references[0][0])
     for gap_mm, speed_mm_s, dt_s in references:
-        expected = expect(expected, Reference(gap_mm, speed_mm_s), dt_s, lag_s, filter_s)
+        expected.update(Reference(gap_mm, speed_mm_s), dt_s, lag_s, filter_s)
     reached = [gap for gap, _, _ in references]
     fastest = max(abs(speed) for _, speed, _ in references)
     assert min(reached) - 1e-9 <= expected.gap_mm <= max(reached) + 1e-9
@@ -177,9 +178,10 @@ def test_what_is_expected_never_leaves_what_was_asked(
 
 
 def test_what_is_expected_of_a_ramp_is_late_by_the_lag() -> None:
-    expected, lag_s = Expected(60.0), 0.004
+    expected, lag_s = Expected(), 0.004
+    expected.begin(60.0)
     for tick in range(200):
-        expected = expect(expected, Reference(60.0 + 20.0 * tick * DT_S, 20.0), DT_S, lag_s, 0.003)
+        expected.update(Reference(60.0 + 20.0 * tick * DT_S, 20.0), DT_S, lag_s, 0.003)
     assert 60.0 + 20.0 * 199 * DT_S - expected.gap_mm == pytest.approx(20.0 * lag_s, rel=1e-6)
     assert expected.filtered_mm_s == pytest.approx(20.0, rel=1e-6)
 

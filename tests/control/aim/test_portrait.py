@@ -7,7 +7,7 @@ from itertools import accumulate
 import numpy as np
 from hypothesis import given, strategies as st
 
-from tormagd.control.portrait import Portrait
+from tormagd.control.aim.portrait import Portrait
 
 GAINS_N = st.lists(st.floats(1e-9, 1.0), min_size=1, max_size=60)
 
@@ -25,7 +25,7 @@ def test_a_force_is_found_as_bisection_finds_it(least_N: float, gains_N: list[fl
     forces_N = shown.force_N
     at_a_point = forces_N[place % len(forces_N)]
     for force_N in (
-        shown.least_N + share * (shown.most_N - shown.least_N),
+        shown.min_N + share * (shown.max_N - shown.min_N),
         at_a_point,
         math.nextafter(at_a_point, -math.inf),
         math.nextafter(at_a_point, math.inf),

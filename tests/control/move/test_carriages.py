@@ -1,0 +1,164 @@
+"""The carriages: duties towards where the plan leads, within the limits; and what is said of limits that act."""
+
+import math
+
+import pytest
+
+from firmware_protocol.codec import DriveMode, Switches
+from tormagd.config import Config
+from tormagd.control.move.carriages import CARRY_S, EXCHANGE_S, MAX_ACCELERATION_SCALE
+from tormagd.control.move.motor import electrical_time_s
+from tormagd.control.move.reference import APPROACH_S
+from tormagd.safety.codes import Limit
+
+CONFIG = Config()
+
+
+def test_the_duty_pushes_towards_the_planned_gap(running) -> None:
+    closing = running.step(79.0, count=20)
+    assert closing.mode is DriveMode.RUN
+    assert closing.left_duty < 0.0
+    assert closing.right_duty == pytest.approx(closing.left_duty)
+    assert running.step(81.0, count=60).left_duty > 0.0
+
+
+def test_skew_pulls_the_carriages_together(make_bench) -> None:
+    """Synchronisation adds its share of the skew to either carriage's own error, towards each other."""
+    duties = []
+    for synchronisation in (0.0, 1.0):
+        bench = make_bench(position={"synchronisation": synchronisation}).enabled()
+        bench.step()
+        duties.append(bench.step(left_mm=-7.49, right_mm=-7.51))
+    own, both = duties
+    assert own.left_duty < 0.0 < own.right_duty
+    pull = CONFIG.position.proportional_per_mm * 0.02 / 2.0
+    assert both.left_duty == pytest.approx(own.left_duty - pull, rel=1e-6)
+    assert both.right_duty == pytest.approx(own.right_duty + pull, rel=1e-6)
+
+
+def test_a_plans_gap_is_carried_forward_along_its_speed_but_not_for_long(running) -> None:
+    running.step(running.plan(80.0, gap_speed_mm_s=-10.0), count=60)
+    # the reference has come to where the plan leads in CARRY_S, although the plan is much older, and closes in on it
+    # with the plan's own speed, which the closing speed makes up for APPROACH_S away
+    lag_s = EXCHANGE_S + electrical_time_s(CONFIG.motor)
+    led_mm = 80.0 - 10.0 * (CARRY_S + lag_s)
+    assert running.move.reference.gap_mm == pytest.approx(led_mm - 10.0 * APPROACH_S, abs=0.02)
+
+
+@pytest.mark.parametrize("gap_mm", [-1e9, 0.0, 300.0, 1e9])
+def test_the_reference_stays_in_the_gap_range(make_bench, gap_mm: float) -> None:
+    """Carriages that follow exactly, sooner than any do; the plan asks for a gap that does not exist."""
+    bench = make_bench(limits={"no_motion_time_s": 10.0}).enabled()
+    for _ in range(3_000):
+        bench.step(gap_mm, **bench.there)
+        assert 45.0 - 1e-3 <= bench.move.reference.gap_mm <= 95.0 + 1e-3
+    assert bench.move.reference.gap_mm == pytest.approx(min(max(gap_mm, 45.0), 95.0), abs=0.01)
+
+
+def test_a_least_gap_ends_a_motion_towards_it(running) -> None:
+    """A path that closes at 38 mm/s, well beyond the gap that this device allows."""
+    lowest_mm = math.inf
+    for tick in range(1, 300):
+        closing = running.plan(80.0 - 0.038 * tick, gap_speed_mm_s=-38.0, min_gap_mm=76.0)
+        running.step(closing, **running.there)
+        lowest_mm = min(lowest_mm, running.move.reference.gap_mm)
+    assert 76.0 - 1e-3 < lowest_mm < 76.01
+
+
+@pytest.mark.parametrize("min_gap_mm", [0.0, 79.8])
+def test_the_gap_is_closed_no_further_than_this_device_allows(running, min_gap_mm: float) -> None:
+    for _ in range(40):
+        running.step(running.plan(50.0, min_gap_mm=min_gap_mm))
+    assert (running.move.reference.gap_mm >= 79.7) == (min_gap_mm > 0.0)
+
+
+@pytest.mark.parametrize("gap_mm", [40.5, 42.0, 44.9])
+def test_carriages_beyond_the_closed_end_are_driven_back(bench, gap_mm: float) -> None:
+    bench.enabled(**bench.gap(gap_mm))
+    for _ in range(30):
+        output = bench.step(70.0, **bench.gap(gap_mm))
+        assert bench.move.reference.speed_mm_s >= 0.0
+    assert min(output.left_duty, output.right_duty) > 0.5
+
+
+def test_a_carriage_that_the_firmware_holds_at_its_open_switch_is_not_driven(bench) -> None:
+    """The switch lies 0.2 mm before the end asked for: nothing is learned there, and closing takes no longer."""
+    at_end = bench.gap(94.6)
+    switches = Switches.HOMED | Switches.LEFT_OPEN | Switches.RIGHT_OPEN
+    bench.enabled(**at_end)
+    for _ in range(2_000):
+        output = bench.step(95.0, **at_end, switches=switches)
+        assert bench.is_held
+        assert Limit.SATURATED not in output.limits
+    assert not bench.faults
+    assert bench.move.left.integral <= 0.0
+    pushed = [bench.step(90.0, **at_end, switches=switches).left_duty for _ in range(30)]
+    assert max(pushed[5:]) < 0.0
+
+
+def test_less_supply_takes_more_duty(make_bench) -> None:
+    duties = {}
+    for supply_V in (9.0, 12.0, 14.5, 3.0, 0.0):
+        bench = make_bench().enabled()
+        bench.step(count=3, supply_V=supply_V)
+        duties[supply_V] = bench.step(left_mm=-7.49, right_mm=-7.49, supply_V=supply_V).left_duty
+    assert -0.5 < duties[12.0] < 0.0
+    assert duties[9.0] == pytest.approx(duties[12.0] * 12.0 / 9.0)
+    assert duties[14.5] == pytest.approx(duties[12.0] * 12.0 / 14.5)
+    # a supply that is not there does not make the duty boundless
+    assert duties[0.0] == duties[3.0] == pytest.approx(duties[12.0] * 2.0)
+
+
+def test_limits_name_what_holds_back(running) -> None:
+    assert running.step().limits == ()
+    assert Limit.SKEW in running.step(left_mm=-7.35, right_mm=-7.65).limits
+    far = [running.step(50.0).limits for _ in range(40)]
+    assert Limit.RATE in far[20]
+    assert Limit.SATURATED in far[-1]
+    assert Limit.SKEW not in far[-1]
+    assert not running.faults
+
+
+def test_only_carriages_that_gain_speed_sooner_than_expected_are_asked_for_more(make_bench) -> None:
+    lively, weak = make_bench().enabled(), make_bench().enabled()
+    for _ in range(400):
+        lively.step(79.0, **lively.there)
+        weak.step(79.0, **weak.gap(80.0))
+    scale = lively.move.acceleration_scale
+    assert 1.01 < scale < MAX_ACCELERATION_SCALE
+    assert weak.move.acceleration_scale == 1.0
+    lively.step(79.0, count=400, **lively.there)
+    assert lively.move.acceleration_scale == scale, "what rests shows nothing"
+    lively.stepper.lose_link()
+    assert lively.move.acceleration_scale == 1.0, "another device may come"
+
+
+def acted(bench) -> tuple[int, int, int, int]:
+    """How often: rate, slew, not finite, range."""
+    counts = bench.move.acted
+    return counts.rate, counts.slew, counts.not_finite, counts.range
+
+
+def test_each_stage_of_the_output_is_counted_when_it_acts(running) -> None:
+    running.step(count=5)
+    assert acted(running) == (0, 0, 0, 0), "a gap that is where it should be is held back by nothing"
+    running.step(79.95)
+    assert acted(running) == (0, 1, 0, 0), "a short way takes no speed, but the reference does not leap"
+    running.step(50.0, count=40)  # and is not followed: the duty grows beyond what may be given
+    rate, slew, not_finite, cut = acted(running)
+    assert 0 < rate < slew + rate <= 2 * 41
+    assert 0 < cut <= 40
+    assert not_finite == 0
+    running.step(50.0, supply_V=6.0)
+    limit = CONFIG.position.duty_limit
+    assert running.driven[1:] == (-limit, -limit), "and is cut, whatever the supply would take"
+    assert acted(running)[3] == cut + 1
+    running.step(math.nan)
+    assert acted(running)[2:] == (1, cut + 1), "counters outlive a start afresh"
+    running.command("clear-fault")
+    running.step(count=3)
+    running.command("enable")
+    running.command("pause")
+    held = acted(running)
+    running.step(50.0, count=5)
+    assert acted(running) == held, "where the gap stands there is nothing to hold back"

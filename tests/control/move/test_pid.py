@@ -1,0 +1,181 @@
+"""The PID against simple-pid where their structures coincide, and where ours is meant to be better."""
+
+import math
+
+import msgspec
+import pytest
+from hypothesis import given, settings, strategies as st
+from simple_pid import PID
+
+from tormagd.config import Config, Position
+from tormagd.control.move.pid import ON_TARGET_MM, Pid
+
+DT_S = 1e-3
+SHIPPED = Config().position
+errors = st.floats(-50.0, 50.0)
+speeds = st.floats(-500.0, 500.0)
+positions = st.builds(
+    Position,
+    proportional_per_mm=st.floats(0.1, 20.0),
+    integral_time_s=st.floats(0.01, 10.0),
+    derivative_time_s=st.floats(0.0, 0.05),
+    back_calculation_s=st.floats(0.01, 10.0),
+    duty_limit=st.floats(0.1, 1.0),
+)
+
+
+def begun(position: Position = SHIPPED, integral: float = 0.0) -> Pid:
+    """A PID that has learned this."""
+    stage = Pid(position)
+    stage.integral = integral
+    return stage
+
+
+def updated(stage: Pid, error_mm: float, error_mm_s: float = 0.0, ahead: float = 0.0, count: int = 1) -> float:
+    """The duty after some updates, a millisecond apart."""
+    for _ in range(count):
+        duty = stage.update(error_mm, error_mm_s, ahead, DT_S, False)
+    assert stage.duty == duty
+    return duty
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    sequence=st.lists(st.floats(-0.02, 0.02), min_size=1, max_size=40),
+    proportional=st.floats(0.1, 5.0),
+    integral_time_s=st.floats(0.05, 10.0),
+)
+def test_unsaturated_p_and_i_are_those_of_simple_pid(
+    sequence: list[float], proportional: float, integral_time_s: float
+) -> None:
+    """simple-pid integrates before it answers and we do after, so its integral is ours one update later."""
+    stage = Pid(Position(proportional_per_mm=proportional, integral_time_s=integral_time_s, derivative_time_s=0.0))
+    oracle = PID(proportional, proportional / integral_time_s, 0.0, setpoint=0.0, sample_time=None)
+    for error in sequence:
+        before = stage.integral
+        duty = updated(stage, error)
+        oracle(-error, dt=DT_S)
+        proportional_part, integral_part, _ = oracle.components
+        assert not stage.is_saturated
+        assert duty == pytest.approx(proportional_part + before, abs=1e-12)
+        assert stage.integral == pytest.approx(integral_part, abs=1e-12)
+
+
+@given(position=positions, integral=st.floats(-1.0, 1.0), error=errors, speed=speeds, ahead=st.floats(-3.0, 3.0))
+def test_the_duty_never_leaves_its_limit(
+    position: Position, integral: float, error: float, speed: float, ahead: float
+) -> None:
+    stage, limit = begun(position, integral), position.duty_limit
+    assert abs(updated(stage, error, speed, ahead)) <= limit
+    asked = position.proportional_per_mm * (error + position.derivative_time_s * speed) + integral + ahead
+    assert stage.is_saturated == (abs(asked) > limit) or abs(abs(asked) - limit) < 1e-9
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    position=positions,
+    integral=st.floats(-0.1, 0.1),
+    history=st.lists(st.tuples(st.floats(0.0, 5.0), st.floats(0.0, 30.0), st.floats(0.0, 1.0)), min_size=1),
+)
+def test_nothing_winds_up_against_a_switch(
+    position: Position, integral: float, history: list[tuple[float, float, float]]
+) -> None:
+    """However it is pushed there, for however long: no duty, no saturation, and closing finds no more to unlearn."""
+    stage = begun(position, integral)
+    for error, speed, ahead in history * 20:
+        assert stage.update(error, speed, ahead, DT_S, True) <= 0.0
+        assert not stage.is_saturated
+        assert -position.duty_limit <= stage.integral <= max(integral, 0.0)
+
+
+def test_a_carriage_at_its_switch_closes_as_any_other() -> None:
+    blocked, free = begun(), begun()
+    assert blocked.update(-0.1, -5.0, -0.2, DT_S, True) == updated(free, -0.1, -5.0, -0.2)
+    assert (blocked.integral, blocked.is_saturated) == (free.integral, free.is_saturated)
+
+
+@settings(max_examples=30, deadline=None)
+@given(position=positions, error=st.floats(1.0, 50.0), sign=st.sampled_from([-1.0, 1.0]))
+def test_a_long_saturation_winds_nothing_up(position: Position, error: float, sign: float) -> None:
+    stage = Pid(position)
+    for _ in range(2_000):
+        updated(stage, sign * error)
+        assert abs(stage.integral) <= position.duty_limit
+    # with the error gone, the integral alone is left; it never asks for more than the whole duty
+    updated(stage, 0.0)
+    assert not stage.is_saturated
+
+
+@settings(max_examples=40, deadline=None)
+@given(position=positions, back_calculation_s=st.floats(0.01, 0.2), error=st.floats(15.0, 50.0))
+def test_back_calculation_balances_growth(position: Position, back_calculation_s: float, error: float) -> None:
+    """Standing saturation comes to P / Ti + (limit - P - I) / Tt = 0, within the limit."""
+    stage = Pid(msgspec.structs.replace(position, back_calculation_s=back_calculation_s))
+    updated(stage, error, count=2_000)
+    assert stage.is_saturated
+    proportional, limit = position.proportional_per_mm * error, position.duty_limit
+    balance = limit - proportional * (1.0 - back_calculation_s / position.integral_time_s)
+    assert stage.integral == pytest.approx(min(max(balance, -limit), limit), abs=1e-3)
+
+
+def test_faster_back_calculation_lets_go_sooner() -> None:
+    """A second of a blocked carriage: what the integral keeps of it is what delays the way back."""
+    kept = []
+    for back_calculation_s in (0.02, 0.05, 0.1, 1.0):
+        stage = Pid(msgspec.structs.replace(SHIPPED, back_calculation_s=back_calculation_s))
+        updated(stage, 0.5, count=1_000)
+        kept.append(stage.integral)
+    assert kept == sorted(kept)
+    assert kept[0] < 0.0 < kept[-1]
+
+
+def test_a_jump_of_the_reference_is_no_derivative_kick() -> None:
+    """A target that jumps moves the error, not the speed error: the derivative does not see it."""
+    assert updated(begun(), 0.1) == pytest.approx(SHIPPED.proportional_per_mm * 0.1)
+    # a carriage that moves exactly as its reference asks for no derivative action
+    assert updated(begun(), 0.0, ahead=0.3) == pytest.approx(0.3)
+
+
+def test_derivative_action_brakes() -> None:
+    asked = -10.0 * SHIPPED.proportional_per_mm * SHIPPED.derivative_time_s
+    assert updated(begun(), 0.0, -10.0) == pytest.approx(asked)
+
+
+def test_the_first_update_at_rest_on_target_asks_for_nothing() -> None:
+    stage = begun()
+    assert (updated(stage, 0.0), stage.integral, stage.is_saturated) == (0.0, 0.0, False)
+
+
+@given(error=errors, speed=speeds, integral=st.floats(-1.0, 1.0))
+def test_both_directions_are_alike(error: float, speed: float, integral: float) -> None:
+    stage, mirrored = begun(integral=integral), begun(integral=-integral)
+    assert updated(mirrored, -error, -speed) == -updated(stage, error, speed)
+    assert mirrored.integral == -stage.integral
+
+
+@settings(max_examples=5, deadline=None)
+@given(position=positions, error=st.floats(0.5, 50.0), dt_s=st.sampled_from([0.01, 0.05, 0.1]))
+def test_an_hour_of_saturation_is_left_at_once(position: Position, error: float, dt_s: float) -> None:
+    """The integral stays within the whole duty, and an error of the other sign turns the duty round in one update."""
+    stage = Pid(position)
+    for _ in range(round(3_600.0 / dt_s)):
+        stage.update(error, 0.0, 0.0, dt_s, False)
+        assert abs(stage.integral) <= position.duty_limit
+    most = 2.0 * position.duty_limit / position.proportional_per_mm
+    assert updated(stage, -most) <= -position.duty_limit * (1.0 - 1e-9)
+
+
+@given(integral=st.floats(-1.0, 1.0), error_mm=st.floats(-0.01, 0.01))
+def test_a_carriage_at_rest_on_target_forgets_within_its_integral_time(integral: float, error_mm: float) -> None:
+    stage = begun(integral=integral)
+    for _ in range(round(SHIPPED.integral_time_s / DT_S)):
+        stage.rest(error_mm, DT_S)
+    if abs(error_mm) > ON_TARGET_MM:
+        assert stage.integral == integral  # it is still on its way, and the integral is what gets it there
+    else:
+        assert stage.integral == pytest.approx(integral / math.e, rel=0.01)
+
+
+def test_no_carriage_is_nearer_than_on_target() -> None:
+    """Half a count of the device's encoders, 4480 on a lead of 8 mm, is within it, and a whole one is not."""
+    assert 0.5 * 8.0 / 4480.0 < ON_TARGET_MM < 8.0 / 4480.0

@@ -1,0 +1,259 @@
+"""What is watched: every way a run can fail ends it, in its time, and what a device may do does not."""
+
+import msgspec
+import pytest
+
+from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
+from tormagd.config import Config
+from tormagd.control.move.watch import SENSE_FAULT_S, SENSOR_FAULT_S, STARTING_S, STATUS_FAULT_S
+from tormagd.control.sight import UNSENSED_S
+from tormagd.hardware.link_quality import LinkQuality
+from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.operating_state import RefusedError
+
+PERIOD_S = 1e-3
+CONFIG = Config()
+TIMEOUT_S = CONFIG.device.measurement_timeout_ms * 1e-3
+
+# -- the device and its streams ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bit", DeviceFault)
+def test_a_fault_of_the_device_is_ours(running, bit: DeviceFault) -> None:
+    assert running.run_into(Fault(f"DEVICE_{bit.name}"), faults=bit, mode=DeviceMode.RETRACTING) == 1
+
+
+@pytest.mark.parametrize("bit", DeviceFault)
+def test_a_fault_of_the_device_is_ours_while_disabled_too(bench, bit: DeviceFault) -> None:
+    bench.step(faults=bit)
+    assert bench.faults == (Fault(f"DEVICE_{bit.name}"),)
+
+
+@pytest.mark.parametrize("mode", [DeviceMode.IDLE, DeviceMode.LATCHED, DeviceMode.HOMING, DeviceMode.RETRACTING])
+def test_a_device_that_stopped_running(running, mode: DeviceMode) -> None:
+    running.step(count=round(STARTING_S / PERIOD_S))
+    assert not running.faults
+    assert running.run_into(Fault.DEVICE_NOT_RUNNING, mode=mode) == 1
+
+
+def test_a_device_may_take_a_moment_to_start(bench) -> None:
+    bench.enabled(mode=DeviceMode.IDLE)
+    bench.step(count=round(STARTING_S / PERIOD_S) - 1, mode=DeviceMode.IDLE)
+    assert not bench.faults
+    assert bench.run_into(Fault.DEVICE_NOT_RUNNING, mode=DeviceMode.IDLE) <= 3
+
+
+def test_a_stale_measurement(running) -> None:
+    newest = running.measure(running.ticks)
+    running.silent(newest, count=round(TIMEOUT_S / PERIOD_S) - 1)
+    assert not running.faults
+    running.silent(newest)
+    assert running.faults == (Fault.MEASUREMENT_STALE,)
+    assert running.is_opened
+
+
+def test_a_measurement_over_a_slow_line(running) -> None:
+    """Each state comes at once after the last, but answers a drive of long ago: a loop around that would swing."""
+    running.step(count=5, delay_s=TIMEOUT_S - 1e-3)
+    assert not running.faults
+    assert running.run_into(Fault.MEASUREMENT_STALE, delay_s=TIMEOUT_S + 1e-3) == 1
+
+
+def test_a_sense_that_stops_is_a_limit_and_then_a_fault_where_the_scene_needs_it(running) -> None:
+    running.step(count=200)
+    last_s = running.now_s
+    assert Limit.SENSE_STALE not in running.step(count=round(UNSENSED_S / PERIOD_S), sensed_s=last_s).limits
+    assert running.step(count=2, sensed_s=last_s).limits == (Limit.SENSE_STALE,)
+    running.run_into(Fault.SENSE_STALE, sensed_s=last_s)
+    assert running.now_s - last_s == pytest.approx(SENSE_FAULT_S, abs=0.5 * PERIOD_S)
+
+
+def test_a_scene_that_does_without_the_sensor_does_without_its_messages(core, make_bench) -> None:
+    force = msgspec.structs.replace(core.scene.force, tolerance_rms_N=0.5 * core.scene.force.most_N)
+    bench = make_bench(msgspec.structs.replace(core.scene, force=force)).enabled()
+    bench.step(count=200)
+    assert bench.step(count=500, sensed_s=bench.now_s).limits == (Limit.SENSE_STALE,)
+    assert not bench.faults
+
+
+def test_a_status_that_stops_is_a_fault(running) -> None:
+    running.step(count=200)
+    last_s = running.now_s
+    running.step(count=round(STATUS_FAULT_S / PERIOD_S) - 1, reported_s=last_s)
+    assert not running.faults
+    assert running.run_into(Fault.STATUS_STALE, reported_s=last_s) == 1
+
+
+def test_a_sensor_that_stays_doubted_is_a_fault(running) -> None:
+    running.step(running.plan(80.0, sensor_doubted_s=SENSOR_FAULT_S))
+    assert not running.faults
+    assert running.run_into(Fault.SENSOR, running.plan(80.0, sensor_doubted_s=1.01 * SENSOR_FAULT_S)) == 1
+
+
+# -- where the carriages are ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_skew(running, side: float) -> None:
+    def apart(skew_mm: float) -> dict[str, float]:
+        return {"left_mm": -7.5 + side * skew_mm / 2.0, "right_mm": -7.5 - side * skew_mm / 2.0}
+
+    allowed_mm = CONFIG.limits.skew_fault_mm
+    for part in range(1, 41):  # no faster than carriages do
+        running.step(**apart(0.98 * allowed_mm * part / 40.0))
+    running.step(count=20, **apart(0.98 * allowed_mm))
+    for back_mm in (0.008, 0.016, 0.024, 0.032):  # as the loop wants it, so that nothing goes the wrong way
+        running.step(**apart(0.98 * allowed_mm - back_mm))
+    running.step(count=20, **apart(0.98 * allowed_mm - back_mm))
+    assert not running.faults
+    assert running.run_into(Fault.SKEW, **apart(1.02 * allowed_mm)) == 1
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_carriages_that_are_too_far_apart_are_not_enabled(bench, side: float) -> None:
+    half_mm = side * CONFIG.limits.skew_fault_mm / 2.0
+    bench.step(left_mm=-7.5 + 1.01 * half_mm, right_mm=-7.5 - 1.01 * half_mm)
+    with pytest.raises(RefusedError, match=r"1.01 mm apart: allowed is at most 1 mm") as caught:
+        bench.command("enable")
+    assert (caught.value.code, caught.value.hint) == ("skewed", "tormagctl home")
+    bench.step(left_mm=-7.5 + 0.99 * half_mm, right_mm=-7.5 - 0.99 * half_mm)
+    bench.command("enable")
+    assert not bench.faults
+
+
+@pytest.mark.parametrize("gap_mm", [-64.0, -40.0, -5.0, 0.0, 30.0, 100.5, 140.0])
+def test_carriages_where_none_can_be_are_a_fault_before_anything_is_driven(bench, gap_mm: float) -> None:
+    assert bench.run_into(Fault.OUT_OF_STROKE, **bench.gap(gap_mm)) == 1
+    assert bench.stepper.safety.needs_homing
+
+
+@pytest.mark.parametrize("switch", [Switches.LEFT_OPEN, Switches.RIGHT_OPEN])
+def test_an_open_switch_far_from_where_its_carriage_reads_is_a_fault(running, switch: Switches) -> None:
+    """Counts were lost, or the switch is stuck: then nothing is driven by either."""
+    assert running.run_into(Fault.OUT_OF_STROKE, switches=Switches.HOMED | switch) == 1
+
+
+def test_a_switch_that_is_newer_than_the_position_says_nothing(running) -> None:
+    """Status comes without a State, too: by then the carriage may have come to its switch."""
+    last = running.ticks
+    running.silent(running.measure(last), 8)
+    assert running.stepper.measure.sight.is_blind
+    open_now = Switches.HOMED | Switches.RIGHT_OPEN
+    running.silent(running.measure(last, switches=open_now, reported_s=running.now_s), 20)
+    assert not running.faults
+
+
+# -- how they move -------------------------------------------------------------------------------------------------
+
+
+def test_a_gap_that_does_not_follow(make_bench) -> None:
+    """The carriages creep, so that they do move, but by far too little."""
+    bench = make_bench(limits={"no_motion_time_s": 10.0}).enabled()
+    while bench.watch.straying_s == 0.0:
+        bench.step(50.0)
+        assert bench.ticks < 1_000
+    took_s = bench.run_into(Fault.FOLLOWING_ERROR, 50.0) * PERIOD_S
+    assert took_s == pytest.approx(CONFIG.limits.following_time_s, abs=2.5e-3)
+
+
+def test_following_again_in_time_is_no_fault(running) -> None:
+    away_mm = [80.0 - 3.5 * part / 16.0 for part in range(1, 17)]
+    for _ in range(3):
+        # the gap is 3.5 mm away from where the reference rests, for less than the time allowed
+        for gap_mm in (*away_mm, *[away_mm[-1]] * 20, *reversed(away_mm)):
+            running.step(**running.gap(gap_mm))
+        running.step(count=20)
+    assert not running.faults
+
+
+def test_a_carriage_that_is_driven_and_does_not_move(running) -> None:
+    assert running.run_into(Fault.NO_MOTION, 60.0) * PERIOD_S < 0.25
+
+
+@pytest.mark.parametrize("switch", [Switches.LEFT_OPEN, Switches.RIGHT_OPEN])
+def test_one_carriage_at_its_switch_excuses_no_other(bench, switch: Switches) -> None:
+    at_end = bench.gap(94.4)
+    bench.enabled(**at_end)
+    bench.run_into(Fault.NO_MOTION, 95.0, **at_end, switches=Switches.HOMED | switch)
+
+
+def test_a_process_that_stood_still_saw_no_carriage_stand_still(running) -> None:
+    """One look before the pause and one after it say nothing of what the carriages did between."""
+    running.step(60.0, count=30)
+    assert running.watch.still_s > 0.0
+    running.ticks += round(CONFIG.limits.no_motion_time_s / PERIOD_S)
+    running.step(60.0, count=2)
+    assert not running.faults
+
+
+@pytest.mark.parametrize("target_mm", [60.0, 90.0])
+def test_carriages_that_go_the_other_way_are_named(running, target_mm: float) -> None:
+    """Both, so that nothing skews; what the loop does about it makes it worse."""
+    at_mm = -7.5
+    while not running.faults:
+        output = running.step(target_mm, left_mm=at_mm, right_mm=at_mm)
+        at_mm -= 15.0 * output.left_duty * PERIOD_S
+        assert running.ticks < 300
+    assert running.faults[0] is Fault.WRONG_DIRECTION
+    assert abs(at_mm + 7.5) < 2.5
+    assert running.is_opened
+    assert running.stepper.safety.needs_homing
+
+
+def test_a_carriage_that_goes_the_other_way_into_its_stop_is_named(running) -> None:
+    at_mm = -7.5
+    while not running.faults:
+        running.step(60.0, left_mm=at_mm, right_mm=at_mm)
+        at_mm = min(at_mm + 0.015, -7.0)
+        assert running.ticks < 300
+    assert set(running.faults) <= {Fault.WRONG_DIRECTION, Fault.NO_MOTION}
+    assert running.faults[0] is Fault.WRONG_DIRECTION
+
+
+def test_too_much_force_opens_and_is_then_a_fault(running) -> None:
+    limits = [running.step(force_N=3.0).limits for _ in range(35)]
+    assert Limit.OVER_FORCE not in limits[5]
+    assert Limit.OVER_FORCE in limits[30]
+    assert running.move.reference.gap_mm > 80.0
+    assert running.run_into(Fault.OVER_FORCE, force_N=3.0) < 20
+
+
+# -- the wire and the clock ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("link", "limits"),
+    [
+        (LinkQuality(), ()),
+        (LinkQuality(unanswered=0.019, damaged=0.019, unsent=0.019, round_trip_s=5e-3, clock_drift=0.0099), ()),
+        (LinkQuality(unanswered=0.021), (Limit.LINK_DEGRADED,)),
+        (LinkQuality(damaged=0.021), (Limit.LINK_DEGRADED,)),
+        (LinkQuality(unsent=0.021), (Limit.LINK_DEGRADED,)),
+        (LinkQuality(round_trip_s=7e-3), (Limit.LINK_DEGRADED,)),
+        (LinkQuality(clock_drift=0.011), (Limit.CLOCK,)),
+        (LinkQuality(clock_drift=-0.011), (Limit.CLOCK,)),
+    ],
+)
+def test_a_wire_or_a_clock_that_is_not_what_it_should_be_is_a_limit(running, link: LinkQuality, limits) -> None:
+    assert running.step(count=50, link=link).limits == limits
+    assert not running.faults
+
+
+@pytest.mark.parametrize(
+    ("link", "fault", "code"),
+    [
+        (LinkQuality(round_trip_s=0.012), Fault.LINK_DEGRADED, "link_degraded"),
+        (LinkQuality(clock_drift=0.11), Fault.CLOCK, "clock"),
+        (LinkQuality(clock_drift=-1.0), Fault.CLOCK, "clock"),
+    ],
+)
+def test_what_would_swing_is_opened_and_not_enabled_in_the_first_place(
+    bench, link: LinkQuality, fault: Fault, code: str
+) -> None:
+    bench.step(count=3)
+    with pytest.raises(RefusedError, match="allowed is") as caught:
+        bench.command("enable", round_trip_s=link.round_trip_s, clock_drift=link.clock_drift)
+    assert caught.value.code == code
+    bench.command("enable")
+    bench.step(count=20)
+    assert bench.run_into(fault, link=link) == 1

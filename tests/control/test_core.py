@@ -1,0 +1,433 @@
+"""The whole Stepper: deterministic, what ends a run opens the device, no input asks for more than the whole duty."""
+
+import contextlib
+import math
+
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
+from tormagd.config import Config
+from tormagd.control.move.watch import STARTING_S
+from tormagd.control.plausible import LEAP_MM
+from tormagd.control.sight import BLIND_S
+from tormagd.exact import plain
+from tormagd.hardware.measurement import Measurement
+from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.operating_state import CLEARING_S, DeviceRequest, OperatingState, RefusedError
+
+PERIOD_S = 1e-3
+CONFIG = Config()
+
+
+def test_disabled_means_off(bench) -> None:
+    output = bench.step(45.0, count=10)
+    assert bench.is_off
+    assert (output.request, output.request_number, output.limits) == (DeviceRequest.NONE, 0, ())
+
+
+def test_enabling_is_bumpless(running) -> None:
+    """At the planned gap, at rest: the first duties are none, whatever was learned in an earlier run."""
+    running.step(60.0, count=50)
+    running.command("disable")
+    running.step(count=3)
+    running.command("enable")
+    for _ in range(20):
+        assert running.step().left_duty == pytest.approx(0.0, abs=1e-9)
+    assert running.move.left.integral == pytest.approx(0.0, abs=1e-12)
+
+
+def test_enabling_wants_a_measurement(bench) -> None:
+    with pytest.raises(RefusedError) as caught:
+        bench.command("enable")
+    assert caught.value.code == "not_fresh"
+    assert bench.stepper.safety.operating_state is OperatingState.DISABLED
+
+
+# -- counts that jump ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("jump_mm", [0.0018, 0.05, 0.4, -0.4])
+def test_counts_that_jump_and_come_back_do_no_harm(running, jump_mm: float) -> None:
+    """A burst on an encoder line, shorter than any motion: a push where a carriage may have gone so far, none where no
+    carriage goes; no fault, and nothing left of it soon."""
+    pushed = running.step(left_mm=-7.5 + jump_mm)
+    if abs(jump_mm) < LEAP_MM:
+        assert -1.0 <= pushed.left_duty * math.copysign(1.0, jump_mm) < 0.0
+    else:
+        assert running.is_held
+        assert pushed.limits == (Limit.ENCODER,)
+    settled = running.step(count=400)
+    assert not running.faults
+    assert abs(settled.left_duty) < 0.05
+    assert abs(running.move.left.integral) < 0.05
+
+
+@pytest.mark.parametrize("side", ["left_mm", "right_mm"])
+@pytest.mark.parametrize("jump_mm", [-120.0, -37.4, 0.9, 1.5, 8.0])
+def test_counts_of_either_side_that_jump_away_are_held_and_a_fault(running, side: str, jump_mm: float) -> None:
+    """A lost or wrapped counter is not followed, and is a fault as soon as the device says that it was not reset. What
+    is less than 1 mm is no skew."""
+    assert running.step(**{side: -7.5 + jump_mm}).limits == (Limit.ENCODER,)
+    assert running.is_held
+    assert running.run_into(Fault.ENCODER, **{side: -7.5 + jump_mm}) == 1
+
+
+@pytest.mark.parametrize("jump_mm", [-4.0, 0.5, 4.0])
+def test_counts_of_both_sides_that_jump_alike_are_a_fault_too(running, jump_mm: float) -> None:
+    """No skew shows them, and a gap that seems 8 mm wider is closed by as much."""
+    jumped = running.gap(80.0 + 2.0 * jump_mm)
+    running.step(**jumped, reported_s=0.0)
+    assert not running.faults, "it may have been reset"
+    running.run_into(Fault.ENCODER, **jumped)
+    assert running.stepper.safety.needs_homing
+
+
+def test_counts_that_a_reset_sets_back_are_the_resets(running) -> None:
+    running.step(count=round(STARTING_S / PERIOD_S))
+    running.step(left_mm=0.0, right_mm=0.0, reported_s=running.now_s, count=10)
+    assert not running.faults
+    running.step(count=200, left_mm=0.0, right_mm=0.0, mode=DeviceMode.IDLE, switches=Switches(0))
+    assert running.faults == (Fault.DEVICE_NOT_RUNNING,)
+
+
+@pytest.mark.parametrize("speed_mm_s", [-19.0, 19.0])
+@pytest.mark.parametrize("missing", [1, 5, 40])
+def test_what_a_carriage_does_at_full_speed_is_no_leap(bench, speed_mm_s: float, missing: int) -> None:
+    """Also where States are missing in between."""
+    at_mm = -7.5
+    for _ in range(10):
+        bench.ticks += missing - 1
+        at_mm = min(max(at_mm + missing * PERIOD_S * speed_mm_s, -24.0), 0.0)
+        bench.step(left_mm=at_mm, right_mm=at_mm)
+    assert bench.stepper.measure.leap is None
+    assert not bench.faults
+
+
+def test_after_an_encoder_fault_positions_are_unknown_until_the_device_has_homed(running) -> None:
+    running.run_into(Fault.ENCODER, left_mm=-5.0)
+    assert not running.stepper.measured.is_homed
+    running.command("clear-fault")
+    for name in ("enable", "home", "enable"):
+        running.step(count=5)
+        assert not running.stepper.measured.is_homed
+        if name == "home":
+            running.command(name)
+            continue
+        with pytest.raises(RefusedError) as caught:
+            running.command(name)
+        assert caught.value.code == "not_homed"
+    running.step(count=30, mode=DeviceMode.HOMING, switches=Switches.LEFT_OPEN | Switches.RIGHT_OPEN)
+    assert not running.stepper.measured.is_homed
+    running.step(count=2)
+    assert running.stepper.measured.is_homed
+    running.command("enable")
+    assert running.step().mode is DriveMode.RUN
+
+
+def test_homing_forgets_the_motion_before_it(bench) -> None:
+    bench.step(count=5)
+    for tick in range(5):
+        bench.step(mode=DeviceMode.HOMING, left_mm=float(tick), right_mm=float(tick), switches=Switches(0))
+    bench.step(left_mm=0.0, right_mm=0.0)
+    # the origin jumped by 4 mm with the last homing state: one period's filtered jump is not carried further
+    bench.step(left_mm=0.0, right_mm=0.0, mode=DeviceMode.RETRACTING)
+    assert bench.stepper.measured.left_mm_s == 0.0
+
+
+def test_a_homing_that_presses_shut_is_ended_and_named(bench) -> None:
+    at_mm = -7.5
+    bench.step(count=3)
+    bench.command("home")
+    while not bench.faults:
+        at_mm -= 0.012
+        bench.step(left_mm=at_mm, right_mm=-7.5, mode=DeviceMode.HOMING, switches=Switches(0))
+        assert at_mm > -12.0
+    assert bench.faults == (Fault.WRONG_DIRECTION,)
+    assert bench.output.request is DeviceRequest.RETRACT
+    assert bench.stepper.homing.went_back_mm[0] > 2.9
+
+
+# -- a link that goes, and numbers that are none -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("names", [[], ["pause"]])
+@pytest.mark.parametrize("is_between", [False, True], ids=["nothing measured", "between two steps"])
+def test_a_lost_link_is_a_fault_while_driven(running, names: list[str], is_between: bool) -> None:
+    """However it went: nothing that was armed is still armed when measurements come back."""
+    for name in names:
+        running.command(name)
+    if is_between:
+        running.stepper.lose_link()
+    else:
+        running.silent(None)
+        assert running.is_opened
+    safety = running.stepper.safety
+    assert (safety.faults, safety.request) == ((Fault.LINK_LOST,), DeviceRequest.RETRACT)
+    assert running.stepper.measured is None
+    running.stepper.lose_link()
+    assert running.stepper.safety == safety
+    running.step(count=5)
+    assert running.is_opened
+
+
+def test_a_lost_link_is_no_fault_while_disabled(bench) -> None:
+    bench.step()
+    output = bench.silent(None, count=5)
+    assert bench.is_off
+    assert (output.request, output.request_number, output.limits) == (DeviceRequest.NONE, 0, ())
+    bench.stepper.lose_link()
+    assert bench.faults == ()
+    assert bench.stepper.measured is None
+
+
+def test_a_number_that_is_not_finite(running) -> None:
+    running.step(math.nan)
+    assert running.faults == (Fault.NOT_FINITE,)
+    assert running.is_opened
+    running.command("clear-fault")
+    running.step(count=3)
+    running.command("enable")
+    running.step(79.0, count=10)
+    assert all(math.isfinite(duty) for duty in running.driven[1:])
+
+
+@pytest.mark.parametrize("name", ["left_mm", "right_mm", "supply_V", "device_time_s"])
+def test_a_measurement_that_is_not_finite_reaches_no_duty(running, name: str) -> None:
+    for value in (math.nan, math.inf, -math.inf):
+        running.step(79.0, **{name: value})
+        assert all(abs(duty) <= 1.0 for duty in running.driven[1:])
+
+
+# -- commands ------------------------------------------------------------------------------------------------------
+
+
+def test_pause_holds_the_gap_and_resume_goes_on(running) -> None:
+    running.step(79.0, count=8)
+    running.command("pause")
+    running.step(50.0, count=100)
+    held = running.move.reference
+    assert held.speed_mm_s == pytest.approx(0.0, abs=1e-6)
+    running.step(50.0, count=50)
+    assert running.move.reference.gap_mm == pytest.approx(held.gap_mm, abs=1e-6)
+    assert running.output.mode is DriveMode.RUN
+    assert not running.faults
+    running.command("resume")
+    running.step(78.0, count=30)
+    assert running.move.reference.gap_mm < held.gap_mm - 0.2
+
+
+def test_disable_and_stop_open(running) -> None:
+    running.command("disable")
+    assert running.step().request is DeviceRequest.RETRACT
+    assert running.is_off
+    assert not running.faults
+    running.command("stop")
+    running.step()
+    assert running.faults == (Fault.STOPPED,)
+    assert running.is_opened
+
+
+def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench) -> None:
+    broken = {"faults": DeviceFault.OVERCURRENT, "mode": DeviceMode.LATCHED}
+    bench.step(**broken)
+    bench.command("clear-fault", device_latched=True)
+    assert bench.step(**broken).request is DeviceRequest.CLEAR
+    assert bench.faults == ()
+    ticks = bench.run_into(Fault.DEVICE_OVERCURRENT, **broken)
+    assert ticks * PERIOD_S == pytest.approx(CLEARING_S, abs=2e-3)
+
+
+def test_a_latched_fault_asks_once_and_stays(running) -> None:
+    running.run_into(Fault.DEVICE_SKEW, faults=DeviceFault.SKEW, mode=DeviceMode.RETRACTING)
+    number = running.output.request_number
+    output = running.step(faults=DeviceFault.SKEW, mode=DeviceMode.LATCHED, count=100)
+    assert output.request_number == number
+    running.step(count=100)
+    assert running.faults == (Fault.DEVICE_SKEW,)
+    assert running.is_opened
+
+
+# -- any input -----------------------------------------------------------------------------------------------------
+
+measurements = st.none() | st.builds(
+    Measurement,
+    number=st.integers(0, 5),
+    received_s=st.floats(-1.0, 1.0),
+    device_time_s=st.floats(0.0, 1.0),
+    left_mm=st.floats(-60.0, 10.0),
+    right_mm=st.floats(-60.0, 10.0),
+    left_current_A=st.floats(-32.0, 32.0),
+    right_current_A=st.floats(-32.0, 32.0),
+    force_N=st.floats(-32.0, 32.0),
+    handle_mm=st.floats(-1e4, 1e4),
+    mode=st.sampled_from(DeviceMode),
+    switches=st.sampled_from([Switches.HOMED, Switches(0), Switches.HOMED | Switches.LEFT_OPEN]),
+    faults=st.sampled_from([DeviceFault(0), DeviceFault(0), DeviceFault(0), *DeviceFault]),
+    temperature_C=st.floats(-40.0, 125.0),
+    supply_V=st.floats(0.0, 25.5),
+    sensed_s=st.floats(0.0, 1.0),
+    reported_s=st.floats(0.0, 1.0),
+)
+plans = st.fixed_dictionaries(
+    {"gap_mm": st.floats(45.0, 95.0), "time_s": st.floats(-1.0, 1.0), "gap_speed_mm_s": st.floats(-38.0, 38.0)}
+)
+elapsed = st.sampled_from([0.0, 1e-3, 1e-3, 1e-5, 0.1, 5.0, 3_600.0, -1e-3, -10.0])
+commands = st.none() | st.sampled_from(["enable", "disable", "pause", "resume", "home", "stop", "clear-fault"])
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    history=st.lists(st.tuples(elapsed, measurements, plans, commands), min_size=1, max_size=25),
+    limit=st.floats(0.1, 1.0),
+)
+def test_any_history_keeps_duties_in_bounds_and_repeats_itself(make_bench, history, limit: float) -> None:
+    runs: list[list[object]] = [[], []]
+    for trace in runs:
+        bench, number = make_bench(position={"duty_limit": limit}), 0
+        for elapsed_s, measurement, plan, name in history:
+            bench.now_s += elapsed_s
+            if name is not None:
+                with contextlib.suppress(RefusedError):
+                    bench.command(name)
+            output = bench.at(bench.now_s, measurement, bench.plan(**plan))
+            assert all(abs(duty) <= limit for duty in bench.driven[1:])
+            is_driven = bench.stepper.safety.operating_state in (OperatingState.ENABLED, OperatingState.PAUSED)
+            assert (output.mode is DriveMode.RUN) == is_driven
+            assert is_driven or bench.is_off
+            assert output.request_number >= number
+            number = output.request_number
+            trace.append((plain(bench.stepper), output))
+    assert runs[0] == runs[1]
+
+
+# -- clocks and stalls ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def make_moving(make_bench):
+    """Makes benches on the way from 80 to 60 mm, whose carriages are where they are wanted."""
+
+    def make():
+        moving = make_bench().enabled()
+        for _ in range(10):
+            moving.step(60.0, **moving.there)
+        return moving
+
+    return make
+
+
+@pytest.mark.parametrize("elapsed_s", [0.0, -1e-3, -1e6])
+def test_a_clock_that_stands_still_is_one_ordinary_period(make_moving, elapsed_s: float) -> None:
+    moved_mm = []
+    for after_s in (PERIOD_S, elapsed_s):
+        moving = make_moving()
+        before_mm, later_s = moving.move.reference.gap_mm, moving.now_s + after_s
+        moving.at(later_s, moving.measure(moving.ticks + 1, received_s=later_s, **moving.there), 60.0)
+        moved_mm.append(moving.move.reference.gap_mm - before_mm)
+    assert moved_mm[0] < -0.01
+    assert moved_mm[1] == pytest.approx(moved_mm[0])
+
+
+@pytest.mark.parametrize("elapsed_s", [BLIND_S + 1e-4, 0.011, 0.048, 1.0, 1e9])
+@pytest.mark.parametrize(
+    "has_more", [False, True], ids=["nothing came", "what came before the stall was read after it"]
+)
+def test_after_a_stall_one_drive_asks_and_moves_nothing(make_moving, elapsed_s: float, has_more: bool) -> None:
+    """Whatever is found then is older than the stall. The reference waits, and nothing is learned or concluded."""
+    moving = make_moving()
+    move, watch, later_s = plain(moving.move), moving.watch, moving.now_s + elapsed_s
+    times_s = (watch.still_s, watch.straying_s)
+    received_s = later_s if has_more else moving.now_s
+    old = moving.measure(moving.ticks + has_more, received_s=received_s, **moving.there)
+    assert moving.at(later_s, old, 60.0).limits == (Limit.HOST_STALL,)
+    assert moving.is_held
+    assert not moving.faults
+    assert plain(moving.move) == move
+    assert (watch.still_s, watch.straying_s) == times_s
+    assert moving.stepper.measure.sight.stall_s == pytest.approx(elapsed_s)
+
+
+@pytest.mark.parametrize("came_mm", [0.0, -1.7, 1.0])
+def test_the_answer_to_it_is_gone_on_from_without_a_kick(make_moving, came_mm: float) -> None:
+    """The device went on with its last duty meanwhile, and is not where it was wanted before."""
+    moving = make_moving()
+    # carriages that are where they are wanted at once pass for lively, and those are braked harder
+    moving.move.acceleration_scale = 1.0
+    integral, came_mm = moving.move.left.integral, moving.move.reference.gap_mm + came_mm
+    for number, at_s in enumerate((moving.now_s + 0.045, moving.now_s + 0.046), moving.ticks):
+        answer = moving.measure(number, received_s=at_s, device_time_s=at_s, **moving.gap(came_mm))
+        output = moving.at(at_s, answer, came_mm)
+    assert not moving.faults
+    assert moving.move.reference.gap_mm == pytest.approx(came_mm, abs=0.1)
+    assert abs(output.left_duty) < 0.6
+    assert moving.move.left.integral == pytest.approx(integral, abs=0.02)
+    assert Limit.HOST_STALL in output.limits
+
+
+def test_without_an_answer_in_time_the_measurement_is_stale(running) -> None:
+    """The device is given some milliseconds, whatever the stall has left of the timeout, and no more."""
+    newest = running.measure(running.ticks)
+    running.ticks += round(CONFIG.device.measurement_timeout_ms) - 2
+    begun = running.ticks
+    while not running.faults:
+        running.silent(newest)
+        assert running.driven[1:] == (0.0, 0.0)
+        assert running.ticks - begun < 100
+    assert running.faults == (Fault.MEASUREMENT_STALE,)
+    assert running.ticks - begun == pytest.approx(2.0 * BLIND_S / PERIOD_S, abs=2)
+    assert running.is_opened
+
+
+def test_a_slow_loop_takes_no_period_of_its_own_for_a_stall(make_bench) -> None:
+    bench = make_bench(rates={"control_hz": 100, "telemetry_hz": 50, "inference_hz": 100})
+    for tick in range(1, 8):
+        output = bench.at(0.01 * tick, bench.measure(tick, received_s=0.01 * tick), 79.0)
+        if tick == 3:
+            bench.command("enable")
+    assert output.left_duty < 0.0
+    assert Limit.HOST_STALL not in output.limits
+    assert bench.at(bench.now_s + 0.06, bench.measure(tick), 79.0).limits == (Limit.HOST_STALL,)
+
+
+def test_a_silent_device_is_held_where_it_is_and_named(running) -> None:
+    running.step(79.0, count=10)
+    newest, integral = running.measure(running.ticks), running.move.left.integral
+    running.silent(newest, count=round(BLIND_S / PERIOD_S) + 1)
+    held = plain(running.move)
+    for _ in range(30):
+        assert running.silent(newest).limits == (Limit.DEVICE_SILENT,)
+        assert running.is_held
+    assert plain(running.move) == held
+    assert abs(running.move.left.integral - integral) < 0.05
+    back = running.step()
+    assert Limit.DEVICE_SILENT not in back.limits
+    assert abs(back.left_duty) < 0.2
+    assert not running.faults
+
+
+@pytest.mark.parametrize(("stall_ms", "fault"), [(83, Fault.HOST_STALL), (36, Fault.DEVICE_COMMAND_TIMEOUT)])
+def test_a_device_that_opened_because_of_a_stall_is_told_as_that(running, stall_ms: int, fault: Fault) -> None:
+    """One fault, though the device goes on saying that it heard nothing; a shorter stall cannot have done it."""
+    running.ticks += stall_ms
+    running.step(count=16)
+    assert not running.faults
+    opened = {"faults": DeviceFault.COMMAND_TIMEOUT, "mode": DeviceMode.RETRACTING}
+    assert running.run_into(fault, **opened) == 1
+    running.step(count=500, **opened | {"mode": DeviceMode.LATCHED})
+    assert running.faults == (fault,)
+    assert running.is_opened
+
+
+@settings(max_examples=60, deadline=None)
+@given(stalls_ms=st.lists(st.tuples(st.integers(6, 49), st.integers(3, 40)), min_size=1, max_size=8))
+def test_stalls_that_the_device_survives_are_never_a_fault(make_bench, stalls_ms: list[tuple[int, int]]) -> None:
+    """However they follow each other, held or moving; the duty right after each is none."""
+    bench = make_bench().enabled()
+    for stall_ms, ran_ms in stalls_ms:
+        bench.ticks += stall_ms
+        bench.step(79.9)
+        assert bench.is_held
+        bench.step(79.9, count=ran_ms)
+        assert not bench.faults
+        assert abs(bench.move.left.integral) < 0.3

@@ -1,0 +1,164 @@
+"""What is measured: gap and speeds from the encoders, the handle's motion since it turned."""
+
+import math
+
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from firmware_protocol.codec import Switches
+from tormagd.control.measure import Measure
+from tormagd.control.records import Measured
+from tormagd.hardware.measurement import Measurement
+from tormagd.model.displacement import MOBILISED_MM, TURN_MM
+
+COUNT_MM = 8.0 / 4480.0
+HANDLE_COUNT_MM = 2.0 * math.pi * 20.0 / 16384.0
+
+
+class Look:
+    """The stage, which is shown one measurement after another."""
+
+    def __init__(self) -> None:
+        self._stage = Measure(47.5, 0.003, turns=True, full_speed_mm_s=20.0, period_s=1e-3)
+
+    def __call__(self, *measurements: Measurement) -> Measured:
+        """What is measured after these."""
+        for measurement in measurements:
+            measured = self._stage.update(0.0, 1e-3, measurement, needs_homing=False)
+        assert measured is self._stage.measured
+        return measured
+
+
+@pytest.fixture
+def look() -> Look:
+    return Look()
+
+
+@pytest.fixture(scope="session")
+def follow_handle(measure):
+    """What is measured after the handle has been at each of these places, a millisecond apart."""
+
+    def follow(positions: list[float], force_N: float = 0.6) -> Measured:
+        return Look()(*[measure(number, handle_mm=mm, force_N=force_N) for number, mm in enumerate(positions)])
+
+    return follow
+
+
+def test_the_first_is_at_rest(look: Look, measure) -> None:
+    measured = look(measure(3, left_mm=-10.0, right_mm=-10.5))
+    assert (measured.left_mm, measured.right_mm) == (37.5, 37.0)
+    assert measured.gap_mm == 74.5
+    assert measured.skew_mm == 0.5
+    assert (measured.left_mm_s, measured.right_mm_s, measured.handle.rate_mm_s) == (0.0, 0.0, 0.0)
+    assert measured.handle.displacement_mm == 0.0
+
+
+def test_the_same_measurement_again_changes_nothing(look: Look, measure) -> None:
+    second = look(measure(0), measure(1, left_mm=-7.4))
+    assert look(measure(1, left_mm=-7.4, received_s=9.0)) is second
+
+
+@pytest.mark.parametrize("device_time_s", [0.005, 0.004, -1.0])
+def test_a_device_clock_that_does_not_advance_gives_no_speed(look: Look, measure, device_time_s: float) -> None:
+    last = look(measure(5))
+    assert look(measure(6, device_time_s=device_time_s, left_mm=-6.0)) is last
+
+
+@settings(max_examples=40, deadline=None)
+@given(speed=st.floats(-40.0, 40.0), dt_s=st.floats(2e-4, 5e-3))
+def test_speeds_are_those_of_a_steady_motion(measure, speed: float, dt_s: float) -> None:
+    look = Look()
+    for number in range(200):
+        way_mm = speed * number * dt_s
+        moved = {"left_mm": -20.0 + way_mm, "right_mm": -20.0 - way_mm}
+        measured = look(measure(number, device_time_s=number * dt_s, **moved))
+    assert measured.left_mm_s == pytest.approx(speed, rel=1e-3, abs=1e-6)
+    assert measured.right_mm_s == pytest.approx(-speed, rel=1e-3, abs=1e-6)
+
+
+def test_late_delivery_is_not_slow_motion(measure) -> None:
+    """Speeds are over the device's clock: when a measurement was received does not matter."""
+    came = []
+    for delay_s in (0.0, 0.05):
+        look = Look()
+        for number in range(20):
+            received_s = number * 1e-3 + delay_s * (number % 2)
+            measured = look(measure(number, left_mm=-20.0 + 0.01 * number, received_s=received_s))
+        came.append(measured)
+    assert came[0] == came[1].replaced(sensed_s=came[0].sensed_s)
+
+
+@pytest.mark.parametrize("missing", [1, 10, 100])
+def test_a_handle_that_nobody_hears_of_has_not_stopped(look: Look, measure, missing: int) -> None:
+    """States come without a Sense for a while; the handle goes on at 42 mm/s meanwhile."""
+    before = look(*[measure(number) for number in range(300)]).handle
+    assert before.rate_mm_s == pytest.approx(42.0, rel=0.01)
+    old = measure(299)
+    for number in range(300, 300 + missing):
+        measured = look(measure(number, handle_mm=old.handle_mm, force_N=old.force_N, sensed_s=old.sensed_s))
+        assert (measured.handle, measured.sensed_s) == (before, old.sensed_s)
+    handle = look(measure(300 + missing)).handle
+    assert handle.rate_mm_s == pytest.approx(42.0, rel=0.01)
+    assert handle.sliding_mm_s == pytest.approx(42.0, rel=0.01)
+
+
+def test_one_encoder_count_is_filtered(look: Look, measure) -> None:
+    """A count in a millisecond is 1.8 mm/s of noise; the filter takes three quarters of it."""
+    after = look(measure(0), measure(1, left_mm=-7.5 + COUNT_MM))
+    assert after.left_mm_s == pytest.approx(COUNT_MM / 1e-3 / 4.0)
+    assert after.right_mm_s == 0.0
+
+
+def test_displacement_counts_from_the_reversal(follow_handle) -> None:
+    handle = follow_handle([*[0.1 * k for k in range(51)], 4.9, 4.5, 4.0]).handle
+    assert handle.turn.direction == -1.0
+    assert handle.turn.turned_mm == pytest.approx(5.0)  # where it turned, not where that was noticed
+    assert handle.displacement_mm == pytest.approx(1.0)
+
+
+def test_displacement_saturates_where_friction_is_mobilised(follow_handle) -> None:
+    forth = [0.1 * k for k in range(51)]
+    assert follow_handle(forth).handle.displacement_mm == MOBILISED_MM
+    back = [5.0 - 0.1 * k for k in range(1, 100)]
+    assert follow_handle(forth + back).handle.displacement_mm == MOBILISED_MM
+
+
+@settings(max_examples=60, deadline=None)
+@given(wobble=st.lists(st.floats(-TURN_MM, 0.0), min_size=1, max_size=30))
+def test_a_wobble_below_the_threshold_is_no_reversal(follow_handle, wobble: list[float]) -> None:
+    turn = follow_handle([0.0, 1.0, 3.0, *(3.0 + offset for offset in wobble)]).handle.turn
+    assert (turn.direction, turn.furthest_mm) == (1.0, 3.0)
+
+
+def test_encoder_noise_at_rest_is_no_reversal(follow_handle) -> None:
+    handle = follow_handle([3.0 + HANDLE_COUNT_MM * (k % 2) for k in range(500)]).handle
+    assert handle.turn.direction == 1.0
+    assert abs(handle.rate_mm_s) < 1.0
+
+
+def test_slow_creep_back_is_a_reversal_in_the_end(follow_handle) -> None:
+    """A reversal is counted from the furthest point: many small steps back are one."""
+    steps = [3.0 - HANDLE_COUNT_MM * k for k in range(20)]
+    assert follow_handle([0.0, 3.0, *steps]).handle.turn.direction == -1.0
+
+
+@settings(max_examples=60, deadline=None)
+@given(positions=st.lists(st.floats(-50.0, 50.0), min_size=2, max_size=60))
+def test_displacement_never_leaves_its_range(follow_handle, positions: list[float]) -> None:
+    handle = follow_handle(positions).handle
+    assert 0.0 <= handle.displacement_mm <= MOBILISED_MM
+    assert handle.turn.direction in (-1.0, 1.0)
+    assert math.isfinite(handle.rate_mm_s)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_force_and_rate_are_positive_along_the_motion(follow_handle, way: float) -> None:
+    """The sensor's sign is the motion's; what is measured is resistance."""
+    measured = follow_handle([way * 0.05 * k for k in range(200)], force_N=way * 0.6)
+    assert measured.force_N == 0.6
+    assert measured.handle.rate_mm_s == pytest.approx(50.0, rel=0.05)
+
+
+def test_whether_it_is_homed_is_the_devices_word(measure) -> None:
+    assert Look()(measure(0)).is_homed
+    assert not Look()(measure(0, switches=Switches(0))).is_homed

@@ -1,0 +1,71 @@
+"""Carriages that lose no time: the bound of what a loop can do with the knowledge that it has.
+
+They are in the plan's gap at once, as far as their top speed lets them. Core, protocol, element and sensor stay as they
+are, so what is missed with these is the plan's, and the rest of the error the carriages'.
+"""
+
+import math
+from typing import Final, final
+
+from tormagd.assembly.build import Core
+from tormagd.control.core import Stepper
+from tormagd.control.move.actuator import Actuator, Drive
+from tormagd.control.move.carriages import CARRY_S
+from tormagd.control.move.reference import Reference
+from tormagd.control.records import Measured, Plan
+from tormagd.hardware.measurement import Measurement
+from tormagd.safety.codes import Limit
+from tormagd.simulation.plant import Plant
+
+
+@final
+class IdealCarriages(Actuator):
+    """Moves the gap of one simulated device, whose motors rest."""
+
+    def __init__(self, core: Core, plant: Plant) -> None:
+        super().__init__()
+        insert = core.scene.insert
+        self._closed_mm: Final = insert.gap_closed_mm
+        self._open_mm: Final = insert.gap_open_mm
+        self._top_speed_mm_s: Final = core.gap_speed_mm_s
+        self._plant: Final = plant
+
+    def begin(self, gap_mm: float) -> None:
+        """See `Actuator.begin`."""
+        self.reference = Reference(gap_mm)
+
+    def resume(self, measured: Measured) -> None:
+        """See `Actuator.resume`."""
+        self.begin(measured.gap_mm)
+
+    def update(
+        self,
+        now_s: float,
+        dt_s: float,
+        plan: Plan | None,
+        measurement: Measurement,
+        measured: Measured,
+        is_over: bool,
+    ) -> Drive:
+        """See `Actuator.update`."""
+        before_mm = self._plant.gap_mm
+        wanted_mm = before_mm
+        if plan is not None:
+            age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S)
+            wanted_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
+            wanted_mm = self._open_mm if is_over else max(wanted_mm, plan.min_gap_mm)
+        wanted_mm = min(max(wanted_mm, self._closed_mm), self._open_mm)
+        reach_mm = self._top_speed_mm_s * dt_s
+        gap_mm = min(max(wanted_mm, before_mm - reach_mm), before_mm + reach_mm)
+        lead_mm_rad = self._plant.parameters.screw.lead_mm / math.tau
+        for axis in (self._plant.left, self._plant.right):
+            # the screw turns with the carriage, so the encoder sees it
+            axis.position_m += 0.5e-3 * (gap_mm - before_mm)
+            axis.angle_rad += 0.5 * (gap_mm - before_mm) / lead_mm_rad
+        self.reference = Reference(gap_mm, (gap_mm - before_mm) / dt_s)
+        return Drive(0.0, 0.0, 0.0, 0.0, [] if gap_mm == wanted_mm else [Limit.RATE])
+
+
+def ideal_stepper(core: Core, plant: Plant) -> Stepper:
+    """Steps of a core whose carriages are ideal, on that simulated device."""
+    return Stepper(core.config, core.scene, move=IdealCarriages(core, plant))
