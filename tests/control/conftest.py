@@ -1,5 +1,6 @@
 """What the control tests share: one core, and a device that is described instead of simulated."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +11,10 @@ import pytest
 from firmware_protocol.codec import DeviceFault, DeviceMode, DriveMode, Switches
 from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config
-from tormagd.control.core import Stepper
-from tormagd.control.records import Duty, Plan
+from tormagd.control.core import Planner, Stepper
+from tormagd.control.records import Duty, Handle, Measured, Plan, TimedSetpoint
 from tormagd.hardware.measurement import Measurement
+from tormagd.model.displacement import MOBILISED_MM, Turn
 from tormagd.model.memory import NO_MEMORY
 from tormagd.model.model_file import ForceModel, load_model
 from tormagd.safety.codes import Fault
@@ -24,6 +26,8 @@ PERIOD_S = 1e-3
 READY = Conditions(
     connected=True, fresh=True, homed=True, busy=False, device_latched=False, requested_N=None, neutral_N=0.5
 )
+PLAN_PERIOD_S = 0.004
+"Between plans."
 
 
 @pytest.fixture(scope="session")
@@ -194,6 +198,18 @@ def make_bench(core: Core, measure: MeasurementMaker) -> Callable[..., Bench]:
     return make
 
 
+@pytest.fixture(scope="session")
+def moving() -> Callable[..., Measured]:
+    """A homed device whose handle has long moved, which gives what the shipped model says. Its Sense never ages."""
+
+    def make(gap_mm: float = 78.1, force_N: float = 1.0871, **changes: object) -> Measured:
+        half_mm, handle = gap_mm / 2.0, Handle(MOBILISED_MM, 42.0, Turn(1.0, 0.0, 100.0), 42.0)
+        measured = Measured(1, True, 0.0, half_mm, half_mm, 0.0, 0.0, force_N, handle, 100.0, math.inf, 0.0)
+        return measured.replaced(**changes)
+
+    return make
+
+
 @pytest.fixture
 def bench(make_bench: Callable[..., Bench]) -> Bench:
     return make_bench()
@@ -205,3 +221,16 @@ def running(bench: Bench) -> Bench:
     bench.enabled().step(count=3)
     assert bench.stepper.safety.operating_state is OperatingState.ENABLED
     return bench
+
+
+@pytest.fixture(scope="session")
+def planned() -> Callable[..., Plan]:
+    """The planner's next plan, a period later, for a setpoint of that moment. What was measured is news."""
+
+    def plan(planner: Planner, force_N: float, measured: Measured | None = None, **setpoint: object) -> Plan:
+        now_s = planner.planned.time_s + PLAN_PERIOD_S
+        if measured is not None:
+            measured = measured.replaced(number=planner.believe.read + 1)
+        return planner.plan(now_s, TimedSetpoint(force_N, now_s, 0.1).replaced(**setpoint), measured)
+
+    return plan

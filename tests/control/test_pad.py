@@ -5,12 +5,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from tormagd.assembly.build import SEVERAL_BRANCHES, Core, build_core, choose_solver
 from tormagd.config import Config
 from tormagd.control.contact import PRESSED, Pressing
-from tormagd.control.core import SEVERAL_BRANCHES, Core, build_core, choose_solver
-from tormagd.control.estimate import Estimate, Handle, update
-from tormagd.control.governor import TimedSetpoint
-from tormagd.control.plan import PlanState
+from tormagd.control.core import Planner
+from tormagd.control.measure import Measure
+from tormagd.control.records import Handle, Measured, TimedSetpoint
+from tormagd.exact import plain
 from tormagd.model.displacement import Turn
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import EVERY_TERM, RELAXATION_S, load_scene, scene_path
@@ -27,21 +28,21 @@ def pad_core() -> Core:
     return build_core(CONFIG)
 
 
-def pressed(depth_mm: float, rate_mm_s: float = 0.0, *, gap_mm: float = 78.0, number: int = 1) -> Estimate:
+def pressed(depth_mm: float, rate_mm_s: float = 0.0, *, gap_mm: float = 78.0, **changes: object) -> Measured:
     """A homed device with a finger that deep in its pad."""
-    handle = Handle(depth_mm, rate_mm_s, Turn(1.0, 0.0, 0.0))
-    half_mm = gap_mm / 2.0
-    return Estimate(number, True, 0.0, half_mm, half_mm, 0.0, 0.0, 3.5, handle, depth_mm, 0.0, 0.0)
+    handle, half_mm = Handle(depth_mm, rate_mm_s, Turn(1.0, 0.0, 0.0)), gap_mm / 2.0
+    measured = Measured(1, True, 0.0, half_mm, half_mm, 0.0, 0.0, 3.5, handle, depth_mm, 0.0, 0.0)
+    return measured.replaced(**changes)
 
 
-def held(core: Core, seconds: float, force_N: float = 3.5, *, depth_mm: float = DEPTH_MM) -> PlanState:
-    """The state after that force was asked for so long, the gap at once where it should be, and nothing learned."""
-    state = core.planner.start(0.0)
+def held(core: Core, seconds: float, force_N: float = 3.5, *, depth_mm: float = DEPTH_MM) -> Planner:
+    """After that force was asked for so long, the gap at once where it should be, and nothing learned."""
+    planner = core.planner()
     for tick in range(1, round(seconds / PERIOD_S) + 1):
         now_s = tick * PERIOD_S
-        estimate = pressed(depth_mm, gap_mm=state.plan.gap_mm).replaced(sensed_s=-1.0)
-        state = core.planner.plan(state, now_s, TimedSetpoint(force_N, now_s, 0.1), estimate)
-    return state
+        measured = pressed(depth_mm, gap_mm=planner.planned.gap_mm, sensed_s=-1.0)
+        planner.plan(now_s, TimedSetpoint(force_N, now_s, 0.1), measured)
+    return planner
 
 
 def test_a_finger_on_its_way_is_planned_for_at_the_scenes_depth() -> None:
@@ -57,54 +58,54 @@ def test_a_finger_on_its_way_is_planned_for_at_the_scenes_depth() -> None:
 
 def test_a_finger_that_draws_back_is_still_pushed_out(measure) -> None:
     """The force of a handle turns round with its motion; a pad's does not."""
-    estimate = None
+    finger = Measure(47.5, 0.002, False, 100.0, 1e-3)
     for number in range(1, 60):
         depth_mm = 2.0 - 0.02 * number
-        estimate = update(estimate, measure(number, handle_mm=depth_mm, force_N=3.0), 47.5, 0.002, turns=False)
-    assert estimate is not None
-    assert estimate.force_N == 3.0
-    assert estimate.handle.displacement_mm == pytest.approx(depth_mm)
-    assert estimate.handle.rate_mm_s == pytest.approx(-20.0, rel=0.4)
+        drawn = measure(number, handle_mm=depth_mm, force_N=3.0)
+        measured = finger.update((number - 1) * 1e-3, number * 1e-3, drawn, needs_homing=False)
+    assert measured.force_N == 3.0
+    assert measured.handle.displacement_mm == pytest.approx(depth_mm)
+    assert measured.handle.rate_mm_s == pytest.approx(-20.0, rel=0.4)
 
 
 def test_a_pad_that_is_held_is_pressed_harder_as_it_relaxes(pad_core: Core) -> None:
     fresh, later = held(pad_core, PERIOD_S), held(pad_core, 60.0)
-    assert fresh.remembered.relaxed_N == pytest.approx(0.0, abs=0.01)
-    assert 0.15 < later.remembered.relaxed_N < 0.35
-    assert later.plan.field_mT > fresh.plan.field_mT + 20.0
-    assert later.plan.predicted_N == pytest.approx(3.5, abs=0.01)
+    relaxed_N, max_N = later.believe.memory.relaxed_N, pad_core.portrait.max_N
+    assert fresh.believe.memory.relaxed_N == pytest.approx(0.0, abs=0.01)
+    assert 0.15 < relaxed_N < 0.35
+    assert later.planned.field_mT > fresh.planned.field_mT + 20.0
+    assert later.planned.predicted_N == pytest.approx(3.5, abs=0.01)
     # what the device gives at most has fallen by as much
-    assert later.device.force_N(pad_core.planner.portrait.most_N) == pytest.approx(
-        pad_core.planner.portrait.most_N - later.remembered.relaxed_N
-    )
+    assert later.believe.device.force_N(max_N) == pytest.approx(max_N - relaxed_N)
 
 
-def test_without_the_term_nothing_is_remembered(pad_core: Core) -> None:
+def test_without_the_term_nothing_is_remembered() -> None:
     without = build_core(CONFIG, msgspec.structs.replace(SCENE, terms=EVERY_TERM.without(*RELAXATION_S)))
     forgetful = held(without, 60.0)
-    assert forgetful.remembered.relaxed_N == 0.0
-    assert forgetful.plan.field_mT == pytest.approx(held(without, PERIOD_S).plan.field_mT, abs=0.01)
+    assert forgetful.believe.memory.relaxed_N == 0.0
+    assert forgetful.planned.field_mT == pytest.approx(held(without, PERIOD_S).planned.field_mT, abs=0.01)
 
 
 def test_a_finger_that_stands_while_the_force_rises_has_not_lost_its_encoder(pad_core: Core) -> None:
     """On a brake it has: friction comes back only with a motion. A pad stiffens under a finger that does not move."""
-    state = pad_core.planner.start(0.0)
+    planner = pad_core.planner()
     for tick in range(1, 200):
-        now_s = 0.01 * tick
-        estimate = pressed(DEPTH_MM, gap_mm=95.0 - 0.2 * tick, number=tick)
-        estimate = estimate.replaced(sensed_s=now_s, force_N=3.3 + 0.005 * tick)
-        state = pad_core.planner.plan(state, now_s, TimedSetpoint(3.8, now_s, 0.1), estimate)
-    assert not state.handle.is_lost
+        now_s, gap_mm = 0.01 * tick, 95.0 - 0.2 * tick
+        measured = pressed(DEPTH_MM, gap_mm=gap_mm, number=tick, sensed_s=now_s, force_N=3.3 + 0.005 * tick)
+        planner.plan(now_s, TimedSetpoint(3.8, now_s, 0.1), measured)
+    assert not planner.believe.handle.is_lost
 
 
 def test_planning_that_begins_anew_has_not_forgotten(pad_core: Core) -> None:
-    state = held(pad_core, 5.0)
-    assert pad_core.planner.afresh(state, 5.1).remembered == state.remembered
+    planner = held(pad_core, 5.0)
+    remembered = plain(planner.believe.memory)
+    planner.afresh(5.1)
+    assert plain(planner.believe.memory) == remembered
 
 
 def test_a_force_out_of_the_pads_reach_says_so(pad_core: Core) -> None:
-    assert Limit.F_MIN in held(pad_core, 0.1, 3.21).plan.limits
-    assert Limit.F_MAX in held(pad_core, 20.0, 3.9, depth_mm=1.82).plan.limits
+    assert Limit.F_MIN in held(pad_core, 0.1, 3.21).planned.limits
+    assert Limit.F_MAX in held(pad_core, 20.0, 3.9, depth_mm=1.82).planned.limits
 
 
 def test_where_the_force_falls_branches_are_compared() -> None:

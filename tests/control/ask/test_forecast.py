@@ -1,35 +1,33 @@
 """What comes next: foreseen where a force repeats itself, and believed only where that was earned. All synthetic."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.control.periodicity import (
+from tormagd.assembly.journal import KNOWN
+from tormagd.control.ask.forecast import (
     BEAT_DELAYS,
     GRID_S,
     HISTORY,
     HORIZON,
     JUDGED,
-    LEAST_HISTORY,
     LONG_S,
-    LONGEST_STEP_S,
     LOST,
-    NOTHING_LEARNED,
+    MAX_STEP_S,
+    MIN_HISTORY,
     RIDGE,
     RISE_DELAYS,
     SAME_N,
     STRIDE,
     TAPS,
-    Periodicity,
-    forecast_N,
-    foreseen,
-    observe,
+    Forecast,
 )
-from tormagd.control.skill import Skill
+from tormagd.control.ask.skill import DOUBT_N, Skill
+from tormagd.exact import plain, restore
 
 Array = npt.NDArray[np.float64]
 
@@ -66,39 +64,52 @@ class Followed(NamedTuple):
         return slope_N, mixture_N
 
 
-def after(state: Periodicity, stamp_s: float, force_N: float, slope_N_s: float) -> Periodicity:
-    """With one setpoint more, and a forecast from it."""
-    return foreseen(observe(state, stamp_s, force_N), slope_N_s)
+def tell(forecast: Forecast, stamp_s: float, force_N: float, slope_N_s: float = 0.0) -> None:
+    """One setpoint more, and a forecast from it."""
+    forecast.update(stamp_s, force_N)
+    forecast.foresee(slope_N_s)
 
 
 def follow(times_s: Array, forces_N: Array) -> Followed:
     """Each setpoint observed, and what would have been planned for beside what came."""
-    state, rows = NOTHING_LEARNED, []
-    slope_N_s = 0.0
+    forecast, rows, slope_N_s = Forecast(), [], 0.0
     for before, (time_s, force_N) in enumerate(zip(times_s[1:].tolist(), forces_N[1:].tolist(), strict=True)):
         steepness = (force_N - forces_N[before]) / (time_s - times_s[before])
         slope_N_s += 0.5 * (float(np.clip(steepness, -STEEPEST_N_S, STEEPEST_N_S)) - slope_N_s)
-        state = after(state, time_s, force_N, slope_N_s)
-        slope_N = force_N + slope_N_s * np.minimum(AHEAD_S, 0.05)
-        trust = state.trust
-        mixture_N = (
-            slope_N
-            if trust == 0.0
-            else slope_N + trust * (np.array(forecast_N(state, 0.0, AHEAD_S.tolist())) - slope_N)
-        )
+        tell(forecast, time_s, force_N, slope_N_s)
+        slope_N, trust = force_N + slope_N_s * np.minimum(AHEAD_S, 0.05), forecast.trust
+        mixture_N = slope_N
+        if trust > 0.0:
+            mixture_N = slope_N + trust * (np.array(forecast.forces_N(0.0, AHEAD_S.tolist())) - slope_N)
         came_N = np.interp(time_s + AHEAD_S, times_s, forces_N)
         rows.append((time_s, trust, slope_N - came_N, mixture_N - came_N))
     return Followed(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def learned(seconds: float = 4.0, rate_hz: int = 200) -> Periodicity:
-    """The state after a pulse."""
+def beaten(seconds: float = 4.0, rate_hz: int = 200) -> Forecast:
+    """After a pulse."""
     times_s = np.arange(round(seconds * rate_hz)) / rate_hz
     forces_N = pulse_N(times_s)
-    state = NOTHING_LEARNED
+    forecast = Forecast()
     for time_s, force_N, slope_N_s in zip(times_s, forces_N, np.gradient(forces_N, times_s), strict=True):
-        state = after(state, float(time_s), float(force_N), float(slope_N_s))
-    return state
+        tell(forecast, float(time_s), float(force_N), float(slope_N_s))
+    return forecast
+
+
+LEARNED = plain(beaten())
+
+
+def read(data: Any = LEARNED) -> Forecast:
+    """One that has learned a pulse, or that."""
+    forecast = Forecast()
+    restore(forecast, data, KNOWN)
+    return forecast
+
+
+@pytest.fixture
+def learned() -> Forecast:
+    """Of a pulse."""
+    return read()
 
 
 def times_at(kind: str, seconds: float) -> Array:
@@ -116,7 +127,7 @@ def test_a_pulse_is_foreseen_after_a_few_beats(kind: str) -> None:
     slope_N, mixture_N = followed.rms_N(5.0, 10.9)
     assert mixture_N < 0.4 * slope_N
     assert followed.trust[(followed.time_s > 5.0)].mean() > 0.8
-    assert np.all(followed.trust[followed.time_s < times_s[0] + LEAST_HISTORY * GRID_S - 0.02] == 0.0)
+    assert np.all(followed.trust[followed.time_s < times_s[0] + MIN_HISTORY * GRID_S - 0.02] == 0.0)
 
 
 def steps_N(times_s: Array) -> Array:
@@ -182,39 +193,50 @@ def test_another_source_is_not_foreseen_from_the_first() -> None:
     assert followed.trust[(followed.time_s > 7.1) & (followed.time_s < 7.4)].max() < 0.3
 
 
-def test_after_a_jump_nothing_is_forecast() -> None:
+def test_after_a_jump_nothing_is_forecast(learned: Forecast) -> None:
     """No remembered stretch is like one with a jump in it, and a regression would carry it on."""
-    state = learned()
-    assert state.trust > 0.0
-    while (state := after(state, state.stamp_s + 0.005, 0.8, 0.0)).stamp_s < 4.03:
-        assert state.time_s < 4.0 or (state.changes_N, state.trust) == ([], 0.0)
+    assert learned.trust > 0.0
+    tell(learned, learned.stamp_s + 0.005, 0.8)
+    while learned.stamp_s < 4.03:
+        assert learned.time_s < 4.0 or (learned.changes_N, learned.trust) == ([], 0.0)
+        tell(learned, learned.stamp_s + 0.005, 0.8)
 
 
-def test_a_gap_or_a_stamp_from_before_begins_anew() -> None:
-    state = learned()
-    for stamp_s in (state.stamp_s + LONGEST_STEP_S + 1e-6, state.stamp_s - 1.1 * GRID_S, -5.0):
-        fresh = observe(state, stamp_s, 1.5)
-        assert fresh.trust == 0.0
-        assert (fresh.stamp_s, fresh.time_s, np.frombuffer(fresh.history).tolist()) == (stamp_s, stamp_s, [1.5])
-    kept = observe(state, state.stamp_s + LONGEST_STEP_S - 1e-6, 1.5)
-    assert len(kept.history) > len(state.history)
+@pytest.mark.parametrize("step_s", [MAX_STEP_S + 1e-6, -1.1 * GRID_S, -9.0])
+def test_a_gap_or_a_stamp_from_before_begins_anew(learned: Forecast, step_s: float) -> None:
+    stamp_s = learned.stamp_s + step_s
+    learned.update(stamp_s, 1.5)
+    assert learned.trust == 0.0
+    assert (learned.stamp_s, learned.time_s, np.frombuffer(learned.history).tolist()) == (stamp_s, stamp_s, [1.5])
+    fresh = Forecast()
+    fresh.update(stamp_s, 1.5)
+    assert plain(fresh) == plain(learned)
 
 
-def test_a_stamp_again_counts_once_with_its_newest_force() -> None:
-    state = learned()
-    assert observe(state, state.stamp_s, state.force_N) is state
+def test_within_a_stream_nothing_begins_anew(learned: Forecast) -> None:
+    heard = len(learned.history)
+    learned.update(learned.stamp_s + MAX_STEP_S - 1e-6, 1.5)
+    assert len(learned.history) > heard
+
+
+def test_a_stamp_again_counts_once_with_its_newest_force(learned: Forecast) -> None:
+    learned.update(learned.stamp_s, learned.force_N)
+    assert plain(learned) == LEARNED
+    history, stamp_s = learned.history, learned.stamp_s
     for back_s in (0.0, 0.003):
-        other = observe(state, state.stamp_s - back_s, 1.7)
-        assert (other.history, other.stamp_s, other.force_N) == (state.history, state.stamp_s, 1.7)
-        assert forecast_N(other, 0.0, [0.0]) == pytest.approx([1.7])
+        learned.update(stamp_s - back_s, 1.7)
+        assert (learned.history, learned.stamp_s, learned.force_N) == (history, stamp_s, 1.7)
+        assert learned.forces_N(0.0, [0.0]) == pytest.approx([1.7])
 
 
-def test_a_forecast_is_looked_for_once_for_each_point_of_the_grid() -> None:
-    state = learned()
-    assert foreseen(state, 0.0) is state
-    passed = observe(state, state.time_s + GRID_S, 1.5)
-    assert passed.changes_N == state.changes_N
-    assert foreseen(passed, 0.0).from_s == passed.time_s
+def test_a_forecast_is_looked_for_once_for_each_point_of_the_grid(learned: Forecast) -> None:
+    assert not learned.foresee(0.0)
+    assert plain(learned) == LEARNED
+    changes_N = learned.changes_N
+    learned.update(learned.time_s + 1.5 * GRID_S, 1.5)
+    assert learned.changes_N == changes_N
+    assert learned.foresee(0.0)
+    assert learned.from_s == learned.time_s
 
 
 def by_regression(history: Array, of: tuple[int, ...]) -> tuple[Array, float]:
@@ -240,83 +262,83 @@ def test_a_forecast_is_a_mixture_of_weighted_ridge_regressions(
     seconds: float, rise_missed: float, beat_missed: float
 ) -> None:
     """By the inverse squares of the mean squares that both missed lately, and are from what they know now."""
-    before = learned(seconds)
-    before = observe(before, before.stamp_s + GRID_S, before.force_N + 0.002)
-    state = foreseen(before.replaced(rise_missed=rise_missed, beat_missed=beat_missed), 0.0)
-    history = np.frombuffer(state.history)
+    forecast = beaten(seconds)
+    forecast.update(forecast.stamp_s + GRID_S, forecast.force_N + 0.002)
+    forecast.rise_missed, forecast.beat_missed = rise_missed, beat_missed
+    forecast.foresee(0.0)
+    history = np.frombuffer(forecast.history)
     (rise, rise_apart), (beat, beat_apart) = (by_regression(history, of) for of in (RISE_DELAYS, BEAT_DELAYS))
     rise_weight, beat_weight = (rise_missed + rise_apart) ** -2, (beat_missed + beat_apart) ** -2
     mixed = (rise_weight * rise + beat_weight * beat) / (rise_weight + beat_weight)
-    assert state.changes_N == pytest.approx(mixed, abs=1e-9)
+    assert forecast.changes_N == pytest.approx(mixed, abs=1e-9)
 
 
 def test_what_both_embeddings_missed_is_remembered() -> None:
     """Setpoints come as the grid's points do: what was said four before is compared with what came."""
     times_s = np.arange(600) * GRID_S * (1.0 + 1e-6)
     forces_N = pulse_N(times_s)
-    state = NOTHING_LEARNED
+    forecast = Forecast()
     said: list[tuple[float, float] | None] = []
     missed: tuple[list[float], list[float]] = ([], [])
     for time_s, force_N in zip(times_s.tolist(), forces_N.tolist(), strict=True):
-        state = after(state, time_s, force_N, 0.0)
-        guess = state.awaited[-1]
+        tell(forecast, time_s, force_N)
+        guess = forecast.awaited[-1]
         said.append(None if guess is None else (guess.rise_N, guess.beat_N))
         if len(said) > JUDGED and (then := said[-1 - JUDGED]) is not None:
-            for errors, forecast in zip(missed, then, strict=True):
-                errors.append(forecast - force_N)
-    for errors, found in zip(missed, (state.rise_missed, state.beat_missed), strict=True):
-        mean = NOTHING_LEARNED.rise_missed
+            for errors, guessed_N in zip(missed, then, strict=True):
+                errors.append(guessed_N - force_N)
+    for errors, found in zip(missed, (forecast.rise_missed, forecast.beat_missed), strict=True):
+        mean = DOUBT_N**2
         for error in errors:
             mean += GRID_S / (LONG_S + GRID_S) * (error**2 - mean)
         assert len(errors) > 400
         assert found == pytest.approx(mean, rel=0.01)
 
 
-def test_where_one_finds_nothing_alike_the_other_speaks_for_both() -> None:
+def test_where_one_finds_nothing_alike_the_other_speaks_for_both(learned: Forecast) -> None:
     """After a jump to a force that is held: before long the short embedding has left it behind, the long one not."""
-    state, spoken = learned(), 0
+    spoken = 0
     for tick in range(1, BEAT_DELAYS[-1] + 2):
-        state = after(state, 4.0 + tick * GRID_S, 0.8 + 1e-4 * math.sin(tick), 0.0)
-        guess = state.awaited[-1]
+        tell(learned, 4.0 + tick * GRID_S, 0.8 + 1e-4 * math.sin(tick))
+        guess = learned.awaited[-1]
         if guess is not None and guess.rise_N == guess.beat_N:
             spoken += 1
-            constants, _ = by_regression(np.frombuffer(state.history), RISE_DELAYS)
-            assert state.changes_N == pytest.approx(constants, abs=1e-9)
+            constants, _ = by_regression(np.frombuffer(learned.history), RISE_DELAYS)
+            assert learned.changes_N == pytest.approx(constants, abs=1e-9)
     assert spoken > 10
 
 
-def test_where_nothing_is_alike_trust_has_to_be_earned_again() -> None:
-    state = learned()
-    jumped = after(state, state.stamp_s + GRID_S, 0.8, 0.0)
-    assert (jumped.changes_N, jumped.short) == ([], LOST)
-    assert jumped.replaced(changes_N=state.changes_N).trust < 0.03 < state.trust
+def test_where_nothing_is_alike_trust_has_to_be_earned_again(learned: Forecast) -> None:
+    trust, changes_N = learned.trust, learned.changes_N
+    tell(learned, learned.stamp_s + GRID_S, 0.8)
+    assert (learned.changes_N, learned.short) == ([], LOST)
+    learned.changes_N = changes_N
+    assert learned.trust < 0.03 < trust
 
 
-def test_the_forecast_starts_at_the_newest_setpoint_between_two_points_of_the_grid() -> None:
-    state = learned()
-    state = observe(state, state.stamp_s + 0.004, 1.5)
-    assert state.stamp_s - state.time_s > 0.003
-    assert forecast_N(state, 0.0, [0.0]) == pytest.approx([1.5])
+def test_the_forecast_starts_at_the_newest_setpoint_between_two_points_of_the_grid(learned: Forecast) -> None:
+    learned.update(learned.stamp_s + 0.004, 1.5)
+    assert learned.stamp_s - learned.time_s > 0.003
+    assert learned.forces_N(0.0, [0.0]) == pytest.approx([1.5])
 
 
 def test_memory_is_bounded() -> None:
-    assert len(learned(15.0, 100).history) == 8 * HISTORY
+    assert len(beaten(15.0, 100).history) == 8 * HISTORY
 
 
 def test_a_constant_force_for_ever_is_no_division_by_zero() -> None:
-    state = NOTHING_LEARNED
+    forecast = Forecast()
     for tick in range(300):
-        state = after(state, tick * GRID_S, 1.5, 0.0)
-    state = state.replaced(long=Skill(0.0, 0.0))
-    assert state.trust == 0.0
-    assert np.array(forecast_N(state, 0.0, AHEAD_S.tolist())) == pytest.approx(np.full(3, 1.5))
+        tell(forecast, tick * GRID_S, 1.5)
+    forecast.long = Skill(0.0, 0.0)
+    assert forecast.trust == 0.0
+    assert forecast.forces_N(0.0, AHEAD_S.tolist()) == pytest.approx([1.5] * 3)
 
 
-LEARNED = learned()
 hostile = st.lists(
     st.tuples(
-        st.sampled_from([0.0, 1e-12, 1e-3, 0.0049, GRID_S, 0.033, LONGEST_STEP_S, 0.2, -1e-9, -1.0, 1e6])
-        | st.floats(-0.01, LONGEST_STEP_S),
+        st.sampled_from([0.0, 1e-12, 1e-3, 0.0049, GRID_S, 0.033, MAX_STEP_S, 0.2, -1e-9, -1.0, 1e6])
+        | st.floats(-0.01, MAX_STEP_S),
         st.floats(0.0, 1_000.0) | st.sampled_from([0.0, 1.4, 2.0]),
         st.floats(-100.0, 100.0),
     ),
@@ -327,22 +349,15 @@ hostile = st.lists(
 @settings(max_examples=150, deadline=None)
 @given(setpoints=hostile)
 def test_nan_never_travels_and_a_replay_is_exact(setpoints: list[tuple[float, float, float]]) -> None:
-    """Stamps in any order, any distance apart, on top of what was learned; the state before stays as it was."""
-
-    def replay() -> list[Periodicity]:
-        states = [LEARNED]
-        for step_s, force_N, slope_N_s in setpoints:
-            states.append(after(states[-1], states[-1].stamp_s + step_s, force_N, slope_N_s))
-        return states
-
-    before = LEARNED.history
-    states = replay()
-    for state in states:
-        assert 0.0 <= state.trust <= 1.0
-        assert len(state.history) <= 8 * HISTORY
-        assert -1e-9 <= state.stamp_s - state.time_s < GRID_S + 1e-9
-        assert all(math.isfinite(skill.gained + skill.apart) for skill in (state.long, state.short))
-        if state.changes_N:
-            assert np.all(np.isfinite(np.array(forecast_N(state, 0.0, AHEAD_S.tolist()))))
-    assert states == replay()
-    assert LEARNED.history == before
+    """Stamps in any order, any distance apart, on top of what was learned."""
+    forecast, again = read(), read()
+    for step_s, force_N, slope_N_s in setpoints:
+        tell(forecast, forecast.stamp_s + step_s, force_N, slope_N_s)
+        assert 0.0 <= forecast.trust <= 1.0
+        assert len(forecast.history) <= 8 * HISTORY
+        assert -1e-9 <= forecast.stamp_s - forecast.time_s < GRID_S + 1e-9
+        assert all(math.isfinite(skill.gained + skill.apart) for skill in (forecast.long, forecast.short))
+        if forecast.changes_N:
+            assert np.all(np.isfinite(forecast.forces_N(0.0, AHEAD_S.tolist())))
+        tell(again, again.stamp_s + step_s, force_N, slope_N_s)
+        assert plain(again) == plain(forecast)

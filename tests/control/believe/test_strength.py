@@ -6,22 +6,24 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.control.device_fit import (
-    LEAST_SCALE,
-    MOST_SCALE,
+from tormagd.control.believe.strength import (
+    ERROR_N2_S,
+    MAX_SCALE,
+    MIN_SCALE,
     OFFSET_SD_N,
     SCALE_SD,
     SURE,
+    UNSEEN,
     DeviceFit,
+    Strength,
     observe,
 )
 
 PERIOD_S = 0.004
 BOUNDS = (0.6, 1.6)
-NEW = DeviceFit()
 
 
-def shown(levels: list[tuple[float, float]], scale: float, offset_N: float, fit: DeviceFit = NEW) -> DeviceFit:
+def shown(levels: list[tuple[float, float]], scale: float, offset_N: float, fit: DeviceFit = UNSEEN) -> DeviceFit:
     """The fit after a device of that scale and offset has been held at model forces for some time each, with noise."""
     random = np.random.default_rng(1)
     for seconds, model_N in levels:
@@ -68,14 +70,14 @@ def test_force_and_model_are_each_others_inverse() -> None:
 
 
 @pytest.mark.parametrize("levels", [[], [(0.2, 0.7)], [(2.0, 0.7)], [(2.0, 0.7), (2.0, 1.6)]])
-@pytest.mark.parametrize("scale", [LEAST_SCALE, 0.8, 1.0, 1.2, MOST_SCALE])
+@pytest.mark.parametrize("scale", [MIN_SCALE, 0.8, 1.0, 1.2, MAX_SCALE])
 def test_what_is_surely_within_is_within(levels: list[tuple[float, float]], scale: float) -> None:
     """However little has been shown, and whatever the device: never over, but for the two in a hundred of `SURE`."""
     most_N = 2.5
     model_N = shown(levels, scale, 0.0).surely_within_N(most_N)
-    allowed_N = most_N if levels else most_N * MOST_SCALE / (1.0 + SURE * SCALE_SD)
+    allowed_N = most_N if levels else most_N * MAX_SCALE / (1.0 + SURE * SCALE_SD)
     assert scale * model_N <= 1.03 * allowed_N
-    assert most_N / MOST_SCALE <= model_N <= most_N / LEAST_SCALE
+    assert most_N / MAX_SCALE <= model_N <= most_N / MIN_SCALE
 
 
 def test_the_ceiling_moves_once_a_weak_device_has_shown_itself() -> None:
@@ -84,7 +86,7 @@ def test_the_ceiling_moves_once_a_weak_device_has_shown_itself() -> None:
 
 
 def test_a_device_of_which_nothing_is_sure_is_taken_for_the_strongest() -> None:
-    assert DeviceFit(scale=2.0 * SCALE_SD).surely_within_N(2.5) == 2.5 / MOST_SCALE
+    assert DeviceFit(scale=2.0 * SCALE_SD).surely_within_N(2.5) == 2.5 / MAX_SCALE
 
 
 readings = st.tuples(st.floats(0.3, 8.0), st.floats(-33.0, 33.0), st.floats(0.0, 0.02))
@@ -110,3 +112,56 @@ def test_over_the_force_without_memory_it_says_the_same(relaxed_N: float) -> Non
     for model_N in (0.5, 1.0, 2.0):
         assert over.force_N(model_N) == pytest.approx(fit.force_N(model_N - relaxed_N))
         assert over.deviation_N(model_N) == pytest.approx(fit.deviation_N(model_N - relaxed_N))
+
+
+@pytest.mark.parametrize(("learns_scale", "learns_offset"), [(True, False), (False, True)])
+def test_what_is_left_out_keeps_its_uncertainty_and_is_counted_with(learns_scale: bool, learns_offset: bool) -> None:
+    """Schmidt's filter against the covariance of any gain, in Joseph's form."""
+    fit, terms = DeviceFit(1.1, 0.02, 0.02, 0.001, 0.008), {"adapts_in_s": 0.5, "bounds": BOUNDS}
+    found, _ = observe(fit, 1.5, 1.7, 0.01, learns_scale=learns_scale, learns_offset=learns_offset, **terms)
+    aged, _ = observe(fit, 1.5, 1.7, 0.01, learns_scale=False, learns_offset=False, **terms)
+    before = np.array([[aged.scale_variance, aged.covariance_N], [aged.covariance_N, aged.offset_variance_N2]])
+    seen = np.array([1.5, 1.0])
+    noise_N2 = ERROR_N2_S / 0.01
+    gains = before @ seen / (seen @ before @ seen + noise_N2) * [learns_scale, learns_offset]
+    kept = np.eye(2) - np.outer(gains, seen)
+    joseph = kept @ before @ kept.T + noise_N2 * np.outer(gains, gains)
+    assert (found.scale_variance, found.covariance_N) == pytest.approx(joseph[0])
+    assert found.offset_variance_N2 == pytest.approx(joseph[1, 1])
+    assert (found.scale == fit.scale) is not learns_scale
+    assert (found.offset_N == fit.offset_N) is not learns_offset
+
+
+KNOWN = DeviceFit(scale_variance=1e-6, offset_variance_N2=1e-4)
+
+
+def heard(off_N: float, seconds: float, learns: tuple[bool, bool] = (True, True)) -> Strength:
+    """A known device after so long of readings with noise, that are off by so much from the model's 1.5 N."""
+    strength = Strength(0.5, BOUNDS, learns)
+    strength.forget(KNOWN)
+    for noise_N in np.random.default_rng(2).normal(0.0, 0.01, round(seconds / PERIOD_S)).tolist():
+        strength.update(1.5, 1.5 + off_N + noise_N, PERIOD_S)
+    return strength
+
+
+def test_a_surprise_is_learned_sooner_and_noise_is_none() -> None:
+    assert heard(0.1, 0.15).fit.force_N(1.5) > 1.58
+    assert shown([(0.15, 1.5)], 1.0, 0.1, KNOWN).force_N(1.5) < 1.52
+    assert heard(0.0, 10.0).fit.force_N(1.5) == pytest.approx(1.5, abs=5e-4)
+
+
+@pytest.mark.parametrize("learns", [(False, True), (True, False), (False, False)])
+def test_what_it_may_not_learn_it_leaves_as_it_was(learns: tuple[bool, bool]) -> None:
+    fit = heard(0.1, 10.0, learns).fit
+    assert (fit.scale != KNOWN.scale, fit.offset_N != KNOWN.offset_N) == learns
+
+
+def test_a_pause_ends_a_surprise_and_what_was_held_and_leaves_the_fit() -> None:
+    strength = Strength(0.5, BOUNDS, (True, True))
+    strength.update(1.5, 4.5, 1.0)
+    known = strength.fit
+    assert (known.scale, strength.is_held, strength.surprise_N > 1.0) == (BOUNDS[1], True, True)
+    strength.settle()
+    assert (strength.fit, strength.surprise_N, strength.is_held) == (known, 0.0, False)
+    strength.forget()
+    assert strength.fit == UNSEEN

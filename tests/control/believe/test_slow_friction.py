@@ -1,22 +1,23 @@
 """Friction at a creep: learned as far as static friction differs and the fit is uncertain, and nothing at speed."""
 
+import copy
 import math
 
 import pytest
 from hypothesis import given, strategies as st
 
-from tormagd.control.device_fit import UNSEEN, DeviceFit
-from tormagd.control.slow_friction import (
-    LEAST,
-    LEAST_SHARE,
-    MOST,
-    NOTHING_SLOW,
+from tormagd.control.believe.slow_friction import (
+    MAX_FACTOR,
+    MAX_STATIC,
+    MIN_FACTOR,
+    MIN_SHARE,
+    MIN_STATIC,
     REACH_MM,
-    STATIC_LEAST,
-    STATIC_MOST,
     STRIBECK_MM_S,
     SlowFriction,
 )
+from tormagd.control.believe.strength import UNSEEN, DeviceFit
+from tormagd.exact import plain
 
 PERIOD_S = 0.003
 KNOWN = DeviceFit(scale_variance=0.0, offset_variance_N2=0.0)
@@ -25,10 +26,18 @@ KNOWN = DeviceFit(scale_variance=0.0, offset_variance_N2=0.0)
 
 def crept(share: float, seconds: float, rate_mm_s: float = 1.0, fit: DeviceFit = UNSEEN) -> SlowFriction:
     """After readings of `share` times what was expected at that rate of a fit that makes the model's force."""
-    slow = SlowFriction(followed_N=1.5)
+    slow = SlowFriction()
+    slow.followed_N = 1.5
     for _ in range(round(seconds / PERIOD_S)):
-        slow = slow.observed(fit, rate_mm_s, 1.5 * share, PERIOD_S)
+        slow.update(fit, rate_mm_s, 1.5 * share, PERIOD_S)
     return slow
+
+
+def rescaled(slow: SlowFriction, before_N: float, after_N: float) -> float:
+    """Its factor once the fit has learned."""
+    after = copy.deepcopy(slow)
+    after.rescale(before_N, after_N)
+    return after.factor
 
 
 def test_what_a_creep_shows_is_learned_and_not_believed_at_speed() -> None:
@@ -44,45 +53,46 @@ def test_it_is_learned_within_the_time_that_a_person_takes_to_notice() -> None:
 
 def test_of_a_known_device_a_creep_shows_its_static_friction_and_no_more() -> None:
     """Nothing judges the sensor at a creep: one that reads too little closes the gap by a tenth at most."""
-    assert crept(0.6, 10.0, fit=KNOWN).factor == STATIC_LEAST
-    assert crept(5.0, 10.0, fit=KNOWN).factor == STATIC_MOST
+    assert crept(0.6, 10.0, fit=KNOWN).factor == MIN_STATIC
+    assert crept(5.0, 10.0, fit=KNOWN).factor == MAX_STATIC
 
 
 def test_of_a_device_that_was_never_seen_a_creep_shows_nearly_all() -> None:
     assert crept(0.75, 10.0).factor_at(1.0) == pytest.approx(0.75, abs=0.01)
     assert crept(1.35, 10.0).factor_at(1.0) == pytest.approx(1.35, abs=0.01)
-    assert crept(0.55, 10.0).factor == LEAST
-    assert crept(5.0, 10.0).factor <= MOST
+    assert crept(0.55, 10.0).factor == MIN_FACTOR
+    assert crept(5.0, 10.0).factor <= MAX_FACTOR
 
 
-def test_a_sensor_that_reads_less_than_any_device_makes_teaches_nothing() -> None:
-    assert crept(0.0, 10.0) == SlowFriction(followed_N=1.5)
-    assert crept(0.9 * LEAST_SHARE, 10.0) == SlowFriction(followed_N=1.5)
+@pytest.mark.parametrize("share", [0.0, 0.9 * MIN_SHARE])
+def test_a_sensor_that_reads_less_than_any_device_makes_teaches_nothing(share: float) -> None:
+    assert plain(crept(share, 10.0)) == plain(crept(1.0, 0.0))
 
 
 def test_friction_follows_a_rise_over_travel_and_a_fall_at_once() -> None:
-    slow = NOTHING_SLOW.followed(1.0, 0.0)
+    slow = SlowFriction()
+    slow.follow(1.0, 0.0)
     assert slow.followed_N == 0.0  # nothing has been travelled
     for step in range(1, 101):
-        slow = slow.followed(1.0, 0.01 * REACH_MM * step)
+        slow.follow(1.0, 0.01 * REACH_MM * step)
     assert slow.followed_N == pytest.approx(1.0 - math.exp(-1.0), rel=1e-9)
-    assert slow.followed(0.3, REACH_MM).followed_N == 0.3
-    # the way back bends the bristles as well
-    assert slow.followed(1.0, 0.0).followed_N > slow.followed_N
+    slow.follow(0.3, REACH_MM)
+    assert slow.followed_N == 0.3
+    slow.follow(1.0, 0.0)  # the way back bends the bristles as well
+    assert slow.followed_N > 0.3
 
 
 def test_beside_a_fit_that_learned_the_force_at_a_creep_stays() -> None:
     slow = crept(1.1, 3.0)
-    assert slow.beside(1.0, 1.05).factor * 1.05 == pytest.approx(slow.factor, rel=1e-4)
-    assert slow.beside(1.0, 1.0) is slow
-    assert slow.beside(1.0, -0.1) is slow
-    assert crept(1.0, 9.0).beside(1.0, 0.5).factor == MOST  # of twice the force
+    assert rescaled(slow, 1.0, 1.05) * 1.05 == pytest.approx(slow.factor, rel=1e-4)
+    assert rescaled(slow, 1.0, 1.0) == rescaled(slow, 1.0, -0.1) == slow.factor
+    assert rescaled(crept(1.0, 9.0), 1.0, 0.5) == MAX_FACTOR  # of twice the force
     # of a creep that was never seen nothing is known but what the fit says
-    assert NOTHING_SLOW.beside(1.0, 0.8) == NOTHING_SLOW
+    assert rescaled(SlowFriction(), 1.0, 0.8) == 1.0
 
 
 @given(
-    start=st.floats(LEAST, MOST),
+    start=st.floats(MIN_FACTOR, MAX_FACTOR),
     events=st.lists(
         st.tuples(
             st.floats(0.1, 5.0), st.floats(0.0, 5.0), st.floats(-33.0, 33.0), st.floats(0.0, 0.02), st.floats(-9, 9)
@@ -91,10 +101,12 @@ def test_beside_a_fit_that_learned_the_force_at_a_creep_stays() -> None:
     ),
 )
 def test_nothing_leaves_its_bounds(start: float, events: list[tuple[float, float, float, float, float]]) -> None:
-    slow, fit = SlowFriction(start), DeviceFit(0.9, 0.05)
-    for expected_N, rate_mm_s, reading_N, elapsed_s, handle_mm in events:
-        slow = slow.followed(expected_N, handle_mm).observed(fit, rate_mm_s, reading_N, elapsed_s)
-        slow = slow.beside(expected_N, abs(reading_N))
-        assert LEAST <= slow.factor <= MOST
+    slow, fit = SlowFriction(), DeviceFit(0.9, 0.05)
+    slow.factor = start
+    for expected_N, rate_mm_s, reading_N, dt_s, handle_mm in events:
+        slow.follow(expected_N, handle_mm)
+        slow.update(fit, rate_mm_s, reading_N, dt_s)
+        slow.rescale(expected_N, abs(reading_N))
+        assert MIN_FACTOR <= slow.factor <= MAX_FACTOR
         assert 0.0 <= slow.followed_N <= 5.0
-        assert LEAST <= slow.factor_at(rate_mm_s) <= MOST
+        assert MIN_FACTOR <= slow.factor_at(rate_mm_s) <= MAX_FACTOR

@@ -5,7 +5,8 @@ from collections.abc import Callable
 
 import pytest
 
-from tormagd.control.handle import FORGETS_S, MODEL_RISES_N, RISES_N, SETTLES_S, STANDS_MM, UNHEARD, HandleWatch
+from tormagd.control.believe.handle import FORGETS_S, MODEL_RISES_N, RISES_N, SETTLES_S, STANDS_MM, HandleWatch
+from tormagd.exact import plain
 
 PERIOD_S = 0.002
 STIFFEST_N_MM = 12.0
@@ -17,13 +18,14 @@ def watched(
     handle_mm: Callable[[float], float],
     force_N: Callable[[float], float],
     model_N: Callable[[float], float],
-    watch: HandleWatch = UNHEARD,
+    watch: HandleWatch | None = None,
 ) -> HandleWatch:
     """After so long of readings, of functions of time; time goes on from the reading before."""
-    from_s = max(watch.heard_s, 0.0)
+    watch = watch or HandleWatch()
+    from_s = watch.heard_s
     for reading in range(1, round(duration_s / PERIOD_S) + 1):
         now_s = from_s + reading * PERIOD_S
-        watch = watch.heard(now_s, handle_mm(now_s), force_N(now_s), model_N(now_s))
+        watch.update(now_s, handle_mm(now_s), force_N(now_s), model_N(now_s))
     return watch
 
 
@@ -51,10 +53,10 @@ def test_it_is_lost_until_it_moves() -> None:
 
 def test_friction_at_rest_falls_with_the_gap_and_does_not_come_back() -> None:
     """What a hand leaves of its force when it rests: no more than the open gap held, however it closes again."""
-    watch, held_N = UNHEARD, 2.0
+    watch, held_N = HandleWatch(), 2.0
     for reading in range(1, 5_000):
         held_N = min(held_N, swinging(reading * PERIOD_S))
-        watch = watch.heard(reading * PERIOD_S, 3.0, held_N, swinging(reading * PERIOD_S))
+        watch.update(reading * PERIOD_S, 3.0, held_N, swinging(reading * PERIOD_S))
         assert not watch.is_lost
 
 
@@ -95,11 +97,23 @@ def test_a_zero_that_drifts_is_forgotten() -> None:
     assert not watched(20.0 * FORGETS_S, still, drifting, swinging).is_lost
 
 
+def test_a_gap_that_moved_since_the_handle_came_to_stand_moved_at_rest() -> None:
+    watch = watched(1.0, still, swinging, still)
+    assert not watch.moved_gap_at_rest(3.0 - 0.9 * MODEL_RISES_N)
+    assert watch.moved_gap_at_rest(3.0 - 1.1 * MODEL_RISES_N)
+    watch.update(1.1, 4.0, 1.5, 2.0)
+    assert not watch.moved_gap_at_rest(2.0)
+
+
 def test_a_silence_and_times_that_are_none_are_no_time_of_standing() -> None:
     watch = watched(0.6, still, swinging, swinging)
     assert not watch.is_lost
-    assert watch.heard(watch.heard_s, 9.0, 9.0, 9.0) is watch
-    assert watch.heard(math.nan, 9.0, 9.0, 9.0) is watch
-    assert watch.heard(watch.heard_s + 60.0, 3.0, 9.0, 9.0).still_s == 0.0
-    endless = watch.heard(math.inf, 3.0, 1.0, 1.0)
-    assert endless.heard(math.inf, 3.0, 1.0, 1.0) is endless
+    heard = plain(watch)
+    for none_s in (watch.heard_s, math.nan):
+        watch.update(none_s, 9.0, 9.0, 9.0)
+        assert plain(watch) == heard
+    watch.update(watch.heard_s + 60.0, 3.0, 9.0, 9.0)
+    assert watch.still_s == 0.0
+    for _ in range(2):
+        watch.update(math.inf, 3.0, 1.0, 1.0)
+        assert (watch.heard_s, watch.still_s, watch.force_N) == (math.inf, 0.0, 1.0)

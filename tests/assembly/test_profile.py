@@ -7,20 +7,13 @@ import msgspec
 import pytest
 from hypothesis import given, strategies as st
 
-from tormagd.control.device_fit import OFFSET_SD_N, SCALE_SD, DeviceFit
-from tormagd.control.lateness import MOST_LAG_S, Lateness
-from tormagd.control.plan import Shown
-from tormagd.control.profile import MAX_BYTES, ZERO_LASTS_S, Profile, ProfileError, profile_of, read_profile
-from tormagd.control.sensor_zero import TARED, SensorZero
-from tormagd.control.slow_friction import SlowFriction
+from tormagd.assembly.profile import MAX_BYTES, ZERO_LASTS_S, Profile, ProfileError, profile_of, read_profile
+from tormagd.control.believe.believe import Learned
+from tormagd.control.believe.carriage_lag import MAX_LAG_S
+from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceFit
 
 OF = {"serial_number": 7, "insert": "MRE-50-40", "model": "ab" * 32}
-KNOWN = Shown(
-    DeviceFit(1.2, -0.05, 1e-4, -1e-4, 4e-4),
-    slow=SlowFriction(1.1, 0.6),
-    zero=SensorZero(0.07),
-    lateness=Lateness(0.012),
-)
+KNOWN = Learned(DeviceFit(1.2, -0.05, 1e-4, -1e-4, 4e-4), 1.1, 0.6, 0.07, 0.012)
 KEPT = profile_of(KNOWN, saved_ns=10**18, **OF)  # type: ignore[arg-type]
 
 
@@ -29,18 +22,16 @@ def again(profile: Profile) -> Profile:
 
 
 def test_what_was_learned_is_there_again_and_less_sure() -> None:
-    shown = again(KEPT).shown(10**18 + 60 * 10**9)
-    assert shown.device.force_N(1.5) == KNOWN.device.force_N(1.5)
-    assert shown.slow.factor_at(0.0) == KNOWN.slow.factor_at(0.0)
-    assert shown.zero.zero_N == 0.07
-    assert shown.lateness.lag_s == 0.012
-    assert KNOWN.device.deviation_N(2.0) < shown.device.deviation_N(2.0) < 0.6 * DeviceFit().deviation_N(2.0)
+    learned = again(KEPT).learned(10**18 + 60 * 10**9)
+    assert learned == KNOWN.replaced(device=learned.device)
+    assert learned.device.force_N(1.5) == KNOWN.device.force_N(1.5)
+    assert KNOWN.device.deviation_N(2.0) < learned.device.deviation_N(2.0) < 0.6 * DeviceFit().deviation_N(2.0)
 
 
 def test_an_old_zero_is_forgotten() -> None:
-    assert again(KEPT).shown(10**18 + round(1.01 * ZERO_LASTS_S * 1e9)).zero == TARED
+    assert again(KEPT).learned(10**18 + round(1.01 * ZERO_LASTS_S * 1e9)).sensor_zero_N == 0.0
     # a clock that was set back says nothing of the age
-    assert again(KEPT).shown(0).zero == TARED
+    assert again(KEPT).learned(0).sensor_zero_N == 0.0
 
 
 @pytest.mark.parametrize(("name", "present"), [("serial_number", 8), ("insert", "MRE-00-50"), ("model", "cd" * 32)])
@@ -58,7 +49,7 @@ def test_that_of_another_is_refused(name: str, present: object) -> None:
         {"offset_N": "much"},
         {"slow_factor": 9.0},
         {"lag_s": -1e-3},
-        {"lag_s": 1.01 * MOST_LAG_S},
+        {"lag_s": 1.01 * MAX_LAG_S},
         {"lag_s": None},
         {"v": 2},
         {"more": 1},
@@ -73,8 +64,8 @@ def test_what_no_device_has_is_refused(changed: dict[str, object]) -> None:
 def test_of_a_profile_from_before_lateness_was_kept_none_is_known() -> None:
     fields = json.loads(msgspec.json.encode(KEPT))
     del fields["lag_s"]
-    shown = read_profile(json.dumps(fields).encode(), **OF).shown(10**18)  # type: ignore[arg-type]
-    assert shown == again(KEPT).shown(10**18).replaced(lateness=Lateness())
+    learned = read_profile(json.dumps(fields).encode(), **OF).learned(10**18)  # type: ignore[arg-type]
+    assert learned == again(KEPT).learned(10**18).replaced(lag_s=0.0)
 
 
 @given(data=st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
@@ -97,14 +88,14 @@ def test_large_and_deep_rubbish_is_refused(data: bytes) -> None:
     offset_N=st.floats(-0.5, 0.5),
     offset_variance=st.floats(0.0, OFFSET_SD_N**2),
     zero_N=st.floats(-0.4, 0.4),
-    lag_s=st.floats(0.0, MOST_LAG_S),
+    lag_s=st.floats(0.0, MAX_LAG_S),
 )
 def test_every_fit_can_be_kept(
     scale: float, scale_variance: float, offset_N: float, offset_variance: float, zero_N: float, lag_s: float
 ) -> None:
     fit = DeviceFit(scale, offset_N, scale_variance, 0.0, offset_variance)
-    kept = profile_of(Shown(fit, zero=SensorZero(zero_N), lateness=Lateness(lag_s)), saved_ns=0, **OF)  # type: ignore[arg-type]
-    shown = again(kept).shown(0)
-    assert shown.device.force_N(1.0) == pytest.approx(fit.force_N(1.0))
-    assert shown.lateness.lag_s == lag_s
-    assert math.isfinite(shown.device.surely_within_N(2.5))
+    known = Learned(fit, sensor_zero_N=zero_N, lag_s=lag_s)
+    learned = again(profile_of(known, saved_ns=0, **OF)).learned(0)  # type: ignore[arg-type]
+    assert learned.device.force_N(1.0) == pytest.approx(fit.force_N(1.0))
+    assert (learned.sensor_zero_N, learned.lag_s) == (zero_N, lag_s)
+    assert math.isfinite(learned.device.surely_within_N(2.5))

@@ -1,4 +1,4 @@
-"""The way of a gap that misses least of what is known ahead: beside ways that are searched for all at once."""
+"""The path of a gap that misses least of what is known ahead: beside paths that are searched for all at once."""
 
 import itertools
 import math
@@ -6,59 +6,59 @@ import math
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.control.pursuit import nearest_way_mm
+from tormagd.control.ask.path import nearest_path_mm
 
 STEP_S = 0.01
 SPEED_MM_S = 40.0
 MOST_MM = SPEED_MM_S * STEP_S
 
 
-def way_mm(start_mm: float, wanted_mm: list[float], weights: list[float], elapsed_s: float = STEP_S) -> list[float]:
-    """All of the way, in even steps."""
+def path_mm(start_mm: float, wanted_mm: list[float], weights: list[float], elapsed_s: float = STEP_S) -> list[float]:
+    """All of the path, in even steps."""
     times_s = [STEP_S * place for place in range(len(wanted_mm))]
-    return nearest_way_mm(start_mm, elapsed_s, times_s, wanted_mm, weights, SPEED_MM_S, len(wanted_mm))
+    return nearest_path_mm(start_mm, elapsed_s, times_s, wanted_mm, weights, SPEED_MM_S, len(wanted_mm))
 
 
-def cost(way: tuple[float, ...] | list[float], wanted_mm: list[float], weights: list[float]) -> float:
-    """What a way misses."""
-    return sum(weight * (at - want) ** 2 for at, want, weight in zip(way, wanted_mm, weights, strict=True))
+def cost(path: list[float], wanted_mm: list[float], weights: list[float]) -> float:
+    """What a path misses."""
+    return sum(weight * (at - want) ** 2 for at, want, weight in zip(path, wanted_mm, weights, strict=True))
 
 
 def test_what_the_gap_can_follow_is_followed() -> None:
     wanted = [60.0 + math.sin(0.3 * place) for place in range(40)]
-    assert way_mm(60.0, wanted, [1.0] * 40) == pytest.approx(wanted)
+    assert path_mm(60.0, wanted, [1.0] * 40) == pytest.approx(wanted)
 
 
 def test_a_step_is_met_in_its_middle() -> None:
     """As much too soon as too late: the gap is half way where the step is."""
     wanted = [60.0] * 20 + [64.0] * 20
-    way = way_mm(60.0, wanted, [1.0] * 40)
-    assert way[19] == pytest.approx(62.0 - MOST_MM / 2.0)
-    assert way[20] == pytest.approx(62.0 + MOST_MM / 2.0)
-    assert way[:14] == pytest.approx([60.0] * 14)
-    assert way[26:] == pytest.approx([64.0] * 14)
+    path = path_mm(60.0, wanted, [1.0] * 40)
+    assert path[19] == pytest.approx(62.0 - MOST_MM / 2.0)
+    assert path[20] == pytest.approx(62.0 + MOST_MM / 2.0)
+    assert path[:14] == pytest.approx([60.0] * 14)
+    assert path[26:] == pytest.approx([64.0] * 14)
 
 
 def test_where_the_force_hardly_depends_on_the_gap_more_is_given_up() -> None:
     weights = [0.01] * 20 + [1.0] * 20
-    way = way_mm(60.0, [60.0] * 20 + [64.0] * 20, weights)
-    assert way[20] > 63.0
+    path = path_mm(60.0, [60.0] * 20 + [64.0] * 20, weights)
+    assert path[20] > 63.0
 
 
 def test_the_first_gap_is_within_reach_of_the_last() -> None:
     for elapsed_s in (0.0, 0.002, 0.5):
-        way = way_mm(60.0, [70.0] * 10, [1.0] * 10, elapsed_s)
-        assert way[0] == pytest.approx(min(60.0 + SPEED_MM_S * elapsed_s, 70.0))
-        assert way[1] == pytest.approx(min(way[0] + MOST_MM, 70.0))
+        path = path_mm(60.0, [70.0] * 10, [1.0] * 10, elapsed_s)
+        assert path[0] == pytest.approx(min(60.0 + SPEED_MM_S * elapsed_s, 70.0))
+        assert path[1] == pytest.approx(min(path[0] + MOST_MM, 70.0))
 
 
 def test_no_more_of_it_is_told_than_is_asked_for() -> None:
     times_s = [STEP_S * place for place in range(12)]
-    assert len(nearest_way_mm(60.0, 0.0, times_s, [60.0] * 10, [1.0] * 10, SPEED_MM_S, 3)) == 3
+    assert len(nearest_path_mm(60.0, 0.0, times_s, [60.0] * 10, [1.0] * 10, SPEED_MM_S, 3)) == 3
 
 
 GRID = 4
-"Steps of a search over all ways on a grid: a step of the gap is so many of it."
+"Steps of a search over all paths on a grid: a step of the gap is so many of it."
 
 
 @settings(max_examples=100, deadline=None)
@@ -66,15 +66,15 @@ GRID = 4
     st.lists(st.tuples(st.floats(-2.0, 2.0), st.floats(0.01, 1.0), st.integers(1, 3)), min_size=1, max_size=12),
     st.integers(-10, 10),
 )
-def test_no_way_within_the_speed_misses_less(points: list[tuple[float, float, int]], start: int) -> None:
+def test_no_path_within_the_speed_misses_less(points: list[tuple[float, float, int]], start: int) -> None:
     """Nor where the points are unevenly far apart."""
     wanted, weights = [60.0 + at for at, _, _ in points], [weight for _, weight, _ in points]
     steps = [step for _, _, step in points]
     grid_mm = MOST_MM / GRID
     start_mm = 60.0 + start * grid_mm
     times_s = [STEP_S * (passed - steps[0]) for passed in itertools.accumulate(steps)]
-    way = nearest_way_mm(start_mm, STEP_S * steps[0], times_s, wanted, weights, SPEED_MM_S, len(wanted))
-    for (before, after), step in zip(itertools.pairwise([start_mm, *way]), steps, strict=True):
+    path = nearest_path_mm(start_mm, STEP_S * steps[0], times_s, wanted, weights, SPEED_MM_S, len(wanted))
+    for (before, after), step in zip(itertools.pairwise([start_mm, *path]), steps, strict=True):
         assert abs(after - before) <= step * MOST_MM + 1e-9
     reached = {start: 0.0}
     for want, weight, step in zip(wanted, weights, steps, strict=True):
@@ -84,4 +84,4 @@ def test_no_way_within_the_speed_misses_less(points: list[tuple[float, float, in
                 total = spent + weight * (60.0 + there * grid_mm - want) ** 2
                 following[there] = min(total, following.get(there, math.inf))
         reached = following
-    assert cost(way, wanted, weights) <= min(reached.values()) + 1e-9
+    assert cost(path, wanted, weights) <= min(reached.values()) + 1e-9

@@ -1,0 +1,257 @@
+"""From a force to a gap with the shipped model: by what it knows, within what the gap does, never beyond a floor."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from tormagd.assembly.build import Core
+from tormagd.config import Config
+from tormagd.control.aim.floors import LAW_SHARE, ceiling_mm
+from tormagd.control.believe.believe import Learned
+from tormagd.control.believe.carriage_lag import MAX_LAG_S
+from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.core import Planner
+from tormagd.control.records import Handle, Measured, Outside, Plan, TimedSetpoint
+from tormagd.inverse.solution import FieldSolution, Reach
+from tormagd.model.displacement import MOBILISED_MM, Turn
+from tormagd.safety.codes import Limit
+
+PERIOD_S = 0.004
+CONFIG = Config()
+TURN = Turn(1.0, 0.0, 100.0)
+RESTING = {"handle": Handle(MOBILISED_MM, 0.0, TURN, 42.0)}
+
+
+@pytest.fixture
+def planner(core: Core) -> Planner:
+    return core.planner()
+
+
+@pytest.fixture
+def first(core, planned):
+    """The first plan for a setpoint."""
+
+    def plan(force_N: float, measured: Measured | None = None, **setpoint: object) -> Plan:
+        return planned(core.planner(), force_N, measured, **setpoint)
+
+    return plan
+
+
+def test_starts_with_the_gap_open(core) -> None:
+    plan = core.planner(3.0).planned
+    assert (plan.gap_mm, plan.gap_speed_mm_s, plan.time_s) == (95.0, 0.0, 3.0)
+    assert plan.governed_N == core.portrait.min_N
+    assert plan.limits == (Limit.NO_SETPOINT,)
+
+
+@pytest.mark.parametrize("is_there", [False, True], ids=["no device", "at rest"])
+def test_without_a_setpoint_the_gap_stays_open(planner, moving, is_there: bool) -> None:
+    for tick in range(1, 20):
+        plan = planner.plan(tick * PERIOD_S, None, moving(**RESTING) if is_there else None)
+    assert plan.gap_mm == pytest.approx(95.0, abs=1.0)
+    assert plan.setpoint_N is None
+    assert plan.number == 19
+
+
+@pytest.mark.parametrize("rate_mm_s", [0.0, 1.0, 4.9])
+@pytest.mark.parametrize("force_N", [0.6, 1.0, 1.8])
+def test_a_handle_that_rests_does_not_close_the_gap(first, moving, rate_mm_s: float, force_N: float) -> None:
+    """At rest the force is the hand's choice: the gap waits where it is right once the handle moves on."""
+    resting = moving(handle=Handle(MOBILISED_MM, rate_mm_s, TURN, 42.0))
+    gap_mm = first(force_N, moving()).gap_mm
+    assert first(force_N, resting).gap_mm == pytest.approx(gap_mm, abs=0.1)
+    # nothing is known of a handle that was never seen: it is planned for as one that moves slowly
+    assert first(force_N).gap_mm == pytest.approx(gap_mm, abs=1.5)
+
+
+def test_a_creeping_handle_is_planned_for_with_its_static_friction(first, moving) -> None:
+    creeping = moving(handle=Handle(MOBILISED_MM, 0.5, TURN, 0.5))
+    assert first(1.5, creeping).gap_mm > first(1.5, moving()).gap_mm + 2.0
+
+
+def test_the_portrait_rises_and_agrees_with_its_slope(core) -> None:
+    portrait = core.portrait
+    assert np.all(np.diff(portrait.force_N) > 0.0)
+    assert 0.6 < portrait.min_N < 0.7
+    assert portrait.max_N > 2.0
+    assert min(portrait.slope_N_mm) >= 0.0
+    # the slope is dF/dgap: integrated over the range it gives the force range back
+    step_mm = 50.0 / (len(portrait.force_N) - 1)
+    swept_N = float(np.trapezoid(portrait.slope_N_mm, dx=step_mm))
+    assert swept_N == pytest.approx(portrait.max_N - portrait.min_N, rel=0.01)
+    assert portrait.force_rate_N_s(1.5, 38.0) == pytest.approx(38.0 * portrait.slope_at_N_mm(1.5))
+
+
+def test_more_force_takes_a_smaller_gap(first) -> None:
+    gaps_mm = [first(force_N).gap_mm for force_N in np.arange(0.7, 1.81, 0.1)]
+    assert all(closer < further for further, closer in pairwise(gaps_mm))
+    assert 45.0 <= gaps_mm[-1] < gaps_mm[0] <= 95.0
+
+
+@pytest.mark.parametrize("force_N", [0.7, 1.0, 1.5, 1.8])
+def test_the_planned_gap_gives_the_force_by_the_portrait(core, first, moving, force_N: float) -> None:
+    plan, portrait = first(force_N, moving()), core.portrait
+    assert np.interp(plan.gap_mm, portrait.gap_mm[::-1], portrait.force_N[::-1]) == pytest.approx(force_N, abs=0.03)
+    assert plan.governed_N == pytest.approx(force_N)
+    assert plan.confidence > 0.5
+
+
+@pytest.mark.parametrize(("force_N", "limit"), [(0.05, Limit.F_MIN), (2.5, Limit.RANGE)])
+def test_what_cannot_be_given_is_said_once(first, moving, force_N: float, limit: Limit) -> None:
+    limits = first(force_N, moving()).limits
+    assert limits.count(limit) == 1
+    assert len(set(limits)) == len(limits)
+
+
+def test_a_device_that_gives_more_than_was_asked_at_its_open_gap_is_said(planner, planned, first) -> None:
+    """Where the element gives 1.6 times the model's force, 0.7 N are less than the open gap gives."""
+    planner.teach(Learned(DeviceFit(scale=1.6)))
+    plan = planned(planner, 0.7)
+    assert Limit.F_MIN in plan.limits
+    assert plan.gap_mm == pytest.approx(95.0, abs=0.1)
+    assert Limit.F_MIN not in first(0.7).limits
+
+
+def test_the_gap_moves_ahead_along_the_setpoints_slope(core, planner, planned, moving) -> None:
+    for _ in range(40):
+        plan = planned(planner, 1.0 + 0.5 * planner.planned.time_s, moving())
+    slope_N_mm = core.portrait.slope_at_N_mm(plan.governed_N)
+    assert plan.gap_speed_mm_s == pytest.approx(-0.5 / slope_N_mm, rel=0.1)
+
+
+@settings(max_examples=30, deadline=None)
+@given(forces=st.lists(st.floats(0.0, 3.0), min_size=1, max_size=10))
+def test_the_gap_speed_is_one_the_carriages_have(core, planned, moving, forces: list[float]) -> None:
+    planner = core.planner()
+    for force_N in forces:
+        plan = planned(planner, force_N, moving())
+        assert abs(plan.gap_speed_mm_s) <= CONFIG.position.gap_speed_mm_s
+        assert 45.0 <= plan.gap_mm <= 95.0
+
+
+def test_a_preview_gives_the_gaps_speed_and_acceleration(core, planner, first, moving) -> None:
+    """Where the force turns round, the speed is none and only the acceleration tells what comes."""
+
+    def force_N(time_s: float) -> float:
+        return 1.5 + 0.1 * math.cos(2.0 * math.pi * 3.0 * (time_s - 0.2))
+
+    planner.governor.asked_N = force_N(0.0)
+    for tick in range(1, 101):
+        now_s = 2e-3 * tick
+        ahead_N = tuple(force_N(now_s + 2e-3 * step) for step in range(1, 40))
+        setpoint = TimedSetpoint(force_N(now_s), now_s, 0.1, preview_N=ahead_N, preview_dt_s=2e-3)
+        plan = planner.plan(now_s, setpoint, None)
+    curve_N_s2 = -0.1 * (2.0 * math.pi * 3.0) ** 2
+    # within 4 ms of the turn: the path is planned in steps of 10
+    assert plan.gap_speed_mm_s == pytest.approx(0.0, abs=2.5)
+    assert plan.gap_acceleration_mm_s2 == pytest.approx(-curve_N_s2 / core.portrait.slope_at_N_mm(1.6), rel=0.2)
+    assert first(1.6, moving()).gap_acceleration_mm_s2 == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_model_is_never_asked_outside_what_it_was_shown(first) -> None:
+    """A setpoint may be meant for any motion; the model answers for the nearest that it knows, and the plan says so."""
+    fast = first(1.0, rate_mm_s=1_000.0)
+    assert Limit.MODEL_RANGE in fast.limits
+    (replaced,) = fast.outside
+    assert (replaced.quantity, replaced.asked) == ("rate_mm_s", 1_000.0)
+    assert 295.0 < replaced.used < 320.0
+    assert fast.gap_mm == first(1.0, rate_mm_s=replaced.used).gap_mm
+    early = first(1.0, displacement_mm=0.1)
+    assert early.outside == (Outside("displacement_mm", 0.1, MOBILISED_MM),)
+    assert early.gap_mm == first(1.0).gap_mm
+    assert first(1.0).outside == ()
+
+
+class WrongSolver:
+    """A search that answers with one field, whatever is asked."""
+
+    def __init__(self, field_mT: float) -> None:
+        self._field_mT = field_mT
+
+    def solve(self, *_: object) -> FieldSolution:
+        return FieldSolution(self._field_mT, 1.0, 1.0, 1, Reach.INSIDE)
+
+
+@pytest.mark.parametrize("wrong_mT", [1.0, 780.0])
+def test_the_force_law_stands_around_the_search(core, planned, first, moving, wrong_mT: float) -> None:
+    misled = core._replace(element=core.element._replace(search=WrongSolver(wrong_mT)))
+    wrong = planned(misled.planner(), 1.0, moving())
+    assert wrong.field_mT == pytest.approx(first(1.0, moving()).field_mT, rel=LAW_SHARE + 0.01)
+    (replaced,) = wrong.outside
+    assert replaced == Outside("field_mT", wrong_mT, wrong.field_mT)
+    assert Limit.MODEL_RANGE in wrong.limits
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.0, 1.4])
+def test_at_the_ceilings_floor_a_known_device_gives_the_ceiling(core, scale: float) -> None:
+    known = DeviceFit(scale, scale_variance=0.0, offset_variance_N2=0.0)
+    floor_mm = ceiling_mm(core.portrait, known, 1.5)
+    assert known.force_N(core.portrait.force_N_at(floor_mm)) == pytest.approx(1.5, abs=1e-3)
+
+
+TURNING = {"is_homed": False, "handle": Handle(MOBILISED_MM / 2.0, 42.0, TURN, 42.0)}
+
+
+def test_a_publishers_own_motion_is_used_until_the_handle_slides(first, moving) -> None:
+    turning, sliding = moving(**TURNING), moving(is_homed=False)
+    slow_mm = first(1.0, moving(is_homed=False, force_N=0.0, handle=Handle(MOBILISED_MM, 8.0, TURN, 8.0))).gap_mm
+    assert first(1.0, rate_mm_s=8.0).gap_mm == slow_mm == first(1.0, turning, rate_mm_s=-8.0).gap_mm
+    assert first(1.0, sliding, rate_mm_s=8.0).gap_mm == first(1.0, sliding).gap_mm != slow_mm
+
+
+@pytest.mark.parametrize(("waited_s", "is_used"), [(0.09, True), (0.2, False)])
+def test_a_stale_setpoints_motion_is_not_used_any_more(core, moving, waited_s: float, is_used: bool) -> None:
+    gaps_mm = {
+        core.planner().plan(waited_s, TimedSetpoint(1.0, PERIOD_S, 0.1, rate_mm_s=rate_mm_s), moving(**TURNING)).gap_mm
+        for rate_mm_s in (8.0, None)
+    }
+    assert len(gaps_mm) == 1 + is_used
+
+
+measurements = st.none() | st.fixed_dictionaries(
+    {
+        "gap_mm": st.floats(-200.0, 400.0),
+        "force_N": st.floats(-33.0, 33.0),
+        "is_homed": st.booleans(),
+        "handle": st.builds(
+            Handle,
+            displacement_mm=st.floats(0.0, MOBILISED_MM),
+            rate_mm_s=st.floats(-2_000.0, 2_000.0),
+            turn=st.sampled_from([Turn(-1.0, 0.0, 0.0), Turn(1.0, 0.0, 0.0)]),
+            sliding_mm_s=st.floats(0.0, 2_000.0),
+        ),
+    }
+)
+setpoints = st.none() | st.builds(
+    TimedSetpoint,
+    force_N=st.floats(0.0, 1_000.0),
+    stamp_s=st.floats(-10.0, 100.0),
+    valid_for_s=st.floats(1e-6, 60.0),
+    displacement_mm=st.none() | st.floats(-1e9, 1e9),
+    rate_mm_s=st.none() | st.floats(-1e9, 1e9),
+    preview_N=st.lists(st.floats(0.0, 1_000.0), max_size=10).map(tuple),
+    preview_dt_s=st.floats(1e-9, 1.0),
+)
+
+
+@settings(max_examples=80, deadline=None)
+@given(history=st.lists(st.tuples(st.floats(0.0, 20.0), setpoints, measurements), min_size=1, max_size=8))
+def test_nan_never_travels(core, moving, history: list[tuple[float, TimedSetpoint | None, dict | None]]) -> None:
+    planner, now_s = core.planner(), 0.0
+    for number, (elapsed_s, setpoint, changes) in enumerate(history):
+        now_s += elapsed_s
+        plan = planner.plan(now_s, setpoint, None if changes is None else moving(number=number, **changes))
+        device, lag_s = planner.believe.device, planner.believe.carriages.lag_s
+        numbers = (plan.governed_N, plan.field_mT, plan.gap_mm, plan.gap_speed_mm_s, plan.confidence, plan.trim)
+        assert all(math.isfinite(value) for value in (*numbers, plan.gap_acceleration_mm_s2, lag_s))
+        assert plan.predicted_N is None or math.isfinite(plan.predicted_N)
+        assert 45.0 <= plan.gap_mm <= 95.0
+        assert CONFIG.trim.least <= device.scale <= CONFIG.trim.most
+        assert all(math.isfinite(getattr(device, name)) for name in DeviceFit.__match_args__)
+        assert plan.governed_N <= max(core.scene.force.most_N, device.force_N(core.portrait.min_N))
+        assert plan.gap_mm >= plan.min_gap_mm
+        assert 0.0 <= lag_s <= MAX_LAG_S
+        assert plan.number == number + 1

@@ -1,0 +1,499 @@
+"""The governor: every difference between force asked and force rendered has a reason, and none of them jumps."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from tormagd.assembly.journal import KNOWN
+from tormagd.control.aim.portrait import Portrait
+from tormagd.control.ask.forecast import Forecast
+from tormagd.control.ask.governor import AHEAD_S, MIN_TIMES, Governor, _wanted_N
+from tormagd.control.ask.path import PATH_S, TIMES_S
+from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.records import Ask, TimedSetpoint
+from tormagd.exact import plain, restore
+from tormagd.safety.codes import Limit
+from tormagd.scenes.scene import EVERY_TERM, Force, Terms
+
+PORTRAIT = Portrait(
+    np.linspace(95.0, 45.0, 19).tolist(), np.linspace(0.4, 2.2, 19).tolist(), np.linspace(0.01, 0.1, 19).tolist()
+)
+SCENE = Force(least_N=0.0, most_N=2.0, resolution_N=0.1, tolerance_rms_N=0.05)
+GAP_SPEED_MM_S = 38.0
+STEEPEST_N_S = GAP_SPEED_MM_S * max(PORTRAIT.slope_N_mm)
+AFTER_S = np.array(PATH_S)
+VALID_S = 0.1
+
+
+def governor(
+    now_s: float = 0.0,
+    asked_N: float = 0.4,
+    *,
+    scene: Force = SCENE,
+    portrait: Portrait = PORTRAIT,
+    gap_speed_mm_s: float = GAP_SPEED_MM_S,
+    terms: Terms = EVERY_TERM,
+) -> Governor:
+    """On the device of these tests, which was asked for this last."""
+    begun = Governor(now_s, portrait, scene, gap_speed_mm_s, terms)
+    begun.asked_N, begun.above_N = asked_N, asked_N - portrait.min_N
+    return begun
+
+
+def decide(following: Governor, now_s: float, setpoint: TimedSetpoint | None, lag_s: float = 0.0) -> Ask:
+    """Its next decision."""
+    return following.update(now_s, setpoint, DeviceFit(), lag_s)
+
+
+def path_N(ask: Ask) -> npt.NDArray[np.float64]:
+    """The force to come."""
+    return np.array(ask.path_N)
+
+
+def stream_of(
+    forces_N: list[float], period_s: float = 0.01, lag_s: float = 0.0, portrait: Portrait = PORTRAIT
+) -> tuple[Governor, Ask]:
+    """After setpoints that came one per period, with the last decision."""
+    following = governor(portrait=portrait)
+    for number, force_N in enumerate(forces_N, 1):
+        now_s = number * period_s
+        ask = decide(following, now_s, TimedSetpoint(force_N, now_s, VALID_S), lag_s)
+    return following, ask
+
+
+RAMP_N = [1.0 + 0.01 * k for k in range(40)]
+"Of 1 N/s."
+
+
+@pytest.mark.parametrize(
+    ("asked", "scene_range", "rendered", "limits"),
+    [
+        (1.0, (0.0, 2.0), 1.0, ()),
+        (0.4, (0.0, 2.0), 0.4, ()),
+        (2.0, (0.0, 2.0), 2.0, ()),
+        (0.1, (0.0, 2.0), 0.4, (Limit.F_MIN,)),
+        (0.1, (0.5, 2.0), 0.5, (Limit.RANGE,)),
+        (2.5, (0.0, 2.0), 2.0, (Limit.RANGE,)),
+        (2.5, (0.0, 3.0), 2.2, (Limit.F_MAX,)),
+        (3.5, (0.0, 3.0), 2.2, (Limit.RANGE, Limit.F_MAX)),
+        (0.1, (0.2, 3.0), 0.4, (Limit.RANGE, Limit.F_MIN)),
+    ],
+)
+def test_range_and_reach(
+    asked: float, scene_range: tuple[float, float], rendered: float, limits: tuple[Limit, ...]
+) -> None:
+    scene = Force(least_N=scene_range[0], most_N=scene_range[1], resolution_N=0.1, tolerance_rms_N=0.05)
+    ask = decide(governor(scene=scene), 1.0, TimedSetpoint(asked, 1.0, VALID_S))
+    assert ask.force_N == pytest.approx(rendered)
+    assert ask.limits == limits
+
+
+def test_without_a_setpoint_the_least_force_is_rendered() -> None:
+    ask = decide(governor(), 1.0, None)
+    assert (ask.force_N, ask.age_s, ask.limits) == (0.4, None, (Limit.NO_SETPOINT,))
+    assert np.all(path_N(ask) == 0.4)
+
+
+def test_a_stale_setpoint_decays_along_the_ramp_and_not_below_the_least() -> None:
+    following, setpoint = governor(0.99, 1.6), TimedSetpoint(1.6, 1.0, VALID_S)
+    decide(following, 1.0, setpoint)
+    assert decide(following, 1.1 - 1e-9, setpoint).limits == ()
+    last_N = 1.6
+    for tick in range(1, 1_000):
+        now_s = 1.1 + tick * 1e-3
+        ask = decide(following, now_s, setpoint)
+        assert ask.limits == (Limit.STALE,)
+        assert ask.age_s == pytest.approx(now_s - 1.0)
+        assert np.all(path_N(ask) == ask.force_N)
+        assert last_N - ask.force_N <= SCENE.release_N_s * 1e-3 + 1e-8
+        assert ask.force_N == pytest.approx(max(0.4, 1.6 - SCENE.release_N_s * tick * 1e-3))
+        last_N = ask.force_N
+    assert last_N == 0.4
+
+
+def test_a_setpoint_that_goes_stale_on_a_slope_is_let_go_from_where_the_force_is() -> None:
+    """It was carried on along its slope; the ramp begins there, not at the setpoint."""
+    following, ask = stream_of([1.0 + 0.02 * number for number in range(20)])
+    for tick in range(1, 400):
+        last_N = ask.path_N[0]
+        ask = decide(following, 0.2 + tick * 1e-3, TimedSetpoint(1.38, 0.2, VALID_S))
+        assert last_N - ask.path_N[0] <= SCENE.release_N_s * 1e-3 + 1e-8
+    assert ask.path_N[0] < 1.0
+
+
+@pytest.mark.parametrize("ahead_N", [(), (1.0,) * 40])
+@pytest.mark.parametrize(("before_N", "after_N"), [(1.6, 0.8), (0.8, 1.6)])
+def test_from_one_holder_to_the_next_the_force_goes_along_the_ramp(
+    before_N: float, after_N: float, ahead_N: tuple[float, ...]
+) -> None:
+    following, reached = governor(0.0, before_N), 0
+    ask = decide(following, 0.001, TimedSetpoint(before_N, 0.001, VALID_S))
+    for tick in range(2, 1_000):
+        now_s, last_N = tick * 1e-3, ask.force_N
+        preview_N = tuple(after_N * share for share in ahead_N)
+        setpoint = TimedSetpoint(
+            after_N, now_s, VALID_S, preview_N=preview_N, preview_dt_s=0.002, holder=1, is_contested=True
+        )
+        ask = decide(following, now_s, setpoint)
+        assert abs(ask.force_N - last_N) <= SCENE.release_N_s * 1e-3 + 1e-9
+        assert Limit.OTHER_SOURCE in ask.limits
+        is_there = abs(ask.force_N - after_N) <= 1e-12
+        assert (Limit.TAKEOVER in ask.limits) != is_there
+        reached = reached or tick * is_there
+    assert reached == pytest.approx(0.8 / SCENE.release_N_s * 1e3, abs=5)
+    # and it is followed as any other from then on
+    ask = decide(following, 1.001, TimedSetpoint(1.2, 1.001, VALID_S, holder=1))
+    assert (ask.force_N, ask.limits) == (1.2, ())
+
+
+def test_a_takeover_after_a_silence_begins_from_the_decayed_force() -> None:
+    following = governor(0.0, 1.6)
+    for tick in range(1, 301):
+        decayed_N = decide(following, tick * 1e-3, TimedSetpoint(1.6, 0.001, VALID_S)).force_N
+    ask = decide(following, 0.301, TimedSetpoint(1.6, 0.301, VALID_S, holder=1))
+    assert ask.force_N == pytest.approx(decayed_N + SCENE.release_N_s * 1e-3)
+
+
+def test_another_holders_forces_teach_no_slope_and_no_period() -> None:
+    following, _ = stream_of([1.0, 1.1, 1.2])
+    assert following.slope_N_s != 0.0
+    decide(following, 0.04, TimedSetpoint(1.0, 0.04, VALID_S, holder=1))
+    assert following.slope_N_s == 0.0
+    assert np.frombuffer(following.forecast.history).tolist() == [1.0]
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 3), st.sampled_from([0.0, 0.02, 0.2, 2.0]), st.floats(1e-4, 0.01)),
+        min_size=1,
+        max_size=100,
+    )
+)
+def test_no_loss_of_force_that_was_not_asked_for_is_faster_than_the_ramp(
+    events: list[tuple[int, float, float]],
+) -> None:
+    """Each holder asks for a constant force; publishers fall silent, come late, and take over from each other."""
+    following, now_s = governor(0.0, 2.0), 0.0
+    for holder, age_s, elapsed_s in events:
+        now_s += elapsed_s
+        before_N = following.asked_N
+        ask = decide(following, now_s, TimedSetpoint(0.5 + 0.5 * holder, now_s - age_s, VALID_S, holder=holder))
+        # a first publisher takes over from nobody, and one that comes back says itself what it wants
+        if following.is_passing or Limit.STALE in ask.limits:
+            assert before_N - following.asked_N <= SCENE.release_N_s * elapsed_s + 1e-9
+        assert following.asked_N == ask.path_N[0]
+
+
+def test_a_publisher_that_comes_back_is_followed_again_without_a_slope_from_before() -> None:
+    following, _ = stream_of([1.0, 1.1, 1.2])
+    decide(following, 0.5, TimedSetpoint(1.2, 0.03, VALID_S))
+    ask = decide(following, 0.6, TimedSetpoint(1.5, 0.6, VALID_S))
+    assert (ask.force_N, ask.limits) == (1.5, ())
+    assert np.all(path_N(ask) == 1.5)
+
+
+def test_a_slope_is_learned_and_carried_ahead() -> None:
+    following, ask = stream_of(RAMP_N)
+    assert following.slope_N_s == pytest.approx(1.0, rel=1e-3)
+    assert path_N(ask) == pytest.approx(1.39 + AFTER_S, abs=1e-3)
+    for waited_s, ahead_N in ((0.0, 1.39), (0.01, 1.40), (AHEAD_S, 1.44), (0.09, 1.44)):
+        later = decide(following, 0.4 + waited_s, TimedSetpoint(1.39, 0.4, VALID_S))
+        assert path_N(later)[0] == pytest.approx(ahead_N, abs=1e-3)
+        assert later.force_N == pytest.approx(1.39)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    forces_N=st.lists(st.floats(0.0, 3.0), min_size=1, max_size=40),
+    period_s=st.floats(1e-6, 0.2),
+    lag_s=st.floats(0.0, 0.05),
+)
+def test_the_slope_is_one_that_the_gap_speed_can_render(forces_N: list[float], period_s: float, lag_s: float) -> None:
+    following, ask = stream_of(forces_N, period_s, lag_s)
+    assert abs(following.slope_N_s) <= STEEPEST_N_S + 1e-9
+    assert np.all((path_N(ask) >= PORTRAIT.min_N) & (path_N(ask) <= SCENE.most_N))
+    assert PORTRAIT.min_N <= ask.force_N <= SCENE.most_N
+
+
+def test_a_jump_at_a_flat_force_gives_the_slope_renderable_there() -> None:
+    flat = Portrait([95.0, 70.0, 45.0], [0.4, 1.0, 2.2], [0.001, 0.001, 0.1])
+    following, _ = stream_of([1.0, 0.4, 1.0, 0.4, 0.5], portrait=flat)
+    assert abs(following.slope_N_s) <= GAP_SPEED_MM_S * 0.001 + 1e-12
+
+
+def test_setpoints_with_equal_stamps_have_no_slope_between_them() -> None:
+    following, _ = stream_of([1.0, 1.02, 1.04])
+    slope_N_s = following.slope_N_s
+    assert decide(following, 0.031, TimedSetpoint(1.5, 0.03, VALID_S)).force_N == 1.5
+    assert following.slope_N_s == slope_N_s
+
+
+def test_a_stamp_ahead_of_the_clock_is_of_no_age() -> None:
+    following, _ = stream_of(RAMP_N)
+    ask = decide(following, 0.41, TimedSetpoint(1.4, 0.45, VALID_S))
+    assert ask.age_s == pytest.approx(-0.04)
+    assert path_N(ask)[0] == pytest.approx(1.4)
+    assert ask.limits == ()
+
+
+@pytest.mark.parametrize("now_s", [1.0, 0.5, -10.0])
+def test_a_clock_that_stands_still_or_goes_back_lets_nothing_jump(now_s: float) -> None:
+    assert decide(governor(1.0, 1.5), now_s, None).force_N == 1.5
+
+
+def told(force_N: Callable[[float], float], seconds: float, *, ahead_s: float = 0.4, lag_s: float = 0.0) -> Ask:
+    """The last decision on setpoints that carry what follows, 500 times a second from 0 s on."""
+    following = governor(0.0, force_N(0.0))
+    for tick in range(1, round(500 * seconds) + 1):
+        now_s = tick / 500
+        ahead_N = tuple(force_N(now_s + 0.002 * place) for place in range(1, round(500 * ahead_s) + 1))
+        setpoint = TimedSetpoint(force_N(now_s), now_s, VALID_S, preview_N=ahead_N, preview_dt_s=0.002)
+        ask = decide(following, now_s, setpoint, lag_s)
+    return ask
+
+
+def swing_N(time_s: float) -> float:
+    """As slow as the gap of these tests can follow."""
+    return 1.5 + 0.05 * math.sin(2.0 * math.pi * 2.0 * time_s)
+
+
+@pytest.mark.parametrize("seconds", [0.3, 0.5, 0.82])
+@pytest.mark.parametrize("ahead_s", [0.07, 0.4])
+def test_a_preview_is_what_comes(seconds: float, ahead_s: float) -> None:
+    """A swing that no slope foresees; the path goes along it."""
+    ask = told(swing_N, seconds, ahead_s=ahead_s)
+    assert path_N(ask) == pytest.approx([swing_N(seconds + after_s) for after_s in PATH_S], abs=2e-3)
+    assert ask.force_N == ask.path_N[0]
+    assert (ask.limits, ask.foresight) == ((), 1.0)
+
+
+def step_N(time_s: float) -> float:
+    """Too fast for any gap."""
+    return 1.2 if time_s < 1.0 else 1.8
+
+
+def test_what_is_too_fast_is_missed_before_and_after() -> None:
+    """The carriages set out before a step that they know of, and the limit says that they are too slow for it."""
+    assert path_N(told(step_N, 0.6)) == pytest.approx(1.2)
+    there = told(step_N, 1.0)
+    assert 1.4 < there.force_N < 1.6
+    assert there.limits == (Limit.RATE,)
+    long_after = told(step_N, 1.4)
+    assert path_N(long_after) == pytest.approx(1.8, abs=2e-3)
+    assert long_after.limits == ()
+    # of what is not known nobody can be ahead
+    assert told(step_N, 0.88, ahead_s=0.05).force_N == pytest.approx(1.2)
+
+
+def test_late_carriages_set_out_sooner() -> None:
+    assert told(step_N, 0.75, lag_s=0.03).force_N > told(step_N, 0.75).force_N + 1e-3
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.floats(0.0, 4.0), min_size=1, max_size=60), st.floats(1e-4, 1.0), st.floats(0.0, 0.03))
+def test_no_path_is_faster_than_the_gap_or_beyond_what_was_asked(
+    ahead_N: list[float], spacing_s: float, lag_s: float
+) -> None:
+    """However the preview leaps, and whatever it says: the path goes on from where the last one was."""
+    following = governor(0.0, 1.0)
+    for tick in range(1, 6):
+        before_N, now_s = following.asked_N, 0.004 * tick
+        leap = tuple(ahead_N[tick:] + ahead_N[:tick])
+        setpoint = TimedSetpoint(leap[0], now_s, VALID_S, preview_N=leap, preview_dt_s=spacing_s)
+        ask = decide(following, now_s, setpoint, lag_s)
+        assert abs(ask.path_N[0] - before_N) <= STEEPEST_N_S * 0.004 + 1e-9
+        assert np.all(np.abs(np.diff(path_N(ask))) <= STEEPEST_N_S * 0.005 + 1e-9)
+        assert np.all((path_N(ask) >= PORTRAIT.min_N) & (path_N(ask) <= SCENE.most_N))
+
+
+@pytest.mark.parametrize(("asked_N", "held_N"), [(3.0, SCENE.most_N), (0.0, PORTRAIT.min_N)])
+def test_a_preview_beyond_the_range_is_held_at_its_ends(asked_N: float, held_N: float) -> None:
+    assert path_N(told(lambda time_s: asked_N, 1.5)) == pytest.approx(held_N)
+
+
+def test_a_short_preview_goes_on_as_it_ran_and_not_for_long() -> None:
+    rising = TimedSetpoint(1.0, 0.5, 10.0, preview_N=(1.005, 1.01), preview_dt_s=5e-3)
+    following = governor(0.499, 1.0)
+    soon = decide(following, 0.5, rising)
+    assert np.all(np.diff(path_N(soon)) > 0.0)
+    # no further than it was known
+    assert path_N(soon)[-1] < 1.02
+    for tick in range(1, 100):
+        late = decide(following, 0.5 + 0.01 * tick, rising)
+    assert path_N(late) == pytest.approx(np.full(len(PATH_S), 1.02))
+
+
+def test_a_preview_does_not_outlive_its_validity() -> None:
+    setpoint = TimedSetpoint(1.5, 0.5, VALID_S, preview_N=(1.5,) * 200, preview_dt_s=2e-3)
+    ask = decide(governor(0.699, 1.5), 0.7, setpoint)
+    assert ask.limits == (Limit.STALE,)
+    assert np.all(path_N(ask) < 1.5)
+
+
+def beats_N(time_s: float) -> float:
+    """A pulse of 1.1 Hz with a notch."""
+    phase = 2.0 * math.pi * 1.1 * time_s
+    return 1.4 + 0.15 * math.sin(phase) + 0.08 * math.sin(2.0 * phase + 1.0) + 0.04 * math.sin(3.0 * phase)
+
+
+def beat(time_s: float) -> TimedSetpoint:
+    return TimedSetpoint(beats_N(time_s), time_s, VALID_S)
+
+
+def beaten(seconds: float, **keywords: Any) -> Governor:
+    """A governor after so much of the pulse, 500 times a second, without a preview."""
+    following = governor(**keywords)
+    for tick in range(1, round(500 * seconds) + 1):
+        decide(following, tick / 500, beat(tick / 500))
+        following.foresee()
+    return following
+
+
+@pytest.fixture(scope="module")
+def learned_once() -> Any:
+    return plain(beaten(10.0))
+
+
+@pytest.fixture
+def learned(learned_once: Any) -> Governor:
+    """Of ten seconds of the pulse."""
+    following = governor()
+    restore(following, learned_once, KNOWN)
+    return following
+
+
+@pytest.mark.parametrize(("lag_s", "share"), [(0.0, 0.3), (0.01, 0.75)])
+def test_a_force_that_repeats_itself_is_foreseen(lag_s: float, share: float) -> None:
+    worst_N = extrapolated_N = 0.0
+    swift_mm_s = 3.0 * GAP_SPEED_MM_S  # a gap that is fast enough for this pulse
+    following = beaten(10.0, gap_speed_mm_s=swift_mm_s)
+    blind = beaten(10.0, gap_speed_mm_s=swift_mm_s, terms=EVERY_TERM.without("forecast"))
+    for tick in range(5_001, 5_501):
+        now_s = tick / 500
+        ask, extrapolated = decide(following, now_s, beat(now_s), lag_s), decide(blind, now_s, beat(now_s))
+        following.foresee()
+        assert ask.foresight > 0.9
+        assert ask.limits == ()
+        # what carriages that come later by the lag are sent to now is rendered then
+        wanted_N = [beats_N(now_s + lag_s + ahead_s) for ahead_s in PATH_S]
+        worst_N = max(worst_N, float(np.abs(path_N(ask) - wanted_N).max()))
+        extrapolated_N = max(extrapolated_N, float(np.abs(path_N(extrapolated) - wanted_N).max()))
+    assert worst_N < share * extrapolated_N
+
+
+def test_of_what_is_foreseen_a_slow_gap_makes_the_best(learned: Governor) -> None:
+    """It turns before the force does, and is asked for no more than it can do."""
+    fastest_N_s = GAP_SPEED_MM_S * (PORTRAIT.force_N[-1] - PORTRAIT.force_N[0]) / (95.0 - 45.0)
+    follower_N = learned.asked_N
+    missed_N, followed_N = [], []
+    for tick in range(5_001, 5_956):
+        now_s = tick / 500
+        learned.foresee()
+        ask = decide(learned, now_s, beat(now_s))
+        assert np.all(np.abs(np.diff(path_N(ask))) <= fastest_N_s * np.diff(PATH_S) + 0.01)
+        assert ask.force_N == pytest.approx(beats_N(now_s))
+        step_N = fastest_N_s / 500
+        follower_N += min(max(beats_N(now_s) - follower_N, -step_N), step_N)
+        missed_N.append(ask.path_N[0] - beats_N(now_s))
+        followed_N.append(follower_N - beats_N(now_s))
+    assert np.std(missed_N) < 0.8 * np.std(followed_N)
+
+
+def test_a_lag_is_made_up_for_as_far_as_it_is_known_what_comes() -> None:
+    following, _ = stream_of(RAMP_N)
+    extrapolated = decide(following, 0.4, TimedSetpoint(1.39, 0.4, VALID_S), 0.02)
+    assert extrapolated.foresight == 0.0
+    assert path_N(extrapolated)[0] == pytest.approx(1.39)
+
+
+def test_no_forecast_holds_a_force_of_a_stale_setpoint(learned: Governor) -> None:
+    for tick in range(1, 1_000):
+        now_s = 10.0 + tick * 1e-3
+        ask = decide(learned, now_s, beat(10.0))
+        if now_s - 10.0 <= VALID_S:
+            continue
+        assert ask.limits == (Limit.STALE,)
+        assert ask.foresight == 0.0
+        assert np.all(path_N(ask) == ask.force_N)
+        assert plain(learned.forecast) == plain(Forecast())
+    assert learned.asked_N == PORTRAIT.min_N
+
+
+def test_a_silent_stream_is_not_believed_to_go_on(learned: Governor) -> None:
+    """However long its last setpoint is valid."""
+    last = TimedSetpoint(beats_N(10.0), 10.0, 60.0)
+    assert decide(learned, 10.05, last).foresight > 0.9
+    late = decide(learned, 10.2, last)
+    assert late.foresight == 0.0
+    learned.forecast.forget()
+    assert np.all(path_N(late) == path_N(decide(learned, 10.2, last)))
+
+
+def test_what_a_long_preview_says_is_not_foreseen(learned: Governor) -> None:
+    decide(learned, 10.002, TimedSetpoint(1.4, 10.002, VALID_S, preview_N=(1.4,) * 200, preview_dt_s=2e-3))
+    assert plain(learned.forecast) == plain(Forecast())
+
+
+def test_past_its_end_a_short_preview_of_what_repeats_itself_is_foreseen() -> None:
+    """With 40 ms of a pulse known, the gap is sent to what comes in 90."""
+    missed: dict[bool, list[float]] = {True: [], False: []}
+    for is_foreseen, found in missed.items():
+        following = governor(0.0, beats_N(0.0), terms=Terms(forecast=is_foreseen))
+        for tick in range(1, 5_000):
+            now_s = tick * 2e-3
+            ahead_N = tuple(beats_N(now_s + 2e-3 * step) for step in range(1, 21))
+            setpoint = TimedSetpoint(beats_N(now_s), now_s, VALID_S, preview_N=ahead_N, preview_dt_s=2e-3)
+            following.foresee()
+            decide(following, now_s, setpoint)
+            if now_s > 6.0:
+                wanted_N = _wanted_N(setpoint, 0.0, (0.0, 10.0), following.forecast)
+                found.append(wanted_N[MIN_TIMES - 1] - beats_N(now_s + TIMES_S[MIN_TIMES - 1]))
+    assert np.std(missed[True]) < 0.5 * np.std(missed[False])
+
+
+def test_touches_that_nobody_foresees_are_gone_for() -> None:
+    """Random ones of a newton, each as long as the pause behind it, and half of what the gap would need."""
+    random, following, now_s = np.random.default_rng(8), governor(0.0, 0.7), 0.0
+    for _ in range(20):
+        for force_N in (0.7, random.uniform(1.2, 1.9)):
+            for _ in range(round(100 * random.uniform(0.2, 0.5))):
+                now_s += 0.01
+                following.foresee()
+                ask = decide(following, now_s, TimedSetpoint(force_N, now_s, VALID_S))
+                assert (ask.force_N, ask.limits) == (force_N, ())
+
+
+events = st.tuples(
+    st.none() | st.floats(0.0, 1_000.0),
+    st.lists(st.floats(0.0, 1_000.0), max_size=20),
+    st.floats(-2.0, 2.0) | st.just(0.0) | st.just(1e6),
+    st.floats(1e-3, 60.0),
+    st.floats(0.0, 0.5) | st.just(0.0) | st.just(1e-9) | st.just(1e5),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(history=st.lists(events, min_size=1, max_size=30))
+def test_nan_never_travels(history: list[tuple[float | None, list[float], float, float, float]]) -> None:
+    """First setpoints, equal stamps, huge gaps, stamps ahead and behind, in any order."""
+    following, now_s = governor(), 0.0
+    for force_N, preview, age_s, valid_s, elapsed_s in history:
+        now_s += elapsed_s
+        setpoint = None
+        if force_N is not None:
+            setpoint = TimedSetpoint(
+                force_N, now_s - age_s, valid_s, preview_N=tuple(preview), preview_dt_s=max(valid_s / 20.0, 1e-6)
+            )
+        ask = decide(following, now_s, setpoint)
+        assert math.isfinite(following.slope_N_s)
+        assert PORTRAIT.min_N <= ask.force_N <= PORTRAIT.max_N
+        assert np.all((path_N(ask) >= PORTRAIT.min_N) & (path_N(ask) <= PORTRAIT.max_N))
+        assert math.isfinite(following.asked_N)
+        is_stale = setpoint is not None and now_s - setpoint.stamp_s > valid_s
+        assert (Limit.STALE in ask.limits) == is_stale
+        assert (Limit.NO_SETPOINT in ask.limits) == (setpoint is None)

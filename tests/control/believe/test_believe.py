@@ -1,0 +1,236 @@
+"""What may teach which estimator, and what of it the next plans are made with."""
+
+import math
+
+import pytest
+
+from tormagd.assembly.build import Core
+from tormagd.assembly.journal import KNOWN
+from tormagd.control.believe.believe import NOTHING_LEARNED, UNTARED_N, Learned
+from tormagd.control.believe.carriage_lag import AGE_S, MAX_LAG_S
+from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
+from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.core import Planner
+from tormagd.control.records import Handle, Measured, TimedSetpoint
+from tormagd.exact import plain, restore
+from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
+from tormagd.safety.codes import Limit
+
+PERIOD_S = 0.004
+TURN = Turn(1.0, 0.0, 100.0)
+RESTING = {"handle": Handle(MOBILISED_MM, 0.0, TURN, 42.0)}
+CREEPING = {"handle": Handle(MOBILISED_MM, 1.0, TURN, 1.0)}
+
+
+@pytest.fixture
+def planner(core: Core) -> Planner:
+    return core.planner()
+
+
+@pytest.fixture
+def hear(planned):
+    """Plans for 1 N while the same is measured, but for the noise that a live sensor has."""
+
+    def heard(planner: Planner, seconds: float, measured: Measured) -> Planner:
+        for number in range(round(seconds / PERIOD_S)):
+            noise_N = 0.003 * (-1) ** number
+            planned(planner, 1.0, measured.replaced(force_N=measured.force_N + noise_N))
+        return planner
+
+    return heard
+
+
+def test_the_device_is_learned_from_measured_over_predicted_force(core, hear, moving) -> None:
+    plan = hear(core.planner(), 8.0, moving(force_N=1.2 * 1.08)).planned
+    assert plan.predicted_N == pytest.approx(1.2 * 1.08, rel=0.01)
+    assert plan.trim == pytest.approx(1.2, rel=0.02)
+    assert Limit.TRIM not in plan.limits
+    # a model that is too low in force is corrected by a wider gap
+    assert plan.gap_mm > hear(core.planner(), 8.0, moving()).planned.gap_mm + 3.0
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        None,
+        {"is_homed": False},
+        {"handle": Handle(MOBILISED_MM - 0.01, 42.0, TURN)},
+        {"handle": Handle(MOBILISED_MM, MOVING_MM_S - 0.01, TURN)},
+        {"handle": Handle(MOBILISED_MM, 0.0, TURN)},
+        {"sensed_s": -1.0},
+        {"handle_mm": 99.9},
+    ],
+    ids=["no measurement", "not homed", "not mobilised", "too slow", "at rest", "an old force", "turning back"],
+)
+def test_what_teaches_nothing_leaves_the_device_as_it_is(planner, planned, moving, changes) -> None:
+    known = DeviceFit(scale=1.1, scale_variance=1e-4)
+    planner.teach(Learned(known))
+    for _ in range(20):
+        planned(planner, 1.0, None if changes is None else moving(force_N=1.4, **changes))
+    assert planner.believe.device == known
+
+
+def test_without_learning_no_reading_teaches_and_the_sensor_is_judged_all_the_same(planner, hear, moving) -> None:
+    learned = Learned(DeviceFit(1.1, 0.02, 1e-4), 1.05, 0.5, 0.01, 0.02)
+    planner.teach(learned)
+    planner.believe.learns = False
+    back = Handle(MOBILISED_MM, -42.0, Turn(-1.0, 0.0, 100.0), 42.0)
+    for changes in ({}, {"handle": back}, CREEPING):
+        hear(planner, 0.4, moving(force_N=1.4, **changes))
+    assert planner.believe.learned() == learned
+    assert Limit.SENSOR in hear(planner, 0.4, moving(force_N=9.0)).planned.limits
+
+
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_handle_that_has_stopped_teaches_nothing_of_a_gap_that_goes_on(
+    planner, hear, planned, moving, goes_on: bool
+) -> None:
+    """Its rate is filtered, and known for slower only later."""
+    devices = []
+    hear(planner, 2.0, moving(sensed_s=0.0))
+    for number in range(20):
+        now_s = planner.planned.time_s + PERIOD_S
+        at_mm, gap_mm = 100.0 + 5.0 * PERIOD_S * number * goes_on, 78.1 - 0.3 * number
+        slower = Handle(MOBILISED_MM, 5.0, Turn(1.0, 0.0, at_mm), 42.0)
+        planned(planner, 1.0, moving(gap_mm, sensed_s=now_s, handle_mm=at_mm, handle=slower))
+        devices.append(planner.believe.device)
+    assert (devices[10] == devices[-1]) is not goes_on
+
+
+def test_one_reading_teaches_once(planner, planned, moving) -> None:
+    planned(planner, 1.0, moving(force_N=1.4))
+    known = planner.believe.device
+    planner.plan(2.0 * PERIOD_S, None, moving(force_N=1.4, number=planner.believe.read))
+    assert planner.believe.device == known != DeviceFit()
+
+
+def test_what_a_creep_shows_is_learned_of_the_creep_alone_and_what_speed_shows_of_the_device(
+    core, hear, moving
+) -> None:
+    crept = hear(core.planner(), 1.0, moving(force_N=1.4, **CREEPING)).believe
+    assert crept.slow.factor > 1.05
+    assert crept.device == DeviceFit()
+    sped = hear(core.planner(), 1.0, moving(force_N=1.4)).believe
+    assert sped.device.scale > 1.05
+    assert (sped.slow.factor, sped.slow.learned) == (1.0, 0.0)
+
+
+def test_of_a_sensor_whose_zero_nothing_told_for_long_nothing_is_learned(planner, hear, moving) -> None:
+    planner.believe.zero.variance_N2 = (1.01 * UNKNOWN_SD_N) ** 2
+    hear(planner, 0.2, moving(force_N=1.2))
+    hear(planner, 0.2, moving(force_N=1.2, **CREEPING))
+    assert planner.believe.learned() == NOTHING_LEARNED
+    assert Limit.OFFSET_UNKNOWN in planner.planned.limits
+
+
+def test_what_its_zero_is_off_by_is_no_part_of_what_a_sensor_teaches_and_is_said(planner, hear, moving) -> None:
+    planner.teach(Learned(sensor_zero_N=1.1 * UNTARED_N))
+    plan = hear(planner, 1.0, moving(force_N=1.0871 + 1.1 * UNTARED_N)).planned
+    assert plan.trim == pytest.approx(1.0, abs=0.01)
+    assert Limit.SENSOR_ZERO in plan.limits
+
+
+def test_a_device_that_has_shown_nothing_is_taken_for_a_strong_one(core, hear, planned, moving) -> None:
+    """The gap stays where the strongest believable device would keep to the ceiling; turning the handle shows which it
+    is, and the ceiling moves."""
+    new = planned(core.planner(), 2.0, moving(**RESTING))
+    assert Limit.CEILING in new.limits
+    assert new.gap_mm == new.min_gap_mm
+    known = planned(hear(core.planner(), 2.0, moving()), 2.0, moving(**RESTING))
+    assert Limit.CEILING not in known.limits
+    assert known.gap_mm < new.gap_mm - 0.5
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"is_homed": False}, {"handle": Handle(MOBILISED_MM - 0.01, 42.0, TURN)}],
+    ids=["unhomed", "unmobilised"],
+)
+def test_what_a_force_says_before_homing_and_before_break_away_is_not_predicted(core, planned, moving, changes) -> None:
+    assert planned(core.planner(), 1.0, moving(**changes)).predicted_N is None
+    assert planned(core.planner(), 1.0, moving()).predicted_N is not None
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_doubted"),
+    [(RESTING, False), ({}, False), ({"force_N": 20.0}, True)],
+    ids=["at rest", "sliding", "a sensor that is not believed"],
+)
+def test_what_is_known_of_the_lag_outlasts_what_the_sensor_teaches(planner, hear, moving, changes, is_doubted) -> None:
+    planner.teach(Learned(lag_s=0.02))
+    believed = hear(planner, 1.2, moving(**changes)).believe
+    assert believed.sensor.is_doubted == is_doubted
+    assert (believed.read, believed.carriages.lag_s) == (299, 0.02)
+
+
+@pytest.fixture
+def swing(core, moving):
+    """A planner after a swing that the gap follows that much too late, and a handle that rests: it teaches nothing."""
+    gap_mm_at = core.portrait.gap_mm_at
+
+    def swung(late_s: float, *, is_known: bool, seconds: float = 10.0) -> Planner:
+        # late carriages are only sent along swings that they can follow
+        planner, swings_Hz = core.planner(), 1.0 if is_known else 2.0
+
+        def force_N(time_s: float) -> float:
+            return 1.5 + 0.1 * math.sin(2.0 * math.pi * swings_Hz * time_s)
+
+        for tick in range(1, round(seconds / PERIOD_S)):
+            now_s = tick * PERIOD_S
+            # it starts as much sooner as has been learned, and is measured before the plan
+            come_s = now_s - AGE_S - late_s + planner.believe.carriages.lag_s
+            gap_mm = gap_mm_at(force_N(come_s))
+            side_mm_s = (gap_mm - gap_mm_at(force_N(come_s - 1e-3))) / 2e-3
+            ahead_N = tuple(force_N(now_s + 2e-3 * k) for k in range(1, 40)) if is_known else ()
+            setpoint = TimedSetpoint(force_N(now_s), now_s, 0.1, preview_N=ahead_N, preview_dt_s=2e-3)
+            planner.plan(now_s, setpoint, moving(gap_mm, left_mm_s=side_mm_s, right_mm_s=side_mm_s, **RESTING))
+            planner.foresee()
+        return planner
+
+    return swung
+
+
+@pytest.mark.parametrize(("late_s", "learned_s"), [(0.015, 0.017), (0.0, 0.002), (-0.01, 0.0), (0.06, MAX_LAG_S)])
+def test_a_lag_is_learned_where_what_comes_is_known(swing, late_s: float, learned_s: float) -> None:
+    """And half a plan's period besides: by so much the governor's gap goes before what is previewed."""
+    assert swing(late_s, is_known=True).believe.carriages.lag_s == pytest.approx(learned_s, abs=1e-3)
+
+
+def test_without_a_preview_a_lag_is_learned_once_the_swing_is_foreseen(swing) -> None:
+    early = swing(0.015, is_known=False, seconds=1.0)
+    assert (early.planned.foresight, early.believe.carriages.lag_s) == (0.0, 0.0)
+    late = swing(0.015, is_known=False, seconds=20.0)
+    assert late.planned.foresight > 0.9
+    assert late.believe.carriages.lag_s == pytest.approx(0.015, abs=2e-3)
+
+
+def test_a_gap_on_its_way_after_a_jump_is_not_late(planner, moving) -> None:
+    planner.governor.asked_N = 1.5
+    travelling = moving(85.0, left_mm_s=-15.0, right_mm_s=-15.0, **RESTING)
+    for tick in range(1, 500):
+        now_s = tick * PERIOD_S
+        planner.plan(now_s, TimedSetpoint(1.5, now_s, 0.1, preview_N=(1.5,) * 40, preview_dt_s=2e-3), travelling)
+    assert planner.believe.carriages.lag_s == 0.0
+
+
+def test_what_is_forgotten_and_what_is_taught(planner, hear, moving) -> None:
+    """The element has been through what it has been through, whatever is known of the device."""
+    hear(planner, 1.0, moving(force_N=1.2))
+    memory, learned = plain(planner.believe.memory), planner.believe.learned()
+    number = planner.planned.number
+    planner.afresh(3.0)
+    assert planner.believe.learned() == NOTHING_LEARNED != learned
+    assert plain(planner.believe.memory) == memory
+    assert (planner.planned.number, planner.planned.gap_mm, planner.planned.time_s) == (number + 1, 95.0, 3.0)
+    planner.teach(learned)
+    assert planner.believe.learned() == learned
+
+
+def test_a_replay_and_what_is_read_back_plan_the_same(core, swing, planned, moving) -> None:
+    first, again = (swing(0.015, is_known=False, seconds=3.0) for _ in range(2))
+    assert first.planned.foresight > 0.0
+    assert plain(first) == plain(again)
+    read = core.planner()
+    restore(read, plain(first), KNOWN)
+    assert planned(read, 1.3, moving()) == planned(first, 1.3, moving())
+    assert plain(read) == plain(first) != plain(again)

@@ -1,0 +1,183 @@
+"""What the element remembers, beside the laws that it follows: a Prony series, and a lag that goes along changes."""
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given, strategies as st
+
+from tormagd.assembly.build import build_core
+from tormagd.config import Config
+from tormagd.control.aim.aim import Element
+from tormagd.control.believe.memory import ElementMemory
+from tormagd.control.records import Handle, Measured
+from tormagd.exact import plain
+from tormagd.model.displacement import Turn
+from tormagd.model.force_curve import within
+from tormagd.model.memory import NO_MEMORY, Memory
+from tormagd.physics.relaxation import PronySeries
+
+MEMORY = Memory(fractions=(0.05, 0.04, 0.04), times_s=(8.0, 90.0, 900.0), lag_mT=8.0, turn_mT=80.0)
+STEADY = MEMORY.of(relaxes=lambda _: True, hysteresis=False)
+GAPS_MM = (45.0, 95.0)
+FAR_MM, NEAR_MM = 70.0, 48.0
+Maker = Callable[[Memory], ElementMemory]
+
+
+@pytest.fixture(scope="session")
+def element() -> Element:
+    """The brake's, with the memory that was measured."""
+    return build_core(Config()).element
+
+
+@pytest.fixture(scope="session")
+def make(element: Element) -> Maker:
+    """Makes a brake's memory that has followed nothing yet."""
+    return lambda memory: ElementMemory(memory, element.nominal, element.field, GAPS_MM)
+
+
+@pytest.fixture
+def followed(make: Maker) -> ElementMemory:
+    """A memory of which a field of 400 mT is known, behind which the element's own is by 3."""
+    memory = make(MEMORY)
+    memory.field_mT, memory.lag_mT, memory.time_s = 400.0, 3.0, 0.0
+    return memory
+
+
+def found(gap_mm: float, *, depth_mm: float = 0.0, is_homed: bool = True) -> Measured:
+    """A device at that gap, whose handle has not moved; or with a finger that deep in its pad."""
+    handle = Handle(depth_mm, 0.0, Turn(1.0, 0.0, 0.0))
+    return Measured(1, is_homed, 0.0, gap_mm / 2.0, gap_mm / 2.0, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("memory", [STEADY, MEMORY], ids=["steady", "lagging"])
+def test_it_relaxes_as_its_series_does_of_the_force_of_its_own_field(
+    make: Maker, element: Element, memory: Memory
+) -> None:
+    curve, series, remembered = element.nominal.only, PronySeries(MEMORY.fractions, MEMORY.times_s), make(memory)
+    before_mT, after_mT = element.field.field_mT(FAR_MM), element.field.field_mT(NEAR_MM)
+    remembered.update(0.0, found(FAR_MM))
+    state = series.relaxed(curve.force_N(before_mT))
+    assert remembered.relaxed_N == pytest.approx(curve.force_N(before_mT) * 0.13)
+    lag_mT = remembered.lag_at_mT(after_mT)
+    assert (lag_mT > 1.0) is (memory is MEMORY)
+    after_N = curve.force_N(after_mT - lag_mT)
+    for place in range(41):
+        true_N, state = series.discretise(0.5 if place else 0.0).advance(state, after_N)
+        remembered.update(0.5 * place, found(NEAR_MM))
+        assert remembered.lag_mT == lag_mT
+        assert after_N - remembered.relaxed_N == pytest.approx(true_N, abs=1e-12)
+        assert remembered.force_N(curve) == pytest.approx(true_N, abs=1e-12)
+
+
+def test_what_the_field_adds_relaxes_by_fractions_of_its_own() -> None:
+    """Of a pad, which nothing had pressed before."""
+    pad = build_core(Config(scene="radial_pulse")).element
+    memory = Memory(fractions=(0.05, 0.04), times_s=(1.0, 30.0), field_fractions=(0.1, 0.02))
+    remembered, pressed = ElementMemory(memory, pad.nominal, pad.field, GAPS_MM), found(NEAR_MM, depth_mm=2.0)
+    remembered.update(5.0, pressed)
+    assert remembered.relaxed_N == pytest.approx(0.0)
+    remembered.update(1e4, pressed)
+    curve = pad.nominal.now(pressed)
+    free_N = curve.force_N(within(0.0, pad.nominal.fields_mT))
+    added_N = curve.force_N(pad.field.field_mT(NEAR_MM)) - free_N
+    assert remembered.relaxed_N == pytest.approx(0.09 * free_N + 0.12 * added_N)
+
+
+def test_time_that_goes_back_ages_nothing(make: Maker) -> None:
+    remembered = make(MEMORY)
+    remembered.update(10.0, found(FAR_MM))
+    remembered.update(11.0, found(NEAR_MM))
+    relaxed_N = remembered.relaxed_N
+    remembered.update(10.0, found(NEAR_MM))
+    assert remembered.relaxed_N == pytest.approx(relaxed_N)
+
+
+def test_the_field_lags_along_its_way_and_not_in_time(followed: ElementMemory) -> None:
+    assert followed.lag_at_mT(400.0) == 3.0
+    assert followed.lag_at_mT(2_000.0) == pytest.approx(8.0)
+    assert followed.lag_at_mT(-2_000.0) == pytest.approx(-8.0)
+    at_once_mT, halfway_mT = followed.lag_at_mT(460.0), followed.lag_at_mT(430.0)
+    followed.field_mT, followed.lag_mT = 430.0, halfway_mT
+    assert followed.lag_at_mT(460.0) == pytest.approx(at_once_mT)
+
+
+def test_an_element_without_memory_is_as_its_gap(make: Maker) -> None:
+    remembered = make(NO_MEMORY)
+    remembered.update(0.0, found(FAR_MM))
+    remembered.update(1.0, found(NEAR_MM))
+    assert (remembered.lag_mT, remembered.relaxed_N) == (0.0, 0.0)
+
+
+def test_before_anything_is_known_nothing_is_expected(make: Maker) -> None:
+    remembered = make(MEMORY)
+    assert remembered.lag_at_mT(500.0) == 0.0
+    assert remembered.relaxed_N == 0.0
+
+
+def test_each_can_be_left_out() -> None:
+    assert MEMORY.of(relaxes=lambda _: True, hysteresis=True) == MEMORY
+    assert MEMORY.of(relaxes=lambda _: True, hysteresis=False) == STEADY
+    assert MEMORY.of(relaxes=lambda _: False, hysteresis=True) == Memory(lag_mT=8.0, turn_mT=80.0)
+    short = MEMORY.of(relaxes=lambda time_s: time_s < 100.0, hysteresis=False)
+    assert short == Memory(fractions=(0.05, 0.04), times_s=(8.0, 90.0), turn_mT=80.0)
+    pads = Memory(fractions=(0.01, 0.04), times_s=(1.0, 10.0), field_fractions=(0.03, 0.05))
+    assert pads.of(relaxes=lambda time_s: time_s > 5.0, hysteresis=True) == Memory(
+        fractions=(0.04,), times_s=(10.0,), field_fractions=(0.05,)
+    )
+
+
+RELAXED = 0.13
+"Of what the shipped model's element has relaxed after a long rest, about."
+
+
+@pytest.fixture
+def remembering(make: Maker, element: Element) -> Callable[..., ElementMemory]:
+    """What the shipped model's element remembers of being found like that, every half a second."""
+
+    def follow(*measured: Measured) -> ElementMemory:
+        remembered = make(element.memory)
+        for place, each in enumerate(measured):
+            remembered.update(0.5 * place, each)
+        return remembered
+
+    return follow
+
+
+def test_a_device_that_is_found_homed_has_rested_there(remembering) -> None:
+    remembered = remembering(found(95.0))
+    assert remembered.relaxed_N == pytest.approx(RELAXED * 0.62, rel=0.1)
+    assert remembered.lag_mT == 0.0
+
+
+def test_one_that_has_to_be_homed_has_rested_where_it_was_switched_on(remembering) -> None:
+    """Its counts are 0 there, and once more where the switches are; the flag comes later than that."""
+    on_its_way = [found(95.0 + opened_mm, is_homed=False) for opened_mm in (0.0, 10.0, 16.0, 15.5, 0.0)]
+    remembered = remembering(*on_its_way, found(95.0))
+    assert remembered.relaxed_N == pytest.approx(remembering(found(79.0)).relaxed_N, rel=0.02)
+    assert remembered.lag_mT < 0.0  # the field fell
+
+
+def test_a_gap_that_no_device_has_is_not_believed_to_have_been_one(remembering) -> None:
+    remembered = remembering(found(900.0, is_homed=False), found(95.0))
+    assert remembered.relaxed_N == pytest.approx(RELAXED * 0.62, rel=0.1)
+
+
+def test_a_brake_that_loses_its_position_remembers_what_it_knew(remembering) -> None:
+    known = remembering(found(95.0), found(60.0))
+    lost = remembering(found(95.0), found(60.0), found(45.0, is_homed=False))
+    assert plain(lost) == plain(known)
+
+
+@given(steps=st.lists(st.tuples(st.floats(43.0, 97.0), st.floats(0.0, 1e6)), min_size=1, max_size=30))
+def test_it_never_remembers_more_than_there_was(
+    make: Maker, element: Element, steps: list[tuple[float, float]]
+) -> None:
+    remembered, curve, most_N = make(MEMORY), element.nominal.only, 0.0
+    remembered.update(0.0, found(FAR_MM))
+    most_N = curve.force_N(remembered.field_mT)
+    for gap_mm, time_s in steps:
+        remembered.update(time_s, found(gap_mm))
+        own_mT = within(remembered.field_mT - remembered.lag_mT, element.nominal.fields_mT)
+        most_N = max(most_N, curve.force_N(own_mT))
+        assert abs(remembered.lag_mT) <= MEMORY.lag_mT
+        assert remembered.relaxed_N <= sum(MEMORY.fractions) * most_N * (1.0 + 1e-12)
