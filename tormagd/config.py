@@ -96,7 +96,7 @@ class RealTime(Strict, frozen=True):
 
 
 class Motor(Strict, frozen=True):
-    """The DC motor and lead screw the controller believes in (37D class, 70:1); see `control/motor.py`."""
+    """The DC motor and lead screw the controller believes in (37D class, 70:1); see `control/move/motor.py`."""
 
     supply_V: Annotated[float, Meta(ge=3.0, le=60.0)] = 12.0
     "What full duty puts on the motor: its rated voltage."

@@ -127,7 +127,7 @@ def packed(data: Any) -> bytes:
 
 
 def first_difference(left: Any, right: Any) -> tuple[str, Any, Any] | None:
-    """Where two plain data differ first, as in "estimate.handle.rate_mm_s", and what is there; None where they are the
+    """Where two plain data differ first, as in "measured.handle.rate_mm_s", and what is there; None where they are the
     same to the bit."""
     if packed(left) == packed(right):
         return None

@@ -16,7 +16,7 @@ class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
 
 
 class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
-    """Some control periods: entries as `control/journal.py` encodes them. `time_s` and `t_ns` are the last one's."""
+    """Some control periods: entries as `assembly/journal.py` encodes them. `time_s` and `t_ns` are the last one's."""
 
     time_s: float
     t_ns: int

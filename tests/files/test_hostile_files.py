@@ -13,10 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tormagd.control.profile import ProfileError
 
 from tormagd.bounded_file import read_bounded
 from tormagd.config import load_config
-from tormagd.control.profile import ProfileError
 from tormagd.ctl.waveform import read_csv
 from tormagd.daemon.profiles import ProfileFolder
 from tormagd.force_file import ForceFileError

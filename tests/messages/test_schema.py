@@ -41,13 +41,13 @@ PAGE = (ROOT / "docs/messages.md").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 TELEMETRY = (
     "v t_ns seq operating_state is_homed is_busy setpoint_cf governed_cf measured_cf predicted_cf field_mT gap_mm "
-    "gap_setpoint_mm measured_jp skew_mm duty limits faults setpoint_age_ms confidence tick"
+    "gap_setpoint_mm measured_jp skew_mm duty limits faults setpoint_age_ms confidence tick belief"
 )
 V1: dict[type[msgspec.Struct], str] = {
     Telemetry: TELEMETRY,
     Tick: "lateness_us exec_us",
     Status: f"{TELEMETRY} version build scene scene_fingerprint terms_out solver uptime_s least_N most_N trim "
-    "device belief profile least_gap_mm link setpoints peers "
+    "device profile least_gap_mm link setpoints peers "
     "rates late_ticks_by fault_details limit_details newest_stall not_granted way "
     "black_box output next_commands",
     OutputReport: "rate slew not_finite range",

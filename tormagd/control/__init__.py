@@ -1,1 +1,1 @@
-"""Control: from a force setpoint to two motor duties, as pure functions of explicit state."""
+"""Control: from a force setpoint to two motor duties, in stages that hold their own state."""
