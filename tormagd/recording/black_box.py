@@ -18,9 +18,9 @@ from mcap.writer import CompressionType, Writer
 from tormagd import __version__
 from tormagd.bounded_file import in_place_of
 from tormagd.keeping import READ, WROTE, Part
-from tormagd.recording.closing import ABOUT
 from tormagd.recording.reader import MAX_FILE_BYTES, MAX_RECORD_BYTES, UNREADABLE, RecordingError
 from tormagd.recording.writer import (
+    ABOUT,
     CHUNK_BYTES,
     TICK_KINDS,
     TICKS_TOPIC,
@@ -87,23 +87,21 @@ def _write(path: Path, header: dict[str, str], parts: Sequence[Part]) -> int:
         mcap.add_metadata(ABOUT, {"version": __version__, "kind": HEADER})
         core = mcap.register_channel(topic=CORE_TOPIC, message_encoding="msgpack", schema_id=0)
         kinds = {name: TICK_KINDS[name] for name in columns if name in TICK_KINDS}
-        _, tick_channel = registered(mcap, TICKS_TOPIC, tick_schema(kinds))
-        _, frame_channel = registered(mcap, FRAMES_TOPIC, plain_schema(Frame))
+        tick_channel = registered(mcap, TICKS_TOPIC, tick_schema(kinds))
+        frame_channel = registered(mcap, FRAMES_TOPIC, plain_schema(Frame))
         began = parts[0]
         for number, part in enumerate(parts):
             mcap.add_message(core, log_time=part.t_ns, data=part.entries, publish_time=part.t_ns, sequence=number)
             for entry in msgspec.msgpack.decode(part.entries):
                 if is_tick(entry):
                     data = msgspec.json.encode(known_values(columns, entry))
-                    mcap.add_message(
-                        tick_channel.id, log_time=entry[0], data=data, publish_time=entry[0], sequence=ticks
-                    )
+                    mcap.add_message(tick_channel, log_time=entry[0], data=data, publish_time=entry[0], sequence=ticks)
                     ticks += 1
                 for frame in frames_in(entry):
                     frames += 1
                     t_ns = began.t_ns + round((frame.monotonic_s - began.time_s) * 1e9)  # so they stay in their order
                     data = msgspec.json.encode(frame)
-                    mcap.add_message(frame_channel.id, log_time=t_ns, data=data, publish_time=t_ns, sequence=frames)
+                    mcap.add_message(frame_channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=frames)
         mcap.finish()  # type: ignore[no-untyped-call]
     return ticks
 

@@ -10,13 +10,12 @@ from typing import Any, BinaryIO
 import msgspec
 import numpy as np
 from mcap.exceptions import McapError
-from mcap.records import Channel, Message, Metadata, Schema
+from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 from zstandard import ZstdError
 
-from tormagd.recording.closing import ABOUT, CUT
-from tormagd.recording.writer import TELEMETRY_TOPIC, TICKS_TOPIC
+from tormagd.recording.writer import ABOUT, CUT, TELEMETRY_TOPIC, TICKS_TOPIC
 from tormagd_client.regular_file import require_regular
 
 MAX_FILE_BYTES = 1 << 40
@@ -34,9 +33,9 @@ class RecordingError(ValueError):
 class Columns:
     """The messages of one topic, one row each, in the order they were written.
 
-    `numbers[name]` is float64 of shape (rows,), with NaN where a value was not known or the row had no such column;
-    true and false are 1 and 0. `words[name]` holds a tuple of strings for each row. An object's or a list's members get
-    names of their own: `tick.exec_us`, `duty.0`.
+    `numbers[name]` is float64 of shape (rows,), with NaN where a value was not known; true and false are 1 and 0.
+    `words[name]` holds a tuple of strings for each row. An object's or a list's members get names of their own:
+    `tick.exec_us`, `duty.0`. Of what was never known there is no column.
     """
 
     t_ns: NDArray[np.int64]
@@ -79,17 +78,12 @@ def read_open_recording(file: BinaryIO, name: str, only: Collection[str] | None 
     builders = {TELEMETRY_TOPIC: _Builder(only), TICKS_TOPIC: _Builder(only)}
     metadata: dict[str, str] = {}
     topics: dict[int, str] = {}
-    schemas: dict[int, bytes] = {}
     is_complete = True
     try:
         try:
             for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:
-                if isinstance(record, Schema):
-                    schemas[record.id] = record.data
-                elif isinstance(record, Channel):
+                if isinstance(record, Channel):
                     topics[record.id] = record.topic
-                    if record.topic in builders and record.schema_id in schemas:
-                        builders[record.topic].expect(msgspec.json.decode(schemas[record.schema_id]))
                 elif isinstance(record, Metadata) and record.name == ABOUT:
                     metadata.update(record.metadata)
                 elif isinstance(record, Message) and topics.get(record.channel_id) in builders:
@@ -135,16 +129,6 @@ class _Builder:
                 numbers.extend([math.nan] * (row - len(numbers)))
                 numbers.append(value)
 
-    def expect(self, schema: object) -> None:
-        """The columns that the schema names are there, whether anything is ever known of them or not."""
-        for name, kind in _columns("", schema, MAX_NESTING):
-            if self._only is not None and name.partition(".")[0] not in self._only:
-                continue
-            if kind in ("number", "integer", "boolean"):
-                self._numbers.setdefault(name, [])
-            elif kind in ("string", "array"):
-                self._words.setdefault(name, [])
-
     def columns(self) -> Columns:
         rows = len(self._t_ns)
         for numbers in self._numbers.values():
@@ -157,18 +141,6 @@ class _Builder:
             {n: np.array(v, dtype=np.float64) for n, v in self._numbers.items() if n not in self._words},
             self._words,
         )
-
-
-def _columns(prefix: str, schema: object, depth: int) -> Iterator[tuple[str, object]]:
-    """The columns in a plain JSON schema, each with its dotted name and type; of lists, those of words."""
-    properties = schema.get("properties") if isinstance(schema, dict) else None
-    for name, inner in (properties if isinstance(properties, dict) else {}).items():
-        if not isinstance(inner, dict):
-            continue
-        if inner.get("type") == "object" and depth > 0:
-            yield from _columns(f"{prefix}{name}.", inner, depth - 1)
-        elif inner.get("type") != "array" or inner.get("items") == {"type": "string"}:
-            yield f"{prefix}{name}", inner.get("type")
 
 
 def _flat(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, float | tuple[str, ...]]]:
