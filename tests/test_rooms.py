@@ -9,13 +9,14 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LOWEST = {"firmware_protocol", "config", "messages"}
-FILES = {"bounded_file", "toml_file"}
+FILES = {"bounded_file", "named_file", "toml_file"}
 NO_ROOM = {"firmware_protocol.value", "firmware_protocol.build"}
 """What all values are made of, and which build runs: they know nothing of any room, the protocol's included."""
 MAY_IMPORT = {
     "firmware_protocol": set(),
     "bounded_file": set(),
-    "toml_file": {"bounded_file"},
+    "named_file": set(),
+    "toml_file": {"bounded_file", "named_file"},
     "force_file": {"bounded_file", "messages"},
     "config": {"toml_file"},
     "messages": set(),
@@ -28,9 +29,9 @@ MAY_IMPORT = {
     "physics": FILES,
     "model": FILES | {"physics"},
     "inverse": {"firmware_protocol", "physics", "model"},
-    "scenes": {"config", "force_file"},
+    "scenes": {"named_file", "toml_file", "config", "force_file"},
     "safety": {"firmware_protocol"},
-    "hardware": LOWEST | {"exact", "safety"},
+    "hardware": LOWEST | {"named_file", "exact", "safety"},
     "control": LOWEST | {"exact", "keeping", "physics", "model", "inverse", "scenes", "safety", "hardware"},
     "daemon": LOWEST | FILES | {"output", "keys", "keeping", "slices", "scenes", "safety", "hardware", "control"},
     "recording": FILES | {"messages", "output", "keeping"},
