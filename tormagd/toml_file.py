@@ -17,8 +17,8 @@ from tormagd_client.printable import in_short
 
 MOST_BYTES = 65_536
 "Ten times the longest configuration with all its comments."
-MOST_DEPTH = 16
-"Parts of a key, and arrays and tables in each other: the parser takes their square, or all of the stack."
+LONGEST_LINE = 8_192
+"Of a key with more parts than that the parser takes the square: a minute."
 MOST_GUESSES = 16
 "Lines that may give a key, of those that have its name in them: a file may be full of them."
 MOST_LINES = 8
@@ -30,15 +30,6 @@ _OURS = re.compile(r"([a-z_A-Z.]+)(?: =|:) ")
 _PLACE = re.compile(r"`\$([^`]*)`")
 "The place that one of msgspec's ends with."
 _UNKNOWN = re.compile(r"unknown field `(\w+)`")
-# a string that does not end goes on to the end of the line or the text: the parser stops there, too
-_TOKEN = re.compile(
-    r'"""(?:[^"\\]|\\.|"(?!""))*+(?:"""|\Z)'
-    r"|'''(?:[^']|'(?!''))*+(?:'''|\Z)"
-    r'|"(?:[^"\\\n]|\\.)*+"?'
-    r"|'[^'\n]*+'?"
-    r"|#[^\n]*+|[\[\]{}.,=\n]",
-    re.DOTALL,
-)
 
 
 class TomlError(ValueError):
@@ -62,14 +53,22 @@ def toml_tables(text: str) -> dict[str, Any]:
     """The tables in `text`, all numbers finite and of 64 bits. Raises TomlError."""
     import tomllib  # not above: who reads no file, as most commands of tormagctl, need not wait for it
 
-    _require_shallow(text)
+    for number, line in enumerate(text.splitlines(), start=1):
+        if len(line) > LONGEST_LINE:
+            raise TomlError(f"line {number} has {len(line)} characters: allowed are {LONGEST_LINE}")
     try:
         tables = tomllib.loads(text)
+        _require_numbers(tables, "")
+    except RecursionError as error:
+        raise TomlError(
+            "arrays, tables or parts of a key stand too deep in each other: allowed are hundreds"
+        ) from error
     except tomllib.TOMLDecodeError as error:
         raise TomlError(f"not TOML: {error}") from error
+    except TomlError:
+        raise
     except ValueError as error:  # Python reads no integer of more than 4300 digits
         raise TomlError("not TOML: an integer has more digits than any that is allowed here") from error
-    _require_numbers(tables, "")
     return tables
 
 
@@ -177,25 +176,6 @@ def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
             table = table[name]
         return True
     return False
-
-
-def _require_shallow(text: str) -> None:
-    depth = parts = 0
-    line = 1
-    for token in _TOKEN.finditer(text):
-        mark = token[0]
-        if mark in "[{":
-            depth, parts = depth + 1, 0
-        elif mark in "]}":
-            depth -= 1
-        elif mark == ".":
-            parts += 1
-        elif mark in ",=\n":
-            parts = 0
-        line += mark.count("\n")
-        if depth > MOST_DEPTH or parts >= MOST_DEPTH:
-            what = "arrays or tables in each other" if depth > MOST_DEPTH else "parts of a key"
-            raise TomlError(f"more than {MOST_DEPTH} {what} (line {line}): allowed are {MOST_DEPTH}")
 
 
 def _require_numbers(value: Any, key: str) -> None:
