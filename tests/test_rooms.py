@@ -38,7 +38,7 @@ MAY_IMPORT = {
     "client": {"config", "keys", "messages", "output"},
     "dashboard": {"client", "messages", "output", "recording", "safety"},
     "ctl": FILES | {"dashboard", "force_file", "client", "config", "messages", "output", "keys", "scenes", "recording"},
-    "simulation": FILES | {"physics", "firmware_protocol", "output", "slices"},
+    "simulation": FILES | {"force_file", "physics", "firmware_protocol", "output", "slices"},
     "headroom": {"config", "output", "daemon", "control", "simulation", "closed_loop"},
     "replay": LOWEST
     | {"exact", "keeping", "output", "recording", "model", "scenes", "safety", "hardware", "control", "daemon"}
