@@ -71,14 +71,8 @@ class Machine:
 
     def resolved(self, absolute: str) -> str:
         """The path that `absolute` leads to, following symbolic links inside the root."""
-        current = absolute
-        for _ in range(8):
-            try:
-                target = self.path(current).readlink()
-            except OSError:
-                return current
-            current = os.path.normpath(os.path.join(os.path.dirname(current), target))  # noqa: PTH118, PTH120
-        return current
+        there, root = os.path.realpath(self.path(absolute)), os.path.realpath(self.root)
+        return f"/{os.path.relpath(there, root)}"
 
     def holders(self, paths: Sequence[str]) -> tuple[dict[str, list[tuple[int, str]]], int]:
         """Process id and name of everybody who has one of these open, as far as we may see, not this process; and the

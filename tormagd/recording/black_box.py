@@ -12,13 +12,12 @@ from typing import Any
 
 import msgspec
 from mcap.records import Channel, Message, Metadata
-from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from tormagd import __version__
 from tormagd.bounded_file import in_place_of
 from tormagd.keeping import READ, WROTE, Part
-from tormagd.recording.reader import MAX_FILE_BYTES, MAX_RECORD_BYTES, UNREADABLE, RecordingError
+from tormagd.recording.reader import RecordingError, opened, scan
 from tormagd.recording.writer import (
     ABOUT,
     CHUNK_BYTES,
@@ -29,7 +28,6 @@ from tormagd.recording.writer import (
     registered,
     tick_schema,
 )
-from tormagd_client.regular_file import require_regular
 
 CORE_TOPIC, FRAMES_TOPIC = "/core", "/frames"
 HEADER = "black_box"
@@ -116,32 +114,24 @@ def read_black_box(path: Path) -> BlackBoxFile:
     header: dict[str, str] = {}
     entries: list[Any] = []
     cores: set[int] = set()
-    size, parts, is_complete = 0, 0, True
-    try:
-        require_regular(path, MAX_FILE_BYTES)
-        with path.open("rb") as file:
-            try:
-                for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:
-                    if isinstance(record, Channel) and record.topic == CORE_TOPIC:
-                        if record.message_encoding != "msgpack":
-                            raise ValueError(f"{CORE_TOPIC} is {record.message_encoding[:20]!r}: allowed is msgpack")
-                        cores.add(record.id)
-                    elif isinstance(record, Metadata) and record.name == HEADER:
-                        header.update(record.metadata)
-                    elif isinstance(record, Message) and record.channel_id in cores:
-                        size, parts = size + len(record.data), parts + 1
-                        if size > MAX_BYTES or parts > MAX_PARTS:
-                            raise ValueError(f"over {MAX_BYTES} bytes or {MAX_PARTS} parts")
-                        entries.extend(msgspec.msgpack.decode(record.data, type=list[Any]))
-            except UNREADABLE:
-                # a record that runs into the end of the file was being written when its writer died
-                if file.read(1) or not entries:
-                    raise
-                is_complete = False
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}") from error
-    except (*UNREADABLE, RecursionError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: not an intact MCAP file ({str(error)[:200]})") from error
-    if not header or not cores:
-        raise RecordingError(f"{path}: no black box of tormagd: it has no {CORE_TOPIC} or no header {HEADER!r}")
+    size = parts = 0
+
+    def take(record: Any) -> None:
+        nonlocal size, parts
+        if isinstance(record, Channel) and record.topic == CORE_TOPIC:
+            if record.message_encoding != "msgpack":
+                raise ValueError(f"{CORE_TOPIC} is {record.message_encoding[:20]!r}: allowed is msgpack")
+            cores.add(record.id)
+        elif isinstance(record, Metadata) and record.name == HEADER:
+            header.update(record.metadata)
+        elif isinstance(record, Message) and record.channel_id in cores:
+            size, parts = size + len(record.data), parts + 1
+            if size > MAX_BYTES or parts > MAX_PARTS:
+                raise ValueError(f"over {MAX_BYTES} bytes or {MAX_PARTS} parts")
+            entries.extend(msgspec.msgpack.decode(record.data, type=list[Any]))
+
+    with opened(path) as file:
+        is_complete = scan(file, str(path), take)
+    if not header or not entries:
+        raise RecordingError(f"{path}: no black box of tormagd: it has nothing in {CORE_TOPIC} or no header {HEADER!r}")
     return BlackBoxFile(header, entries, is_complete)

@@ -1,8 +1,9 @@
 """Reading a recording back into columns."""
 
+import contextlib
 import math
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -21,7 +22,9 @@ from tormagd_client.regular_file import require_regular
 MAX_FILE_BYTES = 1 << 40
 MAX_RECORD_BYTES = 64_000_000
 MAX_NESTING = 2
-UNREADABLE = (McapError, ZstdError, ValueError, OverflowError, MemoryError, struct.error, msgspec.MsgspecError)
+UNREADABLE = (
+    McapError, ZstdError, ValueError, OverflowError, MemoryError, RecursionError, struct.error, msgspec.MsgspecError,
+)  # fmt: skip
 """What damage raises; MemoryError where a damaged length asks for more than there is."""
 
 
@@ -61,14 +64,38 @@ class Recording:
             return None
 
 
-def read_recording(path: Path) -> Recording:
-    """The recording in `path`. Raises RecordingError: not readable, not MCAP, damaged, or not written by tormagd."""
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """The file in `path`. Raises RecordingError where it is not readable."""
     try:
         require_regular(path, MAX_FILE_BYTES)
         with path.open("rb") as file:
-            return read_open_recording(file, str(path))
+            yield file
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
+
+
+def scan(file: BinaryIO, name: str, take: Callable[[Any], None]) -> bool:
+    """Hands each of the file's records to `take`, which may raise UNREADABLE; False where it ends in the middle of one.
+    Raises RecordingError, in which the file is called `name`: not MCAP, or damaged."""
+    try:
+        try:
+            for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:
+                take(record)
+        except UNREADABLE:
+            # a record that runs into the end of the file was being written when its writer died
+            if file.read(1):
+                raise
+            return False
+    except UNREADABLE as error:
+        raise RecordingError(f"{name}: not an intact MCAP recording ({str(error)[:200]})") from error
+    return True
+
+
+def read_recording(path: Path) -> Recording:
+    """The recording in `path`. Raises RecordingError: not readable, not MCAP, damaged, or not written by tormagd."""
+    with opened(path) as file:
+        return read_open_recording(file, str(path))
 
 
 def read_open_recording(file: BinaryIO, name: str, only: Collection[str] | None = None) -> Recording:
@@ -78,29 +105,22 @@ def read_open_recording(file: BinaryIO, name: str, only: Collection[str] | None 
     builders = {TELEMETRY_TOPIC: _Builder(only), TICKS_TOPIC: _Builder(only)}
     metadata: dict[str, str] = {}
     topics: dict[int, str] = {}
-    is_complete = True
-    try:
-        try:
-            for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:
-                if isinstance(record, Channel):
-                    topics[record.id] = record.topic
-                elif isinstance(record, Metadata) and record.name == ABOUT:
-                    metadata.update(record.metadata)
-                elif isinstance(record, Message) and topics.get(record.channel_id) in builders:
-                    builders[topics[record.channel_id]].add(record.log_time, msgspec.json.decode(record.data))
-        except UNREADABLE:
-            # a record that runs into the end of the file was being written when the recorder died
-            if file.read(1):
-                raise
-            is_complete = False
-        telemetry, ticks = builders[TELEMETRY_TOPIC].columns(), builders[TICKS_TOPIC].columns()
-    except UNREADABLE as error:
-        raise RecordingError(f"{name}: not an intact MCAP recording ({error})") from error
+
+    def take(record: Any) -> None:
+        if isinstance(record, Channel):
+            topics[record.id] = record.topic
+        elif isinstance(record, Metadata) and record.name == ABOUT:
+            metadata.update(record.metadata)
+        elif isinstance(record, Message) and topics.get(record.channel_id) in builders:
+            builders[topics[record.channel_id]].add(record.log_time, msgspec.json.decode(record.data))
+
+    is_whole = scan(file, name, take)
     if not set(topics.values()) & set(builders):
         raise RecordingError(
             f"{name}: no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
         )
-    return Recording(telemetry, ticks, metadata, is_complete and CUT not in metadata)
+    telemetry, ticks = builders[TELEMETRY_TOPIC].columns(), builders[TICKS_TOPIC].columns()
+    return Recording(telemetry, ticks, metadata, is_whole and CUT not in metadata)
 
 
 class _Builder:
