@@ -32,7 +32,7 @@ from tormagd.model.features import (
     require_features,
     require_number,
 )
-from tormagd.model.force_curve import ForceCurve, Known, Network, require_inputs
+from tormagd.model.force_curve import ForceCurve, Known, Network
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.physics.errors import DomainError
 
@@ -189,12 +189,9 @@ class ForceModel:
         return np.asarray(np.tanh(rows @ weight.T + bias) @ output + constant, dtype=np.float64)
 
     def predict_one(self, displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
-        """Force in N at one point: `predict` without its overhead. Raises `DomainError` on a non-finite input."""
-        require_inputs(displacement_mm, rate_mm_s, field_mT, cip_percent)
-        weight, bias, output, constant = self._tanh
-        hidden = weight.dot((displacement_mm, rate_mm_s, field_mT, cip_percent))
-        hidden += bias
-        return float(output.dot(np.tanh(hidden, hidden))) + constant
+        """Force in N at one point, as plans know it. Raises `DomainError` on a non-finite input."""
+        require_number("field_mT", field_mT)
+        return self.curve(displacement_mm, rate_mm_s, cip_percent).force_N(field_mT)
 
     def field_slope_N_per_mT(self, features: ArrayLike) -> Array:
         """dF/dB (n) at `features` (n x 4). Raises `DomainError` like `predict`."""
