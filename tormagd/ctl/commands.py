@@ -241,7 +241,7 @@ COMMANDS = {
     ),
     "calibrate": Command(
         "guided: let the daemon learn its device, sweep an insert into a model file, or motors into a log",
-        "calibration.calibration",
+        "calibrate.calibrate",
         ("config", "endpoints", "wait_s"),
         (
             option("--device", action="store_true", help="what this device shows of itself becomes its profile"),
