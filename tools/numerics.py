@@ -30,16 +30,10 @@ from extremes.tally import COUNTS, Tally
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from tormagd.lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
 from tormagd.physics.errors import FloatArray
 from tormagd.physics.field import ThesisFieldLaw
-from tormagd.physics.force import (
-    brake_force_N,
-    d_force_d_gap,
-    d_force_d_moment,
-    max_radial_moment_Tm,
-    radial_moment_for_force_Tm,
-    stretch_minus_one,
-)
+from tormagd.physics.force import brake_force_N, max_radial_moment_Tm
 
 BATCH = 500
 """Inputs for each device."""
