@@ -23,8 +23,8 @@ from tormagd.ctl.calibrate_run import Range
 from tormagd.ctl.main import main
 from tormagd.ctl.outcome import CommandError
 from tormagd.lab.training import calibration
-from tormagd.lab.training.calibration import CalibrationError, fit, require_usable, training_rows
-from tormagd.model.displacement import MOVING_MM_S, Turn, displacement
+from tormagd.lab.training.calibration import CalibrationError, displacement, fit, require_usable, training_rows
+from tormagd.model.displacement import MOVING_MM_S, Turn
 from tormagd.model.model_file import load_model
 from tormagd.model.shipped import model_path
 from tormagd.physics.inserts import insert

@@ -16,13 +16,12 @@ from hypothesis import given, strategies as st
 from safetensors import safe_open
 
 from tormagd.lab.training.dataset import Dataset
-from tormagd.lab.training.metrics import fit_metrics
+from tormagd.lab.training.metrics import fit_metrics, not_rising_share
 from tormagd.model import model_file
 from tormagd.model.features import FEATURES, LARGEST, UNITS, Element, Scaling
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelFileError, ModelMetadata, load_model, save_model
 from tormagd.model.network import to_model, to_network
-from tormagd.model.rising import not_rising_share
 from tormagd.physics.errors import DomainError
 
 POINT = (0.3, 12.0, 420.0, 40.0)

@@ -12,9 +12,10 @@ import numpy.typing as npt
 
 from tormagd.control.portrait import FieldOfGap
 from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.fitting import scaling_of
 from tormagd.lab.training.levenberg_marquardt import train
 from tormagd.lab.training.metrics import fit_metrics
-from tormagd.model.features import Element, Scaling
+from tormagd.model.features import Element
 from tormagd.model.model_file import ForceModel, ModelMetadata
 from tormagd.model.network import ForceNetwork, to_model
 from tormagd.physics.field import PowerFieldLaw
@@ -98,7 +99,7 @@ def training_data(plant: PlantParameters, rows: int, seed: int) -> Dataset:
 def trained(data: Dataset, hidden: int, epochs: int, seed: int = 0) -> ForceModel:
     """A network with that many units, trained by Levenberg-Marquardt; its metrics hold `mae_N` of the held-out rows."""
     training, validation = data.split(0.3, seed)
-    scaling = Scaling.fit(training.features, training.force_N)
+    scaling = scaling_of(training)
     network = ForceNetwork(scaling, hidden, seed=seed)
     train(network, training, validation, epochs=epochs)
     metadata = ModelMetadata(

@@ -288,11 +288,6 @@ def load_scene(name_or_path: str) -> Scene:
     return scene if isinstance(scene.terms, Terms) else msgspec.structs.replace(scene, terms=EVERY_TERM)
 
 
-def load_task(name_or_path: str) -> Scene:
-    """The same scene with every term, whatever its file says of them: what terms are measured on."""
-    return msgspec.structs.replace(convert(scene_path(name_or_path), Scene), terms=EVERY_TERM)
-
-
 def _required(scene: Scene, path: Path) -> Terms:
     for known in measured().scenes:
         if known.fingerprint == scene.fingerprint:

@@ -18,11 +18,10 @@ from tormagd.lab.main import Found
 from tormagd.lab.tactile.models import dataset
 from tormagd.lab.tactile.pads import cyclic_records, holding_records
 from tormagd.lab.training.grey_box import fit_grey_box
-from tormagd.lab.training.metrics import force_metrics
+from tormagd.lab.training.metrics import force_metrics, not_rising_share
 from tormagd.lab.training.splits import random_split
 from tormagd.model.memory import Memory
 from tormagd.model.model_file import ForceModel, save_model
-from tormagd.model.rising import not_rising_share
 from tormagd.simulation.parameters import PlantError, load_plant
 
 INSERT = "MRE-C"
