@@ -107,7 +107,7 @@ COMMANDS = {
         ("client",),
     ),
     "firmware": Command(
-        "who is at the other end of the wire, and how well the wire carries", "firmware.firmware", ("client",)
+        "who is at the other end of the wire, and how well the wire carries", "status.firmware", ("client",)
     ),
     "ports": Command("where a device could be connected, and who holds what is there", "ports.ports", ("config",)),
     "enable": _operate("start rendering force (homed, fresh measurements and a neutral setpoint needed)"),

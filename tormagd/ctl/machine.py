@@ -84,7 +84,7 @@ class Machine:
                 continue
             # a process may end, or its files be another user's, while we look
             try:
-                targets = {target for link in (process / "fd").iterdir() if (target := _target(link))}
+                targets = {os.path.realpath(link) for link in (process / "fd").iterdir()}
             except PermissionError:
                 hidden += 1
                 continue
@@ -107,10 +107,3 @@ class Machine:
         inode = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
         rows = [line.split() for line in (self.text("/proc/locks") or "").splitlines()]
         return sorted({int(row[4]) for row in rows if len(row) > 5 and row[1] == "FLOCK" and row[5] == inode})
-
-
-def _target(link: Path) -> str | None:
-    try:
-        return str(link.readlink())
-    except OSError:
-        return None

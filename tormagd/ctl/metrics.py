@@ -134,7 +134,6 @@ def _families(status: Status) -> Iterator[Family]:
         ("peers_refused", "Connections that were not let in", status.peers.refused),
     ):
         yield Family(COUNTER, name, text, (), {(): count})
-    trips = {} if trip_us is None else {"p50": trip_us.p50 * MICRO, "p99": trip_us.p99 * MICRO}
     for kind, name, text, label, values in (
         (GAUGE, "fault", "Latched faults, 1 for each that is there", "code", dict.fromkeys(status.faults, 1.0)),
         (GAUGE, "limit", "Limits, 1 for each that holds the force back now", "code", dict.fromkeys(status.limits, 1.0)),
@@ -163,7 +162,13 @@ def _families(status: Status) -> Iterator[Family]:
         ),
         (COUNTER, "loop_stalls", "Runs done after ten were due", "loop", {n: it.stalls for n, it in rates.items()}),
         (COUNTER, "late_ticks", "Late control ticks, by who is to blame", "culprit", status.late_ticks_by),
-        (GAUGE, "link_round_trip_seconds", "From a Drive to its State", "percentile", trips),
+        (
+            GAUGE,
+            "link_round_trip_seconds",
+            "From a Drive to its State",
+            "percentile",
+            {} if trip_us is None else {"p50": trip_us.p50 * MICRO, "p99": trip_us.p99 * MICRO},
+        ),
     ):
         yield Family(kind, name, text, (label,), {(key,): value for key, value in values.items()})
     for name, text, label, reports in (

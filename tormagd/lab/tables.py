@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tormagd.bounded_file import MOST_TABLE_BYTES
 from tormagd.lab.errors import LabError
 from tormagd_client.regular_file import require_regular
 
 MAX_ROWS = 5_000_000
+MOST_TABLE_BYTES = 1 << 30
+"A table of measurements, which is read row by row: a day of a testing machine."
 
 
 def read_columns(

@@ -24,6 +24,13 @@ DEEPEST_MM: Final = 6.0
 FASTEST_MM_S: Final = 100.0
 STRONGEST_MT: Final = 500.0
 
+TOUCHING_MM = 0.2
+"""Where the cycles turn at their open end: plates that leave the pad at every cycle measure air."""
+RATES_MM_S = (1.0, 0.5, 4.0, 2.0)
+"""Not in order, so that a drift over the record is not mistaken for an effect of the rate."""
+CYCLES_PER_RATE = 3
+SAMPLES_PER_CYCLE = 175
+
 
 @final
 class TactilePad:
@@ -94,3 +101,27 @@ class TactilePad:
         steps = np.round(np.diff(time_s, prepend=0.0 if time_s[0] == 0.0 else 2 * time_s[0] - time_s[1]), 9)
         columns = zip(steps.tolist(), displacement_mm.tolist(), rate_mm_s.tolist(), field_mT.tolist(), strict=True)
         return np.array([self.advance(*row) for row in columns])
+
+
+def cycling_program(samples_per_cycle: int = SAMPLES_PER_CYCLE) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+    """Time, displacement, rate and cycle number of one pass: cycles 0.2 to 4.5 mm and back, each rate three times."""
+    times, displacements, rates, cycles, start_s = [], [], [], [], 0.0
+    stroke_mm = FULL_INDENTATION_MM - TOUCHING_MM
+    share = np.arange(1, samples_per_cycle + 1) / samples_per_cycle
+    for index, rate in enumerate(np.repeat(RATES_MM_S, CYCLES_PER_RATE)):
+        period_s = 2.0 * stroke_mm / rate
+        times.append(start_s + share * period_s)
+        displacements.append(TOUCHING_MM + stroke_mm * (1.0 - np.abs(1.0 - 2.0 * share)))
+        rates.append(np.where(share <= 0.5, rate, -rate))
+        cycles.append(np.full(samples_per_cycle, index))
+        start_s += period_s
+    return np.concatenate(times), np.concatenate(displacements), np.concatenate(rates), np.concatenate(cycles)
+
+
+def worked_pad(parameters: PadParameters) -> TactilePad:
+    """A pad after ten cycles without field and a rest."""
+    pad = TactilePad(parameters)
+    time_s, displacement_mm, rate_mm_s, _ = cycling_program(50)
+    pad.run(time_s, displacement_mm, rate_mm_s, np.zeros_like(time_s))
+    pad.rest()
+    return pad

@@ -8,9 +8,8 @@ import numpy.typing as npt
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
-from tormagd.bounded_file import MOST_TABLE_BYTES
 from tormagd.lab.errors import LabError
-from tormagd.lab.tables import read_columns
+from tormagd.lab.tables import MOST_TABLE_BYTES, read_columns
 from tormagd_client.regular_file import require_regular
 
 Array = npt.NDArray[np.float64]

@@ -15,9 +15,8 @@ from tormagd.lab.training.metrics import force_metrics, not_rising_share
 from tormagd.lab.training.splits import Mask, leave_cycles_out, leave_one_out, random_split
 from tormagd.model.features import FEATURES
 from tormagd.model.model_file import ForceModel
-from tormagd.simulation.pad import RATES_MM_S, TOUCHING_MM, worked_pad
 from tormagd.simulation.parameters import PadParameters
-from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM
+from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM, RATES_MM_S, TOUCHING_MM, worked_pad
 
 CIP = FEATURES.index("cip_percent")
 SCORED_SLOPE_N_MT = 0.03
