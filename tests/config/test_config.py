@@ -145,11 +145,6 @@ def test_numbers_that_are_not_finite_are_refused(write, number: str, table: str)
     assert "finite" in refused
 
 
-def test_a_nan_hides_in_no_list_and_no_unknown_table(write) -> None:
-    assert "finite" in refusal(write("[realtime]\ncpus = [0, nan]"))
-    assert "finite" in refusal(write("[a.b.c]\nd = [[{e = inf}]]"))
-
-
 @pytest.mark.parametrize(
     ("text", "key", "value", "other"),
     [
