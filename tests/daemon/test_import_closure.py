@@ -43,6 +43,7 @@ LIBRARIES = (
     "safetensors",
     "scipy",
     "serial",
+    "sklearn",
     "torch",
     "zmq",
 )

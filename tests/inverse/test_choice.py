@@ -1,8 +1,5 @@
 """The search of a scene: by name, or Newton's method, which no measured scene has a reason to leave."""
 
-import subprocess
-import sys
-
 import msgspec
 import pytest
 
@@ -62,11 +59,3 @@ def test_a_scene_may_name_its_search() -> None:
     wanted = msgspec.structs.replace(scene, solver=Solver(name="nearest", step_mT=5.0, neighbours=2))
     choice = choose_solver(wanted)
     assert (choice.solver, choice.step_mT, choice.neighbours) == ("nearest", 5.0, 2)
-
-
-def test_what_trains_and_what_is_for_the_laboratory_stays_out_of_the_daemon() -> None:
-    """torch takes seconds to load, and the searches that the daemon may run know nothing but a curve."""
-    loaded = "import sys, tormagd.control.core, tormagd.inverse.choice; print(*sys.modules)"
-    found = subprocess.run([sys.executable, "-c", loaded], check=True, capture_output=True, text=True).stdout.split()
-    assert "tormagd.inverse.newton" in found
-    assert not {"torch", "scipy", "sklearn", "matplotlib"} & set(found)

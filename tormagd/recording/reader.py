@@ -78,17 +78,18 @@ def opened(path: Path) -> Iterator[BinaryIO]:
 def scan(file: BinaryIO, name: str, take: Callable[[Any], None]) -> bool:
     """Hands each of the file's records to `take`, which may raise UNREADABLE; False where it ends in the middle of one.
     Raises RecordingError, in which the file is called `name`: not MCAP, or damaged."""
+    record: Any = None
     try:
         try:
             for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:
                 take(record)
         except UNREADABLE:
             # a record that runs into the end of the file was being written when its writer died
-            if file.read(1):
+            if file.read(1) or record is None:
                 raise
             return False
     except UNREADABLE as error:
-        raise RecordingError(f"{name}: not an intact MCAP recording ({str(error)[:200]})") from error
+        raise RecordingError(f"{name}: not an intact MCAP file ({str(error)[:200]})") from error
     return True
 
 
