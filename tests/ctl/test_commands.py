@@ -276,22 +276,6 @@ def test_home_no_wait_returns_at_once(fake_daemon, capsys, states):
     assert fake_daemon.commands == ["status", "home"]
 
 
-class Terminal:
-    def isatty(self) -> bool:
-        return True
-
-
-def test_colours_only_on_a_terminal_and_not_with_no_color(monkeypatch):
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    monkeypatch.setenv("TERM", "xterm")
-    assert Colour(Terminal()).red("x") == "\x1b[31mx\x1b[0m"  # type: ignore[arg-type]
-    monkeypatch.setenv("NO_COLOR", "1")
-    assert Colour(Terminal()).red("x") == "x"  # type: ignore[arg-type]
-    monkeypatch.delenv("NO_COLOR")
-    monkeypatch.setenv("TERM", "dumb")
-    assert Colour(Terminal()).red("x") == "x"  # type: ignore[arg-type]
-
-
 PERCENTILES_US = {"p50": 12.0, "p99": 80.0, "p999": 90.0, "max": 95.0}
 KEPT_RATE = {"grade": "error", "hz": 999.6, "lateness_us": PERCENTILES_US | {"worst": 99.0}, "exec_us": PERCENTILES_US}
 KEPT_RATE |= {"runs": 999, "overruns": 9, "stalls": 2, "merged": 4}
