@@ -124,20 +124,24 @@ def test_no_state_and_no_field_has_no_force(
     assert 0.0 <= curve.confidence(field, force) <= 1.0
 
 
-def test_confidence_follows_its_formula(model: ForceModel) -> None:
+@pytest.mark.parametrize(
+    ("place", "error_N", "expected"),
+    [
+        ((0.5, 10.0, 400.0, 40.0), 0.0, 1.0),
+        ((0.5, 10.0, 400.0, 40.0), 0.3, pytest.approx(math.exp(-20 * 0.3 / 5.6))),
+        ((1.25, 10.0, 400.0, 40.0), 0.0, pytest.approx(math.exp(-1))),
+        ((-0.25, 75.0, 400.0, 40.0), 0.0, pytest.approx(math.exp(-2))),
+        ((0.5, 10.0, 975.0, 40.0), 0.0, pytest.approx(math.exp(-1))),
+        ((0.5, 10.0, -75.0, 40.0), 0.0, pytest.approx(math.exp(-1))),
+        ((0.5, 10.0, 400.0, 50.0), 0.0, pytest.approx(math.exp(-1))),
+        ((LARGEST, 10.0, 400.0, 40.0), LARGEST, 0.0),
+    ],
+)
+def test_confidence_follows_its_formula(
+    model: ForceModel, place: tuple[float, float, float, float], error_N: float, expected: float
+) -> None:
     """The model's force span is 5.6 N; its share of iron never varied."""
-
-    def confidence(place: tuple[float, float, float, float], error_N: float) -> float:
-        displacement, rate, field, cip = place
-        return model.curve(displacement, rate, cip).confidence(field, error_N)
-
-    inside = (0.5, 10.0, 400.0, 40.0)
-    assert confidence(inside, 0.0) == 1.0
-    assert confidence(inside, 0.3) == pytest.approx(math.exp(-20 * 0.3 / 5.6))
-    assert confidence(inside, -0.3) == confidence(inside, 0.3)
-    assert confidence((1.25, 10.0, 400.0, 40.0), 0.0) == pytest.approx(math.exp(-1))
-    assert confidence((-0.25, 75.0, 400.0, 40.0), 0.0) == pytest.approx(math.exp(-2))
-    assert confidence((0.5, 10.0, 975.0, 40.0), 0.0) == pytest.approx(math.exp(-1))
-    assert confidence((0.5, 10.0, -75.0, 40.0), 0.0) == pytest.approx(math.exp(-1))
-    assert confidence((0.5, 10.0, 400.0, 50.0), 0.0) == pytest.approx(math.exp(-1))
-    assert confidence((LARGEST, 10.0, 400.0, 40.0), LARGEST) == 0.0
+    displacement, rate, field, cip = place
+    curve = model.curve(displacement, rate, cip)
+    assert curve.confidence(field, error_N) == expected
+    assert curve.confidence(field, -error_N) == curve.confidence(field, error_N)
