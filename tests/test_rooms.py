@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LOWEST = {"firmware_protocol", "config", "messages"}
-FILES = {"bounded_file", "toml_file"}
+FILES = {"bounded_file", "named_file", "toml_file"}
 DECIDES = {"firmware_protocol", "config", "physics", "model", "inverse", "scenes", "safety", "hardware"}
 """What the core is made of."""
 NO_ROOM = {"firmware_protocol.value", "firmware_protocol.build"}
@@ -17,7 +17,8 @@ NO_ROOM = {"firmware_protocol.value", "firmware_protocol.build"}
 MAY_IMPORT = {
     "firmware_protocol": set(),
     "bounded_file": set(),
-    "toml_file": {"bounded_file"},
+    "named_file": set(),
+    "toml_file": {"bounded_file", "named_file"},
     "force_file": {"bounded_file", "messages"},
     "config": {"toml_file"},
     "messages": set(),
@@ -30,9 +31,9 @@ MAY_IMPORT = {
     "physics": FILES,
     "model": FILES | {"physics"},
     "inverse": {"firmware_protocol", "physics", "model"},
-    "scenes": {"config", "force_file"},
+    "scenes": {"named_file", "toml_file", "config", "force_file"},
     "safety": {"firmware_protocol"},
-    "hardware": LOWEST | {"exact", "safety"},
+    "hardware": LOWEST | {"named_file", "exact", "safety"},
     "control": DECIDES,
     "assembly": DECIDES | {"messages", "exact", "keeping", "control"},
     "daemon": LOWEST
@@ -42,7 +43,7 @@ MAY_IMPORT = {
     "client": {"config", "keys", "messages", "output"},
     "dashboard": {"client", "messages", "output", "recording", "safety"},
     "ctl": FILES | {"dashboard", "force_file", "client", "config", "messages", "output", "keys", "scenes", "recording"},
-    "simulation": FILES | {"physics", "firmware_protocol", "output", "slices"},
+    "simulation": FILES | {"force_file", "physics", "firmware_protocol", "output", "slices"},
     "headroom": {"config", "output", "daemon", "control", "assembly", "simulation", "closed_loop"},
     "replay": LOWEST
     | {"exact", "keeping", "output", "recording", "model", "scenes", "safety", "hardware", "control", "daemon"}

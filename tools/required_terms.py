@@ -24,7 +24,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from rendering.device_draws import SAMPLES
-from rendering.scene_runs import ROOT, Case, costs, run, run_all
+from rendering.scene_runs import ROOT, Case, costs, load_task, run, run_all
 from rendering.signals import Signal, data_folder, recorded_signals
 
 from tormagd.ctl.scene_new import new_scene
@@ -49,7 +49,7 @@ from tormagd.scenes.measured import (
     measured,
     required,
 )
-from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_task, shipped_scenes
+from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, shipped_scenes
 from tormagd_client.endpoints import ConfigError
 
 SHARE = 0.2

@@ -11,9 +11,6 @@ from pathlib import Path
 
 from tormagd_client.regular_file import require_regular
 
-MOST_TABLE_BYTES = 1 << 30
-"A table of measurements, which is read row by row: a day of a testing machine."
-
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
     """All of a regular file of at most `most_bytes`. Raises OSError; its `strerror` says what is allowed.

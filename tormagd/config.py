@@ -4,28 +4,19 @@ A TOML file, or the defaults. Unknown keys, wrong types, NaN and infinities, val
 orderings are refused with the key's path, the value and what is allowed.
 """
 
-import re
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
 
-from tormagd.toml_file import TomlError, line_of, toml_tables, toml_text
-from tormagd_client.endpoints import ConfigError, Endpoints, Strict, require_usable
-from tormagd_client.printable import in_short, require
+from tormagd.toml_file import checked as checked, convert, table_in as table_in
+from tormagd_client.endpoints import Endpoints, Strict, require_usable
+from tormagd_client.printable import require
 
 LEAST_INFERENCE_HZ = 83  # the thesis's own rate, 1 / (4 + 8 ms): slower than this is not worth running
 MOST_LISTED = 8
 "Sources in the order of priority: fewer than are kept apart, so that one that is not listed is heard, too."
-
-T = TypeVar("T")
-_OURS = re.compile(r"([a-z_A-Z.]+)(?: =|:) ")
-"The key, or the table, that a refusal of ours begins with."
-_PLACE = re.compile(r"`\$([^`]*)`")
-"The place that one of msgspec's ends with."
-_UNKNOWN = re.compile(r"unknown field `(\w+)`")
 
 
 class Device(Strict, frozen=True):
@@ -242,90 +233,3 @@ class Config(Strict, frozen=True):
 def load_config(path: Path | None) -> Config:
     """The configuration in `path`, or the defaults. Raises ConfigError."""
     return Config() if path is None else convert(path, Config)
-
-
-def convert(path: Path, kind: type[T]) -> T:
-    """The file's tables as a `kind`. Raises ConfigError naming file, key, value, what is allowed, and the line."""
-    try:
-        text = toml_text(path)
-        try:
-            return checked(toml_tables(text), kind)
-        except (TomlError, ConfigError) as error:
-            raise ConfigError(f"{error}{_line(text, str(error))}") from error
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from error
-    except (TomlError, ConfigError) as error:
-        raise ConfigError(f"{path}: {error}") from error
-
-
-def placed(path: Path | None, message: str) -> str:
-    """A refusal of what a file, which has been read, says: with its name and the line, where it names a key there."""
-    where = "" if path is None else _line(toml_text(path), message)
-    return f"{path}: {message}{where}" if where else message
-
-
-def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
-    """The tables as a `kind`, whose root is at `where`. Raises ConfigError naming key, value and what is allowed."""
-    try:
-        return msgspec.convert(tables, kind)
-    except msgspec.ValidationError as error:
-        text = str(error)
-        told = _value_at(tables, text) + _known_key(kind, text)
-        refused = text if "`$" in text or where == "$" else f"{text} - at `$`"
-        raise ConfigError(refused.replace("`$", f"`{where}") + told) from error
-
-
-def did_you_mean(word: str, allowed: Iterable[str]) -> str:
-    """`; did you mean ...?` where one of the allowed words is near, or nothing."""
-    import difflib  # takes a moment, and most configurations are right
-
-    near = difflib.get_close_matches(word, list(allowed), n=1)
-    return f"; did you mean `{near[0]}`?" if near else ""
-
-
-def table_in(kind: Any) -> type[msgspec.Struct] | None:
-    """The table that a field of this type holds, optional or not; None where it is a plain value."""
-    structs = (each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, msgspec.Struct))
-    return next(structs, None)
-
-
-def _known_key(kind: Any, message: str) -> str:
-    """The known key that is nearest to an unknown one of msgspec's message."""
-    if (unknown := _UNKNOWN.search(message)) is None:
-        return ""
-    table = table_in(kind)
-    for name in _key_in(message)[:-1]:
-        fields = {field.name: field.type for field in msgspec.structs.fields(table)} if table else {}
-        table = table_in(fields.get(name))
-    return did_you_mean(unknown[1], [field.name for field in msgspec.structs.fields(table)]) if table else ""
-
-
-def _line(text: str, message: str) -> str:
-    """` (line N)` of the key that the message is about, or of the table it is missing in; nothing without either."""
-    key = _key_in(message)
-    lines = (line_of(text, key[:size]) for size in range(len(key), 0, -1))
-    return next((f" (line {line})" for line in lines if line is not None), "")
-
-
-def _key_in(message: str) -> list[str]:
-    """The key that a refusal names: ours begin with it, msgspec's end with its place, and may name an unknown one."""
-    if ours := _OURS.match(message):
-        return ours[1].split(".")
-    place, unknown = _PLACE.search(message), _UNKNOWN.search(message)
-    key = [name for name in place[1].split("[")[0].split(".") if name] if place else []
-    return [*key, unknown[1]] if unknown else key
-
-
-def _value_at(tables: dict[str, Any], message: str) -> str:
-    """` (it is VALUE)` for the `$.a.b` path msgspec puts at the end of its message; msgspec leaves the value out.
-
-    An element of an array, `$.a[...]`, is not told from its neighbours, so the value is the array.
-    """
-    if "`$." not in message:
-        return ""
-    value: Any = tables
-    for key in message.rsplit("`$.", 1)[1].rstrip("`").split("[")[0].split("."):
-        if not isinstance(value, dict) or key not in value:
-            return ""
-        value = value[key]
-    return "" if isinstance(value, dict) else f" (it is {in_short(value)})"

@@ -2,25 +2,11 @@
 
 import signal
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 
 INTERRUPTED = 130
 """What a shell makes of a process that SIGINT has ended."""
-
-
-def daemon() -> int:
-    """`tormagd`."""
-    return _run("tormagd.daemon.main")
-
-
-def ctl() -> int:
-    """`tormagctl`."""
-    return _run("tormagd.ctl.main")
-
-
-def lab() -> int:
-    """`tormag-lab`."""
-    return _run("tormagd.lab.main")
 
 
 def _run(module: str) -> int:
@@ -34,3 +20,11 @@ def _run(module: str) -> int:
         return main()
     except KeyboardInterrupt:
         return INTERRUPTED
+
+
+daemon = partial(_run, "tormagd.daemon.main")
+"`tormagd`."
+ctl = partial(_run, "tormagd.ctl.main")
+"`tormagctl`."
+lab = partial(_run, "tormagd.lab.main")
+"`tormag-lab`."

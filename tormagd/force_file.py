@@ -1,18 +1,19 @@
-"""A force over time in a CSV file: what is sent, what a scene asks for, what a design is judged by."""
+"""A quantity over time in a CSV file: a force that is sent, asked for by a scene or designed for; a hand's motion."""
 
 import csv
 import io
 import math
 from array import array
+from collections.abc import Mapping
 from pathlib import Path
 
 from tormagd.bounded_file import read_bounded
 from tormagd_client.messages import MAX_DISPLACEMENT_MM, MAX_FORCE_N, MAX_RATE_MM_S
 
-REQUIRED_COLUMNS = ("t_s", "force_N")
 OPTIONAL_COLUMNS = ("displacement_mm", "rate_mm_s")
+TIME = (-1e10, 1e10, "s")  # seconds since 1970 are fine
 ALLOWED = {
-    "t_s": (-1e10, 1e10, "s"),  # seconds since 1970 are fine
+    "t_s": TIME,
     "force_N": (0.0, MAX_FORCE_N, "N"),
     "displacement_mm": (0.0, MAX_DISPLACEMENT_MM, "mm"),
     "rate_mm_s": (-MAX_RATE_MM_S, MAX_RATE_MM_S, "mm/s"),
@@ -23,13 +24,21 @@ MAX_FILE_BYTES = 16_000_000
 "More than a quarter of an hour at 1 kHz."
 
 
+Allowed = Mapping[str, tuple[float, float, str]]
+
+
 class ForceFileError(ValueError):
-    """A file that is no force over time: names the file, row, column, value and what is allowed."""
+    """A file that is no such table: names the file, row, column, value and what is allowed."""
 
 
 def read_forces(path: Path) -> dict[str, "array[float]"]:
-    """The columns by name: `t_s`, which rises from row to row, `force_N`, and of the optional ones those that the file
-    has, equally long. Raises ForceFileError.
+    """The columns `t_s`, `force_N`, and of the optional ones those that the file has. Raises as `read_table`."""
+    return read_table(path, ALLOWED, OPTIONAL_COLUMNS)
+
+
+def read_table(path: Path, allowed: Allowed, optional: tuple[str, ...] = ()) -> dict[str, "array[float]"]:
+    """The columns by name, equally long: `t_s`, which rises from row to row, and the others of `allowed`, of which a
+    file may lack those that are `optional`. Raises ForceFileError.
 
     Arrays, for a million rows of lists would not fit in the memory that a command may take.
     """
@@ -37,11 +46,11 @@ def read_forces(path: Path) -> dict[str, "array[float]"]:
         data = io.BytesIO(read_bounded(path, MAX_FILE_BYTES))
         with io.TextIOWrapper(data, encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file, strict=True)
-            columns = _check_header(path, [name.strip() for name in next(reader, [])])
+            columns = _check_header(path, [name.strip() for name in next(reader, [])], list(allowed), optional)
             table = {name: array("d") for name in columns}
             for cells in reader:
                 if cells:
-                    row = _check_row(path, reader.line_num, columns, cells, table["t_s"][-1:])
+                    row = _check_row(path, reader.line_num, columns, cells, table["t_s"][-1:], allowed)
                     for name, value in zip(columns, row, strict=True):
                         table[name].append(value)
     except OSError as error:
@@ -55,23 +64,27 @@ def read_forces(path: Path) -> dict[str, "array[float]"]:
     return table
 
 
-def _check_header(path: Path, columns: list[str]) -> list[str]:
-    allowed = f"allowed is {','.join(REQUIRED_COLUMNS)} and optionally {','.join(OPTIONAL_COLUMNS)}"
-    missing = [name for name in REQUIRED_COLUMNS if name not in columns]
+def _check_header(path: Path, columns: list[str], known: list[str], optional: tuple[str, ...]) -> list[str]:
+    required = [name for name in known if name not in optional]
+    also = f" and optionally {','.join(optional)}" if optional else ""
+    allowed = f"allowed is {','.join(required)}{also}"
+    missing = [name for name in required if name not in columns]
     if missing:
         raise ForceFileError(f"{path}: row 1 has no column {missing[0]} (it is {','.join(columns)[:80]!r}): {allowed}")
     for index, name in enumerate(columns):
-        if name not in REQUIRED_COLUMNS + OPTIONAL_COLUMNS:
+        if name not in known:
             raise ForceFileError(f"{path}: row 1: column {name[:40]!r} is not known: {allowed}")
         if name in columns[:index]:
             raise ForceFileError(f"{path}: row 1: column {name} is there twice")
     return columns
 
 
-def _check_row(path: Path, line: int, columns: list[str], cells: list[str], before_s: "array[float]") -> list[float]:
+def _check_row(
+    path: Path, line: int, columns: list[str], cells: list[str], before_s: "array[float]", allowed: Allowed
+) -> list[float]:
     if len(cells) != len(columns):
         raise ForceFileError(f"{path}: row {line} has {len(cells)} values: allowed is {len(columns)}")
-    row = [_number(path, line, name, text) for name, text in zip(columns, cells, strict=True)]
+    row = [_number(path, line, name, text, *allowed[name]) for name, text in zip(columns, cells, strict=True)]
     time = columns.index("t_s")
     if before_s and not row[time] > before_s[0]:
         raise ForceFileError(
@@ -80,14 +93,13 @@ def _check_row(path: Path, line: int, columns: list[str], cells: list[str], befo
     return row
 
 
-def _number(path: Path, line: int, name: str, text: str) -> float:
+def _number(path: Path, line: int, name: str, text: str, least: float, most: float, unit: str) -> float:
     try:
         value = float(text) if "_" not in text else math.nan  # Python reads 1_5 as 15; a table means something else
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
         raise ForceFileError(f"{path}: row {line}, {name} = {text[:40]!r}: allowed is a finite number")
-    least, most, unit = ALLOWED[name]
     if not least <= value <= most:
         raise ForceFileError(f"{path}: row {line}, {name} = {text[:40]}: allowed is {least:g}..{most:g} {unit}")
     return value

@@ -1,32 +1,35 @@
-"""TOML that anybody may have written: refused by its shape before it is parsed, and by its numbers after."""
+"""TOML that anybody may have written: refused by its shape before it is parsed, by its numbers after, and by what its
+tables may say: with the key's path, the value, what is allowed and the line."""
 
 import math
 import re
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_args
+
+import msgspec
 
 from tormagd.bounded_file import read_bounded
+from tormagd.named_file import did_you_mean
+from tormagd_client.endpoints import ConfigError
+from tormagd_client.printable import in_short
 
 MOST_BYTES = 65_536
 "Ten times the longest configuration with all its comments."
-MOST_DEPTH = 16
-"Parts of a key, and arrays and tables in each other: the parser takes their square, or all of the stack."
+LONGEST_LINE = 8_192
+"Of a key with more parts than that the parser takes the square: a minute."
 MOST_GUESSES = 16
 "Lines that may give a key, of those that have its name in them: a file may be full of them."
 MOST_LINES = 8
 "Of one value, to be told where it stands."
 
-# a string that does not end goes on to the end of the line or the text: the parser stops there, too
-_TOKEN = re.compile(
-    r'"""(?:[^"\\]|\\.|"(?!""))*+(?:"""|\Z)'
-    r"|'''(?:[^']|'(?!''))*+(?:'''|\Z)"
-    r'|"(?:[^"\\\n]|\\.)*+"?'
-    r"|'[^'\n]*+'?"
-    r"|#[^\n]*+|[\[\]{}.,=\n]",
-    re.DOTALL,
-)
+T = TypeVar("T")
+_OURS = re.compile(r"([a-z_A-Z.]+)(?: =|:) ")
+"The key, or the table, that a refusal of ours begins with."
+_PLACE = re.compile(r"`\$([^`]*)`")
+"The place that one of msgspec's ends with."
+_UNKNOWN = re.compile(r"unknown field `(\w+)`")
 
 
 class TomlError(ValueError):
@@ -50,15 +53,102 @@ def toml_tables(text: str) -> dict[str, Any]:
     """The tables in `text`, all numbers finite and of 64 bits. Raises TomlError."""
     import tomllib  # not above: who reads no file, as most commands of tormagctl, need not wait for it
 
-    _require_shallow(text)
+    for number, line in enumerate(text.splitlines(), start=1):
+        if len(line) > LONGEST_LINE:
+            raise TomlError(f"line {number} has {len(line)} characters: allowed are {LONGEST_LINE}")
     try:
         tables = tomllib.loads(text)
+        _require_numbers(tables, "")
+    except RecursionError as error:
+        raise TomlError(
+            "arrays, tables or parts of a key stand too deep in each other: allowed are hundreds"
+        ) from error
     except tomllib.TOMLDecodeError as error:
         raise TomlError(f"not TOML: {error}") from error
+    except TomlError:
+        raise
     except ValueError as error:  # Python reads no integer of more than 4300 digits
         raise TomlError("not TOML: an integer has more digits than any that is allowed here") from error
-    _require_numbers(tables, "")
     return tables
+
+
+def convert(path: Path, kind: type[T]) -> T:
+    """The file's tables as a `kind`. Raises ConfigError naming file, key, value, what is allowed, and the line."""
+    try:
+        text = toml_text(path)
+        try:
+            return checked(toml_tables(text), kind)
+        except (TomlError, ConfigError) as error:
+            raise ConfigError(f"{error}{_line(text, str(error))}") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except (TomlError, ConfigError) as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def placed(path: Path | None, message: str) -> str:
+    """A refusal of what a file, which has been read, says: with its name and the line, where it names a key there."""
+    where = "" if path is None else _line(toml_text(path), message)
+    return f"{path}: {message}{where}" if where else message
+
+
+def checked(tables: dict[str, Any], kind: type[T], where: str = "$") -> T:
+    """The tables as a `kind`, whose root is at `where`. Raises ConfigError naming key, value and what is allowed."""
+    try:
+        return msgspec.convert(tables, kind)
+    except msgspec.ValidationError as error:
+        text = str(error)
+        told = _value_at(tables, text) + _known_key(kind, text)
+        refused = text if "`$" in text or where == "$" else f"{text} - at `$`"
+        raise ConfigError(refused.replace("`$", f"`{where}") + told) from error
+
+
+def table_in(kind: Any) -> type[msgspec.Struct] | None:
+    """The table that a field of this type holds, optional or not; None where it is a plain value."""
+    structs = (each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, msgspec.Struct))
+    return next(structs, None)
+
+
+def _known_key(kind: Any, message: str) -> str:
+    """The known key that is nearest to an unknown one of msgspec's message."""
+    if (unknown := _UNKNOWN.search(message)) is None:
+        return ""
+    table = table_in(kind)
+    for name in _key_in(message)[:-1]:
+        fields = {field.name: field.type for field in msgspec.structs.fields(table)} if table else {}
+        table = table_in(fields.get(name))
+    return did_you_mean(unknown[1], [field.name for field in msgspec.structs.fields(table)]) if table else ""
+
+
+def _line(text: str, message: str) -> str:
+    """` (line N)` of the key that the message is about, or of the table it is missing in; nothing without either."""
+    key = _key_in(message)
+    lines = (line_of(text, key[:size]) for size in range(len(key), 0, -1))
+    return next((f" (line {line})" for line in lines if line is not None), "")
+
+
+def _key_in(message: str) -> list[str]:
+    """The key that a refusal names: ours begin with it, msgspec's end with its place, and may name an unknown one."""
+    if ours := _OURS.match(message):
+        return ours[1].split(".")
+    place, unknown = _PLACE.search(message), _UNKNOWN.search(message)
+    key = [name for name in place[1].split("[")[0].split(".") if name] if place else []
+    return [*key, unknown[1]] if unknown else key
+
+
+def _value_at(tables: dict[str, Any], message: str) -> str:
+    """` (it is VALUE)` for the `$.a.b` path msgspec puts at the end of its message; msgspec leaves the value out.
+
+    An element of an array, `$.a[...]`, is not told from its neighbours, so the value is the array.
+    """
+    if "`$." not in message:
+        return ""
+    value: Any = tables
+    for key in message.rsplit("`$.", 1)[1].rstrip("`").split("[")[0].split("."):
+        if not isinstance(value, dict) or key not in value:
+            return ""
+        value = value[key]
+    return "" if isinstance(value, dict) else f" (it is {in_short(value)})"
 
 
 def line_of(text: str, key: Sequence[str]) -> int | None:
@@ -86,25 +176,6 @@ def _is_known(lines: Sequence[str], number: int, key: Sequence[str]) -> bool:
             table = table[name]
         return True
     return False
-
-
-def _require_shallow(text: str) -> None:
-    depth = parts = 0
-    line = 1
-    for token in _TOKEN.finditer(text):
-        mark = token[0]
-        if mark in "[{":
-            depth, parts = depth + 1, 0
-        elif mark in "]}":
-            depth -= 1
-        elif mark == ".":
-            parts += 1
-        elif mark in ",=\n":
-            parts = 0
-        line += mark.count("\n")
-        if depth > MOST_DEPTH or parts >= MOST_DEPTH:
-            what = "arrays or tables in each other" if depth > MOST_DEPTH else "parts of a key"
-            raise TomlError(f"more than {MOST_DEPTH} {what} (line {line}): allowed are {MOST_DEPTH}")
 
 
 def _require_numbers(value: Any, key: str) -> None:

@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from tormagd.closed_loop import Array, ClosedLoop, Sample
 from tormagd.config import Config
 from tormagd.control.core import Stepper
+from tormagd.control.move.carriages import Carriages
 from tormagd.control.move.reference import Reference
 from tormagd.control.records import Plan
 from tormagd.safety.operating_state import OperatingState
@@ -40,6 +41,7 @@ def ticked(loop: ClosedLoop, gap_mm: float, speed_mm_s: float = 0.0) -> Sample:
     """One tick towards a gap: finite everywhere, nothing wound up beyond the duty limit."""
     sample, move = loop.tick(plan=gap_plan(gap_mm, loop.now_s, speed_mm_s)), loop.stepper.move
     limit = CONFIG.position.duty_limit
+    assert isinstance(move, Carriages)
     assert max(abs(sample.output.left_duty), abs(sample.output.right_duty)) <= limit
     assert max(abs(move.left.integral), abs(move.right.integral)) <= limit
     reference, expected = move.reference or Reference(0.0), move.expected

@@ -8,6 +8,7 @@ from firmware_protocol.codec import DeviceMode
 from tormagd.assembly.build import Core, build_core
 from tormagd.closed_loop import ClosedLoop, Sample
 from tormagd.config import Config
+from tormagd.control.move.carriages import Carriages
 from tormagd.control.records import TimedSetpoint
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import OperatingState
@@ -99,11 +100,12 @@ def limits_of(samples: Iterable[Sample]) -> set[Limit]:
 
 @pytest.mark.parametrize("stall_ms", SHORT_MS)
 def test_a_daemon_that_stalls_for_less_than_the_timeout_goes_on(holding: ClosedLoop, stall_ms: int) -> None:
-    before = holding.stepper.move.left.integral
+    move = holding.stepper.move
+    assert isinstance(move, Carriages)
+    before = move.left.integral
     forces_N = stall(holding, stall_ms)
     seen = [
-        (sample, holding.stepper.measure.sight.is_blind, holding.stepper.move.left.integral)
-        for sample in ticks(holding, FORCE_N, 0.6)
+        (sample, holding.stepper.measure.sight.is_blind, move.left.integral) for sample in ticks(holding, FORCE_N, 0.6)
     ]
     samples, are_blind, integrals = zip(*seen, strict=True)
     assert samples[-1].safety.faults == ()
@@ -182,6 +184,7 @@ def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(core: Core
     run(loop, 1.2, 0.8)
     loop.device.messages._home_m -= 2e-4
     move = loop.stepper.move
+    assert isinstance(move, Carriages)
     seen = [(sample, move.left.integral, move.right.integral) for sample in ticks(loop, force_N, 3.0)]
     samples, left, right = zip(*seen, strict=True)
     assert samples[-1].safety.faults == ()

@@ -6,7 +6,7 @@ import pytest
 from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
-from tormagd.control.move.carriages import MAX_ACCELERATION_SCALE
+from tormagd.control.move.carriages import MAX_ACCELERATION_SCALE, Carriages
 from tormagd.simulation.hand import RecordedHand
 
 CONFIG = Config()
@@ -18,7 +18,9 @@ AT_REST = RecordedHand((0.0,), (0.0,))
 
 def lag_mm(loop: ClosedLoop) -> float:
     """How far the encoders are off what is expected of them."""
-    return abs(loop.stepper.move.expected.gap_mm - loop.stepper.measured.gap_mm)  # type: ignore[union-attr]
+    stepper = loop.stepper
+    assert isinstance(stepper.move, Carriages)
+    return abs(stepper.move.expected.gap_mm - stepper.measured.gap_mm)  # type: ignore[union-attr]
 
 
 def test_the_gap_opens_no_faster_than_the_magnets_let_it(arm, hold_gap, gap_ticks) -> None:

@@ -15,7 +15,6 @@ from tormagd.config import LEAST_INFERENCE_HZ, Config, load_config
 from tormagd.daemon.main import main
 from tormagd.hardware.backend import ENTRY_POINTS, choose
 from tormagd_client.endpoints import ConfigError
-from tormagd_client.keys import generate
 
 Write = Callable[[str], Path]
 
@@ -144,11 +143,6 @@ def test_numbers_that_are_not_finite_are_refused(write, number: str, table: str)
     assert f"{table}.{key}" in refused
     assert number.strip("+-") in refused
     assert "finite" in refused
-
-
-def test_a_nan_hides_in_no_list_and_no_unknown_table(write) -> None:
-    assert "finite" in refusal(write("[realtime]\ncpus = [0, nan]"))
-    assert "finite" in refusal(write("[a.b.c]\nd = [[{e = inf}]]"))
 
 
 @pytest.mark.parametrize(
@@ -352,23 +346,6 @@ def test_a_scene_beyond_what_the_device_reaches_is_refused(
         refused = capsys.readouterr().err
         assert f"scene x: {force.splitlines()[1].removesuffix('.0').replace('most', 'force.most')}" in refused
         assert "allowed is 0.65..5.43" in refused
-
-
-def test_a_guarded_address_without_keys_is_refused_with_the_remedy(write: Write, tmp_path: Path, capsys) -> None:
-    """And a secret that others can read is none."""
-
-    def refused(curve: str) -> str:
-        path = write(f'[endpoints]\nsetpoint = "tcp://192.0.2.1:5555"\n{curve}')
-        assert main(["--check", "--config", str(path)]) == 2
-        return str(capsys.readouterr().err)
-
-    assert "others need CURVE keys in [endpoints.curve]" in refused("")
-    secret, _ = generate("server", tmp_path, tmp_path)
-    secret.chmod(0o644)
-    assert "server.key_secret can be read by others (mode 0644)" in refused(
-        f'[endpoints.curve]\nserver_secret = "{secret}"\n'
-    )
-    assert "endpoints.curve.server_secret is missing" in refused(f'[endpoints.curve]\nclient_secret = "{secret}"\n')
 
 
 def test_version_and_usage(capsys) -> None:

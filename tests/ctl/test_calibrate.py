@@ -23,8 +23,8 @@ from tormagd.ctl.calibrate_run import Range
 from tormagd.ctl.main import main
 from tormagd.ctl.outcome import CommandError
 from tormagd.lab.training import calibration
-from tormagd.lab.training.calibration import CalibrationError, fit, require_usable, training_rows
-from tormagd.model.displacement import MOVING_MM_S, Turn, displacement
+from tormagd.lab.training.calibration import CalibrationError, displacement, fit, require_usable, training_rows
+from tormagd.model.displacement import MOVING_MM_S, Turn
 from tormagd.model.model_file import load_model
 from tormagd.model.shipped import model_path
 from tormagd.physics.inserts import insert
@@ -329,26 +329,24 @@ def test_what_cannot_be_meant_is_a_usage_error(tmp_path, monkeypatch, capsys, ar
     assert Path("there").read_text() == "precious"
 
 
-@pytest.mark.parametrize(("age_ms", "state"), [(12.0, "stale"), (20_000.0, "holds")])
-def test_a_second_publisher_is_refused_before_anything_moves(
-    fake_daemon, status_with, source_with, tmp_path, capsys, age_ms, state
+@pytest.mark.parametrize(
+    ("name", "age_ms", "state", "told", "asked"),
+    [
+        # one that sends, and one whose old setpoint is still valid and keeps ours out
+        (INSERT, 12.0, "stale", ("code", "other_publisher"), ["status"]),
+        (INSERT, 20_000.0, "holds", ("code", "other_publisher"), ["status"]),
+        ("MRE-99-99", None, "stale", ("message", "MRE-99-99"), []),
+    ],
+)
+def test_a_second_publisher_and_an_unknown_insert_are_refused_before_anything_moves(
+    fake_daemon, status_with, source_with, tmp_path, capsys, name, age_ms, state, told, asked
 ):
-    """One that sends, and one whose old setpoint is still valid and keeps ours out."""
     setpoints = status_with()["setpoints"] | {"by_source": {"a": source_with(state=state)}}
     fake_daemon.says(setpoint_age_ms=age_ms, setpoints=setpoints)
-    out = tmp_path / "m.safetensors"
-    arguments = ["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--insert", INSERT]
-    assert main([*arguments, "--out", str(out)]) == 1
-    assert json.loads(capsys.readouterr().out)["error"]["code"] == "other_publisher"
-    assert fake_daemon.commands == ["status"]
-
-
-def test_an_unknown_insert_is_refused_before_anything_moves(fake_daemon, tmp_path, capsys):
-    out = tmp_path / "m.safetensors"
-    arguments = ["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--insert", "MRE-99-99"]
-    assert main([*arguments, "--out", str(out)]) == 1
-    assert "MRE-99-99" in json.loads(capsys.readouterr().out)["error"]["message"]
-    assert fake_daemon.commands == []
+    arguments = ["--endpoint", fake_daemon.control, "--json", "calibrate", "--yes", "--insert", name]
+    assert main([*arguments, "--out", str(tmp_path / "m.safetensors")]) == 1
+    assert told[1] in json.loads(capsys.readouterr().out)["error"][told[0]]
+    assert fake_daemon.commands == asked
 
 
 def test_a_refused_fit_is_the_commands_refusal(tmp_path):

@@ -82,6 +82,11 @@ def test_what_the_daemon_says_reaches_no_terminal_raw(client, fake_daemon):
         {"ok": False},
         {"ok": True, "result": {}, "id": None},
         {"ok": True, "result": {}, "error": {"code": "busy", "message": "", "hint": ""}},
+        {"ok": "perhaps"},
+        {"ok": True, "result": None},
+        {"ok": True, "result": [1]},
+        {"ok": False, "error": {"code": "a"}},
+        {"ok": True, "result": {"operating_state": "PAUSED" * 1_000}},
     ],
 )
 def test_an_answer_that_says_neither_is_none(client, fake_daemon, reply):

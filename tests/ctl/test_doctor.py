@@ -271,12 +271,3 @@ def test_what_others_took_is_the_difference_of_two_looks(good):
     assert headroom.shares(before, Machine(good).taken(), 5.0) == (pytest.approx(0.05), pytest.approx(0.1))
     (good / "proc/pressure/cpu").unlink()
     assert headroom.shares(before, Machine(good).taken(), 5.0)[1] is None
-
-
-def test_what_cannot_be_measured_says_why(tmp_path, capsys):
-    path = tmp_path / "unfit.toml"
-    path.write_text('scene = "nowhere"\n')
-    assert main(["--config", str(path), "--json", "doctor", "--measure"]) == 1
-    error = json.loads(capsys.readouterr().out)["error"]
-    assert error["code"] == "not_measured"
-    assert "nowhere" in error["message"]

@@ -7,9 +7,9 @@ from typing import Any, get_args, get_type_hints
 import msgspec
 import pytest
 
-from tormagd.ctl.firmware import firmware_text
 from tormagd.ctl.main import main
 from tormagd.ctl.outcome import Colour
+from tormagd.ctl.status import firmware_text
 from tormagd_client.messages import LinkReport
 
 

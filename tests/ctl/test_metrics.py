@@ -59,23 +59,29 @@ def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return capsys.readouterr().out
 
 
+SHOWN: list[tuple[str, dict[str, str], Any]] = [
+    ("up", {}, 1.0),
+    ("force_measured_newtons", {}, 1.49),
+    ("gap_meters", {}, pytest.approx(0.07)),
+    ("field_teslas", {}, pytest.approx(0.12)),
+    ("operating_state", {"tormag_operating_state": "ENABLED"}, 1.0),
+    ("operating_state", {"tormag_operating_state": "FAULT"}, 0.0),
+    ("fault", {"code": "SKEW"}, 1.0),
+    ("limit", {"code": "RATE"}, 1.0),
+    ("loop_stalls", {"loop": "control"}, 3.0),
+    ("loop_lateness_seconds", {"loop": "control", "percentile": "p99"}, pytest.approx(304e-6)),
+    ("late_ticks", {"culprit": "kernel"}, 2.0),
+    ("link_round_trip_seconds", {"percentile": "p50"}, pytest.approx(402.5e-6)),
+    ("setpoints_accepted", {}, 3.0),
+    # a name with a quote, a backslash and a line's end comes as one label: printable, as everything that a daemon says
+    ("source_lost", {"source": '"\\\\n'}, 3.0),
+]
+
+
 def test_the_status_is_there_in_base_units(full: Any, capsys: pytest.CaptureFixture[str]) -> None:
     families = read(printed(capsys, full.control))
-    assert value(families, "tormag_up") == 1.0
-    assert value(families, "tormag_force_measured_newtons") == 1.49
-    assert value(families, "tormag_gap_meters") == pytest.approx(0.07)
-    assert value(families, "tormag_field_teslas") == pytest.approx(0.12)
-    assert value(families, "tormag_operating_state", tormag_operating_state="ENABLED") == 1.0
-    assert value(families, "tormag_operating_state", tormag_operating_state="FAULT") == 0.0
-    assert value(families, "tormag_fault", code="SKEW") == 1.0
-    assert value(families, "tormag_limit", code="RATE") == 1.0
-    assert value(families, "tormag_loop_stalls", loop="control") == 3.0
-    assert value(families, "tormag_loop_lateness_seconds", loop="control", percentile="p99") == pytest.approx(304e-6)
-    assert value(families, "tormag_late_ticks", culprit="kernel") == 2.0
-    assert value(families, "tormag_link_round_trip_seconds", percentile="p50") == pytest.approx(402.5e-6)
-    assert value(families, "tormag_setpoints_accepted") == 3.0
-    # a name with a quote, a backslash and a line's end comes as one label: printable, as everything that a daemon says
-    assert value(families, "tormag_source_lost", source='"\\\\n') == 3.0
+    for name, labels, expected in SHOWN:
+        assert value(families, f"tormag_{name}", **labels) == expected, name
 
 
 def test_names_and_types_keep_to_the_conventions(full: Any, capsys: pytest.CaptureFixture[str]) -> None:

@@ -48,19 +48,24 @@ def test_whatever_is_written_is_printable_and_json_stays_json(text: str) -> None
     assert json.loads(stream.getvalue()) == {"said": text}
 
 
-def test_our_own_colours_and_lines_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
 
+
+def test_our_own_colours_and_lines_stay_on_a_terminal_that_wants_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.delenv("NO_COLOR", raising=False)
     stream = Terminal()
     colour = Colour(stream)
+    assert colour.red("x") == "\x1b[31mx\x1b[0m"
     text = "\n".join(paint("x") for paint in (colour.red, colour.green, colour.yellow, colour.bold))
     write_line(text, stream)
     assert stream.getvalue() == text + "\n"
-    assert "\x1b" in text
+    for name, value in (("NO_COLOR", "1"), ("TERM", "dumb")):
+        with monkeypatch.context() as other:
+            other.setenv(name, value)
+            assert Colour(stream).red("x") == "x"
 
 
 @pytest.mark.parametrize("command", ["status", "firmware"])

@@ -13,8 +13,7 @@ import pytest
 from hypothesis import given, strategies as st
 from rich.console import Console
 
-from tormagd.ctl.sparkline import EIGHTHS, columns, span, sparkline
-from tormagd.ctl.top_screen import CURVES, Seen, screen
+from tormagd.ctl.top_screen import CURVES, EIGHTHS, Seen, columns, screen, span, sparkline
 from tormagd_client.messages import Explained, Status
 
 SIZES = ((80, 24), (160, 50))

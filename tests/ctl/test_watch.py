@@ -8,6 +8,7 @@ import msgspec
 import pytest
 
 from tormagd.ctl.main import main
+from tormagd.ctl.outcome import CommandError
 from tormagd.ctl.watch import held_back
 from tormagd_client.messages import Status
 
@@ -54,10 +55,11 @@ def test_setpoints_that_are_taken_while_enabled_are_rendered(seen):
     ],
 )
 def test_what_holds_a_force_back_is_named_with_its_remedy(seen, source, changes, code, exit_code, said, hint):
-    held = held_back(seen(source, **changes), "me")
-    assert (held.code, held.exit_code) == (code, exit_code)
-    assert said in held.message
-    assert hint in held.hint
+    with pytest.raises(CommandError) as held:
+        raise held_back(seen(source, **changes), "me") or AssertionError("rendered")
+    assert (held.value.code, held.value.exit_code) == (code, exit_code)
+    assert said in held.value.message
+    assert hint in held.value.hint
 
 
 def test_when_sending_is_over_the_newest_may_be_stale(seen):

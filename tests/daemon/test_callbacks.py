@@ -61,23 +61,28 @@ def test_the_callback_that_ran_into_the_tick_is_named(loop: Loop, callbacks: Cal
     assert callbacks.blamed == {"Slow.receive": 1}
 
 
-def test_what_a_callback_took_before_the_tick_was_due_does_not_count(loop: Loop, callbacks: Callbacks) -> None:
-    callbacks.ran("long, but before", 0, 9 * MS)
-    callbacks.ran("short", 10 * MS, 11 * MS)
-    callbacks.ran("tick", 11 * MS, 13 * MS)
-    assert callbacks.blame(10 * MS, 13 * MS) == Delay(3 * MS, "tick", 2 * MS)
+RUNS: dict[str, tuple[list[tuple[str, int, int]], int, Delay]] = {
+    "what a callback took before the tick was due does not count": (
+        [("long, but before", 0, 9), ("short", 10, 11), ("tick", 11, 13)],
+        13,
+        Delay(3 * MS, "tick", 2 * MS),
+    ),
+    "many short runs of one callback add up": (
+        [("often", start, start + 1) for start in range(10, 18, 2)] + [("once", 18, 21)],
+        21,
+        Delay(11 * MS, "often", 4 * MS),
+    ),
+    "where nothing of ours ran it was the kernel": ([("tick", 14, 15)], 15, Delay(5 * MS, KERNEL, 4 * MS)),
+}
 
 
-def test_many_short_runs_of_one_callback_add_up(loop: Loop, callbacks: Callbacks) -> None:
-    for start in range(10, 18, 2):
-        callbacks.ran("often", start * MS, (start + 1) * MS)
-    callbacks.ran("once", 18 * MS, 21 * MS)
-    assert callbacks.blame(10 * MS, 21 * MS) == Delay(11 * MS, "often", 4 * MS)
-
-
-def test_where_nothing_of_ours_ran_it_was_the_kernel(loop: Loop, callbacks: Callbacks) -> None:
-    callbacks.ran("tick", 14 * MS, 15 * MS)
-    assert callbacks.blame(10 * MS, 15 * MS) == Delay(5 * MS, KERNEL, 4 * MS)
+@pytest.mark.parametrize(("runs", "done", "delay"), RUNS.values(), ids=RUNS)
+def test_who_is_to_blame_for_a_tick_that_was_due_at_10_ms(
+    callbacks: Callbacks, runs: list[tuple[str, int, int]], done: int, delay: Delay
+) -> None:
+    for name, begun, ended in runs:
+        callbacks.ran(name, begun * MS, ended * MS)
+    assert callbacks.blame(10 * MS, done * MS) == delay
 
 
 def test_a_callback_in_whose_midst_the_thread_was_stopped_is_not_to_blame(loop: Loop) -> None:

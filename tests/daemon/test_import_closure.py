@@ -25,6 +25,7 @@ ROOMS = {
     "keeping",
     "keys",
     "model",
+    "named_file",
     "output",
     "physics",
     "safety",
@@ -43,6 +44,7 @@ LIBRARIES = (
     "safetensors",
     "scipy",
     "serial",
+    "sklearn",
     "torch",
     "zmq",
 )
@@ -76,7 +78,6 @@ def test_the_daemon_loads_the_model_and_nothing_of_its_training() -> None:
         "tormagd.inverse.choice",
         "tormagd.inverse.nearest",
         "tormagd.inverse.newton",
-        "tormagd.inverse.scan",
         "tormagd.inverse.solution",
     }
     assert libraries.split() == ["can", "msgpack", "msgspec", "numpy", "safetensors", "serial", "zmq"]

@@ -1,5 +1,4 @@
 import msgspec
-import pytest
 
 from tormagd.config import Config, checked
 from tormagd.daemon.reload import LIVE, reread
@@ -10,6 +9,7 @@ RUNNING = Config()
 def test_what_only_a_loop_looks_at_is_taken_over():
     read = checked({"sources": {"priority": ["robot"]}, "realtime": {"watchdog_ms": 800.0}}, Config)
     again = reread(RUNNING, read)
+    assert set(again.taken) == set(LIVE), "a key in the list that is not carried over would be told as in force"
     assert again == (read, ("realtime.watchdog_ms", "sources.priority"), ())
 
 
@@ -42,13 +42,3 @@ def test_what_something_was_built_from_is_named_and_stays():
 
 def test_the_same_is_no_news():
     assert reread(RUNNING, Config()) == (RUNNING, (), ())
-
-
-@pytest.mark.parametrize("key", sorted(LIVE))
-def test_every_key_that_is_said_to_change_does(key):
-    """A key in the list that is not carried over would be told as in force and be forgotten."""
-    values = {"sources.priority": ("robot",), "realtime.watchdog_ms": 800.0}
-    table, name = key.split(".")
-    again = reread(RUNNING, checked({table: {name: values[key]}}, Config))
-    assert again.taken == (key,)
-    assert msgspec.to_builtins(again.config)[table][name] == values[key]

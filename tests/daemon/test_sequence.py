@@ -1,6 +1,7 @@
 """What is newer, what is a restart, what is neither: no number keeps a publisher out."""
 
 from itertools import pairwise
+from typing import NamedTuple
 
 import pytest
 from hypothesis import given, strategies as st
@@ -10,72 +11,102 @@ from tormagd.daemon.sequence import LONGEST_JUMP, RUN, STRAYS_S, Order, Sequence
 NEWER, RESTARTED, REPLACED, STRAY = Order.NEWER, Order.RESTARTED, Order.REPLACED, Order.STRAY
 
 
-def orders(sequence: Sequence, numbers: list[int], session: int | None = None, *, is_over: bool = False) -> list[Order]:
-    return [sequence.order(0.0, session, number, is_over=is_over) for number in numbers]
+class Part(NamedTuple):
+    """Some messages of a stream, and what each has to be taken for."""
+
+    numbers: list[int]
+    orders: list[Order]
+    session: int | None = None
+    is_over: bool = False
 
 
-def test_what_grows_is_newer_and_what_does_not_is_not_taken() -> None:
-    sequence = Sequence(None, 5)
-    assert orders(sequence, [6, 7, 7, 5, 7, 8]) == [NEWER, NEWER, STRAY, STRAY, STRAY, NEWER]
-    assert (sequence.seq, sequence.lost, sequence.restarts) == (8, 0, 0)
+FAR = 1 + 3 * LONGEST_JUMP
+LAST = 2**63 - 1
+Start = tuple[int | None, int]
+STREAMS: dict[str, tuple[Start, list[Part], dict[str, int]]] = {
+    "what grows is newer and what does not is not taken": (
+        (None, 5),
+        [Part([6, 7, 7, 5, 7, 8], [NEWER, NEWER, STRAY, STRAY, STRAY, NEWER])],
+        {"seq": 8, "lost": 0, "restarts": 0},
+    ),
+    "losses are counted where the publisher counts by ones": (
+        (None, 0),
+        [Part([1, 2, 5, 6, 16], [NEWER] * 5)],
+        {"lost": 2 + 9},
+    ),
+    "and not where it counts in nanoseconds": (
+        (None, 0),
+        [Part([2_000_000, 4_100_000, 5_900_000, 9_900_000], [NEWER] * 4)],
+        {"seq": 9_900_000, "lost": 0},
+    ),
+    "a higher session starts anew at once": (
+        (7, 1_000),
+        [
+            Part([0, 1, 2], [RESTARTED, NEWER, NEWER], 8),
+            # what the one before has left on the way is not taken any more
+            Part([1_001, 1_002], [STRAY, STRAY], 7),
+            Part([3], [NEWER], 8),
+        ],
+        {"session": 8, "seq": 3, "restarts": 1},
+    ),
+    "a publisher without session that starts at 0 is heard after some messages": (
+        (None, 1_000),
+        [Part([0, 1, 2, 3], [STRAY, STRAY, REPLACED, NEWER])],
+        {"restarts": 1},
+    ),
+    "and at once where what came before is not valid any more": (
+        (None, 1_000),
+        [Part([0, 0], [REPLACED, STRAY], is_over=True)],
+        {},
+    ),
+    **{
+        f"no number locks a source out, as {wrong}": (
+            (None, 0),
+            # one wrong message in a stream is no more than that; nothing of the stream is lost
+            [Part([1, 2, wrong, 3, 4], [NEWER, NEWER, STRAY, NEWER, NEWER])],
+            {},
+        )
+        for wrong in (LAST, 10_000_000)
+    },
+    **{
+        f"nor as the second message, where it cannot be told from a publisher that counts so, as {wrong}": (
+            (None, 0),
+            [Part([wrong, 1, 2, 3, 4], [NEWER, STRAY, STRAY, REPLACED, NEWER])],
+            {},
+        )
+        for wrong in (LAST, 10_000_000)
+    },
+    **{
+        f"nor as the first, as {wrong}": (
+            (None, wrong),
+            [Part([1, 2, 3, 4], [STRAY, STRAY, REPLACED, NEWER])],
+            {},
+        )
+        for wrong in (LAST, 10_000_000)
+    },
+    "no session locks a source out": (
+        (1, 10),
+        [Part([0], [RESTARTED], LAST), Part([11, 12, 13, 14], [STRAY, STRAY, REPLACED, NEWER], 1)],
+        {},
+    ),
+    "more missing than a loss can be is another run": (
+        (None, 0),
+        [
+            Part([1, 1 + LONGEST_JUMP], [NEWER, NEWER]),
+            Part([FAR, FAR + 1, FAR + 2], [STRAY, STRAY, REPLACED]),
+            Part([2 * FAR], [NEWER], is_over=True),
+        ],
+        {},
+    ),
+}
 
 
-def test_losses_are_counted_where_the_publisher_counts_by_ones() -> None:
-    sequence = Sequence(None, 0)
-    orders(sequence, [1, 2, 5, 6, 16])
-    assert sequence.lost == 2 + 9
-    in_ns = Sequence(None, 0)
-    orders(in_ns, [2_000_000, 4_100_000, 5_900_000, 9_900_000])
-    assert (in_ns.seq, in_ns.lost) == (9_900_000, 0)
-
-
-def test_a_higher_session_starts_anew_at_once() -> None:
-    sequence = Sequence(7, 1_000)
-    assert orders(sequence, [0, 1, 2], session=8) == [RESTARTED, NEWER, NEWER]
-    # what the one before has left on the way is not taken any more
-    assert orders(sequence, [1_001, 1_002], session=7) == [STRAY, STRAY]
-    assert orders(sequence, [3], session=8) == [NEWER]
-    assert (sequence.session, sequence.seq, sequence.restarts) == (8, 3, 1)
-
-
-def test_a_publisher_without_session_that_starts_at_0_is_heard_after_some_messages() -> None:
-    sequence = Sequence(None, 1_000)
-    assert orders(sequence, [0, 1, 2, 3]) == [STRAY, STRAY, REPLACED, NEWER]
-    assert sequence.restarts == 1
-
-
-def test_it_is_heard_at_once_where_what_came_before_is_not_valid_any_more() -> None:
-    sequence = Sequence(None, 1_000)
-    assert orders(sequence, [0], is_over=True) == [REPLACED]
-    assert orders(sequence, [0], is_over=True) == [STRAY]
-
-
-@pytest.mark.parametrize("wrong", [2**63 - 1, 10_000_000])
-def test_no_number_locks_a_source_out(wrong: int) -> None:
-    """One wrong message in a stream is no more than that; nothing of the stream is lost."""
-    sequence = Sequence(None, 0)
-    assert orders(sequence, [1, 2, wrong, 3, 4]) == [NEWER, NEWER, STRAY, NEWER, NEWER]
-    # as the second message it cannot be told from a publisher that counts so
-    sequence = Sequence(None, 0)
-    assert orders(sequence, [wrong, 1, 2, 3, 4]) == [NEWER, STRAY, STRAY, REPLACED, NEWER]
-    # and as the first not either
-    sequence = Sequence(None, wrong)
-    assert orders(sequence, [1, 2, 3, 4]) == [STRAY, STRAY, REPLACED, NEWER]
-
-
-def test_no_session_locks_a_source_out() -> None:
-    sequence = Sequence(1, 10)
-    assert orders(sequence, [0], session=2**63 - 1) == [RESTARTED]
-    assert orders(sequence, [11, 12, 13, 14], session=1) == [STRAY, STRAY, REPLACED, NEWER]
-
-
-def test_more_missing_than_a_loss_can_be_is_another_run() -> None:
-    sequence = Sequence(None, 0)
-    orders(sequence, [1])
-    assert orders(sequence, [1 + LONGEST_JUMP]) == [NEWER]
-    far = 1 + 3 * LONGEST_JUMP
-    assert orders(sequence, [far, far + 1, far + 2]) == [STRAY, STRAY, REPLACED]
-    assert orders(sequence, [2 * far], is_over=True) == [NEWER]
+@pytest.mark.parametrize(("start", "parts", "known"), STREAMS.values(), ids=STREAMS)
+def test_what_the_messages_of_a_stream_are_taken_for(start: Start, parts: list[Part], known: dict[str, int]) -> None:
+    sequence = Sequence(*start)
+    for numbers, orders, session, is_over in parts:
+        assert [sequence.order(0.0, session, number, is_over=is_over) for number in numbers] == orders
+    assert {name: getattr(sequence, name) for name in known} == known
 
 
 @pytest.mark.parametrize("sessions", [(None, None), (1, 1), (1, 2), (2, 1)])

@@ -18,11 +18,6 @@ def ready() -> Service:
     return service
 
 
-def is_fed(service: Service, now_s: float, link: LinkState, received_s: float | None = None) -> bool:
-    alive = service.is_alive(now_s, LIMIT_S, now_s, link, received_s)
-    return "WATCHDOG=1" in service.news(now_s, alive, link, "up")
-
-
 def test_ready_is_said_once_and_only_when_the_device_is_identified():
     service = Service()
     for link in (*ABSENT, *SILENT, LinkState.REFUSED):
@@ -46,31 +41,48 @@ def test_a_status_is_said_when_it_changes():
     assert service.news(2.0, False, LinkState.RUNNING, "FAULT") == ["STATUS=FAULT"]
 
 
-@pytest.mark.parametrize("link", SILENT)
-def test_a_device_that_was_there_and_is_silent_behind_an_open_port_ends_the_feeding(link):
-    service = ready()
-    assert is_fed(service, 0.49, link)
-    assert not is_fed(service, 0.51, link)
-    assert not is_fed(service, 60.0, link)
-    assert is_fed(service, 61.0, LinkState.RUNNING, 61.0)
+TENTHS = [0.1 * tenths for tenths in range(100)]
+Look = tuple[float, LinkState, float | None, bool]
+LOOKS: dict[str, tuple[bool, list[Look]]] = {
+    **{
+        f"a device that was there and is silent behind an open port ends the feeding, {link}": (
+            True,
+            [
+                (0.49, link, None, True),
+                (0.51, link, None, False),
+                (60.0, link, None, False),
+                (61.0, LinkState.RUNNING, 61.0, True),
+            ],
+        )
+        for link in SILENT
+    },
+    **{
+        f"without a port or with a firmware that does not fit there is nothing to start again for, {link}": (
+            True,
+            [(now_s, link, None, True) for now_s in TENTHS],
+        )
+        for link in (*ABSENT, LinkState.REFUSED)
+    },
+    "a device that never came is waited for": (
+        False,
+        [(now_s, link, None, True) for now_s in TENTHS for link in SILENT],
+    ),
+    **{
+        f"a running link without new states ends the feeding, the last at {received_s}": (
+            True,
+            [(0.4, LinkState.RUNNING, received_s, True), (0.6, LinkState.RUNNING, received_s, False)],
+        )
+        for received_s in (0.0, None)
+    },
+}
 
 
-@pytest.mark.parametrize("link", [*ABSENT, LinkState.REFUSED])
-def test_without_a_port_or_with_a_firmware_that_does_not_fit_there_is_nothing_to_start_again_for(link):
-    service = ready()
-    assert all(is_fed(service, tenths * 0.1, link) for tenths in range(100))
-
-
-def test_a_device_that_never_came_is_waited_for():
-    service = Service()
-    assert all(is_fed(service, tenths * 0.1, link) for tenths in range(100) for link in SILENT)
-
-
-@pytest.mark.parametrize("received_s", [0.0, None])
-def test_a_running_link_without_new_states_ends_the_feeding(received_s):
-    service = ready()
-    assert is_fed(service, 0.4, LinkState.RUNNING, received_s)
-    assert not is_fed(service, 0.6, LinkState.RUNNING, received_s)
+@pytest.mark.parametrize(("was_there", "looks"), LOOKS.values(), ids=LOOKS)
+def test_it_is_fed_while_starting_again_would_not_help(was_there: bool, looks: list[Look]):
+    service = ready() if was_there else Service()
+    for now_s, link, received_s, fed in looks:
+        alive = service.is_alive(now_s, LIMIT_S, now_s, link, received_s)
+        assert ("WATCHDOG=1" in service.news(now_s, alive, link, "up")) == fed, now_s
 
 
 @pytest.mark.parametrize("planned_s", [None, 0.4])

@@ -16,9 +16,10 @@ from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import DeviceRequest, OperatingState, SafetyState
 from tormagd.scenes.scene import load_scene
-from tormagd_client.messages import Telemetry, decode, encode, encode_ticks
+from tormagd_client.messages import BeliefReport, Telemetry, decode, encode, encode_ticks
 
 PLAN = Plan(7, 1.0, 1.5, 0.01, 1.4, 1.38, 500.0, 64.0, -1.0, 0.9, (Limit.RANGE, Limit.SKEW))
+BELIEF = {"scale": BeliefReport(value=1.02, sd=0.04, unit="", acts=True)}
 OUTPUT = Duty(DriveMode.RUN, 0.1, -0.2, DeviceRequest.NONE, 0, (Limit.SKEW, Limit.RATE))
 MEASUREMENT = Measurement(
     number=1,
@@ -57,12 +58,13 @@ def telemetry(
     stepper.move.reference = reference
     tick = tick_record(stepper, OUTPUT, PLAN, measurement, 20.0, 150.0)
     is_homed = stepper.measured is not None and stepper.measured.is_homed
-    return decode(encode(snapshot(tick, 3, is_homed, is_busy, 0.012)), Telemetry)
+    return decode(encode(snapshot(tick, 3, is_homed, is_busy, 0.012, BELIEF)), Telemetry)
 
 
 def test_a_driven_device() -> None:
     published = telemetry(MEASUREMENT, SafetyState(OperatingState.ENABLED), Reference(64.2))
     assert published.measured_jp == (32.5, 32.0)
+    assert published.belief == BELIEF
     assert (published.gap_mm, published.skew_mm, published.gap_setpoint_mm) == (64.5, 0.5, 64.2)
     assert (published.setpoint_cf, published.governed_cf, published.predicted_cf, published.measured_cf) == (
         1.5,

@@ -50,6 +50,8 @@ def test_the_configuration_knows_what_an_exchange_takes_of_a_bus() -> None:
     each_tick = {message.name for message in database.messages if message.cycle_time == 1}
     layouts = [layout for layout in LAYOUTS if layout.message.__name__ in each_tick]
     assert len(layouts) == len(each_tick) == 3
-    assert sum(most_bits(struct.calcsize(layout.format)) for layout in layouts) == EXCHANGE_BITS
-    fullest = sum(fullest_bits(layout, node=0) for layout in layouts)
-    assert 0.95 * EXCHANGE_BITS < fullest <= EXCHANGE_BITS
+    most = [most_bits(struct.calcsize(layout.format)) for layout in layouts]
+    assert sum(most) == EXCHANGE_BITS
+    fullest = [fullest_bits(layout, node=0) for layout in layouts]
+    assert sum(fullest) > 0.95 * EXCHANGE_BITS
+    assert all(bits <= bound for bits, bound in zip(fullest, most, strict=True))

@@ -1,7 +1,5 @@
 """The search of a scene: by name, or Newton's method, which no measured scene has a reason to leave."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import msgspec
@@ -80,11 +78,3 @@ def test_a_scene_whose_search_cannot_be_is_refused(tmp_path: Path, table: str, w
     with pytest.raises(ConfigError) as caught:
         build_core(Config(scene=str(path)))
     assert all(word in str(caught.value) for word in words)
-
-
-def test_what_trains_and_what_is_for_the_laboratory_stays_out_of_the_daemon() -> None:
-    """torch takes seconds to load, and the searches that the daemon may run know nothing but a curve."""
-    loaded = "import sys, tormagd.assembly.build, tormagd.inverse.choice; print(*sys.modules)"
-    found = subprocess.run([sys.executable, "-c", loaded], check=True, capture_output=True, text=True).stdout.split()
-    assert "tormagd.inverse.newton" in found
-    assert not {"torch", "scipy", "sklearn", "matplotlib"} & set(found)

@@ -20,8 +20,9 @@ from tormagd.lab.characterisation.constitutive import (
     stretches,
     total_energy_J_m3,
 )
+from tormagd.lab.design.force_law import stretch_minus_one
 from tormagd.physics.errors import DomainError
-from tormagd.physics.force import MU0_H_M, TORMAG, Elastomer, brake_force_N, stretch_minus_one
+from tormagd.physics.force import MU0_H_M, TORMAG, Elastomer, brake_force_N
 
 MATERIAL = MooneyRivlin(c10_Pa=90e3, c01_Pa=48.65e3, relative_permeability=4.0)
 stretch_values = st.floats(0.3, 3.0)

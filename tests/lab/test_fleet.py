@@ -60,7 +60,7 @@ def test_dask_workers_find_what_is_found_one_by_one(folder, scheduler, capsys, t
     for name, where in (("one.parquet", ["--workers", "1"]), ("dask.parquet", ["--dask", scheduler])):
         assert main(["fleet", str(folder), "--json", "--out", str(tmp_path / name), *where]) == 1
         out, err = capsys.readouterr()
-        assert "left out 2/torn.mcap: not an intact MCAP recording" in err
+        assert "left out 2/torn.mcap: not an intact MCAP file" in err
         assert "left out pipe.mcap: it is no regular file" in err
         said.append((json.loads(out), pyarrow.parquet.read_table(tmp_path / name)))
     assert said[0] == said[1]

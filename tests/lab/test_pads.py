@@ -5,8 +5,7 @@ import pytest
 
 from tormagd.lab.tactile.pads import FIELDS_MT, PADS, cyclic_records, drawn_pad, holding_records
 from tormagd.physics.errors import DomainError
-from tormagd.simulation.pad import cycling_program, worked_pad
-from tormagd.simulation.tactile_pad import TactilePad
+from tormagd.simulation.tactile_pad import TactilePad, cycling_program, worked_pad
 
 AREA_M2 = np.pi / 4 * 0.030**2
 

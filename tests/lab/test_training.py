@@ -8,8 +8,8 @@ import torch
 from torch.func import functional_call, jacrev
 
 from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.fitting import scaling_of
 from tormagd.lab.training.levenberg_marquardt import Epoch, jacobian, train
-from tormagd.model.features import Scaling
 from tormagd.model.network import ForceNetwork
 from tormagd.physics.errors import DomainError
 
@@ -28,7 +28,7 @@ def synthetic(rows: int, seed: int, noise_N: float = NOISE_N) -> Dataset:
 
 
 def network_for(data: Dataset, hidden: int = 10, seed: int = 0) -> ForceNetwork:
-    return ForceNetwork(Scaling.fit(data.features, data.force_N), hidden, seed=seed)
+    return ForceNetwork(scaling_of(data), hidden, seed=seed)
 
 
 def test_the_jacobian_is_that_of_automatic_differentiation() -> None:
@@ -118,7 +118,7 @@ def test_scaling_maps_the_ranges_onto_minus_one_to_one() -> None:
 def test_what_cannot_be_trained_is_refused() -> None:
     data = synthetic(50, 1)
     with pytest.raises(DomainError, match="force_N"):
-        Scaling.fit(data.features, np.ones(50))
+        scaling_of(Dataset(data.features, np.ones(50)))
     with pytest.raises(DomainError, match="hidden"):
         network_for(data, hidden=0)
     for wrong in ({"epochs": 0}, {"patience": 0}):

@@ -14,7 +14,6 @@ from tormagd.model.force_curve import LARGEST_EXPONENT, Known, Network
 from tormagd.model.model_file import ForceModel, load_model
 from tormagd.model.network import to_network
 from tormagd.model.shipped import model_path
-from tormagd.physics.errors import DomainError
 
 BOX = ((0.0, 0.0, 100.0, 40.0), (1.0, 60.0, 800.0, 40.0))
 Array = np.ndarray
@@ -95,15 +94,6 @@ def test_its_state_is_the_one_asked_for(model: ForceModel) -> None:
     )
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
-@pytest.mark.parametrize("place", range(3))
-def test_a_state_that_is_no_number_is_refused_by_name(model: ForceModel, value: float, place: int) -> None:
-    state = [0.3, 12.0, 40.0]
-    state[place] = value
-    with pytest.raises(DomainError, match=("displacement_mm", "rate_mm_s", "cip_percent")[place]):
-        model.curve(*state)
-
-
 @pytest.mark.parametrize("exponent", [LARGEST_EXPONENT, 709.7, 710.0, 1e4, 1e18])
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_unit_far_from_its_step_is_shut_or_open(exponent: float, side: int) -> None:
@@ -134,20 +124,24 @@ def test_no_state_and_no_field_has_no_force(
     assert 0.0 <= curve.confidence(field, force) <= 1.0
 
 
-def test_confidence_follows_its_formula(model: ForceModel) -> None:
+@pytest.mark.parametrize(
+    ("place", "error_N", "expected"),
+    [
+        ((0.5, 10.0, 400.0, 40.0), 0.0, 1.0),
+        ((0.5, 10.0, 400.0, 40.0), 0.3, pytest.approx(math.exp(-20 * 0.3 / 5.6))),
+        ((1.25, 10.0, 400.0, 40.0), 0.0, pytest.approx(math.exp(-1))),
+        ((-0.25, 75.0, 400.0, 40.0), 0.0, pytest.approx(math.exp(-2))),
+        ((0.5, 10.0, 975.0, 40.0), 0.0, pytest.approx(math.exp(-1))),
+        ((0.5, 10.0, -75.0, 40.0), 0.0, pytest.approx(math.exp(-1))),
+        ((0.5, 10.0, 400.0, 50.0), 0.0, pytest.approx(math.exp(-1))),
+        ((LARGEST, 10.0, 400.0, 40.0), LARGEST, 0.0),
+    ],
+)
+def test_confidence_follows_its_formula(
+    model: ForceModel, place: tuple[float, float, float, float], error_N: float, expected: float
+) -> None:
     """The model's force span is 5.6 N; its share of iron never varied."""
-
-    def confidence(place: tuple[float, float, float, float], error_N: float) -> float:
-        displacement, rate, field, cip = place
-        return model.curve(displacement, rate, cip).confidence(field, error_N)
-
-    inside = (0.5, 10.0, 400.0, 40.0)
-    assert confidence(inside, 0.0) == 1.0
-    assert confidence(inside, 0.3) == pytest.approx(math.exp(-20 * 0.3 / 5.6))
-    assert confidence(inside, -0.3) == confidence(inside, 0.3)
-    assert confidence((1.25, 10.0, 400.0, 40.0), 0.0) == pytest.approx(math.exp(-1))
-    assert confidence((-0.25, 75.0, 400.0, 40.0), 0.0) == pytest.approx(math.exp(-2))
-    assert confidence((0.5, 10.0, 975.0, 40.0), 0.0) == pytest.approx(math.exp(-1))
-    assert confidence((0.5, 10.0, -75.0, 40.0), 0.0) == pytest.approx(math.exp(-1))
-    assert confidence((0.5, 10.0, 400.0, 50.0), 0.0) == pytest.approx(math.exp(-1))
-    assert confidence((LARGEST, 10.0, 400.0, 40.0), LARGEST) == 0.0
+    displacement, rate, field, cip = place
+    curve = model.curve(displacement, rate, cip)
+    assert curve.confidence(field, error_N) == expected
+    assert curve.confidence(field, -error_N) == curve.confidence(field, error_N)

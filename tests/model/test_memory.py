@@ -14,7 +14,7 @@ from tormagd.control.records import Handle, Measured
 from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory
 from tormagd.model.displacement import Turn
 from tormagd.model.memory import NO_MEMORY, Memory
-from tormagd.model.model_file import ModelFileError, load_model, save_model
+from tormagd.model.model_file import load_model, save_model
 from tormagd.model.shipped import model_path
 from tormagd.physics.errors import DomainError
 
@@ -48,11 +48,6 @@ def test_memory_survives_its_file_and_is_part_of_the_fingerprint(tmp_path: Path)
     assert again.fingerprint == model.fingerprint
     forgetful = dataclasses.replace(model, metadata=msgspec.structs.replace(model.metadata, memory=NO_MEMORY))
     assert forgetful.fingerprint != model.fingerprint
-
-
-def test_a_pads_model_is_not_a_brakes() -> None:
-    with pytest.raises(ModelFileError, match="trained on the tactile element, but the torque element is in use"):
-        load_model(model_path("tactile_mre_c", HERE), element="torque")
 
 
 @pytest.mark.parametrize("fractions", [(0.6, 0.6), (0.1,), (-0.1, 0.1)])

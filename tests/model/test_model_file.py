@@ -1,6 +1,5 @@
 """Model files: the same bytes again, the same force again, and a refusal of everything else."""
 
-import datetime
 import json
 import struct
 from collections.abc import Callable
@@ -16,13 +15,12 @@ from hypothesis import given, strategies as st
 from safetensors import safe_open
 
 from tormagd.lab.training.dataset import Dataset
-from tormagd.lab.training.metrics import fit_metrics
+from tormagd.lab.training.metrics import fit_metrics, not_rising_share
 from tormagd.model import model_file
-from tormagd.model.features import FEATURES, LARGEST, UNITS, Element, Scaling
+from tormagd.model.features import FEATURES, LARGEST, UNITS, Element
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelFileError, ModelMetadata, load_model, save_model
 from tormagd.model.network import to_model, to_network
-from tormagd.model.rising import not_rising_share
 from tormagd.physics.errors import DomainError
 
 POINT = (0.3, 12.0, 420.0, 40.0)
@@ -122,8 +120,8 @@ def test_a_flipped_bit_anywhere_is_refused(saved: Path) -> None:
             "output_gain",
         ),
         ("metrics", {"r2": "good"}, "metrics"),
-        ("memory", {"fractions": [0.5], "times_s": []}, r"memory\.times_s"),
-        ("memory", {"fractions": [0.5, 0.6], "times_s": [1.0, 2.0]}, r"memory\.fractions"),
+        ("memory", {"fractions": [0.5], "times_s": []}, r"times_s = .* at `\$\.memory"),
+        ("memory", {"fractions": [0.5, 0.6], "times_s": [1.0, 2.0]}, r"fractions = .* at `\$\.memory"),
         ("memory", {"fractions": [0.1, 0.1], "times_s": [2.0, 1.0]}, r"memory\.times_s"),
         ("memory", {"lag_mT": 5.0, "turn_mT": 19.0}, r"memory\.lag_mT"),
         ("memory", {"lag_mT": -1.0}, r"memory\.lag_mT"),
@@ -252,17 +250,6 @@ def test_a_model_is_checked_when_it_is_made(model: ForceModel, metadata: ModelMe
         model.hidden_weight[0, 0] = 1.0
 
 
-def test_the_arrays_path_the_scalar_path_and_torch_agree(model: ForceModel) -> None:
-    rng = np.random.default_rng(2)
-    rows = rng.uniform((-1, -60, 0, 0), (2, 120, 1500, 100), (200, 4))
-    forces = model.predict(rows)
-    assert forces.shape == (200,)
-    scalar = [model.predict_one(*row) for row in rows.tolist()]
-    np.testing.assert_allclose(forces, scalar, rtol=1e-12, atol=1e-12)
-    with torch.no_grad():
-        np.testing.assert_allclose(forces, to_network(model)(torch.tensor(rows)).numpy(), rtol=1e-12, atol=1e-12)
-
-
 def test_a_network_survives_freezing(model: ForceModel) -> None:
     again = to_model(to_network(model), model.metadata)
     np.testing.assert_array_equal(again.hidden_weight, model.hidden_weight)
@@ -292,13 +279,6 @@ def test_features_of_another_shape_are_refused(model: ForceModel, shape: tuple[i
         model.predict(np.zeros(shape))
 
 
-@given(st.tuples(*[st.floats(-LARGEST, LARGEST)] * 4))
-def test_any_finite_input_gives_a_finite_force(point: tuple[float, float, float, float]) -> None:
-    model = STEEP
-    bound = abs(model.physical.output_bias) + float(np.abs(model.physical.output_weight).sum())
-    assert abs(model.predict_one(*point)) <= bound * (1 + 1e-12)
-
-
 def test_metrics_of_a_known_error(model: ForceModel) -> None:
     rows = np.random.default_rng(3).uniform((0, 0, 100, 40), (1, 60, 800, 40.0001), (300, 4))
     signs = np.where(np.arange(300) % 2, 0.5, -0.5)
@@ -323,23 +303,3 @@ def test_not_rising_counts_where_the_force_falls_with_the_field(metadata: ModelM
     hill[:2, 2] = 8.0, -8.0  # rises at -0.5, falls at +0.5 in scaled units
     bump = ForceModel(metadata, hill, np.array([4.0, 4, 0, 0, 0, 0]), np.array([1.0, 1, 0, 0, 0, 0]), 0.0)
     assert not_rising_share(bump, points=17) == pytest.approx(9 / 17)
-
-
-def _steep() -> ForceModel:
-    rng = np.random.default_rng(4)
-    ranges = dict.fromkeys(UNITS, (0.0, 1e-3))
-    scaling = Scaling((0.0,) * 4, (2e3,) * 4, 0.0, 2e3)
-    metadata = ModelMetadata(
-        element=Element.TACTILE,
-        insert="pad",
-        hidden=20,
-        ranges=ranges,
-        scaling=scaling,
-        training_data_sha256="0" * 64,
-        metrics={},
-        created=datetime.date(2024, 1, 1),
-    )
-    return ForceModel(metadata, 50 * rng.normal(size=(20, 4)), rng.normal(size=20), rng.normal(size=20), 0.0)
-
-
-STEEP = _steep()

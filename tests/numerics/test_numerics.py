@@ -13,18 +13,11 @@ import pytest
 from extremes import steps
 from hypothesis import given, strategies as st
 
+from tormagd.lab.design.force_law import d_force_d_gap, radial_moment_for_force_Tm, stretch_minus_one
 from tormagd.physics.brake_curve import BrakeCurve
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import PowerFieldLaw
-from tormagd.physics.force import (
-    Elastomer,
-    Geometry,
-    brake_force_N,
-    d_force_d_gap,
-    max_radial_moment_Tm,
-    radial_moment_for_force_Tm,
-    stretch_minus_one,
-)
+from tormagd.physics.force import Elastomer, Geometry, brake_force_N, max_radial_moment_Tm
 
 TOOL = Path(__file__).parents[2] / "tools" / "numerics.py"
 

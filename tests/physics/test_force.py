@@ -10,19 +10,10 @@ import mpmath as mp
 import numpy as np
 import pytest
 
+from tormagd.lab.design.force_law import d_force_d_gap, d_force_d_moment, radial_moment_for_force_Tm, stretch_minus_one
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
-from tormagd.physics.force import (
-    TORMAG,
-    Elastomer,
-    Geometry,
-    brake_force_N,
-    d_force_d_gap,
-    d_force_d_moment,
-    max_radial_moment_Tm,
-    radial_moment_for_force_Tm,
-    stretch_minus_one,
-)
+from tormagd.physics.force import TORMAG, Elastomer, Geometry, brake_force_N, max_radial_moment_Tm
 
 DIGITS = 50
 STIFF = Elastomer(shear_modulus_Pa=277.3e3, relative_permeability=4.0, friction_coefficient=0.2)
@@ -173,7 +164,7 @@ def test_the_inverse_of_arrays(dtype: Any) -> None:
 
 
 def test_the_inverse_needs_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tormagd.physics.brake_curve._NEWTON_STEPS", 10)
+    monkeypatch.setattr("tormagd.lab.design.force_law._NEWTON_STEPS", 10)
     for case in islice(over_loads(7), 500):
         force = brake_force_N(*case)
         assert radial_moment_for_force_Tm(force, case.elastomer, case.geometry) == pytest.approx(case.moment, rel=1e-14)

@@ -1,12 +1,13 @@
 """The twelve inserts against the thesis's tables."""
 
+import msgspec
 import numpy as np
 import pytest
 
 from tormagd.physics.errors import DomainError
 from tormagd.physics.field import ThesisFieldLaw
-from tormagd.physics.force import TORMAG, brake_force_N
-from tormagd.physics.inserts import INSERTS, Insert, insert, relative_permeability
+from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.physics.inserts import INSERTS, Insert, MeasuredForceRange, insert, relative_permeability
 
 
 def modelled_range_N(item: Insert) -> float:
@@ -59,3 +60,25 @@ def test_printed_errors_that_do_not_follow_from_the_printed_ranges() -> None:
 def test_an_unknown_insert_lists_the_known() -> None:
     with pytest.raises(DomainError, match=r"insert = 'MRE-40' is not allowed: one of MRE-10-10, .*MRE-50-40"):
         insert("MRE-40")
+
+
+def test_what_an_insert_states_itself_goes_before_its_matrix_and_eq_5() -> None:
+    own = Insert("X", 50, 0.5, 310.0, relative_permeability=5.1, friction_coefficient=0.3)
+    assert own.elastomer == Elastomer(310e3, 5.1, 0.3)
+    usual = Insert("X", 50, 0.25, 160.0)
+    assert usual.elastomer.relative_permeability == pytest.approx(3.0)
+    assert usual.elastomer.friction_coefficient == insert("MRE-50-10").elastomer.friction_coefficient
+    with pytest.raises(DomainError, match="measured"):
+        _ = usual.force_range
+    with pytest.raises(DomainError, match="estimate_N"):
+        _ = MeasuredForceRange(3.1, 0.1).thesis_estimate_N
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [{"cip_fraction": 0.7}, {"cip_fraction": float("nan")}, {"shear_modulus_kPa": -1.0}, {"name": "a b"}, {"x": 1}],
+)
+def test_what_makes_no_sense_is_refused_by_its_key(odd: dict[str, object]) -> None:
+    row = {"name": "X", "shore_hardness": 50, "cip_fraction": 0.2, "shear_modulus_kPa": 100.0}
+    with pytest.raises(msgspec.ValidationError, match=next(iter(odd))):
+        msgspec.convert(row | odd, Insert)

@@ -3,16 +3,17 @@ import errno
 import json
 import math
 import resource
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import example, given, strategies as st
 from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
 
-from tormagd.recording.closing import close_cut
 from tormagd.recording.plot import figure, save_plot
 from tormagd.recording.reader import Recording, RecordingError, read_recording
 from tormagd.recording.series import bands, series, tracking_rms_N
@@ -98,17 +99,6 @@ def test_the_telemetry_schema_has_every_field_in_plain_form():
     assert not {"$ref", "anyOf", "prefixItems"} & set(json.dumps(schema).replace('"', " ").split())
 
 
-def test_what_is_not_known_is_left_out_and_comes_back_as_not_a_number(tmp_path):
-    path = tmp_path / "a.mcap"
-    with RecordingWriter(path) as writer:
-        writer.ticks(batch((0, math.nan, math.inf, None, 1.0, 0.0)))
-        writer.telemetry(telemetry(0, 0, measured_cf=math.nan, measured_jp=(math.nan, 1.0)))
-    with path.open("rb") as file:
-        texts = [message.data for _, _, message in make_reader(file).iter_messages()]
-    assert not any(word in text for text in texts for word in (b"NaN", b"Infinity", b"null"))
-    assert math.isnan(read_recording(path).ticks.numbers["measured_cf"][0])
-
-
 def obey(path: Path) -> int:
     """How many messages there are in a file, each of which obeys the schema that the file has for it."""
     validators: dict[int, Draft202012Validator] = {}
@@ -122,85 +112,90 @@ def obey(path: Path) -> int:
     return count
 
 
-def test_every_message_obeys_its_schema_whatever_is_not_known_yet(tmp_path):
+def test_what_is_not_known_is_left_out_and_comes_back_as_not_a_number(tmp_path):
     path = tmp_path / "a.mcap"
-    columns = ("t_ns", "device_mode", "device_force_N", "limits", "new", "is_new")
-    rows = [
-        (None, None, (), None, None),
-        ("RUN", 1.5, ("RATE",), None, True),
-        (None, math.nan, ("RATE", "F_MIN"), "a word", False),
-        ("RUN", 2, (), "a word", None),
-        ("RUN", 2.5, (), 3.0, 1.0),  # what was a word and a boolean is a number now: another schema
-    ]
     with RecordingWriter(path) as writer:
-        writer.ticks(batch(*((ms, *row) for ms, row in enumerate(rows)), columns=columns))
-        writer.telemetry(telemetry(0, 0, measured_jp=(math.nan, 1.0), confidence=math.inf))
+        writer.ticks(batch((0, math.nan, math.inf, None, 1.0, 0.0), (1, 1.0, 1.0, 35.0, 1.0, 0.0)))
+        writer.telemetry(telemetry(0, 0, measured_cf=math.nan, measured_jp=(math.nan, 1.0), confidence=math.inf))
         writer.telemetry(telemetry(20, 1, measured_jp=(1.0, 1.0), measured_cf=1.0))
-    assert obey(path) == len(rows) + 2
+    assert obey(path) == 4
+    with path.open("rb") as file:
+        texts = [message.data for _, _, message in make_reader(file).iter_messages()]
+    assert not any(word in text for text in texts for word in (b"NaN", b"Infinity", b"null"))
+    assert math.isnan(read_recording(path).ticks.numbers["measured_cf"][0])
 
 
 @given(
     st.lists(
-        st.tuples(*4 * [st.none() | st.booleans() | st.integers(-9, 9) | st.floats() | st.text(max_size=2)]),
+        st.tuples(
+            *5 * [st.none() | st.booleans() | st.integers(-9, 9) | st.floats() | st.text(max_size=2)],
+            st.lists(st.sampled_from(["RATE", "F_MIN"]), max_size=2).map(tuple),
+        ),
         min_size=1,
         max_size=8,
     )
+)
+# what was a word and a boolean is a number in the last: another schema
+@example(
+    [
+        (None, None, None, None, None, ()),
+        ("RUN", 1.5, 1.5, None, True, ("RATE",)),
+        (None, math.nan, math.inf, "a word", False, ("RATE", "F_MIN")),
+        ("RUN", 2, 2, "a word", None, ()),
+        ("RUN", 2.5, 2.5, 3.0, 1.0, ()),
+    ]
 )
 def test_no_row_of_any_daemon_breaks_the_schema_it_is_filed_under(tmp_path_factory, rows):
     path = Path(tmp_path_factory.getbasetemp()) / "any.mcap"
     path.unlink(missing_ok=True)
     with RecordingWriter(path) as writer:
-        columns = ("t_ns", "device_mode", "measured_cf", "a", "b")
+        columns = ("t_ns", "device_mode", "device_force_N", "measured_cf", "a", "b", "limits")
         writer.ticks(batch(*((ms, *row) for ms, row in enumerate(rows)), columns=columns))
     assert obey(path) == len(rows)
 
 
-@pytest.mark.parametrize("room_bytes", [0, 3_000, 30_000, 90_000, 200_000])
-def test_what_a_full_disk_took_is_closed_in_order(tmp_path, room_bytes):
-    """The index needs room, too: it takes that of the last chunks."""
-    path = tmp_path / "full.mcap"
+def fill(writer: RecordingWriter) -> None:
     rng = np.random.default_rng(0)
+    with writer:
+        for k in range(400):
+            writer.ticks(batch(*((20 * k + i, *rng.random(5).tolist()) for i in range(20))))
+            writer.telemetry(telemetry(20 * k, k))
+
+
+@pytest.mark.parametrize("chunks", [0, 1, 2, 9])
+def test_before_a_disk_is_full_all_that_came_is_closed_in_order(tmp_path, monkeypatch, chunks):
+    path = tmp_path / "full.mcap"
+    free = iter([16_100_000] * chunks + [15_900_000])
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=next(free)))
     writer = RecordingWriter(path)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (6_000 + room_bytes, hard))
-
-    def fill() -> None:
-        with writer:
-            for k in range(400):
-                writer.ticks(batch(*((20 * k + i, *rng.random(5).tolist()) for i in range(20))))
-                writer.telemetry(telemetry(20 * k, k))
-
-    try:
-        with pytest.raises(OSError, match="too large"):
-            fill()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with pytest.raises(OSError, match=r"No space left on device: 15\.9 MB are free, needed are 16\.0"):
+        fill(writer)
     recording = read_recording(path)
     assert not recording.is_complete
-    assert "too large" in recording.metadata["cut_by"]
+    assert "15.9 MB" in recording.metadata["cut_by"]
     with path.open("rb") as file:
         reader = make_reader(file)
         assert reader.get_summary().statistics.message_count == len(list(reader.iter_messages()))
     assert obey(path) == recording.ticks.t_ns.size + recording.telemetry.t_ns.size
-    if room_bytes >= 90_000:
-        assert np.array_equal(np.diff(recording.ticks.t_ns), np.full(recording.ticks.t_ns.size - 1, 1_000_000))
-        assert recording.ticks.t_ns.size > 1_000
+    assert (recording.ticks.t_ns.size, recording.telemetry.t_ns.size) == (writer.tick_count, writer.telemetry_count)
+    assert (writer.tick_count + 400) // 500 == chunks
 
 
-def test_a_cut_inside_the_indexes_of_a_chunk_takes_the_chunk_with_it(tmp_path, written):
-    """Otherwise its messages would be there for some readers and not for others."""
-    with written.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    (chunk,) = summary.chunk_indexes
-    data = written.read_bytes()
-    inside = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length // 2
-    for end, kept in ((inside, 0), (chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length, 105)):
-        cut = tmp_path / "cut.mcap"
-        cut.write_bytes(data[:end])
-        close_cut(cut, list(summary.schemas.values()), list(summary.channels.values()), {"cut_by": "a test"})
-        with cut.open("rb") as file:
-            assert len(list(make_reader(file).iter_messages())) == kept
-        assert not read_recording(cut).is_complete
+def test_a_disk_that_fails_without_a_warning_leaves_what_is_whole(tmp_path):
+    """Such as one with a quota: the chunk that it did not take whole is lost, and the index."""
+    path = tmp_path / "full.mcap"
+    writer = RecordingWriter(path)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (96_000, hard))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            fill(writer)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    recording = read_recording(path)
+    assert not recording.is_complete
+    assert np.array_equal(np.diff(recording.ticks.t_ns), np.full(recording.ticks.t_ns.size - 1, 1_000_000))
+    assert recording.ticks.t_ns.size > 1_000
 
 
 def test_half_a_second_is_written_at_once(tmp_path):

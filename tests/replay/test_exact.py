@@ -13,6 +13,7 @@ from hypothesis import given, settings, strategies as st
 
 from firmware_protocol.codec import SCHEMA_HASH, Identity, Switches
 from tormagd.assembly.build import Core
+from tormagd.assembly.journal import KNOWN
 from tormagd.control.believe.believe import NOTHING_LEARNED
 from tormagd.control.believe.strength import UNSEEN
 from tormagd.control.records import Outside
@@ -21,7 +22,6 @@ from tormagd.hardware.link import DeviceLink
 from tormagd.hardware.link_statistics import RoundTrip
 from tormagd.model.displacement import Turn
 from tormagd.replay import conversation
-from tormagd.replay.rerun import KNOWN
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import SafetyState
 

@@ -167,6 +167,12 @@ def test_a_refusal_names_file_key_value_and_what_is_allowed(
         ({"force__most_N": "40.0"}, ("force.most_N = 40", "allowed is 0.65..")),
         ({"force__most_N": "0.1"}, ("force.most_N = 0.1", "allowed is 0.65..")),
         ({"signal__bandwidth_hz": "100.0"}, ("they miss it by",)),
+        ({"solver__name": '"bisection"'}, ("solver.name", "bisection", "newton")),
+        ({"solver__step_mT": "5.0"}, ("solver.step_mT", "5.0", "auto")),
+        (
+            {"solver__name": '"nearest"', "solver__neighbours": "60", "solver__step_mT": "50.0"},
+            ("neighbours", "60", "number of grid points"),
+        ),
     ],
 )
 def test_a_scene_that_does_not_fit_model_device_or_rates_gives_no_core(

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tormagd.scenes.scene import Signal
-from tormagd.scenes.signal import asked, recorded
-from tormagd_client.endpoints import ConfigError
+from tormagd.scenes.signal import asked
 
 RANGE_N = (0.5, 2.0)
 
@@ -42,29 +41,3 @@ def test_a_recording_is_smooth_between_its_rows_and_keeps_to_the_range(tmp_path:
     assert time_s[-1] == pytest.approx(2.0, abs=0.003)
     expected = np.clip(1.2 + 0.9 * np.sin(2.0 * np.pi * time_s), *RANGE_N)
     assert force_N == pytest.approx(expected, abs=5e-4)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", ("no column t_s", "t_s,force_N")),
-        ("time,force\n0,1\n", ("'time,force'",)),
-        ("t_s,force_N\n0,1\n", ("1 rows",)),
-        ("t_s,force_N\n0,1\n1,one\n", ("row 3, force_N = 'one'",)),
-        ("t_s,force_N\n0,1\n0,2\n", ("row 3, t_s = 0", "above the row before")),
-        ("t_s,force_N\n0,1\n1,nan\n", ("finite",)),
-        ("t_s,force_N\n0,-1\n1,1\n", ("row 2, force_N = -1", "0..1000")),
-        ("t_s,force_N\n0,1,2\n1,1,2\n", ("row 2 has 3 values",)),
-    ],
-)
-def test_a_file_that_is_no_recording_is_refused(tmp_path: Path, text: str, words: tuple[str, ...]) -> None:
-    path = tmp_path / "bad.csv"
-    path.write_text(text)
-    with pytest.raises(ConfigError) as caught:
-        recorded(path)
-    assert all(word in str(caught.value) for word in (str(path), *words))
-
-
-def test_a_recording_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="No such file"):
-        recorded(tmp_path / "none.csv")

@@ -33,9 +33,6 @@ from tormagd.simulation.device import MessageDevice
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters
 
-EXCHANGE_BITS = 395
-"Drive, State and Sense with the most stuffing, as firmware_protocol/README.md says."
-
 
 def bits_by_hand(frame: CanFrame) -> int:
     """ISO 11898-1, bit by bit: an oracle without tables."""
@@ -59,18 +56,6 @@ def test_bits_are_those_of_the_standard() -> None:
     frames += [CanFrame(0x041, bytes([b]) * 8) for b in (0x0F, 0xF0, 0x78, 0x87, 0x1E)]
     for frame in frames:
         assert frame_bits(frame) == bits_by_hand(frame), frame
-
-
-def test_an_exchange_never_takes_more_bits_than_the_headroom_was_computed_from() -> None:
-    def most_bits(length: int) -> int:
-        stuffable = 34 + 8 * length
-        return stuffable + (stuffable - 1) // 4 + 13
-
-    assert most_bits(7) + 2 * most_bits(8) == EXCHANGE_BITS
-    noise = random.Random(2)
-    for _ in range(2_000):
-        assert frame_bits(CanFrame(0x021, noise.randbytes(7))) <= most_bits(7)
-        assert frame_bits(CanFrame(0x031, noise.randbytes(8))) <= most_bits(8)
 
 
 def test_a_frame_survives_the_socket_and_what_is_none_is_refused() -> None:

@@ -45,11 +45,11 @@ def test_a_recording_is_interpolated_and_held_at_its_ends(tmp_path) -> None:
     ("text", "said"),
     [
         ("t_s,x\n1,2\n", "position_mm"),
-        ("t_s,position_mm\n", "no rows"),
-        ("t_s,position_mm\n0,0\n0,1\n", "line 3"),
-        ("t_s,position_mm\n0,nan\n", "line 2"),
-        ("t_s,position_mm\n0,abc\n", "line 2"),
-        ("t_s,position_mm\n0\n", "line 2"),
+        ("t_s,position_mm\n", "0 rows"),
+        ("t_s,position_mm\n0,0\n0,1\n", "row 3"),
+        ("t_s,position_mm\n0,nan\n", "row 2"),
+        ("t_s,position_mm\n0,abc\n", "row 2"),
+        ("t_s,position_mm\n0\n", "row 2"),
     ],
 )
 def test_a_bad_recording_is_refused_with_its_line(tmp_path, text: str, said: str) -> None:

@@ -11,7 +11,7 @@ import pytest
 import required_terms
 from distributed import Client, LocalCluster
 from rendering import scene_runs
-from rendering.scene_runs import Case, Play, key, run, run_all
+from rendering.scene_runs import Case, Play, key, load_task, run, run_all
 from rendering.signals import Signal
 from required_terms import HOLD, NO_COST, PULSE, RATES_HZ, SHARE, is_good, measure, spared, written, wrong_models
 
@@ -26,7 +26,7 @@ from tormagd.scenes.measured import (
     on_first,
     required,
 )
-from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_scene, load_task, shipped_scenes, terms_of
+from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, load_scene, shipped_scenes, terms_of
 from tormagd_client.endpoints import ConfigError
 
 STORED = measured()

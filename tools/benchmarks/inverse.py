@@ -31,7 +31,6 @@ from benchmarks.inverse_workload import (
 from tormagd.daemon.realtime import freeze_garbage
 from tormagd.inverse.choice import build, named
 from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
-from tormagd.inverse.scan import FieldScan
 from tormagd.inverse.solution import FieldSolver
 from tormagd.lab.arrays import Array
 from tormagd.model.model_file import ForceModel
@@ -228,8 +227,6 @@ def held_bytes(owner: object) -> int:
             total += value.untyped_storage().nbytes()
         elif isinstance(value, list):
             total += sys.getsizeof(value) + sum(map(sys.getsizeof, value))
-        elif isinstance(value, FieldScan):
-            total += held_bytes(value)
     return total
 
 

@@ -1,4 +1,5 @@
-"""`tormagctl calibrate`: a guided sweep through the running daemon, and a model of the insert from it.
+"""`tormagctl calibrate`: which of the three it is to be; and of these, a guided sweep through the running daemon, and a
+model of the insert from it.
 
 The sweep asks for forces, so every limit of the daemon stays in force. A process of its own (`FITTING`)
 turns it into training data, fits, judges and saves: neither the daemon nor this program carries a training.
@@ -11,18 +12,21 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
-from tormagd.ctl.calibrate_run import SOURCE, Columns, InterruptedRunError, Range, Run, armed, reach, seconds_bar
+from tormagd.config import Config
+from tormagd.ctl.calibrate_device import calibrate_device
+from tormagd.ctl.calibrate_motors import calibrate_motors
+from tormagd.ctl.calibrate_run import SOURCE, Columns, Range, Run, armed, interrupted_run, reach, seconds_bar
 from tormagd.ctl.interrupt import interrupted_by
-from tormagd.ctl.outcome import CommandError, Exit, Outcome, usage_error
+from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal, usage_error
 from tormagd.ctl.waveform import Waveform, through
-from tormagd.scenes.scene import Scene
+from tormagd.scenes.scene import Scene, load_scene
 from tormagd_client.blocking import Client
-from tormagd_client.endpoints import Endpoints
+from tormagd_client.endpoints import ConfigError, Endpoints
 
 COLUMNS = ("monotonic_s", "left_mm", "right_mm", "handle_mm", "handle_rate_mm_s", "measured_cf")
 "Of the control ticks, what a sweep is made of."
@@ -35,7 +39,7 @@ FITTING = "tormagd.lab.training.calibration"
 POLL_S = 0.2
 
 
-def calibrate(
+def calibrate_insert(
     endpoints: Endpoints,
     scene: Scene,
     insert: str,
@@ -47,7 +51,7 @@ def calibrate(
     """Sweep the force up and down once for each of `rates_N_s`, fit, judge, save. The gap opens after the sweeps.
 
     Raises CommandError: USAGE, REFUSED (by the daemon; the handle stands still; a sweep or a fit that is not good
-    enough, and then there is no model file), FAULT, UNREACHABLE, `InterruptedRunError`.
+    enough, and then there is no model file), FAULT, UNREACHABLE, `interrupted_run`.
     """
     _ask_fitter("--insert", insert)  # an unknown insert is told now, not after the sweeps
     with Client(endpoints, wait_s, SOURCE) as client:
@@ -123,7 +127,7 @@ def _ask_fitter(*arguments: str) -> dict[str, Any]:
         answer: dict[str, Any] = msgspec.json.decode(said)
     except msgspec.DecodeError as error:
         if is_interrupted():
-            raise InterruptedRunError from error
+            raise interrupted_run() from error
         raise CommandError(
             Exit.REFUSED,
             "fit_failed",
@@ -153,3 +157,52 @@ def require_new(path: Path, option: str) -> None:
         raise usage_error(f"{option} {path} exists", "give another name; nothing is overwritten")
     if not path.parent.is_dir():
         raise usage_error(f"{option} {path}: {path.parent} is not a directory", "give a file in one you may write to")
+
+
+def calibrate(
+    config: Config,
+    endpoints: Endpoints,
+    wait_s: float,
+    device: bool,
+    insert: str | None,
+    motors: bool,
+    out: Path | None,
+    csv: Path | None,
+    rates_N_s: Sequence[float],
+    side: Literal["left", "right"],
+    is_agreed: bool,
+) -> Outcome:
+    """Of a device, an insert, or the motors. Raises CommandError: USAGE for options that do not fit each other and for
+    a faulty scene, and as the three do."""
+    if [insert is not None, motors, device].count(True) != 1:
+        raise usage_error("give one of --insert NAME, --motors and --device", "tormagctl calibrate --help shows them")
+    if insert is None and csv is not None:
+        raise usage_error("--csv is the training data of an insert", "with --motors, --out is the log")
+    if device is (out is not None):
+        raise usage_error(
+            "--out is the file of a model or of a log",
+            "leave it out: the daemon keeps the profile" if device else "give one",
+        )
+    for name, path in (("--out", out), ("--csv", csv)):
+        if path is not None:
+            require_new(path, name)
+    try:
+        scene = load_scene(config.scene)
+    except ConfigError as error:
+        raise usage_error(str(error), "correct the scene, or give the daemon's own --config") from error
+    if not is_agreed:
+        _agree()
+    most_N = scene.force.most_N
+    if out is None:
+        return calibrate_device(endpoints, most_N, wait_s)
+    if insert is None:
+        return calibrate_motors(endpoints, most_N, out, side, wait_s)
+    return calibrate_insert(endpoints, scene, insert, out, csv, rates_N_s, wait_s)
+
+
+def _agree() -> None:
+    """Armed on purpose: a person agrees, or a script says --yes."""
+    if not is_terminal(sys.stdin):
+        raise usage_error("nobody can agree to the carriages moving", "a script says --yes")
+    print("The device homes where needed, enables, and moves its carriages. Press Enter, or Ctrl-C.", file=sys.stderr)
+    sys.stdin.readline()

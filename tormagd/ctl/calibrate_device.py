@@ -8,6 +8,7 @@ import sys
 import time
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from tormagd.ctl.calibrate_run import MOVING_MM_S, SOURCE, Columns, Range, armed, reach, seconds_bar
@@ -54,7 +55,7 @@ def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -
     """Let the daemon learn the device, judge it by steps, and see that its profile is kept. The gap opens in the end.
 
     Raises CommandError: REFUSED (also where no profile is kept, the handle hardly moves, or the force sensor is not
-    believed), FAULT, UNREACHABLE, `InterruptedRunError`.
+    believed), FAULT, UNREACHABLE, `interrupted_run`.
     """
     with Client(endpoints, wait_s, SOURCE) as client:
         profile = client.status().profile
@@ -69,7 +70,8 @@ def calibrate_device(endpoints: Endpoints, scene_most_N: float, wait_s: float) -
                 steps = run.play(judging, bar)
             status = client.status()
             require_believed(status)
-        result = _device(status) | judged(steps, judging, status.device.sensor_zero_N)
+        known = {"serial_number": status.link.serial_number, **msgspec.to_builtins(status.device)}
+        result = known | judged(steps, judging, status.device.sensor_zero_N)
         result["profile"] = _kept(client).folder
     return Outcome(result, _text(result))
 
@@ -147,19 +149,6 @@ def _not_kept(profile: ProfileReport) -> CommandError:
         f"no profile is kept: {profile.refusal or 'the daemon has written none'}",
         "name a folder that the daemon may write to in [device] profiles, and start it again",
     )
-
-
-def _device(status: Status) -> dict[str, Any]:
-    device = status.device
-    return {
-        "serial_number": status.link.serial_number,
-        "scale": device.scale,
-        "scale_sd": device.scale_sd,
-        "offset_N": device.offset_N,
-        "offset_sd_N": device.offset_sd_N,
-        "sensor_zero_N": device.sensor_zero_N,
-        "sensor_zero_sd_N": device.sensor_zero_sd_N,
-    }
 
 
 def _text(result: dict[str, Any]) -> str:

@@ -1,5 +1,6 @@
 """A calibration run through the daemon: arm, publish forces, collect control ticks, open the gap whatever happens."""
 
+import math
 import signal
 import sys
 import time
@@ -16,7 +17,7 @@ from tormagd.ctl.interrupt import interrupted_by
 from tormagd.ctl.operate import home
 from tormagd.ctl.outcome import CommandError, Exit, is_terminal
 from tormagd.ctl.waveform import Waveform
-from tormagd.recording.ticks import TickBatch, Value, decode_ticks, listening
+from tormagd.recording.ticks import Value, decode_ticks, listening
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError, unreachable
@@ -37,16 +38,14 @@ MOVING_MM_S = 5.0
 HANDLE_PATIENCE_S = 30.0
 
 
-class InterruptedRunError(CommandError):
+def interrupted_run() -> CommandError:
     """The person ended the run; nothing is kept of it."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            Exit.REFUSED,
-            "interrupted",
-            "interrupted: a device that was armed is disabled and opens its gap; there is no model and no log",
-            "run it again when you are ready",
-        )
+    return CommandError(
+        Exit.REFUSED,
+        "interrupted",
+        "interrupted: a device that was armed is disabled and opens its gap; there is no model and no log",
+        "run it again when you are ready",
+    )
 
 
 class Range(NamedTuple):
@@ -85,7 +84,7 @@ class Run:
         """Publish `waveform` and return what the ticks of that time said: one array for each column asked for.
 
         A value that was null is NaN. Raises CommandError: FAULT or REFUSED where the device stops rendering on the way,
-        UNREACHABLE where the daemon goes, `InterruptedRunError`.
+        UNREACHABLE where the daemon goes, `interrupted_run`.
         """
         rows: list[list[float]] = []
         start_s = time.monotonic()
@@ -99,7 +98,7 @@ class Run:
     def exchange(self, force_N: float) -> list[list[float]]:
         """Publish one force and return the rows that came until the next one is due. Raises as `play`."""
         if self._is_interrupted():
-            raise InterruptedRunError
+            raise interrupted_run()
         due_s = time.monotonic() + 1.0 / RATE_HZ
         self._client.publish(force_N, VALID_FOR_MS)
         rows: list[list[float]] = []
@@ -127,7 +126,7 @@ class Run:
     def _rows(self, data: bytes) -> list[list[float]]:
         try:
             batch = decode_ticks(data)
-            places = [batch.columns.index(name) for name in ("operating_state", *self._columns)]
+            state, *places = [batch.columns.index(name) for name in ("operating_state", *self._columns)]
         except (MessageError, ValueError) as error:
             raise CommandError(
                 Exit.UNREACHABLE,
@@ -137,8 +136,10 @@ class Run:
             ) from error
         self._heard_s = time.monotonic()
         for row in batch.rows:
-            self._require_enabled(row[places[0]])
-        return [self._values(batch, index, places[1:]) for index in range(len(batch.rows))]
+            self._require_enabled(row[state])
+        # what is a word or not known is NaN
+        taken = [[row[place] for place in places] for row in batch.rows]
+        return [[float(each) if isinstance(each, int | float) else math.nan for each in row] for row in taken]
 
     def _require_enabled(self, state: Value) -> None:
         if state == "ENABLED":
@@ -150,10 +151,6 @@ class Run:
             f"the device went {state} during the run: {'somebody gave a command' if first is None else first.code}",
             "run it again when you are ready" if first is None else first.remedy,
         )
-
-    def _values(self, batch: TickBatch, index: int, places: Sequence[int]) -> list[float]:
-        row = batch.rows[index]
-        return [float(value) if isinstance((value := row[place]), int | float) else float("nan") for place in places]
 
 
 def reach(client: Client, scene_most_N: float) -> Range:
@@ -187,7 +184,7 @@ def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: 
             if not status.is_homed:
                 home(client, HOMING_S, is_waiting=True)
             if is_interrupted():
-                raise InterruptedRunError
+                raise interrupted_run()
             if status.operating_state != "ENABLED":
                 _enable(client)
             try:
@@ -206,14 +203,11 @@ def armed(endpoints: Endpoints, client: Client, columns: Sequence[str], wait_s: 
 def _drop_old(ticks: "zmq.Socket[bytes]", wait_s: float, address: str) -> None:
     # the newest tick from before `enable` took effect must not be read as a fall out of ENABLED
     until_s = time.monotonic() + wait_s
-    while time.monotonic() < until_s:
-        if not ticks.poll(round(wait_s * 1e3)):
-            break
+    while time.monotonic() < until_s and ticks.poll(round(wait_s * 1e3)):
         batch = decode_ticks(ticks.recv_multipart()[-1])
-        if "operating_state" in batch.columns:
-            place = batch.columns.index("operating_state")
-            if batch.rows and all(row[place] == "ENABLED" for row in batch.rows):
-                return
+        states = [dict(zip(batch.columns, row, strict=True)).get("operating_state") for row in batch.rows]
+        if set(states) == {"ENABLED"}:
+            return
     raise unreachable(address, f"no control ticks of an enabled device within {wait_s:g} s")
 
 

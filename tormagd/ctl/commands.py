@@ -107,7 +107,7 @@ COMMANDS = {
         ("client",),
     ),
     "firmware": Command(
-        "who is at the other end of the wire, and how well the wire carries", "firmware.firmware", ("client",)
+        "who is at the other end of the wire, and how well the wire carries", "status.firmware", ("client",)
     ),
     "ports": Command("where a device could be connected, and who holds what is there", "ports.ports", ("config",)),
     "enable": _operate("start rendering force (homed, fresh measurements and a neutral setpoint needed)"),
@@ -241,7 +241,7 @@ COMMANDS = {
     ),
     "calibrate": Command(
         "guided: let the daemon learn its device, sweep an insert into a model file, or motors into a log",
-        "calibration.calibration",
+        "calibrate.calibrate",
         ("config", "endpoints", "wait_s"),
         (
             option("--device", action="store_true", help="what this device shows of itself becomes its profile"),

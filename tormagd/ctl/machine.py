@@ -71,14 +71,8 @@ class Machine:
 
     def resolved(self, absolute: str) -> str:
         """The path that `absolute` leads to, following symbolic links inside the root."""
-        current = absolute
-        for _ in range(8):
-            try:
-                target = self.path(current).readlink()
-            except OSError:
-                return current
-            current = os.path.normpath(os.path.join(os.path.dirname(current), target))  # noqa: PTH118, PTH120
-        return current
+        there, root = os.path.realpath(self.path(absolute)), os.path.realpath(self.root)
+        return f"/{os.path.relpath(there, root)}"
 
     def holders(self, paths: Sequence[str]) -> tuple[dict[str, list[tuple[int, str]]], int]:
         """Process id and name of everybody who has one of these open, as far as we may see, not this process; and the
@@ -90,7 +84,7 @@ class Machine:
                 continue
             # a process may end, or its files be another user's, while we look
             try:
-                targets = {target for link in (process / "fd").iterdir() if (target := _target(link))}
+                targets = {os.path.realpath(link) for link in (process / "fd").iterdir()}
             except PermissionError:
                 hidden += 1
                 continue
@@ -113,10 +107,3 @@ class Machine:
         inode = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
         rows = [line.split() for line in (self.text("/proc/locks") or "").splitlines()]
         return sorted({int(row[4]) for row in rows if len(row) > 5 and row[1] == "FLOCK" and row[5] == inode})
-
-
-def _target(link: Path) -> str | None:
-    try:
-        return str(link.readlink())
-    except OSError:
-        return None

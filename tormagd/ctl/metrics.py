@@ -4,7 +4,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from typing import TypeVar
+from typing import NamedTuple
 
 from prometheus_client import CollectorRegistry, generate_latest, start_http_server
 from prometheus_client.core import (
@@ -22,14 +22,14 @@ from tormagd.output import write_line
 from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import ClientError
-from tormagd_client.messages import ExecReport, Status
+from tormagd_client.messages import Status
 
 LOOPBACK = "127.0.0.1"
 POLL_S = 0.1
 STATES = ("DISABLED", "ENABLED", "PAUSED", "FAULT")
 PERCENTILES = ("p50", "p99", "p999", "max")
 MILLI, MICRO = 1e-3, 1e-6
-Labelled = TypeVar("Labelled", CounterMetricFamily, GaugeMetricFamily)
+COUNTER, GAUGE = CounterMetricFamily, GaugeMetricFamily
 UP = "Whether the daemon answers"
 
 
@@ -60,6 +60,16 @@ def metrics(endpoints: Endpoints, port: int | None, wait_s: float) -> Outcome:
     return Outcome({"address": address}, "the daemon goes on")
 
 
+class Family(NamedTuple):
+    """A metric, with its values by those of its labels; what is not known has no sample."""
+
+    kind: type[CounterMetricFamily] | type[GaugeMetricFamily]
+    name: str
+    text: str
+    labels: tuple[str, ...]
+    values: Mapping[tuple[str, ...], float | None]
+
+
 class Scrape(Collector):
     """Asks the daemon anew each time, by a connection of its own: scrapes come in threads of their own."""
 
@@ -79,22 +89,24 @@ class Scrape(Collector):
             yield GaugeMetricFamily("tormag_up", UP, 0.0)
             return
         yield GaugeMetricFamily("tormag_up", UP, 1.0)
-        for part in (_device, _setpoints, _loops, _link):
-            yield from part(status)
+        about = {name: getattr(status, name) for name in ("version", "build", "scene", "solver")}
+        yield InfoMetricFamily("tormag", "What runs", about | {"firmware": status.link.firmware or ""})
+        states = {state: state == status.operating_state for state in STATES}
+        yield StateSetMetricFamily("tormag_operating_state", "The operating state", states)
+        for each in _families(status):
+            family = each.kind(f"tormag_{each.name}", each.text, labels=each.labels)
+            for key, value in each.values.items():
+                if value is not None:
+                    family.add_metric(key, value)
+            if each.labels or family.samples:
+                yield family
 
 
-def _device(status: Status) -> Iterator[Metric]:
-    about = {name: getattr(status, name) for name in ("version", "build", "scene", "solver")}
-    yield InfoMetricFamily("tormag", "What runs", about | {"firmware": status.link.firmware or ""})
-    states = {state: state == status.operating_state for state in STATES}
-    yield StateSetMetricFamily("tormag_operating_state", "The operating state", states)
-    yield GaugeMetricFamily("tormag_homed", "Whether the positions are known", float(status.is_homed))
-    for name, codes, text in (
-        ("tormag_fault", status.faults, "Latched faults, 1 for each that is there"),
-        ("tormag_limit", status.limits, "Limits, 1 for each that holds the force back now"),
-    ):
-        yield _labelled(GaugeMetricFamily(name, text, labels=["code"]), dict.fromkeys(codes, 1.0))
+def _families(status: Status) -> Iterator[Family]:
+    link, setpoints, rates = status.link, status.setpoints, status.rates
+    sources, trip_us = setpoints.by_source, status.link.round_trip_us
     for name, text, value, unit in (
+        ("homed", "Whether the positions are known", float(status.is_homed), 1.0),
         ("uptime_seconds", "Since the daemon started", status.uptime_s, 1.0),
         ("force_asked_newtons", "Newest setpoint", status.setpoint_cf, 1.0),
         ("force_governed_newtons", "What the governor makes of it", status.governed_cf, 1.0),
@@ -106,79 +118,80 @@ def _device(status: Status) -> Iterator[Metric]:
         ("field_teslas", "Flux density that is planned for", status.field_mT, MILLI),
         ("device_scale_ratio", "The device's force over the model's", status.device.scale, 1.0),
         ("setpoint_age_seconds", "Of the newest setpoint", status.setpoint_age_ms, MILLI),
+        ("link_running", "Whether the device answers", float(link.state == "RUNNING"), 1.0),
     ):
-        if value is not None:  # what is not known has no sample
-            yield GaugeMetricFamily(f"tormag_{name}", text, value * unit)
-
-
-def _setpoints(status: Status) -> Iterator[Metric]:
-    for fate, text in (
-        ("accepted", "Setpoints that were taken"),
-        ("refused", "Setpoints that were not valid"),
-        ("dropped", "Setpoints that were not read"),
-        ("oversize", "Setpoints that were too large"),
-    ):
-        yield CounterMetricFamily(f"tormag_setpoints_{fate}", text, getattr(status.setpoints, fate))
-    sources = status.setpoints.by_source
-    lost = CounterMetricFamily("tormag_source_lost", "Setpoints missing in a source's count", labels=["source"])
-    yield _labelled(lost, {name: source.lost for name, source in sources.items()})
-    yield _percentiles(
-        "tormag_source_delay_seconds",
-        "From the stamp until it was read",
-        "source",
-        {name: source.delay_us for name, source in sources.items()},
-    )
-
-
-def _loops(status: Status) -> Iterator[Metric]:
-    rates = status.rates
-    rate = GaugeMetricFamily("tormag_loop_rate_hertz", "Runs per second", labels=["loop"])
-    yield _labelled(rate, {loop: group.hz for loop, group in rates.items()})
-    for name, text in (
-        ("runs", "Runs"),
-        ("merged", "Runs that were due together and became one"),
-        ("overruns", "Runs done after the next was due"),
-        ("stalls", "Runs done after ten were due"),
-    ):
-        counter = CounterMetricFamily(f"tormag_loop_{name}", text, labels=["loop"])
-        yield _labelled(counter, {loop: getattr(group, name) for loop, group in rates.items()})
-    for name, text, report in (
-        ("lateness", "How late runs began, of the last seconds", "lateness_us"),
-        ("execution", "How long runs took, of the last seconds", "exec_us"),
-    ):
-        reports = {loop: getattr(group, report) for loop, group in rates.items()}
-        yield _percentiles(f"tormag_loop_{name}_seconds", text, "loop", reports)
-    blamed = CounterMetricFamily("tormag_late_ticks", "Late control ticks, by who is to blame", labels=["culprit"])
-    yield _labelled(blamed, status.late_ticks_by)
-
-
-def _link(status: Status) -> Iterator[Metric]:
-    link, trip_us = status.link, status.link.round_trip_us
-    yield GaugeMetricFamily("tormag_link_running", "Whether the device answers", float(link.state == "RUNNING"))
+        yield Family(GAUGE, name, text, (), {(): None if value is None else value * unit})
     for name, text, count in (
-        ("losses", "Times the link was lost", link.losses),
-        ("frames", "Frames received since the port was opened", link.frames),
-        ("corrupt_frames", "Of these, damaged", link.corrupt),
-        ("lost_frames", "Frames missing in the count", link.lost),
-        ("repeated_frames", "Frames that came twice", link.repeated),
+        ("setpoints_accepted", "Setpoints that were taken", setpoints.accepted),
+        ("setpoints_refused", "Setpoints that were not valid", setpoints.refused),
+        ("setpoints_dropped", "Setpoints that were not read", setpoints.dropped),
+        ("setpoints_oversize", "Setpoints that were too large", setpoints.oversize),
+        ("link_losses", "Times the link was lost", link.losses),
+        ("link_frames", "Frames received since the port was opened", link.frames),
+        ("link_corrupt_frames", "Of these, damaged", link.corrupt),
+        ("link_lost_frames", "Frames missing in the count", link.lost),
+        ("link_repeated_frames", "Frames that came twice", link.repeated),
+        ("peers_refused", "Connections that were not let in", status.peers.refused),
     ):
-        if count is not None:
-            yield CounterMetricFamily(f"tormag_link_{name}", text, count)
-    if trip_us is not None:
-        trip = GaugeMetricFamily("tormag_link_round_trip_seconds", "From a Drive to its State", labels=["percentile"])
-        yield _labelled(trip, {"p50": trip_us.p50 * MICRO, "p99": trip_us.p99 * MICRO})
-    yield CounterMetricFamily("tormag_peers_refused", "Connections that were not let in", status.peers.refused)
-
-
-def _labelled(family: Labelled, values: Mapping[str, float]) -> Labelled:
-    for label, value in values.items():
-        family.add_metric([label], value)
-    return family
-
-
-def _percentiles(name: str, text: str, label: str, reports: Mapping[str, ExecReport]) -> Metric:
-    family = GaugeMetricFamily(name, text, labels=[label, "percentile"])
-    for labelled, report in reports.items():
-        for percentile in PERCENTILES:
-            family.add_metric([labelled, percentile], getattr(report, percentile) * MICRO)
-    return family
+        yield Family(COUNTER, name, text, (), {(): count})
+    for kind, name, text, label, values in (
+        (GAUGE, "fault", "Latched faults, 1 for each that is there", "code", dict.fromkeys(status.faults, 1.0)),
+        (GAUGE, "limit", "Limits, 1 for each that holds the force back now", "code", dict.fromkeys(status.limits, 1.0)),
+        (
+            COUNTER,
+            "source_lost",
+            "Setpoints missing in a source's count",
+            "source",
+            {n: it.lost for n, it in sources.items()},
+        ),
+        (GAUGE, "loop_rate_hertz", "Runs per second", "loop", {n: it.hz for n, it in rates.items()}),
+        (COUNTER, "loop_runs", "Runs", "loop", {n: it.runs for n, it in rates.items()}),
+        (
+            COUNTER,
+            "loop_merged",
+            "Runs that were due together and became one",
+            "loop",
+            {n: it.merged for n, it in rates.items()},
+        ),
+        (
+            COUNTER,
+            "loop_overruns",
+            "Runs done after the next was due",
+            "loop",
+            {n: it.overruns for n, it in rates.items()},
+        ),
+        (COUNTER, "loop_stalls", "Runs done after ten were due", "loop", {n: it.stalls for n, it in rates.items()}),
+        (COUNTER, "late_ticks", "Late control ticks, by who is to blame", "culprit", status.late_ticks_by),
+        (
+            GAUGE,
+            "link_round_trip_seconds",
+            "From a Drive to its State",
+            "percentile",
+            {} if trip_us is None else {"p50": trip_us.p50 * MICRO, "p99": trip_us.p99 * MICRO},
+        ),
+    ):
+        yield Family(kind, name, text, (label,), {(key,): value for key, value in values.items()})
+    for name, text, label, reports in (
+        (
+            "source_delay_seconds",
+            "From the stamp until it was read",
+            "source",
+            {n: it.delay_us for n, it in sources.items()},
+        ),
+        (
+            "loop_lateness_seconds",
+            "How late runs began, of the last seconds",
+            "loop",
+            {n: it.lateness_us for n, it in rates.items()},
+        ),
+        (
+            "loop_execution_seconds",
+            "How long runs took, of the last seconds",
+            "loop",
+            {n: it.exec_us for n, it in rates.items()},
+        ),
+    ):
+        shown: dict[tuple[str, ...], float | None] = {
+            (key, each): getattr(it, each) * MICRO for key, it in reports.items() for each in PERCENTILES
+        }
+        yield Family(GAUGE, name, text, (label, "percentile"), shown)

@@ -48,7 +48,7 @@ def operate(client: Client, command: str) -> Outcome:
     if command == "clear-fault":
         until_s = time.monotonic() + COMES_BACK_S
         while time.monotonic() < until_s:
-            _raise_fault(client.status(), "the fault came back")
+            require_no_fault(client.status(), "the fault came back")
             time.sleep(POLL_S)
     return Outcome(result, text)
 
@@ -83,7 +83,7 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     try:
         while (elapsed_s := time.monotonic() - started_s) < timeout_s:
             state = client.status()
-            _raise_fault(state, "fault while homing")
+            require_no_fault(state, "fault while homing")
             # a homing that was over between two looks still shows, as a device that is homed and was not
             has_begun = has_begun or state.is_busy or (state.is_homed and not was_homed)
             if has_begun and not state.is_busy:
@@ -114,15 +114,12 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     )
 
 
-def _raise_fault(state: Status, what: str) -> None:
-    if state.operating_state == "FAULT":
-        raise in_fault(state, what)
-
-
-def in_fault(state: Status, what: str) -> CommandError:
-    """That the device is in FAULT: which, why, and what to do."""
+def require_no_fault(state: Status, what: str) -> None:
+    """Raise CommandError (FAULT) where the device is in FAULT: which, why, and what to do."""
+    if state.operating_state != "FAULT":
+        return
     first = state.fault_details[0] if state.fault_details else Explained("FAULT", "see tormagctl status", "")
-    return CommandError(
+    raise CommandError(
         Exit.FAULT,
         "fault",
         f"{what}: {', '.join(state.faults) or first.code}: {first.cause}",

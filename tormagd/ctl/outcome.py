@@ -3,6 +3,7 @@
 import os
 import sys
 from enum import IntEnum
+from functools import partialmethod
 from typing import Any, TextIO
 
 import msgspec
@@ -89,17 +90,10 @@ class Colour:
     def __init__(self, stream: TextIO | None) -> None:
         self._is_on = is_terminal(stream) and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
-    def red(self, text: str) -> str:
-        return self._paint("31", text)
-
-    def green(self, text: str) -> str:
-        return self._paint("32", text)
-
-    def yellow(self, text: str) -> str:
-        return self._paint("33", text)
-
-    def bold(self, text: str) -> str:
-        return self._paint("1", text)
-
     def _paint(self, code: str, text: str) -> str:
         return f"\x1b[{code}m{text}\x1b[0m" if self._is_on else text
+
+    red = partialmethod(_paint, "31")
+    green = partialmethod(_paint, "32")
+    yellow = partialmethod(_paint, "33")
+    bold = partialmethod(_paint, "1")

@@ -9,9 +9,10 @@ from typing import Any
 
 import msgspec
 
+from tormagd.config import LEAST_INFERENCE_HZ
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal, usage_error
 from tormagd.ctl.scene import as_toml, check_scene
-from tormagd.scenes.scene import Scene
+from tormagd.scenes.scene import LEAST_CONTROL_HZ, Scene
 from tormagd.scenes.signal import recorded
 from tormagd_client.endpoints import ConfigError
 
@@ -22,7 +23,6 @@ TOLERATED, TOLERATED_OF_MOST = 0.05, 0.02
 RESERVED = 0.8
 """Of the greatest force that the model gives: a device may be a fifth weaker than its model, by friction, modulus,
 field and what its elastomer relaxes. A soft insert is asked for more only where no stiffer one follows fast enough."""
-LEAST_CONTROL_HZ, LEAST_INFERENCE_HZ = 500, 83
 
 Tables = dict[str, Any]
 

@@ -5,7 +5,7 @@ import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import msgspec
 
@@ -18,15 +18,6 @@ from tormagd_client.blocking import Client
 from tormagd_client.endpoints import Endpoints
 from tormagd_client.errors import UnreachableError
 from tormagd_client.messages import MAX_PREVIEW_SAMPLES
-
-
-class Stream(NamedTuple):
-    """How setpoints are published. Each carries the `preview` that follow it, in number."""
-
-    rate_hz: float
-    source: str
-    valid_for_ms: float
-    preview: int = 0
 
 
 def send(
@@ -46,7 +37,9 @@ def send(
     """Publish a shape or a CSV file for `duration_s` or until interrupted, and see what becomes of it, unless
     `is_blind`. Without a duration a file lasts as long as it is, a computed shape ten seconds.
 
-    Raises CommandError: USAGE for what is not to be sent, and as `_sent`.
+    Raises CommandError: USAGE for what is not to be sent; UNREACHABLE where no daemon answers or subscribes within
+    `wait_s`, or where it leaves on the way; FAULT as soon as the device is in FAULT; REFUSED where the scene does not
+    allow such forces (nothing is sent), or the setpoints were not rendered.
     """
     try:
         if what.lower().endswith(".csv"):
@@ -68,31 +61,41 @@ def send(
             f"--preview-ms = {preview_ms:g}: {preview} setpoints at {rate_hz:g} Hz; allowed are {MAX_PREVIEW_SAMPLES}",
             "look less far ahead",
         )
-    return _sent(endpoints, waveform, lasts_s, Stream(rate_hz, source, valid_for_ms, preview), wait_s, is_blind)
-
-
-def _sent(
-    endpoints: Endpoints, waveform: Waveform, duration_s: float, stream: Stream, wait_s: float, is_blind: bool
-) -> Outcome:
-    """Each setpoint has its own deadline, counted from the start, so that lateness does not add up. A setpoint whose
-    successor is due already is left out: the newest one wins anyway. Raises CommandError: UNREACHABLE where no daemon
-    answers or subscribes within `wait_s`, or where it leaves on the way; FAULT as soon as the device is in FAULT;
-    REFUSED where the scene does not allow such forces (nothing is sent), or the setpoints were not rendered.
-    """
-    with Client(endpoints, wait_s, stream.source) as client:
-        watch = None
-        if not is_blind:
-            try:
-                known = client.describe()
-            except UnreachableError as error:
-                if endpoints.curve is not None and endpoints.curve.client_secret:
-                    error.hint += "; with a key that may only publish: --blind"
-                raise
-            require_range(known, waveform.least_N, waveform.most_N)
-            watch = Watch(client, stream.source)
+    with Client(endpoints, wait_s, source) as client:
+        watch = None if is_blind else _watched(client, endpoints, waveform, source)
         client.require_taken()
         with interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
-            return _publish(client, endpoints.setpoint, waveform, duration_s, stream, is_interrupted, watch)
+            done = _publish(
+                client,
+                endpoints.setpoint,
+                waveform,
+                lasts_s,
+                rate_hz,
+                valid_for_ms,
+                preview,
+                is_interrupted,
+                watch,
+            )
+            became = None if watch is None else watch.finish(done["sent"])
+    left_out = f", {done['skipped']} left out because this machine was late" if done["skipped"] else ""
+    text = f"sent {done['sent']} setpoints as {source!r} in {done['seconds']:.1f} s{left_out}; "
+    if became is None:
+        return Outcome({"source": source, **done}, f"{text}whether they were taken is not known")
+    held = f", held by {', '.join(became.limits)} at times" if became.limits else ""
+    result = {"source": source, **done, **msgspec.structs.asdict(became)}
+    return Outcome(result, f"{text}{became.accepted} taken and rendered{held}")
+
+
+def _watched(client: Client, endpoints: Endpoints, waveform: Waveform, source: str) -> Watch:
+    """Raises CommandError, REFUSED, where the scene does not allow such forces."""
+    try:
+        known = client.describe()
+    except UnreachableError as error:
+        if endpoints.curve is not None and endpoints.curve.client_secret:
+            error.hint += "; with a key that may only publish: --blind"
+        raise
+    require_range(known, waveform.least_N, waveform.most_N)
+    return Watch(client, source)
 
 
 def _publish(
@@ -100,11 +103,14 @@ def _publish(
     address: str,
     waveform: Waveform,
     duration_s: float,
-    stream: Stream,
+    rate_hz: float,
+    valid_for_ms: float,
+    preview: int,
     is_interrupted: Callable[[], bool],
     watch: Watch | None,
-) -> Outcome:
-    rate_hz = stream.rate_hz
+) -> dict[str, Any]:
+    """Each setpoint has its own deadline, counted from the start, so that lateness does not add up. A setpoint whose
+    successor is due already is left out: the newest one wins anyway. Each carries the `preview` that follow it."""
     sent = skipped = index = 0
     worst_late_s = 0.0
     start_s, start_ns = time.monotonic(), time.time_ns()
@@ -121,11 +127,11 @@ def _publish(
         skipped += overdue
         index += overdue
         sample = waveform.at(index / rate_hz)
-        ahead = range(index + 1, index + 1 + stream.preview)
+        ahead = range(index + 1, index + 1 + preview)
         try:
             client.publish(
                 sample.force_N,
-                stream.valid_for_ms,
+                valid_for_ms,
                 start_ns + round(index / rate_hz * 1e9),  # when the force is meant, whenever it gets sent
                 displacement_mm=sample.displacement_mm,
                 rate_mm_s=sample.rate_mm_s,
@@ -138,22 +144,11 @@ def _publish(
         sent, index = sent + 1, index + 1
         if watch is not None:
             watch.look()
-    seconds = time.monotonic() - start_s
-    result = {
-        "source": stream.source,
+    return {
         "sent": sent,
         "skipped": skipped,
         "start_ns": start_ns,
-        "seconds": round(seconds, 3),
+        "seconds": round(time.monotonic() - start_s, 3),
         "worst_late_ms": round(worst_late_s * 1e3, 3),
         "interrupted": bool(is_interrupted()),
     }
-    fate = "whether they were taken is not known"
-    if watch is not None:
-        became = watch.finish(sent)
-        result |= msgspec.structs.asdict(became)
-        fate = f"{became.accepted} taken and rendered"
-        if became.limits:
-            fate += f", held by {', '.join(became.limits)} at times"
-    left_out = f", {skipped} left out because this machine was late" if skipped else ""
-    return Outcome(result, f"sent {sent} setpoints as {stream.source!r} in {seconds:.1f} s{left_out}; {fate}")

@@ -1,5 +1,6 @@
 """What `tormagctl top` shows: a pure function of what is known and of the terminal's size."""
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from statistics import fmean
@@ -10,7 +11,6 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from tormagd.ctl.sparkline import columns, span, sparkline
 from tormagd_client.messages import Explained, Status, Telemetry
 from tormagd_client.printable import printable
 
@@ -21,6 +21,7 @@ STANDARD_ROWS = 24
 LABEL, VALUE, ENDS = 10, 10, 12
 "Characters of a row's name, of its newest value with the unit, and of the ends of its scale."
 SILENT_S = 0.5
+EIGHTHS = " ▁▂▃▄▅▆▇█"
 STATE_STYLES = {"ENABLED": "black on green", "PAUSED": "black on yellow", "FAULT": "bold white on red"}
 GRADE_STYLES = {"warning": "yellow", "error": "red"}
 
@@ -178,3 +179,49 @@ def _code(code: str, how_long: str, style: str, explained: Mapping[str, Explaine
         text.append(f": {known.cause}")
         text.append(f"\nnext: {known.remedy}", "italic")
     return text
+
+
+def columns(
+    times_ns: Sequence[int],
+    values: Sequence[float | None],
+    count: int,
+    period_ns: int,
+    of_column: Callable[[list[float]], float],
+) -> list[float | None]:
+    """The newest `count` periods, the oldest first: what `of_column` makes of each one's values, None where none is.
+
+    Periods are those of the clock, so that a column stays what it is while the picture moves on.
+    """
+    if not times_ns:
+        return [None] * count
+    first = times_ns[-1] // period_ns - count + 1
+    gathered: list[list[float]] = [[] for _ in range(count)]
+    for t_ns, value in zip(times_ns, values, strict=True):
+        column = t_ns // period_ns - first
+        if 0 <= column < count and value is not None and math.isfinite(value):
+            gathered[column].append(value)
+    return [of_column(known) if known else None for known in gathered]
+
+
+def span(values: Sequence[float | None], least: float) -> tuple[float, float]:
+    """The range that all values lie in, no narrower than `least`: noise is not to look like a signal."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return 0.0, least
+    low, high = min(known), max(known)
+    wider = max(least - (high - low), 0.0) / 2.0
+    return low - wider, high + wider
+
+
+def sparkline(values: Sequence[float | None], low: float, high: float, rows: int) -> list[str]:
+    """`rows` lines of bars from `low` (one eighth of a character) to `high` (all rows), the top line first."""
+    steps = len(EIGHTHS) - 1
+    full = rows * steps
+    eighths = [
+        0 if value is None else 1 + round((full - 1) * min(max((value - low) / (high - low), 0.0), 1.0))
+        for value in values
+    ]
+    return [
+        "".join(EIGHTHS[min(max(height - row * steps, 0), steps)] for height in eighths)
+        for row in reversed(range(rows))
+    ]

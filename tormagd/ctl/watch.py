@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from tormagd.ctl.operate import in_fault
+from tormagd.ctl.operate import require_no_fault
 from tormagd.ctl.outcome import CommandError, Exit
 from tormagd.output import write_line
 from tormagd_client.blocking import Client
@@ -59,10 +59,10 @@ def require_range(known: Description, least_N: float, most_N: float) -> None:
 def held_back(status: Status, source: str, *, is_over: bool = False) -> CommandError | None:
     """Why the setpoints of `source` are not rendered, as the error that it is; None while they are.
 
-    With `is_over` they have been: whether the newest one is still valid does not matter any more.
+    With `is_over` they have been: whether the newest one is still valid does not matter any more. Raises CommandError
+    (FAULT) where the device is in FAULT: nothing is sent to it any more.
     """
-    if status.operating_state == "FAULT":
-        return in_fault(status, "the device is in FAULT")
+    require_no_fault(status, "the device is in FAULT")
     if status.operating_state != "ENABLED":
         enable = f"{'' if status.is_homed else 'tormagctl home, then '}tormagctl enable"
         return CommandError(
@@ -101,7 +101,7 @@ class Watch:
     def __init__(self, client: Client, source: str) -> None:
         self._client, self._source = client, source
         before = client.status()
-        self._raise_fault(held_back(before, source))
+        held_back(before, source)  # it may go on to be enabled, but not in FAULT
         self._before = _accepted(before, source)
         self._asked: Pending | None = None
         self._look_s: float | None = None
@@ -124,7 +124,6 @@ class Watch:
         self._asked, self._look_s = None, now_s + LOOK_S
         status = understood(result)
         held = held_back(status, self._source)
-        self._raise_fault(held)
         self._limits |= dict.fromkeys(status.limits)
         self._looks += 1
         if held is None:
@@ -145,7 +144,6 @@ class Watch:
             if accepted >= sent or time.monotonic() > until_s:
                 break
         held = held_back(status, self._source, is_over=True)
-        self._raise_fault(held)
         why = held or self._spoilt or (self._held if self._looks and not self._rendered else None)
         if why is not None:
             share = f"{self._rendered / self._looks:.0%} of the time" if self._looks else "none of them"
@@ -161,10 +159,6 @@ class Watch:
             )
         share_rendered = round(self._rendered / self._looks, 3) if self._looks else None
         return Fate(accepted, share_rendered, tuple(self._limits))
-
-    def _raise_fault(self, held: CommandError | None) -> None:
-        if held is not None and held.exit_code is Exit.FAULT:
-            raise held
 
 
 def _accepted(status: Status, source: str) -> int:

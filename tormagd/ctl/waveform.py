@@ -36,12 +36,21 @@ class Waveform(NamedTuple):
 def through(points: Sequence[tuple[float, float]]) -> Waveform:
     """Straight lines through these times, from 0 on and rising, and forces."""
     times_s, forces_N = zip(*points, strict=True)
+    return _lines(times_s, [forces_N])
+
+
+def _lines(times_s: Sequence[float], columns: Sequence[Sequence[float] | None]) -> Waveform:
+    """Straight lines between samples, whose columns are in the order of Sample's fields, None where there is none."""
+    forces_N = columns[0]
+    assert forces_N is not None  # every waveform is of forces
 
     def at(t_s: float) -> Sample:
-        right = min(max(bisect_right(times_s, t_s), 1), len(points) - 1)
-        (before_s, before_N), (after_s, after_N) = points[right - 1], points[right]
-        share = min(max((t_s - before_s) / (after_s - before_s), 0.0), 1.0)
-        return Sample(before_N + share * (after_N - before_N))
+        right = min(max(bisect_right(times_s, t_s), 1), len(times_s) - 1)
+        share = (t_s - times_s[right - 1]) / (times_s[right] - times_s[right - 1])
+        share = min(max(share, 0.0), 1.0)
+        force_N, *others = [None if c is None else c[right - 1] + (c[right] - c[right - 1]) * share for c in columns]
+        assert force_N is not None
+        return Sample(force_N, *others)
 
     return Waveform(times_s[-1], at, min(forces_N), max(forces_N))
 
@@ -93,15 +102,4 @@ def read_csv(path: Path) -> Waveform:
     table = read_forces(path)
     start_s = table["t_s"][0]
     times_s = array("d", (time_s - start_s for time_s in table["t_s"]))
-    # in the order of Sample's fields; None for a column that the file does not have
-    columns = [table.get(name) for name in ("force_N", *OPTIONAL_COLUMNS)]
-
-    def at(t_s: float) -> Sample:
-        right = min(max(bisect_right(times_s, t_s), 1), len(times_s) - 1)
-        share = (t_s - times_s[right - 1]) / (times_s[right] - times_s[right - 1])
-        share = min(1.0, max(0.0, share))
-        values = [None if c is None else c[right - 1] + (c[right] - c[right - 1]) * share for c in columns]
-        assert values[0] is not None  # force_N is a required column
-        return Sample(values[0], values[1], values[2])
-
-    return Waveform(times_s[-1], at, min(table["force_N"]), max(table["force_N"]))
+    return _lines(times_s, [table.get(name) for name in ("force_N", *OPTIONAL_COLUMNS)])

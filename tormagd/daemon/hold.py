@@ -23,14 +23,9 @@ class Hold(NamedTuple):
         return self._replace(number=self.number + 1)
 
 
-def rank(source: str, priority: tuple[str, ...]) -> int:
-    """The place in the configured order; what is not listed comes after all that is."""
-    return priority.index(source) if source in priority else len(priority)
-
-
 def is_passed(hold: Hold, source: str, priority: tuple[str, ...], *, is_stale: bool) -> bool:
     """Whether a message of another source makes it the holder. `is_stale`: the holder's newest setpoint is too old."""
-    if is_stale:
-        return True
-    # an operator's choice goes before the configured order
-    return not hold.is_given and rank(source, priority) < rank(hold.source, priority)
+    # an operator's choice goes before the configured order, and what is not listed comes after all that is
+    ranks = {name: place for place, name in enumerate(priority)}
+    goes_before = ranks.get(source, len(ranks)) < ranks.get(hold.source, len(ranks))
+    return is_stale or (not hold.is_given and goes_before)

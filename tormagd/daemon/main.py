@@ -11,9 +11,10 @@ import msgspec
 
 from firmware_protocol.build import settle
 from tormagd import __version__
-from tormagd.config import Config, load_config, placed
+from tormagd.config import Config, load_config
 from tormagd.daemon.log import log_to_stderr
 from tormagd.output import write_line
+from tormagd.toml_file import placed
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Endpoints
 from tormagd_client.printable import printable
 

@@ -1,7 +1,6 @@
 """How well one rate group keeps its time: rate, lateness, execution, overruns, merged ticks."""
 
 import math
-from enum import StrEnum
 from typing import Final, NamedTuple, final
 
 from msgspec.structs import asdict
@@ -79,14 +78,6 @@ def _upper_edge(index: int) -> int:
     return (part + 33) << (shift + 1)
 
 
-class Grade(StrEnum):
-    """How well time was kept over the horizon."""
-
-    GOOD = "good"
-    WARNING = "warning"
-    ERROR = "error"
-
-
 class _Mark(NamedTuple):
     """The counters at a turn of the horizon."""
 
@@ -149,20 +140,20 @@ class RateGroup:
         since = self._marks[0]
         return (self.runs - 1 - since.runs) / ((self._newest_ns - since.time_ns) * 1e-9)
 
-    def grade(self) -> Grade:
-        """ERROR with a stall within the horizon, WARNING with an overrun."""
+    def grade(self) -> str:
+        """How well time was kept over the horizon: error with a stall in it, warning with an overrun, else good."""
         if self._marks is None:
-            return Grade.GOOD
+            return "good"
         since = self._marks[0]
         if self.stalls > since.stalls:
-            return Grade.ERROR
-        return Grade.WARNING if self.overruns > since.overruns else Grade.GOOD
+            return "error"
+        return "warning" if self.overruns > since.overruns else "good"
 
     def refresh(self) -> None:
         """Builds `report`: counts since the start, percentiles over the horizon."""
         lateness = self._lateness.summary()
         self.report = RateReport(
-            grade=str(self.grade()),
+            grade=self.grade(),
             hz=round(self.rate_hz(), 2),
             runs=self.runs,
             merged=self.merged,

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import time
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from typing import Any
 
 import msgspec
@@ -37,7 +37,7 @@ class Live:
         self._explained: dict[str, Explained] = {}
         self._heard_s = time.monotonic()
         self._why_silent = ""
-        self._portrait = _portrait(description)
+        self._portrait = {"portrait": description.portrait}
         self._learn(status)
 
     @property
@@ -48,7 +48,12 @@ class Live:
     async def run(self) -> None:
         """Never ends by itself; a daemon that goes is waited for."""
         async with asyncio.TaskGroup() as tasks:
-            for each in (self._listen(), self._tell(), self._ask(), self._look_at_portrait()):
+            for each in (
+                self._listen(),
+                self._tell(),
+                self._every(STATUS_S, self._look_at_status),
+                self._every(PORTRAIT_S, self._look_at_portrait),
+            ):
                 tasks.create_task(each)
 
     @contextlib.contextmanager
@@ -85,27 +90,22 @@ class Live:
             elif silent_s > SILENT_S:
                 self._publish("silence", {"seconds": round(silent_s, 1), "why": self._why_silent})
 
-    async def _ask(self) -> None:
+    async def _every(self, period_s: float, look: Callable[[], Awaitable[None]]) -> None:
+        """Looks now and then at a daemon that is heard: requests to one that is not would wait, and come at once."""
         while True:
-            await asyncio.sleep(STATUS_S)
-            if self._is_heard:
+            await asyncio.sleep(period_s)
+            if time.monotonic() - self._heard_s < SILENT_S:
                 with contextlib.suppress(ClientError):  # the page says that nothing is heard
-                    self._status = await self._client.status()
-                    self._learn(self._status)
-                    self._publish("status", self._shown_status())
+                    await look()
+
+    async def _look_at_status(self) -> None:
+        self._status = await self._client.status()
+        self._learn(self._status)
+        self._publish("status", self._shown_status())
 
     async def _look_at_portrait(self) -> None:
-        while True:
-            await asyncio.sleep(PORTRAIT_S)
-            if self._is_heard:
-                with contextlib.suppress(ClientError):
-                    self._portrait = _portrait(await self._client.describe())
-                    self._publish("portrait", self._portrait)
-
-    @property
-    def _is_heard(self) -> bool:
-        """Requests to a daemon that is not there would wait for it, and all come at once."""
-        return time.monotonic() - self._heard_s < SILENT_S
+        self._portrait = {"portrait": (await self._client.describe()).portrait}
+        self._publish("portrait", self._portrait)
 
     def _publish(self, name: str, value: object) -> None:
         data = event(name, value)
@@ -142,7 +142,3 @@ class Live:
 def event(name: str, value: object) -> bytes:
     """A server-sent event with `value` as JSON."""
     return b"event: %s\ndata: %s\n\n" % (name.encode(), msgspec.json.encode(value))
-
-
-def _portrait(description: Description) -> dict[str, object]:
-    return {"portrait": description.portrait}

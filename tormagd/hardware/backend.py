@@ -11,9 +11,10 @@ from importlib import metadata
 from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 from firmware_protocol.codec import Message
-from tormagd.config import Device, Rates, checked, did_you_mean
+from tormagd.config import Device, Rates, checked
 from tormagd.hardware.can_stream import CanStream
 from tormagd.hardware.frame_stream import FrameStream
+from tormagd.named_file import did_you_mean
 from tormagd_client.endpoints import ConfigError, Strict
 
 ENTRY_POINTS = "tormagd.backends"

@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from typing import ClassVar
 
 from firmware_protocol.codec import (
@@ -18,7 +17,7 @@ from firmware_protocol.codec import (
     decode,
     encode,
 )
-from firmware_protocol.framing import Succession
+from firmware_protocol.framing import FramingStatistics, Succession
 
 FROM_DEVICE = (State, Sense, Status, Identity)
 UNREADABLE = (0x2000_0000, b"")
@@ -31,40 +30,19 @@ class SecondHostError(Exception):
     """Somebody else drives our node."""
 
 
-@dataclass(slots=True)
-class CanStatistics:
-    """What a CanStream has seen since it was made."""
-
-    __match_args__: ClassVar = ("bytes", "frames", "corrupt", "lost", "resynchronisations")
-
-    bytes: int = 0
-    """Payload bytes of the frames of our node."""
-    frames: int = 0
-    """Frames that were returned as messages."""
-    corrupt: int = 0
-    """Frames of our node that are no message, and error frames; what the bus itself discards is not seen."""
-    lost: int = 0
-    """State messages missing from their counter, those among them that arrived corrupt included; not those that were
-    only overtaken."""
-    repeated: int = 0
-    """Always 0: only State has a counter on CAN, and one that is no news is given out for the link to count."""
-    resynchronisations: int = 0
-    """Times a message was found again after something corrupt."""
-    unsent: int = 0
-    """Sent frames that the bus did not take at once; whoever sends them counts."""
-    refused: dict[str, str] = field(default_factory=dict)
-    """By message, why the newest one was refused."""
-
-
 class CanStream:
-    """Both directions of one conversation with one node. What does not decode is counted, never raised."""
+    """Both directions of one conversation with one node. What does not decode is counted, never raised.
+
+    `statistics` are of the frames of our node; what the bus itself discards is not seen. Corrupt are error frames, too,
+    and lost are States missing from their counter: one that is no news is given out for the link to count.
+    """
 
     __match_args__: ClassVar = ("node", "statistics", "_states", "_drives", "_synchronised")
 
     def __init__(self, node: int) -> None:
         """Raises EncodeError for a node outside 0..15."""
         self.node = node
-        self.statistics = CanStatistics()
+        self.statistics = FramingStatistics()
         self._identifiers = {message: can_identifier(function, node) for message, function in FUNCTION.items()}
         self._states = Succession()
         self._drives: deque[bytes] = deque(maxlen=ECHOES)

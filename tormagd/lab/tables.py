@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tormagd.bounded_file import MOST_TABLE_BYTES
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
 from tormagd_client.regular_file import require_regular
 
 MAX_ROWS = 5_000_000
+MOST_TABLE_BYTES = 1 << 30
+"A table of measurements, which is read row by row: a day of a testing machine."
 
 
 def read_columns(

@@ -2,9 +2,6 @@
 
 from typing import Final, final
 
-import numpy as np
-import numpy.typing as npt
-
 from firmware_protocol.value import Value
 
 TURN_MM: Final = 0.05
@@ -36,20 +33,3 @@ class Turn(Value):
     def displacement_mm(self, position_mm: float) -> float:
         """Travel from the turn to there, saturating at MOBILISED_MM."""
         return min(abs(position_mm - self.turned_mm), MOBILISED_MM)
-
-
-def displacement(handle_mm: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """The displacement at each of these positions (n, mm, in the order of time). NaN until a turn, or so much travel
-    that the last turn no longer matters.
-    """
-    found = np.full_like(handle_mm, np.nan)
-    start_mm = float(handle_mm[0])
-    turn, is_known = Turn(1.0, start_mm, start_mm), False
-    for index, position_mm in enumerate(handle_mm.tolist()):
-        last, turn = turn, turn.moved_to(position_mm)
-        # the first reversal may be no turn, but a handle that came this way all the time
-        has_turned = turn.direction != last.direction and last.turned_mm != last.furthest_mm
-        is_known = is_known or has_turned or abs(position_mm - start_mm) >= MOBILISED_MM
-        if is_known:
-            found[index] = turn.displacement_mm(position_mm)
-    return found

@@ -1,7 +1,7 @@
 """What the network is fed: the four features of Eq. 43, their units, their scaling, and the check at the border."""
 
 from enum import StrEnum
-from typing import Final, Self
+from typing import Final
 
 import msgspec
 import numpy as np
@@ -34,24 +34,6 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     input_gain: tuple[float, float, float, float]
     output_offset: float
     output_gain: float
-
-    @classmethod
-    def fit(cls, features: NDArray[np.float64], force_N: NDArray[np.float64]) -> Self:
-        """Map the range of each column of `features` (n x 4), and of `force_N` (n), onto -1..1."""
-        low, high = features.min(axis=0), features.max(axis=0)
-        span = high - low
-        gain = np.divide(2.0, span, out=np.zeros_like(span), where=span > 0)
-        force_low, force_high = float(force_N.min()), float(force_N.max())
-        if not force_high > force_low:
-            raise DomainError(
-                "force_N", force_low, "at least two different values, otherwise there is nothing to learn"
-            )
-        return cls(
-            input_offset=tuple(((low + high) / 2).tolist()),
-            input_gain=tuple(gain.tolist()),
-            output_offset=(force_low + force_high) / 2,
-            output_gain=2 / (force_high - force_low),
-        )
 
     def scaled(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
         """Map `features` (n x 4) to -1..1."""

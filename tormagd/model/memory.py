@@ -30,13 +30,8 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     turn_mT: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, fractions in (("fractions", self.fractions), ("field_fractions", self._field_fractions)):
-            if len(self.times_s) != len(fractions) or len(fractions) > MOST_TERMS:
-                raise DomainError("memory.times_s", self.times_s, f"one for each of {name}, at most {MOST_TERMS}")
-            for fraction in fractions:
-                require(f"memory.{name}", fraction, 0.0, 1.0)
-            if not sum(fractions, 0.0) < 1.0:
-                raise DomainError(f"memory.{name}", fractions, "a sum below 1")
+        for series in (self.free, self.added):  # these refuse what is no series at all
+            require("memory.times_s, count", len(series.times_s), 0, MOST_TERMS)
         for time_s in self.times_s:
             require("memory.times_s", time_s, 1e-3, LONGEST_S)
         if any(before >= after for before, after in pairwise(self.times_s)):

@@ -32,7 +32,7 @@ from tormagd.model.features import (
     require_features,
     require_number,
 )
-from tormagd.model.force_curve import ForceCurve, Known, Network, require_inputs
+from tormagd.model.force_curve import ForceCurve, Known, Network
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.physics.errors import DomainError
 
@@ -126,7 +126,6 @@ class ForceModel:
     output_weight: Array
     output_bias: float
     physical: PhysicalLayers = field(init=False, repr=False)
-    _tanh: PhysicalLayers = field(init=False, repr=False)
     network: Network = field(init=False, repr=False)
     "The same again, on floats alone: its curves are what plans ask."
 
@@ -136,10 +135,7 @@ class ForceModel:
             object.__setattr__(self, name, _weights(name, getattr(self, name), shape))
         require_number("output_bias", self.output_bias)
         object.__setattr__(self, "physical", self._fold())
-        # sigmoid(z) = (1 + tanh(z/2)) / 2: one operation fewer than exp, and it cannot overflow
         weight, bias, output, constant = self.physical
-        halved = PhysicalLayers(weight / 2, bias / 2, output / 2, constant + float(output.sum()) / 2)
-        object.__setattr__(self, "_tanh", halved)
         known = Known(self.feature_ranges, self.force_span_N)
         object.__setattr__(self, "network", Network(weight, bias, output, constant, known))
 
@@ -185,23 +181,23 @@ class ForceModel:
         """Force in N (n) for `features` (n x 4, order of `FEATURES`). Raises `DomainError` on a wrong shape or NaN."""
         rows = np.asarray(features, dtype=np.float64)
         require_features(rows)
-        weight, bias, output, constant = self._tanh
-        return np.asarray(np.tanh(rows @ weight.T + bias) @ output + constant, dtype=np.float64)
+        weight, bias, output, constant = self.physical
+        # sigmoid(z) = (1 + tanh(z/2)) / 2: one operation fewer than exp, and it cannot overflow
+        forces_N = np.tanh((rows @ weight.T + bias) / 2) @ (output / 2) + (constant + float(output.sum()) / 2)
+        return np.asarray(forces_N, dtype=np.float64)
 
     def predict_one(self, displacement_mm: float, rate_mm_s: float, field_mT: float, cip_percent: float) -> float:
-        """Force in N at one point: `predict` without its overhead. Raises `DomainError` on a non-finite input."""
-        require_inputs(displacement_mm, rate_mm_s, field_mT, cip_percent)
-        weight, bias, output, constant = self._tanh
-        hidden = weight.dot((displacement_mm, rate_mm_s, field_mT, cip_percent))
-        hidden += bias
-        return float(output.dot(np.tanh(hidden, hidden))) + constant
+        """Force in N at one point, as plans know it. Raises `DomainError` on a non-finite input."""
+        require_number("field_mT", field_mT)
+        return self.curve(displacement_mm, rate_mm_s, cip_percent).force_N(field_mT)
 
     def field_slope_N_per_mT(self, features: ArrayLike) -> Array:
         """dF/dB (n) at `features` (n x 4). Raises `DomainError` like `predict`."""
         rows = np.asarray(features, dtype=np.float64)
         require_features(rows)
-        weight, bias, output, _ = self._tanh
-        return np.asarray((1 - np.tanh(rows @ weight.T + bias) ** 2) @ (output * weight[:, FIELD]), dtype=np.float64)
+        weight, bias, output, _ = self.physical
+        rises = 1 - np.tanh((rows @ weight.T + bias) / 2) ** 2
+        return np.asarray(rises @ (output * weight[:, FIELD] / 4), dtype=np.float64)
 
 
 def save_model(path: Path | str, model: ForceModel) -> None:

@@ -26,7 +26,6 @@ Formulas are written once and serve floats (through `math`, for the control loop
 """
 
 import math
-import sys
 from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -36,9 +35,6 @@ from tormagd.physics.errors import Real
 
 MAX_COMPRESSION = 0.95
 """Largest compression the model is used at (lambda1 = 0.05): the force goes to infinity as lambda1 goes to 0."""
-
-_NEWTON_STEPS = 100
-"""Enough for bisection alone; Newton's method takes at most 8 or so (see the tests)."""
 
 _SCALAR = SimpleNamespace(
     sqrt=math.sqrt,
@@ -50,7 +46,7 @@ _SCALAR = SimpleNamespace(
 )
 
 
-def _functions(value: Any) -> SimpleNamespace | ModuleType:
+def functions(value: Any) -> SimpleNamespace | ModuleType:
     """The elementary functions that fit the value's type."""
     return _SCALAR if isinstance(value, float | int) else np
 
@@ -69,7 +65,7 @@ class BrakeCurve(NamedTuple):
 
     def compression(self, load: Real) -> Real:
         """eps = 1 - lambda1 at the load y >= 0."""
-        fn = _functions(load)
+        fn = functions(load)
         p = 1.0 - self.a * load
         larger = fn.sqrt(p * p + 2.0 * self.b * load) + abs(p)
         # a thin wall under a high load has p < 0, where the plain difference is the one that does not cancel
@@ -83,51 +79,8 @@ class BrakeCurve(NamedTuple):
 
     def force(self, compression: Real, load: Real) -> Real:
         """phi at a load and the compression it gives."""
-        fn = _functions(load)
+        fn = functions(load)
         stretch = 1.0 - compression
         elastic: Real = fn.expm1(-4.0 * fn.log1p(-compression))
         magnetic = 4.0 * (1.0 + self.wall) * load / (stretch * stretch)
         return (elastic + magnetic) / stretch
-
-    def force_slope(self, compression: Real, load: Real) -> Real:
-        """d phi / d y; every term is positive."""
-        stretch, w = 1.0 - compression, self.wall
-        # d phi / d eps at constant load, then d phi / d y at constant stretch
-        elastic, magnetic = 5.0 / stretch**6 - 1.0 / stretch**2, 12.0 * (1.0 + w) * load / stretch**4
-        return (elastic + magnetic) * self._compression_slope(compression, load) + 4.0 * (1.0 + w) / stretch**3
-
-    def compression_for_force(self, force: Real) -> Real:
-        """eps at which phi(eps) is `force`, for 0 <= force <= phi(0.95): inverse of the curve along eps.
-
-        Newton's method on log(phi) over log(eps / lambda1), where the curve's slope goes from 1 to 5 only, kept inside
-        a shrinking bracket. It starts at the root of the small-load limit, phi = 4 eps (1 + (1 + w) / B).
-        """
-        fn = _functions(force)
-        rounding = 4.0 * float(np.finfo(force.dtype).eps if isinstance(force, np.ndarray) else sys.float_info.epsilon)
-        wanted = fn.where(force > 0.0, force, 1.0)
-        low, high = 0.0 * wanted, MAX_COMPRESSION + 0.0 * wanted
-        compression = 0.25 * wanted / (1.0 + (1.0 + self.wall) / self.b)
-        compression = fn.where(compression < 0.5, compression, 0.5)
-        for _ in range(_NEWTON_STEPS):
-            load = self.load(compression)
-            value = self.force(compression, load)
-            above = value > wanted
-            low, high = fn.where(above, low, compression), fn.where(above, compression, high)
-            per_compression = self.force_slope(compression, load) / self._compression_slope(compression, load)
-            odds = compression / (1.0 - compression)
-            step = -fn.log(value / wanted) * value / (per_compression * compression * (1.0 - compression))
-            # odds * exp(step) to second order, positive and without overflow
-            odds = fn.where(above, odds / (1.0 + abs(step)), odds * (1.0 + abs(step)))
-            trial = odds / (1.0 + odds)
-            settled = abs(trial - compression) <= rounding * compression
-            # a step down to rounding is taken as it is: noise may put it just outside the bracket
-            good = settled | ((trial > low) & (trial < high))
-            compression = fn.where(good, trial, 0.5 * (low + high))
-            if fn.all(settled):
-                break
-        result: Real = fn.where(force > 0.0, compression, 0.0 * wanted)
-        return result
-
-    def _compression_slope(self, compression: Real, load: Real) -> Real:
-        """d eps / d y = (B + A eps) / r, with r = p + eps."""
-        return (self.b + self.a * compression) / (1.0 - self.a * load + compression)

@@ -7,7 +7,7 @@ which is the opposite of what table 2.4 measured.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeAlias
 
 from tormagd.physics.errors import Real, require
 
@@ -23,27 +23,6 @@ _EQ7_C1, _EQ7_C2, _EQ7_P = 1.206, 1256.0, 1.867
 _EQ7_MIN_MM, _EQ7_MAX_MM = 45.0, 95.0
 
 
-class FieldLaw(Protocol):
-    """A strictly falling map from gap (mm) to radial moment (T m), with its inverse and slope.
-
-    Every method takes a float or an array, returns the same kind and shape, and raises `DomainError` for a gap outside
-    `gap_range_mm`, or a radial moment that no gap in that range gives.
-    """
-
-    @property
-    def gap_range_mm(self) -> tuple[float, float]:
-        """Smallest and largest gap for which the law holds, mm."""
-
-    def radial_moment_Tm(self, gap_mm: Real) -> Real:
-        """Radial moment a, T m."""
-
-    def gap_mm(self, radial_moment_Tm: Real) -> Real:
-        """Gap with that radial moment, mm."""
-
-    def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
-        """First derivative of the radial moment, T m per mm; never positive."""
-
-
 @dataclass(frozen=True, slots=True)
 class ThesisFieldLaw:
     """Thesis Eq. 7: a = c1 (95 - gap)^p + c2, in mT mm, on 45..95 mm.
@@ -56,6 +35,7 @@ class ThesisFieldLaw:
 
     @property
     def gap_range_mm(self) -> tuple[float, float]:
+        """Smallest and largest gap for which the law holds, mm."""
         return _EQ7_MIN_MM, _EQ7_MAX_MM
 
     def radial_moment_Tm(self, gap_mm: Real) -> Real:
@@ -104,6 +84,14 @@ class PowerFieldLaw:
     def d_radial_moment_d_gap(self, gap_mm: Real) -> Real:
         require("gap_mm", gap_mm, *self.gap_range_mm)
         return self.coefficient * self.exponent * _power(gap_mm, self.exponent - 1.0)
+
+
+FieldLaw: TypeAlias = ThesisFieldLaw | PowerFieldLaw
+"""A strictly falling map from gap (mm) to radial moment (T m), with its inverse and slope.
+
+Every method takes a float or an array, returns the same kind and shape, and raises `DomainError` for a gap outside
+`gap_range_mm`, or a radial moment that no gap in that range gives.
+"""
 
 
 def flux_density_T(radial_moment_Tm: Real, relative_permeability: float, radius_m: float) -> Real:

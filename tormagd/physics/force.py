@@ -1,4 +1,4 @@
-"""The magnetoelastic brake force: from the radial moment of the field to the friction force at the roller, and back.
+"""The magnetoelastic brake force: from the radial moment of the field to the friction force at the roller.
 
 This is the thesis's chain (Eq. 29..34, with Gamma_1 and Gamma_2 as its appendix has them) with units; the dimensionless
 curve it reduces to, and why it is written so, is in `tormagd.physics.brake_curve`:
@@ -7,7 +7,7 @@ curve it reduces to, and why it is written so, is in `tormagd.physics.brake_curv
     F = 2 pi t R_i^2 mu_d G0 / R_w * curve(y)                      Eq. 33 and 34
 
 The radial moment a (`radial_moment_Tm`) is that of `tormagd.physics.field`, without mu_r / 4. F rises strictly with it,
-so the inverse is unique. The model is used for a radial stretch lambda1 >= 0.05 only.
+so the inverse is unique; `tormagd.lab.design.force_law` has it. The model is used for a stretch lambda1 >= 0.05 only.
 
 Every function takes a float (and returns one; about ten times faster), or an array of float32 or float64 whose shape
 and type the result keeps. All raise `DomainError` for NaN and for values outside the stated domain.
@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from tormagd.physics.brake_curve import MAX_COMPRESSION, BrakeCurve
 from tormagd.physics.errors import DomainError, Real, require
-from tormagd.physics.field import REFERENCE_PERMEABILITY, FieldLaw
+from tormagd.physics.field import REFERENCE_PERMEABILITY
 
 MU0_H_M = 4e-7 * math.pi
 
@@ -67,57 +67,23 @@ class Elastomer:
 
 def max_radial_moment_Tm(elastomer: Elastomer, geometry: Geometry) -> float:
     """Largest admissible radial moment, T m: the one that compresses the elastomer to lambda1 = 0.05."""
-    return _reduce(elastomer, geometry).max_moment_Tm
-
-
-def stretch_minus_one(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Radial stretch at the shaft less one, lambda1 - 1, from -0.95 to 0 (Eq. 29)."""
-    law = _reduce(elastomer, geometry)
-    require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
-    return -law.curve.compression(law.load(radial_moment_Tm))
+    return reduced(elastomer, geometry).max_moment_Tm
 
 
 def brake_force_N(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
     """Kinetic friction force at the roller, N, >= 0 (Eq. 33 and 34)."""
-    law = _reduce(elastomer, geometry)
+    law = reduced(elastomer, geometry)
     require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
     return law.force(radial_moment_Tm)
 
 
-def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Slope of the force over the radial moment, N / (T m), >= 0."""
-    law = _reduce(elastomer, geometry)
-    require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
-    load = law.load(radial_moment_Tm)
-    slope = law.curve.force_slope(law.curve.compression(load), load)
-    return 2.0 * law.force_scale_N * law.load_root_per_Tm**2 * radial_moment_Tm * slope
-
-
-def d_force_d_gap(gap_mm: Real, field: FieldLaw, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Slope of the force over the gap, N/mm, <= 0 (the bracket of Eq. 36)."""
-    return d_force_d_moment(field.radial_moment_Tm(gap_mm), elastomer, geometry) * field.d_radial_moment_d_gap(gap_mm)
-
-
-def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
-    """Radial moment that gives the force, T m: inverse of `brake_force_N`.
-
-    Raises `DomainError` unless 0 <= force_N <= the force at `max_radial_moment_Tm`.
-    """
-    law = _reduce(elastomer, geometry)
-    require("force_N", force_N, 0.0, law.max_force_N)
-    load = law.curve.load(law.curve.compression_for_force(force_N / law.force_scale_N))
-    root: Real = load**0.5
-    return root / law.load_root_per_Tm
-
-
-class _Reduced(NamedTuple):
+class Reduced(NamedTuple):
     """One elastomer in one geometry: the dimensionless curve and the two scales that give it units."""
 
     curve: BrakeCurve
     load_root_per_Tm: float
     force_scale_N: float
     max_moment_Tm: float
-    max_force_N: float
 
     def load(self, moment_Tm: Real) -> Real:
         root = self.load_root_per_Tm * moment_Tm
@@ -129,7 +95,8 @@ class _Reduced(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _reduce(elastomer: Elastomer, geometry: Geometry) -> _Reduced:
+def reduced(elastomer: Elastomer, geometry: Geometry) -> Reduced:
+    """The law of one elastomer in one geometry."""
     g0, mu_r = elastomer.shear_modulus_Pa, elastomer.relative_permeability
     inner, outer, thickness = geometry.inner_radius_m, geometry.outer_radius_m, geometry.thickness_m
     curve = BrakeCurve.of(wall=(outer - inner) / inner, body_force=thickness * (mu_r - 1.0))
@@ -137,6 +104,4 @@ def _reduce(elastomer: Elastomer, geometry: Geometry) -> _Reduced:
     root = math.sqrt(mu_r / (4.0 * MU0_H_M * g0 * outer * inner)) / REFERENCE_PERMEABILITY
     scale_N = 2.0 * math.pi * thickness * inner * inner * elastomer.friction_coefficient * g0 / geometry.roller_radius_m
     max_moment_Tm = math.sqrt(curve.load(MAX_COMPRESSION)) / root
-    edge = _Reduced(curve, root, scale_N, max_moment_Tm, max_force_N=math.inf)
-    # evaluated as any other force, so that the force of the largest moment is admitted to the last digit
-    return edge._replace(max_force_N=edge.force(max_moment_Tm))
+    return Reduced(curve, root, scale_N, max_moment_Tm)

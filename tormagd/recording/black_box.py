@@ -12,15 +12,14 @@ from typing import Any
 
 import msgspec
 from mcap.records import Channel, Message, Metadata
-from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from tormagd import __version__
 from tormagd.bounded_file import in_place_of
 from tormagd.keeping import READ, WROTE, Part
-from tormagd.recording.closing import ABOUT
-from tormagd.recording.reader import MAX_FILE_BYTES, MAX_RECORD_BYTES, UNREADABLE, RecordingError
+from tormagd.recording.reader import RecordingError, opened, scan
 from tormagd.recording.writer import (
+    ABOUT,
     CHUNK_BYTES,
     TICK_KINDS,
     TICKS_TOPIC,
@@ -29,7 +28,6 @@ from tormagd.recording.writer import (
     registered,
     tick_schema,
 )
-from tormagd_client.regular_file import require_regular
 
 CORE_TOPIC, FRAMES_TOPIC = "/core", "/frames"
 HEADER = "black_box"
@@ -87,23 +85,21 @@ def _write(path: Path, header: dict[str, str], parts: Sequence[Part]) -> int:
         mcap.add_metadata(ABOUT, {"version": __version__, "kind": HEADER})
         core = mcap.register_channel(topic=CORE_TOPIC, message_encoding="msgpack", schema_id=0)
         kinds = {name: TICK_KINDS[name] for name in columns if name in TICK_KINDS}
-        _, tick_channel = registered(mcap, TICKS_TOPIC, tick_schema(kinds))
-        _, frame_channel = registered(mcap, FRAMES_TOPIC, plain_schema(Frame))
+        tick_channel = registered(mcap, TICKS_TOPIC, tick_schema(kinds))
+        frame_channel = registered(mcap, FRAMES_TOPIC, plain_schema(Frame))
         began = parts[0]
         for number, part in enumerate(parts):
             mcap.add_message(core, log_time=part.t_ns, data=part.entries, publish_time=part.t_ns, sequence=number)
             for entry in msgspec.msgpack.decode(part.entries):
                 if is_tick(entry):
                     data = msgspec.json.encode(known_values(columns, entry))
-                    mcap.add_message(
-                        tick_channel.id, log_time=entry[0], data=data, publish_time=entry[0], sequence=ticks
-                    )
+                    mcap.add_message(tick_channel, log_time=entry[0], data=data, publish_time=entry[0], sequence=ticks)
                     ticks += 1
                 for frame in frames_in(entry):
                     frames += 1
                     t_ns = began.t_ns + round((frame.monotonic_s - began.time_s) * 1e9)  # so they stay in their order
                     data = msgspec.json.encode(frame)
-                    mcap.add_message(frame_channel.id, log_time=t_ns, data=data, publish_time=t_ns, sequence=frames)
+                    mcap.add_message(frame_channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=frames)
         mcap.finish()  # type: ignore[no-untyped-call]
     return ticks
 
@@ -118,32 +114,24 @@ def read_black_box(path: Path) -> BlackBoxFile:
     header: dict[str, str] = {}
     entries: list[Any] = []
     cores: set[int] = set()
-    size, parts, is_complete = 0, 0, True
-    try:
-        require_regular(path, MAX_FILE_BYTES)
-        with path.open("rb") as file:
-            try:
-                for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:
-                    if isinstance(record, Channel) and record.topic == CORE_TOPIC:
-                        if record.message_encoding != "msgpack":
-                            raise ValueError(f"{CORE_TOPIC} is {record.message_encoding[:20]!r}: allowed is msgpack")
-                        cores.add(record.id)
-                    elif isinstance(record, Metadata) and record.name == HEADER:
-                        header.update(record.metadata)
-                    elif isinstance(record, Message) and record.channel_id in cores:
-                        size, parts = size + len(record.data), parts + 1
-                        if size > MAX_BYTES or parts > MAX_PARTS:
-                            raise ValueError(f"over {MAX_BYTES} bytes or {MAX_PARTS} parts")
-                        entries.extend(msgspec.msgpack.decode(record.data, type=list[Any]))
-            except UNREADABLE:
-                # a record that runs into the end of the file was being written when its writer died
-                if file.read(1) or not entries:
-                    raise
-                is_complete = False
-    except OSError as error:
-        raise RecordingError(f"{path}: {error.strerror}") from error
-    except (*UNREADABLE, RecursionError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: not an intact MCAP file ({str(error)[:200]})") from error
-    if not header or not cores:
-        raise RecordingError(f"{path}: no black box of tormagd: it has no {CORE_TOPIC} or no header {HEADER!r}")
+    size = parts = 0
+
+    def take(record: Any) -> None:
+        nonlocal size, parts
+        if isinstance(record, Channel) and record.topic == CORE_TOPIC:
+            if record.message_encoding != "msgpack":
+                raise ValueError(f"{CORE_TOPIC} is {record.message_encoding[:20]!r}: allowed is msgpack")
+            cores.add(record.id)
+        elif isinstance(record, Metadata) and record.name == HEADER:
+            header.update(record.metadata)
+        elif isinstance(record, Message) and record.channel_id in cores:
+            size, parts = size + len(record.data), parts + 1
+            if size > MAX_BYTES or parts > MAX_PARTS:
+                raise ValueError(f"over {MAX_BYTES} bytes or {MAX_PARTS} parts")
+            entries.extend(msgspec.msgpack.decode(record.data, type=list[Any]))
+
+    with opened(path) as file:
+        is_complete = scan(file, str(path), take)
+    if not header or not entries:
+        raise RecordingError(f"{path}: no black box of tormagd: it has nothing in {CORE_TOPIC} or no header {HEADER!r}")
     return BlackBoxFile(header, entries, is_complete)

@@ -1,8 +1,9 @@
 """Reading a recording back into columns."""
 
+import contextlib
 import math
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,14 +16,15 @@ from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 from zstandard import ZstdError
 
-from tormagd.recording.closing import ABOUT, CUT
-from tormagd.recording.writer import TELEMETRY_TOPIC, TICKS_TOPIC
+from tormagd.recording.writer import ABOUT, CUT, TELEMETRY_TOPIC, TICKS_TOPIC
 from tormagd_client.regular_file import require_regular
 
 MAX_FILE_BYTES = 1 << 40
 MAX_RECORD_BYTES = 64_000_000
 MAX_NESTING = 2
-UNREADABLE = (McapError, ZstdError, ValueError, OverflowError, MemoryError, struct.error, msgspec.MsgspecError)
+UNREADABLE = (
+    McapError, ZstdError, ValueError, OverflowError, MemoryError, RecursionError, struct.error, msgspec.MsgspecError,
+)  # fmt: skip
 """What damage raises; MemoryError where a damaged length asks for more than there is."""
 
 
@@ -34,9 +36,9 @@ class RecordingError(ValueError):
 class Columns:
     """The messages of one topic, one row each, in the order they were written.
 
-    `numbers[name]` is float64 of shape (rows,), with NaN where a value was not known or the row had no such column;
-    true and false are 1 and 0. `words[name]` holds a tuple of strings for each row. An object's or a list's members get
-    names of their own: `tick.exec_us`, `duty.0`.
+    `numbers[name]` is float64 of shape (rows,), with NaN where a value was not known; true and false are 1 and 0.
+    `words[name]` holds a tuple of strings for each row. An object's or a list's members get names of their own:
+    `tick.exec_us`, `duty.0`. What the file's schemas name has a column, known or not.
     """
 
     t_ns: NDArray[np.int64]
@@ -62,14 +64,39 @@ class Recording:
             return None
 
 
-def read_recording(path: Path) -> Recording:
-    """The recording in `path`. Raises RecordingError: not readable, not MCAP, damaged, or not written by tormagd."""
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """The file in `path`. Raises RecordingError where it is not readable."""
     try:
         require_regular(path, MAX_FILE_BYTES)
         with path.open("rb") as file:
-            return read_open_recording(file, str(path))
+            yield file
     except OSError as error:
         raise RecordingError(f"{path}: {error.strerror}") from error
+
+
+def scan(file: BinaryIO, name: str, take: Callable[[Any], None]) -> bool:
+    """Hands each of the file's records to `take`, which may raise UNREADABLE; False where it ends in the middle of one.
+    Raises RecordingError, in which the file is called `name`: not MCAP, or damaged."""
+    record: Any = None
+    try:
+        try:
+            for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:
+                take(record)
+        except UNREADABLE:
+            # a record that runs into the end of the file was being written when its writer died
+            if file.read(1) or record is None:
+                raise
+            return False
+    except UNREADABLE as error:
+        raise RecordingError(f"{name}: not an intact MCAP file ({str(error)[:200]})") from error
+    return True
+
+
+def read_recording(path: Path) -> Recording:
+    """The recording in `path`. Raises RecordingError: not readable, not MCAP, damaged, or not written by tormagd."""
+    with opened(path) as file:
+        return read_open_recording(file, str(path))
 
 
 def read_open_recording(file: BinaryIO, name: str, only: Collection[str] | None = None) -> Recording:
@@ -80,33 +107,26 @@ def read_open_recording(file: BinaryIO, name: str, only: Collection[str] | None 
     metadata: dict[str, str] = {}
     topics: dict[int, str] = {}
     schemas: dict[int, bytes] = {}
-    is_complete = True
-    try:
-        try:
-            for record in StreamReader(file, record_size_limit=MAX_RECORD_BYTES, validate_crcs=True).records:
-                if isinstance(record, Schema):
-                    schemas[record.id] = record.data
-                elif isinstance(record, Channel):
-                    topics[record.id] = record.topic
-                    if record.topic in builders and record.schema_id in schemas:
-                        builders[record.topic].expect(msgspec.json.decode(schemas[record.schema_id]))
-                elif isinstance(record, Metadata) and record.name == ABOUT:
-                    metadata.update(record.metadata)
-                elif isinstance(record, Message) and topics.get(record.channel_id) in builders:
-                    builders[topics[record.channel_id]].add(record.log_time, msgspec.json.decode(record.data))
-        except UNREADABLE:
-            # a record that runs into the end of the file was being written when the recorder died
-            if file.read(1):
-                raise
-            is_complete = False
-        telemetry, ticks = builders[TELEMETRY_TOPIC].columns(), builders[TICKS_TOPIC].columns()
-    except UNREADABLE as error:
-        raise RecordingError(f"{name}: not an intact MCAP recording ({error})") from error
+
+    def take(record: Any) -> None:
+        if isinstance(record, Schema):
+            schemas[record.id] = record.data
+        elif isinstance(record, Channel):
+            topics[record.id] = record.topic
+            if record.topic in builders and record.schema_id in schemas:
+                builders[record.topic].expect(msgspec.json.decode(schemas[record.schema_id]))
+        elif isinstance(record, Metadata) and record.name == ABOUT:
+            metadata.update(record.metadata)
+        elif isinstance(record, Message) and topics.get(record.channel_id) in builders:
+            builders[topics[record.channel_id]].add(record.log_time, msgspec.json.decode(record.data))
+
+    is_whole = scan(file, name, take)
     if not set(topics.values()) & set(builders):
         raise RecordingError(
             f"{name}: no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
         )
-    return Recording(telemetry, ticks, metadata, is_complete and CUT not in metadata)
+    telemetry, ticks = builders[TELEMETRY_TOPIC].columns(), builders[TICKS_TOPIC].columns()
+    return Recording(telemetry, ticks, metadata, is_whole and CUT not in metadata)
 
 
 class _Builder:
@@ -138,12 +158,11 @@ class _Builder:
     def expect(self, schema: object) -> None:
         """The columns that the schema names are there, whether anything is ever known of them or not."""
         for name, kind in _columns("", schema, MAX_NESTING):
-            if self._only is not None and name.partition(".")[0] not in self._only:
-                continue
-            if kind in ("number", "integer", "boolean"):
-                self._numbers.setdefault(name, [])
-            elif kind in ("string", "array"):
-                self._words.setdefault(name, [])
+            if self._only is None or name.partition(".")[0] in self._only:
+                if kind in ("number", "integer", "boolean"):
+                    self._numbers.setdefault(name, [])
+                elif kind in ("string", "array"):
+                    self._words.setdefault(name, [])
 
     def columns(self) -> Columns:
         rows = len(self._t_ns)

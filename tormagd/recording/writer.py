@@ -6,21 +6,25 @@ schemas only, in which a number cannot be null.
 """
 
 import contextlib
+import errno
 import math
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import msgspec
-from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
 from tormagd import __version__
-from tormagd.recording.closing import ABOUT, CUT, close_cut
 from tormagd.recording.ticks import TickBatch, Value
 from tormagd_client.messages import Telemetry, TickRecord
 
+ABOUT = "tormagd"
+"The metadata records that say what is recorded."
+CUT = "cut_by"
+"Among them: why a recording ends before its end."
 TELEMETRY_TOPIC = "/telemetry"
 TICKS_TOPIC = "/ticks"
 NUMBER_COLUMN = "tick"
@@ -28,6 +32,10 @@ NUMBER_COLUMN = "tick"
 CHUNK_BYTES = 1024 * 1024
 CHUNK_NS = 500_000_000
 "So much is written at once, and lost where the recorder is killed."
+LEAST_FREE_BYTES = 16_000_000
+"A recording ends before the disk is full: the last chunk needs room, and the index, which grows with the file."
+INDEX_SHARE = 64
+"At most such a part of the file is its index."
 GAP_NS = 10_000_000
 "A step between two ticks that counts as a gap. Under one lost batch (20 ms), above a few merged ticks."
 
@@ -38,17 +46,16 @@ class RecordingWriter:
     `telemetry_count`, `tick_count`, `telemetry_lost` (missing `seq`), `ticks_lost` (missing numbers), `gaps` (steps
     between ticks above GAP_NS, or back in time) and `longest_gap_ms` count what was written. Raises FileExistsError
     rather than overwrite a recording, and OSError where the file cannot be made or, from `telemetry`, `ticks`,
-    `describe` and `close`, written. What the disk took of it is closed in order then, and reads like any other.
+    `describe` and `close`, written. Where the disk is nearly full, it is closed in order first, and says why; where the
+    disk fails without that warning, it reads up to its last whole chunk.
     """
 
     def __init__(self, path: Path, metadata: dict[str, str] | None = None) -> None:
         self._path, self._file = path, path.open("xb")
         self._mcap = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._schemas: list[Schema] = []
-        self._channels: list[Channel] = []
         self._mcap.start(profile="", library=f"tormagd {__version__}")
         self.describe({"version": __version__, **(metadata or {})})
-        self._telemetry_channel = self._channel(TELEMETRY_TOPIC, plain_schema(Telemetry))
+        self._telemetry_channel = registered(self._mcap, TELEMETRY_TOPIC, plain_schema(Telemetry))
         self._tick_channels: dict[tuple[tuple[str, str], ...], int] = {}
         self._columns: tuple[str, ...] = ()
         self._kinds: dict[str, str] = {}
@@ -118,15 +125,11 @@ class RecordingWriter:
     def close(self) -> None:
         """Write the index and close the file. Without it the file still reads, up to its last whole chunk.
 
-        Raises OSError where the index or the last chunk could not be written; what was is closed in order then too.
+        Raises OSError where the index or the last chunk could not be written.
         """
         if not self._file.closed:
-            try:
+            with self._file:
                 self._mcap.finish()  # type: ignore[no-untyped-call]
-                self._file.close()
-            except OSError as error:
-                self._close_cut(error)
-                raise
 
     def __enter__(self) -> Self:
         return self
@@ -135,16 +138,10 @@ class RecordingWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         if isinstance(error, OSError):
-            self._close_cut(error)
+            with contextlib.suppress(OSError):  # behind a chunk that was cut, an index would make the file unreadable
+                self._file.close()
         else:
             self.close()
-
-    def _close_cut(self, error: OSError) -> None:
-        """Behind a chunk that was cut, an index would make the whole file unreadable: it goes in the chunk's place."""
-        with contextlib.suppress(OSError):
-            self._file.close()
-        with contextlib.suppress(OSError):  # a disk that takes nothing any more; up to the cut, the file still reads
-            close_cut(self._path, self._schemas, self._channels, {CUT: error.strerror or str(error)})
 
     def _note_gap(self, gap_ns: int) -> None:
         self.gaps += 1
@@ -152,38 +149,36 @@ class RecordingWriter:
 
     def _channel_of(self, message: dict[str, Value]) -> int:
         """The tick channel whose schema `message` obeys."""
-        for name, value in message.items():
-            if self._kinds.get(name) != _KINDS[type(value)]:
-                break
-        else:
-            if self._tick_channel:
-                return self._tick_channel
-        self._kinds |= {name: _KINDS[type(value)] for name, value in message.items()}
-        key = tuple(self._kinds.items())
-        if key not in self._tick_channels:
-            self._tick_channels[key] = self._channel(TICKS_TOPIC, tick_schema(self._kinds))
-        self._tick_channel = self._tick_channels[key]
+        kinds = self._kinds
+        if not self._tick_channel or any(kinds.get(name) != _KINDS[type(value)] for name, value in message.items()):
+            kinds |= {name: _KINDS[type(value)] for name, value in message.items()}
+            key = tuple(kinds.items())
+            if key not in self._tick_channels:
+                self._tick_channels[key] = registered(self._mcap, TICKS_TOPIC, tick_schema(kinds))
+            self._tick_channel = self._tick_channels[key]
         return self._tick_channel
-
-    def _channel(self, topic: str, schema: dict[str, Any]) -> int:
-        of, channel = registered(self._mcap, topic, schema)
-        self._schemas.append(of)
-        self._channels.append(channel)
-        return channel.id
 
     def _add(self, channel: int, t_ns: int, data: bytes, sequence: int) -> None:
         if self._chunk_ns is None or abs(t_ns - self._chunk_ns) > CHUNK_NS:
             self._mcap.flush()  # type: ignore[no-untyped-call]
+            self._require_room()
             self._chunk_ns = t_ns
         self._mcap.add_message(channel, log_time=t_ns, data=data, publish_time=t_ns, sequence=sequence % 2**32)
 
+    def _require_room(self) -> None:
+        free, least = shutil.disk_usage(self._path).free, LEAST_FREE_BYTES + self._file.tell() // INDEX_SHARE
+        if free < least:
+            reason = f"No space left on device: {free / 1e6:.1f} MB are free, needed are {least / 1e6:.1f}"
+            self.describe({CUT: reason})
+            self.close()
+            raise OSError(errno.ENOSPC, reason)
 
-def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> tuple[Schema, Channel]:
+
+def registered(mcap: Writer, topic: str, schema: dict[str, Any]) -> int:
     """A channel of JSON messages that obey this schema, in the file that `mcap` writes."""
     data = msgspec.json.encode(schema)
     schema_id = mcap.register_schema(name=schema["title"], encoding="jsonschema", data=data)
-    channel = mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
-    return Schema(schema_id, data, "jsonschema", schema["title"]), Channel(channel, topic, "json", {}, schema_id)
+    return mcap.register_channel(topic=topic, message_encoding="json", schema_id=schema_id)
 
 
 def plain_schema(message: type[msgspec.Struct]) -> dict[str, Any]:

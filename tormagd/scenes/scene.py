@@ -12,8 +12,10 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from tormagd.config import LEAST_INFERENCE_HZ, convert, did_you_mean
+from tormagd.config import LEAST_INFERENCE_HZ
+from tormagd.named_file import named, shipped
 from tormagd.scenes.measured import measured
+from tormagd.toml_file import convert
 from tormagd_client.endpoints import ConfigError, Strict
 
 AUTO = "auto"
@@ -21,7 +23,7 @@ LEAST_SETPOINT_HZ = 12.0
 "Setpoints a tenth of a second apart are no stream any more."
 LEAST_CONTROL_HZ = 500
 "What is watched for safety is watched in every control tick: slower than this is none that a scene is run at."
-LONGEST_SHOWN = 200  # characters of a refused name
+ENDING = ".toml"
 _SHIPPED = resources.files(__package__)
 
 
@@ -268,23 +270,12 @@ def terms_of(scene: Scene) -> Terms:
 
 def shipped_scenes() -> tuple[str, ...]:
     """The names of the scenes that come with the package."""
-    return tuple(
-        sorted(entry.name.removesuffix(".toml") for entry in _SHIPPED.iterdir() if entry.name.endswith(".toml"))
-    )
+    return shipped(_SHIPPED, ENDING)
 
 
 def scene_path(name_or_path: str) -> Path:
     """The file of a shipped scene's name, or the path itself. Raises ConfigError naming the shipped scenes."""
-    if name_or_path in shipped_scenes():
-        return Path(str(_SHIPPED / f"{name_or_path}.toml"))
-    path, allowed = Path(name_or_path), f"allowed is a scene file or one of {', '.join(shipped_scenes())}"
-    try:
-        if path.exists():
-            return path
-    except OSError as error:  # a name that no file can have, or a directory that may not be entered
-        raise ConfigError(f"scene = {name_or_path[:LONGEST_SHOWN]!r}: {error.strerror}; {allowed}") from error
-    near = did_you_mean(name_or_path, shipped_scenes())
-    raise ConfigError(f"scene = {name_or_path[:LONGEST_SHOWN]!r}: {allowed}{near}")
+    return named("scene", name_or_path, _SHIPPED, ENDING)
 
 
 def load_scene(name_or_path: str) -> Scene:
@@ -295,11 +286,6 @@ def load_scene(name_or_path: str) -> Scene:
     if scene.terms == "required":
         return msgspec.structs.replace(scene, terms=_required(scene, path))
     return scene if isinstance(scene.terms, Terms) else msgspec.structs.replace(scene, terms=EVERY_TERM)
-
-
-def load_task(name_or_path: str) -> Scene:
-    """The same scene with every term, whatever its file says of them: what terms are measured on."""
-    return msgspec.structs.replace(convert(scene_path(name_or_path), Scene), terms=EVERY_TERM)
 
 
 def _required(scene: Scene, path: Path) -> Terms:

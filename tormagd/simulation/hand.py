@@ -1,15 +1,13 @@
 """The hand at the device: where the roller's surface is at a time, or how deep a finger is in the pad."""
 
 import bisect
-import csv
 import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Protocol, final
 
 from firmware_protocol.value import Value
-from tormagd.bounded_file import MOST_TABLE_BYTES
-from tormagd_client.regular_file import require_regular
+from tormagd.force_file import TIME, ForceFileError, read_table
 
 ROLLER_RADIUS_MM: Final = 20.0
 DEFAULT_RPM: Final = 20.0
@@ -18,6 +16,7 @@ REVERSING_TRAVEL_MM: Final = 30.0
 DEFAULT_DEPTH_MM: Final = 2.0
 PRESSES_AT_S: Final = 10.0
 PRESSING_MM_S: Final = 1.0
+RECORDED = {"t_s": TIME, "position_mm": (-1e6, 1e6, "mm")}
 KNOWN = "steady[=RPM], reversing[=PERIOD_S], pressing[=DEPTH_MM], or a FILE.csv with the columns t_s,position_mm"
 
 
@@ -119,29 +118,9 @@ def _number(spec: str, text: str, low: float, high: float) -> float:
 
 
 def read_recording(path: Path) -> RecordedHand:
-    """Read a CSV with the columns t_s and position_mm. Raises HandError naming file and line."""
-    times_s: list[float] = []
-    positions_mm: list[float] = []
+    """Read a CSV with the columns t_s and position_mm. Raises HandError naming file and row."""
     try:
-        require_regular(path, MOST_TABLE_BYTES)
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = csv.DictReader(file)
-            if not {"t_s", "position_mm"} <= set(rows.fieldnames or ()):
-                raise HandError(f"{path}: columns {rows.fieldnames}: needed are t_s and position_mm")
-            for row in rows:
-                where = f"{path}, line {rows.line_num}"
-                try:
-                    time_s, position_mm = float(row["t_s"]), float(row["position_mm"])
-                except (TypeError, ValueError) as error:
-                    raise HandError(f"{where}: {error}") from error
-                if not (math.isfinite(time_s) and abs(position_mm) <= 1e6):
-                    raise HandError(f"{where}: {time_s}, {position_mm}: allowed are finite times, positions to 1e6 mm")
-                if times_s and time_s <= times_s[-1]:
-                    raise HandError(f"{where}: t_s = {time_s}: allowed is more than {times_s[-1]} of the line before")
-                times_s.append(time_s)
-                positions_mm.append(position_mm)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise HandError(f"{path}: {error}") from error
-    if not times_s:
-        raise HandError(f"{path}: no rows")
-    return RecordedHand(tuple(times_s), tuple(positions_mm))
+        table = read_table(path, RECORDED)
+    except ForceFileError as error:
+        raise HandError(str(error)) from error
+    return RecordedHand(tuple(table["t_s"]), tuple(table["position_mm"]))

@@ -1,6 +1,5 @@
 """What a simulated device is made of: the plant file, typed, bounded and refused when it makes no sense."""
 
-import re
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -8,19 +7,18 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from tormagd.bounded_file import read_bounded
+from tormagd.named_file import named, shipped
 from tormagd.physics.inserts import insert
-from tormagd.toml_file import MOST_BYTES, TomlError, toml_tables
-from tormagd_client.printable import in_short
+from tormagd.toml_file import convert
+from tormagd_client.endpoints import ConfigError
+from tormagd_client.printable import require
 
 PLANTS_INSERT = "MRE-50-40"
 "What the committed samples have in them."
+_PLANTS = resources.files(__package__) / "plants"
 
-
-class PlantError(ValueError):
-    """A plant file that cannot be used: the message names the file, the key path, the value and what is allowed."""
-
-
+PlantError = ConfigError
+"A plant file that cannot be used: the message names the file, the key path, the value and what is allowed."
 Positive = Annotated[float, Meta(gt=0.0)]
 NotNegative = Annotated[float, Meta(ge=0.0)]
 Share = Annotated[float, Meta(ge=0.0, lt=1.0)]
@@ -60,6 +58,11 @@ class Relaxation(Struct, frozen=True, forbid_unknown_fields=True):
 
     fractions: Annotated[tuple[Share, ...], Meta(min_length=1, max_length=8)]
     times_s: Annotated[tuple[Positive, ...], Meta(min_length=1, max_length=8)]
+
+    def __post_init__(self) -> None:
+        is_paired = len(self.fractions) == len(self.times_s)
+        require(is_paired, "fractions", self.fractions, f"one for each of {self.times_s}")
+        require(sum(self.fractions) < 1.0, "fractions", self.fractions, "a sum under 1")
 
 
 class PadParameters(Struct, frozen=True, forbid_unknown_fields=True):
@@ -171,6 +174,19 @@ class Assumed(Struct, frozen=True, forbid_unknown_fields=True):
     overcurrent_A: Positive = 3.0  # well over the 1 A of the worst travel, under the 3.7 A of the weakest stall
     force_range_N: Annotated[float, Meta(gt=0.0, le=32.0)] = 20.0  # where the force sensor saturates
 
+    def __post_init__(self) -> None:
+        least_mm, most_mm = self.closed_mm, self.home_mm
+        require(
+            self.stop_beyond_mm < least_mm < most_mm,
+            "assumed.closed_mm",
+            least_mm,
+            f"over stop_beyond_mm = {self.stop_beyond_mm} and under home_mm = {most_mm}",
+        )
+        for key in ("start_left_mm", "start_right_mm"):
+            start_mm, between = getattr(self, key), f"between the switches, {least_mm} .. {most_mm}"
+            require(least_mm < start_mm < most_mm, f"assumed.{key}", start_mm, between)
+        require(self.warm_C >= self.ambient_C, "assumed.warm_C", self.warm_C, f"at least ambient_C = {self.ambient_C}")
+
 
 class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
     """One simulated device, in the units of the plant card."""
@@ -191,6 +207,15 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
     pad: PadParameters | None = None
     "With one the device is a pad under a finger: `elastomer`, `friction` and `relaxation` are of no part of it."
 
+    def __post_init__(self) -> None:
+        limit_A = self.electronics.current_limit_A
+        require(
+            self.assumed.overcurrent_A < limit_A,
+            "assumed.overcurrent_A",
+            self.assumed.overcurrent_A,
+            f"under electronics.current_limit_A = {limit_A}",
+        )
+
     @property
     def closed_stop_mm(self) -> float:
         """Face-to-centre distance at which a carriage meets its inner stop."""
@@ -202,10 +227,16 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
         return self.assumed.home_mm + 2.0 * self.assumed.stop_beyond_mm
 
 
-def plant_names() -> list[str]:
+class _PadBetween(Struct, frozen=True, forbid_unknown_fields=True):
+    """A file of a pad: the plant whose magnets and carriages it stands between."""
+
+    carriages: str
+    pad: PadParameters
+
+
+def plant_names() -> tuple[str, ...]:
     """Names of the plants that come with the package."""
-    folder = resources.files(__package__).joinpath("plants")
-    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    return shipped(_PLANTS, ".toml")
 
 
 def load_plant(path_or_name: str | Path) -> PlantParameters:
@@ -214,45 +245,12 @@ def load_plant(path_or_name: str | Path) -> PlantParameters:
     Raises PlantError for a missing or unreadable file, bad TOML, unknown or missing keys, values that are not
     finite or out of range, and values that contradict each other.
     """
-    name = str(path_or_name)
-    if name in plant_names():
-        text = resources.files(__package__).joinpath("plants", f"{name}.toml").read_text(encoding="utf-8")
-    else:
-        try:
-            text = read_bounded(Path(path_or_name), MOST_BYTES).decode("utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            known, reason = ", ".join(plant_names()), getattr(error, "strerror", None) or error
-            raise PlantError(f"plant {name!r}: neither a readable file ({reason}) nor one of {known}") from error
-    return parse_plant(text, name)
-
-
-def parse_plant(text: str, name: str = "plant") -> PlantParameters:
-    """Turn the TOML text of a plant into parameters; `name` is what errors call it. Raises PlantError."""
-    try:
-        raw = toml_tables(text)
-    except TomlError as error:
-        raise PlantError(f"{name}: {error}") from error
-    carriages = raw.pop("carriages", None)
-    if carriages is not None:
-        raw = _carried(raw, carriages, name)
-    try:
-        parameters = msgspec.convert(raw, PlantParameters)
-    except msgspec.ValidationError as error:
-        reason, _, path = str(error).partition(" - at `$")
-        path = path.rstrip("`").lstrip(".")
-        raise PlantError(f"{name}: {path or 'top level'}{_value_at(raw, path)}: {reason}") from error
-    _require_consistent(parameters, name)
-    return parameters
-
-
-def _carried(raw: dict[str, Any], carriages: Any, name: str) -> dict[str, Any]:
-    """The tables of a pad and, beside it, those of the packaged plant whose magnets and carriages it stands between."""
-    if carriages not in plant_names():
-        raise PlantError(f"{name}: carriages = {in_short(carriages)}: allowed is one of {', '.join(plant_names())}")
-    if set(raw) != {"pad"}:
-        raise PlantError(f"{name}: tables {', '.join(sorted(raw))}: allowed beside carriages is pad alone")
-    carried: dict[str, Any] = msgspec.to_builtins(load_plant(carriages))
-    return carried | raw
+    path = named("plant", str(path_or_name), _PLANTS, ".toml")
+    if "carriages" not in convert(path, dict[str, Any]):
+        return convert(path, PlantParameters)
+    between = convert(path, _PadBetween)
+    carried = convert(named("carriages", between.carriages, _PLANTS, ".toml"), PlantParameters)
+    return msgspec.structs.replace(carried, pad=between.pad)
 
 
 def with_insert(plant: PlantParameters, name: str) -> PlantParameters:
@@ -266,50 +264,3 @@ def with_insert(plant: PlantParameters, name: str) -> PlantParameters:
         own.kinetic_friction * other.friction_coefficient / nominal.friction_coefficient,
     )
     return plant if name == PLANTS_INSERT else msgspec.structs.replace(plant, elastomer=fitted)
-
-
-def _value_at(raw: Any, path: str) -> str:
-    for key, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
-        raw = raw[int(index)] if index else raw.get(key)
-    return "" if isinstance(raw, dict) else f" = {in_short(raw)}"
-
-
-def _require_consistent(plant: PlantParameters, name: str) -> None:
-    def require(holds: bool, message: str) -> None:
-        if not holds:
-            raise PlantError(f"{name}: {message}")
-
-    fractions, times = plant.relaxation.fractions, plant.relaxation.times_s
-    require(
-        len(fractions) == len(times),
-        f"relaxation.fractions has {len(fractions)} values, relaxation.times_s {len(times)}: allowed are equal counts",
-    )
-    require(sum(fractions) < 1.0, f"relaxation.fractions = {list(fractions)}: allowed is a sum under 1")
-    if plant.pad is not None:
-        for key, series in (("relaxing", plant.pad.relaxing), ("field_relaxing", plant.pad.field_relaxing)):
-            require(
-                len(series.fractions) == len(series.times_s) and sum(series.fractions) < 1.0,
-                f"pad.{key}.fractions = {list(series.fractions)}: allowed is one for each time, and a sum under 1",
-            )
-    assumed = plant.assumed
-    require(
-        plant.closed_stop_mm > 0.0 and assumed.closed_mm < assumed.home_mm,
-        f"assumed.closed_mm = {assumed.closed_mm}: allowed is over stop_beyond_mm = {assumed.stop_beyond_mm} "
-        f"and under home_mm = {assumed.home_mm}",
-    )
-    for side in ("left", "right"):
-        start = getattr(assumed, f"start_{side}_mm")
-        require(
-            assumed.closed_mm < start < assumed.home_mm,
-            f"assumed.start_{side}_mm = {start}: allowed is between the switches, "
-            f"{assumed.closed_mm} .. {assumed.home_mm}",
-        )
-    require(
-        assumed.warm_C >= assumed.ambient_C,
-        f"assumed.warm_C = {assumed.warm_C}: allowed is at least ambient_C = {assumed.ambient_C}",
-    )
-    require(
-        assumed.overcurrent_A < plant.electronics.current_limit_A,
-        f"assumed.overcurrent_A = {assumed.overcurrent_A}: allowed is under electronics.current_limit_A = "
-        f"{plant.electronics.current_limit_A}",
-    )

@@ -9,9 +9,8 @@ from typing import Final, final
 
 from tormagd.physics.field import PAD_RADIUS_M
 from tormagd.simulation.gap_field import GapField
-from tormagd.simulation.pad import worked_pad
 from tormagd.simulation.parameters import PlantParameters
-from tormagd.simulation.tactile_pad import DEEPEST_MM, FASTEST_MM_S, TactilePad
+from tormagd.simulation.tactile_pad import DEEPEST_MM, FASTEST_MM_S, TactilePad, worked_pad
 from tormagd.simulation.warmth import Warmth
 
 MT_PER_TM: Final = 1e3 / PAD_RADIUS_M

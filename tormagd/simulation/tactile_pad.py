@@ -24,26 +24,20 @@ DEEPEST_MM: Final = 6.0
 FASTEST_MM_S: Final = 100.0
 STRONGEST_MT: Final = 500.0
 
+TOUCHING_MM = 0.2
+"""Where the cycles turn at their open end: plates that leave the pad at every cycle measure air."""
+RATES_MM_S = (1.0, 0.5, 4.0, 2.0)
+"""Not in order, so that a drift over the record is not mistaken for an effect of the rate."""
+CYCLES_PER_RATE = 3
+SAMPLES_PER_CYCLE = 175
+
 
 @final
 class TactilePad:
     """One pad with its past: what it has been worked, and what its stress remembers. New pads are unworked."""
 
     def __init__(self, parameters: PadParameters) -> None:
-        # kPa mm^2 is 1e-3 N
-        self._area: float = 1e-3 * math.pi / 4.0 * parameters.diameter_mm**2
-        self._height_mm: float = parameters.height_mm
-        self._modulus_kPa: float = parameters.modulus_kPa
-        self._field_modulus_kPa: float = parameters.full_field_modulus_kPa - parameters.modulus_kPa
-        self._breakdown: float = parameters.breakdown
-        self._breakdown_strain: float = parameters.breakdown_strain
-        self._gent_limit: float = parameters.gent_limit
-        self._saturation: float = parameters.saturation_mT * parameters.saturation_mT
-        self._rate_gain: float = parameters.rate_gain
-        self._field_rate_gain: float = parameters.field_rate_gain
-        self._rate_scale_mm_s: float = parameters.rate_scale_mm_s
-        self._mullins_share: float = parameters.mullins_share
-        self._mullins_travel_mm: float = parameters.mullins_travel_mm
+        self._parameters = parameters
         relaxing, field_relaxing = parameters.relaxing, parameters.field_relaxing
         self._series: PronySeries = PronySeries(relaxing.fractions, relaxing.times_s)
         self._field_series: PronySeries = PronySeries(field_relaxing.fractions, field_relaxing.times_s)
@@ -69,20 +63,22 @@ class TactilePad:
         require("displacement_mm", displacement_mm, 0.0, DEEPEST_MM)
         require("rate_mm_s", rate_mm_s, -FASTEST_MM_S, FASTEST_MM_S)
         require("field_mT", field_mT, 0.0, STRONGEST_MT)
-        strain = displacement_mm / self._height_mm
+        pad = self._parameters
+        area = 1e-3 * math.pi / 4.0 * pad.diameter_mm**2  # kPa mm^2 is 1e-3 N
+        strain = displacement_mm / pad.height_mm
         stretch = 1.0 - strain
         invariant = stretch * stretch + 2.0 / stretch - 3.0
-        gent = (1.0 / (stretch * stretch) - stretch) / 3.0 * self._gent_limit / (self._gent_limit - invariant)
-        speed = math.asinh(rate_mm_s / self._rate_scale_mm_s)
-        unworked = 1.0 + self._mullins_share - self._damage
-        matrix_N = self._modulus_kPa * self._area * gent * unworked * (1.0 + self._rate_gain * speed)
-        square = field_mT * field_mT
+        gent = (1.0 / (stretch * stretch) - stretch) / 3.0 * pad.gent_limit / (pad.gent_limit - invariant)
+        speed = math.asinh(rate_mm_s / pad.rate_scale_mm_s)
+        unworked = 1.0 + pad.mullins_share - self._damage
+        matrix_N = pad.modulus_kPa * area * gent * unworked * (1.0 + pad.rate_gain * speed)
+        square, saturation = field_mT * field_mT, pad.saturation_mT * pad.saturation_mT
         full = FULL_FIELD_MT * FULL_FIELD_MT
-        stiffening = square / (square + self._saturation) * (full + self._saturation) / full
-        share = strain / self._breakdown_strain
-        intact = 1.0 - self._breakdown + self._breakdown / (1.0 + share * share)
-        added_kPa = self._field_modulus_kPa * stiffening * intact
-        return matrix_N, added_kPa * self._area * gent * (1.0 + self._field_rate_gain * speed)
+        stiffening = square / (square + saturation) * (full + saturation) / full
+        share = strain / pad.breakdown_strain
+        intact = 1.0 - pad.breakdown + pad.breakdown / (1.0 + share * share)
+        added_kPa = (pad.full_field_modulus_kPa - pad.modulus_kPa) * stiffening * intact
+        return matrix_N, added_kPa * area * gent * (1.0 + pad.field_rate_gain * speed)
 
     def advance(self, dt_s: float, displacement_mm: float, rate_mm_s: float, field_mT: float) -> float:
         """Force, N, at the end of a step of `dt_s` that ends at that displacement, rate and field."""
@@ -91,8 +87,9 @@ class TactilePad:
             self._dt_s = dt_s
         self._deepest_mm = max(self._deepest_mm, displacement_mm)
         travel_mm = abs(displacement_mm - self._displacement_mm)
-        possible = self._mullins_share * min(self._deepest_mm / FULL_INDENTATION_MM, 1.0)
-        self._damage += max(possible - self._damage, 0.0) * -math.expm1(-travel_mm / self._mullins_travel_mm)
+        pad = self._parameters
+        possible = pad.mullins_share * min(self._deepest_mm / FULL_INDENTATION_MM, 1.0)
+        self._damage += max(possible - self._damage, 0.0) * -math.expm1(-travel_mm / pad.mullins_travel_mm)
         self._displacement_mm = displacement_mm
         matrix_N, added_N = self.elastic_parts_N(displacement_mm, rate_mm_s, field_mT)
         relaxed_N, self._memory = self._step.advance(self._memory, matrix_N)
@@ -104,3 +101,27 @@ class TactilePad:
         steps = np.round(np.diff(time_s, prepend=0.0 if time_s[0] == 0.0 else 2 * time_s[0] - time_s[1]), 9)
         columns = zip(steps.tolist(), displacement_mm.tolist(), rate_mm_s.tolist(), field_mT.tolist(), strict=True)
         return np.array([self.advance(*row) for row in columns])
+
+
+def cycling_program(samples_per_cycle: int = SAMPLES_PER_CYCLE) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+    """Time, displacement, rate and cycle number of one pass: cycles 0.2 to 4.5 mm and back, each rate three times."""
+    times, displacements, rates, cycles, start_s = [], [], [], [], 0.0
+    stroke_mm = FULL_INDENTATION_MM - TOUCHING_MM
+    share = np.arange(1, samples_per_cycle + 1) / samples_per_cycle
+    for index, rate in enumerate(np.repeat(RATES_MM_S, CYCLES_PER_RATE)):
+        period_s = 2.0 * stroke_mm / rate
+        times.append(start_s + share * period_s)
+        displacements.append(TOUCHING_MM + stroke_mm * (1.0 - np.abs(1.0 - 2.0 * share)))
+        rates.append(np.where(share <= 0.5, rate, -rate))
+        cycles.append(np.full(samples_per_cycle, index))
+        start_s += period_s
+    return np.concatenate(times), np.concatenate(displacements), np.concatenate(rates), np.concatenate(cycles)
+
+
+def worked_pad(parameters: PadParameters) -> TactilePad:
+    """A pad after ten cycles without field and a rest."""
+    pad = TactilePad(parameters)
+    time_s, displacement_mm, rate_mm_s, _ = cycling_program(50)
+    pad.run(time_s, displacement_mm, rate_mm_s, np.zeros_like(time_s))
+    pad.rest()
+    return pad

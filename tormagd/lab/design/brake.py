@@ -4,16 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tormagd.lab.design.force_law import d_force_d_gap, radial_moment_for_force_Tm
 from tormagd.physics.errors import DomainError, Real, require
 from tormagd.physics.field import FieldLaw
-from tormagd.physics.force import (
-    Elastomer,
-    Geometry,
-    brake_force_N,
-    d_force_d_gap,
-    max_radial_moment_Tm,
-    radial_moment_for_force_Tm,
-)
+from tormagd.physics.force import Elastomer, Geometry, brake_force_N, max_radial_moment_Tm
 
 
 @dataclass(frozen=True, slots=True)

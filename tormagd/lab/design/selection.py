@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tormagd.lab.design.brake import Brake
-from tormagd.physics.force import radial_moment_for_force_Tm
+from tormagd.lab.design.force_law import radial_moment_for_force_Tm
 
 _POINTS = 201
 

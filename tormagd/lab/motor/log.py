@@ -7,10 +7,9 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
-from tormagd.bounded_file import MOST_TABLE_BYTES
 from tormagd.lab.arrays import Array
 from tormagd.lab.errors import LabError
-from tormagd.lab.tables import read_columns
+from tormagd.lab.tables import MOST_TABLE_BYTES, read_columns
 from tormagd_client.regular_file import require_regular
 
 COLUMNS = ("t_s", "input_V", "position_mm")

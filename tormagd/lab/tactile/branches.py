@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from tormagd.inverse.nearest import NearestFieldSearch
+from tormagd.lab.training.metrics import not_rising_share
 from tormagd.model.model_file import ForceModel, load_model
-from tormagd.model.rising import not_rising_share
 from tormagd.model.shipped import model_path
 from tormagd.scenes.scene import scene_path
 

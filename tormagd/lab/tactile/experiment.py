@@ -1,7 +1,7 @@
 """Chapter 4 on a synthetic tactile pad: table 4.1, the pulse experiment of section 4.3, holds.
 
-All data are synthetic: made by `tormagd.simulation.pad`. `--branches` measures instead what the neighbours of the
-k-nearest search decide, on the shipped models.
+All data are synthetic: made by `tormagd.simulation.tactile_pad`. `--branches` measures instead what the neighbours of
+the k-nearest search decide, on the shipped models.
 """
 
 import argparse

@@ -12,13 +12,11 @@ from tormagd.lab.tactile.pads import PADS, PadRecord, cyclic_records, holding_re
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.fitting import fit_network
 from tormagd.lab.training.grey_box import GreyBox, fit_grey_box
-from tormagd.lab.training.metrics import force_metrics, leave_cycles_out, leave_one_out, random_split
+from tormagd.lab.training.metrics import force_metrics, leave_cycles_out, leave_one_out, not_rising_share, random_split
 from tormagd.model.features import FEATURES
 from tormagd.model.model_file import ForceModel
-from tormagd.model.rising import not_rising_share
-from tormagd.simulation.pad import RATES_MM_S, TOUCHING_MM, worked_pad
 from tormagd.simulation.parameters import PadParameters
-from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM
+from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM, RATES_MM_S, TOUCHING_MM, worked_pad
 
 CIP = FEATURES.index("cip_percent")
 SCORED_SLOPE_N_MT = 0.03

@@ -13,9 +13,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tormagd.simulation.pad import SAMPLES_PER_CYCLE, Array, cycling_program, worked_pad
 from tormagd.simulation.parameters import PadParameters, Relaxation
-from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM, TactilePad
+from tormagd.simulation.tactile_pad import (
+    FULL_FIELD_MT,
+    FULL_INDENTATION_MM,
+    SAMPLES_PER_CYCLE,
+    Array,
+    TactilePad,
+    cycling_program,
+    worked_pad,
+)
 
 FIELDS_MT = tuple(float(value) for value in np.linspace(0.0, FULL_FIELD_MT, 11))
 RISE_SAMPLES = 46

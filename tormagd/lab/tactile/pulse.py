@@ -16,9 +16,8 @@ from tormagd.lab.tactile.models import PAD_IN_USE, SCORED_SLOPE_N_MT, Effort, Tr
 from tormagd.lab.tactile.pads import PADS, drawn_pad
 from tormagd.lab.training.grey_box import GreyBoxMemory
 from tormagd.model.model_file import ForceModel
-from tormagd.simulation.pad import worked_pad
 from tormagd.simulation.parameters import PadParameters
-from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM
+from tormagd.simulation.tactile_pad import FULL_FIELD_MT, FULL_INDENTATION_MM, worked_pad
 
 SAMPLES = 4322
 RATE_HZ = 160

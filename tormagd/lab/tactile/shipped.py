@@ -17,10 +17,9 @@ from tormagd.lab.main import Found
 from tormagd.lab.tactile.models import FULL, Effort, dataset
 from tormagd.lab.tactile.pads import cyclic_records, holding_records
 from tormagd.lab.training.grey_box import fit_grey_box
-from tormagd.lab.training.metrics import force_metrics, random_split
+from tormagd.lab.training.metrics import force_metrics, not_rising_share, random_split
 from tormagd.model.memory import Memory
 from tormagd.model.model_file import ForceModel, save_model
-from tormagd.model.rising import not_rising_share
 from tormagd.simulation.parameters import PlantError, load_plant
 
 INSERT = "MRE-C"

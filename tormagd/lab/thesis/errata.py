@@ -6,6 +6,7 @@ import numpy as np
 
 from tormagd.lab.characterisation import constitutive
 from tormagd.lab.design.brake import Brake
+from tormagd.lab.design.force_law import stretch_minus_one
 from tormagd.lab.design.optimisation import Design
 from tormagd.lab.thesis.values import (
     APPENDIX_B_BOUNDS,
@@ -15,7 +16,7 @@ from tormagd.lab.thesis.values import (
     USE_CASES,
 )
 from tormagd.physics.field import FieldLaw, PowerFieldLaw, ThesisFieldLaw
-from tormagd.physics.force import MU0_H_M, TORMAG, Elastomer, stretch_minus_one
+from tormagd.physics.force import MU0_H_M, TORMAG, Elastomer
 from tormagd.physics.inserts import INSERTS
 
 CLOSED_MM, OPEN_MM = 45.0, 95.0

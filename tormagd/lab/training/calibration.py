@@ -26,7 +26,7 @@ from tormagd.lab.errors import LabError, not_installed
 from tormagd.lab.tables import read_columns
 from tormagd.lab.training.dataset import ALLOWED, Dataset, write_csv
 from tormagd.lab.training.metrics import fit_metrics
-from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, displacement
+from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
 from tormagd.model.features import FEATURES, FIELD, Element
 from tormagd.model.model_file import ForceModel, save_model
 from tormagd.physics.errors import DomainError
@@ -101,6 +101,23 @@ def training_rows(table: Array, fitted: Insert, inner_radius_mm: float) -> Datas
     cip_percent = np.full_like(rate_mm_s, 100.0 * fitted.cip_fraction)
     features = np.column_stack((displacement_mm, rate_mm_s, field_mT, cip_percent))
     return Dataset(features, force_N, sweep.astype(np.int64), time_s)
+
+
+def displacement(handle_mm: Array) -> Array:
+    """The displacement at each of these positions (n, mm, in the order of time). NaN until a turn, or so much travel
+    that the last turn no longer matters.
+    """
+    found = np.full_like(handle_mm, np.nan)
+    start_mm = float(handle_mm[0])
+    turn, is_known = Turn(1.0, start_mm, start_mm), False
+    for index, position_mm in enumerate(handle_mm.tolist()):
+        last, turn = turn, turn.moved_to(position_mm)
+        # the first reversal may be no turn, but a handle that came this way all the time
+        has_turned = turn.direction != last.direction and last.turned_mm != last.furthest_mm
+        is_known = is_known or has_turned or abs(position_mm - start_mm) >= MOBILISED_MM
+        if is_known:
+            found[index] = turn.displacement_mm(position_mm)
+    return found
 
 
 def require_usable(data: Dataset) -> None:

@@ -9,12 +9,12 @@ import torch
 from tormagd.lab.arrays import Mask
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.levenberg_marquardt import Training, train
-from tormagd.lab.training.metrics import fit_metrics, random_split
+from tormagd.lab.training.metrics import fit_metrics, not_rising_share, random_split
 from tormagd.model.features import Element, Scaling
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelMetadata
 from tormagd.model.network import ForceNetwork, to_model
-from tormagd.model.rising import not_rising_share
+from tormagd.physics.errors import DomainError
 
 VALIDATION_SHARE = 0.1
 """Of the training rows, to say when the training stops; the test rows have no part in that."""
@@ -43,7 +43,7 @@ def fit_model(
     file may not have.
     """
     ranging = scaled_by or training
-    scaling = Scaling.fit(ranging.features, ranging.force_N)
+    scaling = scaling_of(ranging)
     network = ForceNetwork(scaling, hidden, seed=seed)
     if start is not None:
         _begin_with(network, scaling, start)
@@ -101,3 +101,19 @@ def _begin_with(network: ForceNetwork, scaling: Scaling, start: ForceModel) -> N
     network.hidden_bias.copy_(torch.tensor(bias + weight @ np.array(scaling.input_offset)))
     network.output_weight.copy_(torch.tensor(output * scaling.output_gain))
     network.output_bias.fill_((constant - scaling.output_offset) * scaling.output_gain)
+
+
+def scaling_of(data: Dataset) -> Scaling:
+    """Maps the range of each feature, and of the force, onto -1..1."""
+    low, high = data.features.min(axis=0), data.features.max(axis=0)
+    span = high - low
+    gain = np.divide(2.0, span, out=np.zeros_like(span), where=span > 0)
+    force_low, force_high = float(data.force_N.min()), float(data.force_N.max())
+    if not force_high > force_low:
+        raise DomainError("force_N", force_low, "at least two different values, otherwise there is nothing to learn")
+    return Scaling(
+        input_offset=tuple(((low + high) / 2).tolist()),
+        input_gain=tuple(gain.tolist()),
+        output_offset=(force_low + force_high) / 2,
+        output_gain=2 / (force_high - force_low),
+    )

@@ -59,3 +59,13 @@ def force_metrics(predicted_N: Array, force_N: Array, span_N: float) -> dict[str
     if variance > 0:  # a subset of equal forces has no variance to explain
         metrics["r2"] = 1 - mean_square / variance
     return metrics
+
+
+def not_rising_share(model: ForceModel, points: int = 17) -> float:
+    """Return the share of a grid over the training box (`points` per feature that varies) where dF/dB <= 0.
+
+    There the field for a force is not unique, or the force does not depend on the field.
+    """
+    axes = [np.linspace(low, high, points if high > low else 1) for low, high in model.feature_ranges]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(FEATURES))
+    return float((model.field_slope_N_per_mT(grid) <= 0).mean())

@@ -1,0 +1,96 @@
+"""What design, the thesis and its numbers ask of the force law besides: the stretch, the slopes, and its inverse.
+
+Every function takes a float or an array and raises `DomainError`, as in `tormagd.physics.force`.
+"""
+
+import sys
+
+import numpy as np
+
+from tormagd.physics.brake_curve import MAX_COMPRESSION, BrakeCurve, functions
+from tormagd.physics.errors import Real, require
+from tormagd.physics.field import FieldLaw
+from tormagd.physics.force import Elastomer, Geometry, reduced
+
+_NEWTON_STEPS = 100
+"""Enough for bisection alone; Newton's method takes at most 8 or so (see the tests)."""
+
+
+def stretch_minus_one(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
+    """Radial stretch at the shaft less one, lambda1 - 1, from -0.95 to 0 (Eq. 29)."""
+    law = reduced(elastomer, geometry)
+    require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
+    return -law.curve.compression(law.load(radial_moment_Tm))
+
+
+def d_force_d_moment(radial_moment_Tm: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
+    """Slope of the force over the radial moment, N / (T m), >= 0."""
+    law = reduced(elastomer, geometry)
+    require("radial_moment_Tm", radial_moment_Tm, 0.0, law.max_moment_Tm)
+    load = law.load(radial_moment_Tm)
+    slope = force_slope(law.curve, law.curve.compression(load), load)
+    return 2.0 * law.force_scale_N * law.load_root_per_Tm**2 * radial_moment_Tm * slope
+
+
+def d_force_d_gap(gap_mm: Real, field: FieldLaw, elastomer: Elastomer, geometry: Geometry) -> Real:
+    """Slope of the force over the gap, N/mm, <= 0 (the bracket of Eq. 36)."""
+    return d_force_d_moment(field.radial_moment_Tm(gap_mm), elastomer, geometry) * field.d_radial_moment_d_gap(gap_mm)
+
+
+def radial_moment_for_force_Tm(force_N: Real, elastomer: Elastomer, geometry: Geometry) -> Real:
+    """Radial moment that gives the force, T m: inverse of `brake_force_N`.
+
+    Raises `DomainError` unless 0 <= force_N <= the force at `max_radial_moment_Tm`.
+    """
+    law = reduced(elastomer, geometry)
+    # evaluated as any other force, so that the force of the largest moment is admitted to the last digit
+    require("force_N", force_N, 0.0, law.force(law.max_moment_Tm))
+    load = law.curve.load(compression_for_force(law.curve, force_N / law.force_scale_N))
+    root: Real = load**0.5
+    return root / law.load_root_per_Tm
+
+
+def force_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
+    """d phi / d y; every term is positive."""
+    stretch, w = 1.0 - compression, curve.wall
+    # d phi / d eps at constant load, then d phi / d y at constant stretch
+    elastic, magnetic = 5.0 / stretch**6 - 1.0 / stretch**2, 12.0 * (1.0 + w) * load / stretch**4
+    return (elastic + magnetic) * _compression_slope(curve, compression, load) + 4.0 * (1.0 + w) / stretch**3
+
+
+def compression_for_force(curve: BrakeCurve, force: Real) -> Real:
+    """eps at which phi(eps) is `force`, for 0 <= force <= phi(0.95): inverse of the curve along eps.
+
+    Newton's method on log(phi) over log(eps / lambda1), where the curve's slope goes from 1 to 5 only, kept inside
+    a shrinking bracket. It starts at the root of the small-load limit, phi = 4 eps (1 + (1 + w) / B).
+    """
+    fn = functions(force)
+    rounding = 4.0 * float(np.finfo(force.dtype).eps if isinstance(force, np.ndarray) else sys.float_info.epsilon)
+    wanted = fn.where(force > 0.0, force, 1.0)
+    low, high = 0.0 * wanted, MAX_COMPRESSION + 0.0 * wanted
+    compression = 0.25 * wanted / (1.0 + (1.0 + curve.wall) / curve.b)
+    compression = fn.where(compression < 0.5, compression, 0.5)
+    for _ in range(_NEWTON_STEPS):
+        load = curve.load(compression)
+        value = curve.force(compression, load)
+        above = value > wanted
+        low, high = fn.where(above, low, compression), fn.where(above, compression, high)
+        per_compression = force_slope(curve, compression, load) / _compression_slope(curve, compression, load)
+        odds = compression / (1.0 - compression)
+        step = -fn.log(value / wanted) * value / (per_compression * compression * (1.0 - compression))
+        # odds * exp(step) to second order, positive and without overflow
+        odds = fn.where(above, odds / (1.0 + abs(step)), odds * (1.0 + abs(step)))
+        trial = odds / (1.0 + odds)
+        settled = abs(trial - compression) <= rounding * compression
+        # a step down to rounding is taken as it is: noise may put it just outside the bracket
+        good = settled | ((trial > low) & (trial < high))
+        compression = fn.where(good, trial, 0.5 * (low + high))
+        if fn.all(settled):
+            break
+    result: Real = fn.where(force > 0.0, compression, 0.0 * wanted)
+    return result
+
+
+def _compression_slope(curve: BrakeCurve, compression: Real, load: Real) -> Real:
+    """d eps / d y = (B + A eps) / r, with r = p + eps."""
+    return (curve.b + curve.a * compression) / (1.0 - curve.a * load + compression)
