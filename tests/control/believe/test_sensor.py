@@ -39,13 +39,20 @@ def test_the_same_of_a_sensor_whose_zero_was_just_told_is() -> None:
     assert doubted_after_s(lambda now_s: TARED_SD_N) is not None
 
 
-def heard(sensor: SensorTrust, seconds: float, share: float, noise_N: float = 0.003) -> SensorTrust:
-    """After so long of readings at speed that are so much of the model's 1.5 N, of a device that is being learned."""
-    device = Strength(0.5, (MIN_SCALE, MAX_SCALE), (True, True))
+def heard(
+    sensor: SensorTrust,
+    seconds: float,
+    share: float,
+    noise_N: float = 0.003,
+    at: tuple[float, float, float] = (1.5, 42.0, 1.0),
+) -> SensorTrust:
+    """After so long of readings that are so much of the model's force, of a device that is being learned, `at` that
+    force of the model, rate and direction."""
+    (model_N, rate_mm_s, direction), device = at, Strength(0.5, (MIN_SCALE, MAX_SCALE), (True, True))
     for off_N in np.random.default_rng(3).normal(0.0, noise_N, round(seconds / PERIOD_S)).tolist():
-        reading_N = 1.5 * share + off_N
-        sensor.update(device.fit, 1.5, 42.0, reading_N, PERIOD_S, 1.0, TARED_SD_N)
-        device.update(1.5, reading_N, PERIOD_S)
+        reading_N = share * model_N + off_N
+        sensor.update(device.fit, model_N, rate_mm_s, reading_N, PERIOD_S, direction, TARED_SD_N)
+        device.update(model_N, reading_N, PERIOD_S)
     return sensor
 
 
@@ -65,7 +72,21 @@ def test_what_a_believable_device_gives_is_not_doubted(share: float) -> None:
     assert not heard(SensorTrust(), 20.0, share, 0.01).is_doubted
 
 
-@pytest.mark.parametrize(("leap", "is_doubted"), [(0.05, False), (-0.05, False), (0.3, True), (-0.25, True)])
-def test_a_force_that_leaps_from_what_the_device_showed_is_doubted(leap: float, is_doubted: bool) -> None:
+@pytest.mark.parametrize(
+    ("leap_N", "at", "is_doubted"),
+    [
+        (0.08, (1.5, 42.0, 1.0), False),
+        (-0.08, (1.5, 42.0, 1.0), False),
+        (0.25, (1.5, 42.0, 1.0), True),
+        (-0.25, (1.5, 42.0, 1.0), True),
+        (-0.25, (1.5, 42.0, -1.0), False),
+        (-0.25, (1.5, 300.0, 1.0), False),
+        (-0.25, (1.1, 42.0, 1.0), False),
+    ],
+)
+def test_a_force_that_leaps_from_what_the_device_showed_is_doubted(
+    leap_N: float, at: tuple[float, float, float], is_doubted: bool
+) -> None:
+    """Further where the handle has turned, goes faster, or the gap is another."""
     sensor = heard(SensorTrust(), 3.0 * KEPT_S, 1.0)
-    assert heard(sensor, 0.3, 1.0 + leap).is_doubted is is_doubted
+    assert heard(sensor, 0.2, 1.0 + leap_N / at[0], at=at).is_doubted is is_doubted

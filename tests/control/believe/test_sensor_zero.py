@@ -30,6 +30,7 @@ def strokes(
     scale: float = 1.0,
     from_s: float = 0.0,
     model_N: tuple[float, float] = (1.5, 1.5),
+    rate_mm_s: tuple[float, float] = (42.0, 42.0),
 ) -> tuple[SensorZero, float]:
     """After strokes to and fro of a handle on a device whose sensor is off by that, with noise; and when. Without
     `is_tared` the sensor is not taken for tared."""
@@ -44,7 +45,7 @@ def strokes(
             now_s += PERIOD_S
             reading_N = scale * force_N + direction * off_N + noise_N
             zero.begin(now_s)
-            zero.update(now_s, direction, reading_N, force_N, 42.0, PERIOD_S, scale, 0.02)
+            zero.update(now_s, direction, reading_N, force_N, rate_mm_s[stroke % 2], PERIOD_S, scale, 0.02)
         now_s += rest_s
     return zero, now_s
 
@@ -92,6 +93,19 @@ def test_levels_that_say_nothing_are_not_compared(turn: dict[str, float]) -> Non
     """Too far apart, too short, or of a sensor that is broken rather than off its zero."""
     zero, _ = strokes(**({"off_N": 0.2, "number": 2, "is_tared": False} | turn))  # type: ignore[arg-type]
     assert zero.zero_N == 0.0
+
+
+def test_a_level_takes_its_time() -> None:
+    zero, now_s = strokes(0.3, is_tared=False, number=1)
+    for reading in range(1, 50):
+        zero.update(now_s + reading * PERIOD_S, -1.0, 1.2, 1.5, 42.0, PERIOD_S, 1.0, 0.02)
+        assert (zero.zero_N > 0.2) is (reading * PERIOD_S > LEVEL_S)
+
+
+@pytest.mark.parametrize("changes", [{"rate_mm_s": (42.0, 300.0)}, {"model_N": (0.6, 2.4)}, {"rest_s": 8.0}])
+def test_after_another_speed_or_force_or_a_long_rest_less_is_known(changes: dict[str, object]) -> None:
+    alike, other = (strokes(0.1, is_tared=False, number=2, **each)[0] for each in ({}, changes))
+    assert other.variance_N2 > 1.3 * alike.variance_N2
 
 
 def test_a_drift_is_followed() -> None:
