@@ -115,6 +115,11 @@ def test_a_device_that_gives_more_than_was_asked_at_its_open_gap_is_said(planner
     assert Limit.F_MIN not in first(0.7).limits
 
 
+def test_the_trim_is_the_devices_force_over_the_models_where_the_plan_leads(planner, planned) -> None:
+    planner.teach(Learned(DeviceFit(1.1, 0.2)))
+    assert planned(planner, 1.3).trim == pytest.approx(1.3 / 1.0)
+
+
 def test_the_gap_moves_ahead_along_the_setpoints_slope(core, planner, planned, moving) -> None:
     for _ in range(40):
         plan = planned(planner, 1.0 + 0.5 * planner.planned.time_s, moving())

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from tormagd.control.believe.carriage_lag import AGE_S, MAX_LAG_S, SETTLED_MM, CarriageLag
+from tormagd.control.believe.carriage_lag import AGE_S, FORGETTING_S, MAX_LAG_S, SETTLED_MM, CarriageLag
 
 TOP_SPEED_MM_S, PERIOD_S = 38.0, 0.01
 
@@ -35,6 +35,11 @@ def test_it_comes_to_the_lag_and_stays_there(late_s: float) -> None:
 
 def test_a_beat_teaches_most_of_it() -> None:
     assert swung(0.02, 1.0).lag_s > 0.01
+
+
+def test_of_a_swing_as_much_is_known_as_of_the_last_seconds() -> None:
+    mean_mm2_s2 = 0.5 * (2.0 * 2.0 * math.pi) ** 2
+    assert swung(0.02, 40.0).information_mm2_s == pytest.approx(FORGETTING_S * mean_mm2_s2, rel=0.1)
 
 
 def test_a_gap_that_is_off_is_not_late() -> None:

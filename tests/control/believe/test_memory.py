@@ -128,11 +128,14 @@ def test_a_device_that_is_found_homed_has_rested_there(follow, element: Element)
     assert remembered.lag_mT == 0.0
 
 
-def test_one_that_has_to_be_homed_has_rested_where_it_was_switched_on(follow, element: Element) -> None:
+@pytest.mark.parametrize("rested_mm", [79.0, 44.0])
+def test_one_that_has_to_be_homed_has_rested_where_it_was_switched_on(
+    follow, element: Element, rested_mm: float
+) -> None:
     """Its counts are 0 there, and once more where the switches are; the flag comes later than that."""
-    on_its_way = [found(95.0 + opened_mm, is_homed=False) for opened_mm in (0.0, 10.0, 16.0, 15.5, 0.0)]
+    on_its_way = [found(95.0 + opened_mm, is_homed=False) for opened_mm in (0.0, 10.0, 95.0 - rested_mm, 15.5, 0.0)]
     remembered = follow(*on_its_way, found(95.0), memory=element.memory)
-    assert remembered.relaxed_N == pytest.approx(follow(found(79.0), memory=element.memory).relaxed_N, rel=0.02)
+    assert remembered.relaxed_N == pytest.approx(follow(found(rested_mm), memory=element.memory).relaxed_N, rel=0.02)
     assert remembered.lag_mT < 0.0  # the field fell
 
 

@@ -67,6 +67,7 @@ def test_of_a_device_that_was_never_seen_a_creep_shows_nearly_all() -> None:
 @pytest.mark.parametrize("share", [0.0, 0.9 * MIN_SHARE])
 def test_a_sensor_that_reads_less_than_any_device_makes_teaches_nothing(share: float) -> None:
     assert plain(crept(share, 10.0)) == plain(crept(1.0, 0.0))
+    assert crept(MIN_SHARE, 10.0).factor == MIN_FACTOR
 
 
 def test_friction_follows_a_rise_over_travel_and_a_fall_at_once() -> None:

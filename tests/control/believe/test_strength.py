@@ -11,11 +11,13 @@ from tormagd.control.believe.strength import (
     MAX_SCALE,
     MIN_SCALE,
     OFFSET_SD_N,
+    SCALE_LASTS_S,
     SCALE_SD,
     SURE,
     UNSEEN,
     DeviceFit,
     Strength,
+    forgotten,
     observe,
 )
 
@@ -112,6 +114,31 @@ def test_over_the_force_without_memory_it_says_the_same(relaxed_N: float) -> Non
     for model_N in (0.5, 1.0, 2.0):
         assert over.force_N(model_N) == pytest.approx(fit.force_N(model_N - relaxed_N))
         assert over.deviation_N(model_N) == pytest.approx(fit.deviation_N(model_N - relaxed_N))
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.25])
+def test_of_so_many_times_the_force_it_is_as_many_times_as_unsure(factor: float) -> None:
+    fit = DeviceFit(0.9, -0.05, 0.01, -0.004, 0.006)
+    more = fit.times(factor)
+    assert (more.scale_sd, more.offset_sd_N) == pytest.approx((factor * 0.1, factor * math.sqrt(0.006)))
+    for model_N in (0.5, 2.0):
+        assert more.force_N(model_N) == pytest.approx(factor * fit.force_N(model_N))
+        assert more.deviation_N(model_N) == pytest.approx(factor * fit.deviation_N(model_N))
+
+
+def test_what_is_known_is_forgotten_in_its_time() -> None:
+    """The offset in less, the sooner it adapts; and in two halves of the time as in the whole."""
+    known, adapts_in_s = DeviceFit(1.2, 0.05, 0.01, 0.001, 0.002), 0.5
+    offset_lasts_s = 2.0 * OFFSET_SD_N**2 * adapts_in_s**2 / ERROR_N2_S
+    left = math.exp(-2.0)
+    warmed, relaxed = (forgotten(known, dt_s, adapts_in_s) for dt_s in (SCALE_LASTS_S, offset_lasts_s))
+    assert (warmed.scale, warmed.offset_N) == (known.scale, known.offset_N)
+    assert warmed.scale_variance == pytest.approx(SCALE_SD**2 + left * (0.01 - SCALE_SD**2))
+    assert relaxed.offset_variance_N2 == pytest.approx(OFFSET_SD_N**2 + left * (0.002 - OFFSET_SD_N**2))
+    half = forgotten(known, 0.5 * offset_lasts_s, adapts_in_s)
+    twice = forgotten(half, 0.5 * offset_lasts_s, adapts_in_s)
+    assert twice.covariance_N == pytest.approx(relaxed.covariance_N)
+    assert 0.0 < relaxed.covariance_N < left**0.5 * known.covariance_N
 
 
 @pytest.mark.parametrize(("learns_scale", "learns_offset"), [(True, False), (False, True)])
