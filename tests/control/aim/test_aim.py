@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.assembly.build import Core
+from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config
 from tormagd.control.aim.floors import LAW_SHARE, ceiling_mm
 from tormagd.control.believe.believe import Learned
@@ -158,6 +158,15 @@ def test_the_model_is_never_asked_outside_what_it_was_shown(first) -> None:
     assert early.outside == (Outside("displacement_mm", 0.1, MOBILISED_MM),)
     assert early.gap_mm == first(1.0).gap_mm
     assert first(1.0).outside == ()
+
+
+def test_where_the_field_lags_and_the_force_relaxes_the_gap_makes_up_for_both(planned, moving) -> None:
+    """Whichever way the force goes, with the memory that the element has."""
+    planner = build_core(CONFIG).planner()
+    for force_N in (1.6, 0.9, 1.3):
+        for _ in range(50):
+            plan = planned(planner, force_N, moving(planner.planned.gap_mm, sensed_s=-1.0))
+        assert plan.predicted_N == pytest.approx(force_N, abs=0.004)
 
 
 class WrongSolver:
