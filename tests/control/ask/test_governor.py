@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 
 from tormagd.assembly.journal import KNOWN
 from tormagd.control.aim.portrait import Portrait
-from tormagd.control.ask.forecast import Forecast
+from tormagd.control.ask.forecast import HORIZON_S, Forecast
 from tormagd.control.ask.governor import AHEAD_S, MIN_TIMES, Governor, _wanted_N
 from tormagd.control.ask.path import PATH_S, TIMES_S
 from tormagd.control.believe.strength import DeviceFit
@@ -449,6 +449,8 @@ def test_past_its_end_a_short_preview_of_what_repeats_itself_is_foreseen() -> No
             decide(following, now_s, setpoint)
             if now_s > 6.0:
                 wanted_N = _wanted_N(setpoint, 0.0, (0.0, 10.0), following.forecast)
+                known_s = 0.04 + HORIZON_S * is_foreseen
+                assert len(wanted_N) == max(MIN_TIMES, sum(after_s < known_s for after_s in TIMES_S))
                 found.append(wanted_N[MIN_TIMES - 1] - beats_N(now_s + TIMES_S[MIN_TIMES - 1]))
     assert np.std(missed[True]) < 0.5 * np.std(missed[False])
 
