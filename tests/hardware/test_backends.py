@@ -1,23 +1,28 @@
-"""The CAN backend: over the simulator's own bus, a slcan adapter on a pseudo-terminal, and a bus that fails as told."""
+"""What each backend is besides the contract: a serial port, the simulator's bus, a slcan adapter, a bus that fails."""
 
 import contextlib
 import errno
 import os
 import select
 import socket
+import termios
 import tty
 from collections.abc import Callable, Iterator
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import can
 import pytest
 
 from firmware_protocol.codec import DeviceFault, DeviceMode, Drive, DriveMode, Home, Message, Status, Switches
 from tormagd.config import Device, Rates
-from tormagd.hardware.backend import BackendError, choose, installed
+from tormagd.hardware.backend import ENTRY_POINTS, Backend, BackendError, choose, installed
 from tormagd.hardware.can_backend import FRAMES_AT_ONCE, UNSENT_FRAMES, CanBackend, CanOptions
 from tormagd.hardware.can_stream import CanStream
+from tormagd.hardware.frame_stream import FrameStream
+from tormagd.hardware.serial_backend import SerialOptions, open_serial
+from tormagd.hardware.serial_port import SerialPort
 from tormagd.simulation.can_frame import ERROR_FLAG, CanFrame, to_socket
 from tormagd_client.endpoints import ConfigError
 
@@ -37,7 +42,7 @@ def opened(device: Device) -> CanBackend:
     return backend
 
 
-def wait_readable(backend: CanBackend) -> None:
+def wait_readable(backend: Backend) -> None:
     assert select.select([backend.fileno()], [], [], 5.0)[0]
 
 
@@ -46,6 +51,87 @@ def next_of(backend: CanBackend) -> list[Message]:
     while not (received := backend.receive()):
         wait_readable(backend)
     return received
+
+
+# -- on a serial line -------------------------------------------------------------------------------------------------
+
+
+class Line(NamedTuple):
+    """A pseudo-terminal whose far end the test holds."""
+
+    far: int
+    near: int
+    device: Device
+
+    @property
+    def adapter(self) -> Device:
+        """What is there where it is a slcan adapter's."""
+        return Device(backend="can", options={"interface": "slcan"}, port=self.device.port)
+
+
+@pytest.fixture
+def line() -> Iterator[Line]:
+    far, near = os.openpty()
+    tty.setraw(near)
+    yield Line(far, near, Device(port=os.ttyname(near)))
+    os.close(far)
+    os.close(near)
+
+
+@pytest.fixture
+def port(line: Line) -> Iterator[SerialPort]:
+    opened = open_serial(line.device, SerialOptions())
+    yield opened
+    opened.close()
+
+
+def test_bytes_from_before_the_opening_are_not_read(line: Line) -> None:
+    os.write(line.far, b"half a frame of an earlier life")
+    port = open_serial(line.device, SerialOptions())
+    os.write(line.far, FrameStream().pack(STATUS))
+    wait_readable(port)
+    assert port.receive() == [STATUS]
+    assert port.statistics.corrupt == 0
+    port.close()
+
+
+def test_end_of_file_is_a_device_that_was_unplugged(port: SerialPort, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A real USB port reads nothing, for ever, once its device is gone."""
+    monkeypatch.setattr(os, "read", lambda descriptor, count: b"")
+    with pytest.raises(BackendError, match="unplugged"):
+        port.receive()
+
+
+def test_what_the_driver_did_not_take_is_sent_before_the_next_frame(
+    line: Line, port: SerialPort, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken = b""
+    room = iter([3, 0, 7, 0, 0, 100, 100])
+
+    def write(descriptor: int, data: bytes) -> int:
+        nonlocal taken
+        assert descriptor == port.fileno()
+        count = next(room)
+        if not count:
+            raise BlockingIOError
+        taken += data[:count]
+        return len(data[:count])
+
+    monkeypatch.setattr(os, "write", write)
+    for nonce in range(1, 8):
+        port.send(Home(nonce))
+    far = FrameStream()
+    assert far.unpack(taken) == [Home(nonce) for nonce in range(1, 8)]
+    assert far.statistics.lost == 0
+
+
+def test_a_port_that_goes_while_it_is_set_up_is_not_opened(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(descriptor: int) -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(termios, "tcgetattr", gone)
+    with pytest.raises(BackendError, match="Input/output error"):
+        open_serial(line.device, SerialOptions())
 
 
 # -- on the simulator's bus ----------------------------------------------------------------------------------------
@@ -130,49 +216,27 @@ def test_an_interface_that_is_not_there_says_how_it_comes(
 # -- behind an adapter on a serial line ----------------------------------------------------------------------------
 
 
-class Adapter:
-    """A pseudo-terminal where a slcan adapter would be."""
-
-    def __init__(self) -> None:
-        self.far, self.near = os.openpty()
-        tty.setraw(self.near)
-        self.device = Device(backend="can", options={"interface": "slcan"}, port=os.ttyname(self.near))
-
-    def unplug(self) -> None:
-        """Both ends: the test holds the host's too, so that lines written before it opened stay."""
-        for descriptor in (self.far, self.near):
-            with contextlib.suppress(OSError):
-                os.close(descriptor)
-
-
-@pytest.fixture
-def adapter() -> Iterator[Adapter]:
-    made = Adapter()
-    yield made
-    made.unplug()
-
-
-def test_lines_of_an_adapter_pass_both_ways(adapter: Adapter) -> None:
-    backend = opened(adapter.device)
+def test_lines_of_an_adapter_pass_both_ways(line: Line) -> None:
+    backend = opened(line.adapter)
     backend.send(Home(7))
     said = b""
     while not said.endswith(b"t061107\r"):
-        said += os.read(adapter.far, 100)
+        said += os.read(line.far, 100)
     assert said.startswith(b"C\rS8\r")
     status = frame_of(STATUS)
-    os.write(adapter.far, b"\rz\r\at%03X8%s\r" % (status.identifier, status.data.hex().encode()))
+    os.write(line.far, b"\rz\r\at%03X8%s\r" % (status.identifier, status.data.hex().encode()))
     assert next_of(backend) == [STATUS]
     backend.close()
 
 
 @pytest.mark.parametrize("damaged", [b"t07x8\r", b"t0718zz\r", b"t071\r", b"\xff\xfe071\r", b"t0719\r", b"tttt\r"])
-def test_a_damaged_line_is_counted_and_the_next_is_read(adapter: Adapter, damaged: bytes) -> None:
-    backend = opened(adapter.device)
-    os.write(adapter.far, damaged)
+def test_a_damaged_line_is_counted_and_the_next_is_read(line: Line, damaged: bytes) -> None:
+    backend = opened(line.adapter)
+    os.write(line.far, damaged)
     while not backend.statistics.corrupt:
         wait_readable(backend)
         assert backend.receive() == []
-    os.write(adapter.far, b"t0718%s\r" % frame_of(STATUS).data.hex().encode())
+    os.write(line.far, b"t0718%s\r" % frame_of(STATUS).data.hex().encode())
     assert next_of(backend) == [STATUS]
     assert backend.statistics.resynchronisations == 1
     backend.close()
@@ -260,6 +324,53 @@ def test_other_kinds_of_frames_are_other_peoples(failing: Callable[..., CanBacke
 
 
 # -- finding one ---------------------------------------------------------------------------------------------------
+
+
+FINE = "tormagd.hardware.serial_backend:DRIVER"
+
+
+def install(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
+    """Pretends that these plugins are installed."""
+    points = [metadata.EntryPoint(name, value, ENTRY_POINTS) for name, value in entries.items()]
+    monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == ENTRY_POINTS else [])
+
+
+def test_the_serial_backend_is_installed() -> None:
+    chosen = choose(Device(options={"baud": 115_200}), Rates())
+    assert chosen.options == SerialOptions(baud=115_200)
+
+
+def test_an_unknown_backend_names_the_installed_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, zeta=FINE, alpha=FINE)
+    with pytest.raises(ConfigError, match=r"device\.backend = 'telepathy': installed are alpha, zeta"):
+        choose(Device(backend="telepathy"), Rates())
+    install(monkeypatch)
+    with pytest.raises(ConfigError, match="installed are none"):
+        choose(Device(backend="telepathy"), Rates())
+
+
+def test_a_broken_plugin_is_named_and_stops_nobody_else(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    (tmp_path / "half_a_plugin.py").write_text("def open(device:\n")
+    (tmp_path / "angry_plugin.py").write_text("raise RuntimeError('not on a Friday')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    broken = {
+        "function": ("os:getpid", "allowed is a tormagd.hardware.backend.Driver"),
+        "absent": ("no_such_module_anywhere:open", "ModuleNotFoundError"),
+        "nameless": ("os:no_such_attribute", "AttributeError"),
+        "half": ("half_a_plugin:open", "SyntaxError"),
+        "angry": ("angry_plugin:open", "not on a Friday"),
+    }
+    install(monkeypatch, fine=FINE, **{name: value for name, (value, _) in broken.items()})
+    found = installed()
+    assert (list(found), found["fine"]) == (sorted([*broken, "fine"]), "")
+    assert [record.levelname for record in caplog.records] == ["WARNING"] * len(broken)
+    for name, (_, said) in broken.items():
+        assert said in found[name]
+        with pytest.raises(ConfigError, match=rf"device\.backend = '{name}': the plugin does not load"):
+            choose(Device(backend=name), Rates())
+    assert choose(Device(backend="fine"), Rates()).options == SerialOptions()
 
 
 def can_device(interface: str) -> Device:

@@ -1,6 +1,8 @@
-"""The simulator's CAN doors: a process of its own, and hosts with python-can's own interfaces."""
+"""The simulator's doors: a process of its own, and hosts as the daemon or python-can's own interfaces open them."""
 
 import contextlib
+import csv
+import itertools
 import select
 import signal
 import socket
@@ -25,6 +27,9 @@ from firmware_protocol.codec import (
     can_identifier,
     encode,
 )
+from tormagd.config import Device
+from tormagd.hardware.serial_backend import SerialOptions, open_serial
+from tormagd.simulation.__main__ import main
 from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.can_door import MAX_HOSTS, CanDoor
 from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, CanFrame, from_socket, to_socket
@@ -59,6 +64,13 @@ def start() -> Iterator[Start]:
 def channel(process: "subprocess.Popen[str]") -> str:
     assert process.stdout is not None
     return process.stdout.readline().strip()
+
+
+def ended(process: "subprocess.Popen[str]") -> None:
+    """Asks it to end, which it does without a word."""
+    process.send_signal(signal.SIGTERM)
+    output, errors = process.communicate(timeout=LIMIT_S)
+    assert (process.returncode, output) == (0, ""), errors
 
 
 def message_of(message: Message) -> can.Message:
@@ -102,10 +114,7 @@ def test_hosts_come_and_go_on_the_simulators_bus_and_hear_each_other(start: Star
             assert own.arbitration_id != heard, "a sender does not hear itself"
         with pytest.raises(can.CanOperationError, match="11-bit"):
             one.send(can.Message(arbitration_id=1, is_extended_id=True))
-    process.send_signal(signal.SIGTERM)
-    output, errors = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 0, errors
-    assert output == ""
+    ended(process)
     assert not Path(path).exists()
 
 
@@ -137,6 +146,68 @@ def test_the_device_is_a_node_of_a_bus_that_is_there(start: Start, address: str)
     with bus:
         assert channel(start("--bus", address)) == name
         meet(bus)
+
+
+# -- the serial door, and calls of the process -----------------------------------------------------------------------
+
+
+def meet_on_serial(path: str, nonce: int) -> None:
+    """Opens the line as the daemon does, repeats Hello until both Identity and Status have come, and closes it."""
+    seen: set[type[Message]] = set()
+    deadline_s = time.monotonic() + LIMIT_S
+    with contextlib.closing(open_serial(Device(port=path), SerialOptions())) as port:
+        while not {Identity, Status} <= seen:
+            assert time.monotonic() < deadline_s, f"only {seen} in {LIMIT_S} s"
+            port.send(Hello(SCHEMA_HASH, PROTOCOL_VERSION, nonce))
+            select.select([port.fileno()], [], [], 0.1)
+            seen |= {type(message) for message in port.receive()}
+
+
+def test_hello_is_answered_across_two_hosts_and_the_truth_is_kept(start: Start, tmp_path: Path) -> None:
+    truth = tmp_path / "truth.csv"
+    process = start("--pty", "--seed", "3", "--truth", str(truth))
+    path = channel(process)
+    assert Path(path).is_char_device()
+    for nonce in (1, 2):
+        meet_on_serial(path, nonce)
+    assert process.poll() is None
+    ended(process)
+    with truth.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == [
+        "t_ns", "force_N", "gap_mm", "left_mm", "right_mm", "handle_mm", "handle_mm_s", "temperature_C",
+    ]  # fmt: skip
+    assert len(rows) > 20
+    assert all(int(after["t_ns"]) > int(before["t_ns"]) for before, after in itertools.pairwise(rows))
+    assert abs(int(rows[0]["t_ns"]) - time.time_ns()) < 120e9
+    assert float(rows[-1]["gap_mm"]) == pytest.approx(79.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "--pty"),
+        (("--pty", "--plant", "nowhere.toml"), "sample_1"),
+        (("--pty", "--fault", "gremlins"), "worn_gearbox"),
+        (("--pty", "--hand", "third"), "reversing"),
+        (("--pty", "--baud", "7"), "1200"),
+        (("--pty", "--truth", "/nonexistent/truth.csv"), "/nonexistent"),
+        (("--can", "--bitrate", "7"), "10000"),
+        (("--can", "--node", "16"), "16"),
+        (("--can", "/nonexistent/can"), "/nonexistent"),
+        (("--bus", "telepathy:0"), "telepathy"),
+        (("--can", "--pty"), "not allowed"),
+    ],
+)
+@pytest.mark.usefixtures("usual_slices")
+def test_a_wrong_call_says_what_is_right_and_exits_with_2(
+    arguments: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+    output, errors = capsys.readouterr()
+    assert output == ""
+    assert said in errors
 
 
 # -- the bus's door ------------------------------------------------------------------------------------------------
