@@ -6,9 +6,10 @@ import pytest
 
 from tormagd.assembly.build import build_core
 from tormagd.config import Config
-from tormagd.control.believe.strength import UNSEEN
+from tormagd.control.believe.believe import NOTHING_LEARNED
 from tormagd.control.records import TimedSetpoint
 from tormagd.scenes.scene import Terms, load_scene
+from tormagd.simulation.hand import ReversingHand
 
 VALID_S = 0.2
 SAMPLES = ("sample_1", "sample_2", "sample_3")
@@ -59,4 +60,15 @@ def test_the_model_alone_renders_the_forces_of_the_device_that_it_was_trained_on
         )
     ]
     assert np.sqrt(np.mean(np.square(errors_N))) < 0.02
-    assert loop.planner.believe.strength.fit == UNSEEN
+    assert loop.planner.believe.learned() == NOTHING_LEARNED
+
+
+@pytest.mark.parametrize("sample", ["sample_1", "sample_3"])
+def test_without_learning_nothing_is_learned_though_the_hand_reverses_and_forces_leap(arm, sample: str) -> None:
+    config, scene = Config(scene="pulse"), load_scene("pulse")
+    frozen = build_core(config, msgspec.structs.replace(scene, terms=Terms(learning=False)))
+    loop = arm(sample, ReversingHand(1.0), core=frozen, config=config)
+    for _ in loop.run(5.0, lambda now_s: TimedSetpoint(1.4 + 0.5 * (now_s % 1.0 > 0.5), now_s, VALID_S)):
+        pass
+    assert loop.planner.believe.learned() == NOTHING_LEARNED
+    assert loop.stepper.move.acceleration_scale == 1.0

@@ -90,27 +90,17 @@ def test_a_build_is_kept_and_follows_its_sources(c_compiler, tmp_path, monkeypat
     assert len(list(first.parent.iterdir())) == 2
 
 
-@pytest.fixture
-def without_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_the_reason_and_the_remedy_are_given(capsys, monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("CC", "cc-that-is-not-there")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     c_build.load_library.cache_clear()
-
-
-@pytest.mark.usefixtures("without_compiler")
-def test_without_a_compiler_the_reason_and_the_remedy_are_given(capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("tormagd.simulation.compiled_firmware._library", c_build.load_library)
     with pytest.raises(BuildError, match="no C compiler: 'cc-that-is-not-there' is not on the path; install"):
         compiler()
     assert c_build.main() == 1
     assert "no C compiler" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("without_compiler")
-def test_the_simulator_refuses_the_c_firmware_without_a_compiler(capsys, monkeypatch) -> None:
-    monkeypatch.setattr("tormagd.simulation.compiled_firmware._library", c_build.load_library)
-    with pytest.raises(SystemExit) as exit_info:
+    with pytest.raises(SystemExit, match="2"):
         simulate(["--pty", "--firmware", "c"])
-    assert exit_info.value.code == 2
     assert "no C compiler" in capsys.readouterr().err
 
 

@@ -36,8 +36,6 @@ from tormagd.simulation.firmware import TICK_S, Answer, Firmware, Output, Sensor
 from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
-Exchange = Callable[[list[str]], list[str]]
-
 PLANT = load_plant("sample_1")
 MM_PER_COUNT = PLANT.screw.lead_mm / PLANT.electronics.encoder_counts_per_rev
 HOME_MM, CLOSED_MM = 47.5, 22.25
@@ -383,7 +381,7 @@ def test_one_life_leads_through_every_mode_and_fault(told: Twins) -> None:
     assert told.seen == {*DeviceMode, *DeviceFault}
 
 
-def test_under_sanitizers_the_same_life_gives_the_same_answers(told: Twins, exchange: Exchange) -> None:
+def test_under_sanitizers_the_same_life_gives_the_same_answers(told: Twins, exchange) -> None:
     def duties_as_python_writes_them(answer: str) -> str:
         *rest, left, right, enabled = answer.split(" ")
         return " ".join([*rest, float.fromhex(left).hex(), float.fromhex(right).hex(), enabled])

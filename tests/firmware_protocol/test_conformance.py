@@ -13,7 +13,7 @@ import sys
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 import pytest
@@ -55,6 +55,7 @@ from tormagd.simulation.hand import SteadyHand
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
 PAGE = Path(firmware_protocol.__file__).parent / "README.md"
+Measured = tuple[State, Sense]
 SAMPLE = load_plant("sample_1")
 NEAR_HOME = msgspec.structs.replace(
     SAMPLE, assumed=msgspec.structs.replace(SAMPLE.assumed, start_left_mm=45.5, start_right_mm=45.0)
@@ -65,10 +66,19 @@ NEAR_HOME = msgspec.structs.replace(
 # -- ports in virtual time -----------------------------------------------------------------------------------------
 
 
+def as_it_is(_device: object, *said: Any) -> Any:
+    """A hook that changes nothing; what it is about comes last."""
+    return said[-1]
+
+
+def nothing(_device: object, *_what: object) -> None:
+    """A hook that does nothing."""
+
+
 class Wire:
     """A serial port of a simulated device, in virtual time: a `BytePort`. Wrong ones spoil what passes."""
 
-    def __init__(self, device: VirtualDevice) -> None:
+    def __init__(self, device: Any) -> None:
         self.device = device
         self.time_s = 0.0
 
@@ -85,36 +95,19 @@ class Wire:
     def close(self) -> None:
         pass
 
-    def down(self, data: bytes) -> bytes:
-        return data
-
-    def up(self, data: bytes) -> bytes:
-        return data
+    down = up = as_it_is
 
 
-class Bus:
+class Bus(Wire):
     """The same of a CAN bus: a `FramePort`."""
 
-    def __init__(self, device: CanDevice, *, every_node: bool = False) -> None:
-        self.device = device
-        self.time_s = 0.0
-        self._every_node = every_node
+    def write(self, identifier: int, data: bytes) -> None:  # type: ignore[override]
+        self.device.receive(self.time_s, CanFrame(self.down(identifier), data))
 
-    def now_s(self) -> float:
-        return self.time_s
-
-    def write(self, identifier: int, data: bytes) -> None:
-        if self._every_node:
-            identifier = identifier & ~0xF | 1
-        self.device.receive(self.time_s, CanFrame(identifier, data))
-
-    def read(self, until_s: float) -> list[tuple[float, int, bytes]]:
+    def read(self, until_s: float) -> list[tuple[float, int, bytes]]:  # type: ignore[override]
         self.time_s = max(self.time_s, until_s)
         delivered = self.device.transmit(self.time_s)
         return [(self.time_s, frame.identifier, frame.data) for sender, frame in delivered if sender == DEVICE]
-
-    def close(self) -> None:
-        pass
 
 
 def serial_line(
@@ -126,9 +119,8 @@ def serial_line(
     return SerialLine(wire(VirtualDevice(plant, SteadyHand(), [parse_fault(fault) for fault in faults], boot=boot)))
 
 
-def can_line(boot: FirmwareKind = Firmware, *, every_node: bool = False) -> CanLine:
-    device = CanDevice(MessageDevice(NEAR_HOME, SteadyHand(), boot=boot))
-    return CanLine(Bus(device, every_node=every_node), 1)
+def can_line(bus: type[Bus] = Bus) -> CanLine:
+    return CanLine(bus(CanDevice(MessageDevice(NEAR_HOME, SteadyHand()))), 1)
 
 
 # -- the right device ----------------------------------------------------------------------------------------------
@@ -193,7 +185,7 @@ class Rogue(CompiledFirmware):
         return self.real.status(sensors)
 
     def measurement(self, time_s: float, sensors: Sensors) -> tuple[State, Sense]:
-        return self.measures(time_s, *self.real.measurement(time_s, sensors))
+        return self.measures(time_s, self.real.measurement(time_s, sensors))
 
     def identity(self) -> Identity:
         return self.real.identity()
@@ -216,41 +208,22 @@ class Rogue(CompiledFirmware):
 
     # the hooks
 
-    def before(self, time_s: float, message: Message) -> None:
-        """What a message does to it before it is obeyed."""
-
-    def hears(self, message: Message) -> Message | None:
-        """What it takes a message for; None: for nothing."""
-        return message
-
-    def after(self, time_s: float, message: Message) -> None:
-        """What a message does to it besides."""
-
-    def answers(self, message: Message, answer: Answer) -> Answer:
-        """What it makes of the right answer."""
-        return answer
-
-    def ticks(self, time_s: float) -> None:
-        """What it does before each tick."""
-
-    def ticked(self, time_s: float) -> None:
-        """What it does after each tick."""
-
-    def shows(self, time_s: float, status: Status) -> Status | None:
-        """What it makes of a right Status."""
-        return status
-
-    def measures(self, time_s: float, state: State, sense: Sense) -> tuple[State, Sense]:
-        """What it makes of a right measurement."""
-        return state, sense
-
-    def drives(self, output: Output) -> Output:
-        """What its bridges make of the right output."""
-        return output
+    before = after = nothing
+    """What a message does to it before it is obeyed, and besides."""
+    hears = answers = as_it_is
+    """What it takes a message for, None: for nothing; what it makes of the right answer."""
+    ticks = ticked = nothing
+    """What it does before and after each tick."""
+    shows = measures = drives = as_it_is
+    """What it makes of a right Status, of a right measurement; what its bridges make of the right output."""
 
 
 def is_running(device: Rogue) -> bool:
     return device.real.mode is DeviceMode.RUN
+
+
+def is_idle(device: Rogue, _message: Message) -> bool:
+    return device.real.mode is DeviceMode.IDLE
 
 
 def is_latched(device: Rogue) -> bool:
@@ -302,14 +275,24 @@ def runs_unhomed(device: Rogue, time_s: float, message: Message, sensors: Sensor
     return answer
 
 
-def clear_mends_mismatch(device: Rogue, time_s: float, message: Message) -> None:
-    if isinstance(message, Clear):
-        device.real._compatible = True
+def sets(
+    kind: type[object],
+    when: Callable[[Rogue, Message], bool] = lambda device, message: True,
+    **state: object,
+) -> Callable[[Rogue, float, Message], None]:
+    """A message of that kind puts the firmware in this state."""
+
+    def hook(device: Rogue, time_s: float, message: Message) -> None:
+        if isinstance(message, kind) and when(device, message):
+            for name, value in state.items():
+                setattr(device.real, name, value)
+
+    return hook
 
 
-def forgets_nonce_at_home(device: Rogue, time_s: float, message: Message) -> None:
-    if isinstance(message, Home):
-        device.real._nonce = None
+HOMES_FROM_ANYWHERE = sets(
+    Home, lambda device, message: message.nonce != device.real._nonce, mode=DeviceMode.IDLE, faults=DeviceFault(0)
+)
 
 
 def clear_ends_anything(device: Rogue, time_s: float, message: Message) -> None:
@@ -317,22 +300,9 @@ def clear_ends_anything(device: Rogue, time_s: float, message: Message) -> None:
         device.real._rest(time_s, DeviceMode.IDLE)
 
 
-def homes_from_anywhere(device: Rogue, time_s: float, message: Message) -> None:
-    if isinstance(message, Home) and message.nonce != device.real._nonce:
-        device.real.mode, device.real.faults = DeviceMode.IDLE, DeviceFault(0)
-
-
 def off_only_switches_off(device: Rogue, time_s: float, message: Message) -> None:
     if is_running(device) and isinstance(message, Drive) and message.mode is DriveMode.OFF:
         device.real._rest(time_s, DeviceMode.IDLE)
-
-
-def needs_no_letting_go(device: Rogue, time_s: float, message: Message) -> None:
-    device.real._may_run = True
-
-
-def clear_lets_go(device: Rogue, time_s: float, message: Message) -> None:
-    device.real._may_run |= isinstance(message, Clear)
 
 
 def hello_resets(device: Rogue, time_s: float, message: Message, sensors: Sensors) -> Answer:
@@ -340,10 +310,6 @@ def hello_resets(device: Rogue, time_s: float, message: Message, sensors: Sensor
         device.real = Firmware(device.plant)
         return Answer.IDENTITY
     return device.real.receive(time_s, message, sensors)
-
-
-def clear_homes(device: Rogue, time_s: float, message: Message) -> None:
-    device.real.homed |= isinstance(message, Clear) and device.real.mode is DeviceMode.IDLE
 
 
 def any_message_extends(device: Rogue, time_s: float, message: Message) -> None:
@@ -383,15 +349,16 @@ def latched_keeps_homed(device: Rogue, time_s: float) -> None:
         device.real.homed = device.was_homed
 
 
-def home_keeps_origin(device: Rogue, time_s: float, state: State, sense: Sense) -> tuple[State, Sense]:
-    left_mm = state.left_position_mm + device.real._left_zero_mm
-    return state.replaced(left_position_mm=left_mm, right_position_mm=left_mm), sense
+def home_keeps_origin(device: Rogue, time_s: float, measured: Measured) -> Measured:
+    left_mm = measured[0].left_position_mm + device.real._left_zero_mm
+    return measured[0].replaced(left_position_mm=left_mm, right_position_mm=left_mm), measured[1]
 
 
-def homed_before_zero(device: Rogue, time_s: float, state: State, sense: Sense) -> tuple[State, Sense]:
+def homed_before_zero(device: Rogue, time_s: float, measured: Measured) -> Measured:
     """HOMED shows 40 ms before State is in the new origin."""
     if device.real.homed and device.zeroed_s < 0.0:
         device.zeroed_s = time_s + 0.04
+    state, sense = measured
     if time_s < device.zeroed_s:
         state = state.replaced(left_position_mm=state.left_position_mm + device.real._left_zero_mm)
     return state, sense
@@ -588,7 +555,7 @@ PLANTED = (
     rogue("Hello is no nonce", "hello_nonce", receive=keeps_nonce_at(Hello)),
     rogue("ignores the schema", "schema_mismatch", hears=lambda _, message: any_schema_fits(message)),
     rogue("ignores the version", "version_mismatch", hears=lambda _, message: any_version_fits(message)),
-    rogue("Clear mends a mismatch", "mismatch_holds", before=clear_mends_mismatch),
+    rogue("Clear mends a mismatch", "mismatch_holds", before=sets(Clear, _compatible=True)),
     rogue(
         "Clear is ignored",
         "clear_clears",
@@ -622,12 +589,12 @@ PLANTED = (
     rogue(
         "State's counter stuck",
         "state_counter",
-        measures=lambda _, time_s, state, sense: (state.replaced(counter=5), sense),
+        measures=lambda _, time_s, measured: (measured[0].replaced(counter=5), measured[1]),
     ),
     rogue(
         "State's counter repeated",
         "state_counter",
-        measures=lambda _, time_s, state, sense: (state.replaced(counter=state.counter // 2), sense),
+        measures=lambda _, time_s, measured: (measured[0].replaced(counter=measured[0].counter // 2), measured[1]),
     ),
     fault("clock=+2%", "device_clock"),
     fault("clock=-2%", "device_clock"),
@@ -655,7 +622,10 @@ PLANTED = (
     rogue(
         "current with an offset",
         "sense_plausible",
-        measures=lambda _, time_s, state, sense: (state, sense.replaced(left_current_A=sense.left_current_A + 0.5)),
+        measures=lambda _, time_s, measured: (
+            measured[0],
+            measured[1].replaced(left_current_A=measured[1].left_current_A + 0.5),
+        ),
     ),
     wire("no CRC-8", "drive_crc_8", mended=mending(with_crc8)),
     wire("clamps duties", "drive_range", mended=mending(clamped)),
@@ -669,19 +639,19 @@ PLANTED = (
     wire("takes a zero inside", "frame_zero_inside", down=joined),
     wire("noise is a Drive", "noise", mended=noise_is_a_drive),
     wire("deafened", "noise", mended=deafened),
-    Planted("every node", "other_node", lambda: can_line(every_node=True)),
+    Planted("every node", "other_node", lambda: can_line(wrong(Bus, down=lambda _, identifier: identifier & ~0xF | 1))),
     rogue("Home is ignored", "home_homes", hears=only_acknowledges(Home)),
     fault("motor_reversed_left", "home_homes"),
     fault("encoder_reversed_left", "home_homes"),
     fault("switch_dead_left", "home_homes"),
     rogue("Home keeps the origin", "home_zeroes", measures=home_keeps_origin),
     rogue("homed before zero", "homed_is_in_new_origin", measures=homed_before_zero),
-    rogue("obeys repetitions", "repeated_command", before=forgets_nonce_at_home),
+    rogue("obeys repetitions", "repeated_command", before=sets(Home, _nonce=None)),
     rogue("Retract's nonce not shown", "retract_when_idle", receive=keeps_nonce_at(Retract)),
     rogue("Clear ends anything", "homing_takes_only_retract", before=clear_ends_anything),
-    rogue("homes from anywhere", "retracting_takes_only_retract", before=homes_from_anywhere),
-    rogue("homes from anywhere", "home_refused_in_run", before=homes_from_anywhere),
-    rogue("homes from anywhere", "latched_refuses_home", before=homes_from_anywhere),
+    rogue("homes from anywhere", "retracting_takes_only_retract", before=HOMES_FROM_ANYWHERE),
+    rogue("homes from anywhere", "home_refused_in_run", before=HOMES_FROM_ANYWHERE),
+    rogue("homes from anywhere", "latched_refuses_home", before=HOMES_FROM_ANYWHERE),
     rogue("Clear ends anything", "clear_refused_in_run", before=clear_ends_anything),
     rogue(
         "modes mixed up",
@@ -713,7 +683,7 @@ PLANTED = (
     ),
     rogue("OFF only switches off", "off_opens", before=off_only_switches_off),
     rogue("Retract is ignored", "retract_opens", hears=only_acknowledges(Retract)),
-    rogue("needs no letting go", "let_go_after_retract", before=needs_no_letting_go),
+    rogue("needs no letting go", "let_go_after_retract", before=sets(object, _may_run=True)),
     rogue("Hello resets", "hello_in_run", receive=hello_resets),
     rogue(
         "a mismatch in RUN passes",
@@ -737,8 +707,12 @@ PLANTED = (
         ),
     ),
     rogue("retracts when latched", "latched_refuses_retract", hears=only_acknowledges(Retract, is_latched)),
-    rogue("Clear homes", "cleared_is_not_homed", after=clear_homes),
-    rogue("Clear lets go", "let_go_after_fault", after=clear_lets_go),
+    rogue(
+        "Clear homes",
+        "cleared_is_not_homed",
+        after=sets(Clear, is_idle, homed=True),
+    ),
+    rogue("Clear lets go", "let_go_after_fault", after=sets(Clear, _may_run=True)),
     fault("state_crc", "own_messages", "state_answers_drive"),
     wire(
         "sequence stuck",
@@ -824,20 +798,18 @@ def test_a_check_that_this_computer_spoiled_is_tried_again() -> None:
 
 
 @pytest.fixture
-def opened(monkeypatch: pytest.MonkeyPatch) -> Callable[[Line], None]:
-    """Lets the command open a line in virtual time."""
+def ran(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Runs the command on a line in virtual time."""
 
-    def use(line: Line) -> None:
+    def run_on(line: Line, *arguments: str) -> int:
         monkeypatch.setattr(command, "open_line", lambda *_: line)
+        return command.main(["virtual", *arguments])
 
-    return use
+    return run_on
 
 
-def test_the_command_prints_json_and_exits_with_0(
-    opened: Callable[[Line], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    opened(serial_line())
-    assert command.main(["virtual", "--yes", "--json", "--only", "schema_hash"]) == 0
+def test_the_command_prints_json_and_exits_with_0(ran: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
+    assert ran(serial_line(), "--yes", "--json", "--only", "schema_hash") == 0
     out, err = capsys.readouterr()
     checks = json.loads(out)["checks"]
     assert [check["name"] for check in checks] == ["schema_hash", "left_open"]
@@ -847,31 +819,29 @@ def test_the_command_prints_json_and_exits_with_0(
 
 
 def test_a_failed_check_says_what_to_look_at_and_the_exit_code_is_1(
-    opened: Callable[[Line], None], capsys: pytest.CaptureFixture[str]
+    ran: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    opened(by_error("timeout of 65 ms"))
-    assert command.main(["virtual", "--yes", "--only", "silence_is_noticed"]) == 1
+    assert ran(by_error("timeout of 65 ms"), "--yes", "--only", "silence_is_noticed") == 1
     out = capsys.readouterr().out
     assert re.search(r"FAIL  silence_is_noticed\n +sent +in RUN.*\n +seen +58 ms .*\n +expected .*\n +page +", out)
     assert "virtual: device 1, firmware 1.0: 1 of 2 checks passed" in out
 
 
 def test_nothing_is_sent_before_somebody_agrees(
-    monkeypatch: pytest.MonkeyPatch, opened: Callable[[Line], None], capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, ran: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     class Terminal(io.StringIO):
         def isatty(self) -> bool:
             return True
 
     line = serial_line()
-    opened(line)
     for answer in (io.StringIO("yes\n"), Terminal("no\n"), Terminal("")):
         monkeypatch.setattr(sys, "stdin", answer)
-        assert command.main(["virtual"]) == 2
+        assert ran(line) == 2
     assert "MOTORS WILL MOVE" in capsys.readouterr().err
     assert line.now_s() == 0.0
     monkeypatch.setattr(sys, "stdin", Terminal("Yes\n"))
-    assert command.main(["virtual", "--only", "schema_hash"]) == 0
+    assert ran(line, "--only", "schema_hash") == 0
 
 
 @pytest.mark.parametrize(
@@ -892,12 +862,9 @@ def test_a_wrong_call_says_why_and_exits_with_2(
     assert said in capsys.readouterr().err
 
 
-def test_a_check_that_there_is_not_is_refused(
-    opened: Callable[[Line], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    opened(serial_line())
+def test_a_check_that_there_is_not_is_refused(ran: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
-        command.main(["virtual", "--yes", "--only", "frame_crc_17"])
+        ran(serial_line(), "--yes", "--only", "frame_crc_17")
     assert "frame_crc_16" in capsys.readouterr().err
 
 
@@ -920,37 +887,28 @@ class Unplugged(Interrupted):
     error = OSError
 
 
-def test_an_interrupted_run_leaves_the_gap_open(
-    opened: Callable[[Line], None], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_interrupted_run_leaves_the_gap_open(ran: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
     device = VirtualDevice(NEAR_HOME, SteadyHand())
-    opened(SerialLine(Interrupted(device)))
-    assert command.main(["virtual", "--yes", "--only", "silence_opens"]) == 1
+    assert ran(SerialLine(Interrupted(device)), "--yes", "--only", "silence_opens") == 1
     assert "ok    left_open" in capsys.readouterr().out
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert device.messages.firmware.mode is DeviceMode.IDLE
     assert device.truth.gap_mm > 94.0
 
 
-def test_a_line_that_goes_is_told_and_no_success(
-    opened: Callable[[Line], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    opened(serial_line(wire=Unplugged))
-    assert command.main(["virtual", "--yes", "--only", "off_opens"]) == 1
+def test_a_line_that_goes_is_told_and_no_success(ran: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
+    assert ran(serial_line(wire=Unplugged), "--yes", "--only", "off_opens") == 1
     assert "the line is gone" in capsys.readouterr().err
 
 
-def test_a_reader_that_goes_does_not_end_the_run(
-    monkeypatch: pytest.MonkeyPatch, opened: Callable[[Line], None]
-) -> None:
+def test_a_reader_that_goes_does_not_end_the_run(monkeypatch: pytest.MonkeyPatch, ran: Callable[..., int]) -> None:
     class Closed(io.StringIO):
         def write(self, text: str) -> int:
             raise BrokenPipeError
 
     device = VirtualDevice(NEAR_HOME, SteadyHand())
-    opened(SerialLine(Wire(device)))
     monkeypatch.setattr(sys, "stdout", Closed())
-    assert command.main(["virtual", "--yes", "--only", "run_is_entered"]) == 0
+    assert ran(SerialLine(Wire(device)), "--yes", "--only", "run_is_entered") == 0
     assert device.messages.firmware.mode is DeviceMode.IDLE
 
 
@@ -980,7 +938,6 @@ def test_real_ports_carry_it(door: str, prefix: str) -> None:
     only = [argument for name in names for argument in ("--only", name)]
     simulator = subprocess.Popen([sys.executable, "-m", "tormagd.simulation", door], stdout=subprocess.PIPE, text=True)
     try:
-        assert simulator.stdout is not None
         line = prefix + simulator.stdout.readline().strip()
         done = subprocess.run(
             [sys.executable, "-m", "firmware_protocol.conformance", line, "--yes", "--json", *only],

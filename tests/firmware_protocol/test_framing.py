@@ -1,4 +1,4 @@
-"""Frames over streams that are whole, cut, noisy, repeated and endless."""
+"""Frames over streams that are whole, cut, damaged, repeated and endless."""
 
 import pickle
 import random
@@ -90,16 +90,11 @@ def test_how_a_stream_is_cut_makes_no_difference(pieces: list[bytes], data: st.D
 
 
 @given(st.binary(max_size=400))
-def test_after_any_garbage_at_most_one_frame_is_lost(garbage: bytes) -> None:
-    first, second, third = numbered(3)
-    received = FrameDecoder().feed(garbage + wire(first) + wire(second) + wire(third))
-    assert received[-2:] == [second, third]
-
-
-@given(st.binary(max_size=400))
-def test_after_garbage_with_a_delimiter_no_frame_is_lost(garbage: bytes) -> None:
-    sent = numbered(2)
-    assert FrameDecoder().feed(garbage + b"\0" + wire(sent[0]) + wire(sent[1]))[-2:] == sent
+def test_garbage_costs_at_most_one_frame_and_none_where_a_delimiter_ends_it(garbage: bytes) -> None:
+    sent = numbered(3)
+    stream = b"".join(map(wire, sent))
+    assert FrameDecoder().feed(garbage + stream)[-2:] == sent[1:]
+    assert FrameDecoder().feed(garbage + b"\0" + stream)[-3:] == sent
 
 
 @given(frames, st.data())
@@ -132,21 +127,6 @@ def test_gaps_in_the_sequence_are_counted_through_zero(start: int, missing: int)
     decoder = FrameDecoder()
     decoder.feed(wire(sent[0]) + wire(sent[-1]))
     assert decoder.statistics.lost == missing
-
-
-def test_a_noisy_line_never_gives_a_wrong_frame() -> None:
-    """One bit in 200 flipped: CRC-16 lets through one in 65536 of what is damaged beyond its guarantee, none here."""
-    generator = random.Random(6)
-    decoder = FrameDecoder()
-    sent = numbered(3000)
-    stream = bytearray(b"".join(map(wire, sent)))
-    for position in range(len(stream)):
-        if generator.random() < 8 / 200:
-            stream[position] ^= 1 << generator.randrange(8)
-    received = decoder.feed(bytes(stream))
-    assert 0.4 * len(sent) < len(received) < len(sent)
-    assert set(received) <= set(sent)
-    assert decoder.statistics.resynchronisations <= decoder.statistics.corrupt
 
 
 @pytest.mark.parametrize("piece", [b"\xff" * 65536, b"\x01" * 65536, bytes(65536), bytes(range(256)) * 256])
@@ -219,14 +199,16 @@ def test_a_line_that_reorders_loses_what_it_lost(seed: int, lossy: bool) -> None
     assert (decoder.statistics.lost, decoder.statistics.corrupt) == (len(sent) - len(kept), 0)
 
 
-def test_why_a_frame_was_refused() -> None:
-    frame = numbered(1)[0]
-    for damaged, why in (
-        (wire(frame)[:-3] + b"\x11\x22\x00", "CRC-16"),
+@pytest.mark.parametrize(
+    ("damaged", "why"),
+    [
+        (wire(numbered(1)[0])[:-3] + b"\x11\x22\x00", "CRC-16"),
         (b"\x01" * 40 + b"\x00", "over 13 bytes"),
         (b"\x09\x01\x00", "COBS"),
         (b"\x02\x07\x00", "too short"),
-    ):
-        decoder = FrameDecoder()
-        decoder.feed(damaged)
-        assert decoder.statistics.refused == {"frame": why}
+    ],
+)
+def test_why_a_frame_was_refused(damaged: bytes, why: str) -> None:
+    decoder = FrameDecoder()
+    assert decoder.feed(damaged) == []
+    assert decoder.statistics.refused == {"frame": why}

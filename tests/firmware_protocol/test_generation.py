@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import firmware_protocol
-from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH
+from firmware_protocol.codec import SCHEMA_HASH
 from firmware_protocol.dbc import SchemaError, read_schema
 from firmware_protocol.generate import main
 from firmware_protocol.python_source import python_files
@@ -60,40 +60,26 @@ def test_generating_repairs_every_file_and_then_has_nothing_to_do(room: Path) ->
     assert main(["--check"], room) == 0
 
 
-def test_the_schema_hash_is_the_committed_one() -> None:
-    schema = read_schema()
-    assert schema.schema_hash() == SCHEMA_HASH
-    assert schema.version == PROTOCOL_VERSION
-
-
 @pytest.mark.parametrize(
-    ("old", "new"),
+    ("old", "new", "is_same"),
     [
-        ("(0.0001,0)", "(0.0002,0)"),
-        ("[-1|1]", "[-0.5|0.5]"),
-        ("SG_ right_duty : 16|16@1-", "SG_ right_force : 16|16@1-"),
-        ('1 "COMMAND_TIMEOUT" ;', '1 "TIMEOUT" ;'),
-        ("BO_ 33 Drive", "BO_ 33 Motors"),
-        ('BA_ "ProtocolVersion" 1;', 'BA_ "ProtocolVersion" 2;'),
-        ('BA_ "Kind" SG_ 65 handle_position_mm 1;', ""),
-        ('"mm" Host', '"cm" Host'),
+        ("(0.0001,0)", "(0.0002,0)", False),
+        ("[-1|1]", "[-0.5|0.5]", False),
+        ("SG_ right_duty : 16|16@1-", "SG_ right_force : 16|16@1-", False),
+        ('1 "COMMAND_TIMEOUT" ;', '1 "TIMEOUT" ;', False),
+        ("BO_ 33 Drive", "BO_ 33 Motors", False),
+        ('BA_ "ProtocolVersion" 1;', 'BA_ "ProtocolVersion" 2;', False),
+        ('BA_ "Kind" SG_ 65 handle_position_mm 1;', "", False),
+        ('"mm" Host', '"cm" Host', False),
+        ("Motor duties. Every 1 ms", "Duties of the motors, every 1 ms", True),
+        ('BA_ "GenMsgCycleTime" BO_ 33 1;', 'BA_ "GenMsgCycleTime" BO_ 33 2;', True),
     ],
 )
-def test_a_change_of_layout_changes_the_hash(room: Path, old: str, new: str) -> None:
+def test_a_change_of_layout_changes_the_hash_and_one_of_comment_or_cycle_time_does_not(
+    room: Path, old: str, new: str, is_same: bool
+) -> None:
     edit(room / "tormag.dbc", old, new)
-    assert read_schema(room / "tormag.dbc").schema_hash() != SCHEMA_HASH
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("Motor duties. Every 1 ms", "Duties of the motors, every 1 ms"),
-        ('BA_ "GenMsgCycleTime" BO_ 33 1;', 'BA_ "GenMsgCycleTime" BO_ 33 2;'),
-    ],
-)
-def test_a_change_of_comment_or_cycle_time_does_not(room: Path, old: str, new: str) -> None:
-    edit(room / "tormag.dbc", old, new)
-    assert read_schema(room / "tormag.dbc").schema_hash() == SCHEMA_HASH
+    assert (read_schema(room / "tormag.dbc").schema_hash() == SCHEMA_HASH) is is_same
 
 
 def test_the_generated_modules_follow_the_dbc(room: Path) -> None:
@@ -119,6 +105,7 @@ def test_the_generated_modules_follow_the_dbc(room: Path) -> None:
         ('2 "HOMING" 1', '5 "HOMING" 1', "Status.mode: an enumeration counts"),
         ('256 "SKEW"', '257 "SKEW"', "Status.faults: flags are the bits"),
         ('BA_ "TypeName" SG_ 33 mode "DriveMode";', "", "Drive.mode: a value table, its kind and its TypeName"),
+        (" 33 ", " 34 ", "Drive: 0x22 is not"),
         ("[0|0.65535]", "[0|0.5]", r"State.device_time_s: steps \(0, 50000\)"),
         ('BA_ "Kind" SG_ 33 counter 4;', 'BA_ "Kind" SG_ 33 counter 5;', "Drive.counter: a checksum must be the last"),
     ],
@@ -126,13 +113,6 @@ def test_the_generated_modules_follow_the_dbc(room: Path) -> None:
 def test_a_dbc_that_the_codec_cannot_follow_is_refused(room: Path, old: str, new: str, text: str) -> None:
     edit(room / "tormag.dbc", old, new)
     with pytest.raises(SchemaError, match=text):
-        read_schema(room / "tormag.dbc")
-
-
-def test_an_identifier_of_another_node_is_refused(room: Path) -> None:
-    text = (room / "tormag.dbc").read_text(encoding="utf-8")
-    (room / "tormag.dbc").write_text(text.replace(" 33 ", " 34 "), encoding="utf-8")
-    with pytest.raises(SchemaError, match="Drive: 0x22 is not"):
         read_schema(room / "tormag.dbc")
 
 

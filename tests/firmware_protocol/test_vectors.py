@@ -1,7 +1,9 @@
-"""The golden vectors, and what the README shows: its examples in both directions, its times, its table of modes."""
+"""The golden vectors in Python and in C, also under sanitizers, and what the README shows."""
 
+import ctypes
 import json
 import math
+import random
 import re
 from pathlib import Path
 from typing import Any
@@ -31,25 +33,17 @@ from firmware_protocol.codec import (
     decode,
     encode,
 )
-from firmware_protocol.framing import Frame, FrameDecoder, FramingStatistics, encode_frame
+from firmware_protocol.framing import MAX_PAYLOAD, Frame, FrameDecoder, FramingStatistics, encode_frame
 from firmware_protocol.golden import bitwise_crc8, bitwise_crc16
 from firmware_protocol.layouts import LAYOUTS
+from firmware_protocol.schema import Layout
 from tormagd.simulation.firmware import Answer, Firmware, Sensors
 from tormagd.simulation.parameters import load_plant
 
 ROOM = Path(firmware_protocol.__file__).parent
 MESSAGES: dict[str, Any] = json.loads((ROOM / "vectors" / "messages.json").read_text(encoding="utf-8"))
+PAGE = (ROOM / "README.md").read_text(encoding="utf-8")
 FRAMES: dict[str, Any] = json.loads((ROOM / "vectors" / "frames.json").read_text(encoding="utf-8"))
-
-
-@pytest.mark.parametrize("document", [MESSAGES, FRAMES], ids=["messages", "frames"])
-def test_vectors_are_of_this_schema(document: dict[str, Any]) -> None:
-    assert document["schema_hash"] == f"{SCHEMA_HASH:08X}"
-    assert document["protocol_version"] == PROTOCOL_VERSION
-
-
-def test_every_message_has_vectors() -> None:
-    assert {vector["message"] for vector in MESSAGES["valid"]} == {layout.message.__name__ for layout in LAYOUTS}
 
 
 def test_valid_payloads_in_both_directions() -> None:
@@ -85,9 +79,8 @@ def test_streams_give_the_frames_and_counts_written_down(vector: dict[str, Any])
 
 
 def test_the_examples_of_the_readme_are_true() -> None:
-    text = (ROOM / "README.md").read_text(encoding="utf-8")
     examples = re.findall(
-        r"```frame\n([0-9a-f ]+)\n```\n\n\| bytes \| meaning \|\n\| --- \| --- \|\n((?:\|.*\n)+)", text
+        r"```frame\n([0-9a-f ]+)\n```\n\n\| bytes \| meaning \|\n\| --- \| --- \|\n((?:\|.*\n)+)", PAGE
     )
     open_ends = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
     shown: tuple[tuple[int, Message], ...] = (
@@ -106,8 +99,7 @@ def test_the_examples_of_the_readme_are_true() -> None:
 
 
 def test_the_crcs_of_the_readmes_examples_are_over_what_it_says() -> None:
-    text = (ROOM / "README.md").read_text(encoding="utf-8")
-    checked = re.findall(r"^\| `([0-9a-f ]+)` \| CRC-(8|16) over `([0-9a-f ]+)` \|$", text, re.MULTILINE)
+    checked = re.findall(r"^\| `([0-9a-f ]+)` \| CRC-(8|16) over `([0-9a-f ]+)` \|$", PAGE, re.MULTILINE)
     assert len(checked) == 4
     for crc, width, data in checked:
         expected = bitwise_crc8 if width == "8" else bitwise_crc16
@@ -115,14 +107,12 @@ def test_the_crcs_of_the_readmes_examples_are_over_what_it_says() -> None:
 
 
 def test_the_readme_says_which_way_round_the_schema_hash_is() -> None:
-    text = (ROOM / "README.md").read_text(encoding="utf-8")
-    assert f"`{SCHEMA_HASH.to_bytes(4, 'big').hex(' ')} ..` is 0x{SCHEMA_HASH:08X}" in text
-    assert f"`{SCHEMA_HASH.to_bytes(4, 'little').hex(' ')}`)" in text
+    assert f"`{SCHEMA_HASH.to_bytes(4, 'big').hex(' ')} ..` is 0x{SCHEMA_HASH:08X}" in PAGE
+    assert f"`{SCHEMA_HASH.to_bytes(4, 'little').hex(' ')}`)" in PAGE
 
 
 def test_the_readmes_timing_is_what_the_codecs_frames_take() -> None:
     """At 1 Mbaud a byte takes 10 us, at 1 Mbit/s a bit takes 1."""
-    text = (ROOM / "README.md").read_text(encoding="utf-8")
     for message, said in (
         (Drive(0.0, 0.0, DriveMode.OFF, 1), "Drive on its way"),
         (State(0, 0, 0, 1), "State on its way"),
@@ -131,7 +121,7 @@ def test_the_readmes_timing_is_what_the_codecs_frames_take() -> None:
         serial_ms = 0.01 * len(encode_frame(FUNCTION[type(message)], 0, payload))
         # ISO 11898-1 with the most stuffing: a bit for every four after the first of the 34 + 8 n that are stuffed
         can_ms = 0.001 * (47 + 8 * len(payload) + (34 + 8 * len(payload) - 1) // 4)
-        assert f"| {said} | {serial_ms:.2f} ms serial, at most {math.ceil(100 * can_ms) / 100:.2f} ms CAN |" in text
+        assert f"| {said} | {serial_ms:.2f} ms serial, at most {math.ceil(100 * can_ms) / 100:.2f} ms CAN |" in PAGE
 
 
 # -- what each mode takes, as the page says --------------------------------------------------------------------------
@@ -172,8 +162,7 @@ SAID: dict[str, Message] = {
 
 def taken() -> list[tuple[str, DeviceMode, str]]:
     """The cells of the page's table: what is said, in which mode, and what comes of it."""
-    text = (ROOM / "README.md").read_text(encoding="utf-8")
-    head, _, *rows = re.findall(r"^\|(.*)\|$", text.partition("### What each mode takes")[2].partition("###")[0], re.M)
+    head, _, *rows = re.findall(r"^\|(.*)\|$", PAGE.partition("### What each mode takes")[2].partition("###")[0], re.M)
     modes = [DeviceMode[name.strip()] for name in head.split("|")[1:]]
     cells = [[cell.strip() for cell in row.split("|")] for row in rows]
     return [(said, mode, what) for said, *row in cells for mode, what in zip(modes, row, strict=True)]
@@ -187,9 +176,7 @@ def test_the_table_of_the_page_is_whole() -> None:
 def test_the_firmware_does_what_the_pages_table_says(said: str, mode: DeviceMode, what: str) -> None:
     firmware = in_mode(mode)
     answer = firmware.receive(0.001, SAID[said], AT_REST)
-    first = re.match(r"\w+", what)
-    assert first is not None
-    assert firmware.mode is DeviceMode.__members__.get(first[0], mode)
+    assert firmware.mode is DeviceMode.__members__.get(re.split(r"\W", what)[0], mode)
     nonce = firmware.status(AT_REST).command_nonce
     if said.startswith("Drive"):
         assert answer is Answer.MEASUREMENT
@@ -201,3 +188,132 @@ def test_the_firmware_does_what_the_pages_table_says(said: str, mode: DeviceMode
         assert (answer, nonce == 9) == (Answer.NONE, what != "refused")
     if "not homed" in what:
         assert not firmware.homed
+
+
+# -- the C codec and framing -------------------------------------------------------------------------------------------
+
+
+STEP_TYPES = {
+    "b": ctypes.c_int8,
+    "B": ctypes.c_uint8,
+    "h": ctypes.c_int16,
+    "H": ctypes.c_uint16,
+    "I": ctypes.c_uint32,
+}
+OK, UNKNOWN_FUNCTION, OUT_OF_RANGE = 0, 1, 4
+REFUSALS = 4
+
+
+def structure(layout: Layout) -> type[ctypes.Structure]:
+    """struct tormag_..._t of a message."""
+    names = [signal.name for signal in layout.signals] + ["crc"] * layout.protected
+    fields = [(name, STEP_TYPES[code]) for name, code in zip(names, layout.format[1:], strict=True)]
+    return type(layout.message.__name__, (ctypes.Structure,), {"_fields_": fields})
+
+
+class Signals(ctypes.Union):
+    _fields_ = [(layout.message.__name__, structure(layout)) for layout in LAYOUTS]
+
+
+class CMessage(ctypes.Structure):
+    """struct tormag_message."""
+
+    _fields_ = [("function", ctypes.c_uint8), ("signals", Signals)]
+
+
+def c_decode(library: ctypes.CDLL, function: int, payload: bytes) -> tuple[int, dict[str, int]]:
+    """The result and, if it is OK, the steps of the message's signals."""
+    message = CMessage()
+    result = library.tormag_decode(
+        ctypes.byref(message), ctypes.c_uint8(function), payload, ctypes.c_size_t(len(payload))
+    )
+    if result != OK:
+        return result, {}
+    assert message.function == function
+    layout = next(layout for layout in LAYOUTS if layout.function == function)
+    steps = getattr(message.signals, layout.message.__name__)
+    return result, {signal.name: getattr(steps, signal.name) for signal in layout.signals}
+
+
+def c_encode(library: ctypes.CDLL, function: int, name: str, steps: dict[str, int]) -> tuple[int, bytes]:
+    """The result and, if it is OK, the payload; a checksum field is filled with what must not be sent."""
+    message = CMessage(function=function)
+    signals = getattr(message.signals, name)
+    for signal, step in (steps | {"crc": 0xA5}).items():
+        setattr(signals, signal, step)  # one of no field stays in Python
+    payload = ctypes.create_string_buffer(MAX_PAYLOAD)
+    length = ctypes.c_size_t()
+    result = library.tormag_encode(payload, ctypes.byref(length), ctypes.byref(message))
+    return result, payload.raw[: length.value]
+
+
+def hexed(data: bytes) -> str:
+    """As the exchange program writes bytes."""
+    return data.hex() or "-"
+
+
+# -- payloads ------------------------------------------------------------------------------------------------------
+
+
+def test_c_knows_the_same_payloads_in_both_directions(library: ctypes.CDLL) -> None:
+    for vector in MESSAGES["valid"]:
+        payload = bytes.fromhex(vector["payload"])
+        assert c_decode(library, vector["function"], payload) == (OK, vector["steps"]), vector
+        assert c_encode(library, vector["function"], vector["message"], vector["steps"]) == (OK, payload), vector
+
+
+def test_c_refuses_the_same_payloads(library: ctypes.CDLL) -> None:
+    results = set()
+    for vector in MESSAGES["invalid"]:
+        result, _ = c_decode(library, vector["function"], bytes.fromhex(vector["payload"]))
+        assert result != OK, vector
+        results.add(result)
+    assert results == set(range(1, REFUSALS + 1))
+
+
+DRIVE_STEPS = {"left_duty": 0, "right_duty": 0, "mode": 0, "counter": 0}
+
+
+@pytest.mark.parametrize(
+    ("function", "name", "steps", "result"),
+    [
+        (2, "Drive", DRIVE_STEPS, OK),
+        (2, "Drive", DRIVE_STEPS | {"left_duty": 10001}, OUT_OF_RANGE),
+        (2, "Drive", DRIVE_STEPS | {"right_duty": -10001}, OUT_OF_RANGE),
+        (2, "Drive", DRIVE_STEPS | {"mode": 2}, OUT_OF_RANGE),
+        (7, "Status", {"faults": 1024}, OUT_OF_RANGE),
+        (10, "Drive", DRIVE_STEPS, UNKNOWN_FUNCTION),
+        (0, "Drive", DRIVE_STEPS, UNKNOWN_FUNCTION),
+    ],
+)
+def test_c_sends_no_step_out_of_range(
+    library: ctypes.CDLL, function: int, name: str, steps: dict[str, int], result: int
+) -> None:
+    assert c_encode(library, function, name, steps)[0] == result
+
+
+# -- frames --------------------------------------------------------------------------------------------------------
+
+
+def test_under_sanitizers_any_payload_is_framed_as_by_python(exchange) -> None:
+    generator = random.Random(20240513)
+    frames = []
+    for _ in range(2000):
+        length = generator.randrange(MAX_PAYLOAD + 1)
+        # zeros are what COBS is about
+        payload = bytes(generator.choice((0, 0, 1, 255, generator.randrange(256))) for _ in range(length))
+        frames.append((generator.randrange(256), generator.randrange(256), payload))
+    answers = exchange([f"frame {function} {sequence} {hexed(payload)}" for function, sequence, payload in frames])
+    assert answers == [encode_frame(*frame).hex() for frame in frames]
+    assert exchange([f"frame 1 1 {'00' * (MAX_PAYLOAD + 1)}"]) == ["-"]
+
+
+def test_under_sanitizers_golden_streams_are_read_as_written_down(exchange) -> None:
+    """Random payloads and damaged streams: `tools/endure.py fuzz`, which tests/tools runs for a moment."""
+    requests, expected = [], []
+    for vector in FRAMES["streams"]:
+        requests += ["restart", f"stream {vector['bytes']}"]
+        frames = [f"{frame['function']}:{frame['sequence']}:{frame['payload'] or '-'}" for frame in vector["frames"]]
+        counts = [str(vector["statistics"][name]) for name in FramingStatistics.__match_args__]
+        expected += ["-", " ".join([*frames, *counts])]
+    assert exchange(requests) == expected

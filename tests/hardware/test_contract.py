@@ -14,8 +14,7 @@ import select
 import socket
 import struct
 import termios
-import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -41,7 +40,8 @@ from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import parse_hand
 from tormagd.simulation.parameters import load_plant
 from tormagd.simulation.plant import Truth
-from tormagd.simulation.slcan_door import SlcanAdapter
+from tormagd.simulation.pty_door import Pty, PtyDoor
+from tormagd.simulation.slcan_door import SlcanDoor
 
 CONFIG = Config()
 PATIENCE_S = 10.0
@@ -65,20 +65,27 @@ COASTING_MM = 8.0
 # -- channels ------------------------------------------------------------------------------------------------------
 
 
+Fate = Callable[[random.Random, float], Sequence[float]]
+"""After which times, s, a unit comes out, one for each of its copies; it is given a die and the time."""
+
+
+def at_once(draw: random.Random, now_s: float) -> Sequence[float]:
+    return (0.0,)
+
+
 class Channel:
     """One direction of a line. A unit is what a transport carries at once: a frame, or a line of text."""
 
-    def __init__(self, seed: int) -> None:
-        self._random = random.Random(seed)
+    def __init__(self, fate: Fate, seed: int) -> None:
+        self._fate, self._random = fate, random.Random(seed)
+        self._waiting: list[tuple[float, bytes]] = []
 
     def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
         """What comes out now, of these and earlier units."""
-        return units
-
-
-class Loss(Channel):
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
-        return [unit for unit in units if self._random.random() >= 0.2]
+        self._waiting += [(now_s + after_s, unit) for unit in units for after_s in self._fate(self._random, now_s)]
+        out = [unit for due_s, unit in self._waiting if due_s <= now_s]
+        self._waiting = [(due_s, unit) for due_s, unit in self._waiting if due_s > now_s]
+        return out
 
 
 class Corruption(Channel):
@@ -90,69 +97,25 @@ class Corruption(Channel):
         return bytes(byte ^ (1 << bit % 8 if at == bit // 8 else 0) for at, byte in enumerate(unit))
 
 
-class Duplicates(Channel):
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
-        return [unit for unit in units for _ in range(2 if self._random.random() < 0.3 else 1)]
-
-
-class Twice(Channel):
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
-        return [unit for unit in units for _ in range(2)]
-
-
 class Reordering(Channel):
     """One unit in five waits until another has passed it."""
-
-    def __init__(self, seed: int) -> None:
-        super().__init__(seed)
-        self._waiting: list[bytes] = []
 
     def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
         out = []
         for unit in units:
             if not self._waiting and self._random.random() < 0.2:
-                self._waiting.append(unit)
+                self._waiting.append((now_s, unit))
             else:
-                out += [unit, *self._waiting]
+                out += [unit, *(waited for _, waited in self._waiting)]
                 self._waiting.clear()
         return out
-
-
-class Delay(Channel):
-    delay_s = 0.03
-
-    def __init__(self, seed: int) -> None:
-        super().__init__(seed)
-        self._waiting: list[tuple[float, bytes]] = []
-
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
-        self._waiting += [(self._due_s(now_s), unit) for unit in units]
-        out = [unit for due_s, unit in self._waiting if due_s <= now_s]
-        self._waiting = [(due_s, unit) for due_s, unit in self._waiting if due_s > now_s]
-        return out
-
-    def _due_s(self, now_s: float) -> float:
-        return now_s + self.delay_s
-
-
-class Burst(Delay):
-    """Nothing for 60 ms, then all of it at once."""
-
-    delay_s = 0.06
-
-    def _due_s(self, now_s: float) -> float:
-        return math.ceil(now_s / self.delay_s) * self.delay_s
-
-
-class Cut(Channel):
-    def carry(self, now_s: float, units: list[bytes]) -> list[bytes]:
-        return []
 
 
 class Case(NamedTuple):
     """A kind of line and what has to come of it."""
 
-    channel: type[Channel]
+    fate: Fate = at_once
+    channel: type[Channel] = Channel
     tolerance_N: float = math.inf
     "The force is rendered so well, in the end, where no fault appears."
     faults: frozenset[Fault] = frozenset()
@@ -173,99 +136,87 @@ class Case(NamedTuple):
 
 TOO_LATE = frozenset({Fault.MEASUREMENT_STALE, Fault.DEVICE_COMMAND_TIMEOUT, Fault.LINK_LOST})
 CASES = {
-    "clean": Case(Channel, 0.05),
-    "one byte at a time": Case(Channel, 0.05, is_bytewise=True),
-    "20% loss": Case(Loss, 0.05, counted=("lost",)),
+    "clean": Case(tolerance_N=0.05),
+    "one byte at a time": Case(tolerance_N=0.05, is_bytewise=True),
+    "20% loss": Case(lambda draw, _: () if draw.random() < 0.2 else (0.0,), tolerance_N=0.05, counted=("lost",)),
     # State carries a CRC everywhere, Sense and Status only on serial: there a force or a fault bit may be a wrong one
-    "5% corruption": Case(Corruption, 0.5, faults=frozenset(Fault), counted=("corrupt", "resynchronisations")),
-    "duplicates": Case(Duplicates, 0.05),
-    "reordering": Case(Reordering, 0.05, uncounted=("lost", "corrupt")),
+    "5% corruption": Case(
+        channel=Corruption, tolerance_N=0.5, faults=frozenset(Fault), counted=("corrupt", "resynchronisations")
+    ),
+    "duplicates": Case(lambda draw, _: (0.0,) * (2 if draw.random() < 0.3 else 1), tolerance_N=0.05),
+    "reordering": Case(channel=Reordering, tolerance_N=0.05, uncounted=("lost", "corrupt")),
     # what the device says answers a drive of 60 ms ago: a loop around that would swing
-    "30 ms delay": Case(Delay, faults=TOO_LATE, named=TOO_LATE),
-    "burst": Case(Burst, faults=TOO_LATE, named=TOO_LATE),
+    "30 ms delay": Case(lambda draw, _: (0.03,), faults=TOO_LATE, named=TOO_LATE),
+    # nothing for 60 ms, then all of it at once
+    "burst": Case(lambda _, now_s: (math.ceil(now_s / 0.06) * 0.06 - now_s,), faults=TOO_LATE, named=TOO_LATE),
     # lost, and since then the port was opened again and the device asked who it is
-    "cut": Case(Cut, faults=TOO_LATE, named=TOO_LATE, link=LinkState.IDENTIFYING, losses=1),
+    "cut": Case(lambda *_: (), faults=TOO_LATE, named=TOO_LATE, link=LinkState.IDENTIFYING, losses=1),
 }
 
 
 # -- transports: a device with its end of one, and what the daemon opens to come to it --------------------------------
 
 
-class PtyEnd:
-    """A far end at a pseudo-terminal."""
+class PtyEnd(Pty):
+    """A far end at a pseudo-terminal. It is the simulator's door, which hears and says here what the line carries."""
 
     end: bytes
     "The last byte of a unit."
-
-    def __init__(self) -> None:
-        self._far, self._near = os.openpty()
-        tty.setraw(self._near)
-        self._port = os.ttyname(self._near)
-        self._pending = b""
+    carried = said = arrived = b""
 
     def read(self) -> bytes:
-        """The unit that the backend has just sent."""
-        while self.end not in self._pending:
-            assert select.select([self._far], [], [], PATIENCE_S)[0], "the backend sent nothing"
-            self._pending += os.read(self._far, 4_096)
-        unit, _, self._pending = self._pending.partition(self.end)
-        return unit + self.end
+        """What the door hears."""
+        return self.carried
 
-    def write(self, unit: bytes, backend: Backend) -> None:
-        """Hands a unit to the kernel, and waits until the backend can read it."""
-        expected = _waiting(backend.fileno()) + len(unit)
-        os.write(self._far, unit)
-        while _waiting(backend.fileno()) < expected:
-            assert select.select([backend.fileno()], [], [], PATIENCE_S)[0], "the backend gets nothing"
-
-    def close(self) -> None:
-        os.close(self._far)
-        os.close(self._near)
-
-
-class SerialEnd(PtyEnd):
-    end = b"\x00"
-
-    def __init__(self, device: VirtualDevice, folder: Path) -> None:
-        super().__init__()
-        self.device = device
-        self.configured = Device(port=self._port)
-        self._sending = b""
+    def write(self, data: bytes) -> None:
+        """What the door says."""
+        self.said += data
 
     def units(self, now_s: float) -> list[bytes]:
         """What the device has sent by now."""
-        *units, self._sending = (self._sending + self.device.transmit(now_s)).split(self.end)
+        self.exchange(now_s, ())  # type: ignore[attr-defined]
+        *units, self.said = self.said.split(self.end)
         return [unit + self.end for unit in units]
 
     def take(self, now_s: float, unit: bytes) -> None:
-        self.device.receive(now_s, unit)
+        self.carried = unit
+        self.exchange(now_s, self.descriptors())  # type: ignore[attr-defined]
+
+    def hear(self) -> bytes:
+        """The unit that the backend has just sent."""
+        while self.end not in self.arrived:
+            assert select.select(self.descriptors(), [], [], PATIENCE_S)[0], "the backend sent nothing"
+            self.arrived += Pty.read(self)
+        unit, _, self.arrived = self.arrived.partition(self.end)
+        return unit + self.end
+
+    def say(self, unit: bytes, backend: Backend) -> None:
+        """Hands a unit to the kernel, and waits until the backend can read it."""
+        expected = _waiting(backend.fileno()) + len(unit)
+        os.write(self.descriptors()[0], unit)
+        while _waiting(backend.fileno()) < expected:
+            assert select.select([backend.fileno()], [], [], PATIENCE_S)[0], "the backend gets nothing"
 
 
-class SlcanEnd(PtyEnd):
+class SerialEnd(PtyEnd, PtyDoor):
+    end = b"\x00"
+
+    @property
+    def configured(self) -> Device:
+        return Device(port=self.address)
+
+
+class SlcanEnd(PtyEnd, SlcanDoor):
     end = b"\r"
 
-    def __init__(self, device: VirtualDevice, folder: Path) -> None:
-        super().__init__()
-        self.device = CanDevice(device.messages)
-        self.configured = Device(backend="can", options={"interface": "slcan"}, port=self._port)
-        self._adapter = SlcanAdapter()
-        self._answers = b""
+    @property
+    def configured(self) -> Device:
+        return Device(backend="can", options={"interface": "slcan"}, port=self.address)
 
     def units(self, now_s: float) -> list[bytes]:
-        self._greet()
-        answers, self._answers = self._answers, b""
-        sent = [self._adapter.line(frame) for sender, frame in self.device.transmit(now_s) if sender == DEVICE]
-        return ([answers] if answers else []) + (sent if self._adapter.is_open else [])
-
-    def take(self, now_s: float, unit: bytes) -> None:
-        answers, frames = self._adapter.feed(unit)
-        self._answers += answers
-        for frame in frames:
-            self.device.receive(now_s, frame)
-
-    def _greet(self) -> None:
         while not self._adapter.is_open:  # python-can opens the channel when it opens the port
-            self._answers += self._adapter.feed(self.read())[0]
+            self.take(now_s, self.hear())
+        return super().units(now_s)
 
 
 class PacketEnd:
@@ -292,12 +243,11 @@ class TormagsimEnd(PacketEnd):
         self._listener.settimeout(PATIENCE_S)
         self._host: socket.socket | None = None
 
-    def read(self) -> bytes:
+    def hear(self) -> bytes:
         frame = from_socket(self._connected().recv(64))
-        assert frame is not None
         return _unit(frame)
 
-    def write(self, unit: bytes, backend: Backend) -> None:
+    def say(self, unit: bytes, backend: Backend) -> None:
         self._connected().send(to_socket(_frame(unit)))
 
     def close(self) -> None:
@@ -314,57 +264,51 @@ class TormagsimEnd(PacketEnd):
 class BusEnd(PacketEnd):
     """A far end at any bus of python-can's; the bus may echo what one sends."""
 
-    def __init__(self, device: VirtualDevice, interface: str, channel: str, bus: can.BusABC) -> None:
+    def __init__(self, device: VirtualDevice, interface: str, channel: str, **options: object) -> None:
         super().__init__(device)
         self.configured = Device(backend="can", options={"interface": interface}, port=channel)
-        self._bus = bus
+        self.bus = can.Bus(interface=interface, channel=channel, ignore_config=True, **options)
         self._echoes: list[bytes] = []
 
-    def read(self) -> bytes:
-        while (message := self._bus.recv(PATIENCE_S)) is not None:
+    def hear(self) -> bytes:
+        while (message := self.bus.recv(PATIENCE_S)) is not None:
             unit = _unit(CanFrame(message.arbitration_id, bytes(message.data)))
             if unit not in self._echoes:
                 return unit
             self._echoes.remove(unit)
         raise AssertionError("the backend sent nothing")
 
-    def write(self, unit: bytes, backend: Backend) -> None:
+    def say(self, unit: bytes, backend: Backend) -> None:
         frame = _frame(unit)
         self._echoes = [*self._echoes[-64:], unit]
-        self._bus.send(can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=False), timeout=0)
+        self.bus.send(can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=False), timeout=0)
         assert select.select([backend.fileno()], [], [], PATIENCE_S)[0], "the backend gets nothing"
 
     def close(self) -> None:
-        self._bus.shutdown()
+        self.bus.shutdown()
 
 
 FarEnd: TypeAlias = SerialEnd | SlcanEnd | TormagsimEnd | BusEnd
 
 
 def udp_end(device: VirtualDevice, folder: Path) -> FarEnd:
-    group = "239.74.163.77"
     try:
-        bus = can.Bus(interface="udp_multicast", channel=group, hop_limit=0, fd=False, ignore_config=True)
-        bus.send(can.Message(arbitration_id=0x7FF, is_extended_id=False), timeout=0)
+        end = BusEnd(device, "udp_multicast", "239.74.163.77", hop_limit=0, fd=False)
+        end.bus.send(can.Message(arbitration_id=0x7FF, is_extended_id=False), timeout=0)
     except (can.CanError, OSError) as error:
         pytest.skip(f"no UDP multicast: {error}")
-    if bus.recv(1.0) is None:
-        bus.shutdown()
+    if end.bus.recv(1.0) is None:
+        end.close()
         pytest.skip("UDP multicast does not come back on this machine")
-    return BusEnd(device, "udp_multicast", group, bus)
-
-
-def socketcan_end(device: VirtualDevice, folder: Path) -> FarEnd:
-    bus = can.Bus(interface="socketcan", channel="vcan0", ignore_config=True)
-    return BusEnd(device, "socketcan", "vcan0", bus)
+    return end
 
 
 TRANSPORTS: dict[str, Callable[[VirtualDevice, Path], FarEnd]] = {
-    "serial": SerialEnd,
-    "slcan": SlcanEnd,
+    "serial": lambda device, folder: SerialEnd(device),
+    "slcan": lambda device, folder: SlcanEnd(CanDevice(device.messages)),
     "tormagsim": TormagsimEnd,
     "udp_multicast": udp_end,
-    "socketcan": socketcan_end,
+    "socketcan": lambda device, folder: BusEnd(device, "socketcan", "vcan0"),
 }
 
 
@@ -399,17 +343,17 @@ def _frame(unit: bytes) -> CanFrame:
 class Line:
     """What the closed loop takes for its device: the real backend, a bad line, and the device behind it."""
 
-    def __init__(self, far: FarEnd, case: Case, seed: int) -> None:
-        self.far = far
+    def __init__(self, far: FarEnd, device: VirtualDevice, case: Case, seed: int) -> None:
+        self.far, self._device = far, device
         self.backend = choose(far.configured, CONFIG.rates).open()
         self._bytewise = case.is_bytewise
-        self._up, self._down = case.channel(seed), case.channel(seed + 1)
+        self._up, self._down = (case.channel(case.fate, seed + way) for way in (0, 1))
         self._to_host, self._from_host = FrameStream(), FrameStream()
 
     @property
     def truth(self) -> Truth:
         """What really is."""
-        return self.far.device.truth
+        return self._device.truth
 
     def exchange(self, now_s: float) -> list[Message]:
         """What the backend has for the link now."""
@@ -419,7 +363,7 @@ class Line:
         messages: list[Message] = []
         for unit in units:
             for piece in self._pieces(unit):
-                self.far.write(piece, self.backend)
+                self.far.say(piece, self.backend)
                 if self._bytewise or isinstance(self.far, BusEnd):
                     messages += self.backend.receive()
         return [*messages, *self.backend.receive()]
@@ -427,7 +371,7 @@ class Line:
     def send(self, now_s: float, message: Message) -> None:
         """The link's message goes through the backend."""
         self.backend.send(message)
-        for unit in self._down.carry(now_s, [self.far.read()]):
+        for unit in self._down.carry(now_s, [self.far.hear()]):
             for piece in self._pieces(unit):
                 self.far.take(now_s, piece)
 
@@ -503,7 +447,7 @@ def lines(tmp_path: Path) -> Iterator[Callable[..., Line]]:
     with contextlib.ExitStack() as opened:
 
         def make(transport: str, device: VirtualDevice, case: Case, seed: int = 3) -> Line:
-            line = Line(TRANSPORTS[transport](device, tmp_path), case, seed)
+            line = Line(TRANSPORTS[transport](device, tmp_path), device, case, seed)
             opened.callback(line.close)
             return line
 
@@ -577,7 +521,7 @@ def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
 
 @pytest.mark.parametrize("transport", EVERY_TRANSPORT)
 def test_what_came_twice_is_reported_as_one_repetition(transport: str, lines: Callable[..., Line]) -> None:
-    tap = Tap(lines(transport, a_device(), Case(Twice)))
+    tap = Tap(lines(transport, a_device(), Case(lambda *_: (0.0, 0.0))))
     connection = Connection(CONFIG.device, lambda: tap, lambda: None, lambda: tap.now_s)
     connection.open(VirtualWire())
     for tick in range(1, 300):

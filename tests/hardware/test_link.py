@@ -66,12 +66,6 @@ def told(link: DeviceLink, now_s: float, *messages: Message) -> None:
         link.receive(now_s, message)
 
 
-def measured(link: DeviceLink) -> Measurement:
-    """What it has measured, which has to be something."""
-    assert link.measurement is not None
-    return link.measurement
-
-
 def due(link: DeviceLink, from_s: float, until_s: float, heard: bool = True) -> list[tuple[float, Message]]:
     """What the link sends, asked every millisecond while the device says something that means nothing."""
     sent = []
@@ -138,7 +132,7 @@ def test_a_device_that_was_reset_has_to_say_again_who_it_is() -> None:
     link = running(nonce=FIRST_NONCE)
     link.receive(0.02, status(0, switches=Switches(0)))
     assert link.state is LinkState.RUNNING, "the core sees first what the reset did"
-    assert not measured(link).is_homed
+    assert not link.measurement.is_homed
     link.request(0.021, DeviceRequest.RETRACT)
     assert [type(message) for message in link.due(0.021)] == [Hello]
     assert link.state is LinkState.IDENTIFYING
@@ -146,7 +140,7 @@ def test_a_device_that_was_reset_has_to_say_again_who_it_is() -> None:
     assert link.measurement is None
     told(link, 0.022, US, status(FIRST_NONCE), Sense(0.0, 0.0, 0.0, 0.0), State(5.0, 5.0, 0.0, 1))
     assert link.state is LinkState.RUNNING
-    assert measured(link).left_mm == 5.0
+    assert link.measurement.left_mm == 5.0
     assert [type(message) for message in link.due(0.022)] == [Retract], "opening is still wanted"
 
 
@@ -179,7 +173,7 @@ def test_a_state_that_is_no_news_measures_nothing(behind: int) -> None:
     assert link.measurement is before
     assert link.repeated == 1
     link.receive(0.3, State(-1.5, -1.5, 0.3, 40 + 3))
-    assert measured(link).left_mm == pytest.approx(-1.5)
+    assert link.measurement.left_mm == pytest.approx(-1.5)
 
 
 def test_a_repetition_is_none_the_less_one_before_the_device_is_known() -> None:
@@ -304,10 +298,10 @@ def test_a_device_that_has_homed_is_homed_from_the_first_position_in_its_new_ori
     told(link, 0.0, US, homing, Sense(0.0, 0.0, 0.0, 0.0), State(7.5, 8.5, 0.0, 0))
     open_switches = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
     link.receive(0.001, status(switches=open_switches | Switches.HOMED))
-    before = measured(link)
+    before = link.measurement
     assert (before.is_homed, before.is_busy, before.left_mm) == (False, True, 7.5)
     link.receive(0.001, State(0.1, 0.2, 0.001, 1))
-    after = measured(link)
+    after = link.measurement
     assert (after.is_homed, after.is_busy) == (True, False)
     assert (after.left_mm, after.right_mm) == (pytest.approx(0.1), pytest.approx(0.2))
 
@@ -323,7 +317,7 @@ def test_a_measurement_takes_a_status_a_sense_and_a_state() -> None:
         assert link.measurement is None
     link.receive(0.2, status(supply_V=11.5))
     link.receive(0.7, State(-3.0, -4.0, 0.25, 2))
-    measurement = measured(link)
+    measurement = link.measurement
     assert measurement == Measurement(
         0, 0.7, 0.25, -3.0, -4.0, 0.1, 0.2, 0.3, 0.0, DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 11.5,
         0.1, 0.2,
@@ -333,11 +327,11 @@ def test_a_measurement_takes_a_status_a_sense_and_a_state() -> None:
 
 def test_a_status_updates_what_it_knows_and_leaves_the_number() -> None:
     link = running()
-    before = measured(link)
+    before = link.measurement
     link.receive(
         1.0, status(mode=DeviceMode.LATCHED, switches=Switches(0), faults=DeviceFault.SKEW, temperature_C=41.0)
     )
-    after = measured(link)
+    after = link.measurement
     assert (after.mode, after.faults, after.temperature_C) == (DeviceMode.LATCHED, DeviceFault.SKEW, 41.0)
     assert (after.is_homed, after.is_latched, after.is_busy) == (False, True, False)
     assert (after.number, after.received_s) == (before.number, before.received_s)
@@ -356,7 +350,7 @@ def test_a_status_updates_what_it_knows_and_leaves_the_number() -> None:
 def test_busy_and_latched(mode: DeviceMode, faults: DeviceFault, busy: bool, latched: bool) -> None:
     link = running()
     told(link, 0.1, status(mode=mode, faults=faults))
-    assert (measured(link).is_busy, measured(link).is_latched) == (busy, latched)
+    assert (link.measurement.is_busy, link.measurement.is_latched) == (busy, latched)
 
 
 def through_the_wire(message: Message) -> Message:
@@ -384,12 +378,12 @@ def test_wraps_are_taken_out(
     left, right, time_s, handle = start
     link = DeviceLink(0.0)
     told(link, 0.0, status(), *map(through_the_wire, (Sense(0.0, 0.0, 0.0, handle), State(left, right, time_s, 0))))
-    first = measured(link)
+    first = link.measurement
     for number, (left_mm, right_mm, elapsed_s, handle_mm) in enumerate(moves, 1):
         left, right, time_s, handle = left + left_mm, right + right_mm, time_s + elapsed_s, handle + handle_mm
         news = (State(left, right, time_s, number % 256), Sense(0.0, 0.0, 0.0, handle))
         told(link, number * 1e-3, *map(through_the_wire, news))
-    last = measured(link)
+    last = link.measurement
     assert last.number == len(moves)
     assert last.left_mm - first.left_mm == pytest.approx(left - start[0], abs=2e-3)
     assert last.right_mm - first.right_mm == pytest.approx(right - start[1], abs=2e-3)
@@ -431,6 +425,6 @@ def test_the_quality_goes_with_the_measurement() -> None:
             link.receive(now_s, State(0.0, 0.0, 0.0, tick // 2 % 256))
         if link.is_judging(now_s):
             link.judge(now_s, frames=tick, damaged=tick, unsent=tick // 10)
-    measurement = measured(link)
+    measurement = link.measurement
     assert measurement.link.unanswered == pytest.approx(0.5, abs=0.01)
     assert (measurement.link.damaged, measurement.link.unsent) == pytest.approx((0.5, 0.1), abs=0.001)

@@ -1,4 +1,4 @@
-"""Round trip and device clock, against ways and clocks that are known."""
+"""The link in figures: round trip and device clock against known ones, and how well the wire carries."""
 
 import random
 from collections.abc import Callable, Iterable
@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterable
 import pytest
 from hypothesis import example, given, settings, strategies as st
 
+from tormagd.hardware.link_quality import LOOKED_S, LOOKS, LOSES, SETTLING_LOOKS, Counts, LinkQuality, LinkWatch
 from tormagd.hardware.link_statistics import (
     LEAST_WINDOWS,
     ROUND_TRIPS,
     WINDOW_S,
     WINDOWS,
-    ClockFit,
     DeviceClock,
     RoundTrip,
 )
@@ -87,13 +87,6 @@ def test_an_answer_to_what_has_not_been_sent_ends_the_count() -> None:
 # -- clock ---------------------------------------------------------------------------------------------------------
 
 
-def fit_of(clock: DeviceClock) -> ClockFit:
-    """What it claims, which has to be something."""
-    fit = clock.fit()
-    assert fit is not None
-    return fit
-
-
 def heard(device_s: Callable[[float], float], ticks: int) -> DeviceClock:
     """A clock of which something is heard every millisecond."""
     clock = DeviceClock()
@@ -124,7 +117,7 @@ def test_offset_and_drift_are_found_behind_jitter_and_outliers(
             late_s = noise.uniform(0.005, 0.05) if noise.random() < outlier_share else 0.0
         latched_s = now_s - noise.uniform(0.0002, 0.0004) - late_s
         clock.add(now_s, round((latched_s - offset_s) * (1.0 + drift_ppm * 1e-6), 5))
-    fit = fit_of(clock)
+    fit = clock.fit()
     assert fit.drift_ppm == pytest.approx(drift_ppm, abs=2.0)
     assert fit.residual_us < 20.0
     assert fit.windows == 39
@@ -140,7 +133,7 @@ def test_memory_is_bounded_and_the_fit_follows_the_last_half_minute() -> None:
     for tick in range(600 * 20):
         device_s += 0.05 * (1.0 + (100e-6 if tick < 300 * 20 else -50e-6))
         clock.add(tick * 0.05, device_s)
-    fit = fit_of(clock)
+    fit = clock.fit()
     assert (fit.windows, fit.drift_ppm) == (WINDOWS, pytest.approx(-50.0, abs=0.1))
     assert len(clock._windows) == WINDOWS
     assert len(trip._recent) == ROUND_TRIPS
@@ -153,40 +146,41 @@ def test_nothing_is_claimed_before_there_is_enough() -> None:
 @pytest.mark.parametrize("step_s", [-5.0, -0.1, 0.1])
 @pytest.mark.parametrize("after_s", [5.0, 8.0, 15.0, 25.0])
 def test_a_clock_that_is_set_begins_a_new_line(step_s: float, after_s: float) -> None:
-    fit = fit_of(heard(lambda now_s: now_s * (1.0 + 30e-6) + step_s * (now_s > 30.0 - after_s), 30_000))
+    fit = heard(lambda now_s: now_s * (1.0 + 30e-6) + step_s * (now_s > 30.0 - after_s), 30_000).fit()
     assert fit.drift_ppm == pytest.approx(30.0, abs=1.0)
     assert fit.offset_s == pytest.approx(-30.0 * 30e-6 - step_s, abs=1e-4)
 
 
 def test_a_clock_that_stands_still_is_a_drift_like_any_other() -> None:
-    assert fit_of(heard(lambda _now_s: 1.0, 10_000)).drift_ppm == pytest.approx(-1e6, rel=1e-3)
+    assert heard(lambda _now_s: 1.0, 10_000).fit().drift_ppm == pytest.approx(-1e6, rel=1e-3)
 
 
 # -- what a step is told of both -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("way_ticks", [1, 5, 15])
-@pytest.mark.parametrize("every", [2, 3])
-def test_a_device_that_answers_every_other_drive_is_matched_by_number(way_ticks: int, every: int) -> None:
-    """Its States fall behind the Drives by hundreds a second."""
-    trip = RoundTrip()
-    unanswered = frozenset(tick for tick in range(1, 4_000) if tick % every)
-    exchange(trip, range(1, 4_000), way_ticks, lost=unanswered)
-    report = report_of(trip)
-    assert report["p99"] <= way_ticks * 1e3 + 1.0
-    assert trip.usual_s == pytest.approx(way_ticks * PERIOD_S, abs=1e-6)
+NOISE = random.Random(1)
+NOW_AND_THEN = frozenset(tick for tick in range(1, 20_000) if NOISE.random() < 0.05)
+UNANSWERED = {every: frozenset(tick for tick in range(1, 4_000) if tick % every) for every in (2, 3)}
+"""The States of a device that answers every other Drive fall behind the Drives by hundreds a second."""
 
 
-@pytest.mark.parametrize("way_ticks", [1, 15])
-def test_drives_that_are_lost_now_and_then_make_no_round_trip_long(way_ticks: int) -> None:
-    noise = random.Random(1)
+@pytest.mark.parametrize(
+    ("way_ticks", "ticks", "lost", "least_us", "most_us", "within_s"),
+    [
+        *((way, 4_000, lost, 0.0, way * 1e3 + 1.0, 1e-6) for way in (1, 5, 15) for lost in UNANSWERED.values()),
+        # one lost Drive alone looks like an answer that is on its way
+        *((way, 20_000, NOW_AND_THEN, (way - 1) * 1e3, (way + 2) * 1e3, 1.5 * PERIOD_S) for way in (1, 15)),
+    ],
+)
+def test_drives_that_are_not_answered_make_no_round_trip_long(
+    way_ticks: int, ticks: int, lost: frozenset[int], least_us: float, most_us: float, within_s: float
+) -> None:
     trip = RoundTrip()
-    lost = frozenset(tick for tick in range(1, 20_000) if noise.random() < 0.05)
-    exchange(trip, range(1, 20_000), way_ticks, lost=lost)
+    exchange(trip, range(1, ticks), way_ticks, lost=lost)
     report = report_of(trip)
-    assert report["least"] >= (way_ticks - 1) * 1e3
-    assert report["p99"] <= (way_ticks + 2) * 1e3, "one lost Drive alone looks like an answer that is on its way"
-    assert trip.usual_s == pytest.approx(way_ticks * PERIOD_S, abs=1.5 * PERIOD_S)
+    assert report["least"] >= least_us
+    assert report["p99"] <= most_us
+    assert trip.usual_s == pytest.approx(way_ticks * PERIOD_S, abs=within_s)
 
 
 @pytest.mark.parametrize("after_ticks", [1, 20, 40, 70, 150])
@@ -221,3 +215,65 @@ def test_a_clock_that_stands_is_known_at_once_and_forgiven_when_it_goes() -> Non
     for tick in range(10_000):
         clock.add((1_030 + tick) * PERIOD_S, 1.0 + tick * PERIOD_S)
     assert abs(clock.drift) < 1e-4
+
+
+# -- what is lost, damaged and not taken, within the last second -------------------------------------------------------
+
+
+def watched(looks: list[Counts]) -> LinkQuality:
+    """The quality after these counters, a look apart."""
+    watch, now_s, quality = LinkWatch(0.0), 0.0, LinkQuality()
+    total = Counts()
+    for step in looks:
+        total = Counts(*[getattr(total, name) + getattr(step, name) for name in Counts.__match_args__])
+        while not watch.is_due(now_s):
+            now_s += 1e-3
+        quality = watch.look(now_s, total, 7e-4, 2e-5)
+    return quality
+
+
+GOOD = Counts(drives=100, states=100, frames=205, damaged=0, unsent=0)
+
+
+def test_a_wire_in_order() -> None:
+    assert watched([GOOD] * 20) == LinkQuality(0.0, 0.0, 0.0, 7e-4, 2e-5)
+    assert not watched([GOOD] * 20).is_lossy
+
+
+def test_nothing_is_said_before_the_first_answers_have_come() -> None:
+    watch = LinkWatch(5.0)
+    assert not watch.is_due(5.0 + (SETTLING_LOOKS - 0.1) * LOOKED_S)
+    assert watch.is_due(5.0 + (SETTLING_LOOKS + 0.1) * LOOKED_S)
+    assert watch.look(5.3, Counts(3, 0, 0, 0, 0), 0.0, 0.0) == LinkQuality(), "one look alone is no second"
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "share"),
+    [
+        ({"states": 95}, "unanswered", 0.05),
+        ({"damaged": 205}, "damaged", 0.5),
+        ({"unsent": 30}, "unsent", 0.3),
+        ({"states": 0, "frames": 0}, "unanswered", 1.0),
+    ],
+)
+def test_each_share_is_of_its_own_and_forgotten_after_a_second(change, name: str, share: float) -> None:
+    bad = GOOD.replaced(**change)
+    quality = watched([GOOD] * 3 + [bad] * 11)
+    assert getattr(quality, name) == pytest.approx(share)
+    assert quality.is_lossy
+    assert share > LOSES
+    # the shares of one bad look among the ten of a second
+    assert getattr(watched([GOOD] * 12 + [bad]), name) <= share / LOOKS * 2.0
+    assert not watched([bad] * 12 + [GOOD] * 12).is_lossy
+
+
+def test_a_round_trip_is_long_once_two_looks_have_found_it_so() -> None:
+    watch = LinkWatch(0.0)
+    found = [watch.look(0.1 * look, GOOD, trip_s, 0.0).round_trip_s for look, trip_s in enumerate((1e-3, 2e-2, 1e-3))]
+    assert found[1:] == [1e-3, 1e-3]
+    assert [watch.look(1.0, GOOD, 2e-2, 0.0).round_trip_s for _ in range(2)] == [1e-3, 2e-2]
+
+
+def test_it_says_its_figures() -> None:
+    text = str(LinkQuality(0.05, 0.021, 0.3, 0.0152, 0.0))
+    assert all(figure in text for figure in ("5.0%", "2.1%", "30.0%", "15.2 ms"))

@@ -1,22 +1,110 @@
-"""What every search promises, whatever its method: one suite over all of them."""
+"""What every search promises, whatever its method; then what each does better; then which one a scene gets."""
 
+import datetime
 import math
+import subprocess
+import sys
 from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import pytest
+import torch
+from hypothesis import example, given, strategies as st
+from scipy.optimize import brentq
 
+from tormagd.assembly.build import build_core, choose_solver
+from tormagd.config import Config
 from tormagd.inverse.bracketed import BracketedSearch, Refinement, finer_grid, newton
-from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
-from tormagd.inverse.nearest import NearestFieldSearch
-from tormagd.inverse.newton import ACCURACY_MT, RisingSearch
-from tormagd.inverse.solution import FieldSolver, Reach
-from tormagd.model.features import LARGEST
-from tormagd.model.model_file import ForceModel
+from tormagd.inverse.choice import RUNTIME_SOLVERS, build, named
+from tormagd.inverse.linear import THESIS_EPSILON_N, GridArgmin, LinearFieldSearch, torch_row
+from tormagd.inverse.nearest import NearestFieldSearch, field_grid
+from tormagd.inverse.newton import ACCURACY_MT, MOST_EVALUATIONS, RisingSearch
+from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
+from tormagd.model.features import LARGEST, UNITS, Element, Scaling
+from tormagd.model.force_curve import ForceCurve, Known, Network
+from tormagd.model.model_file import ForceModel, ModelMetadata
 from tormagd.physics.errors import DomainError
+from tormagd.scenes.measured import measured
+from tormagd.scenes.scene import Solver, load_scene, scene_path, shipped_scenes, terms_of
+from tormagd_client.endpoints import ConfigError
 
-RANGE_MT = (100.0, 750.0)
+torch.set_num_threads(1)  # a second thread costs more than it saves at this size, and waits for a busy processor
+
+# -- models whose shape over the field is known -----------------------------------------------------------------------
+
+
+RANGES = {
+    "displacement_mm": (0.0, 1.0),
+    "rate_mm_s": (0.0, 60.0),
+    "field_mT": (100.0, 800.0),
+    "cip_percent": (40.0, 40.0),
+    "force_N": (0.0, 6.0),
+}
+
+
+def make_model(weight: np.ndarray, bias: np.ndarray, output: np.ndarray, constant: float) -> ForceModel:
+    """Build a model of scaled weights over the ranges of a torque element."""
+    metadata = ModelMetadata(
+        element=Element.TORQUE,
+        insert="synthetic",
+        hidden=len(bias),
+        ranges={name: RANGES[name] for name in UNITS},
+        scaling=Scaling((0.5, 30.0, 450.0, 40.0), (2.0, 1 / 30, 1 / 350, 0.0), 3.0, 1 / 3),
+        training_data_sha256="0" * 64,
+        metrics={},
+        created=datetime.date(2024, 1, 1),
+    )
+    return ForceModel(metadata, weight, bias, output, constant)
+
+
+@pytest.fixture(scope="session")
+def rising() -> ForceModel:
+    """Force that rises with the field everywhere, 50 units."""
+    rng = np.random.default_rng(7)
+    weight = rng.normal(size=(50, 4))
+    weight[:, 2] = np.abs(weight[:, 2]) + 0.1
+    return make_model(weight, rng.normal(size=50), np.abs(rng.normal(size=50)) / 20, -1.0)
+
+
+@pytest.fixture(scope="session")
+def bump() -> ForceModel:
+    """Force that rises to a greatest value near 450 mT and falls again, the same on both sides."""
+    weight = np.zeros((2, 4))
+    weight[:, 2] = 8.0, -8.0
+    return make_model(weight, np.array([4.0, 4.0]), np.array([1.5, 1.5]), -2.0)
+
+
+@pytest.fixture(scope="session")
+def lopsided() -> ForceModel:
+    """Force that rises steeply to its greatest value near 450 mT and falls gently."""
+    weight = np.zeros((2, 4))
+    weight[:, 2] = 40.0, -4.0
+    return make_model(weight, np.array([4.0, 4.0]), np.array([1.5, 1.5]), -2.0)
+
+
+@pytest.fixture(scope="session")
+def plateau() -> ForceModel:
+    """Force that climbs steeply at 450 mT and is flat to the last bit on both sides."""
+    weight = np.zeros((1, 4))
+    weight[:, 2] = 500.0
+    return make_model(weight, np.zeros(1), np.array([1.0]), 0.0)
+
+
+@pytest.fixture(scope="session")
+def creeping() -> ForceModel:
+    """The plateau, with a rise of 8 units of rounding across it."""
+    weight = np.zeros((2, 4))
+    weight[:, 2] = 500.0, 1.0
+    return make_model(weight, np.zeros(2), np.array([1.0, 1e-14]), -0.9)
+
+
+# -- what all of them promise -----------------------------------------------------------------------------------------
+
+
+REACHED_MT = (100.0, 750.0)
 CIP = 40.0
 Make = Callable[[ForceModel], FieldSolver]
 
@@ -31,20 +119,20 @@ class Subject(NamedTuple):
 
 
 def bracketed(refine: Refinement) -> Make:
-    return lambda model: BracketedSearch(field_range_mT=RANGE_MT, refine=refine)
+    return lambda model: BracketedSearch(field_range_mT=REACHED_MT, refine=refine)
 
 
 SUBJECTS = {
-    "nearest": Subject(lambda model: NearestFieldSearch(field_range_mT=RANGE_MT), 5e-3),
+    "nearest": Subject(lambda model: NearestFieldSearch(field_range_mT=REACHED_MT), 5e-3),
     "coarse-to-fine": Subject(bracketed(finer_grid), 5e-3),
     "newton": Subject(bracketed(newton), 1e-6),
-    "rising": Subject(lambda model: RisingSearch(RANGE_MT), ACCURACY_MT, needs_rising=True),
+    "rising": Subject(lambda model: RisingSearch(REACHED_MT), ACCURACY_MT, needs_rising=True),
     "thesis-linear": Subject(
-        lambda model: LinearFieldSearch(field_range_mT=RANGE_MT, epsilon_N=0.01, predict_one=torch_row(model)),
+        lambda model: LinearFieldSearch(field_range_mT=REACHED_MT, epsilon_N=0.01, predict_one=torch_row(model)),
         *(5.0, False),
     ),
-    "linear-argmin": Subject(lambda model: LinearFieldSearch(field_range_mT=RANGE_MT, epsilon_N=0.0), 0.51, False),
-    "vectorised-argmin": Subject(lambda model: GridArgmin(model, field_range_mT=RANGE_MT), 0.51, False),
+    "linear-argmin": Subject(lambda model: LinearFieldSearch(field_range_mT=REACHED_MT, epsilon_N=0.0), 0.51, False),
+    "vectorised-argmin": Subject(lambda model: GridArgmin(model, field_range_mT=REACHED_MT), 0.51, False),
 }
 ANY_SHAPE = [name for name, subject in SUBJECTS.items() if not subject.needs_rising]
 CONTINUOUS = [name for name in ANY_SHAPE if SUBJECTS[name].is_continuous]
@@ -110,7 +198,7 @@ def test_a_search_without_memory_answers_with_one_of_the_roots(bump: ForceModel,
 
 
 @pytest.mark.parametrize("name", SUBJECTS)
-@pytest.mark.parametrize("end", RANGE_MT)
+@pytest.mark.parametrize("end", REACHED_MT)
 def test_the_ends_themselves_are_inside(rising: ForceModel, name: str, end: float) -> None:
     curve = rising.curve(0.5, 10, CIP)
     solution = solver(name, rising).solve(curve, curve.force_N(end), None)
@@ -121,11 +209,11 @@ def test_the_ends_themselves_are_inside(rising: ForceModel, name: str, end: floa
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_out_of_reach_is_the_nearest_end_and_never_silent(rising: ForceModel, name: str) -> None:
     searcher = solver(name, rising)
-    least, most = (rising.predict_one(0.5, 10, field, CIP) for field in RANGE_MT)
+    least, most = (rising.predict_one(0.5, 10, field, CIP) for field in REACHED_MT)
     below = searcher.solve(rising.curve(0.5, 10, CIP), least - 0.5, 500.0)
     above = searcher.solve(rising.curve(0.5, 10, CIP), most + 0.5, 500.0)
-    assert (below.field_mT, below.reach) == (RANGE_MT[0], Reach.BELOW)
-    assert (above.field_mT, above.reach) == (RANGE_MT[1], Reach.ABOVE)
+    assert (below.field_mT, below.reach) == (REACHED_MT[0], Reach.BELOW)
+    assert (above.field_mT, above.reach) == (REACHED_MT[1], Reach.ABOVE)
     for solution in (below, above):
         assert solution.confidence == pytest.approx(math.exp(-20 * 0.5 / 6), rel=1e-4)
 
@@ -180,9 +268,9 @@ def test_extreme_inputs_have_a_defined_answer(rising: ForceModel, name: str) -> 
         displacement, rate, force, cip, last = point.values()
         curve = rising.curve(displacement, rate, cip)
         solution = searcher.solve(curve, force, last)
-        assert RANGE_MT[0] <= solution.field_mT <= RANGE_MT[1]
+        assert REACHED_MT[0] <= solution.field_mT <= REACHED_MT[1]
         assert solution.predicted_force_N == pytest.approx(curve.force_N(solution.field_mT), rel=1e-12, abs=1e-12)
-        least, most = (curve.force_N(field) for field in RANGE_MT)
+        least, most = (curve.force_N(field) for field in REACHED_MT)
         if not least - 0.01 <= force <= most + 0.01:
             assert solution.reach is (Reach.BELOW if force < least else Reach.ABOVE)
         elif least + 0.01 < force < most - 0.01:
@@ -194,3 +282,339 @@ def test_extreme_inputs_have_a_defined_answer(rising: ForceModel, name: str) -> 
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_far_outside_the_training_range_the_answer_is_not_trusted(rising: ForceModel, name: str) -> None:
     assert solver(name, rising).solve(rising.curve(100.0, 10.0, CIP), 2.0, 400.0).confidence < 1e-6
+
+
+# -- row by row and by the nearest points ------------------------------------------------------------------------------
+
+
+RANGE_MT = (100.0, 800.0)
+
+
+def nearest(**options: Any) -> NearestFieldSearch:
+    return NearestFieldSearch(**{"field_range_mT": RANGE_MT, "step_mT": 1.0, **options})
+
+
+def linear(**options: Any) -> LinearFieldSearch:
+    return LinearFieldSearch(**{"field_range_mT": RANGE_MT, **options})
+
+
+def search(refine: Refinement = newton, step_mT: float = 30.0, **options: Any) -> BracketedSearch:
+    return BracketedSearch(**{"field_range_mT": RANGE_MT, "refine": refine, "step_mT": step_mT, **options})
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "name"),
+    [
+        (nearest, {"field_range_mT": (800.0, 100.0)}, "field_range_mT"),
+        (nearest, {"field_range_mT": (100.0, math.nan)}, "field_range_mT"),
+        (nearest, {"field_range_mT": (100.0, math.inf)}, "field_range_mT"),
+        (nearest, {"step_mT": 0.0}, "step_mT"),
+        (nearest, {"step_mT": -1.0}, "step_mT"),
+        (nearest, {"step_mT": math.nan}, "step_mT"),
+        (nearest, {"step_mT": 1e-9}, "step_mT"),
+        (nearest, {"step_mT": 701.0}, "step_mT"),
+        (nearest, {"neighbours": 0}, "neighbours"),
+        (nearest, {"neighbours": 702}, "neighbours"),
+        *((linear, {"epsilon_N": epsilon}, "epsilon_N") for epsilon in (-1.0, math.nan, math.inf)),
+        (search, {"step_mT": 0.0}, "step_mT"),
+        (search, {"step_mT": 701.0}, "step_mT"),
+        (search, {"field_range_mT": (9.0, 9.0)}, "field_range_mT"),
+        *(
+            (RisingSearch, {"field_range_mT": ends}, "field_range_mT")
+            for ends in ((800.0, 100.0), (9.0, 9.0), (100.0, math.nan), (-math.inf, 100.0))
+        ),
+    ],
+)
+def test_parameters_that_cannot_work_are_refused(
+    make: Callable[..., FieldSolver], options: dict[str, Any], name: str
+) -> None:
+    with pytest.raises(DomainError, match=name):
+        make(**options)
+
+
+def attainable(model: ForceModel, displacement_mm: float, rate_mm_s: float, share: float) -> float:
+    """Return the force at `share` of the way from the least to the greatest at that point."""
+    low, high = (model.predict_one(displacement_mm, rate_mm_s, field, CIP) for field in RANGE_MT)
+    return low + share * (high - low)
+
+
+def test_interpolation_beats_the_grid(rising: ForceModel) -> None:
+    """With a grid of 25 mT the answers stay within a hundredth of a step."""
+    solver, curve = nearest(step_mT=25.0), rising.curve(0.5, 20, CIP)
+    for field in np.linspace(115.0, 785.0, 41).tolist():
+        assert solver.solve(curve, curve.force_N(field), None).field_mT == pytest.approx(field, abs=0.25)
+
+
+@pytest.mark.parametrize(("neighbours", "keeps"), [(1, False), (2, False), (16, True)])
+def test_neighbours_decide_where_the_force_falls(lopsided: ForceModel, neighbours: int, keeps: bool) -> None:
+    """Steep up, gently down: of the points nearest in force the first few are all on the gentle side."""
+    solver, curve = nearest(neighbours=neighbours, step_mT=5.0), lopsided.curve(0.5, 10, CIP)
+    last, strayed = 440.0, False
+    for force in np.linspace(curve.force_N(440.0), curve.force_N(420.0), 80).tolist():
+        solution = solver.solve(curve, force, last)
+        assert solution.reach is Reach.INSIDE
+        strayed |= solution.field_mT > 450.0
+        last = solution.field_mT
+    assert strayed is not keeps
+
+
+def test_one_neighbour_is_enough_where_the_force_rises(rising: ForceModel) -> None:
+    one, many = nearest(neighbours=1), nearest(neighbours=64)
+    last = None
+    for displacement, rate, share in np.random.default_rng(5).uniform((0, 0, -0.1), (1, 60, 1.1), (200, 3)).tolist():
+        curve, force = rising.curve(displacement, rate, CIP), attainable(rising, displacement, rate, share)
+        solution = one.solve(curve, force, last)
+        assert solution == many.solve(curve, force, last)
+        last = solution.field_mT
+
+
+def test_on_a_plateau_the_field_moves_as_little_as_possible(plateau: ForceModel, creeping: ForceModel) -> None:
+    """Where hundreds of fields give the same force, the answer is one of the nearest in force, not a far one; a rise by
+    a few units of rounding up to 800 mT is no reason to travel there."""
+    solver = nearest(neighbours=701)
+    creep = creeping.curve(0.5, 10, CIP)
+    assert 0 < creep.force_N(800.0) - creep.force_N(500.0) < 1e-14
+    for curve in (plateau.curve(0.5, 10, CIP), creep):
+        top = curve.force_N(800.0)
+        above = solver.solve(curve, top + 1, 600.0)
+        assert above.reach is Reach.ABOVE
+        assert above.field_mT == pytest.approx(600, abs=0.5)
+    assert solver.solve(plateau.curve(0.5, 10, CIP), plateau.predict_one(0.5, 10, 800.0, CIP), 700.0).field_mT == (
+        pytest.approx(700, abs=0.5)
+    )
+
+
+def test_linear_stops_at_the_first_row_within_epsilon_or_has_the_nearest_of_all(
+    rising: ForceModel,
+) -> None:
+    force = attainable(rising, 0.5, 10, 0.7)
+    curve, grid = rising.curve(0.5, 10, CIP), field_grid(RANGE_MT, 1.0)
+    rows = [curve.force_N(field) for field in grid.tolist()]
+    first = next(index for index, predicted in enumerate(rows) if abs(force - predicted) <= 0.2)
+    solution = linear(epsilon_N=0.2).solve(curve, force, None)
+    assert solution == FieldSolution(100.0 + first, rows[first], solution.confidence, first + 1, Reach.INSIDE)
+    of_all = linear(epsilon_N=0.0).solve(curve, force, None)
+    assert (of_all.iterations, of_all.field_mT) == (701, grid[np.abs(np.array(rows) - force).argmin()])
+
+
+def test_linear_has_the_radius_of_the_thesis_by_default(rising: ForceModel) -> None:
+    force = rising.predict_one(0.5, 10, 100.0, CIP)
+    solver = linear()
+    assert THESIS_EPSILON_N == 1.26
+    assert solver.solve(rising.curve(0.5, 10, CIP), force - 1.25, None).reach is Reach.INSIDE
+    assert solver.solve(rising.curve(0.5, 10, CIP), force - 1.27, None).reach is Reach.BELOW
+
+
+def test_the_grid_has_both_ends_and_no_wider_step() -> None:
+    grid = field_grid((100.0, 800.0), 3.0)
+    assert (grid[0], grid[-1]) == (100.0, 800.0)
+    assert 2.9 < np.diff(grid).max() <= 3.0
+
+
+# -- look and refinement: roots beside the last field, steep steps, peaks between grid points --------------------------
+
+
+REFINEMENTS = (newton, finer_grid)
+
+
+def test_a_step_steeper_than_the_grid_is_met_exactly(plateau: ForceModel) -> None:
+    """Newton's slope is zero to the last bit on both sides of the step: bisection carries it there."""
+    middle = 0.5 * sum(plateau.predict_one(0.5, 10, field, CIP) for field in RANGE_MT)
+    solution = search(newton, 60.0).solve(plateau.curve(0.5, 10, CIP), middle, 200.0)
+    assert solution.field_mT == pytest.approx(450, abs=ACCURACY_MT)
+    assert solution.predicted_force_N == pytest.approx(middle, abs=1e-3)
+    assert solution.iterations < 50
+
+
+@pytest.mark.parametrize("refine", REFINEMENTS)
+def test_a_force_met_only_between_grid_points_is_not_called_out_of_reach(bump: ForceModel, refine: Refinement) -> None:
+    """The peak stands at 450 mT; a grid of 100 mT has points at 400 and 500, both lower."""
+    peak, shoulder = (bump.predict_one(0.5, 10, field, CIP) for field in (450.0, 400.0))
+    force = peak - 0.2 * (peak - shoulder)
+    solution = search(refine, 100.0).solve(bump.curve(0.5, 10, CIP), force, 150.0)
+    assert solution.reach is Reach.INSIDE
+    assert solution.predicted_force_N == pytest.approx(force, abs=1e-3)
+    assert solution.field_mT < 450
+
+
+@pytest.mark.parametrize("refine", REFINEMENTS)
+def test_the_last_field_is_a_point_of_the_grid(bump: ForceModel, refine: Refinement) -> None:
+    """From near the peak both roots lie in intervals that a grid of 700 mT does not have."""
+    force = bump.predict_one(0.5, 10, 440.0, CIP)
+    for last, root in ((446.0, 440.0), (455.0, 460.0)):
+        solution = search(refine, 700.0).solve(bump.curve(0.5, 10, CIP), force, last)
+        assert solution.field_mT == pytest.approx(root, abs=1.0 if refine is finer_grid else 0.01)
+
+
+def test_newton_needs_few_evaluations(rising: ForceModel) -> None:
+    rng = np.random.default_rng(2)
+    counts = []
+    for field in rng.uniform(*RANGE_MT, 200).tolist():
+        force = rising.predict_one(0.5, 10, field, CIP)
+        counts.append(search(newton).solve(rising.curve(0.5, 10, CIP), force, field + 20).iterations)
+    assert np.mean(counts) < 6
+    assert max(counts) < 12
+
+
+# -- Newton on the whole range of a force that rises: the root that Brent's method finds, from any last field ----------
+
+
+KNOWN = Known(((0.0, 1.0), (0.0, 60.0), RANGE_MT, (CIP, CIP)), 6.0)
+
+Steps = list[tuple[float, float, float]]
+"""Of each unit: 1/mT, the field, mT, at which it opens half, and N."""
+
+SMOOTH = (0.005, 450.0, 5.0)
+"It gives every network a slope of 1e-4 N/mT at least, so that a root is where its force is, beyond rounding."
+
+steps = st.lists(st.tuples(st.floats(1e-4, 100.0), st.floats(-300.0, 1200.0), st.floats(1e-6, 5.0)), max_size=10)
+fields = st.floats(*RANGE_MT)
+lasts = st.one_of(st.none(), fields, st.floats(-1e9, 1e9), st.sampled_from(RANGE_MT))
+
+
+def curve_of(units: Steps, constant_N: float = -0.5) -> ForceCurve:
+    rows = np.array(units)
+    weight = np.zeros((len(rows), 4))
+    weight[:, 2] = rows[:, 0]
+    return Network(weight, -rows[:, 0] * rows[:, 1], rows[:, 2], constant_N, KNOWN).curve(0.5, 10.0, CIP)
+
+
+def solved(curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
+    """The answer, as far as every answer has to be so."""
+    solution = RisingSearch(RANGE_MT).solve(curve, force_N, last_field_mT)
+    assert RANGE_MT[0] <= solution.field_mT <= RANGE_MT[1]
+    assert solution.predicted_force_N == curve.force_N(solution.field_mT)
+    assert solution.confidence == curve.confidence(solution.field_mT, force_N - solution.predicted_force_N)
+    assert 1 <= solution.iterations < MOST_EVALUATIONS
+    return solution
+
+
+@given(units=steps, share=st.floats(0.0, 1.0), last=lasts)
+def test_the_root_is_that_of_brent(units: Steps, share: float, last: float | None) -> None:
+    curve = curve_of([*units, SMOOTH])
+    least_N, most_N = (curve.force_N(field) for field in RANGE_MT)
+    force = least_N + share * (most_N - least_N)
+    root = brentq(lambda field: curve.force_N(field) - force, *RANGE_MT, xtol=1e-9) if 0 < share < 1 else None
+    solution = solved(curve, force, last)
+    assert solution.reach is Reach.INSIDE
+    assert solution.field_mT == pytest.approx(RANGE_MT[round(share)] if root is None else root, rel=0, abs=ACCURACY_MT)
+
+
+@given(units=steps, beyond=st.floats(1e-9, 1e6), last=lasts)
+@example(units=[], beyond=1e-9, last=103.0)
+@example(units=[], beyond=1.0, last=RANGE_MT[0] + 0.5 * ACCURACY_MT)
+@example(units=[], beyond=1.0, last=RANGE_MT[1] - 0.5 * ACCURACY_MT)
+def test_out_of_reach_is_the_end_and_says_so(units: Steps, beyond: float, last: float | None) -> None:
+    curve = curve_of([*units, SMOOTH])
+    least_N, most_N = (curve.force_N(field) for field in RANGE_MT)
+    below, above = solved(curve, least_N - beyond, last), solved(curve, most_N + beyond, last)
+    assert (below.field_mT, below.reach) == (RANGE_MT[0], Reach.BELOW)
+    assert (above.field_mT, above.reach) == (RANGE_MT[1], Reach.ABOVE)
+
+
+@pytest.mark.parametrize("end", RANGE_MT)
+def test_out_of_reach_costs_one_evaluation_while_it_lasts(rising: ForceModel, end: float) -> None:
+    force = 100.0 if end == RANGE_MT[1] else -100.0
+    assert solved(rising.curve(0.5, 10.0, CIP), force, end).iterations == 1
+
+
+def test_from_the_answer_it_does_not_move(rising: ForceModel) -> None:
+    curve = rising.curve(0.5, 10.0, CIP)
+    first = solved(curve, 2.5, 300.0)
+    again = solved(curve, first.predicted_force_N, first.field_mT)
+    assert (again.field_mT, again.iterations) == (first.field_mT, 1)
+
+
+def test_a_force_that_moves_is_followed_with_few_evaluations(rising: ForceModel) -> None:
+    """20 pulses of 100 mT in 4 s, planned 200 times a second: most answers take three evaluations or fewer."""
+    counts, last = [], 450.0
+    for field in (450.0 + 50.0 * np.sin(np.arange(800) * 2 * np.pi * 5 / 200)).tolist():
+        curve = rising.curve(0.5, 10.0, CIP)
+        solution = solved(curve, curve.force_N(field), last)
+        counts.append(solution.iterations)
+        last = solution.field_mT
+    assert np.mean(counts) <= 3.0
+    assert max(counts) <= 5
+
+
+@pytest.mark.parametrize("rate", [1.0, 5.0, 25.0])
+def test_flat_stretches_do_not_stop_it(rate: float) -> None:
+    """A stair whose steps are 1/rate mT wide, and flat to the last bit between: Newton has no direction there."""
+    curve = curve_of([(rate, 150.0 + 100.0 * place, 1.0) for place in range(7)], 0.0)
+    for stair in range(7):
+        for last in (None, *RANGE_MT, 199.9, 450.0, 650.1):
+            solution = solved(curve, stair + 0.5, last)
+            assert solution.field_mT == pytest.approx(150.0 + 100.0 * stair, abs=ACCURACY_MT)
+
+
+# -- the search of a scene: by name, or Newton's method, which no measured scene has a reason to leave -----------------
+
+
+@pytest.mark.parametrize("name", RUNTIME_SOLVERS)
+def test_a_named_search_is_built_with_its_settings(rising: ForceModel, name: str) -> None:
+    for rises in (False, True):
+        built = build(named(name, step_mT=25.0), (100.0, 800.0), rises=rises)
+        newton = RisingSearch if rises else BracketedSearch
+        expected = {"nearest": NearestFieldSearch, "coarse-to-fine": BracketedSearch, "newton": newton}
+        assert isinstance(built, expected[name])
+        usual = build(named(name), (100.0, 800.0), rises=rises)
+        assert usual.solve(rising.curve(0.5, 10, 40.0), 3.0, None).field_mT > 100
+
+
+def test_a_name_that_is_none_is_refused_with_those_that_are() -> None:
+    with pytest.raises(DomainError, match=r"solver\.name = 'bisection'.*nearest, coarse-to-fine, newton"):
+        named("bisection")
+
+
+@pytest.mark.parametrize("name", shipped_scenes())
+def test_a_scene_gets_the_search_that_it_names_or_newton_where_there_is_one(name: str) -> None:
+    scene = load_scene(name)
+    built = build_core(Config(scene=name)).solver
+    if scene.solver.name != "auto":
+        assert built.solver == scene.solver.name
+    elif "rate" in terms_of(scene).left_out:
+        assert built.solver == "portrait"  # there is nothing to search
+    else:
+        assert built.solver == "newton"
+
+
+def test_no_other_search_is_cheaper_or_more_exact_in_any_measured_scene() -> None:
+    """Why nothing picks among them: on the device, by what `tools/required_terms.py --store` measured."""
+    for scene in measured().scenes:
+        found = {item.search: item for item in scene.searches}
+        assert set(found) == set(RUNTIME_SOLVERS)
+        newton = found.pop("newton")
+        for other in found.values():
+            assert scene.us_s(newton.cost) < scene.us_s(other.cost)
+            assert newton.rms_N < other.rms_N + 0.01 * scene.tolerance_N
+
+
+def test_a_scene_may_name_its_search() -> None:
+    scene = load_scene(shipped_scenes()[0])
+    wanted = msgspec.structs.replace(scene, solver=Solver(name="nearest", step_mT=5.0, neighbours=2))
+    choice = choose_solver(wanted)
+    assert (choice.solver, choice.step_mT, choice.neighbours) == ("nearest", 5.0, 2)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ('name = "bisection"', ("solver.name", "bisection", "newton")),
+        ("step_mT = 5.0", ("solver.step_mT", "5.0", "auto")),
+        ('name = "nearest"\nneighbours = 60\nstep_mT = 50.0', ("neighbours", "60", "number of grid points")),
+    ],
+)
+def test_a_scene_whose_search_cannot_be_is_refused(tmp_path: Path, table: str, words: tuple[str, ...]) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(Path(scene_path("coronary")).read_text() + f"\n[solver]\n{table}\n")
+    with pytest.raises(ConfigError) as caught:
+        build_core(Config(scene=str(path)))
+    assert all(word in str(caught.value) for word in words)
+
+
+def test_what_trains_and_what_is_for_the_laboratory_stays_out_of_the_daemon() -> None:
+    """torch takes seconds to load, and the searches that the daemon may run know nothing but a curve."""
+    loaded = "import sys, tormagd.control.core, tormagd.inverse.choice; print(*sys.modules)"
+    found = subprocess.run([sys.executable, "-c", loaded], check=True, capture_output=True, text=True).stdout.split()
+    assert "tormagd.inverse.newton" in found
+    assert not {"torch", "scipy", "sklearn", "matplotlib"} & set(found)

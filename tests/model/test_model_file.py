@@ -1,12 +1,15 @@
-"""Model files: the same bytes again, the same force again, and a refusal of everything else."""
+"""Models: their files, the same bytes again or a refusal, and the force that they give."""
 
+import datetime
 import json
+import math
 import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mpmath
 import msgspec
 import numpy as np
 import pytest
@@ -14,14 +17,49 @@ import torch
 from hypothesis import given, strategies as st
 from safetensors import safe_open
 
+from tormagd.assembly.build import build_core
+from tormagd.config import Config, Rates
+from tormagd.control.believe.memory import ElementMemory
+from tormagd.control.records import Handle, Measured
 from tormagd.lab.training.dataset import Dataset
+from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory
 from tormagd.lab.training.metrics import fit_metrics, not_rising_share
 from tormagd.model import model_file
-from tormagd.model.features import FEATURES, LARGEST, UNITS, Element
+from tormagd.model.displacement import Turn
+from tormagd.model.features import FEATURES, LARGEST, UNITS, Element, Scaling
+from tormagd.model.force_curve import LARGEST_EXPONENT, Known, Network
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import ForceModel, ModelFileError, ModelMetadata, load_model, save_model
 from tormagd.model.network import to_model, to_network
+from tormagd.model.shipped import model_path
 from tormagd.physics.errors import DomainError
+
+
+@pytest.fixture(scope="session")
+def metadata() -> ModelMetadata:
+    return ModelMetadata(
+        element=Element.TORQUE,
+        insert="MRE-50-40",
+        hidden=6,
+        ranges={
+            "displacement_mm": (0.0, 1.0),
+            "rate_mm_s": (0.0, 60.0),
+            "field_mT": (100.0, 800.0),
+            "cip_percent": (40.0, 40.0),
+            "force_N": (0.1, 5.7),
+        },
+        scaling=Scaling((0.5, 30.0, 450.0, 40.0), (2.0, 1 / 30, 1 / 350, 0.0), 2.9, 1 / 2.8),
+        training_data_sha256="ab" * 32,
+        metrics={"validation_r2": 0.99},
+        created=datetime.date(2024, 2, 29),
+    )
+
+
+@pytest.fixture(scope="session")
+def model(metadata: ModelMetadata) -> ForceModel:
+    rng = np.random.default_rng(0)
+    return ForceModel(metadata, rng.normal(size=(6, 4)), rng.normal(size=6), rng.normal(size=6), 0.25)
+
 
 POINT = (0.3, 12.0, 420.0, 40.0)
 
@@ -33,7 +71,10 @@ def saved(tmp_path: Path, model: ForceModel) -> Path:
     return path
 
 
-def rewritten(path: Path, change: Callable[[dict[str, Any]], object], *, sign: bool = True) -> Path:
+Change = Callable[[dict[str, Any]], object]
+
+
+def rewritten(path: Path, change: Change, *, sign: bool = True) -> Path:
     """Change the header of a model file; `sign` renews the checksum, as someone would who means it."""
     data = path.read_bytes()
     (length,) = struct.unpack_from("<Q", data)
@@ -53,6 +94,11 @@ def rewritten(path: Path, change: Callable[[dict[str, Any]], object], *, sign: b
     encoded += b" " * (-len(encoded) % 8)
     path.write_bytes(struct.pack("<Q", len(encoded)) + encoded + body)
     return path
+
+
+def refused(path: Path, message: str = r"model\.(safetensors|pt): ", **wanted: object) -> None:
+    with pytest.raises(ModelFileError, match=message):
+        load_model(path, **{"element": "torque", **wanted})
 
 
 def test_round_trip_is_exact_to_the_byte(saved: Path, tmp_path: Path, model: ForceModel) -> None:
@@ -80,11 +126,9 @@ def test_every_truncation_is_refused(saved: Path) -> None:
     data = saved.read_bytes()
     for length in (0, 1, 7, 8, 9, 200, struct.unpack_from("<Q", data)[0] + 8, len(data) - 8, len(data) - 1):
         saved.write_bytes(data[:length])
-        with pytest.raises(ModelFileError, match=r"model\.safetensors: "):
-            load_model(saved, element="torque")
+        refused(saved)
     saved.write_bytes(data + b"\0")
-    with pytest.raises(ModelFileError):
-        load_model(saved, element="torque")
+    refused(saved)
 
 
 def test_a_flipped_bit_anywhere_is_refused(saved: Path) -> None:
@@ -97,41 +141,7 @@ def test_a_flipped_bit_anywhere_is_refused(saved: Path) -> None:
         if 8 + length - padding <= index < 8 + length and not bytes([flipped[index]]).strip():
             continue  # one blank for another after the header: not part of the model
         saved.write_bytes(flipped)
-        with pytest.raises(ModelFileError):
-            load_model(saved, element="torque")
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("features", list(reversed(FEATURES)), "features"),
-        ("features", FEATURES[:3], "features"),
-        ("units", {**UNITS, "field_mT": "T"}, "units"),
-        ("hidden", 7, "hidden_weight = shape"),
-        ("hidden", 0, "hidden"),
-        ("hidden", "6", "hidden"),
-        ("ranges", {"field_mT": [100, 800]}, "ranges"),
-        ("ranges", dict.fromkeys(UNITS, (1, 0)), "ranges"),
-        ("ranges", dict.fromkeys(UNITS, (1, 1)), r"ranges\.force_N"),
-        ("scaling", {"input_offset": [0, 0, 0, 0]}, "input_gain"),
-        (
-            "scaling",
-            {"input_offset": [0] * 4, "input_gain": [1] * 4, "output_offset": 0, "output_gain": 0},
-            "output_gain",
-        ),
-        ("metrics", {"r2": "good"}, "metrics"),
-        ("memory", {"fractions": [0.5], "times_s": []}, r"times_s = .* at `\$\.memory"),
-        ("memory", {"fractions": [0.5, 0.6], "times_s": [1.0, 2.0]}, r"fractions = .* at `\$\.memory"),
-        ("memory", {"fractions": [0.1, 0.1], "times_s": [2.0, 1.0]}, r"memory\.times_s"),
-        ("memory", {"lag_mT": 5.0, "turn_mT": 19.0}, r"memory\.lag_mT"),
-        ("memory", {"lag_mT": -1.0}, r"memory\.lag_mT"),
-        ("colour", "red", "colour"),
-    ],
-)
-def test_a_signed_file_with_another_meaning_is_refused(saved: Path, field: str, value: object, message: str) -> None:
-    rewritten(saved, lambda header: header["__metadata__"].update({field: json.dumps(value)}))
-    with pytest.raises(ModelFileError, match=message):
-        load_model(saved, element="torque")
+        refused(saved)
 
 
 def test_a_file_without_a_memory_is_of_an_element_that_remembers_nothing(saved: Path, tmp_path: Path) -> None:
@@ -141,40 +151,78 @@ def test_a_file_without_a_memory_is_of_an_element_that_remembers_nothing(saved: 
     memory = Memory(fractions=(0.05, 0.04), times_s=(8.0, 90.0), lag_mT=7.5, turn_mT=75.0)
     with_memory = replace(without, metadata=msgspec.structs.replace(without.metadata, memory=memory))
     save_model(tmp_path / "with.safetensors", with_memory)
-    assert load_model(tmp_path / "with.safetensors", element="torque").metadata.memory == memory
+    again = load_model(tmp_path / "with.safetensors", element="torque")
+    assert (again.metadata, again.fingerprint) == (with_memory.metadata, with_memory.fingerprint)
     assert with_memory.fingerprint != without.fingerprint
 
 
+def said(field: str, text: str) -> Change:
+    """Sets a field of the header to this text."""
+    return lambda header: header["__metadata__"].update({field: text})
+
+
+MEANINGS: list[tuple[str, Any, str]] = [
+    ("features", list(reversed(FEATURES)), "features"),
+    ("features", FEATURES[:3], "features"),
+    ("units", {**UNITS, "field_mT": "T"}, "units"),
+    ("hidden", 7, "hidden_weight = shape"),
+    ("hidden", 0, "hidden"),
+    ("hidden", "6", "hidden"),
+    ("ranges", {"field_mT": [100, 800]}, "ranges"),
+    ("ranges", dict.fromkeys(UNITS, (1, 0)), "ranges"),
+    ("ranges", dict.fromkeys(UNITS, (1, 1)), r"ranges\.force_N"),
+    ("scaling", {"input_offset": [0, 0, 0, 0]}, "input_gain"),
+    (
+        "scaling",
+        {"input_offset": [0] * 4, "input_gain": [1] * 4, "output_offset": 0, "output_gain": 0},
+        "output_gain",
+    ),
+    ("metrics", {"r2": "good"}, "metrics"),
+    ("memory", {"fractions": [0.5], "times_s": []}, r"times_s = .* at `\$\.memory"),
+    ("memory", {"fractions": [0.5, 0.6], "times_s": [1.0, 2.0]}, r"fractions = .* at `\$\.memory"),
+    ("memory", {"fractions": [0.1, 0.1], "times_s": [2.0, 1.0]}, r"memory\.times_s"),
+    *(
+        ("memory", {"times_s": [1.0, 10.0], "fractions": [0.1, 0.1], which: fractions}, "memory")
+        for which in ("fractions", "field_fractions")
+        for fractions in ([0.6, 0.6], [0.1], [-0.1, 0.1])
+    ),
+    ("memory", {"lag_mT": 5.0, "turn_mT": 19.0}, r"memory\.lag_mT"),
+    ("memory", {"lag_mT": -1.0}, r"memory\.lag_mT"),
+    ("colour", "red", "colour"),
+]
+"""Of another meaning, though each is what JSON can say."""
+
+BROKEN = [
+    ("element", "tactical", "element"),
+    ("insert", "", "insert"),
+    ("created", "yesterday", "created"),
+    ("training_data_sha256", "AB" * 32, "training_data_sha256"),
+    ("format", "tormagd-force-model-2", "format"),
+    ("ranges", "[" * 100_000, "nested"),
+    ("hidden", "9" * 5000, "hidden|range"),
+    ("metrics", '{"r2": NaN}', "malformed"),
+    ("metrics", '{"r2": 1e999}', "range"),
+]
+SIGNED: list[tuple[Change, str]] = [
+    *((said(field, json.dumps(value)), message) for field, value, message in MEANINGS),
+    *((said(field, text), message) for field, text, message in BROKEN),
+    (lambda header: header["__metadata__"].pop("ranges"), "ranges"),
+    (lambda header: header["hidden_weight"].update(shape=[4, 6]), r"hidden_weight = shape \(4, 6\)"),
+    (lambda header: header.update(other=header.pop("hidden_bias")), "needed are"),
+]
+UNSIGNED: list[tuple[Change, str]] = [
+    (said("insert", "MRE-10-30"), "altered since it was written"),
+    (lambda header: header.pop("__metadata__"), "format is None"),
+    (lambda header: header["hidden_weight"].update(dtype="I64"), "hidden_weight is I64"),
+]
+
+
 @pytest.mark.parametrize(
-    ("field", "text", "message"),
-    [
-        ("element", "tactical", "element"),
-        ("insert", "", "insert"),
-        ("created", "yesterday", "created"),
-        ("training_data_sha256", "AB" * 32, "training_data_sha256"),
-        ("format", "tormagd-force-model-2", "format"),
-        ("ranges", "[" * 100_000, "nested"),
-        ("hidden", "9" * 5000, "hidden|range"),
-        ("metrics", '{"r2": NaN}', "malformed"),
-        ("metrics", '{"r2": 1e999}', "range"),
-    ],
+    ("change", "message", "sign"), [*((*row, True) for row in SIGNED), *((*row, False) for row in UNSIGNED)]
 )
-def test_a_signed_file_with_broken_text_is_refused(saved: Path, field: str, text: str, message: str) -> None:
-    rewritten(saved, lambda header: header["__metadata__"].update({field: text}))
-    with pytest.raises(ModelFileError, match=message):
-        load_model(saved, element="torque")
-
-
-def test_an_unsigned_change_and_a_missing_field_are_refused(saved: Path) -> None:
-    rewritten(saved, lambda header: header["__metadata__"].update(insert="MRE-10-30"), sign=False)
-    with pytest.raises(ModelFileError, match="altered since it was written"):
-        load_model(saved, element="torque")
-    rewritten(saved, lambda header: header["__metadata__"].pop("ranges"))
-    with pytest.raises(ModelFileError, match="ranges"):
-        load_model(saved, element="torque")
-    rewritten(saved, lambda header: header.pop("__metadata__"), sign=False)
-    with pytest.raises(ModelFileError, match="format is None"):
-        load_model(saved, element="torque")
+def test_a_file_with_another_header_is_refused(saved: Path, change: Change, message: str, sign: bool) -> None:
+    rewritten(saved, change, sign=sign)
+    refused(saved, message)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e300])
@@ -183,69 +231,57 @@ def test_weights_that_are_not_finite_are_refused(saved: Path, value: float) -> N
     data[-8:] = struct.pack("<d", value)
     saved.write_bytes(data)
     rewritten(saved, lambda header: None)
-    with pytest.raises(ModelFileError, match=r"output_weight = .* finite"):
-        load_model(saved, element="torque")
-
-
-def test_tensors_of_another_type_shape_or_name_are_refused(saved: Path) -> None:
-    data = saved.read_bytes()
-    rewritten(saved, lambda header: header["hidden_weight"].update(shape=[4, 6]))
-    with pytest.raises(ModelFileError, match=r"hidden_weight = shape \(4, 6\)"):
-        load_model(saved, element="torque")
-    saved.write_bytes(data)
-    rewritten(saved, lambda header: header["hidden_weight"].update(dtype="I64"), sign=False)
-    with pytest.raises(ModelFileError, match="hidden_weight is I64"):
-        load_model(saved, element="torque")
-    saved.write_bytes(data)
-    rewritten(saved, lambda header: header.update(other=header.pop("hidden_bias")))
-    with pytest.raises(ModelFileError, match="needed are"):
-        load_model(saved, element="torque")
+    refused(saved, r"output_weight = .* finite")
 
 
 def test_a_model_for_something_else_is_refused(saved: Path) -> None:
-    with pytest.raises(ModelFileError, match="trained on the torque element, but the tactile element is in use"):
-        load_model(saved, element=Element.TACTILE)
-    with pytest.raises(ModelFileError, match="trained on insert MRE-50-40, but MRE-10-30 is in use"):
-        load_model(saved, element="torque", insert="MRE-10-30")
+    refused(saved, "trained on the torque element, but the tactile element is in use", element=Element.TACTILE)
+    refused(saved, "trained on insert MRE-50-40, but MRE-10-30 is in use", insert="MRE-10-30")
+    refused(model_path("tactile_mre_c", Path()), "trained on the tactile element, but the torque element is in use")
 
 
 def test_what_is_no_model_file_is_refused(tmp_path: Path, model: ForceModel) -> None:
-    with pytest.raises(ModelFileError, match="cannot be read: No such file"):
-        load_model(tmp_path / "absent", element="torque")
-    with pytest.raises(ModelFileError, match="cannot be read"):
-        load_model(tmp_path, element="torque")
+    refused(tmp_path / "absent", "cannot be read: No such file")
     pickled = tmp_path / "model.pt"
     torch.save({"weight": torch.zeros(3)}, pickled)
-    with pytest.raises(ModelFileError):
-        load_model(pickled, element="torque")
+    refused(pickled)
     pickled.write_bytes(b"\0" * (model_file.MAX_FILE_BYTES + 1))
-    with pytest.raises(ModelFileError, match="at most 1048576 bytes; this has 1048577"):
-        load_model(pickled, element="torque")
+    refused(pickled, "at most 1048576 bytes; this has 1048577")
 
 
 @given(st.binary(max_size=600))
 def test_noise_is_refused(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
     path = tmp_path_factory.mktemp("noise") / "model.safetensors"
     path.write_bytes(data)
-    with pytest.raises(ModelFileError):
-        load_model(path, element="torque")
+    refused(path)
 
 
-def test_a_model_is_checked_when_it_is_made(model: ForceModel, metadata: ModelMetadata) -> None:
-    weights = (model.hidden_weight, model.hidden_bias, model.output_weight)
-    for metrics in ({"r2": float("nan")}, {"r2": float("inf")}):
-        with pytest.raises(DomainError, match=r"metrics\.r2"):
-            ForceModel(msgspec.structs.replace(metadata, metrics=metrics), *weights, 0.0)
-    feeble = msgspec.structs.replace(metadata, scaling=msgspec.structs.replace(metadata.scaling, output_gain=1e-300))
-    with pytest.raises(DomainError, match="output_gain"):
-        ForceModel(feeble, *weights, 1.0)
-    for change in ({"insert": "two words"}, {"hidden": 0}, {"training_data_sha256": "none"}, {"features": ("x",)}):
-        with pytest.raises(DomainError, match=next(iter(change))):
-            msgspec.structs.replace(metadata, **change)
-    with pytest.raises(DomainError, match="output_bias"):
-        ForceModel(metadata, *weights, float("nan"))
-    with pytest.raises(DomainError, match="floating-point"):
-        ForceModel(metadata, weights[0].astype(int), *weights[1:], 0.0)
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"metrics": {"r2": math.nan}}, r"metrics\.r2"),
+        ({"metrics": {"r2": math.inf}}, r"metrics\.r2"),
+        ({"scaling": Scaling((0.5, 30.0, 450.0, 40.0), (2.0, 1 / 30, 1 / 350, 0.0), 2.9, 1e-300)}, "output_gain"),
+        ({"insert": "two words"}, "insert"),
+        ({"hidden": 0}, "hidden"),
+        ({"training_data_sha256": "none"}, "training_data_sha256"),
+        ({"features": ("x",)}, "features"),
+    ],
+)
+def test_what_a_model_says_of_itself_is_checked_when_it_is_made(
+    model: ForceModel, changes: dict[str, Any], name: str
+) -> None:
+    with pytest.raises(DomainError, match=name):
+        replace(model, metadata=msgspec.structs.replace(model.metadata, **changes), output_bias=1.0)
+
+
+def test_its_weights_are_checked_too_and_stay_what_they_are(model: ForceModel) -> None:
+    for changes, name in (
+        ({"output_bias": math.nan}, "output_bias"),
+        ({"hidden_weight": model.hidden_weight.astype(int)}, "floating-point"),
+    ):
+        with pytest.raises(DomainError, match=name):
+            replace(model, **changes)
     with pytest.raises(ValueError, match="read-only"):
         model.hidden_weight[0, 0] = 1.0
 
@@ -283,12 +319,14 @@ def test_metrics_of_a_known_error(model: ForceModel) -> None:
     rows = np.random.default_rng(3).uniform((0, 0, 100, 40), (1, 60, 800, 40.0001), (300, 4))
     signs = np.where(np.arange(300) % 2, 0.5, -0.5)
     data = Dataset(rows, model.predict(rows) + signs)
-    metrics = fit_metrics(model, data)
-    assert metrics["mae_N"] == pytest.approx(0.5)
-    assert metrics["rmse_N"] == pytest.approx(0.5)
-    assert metrics["max_N"] == pytest.approx(0.5)
-    assert metrics["mae_percent"] == pytest.approx(50 / 5.6)
-    assert metrics["r2"] == pytest.approx(1 - 0.25 / np.var(data.force_N))
+    expected = {
+        "mae_N": 0.5,
+        "rmse_N": 0.5,
+        "max_N": 0.5,
+        "mae_percent": 50 / 5.6,
+        "r2": 1 - 0.25 / np.var(data.force_N),
+    }
+    assert fit_metrics(model, data) == pytest.approx(expected)
 
 
 def test_not_rising_counts_where_the_force_falls_with_the_field(metadata: ModelMetadata) -> None:
@@ -303,3 +341,186 @@ def test_not_rising_counts_where_the_force_falls_with_the_field(metadata: ModelM
     hill[:2, 2] = 8.0, -8.0  # rises at -0.5, falls at +0.5 in scaled units
     bump = ForceModel(metadata, hill, np.array([4.0, 4, 0, 0, 0, 0]), np.array([1.0, 1, 0, 0, 0, 0]), 0.0)
     assert not_rising_share(bump, points=17) == pytest.approx(9 / 17)
+
+
+# -- the force curve: the model's, torch's and a 50-digit calculation's force, and how far it is trusted ---------------
+
+
+BOX = ((0.0, 0.0, 100.0, 40.0), (1.0, 60.0, 800.0, 40.0))
+Array = np.ndarray
+
+
+@pytest.fixture(scope="module")
+def shipped() -> ForceModel:
+    return load_model(model_path("torque_mre_50_40", Path()), element="torque")
+
+
+@pytest.fixture(scope="module")
+def steep(metadata: ModelMetadata) -> ForceModel:
+    """Large weights over narrow ranges."""
+    rng = np.random.default_rng(4)
+    narrow = msgspec.structs.replace(
+        metadata,
+        element=Element.TACTILE,
+        insert="pad",
+        hidden=20,
+        ranges=dict.fromkeys(UNITS, (0.0, 1e-3)),
+        scaling=Scaling((0.0,) * 4, (2e3,) * 4, 0.0, 2e3),
+    )
+    return ForceModel(narrow, 50 * rng.normal(size=(20, 4)), rng.normal(size=20), rng.normal(size=20), 0.0)
+
+
+def states(count: int) -> Array:
+    """Features (count x 4), a third of them up to ten ranges outside the box, and share of iron too."""
+    rng = np.random.default_rng(11)
+    rows = rng.uniform(*BOX, (count, 4))
+    rows[::3] += rng.normal(size=(len(rows[::3]), 4)) * (3.0, 200.0, 2000.0, 10.0)
+    return rows
+
+
+def exact_N(model: ForceModel, row: list[float]) -> mpmath.mpf:
+    """The network in physical units with 50 digits."""
+    weight, bias, output, constant = model.physical
+    with mpmath.workdps(50):
+        total = mpmath.mpf(constant)
+        for column, shift, height in zip(weight.tolist(), bias.tolist(), output.tolist(), strict=True):
+            pairs = zip(column, row, strict=True)
+            exponent = mpmath.mpf(shift) + mpmath.fsum(mpmath.mpf(a) * mpmath.mpf(b) for a, b in pairs)
+            total += mpmath.mpf(height) / (1 + mpmath.exp(-exponent))
+        return total
+
+
+@pytest.mark.parametrize("fixture", ["model", "shipped"])
+def test_the_force_is_that_of_the_model(request: pytest.FixtureRequest, fixture: str) -> None:
+    model = request.getfixturevalue(fixture)
+    rows = states(300)
+    with torch.inference_mode():
+        by_torch = to_network(model)(torch.from_numpy(rows)).numpy()
+    forces = [model.curve(row[0], row[1], row[3]).force_N(row[2]) for row in rows.tolist()]
+    one_by_one = [model.predict_one(*row) for row in rows.tolist()]
+    for others in (model.predict(rows), by_torch, one_by_one):
+        assert forces == pytest.approx(others, rel=0, abs=1e-12 * model.curve(0.5, 10.0, 40.0).magnitude_N)
+
+
+@pytest.mark.parametrize("fixture", ["model", "shipped"])
+def test_the_force_agrees_with_50_digits(request: pytest.FixtureRequest, fixture: str) -> None:
+    model = request.getfixturevalue(fixture)
+    for row in states(60).tolist():
+        curve = model.curve(row[0], row[1], row[3])
+        exact = float(exact_N(model, row))
+        assert curve.force_N(row[2]) == pytest.approx(exact, rel=0, abs=1e-13 * curve.magnitude_N)
+        assert curve.force_and_slope(row[2])[0] == curve.force_N(row[2])
+
+
+@pytest.mark.parametrize("fixture", ["model", "shipped"])
+def test_the_slope_is_that_of_the_model(request: pytest.FixtureRequest, fixture: str) -> None:
+    model = request.getfixturevalue(fixture)
+    rows = states(300)
+    slopes = [model.curve(row[0], row[1], row[3]).force_and_slope(row[2])[1] for row in rows.tolist()]
+    steepest = float(np.abs(model.physical.output_weight) @ np.abs(model.physical.hidden_weight[:, 2]))
+    assert slopes == pytest.approx(model.field_slope_N_per_mT(rows), rel=0, abs=1e-12 * steepest)
+
+
+@pytest.mark.parametrize(("dtype", "accuracy"), [(np.float64, 1e-13), (np.float32, 1e-5)])
+def test_a_grid_of_fields_has_the_forces_of_its_fields(
+    shipped: ForceModel, dtype: type[np.floating], accuracy: float
+) -> None:
+    curve = shipped.curve(2.0, 20.0, 40.0)
+    fields = np.linspace(250.0, 850.0, 61)
+    forces = curve.forces_N(fields.astype(dtype))
+    assert forces.dtype == dtype
+    one_by_one = [curve.force_N(field) for field in fields.tolist()]
+    assert forces == pytest.approx(one_by_one, rel=0, abs=accuracy * curve.magnitude_N)
+
+
+def test_its_state_is_the_one_asked_for(model: ForceModel) -> None:
+    curve = model.curve(0.3, 12.0, 41.0)
+    assert (curve.displacement_mm, curve.rate_mm_s, curve.cip_percent) == (0.3, 12.0, 41.0)
+    assert curve.magnitude_N == pytest.approx(
+        float(np.abs(model.physical.output_weight).sum()) + abs(model.physical.output_bias)
+    )
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
+@pytest.mark.parametrize("place", range(3))
+def test_a_state_that_is_no_number_is_refused_by_name(model: ForceModel, value: float, place: int) -> None:
+    state = [0.3, 12.0, 40.0]
+    state[place] = value
+    with pytest.raises(DomainError, match=("displacement_mm", "rate_mm_s", "cip_percent")[place]):
+        model.curve(*state)
+
+
+@pytest.mark.parametrize("exponent", [LARGEST_EXPONENT, 709.7, 710.0, 1e4, 1e18])
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_unit_far_from_its_step_is_shut_or_open(exponent: float, side: int) -> None:
+    """exp() of more than 709.78 has no float."""
+    known = Known(((0.0, 1.0), (0.0, 60.0), (100.0, 800.0), (40.0, 40.0)), 6.0)
+    weight = np.array([[0.0, 0.0, side * exponent / 400.0, 0.0]])
+    curve = Network(weight, np.zeros(1), np.array([3.0]), 0.25, known).curve(0.5, 10.0, 40.0)
+    expected = 3.25 if side > 0 else 0.25
+    assert curve.force_N(400.0) == expected
+    assert curve.force_and_slope(400.0) == (expected, pytest.approx(0.0, abs=1e-300))
+    assert curve.forces_N(np.array([400.0])) == pytest.approx([expected], abs=1e-15)
+
+
+@pytest.mark.parametrize("fixture", ["shipped", "steep"])
+@given(
+    displacement=st.floats(-LARGEST, LARGEST),
+    rate=st.floats(-LARGEST, LARGEST),
+    field=st.floats(-LARGEST, LARGEST),
+    cip=st.floats(-LARGEST, LARGEST),
+)
+def test_no_state_and_no_field_has_no_force(
+    request: pytest.FixtureRequest, fixture: str, displacement: float, rate: float, field: float, cip: float
+) -> None:
+    curve = request.getfixturevalue(fixture).curve(displacement, rate, cip)
+    force, slope = curve.force_and_slope(field)
+    assert abs(force) <= curve.magnitude_N * (1 + 1e-12)
+    assert force == curve.force_N(field)
+    assert math.isfinite(slope)
+    assert 0.0 <= curve.confidence(field, force) <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("place", "error_N", "expected"),
+    [
+        ((0.5, 10.0, 400.0, 40.0), 0.0, 1.0),
+        ((0.5, 10.0, 400.0, 40.0), 0.3, pytest.approx(math.exp(-20 * 0.3 / 5.6))),
+        ((1.25, 10.0, 400.0, 40.0), 0.0, pytest.approx(math.exp(-1))),
+        ((-0.25, 75.0, 400.0, 40.0), 0.0, pytest.approx(math.exp(-2))),
+        ((0.5, 10.0, 975.0, 40.0), 0.0, pytest.approx(math.exp(-1))),
+        ((0.5, 10.0, -75.0, 40.0), 0.0, pytest.approx(math.exp(-1))),
+        ((0.5, 10.0, 400.0, 50.0), 0.0, pytest.approx(math.exp(-1))),
+        ((LARGEST, 10.0, 400.0, 40.0), LARGEST, 0.0),
+    ],
+)
+def test_confidence_follows_its_formula(
+    model: ForceModel, place: tuple[float, float, float, float], error_N: float, expected: float
+) -> None:
+    """The model's force span is 5.6 N; its share of iron never varied."""
+    displacement, rate, field, cip = place
+    curve = model.curve(displacement, rate, cip)
+    assert curve.confidence(field, error_N) == expected
+    assert curve.confidence(field, -error_N) == curve.confidence(field, error_N)
+
+
+# -- what a model knows of relaxation ----------------------------------------------------------------------------------
+
+
+def test_the_daemon_remembers_what_the_grey_box_does() -> None:
+    model = load_model(model_path("tactile_mre_c", Path()), element="tactile")
+    grey = GreyBox(model, model.metadata.memory.free, model.metadata.memory.added)
+    element = build_core(Config(scene="radial_pulse", rates=Rates(control_hz=500, inference_hz=83))).element
+    gap_range_mm = element.portrait.gap_mm[-1], element.portrait.gap_mm[0]
+    lab, memory = GreyBoxMemory(grey, 0.01), ElementMemory(element.memory, element.nominal, element.field, gap_range_mm)
+    # after a long rest without load
+    memory.free, memory.added = element.memory.free.relaxed(0.0), element.memory.added.relaxed(0.0)
+    memory.field_mT, memory.time_s = 140.0, 0.0
+    draw = np.random.default_rng(4)
+    for step in range(1, 300):
+        place = min(0.01 * step, 2.0), 0.3, float(draw.uniform(140.0, 360.0))
+        expected_N = lab.advance(*place, 45.0)
+        at_mm, handle = element.field.gap_mm(place[2]) / 2.0, Handle(*place[:2], Turn(1.0, 0.0, 0.0))
+        seen = Measured(step, True, 0.0, at_mm, at_mm, 0.0, 0.0, 0.0, handle, 0.0, 0.0, 0.0)
+        memory.update(0.01 * step, seen)
+        assert memory.force_N(element.nominal.now(seen)) == pytest.approx(expected_N, abs=1e-6)

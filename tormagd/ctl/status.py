@@ -1,12 +1,13 @@
 """`tormagctl status` and `firmware`: the daemon's own snapshot, and its link's report, as they are or as text."""
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 from firmware_protocol.build import COST, REMEDY
 from tormagd.ctl.outcome import Colour, Exit, Outcome
 from tormagd_client.blocking import Client
 from tormagd_client.messages import (
+    BeliefReport,
     ClockReport,
     Explained,
     LinkReport,
@@ -92,15 +93,19 @@ def _device(known: Status, colour: Colour) -> list[str]:
         f"device    {shown.scale:.2f} ± {shown.scale_sd:.2f} times the model {shown.offset_N:+.3f} N, sensor's zero "
         f"{shown.sensor_zero_N:+.3f} ± {shown.sensor_zero_sd_N:.3f} N{age}"
     ]
-    told = [
-        f"{name} {it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'}{it.unit and f' {it.unit}'}"
-        for name, it in known.belief.items()
-        if it.acts and name not in ("scale", "offset", "sensor_zero")
-    ]
-    lines += _said("believed  ", ", ".join(told), str)
+    lines += _said("believed  ", believed(known.belief, ("scale", "offset", "sensor_zero")), str)
     if kept.folder and kept.refusal:  # without a folder nothing was to be kept
         lines += _explained(kept.refusal, "tormagctl calibrate --device, which keeps a new profile", colour.yellow)
     return lines
+
+
+def believed(belief: Mapping[str, BeliefReport], but: Collection[str] = ()) -> str:
+    """What of it acts, without some names, in one line: each value with its deviation and unit."""
+    return ", ".join(
+        f"{name} {it.value:.4g}{'' if it.sd is None else f' ± {it.sd:.2g}'}{it.unit and f' {it.unit}'}"
+        for name, it in belief.items()
+        if it.acts and name not in but
+    )
 
 
 def _core(build: str, colour: Colour) -> list[str]:

@@ -11,6 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from tormagd.ctl.status import believed
 from tormagd_client.messages import Explained, Status, Telemetry
 from tormagd_client.printable import printable
 
@@ -150,6 +151,7 @@ def _timing(status: Status, width: int) -> Table:
     )
     heard = f"from {setpoints.newest_source!r}" if setpoints.accepted else "none yet"
     table.add_row(Text("setpoints", "bold"), f"{heard}, {setpoints.accepted} accepted, {setpoints.refused} refused")
+    table.add_row(Text("believed", "bold"), Text(printable(believed(status.belief)) or "nothing that acts"))
     return table
 
 

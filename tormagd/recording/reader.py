@@ -21,7 +21,7 @@ from tormagd_client.regular_file import require_regular
 
 MAX_FILE_BYTES = 1 << 40
 MAX_RECORD_BYTES = 64_000_000
-MAX_NESTING = 2
+MAX_NESTING = 3
 UNREADABLE = (
     McapError, ZstdError, ValueError, OverflowError, MemoryError, RecursionError, struct.error, msgspec.MsgspecError,
 )  # fmt: skip

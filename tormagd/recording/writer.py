@@ -195,6 +195,8 @@ def _plain(schema: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any
     if schema.get("type") == "array":
         items = schema.get("prefixItems", [schema.get("items")])[0]
         return {"type": "array", "items": _plain(items, definitions)}
+    if "additionalProperties" in schema:  # named by who publishes
+        return {"type": "object", "additionalProperties": _plain(schema["additionalProperties"], definitions)}
     if schema.get("type") == "object":
         properties = {name: _plain(inner, definitions) for name, inner in schema["properties"].items()}
         return {"type": "object", "properties": properties}

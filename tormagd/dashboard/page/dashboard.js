@@ -202,6 +202,9 @@ function live() {
     explained = newest;
     at("scene").textContent = `scene ${status.scene}${status.is_homed ? "" : ", not homed"}`;
     at("source").textContent = `tormagd ${status.version}, device ${status.link.state} on ${status.link.port}`;
+    at("believed").textContent = "Believed of the device: " + (Object.entries(status.belief).filter(([, it]) => it.acts)
+      .map(([name, it]) => `${name} ${it.value.toPrecision(3)}${it.sd === null ? "" : ` ± ${it.sd.toPrecision(2)}`} ${it.unit}`.trim())
+      .join(", ") || "nothing that acts") + ".";
     const {control} = status.rates, late = control?.lateness_us;
     at("rates").textContent = "Of every twentieth tick of 20 s, bars as logarithms. " + (control ? `Of all: ${control.hz.toFixed(0)} Hz, `
       + `p50 ${late.p50.toFixed(0)}, p99 ${late.p99.toFixed(0)}, longest ${late.max.toFixed(0)} µs; ${control.stalls} stalls.` : "");

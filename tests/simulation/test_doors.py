@@ -1,6 +1,8 @@
-"""The simulator's CAN doors: a process of its own, and hosts with python-can's own interfaces."""
+"""The simulator's doors: a process of its own, and hosts as the daemon or python-can's own interfaces open them."""
 
 import contextlib
+import csv
+import itertools
 import select
 import signal
 import socket
@@ -25,12 +27,15 @@ from firmware_protocol.codec import (
     can_identifier,
     encode,
 )
+from tormagd.config import Device, Rates
+from tormagd.hardware.backend import BackendError, choose
+from tormagd.simulation.__main__ import main
 from tormagd.simulation.can_device import CanDevice
 from tormagd.simulation.can_door import MAX_HOSTS, CanDoor
 from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, CanFrame, from_socket, to_socket
 from tormagd.simulation.device import MessageDevice
 from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.parameters import PlantParameters
+from tormagd.simulation.parameters import load_plant
 from tormagd.simulation.slcan_door import LONGEST_COMMAND, SlcanAdapter
 
 LIMIT_S = 20.0
@@ -57,25 +62,30 @@ def start() -> Iterator[Start]:
 
 
 def channel(process: "subprocess.Popen[str]") -> str:
-    assert process.stdout is not None
     return process.stdout.readline().strip()
 
 
-def message_of(message: Message) -> can.Message:
-    identifier = can_identifier(FUNCTION[type(message)])
-    return can.Message(arbitration_id=identifier, data=encode(message), is_extended_id=False)
+def ended(process: "subprocess.Popen[str]") -> None:
+    """Asks it to end, which it does without a word."""
+    process.send_signal(signal.SIGTERM)
+    output, errors = process.communicate(timeout=LIMIT_S)
+    assert (process.returncode, output) == (0, ""), errors
 
 
-def meet(bus: can.BusABC) -> None:
-    """Says Hello until both Identity and Status have come."""
-    seen: set[int] = set()
+def meet(device: Device) -> None:
+    """Opens the line as the daemon does, repeats Hello until both Identity and Status have come, and closes it."""
+    seen: set[type[Message]] = set()
     deadline_s = time.monotonic() + LIMIT_S
-    while not {IDENTITY, STATUS} <= seen:
-        assert time.monotonic() < deadline_s, f"only {seen} in {LIMIT_S} s"
-        bus.send(message_of(HELLO), timeout=1.0)
-        for _ in range(20):  # one Hello and many frames: who sends for each frame it reads never gets to the end
-            if (message := bus.recv(0.1)) is not None:
-                seen.add(message.arbitration_id)
+    with contextlib.closing(choose(device, Rates()).open()) as backend:
+        while not {Identity, Status} <= seen:
+            assert time.monotonic() < deadline_s, f"only {seen} in {LIMIT_S} s"
+            backend.send(HELLO)
+            select.select([backend.fileno()], [], [], 0.1)
+            seen |= {type(message) for message in backend.receive()}
+
+
+def on_a_bus(interface: str, channel: str) -> Device:
+    return Device(backend="can", options={"interface": interface}, port=channel)
 
 
 def test_hosts_come_and_go_on_the_simulators_bus_and_hear_each_other(start: Start, tmp_path: Path) -> None:
@@ -84,16 +94,15 @@ def test_hosts_come_and_go_on_the_simulators_bus_and_hear_each_other(start: Star
     assert Path(path).is_socket()
     assert {"interface": "tormagsim", "channel": path} in can.detect_available_configs(["tormagsim"])
     for _ in range(2):
-        with can.Bus(interface="tormagsim", channel=path, ignore_config=True) as bus:
-            meet(bus)
+        meet(on_a_bus("tormagsim", path))
     with (
         can.Bus(interface="tormagsim", channel=path, ignore_config=True) as one,
         can.Bus(interface="tormagsim", channel=path, ignore_config=True) as other,
     ):
-        meet(one)
-        meet(other)
-        one.send(message_of(Home(9)), timeout=1.0)
+        for host in (one, other):
+            assert host.recv(LIMIT_S) is not None, "a Status, as soon as it is there"
         heard = can_identifier(FUNCTION[Home])
+        one.send(can.Message(arbitration_id=heard, data=encode(Home(9)), is_extended_id=False), timeout=1.0)
         deadline_s = time.monotonic() + LIMIT_S
         while (message := other.recv(LIMIT_S)) is not None and message.arbitration_id != heard:
             assert time.monotonic() < deadline_s
@@ -102,10 +111,7 @@ def test_hosts_come_and_go_on_the_simulators_bus_and_hear_each_other(start: Star
             assert own.arbitration_id != heard, "a sender does not hear itself"
         with pytest.raises(can.CanOperationError, match="11-bit"):
             one.send(can.Message(arbitration_id=1, is_extended_id=True))
-    process.send_signal(signal.SIGTERM)
-    output, errors = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 0, errors
-    assert output == ""
+    ended(process)
     assert not Path(path).exists()
 
 
@@ -122,21 +128,68 @@ def test_what_a_killed_simulator_left_is_replaced_and_what_somebody_serves_is_no
     assert Path(path).is_socket()
     third = start("--can", path)
     assert channel(third) == path
-    with can.Bus(interface="tormagsim", channel=path, ignore_config=True) as bus:
-        meet(bus)
+    meet(on_a_bus("tormagsim", path))
 
 
 @pytest.mark.parametrize("address", ["udp_multicast:239.74.163.88", "socketcan:vcan0"])
 def test_the_device_is_a_node_of_a_bus_that_is_there(start: Start, address: str) -> None:
     interface, _, name = address.partition(":")
-    options = {"hop_limit": 0, "fd": False} if interface == "udp_multicast" else {}
     try:
-        bus = can.Bus(interface=interface, channel=name, ignore_config=True, **options)
-    except (can.CanError, OSError) as error:
+        choose(on_a_bus(interface, name), Rates()).open().close()
+    except BackendError as error:
         pytest.skip(f"no {address} on this machine: {error}")
-    with bus:
-        assert channel(start("--bus", address)) == name
-        meet(bus)
+    assert channel(start("--bus", address)) == name
+    meet(on_a_bus(interface, name))
+
+
+# -- the serial door, and calls of the process -----------------------------------------------------------------------
+
+
+def test_hello_is_answered_across_two_hosts_and_the_truth_is_kept(start: Start, tmp_path: Path) -> None:
+    truth = tmp_path / "truth.csv"
+    process = start("--pty", "--seed", "3", "--truth", str(truth))
+    path = channel(process)
+    assert Path(path).is_char_device()
+    for _ in range(2):
+        meet(Device(port=path))
+    assert process.poll() is None
+    ended(process)
+    with truth.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == [
+        "t_ns", "force_N", "gap_mm", "left_mm", "right_mm", "handle_mm", "handle_mm_s", "temperature_C",
+    ]  # fmt: skip
+    assert len(rows) > 20
+    assert all(int(after["t_ns"]) > int(before["t_ns"]) for before, after in itertools.pairwise(rows))
+    assert abs(int(rows[0]["t_ns"]) - time.time_ns()) < 120e9
+    assert float(rows[-1]["gap_mm"]) == pytest.approx(79.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "--pty"),
+        (("--pty", "--plant", "nowhere.toml"), "sample_1"),
+        (("--pty", "--fault", "gremlins"), "worn_gearbox"),
+        (("--pty", "--hand", "third"), "reversing"),
+        (("--pty", "--baud", "7"), "1200"),
+        (("--pty", "--truth", "/nonexistent/truth.csv"), "/nonexistent"),
+        (("--can", "--bitrate", "7"), "10000"),
+        (("--can", "--node", "16"), "16"),
+        (("--can", "/nonexistent/can"), "/nonexistent"),
+        (("--bus", "telepathy:0"), "telepathy"),
+        (("--can", "--pty"), "not allowed"),
+    ],
+)
+@pytest.mark.usefixtures("usual_slices")
+def test_a_wrong_call_says_what_is_right_and_exits_with_2(
+    arguments: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+    output, errors = capsys.readouterr()
+    assert output == ""
+    assert said in errors
 
 
 # -- the bus's door ------------------------------------------------------------------------------------------------
@@ -145,8 +198,8 @@ def test_the_device_is_a_node_of_a_bus_that_is_there(start: Start, address: str)
 class Served:
     """A door in this process, and the clock it lives by."""
 
-    def __init__(self, plant: PlantParameters, path: Path) -> None:
-        self.device = CanDevice(MessageDevice(plant, SteadyHand(), seed=1))
+    def __init__(self, path: Path) -> None:
+        self.device = CanDevice(MessageDevice(load_plant("sample_1"), SteadyHand(), seed=1))
         self.door = CanDoor(self.device, path)
         self.now_s = 0.0
 
@@ -170,8 +223,8 @@ class Served:
 
 
 @pytest.fixture
-def served(sample_1: PlantParameters, tmp_path: Path) -> Iterator[Served]:
-    made = Served(sample_1, tmp_path / "can")
+def served(tmp_path: Path) -> Iterator[Served]:
+    made = Served(tmp_path / "can")
     with contextlib.closing(made.door):
         yield made
 
@@ -224,6 +277,11 @@ def test_a_host_that_does_not_read_holds_nobody_up(served: Served) -> None:
 # -- the adapter ---------------------------------------------------------------------------------------------------
 
 
+DAMAGED_FRAMES = (
+    *(b"t", b"t80", b"t8000", b"t0219", b"t02170", b"t021700\xff", b"t 2100", b"t0_100", b"t02120102030"),
+)
+
+
 @pytest.mark.parametrize(
     ("said", "answer"),
     [
@@ -239,6 +297,7 @@ def test_a_host_that_does_not_read_holds_nobody_up(served: Served) -> None:
         (b"L\r", b"\a"),
         (b"T000000210\r", b"\a"),
         (b"x" * 10_000 + b"\r", b"\a"),
+        *((b"O\r" + damaged + b"\r", b"\r\a") for damaged in DAMAGED_FRAMES),
     ],
 )
 def test_the_adapter_answers_as_the_manual_says(said: bytes, answer: bytes) -> None:
@@ -254,15 +313,6 @@ def test_frames_come_out_however_they_are_cut(cut: int) -> None:
         frames += adapter.feed(said[start_at : start_at + cut])[1]
     assert frames == [CanFrame(0x021, bytes.fromhex("e204d20401c865")), CanFrame(0x7FF, b"")]
     assert adapter.line(frames[0]) == b"t0217E204D20401C865\r"
-
-
-@pytest.mark.parametrize(
-    "damaged", [b"t", b"t80", b"t8000", b"t0219", b"t02170", b"t021700\xff", b"t 2100", b"t0_100", b"t02120102030"]
-)
-def test_a_damaged_frame_is_refused(damaged: bytes) -> None:
-    adapter = SlcanAdapter()
-    adapter.feed(b"O\r")
-    assert adapter.feed(damaged + b"\r") == (b"\a", [])
 
 
 def test_a_command_without_an_end_takes_no_memory() -> None:

@@ -1,0 +1,707 @@
+"""What each backend is besides the contract: its stream, its port or its bus, and how it is chosen."""
+
+import contextlib
+import errno
+import logging
+import os
+import random
+import select
+import socket
+import struct
+import termios
+import tty
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest.mock import Mock
+
+import can
+import cantools.database.can
+import pytest
+import serial
+from hypothesis import given, strategies as st
+
+import firmware_protocol
+from firmware_protocol.codec import (
+    FUNCTION,
+    DecodeError,
+    DeviceFault,
+    DeviceMode,
+    Drive,
+    DriveMode,
+    EncodeError,
+    Hello,
+    Home,
+    Message,
+    Retract,
+    State,
+    Status,
+    Switches,
+    can_identifier,
+    crc8,
+    decode,
+    encode,
+)
+from firmware_protocol.framing import encode_frame
+from firmware_protocol.layouts import LAYOUTS
+from firmware_protocol.schema import Layout
+from tormagd.config import Device, Rates
+from tormagd.hardware.backend import ENTRY_POINTS, Backend, BackendError, choose, installed
+from tormagd.hardware.can_backend import EXCHANGE_BITS, FRAMES_AT_ONCE, UNSENT_FRAMES, CanBackend, CanOptions
+from tormagd.hardware.can_stream import UNREADABLE, CanStream, SecondHostError
+from tormagd.hardware.frame_stream import FrameStream
+from tormagd.hardware.serial_backend import SerialOptions, open_serial
+from tormagd.hardware.serial_port import SerialPort
+from tormagd.hardware.usb_latency import latency_ms, make_prompt
+from tormagd.simulation.can_frame import ERROR_FLAG, CanFrame, frame_bits, to_socket
+from tormagd_client.endpoints import ConfigError
+
+STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
+
+
+@pytest.mark.parametrize("pack", [FrameStream().pack, CanStream(1).pack])
+def test_a_value_that_does_not_fit_is_refused_before_it_is_sent(pack) -> None:
+    with pytest.raises(EncodeError, match="left_duty"):
+        pack(Drive(float("nan"), 0.0, DriveMode.RUN, 0))
+
+
+# -- serial --------------------------------------------------------------------------------------------------------
+
+drives = st.builds(
+    Drive,
+    left_duty=st.integers(-10_000, 10_000).map(lambda steps: steps * 1e-4),
+    right_duty=st.just(0.5),
+    mode=st.sampled_from(DriveMode),
+    counter=st.integers(0, 255),
+)
+messages = st.lists(
+    st.builds(Home, st.integers(0, 255)) | st.builds(Retract, st.integers(0, 255)) | drives, max_size=20
+)
+
+
+@given(sent=messages, cuts=st.lists(st.integers(1, 9), min_size=1, max_size=50))
+def test_what_is_packed_comes_out_however_it_is_cut(sent: list[Message], cuts: list[int]) -> None:
+    sender, receiver = FrameStream(), FrameStream()
+    line = b"".join(sender.pack(message) for message in sent)
+    received: list[Message] = []
+    for cut in cuts:
+        received += receiver.unpack(line[:cut])
+        line = line[cut:]
+    assert received + receiver.unpack(line) == sent
+    assert (receiver.statistics.frames, receiver.statistics.corrupt, receiver.statistics.lost) == (len(sent), 0, 0)
+
+
+@given(noise=st.binary(max_size=300))
+def test_noise_never_raises_and_does_not_outlive_a_delimiter(noise: bytes) -> None:
+    stream = FrameStream()
+    stream.unpack(noise + b"\x00")
+    assert stream.unpack(FrameStream().pack(Home(3))) == [Home(3)]
+
+
+def test_a_whole_frame_with_an_impossible_message_is_counted() -> None:
+    """The last one's CRC is right, that of the Drive in it is not: the damage happened before the frame was made."""
+    stream = FrameStream()
+    for corrupt, frame in enumerate(
+        ((99, 0, b"\x01"), (6, 1, b"\x01\x02"), (2, 2, b"\x00\x00\x00\x00\x01\x05\x00")), 1
+    ):
+        assert stream.unpack(encode_frame(*frame)) == []
+        assert stream.statistics.corrupt == corrupt
+    assert stream.unpack(encode_frame(6, 3, b"\x05")) == [Home(5)]
+
+
+# -- CAN -----------------------------------------------------------------------------------------------------------
+
+
+def state(counter: int) -> State:
+    return State(-12.0, -12.1, 0.25, counter)
+
+
+def frame_of(message: Message, node: int = 1) -> tuple[int, bytes]:
+    return CanStream(node).pack(message)
+
+
+def test_the_frame_of_the_firmware_page() -> None:
+    assert frame_of(Drive(0.125, 0.1234, DriveMode.RUN, 200)) == (0x021, bytes.fromhex("e204d20401c865"))
+    assert frame_of(Home(3), node=15) == (0x06F, b"\x03")
+
+
+@pytest.mark.parametrize("node", [-1, 16])
+def test_a_node_that_is_none_is_refused(node: int) -> None:
+    with pytest.raises(EncodeError, match="nodes 0 to 15"):
+        CanStream(node)
+
+
+def test_what_the_device_says_comes_through_and_other_nodes_and_hosts_commands_are_not_ours() -> None:
+    stream = CanStream(1)
+    for other in (frame_of(STATUS, node=2), frame_of(Hello(1, 1, 1)), frame_of(Home(1))):
+        assert stream.unpack(*other) is None
+    assert (stream.statistics.frames, stream.statistics.bytes) == (0, 7)
+    assert stream.unpack(*frame_of(STATUS)) == STATUS
+    assert stream.unpack(*frame_of(state(7))) == decode(FUNCTION[State], encode(state(7)))
+    assert (stream.statistics.frames, stream.statistics.bytes, stream.statistics.corrupt) == (2, 23, 0)
+
+
+def test_a_drive_that_is_not_ours_is_another_host() -> None:
+    stream = CanStream(1)
+    own = stream.pack(Drive(0.5, 0.5, DriveMode.RUN, 9))
+    assert stream.unpack(*own) is None, "its echo"
+    with pytest.raises(SecondHostError):
+        stream.unpack(*frame_of(Drive(0.5, 0.5, DriveMode.RUN, 10)))
+
+
+def test_what_is_damaged_is_counted_and_the_next_good_one_found_again() -> None:
+    stream = CanStream(1)
+    identifier, data = frame_of(state(7))
+    for damaged in (data[:-1], data[:-1] + bytes((data[-1] ^ 1,)), b""):
+        assert stream.unpack(identifier, damaged) is None
+    assert stream.unpack(0x7F1, b"") is None
+    assert (stream.statistics.corrupt, stream.statistics.resynchronisations) == (4, 0)
+    assert stream.unpack(identifier, data) is not None
+    assert stream.unpack(*frame_of(STATUS)) == STATUS
+    assert (stream.statistics.corrupt, stream.statistics.resynchronisations) == (4, 1)
+
+
+@pytest.mark.parametrize(
+    ("counters", "lost"),
+    [
+        ([254, 255, 0, 1], 0),
+        ([3, 4, 7], 2),
+        ([250, 3], 8),
+        ([5, 5, 5, 6], 0),
+        ([5, 7, 6, 8], 0),
+        ([200, 0, 1], 55),
+    ],
+    ids=["over the end", "a gap", "a gap over the end", "a stuck sender", "overtaken", "a device that began anew"],
+)
+def test_the_states_own_counter_shows_what_is_missing(counters: list[int], lost: int) -> None:
+    stream = CanStream(1)
+    for counter in counters:
+        assert stream.unpack(*frame_of(state(counter))) is not None
+    assert (stream.statistics.lost, stream.statistics.repeated) == (lost, 0), "no news is for the link to count"
+
+
+@given(frames=st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=50))
+def test_no_frame_raises_or_is_more_than_it_is(frames: list[tuple[int, bytes]]) -> None:
+    stream = CanStream(1)
+    functions = set(FUNCTION.values())
+    for identifier, data in frames:
+        try:
+            message = stream.unpack(identifier, data)
+        except SecondHostError:
+            assert identifier == 0x021
+            continue
+        if message is not None:
+            assert identifier & 0xF == 1
+            assert identifier >> 4 in functions
+            assert len(encode(message)) == len(data)
+    assert stream.statistics.frames + stream.statistics.corrupt <= len(frames)
+
+
+def test_what_was_taken_apart_gives_the_same_to_another_stream() -> None:
+    stream, other = CanStream(1), CanStream(1)
+    frames = [
+        frame_of(state(7)),
+        frame_of(state(8), node=2),
+        (frame_of(state(8))[0], b"?"),
+        UNREADABLE,
+        frame_of(STATUS),
+    ]
+    messages = stream.unpack_all(frames)
+    assert [type(message) for message in messages] == [State, Status]
+    assert stream.received == [frames[0], *frames[2:]]
+    assert (other.unpack_all(stream.received), other.statistics) == (messages, stream.statistics)
+    assert stream.statistics.corrupt == 2
+    assert stream.pack(Home(3)) == stream.sent
+
+
+# -- what an exchange takes of a bus, by the DBC: the bound over every payload, and that real frames come near it -----
+
+DBC = Path(firmware_protocol.__file__).parent / "tormag.dbc"
+STUFFABLE_BITS, FIXED_BITS = 34, 13
+"Start, identifier, control and CRC of a classical base frame; delimiters, acknowledge, end and gap to the next."
+
+
+def most_bits(length: int) -> int:
+    """Of a frame with as many stuff bits as its data can need (Davis et al., Real-Time Systems 35, 2007)."""
+    stuffable = STUFFABLE_BITS + 8 * length
+    return stuffable + (stuffable - 1) // 4 + FIXED_BITS
+
+
+def fullest_bits(layout: Layout, node: int) -> int:
+    """Bits of the longest frame with a payload of this layout that ascent, byte by byte, comes to."""
+    length = struct.calcsize(layout.format) - layout.protected
+
+    def bits(body: bytes) -> int:
+        data = body + bytes([crc8(bytes([layout.function]) + body)]) if layout.protected else body
+        try:
+            decode(layout.function, data)
+        except DecodeError:
+            return 0
+        return frame_bits(CanFrame(can_identifier(layout.function, node), data))
+
+    ends = []
+    for phase in range(8):
+        body = bytes([0x0F0F >> phase & 0xFF] * length)  # behind a stuff bit, four equal bits need the next
+        for at in (*range(length), *range(length)):
+            body = max((body[:at] + bytes([byte]) + body[at + 1 :] for byte in range(256)), key=bits)
+        ends.append(bits(body))
+    return max(ends)
+
+
+def test_the_configuration_knows_what_an_exchange_takes_of_a_bus() -> None:
+    database = cantools.database.can.Database()
+    database.add_dbc_file(DBC)
+    each_tick = {message.name for message in database.messages if message.cycle_time == 1}
+    layouts = [layout for layout in LAYOUTS if layout.message.__name__ in each_tick]
+    assert len(layouts) == len(each_tick) == 3
+    most = [most_bits(struct.calcsize(layout.format)) for layout in layouts]
+    assert sum(most) == EXCHANGE_BITS
+    assert EXCHANGE_BITS == 395, "as firmware_protocol/README.md says"
+    fullest = [fullest_bits(layout, node=0) for layout in layouts]
+    assert sum(fullest) > 0.95 * EXCHANGE_BITS
+    assert all(bits <= bound for bits, bound in zip(fullest, most, strict=True))
+    noise = random.Random(2)
+    for _ in range(2_000):
+        for layout in layouts:
+            length = struct.calcsize(layout.format)
+            frame = CanFrame(can_identifier(layout.function, 1), noise.randbytes(length))
+            assert frame_bits(frame) <= most_bits(length)
+
+
+# -- ports and buses ---------------------------------------------------------------------------------------------------
+
+
+BUS_OFF = CanFrame(ERROR_FLAG | 0x40, bytes(8))
+PASSIVE = CanFrame(ERROR_FLAG | 0x04, bytes((0, 0x30, 0, 0, 0, 0, 0, 0)))
+
+
+def bus_frame(message: Message) -> CanFrame:
+    return CanFrame(*frame_of(message))
+
+
+def opened(device: Device) -> CanBackend:
+    """The backend that the configuration asks for."""
+    backend = choose(device, Rates()).open()
+    assert isinstance(backend, CanBackend)
+    return backend
+
+
+STATUS_FRAME = bus_frame(STATUS)
+
+
+def wait_readable(backend: Backend) -> None:
+    assert select.select([backend.fileno()], [], [], 5.0)[0]
+
+
+def next_of(backend: CanBackend) -> list[Message]:
+    """What comes next, together."""
+    while not (received := backend.receive()):
+        wait_readable(backend)
+    return received
+
+
+# -- on a serial line -------------------------------------------------------------------------------------------------
+
+
+class Line(NamedTuple):
+    """A pseudo-terminal whose far end the test holds."""
+
+    far: int
+    near: int
+    device: Device
+
+    @property
+    def adapter(self) -> Device:
+        """What is there where it is a slcan adapter's."""
+        return Device(backend="can", options={"interface": "slcan"}, port=self.device.port)
+
+
+@pytest.fixture
+def line() -> Iterator[Line]:
+    far, near = os.openpty()
+    tty.setraw(near)
+    yield Line(far, near, Device(port=os.ttyname(near)))
+    os.close(far)
+    os.close(near)
+
+
+@pytest.fixture
+def port(line: Line) -> Iterator[SerialPort]:
+    opened = open_serial(line.device, SerialOptions())
+    yield opened
+    opened.close()
+
+
+def test_bytes_from_before_the_opening_are_not_read(line: Line) -> None:
+    os.write(line.far, b"half a frame of an earlier life")
+    port = open_serial(line.device, SerialOptions())
+    os.write(line.far, FrameStream().pack(STATUS))
+    wait_readable(port)
+    assert port.receive() == [STATUS]
+    assert port.statistics.corrupt == 0
+    port.close()
+
+
+def test_end_of_file_is_a_device_that_was_unplugged(port: SerialPort, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A real USB port reads nothing, for ever, once its device is gone."""
+    monkeypatch.setattr(os, "read", lambda descriptor, count: b"")
+    with pytest.raises(BackendError, match="unplugged"):
+        port.receive()
+
+
+def test_what_the_driver_did_not_take_is_sent_before_the_next_frame(
+    line: Line, port: SerialPort, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken = b""
+    room = iter([3, 0, 7, 0, 0, 100, 100])
+
+    def write(descriptor: int, data: bytes) -> int:
+        nonlocal taken
+        assert descriptor == port.fileno()
+        count = next(room)
+        if not count:
+            raise BlockingIOError
+        taken += data[:count]
+        return len(data[:count])
+
+    monkeypatch.setattr(os, "write", write)
+    for nonce in range(1, 8):
+        port.send(Home(nonce))
+    far = FrameStream()
+    assert far.unpack(taken) == [Home(nonce) for nonce in range(1, 8)]
+    assert far.statistics.lost == 0
+
+
+def test_a_port_that_goes_while_it_is_set_up_is_not_opened(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(descriptor: int) -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(termios, "tcgetattr", gone)
+    with pytest.raises(BackendError, match="Input/output error"):
+        open_serial(line.device, SerialOptions())
+
+
+# -- on the simulator's bus ----------------------------------------------------------------------------------------
+
+
+class Bus:
+    """A served bus whose far end the test holds."""
+
+    def __init__(self, folder: Path) -> None:
+        self.device = Device(backend="can", options={"interface": "tormagsim"}, port=str(folder / "can"))
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._listener.bind(self.device.port)
+        self._listener.listen()
+        self.backend = opened(self.device)
+        self.far, _ = self._listener.accept()
+
+    def put(self, *frames: CanFrame) -> None:
+        """Frames that the backend finds on the bus."""
+        for frame in frames:
+            self.far.send(to_socket(frame))
+
+    def close(self) -> None:
+        """Takes everything away."""
+        self.backend.close()
+        self.far.close()
+        self._listener.close()
+
+
+@pytest.fixture
+def bus(tmp_path: Path) -> Iterator[Bus]:
+    with contextlib.closing(Bus(tmp_path)) as made:
+        yield made
+
+
+@pytest.mark.parametrize(
+    ("frames", "said", "remedy"),
+    [
+        ((STATUS_FRAME, BUS_OFF), "bus-off", "termination"),
+        ((bus_frame(Drive(0.1, 0.1, DriveMode.RUN, 1)),), "another host drives node 1", "device.options.node"),
+    ],
+)
+def test_what_ends_a_connection_on_a_bus_is_said_with_a_remedy(
+    bus: Bus, frames: tuple[CanFrame, ...], said: str, remedy: str
+) -> None:
+    bus.put(*frames)
+    with pytest.raises(BackendError, match=said) as caught:
+        bus.backend.receive()
+    assert bus.device.port in str(caught.value)
+    assert remedy in caught.value.remedy
+
+
+def test_an_error_frame_that_is_not_bus_off_is_counted(bus: Bus) -> None:
+    bus.put(PASSIVE, STATUS_FRAME)
+    assert bus.backend.receive() == [STATUS]
+    assert (bus.backend.statistics.corrupt, bus.backend.statistics.resynchronisations) == (1, 1)
+
+
+def test_no_more_frames_are_taken_at_once_than_the_loop_can_bear(bus: Bus) -> None:
+    bus.far.setblocking(False)
+    queued = 0
+    with contextlib.suppress(BlockingIOError):
+        for queued in range(2 * FRAMES_AT_ONCE):  # noqa: B007 - counts what the kernel takes
+            bus.put(STATUS_FRAME)
+    assert len(bus.backend.receive()) == min(queued, FRAMES_AT_ONCE)
+
+
+@pytest.mark.parametrize(
+    ("number", "said", "first"),
+    [(errno.ENODEV, "no such interface", "plug"), (errno.EAFNOSUPPORT, "knows no CAN", "sudo modprobe")],
+)
+def test_an_interface_that_is_not_there_says_how_it_comes(
+    monkeypatch: pytest.MonkeyPatch, number: int, said: str, first: str
+) -> None:
+    def absent(**_options: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(can, "Bus", absent)
+    with pytest.raises(BackendError, match=f"socketcan can7: cannot be opened: .*{said}") as caught:
+        opened(Device(backend="can", options={"interface": "socketcan"}, port="can7"))
+    assert caught.value.remedy.startswith(first)
+    assert "ip link set can7 up type can bitrate 1000000" in caught.value.remedy
+
+
+# -- behind an adapter on a serial line ----------------------------------------------------------------------------
+
+
+def test_lines_of_an_adapter_pass_both_ways(line: Line) -> None:
+    backend = opened(line.adapter)
+    backend.send(Home(7))
+    said = b""
+    while not said.endswith(b"t061107\r"):
+        said += os.read(line.far, 100)
+    assert said.startswith(b"C\rS8\r")
+    status = STATUS_FRAME
+    os.write(line.far, b"\rz\r\at%03X8%s\r" % (status.identifier, status.data.hex().encode()))
+    assert next_of(backend) == [STATUS]
+    backend.close()
+
+
+@pytest.mark.parametrize("damaged", [b"t07x8\r", b"t0718zz\r", b"t071\r", b"\xff\xfe071\r", b"t0719\r", b"tttt\r"])
+def test_a_damaged_line_is_counted_and_the_next_is_read(line: Line, damaged: bytes) -> None:
+    backend = opened(line.adapter)
+    os.write(line.far, damaged)
+    while not backend.statistics.corrupt:
+        wait_readable(backend)
+        assert backend.receive() == []
+    os.write(line.far, b"t0718%s\r" % STATUS_FRAME.data.hex().encode())
+    assert next_of(backend) == [STATUS]
+    assert backend.statistics.resynchronisations == 1
+    backend.close()
+
+
+# -- a bus that fails as told --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def failing() -> Iterator[Callable[..., CanBackend]]:
+    """Makes a backend of a bus that hands out what it is given, and raises what it is given."""
+    reads, writes = os.pipe()
+
+    def make(*events: can.Message | Exception) -> CanBackend:
+        bus = Mock(spec=can.BusABC)
+        bus.fileno.return_value = writes  # always writable, never readable
+        bus.recv.side_effect = [*events, None, None]
+        bus.send.side_effect = events[0]
+        return CanBackend("can0", CanOptions(interface="socketcan"), bus)
+
+    yield make
+    os.close(reads)
+    os.close(writes)
+
+
+def behind_python_cans(number: int) -> can.CanOperationError:
+    """The system's error as python-can wraps it where it has no place for the number."""
+    error = can.CanOperationError("Could not read from serial device")
+    error.__cause__ = OSError(number, "Input/output error")
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "said", "remedy"),
+    [
+        (can.CanOperationError("Failed to transmit", errno.ENETDOWN), "is down", "ip link set can0 up"),
+        (behind_python_cans(errno.EIO), os.strerror(errno.EIO), ""),
+        (can.CanOperationError("fell off the table"), "fell off the table", ""),
+    ],
+)
+def test_why_a_bus_fails_and_what_helps_is_said(
+    failing: Callable[..., CanBackend], error: Exception, said: str, remedy: str
+) -> None:
+    backend = failing(error)
+    for use in (backend.receive, lambda: backend.send(Home(1))):
+        with pytest.raises(BackendError, match=said) as caught:
+            use()
+        assert remedy in caught.value.remedy
+
+
+def test_a_full_queue_is_borne_for_as_long_as_the_device_would(failing: Callable[..., CanBackend]) -> None:
+    backend = failing(can.CanOperationError("Failed to transmit", errno.ENOBUFS))
+    for _ in range(UNSENT_FRAMES):
+        backend.send(Home(1))
+    with pytest.raises(BackendError, match="takes no frames"):
+        backend.send(Home(1))
+
+
+@pytest.mark.parametrize("flag", ["is_extended_id", "is_remote_frame", "is_fd"])
+def test_other_kinds_of_frames_are_other_peoples(failing: Callable[..., CanBackend], flag: str) -> None:
+    status = STATUS_FRAME
+    flags = {"is_extended_id": False} | {flag: True}
+    data = b"" if flag == "is_remote_frame" else status.data
+    other = can.Message(arbitration_id=status.identifier, data=data, **flags)
+    plain = can.Message(arbitration_id=status.identifier, data=status.data, is_extended_id=False)
+    backend = failing(other, plain)
+    assert backend.receive() + backend.receive() == [STATUS]
+    assert backend.statistics.corrupt == 0
+
+
+# -- finding one ---------------------------------------------------------------------------------------------------
+
+
+FINE = "tormagd.hardware.serial_backend:DRIVER"
+
+
+def install(monkeypatch: pytest.MonkeyPatch, **entries: str) -> None:
+    """Pretends that these plugins are installed."""
+    points = [metadata.EntryPoint(name, value, ENTRY_POINTS) for name, value in entries.items()]
+    monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == ENTRY_POINTS else [])
+
+
+SLOW = {"interface": "socketcan", "bitrate": 500_000}
+
+
+@pytest.mark.parametrize(
+    ("device", "rates", "options"),
+    [
+        (Device(options={"baud": 115_200}), Rates(), SerialOptions(baud=115_200)),
+        (Device(backend="can", options={"interface": "tormagsim"}), Rates(), CanOptions(interface="tormagsim")),
+        (Device(backend="can", options=SLOW, port="can0"), Rates(control_hz=850), CanOptions(**SLOW)),
+    ],
+)
+def test_the_chosen_backend_has_its_options(device: Device, rates: Rates, options: SerialOptions | CanOptions) -> None:
+    assert choose(device, rates).options == options
+
+
+def test_an_unknown_backend_names_the_installed_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, zeta=FINE, alpha=FINE)
+    with pytest.raises(ConfigError, match=r"device\.backend = 'telepathy': installed are alpha, zeta"):
+        choose(Device(backend="telepathy"), Rates())
+    install(monkeypatch)
+    with pytest.raises(ConfigError, match="installed are none"):
+        choose(Device(backend="telepathy"), Rates())
+
+
+def test_a_broken_plugin_is_named_and_stops_nobody_else(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    (tmp_path / "half_a_plugin.py").write_text("def open(device:\n")
+    (tmp_path / "angry_plugin.py").write_text("raise RuntimeError('not on a Friday')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    broken = {
+        "function": ("os:getpid", "allowed is a tormagd.hardware.backend.Driver"),
+        "absent": ("no_such_module_anywhere:open", "ModuleNotFoundError"),
+        "nameless": ("os:no_such_attribute", "AttributeError"),
+        "half": ("half_a_plugin:open", "SyntaxError"),
+        "angry": ("angry_plugin:open", "not on a Friday"),
+    }
+    install(monkeypatch, fine=FINE, **{name: value for name, (value, _) in broken.items()})
+    found = installed()
+    assert (list(found), found["fine"]) == (sorted([*broken, "fine"]), "")
+    assert [record.levelname for record in caplog.records] == ["WARNING"] * len(broken)
+    for name, (_, said) in broken.items():
+        assert said in found[name]
+        with pytest.raises(ConfigError, match=rf"device\.backend = '{name}': the plugin does not load"):
+            choose(Device(backend=name), Rates())
+    assert choose(Device(backend="fine"), Rates()).options == SerialOptions()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({}, r"missing required field `interface` - at `\$\.device\.options`"),
+        ({"interface": "socketcan", "node": 16}, r"<= 15 - at `\$\.device\.options\.node` \(it is 16\)"),
+        ({"interface": "socketcan", "bitrate": 2_000_000}, r"<= 1000000 - at `\$\.device\.options\.bitrate` .*2000000"),
+        ({"interface": "socketcan", "nod": 1}, r"unknown field `nod` - at `\$\.device\.options`"),
+        ({"interface": "telepathy"}, r"device\.options\.interface = 'telepathy': .*installed are .*socketcan"),
+        ({"interface": "virtual"}, r"device\.options\.interface = 'virtual': .*no descriptor to wait for"),
+        ({"interface": "nican"}, r"device\.options\.interface = 'nican': .*no descriptor to wait for"),
+        ({"interface": "broken"}, r"device\.options\.interface = 'broken': its driver does not load"),
+        (
+            SLOW,
+            r"device\.options\.bitrate = 500000: allowed is from 564286 on at rates\.control_hz = 1000",
+        ),
+    ],
+)
+def test_options_that_cannot_work_are_refused_before_anything_is_opened(
+    monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], said: str
+) -> None:
+    monkeypatch.setitem(can.interfaces.BACKENDS, "broken", ("no_such_module_anywhere", "Bus"))
+    with pytest.raises(ConfigError, match=said):
+        choose(Device(backend="can", options=options, port="can0"), Rates())
+
+
+# -- the latency timer of USB serial chips, on a directory that stands for sysfs ---------------------------------------
+
+
+USB = "/dev/ttyUSB7"
+
+
+def timer_of(port: str, sysfs: Path, text: str = "16\n") -> Path:
+    """The driver's latency timer of a port."""
+    timer = sysfs / Path(port).name / "latency_timer"
+    timer.parent.mkdir()
+    timer.write_text(text)
+    return timer
+
+
+def test_the_timer_is_read_through_the_stable_name_too(tmp_path: Path) -> None:
+    timer_of(USB, tmp_path)
+    link = tmp_path / "tormag"
+    link.symlink_to(USB)
+    assert latency_ms(USB, tmp_path) == latency_ms(str(link), tmp_path) == 16
+    assert latency_ms("/dev/ttyACM0", tmp_path) is None
+
+
+@pytest.mark.parametrize("text", ["", "soon", "1.5"])
+def test_a_timer_that_is_no_number_is_no_timer(tmp_path: Path, text: str) -> None:
+    timer_of(USB, tmp_path, text)
+    assert latency_ms(USB, tmp_path) is None
+
+
+def test_a_driver_that_can_is_made_prompt_without_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    timer, port = timer_of(USB, tmp_path), Mock(port=USB)
+    port.set_low_latency_mode.side_effect = lambda is_low: timer.write_text("1")
+    make_prompt(port, tmp_path)
+    assert latency_ms(USB, tmp_path) == 1
+    make_prompt(port, tmp_path)
+    port.set_low_latency_mode.assert_called_once_with(True)  # what is prompt already is left alone
+    assert caplog.records == []
+
+
+@pytest.mark.parametrize("effect", [ValueError("Failed to update ASYNC_LOW_LATENCY flag"), None], ids=["no", "ignored"])
+def test_one_that_will_not_is_a_plain_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, effect: Exception | None
+) -> None:
+    timer_of(USB, tmp_path)
+    make_prompt(Mock(**{"port": USB, "set_low_latency_mode.side_effect": effect}), tmp_path)
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert all(word in record.message for word in (USB, "16 ms", "tormagctl doctor"))
+
+
+def test_a_port_without_a_timer_is_not_asked(line: Line, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with serial.Serial(line.device.port) as port:
+        make_prompt(port, tmp_path)
+    assert caplog.records == []
+
+
+def test_a_pty_that_is_said_to_have_a_timer_refuses(
+    line: Line, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The driver's real refusal, as pyserial hands it on."""
+    timer_of(line.device.port, tmp_path)
+    with serial.Serial(line.device.port) as port:
+        make_prompt(port, tmp_path)
+    assert "Failed to update" in caplog.text
