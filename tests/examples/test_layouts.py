@@ -19,7 +19,7 @@ PAIRS = ("duty", "measured_jp")
 
 def fields(schema: dict[str, Any], prefix: str, join: str) -> Iterator[tuple[str, str]]:
     """Everything in a message and its type: `prefix`, `join` and the name, and of a list each item's number."""
-    for name, inner in schema["properties"].items():
+    for name, inner in schema.get("properties", {}).items():  # what a map holds is named by who publishes
         path = f"{prefix}{join}{name}"
         if inner["type"] == "object":
             yield from fields(inner, path, join)

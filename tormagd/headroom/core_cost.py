@@ -14,12 +14,10 @@ from functools import partial
 from typing import NamedTuple
 
 from tormagd.assembly.build import Core
-from tormagd.assembly.journal import KNOWN
 from tormagd.closed_loop import ClosedLoop
 from tormagd.config import Config
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.heartbeat import Heartbeat
-from tormagd.exact import plain, restore
 from tormagd.headroom.bare_timer import NS, beat
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import SteadyHand
@@ -42,12 +40,10 @@ class CoreCost(NamedTuple):
 def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[Call]]:
     """Each step and each plan of an armed device that renders a pulse, to be called again in turn."""
     period_s = 1.0 / config.rates.control_hz
-    loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
-    loop.arm()
-    # stages change in place, so what is called again are others, which begin where these do
-    stepper, planner = core.stepper(), core.planner()
-    restore(stepper, plain(loop.stepper), KNOWN)
-    restore(planner, plain(loop.planner), KNOWN)
+    # stages change in place, so what is called again are those of another loop that has come as far
+    loop, again = _armed(config, core), _armed(config, core)
+    stepper, planner = again.stepper, again.planner
+    assert planner is not None, "this loop plans"
     force = core.scene.force
     middle_N = 0.5 * (force.least_N + force.most_N)
     steps: list[Call] = []
@@ -57,9 +53,15 @@ def calls(config: Config, core: Core, seconds: float) -> tuple[list[Call], list[
         force_N = middle_N * (1.0 + SWING_SHARE * math.sin(math.tau * PULSE_HZ * now_s))
         setpoint = TimedSetpoint(force_N, now_s, 0.1)  # a new one for every tick, so that every tick plans
         sample = loop.tick(setpoint)
-        steps.append(partial(stepper.step, now_s, sample.measurement, sample.plan))
-        plans.append(partial(planner.plan, now_s, setpoint, sample.measured))
+        steps.append(partial(stepper.step, sample.time_s, sample.measurement, sample.plan))
+        plans.append(partial(planner.plan, sample.time_s, setpoint, sample.measured))
     return steps, plans
+
+
+def _armed(config: Config, core: Core) -> ClosedLoop:
+    loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(load_plant(PLANT), SteadyHand(), seed=1))
+    loop.arm()
+    return loop
 
 
 async def core_cost(steps: Sequence[Call], plans: Sequence[Call], rate_hz: int) -> CoreCost:
