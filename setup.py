@@ -43,7 +43,7 @@ COMPILED = {
         *("hand", "plant", "motion", "firmware", "device"),
     ),
     "tormagd/daemon": ("sequence", "source_clock", "rate_group", "telemetry"),
-    "tormagd/lab": ("ideal",),
+    "tormagd/lab": ("ideal_actuator",),
     "tormagd": ("closed_loop",),
 }
 SOURCES = [f"{folder}/{name}.py" for folder, names in COMPILED.items() for name in names]

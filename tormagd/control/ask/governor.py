@@ -17,6 +17,7 @@ from tormagd.control.ask.path import PATH_S, TIMES_S, Path
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.filter import low_pass
 from tormagd.control.records import Ask, TimedSetpoint
+from tormagd.model.force_curve import within
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 
@@ -103,8 +104,8 @@ class Governor:
         bounds = min(max(self._min_N, lowest_N), highest_N), min(max(self._max_N, lowest_N), highest_N)
         governed_N, foresight = force_N, 1.0
         if setpoint.preview_N and self._has_preview:
-            path_N = self._previewed(setpoint, max(age_s, 0.0), dt_s, force_N, bounds, device, lag_s)
-            governed_N = min(max(self.expected_N, bounds[0]), bounds[1]) if self.expected_N is not None else force_N
+            path_N, expected_N = self._previewed(setpoint, max(age_s, 0.0), dt_s, force_N, bounds, device, lag_s)
+            governed_N = within(expected_N, bounds)
         else:
             foresight = self._foreseen(setpoint.stamp_s, allowed_N, age_s)
             path_N = self._continued(max(age_s, 0.0), dt_s, force_N, foresight, bounds, device, lag_s)
@@ -152,8 +153,9 @@ class Governor:
         bounds: Bounds,
         device: DeviceFit,
         lag_s: float,
-    ) -> list[float]:
-        """The forces at PATH_S on the best path for a preview, from `soon_s` after its stamp on."""
+    ) -> tuple[list[float], float]:
+        """The forces at PATH_S on the best path for a preview, from `soon_s` after its stamp on; and the one by now,
+        behind the carriages' lag."""
         if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
             # what comes after its end is foreseen from there
             self.slope_N_s = setpoint.preview_slope_N_s
@@ -169,7 +171,7 @@ class Governor:
         if dt_s > 0.0:
             expected_N += dt_s / (lag_s + dt_s) * (path_N[0] - expected_N)
         self.expected_N = expected_N
-        return [min(max(each_N, bounds[0]), bounds[1]) for each_N in path_N]
+        return [within(each_N, bounds) for each_N in path_N], expected_N
 
     def _continued(
         self,
@@ -189,13 +191,13 @@ class Governor:
         if foresight > 0.0:
             for place, forecast_N in enumerate(self.forecast.forces_N(begins_s, times_s)):
                 path_N[place] += foresight * (forecast_N - path_N[place])
-        path_N = [min(max(each_N, bounds[0]), bounds[1]) for each_N in path_N]
+        path_N = [within(each_N, bounds) for each_N in path_N]
         from_N, sent_N = self._left_from(force_N)
         self.sent_N, self.expected_N = None, None
         if foresight > 0.0 and not self.is_passing and self._path.is_near(sent_N, path_N[-1], device):
             pursued_N, self.sent_N = self._path.pursue(from_N, sent_N, dt_s, path_N, device, lag_s)
             for place, each_N in enumerate(pursued_N):
-                path_N[place] += foresight * (min(max(each_N, bounds[0]), bounds[1]) - path_N[place])
+                path_N[place] += foresight * (within(each_N, bounds) - path_N[place])
         return path_N[: len(PATH_S)]
 
     def _left_from(self, force_N: float) -> tuple[float, float]:
@@ -257,5 +259,5 @@ def _wanted_N(setpoint: TimedSetpoint, begins_s: float, bounds: Bounds, forecast
             place = min(int(at_s / spacing_s), last - 1)
             before_N = forces_N[place - 1] if place else setpoint.force_N
             force_N = (forces_N[place] - before_N) / spacing_s * (at_s - spacing_s * place) + before_N
-        wanted_N.append(min(max(force_N, bounds[0]), bounds[1]))
+        wanted_N.append(within(force_N, bounds))
     return wanted_N

@@ -13,14 +13,12 @@ from tormagd.config import Config
 from tormagd.control.move.actuator import Actuator, Drive
 from tormagd.control.move.motor import electrical_time_s, full_speed_mm_s, mechanical_time_s, pull_V
 from tormagd.control.move.pid import Pid
-from tormagd.control.move.reference import Expected, Reference, Speeds, follow
+from tormagd.control.move.reference import Expected, Reference, Speeds, follow, target_of
 from tormagd.control.records import Measured, Plan
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Scene, terms_of
 
-CARRY_S: Final = 0.012
-"A plan's gap is carried forward along its speed by no more than three inference periods."
 WEAK_MM: Final = 1.0
 "Carriages further behind than this have reached the top speed of motors that are weaker than they are believed to be."
 EXCHANGE_S: Final = 0.0015
@@ -136,7 +134,7 @@ class Carriages(Actuator):
         floor_mm, target = self._closed_mm, Reference(reference.gap_mm)
         if plan is not None:
             floor_mm = max(floor_mm, plan.min_gap_mm)
-            target = self._target(plan, now_s, floor_mm)
+            target = target_of(plan, now_s, self._lag_s, floor_mm, self._open_mm)
             if is_over:
                 target = Reference(self._open_mm)
                 limits.append(Limit.OVER_FORCE)
@@ -148,19 +146,6 @@ class Carriages(Actuator):
         self.acted.rate += is_limited
         self.acted.slew += is_slewed
         return is_slewed
-
-    def _target(self, plan: Plan, now_s: float, floor_mm: float) -> Reference:
-        """Where the plan leads by when a duty of now shows. The least gap, `floor_mm`, or the greatest, where it acts,
-        also ends the motion towards it."""
-        age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + self._lag_s
-        gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
-        speed_mm_s = plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2
-        acceleration_mm_s2 = plan.gap_acceleration_mm_s2
-        if gap_mm < floor_mm:
-            gap_mm, speed_mm_s, acceleration_mm_s2 = floor_mm, max(speed_mm_s, 0.0), max(acceleration_mm_s2, 0.0)
-        if gap_mm > self._open_mm:
-            gap_mm, speed_mm_s, acceleration_mm_s2 = self._open_mm, min(speed_mm_s, 0.0), min(acceleration_mm_s2, 0.0)
-        return Reference(gap_mm, speed_mm_s, acceleration_mm_s2)
 
     def _speeds(self, pull: float, measured: Measured) -> Speeds:
         """The motors' and the configured one, or what the carriages show where they fall behind; not below half, so

@@ -5,7 +5,10 @@ from typing import Final, final
 
 from firmware_protocol.value import Value
 from tormagd.control.filter import low_pass
+from tormagd.control.records import Plan
 
+CARRY_S: Final = 0.012
+"A plan's gap is carried forward along its speed by no more than three inference periods."
 APPROACH_S: Final = 0.01
 "Time constant of the last stretch: below it the reference would chase every quantum of its target."
 MIN_BRAKING: Final = 0.2
@@ -30,6 +33,20 @@ class Speeds(Value):
         self.no_load_mm_s: Final = no_load_mm_s
         self.opening_mm_s: Final = opening_mm_s
         self.closing_mm_s: Final = closing_mm_s
+
+
+def target_of(plan: Plan, now_s: float, lag_s: float, floor_mm: float, open_mm: float) -> Reference:
+    """Where the plan leads `lag_s` from now, when what is done now shows. The least gap, `floor_mm`, or the greatest,
+    `open_mm`, where it acts, also ends the motion towards it."""
+    age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S) + lag_s
+    gap_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
+    speed_mm_s = plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2
+    acceleration_mm_s2 = plan.gap_acceleration_mm_s2
+    if gap_mm < floor_mm:
+        gap_mm, speed_mm_s, acceleration_mm_s2 = floor_mm, max(speed_mm_s, 0.0), max(acceleration_mm_s2, 0.0)
+    if gap_mm > open_mm:
+        gap_mm, speed_mm_s, acceleration_mm_s2 = open_mm, min(speed_mm_s, 0.0), min(acceleration_mm_s2, 0.0)
+    return Reference(gap_mm, speed_mm_s, acceleration_mm_s2)
 
 
 def follow(

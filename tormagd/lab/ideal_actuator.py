@@ -10,8 +10,7 @@ from typing import Final, final
 from tormagd.assembly.build import Core
 from tormagd.control.core import Stepper
 from tormagd.control.move.actuator import Actuator, Drive
-from tormagd.control.move.carriages import CARRY_S
-from tormagd.control.move.reference import Reference
+from tormagd.control.move.reference import Reference, target_of
 from tormagd.control.records import Measured, Plan
 from tormagd.hardware.measurement import Measurement
 from tormagd.safety.codes import Limit
@@ -49,12 +48,10 @@ class IdealCarriages(Actuator):
     ) -> Drive:
         """See `Actuator.update`."""
         before_mm = self._plant.gap_mm
-        wanted_mm = before_mm
+        wanted_mm = min(max(before_mm, self._closed_mm), self._open_mm)
         if plan is not None:
-            age_s = min(max(now_s - plan.time_s, 0.0), CARRY_S)
-            wanted_mm = plan.gap_mm + age_s * (plan.gap_speed_mm_s + age_s * plan.gap_acceleration_mm_s2 / 2.0)
-            wanted_mm = self._open_mm if is_over else max(wanted_mm, plan.min_gap_mm)
-        wanted_mm = min(max(wanted_mm, self._closed_mm), self._open_mm)
+            floor_mm = max(self._closed_mm, plan.min_gap_mm)
+            wanted_mm = self._open_mm if is_over else target_of(plan, now_s, 0.0, floor_mm, self._open_mm).gap_mm
         reach_mm = self._top_speed_mm_s * dt_s
         gap_mm = min(max(wanted_mm, before_mm - reach_mm), before_mm + reach_mm)
         lead_mm_rad = self._plant.parameters.screw.lead_mm / math.tau
