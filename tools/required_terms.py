@@ -30,7 +30,6 @@ from rendering.signals import Signal, data_folder, recorded_signals
 from tormagd.ctl.scene_new import new_scene
 from tormagd.headroom.__main__ import build
 from tormagd.headroom.machine_loop import machine_us
-from tormagd.inverse.choice import RUNTIME_SOLVERS
 from tormagd.lab import executors
 from tormagd.lab.arrays import Json
 from tormagd.lab.told import lines
@@ -53,6 +52,8 @@ from tormagd.scenes.scene import LEAST_CONTROL_HZ, TERMS, shipped_scenes
 from tormagd_client.endpoints import ConfigError
 
 SHARE = 0.2
+SEARCHES = ("nearest", "newton")
+"Those that need no torch."
 KEPT = ROOT / "build" / "required_terms.json"
 STORED = ROOT / "tormagd" / "scenes" / FILE
 FOLDER = ROOT / "build" / "recorded_scenes"
@@ -117,7 +118,7 @@ def measure(
     if is_met(rates[0].judged, tolerance_N):
         left_out = spared(terms, tolerance_N, lambda out: all(is_good(item, tolerance_N) for item in judge(out, hz)))
     judged = judge(left_out, hz)
-    searched = {search: case(left_out, hz, samples[0], True, search) for search in RUNTIME_SOLVERS}
+    searched = {search: case(left_out, hz, samples[0], True, search) for search in SEARCHES}
     found = runs(searched.values())
     searches = tuple(WithSearch(search, found[each], NO_COST) for search, each in searched.items())
     unpriced = MeasuredScene(

@@ -22,6 +22,7 @@ from tormagd.hardware.can_stream import CanStream
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.frame_stream import FrameStream
 from tormagd.hardware.measurement import Measurement
+from tormagd.inverse.solution import Question
 from tormagd.safety.operating_state import Conditions, OperatingState, SafetyState
 from tormagd.simulation.can_device import DEFAULT_NODE, DEVICE, CanLine
 from tormagd.simulation.can_frame import CanFrame
@@ -31,6 +32,8 @@ from tormagd.simulation.plant import Truth
 Array = npt.NDArray[np.float64]
 HOMING_S: Final = 10.0
 "Longer than the slowest homing from a closed gap."
+SEARCH_S: Final = 0.012
+"Of a search beside the plans, from the question to its answer: a period of the thesis's 83 Hz."
 MAX_UNREAD_BYTES: Final = 4096
 "What a serial port keeps for a program that does not read."
 MAX_UNREAD_FRAMES: Final = 512
@@ -176,6 +179,7 @@ class ClosedLoop:
         self._ticks = 0
         self._output: Duty | None = None
         self._setpoint: TimedSetpoint | None = None
+        self._asked: Question | None = None
         self._port: VirtualPort | VirtualBus = device if isinstance(device, VirtualBus) else VirtualPort(device)
         self.connection = Connection(config.device, self._port.open, self._lose_link, self._port.clock)
         self.connection.open(self._port)
@@ -277,8 +281,17 @@ class ClosedLoop:
             return
         is_new = setpoint is not None and setpoint.stamp_s > planner.planned.stamp_s
         if is_new or now_s - planner.planned.time_s >= self._inference_s - 1e-9:
+            self._search(planner, now_s)
             planner.plan(now_s, setpoint, self.stepper.measured)
             planner.foresee()
+            self._asked = self._asked or planner.question
+
+    def _search(self, planner: Planner, now_s: float) -> None:
+        """The search beside the plans, if there is one, as if it ran in a process of its own."""
+        asked = self._asked
+        if asked is not None and now_s - asked.time_s >= SEARCH_S - 1e-9:
+            planner.answered(planner.aim.found(asked))
+            self._asked = None
 
     def _until(self, reached: Callable[[Measurement], bool], what: str, plan: Plan | None) -> None:
         for _ in range(round(HOMING_S / self._period_s)):

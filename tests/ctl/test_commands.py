@@ -218,7 +218,7 @@ def test_a_decision_is_explained_with_what_was_measured(capsys):
     text = capsys.readouterr().out
     assert all(term in text for term in TERMS)
     assert "500 Hz      83 Hz" in text
-    assert "coarse-to-fine" in text
+    assert "nearest" in text
     assert "sample_3 learning" in text
 
 

@@ -17,9 +17,8 @@ from scipy.optimize import brentq
 
 from tormagd.assembly.build import build_core, choose_solver
 from tormagd.config import Config
-from tormagd.inverse.bracketed import BracketedSearch, Refinement, finer_grid, newton
-from tormagd.inverse.choice import RUNTIME_SOLVERS, build, named
-from tormagd.inverse.linear import THESIS_EPSILON_N, GridArgmin, LinearFieldSearch, torch_row
+from tormagd.inverse import choice, ordered
+from tormagd.inverse.choice import RUNTIME_SOLVERS, build, mean_error_N, named
 from tormagd.inverse.nearest import NearestFieldSearch, field_grid
 from tormagd.inverse.newton import ACCURACY_MT, MOST_EVALUATIONS, RisingSearch
 from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
@@ -118,21 +117,19 @@ class Subject(NamedTuple):
     needs_rising: bool = False
 
 
-def bracketed(refine: Refinement) -> Make:
-    return lambda model: BracketedSearch(field_range_mT=REACHED_MT, refine=refine)
+GRID_MT = field_grid(REACHED_MT, 1.0)
+
+
+def by_curve(curve: ForceCurve, field_mT: float) -> float:
+    return curve.force_N(field_mT)
 
 
 SUBJECTS = {
-    "nearest": Subject(lambda model: NearestFieldSearch(field_range_mT=REACHED_MT), 5e-3),
-    "coarse-to-fine": Subject(bracketed(finer_grid), 5e-3),
-    "newton": Subject(bracketed(newton), 1e-6),
-    "rising": Subject(lambda model: RisingSearch(REACHED_MT), ACCURACY_MT, needs_rising=True),
-    "thesis-linear": Subject(
-        lambda model: LinearFieldSearch(field_range_mT=REACHED_MT, epsilon_N=0.01, predict_one=torch_row(model)),
-        *(5.0, False),
-    ),
-    "linear-argmin": Subject(lambda model: LinearFieldSearch(field_range_mT=REACHED_MT, epsilon_N=0.0), 0.51, False),
-    "vectorised-argmin": Subject(lambda model: GridArgmin(model, field_range_mT=REACHED_MT), 0.51, False),
+    "nearest": Subject(lambda model: NearestFieldSearch(field_grid(REACHED_MT, 2.0)), 5e-3),
+    "torch": Subject(lambda model: NearestFieldSearch(GRID_MT, 8, ordered.batch(model, GRID_MT)), 5e-3),
+    "newton": Subject(lambda model: RisingSearch(REACHED_MT), ACCURACY_MT, needs_rising=True),
+    "thesis": Subject(lambda model: ordered.RowByRow(GRID_MT, 0.01, ordered.row(model)), 5.0, False),
+    "every row": Subject(lambda model: ordered.RowByRow(GRID_MT, 0.0, by_curve), 0.51, False),
 }
 ANY_SHAPE = [name for name, subject in SUBJECTS.items() if not subject.needs_rising]
 CONTINUOUS = [name for name in ANY_SHAPE if SUBJECTS[name].is_continuous]
@@ -236,7 +233,7 @@ def test_a_tie_is_resolved_by_continuity(plateau: ForceModel, name: str) -> None
         assert solution.predicted_force_N == pytest.approx(top, abs=0.02)
         if name in CONTINUOUS:
             # the grid searches may move to a neighbouring grid point
-            assert solution.field_mT == pytest.approx(last, abs=2.0 if "nearest" in name else 1e-9)
+            assert solution.field_mT == pytest.approx(last, abs=2.0)
 
 
 @pytest.mark.parametrize("name", SUBJECTS)
@@ -290,24 +287,20 @@ def test_far_outside_the_training_range_the_answer_is_not_trusted(rising: ForceM
 RANGE_MT = (100.0, 800.0)
 
 
-def nearest(**options: Any) -> NearestFieldSearch:
-    return NearestFieldSearch(**{"field_range_mT": RANGE_MT, "step_mT": 1.0, **options})
+def nearest(ends_mT: tuple[float, float] = RANGE_MT, step_mT: float = 1.0, neighbours: int = 8) -> NearestFieldSearch:
+    return NearestFieldSearch(field_grid(ends_mT, step_mT), neighbours)
 
 
-def linear(**options: Any) -> LinearFieldSearch:
-    return LinearFieldSearch(**{"field_range_mT": RANGE_MT, **options})
-
-
-def search(refine: Refinement = newton, step_mT: float = 30.0, **options: Any) -> BracketedSearch:
-    return BracketedSearch(**{"field_range_mT": RANGE_MT, "refine": refine, "step_mT": step_mT, **options})
+def row_by_row(epsilon_N: float) -> ordered.RowByRow:
+    return ordered.RowByRow(field_grid(RANGE_MT, 1.0), epsilon_N, by_curve)
 
 
 @pytest.mark.parametrize(
     ("make", "options", "name"),
     [
-        (nearest, {"field_range_mT": (800.0, 100.0)}, "field_range_mT"),
-        (nearest, {"field_range_mT": (100.0, math.nan)}, "field_range_mT"),
-        (nearest, {"field_range_mT": (100.0, math.inf)}, "field_range_mT"),
+        (nearest, {"ends_mT": (800.0, 100.0)}, "field_range_mT"),
+        (nearest, {"ends_mT": (100.0, math.nan)}, "field_range_mT"),
+        (nearest, {"ends_mT": (100.0, math.inf)}, "field_range_mT"),
         (nearest, {"step_mT": 0.0}, "step_mT"),
         (nearest, {"step_mT": -1.0}, "step_mT"),
         (nearest, {"step_mT": math.nan}, "step_mT"),
@@ -315,10 +308,7 @@ def search(refine: Refinement = newton, step_mT: float = 30.0, **options: Any) -
         (nearest, {"step_mT": 701.0}, "step_mT"),
         (nearest, {"neighbours": 0}, "neighbours"),
         (nearest, {"neighbours": 702}, "neighbours"),
-        *((linear, {"epsilon_N": epsilon}, "epsilon_N") for epsilon in (-1.0, math.nan, math.inf)),
-        (search, {"step_mT": 0.0}, "step_mT"),
-        (search, {"step_mT": 701.0}, "step_mT"),
-        (search, {"field_range_mT": (9.0, 9.0)}, "field_range_mT"),
+        *((row_by_row, {"epsilon_N": epsilon}, "epsilon_N") for epsilon in (-1.0, math.nan, math.inf)),
         *(
             (RisingSearch, {"field_range_mT": ends}, "field_range_mT")
             for ends in ((800.0, 100.0), (9.0, 9.0), (100.0, math.nan), (-math.inf, 100.0))
@@ -384,76 +374,33 @@ def test_on_a_plateau_the_field_moves_as_little_as_possible(plateau: ForceModel,
     )
 
 
-def test_linear_stops_at_the_first_row_within_epsilon_or_has_the_nearest_of_all(
-    rising: ForceModel,
-) -> None:
+def test_the_thesis_search_stops_at_the_first_row_within_epsilon_or_has_the_nearest_of_all(rising: ForceModel) -> None:
     force = attainable(rising, 0.5, 10, 0.7)
     curve, grid = rising.curve(0.5, 10, CIP), field_grid(RANGE_MT, 1.0)
     rows = [curve.force_N(field) for field in grid.tolist()]
     first = next(index for index, predicted in enumerate(rows) if abs(force - predicted) <= 0.2)
-    solution = linear(epsilon_N=0.2).solve(curve, force, None)
+    solution = row_by_row(0.2).solve(curve, force, None)
     assert solution == FieldSolution(100.0 + first, rows[first], solution.confidence, first + 1, Reach.INSIDE)
-    of_all = linear(epsilon_N=0.0).solve(curve, force, None)
+    of_all = row_by_row(0.0).solve(curve, force, None)
     assert (of_all.iterations, of_all.field_mT) == (701, grid[np.abs(np.array(rows) - force).argmin()])
+    below = rows[0] - 1.26
+    assert row_by_row(1.27).solve(curve, below, None).reach is Reach.INSIDE
+    assert row_by_row(1.25).solve(curve, below, None).reach is Reach.BELOW
 
 
-def test_linear_has_the_radius_of_the_thesis_by_default(rising: ForceModel) -> None:
-    force = rising.predict_one(0.5, 10, 100.0, CIP)
-    solver = linear()
-    assert THESIS_EPSILON_N == 1.26
-    assert solver.solve(rising.curve(0.5, 10, CIP), force - 1.25, None).reach is Reach.INSIDE
-    assert solver.solve(rising.curve(0.5, 10, CIP), force - 1.27, None).reach is Reach.BELOW
+def test_the_network_in_torch_is_the_curve(rising: ForceModel) -> None:
+    """As one batch and row by row, for every state of the handle."""
+    batch, row = ordered.batch(rising, GRID_MT), ordered.row(rising)
+    for displacement, rate in ((0.0, 0.0), (0.5, 10.0), (1.0, 60.0)):
+        curve = rising.curve(displacement, rate, CIP)
+        assert batch(curve) == pytest.approx(curve.forces_N(GRID_MT), rel=1e-12)
+        assert row(curve, 333.3) == pytest.approx(curve.force_N(333.3), rel=1e-12)
 
 
 def test_the_grid_has_both_ends_and_no_wider_step() -> None:
     grid = field_grid((100.0, 800.0), 3.0)
     assert (grid[0], grid[-1]) == (100.0, 800.0)
     assert 2.9 < np.diff(grid).max() <= 3.0
-
-
-# -- look and refinement: roots beside the last field, steep steps, peaks between grid points --------------------------
-
-
-REFINEMENTS = (newton, finer_grid)
-
-
-def test_a_step_steeper_than_the_grid_is_met_exactly(plateau: ForceModel) -> None:
-    """Newton's slope is zero to the last bit on both sides of the step: bisection carries it there."""
-    middle = 0.5 * sum(plateau.predict_one(0.5, 10, field, CIP) for field in RANGE_MT)
-    solution = search(newton, 60.0).solve(plateau.curve(0.5, 10, CIP), middle, 200.0)
-    assert solution.field_mT == pytest.approx(450, abs=ACCURACY_MT)
-    assert solution.predicted_force_N == pytest.approx(middle, abs=1e-3)
-    assert solution.iterations < 50
-
-
-@pytest.mark.parametrize("refine", REFINEMENTS)
-def test_a_force_met_only_between_grid_points_is_not_called_out_of_reach(bump: ForceModel, refine: Refinement) -> None:
-    """The peak stands at 450 mT; a grid of 100 mT has points at 400 and 500, both lower."""
-    peak, shoulder = (bump.predict_one(0.5, 10, field, CIP) for field in (450.0, 400.0))
-    force = peak - 0.2 * (peak - shoulder)
-    solution = search(refine, 100.0).solve(bump.curve(0.5, 10, CIP), force, 150.0)
-    assert solution.reach is Reach.INSIDE
-    assert solution.predicted_force_N == pytest.approx(force, abs=1e-3)
-    assert solution.field_mT < 450
-
-
-@pytest.mark.parametrize("refine", REFINEMENTS)
-def test_the_last_field_is_a_point_of_the_grid(bump: ForceModel, refine: Refinement) -> None:
-    """From near the peak both roots lie in intervals that a grid of 700 mT does not have."""
-    force = bump.predict_one(0.5, 10, 440.0, CIP)
-    for last, root in ((446.0, 440.0), (455.0, 460.0)):
-        solution = search(refine, 700.0).solve(bump.curve(0.5, 10, CIP), force, last)
-        assert solution.field_mT == pytest.approx(root, abs=1.0 if refine is finer_grid else 0.01)
-
-
-def test_newton_needs_few_evaluations(rising: ForceModel) -> None:
-    rng = np.random.default_rng(2)
-    counts = []
-    for field in rng.uniform(*RANGE_MT, 200).tolist():
-        force = rising.predict_one(0.5, 10, field, CIP)
-        counts.append(search(newton).solve(rising.curve(0.5, 10, CIP), force, field + 20).iterations)
-    assert np.mean(counts) < 6
-    assert max(counts) < 12
 
 
 # -- Newton on the whole range of a force that rises: the root that Brent's method finds, from any last field ----------
@@ -550,20 +497,60 @@ def test_flat_stretches_do_not_stop_it(rate: float) -> None:
 # -- the search of a scene: by name, or Newton's method, which no measured scene has a reason to leave -----------------
 
 
+BUILT = {"newton": RisingSearch, "nearest": NearestFieldSearch, "torch": NearestFieldSearch, "thesis": ordered.RowByRow}
+
+
 @pytest.mark.parametrize("name", RUNTIME_SOLVERS)
 def test_a_named_search_is_built_with_its_settings(rising: ForceModel, name: str) -> None:
-    for rises in (False, True):
-        built = build(named(name, step_mT=25.0), (100.0, 800.0), rises=rises)
-        newton = RisingSearch if rises else BracketedSearch
-        expected = {"nearest": NearestFieldSearch, "coarse-to-fine": BracketedSearch, "newton": newton}
-        assert isinstance(built, expected[name])
-        usual = build(named(name), (100.0, 800.0), rises=rises)
-        assert usual.solve(rising.curve(0.5, 10, 40.0), 3.0, None).field_mT > 100
+    model = stating(rising, validation_mae_N=0.02)
+    usual = build(named(name), RANGE_MT, model, rises=True)
+    assert isinstance(usual, BUILT[name])
+    solution = usual.solve(model.curve(0.5, 10, CIP), 3.0, None)
+    assert solution.predicted_force_N == pytest.approx(3.0, abs=0.02)
+    if name != "newton":
+        settings = named(name, step_mT=700.0, neighbours=None if name == "thesis" else 1)
+        coarse = build(settings, RANGE_MT, model, rises=False)
+        assert coarse.solve(model.curve(0.5, 10, CIP), 3.0, None).predicted_force_N != solution.predicted_force_N
 
 
-def test_a_name_that_is_none_is_refused_with_those_that_are() -> None:
-    with pytest.raises(DomainError, match=r"solver\.name = 'bisection'.*nearest, coarse-to-fine, newton"):
-        named("bisection")
+def stating(model: ForceModel, **metrics: float) -> ForceModel:
+    """The same network with these figures in its file."""
+    metadata = msgspec.structs.replace(model.metadata, metrics=metrics)
+    return ForceModel(metadata, model.hidden_weight, model.hidden_bias, model.output_weight, model.output_bias)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "words"),
+    [
+        ("bisection", {}, r"solver\.name = 'bisection'.*newton, nearest, torch, thesis"),
+        ("newton", {"step_mT": 5.0}, r"solver\.step_mT = 5\.0.*none beside solver\.name = 'newton'"),
+        ("thesis", {"neighbours": 4}, r"solver\.neighbours = 4.*none beside solver\.name = 'thesis'"),
+    ],
+)
+def test_a_name_that_is_none_or_a_setting_that_it_does_not_have_is_refused(
+    name: str, settings: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(DomainError, match=words):
+        named(name, **settings)
+
+
+def test_newton_is_refused_where_the_force_falls_and_the_thesis_search_without_a_mean_error(rising: ForceModel) -> None:
+    with pytest.raises(DomainError, match="nearest or torch where the model's force falls"):
+        build(named("newton"), RANGE_MT, rising, rises=False)
+    assert mean_error_N(stating(rising, validation_mae_N=0.02)) == 0.02
+    with pytest.raises(DomainError, match="validation_mae_N"):
+        build(named("thesis"), RANGE_MT, rising, rises=True)
+
+
+@pytest.mark.parametrize("name", choice.OF_TORCH)
+def test_without_torch_the_scene_is_refused_and_the_package_named(
+    rising: ForceModel, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "tormagd.inverse.ordered")
+    monkeypatch.delattr("tormagd.inverse.ordered")
+    with pytest.raises(DomainError, match=f"'{name}', which needs the package torch.*newton, nearest"):
+        build(named(name), RANGE_MT, rising, rises=True)
 
 
 @pytest.mark.parametrize("name", shipped_scenes())
@@ -578,15 +565,14 @@ def test_a_scene_gets_the_search_that_it_names_or_newton_where_there_is_one(name
         assert built.solver == "newton"
 
 
-def test_no_other_search_is_cheaper_or_more_exact_in_any_measured_scene() -> None:
+def test_no_other_search_without_torch_is_cheaper_or_more_exact_in_any_measured_scene() -> None:
     """Why nothing picks among them: on the device, by what `tools/required_terms.py --store` measured."""
     for scene in measured().scenes:
         found = {item.search: item for item in scene.searches}
-        assert set(found) == set(RUNTIME_SOLVERS)
-        newton = found.pop("newton")
-        for other in found.values():
-            assert scene.us_s(newton.cost) < scene.us_s(other.cost)
-            assert newton.rms_N < other.rms_N + 0.01 * scene.tolerance_N
+        assert set(found) == set(RUNTIME_SOLVERS).difference(choice.OF_TORCH)
+        newton, nearest = found["newton"], found["nearest"]
+        assert scene.us_s(newton.cost) < scene.us_s(nearest.cost)
+        assert newton.rms_N < nearest.rms_N + 0.01 * scene.tolerance_N
 
 
 def test_a_scene_may_name_its_search() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tormagd.inverse.nearest import NearestFieldSearch
+from tormagd.inverse.nearest import NearestFieldSearch, field_grid
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.fitting import fit_network
 from tormagd.lab.training.grey_box import GreyBox, GreyBoxMemory, fit_grey_box, fit_series
@@ -94,7 +94,7 @@ def test_the_grey_box_sees_through_the_memory(grey: GreyBox, cycles: Dataset, ho
 def test_the_memory_inverts_itself(grey: GreyBox) -> None:
     model = grey.model
     memory, told = GreyBoxMemory(grey, 0.5), GreyBoxMemory(grey, 0.5)
-    solver = NearestFieldSearch(field_range_mT=(0.0, 300.0), step_mT=1.0)
+    solver = NearestFieldSearch(field_grid((0.0, 300.0), 1.0))
     last = None
     for step in range(200):
         field = 180 + 60 * np.sin(step / 9)

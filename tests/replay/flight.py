@@ -11,13 +11,14 @@ from mcap.reader import make_reader
 
 from tormagd.assembly.build import Core
 from tormagd.assembly.journal import Journal, Packer
-from tormagd.closed_loop import ClosedLoop, Sample, VirtualBus
+from tormagd.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.config import Config
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.black_box import header
 from tormagd.daemon.inbox import SetpointInbox
 from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.telemetry import tick_record
+from tormagd.inverse.solution import Answer, Question
 from tormagd.keeping import Part
 from tormagd.recording.black_box import write_black_box
 from tormagd.recording.keeper import Ring
@@ -49,8 +50,15 @@ class Flight:
         endpoint: Any = SimpleNamespace(inbox=self._inbox, drain_setpoints=self._drain)
         period_ns = NS // config.rates.inference_hz
         self._inference = InferenceLoop(
-            self.planner, endpoint, period_ns, self._clock_ns, journal=self._journal, on_failure=self._fail
+            self.planner,
+            endpoint,
+            period_ns,
+            self._clock_ns,
+            journal=self._journal,
+            on_failure=self._fail,
+            beside=self if core.element.is_beside else None,  # type: ignore[arg-type]
         )
+        self._question: Question | None = None
         self._remember()
 
     def tick(self, setpoint: TimedSetpoint | None = None) -> Sample:
@@ -68,6 +76,18 @@ class Flight:
             if self._ticks % SNAPSHOT_TICKS == 0:
                 self._remember()
         return sample
+
+    def answer(self) -> Answer | None:
+        """Of the search beside the plans, which takes some periods."""
+        question = self._question
+        if question is None or self.loop.now_s - question.time_s < SEARCH_S:
+            return None
+        self._question = None
+        return self.planner.aim.found(question)
+
+    def ask(self, question: Question) -> None:
+        """What that is asked, where it is idle."""
+        self._question = self._question or question
 
     def read(self, now_s: float, raw: Any) -> None:
         """Something came: before the step."""

@@ -19,7 +19,7 @@ from mcap.writer import Writer
 from firmware_protocol.build import SWITCH, settle
 from tormagd import __version__
 from tormagd.assembly.build import Core
-from tormagd.assembly.journal import MISSING
+from tormagd.assembly.journal import ANSWER, MISSING
 from tormagd.config import Config
 from tormagd.keeping import Part
 from tormagd.recording.black_box import BlackBoxFile, read_black_box, write_black_box
@@ -34,7 +34,7 @@ CHANGED_TICK = 3_210
 TICKS = 4_000
 ROOT = Path(__file__).parents[2]
 FORMER = (
-    f"format = '3', written by tormagd {__version__!r}: allowed is 4, which tormagd {__version__} writes; "
+    f"format = '4', written by tormagd {__version__!r}: allowed is 5, which tormagd {__version__} writes; "
     "replay it with the version that wrote it"
 )
 NO_TICKS = [Part(0.0, 1, msgspec.msgpack.encode(["step"]))]
@@ -61,6 +61,19 @@ def test_a_fault_is_replayed_bit_for_bit_from_the_file_alone(ended: Flight, box:
     assert (done.ticks, done.from_s, done.snapshots) == (TICKS, 0.0, 7)
     assert (done.frames, done.damaged) == (len(frames(path)), 0)
     assert differences(known, Config()) == []
+
+
+def test_what_a_search_beside_the_plans_answered_is_replayed_not_searched_for(fly: Any, tmp_path: Path) -> None:
+    flown = fly(until_s=3.0, config=Config(scene=str(ROOT / "examples" / "scenes" / "thesis.toml")))
+    box = read_black_box(flown.write(tmp_path / "thesis.mcap"))
+    answers = [entry for entry in box.entries if entry[0] == ANSWER]
+    assert len(answers) > 100
+    done = again(flown.core, box)
+    assert (done.difference, done.gaps, done.ticks) == (None, 0, 3_000)
+    assert again(flown.core, box, 1.7).difference is None
+    # another field in one of them is found
+    answers[-5][1]["Answer"]["solution"]["FieldSolution"]["field_mT"] += 0.5
+    assert again(flown.core, box).difference is not None
 
 
 @pytest.mark.parametrize(("from_s", "begins_s"), [(0.2, 0.0), (2.9, 2.5), (3.7, 3.5)])
@@ -267,7 +280,7 @@ def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Pa
         writer.finish()
     assert "allowed is msgpack" in refusal(other)
     changes = {
-        "format": ("3", FORMER),
+        "format": ("4", FORMER),
         "config": ('{"scene": "pulse"}', "config: its hash"),
         "model_sha256": ("f" * 64, "the model with the hash 'ffffffffffff'"),
         "columns": (json.dumps(["t_ns"]), "no column 'monotonic_s'"),

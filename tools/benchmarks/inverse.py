@@ -29,10 +29,12 @@ from benchmarks.inverse_workload import (
     training_data,
 )
 from tormagd.daemon.realtime import freeze_garbage
-from tormagd.inverse.choice import build, named
-from tormagd.inverse.linear import GridArgmin, LinearFieldSearch, torch_row
-from tormagd.inverse.solution import FieldSolver
+from tormagd.inverse import ordered
+from tormagd.inverse.choice import build, mean_error_N, named
+from tormagd.inverse.nearest import field_grid
+from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach, answer
 from tormagd.lab.arrays import Array
+from tormagd.model.force_curve import ForceCurve
 from tormagd.model.model_file import ForceModel
 from tormagd.model.rising import falling_at
 from tormagd.scenes.scene import AUTO, load_scene, shipped_scenes
@@ -41,12 +43,11 @@ from tormagd.simulation.parameters import load_plant
 PLANT = "sample_1"
 USUAL_HIDDEN = 50
 QUANTILES = {"p50": 50.0, "p99": 99.0, "p999": 99.9}
-NEWTON, RISING = "newton", "newton-rising"
-"The daemon refuses a model that does not rise: the first is what it runs by name, and the second how that is done."
+NEWTON = "newton"
 BASELINES = ("thesis-linear", "linear-argmin", "vectorised-argmin")
 BASELINE_STEP_MT = 1.0
-STEPS_MT = {"nearest": (1.0, 2.0, 5.0, 10.0, 20.0), "coarse-to-fine": (10.0, 20.0, 40.0), NEWTON: (10.0, 20.0, 40.0)}
-ENDS_MT = {"nearest": (2.0, 20.0), "coarse-to-fine": (20.0,), NEWTON: (20.0,)}
+STEPS_MT = {"torch": (1.0, 2.0, 5.0), "nearest": (1.0, 2.0, 5.0, 10.0, 20.0)}
+ENDS_MT = {"torch": (1.0,), "nearest": (2.0, 20.0)}
 "Steps on the networks that are not of the usual size."
 ENCODER_FIELD_MT = 0.02
 "About what one encoder count changes (1/560 mm, 5 to 22 mT/mm): smaller differences of error decide nothing."
@@ -90,8 +91,8 @@ def cases(hidden: tuple[int, ...]) -> Iterator[Case]:
             yield Case(solver, size, BASELINE_STEP_MT)
         for solver, steps_mT in (STEPS_MT if size == USUAL_HIDDEN else ENDS_MT).items():
             for step_mT in steps_mT:
-                yield Case(solver, size, step_mT, named(solver).neighbours if solver == "nearest" else 0)
-        yield Case(RISING, size)
+                yield Case(solver, size, step_mT, named(solver).neighbours)
+        yield Case(NEWTON, size)
     yield from (of_scene(name) for name in shipped_scenes())
 
 
@@ -99,23 +100,30 @@ def of_scene(name: str) -> Case:
     """What the scene runs where it searches."""
     solver = load_scene(name).solver
     choice = named(NEWTON if solver.name == AUTO else solver.name, solver.step_mT or None, solver.neighbours or None)
-    if choice.solver == NEWTON:
-        return Case(RISING)
     return Case(choice.solver, step_mT=choice.step_mT, neighbours=choice.neighbours)
 
 
 def make(case: Case, model: ForceModel) -> FieldSolver:
     """The search: one of the daemon's, or a baseline."""
     if case.solver not in BASELINES:
-        solver = NEWTON if case.solver == RISING else case.solver
-        choice = named(solver, case.step_mT or None, case.neighbours or None)
-        return build(choice, FIELDS_MT, rises=case.solver == RISING)
+        return build(named(case.solver, case.step_mT or None, case.neighbours or None), FIELDS_MT, model, rises=True)
+    fields_mT = field_grid(FIELDS_MT, case.step_mT)
     if case.solver == "vectorised-argmin":
-        return GridArgmin(model, dtype=torch.float64, field_range_mT=FIELDS_MT, step_mT=case.step_mT)
-    # the thesis took its network's mean error for the radius; so does this, with its own network's
-    epsilon_N = model.metadata.metrics["validation_mae_N"] if case.solver == "thesis-linear" else 0.0
-    row = torch_row(model)
-    return LinearFieldSearch(epsilon_N=epsilon_N, predict_one=row, field_range_mT=FIELDS_MT, step_mT=case.step_mT)
+        return Argmin(model, fields_mT)
+    epsilon_N = mean_error_N(model) if case.solver == "thesis-linear" else 0.0
+    return ordered.RowByRow(fields_mT, epsilon_N, ordered.row(model))
+
+
+class Argmin:
+    """The thesis's search as one array: the row of the grid that is nearest in force, and no look at the last field."""
+
+    def __init__(self, model: ForceModel, fields_mT: Array) -> None:
+        self._fields_mT, self._forces_N = fields_mT, ordered.batch(model, fields_mT)
+
+    def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
+        """See `FieldSolver.solve`; the workload has no force out of reach."""
+        field_mT = float(self._fields_mT[np.abs(self._forces_N(curve) - force_N).argmin()])
+        return answer(curve, field_mT, force_N, curve.force_N(field_mT), 1, Reach.INSIDE)
 
 
 class Bench:
@@ -133,7 +141,7 @@ class Bench:
     def sweep(self) -> tuple[list[dict[str, Any]], list[str]]:
         """The rows of the table, and the searches that refused a network. In rounds: a disturbance meets all alike."""
         wanted = list(dict.fromkeys(cases(self.effort.hidden)))
-        refused = [case for case in wanted if case.solver == RISING and self._falls(case.hidden)]
+        refused = [case for case in wanted if case.solver == NEWTON and self._falls(case.hidden)]
         runs = [Run(self, case) for case in wanted if case not in refused]
         freeze_garbage()
         for _ in tqdm(range(self.effort.rounds), desc="rounds", disable=None):
@@ -254,7 +262,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     mark_pareto(rows)
     usual = {row["name"]: row for row in rows if row["hidden"] == USUAL_HIDDEN}
     # where a network refuses it, as a small one may, the scene would run the search that looks at a grid
-    fallback = usual[Case(NEWTON, step_mT=STEPS_MT[NEWTON][1]).name]
+    fallback = usual[Case("nearest", step_mT=2.0, neighbours=named("nearest").neighbours).name]
     scenes = {name: load_scene(name).force.tolerance_rms_N for name in shipped_scenes()}
     chosen = {
         name: usual.get(of_scene(name).name, fallback) | {"tolerance_rms_N": tolerance_N}

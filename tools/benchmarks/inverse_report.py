@@ -31,9 +31,8 @@ MARKERS = {
     "linear-argmin": "^",
     "vectorised-argmin": "s",
     "nearest": "o",
-    "coarse-to-fine": "D",
+    "torch": "D",
     "newton": "*",
-    "newton-rising": "d",
 }
 TEXT = """# Speed against accuracy of the inverse
 
@@ -50,13 +49,12 @@ and no search can be better than its network. *Force* is the plant's force at th
 ![p50 against the solver error and against the plant error](images/inverse_trade.png)
 
 - `thesis-linear`: row by row in torch, 1 mT, stops within the network's mean error of the force (the thesis's rule).
-  `linear-argmin` looks at every row; `vectorised-argmin` asks the whole network for the whole grid at once.
-- `nearest`: the curve over the grid in NumPy, the k nearest, then interpolation.
-- `coarse-to-fine`, `newton`: a look at a grid of that step, then a finer grid or Newton's method, kept in the bracket
-  nearest the last field.
-- `newton-rising`: Newton's method from the last field, the whole range its bracket, where the force is known to rise.
-  It is what the daemon runs as `newton`, because it refuses a model whose force falls, and what every scene runs that
-  names no other. It is {speedup[thesis-linear]:.0f} times as fast as the thesis's search on the same network,
+  `linear-argmin` looks at every row; `vectorised-argmin` asks the whole network for the whole grid at once. The daemon
+  runs the first as `thesis`.
+- `torch`: the network over the grid in torch, the k nearest, then interpolation. `nearest`: the same in NumPy, from the
+  curve of this state of the handle, and without torch.
+- `newton`: Newton's method from the last field, the whole range its bracket. It wants a force that rises with the
+  field, as the brake's does, and is what every scene runs that names no other. It is {speedup[thesis-linear]:.0f} times as fast as the thesis's search on the same network,
   {speedup[linear-argmin]:.0f} times as fast as `linear-argmin`, {speedup[vectorised-argmin]:.0f} times as
   `vectorised-argmin`.
 
@@ -111,7 +109,7 @@ def plot(result: dict[str, Any], figures: list[str]) -> None:
     right.step(*zip(*front, strict=True), where="post", color="0.5", linewidth=1, zorder=0)
     left.set(title=f"against the network's own root, {USUAL_HIDDEN} units", ylabel="mean field error, mT")
     right.set(title="against the plant, all sizes")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=7, fontsize=8)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
     figure.savefig(PLOT, dpi=130, metadata=stamp(figures))
 
 

@@ -24,7 +24,7 @@ from tormagd.control.core import Planner, Stepper
 from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.move.motor import Margins, margins, pull_V
 from tormagd.control.nominal import Nominal
-from tormagd.inverse.choice import Choice, build, named
+from tormagd.inverse.choice import BESIDE_PLANS, Choice, build, mean_error_N, named
 from tormagd.model.force_curve import ForceCurve
 from tormagd.model.model_file import ForceModel, ModelFileError, load_model
 from tormagd.model.rising import falling_at
@@ -129,11 +129,13 @@ def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
     fields_mT, rises = _known_fields_mT(scene, model, part)
     reach = portrait(_curve(model, part), field, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
     choice = choose_solver(scene, rises=rises)
-    search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, rises=rises)
+    if choice.solver == "thesis":
+        choice = choice._replace(reason=f"{choice.reason}; epsilon {mean_error_N(model):.4f} N, its model's mean error")
+    search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, model, rises=rises)
     law = _law(scene, reach, field) if part.contact.slides else None
     nominal = Nominal(model, part.contact, part.cip_percent, terms.rate)
     memory = model.metadata.memory.of(relaxes=terms.relaxes, hysteresis=terms.hysteresis)
-    return Element(nominal, memory, field, reach, search, law), choice
+    return Element(nominal, memory, field, reach, search, law, choice.solver in BESIDE_PLANS), choice
 
 
 def sources_hash() -> str:

@@ -23,23 +23,24 @@ from tormagd.control.plausible import Leap
 from tormagd.control.records import Handle, Measured, Outside, Plan, TimedSetpoint
 from tormagd.exact import kinds, plain
 from tormagd.hardware.backend import Received, Sent
+from tormagd.inverse.solution import Answer, FieldSolution, Question, Reach
 from tormagd.keeping import READ, WROTE
 from tormagd.model.displacement import Turn
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState, SafetyState
 from tormagd_client.messages import TickRecord
 
-FORMAT = 4
+FORMAT = 5
 "Of the entries and of the states in them: raised when one comes, is removed or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
     *(Measured, Handle, Turn, Leap, Reference, Plan, Outside),
-    *(DeviceFit, Level, Learned, Skill, Guess),
+    *(DeviceFit, Level, Learned, Skill, Guess, Question, Answer, FieldSolution, Reach),
 )
 "All records that stages keep, or that were given to them: what `exact` reads back."
 STEP = "step"
 "The step ran here; what it was given stands in the next record."
-PLAN, FORESEE, AFRESH, TEACH = "plan", "foresee", "afresh", "teach"
+PLAN, FORESEE, AFRESH, TEACH, ANSWER = "plan", "foresee", "afresh", "teach", "answer"
 COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
 CONNECTED = "connected"
 "Besides READ and WROTE, which the process that keeps them knows, too."
@@ -85,6 +86,10 @@ class Journal:
     def taught(self, learned: Learned) -> None:
         """What is known of the device from another day was put in the place of what was believed."""
         self._add((TEACH, learned))
+
+    def answered(self, answer: Answer) -> None:
+        """The search beside the plans has found something, for the next plan."""
+        self._add((ANSWER, answer))
 
     def commanded(self, name: str, now_s: float, conditions: Conditions, *, is_refused: bool) -> None:
         """An operator's command was given, and taken or refused."""

@@ -24,6 +24,7 @@ from tormagd.control.move.motor import full_speed_mm_s
 from tormagd.control.move.watch import Watch, ceiling_N
 from tormagd.control.records import Duty, Measured, Plan, TimedSetpoint
 from tormagd.hardware.measurement import Measurement
+from tormagd.inverse.solution import Answer, Question
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import Conditions, OperatingState, SafetyState, command, homed_again, latch
 from tormagd.scenes.scene import Scene, terms_of
@@ -67,6 +68,15 @@ class Planner:
         """Prepares what the next plans need of what comes, and says whether there was something to do: to be called
         after each plan, when nothing waits."""
         return self.governor.foresee()
+
+    @property
+    def question(self) -> Question | None:
+        """What the search beside the plans is to be asked, as of the newest plan; None where there is none."""
+        return self.aim.question
+
+    def answered(self, answer: Answer) -> None:
+        """The search beside the plans has found this: plans use it from now on."""
+        self.aim.answer = answer
 
     def teach(self, learned: Learned) -> None:
         """Takes that for what is known of the device. The element's memory stays."""

@@ -23,14 +23,14 @@ class Nominal:
         self._rates_mm_s: Final = model.feature_ranges[1]
         self.fields_mT: Final = model.feature_ranges[2]
         self.slides: Final = contact.slides
-        self.only: Final[ForceCurve] = self._curve(contact.displacement_mm, contact.rate_mm_s)
+        self.only: Final[ForceCurve] = self.curve(contact.displacement_mm, contact.rate_mm_s)
 
     def now(self, measured: Measured) -> ForceCurve:
         """Of the handle as it moves now."""
         if not self._has_rate:
             return self.only
         displacement_mm, rate_mm_s = self.contact.present(measured)
-        return self._curve(displacement_mm, rate_mm_s)
+        return self.curve(displacement_mm, rate_mm_s)
 
     def planned(
         self, setpoint: TimedSetpoint | None, measured: Measured | None
@@ -39,7 +39,7 @@ class Nominal:
         if not self._has_rate:
             return self.only, ()
         displacement_mm, rate_mm_s = self.contact.planned(setpoint, measured)
-        curve = self._curve(displacement_mm, rate_mm_s)
+        curve = self.curve(displacement_mm, rate_mm_s)
         outside: tuple[Outside, ...] = ()
         if curve.displacement_mm != displacement_mm:
             outside = (Outside(FEATURES[0], displacement_mm, curve.displacement_mm),)
@@ -47,6 +47,7 @@ class Nominal:
             outside = (*outside, Outside(FEATURES[1], rate_mm_s, curve.rate_mm_s))
         return curve, outside
 
-    def _curve(self, displacement_mm: float, rate_mm_s: float) -> ForceCurve:
+    def curve(self, displacement_mm: float, rate_mm_s: float) -> ForceCurve:
+        """Of a handle with this displacement and rate, or what of them the model knows."""
         known_mm, known_mm_s = within(displacement_mm, self._displacements_mm), within(rate_mm_s, self._rates_mm_s)
         return self._network.curve(known_mm, known_mm_s, self._cip_percent)

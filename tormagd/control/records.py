@@ -195,6 +195,7 @@ class Plan(Value):
     confidence        0..1, of the model's in `field_mT`
     trim              the device's force over the model's, where the plan leads
     outside           what the limit MODEL_RANGE is about
+    search_age_s      how long ago the search for `field_mT` began; 0 where it is part of the plan
     """
 
     def __init__(
@@ -217,6 +218,7 @@ class Plan(Value):
         sensor_doubted_s: float = 0.0,
         trim: float = 1.0,
         stamp_s: float = -math.inf,
+        search_age_s: float = 0.0,
     ) -> None:
         self.number: Final = number
         self.time_s: Final = time_s
@@ -236,6 +238,7 @@ class Plan(Value):
         self.sensor_doubted_s: Final = sensor_doubted_s
         self.trim: Final = trim
         self.stamp_s: Final = stamp_s
+        self.search_age_s: Final = search_age_s
 
 
 @final

@@ -61,6 +61,7 @@ def status_text(known: Status, colour: Colour) -> str:
         f"link      {known.link.state}, {_counts(known.link, LINK_COUNTS)}",
         *_explained(known.link.cause, known.link.remedy, colour.yellow),
         *(_rate(name, group, colour) for name, group in known.rates.items()),
+        *([f"field     of a search {known.search_age_ms:.0f} ms ago"] if known.search_age_ms else []),
         *_late_ticks(known.late_ticks_by),
         f"daemon    {known.version}, scene {known.scene}, up {_number(known.uptime_s, 's', 0)}",
         *([f"terms out {', '.join(known.terms_out)}"] if known.terms_out else []),

@@ -135,11 +135,13 @@ def _grid(*widths: int) -> Table:
 def _timing(status: Status, width: int) -> Table:
     """How well the loops keep their time, how the wire carries, and who publishes."""
     table = _grid(LABEL, width - LABEL - 1)
-    for name in ("control", "inference"):
+    for name in ("control", "inference", "search"):
         group = status.rates.get(name)
         if group is not None:
             late = group.lateness_us
             said = f", {group.hz:.0f} Hz, late {late.p50:.0f} us (p50) {late.p99:.0f} us (p99), stalls {group.stalls}"
+            if name == "search":
+                said = f", {group.hz:.0f} Hz, field of {status.search_age_ms:.0f} ms ago"
             table.add_row(
                 Text(name, "bold"), Text.assemble((group.grade, GRADE_STYLES.get(group.grade, "green")), said)
             )

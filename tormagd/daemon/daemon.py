@@ -22,6 +22,7 @@ from tormagd.daemon.inference_loop import InferenceLoop
 from tormagd.daemon.profiles import ProfileFolder, Profiles, state_folder
 from tormagd.daemon.realtime import freeze_garbage, priority_of_threads
 from tormagd.daemon.reload import reread
+from tormagd.daemon.search_process import SearchProcess
 from tormagd.daemon.telemetry_loop import TelemetryLoop
 from tormagd.hardware.backend import Backend
 from tormagd.hardware.connection import Connection
@@ -59,8 +60,10 @@ class Daemon:
         keys: KeyRing | None = None,
         box: BlackBox | None = None,
         read_again: Callable[[], Config] | None = None,
+        beside: SearchProcess | None = None,
     ) -> None:
-        """`box` is one whose process runs already; without it none is kept."""
+        """`box` is one whose process runs already; without it none is kept. `beside` is there where the core's search
+        runs beside the plans."""
         self._config, self._core, self._read_again = config, core, read_again
         self._loop = asyncio.get_running_loop()
         self._callbacks = Callbacks(self._loop)
@@ -79,6 +82,7 @@ class Daemon:
             NS // rates.inference_hz,
             journal=self._box.journal,
             on_failure=partial(self._control.latch, Fault.PLAN_FAILED),
+            beside=beside,
         )
         folder = state_folder(config.device.profiles, "profiles")
         self._profiles = Profiles(
@@ -138,6 +142,8 @@ class Daemon:
         heartbeat.close()
         self._endpoint.close()
         self._box.close()
+        if self._inference.beside is not None:
+            self._inference.beside.close()
         log.info("ended")
 
     def _beat(self, heartbeat: Heartbeat) -> None:

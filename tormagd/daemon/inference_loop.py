@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Callable
+from typing import Final
 
 from tormagd.assembly.journal import Journal
 from tormagd.control.believe.believe import Learned
@@ -10,6 +11,7 @@ from tormagd.control.core import Planner
 from tormagd.control.records import Measured
 from tormagd.daemon.endpoint import Endpoint
 from tormagd.daemon.rate_group import RateGroup
+from tormagd.daemon.search_process import SearchProcess
 
 LEARNT_SHARE = 0.01
 "By how much of itself one plan moves the slack, however long it was interrupted."
@@ -34,9 +36,12 @@ class InferenceLoop:
         *,
         journal: Journal,
         on_failure: Callable[[], None],
+        beside: SearchProcess | None = None,
     ) -> None:
+        """`beside` is the search for the field where it is not part of the plans."""
         self.planner, self._endpoint, self._clock_ns, self._journal = planner, endpoint, clock_ns, journal
         self._on_failure, self._failure = on_failure, ""
+        self.beside: Final = beside
         self.timing = RateGroup("inference", period_ns)
         self._due_ns = 0  # the first is due with the first tick: what the daemon does before that is no stall
         self._waiting_ns = 0
@@ -91,12 +96,18 @@ class InferenceLoop:
         self._slack_ns = min(moved_ns, MOST_SLACK_NS)
 
     def _make_plan(self, now_s: float, measured: Measured | None) -> None:
-        setpoint = self._endpoint.inbox.newest
+        setpoint, beside = self._endpoint.inbox.newest, self.beside
+        answer = None if beside is None else beside.answer()
+        if answer is not None:
+            self._journal.answered(answer)
+            self.planner.answered(answer)
         self._journal.planned(now_s, setpoint)
         try:
             self.planner.plan(now_s, setpoint, measured)
         except PLAN_ERRORS as error:
             self._begin_afresh(now_s, error)
+        if beside is not None:
+            beside.ask(self.planner.question)
 
     def _foresee(self, now_s: float) -> None:
         try:

@@ -75,7 +75,7 @@ def _start(options: argparse.Namespace) -> int:
         return 0
     try:
         uvloop.run(_run(config, core, backend.open, keys, partial(_configured, options)))
-    except OSError as error:
+    except (ConfigError, OSError) as error:
         write_line(f"tormagd: {printable(str(error))}", sys.stderr)
         return 1
     return 0
@@ -115,12 +115,14 @@ async def _run(
     from tormagd.daemon.daemon import Daemon
     from tormagd.daemon.profiles import state_folder
     from tormagd.daemon.realtime import prepare
+    from tormagd.daemon.search_process import SearchProcess
 
     # before this thread is a real-time one: the process that is started keeps off its processors
     folder = state_folder(config.black_box.folder, "blackbox")
     box = BlackBox(folder, {} if folder is None else header(config, core), config.rates.control_hz)
+    beside = SearchProcess(config, core) if core.element.is_beside else None
     refused = prepare(config.realtime)
-    await Daemon(config, core, open_backend, refused, keys, box, read_again).run()
+    await Daemon(config, core, open_backend, refused, keys, box, read_again, beside).run()
 
 
 def _print_resolved(config: Config, core: "Core", options: msgspec.Struct) -> None:

@@ -85,6 +85,7 @@ def tick_record(
         lateness_us,
         exec_us,
         number,
+        plan.search_age_s,
     )
 
 
@@ -139,4 +140,5 @@ def snapshot(
         confidence=tick.confidence,
         tick=Tick(lateness_us=tick.lateness_us, exec_us=tick.exec_us),
         belief=belief,
+        search_age_ms=tick.search_age_s * 1e3,
     )

@@ -76,7 +76,9 @@ class TelemetryLoop:
         self._connection, self._endpoint = connection, endpoint
         self._callbacks, self._causes, self._box = callbacks, causes, box
         self.timing = RateGroup("telemetry", NS // config.rates.telemetry_hz)
-        self._groups = (control.timing, inference.timing, self.timing)
+        self._groups = [control.timing, inference.timing, self.timing]
+        if inference.beside is not None:
+            self._groups.append(inference.beside.timing)
         self._newest: Telemetry
         self._started_s = time.monotonic()
         self._ticks: list[TickRecord] = []

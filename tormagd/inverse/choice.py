@@ -2,15 +2,15 @@
 
 from typing import NamedTuple
 
-from tormagd.inverse.bracketed import BracketedSearch, Refinement, finer_grid, newton
-from tormagd.inverse.nearest import NearestFieldSearch
+from tormagd.inverse.nearest import NearestFieldSearch, field_grid
 from tormagd.inverse.newton import RisingSearch
 from tormagd.inverse.solution import FieldSolver
+from tormagd.model.model_file import ForceModel
 from tormagd.physics.errors import DomainError
 
 
 class Choice(NamedTuple):
-    """A search with its settings, and why it was taken, for the log."""
+    """A search with its settings, and why it was taken, for the log. What a search does not have is 0."""
 
     solver: str
     step_mT: float
@@ -18,35 +18,57 @@ class Choice(NamedTuple):
     reason: str
 
 
-_REFINEMENTS: dict[str, Refinement] = {"coarse-to-fine": finer_grid, "newton": newton}
+_USUAL = {"newton": (0.0, 0), "nearest": (2.0, 4), "torch": (1.0, 4), "thesis": (1.0, 0)}
+"Step of the grid, mT, and neighbours."
 
-RUNTIME_SOLVERS = ("nearest", *_REFINEMENTS)
-"""The searches that the daemon may run. They answer from the curve alone and keep the branch of the last field."""
-
-_USUAL_STEP_MT = {"nearest": 2.0, "coarse-to-fine": 20.0, "newton": 20.0}
-_USUAL_NEIGHBOURS = 4
+RUNTIME_SOLVERS = tuple(_USUAL)
+OF_TORCH = ("torch", "thesis")
+"They ask the network itself in torch, which is loaded for them only; the others ask the curve."
+BESIDE_PLANS = ("thesis",)
+"They take longer than a plan has: they run in a process of their own."
 
 
 def named(
     solver: str, step_mT: float | None = None, neighbours: int | None = None, reason: str = "named by the scene"
 ) -> Choice:
-    """A search by its name, with its usual settings where none are given. Raises `DomainError` on another name."""
-    if solver not in RUNTIME_SOLVERS:
+    """A search by its name, with its usual settings where none are given. Raises `DomainError` on another name, or a
+    setting that the search does not have."""
+    if solver not in _USUAL:
         raise DomainError("solver.name", repr(solver), f"one of {', '.join(RUNTIME_SOLVERS)}")
-    step_mT = _USUAL_STEP_MT[solver] if step_mT is None else step_mT
-    neighbours = _USUAL_NEIGHBOURS if neighbours is None else neighbours
-    return Choice(solver, step_mT, neighbours, reason)
+    settings = []
+    for key, given, usual in zip(("step_mT", "neighbours"), (step_mT, neighbours), _USUAL[solver], strict=True):
+        if given is not None and not usual:
+            raise DomainError(f"solver.{key}", given, f"none beside solver.name = {solver!r}")
+        settings.append(usual if given is None else given)
+    return Choice(solver, float(settings[0]), int(settings[1]), reason)
 
 
-def build(choice: Choice, field_range_mT: tuple[float, float], *, rises: bool) -> FieldSolver:
-    """The search that was chosen. Raises `DomainError` where its settings do not fit the range.
+def build(choice: Choice, field_range_mT: tuple[float, float], model: ForceModel, *, rises: bool) -> FieldSolver:
+    """The search that was chosen, over these fields. `rises` says that every curve of the model rises over them.
 
-    `rises` says that every curve is known to rise over the range: "newton" then needs no look for other roots, and has
-    no settings.
+    Raises `DomainError` where its settings do not fit the range, where Newton's method would have several roots, or
+    where torch is not installed.
     """
-    if choice.solver == "newton" and rises:
+    if choice.solver == "newton":
+        if not rises:
+            raise DomainError("solver.name", "'newton'", "nearest or torch where the model's force falls somewhere")
         return RisingSearch(field_range_mT)
+    fields_mT = field_grid(field_range_mT, choice.step_mT)
     if choice.solver == "nearest":
-        return NearestFieldSearch(field_range_mT=field_range_mT, step_mT=choice.step_mT, neighbours=choice.neighbours)
-    refine = _REFINEMENTS[choice.solver]
-    return BracketedSearch(field_range_mT=field_range_mT, refine=refine, step_mT=choice.step_mT)
+        return NearestFieldSearch(fields_mT, choice.neighbours)
+    try:
+        from tormagd.inverse import ordered
+    except ModuleNotFoundError as error:
+        allowed = f"one of {', '.join(name for name in RUNTIME_SOLVERS if name not in OF_TORCH)} without it"
+        raise DomainError("solver.name", f"{choice.solver!r}, which needs the package {error.name}", allowed) from error
+    if choice.solver == "torch":
+        return NearestFieldSearch(fields_mT, choice.neighbours, ordered.batch(model, fields_mT))
+    return ordered.RowByRow(fields_mT, mean_error_N(model), ordered.row(model))
+
+
+def mean_error_N(model: ForceModel) -> float:
+    """The mean error of the force that its training states of `model`. Raises `DomainError` where it states none."""
+    metrics = model.metadata.metrics
+    if "validation_mae_N" not in metrics:
+        raise DomainError("validation_mae_N", "missing in the model's metrics", "a model that states its mean error")
+    return metrics["validation_mae_N"]

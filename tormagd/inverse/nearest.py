@@ -1,5 +1,7 @@
 """The k-nearest search: the force at every field of a grid at once, the nearest of them, and of those one branch."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,9 @@ from tormagd.model.force_curve import Floats, ForceCurve
 from tormagd.physics.errors import DomainError
 
 MAX_GRID_POINTS = 100_000
+
+Batch = Callable[[ForceCurve], Floats]
+"The force, N, at every field of a grid, for a state of the handle."
 
 
 def field_grid(field_range_mT: tuple[float, float], step_mT: float) -> NDArray[np.float64]:
@@ -40,11 +45,12 @@ class NearestFieldSearch:
     rises with the field there is one root, and one neighbour finds it. Where it also falls there are several, each on
     a branch of its own: with too few neighbours all of them may lie on another branch than the last field's.
 
-    `field_range_mT` and `step_mT` make the grid. Raises `DomainError` on parameters it cannot use.
+    `fields_mT` is an even grid, as `field_grid` makes it. `batch` tells the forces on it; the curve itself where none
+    is given. Raises `DomainError` on parameters it cannot use.
     """
 
-    def __init__(self, *, field_range_mT: tuple[float, float], step_mT: float = 2.0, neighbours: int = 8) -> None:
-        self._fields_mT = field_grid(field_range_mT, step_mT)
+    def __init__(self, fields_mT: NDArray[np.float64], neighbours: int = 8, batch: Batch | None = None) -> None:
+        self._fields_mT, self._batch = fields_mT, batch
         points = len(self._fields_mT)
         if not 1 <= neighbours <= points:
             raise DomainError("neighbours", neighbours, f"1 to the number of grid points, {points}")
@@ -54,7 +60,8 @@ class NearestFieldSearch:
     def solve(self, curve: ForceCurve, force_N: float, last_field_mT: float | None) -> FieldSolution:
         """See `FieldSolver.solve`."""
         near = checked_near_mT(force_N, last_field_mT, float(self._fields_mT[0]))
-        candidates, reach = self._candidates(curve.forces_N(self._fields_mT) - force_N, near, tie_N(curve))
+        forces_N = curve.forces_N(self._fields_mT) if self._batch is None else self._batch(curve)
+        candidates, reach = self._candidates(forces_N - force_N, near, tie_N(curve))
         field_mT = float(candidates[np.abs(candidates - near).argmin()])
         return answer(curve, field_mT, force_N, curve.force_N(field_mT), 2, reach)
 

@@ -34,6 +34,30 @@ class FieldSolution(Value):
         self.reach: Final = reach
 
 
+@final
+class Question(Value):
+    """What a search beside the plans is asked at `time_s`: the field at which the brake gives `force_N`, the handle
+    being taken to move so; of several the one nearest `last_field_mT`."""
+
+    def __init__(
+        self, time_s: float, displacement_mm: float, rate_mm_s: float, force_N: float, last_field_mT: float
+    ) -> None:
+        self.time_s: Final = time_s
+        self.displacement_mm: Final = displacement_mm
+        self.rate_mm_s: Final = rate_mm_s
+        self.force_N: Final = force_N
+        self.last_field_mT: Final = last_field_mT
+
+
+@final
+class Answer(Value):
+    """What a search beside the plans found for the question of `time_s`."""
+
+    def __init__(self, time_s: float, solution: FieldSolution) -> None:
+        self.time_s: Final = time_s
+        self.solution: Final = solution
+
+
 TIE: Final = 16.0 * 2.0**-52
 "A sum of as many terms as a network has units is wrong by a few units of rounding: forces that near are the same."
 

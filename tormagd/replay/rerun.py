@@ -17,6 +17,7 @@ from tormagd.daemon.telemetry import tick_record
 from tormagd.exact import first_difference, packed, plain, restore, restored
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
+from tormagd.inverse.solution import Answer
 from tormagd.recording.black_box import frames_in, is_tick
 from tormagd.replay.conversation import Conversation, Damage, Found
 from tormagd.replay.rebuild import ReplayError
@@ -195,11 +196,14 @@ class _Running:
             case journal.AFRESH:
                 self._failure = None
                 self._planner.afresh(msgspec.convert(entry[1], float))
-            case journal.TEACH:
-                learned = restored(entry[1], KNOWN)
-                if not isinstance(learned, Learned):
-                    raise ValueError(f"{learned!r}: allowed is what is learned of a device")
-                self._planner.teach(learned)
+            case journal.TEACH | journal.ANSWER:
+                told = restored(entry[1], KNOWN)
+                if not isinstance(told, Learned | Answer):
+                    raise ValueError(f"{told!r}: allowed is what is learned of a device, or what a search found")
+                if isinstance(told, Learned):
+                    self._planner.teach(told)
+                else:
+                    self._planner.answered(told)
             case journal.COMMAND:
                 command, now_s, was_refused, given = msgspec.convert(entry[1:], tuple[str, float, bool, dict[str, Any]])
                 try:

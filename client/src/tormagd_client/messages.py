@@ -94,7 +94,8 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     """What the daemon is doing, 50 times a second. Forces in N, lengths in mm, `t_ns` CLOCK_REALTIME.
 
     `measured_cf` is the force sensor's, `predicted_cf` the model's at the measured gap and motion; `belief` is what is
-    believed of the device, by name. A value that is not known (no device, no setpoint) is null.
+    believed of the device, by name. `search_age_ms` is how long ago the search for `field_mT` began, where it runs beside
+    the plans. A value that is not known (no device, no setpoint) is null.
     """
 
     v: int
@@ -119,6 +120,7 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     confidence: float | None
     tick: Tick
     belief: dict[str, BeliefReport] = {}
+    search_age_ms: float = 0.0
 
 
 class Explained(msgspec.Struct, frozen=True):
@@ -462,6 +464,8 @@ class TickRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
     lateness_us: float
     exec_us: float
     tick: int = 0
+    # the plan's, where its search runs beside the plans
+    search_age_s: float = 0.0
 
 
 class Request(msgspec.Struct, frozen=True, kw_only=True):

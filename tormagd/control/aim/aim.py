@@ -20,14 +20,19 @@ from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.nominal import Nominal
 from tormagd.control.records import Ask, Belief, Measured, Outside, Plan, TimedSetpoint
-from tormagd.inverse.solution import FieldSolution, FieldSolver, Reach
+from tormagd.inverse.solution import Answer, FieldSolution, FieldSolver, Question, Reach
 from tormagd.model.features import FEATURES
+from tormagd.model.force_curve import ForceCurve
 from tormagd.model.memory import Memory
+from tormagd.physics.errors import DomainError
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import Scene
 
 # looking a member up takes longer than comparing it
 _INSIDE: Final = Reach.INSIDE
+
+OLDEST_ANSWER_S: Final = 0.25
+"Of a search beside the plans: it takes a tenth of this. With an older one planning fails, and the gap opens."
 
 _PARABOLA: Final = np.linalg.pinv(np.stack([np.array(PATH_S), np.array(PATH_S) ** 2 / 2.0], axis=1))
 _TO_SPEED: Final[list[float]] = _PARABOLA[0].tolist()
@@ -37,7 +42,8 @@ _TO_ACCELERATION: Final[list[float]] = _PARABOLA[1].tolist()
 
 class Element(NamedTuple):
     """How the nominal device makes force: the model and its memory, the field over the gap, the force over the gap
-    (without memory), the search for a field, and the force law beside the model; of a pad no law is known."""
+    (without memory), the search for a field, and the force law beside the model; of a pad no law is known.
+    `is_beside`: the search takes longer than a plan has, and runs beside the plans."""
 
     nominal: Nominal
     memory: Memory
@@ -45,6 +51,7 @@ class Element(NamedTuple):
     portrait: Portrait
     search: FieldSolver
     law: LawOfField | None
+    is_beside: bool = False
 
 
 @final
@@ -55,12 +62,17 @@ class Aim:
     "Of the newest plan."
     element_mT: float = 0.0
     "The element's field at it: where several fields give a force, the one nearest to this is taken."
+    question: Question | None = None
+    "What a search beside the plans is to be asked; None where plans search themselves."
+    answer: Answer
+    "Its newest, which plans use until the next one comes."
 
     def __init__(self, config: Config, scene: Scene, element: Element) -> None:
         self._nominal: Final = element.nominal
         self._field: Final = element.field
         self._portrait: Final = element.portrait
         self._search: Final = element.search
+        self._is_beside: Final = element.is_beside
         self._law: Final = element.law
         self._closed_mm: Final = scene.insert.gap_closed_mm
         self._open_mm: Final = scene.insert.gap_open_mm
@@ -74,6 +86,7 @@ class Aim:
         field_mT = self._field.field_mT(self._open_mm)
         self.number, self.element_mT = number, field_mT - lag_mT
         min_N = self._portrait.min_N
+        self.answer = Answer(now_s, FieldSolution(self.element_mT, min_N, 1.0, 0, _INSIDE))
         return Plan(number, now_s, None, None, min_N, None, field_mT, self._open_mm, 0.0, 1.0, (Limit.NO_SETPOINT,))
 
     def update(
@@ -90,7 +103,7 @@ class Aim:
         device = belief.device
         curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
         wanted_N = device.model_N(ask.path_N[0])
-        solution = self._search.solve(curve, wanted_N, self.element_mT)
+        solution = self._solution(now_s, curve, wanted_N)
         element_mT = lawful_mT(self._law, wanted_N, solution.field_mT)
         if element_mT != solution.field_mT:
             outside = (*outside, Outside(FEATURES[2], solution.field_mT, element_mT))
@@ -103,6 +116,21 @@ class Aim:
         limits = self._limits(ask, belief.limits, outside, min_mm > wanted_mm, solution)
         gap_mm, confidence = max(wanted_mm, min_mm), solution.confidence
         return self._plan(now_s, setpoint, ask, belief, field_mT, gap_mm, min_mm, confidence, limits, outside)
+
+    def found(self, question: Question) -> Answer:
+        """What the search answers: for who runs it beside the plans. Raises DomainError."""
+        curve = self._nominal.curve(question.displacement_mm, question.rate_mm_s)
+        return Answer(question.time_s, self._search.solve(curve, question.force_N, question.last_field_mT))
+
+    def _solution(self, now_s: float, curve: ForceCurve, wanted_N: float) -> FieldSolution:
+        """The field for this force; where the search runs beside the plans, its newest answer."""
+        if not self._is_beside:
+            return self._search.solve(curve, wanted_N, self.element_mT)
+        self.question = Question(now_s, curve.displacement_mm, curve.rate_mm_s, wanted_N, self.element_mT)
+        age_s = now_s - self.answer.time_s
+        if age_s > OLDEST_ANSWER_S:
+            raise DomainError("solver", f"no answer for {age_s:.2f} s", f"one not older than {OLDEST_ANSWER_S:g} s")
+        return self.answer.solution
 
     def _plan(
         self,
@@ -138,6 +166,7 @@ class Aim:
             sensor_doubted_s=belief.sensor_doubted_s,
             trim=ask.force_N / model_N if model_N > 0.0 else belief.at_speed.scale,
             stamp_s=setpoint.stamp_s if setpoint is not None and ask.is_meant else -math.inf,
+            search_age_s=now_s - self.answer.time_s if self._is_beside else 0.0,
         )
 
     def _limits(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from tormagd.inverse.nearest import NearestFieldSearch
+from tormagd.inverse.nearest import NearestFieldSearch, field_grid
 from tormagd.lab.training.metrics import not_rising_share
 from tormagd.model.model_file import ForceModel, load_model
 from tormagd.model.shipped import model_path
@@ -75,7 +75,7 @@ def measured_on(model_name: str, element: str, range_mT: tuple[float, float]) ->
     at = contacts(model, range_mT, SHALLOW_MM if element == "tactile" else None)
     rows = [
         {"neighbours": count}
-        | followed(NearestFieldSearch(field_range_mT=range_mT, neighbours=count), model, at, path_mT)
+        | followed(NearestFieldSearch(field_grid(range_mT, 2.0), count), model, at, path_mT)
         for count in NEIGHBOURS
     ]
     most = np.array(rows[-1]["answers"])

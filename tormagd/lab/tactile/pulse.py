@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tormagd.inverse.linear import LinearFieldSearch
-from tormagd.inverse.nearest import NearestFieldSearch
+from tormagd.inverse.nearest import NearestFieldSearch, field_grid
+from tormagd.inverse.ordered import RowByRow
 from tormagd.inverse.solution import FieldSolver, Reach
 from tormagd.lab.arrays import Array, Mask
 from tormagd.lab.human_pulse import pulse_profile
@@ -24,6 +24,8 @@ RATE_HZ = 160
 """As many samples as the thesis, so dense that the 25 s of measured pulse suffice."""
 REFERENCE_FIELDS_MT = (100.0, 200.0)
 FIELDS_MT = (0.0, FULL_FIELD_MT)
+THESIS_EPSILON_N = 1.26
+"Radius of the neighbourhood in the thesis: the mean error of its network."
 OTHER_PADS = (1, 2)
 SENSOR_SEED = 7
 SHAPE = "measured photoplethysmogram (heartpy)"
@@ -143,7 +145,7 @@ def course(pad: PadParameters, shape: Array, every: int = 1) -> Course:
 
 def nearest() -> NearestFieldSearch:
     """The search of the experiment."""
-    return NearestFieldSearch(field_range_mT=FIELDS_MT)
+    return NearestFieldSearch(field_grid(FIELDS_MT, 2.0))
 
 
 def aware_fields(trained: Trained, along: Course, force_N: Array) -> Array:
@@ -156,7 +158,7 @@ def pulse_on(along: Course, trained: Trained) -> tuple[dict[str, Any], dict[str,
     """Scores of each way to the field, and the traces."""
     noise_N = trained.noise_N
     noisy_N = along.force_N + np.random.default_rng(SENSOR_SEED).normal(0.0, noise_N, len(along.force_N))
-    linear = LinearFieldSearch(field_range_mT=FIELDS_MT)
+    linear = RowByRow(field_grid(FIELDS_MT, 1.0), THESIS_EPSILON_N, lambda curve, field_mT: curve.force_N(field_mT))
     ways = {
         "mlp": solve_all(nearest(), trained.model, along.features, along.force_N, None)[0],
         "mlp_thesis_search": solve_all(linear, trained.model, along.features, along.force_N, None)[0],

@@ -1,0 +1,111 @@
+"""The search that takes longer than a plan has, in a process of its own: `python -m tormagd.daemon.search_process FD`.
+
+It answers one question after the other over a socket of packets. The daemon waits for none: a plan takes the newest
+answer, and asks the next question when the last was answered and a period has passed. Both ends are of one installation
+and one parent, so what passes is pickled.
+"""
+
+import logging
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+from tormagd.assembly.build import Core, build_core
+from tormagd.config import Config
+from tormagd.daemon.rate_group import RateGroup
+from tormagd.inverse.solution import Answer, Question
+from tormagd.physics.errors import DomainError
+from tormagd_client.endpoints import ConfigError
+
+STARTS_S = 60.0
+"Loading torch takes seconds, on a cold disk more."
+MOST_PACKET = 65_536
+
+log = logging.getLogger(__name__)
+
+
+class SearchProcess:
+    """The daemon's end. To be made before the daemon's thread is a real-time one, whose processors the search would
+    have. Raises ConfigError where the search does not start."""
+
+    def __init__(self, config: Config, core: Core) -> None:
+        self.timing = RateGroup("search", 1_000_000_000 // config.rates.inference_hz)
+        self._asked_ns = self._due_ns = 0
+        self._is_idle = True
+        self._socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with its:
+            command = [sys.executable, "-P", "-m", __name__, str(its.fileno())]
+            self._process = subprocess.Popen(command, pass_fds=(its.fileno(),), stdin=subprocess.DEVNULL)
+        self._socket.settimeout(STARTS_S)
+        try:
+            self._socket.send(pickle.dumps((config, core.scene, core.models)))
+            started = self._socket.recv(MOST_PACKET)
+        except OSError:
+            started = b""
+        if not started:
+            self.close()
+            raise ConfigError(f"solver.name = {core.solver.solver!r}: its process did not start within {STARTS_S:g} s")
+        self._socket.setblocking(False)
+
+    def answer(self) -> Answer | None:
+        """What it found, if it has since the last time. Never waits."""
+        if self._is_idle:
+            return None
+        try:
+            data = self._socket.recv(MOST_PACKET)
+        except BlockingIOError:
+            return None
+        except OSError:
+            data = b""
+        if not data:  # it stays asked: plans fail, once its last answer is too old
+            return None
+        self._is_idle = True
+        self.timing.record(self._due_ns, self._asked_ns, time.monotonic_ns())
+        found: Answer | DomainError = pickle.loads(data)
+        if isinstance(found, Answer):
+            return found
+        log.error("the search found no field: %s", found)
+        return None
+
+    def ask(self, question: Question | None) -> None:
+        """Asks, unless a question is open or the next is not due yet."""
+        now_ns, period_ns = time.monotonic_ns(), self.timing.period_ns
+        if question is None or not self._is_idle or now_ns < self._due_ns + period_ns:
+            return
+        self._due_ns += period_ns
+        if now_ns - self._due_ns > period_ns:  # what was missed is not made up for
+            self._due_ns = now_ns
+        self._asked_ns = now_ns
+        try:
+            self._socket.send(pickle.dumps(question))
+            self._is_idle = False
+        except OSError as error:
+            log.error("the search beside the plans has ended: %s; restart the daemon", error.strerror)
+
+    def close(self) -> None:
+        """Ends the process."""
+        self._socket.close()
+        self._process.kill()
+        self._process.wait()
+
+
+def main() -> None:
+    """Answers until the daemon is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with socket.socket(fileno=int(sys.argv[1])) as asked:
+        config, scene, models = pickle.loads(asked.recv(MOST_PACKET))
+        aim = build_core(config, scene, models).planner().aim
+        asked.send(b"ready")
+        while data := asked.recv(MOST_PACKET):
+            try:
+                found: Answer | DomainError = aim.found(pickle.loads(data))
+            except DomainError as error:
+                found = error
+            asked.send(pickle.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
