@@ -38,7 +38,7 @@ MAY_IMPORT = {
     "assembly": DECIDES | {"messages", "exact", "keeping", "control"},
     "daemon": LOWEST
     | FILES
-    | {"output", "keys", "keeping", "slices", "scenes", "safety", "hardware", "control", "assembly"},
+    | {"output", "keys", "keeping", "slices", "inverse", "scenes", "safety", "hardware", "control", "assembly"},
     "recording": FILES | {"messages", "output", "keeping"},
     "client": {"config", "keys", "messages", "output"},
     "dashboard": {"client", "messages", "output", "recording", "safety"},
@@ -46,9 +46,9 @@ MAY_IMPORT = {
     "simulation": FILES | {"force_file", "physics", "firmware_protocol", "output", "slices"},
     "headroom": {"config", "output", "daemon", "control", "assembly", "simulation", "closed_loop"},
     "replay": LOWEST
-    | {"exact", "keeping", "output", "recording", "model", "scenes", "safety", "hardware", "control", "daemon"}
+    | {"exact", "keeping", "output", "recording", "model", "inverse", "scenes", "safety", "hardware", "control", "daemon"}
     | {"assembly", "simulation", "closed_loop"},
-    "closed_loop": LOWEST | {"control", "assembly", "hardware", "safety", "simulation"},
+    "closed_loop": LOWEST | {"inverse", "control", "assembly", "hardware", "safety", "simulation"},
 }
 MAY_IMPORT["lab"] = set(MAY_IMPORT) - {"entry"}
 """The laboratory may import every room, and nothing imports it."""

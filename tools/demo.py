@@ -5,15 +5,18 @@
 Each part is a process of its own, as it would be beside a console; `rendering/show.py` starts them and watches, this
 one judges and sums up. What is called rendered is the plant's friction force at the roller, never the controller's
 prediction. A show that the host disturbed is told as that, and started again; the same pulse in virtual time needs no
-host.
+host. At the end the ordered loops are shown, for some seconds each: the search in torch, and the thesis's own; they decide
+nothing.
 """
 
 import argparse
 import concurrent.futures
+import contextlib
 import signal
 import sys
 import time
 from enum import IntEnum
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -46,6 +49,9 @@ MOST_SPACING = 1.5
 """Time between the fastest ticks, periods, above which the software itself is slow: a host takes at times, and between
 them even software that starves keeps the period."""
 THESIS_GAP_SPEED_MM_S = 8.33
+SCENES = Path(__file__).parents[1] / "examples" / "scenes"
+ORDERED = {"torch, one batch, 500 Hz": "torch", "thesis, row by row, 83 Hz, 8.33 mm/s": "thesis"}
+ORDERED_PULSE_S = 4.0
 CASES = (
     Case("sample 1"),
     Case("sample 2", plant="sample_2"),
@@ -79,7 +85,9 @@ def main() -> int:
         print(f"{sentence}; the show is started again ({number + 1} of {SHOWS})")
     print("The same pulse in virtual time, on the other plant samples:")
     rehearsals = rehearse_all(config, times_s, forces_N)
-    return conclude(scene, shown, rehearsals, verdict, sentence, time.monotonic() - started_s)
+    print("The same pulse, its field searched as it was ordered, in real time:")
+    ordered = show_ordered()
+    return conclude(scene, shown, rehearsals, ordered, verdict, sentence, time.monotonic() - started_s)
 
 
 def judge(scene: Scene, shown: Shown | Aborted) -> tuple[Verdict, str]:
@@ -160,10 +168,22 @@ def rehearse_all(config: Config, times_s: Array, forces_N: Array) -> Rehearsals:
     return done
 
 
+def show_ordered() -> dict[str, Shown | Aborted]:
+    """Each ordered loop live, in a folder of its own beside the demonstration's."""
+    done: dict[str, Shown | Aborted] = {}
+    for label, name in ORDERED.items():
+        folder = Path("run") / name
+        folder.mkdir(parents=True, exist_ok=True)
+        with contextlib.chdir(folder):
+            done[label] = show(*profile(ORDERED_PULSE_S), str(SCENES / f"{name}.toml"))
+    return done
+
+
 def conclude(
     scene: Scene,
     shown: Shown | Aborted,
     rehearsals: Rehearsals,
+    ordered: dict[str, Shown | Aborted],
     verdict: Verdict,
     sentence: str,
     seconds: float,
@@ -171,6 +191,7 @@ def conclude(
     """Prints the summary, writes it and the picture; the exit code."""
     met = in_virtual_time = virtual_time_checks(scene, rehearsals)
     print_forces(shown, rehearsals)
+    print_ordered(shown, ordered)
     summary: dict[str, Any] = {
         "virtual_time": {case.label: found.since(PULSE_START_S)._asdict() for case, found in rehearsals.items()},
         "host": shown.host._asdict(),
@@ -240,6 +261,22 @@ def force_table(shown: Shown | Aborted, rehearsals: Rehearsals) -> list[str]:
     width = max(map(len, rows), default=0)
     heading = f"  {'':{width}s} {'RMS':>8s} {'worst':>8s}  variance accounted for"
     return [heading, *(f"  {label:{width}s} {line}" for label, line in rows.items())]
+
+
+def print_ordered(shown: Shown | Aborted, ordered: dict[str, Shown | Aborted]) -> None:
+    """The ordered loops beside the one that runs usually: forces, searches a second, plans, processor time."""
+    print(f"\nthe field searched for otherwise, {ORDERED_PULSE_S:g} s of the pulse each, real time, plant sample 1:")
+    for label, found in {"k-nearest, as above": shown, **ordered}.items():
+        if isinstance(found, Aborted):
+            print(f"  {label:36s} ended early: {found.error.cause}")
+            continue
+        rates = found.status["rates"]
+        plan, searched = rates["inference"], rates.get("search", rates["inference"])
+        result = scored(found.time_s, found.asked_N, found.rendered_N)
+        print(
+            f"  {label:36s} {numbers(result)}  {searched['hz']:4.0f} searches/s, p99 {searched['exec_us']['p99']:.0f} us, "
+            f"plan p99 {plan['exec_us']['p99']:.0f} us, {found.core_share:.0%} of a processor"
+        )
 
 
 def print_timing(shown: Shown) -> None:

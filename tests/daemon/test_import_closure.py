@@ -74,7 +74,6 @@ def test_the_daemon_loads_the_model_and_nothing_of_its_training() -> None:
         "tormagd.model.shipped",
     }
     assert {name for name in ours.split() if name.startswith("tormagd.inverse.")} == {
-        "tormagd.inverse.bracketed",
         "tormagd.inverse.choice",
         "tormagd.inverse.nearest",
         "tormagd.inverse.newton",

@@ -54,7 +54,7 @@ def test_a_plan_uses_the_newest_answer_asks_anew_and_says_how_old_it_is(core: Co
         assert plan.search_age_s == pytest.approx(0.02)
         assert planner.question != question
     assert plan.governed_N == pytest.approx(1.5)
-    assert plan.gap_mm == pytest.approx(core.portrait.gap_mm_at(1.5), abs=0.5)
+    assert plan.gap_mm == pytest.approx(core.portrait.gap_mm_at(1.5), abs=2.0)  # of another handle
 
 
 def test_the_force_law_guards_every_plan_whatever_was_answered(core: Core) -> None:
@@ -72,7 +72,7 @@ def test_without_an_answer_for_long_planning_fails_and_begins_anew(core: Core) -
     planner = core.planner(0.0)
     planner.plan(OLDEST_ANSWER_S, setpoint(1.5, 0.1), None)
     late_s = OLDEST_ANSWER_S + 0.01
-    with pytest.raises(DomainError, match=r"solver = no answer for 0\.26 s.*0\.25 s"):
+    with pytest.raises(DomainError, match=r"solver = no answer for 0\.51 s.*0\.5 s"):
         planner.plan(late_s, setpoint(1.5, 0.1), None)
     planner.afresh(late_s)
     assert planner.plan(late_s + 0.01, None, None).gap_mm > 0.99 * core.scene.insert.gap_open_mm

@@ -132,6 +132,7 @@ def test_a_tick_is_recorded_whole() -> None:
         outside=(Outside("rate_mm_s", 1 / 3, 300.0),),
         sensor_doubted_s=0.0625,
         trim=1.1,
+        search_age_s=0.0125,
     )
     safety = SafetyState(OperatingState.PAUSED, (Fault.SKEW, Fault.SENSOR), DeviceRequest.CLEAR, 99)
     stepper = stepped(safety, measurement, 1.5)
@@ -203,6 +204,7 @@ def test_a_tick_is_recorded_whole() -> None:
         "lateness_us": 20.0,
         "exec_us": 150.0,
         "tick": 9,
+        "search_age_s": 0.0125,
     }
 
 

@@ -41,7 +41,7 @@ PAGE = (ROOT / "docs/messages.md").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 TELEMETRY = (
     "v t_ns seq operating_state is_homed is_busy setpoint_cf governed_cf measured_cf predicted_cf field_mT gap_mm "
-    "gap_setpoint_mm measured_jp skew_mm duty limits faults setpoint_age_ms confidence tick belief"
+    "gap_setpoint_mm measured_jp skew_mm duty limits faults setpoint_age_ms confidence tick belief search_age_ms"
 )
 V1: dict[type[msgspec.Struct], str] = {
     Telemetry: TELEMETRY,
@@ -78,7 +78,7 @@ V1: dict[type[msgspec.Struct], str] = {
     "device_left_mm device_right_mm device_handle_mm device_force_N device_mode device_switches device_faults "
     "device_temperature_C left_current_A right_current_A supply_V reference_gap_mm measured_cf left_mm right_mm "
     "handle_mm handle_rate_mm_s operating_state limits step_limits faults drive_mode left_duty right_duty request "
-    "request_number lateness_us exec_us tick",
+    "request_number lateness_us exec_us tick search_age_s",
     Description: "version build configuration scene model profile firmware serial_number portrait",
     PortraitReport: "force_N rate_N_s",
 }

@@ -41,6 +41,7 @@ def shown(**changes):
         spacing_s=1e-3,
         worst_stall_ms=4.0,
         host=QUIET,
+        core_share=0.3,
     )
     return known._replace(**changes)
 
@@ -196,8 +197,10 @@ def test_the_virtual_time_cases_are_shown_in_every_case(show_, verdict, exit_cod
     monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
     found, sentence = demo.judge(SCENE, show_)
     assert found is verdict
-    assert demo.conclude(SCENE, show_, rehearsals(), found, sentence, 60.0) == exit_code
+    ordered = {"torch": show_, "thesis": aborted("PLAN_FAILED", QUIET)}  # which decide nothing
+    assert demo.conclude(SCENE, show_, rehearsals(), ordered, found, sentence, 60.0) == exit_code
     printed = capsys.readouterr().out
+    assert "ended early: PLAN_FAILED" in printed
     for case in demo.CASES:
         assert f"virtual time, {case.label}" in printed
     assert ("no verdict after 3 shows" in printed) == (exit_code == 3)
@@ -207,7 +210,7 @@ def test_the_virtual_time_cases_are_shown_in_every_case(show_, verdict, exit_cod
 def test_a_virtual_time_case_that_fails_is_missed_whatever_the_host_did(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(demo, "RUN_DIR", tmp_path)
     for verdict in (demo.Verdict.MET, demo.Verdict.HOST):
-        assert demo.conclude(SCENE, shown(), dict(list(rehearsals().items())[1:]), verdict, "", 60.0) == 1
+        assert demo.conclude(SCENE, shown(), dict(list(rehearsals().items())[1:]), {}, verdict, "", 60.0) == 1
     assert "MISSED every case in virtual time done" in capsys.readouterr().out
 
 

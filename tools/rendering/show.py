@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from machines.host import Host, HostWatch
+from machines.host import Host, HostWatch, processor_s
 from machines.own import end, own_machine
 from machines.wire import carried
 
@@ -37,7 +37,10 @@ RECORDING = RUN_DIR / "pulse.mcap"
 ADDRESS = "ipc://run/demo/{}"
 DAEMON_FIFO = 50
 DEVICE_FIFO, PUBLISHER_FIFO = DAEMON_FIFO - 10, DAEMON_FIFO - 20
-CONFIG = f"""scene = "pulse"
+CONFIG = f"""scene = "{{scene}}"
+
+[rates]
+of_scene = true
 
 [device]
 port = "{{port}}"
@@ -122,6 +125,8 @@ class Shown(NamedTuple):
     spacing_s: float
     worst_stall_ms: float
     host: Host
+    core_share: float
+    "Processor time of the daemon and what it has begun, over the time shown."
 
 
 class Aborted(NamedTuple):
@@ -142,6 +147,7 @@ class Course(NamedTuple):
     after: dict[str, Any]
     limits: dict[str, float]
     exit_codes: dict[str, int]
+    core_share: float
 
 
 def profile(duration_s: float = PULSE_S) -> tuple[Array, Array]:
@@ -155,7 +161,7 @@ def scored(time_s: Array, asked_N: Array, rendered_N: Array) -> Tracking:
     return tracking(asked_N[pulse], rendered_N[pulse])
 
 
-def show(times_s: Array, forces_N: Array) -> Shown | Aborted:
+def show(times_s: Array, forces_N: Array, scene: str = "pulse", plant: str = "sample_1") -> Shown | Aborted:
     """Starts the processes, plays the profile with a live view, ends them in order."""
     shutil.rmtree(RUN_DIR, ignore_errors=True)
     RUN_DIR.mkdir(parents=True)
@@ -168,7 +174,7 @@ def show(times_s: Array, forces_N: Array) -> Shown | Aborted:
     ):
         began_s = time.monotonic()
         try:
-            course = play(watched, float(times_s[-1]))
+            course = play(watched, float(times_s[-1]), scene, plant)
             watched.end()
             return judged(course, watched.between(course.start_s, course.end_s), times_s, forces_N)
         except ShowError as error:
@@ -178,12 +184,12 @@ def show(times_s: Array, forces_N: Array) -> Shown | Aborted:
             return Aborted(error, host, spacing_s)
 
 
-def play(watched: HostWatch, duration_s: float) -> Course:
+def play(watched: HostWatch, duration_s: float, scene: str, plant: str) -> Course:
     """One show from the first process to the last. Raises ShowError."""
     codes: dict[str, int] = {}
     truth = str(RUN_DIR / "truth.csv")
     with contextlib.ExitStack() as stack:
-        options = ("--pty", "--plant", "sample_1", "--seed", "1", "--truth", truth)
+        options = ("--pty", "--plant", plant, "--seed", "1", "--truth", truth)
         device = own_machine(DEVICE_FIFO, "tormagd.simulation", *options)
         simulator = stack.enter_context(process("simulator", *device, is_read=True))
         assert simulator.stdout is not None
@@ -192,7 +198,7 @@ def play(watched: HostWatch, duration_s: float) -> Course:
             raise ended("simulator")
         watched.wait_for("simulated device", simulator.pid)
         config = RUN_DIR / "tormagd.toml"
-        config.write_text(CONFIG.format(port=port))
+        config.write_text(CONFIG.format(port=port, scene=scene))
         daemon = stack.enter_context(process("tormagd", "-m", "tormagd.daemon.main", "--config", str(config)))
         watched.wait_for("daemon", daemon.pid)
         # from the first tick on: it also says how a show went that ended early
@@ -200,12 +206,13 @@ def play(watched: HostWatch, duration_s: float) -> Course:
         client = stack.enter_context(Client.local(ADDRESS.format("").removeprefix("ipc://").rstrip("/"), ANSWER_S))
         wait_for_link(daemon, client)
         arm(client)
-        before, start_s = status(client), time.monotonic()
+        before, start_s, before_s = status(client), time.monotonic(), processor_s(daemon.pid)
         robot = own_machine(PUBLISHER_FIFO, *CTL[1:], "send", str(RUN_DIR / "pulse.csv"), "--rate", str(RATE_HZ))
         publisher = stack.enter_context(process("publisher", *robot, is_read=True))
         limits = watch(publisher, daemon, client, duration_s)
         printed, _ = publisher.communicate(timeout=PATIENCE_S)
         after, end_s = status(client), time.monotonic()
+        core_share = (processor_s(daemon.pid) - before_s) / (end_s - start_s)
         raise_fault(after)
         codes["publisher"] = publisher.returncode
         codes["recorder"] = end(recorder, signal.SIGINT)
@@ -214,7 +221,7 @@ def play(watched: HostWatch, duration_s: float) -> Course:
     answer = json.loads(printed)
     if not answer["ok"]:
         raise ShowError(f"the publisher: {answer['error']['message']}", answer["error"]["hint"], is_of_time=True)
-    return Course(start_s, end_s, answer["result"]["start_ns"], before, after, limits, codes)
+    return Course(start_s, end_s, answer["result"]["start_ns"], before, after, limits, codes, core_share)
 
 
 def judged(course: Course, host: Host, times_s: Array, forces_N: Array) -> Shown:
@@ -242,6 +249,7 @@ def judged(course: Course, host: Host, times_s: Array, forces_N: Array) -> Shown
         spacing_s=float(np.quantile(spacings_s, FASTEST)),
         worst_stall_ms=float(spacings_s.max()) * 1e3,
         host=host,
+        core_share=course.core_share,
     )
 
 

@@ -17,7 +17,6 @@ from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.inverse.solution import Answer, Question
-from tormagd.physics.errors import DomainError
 from tormagd_client.endpoints import ConfigError
 
 STARTS_S = 60.0
@@ -64,7 +63,7 @@ class SearchProcess:
             return None
         self._is_idle = True
         self.timing.record(self._due_ns, self._asked_ns, time.monotonic_ns())
-        found: Answer | DomainError = pickle.loads(data)
+        found: Answer | ValueError = pickle.loads(data)
         if isinstance(found, Answer):
             return found
         log.error("the search found no field: %s", found)
@@ -101,8 +100,8 @@ def main() -> None:
         asked.send(b"ready")
         while data := asked.recv(MOST_PACKET):
             try:
-                found: Answer | DomainError = aim.found(pickle.loads(data))
-            except DomainError as error:
+                found: Answer | ValueError = aim.found(pickle.loads(data))
+            except ValueError as error:
                 found = error
             asked.send(pickle.dumps(found))
 

@@ -31,8 +31,8 @@ from tormagd.scenes.scene import Scene
 # looking a member up takes longer than comparing it
 _INSIDE: Final = Reach.INSIDE
 
-OLDEST_ANSWER_S: Final = 0.25
-"Of a search beside the plans: it takes a tenth of this. With an older one planning fails, and the gap opens."
+OLDEST_ANSWER_S: Final = 0.5
+"Of a search beside the plans, which takes a hundredth of this. With an older one planning fails, and the gap opens."
 
 _PARABOLA: Final = np.linalg.pinv(np.stack([np.array(PATH_S), np.array(PATH_S) ** 2 / 2.0], axis=1))
 _TO_SPEED: Final[list[float]] = _PARABOLA[0].tolist()
