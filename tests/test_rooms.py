@@ -46,7 +46,19 @@ MAY_IMPORT = {
     "simulation": FILES | {"force_file", "physics", "firmware_protocol", "output", "slices"},
     "headroom": {"config", "output", "daemon", "control", "assembly", "simulation", "closed_loop"},
     "replay": LOWEST
-    | {"exact", "keeping", "output", "recording", "model", "inverse", "scenes", "safety", "hardware", "control", "daemon"}
+    | {
+        "exact",
+        "keeping",
+        "output",
+        "recording",
+        "model",
+        "inverse",
+        "scenes",
+        "safety",
+        "hardware",
+        "control",
+        "daemon",
+    }
     | {"assembly", "simulation", "closed_loop"},
     "closed_loop": LOWEST | {"inverse", "control", "assembly", "hardware", "safety", "simulation"},
 }

@@ -5,8 +5,8 @@
 Each part is a process of its own, as it would be beside a console; `rendering/show.py` starts them and watches, this
 one judges and sums up. What is called rendered is the plant's friction force at the roller, never the controller's
 prediction. A show that the host disturbed is told as that, and started again; the same pulse in virtual time needs no
-host. At the end the ordered loops are shown, for some seconds each: the search in torch, and the thesis's own; they decide
-nothing.
+host. At the end the ordered loops are shown, for some seconds each: the search in torch, and the thesis's own; they
+decide nothing.
 """
 
 import argparse
@@ -274,8 +274,8 @@ def print_ordered(shown: Shown | Aborted, ordered: dict[str, Shown | Aborted]) -
         plan, searched = rates["inference"], rates.get("search", rates["inference"])
         result = scored(found.time_s, found.asked_N, found.rendered_N)
         print(
-            f"  {label:36s} {numbers(result)}  {searched['hz']:4.0f} searches/s, p99 {searched['exec_us']['p99']:.0f} us, "
-            f"plan p99 {plan['exec_us']['p99']:.0f} us, {found.core_share:.0%} of a processor"
+            f"  {label:36s} {numbers(result)}  {searched['hz']:4.0f} searches/s, "
+            f"p99 {searched['exec_us']['p99']:.0f} us, plan p99 {plan['exec_us']['p99']:.0f} us, {found.core_share:.0%} of a processor"
         )
 
 

@@ -181,8 +181,8 @@ def _search(scenes: tuple[MeasuredScene, ...]) -> str:
         "search runs it is `newton`: in every scene the cheapest of the searches, with an error that no other "
         "one beats by more than the tolerance's hundredth part, and for networks of 10 to 200 units [exact to 2 uN]"
         "(inverse_trade.md). So nothing picks among them: a brake's model rises with the field everywhere, and one "
-        "neighbour is enough, as it is not on [the pad](tactile.md). `nearest` runs only where a brake's scene names it: "
-        "`pulse` does, to show the k-nearest search in `make run`, which shows `torch` and `thesis` beside it.\n\n"
+        "neighbour is enough, as it is not on [the pad](tactile.md). `nearest` runs only where a brake's scene names "
+        "it: `pulse` does, to show the k-nearest search in `make run`, which shows `torch` and `thesis` beside it.\n\n"
         "RMS on sample 1, mN / processor time, %, with the chosen terms and rates and a search that is named.\n\n"
         + table(["scene", "runs, %", *(f"`{name}`" for name in names)], rows)
     )

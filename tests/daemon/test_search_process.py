@@ -79,7 +79,9 @@ def test_without_an_answer_for_long_planning_fails_and_begins_anew(core: Core) -
 
 
 def test_in_virtual_time_an_answer_comes_a_fixed_time_after_its_question(core: Core) -> None:
-    loop = ClosedLoop(CONFIG, core.stepper(), core.planner(), VirtualDevice(load_plant("sample_1"), SteadyHand(), [], 1))
+    loop = ClosedLoop(
+        CONFIG, core.stepper(), core.planner(), VirtualDevice(load_plant("sample_1"), SteadyHand(), [], 1)
+    )
     loop.arm()
     start_s = loop.now_s
     held = list(loop.run(4.5, lambda now_s: setpoint(1.2, start_s)))[-100:]
@@ -115,12 +117,12 @@ def answered(process: SearchProcess, until: int = -1) -> Answer | None:
     return answer
 
 
-def test_a_search_that_is_gone_answers_no_more_and_one_that_cannot_start_is_refused(
-    core: Core, tmp_path: Path
-) -> None:
+def test_a_search_that_is_gone_answers_no_more_and_one_that_cannot_start_is_refused(core: Core, tmp_path: Path) -> None:
     elsewhere = msgspec.structs.replace(core.scene.insert, model="none.safetensors")
     with pytest.raises(ConfigError, match=r"solver\.name = 'thesis': its process did not start"):
-        SearchProcess(CONFIG, core._replace(models=tmp_path, scene=msgspec.structs.replace(core.scene, insert=elsewhere)))
+        SearchProcess(
+            CONFIG, core._replace(models=tmp_path, scene=msgspec.structs.replace(core.scene, insert=elsewhere))
+        )
     process = SearchProcess(CONFIG, core)
     process.close()
     process.ask(Question(7.0, 2.0, 42.0, 1.5, 300.0))

@@ -46,8 +46,8 @@ TELEMETRY = (
 V1: dict[type[msgspec.Struct], str] = {
     Telemetry: TELEMETRY,
     Tick: "lateness_us exec_us",
-    Status: f"{TELEMETRY} version build scene scene_fingerprint terms_out solver uptime_s least_N most_N trim "
-    "device profile least_gap_mm link setpoints peers "
+    Status: f"{TELEMETRY} version build scene scene_fingerprint terms_out solver roller_radius_mm uptime_s least_N "
+    "most_N trim device profile least_gap_mm link setpoints peers "
     "rates late_ticks_by fault_details limit_details newest_stall not_granted way "
     "black_box output next_commands",
     OutputReport: "rate slew not_finite range",

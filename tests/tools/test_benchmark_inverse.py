@@ -55,7 +55,11 @@ def test_the_solver_error_is_that_of_the_method(result):
 
 
 def test_no_search_is_better_than_its_network(result):
-    errors = [row["plant_mae_mT"] for row in [*rows(result, "newton"), *rows(result, "torch"), *rows(result, "nearest")] if row["step_mT"] <= 2.0]
+    errors = [
+        row["plant_mae_mT"]
+        for row in [*rows(result, "newton"), *rows(result, "torch"), *rows(result, "nearest")]
+        if row["step_mT"] <= 2.0
+    ]
     assert np.ptp(errors) < 1e-3
     assert min(errors) > 0.01
 

@@ -54,7 +54,8 @@ and no search can be better than its network. *Force* is the plant's force at th
 - `torch`: the network over the grid in torch, the k nearest, then interpolation. `nearest`: the same in NumPy, from the
   curve of this state of the handle, and without torch.
 - `newton`: Newton's method from the last field, the whole range its bracket. It wants a force that rises with the
-  field, as the brake's does, and is what every scene runs that names no other. It is {speedup[thesis-linear]:.0f} times as fast as the thesis's search on the same network,
+  field, as the brake's does, and is what every scene runs that names no other. It is {speedup[thesis-linear]:.0f} times
+  as fast as the thesis's search on the same network,
   {speedup[linear-argmin]:.0f} times as fast as `linear-argmin`, {speedup[vectorised-argmin]:.0f} times as
   `vectorised-argmin`.
 

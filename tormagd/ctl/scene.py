@@ -63,6 +63,16 @@ def as_toml(tables: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def torque_range(scene: Scene) -> str:
+    """The forces as torques at the handle's shaft; nothing for a pad."""
+    radius_mm, force = scene.roller_radius_mm, scene.force
+    if radius_mm is None:
+        return ""
+    return (
+        f", {force.least_N * radius_mm:g}..{force.most_N * radius_mm:g} mNm in {force.resolution_N * radius_mm:g} mNm"
+    )
+
+
 def _line(key: str, value: object) -> str:
     # a number or a text reads the same in JSON and TOML
     return f"{key} = {msgspec.json.encode(value).decode()}"
@@ -79,7 +89,8 @@ def check_scene(name: str, config: Path | None) -> Outcome:
     result = {"scene": scene.name, "core_share": share, "core_share_allowed": scene.budget.core_share} | derived
     lines = [
         f"{scene.name}: taken",
-        f"forces     {scene.force.least_N:g}..{scene.force.most_N:g} N of the device's {least_N:.2f}..{most_N:.2f}",
+        f"forces     {scene.force.least_N:g}..{scene.force.most_N:g} N of the device's {least_N:.2f}..{most_N:.2f}"
+        + torque_range(scene),
         f"resolution {scene.force.resolution_N:g} N, the device's is {derived['least_resolution_N']:.2g}",
     ]
     if scene.force.least_N < least_N:

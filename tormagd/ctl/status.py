@@ -50,7 +50,7 @@ def status_text(known: Status, colour: Colour) -> str:
         *([f"next      {', '.join(known.next_commands)}"] if known.next_commands and is_running else []),
         *_codes(known.limits, known.limit_details, "held by", colour.yellow),
         f"force     asked {_number(known.setpoint_cf, 'N')}, governed {_number(known.governed_cf, 'N')}, "
-        f"measured {_number(known.measured_cf, 'N')}",
+        f"measured {_number(known.measured_cf, 'N')}{torque(known.measured_cf, known.roller_radius_mm)}",
         f"gap       {_number(known.gap_mm, 'mm', 2)}, wanted {_number(known.gap_setpoint_mm, 'mm', 2)}, "
         f"skew {_number(known.skew_mm, 'mm', 3)}",
         f"setpoint  {_number(known.setpoint_age_ms, 'ms', 0)} old, {_counts(known.setpoints, SETPOINT_COUNTS)}",
@@ -98,6 +98,13 @@ def _device(known: Status, colour: Colour) -> list[str]:
     if kept.folder and kept.refusal:  # without a folder nothing was to be kept
         lines += _explained(kept.refusal, "tormagctl calibrate --device, which keeps a new profile", colour.yellow)
     return lines
+
+
+def torque(force_N: float | None, roller_radius_mm: float | None) -> str:
+    """A force at the roller as the torque at the handle's shaft, in brackets; nothing where either is not known."""
+    if force_N is None or roller_radius_mm is None:
+        return ""
+    return f" ({force_N * roller_radius_mm:.1f} mNm)"
 
 
 def believed(belief: Mapping[str, BeliefReport], but: Collection[str] = ()) -> str:

@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from tormagd.ctl.status import believed
+from tormagd.ctl.status import believed, torque
 from tormagd_client.messages import Explained, Status, Telemetry
 from tormagd_client.printable import printable
 
@@ -80,6 +80,7 @@ def _head(seen: Seen, width: int) -> Text:
     head.append(f" {state} ", STATE_STYLES.get(state, "reverse"))
     flags = ["homed" if newest.is_homed else "not homed", *(["busy"] if newest.is_busy else [])]
     head.append(f"  {', '.join(flags)}", "" if newest.is_homed else "yellow")
+    head.append(torque(newest.measured_cf, status.roller_radius_mm))
     if seen.silent_s > SILENT_S:
         head.append(f"  nothing heard for {seen.silent_s:.0f} s", "bold red")
     minutes = status.uptime_s / 60.0

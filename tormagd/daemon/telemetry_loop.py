@@ -295,6 +295,7 @@ class TelemetryLoop:
             scene_fingerprint=self._core.scene.fingerprint,
             terms_out=terms_of(self._core.scene).left_out,
             solver=self._core.solver.solver,
+            roller_radius_mm=self._core.scene.roller_radius_mm,
             uptime_s=round(time.monotonic() - self._started_s, 1),
             least_N=round(believe.min_N, 3),
             most_N=round(device.force_N(self._core.portrait.max_N), 3),

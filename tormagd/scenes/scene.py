@@ -255,6 +255,11 @@ class Scene(Strict, frozen=True):
             raise ValueError("handle: allowed only where element is torque, [finger] tells how a pad is pressed")
 
     @property
+    def roller_radius_mm(self) -> float | None:
+        """The lever: a newton at the roller is so many mNm at the handle's shaft. A pad has none."""
+        return self.insert.roller_radius_mm if self.element == "torque" else None
+
+    @property
     def fingerprint(self) -> str:
         """Of the task: of all that is stated but how it is called, and how often and by which terms it is served."""
         task = msgspec.structs.replace(

@@ -94,8 +94,8 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     """What the daemon is doing, 50 times a second. Forces in N, lengths in mm, `t_ns` CLOCK_REALTIME.
 
     `measured_cf` is the force sensor's, `predicted_cf` the model's at the measured gap and motion; `belief` is what is
-    believed of the device, by name. `search_age_ms` is how long ago the search for `field_mT` began, where it runs beside
-    the plans. A value that is not known (no device, no setpoint) is null.
+    believed of the device, by name. `search_age_ms` is how long ago the search for `field_mT` began, where it runs
+    beside the plans. A value that is not known (no device, no setpoint) is null.
     """
 
     v: int
@@ -346,6 +346,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     scene_fingerprint: str = ""
     terms_out: tuple[str, ...] = ()
     solver: str = ""
+    roller_radius_mm: float | None = None
     uptime_s: float
     least_N: float
     most_N: float

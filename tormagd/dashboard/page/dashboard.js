@@ -200,7 +200,8 @@ function live() {
   });
   on("status", ({status, explained: newest}) => {
     explained = newest;
-    at("scene").textContent = `scene ${status.scene}${status.is_homed ? "" : ", not homed"}`;
+    const lever = status.roller_radius_mm === null ? "" : `, 1 N is ${status.roller_radius_mm} mNm of the handle`;
+    at("scene").textContent = `scene ${status.scene}${lever}${status.is_homed ? "" : ", not homed"}`;
     at("source").textContent = `tormagd ${status.version}, device ${status.link.state} on ${status.link.port}`;
     at("believed").textContent = "Believed of the device: " + (Object.entries(status.belief).filter(([, it]) => it.acts)
       .map(([name, it]) => `${name} ${it.value.toPrecision(3)}${it.sd === null ? "" : ` ± ${it.sd.toPrecision(2)}`} ${it.unit}`.trim())

@@ -74,8 +74,7 @@ def measured_on(model_name: str, element: str, range_mT: tuple[float, float]) ->
     path_mT = (middle_mT + swing_mT * np.sin(np.linspace(0.0, 2.0 * np.pi, STEPS))).tolist()
     at = contacts(model, range_mT, SHALLOW_MM if element == "tactile" else None)
     rows = [
-        {"neighbours": count}
-        | followed(NearestFieldSearch(field_grid(range_mT, 2.0), count), model, at, path_mT)
+        {"neighbours": count} | followed(NearestFieldSearch(field_grid(range_mT, 2.0), count), model, at, path_mT)
         for count in NEIGHBOURS
     ]
     most = np.array(rows[-1]["answers"])

@@ -67,7 +67,7 @@ def _figure_2_5(data: Json) -> Figure:
 
 
 def _figure_2_7(data: Json, tests: list[StepTest]) -> Figure:
-    figure, axes = _subplots((9.5, 4.2))
+    figure, (axes, ranges) = _subplots((12.0, 4.2), 1, 2)
     for test, row, colour in zip(tests, data["rows"], (OURS, FREE, THESIS), strict=True):
         axes.plot(test.time_s, test.force_N, color=colour, linewidth=0.9, label=f"{test.insert}, simulated device")
         for index, force in enumerate(row["analytic_N"]):
@@ -78,7 +78,23 @@ def _figure_2_7(data: Json, tests: list[StepTest]) -> Figure:
         xlabel="time, s (virtual)", ylabel="force at the roller, N", xlim=(0.0, tests[0].time_s[-1]), ylim=(0, None)
     )
     axes.legend(frameon=False, loc="upper left")
+    _force_ranges(ranges, data["ranges"])
     return figure
+
+
+def _force_ranges(axes: Axes, rows: list[Json]) -> None:
+    """Least and greatest force over the share of iron, a colour a matrix; the thesis's ranges stand on our least."""
+    for place, (matrix, colour) in enumerate(
+        zip(dict.fromkeys(row["matrix"] for row in rows), (OURS, FREE, THESIS), strict=True)
+    ):
+        own = [row for row in rows if row["matrix"] == matrix]
+        at = [row["cip_percent"] + 2.4 * (place - 1) for row in own]
+        least_N, most_N, measured_N = ([row[key] for row in own] for key in ("least_N", "most_N", "measured_range_N"))
+        axes.bar(at, np.subtract(most_N, least_N), 2.2, least_N, color=colour, label=f"{matrix}, force law")
+        axes.plot(at, np.add(least_N, measured_N), "_", color=MEASURED, markersize=11)
+    axes.plot([], [], "_", color=MEASURED, label="range measured in the thesis")
+    axes.set(xlabel="iron, % by volume", ylabel="least to greatest force, N", ylim=(0, None))
+    axes.legend(frameon=False, loc="upper left")
 
 
 def _figure_3_2(table: Json) -> Figure:

@@ -36,6 +36,13 @@ class StepTest(NamedTuple):
     force_N: Array
     level_gap_mm: Array
     level_force_N: Array
+    rise_s: float
+    "From 10 to 90% of a step of the gap: the median."
+
+    @property
+    def gap_speed_mm_s(self) -> float:
+        """Of the gap in that rise."""
+        return 0.8 * float(np.median(-np.diff(self.level_gap_mm))) / self.rise_s
 
 
 def step_test(fitted: Insert, seed: int) -> StepTest:
@@ -64,4 +71,7 @@ def step_test(fitted: Insert, seed: int) -> StepTest:
     record = np.array(rows)
     settled = record.reshape(len(GAPS_MM), -1, 3)[:, -round(SETTLED_S / 1e-3) :].mean(axis=1)
     time_s, _, force_N = record[::EVERY].T
-    return StepTest(fitted.name, time_s, force_N, settled[:, 1], settled[:, 2])
+    gaps_mm, levels_mm = record.reshape(len(GAPS_MM), -1, 3)[1:, :, 1], settled[:, 1]
+    done = (levels_mm[:-1, None] - gaps_mm) / (levels_mm[:-1] - levels_mm[1:])[:, None]
+    rises_s = 1e-3 * ((done < 0.9).sum(axis=1) - (done < 0.1).sum(axis=1))
+    return StepTest(fitted.name, time_s, force_N, levels_mm, settled[:, 2], float(np.median(rises_s)))
