@@ -275,7 +275,8 @@ def print_ordered(shown: Shown | Aborted, ordered: dict[str, Shown | Aborted]) -
         result = scored(found.time_s, found.asked_N, found.rendered_N)
         print(
             f"  {label:36s} {numbers(result)}  {searched['hz']:4.0f} searches/s, "
-            f"p99 {searched['exec_us']['p99']:.0f} us, plan p99 {plan['exec_us']['p99']:.0f} us, {found.core_share:.0%} of a processor"
+            f"p99 {searched['exec_us']['p99']:.0f} us, plan p99 {plan['exec_us']['p99']:.0f} us, "
+            f"{found.core_share:.0%} of a processor"
         )
 
 

@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> Found:
 
 
 def chapter_4(is_quick: bool) -> Json:
-    """Its table and pulse; what was trained for them stays in the process that did it: no compiled network is pickled."""
+    """Its table and pulse. What was trained for them stays in the process that did it: none of it is pickled."""
     from tormagd.lab.tactile.experiment import contract
     from tormagd.lab.tactile.models import FULL, QUICK
 
