@@ -127,8 +127,7 @@ def test_a_reversal_names_a_zero_that_was_wrong_from_the_beginning(make, render,
     LyingSensor(loop.device, LIES[lie]())
     loop.arm()
     samples = render(loop, ASKED_N, 6.0)
-    told = {limit for sample in samples for limit in sample.plan.limits}
-    assert {Limit.SENSOR, Limit.SENSOR_ZERO} <= told
+    assert {Limit.SENSOR, Limit.SENSOR_ZERO} <= {limit for sample in samples for limit in sample.plan.limits}
     assert worst_N(samples) < ASKED_N + 0.3
 
 
@@ -178,8 +177,7 @@ def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(arm, re
 def test_an_honest_sensor_is_believed(arm, render, sample: str) -> None:
     loop = arm(sample, ReversingHand(3.0))
     for asked_N in (0.7, 2.0, 0.7, 1.4):
-        samples = render(loop, asked_N, 3.0)
-        assert not any(Limit.SENSOR in sample.plan.limits for sample in samples)
+        assert not any(Limit.SENSOR in sample.plan.limits for sample in render(loop, asked_N, 3.0))
 
 
 # -- layer a: the governed force -----------------------------------------------------------------------------------
@@ -230,8 +228,7 @@ def test_the_gap_holds_alone(make, render, core: Core, open_core: Core, sample: 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
 def test_the_measured_force_holds_alone(arm, hold_gap, core: Core, sample: str) -> None:
     """A plan that closes the gap without any word of forces: the force over the ceiling opens it, at a bounded rate."""
-    loop = arm(sample)
-    shut = hold_gap(loop, 47.0, 4.0)
+    shut = hold_gap(arm(sample), 47.0, 4.0)
     assert shut[-1].safety.faults == (Fault.OVER_FORCE,)
     assert any(Limit.OVER_FORCE in sample.output.limits for sample in shut)
     forces_N = np.array([sample.truth.force_N for sample in shut])
@@ -247,7 +244,6 @@ def test_the_measured_force_holds_alone(arm, hold_gap, core: Core, sample: str) 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_2", "sample_3"])
 def test_a_start_from_rest_is_not_over_force(arm, render, sample: str) -> None:
     """Static friction is up to 1.25 times the kinetic one."""
-    loop = arm(sample, ReversingHand(2.0))
-    samples = render(loop, MOST_N, 6.0)
+    samples = render(arm(sample, ReversingHand(2.0)), MOST_N, 6.0)
     assert samples[-1].safety.operating_state is OperatingState.ENABLED
     assert worst_N(samples) < CEILING_N

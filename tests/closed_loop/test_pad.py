@@ -61,8 +61,9 @@ def test_a_hold_of_plans_alone_is_that_of_the_whole_device() -> None:
 def test_a_finger_that_presses_too_hard_opens_the_gap_and_is_no_fault(arm, pad_core: Core) -> None:
     """Its force is the finger's own: more than the scene's greatest by far, at any gap."""
     hand = RecordedHand((0.0, 3.0, 4.0), (0.0, 0.0, 4.0))
-    loop = arm("pad_1", hand, core=pad_core, config=CONFIG)
-    last = list(loop.run(4.5, lambda now_s: TimedSetpoint(3.6, now_s, 0.1)))[-1]
+    last = list(
+        arm("pad_1", hand, core=pad_core, config=CONFIG).run(4.5, lambda now_s: TimedSetpoint(3.6, now_s, 0.1))
+    )[-1]
     assert last.truth.force_N > 1.5 * SCENE.force.most_N
     assert Limit.OVER_FORCE in last.output.limits
     assert last.truth.gap_mm > 94.0

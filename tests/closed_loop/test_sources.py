@@ -169,8 +169,7 @@ def test_a_restarted_publisher_goes_on_without_a_gap(
 
 @pytest.mark.parametrize(("seq", "dropped", "refused"), [(2**63 - 1, 1, 0), (2**63, 0, 1)], ids=["last", "beyond"])
 def test_one_wrong_number_locks_nobody_out(armed: ClosedLoop, seq: int, dropped: int, refused: int) -> None:
-    wrong = Publisher(constant(0.2), from_s=1.5, to_s=1.5 + PERIOD_S, first_seq=seq)
-    done = run(armed, Publisher(swell_N), wrong)
+    done = run(armed, Publisher(swell_N), Publisher(constant(0.2), from_s=1.5, to_s=1.5 + PERIOD_S, first_seq=seq))
     assert not done.held_by(Limit.STALE)
     assert done.error_N(swell_N, 1.0) < 0.05
     assert (done.of("a").restarts, done.inbox.dropped, done.inbox.refused) == (0, dropped, refused)

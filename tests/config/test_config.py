@@ -290,8 +290,7 @@ def _toml(value: object) -> str:
 
 def test_check_prints_the_resolved_configuration(write, capsys) -> None:
     assert main(["--config", str(write('scene = "pulse"\n')), "--check"]) == 0
-    captured = capsys.readouterr()
-    resolved = json.loads(captured.out)
+    resolved = json.loads(capsys.readouterr().out)
     assert msgspec.convert(resolved["config"], Config).scene == "pulse"
     assert (resolved["config"]["device"]["options"], resolved["scene"]["name"]) == ({"baud": 1_000_000}, "pulse")
     assert 0.0 < resolved["derived"]["least_N"] < resolved["derived"]["most_N"]

@@ -234,15 +234,13 @@ def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench) -> Non
     bench.command("clear-fault", device_latched=True)
     assert bench.step(**broken).request is DeviceRequest.CLEAR
     assert bench.faults == ()
-    ticks = bench.run_into(Fault.DEVICE_OVERCURRENT, **broken)
-    assert ticks * PERIOD_S == pytest.approx(CLEARING_S, abs=2e-3)
+    assert bench.run_into(Fault.DEVICE_OVERCURRENT, **broken) * PERIOD_S == pytest.approx(CLEARING_S, abs=2e-3)
 
 
 def test_a_latched_fault_asks_once_and_stays(running) -> None:
     running.run_into(Fault.DEVICE_SKEW, faults=DeviceFault.SKEW, mode=DeviceMode.RETRACTING)
     number = running.output.request_number
-    output = running.step(faults=DeviceFault.SKEW, mode=DeviceMode.LATCHED, count=100)
-    assert output.request_number == number
+    assert running.step(faults=DeviceFault.SKEW, mode=DeviceMode.LATCHED, count=100).request_number == number
     running.step(count=100)
     assert running.faults == (Fault.DEVICE_SKEW,)
     assert running.is_opened

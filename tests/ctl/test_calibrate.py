@@ -40,8 +40,9 @@ def record(plant="sample_1", hand=None, rates_N_s=(0.8, 1.0, 0.8), most_N=2.0):
     """The ticks of each sweep, as the daemon would publish them."""
     config = Config()
     core = build_core(config)
-    device = VirtualDevice(load_plant(plant), hand or ReversingHand(2.0), seed=3)
-    loop = ClosedLoop(config, core.stepper(), core.planner(), device)
+    loop = ClosedLoop(
+        config, core.stepper(), core.planner(), VirtualDevice(load_plant(plant), hand or ReversingHand(2.0), seed=3)
+    )
     loop.arm()
     sweeps = []
     for rate in rates_N_s:
@@ -117,10 +118,8 @@ def test_the_whole_process_writes_model_and_training_data(sweeps, tmp_path, caps
     arguments = [str(tmp_path / "sweep.csv"), "--insert", INSERT, "--out", str(out), "--csv", str(data)]
     assert calibration.main(arguments) == 0
     result = json.loads(capsys.readouterr().out)["result"]
-    model = load_model(out, element="torque", insert=INSERT)
-    assert result["metrics"] == model.metadata.metrics
-    header = data.read_text().splitlines()[0]
-    assert header == "displacement_mm,rate_mm_s,field_mT,cip_percent,force_N,cycle,time_s"
+    assert result["metrics"] == load_model(out, element="torque", insert=INSERT).metadata.metrics
+    assert data.read_text().splitlines()[0] == "displacement_mm,rate_mm_s,field_mT,cip_percent,force_N,cycle,time_s"
     assert calibration.main([*arguments[:2], "MRE-99-99", *arguments[3:]]) == 1
     assert "MRE-99-99" in json.loads(capsys.readouterr().out)["error"]["message"]
 

@@ -106,8 +106,7 @@ def test_what_the_daemon_runs_is_typed_and_what_is_none_is_told(client, fake_dae
 def test_late_answers_do_not_hold_a_call_nor_are_they_taken_for_its_own(fake_daemon):
     with Client.local(str(fake_daemon.directory), 5.0) as client:
         given_up = client.ask("status")
-        newer = client.ask("take", source="robot")
-        assert client.answer(newer, PATIENCE_S) == {}
+        assert client.answer(client.ask("take", source="robot"), PATIENCE_S) == {}
         assert client.answer(given_up) is None
 
 

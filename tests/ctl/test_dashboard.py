@@ -91,8 +91,7 @@ async def event(stream: ClientResponse, wanted: str) -> Any:
 
 
 def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
-    why = {"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}
-    fake_daemon.says(limit_details=[why])
+    fake_daemon.says(limit_details=[{"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}])
     described = fake_daemon.answers["describe"]()["result"] | {"portrait": PORTRAIT}
     fake_daemon.answers["describe"] = lambda: {"ok": True, "result": described}
 
@@ -117,8 +116,7 @@ def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
             assert other.t_s[0] <= first.t_s[0]
             assert sum(then.late_counts) >= len(first.t_s)
             fake_daemon.is_silent = True
-            silence = await event(stream, "silence")
-            assert silence["seconds"] >= 0.5
+            assert (await event(stream, "silence"))["seconds"] >= 0.5
 
     asyncio.run(look())
     assert set(fake_daemon.commands) == {"status", "describe"}
@@ -223,8 +221,7 @@ def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
 @given(at_s=st.floats(-1e300, 1e300) | st.floats(0.0, SECONDS))
 def test_every_moment_has_a_frame(recorded: Recorded, at_s: float) -> None:
     frame = msgspec.json.decode(msgspec.json.encode(recorded.frame(at_s)), type=Frame)
-    lengths = {len(getattr(frame, name)) for name in ("t_s", "asked_N", "measured_N", "gap_mm", "field_mT")}
-    assert len(lengths) == 1
+    assert len({len(getattr(frame, name)) for name in ("t_s", "asked_N", "measured_N", "gap_mm", "field_mT")}) == 1
     assert list(frame.t_s) == sorted(frame.t_s)
 
 

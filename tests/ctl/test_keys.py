@@ -63,8 +63,9 @@ def test_a_client_makes_its_own_pair_and_its_secret_stays(tmp_path: Path, capsys
     assert code == 0
     assert sorted(path.name for path in (tmp_path / "mine").iterdir()) == ["robot.key", "robot.key_secret"]
     (made,) = printed["result"]["made"]
-    shown = run_json(capsys, "keys", "show", made["public"])[1]["result"]["keys"]
-    assert shown == [{"name": "robot", "fingerprint": made["fingerprint"]}]
+    assert run_json(capsys, "keys", "show", made["public"])[1]["result"]["keys"] == [
+        {"name": "robot", "fingerprint": made["fingerprint"]}
+    ]
     code, printed = run_json(capsys, "keys", "generate", str(tmp_path), "--client", "a", "--publish", "b")
     assert code == 2
     assert not list(tmp_path.glob("*.key*"))

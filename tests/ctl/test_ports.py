@@ -45,8 +45,7 @@ def process(root: Path, number: int, name: str, *opened: str) -> None:
 
 
 def test_the_configured_port_is_known_by_where_its_name_leads(root: Path) -> None:
-    found = survey(Config(), Machine(root), [FTDI, ON_BOARD], [])
-    board, chip = found.serial
+    board, chip = survey(Config(), Machine(root), [FTDI, ON_BOARD], []).serial
     assert (chip.port, chip.usb_id, chip.serial_number) == ("/dev/ttyUSB0", "0403:6001", "A50285BI")
     assert (chip.is_configured, chip.is_accessible, chip.latency_ms, chip.holders) == (True, True, 16, ())
     assert (board.is_configured, board.usb_id, board.latency_ms) == (False, None, None)
@@ -81,8 +80,10 @@ def test_can_channels_say_whether_they_are_up(root: Path) -> None:
         (root / f"sys/class/net/{name}/operstate").write_text(state)
     detected = [{"interface": "socketcan", "channel": name} for name in ("can0", "can1")]
     detected.append({"interface": "udp_multicast", "channel": "239.74.163.2"})
-    found = survey(Config(device=Device(port="can0")), Machine(root), [], detected)
-    assert [(entry.channel, entry.is_up) for entry in found.can] == [
+    assert [
+        (entry.channel, entry.is_up)
+        for entry in survey(Config(device=Device(port="can0")), Machine(root), [], detected).can
+    ] == [
         ("can0", True),
         ("can1", False),
         ("239.74.163.2", None),

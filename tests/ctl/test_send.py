@@ -61,8 +61,10 @@ def test_a_second_run_of_the_same_source_is_newer(fake_daemon, capsys):
 
 
 def test_a_preview_is_what_will_be_sent(fake_daemon, capsys):
-    result = send(fake_daemon, capsys, "sine", "--duration", "0.2", "--rate", "100", "--preview-ms", "50")
-    wait_for(fake_daemon, result["sent"])
+    wait_for(
+        fake_daemon,
+        send(fake_daemon, capsys, "sine", "--duration", "0.2", "--rate", "100", "--preview-ms", "50")["sent"],
+    )
     arrived = fake_daemon.setpoints
     forces = {round(100.0 * after_s(setpoint, arrived[0])): setpoint.servo_cf for setpoint in arrived}
     for setpoint in arrived:

@@ -33,8 +33,7 @@ def seen(status_with, telemetry_with) -> Seen:
     times = {"p50": 41.0, "p99": 304.0, "p999": 500.0, "max": 900.0}
     rate |= {"lateness_us": times | {"worst": 2000.0}, "exec_us": times}
     link = status_with()["link"] | {"port": f"/tmp/{'a-port-with-a-long-name' * 9}"}
-    loops = {"control": rate, "inference": rate}
-    known = msgspec.convert(status_with(rates=loops, link=link, uptime_s=7200.0), Status)
+    known = msgspec.convert(status_with(rates={"control": rate, "inference": rate}, link=link, uptime_s=7200.0), Status)
     snapshots = [
         telemetry_with(
             k,

@@ -49,8 +49,7 @@ class Rig:
             generate(name, self.keys, self.keys / role)
         # one that is listed for everything
         generate("bench", self.keys, self.keys / "publish")
-        listed = (self.keys / "publish/bench.key").read_bytes()
-        (self.keys / "operate/bench.key").write_bytes(listed)
+        (self.keys / "operate/bench.key").write_bytes((self.keys / "publish/bench.key").read_bytes())
         (self.keys / "operate/bench.key").chmod(0o600)
         self.addresses = {
             name: f"ipc://{folder}/{name}" if scheme == "ipc" else f"tcp://127.0.0.1:{port}"

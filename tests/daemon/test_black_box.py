@@ -28,8 +28,9 @@ from tormagd.simulation.parameters import load_plant
 
 
 def closed_loop(core: Core) -> ClosedLoop:
-    device = VirtualDevice(load_plant("sample_1"), ReversingHand(2.0))
-    return ClosedLoop(Config(), core.stepper(), core.planner(), device)
+    return ClosedLoop(
+        Config(), core.stepper(), core.planner(), VirtualDevice(load_plant("sample_1"), ReversingHand(2.0))
+    )
 
 
 class Rig:
@@ -54,8 +55,9 @@ class Rig:
     def tick(self, times: int = 1) -> None:
         for _ in range(times):
             self.box.journal.stepped()
-            record = tick_record(self.stepper, self.output, self.planner.planned, None, 0.0, 0.0)
-            self.box.ticked(record, self.stepper, self.planner)
+            self.box.ticked(
+                tick_record(self.stepper, self.output, self.planner.planned, None, 0.0, 0.0), self.stepper, self.planner
+            )
 
     def heard(self) -> list[Said]:
         said: list[Said] = []

@@ -373,8 +373,10 @@ def test_a_disable_that_is_refused_overtakes_nothing(rig: Rig) -> None:
     client = rig.connect(zmq.DEALER, "control")
     client.send(command("home", 0))
     client.send(command("disable", 1))
-    replies = {reply.id: reply.ok for reply in (rig.serve(client, answer), rig.serve(client, answer))}
-    assert replies == {0: True, 1: False}
+    assert {reply.id: reply.ok for reply in (rig.serve(client, answer), rig.serve(client, answer))} == {
+        0: True,
+        1: False,
+    }
 
 
 @pytest.mark.parametrize(

@@ -81,8 +81,9 @@ LOOKS: dict[str, tuple[bool, list[Look]]] = {
 def test_it_is_fed_while_starting_again_would_not_help(was_there: bool, looks: list[Look]):
     service = ready() if was_there else Service()
     for now_s, link, received_s, fed in looks:
-        alive = service.is_alive(now_s, LIMIT_S, now_s, link, received_s)
-        assert ("WATCHDOG=1" in service.news(now_s, alive, link, "up")) == fed, now_s
+        assert (
+            "WATCHDOG=1" in service.news(now_s, service.is_alive(now_s, LIMIT_S, now_s, link, received_s), link, "up")
+        ) == fed, now_s
 
 
 @pytest.mark.parametrize("planned_s", [None, 0.4])
@@ -110,5 +111,7 @@ def test_the_status_line_says_how_it_stands_and_what_is_next():
 
 
 def test_what_the_device_or_the_kernel_says_makes_no_lines_of_its_own():
-    told = line(link=LinkState.BACK_OFF, cause="no port\nREADY=1", remedy="plug it in")
-    assert told == "DISABLED, scene coronary; waiting for the device (BACK_OFF): no port READY=1; plug it in"
+    assert (
+        line(link=LinkState.BACK_OFF, cause="no port\nREADY=1", remedy="plug it in")
+        == "DISABLED, scene coronary; waiting for the device (BACK_OFF): no port READY=1; plug it in"
+    )

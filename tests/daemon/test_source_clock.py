@@ -53,8 +53,7 @@ def listen(
         sent_s = number * period_s
         # nobody overtakes: who would be there before the one before comes with it
         last_s = max(last_s, sent_s + way_s(sent_s))
-        believed_s = clock.hear(last_s, last_s - clock_s(sent_s))
-        heard.append(Heard(sent_s, last_s - sent_s, believed_s))
+        heard.append(Heard(sent_s, last_s - sent_s, clock.hear(last_s, last_s - clock_s(sent_s))))
     return clock, heard
 
 
@@ -149,8 +148,7 @@ def test_a_reader_that_is_held_up_blames_no_clock() -> None:
     """What has waited for 30 ms is read at once; the messages are late, and no stamp has run back."""
     clock = SourceClock()
     for number in range(100):
-        now_s = number * 0.002
-        clock.hear(now_s, 0.001)
+        clock.hear(number * 0.002, 0.001)
     for number in range(100, 115):
         late_s = 0.23 - number * 0.002
         assert clock.hear(0.23 + number * 1e-6, late_s) == pytest.approx(late_s, abs=1e-4)
@@ -189,8 +187,7 @@ def test_any_clock_any_jitter_any_losses(
     def clock_s(sent_s: float) -> float:
         return sent_s * (1.0 + drift) - behind_s + sum(by_s for at_s, by_s in steps if sent_s >= at_s)
 
-    way_s = exponential(seed, 0.001, jitter_s + 1e-6)
-    clock, heard = listen(clock_s, way_s, lost=lambda number: number in lost)
+    clock, heard = listen(clock_s, exponential(seed, 0.001, jitter_s + 1e-6), lost=lambda number: number in lost)
     settled = [each for each in heard if each.sent_s > SETTLED_S + 1.0]
     if not settled:
         return

@@ -207,8 +207,9 @@ def test_a_step_is_python_s_round_of_the_quotient(layout: Layout, data: st.DataO
     signal = data.draw(st.sampled_from(quantities))
     if data.draw(st.booleans()):
         value = (data.draw(st.integers(2 * signal.lowest - 3, 2 * signal.highest + 3)) / 2.0) * signal.scale
-    neutral = layout.message(*(0.0 if s.type is float else s.type(0) for s in layout.signals))
-    message = neutral.replaced(**{signal.name: value})
+    message = layout.message(*(0.0 if s.type is float else s.type(0) for s in layout.signals)).replaced(
+        **{signal.name: value}
+    )
     step = round(value / signal.scale) if math.isfinite(value / signal.scale) else None
     if step is not None and signal.wraps:
         step = (step - signal.lowest) % (signal.highest - signal.lowest + 1) + signal.lowest
@@ -216,8 +217,7 @@ def test_a_step_is_python_s_round_of_the_quotient(layout: Layout, data: st.DataO
         with pytest.raises(EncodeError, match=signal.name):
             encode(message)
         return
-    packed = struct.unpack(layout.format, encode(message))
-    assert packed[layout.signals.index(signal)] == step
+    assert struct.unpack(layout.format, encode(message))[layout.signals.index(signal)] == step
 
 
 @pytest.mark.parametrize("power", [15, 16, 31, 50, 51, 52, 53, 60, 900])

@@ -84,8 +84,7 @@ def test_how_a_stream_is_cut_makes_no_difference(pieces: list[bytes], data: st.D
     whole, cut = FrameDecoder(), FrameDecoder()
     expected = whole.feed(stream)
     bounds = [0, *cuts, len(stream)]
-    received = [frame for a, b in pairwise(bounds) for frame in cut.feed(stream[a:b])]
-    assert received == expected
+    assert [frame for a, b in pairwise(bounds) for frame in cut.feed(stream[a:b])] == expected
     assert cut.statistics == whole.statistics
 
 
@@ -161,8 +160,9 @@ def test_the_longest_frame_passes_and_a_longer_stretch_does_not(excess: int) -> 
     encoded = cobs.encode(body + bitwise_crc16(body).to_bytes(2, "big")) + b"\0"
     for size in (1, 5, 200):
         decoder = FrameDecoder()
-        received = [f for i in range(0, len(encoded), size) for f in decoder.feed(encoded[i : i + size])]
-        assert received == ([Frame(1, 2, bytes(8))] if excess == 0 else [])
+        assert [f for i in range(0, len(encoded), size) for f in decoder.feed(encoded[i : i + size])] == (
+            [Frame(1, 2, bytes(8))] if excess == 0 else []
+        )
         assert decoder.statistics.corrupt == (excess > 0)
 
 

@@ -73,8 +73,9 @@ def test_valid_frames_in_both_directions() -> None:
 @pytest.mark.parametrize("vector", FRAMES["streams"], ids=lambda vector: vector["name"])
 def test_streams_give_the_frames_and_counts_written_down(vector: dict[str, Any]) -> None:
     decoder = FrameDecoder()
-    received = decoder.feed(bytes.fromhex(vector["bytes"]))
-    assert received == [Frame(f["function"], f["sequence"], bytes.fromhex(f["payload"])) for f in vector["frames"]]
+    assert decoder.feed(bytes.fromhex(vector["bytes"])) == [
+        Frame(f["function"], f["sequence"], bytes.fromhex(f["payload"])) for f in vector["frames"]
+    ]
     assert decoder.statistics == FramingStatistics(**vector["statistics"])
 
 

@@ -144,8 +144,7 @@ def test_what_the_device_says_comes_through_and_other_nodes_and_hosts_commands_a
 
 def test_a_drive_that_is_not_ours_is_another_host() -> None:
     stream = CanStream(1)
-    own = stream.pack(Drive(0.5, 0.5, DriveMode.RUN, 9))
-    assert stream.unpack(*own) is None, "its echo"
+    assert stream.unpack(*stream.pack(Drive(0.5, 0.5, DriveMode.RUN, 9))) is None, "its echo"
     with pytest.raises(SecondHostError):
         stream.unpack(*frame_of(Drive(0.5, 0.5, DriveMode.RUN, 10)))
 
@@ -265,8 +264,9 @@ def test_the_configuration_knows_what_an_exchange_takes_of_a_bus() -> None:
     for _ in range(2_000):
         for layout in layouts:
             length = struct.calcsize(layout.format)
-            frame = CanFrame(can_identifier(layout.function, 1), noise.randbytes(length))
-            assert frame_bits(frame) <= most_bits(length)
+            assert frame_bits(CanFrame(can_identifier(layout.function, 1), noise.randbytes(length))) <= most_bits(
+                length
+            )
 
 
 # -- ports and buses ---------------------------------------------------------------------------------------------------

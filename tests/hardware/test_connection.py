@@ -418,8 +418,9 @@ class Cables(RuleBasedStateMachine):
 
     @invariant()
     def ports_are_not_opened_in_a_hurry(self) -> None:
-        attempts_s = self.bench.attempts_s
-        assert all(after - before >= FIRST_BACK_OFF_S - 1e-9 for before, after in itertools.pairwise(attempts_s))
+        assert all(
+            after - before >= FIRST_BACK_OFF_S - 1e-9 for before, after in itertools.pairwise(self.bench.attempts_s)
+        )
 
     @invariant()
     def each_loss_is_told_once(self) -> None:

@@ -244,8 +244,7 @@ class TormagsimEnd(PacketEnd):
         self._host: socket.socket | None = None
 
     def hear(self) -> bytes:
-        frame = from_socket(self._connected().recv(64))
-        return _unit(frame)
+        return _unit(from_socket(self._connected().recv(64)))
 
     def say(self, unit: bytes, backend: Backend) -> None:
         self._connected().send(to_socket(_frame(unit)))
@@ -430,8 +429,7 @@ def moving(core: Core) -> ClosedLoop:
     """A loop that is armed and closing its gap, on a perfect line."""
     loop = ClosedLoop(CONFIG, core.stepper(), core.planner(), a_device())
     loop.arm()
-    asked = publisher(loop.now_s)
-    for _ in loop.run(MOVING_S, asked):
+    for _ in loop.run(MOVING_S, publisher(loop.now_s)):
         pass
     return loop
 

@@ -48,8 +48,7 @@ HANDLE_SPAN_MM = period(Sense, "handle_position_mm")
 
 
 def status(nonce: int = 0, **changes: object) -> Status:
-    healthy = Status(DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 12.0, 0, nonce)
-    return healthy.replaced(**changes)  # type: ignore[arg-type]
+    return Status(DeviceMode.IDLE, Switches.HOMED, DeviceFault(0), 23.0, 12.0, 0, nonce).replaced(**changes)  # type: ignore[arg-type]
 
 
 def running(nonce: int = 0) -> DeviceLink:

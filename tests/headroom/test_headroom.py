@@ -56,8 +56,7 @@ def test_the_calls_are_those_of_the_closed_loop_and_can_be_made_again() -> None:
 def test_each_call_is_made_once_in_its_own_beat() -> None:
     made: list[str] = []
     steps = [lambda: made.append("step")] * 7
-    plans = [lambda: made.append("plan")] * 7
-    found = asyncio.run(core_cost.core_cost(steps, plans, 1_000))
+    found = asyncio.run(core_cost.core_cost(steps, [lambda: made.append("plan")] * 7, 1_000))
     assert made == ["step", "plan"] * 7
     assert (len(found.step_us), len(found.plan_us)) == (7, 7)
 

@@ -153,8 +153,9 @@ def test_on_a_rising_model_the_root_is_found(rising: ForceModel, name: str) -> N
     rng = np.random.default_rng(3)
     last: float | None = None
     for displacement, rate, field in rng.uniform((0.05, 3, 110), (0.95, 57, 740), (60, 3)).tolist():
-        force = rising.predict_one(displacement, rate, field, CIP)
-        solution = searcher.solve(rising.curve(displacement, rate, CIP), force, last)
+        solution = searcher.solve(
+            rising.curve(displacement, rate, CIP), rising.predict_one(displacement, rate, field, CIP), last
+        )
         assert solution.field_mT == pytest.approx(field, abs=accuracy)
         assert solution.reach is Reach.INSIDE
         assert solution.predicted_force_N == pytest.approx(
@@ -191,8 +192,7 @@ def test_without_a_last_field_the_lowest_root_wins(bump: ForceModel, name: str) 
 
 @pytest.mark.parametrize("name", FORGETFUL)
 def test_a_search_without_memory_answers_with_one_of_the_roots(bump: ForceModel, name: str) -> None:
-    force = bump.predict_one(0.5, 10, 300.0, CIP)
-    solution = solver(name, bump).solve(bump.curve(0.5, 10, CIP), force, 600.0)
+    solution = solver(name, bump).solve(bump.curve(0.5, 10, CIP), bump.predict_one(0.5, 10, 300.0, CIP), 600.0)
     assert min(abs(solution.field_mT - 300), abs(solution.field_mT - 600)) <= 5
     assert solution.reach is Reach.INSIDE
 
@@ -220,8 +220,7 @@ def test_out_of_reach_is_the_nearest_end_and_never_silent(rising: ForceModel, na
 
 @pytest.mark.parametrize("name", ANY_SHAPE)
 def test_above_the_peak_of_a_bump_is_above(bump: ForceModel, name: str) -> None:
-    peak = bump.predict_one(0.5, 10, 450.0, CIP)
-    solution = solver(name, bump).solve(bump.curve(0.5, 10, CIP), peak + 0.1, 200.0)
+    solution = solver(name, bump).solve(bump.curve(0.5, 10, CIP), bump.predict_one(0.5, 10, 450.0, CIP) + 0.1, 200.0)
     assert solution.reach is Reach.ABOVE
     assert solution.field_mT == pytest.approx(450, abs=2)
 
@@ -543,8 +542,7 @@ def test_flat_stretches_do_not_stop_it(rate: float) -> None:
     curve = curve_of([(rate, 150.0 + 100.0 * place, 1.0) for place in range(7)], 0.0)
     for stair in range(7):
         for last in (None, *RANGE_MT, 199.9, 450.0, 650.1):
-            solution = solved(curve, stair + 0.5, last)
-            assert solution.field_mT == pytest.approx(150.0 + 100.0 * stair, abs=ACCURACY_MT)
+            assert solved(curve, stair + 0.5, last).field_mT == pytest.approx(150.0 + 100.0 * stair, abs=ACCURACY_MT)
 
 
 # -- the search of a scene: by name, or Newton's method, which no measured scene has a reason to leave -----------------
@@ -591,8 +589,7 @@ def test_no_other_search_is_cheaper_or_more_exact_in_any_measured_scene() -> Non
 
 def test_a_scene_may_name_its_search() -> None:
     scene = load_scene(shipped_scenes()[0])
-    wanted = msgspec.structs.replace(scene, solver=Solver(name="nearest", step_mT=5.0, neighbours=2))
-    choice = choose_solver(wanted)
+    choice = choose_solver(msgspec.structs.replace(scene, solver=Solver(name="nearest", step_mT=5.0, neighbours=2)))
     assert (choice.solver, choice.step_mT, choice.neighbours) == ("nearest", 5.0, 2)
 
 

@@ -31,8 +31,11 @@ def missed_N(core: Core, device: VirtualDevice, stepper: Stepper) -> float:
 def test_the_same_core_misses_less_with_carriages_that_lose_no_time() -> None:
     core = build_core(Config())
     own, ideal = (VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1) for _ in range(2))
-    bound_N = missed_N(core, ideal, ideal_stepper(core, ideal.messages.plant))
-    assert 0.0 < bound_N < 0.9 * missed_N(core, own, core.stepper())
+    assert (
+        0.0
+        < missed_N(core, ideal, ideal_stepper(core, ideal.messages.plant))
+        < 0.9 * missed_N(core, own, core.stepper())
+    )
 
 
 @pytest.mark.parametrize("command", ["pause", "disable"])

@@ -108,8 +108,7 @@ def test_what_a_design_covers_as_it_is_made_is_the_least_of_its_neighbours(use_c
     assert coverage_as_made(problem, printed, 0.0) == coverage(problem, printed)
     least = coverage_as_made(problem, printed, 0.01)
     assert least < coverage_as_made(problem, printed, 0.001) < coverage(problem, printed)
-    off = msgspec.structs.replace(printed, thickness_mm=0.99 * printed.thickness_mm)
-    assert least <= coverage(problem, off)
+    assert least <= coverage(problem, msgspec.structs.replace(printed, thickness_mm=0.99 * printed.thickness_mm))
 
 
 def test_a_design_that_cannot_bear_its_field_as_made_covers_nothing(use_case_1: Region) -> None:

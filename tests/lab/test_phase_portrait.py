@@ -31,8 +31,9 @@ def test_coverage_agrees_with_counted_points(
     portrait = PhasePortrait(brake, speed)
     for region in (use_case_1, use_case_2):
         assert portrait.true_coverage(region) == pytest.approx(count_points(portrait, region, true=True), abs=1e-3)
-        counted = count_points(portrait, region, true=False)
-        assert portrait.trapezoid_coverage(region) == pytest.approx(counted, abs=1e-3)
+        assert portrait.trapezoid_coverage(region) == pytest.approx(
+            count_points(portrait, region, true=False), abs=1e-3
+        )
 
 
 def test_true_coverage_is_good_to_five_digits(brake: Brake, use_case_2: Region) -> None:

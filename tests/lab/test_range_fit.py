@@ -23,8 +23,7 @@ def test_table_2_4_within_the_thesis_error(law: FieldLaw) -> None:
 
 
 def test_no_other_friction_has_a_smaller_mean_error() -> None:
-    law = ThesisFieldLaw()
-    fit = fit_friction(ALL, law)
+    fit = fit_friction(ALL, ThesisFieldLaw())
     for shore, best in fit.friction.items():
         matrix = [item for item in ALL if item.shore_hardness == shore]
         least = mean_relative_error(fit, matrix)
@@ -58,8 +57,9 @@ def test_left_out_inserts_are_predicted_worse() -> None:
 
 def test_the_left_out_insert_does_not_see_its_own_measurement() -> None:
     law = PowerFieldLaw()
-    others = [item for item in ALL if item.name != "MRE-10-10"]
-    expected = fit_friction(others, law).relative_error(INSERTS["MRE-10-10"])
+    expected = fit_friction([item for item in ALL if item.name != "MRE-10-10"], law).relative_error(
+        INSERTS["MRE-10-10"]
+    )
     assert leave_one_out(ALL, law, free_exponent=False)["MRE-10-10"] == expected
 
 

@@ -317,8 +317,7 @@ def test_features_of_another_shape_are_refused(model: ForceModel, shape: tuple[i
 
 def test_metrics_of_a_known_error(model: ForceModel) -> None:
     rows = np.random.default_rng(3).uniform((0, 0, 100, 40), (1, 60, 800, 40.0001), (300, 4))
-    signs = np.where(np.arange(300) % 2, 0.5, -0.5)
-    data = Dataset(rows, model.predict(rows) + signs)
+    data = Dataset(rows, model.predict(rows) + np.where(np.arange(300) % 2, 0.5, -0.5))
     expected = {
         "mae_N": 0.5,
         "rmse_N": 0.5,
@@ -407,8 +406,7 @@ def test_the_force_agrees_with_50_digits(request: pytest.FixtureRequest, fixture
     model = request.getfixturevalue(fixture)
     for row in states(60).tolist():
         curve = model.curve(row[0], row[1], row[3])
-        exact = float(exact_N(model, row))
-        assert curve.force_N(row[2]) == pytest.approx(exact, rel=0, abs=1e-13 * curve.magnitude_N)
+        assert curve.force_N(row[2]) == pytest.approx(float(exact_N(model, row)), rel=0, abs=1e-13 * curve.magnitude_N)
         assert curve.force_and_slope(row[2])[0] == curve.force_N(row[2])
 
 

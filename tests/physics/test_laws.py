@@ -157,8 +157,9 @@ def test_float32_force_agrees_with_float64() -> None:
 
 @pytest.mark.parametrize(("law", "weakest", "strongest"), [(ThesisFieldLaw(), 0.69, 5.0), (PowerFieldLaw(), 0.61, 5.3)])
 def test_force_range_of_the_device(law: FieldLaw, weakest: float, strongest: float) -> None:
-    force = brake_force_N(law.radial_moment_Tm(np.array([95.0, 45.0])), STIFF, TORMAG)
-    assert force == pytest.approx([weakest, strongest], rel=0.01)
+    assert brake_force_N(law.radial_moment_Tm(np.array([95.0, 45.0])), STIFF, TORMAG) == pytest.approx(
+        [weakest, strongest], rel=0.01
+    )
 
 
 @pytest.mark.parametrize("law", [ThesisFieldLaw(), PowerFieldLaw()])
@@ -186,15 +187,17 @@ def test_the_inverse_of_arrays(dtype: Any) -> None:
 
 def test_the_inverse_returns_the_radial_moment() -> None:
     for case in islice(over_loads(5), 1500):
-        force = brake_force_N(*case)
-        assert radial_moment_for_force_Tm(force, case.elastomer, case.geometry) == pytest.approx(case.moment, rel=4e-15)
+        assert radial_moment_for_force_Tm(brake_force_N(*case), case.elastomer, case.geometry) == pytest.approx(
+            case.moment, rel=4e-15
+        )
 
 
 def test_the_inverse_needs_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tormagd.lab.design.force_law._NEWTON_STEPS", 10)
     for case in islice(over_loads(7), 500):
-        force = brake_force_N(*case)
-        assert radial_moment_for_force_Tm(force, case.elastomer, case.geometry) == pytest.approx(case.moment, rel=1e-14)
+        assert radial_moment_for_force_Tm(brake_force_N(*case), case.elastomer, case.geometry) == pytest.approx(
+            case.moment, rel=1e-14
+        )
 
 
 def test_no_field_is_no_force() -> None:
@@ -332,8 +335,7 @@ def test_the_first_micrometres_are_a_spring() -> None:
 
 def test_the_exact_solution_between_reversals() -> None:
     """From -z_ss, dz/dt = v - sigma0 |v| z / g has z = z_ss (1 - 2 exp(-x / z_ss)) after a travel x."""
-    level = FRICTION.level_N(30.0, 2.0)
-    reach = level / 8.0
+    reach = FRICTION.level_N(30.0, 2.0) / 8.0
     _, deflection = FRICTION.advance(-reach, 30.0, 2.0, 0.01)
     assert deflection == pytest.approx(reach * (1.0 - 2.0 * math.exp(-0.3 / reach)), rel=1e-12)
 
@@ -632,8 +634,7 @@ def test_a_naive_formula_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
         "compression",
         lambda self, y: ((1 - self.a * y) ** 2 + 2 * self.b * y) ** 0.5 - (1 - self.a * y),
     )
-    tally = numerics.check_chunk(seed=3, devices=8, references=20)
-    assert tally.worst["float64", "stretch"].over_allowed > 10.0
+    assert numerics.check_chunk(seed=3, devices=8, references=20).worst["float64", "stretch"].over_allowed > 10.0
 
 
 def test_wrong_time_steps_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -654,8 +655,7 @@ def test_no_load_in_the_domain_gives_anything_but_a_number(
 ) -> None:
     inner, wall, thickness = shape
     geometry = Geometry(inner, inner + wall, thickness, 0.02)
-    most = max_radial_moment_Tm(elastomer, geometry)
-    moment: Any = np.array([min(share, 0.999) * most], dtype=dtype)
+    moment: Any = np.array([min(share, 0.999) * max_radial_moment_Tm(elastomer, geometry)], dtype=dtype)
     force = brake_force_N(moment, elastomer, geometry)
     assert force.dtype == dtype
     assert np.isfinite(force).all()

@@ -262,8 +262,7 @@ def test_a_recorder_killed_in_the_middle_of_a_chunk_loses_only_that(tmp_path):
     with path.open("rb") as file:
         summary = make_reader(file).get_summary()
     second = sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)[1]
-    data = path.read_bytes()
-    path.write_bytes(data[: second.chunk_start_offset + 5_000])
+    path.write_bytes(path.read_bytes()[: second.chunk_start_offset + 5_000])
     recording = read_recording(path)
     assert not recording.is_complete
     assert int(recording.ticks.t_ns[-1]) < second.message_start_time + 1
@@ -336,8 +335,7 @@ def test_the_picture_names_what_happened(written):
     # the sensor's noise and the approach are in the figure, and whoever reads it has to know
     assert "100 mN rms (sensor noise and approach included)" in heading
     assert "SKEW" in heading
-    lanes = [label.get_text() for label in drawn.axes[-1].get_yticklabels()]
-    assert lanes == ["state", "limit RATE", "FAULT SKEW"]
+    assert [label.get_text() for label in drawn.axes[-1].get_yticklabels()] == ["state", "limit RATE", "FAULT SKEW"]
     assert [line.get_label() for line in drawn.axes[0].lines] == ["measured", "asked"]
 
 

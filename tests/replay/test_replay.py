@@ -96,8 +96,7 @@ def test_the_other_build_replays_it_to_the_bit(path: Path) -> None:
     switch = "0" if settle().is_compiled else "1"
     command = [sys.executable, "-P", "-m", "tormagd.replay", str(path), "--from", "3"]
     environment = os.environ | {SWITCH: switch, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    result = json.loads(done.stdout)
+    result = json.loads(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
     assert result["rerun"]["difference"] is None
     assert result["rerun"]["ticks"] == TICKS - 3_000
     assert switch == "1" or result["build"].startswith("interpreted")
@@ -137,8 +136,7 @@ def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, 
 def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxFile) -> None:
     """A part was lost: 20 ticks are missing, and the rest up to the next snapshot says nothing."""
     places = list(ticks_of(COLUMNS, box.entries))
-    entries = [*box.entries[: places[3_100] + 1], [MISSING], *box.entries[places[3_120] + 1 :]]
-    done = rerun(core, COLUMNS, entries)
+    done = rerun(core, COLUMNS, [*box.entries[: places[3_100] + 1], [MISSING], *box.entries[places[3_120] + 1 :]])
     assert (done.difference, done.gaps) == (None, 1)
     assert done.ticks == TICKS - 3_500 + 3_101
 
@@ -178,8 +176,7 @@ def test_a_changed_setpoint_is_found_in_the_next_tick(core: Core, box: BlackBoxF
 
 def test_a_command_that_is_missing_is_found(core: Core, box: BlackBoxFile) -> None:
     entries = [it for it in box.entries if not (it[0] == "command" and it[1] == "home")]
-    found = rerun(core, COLUMNS, entries).difference
-    assert found.field == "request"
+    assert rerun(core, COLUMNS, entries).difference.field == "request"
 
 
 def test_a_state_that_differs_is_found_where_no_tick_shows_it(core: Core, box: BlackBoxFile) -> None:
@@ -188,8 +185,7 @@ def test_a_state_that_differs_is_found_where_no_tick_shows_it(core: Core, box: B
     state = msgspec.msgpack.decode(msgspec.msgpack.encode(entries[place]))
     state[1]["Stepper"]["measure"]["Measure"]["measured"]["Measured"]["handle"]["Handle"]["sliding_mm_s"] += 1e-12
     entries[place] = state
-    found = rerun(core, COLUMNS, entries, 1.5).difference
-    assert found.field == "state.step.measure.measured.handle.sliding_mm_s"
+    assert rerun(core, COLUMNS, entries, 1.5).difference.field == "state.step.measure.measured.handle.sliding_mm_s"
 
 
 def test_another_limit_gives_another_first_tick(box: BlackBoxFile, path: Path) -> None:
@@ -290,8 +286,7 @@ def test_no_entries_break_it(core: Core, box: BlackBoxFile) -> None:
     rubbish: list[Any] = [None, -1, 2**63, "x", float("nan"), b"\0", {}, [], [[]], [1], ["plan"], ["unheard"]]
     rubbish += [["state", 1, 2], ["command", "stop", 1.0, False], ["latch", "SKEWED"], ["afresh", "now"]]
     rubbish += [["teach", {"Learned": {}}], ["teach", {"Limit": "RATE"}]]
-    first = list(ticks_of(COLUMNS, box.entries))[60]
-    head = box.entries[: first + 1]
+    head = box.entries[: list(ticks_of(COLUMNS, box.entries))[60] + 1]
     for _ in range(100):
         entries = list(head)
         place = rng.randrange(len(entries))

@@ -211,8 +211,7 @@ def test_a_thousand_scenes_are_a_thousand_fingerprints(write) -> None:
     steps += [{"tolerance_rms_N": 0.01 + 1e-5 * number} for number in range(1000)]
     forces = [msgspec.structs.replace(base.force, **step) for step in steps]
     assert len({msgspec.structs.replace(base, force=force).fingerprint for force in forces}) == 2000
-    renamed = msgspec.structs.replace(base, name="other", terms=EVERY_TERM.without("rate"))
-    assert renamed.fingerprint == base.fingerprint
+    assert msgspec.structs.replace(base, name="other", terms=EVERY_TERM.without("rate")).fingerprint == base.fingerprint
 
 
 def test_terms_are_named_in_the_scene(write) -> None:
@@ -234,8 +233,7 @@ def test_a_time_constant_belongs_to_the_nearest_of_its_terms() -> None:
 def test_a_daemon_may_run_at_the_rates_of_its_scene(write) -> None:
     own = Config(rates=Rates(of_scene=True))
     assert at_rates_of(load_scene("coronary"), Config()) == Config()
-    slow = load_scene(write(bandwidth__control_hz="250", bandwidth__inference_hz="100"))
-    rates = at_rates_of(slow, own).rates
+    rates = at_rates_of(load_scene(write(bandwidth__control_hz="250", bandwidth__inference_hz="100")), own).rates
     # nothing is watched less often than that
     assert (rates.control_hz, rates.inference_hz, rates.telemetry_hz) == (500, 100, 50)
     assert at_rates_of(load_scene(write(bandwidth__control_hz="2000")), own).rates.control_hz == 2000

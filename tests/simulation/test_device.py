@@ -123,8 +123,7 @@ def test_the_device_clock_runs_off_by_its_ppm_and_wraps(ppm: float) -> None:
 def test_status_comes_on_the_devices_own_clock() -> None:
     device = a_device(ppm=1000.0)
     device.advance(20.0)
-    frames = FrameDecoder().feed(device.transmit(20.0))
-    assert len(frames) == math.floor(20.0 * 1.001 / 0.02)
+    assert len(FrameDecoder().feed(device.transmit(20.0))) == math.floor(20.0 * 1.001 / 0.02)
 
 
 def test_handle_and_force_are_those_of_the_plant_in_sensor_steps() -> None:
@@ -159,8 +158,7 @@ def test_a_flood_is_bounded_and_the_device_recovers() -> None:
         device.receive(0.0, noise.randbytes(100_000))
     assert device.statistics.bytes <= 65_536
     device.receive(1.0, b"\x00" + HELLO)
-    frames = FrameDecoder().feed(device.transmit(1.1))
-    assert any(frame.function == FUNCTION[Identity] for frame in frames)
+    assert any(frame.function == FUNCTION[Identity] for frame in FrameDecoder().feed(device.transmit(1.1)))
 
 
 def a_conversation(device: VirtualDevice, cuts_per_ms: int = 1) -> bytes:
@@ -287,8 +285,7 @@ def test_the_lowest_identifier_goes_first_once_the_bus_is_free() -> None:
         device.receive(0.0, frame, host)
     seen = [delivery for _, delivery in run(device, 0.0, 0.002) if delivery.sender != DEVICE]
     # the first is on the bus before the others come; equal identifiers go in the order they came
-    order = [frames[0], frames[2], frames[4], frames[3], frames[1]]
-    assert [delivery.frame for delivery in seen] == order
+    assert [delivery.frame for delivery in seen] == [frames[0], frames[2], frames[4], frames[3], frames[1]]
     assert [delivery.sender for delivery in seen] == [1, 3, 5, 4, 2]
 
 
@@ -357,8 +354,9 @@ class Bench(Host):
     """A simulated device and the conformance kit's host of it, which looks through the wire."""
 
     def __init__(self, faults: Iterable[str] = (), plant: PlantParameters | None = None) -> None:
-        faulty = [parse_fault(fault) for fault in faults]
-        self.device = VirtualDevice(plant or load_plant("sample_1"), SteadyHand(), faulty)
+        self.device = VirtualDevice(
+            plant or load_plant("sample_1"), SteadyHand(), [parse_fault(fault) for fault in faults]
+        )
         super().__init__(SerialLine(Port(self.device)))
 
     def go_to(self, gap_mm: float, seconds: float = 1.5) -> None:

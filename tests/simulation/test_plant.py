@@ -589,8 +589,10 @@ def test_force_sensor_noise_has_the_stated_spread_around_the_truth(name: str) ->
 
 @pytest.mark.parametrize(("delay_ms", "rate_Hz"), [(0.0, 1000.0), (1.0, 1000.0), (7.0, 1000.0), (4.0, 250.0)])
 def test_force_sensor_shows_the_force_of_its_delay_ago(delay_ms: float, rate_Hz: float) -> None:
-    quiet = changed(SAMPLE_1, "force_sensor", noise_mN=0.0, drift_mN_min=0.0, delay_ms=delay_ms, rate_Hz=rate_Hz)
-    plant = Plant(quiet, ReversingHand(2.0))
+    plant = Plant(
+        changed(SAMPLE_1, "force_sensor", noise_mN=0.0, drift_mN_min=0.0, delay_ms=delay_ms, rate_Hz=rate_Hz),
+        ReversingHand(2.0),
+    )
     forces = []
     period_ms = round(1000.0 / rate_Hz)
     for millisecond in range(1, 600):

@@ -34,8 +34,9 @@ INSTALLED = sorted(
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `make install DESTDIR=ROOT PREFIX=/usr` puts there besides the library."""
     made: Path = tmp_path_factory.mktemp("root")
-    command = ["sh", str(UNITS / "install.sh"), str(made), "/usr", sys.executable, str(UNITS.parent)]
-    subprocess.run(command, check=True, timeout=60)
+    subprocess.run(
+        ["sh", str(UNITS / "install.sh"), str(made), "/usr", sys.executable, str(UNITS.parent)], check=True, timeout=60
+    )
     return made
 
 
@@ -63,8 +64,14 @@ def commands() -> dict[str, argparse.ArgumentParser]:
 
 def analyze(*arguments: object) -> "subprocess.CompletedProcess[str]":
     environment = os.environ | {"SYSTEMD_COLORS": "0", "SYSTEMD_PAGER": ""}
-    command = ["systemd-analyze", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=60)
+    return subprocess.run(
+        ["systemd-analyze", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
+        timeout=60,
+    )
 
 
 @needs_analyze
@@ -102,8 +109,10 @@ def test_the_unit_is_closed_to_what_it_does_not_need(unit, drop_ins, most):
 
 
 def test_what_is_installed_lies_in_its_places(root):
-    installed = sorted(str(path.relative_to(root / "usr")) for path in (root / "usr/lib").rglob("*") if path.is_file())
-    assert installed == INSTALLED
+    assert (
+        sorted(str(path.relative_to(root / "usr")) for path in (root / "usr/lib").rglob("*") if path.is_file())
+        == INSTALLED
+    )
     assert (root / "etc/tormag/tormagd.toml").read_bytes() == (UNITS.parent / "examples/service.toml").read_bytes()
     assert (root / "usr/share/tormagd/drop-ins/tcp.conf").is_file()
     # nothing of the folder that it was put together in: that is moved, or packed

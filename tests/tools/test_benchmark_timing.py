@@ -54,8 +54,7 @@ def test_a_tick_is_fresh_whose_state_came_since_the_one_before() -> None:
     times = zip((0, 500, 1_000, 2_000, 2_500), (0.1, 0.2, 0.2, 0.3, 0.4), strict=True)
     made = loop.as_block([[stamp_us * 1_000, 0.0, 50.0, received_s] for stamp_us, received_s in times], 2_000)
     assert (made.ticks, made.merged, made.fresh) == (5, 1, 3)
-    result = loop.summary([loop.Pair(made, made._replace(lateness_us=np.ones(5)))], RealTime())
-    assert result["fresh_share"] == 0.75
+    assert loop.summary([loop.Pair(made, made._replace(lateness_us=np.ones(5)))], RealTime())["fresh_share"] == 0.75
 
 
 def test_the_fastest_wires_are_configurations_that_tormagd_takes(tmp_path: Path) -> None:
@@ -123,8 +122,9 @@ def test_builds_take_turns_in_stretches_and_ratios_are_medians_over_them() -> No
 
 
 def test_without_a_compiled_build_there_is_none() -> None:
-    taken = {"whole_core": [100.0, 300.0, 200.0], "position_loop": [50.0]}
-    result = virtual_time.summary({"interpreted": taken}, 1_000.0)
+    result = virtual_time.summary(
+        {"interpreted": {"whole_core": [100.0, 300.0, 200.0], "position_loop": [50.0]}}, 1_000.0
+    )
     assert result["compiled"] is None
     assert (result["interpreted"]["whole_core"], result["interpreted"]["position_loop"]) == (5.0, 20.0)
     assert "ratio" not in result

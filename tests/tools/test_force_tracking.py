@@ -124,8 +124,9 @@ def test_a_step_is_judged_once_it_arrived_a_second_later_and_by_its_greatest() -
         (arrives_s + 0.5, arrives_s + 0.6, 0.09),
         (BEGINS_S + STEP_S, 10.0, 1.3),  # the next step
     )
-    figures = step_figures(found, BEGINS_S, IDEAL_S, 1.0)
-    assert figures == pytest.approx({"arrived_N": -0.05, "later_N": 0.02, "overshoot_N": 0.09})
+    assert step_figures(found, BEGINS_S, IDEAL_S, 1.0) == pytest.approx(
+        {"arrived_N": -0.05, "later_N": 0.02, "overshoot_N": 0.09}
+    )
     # downwards what falls short of the force asked is beyond it
     assert step_figures(found, BEGINS_S, IDEAL_S, -1.0)["overshoot_N"] == pytest.approx(0.05)
 

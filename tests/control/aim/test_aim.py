@@ -68,8 +68,7 @@ def test_a_handle_that_rests_does_not_close_the_gap(first, moving, rate_mm_s: fl
 
 
 def test_a_creeping_handle_is_planned_for_with_its_static_friction(first, moving) -> None:
-    creeping = moving(handle=Handle(MOBILISED_MM, 0.5, TURN, 0.5))
-    assert first(1.5, creeping).gap_mm > first(1.5, moving()).gap_mm + 2.0
+    assert first(1.5, moving(handle=Handle(MOBILISED_MM, 0.5, TURN, 0.5))).gap_mm > first(1.5, moving()).gap_mm + 2.0
 
 
 def test_the_portrait_rises_and_agrees_with_its_slope(core) -> None:

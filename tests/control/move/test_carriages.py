@@ -59,8 +59,7 @@ def test_a_least_gap_ends_a_motion_towards_it(running) -> None:
     """A path that closes at 38 mm/s, well beyond the gap that this device allows."""
     lowest_mm = math.inf
     for tick in range(1, 300):
-        closing = running.plan(80.0 - 0.038 * tick, gap_speed_mm_s=-38.0, min_gap_mm=76.0)
-        running.step(closing, **running.there)
+        running.step(running.plan(80.0 - 0.038 * tick, gap_speed_mm_s=-38.0, min_gap_mm=76.0), **running.there)
         lowest_mm = min(lowest_mm, running.move.reference.gap_mm)
     assert 76.0 - 1e-3 < lowest_mm < 76.01
 
