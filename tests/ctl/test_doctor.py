@@ -152,8 +152,7 @@ def test_port_missing_taken_or_not_ours(good):
     (good / "proc/4242/fd/3").symlink_to("/dev/ttyUSB0")
     write(good, "proc/4242/comm", "minicom\n")
     finding = checks.port_holder(Config(), Machine(good))
-    assert finding.verdict is Verdict.FAIL
-    assert finding.found == "minicom (process 4242)"
+    assert (finding.verdict, finding.found) == (Verdict.FAIL, "minicom (process 4242)")
     write(good, "proc/4242/comm", "tormagd\n")
     assert checks.port_holder(Config(), Machine(good)).verdict is Verdict.OK
 

@@ -90,8 +90,7 @@ def test_parts_have_the_ticks_in_their_order_and_a_state_every_second(rig: Rig) 
         parts += rig.heard()
     assert first == Begin("/boxes", {"format": "1"})
     assert all(isinstance(part, Part) for part in parts)
-    assert names(parts[0])[:3] == ["state", "step", "tick"]
-    assert names(parts[0])[-3:] == ["plan", "step", "tick"]
+    assert (names(parts[0])[:3], names(parts[0])[-3:]) == (["state", "step", "tick"], ["plan", "step", "tick"])
     assert [number for number, part in enumerate(parts) if "state" in names(part)] == [0, 50, 100, 150]
     ticks = [names(part).count("tick") for part in parts]
     assert sum(ticks) == 3_010
@@ -159,8 +158,7 @@ def test_an_entry_that_cannot_be_written_ends_the_box_and_not_control(rig: Rig) 
 def test_it_says_when_it_ends(rig: Rig) -> None:
     rig.heard()
     rig.box.close()
-    assert rig.heard() == [End()]
-    assert rig.waited == 1
+    assert (rig.heard(), rig.waited) == ([End()], 1)
 
 
 def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -149,8 +149,7 @@ def test_garbage_between_setpoints_is_counted_and_does_not_hide_them(rig: Rig) -
         publisher.send(setpoint(seq, 1.0 + seq / 10.0))
         publisher.send(b"")
     rig.until(lambda: rig.endpoint.inbox.refused == 10)
-    assert rig.endpoint.inbox.accepted == 5
-    assert rig.force_N == 1.4
+    assert (rig.endpoint.inbox.accepted, rig.force_N) == (5, 1.4)
 
 
 def test_a_flood_is_drained_in_bounded_portions(rig: Rig) -> None:

@@ -238,9 +238,11 @@ def test_something_else_is_not_a_message() -> None:
 
 
 def test_periods() -> None:
-    assert period(State, "left_position_mm") == pytest.approx(65536 * 8 / 4480)
-    assert period(State, "device_time_s") == pytest.approx(0.65536)
-    assert period(Sense, "handle_position_mm") == pytest.approx(4 * 2 * math.pi * 20)
+    assert (
+        period(State, "left_position_mm"),
+        period(State, "device_time_s"),
+        period(Sense, "handle_position_mm"),
+    ) == pytest.approx((65536 * 8 / 4480, 0.65536, 4 * 2 * math.pi * 20))
     with pytest.raises(KeyError):
         period(Sense, "force_N")
 

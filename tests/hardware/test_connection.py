@@ -280,8 +280,7 @@ def test_a_host_that_was_not_run_does_not_take_its_own_sleep_for_the_devices(ben
     bench.running().pass_ms(500, is_stalled=True)
     bench.ms += 1
     bench.connection.exchange(0.0, 0.0, DriveMode.OFF, bench.request, bench.number)
-    assert bench.connection.state is LinkState.RUNNING
-    assert bench.losses == 0
+    assert (bench.connection.state, bench.losses) == (LinkState.RUNNING, 0)
 
 
 def test_a_device_whose_first_word_is_who_it_is_runs_at_once(bench: Bench) -> None:

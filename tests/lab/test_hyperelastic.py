@@ -27,8 +27,7 @@ def test_every_law_starts_with_three_times_its_shear_modulus(law: Ogden | Thesis
 def test_stress_rises_and_keeps_type_and_shape(law: Ogden | ThesisOgden, dtype: type) -> None:
     stretch: Any = np.linspace(0.1, 10.0, 60, dtype=dtype).reshape(6, 10)
     stress = law.stress_Pa(stretch)
-    assert stress.dtype == dtype
-    assert stress.shape == stretch.shape
+    assert (stress.dtype, stress.shape) == (dtype, stretch.shape)
     assert (np.diff(stress.ravel()) > 0.0).all()
 
 

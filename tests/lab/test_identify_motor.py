@@ -61,8 +61,7 @@ def test_emps_is_within_the_published_values(recordings, capsys):
     assert main(["identify-motor", str(recordings / "emps" / "DATA_EMPS.mat"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     values = {name: item["value"] for name, item in found["parameters"].items() if item is not None}
-    assert values["mass_kg"] == pytest.approx(95.1089, rel=0.02)
-    assert values["viscous_N_s_m"] == pytest.approx(203.5034, rel=0.02)
+    assert (values["mass_kg"], values["viscous_N_s_m"]) == pytest.approx((95.1089, 203.5034), rel=0.02)
     assert values["coulomb_N"] == pytest.approx(20.3935, rel=0.03)
     assert values["offset_N"] == pytest.approx(-3.1648, abs=0.3)
     assert found["holdout_voltage_nrmse"] <= 0.06

@@ -483,8 +483,7 @@ def test_arrays_keep_type_and_shape_and_agree_with_floats(
 ) -> None:
     points = np.linspace(low, high, 12).astype(dtype).reshape(3, 4)
     values = law(points)
-    assert values.dtype == dtype
-    assert values.shape == points.shape
+    assert (values.dtype, values.shape) == (dtype, points.shape)
     expected = [law(float(one)) for one in points.ravel()]
     np.testing.assert_allclose(values.ravel(), expected, rtol=digits * np.finfo(dtype).eps)
     assert isinstance(law(0.5 * (low + high)), float)
@@ -681,8 +680,7 @@ def test_composition_reproduces_the_printed_masses() -> None:
     for item in INSERTS.values():
         masses_g = item.masses_g
         matrix_g, cip_g = printed_g[item.cip_fraction]
-        assert masses_g["matrix"] == pytest.approx(matrix_g, abs=0.051)
-        assert masses_g["cip"] == pytest.approx(cip_g, abs=0.051)
+        assert (masses_g["matrix"], masses_g["cip"]) == pytest.approx((matrix_g, cip_g), abs=0.051)
         assert masses_g["slacker"] == masses_g["thinner"] == pytest.approx(4.9, abs=0.051)
 
 

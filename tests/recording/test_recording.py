@@ -310,8 +310,7 @@ def test_quantities_come_from_the_ticks_and_else_from_telemetry(written):
 def test_bands_are_the_stretches_of_time_of_a_code(written):
     recording = read_recording(written)
     (limit,) = bands(recording, "limits")
-    assert limit.name == "RATE"
-    assert limit.spans_s == (pytest.approx((0.02, 0.06)),)
+    assert (limit.name, limit.spans_s) == ("RATE", (pytest.approx((0.02, 0.06)),))
     assert [(band.name, len(band.spans_s)) for band in bands(recording, "operating_state")] == [
         ("ENABLED", 1),
         ("FAULT", 1),

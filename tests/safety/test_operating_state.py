@@ -266,8 +266,7 @@ class Operating(RuleBasedStateMachine):
             assert not present.device_latched
             assert present.requested_N is None or present.requested_N <= present.neutral_N
         if before.operating_state is ENABLED and self.state.operating_state in (DISABLED, FAULT):
-            assert self.state.request is DeviceRequest.RETRACT
-            assert self.state.request_number == before.request_number + 1
+            assert (self.state.request, self.state.request_number) == (DeviceRequest.RETRACT, before.request_number + 1)
 
     @rule(found=faults)
     def fail(self, found: tuple[Fault, ...]) -> None:
@@ -293,8 +292,7 @@ class Operating(RuleBasedStateMachine):
         if self.state.request_number == before.request_number:
             assert self.state.request is before.request
         if set(self.state.faults) - set(before.faults):
-            assert self.state.request is DeviceRequest.RETRACT
-            assert self.state.request_number == before.request_number + 1
+            assert (self.state.request, self.state.request_number) == (DeviceRequest.RETRACT, before.request_number + 1)
 
 
 TestOperating = Operating.TestCase

@@ -134,8 +134,9 @@ def test_handle_and_force_are_those_of_the_plant_in_sensor_steps() -> None:
     span_mm = period(Sense, "handle_position_mm")
     turned_mm = 13.0 * SteadyHand().rpm / 60.0 * math.tau * 20.0
     assert turned_mm > span_mm
-    assert sense.handle_position_mm == pytest.approx(turned_mm % span_mm, abs=0.05)
-    assert sense.force_N == pytest.approx(device.truth.force_N, abs=0.05)
+    assert (sense.handle_position_mm, sense.force_N) == pytest.approx(
+        (turned_mm % span_mm, device.truth.force_N), abs=0.05
+    )
 
 
 def test_corrupt_and_foreign_payloads_are_counted_and_dropped() -> None:
@@ -419,8 +420,7 @@ def test_drive_run_moves_nothing_before_homing() -> None:
     before_mm = host.device.truth.gap_mm
     for _ in range(200):
         host.beat(Beat.RUN, -1.0, -1.0)
-    assert host.status.mode is DeviceMode.IDLE
-    assert host.device.truth.gap_mm == before_mm
+    assert (host.status.mode, host.device.truth.gap_mm) == (DeviceMode.IDLE, before_mm)
 
 
 def test_drive_run_is_refused_without_a_hello() -> None:
@@ -450,8 +450,7 @@ def test_homing_zeroes_the_encoders_at_the_open_switches_repeatably(name: str) -
         assert (host.status.mode, host.status.faults) == (DeviceMode.IDLE, DeviceFault(0))
         truth, state = host.device.truth, host.last(State)
         zeros.append((truth.left_mm - state.left_position_mm, truth.right_mm - state.right_position_mm))
-        assert truth.left_mm == pytest.approx(47.5, abs=0.05)
-        assert truth.right_mm == pytest.approx(47.5, abs=0.05)
+        assert (truth.left_mm, truth.right_mm) == pytest.approx((47.5, 47.5), abs=0.05)
         assert host.status.switches == Switches.LEFT_OPEN | Switches.RIGHT_OPEN | Switches.HOMED
         host.go_to(80.0, 1.0)
         host.pass_time(2.0, Beat.OFF)
@@ -621,8 +620,7 @@ def test_how_a_run_ends(ending: Ending) -> None:
     host.pass_time(1.0)
     truth = host.device.truth
     assert (host.status.faults, truth.left_A, truth.right_A) == (ending.latched, 0.0, 0.0)
-    assert truth.left_mm == pytest.approx(ending.left_mm, abs=ending.within_mm)
-    assert truth.right_mm == pytest.approx(ending.right_mm, abs=ending.within_mm)
+    assert (truth.left_mm, truth.right_mm) == pytest.approx((ending.left_mm, ending.right_mm), abs=ending.within_mm)
 
 
 def test_a_fault_is_not_cleared_while_its_cause_lasts() -> None:

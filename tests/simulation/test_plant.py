@@ -126,9 +126,11 @@ def test_another_insert_keeps_what_the_sample_is_off_its_kind() -> None:
     """Sample 1 has the registry's own MRE-50-40; sample 2 is softer by 8 %, and stays so."""
     soft = insert("MRE-10-10").elastomer
     first = with_insert(load_plant("sample_1"), "MRE-10-10")
-    assert first.elastomer.shear_modulus_kPa == pytest.approx(1e-3 * soft.shear_modulus_Pa)
-    assert first.elastomer.relative_permeability == pytest.approx(soft.relative_permeability)
-    assert first.elastomer.kinetic_friction == pytest.approx(soft.friction_coefficient)
+    assert (
+        first.elastomer.shear_modulus_kPa,
+        first.elastomer.relative_permeability,
+        first.elastomer.kinetic_friction,
+    ) == pytest.approx((1e-3 * soft.shear_modulus_Pa, soft.relative_permeability, soft.friction_coefficient))
     second = with_insert(load_plant("sample_2"), "MRE-10-10")
     assert second.elastomer.shear_modulus_kPa == pytest.approx(1e-3 * soft.shear_modulus_Pa * 255.0 / 277.3)
     assert second.motor == load_plant("sample_2").motor
@@ -305,8 +307,7 @@ def test_under_break_away_voltage_the_screw_truly_stands() -> None:
     axis = an_axis()
     break_away_V = SAMPLE_1.gear.output_friction_Nm / (70.0 * 0.011) * 2.2
     turn(axis, 0.5, 0.98 * break_away_V)
-    assert axis.speed_rad_s == 0.0
-    assert axis.angle_rad == 0.0
+    assert (axis.speed_rad_s, axis.angle_rad) == (0.0, 0.0)
     turn(axis, 0.5, 1.05 * break_away_V)
     assert axis.angle_rad > 0.0
 
@@ -666,8 +667,7 @@ def test_a_held_pad_relaxes_and_a_warm_one_is_softer() -> None:
 def test_the_device_feels_the_finger() -> None:
     plant = Plant(load_plant("pad_1"), PressingHand(1.5), seed=1)
     plant.advance(9.0)
-    assert plant.truth.handle_mm == 0.0
-    assert plant.truth.force_N == 0.0
+    assert (plant.truth.handle_mm, plant.truth.force_N) == (0.0, 0.0)
     plant.advance(5.0)
     truth = plant.truth
     assert (truth.handle_mm, truth.handle_mm_s) == (1.5, 0.0)

@@ -133,8 +133,7 @@ def test_a_step_is_judged_once_it_arrived_a_second_later_and_by_its_greatest() -
 
 def test_the_worst_is_of_means_in_between() -> None:
     found = course((3.0, 3.2, -0.4), (5.0, 5.001, 5.0), (8.0, 9.0, 1.0))
-    assert found.worst_N(2.0, 4.0) == pytest.approx(0.4)
-    assert found.worst_N(4.5, 6.0) == pytest.approx(0.1)  # one reading of fifty
+    assert (found.worst_N(2.0, 4.0), found.worst_N(4.5, 6.0)) == pytest.approx((0.4, 0.1))
 
 
 def test_every_speed_follows_every_other_once() -> None:

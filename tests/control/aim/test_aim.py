@@ -43,8 +43,7 @@ def first(core, planned):
 def test_starts_with_the_gap_open(core) -> None:
     plan = core.planner(3.0).planned
     assert (plan.gap_mm, plan.gap_speed_mm_s, plan.time_s) == (95.0, 0.0, 3.0)
-    assert plan.governed_N == core.portrait.min_N
-    assert plan.limits == (Limit.NO_SETPOINT,)
+    assert (plan.governed_N, plan.limits) == (core.portrait.min_N, (Limit.NO_SETPOINT,))
 
 
 @pytest.mark.parametrize("is_there", [False, True], ids=["no device", "at rest"])

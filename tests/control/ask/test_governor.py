@@ -415,8 +415,7 @@ def test_no_forecast_holds_a_force_of_a_stale_setpoint(learned: Governor) -> Non
         ask = decide(learned, now_s, at(beats_N, 10.0))
         if now_s - 10.0 <= VALID_S:
             continue
-        assert ask.limits == (Limit.STALE,)
-        assert ask.foresight == 0.0
+        assert (ask.limits, ask.foresight) == ((Limit.STALE,), 0.0)
         assert np.all(path_N(ask) == ask.force_N)
         assert plain(learned.forecast) == plain(Forecast())
     assert learned.asked_N == PORTRAIT.min_N

@@ -32,8 +32,7 @@ def test_what_the_gap_can_follow_is_followed() -> None:
 def test_a_step_is_met_in_its_middle() -> None:
     """As much too soon as too late: the gap is half way where the step is."""
     path = path_mm(60.0, [60.0] * 20 + [64.0] * 20, [1.0] * 40)
-    assert path[19] == pytest.approx(62.0 - MOST_MM / 2.0)
-    assert path[20] == pytest.approx(62.0 + MOST_MM / 2.0)
+    assert (path[19], path[20]) == pytest.approx((62.0 - MOST_MM / 2.0, 62.0 + MOST_MM / 2.0))
     assert path[:14] == pytest.approx([60.0] * 14)
     assert path[26:] == pytest.approx([64.0] * 14)
 
