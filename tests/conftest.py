@@ -6,7 +6,9 @@ failure itself: the kernel's counters and bare timers on every processor say so 
 failure.
 """
 
+import asyncio
 import contextlib
+import inspect
 import os
 import signal
 import time
@@ -58,10 +60,14 @@ class HostWarning(UserWarning):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Runs a live test, again after a failure that the host explains. What it asserts stays the same."""
+    """Runs a test that is a coroutine; runs a live test, again after a failure that the host explains. What it asserts
+    stays the same."""
+    call = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
+    if inspect.iscoroutinefunction(pyfuncitem.obj):
+        asyncio.run(pyfuncitem.obj(**call))
+        return True
     if pyfuncitem.get_closest_marker("live") is None:
         return None
-    call = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
     for attempt in range(1, ATTEMPTS + 1):
         watched = host_watch(pyfuncitem.config)
         start_s = time.monotonic()

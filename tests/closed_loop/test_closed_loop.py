@@ -242,7 +242,6 @@ def test_a_fault_is_named_and_the_gap_opens(arm, spec: str, fault: Fault, within
 def test_after_a_lost_encoder_enabling_wants_homing_though_the_device_calls_itself_homed(arm) -> None:
     loop, samples = struck(arm, "encoder_stuck_left")
     assert faults_of(samples) == (Fault.NO_MOTION,)
-    assert loop.measurement is not None
     assert loop.measurement.is_homed
     assert not samples[-1].measured.is_homed  # type: ignore[union-attr]
     loop.command("clear-fault")
@@ -284,7 +283,6 @@ def test_without_supply_the_gap_is_held_by_friction_and_both_facts_are_named(arm
     held_mm = samples[1_000].truth.gap_mm
     assert held_mm > samples[0].truth.gap_mm - 3.0
     assert all(sample.truth.gap_mm == pytest.approx(held_mm, abs=0.02) for sample in samples[1_000:])
-    assert loop.measurement is not None
     assert loop.measurement.mode is DeviceMode.LATCHED
 
 

@@ -209,7 +209,6 @@ def test_a_wrong_clock_makes_no_setpoint_stale_and_is_named(armed: ClosedLoop, n
         assert "and is corrected" in found.cause
         assert "chrony" in found.remedy
     else:
-        assert found.clock is not None
         assert found.clock.drift_ppm == pytest.approx(200.0 if "fast" in name else -200.0, abs=100.0)
     assert found.lost == pytest.approx(125, abs=1)
 

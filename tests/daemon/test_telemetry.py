@@ -138,7 +138,6 @@ def test_a_tick_is_recorded_whole() -> None:
     stepper = stepped(safety, measurement, 1.5)
     stepper.move.reference = Reference(64.2)
     measured = stepper.measured
-    assert measured is not None
     output = Duty(DriveMode.RUN, 0.1, -0.2, DeviceRequest.HOME, 5, (Limit.RATE,))
     tick = tick_record(stepper, output, plan, measurement, 20.0, 150.0, 9)
     sent = msgspec.msgpack.decode(encode_ticks([tick]))

@@ -247,5 +247,4 @@ def test_a_hold_of_a_day_and_a_recording_at_1_khz_are_taken(write, tmp_path: Pat
     rows = "".join(f"{n / 1000:.3f},{1.2 + 0.3 * (n % 2000) / 2000:.5f}\n" for n in range(2000))
     (tmp_path / "fast.csv").write_text(f"t_s,force_N\n{rows}")
     core = build_core(Config(scene=write(signal__file='"fast.csv"')))
-    assert core.missed is not None
     assert core.missed.rms_N < 1e-3

@@ -59,7 +59,6 @@ def test_a_recording_becomes_a_scene_that_is_taken(tmp_path: Path) -> None:
     time_s = np.arange(0.0, 8.0, 0.02)
     played = Signal("", "", time_s, 1.2 + 0.3 * np.sin(time_s))
     signal = load_task(str(written(tmp_path / "cataract.toml", played, is_known_ahead=True))).signal
-    assert signal is not None
     assert signal.is_known_ahead
 
 
