@@ -134,8 +134,8 @@ def test_a_node_that_is_none_is_refused(node: int) -> None:
 
 def test_what_the_device_says_comes_through_and_other_nodes_and_hosts_commands_are_not_ours() -> None:
     stream = CanStream(1)
-    for other in (frame_of(STATUS, node=2), frame_of(Hello(1, 1, 1)), frame_of(Home(1))):
-        assert stream.unpack(*other) is None
+    others = (frame_of(STATUS, node=2), frame_of(Hello(1, 1, 1)), frame_of(Home(1)))
+    assert [stream.unpack(*other) for other in others] == [None] * 3
     assert (stream.statistics.frames, stream.statistics.bytes) == (0, 7)
     assert stream.unpack(*frame_of(STATUS)) == STATUS
     assert stream.unpack(*frame_of(state(7))) == decode(FUNCTION[State], encode(state(7)))
@@ -152,9 +152,8 @@ def test_a_drive_that_is_not_ours_is_another_host() -> None:
 def test_what_is_damaged_is_counted_and_the_next_good_one_found_again() -> None:
     stream = CanStream(1)
     identifier, data = frame_of(state(7))
-    for damaged in (data[:-1], data[:-1] + bytes((data[-1] ^ 1,)), b""):
-        assert stream.unpack(identifier, damaged) is None
-    assert stream.unpack(0x7F1, b"") is None
+    damaged = [(identifier, spoilt) for spoilt in (data[:-1], data[:-1] + bytes((data[-1] ^ 1,)), b"")]
+    assert [stream.unpack(*frame) for frame in (*damaged, (0x7F1, b""))] == [None] * 4
     assert (stream.statistics.corrupt, stream.statistics.resynchronisations) == (4, 0)
     assert stream.unpack(identifier, data) is not None
     assert stream.unpack(*frame_of(STATUS)) == STATUS
@@ -175,8 +174,7 @@ def test_what_is_damaged_is_counted_and_the_next_good_one_found_again() -> None:
 )
 def test_the_states_own_counter_shows_what_is_missing(counters: list[int], lost: int) -> None:
     stream = CanStream(1)
-    for counter in counters:
-        assert stream.unpack(*frame_of(state(counter))) is not None
+    assert None not in [stream.unpack(*frame_of(state(counter))) for counter in counters]
     assert (stream.statistics.lost, stream.statistics.repeated) == (lost, 0), "no news is for the link to count"
 
 
@@ -328,9 +326,8 @@ def line() -> Iterator[Line]:
 
 @pytest.fixture
 def port(line: Line) -> Iterator[SerialPort]:
-    opened = open_serial(line.device, SerialOptions())
-    yield opened
-    opened.close()
+    with contextlib.closing(open_serial(line.device, SerialOptions())) as opened:
+        yield opened
 
 
 def test_bytes_from_before_the_opening_are_not_read(line: Line) -> None:
@@ -352,31 +349,27 @@ def test_end_of_file_is_a_device_that_was_unplugged(port: SerialPort, monkeypatc
 def test_what_the_driver_did_not_take_is_sent_before_the_next_frame(
     line: Line, port: SerialPort, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    taken = b""
+    taken = bytearray()
     room = iter([3, 0, 7, 0, 0, 100, 100])
 
     def write(descriptor: int, data: bytes) -> int:
-        nonlocal taken
         assert descriptor == port.fileno()
         count = next(room)
         if not count:
             raise BlockingIOError
-        taken += data[:count]
+        taken.extend(data[:count])
         return len(data[:count])
 
     monkeypatch.setattr(os, "write", write)
     for nonce in range(1, 8):
         port.send(Home(nonce))
     far = FrameStream()
-    assert far.unpack(taken) == [Home(nonce) for nonce in range(1, 8)]
+    assert far.unpack(bytes(taken)) == [Home(nonce) for nonce in range(1, 8)]
     assert far.statistics.lost == 0
 
 
 def test_a_port_that_goes_while_it_is_set_up_is_not_opened(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
-    def gone(descriptor: int) -> None:
-        raise termios.error(errno.EIO, "Input/output error")
-
-    monkeypatch.setattr(termios, "tcgetattr", gone)
+    monkeypatch.setattr(termios, "tcgetattr", Mock(side_effect=termios.error(errno.EIO, "Input/output error")))
     with pytest.raises(BackendError, match="Input/output error"):
         open_serial(line.device, SerialOptions())
 
@@ -452,10 +445,7 @@ def test_no_more_frames_are_taken_at_once_than_the_loop_can_bear(bus: Bus) -> No
 def test_an_interface_that_is_not_there_says_how_it_comes(
     monkeypatch: pytest.MonkeyPatch, number: int, said: str, first: str
 ) -> None:
-    def absent(**_options: object) -> None:
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(can, "Bus", absent)
+    monkeypatch.setattr(can, "Bus", Mock(side_effect=OSError(number, os.strerror(number))))
     with pytest.raises(BackendError, match=f"socketcan can7: cannot be opened: .*{said}") as caught:
         opened(Device(backend="can", options={"interface": "socketcan"}, port="can7"))
     assert caught.value.remedy.startswith(first)
@@ -472,8 +462,7 @@ def test_lines_of_an_adapter_pass_both_ways(line: Line) -> None:
     while not said.endswith(b"t061107\r"):
         said += os.read(line.far, 100)
     assert said.startswith(b"C\rS8\r")
-    status = STATUS_FRAME
-    os.write(line.far, b"\rz\r\at%03X8%s\r" % (status.identifier, status.data.hex().encode()))
+    os.write(line.far, b"\rz\r\at%03X8%s\r" % (STATUS_FRAME.identifier, STATUS_FRAME.data.hex().encode()))
     assert next_of(backend) == [STATUS]
     backend.close()
 
@@ -546,12 +535,10 @@ def test_a_full_queue_is_borne_for_as_long_as_the_device_would(failing: Callable
 
 @pytest.mark.parametrize("flag", ["is_extended_id", "is_remote_frame", "is_fd"])
 def test_other_kinds_of_frames_are_other_peoples(failing: Callable[..., CanBackend], flag: str) -> None:
-    status = STATUS_FRAME
-    flags = {"is_extended_id": False} | {flag: True}
-    data = b"" if flag == "is_remote_frame" else status.data
-    other = can.Message(arbitration_id=status.identifier, data=data, **flags)
-    plain = can.Message(arbitration_id=status.identifier, data=status.data, is_extended_id=False)
-    backend = failing(other, plain)
+    identifier, data = STATUS_FRAME.identifier, STATUS_FRAME.data
+    flags = {"is_extended_id": False, "data": b"" if flag == "is_remote_frame" else data} | {flag: True}
+    other = can.Message(arbitration_id=identifier, **flags)
+    backend = failing(other, can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
     assert backend.receive() + backend.receive() == [STATUS]
     assert backend.statistics.corrupt == 0
 

@@ -49,7 +49,8 @@ def answers(outcomes: dict[Run, Outcome]) -> list[tuple[Design, float]]:
 
 
 def test_dask_cluster_and_process_pool_give_the_same_answer(runs: list[Run], problem: Problem) -> None:
-    every = [*runs, Run(problem, Design(12.0, 20.0, 95.0), "global", seed=3)]
+    quick = msgspec.structs.replace(problem, measure="trapezoid")
+    every = [*runs, Run(quick, Design(12.0, 20.0, 95.0), "global", seed=3)]
     with ProcessPoolExecutor(1) as pool:
         here = sweep(every, pool)
     with (

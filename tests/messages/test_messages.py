@@ -271,7 +271,7 @@ def test_random_bytes_are_a_message_error(data: bytes, kind: type[Any]) -> None:
     refusal(data, kind)
 
 
-@settings(max_examples=300)
+@settings(max_examples=120)
 @given(
     base=st.sampled_from([SETPOINT, REQUEST]),
     changes=st.dictionaries(

@@ -296,7 +296,7 @@ class Operating(RuleBasedStateMachine):
 
 
 TestOperating = Operating.TestCase
-TestOperating.settings = settings(max_examples=150, stateful_step_count=30, deadline=None)
+TestOperating.settings = settings(max_examples=60, stateful_step_count=30, deadline=None)
 
 
 @pytest.mark.parametrize(
