@@ -34,8 +34,7 @@ def test_a_pulse_is_felt_on_the_pad(arm, pad_core: Core, plant: str) -> None:
         stamp_s = math.floor(100.0 * now_s) / 100.0
         return TimedSetpoint(float(np.interp(stamp_s - PRESSED_S, time_s, force_N)), stamp_s, 0.1)
 
-    for _ in loop.run(PRESSED_S - loop.now_s, publish):
-        pass
+    list(loop.run(PRESSED_S - loop.now_s, publish))
     errors_N = [
         sample.truth.force_N - float(np.interp(sample.time_s - PRESSED_S, time_s, force_N))
         for sample in loop.run(PULSE_S, publish)

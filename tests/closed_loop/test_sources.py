@@ -47,13 +47,12 @@ class Publisher(NamedTuple):
             fields = {
                 "v": 1,
                 "source": self.source,
+                "session": self.session,
                 "seq": self.first_seq + number - round(self.from_s / PERIOD_S),
                 "stamp_ns": START_NS + round((start_s + self.clock_s(sent_s)) * 1e9),
                 "servo_cf": self.force_N(sent_s),
                 "valid_for_ms": VALID_MS,
             }
-            if self.session is not None:
-                fields["session"] = self.session
             yield start_s + arrived_s, msgpack.packb(fields)
 
 

@@ -1,5 +1,6 @@
 """The codec against cantools, against its own inverse, and against what must not pass."""
 
+import contextlib
 import math
 import random
 import struct
@@ -68,10 +69,10 @@ def cantools_payload(message: Message) -> bytes:
     """The same message packed by cantools, with a CRC computed bit by bit."""
     definition = DATABASE.get_message_by_name(type(message).__name__)
     values = values_of(message)
-    if isinstance(message, Drive | State):
-        body = bytes(definition.encode(values | {"crc": 0}, strict=True))[:-1]
-        return body + bytes([bitwise_crc8(bytes([FUNCTION[type(message)]]) + body)])
-    return bytes(definition.encode(values, strict=True))
+    if not isinstance(message, Drive | State):
+        return bytes(definition.encode(values, strict=True))
+    body = bytes(definition.encode(values | {"crc": 0}, strict=True))[:-1]
+    return body + bytes([bitwise_crc8(bytes([FUNCTION[type(message)]]) + body)])
 
 
 @by_name
@@ -90,9 +91,8 @@ def test_bytes_and_values_are_those_of_cantools_in_bulk(layout: Layout) -> None:
 
 
 def test_crc8_is_sae_j1850() -> None:
-    assert crc8(b"123456789") == 0x4B
+    assert crc8(b"123456789") == bitwise_crc8(b"123456789") == 0x4B
     assert crc8(b"") == 0
-    assert bitwise_crc8(b"123456789") == 0x4B
     payload = encode(STATE)
     assert payload[-1] != crc8(bytes([FUNCTION[Drive]]) + payload[:-1]), "it covers the function"
 
@@ -251,12 +251,8 @@ def test_numbers_of_numpy_s_are_numbers() -> None:
     """Compiled, a message takes whole numbers of Python's only."""
     drive = Drive(np.float64(0.5), np.float32(-0.25), DriveMode.RUN, 7)  # type: ignore[arg-type]
     assert encode(drive) == encode(DRIVE)
-    changes: dict[str, Any] = {"counter": np.uint8(7)}
-    if IS_COMPILED:
-        with pytest.raises(TypeError, match="int object expected"):
-            DRIVE.replaced(**changes)
-    else:
-        assert encode(DRIVE.replaced(**changes)) == encode(DRIVE)
+    with pytest.raises(TypeError, match="int object expected") if IS_COMPILED else contextlib.nullcontext():
+        assert encode(DRIVE.replaced(counter=np.uint8(7))) == encode(DRIVE)
 
 
 @pytest.mark.parametrize(

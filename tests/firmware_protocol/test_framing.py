@@ -1,5 +1,6 @@
 """Frames over streams that are whole, cut, damaged, repeated and endless."""
 
+import contextlib
 import pickle
 import random
 from binascii import crc_hqx
@@ -43,10 +44,9 @@ def test_cobs_is_the_cobs_of_the_reference(data: bytes) -> None:
 
 @given(st.binary(min_size=1, max_size=20).map(lambda data: data.replace(b"\0", b"\1")))
 def test_cobs_refuses_what_the_reference_refuses(data: bytes) -> None:
-    try:
+    expected = None
+    with contextlib.suppress(cobs.DecodeError):
         expected = cobs.decode(data)
-    except cobs.DecodeError:
-        expected = None
     assert cobs_decode(data) == expected
 
 
@@ -63,8 +63,7 @@ def test_a_crc_carried_on_over_itself_leaves_the_residue(data: bytes) -> None:
 @given(frames)
 def test_a_frame_comes_back(frame: Frame) -> None:
     encoded = wire(frame)
-    assert encoded.count(0) == 1
-    assert encoded.endswith(b"\0")
+    assert encoded.index(0) == len(encoded) - 1
     assert len(encoded) == len(frame.payload) + 6 <= MAX_ENCODED + 1
     assert FrameDecoder().feed(encoded) == [frame]
 
@@ -147,8 +146,8 @@ def test_a_byte_more_or_less_at_the_end_is_found(frame: Frame, more: int) -> Non
     """Zeros above all, which a CRC without a final XOR does not see."""
     checked = cobs.decode(wire(frame)[:-1])
     decoder = FrameDecoder()
-    for damaged in (checked + bytes((more,)), checked + b"\0", checked + bytes(3), checked[:-1]):
-        assert decoder.feed(cobs.encode(damaged) + b"\0") == []
+    damaged = (checked + bytes((more,)), checked + b"\0", checked + bytes(3), checked[:-1])
+    assert decoder.feed(b"".join(cobs.encode(data) + b"\0" for data in damaged)) == []
     assert decoder.statistics.corrupt == 4
 
 

@@ -429,8 +429,7 @@ def moving(core: Core) -> ClosedLoop:
     """A loop that is armed and closing its gap, on a perfect line."""
     loop = ClosedLoop(CONFIG, core.stepper(), core.planner(), a_device())
     loop.arm()
-    for _ in loop.run(MOVING_S, publisher(loop.now_s)):
-        pass
+    list(loop.run(MOVING_S, publisher(loop.now_s)))
     return loop
 
 

@@ -5,6 +5,7 @@ import math
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -69,36 +70,35 @@ def rising() -> ForceModel:
     return make_model(weight, rng.normal(size=50), np.abs(rng.normal(size=50)) / 20, -1.0)
 
 
+def of_field(slopes: list[float], bias: float, output: list[float], constant: float) -> ForceModel:
+    """A model whose force depends on the field alone."""
+    weight = np.zeros((len(slopes), 4))
+    weight[:, 2] = slopes
+    return make_model(weight, np.full(len(slopes), bias), np.array(output), constant)
+
+
 @pytest.fixture(scope="session")
 def bump() -> ForceModel:
     """Force that rises to a greatest value near 450 mT and falls again, the same on both sides."""
-    weight = np.zeros((2, 4))
-    weight[:, 2] = 8.0, -8.0
-    return make_model(weight, np.array([4.0, 4.0]), np.array([1.5, 1.5]), -2.0)
+    return of_field([8.0, -8.0], 4.0, [1.5, 1.5], -2.0)
 
 
 @pytest.fixture(scope="session")
 def lopsided() -> ForceModel:
     """Force that rises steeply to its greatest value near 450 mT and falls gently."""
-    weight = np.zeros((2, 4))
-    weight[:, 2] = 40.0, -4.0
-    return make_model(weight, np.array([4.0, 4.0]), np.array([1.5, 1.5]), -2.0)
+    return of_field([40.0, -4.0], 4.0, [1.5, 1.5], -2.0)
 
 
 @pytest.fixture(scope="session")
 def plateau() -> ForceModel:
     """Force that climbs steeply at 450 mT and is flat to the last bit on both sides."""
-    weight = np.zeros((1, 4))
-    weight[:, 2] = 500.0
-    return make_model(weight, np.zeros(1), np.array([1.0]), 0.0)
+    return of_field([500.0], 0.0, [1.0], 0.0)
 
 
 @pytest.fixture(scope="session")
 def creeping() -> ForceModel:
     """The plateau, with a rise of 8 units of rounding across it."""
-    weight = np.zeros((2, 4))
-    weight[:, 2] = 500.0, 1.0
-    return make_model(weight, np.zeros(2), np.array([1.0, 1e-14]), -0.9)
+    return of_field([500.0, 1.0], 0.0, [1.0, 1e-14], -0.9)
 
 
 # -- what all of them promise -----------------------------------------------------------------------------------------
@@ -137,14 +137,12 @@ SUBJECTS = {
 ANY_SHAPE = [name for name, subject in SUBJECTS.items() if not subject.needs_rising]
 CONTINUOUS = [name for name in ANY_SHAPE if SUBJECTS[name].is_continuous]
 FORGETFUL = [name for name in ANY_SHAPE if not SUBJECTS[name].is_continuous]
-_MADE: dict[tuple[str, int], FieldSolver] = {}
 
 
+@cache
 def solver(name: str, model: ForceModel) -> FieldSolver:
     """The search on that model, made once."""
-    if (name, id(model)) not in _MADE:
-        _MADE[name, id(model)] = SUBJECTS[name].make(model)
-    return _MADE[name, id(model)]
+    return SUBJECTS[name].make(model)
 
 
 @pytest.mark.parametrize("name", SUBJECTS)
@@ -214,8 +212,7 @@ def test_out_of_reach_is_the_nearest_end_and_never_silent(rising: ForceModel, na
     above = searcher.solve(rising.curve(0.5, 10, CIP), most + 0.5, 500.0)
     assert (below.field_mT, below.reach) == (REACHED_MT[0], Reach.BELOW)
     assert (above.field_mT, above.reach) == (REACHED_MT[1], Reach.ABOVE)
-    for solution in (below, above):
-        assert solution.confidence == pytest.approx(math.exp(-20 * 0.5 / 6), rel=1e-4)
+    assert (below.confidence, above.confidence) == pytest.approx((math.exp(-20 * 0.5 / 6),) * 2, rel=1e-4)
 
 
 @pytest.mark.parametrize("name", ANY_SHAPE)
@@ -241,11 +238,9 @@ def test_a_tie_is_resolved_by_continuity(plateau: ForceModel, name: str) -> None
 @pytest.mark.parametrize("name", SUBJECTS)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
 def test_numbers_that_are_none_are_refused(rising: ForceModel, name: str, value: float) -> None:
-    names = ("displacement_mm", "rate_mm_s", "force_N", "cip_percent", "last_field_mT")
-    for position, word in enumerate(names):
-        point = [0.5, 10.0, 2.0, CIP, 400.0]
-        point[position] = value
-        displacement, rate, force, cip, last = point
+    usual = {"displacement_mm": 0.5, "rate_mm_s": 10.0, "force_N": 2.0, "cip_percent": CIP, "last_field_mT": 400.0}
+    for word in usual:
+        displacement, rate, force, cip, last = (usual | {word: value}).values()
         with pytest.raises(DomainError, match=word):
             solver(name, rising).solve(rising.curve(displacement, rate, cip), force, last)
 
@@ -447,10 +442,11 @@ def test_the_last_field_is_a_point_of_the_grid(bump: ForceModel, refine: Refinem
 
 def test_newton_needs_few_evaluations(rising: ForceModel) -> None:
     rng = np.random.default_rng(2)
-    counts = []
-    for field in rng.uniform(*RANGE_MT, 200).tolist():
-        force = rising.predict_one(0.5, 10, field, CIP)
-        counts.append(search(newton).solve(rising.curve(0.5, 10, CIP), force, field + 20).iterations)
+    curve = rising.curve(0.5, 10, CIP)
+    counts = [
+        search(newton).solve(curve, curve.force_N(field), field + 20).iterations
+        for field in rng.uniform(*RANGE_MT, 200).tolist()
+    ]
     assert np.mean(counts) < 6
     assert max(counts) < 12
 
@@ -552,9 +548,8 @@ def test_flat_stretches_do_not_stop_it(rate: float) -> None:
 def test_a_named_search_is_built_with_its_settings(rising: ForceModel, name: str) -> None:
     for rises in (False, True):
         built = build(named(name, step_mT=25.0), (100.0, 800.0), rises=rises)
-        newton = RisingSearch if rises else BracketedSearch
-        expected = {"nearest": NearestFieldSearch, "coarse-to-fine": BracketedSearch, "newton": newton}
-        assert isinstance(built, expected[name])
+        kinds = {"nearest": NearestFieldSearch, "newton": RisingSearch if rises else BracketedSearch}
+        assert isinstance(built, kinds.get(name, BracketedSearch))
         usual = build(named(name), (100.0, 800.0), rises=rises)
         assert usual.solve(rising.curve(0.5, 10, 40.0), 3.0, None).field_mT > 100
 
@@ -567,13 +562,10 @@ def test_a_name_that_is_none_is_refused_with_those_that_are() -> None:
 @pytest.mark.parametrize("name", shipped_scenes())
 def test_a_scene_gets_the_search_that_it_names_or_newton_where_there_is_one(name: str) -> None:
     scene = load_scene(name)
-    built = build_core(Config(scene=name)).solver
-    if scene.solver.name != "auto":
-        assert built.solver == scene.solver.name
-    elif "rate" in terms_of(scene).left_out:
-        assert built.solver == "portrait"  # there is nothing to search
-    else:
-        assert built.solver == "newton"
+    # without the rate there is nothing to search
+    best = "portrait" if "rate" in terms_of(scene).left_out else "newton"
+    wanted = best if scene.solver.name == "auto" else scene.solver.name
+    assert build_core(Config(scene=name)).solver.solver == wanted
 
 
 def test_no_other_search_is_cheaper_or_more_exact_in_any_measured_scene() -> None:

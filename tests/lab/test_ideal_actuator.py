@@ -43,12 +43,10 @@ def test_they_stand_where_nothing_is_planned_for(command: str) -> None:
     core, device = build_core(Config()), VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1)
     loop = ClosedLoop(core.config, ideal_stepper(core, device.messages.plant), core.planner(), device)
     loop.arm()
-    for _ in loop.run(0.5, lambda now_s: TimedSetpoint(1.4, now_s, 0.1)):
-        pass
+    list(loop.run(0.5, lambda now_s: TimedSetpoint(1.4, now_s, 0.1)))
     stood_mm = device.truth.gap_mm
     loop.command(command)
-    for _ in loop.run(0.1):
-        pass
+    list(loop.run(0.1))
     # the firmware opens a device that is disabled, by its own motors
     assert (device.truth.gap_mm > stood_mm + 0.3) is (command == "disable")
     assert device.truth.gap_mm > stood_mm - 0.01

@@ -22,12 +22,11 @@ SCENE = json.dumps({"name": "pulse", "insert": {"name": "MRE-50-40"}})
 def tick(k):
     """Every ms: DISABLED and far off for 50 ms, then ENABLED and 20 mN off; RATE for 10 ms, and a fault at 100 ms."""
     row = (START_NS + k * 1_000_000, 1.5)
-    currents = (0.3 if k % 2 else -0.3, 0.4)
     if k < 50:
         return *row, 9.0, "DISABLED", (), (), 7.0, 1e-3, 9.0, 9.0, 900.0, 70.0
     state, faults = ("FAULT", ("SKEW",)) if k >= 100 else ("ENABLED", ())
     limits = ("RATE",) if 60 <= k < 70 else ()
-    return *row, 1.52, state, limits, faults, 1.1, 2e-5, *currents, 30.0, 70.0
+    return *row, 1.52, state, limits, faults, 1.1, 2e-5, 0.3 if k % 2 else -0.3, 0.4, 30.0, 70.0
 
 
 @pytest.fixture

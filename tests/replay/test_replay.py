@@ -20,7 +20,7 @@ from firmware_protocol.build import SWITCH, settle
 from tormagd import __version__
 from tormagd.assembly.build import Core
 from tormagd.assembly.journal import MISSING
-from tormagd.config import Config
+from tormagd.config import Config, Device
 from tormagd.keeping import Part
 from tormagd.recording.black_box import BlackBoxFile, read_black_box, write_black_box
 from tormagd.recording.reader import RecordingError, read_recording
@@ -197,8 +197,7 @@ def test_another_limit_gives_another_first_tick(box: BlackBoxFile, path: Path) -
 
 def test_what_is_not_as_it_was_is_told(box: BlackBoxFile, path: Path) -> None:
     changed = msgspec.structs.replace(box, header={**box.header, "sources_sha256": "0" * 64, "platform": "PDP-11"})
-    device = msgspec.structs.replace(Config().device, port="/dev/another")
-    configured = msgspec.structs.replace(Config(), device=device, scene="pulse")
+    configured = Config(device=Device(port="/dev/another"), scene="pulse")
     told = differences(recorded(changed, path.parent), configured)
     assert [line.partition(":")[0] for line in told] == ["build", "platform", "scene", "configuration"]
 
@@ -222,19 +221,27 @@ def refusal(path: Path) -> str:
     return text
 
 
+def stated(path: Path, header: dict[str, str], encoding: str, data: bytes) -> Path:
+    """A file with that header, whose one message is this."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata("black_box", header)
+        channel = writer.register_channel(topic="/core", message_encoding=encoding, schema_id=0)
+        writer.add_message(channel, log_time=1, data=data, publish_time=1)
+        writer.finish()
+    return path
+
+
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.01])
 def test_one_that_breaks_off_early_is_refused(path: Path, tmp_path: Path, share: float) -> None:
-    broken = tmp_path / "broken.mcap"
-    data = path.read_bytes()
-    broken.write_bytes(data[: int(share * len(data))])
-    assert refusal(broken)
+    (tmp_path / "broken.mcap").write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    assert refusal(tmp_path / "broken.mcap")
 
 
 def test_one_that_breaks_off_late_is_replayed_so_far(core: Core, path: Path, tmp_path: Path) -> None:
-    broken = tmp_path / "broken.mcap"
-    data = path.read_bytes()
-    broken.write_bytes(data[: len(data) * 2 // 3])
-    box = read_black_box(broken)
+    (tmp_path / "broken.mcap").write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    box = read_black_box(tmp_path / "broken.mcap")
     assert not box.is_complete
     done = again(core, box)
     assert done.difference is None
@@ -254,30 +261,19 @@ def test_random_and_damaged_bytes_are_refused(path: Path, tmp_path: Path) -> Non
 
 
 def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Path) -> None:
-    other = tmp_path / "other.mcap"
-    with other.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel(topic="/core", message_encoding="json", schema_id=0)
-        writer.add_message(channel, log_time=1, data=b"{}", publish_time=1)
-        writer.finish()
-    assert "allowed is msgpack" in refusal(other)
-    changes = {
-        "format": ("3", FORMER),
-        "config": ('{"scene": "pulse"}', "config: its hash"),
-        "model_sha256": ("f" * 64, "the model with the hash 'ffffffffffff'"),
-        "columns": (json.dumps(["t_ns"]), "no column 'monotonic_s'"),
-    }
-    for name, (value, said) in changes.items():
-        path = tmp_path / f"{name}.mcap"
-        write_black_box(path, box.header | {name: value}, NO_TICKS)
-        assert said in refusal(path)
-    path = tmp_path / "no scene.mcap"
-    write_black_box(path, {name: text for name, text in box.header.items() if name != "scene"}, NO_TICKS)
-    assert "its header has no 'scene'" in refusal(path)
-    path = tmp_path / "empty.mcap"
-    write_black_box(path, box.header, NO_TICKS)
-    assert "no tick in it" in refusal(path)
+    assert "allowed is msgpack" in refusal(stated(tmp_path / "other.mcap", {}, "json", b"{}"))
+    for number, (header, said) in enumerate(
+        (
+            (box.header | {"format": "3"}, FORMER),
+            (box.header | {"config": '{"scene": "pulse"}'}, "config: its hash"),
+            (box.header | {"model_sha256": "f" * 64}, "the model with the hash 'ffffffffffff'"),
+            (box.header | {"columns": json.dumps(["t_ns"])}, "no column 'monotonic_s'"),
+            ({name: text for name, text in box.header.items() if name != "scene"}, "its header has no 'scene'"),
+            (box.header, "no tick in it"),
+        )
+    ):
+        write_black_box(tmp_path / f"{number}.mcap", header, NO_TICKS)
+        assert said in refusal(tmp_path / f"{number}.mcap")
 
 
 def test_no_entries_break_it(core: Core, box: BlackBoxFile) -> None:
@@ -289,25 +285,15 @@ def test_no_entries_break_it(core: Core, box: BlackBoxFile) -> None:
     head = box.entries[: list(ticks_of(COLUMNS, box.entries))[60] + 1]
     for _ in range(100):
         entries = list(head)
-        place = rng.randrange(len(entries))
-        victim = entries[place]
-        if isinstance(victim, list) and victim and rng.random() < 0.7:
-            victim = list(victim)
-            victim[rng.randrange(len(victim))] = rng.choice(rubbish)
-            entries[place] = victim
-        else:
-            entries[place] = rng.choice(rubbish)
+        place, spoilt = rng.randrange(len(entries)), rng.choice(rubbish)
+        if isinstance(entries[place], list) and entries[place] and rng.random() < 0.7:
+            inner = rng.randrange(len(entries[place]))
+            spoilt = [*entries[place][:inner], spoilt, *entries[place][inner + 1 :]]
+        entries[place] = spoilt
         with contextlib.suppress(ReplayError):
             assert rerun(core, COLUMNS, entries).ticks <= 61
 
 
 def test_a_list_that_says_it_is_endless_is_refused(box: BlackBoxFile, tmp_path: Path) -> None:
-    other = tmp_path / "lies.mcap"
-    with other.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.add_metadata("black_box", box.header)
-        channel = writer.register_channel(topic="/core", message_encoding="msgpack", schema_id=0)
-        writer.add_message(channel, log_time=1, data=b"\xdd" + struct.pack(">I", 2**32 - 1), publish_time=1)
-        writer.finish()
-    assert "not an intact MCAP file" in refusal(other)
+    endless = b"\xdd" + struct.pack(">I", 2**32 - 1)
+    assert "not an intact MCAP file" in refusal(stated(tmp_path / "lies.mcap", box.header, "msgpack", endless))
