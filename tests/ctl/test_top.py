@@ -65,8 +65,10 @@ def test_the_screen_fits_and_says_what_the_device_does(seen: Seen, width: int, h
     assert len(lines) <= height
     assert all(len(line) <= width for line in lines)
     text = "\n".join(lines)
-    said = ("ENABLED", "homed", "up 2.0 h", "warning, 1000 Hz, late 41 us (p50) 304 us (p99), stalls 3")
-    said += ("RUNNING", "round trip 0.40 ms", "RATE 10% of the time", "next: ask for slower changes")
+    said = (
+        *("ENABLED", "homed", "up 2.0 h", "warning, 1000 Hz, late 41 us (p50) 304 us (p99), stalls 3"),
+        *("RUNNING", "round trip 0.40 ms", "RATE 10% of the time", "next: ask for slower changes"),
+    )
     assert [words for words in said if words not in text] == []
     labels = ("control", "inference", "link", "setpoints", *(curve.label for curve in CURVES))
     assert all(any(line.startswith(f" {label} ") for line in lines) for label in labels)

@@ -3,6 +3,7 @@
 import asyncio
 import json
 from functools import partial
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -40,7 +41,8 @@ def test_what_the_kernel_refuses_is_said() -> None:
 
 def test_the_calls_are_those_of_the_closed_loop_and_can_be_made_again() -> None:
     core = build_core(Config())
-    steps, plans = core_cost.calls(Config(), core, 0.05)
+    made: Any = core_cost.calls(Config(), core, 0.05)
+    steps, plans = made
     assert (len(steps), len(plans)) == (50, 50)
     # each of these plans is the one that the next step was given in the loop
     planned = [plan() for plan in plans]
@@ -55,8 +57,8 @@ def test_the_calls_are_those_of_the_closed_loop_and_can_be_made_again() -> None:
 
 def test_each_call_is_made_once_in_its_own_beat() -> None:
     made: list[str] = []
-    calls = [[partial(made.append, name)] * 7 for name in ("step", "plan")]
-    found = asyncio.run(core_cost.core_cost(*calls, 1_000))
+    steps, plans = ([partial(made.append, name)] * 7 for name in ("step", "plan"))
+    found = asyncio.run(core_cost.core_cost(steps, plans, 1_000))
     assert made == ["step", "plan"] * 7
     assert (len(found.step_us), len(found.plan_us)) == (7, 7)
 
