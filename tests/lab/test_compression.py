@@ -1,5 +1,6 @@
 """Cyclic compression tests: the right cycle is evaluated, the standard's rules are checked. Synthetic data."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -80,16 +81,18 @@ def test_deviations_from_the_cycle_rules_are_told() -> None:
     assert any("cycle 2 loads at 5" in one for one in found)
 
 
-def test_records_that_cannot_be_evaluated() -> None:
-    with pytest.raises(LabError, match="cycle 4 of 3"):
-        evaluated_cycle(cyclic_test(cycles=3), SAMPLE)
-    with pytest.raises(LabError, match="height"):
-        evaluated_cycle(cyclic_test(), Sample(height_mm=2.0))
-    still = CompressionRecord(np.arange(5.0), np.zeros(5), np.zeros(5))
-    with pytest.raises(LabError, match="no cycle"):
-        loading_halves(still)
-    with pytest.raises(DomainError, match="diameter_mm"):
-        Sample(diameter_mm=0.0)
+@pytest.mark.parametrize(
+    ("evaluated", "error", "said"),
+    [
+        (lambda: evaluated_cycle(cyclic_test(cycles=3), SAMPLE), LabError, "cycle 4 of 3"),
+        (lambda: evaluated_cycle(cyclic_test(), Sample(height_mm=2.0)), LabError, "height"),
+        (lambda: loading_halves(CompressionRecord(np.arange(5.0), np.zeros(5), np.zeros(5))), LabError, "no cycle"),
+        (lambda: Sample(diameter_mm=0.0), DomainError, "diameter_mm"),
+    ],
+)
+def test_records_that_cannot_be_evaluated(evaluated: Callable[[], object], error: type[Exception], said: str) -> None:
+    with pytest.raises(error, match=said):
+        evaluated()
 
 
 def test_files_are_read_past_a_preamble_and_checked(tmp_path: Path) -> None:
