@@ -6,7 +6,9 @@ failure itself: the kernel's counters and bare timers on every processor say so 
 failure.
 """
 
+import asyncio
 import contextlib
+import inspect
 import os
 import signal
 import time
@@ -23,8 +25,8 @@ from tormagd.slices import ask_for_slices
 # No test asserts a wall-clock duration, so none fails because the machine is slow. One commit has one verdict: a
 # property's cases are drawn from its source, and `make search` draws others; what it finds becomes an `@example`
 UNHURRIED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("tormagd", UNHURRIED, derandomize=True)
-settings.register_profile("search", UNHURRIED, print_blob=True)
+settings.register_profile("tormagd", UNHURRIED, derandomize=True, max_examples=60)
+settings.register_profile("search", UNHURRIED, print_blob=True, max_examples=200)
 settings.load_profile("tormagd")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # pytest-xdist's workers ignore Ctrl-C, as what runs in the background does, and what a test starts would inherit it
@@ -58,10 +60,14 @@ class HostWarning(UserWarning):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Runs a live test, again after a failure that the host explains. What it asserts stays the same."""
+    """Runs a test that is a coroutine; runs a live test, again after a failure that the host explains. What it asserts
+    stays the same."""
+    call = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
+    if inspect.iscoroutinefunction(pyfuncitem.obj):
+        asyncio.run(pyfuncitem.obj(**call))
+        return True
     if pyfuncitem.get_closest_marker("live") is None:
         return None
-    call = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
     for attempt in range(1, ATTEMPTS + 1):
         watched = host_watch(pyfuncitem.config)
         start_s = time.monotonic()

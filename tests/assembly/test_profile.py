@@ -94,8 +94,7 @@ def test_every_fit_can_be_kept(
     scale: float, scale_variance: float, offset_N: float, offset_variance: float, zero_N: float, lag_s: float
 ) -> None:
     fit = DeviceFit(scale, offset_N, scale_variance, 0.0, offset_variance)
-    known = Learned(fit, sensor_zero_N=zero_N, lag_s=lag_s)
-    learned = again(profile_of(known, saved_ns=0, **OF)).learned(0)  # type: ignore[arg-type]
+    learned = again(profile_of(Learned(fit, sensor_zero_N=zero_N, lag_s=lag_s), saved_ns=0, **OF)).learned(0)  # type: ignore[arg-type]
     assert learned.device.force_N(1.0) == pytest.approx(fit.force_N(1.0))
     assert (learned.sensor_zero_N, learned.lag_s) == (zero_N, lag_s)
     assert math.isfinite(learned.device.surely_within_N(2.5))

@@ -19,8 +19,7 @@ def test_a_slow_force_is_followed_exactly() -> None:
 
 def test_a_step_is_caught_up_with_at_top_speed() -> None:
     """A step of 0.5 N: the error falls from there to 0 within a second, evenly, and its square has a third as mean."""
-    forces_N = [0.7] + [1.2] * 1000
-    found = missed(EVEN, [0.001 * tick for tick in range(1001)], forces_N, SPEED_MM_S)
+    found = missed(EVEN, [0.001 * tick for tick in range(1001)], [0.7] + [1.2] * 1000, SPEED_MM_S)
     assert found.rms_N == pytest.approx(0.5 / np.sqrt(3.0), rel=2e-3)
     assert found.share == pytest.approx(1 / 1000)
     (worst,) = found.worst

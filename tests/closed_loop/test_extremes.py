@@ -64,8 +64,9 @@ def uneven() -> PlantParameters:
 
 def skews_um(synchronisation: float) -> Array:
     """Skew by the encoders on the way to and fro at 15 mm/s, with half of the drag again on the left soon."""
-    position = msgspec.structs.replace(CONFIG.position, synchronisation=synchronisation)
-    config = msgspec.structs.replace(CONFIG, position=position)
+    config = msgspec.structs.replace(
+        CONFIG, position=msgspec.structs.replace(CONFIG.position, synchronisation=synchronisation)
+    )
     device = VirtualDevice(uneven(), SteadyHand(), [parse_fault("drag_left=+50%@2.7")], 1)
     loop = ClosedLoop(config, Stepper(config, SCENE), None, device)
     loop.arm(gap_plan(OPEN_MM))

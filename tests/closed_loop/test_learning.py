@@ -68,7 +68,6 @@ def test_without_learning_nothing_is_learned_though_the_hand_reverses_and_forces
     config, scene = Config(scene="pulse"), load_scene("pulse")
     frozen = build_core(config, msgspec.structs.replace(scene, terms=Terms(learning=False)))
     loop = arm(sample, ReversingHand(1.0), core=frozen, config=config)
-    for _ in loop.run(5.0, lambda now_s: TimedSetpoint(1.4 + 0.5 * (now_s % 1.0 > 0.5), now_s, VALID_S)):
-        pass
+    list(loop.run(5.0, lambda now_s: TimedSetpoint(1.4 + 0.5 * (now_s % 1.0 > 0.5), now_s, VALID_S)))
     assert loop.planner.believe.learned() == NOTHING_LEARNED
     assert loop.stepper.move.acceleration_scale == 1.0

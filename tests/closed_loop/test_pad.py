@@ -34,8 +34,7 @@ def test_a_pulse_is_felt_on_the_pad(arm, pad_core: Core, plant: str) -> None:
         stamp_s = math.floor(100.0 * now_s) / 100.0
         return TimedSetpoint(float(np.interp(stamp_s - PRESSED_S, time_s, force_N)), stamp_s, 0.1)
 
-    for _ in loop.run(PRESSED_S - loop.now_s, publish):
-        pass
+    list(loop.run(PRESSED_S - loop.now_s, publish))
     errors_N = [
         sample.truth.force_N - float(np.interp(sample.time_s - PRESSED_S, time_s, force_N))
         for sample in loop.run(PULSE_S, publish)
@@ -61,8 +60,9 @@ def test_a_hold_of_plans_alone_is_that_of_the_whole_device() -> None:
 def test_a_finger_that_presses_too_hard_opens_the_gap_and_is_no_fault(arm, pad_core: Core) -> None:
     """Its force is the finger's own: more than the scene's greatest by far, at any gap."""
     hand = RecordedHand((0.0, 3.0, 4.0), (0.0, 0.0, 4.0))
-    loop = arm("pad_1", hand, core=pad_core, config=CONFIG)
-    last = list(loop.run(4.5, lambda now_s: TimedSetpoint(3.6, now_s, 0.1)))[-1]
+    last = list(
+        arm("pad_1", hand, core=pad_core, config=CONFIG).run(4.5, lambda now_s: TimedSetpoint(3.6, now_s, 0.1))
+    )[-1]
     assert last.truth.force_N > 1.5 * SCENE.force.most_N
     assert Limit.OVER_FORCE in last.output.limits
     assert last.truth.gap_mm > 94.0

@@ -29,8 +29,7 @@ def core() -> Core:
 
 
 def armed(core: Core, plant: str = "sample_1") -> ClosedLoop:
-    device = VirtualDevice(load_plant(plant), SteadyHand(), seed=1)
-    loop = ClosedLoop(Config(), core.stepper(), core.planner(), device)
+    loop = ClosedLoop(Config(), core.stepper(), core.planner(), VirtualDevice(load_plant(plant), SteadyHand(), seed=1))
     loop.arm()
     return loop
 
@@ -39,8 +38,7 @@ def armed(core: Core, plant: str = "sample_1") -> ClosedLoop:
 def holding(core: Core) -> ClosedLoop:
     """A loop that has settled on the force."""
     loop = armed(core)
-    samples = run(loop, FORCE_N, 1.6)
-    assert samples[-1].truth.force_N == pytest.approx(FORCE_N, abs=0.05)
+    assert run(loop, FORCE_N, 1.6)[-1].truth.force_N == pytest.approx(FORCE_N, abs=0.05)
     return loop
 
 
@@ -146,7 +144,6 @@ def test_a_daemon_that_stalls_for_longer_finds_the_device_opening_and_says_why(
     assert samples[25].safety.operating_state is OperatingState.FAULT
     assert samples[-1].safety.faults == (Fault.HOST_STALL,)
     assert samples[-1].truth.gap_mm > OPEN_MM - 1.0
-    assert holding.measurement is not None
     assert holding.measurement.mode is DeviceMode.LATCHED
     assert holding.stepper.measure.sight.stall_s == pytest.approx(stall_ms * 1e-3 + 1e-3)
 
@@ -190,8 +187,7 @@ def test_a_force_below_the_least_is_held_at_a_switch_that_comes_early(core: Core
     assert samples[-1].safety.faults == ()
     assert Limit.F_MIN in samples[-1].plan.limits
     assert OPEN_MM - 0.5 < samples[-1].truth.gap_mm < OPEN_MM - 0.02
-    held = samples[1_500:]
-    assert Limit.SATURATED not in limits_of(held)
+    assert Limit.SATURATED not in limits_of(samples[1_500:])
     assert max(*left[1_500:], *right[1_500:]) < 0.1
     # and it comes off again as ever
     forces_N = [sample.truth.force_N for sample in run(loop, 1.2, 1.5)]

@@ -130,9 +130,7 @@ def test_a_resolved_configuration_is_a_configuration(write) -> None:
 )
 def test_a_refusal_names_key_value_and_what_is_allowed(write, text: str, key: str, value: str, allowed: str) -> None:
     refused = refusal(write(text))
-    assert key in refused or key == "$"
-    assert value in refused
-    assert allowed in refused
+    assert [said for said in (key.removesuffix("$"), value, allowed) if said not in refused] == []
 
 
 @pytest.mark.parametrize("number", ["nan", "-nan", "inf", "-inf", "+inf"])
@@ -140,9 +138,7 @@ def test_a_refusal_names_key_value_and_what_is_allowed(write, text: str, key: st
 def test_numbers_that_are_not_finite_are_refused(write, number: str, table: str) -> None:
     key = {"motor": "supply_V", "position": "integral_time_s"}[table]
     refused = refusal(write(f"[{table}]\n{key} = {number}"))
-    assert f"{table}.{key}" in refused
-    assert number.strip("+-") in refused
-    assert "finite" in refused
+    assert [said for said in (f"{table}.{key}", number.strip("+-"), "finite") if said not in refused] == []
 
 
 @pytest.mark.parametrize(
@@ -252,9 +248,8 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, write) -> None:
     assert "No such file" in refusal(tmp_path / "absent.toml")
     assert "directory" in refusal(tmp_path)
     assert "line 2" in refusal(write("scene = 'pulse'\nscene == 3"))
-    binary = tmp_path / "binary.toml"
-    binary.write_bytes(b"scene = '\xff'")
-    assert "UTF-8 text (byte 9)" in refusal(binary)
+    (tmp_path / "binary.toml").write_bytes(b"scene = '\xff'")
+    assert "UTF-8 text (byte 9)" in refusal(tmp_path / "binary.toml")
 
 
 SCALARS = st.one_of(st.integers(), st.floats(), st.booleans(), st.text(max_size=5))
@@ -269,13 +264,11 @@ INNER = st.sampled_from(
 def test_whatever_stands_in_the_file_is_taken_or_refused_as_a_configuration(write, tables: dict[str, object]) -> None:
     lines = [f"{key} = {_toml(value)}" for key, value in tables.items()]
     try:
-        config = load_config(write("\n".join(lines)))
+        rates = load_config(write("\n".join(lines))).rates
     except ConfigError as error:
-        refused = str(error)
+        assert "tormagd.toml" in str(error)  # noqa: PT017
     else:
-        assert config.rates.control_hz >= config.rates.inference_hz >= LEAST_INFERENCE_HZ
-        return
-    assert "tormagd.toml" in refused
+        assert rates.control_hz >= rates.inference_hz >= LEAST_INFERENCE_HZ
 
 
 def _toml(value: object) -> str:
@@ -290,8 +283,7 @@ def _toml(value: object) -> str:
 
 def test_check_prints_the_resolved_configuration(write, capsys) -> None:
     assert main(["--config", str(write('scene = "pulse"\n')), "--check"]) == 0
-    captured = capsys.readouterr()
-    resolved = json.loads(captured.out)
+    resolved = json.loads(capsys.readouterr().out)
     assert msgspec.convert(resolved["config"], Config).scene == "pulse"
     assert (resolved["config"]["device"]["options"], resolved["scene"]["name"]) == ({"baud": 1_000_000}, "pulse")
     assert 0.0 < resolved["derived"]["least_N"] < resolved["derived"]["most_N"]
@@ -349,13 +341,11 @@ def test_a_scene_beyond_what_the_device_reaches_is_refused(
 
 
 def test_version_and_usage(capsys) -> None:
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit, match=r"^0$"):
         main(["--version"])
-    assert ended.value.code == 0
     assert capsys.readouterr().out.split() == ["tormagd", f"{__version__},", *str(settle()).split()]
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit, match=r"^2$"):
         main(["--chekc"])
-    assert ended.value.code == 2
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,9 @@ FAR = {name: f"tcp://192.0.2.1:{5_555 + number}" for number, name in enumerate(E
 
 
 def ring(folder: Path) -> KeyRing:
-    curve = Curve(server_secret=str(folder / "server.key_secret"))
-    return KeyRing(Config(endpoints=Endpoints(**FAR, curve=curve)).endpoints)
+    return KeyRing(
+        Config(endpoints=Endpoints(**FAR, curve=Curve(server_secret=str(folder / "server.key_secret")))).endpoints
+    )
 
 
 @pytest.fixture
@@ -170,8 +171,9 @@ def test_with_keys_too_an_address_has_to_be_one(address: str) -> None:
 def test_local_endpoints_are_open_unless_the_configuration_says_so() -> None:
     local = {"setpoint": "tcp://127.0.0.1:5555", "control": "ipc:///tmp/control"}
     for also_local in (False, True):
-        curve = Curve(server_secret="a", also_local=also_local)
-        endpoints = Config(endpoints=Endpoints(**local, curve=curve)).endpoints
+        endpoints = Config(
+            endpoints=Endpoints(**local, curve=Curve(server_secret="a", also_local=also_local))
+        ).endpoints
         assert [endpoints.is_guarded(name) for name in ENDPOINTS] == [also_local] * 4
     with pytest.raises(ValueError, match="also_local"):
         Config(endpoints=Endpoints(**local, curve=Curve(also_local=True)))

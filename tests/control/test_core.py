@@ -143,8 +143,7 @@ def test_a_homing_that_presses_shut_is_ended_and_named(bench) -> None:
         at_mm -= 0.012
         bench.step(left_mm=at_mm, right_mm=-7.5, mode=DeviceMode.HOMING, switches=Switches(0))
         assert at_mm > -12.0
-    assert bench.faults == (Fault.WRONG_DIRECTION,)
-    assert bench.output.request is DeviceRequest.RETRACT
+    assert (bench.faults, bench.output.request) == ((Fault.WRONG_DIRECTION,), DeviceRequest.RETRACT)
     assert bench.stepper.homing.went_back_mm[0] > 2.9
 
 
@@ -177,8 +176,7 @@ def test_a_lost_link_is_no_fault_while_disabled(bench) -> None:
     assert bench.is_off
     assert (output.request, output.request_number, output.limits) == (DeviceRequest.NONE, 0, ())
     bench.stepper.lose_link()
-    assert bench.faults == ()
-    assert bench.stepper.measured is None
+    assert (bench.faults, bench.stepper.measured) == ((), None)
 
 
 def test_a_number_that_is_not_finite(running) -> None:
@@ -234,15 +232,13 @@ def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench) -> Non
     bench.command("clear-fault", device_latched=True)
     assert bench.step(**broken).request is DeviceRequest.CLEAR
     assert bench.faults == ()
-    ticks = bench.run_into(Fault.DEVICE_OVERCURRENT, **broken)
-    assert ticks * PERIOD_S == pytest.approx(CLEARING_S, abs=2e-3)
+    assert bench.run_into(Fault.DEVICE_OVERCURRENT, **broken) * PERIOD_S == pytest.approx(CLEARING_S, abs=2e-3)
 
 
 def test_a_latched_fault_asks_once_and_stays(running) -> None:
     running.run_into(Fault.DEVICE_SKEW, faults=DeviceFault.SKEW, mode=DeviceMode.RETRACTING)
     number = running.output.request_number
-    output = running.step(faults=DeviceFault.SKEW, mode=DeviceMode.LATCHED, count=100)
-    assert output.request_number == number
+    assert running.step(faults=DeviceFault.SKEW, mode=DeviceMode.LATCHED, count=100).request_number == number
     running.step(count=100)
     assert running.faults == (Fault.DEVICE_SKEW,)
     assert running.is_opened

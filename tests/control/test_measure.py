@@ -47,8 +47,7 @@ def follow_handle(measure):
 def test_the_first_is_at_rest(look: Look, measure) -> None:
     measured = look(measure(3, left_mm=-10.0, right_mm=-10.5))
     assert (measured.left_mm, measured.right_mm) == (37.5, 37.0)
-    assert measured.gap_mm == 74.5
-    assert measured.skew_mm == 0.5
+    assert (measured.gap_mm, measured.skew_mm) == (74.5, 0.5)
     assert (measured.left_mm_s, measured.right_mm_s, measured.handle.rate_mm_s) == (0.0, 0.0, 0.0)
     assert measured.handle.displacement_mm == 0.0
 
@@ -72,8 +71,7 @@ def test_speeds_are_those_of_a_steady_motion(measure, speed: float, dt_s: float)
         way_mm = speed * number * dt_s
         moved = {"left_mm": -20.0 + way_mm, "right_mm": -20.0 - way_mm}
         measured = look(measure(number, device_time_s=number * dt_s, **moved))
-    assert measured.left_mm_s == pytest.approx(speed, rel=1e-3, abs=1e-6)
-    assert measured.right_mm_s == pytest.approx(-speed, rel=1e-3, abs=1e-6)
+    assert (measured.left_mm_s, measured.right_mm_s) == pytest.approx((speed, -speed), rel=1e-3, abs=1e-6)
 
 
 def test_late_delivery_is_not_slow_motion(measure) -> None:
@@ -98,8 +96,7 @@ def test_a_handle_that_nobody_hears_of_has_not_stopped(look: Look, measure, miss
         measured = look(measure(number, handle_mm=old.handle_mm, force_N=old.force_N, sensed_s=old.sensed_s))
         assert (measured.handle, measured.sensed_s) == (before, old.sensed_s)
     handle = look(measure(300 + missing)).handle
-    assert handle.rate_mm_s == pytest.approx(42.0, rel=0.01)
-    assert handle.sliding_mm_s == pytest.approx(42.0, rel=0.01)
+    assert (handle.rate_mm_s, handle.sliding_mm_s) == pytest.approx((42.0, 42.0), rel=0.01)
 
 
 def test_one_encoder_count_is_filtered(look: Look, measure) -> None:
@@ -112,8 +109,7 @@ def test_one_encoder_count_is_filtered(look: Look, measure) -> None:
 def test_displacement_counts_from_the_reversal(follow_handle) -> None:
     handle = follow_handle([*[0.1 * k for k in range(51)], 4.9, 4.5, 4.0]).handle
     assert handle.turn.direction == -1.0
-    assert handle.turn.turned_mm == pytest.approx(5.0)  # where it turned, not where that was noticed
-    assert handle.displacement_mm == pytest.approx(1.0)
+    assert (handle.turn.turned_mm, handle.displacement_mm) == pytest.approx((5.0, 1.0))
 
 
 def test_displacement_saturates_where_friction_is_mobilised(follow_handle) -> None:

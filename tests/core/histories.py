@@ -118,10 +118,7 @@ def hostile(core: Core, seen: Digest) -> None:
                 name = NEXT.get(stepper.safety.operating_state, "resume")
                 if rng.random() < 0.2:
                     name = rng.choice(COMMANDS)
-                try:
-                    stepper.command(name, now_s, conditions(rng))
-                except RefusedError as error:
-                    seen.see(error)
+                _attempted(seen, stepper.command, name, now_s, conditions(rng))
             if rng.random() < 0.003:
                 stepper.lose_link()
 
@@ -247,12 +244,8 @@ def loop(core: Core, seen: Digest, plant: str, hand: Hand, fault: str, flips: fl
             seen.see(running.device.truth)
         on(then_s)
     for command in ("clear-fault", "enable", "home"):
-        for _ in running.run(0.1):
-            pass
-        try:
-            running.command(command)
-        except RefusedError as error:
-            seen.see(error)
+        list(running.run(0.1))
+        _attempted(seen, running.command, command)
         on(0.3)
     seen.see([running._port.statistics, running.connection.losses])
 
@@ -267,7 +260,7 @@ def vectors(core: Core, seen: Digest) -> None:
     for vector in messages["valid"]:
         seen.see(encode(types[vector["message"]](**vector["values"])))
     for vector in (*messages["valid"], *messages["invalid"]):
-        _decoded(seen, vector["function"], bytes.fromhex(vector["payload"]))
+        _attempted(seen, decode, vector["function"], bytes.fromhex(vector["payload"]))
     frames = json.loads((VECTORS / "frames.json").read_text(encoding="utf-8"))
     for vector in (*frames["valid"], *frames["streams"]):
         decoder = FrameDecoder()
@@ -297,7 +290,7 @@ def streams(core: Core, seen: Digest) -> None:
             start, now_s = start + len(piece), now_s + 1e-3
             for frame in decoder.feed(piece):
                 seen.see(frame)
-                _decoded(seen, frame.function, frame.payload)
+                _attempted(seen, decode, frame.function, frame.payload)
             for message in pieces.unpack(piece):
                 link.receive(now_s, message)
             seen.see(list(link.due(now_s)))
@@ -305,7 +298,7 @@ def streams(core: Core, seen: Digest) -> None:
             seen.see(link.drive(rng.uniform(-1.0, 1.0), 0.0, DriveMode.RUN))
         seen.see([decoder.statistics, pieces.statistics])
     for _ in range(3_000):
-        _decoded(seen, rng.randrange(12), rng.randbytes(rng.choice([1, 1, 4, 7, 7, 8, 8, rng.randrange(12)])))
+        _attempted(seen, decode, rng.randrange(12), rng.randbytes(rng.choice([1, 1, 4, 7, 7, 8, 8, rng.randrange(12)])))
 
 
 def _signal(rng: random.Random, low: float, high: float, kind: Callable[[Any], Any]) -> Any:
@@ -314,10 +307,11 @@ def _signal(rng: random.Random, low: float, high: float, kind: Callable[[Any], A
     return kind(rng.choice([int(low), int(high), int(low)]))
 
 
-def _decoded(seen: Digest, function: int, payload: bytes) -> None:
+def _attempted(seen: Digest, attempt: Callable[..., object], *arguments: object) -> None:
+    """What comes of it, a value or an error."""
     try:
-        seen.see(decode(function, payload))
-    except DecodeError as error:
+        seen.see(attempt(*arguments))
+    except (DecodeError, RefusedError) as error:
         seen.see(error)
 
 
@@ -333,11 +327,10 @@ def main() -> None:
         "sample 3": lambda core, seen: loop(core, seen, "sample_3", ReversingHand(2.0), "drag_left=+50%@4.5", 0.0),
         "reset": lambda core, seen: loop(core, seen, "sample_1", ReversingHand(3.0), "reset@4.2", 0.0),
     }
-    digests, things = {}, {}
+    seen = {name: Digest() for name in histories}
     for name, history in histories.items():
-        seen = Digest()
-        history(core, seen)
-        digests[name], things[name] = seen.text, seen.things
+        history(core, seen[name])
+    digests, things = ({name: getattr(each, of) for name, each in seen.items()} for of in ("text", "things"))
     print(json.dumps({"is_compiled": BUILD.is_compiled, "digests": digests, "things": things}))
 
 

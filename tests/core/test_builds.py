@@ -22,8 +22,7 @@ LEAST_THINGS = 1_500
 def started(switch: str) -> subprocess.Popen[str]:
     """All histories, in a process of their own with that build."""
     environment = {**os.environ, SWITCH: switch, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-P", str(HISTORIES)]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen([sys.executable, "-P", str(HISTORIES)], env=environment, stdout=subprocess.PIPE, text=True)
 
 
 def told(process: subprocess.Popen[str]) -> dict[str, Any]:
@@ -53,8 +52,12 @@ def test_what_an_earlier_build_left_does_not_run_where_none_was_made(tmp_path: P
         shutil.copy(ROOT / name, tmp_path)
     left = tmp_path / "firmware_protocol" / f"checksum{EXTENSION_SUFFIXES[0]}"
     left.write_bytes(b"of another day")
-    build = [sys.executable, "setup.py", "-q", "build_ext", "--inplace"]
-    subprocess.run(build, cwd=tmp_path, env={**os.environ, "TORMAG_COMPILE": "skip"}, check=True)
+    subprocess.run(
+        [sys.executable, "setup.py", "-q", "build_ext", "--inplace"],
+        cwd=tmp_path,
+        env={**os.environ, "TORMAG_COMPILE": "skip"},
+        check=True,
+    )
     shown = "from firmware_protocol import build, checksum; print(build.settle(), checksum.__file__)"
     environment = {**os.environ, SWITCH: "1", "PYTHONPATH": str(tmp_path)}
     ran = subprocess.run(

@@ -38,26 +38,23 @@ CREATED = datetime.date(2024, 2, 29)
 
 def record(plant="sample_1", hand=None, rates_N_s=(0.8, 1.0, 0.8), most_N=2.0):
     """The ticks of each sweep, as the daemon would publish them."""
-    config = Config()
-    core = build_core(config)
+    core = build_core(Config())
     device = VirtualDevice(load_plant(plant), hand or ReversingHand(2.0), seed=3)
-    loop = ClosedLoop(config, core.stepper(), core.planner(), device)
+    loop = ClosedLoop(Config(), core.stepper(), core.planner(), device)
     loop.arm()
     sweeps = []
     for rate in rates_N_s:
         waveform = up_and_down(Range(core.portrait.min_N, most_N), rate)
         start_s = loop.now_s
-        rows = []
-        for sample in loop.run(
-            waveform.duration_s,
-            lambda now_s, w=waveform, s=start_s: TimedSetpoint(w.at(now_s - s).force_N, now_s, 0.25),  # type: ignore[misc]
-        ):
-            seen = sample.measured
-            assert seen is not None
-            rows.append(
-                (sample.time_s, seen.left_mm, seen.right_mm, seen.handle_mm, seen.handle.rate_mm_s, seen.force_N)
+        ticks = [
+            (sample.time_s, seen.left_mm, seen.right_mm, seen.handle_mm, seen.handle.rate_mm_s, seen.force_N)
+            for sample in loop.run(
+                waveform.duration_s,
+                lambda now_s, w=waveform, s=start_s: TimedSetpoint(w.at(now_s - s).force_N, now_s, 0.25),  # type: ignore[misc]
             )
-        sweeps.append(dict(zip(COLUMNS, np.array(rows).T, strict=True)))
+            if (seen := sample.measured)
+        ]
+        sweeps.append(dict(zip(COLUMNS, np.array(ticks).T, strict=True)))
     return sweeps
 
 
@@ -117,10 +114,8 @@ def test_the_whole_process_writes_model_and_training_data(sweeps, tmp_path, caps
     arguments = [str(tmp_path / "sweep.csv"), "--insert", INSERT, "--out", str(out), "--csv", str(data)]
     assert calibration.main(arguments) == 0
     result = json.loads(capsys.readouterr().out)["result"]
-    model = load_model(out, element="torque", insert=INSERT)
-    assert result["metrics"] == model.metadata.metrics
-    header = data.read_text().splitlines()[0]
-    assert header == "displacement_mm,rate_mm_s,field_mT,cip_percent,force_N,cycle,time_s"
+    assert result["metrics"] == load_model(out, element="torque", insert=INSERT).metadata.metrics
+    assert data.read_text().splitlines()[0] == "displacement_mm,rate_mm_s,field_mT,cip_percent,force_N,cycle,time_s"
     assert calibration.main([*arguments[:2], "MRE-99-99", *arguments[3:]]) == 1
     assert "MRE-99-99" in json.loads(capsys.readouterr().out)["error"]["message"]
 
@@ -136,9 +131,8 @@ def test_a_missing_package_is_told_before_anybody_turns_the_handle(monkeypatch, 
 
 
 def test_a_handle_that_stands_still_is_refused(table):
-    still = table.copy()
-    still[still[:, column("sweep")] == 2.0, column("rate_mm_s")] = 0.3
-    code, text = refusal(still)
+    table[table[:, column("sweep")] == 2.0, column("rate_mm_s")] = 0.3
+    code, text = refusal(table)
     assert code == "handle_still"
     assert "0% of sweep 3" in text
     assert "30%" in text
@@ -146,25 +140,21 @@ def test_a_handle_that_stands_still_is_refused(table):
 
 @pytest.mark.parametrize("dead", [0.0, 1.3, "noise"])
 def test_a_dead_force_sensor_is_refused(table, dead):
-    spoilt = table.copy()
     noise = np.random.default_rng(0).normal(0.0, 0.01, len(table))
-    spoilt[:, column("force_N")] = noise if dead == "noise" else dead
-    assert refusal(spoilt)[0] == "force_dead"
+    table[:, column("force_N")] = noise if dead == "noise" else dead
+    assert refusal(table)[0] == "force_dead"
 
 
 def test_too_small_a_field_range_is_refused(table):
-    narrow = table.copy()
-    narrow[:, column("gap_mm")] = 80.0 + 0.05 * (narrow[:, column("gap_mm")] - 80.0)
-    code, text = refusal(narrow)
+    table[:, column("gap_mm")] = 80.0 + 0.05 * (table[:, column("gap_mm")] - 80.0)
+    code, text = refusal(table)
     assert code == "field_range"
     assert "20%" in text
 
 
 def test_a_force_that_has_little_to_do_with_the_field_is_refused_with_figures(table):
-    loose = table.copy()
-    slow = np.sin(table[:, column("time_s")] * 1.7) * 0.4
-    loose[:, column("force_N")] += slow
-    code, text = refusal(loose)
+    table[:, column("force_N")] += np.sin(table[:, column("time_s")] * 1.7) * 0.4
+    code, text = refusal(table)
     assert code == "poor_fit"
     r2, mae_mN, allowed_mN = (
         float(re.findall(pattern, text)[0])
@@ -175,11 +165,10 @@ def test_a_force_that_has_little_to_do_with_the_field_is_refused_with_figures(ta
 
 
 def test_a_force_that_falls_with_the_field_somewhere_is_refused(table):
-    folded = table.copy()
     closed = (95.0 - table[:, column("gap_mm")]) / 35.0
     noise = np.random.default_rng(0).normal(0.0, 0.01, len(table))
-    folded[:, column("force_N")] = 1.0 + 2.0 * (closed - 0.4) ** 2 + noise
-    code, text = refusal(folded, epochs=60)
+    table[:, column("force_N")] = 1.0 + 2.0 * (closed - 0.4) ** 2 + noise
+    code, text = refusal(table, epochs=60)
     assert code == "not_rising"
     assert "falls by" in text
 
@@ -189,10 +178,9 @@ def test_two_sweeps_are_too_few(table):
 
 
 def test_a_steady_handle_teaches_nothing_about_rate_and_displacement(table):
-    steady = table.copy()
-    steady[:, column("handle_mm")] = 42.0 * steady[:, column("time_s")]
-    steady[:, column("rate_mm_s")] = 42.0 + np.random.default_rng(0).normal(0.0, 0.2, len(table))
-    ranges = rows(steady).ranges()
+    table[:, column("handle_mm")] = 42.0 * table[:, column("time_s")]
+    table[:, column("rate_mm_s")] = 42.0 + np.random.default_rng(0).normal(0.0, 0.2, len(table))
+    ranges = rows(table).ranges()
     assert ranges["displacement_mm"] == (2.0, 2.0)
     assert ranges["rate_mm_s"][0] == ranges["rate_mm_s"][1] == pytest.approx(42.0, abs=0.1)
 
@@ -219,12 +207,12 @@ def test_what_ctl_may_not_import_is_equal():
 
 
 def test_a_sweep_file_that_is_none_says_why(tmp_path):
+    path = tmp_path / "sweep.csv"
     for text, told in (
         ("a,b\n1,2\n", "header"),
         (",".join(FILE_COLUMNS) + "\n1,2,3,4,5,x\n", "x"),
         (",".join(FILE_COLUMNS) + "\n1,2,3,4,5,nan\n1,2,3,4,5,6\n", "only numbers -1000 to 1000"),
     ):
-        path = tmp_path / "sweep.csv"
         path.write_text(text)
         with pytest.raises(ValueError, match=told):
             calibration.read_sweep(path)
@@ -283,7 +271,7 @@ def test_a_motor_log_has_volts_and_even_times_whatever_the_ticks_missed():
 
 def test_a_motor_log_with_a_hole_is_refused():
     given = ticks()
-    given["device_time_s"] = given["device_time_s"] + 0.03 * (np.arange(200) > 100)
+    given["device_time_s"] += 0.03 * (np.arange(200) > 100)
     with pytest.raises(CommandError, match="silence of 31 ms"):
         motor_log(given, "left")
 

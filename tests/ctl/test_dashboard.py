@@ -4,11 +4,12 @@ import asyncio
 import itertools
 import json
 import math
+import re
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -90,107 +91,87 @@ async def event(stream: ClientResponse, wanted: str) -> Any:
             return json.loads(data)
 
 
-def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
-    why = {"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}
-    fake_daemon.says(limit_details=[why])
+async def test_a_browser_is_sent_what_the_daemon_does(fake_daemon: Any) -> None:
+    fake_daemon.says(limit_details=[{"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}])
     described = fake_daemon.answers["describe"]()["result"] | {"portrait": PORTRAIT}
     fake_daemon.answers["describe"] = lambda: {"ok": True, "result": described}
 
-    async def look() -> None:
-        async with live(fake_daemon.directory) as shown, served(shown) as asks:
-            about = await (await asks.get("/about")).json()
-            assert (about["kind"], about["shown_s"], tuple(about["late_us"])) == ("live", SHOWN_S, LATE_US)
-            stream = await asks.get("/live")
-            assert stream.content_type == "text/event-stream"
-            told = await event(stream, "status")
-            assert told["status"]["link"]["state"] == "RUNNING"
-            assert told["explained"] == {
-                "RATE": {"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}
-            }
-            assert await event(stream, "portrait") == {"portrait": PORTRAIT}
-            first = msgspec.convert(await event(stream, "frame"), Frame)
-            then = msgspec.convert(await event(stream, "frame"), Frame)
-            assert (first.asked_N[-1], first.gap_mm[-1], first.operating_state) == (1.5, 70.0, "ENABLED")
-            assert then.t_s[0] > first.t_s[-1]
-            # one that comes later begins with the seconds that were
-            other = msgspec.convert(await event(await asks.get("/live"), "frame"), Frame)
-            assert other.t_s[0] <= first.t_s[0]
-            assert sum(then.late_counts) >= len(first.t_s)
-            fake_daemon.is_silent = True
-            silence = await event(stream, "silence")
-            assert silence["seconds"] >= 0.5
-
-    asyncio.run(look())
+    async with live(fake_daemon.directory) as shown, served(shown) as asks:
+        about = await (await asks.get("/about")).json()
+        assert (about["kind"], about["shown_s"], tuple(about["late_us"])) == ("live", SHOWN_S, LATE_US)
+        stream = await asks.get("/live")
+        assert stream.content_type == "text/event-stream"
+        told = await event(stream, "status")
+        assert told["status"]["link"]["state"] == "RUNNING"
+        assert told["explained"] == {"RATE": {"code": "RATE", "cause": "too fast", "remedy": "ask for slower changes"}}
+        assert await event(stream, "portrait") == {"portrait": PORTRAIT}
+        first = msgspec.convert(await event(stream, "frame"), Frame)
+        then = msgspec.convert(await event(stream, "frame"), Frame)
+        assert (first.asked_N[-1], first.gap_mm[-1], first.operating_state) == (1.5, 70.0, "ENABLED")
+        assert then.t_s[0] > first.t_s[-1]
+        # one that comes later begins with the seconds that were
+        other = msgspec.convert(await event(await asks.get("/live"), "frame"), Frame)
+        assert other.t_s[0] <= first.t_s[0]
+        assert sum(then.late_counts) >= len(first.t_s)
+        fake_daemon.is_silent = True
+        assert (await event(stream, "silence"))["seconds"] >= 0.5
     assert set(fake_daemon.commands) == {"status", "describe"}
     assert not fake_daemon.setpoints
 
 
-def test_ten_browsers_are_one_subscriber(run_dir: Path, status_with, telemetry_with) -> None:
+async def test_ten_browsers_are_one_subscriber(run_dir: Path, status_with, telemetry_with) -> None:
     described: dict[str, Any] = {"version": "0", "build": "", "configuration": {}, "scene": {}, "model": ""}
     described |= {"firmware": None, "profile": {"is_used": False, "age_s": None, "refusal": ""}, "serial_number": None}
 
-    async def look() -> None:
-        context = zmq.Context()
-        publishes = context.socket(zmq.XPUB)
-        publishes.setsockopt(zmq.XPUB_VERBOSE, 1)  # or only the first of them is told
-        publishes.bind(f"ipc://{run_dir}/telemetry")
-        async with AsyncClient(in_folder(str(run_dir)), 0.1) as client:
-            known = msgspec.convert(status_with(), Status), msgspec.convert(described, Description)
-            shown = Live(client, *known)
-            listening = asyncio.create_task(shown.run())
-            async with served(shown) as asks:
-                streams = [await asks.get("/live") for _ in range(10)]
-                publishes.send(encode(telemetry_with(1, START_NS)))
-                while not publishes.poll(0):
-                    await asyncio.sleep(0.01)
-                for seq in range(2, 5):
-                    publishes.send(encode(telemetry_with(seq, START_NS + seq * 20_000_000)))
-                frames = [await event(stream, "frame") for stream in streams]
-                assert all(frame == frames[0] for frame in frames)
-            listening.cancel()
-        subscribed = 0
-        while publishes.poll(100):
-            subscribed += publishes.recv().startswith(b"\x01")
-        assert subscribed == 1
-        context.destroy(linger=0)
-
-    asyncio.run(look())
+    context = zmq.Context()
+    publishes = context.socket(zmq.XPUB)
+    publishes.setsockopt(zmq.XPUB_VERBOSE, 1)  # or only the first of them is told
+    publishes.bind(f"ipc://{run_dir}/telemetry")
+    async with AsyncClient(in_folder(str(run_dir)), 0.1) as client:
+        shown = Live(client, msgspec.convert(status_with(), Status), msgspec.convert(described, Description))
+        listening = asyncio.create_task(shown.run())
+        async with served(shown) as asks:
+            streams = [await asks.get("/live") for _ in range(10)]
+            publishes.send(encode(telemetry_with(1, START_NS)))
+            while not publishes.poll(0):
+                await asyncio.sleep(0.01)
+            for seq in range(2, 5):
+                publishes.send(encode(telemetry_with(seq, START_NS + seq * 20_000_000)))
+            first, *others = [await event(stream, "frame") for stream in streams]
+            assert others == 9 * [first]
+        listening.cancel()
+    told = []
+    while publishes.poll(100):
+        told.append(publishes.recv()[:1])
+    assert told.count(b"\x01") == 1
+    context.destroy(linger=0)
 
 
-def test_a_browser_that_does_not_read_misses_the_oldest_and_holds_nobody_up(fake_daemon: Any) -> None:
-    async def look() -> None:
-        async with live(fake_daemon.directory) as shown:
-            with shown.browser() as events:
-                for number in range(3 * WAITING):
-                    shown._publish("status", number)
-                assert events.qsize() == WAITING
-                assert events.get_nowait() == b"event: status\ndata: %d\n\n" % (2 * WAITING)
-            assert not shown.browsers
-
-    asyncio.run(look())
+async def test_a_browser_that_does_not_read_misses_the_oldest_and_holds_nobody_up(fake_daemon: Any) -> None:
+    async with live(fake_daemon.directory) as shown:
+        with shown.browser() as events:
+            for number in range(3 * WAITING):
+                shown._publish("status", number)
+            assert events.qsize() == WAITING
+            assert events.get_nowait() == b"event: status\ndata: %d\n\n" % (2 * WAITING)
+        assert not shown.browsers
 
 
-def test_nobody_from_elsewhere_reads_along_and_nobody_writes(recorded: Recorded) -> None:
-    async def look() -> None:
-        async with served(recorded) as asks:
-            assert (await asks.get("/about", headers={"Host": "evil.example"})).status == 403
-            for name in ("localhost", "127.0.0.1:8733"):
-                assert (await asks.get("/about", headers={"Host": name})).status == 200
-            for path in ("/", "/about", "/frame"):
-                assert (await asks.post(path)).status == 405
-            page = await asks.get("/")
-            assert page.headers["Content-Security-Policy"].startswith("default-src 'self'")
-            text = await page.text()
-            for asset in ("page/dashboard.css", "page/dashboard.js", "page/vendor/uPlot.iife.min.js"):
-                assert asset in text
-                assert (await asks.get(f"/{asset}")).status == 200
-            # works without a network: everything is asked of where the page came from
-            assert "http://" not in text
-            assert "https://" not in text
-            assert (await asks.get("/page/../server.py")).status == 404
-            assert (await asks.get("/live")).status == 404
-
-    asyncio.run(look())
+async def test_nobody_from_elsewhere_reads_along_and_nobody_writes(recorded: Recorded) -> None:
+    async with served(recorded) as asks:
+        hosts = ("evil.example", "localhost", "127.0.0.1:8733")
+        answers = [await asks.get("/about", headers={"Host": host}) for host in hosts]
+        assert [answer.status for answer in answers] == [403, 200, 200]
+        assert [(await asks.post(path)).status for path in ("/", "/about", "/frame")] == [405] * 3
+        page = await asks.get("/")
+        assert page.headers["Content-Security-Policy"].startswith("default-src 'self'")
+        text = await page.text()
+        for asset in ("page/dashboard.css", "page/dashboard.js", "page/vendor/uPlot.iife.min.js"):
+            assert asset in text
+            assert (await asks.get(f"/{asset}")).status == 200
+        # works without a network: everything is asked of where the page came from
+        assert re.findall("https?://", text) == []
+        assert [(await asks.get(path)).status for path in ("/page/../server.py", "/live")] == [404, 404]
 
 
 def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
@@ -223,20 +204,16 @@ def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
 @given(at_s=st.floats(-1e300, 1e300) | st.floats(0.0, SECONDS))
 def test_every_moment_has_a_frame(recorded: Recorded, at_s: float) -> None:
     frame = msgspec.json.decode(msgspec.json.encode(recorded.frame(at_s)), type=Frame)
-    lengths = {len(getattr(frame, name)) for name in ("t_s", "asked_N", "measured_N", "gap_mm", "field_mT")}
-    assert len(lengths) == 1
+    assert len({len(getattr(frame, name)) for name in ("t_s", "asked_N", "measured_N", "gap_mm", "field_mT")}) == 1
     assert list(frame.t_s) == sorted(frame.t_s)
 
 
 @pytest.mark.parametrize("at_s", ["", "nan", "inf", "x" * 1000])
-def test_a_moment_that_is_none_is_refused(recorded: Recorded, at_s: str) -> None:
-    async def look() -> None:
-        async with served(recorded) as asks:
-            answer = await asks.get("/frame", params={"at_s": at_s})
-            assert answer.status == 400
-            assert "allowed is a finite number" in await answer.text()
-
-    asyncio.run(look())
+async def test_a_moment_that_is_none_is_refused(recorded: Recorded, at_s: str) -> None:
+    async with served(recorded) as asks:
+        answer = await asks.get("/frame", params={"at_s": at_s})
+        assert answer.status == 400
+        assert "allowed is a finite number" in await answer.text()
 
 
 def test_lateness_falls_into_the_bar_that_names_it() -> None:
@@ -249,7 +226,6 @@ def test_the_command_says_where_it_serves_and_ends_in_order(fake_daemon: Any) ->
     command += ["dashboard", "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
-            assert process.stderr is not None
             assert any(line.startswith("tormagctl dashboard: http://127.0.0.1:") for line in process.stderr)
             process.send_signal(signal.SIGINT)
             said, _ = process.communicate(timeout=60.0)
@@ -286,20 +262,23 @@ class Page:
             if said.get("id") == number:
                 if "error" in said:
                     raise RuntimeError(f"{method}: {said['error']}")
-                result: dict[str, Any] = said["result"]
-                return result
+                return said["result"]
 
-    async def open(self, address: str, width: int, height: int) -> None:
-        """Goes to a page, in a window of this size."""
+    async def open(self, address: str) -> None:
+        """Goes to a page."""
         for domain in ("Runtime", "Log", "Page"):
             await self.tell(f"{domain}.enable")
-        await self.resize(width, height)
         await self.tell("Page.navigate", url=address)
 
     async def resize(self, width: int, height: int) -> None:
         """Gives the window another size."""
-        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < PHONE}
-        await self.tell("Emulation.setDeviceMetricsOverride", **metrics)
+        await self.tell(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=width < PHONE,
+        )
 
     async def ask(self, expression: str) -> Any:
         """The value of a JavaScript expression."""
@@ -341,18 +320,14 @@ async def browser(profile: Path) -> AsyncIterator[Page]:
         await process.wait()
 
 
-def in_chromium(shown: Callable[[], Any], tmp_path: Path, act: Callable[[Page, str], Awaitable[None]]) -> None:
-    async def look() -> None:
-        async with shown() as what, served(what) as asks, browser(tmp_path) as page:
-            await act(page, str(asks.make_url("/")))
-            assert page.complaints == []
-
-    asyncio.run(look())
-
-
 @asynccontextmanager
-async def only(shown: Recorded) -> AsyncIterator[Recorded]:
-    yield shown
+async def page_of(shown: Live | Recorded, tmp_path: Path, width: int, height: int) -> AsyncIterator[Page]:
+    """The page in a window of this size; it has complained of nothing in the end."""
+    async with served(shown) as asks, browser(tmp_path) as page:
+        await page.resize(width, height)
+        await page.open(str(asks.make_url("/")))
+        yield page
+        assert page.complaints == []
 
 
 DRAWN = """[...document.querySelectorAll("canvas")].every((it) => it.width * it.height > 0 &&
@@ -362,9 +337,8 @@ needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="there is no chromium h
 
 
 @needs_chromium
-def test_the_page_shows_the_daemon_as_it_is(fake_daemon: Any, tmp_path: Path) -> None:
-    async def act(page: Page, address: str) -> None:
-        await page.open(address, 1440, 900)
+async def test_the_page_shows_the_daemon_as_it_is(fake_daemon: Any, tmp_path: Path) -> None:
+    async with live(fake_daemon.directory) as shown, page_of(shown, tmp_path, 1440, 900) as page:
         await page.until("document.querySelector('#state')?.textContent === 'ENABLED'")
         await page.until("document.querySelector('#source').textContent.includes('RUNNING on /dev/tormag')")
         assert await page.ask("document.querySelector('#asked_N').textContent") == "1.500"
@@ -377,13 +351,10 @@ def test_the_page_shows_the_daemon_as_it_is(fake_daemon: Any, tmp_path: Path) ->
         fake_daemon.is_silent = True
         await page.until("document.querySelector('#silence').textContent.startsWith('nothing heard for')")
 
-    in_chromium(lambda: live(fake_daemon.directory), tmp_path, act)
-
 
 @needs_chromium
-def test_the_page_scrubs_through_a_recording(recorded: Recorded, tmp_path: Path) -> None:
-    async def act(page: Page, address: str) -> None:
-        await page.open(address, 390, 844)
+async def test_the_page_scrubs_through_a_recording(recorded: Recorded, tmp_path: Path) -> None:
+    async with page_of(recorded, tmp_path, 390, 844) as page:
         # it begins where the first fault is
         await page.until("document.querySelector('#moment')?.textContent.startsWith('29.')")
         await page.until("document.querySelector('#state').textContent === 'FAULT'")
@@ -397,5 +368,3 @@ def test_the_page_scrubs_through_a_recording(recorded: Recorded, tmp_path: Path)
         assert await page.ask("at('play').textContent") == "Pause"
         await page.until(DRAWN)
         await page.until(FITS)
-
-    in_chromium(lambda: only(recorded), tmp_path, act)

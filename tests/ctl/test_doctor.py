@@ -152,8 +152,7 @@ def test_port_missing_taken_or_not_ours(good):
     (good / "proc/4242/fd/3").symlink_to("/dev/ttyUSB0")
     write(good, "proc/4242/comm", "minicom\n")
     finding = checks.port_holder(Config(), Machine(good))
-    assert finding.verdict is Verdict.FAIL
-    assert finding.found == "minicom (process 4242)"
+    assert (finding.verdict, finding.found) == (Verdict.FAIL, "minicom (process 4242)")
     write(good, "proc/4242/comm", "tormagd\n")
     assert checks.port_holder(Config(), Machine(good)).verdict is Verdict.OK
 
@@ -172,8 +171,7 @@ def test_who_made_a_pseudo_terminal_is_not_its_holder(good):
 
 
 def test_an_empty_root_is_examined_without_error(tmp_path):
-    findings = examine(Config(), Machine(tmp_path))
-    assert all(finding.found for finding in findings)
+    assert all(finding.found for finding in examine(Config(), Machine(tmp_path)))
     assert judged(Config(), Machine(tmp_path)).exit_code == 1
 
 
@@ -234,10 +232,8 @@ def test_inference_is_held_where_a_plan_fits_beside_the_ticks():
 
 
 def test_what_to_change_is_what_is_fullest():
-    late = by_rate(measured(late_us=900.0), "control")[1_000]
-    assert "kernel" in late.change
-    slow = by_rate(measured(step_us=450.0), "control")[1_000]
-    assert "compile" in slow.change
+    assert "kernel" in by_rate(measured(late_us=900.0), "control")[1_000].change
+    assert "compile" in by_rate(measured(step_us=450.0), "control")[1_000].change
     assert "faster processor" in by_rate(measured(step_us=450.0, build="compiled"), "control")[1_000].change
     assert all(bool(row.change) != row.holds for row in headroom.rates(REALTIME, measured(late_us=900.0)))
 

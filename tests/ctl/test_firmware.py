@@ -20,8 +20,7 @@ def text(status_with: Any, capsys: pytest.CaptureFixture[str]) -> Any:
 
 
 def test_everything_that_is_known_is_said(text: Any) -> None:
-    shown = text()
-    for words in (
+    said = (
         "RUNNING on /dev/tormag (serial)",
         "1.0, device 7",
         "4b3a5911 (the daemon's too), protocol 1",
@@ -30,15 +29,14 @@ def test_everything_that_is_known_is_said(text: Any) -> None:
         "2 lost",
         "402 us (p50)",
         "+30.1 ppm",
-    ):
-        assert words in shown
+    )
+    assert [words for words in said if words not in text()] == []
 
 
 def test_two_schemas_are_both_named(text: Any) -> None:
     shown = text(state="REFUSED", firmware_schema="1f00c0de", cause="the schemas differ", remedy="install one")
-    assert "1f00c0de (the daemon's is 4b3a5911)" in shown
-    assert "the schemas differ" in shown
-    assert "next: install one" in shown
+    said = ("1f00c0de (the daemon's is 4b3a5911)", "the schemas differ", "next: install one")
+    assert [words for words in said if words not in shown] == []
 
 
 def test_nothing_known_is_no_error(text: Any) -> None:

@@ -1,10 +1,9 @@
 """`tormagctl keys`, and clients that show a key: to a daemon made of guarded sockets only."""
 
-import asyncio
 import json
 import stat
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +30,7 @@ def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, 
 
 @pytest.fixture
 def keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
-    code, _ = run_json(capsys, "keys", "generate", str(tmp_path / "keys"), "--operate", "console", "--publish", "robot")
-    assert code == 0
+    assert main(["keys", "generate", str(tmp_path / "keys"), "--operate", "console", "--publish", "robot"]) == 0
     return tmp_path / "keys"
 
 
@@ -52,9 +50,8 @@ def test_a_client_is_added_later_and_nothing_is_made_twice(keys: Path, capsys: p
     assert code == 0
     assert [made["name"] for made in printed["result"]["made"]] == ["screen"]
     for arguments in ((), ("--observe", "screen"), ("--publish", "server"), ("--client", "robot")):
-        code, printed = run_json(capsys, "keys", "generate", str(keys), *arguments)
-        assert code == 2
-        assert "exists: keys are never overwritten" in printed["error"]["message"]
+        assert main(["keys", "generate", str(keys), *arguments]) == 2
+        assert "exists: keys are never overwritten" in capsys.readouterr().err
     assert (keys / "server.key_secret").read_bytes() == before
 
 
@@ -63,17 +60,17 @@ def test_a_client_makes_its_own_pair_and_its_secret_stays(tmp_path: Path, capsys
     assert code == 0
     assert sorted(path.name for path in (tmp_path / "mine").iterdir()) == ["robot.key", "robot.key_secret"]
     (made,) = printed["result"]["made"]
-    shown = run_json(capsys, "keys", "show", made["public"])[1]["result"]["keys"]
-    assert shown == [{"name": "robot", "fingerprint": made["fingerprint"]}]
-    code, printed = run_json(capsys, "keys", "generate", str(tmp_path), "--client", "a", "--publish", "b")
-    assert code == 2
+    assert run_json(capsys, "keys", "show", made["public"])[1]["result"]["keys"] == [
+        {"name": "robot", "fingerprint": made["fingerprint"]}
+    ]
+    assert main(["keys", "generate", str(tmp_path), "--client", "a", "--publish", "b"]) == 2
     assert not list(tmp_path.glob("*.key*"))
 
 
 def test_a_folder_of_keys_is_shown(keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["keys", "show", str(keys / "publish")]) == 0
     assert capsys.readouterr().out.endswith("  robot\n")
-    assert run_json(capsys, "keys", "show", "/nowhere")[0] == 2
+    assert main(["keys", "show", "/nowhere"]) == 2
 
 
 @pytest.fixture
@@ -96,13 +93,8 @@ def guarded(keys: Path) -> Iterator[str]:
                 zap.send_multipart([version, number, b"200" if public == known else b"400", b"", b"", b""])
             while router.poll(0):
                 *envelope, data = router.recv_multipart()
-                reply = {
-                    "v": VERSION,
-                    "id": msgpack.unpackb(data)["id"],
-                    "ok": True,
-                    "result": {"operating_state": "DISABLED"},
-                }
-                router.send_multipart([*envelope, msgpack.packb(reply)])
+                reply = {"v": VERSION, "ok": True, "result": {"operating_state": "DISABLED"}}
+                router.send_multipart([*envelope, msgpack.packb(reply | {"id": msgpack.unpackb(data)["id"]})])
         context.destroy(linger=0)
 
     serving = threading.Thread(target=serve)
@@ -110,9 +102,6 @@ def guarded(keys: Path) -> Iterator[str]:
     yield f"tcp://127.0.0.1:{port}"
     is_over.set()
     serving.join(5.0)
-
-
-Ask = Callable[..., tuple[int, dict[str, Any]]]
 
 
 def test_a_key_is_shown_by_option_by_environment_and_by_configuration(
@@ -125,10 +114,10 @@ def test_a_key_is_shown_by_option_by_environment_and_by_configuration(
     config.write_text(
         f'[endpoints]\ncontrol = "{guarded}"\n[endpoints.curve]\nclient_secret = "{mine}"\nserver_public = "{server}"\n'
     )
-    assert run_json(capsys, "--config", str(config), "disable")[0] == 0
+    assert main(["--config", str(config), "disable"]) == 0
     monkeypatch.setenv(KEY, mine)
     monkeypatch.setenv(SERVER_KEY, server)
-    assert run_json(capsys, "--endpoint", guarded, "disable")[0] == 0
+    assert main(["--endpoint", guarded, "disable"]) == 0
 
 
 def test_another_key_or_none_is_not_answered_and_the_hint_says_where_to_look(
@@ -140,21 +129,17 @@ def test_another_key_or_none_is_not_answered_and_the_hint_says_where_to_look(
         assert "--key and --server-key" in printed["error"]["hint"]
 
 
-def test_who_was_refused_and_asks_again_is_told_and_does_not_wait_for_ever(guarded: str) -> None:
+async def test_who_was_refused_and_asks_again_is_told_and_does_not_wait_for_ever(guarded: str) -> None:
     """A refusal ends the connection for good, and there is nobody to send to."""
     endpoints = Endpoints(control=guarded)
     with Client(endpoints, wait_s=0.2) as client:
         for _ in range(3):
             with pytest.raises(UnreachableError):
                 client.request("disable")
-
-    async def ask() -> None:
-        async with AsyncClient(endpoints, wait_s=0.2) as client:
-            for _ in range(3):
-                with pytest.raises(UnreachableError):
-                    await client.request("disable")
-
-    asyncio.run(ask())
+    async with AsyncClient(endpoints, wait_s=0.2) as client:
+        for _ in range(3):
+            with pytest.raises(UnreachableError):
+                await client.request("disable")
 
 
 @pytest.mark.parametrize(

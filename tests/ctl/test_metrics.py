@@ -99,17 +99,19 @@ def test_names_and_types_keep_to_the_conventions(full: Any, capsys: pytest.Captu
 
 @pytest.mark.skipif(PROMTOOL is None, reason="no promtool here: it comes with Debian's package prometheus")
 def test_prometheus_s_own_parser_finds_no_fault(full: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    text = printed(capsys, full.control)
     checked = subprocess.run(
-        [str(PROMTOOL), "check", "metrics"], input=text, text=True, capture_output=True, check=False
+        [str(PROMTOOL), "check", "metrics"],
+        input=printed(capsys, full.control),
+        text=True,
+        capture_output=True,
+        check=False,
     )
     assert (checked.returncode, checked.stdout, checked.stderr) == (0, "", "")
 
 
 def test_what_is_not_known_has_no_sample(fake_daemon: Any, capsys: pytest.CaptureFixture[str]) -> None:
     fake_daemon.says(measured_cf=None, gap_mm=None, faults=[])
-    text = printed(capsys, fake_daemon.control)
-    families = read(text)
+    families = read(printed(capsys, fake_daemon.control))
     assert "tormag_force_measured_newtons" not in families
     assert not families["tormag_fault"].samples
     assert all(math.isfinite(sample.value) for family in families.values() for sample in family.samples)
@@ -148,8 +150,7 @@ def test_the_board_asks_for_what_there_is(full: Any, capsys: pytest.CaptureFixtu
     known = {sample.name for family in read(printed(capsys, full.control)).values() for sample in family.samples}
     board = json.loads(BOARD.read_text(encoding="utf-8"))
     asked = [target["expr"] for panel in board["panels"] for target in panel["targets"]]
-    names = {name for expression in asked for name in re.findall(r"tormag_[a-z_]+", expression)}
-    assert names <= known
+    assert {name for expression in asked for name in re.findall(r"tormag_[a-z_]+", expression)} <= known
     assert len(asked) >= 10
     for panel in board["panels"]:
         assert panel["title"]

@@ -8,6 +8,7 @@ import sys
 import tty
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -25,14 +26,11 @@ ON_BOARD = SimpleNamespace(device="/dev/ttyS0", description="n/a", vid=None, pid
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """Two ports, /dev/tormag leading to the one with a chip of its own."""
-    (tmp_path / "dev").mkdir()
-    (tmp_path / "dev/ttyUSB0").write_text("")
-    (tmp_path / "dev/ttyS0").write_text("")
+    timer = "sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
+    for path, text in (("dev/ttyUSB0", ""), ("dev/ttyS0", ""), (timer, "16\n"), ("proc/locks", "")):
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(text)
     (tmp_path / "dev/tormag").symlink_to("ttyUSB0")
-    (tmp_path / "proc").mkdir()
-    timer = tmp_path / "sys/bus/usb-serial/devices/ttyUSB0/latency_timer"
-    timer.parent.mkdir(parents=True)
-    timer.write_text("16\n")
     return tmp_path
 
 
@@ -45,8 +43,7 @@ def process(root: Path, number: int, name: str, *opened: str) -> None:
 
 
 def test_the_configured_port_is_known_by_where_its_name_leads(root: Path) -> None:
-    found = survey(Config(), Machine(root), [FTDI, ON_BOARD], [])
-    board, chip = found.serial
+    board, chip = survey(Config(), Machine(root), [FTDI, ON_BOARD], []).serial
     assert (chip.port, chip.usb_id, chip.serial_number) == ("/dev/ttyUSB0", "0403:6001", "A50285BI")
     assert (chip.is_configured, chip.is_accessible, chip.latency_ms, chip.holders) == (True, True, 16, ())
     assert (board.is_configured, board.usb_id, board.latency_ms) == (False, None, None)
@@ -79,14 +76,10 @@ def test_can_channels_say_whether_they_are_up(root: Path) -> None:
     for name, state in (("can0", "up"), ("can1", "down")):
         (root / f"sys/class/net/{name}").mkdir(parents=True)
         (root / f"sys/class/net/{name}/operstate").write_text(state)
-    detected = [{"interface": "socketcan", "channel": name} for name in ("can0", "can1")]
-    detected.append({"interface": "udp_multicast", "channel": "239.74.163.2"})
-    found = survey(Config(device=Device(port="can0")), Machine(root), [], detected)
-    assert [(entry.channel, entry.is_up) for entry in found.can] == [
-        ("can0", True),
-        ("can1", False),
-        ("239.74.163.2", None),
-    ]
+    channels = (("socketcan", "can0"), ("socketcan", "can1"), ("udp_multicast", "239.74.163.2"))
+    detected = [{"interface": interface, "channel": channel} for interface, channel in channels]
+    found = survey(Config(device=Device(port="can0")), Machine(root), [], detected).can
+    assert [(each.channel, each.is_up) for each in found] == [("can0", True), ("can1", False), ("239.74.163.2", None)]
 
 
 def test_a_configured_channel_is_no_serial_port_whether_it_is_detected_or_not(root: Path) -> None:
@@ -107,22 +100,16 @@ def test_the_text_says_what_it_cannot_see(root: Path, monkeypatch: pytest.Monkey
     process(root, 4242, "minicom", "/dev/ttyUSB0")
     process(root, 5, "secret")
     (root / "proc/5/fd").rmdir()
-    listing = Path.iterdir
-
-    def guarded(path: Path) -> object:
-        if path == root / "proc/5/fd":
-            raise PermissionError
-        return listing(path)
-
-    monkeypatch.setattr(Path, "iterdir", guarded)
+    listing, of_another = Path.iterdir, Mock(side_effect=PermissionError)
+    monkeypatch.setattr(Path, "iterdir", lambda path: of_another() if path == root / "proc/5/fd" else listing(path))
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [FTDI])
     monkeypatch.setattr(
         "can.detect_available_configs", lambda asked, timeout: [{"interface": "socketcan", "channel": "can0"}]
     )
     outcome = ports(Config(), root)
     assert outcome.result["hidden_processes"] == 1
-    for words in ("/dev/ttyUSB0", "configured", "held by minicom (process 4242)", "can0", "1 processes of other users"):
-        assert words in outcome.text
+    said = ("/dev/ttyUSB0", "configured", "held by minicom (process 4242)", "can0", "1 processes of other users")
+    assert [words for words in said if words not in outcome.text] == []
 
 
 def test_a_configured_port_that_is_not_there_is_said(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

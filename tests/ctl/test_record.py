@@ -50,10 +50,7 @@ def test_a_silent_end_is_a_gap_and_a_daemon_that_has_gone(fake_daemon, tmp_path,
     file = tmp_path / "a.mcap"
     silencer = threading.Timer(0.3, lambda: setattr(fake_daemon, "is_silent", True))
     silencer.start()
-    try:
-        code = main(["--endpoint", fake_daemon.control, "--json", "record", str(file), "--duration", "2"])
-    finally:
-        silencer.join()
+    code = main(["--endpoint", fake_daemon.control, "--json", "record", str(file), "--duration", "2"])
     printed = json.loads(capsys.readouterr().out)
     assert (code, printed["ok"], printed["result"]["gaps"]) == (3, False, 1)
     assert printed["result"]["longest_gap_ms"] == pytest.approx(printed["result"]["silent_ms"])
@@ -62,16 +59,14 @@ def test_a_silent_end_is_a_gap_and_a_daemon_that_has_gone(fake_daemon, tmp_path,
 
 
 def test_lost_ticks_are_counted_and_are_no_success(fake_daemon, tmp_path, capsys):
-    columns = ("t_ns", "tick")
-    numbers = (3, 4, 8, 9, 0, 1, 2)  # 5, 6 and 7 are lost; then the daemon restarts; and so on
     fake_daemon.rubbish += [
-        msgpack.packb({"v": 1, "columns": columns, "rows": [[2**60 + number, number]]}) for number in numbers
+        msgpack.packb({"v": 1, "columns": ("t_ns", "tick"), "rows": [[2**60 + number, number]]})
+        for number in (3, 4, 8, 9, 0, 1, 2)  # 5, 6 and 7 are lost; then the daemon restarts; and so on
     ]
     code = main(["--endpoint", fake_daemon.control, "--json", "record", str(tmp_path / "a.mcap"), "--duration", "0.3"])
     result = json.loads(capsys.readouterr().out)["result"]
-    assert code == 1
+    assert (code, result["ticks_lost"] % 3) == (1, 0)
     assert result["ticks_lost"] > 0
-    assert result["ticks_lost"] % 3 == 0
 
 
 def test_a_recording_is_never_overwritten(fake_daemon, tmp_path, capsys):

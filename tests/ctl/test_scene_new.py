@@ -72,8 +72,7 @@ class Terminal(io.StringIO):
 
 
 def test_without_a_recording_it_asks_and_enter_takes_what_is_proposed(tmp_path, capsys, monkeypatch):
-    answers = "A vein is held open.\n\n1.5\nmuch\n0.06\n" + "\n" * 6
-    monkeypatch.setattr(sys, "stdin", Terminal(answers))
+    monkeypatch.setattr(sys, "stdin", Terminal("A vein is held open.\n\n1.5\nmuch\n0.06\n" + "\n" * 6))
     code, printed = new(capsys, str(tmp_path / "vein.toml"))
     assert code == 0
     scene = load_scene(printed["result"]["file"])

@@ -39,8 +39,7 @@ def test_every_setpoint_arrives_from_the_first_on(fake_daemon, capsys):
     arrived = fake_daemon.setpoints
     assert result["sent"] + result["skipped"] == 61
     assert len(arrived) == result["sent"]
-    assert arrived[0].servo_cf == 1.0
-    assert arrived[-1].servo_cf == 2.0
+    assert (arrived[0].servo_cf, arrived[-1].servo_cf) == (1.0, 2.0)
     assert all(b.seq > a.seq and b.stamp_ns > a.stamp_ns for a, b in pairwise(arrived))
     # the force belongs to the setpoint's own deadline, whatever was left out
     for setpoint in arrived:
@@ -61,8 +60,10 @@ def test_a_second_run_of_the_same_source_is_newer(fake_daemon, capsys):
 
 
 def test_a_preview_is_what_will_be_sent(fake_daemon, capsys):
-    result = send(fake_daemon, capsys, "sine", "--duration", "0.2", "--rate", "100", "--preview-ms", "50")
-    wait_for(fake_daemon, result["sent"])
+    wait_for(
+        fake_daemon,
+        send(fake_daemon, capsys, "sine", "--duration", "0.2", "--rate", "100", "--preview-ms", "50")["sent"],
+    )
     arrived = fake_daemon.setpoints
     forces = {round(100.0 * after_s(setpoint, arrived[0])): setpoint.servo_cf for setpoint in arrived}
     for setpoint in arrived:
@@ -151,9 +152,7 @@ def test_byte_order_mark_windows_lines_and_blank_lines_are_read(tmp_path):
     file = tmp_path / "task.csv"
     file.write_bytes("\ufefft_s,force_N\r\n0,1\r\n\r\n2,3\r\n".encode())
     waveform = read_csv(file)
-    assert waveform.duration_s == 2.0
-    assert waveform.at(1.0).force_N == 2.0
-    assert waveform.at(1.0).displacement_mm is None
+    assert (waveform.duration_s, waveform.at(1.0).force_N, waveform.at(1.0).displacement_mm) == (2.0, 2.0, None)
 
 
 @given(
@@ -179,11 +178,10 @@ def test_shapes_stay_between_their_two_forces_and_reach_both(name):
 
 
 def test_shapes_have_their_frequency_and_their_step():
-    assert shape("step", 1.0, 2.0, 1.0, 4.0).at(1.999).force_N == 1.0
-    assert shape("step", 1.0, 2.0, 1.0, 4.0).at(2.0).force_N == 2.0
+    step = shape("step", 1.0, 2.0, 1.0, 4.0)
+    assert (step.at(1.999).force_N, step.at(2.0).force_N) == (1.0, 2.0)
     sine = shape("sine", 1.0, 2.0, 2.0, 4.0)
-    assert sine.at(0.25).force_N == pytest.approx(2.0)
-    assert sine.at(0.5).force_N == pytest.approx(1.0)
+    assert (sine.at(0.25).force_N, sine.at(0.5).force_N) == pytest.approx((2.0, 1.0))
     pulse = shape("pulse", 1.0, 2.0, 0.5, 4.0)
     assert pulse.at(0.5).force_N == pytest.approx(pulse.at(2.5).force_N)
 

@@ -33,8 +33,7 @@ def seen(status_with, telemetry_with) -> Seen:
     times = {"p50": 41.0, "p99": 304.0, "p999": 500.0, "max": 900.0}
     rate |= {"lateness_us": times | {"worst": 2000.0}, "exec_us": times}
     link = status_with()["link"] | {"port": f"/tmp/{'a-port-with-a-long-name' * 9}"}
-    loops = {"control": rate, "inference": rate}
-    known = msgspec.convert(status_with(rates=loops, link=link, uptime_s=7200.0), Status)
+    known = msgspec.convert(status_with(rates={"control": rate, "inference": rate}, link=link, uptime_s=7200.0), Status)
     snapshots = [
         telemetry_with(
             k,
@@ -66,10 +65,11 @@ def test_the_screen_fits_and_says_what_the_device_does(seen: Seen, width: int, h
     assert len(lines) <= height
     assert all(len(line) <= width for line in lines)
     text = "\n".join(lines)
-    for said in ("ENABLED", "homed", "up 2.0 h", "warning, 1000 Hz, late 41 us (p50) 304 us (p99), stalls 3"):
-        assert said in text
-    for said in ("RUNNING", "round trip 0.40 ms", "RATE 10% of the time", "next: ask for slower changes"):
-        assert said in text
+    said = (
+        *("ENABLED", "homed", "up 2.0 h", "warning, 1000 Hz, late 41 us (p50) 304 us (p99), stalls 3"),
+        *("RUNNING", "round trip 0.40 ms", "RATE 10% of the time", "next: ask for slower changes"),
+    )
+    assert [words for words in said if words not in text] == []
     labels = ("control", "inference", "link", "setpoints", *(curve.label for curve in CURVES))
     assert all(any(line.startswith(f" {label} ") for line in lines) for label in labels)
     # a sine fills its rows from bottom to top
@@ -119,8 +119,7 @@ def test_a_bar_is_as_high_as_its_value(values: list[float | None], rows: int, le
     lines = sparkline(values, low, high, rows)
     assert [len(line) for line in lines] == [len(values)] * rows
     heights = [sum(EIGHTHS.index(line[column]) for line in lines) for column in range(len(values))]
-    for value, height in zip(values, heights, strict=True):
-        assert (height == 0) == (value is None)
+    assert [height == 0 for height in heights] == [value is None for value in values]
     known = sorted((value, height) for value, height in zip(values, heights, strict=True) if value is not None)
     assert [height for _, height in known] == sorted(height for _, height in known)
     if known and known[-1][0] - known[0][0] >= least:
@@ -145,10 +144,7 @@ def in_terminal(control: str, end: bytes | signal.Signals) -> tuple[int, str]:
     try:
         while b"late" not in text:
             text += os.read(far, 65_536)
-        if isinstance(end, bytes):
-            os.write(far, end)
-        else:
-            process.send_signal(end)
+        os.write(far, end) if isinstance(end, bytes) else process.send_signal(end)
         while b"the daemon goes on" not in text:
             text += os.read(far, 65_536)
         return process.wait(20.0), text.decode()

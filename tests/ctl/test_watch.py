@@ -166,8 +166,7 @@ def test_blind_it_asks_nothing_and_says_that_it_does_not_know(fake_daemon, capsy
 def test_a_key_that_may_only_publish_is_told_how(run_dir, tmp_path, capsys):
     assert main(["keys", "generate", str(tmp_path / "keys"), "--publish", "robot"]) == 0
     keys = ("--key", str(tmp_path / "keys/robot.key_secret"), "--server-key", str(tmp_path / "keys/server.key"))
-    endpoint = f"ipc://{run_dir}/control"
-    assert main(["--endpoint", endpoint, *keys, "--wait", "0.05", "send", "step"]) == 3
+    assert main(["--endpoint", f"ipc://{run_dir}/control", *keys, "--wait", "0.05", "send", "step"]) == 3
     assert "with a key that may only publish: --blind" in capsys.readouterr().err
 
 

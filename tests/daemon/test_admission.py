@@ -4,10 +4,13 @@ import contextlib
 import os
 import socket
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import msgpack
 import pytest
@@ -49,8 +52,7 @@ class Rig:
             generate(name, self.keys, self.keys / role)
         # one that is listed for everything
         generate("bench", self.keys, self.keys / "publish")
-        listed = (self.keys / "publish/bench.key").read_bytes()
-        (self.keys / "operate/bench.key").write_bytes(listed)
+        (self.keys / "operate/bench.key").write_bytes((self.keys / "publish/bench.key").read_bytes())
         (self.keys / "operate/bench.key").chmod(0o600)
         self.addresses = {
             name: f"ipc://{folder}/{name}" if scheme == "ipc" else f"tcp://127.0.0.1:{port}"
@@ -79,6 +81,11 @@ class Rig:
         self.peers.append(made)
         return made
 
+    def dial(self) -> socket.socket:
+        """A stranger at the setpoints' TCP port, who has said nothing yet."""
+        port = int(self.addresses["setpoint"].rsplit(":", 1)[1])
+        return socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
+
     def until(self, reached: Callable[[], Any], what: str = "reached") -> None:
         """Serves until it is so."""
         until_s = time.monotonic() + PATIENCE_S
@@ -95,10 +102,9 @@ class Rig:
 
     def reasons(self) -> dict[tuple[str, str, str], int]:
         """How many were refused by endpoint, reason and key."""
-        found: dict[tuple[str, str, str], int] = {}
+        found: Counter[tuple[str, str, str]] = Counter()
         for each in self.endpoint.report().refusals:
-            place = (each.endpoint, each.reason, each.key)
-            found[place] = found.get(place, 0) + each.count
+            found[each.endpoint, each.reason, each.key] += each.count
         return found
 
     def close(self) -> None:
@@ -113,17 +119,11 @@ def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
     made.close()
 
 
-@pytest.fixture
-def tcp_rig(tmp_path: Path) -> Iterator[Rig]:
-    made = Rig(tmp_path, "tcp")
-    yield made
-    made.close()
+over_tcp = pytest.mark.parametrize("rig", ["tcp"], indirect=True)
 
 
 def setpoint(seq: int) -> bytes:
-    fields = {"v": 1, "source": "a", "seq": seq, "stamp_ns": 1, "servo_cf": 1.0, "valid_for_ms": 50.0}
-    packed: bytes = msgpack.packb(fields)
-    return packed
+    return msgpack.packb({"v": 1, "source": "a", "seq": seq, "stamp_ns": 1, "servo_cf": 1.0, "valid_for_ms": 50.0})
 
 
 def request(command: str) -> bytes:
@@ -235,6 +235,7 @@ def test_nobody_else_is_let_in_and_everybody_is_counted(
             assert report.address == f"process {os.getpid()} of user {os.getuid()}" or "gone" in report.address
 
 
+@over_tcp
 @pytest.mark.parametrize(
     ("sent", "reason"),
     [
@@ -249,23 +250,20 @@ def test_nobody_else_is_let_in_and_everybody_is_counted(
     ],
     ids=range(5),
 )
-def test_a_stranger_gets_nothing_but_the_greeting_and_its_mechanism(tcp_rig: Rig, sent: bytes, reason: str) -> None:
-    port = int(tcp_rig.addresses["setpoint"].rsplit(":", 1)[1])
-    with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as stranger:
+def test_a_stranger_gets_nothing_but_the_greeting_and_its_mechanism(rig: Rig, sent: bytes, reason: str) -> None:
+    with rig.dial() as stranger:
         stranger.sendall(sent)
         stranger.settimeout(0.2)
         got = b""
-        try:
+        with contextlib.suppress(OSError):
             while part := stranger.recv(1_000):
                 got += part
-        except OSError:
-            pass
         assert len(got) <= 64
         assert got[:1] in (b"", b"\xff")
         if len(got) == 64:
             assert got[12:32] == b"CURVE".ljust(20, b"\0")
-    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused == 1, "refused")
-    assert [place[:2] for place in tcp_rig.reasons()] == [("setpoint", reason)]
+    rig.until(lambda: rig.endpoint.report().refused == 1, "refused")
+    assert [place[:2] for place in rig.reasons()] == [("setpoint", reason)]
 
 
 # -- lists that change ---------------------------------------------------------------------------------------------
@@ -300,84 +298,83 @@ def test_lists_that_are_no_good_leave_the_old_ones(rig: Rig, caplog: pytest.LogC
     rig.until(lambda: publisher.poll(0))
 
 
-def test_a_stranger_that_leaves_before_it_was_asked_about_is_counted_once(tcp_rig: Rig) -> None:
-    tcp_rig.endpoint.admission.pause_s = lambda: 0.05
+@over_tcp
+def test_a_stranger_that_leaves_before_it_was_asked_about_is_counted_once(rig: Rig) -> None:
+    rig.endpoint.admission.pause_s = lambda: 0.05
     for _ in range(5):
-        stranger = tcp_rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
+        stranger = rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
         time.sleep(0.03)
         stranger.close(linger=0)
-    tcp_rig.until(lambda: tcp_rig.endpoint.report().connections["setpoint"] == 0, "closed")
-    tcp_rig.endpoint.admission.pause_s = lambda: 0.0
-    tcp_rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
-    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused >= 6, "refused")
-    assert tcp_rig.endpoint.report().refused == 6
+    rig.until(lambda: rig.endpoint.report().connections["setpoint"] == 0, "closed")
+    rig.endpoint.admission.pause_s = lambda: 0.0
+    rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
+    rig.until(lambda: rig.endpoint.report().refused >= 6, "refused")
+    assert rig.endpoint.report().refused == 6
 
 
-def test_one_that_leaves_in_the_handshake_is_not_taken_for_one_that_was_asked_about(tcp_rig: Rig) -> None:
-    publisher = tcp_rig.peer(zmq.XPUB, "setpoint", tcp_rig.pair("robot"))
-    tcp_rig.until(lambda: publisher.poll(0))
-    tcp_rig.endpoint.admission.pause_s = lambda: 0.05
-    tcp_rig.peer(zmq.XPUB, "setpoint", STRANGER)
-    port = int(tcp_rig.addresses["setpoint"].rsplit(":", 1)[1])
-    socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S).close()
-    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused, "refused")
-    tcp_rig.endpoint.admission.pause_s = lambda: 0.0
-    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused >= 2, "counted")
-    tcp_rig.until(lambda: tcp_rig.endpoint.report().connections["setpoint"] == 1, "closed")
-    assert tcp_rig.endpoint.report().refused == 2
-    assert not any(has_left for _, has_left in tcp_rig.endpoint.admission.moves)
+@over_tcp
+def test_one_that_leaves_in_the_handshake_is_not_taken_for_one_that_was_asked_about(rig: Rig) -> None:
+    publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair("robot"))
+    rig.until(lambda: publisher.poll(0))
+    rig.endpoint.admission.pause_s = lambda: 0.05
+    rig.peer(zmq.XPUB, "setpoint", STRANGER)
+    rig.dial().close()
+    rig.until(lambda: rig.endpoint.report().refused, "refused")
+    rig.endpoint.admission.pause_s = lambda: 0.0
+    rig.until(lambda: rig.endpoint.report().refused >= 2, "counted")
+    rig.until(lambda: rig.endpoint.report().connections["setpoint"] == 1, "closed")
+    assert rig.endpoint.report().refused == 2
+    assert not any(has_left for _, has_left in rig.endpoint.admission.moves)
 
 
 # -- how many ------------------------------------------------------------------------------------------------------
 
 
-def test_an_address_has_so_many_connections_and_no_more(tcp_rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+@over_tcp
+def test_an_address_has_so_many_connections_and_no_more(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(admission, "CONNECTIONS_PER_PEER", 5)
-    port = int(tcp_rig.addresses["setpoint"].rsplit(":", 1)[1])
-    strangers = [socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) for _ in range(12)]
-    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused >= 7, "refused")
-    assert ("setpoint", "too many connections", "") in tcp_rig.reasons()
-    tcp_rig.until(lambda: tcp_rig.endpoint.report().connections["setpoint"] <= 5, "cut off")
+    strangers = [rig.dial() for _ in range(12)]
+    rig.until(lambda: rig.endpoint.report().refused >= 7, "refused")
+    assert ("setpoint", "too many connections", "") in rig.reasons()
+    rig.until(lambda: rig.endpoint.report().connections["setpoint"] <= 5, "cut off")
     for stranger in strangers:
         stranger.close()
-    tcp_rig.until(lambda: tcp_rig.endpoint.report().connections["setpoint"] == 0, "closed")
-    publisher = tcp_rig.peer(zmq.XPUB, "setpoint", tcp_rig.pair("robot"))
-    tcp_rig.until(lambda: publisher.poll(0))
+    rig.until(lambda: rig.endpoint.report().connections["setpoint"] == 0, "closed")
+    publisher = rig.peer(zmq.XPUB, "setpoint", rig.pair("robot"))
+    rig.until(lambda: publisher.poll(0))
     assert CONNECTIONS_PER_PEER > 100
 
 
+@over_tcp
 def test_refused_peers_beyond_those_that_are_told_apart_are_counted_together(
-    tcp_rig: Rig, monkeypatch: pytest.MonkeyPatch
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(admission, "PEERS", 4)
     for _ in range(10):
-        tcp_rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
-    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused == 10, "refused")
-    reports: tuple[PeerReport, ...] = tcp_rig.endpoint.report().refusals
+        rig.peer(zmq.XPUB, "setpoint", KeyPair(*zmq.curve_keypair()))
+    rig.until(lambda: rig.endpoint.report().refused == 10, "refused")
+    reports: tuple[PeerReport, ...] = rig.endpoint.report().refusals
     assert len(reports) == 5
     assert sum(each.count for each in reports) == 10
     assert [each.count for each in reports if each.address == "others"] == [6]
 
 
-def test_the_log_names_the_newest_and_is_not_flooded(tcp_rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
+@over_tcp
+def test_the_log_names_the_newest_and_is_not_flooded(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:
     for _ in range(10):
-        tcp_rig.peer(zmq.XPUB, "setpoint", STRANGER)
-    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused == 10, "refused")
+        rig.peer(zmq.XPUB, "setpoint", STRANGER)
+    rig.until(lambda: rig.endpoint.report().refused == 10, "refused")
     lines = [record.getMessage() for record in caplog.records if "refused" in record.getMessage()]
     assert len(lines) == 1
     assert f"setpoint: 127.0.0.1, key {fingerprint(STRANGER.public)}: key not listed" in lines[0]
 
 
-def test_the_thread_waits_before_each_event_for_as_long_as_it_is_told_to(tcp_rig: Rig) -> None:
-    waits = iter([0.0, 0.01] * 1_000)
-    asked: list[float] = []
-
-    def pause_s() -> float:
-        asked.append(next(waits))
-        return asked[-1]
-
-    tcp_rig.endpoint.admission.pause_s = pause_s
-    peers = [tcp_rig.peer(zmq.DEALER, "control", STRANGER) for _ in range(5)]
-    tcp_rig.until(lambda: tcp_rig.endpoint.report().refused == 5, "refused")
+@over_tcp
+def test_the_thread_waits_before_each_event_for_as_long_as_it_is_told_to(rig: Rig) -> None:
+    waited = Mock(side_effect=cycle([0.0, 0.01]))
+    rig.endpoint.admission.pause_s = waited
+    for _ in range(5):
+        rig.peer(zmq.DEALER, "control", STRANGER)
+    rig.until(lambda: rig.endpoint.report().refused == 5, "refused")
     # each is asked about, and seen to come by another thread
-    tcp_rig.until(lambda: len(asked) >= 2 * len(peers), "seen")
+    rig.until(lambda: waited.call_count >= 2 * 5, "seen")

@@ -1,9 +1,11 @@
 """The daemon's side of the black box: it waits for nobody, and what is lost is said."""
 
+import contextlib
 import socket
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -28,15 +30,16 @@ from tormagd.simulation.parameters import load_plant
 
 
 def closed_loop(core: Core) -> ClosedLoop:
-    device = VirtualDevice(load_plant("sample_1"), ReversingHand(2.0))
-    return ClosedLoop(Config(), core.stepper(), core.planner(), device)
+    return ClosedLoop(
+        Config(), core.stepper(), core.planner(), VirtualDevice(load_plant("sample_1"), ReversingHand(2.0))
+    )
 
 
 class Rig:
     """A black box, whose other process is this one."""
 
     def __init__(self, core: Core, connection: Connection | None = None) -> None:
-        self.waited = 0
+        self.process = Mock()
         self.stepper, self.planner = core.stepper(), core.planner()
         self.output = self.stepper.step(1.0, None, self.planner.planned)
         self.box = BlackBox(Path("/boxes"), {"format": "1"}, 1_000, self.start)
@@ -46,27 +49,21 @@ class Rig:
     def start(self, its: socket.socket) -> Any:
         self.its = its.dup()
         self.its.setblocking(False)
-        return SimpleNamespace(wait=self.wait)
-
-    def wait(self, _timeout_s: float) -> None:
-        self.waited += 1
+        return self.process
 
     def tick(self, times: int = 1) -> None:
         for _ in range(times):
             self.box.journal.stepped()
-            record = tick_record(self.stepper, self.output, self.planner.planned, None, 0.0, 0.0)
-            self.box.ticked(record, self.stepper, self.planner)
+            self.box.ticked(
+                tick_record(self.stepper, self.output, self.planner.planned, None, 0.0, 0.0), self.stepper, self.planner
+            )
 
     def heard(self) -> list[Said]:
         said: list[Said] = []
-        while True:
-            try:
-                data = self.its.recv(4_000_000)
-            except BlockingIOError:
-                return said
-            if not data:
-                return said
-            said.append(msgspec.msgpack.decode(data, type=Said))
+        with contextlib.suppress(BlockingIOError):
+            while data := self.its.recv(4_000_000):
+                said.append(msgspec.msgpack.decode(data, type=Said))
+        return said
 
 
 @pytest.fixture
@@ -88,11 +85,9 @@ def test_parts_have_the_ticks_in_their_order_and_a_state_every_second(rig: Rig) 
         parts += rig.heard()
     assert first == Begin("/boxes", {"format": "1"})
     assert all(isinstance(part, Part) for part in parts)
-    assert names(parts[0])[:3] == ["state", "step", "tick"]
-    assert names(parts[0])[-3:] == ["plan", "step", "tick"]
+    assert (names(parts[0])[:3], names(parts[0])[-3:]) == (["state", "step", "tick"], ["plan", "step", "tick"])
     assert [number for number, part in enumerate(parts) if "state" in names(part)] == [0, 50, 100, 150]
-    ticks = [names(part).count("tick") for part in parts]
-    assert sum(ticks) == 3_010
+    assert [each for part in parts for each in names(part)].count("tick") == 3_010
 
 
 def test_what_passes_between_daemon_and_device_is_kept_in_its_order(core: Core) -> None:
@@ -158,7 +153,7 @@ def test_it_says_when_it_ends(rig: Rig) -> None:
     rig.heard()
     rig.box.close()
     assert rig.heard() == [End()]
-    assert rig.waited == 1
+    rig.process.wait.assert_called_once()
 
 
 def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,10 +173,7 @@ def test_without_a_folder_nothing_is_kept(core: Core, monkeypatch: pytest.Monkey
 
 
 def test_a_process_that_does_not_start_is_no_reason_not_to_run(core: Core) -> None:
-    def fail(_its: socket.socket) -> Any:
-        raise OSError(11, "Resource temporarily unavailable")
-
-    box = BlackBox(Path("/boxes"), {}, 1_000, fail)
+    box = BlackBox(Path("/boxes"), {}, 1_000, Mock(side_effect=OSError(11, "Resource temporarily unavailable")))
     assert "did not start" in box.report().refusal
     box.close()
 

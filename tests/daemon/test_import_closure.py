@@ -51,12 +51,10 @@ LIBRARIES = (
 
 
 def test_the_daemon_loads_the_model_and_nothing_of_its_training() -> None:
-    done = subprocess.run(
+    ours, libraries = subprocess.run(
         [sys.executable, "-P", "-c", LOADED, *LIBRARIES], capture_output=True, text=True, check=True, timeout=60
-    )
-    ours, libraries = done.stdout.splitlines()
-    rooms = {name.split(".")[1] for name in ours.split() if name.startswith("tormagd.")}
-    assert rooms == ROOMS
+    ).stdout.splitlines()
+    assert {name.split(".")[1] for name in ours.split() if name.startswith("tormagd.")} == ROOMS
     assert {name for name in ours.split() if name.startswith("tormagd_client.")} == {
         "tormagd_client.endpoints",
         "tormagd_client.keys",

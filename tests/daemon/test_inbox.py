@@ -32,20 +32,18 @@ class Publishing:
     def realtime_ns(self) -> int:
         return START_NS + round((self.now_s + self.step_s) * 1e9)
 
-    def take(self, data: bytes) -> bool:
-        return self.inbox.take(data, self.now_s, self.realtime_ns)
-
     def send(self, seq: int, force_N: float = 1.0, source: str = "a", age_s: float = 0.0, /, **fields: Any) -> bool:
         """Publishes one setpoint, stamped `age_s` ago."""
+        stamp_ns = self.realtime_ns - round(age_s * 1e9)
         message = {
             "v": 1,
             "source": source,
             "seq": seq,
-            "stamp_ns": self.realtime_ns - round(age_s * 1e9),
+            "stamp_ns": stamp_ns,
             "servo_cf": force_N,
             "valid_for_ms": 50.0,
         }
-        return self.take(msgpack.packb(message | fields))
+        return self.inbox.take(msgpack.packb(message | fields), self.now_s, self.realtime_ns)
 
     def counters(self) -> tuple[int, int, int]:
         return self.inbox.accepted, self.inbox.refused, self.inbox.dropped
@@ -154,11 +152,10 @@ def test_two_publishers_of_one_name_do_not_alternate_on_the_brake(publishing: Pu
     forces = []
     for tick in range(200):
         publishing.now_s = tick * 0.004
-        publishing.send(tick + 1, 0.9)
-        forces.append(publishing.force_N)
-        publishing.send(tick + 1_000_000, 1.6)
-        forces.append(publishing.force_N)
-    assert set(forces[4:]) == {0.9} or set(forces[4:]) == {1.6}
+        for seq, force_N in ((tick + 1, 0.9), (tick + 1_000_000, 1.6)):
+            publishing.send(seq, force_N)
+            forces.append(publishing.force_N)
+    assert set(forces[4:]) in ({0.9}, {1.6})
     assert publishing.newest.is_contested
     assert "two publishers call themselves 'a'" in publishing.inbox.told(publishing.now_s)[Limit.OTHER_SOURCE].cause
 
@@ -166,11 +163,11 @@ def test_two_publishers_of_one_name_do_not_alternate_on_the_brake(publishing: Pu
 def test_why_it_is_stale_is_said(publishing: Publishing) -> None:
     publishing.send(1)
     publishing.now_s = 0.3
-    told = publishing.inbox.told(publishing.now_s)[Limit.STALE]
-    assert told.cause.startswith("'a' has sent nothing for 300 ms")
+    silent = publishing.inbox.told(publishing.now_s)[Limit.STALE]
     publishing.send(2, 1.0, "a", 0.12)
-    told = publishing.inbox.told(publishing.now_s)[Limit.STALE]
-    assert told.cause.startswith("setpoints of 'a' come 120 ms late, and are valid for 50 ms")
+    late = publishing.inbox.told(publishing.now_s)[Limit.STALE]
+    assert silent.cause.startswith("'a' has sent nothing for 300 ms")
+    assert late.cause.startswith("setpoints of 'a' come 120 ms late, and are valid for 50 ms")
 
 
 # -- clocks --------------------------------------------------------------------------------------------------------
@@ -203,8 +200,7 @@ def test_a_clock_that_is_set_makes_no_setpoint_older_or_younger(publishing: Publ
 def test_a_stamp_ahead_of_the_clock_is_refused_until_it_is_known_to_be_the_clock(publishing: Publishing) -> None:
     assert not publishing.send(1, 2.0, "a", -AHEAD_S - 0.001)
     assert publishing.counters() == (0, 1, 0)
-    assert publishing.inbox.last_refusal is not None
-    assert "51 ms ahead" in publishing.inbox.last_refusal
+    assert "51 ms ahead" in str(publishing.inbox.last_refusal)
     publishing.now_s = SETTLED_S
     assert publishing.send(2, 2.0, "a", -AHEAD_S - 0.001)
     # of a source that is known, it is the clock; and no setpoint is younger than its arrival
@@ -236,7 +232,6 @@ def test_a_drifting_clock_is_told(publishing: Publishing, drift_ppm: float) -> N
         publishing.now_s = tick * 0.01
         publishing.send(tick, 1.0, "a", noise.uniform(0.0, 0.001) - drift_ppm * 1e-6 * publishing.now_s)
     found = publishing.of("a")
-    assert found.clock is not None
     assert found.clock.windows > 8
     assert found.clock.drift_ppm == pytest.approx(drift_ppm, abs=60.0)
     assert f"ppm {'fast' if drift_ppm > 0.0 else 'slow'}" in found.cause
@@ -269,10 +264,8 @@ def test_one_publisher_too_many_is_refused_until_one_is_silent(publishing: Publi
     # the first holds the brake and stays; the second has been silent for long enough, the third has not
     publishing.now_s = SILENT_S + 0.015
     publishing.send(1, 2.0, source="one more")
-    sources = publishing.inbox.report(publishing.now_s).sources
-    assert len(sources) == SOURCES
-    assert {"source 0", "source 2", "one more"} <= set(sources)
-    assert "source 1" not in sources
+    kept = {f"source {number}" for number in range(SOURCES) if number != 1}
+    assert set(publishing.inbox.report(publishing.now_s).sources) == kept | {"one more"}
 
 
 def test_a_flood_of_names_takes_no_memory_and_keeps_no_listed_source_out() -> None:
@@ -320,8 +313,7 @@ def test_a_refused_setpoint_changes_nothing_but_the_counter(publishing: Publishi
 
 
 def test_the_report_fits_into_an_answer_whatever_the_sources_call_themselves(publishing: Publishing) -> None:
-    hostile = {"preview_N": [-1.2345678901234567e-100] * 256, "preview_dt_ms": 1.0}
-    assert not publishing.send(1, **hostile)
+    assert not publishing.send(1, preview_N=[-1.2345678901234567e-100] * 256, preview_dt_ms=1.0)
     for tick in range(30):
         publishing.now_s += 0.01
         for number in range(SOURCES):

@@ -23,12 +23,13 @@ class Rig:
     """Profiles of what is believed, on an event loop that runs while they are asked to look."""
 
     def __init__(self, core: Core, runner: asyncio.Runner, folder: Path | None) -> None:
+        async def begun() -> Profiles:
+            kept = None if folder is None else ProfileFolder(folder, "MRE-50-40", MODEL)
+            return Profiles(kept, self.believe, self.believe.teach)
+
         self.believe = core.planner().believe
         self._runner = runner
-        self.profiles = runner.run(self._begun(None if folder is None else ProfileFolder(folder, "MRE-50-40", MODEL)))
-
-    async def _begun(self, folder: ProfileFolder | None) -> Profiles:
-        return Profiles(folder, self.believe, self.believe.teach)
+        self.profiles = runner.run(begun())
 
     @property
     def learned(self) -> Learned:
@@ -57,9 +58,9 @@ def new_rig(core: Core) -> Iterator[Callable[[Path | None], Rig]]:
         yield partial(Rig, core, runner)
 
 
-def keep(folder: Path, serial_number: int) -> None:
-    profile = profile_of(STRONG, serial_number=serial_number, insert="MRE-50-40", model=MODEL, saved_ns=0)
-    ProfileFolder(folder, "MRE-50-40", MODEL).write(profile)
+def keep(folder: Path, serial_number: int, model: str = MODEL) -> None:
+    profile = profile_of(STRONG, serial_number=serial_number, insert="MRE-50-40", model=model, saved_ns=0)
+    ProfileFolder(folder, "MRE-50-40", model).write(profile)
 
 
 def test_what_is_learned_while_driven_is_there_after_a_restart(
@@ -134,11 +135,6 @@ def test_what_a_doubted_sensor_taught_is_not_kept(new_rig: Callable[[Path | None
     assert list(tmp_path.iterdir()) == []
 
 
-def wrong_model(path: Path) -> None:
-    profile = profile_of(STRONG, serial_number=7, insert="MRE-50-40", model="cd" * 32, saved_ns=0)
-    ProfileFolder(path.parent, "MRE-50-40", "cd" * 32).write(profile)
-
-
 def another_device(path: Path) -> None:
     keep(path.parent, 8)
     (path.parent / "00000008-MRE-50-40.json").rename(path)
@@ -151,7 +147,7 @@ def another_device(path: Path) -> None:
         (lambda path: path.write_bytes(b"[" * 100_000), "allowed is"),
         (os.mkfifo, "this is a pipe"),
         (Path.mkdir, "directory"),
-        (wrong_model, "model = "),
+        (lambda path: keep(path.parent, 7, "cd" * 32), "model = "),
         (another_device, "serial_number = 8"),
     ],
 )

@@ -61,16 +61,12 @@ def test_the_horizon_forgets_and_the_worst_does_not() -> None:
     report = recorded([900.0] + [5.0] * count).report
     assert (report.runs, report.lateness_us.worst, report.lateness_us.max) == (count + 1, 900.0, 5.0)
     assert report.hz == pytest.approx(1_000.0, rel=1e-3)
-    early = recorded([900.0] + [5.0] * round(0.9 * HORIZON_NS / PERIOD_NS)).report
-    assert early.lateness_us.max == 900.0
+    assert recorded([900.0] + [5.0] * round(0.9 * HORIZON_NS / PERIOD_NS)).report.lateness_us.max == 900.0
 
 
 def test_the_rate_is_that_of_the_horizon() -> None:
     group = RateGroup("test", PERIOD_NS)
-    fast = HORIZON_NS // PERIOD_NS
-    due = 0
-    for number in range(2 * fast):
-        due += PERIOD_NS if number < fast else 4 * PERIOD_NS
+    for due in (*range(0, HORIZON_NS, PERIOD_NS), *range(HORIZON_NS, 5 * HORIZON_NS, 4 * PERIOD_NS)):
         group.record(due, due, due)
     assert group.rate_hz() == pytest.approx(250.0, rel=1e-2)
 
@@ -96,19 +92,18 @@ def test_a_stall_is_an_error_and_an_overrun_a_warning_for_as_long_as_the_horizon
     group = RateGroup("test", PERIOD_NS)
     stall_ns = round(ERROR_PERIODS * PERIOD_NS) + 1
     assert group.grade() == "good"
-
-    def run(due_ns: int, took_ns: int) -> str:
+    for due_ns, took_ns, grade in (
+        (0, PERIOD_NS, "good"),
+        (PERIOD_NS, PERIOD_NS + 1, "warning"),
+        (2 * PERIOD_NS, stall_ns - 1, "warning"),
+        (3 * PERIOD_NS, stall_ns, "error"),
+        (4 * PERIOD_NS, 0, "error"),
+        # forgotten one to two horizons later, while the counters stay
+        (HORIZON_NS + PERIOD_NS, 0, "error"),
+        (2 * HORIZON_NS + 2 * PERIOD_NS, 0, "good"),
+    ):
         group.record(due_ns, due_ns, due_ns + took_ns)
-        return group.grade()
-
-    assert run(0, PERIOD_NS) == "good"
-    assert run(PERIOD_NS, PERIOD_NS + 1) == "warning"
-    assert run(2 * PERIOD_NS, stall_ns - 1) == "warning"
-    assert run(3 * PERIOD_NS, stall_ns) == "error"
-    assert run(4 * PERIOD_NS, 0) == "error"
-    # forgotten one to two horizons later, while the counters stay
-    assert run(HORIZON_NS + PERIOD_NS, 0) == "error"
-    assert run(2 * HORIZON_NS + 2 * PERIOD_NS, 0) == "good"
+        assert group.grade() == grade, due_ns
     assert (group.overruns, group.stalls) == (3, 1)
     group.refresh()
     assert (group.report.grade, group.report.stalls) == ("good", 1)

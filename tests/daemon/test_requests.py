@@ -12,18 +12,13 @@ def waiting(client: str, number: int = 0, opens: int = 0) -> Waiting:
 
 
 def taken(requests: Requests) -> list[str]:
-    order = []
-    while (each := requests.next()) is not None:
-        order.append(f"{each.envelope[0].decode()}{each.data.decode()}")
-    return order
+    return [f"{each.envelope[0].decode()}{each.data.decode()}" for each in iter(requests.next, None)]
 
 
 def test_every_client_has_its_turn_and_each_keeps_its_order() -> None:
     requests = Requests()
-    for number in range(3):
-        assert requests.put(waiting("a", number))
-    assert requests.put(waiting("b"))
-    assert requests.put(waiting("c"))
+    asked = [waiting("a", 0), waiting("a", 1), waiting("a", 2), waiting("b"), waiting("c")]
+    assert all(requests.put(each) for each in asked)
     assert taken(requests) == ["a0", "b0", "c0", "a1", "a2"]
     assert requests.next() is None
 
@@ -67,8 +62,7 @@ def test_a_peer_may_send_a_burst_and_then_its_rate() -> None:
 
 def test_more_peers_than_are_kept_apart_cost_the_one_that_was_silent_longest() -> None:
     allowance = Allowance(1.0, 1.0)
-    for number in range(PEERS):
-        assert allowance.grants(f"p{number}", float(number) * 1e-3)
+    assert all(allowance.grants(f"p{number}", float(number) * 1e-3) for number in range(PEERS))
     assert not allowance.grants("p0", 0.5)
     assert allowance.grants("new", 0.6)
     assert not allowance.grants("p0", 0.6)

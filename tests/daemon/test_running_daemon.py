@@ -247,13 +247,26 @@ def running(clock: Clock, core: Core, tmp_path: Path) -> Iterator[Running]:
         made.end()
 
 
+@pytest.fixture
+def alone(running: Running) -> Running:
+    """One that has no device."""
+    running.start(is_plugged_in=False)
+    return running
+
+
+@pytest.fixture
+def armed(running: Running) -> Running:
+    running.start()
+    running.arm()
+    return running
+
+
 # -- without a device ----------------------------------------------------------------------------------------------
 
 
-def test_stop_without_a_device_says_that_there_is_none(running: Running) -> None:
-    running.start(is_plugged_in=False)
-    assert running.command("stop") == {"operating_state": "FAULT", "is_connected": False}
-    status = running.command("status")
+def test_stop_without_a_device_says_that_there_is_none(alone: Running) -> None:
+    assert alone.command("stop") == {"operating_state": "FAULT", "is_connected": False}
+    status = alone.command("status")
     assert (status["faults"], status["governed_cf"], status["is_busy"]) == (["STOPPED"], None, False)
     assert status["build"] == str(settle())
 
@@ -267,42 +280,38 @@ def test_requests_are_answered_with_the_newest_snapshot_however_few_ticks_it_sta
     assert numbers == sorted(set(numbers))  # one answer in a period
 
 
-def test_a_daemon_describes_what_it_runs(running: Running) -> None:
-    running.start(is_plugged_in=False)
-    described = msgspec.convert(running.command("describe"), Description)
-    assert described.scene["name"] == running.core.scene.name
+def test_a_daemon_describes_what_it_runs(alone: Running) -> None:
+    described = msgspec.convert(alone.command("describe"), Description)
+    assert described.scene["name"] == alone.core.scene.name
     assert described.configuration["realtime"]["watchdog_ms"] == WATCHDOG_MS
-    assert (described.model, described.build) == (running.core.model, str(settle()))
+    assert (described.model, described.build) == (alone.core.model, str(settle()))
     assert (described.firmware, described.serial_number) == (None, None)
     # a device that has shown nothing yet is the model, at the gap speed of the configuration
-    shown, told = running.core.portrait, described.portrait
-    assert told is not None
+    shown, told = alone.core.portrait, described.portrait
     assert told.force_N == pytest.approx(shown.force_N[::5], abs=1e-4)
     speed_mm_s = described.configuration["position"]["gap_speed_mm_s"]
     assert told.rate_N_s == pytest.approx([shown.force_rate_N_s(f, speed_mm_s) for f in shown.force_N[::5]], abs=1e-4)
 
 
 @pytest.mark.parametrize("error", [DomainError("displacement_mm", 1e10, "less"), TypeError("nobody expects this")])
-def test_a_daemon_that_cannot_plan_can_be_seen_and_stopped(running: Running, error: Exception) -> None:
-    running.start(is_plugged_in=False)
-    running.tick()
-    running.planner.error = error
-    running.tick(100)
-    assert ("PLAN_FAILED" in running.command("status")["faults"]) == isinstance(error, DomainError)
-    running.command("stop")
-    assert "STOPPED" in running.command("status")["faults"]
+def test_a_daemon_that_cannot_plan_can_be_seen_and_stopped(alone: Running, error: Exception) -> None:
+    alone.tick()
+    alone.planner.error = error
+    alone.tick(100)
+    assert ("PLAN_FAILED" in alone.command("status")["faults"]) == isinstance(error, DomainError)
+    alone.command("stop")
+    assert "STOPPED" in alone.command("status")["faults"]
 
 
-def test_the_watchdog_is_fed_while_plans_are_fresh(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_watchdog_is_fed_while_plans_are_fresh(alone: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     notified: list[str] = []
     monkeypatch.setattr(notify, "notify", notified.append)
-    running.start(is_plugged_in=False)
-    running.tick(100)
+    alone.tick(100)
     assert "WATCHDOG=1" in notified
-    running.planner.error = TypeError("nobody expects this")
-    running.tick(round(2 * WATCHDOG_MS))
+    alone.planner.error = TypeError("nobody expects this")
+    alone.tick(round(2 * WATCHDOG_MS))
     notified.clear()
-    running.tick(100)
+    alone.tick(100)
     assert notified == []
 
 
@@ -326,11 +335,10 @@ def test_a_slow_start_is_graded_as_a_fast_one(running: Running, caplog: pytest.L
 
 
 def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
-    running: Running, caplog: pytest.LogCaptureFixture
+    alone: Running, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Length and culprit are those of the stall that did it, whatever stalls come after."""
-    running.start(is_plugged_in=False)
-    control, causes = running.daemon._control, running.daemon._causes
+    control, causes = alone.daemon._control, alone.daemon._causes
 
     def stall(now_s: float, took_s: float, culprit: str) -> None:
         stepper, sight = control.stepper, control.stepper.measure.sight
@@ -358,69 +366,62 @@ def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
 # -- with a device -------------------------------------------------------------------------------------------------
 
 
-def test_force_follows_the_setpoint_and_what_holds_it_back_is_said(running: Running) -> None:
-    running.start()
-    running.arm()
+def test_force_follows_the_setpoint_and_what_holds_it_back_is_said(armed: Running) -> None:
     for force_N in (1.0, 1.6):
-        running.ask(force_N)
-        status = running.until(lambda status, asked=force_N: abs(status["measured_cf"] - asked) < 0.06, f"{force_N} N")  # type: ignore[misc]
+        armed.ask(force_N)
+        status = armed.until(lambda status, asked=force_N: abs(status["measured_cf"] - asked) < 0.06, f"{force_N} N")  # type: ignore[misc]
     assert (status["operating_state"], status["setpoint_cf"]) == ("ENABLED", 1.6)
     assert abs(status["skew_mm"]) < 0.05
-    running.ask(0.1)
-    status = running.until(lambda status: abs(status["governed_cf"] - status["least_N"]) < 5e-3, "the least force")
+    armed.ask(0.1)
+    status = armed.until(lambda status: abs(status["governed_cf"] - status["least_N"]) < 5e-3, "the least force")
     assert "F_MIN" in status["limits"]
     assert {"code": "F_MIN", "remedy": LIMITS[Limit.F_MIN].remedy}.items() <= status["limit_details"][0].items()
-    running.ask(1.5)
-    running.until(lambda status: status["governed_cf"] == 1.5, "governed")
-    running.ask(1.5, valid_for_ms=50.0)
-    running.until(lambda status: "STALE" in status["limits"], "STALE shown")
-    status = running.until(lambda status: status["governed_cf"] < status["least_N"] + 0.01, "decayed")
+    armed.ask(1.5)
+    armed.until(lambda status: status["governed_cf"] == 1.5, "governed")
+    armed.ask(1.5, valid_for_ms=50.0)
+    armed.until(lambda status: "STALE" in status["limits"], "STALE shown")
+    status = armed.until(lambda status: status["governed_cf"] < status["least_N"] + 0.01, "decayed")
     assert status["operating_state"] == "ENABLED"
 
 
-def test_what_may_not_be_done_yet_is_refused_and_stop_opens_and_latches(running: Running) -> None:
-    running.start()
-    running.arm()
-    running.command("disable")
-    running.until(lambda status: not status["is_busy"], "open")
-    home, enable, look = (running.client.ask(name) for name in ("home", "enable", "status"))
-    assert running.answer(home)
+def test_what_may_not_be_done_yet_is_refused_and_stop_opens_and_latches(armed: Running) -> None:
+    armed.command("disable")
+    armed.until(lambda status: not status["is_busy"], "open")
+    home, enable, look = (armed.client.ask(name) for name in ("home", "enable", "status"))
+    assert armed.answer(home)
     with pytest.raises(RefusedError, match="homing"):
-        running.answer(enable)
-    assert running.answer(look)["is_busy"]
-    status = running.until(lambda status: status["is_homed"] and not status["is_busy"], "homed")
+        armed.answer(enable)
+    assert armed.answer(look)["is_busy"]
+    status = armed.until(lambda status: status["is_homed"] and not status["is_busy"], "homed")
     assert status["faults"] == []
-    running.ask(1.5)
-    assert running.refused("enable") == "not_neutral"
-    running.ask(0.5)
-    running.command("enable")
-    running.ask(1.5)
-    running.until(lambda status: status["gap_mm"] < 72.0, "closing")
-    running.command("stop")
-    status = running.until(lambda status: status["gap_mm"] > 94.0 and not status["is_busy"], "open")
+    armed.ask(1.5)
+    assert armed.refused("enable") == "not_neutral"
+    armed.ask(0.5)
+    armed.command("enable")
+    armed.ask(1.5)
+    armed.until(lambda status: status["gap_mm"] < 72.0, "closing")
+    armed.command("stop")
+    status = armed.until(lambda status: status["gap_mm"] > 94.0 and not status["is_busy"], "open")
     assert (status["operating_state"], status["fault_details"][0]["code"]) == ("FAULT", "STOPPED")
-    running.command("clear-fault")
-    assert running.command("status")["operating_state"] == "DISABLED"
+    armed.command("clear-fault")
+    assert armed.command("status")["operating_state"] == "DISABLED"
 
 
-def test_a_second_publisher_is_refused_and_named_until_it_is_given_the_brake(running: Running) -> None:
-    running.start()
-    console = running.publisher("console")
-    running.arm()
-    running.ask(0.9)
-    running.until(lambda status: abs(status["measured_cf"] - 0.9) < 0.06, "0.9 N")
-    running.ask(1.6, by=console)
-    running.ask(0.9)
-    status = running.until(lambda status: "OTHER_SOURCE" in status["limits"], "the other one is named")
+def test_a_second_publisher_is_refused_and_named_until_it_is_given_the_brake(armed: Running) -> None:
+    console = armed.publisher("console")
+    armed.ask(0.9)
+    armed.until(lambda status: abs(status["measured_cf"] - 0.9) < 0.06, "0.9 N")
+    armed.ask(1.6, by=console)
+    armed.ask(0.9)
+    status = armed.until(lambda status: "OTHER_SOURCE" in status["limits"], "the other one is named")
     told = {each["code"]: each for each in status["limit_details"]}["OTHER_SOURCE"]
     assert told["cause"] == "'console' sends setpoints too, and 'test' holds the brake"
     assert told["remedy"].endswith("tormagctl take console")
     assert status["setpoint_cf"] == 0.9
-    assert running.refused("take") == "bad_source"
-    assert running.refused("take", source="nobody") == "unknown_source"
-    assert running.command("take", source="console") == {"source": "console", "instead_of": "test"}
+    assert (armed.refused("take"), armed.refused("take", source="nobody")) == ("bad_source", "unknown_source")
+    assert armed.command("take", source="console") == {"source": "console", "instead_of": "test"}
     governed_N: list[float] = []
-    status = running.until(
+    status = armed.until(
         lambda status: governed_N.append(status["governed_cf"]) or governed_N[-1] == 1.6,  # type: ignore[func-returns-value]
         "the ramp ends at 1.6 N",
     )
@@ -429,19 +430,17 @@ def test_a_second_publisher_is_refused_and_named_until_it_is_given_the_brake(run
     assert status["setpoints"]["by_source"]["test"]["state"] == "refused"
 
 
-def test_a_device_that_is_unplugged_in_motion_comes_back_without_re_arming(running: Running) -> None:
-    running.start()
-    running.arm()
-    running.ask(1.5)
-    running.until(lambda status: status["gap_mm"] < 85.0, "closing")
-    running.port.is_plugged_in = False
-    status = running.until(lambda status: "LINK_LOST" in status["faults"], "the loss is named")
+def test_a_device_that_is_unplugged_in_motion_comes_back_without_re_arming(armed: Running) -> None:
+    armed.ask(1.5)
+    armed.until(lambda status: status["gap_mm"] < 85.0, "closing")
+    armed.port.is_plugged_in = False
+    status = armed.until(lambda status: "LINK_LOST" in status["faults"], "the loss is named")
     assert (status["link"]["cause"], status["link"]["remedy"]) == ("no such port", "plug it in")
-    running.tick(500)
-    running.port.is_plugged_in = True
-    status = running.until(lambda status: status["link"]["state"] == "RUNNING" and not status["is_busy"], "back, open")
+    armed.tick(500)
+    armed.port.is_plugged_in = True
+    status = armed.until(lambda status: status["link"]["state"] == "RUNNING" and not status["is_busy"], "back, open")
     assert status["operating_state"] == "FAULT"
-    running.command("clear-fault")
-    assert running.command("status")["operating_state"] == "DISABLED"
-    running.ask(0.5)
-    running.arm()
+    armed.command("clear-fault")
+    assert armed.command("status")["operating_state"] == "DISABLED"
+    armed.ask(0.5)
+    armed.arm()

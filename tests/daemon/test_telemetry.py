@@ -80,8 +80,9 @@ def test_a_driven_device() -> None:
 
 
 def test_positions_before_homing_are_not_known() -> None:
-    lost = MEASUREMENT.replaced(switches=Switches(0), mode=DeviceMode.HOMING)
-    published = telemetry(lost, SafetyState(), is_busy=True)
+    published = telemetry(
+        MEASUREMENT.replaced(switches=Switches(0), mode=DeviceMode.HOMING), SafetyState(), is_busy=True
+    )
     assert (published.gap_mm, published.measured_jp, published.skew_mm, published.gap_setpoint_mm) == (None,) * 4
     assert (published.is_homed, published.is_busy, published.measured_cf) == (False, True, 1.39)
 
@@ -138,7 +139,6 @@ def test_a_tick_is_recorded_whole() -> None:
     stepper = stepped(safety, measurement, 1.5)
     stepper.move.reference = Reference(64.2)
     measured = stepper.measured
-    assert measured is not None
     output = Duty(DriveMode.RUN, 0.1, -0.2, DeviceRequest.HOME, 5, (Limit.RATE,))
     tick = tick_record(stepper, output, plan, measurement, 20.0, 150.0, 9)
     sent = msgspec.msgpack.decode(encode_ticks([tick]))

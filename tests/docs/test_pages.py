@@ -125,8 +125,7 @@ def test_every_command_in_a_line_has_the_options_that_are_named(page):
             require_there(words)
             continue
         parser, arguments = found
-        options = {word for word in arguments if word.startswith("--")}
-        assert options <= known_options(parser), words
+        assert {word for word in arguments if word.startswith("--")} <= known_options(parser), words
         if words[0] == "tormagctl" and arguments and not arguments[0].startswith("--"):
             (subparsers,) = (each for each in parser._actions if isinstance(each, argparse._SubParsersAction))
             assert arguments[0] in subparsers.choices, words

@@ -64,8 +64,7 @@ class Rig:
         command = [sys.executable, "-m", "tormagd.simulation", "--pty", "--seed", "1", "--truth", str(self.truth_path)]
         self.simulator = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         with contextlib.suppress(OSError):  # where it is allowed: a device does not wait for the host's processors
-            policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
-            os.sched_setscheduler(self.simulator.pid, policy, os.sched_param(40))
+            os.sched_setscheduler(self.simulator.pid, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(40))
 
     def _plug_in(self) -> None:
         """A symbolic link to the simulator's line stands for the stable name that udev gives a real one."""

@@ -133,8 +133,7 @@ def test_the_black_box_of_a_fault_is_run_again_bit_for_bit(rig):
     box = rig.status()["black_box"]
     path = rig.folder / "boxes" / box["newest"]
     command = [sys.executable, "-m", "tormagd.replay", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120.0)
-    result = json.loads(done.stdout)
+    result = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=120.0).stdout)
     assert (result["reason"], result["differences"]) == ("STOPPED", [])
     assert result["rerun"]["difference"] is None
     assert result["rerun"]["frames"] > 2 * result["rerun"]["ticks"] > 2_000

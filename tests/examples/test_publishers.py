@@ -32,8 +32,10 @@ def cpp(tmp_path_factory):
     if found.returncode:
         pytest.skip("no headers: apt install libzmq3-dev cppzmq-dev libmsgpack-cxx-dev")
     made = tmp_path_factory.mktemp("cpp") / "publish"
-    source = EXAMPLES / "cpp" / "publish.cpp"
-    subprocess.run(["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", source, "-lzmq", "-o", made], check=True)
+    subprocess.run(
+        ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", EXAMPLES / "cpp" / "publish.cpp", "-lzmq", "-o", made],
+        check=True,
+    )
     return [str(made)]
 
 

@@ -37,8 +37,14 @@ def exchange(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Excha
     program: Path = build(Target.SANITIZED_EXCHANGE)
 
     def ask(requests: list[str]) -> list[str]:
-        text = "".join(f"{request}\n" for request in requests)
-        result = subprocess.run([program], input=text, capture_output=True, text=True, timeout=60, check=False)
+        result = subprocess.run(
+            [program],
+            input="".join(f"{request}\n" for request in requests),
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
         assert result.returncode == 0, result.stderr
         answers = result.stdout.splitlines()
         assert len(answers) == len(requests)

@@ -54,9 +54,8 @@ class Carriages:
         self.mend()
 
     def mend(self) -> None:
-        self.supply_V, self.temperature_C, self.drift_mm_s = 12.0, 25.0, 0.0
+        self.supply_V, self.temperature_C, self.drift_mm_s, self.held = 12.0, 25.0, 0.0, False
         self.current_A: float | None = None
-        self.held = False
         self.blind: int | None = None
 
     def move(self, output: Output, dt_s: float) -> None:
@@ -66,11 +65,12 @@ class Carriages:
             self.positions_mm[side] = min(max(position_mm, CLOSED_MM - 0.25), HOME_MM + 0.5)
 
     def sensors(self, output: Output) -> Sensors:
-        left_mm, right_mm = self.positions_mm
         switches = Switches(0)
-        for position_mm, opened, closed in (
-            (left_mm, Switches.LEFT_OPEN, Switches.LEFT_CLOSED),
-            (right_mm, Switches.RIGHT_OPEN, Switches.RIGHT_CLOSED),
+        for position_mm, opened, closed in zip(
+            self.positions_mm,
+            (Switches.LEFT_OPEN, Switches.RIGHT_OPEN),
+            (Switches.LEFT_CLOSED, Switches.RIGHT_CLOSED),
+            strict=True,
         ):
             switches |= opened if position_mm >= HOME_MM else closed if position_mm <= CLOSED_MM else Switches(0)
         counts = [
@@ -155,9 +155,7 @@ class Bench:
     def __init__(self, left_mm: float = 46.8, right_mm: float = 46.5) -> None:
         self.twins = Twins()
         self.carriages = Carriages(left_mm, right_mm)
-        self.time_s = 0.0
-        self.counter = 0
-        self.nonce = 0
+        self.time_s, self.counter, self.nonce = 0.0, 0, 0
 
     @property
     def sensors(self) -> Sensors:
@@ -261,8 +259,7 @@ def life(bench: Bench, generator: random.Random) -> Iterator[str]:
 def test_twins_agree_step_by_step_whatever_happens(
     seed: random.Random, left_mm: float, skew_mm: float, happenings: int
 ) -> None:
-    for _name in islice(life(Bench(left_mm, left_mm + skew_mm), seed), happenings):
-        pass
+    list(islice(life(Bench(left_mm, left_mm + skew_mm), seed), happenings))
 
 
 COUNTS = st.integers(-(2**31), 2**31 - 1) | st.sampled_from([32767, 32768, -32768, -32769, 65535])
@@ -312,11 +309,11 @@ def test_twins_agree_on_sensors_that_no_device_could_have(steps: list[tuple[str,
         twins.measurement(time_s, sensors)
 
 
-def told_life() -> Twins:
+@pytest.fixture(scope="module")
+def told() -> Twins:
     """One life that leads through every mode and every fault, then at random."""
     bench = Bench()
     carriages = bench.carriages
-
     bench.home()
     bench.drive(-0.5, -0.5, count=200)
     bench.tick(400)  # silence: COMMAND_TIMEOUT
@@ -367,14 +364,8 @@ def told_life() -> Twins:
     bench.command(Retract)
     bench.drive(-0.7, -0.7, count=1200)  # not obeyed before it has let go
     assert bench.twins.mode is DeviceMode.IDLE
-    for _name in islice(life(bench, random.Random(20240515)), 60):
-        pass
+    list(islice(life(bench, random.Random(20240515)), 60))
     return bench.twins
-
-
-@pytest.fixture(scope="module")
-def told() -> Twins:
-    return told_life()
 
 
 def test_one_life_leads_through_every_mode_and_fault(told: Twins) -> None:
@@ -442,11 +433,9 @@ def test_the_twins_agree_in_the_simulated_device(
         for message in messages:
             device.receive(tick * 1e-3, FUNCTION[type(message)], encode(message))
         device.advance((tick + 1) * 1e-3)
-        for packet in device.outbox:
-            message = decode(packet.function, packet.payload)
-            senses += isinstance(message, Sense)
-            if isinstance(message, State):
-                position_mm = message.left_position_mm
+        said = [decode(packet.function, packet.payload) for packet in device.outbox]
+        senses += sum(isinstance(message, Sense) for message in said)
+        position_mm = next((each.left_position_mm for each in said if isinstance(each, State)), position_mm)
         device.outbox.clear()
     assert latched in device.firmware.faults
     assert senses > 0.98 * ticks

@@ -1,5 +1,6 @@
 """The codec against cantools, against its own inverse, and against what must not pass."""
 
+import contextlib
 import math
 import random
 import struct
@@ -68,10 +69,10 @@ def cantools_payload(message: Message) -> bytes:
     """The same message packed by cantools, with a CRC computed bit by bit."""
     definition = DATABASE.get_message_by_name(type(message).__name__)
     values = values_of(message)
-    if isinstance(message, Drive | State):
-        body = bytes(definition.encode(values | {"crc": 0}, strict=True))[:-1]
-        return body + bytes([bitwise_crc8(bytes([FUNCTION[type(message)]]) + body)])
-    return bytes(definition.encode(values, strict=True))
+    if not isinstance(message, Drive | State):
+        return bytes(definition.encode(values, strict=True))
+    body = bytes(definition.encode(values | {"crc": 0}, strict=True))[:-1]
+    return body + bytes([bitwise_crc8(bytes([FUNCTION[type(message)]]) + body)])
 
 
 @by_name
@@ -90,9 +91,8 @@ def test_bytes_and_values_are_those_of_cantools_in_bulk(layout: Layout) -> None:
 
 
 def test_crc8_is_sae_j1850() -> None:
-    assert crc8(b"123456789") == 0x4B
+    assert crc8(b"123456789") == bitwise_crc8(b"123456789") == 0x4B
     assert crc8(b"") == 0
-    assert bitwise_crc8(b"123456789") == 0x4B
     payload = encode(STATE)
     assert payload[-1] != crc8(bytes([FUNCTION[Drive]]) + payload[:-1]), "it covers the function"
 
@@ -207,8 +207,9 @@ def test_a_step_is_python_s_round_of_the_quotient(layout: Layout, data: st.DataO
     signal = data.draw(st.sampled_from(quantities))
     if data.draw(st.booleans()):
         value = (data.draw(st.integers(2 * signal.lowest - 3, 2 * signal.highest + 3)) / 2.0) * signal.scale
-    neutral = layout.message(*(0.0 if s.type is float else s.type(0) for s in layout.signals))
-    message = neutral.replaced(**{signal.name: value})
+    message = layout.message(*(0.0 if s.type is float else s.type(0) for s in layout.signals)).replaced(
+        **{signal.name: value}
+    )
     step = round(value / signal.scale) if math.isfinite(value / signal.scale) else None
     if step is not None and signal.wraps:
         step = (step - signal.lowest) % (signal.highest - signal.lowest + 1) + signal.lowest
@@ -216,8 +217,7 @@ def test_a_step_is_python_s_round_of_the_quotient(layout: Layout, data: st.DataO
         with pytest.raises(EncodeError, match=signal.name):
             encode(message)
         return
-    packed = struct.unpack(layout.format, encode(message))
-    assert packed[layout.signals.index(signal)] == step
+    assert struct.unpack(layout.format, encode(message))[layout.signals.index(signal)] == step
 
 
 @pytest.mark.parametrize("power", [15, 16, 31, 50, 51, 52, 53, 60, 900])
@@ -238,9 +238,11 @@ def test_something_else_is_not_a_message() -> None:
 
 
 def test_periods() -> None:
-    assert period(State, "left_position_mm") == pytest.approx(65536 * 8 / 4480)
-    assert period(State, "device_time_s") == pytest.approx(0.65536)
-    assert period(Sense, "handle_position_mm") == pytest.approx(4 * 2 * math.pi * 20)
+    assert (
+        period(State, "left_position_mm"),
+        period(State, "device_time_s"),
+        period(Sense, "handle_position_mm"),
+    ) == pytest.approx((65536 * 8 / 4480, 0.65536, 4 * 2 * math.pi * 20))
     with pytest.raises(KeyError):
         period(Sense, "force_N")
 
@@ -249,12 +251,8 @@ def test_numbers_of_numpy_s_are_numbers() -> None:
     """Compiled, a message takes whole numbers of Python's only."""
     drive = Drive(np.float64(0.5), np.float32(-0.25), DriveMode.RUN, 7)  # type: ignore[arg-type]
     assert encode(drive) == encode(DRIVE)
-    changes: dict[str, Any] = {"counter": np.uint8(7)}
-    if IS_COMPILED:
-        with pytest.raises(TypeError, match="int object expected"):
-            DRIVE.replaced(**changes)
-    else:
-        assert encode(DRIVE.replaced(**changes)) == encode(DRIVE)
+    with pytest.raises(TypeError, match="int object expected") if IS_COMPILED else contextlib.nullcontext():
+        assert encode(DRIVE.replaced(counter=np.uint8(7))) == encode(DRIVE)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Frames over streams that are whole, cut, damaged, repeated and endless."""
 
+import contextlib
 import pickle
 import random
 from binascii import crc_hqx
@@ -43,10 +44,9 @@ def test_cobs_is_the_cobs_of_the_reference(data: bytes) -> None:
 
 @given(st.binary(min_size=1, max_size=20).map(lambda data: data.replace(b"\0", b"\1")))
 def test_cobs_refuses_what_the_reference_refuses(data: bytes) -> None:
-    try:
+    expected = None
+    with contextlib.suppress(cobs.DecodeError):
         expected = cobs.decode(data)
-    except cobs.DecodeError:
-        expected = None
     assert cobs_decode(data) == expected
 
 
@@ -63,8 +63,7 @@ def test_a_crc_carried_on_over_itself_leaves_the_residue(data: bytes) -> None:
 @given(frames)
 def test_a_frame_comes_back(frame: Frame) -> None:
     encoded = wire(frame)
-    assert encoded.count(0) == 1
-    assert encoded.endswith(b"\0")
+    assert encoded.index(0) == len(encoded) - 1
     assert len(encoded) == len(frame.payload) + 6 <= MAX_ENCODED + 1
     assert FrameDecoder().feed(encoded) == [frame]
 
@@ -84,8 +83,7 @@ def test_how_a_stream_is_cut_makes_no_difference(pieces: list[bytes], data: st.D
     whole, cut = FrameDecoder(), FrameDecoder()
     expected = whole.feed(stream)
     bounds = [0, *cuts, len(stream)]
-    received = [frame for a, b in pairwise(bounds) for frame in cut.feed(stream[a:b])]
-    assert received == expected
+    assert [frame for a, b in pairwise(bounds) for frame in cut.feed(stream[a:b])] == expected
     assert cut.statistics == whole.statistics
 
 
@@ -104,8 +102,7 @@ def test_a_cut_frame_is_not_a_frame(frame: Frame, data: st.DataObject) -> None:
     decoder = FrameDecoder()
     following = Frame(frame.function, (frame.sequence + 1) % 256, b"after")
     assert decoder.feed(cut + b"\0" + wire(following)) == [following]
-    assert decoder.statistics.corrupt == 1
-    assert decoder.statistics.resynchronisations == 1
+    assert (decoder.statistics.corrupt, decoder.statistics.resynchronisations) == (1, 1)
 
 
 @given(frames, st.data())
@@ -149,8 +146,8 @@ def test_a_byte_more_or_less_at_the_end_is_found(frame: Frame, more: int) -> Non
     """Zeros above all, which a CRC without a final XOR does not see."""
     checked = cobs.decode(wire(frame)[:-1])
     decoder = FrameDecoder()
-    for damaged in (checked + bytes((more,)), checked + b"\0", checked + bytes(3), checked[:-1]):
-        assert decoder.feed(cobs.encode(damaged) + b"\0") == []
+    damaged = (checked + bytes((more,)), checked + b"\0", checked + bytes(3), checked[:-1])
+    assert decoder.feed(b"".join(cobs.encode(data) + b"\0" for data in damaged)) == []
     assert decoder.statistics.corrupt == 4
 
 
@@ -161,8 +158,9 @@ def test_the_longest_frame_passes_and_a_longer_stretch_does_not(excess: int) -> 
     encoded = cobs.encode(body + bitwise_crc16(body).to_bytes(2, "big")) + b"\0"
     for size in (1, 5, 200):
         decoder = FrameDecoder()
-        received = [f for i in range(0, len(encoded), size) for f in decoder.feed(encoded[i : i + size])]
-        assert received == ([Frame(1, 2, bytes(8))] if excess == 0 else [])
+        assert [f for i in range(0, len(encoded), size) for f in decoder.feed(encoded[i : i + size])] == (
+            [Frame(1, 2, bytes(8))] if excess == 0 else []
+        )
         assert decoder.statistics.corrupt == (excess > 0)
 
 

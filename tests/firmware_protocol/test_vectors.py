@@ -73,8 +73,9 @@ def test_valid_frames_in_both_directions() -> None:
 @pytest.mark.parametrize("vector", FRAMES["streams"], ids=lambda vector: vector["name"])
 def test_streams_give_the_frames_and_counts_written_down(vector: dict[str, Any]) -> None:
     decoder = FrameDecoder()
-    received = decoder.feed(bytes.fromhex(vector["bytes"]))
-    assert received == [Frame(f["function"], f["sequence"], bytes.fromhex(f["payload"])) for f in vector["frames"]]
+    assert decoder.feed(bytes.fromhex(vector["bytes"])) == [
+        Frame(f["function"], f["sequence"], bytes.fromhex(f["payload"])) for f in vector["frames"]
+    ]
     assert decoder.statistics == FramingStatistics(**vector["statistics"])
 
 
@@ -94,8 +95,7 @@ def test_the_examples_of_the_readme_are_true() -> None:
     for (line, rows), (sequence, message) in zip(examples, shown, strict=True):
         assert bytes.fromhex(line) == encode_frame(FUNCTION[type(message)], sequence, encode(message))
         assert f"function {FUNCTION[type(message)]}, {type(message).__name__} |" in rows
-        annotated = re.findall(r"^\| `([0-9a-f ]+)` \|", rows, re.MULTILINE)
-        assert " ".join(annotated) == line
+        assert " ".join(re.findall(r"^\| `([0-9a-f ]+)` \|", rows, re.MULTILINE)) == line
 
 
 def test_the_crcs_of_the_readmes_examples_are_over_what_it_says() -> None:
@@ -113,14 +113,12 @@ def test_the_readme_says_which_way_round_the_schema_hash_is() -> None:
 
 def test_the_readmes_timing_is_what_the_codecs_frames_take() -> None:
     """At 1 Mbaud a byte takes 10 us, at 1 Mbit/s a bit takes 1."""
-    for message, said in (
-        (Drive(0.0, 0.0, DriveMode.OFF, 1), "Drive on its way"),
-        (State(0, 0, 0, 1), "State on its way"),
-    ):
+    for message in (Drive(0.0, 0.0, DriveMode.OFF, 1), State(0, 0, 0, 1)):
         payload = encode(message)
         serial_ms = 0.01 * len(encode_frame(FUNCTION[type(message)], 0, payload))
         # ISO 11898-1 with the most stuffing: a bit for every four after the first of the 34 + 8 n that are stuffed
         can_ms = 0.001 * (47 + 8 * len(payload) + (34 + 8 * len(payload) - 1) // 4)
+        said = f"{type(message).__name__} on its way"
         assert f"| {said} | {serial_ms:.2f} ms serial, at most {math.ceil(100 * can_ms) / 100:.2f} ms CAN |" in PAGE
 
 

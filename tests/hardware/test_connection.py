@@ -102,10 +102,10 @@ class Port:
             assert bench.asked_of == bench.losses, "a command that the last device was given moves no other"
         if self.is_dead:
             raise BackendError("/dev/tormag: writing failed")
-        if self.bench.is_bus_off:
+        if bench.is_bus_off:
             raise BackendError("can0: bus-off", "look at the termination")
-        self.bench.sent.append(type(message))
-        if not self.bench.is_mute:
+        bench.sent.append(type(message))
+        if not bench.is_mute:
             self.waiting.extend(bench.firmware.answers(message, bench.identity))
 
     def close(self) -> None:
@@ -280,16 +280,14 @@ def test_a_host_that_was_not_run_does_not_take_its_own_sleep_for_the_devices(ben
     bench.running().pass_ms(500, is_stalled=True)
     bench.ms += 1
     bench.connection.exchange(0.0, 0.0, DriveMode.OFF, bench.request, bench.number)
-    assert bench.connection.state is LinkState.RUNNING
-    assert bench.losses == 0
+    assert (bench.connection.state, bench.losses) == (LinkState.RUNNING, 0)
 
 
 def test_a_device_whose_first_word_is_who_it_is_runs_at_once(bench: Bench) -> None:
     bench.is_mute = True
     bench.connection.open(bench)
     bench.pass_ms(1_100)
-    bench.is_mute = False
-    bench.has_status = False
+    bench.is_mute = bench.has_status = False
     bench.pass_ms(1_000)
     assert bench.seen == [LinkState.CLOSED, LinkState.IDENTIFYING, LinkState.UNANSWERED, LinkState.RUNNING]
 
@@ -311,8 +309,7 @@ def test_waiting_grows_to_a_second_and_starts_anew_with_the_next_device(bench: B
 
 def test_opening_the_gap_waits_for_a_device_that_went_before_it_had_heard(bench: Bench) -> None:
     bench.running()
-    bench.is_armed = False
-    bench.is_mute = True
+    bench.is_armed, bench.is_mute = False, True
     bench.ask(DeviceRequest.RETRACT)
     bench.pass_ms(20)
     assert Retract in bench.sent
@@ -344,8 +341,8 @@ def test_what_is_not_known_is_reported_as_such(bench: Bench) -> None:
     assert (before.state, before.frames, before.round_trip_us, before.clock) == ("CLOSED", None, None, None)
     bench.running().pass_ms(4_000)
     after = bench.connection.report()
-    assert msgspec.msgpack.decode(msgspec.msgpack.encode(before), type=LinkReport) == before, "it travels"
-    assert msgspec.msgpack.decode(msgspec.msgpack.encode(after), type=LinkReport) == after, "it travels"
+    for report in (before, after):
+        assert msgspec.msgpack.decode(msgspec.msgpack.encode(report), type=LinkReport) == report, "it travels"
     assert (after.firmware, after.serial_number, after.daemon_schema) == ("1.0", 7, f"{SCHEMA_HASH:08x}")
     assert after.round_trip_us.p50 == pytest.approx(1_000.0)
     assert abs(after.clock.drift_ppm) < 1.0
@@ -402,24 +399,23 @@ class Cables(RuleBasedStateMachine):
     @invariant()
     def a_state_says_why_and_what_to_do(self) -> None:
         connection = self.bench.connection
-        is_running = connection.state is LinkState.RUNNING
+        state = connection.state
         assert bool(connection.cause) == (connection.measurement is None)
-        is_asking = connection.state is LinkState.IDENTIFYING
-        assert bool(connection.remedy) == (bool(connection.cause) and not is_asking)
-        assert is_running or connection.measurement is None
+        assert bool(connection.remedy) == (bool(connection.cause) and state is not LinkState.IDENTIFYING)
+        assert state is LinkState.RUNNING or connection.measurement is None
 
     @invariant()
     def one_port_is_open_at_most_and_watched(self) -> None:
         still_open = [port.fd for port in self.bench.ports if not port.is_closed]
         assert len(still_open) <= 1
         assert list(self.bench.readers) == still_open
-        waits = self.bench.connection.state in (LinkState.BACK_OFF, LinkState.LOST)
-        assert waits == (not still_open)
+        assert (self.bench.connection.state in (LinkState.BACK_OFF, LinkState.LOST)) == (not still_open)
 
     @invariant()
     def ports_are_not_opened_in_a_hurry(self) -> None:
-        attempts_s = self.bench.attempts_s
-        assert all(after - before >= FIRST_BACK_OFF_S - 1e-9 for before, after in itertools.pairwise(attempts_s))
+        assert all(
+            after - before >= FIRST_BACK_OFF_S - 1e-9 for before, after in itertools.pairwise(self.bench.attempts_s)
+        )
 
     @invariant()
     def each_loss_is_told_once(self) -> None:

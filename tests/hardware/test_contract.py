@@ -244,8 +244,7 @@ class TormagsimEnd(PacketEnd):
         self._host: socket.socket | None = None
 
     def hear(self) -> bytes:
-        frame = from_socket(self._connected().recv(64))
-        return _unit(frame)
+        return _unit(from_socket(self._connected().recv(64)))
 
     def say(self, unit: bytes, backend: Backend) -> None:
         self._connected().send(to_socket(_frame(unit)))
@@ -430,16 +429,13 @@ def moving(core: Core) -> ClosedLoop:
     """A loop that is armed and closing its gap, on a perfect line."""
     loop = ClosedLoop(CONFIG, core.stepper(), core.planner(), a_device())
     loop.arm()
-    asked = publisher(loop.now_s)
-    for _ in loop.run(MOVING_S, asked):
-        pass
+    list(loop.run(MOVING_S, publisher(loop.now_s)))
     return loop
 
 
 def publisher(from_s: float) -> Callable[[float], object]:
     """Somebody who wants FORCE_N every 10 ms."""
-    times = from_s + np.arange(1_000) * 0.01
-    return stream(times, np.full(1_000, FORCE_N))
+    return stream(from_s + np.arange(1_000) * 0.01, np.full(1_000, FORCE_N))
 
 
 @pytest.fixture
@@ -500,10 +496,9 @@ def test_on_any_line_the_output_keeps_its_limits_and_what_is_wrong_has_a_name(
     if case.named:
         settled = samples[-SETTLED_TICKS:]
         assert case.named & {name for sample in settled for name in (*sample.safety.faults, *sample.output.limits)}
-    for name in case.counted:
-        assert getattr(line.backend.statistics, name) > 0, name
-    for name in case.uncounted:
-        assert getattr(line.backend.statistics, name) <= 1, f"{name}: at most what is on its way at the end"
+    assert [name for name in case.counted if getattr(line.backend.statistics, name) == 0] == []
+    # at most what is on its way at the end
+    assert [name for name in case.uncounted if getattr(line.backend.statistics, name) > 1] == []
 
 
 def check_safe(loop: ClosedLoop, faulted: Sample) -> None:
@@ -564,10 +559,9 @@ def test_a_device_that_goes_is_said_by_reading_and_writing_and_leaves_nothing_op
     far = TRANSPORTS[transport](a_device(), tmp_path)
     backend = choose(far.configured, CONFIG.rates).open()
     far.close()
-    with pytest.raises(BackendError, match=far.configured.port):
-        backend.receive()
-    with pytest.raises(BackendError, match=far.configured.port):
-        backend.send(Home(1))
+    for use in (backend.receive, lambda: backend.send(Home(1))):
+        with pytest.raises(BackendError, match=far.configured.port):
+            use()
     backend.close()
     backend.close()
     assert len(list(Path("/proc/self/fd").iterdir())) == before
@@ -596,9 +590,7 @@ def test_a_far_end_that_takes_nothing_is_noticed(
 def test_a_port_belongs_to_one(first: str, second: str, lines: Callable[..., Line]) -> None:
     line = lines(first, a_device(), CASES["clean"])
     port = line.far.configured.port
-    wanted = (
-        Device(port=port) if second == "serial" else Device(backend="can", options={"interface": second}, port=port)
-    )
+    wanted = Device(**{} if second == "serial" else {"backend": "can", "options": {"interface": second}}, port=port)
     with pytest.raises(BackendError, match=f"{port}: .*another (process|program) holds it") as caught:
         choose(wanted, CONFIG.rates).open()
     assert "tormagctl ports" in caught.value.remedy

@@ -5,6 +5,7 @@ import math
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,36 +69,35 @@ def rising() -> ForceModel:
     return make_model(weight, rng.normal(size=50), np.abs(rng.normal(size=50)) / 20, -1.0)
 
 
+def of_field(slopes: list[float], bias: float, output: list[float], constant: float) -> ForceModel:
+    """A model whose force depends on the field alone."""
+    weight = np.zeros((len(slopes), 4))
+    weight[:, 2] = slopes
+    return make_model(weight, np.full(len(slopes), bias), np.array(output), constant)
+
+
 @pytest.fixture(scope="session")
 def bump() -> ForceModel:
     """Force that rises to a greatest value near 450 mT and falls again, the same on both sides."""
-    weight = np.zeros((2, 4))
-    weight[:, 2] = 8.0, -8.0
-    return make_model(weight, np.array([4.0, 4.0]), np.array([1.5, 1.5]), -2.0)
+    return of_field([8.0, -8.0], 4.0, [1.5, 1.5], -2.0)
 
 
 @pytest.fixture(scope="session")
 def lopsided() -> ForceModel:
     """Force that rises steeply to its greatest value near 450 mT and falls gently."""
-    weight = np.zeros((2, 4))
-    weight[:, 2] = 40.0, -4.0
-    return make_model(weight, np.array([4.0, 4.0]), np.array([1.5, 1.5]), -2.0)
+    return of_field([40.0, -4.0], 4.0, [1.5, 1.5], -2.0)
 
 
 @pytest.fixture(scope="session")
 def plateau() -> ForceModel:
     """Force that climbs steeply at 450 mT and is flat to the last bit on both sides."""
-    weight = np.zeros((1, 4))
-    weight[:, 2] = 500.0
-    return make_model(weight, np.zeros(1), np.array([1.0]), 0.0)
+    return of_field([500.0], 0.0, [1.0], 0.0)
 
 
 @pytest.fixture(scope="session")
 def creeping() -> ForceModel:
     """The plateau, with a rise of 8 units of rounding across it."""
-    weight = np.zeros((2, 4))
-    weight[:, 2] = 500.0, 1.0
-    return make_model(weight, np.zeros(2), np.array([1.0, 1e-14]), -0.9)
+    return of_field([500.0, 1.0], 0.0, [1.0, 1e-14], -0.9)
 
 
 # -- what all of them promise -----------------------------------------------------------------------------------------
@@ -134,14 +134,12 @@ SUBJECTS = {
 ANY_SHAPE = [name for name, subject in SUBJECTS.items() if not subject.needs_rising]
 CONTINUOUS = [name for name in ANY_SHAPE if SUBJECTS[name].is_continuous]
 FORGETFUL = [name for name in ANY_SHAPE if not SUBJECTS[name].is_continuous]
-_MADE: dict[tuple[str, int], FieldSolver] = {}
 
 
+@cache
 def solver(name: str, model: ForceModel) -> FieldSolver:
     """The search on that model, made once."""
-    if (name, id(model)) not in _MADE:
-        _MADE[name, id(model)] = SUBJECTS[name].make(model)
-    return _MADE[name, id(model)]
+    return SUBJECTS[name].make(model)
 
 
 @pytest.mark.parametrize("name", SUBJECTS)
@@ -150,8 +148,9 @@ def test_on_a_rising_model_the_root_is_found(rising: ForceModel, name: str) -> N
     rng = np.random.default_rng(3)
     last: float | None = None
     for displacement, rate, field in rng.uniform((0.05, 3, 110), (0.95, 57, 740), (60, 3)).tolist():
-        force = rising.predict_one(displacement, rate, field, CIP)
-        solution = searcher.solve(rising.curve(displacement, rate, CIP), force, last)
+        solution = searcher.solve(
+            rising.curve(displacement, rate, CIP), rising.predict_one(displacement, rate, field, CIP), last
+        )
         assert solution.field_mT == pytest.approx(field, abs=accuracy)
         assert solution.reach is Reach.INSIDE
         assert solution.predicted_force_N == pytest.approx(
@@ -188,8 +187,7 @@ def test_without_a_last_field_the_lowest_root_wins(bump: ForceModel, name: str) 
 
 @pytest.mark.parametrize("name", FORGETFUL)
 def test_a_search_without_memory_answers_with_one_of_the_roots(bump: ForceModel, name: str) -> None:
-    force = bump.predict_one(0.5, 10, 300.0, CIP)
-    solution = solver(name, bump).solve(bump.curve(0.5, 10, CIP), force, 600.0)
+    solution = solver(name, bump).solve(bump.curve(0.5, 10, CIP), bump.predict_one(0.5, 10, 300.0, CIP), 600.0)
     assert min(abs(solution.field_mT - 300), abs(solution.field_mT - 600)) <= 5
     assert solution.reach is Reach.INSIDE
 
@@ -211,14 +209,12 @@ def test_out_of_reach_is_the_nearest_end_and_never_silent(rising: ForceModel, na
     above = searcher.solve(rising.curve(0.5, 10, CIP), most + 0.5, 500.0)
     assert (below.field_mT, below.reach) == (REACHED_MT[0], Reach.BELOW)
     assert (above.field_mT, above.reach) == (REACHED_MT[1], Reach.ABOVE)
-    for solution in (below, above):
-        assert solution.confidence == pytest.approx(math.exp(-20 * 0.5 / 6), rel=1e-4)
+    assert (below.confidence, above.confidence) == pytest.approx((math.exp(-20 * 0.5 / 6),) * 2, rel=1e-4)
 
 
 @pytest.mark.parametrize("name", ANY_SHAPE)
 def test_above_the_peak_of_a_bump_is_above(bump: ForceModel, name: str) -> None:
-    peak = bump.predict_one(0.5, 10, 450.0, CIP)
-    solution = solver(name, bump).solve(bump.curve(0.5, 10, CIP), peak + 0.1, 200.0)
+    solution = solver(name, bump).solve(bump.curve(0.5, 10, CIP), bump.predict_one(0.5, 10, 450.0, CIP) + 0.1, 200.0)
     assert solution.reach is Reach.ABOVE
     assert solution.field_mT == pytest.approx(450, abs=2)
 
@@ -239,11 +235,9 @@ def test_a_tie_is_resolved_by_continuity(plateau: ForceModel, name: str) -> None
 @pytest.mark.parametrize("name", SUBJECTS)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300])
 def test_numbers_that_are_none_are_refused(rising: ForceModel, name: str, value: float) -> None:
-    names = ("displacement_mm", "rate_mm_s", "force_N", "cip_percent", "last_field_mT")
-    for position, word in enumerate(names):
-        point = [0.5, 10.0, 2.0, CIP, 400.0]
-        point[position] = value
-        displacement, rate, force, cip, last = point
+    usual = {"displacement_mm": 0.5, "rate_mm_s": 10.0, "force_N": 2.0, "cip_percent": CIP, "last_field_mT": 400.0}
+    for word in usual:
+        displacement, rate, force, cip, last = (usual | {word: value}).values()
         with pytest.raises(DomainError, match=word):
             solver(name, rising).solve(rising.curve(displacement, rate, cip), force, last)
 
@@ -490,8 +484,7 @@ def test_flat_stretches_do_not_stop_it(rate: float) -> None:
     curve = curve_of([(rate, 150.0 + 100.0 * place, 1.0) for place in range(7)], 0.0)
     for stair in range(7):
         for last in (None, *RANGE_MT, 199.9, 450.0, 650.1):
-            solution = solved(curve, stair + 0.5, last)
-            assert solution.field_mT == pytest.approx(150.0 + 100.0 * stair, abs=ACCURACY_MT)
+            assert solved(curve, stair + 0.5, last).field_mT == pytest.approx(150.0 + 100.0 * stair, abs=ACCURACY_MT)
 
 
 # -- the search of a scene: by name, or Newton's method, which no measured scene has a reason to leave -----------------
@@ -556,13 +549,10 @@ def test_without_torch_the_scene_is_refused_and_the_package_named(
 @pytest.mark.parametrize("name", shipped_scenes())
 def test_a_scene_gets_the_search_that_it_names_or_newton_where_there_is_one(name: str) -> None:
     scene = load_scene(name)
-    built = build_core(Config(scene=name)).solver
-    if scene.solver.name != "auto":
-        assert built.solver == scene.solver.name
-    elif "rate" in terms_of(scene).left_out:
-        assert built.solver == "portrait"  # there is nothing to search
-    else:
-        assert built.solver == "newton"
+    # without the rate there is nothing to search
+    best = "portrait" if "rate" in terms_of(scene).left_out else "newton"
+    wanted = best if scene.solver.name == "auto" else scene.solver.name
+    assert build_core(Config(scene=name)).solver.solver == wanted
 
 
 def test_no_other_search_without_torch_is_cheaper_or_more_exact_in_any_measured_scene() -> None:
@@ -577,8 +567,7 @@ def test_no_other_search_without_torch_is_cheaper_or_more_exact_in_any_measured_
 
 def test_a_scene_may_name_its_search() -> None:
     scene = load_scene(shipped_scenes()[0])
-    wanted = msgspec.structs.replace(scene, solver=Solver(name="nearest", step_mT=5.0, neighbours=2))
-    choice = choose_solver(wanted)
+    choice = choose_solver(msgspec.structs.replace(scene, solver=Solver(name="nearest", step_mT=5.0, neighbours=2)))
     assert (choice.solver, choice.step_mT, choice.neighbours) == ("nearest", 5.0, 2)
 
 

@@ -77,8 +77,7 @@ def zigzag(phase: np.ndarray) -> np.ndarray:
 
 
 def test_what_is_slower_than_the_carriages_is_followed_exactly() -> None:
-    ramp_mm = 40.0 + 0.9 * SPEED_MM_S * time_s(0.5)
-    no_delay_N, foresight_N = errors_N(ramp_mm)
+    no_delay_N, foresight_N = errors_N(40.0 + 0.9 * SPEED_MM_S * time_s(0.5))
     assert no_delay_N <= 1e-3 * N_MM  # it starts from rest
     assert foresight_N <= 1e-6
     assert errors_N(np.full(200, 60.0)) == pytest.approx((0.0, 0.0), abs=1e-6)
@@ -87,10 +86,8 @@ def test_what_is_slower_than_the_carriages_is_followed_exactly() -> None:
 def test_a_step_is_begun_half_its_way_before_it_comes() -> None:
     """The way D takes D/V: without delay the error falls from D, D^3/3V in all; begun D/2V before, D^3/12V."""
     way_mm, lasts_s = 6.0, 1.0
-    along_s = time_s(lasts_s)
-    no_delay_N, foresight_N = errors_N(np.where(along_s < 0.5, 50.0, 50.0 + way_mm))
-    assert no_delay_N == pytest.approx(N_MM * math.sqrt(way_mm**3 / (3.0 * SPEED_MM_S) / lasts_s), rel=0.01)
-    assert foresight_N == pytest.approx(N_MM * math.sqrt(way_mm**3 / (12.0 * SPEED_MM_S) / lasts_s), rel=0.01)
+    expected_N = [N_MM * math.sqrt(way_mm**3 / (share * SPEED_MM_S) / lasts_s) for share in (3.0, 12.0)]
+    assert errors_N(np.where(time_s(lasts_s) < 0.5, 50.0, 50.0 + way_mm)) == pytest.approx(tuple(expected_N), rel=0.01)
 
 
 def test_a_square_wave_that_is_too_fast_is_met_by_a_zigzag_in_phase() -> None:
@@ -219,8 +216,7 @@ def test_the_force_of_the_gap_is_that_of_the_devices_element(plant: PlantParamet
 def test_without_delay_a_force_within_reach_is_met_in_spite_of_the_fields_lag(plant: PlantParameters) -> None:
     """A slow wave that turns twice, first step excepted: the greedy gap goes further after every turn."""
     brake = brake_of(plant)
-    force_N = 1.3 - 0.3 * np.cos(2.0 * time_s(6.0))
-    wanted = asked_of(brake, force_N, most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
+    wanted = asked_of(brake, 1.3 - 0.3 * np.cos(2.0 * time_s(6.0)), most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
     greedy_mm = no_delay_mm(drive_of(plant), brake, wanted, STEP_S)
     assert rms(wanted.rendered_N(brake, greedy_mm) - wanted.force_N) <= 1e-3
     assert np.ptp(greedy_mm) > np.ptp(no_delay_mm(drive_of(plant), brake._replace(branch_Tm=0.0), wanted, STEP_S))
@@ -230,8 +226,7 @@ def test_without_delay_a_force_within_reach_is_met_in_spite_of_the_fields_lag(pl
 def test_the_fields_lag_takes_some_of_what_foresight_gains(plant: PlantParameters) -> None:
     """And no wave of the gap beside the optimum is better than the optimum, lag included."""
     brake, drive, along_s = brake_of(plant), drive_of(plant), time_s(1.2)
-    force_N = 1.55 + 0.15 * zigzag(along_s / 0.25)
-    wanted = asked_of(brake, force_N, most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
+    wanted = asked_of(brake, 1.55 + 0.15 * zigzag(along_s / 0.25), most_N=2.0, hand_mm_s=42.0, step_s=STEP_S)
 
     def error_N(brake: Brake, gap_mm: np.ndarray) -> float:
         return rms(wanted.rendered_N(brake, gap_mm) - wanted.force_N)
@@ -241,21 +236,18 @@ def test_the_fields_lag_takes_some_of_what_foresight_gains(plant: PlantParameter
     straight = brake._replace(branch_Tm=0.0)
     assert best_N > error_N(straight, foresight_mm(drive, straight, wanted, STEP_S))
     # what only moves or shrinks the way is within the drive's limits as well
-    for shift_mm in (-0.05, 0.05):
-        assert error_N(brake, best_mm + shift_mm) > best_N
-    for share in (0.9, 0.97):
-        assert error_N(brake, best_mm.mean() + share * (best_mm - best_mm.mean())) > best_N
-    for steps in (-5, 5):
-        assert error_N(brake, np.roll(best_mm, steps)) > best_N
+    others_mm = [best_mm - 0.05, best_mm + 0.05, np.roll(best_mm, -5), np.roll(best_mm, 5)]
+    others_mm += [best_mm.mean() + share * (best_mm - best_mm.mean()) for share in (0.9, 0.97)]
+    assert min(error_N(brake, gap_mm) for gap_mm in others_mm) > best_N
 
 
 @pytest.mark.parametrize("plant", SAMPLES)
 def test_finer_steps_find_the_same(plant: PlantParameters) -> None:
     """On sample 2 another round of the finer would take the solver more than its usual 200 iterations."""
-    found = [best(plant, *pulse_profile(1.0, 1.4, 1.8, 500), step_s=step_s).figures() for step_s in (1e-3, 5e-4)]
-    coarse, fine = found
-    assert coarse["foresight_rms_N"] == pytest.approx(fine["foresight_rms_N"], rel=0.03)
-    assert coarse["no_delay_rms_N"] == pytest.approx(fine["no_delay_rms_N"], rel=0.03)
+    coarse, fine = [best(plant, *pulse_profile(1.0, 1.4, 1.8, 500), step_s=step_s).figures() for step_s in (1e-3, 5e-4)]
+    assert (coarse["foresight_rms_N"], coarse["no_delay_rms_N"]) == pytest.approx(
+        (fine["foresight_rms_N"], fine["no_delay_rms_N"]), rel=0.03
+    )
     assert 1e-3 <= coarse["foresight_rms_N"] < coarse["no_delay_rms_N"] < coarse["sd_N"]
 
 

@@ -1,5 +1,6 @@
 """Cyclic compression tests: the right cycle is evaluated, the standard's rules are checked. Synthetic data."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -47,10 +48,8 @@ def cyclic_test(
 
 def test_the_fourth_cycle_gives_the_conditioned_modulus() -> None:
     curve = evaluated_cycle(cyclic_test(), SAMPLE)
-    assert curve.stretch[0] == pytest.approx(1.0)
-    assert curve.stretch[-1] == pytest.approx(0.75)
-    fit = fit_ogden(curve.stretch, curve.stress_Pa)
-    assert fit.law.shear_modulus_Pa == pytest.approx(120e3, rel=1e-3)
+    assert (curve.stretch[0], curve.stretch[-1]) == pytest.approx((1.0, 0.75))
+    assert fit_ogden(curve.stretch, curve.stress_Pa).law.shear_modulus_Pa == pytest.approx(120e3, rel=1e-3)
     assert fit_thesis_ogden(curve.stretch, curve.stress_Pa).r2 > 0.99
 
 
@@ -67,8 +66,7 @@ def test_noise_and_set_make_no_cycles() -> None:
 
 
 def test_a_record_that_ends_while_loading_still_counts_the_cycle() -> None:
-    record = CompressionRecord(*(column[:-300] for column in cyclic_test()))
-    assert len(loading_halves(record)) == 4
+    assert len(loading_halves(CompressionRecord(*(column[:-300] for column in cyclic_test())))) == 4
 
 
 def test_the_thesis_sample_differs_from_the_standard_in_its_diameter_only() -> None:
@@ -83,23 +81,24 @@ def test_deviations_from_the_cycle_rules_are_told() -> None:
     assert any("cycle 2 loads at 5" in one for one in found)
 
 
-def test_records_that_cannot_be_evaluated() -> None:
-    with pytest.raises(LabError, match="cycle 4 of 3"):
-        evaluated_cycle(cyclic_test(cycles=3), SAMPLE)
-    with pytest.raises(LabError, match="height"):
-        evaluated_cycle(cyclic_test(), Sample(height_mm=2.0))
-    still = CompressionRecord(np.arange(5.0), np.zeros(5), np.zeros(5))
-    with pytest.raises(LabError, match="no cycle"):
-        loading_halves(still)
-    with pytest.raises(DomainError, match="diameter_mm"):
-        Sample(diameter_mm=0.0)
+@pytest.mark.parametrize(
+    ("evaluated", "error", "said"),
+    [
+        (lambda: evaluated_cycle(cyclic_test(cycles=3), SAMPLE), LabError, "cycle 4 of 3"),
+        (lambda: evaluated_cycle(cyclic_test(), Sample(height_mm=2.0)), LabError, "height"),
+        (lambda: loading_halves(CompressionRecord(np.arange(5.0), np.zeros(5), np.zeros(5))), LabError, "no cycle"),
+        (lambda: Sample(diameter_mm=0.0), DomainError, "diameter_mm"),
+    ],
+)
+def test_records_that_cannot_be_evaluated(evaluated: Callable[[], object], error: type[Exception], said: str) -> None:
+    with pytest.raises(error, match=said):
+        evaluated()
 
 
 def test_files_are_read_past_a_preamble_and_checked(tmp_path: Path) -> None:
     path = tmp_path / "test.csv"
     path.write_text("Machine;X\ntime_s, displacement_mm ,force_N,note\n0,0,0,a\n1,0.5,20,b\n\n2,1,45\n")
-    record = read_compression(path)
-    assert record.force_N.tolist() == [0.0, 20.0, 45.0]
+    assert read_compression(path).force_N.tolist() == [0.0, 20.0, 45.0]
     for text, said in (
         ("a,b\n1,2\n", "header is .*needed is 'time_s,displacement_mm,force_N'"),
         ("time_s,displacement_mm,force_N\n", "0 rows"),

@@ -96,8 +96,9 @@ def test_a_missing_package_is_one_sentence_with_the_command_that_brings_it():
 
 def test_where_tormagd_stands_in_a_folder_of_its_own_packages_are_brought_there(monkeypatch, tmp_path):
     monkeypatch.setattr(errors, "__file__", str(tmp_path / "tormagd" / "tormagd" / "lab" / "errors.py"))
-    told = errors.not_installed("torch")
-    assert told.endswith(f"sudo python3 -m pip install --target {tmp_path}/tormagd 'torch==2.13.0'")
+    assert errors.not_installed("torch").endswith(
+        f"sudo python3 -m pip install --target {tmp_path}/tormagd 'torch==2.13.0'"
+    )
 
 
 def imported(path: Path) -> set[str]:
@@ -120,8 +121,7 @@ def test_every_command_that_is_named_exists():
     known = set(COMMANDS) | {"NAME"}
     for path in (*SOURCES, *PAGES):
         text = path.read_text(encoding="utf-8")
-        named = set(re.findall(r"tormag-lab ([a-zA-Z][\w-]*)", text))
-        assert named <= known, path
+        assert set(re.findall(r"tormag-lab ([a-zA-Z][\w-]*)", text)) <= known, path
         scripts = set(re.findall(r"\btools/(\w+)\.py", text)) if path in SOURCES else set()
         assert all((ROOT / "tools" / f"{name}.py").exists() for name in scripts), path
 

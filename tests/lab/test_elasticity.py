@@ -59,8 +59,7 @@ def test_noise_moves_the_modulus_little() -> None:
 def test_measured_silicones(recordings: Path, file: str, published_kPa: float) -> None:
     """Neo-Hookean over 5..50 % strain, where the grips' slack is out; Ogden to four times the length."""
     columns = ("Engineering Strain", "Engineering Stress (MPa)")
-    path = recordings / "srmd_silicone" / f"{file}.csv"
-    strain, stress_MPa = read_columns(path, columns, delimiter=";").values()
+    strain, stress_MPa = read_columns(recordings / "srmd_silicone" / f"{file}.csv", columns, delimiter=";").values()
     chosen = (strain >= 0.05) & (strain <= 0.5)
     fit = fit_neo_hookean(1.0 + strain[chosen], 1e6 * stress_MPa[chosen])
     assert 1e-3 * fit.law.shear_modulus_Pa == pytest.approx(published_kPa, rel=0.01)
@@ -70,8 +69,7 @@ def test_measured_silicones(recordings: Path, file: str, published_kPa: float) -
 
 
 def test_treloars_rubber(recordings: Path) -> None:
-    path = recordings / "hyperelastics_jl" / "uniaxial.csv"
-    stretch, stress_MPa = read_columns(path, ("Stretch", "Stress")).values()
+    stretch, stress_MPa = read_columns(recordings / "hyperelastics_jl" / "uniaxial.csv", ("Stretch", "Stress")).values()
     assert fit_neo_hookean(stretch, 1e6 * stress_MPa).r2 < 0.9
     fit = fit_ogden(stretch, 1e6 * stress_MPa, terms=3)
     assert fit.r2 > 0.998

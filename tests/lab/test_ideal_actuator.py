@@ -31,8 +31,11 @@ def missed_N(core: Core, device: VirtualDevice, stepper: Stepper) -> float:
 def test_the_same_core_misses_less_with_carriages_that_lose_no_time() -> None:
     core = build_core(Config())
     own, ideal = (VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1) for _ in range(2))
-    bound_N = missed_N(core, ideal, ideal_stepper(core, ideal.messages.plant))
-    assert 0.0 < bound_N < 0.9 * missed_N(core, own, core.stepper())
+    assert (
+        0.0
+        < missed_N(core, ideal, ideal_stepper(core, ideal.messages.plant))
+        < 0.9 * missed_N(core, own, core.stepper())
+    )
 
 
 @pytest.mark.parametrize("command", ["pause", "disable"])
@@ -40,12 +43,10 @@ def test_they_stand_where_nothing_is_planned_for(command: str) -> None:
     core, device = build_core(Config()), VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1)
     loop = ClosedLoop(core.config, ideal_stepper(core, device.messages.plant), core.planner(), device)
     loop.arm()
-    for _ in loop.run(0.5, lambda now_s: TimedSetpoint(1.4, now_s, 0.1)):
-        pass
+    list(loop.run(0.5, lambda now_s: TimedSetpoint(1.4, now_s, 0.1)))
     stood_mm = device.truth.gap_mm
     loop.command(command)
-    for _ in loop.run(0.1):
-        pass
+    list(loop.run(0.1))
     # the firmware opens a device that is disabled, by its own motors
     assert (device.truth.gap_mm > stood_mm + 0.3) is (command == "disable")
     assert device.truth.gap_mm > stood_mm - 0.01

@@ -61,8 +61,7 @@ def test_emps_is_within_the_published_values(recordings, capsys):
     assert main(["identify-motor", str(recordings / "emps" / "DATA_EMPS.mat"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     values = {name: item["value"] for name, item in found["parameters"].items() if item is not None}
-    assert values["mass_kg"] == pytest.approx(95.1089, rel=0.02)
-    assert values["viscous_N_s_m"] == pytest.approx(203.5034, rel=0.02)
+    assert (values["mass_kg"], values["viscous_N_s_m"]) == pytest.approx((95.1089, 203.5034), rel=0.02)
     assert values["coulomb_N"] == pytest.approx(20.3935, rel=0.03)
     assert values["offset_N"] == pytest.approx(-3.1648, abs=0.3)
     assert found["holdout_voltage_nrmse"] <= 0.06
@@ -82,39 +81,35 @@ def compare(log: Log, plant: PlantParameters, side: str) -> dict:
 
 def record(sample: str, seed: int = 1, rounds: int = 2) -> Columns:
     """The control ticks of `tormagctl calibrate --motors` on a simulated device, in virtual time."""
-    config = Config()
-    core = build_core(config)
+    core = build_core(Config())
     device = VirtualDevice(load_plant(sample), SteadyHand(), seed=seed)
-    loop = ClosedLoop(config, core.stepper(), core.planner(), device)
+    loop = ClosedLoop(Config(), core.stepper(), core.planner(), device)
     loop.arm()
-    for _ in loop.run(1.0):
-        pass
+    list(loop.run(1.0))
     # the status of a daemon says the same: what this device gives with its gap open, as far as it has shown itself
-    least_N = loop.planner.believe.min_N
-    waveform = excitation(Range(least_N, min(core.portrait.max_N, core.scene.force.most_N)), rounds)
+    shown = Range(loop.planner.believe.min_N, min(core.portrait.max_N, core.scene.force.most_N))
+    waveform = excitation(shown, rounds)
     start_s = loop.now_s
 
     def newest(now_s: float) -> TimedSetpoint:
         sent_s = math.floor((now_s - start_s) * RATE_HZ + 1e-9) / RATE_HZ
         return TimedSetpoint(waveform.at(sent_s).force_N, start_s + sent_s, VALID_FOR_MS * 1e-3)
 
-    rows = []
-    for sample_ in loop.run(waveform.duration_s, newest):
-        measured, estimate, reference = loop.measurement, sample_.measured, sample_.reference
-        rows.append(
-            (
-                measured.device_time_s,
-                sample_.output.left_duty,
-                sample_.output.right_duty,
-                measured.supply_V,
-                estimate.left_mm,
-                estimate.right_mm,
-                measured.left_current_A,
-                measured.right_current_A,
-                estimate.force_N,
-                reference.gap_mm,
-            )
+    rows = [
+        (
+            loop.measurement.device_time_s,
+            tick.output.left_duty,
+            tick.output.right_duty,
+            loop.measurement.supply_V,
+            tick.measured.left_mm,
+            tick.measured.right_mm,
+            loop.measurement.left_current_A,
+            loop.measurement.right_current_A,
+            tick.measured.force_N,
+            tick.reference.gap_mm,
         )
+        for tick in loop.run(waveform.duration_s, newest)
+    ]
     return dict(zip(COLUMNS, np.array(rows).T, strict=True))
 
 
@@ -143,8 +138,7 @@ def truth(plant: PlantParameters, side: str, gap_mm: np.ndarray) -> dict[str, fl
         load_N = direction * contact_N + rub * np.abs(contact_N)
         driving = idle_N + load_N / gear.efficiency
         braking = np.maximum(idle_N + load_N, (load_N + gear.efficiency * idle_N) / (2.0 - gear.efficiency))
-        force_N: np.ndarray = np.where(load_N > 0.0, driving, braking) * direction
-        return force_N
+        return np.where(load_N > 0.0, driving, braking) * direction
 
     opening, closing = slow(1.0), slow(-1.0)
     return {

@@ -30,9 +30,8 @@ def test_coverage_agrees_with_counted_points(
 ) -> None:
     portrait = PhasePortrait(brake, speed)
     for region in (use_case_1, use_case_2):
-        assert portrait.true_coverage(region) == pytest.approx(count_points(portrait, region, true=True), abs=1e-3)
-        counted = count_points(portrait, region, true=False)
-        assert portrait.trapezoid_coverage(region) == pytest.approx(counted, abs=1e-3)
+        counted = [count_points(portrait, region, true=true) for true in (True, False)]
+        assert [portrait.true_coverage(region), portrait.trapezoid_coverage(region)] == pytest.approx(counted, abs=1e-3)
 
 
 def test_true_coverage_is_good_to_five_digits(brake: Brake, use_case_2: Region) -> None:
@@ -64,8 +63,9 @@ def test_boundary_rate_is_what_a_moving_gap_gives(brake: Brake) -> None:
 def test_a_region_out_of_reach_is_not_covered_and_one_inside_is_whole(brake: Brake) -> None:
     portrait = PhasePortrait(brake, 40.0)
     for region, share in ((Region(brake.most_N, 0.1, brake.most_N + 1.0, 0.1), 0.0), (Region(2.0, 0.1, 3.0, 0.1), 1.0)):
-        assert portrait.true_coverage(region) == pytest.approx(share, abs=1e-12)
-        assert portrait.trapezoid_coverage(region) == pytest.approx(share, abs=1e-12)
+        assert (portrait.true_coverage(region), portrait.trapezoid_coverage(region)) == pytest.approx(
+            (share, share), abs=1e-12
+        )
 
 
 @settings(max_examples=60, deadline=None)
@@ -89,10 +89,8 @@ def test_cloud_says_which_points_fail_and_why(brake: Brake) -> None:
     limit = 40.0 * brake.slope_N_mm(brake.gap_mm(2.0))
     force = np.array([2.0, 2.0, 2.0, 0.5 * brake.least_N, brake.most_N + 0.1])
     cloud = portrait.true_cloud(force, np.array([0.99 * limit, 1.01 * limit, -1.01 * limit, 0.0, 0.0]))
-    assert cloud.covered.tolist() == [True, False, False, False, False]
-    assert cloud.too_fast.tolist() == [False, True, True, False, False]
-    assert cloud.below_least_force.tolist() == [False, False, False, True, False]
-    assert cloud.above_most_force.tolist() == [False, False, False, False, True]
+    said = [cloud.covered, cloud.too_fast, cloud.below_least_force, cloud.above_most_force]
+    assert [np.flatnonzero(points).tolist() for points in said] == [[0], [1, 2], [3], [4]]
     assert cloud.share == pytest.approx(0.2)
 
 
@@ -124,19 +122,18 @@ def test_end_forces_come_back_as_end_gaps(law: FieldLaw, g0_Pa: float) -> None:
     ],
 )
 def test_impossible_regions_are_refused(arguments: tuple[float, ...], variable: str) -> None:
-    with pytest.raises(DomainError) as refused:
+    with pytest.raises(DomainError, match=f"^{variable} "):
         Region(*arguments)
-    assert refused.value.variable == variable
 
 
 def test_impossible_brakes_and_speeds_are_refused(brake: Brake) -> None:
-    elastomer = Elastomer(300e3, 3.8, 0.2)
-    with pytest.raises(DomainError, match="open_mm"):
-        Brake(PowerFieldLaw(), elastomer, TORMAG, 95.0, 45.0)
-    with pytest.raises(DomainError, match="open_mm = 120"):
-        Brake(ThesisFieldLaw(), elastomer, TORMAG, 45.0, 120.0)
-    with pytest.raises(DomainError, match="radial_moment_Tm"):
-        Brake(PowerFieldLaw(), Elastomer(5e3, 3.8, 0.2), TORMAG, 5.0, 95.0)
+    for law, modulus_Pa, closed_mm, open_mm, said in (
+        (PowerFieldLaw(), 300e3, 95.0, 45.0, "open_mm"),
+        (ThesisFieldLaw(), 300e3, 45.0, 120.0, "open_mm = 120"),
+        (PowerFieldLaw(), 5e3, 5.0, 95.0, "radial_moment_Tm"),
+    ):
+        with pytest.raises(DomainError, match=said):
+            Brake(law, Elastomer(modulus_Pa, 3.8, 0.2), TORMAG, closed_mm, open_mm)
     with pytest.raises(DomainError, match="gap_speed_mm_s"):
         PhasePortrait(brake, 0.0)
     with pytest.raises(DomainError, match="force_N"):

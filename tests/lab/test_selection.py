@@ -41,8 +41,7 @@ def test_the_sufficient_gap_makes_the_brake_serve(brake: Brake) -> None:
     task = ForceTask("task", 0.0, 2.0, 0.1)
     gap = judge("it", brake, task, STEP_MM).sufficient_gap_mm
     assert gap > brake.open_mm
-    wider = dataclasses.replace(brake, open_mm=gap * 1.0001)
-    assert judge("it", wider, task, STEP_MM).serves
+    assert judge("it", dataclasses.replace(brake, open_mm=gap * 1.0001), task, STEP_MM).serves
 
 
 def test_no_gap_is_named_beyond_the_field_law(brake: Brake) -> None:

@@ -49,7 +49,8 @@ def answers(outcomes: dict[Run, Outcome]) -> list[tuple[Design, float]]:
 
 
 def test_dask_cluster_and_process_pool_give_the_same_answer(runs: list[Run], problem: Problem) -> None:
-    every = [*runs, Run(problem, Design(12.0, 20.0, 95.0), "global", seed=3)]
+    quick = msgspec.structs.replace(problem, measure="trapezoid")
+    every = [*runs, Run(quick, Design(12.0, 20.0, 95.0), "global", seed=3)]
     with ProcessPoolExecutor(1) as pool:
         here = sweep(every, pool)
     with (
@@ -87,8 +88,7 @@ def test_a_failure_keeps_what_was_finished(runs: list[Run], thread: Executor, tm
 def test_another_problem_does_not_take_an_old_answer(runs: list[Run], thread: Executor, tmp_path: Path) -> None:
     state = tmp_path / "sweep.json"
     sweep(runs[:1], thread, state)
-    faster = msgspec.structs.replace(runs[0].problem, gap_speed_mm_s=20.0)
-    other = msgspec.structs.replace(runs[0], problem=faster)
+    other = msgspec.structs.replace(runs[0], problem=msgspec.structs.replace(runs[0].problem, gap_speed_mm_s=20.0))
     with pytest.raises(ConnectionError):
         sweep([other], Refusing(thread, 0), state)
     sweep([other], thread, state)

@@ -80,8 +80,7 @@ def test_cantools_decodes_every_frame_with_names_and_units(
         signals = database.decode_message(frame.arbitration_id, frame.data, decode_choices=False)
         assert isinstance(signals, dict)
         for name in message.__match_args__:
-            value = getattr(message, name)
-            assert signals[name] == pytest.approx(float(value))
+            assert signals[name] == pytest.approx(float(getattr(message, name)))
     units = {s.name: s.unit for m in database.messages for s in m.signals}
     for name, unit in units.items():
         suffix = {"mm": "_mm", "s": "_s", "A": "_A", "N": "_N", "V": "_V", "degC": "_C"}

@@ -39,8 +39,7 @@ def fly(core: Core) -> Fly:
         core = shipped if config is None else build_core(config)
         config = config or Config()
         device = VirtualDevice(load_plant("sample_1"), ReversingHand(2.0), [parse_fault(it) for it in faults], 1)
-        line = VirtualBus(CanDevice(device.messages)) if bus else device
-        flight = Flight(config, core, line)
+        flight = Flight(config, core, VirtualBus(CanDevice(device.messages)) if bus else device)
         flight.arm()
         while flight.loop.now_s < until_s:
             flight.tick(asked(flight.loop.now_s))

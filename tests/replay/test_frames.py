@@ -45,8 +45,9 @@ def again(core: Core, entries: list[Any], from_s: float = 0.0) -> Rerun:
 
 def place_of(entries: list[Any], name: str, tick: int) -> int:
     """Of the entry with this name that comes before that tick's record."""
-    end = list(ticks_of(COLUMNS, entries))[tick - 1]
-    return next(place for place in range(end, 0, -1) if entries[place][0] == name)
+    return next(
+        place for place in range(list(ticks_of(COLUMNS, entries))[tick - 1], 0, -1) if entries[place][0] == name
+    )
 
 
 def changed(entries: list[Any], place: int, raw: Any) -> list[Any]:
@@ -79,8 +80,7 @@ def test_frames_are_messages_that_anybody_can_read(path: Path, can_path: Path) -
     line = b"".join(bytes.fromhex(frame["data"]) for frame in serial if frame["direction"] == "read")
     wrote = b"".join(bytes.fromhex(frame["data"]) for frame in serial if frame["direction"] == "wrote")
     functions = Counter(type(decode(frame.function, frame.payload)) for frame in FrameDecoder().feed(line + wrote))
-    assert functions[State] == pytest.approx(4_000, abs=30)
-    assert functions[Drive] == pytest.approx(4_000, abs=30)
+    assert (functions[State], functions[Drive]) == pytest.approx((4_000, 4_000), abs=30)
     assert functions[Home] >= 1
     identifiers = Counter(frame["identifier"] for frame in can if frame["direction"] == "wrote")
     assert identifiers[can_identifier(FUNCTION[Drive])] == pytest.approx(3_300, abs=30)
@@ -137,8 +137,7 @@ def test_a_memory_that_differs_is_found_where_no_tick_shows_it(core: Core, box: 
     link = connection["link"]["DeviceLink"]
     altered = {**connection, "link": {"DeviceLink": link | {"_least_delay_s": link["_least_delay_s"] + 1e-9}}}
     entries = [*box.entries[:place], ["state", step, plan, altered], *box.entries[place + 1 :]]
-    found = again(core, entries, SNAPSHOT_S - 0.5).difference
-    assert found.field == "state.connection.link._least_delay_s"
+    assert again(core, entries, SNAPSHOT_S - 0.5).difference.field == "state.connection.link._least_delay_s"
 
 
 def test_a_link_that_was_lost_and_came_back_is_run_again(fly: Any, core: Core, tmp_path: Path) -> None:

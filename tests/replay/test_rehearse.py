@@ -97,5 +97,4 @@ def test_what_cannot_be_run_again_is_refused_in_one_line(path: Path, capsys: pyt
     ):
         assert run(arguments) == 2
         captured = capsys.readouterr()
-        assert captured.out == ""
-        assert captured.err.count("\n") == 1
+        assert (captured.out, captured.err.count("\n")) == ("", 1)

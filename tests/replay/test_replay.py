@@ -20,7 +20,7 @@ from firmware_protocol.build import SWITCH, settle
 from tormagd import __version__
 from tormagd.assembly.build import Core
 from tormagd.assembly.journal import ANSWER, MISSING
-from tormagd.config import Config
+from tormagd.config import Config, Device
 from tormagd.keeping import Part
 from tormagd.recording.black_box import BlackBoxFile, read_black_box, write_black_box
 from tormagd.recording.reader import RecordingError, read_recording
@@ -109,8 +109,7 @@ def test_the_other_build_replays_it_to_the_bit(path: Path) -> None:
     switch = "0" if settle().is_compiled else "1"
     command = [sys.executable, "-P", "-m", "tormagd.replay", str(path), "--from", "3"]
     environment = os.environ | {SWITCH: switch, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    result = json.loads(done.stdout)
+    result = json.loads(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
     assert result["rerun"]["difference"] is None
     assert result["rerun"]["ticks"] == TICKS - 3_000
     assert switch == "1" or result["build"].startswith("interpreted")
@@ -150,8 +149,7 @@ def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, 
 def test_over_a_gap_it_goes_on_from_the_next_snapshot(core: Core, box: BlackBoxFile) -> None:
     """A part was lost: 20 ticks are missing, and the rest up to the next snapshot says nothing."""
     places = list(ticks_of(COLUMNS, box.entries))
-    entries = [*box.entries[: places[3_100] + 1], [MISSING], *box.entries[places[3_120] + 1 :]]
-    done = rerun(core, COLUMNS, entries)
+    done = rerun(core, COLUMNS, [*box.entries[: places[3_100] + 1], [MISSING], *box.entries[places[3_120] + 1 :]])
     assert (done.difference, done.gaps) == (None, 1)
     assert done.ticks == TICKS - 3_500 + 3_101
 
@@ -191,8 +189,7 @@ def test_a_changed_setpoint_is_found_in_the_next_tick(core: Core, box: BlackBoxF
 
 def test_a_command_that_is_missing_is_found(core: Core, box: BlackBoxFile) -> None:
     entries = [it for it in box.entries if not (it[0] == "command" and it[1] == "home")]
-    found = rerun(core, COLUMNS, entries).difference
-    assert found.field == "request"
+    assert rerun(core, COLUMNS, entries).difference.field == "request"
 
 
 def test_a_state_that_differs_is_found_where_no_tick_shows_it(core: Core, box: BlackBoxFile) -> None:
@@ -201,8 +198,7 @@ def test_a_state_that_differs_is_found_where_no_tick_shows_it(core: Core, box: B
     state = msgspec.msgpack.decode(msgspec.msgpack.encode(entries[place]))
     state[1]["Stepper"]["measure"]["Measure"]["measured"]["Measured"]["handle"]["Handle"]["sliding_mm_s"] += 1e-12
     entries[place] = state
-    found = rerun(core, COLUMNS, entries, 1.5).difference
-    assert found.field == "state.step.measure.measured.handle.sliding_mm_s"
+    assert rerun(core, COLUMNS, entries, 1.5).difference.field == "state.step.measure.measured.handle.sliding_mm_s"
 
 
 def test_another_limit_gives_another_first_tick(box: BlackBoxFile, path: Path) -> None:
@@ -214,8 +210,7 @@ def test_another_limit_gives_another_first_tick(box: BlackBoxFile, path: Path) -
 
 def test_what_is_not_as_it_was_is_told(box: BlackBoxFile, path: Path) -> None:
     changed = msgspec.structs.replace(box, header={**box.header, "sources_sha256": "0" * 64, "platform": "PDP-11"})
-    device = msgspec.structs.replace(Config().device, port="/dev/another")
-    configured = msgspec.structs.replace(Config(), device=device, scene="pulse")
+    configured = Config(device=Device(port="/dev/another"), scene="pulse")
     told = differences(recorded(changed, path.parent), configured)
     assert [line.partition(":")[0] for line in told] == ["build", "platform", "scene", "configuration"]
 
@@ -239,19 +234,27 @@ def refusal(path: Path) -> str:
     return text
 
 
+def stated(path: Path, header: dict[str, str], encoding: str, data: bytes) -> Path:
+    """A file with that header, whose one message is this."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata("black_box", header)
+        channel = writer.register_channel(topic="/core", message_encoding=encoding, schema_id=0)
+        writer.add_message(channel, log_time=1, data=data, publish_time=1)
+        writer.finish()
+    return path
+
+
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.01])
 def test_one_that_breaks_off_early_is_refused(path: Path, tmp_path: Path, share: float) -> None:
-    broken = tmp_path / "broken.mcap"
-    data = path.read_bytes()
-    broken.write_bytes(data[: int(share * len(data))])
-    assert refusal(broken)
+    (tmp_path / "broken.mcap").write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    assert refusal(tmp_path / "broken.mcap")
 
 
 def test_one_that_breaks_off_late_is_replayed_so_far(core: Core, path: Path, tmp_path: Path) -> None:
-    broken = tmp_path / "broken.mcap"
-    data = path.read_bytes()
-    broken.write_bytes(data[: len(data) * 2 // 3])
-    box = read_black_box(broken)
+    (tmp_path / "broken.mcap").write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    box = read_black_box(tmp_path / "broken.mcap")
     assert not box.is_complete
     done = again(core, box)
     assert done.difference is None
@@ -271,30 +274,19 @@ def test_random_and_damaged_bytes_are_refused(path: Path, tmp_path: Path) -> Non
 
 
 def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Path) -> None:
-    other = tmp_path / "other.mcap"
-    with other.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        channel = writer.register_channel(topic="/core", message_encoding="json", schema_id=0)
-        writer.add_message(channel, log_time=1, data=b"{}", publish_time=1)
-        writer.finish()
-    assert "allowed is msgpack" in refusal(other)
-    changes = {
-        "format": ("4", FORMER),
-        "config": ('{"scene": "pulse"}', "config: its hash"),
-        "model_sha256": ("f" * 64, "the model with the hash 'ffffffffffff'"),
-        "columns": (json.dumps(["t_ns"]), "no column 'monotonic_s'"),
-    }
-    for name, (value, said) in changes.items():
-        path = tmp_path / f"{name}.mcap"
-        write_black_box(path, box.header | {name: value}, NO_TICKS)
-        assert said in refusal(path)
-    path = tmp_path / "no scene.mcap"
-    write_black_box(path, {name: text for name, text in box.header.items() if name != "scene"}, NO_TICKS)
-    assert "its header has no 'scene'" in refusal(path)
-    path = tmp_path / "empty.mcap"
-    write_black_box(path, box.header, NO_TICKS)
-    assert "no tick in it" in refusal(path)
+    assert "allowed is msgpack" in refusal(stated(tmp_path / "other.mcap", {}, "json", b"{}"))
+    for number, (header, said) in enumerate(
+        (
+            (box.header | {"format": "4"}, FORMER),
+            (box.header | {"config": '{"scene": "pulse"}'}, "config: its hash"),
+            (box.header | {"model_sha256": "f" * 64}, "the model with the hash 'ffffffffffff'"),
+            (box.header | {"columns": json.dumps(["t_ns"])}, "no column 'monotonic_s'"),
+            ({name: text for name, text in box.header.items() if name != "scene"}, "its header has no 'scene'"),
+            (box.header, "no tick in it"),
+        )
+    ):
+        write_black_box(tmp_path / f"{number}.mcap", header, NO_TICKS)
+        assert said in refusal(tmp_path / f"{number}.mcap")
 
 
 def test_no_entries_break_it(core: Core, box: BlackBoxFile) -> None:
@@ -303,29 +295,18 @@ def test_no_entries_break_it(core: Core, box: BlackBoxFile) -> None:
     rubbish: list[Any] = [None, -1, 2**63, "x", float("nan"), b"\0", {}, [], [[]], [1], ["plan"], ["unheard"]]
     rubbish += [["state", 1, 2], ["command", "stop", 1.0, False], ["latch", "SKEWED"], ["afresh", "now"]]
     rubbish += [["teach", {"Learned": {}}], ["teach", {"Limit": "RATE"}]]
-    first = list(ticks_of(COLUMNS, box.entries))[60]
-    head = box.entries[: first + 1]
+    head = box.entries[: list(ticks_of(COLUMNS, box.entries))[60] + 1]
     for _ in range(100):
         entries = list(head)
-        place = rng.randrange(len(entries))
-        victim = entries[place]
-        if isinstance(victim, list) and victim and rng.random() < 0.7:
-            victim = list(victim)
-            victim[rng.randrange(len(victim))] = rng.choice(rubbish)
-            entries[place] = victim
-        else:
-            entries[place] = rng.choice(rubbish)
+        place, spoilt = rng.randrange(len(entries)), rng.choice(rubbish)
+        if isinstance(entries[place], list) and entries[place] and rng.random() < 0.7:
+            inner = rng.randrange(len(entries[place]))
+            spoilt = [*entries[place][:inner], spoilt, *entries[place][inner + 1 :]]
+        entries[place] = spoilt
         with contextlib.suppress(ReplayError):
             assert rerun(core, COLUMNS, entries).ticks <= 61
 
 
 def test_a_list_that_says_it_is_endless_is_refused(box: BlackBoxFile, tmp_path: Path) -> None:
-    other = tmp_path / "lies.mcap"
-    with other.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.add_metadata("black_box", box.header)
-        channel = writer.register_channel(topic="/core", message_encoding="msgpack", schema_id=0)
-        writer.add_message(channel, log_time=1, data=b"\xdd" + struct.pack(">I", 2**32 - 1), publish_time=1)
-        writer.finish()
-    assert "not an intact MCAP file" in refusal(other)
+    endless = b"\xdd" + struct.pack(">I", 2**32 - 1)
+    assert "not an intact MCAP file" in refusal(stated(tmp_path / "lies.mcap", box.header, "msgpack", endless))

@@ -20,8 +20,7 @@ def test_up_and_down_by_half_cosines_with_rests(tmp_path: Path) -> None:
 
 
 def test_steps_divide_the_range_evenly(tmp_path: Path) -> None:
-    signal = Signal(bandwidth_hz=5.0, step_N=0.4, hold_s=0.4)
-    _, force_N = asked(signal, tmp_path, RANGE_N, 100.0, 100)
+    _, force_N = asked(Signal(bandwidth_hz=5.0, step_N=0.4, hold_s=0.4), tmp_path, RANGE_N, 100.0, 100)
     held_N = np.unique(np.round(force_N[1:][np.diff(force_N) == 0.0], 6))
     assert held_N == pytest.approx([0.5, 0.875, 1.25, 1.625, 2.0])
     assert len(force_N) == 8 * 50

@@ -126,8 +126,7 @@ def test_what_a_killed_simulator_left_is_replaced_and_what_somebody_serves_is_no
     killed.kill()
     killed.wait()
     assert Path(path).is_socket()
-    third = start("--can", path)
-    assert channel(third) == path
+    assert channel(start("--can", path)) == path
     meet(on_a_bus("tormagsim", path))
 
 

@@ -150,8 +150,9 @@ def package(tmp_path: Path) -> Path:
     """The package with this checkout in it, and links to where a `Machine` has what it imports in place of that."""
     if shutil.which("dpkg-deb") is None:
         pytest.skip("dpkg-deb is not installed")
-    asked = ["dpkg-query", "--show", "--showformat", "${Version}", "python3"]
-    debians = subprocess.run(asked, capture_output=True, text=True, check=False).stdout
+    debians = subprocess.run(
+        ["dpkg-query", "--show", "--showformat", "${Version}", "python3"], capture_output=True, text=True, check=False
+    ).stdout
     if debians and not debians.startswith(f"{VERSION}."):
         pytest.skip(f"the package of Python {VERSION} is for a Debian that has it; this one's is {debians}")
     library, out = tmp_path / "library", tmp_path / "package"

@@ -158,8 +158,9 @@ def another_console_stands_beside_it(console, left) -> None:
     machine = console.machine
     text = re.sub(r'port = ".*"', 'port = "/dev/left"', shown("Several consoles"))
     put(machine, "/etc/tormag/left.toml", re.sub('setpoint = ".*"', 'setpoint = "tcp://127.0.0.1:5555"', text))
-    drop_in = "/usr/share/tormagd/drop-ins/tcp.conf"
-    machine.run("install", "-D", "-m", "644", "-t", DROP_INS.format(unit=left.unit), drop_in)
+    machine.run(
+        "install", "-D", "-m", "644", "-t", DROP_INS.format(unit=left.unit), "/usr/share/tormagd/drop-ins/tcp.conf"
+    )
     machine.run("systemctl", "daemon-reload")
     machine.run("systemctl", "start", "simulator@left", "tormagd@left", "tormag-record@left")
     machine.until(left.is_ready, "the other device is identified")

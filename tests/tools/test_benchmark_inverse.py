@@ -38,8 +38,7 @@ def test_every_variant_has_the_keys_of_the_contract(result):
         assert row.keys() >= KEYS
         assert 0 < row["p50_us"] <= row["p99_us"] <= row["p999_us"]
         assert row["memory_kB"] > 0 or row["solver"] == "newton"
-    names = {row["name"] for row in result["variants"]}
-    assert names >= {"thesis-linear", "linear-argmin", "vectorised-argmin"}
+    assert {row["name"] for row in result["variants"]} >= {"thesis-linear", "linear-argmin", "vectorised-argmin"}
     assert any(row["pareto"] for row in result["variants"])
     assert result["speedup_vs_thesis_linear"] > 0
     assert rows(result, "newton") or "newton, 50 units" in result["refused"]

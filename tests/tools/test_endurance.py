@@ -22,7 +22,7 @@ from tormagd_client.messages import MessageError, Request, decode
 CONFIG = Config()
 
 
-@pytest.mark.parametrize(("name", "count"), [("fuzz", 20_000), ("walk", 100_000)])
+@pytest.mark.parametrize(("name", "count"), [("fuzz", 8_000), ("walk", 40_000)])
 def test_a_case_in_virtual_time_holds_and_repeats_itself(name: str, count: int) -> None:
     result = endure.measured(name, count, 1)
     assert result["failures"] == []
@@ -50,9 +50,8 @@ def test_cases_in_real_time_hold_on_one_stand_one_after_the_other() -> None:
 
 @pytest.mark.parametrize("wrong", [["nobody"], ["walk", "--count", "0"]])
 def test_a_wrong_command_line_is_refused(wrong: list[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
+    with pytest.raises(SystemExit, match=r"^2$"):
         endure.main(wrong)
-    assert caught.value.code == 2
 
 
 # -- fuzz ----------------------------------------------------------------------------------------------------------

@@ -39,8 +39,7 @@ def test_the_greatest_force_counts_whenever_it_was() -> None:
 
 def test_below_what_the_open_gap_brakes_there_is_nothing_to_fall_short_of() -> None:
     found = judged(0.2, np.full(6_000, 0.55))
-    assert found.under_N == -np.inf
-    assert found.settled == ()
+    assert (found.under_N, found.settled) == (-np.inf, ())
     assert judged(1.0, np.full(6_000, 0.8)).under_N == pytest.approx(0.2)
 
 

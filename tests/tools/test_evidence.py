@@ -29,22 +29,22 @@ def test_all_parts_run_and_the_status_tells_of_the_failed(tmp_path: Path) -> Non
     }
     assert evidence.collect(parts, tmp_path) == 1
     text = page.read_text(encoding="utf-8")
-    rows = {line.split(" | ")[0].removeprefix("| "): line for line in text.splitlines() if " | `" in line}
-    assert list(rows) == ["good", "other", "doubtful", "failed", "crashed", "measured"]
-    assert rows["good"].endswith("| yes | 1 cases |")
-    assert rows["other"].endswith("| yes | kept |")
-    assert rows["doubtful"].endswith("| **no** | 2 cases |")
-    assert rows["failed"].endswith("| **no** | 3 cases |")
-    assert rows["crashed"].endswith("| **no** | no figures, exit status 1 |")
-    assert rows["measured"].endswith("| measured | 5 cases |")
+    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if " | `" in line]
+    assert [(row[0], *row[-2:]) for row in rows] == [
+        ("good", "yes", "1 cases"),
+        ("other", "yes", "kept"),
+        ("doubtful", "**no**", "2 cases"),
+        ("failed", "**no**", "3 cases"),
+        ("crashed", "**no**", "no figures, exit status 1"),
+        ("measured", "measured", "5 cases"),
+    ]
     assert [path.name for path in tmp_path.glob("*.json")] == ["good.json"]
     assert evidence.collect({"good": parts["good"]}, tmp_path) == 0
 
 
 def test_an_unknown_part_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
+    with pytest.raises(SystemExit, match=r"^2$"):
         evidence.main(["fuz"])
-    assert caught.value.code == 2
     assert "fuz: allowed are fuzz" in capsys.readouterr().err
 
 

@@ -36,8 +36,7 @@ def test_a_stall_costs_the_beats_that_were_due_in_it():
     ],
 )
 def test_what_was_taken_is_judged_by_what_a_program_would_have_missed(changes, took_much):
-    calm = host.Host(steal=0.0, bare_kept=1.0, bare_worst_ms=1.2, waited={})
-    assert calm._replace(**changes).took_much is took_much
+    assert host.Host(steal=0.0, bare_kept=1.0, bare_worst_ms=1.2, waited={})._replace(**changes).took_much is took_much
 
 
 def looked(time_s: float, **waited_s: float) -> host.Counters:

@@ -59,7 +59,6 @@ def test_a_recording_becomes_a_scene_that_is_taken(tmp_path: Path) -> None:
     time_s = np.arange(0.0, 8.0, 0.02)
     played = Signal("", "", time_s, 1.2 + 0.3 * np.sin(time_s))
     signal = load_task(str(written(tmp_path / "cataract.toml", played, is_known_ahead=True))).signal
-    assert signal is not None
     assert signal.is_known_ahead
 
 
@@ -138,8 +137,9 @@ def test_what_is_only_missed_together_is_put_back() -> None:
 
 def test_what_was_put_back_is_tried_again() -> None:
     """`scale` counts for more, and is not enough; beside `offset` it is not needed."""
-    terms = table({"scale": 0.004, "offset": 0.003})
-    assert spared(terms, 0.05, lambda out: "offset" not in out) == tuple(term for term in TERMS if term != "offset")
+    assert spared(table({"scale": 0.004, "offset": 0.003}), 0.05, lambda out: "offset" not in out) == tuple(
+        term for term in TERMS if term != "offset"
+    )
 
 
 @pytest.mark.usefixtures("costless")
@@ -158,8 +158,7 @@ def test_the_lowest_rates_are_taken_that_do_what_the_fastest_do() -> None:
 
 @pytest.mark.usefixtures("costless")
 def test_a_scene_that_the_full_model_does_not_meet_leaves_nothing_out() -> None:
-    found = measure("coronary", lambda cases: dict.fromkeys(cases, 0.3))
-    assert found.left_out == ()
+    assert measure("coronary", lambda cases: dict.fromkeys(cases, 0.3)).left_out == ()
 
 
 def test_a_scene_without_a_signal_cannot_be_measured(tmp_path: Path) -> None:

@@ -43,8 +43,7 @@ def first(core, planned):
 def test_starts_with_the_gap_open(core) -> None:
     plan = core.planner(3.0).planned
     assert (plan.gap_mm, plan.gap_speed_mm_s, plan.time_s) == (95.0, 0.0, 3.0)
-    assert plan.governed_N == core.portrait.min_N
-    assert plan.limits == (Limit.NO_SETPOINT,)
+    assert (plan.governed_N, plan.limits) == (core.portrait.min_N, (Limit.NO_SETPOINT,))
 
 
 @pytest.mark.parametrize("is_there", [False, True], ids=["no device", "at rest"])
@@ -68,8 +67,7 @@ def test_a_handle_that_rests_does_not_close_the_gap(first, moving, rate_mm_s: fl
 
 
 def test_a_creeping_handle_is_planned_for_with_its_static_friction(first, moving) -> None:
-    creeping = moving(handle=Handle(MOBILISED_MM, 0.5, TURN, 0.5))
-    assert first(1.5, creeping).gap_mm > first(1.5, moving()).gap_mm + 2.0
+    assert first(1.5, moving(handle=Handle(MOBILISED_MM, 0.5, TURN, 0.5))).gap_mm > first(1.5, moving()).gap_mm + 2.0
 
 
 def test_the_portrait_rises_and_agrees_with_its_slope(core) -> None:

@@ -182,8 +182,9 @@ def test_a_pulse_that_suddenly_beats_faster_is_followed() -> None:
 def test_another_source_is_not_foreseen_from_the_first() -> None:
     """It takes over within the stream: what was learned loses its trust within a tenth of a second."""
     times_s = times_at("250 Hz", 9.0)
-    forces_N = np.where(times_s < 7.0, pulse_N(times_s), 0.9 + 0.2 * np.sin(2.0 * math.pi * 2.3 * times_s))
-    followed = follow(times_s, forces_N)
+    followed = follow(
+        times_s, np.where(times_s < 7.0, pulse_N(times_s), 0.9 + 0.2 * np.sin(2.0 * math.pi * 2.3 * times_s))
+    )
     assert followed.trust[np.searchsorted(followed.time_s, 6.99)] > 0.8
     slope_N, mixture_N = followed.rms_N(7.0, 7.5)
     assert mixture_N < 2.0 * slope_N

@@ -155,8 +155,9 @@ def test_a_takeover_after_a_silence_begins_from_the_decayed_force() -> None:
     following = governor(0.0, 1.6)
     for tick in range(1, 301):
         decayed_N = decide(following, tick * 1e-3, TimedSetpoint(1.6, 0.001, VALID_S)).force_N
-    ask = decide(following, 0.301, TimedSetpoint(1.6, 0.301, VALID_S, holder=1))
-    assert ask.force_N == pytest.approx(decayed_N + SCENE.release_N_s * 1e-3)
+    assert decide(following, 0.301, TimedSetpoint(1.6, 0.301, VALID_S, holder=1)).force_N == pytest.approx(
+        decayed_N + SCENE.release_N_s * 1e-3
+    )
 
 
 def test_another_holders_forces_teach_no_slope_and_no_period() -> None:
@@ -335,8 +336,7 @@ def test_a_short_preview_goes_on_as_it_ran_and_not_for_long() -> None:
 
 
 def test_a_preview_does_not_outlive_its_validity() -> None:
-    setpoint = TimedSetpoint(1.5, 0.5, VALID_S, preview_N=(1.5,) * 200, preview_dt_s=2e-3)
-    ask = decide(governor(0.699, 1.5), 0.7, setpoint)
+    ask = decide(governor(0.699, 1.5), 0.7, TimedSetpoint(1.5, 0.5, VALID_S, preview_N=(1.5,) * 200, preview_dt_s=2e-3))
     assert ask.limits == (Limit.STALE,)
     assert np.all(path_N(ask) < 1.5)
 
@@ -415,8 +415,7 @@ def test_no_forecast_holds_a_force_of_a_stale_setpoint(learned: Governor) -> Non
         ask = decide(learned, now_s, at(beats_N, 10.0))
         if now_s - 10.0 <= VALID_S:
             continue
-        assert ask.limits == (Limit.STALE,)
-        assert ask.foresight == 0.0
+        assert (ask.limits, ask.foresight) == ((Limit.STALE,), 0.0)
         assert np.all(path_N(ask) == ask.force_N)
         assert plain(learned.forecast) == plain(Forecast())
     assert learned.asked_N == PORTRAIT.min_N

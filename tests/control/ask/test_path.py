@@ -31,18 +31,15 @@ def test_what_the_gap_can_follow_is_followed() -> None:
 
 def test_a_step_is_met_in_its_middle() -> None:
     """As much too soon as too late: the gap is half way where the step is."""
-    wanted = [60.0] * 20 + [64.0] * 20
-    path = path_mm(60.0, wanted, [1.0] * 40)
-    assert path[19] == pytest.approx(62.0 - MOST_MM / 2.0)
-    assert path[20] == pytest.approx(62.0 + MOST_MM / 2.0)
+    path = path_mm(60.0, [60.0] * 20 + [64.0] * 20, [1.0] * 40)
+    assert (path[19], path[20]) == pytest.approx((62.0 - MOST_MM / 2.0, 62.0 + MOST_MM / 2.0))
     assert path[:14] == pytest.approx([60.0] * 14)
     assert path[26:] == pytest.approx([64.0] * 14)
 
 
 def test_where_the_force_hardly_depends_on_the_gap_more_is_given_up() -> None:
     weights = [0.01] * 20 + [1.0] * 20
-    path = path_mm(60.0, [60.0] * 20 + [64.0] * 20, weights)
-    assert path[20] > 63.0
+    assert path_mm(60.0, [60.0] * 20 + [64.0] * 20, weights)[20] > 63.0
 
 
 def test_the_first_gap_is_within_reach_of_the_last() -> None:

@@ -32,8 +32,7 @@ def test_skew_pulls_the_carriages_together(make_bench) -> None:
     own, both = duties
     assert own.left_duty < 0.0 < own.right_duty
     pull = CONFIG.position.proportional_per_mm * 0.02 / 2.0
-    assert both.left_duty == pytest.approx(own.left_duty - pull, rel=1e-6)
-    assert both.right_duty == pytest.approx(own.right_duty + pull, rel=1e-6)
+    assert (both.left_duty, both.right_duty) == pytest.approx((own.left_duty - pull, own.right_duty + pull), rel=1e-6)
 
 
 def test_a_plans_gap_is_carried_forward_along_its_speed_but_not_for_long(running) -> None:
@@ -59,8 +58,7 @@ def test_a_least_gap_ends_a_motion_towards_it(running) -> None:
     """A path that closes at 38 mm/s, well beyond the gap that this device allows."""
     lowest_mm = math.inf
     for tick in range(1, 300):
-        closing = running.plan(80.0 - 0.038 * tick, gap_speed_mm_s=-38.0, min_gap_mm=76.0)
-        running.step(closing, **running.there)
+        running.step(running.plan(80.0 - 0.038 * tick, gap_speed_mm_s=-38.0, min_gap_mm=76.0), **running.there)
         lowest_mm = min(lowest_mm, running.move.reference.gap_mm)
     assert 76.0 - 1e-3 < lowest_mm < 76.01
 
@@ -103,8 +101,7 @@ def test_less_supply_takes_more_duty(make_bench) -> None:
         bench.step(count=3, supply_V=supply_V)
         duties[supply_V] = bench.step(left_mm=-7.49, right_mm=-7.49, supply_V=supply_V).left_duty
     assert -0.5 < duties[12.0] < 0.0
-    assert duties[9.0] == pytest.approx(duties[12.0] * 12.0 / 9.0)
-    assert duties[14.5] == pytest.approx(duties[12.0] * 12.0 / 14.5)
+    assert (duties[9.0], duties[14.5]) == pytest.approx((duties[12.0] * 12.0 / 9.0, duties[12.0] * 12.0 / 14.5))
     # a supply that is not there does not make the duty boundless
     assert duties[0.0] == duties[3.0] == pytest.approx(duties[12.0] * 2.0)
 

@@ -152,8 +152,9 @@ def test_a_gap_that_does_not_follow(make_bench) -> None:
     while bench.watch.straying_s == 0.0:
         bench.step(50.0)
         assert bench.ticks < 1_000
-    took_s = bench.run_into(Fault.FOLLOWING_ERROR, 50.0) * PERIOD_S
-    assert took_s == pytest.approx(CONFIG.limits.following_time_s, abs=2.5e-3)
+    assert bench.run_into(Fault.FOLLOWING_ERROR, 50.0) * PERIOD_S == pytest.approx(
+        CONFIG.limits.following_time_s, abs=2.5e-3
+    )
 
 
 def test_following_again_in_time_is_no_fault(running) -> None:

@@ -1,0 +1,277 @@
+"""What each stream makes of bytes and frames, good and damaged, and what an exchange takes of a bus."""
+
+import os
+import random
+import struct
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import cantools.database.can
+import pytest
+from hypothesis import given, strategies as st
+
+import firmware_protocol
+from firmware_protocol.codec import (
+    FUNCTION,
+    DecodeError,
+    DeviceFault,
+    DeviceMode,
+    Drive,
+    DriveMode,
+    EncodeError,
+    Hello,
+    Home,
+    Message,
+    Retract,
+    State,
+    Status,
+    Switches,
+    can_identifier,
+    crc8,
+    decode,
+    encode,
+)
+from firmware_protocol.framing import encode_frame
+from firmware_protocol.layouts import LAYOUTS
+from firmware_protocol.schema import Layout
+from tormagd.config import Device
+from tormagd.hardware.can_backend import EXCHANGE_BITS
+from tormagd.hardware.can_stream import UNREADABLE, CanStream, SecondHostError
+from tormagd.hardware.frame_stream import FrameStream
+from tormagd.simulation.can_frame import CanFrame, frame_bits
+
+STATUS = Status(DeviceMode.IDLE, Switches(0), DeviceFault(0), 23.0, 12.0, 0, 0)
+
+
+@pytest.mark.parametrize("pack", [FrameStream().pack, CanStream(1).pack])
+def test_a_value_that_does_not_fit_is_refused_before_it_is_sent(pack) -> None:
+    with pytest.raises(EncodeError, match="left_duty"):
+        pack(Drive(float("nan"), 0.0, DriveMode.RUN, 0))
+
+
+# -- serial --------------------------------------------------------------------------------------------------------
+
+drives = st.builds(
+    Drive,
+    left_duty=st.integers(-10_000, 10_000).map(lambda steps: steps * 1e-4),
+    right_duty=st.just(0.5),
+    mode=st.sampled_from(DriveMode),
+    counter=st.integers(0, 255),
+)
+messages = st.lists(
+    st.builds(Home, st.integers(0, 255)) | st.builds(Retract, st.integers(0, 255)) | drives, max_size=20
+)
+
+
+@given(sent=messages, cuts=st.lists(st.integers(1, 9), min_size=1, max_size=50))
+def test_what_is_packed_comes_out_however_it_is_cut(sent: list[Message], cuts: list[int]) -> None:
+    sender, receiver = FrameStream(), FrameStream()
+    line = b"".join(sender.pack(message) for message in sent)
+    received: list[Message] = []
+    for cut in cuts:
+        received += receiver.unpack(line[:cut])
+        line = line[cut:]
+    assert received + receiver.unpack(line) == sent
+    assert (receiver.statistics.frames, receiver.statistics.corrupt, receiver.statistics.lost) == (len(sent), 0, 0)
+
+
+@given(noise=st.binary(max_size=300))
+def test_noise_never_raises_and_does_not_outlive_a_delimiter(noise: bytes) -> None:
+    stream = FrameStream()
+    stream.unpack(noise + b"\x00")
+    assert stream.unpack(FrameStream().pack(Home(3))) == [Home(3)]
+
+
+def test_a_whole_frame_with_an_impossible_message_is_counted() -> None:
+    """The last one's CRC is right, that of the Drive in it is not: the damage happened before the frame was made."""
+    stream = FrameStream()
+    for corrupt, frame in enumerate(
+        ((99, 0, b"\x01"), (6, 1, b"\x01\x02"), (2, 2, b"\x00\x00\x00\x00\x01\x05\x00")), 1
+    ):
+        assert stream.unpack(encode_frame(*frame)) == []
+        assert stream.statistics.corrupt == corrupt
+    assert stream.unpack(encode_frame(6, 3, b"\x05")) == [Home(5)]
+
+
+# -- CAN -----------------------------------------------------------------------------------------------------------
+
+
+def state(counter: int) -> State:
+    return State(-12.0, -12.1, 0.25, counter)
+
+
+def frame_of(message: Message, node: int = 1) -> tuple[int, bytes]:
+    return CanStream(node).pack(message)
+
+
+def test_the_frame_of_the_firmware_page() -> None:
+    assert frame_of(Drive(0.125, 0.1234, DriveMode.RUN, 200)) == (0x021, bytes.fromhex("e204d20401c865"))
+    assert frame_of(Home(3), node=15) == (0x06F, b"\x03")
+
+
+@pytest.mark.parametrize("node", [-1, 16])
+def test_a_node_that_is_none_is_refused(node: int) -> None:
+    with pytest.raises(EncodeError, match="nodes 0 to 15"):
+        CanStream(node)
+
+
+def test_what_the_device_says_comes_through_and_other_nodes_and_hosts_commands_are_not_ours() -> None:
+    stream = CanStream(1)
+    others = (frame_of(STATUS, node=2), frame_of(Hello(1, 1, 1)), frame_of(Home(1)))
+    assert [stream.unpack(*other) for other in others] == [None] * 3
+    assert (stream.statistics.frames, stream.statistics.bytes) == (0, 7)
+    assert stream.unpack(*frame_of(STATUS)) == STATUS
+    assert stream.unpack(*frame_of(state(7))) == decode(FUNCTION[State], encode(state(7)))
+    assert (stream.statistics.frames, stream.statistics.bytes, stream.statistics.corrupt) == (2, 23, 0)
+
+
+def test_a_drive_that_is_not_ours_is_another_host() -> None:
+    stream = CanStream(1)
+    assert stream.unpack(*stream.pack(Drive(0.5, 0.5, DriveMode.RUN, 9))) is None, "its echo"
+    with pytest.raises(SecondHostError):
+        stream.unpack(*frame_of(Drive(0.5, 0.5, DriveMode.RUN, 10)))
+
+
+def test_what_is_damaged_is_counted_and_the_next_good_one_found_again() -> None:
+    stream = CanStream(1)
+    identifier, data = frame_of(state(7))
+    damaged = [(identifier, spoilt) for spoilt in (data[:-1], data[:-1] + bytes((data[-1] ^ 1,)), b"")]
+    assert [stream.unpack(*frame) for frame in (*damaged, (0x7F1, b""))] == [None] * 4
+    assert (stream.statistics.corrupt, stream.statistics.resynchronisations) == (4, 0)
+    assert stream.unpack(identifier, data) is not None
+    assert stream.unpack(*frame_of(STATUS)) == STATUS
+    assert (stream.statistics.corrupt, stream.statistics.resynchronisations) == (4, 1)
+
+
+@pytest.mark.parametrize(
+    ("counters", "lost"),
+    [
+        ([254, 255, 0, 1], 0),
+        ([3, 4, 7], 2),
+        ([250, 3], 8),
+        ([5, 5, 5, 6], 0),
+        ([5, 7, 6, 8], 0),
+        ([200, 0, 1], 55),
+    ],
+    ids=["over the end", "a gap", "a gap over the end", "a stuck sender", "overtaken", "a device that began anew"],
+)
+def test_the_states_own_counter_shows_what_is_missing(counters: list[int], lost: int) -> None:
+    stream = CanStream(1)
+    assert None not in [stream.unpack(*frame_of(state(counter))) for counter in counters]
+    assert (stream.statistics.lost, stream.statistics.repeated) == (lost, 0), "no news is for the link to count"
+
+
+@given(frames=st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)), max_size=50))
+def test_no_frame_raises_or_is_more_than_it_is(frames: list[tuple[int, bytes]]) -> None:
+    stream = CanStream(1)
+    functions = set(FUNCTION.values())
+    for identifier, data in frames:
+        try:
+            message = stream.unpack(identifier, data)
+        except SecondHostError:
+            assert identifier == 0x021
+            continue
+        if message is not None:
+            assert identifier & 0xF == 1
+            assert identifier >> 4 in functions
+            assert len(encode(message)) == len(data)
+    assert stream.statistics.frames + stream.statistics.corrupt <= len(frames)
+
+
+def test_what_was_taken_apart_gives_the_same_to_another_stream() -> None:
+    stream, other = CanStream(1), CanStream(1)
+    frames = [
+        frame_of(state(7)),
+        frame_of(state(8), node=2),
+        (frame_of(state(8))[0], b"?"),
+        UNREADABLE,
+        frame_of(STATUS),
+    ]
+    messages = stream.unpack_all(frames)
+    assert [type(message) for message in messages] == [State, Status]
+    assert stream.received == [frames[0], *frames[2:]]
+    assert (other.unpack_all(stream.received), other.statistics) == (messages, stream.statistics)
+    assert stream.statistics.corrupt == 2
+    assert stream.pack(Home(3)) == stream.sent
+
+
+# -- what an exchange takes of a bus, by the DBC: the bound over every payload, and that real frames come near it -----
+
+DBC = Path(firmware_protocol.__file__).parent / "tormag.dbc"
+STUFFABLE_BITS, FIXED_BITS = 34, 13
+"Start, identifier, control and CRC of a classical base frame; delimiters, acknowledge, end and gap to the next."
+
+
+def most_bits(length: int) -> int:
+    """Of a frame with as many stuff bits as its data can need (Davis et al., Real-Time Systems 35, 2007)."""
+    stuffable = STUFFABLE_BITS + 8 * length
+    return stuffable + (stuffable - 1) // 4 + FIXED_BITS
+
+
+def fullest_bits(layout: Layout, node: int) -> int:
+    """Bits of the longest frame with a payload of this layout that ascent, byte by byte, comes to."""
+    length = struct.calcsize(layout.format) - layout.protected
+
+    def bits(body: bytes) -> int:
+        data = body + bytes([crc8(bytes([layout.function]) + body)]) if layout.protected else body
+        try:
+            decode(layout.function, data)
+        except DecodeError:
+            return 0
+        return frame_bits(CanFrame(can_identifier(layout.function, node), data))
+
+    ends = []
+    for phase in range(8):
+        body = bytes([0x0F0F >> phase & 0xFF] * length)  # behind a stuff bit, four equal bits need the next
+        for at in (*range(length), *range(length)):
+            body = max((body[:at] + bytes([byte]) + body[at + 1 :] for byte in range(256)), key=bits)
+        ends.append(bits(body))
+    return max(ends)
+
+
+def test_the_configuration_knows_what_an_exchange_takes_of_a_bus() -> None:
+    database = cantools.database.can.Database()
+    database.add_dbc_file(DBC)
+    each_tick = {message.name for message in database.messages if message.cycle_time == 1}
+    layouts = [layout for layout in LAYOUTS if layout.message.__name__ in each_tick]
+    assert len(layouts) == len(each_tick) == 3
+    most = [most_bits(struct.calcsize(layout.format)) for layout in layouts]
+    assert sum(most) == EXCHANGE_BITS
+    assert EXCHANGE_BITS == 395, "as firmware_protocol/README.md says"
+    fullest = [fullest_bits(layout, node=0) for layout in layouts]
+    assert sum(fullest) > 0.95 * EXCHANGE_BITS
+    assert all(bits <= bound for bits, bound in zip(fullest, most, strict=True))
+    noise = random.Random(2)
+    for _ in range(2_000):
+        for layout in layouts:
+            length = struct.calcsize(layout.format)
+            assert frame_bits(CanFrame(can_identifier(layout.function, 1), noise.randbytes(length))) <= most_bits(
+                length
+            )
+
+
+# -- on a serial line -------------------------------------------------------------------------------------------------
+
+
+class Line(NamedTuple):
+    """A pseudo-terminal whose far end the test holds."""
+
+    far: int
+    near: int
+    device: Device
+
+    @property
+    def adapter(self) -> Device:
+        """What is there where it is a slcan adapter's."""
+        return Device(backend="can", options={"interface": "slcan"}, port=self.device.port)
+
+
+@pytest.fixture
+def line() -> Iterator[Line]:
+    far, near = os.openpty()
+    tty.setraw(near)
+    yield Line(far, near, Device(port=os.ttyname(near)))
+    os.close(far)
+    os.close(near)

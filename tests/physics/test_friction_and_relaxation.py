@@ -1,0 +1,174 @@
+"""What friction and an elastomer's memory do to the force: closed forms, passivity, superposition."""
+
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, strategies as st
+
+from tormagd.physics.friction import Friction
+from tormagd.physics.relaxation import PronySeries
+
+# -- friction ----------------------------------------------------------------------------------------------------------
+
+
+FRICTION = Friction(presliding_stiffness_N_mm=8.0, viscous_N_s_mm=0.0005, static_ratio=1.15, stribeck_speed_mm_s=5.0)
+frictions = st.builds(
+    Friction,
+    presliding_stiffness_N_mm=st.floats(0.1, 100.0),
+    viscous_N_s_mm=st.floats(0.0, 0.1),
+    static_ratio=st.floats(1.0, 2.0),
+    stribeck_speed_mm_s=st.floats(0.1, 50.0),
+)
+speeds = st.floats(-200.0, 200.0)
+levels = st.floats(0.0, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("speed_mm_s", "force_N", "rel"),
+    [
+        (42.0, 2.0 + 0.0005 * 42.0, 1e-6),
+        (-42.0, -2.0 - 0.0005 * 42.0, 1e-6),
+        (1e-2, 2.0 * 1.15, 1e-4),
+        (5.0, 2.0 * (1.0 + 0.15 / math.e) + 0.0025, 1e-6),
+    ],
+)
+def test_steady_sliding_gives_kinetic_plus_viscous_force_and_break_away_the_static_level(
+    speed_mm_s: float, force_N: float, rel: float
+) -> None:
+    assert FRICTION.advance(0.0, speed_mm_s, 2.0, 1e3)[0] == pytest.approx(force_N, rel=rel)
+
+
+def test_the_first_micrometres_are_a_spring() -> None:
+    force, deflection = FRICTION.advance(0.0, 0.1, 2.0, 1e-2)
+    assert deflection == pytest.approx(1e-3, rel=3e-3)
+    assert force == pytest.approx(8.0 * deflection + 0.0005 * 0.1, rel=1e-12)
+
+
+def test_the_exact_solution_between_reversals() -> None:
+    """From -z_ss, dz/dt = v - sigma0 |v| z / g has z = z_ss (1 - 2 exp(-x / z_ss)) after a travel x."""
+    reach = FRICTION.level_N(30.0, 2.0) / 8.0
+    _, deflection = FRICTION.advance(-reach, 30.0, 2.0, 0.01)
+    assert deflection == pytest.approx(reach * (1.0 - 2.0 * math.exp(-0.3 / reach)), rel=1e-12)
+
+
+def test_at_rest_the_force_is_held() -> None:
+    assert FRICTION.advance(0.1, 0.0, 2.0, 1e3) == pytest.approx((0.8, 0.1), rel=1e-15)
+
+
+def test_a_falling_level_lets_the_bristle_slip() -> None:
+    _, deflection = FRICTION.advance(0.25, 0.0, 0.5, 0.0)
+    assert 8.0 * deflection == pytest.approx(0.5 * 1.15)
+    assert FRICTION.advance(0.25, 42.0, 0.0, 1e-3) == pytest.approx((0.021, 0.0))
+
+
+@given(frictions, st.floats(-1.0, 1.0), speeds, st.floats(0.01, 10.0), st.floats(1e-6, 0.1), st.floats(0.0, 1.0))
+def test_splitting_a_stroke_changes_nothing(
+    friction: Friction, start_mm: float, speed_mm_s: float, kinetic_N: float, dt_s: float, share: float
+) -> None:
+    _, whole = friction.advance(start_mm, speed_mm_s, kinetic_N, dt_s)
+    _, part = friction.advance(start_mm, speed_mm_s, kinetic_N, share * dt_s)
+    _, rest = friction.advance(part, speed_mm_s, kinetic_N, (1.0 - share) * dt_s)
+    assert rest == pytest.approx(whole, abs=1e-12)
+
+
+@given(frictions, st.floats(-10.0, 10.0), st.floats(-1e6, 1e6), st.floats(0.0, 1e6), st.floats(0.0, 1e6))
+def test_the_dry_force_never_exceeds_the_level(
+    friction: Friction, start_mm: float, speed_mm_s: float, kinetic_N: float, dt_s: float
+) -> None:
+    force, deflection = friction.advance(start_mm, speed_mm_s, kinetic_N, dt_s)
+    assert math.isfinite(force)
+    level_N = friction.level_N(speed_mm_s, kinetic_N)
+    # below 1e-300 a float has not the digits for a relative bound
+    assert abs(friction.presliding_stiffness_N_mm * deflection) <= level_N * (1 + 1e-12) + 1e-300
+
+
+@given(frictions, st.lists(st.tuples(speeds, levels, st.floats(1e-4, 0.5)), min_size=1, max_size=40))
+def test_passive_under_any_motion_and_any_field(friction: Friction, steps: list[tuple[float, float, float]]) -> None:
+    """The hand never gets back more than it put in: work done stays above the energy stored in the bristles."""
+    deflection_mm, work_mJ = 0.0, 0.0
+    for speed_mm_s, kinetic_N, dt_s in steps:
+        force_N, deflection_mm = friction.advance(deflection_mm, speed_mm_s, kinetic_N, dt_s)
+        work_mJ += force_N * speed_mm_s * dt_s
+        stored_mJ = 0.5 * friction.presliding_stiffness_N_mm * deflection_mm**2
+        assert work_mJ >= stored_mJ - 1e-9 * (1.0 + work_mJ)
+
+
+@given(frictions, st.floats(0.1, 10.0), st.floats(0.01, 20.0), st.floats(0.1, 5.0), st.integers(8, 100))
+def test_a_closed_cycle_costs_the_hand_work(
+    friction: Friction, kinetic_N: float, amplitude_mm: float, frequency_Hz: float, steps: int
+) -> None:
+    dt_s = 1.0 / (frequency_Hz * steps)
+    positions = [amplitude_mm * math.sin(2.0 * math.pi * index / steps) for index in range(2 * steps + 1)]
+    deflection_mm, works_mJ = 0.0, []
+    for before, after in pairwise(positions):
+        force_N, deflection_mm = friction.advance(deflection_mm, (after - before) / dt_s, kinetic_N, dt_s)
+        works_mJ.append(force_N * (after - before))
+    assert sum(works_mJ[steps:]) > 0.0
+
+
+# -- relaxation --------------------------------------------------------------------------------------------------------
+
+
+SERIES = PronySeries(fractions=(0.05, 0.04, 0.04), times_s=(8.0, 90.0, 900.0))
+forces = st.floats(-10.0, 10.0)
+
+
+def step_response(time_s: float) -> float:
+    return 1.0 - sum(g * -math.expm1(-time_s / tau) for g, tau in zip(SERIES.fractions, SERIES.times_s, strict=True))
+
+
+@pytest.mark.parametrize("time_s", [1e-6, 1e-3, 1.0, 10.0, 300.0, 1e5])
+def test_a_step_relaxes_as_the_closed_form(time_s: float) -> None:
+    force, state = SERIES.discretise(0.0).advance(SERIES.relaxed(0.0), 2.0)
+    assert force == pytest.approx(2.0, rel=1e-15)
+    force, _ = SERIES.discretise(time_s).advance(state, 2.0)
+    assert force == pytest.approx(2.0 * step_response(time_s), rel=1e-14)
+
+
+@pytest.mark.parametrize("dt_s", [1e-6, 1e-4, 1.0, 10.0])
+def test_a_ramp_follows_the_closed_form(dt_s: float) -> None:
+    """F0 = t: F = (1 - sum g) t + sum g tau (1 - exp(-t / tau)), whatever the step."""
+    update, state, force = SERIES.discretise(dt_s), SERIES.relaxed(0.0), 0.0
+    for index in range(1, 101):
+        force, state = update.advance(state, index * dt_s)
+    time_s = 100 * dt_s
+    branches = sum(
+        g * tau * -math.expm1(-time_s / tau) for g, tau in zip(SERIES.fractions, SERIES.times_s, strict=True)
+    )
+    assert force == pytest.approx(0.87 * time_s + branches, rel=1e-12)
+
+
+@given(forces, forces, st.floats(1e-6, 10.0), st.integers(2, 50))
+def test_splitting_a_step_changes_nothing(start_N: float, end_N: float, dt_s: float, parts: int) -> None:
+    jumped = SERIES.discretise(0.0).advance(SERIES.relaxed(0.0), start_N)[1]
+    whole_N, whole = SERIES.discretise(dt_s).advance(jumped, end_N)
+    update, state, force_N = SERIES.discretise(dt_s / parts), jumped, math.nan
+    for index in range(1, parts + 1):
+        force_N, state = update.advance(state, start_N + (end_N - start_N) * index / parts)
+    assert force_N == pytest.approx(whole_N, abs=1e-12)
+    assert state == pytest.approx(whole, abs=1e-12)
+
+
+@given(st.lists(st.tuples(forces, forces), min_size=1, max_size=50), st.floats(1e-6, 10.0))
+def test_superposition_and_the_bound_of_the_response(pairs: list[tuple[float, float]], dt_s: float) -> None:
+    update = SERIES.discretise(dt_s)
+    one, two, both = SERIES.relaxed(0.0), SERIES.relaxed(0.0), SERIES.relaxed(0.0)
+    largest_N = max(abs(first) for first, _ in pairs)
+    for first, second in pairs:
+        force_one, one = update.advance(one, first)
+        force_two, two = update.advance(two, second)
+        force_both, both = update.advance(both, first + second)
+        assert force_both == pytest.approx(force_one + force_two, abs=1e-12)
+        assert abs(force_one) <= (1.0 + sum(SERIES.fractions)) * largest_N + 1e-12
+
+
+def test_a_rested_element_carries_the_equilibrium_share_and_may_undershoot() -> None:
+    update, state = SERIES.discretise(1e-3), SERIES.relaxed(5.0)
+    assert update.advance(state, 5.0)[0] == pytest.approx(0.87 * 5.0)
+    assert update.advance(state, 0.5)[0] == pytest.approx(0.87 * 0.5 - 0.13 * 4.5, rel=1e-3)
+
+
+def test_a_series_without_branches_is_the_identity() -> None:
+    empty = PronySeries((), ())
+    assert empty.discretise(1e-4).advance(empty.relaxed(1.0), 3.0) == (3.0, (3.0,))

@@ -1,0 +1,306 @@
+"""The device on its carriers: bytes of a serial line, frames of a bus, each as late as the carrier makes it."""
+
+import math
+import random
+from collections import Counter
+from itertools import pairwise
+
+import msgspec
+import pytest
+
+from firmware_protocol.codec import (
+    FUNCTION,
+    PROTOCOL_VERSION,
+    SCHEMA_HASH,
+    Drive,
+    DriveMode,
+    Hello,
+    Identity,
+    Message,
+    Sense,
+    State,
+    Status,
+    can_identifier,
+    decode,
+    encode,
+    period,
+)
+from firmware_protocol.framing import FrameDecoder, encode_frame
+from tormagd.simulation.can_device import DEVICE, MAX_WAITING, CanDevice, Delivery
+from tormagd.simulation.can_frame import ERROR_FLAG, SOCKET_FRAME, CanFrame, frame_bits, from_socket, to_socket
+from tormagd.simulation.device import MessageDevice, Packet, VirtualDevice
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import load_plant
+
+# -- a serial line -----------------------------------------------------------------------------------------------------
+
+
+SAMPLE_1 = load_plant("sample_1")
+HELLO = encode_frame(FUNCTION[Hello], 0, encode(Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1)))
+IDENTITY_BYTES = 1 + 2 + 8 + 2 + 1  # COBS, header, payload, CRC, delimiter
+
+
+def a_device(baud: int = 1_000_000, seed: int = 0, ppm: float = 0.0, jitter_us: float = 0.0) -> VirtualDevice:
+    timing = msgspec.structs.replace(SAMPLE_1.firmware, clock_ppm=ppm, reply_jitter_us=jitter_us)
+    return VirtualDevice(msgspec.structs.replace(SAMPLE_1, firmware=timing), SteadyHand(), seed=seed, baud=baud)
+
+
+@pytest.mark.parametrize("baud", [9600, 115_200, 1_000_000])
+def test_bytes_take_ten_bits_each_in_both_directions(baud: int) -> None:
+    device = a_device(baud)
+    byte_s = 10.0 / baud
+    arrived_s = 0.001 + len(HELLO) * byte_s
+    device.receive(0.001, HELLO)
+    out = b""
+    for count in range(1, IDENTITY_BYTES + 1):
+        leaves_s = arrived_s + count * byte_s
+        assert device.transmit(leaves_s - 0.01 * byte_s) == b""
+        byte = device.transmit(leaves_s + 1e-9)
+        assert len(byte) == 1
+        out += byte
+        if leaves_s > 0.018:  # before the first Status of the device gets in line
+            return
+    (frame,) = FrameDecoder().feed(out)
+    assert isinstance(decode(frame.function, frame.payload), Identity)
+
+
+def test_a_written_burst_arrives_one_byte_after_the_other() -> None:
+    device = a_device(baud=115_200)
+    frames = b"".join(encode_frame(2, n, encode(Drive(0.0, 0.0, DriveMode.OFF, n))) for n in range(1, 6))
+    device.receive(0.0, frames)
+    duration_s = len(frames) * 10 / 115_200
+    decoder = FrameDecoder()
+    received = decoder.feed(device.transmit(duration_s / 2.0))
+    assert len(received) < 6
+    received += decoder.feed(device.transmit(1.0))
+    states = [decode(f.function, f.payload) for f in received if f.function == FUNCTION[State]]
+    assert len(states) == 5
+    gaps_s = [after.device_time_s - before.device_time_s for before, after in pairwise(states)]
+    assert gaps_s == pytest.approx([len(frames) / 5 * 10 / 115_200] * 4, abs=2e-5)
+
+
+def answered(device: MessageDevice, time_s: float, counter: int) -> Packet:
+    """The State that a Drive is answered with."""
+    device.receive(time_s, FUNCTION[Drive], encode(Drive(0.0, 0.0, DriveMode.OFF, counter)))
+    device.advance(time_s + 9e-4)
+    answer = next(packet for packet in device.outbox if packet.function == FUNCTION[State])
+    device.outbox.clear()
+    return answer
+
+
+def test_replies_are_delayed_by_the_stated_jitter() -> None:
+    device = MessageDevice(SAMPLE_1, SteadyHand(), seed=5)
+    delays_us = [(answered(device, n * 1e-3, n % 256).time_s - n * 1e-3) * 1e6 for n in range(1, 501)]
+    assert 0.0 <= min(delays_us) <= max(delays_us) <= 50.0 + 1e-6
+    assert sum(delays_us) / len(delays_us) == pytest.approx(25.0, abs=3.0)
+
+
+@pytest.mark.parametrize("ppm", [-1000.0, 30.0, 1000.0])
+def test_the_device_clock_runs_off_by_its_ppm_and_wraps(ppm: float) -> None:
+    device = a_device(ppm=ppm, jitter_us=50.0).messages
+    span_s = period(State, "device_time_s")
+    seen_s = 0.0
+    for n in range(1, 40):
+        packet = answered(device, n * 0.05, n)
+        seen_s += (decode(packet.function, packet.payload).device_time_s - seen_s) % span_s
+    assert seen_s > 2.0 * span_s
+    assert seen_s == pytest.approx(packet.time_s * (1.0 + ppm * 1e-6), abs=2e-5)
+
+
+def test_status_comes_on_the_devices_own_clock() -> None:
+    device = a_device(ppm=1000.0)
+    device.advance(20.0)
+    assert len(FrameDecoder().feed(device.transmit(20.0))) == math.floor(20.0 * 1.001 / 0.02)
+
+
+def test_handle_and_force_are_those_of_the_plant_in_sensor_steps() -> None:
+    device = a_device()
+    device.receive(13.0, encode_frame(2, 0, encode(Drive(0.0, 0.0, DriveMode.OFF, 1))))
+    frames = FrameDecoder().feed(device.transmit(13.01))
+    sense = next(message for f in frames if isinstance(message := decode(f.function, f.payload), Sense))
+    span_mm = period(Sense, "handle_position_mm")
+    turned_mm = 13.0 * SteadyHand().rpm / 60.0 * math.tau * 20.0
+    assert turned_mm > span_mm
+    assert (sense.handle_position_mm, sense.force_N) == pytest.approx(
+        (turned_mm % span_mm, device.truth.force_N), abs=0.05
+    )
+
+
+def test_corrupt_and_foreign_payloads_are_counted_and_dropped() -> None:
+    device = MessageDevice(SAMPLE_1, SteadyHand())
+    drive = encode(Drive(0.5, 0.5, DriveMode.RUN, 1))
+    for function, payload in (
+        (FUNCTION[Drive], bytes((drive[0] ^ 1, *drive[1:]))),
+        (99, b"\x00"),
+        (FUNCTION[Drive], b""),
+        (FUNCTION[State], encode(State(0.0, 0.0, 0.0, 0))),
+    ):
+        device.receive(0.001, function, payload)
+    device.advance(0.01)
+    assert device.undecodable == 3
+    assert not device.outbox
+
+
+def test_a_flood_is_bounded_and_the_device_recovers() -> None:
+    device = a_device()
+    noise = random.Random(1)
+    for _ in range(20):
+        device.receive(0.0, noise.randbytes(100_000))
+    assert device.statistics.bytes <= 65_536
+    device.receive(1.0, b"\x00" + HELLO)
+    assert any(frame.function == FUNCTION[Identity] for frame in FrameDecoder().feed(device.transmit(1.1)))
+
+
+def a_conversation(device: VirtualDevice, cuts_per_ms: int = 1) -> bytes:
+    out = b""
+    for millisecond in range(400):
+        device.receive(
+            millisecond * 1e-3,
+            encode_frame(2, millisecond % 256, encode(Drive(0.0, 0.0, DriveMode.OFF, millisecond % 256))),
+        )
+        for cut in range(1, cuts_per_ms + 1):
+            out += device.transmit((millisecond + cut / cuts_per_ms) * 1e-3)
+    return out
+
+
+def test_the_same_seed_gives_the_same_bytes_however_time_is_cut_and_another_seed_does_not() -> None:
+    once = a_conversation(a_device(seed=1, jitter_us=50.0))
+    assert a_conversation(a_device(seed=1, jitter_us=50.0)) == once
+    assert a_conversation(a_device(seed=1, jitter_us=50.0), cuts_per_ms=7) == once
+    assert a_conversation(a_device(seed=2, jitter_us=50.0)) != once
+
+
+def test_time_that_falls_is_refused() -> None:
+    device = a_device()
+    device.advance(1.0)
+    for attempt in (device.advance, device.transmit, lambda now_s: device.receive(now_s, b"")):
+        for now_s in (0.5, math.nan, math.inf):
+            with pytest.raises(ValueError, match="allowed is from"):
+                attempt(now_s)
+    bus = CanDevice(MessageDevice(SAMPLE_1, SteadyHand()))
+    bus.advance(0.01)
+    with pytest.raises(ValueError, match="now_s"):
+        bus.advance(0.009)
+
+
+def test_next_event_is_never_behind_and_always_comes() -> None:
+    device = a_device()
+    device.receive(0.0, HELLO)
+    now_s = 0.0
+    events = 0
+    while now_s < 0.1:
+        due_s = device.next_event_s
+        assert due_s >= now_s
+        now_s = max(due_s, now_s)
+        device.transmit(now_s)
+        events += 1
+    assert 100 <= events < 300
+
+
+# -- frames of a bus ------------------------------------------------------------------------------------------------
+
+
+def bits_by_hand(frame: CanFrame) -> int:
+    """ISO 11898-1, bit by bit: an oracle without tables."""
+    sent = "0" + f"{frame.identifier:011b}" + "000" + f"{len(frame.data):04b}" + "".join(f"{b:08b}" for b in frame.data)
+    crc = 0
+    for bit in sent:
+        crc = (crc << 1) ^ (0x4599 if (crc >> 14 & 1) ^ int(bit) else 0)
+        crc &= 0x7FFF
+    stuffed = ""
+    for bit in sent + f"{crc:015b}":
+        stuffed += bit
+        if stuffed[-5:] in ("00000", "11111"):
+            stuffed += "1" if bit == "0" else "0"
+    return len(stuffed) + 13
+
+
+def test_bits_are_those_of_the_standard() -> None:
+    noise = random.Random(1)
+    frames = [CanFrame(noise.randrange(0x800), noise.randbytes(noise.randrange(9))) for _ in range(2_000)]
+    frames += [CanFrame(0, bytes(n)) for n in range(9)] + [CanFrame(0x7FF, b"\xff" * n) for n in range(9)]
+    frames += [CanFrame(0x041, bytes([b]) * 8) for b in (0x0F, 0xF0, 0x78, 0x87, 0x1E)]
+    assert [frame for frame in frames if frame_bits(frame) != bits_by_hand(frame)] == []
+
+
+def test_a_frame_survives_the_socket_and_what_is_none_is_refused() -> None:
+    frames = [CanFrame(0x7FF, b""), CanFrame(0x021, b"1234567"), CanFrame(ERROR_FLAG | 0x40, bytes(8))]
+    assert [from_socket(to_socket(frame)) for frame in frames] == frames
+    none = (b"", bytes(15), bytes(17), SOCKET_FRAME.pack(0x21, 9, bytes(8)), SOCKET_FRAME.pack(0x800, 0, b""))
+    assert {from_socket(packet) for packet in none} == {None}
+
+
+# -- the bus -------------------------------------------------------------------------------------------------------
+
+
+def a_bus(bitrate: int = 1_000_000, node: int = 1) -> CanDevice:
+    return CanDevice(MessageDevice(SAMPLE_1, SteadyHand(), seed=1), bitrate, node)
+
+
+def frame_of(message: Message, node: int = 1) -> CanFrame:
+    return CanFrame(can_identifier(FUNCTION[type(message)], node), encode(message))
+
+
+HELLO_FRAME = frame_of(Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1))
+IDENTITY = can_identifier(FUNCTION[Identity])
+STATUS = can_identifier(FUNCTION[Status])
+
+
+def run(device: CanDevice, from_s: float, until_s: float, step_s: float = 1e-5) -> list[tuple[float, Delivery]]:
+    """What goes by, and when it had."""
+    looks_s = (from_s + tick * step_s for tick in range(1, round((until_s - from_s) / step_s) + 1))
+    return [(now_s, delivery) for now_s in looks_s for delivery in device.transmit(now_s)]
+
+
+@pytest.mark.parametrize("bitrate", [1_000_000, 500_000, 125_000])
+def test_a_frame_takes_its_bits_and_is_answered(bitrate: int) -> None:
+    device = a_bus(bitrate)
+    device.receive(0.0001, HELLO_FRAME)
+    seen = run(device, 0.0001, 0.005)
+    (heard_s, hello), (answered_s, identity) = [item for item in seen if item[1].frame.identifier != STATUS]
+    assert hello == Delivery(1, HELLO_FRAME)
+    assert heard_s == pytest.approx(0.0001 + frame_bits(HELLO_FRAME) / bitrate, abs=1.1e-5)
+    assert (identity.sender, identity.frame.identifier) == (DEVICE, IDENTITY)
+    assert answered_s >= heard_s + frame_bits(identity.frame) / bitrate - 1e-9
+
+
+def test_the_lowest_identifier_goes_first_once_the_bus_is_free() -> None:
+    device = a_bus()
+    frames = [CanFrame(identifier, b"12345678") for identifier in (0x700, 0x7F2, 0x012, 0x7F1, 0x012)]
+    for host, frame in enumerate(frames, start=1):
+        device.receive(0.0, frame, host)
+    seen = [delivery for _, delivery in run(device, 0.0, 0.002) if delivery.sender != DEVICE]
+    # the first is on the bus before the others come; equal identifiers go in the order they came
+    assert seen == [Delivery(host, frames[host - 1]) for host in (1, 3, 5, 4, 2)]
+
+
+def test_only_its_own_node_reaches_the_device() -> None:
+    device = a_bus(node=2)
+    device.receive(0.0, HELLO_FRAME)
+    assert not any(delivery.sender == DEVICE for _, delivery in run(device, 0.0, 0.005))
+    device.receive(0.005, frame_of(Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1), node=2))
+    answers = [delivery.frame for _, delivery in run(device, 0.005, 0.01) if delivery.sender == DEVICE]
+    assert [frame.identifier for frame in answers] == [can_identifier(FUNCTION[Identity], 2)]
+
+
+def test_what_the_controllers_cannot_hold_is_lost_and_counted() -> None:
+    device = a_bus(10_000)
+    for _ in range(MAX_WAITING + 10):
+        device.receive(0.0, CanFrame(0x7F2, bytes(8)))
+    assert device.lost == 9, "one is on the bus"
+    run(device, 0.0, 0.5, 1e-3)
+    assert device.messages.undecodable == 0
+
+
+def test_control_at_a_kilohertz_leaves_thirty_percent_of_the_bus() -> None:
+    device = a_bus()
+    device.receive(0.0, HELLO_FRAME)
+    device.transmit(0.01)
+    busy_s = device.busy_s
+    answers: Counter[int] = Counter()
+    for tick in range(500):
+        now_s = 0.01 + tick * 1e-3
+        device.receive(now_s, frame_of(Drive(0.1234, -0.1234, DriveMode.OFF, tick % 256)))
+        answers.update(delivery.frame.identifier for delivery in device.transmit(now_s + 0.999e-3))
+    assert answers[can_identifier(FUNCTION[State])] == answers[can_identifier(FUNCTION[Sense])] == 500
+    assert 0.3 < (device.busy_s - busy_s) / 0.5 < 0.7

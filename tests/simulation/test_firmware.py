@@ -1,0 +1,368 @@
+"""What the device's firmware does with motors, switches and encoders, seen through the wire."""
+
+from collections.abc import Iterable
+from itertools import pairwise
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import pytest
+
+from firmware_protocol.codec import (
+    PROTOCOL_VERSION,
+    SCHEMA_HASH,
+    Clear,
+    DeviceFault,
+    DeviceMode,
+    Hello,
+    Home,
+    Sense,
+    State,
+    Status,
+    Switches,
+)
+from firmware_protocol.conformance.host import Beat, Host
+from firmware_protocol.conformance.line import SerialLine
+from tormagd.simulation.device import VirtualDevice
+from tormagd.simulation.faults import KNOWN, SIZED, parse_fault
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import PlantParameters, load_plant
+
+# -- the firmware, seen through the wire; the rules of the page are the conformance kit's, which it passes -------------
+
+
+SAMPLES = ("sample_1", "sample_2", "sample_3")
+
+PERIOD_S = 1e-3
+COMMAND_TIMEOUT_S = 0.05
+STATUS_PERIOD_S = 0.02
+
+
+class Port:
+    """The serial port of a simulated device, in virtual time: a `BytePort`."""
+
+    def __init__(self, device: VirtualDevice) -> None:
+        self.device = device
+        self.time_s = 0.0
+
+    def now_s(self) -> float:
+        return self.time_s
+
+    def write(self, data: bytes) -> None:
+        self.device.receive(self.time_s, data)
+
+    def read(self, until_s: float) -> list[tuple[float, bytes]]:
+        self.time_s = until_s
+        return [(until_s, self.device.transmit(until_s))]
+
+
+class Bench(Host):
+    """A simulated device and the conformance kit's host of it, which looks through the wire."""
+
+    def __init__(self, faults: Iterable[str] = (), plant: PlantParameters | None = None) -> None:
+        self.device = VirtualDevice(
+            plant or load_plant("sample_1"), SteadyHand(), [parse_fault(fault) for fault in faults]
+        )
+        super().__init__(SerialLine(Port(self.device)))
+
+    def go_to(self, gap_mm: float, seconds: float = 1.5) -> None:
+        """Run to a gap with a plain proportional loop on each carriage, starting homed."""
+        target_mm = gap_mm / 2.0 - 47.5
+        for _ in range(round(seconds / PERIOD_S)):
+            state = self.last(State)
+            errors = (target_mm - state.left_position_mm, target_mm - state.right_position_mm)
+            self.beat(Beat.RUN, *(min(max(2.0 * error, -1.0), 1.0) for error in errors))
+
+    def run_until(self, time_s: float, duty: float = 0.0) -> None:
+        while self.now_s < time_s:
+            self.beat(Beat.RUN, duty, duty)
+
+    def reaches(self, mode: DeviceMode, beat: Beat = Beat.NOTHING, limit_s: float = 10.0) -> None:
+        """Waits until Status shows the mode."""
+        assert self.until(lambda: self.status.mode is mode, limit_s, beat), self.status
+
+
+def running(faults: Iterable[str] = (), *, gap_mm: float = 60.0, plant: str = "sample_1") -> Bench:
+    """A device homed and at that gap, in RUN, which is before 3.4 s."""
+    sample = load_plant(plant)
+    near_home = msgspec.structs.replace(sample.assumed, start_left_mm=46.0, start_right_mm=45.5)
+    host = Bench(faults, msgspec.structs.replace(sample, assumed=near_home))
+    host.homed()
+    host.go_to(gap_mm)
+    assert host.status.mode is DeviceMode.RUN
+    assert host.now_s < 3.4
+    assert host.device.truth.gap_mm == pytest.approx(gap_mm, abs=0.3)
+    return host
+
+
+# -- status, and answers to Drives: exactly, where the kit allows for a wire ------------------------------------------
+
+
+def test_status_comes_fifty_times_a_second_unasked_and_nothing_else_does() -> None:
+    host = Bench()
+    host.pass_time(2.0)
+    assert 99 <= len(host.all_of(Status)) <= 101
+    assert len(host.heard) == len(host.all_of(Status))
+
+
+def test_each_accepted_drive_is_answered_once_by_state_and_sense() -> None:
+    host = Bench()
+    host.pass_time(0.5, Beat.OFF)
+    host.pass_time(0.005)
+    states = [message for _, message in host.all_of(State)]
+    assert len(states) == len(host.all_of(Sense)) == 500
+    assert all((after.counter - before.counter) % 256 == 1 for before, after in pairwise(states))
+    host.pass_time(STATUS_PERIOD_S)
+    assert host.status.drive_counter == 500 % 256
+
+
+# -- what must come before a run -----------------------------------------------------------------------------------
+
+
+def test_drive_run_moves_nothing_before_homing() -> None:
+    host = Bench()
+    host.hello()
+    before_mm = host.device.truth.gap_mm
+    host.run_until(host.now_s + 0.2, -1.0)
+    assert (host.status.mode, host.device.truth.gap_mm) == (DeviceMode.IDLE, before_mm)
+
+
+def test_drive_run_is_refused_without_a_hello() -> None:
+    host = Bench()
+    host.command(Home)
+    host.pass_time(3.0, Beat.OFF)
+    assert Switches.HOMED in host.status.switches
+    host.run_until(host.now_s + 0.1, -1.0)
+    assert host.status.mode is DeviceMode.IDLE
+    host.hello()
+    host.run_until(host.now_s + 0.1, -0.5)
+    assert host.status.mode is DeviceMode.RUN
+
+
+# -- homing --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_homing_zeroes_the_encoders_at_the_open_switches_repeatably(name: str) -> None:
+    host = Bench(plant=load_plant(name))
+    zeros = []
+    for _ in range(2):
+        host.hello()
+        host.home()
+        assert (host.status.mode, host.status.faults) == (DeviceMode.IDLE, DeviceFault(0))
+        truth, state = host.device.truth, host.last(State)
+        zeros.append((truth.left_mm - state.left_position_mm, truth.right_mm - state.right_position_mm))
+        assert (truth.left_mm, truth.right_mm) == pytest.approx((47.5, 47.5), abs=0.05)
+        assert host.status.switches == Switches.LEFT_OPEN | Switches.RIGHT_OPEN | Switches.HOMED
+        host.go_to(80.0, 1.0)
+        host.pass_time(2.0, Beat.OFF)
+    assert [zero for pair in zeros for zero in pair] == pytest.approx([47.5] * 4, abs=0.02)
+    assert zeros[0] == pytest.approx(zeros[1], abs=0.01)
+
+
+@pytest.mark.parametrize("fault", ["encoder_stuck_left", "motor_reversed_left", "encoder_reversed_left"])
+def test_homing_that_fails_opens_where_it_can_and_does_not_press_shut(fault: str) -> None:
+    """Without an encoder it opens blind; what goes the wrong way cannot, and ends where it is at once."""
+    host = Bench([fault])
+    before = host.device.truth
+    host.command(Home)
+    smallest_mm = before.gap_mm
+    is_reversed = "reversed" in fault
+    while host.status.mode is not DeviceMode.LATCHED:
+        host.pass_time(0.01, Beat.OFF)
+        assert host.now_s < (2.0 if is_reversed else 20.0)
+        smallest_mm = min(smallest_mm, host.device.truth.gap_mm)
+    host.pass_time(3.0, Beat.OFF)
+    assert (host.status.mode, host.status.faults) == (DeviceMode.LATCHED, DeviceFault.HOMING_FAILED)
+    assert Switches.HOMED not in host.status.switches
+    assert not host.device.messages.firmware.output.enabled
+    if is_reversed:
+        assert abs(host.device.truth.left_mm - before.left_mm) < 2.0
+    else:
+        assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
+        assert smallest_mm > 78.0
+
+
+def test_duties_are_applied_in_steps_of_ten_bits() -> None:
+    def travel(duty: float) -> float:
+        host = running()
+        host.run_until(host.now_s + 0.3, duty)
+        return host.device.truth.gap_mm
+
+    step = 1.0 / 1023.0
+    assert travel(512.3 * step) == travel(511.7 * step) == travel(512 * step)
+    assert travel(513 * step) > travel(512 * step) > 60.0
+
+
+# -- ways out of a run ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_silence_opens_the_gap_and_latches(name: str) -> None:
+    host = running(plant=name)
+    host.run_until(host.now_s + 0.2)  # stand still first
+    stood_mm, silent_s = host.device.truth.gap_mm, host.now_s
+    trace = []
+    while host.status.mode is not DeviceMode.LATCHED:
+        host.beat(Beat.NOTHING)
+        trace.append((host.now_s - silent_s, host.device.truth.gap_mm, host.device.truth.force_N))
+    silence_s, gap_mm, force_N = np.array(trace).T
+    assert COMMAND_TIMEOUT_S - 1e-3 <= silence_s[gap_mm > stood_mm + 0.05][0] < COMMAND_TIMEOUT_S + 0.03
+    # from 60 mm, with what the sensorless watch waits and the bounded travel
+    assert 0.3 < silence_s[force_N < 1.0][0] < 0.8
+    assert np.diff(gap_mm, prepend=stood_mm).max() / PERIOD_S < 2 * 20.0
+    assert host.status.faults == DeviceFault.COMMAND_TIMEOUT
+    assert Switches.HOMED not in host.status.switches
+    assert host.device.truth.gap_mm == pytest.approx(95.0, abs=0.6)
+    assert host.device.truth.left_A == 0.0
+
+
+class Ending(NamedTuple):
+    """How a run from a gap of `gap_mm` ends, with these faults of the device, while the host drives so."""
+
+    faults: tuple[str, ...]
+    duties: tuple[float, float] | None
+    "None: it falls silent."
+    gap_mm: float
+    at_once: DeviceFault
+    "What is latched when it is out of RUN."
+    latched: DeviceFault
+    "And once the drives are off."
+    left_mm: float
+    right_mm: float
+    "Where the carriages are then."
+    within_mm: float = 0.3
+
+
+OPEN_MM = 47.5
+ENDINGS = {
+    "a closed switch": Ending((), (-0.3, -0.3), 50.0, DeviceFault.END_STOP, DeviceFault.END_STOP, OPEN_MM, OPEN_MM),
+    "skew": Ending((), (0.4, -0.4), 60.0, DeviceFault.SKEW, DeviceFault.SKEW, OPEN_MM, OPEN_MM),
+    # the other carriage is opened all the same
+    "a blocked carriage": Ending(
+        ("blocked_left@3.5",),
+        (1.0, 0.0),
+        60.0,
+        DeviceFault.OVERCURRENT,
+        DeviceFault.OVERCURRENT | DeviceFault.RETRACT_FAILED,
+        30.0,
+        OPEN_MM,
+    ),
+    "a stiff guide": Ending(
+        ("drag_left=+1000%@3.5",),
+        None,
+        60.0,
+        DeviceFault.COMMAND_TIMEOUT,
+        DeviceFault.COMMAND_TIMEOUT,
+        OPEN_MM,
+        OPEN_MM,
+    ),
+    # found by the skew, and opened blind
+    "a stuck encoder": Ending(
+        ("encoder_stuck_left@3.5",), (-0.3, -0.3), 60.0, DeviceFault.SKEW, DeviceFault.SKEW, OPEN_MM, OPEN_MM
+    ),
+    "no supply": Ending(
+        ("supply_loss@3.5",),
+        (0.0, 0.0),
+        60.0,
+        DeviceFault.SUPPLY,
+        DeviceFault.SUPPLY | DeviceFault.RETRACT_FAILED,
+        30.0,
+        30.0,
+        0.16,
+    ),
+    "a worn gearbox without supply": Ending(
+        ("worn_gearbox@3.5", "supply_loss@3.5"),
+        (0.0, 0.0),
+        48.0,
+        DeviceFault.SUPPLY,
+        DeviceFault.SUPPLY | DeviceFault.UNCOMMANDED_MOTION | DeviceFault.RETRACT_FAILED,
+        22.0,
+        22.0,
+        0.24,
+    ),
+    "a worn gearbox after a reset": Ending(
+        ("worn_gearbox@3.6", "reset@3.5"),
+        (0.0, 0.0),
+        48.0,
+        DeviceFault(0),
+        DeviceFault.UNCOMMANDED_MOTION,
+        OPEN_MM,
+        OPEN_MM,
+    ),
+}
+
+
+@pytest.mark.parametrize("ending", ENDINGS.values(), ids=ENDINGS)
+def test_how_a_run_ends(ending: Ending) -> None:
+    host = running(ending.faults, gap_mm=ending.gap_mm)
+    host.run_until(3.5)
+    beat = (Beat.NOTHING,) if ending.duties is None else (Beat.RUN, *ending.duties)
+    while host.status.mode is DeviceMode.RUN:
+        host.beat(*beat)
+        assert host.now_s < 20.0
+    assert host.status.faults == ending.at_once
+    truth = host.device.truth
+    assert abs(truth.left_mm - truth.right_mm) < 4.0
+    assert truth.gap_mm > 44.0 - 1e-6
+    host.reaches(DeviceMode.LATCHED)
+    host.pass_time(1.0)
+    truth = host.device.truth
+    assert (host.status.faults, truth.left_A, truth.right_A) == (ending.latched, 0.0, 0.0)
+    assert (truth.left_mm, truth.right_mm) == pytest.approx((ending.left_mm, ending.right_mm), abs=ending.within_mm)
+
+
+def test_a_fault_is_not_cleared_while_its_cause_lasts() -> None:
+    host = running(["supply_loss@3.5"])
+    host.run_until(3.5)
+    stood_mm = host.device.truth.gap_mm
+    host.reaches(DeviceMode.LATCHED)
+    assert host.status.supply_V == 0.0
+    assert host.device.truth.gap_mm == pytest.approx(stood_mm, abs=0.02)
+    assert host.is_refused(Clear)
+
+
+# -- injected faults -----------------------------------------------------------------------------------------------
+
+
+def test_reset_forgets_zero_handshake_and_mode_but_holds_the_gap() -> None:
+    host = running(["reset@3.5"], gap_mm=60.0)
+    host.run_until(3.6, -0.2)
+    assert host.status.mode is DeviceMode.IDLE
+    assert Switches.HOMED not in host.status.switches
+    stood_mm = host.device.truth.gap_mm
+    host.pass_time(0.5, Beat.OFF)
+    assert host.device.truth.gap_mm == pytest.approx(stood_mm, abs=1e-6)
+    assert host.last(State).left_position_mm == pytest.approx(0.0, abs=0.3)
+    host.homed()
+    host.go_to(60.0)
+
+
+def test_a_gap_that_closes_fast_is_noticed_while_the_device_still_tries_to_open() -> None:
+    host = running(["worn_gearbox@3.5", "supply_loss@3.5"], gap_mm=47.0, plant="sample_3")
+    host.run_until(3.5)
+    while DeviceFault.UNCOMMANDED_MOTION not in host.status.faults:
+        host.beat(Beat.NOTHING)
+        assert host.now_s < 5.0
+    assert host.status.mode is DeviceMode.RETRACTING
+    assert DeviceFault.RETRACT_FAILED not in host.status.faults
+
+
+def test_a_device_that_is_mended_homes_as_a_healthy_one() -> None:
+    """After all faults that last have struck it at rest; what they made it latch, it clears."""
+    passing = ("frozen", "reset", "encoder_jump", "encoder_jump_left")
+    lasting = [f"{name}=+20%" if name in SIZED else name for name in KNOWN if name not in passing]
+    mended, healthy = Bench(f"{fault}@0.1" for fault in lasting), Bench()
+    mended.pass_time(0.2)
+    healthy.pass_time(0.2)
+    assert mended.device.messages.firmware.faults
+    mended.device.messages.mend()
+    for host in (mended, healthy):
+        for message in (Hello(SCHEMA_HASH, PROTOCOL_VERSION, 1), Clear(2), Home(3)):
+            host.send(message)
+        host.pass_time(5.8, Beat.OFF)
+        host.pass_time(2.0 * STATUS_PERIOD_S)
+    assert mended.status == healthy.status
+    assert Switches.HOMED in mended.status.switches
+    assert mended.last(State).left_position_mm == pytest.approx(healthy.last(State).left_position_mm, abs=0.01)
+    assert mended.last(Sense).handle_position_mm == healthy.last(Sense).handle_position_mm
