@@ -24,7 +24,6 @@ class Measure:
 
     measured: Measured | None = None
     "The newest; None while the device has said nothing."
-    sight: Sight
     leap: Leap | None = None
     "Of the encoders, until the device has said whether it was reset."
 

@@ -22,7 +22,6 @@ class Nominal:
         self._displacements_mm: Final = model.feature_ranges[0]
         self._rates_mm_s: Final = model.feature_ranges[1]
         self.fields_mT: Final = model.feature_ranges[2]
-        self.slides: Final = contact.slides
         self.only: Final[ForceCurve] = self._curve(contact.displacement_mm, contact.rate_mm_s)
 
     def now(self, measured: Measured) -> ForceCurve:

@@ -317,7 +317,9 @@ class TelemetryLoop:
             limit_details=self._causes.of_limits(newest.limits, outside, inbox.told(now_s), self._control.measurement),
             newest_stall=self._causes.newest_stall(),
             not_granted=self._not_granted,
-            way=self._way.report(None if link.round_trip_us is None else link.round_trip_us.p50, believe.carriages.lag_s),
+            way=self._way.report(
+                None if link.round_trip_us is None else link.round_trip_us.p50, believe.carriages.lag_s
+            ),
             black_box=self._box.report(),
             output=OutputReport(rate=acted.rate, slew=acted.slew, not_finite=acted.not_finite, range=acted.range),
             next_commands=tuple(map(str, next_commands(safety, newest.is_homed))),

@@ -25,7 +25,6 @@ class Portrait:
         self.gap_mm: Final = gap_mm
         self.force_N: Final = force_N
         self.slope_N_mm: Final = slope_N_mm
-        self._open_mm: Final = gap_mm[0]
         self._step_mm: Final = (gap_mm[0] - gap_mm[-1]) / (len(gap_mm) - 1)
         self._rising_N: Final = Rising(force_N)
 
@@ -55,7 +54,7 @@ class Portrait:
 
     def force_N_at(self, gap_mm: float) -> float:
         """What this gap gives; of the nearest end of the range outside of it."""
-        return at_step(max((self._open_mm - gap_mm) / self._step_mm, 0.0), self.force_N)
+        return at_step(max((self.gap_mm[0] - gap_mm) / self._step_mm, 0.0), self.force_N)
 
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
         """The fastest change of force that a gap speed renders at this force."""

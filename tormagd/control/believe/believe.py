@@ -64,15 +64,6 @@ NOTHING_LEARNED: Final = Learned()
 class Believe:
     """The estimators of one device."""
 
-    memory: ElementMemory
-    handle: HandleWatch
-    strength: Strength
-    slow: SlowFriction
-    zero: SensorZero
-    sensor: SensorTrust
-    carriages: CarriageLag
-    learns: bool
-    "Whether anything is learned. What protects goes on without: the sensor is judged, and a lie makes it forgotten."
     read: int = -1
     "Number of the newest measurement that taught,"
     read_s: float
@@ -93,10 +84,12 @@ class Believe:
         self._nominal: Final = nominal
         self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)
         self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
-        self.learns, self.read_s = terms.learning, -math.inf
-        self._has_lag: Final = terms.lag
-        self._has_creep: Final = terms.creep and nominal.slides
-        self._fits: Final = terms.scale or terms.offset
+        self.read_s = -math.inf
+        self.learns = terms.learning
+        """Whether anything is learned. What protects goes on without: the sensor is judged, and a lie makes it
+        forgotten."""
+        self._terms: Final = terms
+        self._has_creep: Final = terms.creep and nominal.contact.slides
 
     @property
     def device(self) -> DeviceFit:
@@ -139,7 +132,7 @@ class Believe:
 
     def expect(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
         """Learns how late the carriages are, once a plan is made `dt_s` after the last."""
-        if not (self.learns and self._has_lag):
+        if not (self.learns and self._terms.lag):
             return
         if measured is None or not measured.is_homed or foresight < MIN_FORESIGHT:
             self.carriages.update(dt_s, None, 0.0, 0.0, self._top_speed_mm_s)
@@ -156,13 +149,13 @@ class Believe:
         if measured is not None and model_N is not None and self._nominal.contact.is_known(measured):
             slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
             predicted_N = self.strength.fit.force_N(model_N) * slow
-        lag_s = self.carriages.lag_s if self._has_lag else 0.0
+        lag_s = self.carriages.lag_s if self._terms.lag else 0.0
         limits = (*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits
         return Belief(device, at_speed, lag_s, predicted_N, limits, self.sensor.doubted_s)
 
     def _hear(self, now_s: float, measured: Measured, model_N: float) -> None:
         """Learns from the newest reading, where the model says `model_N`."""
-        if self._nominal.slides:
+        if self._nominal.contact.slides:
             self.handle.update(measured.sensed_s, measured.handle_mm, measured.force_N, model_N)
         if measured.number == self.read or now_s - self.read_s < MIN_DT_S:
             return
@@ -172,7 +165,7 @@ class Believe:
         self.read, self.read_s = measured.number, now_s
         rate_mm_s = abs(measured.handle.rate_mm_s)
         is_mobilised = self._nominal.contact.is_known(measured)
-        is_slow = self._nominal.slides and (rate_mm_s < MOVING_MM_S or self.handle.moved_gap_at_rest(model_N))
+        is_slow = self._nominal.contact.slides and (rate_mm_s < MOVING_MM_S or self.handle.moved_gap_at_rest(model_N))
         if is_mobilised and not is_slow:
             self._hear_at_speed(now_s, measured, model_N, dt_s)
         else:
@@ -225,7 +218,7 @@ class Believe:
     def _fit(self, measured: Measured, model_N: float, reading_N: float, dt_s: float) -> None:
         if self._has_creep:
             self.slow.follow(model_N, measured.handle_mm)
-        if not (self.learns and self._fits):
+        if not (self.learns and (self._terms.scale or self._terms.offset)):
             return
         before_N = self.strength.fit.force_N(model_N)
         self.strength.update(model_N, reading_N, dt_s)

@@ -65,9 +65,8 @@ class SlowFriction:
     def rescale(self, before_N: float, after_N: float) -> None:
         """The fit now expects `after_N` where it expected `before_N`: the force at a creep stays what it was, as far as
         that was learned at a creep."""
-        if before_N == after_N or self.learned == 0.0 or not (before_N > 0.0 and after_N > 0.0):
-            return
-        self.factor = min(max(self.factor * math.pow(before_N / after_N, self.learned), MIN_FACTOR), MAX_FACTOR)
+        if before_N > 0.0 and after_N > 0.0:
+            self.factor = min(max(self.factor * math.pow(before_N / after_N, self.learned), MIN_FACTOR), MAX_FACTOR)
 
     def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Takes a reading along a motion at `rate_mm_s`. The fit gives more than nothing of what was followed."""

@@ -83,8 +83,6 @@ class DeviceFit(Value):
 
     def times(self, factor: float) -> "DeviceFit":
         """The fit of a device that gives `factor` > 0 times the force."""
-        if factor == 1.0:
-            return self
         square = factor * factor
         return DeviceFit(
             factor * self.scale,
@@ -96,8 +94,6 @@ class DeviceFit(Value):
 
     def relaxed(self, relaxed_N: float) -> "DeviceFit":
         """The fit over the model's force without memory, of a device whose force it is without `relaxed_N` of that."""
-        if relaxed_N == 0.0:
-            return self
         by_scale_N = relaxed_N * self.scale_variance
         return DeviceFit(
             self.scale,
