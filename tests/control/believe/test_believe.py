@@ -99,8 +99,8 @@ def test_before_it_is_mobilised_only_more_force_than_expected_teaches(
     planner, hear, moving, force_N: float, teaches: bool
 ) -> None:
     handle = Handle(MOBILISED_MM - 0.01, 1.0, TURN, 1.0)
-    assert (hear(planner, 0.2, moving(force_N=force_N, handle=handle)).believe.slow.factor > 1.0) is teaches
-    assert planner.believe.slow.learned > 0.0 or not teaches
+    slow = hear(planner, 0.2, moving(force_N=force_N, handle=handle)).believe.slow
+    assert (slow.learned > 0.0, slow.factor > 1.0) == (teaches, teaches)
 
 
 @pytest.mark.parametrize("goes_on", [False, True])
