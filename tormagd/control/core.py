@@ -138,7 +138,7 @@ class Stepper:
         self.safety = latch(self.safety, (fault,))
 
     def lose_link(self) -> None:
-        """The link broke: a fault where the device was driven, otherwise only a forgotten device."""
+        """The link broke: the device is forgotten; where it was driven, that is a fault."""
         if self.safety.is_driven:
             self.latch(Fault.LINK_LOST)
         self.measure.lose_device()

@@ -98,7 +98,8 @@ class LawOfField:
 def law_beside(
     shown: Portrait, law: PowerFieldLaw, field: FieldOfGap, elastomer: Elastomer, geometry: Geometry
 ) -> LawOfField:
-    """The law beside a portrait. Raises `DomainError` where the gaps leave the law's domain."""
+    """The force law over the gaps of a portrait, times the median of how much stronger that is. Raises `DomainError`
+    where the gaps leave the law's domain."""
     forces_N = brake_force_N(law.radial_moment_Tm(np.array(shown.gap_mm)), elastomer, geometry)
     scale = float(np.median(np.array(shown.force_N) / forces_N))
     scaled_N: list[float] = (scale * forces_N).tolist()

@@ -121,8 +121,8 @@ class Forecast:
 
     @property
     def trust(self) -> float:
-        """0..1: how far the forecast takes the place of the slope; half of what would have been best, and nothing where
-        nothing was gained."""
+        """0..1: how far the forecast takes the place of the slope. It is the skill of LONG_S, less the share of it that
+        SHORT_S lost, and 0 while nothing is forecast."""
         if not self.changes_N:
             return 0.0
         earned, lost = self.long.score, -self.short.score
@@ -175,8 +175,8 @@ class Forecast:
         return True
 
     def forces_N(self, begins_s: float, after_s: list[float]) -> list[float]:
-        """The forces at these times (n) after `begins_s`, 0 or more, from the newest setpoint on; they stay where the
-        forecast ends. Only where `trust` is above 0."""
+        """The forces at `begins_s` plus each of `after_s` (n), all 0 or more, after the newest setpoint; they stay
+        where the forecast ends. Only where `trust` is above 0."""
         changes = self.changes_N
         # the forecast starts at the newest setpoint, which may have come some steps after the point it is from
         since_s = self.stamp_s - self.from_s

@@ -121,7 +121,8 @@ class Believe:
         self.handle = HandleWatch()
 
     def update(self, now_s: float, measured: Measured | None) -> Belief:
-        """What is believed at `now_s`. `measured` is None while the device has said nothing."""
+        """Learns from what is measured, where that is new, and says what is believed at `now_s`. `measured` is None
+        while the device has said nothing."""
         model_N: float | None = None
         if measured is not None:
             self.memory.update(now_s, measured)
@@ -131,7 +132,8 @@ class Believe:
         return self._belief(measured, model_N)
 
     def expect(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
-        """Learns how late the carriages are, once a plan is made `dt_s` after the last."""
+        """Learns how late the carriages are, once a plan is made `dt_s` after the last: from its gap, `planned_mm`, and
+        the measured one, where its `foresight`, 0..1, says that it knows what comes."""
         if not (self.learns and self._terms.lag):
             return
         if measured is None or not measured.is_homed or foresight < MIN_FORESIGHT:

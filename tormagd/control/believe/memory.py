@@ -69,7 +69,7 @@ class ElementMemory:
         return curve.force_N(within(self.field_mT - self.lag_mT, self._nominal.fields_mT)) - self.relaxed_N
 
     def update(self, now_s: float, measured: Measured) -> None:
-        """Takes the newest gap."""
+        """Follows the field's lag and what has relaxed to `now_s`, by the measured gap."""
         slides = self._nominal.contact.slides
         is_empty = self.time_s == -math.inf
         if slides and not measured.is_homed:

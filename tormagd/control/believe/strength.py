@@ -77,7 +77,7 @@ class DeviceFit(Value):
         return (force_N - self.offset_N) / self.scale
 
     def deviation_N(self, model_N: float) -> float:
-        """Standard deviation of `force_N` there."""
+        """Standard deviation of the force that the device gives where the model says `model_N`."""
         variance = model_N * (model_N * self.scale_variance + 2.0 * self.covariance_N) + self.offset_variance_N2
         return math.sqrt(max(variance, 0.0))
 
@@ -207,10 +207,10 @@ class Strength:
         )
 
     def settle(self) -> None:
-        """Nothing can be learned now: what comes then is no surprise yet."""
+        """Nothing can be learned now: what comes after that is no surprise yet, and no bound holds the scale."""
         self.surprise_N, self.is_held = 0.0, False
 
     def forget(self, fit: DeviceFit = UNSEEN) -> None:
-        """Takes `fit` for what is known."""
+        """Forgets what was learned: `fit` is what is known from now on."""
         self.fit = fit
         self.settle()

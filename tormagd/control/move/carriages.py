@@ -59,7 +59,7 @@ class Carriages(Actuator):
         self._terms: Final = terms_of(scene)
 
     def begin(self, gap_mm: float) -> None:
-        """Begins bumpless, with empty integrators."""
+        """See `Actuator.begin`: with empty integrals, so that no duty jumps."""
         self.reference = Reference(gap_mm)
         self.expected.begin(gap_mm)
         self.left.begin()
