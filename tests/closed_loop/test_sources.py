@@ -232,6 +232,7 @@ def test_the_whole_way_is_measured_part_by_part(armed: ClosedLoop) -> None:
     # in ticks of 1 ms: what arrives is read in the next, planned in it, and driven in the one after; bins are 3% wide
     assert 0.0 < found.to_duty_us.p50 - delay_us.p50 <= 1_000.0 + 0.04 * delay_us.p50
     assert delay_us.p50 == pytest.approx(81e3, rel=0.04)
+    assert found.carriages_ms is not None
     assert found.total_ms == pytest.approx((found.to_duty_us.p99 + 400.0) * 1e-3 + found.carriages_ms, abs=0.02)
     assert found.total_ms is not None
     assert (found.total_ms < 400.0, found.budget_ms) == (True, 400.0)
