@@ -57,18 +57,24 @@ class Aim:
     "The element's field at it: where several fields give a force, the one nearest to this is taken."
 
     def __init__(self, config: Config, scene: Scene, element: Element) -> None:
-        self._element: Final = element
-        self._insert: Final = scene.insert
-        self._position: Final = config.position
+        self._nominal: Final = element.nominal
+        self._field: Final = element.field
+        self._portrait: Final = element.portrait
+        self._search: Final = element.search
+        self._law: Final = element.law
+        self._closed_mm: Final = scene.insert.gap_closed_mm
+        self._open_mm: Final = scene.insert.gap_open_mm
         self._ceiling_N: Final = CEILING * scene.force.most_N
+        self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
+        self._max_mm_s2: Final = config.position.gap_acceleration_mm_s2
         self._low_confidence: Final = config.limits.low_confidence
 
     def begin(self, now_s: float, number: int, lag_mT: float) -> Plan:
         """The plan before the first, numbered `number`: gap open. The element's field lags by `lag_mT`."""
-        open_mm, element = self._insert.gap_open_mm, self._element
-        field_mT, min_N = element.field.field_mT(open_mm), element.portrait.min_N
+        field_mT = self._field.field_mT(self._open_mm)
         self.number, self.element_mT = number, field_mT - lag_mT
-        return Plan(number, now_s, None, None, min_N, None, field_mT, open_mm, 0.0, 1.0, (Limit.NO_SETPOINT,))
+        min_N = self._portrait.min_N
+        return Plan(number, now_s, None, None, min_N, None, field_mT, self._open_mm, 0.0, 1.0, (Limit.NO_SETPOINT,))
 
     def update(
         self,
@@ -81,17 +87,17 @@ class Aim:
     ) -> Plan:
         """The plan for what is asked of the device that is believed in, whose element has this `memory`. `setpoint` is
         what `ask` was made of. Raises DomainError where no field or gap can be found."""
-        device, element, insert = belief.device, self._element, self._insert
-        curve, outside = element.nominal.planned(setpoint if ask.is_meant else None, measured)
+        device = belief.device
+        curve, outside = self._nominal.planned(setpoint if ask.is_meant else None, measured)
         wanted_N = device.model_N(ask.path_N[0])
-        solution = element.search.solve(curve, wanted_N, self.element_mT)
-        element_mT = lawful_mT(element.law, wanted_N, solution.field_mT)
+        solution = self._search.solve(curve, wanted_N, self.element_mT)
+        element_mT = lawful_mT(self._law, wanted_N, solution.field_mT)
         if element_mT != solution.field_mT:
             outside = (*outside, Outside(FEATURES[2], solution.field_mT, element_mT))
         field_mT = element_mT + memory.lag_at_mT(element_mT + memory.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
-        wanted_mm = min(max(element.field.gap_mm(field_mT), insert.gap_closed_mm), insert.gap_open_mm)
-        min_mm = ceiling_mm(element.portrait, device, self._ceiling_N)
+        wanted_mm = min(max(self._field.gap_mm(field_mT), self._closed_mm), self._open_mm)
+        min_mm = ceiling_mm(self._portrait, device, self._ceiling_N)
         self.number += 1
         self.element_mT = field_mT - memory.lag_mT
         limits = self._limits(ask, belief.limits, outside, min_mm > wanted_mm, solution)
@@ -160,12 +166,11 @@ class Aim:
     def _motion_ahead(self, path_N: list[float], device: DeviceFit) -> tuple[float, float]:
         """Speed and acceleration of the gap along these forces at PATH_S (7), within what the carriages do."""
         # along the portrait, not from one solution to the next: a difference would amplify the solver's grain
-        portrait = self._element.portrait
-        start_mm = portrait.gap_mm_at(device.model_N(path_N[0]))
+        start_mm = self._portrait.gap_mm_at(device.model_N(path_N[0]))
         speed, acceleration = 0.0, 0.0
         for place, force_N in enumerate(path_N):
-            away_mm = portrait.gap_mm_at(device.model_N(force_N)) - start_mm
+            away_mm = self._portrait.gap_mm_at(device.model_N(force_N)) - start_mm
             speed += _TO_SPEED[place] * away_mm
             acceleration += _TO_ACCELERATION[place] * away_mm
-        top, hardest = self._position.gap_speed_mm_s, self._position.gap_acceleration_mm_s2
+        top, hardest = self._top_speed_mm_s, self._max_mm_s2
         return min(max(speed, -top), top), min(max(acceleration, -hardest), hardest)

@@ -63,11 +63,15 @@ class Governor:
         self, now_s: float, portrait: Portrait, force: Force, gap_speed_mm_s: float, terms: Terms = EVERY_TERM
     ) -> None:
         """`force` is the scene's."""
-        self._terms: Final = terms
+        self._has_slope: Final = terms.slope
+        self._has_forecast: Final = terms.forecast
+        self._has_preview: Final = terms.preview
         self._portrait: Final = portrait
         self._path: Final = Path(portrait, gap_speed_mm_s)
         self._gap_speed_mm_s: Final = gap_speed_mm_s
-        self._force: Final = force
+        self._min_N: Final = force.least_N
+        self._max_N: Final = force.most_N
+        self._release_N_s: Final = force.release_N_s
         self.forecast = Forecast()
         self.begin(now_s)
 
@@ -91,14 +95,14 @@ class Governor:
             return self._decay(dt_s, lowest_N, age_s, stale)
         highest_N = max(device.force_N(self._portrait.max_N), 0.0)
         # what comes is told from what is asked: the least that the device makes is learned, and so it varies
-        allowed_N = min(max(setpoint.force_N, self._force.least_N), self._force.most_N)
+        allowed_N = min(max(setpoint.force_N, self._min_N), self._max_N)
         force_N, limits = _within_reach(setpoint.force_N, allowed_N, lowest_N, highest_N)
         if setpoint.is_contested:
             limits = (*limits, Limit.OTHER_SOURCE)
         self._hear(setpoint, allowed_N, force_N, device)
-        bounds = min(max(self._force.least_N, lowest_N), highest_N), min(max(self._force.most_N, lowest_N), highest_N)
+        bounds = min(max(self._min_N, lowest_N), highest_N), min(max(self._max_N, lowest_N), highest_N)
         governed_N, foresight = force_N, 1.0
-        if setpoint.preview_N and self._terms.preview:
+        if setpoint.preview_N and self._has_preview:
             path_N, expected_N = self._previewed(setpoint, max(age_s, 0.0), dt_s, force_N, bounds, device, lag_s)
             governed_N = within(expected_N, bounds)
         else:
@@ -107,7 +111,7 @@ class Governor:
         if abs(governed_N - force_N) > OUTRUN_N:
             limits = (*limits, Limit.RATE)
         if self.is_passing and self._passes(path_N[0], dt_s):
-            governed_N = self.asked_N + math.copysign(self._force.release_N_s * dt_s, path_N[0] - self.asked_N)
+            governed_N = self.asked_N + math.copysign(self._release_N_s * dt_s, path_N[0] - self.asked_N)
             path_N, self.sent_N, self.expected_N = [governed_N] * len(PATH_S), None, None
             limits, foresight = (*limits, Limit.TAKEOVER), 0.0
         self.asked_N, self.above_N = path_N[0], max(path_N[0] - lowest_N, 0.0)
@@ -115,7 +119,7 @@ class Governor:
 
     def foresee(self) -> bool:
         """Prepares a forecast for the next plans, where one is due, and tells whether: for the time between plans."""
-        return self._terms.forecast and self.forecast.foresee(self.slope_N_s)
+        return self._has_forecast and self.forecast.foresee(self.slope_N_s)
 
     def _hear(self, setpoint: TimedSetpoint, allowed_N: float, force_N: float, device: DeviceFit) -> None:
         """Takes the setpoint's slope, and whose it is."""
@@ -123,7 +127,7 @@ class Governor:
         if setpoint.holder != self.holder:  # another publisher's forces say nothing of this one's
             self.holder, self.is_passing, self.slope_N_s = setpoint.holder, True, 0.0
             self.forecast.forget()
-        elif spacing_s > MAX_STEP_S or not self._terms.slope:
+        elif spacing_s > MAX_STEP_S or not self._has_slope:
             self.slope_N_s = 0.0
         elif spacing_s > 0.0:
             rate_N_s = device.scale * self._portrait.force_rate_N_s(device.model_N(force_N), self._gap_speed_mm_s)
@@ -133,7 +137,7 @@ class Governor:
 
     def _foreseen(self, stamp_s: float, allowed_N: float, age_s: float) -> float:
         """How far the forecast is trusted after this setpoint."""
-        if not self._terms.forecast:
+        if not self._has_forecast:
             return 0.0
         self.forecast.update(stamp_s, allowed_N)
         # one that has fallen silent for longer than a stream may is not believed to go on as it did
@@ -151,10 +155,10 @@ class Governor:
     ) -> tuple[list[float], float]:
         """The forces at PATH_S on the best path for a preview, from `soon_s` after its stamp on; and the one by now,
         behind the carriages' lag."""
-        if self._terms.forecast and setpoint.preview_s < TIMES_S[-1]:
+        if self._has_forecast and setpoint.preview_s < TIMES_S[-1]:
             # what comes after its end is foreseen from there
             self.slope_N_s = setpoint.preview_slope_N_s
-            last_N = min(max(setpoint.preview_N[-1], self._force.least_N), self._force.most_N)
+            last_N = min(max(setpoint.preview_N[-1], self._min_N), self._max_N)
             self.forecast.update(setpoint.stamp_s + setpoint.preview_s, last_N)
         else:
             self.forecast.forget()
@@ -203,12 +207,12 @@ class Governor:
 
     def _passes(self, to_N: float, dt_s: float) -> bool:
         """Whether the force of a new holder is still further away than a takeover goes in `dt_s`."""
-        self.is_passing = abs(to_N - self.asked_N) > self._force.release_N_s * dt_s
+        self.is_passing = abs(to_N - self.asked_N) > self._release_N_s * dt_s
         return self.is_passing
 
     def _decay(self, dt_s: float, lowest_N: float, age_s: float | None, limits: tuple[Limit, ...]) -> Ask:
         # a device that is found to make less than was believed is not asked for more above its least than it was
-        above_N = max(min(self.above_N, self.asked_N - lowest_N) - self._force.release_N_s * dt_s, 0.0)
+        above_N = max(min(self.above_N, self.asked_N - lowest_N) - self._release_N_s * dt_s, 0.0)
         self.asked_N, self.above_N = lowest_N + above_N, above_N
         self._forget()
         return Ask(self.asked_N, [self.asked_N] * len(PATH_S), age_s, limits)

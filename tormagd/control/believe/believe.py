@@ -88,8 +88,9 @@ class Believe:
         self.learns = terms.learning
         """Whether anything is learned. What protects goes on without: the sensor is judged, and a lie makes it
         forgotten."""
-        self._terms: Final = terms
+        self._has_lag: Final = terms.lag
         self._has_creep: Final = terms.creep and nominal.contact.slides
+        self._fits: Final = terms.scale or terms.offset
 
     @property
     def device(self) -> DeviceFit:
@@ -134,7 +135,7 @@ class Believe:
     def expect(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
         """Learns how late the carriages are, once a plan is made `dt_s` after the last: from its gap, `planned_mm`, and
         the measured one, where its `foresight`, 0..1, says that it knows what comes."""
-        if not (self.learns and self._terms.lag):
+        if not (self.learns and self._has_lag):
             return
         if measured is None or not measured.is_homed or foresight < MIN_FORESIGHT:
             self.carriages.update(dt_s, None, 0.0, 0.0, self._top_speed_mm_s)
@@ -151,7 +152,7 @@ class Believe:
         if measured is not None and model_N is not None and self._nominal.contact.is_known(measured):
             slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
             predicted_N = self.strength.fit.force_N(model_N) * slow
-        lag_s = self.carriages.lag_s if self._terms.lag else 0.0
+        lag_s = self.carriages.lag_s if self._has_lag else 0.0
         limits = (*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits
         return Belief(device, at_speed, lag_s, predicted_N, limits, self.sensor.doubted_s)
 
@@ -220,7 +221,7 @@ class Believe:
     def _fit(self, measured: Measured, model_N: float, reading_N: float, dt_s: float) -> None:
         if self._has_creep:
             self.slow.follow(model_N, measured.handle_mm)
-        if not (self.learns and (self._terms.scale or self._terms.offset)):
+        if not (self.learns and self._fits):
             return
         before_N = self.strength.fit.force_N(model_N)
         self.strength.update(model_N, reading_N, dt_s)

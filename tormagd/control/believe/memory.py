@@ -44,9 +44,11 @@ class ElementMemory:
     def __init__(self, memory: Memory, nominal: Nominal, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> None:
         """`gap_range_mm`: closed and open."""
         self.time_s = -math.inf
-        self._memory: Final = memory
         self._free: Final = memory.free
         self._added: Final = memory.added
+        self._width_mT: Final = memory.lag_mT
+        self._turn_mT: Final = memory.turn_mT
+        self._relaxes: Final = len(memory.fractions) > 0
         self._nominal: Final = nominal
         self._field: Final = field
         self._closed_mm: Final = gap_range_mm[0]
@@ -61,8 +63,8 @@ class ElementMemory:
             return 0.0
         if change_mT == 0.0:
             return self.lag_mT
-        side_mT = math.copysign(self._memory.lag_mT, change_mT)
-        return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._memory.turn_mT)
+        side_mT = math.copysign(self._width_mT, change_mT)
+        return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._turn_mT)
 
     def force_N(self, curve: ForceCurve) -> float:
         """What the model gives now, if the force without memory over the field is `curve`."""
@@ -101,7 +103,7 @@ class ElementMemory:
         self.lag_mT = self.lag_at_mT(field_mT)
         dt_s = max(now_s - self.time_s, 0.0)
         self.field_mT, self.time_s = field_mT, now_s
-        if not self._memory.fractions:
+        if not self._relaxes:
             return
         added_N = self._added_N(curve, field_mT - self.lag_mT, free_N)
         step = self._free.discretise(dt_s)

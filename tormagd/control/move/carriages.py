@@ -46,8 +46,14 @@ class Carriages(Actuator):
         position, motor = config.position, config.motor
         self.expected = Expected()
         self.left, self.right = Pid(position), Pid(position)
-        self._position: Final = position
-        self._insert: Final = scene.insert
+        self._duty_limit: Final = position.duty_limit
+        self._derivative_time_s: Final = position.derivative_time_s
+        self._derivative_filter_s: Final = position.derivative_filter_s
+        self._synchronisation: Final = position.synchronisation
+        self._gap_acceleration_mm_s2: Final = position.gap_acceleration_mm_s2
+        self._gap_speed_mm_s: Final = position.gap_speed_mm_s
+        self._closed_mm: Final = scene.insert.gap_closed_mm
+        self._open_mm: Final = scene.insert.gap_open_mm
         self._pull_V: Final = motor.pull_V
         self._supply_V: Final = motor.supply_V
         self._full_speed_mm_s: Final = full_speed_mm_s(motor)
@@ -56,7 +62,9 @@ class Carriages(Actuator):
         self._lag_s: Final = electrical_time_s(motor) + EXCHANGE_S
         self._gear_loss: Final = 1.0 - motor.gear_efficiency
         self._coulomb: Final = motor.coulomb_V / motor.supply_V
-        self._terms: Final = terms_of(scene)
+        terms = terms_of(scene)
+        self._has_motor: Final = terms.motor
+        self._learns: Final = terms.learning
 
     def begin(self, gap_mm: float) -> None:
         """See `Actuator.begin`: with empty integrals, so that no duty jumps."""
@@ -87,22 +95,22 @@ class Carriages(Actuator):
     ) -> Drive:
         """See `Actuator.update`."""
         assert self.reference is not None, "enabling begins one"
-        self.expected.update(self.reference, dt_s, self._lag_s, self._position.derivative_filter_s)
+        self.expected.update(self.reference, dt_s, self._lag_s, self._derivative_filter_s)
         # a homed carriage that is found beyond the closed end has to come back from there
         pull = 0.0
-        if self._terms.motor:
-            pull = pull_V(self._pull_V, max(self.reference.gap_mm, self._insert.gap_closed_mm)) / self._supply_V
+        if self._has_motor:
+            pull = pull_V(self._pull_V, max(self.reference.gap_mm, self._closed_mm)) / self._supply_V
         limits: list[Limit] = []
         reference, is_slewed = self._follow(
             self.reference, now_s, dt_s, plan, self._speeds(pull, measured), is_over, limits
         )
         self.reference = reference
         # either also takes half of the skew, so that the faster waits for the slower
-        skew_mm = self._position.synchronisation * measured.skew_mm / 2.0
+        skew_mm = self._synchronisation * measured.skew_mm / 2.0
         half_mm, half_mm_s = self.expected.gap_mm / 2.0, self.expected.filtered_mm_s / 2.0
         left_mm, right_mm = half_mm - measured.left_mm - skew_mm, half_mm - measured.right_mm + skew_mm
         left_mm_s, right_mm_s = half_mm_s - measured.left_mm_s, half_mm_s - measured.right_mm_s
-        if is_slewed and self._terms.learning:
+        if is_slewed and self._learns:
             self._learn_acceleration(reference, left_mm + right_mm, left_mm_s + right_mm_s, dt_s)
         ahead = self._feed_forward(reference, pull)
         if abs(reference.speed_mm_s) < RESTING_MM_S:
@@ -124,14 +132,14 @@ class Carriages(Actuator):
         limits: list[Limit],
     ) -> tuple[Reference, bool]:
         """The reference `dt_s` later, and whether the limit of its acceleration held it back."""
-        floor_mm, target = self._insert.gap_closed_mm, Reference(reference.gap_mm)
+        floor_mm, target = self._closed_mm, Reference(reference.gap_mm)
         if plan is not None:
             floor_mm = max(floor_mm, plan.min_gap_mm)
-            target = target_of(plan, now_s, self._lag_s, floor_mm, self._insert.gap_open_mm)
+            target = target_of(plan, now_s, self._lag_s, floor_mm, self._open_mm)
             if is_over:
-                target = Reference(self._insert.gap_open_mm)
+                target = Reference(self._open_mm)
                 limits.append(Limit.OVER_FORCE)
-        max_mm_s2 = self.acceleration_scale * self._position.gap_acceleration_mm_s2
+        max_mm_s2 = self.acceleration_scale * self._gap_acceleration_mm_s2
         reference, is_limited, is_slewed = follow(max_mm_s2, reference, target, dt_s, speeds, floor_mm)
         if plan is not None and is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
             limits.append(Limit.RATE)
@@ -145,9 +153,9 @@ class Carriages(Actuator):
         motors_mm_s = self._no_load_mm_s
         if abs(self.expected.gap_mm - measured.gap_mm) > WEAK_MM:
             motors_mm_s = min(max(abs(measured.gap_speed_mm_s), motors_mm_s / 2.0), motors_mm_s)
-        closing_mm_s = min(motors_mm_s, self._position.gap_speed_mm_s)
+        closing_mm_s = min(motors_mm_s, self._gap_speed_mm_s)
         # the magnets' pull helps to close, but a reserve is worth more there than a little speed
-        opening_mm_s = self._no_load_mm_s * (self._position.duty_limit - self._coulomb - pull)
+        opening_mm_s = self._no_load_mm_s * (self._duty_limit - self._coulomb - pull)
         return Speeds(motors_mm_s, min(closing_mm_s, opening_mm_s), closing_mm_s)
 
     def _learn_acceleration(self, reference: Reference, error_mm: float, error_mm_s: float, dt_s: float) -> None:
@@ -155,14 +163,14 @@ class Carriages(Actuator):
         if reference.acceleration_mm_s2 * reference.speed_mm_s <= 0.0:
             return
         # a carriage that did not get as far as it should is not ahead because it need not come back as far
-        behind_mm = error_mm + self._position.derivative_time_s * error_mm_s
+        behind_mm = error_mm + self._derivative_time_s * error_mm_s
         ahead_mm = -math.copysign(1.0, reference.speed_mm_s) * behind_mm
         scale = self.acceleration_scale + SCALE_PER_MM_S * ahead_mm * dt_s
         self.acceleration_scale = min(max(scale, 1.0), MAX_ACCELERATION_SCALE)
 
     def _feed_forward(self, reference: Reference, pull: float) -> float:
         """The duty that the reference's speed and acceleration take, with friction and the magnets' `pull`, a duty."""
-        if not self._terms.motor:
+        if not self._has_motor:
             return 0.0
         speed, acceleration = reference.speed_mm_s / 2.0, reference.acceleration_mm_s2 / 2.0
         moving = min(max(speed / COULOMB_SPEED_MM_S, -1.0), 1.0)
@@ -178,7 +186,7 @@ class Carriages(Actuator):
         is_saturated = self.left.is_saturated or self.right.is_saturated
         if is_saturated:
             limits.append(Limit.SATURATED)
-        scale, limit = self._supply_V / max(supply_V, 0.5 * self._supply_V), self._position.duty_limit
+        scale, limit = self._supply_V / max(supply_V, 0.5 * self._supply_V), self._duty_limit
         left_duty, right_duty = left * scale, right * scale
         self.acted.range += is_saturated or max(abs(left_duty), abs(right_duty)) > limit
         left_duty, right_duty = min(max(left_duty, -limit), limit), min(max(right_duty, -limit), limit)

@@ -73,11 +73,16 @@ class Watch:
     def __init__(self, config: Config, scene: Scene) -> None:
         limits, device, period_s = config.limits, config.device, 1.0 / config.rates.control_hz
         bears_s = delay_margin_s(config.motor, config.position, period_s)
-        self._limits: Final = limits
+        self._max_apart_mm: Final = limits.skew_fault_mm
         self._max_round_trip_s: Final = period_s + TOO_SLOW_SHARE * bears_s
         self._slow_s: Final = period_s + SLOW_SHARE * bears_s
         self._period_s: Final = period_s
         self._unsensed_s: Final = unsensed_s(period_s)
+        self._skew_warning_mm: Final = limits.skew_warning_mm
+        self._following_error_mm: Final = limits.following_error_mm
+        self._following_time_s: Final = limits.following_time_s
+        self._no_motion_duty: Final = limits.no_motion_duty
+        self._no_motion_time_s: Final = limits.no_motion_time_s
         self._measurement_timeout_s: Final = device.measurement_timeout_ms * 1e-3
         self._longest_own_stall_s: Final = STALL_SHARE * device.command_timeout_ms * 1e-3
         self._closed_mm: Final = scene.insert.gap_closed_mm
@@ -98,7 +103,7 @@ class Watch:
         return conditions.replaced(
             fresh=conditions.fresh and measured is not None,
             apart_mm=math.inf if measured is None else abs(measured.skew_mm),
-            most_apart_mm=self._limits.skew_fault_mm,
+            most_apart_mm=self._max_apart_mm,
             most_round_trip_s=self._max_round_trip_s,
             most_clock_drift=CLOCK_FAULT,
         )
@@ -140,7 +145,7 @@ class Watch:
     def limits(self, now_s: float, measurement: Measurement, measured: Measured, sight: Sight) -> list[Limit]:
         """What is not as it should be, and no fault."""
         limits: list[Limit] = []
-        if abs(measured.skew_mm) > self._limits.skew_warning_mm:
+        if abs(measured.skew_mm) > self._skew_warning_mm:
             limits.append(Limit.SKEW)
         if sight.has_stalled(now_s):
             limits.append(Limit.HOST_STALL)
@@ -155,7 +160,7 @@ class Watch:
 
     def update(self, dt_s: float, measured: Measured, reference_mm: float, left_duty: float, right_duty: float) -> None:
         """Takes a tick in which the carriages were driven with these duties, towards the gap `reference_mm`."""
-        is_astray = abs(reference_mm - measured.gap_mm) > self._limits.following_error_mm
+        is_astray = abs(reference_mm - measured.gap_mm) > self._following_error_mm
         self.straying_s = self.straying_s + dt_s if is_astray else 0.0
         is_felt = not self._slides or abs(measured.handle.rate_mm_s) > STILL_MM_S
         self.over_s = self.over_s + dt_s if measured.force_N > self._ceiling_N and is_felt else 0.0
@@ -196,13 +201,13 @@ class Watch:
 
     def _of_motion(self, measured: Measured, sensor_doubted_s: float) -> list[Fault]:
         faults: list[Fault] = []
-        is_skewed = abs(measured.skew_mm) > self._limits.skew_fault_mm
-        is_still = self.still_s > self._limits.no_motion_time_s
+        is_skewed = abs(measured.skew_mm) > self._max_apart_mm
+        is_still = self.still_s > self._no_motion_time_s
         if self.opposed_s > (WENT_AGAINST_S if is_skewed or is_still else OPPOSED_S):
             faults.append(Fault.WRONG_DIRECTION)
         if is_skewed:
             faults.append(Fault.SKEW)
-        if self.straying_s > self._limits.following_time_s:
+        if self.straying_s > self._following_time_s:
             faults.append(Fault.FOLLOWING_ERROR)
         if self.over_s > OVER_FAULT_S and self._slides:  # of a pad it is the finger that presses so hard
             faults.append(Fault.OVER_FORCE)
@@ -215,8 +220,8 @@ class Watch:
     def _is_still(self, measured: Measured, left_duty: float, right_duty: float) -> bool:
         """Whether a carriage that is driven stands."""
         # a duty that turns round before the carriage could move drives it nowhere
-        is_left_driven = left_duty * math.copysign(1.0, self.left_duty) > self._limits.no_motion_duty
-        is_right_driven = right_duty * math.copysign(1.0, self.right_duty) > self._limits.no_motion_duty
+        is_left_driven = left_duty * math.copysign(1.0, self.left_duty) > self._no_motion_duty
+        is_right_driven = right_duty * math.copysign(1.0, self.right_duty) > self._no_motion_duty
         is_left_still = is_left_driven and abs(measured.left_mm_s) < STILL_MM_S
         is_right_still = is_right_driven and abs(measured.right_mm_s) < STILL_MM_S
         return is_left_still or is_right_still
@@ -224,8 +229,7 @@ class Watch:
     def _judge_direction(self, dt_s: float, measured: Measured, left_duty: float, right_duty: float) -> None:
         """A carriage that is driven well moves the other way; one that comes to a stop there, did."""
         left_mm_s = right_mm_s = 0.0
-        is_left_driven = abs(left_duty) > self._limits.no_motion_duty
-        is_right_driven = abs(right_duty) > self._limits.no_motion_duty
+        is_left_driven, is_right_driven = abs(left_duty) > self._no_motion_duty, abs(right_duty) > self._no_motion_duty
         if is_left_driven:
             left_mm_s = measured.left_mm_s * math.copysign(1.0, left_duty)
         if is_right_driven:
