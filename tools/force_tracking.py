@@ -6,8 +6,8 @@ How soon a device is known: `steps`, `creep` and `speeds`, of the three samples 
 of the force sensor, and the `pulse` of `make run` as more is known, of the samples. How well signals are followed:
 that pulse on the `samples` and on random `draws`, 500 setpoints a second, with a preview of 70 ms and without; a
 `staircase`; recorded `signals` from the folder that TORMAG_DATA names, with 400 ms, as a publisher can that plays a
-file, and live. Beside them stands what ideal carriages miss (`bound.py`). Draws 40 to 79 and samples 2 and 3 only
-judge. All devices are synthetic.
+file, and live. Beside them stands what ideal carriages miss (`bound.py`), and beside `samples` what the same core does
+with carriages that lose no time. Draws 40 to 79 and samples 2 and 3 only judge. All devices are synthetic.
 """
 
 import argparse

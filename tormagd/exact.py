@@ -8,8 +8,8 @@ Plain data are what msgpack holds. What it does not know is a map with one key, 
 
 Two equal values come back as two: nothing in the core asks whether a value is the very one that it made before. What
 changes in place, such as a stage of the core or the device's link, is written like a value, and read into one that is
-there already. Its fields are those that its class names in `__match_args__` or annotates; one that begins with an
-underscore is a constant.
+there already. Its fields are those that its class annotates, or its methods make; one that begins with an underscore is
+a constant.
 """
 
 from collections import deque
@@ -45,7 +45,7 @@ def plain(thing: object) -> Any:
     list nor a deque."""
     if type(thing) in _AS_THEY_ARE:
         return thing
-    names = _fields(type(thing))
+    names = _fields(thing)
     if names:
         return {type(thing).__name__: {name: plain(getattr(thing, name)) for name in names}}
     if isinstance(thing, Enum):
@@ -59,18 +59,20 @@ def plain(thing: object) -> Any:
     raise TypeError(f"{thing!r}: allowed are values, enumerators, tuples, lists and what msgpack knows")
 
 
-def _fields(kind: type) -> tuple[str, ...]:
-    if issubclass(kind, Enum):
+def _fields(thing: object) -> tuple[str, ...]:
+    if isinstance(thing, Enum):
         return ()
-    if hasattr(kind, "__match_args__"):
-        return tuple(kind.__match_args__)
-    # a compiled class has no annotations, but says its attributes
-    told = [vars(each).get("__mypyc_attrs__") or vars(each).get("__annotations__", ()) for each in kind.__mro__]
-    return tuple(sorted({name for names in told for name in names if name[0] != "_"}))
+    if hasattr(thing, "__match_args__"):
+        return tuple(thing.__match_args__)
+    # a compiled class has neither annotations nor a dictionary, but says its attributes
+    told = [vars(each).get("__mypyc_attrs__") or vars(each).get("__annotations__", ()) for each in type(thing).__mro__]
+    return tuple(
+        sorted({name for names in (*told, getattr(thing, "__dict__", ())) for name in names if name[0] != "_"})
+    )
 
 
 def _changes(thing: object) -> bool:
-    return not isinstance(thing, Value) and bool(_fields(type(thing)))
+    return not isinstance(thing, Value) and bool(_fields(thing))
 
 
 def restored(data: Any, known: Kinds) -> Any:
@@ -105,7 +107,7 @@ def restore(thing: Any, data: Any, known: Kinds) -> None:
     """Gives `thing`, which changes in place, the fields that `data` stand for. Raises InexactError."""
     name = type(thing).__name__
     fields = data.get(name) if isinstance(data, dict) else None
-    if not isinstance(fields, dict) or set(fields) != set(_fields(type(thing))):
+    if not isinstance(fields, dict) or set(fields) != set(_fields(thing)):
         raise InexactError(f"{str(data)[:60]}: allowed are the fields of {name}")
     for field, told in fields.items():
         own = getattr(thing, field)

@@ -103,7 +103,7 @@ def run(
         at(inbox, now_s - start_s)
         used = loop.planner.planned
         samples.append(loop.tick(inbox.newest))
-        way.ticked(loop.stepper, used)
+        way.ticked(loop.stepper.time_s, used)
     for _ in range(8):
         inbox.refresh(loop.now_s)
     way.refresh()
@@ -224,15 +224,12 @@ def test_a_way_that_takes_too_long_is_stale_and_says_why(armed: ClosedLoop) -> N
 def test_the_whole_way_is_measured_part_by_part(armed: ClosedLoop) -> None:
     noise = random.Random(1)
     done = run(armed, Publisher(swell_N, way_s=lambda t: noise.uniform(0.08, 0.0815)), lasts_s=6.0)
-    found = done.way.report(400.0)
+    found = done.way.report(400.0, armed.planner.believe.carriages.lag_s)
     delay_us = done.of("a").delay_us
     # in ticks of 1 ms: what arrives is read in the next, planned in it, and driven in the one after; bins are 3% wide
     assert 0.0 < found.to_duty_us.p50 - delay_us.p50 <= 1_000.0 + 0.04 * delay_us.p50
     assert delay_us.p50 == pytest.approx(81e3, rel=0.04)
     assert found.carriages_ms is not None
-    assert 0.0 < found.carriages_ms < 20.0  # no speed is foreseen that far, so the reference trails its target
-    assert found.total_ms == pytest.approx(
-        (found.to_duty_us.p99 + 400.0) * 1e-3 + max(found.carriages_ms, 0.0), abs=0.02
-    )
+    assert found.total_ms == pytest.approx((found.to_duty_us.p99 + 400.0) * 1e-3 + found.carriages_ms, abs=0.02)
     assert found.total_ms is not None
     assert (found.total_ms < 400.0, found.budget_ms) == (True, 400.0)

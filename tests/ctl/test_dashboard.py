@@ -31,7 +31,7 @@ from tormagd.recording.writer import RecordingWriter
 from tormagd.safety.codes import FAULTS, LIMITS, Fault, Limit
 from tormagd_client.aio import AsyncClient
 from tormagd_client.endpoints import in_folder
-from tormagd_client.messages import Description, Status, encode
+from tormagd_client.messages import BeliefReport, Description, Status, encode
 
 START_NS = 1_790_000_000_000_000_000
 PORTRAIT = {"force_N": [0.5, 1.0, 3.0], "rate_N_s": [1.0, 2.0, 8.0]}
@@ -197,7 +197,23 @@ def test_a_recording_is_shown_at_any_moment(recorded: Recorded) -> None:
     assert sum(frame.late_counts) == pytest.approx(2_000, abs=2)
     assert frame.late_counts[LATE_US.index(500.0)] == pytest.approx(20, abs=1)
     assert recorded.frame(29.5).faults == ["SKEW"]
+    assert frame.belief == {}  # ticks do not say
     assert [held.is_now for held in recorded.frame(6.0).held] == [True]
+
+
+def test_a_recording_shows_what_was_believed_then(tmp_path: Path, telemetry_with) -> None:
+    """Of the newest snapshot before, where that is no older than a break."""
+    lag = BeliefReport(value=0.013, sd=None, unit="s", acts=False)
+    with RecordingWriter(tmp_path / "b.mcap") as writer:
+        for seq, at_s in enumerate((0.0, 0.02, 0.04, 1.0)):
+            scale = BeliefReport(value=1.0 + at_s, sd=0.17, unit="", acts=True)
+            belief = {"scale": scale, "carriage_lag": lag} if at_s else {}
+            writer.telemetry(telemetry_with(seq, START_NS + round(at_s * 1e9), belief=belief))
+    shown = Recorded(read_recording(tmp_path / "b.mcap"), "b.mcap")
+    assert [shown.frame(at_s).belief for at_s in (0.01, 0.5)] == [{}, {}]
+    for at_s, value in ((0.03, 1.02), (0.1, 1.04), (1.0, 2.0)):
+        known = BeliefReport(value=value, sd=0.17, unit="", acts=True)
+        assert shown.frame(at_s).belief == {"scale": known, "carriage_lag": lag}
 
 
 @settings(max_examples=25)

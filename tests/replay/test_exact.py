@@ -132,18 +132,22 @@ def test_stages_in_the_middle_of_a_run_go_on_in_others_to_the_bit(fly: Any, core
             assert first_difference(plain(planner), plain(planner_again)) is None
 
 
-def test_what_changes_in_a_stage_is_a_field_of_its_class() -> None:
-    """So it is written down; whatever else there is, is final."""
+def test_what_changes_in_a_stage_is_annotated_in_its_class_or_made_at_its_beginning() -> None:
+    """So it is written down, before it has changed too; whatever else there is, is final."""
     of_bases = {"Actuator": {"self.reference", "self.acceleration_scale", "self.acted"}}
     for path in (ROOT / "tormagd" / "control").rglob("*.py"):
         for kind in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(kind, ast.ClassDef):
                 named = [ast.unparse(it.target) for it in kind.body if isinstance(it, ast.AnnAssign)]
                 inside = [it for method in kind.body if isinstance(method, ast.FunctionDef) for it in ast.walk(method)]
-                final = [ast.unparse(it.target) for it in inside if isinstance(it, ast.AnnAssign)]
+                annotated = [it for it in inside if isinstance(it, ast.AnnAssign)]
+                final = [ast.unparse(it.target) for it in annotated if "Final" in ast.unparse(it.annotation)]
                 attributes = [it for it in inside if isinstance(it, ast.Attribute) and isinstance(it.ctx, ast.Store)]
                 own = {ast.unparse(it) for it in attributes if isinstance(it.value, ast.Name) and it.value.id == "self"}
-                public = {f"self.{name}" for name in named if not name.startswith("_")}
+                begun = [it for it in kind.body if isinstance(it, ast.FunctionDef) and it.name == "__init__"]
+                made = [ast.unparse(it) for method in begun for it in ast.walk(method) if it in attributes]
+                public = {f"self.{name}" for name in named} | {*made}
+                public = {name for name in public if not name.startswith("self._")}
                 public |= set().union(*(of_bases.get(ast.unparse(base), set()) for base in kind.bases))
                 assert own - {*final} <= public, f"{path}: {kind.name}"
 

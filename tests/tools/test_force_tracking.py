@@ -83,6 +83,13 @@ def test_no_figure_is_better_than_that_of_the_ideal_carriages(swung: Followed) -
     assert track(load_plant("sample_1"), begun, "pulse", 0.0).since(0.0).rms_N >= at_first["no_delay_rms_N"]
 
 
+def test_the_same_core_misses_less_with_carriages_that_lose_no_time() -> None:
+    weak, swung = load_plant("sample_2"), swing(1.6)
+    fast = swung._replace(force_N=1.5 + 0.2 * np.sin(12.0 * np.pi * swung.time_s))
+    own, same = (track(weak, fast, "pulse", 0.0, is_ideal=is_ideal).since(0.4).rms_N for is_ideal in (False, True))
+    assert 0.0 < same < 0.8 * own
+
+
 def test_weak_motors_render_a_live_pulse_once_it_is_foreseen() -> None:
     """Sample 2 starts and turns too late for what it is not told before: with the slope alone it misses by 28 mN."""
     found = track(load_plant("sample_2"), pulse_signal(13.0), "pulse", 0.0)

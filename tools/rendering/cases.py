@@ -245,12 +245,15 @@ def track(
     *,
     is_learning: bool = True,
     shown: Learned = NOTHING_LEARNED,
+    is_ideal: bool = False,
 ) -> Followed:
     """Plays a signal behind an approach; time counts from its first force. The device counts as having `shown` so much
-    of itself, and goes on doing so where `is_learning`. Raises RuntimeError for a fault."""
+    of itself, and goes on doing so where `is_learning`; carriages that lose no time move its gap where `is_ideal`.
+    Raises RuntimeError for a fault."""
     stated = load_scene(scene)
     terms = msgspec.structs.replace(terms_of(stated), learning=is_learning)
-    loop = armed(Config(scene=scene), plant, SteadyHand(), msgspec.structs.replace(stated, terms=terms), shown)
+    meant = msgspec.structs.replace(stated, terms=terms)
+    loop = armed(Config(scene=scene), plant, SteadyHand(), meant, shown, is_ideal=is_ideal)
     flat = np.array([0.0, 1.0 / RATE_HZ]), np.full(2, signal.force_N[0])
     approach_s, approach_N = with_approach(*flat, START_N, RAMP_S, HOLD_S)
     lead_s, start_s = float(approach_s[-1]), loop.now_s
@@ -288,19 +291,27 @@ def compared(found: Followed, best: Bound, start_s: float) -> Json:
 
 
 def samples(pool: Executor, kept: Kept) -> Json:
-    """The pulse on the three samples, with and without preview: the whole of it, and after TRIM_S."""
+    """The pulse on the three samples, with and without preview: the whole of it, and after TRIM_S; and the RMS error of
+    the same core with carriages that lose no time."""
     rows, played = [], pulse_signal(PULSE_S)
     cases = [(name, preview_s) for name in SAMPLES for preview_s in (PREVIEW_S, 0.0)]
-    runs = [pool.submit(track, device(name), played, "pulse", preview_s) for name, preview_s in cases]
+    runs, bounds = (
+        [pool.submit(track, device(name), played, "pulse", preview_s, is_ideal=ideal) for name, preview_s in cases]
+        for ideal in (False, True)
+    )
     best = {name: pool.submit(ideal, name, played) for name in SAMPLES}
-    for (name, preview_s), run in zip(cases, runs, strict=True):
-        found, least = run.result(), best[name].result()
+    for (name, preview_s), run, bound_run in zip(cases, runs, bounds, strict=True):
+        found, least, same = run.result(), best[name].result(), bound_run.result()
+        whole, after_trim = (
+            compared(found, least, start_s) | {"same_core_ideal_rms_N": same.since(start_s).rms_N}
+            for start_s in (0.0, TRIM_S)
+        )
         rows.append(
             {
                 "plant": name,
                 "preview": preview_s > 0.0,
-                "whole": compared(found, least, 0.0),
-                "after_trim": compared(found, least, TRIM_S),
+                "whole": whole,
+                "after_trim": after_trim,
                 "trim": found.trim,
                 "lag_ms": found.shown.lag_s * 1e3,
                 "limits": found.limits,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from rendering.device_draws import device
+from rendering.device_draws import device as device_of
 from rendering.hands import Legs, WaitingHand
 from tormagd.assembly.build import build_core
 from tormagd.closed_loop import ClosedLoop, stream
@@ -16,6 +16,7 @@ from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
 from tormagd.control.believe.slow_friction import believable
 from tormagd.control.records import TimedSetpoint
 from tormagd.lab.arrays import Array
+from tormagd.lab.ideal_actuator import ideal_stepper
 from tormagd.scenes.scene import Scene, load_scene
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.hand import Hand, parse_hand
@@ -110,11 +111,15 @@ def armed(
     hand: Hand,
     scene: Scene | None = None,
     shown: Learned = NOTHING_LEARNED,
+    *,
+    is_ideal: bool = False,
 ) -> ClosedLoop:
     """A device that was homed and enabled, and counts as having `shown` so much of itself. A given `scene` takes the
-    place of the configured one. Raises RuntimeError where the device does not get that far."""
-    core = build_core(config, scene)
-    loop = ClosedLoop(config, core.stepper(), core.planner(), VirtualDevice(plant, hand, seed=1))
+    place of the configured one; `is_ideal`: carriages that lose no time move its gap. Raises RuntimeError where the
+    device does not get that far."""
+    core, device = build_core(config, scene), VirtualDevice(plant, hand, seed=1)
+    stepper = ideal_stepper(core, device.messages.plant) if is_ideal else core.stepper()
+    loop = ClosedLoop(config, stepper, core.planner(), device)
     taught(loop).teach(shown)
     loop.arm()
     return loop
@@ -217,7 +222,7 @@ def rehearse(config: Config, case: Case, times_s: Array, forces_N: Array) -> Fol
         config = msgspec.structs.replace(config, position=slow)
     # what is played is not the scene's own signal, which the daemon refuses where the gap is too slow for it
     scene = msgspec.structs.replace(load_scene(config.scene), signal=None)
-    loop = armed(config, device(case.plant), parse_hand(case.hand), scene)
+    loop = armed(config, device_of(case.plant), parse_hand(case.hand), scene)
     start_s = loop.now_s + LEAD_IN_S
     publish = publisher(times_s + start_s, forces_N, 0.0, REHEARSED_VALID_S)
     found = follow(loop, publish, LEAD_IN_S + float(times_s[-1]), start_s)

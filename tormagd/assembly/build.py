@@ -25,7 +25,6 @@ from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.move.motor import Margins, margins, pull_V
 from tormagd.control.nominal import Nominal
 from tormagd.inverse.choice import BESIDE_PLANS, Choice, build, mean_error_N, named
-from tormagd.model.force_curve import ForceCurve
 from tormagd.model.model_file import ForceModel, ModelFileError, load_model
 from tormagd.model.rising import falling_at
 from tormagd.model.shipped import model_path
@@ -124,16 +123,15 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
 def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
     """The scene's element as the model has it, and how its field is searched for."""
     terms = terms_of(scene)
-    part = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
-    field = part.field
-    fields_mT, rises = _known_fields_mT(scene, model, part)
-    reach = portrait(_curve(model, part), field, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
+    contact, field, cip_percent = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
+    nominal = Nominal(model, contact, cip_percent, terms.rate)
+    fields_mT, rises = _known_fields_mT(scene, model, contact, field)
+    reach = portrait(nominal.only, field, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))
     choice = choose_solver(scene, rises=rises)
     if choice.solver == "thesis":
         choice = choice._replace(reason=f"{choice.reason}; epsilon {mean_error_N(model):.4f} N, its model's mean error")
     search = PortraitSearch(reach, field) if choice is IN_PORTRAIT else build(choice, fields_mT, model, rises=rises)
-    law = _law(scene, reach, field) if part.contact.slides else None
-    nominal = Nominal(model, part.contact, part.cip_percent, terms.rate)
+    law = _law(scene, reach, field) if contact.slides else None
     memory = model.metadata.memory.of(relaxes=terms.relaxes, hysteresis=terms.hysteresis)
     return Element(nominal, memory, field, reach, search, law, choice.solver in BESIDE_PLANS), choice
 
@@ -153,33 +151,17 @@ def platform_name() -> str:
     return f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}"
 
 
-class Part(NamedTuple):
-    """What the scene's element is to the core: how it is touched, the field in it over the gap, and its iron."""
-
-    contact: Contact
-    field: FieldOfGap
-    cip_percent: float
-
-
-def _brake(scene: Scene) -> Part:
+def _brake(scene: Scene) -> tuple[Contact, FieldOfGap, float]:
+    """How the brake is touched, the field in its elastomer over the gap, and how much of that is iron, percent."""
     fitted = insert(scene.insert.name)
     permeability, radius_mm = fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm
-    return Part(Sliding(), FieldOfGap(PowerFieldLaw(), permeability, radius_mm * 1e-3), 100.0 * fitted.cip_fraction)
+    return Sliding(), FieldOfGap(PowerFieldLaw(), permeability, radius_mm * 1e-3), 100.0 * fitted.cip_fraction
 
 
-def _pad(finger: Finger, model: ForceModel) -> Part:
+def _pad(finger: Finger, model: ForceModel) -> tuple[Contact, FieldOfGap, float]:
+    """The same of a pad."""
     *_, (cip_percent, _) = model.feature_ranges
-    return Part(
-        Pressing(finger.depth_mm), FieldOfGap(PowerFieldLaw(), REFERENCE_PERMEABILITY, PAD_RADIUS_M), cip_percent
-    )
-
-
-def _curve(model: ForceModel, part: Part) -> ForceCurve:
-    """Of the contact that the portrait is drawn for, or the nearest that the model knows."""
-    (_, most_mm), (slowest_mm_s, fastest_mm_s), _, _ = model.feature_ranges
-    contact = part.contact
-    rate_mm_s = min(max(contact.rate_mm_s, slowest_mm_s), fastest_mm_s)
-    return model.curve(min(contact.displacement_mm, most_mm), rate_mm_s, part.cip_percent)
+    return Pressing(finger.depth_mm), FieldOfGap(PowerFieldLaw(), REFERENCE_PERMEABILITY, PAD_RADIUS_M), cip_percent
 
 
 def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
@@ -194,25 +176,27 @@ def _law(scene: Scene, reach: Portrait, field: FieldOfGap) -> LawOfField:
     return law_beside(reach, PowerFieldLaw(), field, insert(fitted.name).elastomer, geometry)
 
 
-def _known_fields_mT(scene: Scene, model: ForceModel, part: Part) -> tuple[tuple[float, float], bool]:
+def _known_fields_mT(
+    scene: Scene, model: ForceModel, contact: Contact, field: FieldOfGap
+) -> tuple[tuple[float, float], bool]:
     """The fields of the scene's gaps, as far as the model knows them; and whether it knows that they give more force
     however the element is touched. Where it is touched as the portrait is, they have to."""
     low_mT, high_mT = model.field_range_mT
-    low_mT = max(low_mT, part.field.field_mT(scene.insert.gap_open_mm))
-    high_mT = min(high_mT, part.field.field_mT(scene.insert.gap_closed_mm))
+    low_mT = max(low_mT, field.field_mT(scene.insert.gap_open_mm))
+    high_mT = min(high_mT, field.field_mT(scene.insert.gap_closed_mm))
     if not low_mT < high_mT:
         raise DomainError("insert.model", f"trained on {model.field_range_mT} mT", "fields that the scene's gaps give")
     (_, most_mm), *_ = model.feature_ranges
-    falling_mm_s = falling_at(model, (low_mT, high_mT), min(part.contact.displacement_mm, most_mm))
+    falling_mm_s = falling_at(model, (low_mT, high_mT), min(contact.displacement_mm, most_mm))
     if falling_mm_s is not None:
         raise DomainError(
             "insert.model",
             f"force that falls with the field at {falling_mm_s:.3g} mm/s",
             "a force that rises with the field: train it on more data, as `tormag-lab train-model --rising` checks",
         )
-    if part.contact.slides:
+    if contact.slides:
         return (low_mT, high_mT), True
-    depths_mm = np.linspace(PRESSED * part.contact.displacement_mm, most_mm, DEPTHS).tolist()
+    depths_mm = np.linspace(PRESSED * contact.displacement_mm, most_mm, DEPTHS).tolist()
     return (low_mT, high_mT), all(falling_at(model, (low_mT, high_mT), depth) is None for depth in depths_mm)
 
 

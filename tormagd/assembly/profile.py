@@ -25,8 +25,6 @@ RELAXED_SD_N = 0.06
 ZERO_LASTS_S = 600.0
 "An older zero is forgotten: the sensor has drifted, or was tared, and is taken for tared as at any start."
 
-Hash = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
-
 
 class ProfileError(ValueError):
     """A profile that cannot be used, and why."""
@@ -40,7 +38,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     v: Annotated[int, Meta(ge=VERSION, le=VERSION)]
     serial_number: Annotated[int, Meta(ge=0, lt=2**32)]
     insert: Annotated[str, Meta(min_length=1, max_length=64)]
-    model: Hash
+    model: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
     saved_ns: Annotated[int, Meta(ge=0, le=2**63 - 1)]
     scale: Annotated[float, Meta(gt=0.1, lt=10.0)]
     scale_sd: Annotated[float, Meta(ge=0.0, le=2.0 * SCALE_SD)]

@@ -36,12 +36,6 @@ _PAUSED: Final = OperatingState.PAUSED
 class Planner:
     """From setpoints to gaps, for one device."""
 
-    planned: Plan
-    "The newest."
-    believe: Believe
-    governor: Governor
-    aim: Aim
-
     def __init__(self, config: Config, scene: Scene, element: Element, now_s: float = 0.0) -> None:
         """Begins with the gap open at `now_s`."""
         terms, insert = terms_of(scene), scene.insert
@@ -52,6 +46,7 @@ class Planner:
         self.governor = Governor(now_s, element.portrait, scene.force, gap_speed_mm_s, terms)
         self.aim = Aim(config, scene, element)
         self.planned = self.aim.begin(now_s, 0, 0.0)
+        "The newest."
 
     def plan(self, now_s: float, setpoint: TimedSetpoint | None, measured: Measured | None) -> Plan:
         """The next plan. `measured` is None while the device has said nothing: nothing is learned of it then. Raises
@@ -94,25 +89,19 @@ class Planner:
 class Stepper:
     """From measurements and plans to duties, for one device."""
 
-    time_s: float
-    "Of the newest step."
-    safety: SafetyState
-    measure: Measure
-    homing: Homing
-    watch: Watch
-    move: Actuator
-
     def __init__(self, config: Config, scene: Scene, now_s: float = 0.0, move: Actuator | None = None) -> None:
         """Begins disabled at `now_s`. Without `move` the carriages are what moves the gap."""
         position, period_s = config.position, 1.0 / config.rates.control_hz
-        self.time_s, self.safety = now_s, SafetyState()
+        self.time_s = now_s
+        "Of the newest step."
+        self.safety = SafetyState()
         slides = scene.element == "torque"
         home_mm, full_mm_s = scene.insert.gap_open_mm / 2.0, full_speed_mm_s(config.motor)
         self.measure = Measure(home_mm, position.derivative_filter_s, slides, full_mm_s, period_s)
         self._ceiling_N: Final = ceiling_N(scene)
         self.homing = Homing(self._ceiling_N)
         self.watch = Watch(config, scene)
-        self.move = Carriages(config, scene) if move is None else move
+        self.move: Actuator = Carriages(config, scene) if move is None else move
         self._period_s: Final = period_s
 
     @property
@@ -159,7 +148,7 @@ class Stepper:
         self.safety = latch(self.safety, (fault,))
 
     def lose_link(self) -> None:
-        """The link broke: a fault where the device was driven, otherwise only a forgotten device."""
+        """The link broke: the device is forgotten; where it was driven, that is a fault."""
         if self.safety.is_driven:
             self.latch(Fault.LINK_LOST)
         self.measure.lose_device()

@@ -41,7 +41,7 @@ def interpolated(x: float, xs: Rising, ys: list[float]) -> float:
 
 
 def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> float:
-    """The same where it is known that so many of `xs` are not above `x`."""
+    """`interpolated` where it is known that `after` of `xs` are not above `x`."""
     if after == 0:
         return ys[0]
     if after == len(ys):
@@ -52,7 +52,7 @@ def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> fl
 
 
 def at_step(steps: float, ys: list[float]) -> float:
-    """The same of evenly spaced points: so many steps, 0 or more, behind the first of `ys` (n)."""
+    """Linear between evenly spaced `ys` (n), at so many steps, 0 or more, from the first; the last beyond them."""
     whole = int(steps)
     if whole >= len(ys) - 1:
         return ys[-1]

@@ -24,7 +24,6 @@ class Measure:
 
     measured: Measured | None = None
     "The newest; None while the device has said nothing."
-    sight: Sight
     leap: Leap | None = None
     "Of the encoders, until the device has said whether it was reset."
 
@@ -40,8 +39,9 @@ class Measure:
         self._full_speed_mm_s: Final = full_speed_mm_s
 
     def update(self, last_s: float, now_s: float, measurement: Measurement, needs_homing: bool) -> Measured:
-        """Takes what is known at `now_s`, a tick after `last_s`: the newest measurement, or the last one again.
-        `needs_homing`: the device's word that it is homed does not count."""
+        """What is measured at `now_s`, a tick after `last_s`, by the newest measurement, or the last one again; follows
+        whether the device is seen, and whether its encoders leapt. `needs_homing`: the device's word that it is homed
+        does not count."""
         last, seen_s = self.measured, self.sight.seen_s
         is_new = last is None or measurement.number != last.number
         self.sight.update(last_s, now_s, is_new)
@@ -56,7 +56,7 @@ class Measure:
         return measured
 
     def lose_position(self, measured: Measured) -> Measured:
-        """The same of a device whose carriages are nowhere known until it is homed again."""
+        """Takes what was measured last for that of a device that is not homed, whatever it says; and gives that."""
         self.measured = measured.replaced(is_homed=False) if measured.is_homed else measured
         return self.measured
 

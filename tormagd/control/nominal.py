@@ -22,11 +22,10 @@ class Nominal:
         self._displacements_mm: Final = model.feature_ranges[0]
         self._rates_mm_s: Final = model.feature_ranges[1]
         self.fields_mT: Final = model.feature_ranges[2]
-        self.slides: Final = contact.slides
         self.only: Final[ForceCurve] = self.curve(contact.displacement_mm, contact.rate_mm_s)
 
     def now(self, measured: Measured) -> ForceCurve:
-        """Of the handle as it moves now."""
+        """The force over the field, of the handle as it moves now."""
         if not self._has_rate:
             return self.only
         displacement_mm, rate_mm_s = self.contact.present(measured)
@@ -35,7 +34,8 @@ class Nominal:
     def planned(
         self, setpoint: TimedSetpoint | None, measured: Measured | None
     ) -> tuple[ForceCurve, tuple[Outside, ...]]:
-        """Of the handle as a setpoint is planned for, and what of that the model does not know."""
+        """The force over the field, of the handle as a setpoint is planned for; and what of that the model does not
+        know, with what it was asked about instead."""
         if not self._has_rate:
             return self.only, ()
         displacement_mm, rate_mm_s = self.contact.planned(setpoint, measured)

@@ -51,7 +51,7 @@ class Leap(Value):
 def leap_between(
     last: Measured, measured: Measured, full_speed_mm_s: float, now_s: float, seen_s: float
 ) -> Leap | None:
-    """The leap from `last` to `measured`, the first that was seen since `seen_s`; None for what a carriage can do.
+    """The leap from `last`, which came at `seen_s`, to `measured`, the next; None for what a carriage can do.
 
     The device's clock says how long it took, unless there was nothing to see for longer, and the clock ran over.
     """

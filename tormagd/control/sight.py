@@ -41,7 +41,7 @@ class Sight:
         self.is_blind = self.was_blind = False
 
     def has_stalled(self, now_s: float) -> bool:
-        """Whether a stall ended not long ago."""
+        """Whether a stall ended within the last SHOWN_S."""
         return now_s - self.stalled_s < SHOWN_S
 
     def is_waiting(self, now_s: float) -> bool:

@@ -91,7 +91,7 @@ class TelemetryLoop:
         control = self._control
         if control.output is None:
             return
-        self._way.ticked(control.stepper, used)
+        self._way.ticked(control.stepper.time_s, used)
         timing = control.timing
         record = tick_record(
             control.stepper,
@@ -320,7 +320,9 @@ class TelemetryLoop:
             limit_details=self._causes.of_limits(newest.limits, outside, inbox.told(now_s), self._control.measurement),
             newest_stall=self._causes.newest_stall(),
             not_granted=self._not_granted,
-            way=self._way.report(None if link.round_trip_us is None else link.round_trip_us.p50),
+            way=self._way.report(
+                None if link.round_trip_us is None else link.round_trip_us.p50, believe.carriages.lag_s
+            ),
             black_box=self._box.report(),
             output=OutputReport(rate=acted.rate, slew=acted.slew, not_finite=acted.not_finite, range=acted.range),
             next_commands=tuple(map(str, next_commands(safety, newest.is_homed))),

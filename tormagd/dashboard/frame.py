@@ -1,9 +1,11 @@
 """What the page shows of one moment, live or recorded: the seconds before it, and what holds the force back."""
 
 from bisect import bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
+
+from tormagd_client.messages import BeliefReport
 
 SHOWN_S = 20.0
 LATE_US = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1_000.0, 2_000.0, 5_000.0)
@@ -22,7 +24,7 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
     """Curves of the same length, the oldest first, `t_s` since 1970; what is not known is null.
 
     Live ones hold what is new, and the codes and `late_counts` (control ticks by lateness, between LATE_US) of all the
-    seconds shown.
+    seconds shown. `belief` is that of their end.
     """
 
     t_s: Sequence[float]
@@ -35,6 +37,7 @@ class Frame(msgspec.Struct, frozen=True, kw_only=True):
     operating_state: str
     held: Sequence[Held]
     faults: Sequence[str]
+    belief: Mapping[str, BeliefReport]
     late_counts: Sequence[int]
 
 

@@ -135,6 +135,7 @@ class Live:
             operating_state=newest.operating_state,
             held=[Held(code, count / len(kept), code in newest.limits) for code, count in times.most_common()],
             faults=newest.faults,
+            belief=newest.belief,
             late_counts=late_counts(each.tick.lateness_us for each in kept),
         )
 

@@ -1,14 +1,17 @@
 """A recording, at any moment of it, in the form in which the daemon is shown live."""
 
+import math
+import re
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tormagd.dashboard.frame import SHOWN_S, Frame, Held, late_counts
 from tormagd.recording.reader import Recording
 from tormagd.recording.series import BREAK_S, Band, Series, bands, series, start_ns, tracking_rms_N
 from tormagd.safety.codes import FAULTS, LIMITS
-from tormagd_client.messages import Explained, PortraitReport
+from tormagd_client.messages import BeliefReport, Explained, PortraitReport
 
 STEP_S = 0.02
 "Between two points of a curve, as live."
@@ -23,6 +26,7 @@ CURVES = {
     "field_mT": "field_mT",
 }
 "What the page calls a quantity, and what a recording does."
+_BELIEVED = re.compile(r"belief\.[^.]+\.value")
 
 
 class Recorded:
@@ -77,8 +81,24 @@ class Recorded:
             operating_state=next((band.name for band in self._states if _is_at(band, at_s)), ""),
             held=sorted(limits, key=lambda held: -held.share),
             faults=[band.name for band in self._faults if _is_at(band, at_s)],
+            belief=self._belief(at_s),
             late_counts=late_counts([] if late is None else late[np.isfinite(late)].tolist()),
         )
+
+    def _belief(self, at_s: float) -> dict[str, BeliefReport]:
+        """What the newest snapshot said; nothing where that is too old to be true, or said nothing."""
+        telemetry = self._recording.telemetry
+        numbers, words, at_ns = telemetry.numbers, telemetry.words, self._start_ns + round(at_s * 1e9)
+        row = int(np.searchsorted(telemetry.t_ns, at_ns, side="right")) - 1
+        if row < 0 or (at_ns - telemetry.t_ns[row]) * 1e-9 > BREAK_S:
+            return {}
+        told = {}
+        for name in (path.split(".")[1] for path in numbers if _BELIEVED.fullmatch(path)):
+            value, sd, acts = (_number(numbers, f"belief.{name}.{part}", row) for part in ("value", "sd", "acts"))
+            if value is not None:
+                unit = "".join(words[f"belief.{name}.unit"][row]) if f"belief.{name}.unit" in words else ""
+                told[name] = BeliefReport(value=value, sd=sd, unit=unit, acts=bool(acts))
+        return told
 
     def _overview(self) -> dict[str, Any]:
         """Ends of the stretches, the least and greatest measured force in each, and where faults and limits were."""
@@ -96,6 +116,11 @@ class Recorded:
         codes = {"limits": self._limits, "faults": self._faults}
         spans = {name: [span for band in found for span in band.spans_s] for name, found in codes.items()}
         return {"t_s": edges_s[1:].tolist(), "low_N": low, "high_N": high, **spans}
+
+
+def _number(numbers: dict[str, NDArray[np.float64]], name: str, row: int) -> float | None:
+    value = float(numbers[name][row]) if name in numbers else math.nan
+    return value if math.isfinite(value) else None
 
 
 def _sampled(known: Series | None, times_s: np.ndarray) -> list[float | None]:

@@ -231,7 +231,7 @@ class WayReport(msgspec.Struct, frozen=True, kw_only=True):
     """The whole way of a setpoint, from its stamp to the force, against a budget. What is not known yet is null.
 
     `to_duty_us`: from the stamp, by the corrected clock, until the first duty that follows it. `device_us`: from a
-    Drive to its State, median. `carriages_ms`: how far the gap is behind where it was wanted, in time.
+    Drive to its State, median. `carriages_ms`: how late the carriages are believed to be.
     """
 
     to_duty_us: ExecReport

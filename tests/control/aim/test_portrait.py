@@ -15,7 +15,8 @@ GAINS_N = st.lists(st.floats(1e-9, 1.0), min_size=1, max_size=60)
 def drawn_portrait(least_N: float, gains_N: list[float]) -> Portrait:
     """A portrait whose forces rise by so much from point to point, from steep to flat as they come."""
     forces_N = list(accumulate(gains_N, initial=least_N))
-    return Portrait(np.linspace(40.0, 15.0, len(forces_N)).tolist(), forces_N, [*gains_N, gains_N[-1]])
+    gaps_mm = np.linspace(40.0, 15.0, len(forces_N)).tolist()
+    return Portrait(gaps_mm, forces_N, [*gains_N, 2.0 * gains_N[-1]])
 
 
 @given(least_N=st.floats(0.1, 1.0), gains_N=GAINS_N, share=st.floats(-0.5, 1.5), place=st.integers(0))

@@ -200,6 +200,8 @@ def test_after_a_jump_nothing_is_forecast_and_trust_has_to_be_earned_again(learn
     assert learned.time_s > 4.02
     learned.changes_N = changes_N
     assert learned.trust < 0.03 < trust
+    # as if it had missed all that the slope met, and by no more than what the first judgement counts
+    assert (LOST.score, LOST.apart) == (pytest.approx(-1.0, abs=0.03), pytest.approx(DOUBT_N**2))
 
 
 @pytest.mark.parametrize("step_s", [MAX_STEP_S + 1e-6, -1.1 * GRID_S, -9.0])

@@ -151,6 +151,19 @@ def test_from_one_holder_to_the_next_the_force_goes_along_the_ramp(
     assert (ask.force_N, ask.limits) == (1.2, ())
 
 
+def test_a_takeover_turns_where_the_new_holder_does_and_ends_a_step_from_its_force() -> None:
+    following, at_N, step_N = governor(0.0, 1.2), 1.2, SCENE.release_N_s * 1e-3
+    decide(following, 0.001, TimedSetpoint(1.2, 0.001, VALID_S))
+    for tick in range(2, 62):
+        now_s, to_N = tick * 1e-3, 1.6 if tick < 30 else 1.2 - 0.6 * step_N
+        ask = decide(following, now_s, TimedSetpoint(to_N, now_s, VALID_S, holder=1))
+        is_far = abs(to_N - at_N) > step_N
+        at_N = at_N + math.copysign(step_N, to_N - at_N) if is_far else ask.path_N[0]
+        assert (ask.force_N, Limit.TAKEOVER in ask.limits) == (pytest.approx(at_N), is_far)
+        assert ask.path_N == pytest.approx([at_N] * len(PATH_S)) or not is_far
+    assert ask.force_N == to_N
+
+
 def test_a_takeover_after_a_silence_begins_from_the_decayed_force() -> None:
     following = governor(0.0, 1.6)
     for tick in range(1, 301):

@@ -6,7 +6,9 @@ import math
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from tormagd.control.ask.path import nearest_path_mm
+from tormagd.control.aim.portrait import Portrait
+from tormagd.control.ask.path import NEAR_S, Path, nearest_path_mm
+from tormagd.control.believe.strength import DeviceFit
 
 STEP_S = 0.01
 SPEED_MM_S = 40.0
@@ -52,6 +54,16 @@ def test_the_first_gap_is_within_reach_of_the_last() -> None:
 def test_no_more_of_it_is_told_than_is_asked_for() -> None:
     times_s = [STEP_S * place for place in range(12)]
     assert len(nearest_path_mm(60.0, 0.0, times_s, [60.0] * 10, [1.0] * 10, SPEED_MM_S, 3)) == 3
+
+
+@pytest.mark.parametrize("device", [DeviceFit(), DeviceFit(scale=1.5, offset_N=0.1)])
+@pytest.mark.parametrize(("share", "is_near"), [(0.99, True), (1.01, False)])
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_force_is_near_that_the_gap_gets_to_soon(device: DeviceFit, share: float, is_near: bool, way: float) -> None:
+    """Either way, by the model's force: 40 mm for 1 N of it."""
+    path = Path(Portrait([90.0, 50.0], [1.0, 2.0], [0.025, 0.025]), SPEED_MM_S)
+    to_N = 1.5 + way * share * NEAR_S * SPEED_MM_S / 40.0
+    assert path.is_near(device.force_N(1.5), device.force_N(to_N), device) is is_near
 
 
 GRID = 4

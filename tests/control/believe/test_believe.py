@@ -8,7 +8,7 @@ from tormagd.assembly.build import Core
 from tormagd.assembly.journal import KNOWN
 from tormagd.control.believe.believe import NOTHING_LEARNED, UNTARED_N, Learned
 from tormagd.control.believe.carriage_lag import AGE_S, MAX_LAG_S
-from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
+from tormagd.control.believe.sensor_zero import MAX_SD_N, UNKNOWN_SD_N
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.core import Planner
 from tormagd.control.records import Handle, Measured, TimedSetpoint
@@ -79,6 +79,28 @@ def test_without_learning_no_reading_teaches_and_the_sensor_is_judged_all_the_sa
         hear(planner, 0.4, moving(force_N=1.4, **changes))
     assert planner.believe.learned() == learned
     assert Limit.SENSOR in hear(planner, 0.4, moving(force_N=9.0)).planned.limits
+    assert planner.believe.zero.sd_N(planner.planned.time_s) == MAX_SD_N
+
+
+@pytest.mark.parametrize(
+    ("rate_mm_s", "sliding_mm_s", "teaches"),
+    [(2.0, 5.9, True), (2.1, 6.1, False), (1.0, 2.9, True), (1.0, 3.5, False), (0.2, 0.2, False)],
+    ids=["slow", "was faster", "slower", "comes to rest", "may stand"],
+)
+def test_a_creep_is_a_handle_that_is_slow_and_has_been(
+    planner, hear, moving, rate_mm_s: float, sliding_mm_s: float, teaches: bool
+) -> None:
+    handle = Handle(MOBILISED_MM, rate_mm_s, TURN, sliding_mm_s)
+    assert (hear(planner, 0.2, moving(force_N=1.4, handle=handle)).believe.slow.factor != 1.0) is teaches
+
+
+@pytest.mark.parametrize(("force_N", "teaches"), [(0.8, False), (1.4, True)])
+def test_before_it_is_mobilised_only_more_force_than_expected_teaches(
+    planner, hear, moving, force_N: float, teaches: bool
+) -> None:
+    handle = Handle(MOBILISED_MM - 0.01, 1.0, TURN, 1.0)
+    slow = hear(planner, 0.2, moving(force_N=force_N, handle=handle)).believe.slow
+    assert (slow.learned > 0.0, slow.factor > 1.0) == (teaches, teaches)
 
 
 @pytest.mark.parametrize("goes_on", [False, True])

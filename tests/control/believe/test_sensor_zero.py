@@ -64,6 +64,12 @@ def test_one_reversal_is_enough_where_the_sensor_is_not_taken_for_tared() -> Non
     assert zero.sd_N(now_s) < 0.03
 
 
+def test_of_a_doubted_sensor_as_little_is_known_as_after_an_hour_of_drift() -> None:
+    zero, _ = strokes(0.1)
+    zero.doubt()
+    assert zero.variance_N2 == pytest.approx(MAX_SD_N**2)
+
+
 def test_the_force_may_be_another_after_the_reversal() -> None:
     zero, _ = strokes(0.1, is_tared=False, number=2, scale=1.2, model_N=(0.8, 1.9))
     assert zero.zero_N == pytest.approx(0.1, abs=0.01)

@@ -15,6 +15,7 @@ from tormagd.control.believe.slow_friction import (
     REACH_MM,
     STRIBECK_MM_S,
     SlowFriction,
+    believable,
 )
 from tormagd.control.believe.strength import UNSEEN, DeviceFit
 from tormagd.exact import plain
@@ -60,6 +61,7 @@ def test_of_a_known_device_a_creep_shows_its_static_friction_and_no_more() -> No
 def test_of_a_device_that_was_never_seen_a_creep_shows_nearly_all() -> None:
     assert crept(0.75, 10.0).factor_at(1.0) == pytest.approx(0.75, abs=0.01)
     assert crept(1.35, 10.0).factor_at(1.0) == pytest.approx(1.35, abs=0.01)
+    assert crept(0.59, 10.0).factor_at(1.0) == pytest.approx(0.59, abs=0.01)
     assert crept(0.55, 10.0).factor == MIN_FACTOR
     assert crept(5.0, 10.0).factor <= MAX_FACTOR
 
@@ -68,6 +70,12 @@ def test_of_a_device_that_was_never_seen_a_creep_shows_nearly_all() -> None:
 def test_a_sensor_that_reads_less_than_any_device_makes_teaches_nothing(share: float) -> None:
     assert plain(crept(share, 10.0)) == plain(crept(1.0, 0.0))
     assert crept(MIN_SHARE, 10.0).factor == MIN_FACTOR
+
+
+def test_what_is_believed_of_a_creep_grows_by_three_deviations_of_the_fit() -> None:
+    known, unsure = (DeviceFit(scale_variance=sd * sd, offset_variance_N2=0.0) for sd in (0.0, 0.02))
+    assert believable(known, 1.5) == (MIN_STATIC, MAX_STATIC)
+    assert believable(unsure, 1.5) == pytest.approx((MIN_STATIC - 0.06, MAX_STATIC + 0.06))
 
 
 def test_friction_follows_a_rise_over_travel_and_a_fall_at_once() -> None:

@@ -25,7 +25,6 @@ class Portrait:
         self.gap_mm: Final = gap_mm
         self.force_N: Final = force_N
         self.slope_N_mm: Final = slope_N_mm
-        self._open_mm: Final = gap_mm[0]
         self._step_mm: Final = (gap_mm[0] - gap_mm[-1]) / (len(gap_mm) - 1)
         self._rising_N: Final = Rising(force_N)
 
@@ -55,7 +54,7 @@ class Portrait:
 
     def force_N_at(self, gap_mm: float) -> float:
         """What this gap gives; of the nearest end of the range outside of it."""
-        return at_step(max((self._open_mm - gap_mm) / self._step_mm, 0.0), self.force_N)
+        return at_step(max((self.gap_mm[0] - gap_mm) / self._step_mm, 0.0), self.force_N)
 
     def force_rate_N_s(self, force_N: float, gap_speed_mm_s: float) -> float:
         """The fastest change of force that a gap speed renders at this force."""
@@ -99,7 +98,8 @@ class LawOfField:
 def law_beside(
     shown: Portrait, law: PowerFieldLaw, field: FieldOfGap, elastomer: Elastomer, geometry: Geometry
 ) -> LawOfField:
-    """The law beside a portrait. Raises `DomainError` where the gaps leave the law's domain."""
+    """The force law over the gaps of a portrait, times the median of how much stronger that is. Raises `DomainError`
+    where the gaps leave the law's domain."""
     forces_N = brake_force_N(law.radial_moment_Tm(np.array(shown.gap_mm)), elastomer, geometry)
     scale = float(np.median(np.array(shown.force_N) / forces_N))
     scaled_N: list[float] = (scale * forces_N).tolist()

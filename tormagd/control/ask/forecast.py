@@ -61,26 +61,17 @@ _MIN_BYTES: Final = MIN_HISTORY * array("d").itemsize
 _MAX_BYTES: Final = HISTORY * array("d").itemsize
 
 
-@final
-class Embedding(Value):
-    """Where stretches and what followed them are in a full history.
-
-    shortest  the points that a stretch takes with what followed it
-    around    (TAPS + 1 + HORIZON, n) places from the history's end, a column for each stretch: what is compared of it,
-              its end, what followed; the first is the newest stretch, which nothing has followed yet
-    """
-
-    __match_args__ = ("shortest", "around")
-
-    def __init__(self, delays: tuple[int, ...]) -> None:
-        self.shortest: Final = delays[-1] + 1 + HORIZON
-        rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
-        ends = np.arange(-1 - HORIZON, self.shortest - HORIZON - HISTORY - 2, -STRIDE)
-        self.around: Final[Array] = np.concatenate([np.minimum(rows - 1, -1), rows + ends], axis=1)
+def embedding(delays: tuple[int, ...]) -> Array:
+    """Where stretches and what followed them are in a full history: (TAPS + 1 + HORIZON, n) places from its end, a
+    column for each stretch: what is compared of it, its end, what followed. The first is the newest stretch, which
+    nothing has followed yet."""
+    rows = np.array([*[-delay for delay in delays], *range(HORIZON + 1)])[:, None]
+    ends = np.arange(-1 - HORIZON, delays[-1] - HISTORY - 1, -STRIDE)
+    return np.concatenate([np.minimum(rows - 1, -1), rows + ends], axis=1)
 
 
-RISE: Final = Embedding(RISE_DELAYS)
-BEAT: Final = Embedding(BEAT_DELAYS)
+RISE: Final = embedding(RISE_DELAYS)
+BEAT: Final = embedding(BEAT_DELAYS)
 
 
 @final
@@ -130,8 +121,8 @@ class Forecast:
 
     @property
     def trust(self) -> float:
-        """0..1: how far the forecast takes the place of the slope; half of what would have been best, and nothing where
-        nothing was gained."""
+        """0..1: how far the forecast takes the place of the slope. It is the skill of LONG_S, less the share of it that
+        SHORT_S lost, and 0 while nothing is forecast."""
         if not self.changes_N:
             return 0.0
         earned, lost = self.long.score, -self.short.score
@@ -166,8 +157,8 @@ class Forecast:
         if self.from_s >= self.time_s or len(self.history) < _MIN_BYTES:
             return False
         history = np.frombuffer(self.history)
-        rise, rise_unlike = _search(history, RISE)
-        beat, beat_unlike = _search(history, BEAT)
+        rise, rise_unlike = _search(history, RISE, RISE_DELAYS[-1])
+        beat, beat_unlike = _search(history, BEAT, BEAT_DELAYS[-1])
         changes: list[float] = []
         said: Guess | None = None
         if rise or beat:
@@ -184,8 +175,8 @@ class Forecast:
         return True
 
     def forces_N(self, begins_s: float, after_s: list[float]) -> list[float]:
-        """The forces at these times (n) after `begins_s`, 0 or more, from the newest setpoint on; they stay where the
-        forecast ends. Only where `trust` is above 0."""
+        """The forces at `begins_s` plus each of `after_s` (n), all 0 or more, after the newest setpoint; they stay
+        where the forecast ends. Only where `trust` is above 0."""
         changes = self.changes_N
         # the forecast starts at the newest setpoint, which may have come some steps after the point it is from
         since_s = self.stamp_s - self.from_s
@@ -237,14 +228,15 @@ def _ahead_N(force_N: float, changes_N: list[float], since_s: float) -> float:
     return force_N + changes_N[JUDGED] - changes_N[1] * since_s / GRID_S
 
 
-def _search(history: Array, embedding: Embedding) -> tuple[list[float], float]:
+def _search(history: Array, around: Array, longest: int) -> tuple[list[float], float]:
     """The changes from the newest point of the grid to itself and the next HORIZON, empty where nothing is like it; and
-    how far the stretch most like the newest is from it: the mean square of a point, N², SAME_N's at least.
+    how far the stretch most like the newest is from it: the mean square of a point, N², SAME_N's at least. `around` is
+    an embedding, `longest` the longest of its delays.
 
     What followed a stretch is regressed on 1 and on how the stretch differs from the newest. The newest does not differ
     from itself, so that the regression's constant is its forecast.
     """
-    changes = history[embedding.around[:, : (len(history) - embedding.shortest) // STRIDE + 2]]
+    changes = history[around[:, : (len(history) - longest - 1 - HORIZON) // STRIDE + 2]]
     changes -= changes[TAPS]
     before = changes[:TAPS]
     before -= before[:, :1].copy()

@@ -58,7 +58,6 @@ class Governor:
     "Where the carriages were sent, as a force; None where it is not known what comes."
     expected_N: float | None
     "The force by now along the path of a preview, behind the carriages' lag."
-    forecast: Forecast
 
     def __init__(
         self, now_s: float, portrait: Portrait, force: Force, gap_speed_mm_s: float, terms: Terms = EVERY_TERM

@@ -50,8 +50,8 @@ class Path:
         self._gap_speed_mm_s: Final = gap_speed_mm_s
 
     def is_near(self, from_N: float, to_N: float, device: DeviceFit) -> bool:
-        """Whether the gap gets from one force to the other soon. Where it does not, nothing is gained by what comes,
-        and it goes at once."""
+        """Whether the gap of this device gets from one force to the other within NEAR_S. Where it does not, nothing is
+        gained by looking ahead, and it sets out at once."""
         portrait = self._portrait
         away_mm = portrait.gap_mm_at(device.model_N(from_N)) - portrait.gap_mm_at(device.model_N(to_N))
         return abs(away_mm) < NEAR_S * self._gap_speed_mm_s

@@ -64,15 +64,6 @@ NOTHING_LEARNED: Final = Learned()
 class Believe:
     """The estimators of one device."""
 
-    memory: ElementMemory
-    handle: HandleWatch
-    strength: Strength
-    slow: SlowFriction
-    zero: SensorZero
-    sensor: SensorTrust
-    carriages: CarriageLag
-    learns: bool
-    "Whether anything is learned. What protects goes on without: the sensor is judged, and a lie makes it forgotten."
     read: int = -1
     "Number of the newest measurement that taught,"
     read_s: float
@@ -93,9 +84,12 @@ class Believe:
         self._nominal: Final = nominal
         self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)
         self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
-        self.learns, self.read_s = terms.learning, -math.inf
+        self.read_s = -math.inf
+        self.learns = terms.learning
+        """Whether anything is learned. What protects goes on without: the sensor is judged, and a lie makes it
+        forgotten."""
         self._has_lag: Final = terms.lag
-        self._has_creep: Final = terms.creep and nominal.slides
+        self._has_creep: Final = terms.creep and nominal.contact.slides
         self._fits: Final = terms.scale or terms.offset
 
     @property
@@ -128,7 +122,8 @@ class Believe:
         self.handle = HandleWatch()
 
     def update(self, now_s: float, measured: Measured | None) -> Belief:
-        """What is believed at `now_s`. `measured` is None while the device has said nothing."""
+        """Learns from what is measured, where that is new, and says what is believed at `now_s`. `measured` is None
+        while the device has said nothing."""
         model_N: float | None = None
         if measured is not None:
             self.memory.update(now_s, measured)
@@ -138,7 +133,8 @@ class Believe:
         return self._belief(measured, model_N)
 
     def expect(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
-        """Learns how late the carriages are, once a plan is made `dt_s` after the last."""
+        """Learns how late the carriages are, once a plan is made `dt_s` after the last: from its gap, `planned_mm`, and
+        the measured one, where its `foresight`, 0..1, says that it knows what comes."""
         if not (self.learns and self._has_lag):
             return
         if measured is None or not measured.is_homed or foresight < MIN_FORESIGHT:
@@ -162,7 +158,7 @@ class Believe:
 
     def _hear(self, now_s: float, measured: Measured, model_N: float) -> None:
         """Learns from the newest reading, where the model says `model_N`."""
-        if self._nominal.slides:
+        if self._nominal.contact.slides:
             self.handle.update(measured.sensed_s, measured.handle_mm, measured.force_N, model_N)
         if measured.number == self.read or now_s - self.read_s < MIN_DT_S:
             return
@@ -172,7 +168,7 @@ class Believe:
         self.read, self.read_s = measured.number, now_s
         rate_mm_s = abs(measured.handle.rate_mm_s)
         is_mobilised = self._nominal.contact.is_known(measured)
-        is_slow = self._nominal.slides and (rate_mm_s < MOVING_MM_S or self.handle.moved_gap_at_rest(model_N))
+        is_slow = self._nominal.contact.slides and (rate_mm_s < MOVING_MM_S or self.handle.moved_gap_at_rest(model_N))
         if is_mobilised and not is_slow:
             self._hear_at_speed(now_s, measured, model_N, dt_s)
         else:

@@ -71,8 +71,8 @@ class ElementMemory:
         return curve.force_N(within(self.field_mT - self.lag_mT, self._nominal.fields_mT)) - self.relaxed_N
 
     def update(self, now_s: float, measured: Measured) -> None:
-        """Takes the newest gap."""
-        slides = self._nominal.slides
+        """Follows the field's lag and what has relaxed to `now_s`, by the measured gap."""
+        slides = self._nominal.contact.slides
         is_empty = self.time_s == -math.inf
         if slides and not measured.is_homed:
             # until both switches are found, positions count from where the carriages were, as if they were open

@@ -74,14 +74,13 @@ class SensorTrust:
     "A fit of the readings that forgets in SLOW_S."
     before: DeviceFit = UNSEEN
     "The device's own fit of KEPT_S to twice that ago,"
-    before_at: At
     kept: DeviceFit = UNSEEN
     "and of up to KEPT_S ago."
-    kept_at: At
     kept_s: float = 0.0
 
     def __init__(self) -> None:
-        self.before_at = self.kept_at = (0.0, 0.0, 0.0)
+        self.before_at: At = (0.0, 0.0, 0.0)
+        self.kept_at: At = (0.0, 0.0, 0.0)
 
     def update(
         self,
@@ -120,8 +119,7 @@ class SensorTrust:
             self.loaded_N = low_pass(self.loaded_N, model_N, dt_s, MEMORY_S)
             self.kept_s += dt_s
         self.reading_N = reading_N
-        bounds = MIN_SCALE, MAX_SCALE
-        self.slow, _ = observe(self.slow, model_N, reading_N, dt_s, adapts_in_s=SLOW_S, bounds=bounds)
+        self.slow, _ = observe(self.slow, model_N, reading_N, dt_s, adapts_in_s=SLOW_S, bounds=(MIN_SCALE, MAX_SCALE))
 
     def _hope(self, model_N: float, dt_s: float) -> None:
         """A doubted sensor has to read for long what most devices do, not what one at the edge might."""

@@ -85,11 +85,11 @@ class SensorZero:
         return math.sqrt(min(self.variance_N2 + drifted_N2, MAX_SD_N * MAX_SD_N))
 
     def begin(self, now_s: float) -> None:
-        """There is a reading: from the first on the zero drifts."""
+        """Says that there is a reading: from the first one on the zero's variance grows."""
         self.told_s = min(self.told_s, now_s)
 
     def doubt(self) -> None:
-        """The sensor is not believed to have been tared."""
+        """The sensor is not believed to have been tared: its zero is known to within MAX_SD_N."""
         self.variance_N2 = MAX_SD_N * MAX_SD_N
 
     def update(

@@ -65,12 +65,12 @@ class SlowFriction:
     def rescale(self, before_N: float, after_N: float) -> None:
         """The fit now expects `after_N` where it expected `before_N`: the force at a creep stays what it was, as far as
         that was learned at a creep."""
-        if before_N == after_N or self.learned == 0.0 or not (before_N > 0.0 and after_N > 0.0):
-            return
-        self.factor = min(max(self.factor * math.pow(before_N / after_N, self.learned), MIN_FACTOR), MAX_FACTOR)
+        if before_N > 0.0 and after_N > 0.0:
+            self.factor = min(max(self.factor * math.pow(before_N / after_N, self.learned), MIN_FACTOR), MAX_FACTOR)
 
     def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
-        """Takes a reading along a motion at `rate_mm_s`. The fit gives more than nothing of what was followed."""
+        """Learns k from a reading along the motion of a handle that slides at `rate_mm_s`, which stands for `dt_s`. The
+        `fit` has to expect more than 0 N where the model says `followed_N`."""
         if reading_N < MIN_SHARE * self.followed_N - NOISE_N:
             return
         slowness = _slowness(rate_mm_s)
@@ -82,7 +82,7 @@ class SlowFriction:
 
 
 def believable(fit: DeviceFit, model_N: float) -> tuple[float, float]:
-    """The least and the greatest factor of a device with that fit, where the model says `model_N`."""
+    """The least and the greatest k that is believed of a device with that fit, where the model says `model_N`."""
     unsure = BELIEVED_SD * fit.deviation_N(model_N) / fit.force_N(model_N)
     return max(MIN_STATIC - unsure, MIN_FACTOR), min(MAX_STATIC + unsure, MAX_FACTOR)
 

@@ -77,14 +77,12 @@ class DeviceFit(Value):
         return (force_N - self.offset_N) / self.scale
 
     def deviation_N(self, model_N: float) -> float:
-        """Standard deviation of `force_N` there."""
+        """Standard deviation of the force that the device gives where the model says `model_N`."""
         variance = model_N * (model_N * self.scale_variance + 2.0 * self.covariance_N) + self.offset_variance_N2
         return math.sqrt(max(variance, 0.0))
 
     def times(self, factor: float) -> "DeviceFit":
         """The fit of a device that gives `factor` > 0 times the force."""
-        if factor == 1.0:
-            return self
         square = factor * factor
         return DeviceFit(
             factor * self.scale,
@@ -96,8 +94,6 @@ class DeviceFit(Value):
 
     def relaxed(self, relaxed_N: float) -> "DeviceFit":
         """The fit over the model's force without memory, of a device whose force it is without `relaxed_N` of that."""
-        if relaxed_N == 0.0:
-            return self
         by_scale_N = relaxed_N * self.scale_variance
         return DeviceFit(
             self.scale,
@@ -211,10 +207,10 @@ class Strength:
         )
 
     def settle(self) -> None:
-        """Nothing can be learned now: what comes then is no surprise yet."""
+        """Nothing can be learned now: what comes after that is no surprise yet, and no bound holds the scale."""
         self.surprise_N, self.is_held = 0.0, False
 
     def forget(self, fit: DeviceFit = UNSEEN) -> None:
-        """Takes `fit` for what is known."""
+        """Forgets what was learned: `fit` is what is known from now on."""
         self.fit = fit
         self.settle()

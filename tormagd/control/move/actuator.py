@@ -50,7 +50,6 @@ class Actuator:
     "Where the gap is driven; None while nothing is driven."
     acceleration_scale: float = 1.0
     "1 or more: how fast the actuator has shown to gain speed, times what is asked of all."
-    acted: Acted
 
     def __init__(self) -> None:
         self.acted = Acted()

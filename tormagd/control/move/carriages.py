@@ -41,10 +41,6 @@ class Carriages(Actuator):
     """Drives the two carriages of one device. Those whose motors are livelier than believed get ahead of what is
     expected, and `acceleration_scale` grows. Of weaker ones no less is asked: they would turn too late."""
 
-    expected: Expected
-    left: Pid
-    right: Pid
-
     def __init__(self, config: Config, scene: Scene) -> None:
         super().__init__()
         position, motor = config.position, config.motor
@@ -71,7 +67,7 @@ class Carriages(Actuator):
         self._learns: Final = terms.learning
 
     def begin(self, gap_mm: float) -> None:
-        """Begins bumpless, with empty integrators."""
+        """See `Actuator.begin`: with empty integrals, so that no duty jumps."""
         self.reference = Reference(gap_mm)
         self.expected.begin(gap_mm)
         self.left.begin()
@@ -98,17 +94,17 @@ class Carriages(Actuator):
         is_over: bool,
     ) -> Drive:
         """See `Actuator.update`."""
-        if self.reference is None:
-            self.reference = Reference(measured.gap_mm)
-            self.expected.begin(measured.gap_mm)
+        assert self.reference is not None, "enabling begins one"
         self.expected.update(self.reference, dt_s, self._lag_s, self._derivative_filter_s)
         # a homed carriage that is found beyond the closed end has to come back from there
         pull = 0.0
         if self._has_motor:
             pull = pull_V(self._pull_V, max(self.reference.gap_mm, self._closed_mm)) / self._supply_V
         limits: list[Limit] = []
-        is_slewed = self._follow(now_s, dt_s, plan, self._speeds(pull, measured), is_over, limits)
-        reference = self.reference
+        reference, is_slewed = self._follow(
+            self.reference, now_s, dt_s, plan, self._speeds(pull, measured), is_over, limits
+        )
+        self.reference = reference
         # either also takes half of the skew, so that the faster waits for the slower
         skew_mm = self._synchronisation * measured.skew_mm / 2.0
         half_mm, half_mm_s = self.expected.gap_mm / 2.0, self.expected.filtered_mm_s / 2.0
@@ -126,11 +122,16 @@ class Carriages(Actuator):
         return self._drive(left, right, measurement.supply_V, limits)
 
     def _follow(
-        self, now_s: float, dt_s: float, plan: Plan | None, speeds: Speeds, is_over: bool, limits: list[Limit]
-    ) -> bool:
-        """Moves the reference on, and says whether the limit of its acceleration held it back."""
-        reference = self.reference
-        assert reference is not None, "it begins with the first tick"
+        self,
+        reference: Reference,
+        now_s: float,
+        dt_s: float,
+        plan: Plan | None,
+        speeds: Speeds,
+        is_over: bool,
+        limits: list[Limit],
+    ) -> tuple[Reference, bool]:
+        """The reference `dt_s` later, and whether the limit of its acceleration held it back."""
         floor_mm, target = self._closed_mm, Reference(reference.gap_mm)
         if plan is not None:
             floor_mm = max(floor_mm, plan.min_gap_mm)
@@ -142,10 +143,9 @@ class Carriages(Actuator):
         reference, is_limited, is_slewed = follow(max_mm_s2, reference, target, dt_s, speeds, floor_mm)
         if plan is not None and is_limited and abs(target.gap_mm - reference.gap_mm) > LAGGING_MM:
             limits.append(Limit.RATE)
-        self.reference = reference
         self.acted.rate += is_limited
         self.acted.slew += is_slewed
-        return is_slewed
+        return reference, is_slewed
 
     def _speeds(self, pull: float, measured: Measured) -> Speeds:
         """The motors' and the configured one, or what the carriages show where they fall behind; not below half, so

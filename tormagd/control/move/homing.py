@@ -25,7 +25,6 @@ RISES: Final = 1.25
 
 _HOMING: Final = DeviceMode.HOMING
 _BOTH_OPEN: Final = int(Switches.LEFT_OPEN) | int(Switches.RIGHT_OPEN)
-_NOTHING: Final[tuple[Fault, ...]] = ()
 
 
 @final
@@ -48,7 +47,7 @@ class Homing:
     "What the force sensor may show,"
     over_s: float = 0.0
     "and for how long it has shown more."
-    faults: tuple[Fault, ...] = _NOTHING
+    faults: tuple[Fault, ...] = ()
     "What was wrong at the newest look; told once."
 
     def __init__(self, ceiling_N: float) -> None:
@@ -72,7 +71,7 @@ class Homing:
 
     def update(self, now_s: float, measurement: Measurement) -> None:
         """Takes one more look at the device."""
-        self.faults = _NOTHING
+        self.faults = ()
         if measurement.mode is not _HOMING:
             if self.is_running:
                 self._end(now_s, measurement)

@@ -22,10 +22,8 @@ class Pid:
 
     integral: float = 0.0
     "Duty."
-    duty: float = 0.0
-    "The newest, in -limit..limit,"
     is_saturated: bool = False
-    "and whether the limit held it back."
+    "The limit held the newest duty back."
 
     def __init__(self, position: Position) -> None:
         self._proportional_per_mm: Final = position.proportional_per_mm
@@ -36,7 +34,7 @@ class Pid:
 
     def begin(self) -> None:
         """Begins with an empty integral."""
-        self.integral, self.duty, self.is_saturated = 0.0, 0.0, False
+        self.integral, self.is_saturated = 0.0, False
 
     def rest(self, error_mm: float, dt_s: float) -> None:
         """The reference rests. On target friction holds the carriage, and no error would ever take back what the
@@ -57,5 +55,5 @@ class Pid:
             growth = min(growth, 0.0)
         # the integral never needs more than the whole duty, whatever a long saturation makes of back-calculation
         self.integral = min(max(self.integral + growth * dt_s, -self._limit), self._limit)
-        self.duty, self.is_saturated = duty, within != asked and duty == within
+        self.is_saturated = within != asked and duty == within
         return duty

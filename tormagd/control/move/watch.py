@@ -98,7 +98,8 @@ class Watch:
         return self.over_s > OVER_HELD_S
 
     def known(self, conditions: Conditions, measured: Measured | None) -> Conditions:
-        """The conditions of a command, with what is watched here."""
+        """The conditions of a command, with how far the carriages are apart, and what skew, round trip and drift of the
+        clock a command may find at most."""
         return conditions.replaced(
             fresh=conditions.fresh and measured is not None,
             apart_mm=math.inf if measured is None else abs(measured.skew_mm),

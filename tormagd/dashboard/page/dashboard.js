@@ -174,6 +174,14 @@ function showLate(counts) {
   }));
 }
 
+// an older daemon and a recording of ticks alone say nothing of it
+function showBelief(belief) {
+  const acting = Object.entries(belief).filter(([, it]) => it.acts)
+    .map(([name, it]) => `${name} ${it.value.toPrecision(3)}${it.sd === null ? "" : ` ± ${it.sd.toPrecision(2)}`} ${it.unit}`.trim());
+  at("believed").textContent = Object.keys(belief).length
+    ? `Believed of the device: ${acting.join(", ") || "nothing that acts"}.` : "";
+}
+
 // ---- frames
 
 const seconds = (t_s) => t_s - (about.start_s ?? kept.t_s.at(-1));
@@ -183,6 +191,7 @@ function show(frame) {
   showState(frame);
   showCodes(frame);
   showLate(frame.late_counts);
+  showBelief(frame.belief);
   charts.force.setData([x, kept.measured_N, kept.governed_N, kept.asked_N]);
   charts.gap.setData([x, kept.gap_mm, kept.gap_wanted_mm, kept.field_mT]);
   showPortrait();
@@ -203,9 +212,6 @@ function live() {
     const lever = status.roller_radius_mm === null ? "" : `, 1 N is ${status.roller_radius_mm} mNm of the handle`;
     at("scene").textContent = `scene ${status.scene}${lever}${status.is_homed ? "" : ", not homed"}`;
     at("source").textContent = `tormagd ${status.version}, device ${status.link.state} on ${status.link.port}`;
-    at("believed").textContent = "Believed of the device: " + (Object.entries(status.belief).filter(([, it]) => it.acts)
-      .map(([name, it]) => `${name} ${it.value.toPrecision(3)}${it.sd === null ? "" : ` ± ${it.sd.toPrecision(2)}`} ${it.unit}`.trim())
-      .join(", ") || "nothing that acts") + ".";
     const {control} = status.rates, late = control?.lateness_us;
     at("rates").textContent = "Of every twentieth tick of 20 s, bars as logarithms. " + (control ? `Of all: ${control.hz.toFixed(0)} Hz, `
       + `p50 ${late.p50.toFixed(0)}, p99 ${late.p99.toFixed(0)}, longest ${late.max.toFixed(0)} µs; ${control.stalls} stalls.` : "");
