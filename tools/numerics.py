@@ -3,11 +3,12 @@ configurations at their ends, clocks through their rollovers, the network in flo
 
 `stages` has a row for each stage of the core: `cases`, steps with NaN, infinities, denormals, zeros, largest floats,
 time that stands or goes back, tables that do not rise; of them `refused` by name; `stated`, those after which a limit
-or a fault was told; `nonfinite`, numbers that came out; `unnamed`, errors that name nothing. Of a stage with a `border`
-the cases are those that pass that check. `configurations`: each end of what is accepted, alone and in pairs, is
-`refused`, or it `ran` for `--seconds` in virtual time, or a fault or a refusal to enable was `stated`. `counters`: by
-how much a duty differs where a clock rolls over. `networks`: the worst force over a model's box, mN. `travelled` is
-what must be 0: all `nonfinite`, `unnamed` and `wrong`.
+or a fault was told; `nonfinite`, numbers that came out; `swallowed`, steps with NaN of which nothing was said;
+`unnamed`, errors that name nothing. Of a stage with a `border` the cases are those that pass that check.
+`configurations`: each end of what is accepted, alone and in pairs, is `refused`, or it `ran` for `--seconds` in virtual
+time, or a fault or a refusal to enable was `stated`. `counters`: by how much a duty differs where a clock rolls over.
+`networks`: the worst force over a model's box, mN. `travelled` is what must be 0: all `nonfinite`, `swallowed`,
+`unnamed` and `wrong`.
 
 `--json` prints one object. `cases` inputs are evaluated as arrays in float64 and float32; `reference_cases` of them are
 computed in 50 digits from the formulas as printed, and compared with the arrays' float64 and with plain floats.
@@ -200,7 +201,7 @@ def of_core(options: argparse.Namespace) -> dict[str, Any]:
         clocks, models = pool.submit(counters), pool.submit(networks, options.networks, options.seed)
         _wait([*rows, *runs, clocks, models], "core")
     told, ends, rolled = [row.result() for row in rows], summed([run.result() for run in runs]), clocks.result()
-    travelled = sum(row.nonfinite + row.unnamed for row in told) + ends["wrong"]
+    travelled = sum(row.nonfinite + row.swallowed + row.unnamed for row in told) + ends["wrong"]
     return {
         "stage_cases": sum(row.cases for row in told),
         "travelled": travelled,

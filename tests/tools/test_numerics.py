@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from extremes.runs import SAME_DUTY, Became, End, became, counters, drawn_ends, ends, networks, summed
 from extremes.stages import HOSTILE_STEPS, Draw, Row, Stage, leaves, tried
 from extremes.table import stages
 
+import tormagd.control
 from tormagd.config import Position
 from tormagd.control.move.pid import Pid
 from tormagd.physics.errors import DomainError
@@ -22,12 +24,20 @@ def rows() -> list[Row]:
 
 
 def test_nothing_travels_through_any_stage(rows: list[Row]) -> None:
-    assert [row for row in rows if row.nonfinite or row.unnamed] == []
+    assert [row for row in rows if row.nonfinite or row.swallowed or row.unnamed] == []
     assert {row.cases for row in rows} == {EPISODES * HOSTILE_STEPS}
 
 
 def test_a_stage_before_which_no_check_stands_refuses_by_name(rows: list[Row]) -> None:
     assert [row.stage for row in rows if not row.border and row.refused == 0] == []
+
+
+def test_every_module_of_the_core_has_a_row(rows: list[Row]) -> None:
+    folder = Path(tormagd.control.__file__).parent
+    modules = {path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.py")}
+    # `core` is the rows Stepper and Planner; believe and aim ask `nominal`
+    beside = {"core", "records", "nominal", "move/actuator"}
+    assert {name for name in modules if not name.endswith("__init__")} - {row.stage for row in rows} == beside
 
 
 def test_the_same_seed_gives_the_same_row(rows: list[Row]) -> None:
@@ -45,6 +55,10 @@ def keeps(stage: Pid, draw: Draw) -> float:
     return 0.0
 
 
+def swallows(_: object, draw: Draw) -> float:
+    return min(max(0.0, draw(1.0)), 1.0)
+
+
 def fails(_: object, draw: Draw) -> float:
     return math.log(draw(1.0))
 
@@ -57,10 +71,15 @@ def refuses(_: object, draw: Draw) -> list[Limit]:
 
 @pytest.mark.parametrize(
     ("feed", "found", "told"),
-    [(passes_on, "nonfinite", "out = "), (keeps, "nonfinite", ".Pid.integral = "), (fails, "unnamed", "ValueError: ")],
+    [
+        (passes_on, "nonfinite", "out = "),
+        (keeps, "nonfinite", ".Pid.integral = "),
+        (swallows, "swallowed", "of NaN came 0.0"),
+        (fails, "unnamed", "ValueError: "),
+    ],
 )
 def test_what_travels_is_counted_and_told(feed: Callable[..., object], found: str, told: str) -> None:
-    row = tried(Stage("planted", lambda: Pid(Position()), feed), EPISODES, seed=1)
+    row = tried(Stage("planted", lambda: Pid(Position()), feed), 10 * EPISODES, seed=1)
     assert getattr(row, found) > 0
     assert row.told[0].startswith(told)
 
@@ -68,7 +87,7 @@ def test_what_travels_is_counted_and_told(feed: Callable[..., object], found: st
 def test_refusals_and_what_is_stated_are_counted() -> None:
     row = tried(Stage("planted", lambda: None, refuses), EPISODES, seed=1)
     assert min(row.refused, row.stated) > 0
-    assert (row.nonfinite, row.unnamed, row.told) == (0, 0, [])
+    assert (row.nonfinite, row.swallowed, row.unnamed, row.told) == (0, 0, 0, [])
 
 
 def test_behind_a_border_comes_only_what_passes_it() -> None:

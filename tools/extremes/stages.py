@@ -43,23 +43,27 @@ class Draw:
     """The inputs of one step: the usual ones, or some of `strange`."""
 
     def __init__(self, rng: random.Random, strange: tuple[float, ...]) -> None:
-        self._rng, self._strange, self.is_hostile = rng, strange, False
+        self._rng, self._strange, self.is_hostile, self.has_nan = rng, strange, False, False
         self.now_s, self.steps = 10.0, 0
 
     def begin(self) -> None:
         """Time and steps of an episode begin."""
         self.now_s, self.steps, self.is_hostile = 10.0, 0, False
 
+    def turn(self, is_hostile: bool) -> None:
+        """The next step of it begins."""
+        self.steps, self.is_hostile, self.has_nan = self.steps + 1, is_hostile, False
+
     def step(self, period_s: float) -> float:
         """The time of this step: a period on, or while it is hostile also the same again, earlier or much later."""
-        self.steps += 1
         self.now_s += self._rng.choice((0.0, -0.5, 5.0, period_s)) if self.is_hostile else period_s
         return self.now_s
 
     def __call__(self, usual: float) -> float:
         """A number."""
         if self.is_hostile and self._rng.random() < SHARE:
-            return self._rng.choice(self._strange)
+            usual = self._rng.choice(self._strange)
+            self.has_nan |= math.isnan(usual)
         return usual
 
     def bounded(self, usual: float) -> float:
@@ -88,9 +92,9 @@ class Stage(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What became of a stage: steps with hostile inputs, those that it refused by name, those after which a limit or a
-    fault was told, numbers that came out and were not finite, errors that name nothing; and the first of the last two.
-    """
+    """What became of a stage: steps with hostile inputs; those that it refused by name; those after which a limit or a
+    fault was told; numbers that came out and were not finite; steps with NaN after which nothing was said; errors that
+    name nothing; and the first of the last three."""
 
     stage: str
     border: str
@@ -98,6 +102,7 @@ class Row(NamedTuple):
     refused: int
     stated: int
     nonfinite: int
+    swallowed: int
     unnamed: int
     told: list[str]
 
@@ -113,7 +118,7 @@ def tried(stage: Stage, episodes: int, seed: int) -> Row:
         fed = stage.make()
         sentinels = {path for path, value in leaves(fed) if math.isinf(value)}
         for step in range(USUAL_STEPS + HOSTILE_STEPS + AFTER_STEPS):
-            draw.is_hostile = USUAL_STEPS <= step < USUAL_STEPS + HOSTILE_STEPS
+            draw.turn(USUAL_STEPS <= step < USUAL_STEPS + HOSTILE_STEPS)
             counts["cases"] += draw.is_hostile
             try:
                 came = stage.feed(fed, draw)
@@ -127,13 +132,16 @@ def tried(stage: Stage, episodes: int, seed: int) -> Row:
                 _tell(counts, told, "unnamed", f"{type(error).__name__}: {error}")
                 fed = stage.make()
                 continue
-            counts["stated"] += draw.is_hostile and any(isinstance(each, Limit | Fault) for each in _members(came))
+            is_stated = any(isinstance(each, Limit | Fault) for each in _members(came))
+            counts["stated"] += draw.is_hostile and is_stated
+            if draw.has_nan and not is_stated:
+                _tell(counts, told, "swallowed", f"of NaN came {came}")
             for path, value in (*leaves(came, "out"), *leaves(fed)):
                 if math.isnan(value) or (math.isinf(value) and path not in sentinels and (path, value) not in MEANT):
                     _tell(counts, told, "nonfinite", f"{path} = {value}")
                     fed = stage.make()
                     break
-    kinds = {name: counts[name] for name in ("cases", "refused", "stated", "nonfinite", "unnamed")}
+    kinds = {name: counts[name] for name in ("cases", "refused", "stated", "nonfinite", "swallowed", "unnamed")}
     return Row(stage.name, stage.border, **kinds, told=told)
 
 

@@ -29,7 +29,7 @@ from tormagd.control.aim.portrait import Portrait, PortraitSearch
 from tormagd.control.ask.forecast import Forecast
 from tormagd.control.ask.governor import Governor
 from tormagd.control.ask.path import TIMES_S, Path
-from tormagd.control.ask.skill import UNJUDGED, Skill
+from tormagd.control.ask.skill import Skill
 from tormagd.control.believe.believe import Believe
 from tormagd.control.believe.carriage_lag import CarriageLag
 from tormagd.control.believe.handle import HandleWatch
@@ -184,9 +184,18 @@ def planner() -> Planner:
 
 
 def planning(stage: Planner, draw: Draw) -> object:
-    """One plan."""
+    """One plan. Where it is refused its owner begins afresh, and the next is made."""
     now_s = draw.step(PLAN_S)
-    made = stage.plan(draw(now_s), setpoint(draw, now_s), measured(draw, now_s))
+    told_s = draw(now_s)
+    try:
+        made = stage.plan(now_s if math.isfinite(told_s) else told_s, setpoint(draw, now_s), measured(draw, now_s))
+    except DomainError as error:
+        stage.afresh(now_s)
+        try:
+            stage.plan(now_s, setpoint(usual(), now_s), measured(usual(), now_s))
+        except DomainError as again:
+            raise AssertionError(f"afresh after {error}") from again
+        raise
     stage.foresee()
     return made
 
@@ -307,8 +316,9 @@ def path(stage: Path, draw: Draw) -> object:
 
 
 def skill(stages: list[Skill], draw: Draw) -> object:
+    before = stages[0].score
     stages[0] = stages[0].after(draw(0.01), draw(0.02), 0.05)
-    return stages[0].score
+    return [before, stages[0].score]
 
 
 # -- aim -----------------------------------------------------------------------------------------------------------
@@ -336,7 +346,7 @@ def portrait(stage: Portrait, draw: Draw) -> object:
     force_N = draw(1.2)
     return [
         *stage.gap_and_slope_at(force_N),
-        stage.force_N_at(draw.bounded(70.0)),
+        stage.force_N_at(draw(70.0)),
         stage.force_rate_N_s(force_N, draw.bounded(38.0)),
         stage.gap_mm_at(draw(1.2)),
     ]
@@ -365,8 +375,10 @@ def reading(draw: Draw, now_s: float) -> Measurement:
 
 
 def pid(stage: Pid, draw: Draw) -> object:
-    stage.rest(draw(0.1), PERIOD_S)
-    return stage.update(draw(0.1), draw(1.0), draw(0.1), min(draw.positive(PERIOD_S), LONGEST_S), draw(0.0) > 0.0)
+    stage.rest(draw.bounded(0.1), PERIOD_S)
+    return stage.update(
+        draw(0.1), draw(1.0), draw(0.1), min(draw.positive(PERIOD_S), LONGEST_S), draw.bounded(0.0) > 0.0
+    )
 
 
 def reference(stages: list[Reference], draw: Draw) -> object:
@@ -486,7 +498,6 @@ def linked(stage: DeviceLink, draw: Draw) -> object:
 
 def wire(_: object, draw: Draw) -> object:
     """Numbers to bytes and back, and any bytes."""
-    draw.step(PERIOD_S)
     if draw.is_hostile and draw.steps % 2:
         return decode(4, draw.bytes(8))
     sense = Sense(draw(0.1), draw(0.1), draw(0.6), draw(1.0))
@@ -553,7 +564,7 @@ def stages() -> list[Stage]:
         Stage("ask/governor", governor, governing),
         Stage("ask/forecast", Forecast, forecast, SETPOINT),
         Stage("ask/path", lambda: Path(made.portrait, 38.0), path),
-        Stage("ask/skill", lambda: [UNJUDGED], skill, SETPOINT),
+        Stage("ask/skill", lambda: [Skill(0.0, 0.0)], skill, SETPOINT),
         Stage("aim/aim", aim, aiming),
         Stage("aim/floors", lambda: None, floors),
         Stage("aim/portrait", lambda: made.portrait, portrait),
