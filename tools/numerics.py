@@ -1,4 +1,14 @@
-"""How exact the physics is at its extremes: the force law against 50 digits, float32 against float64, long time steps.
+"""Numbers at their extremes: the force law against 50 digits, every stage of the core fed with what is no number,
+configurations at their ends, clocks through their rollovers, the network in float32 beside float64.
+
+`stages` has a row for each stage of the core: `cases`, steps with NaN, infinities, denormals, zeros, largest floats,
+time that stands or goes back, tables that do not rise; of them `refused` by name; `stated`, those after which a limit
+or a fault was told; `nonfinite`, numbers that came out; `swallowed`, steps with NaN of which nothing was said;
+`unnamed`, errors that name nothing. Of a stage with a `border` the cases are those that pass that check.
+`configurations`: each end of what is accepted, alone and in pairs, is `refused`, or it `ran` for `--seconds` in virtual
+time, or a fault or a refusal to enable was `stated`. `counters`: by how much a duty differs where a clock rolls over.
+`networks`: the worst force over a model's box, mN. `travelled` is what must be 0: all `nonfinite`, `swallowed`,
+`unnamed` and `wrong`.
 
 `--json` prints one object. `cases` inputs are evaluated as arrays in float64 and float32; `reference_cases` of them are
 computed in 50 digits from the formulas as printed, and compared with the arrays' float64 and with plain floats.
@@ -10,7 +20,8 @@ of the quantity there. Of the round trip, kappa is that of its worse half, since
 too: at the flat end of Eq. 7 the gap hardly shows in the force. `worst_rel_error` is over the cases where the plain
 bound holds.
 
-Exit status 0 if every error is allowed, nothing is NaN or infinite, and the domain ends where it should; 1 otherwise.
+Exit status 0 if every error is allowed, nothing is NaN or infinite, nothing travelled, and the domain ends where it
+should; 1 otherwise.
 """
 
 import argparse
@@ -18,13 +29,16 @@ import json
 import multiprocessing
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from typing import Any
 
 import mpmath as mp
 import numpy as np
 from extremes.cases import DIGITS, Batch, draw_batch, reference
+from extremes.runs import became, counters, drawn_ends, networks, summed
+from extremes.stages import Row, tried
 from extremes.steps import worst_step_errors
+from extremes.table import stages
 from extremes.tally import COUNTS, Tally
 from numpy.typing import NDArray
 from tqdm import tqdm
@@ -173,20 +187,55 @@ def _plain(batch: Batch, x: float) -> dict[str, float]:
     }
 
 
+def stage_row(place: int, episodes: int, seed: int) -> Row:
+    """One row of the table of stages."""
+    return tried(stages()[place], episodes, seed)
+
+
+def of_core(options: argparse.Namespace) -> dict[str, Any]:
+    """What the core makes of such numbers; a part of the object that `--json` prints."""
+    cases = drawn_ends(options.configurations, options.seed)
+    with _pool(options.workers) as pool:
+        rows = [pool.submit(stage_row, place, options.episodes, options.seed) for place in range(len(stages()))]
+        runs = [pool.submit(became, case, options.seconds) for case in cases]
+        clocks, models = pool.submit(counters), pool.submit(networks, options.networks, options.seed)
+        _wait([*rows, *runs, clocks, models], "core")
+    told, ends, rolled = [row.result() for row in rows], summed([run.result() for run in runs]), clocks.result()
+    travelled = sum(row.nonfinite + row.swallowed + row.unnamed for row in told) + ends["wrong"]
+    return {
+        "stage_cases": sum(row.cases for row in told),
+        "travelled": travelled,
+        "stages": [row._asdict() for row in told],
+        "configurations": ends,
+        "counters": rolled,
+        "networks": models.result(),
+        "passed": travelled == 0 and rolled["passed"],
+    }
+
+
+def _pool(workers: int) -> ProcessPoolExecutor:
+    # a fresh interpreter for each worker, so that the same seed gives the same cases everywhere
+    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+
+
+def _wait(tasks: list[Future[Any]], what: str) -> None:
+    for _ in tqdm(as_completed(tasks), total=len(tasks), desc=what, disable=None):
+        pass
+
+
 def run(cases: int, references: int, seed: int, workers: int) -> dict[str, Any]:
-    """All the checks; the object that `--json` prints."""
+    """The checks of the physics; a part of the object that `--json` prints."""
     started = time.perf_counter()
     devices = -(-cases // BATCH)
     chunks = [min(CHUNK, devices - first) for first in range(0, devices, CHUNK)]
     each = -(-references // devices)
     tally = Tally()
-    # a fresh interpreter for each worker, so that the same seed gives the same cases everywhere
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+    with _pool(workers) as pool:
         tasks = [pool.submit(worst_step_errors, seed, max(50, references // 10))]
         tasks += [pool.submit(check_chunk, seed + 1 + index, size, each) for index, size in enumerate(chunks)]
-        for task in tqdm(as_completed(tasks), total=len(tasks), desc="chunks", disable=None):
-            tally.add(task.result())
+        _wait(tasks, "physics")
+    for task in tasks:
+        tally.add(task.result())
     worst = {name: [found for (kind, _), found in tally.worst.items() if kind == name] for name in PRECISIONS}
     return {name: tally.counts[name] for name in COUNTS} | {
         "worst_rel_error": {name: max((it.error for it in found), default=0.0) for name, found in worst.items()},
@@ -201,14 +250,20 @@ def main() -> int:
     """Runs the checks; returns the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--cases", type=int, default=1_000_000, help="inputs evaluated as arrays")
-    parser.add_argument("--reference", type=int, default=12_000, help="of them, computed in 50 digits")
+    parser.add_argument("--cases", type=int, default=1_000_000, help="inputs of the physics, as arrays (%(default)s)")
+    parser.add_argument("--reference", type=int, default=12_000, help="of them, computed in 50 digits (%(default)s)")
+    parser.add_argument("--episodes", type=int, default=1_000, help="of hostile inputs to each stage (%(default)s)")
+    parser.add_argument("--configurations", type=int, default=200, help="at their ends (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=10.0, help="that each of them runs (%(default)s)")
+    parser.add_argument("--networks", type=int, default=100_000, help="inputs of each model (%(default)s)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=WORKERS, help="processes")
     options = parser.parse_args()
-    if options.cases < 1 or options.reference < 1 or options.workers < 1:
-        parser.error("--cases, --reference and --workers are at least 1")
-    result = run(options.cases, options.reference, options.seed, options.workers)
+    if min(options.cases, options.reference, options.workers, options.episodes) < 1:
+        parser.error("--cases, --reference, --episodes and --workers are at least 1")
+    physics = run(options.cases, options.reference, options.seed, options.workers)
+    core = of_core(options)
+    result = physics | core | {"passed": physics["passed"] and core["passed"]}
     print(json.dumps(result) if options.json else "\n".join(lines(result)))
     return 0 if result["passed"] else 1
 

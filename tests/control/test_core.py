@@ -12,7 +12,9 @@ from tormagd.control.move.watch import STARTING_S
 from tormagd.control.plausible import LEAP_MM
 from tormagd.control.sight import BLIND_S
 from tormagd.exact import plain
+from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.measurement import Measurement
+from tormagd.physics.errors import DomainError
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import CLEARING_S, DeviceRequest, OperatingState, RefusedError
 
@@ -190,11 +192,27 @@ def test_a_number_that_is_not_finite(running) -> None:
     assert all(math.isfinite(duty) for duty in running.driven[1:])
 
 
-@pytest.mark.parametrize("name", ["left_mm", "right_mm", "supply_V", "device_time_s"])
-def test_a_measurement_that_is_not_finite_reaches_no_duty(running, name: str) -> None:
-    for value in (math.nan, math.inf, -math.inf):
-        running.step(79.0, **{name: value})
-        assert all(abs(duty) <= 1.0 for duty in running.driven[1:])
+FLOATS = [name for name in Measurement.__match_args__ if name.endswith(("_s", "_mm", "_A", "_N", "_C", "_V"))]
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300], ids=str)
+@pytest.mark.parametrize("name", [*FLOATS, "round_trip_s", "clock_drift"])
+def test_a_measurement_that_is_not_finite_is_a_fault_and_goes_no_further(running, name: str, value: float) -> None:
+    link = {"link": LinkQuality(**{name: value})} if name not in FLOATS else {name: value}
+    running.step(79.0, **link)
+    assert running.faults == (Fault.NOT_FINITE,)
+    assert running.is_opened
+    assert running.stepper.measured is None
+
+
+@pytest.mark.parametrize("now_s", [math.nan, math.inf, -math.inf])
+def test_a_time_that_is_no_number_is_refused(running, core, now_s: float) -> None:
+    before_s, planner = running.stepper.time_s, core.planner()
+    for late in (lambda: running.at(now_s, running.measure(9)), lambda: planner.plan(now_s, None, None)):
+        with pytest.raises(DomainError, match=r"^now_s = .* is not allowed: a finite number"):
+            late()
+    assert running.stepper.time_s == before_s
+    assert planner.planned.number == 0
 
 
 # -- commands ------------------------------------------------------------------------------------------------------

@@ -25,6 +25,8 @@ from tormagd.control.move.watch import Watch, ceiling_N
 from tormagd.control.records import Duty, Measured, Plan, TimedSetpoint
 from tormagd.hardware.measurement import Measurement
 from tormagd.inverse.solution import Answer, Question
+from tormagd.model.features import require_number
+from tormagd.physics.errors import DomainError
 from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import Conditions, OperatingState, SafetyState, command, homed_again, latch
 from tormagd.scenes.scene import Scene, terms_of
@@ -50,7 +52,9 @@ class Planner:
 
     def plan(self, now_s: float, setpoint: TimedSetpoint | None, measured: Measured | None) -> Plan:
         """The next plan. `measured` is None while the device has said nothing: nothing is learned of it then. Raises
-        what its searches raise: call `afresh` then."""
+        what its searches raise, and DomainError for a number that is not finite: call `afresh` then."""
+        if not -math.inf < now_s < math.inf:
+            require_number("now_s", now_s)
         belief = self.believe.update(now_s, measured)
         ask = self.governor.update(now_s, setpoint, belief.device, belief.lag_s)
         plan = self.aim.update(now_s, setpoint, ask, belief, self.believe.memory, measured)
@@ -110,12 +114,17 @@ class Stepper:
         return self.measure.measured
 
     def step(self, now_s: float, measurement: Measurement | None, plan: Plan) -> Duty:
-        """One control period. With no measurement the link is lost, and the device is told nothing but OFF."""
+        """One control period. With no measurement the link is lost, and the device is told nothing but OFF. A number
+        that is not finite is the fault NOT_FINITE; where `now_s` is none, raises DomainError."""
         last_s = self.time_s
+        if not -math.inf < now_s < math.inf:
+            require_number("now_s", now_s)
         self.time_s = now_s
         if measurement is None:
             self.lose_link()
             return self._duty(DriveMode.OFF, 0.0, 0.0, ())
+        if not measurement.is_finite:
+            return self._begin_anew()
         measured = self.measure.update(last_s, now_s, measurement, self.safety.needs_homing)
         measured = self._judge(now_s, measurement, measured, plan)
         if not self.safety.is_driven:
@@ -179,23 +188,23 @@ class Stepper:
 
     def _drive(self, now_s: float, dt_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Duty:
         followed = None if self.safety.operating_state is _PAUSED else plan
-        drive = self.move.update(now_s, dt_s, followed, measurement, measured, self.watch.is_over)
-        total = drive.left_motor + drive.right_motor + measurement.supply_V
-        if not -math.inf < total < math.inf:  # a sum is finite only if all of it is
-            self._begin_anew()
-            return self._duty(DriveMode.OFF, 0.0, 0.0, ())
+        try:
+            drive = self.move.update(now_s, dt_s, followed, measurement, measured, self.watch.is_over)
+        except DomainError:
+            return self._begin_anew()
         self.watch.update(dt_s, measured, self.move.reference_mm, drive.left_motor, drive.right_motor)
         limits = (*drive.limits, *self.watch.limits(now_s, measurement, measured, self.measure.sight))
         return self._duty(DriveMode.RUN, drive.left_duty, drive.right_duty, limits)
 
-    def _begin_anew(self) -> None:
-        """A number is not finite: nothing that it may have come into is kept."""
+    def _begin_anew(self) -> Duty:
+        """A number is not finite: nothing that it may have come into is kept, and nothing is driven."""
         self.latch(Fault.NOT_FINITE)
         self.measure.forget()
         self.homing = Homing(self._ceiling_N)
         self.watch.begin(math.inf)
         self.watch.rest()
         self.move.forget()
+        return self._duty(DriveMode.OFF, 0.0, 0.0, ())
 
     def _duty(self, mode: DriveMode, left: float, right: float, limits: tuple[Limit, ...]) -> Duty:
         return Duty(mode, left, right, self.safety.request, self.safety.request_number, limits)

@@ -3,17 +3,26 @@
 from itertools import accumulate
 from typing import Final, final
 
+from tormagd.model.features import require_number
+from tormagd.physics.errors import DomainError
+
 STRETCHES: Final = 1024
 "So many equal ones a rising list is divided into, to find a place in it: few points share one."
 LEAST_SPAN: Final = 1e-9
 "A list that does not rise has its points in the outermost of them."
+LEAST_STEP: Final = 1e-200
 
 
 @final
 class Rising:
-    """A list (n) that rises, and the places in it."""
+    """A list (n) of finite numbers that rises, and the places in it. Raises DomainError for other numbers, and for two
+    that are closer than LEAST_STEP and not the same: no slope is between them."""
 
     def __init__(self, values: list[float]) -> None:
+        for place, value in enumerate(values):
+            require_number("values", value)
+            if place and 0.0 < abs(value - values[place - 1]) < LEAST_STEP:
+                raise DomainError("values", value, f"{values[place - 1]:g}, or {LEAST_STEP:g} from there")
         self.values: Final = values
         self._per_unit: Final = STRETCHES / max(values[-1] - values[0], LEAST_SPAN)
         # the points before each stretch, as a value finds its own, and before what is beyond the last of them
@@ -27,7 +36,9 @@ class Rising:
         its time less so where it is compiled."""
         values = self.values
         stretch = (value - values[0]) * self._per_unit
-        if stretch < 0.0:
+        if not stretch >= 0.0:
+            if stretch != stretch:  # it would be taken for the last, which is the closest gap
+                raise DomainError("value", value, "a number")
             return 0
         place = self._points_before[int(stretch) if stretch < STRETCHES else STRETCHES]
         while place < len(values) and values[place] <= value:
@@ -36,7 +47,7 @@ class Rising:
 
 
 def interpolated(x: float, xs: Rising, ys: list[float]) -> float:
-    """Linear between the points (n, n), and the outermost `ys` beyond them."""
+    """Linear between the points (n, n), and the outermost `ys` beyond them. Raises DomainError for NaN."""
     return interpolated_before(xs.after(x), x, xs, ys)
 
 
@@ -52,9 +63,12 @@ def interpolated_before(after: int, x: float, xs: Rising, ys: list[float]) -> fl
 
 
 def at_step(steps: float, ys: list[float]) -> float:
-    """Linear between evenly spaced `ys` (n), at so many steps, 0 or more, from the first; the last beyond them."""
-    whole = int(steps)
-    if whole >= len(ys) - 1:
+    """Linear between evenly spaced `ys` (n), at so many steps, 0 or more, from the first; the last beyond them. Raises
+    DomainError for NaN."""
+    if not steps < len(ys) - 1:
+        if steps != steps:
+            raise DomainError("steps", steps, "a number")
         return ys[-1]
+    whole = int(steps)
     before = ys[whole]
     return (ys[whole + 1] - before) * (steps - whole) + before

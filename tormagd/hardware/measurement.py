@@ -12,6 +12,8 @@ _LEFT_OPEN: Final = Switches.LEFT_OPEN.bit_length() - 1
 _RIGHT_OPEN: Final = Switches.RIGHT_OPEN.bit_length() - 1
 _LATCHED: Final = DeviceMode.LATCHED
 _BUSY: Final = (DeviceMode.HOMING, DeviceMode.RETRACTING)
+_LARGEST: Final = 1e10
+"Of any number, and a clock's 300 years: what is computed of larger ones may overflow."
 
 
 def _is_set(bits: int, place: int) -> bool:
@@ -69,6 +71,28 @@ class Measurement(Value):
         self.reported_s: Final = reported_s
         self.delay_s: Final = delay_s
         self.link: Final = link
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether all of it are numbers that may be computed with: the codec gives no others, a plugin may."""
+        link = self.link
+        return (
+            -_LARGEST <= self.received_s <= _LARGEST
+            and -_LARGEST <= self.device_time_s <= _LARGEST
+            and -_LARGEST <= self.left_mm <= _LARGEST
+            and -_LARGEST <= self.right_mm <= _LARGEST
+            and -_LARGEST <= self.left_current_A <= _LARGEST
+            and -_LARGEST <= self.right_current_A <= _LARGEST
+            and -_LARGEST <= self.force_N <= _LARGEST
+            and -_LARGEST <= self.handle_mm <= _LARGEST
+            and -_LARGEST <= self.temperature_C <= _LARGEST
+            and -_LARGEST <= self.supply_V <= _LARGEST
+            and -_LARGEST <= self.sensed_s <= _LARGEST
+            and -_LARGEST <= self.reported_s <= _LARGEST
+            and -_LARGEST <= self.delay_s <= _LARGEST
+            and -_LARGEST <= link.round_trip_s <= _LARGEST
+            and -_LARGEST <= link.clock_drift <= _LARGEST
+        )
 
     @property
     def is_homed(self) -> bool:

@@ -12,6 +12,7 @@ from scipy.signal import StateSpace, cont2discrete, dlsim, lfilter
 from tormagd.assembly.build import LEAST_GAIN_MARGIN_DB, LEAST_PHASE_MARGIN_DEG, build_core
 from tormagd.config import Config, Motor, Position
 from tormagd.control.move.motor import (
+    MAX_MARGIN_DB,
     delay_margin_s,
     full_speed_mm_s,
     margins,
@@ -138,6 +139,38 @@ def test_gain_margin_falls_with_gain_decibel_for_decibel(motor: Motor, position:
             least.gain_margin_dB - 20.0 * math.log10(2.0), abs=0.05
         )
     assert margins(motor, doubled, PERIOD_S).crossover_Hz > least.crossover_Hz
+
+
+def test_a_loop_that_swings_is_told_by_how_much_its_gain_is_too_high() -> None:
+    """Five times the supply is five times the gain: 14 dB."""
+    motor, position = Config().motor, Config().position
+    hard = msgspec.structs.replace(motor, supply_V=5.0 * motor.supply_V)
+    usual_dB = margins(motor, position, PERIOD_S).gain_margin_dB
+    assert margins(hard, position, PERIOD_S).gain_margin_dB == pytest.approx(usual_dB - 20.0 * math.log10(5.0), abs=0.1)
+
+
+ENDS = {
+    "supply_V": (3.0, 60.0),
+    "resistance_ohm": (0.05, 100.0),
+    "inductance_mH": (0.01, 100.0),
+    "back_emf_V_s": (1e-4, 1.0),
+    "inertia_kg_m2": (1e-9, 1e-2),
+    "gear_ratio": (1.0, 1_000.0),
+    "screw_lead_mm": (0.2, 50.0),
+}
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    motor=st.builds(Motor, **{name: st.sampled_from(both) for name, both in ENDS.items()}),
+    gain=st.sampled_from([5e-324, 3.6, 1_000.0]),
+    period_s=st.sampled_from([2.5e-4, 1e-3, 1.0 / 83.0]),
+)
+def test_margins_are_numbers_at_every_corner_of_what_is_accepted(motor: Motor, gain: float, period_s: float) -> None:
+    position = Position(proportional_per_mm=gain)
+    found = margins(motor, position, period_s)
+    assert all(map(math.isfinite, (*found, delay_margin_s(motor, position, period_s))))
+    assert abs(found.gain_margin_dB) <= MAX_MARGIN_DB
 
 
 def closed_loop_radius(motor: Motor, position: Position) -> float:

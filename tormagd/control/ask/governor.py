@@ -17,10 +17,14 @@ from tormagd.control.ask.path import PATH_S, TIMES_S, Path
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.filter import low_pass
 from tormagd.control.records import Ask, TimedSetpoint
+from tormagd.model.features import LARGEST, require_number
 from tormagd.model.force_curve import within
+from tormagd.physics.errors import DomainError
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import EVERY_TERM, Force, Terms
 
+# compiled, a constant of this module is a plain float
+_LARGEST: Final[float] = LARGEST
 SLOPE_FILTER_S: Final = 0.003
 AHEAD_S: Final = 0.05
 "Setpoints are carried forward along their slope, or past the end of their preview, by no more than this."
@@ -83,13 +87,15 @@ class Governor:
 
     def update(self, now_s: float, setpoint: TimedSetpoint | None, device: DeviceFit, lag_s: float) -> Ask:
         """What is asked at `now_s`. Of what is known ahead it looks up to `lag_s` further. The force is within what the
-        scene allows and `device` gives. It never jumps, and is never held for ever: see `decay` and `takeover`."""
+        scene allows and `device` gives. It never jumps, and is never held for ever: see `decay` and `takeover`.
+        Raises DomainError for a number of the setpoint that is not finite, or beyond LARGEST."""
         lowest_N = max(device.force_N(self._portrait.min_N), 0.0)
         dt_s = max(now_s - self.time_s, 0.0)
         self.time_s = now_s
         if setpoint is None:
             return self._decay(dt_s, lowest_N, None, (Limit.NO_SETPOINT,))
         age_s = now_s - setpoint.stamp_s
+        _require_numbers(setpoint, age_s)
         if age_s > setpoint.valid_for_s:
             stale = (Limit.STALE, Limit.OTHER_SOURCE) if setpoint.is_contested else (Limit.STALE,)
             return self._decay(dt_s, lowest_N, age_s, stale)
@@ -224,6 +230,22 @@ class Governor:
         self.forecast.forget()
 
 
+def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
+    """Of all but the preview's forces, which are looked at where they act."""
+    if not (
+        -_LARGEST <= age_s <= _LARGEST
+        and -_LARGEST <= setpoint.force_N <= _LARGEST
+        and -_LARGEST <= setpoint.valid_for_s <= _LARGEST
+        and -_LARGEST <= (setpoint.displacement_mm or 0.0) <= _LARGEST
+        and -_LARGEST <= (setpoint.rate_mm_s or 0.0) <= _LARGEST
+    ):
+        for name in ("force_N", "stamp_s", "valid_for_s", "displacement_mm", "rate_mm_s"):
+            require_number(name, getattr(setpoint, name) or 0.0)
+        require_number("age_s", age_s)
+    if setpoint.preview_N and not 0.0 < setpoint.preview_dt_s <= _LARGEST:
+        raise DomainError("preview_dt_s", setpoint.preview_dt_s, "above 0 s")
+
+
 def _within_reach(
     setpoint_N: float, allowed_N: float, lowest_N: float, highest_N: float
 ) -> tuple[float, tuple[Limit, ...]]:
@@ -258,5 +280,7 @@ def _wanted_N(setpoint: TimedSetpoint, begins_s: float, bounds: Bounds, forecast
             place = min(int(at_s / spacing_s), last - 1)
             before_N = forces_N[place - 1] if place else setpoint.force_N
             force_N = (forces_N[place] - before_N) / spacing_s * (at_s - spacing_s * place) + before_N
+        if not -_LARGEST <= force_N <= _LARGEST:
+            require_number("preview_N", force_N)
         wanted_N.append(within(force_N, bounds))
     return wanted_N

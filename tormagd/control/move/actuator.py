@@ -77,7 +77,8 @@ class Actuator:
         is_over: bool,
     ) -> Drive:
         """One tick, `dt_s` > 0 after the last. Without a `plan` the gap is held; it opens while the force `is_over`
-        what it may be. The gap is never to be closer than the plan's least."""
+        what it may be. The gap is never to be closer than the plan's least. Raises DomainError for what is not
+        finite: `forget` follows."""
         raise NotImplementedError
 
     def stop(self) -> None:

@@ -16,6 +16,8 @@ Array = npt.NDArray[np.float64]
 
 PULL_STATED_MM: Final = 45.0
 "The gap for which `motor.pull_V` is stated."
+MAX_MARGIN_DB: Final = 200.0
+"Of a gain margin: a loop that no gain makes swing, or that swings with every gain, has so much or so little."
 PULL_DEPTH_MM: Final = 32.0
 "Two blocks of 40 x 40 x 20 mm attract each other like dipoles this much further apart than their faces."
 
@@ -29,7 +31,8 @@ class TransferFunction(NamedTuple):
 
 
 class Margins(NamedTuple):
-    """Open-loop stability margins: gain margin dB, upwards or downwards, phase margin degrees, crossover Hz."""
+    """Open-loop stability margins: gain margin dB, upwards or downwards, within MAX_MARGIN_DB, phase margin degrees,
+    crossover Hz."""
 
     gain_margin_dB: float
     phase_margin_deg: float
@@ -116,19 +119,20 @@ def margins(motor: Motor, position: Position, period_s: float, *, delay_periods:
     smoothing = period_s / (position.derivative_filter_s + period_s)
     derivative = position.derivative_time_s * smoothing * (1.0 - 1.0 / z) / period_s / (1.0 - (1.0 - smoothing) / z)
     open_loop = open_loop * position.proportional_per_mm * (1.0 + integral + derivative)
-    magnitude = np.abs(open_loop)
+    magnitude = np.maximum(np.abs(open_loop), 10.0 ** (-MAX_MARGIN_DB / 20.0))
     phase_deg = np.degrees(np.unwrap(np.angle(open_loop)))
     phase_deg += 360.0 * np.round((-180.0 - phase_deg[0]) / 360.0)
     below = np.flatnonzero((magnitude[:-1] >= 1.0) & (magnitude[1:] < 1.0))
     crossing = int(below[-1]) if below.size else 0
     turning = np.flatnonzero((phase_deg[:-1] >= -180.0) & (phase_deg[1:] < -180.0))
-    turning = turning[turning > crossing] if below.size else turning
-    gain_margin = -20.0 * math.log10(float(magnitude[turning[0]])) if turning.size else math.inf
+    after = turning[turning > crossing] if below.size else turning
+    gain_margin = -20.0 * math.log10(float(magnitude[after[0]])) if after.size else MAX_MARGIN_DB
     # with a short integral time the phase comes from below -180 degrees: there less gain loses the loop
     rising = np.flatnonzero((phase_deg[:-1] < -180.0) & (phase_deg[1:] >= -180.0))
     rising = rising[rising < crossing]
     if rising.size:
         gain_margin = min(gain_margin, 20.0 * math.log10(float(magnitude[rising].min())))
-    if phase_deg[crossing] < -180.0:
-        gain_margin = -abs(gain_margin)
+    if phase_deg[crossing] < -180.0:  # it swings: by so much less gain it would not, if any keeps it from that
+        before = turning[turning <= crossing]
+        gain_margin = -20.0 * abs(math.log10(float(magnitude[before[-1]]))) if before.size else -MAX_MARGIN_DB
     return Margins(gain_margin, 180.0 + float(phase_deg[crossing]), float(frequency[crossing]))

@@ -10,7 +10,10 @@ half the speed that is expected, so that a moving reference gives no derivative 
 from typing import Final, final
 
 from tormagd.config import Position
+from tormagd.model.features import LARGEST, require_number
 
+# compiled, a constant of this module is a plain float
+_LARGEST: Final[float] = LARGEST
 ON_TARGET_MM: Final = 0.001
 "Just over half a count of 4,480 on 8 mm: a carriage cannot be told to stand nearer."
 
@@ -44,10 +47,13 @@ class Pid:
 
     def update(self, error_mm: float, error_mm_s: float, feed_forward: float, dt_s: float, is_blocked: bool) -> float:
         """The duty, `dt_s` > 0 after the last. Where `is_blocked`, opening moves nothing: no duty above 0 is given, the
-        integral does not rise against that, and it is no saturation."""
+        integral does not rise against that, and it is no saturation. Raises DomainError for a duty that is no finite
+        number, or beyond LARGEST: nothing has changed then."""
         proportional = self._proportional_per_mm * error_mm
         derivative = self._proportional_per_mm * self._derivative_time_s * error_mm_s
         asked = proportional + self.integral + derivative + feed_forward
+        if not -_LARGEST <= asked <= _LARGEST:
+            require_number("duty", asked)
         within = min(max(asked, -self._limit), self._limit)
         duty = min(within, 0.0) if is_blocked else within
         growth = proportional / self._integral_time_s + (duty - asked) / self._back_calculation_s

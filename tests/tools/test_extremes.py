@@ -1,0 +1,157 @@
+"""The table of stages: nothing travels through any, what does is found, and runs at the ends are judged."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from extremes.runs import SAME_DUTY, Became, End, became, counters, drawn_ends, ends, networks, summed
+from extremes.stages import HOSTILE_STEPS, Draw, Row, Stage, leaves, tried
+from extremes.table import stages
+
+import tormagd.control
+from tormagd.config import Position
+from tormagd.control.move.pid import Pid
+from tormagd.physics.errors import DomainError
+from tormagd.safety.codes import Limit
+
+EPISODES = 12
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[Row]:
+    return [tried(stage, EPISODES, seed=1) for stage in stages()]
+
+
+def test_nothing_travels_through_any_stage(rows: list[Row]) -> None:
+    assert [row for row in rows if row.nonfinite or row.swallowed or row.unnamed] == []
+    assert {row.cases for row in rows} == {EPISODES * HOSTILE_STEPS}
+
+
+def test_a_stage_before_which_no_check_stands_refuses_by_name(rows: list[Row]) -> None:
+    assert [row.stage for row in rows if not row.border and row.refused == 0] == []
+
+
+def test_every_module_of_the_core_has_a_row(rows: list[Row]) -> None:
+    folder = Path(tormagd.control.__file__).parent
+    modules = {path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.py")}
+    # `core` is the rows Stepper and Planner; believe and aim ask `nominal`
+    beside = {"core", "records", "nominal", "move/actuator"}
+    assert {name for name in modules if not name.endswith("__init__")} - {row.stage for row in rows} == beside
+
+
+def test_the_same_seed_gives_the_same_row(rows: list[Row]) -> None:
+    place = next(place for place, row in enumerate(rows) if row.stage == "ask/governor")
+    assert tried(stages()[place], EPISODES, seed=1) == rows[place]
+    assert tried(stages()[place], EPISODES, seed=2) != rows[place]
+
+
+def passes_on(_: object, draw: Draw) -> float:
+    return draw(1.0)
+
+
+def keeps(stage: Pid, draw: Draw) -> float:
+    stage.integral = draw(0.0)
+    return 0.0
+
+
+def swallows(_: object, draw: Draw) -> float:
+    return min(max(0.0, draw(1.0)), 1.0)
+
+
+def fails(_: object, draw: Draw) -> float:
+    return math.log(draw(1.0))
+
+
+def refuses(_: object, draw: Draw) -> list[Limit]:
+    if not math.isfinite(value := draw(1.0)):
+        raise DomainError("value", value, "a finite number")
+    return [Limit.RANGE] if value != 1.0 else []
+
+
+@pytest.mark.parametrize(
+    ("feed", "found", "told"),
+    [
+        (passes_on, "nonfinite", "out = "),
+        (keeps, "nonfinite", ".Pid.integral = "),
+        (swallows, "swallowed", "of NaN came 0.0"),
+        (fails, "unnamed", "ValueError: "),
+    ],
+)
+def test_what_travels_is_counted_and_told(feed: Callable[..., object], found: str, told: str) -> None:
+    row = tried(Stage("planted", lambda: Pid(Position()), feed), 10 * EPISODES, seed=1)
+    assert getattr(row, found) > 0
+    assert row.told[0].startswith(told)
+
+
+def test_refusals_and_what_is_stated_are_counted() -> None:
+    row = tried(Stage("planted", lambda: None, refuses), EPISODES, seed=1)
+    assert min(row.refused, row.stated) > 0
+    assert (row.nonfinite, row.swallowed, row.unnamed, row.told) == (0, 0, 0, [])
+
+
+def test_behind_a_border_comes_only_what_passes_it() -> None:
+    row = tried(Stage("planted", lambda: None, refuses, border="another"), EPISODES, seed=1)
+    assert row.refused == 0
+    assert row.stated > 0
+
+
+def test_every_float_of_plain_data_values_and_stages_is_seen() -> None:
+    stage = Pid(Position())
+    stage.integral = 0.25
+    assert dict(leaves([stage, (1.0, {"a": 2.0})])) == {
+        ".0.Pid.duty": 0.0, ".0.Pid.integral": 0.25, ".1.0": 1.0, ".1.1.a": 2.0,
+    }  # fmt: skip
+
+
+# -- whole runs ----------------------------------------------------------------------------------------------------
+
+
+def test_the_ends_are_those_of_the_configuration_the_insert_and_the_device() -> None:
+    found = {str(end) for end in ends()}
+    assert {"motor.supply_V = 60", "rates.control_hz = 83", "trim.least = 1", "insert.gap_open_mm = 300"} <= found
+    assert {"plant.encoder_counts_per_rev = 16", "limits.low_confidence = 0"} <= found
+    assert len(drawn_ends(5, seed=1)) == 5
+    assert [len(case) for case in drawn_ends(len(found) + 3, seed=1)] == [*[1] * len(found), 2, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("end", "kind", "why"),
+    [
+        (End("motor", "supply_V", 60.0), "refused", "gain margin of -0.5 dB: allowed is at least 30 and 4"),
+        (End("rates", "control_hz", 83), "refused", "rates.inference_hz = 250: allowed is at most"),
+        (End("insert", "gap_closed_mm", 300.0), "refused", "gap"),
+        (End("limits", "skew_fault_mm", 10.0), "ran", ""),
+        (End("plant", "encoder_counts_per_rev", 1_000_000), "ran", ""),
+    ],
+    ids=lambda value: str(value) if isinstance(value, End) else "",
+)
+def test_an_end_is_refused_by_name_or_runs(end: End, kind: str, why: str) -> None:
+    found = became((end,), 0.05)
+    assert found.kind == kind, found.why
+    assert str(end) in found.why
+    assert why in found.why
+    assert (found.gain_margin_dB is None) == (kind == "refused")
+
+
+def test_configurations_are_summed() -> None:
+    found = summed(
+        [Became("ran", "a", 7.0), Became("ran", "b", 9.0), Became("refused", "c"), Became("wrong", "d", 8.0)]
+    )
+    assert found == {
+        "cases": 4, "refused": 1, "ran": 2, "stated": 0, "wrong": 1, "gain_margin_dB": [7.0, 9.0], "told": ["d"],
+    }  # fmt: skip
+
+
+def test_a_rollover_changes_no_duty() -> None:
+    found = counters()
+    assert found["passed"]
+    assert 0.0 < max(found["duty"].values()) <= SAME_DUTY
+
+
+def test_float32_gives_every_model_the_same_force_to_a_hundredth_of_a_millinewton() -> None:
+    found = networks(2_000, seed=1)
+    assert "torque_mre_50_40" in found
+    for worst in found.values():
+        assert 0.0 < worst["float32_mN"] < 0.01
+        assert 0.0 < worst["plain_mN"] < 1e-9

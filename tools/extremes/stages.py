@@ -1,0 +1,182 @@
+"""Every stage of the core, fed with what it should never see: the part of `numerics.py` that looks for a number that
+travels.
+
+A stage is fed at its border. Where another check stands before it, that is named, and the stage gets whatever passes
+that check; else it gets NaN, infinities and the largest floats, too. In each episode a fresh stage has healthy inputs,
+then hostile ones, then healthy ones again. What is not finite afterwards, in what came out or in a field of the stage,
+has travelled. A stage that refused is made anew, as its owner does.
+"""
+
+import math
+import random
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+from firmware_protocol.codec import DecodeError, EncodeError
+from tormagd.exact import plain
+from tormagd.physics.errors import DomainError
+from tormagd.safety.codes import Fault, Limit
+from tormagd.safety.operating_state import RefusedError
+from tormagd_client.endpoints import ConfigError
+from tormagd_client.messages import MessageError
+
+NO_NUMBERS = (math.nan, math.inf, -math.inf)
+TINY = (0.0, -0.0, 5e-324, -5e-324, 2.2250738585072014e-308, 1e-300, -1e-12)
+LARGE = (1e9, -1e9, 1e10, -1e10, 1.0, -1.0, 300.0, -300.0)
+"What passes the core's borders."
+HUGE = (1.7976931348623157e308, -1.7976931348623157e308, 1e300, 1e11, -1e11)
+EVERYTHING = (*NO_NUMBERS, *TINY, *LARGE, *HUGE)
+BOUNDED = (*TINY, *LARGE)
+REFUSALS = (DomainError, ConfigError, MessageError, RefusedError, EncodeError, DecodeError)
+"They name the name, the value and what is allowed."
+UNNAMED = (ArithmeticError, ValueError, TypeError, LookupError, AssertionError, RuntimeError)
+USUAL_STEPS, HOSTILE_STEPS, AFTER_STEPS = 3, 6, 3
+SHARE = 0.25
+"Of the numbers of a hostile step, so many are hostile."
+MAX_TOLD = 3
+MEANT = {("out.Plan.stamp_s", -math.inf)}
+"An infinity that a record states: it follows no setpoint."
+
+
+class Draw:
+    """The inputs of one step: the usual ones, or some of `strange`."""
+
+    def __init__(self, rng: random.Random, strange: tuple[float, ...]) -> None:
+        self._rng, self._strange, self.is_hostile, self.has_nan = rng, strange, False, False
+        self.now_s, self.steps = 10.0, 0
+
+    def begin(self) -> None:
+        """Time and steps of an episode begin."""
+        self.now_s, self.steps, self.is_hostile = 10.0, 0, False
+
+    def turn(self, is_hostile: bool) -> None:
+        """The next step of it begins."""
+        self.steps, self.is_hostile, self.has_nan = self.steps + 1, is_hostile, False
+
+    def step(self, period_s: float) -> float:
+        """The time of this step: a period on, or while it is hostile also the same again, earlier or much later."""
+        self.now_s += self._rng.choice((0.0, -0.5, 5.0, period_s)) if self.is_hostile else period_s
+        return self.now_s
+
+    def __call__(self, usual: float) -> float:
+        """A number."""
+        if self.is_hostile and self._rng.random() < SHARE:
+            usual = self._rng.choice(self._strange)
+            self.has_nan |= math.isnan(usual)
+        return usual
+
+    def bounded(self, usual: float) -> float:
+        """A number that has passed the core's borders."""
+        if self.is_hostile and self._rng.random() < SHARE:
+            return self._rng.choice(BOUNDED)
+        return usual
+
+    def positive(self, usual: float) -> float:
+        """A number above 0, where the stage is promised one."""
+        return abs(self.bounded(usual)) or usual
+
+    def bytes(self, count: int) -> bytes:
+        """So many at random."""
+        return self._rng.randbytes(count)
+
+
+class Stage(NamedTuple):
+    """One row of the table. `make` gives a fresh stage, or whatever `feed` is given; `feed` takes one step of it and
+    gives what came out. `border` names the check that stands before it; empty: its own."""
+
+    name: str
+    make: Callable[[], Any]
+    feed: Callable[[Any, Draw], object]
+    border: str = ""
+
+
+class Row(NamedTuple):
+    """What became of a stage: steps with hostile inputs; those that it refused by name; those after which a limit or a
+    fault was told; numbers that came out and were not finite; steps with NaN after which nothing was said; errors that
+    name nothing; and the first of the last three."""
+
+    stage: str
+    border: str
+    cases: int
+    refused: int
+    stated: int
+    nonfinite: int
+    swallowed: int
+    unnamed: int
+    told: list[str]
+
+
+def tried(stage: Stage, episodes: int, seed: int) -> Row:
+    """One stage through so many episodes."""
+    rng = random.Random(f"{seed} {stage.name}")
+    draw = Draw(rng, BOUNDED if stage.border else EVERYTHING)
+    counts: Counter[str] = Counter()
+    told: list[str] = []
+    for _ in range(episodes):
+        draw.begin()
+        fed = stage.make()
+        sentinels = {path for path, value in leaves(fed) if math.isinf(value)}
+        for step in range(USUAL_STEPS + HOSTILE_STEPS + AFTER_STEPS):
+            draw.turn(USUAL_STEPS <= step < USUAL_STEPS + HOSTILE_STEPS)
+            counts["cases"] += draw.is_hostile
+            try:
+                came = stage.feed(fed, draw)
+            except REFUSALS as error:
+                counts["refused"] += step >= USUAL_STEPS
+                if step < USUAL_STEPS:
+                    _tell(counts, told, "unnamed", f"refused what is usual: {error}")
+                fed = stage.make()
+                continue
+            except UNNAMED as error:
+                _tell(counts, told, "unnamed", f"{type(error).__name__}: {error}")
+                fed = stage.make()
+                continue
+            is_stated = any(isinstance(each, Limit | Fault) for each in _members(came))
+            counts["stated"] += draw.is_hostile and is_stated
+            if draw.has_nan and not is_stated:
+                _tell(counts, told, "swallowed", f"of NaN came {came}")
+            for path, value in (*leaves(came, "out"), *leaves(fed)):
+                if math.isnan(value) or (math.isinf(value) and path not in sentinels and (path, value) not in MEANT):
+                    _tell(counts, told, "nonfinite", f"{path} = {value}")
+                    fed = stage.make()
+                    break
+    kinds = {name: counts[name] for name in ("cases", "refused", "stated", "nonfinite", "swallowed", "unnamed")}
+    return Row(stage.name, stage.border, **kinds, told=told)
+
+
+def _tell(counts: Counter[str], told: list[str], kind: str, what: str) -> None:
+    counts[kind] += 1
+    if len(told) < MAX_TOLD and what not in told:
+        told.append(what[:120])
+
+
+def leaves(thing: object, path: str = "") -> Iterator[tuple[str, float]]:
+    """Every float of plain data, of values and of stages, with where it is."""
+    if isinstance(thing, float):
+        yield path, thing
+    elif isinstance(thing, dict):
+        for name, each in thing.items():
+            yield from leaves(each, f"{path}.{name}")
+    elif isinstance(thing, list | tuple):
+        for place, each in enumerate(thing):
+            yield from leaves(each, f"{path}.{place}")
+    elif hasattr(thing, "__dict__") or hasattr(thing, "__mypyc_attrs__"):
+        yield from leaves(_plain(thing), path)
+
+
+def _plain(thing: object) -> object:
+    try:
+        return plain(thing)
+    except TypeError:  # it has no fields
+        return None
+
+
+def _members(came: object) -> Iterator[object]:
+    if isinstance(came, list | tuple):
+        for each in came:
+            yield from _members(each)
+    elif isinstance(came, Limit | Fault):
+        yield came
+    elif hasattr(came, "limits"):
+        yield from came.limits

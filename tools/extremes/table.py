@@ -1,0 +1,587 @@
+"""The stages of the core in the order in which data flow, and how each is fed: see `stages.py`."""
+
+import math
+import random
+from functools import cache, partial
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from extremes.stages import Draw, Stage
+from firmware_protocol.codec import (
+    DeviceFault,
+    DeviceMode,
+    Drive,
+    DriveMode,
+    Sense,
+    State,
+    Status,
+    Switches,
+    decode,
+    encode,
+)
+from tormagd.assembly.build import Core, build_core
+from tormagd.config import Config, Motor, Position
+from tormagd.control.aim.aim import Aim
+from tormagd.control.aim.floors import ceiling_mm, lawful_mT
+from tormagd.control.aim.portrait import Portrait, PortraitSearch
+from tormagd.control.ask.forecast import Forecast
+from tormagd.control.ask.governor import Governor
+from tormagd.control.ask.path import TIMES_S, Path
+from tormagd.control.ask.skill import Skill
+from tormagd.control.believe.believe import Believe
+from tormagd.control.believe.carriage_lag import CarriageLag
+from tormagd.control.believe.handle import HandleWatch
+from tormagd.control.believe.memory import ElementMemory
+from tormagd.control.believe.sensor import SensorTrust
+from tormagd.control.believe.sensor_zero import SensorZero
+from tormagd.control.believe.slow_friction import SlowFriction
+from tormagd.control.believe.strength import UNSEEN, Strength
+from tormagd.control.contact import Pressing, Sliding
+from tormagd.control.core import Planner, Stepper
+from tormagd.control.filter import low_pass
+from tormagd.control.interpolation import Rising, at_step, interpolated
+from tormagd.control.measure import Measure
+from tormagd.control.move.carriages import Carriages
+from tormagd.control.move.homing import Homing
+from tormagd.control.move.motor import full_speed_mm_s, margins
+from tormagd.control.move.pid import Pid
+from tormagd.control.move.reference import Reference, Speeds, follow, target_of
+from tormagd.control.move.watch import Watch
+from tormagd.control.plausible import is_outside, leap_between
+from tormagd.control.records import Ask, Handle, Measured, Plan, TimedSetpoint
+from tormagd.control.sight import Sight
+from tormagd.hardware.link import DeviceLink
+from tormagd.hardware.link_quality import LinkQuality
+from tormagd.hardware.link_statistics import DeviceClock
+from tormagd.hardware.measurement import Measurement
+from tormagd.inverse.choice import build, named
+from tormagd.model.displacement import MOBILISED_MM, Turn
+from tormagd.physics.errors import DomainError
+from tormagd.safety.codes import Fault
+from tormagd.safety.operating_state import Conditions, SafetyState, command
+from tormagd_client.messages import Setpoint, decode as decode_message
+
+PERIOD_S, PLAN_S, LONGEST_S = 1e-3, 4e-3, 1e-2
+"Of a tick, of a plan, and of what `Stepper` lets a tick take."
+CONFIG = Config(scene="coronary")
+READY = Conditions(True, True, True, False, False, None, 0.5)
+MEASUREMENT, SETPOINT, CODEC, CONFIGURATION, PLANNED = (
+    "Stepper, of measurements",
+    "ask/governor, of setpoints",
+    "firmware_protocol: codec",
+    "config",
+    "Planner, of plans",
+)
+"Checks that stand before a stage."
+
+
+@cache
+def core() -> Core:
+    """The shipped core that all are fed beside."""
+    return build_core(CONFIG)
+
+
+# -- inputs --------------------------------------------------------------------------------------------------------
+
+
+def measurement(draw: Draw, now_s: float) -> Measurement:
+    """Of a healthy homed device at a gap of 80 mm, but for what is drawn."""
+    return Measurement(
+        number=draw.steps,
+        received_s=draw(now_s),
+        device_time_s=draw(now_s),
+        left_mm=draw(-7.5),
+        right_mm=draw(-7.5),
+        left_current_A=draw(0.1),
+        right_current_A=draw(0.1),
+        force_N=draw(1.1),
+        handle_mm=draw(42.0 * now_s),
+        mode=DeviceMode.RUN,
+        switches=Switches.HOMED,
+        faults=DeviceFault(0),
+        temperature_C=draw(23.0),
+        supply_V=draw(12.0),
+        sensed_s=draw(now_s),
+        reported_s=draw(now_s),
+        delay_s=draw(0.0),
+        link=LinkQuality(0.0, 0.0, 0.0, draw(2e-3), draw(0.0)),
+    )
+
+
+def measured(draw: Draw, now_s: float) -> Measured:
+    """What `measure` makes of it: never anything that has not passed `Stepper`'s border."""
+    some = draw.bounded
+    turn = Turn(1.0 if some(1.0) >= 0.0 else -1.0, some(0.0), some(42.0 * now_s))
+    handle = Handle(min(abs(some(MOBILISED_MM)), MOBILISED_MM), some(42.0), turn, abs(some(42.0)))
+    return Measured(
+        number=draw.steps,
+        is_homed=True,
+        device_time_s=some(now_s),
+        left_mm=some(40.0),
+        right_mm=some(40.0),
+        left_mm_s=some(0.0),
+        right_mm_s=some(0.0),
+        force_N=some(1.1),
+        handle=handle,
+        handle_mm=some(42.0 * now_s),
+        sensed_s=some(now_s),
+        handle_time_s=some(now_s),
+    )
+
+
+def setpoint(draw: Draw, now_s: float) -> TimedSetpoint:
+    """A force of about 1.2 N, in a third of the steps with a preview."""
+    preview = tuple([draw(1.2) for _ in range(8)]) if draw.steps % 3 == 0 else ()
+    made = TimedSetpoint(draw(1.2), draw(now_s), draw(0.1), None, None, preview, draw(0.05) if preview else 0.0)
+    return made.replaced(displacement_mm=draw(MOBILISED_MM), rate_mm_s=draw(42.0)) if draw.steps % 2 else made
+
+
+def plan(draw: Draw, now_s: float) -> Plan:
+    """For a gap of 79 mm."""
+    at = Plan(1, draw(now_s), 1.2, draw(0.0), draw(1.2), draw(1.1), draw(200.0), draw(79.0), draw(-5.0), draw(1.0), ())
+    return at.replaced(gap_acceleration_mm_s2=draw(0.0), min_gap_mm=draw(45.0), sensor_doubted_s=draw(0.0))
+
+
+# -- the core through its entries ----------------------------------------------------------------------------------
+
+
+def usual() -> Draw:
+    """Draws nothing strange."""
+    return Draw(random.Random(0), ())
+
+
+def hold(now_s: float) -> Plan:
+    """A plan that asks for a gap of 80 mm."""
+    return Plan(1, now_s, None, None, 0.0, None, 0.0, 80.0, 0.0, 1.0, ())
+
+
+def stepper() -> Stepper:
+    """Enabled, at a gap of 80 mm."""
+    made, draw = core().stepper(9.9), usual()
+    for tick in range(1, 4):
+        now_s = 9.9 + tick * PERIOD_S
+        draw.steps = -tick
+        made.step(now_s, measurement(draw, now_s), hold(now_s))
+    made.command("enable", 9.91, READY)
+    return made
+
+
+def step(stage: Stepper, draw: Draw) -> object:
+    """One tick; a fault that it latches is what it says."""
+    now_s = draw.step(PERIOD_S)
+    duty = stage.step(draw(now_s), measurement(draw, now_s), plan(draw, now_s))
+    faults = stage.safety.faults
+    if Fault.NOT_FINITE in faults:
+        raise DomainError("measurement or plan", Fault.NOT_FINITE, "finite numbers")
+    return [duty, list(faults), stage.measured]
+
+
+def planner() -> Planner:
+    """Of a device of which nothing is known."""
+    return core().planner(9.9)
+
+
+def planning(stage: Planner, draw: Draw) -> object:
+    """One plan. Where it is refused its owner begins afresh, and the next is made."""
+    now_s = draw.step(PLAN_S)
+    told_s = draw(now_s)
+    try:
+        made = stage.plan(now_s if math.isfinite(told_s) else told_s, setpoint(draw, now_s), measured(draw, now_s))
+    except DomainError as error:
+        stage.afresh(now_s)
+        try:
+            stage.plan(now_s, setpoint(usual(), now_s), measured(usual(), now_s))
+        except DomainError as again:
+            raise AssertionError(f"afresh after {error}") from again
+        raise
+    stage.foresee()
+    return made
+
+
+# -- measure -------------------------------------------------------------------------------------------------------
+
+
+def measure(stage: Measure, draw: Draw) -> object:
+    last_s = draw.now_s
+    now_s = draw.step(PERIOD_S)
+    return stage.update(last_s, now_s, measurement(draw, now_s), False)
+
+
+def sight(stage: Sight, draw: Draw) -> object:
+    last_s = draw.now_s
+    stage.update(last_s, draw.step(PERIOD_S), draw(1.0) > 0.0)
+    return stage.is_blind
+
+
+def plausible(_: object, draw: Draw) -> object:
+    now_s = draw.step(PERIOD_S)
+    one, other = measured(draw, now_s), measured(draw, now_s)
+    leap = leap_between(one, other, 8.0, now_s, draw.bounded(now_s))
+    is_back = leap is not None and leap.has_come_back(one, 8.0, now_s)
+    return [leap, is_back, is_outside(other, 45.0, 95.0, False, False)]
+
+
+# -- believe -------------------------------------------------------------------------------------------------------
+
+
+def believe() -> Believe:
+    return core().planner(9.9).believe
+
+
+def believing(stage: Believe, draw: Draw) -> object:
+    now_s, before_s = draw.step(PLAN_S), draw.now_s
+    seen = measured(draw, now_s)
+    belief = stage.update(now_s, seen)
+    stage.expect(now_s - before_s, seen, draw(1.0), draw(80.0))
+    return [belief, stage.learned(), stage.min_N]
+
+
+def strength(stage: Strength, draw: Draw) -> object:
+    stage.update(draw(1.1), draw(1.2), draw.positive(PLAN_S))
+    fit = stage.fit
+    return [fit.force_N(1.1), fit.model_N(1.1), fit.deviation_N(1.1), fit.surely_within_N(2.5)]
+
+
+def slow_friction(stage: SlowFriction, draw: Draw) -> object:
+    stage.follow(draw(1.1), draw(10.0))
+    stage.rescale(draw(1.1), draw(1.1))
+    if UNSEEN.force_N(stage.followed_N) > 0.1:  # as `believe` has it
+        stage.update(UNSEEN, abs(draw(1.0)) % 6.0, draw(1.2), PLAN_S)
+    return stage.factor_at(abs(draw(1.0)))
+
+
+def sensor_zero(stage: SensorZero, draw: Draw) -> object:
+    now_s = draw.step(PLAN_S)
+    stage.begin(now_s)
+    direction = 1.0 if draw.steps // 4 % 2 else -1.0
+    stage.update(now_s, direction, draw(1.1), draw(1.1), abs(draw(42.0)), draw.positive(0.2), 1.0, 0.1)
+    return stage.sd_N(now_s)
+
+
+def sensor(stage: SensorTrust, draw: Draw) -> object:
+    stage.update(UNSEEN, draw(1.1), abs(draw(42.0)), draw(1.1), draw.positive(PLAN_S), 1.0, abs(draw(0.02)))
+    return stage.is_doubted
+
+
+def carriage_lag(stage: CarriageLag, draw: Draw) -> object:
+    stage.update(draw(PLAN_S), draw(80.0), draw(80.1), draw(-5.0), 38.0)
+    return stage.lag_s
+
+
+def handle_watch(stage: HandleWatch, draw: Draw) -> object:
+    stage.update(draw.step(PLAN_S), draw(10.0), draw(1.1), draw(1.1))
+    return stage.moved_gap_at_rest(1.1)
+
+
+def memory() -> ElementMemory:
+    return core().planner(9.9).believe.memory
+
+
+def remembering(stage: ElementMemory, draw: Draw) -> object:
+    stage.update(draw.step(PLAN_S), measured(draw, draw.now_s))
+    return [stage.lag_at_mT(draw(200.0)), stage.force_N(core().element.nominal.only)]
+
+
+# -- ask -----------------------------------------------------------------------------------------------------------
+
+
+def governor() -> Governor:
+    made = core()
+    return Governor(9.9, made.portrait, made.scene.force, made.gap_speed_mm_s)
+
+
+def governing(stage: Governor, draw: Draw) -> object:
+    now_s = draw.step(PLAN_S)
+    asked = stage.update(now_s, setpoint(draw, now_s), UNSEEN, abs(draw.bounded(0.02)))
+    stage.foresee()
+    return asked
+
+
+def forecast(stage: Forecast, draw: Draw) -> object:
+    if not stage.history or len(stage.history) < 800:  # of what it needs to forecast
+        for place in range(150):
+            stage.update(draw.step(0.01), 1.2 + 0.2 * math.sin(0.6 * place))
+    stage.update(draw.step(0.01), draw(1.2))
+    stage.foresee(draw(1.0))
+    ahead = stage.forces_N(0.0, TIMES_S) if stage.trust > 0.0 else []
+    return [stage.trust, *ahead, *np.frombuffer(stage.history).tolist()]
+
+
+def path(stage: Path, draw: Draw) -> object:
+    wanted_N = [draw(1.2) for _ in TIMES_S]
+    forces_N, sent_N = stage.pursue(draw(1.1), draw(1.1), abs(draw.bounded(PLAN_S)), wanted_N, UNSEEN, 0.02)
+    return [forces_N, sent_N, stage.is_near(draw(1.0), draw(1.2), UNSEEN)]
+
+
+def skill(stages: list[Skill], draw: Draw) -> object:
+    before = stages[0].score
+    stages[0] = stages[0].after(draw(0.01), draw(0.02), 0.05)
+    return [before, stages[0].score]
+
+
+# -- aim -----------------------------------------------------------------------------------------------------------
+
+
+def aim() -> list[Any]:
+    made = core()
+    planned = made.planner(9.9)
+    return [Aim(CONFIG, made.scene, made.element), planned.believe.memory, planned.believe.update(9.9, None)]
+
+
+def aiming(stage: list[Any], draw: Draw) -> object:
+    now_s = draw.step(PLAN_S)
+    asked = Ask(draw.bounded(1.2), [draw(1.2) for _ in range(7)], 0.0, (), draw.bounded(1.0), is_meant=True)
+    meant = setpoint(usual(), now_s)
+    return stage[0].update(now_s, meant, asked, stage[2], stage[1], measured(draw, now_s))
+
+
+def floors(_: object, draw: Draw) -> object:
+    element = core().element
+    return [ceiling_mm(element.portrait, UNSEEN, draw(2.5)), lawful_mT(element.law, draw(1.2), draw.bounded(200.0))]
+
+
+def portrait(stage: Portrait, draw: Draw) -> object:
+    force_N = draw(1.2)
+    return [
+        *stage.gap_and_slope_at(force_N),
+        stage.force_N_at(draw(70.0)),
+        stage.force_rate_N_s(force_N, draw.bounded(38.0)),
+        stage.gap_mm_at(draw(1.2)),
+    ]
+
+
+# -- move ----------------------------------------------------------------------------------------------------------
+
+
+def carriages() -> Carriages:
+    made = Carriages(CONFIG, core().scene)
+    made.begin(80.0)
+    return made
+
+
+def driving(stage: Carriages, draw: Draw) -> object:
+    now_s = draw.step(PERIOD_S)
+    seen = measured(draw, now_s)
+    dt_s = min(draw.positive(PERIOD_S), LONGEST_S)
+    drive = stage.update(now_s, dt_s, plan(draw, now_s), reading(draw, now_s), seen, False)
+    return [drive, stage.reference, stage.expected]
+
+
+def reading(draw: Draw, now_s: float) -> Measurement:
+    """A measurement as the border lets it pass."""
+    return measurement(usual(), now_s).replaced(supply_V=draw.bounded(12.0), number=draw.steps)
+
+
+def pid(stage: Pid, draw: Draw) -> object:
+    stage.rest(draw.bounded(0.1), PERIOD_S)
+    return stage.update(
+        draw(0.1), draw(1.0), draw(0.1), min(draw.positive(PERIOD_S), LONGEST_S), draw.bounded(0.0) > 0.0
+    )
+
+
+def reference(stages: list[Reference], draw: Draw) -> object:
+    now_s = draw.step(PERIOD_S)
+    to = target_of(plan(draw, now_s), now_s, 2e-3, 45.0, 95.0)
+    dt_s = min(draw.positive(PERIOD_S), LONGEST_S)
+    stages[0], *_ = follow(1600.0, stages[0], to, dt_s, Speeds(40.0, 38.0, 38.0), 45.0)
+    return stages[0]
+
+
+def motor(_: object, draw: Draw) -> object:
+    """Of what a configuration accepts."""
+    if not draw.is_hostile:
+        return []
+    ends: dict[str, Any] = {}
+    for name, least, usual_is, most in MOTORS:
+        if draw(1.0) != 1.0:
+            ends[name] = least if draw.steps % 2 else most
+        else:
+            ends[name] = usual_is
+    made = Motor(**ends)
+    return [*margins(made, Position(), PERIOD_S), full_speed_mm_s(made)]
+
+
+MOTORS = (
+    ("supply_V", 3.0, 12.0, 60.0),
+    ("resistance_ohm", 0.05, 2.2, 100.0),
+    ("inductance_mH", 0.01, 1.5, 100.0),
+    ("back_emf_V_s", 1e-4, 0.011, 1.0),
+    ("inertia_kg_m2", 1e-9, 8e-7, 1e-2),
+    ("gear_ratio", 1.0, 70.0, 1_000.0),
+    ("screw_lead_mm", 0.2, 8.0, 50.0),
+)
+
+
+def homing(stage: Homing, draw: Draw) -> object:
+    now_s = draw.step(PERIOD_S)
+    mode = DeviceMode.HOMING if draw.steps % 8 else DeviceMode.IDLE
+    stage.update(now_s, measurement(draw, now_s).replaced(mode=mode))
+    return [*stage.faults, *stage.went_back_mm]
+
+
+def watch(stage: Watch, draw: Draw) -> object:
+    now_s = draw.step(PERIOD_S)
+    seen, said, seeing = measured(draw, now_s), measurement(draw, now_s), Sight(PERIOD_S)
+    stage.update(PERIOD_S, seen, draw(80.0), draw(0.1), draw(0.1))
+    faults = stage.faults(now_s, SafetyState(), said, seen, seeing, None, draw(0.0))
+    return [*faults, *stage.limits(now_s, said, seen, seeing)]
+
+
+# -- what several stages use ---------------------------------------------------------------------------------------
+
+
+def filtered(values: list[float], draw: Draw) -> object:
+    values[0] = low_pass(values[0], draw(1.0), abs(draw(PERIOD_S)), draw.positive(0.01))
+    return values
+
+
+def tables(_: object, draw: Draw) -> object:
+    """Of five points: also of equal ones, and of some that are a denormal apart or do not rise."""
+    points = [draw(each) for each in (0.0, 1.0, 2.0, 3.0, 4.0)]
+    points = points if draw.steps % 3 else sorted(points)
+    gaps_mm = [95.0, 80.0, 65.0, 50.0, 35.0]
+    degenerate, value = Portrait(gaps_mm, points, [0.1] * 5), draw(points[draw.steps % 5])
+    return [
+        interpolated(value, Rising(points), gaps_mm),
+        at_step(abs(draw(1.5)), gaps_mm),
+        *degenerate.gap_and_slope_at(value),
+        degenerate.force_N_at(draw(70.0)),
+    ]
+
+
+def fields(_: object, draw: Draw) -> object:
+    field = core().element.field
+    return [field.field_mT(draw(80.0)), field.gap_mm(draw(200.0))]
+
+
+def contact(stages: list[Any], draw: Draw) -> object:
+    now_s = draw.step(PLAN_S)
+    seen, asked = measured(draw, now_s), setpoint(draw, now_s)
+    return [[*each.planned(asked, seen), *each.present(seen), each.is_known(seen)] for each in stages]
+
+
+def curve(_: object, draw: Draw) -> object:
+    made = core().element.nominal._network.curve(draw(2.0), draw(42.0), draw(40.0))
+    field_mT = draw.bounded(200.0)
+    return [made.force_N(field_mT), *made.force_and_slope(field_mT), made.confidence(field_mT, draw.bounded(0.1))]
+
+
+def search(stage: Any, draw: Draw) -> object:
+    found = stage.solve(core().element.nominal.only, draw(1.2), draw(200.0) if draw.steps % 2 else None)
+    return [found.field_mT, found.predicted_force_N, found.confidence]
+
+
+# -- the borders ---------------------------------------------------------------------------------------------------
+
+
+def link() -> DeviceLink:
+    made = DeviceLink(9.9)
+    made.receive(9.9, STATUS)
+    made.receive(9.9, Sense(0.1, 0.1, 0.6, 0.0))
+    return made
+
+
+STATUS = Status(DeviceMode.RUN, Switches.HOMED, DeviceFault(0), 23.0, 12.0, 0, 1)
+
+
+def linked(stage: DeviceLink, draw: Draw) -> object:
+    """One exchange, with times that repeat themselves and go back."""
+    now_s = draw.step(PERIOD_S)
+    if draw.steps % 20 == 0:
+        stage.receive(now_s, Status(DeviceMode.RUN, Switches.HOMED, DeviceFault(0), draw(23.0), draw(12.0), 0, 1))
+    stage.receive(now_s, State(draw(-7.5), draw(-7.5), draw(now_s % 0.65536), draw.steps % 256))
+    stage.receive(now_s, Sense(draw(0.1), draw(0.1), draw(0.6), draw(1.0)))
+    return stage.measurement
+
+
+def wire(_: object, draw: Draw) -> object:
+    """Numbers to bytes and back, and any bytes."""
+    if draw.is_hostile and draw.steps % 2:
+        return decode(4, draw.bytes(8))
+    sense = Sense(draw(0.1), draw(0.1), draw(0.6), draw(1.0))
+    drive = Drive(draw(0.1), draw(-0.1), DriveMode.RUN, 1)
+    return [decode(4, encode(sense)), decode(2, encode(drive))]
+
+
+def clock(stage: DeviceClock, draw: Draw) -> object:
+    now_s = draw.step(0.6)
+    stage.add(now_s, draw(now_s))
+    return [stage.drift, stage.fit()]
+
+
+def safety(stages: list[SafetyState], draw: Draw) -> object:
+    some = READY.replaced(
+        requested_N=abs(draw(0.5)),
+        round_trip_s=abs(draw(2e-3)),
+        clock_drift=draw(0.0),
+        apart_mm=abs(draw(0.0)),
+        most_apart_mm=1.0,
+        most_round_trip_s=0.01,
+        most_clock_drift=0.1,
+    )
+    stages[0] = command(SafetyState(), "enable", draw.step(PERIOD_S), some)
+    return [some.requested_N, some.round_trip_s, some.clock_drift, some.apart_mm]
+
+
+def inbox(_: object, draw: Draw) -> object:
+    """A setpoint's message."""
+    fields = {"v": 1, "source": "a", "seq": draw.steps, "stamp_ns": 1, "servo_cf": draw(1.2)}
+    fields |= {"valid_for_ms": draw(100.0), "displacement_mm": draw(2.0), "rate_mm_s": draw(42.0)}
+    fields |= {"preview_N": [draw(1.2), draw(1.2)], "preview_dt_ms": draw(10.0)}
+    found = decode_message(msgspec.msgpack.encode(fields), Setpoint)
+    return [getattr(found, name) for name in ("servo_cf", "valid_for_ms", "displacement_mm", "preview_N")]
+
+
+SEARCHES = ("nearest", "coarse-to-fine", "newton")
+
+
+def stages() -> list[Stage]:
+    """The table."""
+    made, position = core(), CONFIG.position
+    element = made.element
+    range_mT = element.nominal.fields_mT
+    return [
+        Stage("client: a setpoint's message", lambda: None, inbox),
+        Stage("firmware_protocol: codec", lambda: None, wire),
+        Stage("hardware/link", link, linked, CODEC),
+        Stage("hardware/link_statistics", DeviceClock, clock, CODEC),
+        Stage("safety/operating_state", lambda: [SafetyState()], safety),
+        Stage("Stepper", stepper, step),
+        Stage("Planner", planner, planning),
+        Stage("measure", lambda: Measure(47.5, 0.003, True, 8.0, PERIOD_S), measure, MEASUREMENT),
+        Stage("plausible", lambda: None, plausible, MEASUREMENT),
+        Stage("sight", lambda: Sight(PERIOD_S), sight, MEASUREMENT),
+        Stage("believe/believe", believe, believing, MEASUREMENT),
+        Stage("believe/strength", lambda: Strength(0.5, (0.6, 1.6), (True, True)), strength, MEASUREMENT),
+        Stage("believe/slow_friction", SlowFriction, slow_friction, MEASUREMENT),
+        Stage("believe/sensor_zero", SensorZero, sensor_zero, MEASUREMENT),
+        Stage("believe/sensor", SensorTrust, sensor, MEASUREMENT),
+        Stage("believe/carriage_lag", CarriageLag, carriage_lag, MEASUREMENT),
+        Stage("believe/handle", HandleWatch, handle_watch, MEASUREMENT),
+        Stage("believe/memory", memory, remembering, MEASUREMENT),
+        Stage("ask/governor", governor, governing),
+        Stage("ask/forecast", Forecast, forecast, SETPOINT),
+        Stage("ask/path", lambda: Path(made.portrait, 38.0), path),
+        Stage("ask/skill", lambda: [Skill(0.0, 0.0)], skill, SETPOINT),
+        Stage("aim/aim", aim, aiming),
+        Stage("aim/floors", lambda: None, floors),
+        Stage("aim/portrait", lambda: made.portrait, portrait),
+        Stage("move/carriages", carriages, driving),
+        Stage("move/pid", lambda: Pid(position), pid),
+        Stage("move/reference", lambda: [Reference(80.0)], reference, PLANNED),
+        Stage("move/motor", lambda: None, motor, CONFIGURATION),
+        Stage("move/homing", lambda: Homing(2.6), homing, MEASUREMENT),
+        Stage("move/watch", lambda: Watch(CONFIG, made.scene), watch, MEASUREMENT),
+        Stage("filter", lambda: [0.0], filtered, MEASUREMENT),
+        Stage("interpolation", lambda: None, tables),
+        Stage("field_of_gap", lambda: None, fields),
+        Stage("contact", lambda: [Sliding(), Pressing(2.0)], contact, MEASUREMENT),
+        Stage("model/force_curve", lambda: None, curve),
+        *[
+            Stage(f"inverse: {name}", partial(build, named(name), range_mT, rises=name == "newton"), search)
+            for name in SEARCHES
+        ],
+        Stage("inverse: portrait", lambda: PortraitSearch(made.portrait, element.field), search),
+    ]
