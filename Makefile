@@ -10,6 +10,7 @@ GOAL ?= test
 SEARCHES ?= 5
 MUTANTS ?= 60
 SEED ?= 1
+MATRICES ?= 10 30 50
 
 DESTDIR ?=
 PREFIX ?= /usr/local
@@ -106,17 +107,14 @@ format: $(VENV)/.dev
 compile: core
 	@$(SAY_BUILD)
 
-# the shipped models: bench sweeps recorded from the simulated device (sample 1, with each insert), then training
+# the shipped models, one for the inserts of a matrix: bench sweeps recorded from the simulated device (sample 1), then training
 model: $(VENV)/.dev
-	$(BIN)/tormag-lab bench-sweep --plant sample_1 --out build/bench_sweep.csv
-	$(BIN)/tormag-lab train-model build/bench_sweep.csv --element torque --insert MRE-50-40 --without-memory \
-	    --rising --hidden 40 --epochs 120 --validation-share 0.2 \
-	    --out tormagd/model/models/torque_mre_50_40.safetensors --plot build/training.png
-	for pair in brain:10-10 cardiovascular:10-20; do \
-	    $(BIN)/tormag-lab bench-sweep --plant sample_1 --scene $${pair%:*} --out build/$${pair%:*}.csv && \
-	    $(BIN)/tormag-lab train-model build/$${pair%:*}.csv --element torque --insert MRE-$${pair#*:} \
-	        --without-memory --rising --hidden 40 --epochs 120 --validation-share 0.2 \
-	        --out tormagd/model/models/torque_mre_$$(echo $${pair#*:} | tr - _).safetensors || exit 1; \
+	for matrix in $(MATRICES); do \
+	    inserts=$$(printf "MRE-$$matrix-%s " 10 20 30 40) && \
+	    $(BIN)/tormag-lab bench-sweep --plant sample_1 --insert $$inserts --out build/mre_$$matrix.csv && \
+	    $(BIN)/tormag-lab train-model build/mre_$$matrix.csv --element torque --insert $$inserts --without-memory \
+	        --rising --hidden 50 --epochs 150 --validation-share 0.2 \
+	        --out tormagd/model/models/torque_mre_$$matrix.safetensors || exit 1; \
 	done
 
 # the shipped model of the tactile pad: cycles and holds of the simulated pad 1 on the bench, then training

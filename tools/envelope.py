@@ -1,11 +1,13 @@
 """What the whole path does at the corners: handles x devices x forces x what setpoints may say, in virtual time.
 
     envelope.py [--quick] [--json] [--picture FILE.png]
+    envelope.py --models [--json] [--picture FILE.png]
 
 Forces are the simulated plant's while the handle slides. *Asked* is the greater of the force asked and what this
 device brakes with its gap open at this speed; *arrived* is 0.2 s after an ideal carriage would have. Devices are the
 three samples and random draws around sample 1 (plant card). Sample 1 and draws 0 to 39 were looked at while constants
-were chosen; samples 2 and 3 and the draws from 40 on only judge. All devices are synthetic.
+were chosen; samples 2 and 3 and the draws from 40 on only judge. All devices are synthetic. `--models` asks only how
+near the model of each insert is to devices without a loop around it: samples 2 and 3 and draws 100 to 119.
 """
 
 import argparse
@@ -23,6 +25,7 @@ import numpy as np
 from rendering.device_draws import SAMPLES, device, judging
 from rendering.following import CORNER_SCENE, VALID_S, Followed, Levels, armed_at_rest, asked_at, follow
 from rendering.hands import HANDS
+from rendering.models import errors, models, models_picture, models_table
 from tqdm import tqdm
 
 from tormagd.control.records import TimedSetpoint
@@ -30,11 +33,9 @@ from tormagd.lab.arrays import Array, Json, Mask
 from tormagd.lab.ideal_carriage import TURNED_MM_S, brake_of
 from tormagd.lab.pages import stamp
 from tormagd.lab.told import lines
-from tormagd.model.displacement import MOBILISED_MM
+from tormagd.lab.training.metrics import not_rising_share
 from tormagd.model.model_file import load_model
 from tormagd.model.shipped import model_path
-from tormagd.physics.field import PowerFieldLaw, flux_density_T
-from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
 from tormagd.physics.inserts import insert
 from tormagd.safety.codes import Limit
 from tormagd.scenes.scene import load_scene
@@ -212,31 +213,12 @@ def low_hold(name: str, asked_N: float, lasts_s: float) -> tuple[str, ...]:
 
 
 def model_on_plant() -> Json:
-    """The shipped model on sample 1 without memory, friction mobilised, over the gaps of the scene and 5..300 mm/s."""
-    plant, scene = load_plant("sample_1"), load_scene(CORNER_SCENE)
-    model = load_model(model_path(scene.insert.model, Path()), element="torque")
-    fitted, open_mm, closed_mm = insert(scene.insert.name), scene.insert.gap_open_mm, scene.insert.gap_closed_mm
-    gaps_mm, rates_mm_s = np.linspace(closed_mm, open_mm, 101), np.linspace(5.0, 300.0, 119)
-    moments_Tm = PowerFieldLaw(plant.field.coefficient, plant.field.exponent).radial_moment_Tm(gaps_mm)
-    elastomer = Elastomer(
-        plant.elastomer.shear_modulus_kPa * 1e3,
-        plant.elastomer.relative_permeability,
-        plant.elastomer.kinetic_friction,
-    )
-    fields_mT = 1e3 * np.asarray(
-        flux_density_T(moments_Tm, fitted.elastomer.relative_permeability, 1e-3 * scene.insert.inner_radius_mm)
-    )
-    friction, rates = plant.friction, rates_mm_s[:, np.newaxis]
-    over = 1.0 + (friction.static_to_kinetic - 1.0) * np.exp(-((rates / friction.stribeck_speed_mm_s) ** 2))
-    true_N = brake_force_N(moments_Tm, elastomer, TORMAG) * over + friction.viscous_N_s_mm * rates
-    rows = np.array(
-        [[MOBILISED_MM, rate, field, 100.0 * fitted.cip_fraction] for rate in rates_mm_s for field in fields_mT]
-    )
-    error_N = np.abs(model.predict(rows).reshape(true_N.shape) - true_N)
-    return {
-        "mean_N": float(error_N.mean()),
-        "worst_N": float(error_N.max()),
-        "not_rising_share": float((model.field_slope_N_per_mT(rows) <= 0.0).mean()),
+    """The scene's model on sample 1 without memory, friction mobilised, over the gaps of the scene and 5..300 mm/s."""
+    stated = load_scene(CORNER_SCENE).insert
+    fitted = insert(stated.name)
+    model = load_model(model_path(stated.model, Path(), stated.name), element="torque", insert=stated.name)
+    return errors(model, fitted, load_plant("sample_1"), np.linspace(5.0, 300.0, 119)) | {
+        "not_rising_share": not_rising_share(model)
     }
 
 
@@ -317,6 +299,15 @@ def picture(path: Path, result: Json, found: list[tuple[Case, Figures]]) -> None
     figure.savefig(path, dpi=130, metadata=stamp(result))
 
 
+def judge_models(options: argparse.Namespace) -> int:
+    """The errors of every shipped model; 1 where one falls with the field anywhere in its box."""
+    result = models()
+    print(json.dumps(result) if options.json else models_table(result))
+    if options.picture is not None:
+        models_picture(options.picture, result)
+    return 1 if any(row["not_rising_share"] > 0.0 for row in result["rows"]) else 0
+
+
 def main() -> int:
     """Measures, prints, and draws; 0 only if the bounds were kept and nothing faulted."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -324,7 +315,10 @@ def main() -> int:
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--picture", type=Path, help="PNG of the force error over handle speed and asked force")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes at a time")
+    parser.add_argument("--models", action="store_true", help="the shipped models, an insert a row")
     options = parser.parse_args()
+    if options.models:
+        return judge_models(options)
     result, found = measure(options)
     worst = sorted(result["rows"], key=lambda shown: -shown["over_N"])[:6]
     print(json.dumps(result) if options.json else "\n".join(lines(result | {"rows": worst})))

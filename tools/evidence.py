@@ -76,6 +76,11 @@ PARTS = {
         "{cases} runs on samples and {draws} draws: over what was asked by {over_N:.3f} N at most, at most "
         "{peak_N:.2f} N at all, {settled_N:.3f} N off after 2 s of sliding, {low_hold_faults} faults below F_min",
     ),
+    "models": Part(
+        "tools/envelope.py --models --json --picture docs/images/models.png",
+        "[every insert's model on devices](../guides/insert.md#the-shipped-models)",
+        is_kept=True,
+    ),
     "step": Part(
         "tools/benchmark.py step --json",
         "1 mm: rise {rise_s:.3f} s, {rise_over_time_optimal:.2f} times the fastest, overshoot {overshoot:.1%}, settled "

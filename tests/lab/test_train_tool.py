@@ -8,7 +8,7 @@ import pytest
 
 from tormagd.lab.main import main
 from tormagd.lab.training import train_model
-from tormagd.lab.training.dataset import Dataset, write_csv
+from tormagd.lab.training.dataset import Dataset, read_csv, write_csv
 from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.model.model_file import load_model
 
@@ -45,6 +45,33 @@ def test_from_csv_to_model(data: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert report["data_sha256"] == model.metadata.training_data_sha256
     assert model.metadata.metrics["validation_r2"] == report["validation_r2"]
     assert model.predict_one(1.0, 60.0, 800.0, 40.0) == pytest.approx(4.9, abs=0.05)
+
+
+def test_several_inserts_are_told_apart_by_their_iron(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = read_csv(data)
+    weak = rows.features.copy()
+    weak[:, 2:] = weak[:, 2:] / 2.0  # half the field, half the iron
+    assert rows.cycle is not None
+    joined = Dataset(
+        np.concatenate((rows.features, weak)),
+        np.concatenate((rows.force_N, rows.force_N / 3.0)),
+        np.concatenate((rows.cycle, rows.cycle + 100)),
+    )
+    both, out = tmp_path / "both.csv", tmp_path / "model.safetensors"
+    write_csv(both, joined)
+    arguments = [*command(both, out, "--rising", "--epochs", "10"), "--insert", "MRE-50-20", "MRE-50-40"]
+    assert main(arguments) == 0
+    whole, strong = (load_model(out, element="torque", insert=name) for name in (None, "MRE-50-40"))
+    assert whole.metadata.insert == "MRE-50"
+    assert whole.metadata.ranges["cip_percent"] == (20.0, 40.0)
+    assert strong.metadata.ranges["cip_percent"] == (40.0, 40.0)
+    assert strong.field_range_mT[1] == pytest.approx(800.0, rel=0.01)
+    assert load_model(out, element="torque", insert="MRE-50-20").field_range_mT[1] == pytest.approx(400.0, rel=0.01)
+    assert whole.metadata.metrics["not_rising_share"] == 0.0
+    assert main([*arguments[:-1], "MRE-50-30"]) == 2
+    assert "insert = MRE-50-30 is not allowed: one that there are rows of" in capsys.readouterr().err
 
 
 def test_the_same_command_gives_the_same_bytes(data: Path, tmp_path: Path) -> None:

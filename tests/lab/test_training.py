@@ -10,6 +10,7 @@ from torch.func import functional_call, jacrev
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.fitting import scaling_of
 from tormagd.lab.training.levenberg_marquardt import Epoch, jacobian, train
+from tormagd.model.features import FIELD
 from tormagd.model.network import ForceNetwork
 from tormagd.physics.errors import DomainError
 
@@ -111,6 +112,27 @@ def test_scaling_maps_the_ranges_onto_minus_one_to_one() -> None:
     torch.testing.assert_close(scaled.max(dim=0).values, torch.tensor([1.0, 1, 1, 0], dtype=torch.float64))
     forces = network.scale_output(torch.tensor(data.force_N))
     assert (float(forces.min()), float(forces.max())) == pytest.approx((-1, 1))
+
+
+def test_a_rising_force_rises_everywhere_and_fits_as_well() -> None:
+    training, fresh = synthetic(2000, 1), synthetic(1000, 3, noise_N=0.0)
+    network = network_for(training, hidden=12)
+    train(network, training, synthetic(500, 2), epochs=150, rising=True)
+    with torch.no_grad():
+        error = network(torch.tensor(fresh.features)).numpy() - fresh.force_N
+    assert np.sqrt(np.mean(error**2)) < NOISE_N / 2
+    corners = np.random.default_rng(0).uniform((-1, -100, -500, 0), (3, 400, 2000, 80), (2000, 4))
+    features = torch.tensor(corners, requires_grad=True)
+    (slope,) = torch.autograd.grad(network(features).sum(), features)
+    assert float(slope[:, FIELD].min()) >= 0.0
+
+
+def test_a_rising_force_rises_where_the_data_fall() -> None:
+    data = synthetic(500, 1)
+    falling = Dataset(data.features, -data.force_N)
+    network = network_for(falling, hidden=6)
+    train(network, falling, falling, epochs=20, rising=True)
+    assert bool((network.hidden_weight[:, FIELD] * network.output_weight > 0.0).all())
 
 
 def test_what_cannot_be_trained_is_refused() -> None:

@@ -331,6 +331,59 @@ def test_not_rising_counts_where_the_force_falls_with_the_field(metadata: ModelM
     assert share([8.0, -8.0, 0, 0, 0, 0], [4.0, 4, 0, 0, 0, 0], points=17) == pytest.approx(9 / 17)
 
 
+@pytest.fixture
+def of_two(model: ForceModel) -> ForceModel:
+    """One network of two inserts, whose fields overlap and whose iron differs."""
+    whole = model.metadata.ranges | {"cip_percent": (20.0, 40.0)}
+    boxes = {
+        f"MRE-50-{iron:g}": whole | {"field_mT": fields_mT, "cip_percent": (iron, iron)}
+        for iron, fields_mT in ((20.0, (100.0, 400.0)), (40.0, (200.0, 800.0)))
+    }
+    memory = Memory(fractions=(0.05,), times_s=(8.0,), lag_mT=8.0, turn_mT=80.0)
+    changes = {"insert": "MRE-50", "ranges": whole, "boxes": boxes, "memory": memory}
+    return replace(model, metadata=msgspec.structs.replace(model.metadata, **changes))
+
+
+def test_a_model_of_several_inserts_is_loaded_in_the_box_of_the_one_that_is_asked_for(
+    tmp_path: Path, of_two: ForceModel
+) -> None:
+    path = tmp_path / "model.safetensors"
+    save_model(path, of_two)
+    assert load_model(path, element="torque").metadata == of_two.metadata
+    weak = load_model(path, element="torque", insert="MRE-50-20")
+    assert weak.metadata.insert == "MRE-50-20"
+    assert weak.feature_ranges == ((0.0, 1.0), (0.0, 60.0), (100.0, 400.0), (20.0, 20.0))
+    assert weak.metadata.memory == Memory(fractions=(0.05,), times_s=(8.0,), lag_mT=4.0, turn_mT=40.0)
+    assert weak.predict_one(0.3, 12.0, 300.0, 20.0) == of_two.predict_one(0.3, 12.0, 300.0, 20.0)
+    assert (
+        weak.curve(0.3, 12.0, 20.0).confidence(700.0, 0.0)
+        < 0.1
+        < 0.9
+        < of_two.curve(0.3, 12.0, 20.0).confidence(700.0, 0.0)
+    )
+    refused(path, "trained on insert MRE-50, but MRE-50-30 is in use", insert="MRE-50-30")
+
+
+def test_not_rising_counts_in_the_boxes_alone(of_two: ForceModel) -> None:
+    weight = np.zeros((6, 4))
+    weight[:, 2] = 0.5, -0.5, 0.0, 0.0, 0.0, 0.0
+    # rises where either insert's fields are, falls with more iron: the whole's ranges have corners that neither has
+    whole = replace(of_two, hidden_weight=weight, output_weight=np.array([1.0, -1.0, 0.0, 0.0, 0.0, 0.0]))
+    assert not_rising_share(whole) == 0.0
+    falls = replace(of_two, hidden_weight=-np.abs(weight), output_weight=np.ones(6))
+    assert not_rising_share(falls) == 1.0
+
+
+def test_a_box_that_is_none_is_refused(of_two: ForceModel) -> None:
+    for box, message in (
+        ({"rate_mm_s": (0.0, 60.0)}, r"boxes.MRE-50-20 = \['rate_mm_s'\]"),
+        (of_two.metadata.ranges | {"rate_mm_s": (2.0, 1.0)}, "boxes.MRE-50-20.rate_mm_s"),
+        (of_two.metadata.ranges | {"force_N": (1.0, 1.0)}, "boxes.MRE-50-20.force_N"),
+    ):
+        with pytest.raises(DomainError, match=message):
+            msgspec.structs.replace(of_two.metadata, boxes={"MRE-50-20": box})
+
+
 # -- the force curve: the model's, torch's and a 50-digit calculation's force, and how far it is trusted ---------------
 
 

@@ -96,7 +96,7 @@ def trained(data: Dataset, hidden: int, epochs: int, seed: int = 0) -> ForceMode
     model, _ = fit_model(
         *data.split(0.3, seed),
         element=Element.TORQUE,
-        insert=INSERT.name,
+        inserts=(INSERT.name,),
         data_sha256=data.sha256(),
         created=datetime.date(2024, 1, 1),
         hidden=hidden,

@@ -25,10 +25,11 @@ from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.move.motor import Margins, margins, pull_V
 from tormagd.control.nominal import Nominal
 from tormagd.inverse.choice import BESIDE_PLANS, Choice, build, mean_error_N, named
+from tormagd.model.features import FEATURES
 from tormagd.model.model_file import ForceModel, ModelFileError, load_model
 from tormagd.model.rising import falling_at
 from tormagd.model.shipped import model_path
-from tormagd.physics.errors import DomainError
+from tormagd.physics.errors import DomainError, require
 from tormagd.physics.field import PAD_RADIUS_M, REFERENCE_PERMEABILITY, PowerFieldLaw
 from tormagd.physics.force import Geometry
 from tormagd.physics.inserts import insert
@@ -107,7 +108,7 @@ def build_core(config: Config, scene: Scene | None = None, models: Path | None =
     _refuse_too_weak(config, scene)
     try:
         model = load_model(
-            model_path(scene.insert.model, beside=beside), element=scene.element, insert=scene.insert.name
+            model_path(scene.insert.model, beside, scene.insert.name), element=scene.element, insert=scene.insert.name
         )
         element, choice = _element(scene, model)
     except (DomainError, ModelFileError) as error:
@@ -124,6 +125,7 @@ def _element(scene: Scene, model: ForceModel) -> tuple[Element, Choice]:
     """The scene's element as the model has it, and how its field is searched for."""
     terms = terms_of(scene)
     contact, field, cip_percent = _brake(scene) if scene.finger is UNSET else _pad(scene.finger, model)
+    require("insert.name, cip_percent", cip_percent, *model.feature_ranges[FEATURES.index("cip_percent")])
     nominal = Nominal(model, contact, cip_percent, terms.rate)
     fields_mT, rises = _known_fields_mT(scene, model, contact, field)
     reach = portrait(nominal.only, field, (field.gap_mm(fields_mT[1]), field.gap_mm(fields_mT[0])))

@@ -19,7 +19,10 @@ class Nominal:
         self.contact: Final = contact
         self._cip_percent: Final = cip_percent
         self._has_rate: Final = has_rate
-        self._displacements_mm: Final = model.feature_ranges[0]
+        known_mm = model.feature_ranges[0]
+        # what slides is planned for mobilised: the handle's way there is no force that a field could be found for
+        mobilised_mm = within(contact.displacement_mm, known_mm)
+        self._displacements_mm: Final = (mobilised_mm, mobilised_mm) if contact.slides else known_mm
         self._rates_mm_s: Final = model.feature_ranges[1]
         self.fields_mT: Final = model.feature_ranges[2]
         self.only: Final[ForceCurve] = self.curve(contact.displacement_mm, contact.rate_mm_s)

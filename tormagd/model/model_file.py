@@ -10,7 +10,7 @@ import json
 import math
 import re
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -37,6 +37,8 @@ from tormagd.model.memory import NO_MEMORY, Memory
 from tormagd.physics.errors import DomainError
 
 Array: TypeAlias = NDArray[np.float64]
+Ranges: TypeAlias = dict[str, tuple[float, float]]
+"The least and the greatest value of each feature, and of `force_N`."
 
 FORMAT = "tormagd-force-model-1"
 MAX_HIDDEN = 4096
@@ -56,14 +58,15 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     `insert` names the insert the data were measured on; `ranges` holds the least and the greatest value seen in
     training for each feature and for `force_N`; `metrics` whatever the trainer measured; `created` is given, never
-    read from a clock; `memory` is what the network leaves out. Raises `DomainError` on anything that could not be saved
-    and loaded again.
+    read from a clock; `memory` is what the network leaves out. Where the data are of several inserts, `insert` is what
+    their names begin with, and `boxes` holds the ranges of each. Raises `DomainError` on anything that could not be
+    saved and loaded again.
     """
 
     element: Element
     insert: str
     hidden: int
-    ranges: dict[str, tuple[float, float]]
+    ranges: Ranges
     scaling: Scaling
     training_data_sha256: str
     metrics: dict[str, float]
@@ -71,6 +74,7 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     features: tuple[str, ...] = FEATURES
     units: dict[str, str] = msgspec.field(default_factory=lambda: dict(UNITS))
     memory: Memory = NO_MEMORY
+    boxes: dict[str, Ranges] | msgspec.UnsetType = msgspec.UNSET
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\x21-\x7e]{1,64}", self.insert):
@@ -83,14 +87,9 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             raise DomainError("features", self.features, f"{FEATURES}, in this order")
         if self.units != UNITS:
             raise DomainError("units", self.units, str(UNITS))
-        if set(self.ranges) != set(UNITS):
-            raise DomainError("ranges", sorted(self.ranges), f"one range for each of {', '.join(UNITS)}")
-        for name, (low, high) in self.ranges.items():
-            if not -LARGEST <= low <= high <= LARGEST:
-                raise DomainError(f"ranges.{name}", (low, high), f"[least, greatest], finite, within +-{LARGEST:g}")
-        low, high = self.ranges["force_N"]
-        if not low < high:
-            raise DomainError("ranges.force_N", (low, high), "a greatest force above the least")
+        _require_ranges("ranges", self.ranges)
+        for name, box in (self.boxes or {}).items():
+            _require_ranges(f"boxes.{name}", box)
         scaling = self.scaling
         numbers = (*scaling.input_offset, *scaling.input_gain, scaling.output_offset, scaling.output_gain)
         if not all(abs(number) <= LARGEST for number in numbers):
@@ -100,6 +99,17 @@ class ModelMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         for name, value in self.metrics.items():
             if not math.isfinite(value):
                 raise DomainError(f"metrics.{name}", value, "a finite number")
+
+
+def _require_ranges(key: str, ranges: Ranges) -> None:
+    if set(ranges) != set(UNITS):
+        raise DomainError(key, sorted(ranges), f"one range for each of {', '.join(UNITS)}")
+    for name, (low, high) in ranges.items():
+        if not -LARGEST <= low <= high <= LARGEST:
+            raise DomainError(f"{key}.{name}", (low, high), f"[least, greatest], finite, within +-{LARGEST:g}")
+    low, high = ranges["force_N"]
+    if not low < high:
+        raise DomainError(f"{key}.force_N", (low, high), "a greatest force above the least")
 
 
 class PhysicalLayers(NamedTuple):
@@ -113,7 +123,7 @@ class PhysicalLayers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ForceModel:
-    """Force of one insert from (displacement_mm, rate_mm_s, field_mT, cip_percent), by a 4-h-1 sigmoid network.
+    """Force of an insert from (displacement_mm, rate_mm_s, field_mT, cip_percent), by a 4-h-1 sigmoid network.
 
     The weights act on scaled values (`metadata.scaling`): hidden_weight (h x 4), hidden_bias (h), output_weight (h).
     `physical` is the same network with the scaling folded in.
@@ -173,6 +183,17 @@ class ForceModel:
         """SHA-256 of all that the file holds, 64 hexadecimal digits: which model it is."""
         return _checksum(_header(self.metadata), _tensors(self))
 
+    def of(self, insert: str) -> "ForceModel":
+        """The same network for one of the inserts it was trained on, in that one's box; the field lags to its scale."""
+        whole, memory = self.metadata, self.metadata.memory
+        ranges = (whole.boxes or {}).get(insert)
+        if ranges is None:
+            return self
+        share = ranges["field_mT"][1] / whole.ranges["field_mT"][1]
+        memory = msgspec.structs.replace(memory, lag_mT=share * memory.lag_mT, turn_mT=share * memory.turn_mT)
+        own = msgspec.structs.replace(whole, insert=insert, ranges=ranges, memory=memory, boxes=msgspec.UNSET)
+        return replace(self, metadata=own)
+
     def curve(self, displacement_mm: float, rate_mm_s: float, cip_percent: float) -> ForceCurve:
         """The force over the field for one state of the handle. Raises `DomainError` on a non-finite input."""
         return self.network.curve(displacement_mm, rate_mm_s, cip_percent)
@@ -210,14 +231,14 @@ def save_model(path: Path | str, model: ForceModel) -> None:
 
 
 def load_model(path: Path | str, *, element: Element | str, insert: str | None = None) -> ForceModel:
-    """Read a model meant for `element` and, when given, trained on `insert`.
+    """Read a model meant for `element` and, when given, trained on `insert`: of several inserts, for that one.
 
     Raises `ModelFileError` when the file cannot be read, is truncated or altered, holds anything but a finite 4-h-1
     network in the features and units of this program, or belongs to another element or insert.
     """
     source = Path(path)
     try:
-        model = _decode(read_bounded(source, MAX_FILE_BYTES))
+        model = _decode(read_bounded(source, MAX_FILE_BYTES)).of(insert or "")
     except OSError as error:
         raise ModelFileError(f"{source}: cannot be read: {error.strerror}") from error
     except safetensors.SafetensorError as error:

@@ -172,7 +172,8 @@ class Insert(Strict, frozen=True):
 
     name: str
     model: str
-    "A safetensors file (relative to the scene file), or the name of a shipped model."
+    """A safetensors file (relative to the scene file), or the name of a shipped model; "auto": the shipped one of this
+    insert, or that of all inserts of its matrix."""
     gap_closed_mm: Annotated[float, Meta(ge=20.0, le=300.0)] = 45.0
     gap_open_mm: Annotated[float, Meta(ge=20.0, le=300.0)] = 95.0
     inner_radius_mm: Annotated[float, Meta(gt=0.0, le=100.0)] = 4.0

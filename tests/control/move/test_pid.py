@@ -188,4 +188,4 @@ def test_what_is_no_number_is_refused_and_not_learned(place: int, value: float) 
     given[place] = value
     with pytest.raises(DomainError, match=r"^duty = .* is not allowed: a finite number"):
         updated(stage, *given)
-    assert (stage.integral, stage.duty) == (0.1, 0.0)
+    assert (stage.integral, stage.is_saturated) == (0.1, False)

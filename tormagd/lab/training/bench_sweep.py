@@ -2,16 +2,19 @@
 
 Like figure 2.7 of the thesis: the gap goes down in steps and up again while the handle moves. It moves as hands do:
 both ways, from a creep of 0.5 mm/s to 300 mm/s, with stops and reversals. Each sweep is a record of its own, from a
-long rest at the open gap on, and has a number (`cycle`); record 0 is a hold, which shows how the elastomer relaxes.
-Every figure in the file passed the wire as protocol bytes: gap from the encoders, force from the force sensor, motion
-from the handle's encoder. Kept are the rows in which the handle slides steadily: what friction does before break-away
-is the hand's choice and no force law. Synthetic data: the device is the simulator's, on a bench whose stops stand
-2.5 mm beyond the stroke at either end, so that the model knows what lies behind the ends of the scenes.
+long rest at the open gap on, and has a number (`cycle`); record 0 is a hold of the last insert, which shows how
+the elastomer relaxes. Every figure in the file passed the wire as protocol bytes: gap from the encoders, force from the
+force sensor, motion from the handle's encoder. Two kinds of rows are kept: those in which the handle slides steadily,
+whose displacement is that of full mobilisation, and those after a turn in which the force rises towards it. There the
+displacement counts from where the elastomer bears no force, between the two ways: counted from the turn, more field
+would at first mean less force. Synthetic data: the device is the simulator's, on a bench whose stops stand 2.5 mm
+beyond the stroke at either end, so that the model knows what lies behind the ends of the scenes.
 """
 
 import argparse
 import concurrent.futures
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,28 +46,35 @@ STOPS_MM = 2.5
 BENCH_MOST_N = 20.0
 "On a bench no force that the closed gap gives is a fault."
 GAP_STEP_MM = 3.0
-HOLD_GAP_MM, HOLD_STROKES = 46.0, 150
+HOLD_GAP_MM, HOLD_STROKES = 46.0, 100
 BEGIN_S = 8.0
 "Connecting, homing and enabling are over by then, and the handle begins to move."
 CREEP_MM_S, FASTEST_MM_S = 0.5, 310.0
 EVEN_S, EVEN_MM = 0.3, 4.0
 "The handle keeps a speed for so long, and for so much travel: at a creep friction takes millimetres to settle."
 SPEEDS = 3
-"Of each stroke, there and back."
-STOP_S = 0.1
+"Of each stroke, there and back, beside the first."
+STOP_S = 0.3
+"The gap arrives within the last of a stroke."
 RATE_TICKS = 50
 "On either side, over which a rate is taken: one count of the handle's encoder is 8 um."
 STEADY_SHARE, STEADY_MM_S = 0.02, 0.2
 SETTLED_MM, MOBILISED_AFTER_MM = 3.0, 6.0
 "Travel after the speed or the gap has changed; and after the handle has turned, which bends every bristle over."
+LOADING_MM = 3.0
+"Of a stroke's first speed: the way back to no force, and on through mobilisation."
+LOADED_MM, LOADED_STEP_MM = 1.5, 0.45
+"Rows before mobilisation end here, and stand so far apart: on to 2 mm the greatest forces still rise by a tenth."
 RESTING_GAP_MM_S = 0.5
-EVERY = 20
-"Every twentieth tick is kept: 50 Hz, because neighbouring ticks say nearly the same."
+EVERY = 90
+"Of the ticks of steady sliding: neighbours say nearly the same."
 
 
 class Course(NamedTuple):
-    """One record: the gaps, mm, one for each stroke of the handle, there and back, and the seed of hand and noise."""
+    """One record: the insert, the gaps, mm, one for each stroke of the handle, there and back, and the seed of hand
+    and noise."""
 
+    insert: str
     gaps_mm: tuple[float, ...]
     seed: int
 
@@ -73,55 +83,55 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of `tormag-lab bench-sweep`."""
     parser.add_argument("--plant", default="sample_1", help="plant file or the name of a committed sample")
     parser.add_argument("--scene", default="coronary", help="whose insert and gap range are swept")
+    parser.add_argument("--insert", nargs="+", metavar="NAME", help="other inserts, one after the other")
     parser.add_argument("--out", type=Path, required=True, help="training CSV to write")
     parser.add_argument("--seed", type=int, default=1)
 
 
 def run(options: argparse.Namespace) -> Found:
     """Writes the training CSV."""
-    data = record(options.plant, options.scene, options.seed)
+    data = record(options.plant, options.scene, options.insert, options.seed)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     write_csv(options.out, data)
     return Found({"out": str(options.out), "rows": len(data), "synthetic": True})
 
 
-def record(plant: str, scene_name: str, seed: int) -> Dataset:
-    """SWEEPS sweeps and a hold; `cycle` is the number of the record, `time_s` counts from its rest."""
+def record(plant: str, scene_name: str, inserts: Sequence[str] | None, seed: int) -> Dataset:
+    """A hold of the last insert and SWEEPS sweeps of each; `cycle` is the number of the record, `time_s` counts from
+    its rest."""
     scene = load_scene(scene_name)
-    courses = [Course((HOLD_GAP_MM,) * HOLD_STROKES, seed + SWEEPS)]  # the longest first
-    courses += [sweep_course(scene, seed + number) for number in range(SWEEPS)]
+    names = inserts or [scene.insert.name]
+    courses = [Course(names[-1], (HOLD_GAP_MM,) * HOLD_STROKES, seed + SWEEPS)]  # the longest first
+    courses += [sweep_course(scene, name, seed + number) for name in names for number in range(SWEEPS)]
     with concurrent.futures.ProcessPoolExecutor() as pool:
         waiting = [pool.submit(swept, plant, scene_name, course) for course in courses]
         bar = tqdm(waiting, desc="records", unit="record", disable=None)
         tables = [future.result() for future in bar]
-    time_s, rate_mm_s, field_mT, force_N = np.concatenate(tables).T
+    time_s, *features, force_N = np.concatenate(tables).T
     cycle = np.repeat(np.arange(len(tables)), [len(rows) for rows in tables])
-    cip_percent = np.full_like(rate_mm_s, 100.0 * insert(scene.insert.name).cip_fraction)
-    features = np.column_stack((np.full_like(rate_mm_s, MOBILISED_MM), rate_mm_s, field_mT, cip_percent))
-    return Dataset(features, force_N, cycle, time_s)
+    return Dataset(np.column_stack(features), force_N, cycle, time_s)
 
 
-def sweep_course(scene: Scene, seed: int) -> Course:
+def sweep_course(scene: Scene, name: str, seed: int) -> Course:
     """Down and up, the steps of each sweep at gaps of its own; both ends are reached."""
     closed_mm, open_mm = scene.insert.gap_closed_mm - BEYOND_MM, scene.insert.gap_open_mm + BEYOND_MM
     offset_mm = np.random.default_rng(seed).uniform(0.0, GAP_STEP_MM)
     between = np.arange(open_mm - offset_mm, closed_mm, -GAP_STEP_MM)
     down = (open_mm, *between.tolist(), closed_mm)
-    return Course((*down, *down[::-1]), seed)
+    return Course(name, (*down, *down[::-1]), seed)
 
 
 def swept(plant: str, scene_name: str, course: Course) -> Array:
-    """The rows of one record (n x 4): time_s, rate_mm_s, field_mT, force_N along the motion."""
-    config, scene = load_config(None), bench_scene(load_scene(scene_name))
-    fitted = insert(scene.insert.name)
-    field = FieldOfGap(PowerFieldLaw(), fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm * 1e-3)
+    """The rows of one record (n x 6): time_s, the features, force_N along the motion."""
+    scene = bench_scene(load_scene(scene_name), course.insert)
     hand, ends_s = strokes(len(course.gaps_mm), course.seed)
-    device = VirtualDevice(bench(with_insert(load_plant(plant), scene.insert.name), scene), hand, seed=course.seed)
+    device = VirtualDevice(bench(with_insert(load_plant(plant), course.insert), scene), hand, seed=course.seed)
+    config = load_config(None)
     loop = ClosedLoop(config, Stepper(config, scene), None, device)
     loop.arm(gap_plan(scene.insert.gap_open_mm, 0.0))
     while loop.now_s < BEGIN_S:
         loop.tick(plan=gap_plan(scene.insert.gap_open_mm, loop.now_s))
-    rows = []
+    ticks = []
     for gap_mm, end_s in zip(course.gaps_mm, ends_s, strict=True):
         while loop.now_s < end_s:
             sample = loop.tick(plan=gap_plan(gap_mm, loop.now_s))
@@ -129,13 +139,53 @@ def swept(plant: str, scene_name: str, course: Course) -> Array:
             if estimate is None or sample.safety.faults:
                 raise RuntimeError(f"the sweep ended at {gap_mm:.1f} mm: {sample.safety}")
             signed_N = estimate.force_N * estimate.handle.turn.direction
-            rows.append((loop.now_s, estimate.handle_mm, estimate.gap_mm, signed_N))
-    time_s, handle_mm, gap_mm, signed_N = np.array(rows).T
-    rate_mm_s, slides = sliding(handle_mm, gap_mm)
-    kept = np.flatnonzero(slides)[::EVERY]
+            ticks.append((loop.now_s, estimate.handle_mm, estimate.gap_mm, signed_N))
+    return rows_of(np.array(ticks), scene)
+
+
+def rows_of(ticks: Array, scene: Scene) -> Array:
+    """The rows that are kept (n x 6) of all ticks (m x 4): time_s, handle_mm, gap_mm, and the force with its sign."""
+    _, handle_mm, gap_mm, signed_N = ticks.T
+    sliding_mm_s, slides = sliding(handle_mm, gap_mm)
+    loading_mm_s, loading_mm = loading(handle_mm, gap_mm, signed_N)
+    slid, loaded = np.flatnonzero(slides)[::EVERY], np.flatnonzero(~np.isnan(loading_mm))
+    displacement_mm = np.concatenate((np.full(len(slid), MOBILISED_MM), loading_mm[loaded]))
+    rate_mm_s = np.concatenate((sliding_mm_s[slid], loading_mm_s[loaded]))
+    kept, fitted = np.concatenate((slid, loaded)), insert(scene.insert.name)
+    field = FieldOfGap(PowerFieldLaw(), fitted.elastomer.relative_permeability, scene.insert.inner_radius_mm * 1e-3)
     field_mT = np.array([field.field_mT(gap) for gap in gap_mm[kept].tolist()])
-    along_N = signed_N[kept] * np.sign(rate_mm_s[kept])
-    return np.column_stack((time_s[kept], np.abs(rate_mm_s[kept]), field_mT, along_N))
+    cip_percent = np.full(len(kept), 100.0 * fitted.cip_fraction)
+    along_N = signed_N[kept] * np.sign(rate_mm_s)
+    rows = np.column_stack((ticks[kept, 0], displacement_mm, np.abs(rate_mm_s), field_mT, cip_percent, along_N))
+    return rows[np.argsort(kept, kind="stable")]
+
+
+def loading(handle_mm: Array, gap_mm: Array, signed_N: Array) -> tuple[Array, Array]:
+    """The handle's rate, mm/s, at each tick, and how far it has gone since the elastomer bore no force, where that is
+    after a turn, at one speed, at a resting gap, and a row is due: NaN elsewhere."""
+    gap_mm_s, is_resting = _even(gap_mm, RESTING_GAP_MM_S)
+    is_resting &= np.abs(gap_mm_s) <= RESTING_GAP_MM_S
+    gone = (handle_mm[RATE_TICKS:] - handle_mm[:-RATE_TICKS]) / RATE_TICKS * 1e3
+    rate_mm_s = np.concatenate((gone, np.zeros(RATE_TICKS)))
+    later = np.concatenate((rate_mm_s[RATE_TICKS:], np.zeros(RATE_TICKS)))
+    is_even = np.abs(later - rate_mm_s) <= STEADY_SHARE * np.abs(rate_mm_s) + STEADY_MM_S
+    way = np.sign(rate_mm_s) * (np.abs(rate_mm_s) >= CREEP_MM_S / 2.0)
+    due_mm = np.full(len(handle_mm), np.nan)
+    # the ticks of each way, from a turn to a stop
+    for ticks in np.split(np.arange(len(way)), np.flatnonzero(np.diff(way)) + 1):
+        along_N = signed_N[ticks] * way[ticks[0]]
+        borne = np.flatnonzero(along_N >= 0.0)
+        if way[ticks[0]] == 0.0 or len(borne) == 0 or borne[0] == 0:
+            continue
+        first = int(borne[0])
+        share = along_N[first] / (along_N[first] - along_N[first - 1])
+        unloaded_mm = handle_mm[ticks[first]] - share * (handle_mm[ticks[first]] - handle_mm[ticks[first - 1]])
+        rows = ticks[first:][(is_even & is_resting)[ticks[first:]]]
+        far_mm = np.abs(handle_mm[rows] - unloaded_mm)
+        is_due = np.diff(np.floor(far_mm / LOADED_STEP_MM), prepend=-1.0) > 0.0
+        is_due &= far_mm <= LOADED_MM
+        due_mm[rows[is_due]] = far_mm[is_due]
+    return rate_mm_s, due_mm
 
 
 def sliding(handle_mm: Array, gap_mm: Array) -> tuple[Array, Mask]:
@@ -166,10 +216,11 @@ def _even(position_mm: Array, changes_mm_s: float = STEADY_MM_S) -> tuple[Array,
     return rate_mm_s, np.abs(after - before) <= STEADY_SHARE * np.abs(rate_mm_s) + changes_mm_s
 
 
-def bench_scene(scene: Scene) -> Scene:
-    """The scene with the gaps that the bench's switches allow."""
+def bench_scene(scene: Scene, name: str) -> Scene:
+    """The scene with another insert, and the gaps that the bench's switches allow."""
     stroke = msgspec.structs.replace(
         scene.insert,
+        name=name,
         gap_closed_mm=scene.insert.gap_closed_mm - BEYOND_MM,
         gap_open_mm=scene.insert.gap_open_mm + STOPS_MM,
     )
@@ -199,18 +250,18 @@ def gap_plan(gap_mm: float, now_s: float) -> Plan:
 
 def strokes(count: int, seed: int) -> tuple[RecordedHand, list[float]]:
     """The hand from BEGIN_S on, and when each of its `count` strokes ends. A stroke goes there and back at speeds drawn
-    evenly over their logarithm; the first of either way is fast enough to mobilise friction before a creep."""
+    evenly over their logarithm; the second of either way is fast enough to mobilise friction before a creep."""
     random = np.random.default_rng(seed)
     times, positions, ends_s = [BEGIN_S], [0.0], []
     for _ in range(count):
         for direction in (1.0, -1.0):
-            speeds = np.exp(random.uniform(np.log(CREEP_MM_S), np.log(FASTEST_MM_S), SPEEDS))
-            speeds[0] = random.uniform((MOBILISED_AFTER_MM + SETTLED_MM) / EVEN_S, FASTEST_MM_S)
-            for speed in speeds.tolist():
-                lasts_s = max(EVEN_S, EVEN_MM / speed)
+            speeds = np.exp(random.uniform(np.log(CREEP_MM_S), np.log(FASTEST_MM_S), 1 + SPEEDS))
+            speeds[1] = random.uniform((MOBILISED_AFTER_MM + SETTLED_MM) / EVEN_S, FASTEST_MM_S)
+            for speed, least_mm in zip(speeds.tolist(), (LOADING_MM, *[EVEN_MM] * SPEEDS), strict=True):
+                lasts_s = max(EVEN_S, least_mm / speed)
                 times.append(times[-1] + lasts_s)
                 positions.append(positions[-1] + direction * speed * lasts_s)
+            ends_s.append(times[-1])
             times.append(times[-1] + STOP_S)
             positions.append(positions[-1])
-        ends_s.append(times[-1])
-    return RecordedHand(tuple(times), tuple(positions)), ends_s
+    return RecordedHand(tuple(times), tuple(positions)), ends_s[1::2]

@@ -174,7 +174,7 @@ def fit(data: Dataset, insert_name: str, created: datetime.date, *, hidden: int 
         training,
         validation,
         element=Element.TORQUE,
-        insert=insert_name,
+        inserts=(insert_name,),
         data_sha256=data.sha256(),
         created=created,
         hidden=hidden,

@@ -1,6 +1,7 @@
 """Training one force model: network, scaling, Levenberg-Marquardt, and what is written down about it."""
 
 import datetime
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -10,11 +11,12 @@ from tormagd.lab.arrays import Mask
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.levenberg_marquardt import Training, train
 from tormagd.lab.training.metrics import fit_metrics, not_rising_share, random_split
-from tormagd.model.features import Element, Scaling
+from tormagd.model.features import FEATURES, Element, Scaling
 from tormagd.model.memory import NO_MEMORY, Memory
-from tormagd.model.model_file import ForceModel, ModelMetadata
+from tormagd.model.model_file import ForceModel, ModelMetadata, Ranges
 from tormagd.model.network import ForceNetwork, to_model
 from tormagd.physics.errors import DomainError
+from tormagd.physics.inserts import insert
 
 VALIDATION_SHARE = 0.1
 """Of the training rows, to say when the training stops; the test rows have no part in that."""
@@ -25,7 +27,7 @@ def fit_model(
     validation: Dataset,
     *,
     element: Element,
-    insert: str,
+    inserts: Sequence[str],
     data_sha256: str,
     created: datetime.date,
     memory: Memory = NO_MEMORY,
@@ -34,9 +36,10 @@ def fit_model(
     seed: int = 0,
     scaled_by: Dataset | None = None,
     start: ForceModel | None = None,
+    rising: bool = False,
 ) -> tuple[ForceModel, Training]:
-    """Train on `training`, stop by `validation`, and return the model with its metrics on both, and how it went. What
-    was taken out of the data before is their `memory`.
+    """Train on `training`, stop by `validation`, and return the model with its metrics on both, and how it went. The
+    data are of the `inserts`, told apart by their iron. What was taken out of the data before is their `memory`.
 
     The network is scaled by the ranges of `scaled_by`, of `training` by default, and begins with the weights of
     `start`, if given. Deterministic for given data and seed. Raises `DomainError` on a name or a count that a model
@@ -49,7 +52,7 @@ def fit_model(
         _begin_with(network, scaling, start)
     metadata = ModelMetadata(  # before the training, which a wrong name should not have to wait for
         element=element,
-        insert=insert,
+        insert=inserts[0] if len(inserts) == 1 else inserts[0].rpartition("-")[0],
         hidden=hidden,
         ranges=ranging.ranges(),
         scaling=scaling,
@@ -57,8 +60,9 @@ def fit_model(
         metrics={},
         created=created,
         memory=memory,
+        boxes=msgspec.UNSET if len(inserts) == 1 else {name: _box(training, name) for name in inserts},
     )
-    result = train(network, training, validation, epochs=epochs)
+    result = train(network, training, validation, epochs=epochs, rising=rising)
     model = to_model(network, metadata)
     metrics = {
         **{f"train_{name}": value for name, value in fit_metrics(model, training).items()},
@@ -82,7 +86,7 @@ def fit_network(
         rows.subset(~stop),
         rows.subset(stop),
         element=Element.TACTILE,
-        insert="MRE-ABC",
+        inserts=("MRE-ABC",),
         data_sha256=rows.sha256(),
         created=datetime.date.today(),
         hidden=hidden,
@@ -90,6 +94,13 @@ def fit_network(
         scaled_by=rows,
         start=start,
     )
+
+
+def _box(data: Dataset, name: str) -> Ranges:
+    is_own = data.features[:, FEATURES.index("cip_percent")] == 100.0 * insert(name).cip_fraction
+    if is_own.sum() < 2:
+        raise DomainError("insert", name, "one that there are rows of, by cip_percent")
+    return data.subset(is_own).ranges()
 
 
 @torch.no_grad()

@@ -15,6 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from tormagd.lab.training.dataset import Dataset
+from tormagd.model.features import FIELD
 from tormagd.model.network import ForceNetwork
 from tormagd.physics.errors import DomainError
 
@@ -24,6 +25,8 @@ BATCH_ROWS = 4096
 INITIAL_DAMPING = 1e-3
 DAMPING_DOWN = 0.1
 DAMPING_UP = 10.0
+LEAST_POSITIVE = 1e-3
+"Where a weight begins that has to stay positive."
 LEAST_DAMPING = 1e-15
 GREATEST_DAMPING = 1e10
 """Marquardt's schedule with the factors that trainlm made usual; errors are means, so they fit any number of rows."""
@@ -69,6 +72,7 @@ def train(
     epochs: int = 200,
     patience: int = 10,
     least_improvement: float = 1e-4,
+    rising: bool = False,
 ) -> Training:
     """Fit `network` to `training` in place and leave it with the weights that did best on `validation`. It is of
     float64, because the normal equations square the rounding.
@@ -76,7 +80,8 @@ def train(
     Stops after `epochs` accepted steps; when `patience` steps in a row have not lowered the validation error by the
     share `least_improvement`; or when no damping lowers the training error any more (`stopped_by`: "epochs",
     "validation", "damping"). Deterministic for a given network and data.
-    Raises `DomainError` on a count below 1.
+    With `rising` the force rises with the field everywhere, whatever the data: each unit's weight of the field and its
+    output stay positive, because a step changes their logarithms. Raises `DomainError` on a count below 1.
     """
     for name, count in (("epochs", epochs), ("patience", patience)):
         if count < 1:
@@ -85,6 +90,7 @@ def train(
     check_inputs, check_targets = _scaled(network, validation)
     to_N = 1 / float(network.output_gain)
 
+    is_positive = _made_rising(network) if rising else torch.zeros((), dtype=torch.bool)
     weights = torch.nn.utils.parameters_to_vector(network.parameters())
     best_weights = weights
     error = _mean_square(network, inputs, targets)
@@ -97,10 +103,12 @@ def train(
     stopped_by = "epochs"
     for epoch in tqdm(range(1, epochs + 1), desc="training", unit="epoch", disable=None, leave=False):
         normal, gradient = _normal_equations(network, inputs, targets)
+        per_change = torch.where(is_positive, weights, 1.0)
+        normal, gradient = per_change[:, None] * normal * per_change, per_change * gradient
         while damping <= GREATEST_DAMPING:
             change = _step(normal, gradient, damping)
             if change is not None:
-                candidate = weights + change
+                candidate = torch.where(is_positive, weights * change.exp(), weights + change)
                 torch.nn.utils.vector_to_parameters(candidate, network.parameters())
                 candidate_error = _mean_square(network, inputs, targets)
                 if candidate_error < error:
@@ -125,6 +133,21 @@ def train(
             break
     torch.nn.utils.vector_to_parameters(best_weights, network.parameters())
     return Training(tuple(history), best, stopped_by)
+
+
+def _made_rising(network: ForceNetwork) -> Tensor:
+    """Turn each unit so that it rises with the field; which of the network's parameters have to stay positive."""
+    weight, output = network.hidden_weight, network.output_weight
+    side = torch.where(weight[:, FIELD] < 0.0, -1.0, 1.0).double()
+    weight.mul_(side[:, None])
+    network.hidden_bias.mul_(side)
+    weight[:, FIELD].clamp_(min=LEAST_POSITIVE)
+    output.abs_().clamp_(min=LEAST_POSITIVE)
+    network.output_bias.fill_(-output.sum() / 2)  # in the middle of the forces
+    is_positive = [torch.zeros_like(each, dtype=torch.bool) for each in network.parameters()]
+    is_positive[0][:, FIELD] = True
+    is_positive[2][:] = True
+    return torch.cat([each.flatten() for each in is_positive])
 
 
 def _scaled(network: ForceNetwork, dataset: Dataset) -> tuple[Tensor, Tensor]:

@@ -64,8 +64,11 @@ def force_metrics(predicted_N: Array, force_N: Array, span_N: float) -> dict[str
 def not_rising_share(model: ForceModel, points: int = 17) -> float:
     """Return the share of a grid over the training box (`points` per feature that varies) where dF/dB <= 0.
 
-    There the field for a force is not unique, or the force does not depend on the field.
+    There the field for a force is not unique, or the force does not depend on the field. Of several inserts it is the
+    greatest share of one.
     """
+    if model.metadata.boxes:
+        return max(not_rising_share(model.of(name), points) for name in model.metadata.boxes)
     axes = [np.linspace(low, high, points if high > low else 1) for low, high in model.feature_ranges]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(FEATURES))
     return float((model.field_slope_N_per_mT(grid) <= 0).mean())

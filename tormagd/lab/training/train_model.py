@@ -27,7 +27,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "data", type=Path, metavar="DATA.csv", help="training CSV; a `cycle` column keeps cycles together"
     )
     parser.add_argument("--element", type=Element, choices=list(Element), required=True, help="what was measured")
-    parser.add_argument("--insert", required=True, help="the insert it was measured on, such as MRE-50-40")
+    parser.add_argument(
+        "--insert", required=True, nargs="+", help="the insert it was measured on, such as MRE-50-40, or several"
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.safetensors")
     parser.add_argument("--hidden", type=int, default=50, help="hidden units (default: 50)")
     parser.add_argument("--epochs", type=int, default=200, help="most epochs (default: 200)")
@@ -37,7 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--without-memory", action="store_true", help="take out what relaxation and hysteresis did; needs time_s"
     )
     parser.add_argument(
-        "--rising", action="store_true", help="refuse a model whose force does not rise with the field everywhere"
+        "--rising", action="store_true", help="train a force that rises with the field everywhere, and refuse any other"
     )
     parser.add_argument("--created", type=datetime.date.fromisoformat, help="date in the file (default: today)")
 
@@ -61,13 +63,14 @@ def fit(options: argparse.Namespace, data: Dataset) -> tuple[ForceModel, Trainin
     model, training = fit_model(
         *data.split(options.validation_share, options.seed),
         element=options.element,
-        insert=options.insert,
+        inserts=options.insert,
         data_sha256=data_sha256,
         created=options.created or datetime.date.today(),
         memory=memory,
         hidden=options.hidden,
         epochs=options.epochs,
         seed=options.seed,
+        rising=options.rising,
     )
     share = model.metadata.metrics["not_rising_share"]
     if options.rising and share > 0.0:

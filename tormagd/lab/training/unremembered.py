@@ -3,10 +3,13 @@
 A force model of displacement, rate and field has no memory, the elastomer and the magnets' circuit have. Fitted to the
 records as they are, a model learns the memory of the bench's own program; so the memory is identified with them:
 
-    F = D(B - h) m S(v)       m = 1 - sum g_i q_i / D(B)       q_i: D(B) behind a low-pass of time constant tau_i
+    G = D(B - h) m S(v)       m = 1 - sum g_i q_i / D(B)       q_i: D(B) behind a low-pass of time constant tau_i
+    F = G (1 - exp(-k x / G)) before mobilisation, then G
 
-D is the force of the field at rest, a smooth curve; S = 1 + s exp(-(v / v_s)^2) + c v, friction over its kinetic level;
-h follows the field's changes towards +-h_max. A record begins after a long rest at its first row's field.
+D is the force of the field at rest, a smooth curve of each insert; S = 1 + s exp(-(v / v_s)^2) + c v, friction over its
+kinetic level; k x is what the elastomer bears at first, over the displacement; h follows the field's changes towards
++-h_max. A record begins after a long rest at its first row's field. Inserts of one matrix relax alike, and their fields
+lag alike, each to the scale of its greatest.
 """
 
 import numpy as np
@@ -15,10 +18,11 @@ from scipy.optimize import least_squares
 from tormagd.lab.arrays import Array
 from tormagd.lab.training.dataset import Dataset
 from tormagd.lab.training.memory import records, times_of
+from tormagd.model.displacement import MOBILISED_MM
 from tormagd.model.features import FEATURES, FIELD
 from tormagd.model.memory import Memory
 
-RATE = FEATURES.index("rate_mm_s")
+DISPLACEMENT, RATE, CIP = (FEATURES.index(name) for name in ("displacement_mm", "rate_mm_s", "cip_percent"))
 START_TIMES_S = (10.0, 100.0, 1000.0)
 "Those of field-step tests."
 TIME_SPREADS = (3.0, 3.0, 1.01)
@@ -27,7 +31,9 @@ for records of ten minutes do not tell a term that is slow from one that is slow
 START_FRACTION = 0.03
 DEGREE = 4
 "Of the logarithm of D over the logarithm of the field."
-FITTED_ROWS = 6000
+FITTED_ROWS = 3000
+LEAST_N = 1e-6
+"No insert brakes less, whatever is tried."
 ROBUST_N = 0.05
 "Errors beyond this count less: rows near a reversal of the field."
 
@@ -40,51 +46,65 @@ def identify(data: Dataset) -> tuple[Memory, Dataset]:
     every = max(1, len(data) // FITTED_ROWS)
     kept = data.subset(np.arange(0, len(data), every))
     terms = len(START_TIMES_S)
-    greatest_mT = float(data.features[:, FIELD].max())
-    middle = float(np.log(data.features[:, FIELD]).mean())
+    irons, insert = np.unique(data.features[:, CIP], return_inverse=True)
+    greatest_mT = np.array([data.features[insert == place, FIELD].max() for place in range(len(irons))])
+    middle = float(np.log(data.features[:, FIELD] / greatest_mT[insert] * greatest_mT.max()).mean())
+    levels = len(irons) * (DEGREE + 1)
 
     def split(parameters: Array) -> tuple[Array, Array, Memory]:
-        shape, friction = parameters[: DEGREE + 1], parameters[DEGREE + 1 : DEGREE + 4]
+        shapes, friction = parameters[:levels].reshape(-1, DEGREE + 1), parameters[levels : levels + 4]
         fractions, times, lag = parameters[-2 * terms - 2 : -terms - 2], parameters[-terms - 2 : -2], parameters[-2:]
-        lag_mT, turn_mT = (greatest_mT * lag).tolist()
+        turn_mT = float(greatest_mT.max() * lag[1])
         memory = Memory(
-            fractions=tuple(fractions.tolist()), times_s=tuple(np.exp(times).tolist()), lag_mT=lag_mT, turn_mT=turn_mT
+            fractions=tuple(fractions.tolist()),
+            times_s=tuple(np.exp(times).tolist()),
+            lag_mT=float(lag[0]) * turn_mT,
+            turn_mT=turn_mT,
         )
-        return shape, friction, memory
+        return shapes, friction, memory
 
-    def level_N(shape: Array, field_mT: Array) -> Array:
-        level: Array = np.exp(np.polynomial.polynomial.polyval(np.log(field_mT) - middle, shape))
-        return level
+    def forces(parameters: Array, rows: Dataset) -> tuple[Array, Array]:
+        """Without memory, and with it."""
+        shapes, (static, speed_mm_s, viscous, stiffness_N_mm), memory = split(parameters)
+        displacement_mm, rate, field_mT, iron = rows.features.T
+        of_insert = np.searchsorted(irons, iron)
+        # at one gap the fields of all inserts are the same share of their greatest
+        common_mT = field_mT / greatest_mT[of_insert] * greatest_mT.max()
 
-    def remembered(shape: Array, memory: Memory, rows: Dataset) -> tuple[Array, Array]:
-        """Force at rest without memory, and with it."""
-        field_mT = rows.features[:, FIELD]
-        lagging_mT = field_mT - _lag_mT(memory, field_mT, rows)
-        free_N = level_N(shape, field_mT)
-        lagging_N = level_N(shape, lagging_mT)
-        return free_N, lagging_N - _relaxed_away_N(memory, lagging_N, rows)
+        def level_N(field_mT: Array) -> Array:
+            powers = np.vander(np.log(field_mT) - middle, DEGREE + 1, increasing=True)
+            level: Array = np.exp((powers * shapes[of_insert]).sum(axis=1))
+            return level
+
+        def given_N(kinetic_N: Array) -> Array:
+            over = 1.0 + static * np.exp(-np.square(rate / speed_mm_s)) + viscous * rate
+            level = np.maximum(kinetic_N * over, LEAST_N)
+            borne: Array = level * -np.expm1(-stiffness_N_mm * displacement_mm / level)
+            return np.where(displacement_mm < MOBILISED_MM, borne, level)
+
+        lagging_N = level_N(common_mT - _lag_mT(memory, common_mT, rows))
+        return given_N(level_N(common_mT)), given_N(lagging_N - _relaxed_away_N(memory, lagging_N, rows))
 
     def residual(parameters: Array) -> Array:
-        shape, (static, speed_mm_s, viscous), memory = split(parameters)
-        rate = kept.features[:, RATE]
-        over = 1.0 + static * np.exp(-np.square(rate / speed_mm_s)) + viscous * rate
-        error: Array = remembered(shape, memory, kept)[1] * over - kept.force_N
-        return error
+        return forces(parameters, kept)[1] - kept.force_N
 
     times = np.log(START_TIMES_S)
     spread = np.log(TIME_SPREADS)
-    start = np.concatenate(([0.5, 2.0], np.zeros(DEGREE - 1), [0.1, 5.0, 3e-4], np.full(terms, START_FRACTION), times))
-    start = np.concatenate((start, [0.01, 0.1]))
-    low = np.concatenate((np.full(DEGREE + 1, -20.0), [0.0, 0.5, -0.01], np.zeros(terms), times - spread, [0.0, 0.01]))
-    high = np.concatenate(
-        (np.full(DEGREE + 1, 20.0), [1.0, 50.0, 0.01], np.full(terms, 0.3), times + spread, [0.1, 0.5])
+    shape = np.concatenate(([0.5, 2.0], np.zeros(DEGREE - 1)))
+    parts = (  # start, least, most, scale
+        (np.tile(shape, len(irons)), np.full(levels, -20.0), np.full(levels, 20.0), np.full(levels, 0.1)),
+        ([0.1, 5.0, 3e-4, 5.0], [0.0, 0.5, -0.01, 1.0], [1.0, 50.0, 0.01, 50.0], [0.1, 1.0, 1e-3, 1.0]),
+        (np.full(terms, START_FRACTION), np.zeros(terms), np.full(terms, 0.3), np.full(terms, 0.03)),
+        (times, times - spread, times + spread, np.full(terms, 0.5)),
+        # the lag as a share of what turns it, which a memory bounds; and that as a share of the greatest field
+        ([0.1, 0.1], [0.0, 0.01], [0.25, 0.5], [0.1, 0.1]),
     )
-    scale = np.concatenate((np.full(DEGREE + 1, 0.1), [0.1, 1.0, 1e-3], np.full(terms, 0.03), np.full(terms, 0.5)))
-    scale = np.concatenate((scale, [0.01, 0.1]))
+    start, low, high, scale = (np.concatenate(column) for column in zip(*parts, strict=True))
     found = least_squares(residual, start, bounds=(low, high), x_scale=scale, loss="soft_l1", f_scale=ROBUST_N)
-    shape, _, memory = split(found.x)
-    free_N, with_memory_N = remembered(shape, memory, data)
-    return memory, Dataset(data.features, data.force_N * free_N / with_memory_N, data.cycle, data.time_s)
+    free_N, with_memory_N = forces(found.x, data)
+    # at no displacement there is no force to lose
+    kept_share = np.divide(with_memory_N, free_N, out=np.ones_like(free_N), where=free_N > 0.0)
+    return split(found.x)[2], Dataset(data.features, data.force_N / kept_share, data.cycle, data.time_s)
 
 
 def _lag_mT(memory: Memory, field_mT: Array, rows: Dataset) -> Array:

@@ -1,0 +1,129 @@
+"""How near the shipped models are to devices: the brake's force over gaps and handle speeds, friction mobilised."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rendering.device_draws import SAMPLES, device
+from rendering.pictures import OTHER, QUIET, RENDERED, THIRD
+from tormagd.control.field_of_gap import FieldOfGap
+from tormagd.lab.arrays import Array, Json
+from tormagd.lab.pages import stamp, table
+from tormagd.lab.training.metrics import force_metrics, not_rising_share
+from tormagd.model.displacement import MOBILISED_MM
+from tormagd.model.model_file import ForceModel, load_model
+from tormagd.model.shipped import model_path
+from tormagd.physics.field import PowerFieldLaw
+from tormagd.physics.force import TORMAG, Elastomer, brake_force_N
+from tormagd.physics.inserts import Insert, insert
+from tormagd.simulation.parameters import PlantParameters, with_insert
+from tormagd.simulation.static_laws import radial_moment_Tm
+
+JUDGING = ("sample_2", "sample_3", *(f"draw {number}" for number in range(100, 120)))
+"Neither trained on nor, of the draws of the plant card, looked at."
+FILES = sorted(model_path("torque_mre_50_40", Path()).parent.glob("torque_*.safetensors"))
+GAPS_MM, RATES_MM_S = np.linspace(45.0, 95.0, 101), np.geomspace(1.0, 300.0, 61)
+
+
+def models() -> Json:
+    """Of each shipped model of the brake and each insert that it knows: the errors on sample 1, whose sweeps it learned
+    from, and on the devices that judge."""
+    return {"rows": [row for path in FILES for row in of_file(path)]}
+
+
+def of_file(path: Path) -> list[Json]:
+    """A row for each insert that this model knows."""
+    model = load_model(path, element="torque")
+    return [_row(path, model.of(name)) for name in model.metadata.boxes or (model.metadata.insert,)]
+
+
+def _row(path: Path, model: ForceModel) -> Json:
+    fitted = insert(model.metadata.insert)
+    own, *others = (errors(model, fitted, device(name)) for name in (SAMPLES[0], *JUDGING))
+    return {
+        "insert": fitted.name,
+        "model": path.stem,
+        "hidden": model.metadata.hidden,
+        "full_N": own["full_N"],
+        "sample_1": own,
+        "mean_N": float(np.mean([found["mean_N"] for found in others])),
+        "worst_N": max(found["worst_N"] for found in others),
+        "bias_N": float(np.mean([found["bias_N"] for found in others])),
+        "not_rising_share": not_rising_share(model),
+        "devices": dict(zip(JUDGING, others, strict=True)),
+    }
+
+
+def models_table(result: Json) -> str:
+    """The errors as Markdown, mN and % of the full force."""
+    columns = ("insert", "full force, N", "model", "sample 1: mean, worst", "judging: mean", "worst", "bias")
+    return table(columns, (_cells(row) for row in result["rows"]))
+
+
+def _cells(row: Json) -> Iterator[str]:
+    yield from (row["insert"], f"{row['full_N']:.2f}", f"`{row['model']}`")
+    own = row["sample_1"]
+    yield f"{1e3 * own['mean_N']:.0f}, {1e3 * own['worst_N']:.0f}"
+    for key in ("mean_N", "worst_N", "bias_N"):
+        yield f"{1e3 * row[key]:.0f} ({100.0 * row[key] / row['full_N']:.1f}%)"
+
+
+def errors(
+    model: ForceModel, fitted: Insert, plant: PlantParameters, rates_mm_s: Array = RATES_MM_S, gaps_mm: Array = GAPS_MM
+) -> Json:
+    """The model less the device, fresh and cool, at the same gaps and speeds; `full_N` is the most that it gives."""
+    true_N = brake_N(with_insert(plant, fitted.name), rates_mm_s, gaps_mm)
+    field = FieldOfGap(PowerFieldLaw(), fitted.elastomer.relative_permeability, TORMAG.inner_radius_m)
+    rates, fields = np.meshgrid(rates_mm_s, [field.field_mT(gap) for gap in gaps_mm.tolist()], indexing="ij")
+    ones = np.ones(rates.size)
+    rows = np.column_stack((MOBILISED_MM * ones, rates.ravel(), fields.ravel(), 100.0 * fitted.cip_fraction * ones))
+    error_N = model.predict(rows) - true_N.ravel()
+    found = force_metrics(error_N, np.zeros_like(error_N), float(true_N.max()))
+    return {
+        "mean_N": found["mae_N"],
+        "worst_N": found["max_N"],
+        "bias_N": float(error_N.mean()),
+        "full_N": float(true_N.max()),
+    }
+
+
+def brake_N(plant: PlantParameters, rates_mm_s: Array, gaps_mm: Array) -> Array:
+    """The sliding friction of a device that remembers nothing, N (rates x gaps)."""
+    elastomer, friction, rates = plant.elastomer, plant.friction, rates_mm_s[:, np.newaxis]
+    law = Elastomer(elastomer.shear_modulus_kPa * 1e3, elastomer.relative_permeability, elastomer.kinetic_friction)
+    stribeck = (friction.static_to_kinetic - 1.0) * np.exp(-np.square(rates / friction.stribeck_speed_mm_s))
+    kinetic_N = brake_force_N(radial_moment_Tm(gaps_mm, plant), law, TORMAG)
+    found: Array = kinetic_N * (1.0 + stribeck) + friction.viscous_N_s_mm * rates
+    return found
+
+
+def models_picture(path: Path, result: Json) -> None:
+    """A line for each insert: the model's error on sample 1, and its bias on each device that judges, as a share of the
+    full force."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 6.5), layout="constrained")
+    axes, rows = figure.subplots(), result["rows"]
+    axes.axvline(0.0, color=QUIET, linewidth=0.8)
+    for place, row in enumerate(rows):
+        full = row["full_N"] / 100.0
+        worst = row["sample_1"]["worst_N"] / full
+        axes.barh(place, 2.0 * worst, left=-worst, height=0.6, color=RENDERED, alpha=0.8)
+        biases = {name: found["bias_N"] / full for name, found in row["devices"].items()}
+        for name, bias in biases.items():
+            colour = {"sample_2": OTHER, "sample_3": THIRD}.get(name, QUIET)
+            axes.plot(bias, place, "|", color=colour, markersize=11, markeredgewidth=2.0)
+    axes.set_yticks(range(len(rows)), [f"{row['insert']}, {row['full_N']:.1f} N: {row['model']}" for row in rows])
+    axes.invert_yaxis()
+    for label, colour in (
+        ("sample 1, worst", RENDERED),
+        ("sample 2, bias", OTHER),
+        ("sample 3", THIRD),
+        ("draws 100 to 119", QUIET),
+    ):
+        axes.plot([], [], "s", color=colour, label=label)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.1), ncols=4, frameon=False)
+    axes.set_xlabel("model less device, % of the full force: what devices differ by is learned from each in use")
+    axes.grid(axis="x", alpha=0.3)
+    figure.savefig(path, dpi=110, metadata=stamp(result))
