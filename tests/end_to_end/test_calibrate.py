@@ -13,16 +13,16 @@ from tormagd.model.model_file import load_model
 pytestmark = pytest.mark.live
 
 
-def test_an_interrupt_leaves_no_file_and_a_sweep_becomes_a_model_that_says_what_it_is(rig, tmp_path):
+def test_an_interrupt_leaves_no_file_and_a_sweep_becomes_a_model_that_says_what_it_is(new_rig, tmp_path):
     # patient because the machine may be busy
-    program = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(rig.config), "--wait", "20", "--json"]
+    program = [sys.executable, "-m", "tormagd.ctl.main", "--config", str(new_rig.config), "--wait", "20", "--json"]
     command = [*program, "calibrate", "--yes"]
-    an_interrupt_opens_the_gap_and_leaves_no_file(rig, [*command, "--motors"], tmp_path / "log.csv")
-    rig.until(lambda: rig.status()["setpoint_age_ms"] > 1_000.0, "nobody else publishes")
+    an_interrupt_opens_the_gap_and_leaves_no_file(new_rig, [*command, "--motors"], tmp_path / "log.csv")
+    new_rig.until(lambda: new_rig.status()["setpoint_age_ms"] > 1_000.0, "nobody else publishes")
     out, data = tmp_path / "model.safetensors", tmp_path / "training.csv"
     arguments = ("--insert", "MRE-50-40", "--out", str(out), "--csv", str(data), "--rates", "1.0,1.4,1.0")
     # the sweep begins at the least force that this device has shown, and a rested one gives less than its model says
-    rig.until(lambda: rig.status()["least_N"] < 0.6, "the device has shown itself")
+    new_rig.until(lambda: new_rig.status()["least_N"] < 0.6, "the device has shown itself")
     done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     metrics = json.loads(done.stdout)["result"]["metrics"]
@@ -35,7 +35,7 @@ def test_an_interrupt_leaves_no_file_and_a_sweep_becomes_a_model_that_says_what_
     low, high = model.field_range_mT
     assert low < 320.0
     assert high > 480.0
-    is_disabled_and_open(rig)
+    is_disabled_and_open(new_rig)
 
 
 def an_interrupt_opens_the_gap_and_leaves_no_file(rig, command, out) -> None:
