@@ -135,12 +135,16 @@ def test_an_end_is_refused_by_name_or_runs(end: End, kind: str, why: str) -> Non
 
 
 def test_configurations_are_summed() -> None:
-    found = summed(
-        [Became("ran", "a", 7.0), Became("ran", "b", 9.0), Became("refused", "c"), Became("wrong", "d", 8.0)]
-    )
-    assert found == {
-        "cases": 4, "refused": 1, "ran": 2, "stated": 0, "wrong": 1, "gain_margin_dB": [7.0, 9.0], "told": ["d"],
-    }  # fmt: skip
+    ran = [Became("ran", "a", 7.0), Became("ran", "b", 9.0)]
+    assert summed([*ran, Became("refused", "c"), Became("stated", "e", 8.0), Became("wrong", "d", 8.0)]) == {
+        "cases": 5,
+        "refused": 1,
+        "ran": 2,
+        "stated": 1,
+        "wrong": 1,
+        "gain_margin_dB": [7.0, 9.0],
+        "told": ["wrong: d", "stated: e"],
+    }
 
 
 def test_a_rollover_changes_no_duty() -> None:

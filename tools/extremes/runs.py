@@ -143,14 +143,16 @@ def _loop(core: Core, plant: PlantParameters) -> ClosedLoop:
 
 
 def summed(found: list[Became]) -> dict[str, Any]:
-    """Of all configurations: how many of each kind, the ends of their gain margins, and what was wrong."""
+    """Of all configurations: how many of each kind, the ends of their gain margins, and first what was wrong, then what
+    was stated."""
+    told = sorted((each for each in found if each.kind in ("wrong", "stated")), key=lambda each: each.kind != "wrong")
     counts = Counter(each.kind for each in found)
     margins_dB = [each.gain_margin_dB for each in found if each.gain_margin_dB is not None]
     return {
         "cases": len(found),
         **{kind: counts[kind] for kind in ("refused", "ran", "stated", "wrong")},
         "gain_margin_dB": [min(margins_dB, default=None), max(margins_dB, default=None)],
-        "told": [each.why for each in found if each.kind == "wrong"][:MAX_TOLD],
+        "told": [f"{each.kind}: {each.why}" for each in told][:MAX_TOLD],
     }
 
 
