@@ -100,7 +100,7 @@ def test_every_float_of_plain_data_values_and_stages_is_seen() -> None:
     stage = Pid(Position())
     stage.integral = 0.25
     assert dict(leaves([stage, (1.0, {"a": 2.0})])) == {
-        ".0.Pid.duty": 0.0, ".0.Pid.integral": 0.25, ".1.0": 1.0, ".1.1.a": 2.0,
+        ".0.Pid.integral": 0.25, ".1.0": 1.0, ".1.1.a": 2.0,
     }  # fmt: skip
 
 

@@ -117,7 +117,7 @@ def test_a_days_pulse_goes_there_and_back_without_a_leap() -> None:
     over_two = [force_N(0.25 * place) for place in range(2 * 4 * 800)]
     assert np.abs(np.diff(over_two)).max() < 0.03
     assert over_two[: 4 * 800] == over_two[4 * 800 :]
-    assert (min(over_two), max(over_two)) == pytest.approx((1.4, 1.7), abs=0.01)
+    assert (min(over_two), max(over_two)) == pytest.approx((1.4, 1.7), abs=0.02)  # between two of its points
 
 
 def test_nothing_is_removed_from_the_error() -> None:

@@ -56,8 +56,10 @@ from tormagd.hardware.link import DeviceLink
 from tormagd.hardware.link_quality import LinkQuality
 from tormagd.hardware.link_statistics import DeviceClock
 from tormagd.hardware.measurement import Measurement
-from tormagd.inverse.choice import build, named
+from tormagd.inverse.choice import RUNTIME_SOLVERS, build, named
 from tormagd.model.displacement import MOBILISED_MM, Turn
+from tormagd.model.model_file import load_model
+from tormagd.model.shipped import model_path
 from tormagd.physics.errors import DomainError
 from tormagd.safety.codes import Fault
 from tormagd.safety.operating_state import Conditions, SafetyState, command
@@ -534,14 +536,12 @@ def inbox(_: object, draw: Draw) -> object:
     return [getattr(found, name) for name in ("servo_cf", "valid_for_ms", "displacement_mm", "preview_N")]
 
 
-SEARCHES = ("nearest", "coarse-to-fine", "newton")
-
-
 def stages() -> list[Stage]:
     """The table."""
     made, position = core(), CONFIG.position
     element = made.element
-    range_mT = element.nominal.fields_mT
+    range_mT, scene = element.nominal.fields_mT, made.scene
+    model = load_model(model_path(scene.insert.model, made.models), element=scene.element)
     return [
         Stage("client: a setpoint's message", lambda: None, inbox),
         Stage("firmware_protocol: codec", lambda: None, wire),
@@ -580,8 +580,8 @@ def stages() -> list[Stage]:
         Stage("contact", lambda: [Sliding(), Pressing(2.0)], contact, MEASUREMENT),
         Stage("model/force_curve", lambda: None, curve),
         *[
-            Stage(f"inverse: {name}", partial(build, named(name), range_mT, rises=name == "newton"), search)
-            for name in SEARCHES
+            Stage(f"inverse: {name}", partial(build, named(name), range_mT, model, rises=True), search)
+            for name in RUNTIME_SOLVERS
         ],
         Stage("inverse: portrait", lambda: PortraitSearch(made.portrait, element.field), search),
     ]
