@@ -34,7 +34,7 @@ CHANGED_TICK = 3_210
 TICKS = 4_000
 ROOT = Path(__file__).parents[2]
 FORMER = (
-    f"format = '3', written by tormagd {__version__!r}: allowed is 4, which tormagd {__version__} writes; "
+    f"format = '4', written by tormagd {__version__!r}: allowed is 5, which tormagd {__version__} writes; "
     "replay it with the version that wrote it"
 )
 NO_TICKS = [Part(0.0, 1, msgspec.msgpack.encode(["step"]))]
@@ -267,7 +267,7 @@ def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Pa
         writer.finish()
     assert "allowed is msgpack" in refusal(other)
     changes = {
-        "format": ("3", FORMER),
+        "format": ("4", FORMER),
         "config": ('{"scene": "pulse"}', "config: its hash"),
         "model_sha256": ("f" * 64, "the model with the hash 'ffffffffffff'"),
         "columns": (json.dumps(["t_ns"]), "no column 'monotonic_s'"),
