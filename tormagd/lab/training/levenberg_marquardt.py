@@ -139,8 +139,8 @@ def _made_rising(network: ForceNetwork) -> Tensor:
     """Turn each unit so that it rises with the field; which of the network's parameters have to stay positive."""
     weight, output = network.hidden_weight, network.output_weight
     side = torch.where(weight[:, FIELD] < 0.0, -1.0, 1.0).double()
-    weight *= side[:, None]
-    network.hidden_bias *= side
+    weight.mul_(side[:, None])
+    network.hidden_bias.mul_(side)
     weight[:, FIELD].clamp_(min=LEAST_POSITIVE)
     output.abs_().clamp_(min=LEAST_POSITIVE)
     network.output_bias.fill_(-output.sum() / 2)  # in the middle of the forces
