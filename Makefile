@@ -113,7 +113,7 @@ model: $(VENV)/.dev
 	    inserts=$$(printf "MRE-$$matrix-%s " 10 20 30 40) && \
 	    $(BIN)/tormag-lab bench-sweep --plant sample_1 --insert $$inserts --out build/mre_$$matrix.csv && \
 	    $(BIN)/tormag-lab train-model build/mre_$$matrix.csv --element torque --insert $$inserts --without-memory \
-	        --rising --hidden 50 --epochs 150 --validation-share 0.2 \
+	        --rising --hidden 50 --epochs 200 --validation-share 0.2 \
 	        --out tormagd/model/models/torque_mre_$$matrix.safetensors || exit 1; \
 	done
 

@@ -114,13 +114,13 @@ def test_scaling_maps_the_ranges_onto_minus_one_to_one() -> None:
     assert (float(forces.min()), float(forces.max())) == pytest.approx((-1, 1))
 
 
-def test_a_rising_force_rises_everywhere_and_fits_as_well() -> None:
+def test_a_rising_force_rises_everywhere_and_fits() -> None:
     training, fresh = synthetic(2000, 1), synthetic(1000, 3, noise_N=0.0)
     network = network_for(training, hidden=12)
     train(network, training, synthetic(500, 2), epochs=150, rising=True)
     with torch.no_grad():
         error = network(torch.tensor(fresh.features)).numpy() - fresh.force_N
-    assert np.sqrt(np.mean(error**2)) < NOISE_N / 2
+    assert np.sqrt(np.mean(error**2)) < 0.01 * np.ptp(fresh.force_N)
     corners = np.random.default_rng(0).uniform((-1, -100, -500, 0), (3, 400, 2000, 80), (2000, 4))
     features = torch.tensor(corners, requires_grad=True)
     (slope,) = torch.autograd.grad(network(features).sum(), features)

@@ -9,6 +9,12 @@ import pytest
 
 from tormagd.assembly.build import at_rates_of, build_core
 from tormagd.config import Config, Rates
+from tormagd.control.records import TimedSetpoint
+from tormagd.model.displacement import MOBILISED_MM
+from tormagd.model.features import FEATURES
+from tormagd.model.model_file import load_model
+from tormagd.model.shipped import model_path
+from tormagd.physics.inserts import INSERTS, insert
 from tormagd.scenes.scene import EVERY_TERM, Scene, Terms, load_scene, scene_path, shipped_scenes
 from tormagd_client.endpoints import ConfigError
 
@@ -179,6 +185,31 @@ def test_a_scene_that_does_not_fit_model_device_or_rates_gives_no_core(
     (tmp_path / "mine.safetensors").write_bytes(b"not a model")
     refused = refusal(write(**changes), lambda path: build_core(Config(scene=path)))
     assert all(word in refused for word in words)
+
+
+@pytest.mark.parametrize("name", INSERTS)
+def test_every_insert_of_the_registry_has_a_model_that_stays_in_its_box(write, name: str) -> None:
+    """Whatever the handle does, and whatever a setpoint says that it is meant for."""
+    core = build_core(Config(scene=write(insert__name=f'"{name}"', insert__model='"auto"', force__most_N="0.8")))
+    nominal, box = (
+        core.element.nominal,
+        load_model(model_path("auto", Path(), name), element="torque", insert=name).feature_ranges,
+    )
+    low_mT, high_mT = box[FEATURES.index("field_mT")]
+    for displacement_mm, rate_mm_s in ((None, None), (0.0, 0.0), (0.3, -300.0), (1e9, 1e9)):
+        curve, _ = nominal.planned(TimedSetpoint(0.5, 0.0, 0.1, displacement_mm, rate_mm_s), None)
+        asked = curve.displacement_mm, curve.rate_mm_s, low_mT, curve.cip_percent
+        assert all(low <= value <= high for value, (low, high) in zip(asked, box, strict=True))
+        assert curve.displacement_mm == MOBILISED_MM  # a force is planned for what slides
+    fields_mT = [core.element.field.field_mT(gap_mm) for gap_mm in (95.0, 45.0)]
+    assert low_mT <= fields_mT[0] < fields_mT[1] <= high_mT
+
+
+def test_an_insert_whose_iron_the_model_does_not_know_is_refused(write, monkeypatch: pytest.MonkeyPatch) -> None:
+    other = msgspec.structs.replace(insert("MRE-50-40"), cip_fraction=0.35)
+    monkeypatch.setitem(INSERTS, "MRE-50-40", other)
+    with pytest.raises(ConfigError, match=r"cip_percent = 35.0 is not allowed: a number from 40 to 40"):
+        build_core(Config(scene=write()))
 
 
 def test_a_force_that_is_too_fast_for_the_gap_is_refused_with_the_failing_points(write) -> None:

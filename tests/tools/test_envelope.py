@@ -1,11 +1,20 @@
 """The envelope's own measure, and two of its runs; all of them are `make evidence`. All devices are synthetic."""
 
+import json
 import math
+from pathlib import Path
 
 import envelope
 import numpy as np
 import pytest
+from rendering import models
 from rendering.following import Followed
+from rendering.models import models_table
+
+from tormagd.model.shipped import model_path
+from tormagd.physics.inserts import INSERTS
+
+ROOT = Path(__file__).parents[2]
 
 FLOOR_N = 0.6
 
@@ -78,3 +87,16 @@ def test_the_shipped_model_is_good_where_it_is_asked() -> None:
     assert found["mean_N"] <= 0.03
     assert found["worst_N"] <= 0.15
     assert found["not_rising_share"] == 0.0
+
+
+def test_the_page_has_the_figures_of_every_model_and_none_falls_with_the_field() -> None:
+    found = json.loads((ROOT / "docs/evidence/models.json").read_text(encoding="utf-8"))["figures"]
+    assert {row["insert"] for row in found["rows"]} == set(INSERTS)
+    assert models_table(found) in (ROOT / "docs/guides/insert.md").read_text(encoding="utf-8")
+    assert all(row["not_rising_share"] == 0.0 for row in found["rows"])
+    of_now = models.of_file(model_path("torque_mre_30", Path()))
+    kept = {row["insert"]: row for row in found["rows"]}
+    assert [row["insert"] for row in of_now] == [f"MRE-30-{iron}" for iron in (10, 20, 30, 40)]
+    for row in of_now:
+        for key in ("mean_N", "worst_N", "bias_N"):
+            assert row[key] == pytest.approx(kept[row["insert"]][key], rel=1e-6)

@@ -63,11 +63,11 @@ SETTLED_MM, MOBILISED_AFTER_MM = 3.0, 6.0
 "Travel after the speed or the gap has changed; and after the handle has turned, which bends every bristle over."
 LOADING_MM = 3.0
 "Of a stroke's first speed: the way back to no force, and on through mobilisation."
-LOADED_MM, LOADED_STEP_MM = 1.5, 0.45
+LOADED_MM, LOADED_STEP_MM = 1.5, 0.15
 "Rows before mobilisation end here, and stand so far apart: on to 2 mm the greatest forces still rise by a tenth."
 RESTING_GAP_MM_S = 0.5
-EVERY = 90
-"Of the ticks of steady sliding: neighbours say nearly the same."
+EVERY, LOADED_EVERY = 90, 7
+"Of the ticks of steady sliding, whose neighbours say nearly the same; of the rows before, which weigh little."
 
 
 class Course(NamedTuple):
@@ -148,7 +148,7 @@ def rows_of(ticks: Array, scene: Scene) -> Array:
     _, handle_mm, gap_mm, signed_N = ticks.T
     sliding_mm_s, slides = sliding(handle_mm, gap_mm)
     loading_mm_s, loading_mm = loading(handle_mm, gap_mm, signed_N)
-    slid, loaded = np.flatnonzero(slides)[::EVERY], np.flatnonzero(~np.isnan(loading_mm))
+    slid, loaded = np.flatnonzero(slides)[::EVERY], np.flatnonzero(~np.isnan(loading_mm))[::LOADED_EVERY]
     displacement_mm = np.concatenate((np.full(len(slid), MOBILISED_MM), loading_mm[loaded]))
     rate_mm_s = np.concatenate((sliding_mm_s[slid], loading_mm_s[loaded]))
     kept, fitted = np.concatenate((slid, loaded)), insert(scene.insert.name)
