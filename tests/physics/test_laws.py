@@ -602,7 +602,8 @@ TOOL = Path(__file__).parents[2] / "tools" / "numerics.py"
 
 
 def test_a_sampled_run_passes_and_has_the_agreed_keys() -> None:
-    command = [sys.executable, str(TOOL), "--json", "--cases", "20000", "--reference", "400"]
+    command = [sys.executable, str(TOOL), "--json", "--cases", "20000", "--reference", "400", "--episodes", "1"]
+    command += ["--configurations", "1", "--seconds", "0.1", "--networks", "500"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(done.stdout)
@@ -614,6 +615,11 @@ def test_a_sampled_run_passes_and_has_the_agreed_keys() -> None:
     assert 0.0 < found["worst_rel_error"]["float32"] <= 1e-5
     assert 0.0 < found["worst_rel_error"]["float32_soft"] <= 3e-4
     assert all(share <= 1.0 for share in found["over_allowed"].values())
+    assert found["travelled"] == 0
+    assert found["stage_cases"] == sum(row["cases"] for row in found["stages"])
+    assert found["configurations"]["cases"] == 1
+    assert found["counters"]["passed"]
+    assert found["networks"]["torque_mre_50_40"]["float32_mN"] < 0.01
 
 
 def test_an_error_in_the_physics_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
