@@ -62,7 +62,8 @@ PARTS = {
     "numerics": Part(
         "tools/numerics.py --json",
         "{cases:,} cases, {reference_cases:,} references; worst relative error float64 {worst_rel_error[float64]:.1e}, "
-        "float32 {worst_rel_error[float32]:.1e}, float32_soft {worst_rel_error[float32_soft]:.1e}",
+        "float32 {worst_rel_error[float32]:.1e}, float32_soft {worst_rel_error[float32_soft]:.1e}; {stage_cases:,} "
+        "hostile steps of the core's stages: {travelled} numbers travelled",
     ),
     "inverse": Part(
         "tools/benchmark.py inverse --json --write",

@@ -115,9 +115,9 @@ def test_a_day_is_told_by_the_hour(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 def test_a_days_pulse_goes_there_and_back_without_a_leap() -> None:
     force_N = cases.there_and_back()
     over_two = [force_N(0.25 * place) for place in range(2 * 4 * 800)]
-    assert np.abs(np.diff(over_two)).max() < 0.03
+    assert np.abs(np.diff(over_two)).max() < 0.035  # 0.12 N between two points, at the pulse's rise
     assert over_two[: 4 * 800] == over_two[4 * 800 :]
-    assert (min(over_two), max(over_two)) == pytest.approx((1.4, 1.7), abs=0.02)  # between two of its points
+    assert (min(over_two), max(over_two)) == pytest.approx((1.4, 1.7), abs=0.02)
 
 
 def test_nothing_is_removed_from_the_error() -> None:
