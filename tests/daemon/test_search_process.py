@@ -33,7 +33,7 @@ def core() -> Core:
 
 @pytest.fixture(scope="module")
 def process(core: Core) -> Iterator[SearchProcess]:
-    made = SearchProcess(CONFIG, core)
+    made = SearchProcess(core)
     yield made
     made.close()
 
@@ -117,13 +117,15 @@ def answered(process: SearchProcess, until: int = -1) -> Answer | None:
     return answer
 
 
-def test_a_search_that_is_gone_answers_no_more_and_one_that_cannot_start_is_refused(core: Core, tmp_path: Path) -> None:
+def test_a_search_that_is_gone_answers_no_more_and_one_that_cannot_start_is_refused(
+    core: Core, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     elsewhere = msgspec.structs.replace(core.scene.insert, model="none.safetensors")
     with pytest.raises(ConfigError, match=r"solver\.name = 'thesis': its process did not start"):
-        SearchProcess(
-            CONFIG, core._replace(models=tmp_path, scene=msgspec.structs.replace(core.scene, insert=elsewhere))
-        )
-    process = SearchProcess(CONFIG, core)
+        SearchProcess(core._replace(models=tmp_path, scene=msgspec.structs.replace(core.scene, insert=elsewhere)))
+    process = SearchProcess(core)
     process.close()
-    process.ask(Question(7.0, 2.0, 42.0, 1.5, 300.0))
-    assert process.answer() is None
+    for _ in range(3):
+        process.ask(Question(7.0, 2.0, 42.0, 1.5, 300.0))
+        assert process.answer() is None
+    assert caplog.messages == ["the search beside the plans has ended; restart the daemon"]

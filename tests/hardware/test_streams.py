@@ -1,12 +1,8 @@
 """What each stream makes of bytes and frames, good and damaged, and what an exchange takes of a bus."""
 
-import os
 import random
 import struct
-import tty
-from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import cantools.database.can
 import pytest
@@ -36,7 +32,6 @@ from firmware_protocol.codec import (
 from firmware_protocol.framing import encode_frame
 from firmware_protocol.layouts import LAYOUTS
 from firmware_protocol.schema import Layout
-from tormagd.config import Device
 from tormagd.hardware.can_backend import EXCHANGE_BITS
 from tormagd.hardware.can_stream import UNREADABLE, CanStream, SecondHostError
 from tormagd.hardware.frame_stream import FrameStream
@@ -250,28 +245,3 @@ def test_the_configuration_knows_what_an_exchange_takes_of_a_bus() -> None:
             assert frame_bits(CanFrame(can_identifier(layout.function, 1), noise.randbytes(length))) <= most_bits(
                 length
             )
-
-
-# -- on a serial line -------------------------------------------------------------------------------------------------
-
-
-class Line(NamedTuple):
-    """A pseudo-terminal whose far end the test holds."""
-
-    far: int
-    near: int
-    device: Device
-
-    @property
-    def adapter(self) -> Device:
-        """What is there where it is a slcan adapter's."""
-        return Device(backend="can", options={"interface": "slcan"}, port=self.device.port)
-
-
-@pytest.fixture
-def line() -> Iterator[Line]:
-    far, near = os.openpty()
-    tty.setraw(near)
-    yield Line(far, near, Device(port=os.ttyname(near)))
-    os.close(far)
-    os.close(near)

@@ -12,10 +12,10 @@ import json
 import logging
 import socket
 import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -26,6 +26,7 @@ from tormagd.assembly.build import Core, platform_name, sources_hash
 from tormagd.assembly.journal import FORMAT, Journal, Packer
 from tormagd.config import Config
 from tormagd.control.core import Planner, Stepper
+from tormagd.daemon.beside import start_beside
 from tormagd.hardware.connection import Connection
 from tormagd.keeping import KEEPER, Begin, End, Part, Said, Write, Written
 from tormagd.safety.operating_state import RefusedError
@@ -46,6 +47,8 @@ ASKED = "REQUEST"
 
 log = logging.getLogger(__name__)
 Start = Callable[[socket.socket], "subprocess.Popen[bytes]"]
+start_keeper: Start = partial(start_beside, KEEPER)
+"The process that keeps."
 
 
 def header(config: Config, core: Core) -> dict[str, str]:
@@ -65,14 +68,6 @@ def header(config: Config, core: Core) -> dict[str, str]:
         "model_sha256": core.model,
         "columns": json.dumps(TickRecord.__struct_fields__),
     }
-
-
-def start_keeper(its_end: socket.socket) -> "subprocess.Popen[bytes]":
-    """The process that keeps. To be called before this one becomes a real-time one, whose processors it would have."""
-    number = its_end.fileno()
-    command = [sys.executable, "-P", "-m", KEEPER, str(number)]
-    # no signal for our group is meant for it: it ends when we have ended
-    return subprocess.Popen(command, pass_fds=(number,), stdin=subprocess.DEVNULL, start_new_session=True)
 
 
 class BlackBox:

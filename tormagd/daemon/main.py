@@ -120,7 +120,7 @@ async def _run(
     # before this thread is a real-time one: the process that is started keeps off its processors
     folder = state_folder(config.black_box.folder, "blackbox")
     box = BlackBox(folder, {} if folder is None else header(config, core), config.rates.control_hz)
-    beside = SearchProcess(config, core) if core.element.is_beside else None
+    beside = SearchProcess(core) if core.element.is_beside else None
     refused = prepare(config.realtime)
     await Daemon(config, core, open_backend, refused, keys, box, read_again, beside).run()
 

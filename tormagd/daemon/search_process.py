@@ -9,12 +9,11 @@ import logging
 import pickle
 import signal
 import socket
-import subprocess
 import sys
 import time
 
 from tormagd.assembly.build import Core, build_core
-from tormagd.config import Config
+from tormagd.daemon.beside import start_beside
 from tormagd.daemon.rate_group import RateGroup
 from tormagd.inverse.solution import Answer, Question
 from tormagd_client.endpoints import ConfigError
@@ -30,17 +29,16 @@ class SearchProcess:
     """The daemon's end. To be made before the daemon's thread is a real-time one, whose processors the search would
     have. Raises ConfigError where the search does not start."""
 
-    def __init__(self, config: Config, core: Core) -> None:
-        self.timing = RateGroup("search", 1_000_000_000 // config.rates.inference_hz)
+    def __init__(self, core: Core) -> None:
+        self.timing = RateGroup("search", 1_000_000_000 // core.config.rates.inference_hz)
         self._asked_ns = self._due_ns = 0
-        self._is_idle = True
+        self._is_idle, self._is_lost = True, False
         self._socket, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with its:
-            command = [sys.executable, "-P", "-m", __name__, str(its.fileno())]
-            self._process = subprocess.Popen(command, pass_fds=(its.fileno(),), stdin=subprocess.DEVNULL)
+            self._process = start_beside(__name__, its)
         self._socket.settimeout(STARTS_S)
         try:
-            self._socket.send(pickle.dumps((config, core.scene, core.models)))
+            self._socket.send(pickle.dumps((core.config, core.scene, core.models)))
             started = self._socket.recv(MOST_PACKET)
         except OSError:
             started = b""
@@ -51,7 +49,7 @@ class SearchProcess:
 
     def answer(self) -> Answer | None:
         """What it found, if it has since the last time. Never waits."""
-        if self._is_idle:
+        if self._is_idle or self._is_lost:
             return None
         try:
             data = self._socket.recv(MOST_PACKET)
@@ -59,7 +57,8 @@ class SearchProcess:
             return None
         except OSError:
             data = b""
-        if not data:  # it stays asked: plans fail, once its last answer is too old
+        if not data:
+            self._lose()
             return None
         self._is_idle = True
         self.timing.record(self._due_ns, self._asked_ns, time.monotonic_ns())
@@ -72,7 +71,7 @@ class SearchProcess:
     def ask(self, question: Question | None) -> None:
         """Asks, unless a question is open or the next is not due yet."""
         now_ns, period_ns = time.monotonic_ns(), self.timing.period_ns
-        if question is None or not self._is_idle or now_ns < self._due_ns + period_ns:
+        if question is None or self._is_lost or not self._is_idle or now_ns < self._due_ns + period_ns:
             return
         self._due_ns += period_ns
         if now_ns - self._due_ns > period_ns:  # what was missed is not made up for
@@ -81,8 +80,13 @@ class SearchProcess:
         try:
             self._socket.send(pickle.dumps(question))
             self._is_idle = False
-        except OSError as error:
-            log.error("the search beside the plans has ended: %s; restart the daemon", error.strerror)
+        except OSError:
+            self._lose()
+
+    def _lose(self) -> None:
+        """Says once that it has ended: plans fail as soon as its last answer is too old."""
+        self._is_lost = True
+        log.error("the search beside the plans has ended; restart the daemon")
 
     def close(self) -> None:
         """Ends the process."""
@@ -93,7 +97,7 @@ class SearchProcess:
 
 def main() -> None:
     """Answers until the daemon is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a service's whole group gets it; the daemon still plans then
     with socket.socket(fileno=int(sys.argv[1])) as asked:
         config, scene, models = pickle.loads(asked.recv(MOST_PACKET))
         aim = build_core(config, scene, models).planner().aim
