@@ -366,6 +366,21 @@ def test_a_fault_is_told_with_what_was_known_when_it_was_latched(
 # -- with a device -------------------------------------------------------------------------------------------------
 
 
+def test_a_homing_that_is_over_shows_as_one_that_succeeded(running: Running) -> None:
+    running.start()
+    running.until(lambda status: status["link"]["state"] == "RUNNING", "the link runs")
+    running.command("home")
+    telemetry = running.daemon._telemetry
+    for _ in range(PATIENCE_TICKS):
+        running.port.advance(time.monotonic() + 0.5e-3)  # a look between two ticks
+        running.daemon._connection.receive()
+        look = telemetry._build_status(telemetry._newest)
+        if not look.is_busy:
+            break
+        running.tick()
+    assert look.is_homed
+
+
 def test_force_follows_the_setpoint_and_what_holds_it_back_is_said(armed: Running) -> None:
     for force_N in (1.0, 1.6):
         armed.ask(force_N)

@@ -17,12 +17,16 @@ def is_homed(measurement: Measurement | None, measured: Measured | None) -> bool
 def is_busy(measurement: Measurement | None, pending: DeviceRequest, stepper: Stepper, output: Duty | None) -> bool:
     """Whether the device homes or opens, or was asked to and has not said yet that it does.
 
-    `output` is the newest step's, `pending` the request that the device has not acknowledged.
+    `output` is the newest step's, `pending` the request that the device has not acknowledged. A homing ends when a step
+    has taken the positions that it made known: until then the device is busy.
     """
     if measurement is None:
         return False
     is_asked = output is not None and output.request_number != stepper.safety.request_number
-    return is_asked or pending is not DeviceRequest.NONE or measurement.is_busy
+    is_untaken = (
+        measurement.is_homed and not is_homed(measurement, stepper.measured) and not stepper.safety.needs_homing
+    )
+    return is_asked or pending is not DeviceRequest.NONE or measurement.is_busy or is_untaken
 
 
 def conditions(

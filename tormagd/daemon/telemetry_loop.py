@@ -162,13 +162,15 @@ class TelemetryLoop:
         connection, control = self._connection, self._control
         return is_busy(connection.measurement, connection.pending, control.stepper, control.output)
 
+    def _is_homed(self) -> bool:
+        return is_homed(self._connection.measurement, self._control.stepper.measured)
+
     def _snapshot(self, now_s: float) -> Telemetry:
         stamp = self._endpoint.inbox.newest
-        homed = is_homed(self._connection.measurement, self._control.stepper.measured)
         age_s = None if stamp is None else now_s - stamp.stamp_s
         planner, stepper = self._inference.planner, self._control.stepper
         believed = beliefs(planner, stepper, now_s, terms_of(self._core.scene))
-        return snapshot(self._ticks[-1], self.timing.runs, homed, self.is_busy(), age_s, believed)
+        return snapshot(self._ticks[-1], self.timing.runs, self._is_homed(), self.is_busy(), age_s, believed)
 
     def take_over(self, config: Config) -> None:
         """Goes on with another configuration, of which only what a loop looks at each time may differ."""
@@ -279,9 +281,11 @@ class TelemetryLoop:
         stepper, planner = self._control.stepper, self._inference.planner
         safety, plan, believe, acted = stepper.safety, planner.planned, planner.believe, stepper.move.acted
         device = believe.device
-        # a command of this very period has changed the state since the snapshot, and whoever gave it asks now
+        # a command or the end of a homing changes these after the snapshot, and whoever waits for that asks now
+        is_homed_ = self._is_homed()
         known = msgspec.structs.asdict(newest) | {
             "operating_state": str(safety.operating_state),
+            "is_homed": is_homed_,
             "is_busy": self.is_busy(),
             "faults": safety.faults,
         }
@@ -325,5 +329,5 @@ class TelemetryLoop:
             ),
             black_box=self._box.report(),
             output=OutputReport(rate=acted.rate, slew=acted.slew, not_finite=acted.not_finite, range=acted.range),
-            next_commands=tuple(map(str, next_commands(safety, newest.is_homed))),
+            next_commands=tuple(map(str, next_commands(safety, is_homed_))),
         )
