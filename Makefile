@@ -19,6 +19,8 @@ LIBRARY := $(PREFIX)/lib/tormagd
 SERVICE_EXTRAS ?= record,plot,identify,top,dashboard,metrics
 
 export OMP_NUM_THREADS ?= 1
+# each of the many processes that a test starts would compile all that it imports
+unexport PYTHONDONTWRITEBYTECODE
 
 # which build of the core runs; where it is interpreted, why
 SAY_BUILD = $(BIN)/python -P -c 'from firmware_protocol.build import settle; print("the core runs", settle())'
@@ -183,10 +185,11 @@ $(VENV)/.dev: pyproject.toml client/pyproject.toml setup.py | $(BIN)/python
 	@$(SAY_BUILD)
 	touch $@ $(VENV)/.demo
 
-# the core is compiled while what it needs is fetched: each takes a minute, and a processor
+# the core is compiled while what it needs is fetched, which waits for the network and the disk
 core: | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --no-deps --editable client --editable .
 
+# --no-compile: pip would compile every module of torch, SciPy and PyArrow, where few are imported
 fetched: | $(BIN)/python
 	$(BIN)/python tools/dependencies.py $(EXTRAS) > $(VENV)/$(EXTRAS).txt
-	$(BIN)/python -m pip install --quiet --requirement $(VENV)/$(EXTRAS).txt
+	$(BIN)/python -m pip install --quiet --no-compile --requirement $(VENV)/$(EXTRAS).txt

@@ -11,6 +11,7 @@ import shutil
 import sys
 import sysconfig
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
@@ -107,13 +108,41 @@ class BuildCore(build_ext):
         Path(self.build_temp).mkdir(parents=True, exist_ok=True)
         options = ["--config-file=", "--ignore-missing-imports", f"--cache-dir={self.build_temp}/mypy"]
         extensions = mypycify(
-            [*options, *SOURCES], opt_level="1", debug_level="0", group_name=GROUP, target_dir=self.build_temp
+            [*options, *SOURCES],
+            opt_level="1",
+            debug_level="0",
+            multi_file=True,
+            group_name=GROUP,
+            target_dir=self.build_temp,
         )
         for extension in extensions:
-            # a warning of another compiler is no reason to go without; and both builds round alike only without fusing
+            # where mypyc puts the headers of all files
+            extension.include_dirs.append(str(Path(self.build_temp, RECORD.parent)))
+            # a warning of another compiler is no reason to go without; and both builds round alike only without fusing.
+            # hidden: a call into another of the C files is a direct one, which makes a tick a tenth faster
             kept = [option for option in extension.extra_compile_args if option != "-Werror"]
-            extension.extra_compile_args = [*kept, "-ffp-contract=off"]
+            extension.extra_compile_args = [*kept, "-ffp-contract=off", "-fvisibility=hidden"]
         return extensions
+
+    def build_extensions(self) -> None:
+        """Compiles the C files on every processor, where distutils takes one after the other; then links them."""
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            for extension in self.extensions:
+                extension.extra_objects = [pool.submit(self._object, c, extension) for c in extension.sources]
+        for extension in self.extensions:
+            extension.sources, extension.extra_objects = [], [made.result() for made in extension.extra_objects]
+            extension.depends = extension.extra_objects
+        self.parallel = True
+        super().build_extensions()
+
+    def _object(self, source: str, extension: Extension) -> str:
+        [compiled] = self.compiler.compile(
+            [source],
+            output_dir=self.build_temp,
+            include_dirs=extension.include_dirs,
+            extra_postargs=extension.extra_compile_args,
+        )
+        return compiled
 
     def _record(self, lacking: str) -> None:
         # without a build, too: what an earlier one left beside the sources is not to be imported

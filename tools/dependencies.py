@@ -1,5 +1,5 @@
 """The requirements of this project and some of its extras, for `pip install -r`: so they are fetched while the core is
-compiled, which takes as long."""
+compiled."""
 
 import re
 import sys
