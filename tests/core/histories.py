@@ -2,7 +2,7 @@
 
     python tests/core/histories.py     a line of JSON: which build ran, and SHA-256 by kind of history
 
-Every float goes into its digest as hexadecimal: one bit in one number of one tick is another digest.
+Every float goes into its digest as it is: one bit in one number of one tick is another digest.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ from tormagd.assembly.build import Core, build_core  # noqa: E402
 from tormagd.closed_loop import ClosedLoop  # noqa: E402
 from tormagd.config import Config  # noqa: E402
 from tormagd.control.records import Plan, TimedSetpoint  # noqa: E402
-from tormagd.exact import plain  # noqa: E402
+from tormagd.exact import packed, plain  # noqa: E402
 from tormagd.hardware.frame_stream import FrameStream  # noqa: E402
 from tormagd.hardware.link import DeviceLink  # noqa: E402
 from tormagd.hardware.link_quality import LinkQuality  # noqa: E402
@@ -52,32 +52,18 @@ class Digest:
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
-        self.things = 0
+        self.shown_bytes = 0
 
     def see(self, thing: object) -> None:
         """Takes a value, a stage of the core or an error, with everything in it."""
-        texts: list[str] = []
-        _write(f"{type(thing).__name__}: {thing}" if isinstance(thing, Exception) else plain(thing), texts)
-        self.things += len(texts)
-        self._hash.update("\n".join([*texts, ""]).encode())
+        shown = packed(f"{type(thing).__name__}: {thing}" if isinstance(thing, Exception) else plain(thing))
+        self.shown_bytes += len(shown)
+        self._hash.update(shown)
 
     @property
     def text(self) -> str:
         """Of all that was seen."""
         return self._hash.hexdigest()
-
-
-def _write(data: Any, texts: list[str]) -> None:
-    if isinstance(data, float | bytes):
-        texts.append(data.hex())
-    elif isinstance(data, dict):
-        _write(list(data.items()), texts)
-    elif isinstance(data, list | tuple):
-        texts.append(f"{len(data)}:")
-        for inner in data:
-            _write(inner, texts)
-    else:
-        texts.append(repr(data))
 
 
 # -- step and plan, whatever is measured ---------------------------------------------------------------------------
@@ -330,8 +316,8 @@ def main() -> None:
     seen = {name: Digest() for name in histories}
     for name, history in histories.items():
         history(core, seen[name])
-    digests, things = ({name: getattr(each, of) for name, each in seen.items()} for of in ("text", "things"))
-    print(json.dumps({"is_compiled": BUILD.is_compiled, "digests": digests, "things": things}))
+    digests, shown = ({name: getattr(each, of) for name, each in seen.items()} for of in ("text", "shown_bytes"))
+    print(json.dumps({"is_compiled": BUILD.is_compiled, "digests": digests, "shown_bytes": shown}))
 
 
 if __name__ == "__main__":
