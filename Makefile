@@ -35,26 +35,29 @@ SITE = NO_MKDOCS_2_WARNING=1 $(BIN)/python -P -m mkdocs build --strict
 
 PIP_TO := $(BIN)/python -m pip install --quiet --no-warn-script-location --upgrade --target
 
-.PHONY: install uninstall deb wheels run test unhurried live yielding-check coverage search mutation pythons check docs format compile core fetched model tactile-model reproduction evidence clean
+.PHONY: install uninstall deb wheels run test compiled live yielding interpreted coverage search mutation pythons check docs format compile core fetched model tactile-model reproduction evidence clean
 
 run: $(VENV)/.demo
 	$(BIN)/python tools/demo.py
 
 test: $(VENV)/.dev
-	$(MAKE) --no-print-directory unhurried
-	$(MAKE) --no-print-directory --jobs=2 live yielding-check
+	$(MAKE) --no-print-directory compiled
+	$(MAKE) --no-print-directory --jobs=2 live yielding
 
 # real processes in real time, one test after the other: they wait more than they work, and what is checked beside them
 # gives way
 live: $(VENV)/.dev
 	$(BIN)/python -P -m pytest -q -m live $$(grep -rlE 'mark\.live' tests --include='test_*.py')
 
-yielding-check: $(VENV)/.dev
-	nice -n 19 $(MAKE) --no-print-directory check
+yielding: $(VENV)/.dev
+	nice -n 19 $(MAKE) --no-print-directory check interpreted WORKERS=0
 
-# -P: what its owner keeps in this folder is not imported in place of a module. The core's tests run on both builds
-unhurried: $(VENV)/.dev
+# -P: what its owner keeps in this folder is not imported in place of a module
+compiled: $(VENV)/.dev
 	$(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live'
+
+# the core's tests on the other build
+interpreted: $(VENV)/.dev
 	TORMAG_COMPILED=0 $(BIN)/python -P -m pytest -q -n $(WORKERS) --dist worksteal -m 'not live' $(CORE_TESTS)
 
 # which lines of the two packages the tests without real time run; nothing compiled is seen, so the rooms that are compiled in
