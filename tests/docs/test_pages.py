@@ -103,14 +103,19 @@ def require_there(words):
         assert all(f'"{word}"' in source for word in words[2:] if word.startswith("--")), words
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_every_command_in_a_block_is_understood(page, capsys):
-    for words in commands(blocks(page.read_text(encoding="utf-8"))):
+def parsed(lines):
+    """Each command in them that has a parser here, with that and its arguments; the others have to be there."""
+    for words in commands(lines):
         found = parser_of(words)
         if found is None:
             require_there(words)
-            continue
-        parser, arguments = found
+        else:
+            yield words, *found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_command_in_a_block_is_understood(page, capsys):
+    for words, parser, arguments in parsed(blocks(page.read_text(encoding="utf-8"))):
         try:
             parser.parse_args(arguments)
         except SystemExit:
@@ -119,12 +124,7 @@ def test_every_command_in_a_block_is_understood(page, capsys):
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_every_command_in_a_line_has_the_options_that_are_named(page):
-    for words in commands(spans(page.read_text(encoding="utf-8"))):
-        found = parser_of(words)
-        if found is None:
-            require_there(words)
-            continue
-        parser, arguments = found
+    for words, parser, arguments in parsed(spans(page.read_text(encoding="utf-8"))):
         assert {word for word in arguments if word.startswith("--")} <= known_options(parser), words
         if words[0] == "tormagctl" and arguments and not arguments[0].startswith("--"):
             (subparsers,) = (each for each in parser._actions if isinstance(each, argparse._SubParsersAction))

@@ -237,12 +237,9 @@ def identity_with(schema_hash: int) -> Identity:
     return Identity(schema_hash, 1, 0, 1)
 
 
-def any_version_fits(message: Message) -> Message:
-    return message.replaced(protocol_version=1) if isinstance(message, Hello) else message
-
-
-def any_schema_fits(message: Message) -> Message:
-    return message.replaced(schema_hash=SCHEMA_HASH) if isinstance(message, Hello) else message
+def fitting(message: Message, **right: int) -> Message:
+    """As if a Hello had said what is right."""
+    return message.replaced(**right) if isinstance(message, Hello) else message
 
 
 def keeps_nonce_at(kind: type[Message]) -> Callable[..., Answer]:
@@ -312,17 +309,14 @@ def hello_resets(device: Rogue, time_s: float, message: Message, sensors: Sensor
     return device.real.receive(time_s, message, sensors)
 
 
-def any_message_extends(device: Rogue, time_s: float, message: Message) -> None:
+def extends(device: Rogue, time_s: float, *_message: Message) -> None:
+    """Any message does, or any tick."""
     device.real._drive_s = time_s
 
 
 def repetition_extends(device: Rogue, time_s: float, message: Message) -> None:
     if isinstance(message, Drive):
         device.real._drive_s = time_s
-
-
-def has_no_timeout(device: Rogue, time_s: float) -> None:
-    device.real._drive_s = time_s
 
 
 def timeout_of(timeout_s: float) -> Callable[[Rogue, float], None]:
@@ -553,8 +547,8 @@ PLANTED = (
     rogue("another hash", "schema_hash", identity=lambda device: identity_with(SCHEMA_HASH ^ 0x100)),
     rogue("hash reversed", "schema_hash", identity=lambda device: identity_with(HASH_REVERSED)),
     rogue("Hello is no nonce", "hello_nonce", receive=keeps_nonce_at(Hello)),
-    rogue("ignores the schema", "schema_mismatch", hears=lambda _, message: any_schema_fits(message)),
-    rogue("ignores the version", "version_mismatch", hears=lambda _, message: any_version_fits(message)),
+    rogue("ignores the schema", "schema_mismatch", hears=lambda _, message: fitting(message, schema_hash=SCHEMA_HASH)),
+    rogue("ignores the version", "version_mismatch", hears=lambda _, message: fitting(message, protocol_version=1)),
     rogue("Clear mends a mismatch", "mismatch_holds", before=sets(Clear, _compatible=True)),
     rogue(
         "Clear is ignored",
@@ -688,14 +682,14 @@ PLANTED = (
     rogue(
         "a mismatch in RUN passes",
         "mismatch_in_run",
-        hears=lambda device, message: any_schema_fits(message) if is_running(device) else message,
+        hears=lambda device, message: fitting(message, schema_hash=SCHEMA_HASH) if is_running(device) else message,
     ),
     rogue("timeout of 35 ms", "short_silence_is_borne", ticks=timeout_of(0.035)),
     rogue("timeout of 65 ms", "silence_is_noticed", ticks=timeout_of(0.065)),
-    rogue("no timeout", "silence_is_noticed", ticks=has_no_timeout),
-    rogue("no timeout", "silence_opens", ticks=has_no_timeout),
+    rogue("no timeout", "silence_is_noticed", ticks=extends),
+    rogue("no timeout", "silence_opens", ticks=extends),
     rogue("latches without opening", "silence_opens", ticked=latches_without_opening),
-    rogue("any message extends", "only_good_drives_extend", before=any_message_extends),
+    rogue("any message extends", "only_good_drives_extend", before=extends),
     rogue("a repetition extends", "only_good_drives_extend", before=repetition_extends),
     rogue("does not latch", "silence_latches", ticked=does_not_latch),
     rogue("latched keeps homed", "silence_latches", ticked=latched_keeps_homed),
