@@ -40,8 +40,8 @@ COMPILED = {
     "tormagd/control/move": ("motor", "pid", "reference", "homing", "watch", "actuator", "carriages"),
     "tormagd/assembly": ("conditions",),
     "tormagd/simulation": (
-        *("curve", "axis", "gap_field", "warmth", "element", "tactile_pad", "pressed_pad"),
-        *("hand", "plant", "motion", "firmware", "device"),
+        *("curve", "axis", "gap_field", "warmth", "element", "second_element", "tactile_pad"),
+        *("pressed_pad", "hand", "plant", "motion", "firmware", "device"),
     ),
     "tormagd/daemon": ("sequence", "source_clock", "rate_group", "telemetry"),
     "tormagd/lab": ("ideal_actuator",),

@@ -2,13 +2,14 @@
 
     force_tracking.py [CASE ...] [--draws N] [--drift-s S] [--hours H] [--json] [--picture FILE.png]
 
-How soon a device is known: `steps`, `creep` and `speeds`, of the three samples and of draws of the plant card; `drift`
-of the force sensor, and the `pulse` of `make run` as more is known, of the samples. A `day` of pulses, by the hour, of
-sample 1: only where it is named. How well signals are followed:
-that pulse on the `samples` and on random `draws`, 500 setpoints a second, with a preview of 70 ms and without; a
-`staircase`; recorded `signals` from the folder that TORMAG_DATA names, with 400 ms, as a publisher can that plays a
-file, and live. Beside them stands what ideal carriages miss (`bound.py`), and beside `samples` what the same core does
-with carriages that lose no time. Draws 40 to 79 and samples 2 and 3 only judge. All devices are synthetic.
+How soon a device is known: `steps`, `creep` and `speeds`, of the three samples, of the second plant, whose structure is
+another, and of draws of the plant card; `drift` of the force sensor, and the `pulse` of `make run` as more is known, of
+samples and second plant. A `day` of pulses, by the hour, of sample 1: only where it is named. How well signals are
+followed: that pulse on the `samples` and the second plant, and on random `draws`, 500 setpoints a second, with a
+preview of 70 ms and without; a `staircase`; recorded `signals` from the folder that TORMAG_DATA names, with 400 ms, as
+a publisher can that plays a file, and live. Beside them stands what ideal carriages miss (`bound.py`), and beside
+`samples` what the same core does with carriages that lose no time. Draws 40 to 79, samples 2 and 3 and the second plant
+only judge. All devices are synthetic.
 """
 
 import argparse
@@ -50,7 +51,7 @@ def measure(case: str, options: argparse.Namespace, pool: Executor, kept: cases.
         return {SAMPLES[0]: pool.submit(cases.day, SAMPLES[0], options.hours).result()}
     names = judging(options.draws)
     if case in ("drift", "pulse"):
-        names = [name for name in names if name in SAMPLES]
+        names = judging(0)
     run = partial(cases.drift, lasts_s=options.drift_s) if case == "drift" else OF_DEVICES[case]
     found = tqdm(pool.map(run, names), desc=case, total=len(names), disable=not sys.stderr.isatty())
     return dict(zip(names, found, strict=True))

@@ -3,7 +3,7 @@ tables may say: with the key's path, the value, what is allowed and the line."""
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -74,10 +74,16 @@ def toml_tables(text: str) -> dict[str, Any]:
 
 def convert(path: Path, kind: type[T]) -> T:
     """The file's tables as a `kind`. Raises ConfigError naming file, key, value, what is allowed, and the line."""
+    return convert_as(path, lambda _tables: kind)
+
+
+def convert_as(path: Path, kind_of: Callable[[dict[str, Any]], type[T]]) -> T:
+    """The file's tables as the kind that they say they are. Raises as `convert` does."""
     try:
         text = toml_text(path)
         try:
-            return checked(toml_tables(text), kind)
+            tables = toml_tables(text)
+            return checked(tables, kind_of(tables))
         except (TomlError, ConfigError) as error:
             raise ConfigError(f"{error}{_line(text, str(error))}") from error
     except OSError as error:

@@ -26,7 +26,6 @@ from tormagd.lab.ideal_carriage import (
     rms,
 )
 from tormagd.lab.main import main
-from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.element import Element
 from tormagd.simulation.hand import SteadyHand
@@ -45,7 +44,7 @@ STRAIGHT = Brake(
     fresh_N=np.array([1.0, 11.0]),
     relaxation=PronySeries((), ()),
     rested_mm=50.0,
-    friction=Friction(8.0, 0.0, 1.0, 5.0),
+    sliding_N=lambda kinetic_N, _hand_mm_s: kinetic_N,
 )
 N_MM = 0.1
 

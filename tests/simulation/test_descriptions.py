@@ -17,7 +17,10 @@ from tormagd.simulation.parameters import PlantError, load_plant, plant_names, w
 # -- plants ------------------------------------------------------------------------------------------------------------
 
 
-SAMPLE_1_TEXT = resources.files("tormagd.simulation").joinpath("plants/sample_1.toml").read_text(encoding="utf-8")
+SAMPLE_1_TEXT, SECOND_TEXT = (
+    resources.files("tormagd.simulation").joinpath(f"plants/{name}.toml").read_text(encoding="utf-8")
+    for name in ("sample_1", "second")
+)
 
 
 def written(folder: Path, text: str) -> Path:
@@ -28,7 +31,7 @@ def written(folder: Path, text: str) -> Path:
 
 def test_the_three_samples_of_the_plant_card_are_packaged() -> None:
     names = ["sample_1", "sample_2", "sample_3"]
-    assert plant_names() == ("pad_1", "pad_2", "pad_3", *names)
+    assert plant_names() == ("pad_1", "pad_2", "pad_3", *names, "second")
     plants = [load_plant(name) for name in names]
     assert [plant.elastomer.shear_modulus_kPa for plant in plants] == [277.3, 255.0, 300.0]
     assert [plant.field.law for plant in plants] == ["power", "thesis", "power"]
@@ -84,6 +87,7 @@ def test_a_bad_plant_is_refused_with_key_value_and_what_is_allowed(
     [
         ('carriages = "sample_9"\n[pad]\n', "carriages = 'sample_9': allowed is a file or one of pad_1"),
         ('carriages = "sample_1"\n[pad]\n[motor]\n', "unknown field `motor`"),
+        ('carriages = "sample_1"\n', "carriages = 'sample_1': allowed is a plant with one of [pad] and [second]"),
         ('carriages = "sample_1"\n[pad]\nmodulus_kPa = -1.0\n', ">= 1.0 - at `$.pad.modulus_kPa` (it is -1.0) (line"),
         ('carriages = "sample_1"\n[pad]\nstrength = 1.0\n', "strength"),
         (
@@ -97,6 +101,26 @@ def test_a_pads_file_is_read_as_strictly_as_any(tmp_path: Path, text: str, said:
     keys = "".join(line + "\n" for line in good.splitlines() if line.split(" ")[0] not in text)
     with pytest.raises(PlantError) as caught:
         load_plant(written(tmp_path, text.replace("[pad]\n", f"[pad]\n{keys}")))
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (
+            "play_shares = [0.4, 0.4]",
+            "play_shares = [0.4]",
+            "play_shares = (0.4,): allowed is one for each of (2.0, 6.0)",
+        ),
+        ("play_shares = [0.4, 0.4]", "play_shares = [0.5, 0.6]", "play_shares = (0.5, 0.6): allowed is a sum under 1"),
+        ("[0.2, 0.3, 0.5]", "[0.2, 0.3, 0.4]", "spring_shares = (0.2, 0.3, 0.4): allowed is a sum of 1"),
+        ("creep_s = 900.0", "", "missing required field `creep_s`"),
+    ],
+)
+def test_the_second_plants_file_is_read_as_strictly(tmp_path: Path, old: str, new: str, said: str) -> None:
+    assert old in SECOND_TEXT
+    with pytest.raises(PlantError) as caught:
+        load_plant(written(tmp_path, SECOND_TEXT.replace(old, new)))
     assert said in str(caught.value)
 
 

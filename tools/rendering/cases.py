@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from tqdm import tqdm
 
-from rendering.device_draws import SAMPLES, device, evenly_drawn
+from rendering.device_draws import SAMPLES, device, evenly_drawn, judging
 from rendering.following import (
     CORNER_SCENE,
     FILE_PREVIEW_S,
@@ -353,15 +353,15 @@ def compared(found: Followed, best: Bound, start_s: float) -> Json:
 
 
 def samples(pool: Executor, kept: Kept) -> Json:
-    """The pulse on the three samples, with and without preview: the whole of it, and after TRIM_S; and the RMS error of
-    the same core with carriages that lose no time."""
-    rows, played = [], pulse_signal(PULSE_S)
-    cases = [(name, preview_s) for name in SAMPLES for preview_s in (PREVIEW_S, 0.0)]
+    """The pulse on the three samples and the second plant, with and without preview: the whole of it, and after TRIM_S;
+    and the RMS error of the same core with carriages that lose no time."""
+    rows, played, names = [], pulse_signal(PULSE_S), judging(0)
+    cases = [(name, preview_s) for name in names for preview_s in (PREVIEW_S, 0.0)]
     runs, bounds = (
         [pool.submit(track, device(name), played, "pulse", preview_s, is_ideal=ideal) for name, preview_s in cases]
         for ideal in (False, True)
     )
-    best = {name: pool.submit(ideal, name, played) for name in SAMPLES}
+    best = {name: pool.submit(ideal, name, played) for name in names}
     for (name, preview_s), run, bound_run in zip(cases, runs, bounds, strict=True):
         found, least, same = run.result(), best[name].result(), bound_run.result()
         whole, after_trim = (

@@ -6,6 +6,8 @@ import numpy as np
 from tormagd.simulation.parameters import PlantParameters, load_plant
 
 SAMPLES = ("sample_1", "sample_2", "sample_3")
+SECOND = "second"
+"The plant of other structure: it judges, and nothing else."
 FIRST_DRAW = 40
 "Of those of the plant card that only judge: on earlier ones constants were chosen."
 TURNING_GAP_MM = 67.0
@@ -27,13 +29,13 @@ DRAWN = (
 
 
 def device(name: str) -> PlantParameters:
-    """A sample by its name, or `draw N` of the plant card."""
+    """A plant that comes with the package, by its name, or `draw N` of the plant card."""
     return drawn_device(int(name.split()[1])) if name.startswith("draw") else load_plant(name)
 
 
 def judging(draws: int) -> list[str]:
-    """The samples, and the names of so many draws that only judge."""
-    return [*SAMPLES, *(f"draw {number}" for number in range(FIRST_DRAW, FIRST_DRAW + draws))]
+    """The samples, the second plant, and the names of so many draws that only judge."""
+    return [*SAMPLES, SECOND, *(f"draw {number}" for number in range(FIRST_DRAW, FIRST_DRAW + draws))]
 
 
 def evenly_drawn(count: int) -> list[tuple[PlantParameters, dict[str, float]]]:

@@ -14,7 +14,7 @@ from tormagd.lab.pages import stamp
 from tormagd.scenes.scene import Scene
 
 ASKED, RENDERED, OTHER, THIRD, QUIET = "#222222", "#d1495b", "#2a6f97", "#6a994e", "#8d99ae"
-SAMPLE_COLOURS = {"sample_1": RENDERED, "sample_2": OTHER, "sample_3": THIRD}
+SAMPLE_COLOURS = {"sample_1": RENDERED, "sample_2": OTHER, "sample_3": THIRD, "second": QUIET}
 CLOSE_UP_S = 4.0
 SAMPLES_FROM_S = 12.0
 BAR_MN = 18.0

@@ -36,7 +36,8 @@ from tormagd.physics.friction import Friction
 from tormagd.physics.relaxation import PronySeries
 from tormagd.simulation.curve import Curve
 from tormagd.simulation.gap_field import SMALLEST_GAP_MM
-from tormagd.simulation.parameters import PlantParameters, load_plant
+from tormagd.simulation.parameters import PlantParameters, SecondParameters, load_plant
+from tormagd.simulation.second_element import fresh_N, rate_factor, shaft_field_mT
 from tormagd.simulation.static_laws import MOMENT_POINTS, force_over_moment, pull_over_gap, radial_moment_Tm
 
 TURNED_MM_S = 42.0
@@ -116,8 +117,10 @@ class Brake(NamedTuple):
 
     A gap gives a moment of the field (`moment_Tm` over `gap_mm`, from closed to open), which lags behind while it
     changes: up to `branch_Tm`, and by most of that within a change of `turn_Tm`. Moment and lag together give the force
-    of the fresh, cool insert (`fresh_N` over `strength_Tm`), part of which relaxes; friction makes of it what is felt.
-    `rested_mm` is the gap at which the insert has rested before.
+    of the fresh, cool insert (`fresh_N` over `strength_Tm`), part of which relaxes; friction makes of it what is felt,
+    `sliding_N` of a kinetic level, N, and of the handle's speed, mm/s. `rested_mm` is the gap at which the insert has
+    rested before. Of the second plant a field in T stands for the moment, one exponential for its creep, and an
+    exponential lag for its play: there a bound is near, but not exact.
     """
 
     gap_mm: Array
@@ -128,11 +131,7 @@ class Brake(NamedTuple):
     fresh_N: Array
     relaxation: PronySeries
     rested_mm: float
-    friction: Friction
-
-    def sliding_N(self, kinetic_N: float, hand_mm_s: float) -> float:
-        """The force at that level of kinetic friction, at that speed of the handle."""
-        return self.friction.level_N(hand_mm_s, kinetic_N) + self.friction.viscous_N_s_mm * abs(hand_mm_s)
+    sliding_N: Callable[[float, float], float]
 
     def fresh_at_N(self, moment_Tm: float, lag_Tm: float = 0.0) -> float:
         """The force of the fresh insert at a moment and its lag."""
@@ -194,15 +193,23 @@ def drive_of(plant: PlantParameters) -> Drive:
 
 def brake_of(plant: PlantParameters) -> Brake:
     """The brake of a device, between its switches."""
-    assumed, friction = plant.assumed, plant.friction
+    assumed = plant.assumed
     closed_mm, open_mm = 2.0 * assumed.closed_mm, 2.0 * assumed.home_mm
     gap_mm = np.linspace(closed_mm, open_mm, math.ceil((open_mm - closed_mm) / GRID_MM) + 1)
+    if plant.second is not None:
+        return _second_brake(gap_mm, plant, plant.second)
     moment_Tm = np.asarray(radial_moment_Tm(gap_mm, plant), dtype=np.float64)
     largest_Tm = float(radial_moment_Tm(np.array([SMALLEST_GAP_MM]), plant)[0])
     branch_Tm = plant.field.hysteresis_percent / 100.0 * largest_Tm
     weakest_Tm, strongest_Tm = float(moment_Tm[-1]) - branch_Tm, float(moment_Tm[0]) + branch_Tm
     force = force_over_moment(plant, weakest_Tm, strongest_Tm)
     strength_Tm = np.linspace(weakest_Tm, strongest_Tm, MOMENT_POINTS)
+    friction = Friction(
+        presliding_stiffness_N_mm=plant.friction.presliding_stiffness_N_mm,
+        viscous_N_s_mm=plant.friction.viscous_N_s_mm,
+        static_ratio=plant.friction.static_to_kinetic,
+        stribeck_speed_mm_s=plant.friction.stribeck_speed_mm_s,
+    )
     return Brake(
         gap_mm,
         moment_Tm,
@@ -212,11 +219,26 @@ def brake_of(plant: PlantParameters) -> Brake:
         np.array([force.at(strength) for strength in strength_Tm.tolist()]),
         PronySeries(plant.relaxation.fractions, plant.relaxation.times_s),
         assumed.start_left_mm + assumed.start_right_mm,
-        Friction(
-            presliding_stiffness_N_mm=friction.presliding_stiffness_N_mm,
-            viscous_N_s_mm=friction.viscous_N_s_mm,
-            static_ratio=friction.static_to_kinetic,
-            stribeck_speed_mm_s=friction.stribeck_speed_mm_s,
+        lambda kinetic_N, hand_mm_s: friction.level_N(hand_mm_s, kinetic_N) + friction.viscous_N_s_mm * abs(hand_mm_s),
+    )
+
+
+def _second_brake(gap_mm: Array, plant: PlantParameters, second: SecondParameters) -> Brake:
+    field_T = np.array([1e-3 * shaft_field_mT(gap, plant, second.concentration) for gap in gap_mm.tolist()])
+    shares_T = [1e-3 * share * half_mT for share, half_mT in zip(second.play_shares, second.play_mT, strict=True)]
+    branch_T = sum(shares_T, 0.0)
+    strength_T = np.linspace(float(field_T[-1]) - branch_T, float(field_T[0]) + branch_T, MOMENT_POINTS)
+    return Brake(
+        gap_mm,
+        field_T,
+        branch_T,
+        1e-3 * max(second.play_mT),
+        strength_T,
+        np.array([fresh_N(1e3 * strength, second) for strength in strength_T.tolist()]),
+        PronySeries((second.creeping_share,), (second.creep_s,)),
+        plant.assumed.start_left_mm + plant.assumed.start_right_mm,
+        lambda kinetic_N, hand_mm_s: (
+            kinetic_N * rate_factor(hand_mm_s, second.renewed_mm / max(hand_mm_s, second.slow_mm_s), second)
         ),
     )
 

@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from tormagd.named_file import named, shipped
 from tormagd.physics.inserts import insert
-from tormagd.toml_file import convert
+from tormagd.toml_file import convert, convert_as
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import require
 
@@ -86,6 +86,36 @@ class PadParameters(Struct, frozen=True, forbid_unknown_fields=True):
     mullins_travel_mm: Positive = 20.0
     relaxing: Relaxation = Relaxation((0.015, 0.040, 0.028, 0.025), (1.2, 9.5, 95.0, 1100.0))
     field_relaxing: Relaxation = Relaxation((0.018, 0.048, 0.034, 0.030), (0.8, 6.5, 70.0, 800.0))
+
+
+class SecondParameters(Struct, frozen=True, forbid_unknown_fields=True):
+    """The second plant's element, in the place of the insert: see `SecondElement`, whose laws name what these are."""
+
+    concentration: Annotated[float, Meta(ge=1.0, le=3.0)]
+    without_field_N: NotNegative
+    saturated_N: Annotated[float, Meta(gt=0.0, le=100.0)]
+    saturating_mT: Positive
+    play_mT: Annotated[tuple[NotNegative, ...], Meta(min_length=1, max_length=8)]
+    play_shares: Annotated[tuple[Share, ...], Meta(min_length=1, max_length=8)]
+    creeping_share: Share
+    creep_scale_N: Annotated[float, Meta(ge=1e-3, le=10.0)]
+    creep_s: Annotated[float, Meta(ge=1.0)]
+    reference_mm_s: Positive
+    slow_mm_s: Annotated[float, Meta(ge=0.01)]
+    rate_gain: Annotated[float, Meta(ge=0.0, le=0.05)]
+    age_gain: Annotated[float, Meta(ge=0.0, le=0.1)]
+    ageing_s: Positive
+    renewed_mm: Positive
+    springs_N_mm: Annotated[tuple[Positive, ...], Meta(min_length=1, max_length=8)]
+    spring_shares: Annotated[tuple[Share, ...], Meta(min_length=1, max_length=8)]
+
+    def __post_init__(self) -> None:
+        for one, other in (("play_shares", "play_mT"), ("spring_shares", "springs_N_mm")):
+            shares, paired = getattr(self, one), getattr(self, other)
+            require(len(shares) == len(paired), one, shares, f"one for each of {paired}")
+        require(sum(self.play_shares) < 1.0, "play_shares", self.play_shares, "a sum under 1")
+        is_whole = abs(sum(self.spring_shares) - 1.0) < 1e-9
+        require(is_whole, "spring_shares", self.spring_shares, "a sum of 1")
 
 
 class Thermal(Struct, frozen=True, forbid_unknown_fields=True):
@@ -206,6 +236,8 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
     assumed: Assumed = Assumed()
     pad: PadParameters | None = None
     "With one the device is a pad under a finger: `elastomer`, `friction` and `relaxation` are of no part of it."
+    second: SecondParameters | None = None
+    "With one the element is the second plant's: nor are they, or `field`, of any part of it."
 
     def __post_init__(self) -> None:
         limit_A = self.electronics.current_limit_A
@@ -227,11 +259,20 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True):
         return self.assumed.home_mm + 2.0 * self.assumed.stop_beyond_mm
 
 
-class _PadBetween(Struct, frozen=True, forbid_unknown_fields=True):
-    """A file of a pad: the plant whose magnets and carriages it stands between."""
+class _Between(Struct, frozen=True, forbid_unknown_fields=True):
+    """A file of a pad, or of the second plant's element: of what plant the magnets and carriages about it are."""
 
     carriages: str
-    pad: PadParameters
+    pad: PadParameters | None = None
+    second: SecondParameters | None = None
+
+    def __post_init__(self) -> None:
+        is_one = (self.pad is None) != (self.second is None)
+        require(is_one, "carriages", self.carriages, "a plant with one of [pad] and [second] between its magnets")
+
+
+def _kind(tables: dict[str, Any]) -> type[PlantParameters | _Between]:
+    return _Between if "carriages" in tables else PlantParameters
 
 
 def plant_names() -> tuple[str, ...]:
@@ -246,11 +287,11 @@ def load_plant(path_or_name: str | Path) -> PlantParameters:
     finite or out of range, and values that contradict each other.
     """
     path = named("plant", str(path_or_name), _PLANTS, ".toml")
-    if "carriages" not in convert(path, dict[str, Any]):
-        return convert(path, PlantParameters)
-    between = convert(path, _PadBetween)
-    carried = convert(named("carriages", between.carriages, _PLANTS, ".toml"), PlantParameters)
-    return msgspec.structs.replace(carried, pad=between.pad)
+    read = convert_as(path, _kind)
+    if isinstance(read, PlantParameters):
+        return read
+    carried = convert(named("carriages", read.carriages, _PLANTS, ".toml"), PlantParameters)
+    return msgspec.structs.replace(carried, pad=read.pad, second=read.second)
 
 
 def with_insert(plant: PlantParameters, name: str) -> PlantParameters:

@@ -11,6 +11,7 @@ from tormagd.simulation.element import Element
 from tormagd.simulation.hand import Hand
 from tormagd.simulation.parameters import PlantParameters
 from tormagd.simulation.pressed_pad import PressedPad
+from tormagd.simulation.second_element import SecondElement
 from tormagd.simulation.static_laws import pull_over_gap
 
 SUBSTEP_S: Final = 5e-4
@@ -88,11 +89,13 @@ class Plant:
         screw = parameters.screw
         self.left = Axis(parameters, screw.drag_left_N, assumed.start_left_mm, pull_N, substep_s)
         self.right = Axis(parameters, screw.drag_right_N, assumed.start_right_mm, pull_N, substep_s)
-        self.element: Element | PressedPad = (
-            Element(parameters, gap_mm, ELEMENT_STEP_S)
-            if parameters.pad is None
-            else PressedPad(parameters, gap_mm, ELEMENT_STEP_S)
-        )
+        self.element: Element | PressedPad | SecondElement
+        if parameters.pad is not None:
+            self.element = PressedPad(parameters, gap_mm, ELEMENT_STEP_S)
+        elif parameters.second is not None:
+            self.element = SecondElement(parameters, gap_mm, ELEMENT_STEP_S)
+        else:
+            self.element = Element(parameters, gap_mm, ELEMENT_STEP_S)
         self.handle_mm = hand.position_mm(0.0)
         self.handle_mm_s = 0.0
         self.force_sensor: Sensor = ForceSensor(parameters, random.Random(seed))

@@ -1,0 +1,119 @@
+"""The element of the second plant: each law is of another form than those of `Element` and of the controller's models.
+
+It only judges: no model is trained on it, and no constant of a controller was chosen by it. Sizes are assumptions, of
+the order that the literature gives; they stand in `plants/second.toml`, with their sources.
+
+    field        b = 2 c B(gap / 2)                     two blocks, on their axis (Furlani 2001); c of the iron shaft
+    memory       m = (1 - sum w_i) b + sum w_i play_i   play of half width r_i (Krasnoselskii and Pokrovskii 1989)
+    fresh force  F = F_0 + F_s tanh(m / b_s)^2          particles saturate (Jolly, Carlson and Munoz 1996)
+    creep        N = (1 - g) F + s,  ds/dt = g dF/dt - (V / T) sinh(s / V)          flow over barriers (Eyring 1936)
+    contact      dA/dt = 1 - A |v| / D                  its age, s (Dieterich 1979, Ruina 1983)
+                 L = N (1 + a ln(v_c + |v|) + c ln(1 + A / A_c)), and 1 N at v_ref   rubber on steel (Grosch 1963)
+    before it slides: springs k_i side by side, each of which slips at its share of L (Iwan 1966)
+
+So the force creeps with the logarithm of time, a large step sooner than a small one; friction grows with the logarithm
+of the speed, and of the time at rest; and what the handle feels after it turned depends on where it turned before.
+"""
+
+import math
+from typing import Final, final
+
+from tormagd.simulation.parameters import PlantParameters, SecondParameters
+from tormagd.simulation.warmth import Warmth
+
+RESTED_S: Final = 1000.0
+"How long the handle has been standing when the power comes."
+
+
+def shaft_field_mT(gap_mm: float, plant: PlantParameters, concentration: float) -> float:
+    """The flux density at the shaft: of a block on its axis, half a gap away, twice, and what the iron draws in."""
+    width_mm, depth_mm, thickness_mm = plant.magnets.size_mm
+
+    def angle(from_mm: float) -> float:
+        across = math.sqrt(4.0 * from_mm * from_mm + width_mm * width_mm + depth_mm * depth_mm)
+        return math.atan(width_mm * depth_mm / (2.0 * from_mm * across))
+
+    block_mT = 1e3 * plant.magnets.remanence_T / math.pi * (angle(0.5 * gap_mm) - angle(0.5 * gap_mm + thickness_mm))
+    return 2.0 * concentration * block_mT
+
+
+def fresh_N(field_mT: float, second: SecondParameters) -> float:
+    """Kinetic friction of the fresh, cool element in that field, at the speed of reference."""
+    saturation = math.tanh(field_mT / second.saturating_mT)
+    return second.without_field_N + second.saturated_N * saturation * saturation
+
+
+def rate_factor(speed_mm_s: float, age_s: float, second: SecondParameters) -> float:
+    """Friction at that speed and age of the contact over that while it slides at the speed of reference."""
+    reference_mm_s, slow_mm_s = second.reference_mm_s, second.slow_mm_s
+    reference_age = second.renewed_mm / reference_mm_s / second.ageing_s
+    faster = math.log((slow_mm_s + abs(speed_mm_s)) / (slow_mm_s + reference_mm_s))
+    older = math.log((1.0 + age_s / second.ageing_s) / (1.0 + reference_age))
+    return 1.0 + second.rate_gain * faster + second.age_gain * older
+
+
+@final
+class SecondElement:
+    """State of the second plant's element, behind the interface of `Element`: the plays, what still creeps, the age of
+    the contact, its springs. Advances in equal steps of `dt_s`.
+
+    `kinetic_N` is the level at the speed of reference. Passive: springs are stretched by the handle alone, and slip.
+    """
+
+    def __init__(self, plant: PlantParameters, gap_mm: float, dt_s: float) -> None:
+        if plant.second is None:
+            raise ValueError("plant.second = None: allowed is the second plant")
+        self._plant = plant
+        self._second = second = plant.second
+        self._dt_s = dt_s
+        self._warmth = Warmth(plant)
+        self._plays_mT = [shaft_field_mT(gap_mm, plant, second.concentration) for _ in second.play_mT]
+        self._fresh_N = fresh_N(self._plays_mT[0], second)
+        self._creeping_N = 0.0
+        self._age_s = RESTED_S
+        self._stretched_mm = [0.0 for _ in second.springs_N_mm]
+        self.force_N = 0.0
+        self.kinetic_N = (1.0 - second.creeping_share) * self._fresh_N
+
+    @property
+    def temperature_C(self) -> float:
+        """Of the elastomer."""
+        return self._warmth.temperature_C
+
+    def advance(self, time_s: float, gap_mm: float, speed_mm_s: float) -> None:
+        """One step that ends at that time, at that gap, with the handle at that mean speed."""
+        second, dt_s = self._second, self._dt_s
+        driving_N = fresh_N(self._magnetised_mT(gap_mm), second) * self._warmth.advance(time_s)
+        self._creeping_N = self._crept_N(self._creeping_N + second.creeping_share * (driving_N - self._fresh_N))
+        self._fresh_N = driving_N
+        self.kinetic_N = max((1.0 - second.creeping_share) * driving_N + self._creeping_N, 0.0)
+        # exact for a constant speed: what is left of the age, and what the step adds to it
+        renewed = abs(speed_mm_s) * dt_s / second.renewed_mm
+        added_s = dt_s if renewed == 0.0 else -dt_s * math.expm1(-renewed) / renewed
+        self._age_s = self._age_s * math.exp(-renewed) + added_s
+        level_N = self.kinetic_N * rate_factor(speed_mm_s, self._age_s, second)
+        force_N = 0.0
+        for index, stiffness_N_mm in enumerate(second.springs_N_mm):
+            reach_mm = second.spring_shares[index] * level_N / stiffness_N_mm
+            stretched_mm = self._stretched_mm[index] + speed_mm_s * dt_s
+            self._stretched_mm[index] = stretched_mm = min(max(stretched_mm, -reach_mm), reach_mm)
+            force_N += stiffness_N_mm * stretched_mm
+        self.force_N = force_N
+
+    def _magnetised_mT(self, gap_mm: float) -> float:
+        second = self._second
+        field_mT = shaft_field_mT(gap_mm, self._plant, second.concentration)
+        found_mT = field_mT
+        for index, half_mT in enumerate(second.play_mT):
+            play_mT = min(max(self._plays_mT[index], field_mT - half_mT), field_mT + half_mT)
+            self._plays_mT[index] = play_mT
+            found_mT += second.play_shares[index] * (play_mT - field_mT)
+        return found_mT
+
+    def _crept_N(self, creeping_N: float) -> float:
+        """After a step, exactly: tanh(s / 2 V) falls by exp(-dt / T), written so that a large s loses no digits."""
+        scale_N = self._second.creep_scale_N
+        large = math.exp(-abs(creeping_N) / scale_N)
+        kept, lost = math.exp(-self._dt_s / self._second.creep_s), -math.expm1(-self._dt_s / self._second.creep_s)
+        left = math.log((1.0 + kept + large * lost) / (lost + large * (1.0 + kept)))
+        return math.copysign(scale_N * left, creeping_N)
