@@ -6,8 +6,9 @@
 Forces are the simulated plant's while the handle slides. *Asked* is the greater of the force asked and what this
 device brakes with its gap open at this speed; *arrived* is 0.2 s after an ideal carriage would have. Devices are the
 three samples and random draws around sample 1 (plant card). Sample 1 and draws 0 to 39 were looked at while constants
-were chosen; samples 2 and 3 and the draws from 40 on only judge. All devices are synthetic. `--models` asks only how
-near the model of each insert is to devices without a loop around it: samples 2 and 3 and draws 100 to 119.
+were chosen; samples 2 and 3 and the draws from 40 on only judge. The second plant, of other structure, is told apart
+and keeps no bound. All devices are synthetic. `--models` asks only how near the model of each insert is to devices
+without a loop around it: samples 2 and 3 and draws 100 to 119.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from rendering.device_draws import SAMPLES, device, judging
+from rendering.device_draws import SAMPLES, SECOND, device, judging
 from rendering.following import CORNER_SCENE, VALID_S, Followed, Levels, armed_at_rest, asked_at, follow
 from rendering.hands import HANDS
 from rendering.models import errors, models, models_picture, models_table
@@ -231,7 +232,9 @@ def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures
         waiting, low = [pool.submit(run, case) for case in asked], [pool.submit(low_hold, *hold) for hold in holds]
         for future in tqdm([*waiting, *low], desc="runs", unit="run", disable=not sys.stderr.isatty()):
             future.exception()
-    found = [(case, future.result()) for case, future in zip(asked, waiting, strict=True)]
+    every = [(case, future.result()) for case, future in zip(asked, waiting, strict=True)]
+    second = [(case, figures) for case, figures in every if case.device == SECOND]
+    found = [(case, figures) for case, figures in every if case.device != SECOND]
     faults = [(*hold, future.result()) for hold, future in zip(holds, low, strict=True)]
     stepped = [figures.steps_N for case, figures in found if figures.steps_N and case.device.startswith("draw")]
     first, again, overshoot = (np.array(part) for part in zip(*stepped, strict=True))
@@ -246,17 +249,26 @@ def measure(options: argparse.Namespace) -> tuple[Json, list[tuple[Case, Figures
         "step_again_N": float(np.abs(again).max()),
         "overshoot_N": float(overshoot.max()),
         "slow_error_N": max(abs(error) for case, figures in found if case.hand == "1 mm/s" for error in figures.slow_N),
-        "cases": len(found) + len(holds),
-        "faults": [
-            f"{case.device}, {case.hand}, {case.forces}: {', '.join(f.faults)}" for case, f in found if f.faults
-        ],
+        "cases": len(every) + len(holds),
+        "faults": faulted(found),
+        "second": {
+            "over_N": max(figures.over_N for _, figures in second),
+            "under_N": max(figures.under_N for _, figures in second),
+            "settled_N": max(abs(error) for _, _, error in settled(second)),
+            "faults": faulted(second),
+        },
         "low_holds": [f"{name} at {force} N: {', '.join(wrong)}" for name, force, _, wrong in faults if wrong],
         "model": model_on_plant(),
         "draws": draws,
         "low_hold_s": lasts_s,
-        "rows": list(starmap(row, found)),
+        "rows": list(starmap(row, every)),
     }
     return result, found
+
+
+def faulted(found: list[tuple[Case, Figures]]) -> list[str]:
+    """The runs that a fault ended."""
+    return [f"{case.device}, {case.hand}, {case.forces}: {', '.join(f.faults)}" for case, f in found if f.faults]
 
 
 def settled(found: list[tuple[Case, Figures]]) -> list[tuple[float, float, float]]:
