@@ -16,7 +16,11 @@
 #define PATIENCE_S 0.3
 #define DEAD_CURRENT_A 0.02 /* a connected motor draws ten times this at the duty that stands for no progress */
 #define WRONG_WAY_MM 1.0     /* back, while homing drives the carriage open: its motor or its encoder is reversed */
-#define TIME_LIMIT_S 8.0    /* the whole stroke at homing speed takes under 4 s */
+#define HOMING_LIMIT_S 8.0   /* the whole stroke at homing speed takes under 4 s */
+#define SEARCH_SHARE 0.5     /* of the speed of opening, about that of homing, from which it brakes at a switch */
+#define STROKE_MM 25.5       /* of a carriage, between its stops */
+#define LEAST_SHARE 0.6      /* of the speed of opening: what the weakest motors reach on the lowest supply */
+#define LATE_S 0.5           /* to turn round, to taper, to settle at the switch */
 
 static double lesser(double a, double b)
 {
@@ -105,7 +109,7 @@ void tormag_retraction_start(
     double speed_mm_s,
     bool tapered)
 {
-    retraction->deadline_s = time_s + TIME_LIMIT_S;
+    retraction->deadline_s = time_s + STROKE_MM / (LEAST_SHARE * speed_mm_s) + LATE_S;
     retraction->speed_mm_s = speed_mm_s;
     retraction->tapered = tapered;
     for (int side = 0; side < TORMAG_SIDES; side++) {
@@ -128,8 +132,10 @@ enum tormag_outcome tormag_retraction_step(
         struct tormag_opening *opening = &retraction->openings[side];
         double speed_mm_s = retraction->speed_mm_s;
         if (retraction->tapered) {
-            const double remaining_mm = greater(-carriages[side].position_mm, 0.0);
-            speed_mm_s = lesser(speed_mm_s, CREEP_MM_S + TAPER_PER_S * remaining_mm);
+            /* beyond where its switch should have been the zero is wrong: it searches there */
+            const double position_mm = carriages[side].position_mm;
+            const double most_mm_s = position_mm < 0.0 ? speed_mm_s : SEARCH_SHARE * speed_mm_s;
+            speed_mm_s = lesser(most_mm_s, CREEP_MM_S + TAPER_PER_S * fabs(position_mm));
         }
         opening_step(opening, time_s, &carriages[side], speed_mm_s);
         moving = moving || opening->outcome == TORMAG_MOVING;
@@ -151,7 +157,7 @@ void tormag_homing_start(
     double speed_mm_s)
 {
     memset(homing, 0, sizeof *homing);
-    homing->deadline_s = time_s + TIME_LIMIT_S;
+    homing->deadline_s = time_s + HOMING_LIMIT_S;
     homing->speed_mm_s = speed_mm_s;
     homing->drive_train = *drive_train;
     homing->phase = TORMAG_HOMING_SEARCH;

@@ -31,12 +31,22 @@ from firmware_protocol.conformance.host import (
 )
 
 PAGE: Final = "Modes"
+OPENING: Final = "Opening"
 RAMP_PER_S: Final = 1.0
 MOVED_MM: Final = 0.3
 AT_STOP_DUTY: Final = 0.3
 AT_STOP_MM: Final = 0.1
 AT_STOP_A: Final = 0.3
 """A motor that pushes into the stop draws several times this at that duty."""
+BEGUN_MM: Final = 0.1
+BEGUN_S: Final = 0.2
+OPEN_S: Final = 0.8
+"""From INSIDE_MM in a carriage has begun to open after the first, and is open after the second."""
+GIVEN_UP_S: Final = 7.0
+"""By then a device that cannot open has said so, from anywhere."""
+IN_TIME: Final = (
+    f"RETRACTING, both out by {BEGUN_MM:g} mm in {BEGUN_S:g} s; in {OPEN_S:g} s IDLE, open, HOMED, no fault"
+)
 RUNNING: Final = f"in RUN, {INSIDE_MM:g} mm in, "
 
 
@@ -119,7 +129,12 @@ def _moved_mm(host: Host, start: State) -> tuple[float, float]:
     return state.left_position_mm - start.left_position_mm, state.right_position_mm - start.right_position_mm
 
 
-@check(PAGE, f"{RUNNING}Drive OFF", "RETRACTING, then IDLE at both open switches, HOMED, no fault", moves=True)
+@check(
+    OPENING,
+    f"{RUNNING}Drive OFF",
+    IN_TIME,
+    moves=True,
+)
 def off_opens(host: Host) -> str:
     """Parting: the gap opens, and nothing is latched."""
     host.running(INSIDE_MM)
@@ -127,9 +142,9 @@ def off_opens(host: Host) -> str:
 
 
 @check(
-    PAGE,
+    OPENING,
     f"{RUNNING}Retract, while Drive RUN goes on",
-    "acknowledged; RETRACTING, then IDLE at both open switches, HOMED, no fault",
+    f"acknowledged; {IN_TIME}",
     moves=True,
 )
 def retract_opens(host: Host) -> str:
@@ -140,11 +155,29 @@ def retract_opens(host: Host) -> str:
 
 
 def _opens(host: Host, beat: Beat) -> str:
-    before = positions(host.last(State))
-    host.shows(DeviceMode.RETRACTING, beat, besides=f"from {before}")
-    host.until(lambda: host.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED), OPENED_S, beat)
-    besides = f"from {before} to {positions(host.last(State))}: RETRACTING, then"
+    start = host.last(State)
+    host.shows(DeviceMode.RETRACTING, beat, besides=f"from {positions(start)}")
+    seen = f"from {positions(start)} to "
+    if not host.until(lambda: min(_moved_mm(host, start)) >= BEGUN_MM, BEGUN_S, beat):
+        what = "went the wrong way" if min(_moved_mm(host, start)) <= -BEGUN_MM else "did not begin"
+        raise Unmet(f"{what}: {seen}{positions(host.last(State))} in {BEGUN_S:g} s, {_given_up(host, beat)}")
+    if not host.until(lambda: _is_over(host), OPEN_S - BEGUN_S, beat):
+        late = host.last(State)
+        host.pass_time(SEEN_S, beat)
+        what = "too slow" if max(_moved_mm(host, late)) > 0.0 else "stands"
+        raise Unmet(f"{what}: {seen}{positions(late)} in {OPEN_S:g} s, {_given_up(host, beat)}")
+    besides = f"{seen}{positions(host.last(State))}: RETRACTING, then"
     return host.shows(DeviceMode.IDLE, beat, homed=True, opened=True, fault=NO_FAULT, besides=besides)
+
+
+def _is_over(host: Host) -> bool:
+    return host.status.mode in (DeviceMode.IDLE, DeviceMode.LATCHED)
+
+
+def _given_up(host: Host, beat: Beat) -> str:
+    """How a device ends that does not open in time: it has to say so."""
+    is_over = host.until(lambda: _is_over(host), GIVEN_UP_S, beat)
+    return f"then {shown(host.status)}" if is_over else f"and says nothing of it in {GIVEN_UP_S:g} s"
 
 
 @check(

@@ -162,6 +162,7 @@ class Rogue(CompiledFirmware):
         self.drive_s = 0.0
         self.was_homed = False
         self.zeroed_s = -1.0
+        self.opened_s = 0.0
 
     def receive(self, time_s: float, message: Message, sensors: Sensors) -> Answer:
         self.count[type(message)] += 1
@@ -356,6 +357,24 @@ def homed_before_zero(device: Rogue, time_s: float, measured: Measured) -> Measu
     if time_s < device.zeroed_s:
         state = state.replaced(left_position_mm=state.left_position_mm + device.real._left_zero_mm)
     return state, sense
+
+
+def opens_with(share: float) -> Callable[[Rogue, Output], Output]:
+    """While it opens, its bridges give this share of the right duties."""
+
+    def drives(device: Rogue, output: Output) -> Output:
+        if device.real.mode is not DeviceMode.RETRACTING:
+            return output
+        return Output(share * output.left_duty, share * output.right_duty, output.enabled)
+
+    return drives
+
+
+def stops_half_way(device: Rogue, time_s: float) -> None:
+    if device.real.mode is DeviceMode.RETRACTING and device.real.output.left_duty > 0.0:
+        device.opened_s += 1e-3
+        if device.opened_s > 0.08:
+            device.real._rest(time_s, DeviceMode.IDLE)
 
 
 SWAPPED = {DeviceMode.RUN: DeviceMode.HOMING, DeviceMode.HOMING: DeviceMode.RUN}
@@ -676,6 +695,10 @@ PLANTED = (
         ),
     ),
     rogue("OFF only switches off", "off_opens", before=off_only_switches_off),
+    rogue("does not begin to open", "off_opens", drives=opens_with(0.0)),
+    rogue("presses shut", "off_opens", drives=opens_with(-1.0)),
+    rogue("opens too slowly", "retract_opens", drives=opens_with(0.2)),
+    rogue("stops half way", "off_opens", ticked=stops_half_way),
     rogue("Retract is ignored", "retract_opens", hears=only_acknowledges(Retract)),
     rogue("needs no letting go", "let_go_after_retract", before=sets(object, _may_run=True)),
     rogue("Hello resets", "hello_in_run", receive=hello_resets),
@@ -728,6 +751,10 @@ PLANTED = (
 
 
 SAID = {
+    "does not begin to open": "did not begin: from left -1",
+    "presses shut": "went the wrong way: from left -1",
+    "opens too slowly": "too slow: from left -1",
+    "stops half way": "RETRACTING, then, IDLE, no fault",
     "hash reversed": "the wrong way round",
     "timeout of 65 ms": "58 ms after the last Drive: RUN, no fault",
     "state_crc": "State: CRC-8",

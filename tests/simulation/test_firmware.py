@@ -312,6 +312,18 @@ def test_how_a_run_ends(ending: Ending) -> None:
     assert (truth.left_mm, truth.right_mm) == pytest.approx((ending.left_mm, ending.right_mm), abs=ending.within_mm)
 
 
+@pytest.mark.parametrize(("percent", "within_s"), [(-100, 0.4), (-75, 3.5), (-200, 3.5)])
+def test_a_gap_that_does_not_open_is_said_in_the_time_of_its_stroke(percent: int, within_s: float) -> None:
+    """No current, too few volts, the wrong way: it was 8 s, whatever the stroke takes."""
+    host = running([f"opening={percent}%@3.5"], gap_mm=52.0)
+    host.run_until(3.5)
+    started_s = host.now_s
+    host.beat(Beat.OFF)
+    host.reaches(DeviceMode.LATCHED)
+    assert DeviceFault.RETRACT_FAILED in host.status.faults
+    assert host.now_s - started_s < within_s
+
+
 def test_a_fault_is_not_cleared_while_its_cause_lasts() -> None:
     host = running(["supply_loss@3.5"])
     host.run_until(3.5)

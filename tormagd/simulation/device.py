@@ -62,7 +62,7 @@ STANDING: Final = frozenset(
     }
 )
 """Faults that are there or not, and are asked for where they show."""
-OF_BRIDGES: Final = frozenset({"motor_dead_left", "supply_loss", "motor_reversed_left", "duties_reversed"})
+OF_BRIDGES: Final = frozenset({"motor_dead_left", "supply_loss", "motor_reversed_left", "duties_reversed", "opening"})
 LEFT_OPEN: Final = 1
 RIGHT_OPEN: Final = 2
 LEFT_CLOSED: Final = 4
@@ -131,6 +131,7 @@ class MessageDevice:
         self._drives = 0
         self._left_motor_sign = 1.0
         self._duty_sign = 1.0
+        self._opening_share = 1.0
         self._has_bad_encoders = False
         self._left_count_sign = 1
         self._left_extra_counts = 0
@@ -199,6 +200,8 @@ class MessageDevice:
             left_V, right_V = self._volts(output.left_duty), self._volts(output.right_duty)
             if self._duty_sign < 0.0 and self.firmware.mode is DeviceMode.RUN:
                 left_V, right_V = -left_V, -right_V
+            if self._opening_share != 1.0 and self.firmware.mode is DeviceMode.RETRACTING:
+                left_V, right_V = self._opening_share * left_V, self._opening_share * right_V
             self.plant.drive(None if "motor_dead_left" in self._struck else self._left_motor_sign * left_V, right_V)
         else:
             self.plant.drive(None, None)
@@ -338,7 +341,7 @@ class MessageDevice:
         self._struck.clear()
         self._stuck_handle = None
         self._answering_every = 1
-        self._left_motor_sign = self._duty_sign = 1.0
+        self._left_motor_sign = self._duty_sign = self._opening_share = 1.0
         if self._stuck_left is not None or self._left_count_sign < 0:
             self._count_on(None, 1)
         self._run_clock_at(time_s, 1.0 + parameters.firmware.clock_ppm * 1e-6)
@@ -390,6 +393,8 @@ class MessageDevice:
                 self._left_motor_sign = -1.0
             case "duties_reversed":
                 self._duty_sign = -1.0
+            case "opening":
+                self._opening_share = 1.0 + fault.percent / 100.0
             case "clock":
                 self._run_clock_at(time_s, self._rate * (1.0 + fault.percent / 100.0))
             case _ if fault.name not in STANDING:

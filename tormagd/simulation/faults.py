@@ -31,10 +31,11 @@ KNOWN = {
     "encoder_reversed_left": "the left encoder counts backwards from now on",
     "motor_reversed_left": "the left motor turns the other way",
     "duties_reversed": "in RUN the firmware takes an opening duty for a closing one",
+    "opening": "while the firmware opens, the motors get VALUE percent more volts; -200% is the wrong way",
     "switch_dead_left": "the left open switch never closes",
     "clock": "the device's clock runs fast by VALUE percent, as in clock=+2%",
 }
-SIZED = ("drag_left", "backlash", "clock")
+SIZED = ("drag_left", "backlash", "clock", "opening")
 FORMS = "NAME[=PERCENT%][@SECONDS] with NAME one of: " + "; ".join(f"{name}: {what}" for name, what in KNOWN.items())
 _FORM = re.compile(r"(?P<name>\w+)(?:=(?P<percent>[+-]?[\d.]+)%)?(?:@(?P<at_s>[\d.]+))?")
 
@@ -63,6 +64,7 @@ def parse_fault(spec: str) -> Fault:
         at_s, percent = float(match["at_s"] or 0.0), float(match["percent"] or 0.0)
     except ValueError as error:
         raise FaultError(f"fault {spec!r}: {error}") from error
-    if not (at_s < math.inf and -100.0 <= percent <= 10_000.0 and (name != "clock" or percent > -100.0)):
-        raise FaultError(f"fault {spec!r}: allowed are finite times and -100% to +10000%")
+    least = -200.0 if name == "opening" else -100.0
+    if not (at_s < math.inf and least <= percent <= 10_000.0 and (name != "clock" or percent > -100.0)):
+        raise FaultError(f"fault {spec!r}: allowed are finite times and {least:.0f}% to +10000%")
     return Fault(name, at_s, percent)

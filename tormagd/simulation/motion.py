@@ -23,7 +23,11 @@ PROGRESS_MM: Final = 0.05
 PATIENCE_S: Final = 0.3
 DEAD_CURRENT_A: Final = 0.02  # a connected motor draws ten times this at the duty that stands for no progress
 WRONG_WAY_MM: Final = 1.0  # back, while homing drives the carriage open: its motor or its encoder is reversed
-TIME_LIMIT_S: Final = 8.0  # the whole stroke at homing speed takes under 4 s
+HOMING_LIMIT_S: Final = 8.0  # the whole stroke at homing speed takes under 4 s
+SEARCH_SHARE: Final = 0.5  # of the speed of opening, about that of homing, from which it brakes at a switch
+STROKE_MM: Final = 25.5  # of a carriage, between its stops
+LEAST_SHARE: Final = 0.6  # of the speed of opening: what the weakest motors reach on the lowest supply
+LATE_S: Final = 0.5  # to turn round, to taper, to settle at the switch
 
 
 @final
@@ -107,6 +111,7 @@ class Retraction:
     """Opens the gap: both carriages to their switches, each as far as it comes.
 
     With a valid zero the speed tapers towards the open end; without one the search for the switch is slow throughout.
+    It may take the time of the whole stroke, wherever it begins: a dead encoder says nothing of what is left.
     """
 
     def __init__(
@@ -119,7 +124,7 @@ class Retraction:
         speed_mm_s: float,
         tapered: bool,
     ) -> None:
-        self._deadline_s = time_s + TIME_LIMIT_S
+        self._deadline_s = time_s + STROKE_MM / (LEAST_SHARE * speed_mm_s) + LATE_S
         self._speed_mm_s = speed_mm_s
         self._tapered = tapered
         self._openings = [Opening(time_s, carriage, lead_mm_rev, stall_A) for carriage in carriages]
@@ -151,7 +156,9 @@ class Retraction:
     def _bounded_mm_s(self, carriage: Carriage) -> float:
         if not self._tapered:
             return self._speed_mm_s
-        return min(self._speed_mm_s, CREEP_MM_S + TAPER_PER_S * max(-carriage.position_mm, 0.0))
+        # beyond where its switch should have been the zero is wrong, as after an encoder's leap: it searches there
+        most_mm_s = self._speed_mm_s if carriage.position_mm < 0.0 else SEARCH_SHARE * self._speed_mm_s
+        return min(most_mm_s, CREEP_MM_S + TAPER_PER_S * abs(carriage.position_mm))
 
 
 @final
@@ -170,7 +177,7 @@ class Homing:
         stall_A: float,
         speed_mm_s: float,
     ) -> None:
-        self._deadline_s = time_s + TIME_LIMIT_S
+        self._deadline_s = time_s + HOMING_LIMIT_S
         self._lead_mm_rev = lead_mm_rev
         self._stall_A = stall_A
         self._speed_mm_s = speed_mm_s
