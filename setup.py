@@ -37,7 +37,7 @@ COMPILED = {
     ),
     "tormagd/control/ask": ("skill", "forecast", "path", "governor"),
     "tormagd/control/aim": ("portrait", "floors", "aim"),
-    "tormagd/control/move": ("motor", "pid", "reference", "homing", "watch", "actuator", "carriages"),
+    "tormagd/control/move": ("motor", "pid", "reference", "homing", "opening", "watch", "actuator", "carriages"),
     "tormagd/assembly": ("conditions",),
     "tormagd/simulation": (
         *("curve", "axis", "gap_field", "warmth", "element", "second_element", "tactile_pad"),

@@ -245,7 +245,7 @@ def test_disable_and_stop_open(running) -> None:
 
 
 def test_a_cleared_fault_has_time_to_go_and_comes_back_if_it_stays(bench) -> None:
-    broken = {"faults": DeviceFault.OVERCURRENT, "mode": DeviceMode.LATCHED}
+    broken = {"faults": DeviceFault.OVERCURRENT, "mode": DeviceMode.LATCHED, "left_mm": 0.0, "right_mm": 0.0}
     bench.step(**broken)
     bench.command("clear-fault", device_latched=True)
     assert bench.step(**broken).request is DeviceRequest.CLEAR
@@ -428,7 +428,7 @@ def test_a_device_that_opened_because_of_a_stall_is_told_as_that(running, stall_
     assert not running.faults
     opened = {"faults": DeviceFault.COMMAND_TIMEOUT, "mode": DeviceMode.RETRACTING}
     assert running.run_into(fault, **opened) == 1
-    running.step(count=500, **opened | {"mode": DeviceMode.LATCHED})
+    running.step(count=300, **opened | {"mode": DeviceMode.LATCHED})
     assert running.faults == (fault,)
     assert running.is_opened
 

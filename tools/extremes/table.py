@@ -46,6 +46,7 @@ from tormagd.control.measure import Measure
 from tormagd.control.move.carriages import Carriages
 from tormagd.control.move.homing import Homing
 from tormagd.control.move.motor import full_speed_mm_s, margins
+from tormagd.control.move.opening import Opening
 from tormagd.control.move.pid import Pid
 from tormagd.control.move.reference import Reference, Speeds, follow, target_of
 from tormagd.control.move.watch import Watch
@@ -62,7 +63,7 @@ from tormagd.model.model_file import load_model
 from tormagd.model.shipped import model_path
 from tormagd.physics.errors import DomainError
 from tormagd.safety.codes import Fault
-from tormagd.safety.operating_state import Conditions, SafetyState, command
+from tormagd.safety.operating_state import Conditions, DeviceRequest, SafetyState, command
 from tormagd_client.messages import Setpoint, decode as decode_message
 
 PERIOD_S, PLAN_S, LONGEST_S = 1e-3, 4e-3, 1e-2
@@ -423,6 +424,14 @@ def homing(stage: Homing, draw: Draw) -> object:
     return [*stage.faults, *stage.went_back_mm]
 
 
+def opening(stage: Opening, draw: Draw) -> object:
+    now_s = draw.step(PERIOD_S)
+    mode = DeviceMode.RETRACTING if draw.steps % 4 else DeviceMode.IDLE
+    seen = measurement(draw, now_s).replaced(mode=mode)
+    stage.update(seen, draw.steps % 3 > 0, draw.steps % 5 == 0, SafetyState().ask(DeviceRequest.RETRACT))
+    return [*stage.faults, stage.left_late_s, stage.right_late_s, stage.waits_s]
+
+
 def watch(stage: Watch, draw: Draw) -> object:
     now_s = draw.step(PERIOD_S)
     seen, said, seeing = measured(draw, now_s), measurement(draw, now_s), Sight(PERIOD_S)
@@ -573,6 +582,7 @@ def stages() -> list[Stage]:
         Stage("move/reference", lambda: [Reference(80.0)], reference, PLANNED),
         Stage("move/motor", lambda: None, motor, CONFIGURATION),
         Stage("move/homing", lambda: Homing(2.6), homing, MEASUREMENT),
+        Stage("move/opening", lambda: Opening(CONFIG, made.scene), opening, MEASUREMENT),
         Stage("move/watch", lambda: Watch(CONFIG, made.scene), watch, MEASUREMENT),
         Stage("filter", lambda: [0.0], filtered, MEASUREMENT),
         Stage("interpolation", lambda: None, tables),

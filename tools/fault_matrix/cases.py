@@ -50,7 +50,8 @@ class Injection(NamedTuple):
     @property
     def passes(self) -> bool:
         """Whether its cause is gone again before anybody can do anything about it."""
-        return bool(self.stall_ms) or self.host in ("stop", "disable") or self.device in PASSING
+        is_ordered = self.host in ("stop", "disable") and self.device is None
+        return bool(self.stall_ms) or is_ordered or self.device in PASSING
 
 
 PASSING = ("reset", "frozen", "encoder_jump", "encoder_jump_left")
@@ -70,6 +71,16 @@ MATRIX = (
     Injection("another source takes over", (), FOLLOWED, host="other"),
     Injection("operator: stop", ("STOPPED",), host="stop"),
     Injection("operator: disable", (), host="disable"),
+    Injection(
+        "operator: disable, and the gap does not open",
+        ("NOT_OPENING", "DEVICE_RETRACT_FAILED"),
+        STAYS,
+        device="opening=-100%",
+        host="disable",
+    ),
+    Injection(
+        "operator: disable, and the gap opens too slowly", ("NOT_OPENING",), device="opening=-60%", host="disable"
+    ),
     # one of its streams stops
     Injection("no State any more", ("MEASUREMENT_STALE",), device="no_state"),
     Injection("no Sense any more", ("SENSE_STALE",), device="no_sense"),

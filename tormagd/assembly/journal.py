@@ -30,7 +30,7 @@ from tormagd.safety.codes import Fault, Limit
 from tormagd.safety.operating_state import Conditions, DeviceRequest, OperatingState, SafetyState
 from tormagd_client.messages import TickRecord
 
-FORMAT = 5
+FORMAT = 6
 "Of the entries and of the states in them: raised when one comes, is removed or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),

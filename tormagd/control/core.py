@@ -21,6 +21,7 @@ from tormagd.control.move.actuator import Actuator
 from tormagd.control.move.carriages import Carriages
 from tormagd.control.move.homing import Homing
 from tormagd.control.move.motor import full_speed_mm_s
+from tormagd.control.move.opening import Opening
 from tormagd.control.move.watch import Watch, ceiling_N
 from tormagd.control.records import Duty, Measured, Plan, TimedSetpoint
 from tormagd.hardware.measurement import Measurement
@@ -104,6 +105,7 @@ class Stepper:
         self.measure = Measure(home_mm, position.derivative_filter_s, slides, full_mm_s, period_s)
         self._ceiling_N: Final = ceiling_N(scene)
         self.homing = Homing(self._ceiling_N)
+        self.opening = Opening(config, scene)
         self.watch = Watch(config, scene)
         self.move: Actuator = Carriages(config, scene) if move is None else move
         self._period_s: Final = period_s
@@ -160,6 +162,7 @@ class Stepper:
         """The link broke: the device is forgotten; where it was driven, that is a fault."""
         if self.safety.is_driven:
             self.latch(Fault.LINK_LOST)
+        self.opening.rest(self.safety.request_number)
         self.measure.lose_device()
         self.move.lose_device()
 
@@ -169,9 +172,14 @@ class Stepper:
         shown = self.watch.faults(
             now_s, self.safety, measurement, measured, measure.sight, measure.leap, plan.sensor_doubted_s
         )
-        if not self.safety.is_driven:
+        if self.safety.is_driven:
+            self.opening.rest(self.safety.request_number)
+        else:
             self.homing.update(now_s, measurement)
-            shown = self.homing.faults + shown
+            is_placed = measured.is_homed and not self.safety.needs_homing
+            is_blind = measure.sight.is_blind or measure.leap is not None
+            self.opening.update(measurement, is_placed, is_blind, self.safety)
+            shown = self.homing.faults + self.opening.faults + shown
         self.safety = latch(self.safety, shown)
         if not self.safety.needs_homing:
             return measured

@@ -70,6 +70,7 @@ class Causes:
         if stepper.measure.leap is not None:
             figures[Fault.ENCODER] = str(stepper.measure.leap)
         figures |= dict.fromkeys(stepper.homing.faults, str(stepper.homing))
+        figures |= dict.fromkeys(stepper.opening.faults, str(stepper.opening))
         for fault in faults:
             if fault in figures:
                 self._told[fault] = f"{FAULTS[fault].cause}: {figures[fault]}"

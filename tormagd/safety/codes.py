@@ -82,6 +82,7 @@ class Fault(StrEnum):
     OVER_FORCE = "OVER_FORCE"
     SENSOR = "SENSOR"
     NO_MOTION = "NO_MOTION"
+    NOT_OPENING = "NOT_OPENING"
     DEVICE_NOT_RUNNING = "DEVICE_NOT_RUNNING"
 
 
@@ -334,6 +335,14 @@ FAULTS: dict[Fault, Explanation] = {
         Reaction.OPENING,
         250.0,
         "while a carriage is driven: 60 ms of a duty that moves one, which takes a following error to come about",
+        Position.LOST_HERE,
+    ),
+    Fault.NOT_OPENING: Explanation(
+        "the gap is to be open, and a carriage did not begin, stopped, went back or was slower than the device says",
+        "the insert still brakes: remove it by hand; check screws, motors and supply, then clear-fault and home",
+        Reaction.HELD,
+        500.0,
+        "while it is to be open",
         Position.LOST_HERE,
     ),
     Fault.DEVICE_NOT_RUNNING: Explanation(

@@ -1,0 +1,212 @@
+"""After `disable`, `stop` or a fault the gap opens, on both buses; where it does not, that is named in time."""
+
+import random
+from collections.abc import Callable
+
+import msgspec
+import pytest
+
+from firmware_protocol.codec import DeviceMode
+from tormagd.assembly.build import Core
+from tormagd.closed_loop import ClosedLoop, Sample, VirtualBus
+from tormagd.config import Config
+from tormagd.control.records import Plan
+from tormagd.safety.codes import Fault
+from tormagd.simulation.can_device import CanDevice
+from tormagd.simulation.device import MessageDevice, VirtualDevice
+from tormagd.simulation.faults import parse_fault
+from tormagd.simulation.firmware import Firmware
+from tormagd.simulation.hand import SteadyHand
+from tormagd.simulation.parameters import PlantParameters, load_plant
+
+CLOSED_MM, OPEN_MM = 48.0, 95.0
+NAMED_S = 0.5
+SHOULD_S = (OPEN_MM - CLOSED_MM) / 2.0 / Config().device.retract_mm_s + 0.3
+"When it should be open: the way at the device's speed, and what it takes to turn round and to taper."
+BUSES = ("serial", "can")
+Spoils = Callable[[MessageDevice, float], None]
+Opens = Callable[..., ClosedLoop]
+
+
+@pytest.fixture(scope="module")
+def closed(core: Core) -> Opens:
+    """A loop that has driven the gap to a place, on either bus. The handle rests, or the force would be a fault."""
+
+    def build(bus: str, plant: str | PlantParameters = "sample_1", gap_mm: float = CLOSED_MM, faults=()) -> ClosedLoop:
+        parameters = load_plant(plant) if isinstance(plant, str) else plant
+        struck = [parse_fault(fault) for fault in faults]
+        config, stepper = Config(), core.stepper()
+        if bus == "can":
+            device = CanDevice(MessageDevice(parameters, SteadyHand(0.0), struck, 1))
+            loop = ClosedLoop(config, stepper, None, VirtualBus(device))
+        else:
+            loop = ClosedLoop(config, stepper, None, VirtualDevice(parameters, SteadyHand(0.0), struck, 1))
+        loop.arm(gap_plan(OPEN_MM))
+        held(loop, gap_mm, 3.0)
+        assert loop.stepper.safety.faults == ()
+        return loop
+
+    return build
+
+
+def gap_plan(gap_mm: float, now_s: float = 0.0) -> Plan:
+    """A plan for a gap instead of a force."""
+    return Plan(1, now_s, None, None, 0.0, None, 0.0, gap_mm, 0.0, 1.0, ())
+
+
+def held(loop: ClosedLoop, gap_mm: float, seconds: float) -> list[Sample]:
+    return [loop.tick(plan=gap_plan(gap_mm, loop.now_s)) for _ in range(round(1e3 * seconds))]
+
+
+def named_s(loop: ClosedLoop, spoils: Spoils | None = None, seconds: float = 6.0) -> float | None:
+    """How long after now NOT_OPENING is latched; `spoils` is done to the device before each tick."""
+    begins_s = loop.now_s
+    while loop.now_s < begins_s + seconds:
+        if spoils is not None:
+            spoils(loop.simulated, loop.now_s)
+        if Fault.NOT_OPENING in held(loop, CLOSED_MM, 1e-3)[0].safety.faults:
+            return loop.now_s - begins_s
+    return None
+
+
+def never_begins(device: MessageDevice, time_s: float) -> None:
+    """The firmware forgets to open, and says nothing."""
+    assert isinstance(device.firmware, Firmware)
+    if device.firmware.mode is DeviceMode.RETRACTING:
+        device.firmware._rest(time_s, DeviceMode.IDLE)
+
+
+def stops_half_way(device: MessageDevice, time_s: float) -> None:
+    if device.truth.gap_mm > 70.0:
+        never_begins(device, time_s)
+
+
+@pytest.mark.parametrize("bus", BUSES)
+@pytest.mark.parametrize("command", ["disable", "stop"])
+def test_a_retract_that_does_not_begin_is_named(closed: Opens, bus: str, command: str) -> None:
+    loop = closed(bus)
+    loop.command(command)
+    found_s = named_s(loop, never_begins)
+    assert found_s is not None
+    assert found_s <= NAMED_S
+    assert loop.simulated.truth.gap_mm < 50.0
+
+
+@pytest.mark.parametrize("bus", BUSES)
+def test_a_retract_that_stops_half_way_is_named(closed: Opens, bus: str) -> None:
+    loop = closed(bus)
+    loop.command("disable")
+    begins_s, stopped_s = loop.now_s, []
+
+    def stops(device: MessageDevice, time_s: float) -> None:
+        if device.truth.gap_mm > 70.0 and device.firmware.mode is DeviceMode.RETRACTING:
+            stopped_s.append(time_s - begins_s)
+        stops_half_way(device, time_s)
+
+    found_s = named_s(loop, stops)
+    assert found_s is not None
+    assert found_s - stopped_s[0] <= NAMED_S
+
+
+@pytest.mark.parametrize("bus", BUSES)
+@pytest.mark.parametrize("percent", [-100, -200])
+def test_motors_that_do_not_open_or_press_shut_are_named(closed: Opens, bus: str, percent: int) -> None:
+    """The device may say it before: it finds no current, or a carriage that slips."""
+    loop = closed(bus, gap_mm=65.0, faults=[f"opening={percent}%"])
+    loop.command("disable")
+    begins_s, faults = loop.now_s, loop.stepper.safety.faults
+    while not faults and loop.now_s < begins_s + NAMED_S:
+        faults = held(loop, CLOSED_MM, 1e-3)[0].safety.faults
+    assert set(faults) & {Fault.NOT_OPENING, Fault.DEVICE_RETRACT_FAILED, Fault.DEVICE_UNCOMMANDED_MOTION}
+
+
+@pytest.mark.parametrize("bus", BUSES)
+@pytest.mark.parametrize("percent", [-60, -35])
+def test_a_retract_that_is_too_slow_is_named(closed: Opens, bus: str, percent: int) -> None:
+    loop = closed(bus, faults=[f"opening={percent}%"])
+    loop.command("disable")
+    found_s = named_s(loop)
+    assert found_s is not None
+    assert found_s <= SHOULD_S + NAMED_S
+
+
+@pytest.mark.parametrize("bus", BUSES)
+def test_after_a_fault_too(closed: Opens, bus: str) -> None:
+    loop = closed(bus)
+    loop.stepper.latch(Fault.PLAN_FAILED)
+    found_s = named_s(loop, never_begins)
+    assert found_s is not None
+    assert found_s <= NAMED_S
+
+
+def test_at_the_daemons_start_a_homed_device_that_stands_half_closed_is_named_and_opened(core: Core) -> None:
+    device = VirtualDevice(load_plant("sample_1"), SteadyHand(), [], 1)
+    firmware = device.messages.firmware
+    assert isinstance(firmware, Firmware)
+    firmware.homed, firmware._left_zero_mm, firmware._right_zero_mm = True, 7.5, 8.5
+    loop = ClosedLoop(Config(), core.stepper(), None, device)
+    found_s = named_s(loop)
+    assert found_s is not None
+    assert found_s <= NAMED_S + 0.1  # until the first State
+    held(loop, CLOSED_MM, 2.0)
+    assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0
+
+
+def with_supply(plant: PlantParameters, supply_V: float) -> PlantParameters:
+    return msgspec.structs.replace(plant, electronics=msgspec.structs.replace(plant.electronics, supply_V=supply_V))
+
+
+def at_temperature(plant: PlantParameters, ambient_C: float) -> PlantParameters:
+    return msgspec.structs.replace(plant, assumed=msgspec.structs.replace(plant.assumed, ambient_C=ambient_C))
+
+
+SAMPLES = {name: load_plant(name) for name in ("sample_1", "sample_2", "sample_3")}
+HEALTHY = {
+    **{f"{name} {bus}": (bus, plant) for name, plant in SAMPLES.items() for bus in BUSES},
+    **{f"{name} at 9.1 V": ("serial", with_supply(plant, 9.1)) for name, plant in SAMPLES.items()},
+    "14.9 V": ("can", with_supply(SAMPLES["sample_2"], 14.9)),
+    **{f"{ambient_C:g} C": ("serial", at_temperature(SAMPLES["sample_1"], ambient_C)) for ambient_C in (5.0, 40.0)},
+    "slow clock": ("serial", "clock=-5%"),
+    "worn": ("can", "worn_gearbox"),
+}
+
+
+@pytest.mark.parametrize("case", HEALTHY)
+def test_a_healthy_opening_is_no_fault(closed: Opens, case: str) -> None:
+    """From the closed end, while the carriages close at full speed, and again as it rests."""
+    bus, plant = HEALTHY[case]
+    loop = closed(bus, "sample_1", faults=[plant]) if isinstance(plant, str) else closed(bus, plant)
+    held(loop, 70.0, 1.5)
+    held(loop, CLOSED_MM, 0.3)
+    loop.command("disable")
+    assert named_s(loop, seconds=4.0) is None
+    assert loop.stepper.safety.faults == ()
+    assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0
+    for gap_mm in (94.0, 60.0):
+        loop.command("enable")
+        held(loop, gap_mm, 1.0)
+        loop.command("disable")
+        assert named_s(loop, seconds=3.0) is None
+
+
+@pytest.mark.parametrize("gap_mm", [50.0, 85.0])
+def test_a_line_that_loses_what_was_said_makes_no_fault(closed: Opens, gap_mm: float) -> None:
+    loop = closed("serial", gap_mm=gap_mm)
+    device, chance = loop.device, random.Random(3)
+
+    class Loses:
+        def __getattr__(self, name: str) -> object:
+            return getattr(device, name)
+
+        def receive(self, now_s: float, data: bytes) -> None:
+            if chance.random() > 0.1:
+                device.receive(now_s, data)
+
+        def transmit(self, now_s: float) -> bytes:
+            data = device.transmit(now_s)
+            return data if chance.random() > 0.1 else b""
+
+    loop.device = Loses()  # type: ignore[assignment]
+    loop.command("disable")
+    assert named_s(loop, seconds=4.0) is None
+    assert loop.simulated.truth.gap_mm > OPEN_MM - 1.0

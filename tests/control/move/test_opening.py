@@ -1,0 +1,152 @@
+"""The opening as it is watched: it begins, goes on, keeps to the device's speed, and ends open."""
+
+import pytest
+
+from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
+from tormagd.config import Config
+from tormagd.control.move.opening import LATE_S, OPEN_MM, Opening, is_open
+from tormagd.safety.codes import Fault
+from tormagd.safety.operating_state import DeviceRequest, SafetyState, latch
+from tormagd.scenes.scene import load_scene
+
+CONFIG = Config()
+SPEED_MM_S = CONFIG.device.retract_mm_s
+BOTH = Switches.LEFT_OPEN | Switches.RIGHT_OPEN
+LATCHED = {"mode": DeviceMode.LATCHED, "switches": Switches(0)}
+
+
+class Opens:
+    """A device that is to open, a look every millisecond; faults are latched as the core does."""
+
+    def __init__(self, measure) -> None:
+        self._measure, self.ticks = measure, 0
+        self.opening = Opening(CONFIG, load_scene("coronary"))
+        self.safety = SafetyState()
+        self.ask()
+
+    def ask(self) -> None:
+        self.safety = self.safety.ask(DeviceRequest.RETRACT)
+
+    def look(self, seconds: float, start_mm: float = -20.0, speed_mm_s: float = 0.0, **changes: object) -> float | None:
+        """After how many seconds a fault shows; None where none does."""
+        for step in range(1, round(seconds * 1e3) + 1):
+            self.ticks += 1
+            at_mm = min(start_mm + 1e-3 * step * speed_mm_s, 0.0)
+            seen = {"mode": DeviceMode.RETRACTING, "left_mm": at_mm, "right_mm": at_mm, **changes}
+            measured = self._measure(self.ticks, **seen)
+            is_placed = measured.is_homed and not self.safety.needs_homing
+            self.opening.update(measured, is_placed, False, self.safety)
+            if self.opening.faults:
+                self.safety = latch(self.safety, self.opening.faults)
+                return 1e-3 * step
+        return None
+
+
+@pytest.fixture
+def opens(measure) -> Opens:
+    return Opens(measure)
+
+
+@pytest.mark.parametrize("start_mm", [-25.0, -12.0, -2.0, -0.2])
+def test_an_ordinary_opening(opens: Opens, start_mm: float) -> None:
+    assert opens.look(0.1, start_mm) is None
+    assert opens.look(2.0, start_mm, SPEED_MM_S) is None
+    assert opens.look(5.0, 0.0, mode=DeviceMode.IDLE, switches=Switches.HOMED | BOTH) is None
+    assert opens.look(5.0, -0.3, mode=DeviceMode.IDLE) is None
+
+
+@pytest.mark.parametrize("start_mm", [-25.0, -12.0, -2.0])
+@pytest.mark.parametrize("mode", [DeviceMode.IDLE, DeviceMode.RETRACTING, DeviceMode.RUN])
+def test_one_that_does_not_begin(opens: Opens, start_mm: float, mode: DeviceMode) -> None:
+    assert opens.look(1.0, start_mm, mode=mode) == pytest.approx(LATE_S, abs=3e-3)
+    assert f"left {-start_mm:.1f} mm from open, {LATE_S:.2f} s late" in str(opens.opening)
+
+
+def test_one_that_stops_half_way(opens: Opens) -> None:
+    assert opens.look(0.8, -25.0, SPEED_MM_S) is None
+    assert opens.look(1.0, -13.0, mode=DeviceMode.IDLE) == pytest.approx(LATE_S, abs=3e-3)
+
+
+def test_one_carriage_that_stops(opens: Opens) -> None:
+    assert opens.look(1.0, -25.0, SPEED_MM_S, right_mm=-20.0) == pytest.approx(LATE_S, abs=3e-3)
+
+
+def test_one_that_goes_the_wrong_way(opens: Opens) -> None:
+    assert opens.look(1.0, -12.0, -SPEED_MM_S) == pytest.approx(LATE_S / 2.0, abs=3e-3)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.8])
+def test_one_that_is_too_slow_is_named_half_a_second_late_at_most(opens: Opens, share: float) -> None:
+    named_s = opens.look(8.0, -25.0, share * SPEED_MM_S)
+    assert named_s == pytest.approx(LATE_S / (1.0 - share), rel=0.02)
+    assert named_s is not None
+    assert named_s < 25.0 / SPEED_MM_S + 0.5
+
+
+def test_a_low_supply_explains_a_lower_speed(opens: Opens) -> None:
+    assert opens.look(5.0, -25.0, 0.7 * SPEED_MM_S, supply_V=9.0) is None
+    assert opens.look(5.0, -25.0, 0.3 * SPEED_MM_S, supply_V=0.0) is not None
+
+
+def test_a_line_that_shows_nothing_for_a_while_hides_no_opening_and_no_standstill(opens: Opens) -> None:
+    """While no State comes nothing is concluded from places; the next one has the whole way in it, or has not."""
+    assert opens.look(0.2, -25.0, SPEED_MM_S) is None
+    opens.ticks += 700
+    assert opens.look(0.1, -11.5, SPEED_MM_S) is None
+    opens.ticks += 700
+    assert opens.look(0.1, -10.0) == pytest.approx(1e-3)
+
+
+def test_a_fault_is_told_once_and_again_after_another_request(opens: Opens) -> None:
+    assert opens.look(1.0) is not None
+    assert opens.safety.faults == (Fault.NOT_OPENING,)
+    assert opens.look(5.0) is None
+    opens.safety = opens.safety.replaced(faults=(), needs_homing=False)
+    assert opens.look(5.0, mode=DeviceMode.IDLE) is None
+    opens.ask()
+    assert opens.look(1.0) == pytest.approx(LATE_S, abs=3e-3)
+
+
+def test_at_the_start_a_homed_device_that_stands_half_closed_is_named_unasked(opens: Opens) -> None:
+    opens.safety = SafetyState()
+    assert opens.look(1.0, mode=DeviceMode.IDLE) == pytest.approx(LATE_S, abs=3e-3)
+
+
+def test_a_device_without_a_zero_is_judged_by_what_it_says(opens: Opens) -> None:
+    unhomed = {"switches": Switches(0)}
+    opens.safety = SafetyState()
+    assert opens.look(5.0, mode=DeviceMode.IDLE, **unhomed) is None  # nobody has asked
+    opens.ask()
+    assert opens.look(5.0, mode=DeviceMode.IDLE, switches=BOTH) is None
+    assert opens.look(4.0, **unhomed) is None  # it searches
+    assert opens.look(5.0, 0.0, mode=DeviceMode.IDLE, switches=BOTH) is None
+    assert opens.look(1.0, mode=DeviceMode.IDLE, **unhomed) == pytest.approx(LATE_S, abs=3e-3)
+    assert f"not open by its switches for {LATE_S:.2f} s" in str(opens.opening)
+
+
+def test_a_search_that_does_not_end_is_named(opens: Opens) -> None:
+    assert 5.0 < (opens.look(9.0, switches=Switches(0)) or 0.0) < 7.0
+
+
+@pytest.mark.parametrize("fault", [DeviceFault.RETRACT_FAILED, DeviceFault.HOMING_FAILED | DeviceFault.SUPPLY])
+def test_a_device_that_says_itself_that_it_failed_is_not_told_twice(opens: Opens, fault: DeviceFault) -> None:
+    assert opens.look(5.0, **LATCHED, faults=fault) is None
+    assert opens.look(1.0, **LATCHED, faults=DeviceFault.COMMAND_TIMEOUT) == pytest.approx(LATE_S, abs=3e-3)
+
+
+def test_a_homing_and_a_device_that_was_away_are_no_failure(opens: Opens) -> None:
+    assert opens.look(5.0, mode=DeviceMode.HOMING, switches=Switches(0)) is None
+    assert opens.look(5.0, mode=DeviceMode.IDLE, switches=Switches(0)) is None
+    opens.ask()
+    assert opens.look(0.3) is None
+    opens.opening.rest(opens.safety.request_number)
+    assert opens.look(5.0, mode=DeviceMode.IDLE, switches=Switches(0)) is None
+
+
+def test_open_is_by_places_or_by_both_switches(measure) -> None:
+    near = measure(1, left_mm=-OPEN_MM, right_mm=0.1)
+    assert is_open(near, True)
+    assert not is_open(near, False)
+    assert not is_open(measure(1, left_mm=-OPEN_MM, right_mm=-OPEN_MM - 0.1), True)
+    assert is_open(measure(1, switches=BOTH), False)
+    assert not is_open(measure(1, switches=Switches.LEFT_OPEN), False)

@@ -1,0 +1,144 @@
+"""The gap's opening, watched from here: while nothing is driven, each carriage is at its open end or there in time.
+
+    late  <-  max(late + dt - way / v, 0)        way: opened by since the last State; v: the device's own speed
+
+A carriage that stands loses a second in each second, a slow one what it is slower by, one that goes back more. So it is
+named LATE_S after it should have moved, or have been there, from wherever it began. Opening is the firmware's own
+routine. While positions are not known (not homed, or no State comes) its word is judged instead: once asked, it says
+that it opens, for no longer than a search of the switches takes, or shows both open switches, or that it failed.
+"""
+
+from typing import Final, final
+
+from firmware_protocol.codec import DeviceFault, DeviceMode
+from tormagd.config import Config
+from tormagd.hardware.measurement import Measurement
+from tormagd.safety.codes import Fault
+from tormagd.safety.operating_state import DeviceRequest, SafetyState
+from tormagd.scenes.scene import Scene
+
+LATE_S: Final = 0.35
+"""Carriages that close at full speed turn round in 0.1 s, a bad line loses a request twice in 0.1 s, and weak motors of
+the plant card lose 0.1 s over the whole stroke beyond what a low supply explains."""
+OPEN_MM: Final = 0.5
+"A carriage that is so near its switch is open: the force is within 2 % of the open gap's, and the device creeps there."
+SEARCH_SHARE: Final = 0.5
+"Without a zero a device opens at half of its speed or more, for it does not know where its switches are."
+REPORT_S: Final = 0.1
+"Status comes every 20 ms: more than this between two was no time in which the device was heard."
+LOWEST_SUPPLY: Final = 0.5
+"Of the nominal voltage: what reads less gives no speed, and the device says so itself."
+
+_HOMING: Final = DeviceMode.HOMING
+_RETRACTING: Final = DeviceMode.RETRACTING
+_RETRACT: Final = DeviceRequest.RETRACT
+_FAILED: Final = int(DeviceFault.RETRACT_FAILED) | int(DeviceFault.HOMING_FAILED)
+
+
+def is_open(measurement: Measurement, is_placed: bool) -> bool:
+    """Whether the gap is open: by the carriages' places where `is_placed`, and else by both open switches."""
+    if is_placed:
+        return min(measurement.left_mm, measurement.right_mm) >= -OPEN_MM
+    return measurement.is_left_open and measurement.is_right_open
+
+
+@final
+class Opening:
+    """Watches a device that is not driven from here."""
+
+    is_watching: bool = False
+    device_s: float = 0.0
+    "The device's clock at the newest State,"
+    left_mm: float = 0.0
+    "where the carriages were then,"
+    right_mm: float = 0.0
+    left_late_s: float = 0.0
+    "and how much later they are than at the device's own speed."
+    right_late_s: float = 0.0
+    reported_s: float = 0.0
+    "When the newest Status came,"
+    waits_s: float = 0.0
+    "and for how long a device whose carriages' places are not known has not been open."
+    unheard_request: int = 0
+    "The newest request before this watch: it was another device's, or was for another end."
+    told_request: int = -1
+    "The request that followed the newest fault. Only what is asked for after it is judged."
+    faults: tuple[Fault, ...] = ()
+    "What was wrong at the newest look; told once."
+
+    def __init__(self, config: Config, scene: Scene) -> None:
+        self._full_mm_s: Final = config.device.retract_mm_s
+        self._supply_V: Final = config.motor.supply_V
+        # a device without a zero may be anywhere, and says by itself that it failed: this is for one that does not
+        self._search_s: Final = 0.5 * scene.insert.gap_open_mm / (SEARCH_SHARE * self._full_mm_s) + LATE_S
+
+    def __str__(self) -> str:
+        if self.waits_s > 0.0:
+            return f"not open by its switches for {self.waits_s:.2f} s; where the carriages are is not known"
+        return (
+            f"left {-self.left_mm:.1f} mm from open, {self.left_late_s:.2f} s late; "
+            f"right {-self.right_mm:.1f} mm, {self.right_late_s:.2f} s"
+        )
+
+    def rest(self, request_number: int) -> None:
+        """Nothing is watched: the device is driven, homes, or has gone. What was asked for so far is not judged."""
+        self.is_watching, self.unheard_request, self.told_request, self.faults = False, request_number, -1, ()
+
+    def update(self, measurement: Measurement, is_placed: bool, is_blind: bool, safety: SafetyState) -> None:
+        """Takes one more look at the device. `is_placed`: its carriages' places are known; `is_blind`: not now."""
+        number = safety.request_number
+        if self.faults:
+            self.told_request, self.faults = number, ()
+        if measurement.mode is _HOMING:
+            self.rest(number)
+            return
+        if number <= self.told_request:
+            self.is_watching = False
+            return
+        if not self.is_watching:
+            self._begin(measurement)
+        if not is_placed or is_blind:
+            is_asked = safety.request is _RETRACT and number > self.unheard_request
+            self._listen(measurement, is_asked, is_placed)
+        else:
+            self._follow(measurement)
+
+    def _begin(self, measurement: Measurement) -> None:
+        self.is_watching = True
+        self.left_late_s = self.right_late_s = self.waits_s = 0.0
+        self.reported_s = measurement.reported_s
+        self._place(measurement)
+
+    def _place(self, measurement: Measurement) -> None:
+        self.device_s = measurement.device_time_s
+        self.left_mm, self.right_mm = measurement.left_mm, measurement.right_mm
+
+    def _follow(self, measurement: Measurement) -> None:
+        dt_s = max(measurement.device_time_s - self.device_s, 0.0)
+        share = min(max(measurement.supply_V / self._supply_V, LOWEST_SUPPLY), 1.0)
+        speed_mm_s = share * self._full_mm_s
+        self.left_late_s = _late_s(self.left_late_s + dt_s, self.left_mm, measurement.left_mm, speed_mm_s)
+        self.right_late_s = _late_s(self.right_late_s + dt_s, self.right_mm, measurement.right_mm, speed_mm_s)
+        self._place(measurement)
+        self.waits_s, self.reported_s = 0.0, measurement.reported_s
+        if max(self.left_late_s, self.right_late_s) > LATE_S:
+            self.faults = (Fault.NOT_OPENING,)
+
+    def _listen(self, measurement: Measurement, is_asked: bool, is_placed: bool) -> None:
+        if not is_placed:
+            self._place(measurement)
+        dt_s = min(measurement.reported_s - self.reported_s, REPORT_S)
+        self.reported_s = measurement.reported_s
+        opens = measurement.mode is _RETRACTING
+        shown: int = measurement.faults
+        if is_open(measurement, False) or shown & _FAILED or not (opens or is_asked):
+            self.waits_s = 0.0
+            return
+        self.waits_s += dt_s
+        if self.waits_s > (self._search_s if opens else LATE_S):
+            self.faults = (Fault.NOT_OPENING,)
+
+
+def _late_s(late_s: float, before_mm: float, now_mm: float, speed_mm_s: float) -> float:
+    """How late a carriage is that was as late before it came from there to here; one that is open is not."""
+    return 0.0 if now_mm >= -OPEN_MM else max(late_s - (now_mm - before_mm) / speed_mm_s, 0.0)
