@@ -27,6 +27,9 @@ def run_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, 
 
 SUPPLY = {"code": "SUPPLY", "cause": "supply voltage low", "remedy": "check the power supply"}
 IN_FAULT = {"operating_state": "FAULT", "faults": ["SUPPLY"], "fault_details": [SUPPLY]}
+STOPPED = {"code": "STOPPED", "cause": "somebody gave the stop command", "remedy": "clear-fault"}
+STANDS = {"code": "NOT_OPENING", "cause": "it stands", "remedy": "remove the insert by hand"}
+SHUT = {"operating_state": "FAULT", "faults": ["STOPPED", "NOT_OPENING"], "fault_details": [STOPPED, STANDS]}
 Row = tuple[dict[str, Any], dict[str, Any], int, list[str]]
 UNDONE: list[Row] = [
     ({}, result, 1, ['"code":"not_done"']) for result in ({}, {"operating_state": None}, {"operating_state": "ASLEEP"})
@@ -51,8 +54,20 @@ ANSWERS: dict[str, list[Row]] = {
     "record /nowhere/a.mcap": [({}, {}, 2, ["/nowhere/a.mcap: No such file"])],
     # a command is done where the answer says so
     "stop": [
-        ({}, {"operating_state": "FAULT", "is_connected": True}, 0, ["the gap opens"]),
+        ({"is_open": True}, {"operating_state": "FAULT", "is_connected": True}, 0, ["latched; the gap is open"]),
         ({}, {"operating_state": "FAULT", "is_connected": False}, 1, ["nothing could be sent"]),
+        (SHUT, {"operating_state": "FAULT", "is_connected": True}, 4, ["is not open: STOPPED, NOT_OPENING: it stands"]),
+    ],
+    "stop --no-wait": [({}, {"operating_state": "FAULT", "is_connected": True}, 0, ["the gap opens"])],
+    "disable": [
+        ({"is_open": True}, {"operating_state": "DISABLED"}, 0, ["disabled; the gap is open"]),
+        (SHUT, {"operating_state": "DISABLED"}, 4, ["is not open: STOPPED, NOT_OPENING: it stands"]),
+        (SHUT | {"is_busy": True}, {"operating_state": "DISABLED"}, 4, ["NOT_OPENING: it stands", "remove the insert"]),
+    ],
+    "disable --no-wait": [({}, {"operating_state": "DISABLED"}, 0, ["disabled; the gap opens"])],
+    "disable --timeout 0.1": [
+        ({"is_busy": True, "is_open": True}, {"operating_state": "DISABLED"}, 1, ["0.1 s the gap is not open: 70.0"]),
+        ({"gap_mm": None}, {"operating_state": "DISABLED"}, 1, ["after 0.1 s the gap is not known to be open"]),
     ],
     "take b": [
         ({}, {"source": "b", "instead_of": "a"}, 0, ["'b' holds the brake instead of 'a'"]),
@@ -117,7 +132,8 @@ def test_a_status_without_a_key_names_it(fake_daemon, capsys):
 def test_a_command_reaches_the_daemon_under_its_name(fake_daemon, capsys, command):
     done = {"operating_state": DONE[command][1][0]}
     fake_daemon.answers[command] = lambda: {"ok": True, "result": done}
-    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, command)
+    at_once = ["--no-wait"] if command in ("disable", "stop") else []
+    code, printed = run_json(capsys, "--endpoint", fake_daemon.control, command, *at_once)
     assert (code, printed["command"], printed["result"]) == (0, command, done)
     assert fake_daemon.commands == (["status", command] if command == "clear-fault" else [command])
 

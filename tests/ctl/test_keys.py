@@ -108,23 +108,25 @@ def test_a_key_is_shown_by_option_by_environment_and_by_configuration(
     keys: Path, guarded: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     mine, server = str(keys / "console.key_secret"), str(keys / "server.key")
-    code, printed = run_json(capsys, "--endpoint", guarded, "--key", mine, "--server-key", server, "disable")
+    code, printed = run_json(
+        capsys, "--endpoint", guarded, "--key", mine, "--server-key", server, "disable", "--no-wait"
+    )
     assert (code, printed["result"]) == (0, {"operating_state": "DISABLED"})
     config = tmp_path / "client.toml"
     config.write_text(
         f'[endpoints]\ncontrol = "{guarded}"\n[endpoints.curve]\nclient_secret = "{mine}"\nserver_public = "{server}"\n'
     )
-    assert main(["--config", str(config), "disable"]) == 0
+    assert main(["--config", str(config), "disable", "--no-wait"]) == 0
     monkeypatch.setenv(KEY, mine)
     monkeypatch.setenv(SERVER_KEY, server)
-    assert main(["--endpoint", guarded, "disable"]) == 0
+    assert main(["--endpoint", guarded, "disable", "--no-wait"]) == 0
 
 
 def test_another_key_or_none_is_not_answered_and_the_hint_says_where_to_look(
     keys: Path, guarded: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for arguments in ((), ("--key", str(keys / "robot.key_secret"), "--server-key", str(keys / "server.key"))):
-        code, printed = run_json(capsys, "--endpoint", guarded, "--wait", "0.3", *arguments, "disable")
+        code, printed = run_json(capsys, "--endpoint", guarded, "--wait", "0.3", *arguments, "disable", "--no-wait")
         assert (code, printed["error"]["code"]) == (3, "unreachable")
         assert "--key and --server-key" in printed["error"]["hint"]
 

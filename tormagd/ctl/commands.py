@@ -99,6 +99,26 @@ def _operate(help_text: str) -> Command:
     return Command(help_text, "operate.operate", ("client", "command"))
 
 
+def _waiting(usual_s: float) -> tuple[Option, ...]:
+    """The options of a command that waits until the carriages have arrived."""
+    return (
+        option(
+            "--timeout",
+            dest="timeout_s",
+            type=ABOVE_ZERO,
+            default=usual_s,
+            metavar="S",
+            help=f"wait this long ({usual_s:g})",
+        ),
+        option("--no-wait", dest="is_waiting", action="store_false", help="do not wait until it is done"),
+    )
+
+
+def _open_gap(help_text: str) -> Command:
+    # a device without a zero searches its switches for six seconds at most
+    return Command(help_text, "operate.open_gap", ("client", "command"), _waiting(10.0))
+
+
 COMMANDS = {
     "status": Command("what the daemon is doing", "status.status", ("client",)),
     "top": Command(
@@ -111,10 +131,10 @@ COMMANDS = {
     ),
     "ports": Command("where a device could be connected, and who holds what is there", "ports.ports", ("config",)),
     "enable": _operate("start rendering force (homed, fresh measurements and a neutral setpoint needed)"),
-    "disable": _operate("open the gap, then drives off"),
+    "disable": _open_gap("open the gap, then drives off; waits until it is open"),
     "pause": _operate("hold the gap where it is"),
     "resume": _operate("go on after pause"),
-    "stop": _operate("open the gap and latch; needs clear-fault"),
+    "stop": _open_gap("open the gap and latch; waits until it is open; needs clear-fault"),
     "clear-fault": _operate("forget latched faults; stays disabled"),
     "take": Command(
         "give the brake to another source; the force goes to its setpoints along a ramp",
@@ -126,12 +146,7 @@ COMMANDS = {
         "find the home switches of both carriages",
         "operate.home",
         ("client",),
-        (
-            option(
-                "--timeout", dest="timeout_s", type=ABOVE_ZERO, default=30.0, metavar="S", help="wait this long (30)"
-            ),
-            option("--no-wait", dest="is_waiting", action="store_false", help="do not wait until it is done"),
-        ),
+        _waiting(30.0),
     ),
     "send": Command(
         "publish setpoints (a synthetic shape, or a CSV file t_s,force_N); done if they were rendered",

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections.abc import Iterator
 
 from tormagd.ctl.outcome import CommandError, Exit, Outcome, is_terminal
 from tormagd_client.blocking import Client
@@ -25,6 +26,12 @@ STOPPED_WITHOUT_DEVICE = (
     "latched, but no device is connected: nothing could be sent, and the gap does not open. The device is told to open "
     "it when it is back; tormagctl status shows the link"
 )
+IS_OPEN = {
+    "disable": "disabled; the gap is open",
+    "stop": "stopped and latched; the gap is open. tormagctl clear-fault when it is safe to go on",
+}
+STAYED_SHUT = ("NOT_OPENING", "DEVICE_RETRACT_FAILED")
+"The faults that say of a gap that it does not open."
 COMES_BACK_S = 0.6
 "So long the daemon waits for the device to say that a fault is gone (CLEARING_S), and then calls it a fault again."
 
@@ -53,6 +60,31 @@ def operate(client: Client, command: str) -> Outcome:
     return Outcome(result, text)
 
 
+def open_gap(client: Client, command: str, timeout_s: float, is_waiting: bool) -> Outcome:
+    """Give `disable` or `stop`, and wait until the gap is open.
+
+    Raises CommandError as `operate` does: FAULT where the device is given up, or what `disable` met on the way; REFUSED
+    where the gap is not known to be open within `timeout_s`.
+    """
+    begun = operate(client, command)
+    if begun.exit_code is not Exit.DONE or not is_waiting:
+        return begun
+    gap_mm = None
+    for elapsed_s, state in _looks(client, "opening", timeout_s):
+        gap_mm = state.gap_mm
+        if state.is_open and not state.is_busy:
+            return Outcome({**begun.result, "seconds": round(elapsed_s, 2)}, IS_OPEN[command])
+        # stop has latched STOPPED itself, and what was latched before it may be over
+        if command == "disable" or (not state.is_busy and not set(STAYED_SHUT).isdisjoint(state.faults)):
+            require_no_fault(state, "the gap is not open")
+    raise CommandError(
+        Exit.REFUSED,
+        "not_open",
+        f"after {timeout_s:g} s the gap is not " + ("known to be open" if gap_mm is None else f"open: {gap_mm:.1f} mm"),
+        "it goes on by itself; tormagctl status shows how far",
+    )
+
+
 def take(client: Client, source: str) -> Outcome:
     """Give the brake to `source`, whoever holds it."""
     result = client.request("take", source=source)
@@ -77,35 +109,21 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     result = client.request("home")
     if not is_waiting:
         return Outcome(result, "homing; tormagctl status shows when it is done")
-    started_s = time.monotonic()
     has_begun = False
-    shows_progress = is_terminal(sys.stderr)
-    try:
-        while (elapsed_s := time.monotonic() - started_s) < timeout_s:
-            state = client.status()
-            require_no_fault(state, "fault while homing")
-            # a homing that was over between two looks still shows, as a device that is homed and was not
-            has_begun = has_begun or state.is_busy or (state.is_homed and not was_homed)
-            if has_begun and not state.is_busy:
-                if state.is_homed:
-                    return Outcome({**result, "seconds": round(elapsed_s, 2)}, f"homed in {elapsed_s:.1f} s")
-                raise CommandError(
-                    Exit.REFUSED, "not_homed", "homing ended, but the device is not homed", "tormagctl status"
-                )
-            if not has_begun and elapsed_s > BEGIN_S:
-                raise CommandError(
-                    Exit.REFUSED,
-                    "not_begun",
-                    "the device did not begin to home",
-                    "look at the link in tormagctl status",
-                )
-            if shows_progress:
-                gap = "not known" if state.gap_mm is None else f"{state.gap_mm:.1f} mm"
-                print(f"\rhoming {elapsed_s:5.1f} s, gap {gap}   ", end="", file=sys.stderr, flush=True)
-            time.sleep(POLL_S)
-    finally:
-        if shows_progress:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+    for elapsed_s, state in _looks(client, "homing", timeout_s):
+        require_no_fault(state, "fault while homing")
+        # a homing that was over between two looks still shows, as a device that is homed and was not
+        has_begun = has_begun or state.is_busy or (state.is_homed and not was_homed)
+        if has_begun and not state.is_busy:
+            if state.is_homed:
+                return Outcome({**result, "seconds": round(elapsed_s, 2)}, f"homed in {elapsed_s:.1f} s")
+            raise CommandError(
+                Exit.REFUSED, "not_homed", "homing ended, but the device is not homed", "tormagctl status"
+            )
+        if not has_begun and elapsed_s > BEGIN_S:
+            raise CommandError(
+                Exit.REFUSED, "not_begun", "the device did not begin to home", "look at the link in tormagctl status"
+            )
     raise CommandError(
         Exit.REFUSED,
         "timeout",
@@ -114,11 +132,30 @@ def home(client: Client, timeout_s: float, is_waiting: bool) -> Outcome:
     )
 
 
+def _looks(client: Client, doing: str, timeout_s: float) -> Iterator[tuple[float, Status]]:
+    """The status again and again for so long, with the seconds since the first; on a terminal a line of progress."""
+    started_s = time.monotonic()
+    shows_progress = is_terminal(sys.stderr)
+    try:
+        while (elapsed_s := time.monotonic() - started_s) < timeout_s:
+            state = client.status()
+            yield elapsed_s, state
+            if shows_progress:
+                gap = "not known" if state.gap_mm is None else f"{state.gap_mm:.1f} mm"
+                print(f"\r{doing} {elapsed_s:5.1f} s, gap {gap}   ", end="", file=sys.stderr, flush=True)
+            time.sleep(POLL_S)
+    finally:
+        if shows_progress:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
 def require_no_fault(state: Status, what: str) -> None:
     """Raise CommandError (FAULT) where the device is in FAULT: which, why, and what to do."""
     if state.operating_state != "FAULT":
         return
-    first = state.fault_details[0] if state.fault_details else Explained("FAULT", "see tormagctl status", "")
+    # what the device met says more than that somebody stopped it
+    told = sorted(state.fault_details, key=lambda each: each.code == "STOPPED")
+    first = told[0] if told else Explained("FAULT", "see tormagctl status", "")
     raise CommandError(
         Exit.FAULT,
         "fault",

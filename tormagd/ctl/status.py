@@ -43,6 +43,7 @@ def status_text(known: Status, colour: Colour) -> str:
     paint = {"ENABLED": colour.green, "PAUSED": colour.yellow, "FAULT": colour.red}.get(state, colour.bold)
     is_running = known.link.state == "RUNNING"
     flags = ["homed" if known.is_homed else colour.yellow("not homed"), *(["busy"] if known.is_busy else [])]
+    flags += ["open"] if known.is_open else []
     lines = [
         f"state     {paint(state)}, {', '.join(flags)}",
         *_codes(known.faults, known.fault_details, "fault", colour.red),

@@ -44,6 +44,8 @@ SERVED_AFTER = 1
 thread has no real-time priority."""
 LONGEST_RETRACT_S = 10.0
 "A full stroke takes the firmware 3 s at its own retract speed; longer means that it cannot, and it says so itself."
+NAMED_S = 0.5
+"By then a gap that does not open is a fault, and in the log."
 
 log = logging.getLogger(__name__)
 
@@ -226,3 +228,5 @@ class Daemon:
         until_s = time.monotonic() + LONGEST_RETRACT_S
         while self._telemetry.is_busy() and time.monotonic() < until_s:
             await asyncio.sleep(OPENING_LOOK_S)
+        if self._telemetry.is_open() is False:
+            await asyncio.sleep(NAMED_S)

@@ -13,6 +13,7 @@ from tormagd.assembly.belief import beliefs
 from tormagd.assembly.build import Core
 from tormagd.assembly.conditions import conditions, is_busy, is_homed
 from tormagd.config import Config
+from tormagd.control.move.opening import is_open
 from tormagd.control.records import Plan
 from tormagd.daemon import notify
 from tormagd.daemon.black_box import ASKED, BlackBox
@@ -161,6 +162,11 @@ class TelemetryLoop:
         """Whether the device homes or opens, or is about to."""
         connection, control = self._connection, self._control
         return is_busy(connection.measurement, connection.pending, control.stepper, control.output)
+
+    def is_open(self) -> bool | None:
+        """Whether the gap is open; None without a device."""
+        measurement = self._connection.measurement
+        return None if measurement is None else is_open(measurement, self._is_homed())
 
     def _is_homed(self) -> bool:
         return is_homed(self._connection.measurement, self._control.stepper.measured)
@@ -330,4 +336,5 @@ class TelemetryLoop:
             black_box=self._box.report(),
             output=OutputReport(rate=acted.rate, slew=acted.slew, not_finite=acted.not_finite, range=acted.range),
             next_commands=tuple(map(str, next_commands(safety, is_homed_))),
+            is_open=self.is_open(),
         )

@@ -367,6 +367,7 @@ class Status(Telemetry, frozen=True, kw_only=True):
     black_box: BlackBoxReport = BlackBoxReport()
     output: OutputReport = OutputReport()
     next_commands: tuple[str, ...] = ()
+    is_open: bool | None = None
 
 
 class PortraitReport(msgspec.Struct, frozen=True, kw_only=True):
