@@ -392,6 +392,9 @@ static void tick_retracting(struct tormag_device *device, double time_s, const s
     if (!tormag_retraction_blocked(retraction) && slipped(device, time_s, sensors)) {
         device->faults |= UNCOMMANDED_MOTION;
     }
+    if (tormag_retraction_late(retraction, time_s)) {
+        device->faults |= RETRACT_FAILED;
+    }
     read_carriages(device, sensors, carriages);
     const enum tormag_outcome outcome = tormag_retraction_step(retraction, time_s, carriages);
     for (int side = 0; side < TORMAG_SIDES; side++) {

@@ -16,7 +16,7 @@
 #define PATIENCE_S 0.3
 #define DEAD_CURRENT_A 0.02 /* a connected motor draws ten times this at the duty that stands for no progress */
 #define WRONG_WAY_MM 1.0     /* back, while homing drives the carriage open: its motor or its encoder is reversed */
-#define HOMING_LIMIT_S 8.0   /* the whole stroke at homing speed takes under 4 s */
+#define TIME_LIMIT_S 8.0     /* the whole stroke at homing speed takes under 4 s */
 #define SEARCH_SHARE 0.5     /* of the speed of opening, about that of homing, from which it brakes at a switch */
 #define STROKE_MM 25.5       /* of a carriage, between its stops */
 #define LEAST_SHARE 0.6      /* of the speed of opening: what the weakest motors reach on the lowest supply */
@@ -109,7 +109,8 @@ void tormag_retraction_start(
     double speed_mm_s,
     bool tapered)
 {
-    retraction->deadline_s = time_s + STROKE_MM / (LEAST_SHARE * speed_mm_s) + LATE_S;
+    retraction->deadline_s = time_s + TIME_LIMIT_S;
+    retraction->late_s = time_s + STROKE_MM / (LEAST_SHARE * speed_mm_s) + LATE_S;
     retraction->speed_mm_s = speed_mm_s;
     retraction->tapered = tapered;
     for (int side = 0; side < TORMAG_SIDES; side++) {
@@ -121,6 +122,11 @@ bool tormag_retraction_blocked(const struct tormag_retraction *retraction)
 {
     return retraction->openings[TORMAG_LEFT].outcome == TORMAG_FAILED
         || retraction->openings[TORMAG_RIGHT].outcome == TORMAG_FAILED;
+}
+
+bool tormag_retraction_late(const struct tormag_retraction *retraction, double time_s)
+{
+    return time_s > retraction->late_s;
 }
 
 enum tormag_outcome tormag_retraction_step(
@@ -157,7 +163,7 @@ void tormag_homing_start(
     double speed_mm_s)
 {
     memset(homing, 0, sizeof *homing);
-    homing->deadline_s = time_s + HOMING_LIMIT_S;
+    homing->deadline_s = time_s + TIME_LIMIT_S;
     homing->speed_mm_s = speed_mm_s;
     homing->drive_train = *drive_train;
     homing->phase = TORMAG_HOMING_SEARCH;

@@ -52,6 +52,7 @@ struct tormag_opening {
 /* Opens the gap: both carriages to their switches, each as far as it comes. */
 struct tormag_retraction {
     double deadline_s;
+    double late_s; /* the time of the whole stroke is over then: it says so, and goes on */
     double speed_mm_s;
     bool tapered;
     struct tormag_opening openings[TORMAG_SIDES];
@@ -97,6 +98,9 @@ enum tormag_outcome tormag_retraction_step(
 
 /* Whether a carriage has been given up; its screw springs back from the stall. */
 bool tormag_retraction_blocked(const struct tormag_retraction *retraction);
+
+/* Whether it has taken longer than the whole stroke takes a device that can open; it goes on, for it may arrive. */
+bool tormag_retraction_late(const struct tormag_retraction *retraction, double time_s);
 
 /* Starts to look for the switches, wherever the carriages are. */
 void tormag_homing_start(

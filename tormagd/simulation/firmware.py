@@ -249,6 +249,8 @@ class Firmware:
             return
         if isinstance(motion, Retraction) and not motion.blocked and self._slip_mm(time_s, sensors) > MAX_SLIP_MM:
             self.faults |= DeviceFault.UNCOMMANDED_MOTION
+        if isinstance(motion, Retraction) and motion.is_late(time_s):
+            self.faults |= DeviceFault.RETRACT_FAILED
         outcome = motion.step(time_s, TICK_S, self._carriages(sensors))
         left_duty, right_duty = motion.duties
         self.output = Output(left_duty, right_duty, enabled=True)

@@ -23,7 +23,7 @@ PROGRESS_MM: Final = 0.05
 PATIENCE_S: Final = 0.3
 DEAD_CURRENT_A: Final = 0.02  # a connected motor draws ten times this at the duty that stands for no progress
 WRONG_WAY_MM: Final = 1.0  # back, while homing drives the carriage open: its motor or its encoder is reversed
-HOMING_LIMIT_S: Final = 8.0  # the whole stroke at homing speed takes under 4 s
+TIME_LIMIT_S: Final = 8.0  # the whole stroke at homing speed takes under 4 s
 SEARCH_SHARE: Final = 0.5  # of the speed of opening, about that of homing, from which it brakes at a switch
 STROKE_MM: Final = 25.5  # of a carriage, between its stops
 LEAST_SHARE: Final = 0.6  # of the speed of opening: what the weakest motors reach on the lowest supply
@@ -111,7 +111,8 @@ class Retraction:
     """Opens the gap: both carriages to their switches, each as far as it comes.
 
     With a valid zero the speed tapers towards the open end; without one the search for the switch is slow throughout.
-    It may take the time of the whole stroke, wherever it begins: a dead encoder says nothing of what is left.
+    It is late after the time of the whole stroke, wherever it began: a dead encoder says nothing of what is left. It
+    goes on then, for it may still arrive.
     """
 
     def __init__(
@@ -124,7 +125,8 @@ class Retraction:
         speed_mm_s: float,
         tapered: bool,
     ) -> None:
-        self._deadline_s = time_s + STROKE_MM / (LEAST_SHARE * speed_mm_s) + LATE_S
+        self._deadline_s = time_s + TIME_LIMIT_S
+        self._late_s = time_s + STROKE_MM / (LEAST_SHARE * speed_mm_s) + LATE_S
         self._speed_mm_s = speed_mm_s
         self._tapered = tapered
         self._openings = [Opening(time_s, carriage, lead_mm_rev, stall_A) for carriage in carriages]
@@ -139,6 +141,10 @@ class Retraction:
     def blocked(self) -> bool:
         """Whether a carriage has been given up; its screw springs back from the stall."""
         return Outcome.FAILED in [opening.outcome for opening in self._openings]
+
+    def is_late(self, time_s: float) -> bool:
+        """Whether it has taken longer than the whole stroke takes a device that can open."""
+        return time_s > self._late_s
 
     def is_reversed(self, carriages: tuple[Carriage, Carriage]) -> bool:
         """Whether a carriage has gone back towards closed."""
@@ -177,7 +183,7 @@ class Homing:
         stall_A: float,
         speed_mm_s: float,
     ) -> None:
-        self._deadline_s = time_s + HOMING_LIMIT_S
+        self._deadline_s = time_s + TIME_LIMIT_S
         self._lead_mm_rev = lead_mm_rev
         self._stall_A = stall_A
         self._speed_mm_s = speed_mm_s
