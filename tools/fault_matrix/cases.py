@@ -50,8 +50,7 @@ class Injection(NamedTuple):
     @property
     def passes(self) -> bool:
         """Whether its cause is gone again before anybody can do anything about it."""
-        is_ordered = self.host in ("stop", "disable") and self.device is None
-        return bool(self.stall_ms) or is_ordered or self.device in PASSING
+        return bool(self.stall_ms) or self.host in ("stop", "disable") or self.device in PASSING
 
 
 PASSING = ("reset", "frozen", "encoder_jump", "encoder_jump_left")

@@ -234,7 +234,7 @@ FAULTS: dict[Fault, Explanation] = {
         "the device could not open the gap",
         "remove the insert by hand; check motors and supply",
         Reaction.HELD,
-        12000.0,
+        6000.0,
         "while it opens",
         Position.LOST_THERE,
     ),
