@@ -62,12 +62,12 @@ def try_out(injection: Injection, plant: str, bus: str) -> Cell:
     return recover(rig, injection, cell)
 
 
-def inject(injection: Injection, plant: str, bus: str = SERIAL) -> tuple[Rig, Cell]:
+def inject(injection: Injection, plant: str, bus: str = SERIAL, watched_s: float = WATCHED_S) -> tuple[Rig, Cell]:
     """Runs one fault; also the rig, where it still lasts."""
     if not injection.is_driven:
-        return _begin_with(injection, plant, bus)
+        return _begin_with(injection, plant, bus, watched_s)
     rig, watch = spoiled(injection, plant, bus)
-    for sample in rig.run(WATCHED_S):
+    for sample in rig.run(watched_s):
         watch.see(sample)
     return rig, watch.cell(injection, bus)
 
@@ -84,7 +84,7 @@ def spoiled(injection: Injection, plant: str, bus: str) -> tuple[Rig, Watch]:
     return rig, Watch(rig, usual, is_driven=True)
 
 
-def _begin_with(injection: Injection, plant: str, bus: str) -> tuple[Rig, Cell]:
+def _begin_with(injection: Injection, plant: str, bus: str, watched_s: float) -> tuple[Rig, Cell]:
     """Connects, homes and enables as far as the device lets one, and asks for the force then."""
     rig = Rig(injection, plant, bus, 0.0)
     rig.spoil(injection)
@@ -98,7 +98,7 @@ def _begin_with(injection: Injection, plant: str, bus: str) -> tuple[Rig, Cell]:
             if rig.safety.faults:
                 break
         rig.publisher.is_silent = bool(rig.safety.faults) or not _is_taken(rig, watch, "enable")
-    for sample in rig.run(WATCHED_S):
+    for sample in rig.run(watched_s):
         watch.see(sample)
     return rig, watch.cell(injection, bus)
 
