@@ -47,7 +47,7 @@ SAMPLED = (
     "from the start: wrong CRC-8 in State",
 )
 SAMPLED_S = 3.0
-"""How long a fault is watched here: the slowest gap is open after 2.2 s. `tools/faults.py` watches all of them longer."""
+"""How long a fault is watched here: the slowest gap is open after 2.2 s. `tools/faults.py` watches all for longer."""
 
 
 def within_N_s(item: Injection) -> float:

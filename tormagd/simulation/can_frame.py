@@ -1,6 +1,5 @@
 """A classical CAN frame with an 11-bit identifier: its bits on the bus, and its bytes on the simulator's socket."""
 
-import re
 import struct
 from typing import NamedTuple
 
@@ -14,9 +13,8 @@ SOCKET_FRAME = struct.Struct("=IB3x8s")
 CRC_BITS = 15
 CRC_MASK = 0x7FFF
 CRC_GENERATOR = 0xC599
-STUFFED = re.compile("0{5}(?:1{4}0{4})*(?:1{4})?|1{5}(?:0{4}1{4})*(?:0{4})?")
-"""After five equal bits a sender stuffs one of the other kind, with which the next run begins (ISO 11898-1, 10.5): a
-match has one for its first five, and one for each four more."""
+STUFFED_AFTER = 5
+"""After so many equal bits a sender stuffs one of the other kind, which begins the next run (ISO 11898-1, 10.5)."""
 UNSTUFFED_BITS = 13
 """CRC delimiter, acknowledgement and its delimiter, end of frame (7), and the pause before the next frame (3)."""
 
@@ -36,8 +34,13 @@ def frame_bits(frame: CanFrame) -> int:
     for byte in head + frame.data:
         crc = _CRC_TABLE[crc >> 7 ^ byte] ^ crc << 8 & CRC_MASK
     count = 19 + 8 * len(frame.data) + CRC_BITS
-    bits = f"{int.from_bytes(head + frame.data, 'big') << CRC_BITS | crc:0{count}b}"
-    return count + sum((len(run) - 1) // 4 for run in STUFFED.findall(bits)) + UNSTUFFED_BITS
+    bits = int.from_bytes(head + frame.data, "big") << CRC_BITS | crc
+    # six bits in front make them whole bytes; into these, which alternate, nothing is stuffed
+    stuffed, run = 0, 0
+    for byte in (0b010101 << count | bits).to_bytes((6 + count) // 8, "big"):
+        more, run = _RUNS[run][byte]
+        stuffed += more
+    return count + stuffed + UNSTUFFED_BITS
 
 
 def to_socket(frame: CanFrame) -> bytes:
@@ -63,3 +66,19 @@ def _crc_of(byte: int) -> int:
 
 
 _CRC_TABLE = [_crc_of(byte) for byte in range(256)]
+
+
+def _after(run: int, byte: int) -> tuple[int, int]:
+    """How many bits are stuffed into a byte after a run of so many zeros, or ones where it is negative; and the run
+    that it leaves."""
+    stuffed = 0
+    for place in range(7, -1, -1):
+        one = -1 if byte >> place & 1 else 1
+        run = run + one if run * one > 0 else one
+        if abs(run) == STUFFED_AFTER:
+            stuffed, run = stuffed + 1, -one
+    return stuffed, run
+
+
+_RUNS = [[_after(run, byte) for byte in range(256)] for run in (0, 1, 2, 3, 4, -4, -3, -2, -1)]
+"""By the run before, from whose end a negative one counts, and the byte."""
