@@ -253,7 +253,7 @@ def test_finer_steps_find_the_same(plant: PlantParameters) -> None:
 def test_forces_out_of_range_are_clipped_before_they_count() -> None:
     """Below what the open gap brakes and above the scene's greatest nothing is missed: the rest is a slow ramp."""
     times_s, forces_N = np.array([0.0, 0.1, 3.1, 3.2]), np.array([0.1, 0.1, 2.6, 2.6])
-    found = best(SAMPLES[0], times_s, forces_N)
+    found = best(SAMPLES[0], times_s, forces_N, step_s=4e-3)
     assert 0.4 <= found.asked_N.min() <= 0.7
     assert found.asked_N.max() == pytest.approx(2.0, abs=1e-4)
     assert found.figures()["foresight_rms_N"] <= 0.002
