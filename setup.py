@@ -33,7 +33,7 @@ COMPILED = {
         *("core",),
     ),
     "tormagd/control/believe": (
-        *("strength", "slow_friction", "sensor_zero", "sensor", "carriage_lag", "handle", "memory", "believe"),
+        *("strength", "slow_friction", "sensor_zero", "freshness", "sensor", "carriage_lag", "handle", "memory", "believe"),
     ),
     "tormagd/control/ask": ("skill", "forecast", "path", "governor"),
     "tormagd/control/aim": ("portrait", "floors", "aim"),

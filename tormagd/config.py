@@ -146,7 +146,7 @@ class Trim(Strict, frozen=True):
     "In which the force's offset is learned anew in the long run; a new device shows itself sooner."
     least: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.6
     "Of a device's force over the model's; what is below is not corrected, and the limit `TRIM` says so."
-    most: Annotated[float, Meta(ge=1.0, le=5.0)] = 1.6
+    most: Annotated[float, Meta(ge=1.0, le=5.0)] = 2.0
     "The same for what is above."
 
 

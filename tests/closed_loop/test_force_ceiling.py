@@ -50,6 +50,7 @@ def frozen() -> Callable[[float], float]:
 
 CONFIG = Config(scene="coronary")
 ASKED_N, F_MIN_N, MOST_N = 1.5, 0.65, 2.0
+NAMED = {Limit.SENSOR, Limit.DEVICE_OR_SENSOR}
 CEILING_N = 1.25 * MOST_N + 0.1
 
 
@@ -58,9 +59,9 @@ def worst_N(samples: list[Sample]) -> float:
 
 
 def named_s(samples: list[Sample]) -> float:
-    """When the sensor was named first, s from the first of these samples."""
-    doubted = [sample.time_s for sample in samples if Limit.SENSOR in sample.plan.limits]
-    assert doubted, "the sensor was never named"
+    """When the readings were named first, s from the first of these samples."""
+    doubted = [sample.time_s for sample in samples if NAMED & set(sample.plan.limits)]
+    assert doubted, "the readings were never named"
     return doubted[0] - samples[0].time_s
 
 
@@ -86,10 +87,10 @@ def test_a_sensor_that_begins_to_lie_is_named_and_closes_nothing(arm, render, li
     LyingSensor(loop.device, LIES[lie](), loop.now_s)
     samples = render(loop, ASKED_N, 3.0)
     assert named_s(samples) < 0.5
-    assert worst_N(samples) < ASKED_N + 0.3
+    assert worst_N(samples) < ASKED_N + 0.25
 
 
-@pytest.mark.parametrize("lie", ["-0.5 N", "+1 N", "-1 N", "frozen", "tenfold", "inverted"])
+@pytest.mark.parametrize("lie", ["-0.5 N", "+1 N", "-1 N", "tenfold", "inverted"])
 def test_a_sensor_that_lies_from_the_beginning_keeps_the_device_disabled(make, lie: str) -> None:
     loop = make()
     LyingSensor(loop.device, LIES[lie]())
@@ -101,21 +102,29 @@ def test_a_sensor_that_lies_from_the_beginning_keeps_the_device_disabled(make, l
     assert refused.value.code == "sensor_doubted"
 
 
-@pytest.mark.parametrize("lie", ["-0.3 N", "+0.5 N"])
-def test_an_offset_from_the_beginning_is_told_from_a_scale(make, render, lie: str) -> None:
+def test_a_sensor_that_is_frozen_from_the_beginning_is_named_as_the_gap_moves(make, render) -> None:
     loop = make()
-    LyingSensor(loop.device, LIES[lie]())
+    LyingSensor(loop.device, frozen())
     loop.arm()
     samples = render(loop, ASKED_N, 3.0)
     assert named_s(samples) < 1.0
     assert worst_N(samples) < ASKED_N + 0.3
 
 
-def test_a_sensor_that_reads_a_little_too_much_from_the_beginning_presses_less(make, render) -> None:
+def test_a_sensor_that_reads_too_little_from_the_beginning_presses_more_by_no_more(make, render) -> None:
+    """Until the handle turns back it cannot be told from a weaker device."""
+    loop = make()
+    LyingSensor(loop.device, LIES["-0.3 N"]())
+    loop.arm()
+    assert worst_N(render(loop, ASKED_N, 3.0)) < ASKED_N + 0.35
+
+
+@pytest.mark.parametrize("lie", ["+0.3 N", "+0.5 N"])
+def test_a_sensor_that_reads_too_much_from_the_beginning_presses_less(make, render, lie: str) -> None:
     """As long as the handle goes one way it cannot be told from a stronger device with another field law; what it does
     is on the safe side."""
     loop = make()
-    LyingSensor(loop.device, LIES["+0.3 N"]())
+    LyingSensor(loop.device, LIES[lie]())
     loop.arm()
     assert worst_N(render(loop, ASKED_N, 3.0)) < ASKED_N
 
@@ -125,9 +134,10 @@ def test_a_reversal_names_a_zero_that_was_wrong_from_the_beginning(make, render,
     loop = make(hand=ReversingHand(4.0))
     LyingSensor(loop.device, LIES[lie]())
     loop.arm()
-    samples = render(loop, ASKED_N, 6.0)
-    assert {Limit.SENSOR, Limit.SENSOR_ZERO} <= {limit for sample in samples for limit in sample.plan.limits}
-    assert worst_N(samples) < ASKED_N + 0.3
+    render(loop, ASKED_N, 3.0)
+    samples = render(loop, ASKED_N, 3.0)
+    assert samples[-1].plan.limits == (Limit.SENSOR_ZERO,)
+    assert worst_N(samples) < ASKED_N + 0.1
 
 
 @pytest.mark.parametrize("sample", ["sample_1", "sample_3"])
@@ -141,7 +151,7 @@ def test_a_zero_that_drifts_is_taken_off_where_the_handle_turns(arm, render, sam
     assert loop.planner.believe.zero.zero_N == pytest.approx(0.08, abs=0.04)
     sliding = [abs(each.truth.force_N) for each in samples[-4_000:] if slides(each)]
     assert np.mean(sliding) == pytest.approx(ASKED_N, abs=0.02)
-    assert Limit.SENSOR not in samples[-1].plan.limits
+    assert not NAMED & set(samples[-1].plan.limits)
 
 
 def slides(sample: Sample) -> bool:
@@ -176,7 +186,7 @@ def test_a_sensor_that_stays_doubted_is_a_fault_where_the_scene_needs_it(arm, re
 def test_an_honest_sensor_is_believed(arm, render, sample: str) -> None:
     loop = arm(sample, ReversingHand(3.0))
     for asked_N in (0.7, 2.0, 0.7, 1.4):
-        assert not any(Limit.SENSOR in sample.plan.limits for sample in render(loop, asked_N, 3.0))
+        assert not any(NAMED & set(sample.plan.limits) for sample in render(loop, asked_N, 3.0))
 
 
 # -- layer a: the governed force -----------------------------------------------------------------------------------

@@ -102,13 +102,8 @@ def test_a_cell_that_is_not_named_or_not_safe_is_told_from_one_that_is() -> None
 
 
 RECOVERED = (
-    # a sensor is doubted until it is believed, and then its zero is not known before the handle has turned
-    (
-        "force sensor 0.8 N too high",
-        SERIAL,
-        "clear-fault, enable refused: sensor_doubted",
-        ("enable", "turn the handle back and forth"),
-    ),
+    # a sensor is doubted until it agrees with the device, which is as it was
+    ("force sensor reads nothing", SERIAL, "clear-fault, enable refused: sensor_doubted", ("enable",)),
     # what the device has latched comes back while its cause stands
     ("device too hot", CAN, "clear-fault, DEVICE_TEMPERATURE again", ("clear-fault", "home", "enable")),
     ("handle's encoder lost", SERIAL, "HANDLE_LOST still told", ()),

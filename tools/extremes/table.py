@@ -264,8 +264,10 @@ def sensor_zero(stage: SensorZero, draw: Draw) -> object:
 
 
 def sensor(stage: SensorTrust, draw: Draw) -> object:
-    stage.update(UNSEEN, draw(1.1), abs(draw(42.0)), draw(1.1), draw.positive(PLAN_S), 1.0, abs(draw(0.02)))
-    return stage.is_doubted
+    dt_s = draw.positive(PLAN_S)
+    stage.update(UNSEEN, draw(1.1), abs(draw(42.0)), 1.0, draw(1.1), abs(draw(0.02)), dt_s)
+    stage.learned(draw(0.0), draw(1.1), dt_s)
+    return stage.lead_N, stage.back_N
 
 
 def carriage_lag(stage: CarriageLag, draw: Draw) -> object:
@@ -566,7 +568,7 @@ def stages() -> list[Stage]:
         Stage("believe/strength", lambda: Strength(0.5, (0.6, 1.6), (True, True)), strength, MEASUREMENT),
         Stage("believe/slow_friction", SlowFriction, slow_friction, MEASUREMENT),
         Stage("believe/sensor_zero", SensorZero, sensor_zero, MEASUREMENT),
-        Stage("believe/sensor", SensorTrust, sensor, MEASUREMENT),
+        Stage("believe/sensor", partial(SensorTrust, (0.6, 2.0)), sensor, MEASUREMENT),
         Stage("believe/carriage_lag", CarriageLag, carriage_lag, MEASUREMENT),
         Stage("believe/handle", HandleWatch, handle_watch, MEASUREMENT),
         Stage("believe/memory", memory, remembering, MEASUREMENT),

@@ -119,8 +119,8 @@ MATRIX = (
     ),
     # the force sensor and the handle
     Injection("force sensor stuck", ("SENSOR",), sensor="stuck"),
-    Injection("force sensor 0.8 N too high", ("SENSOR", "OVER_FORCE"), sensor="high"),
-    Injection("force sensor 0.8 N too low", ("SENSOR",), sensor="low"),
+    Injection("force sensor 0.8 N too high", ("DEVICE_OR_SENSOR",), LIMITED, sensor="high"),
+    Injection("force sensor 0.8 N too low", ("DEVICE_OR_SENSOR",), HELD, sensor="low"),
     Injection("force sensor at its end", ("OVER_FORCE",), sensor="saturated"),
     Injection("force sensor reads nothing", ("SENSOR",), sensor="dead"),
     Injection("handle's encoder lost", ("HANDLE_LOST",), HELD, device="no_handle"),

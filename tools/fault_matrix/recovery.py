@@ -8,7 +8,6 @@ nothing, or the fault be named all the while; afterwards the force has to be fol
 from fault_matrix.cases import Injection
 from fault_matrix.rig import Rig
 from fault_matrix.watch import MOST_OFF_N, MOST_OVER_N, Cell
-from tormagd.safety.codes import Limit
 from tormagd.safety.operating_state import Event, OperatingState, RefusedError, next_commands
 
 MENDED_S = 1.5
@@ -36,15 +35,10 @@ def recover(rig: Rig, injection: Injection, cell: Cell) -> Cell:
     trouble = _obeyed(rig, commands, PATIENCE_S)
     back_s = rig.loop.now_s - mended_s
     is_held, told = _follow(rig)
-    done = list(map(str, commands))
-    if Limit.OFFSET_UNKNOWN in told:
-        rig.hand.turn_back(rig.loop.now_s)
-        done.append("turn the handle back and forth")
-        is_held, told = _follow(rig)
     is_back = not trouble and not rig.safety.faults and is_held and not _named(injection, told)
     return cell._replace(
         tried=tried,
-        recovery=tuple(done),
+        recovery=tuple(map(str, commands)),
         back_s=round(back_s, 3) if is_back and commands else None,
         recovered=is_held_back and is_back,
     )

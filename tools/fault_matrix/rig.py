@@ -26,8 +26,6 @@ from tormagd.simulation.plant import Sensor
 
 FORCE_N = 1.8
 SWING_N = 0.1
-TURNED_MM = 10.0
-"The limit OFFSET_UNKNOWN asks for so much, back and forth."
 OFFSET_N = 0.8
 SATURATED_N = 20.0
 "Of a broken force sensor."
@@ -49,8 +47,7 @@ class Rig:
         self.config, core = _coronary()
         self.most_N = core.scene.force.most_N
         faults = [parse_fault(f"{fault}@{injected_s}") for fault in (injection.device or "").split()]
-        self.hand = TurningHand()
-        device = VirtualDevice(load_plant(plant), self.hand, faults, seed=1)
+        device = VirtualDevice(load_plant(plant), SteadyHand(), faults, seed=1)
         self.line: BadSerialLine | BadBus
         if bus == SERIAL:
             self.line = serial = BadSerialLine(device)
@@ -128,25 +125,6 @@ def _coronary() -> tuple[Config, Core]:
     """A core keeps nothing of what it is stepped through: one does for every rig."""
     config = msgspec.structs.replace(load_config(None), scene="coronary")
     return config, build_core(config)
-
-
-class TurningHand:
-    """A hand that turns steadily, and back for a moment where it is told to."""
-
-    def __init__(self) -> None:
-        self._steady = SteadyHand()
-        self._back_s = math.inf
-
-    def turn_back(self, now_s: float) -> None:
-        """From now on it goes back by TURNED_MM, and then forth again. Once."""
-        self._back_s = now_s
-
-    def position_mm(self, time_s: float) -> float:
-        """See `Hand`."""
-        forth_mm = self._steady.position_mm(time_s)
-        if time_s <= self._back_s:
-            return forth_mm
-        return forth_mm - 2.0 * min(forth_mm - self._steady.position_mm(self._back_s), TURNED_MM)
 
 
 def asked_N(now_s: float) -> float:

@@ -16,6 +16,7 @@ from tormagd.control.aim.aim import Aim, Element
 from tormagd.control.ask.governor import Governor
 from tormagd.control.believe.believe import Believe, Learned
 from tormagd.control.believe.memory import ElementMemory
+from tormagd.control.believe.sensor import Disputed
 from tormagd.control.measure import Measure
 from tormagd.control.move.actuator import Actuator
 from tormagd.control.move.carriages import Carriages
@@ -81,6 +82,10 @@ class Planner:
     def teach(self, learned: Learned) -> None:
         """Takes that for what is known of the device. The element's memory stays."""
         self.believe.teach(learned)
+
+    def confirm(self, wrong: Disputed) -> None:
+        """The operator settles a dispute of device and sensor."""
+        self.believe.confirm(wrong)
 
     def afresh(self, now_s: float) -> None:
         """Begins anew after a plan that could not be made. Plans go on being numbered, and the element has not

@@ -126,6 +126,7 @@ class Belief(Value):
 
     device            its force over the model's without memory, for the rate at which the handle slides
     at_speed          the same at the speed of a handle in motion
+    unseen            a device of which nothing is known, while what is known of this one is from another day; else None
     lag_s             how late its carriages come
     predicted_N       the force that it is expected to show now; None where nothing is known, as before break-away
     limits            what is wrong with what it shows
@@ -136,6 +137,7 @@ class Belief(Value):
         self,
         device: DeviceFit,
         at_speed: DeviceFit,
+        unseen: DeviceFit | None,
         lag_s: float,
         predicted_N: float | None,
         limits: tuple[Limit, ...],
@@ -143,6 +145,7 @@ class Belief(Value):
     ) -> None:
         self.device: Final = device
         self.at_speed: Final = at_speed
+        self.unseen: Final = unseen
         self.lag_s: Final = lag_s
         self.predicted_N: Final = predicted_N
         self.limits: Final = limits

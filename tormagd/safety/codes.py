@@ -103,6 +103,7 @@ class Limit(StrEnum):
     CEILING = "CEILING"
     OVER_FORCE = "OVER_FORCE"
     SENSOR = "SENSOR"
+    DEVICE_OR_SENSOR = "DEVICE_OR_SENSOR"
     SENSOR_ZERO = "SENSOR_ZERO"
     OFFSET_UNKNOWN = "OFFSET_UNKNOWN"
     HANDLE_LOST = "HANDLE_LOST"
@@ -319,7 +320,7 @@ FAULTS: dict[Fault, Explanation] = {
         "the measured force stayed over what the scene allows; the gap opens at the device's own bounded speed",
         "compare force sensor and gap: is it the insert and the model that the scene names? Then clear-fault, home",
         Reaction.OPENING,
-        100.0,
+        150.0,
         "while the handle moves",
     ),
     Fault.SENSOR: Explanation(
@@ -448,10 +449,19 @@ LIMITS: dict[Limit, Explanation] = {
         "while the handle moves",
     ),
     Limit.SENSOR: Explanation(
-        "the force sensor reads what no believable device gives at this gap; nothing is learned from it",
+        "the force sensor reads what no device gives at this gap, or stands still; nothing is learned from it, and "
+        "what is known of the device is kept",
         "check sensor, cable and zero, and that the insert is the scene's",
         Reaction.HELD,
         1000.0,
+        "while the handle slides",
+    ),
+    Limit.DEVICE_OR_SENSOR: Explanation(
+        "the readings have left what was known of the device: it has changed, or the sensor is wrong; the gap follows "
+        "whichever brakes more, and nothing is learned",
+        "turn the handle back and forth once; then tormagctl confirm device, or tormagctl confirm sensor",
+        Reaction.HELD,
+        500.0,
         "while the handle slides",
     ),
     Limit.SENSOR_ZERO: Explanation(

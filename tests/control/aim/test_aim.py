@@ -9,12 +9,12 @@ from hypothesis import given, settings, strategies as st
 
 from tormagd.assembly.build import Core, build_core
 from tormagd.config import Config
-from tormagd.control.aim.floors import LAW_SHARE, ceiling_mm
+from tormagd.control.aim.floors import CEILING, LAW_SHARE, ceiling_mm
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.carriage_lag import MAX_LAG_S
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.core import Planner
-from tormagd.control.records import Handle, Measured, Outside, Plan, TimedSetpoint
+from tormagd.control.records import Ask, Belief, Handle, Measured, Outside, Plan, TimedSetpoint
 from tormagd.inverse.solution import FieldSolution, Reach
 from tormagd.model.displacement import MOBILISED_MM, Turn
 from tormagd.safety.codes import Limit
@@ -258,3 +258,20 @@ def test_nan_never_travels(core, moving, history: list[tuple[float, TimedSetpoin
         assert plan.gap_mm >= plan.min_gap_mm
         assert 0.0 <= lag_s <= MAX_LAG_S
         assert plan.number == number + 1
+
+
+fits = st.builds(
+    DeviceFit, st.floats(0.6, 2.0), st.floats(-0.2, 0.3), st.floats(0.0, 0.03), st.just(0.0), st.floats(0.0, 0.01)
+)
+
+
+@given(device=fits, unseen=st.none() | fits, asked_N=st.floats(0.0, 5.0))
+def test_the_most_open_of_the_guards_wins(core, device: DeviceFit, unseen: DeviceFit | None, asked_N: float) -> None:
+    """Whatever is asked and believed, the gap is never closer than any guard allows."""
+    belief = Belief(device, device, unseen, 0.0, None, (), 0.0)
+    planner = core.planner()
+    plan = planner.aim.update(0.1, None, Ask(asked_N, [asked_N] * 7, None, ()), belief, planner.believe.memory, None)
+    ceiling_N = CEILING * core.scene.force.most_N
+    for guard in (device, unseen):
+        assert guard is None or plan.gap_mm >= ceiling_mm(core.portrait, guard, ceiling_N)
+    assert plan.gap_mm >= plan.min_gap_mm

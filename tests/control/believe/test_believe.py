@@ -4,14 +4,13 @@ import math
 
 import pytest
 
-from tormagd.assembly.build import Core
 from tormagd.assembly.journal import KNOWN
 from tormagd.control.believe.believe import NOTHING_LEARNED, UNTARED_N, Learned
 from tormagd.control.believe.carriage_lag import AGE_S, MAX_LAG_S
 from tormagd.control.believe.sensor_zero import MAX_SD_N, UNKNOWN_SD_N
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.core import Planner
-from tormagd.control.records import Handle, Measured, TimedSetpoint
+from tormagd.control.records import Handle, TimedSetpoint
 from tormagd.exact import plain, restore
 from tormagd.model.displacement import MOBILISED_MM, MOVING_MM_S, Turn
 from tormagd.safety.codes import Limit
@@ -20,24 +19,6 @@ PERIOD_S = 0.004
 TURN = Turn(1.0, 0.0, 100.0)
 RESTING = {"handle": Handle(MOBILISED_MM, 0.0, TURN, 42.0)}
 CREEPING = {"handle": Handle(MOBILISED_MM, 1.0, TURN, 1.0)}
-
-
-@pytest.fixture
-def planner(core: Core) -> Planner:
-    return core.planner()
-
-
-@pytest.fixture
-def hear(planned):
-    """Plans for 1 N while the same is measured, but for the noise that a live sensor has."""
-
-    def heard(planner: Planner, seconds: float, measured: Measured) -> Planner:
-        for number in range(round(seconds / PERIOD_S)):
-            noise_N = 0.003 * (-1) ** number
-            planned(planner, 1.0, measured.replaced(force_N=measured.force_N + noise_N))
-        return planner
-
-    return heard
 
 
 def test_the_device_is_learned_from_measured_over_predicted_force(core, hear, moving) -> None:
@@ -114,7 +95,8 @@ def test_a_handle_that_has_stopped_teaches_nothing_of_a_gap_that_goes_on(
         now_s = planner.planned.time_s + PERIOD_S
         at_mm, gap_mm = 100.0 + 5.0 * PERIOD_S * number * goes_on, 78.1 - 0.3 * number
         slower = Handle(MOBILISED_MM, 5.0, Turn(1.0, 0.0, at_mm), 42.0)
-        planned(planner, 1.0, moving(gap_mm, sensed_s=now_s, handle_mm=at_mm, handle=slower))
+        read_N = 1.0871 + 1e-3 * number
+        planned(planner, 1.0, moving(gap_mm, read_N, sensed_s=now_s, handle_mm=at_mm, handle=slower))
         devices.append(planner.believe.device)
     assert (devices[10] == devices[-1]) is not goes_on
 

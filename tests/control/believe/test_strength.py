@@ -71,13 +71,17 @@ def test_force_and_model_are_each_others_inverse() -> None:
     assert fit.model_N(fit.force_N(1.7)) == pytest.approx(1.7)
 
 
+STRONGEST = 1.53
+"With friction, modulus and field all at the ends that the plant card has for them."
+
+
 @pytest.mark.parametrize("levels", [[], [(0.2, 0.7)], [(2.0, 0.7)], [(2.0, 0.7), (2.0, 1.6)]])
-@pytest.mark.parametrize("scale", [MIN_SCALE, 0.8, 1.0, 1.2, MAX_SCALE])
+@pytest.mark.parametrize("scale", [MIN_SCALE, 0.8, 1.0, 1.2, STRONGEST])
 def test_what_is_surely_within_is_within(levels: list[tuple[float, float]], scale: float) -> None:
     """However little has been shown, and whatever the device: never over, but for the two in a hundred of `SURE`."""
     most_N = 2.5
     model_N = shown(levels, scale, 0.0).surely_within_N(most_N)
-    allowed_N = most_N if levels else most_N * MAX_SCALE / (1.0 + SURE * SCALE_SD)
+    allowed_N = most_N if levels else most_N * STRONGEST / (1.0 + SURE * SCALE_SD)
     assert scale * model_N <= 1.03 * allowed_N
     assert most_N / MAX_SCALE <= model_N <= most_N / MIN_SCALE
 

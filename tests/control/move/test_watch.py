@@ -212,11 +212,11 @@ def test_a_carriage_that_goes_the_other_way_into_its_stop_is_named(running) -> N
 
 
 def test_too_much_force_opens_and_is_then_a_fault(running) -> None:
-    limits = [running.step(force_N=3.0).limits for _ in range(35)]
-    assert Limit.OVER_FORCE not in limits[5]
-    assert Limit.OVER_FORCE in limits[30]
-    assert running.move.reference.gap_mm > 80.0
-    assert running.run_into(Fault.OVER_FORCE, force_N=3.0) < 20
+    limits = [running.step(force_N=3.0, **running.there).limits for _ in range(95)]
+    assert Limit.OVER_FORCE not in limits[25]
+    assert Limit.OVER_FORCE in limits[35]
+    assert running.move.reference.gap_mm > 80.5
+    assert running.run_into(Fault.OVER_FORCE, force_N=3.0, **running.there) < 20
 
 
 # -- the wire and the clock ----------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple, final
 import numpy as np
 
 from tormagd.config import Config
-from tormagd.control.aim.floors import CEILING, ceiling_mm, lawful_mT
+from tormagd.control.aim.floors import CEILING, lawful_mT, least_mm
 from tormagd.control.aim.portrait import LawOfField, Portrait
 from tormagd.control.ask.path import PATH_S
 from tormagd.control.believe.memory import ElementMemory
@@ -111,7 +111,7 @@ class Aim:
         field_mT = element_mT + memory.lag_at_mT(element_mT + memory.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
         wanted_mm = min(max(self._field.gap_mm(field_mT), self._closed_mm), self._open_mm)
-        min_mm = ceiling_mm(self._portrait, device, self._ceiling_N)
+        min_mm = least_mm(self._portrait, belief, self._ceiling_N)
         self.number += 1
         self.element_mT = field_mT - memory.lag_mT
         limits = self._limits(ask, belief.limits, outside, min_mm > wanted_mm, solution)

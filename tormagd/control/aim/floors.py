@@ -4,6 +4,7 @@ from typing import Final
 
 from tormagd.control.aim.portrait import LawOfField, Portrait
 from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.records import Belief
 
 CEILING: Final = 1.25
 "The gap stays where the device surely gives no more than this many times the scene's greatest force."
@@ -12,9 +13,19 @@ LAW_SHARE: Final = 0.12
 mm/s, 6% at a creep and 11% at 300 mm/s and the least force: the law knows neither Stribeck nor viscous friction."""
 
 
+def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float) -> float:
+    """The least gap that the guards allow: the most open of theirs."""
+    return max(ceiling_mm(portrait, belief.device, ceiling_N), unseen_mm(portrait, belief, ceiling_N))
+
+
 def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float) -> float:
     """The least gap at which the device surely gives no more than `ceiling_N`."""
     return portrait.gap_mm_at(device.surely_within_N(ceiling_N))
+
+
+def unseen_mm(portrait: Portrait, belief: Belief, ceiling_N: float) -> float:
+    """The same of any device, while what is known of this one is a profile's, which may be another's."""
+    return portrait.gap_mm[-1] if belief.unseen is None else ceiling_mm(portrait, belief.unseen, ceiling_N)
 
 
 def lawful_mT(law: LawOfField | None, wanted_N: float, field_mT: float) -> float:

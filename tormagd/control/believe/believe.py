@@ -2,7 +2,7 @@
 
 A reading of the force teaches where the model knows the force: while friction is mobilised and the handle slides. It is
 compared with the model at the *measured* gap, so the model's error is learned and not the tracking error, and learning
-cannot fight the position loop. A sensor that is not believed teaches nothing, and what it has taught is forgotten.
+cannot fight the position loop. A sensor that is not believed teaches nothing, and what is known of the device is kept.
 """
 
 import math
@@ -13,7 +13,7 @@ from tormagd.config import Config
 from tormagd.control.believe.carriage_lag import CarriageLag
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.memory import ElementMemory
-from tormagd.control.believe.sensor import SensorTrust
+from tormagd.control.believe.sensor import Disputed, SensorTrust
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N, SensorZero
 from tormagd.control.believe.slow_friction import SLOWEST_MM_S, SlowFriction
 from tormagd.control.believe.strength import UNSEEN, DeviceFit, Strength
@@ -34,6 +34,8 @@ MIN_EXPECTED_N: Final = 0.1
 "Of less force no share is told."
 UNTARED_N: Final = 0.15
 "A sensor that is off by more is worth a word: it is half an hour's drift."
+CONTRADICTED_N: Final = 0.4
+"A profile whose force is further off than rest, warmth and another zero explain is another device's."
 MIN_FORESIGHT: Final = 0.5
 "With less what is planned leaps, and no carriages are on time."
 
@@ -68,8 +70,16 @@ class Believe:
     "Number of the newest measurement that taught,"
     read_s: float
     "and when."
+    heard_N: float = 0.0
+    "What the model said then."
     limits: tuple[Limit, ...] = ()
     "What is wrong with what the sensor shows."
+    taught: DeviceFit = UNSEEN
+    "What is known of the device from another day."
+    is_prior: bool = False
+    "That is what is believed of it,"
+    is_contradicted: bool = False
+    "or was: its first slide has shown another one."
 
     def __init__(
         self, config: Config, terms: Terms, nominal: Nominal, memory: ElementMemory, min_model_N: float
@@ -80,7 +90,8 @@ class Believe:
         self.memory, self.handle = memory, HandleWatch()
         self.strength = Strength(trim.time_s, (trim.least, trim.most), (terms.scale, terms.offset))
         self.slow, self.zero = SlowFriction(), SensorZero()
-        self.sensor, self.carriages = SensorTrust(), CarriageLag()
+        self._bounds: Final = (trim.least, trim.most)
+        self.sensor, self.carriages = SensorTrust(self._bounds), CarriageLag()
         self._nominal: Final = nominal
         self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)
         self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
@@ -94,8 +105,12 @@ class Believe:
 
     @property
     def device(self) -> DeviceFit:
-        """The device's force over the model's without memory, as its element is relaxed now, at speed."""
-        return self.strength.fit.relaxed(self.memory.relaxed_N)
+        """The device's force over the model's without memory, as its element is relaxed now, at speed. Of two that fit
+        the readings it is the one with more force."""
+        fit, lead_N = self.strength.fit, self.sensor.lead_N
+        if lead_N > 0.0:
+            fit = fit.times(1.0 + lead_N / max(fit.force_N(self.heard_N), MIN_EXPECTED_N))
+        return fit.relaxed(self.memory.relaxed_N)
 
     @property
     def min_N(self) -> float:
@@ -111,10 +126,12 @@ class Believe:
         """Takes that for what is known of the device. The element's memory and the handle's watch stay."""
         self.strength.forget(learned.device)
         self.slow, self.zero = SlowFriction(), SensorZero()
-        self.sensor, self.carriages = SensorTrust(), CarriageLag()
+        self.sensor, self.carriages = SensorTrust(self._bounds), CarriageLag()
         self.slow.factor, self.slow.learned = learned.slow_factor, learned.slow_learned
         self.zero.zero_N, self.carriages.lag_s = learned.sensor_zero_N, learned.lag_s
         self.read, self.read_s, self.limits = -1, -math.inf, ()
+        self.taught = learned.device
+        self.is_prior, self.is_contradicted = learned.device is not UNSEEN, False
 
     def forget(self) -> None:
         """Forgets the device, but not what its element has been through."""
@@ -152,9 +169,11 @@ class Believe:
         if measured is not None and model_N is not None and self._nominal.contact.is_known(measured):
             slow = self.slow.factor_at(abs(measured.handle.rate_mm_s))
             predicted_N = self.strength.fit.force_N(model_N) * slow
+        is_unseen = self.is_prior and not self.sensor.has_slid
+        unseen = UNSEEN.relaxed(self.memory.relaxed_N) if is_unseen else None
         lag_s = self.carriages.lag_s if self._has_lag else 0.0
         limits = (*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits
-        return Belief(device, at_speed, lag_s, predicted_N, limits, self.sensor.doubted_s)
+        return Belief(device, at_speed, unseen, lag_s, predicted_N, limits, self.sensor.doubted_s)
 
     def _hear(self, now_s: float, measured: Measured, model_N: float) -> None:
         """Learns from the newest reading, where the model says `model_N`."""
@@ -176,10 +195,7 @@ class Believe:
 
     def _hear_at_creep(self, now_s: float, measured: Measured, model_N: float, dt_s: float, is_mobilised: bool) -> None:
         self.strength.settle()
-        if not self._has_creep:
-            return
-        if self.sensor.is_doubted:
-            self.slow = SlowFriction()
+        if not self._has_creep or self.sensor.is_disputed:
             return
         self.slow.follow(model_N, measured.handle_mm)
         handle = measured.handle
@@ -196,36 +212,65 @@ class Believe:
 
     def _hear_at_speed(self, now_s: float, measured: Measured, model_N: float, dt_s: float) -> None:
         direction, rate_mm_s = measured.handle.turn.direction, abs(measured.handle.rate_mm_s)
-        zero, fit = self.zero, self.strength.fit
+        zero, fit, sensor = self.zero, self.strength.fit, self.sensor
         reading_N, zero_sd_N = measured.force_N - direction * zero.zero_N, zero.sd_N(now_s)
-        was_doubted, relaxed_N = self.sensor.is_doubted, self.memory.relaxed_N
-        # the sensor is judged by all that an elastomer may do, whatever this one is thought to remember
-        free_N, free_fit = model_N + relaxed_N, fit.relaxed(relaxed_N)
-        self.sensor.update(free_fit, free_N, rate_mm_s, reading_N, dt_s, direction, zero_sd_N)
-        if self.sensor.is_doubted and not was_doubted:
-            zero.doubt()
+        self.heard_N = model_N
         zero.begin(now_s)
-        if self.learns:
-            zero.update(now_s, direction, measured.force_N, model_N, rate_mm_s, dt_s, fit.scale, fit.scale_sd)
+        known_N = zero.zero_N
+        if self.learns and zero.update(
+            now_s, direction, measured.force_N, model_N, rate_mm_s, dt_s, fit.scale, fit.scale_sd
+        ):
+            self.strength.shift(sensor.told_zero(zero.zero_N - known_N))
+        was_disputed = sensor.is_disputed
+        sensor.update(fit, model_N, rate_mm_s, direction, reading_N, zero_sd_N, dt_s)
         self.limits = (Limit.SENSOR_ZERO,) if abs(zero.zero_N) > UNTARED_N else ()
-        if self.sensor.is_doubted:
-            self.strength.forget()
-            self.slow = SlowFriction()
-            self.limits = (Limit.SENSOR, *self.limits)
+        if sensor.is_disputed:
+            self.strength.settle()
+            if sensor.is_named or sensor.is_doubted:
+                self.limits = (Limit.SENSOR if sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
         elif not zero_sd_N <= UNKNOWN_SD_N:
             self.strength.settle()
+            sensor.compare(fit, model_N)
             self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)
         else:
             self._fit(measured, model_N, reading_N, dt_s)
+        if sensor.is_disputed and not was_disputed:
+            self._dispute(model_N)
+        elif was_disputed and not sensor.is_disputed:
+            zero.trust()
+
+    def _dispute(self, model_N: float) -> None:
+        """The device is taken for what it was before the readings left it."""
+        self.zero.doubt()
+        before_N = self.strength.fit.force_N(model_N)
+        if self.sensor.has_slid:
+            self.strength.shift(self.sensor.back_N)
+        else:
+            self.strength.forget(self.taught)  # all else that is known of it came from this sensor
+        self.slow.rescale(before_N, self.strength.fit.force_N(model_N))
 
     def _fit(self, measured: Measured, model_N: float, reading_N: float, dt_s: float) -> None:
         if self._has_creep:
             self.slow.follow(model_N, measured.handle_mm)
+        if self.sensor.freshness.is_stale or self.sensor.wrong_s > 0.0:
+            return  # there may be no lesson in it
         if not (self.learns and self._fits):
+            self.sensor.compare(self.strength.fit, model_N)
             return
         before_N = self.strength.fit.force_N(model_N)
+        if self.is_prior and not self.sensor.has_slid and abs(reading_N - before_N) > CONTRADICTED_N:
+            self.is_prior, self.is_contradicted = False, True
+            self.strength.forget()
         self.strength.update(model_N, reading_N, dt_s)
+        self.sensor.learned(self.strength.fit.force_N(model_N) - before_N, model_N, dt_s)
         # what is known of a creep stays what it is while the rest is learned
         self.slow.rescale(before_N, self.strength.fit.force_N(model_N))
         if self.strength.is_held:
             self.limits = (Limit.TRIM, *self.limits)
+
+    def confirm(self, wrong: Disputed) -> None:
+        """The operator settles a dispute: the `device` has changed, and is learned anew; or the `sensor` is wrong."""
+        self.sensor.confirm(wrong)
+        if wrong == "device":
+            self.zero.trust()
+            self.strength.forget(self.strength.fit.unsure())

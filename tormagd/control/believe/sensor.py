@@ -1,163 +1,235 @@
-"""Whether the force sensor is believed: its readings against the model, with all that a believable device may differ.
+"""Who is right where the readings leave the believed device: the sensor, or a device that has changed.
 
-Judged while friction is mobilised and the handle slides, where the model knows the force. Four things no believable
-device does: it makes less than the weakest or more than the strongest of its kind; its force jumps away from what it
-has shown; its offset goes beyond what an elastomer relaxes; or the reading stands still to the last digit.
+    moved    d    what the fit has learned of late, N, where it is now; forgotten as fast as a device changes by itself
+    dispute  |d| > what a device changes by itself: the fit goes back by d, and learns nothing more
+    lead     l    by how much the readings are over the fit's force, N: the device is taken for that much stronger
+    agreed   the readings come back to the fit: it learns again
+
+While friction is mobilised and the handle slides, two explanations may fit the readings: the device is as it was and
+the sensor wrong, or the sensor right and the device changed. The gap follows the one with more force. So a reading that
+rises opens, and one that falls moves nothing. A sensor that shows what no device gives is wrong, and opens nothing.
 """
 
-import math
-from typing import Final, final
+from typing import Final, Literal, final
 
+from tormagd.control.believe.freshness import Freshness
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
-from tormagd.control.believe.strength import (
-    MAX_RELAXED,
-    MAX_SCALE,
-    MIN_RELAXED,
-    MIN_SCALE,
-    SURE,
-    UNSEEN,
-    DeviceFit,
-    observe,
-)
+from tormagd.control.believe.strength import SURE, DeviceFit
 from tormagd.control.filter import low_pass
 
-NOISE_N: Final = 0.03
-"What noise, and the model's own error, leave of a mean over FILTER_S."
+Disputed = Literal["device", "sensor"]
+"What an operator may say in a dispute: the device has changed, or the sensor is wrong."
+DISPUTED: Final[tuple[Disputed, Disputed]] = ("device", "sensor")
+
 FILTER_S: Final = 0.01
-JUMP_N: Final = 0.15
-"A device may depart so far from its fit of a moment ago: its hysteresis and its own friction at a creep do."
-VISCOUS_N_S_MM: Final = 6e-4
-"And so much further for each mm/s that the handle goes at another speed than then,"
+"Of the readings' mean."
+LEARNS_S: Final = 0.5
+"A device that has not slid for so long has shown nothing to dispute."
+MOVED_N: Final = 0.12
+"Hysteresis, a creep and a kelvin may move a device's force so far at once."
 SHAPE: Final = 0.25
-"and for each newton that the model says more or less: Eq. 7 is flat where the gap is open, the power law is not."
-MIN_OFFSET_N: Final = -0.12
-MAX_OFFSET_N: Final = 0.3
-"""Of a believable device that has not relaxed: another field law than the model's looks like an offset of up to 0.2 N.
-So a sensor that reads 0.3 N too much from the beginning may pass for such a device; it makes the brake press less."""
-KEPT_S: Final = 0.3
-"How old the fit is that jumps are told from."
-FROZEN_S: Final = 0.1
-"A sensor that measures a friction in motion shows its own noise, at 500 readings a second or more."
-DOUBTED_S: Final = 0.05
-"Evidence for so long is doubt."
+"And so far for each newton that the model says more or less than lately: field laws differ in shape,"
+VISCOUS_N_S_MM: Final = 6e-4
+"and for each mm/s that the handle goes faster or slower than lately."
+LATELY_S: Final = 1.0
+SLACK_N: Final = 0.05
+"So much of that the force of a gap that hardly moves has, too: it is not forgotten sooner for it."
+RELAXES_1_S: Final = 0.012
+"Of its force an elastomer may lose, or win back, this share a second beyond what its model remembers,"
+RELAXED: Final = 0.12
+"and no more than this altogether, or in SLOWEST_S again."
+SLOWEST_S: Final = 900.0
+AGREES_N: Final = 0.06
+AGREES_S: Final = 0.2
+"Readings this near to the fit for so long agree."
+NAMED_S: Final = 0.1
+"A dispute that is settled sooner is not worth a word."
+RISES_N_S: Final = 2.0
+"A reading that rises for 80 ms costs 0.2 N at most; a device that is 20% stronger at once is followed in 0.2 s."
+LEADS_S: Final = 0.03
+"Noise opens no gap."
+NOISE_N: Final = 0.05
+"What noise, a creep and the model's shape leave of a device at one of its bounds."
+WRONG_S: Final = 0.05
+"Evidence for so long shows that the sensor is wrong."
 TRUSTED_AGAIN_S: Final = 1.0
-"A sensor that reads, for so long, what a device gives that is like most, is believed anew."
-SLOW_S: Final = 5.0
-"A fit that forgets slowly, and takes the model at its word, tells an offset from a scale best."
-MEMORY_S: Final = 900.0
-"The slowest of the elastomer's time constants."
-
-
-At = tuple[float, float, float]
-"Where a fit was taken: the model's force, N, the handle's rate, mm/s, and its direction, 1 or -1."
+"A wrong sensor has to agree for longer."
 
 
 @final
 class SensorTrust:
-    """Judges one force sensor."""
+    """Judges one force sensor, and keeps what was known of the device while it does."""
 
-    is_doubted: bool = False
-    doubted_s: float = 0.0
-    "For how long of sliding it has been doubted."
-    evidence_s: float = 0.0
-    "For how long there has been evidence: of a lie, or while it is doubted of the truth."
-    has_heard: bool = False
-    reading_N: float = 0.0
-    "The newest."
-    still_s: float = 0.0
-    "For how long it has stood still to the last digit."
+    known_s: float = 0.0
+    "For how long the device has slid, LEARNS_S at most."
     measured_N: float = 0.0
-    "A mean over FILTER_S."
-    loaded_N: float = 0.0
-    "The model's force, a mean over MEMORY_S."
-    slow: DeviceFit = UNSEEN
-    "A fit of the readings that forgets in SLOW_S."
-    before: DeviceFit = UNSEEN
-    "The device's own fit of KEPT_S to twice that ago,"
-    kept: DeviceFit = UNSEEN
-    "and of up to KEPT_S ago."
-    kept_s: float = 0.0
+    "Mean of the readings over FILTER_S."
+    model_N: float = 0.0
+    "The model's force, a mean over LATELY_S,"
+    rate_mm_s: float = 0.0
+    "and the handle's rate."
+    direction: float = 0.0
+    "The way it goes, 1 or -1."
+    slack_N: float = 0.0
+    "What the fit may learn at once, as what is around it has changed lately."
+    moved_N: float = 0.0
+    "What the fit has learned of late, and would have to unlearn in a dispute."
+    relaxed_N: float = 0.0
+    "How much of RELAXED is used up."
+    is_disputed: bool = False
+    disputed_s: float = 0.0
+    "For how long of sliding."
+    back_N: float = 0.0
+    "By how much the fit had to go back when it began."
+    began_way: float = 0.0
+    "The way that the handle went when it began."
+    agreed_s: float = 0.0
+    "For how long the readings have agreed with the fit."
+    lead_N: float = 0.0
+    "By how much the device is taken for stronger than its fit, at the model's force of now."
+    is_doubted: bool = False
+    "The sensor is shown to be wrong."
+    doubted_s: float = 0.0
+    "For how long of sliding it has been."
+    wrong_s: float = 0.0
+    "For how long there has been evidence of it."
 
-    def __init__(self) -> None:
-        self.before_at: At = (0.0, 0.0, 0.0)
-        self.kept_at: At = (0.0, 0.0, 0.0)
+    def __init__(self, bounds: tuple[float, float]) -> None:
+        """`bounds`: the least and the greatest scale of a device over the model."""
+        self._least: Final = bounds[0]
+        self._most: Final = bounds[1]
+        self.freshness = Freshness()
+
+    @property
+    def has_slid(self) -> bool:
+        """Whether the device has shown itself in this session."""
+        return self.known_s >= LEARNS_S
+
+    @property
+    def is_named(self) -> bool:
+        """Whether the dispute is worth a word."""
+        return self.is_disputed and self.disputed_s > NAMED_S
 
     def update(
         self,
         fit: DeviceFit,
         model_N: float,
         rate_mm_s: float,
-        reading_N: float,
-        dt_s: float,
         direction: float,
+        reading_N: float,
         zero_sd_N: float,
+        dt_s: float,
     ) -> None:
         """Takes a reading along the motion of a handle that slides at `rate_mm_s` the way `direction`, 1 or -1, where
-        the model says `model_N` and the device has shown itself to be `fit`. The reading stands for `dt_s`; the zero
+        the model says `model_N` and the device is believed to be `fit`. The reading stands for `dt_s` > 0; the zero
         that is off it is known to within `zero_sd_N`. All are finite."""
+        if self.is_disputed:
+            zero_sd_N = 0.0  # it is for a reversal to tell
+        self.freshness.update(fit.scale, model_N, reading_N, dt_s, learns=not self.is_disputed)
         self._hear(model_N, reading_N, dt_s)
-        if self.is_doubted:
-            self._hope(model_N, dt_s)
+        self._allow(fit, model_N, rate_mm_s, direction, zero_sd_N, dt_s)
+        self._judge(self.measured_N - fit.force_N(model_N), self._is_strange(model_N, zero_sd_N), dt_s)
+
+    def learned(self, learned_N: float, model_N: float, dt_s: float) -> None:
+        """Takes by how much a reading has moved the fit's force where the model says `model_N`."""
+        if not self.has_slid:
             return
-        is_strange = self._is_strange(model_N, rate_mm_s, direction, zero_sd_N)
-        self.evidence_s = max(self.evidence_s + (dt_s if is_strange else -dt_s), 0.0)
-        if self.evidence_s > DOUBTED_S:
-            self.is_doubted, self.doubted_s, self.evidence_s = True, 0.0, 0.0
-        elif self.kept_s >= KEPT_S and not is_strange:
-            self.before, self.before_at = self.kept, self.kept_at
-            self.kept, self.kept_at, self.kept_s = fit, (model_N, rate_mm_s, direction), 0.0
+        self.moved_N += learned_N
+        if abs(self.moved_N) > MOVED_N + self.slack_N:
+            self._begin(self.moved_N)
+        else:
+            self._forget(model_N, dt_s)
+
+    def compare(self, fit: DeviceFit, model_N: float) -> None:
+        """Looks whether the readings have left a fit that learns nothing now: then a dispute begins."""
+        over_N = self.measured_N - fit.force_N(model_N)
+        if self.has_slid and abs(over_N) > MOVED_N + self.slack_N + SURE * fit.deviation_N(model_N):
+            self._begin(over_N)
+
+    def told_zero(self, found_N: float) -> float:
+        """The handle has turned, and shown the sensor's zero to be `found_N` more than was known: what has relaxed is
+        known to have. The result is by how much the device gives more than its fit says: in a dispute that began since
+        the turn, the fit was learned with that zero."""
+        self.relaxed_N = 0.0
+        return found_N * self.direction if self.is_disputed and self.began_way == self.direction else 0.0
+
+    def confirm(self, wrong: Disputed) -> None:
+        """The operator settles the dispute: the `device` has changed, or the `sensor` is wrong."""
+        if wrong == "device":
+            self._settle()
+            self.known_s = 0.0
+        else:
+            self.is_doubted = True
 
     def _hear(self, model_N: float, reading_N: float, dt_s: float) -> None:
-        if not self.has_heard:
-            self.has_heard, self.still_s, self.kept_s = True, 0.0, 0.0
-            self.measured_N, self.loaded_N, self.slow = reading_N, model_N, UNSEEN
-            self.before = self.kept = UNSEEN
-            self.before_at = self.kept_at = (0.0, 0.0, 0.0)
-        else:
-            self.still_s = self.still_s + dt_s if reading_N == self.reading_N else 0.0
-            self.measured_N = low_pass(self.measured_N, reading_N, dt_s, FILTER_S)
-            self.loaded_N = low_pass(self.loaded_N, model_N, dt_s, MEMORY_S)
-            self.kept_s += dt_s
-        self.reading_N = reading_N
-        self.slow, _ = observe(self.slow, model_N, reading_N, dt_s, adapts_in_s=SLOW_S, bounds=(MIN_SCALE, MAX_SCALE))
+        if self.known_s == 0.0:
+            self.measured_N, self.model_N = reading_N, model_N
+        self.known_s = min(self.known_s + dt_s, LEARNS_S)
+        self.measured_N = low_pass(self.measured_N, reading_N, dt_s, FILTER_S)
 
-    def _hope(self, model_N: float, dt_s: float) -> None:
-        """A doubted sensor has to read for long what most devices do, not what one at the edge might."""
-        misses_N = abs(self.measured_N - UNSEEN.force_N(model_N))
-        agrees = self.still_s <= FROZEN_S and misses_N <= UNSEEN.deviation_N(model_N)
-        self.evidence_s = self.evidence_s + dt_s if agrees else 0.0
-        self.doubted_s += dt_s
-        if self.evidence_s > TRUSTED_AGAIN_S:
-            self.is_doubted, self.doubted_s, self.evidence_s, self.has_heard = False, 0.0, 0.0, False
-
-    def _is_strange(self, model_N: float, rate_mm_s: float, direction: float, zero_sd_N: float) -> bool:
-        """Whether the newest readings are such as no believable device gives."""
-        if self.still_s > FROZEN_S:
-            return True
-        # where nothing has told the zero for long, it may explain what no device does
-        unknown_N = SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
-        max_loaded_N, min_loaded_N = max(model_N, self.loaded_N), min(model_N, self.loaded_N)
-        weakest_N = MIN_SCALE * (model_N - MAX_RELAXED * max_loaded_N) - NOISE_N - unknown_N
-        strongest_N = MAX_SCALE * (model_N - MIN_RELAXED * min_loaded_N) + NOISE_N + unknown_N
-        if not weakest_N <= self.measured_N <= strongest_N:
-            return True
-        if abs(self.measured_N - self.before.force_N(model_N)) > self._jump_N(model_N, rate_mm_s, direction, zero_sd_N):
-            return True
-        slow = self.slow
-        unsure_N = SURE * math.sqrt(slow.offset_variance_N2) + unknown_N
-        min_N = MIN_OFFSET_N - MAX_RELAXED * slow.scale * max_loaded_N
-        return slow.offset_N + unsure_N < min_N or slow.offset_N - unsure_N > MAX_OFFSET_N
-
-    def _jump_N(self, model_N: float, rate_mm_s: float, direction: float, zero_sd_N: float) -> float:
-        """How far a device may depart from its fit of a moment ago."""
-        (before_N, before_mm_s, before_way), (kept_N, kept_mm_s, _) = self.before_at, self.kept_at
-        # a zero that is wrong is the fit's as well, but for the other way; and in time it drifts from both
-        is_turned = before_way * direction < 0.0
-        zero_N = SURE * zero_sd_N * (2.0 if is_turned else 1.0 if zero_sd_N > UNKNOWN_SD_N else 0.0)
-        return (
-            JUMP_N
-            + zero_N
-            + SURE * self.before.deviation_N(model_N)
-            + SHAPE * max(abs(model_N - before_N), abs(model_N - kept_N))
-            + VISCOUS_N_S_MM * max(abs(rate_mm_s - before_mm_s), abs(rate_mm_s - kept_mm_s))
+    def _allow(
+        self, fit: DeviceFit, model_N: float, rate_mm_s: float, direction: float, zero_sd_N: float, dt_s: float
+    ) -> None:
+        """What the device may show that its fit did not: what is around it has changed."""
+        # a zero that is wrong shows twice where the handle has turned
+        is_turned = direction * self.direction < 0.0
+        slack_N = (
+            SURE * max(fit.deviation_N(model_N) - fit.deviation_N(self.model_N), 0.0)
+            + SHAPE * abs(model_N - self.model_N)
+            + VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s)
+            + SURE * (2.0 * zero_sd_N if is_turned else max(zero_sd_N - UNKNOWN_SD_N, 0.0))
         )
+        self.direction = direction
+        self.slack_N = max(low_pass(self.slack_N, 0.0, dt_s, LATELY_S), slack_N)
+        self.model_N = low_pass(self.model_N, model_N, dt_s, LATELY_S)
+        self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LATELY_S)
+
+    def _judge(self, over_N: float, is_strange: bool, dt_s: float) -> None:
+        """Takes by how much the readings are over the fit's force as evidence of who is right."""
+        agrees = not is_strange and abs(over_N) <= AGREES_N + self.slack_N
+        self.wrong_s = self.wrong_s + dt_s if is_strange else max(self.wrong_s - dt_s, 0.0)
+        if self.wrong_s > WRONG_S and not self.is_doubted:
+            if not self.is_disputed:
+                self._begin(0.0)
+            self.is_doubted, self.doubted_s = True, 0.0
+        if not self.is_disputed:
+            return
+        self.disputed_s += dt_s
+        self.agreed_s = self.agreed_s + dt_s if agrees else 0.0
+        if self.is_doubted:
+            self.doubted_s += dt_s
+        wanted_N = 0.0 if is_strange or self.is_doubted else max(over_N, 0.0)
+        change_N = low_pass(self.lead_N, wanted_N, dt_s, LEADS_S) - self.lead_N
+        self.lead_N += min(max(change_N, -RISES_N_S * dt_s), RISES_N_S * dt_s)
+        if self.agreed_s > (TRUSTED_AGAIN_S if self.is_doubted else AGREES_S):
+            self._settle()
+
+    def _settle(self) -> None:
+        self.is_disputed = self.is_doubted = False
+        self.disputed_s = self.agreed_s = self.doubted_s = self.wrong_s = 0.0
+        self.lead_N = self.moved_N = 0.0
+
+    def _begin(self, over_N: float) -> None:
+        self.is_disputed, self.disputed_s, self.agreed_s = True, 0.0, 0.0
+        self.lead_N, self.began_way = max(over_N, 0.0), self.direction
+        self.back_N, self.moved_N = -self.moved_N, 0.0
+
+    def _forget(self, model_N: float, dt_s: float) -> None:
+        """What a device changes by itself in `dt_s` is no move of it."""
+        self.relaxed_N = low_pass(self.relaxed_N, 0.0, dt_s, SLOWEST_S)
+        by_itself_N = max(self.slack_N - SLACK_N, 0.0) / LEARNS_S * dt_s
+        relaxes_N = min(RELAXES_1_S * model_N * dt_s, max(RELAXED * model_N - self.relaxed_N, 0.0))
+        if self.moved_N < 0.0:
+            used_N = min(max(-self.moved_N - by_itself_N, 0.0), relaxes_N)
+            self.relaxed_N += used_N
+            self.moved_N = min(self.moved_N + by_itself_N + used_N, 0.0)
+        else:
+            self.moved_N = max(self.moved_N - by_itself_N - RELAXES_1_S * model_N * dt_s, 0.0)
+
+    def _is_strange(self, model_N: float, zero_sd_N: float) -> bool:
+        """Whether the newest readings are such as no device gives."""
+        if self.freshness.is_frozen:
+            return True
+        unknown_N = NOISE_N + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
+        weakest_N = self._least * (1.0 - RELAXED) * model_N - unknown_N
+        return not weakest_N <= self.measured_N <= self._most * (1.0 + RELAXED) * model_N + unknown_N

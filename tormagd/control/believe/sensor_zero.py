@@ -69,6 +69,8 @@ class SensorZero:
 
     zero_N: float = 0.0
     variance_N2: float = TARED_VARIANCE_N2
+    undoubted_N2: float = TARED_VARIANCE_N2
+    "What it was before the zero was doubted."
     told_s: float = math.inf
     "When the variance was that."
     direction: float = 0.0
@@ -89,8 +91,12 @@ class SensorZero:
         self.told_s = min(self.told_s, now_s)
 
     def doubt(self) -> None:
-        """The sensor is not believed to have been tared: its zero is known to within MAX_SD_N."""
-        self.variance_N2 = MAX_SD_N * MAX_SD_N
+        """The zero may be any: the next reversal tells it."""
+        self.undoubted_N2, self.variance_N2 = self.variance_N2, MAX_SD_N * MAX_SD_N
+
+    def trust(self) -> None:
+        """The readings show that it is the one it was."""
+        self.variance_N2 = min(self.variance_N2, self.undoubted_N2)
 
     def update(
         self,
@@ -102,29 +108,31 @@ class SensorZero:
         dt_s: float,
         scale: float,
         scale_sd: float,
-    ) -> None:
+    ) -> bool:
         """Takes a reading along `direction` of a handle that slides at `rate_mm_s`, where the model says `model_N`. It
-        stands for `dt_s` > 0; the device's scale is known to within `scale_sd`. All are finite."""
+        stands for `dt_s` > 0; the device's scale is known to within `scale_sd`. All are finite. The result tells
+        whether a reversal has told the zero just now."""
         level = self.level
         if level is None or direction != self.direction:
             # what was heard for too short a time is no level
             self.before = level if level is not None and level.heard_s >= LEVEL_S else None
             self.level, self.direction = Level(reading_N, model_N, rate_mm_s, dt_s, now_s), direction
-            return
+            return False
         began_s = now_s - level.heard_s
         level = self.level = level.heard(reading_N, model_N, rate_mm_s, dt_s, now_s)
-        if self.before is not None and level.heard_s >= LEVEL_S:
-            self._compare(now_s, self.before, level, began_s - self.before.until_s, scale, scale_sd)
-            self.before = None
+        if self.before is None or level.heard_s < LEVEL_S:
+            return False
+        before, self.before = self.before, None
+        return self._compare(now_s, before, level, began_s - before.until_s, scale, scale_sd)
 
     def _compare(
         self, now_s: float, before: Level, level: Level, between_s: float, scale: float, scale_sd: float
-    ) -> None:
-        """Learns from the levels before and after a reversal, which took `between_s`."""
+    ) -> bool:
+        """Learns from the levels before and after a reversal, which took `between_s`, and says whether it could."""
         by_model_N = level.model_N - before.model_N
         found_N = 0.5 * self.direction * (level.reading_N - before.reading_N - scale * by_model_N)
         if between_s > LONGEST_TURN_S or abs(found_N) > MAX_ZERO_N:
-            return
+            return False
         by_scale_N = 0.5 * scale_sd * by_model_N
         by_speed_N = 0.5 * VISCOUS_N_S_MM * (level.rate_mm_s - before.rate_mm_s)
         by_time_N = 0.5 * RELAXES_N_S * between_s
@@ -133,3 +141,4 @@ class SensorZero:
         gain = variance_N2 / (variance_N2 + read_N2)
         self.zero_N += gain * (found_N - self.zero_N)
         self.variance_N2, self.told_s = (1.0 - gain) * variance_N2, now_s
+        return True

@@ -16,12 +16,14 @@ from tormagd.control.filter import low_pass
 
 SCALE_SD: Final = 0.17
 "Spread of the scale of devices not yet seen: friction, shear modulus and field each differ evenly within 12%."
-MIN_SCALE: Final = 0.64
-MAX_SCALE: Final = 1.53
-"All three at their ends, and the field's exponent at its own, -1.34 and -1.26: no believable device is beyond."
-MIN_RELAXED: Final = 0.1
+MIN_SCALE: Final = 0.6
+MAX_SCALE: Final = 2.0
+"No device is taken for weaker or stronger. One that presses harder than it is asked to is believed sooner."
+MIN_OFFSET_N: Final = -0.2
+MAX_OFFSET_N: Final = 0.3
+"And none for further off: another field law and what relaxes look like -0.15 N at most, more is a sensor's zero."
 MAX_RELAXED: Final = 0.21
-"The least and the greatest share of its force that an elastomer loses in the course of hours."
+"The greatest share of its force that an elastomer loses in the course of hours."
 OFFSET_SD_N: Final = 0.1
 "Of the offset: what relaxation and hysteresis do around 0.5 N."
 ERROR_N2_S: Final = 3e-4
@@ -91,6 +93,16 @@ class DeviceFit(Value):
             square * self.covariance_N,
             square * self.offset_variance_N2,
         )
+
+    def shifted(self, by_N: float) -> "DeviceFit":
+        """The fit of a device that gives `by_N` more."""
+        return DeviceFit(
+            self.scale, self.offset_N + by_N, self.scale_variance, self.covariance_N, self.offset_variance_N2
+        )
+
+    def unsure(self) -> "DeviceFit":
+        """The same force, of a device that may be any."""
+        return DeviceFit(self.scale, self.offset_N)
 
     def relaxed(self, relaxed_N: float) -> "DeviceFit":
         """The fit over the model's force without memory, of a device whose force it is without `relaxed_N` of that."""
@@ -182,7 +194,7 @@ class Strength:
     surprise_N: float = 0.0
     "By how much the readings of the last SURPRISE_S were more than expected."
     is_held: bool = False
-    "The scale is at one of its bounds."
+    "Scale or offset is at one of its bounds."
 
     def __init__(self, adapts_in_s: float, bounds: tuple[float, float], learns: tuple[bool, bool]) -> None:
         """`adapts_in_s`: the offset's time without surprise; `bounds` of the scale; what `learns`, scale and offset."""
@@ -205,10 +217,18 @@ class Strength:
             learns_scale=self._learns[0],
             learns_offset=self._learns[1],
         )
+        offset_N = min(max(self.fit.offset_N, MIN_OFFSET_N), MAX_OFFSET_N)
+        if offset_N != self.fit.offset_N:
+            self.fit, self.is_held = self.fit.shifted(offset_N - self.fit.offset_N), True
 
     def settle(self) -> None:
         """Nothing can be learned now: what comes after that is no surprise yet, and no bound holds the scale."""
         self.surprise_N, self.is_held = 0.0, False
+
+    def shift(self, by_N: float) -> None:
+        """Takes the device's force for so much more, or less: what the last readings taught was no lesson."""
+        self.fit = self.fit.shifted(by_N)
+        self.settle()
 
     def forget(self, fit: DeviceFit = UNSEEN) -> None:
         """Forgets what was learned: `fit` is what is known from now on."""

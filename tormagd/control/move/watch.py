@@ -23,8 +23,8 @@ STARTS_OVER: Final = 1.25
 "Static over kinetic friction at most: a start from rest may take so many times the greatest force."
 OVER_N: Final = 0.1
 "What the sensor may be off besides."
-OVER_HELD_S: Final = 0.01
-OVER_FAULT_S: Final = 0.04
+OVER_HELD_S: Final = 0.03
+OVER_FAULT_S: Final = 0.1
 "A force over the ceiling opens the gap after the first, and is a fault after the second."
 SENSOR_FAULT_S: Final = 2.0
 "A sensor that has not been believed for so long of sliding is a fault: forces are then only as good as the model."

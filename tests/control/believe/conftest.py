@@ -1,0 +1,29 @@
+"""What the tests of beliefs share: a planner of a device that nothing is known of, and readings for it."""
+
+from collections.abc import Callable
+
+import pytest
+
+from tormagd.assembly.build import Core
+from tormagd.control.core import Planner
+from tormagd.control.records import Measured, Plan
+
+PERIOD_S = 0.004
+
+
+@pytest.fixture
+def planner(core: Core) -> Planner:
+    return core.planner()
+
+
+@pytest.fixture
+def hear(planned: Callable[..., Plan]) -> Callable[..., Planner]:
+    """Plans for 1 N while the same is measured, but for the noise that a live sensor has."""
+
+    def heard(planner: Planner, seconds: float, measured: Measured, noise_N: float = 0.003) -> Planner:
+        for number in range(round(seconds / PERIOD_S)):
+            off_N = noise_N * (-1) ** number
+            planned(planner, 1.0, measured.replaced(force_N=measured.force_N + off_N))
+        return planner
+
+    return heard

@@ -1,0 +1,93 @@
+"""Whether a force sensor still shows new values, told from its own noise and steps.
+
+run      readings of one value, one after the other
+stale    the same value although the force has changed by STALE_N and two of the sensor's steps: it teaches nothing
+frozen   the same although it has changed by FROZEN_N and two steps; and of a sensor whose noise is resolved, for
+         longer than FROZEN_RUNS of its mean runs
+"""
+
+import math
+from typing import Final, final
+
+STALE_N: Final = 0.03
+"Three times the noise of a sensor."
+FROZEN_N: Final = 0.15
+"A sensor that shows nothing of this is broken."
+FROZEN_S: Final = 0.1
+"No sensor is frozen sooner: it shows ten readings a second at least."
+FROZEN_RUNS: Final = 12.0
+"White noise as large as a step shows one value so often once in five million times."
+RESOLVED: Final = 1.5
+ALTERNATES: Final = 0.4
+"Noise is resolved where runs are this many times the least one in the mean, and so many of the changes go back."
+HEARD: Final = 100
+"So many runs tell a sensor's noise."
+
+
+@final
+class Freshness:
+    """Follows the readings of one sensor."""
+
+    has_heard: bool = False
+    reading_N: float = 0.0
+    "The newest."
+    still_s: float = 0.0
+    "For how long it has been the same."
+    stood_N: float = 0.0
+    "The model's force when it began to be."
+    changed_N: float = 0.0
+    "By how much the device's force has changed since."
+    runs: int = 0
+    "How many runs there were, HEARD at most."
+    run_s: float = 0.0
+    "How long a run is in the mean,"
+    min_run_s: float = math.inf
+    "and at the least."
+    change_N: float = 0.0
+    "How the value changed last,"
+    step_N: float = 0.0
+    "and by how much at the least."
+    alternates: float = 0.0
+    "Which share of the changes goes back."
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether the newest reading is an old one."""
+        return self.changed_N > STALE_N + self._steps_N
+
+    @property
+    def is_frozen(self) -> bool:
+        """Whether the sensor should have shown another value by now."""
+        if self.still_s <= FROZEN_S:
+            return False
+        is_resolved = self.alternates > ALTERNATES and self.run_s < RESOLVED * self.min_run_s
+        if self.runs == HEARD and is_resolved and self.still_s > FROZEN_RUNS * self.run_s:
+            return True
+        return self.changed_N > FROZEN_N + self._steps_N
+
+    @property
+    def _steps_N(self) -> float:
+        return 2.0 * min(self.step_N, FROZEN_N)
+
+    def update(self, scale: float, model_N: float, reading_N: float, dt_s: float, *, learns: bool) -> None:
+        """Takes a reading that stands for `dt_s` > 0, where the model says `model_N` of a device that has so many times
+        its force. `learns`: the sensor is believed, and shows its noise."""
+        if not self.has_heard:
+            self.has_heard, self.stood_N = True, model_N
+        elif reading_N == self.reading_N:
+            self.still_s += dt_s
+        else:
+            if learns:
+                self._take_run(reading_N - self.reading_N, self.still_s + dt_s)
+            self.still_s, self.stood_N = 0.0, model_N
+        self.reading_N = reading_N
+        self.changed_N = scale * abs(model_N - self.stood_N)
+
+    def _take_run(self, change_N: float, run_s: float) -> None:
+        self.runs = min(self.runs + 1, HEARD)
+        share = 1.0 / self.runs
+        self.run_s += share * (run_s - self.run_s)
+        self.alternates += share * ((1.0 if change_N * self.change_N < 0.0 else 0.0) - self.alternates)
+        self.min_run_s = min(self.min_run_s, run_s)
+        self.step_N = abs(change_N) if self.step_N == 0.0 else min(self.step_N, abs(change_N))
+        self.change_N = change_N
