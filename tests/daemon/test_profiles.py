@@ -126,10 +126,22 @@ def test_a_device_that_has_shown_itself_meanwhile_is_believed(
     assert rig.learned.device.scale == 0.8
 
 
-def test_what_a_doubted_sensor_taught_is_not_kept(new_rig: Callable[[Path | None], Rig], tmp_path: Path) -> None:
+def test_a_profile_that_the_first_slide_contradicts_is_dropped_by_name(
+    new_rig: Callable[[Path | None], Rig], tmp_path: Path
+) -> None:
+    keep(tmp_path, 7)
+    rig = new_rig(tmp_path)
+    rig.look(7, False)
+    rig.believe.is_contradicted = True
+    rig.look(7, True)
+    report = rig.profiles.report()
+    assert (report.is_used, report.refusal) == (False, "the device's first slide shows another one")
+
+
+def test_what_a_disputed_sensor_taught_is_not_kept(new_rig: Callable[[Path | None], Rig], tmp_path: Path) -> None:
     rig = new_rig(tmp_path)
     rig.look(7, False, True, learned=STRONG)
-    rig.believe.sensor.is_doubted = True
+    rig.believe.sensor.is_disputed = True
     rig.look(7, False)
     assert rig.learned == STRONG
     assert list(tmp_path.iterdir()) == []

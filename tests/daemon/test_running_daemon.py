@@ -445,6 +445,15 @@ def test_a_second_publisher_is_refused_and_named_until_it_is_given_the_brake(arm
     assert status["setpoints"]["by_source"]["test"]["state"] == "refused"
 
 
+def test_a_dispute_of_device_and_sensor_is_the_operators_to_settle(armed: Running) -> None:
+    assert armed.refused("confirm", what="both") == "bad_confirmation"
+    assert armed.refused("confirm", what="device") == "not_disputed"
+    sensor = armed.daemon._inference.planner.believe.sensor
+    sensor.is_disputed = True
+    assert armed.command("confirm", what="sensor") == {"confirmed": "sensor"}
+    assert sensor.is_doubted
+
+
 def test_a_device_that_is_unplugged_in_motion_comes_back_without_re_arming(armed: Running) -> None:
     armed.ask(1.5)
     armed.until(lambda status: status["gap_mm"] < 85.0, "closing")

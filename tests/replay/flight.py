@@ -13,6 +13,7 @@ from tormagd.assembly.build import Core
 from tormagd.assembly.journal import Journal, Packer
 from tormagd.closed_loop import SEARCH_S, ClosedLoop, Sample, VirtualBus
 from tormagd.config import Config
+from tormagd.control.believe.sensor import Disputed
 from tormagd.control.records import TimedSetpoint
 from tormagd.daemon.black_box import header
 from tormagd.daemon.inbox import SetpointInbox
@@ -137,6 +138,10 @@ class Flight:
         except RefusedError:
             is_refused = True
         self._journal.commanded(name, self.loop.now_s, conditions, is_refused=is_refused)
+
+    def confirm(self, wrong: Disputed) -> None:
+        """The operator says who is right."""
+        self._inference.confirm(wrong)
 
     def until(self, reached: Callable[[], bool]) -> None:
         """Ticks until then."""

@@ -19,8 +19,9 @@ from mcap.writer import Writer
 from firmware_protocol.build import SWITCH, settle
 from tormagd import __version__
 from tormagd.assembly.build import Core
-from tormagd.assembly.journal import ANSWER, MISSING
+from tormagd.assembly.journal import ANSWER, CONFIRM, MISSING
 from tormagd.config import Config, Device
+from tormagd.control.records import TimedSetpoint
 from tormagd.keeping import Part
 from tormagd.recording.black_box import BlackBoxFile, read_black_box, write_black_box
 from tormagd.recording.reader import RecordingError, read_recording
@@ -77,6 +78,17 @@ def test_what_a_search_beside_the_plans_answered_is_replayed_not_searched_for(fl
     assert again(flown.core, box, 1.7).difference is None
     # another field in one of them is found
     answers[-5][1]["Answer"]["solution"]["FieldSolution"]["field_mT"] += 0.5
+    assert again(flown.core, box).difference is not None
+
+
+def test_what_an_operator_confirmed_is_replayed(fly: Any, tmp_path: Path) -> None:
+    flown = fly(until_s=4.0)
+    flown.confirm("device")
+    for _ in range(500):
+        flown.tick(TimedSetpoint(1.0, flown.loop.now_s, 0.1))
+    box = read_black_box(flown.write(tmp_path / "confirmed.mcap"))
+    assert again(flown.core, box).difference is None
+    box.entries.remove([CONFIRM, "device"])
     assert again(flown.core, box).difference is not None
 
 
@@ -298,7 +310,7 @@ def test_no_entries_break_it(core: Core, box: BlackBoxFile) -> None:
     rng = random.Random(5)
     rubbish: list[Any] = [None, -1, 2**63, "x", float("nan"), b"\0", {}, [], [[]], [1], ["plan"], ["unheard"]]
     rubbish += [["state", 1, 2], ["command", "stop", 1.0, False], ["latch", "SKEWED"], ["afresh", "now"]]
-    rubbish += [["teach", {"Learned": {}}], ["teach", {"Limit": "RATE"}]]
+    rubbish += [["teach", {"Learned": {}}], ["teach", {"Limit": "RATE"}], ["confirm", "both"]]
     head = box.entries[: list(ticks_of(COLUMNS, box.entries))[60] + 1]
     for _ in range(100):
         entries = list(head)

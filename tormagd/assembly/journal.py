@@ -40,7 +40,7 @@ KNOWN = kinds(
 "All records that stages keep, or that were given to them: what `exact` reads back."
 STEP = "step"
 "The step ran here; what it was given stands in the next record."
-PLAN, FORESEE, AFRESH, TEACH, ANSWER = "plan", "foresee", "afresh", "teach", "answer"
+PLAN, FORESEE, AFRESH, TEACH, ANSWER, CONFIRM = "plan", "foresee", "afresh", "teach", "answer", "confirm"
 COMMAND, LATCH, LOSE_LINK = "command", "latch", "lose_link"
 CONNECTED = "connected"
 "Besides READ and WROTE, which the process that keeps them knows, too."
@@ -86,6 +86,10 @@ class Journal:
     def taught(self, learned: Learned) -> None:
         """What is known of the device from another day was put in the place of what was believed."""
         self._add((TEACH, learned))
+
+    def confirmed(self, what: str) -> None:
+        """The operator said who is right, the device or its sensor."""
+        self._add((CONFIRM, what))
 
     def answered(self, answer: Answer) -> None:
         """The search beside the plans has found something, for the next plan."""

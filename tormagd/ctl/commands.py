@@ -142,6 +142,12 @@ COMMANDS = {
         ("client",),
         (option("source", type=source, metavar="SOURCE", help="as tormagctl status names it"),),
     ),
+    "confirm": Command(
+        "say who is right where the limit DEVICE_OR_SENSOR asks: the device has changed, or the sensor is wrong",
+        "operate.confirm",
+        ("client",),
+        (option("what", choices=("device", "sensor"), help="device: it is learned anew; sensor: it is not believed"),),
+    ),
     "home": Command(
         "find the home switches of both carriages",
         "operate.home",

@@ -1,4 +1,5 @@
-"""The commands that change what the device does: enable, disable, pause, resume, stop, clear-fault, take, home."""
+"""The commands that change what the device does: enable, disable, pause, resume, stop, clear-fault, take, confirm,
+home."""
 
 import sys
 import time
@@ -93,6 +94,16 @@ def take(client: Client, source: str) -> Outcome:
     before = result.get("instead_of")
     instead = "already" if before == source else f"instead of {before!r}; the force goes to its setpoints along a ramp"
     return Outcome(result, f"{source!r} holds the brake {instead}")
+
+
+def confirm(client: Client, what: str) -> Outcome:
+    """Settle a dispute between readings and believed device: `what` is "device", it has changed, or "sensor", it is
+    wrong. Raises CommandError (REFUSED) where nothing is disputed."""
+    result = client.request("confirm", what=what)
+    if result.get("confirmed") != what:
+        raise _not_done(f"the daemon answers that {result.get('confirmed')!r} is confirmed, not {what!r}")
+    text = "the device has changed: it is learned anew" if what == "device" else "the force sensor is wrong: SENSOR"
+    return Outcome(result, text)
 
 
 def _not_done(what: str) -> CommandError:

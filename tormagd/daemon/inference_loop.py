@@ -7,6 +7,7 @@ from typing import Final
 
 from tormagd.assembly.journal import Journal
 from tormagd.control.believe.believe import Learned
+from tormagd.control.believe.sensor import Disputed
 from tormagd.control.core import Planner
 from tormagd.control.records import Measured
 from tormagd.daemon.endpoint import Endpoint
@@ -51,6 +52,11 @@ class InferenceLoop:
         """Plans from now on for a device of which this is known."""
         self._journal.taught(learned)
         self.planner.teach(learned)
+
+    def confirm(self, wrong: Disputed) -> None:
+        """The operator says that the device has changed, or that its sensor is wrong."""
+        self._journal.confirmed(wrong)
+        self.planner.confirm(wrong)
 
     def receive(self, measured: Measured | None, next_tick_ns: int) -> None:
         """Something has arrived: reads it, and plans on a new setpoint, if the next control tick leaves the time."""

@@ -94,16 +94,19 @@ class Profiles:
             if self._folder is not None:
                 self._refusal = ""
                 self._loop.run_in_executor(None, self._folder.read, serial_number).add_done_callback(self._take)
+        if self._is_used and self._believe.is_contradicted:
+            self._is_used, self._refusal = False, "the device's first slide shows another one"
+            log.warning("the profile is dropped: %s", self._refusal)
         if self._was_driven and not is_driven:
             self.keep()
         self._was_driven = is_driven
 
     def keep(self) -> None:
-        """Keeps what has been learned, where anything has been and the sensor is believed.
+        """Keeps what has been learned, where anything has been and nothing is disputed.
 
         A profile that nothing was added to stays as it is: it does not get younger by being used."""
-        learned, is_doubted = self._believe.learned(), self._believe.sensor.is_doubted
-        if self._folder is None or self._serial_number is None or learned.device is UNSEEN or is_doubted:
+        learned, is_disputed = self._believe.learned(), self._believe.sensor.is_disputed
+        if self._folder is None or self._serial_number is None or learned.device is UNSEEN or is_disputed:
             return
         if learned == self._on_disk:
             return

@@ -13,6 +13,7 @@ from tormagd.assembly.belief import beliefs
 from tormagd.assembly.build import Core
 from tormagd.assembly.conditions import conditions, is_busy, is_homed
 from tormagd.config import Config
+from tormagd.control.believe.sensor import DISPUTED
 from tormagd.control.move.opening import is_open
 from tormagd.control.records import Plan
 from tormagd.daemon import notify
@@ -265,6 +266,8 @@ class TelemetryLoop:
         self._status = None
         if request.command == "take":
             return self._give(request.args.get("source"))
+        if request.command == "confirm":
+            return self._confirm(request.args.get("what"))
         if request.command == "blackbox":
             return {"file": str(self.keep(ASKED, 0.0))}
         self._control.command(request.command, self.conditions())
@@ -273,6 +276,21 @@ class TelemetryLoop:
             # without a device nothing moves yet: a request to open is kept for it, and no other is taken
             "is_connected": self._connection.measurement is not None,
         }
+
+    def _confirm(self, what: object) -> dict[str, Any]:
+        if what not in DISPUTED:
+            raise RefusedError(
+                "bad_confirmation",
+                f"args.what = {what!r}: allowed are {' and '.join(DISPUTED)}",
+                "tormagctl confirm device",
+            )
+        if not self._inference.planner.believe.sensor.is_disputed:
+            raise RefusedError(
+                "not_disputed", "the readings agree with the device: there is nothing to confirm", "tormagctl status"
+            )
+        self._inference.confirm(DISPUTED[DISPUTED.index(what)])
+        log.warning("confirm: %s", "the device has changed" if what == "device" else "the force sensor is wrong")
+        return {"confirmed": what}
 
     def _give(self, source: object) -> dict[str, Any]:
         if not isinstance(source, str):

@@ -11,6 +11,7 @@ from tormagd.assembly import journal
 from tormagd.assembly.build import Core
 from tormagd.assembly.journal import KNOWN
 from tormagd.control.believe.believe import Learned
+from tormagd.control.believe.sensor import Disputed
 from tormagd.control.records import Duty, TimedSetpoint
 from tormagd.daemon.inference_loop import PLAN_ERRORS
 from tormagd.daemon.telemetry import tick_record
@@ -204,6 +205,8 @@ class _Running:
                     self._planner.teach(told)
                 else:
                     self._planner.answered(told)
+            case journal.CONFIRM:
+                self._planner.confirm(msgspec.convert(entry[1], Disputed))
             case journal.COMMAND:
                 command, now_s, was_refused, given = msgspec.convert(entry[1:], tuple[str, float, bool, dict[str, Any]])
                 try:
