@@ -3,13 +3,14 @@
     force_tracking.py [CASE ...] [--draws N] [--drift-s S] [--hours H] [--json] [--picture FILE.png]
 
 How soon a device is known: `steps`, `creep` and `speeds`, of the three samples, of the second plant, whose structure is
-another, and of draws of the plant card; `drift` of the force sensor, and the `pulse` of `make run` as more is known, of
-samples and second plant. A `day` of pulses, by the hour, of sample 1: only where it is named. How well signals are
-followed: that pulse on the `samples` and the second plant, and on random `draws`, 500 setpoints a second, with a
-preview of 70 ms and without; a `staircase`; recorded `signals` from the folder that TORMAG_DATA names, with 400 ms, as
-a publisher can that plays a file, and live. Beside them stands what ideal carriages miss (`bound.py`), and beside
-`samples` what the same core does with carriages that lose no time. Draws 40 to 79, samples 2 and 3 and the second plant
-only judge. All devices are synthetic.
+another, and of draws of the plant card; and of those, `doubts`: lies of the sensor, friction that changes, and honest
+sensors. `drift` of the force sensor, and the `pulse` of `make run` as more is known, of samples and second plant. A
+`day` of pulses, by the hour, of sample 1: only where it is named. How well signals are followed: that pulse on the
+`samples` and the second plant, and on random `draws`, 500 setpoints a second, with a preview of 70 ms and without; a
+`staircase`; recorded `signals` from the folder that TORMAG_DATA names, with 400 ms, as a publisher can that plays a
+file, and live. Beside them stands what ideal carriages miss (`bound.py`), and beside `samples` what the same core does
+with carriages that lose no time. Draws 40 to 79, samples 2 and 3 and the second plant only judge. All devices are
+synthetic.
 """
 
 import argparse
@@ -25,13 +26,20 @@ from typing import Any
 import numpy as np
 from rendering import cases
 from rendering.device_draws import SAMPLES, judging
+from rendering.doubts import doubts
 from tqdm import tqdm
 
 from tormagd.lab.arrays import Json
 from tormagd.lab.told import lines
 
 DRAWS = 40
-OF_DEVICES = {"steps": cases.steps, "creep": cases.creep, "speeds": cases.speeds, "pulse": cases.pulse}
+OF_DEVICES = {
+    "steps": cases.steps,
+    "creep": cases.creep,
+    "speeds": cases.speeds,
+    "pulse": cases.pulse,
+    "doubts": doubts,
+}
 OF_SIGNALS: dict[str, Callable[[Executor, cases.Kept], Any]] = {
     "samples": cases.samples,
     "draws": cases.draws,
