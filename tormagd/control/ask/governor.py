@@ -231,7 +231,6 @@ class Governor:
 
 
 def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
-    """Of all but the preview's forces, which are looked at where they act."""
     if not (
         -_LARGEST <= age_s <= _LARGEST
         and -_LARGEST <= setpoint.force_N <= _LARGEST
@@ -242,8 +241,13 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
         for name in ("force_N", "stamp_s", "valid_for_s", "displacement_mm", "rate_mm_s"):
             require_number(name, getattr(setpoint, name) or 0.0)
         require_number("age_s", age_s)
-    if setpoint.preview_N and not 0.0 < setpoint.preview_dt_s <= _LARGEST:
+    if not setpoint.preview_N:
+        return
+    if not 0.0 < setpoint.preview_dt_s <= _LARGEST:
         raise DomainError("preview_dt_s", setpoint.preview_dt_s, "above 0 s")
+    if not -_LARGEST <= sum(setpoint.preview_N) <= _LARGEST:
+        for force_N in setpoint.preview_N:
+            require_number("preview_N", force_N)
 
 
 def _within_reach(
