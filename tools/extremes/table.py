@@ -32,6 +32,7 @@ from tormagd.control.ask.path import TIMES_S, Path
 from tormagd.control.ask.skill import Skill
 from tormagd.control.believe.believe import Believe
 from tormagd.control.believe.carriage_lag import CarriageLag
+from tormagd.control.believe.freshness import Freshness
 from tormagd.control.believe.handle import HandleWatch
 from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.sensor import SensorTrust
@@ -261,6 +262,11 @@ def sensor_zero(stage: SensorZero, draw: Draw) -> object:
     direction = 1.0 if draw.steps // 4 % 2 else -1.0
     stage.update(now_s, direction, draw(1.1), draw(1.1), abs(draw(42.0)), draw.positive(0.2), 1.0, 0.1)
     return stage.sd_N(now_s)
+
+
+def freshness(stage: Freshness, draw: Draw) -> object:
+    stage.update(abs(draw(1.0)), draw(1.1), draw(1.1), draw.positive(PLAN_S), learns=True)
+    return stage.changed_N
 
 
 def sensor(stage: SensorTrust, draw: Draw) -> object:
@@ -568,6 +574,7 @@ def stages() -> list[Stage]:
         Stage("believe/strength", lambda: Strength(0.5, (0.6, 1.6), (True, True)), strength, MEASUREMENT),
         Stage("believe/slow_friction", SlowFriction, slow_friction, MEASUREMENT),
         Stage("believe/sensor_zero", SensorZero, sensor_zero, MEASUREMENT),
+        Stage("believe/freshness", Freshness, freshness, MEASUREMENT),
         Stage("believe/sensor", partial(SensorTrust, (0.6, 2.0)), sensor, MEASUREMENT),
         Stage("believe/carriage_lag", CarriageLag, carriage_lag, MEASUREMENT),
         Stage("believe/handle", HandleWatch, handle_watch, MEASUREMENT),

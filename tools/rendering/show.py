@@ -395,7 +395,7 @@ COLUMNS = 79
 
 def live_line(telemetry: Telemetry, elapsed_s: float, duration_s: float) -> str:
     """One line: a bar of the measured force with a mark where it was asked, gap, limits; as many as fit."""
-    width, most = 20, 2.0
+    width, most = 18, 2.0
     measured, asked = telemetry.measured_cf or 0.0, telemetry.setpoint_cf or 0.0
     shown = "-" if telemetry.setpoint_cf is None else f"{asked:.2f}"
     filled = round(min(max(measured / most, 0.0), 1.0) * width)

@@ -16,7 +16,7 @@ from tormagd.control.filter import low_pass
 
 SCALE_SD: Final = 0.17
 "Spread of the scale of devices not yet seen: friction, shear modulus and field each differ evenly within 12%."
-MIN_SCALE: Final = 0.6
+MIN_SCALE: Final = 0.64
 MAX_SCALE: Final = 2.0
 "No device is taken for weaker or stronger. One that presses harder than it is asked to is believed sooner."
 MIN_OFFSET_N: Final = -0.2
