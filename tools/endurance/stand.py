@@ -72,7 +72,8 @@ class Stand:
         )
         self.daemon = self.begin("-m", "tormagd.daemon.main", "--config", str(config))
         self.endpoints = load_config(config).endpoints
-        self.client = stack.enter_context(Client(self.endpoints, 2.0))
+        # patient, because the host may be busy: what is to come in time is measured, not waited for
+        self.client = stack.enter_context(Client(self.endpoints, 10.0))
         self.until(lambda status: status["link"]["state"] == "RUNNING", "the link runs")
 
     def begin(self, *arguments: str) -> "subprocess.Popen[str]":
