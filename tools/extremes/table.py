@@ -337,8 +337,9 @@ def skill(stages: list[Skill], draw: Draw) -> object:
 
 def aim() -> list[Any]:
     made = core()
-    planned = made.planner(9.9)
-    return [Aim(CONFIG, made.scene, made.element), planned.believe.memory, planned.believe.update(9.9, None)]
+    planned, begun = made.planner(9.9), Aim(CONFIG, made.scene, made.element)
+    begun.begin(9.9, 0, 0.0)
+    return [begun, planned.believe.memory, planned.believe.update(9.9, None)]
 
 
 def aiming(stage: list[Any], draw: Draw) -> object:

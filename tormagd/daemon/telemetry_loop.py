@@ -13,7 +13,7 @@ from tormagd.assembly.belief import beliefs
 from tormagd.assembly.build import Core
 from tormagd.assembly.conditions import conditions, is_busy, is_homed
 from tormagd.config import Config
-from tormagd.control.believe.sensor import DISPUTED
+from tormagd.control.believe.sensor import Disputed
 from tormagd.control.move.opening import is_open
 from tormagd.control.records import Plan
 from tormagd.daemon import notify
@@ -278,19 +278,19 @@ class TelemetryLoop:
         }
 
     def _confirm(self, what: object) -> dict[str, Any]:
-        if what not in DISPUTED:
+        try:
+            wrong = msgspec.convert(what, Disputed)
+        except msgspec.ValidationError as error:
             raise RefusedError(
-                "bad_confirmation",
-                f"args.what = {what!r}: allowed are {' and '.join(DISPUTED)}",
-                "tormagctl confirm device",
-            )
+                "bad_confirmation", f"args.what = {what!r}: allowed are device and sensor", "tormagctl confirm device"
+            ) from error
         if not self._inference.planner.believe.sensor.is_disputed:
             raise RefusedError(
                 "not_disputed", "the readings agree with the device: there is nothing to confirm", "tormagctl status"
             )
-        self._inference.confirm(DISPUTED[DISPUTED.index(what)])
-        log.warning("confirm: %s", "the device has changed" if what == "device" else "the force sensor is wrong")
-        return {"confirmed": what}
+        self._inference.confirm(wrong)
+        log.warning("confirm: %s", "the device has changed" if wrong == "device" else "the force sensor is wrong")
+        return {"confirmed": wrong}
 
     def _give(self, source: object) -> dict[str, Any]:
         if not isinstance(source, str):

@@ -73,7 +73,6 @@ class Aim:
         self._portrait: Final = element.portrait
         self._search: Final = element.search
         self._is_beside: Final = element.is_beside
-        self.answer = Answer(0.0, FieldSolution(0.0, 0.0, 0.0, 0, _INSIDE))
         self._law: Final = element.law
         self._closed_mm: Final = scene.insert.gap_closed_mm
         self._open_mm: Final = scene.insert.gap_open_mm

@@ -245,6 +245,7 @@ def _require_numbers(setpoint: TimedSetpoint, age_s: float) -> None:
         return
     if not 0.0 < setpoint.preview_dt_s <= _LARGEST:
         raise DomainError("preview_dt_s", setpoint.preview_dt_s, "above 0 s")
+    # one look for NaN and infinity, wherever they stand; a force that acts is held to its bounds where it does
     if not -_LARGEST <= sum(setpoint.preview_N) <= _LARGEST:
         for force_N in setpoint.preview_N:
             require_number("preview_N", force_N)

@@ -88,9 +88,9 @@ class Believe:
         trim = config.trim
         self._min_model_N: Final = min_model_N
         self.memory, self.handle = memory, HandleWatch()
-        self.strength = Strength(trim.time_s, (trim.least, trim.most), (terms.scale, terms.offset))
-        self.slow, self.zero = SlowFriction(), SensorZero()
         self._bounds: Final = (trim.least, trim.most)
+        self.strength = Strength(trim.time_s, self._bounds, (terms.scale, terms.offset))
+        self.slow, self.zero = SlowFriction(), SensorZero()
         self.sensor, self.carriages = SensorTrust(self._bounds), CarriageLag()
         self._nominal: Final = nominal
         self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)

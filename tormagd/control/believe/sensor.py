@@ -19,7 +19,6 @@ from tormagd.control.filter import low_pass
 
 Disputed = Literal["device", "sensor"]
 "What an operator may say in a dispute: the device has changed, or the sensor is wrong."
-DISPUTED: Final[tuple[Disputed, Disputed]] = ("device", "sensor")
 
 FILTER_S: Final = 0.01
 "Of the readings' mean."
