@@ -67,6 +67,8 @@ class SecondElement:
         self._second = second = plant.second
         self._dt_s = dt_s
         self._warmth = Warmth(plant)
+        creeps = dt_s / second.creep_s
+        self._kept, self._lost = math.exp(-creeps), -math.expm1(-creeps)
         self._plays_mT = [shaft_field_mT(gap_mm, plant, second.concentration) for _ in second.play_mT]
         self._fresh_N = fresh_N(self._plays_mT[0], second)
         self._creeping_N = 0.0
@@ -114,6 +116,6 @@ class SecondElement:
         """After a step, exactly: tanh(s / 2 V) falls by exp(-dt / T), written so that a large s loses no digits."""
         scale_N = self._second.creep_scale_N
         large = math.exp(-abs(creeping_N) / scale_N)
-        kept, lost = math.exp(-self._dt_s / self._second.creep_s), -math.expm1(-self._dt_s / self._second.creep_s)
+        kept, lost = self._kept, self._lost
         left = math.log((1.0 + kept + large * lost) / (lost + large * (1.0 + kept)))
         return math.copysign(scale_N * left, creeping_N)
