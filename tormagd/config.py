@@ -147,7 +147,11 @@ class Trim(Strict, frozen=True):
     least: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.6
     "Of a device's force over the model's; what is below is not corrected, and the limit `TRIM` says so."
     most: Annotated[float, Meta(ge=1.0, le=5.0)] = 2.0
-    "The same for what is above."
+    "The same for what is above. No device is taken for stronger, so its greatest force rests on this."
+    least_offset_N: Annotated[float, Meta(ge=-2.0, le=0.0)] = -0.2
+    "Of a device's force at speed: another field law and what relaxes look like -0.15 N at most."
+    most_offset_N: Annotated[float, Meta(ge=0.0, le=2.0)] = 0.3
+    "The same for what is above; more is the sensor's zero."
 
 
 class Limits(Strict, frozen=True):

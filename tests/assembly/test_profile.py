@@ -8,17 +8,19 @@ import pytest
 from hypothesis import given, strategies as st
 
 from tormagd.assembly.profile import MAX_BYTES, ZERO_LASTS_S, Profile, ProfileError, profile_of, read_profile
+from tormagd.config import Config
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.carriage_lag import MAX_LAG_S
-from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceFit
+from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceFit, device_bounds
 
 OF = {"serial_number": 7, "insert": "MRE-50-40", "model": "ab" * 32}
+BOUNDS = device_bounds(Config().trim)
 KNOWN = Learned(DeviceFit(1.2, -0.05, 1e-4, -1e-4, 4e-4), 1.1, 0.6, 0.07, 0.012)
 KEPT = profile_of(KNOWN, saved_ns=10**18, **OF)  # type: ignore[arg-type]
 
 
 def again(profile: Profile) -> Profile:
-    return read_profile(msgspec.json.encode(profile), **OF)  # type: ignore[arg-type]
+    return read_profile(msgspec.json.encode(profile), bounds=BOUNDS, **OF)  # type: ignore[arg-type]
 
 
 def test_what_was_learned_is_there_again_and_less_sure() -> None:
@@ -37,7 +39,7 @@ def test_an_old_zero_is_forgotten() -> None:
 @pytest.mark.parametrize(("name", "present"), [("serial_number", 8), ("insert", "MRE-00-50"), ("model", "cd" * 32)])
 def test_that_of_another_is_refused(name: str, present: object) -> None:
     with pytest.raises(ProfileError, match=f"{name} = .*: it is of another"):
-        read_profile(msgspec.json.encode(KEPT), **(OF | {name: present}))  # type: ignore[arg-type]
+        read_profile(msgspec.json.encode(KEPT), bounds=BOUNDS, **(OF | {name: present}))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -47,7 +49,6 @@ def test_that_of_another_is_refused(name: str, present: object) -> None:
         {"scale": 1e9},
         {"scale": None},
         {"offset_N": "much"},
-        {"slow_factor": 9.0},
         {"lag_s": -1e-3},
         {"lag_s": 1.01 * MAX_LAG_S},
         {"lag_s": None},
@@ -58,20 +59,27 @@ def test_that_of_another_is_refused(name: str, present: object) -> None:
 def test_what_no_device_has_is_refused(changed: dict[str, object]) -> None:
     data = json.dumps(json.loads(msgspec.json.encode(KEPT)) | changed).encode()
     with pytest.raises(ProfileError, match="not a profile"):
-        read_profile(data, **OF)  # type: ignore[arg-type]
+        read_profile(data, bounds=BOUNDS, **OF)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("name", "value"), [("scale", 0.59), ("scale", 2.1), ("offset_N", 0.31), ("slow_factor", 0.5)])
+def test_what_is_beyond_the_bounds_of_a_device_is_refused_by_name(name: str, value: float) -> None:
+    data = json.dumps(json.loads(msgspec.json.encode(KEPT)) | {name: value}).encode()
+    with pytest.raises(ProfileError, match=f"^{name} = {value}: allowed is .* to "):
+        read_profile(data, bounds=BOUNDS, **OF)  # type: ignore[arg-type]
 
 
 def test_of_a_profile_from_before_lateness_was_kept_none_is_known() -> None:
     fields = json.loads(msgspec.json.encode(KEPT))
     del fields["lag_s"]
-    learned = read_profile(json.dumps(fields).encode(), **OF).learned(10**18)  # type: ignore[arg-type]
+    learned = read_profile(json.dumps(fields).encode(), bounds=BOUNDS, **OF).learned(10**18)  # type: ignore[arg-type]
     assert learned == again(KEPT).learned(10**18).replaced(lag_s=0.0)
 
 
 @given(data=st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
 def test_rubbish_is_refused(data: bytes) -> None:
     with pytest.raises(ProfileError):
-        read_profile(data, **OF)  # type: ignore[arg-type]
+        read_profile(data, bounds=BOUNDS, **OF)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -79,13 +87,13 @@ def test_rubbish_is_refused(data: bytes) -> None:
 )
 def test_large_and_deep_rubbish_is_refused(data: bytes) -> None:
     with pytest.raises(ProfileError):
-        read_profile(data, **OF)  # type: ignore[arg-type]
+        read_profile(data, bounds=BOUNDS, **OF)  # type: ignore[arg-type]
 
 
 @given(
     scale=st.floats(0.6, 1.6),
     scale_variance=st.floats(0.0, SCALE_SD**2),
-    offset_N=st.floats(-0.5, 0.5),
+    offset_N=st.floats(-0.2, 0.3),
     offset_variance=st.floats(0.0, OFFSET_SD_N**2),
     zero_N=st.floats(-0.4, 0.4),
     lag_s=st.floats(0.0, MAX_LAG_S),
@@ -97,4 +105,4 @@ def test_every_fit_can_be_kept(
     learned = again(profile_of(Learned(fit, sensor_zero_N=zero_N, lag_s=lag_s), saved_ns=0, **OF)).learned(0)  # type: ignore[arg-type]
     assert learned.device.force_N(1.0) == pytest.approx(fit.force_N(1.0))
     assert (learned.sensor_zero_N, learned.lag_s) == (zero_N, lag_s)
-    assert math.isfinite(learned.device.surely_within_N(2.5))
+    assert math.isfinite(learned.device.surely_within_N(2.5, BOUNDS))

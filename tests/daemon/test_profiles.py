@@ -11,11 +11,13 @@ import pytest
 
 from tormagd.assembly.build import Core
 from tormagd.assembly.profile import ProfileError, profile_of
+from tormagd.config import Config
 from tormagd.control.believe.believe import NOTHING_LEARNED, Learned
-from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.believe.strength import DeviceFit, device_bounds
 from tormagd.daemon.profiles import ProfileFolder, Profiles
 
 MODEL = "ab" * 32
+BOUNDS = device_bounds(Config().trim)
 STRONG = Learned(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4), lag_s=0.02)
 
 
@@ -24,7 +26,7 @@ class Rig:
 
     def __init__(self, core: Core, runner: asyncio.Runner, folder: Path | None) -> None:
         async def begun() -> Profiles:
-            kept = None if folder is None else ProfileFolder(folder, "MRE-50-40", MODEL)
+            kept = None if folder is None else ProfileFolder(folder, "MRE-50-40", MODEL, BOUNDS)
             return Profiles(kept, self.believe, self.believe.teach)
 
         self.believe = core.planner().believe
@@ -60,7 +62,7 @@ def new_rig(core: Core) -> Iterator[Callable[[Path | None], Rig]]:
 
 def keep(folder: Path, serial_number: int, model: str = MODEL) -> None:
     profile = profile_of(STRONG, serial_number=serial_number, insert="MRE-50-40", model=model, saved_ns=0)
-    ProfileFolder(folder, "MRE-50-40", model).write(profile)
+    ProfileFolder(folder, "MRE-50-40", model, BOUNDS).write(profile)
 
 
 def test_what_is_learned_while_driven_is_there_after_a_restart(

@@ -16,7 +16,8 @@ import pytest
 
 from tormagd.assembly.profile import ProfileError
 from tormagd.bounded_file import read_bounded
-from tormagd.config import load_config
+from tormagd.config import Config, load_config
+from tormagd.control.believe.strength import device_bounds
 from tormagd.ctl.waveform import read_csv
 from tormagd.daemon.profiles import ProfileFolder
 from tormagd.force_file import ForceFileError
@@ -86,7 +87,7 @@ HOSTILE: dict[str, Callable[[Path], object]] = {
 
 
 def _profile(path: Path) -> None:
-    folder = ProfileFolder(path.parent, "MRE-50-40", "ab" * 32)
+    folder = ProfileFolder(path.parent, "MRE-50-40", "ab" * 32, device_bounds(Config().trim))
     path.rename(folder.path(7))
     if folder.read(7) is None:
         raise ProfileError("No such file")

@@ -38,7 +38,7 @@ from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.sensor import SensorTrust
 from tormagd.control.believe.sensor_zero import SensorZero
 from tormagd.control.believe.slow_friction import SlowFriction
-from tormagd.control.believe.strength import UNSEEN, Strength
+from tormagd.control.believe.strength import UNSEEN, Strength, device_bounds
 from tormagd.control.contact import Pressing, Sliding
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.filter import low_pass
@@ -70,6 +70,7 @@ from tormagd_client.messages import Setpoint, decode as decode_message
 PERIOD_S, PLAN_S, LONGEST_S = 1e-3, 4e-3, 1e-2
 "Of a tick, of a plan, and of what `Stepper` lets a tick take."
 CONFIG = Config(scene="coronary")
+BOUNDS = device_bounds(CONFIG.trim)
 READY = Conditions(True, True, True, False, False, None, 0.5)
 MEASUREMENT, SETPOINT, CODEC, CONFIGURATION, PLANNED = (
     "Stepper, of measurements",
@@ -245,7 +246,7 @@ def believing(stage: Believe, draw: Draw) -> object:
 def strength(stage: Strength, draw: Draw) -> object:
     stage.update(draw(1.1), draw(1.2), draw.positive(PLAN_S))
     fit = stage.fit
-    return [fit.force_N(1.1), fit.model_N(1.1), fit.deviation_N(1.1), fit.surely_within_N(2.5)]
+    return [fit.force_N(1.1), fit.model_N(1.1), fit.deviation_N(1.1), fit.surely_within_N(2.5, BOUNDS)]
 
 
 def slow_friction(stage: SlowFriction, draw: Draw) -> object:
@@ -351,7 +352,10 @@ def aiming(stage: list[Any], draw: Draw) -> object:
 
 def floors(_: object, draw: Draw) -> object:
     element = core().element
-    return [ceiling_mm(element.portrait, UNSEEN, draw(2.5)), lawful_mT(element.law, draw(1.2), draw.bounded(200.0))]
+    return [
+        ceiling_mm(element.portrait, UNSEEN, draw(2.5), BOUNDS),
+        lawful_mT(element.law, draw(1.2), draw.bounded(200.0)),
+    ]
 
 
 def portrait(stage: Portrait, draw: Draw) -> object:
@@ -572,11 +576,11 @@ def stages() -> list[Stage]:
         Stage("plausible", lambda: None, plausible, MEASUREMENT),
         Stage("sight", lambda: Sight(PERIOD_S), sight, MEASUREMENT),
         Stage("believe/believe", believe, believing, MEASUREMENT),
-        Stage("believe/strength", lambda: Strength(0.5, (0.6, 1.6), (True, True)), strength, MEASUREMENT),
-        Stage("believe/slow_friction", SlowFriction, slow_friction, MEASUREMENT),
+        Stage("believe/strength", lambda: Strength(0.5, BOUNDS, (True, True)), strength, MEASUREMENT),
+        Stage("believe/slow_friction", partial(SlowFriction, BOUNDS), slow_friction, MEASUREMENT),
         Stage("believe/sensor_zero", SensorZero, sensor_zero, MEASUREMENT),
         Stage("believe/freshness", Freshness, freshness, MEASUREMENT),
-        Stage("believe/sensor", partial(SensorTrust, (0.6, 2.0)), sensor, MEASUREMENT),
+        Stage("believe/sensor", partial(SensorTrust, BOUNDS), sensor, MEASUREMENT),
         Stage("believe/carriage_lag", CarriageLag, carriage_lag, MEASUREMENT),
         Stage("believe/handle", HandleWatch, handle_watch, MEASUREMENT),
         Stage("believe/memory", memory, remembering, MEASUREMENT),

@@ -14,6 +14,7 @@ from tormagd.closed_loop import ClosedLoop, stream
 from tormagd.config import Config
 from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
 from tormagd.control.believe.slow_friction import believable
+from tormagd.control.believe.strength import device_bounds
 from tormagd.control.records import TimedSetpoint
 from tormagd.lab.arrays import Array
 from tormagd.lab.ideal_actuator import ideal_stepper
@@ -38,7 +39,7 @@ MEAN_S = 0.05
 LEAD_IN_S = 0.2
 "Time between enabling and the first setpoint of a rehearsal."
 REHEARSED_VALID_S = 0.1
-TRIM = Config().trim
+BOUNDS = device_bounds(Config().trim)
 
 
 class Tracking(NamedTuple):
@@ -170,8 +171,8 @@ def taught(loop: ClosedLoop) -> Believe:
 def is_railed(loop: ClosedLoop) -> bool:
     """Whether a learned value stands at its bound."""
     fit, slow = taught(loop).strength.fit, taught(loop).slow
-    is_creep_railed = slow.learned > 0.0 and slow.factor in believable(fit, slow.followed_N)
-    return fit.scale in (TRIM.least, TRIM.most) or is_creep_railed
+    is_creep_railed = slow.learned > 0.0 and slow.factor in believable(fit, slow.followed_N, BOUNDS)
+    return fit.scale in (BOUNDS.min_scale, BOUNDS.max_scale) or is_creep_railed
 
 
 def asked_at(levels: Levels) -> Callable[[float], float]:

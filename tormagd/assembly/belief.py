@@ -1,7 +1,6 @@
 """All that is believed of the device, as one table for whoever looks: status, `top`, the page."""
 
 from tormagd.control.believe.believe import MIN_FORESIGHT
-from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
 from tormagd.control.core import Planner, Stepper
 from tormagd.scenes.scene import Terms
 from tormagd_client.messages import BeliefReport
@@ -17,7 +16,7 @@ def beliefs(planner: Planner, stepper: Stepper, now_s: float, terms: Terms) -> d
         "scale": _told(fit.scale, fit.scale_sd, "", terms.scale),
         "offset": _told(fit.offset_N, fit.offset_sd_N, "N", terms.offset),
         "low_speed_factor": _told(believe.slow.factor, None, "", terms.creep),
-        "sensor_zero": _told(believe.zero.zero_N, zero_sd_N, "N", zero_sd_N <= UNKNOWN_SD_N),
+        "sensor_zero": _told(believe.zero.zero_N, zero_sd_N, "N", believe.knows_zero(now_s)),
         "carriage_lag": _told(believe.carriages.lag_s, None, "s", terms.lag and is_ahead),
         "acceleration_scale": _told(stepper.move.acceleration_scale, None, "", stepper.move.reference is not None),
         "forecast_trust": _told(planner.governor.forecast.trust, None, "", plan.foresight > 0.0),

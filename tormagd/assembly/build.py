@@ -18,7 +18,6 @@ from tormagd.config import Config
 from tormagd.control.aim.aim import Element
 from tormagd.control.aim.floors import CEILING
 from tormagd.control.aim.portrait import LawOfField, Portrait, PortraitSearch, law_beside, portrait
-from tormagd.control.believe.strength import MIN_SCALE
 from tormagd.control.contact import PRESSED, Contact, Pressing, Sliding
 from tormagd.control.core import Planner, Stepper
 from tormagd.control.field_of_gap import FieldOfGap
@@ -309,12 +308,13 @@ def _refuse_too_sudden(config: Config, scene: Scene, reach: Portrait) -> None:
         (2.0 * config.device.retract_mm_s, "device.retract_mm_s"),
         (config.position.gap_speed_mm_s, "position.gap_speed_mm_s"),
     )
-    model_N = min(CEILING * scene.force.most_N / MIN_SCALE, reach.max_N)
-    lost_N_s = MIN_SCALE * reach.force_rate_N_s(model_N, opening_mm_s)
+    weakest = config.trim.least
+    model_N = min(CEILING * scene.force.most_N / weakest, reach.max_N)
+    lost_N_s = weakest * reach.force_rate_N_s(model_N, opening_mm_s)
     if lost_N_s > scene.force.most_release_N_s:
         raise ConfigError(
             f"scene {scene.name}: force.most_release_N_s = {scene.force.most_release_N_s:g}: allowed is at least "
-            f"{lost_N_s:.2f}: {key} opens the gap by {opening_mm_s:g} mm/s, which at {MIN_SCALE * model_N:.2g} N "
+            f"{lost_N_s:.2f}: {key} opens the gap by {opening_mm_s:g} mm/s, which at {weakest * model_N:.2g} N "
             "loses so much"
         )
 

@@ -13,8 +13,8 @@ from msgspec import Meta
 from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.carriage_lag import MAX_LAG_S
 from tormagd.control.believe.sensor_zero import MAX_ZERO_N
-from tormagd.control.believe.slow_friction import MAX_FACTOR, MIN_FACTOR
-from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceFit
+from tormagd.control.believe.slow_friction import factor_bounds
+from tormagd.control.believe.strength import OFFSET_SD_N, SCALE_SD, DeviceBounds, DeviceFit
 
 VERSION = 1
 MAX_BYTES = 4_096
@@ -43,7 +43,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     scale: Annotated[float, Meta(gt=0.1, lt=10.0)]
     scale_sd: Annotated[float, Meta(ge=0.0, le=2.0 * SCALE_SD)]
     offset_N: Annotated[float, Meta(ge=-5.0, le=5.0)]
-    slow_factor: Annotated[float, Meta(ge=MIN_FACTOR, le=MAX_FACTOR)]
+    slow_factor: Annotated[float, Meta(gt=0.0, lt=20.0)]
     slow_learned: Annotated[float, Meta(ge=0.0, le=1.0)]
     sensor_zero_N: Annotated[float, Meta(ge=-MAX_ZERO_N, le=MAX_ZERO_N)]
     lag_s: Annotated[float, Meta(ge=0.0, le=MAX_LAG_S)] = 0.0
@@ -75,8 +75,9 @@ def profile_of(learned: Learned, *, serial_number: int, insert: str, model: str,
     )
 
 
-def read_profile(data: bytes, *, serial_number: int, insert: str, model: str) -> Profile:
-    """The profile in `data`. Raises ProfileError for what is damaged, or of another device, insert or model."""
+def read_profile(data: bytes, *, serial_number: int, insert: str, model: str, bounds: DeviceBounds) -> Profile:
+    """The profile in `data`. Raises ProfileError for what is damaged, of another device, insert or model, or beyond the
+    `bounds` of a device."""
     if len(data) > MAX_BYTES:
         raise ProfileError(f"{len(data)} bytes: allowed is {MAX_BYTES}")
     try:
@@ -92,4 +93,11 @@ def read_profile(data: bytes, *, serial_number: int, insert: str, model: str) ->
             raise ProfileError(
                 f"{name} = {kept!r}: it is of another {name.removesuffix('_number')}, here is {present!r}"
             )
+    for name, value, (least, most) in (
+        ("scale", profile.scale, (bounds.min_scale, bounds.max_scale)),
+        ("offset_N", profile.offset_N, (bounds.min_offset_N, bounds.max_offset_N)),
+        ("slow_factor", profile.slow_factor, factor_bounds(bounds)),
+    ):
+        if not least <= value <= most:
+            raise ProfileError(f"{name} = {value:g}: allowed is {least:g} to {most:g}, as [trim] bounds a device")
     return profile

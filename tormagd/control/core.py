@@ -45,7 +45,7 @@ class Planner:
         terms, insert = terms_of(scene), scene.insert
         gap_range_mm, memory = (insert.gap_closed_mm, insert.gap_open_mm), element.memory
         followed = ElementMemory(memory, element.nominal, element.field, gap_range_mm)
-        self.believe = Believe(config, terms, element.nominal, followed, element.portrait.min_N)
+        self.believe = Believe(config, scene, element.nominal, followed, element.portrait.min_N)
         gap_speed_mm_s = config.position.gap_speed_mm_s
         self.governor = Governor(now_s, element.portrait, scene.force, gap_speed_mm_s, terms)
         self.aim = Aim(config, scene, element)

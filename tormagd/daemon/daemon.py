@@ -11,6 +11,7 @@ from functools import partial
 
 from tormagd.assembly.build import Core
 from tormagd.config import Config
+from tormagd.control.believe.strength import device_bounds
 from tormagd.daemon import notify
 from tormagd.daemon.black_box import AFTER_FAULT_S, BlackBox
 from tormagd.daemon.callbacks import Callbacks
@@ -88,7 +89,9 @@ class Daemon:
         )
         folder = state_folder(config.device.profiles, "profiles")
         self._profiles = Profiles(
-            None if folder is None else ProfileFolder(folder, core.scene.insert.name, core.model),
+            None
+            if folder is None
+            else ProfileFolder(folder, core.scene.insert.name, core.model, device_bounds(config.trim)),
             self._inference.planner.believe,
             self._inference.teach,
         )

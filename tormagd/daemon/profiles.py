@@ -14,7 +14,7 @@ import msgspec
 from tormagd.assembly.profile import MAX_BYTES, Profile, ProfileError, profile_of, read_profile
 from tormagd.bounded_file import in_place_of, read_bounded
 from tormagd.control.believe.believe import NOTHING_LEARNED, Believe, Learned
-from tormagd.control.believe.strength import UNSEEN
+from tormagd.control.believe.strength import UNSEEN, DeviceBounds
 from tormagd_client.messages import ProfileReport
 
 log = logging.getLogger(__name__)
@@ -30,8 +30,8 @@ def state_folder(configured: str, name: str) -> Path | None:
 class ProfileFolder:
     """The files of one scene's insert and model, one for each device."""
 
-    def __init__(self, folder: Path, insert: str, model: str) -> None:
-        self.folder, self.insert, self.model = folder, insert, model
+    def __init__(self, folder: Path, insert: str, model: str, bounds: DeviceBounds) -> None:
+        self.folder, self.insert, self.model, self._bounds = folder, insert, model, bounds
 
     def path(self, serial_number: int) -> Path:
         """Where the profile of that device is."""
@@ -47,7 +47,9 @@ class ProfileFolder:
         except OSError as error:
             raise ProfileError(f"{path}: {error.strerror}") from error
         try:
-            return read_profile(data, serial_number=serial_number, insert=self.insert, model=self.model)
+            return read_profile(
+                data, serial_number=serial_number, insert=self.insert, model=self.model, bounds=self._bounds
+            )
         except ProfileError as error:
             raise ProfileError(f"{path}: {error}") from error
 

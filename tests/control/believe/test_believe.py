@@ -2,6 +2,7 @@
 
 import math
 
+import msgspec
 import pytest
 
 from tormagd.assembly.journal import KNOWN
@@ -125,6 +126,16 @@ def test_of_a_sensor_whose_zero_nothing_told_for_long_nothing_is_learned(planner
     hear(planner, 0.2, moving(force_N=1.2, **CREEPING))
     assert planner.believe.learned() == NOTHING_LEARNED
     assert Limit.OFFSET_UNKNOWN in planner.planned.limits
+
+
+def test_a_scene_that_tolerates_more_goes_on_learning(core, hear, moving) -> None:
+    force = msgspec.structs.replace(core.scene.force, tolerance_rms_N=0.17)
+    planner = core._replace(scene=msgspec.structs.replace(core.scene, force=force)).planner()
+    planner.believe.zero.variance_N2 = (1.01 * UNKNOWN_SD_N) ** 2
+    assert hear(planner, 0.2, moving(force_N=1.2)).believe.learned() != NOTHING_LEARNED
+    assert Limit.OFFSET_UNKNOWN not in planner.planned.limits
+    planner.believe.zero.variance_N2 = 0.18**2
+    assert Limit.OFFSET_UNKNOWN in hear(planner, 0.2, moving(force_N=1.2)).planned.limits
 
 
 def test_what_its_zero_is_off_by_is_no_part_of_what_a_sensor_teaches_and_is_said(planner, hear, moving) -> None:

@@ -1,33 +1,34 @@
 """Friction at a creep: learned as far as static friction differs and the fit is uncertain, and nothing at speed."""
 
-import copy
 import math
 
 import pytest
 from hypothesis import given, strategies as st
 
+from tormagd.config import Config
 from tormagd.control.believe.slow_friction import (
-    MAX_FACTOR,
     MAX_STATIC,
-    MIN_FACTOR,
-    MIN_SHARE,
     MIN_STATIC,
     REACH_MM,
     STRIBECK_MM_S,
     SlowFriction,
     believable,
+    factor_bounds,
 )
-from tormagd.control.believe.strength import UNSEEN, DeviceFit
+from tormagd.control.believe.strength import MAX_RELAXED, UNSEEN, DeviceFit, device_bounds
 from tormagd.exact import plain
 
 PERIOD_S = 0.003
+BOUNDS = device_bounds(Config().trim)
+MIN_FACTOR, MAX_FACTOR = factor_bounds(BOUNDS)
+MIN_SHARE = BOUNDS.min_scale * (1.0 - MAX_RELAXED)
 KNOWN = DeviceFit(scale_variance=0.0, offset_variance_N2=0.0)
 "A device of which everything is known."
 
 
 def crept(share: float, seconds: float, rate_mm_s: float = 1.0, fit: DeviceFit = UNSEEN) -> SlowFriction:
     """After readings of `share` times what was expected at that rate of a fit that makes the model's force."""
-    slow = SlowFriction()
+    slow = SlowFriction(BOUNDS)
     slow.followed_N = 1.5
     for _ in range(round(seconds / PERIOD_S)):
         slow.update(fit, rate_mm_s, 1.5 * share, PERIOD_S)
@@ -36,7 +37,8 @@ def crept(share: float, seconds: float, rate_mm_s: float = 1.0, fit: DeviceFit =
 
 def rescaled(slow: SlowFriction, before_N: float, after_N: float) -> float:
     """Its factor once the fit has learned."""
-    after = copy.deepcopy(slow)
+    after = SlowFriction(BOUNDS)
+    after.factor, after.learned = slow.factor, slow.learned
     after.rescale(before_N, after_N)
     return after.factor
 
@@ -74,12 +76,12 @@ def test_a_sensor_that_reads_less_than_any_device_makes_teaches_nothing(share: f
 
 def test_what_is_believed_of_a_creep_grows_by_three_deviations_of_the_fit() -> None:
     known, unsure = (DeviceFit(scale_variance=sd * sd, offset_variance_N2=0.0) for sd in (0.0, 0.02))
-    assert believable(known, 1.5) == (MIN_STATIC, MAX_STATIC)
-    assert believable(unsure, 1.5) == pytest.approx((MIN_STATIC - 0.06, MAX_STATIC + 0.06))
+    assert believable(known, 1.5, BOUNDS) == (MIN_STATIC, MAX_STATIC)
+    assert believable(unsure, 1.5, BOUNDS) == pytest.approx((MIN_STATIC - 0.06, MAX_STATIC + 0.06))
 
 
 def test_friction_follows_a_rise_over_travel_and_a_fall_at_once() -> None:
-    slow = SlowFriction()
+    slow = SlowFriction(BOUNDS)
     slow.follow(1.0, 0.0)
     assert slow.followed_N == 0.0  # nothing has been travelled
     for step in range(1, 101):
@@ -97,7 +99,7 @@ def test_beside_a_fit_that_learned_the_force_at_a_creep_stays() -> None:
     assert rescaled(slow, 1.0, 1.0) == rescaled(slow, 1.0, -0.1) == slow.factor
     assert rescaled(crept(1.0, 9.0), 1.0, 0.4) == MAX_FACTOR  # of more than twice the force
     # of a creep that was never seen nothing is known but what the fit says
-    assert rescaled(SlowFriction(), 1.0, 0.8) == 1.0
+    assert rescaled(SlowFriction(BOUNDS), 1.0, 0.8) == 1.0
 
 
 @given(
@@ -110,7 +112,7 @@ def test_beside_a_fit_that_learned_the_force_at_a_creep_stays() -> None:
     ),
 )
 def test_nothing_leaves_its_bounds(start: float, events: list[tuple[float, float, float, float, float]]) -> None:
-    slow, fit = SlowFriction(), DeviceFit(0.9, 0.05)
+    slow, fit = SlowFriction(BOUNDS), DeviceFit(0.9, 0.05)
     slow.factor = start
     for expected_N, rate_mm_s, reading_N, dt_s, handle_mm in events:
         slow.follow(expected_N, handle_mm)

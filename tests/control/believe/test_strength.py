@@ -8,13 +8,12 @@ from hypothesis import given, settings, strategies as st
 
 from tormagd.control.believe.strength import (
     ERROR_N2_S,
-    MAX_SCALE,
-    MIN_SCALE,
     OFFSET_SD_N,
     SCALE_LASTS_S,
     SCALE_SD,
     SURE,
     UNSEEN,
+    DeviceBounds,
     DeviceFit,
     Strength,
     forgotten,
@@ -22,7 +21,7 @@ from tormagd.control.believe.strength import (
 )
 
 PERIOD_S = 0.004
-BOUNDS = (0.6, 1.6)
+BOUNDS = DeviceBounds(0.6, 1.6, -0.2, 0.3)
 
 
 def shown(levels: list[tuple[float, float]], scale: float, offset_N: float, fit: DeviceFit = UNSEEN) -> DeviceFit:
@@ -63,7 +62,7 @@ def test_an_offset_is_learned_in_its_time_and_the_scale_stays() -> None:
 def test_a_scale_beyond_its_bounds_is_held_and_said() -> None:
     fit, is_held = observe(DeviceFit(), 1.0, 9.0, 1.0, adapts_in_s=0.5, bounds=BOUNDS)
     assert is_held
-    assert fit.scale == BOUNDS[1]
+    assert fit.scale == BOUNDS.max_scale
 
 
 def test_force_and_model_are_each_others_inverse() -> None:
@@ -76,23 +75,29 @@ STRONGEST = 1.53
 
 
 @pytest.mark.parametrize("levels", [[], [(0.2, 0.7)], [(2.0, 0.7)], [(2.0, 0.7), (2.0, 1.6)]])
-@pytest.mark.parametrize("scale", [MIN_SCALE, 0.8, 1.0, 1.2, STRONGEST])
+@pytest.mark.parametrize("scale", [BOUNDS.min_scale, 0.8, 1.0, 1.2, STRONGEST])
 def test_what_is_surely_within_is_within(levels: list[tuple[float, float]], scale: float) -> None:
     """However little has been shown, and whatever the device: never over, but for the two in a hundred of `SURE`."""
     most_N = 2.5
-    model_N = shown(levels, scale, 0.0).surely_within_N(most_N)
+    model_N = shown(levels, scale, 0.0).surely_within_N(most_N, BOUNDS)
     allowed_N = most_N if levels else most_N * STRONGEST / (1.0 + SURE * SCALE_SD)
     assert scale * model_N <= 1.03 * allowed_N
-    assert most_N / MAX_SCALE <= model_N <= most_N / MIN_SCALE
+    assert most_N / BOUNDS.max_scale <= model_N <= most_N / BOUNDS.min_scale
 
 
 def test_the_ceiling_moves_once_a_weak_device_has_shown_itself() -> None:
     weak = shown([(2.0, 0.7), (2.0, 1.6)], 0.75, 0.0)
-    assert weak.surely_within_N(2.5) > 1.5 * DeviceFit().surely_within_N(2.5)
+    assert weak.surely_within_N(2.5, BOUNDS) > 1.5 * DeviceFit().surely_within_N(2.5, BOUNDS)
 
 
 def test_a_device_of_which_nothing_is_sure_is_taken_for_the_strongest() -> None:
-    assert DeviceFit(scale=2.0 * SCALE_SD).surely_within_N(2.5) == 2.5 / MAX_SCALE
+    assert DeviceFit(scale=2.0 * SCALE_SD).surely_within_N(2.5, BOUNDS) == 2.5 / BOUNDS.max_scale
+
+
+def test_where_stronger_devices_are_allowed_the_ceiling_holds_for_them() -> None:
+    strong = DeviceFit(3.0, scale_variance=0.0, offset_variance_N2=0.0)
+    model_N = strong.surely_within_N(2.5, DeviceBounds(0.6, 4.0, -0.2, 0.3))
+    assert strong.force_N(model_N) == pytest.approx(2.5)
 
 
 readings = st.tuples(st.floats(0.3, 8.0), st.floats(-33.0, 33.0), st.floats(0.0, 0.02))
@@ -191,7 +196,7 @@ def test_a_pause_ends_a_surprise_and_what_was_held_and_leaves_the_fit() -> None:
     strength = Strength(0.5, BOUNDS, (True, True))
     strength.update(1.5, 4.5, 1.0)
     known = strength.fit
-    assert (known.scale, strength.is_held, strength.surprise_N > 1.0) == (BOUNDS[1], True, True)
+    assert (known.scale, strength.is_held, strength.surprise_N > 1.0) == (BOUNDS.max_scale, True, True)
     strength.settle()
     assert (strength.fit, strength.surprise_N, strength.is_held) == (known, 0.0, False)
     strength.forget()

@@ -16,7 +16,7 @@ from tormagd.control.aim.floors import CEILING, lawful_mT, least_mm
 from tormagd.control.aim.portrait import LawOfField, Portrait
 from tormagd.control.ask.path import PATH_S
 from tormagd.control.believe.memory import ElementMemory
-from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.believe.strength import DeviceFit, device_bounds
 from tormagd.control.field_of_gap import FieldOfGap
 from tormagd.control.nominal import Nominal
 from tormagd.control.records import Ask, Belief, Measured, Outside, Plan, TimedSetpoint
@@ -77,6 +77,7 @@ class Aim:
         self._closed_mm: Final = scene.insert.gap_closed_mm
         self._open_mm: Final = scene.insert.gap_open_mm
         self._ceiling_N: Final = CEILING * scene.force.most_N
+        self._bounds: Final = device_bounds(config.trim)
         self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
         self._max_mm_s2: Final = config.position.gap_acceleration_mm_s2
         self._low_confidence: Final = config.limits.low_confidence
@@ -110,7 +111,7 @@ class Aim:
         field_mT = element_mT + memory.lag_at_mT(element_mT + memory.lag_mT)
         # the field grid ends where the gap range ends, up to rounding
         wanted_mm = min(max(self._field.gap_mm(field_mT), self._closed_mm), self._open_mm)
-        min_mm = least_mm(self._portrait, belief, self._ceiling_N)
+        min_mm = least_mm(self._portrait, belief, self._ceiling_N, self._bounds)
         self.number += 1
         self.element_mT = field_mT - memory.lag_mT
         limits = self._limits(ask, belief.limits, outside, min_mm > wanted_mm, solution)

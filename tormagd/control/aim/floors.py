@@ -3,7 +3,7 @@
 from typing import Final
 
 from tormagd.control.aim.portrait import LawOfField, Portrait
-from tormagd.control.believe.strength import DeviceFit
+from tormagd.control.believe.strength import DeviceBounds, DeviceFit
 from tormagd.control.records import Belief
 
 CEILING: Final = 1.25
@@ -13,19 +13,21 @@ LAW_SHARE: Final = 0.12
 mm/s, 6% at a creep and 11% at 300 mm/s and the least force: the law knows neither Stribeck nor viscous friction."""
 
 
-def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float) -> float:
+def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
     """The least gap that the guards allow: the most open of theirs."""
-    return max(ceiling_mm(portrait, belief.device, ceiling_N), unseen_mm(portrait, belief, ceiling_N))
+    return max(ceiling_mm(portrait, belief.device, ceiling_N, bounds), unseen_mm(portrait, belief, ceiling_N, bounds))
 
 
-def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float) -> float:
+def ceiling_mm(portrait: Portrait, device: DeviceFit, ceiling_N: float, bounds: DeviceBounds) -> float:
     """The least gap at which the device surely gives no more than `ceiling_N`."""
-    return portrait.gap_mm_at(device.surely_within_N(ceiling_N))
+    return portrait.gap_mm_at(device.surely_within_N(ceiling_N, bounds))
 
 
-def unseen_mm(portrait: Portrait, belief: Belief, ceiling_N: float) -> float:
+def unseen_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: DeviceBounds) -> float:
     """The same of any device, while what is known of this one is a profile's, which may be another's."""
-    return portrait.gap_mm[-1] if belief.unseen is None else ceiling_mm(portrait, belief.unseen, ceiling_N)
+    if belief.unseen is None:
+        return portrait.gap_mm[-1]
+    return ceiling_mm(portrait, belief.unseen, ceiling_N, bounds)
 
 
 def lawful_mT(law: LawOfField | None, wanted_N: float, field_mT: float) -> float:

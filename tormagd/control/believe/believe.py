@@ -16,13 +16,13 @@ from tormagd.control.believe.memory import ElementMemory
 from tormagd.control.believe.sensor import Disputed, SensorTrust
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N, SensorZero
 from tormagd.control.believe.slow_friction import SLOWEST_MM_S, SlowFriction
-from tormagd.control.believe.strength import UNSEEN, DeviceFit, Strength
+from tormagd.control.believe.strength import UNSEEN, DeviceFit, Strength, device_bounds
 from tormagd.control.nominal import Nominal
 from tormagd.control.records import Belief, Measured
 from tormagd.control.sight import unsensed_s
 from tormagd.model.displacement import MOVING_MM_S
 from tormagd.safety.codes import Limit
-from tormagd.scenes.scene import Terms
+from tormagd.scenes.scene import Scene, terms_of
 
 MIN_DT_S: Final = 0.003
 MAX_DT_S: Final = 0.02
@@ -82,17 +82,19 @@ class Believe:
     "or was: its first slide has shown another one."
 
     def __init__(
-        self, config: Config, terms: Terms, nominal: Nominal, memory: ElementMemory, min_model_N: float
+        self, config: Config, scene: Scene, nominal: Nominal, memory: ElementMemory, min_model_N: float
     ) -> None:
         """`min_model_N`: the model's force with the gap open."""
+        terms = terms_of(scene)
         trim = config.trim
         self._min_model_N: Final = min_model_N
         self.memory, self.handle = memory, HandleWatch()
-        self._bounds: Final = (trim.least, trim.most)
+        self._bounds: Final = device_bounds(trim)
         self.strength = Strength(trim.time_s, self._bounds, (terms.scale, terms.offset))
-        self.slow, self.zero = SlowFriction(), SensorZero()
+        self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
         self.sensor, self.carriages = SensorTrust(self._bounds), CarriageLag()
         self._nominal: Final = nominal
+        self._unknown_sd_N: Final = max(UNKNOWN_SD_N, scene.force.tolerance_rms_N)
         self._unsensed_s: Final = unsensed_s(1.0 / config.rates.control_hz)
         self._top_speed_mm_s: Final = config.position.gap_speed_mm_s
         self.read_s = -math.inf
@@ -117,6 +119,10 @@ class Believe:
         """F_min of this device: what its open gap gives at speed."""
         return self.device.force_N(self._min_model_N)
 
+    def knows_zero(self, now_s: float) -> bool:
+        """Whether the sensor's zero is known to within what the scene tolerates: else readings teach nothing."""
+        return self.zero.sd_N(now_s) <= self._unknown_sd_N
+
     def learned(self) -> Learned:
         """What is worth keeping of this device."""
         slow = self.slow
@@ -125,7 +131,7 @@ class Believe:
     def teach(self, learned: Learned) -> None:
         """Takes that for what is known of the device. The element's memory and the handle's watch stay."""
         self.strength.forget(learned.device)
-        self.slow, self.zero = SlowFriction(), SensorZero()
+        self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
         self.sensor, self.carriages = SensorTrust(self._bounds), CarriageLag()
         self.slow.factor, self.slow.learned = learned.slow_factor, learned.slow_learned
         self.zero.zero_N, self.carriages.lag_s = learned.sensor_zero_N, learned.lag_s
@@ -206,7 +212,7 @@ class Believe:
         expected_N = self.strength.fit.force_N(self.slow.followed_N)
         reading_N = measured.force_N - handle.turn.direction * self.zero.zero_N
         # before it is mobilised friction is less than the model's; more is more all the same
-        is_lesson = self.zero.sd_N(now_s) <= UNKNOWN_SD_N and (is_mobilised or reading_N > expected_N)
+        is_lesson = self.knows_zero(now_s) and (is_mobilised or reading_N > expected_N)
         if expected_N > MIN_EXPECTED_N and is_lesson:
             self.slow.update(self.strength.fit, rate_mm_s, reading_N, dt_s)
 
@@ -228,7 +234,7 @@ class Believe:
             self.strength.settle()
             if sensor.is_named or sensor.is_doubted:
                 self.limits = (Limit.SENSOR if sensor.is_doubted else Limit.DEVICE_OR_SENSOR, *self.limits)
-        elif not zero_sd_N <= UNKNOWN_SD_N:
+        elif not self.knows_zero(now_s):
             self.strength.settle()
             sensor.compare(fit, model_N)
             self.limits = (Limit.OFFSET_UNKNOWN, *self.limits)

@@ -14,7 +14,7 @@ from typing import Final, Literal, final
 
 from tormagd.control.believe.freshness import Freshness
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N
-from tormagd.control.believe.strength import SURE, DeviceFit
+from tormagd.control.believe.strength import SURE, DeviceBounds, DeviceFit
 from tormagd.control.filter import low_pass
 
 Disputed = Literal["device", "sensor"]
@@ -93,10 +93,8 @@ class SensorTrust:
     wrong_s: float = 0.0
     "For how long there has been evidence of it."
 
-    def __init__(self, bounds: tuple[float, float]) -> None:
-        """`bounds`: the least and the greatest scale of a device over the model."""
-        self._least: Final = bounds[0]
-        self._most: Final = bounds[1]
+    def __init__(self, bounds: DeviceBounds) -> None:
+        self._bounds: Final = bounds
         self.freshness = Freshness()
 
     @property
@@ -230,5 +228,5 @@ class SensorTrust:
         if self.freshness.is_frozen:
             return True
         unknown_N = NOISE_N + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
-        weakest_N = self._least * (1.0 - RELAXED) * model_N - unknown_N
-        return not weakest_N <= self.measured_N <= self._most * (1.0 + RELAXED) * model_N + unknown_N
+        weakest_N = self._bounds.min_scale * (1.0 - RELAXED) * model_N - unknown_N
+        return not weakest_N <= self.measured_N <= self._bounds.max_scale * (1.0 + RELAXED) * model_N + unknown_N

@@ -12,7 +12,7 @@ shows nearly all.
 import math
 from typing import Final, final
 
-from tormagd.control.believe.strength import MAX_RELAXED, MAX_SCALE, MIN_SCALE, DeviceFit
+from tormagd.control.believe.strength import MAX_RELAXED, DeviceBounds, DeviceFit
 
 STRIBECK_MM_S: Final = 5.0
 "Handles of this speed have left most of static friction behind (plant card)."
@@ -25,15 +25,11 @@ MIN_STATIC: Final = 0.9
 MAX_STATIC: Final = 1.15
 """Static over kinetic friction is 1.08 to 1.25, and 1.15 on the device of the model; and the speeds at which it fades
 differ."""
-MIN_FACTOR: Final = MIN_SCALE * MIN_STATIC
-MAX_FACTOR: Final = MAX_SCALE * MAX_STATIC
-"Of any device."
 BELIEVED_SD: Final = 3.0
 """Standard deviations of the fit within which a creep is believed. Chosen on draws 0 to 39: with two, seven of them are
 held at this bound, for up to a hundredth of the time in which they creep at first."""
-MIN_SHARE: Final = MIN_SCALE * (1.0 - MAX_RELAXED)
 NOISE_N: Final = 0.03
-"A sensor that reads less than this share of the model's force, and its noise, teaches nothing: no device is so weak."
+"A sensor that reads less than the weakest device's force, which has relaxed, and this noise, teaches nothing."
 
 
 @final
@@ -48,6 +44,10 @@ class SlowFriction:
     "The model's force as far as the bristles of the contact have followed it."
     handle_mm: float = 0.0
     "Where the handle was then."
+
+    def __init__(self, bounds: DeviceBounds) -> None:
+        self._bounds: Final = bounds
+        self._least, self._most = factor_bounds(bounds)
 
     def factor_at(self, rate_mm_s: float) -> float:
         """The factor for a handle that slides at this rate, 0 or more: 1 at speed."""
@@ -66,25 +66,31 @@ class SlowFriction:
         """The fit now expects `after_N` where it expected `before_N`: the force at a creep stays what it was, as far as
         that was learned at a creep."""
         if before_N > 0.0 and after_N > 0.0:
-            self.factor = min(max(self.factor * math.pow(before_N / after_N, self.learned), MIN_FACTOR), MAX_FACTOR)
+            self.factor = min(max(self.factor * math.pow(before_N / after_N, self.learned), self._least), self._most)
 
     def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Learns k from a reading along the motion of a handle that slides at `rate_mm_s`, which stands for `dt_s`. The
         `fit` has to expect more than 0 N where the model says `followed_N`."""
-        if reading_N < MIN_SHARE * self.followed_N - NOISE_N:
+        if reading_N < self._bounds.min_scale * (1.0 - MAX_RELAXED) * self.followed_N - NOISE_N:
             return
         slowness = _slowness(rate_mm_s)
         share = slowness * dt_s / (LEARNED_S + dt_s)
         shown = 1.0 + (reading_N / fit.force_N(self.followed_N) - 1.0) / slowness
-        least, most = believable(fit, self.followed_N)
+        least, most = believable(fit, self.followed_N, self._bounds)
         self.factor = min(max(self.factor + share * (shown - self.factor), least), most)
         self.learned += share * (1.0 - self.learned)
 
 
-def believable(fit: DeviceFit, model_N: float) -> tuple[float, float]:
+def factor_bounds(bounds: DeviceBounds) -> tuple[float, float]:
+    """The least and the greatest k of any device."""
+    return bounds.min_scale * MIN_STATIC, bounds.max_scale * MAX_STATIC
+
+
+def believable(fit: DeviceFit, model_N: float, bounds: DeviceBounds) -> tuple[float, float]:
     """The least and the greatest k that is believed of a device with that fit, where the model says `model_N`."""
     unsure = BELIEVED_SD * fit.deviation_N(model_N) / fit.force_N(model_N)
-    return max(MIN_STATIC - unsure, MIN_FACTOR), min(MAX_STATIC + unsure, MAX_FACTOR)
+    least, most = factor_bounds(bounds)
+    return max(MIN_STATIC - unsure, least), min(MAX_STATIC + unsure, most)
 
 
 def _slowness(rate_mm_s: float) -> float:

@@ -12,16 +12,11 @@ import math
 from typing import Final, final
 
 from firmware_protocol.value import Value
+from tormagd.config import Trim
 from tormagd.control.filter import low_pass
 
 SCALE_SD: Final = 0.17
 "Spread of the scale of devices not yet seen: friction, shear modulus and field each differ evenly within 12%."
-MIN_SCALE: Final = 0.64
-MAX_SCALE: Final = 2.0
-"No device is taken for weaker or stronger. One that presses harder than it is asked to is believed sooner."
-MIN_OFFSET_N: Final = -0.2
-MAX_OFFSET_N: Final = 0.3
-"And none for further off: another field law and what relaxes look like -0.15 N at most, more is a sensor's zero."
 MAX_RELAXED: Final = 0.21
 "The greatest share of its force that an elastomer loses in the course of hours."
 OFFSET_SD_N: Final = 0.1
@@ -40,6 +35,22 @@ SURPRISE_N: Final = 0.01
 """A mean over that time, in which noise leaves 2 to 5 mN, of more than this is the device's own: then its offset is
 learned sooner, in a fifth of its time at twice as much. So noise alone hardly moves the gap, and a step settles."""
 MIN_ADAPTS_IN_S: Final = 0.04
+
+
+@final
+class DeviceBounds(Value):
+    """What a device may be: its scale over the model, 1 of the model's own, and its offset at speed, N."""
+
+    def __init__(self, min_scale: float, max_scale: float, min_offset_N: float, max_offset_N: float) -> None:
+        self.min_scale: Final = min_scale
+        self.max_scale: Final = max_scale
+        self.min_offset_N: Final = min_offset_N
+        self.max_offset_N: Final = max_offset_N
+
+
+def device_bounds(trim: Trim) -> DeviceBounds:
+    """The bounds that the configuration states."""
+    return DeviceBounds(trim.least, trim.most, trim.least_offset_N, trim.most_offset_N)
 
 
 @final
@@ -115,18 +126,18 @@ class DeviceFit(Value):
             self.offset_variance_N2 + relaxed_N * (by_scale_N - 2.0 * self.covariance_N),
         )
 
-    def surely_within_N(self, max_N: float) -> float:
-        """The model's force at which a device that is SURE deviations stronger gives `max_N`. No device is taken for
-        weaker than MIN_SCALE or stronger than MAX_SCALE."""
+    def surely_within_N(self, max_N: float, bounds: DeviceBounds) -> float:
+        """The model's force at which a device that is SURE deviations stronger gives `max_N`. No scale is taken for
+        beyond the `bounds`."""
         # scale m + offset + SURE sqrt(variance of that) = max, a quadratic: the smaller root is where the sum is meant
         room_N, sure = max_N - self.offset_N, SURE * SURE
         square = self.scale * self.scale - sure * self.scale_variance
         half = self.scale * room_N + sure * self.covariance_N
         rest = room_N * room_N - sure * self.offset_variance_N2
         if square <= 0.0:  # so uncertain beside its scale that no force is surely within
-            return max_N / MAX_SCALE
+            return max_N / bounds.max_scale
         root_N = (half - math.sqrt(max(half * half - square * rest, 0.0))) / square
-        return min(max(root_N, max_N / MAX_SCALE), max_N / MIN_SCALE)
+        return min(max(root_N, max_N / bounds.max_scale), max_N / bounds.min_scale)
 
 
 UNSEEN: Final = DeviceFit()
@@ -153,7 +164,7 @@ def observe(
     dt_s: float,
     *,
     adapts_in_s: float,
-    bounds: tuple[float, float],
+    bounds: DeviceBounds,
     learns_scale: bool = True,
     learns_offset: bool = True,
 ) -> tuple[DeviceFit, bool]:
@@ -170,7 +181,7 @@ def observe(
     gain_offset = by_offset / innovation_variance if learns_offset else 0.0
     error_N = measured_N - fit.force_N(model_N)
     wanted = fit.scale + gain_scale * error_N
-    scale = min(max(wanted, bounds[0]), bounds[1])
+    scale = min(max(wanted, bounds.min_scale), bounds.max_scale)
     offset_N = fit.offset_N + gain_offset * error_N
     if scale != wanted and learns_offset:
         # a scale that is held is known: what is left of the error is the offset's alone
@@ -196,8 +207,8 @@ class Strength:
     is_held: bool = False
     "Scale or offset is at one of its bounds."
 
-    def __init__(self, adapts_in_s: float, bounds: tuple[float, float], learns: tuple[bool, bool]) -> None:
-        """`adapts_in_s`: the offset's time without surprise; `bounds` of the scale; what `learns`, scale and offset."""
+    def __init__(self, adapts_in_s: float, bounds: DeviceBounds, learns: tuple[bool, bool]) -> None:
+        """`adapts_in_s`: the offset's time without surprise; what `learns`: scale and offset."""
         self._adapts_in_s: Final = adapts_in_s
         self._bounds: Final = bounds
         self._learns: Final = learns
@@ -217,7 +228,8 @@ class Strength:
             learns_scale=self._learns[0],
             learns_offset=self._learns[1],
         )
-        offset_N = min(max(self.fit.offset_N, MIN_OFFSET_N), MAX_OFFSET_N)
+        bounds = self._bounds
+        offset_N = min(max(self.fit.offset_N, bounds.min_offset_N), bounds.max_offset_N)
         if offset_N != self.fit.offset_N:
             self.fit, self.is_held = self.fit.shifted(offset_N - self.fit.offset_N), True
 
