@@ -1,4 +1,4 @@
-"""From a measurement to positions, speeds and the handle's motion; what of it is plausible, and how old it is."""
+"""Positions, speeds and the handle's motion from a device's measurements, their plausibility and their age."""
 
 from typing import Final, final
 
@@ -20,7 +20,7 @@ MIN_DT_S: Final = 5e-6
 
 @final
 class Measure:
-    """Follows one device's measurements."""
+    """The newest measurement of one device, filtered, with its silence (`sight`) and its encoders' steps (`leap`)."""
 
     measured: Measured | None = None
     "The newest; None while the device has said nothing."
@@ -30,8 +30,12 @@ class Measure:
     def __init__(
         self, home_mm: float, derivative_filter_s: float, turns: bool, full_speed_mm_s: float, period_s: float
     ) -> None:
-        """`home_mm`: a carriage's distance from the centre plane on its home switch. `turns` tells a handle from a
-        finger, whose force always pushes the same way. `full_speed_mm_s` is a carriage's, `period_s` a tick's."""
+        """Take the constants of one device.
+
+        `home_mm` is a carriage's distance from the centre plane on its home switch. `full_speed_mm_s` is one
+        carriage's. With `turns` the element is a handle that turns round. Without it a finger presses, whose force
+        always has the same sign.
+        """
         self.sight = Sight(period_s)
         self._home_mm: Final = home_mm
         self._derivative_filter_s: Final = derivative_filter_s
@@ -39,9 +43,11 @@ class Measure:
         self._full_speed_mm_s: Final = full_speed_mm_s
 
     def update(self, last_s: float, now_s: float, measurement: Measurement, needs_homing: bool) -> Measured:
-        """What is measured at `now_s`, a tick after `last_s`, by the newest measurement, or the last one again; follows
-        whether the device is seen, and whether its encoders leapt. `needs_homing`: the device's word that it is homed
-        does not count."""
+        """Return what is measured at `now_s`, one tick after `last_s`, and keep it in `measured`.
+
+        A `measurement` that is not new gives the last record again. Updates `sight`, and begins or ends a `leap`. With
+        `needs_homing` the device's word that it is homed does not count.
+        """
         last, seen_s = self.measured, self.sight.seen_s
         is_new = last is None or measurement.number != last.number
         self.sight.update(last_s, now_s, is_new)
@@ -56,21 +62,22 @@ class Measure:
         return measured
 
     def lose_position(self, measured: Measured) -> Measured:
-        """Takes what was measured last for that of a device that is not homed, whatever it says; and gives that."""
+        """Return `measured` marked as not homed, and keep it. The next new measurement brings the device's own word
+        again."""
         self.measured = measured.replaced(is_homed=False) if measured.is_homed else measured
         return self.measured
 
     def lose_device(self) -> None:
-        """The device has gone."""
+        """Drop the newest measurement. `sight` and `leap` stay."""
         self.measured = None
 
     def forget(self) -> None:
-        """Nothing has been measured."""
+        """Drop the newest measurement, `leap` and `sight`."""
         self.measured, self.leap = None, None
         self.sight.forget()
 
     def begin(self, measurement: Measurement) -> None:
-        """Begins with one measurement: everything at rest. What was learned about motion before it is void."""
+        """Begin with one measurement, at rest: speeds are 0 and the handle has not travelled."""
         self.measured = self._first(measurement)
 
     def _first(self, measurement: Measurement) -> Measured:

@@ -1,4 +1,4 @@
-"""Whether the encoders say what carriages can do: no step beyond any motor's speed, no place outside the stroke."""
+"""Plausibility of the encoders: no step faster than any motor, no place outside the stroke."""
 
 from typing import Final, final
 
@@ -17,8 +17,10 @@ CLOSED_END_MM: Final = 45.0
 
 @final
 class Leap(Value):
-    """A step of the encoders that no carriage takes: seen at `seen_s`, by so much either side, within `within_s`, away
-    from `left_from_mm` and `right_from_mm`."""
+    """A step of the encoders that no carriage makes, found at `seen_s`: by `left_mm` and `right_mm` within `within_s`.
+
+    `left_from_mm` and `right_from_mm` are the places before the step.
+    """
 
     def __init__(
         self,
@@ -37,7 +39,7 @@ class Leap(Value):
         self.right_from_mm: Final = right_from_mm
 
     def has_come_back(self, measured: Measured, full_speed_mm_s: float, now_s: float) -> bool:
-        """Whether the counts are where carriages can have come to since before the leap: it was a burst on a line."""
+        """Tell whether both carriages read places that they can have reached: the leap was noise on a line."""
         max_mm = LEAP_SPEEDS * full_speed_mm_s * (self.within_s + now_s - self.seen_s) + LEAP_MM
         return (
             abs(measured.left_mm - self.left_from_mm) <= max_mm
@@ -51,9 +53,10 @@ class Leap(Value):
 def leap_between(
     last: Measured, measured: Measured, full_speed_mm_s: float, now_s: float, seen_s: float
 ) -> Leap | None:
-    """The leap from `last`, which came at `seen_s`, to `measured`, the next; None for what a carriage can do.
+    """Return the leap from `last`, found at `seen_s`, to `measured`, found at `now_s`. None: carriages can do this.
 
-    The device's clock says how long it took, unless there was nothing to see for longer, and the clock ran over.
+    The step took the longer of two times, the device's clock and the host's. The device's clock may run over in a long
+    silence.
     """
     left_mm, right_mm = measured.left_mm - last.left_mm, measured.right_mm - last.right_mm
     within_s = max(measured.device_time_s - last.device_time_s, now_s - seen_s)
@@ -64,8 +67,11 @@ def leap_between(
 
 
 def is_outside(measured: Measured, closed_mm: float, open_mm: float, is_left_open: bool, is_right_open: bool) -> bool:
-    """Whether a carriage of a homed device reads a place where none can be, for gaps from `closed_mm` to `open_mm`, or
-    where it cannot be because its open switch is closed: there it was homed."""
+    """Tell whether a carriage of a homed device reads an impossible place, for gaps from `closed_mm` to `open_mm`.
+
+    A place is impossible outside the stroke. A carriage whose open switch is closed cannot be far from its open end
+    either.
+    """
     min_mm, max_mm = min(closed_mm, CLOSED_END_MM) / 2.0 - OVERRUN_MM, open_mm / 2.0 + OVERRUN_MM
     home_mm = open_mm / 2.0 - OVERRUN_MM
     left_min_mm = home_mm if is_left_open else min_mm

@@ -1,7 +1,7 @@
-"""Whether the loop sees the device: not while the device is silent, and not right after a stall of its own.
+"""Whether the loop sees the device: not while the device is silent, and not right after a stall of the loop.
 
-States only answer Drives. So whatever a process finds that has just been stopped is as old as its stall, and what the
-device does now is not known before it has answered the next Drive.
+A State is sent only in answer to a Drive. After a stall, the State that waits is therefore as old as the stall. Only
+the answer to the next Drive tells what the device does now.
 """
 
 import math
@@ -19,7 +19,7 @@ SHOWN_S: Final = 0.1
 
 @final
 class Sight:
-    """Follows when states came and when steps ran."""
+    """The times of new states and of steps, and whether the loop is blind."""
 
     seen_s: float = math.inf
     "When a new state was last found."
@@ -36,7 +36,7 @@ class Sight:
         self._blind_s: Final = max(BLIND_S, BLIND_PERIODS * period_s)
 
     def forget(self) -> None:
-        """No step has run."""
+        """Return to the state before the first step."""
         self.seen_s, self.stalled_s, self.stall_s = math.inf, -math.inf, 0.0
         self.is_blind = self.was_blind = False
 
@@ -49,7 +49,8 @@ class Sight:
         return self.is_blind and now_s - self.stalled_s < 2.0 * self._blind_s
 
     def update(self, last_s: float, now_s: float, is_new: bool) -> None:
-        """Takes a step at `now_s` after one at `last_s`; `is_new`: it was given a state that the other was not."""
+        """Take a step at `now_s`, after the last one at `last_s`. `is_new`: this step has a state that the last one had
+        not."""
         stall_s, self.was_blind = now_s - last_s, self.is_blind
         if stall_s > self._blind_s:
             before_s = self.stall_s if self.has_stalled(now_s) else 0.0
@@ -61,5 +62,5 @@ class Sight:
 
 
 def unsensed_s(period_s: float) -> float:
-    """How old a Sense may be: force and handle of an older one are not measured."""
+    """Return the greatest age of a Sense. With an older one, force and handle count as not measured."""
     return max(UNSENSED_S, BLIND_PERIODS * period_s)
