@@ -1,8 +1,9 @@
-"""From what is measured to what is believed of the device: the estimators of one device, and what each may learn from.
+"""What is believed of one device: its estimators, and which of them may learn from a reading of the force sensor.
 
-A reading of the force teaches where the model knows the force: while friction is mobilised and the handle slides. It is
-compared with the model at the *measured* gap, so the model's error is learned and not the tracking error, and learning
-cannot fight the position loop. A sensor that is not believed teaches nothing, and what is known of the device is kept.
+The force teaches only while friction is mobilised and the handle slides: only there the model knows the force. A
+reading is compared with the model at the *measured* gap. So the estimators learn the model's error, not the tracking
+error, and cannot fight the position loop. A sensor that is not believed teaches nothing, and what is known of the
+device is kept.
 """
 
 import math
@@ -42,7 +43,11 @@ MIN_FORESIGHT: Final = 0.5
 
 @final
 class Learned(Value):
-    """What is known of a device from another day. `slow_factor` was learned at a creep by the share `slow_learned`."""
+    """What is known of a device from another day.
+
+    `slow_factor` is its force at a creep over its force at speed. The share `slow_learned`, 0..1, of it was learned at
+    a creep. `lag_s` is its carriages'.
+    """
 
     def __init__(
         self,
@@ -84,7 +89,8 @@ class Believe:
     def __init__(
         self, config: Config, scene: Scene, nominal: Nominal, memory: ElementMemory, min_model_N: float
     ) -> None:
-        """`min_model_N`: the model's force with the gap open."""
+        """Begin with an unseen device. `min_model_N` is the model's force with the gap open; `memory` is updated from
+        here."""
         terms = terms_of(scene)
         trim = config.trim
         self._min_model_N: Final = min_model_N
@@ -124,12 +130,16 @@ class Believe:
         return self.zero.sd_N(now_s) <= self._unknown_sd_N
 
     def learned(self) -> Learned:
-        """What is worth keeping of this device."""
+        """Return what is worth keeping of this device."""
         slow = self.slow
         return Learned(self.strength.fit, slow.factor, slow.learned, self.zero.zero_N, self.carriages.lag_s)
 
     def teach(self, learned: Learned) -> None:
-        """Takes that for what is known of the device. The element's memory and the handle's watch stay."""
+        """Take `learned` for all that is known of the device, and begin every estimator of it anew.
+
+        Until the handle has slid, the device may still be another one. The element's memory and the watch on the
+        encoder stay.
+        """
         self.strength.forget(learned.device)
         self.slow, self.zero = SlowFriction(self._bounds), SensorZero()
         self.sensor, self.carriages = SensorTrust(self._bounds), CarriageLag()
@@ -140,13 +150,16 @@ class Believe:
         self.is_prior, self.is_contradicted = learned.device is not UNSEEN, False
 
     def forget(self) -> None:
-        """Forgets the device, but not what its element has been through."""
+        """Forget the device, and begin the watch on the encoder anew. The element's memory stays."""
         self.teach(NOTHING_LEARNED)
         self.handle = HandleWatch()
 
     def update(self, now_s: float, measured: Measured | None) -> Belief:
-        """Learns from what is measured, where that is new, and says what is believed at `now_s`. `measured` is None
-        while the device has said nothing."""
+        """Learn from `measured`, where it is new, and return the belief at `now_s`.
+
+        `measured` is None while the device is silent: nothing is learned. A device that is not homed teaches no force.
+        Raises DomainError for a measured gap outside the field law's range.
+        """
         model_N: float | None = None
         if measured is not None:
             self.memory.update(now_s, measured)
@@ -156,8 +169,11 @@ class Believe:
         return self._belief(measured, model_N)
 
     def expect(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
-        """Learns how late the carriages are, once a plan is made `dt_s` after the last: from its gap, `planned_mm`, and
-        the measured one, where its `foresight`, 0..1, says that it knows what comes."""
+        """Learn the carriages' lag from the gap of a plan, `planned_mm`, which came `dt_s` after the last plan.
+
+        `foresight`, 0..1, is the plan's. Below MIN_FORESIGHT, or without a homed device, nothing is learned and the
+        expected gap starts again.
+        """
         if not (self.learns and self._has_lag):
             return
         if measured is None or not measured.is_homed or foresight < MIN_FORESIGHT:
@@ -275,7 +291,11 @@ class Believe:
             self.limits = (Limit.TRIM, *self.limits)
 
     def confirm(self, wrong: Disputed) -> None:
-        """The operator settles a dispute: the `device` has changed, and is learned anew; or the `sensor` is wrong."""
+        """Take the operator's word in a dispute of device and sensor.
+
+        `device`: the dispute ends, and scale and offset are as uncertain as an unseen device's. `sensor`: it is not
+        believed until its readings agree again.
+        """
         self.sensor.confirm(wrong)
         if wrong == "device":
             self.zero.trust()

@@ -1,12 +1,12 @@
-"""How late the carriages are: the time constant T of a first-order lag between planned and measured gap.
+"""Lag of the carriages: the time constant T of a first-order lag from planned to measured gap.
 
     model    T de/dt + e = g           g planned gap, e expected gap, mm
     error    y = e - (x + v age)       x measured gap, mm, v its speed, mm/s, `age` before the plan
     update   dM = (v^2 - M / tau) dt   recursive least squares with forgetting: since de/dT = -v, v is the regressor
              dT = y v dt / (P + M)     M is the information so far, P the prior's: T = 0 at the start
 
-An error counts with the speed, so slow stretches, on which nobody is late, do not hide that a steep one is. T is
-learned only while the plan knows what comes: after a jump any carriage is behind.
+An error counts with the speed: slow stretches, where nothing is late, do not hide the steep ones. T is learned only
+from plans that know what comes. After a jump all carriages are behind.
 """
 
 from typing import Final, final
@@ -28,7 +28,7 @@ AGE_S: Final = 0.0015
 
 @final
 class CarriageLag:
-    """Estimates the lag of one device's carriages."""
+    """Estimator of one device's carriage lag, `lag_s`."""
 
     lag_s: float = 0.0
     "T, 0..MAX_LAG_S."
@@ -42,8 +42,11 @@ class CarriageLag:
     def update(
         self, dt_s: float, planned_mm: float | None, gap_mm: float, speed_mm_s: float, top_speed_mm_s: float
     ) -> None:
-        """Takes a plan, `dt_s` after the last, and the gap measured before it. `planned_mm` is None where the plan did
-        not know what comes. No carriages make the gap faster than `top_speed_mm_s`."""
+        """Take one plan, made `dt_s` after the last, with the gap measured AGE_S before it.
+
+        `planned_mm` is None where the plan did not know what comes: the expected gap then starts again.
+        `top_speed_mm_s` bounds the measured speed, which a new filter may overstate.
+        """
         if planned_mm is None:
             self.expected_mm, self.is_settling = None, False
             return

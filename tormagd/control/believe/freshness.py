@@ -1,4 +1,4 @@
-"""Whether a force sensor still shows new values, told from its own noise and steps.
+"""Whether a force sensor still shows new values, told from its own noise and resolution.
 
 run      readings of one value, one after the other
 stale    the same value although the force has changed by STALE_N and two of the sensor's steps: it teaches nothing
@@ -26,7 +26,7 @@ HEARD: Final = 100
 
 @final
 class Freshness:
-    """Follows the readings of one sensor."""
+    """Statistics of one sensor's readings."""
 
     has_heard: bool = False
     reading_N: float = 0.0
@@ -70,8 +70,11 @@ class Freshness:
         return 2.0 * min(self.step_N, FROZEN_N)
 
     def update(self, scale: float, model_N: float, reading_N: float, dt_s: float, *, learns: bool) -> None:
-        """Takes a reading that stands for `dt_s` > 0, where the model says `model_N` of a device that has so many times
-        its force. `learns`: the sensor is believed, and shows its noise."""
+        """Take one reading, which stands for `dt_s` > 0. The model's force is `model_N`, the device's force over it
+        `scale`.
+
+        With `learns` a change of the reading also teaches the sensor's noise and resolution.
+        """
         if not self.has_heard:
             self.has_heard, self.stood_N = True, model_N
         elif reading_N == self.reading_N:

@@ -1,8 +1,8 @@
-"""Whether the handle's encoder is believed: a force that grows with the gap's is that of a shaft that moves.
+"""Whether the handle's encoder is believed: a force that grows with the gap's force needs a shaft that moves.
 
-Friction at rest holds what the hand gives it, through elastomer that bends. It may fall where the gap opens, and comes
-back only with a motion, of the force over the stiffness. So where the measured force rises as the gap's does and the
-encoder stands, the encoder is lost, or the sensor reads what nobody feels.
+At rest, friction holds what the hand gives, through elastomer that bends. The force may fall when the gap opens. The
+force returns only with a motion of the shaft, by the force over the stiffness. So a force that rises with the gap's,
+while the encoder stands, shows a lost encoder, or a sensor that reads what nobody feels.
 """
 
 import math
@@ -27,7 +27,7 @@ FORGETS_S: Final = 5.0
 
 @final
 class HandleWatch:
-    """Compares the force of a handle that stands with the one that the gap gives."""
+    """Watch on the encoder: compares the force of a resting handle with the model's force at the gap."""
 
     at_mm: float = math.inf
     "Where the handle stands."
@@ -46,12 +46,18 @@ class HandleWatch:
     "The encoder is not believed until it moves."
 
     def moved_gap_at_rest(self, model_N: float) -> bool:
-        """Whether the handle stands since before the gap went to where the model gives `model_N`: friction at rest does
-        not follow, though the handle's filtered rate may still say that it moves."""
+        """Tell whether the gap's force has changed to `model_N` by more than MODEL_RISES_N while the handle stood.
+
+        Friction at rest does not follow a changing gap. The handle's filtered rate may still show a motion then.
+        """
         return abs(model_N - self.rested_N) > MODEL_RISES_N
 
     def update(self, sensed_s: float, handle_mm: float, reading_N: float, model_N: float) -> None:
-        """Takes a reading of handle and force, where the model gives `model_N` at the measured gap."""
+        """Take one reading of handle and force, with the model's force `model_N` at the measured gap. May set
+        `is_lost`.
+
+        A `sensed_s` (host time) that is not newer changes nothing.
+        """
         dt_s = sensed_s - self.heard_s
         if not dt_s > 0.0:
             return

@@ -1,11 +1,11 @@
-"""What the element remembers: how much of its force has relaxed, and how far its field lags behind the gap's.
+"""What the element remembers: its relaxed force, and the hysteresis of its field behind the gap's field.
 
     force    F = m(B - l) - r          m the model's force without memory, B the gap's field, l its lag, r what relaxed
     lag      l goes to +-width along a rising or falling field, over a change by `turn`
     relaxed  r is what Prony series of two parts leave: of the force without field, and of what the field adds
 
-Both are followed from the measured gaps and expected of every device, so neither is learned. What has relaxed is the
-same for every field: a shift, and any search still finds the field.
+Both follow the measured gaps and hold for every device, so neither is learned. What has relaxed is the same for all
+fields, a shift of the force, and any search still finds the field.
 """
 
 import math
@@ -24,8 +24,11 @@ BEYOND_MM: Final = 2.0
 
 @final
 class ElementMemory:
-    """Follows one element. A brake has rested where its device was switched on, and relaxes of what a handle at the
-    roller's speed would feel; a pad was not touched, and relaxes of what presses it."""
+    """The memory of one element, which begins with the first known gap.
+
+    A brake is taken as rested at the gap it was switched on with, and relaxes for a handle at the roller's speed. A pad
+    is taken as untouched, and relaxes for what presses it.
+    """
 
     field_mT: float = 0.0
     "Of the newest gap."
@@ -42,7 +45,7 @@ class ElementMemory:
     "Until then: by how much the gap has opened since the device was switched on."
 
     def __init__(self, memory: Memory, nominal: Nominal, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> None:
-        """`gap_range_mm`: closed and open."""
+        """Begin before the first gap. `gap_range_mm` is the closed and the open gap."""
         self.time_s = -math.inf
         self._free: Final = memory.free
         self._added: Final = memory.added
@@ -56,8 +59,10 @@ class ElementMemory:
         self._only_free_N: Final = self._free_N(nominal.only)
 
     def lag_at_mT(self, field_mT: float) -> float:
-        """How far the element's field is behind the gap's once that is `field_mT`, on a straight way from here. It is 0
-        before anything was measured."""
+        """Return how far the element's field would lag once the gap's field has gone straight to `field_mT`.
+
+        0 before anything was measured.
+        """
         change_mT = field_mT - self.field_mT
         if self.time_s == -math.inf:
             return 0.0
@@ -67,11 +72,16 @@ class ElementMemory:
         return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._turn_mT)
 
     def force_N(self, curve: ForceCurve) -> float:
-        """What the model gives now, if the force without memory over the field is `curve`."""
+        """Return the model's force now, for the memoryless force over the field `curve`. Before a measurement the field
+        is 0 mT."""
         return curve.force_N(within(self.field_mT - self.lag_mT, self._nominal.fields_mT)) - self.relaxed_N
 
     def update(self, now_s: float, measured: Measured) -> None:
-        """Follows the field's lag and what has relaxed to `now_s`, by the measured gap."""
+        """Follow lag and relaxation to `now_s`, along a straight change to the measured gap.
+
+        Not homed, a brake only notes how far its gap has opened, and a pad's gap counts as open. Raises DomainError for
+        a gap outside the field law's range.
+        """
         slides = self._nominal.contact.slides
         is_empty = self.time_s == -math.inf
         if slides and not measured.is_homed:

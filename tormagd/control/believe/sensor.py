@@ -5,9 +5,9 @@
     lead     l    by how much the readings are over the fit's force, N: the device is taken for that much stronger
     agreed   the readings come back to the fit: it learns again
 
-While friction is mobilised and the handle slides, two explanations may fit the readings: the device is as it was and
-the sensor wrong, or the sensor right and the device changed. The gap follows the one with more force. So a reading that
-rises opens, and one that falls moves nothing. A sensor that shows what no device gives is wrong, and opens nothing.
+While the handle slides with mobilised friction, two explanations may fit the readings. The sensor is wrong, or the
+device has changed. The gap follows the explanation with more force. So a rising reading opens the gap, and a falling
+one moves nothing. A sensor that shows what no device gives is wrong, and opens nothing.
 """
 
 from typing import Final, Literal, final
@@ -57,7 +57,7 @@ TRUSTED_AGAIN_S: Final = 1.0
 
 @final
 class SensorTrust:
-    """Judges one force sensor, and keeps what was known of the device while it does."""
+    """Judge of one force sensor. It keeps what was known of the device while the two are in dispute."""
 
     known_s: float = 0.0
     "For how long the device has slid, LEARNS_S at most."
@@ -117,9 +117,12 @@ class SensorTrust:
         zero_sd_N: float,
         dt_s: float,
     ) -> None:
-        """Takes a reading along the motion of a handle that slides at `rate_mm_s` the way `direction`, 1 or -1, where
-        the model says `model_N` and the device is believed to be `fit`. The reading stands for `dt_s` > 0; the zero
-        that is off it is known to within `zero_sd_N`. All are finite."""
+        """Take one reading and judge it against `fit`. May begin or end a dispute.
+
+        The handle slides at `rate_mm_s` >= 0 the way `direction`, 1 or -1. `reading_N` is the force against this
+        motion, less the sensor's zero, which is known to within `zero_sd_N`. The model's force is `model_N`. The
+        reading stands for `dt_s` > 0. All arguments are finite.
+        """
         if self.is_disputed:
             zero_sd_N = 0.0  # it is for a reversal to tell
         self.freshness.update(fit.scale, model_N, reading_N, dt_s, learns=not self.is_disputed)
@@ -128,7 +131,11 @@ class SensorTrust:
         self._judge(self.measured_N - fit.force_N(model_N), self._is_strange(model_N, zero_sd_N), dt_s)
 
     def learned(self, learned_N: float, model_N: float, dt_s: float) -> None:
-        """Takes by how much a reading has moved the fit's force where the model says `model_N`."""
+        """Take the change `learned_N` that one reading made to the fit's force, where the model's force is `model_N`.
+
+        Begins a dispute when recent changes exceed what a device changes by itself. Nothing happens before LEARNS_S of
+        sliding.
+        """
         if not self.has_slid:
             return
         self.moved_N += learned_N
@@ -138,20 +145,28 @@ class SensorTrust:
             self._forget(model_N, dt_s)
 
     def compare(self, fit: DeviceFit, model_N: float) -> None:
-        """Looks whether the readings have left a fit that learns nothing now: then a dispute begins."""
+        """Begin a dispute where the mean reading has left a `fit` that does not learn now. The model's force is
+        `model_N`."""
         over_N = self.measured_N - fit.force_N(model_N)
         if self.has_slid and abs(over_N) > MOVED_N + self.slack_N + SURE * fit.deviation_N(model_N):
             self._begin(over_N)
 
     def told_zero(self, found_N: float) -> float:
-        """The handle has turned, and shown the sensor's zero to be `found_N` more than was known: what has relaxed is
-        known to have. The result is by how much the device gives more than its fit says: in a dispute that began since
-        the turn, the fit was learned with that zero."""
+        """Take a change `found_N` of the sensor's zero, which a reversal of the handle has shown. Return a shift of the
+        fit, N.
+
+        The shift is 0 except in a dispute that began since the reversal: the fit was learned with the old zero. The
+        share of RELAXED that is used up returns to 0.
+        """
         self.relaxed_N = 0.0
         return found_N * self.direction if self.is_disputed and self.began_way == self.direction else 0.0
 
     def confirm(self, wrong: Disputed) -> None:
-        """The operator settles the dispute: the `device` has changed, or the `sensor` is wrong."""
+        """Take the operator's word in a dispute.
+
+        `device`: the dispute ends, and none begins before LEARNS_S of sliding. `sensor`: it is wrong until its readings
+        agree for TRUSTED_AGAIN_S.
+        """
         if wrong == "device":
             self._settle()
             self.known_s = 0.0

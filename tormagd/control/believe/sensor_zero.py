@@ -1,11 +1,11 @@
-"""What the force sensor reads where there is no force: its zero z, which drifts.
+"""The force sensor's zero z, its reading without a force, which drifts.
 
     reversal   z' = d (F1 - F0 - s (m1 - m0)) / 2     F0, F1 readings along the motion before and after the handle
                                                       turned to direction d, m0, m1 the model's forces, s the scale
     update     Kalman filter of z with the error of that half sum; between reversals its variance grows
 
-Friction turns round with the handle and a zero does not. Between reversals nothing tells the zero from the device
-itself: where it is too uncertain, nothing may be learned from readings.
+Friction reverses with the handle and a zero does not. Between reversals nothing separates the zero from the device.
+Where the zero is too uncertain, nothing may be learned from readings.
 """
 
 import math
@@ -40,8 +40,11 @@ LONGEST_TURN_S: Final = 10.0
 
 @final
 class Level(Value):
-    """Means over the newest sliding one way: of the readings along the motion, of the model's force there, N, and of
-    the handle's rate, mm/s, over `heard_s`, the last of it at `until_s`."""
+    """Means of a handle's newest sliding one way: of the reading along the motion and the model's force, N, and of the
+    rate, mm/s.
+
+    `heard_s` is the time of sliding in the mean, and `until_s` the host time of its last reading.
+    """
 
     def __init__(self, reading_N: float, model_N: float, rate_mm_s: float, heard_s: float, until_s: float) -> None:
         self.reading_N: Final = reading_N
@@ -51,7 +54,10 @@ class Level(Value):
         self.until_s: Final = until_s
 
     def heard(self, reading_N: float, model_N: float, rate_mm_s: float, dt_s: float, now_s: float) -> "Level":
-        """After one more reading, which stands for `dt_s` > 0: a plain mean at first, then one that forgets."""
+        """Return the level with one more reading, which stands for `dt_s` > 0.
+
+        The mean is plain over the first LEVEL_S and forgets after them.
+        """
         heard_s = self.heard_s + dt_s
         share = dt_s / min(heard_s, max(LEVEL_S, dt_s))
         return Level(
@@ -65,7 +71,7 @@ class Level(Value):
 
 @final
 class SensorZero:
-    """Estimates the zero of one sensor."""
+    """Estimator of one sensor's zero, `zero_N`, with its variance."""
 
     zero_N: float = 0.0
     variance_N2: float = TARED_VARIANCE_N2
@@ -81,21 +87,22 @@ class SensorZero:
     "Of the way before, until the two have been compared."
 
     def sd_N(self, now_s: float) -> float:
-        """Standard deviation of the zero by now; before the first reading no time counts."""
+        """Return the zero's standard deviation at `now_s`. Drift counts from the first reading or the newest
+        reversal."""
         since_s = max(now_s - self.told_s, 0.0)
         drifted_N2 = DRIFT_N2_S * since_s * max(since_s / WANDERS_S, 1.0)
         return math.sqrt(min(self.variance_N2 + drifted_N2, MAX_SD_N * MAX_SD_N))
 
     def begin(self, now_s: float) -> None:
-        """Says that there is a reading: from the first one on the zero's variance grows."""
+        """Note the first reading at `now_s`: from then on the variance grows. Later calls change nothing."""
         self.told_s = min(self.told_s, now_s)
 
     def doubt(self) -> None:
-        """The zero may be any: the next reversal tells it."""
+        """Set the variance to its greatest, and remember the old one: the zero may be any."""
         self.undoubted_N2, self.variance_N2 = self.variance_N2, MAX_SD_N * MAX_SD_N
 
     def trust(self) -> None:
-        """The readings show that it is the one it was."""
+        """Take back a doubt: the variance returns, unless a reversal has made it smaller."""
         self.variance_N2 = min(self.variance_N2, self.undoubted_N2)
 
     def update(
@@ -109,9 +116,12 @@ class SensorZero:
         scale: float,
         scale_sd: float,
     ) -> bool:
-        """Takes a reading along `direction` of a handle that slides at `rate_mm_s`, where the model says `model_N`. It
-        stands for `dt_s` > 0; the device's scale is known to within `scale_sd`. All are finite. The result tells
-        whether a reversal has told the zero just now."""
+        """Take one reading, and return whether a reversal has told the zero just now.
+
+        The handle slides at `rate_mm_s` the way `direction`, 1 or -1. `reading_N` is the force against this motion, the
+        model's force `model_N`. The reading stands for `dt_s` > 0. `scale` is the device's force over the model's,
+        known to within `scale_sd`. All arguments are finite.
+        """
         level = self.level
         if level is None or direction != self.direction:
             # what was heard for too short a time is no level

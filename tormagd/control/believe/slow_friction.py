@@ -1,12 +1,11 @@
-"""How much more force a creeping handle meets than one at speed: static friction differs from device to device.
+"""The static friction of one device: the force of a creeping handle over the force at speed, a factor k.
 
     model    F = f(v) (s m + o)            f(v) = 1 + e(v) (k - 1),  e(v) = exp(-(v / STRIBECK_MM_S)^2)
     error    1 + (F / (s m + o) - 1) / e(v) - k
     update   k by that times e(v) dt / (LEARNED_S + dt)
 
-The factor k is learned while the handle slides slowly, and acts there only. It stays within what static friction
-differs from device to device and how uncertain the fit (s, o) is: of a device that was never seen at speed a creep
-shows nearly all.
+The factor is learned, and acts, at creep only. It is bounded by how much static friction differs from device to device,
+and by how uncertain the fit (s, o) is. A device never seen at speed shows nearly all in a creep.
 """
 
 import math
@@ -26,15 +25,15 @@ MAX_STATIC: Final = 1.15
 """Static over kinetic friction is 1.08 to 1.25, and 1.15 on the device of the model; and the speeds at which it fades
 differ."""
 BELIEVED_SD: Final = 3.0
-"""Standard deviations of the fit within which a creep is believed. Chosen on draws 0 to 39: with two, seven of them are
-held at this bound, for up to a hundredth of the time in which they creep at first."""
+"""Standard deviations of the fit within which a creep is believed. Chosen on draws 0 to 39; two hold seven of
+them at this bound."""
 NOISE_N: Final = 0.03
 "A sensor that reads less than the weakest device's force, which has relaxed, and this noise, teaches nothing."
 
 
 @final
 class SlowFriction:
-    """Learns the factor k of one device."""
+    """Estimator of one device's factor k."""
 
     factor: float = 1.0
     "k."
@@ -50,12 +49,12 @@ class SlowFriction:
         self._least, self._most = factor_bounds(bounds)
 
     def factor_at(self, rate_mm_s: float) -> float:
-        """The factor for a handle that slides at this rate, 0 or more: 1 at speed."""
+        """Return the factor on the force of a handle that slides at `rate_mm_s` >= 0: 1 at speed, k at rest."""
         return 1.0 + _slowness(rate_mm_s) * (self.factor - 1.0)
 
     def follow(self, model_N: float, handle_mm: float) -> None:
-        """The handle went to `handle_mm`, where the model says `model_N`: bristles follow less force at once, and more
-        over REACH_MM of travel."""
+        """Follow the model's force `model_N` with the handle at `handle_mm`: a fall at once, a rise over REACH_MM of
+        travel."""
         rise_N = model_N - self.followed_N
         if rise_N > 0.0:
             rise_N *= 1.0 - math.exp(-abs(handle_mm - self.handle_mm) / REACH_MM)
@@ -63,14 +62,17 @@ class SlowFriction:
         self.handle_mm = handle_mm
 
     def rescale(self, before_N: float, after_N: float) -> None:
-        """The fit now expects `after_N` where it expected `before_N`: the force at a creep stays what it was, as far as
-        that was learned at a creep."""
+        """Change k so that the force at a creep stays, though the fit's force at speed went from `before_N` to
+        `after_N`. Only the share `learned` at a creep counts."""
         if before_N > 0.0 and after_N > 0.0:
             self.factor = min(max(self.factor * math.pow(before_N / after_N, self.learned), self._least), self._most)
 
     def update(self, fit: DeviceFit, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
-        """Learns k from a reading along the motion of a handle that slides at `rate_mm_s`, which stands for `dt_s`. The
-        `fit` has to expect more than 0 N where the model says `followed_N`."""
+        """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`.
+
+        `reading_N` is the force against the motion. A force below what any device gives teaches nothing. The force of
+        `fit` at `followed_N` must be above 0 N.
+        """
         if reading_N < self._bounds.min_scale * (1.0 - MAX_RELAXED) * self.followed_N - NOISE_N:
             return
         slowness = _slowness(rate_mm_s)
@@ -82,12 +84,13 @@ class SlowFriction:
 
 
 def factor_bounds(bounds: DeviceBounds) -> tuple[float, float]:
-    """The least and the greatest k of any device."""
+    """Return the least and the greatest k of any device."""
     return bounds.min_scale * MIN_STATIC, bounds.max_scale * MAX_STATIC
 
 
 def believable(fit: DeviceFit, model_N: float, bounds: DeviceBounds) -> tuple[float, float]:
-    """The least and the greatest k that is believed of a device with that fit, where the model says `model_N`."""
+    """Return the least and the greatest k of a device with this fit, where the model's force is `model_N`. The force of
+    `fit` there must be above 0 N."""
     unsure = BELIEVED_SD * fit.deviation_N(model_N) / fit.force_N(model_N)
     least, most = factor_bounds(bounds)
     return max(MIN_STATIC - unsure, least), min(MAX_STATIC + unsure, most)

@@ -1,11 +1,11 @@
-"""How strong this device is: the force it makes over the model's, as a scale and an offset with their variances.
+"""The strength of one device: scale and offset of its force over the model's, with their variances.
 
     model    F = s m + o + v           m model's force, N; F measured force, N; s scale; o offset, N
     predict  s, o forget towards their spread with time constants SCALE_LASTS_S and one that gives `adapts_in_s`
     update   Kalman filter of (s, o), with v of density ERROR_N2_S; what is not learned keeps its value (Schmidt)
 
-Friction, field and elastomer differ from device to device by a factor. What the elastomer has relaxed shifts the
-force. A low force shows little of a high one: the variances say how little.
+Friction, field and elastomer differ from device to device by a factor. A relaxed elastomer shifts the force. A low
+force tells little of a high one: the variances say how little.
 """
 
 import math
@@ -23,7 +23,7 @@ OFFSET_SD_N: Final = 0.1
 "Of the offset: what relaxation and hysteresis do around 0.5 N."
 ERROR_N2_S: Final = 3e-4
 """Density of what the model does not follow, N^2 s: with these spreads a new device is learned in some hundredths of a
-second. Chosen on sample 1 and draws 0 to 11, for their steps; with seven times as much these took two seconds."""
+second. Chosen on sample 1 and draws 0 to 11, for their steps."""
 SCALE_LASTS_S: Final = 600.0
 "In which what was learned of the scale is forgotten: the device has warmed, by a kelvin or less."
 SCALE_VARIANCE: Final = SCALE_SD * SCALE_SD
@@ -82,20 +82,20 @@ class DeviceFit(Value):
         return math.sqrt(max(self.offset_variance_N2, 0.0))
 
     def force_N(self, model_N: float) -> float:
-        """What the device gives where the model says `model_N`."""
+        """Return the device's force where the model's is `model_N`."""
         return self.scale * model_N + self.offset_N
 
     def model_N(self, force_N: float) -> float:
-        """What to ask of the model for the device to give `force_N`."""
+        """Return the model's force with which the device gives `force_N`."""
         return (force_N - self.offset_N) / self.scale
 
     def deviation_N(self, model_N: float) -> float:
-        """Standard deviation of the force that the device gives where the model says `model_N`."""
+        """Return the standard deviation of the device's force where the model's is `model_N`."""
         variance = model_N * (model_N * self.scale_variance + 2.0 * self.covariance_N) + self.offset_variance_N2
         return math.sqrt(max(variance, 0.0))
 
     def times(self, factor: float) -> "DeviceFit":
-        """The fit of a device that gives `factor` > 0 times the force."""
+        """Return the fit of a device with `factor` > 0 times the force, and its variances times the square."""
         square = factor * factor
         return DeviceFit(
             factor * self.scale,
@@ -106,17 +106,18 @@ class DeviceFit(Value):
         )
 
     def shifted(self, by_N: float) -> "DeviceFit":
-        """The fit of a device that gives `by_N` more."""
+        """Return the fit of a device with `by_N` more force, and the same variances."""
         return DeviceFit(
             self.scale, self.offset_N + by_N, self.scale_variance, self.covariance_N, self.offset_variance_N2
         )
 
     def unsure(self) -> "DeviceFit":
-        """The same force, of a device that may be any."""
+        """Return the same scale and offset with the variances of a device not yet seen."""
         return DeviceFit(self.scale, self.offset_N)
 
     def relaxed(self, relaxed_N: float) -> "DeviceFit":
-        """The fit over the model's force without memory, of a device whose force it is without `relaxed_N` of that."""
+        """Return the fit over the model's memoryless force m of a device that gives this fit's force at m less
+        `relaxed_N`."""
         by_scale_N = relaxed_N * self.scale_variance
         return DeviceFit(
             self.scale,
@@ -127,8 +128,8 @@ class DeviceFit(Value):
         )
 
     def surely_within_N(self, max_N: float, bounds: DeviceBounds) -> float:
-        """The model's force at which a device that is SURE deviations stronger gives `max_N`. No scale is taken for
-        beyond the `bounds`."""
+        """Return the model's force at which the device, taken SURE deviations stronger, gives `max_N`. No scale is
+        taken for beyond the `bounds`."""
         # scale m + offset + SURE sqrt(variance of that) = max, a quadratic: the smaller root is where the sum is meant
         room_N, sure = max_N - self.offset_N, SURE * SURE
         square = self.scale * self.scale - sure * self.scale_variance
@@ -145,7 +146,7 @@ UNSEEN: Final = DeviceFit()
 
 
 def forgotten(fit: DeviceFit, dt_s: float, adapts_in_s: float) -> DeviceFit:
-    """The fit after `dt_s` without a reading: its variances go to those of a believable device."""
+    """Return the fit after `dt_s` without a reading: its variances go to those of a device not yet seen."""
     keeps_scale = math.exp(-dt_s / SCALE_LASTS_S)
     keeps_offset = math.exp(-dt_s * ERROR_N2_S / (2.0 * OFFSET_VARIANCE_N2 * (adapts_in_s * adapts_in_s)))
     return DeviceFit(
@@ -168,8 +169,12 @@ def observe(
     learns_scale: bool = True,
     learns_offset: bool = True,
 ) -> tuple[DeviceFit, bool]:
-    """The fit after `measured_N` where the model says `model_N`, `dt_s` after the last, and whether its scale is held
-    at one of the `bounds`. The offset adapts in about `adapts_in_s`. All are finite."""
+    """Return the fit after one reading, and whether one of the `bounds` held its scale.
+
+    `measured_N` is the reading, `model_N` the model's force, `dt_s` the time since the last reading. At `dt_s` <= 0 the
+    fit is unchanged. The offset adapts in about `adapts_in_s`. Without `learns_scale` or `learns_offset` this value
+    stays, and its variance counts (Schmidt). All arguments are finite.
+    """
     if dt_s <= 0.0:
         return fit, False
     prior = forgotten(fit, dt_s, adapts_in_s)
@@ -199,7 +204,7 @@ def observe(
 
 @final
 class Strength:
-    """Learns how strong one device is, sooner where its readings surprise."""
+    """Estimator of one device's scale and offset. It learns the offset sooner where readings surprise."""
 
     fit: DeviceFit = UNSEEN
     surprise_N: float = 0.0
@@ -208,13 +213,14 @@ class Strength:
     "Scale or offset is at one of its bounds."
 
     def __init__(self, adapts_in_s: float, bounds: DeviceBounds, learns: tuple[bool, bool]) -> None:
-        """`adapts_in_s`: the offset's time without surprise; what `learns`: scale and offset."""
+        """Begin with the fit of a device not yet seen. `adapts_in_s` is the offset's time without surprise. `learns`
+        enables scale and offset."""
         self._adapts_in_s: Final = adapts_in_s
         self._bounds: Final = bounds
         self._learns: Final = learns
 
     def update(self, model_N: float, reading_N: float, dt_s: float) -> None:
-        """Takes a reading that stands for `dt_s` > 0, where the model says `model_N`."""
+        """Take one reading, which stands for `dt_s` > 0, where the model's force is `model_N`."""
         error_N = reading_N - self.fit.force_N(model_N)
         self.surprise_N = low_pass(self.surprise_N, error_N, dt_s, SURPRISE_S)
         adapts_in_s = self._adapts_in_s / (1.0 + (self.surprise_N / SURPRISE_N) ** 2)
@@ -234,15 +240,15 @@ class Strength:
             self.fit, self.is_held = self.fit.shifted(offset_N - self.fit.offset_N), True
 
     def settle(self) -> None:
-        """Nothing can be learned now: what comes after that is no surprise yet, and no bound holds the scale."""
+        """Forget the surprise, and that a bound held scale or offset: no reading teaches now."""
         self.surprise_N, self.is_held = 0.0, False
 
     def shift(self, by_N: float) -> None:
-        """Takes the device's force for so much more, or less: what the last readings taught was no lesson."""
+        """Shift the fit's force by `by_N`, and forget the surprise: the last readings were misread."""
         self.fit = self.fit.shifted(by_N)
         self.settle()
 
     def forget(self, fit: DeviceFit = UNSEEN) -> None:
-        """Forgets what was learned: `fit` is what is known from now on."""
+        """Replace all that was learned by `fit`."""
         self.fit = fit
         self.settle()
